@@ -11,6 +11,7 @@ use crate::common::{
     attributes, extreme_values, followers, light_bounds, neighbors, overflow, partial_steps, surfaces, truncation,
 };
 
+/// A deformer that also computes light-space bounds if the scene has a shadow.
 fn cpu_deformer(scene: &Arc<Scene>) -> CpuDeformer {
     CpuDeformer::new(scene).with_bounding_axes(scene.light_axes())
 }
@@ -57,7 +58,7 @@ fn shears_and_mirrors_equal_the_reference() {
 }
 
 #[test]
-fn zero_area_and_missing_uvs_give_unit_directions() {
+fn zero_area_and_missing_uvs_give_valid_directions() {
     surfaces::check_zero_area_and_missing_uvs(cpu_deformer);
 }
 
@@ -77,14 +78,17 @@ fn truncation_errors_stay_within_the_budget() {
 }
 
 #[test]
-fn mode_near_the_truncation_limit_does_not_flicker() {
+fn mode_near_the_truncation_limit_keeps_its_status() {
     truncation::check_hysteresis(cpu_deformer);
 }
 
 #[test]
 fn partial_steps_have_the_bits_of_full_steps() {
-    partial_steps::check_partial_steps(|scene, _| cpu_deformer(scene));
-    assert!(!partial_steps::relies_on_dirty_list(cpu_deformer), "expected the CPU deformer to compare values");
+    partial_steps::check_partial_steps(|scene, _batch_policy| cpu_deformer(scene));
+    assert!(
+        !partial_steps::relies_on_dirty_list(cpu_deformer),
+        "expected the CPU deformer to find changed domains by comparing q and transforms"
+    );
 }
 
 #[test]
@@ -129,7 +133,7 @@ fn partial_steps_of_roots_move_their_followers() {
 }
 
 #[test]
-fn followers_10000_km_away_keep_the_millimeter() {
+fn followers_10000_km_away_are_exact_to_1_mm() {
     followers::check_far_followers(cpu_deformer);
 }
 
@@ -140,11 +144,11 @@ fn overflowing_frame_products_keep_finite_vertices() {
 
 #[test]
 fn light_bounds_contain_every_vertex() {
-    light_bounds::check_containment(|scene, _| cpu_deformer(scene));
+    light_bounds::check_containment(|scene, _batch_policy| cpu_deformer(scene));
 }
 
 #[test]
-fn thin_scene_is_fitted_closely_in_light_space() {
+fn light_bounds_of_a_thin_scene_are_tight() {
     light_bounds::check_tightness(cpu_deformer);
 }
 

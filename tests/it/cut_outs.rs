@@ -1,4 +1,5 @@
-//! Alpha tests of cut-outs in the compute rasterizer, compared with geometry.
+//! Alpha tests of cut-outs in the reference rasterizer. A footprint is the texture coordinates at a sample and their
+//! derivatives by pixel column (x) and row (y).
 
 use modalcast_compute::reference::raster::cut_out::{Footprint, alpha, footprint};
 use modalcast_compute::reference::raster::{VisibilityBuffer, corners};
@@ -9,14 +10,14 @@ use nalgebra::{Matrix3, Vector3};
 use crate::common::cut_outs::{alpha_image, floor_soup, sheet_soup, uniform_cut_out_soups};
 use crate::common::soups::{clip_space_viewport, perspective_viewport};
 
-/// Texture coordinates where the ray through the sample (`x`, `y`) meets the plane of a triangle, in f64. The camera is
-/// that of [`perspective_viewport`], with a vertical field of view of 60 degrees.
+/// Texture coordinates where the ray through a point of the image meets the plane of a triangle, in f64. `x` and `y`
+/// are in pixels. The camera is that of [`perspective_viewport`], with a vertical field of view of 60 degrees.
 fn ray_cast_uv(viewport: &Viewport, triangle: [[f64; 3]; 3], uvs: [[f64; 2]; 3], [x, y]: [f64; 2]) -> [f64; 2] {
     let [width, height] = viewport.size().map(f64::from);
     let focal = 1.0 / 30.0_f64.to_radians().tan();
     let ray = Vector3::new((2.0 * x / width - 1.0) * width / height / focal, (1.0 - 2.0 * y / height) / focal, -1.0);
     let [a, b, c] = triangle.map(Vector3::from);
-    // Solve a + s (b - a) + t (c - a) = r ray.
+    // Solve a + s (b - a) + t (c - a) = r ray for (s, t, r).
     let solution =
         Matrix3::from_columns(&[b - a, c - a, -ray]).lu().solve(&-a).expect("expected a triangle with an area");
     [0, 1].map(|axis| {
@@ -41,10 +42,11 @@ impl FootprintCase {
             footprint(&self.viewport, &corners, &self.uvs.map(|uv| uv.map(|number| number as f32)), self.pixel);
         let center = self.pixel.map(|index| f64::from(index) + 0.5);
         let uv_at =
-            |x: f64, y: f64| ray_cast_uv(&self.viewport, self.triangle, self.uvs, [center[0] + x, center[1] + y]);
+            |dx: f64, dy: f64| ray_cast_uv(&self.viewport, self.triangle, self.uvs, [center[0] + dx, center[1] + dy]);
         let max_error = |actual: [f32; 2], expected: [f64; 2]| {
             (0..2).map(|axis| (f64::from(actual[axis]) - expected[axis]).abs()).fold(0.0, f64::max)
         };
+        // Points 1e-3 pixels before and after the center.
         let central_difference =
             |upper: [f64; 2], lower: [f64; 2]| [0, 1].map(|axis| (upper[axis] - lower[axis]) / 2e-3);
         let column_error = max_error(result.duv_dx, central_difference(uv_at(1e-3, 0.0), uv_at(-1e-3, 0.0)));
@@ -53,23 +55,28 @@ impl FootprintCase {
     }
 }
 
-/// Also for a triangle with corners behind the eye.
+/// One triangle is tilted, the other has corners behind the eye.
 #[test]
 fn footprints_match_ray_cast_texture_coordinates() {
     let viewport = perspective_viewport(192, 128, 0.1, 100.0);
     let uvs = [[0.0, 0.0], [3.0, 0.0], [3.0, 5.0]];
     let tilted_triangle = [[-2.0, -2.0, -3.0], [2.5, -1.0, -5.0], [0.3, 3.0, -9.0]];
     let triangle_behind_eye = [[-9.0, -1.0, 9.0], [9.0, -1.0, 9.0], [2.0, -1.0, -20.0]];
-    let mut max_errors = (0.0_f64, 0.0_f64);
+    let (mut max_uv_error, mut max_derivative_error) = (0.0_f64, 0.0_f64);
     for (triangle, pixels) in
         [(tilted_triangle, [[90, 60], [101, 70], [80, 66]]), (triangle_behind_eye, [[96, 80], [96, 120], [99, 100]])]
     {
         for pixel in pixels {
             let (uv_error, derivative_error) = FootprintCase { triangle, uvs, pixel, viewport }.max_errors();
-            max_errors = (max_errors.0.max(uv_error), max_errors.1.max(derivative_error));
+            max_uv_error = max_uv_error.max(uv_error);
+            max_derivative_error = max_derivative_error.max(derivative_error);
         }
     }
-    assert!(max_errors.0 < 1e-5 && max_errors.1 < 1e-4, "{max_errors:?}");
+    assert!(
+        max_uv_error < 1e-5 && max_derivative_error < 1e-4,
+        "error of texture coordinates {max_uv_error}, of derivatives {max_derivative_error}"
+    );
+    // Projecting the corners to z = -1 makes the interpolation affine.
     let affine_uv = ray_cast_uv(&viewport, tilted_triangle.map(|[x, y, z]| [-x / z, -y / z, -1.0]), uvs, [90.5, 60.5]);
     let perspective_uv = ray_cast_uv(&viewport, tilted_triangle, uvs, [90.5, 60.5]);
     assert!(
@@ -93,15 +100,16 @@ fn small_triangles_at_window_border_keep_precision() {
         .collect();
     let result =
         footprint(&viewport, &corners(&viewport, &positions, [0, 1, 2]), &[[0.0, 0.0], [1.0, 0.0], [0.5, 1.0]], pixel);
-    // Here f32 resolves 1/16384^2 of the window, a twentieth of this triangle.
+    // Near 1, numbers in f32 are 2^-24 apart, which is 1/2048 pixel here. Each corner thus moves by up to 1/4096 pixel,
+    // 1.2 % of the triangle's side. The texture coordinate u changes by 1 over 1/50 pixel.
     assert!((result.uv[0] - 0.5).abs() < 0.06 && (result.uv[1] - 0.5).abs() < 0.06, "{result:?}");
     assert!((result.duv_dx[0] / 50.0 - 1.0).abs() < 0.1, "{result:?}");
-    // The sample lies outside of the triangle by a rounding error. It gets the texture coordinates of the nearest point
-    // of the triangle, not extrapolated ones.
+    // This triangle lies less than 1/100 pixel to the right of the sample, and rasterizers may draw the sample because
+    // of rounding. It gets the texture coordinates of the nearest point of the triangle, not extrapolated coordinates.
     let shifted_positions = [position(0.2, -1.0), position(2.0, -1.0), position(1.2, 1.0)]
         .as_flattened()
         .iter()
-        .map(|n| *n as f32)
+        .map(|number| *number as f32)
         .collect::<Vec<_>>();
     let result = footprint(
         &viewport,
@@ -130,6 +138,7 @@ fn degenerate_footprints_are_zero() {
     assert_eq!(footprint_of(valid_corners, [[3e38, 0.0], [-3e38, 0.0], uvs[2]]), Footprint::default());
 }
 
+/// Cut-outs whose only alpha-tested triangle has index 4.
 fn cut_outs_of_image(image: AlphaImage) -> CutOuts {
     let materials = vec![AlphaMaterial { alpha: 1.0, cutoff: 0.5, image: Some(0) }];
     CutOuts {
@@ -147,21 +156,24 @@ fn alpha_images_repeat_and_filter_trilinearly() {
     // Level 0 is a row of 4 texels with values 0, 51, 102 and 153. Level 1 is two texels of 255, and level 2 is one
     // texel of 0.
     let cut_outs = cut_outs_of_image(alpha_image(4, 1, |level, column, _| [51 * column as u8, 255, 0][level as usize]));
-    let alpha_at = |u: f32, derivative: f32| {
-        let footprint = Footprint { uv: [u, 0.3], duv_dx: [derivative, 0.0], duv_dy: [0.0; 2] };
+    let alpha_at = |u: f32, du_dx: f32| {
+        let footprint = Footprint { uv: [u, 0.3], duv_dx: [du_dx, 0.0], duv_dy: [0.0; 2] };
         alpha(&cut_outs, 4, &footprint)
     };
     let assert_close =
         |actual: f32, expected: f32| assert!((actual - expected).abs() < 1e-6, "expected {expected}, got {actual}");
+    // Texel centers of level 0 are at u = 1/8, 3/8, 5/8 and 7/8. A texel has the width 1/4, so level 0 is used up to a
+    // derivative of 1/4, level 1 at 1/2 and level 2 from 1 on.
     assert_close(alpha_at(0.125, 0.0), 0.0);
     assert_close(alpha_at(0.375, 0.25), 0.2);
     assert_close(alpha_at(0.5, 0.1), 0.3);
-    // Halfway between the last texel and the first.
+    // Halfway between the last texel and the first texel of the next repetition.
     assert_close(alpha_at(0.0, 0.0), 0.3);
     for repeat in [-2.0, 1.0, 5.0] {
         assert_close(alpha_at(0.375 + repeat, 0.0), 0.2);
     }
     assert_close(alpha_at(0.375, 0.5), 1.0);
+    // Halfway between levels 0 and 1.
     assert_close(alpha_at(0.375, 0.25 * 2.0_f32.sqrt()), 0.6);
     assert_close(alpha_at(0.375, 1.0), 0.0);
     assert_close(alpha_at(0.375, 1e30), 0.0);
@@ -191,15 +203,16 @@ fn uniform_images_keep_all_or_nothing_of_a_triangle() {
     let mut different_samples = 0;
     for cut_out_soup in uniform_cut_out_soups() {
         let (soup, cut_outs) = (&cut_out_soup.soup, &cut_out_soup.cut_outs);
-        // Per material of the soup: whether the alpha test keeps all samples. It discards all samples of the others.
+        // Whether the alpha test keeps all samples of a material; otherwise it discards all. The materials have these
+        // values of alpha times image alpha, and of the cutoff: (0, 0.5), (1, 0.5), (0.25, 0.5), (0, 0), (0.75, 0.75),
+        // (0.5, 0.75) and (1, NaN).
         let is_material_opaque = [false, true, false, true, true, false, false];
         let mut expected = VisibilityBuffer::new(soup.viewport);
         for group in &soup.groups {
             for triangle in group.first..group.first + group.triangles {
-                let cut_out = triangle.checked_sub(cut_outs.first);
-                if cut_out
-                    .is_none_or(|cut_out| is_material_opaque[cut_outs.material_indices[cut_out as usize] as usize])
-                {
+                let cut_out_index = triangle.checked_sub(cut_outs.first);
+                let material = cut_out_index.map(|index| cut_outs.material_indices[index as usize]);
+                if material.is_none_or(|material| is_material_opaque[material as usize]) {
                     let range =
                         modalcast_model::scene::DrawRange { first: triangle, triangles: 1, cull_mode: group.cull_mode };
                     expected.draw(&soup.positions, &soup.triangles, range);
@@ -214,15 +227,19 @@ fn uniform_images_keep_all_or_nothing_of_a_triangle() {
     assert!(different_samples > 10_000, "negative control: {different_samples} samples differ without cut-outs");
 }
 
-/// The wall is visible through the cut-outs of the floor. Few samples are ambiguous, and splitting the floor into smaller
-/// triangles changes few samples.
+/// The wall is visible through the cut-outs of the floor. Few samples are ambiguous (their alpha is near the cutoff).
+/// Splitting the floor into smaller triangles changes few samples.
 #[test]
 fn wall_shows_through_holes_of_the_floor() {
     let cut_out_soup = floor_soup(1);
+    // Triangles 0 and 1 are the wall.
+    let is_floor = |id: &Option<u32>| id.is_some_and(|id| id >= 2);
+    let is_wall = |id: &Option<u32>| id.is_some_and(|id| id < 2);
     let ids = cut_out_soup.rasterize().ids();
-    let count_ids = |predicate: fn(u32) -> bool| ids.iter().flatten().filter(|id| predicate(**id)).count();
-    let (wall_samples, floor_samples) = (count_ids(|id| id < 2), count_ids(|id| id >= 2));
-    let opaque_samples = cut_out_soup.soup.rasterize().ids().iter().flatten().filter(|id| **id >= 2).count();
+    let wall_samples = ids.iter().filter(|id| is_wall(id)).count();
+    let floor_samples = ids.iter().filter(|id| is_floor(id)).count();
+    // Samples of the floor without its cut-outs.
+    let opaque_samples = cut_out_soup.soup.rasterize().ids().iter().filter(|id| is_floor(id)).count();
     assert!(
         floor_samples > opaque_samples / 5 && floor_samples < opaque_samples * 4 / 5 && wall_samples > 1000,
         "{floor_samples} of {opaque_samples} floor samples remain, {wall_samples} samples of the wall are visible"
@@ -234,8 +251,8 @@ fn wall_shows_through_holes_of_the_floor() {
         "{ambiguous_samples} of {opaque_samples} samples are ambiguous"
     );
     let split_ids = floor_soup(40).rasterize().ids();
-    let is_same = |(a, b): (&Option<u32>, &Option<u32>)| a.is_some_and(|id| id >= 2) == b.is_some_and(|id| id >= 2);
-    let different_samples = ids.iter().zip(&split_ids).filter(|pair| !is_same(*pair)).count();
+    let different_samples =
+        ids.iter().zip(&split_ids).filter(|(id, split_id)| is_floor(id) != is_floor(split_id)).count();
     assert!(
         different_samples < opaque_samples / 50,
         "split floor: {different_samples} of {opaque_samples} samples differ"

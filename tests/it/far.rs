@@ -1,5 +1,5 @@
-//! The three wire formats of transforms, and domains ten thousand kilometers from the origin: vertices are exact to the
-//! millimeter.
+//! The three wire formats of transforms give the same vertices. Vertices 10,000 km from the origin have errors of at
+//! most 1 mm.
 
 use modalcast::config::{BackendChoice, Config};
 use modalcast_model::scene::Scene;
@@ -12,8 +12,13 @@ use crate::service_harness::{
     step, strips,
 };
 
-/// Pose of a domain: quaternion x y z w and translation.
-type Pose = ([f32; 4], [f64; 3]);
+/// Pose of a domain.
+#[derive(Clone, Copy)]
+struct Pose {
+    /// Quaternion x y z w.
+    rotation: [f32; 4],
+    translation: [f64; 3],
+}
 
 fn vertex_request(scene: &str, domains: &[u32]) -> v1::GetVerticesRequest {
     let selection = Some(v1::VertexSelection { domains: domains.to_vec(), ..Default::default() });
@@ -26,8 +31,8 @@ fn quaternion(roll: f64, pitch: f64, yaw: f64) -> [f32; 4] {
 }
 
 /// World positions in meters, computed in f64: unit (R (x0 + U q) + t).
-fn expected_positions(scene: &Scene, domain: usize, q: &[f32], (rotation, translation): Pose) -> Vec<Vector3<f64>> {
-    let [x, y, z, w] = rotation.map(f64::from);
+fn expected_positions(scene: &Scene, domain: usize, q: &[f32], pose: Pose) -> Vec<Vector3<f64>> {
+    let [x, y, z, w] = pose.rotation.map(f64::from);
     let rotation = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
     let shape = scene.shape_of(domain);
     let world_position = |(vertex, rest_position): (usize, &[f32; 3])| {
@@ -37,7 +42,7 @@ fn expected_positions(scene: &Scene, domain: usize, q: &[f32], (rotation, transl
                 modes.map(|(mode, q)| f64::from(shape.modes.entry(vertex, axis, mode)) * f64::from(*q)).sum();
             f64::from(rest_position[axis]) + displacement
         });
-        scene.unit * (rotation * deformed_position + Vector3::from(translation))
+        scene.unit * (rotation * deformed_position + Vector3::from(pose.translation))
     };
     shape.mesh.rest_positions().iter().enumerate().map(world_position).collect()
 }
@@ -47,6 +52,7 @@ fn decode_positions(scene: &Scene, reply: &ReceivedVertices) -> Vec<Vector3<f64>
     let mut positions = reply.positions.chunks_exact(3);
     let mut world_positions = Vec::new();
     for (index, vertices) in reply.head.vertices.iter().enumerate() {
+        // One origin per domain, or one origin in the head for all domains.
         let origin = if reply.origins.is_empty() { &reply.head.origin } else { &reply.origins[3 * index..][..3] };
         let origin = Vector3::from_column_slice(origin);
         for position in positions.by_ref().take(*vertices as usize) {
@@ -69,9 +75,10 @@ async fn start_cpu_server() -> Server {
 async fn transform_formats_agree_at_any_byte_alignment() {
     let server = Server::start_default().await;
     server.open("strips").await;
-    let mut writer = server.drive("strips", v1::Policy::Lossless, 0).await;
-    let pose = (quaternion(0.3, -0.8, 2.0), [1.5, -2.25, 1e3]);
-    let matrix = state_after_steps(&strips(), &[rigid_step(0, RigidF32, &[(1, pose.0, pose.1)])]).transforms[1];
+    let mut writer = server.drive_lossless("strips").await;
+    let pose = Pose { rotation: quaternion(0.3, -0.8, 2.0), translation: [1.5, -2.25, 1e3] };
+    let matrix =
+        state_after_steps(&strips(), &[rigid_step(0, RigidF32, &[(1, pose.rotation, pose.translation)])]).transforms[1];
     let affine_step = |format: v1::TransformFormat| v1::Step {
         transform_domains: vec![1],
         transforms: bytemuck::cast_slice::<f32, u8>(&matrix.0).to_vec().into(),
@@ -81,15 +88,17 @@ async fn transform_formats_agree_at_any_byte_alignment() {
     let steps = [
         affine_step(Unspecified),
         affine_step(AffineF32),
-        rigid_step(0, RigidF32, &[(1, pose.0, pose.1)]),
-        rigid_step(0, RigidF64, &[(1, pose.0, pose.1)]),
+        rigid_step(0, RigidF32, &[(1, pose.rotation, pose.translation)]),
+        rigid_step(0, RigidF64, &[(1, pose.rotation, pose.translation)]),
     ];
     let expected_vertices = reference_vertices(&strips(), &steps[..1]);
     for (number, mut step) in steps.into_iter().enumerate() {
         step.number = number as u64;
         // An odd number of bytes before the transforms changes their alignment within the message.
-        step.q_domains = vec![0; usize::from(number % 2 == 1)];
-        step.q = vec![0; 8 * step.q_domains.len()].into();
+        if number % 2 == 1 {
+            step.q_domains = vec![0];
+            step.q = vec![0; 8].into();
+        }
         writer.send_step_and_wait(step).await;
         let reply = get_vertices(&server, vertex_request("strips", &[])).await.expect("expected vertices");
         assert_eq!(
@@ -100,7 +109,7 @@ async fn transform_formats_agree_at_any_byte_alignment() {
         assert_eq!((reply.head.origin.as_slice(), reply.origins.len()), ([0.0; 3].as_slice(), 0));
     }
     // Negative control: another rotation gives other vertices.
-    let other_step = rigid_step(9, RigidF32, &[(1, quaternion(0.3, -0.8, 2.1), pose.1)]);
+    let other_step = rigid_step(9, RigidF32, &[(1, quaternion(0.3, -0.8, 2.1), pose.translation)]);
     assert_ne!(reference_vertices(&strips(), &[other_step]).positions, expected_vertices.positions);
 }
 
@@ -109,31 +118,43 @@ async fn far_scene_and_far_domain_keep_millimeter_precision() {
     let server = start_cpu_server().await;
     let scene = far_strips();
     server.open("far").await;
-    let mut writer = server.drive("far", v1::Policy::Lossless, 0).await;
+    let mut writer = server.drive_lossless("far").await;
     let q = [0.25, -0.5, 0.125, 0.75_f32];
     writer.send_step_and_wait(step(0, &[], &q)).await;
-    // In half meters from the world origin. The first domain is near the scene origin, the second is 10,000 km east of
-    // it.
+    // Poses are in half meters, the unit of the scene, from the world origin. The first domain is near the scene
+    // origin, the second is 10,000 km from it along x.
     let origin = scene.origin.map(|meters| meters / scene.unit);
-    let near_pose = (quaternion(0.1, 0.2, 0.3), [origin[0] + 3.001, origin[1] - 2.003, origin[2] + 0.007]);
-    let far_pose = (quaternion(-1.0, 0.5, 0.9), [origin[0] + 2e7 + 1.234, origin[1] + 0.001, origin[2] - 700.021]);
+    let near_pose = Pose {
+        rotation: quaternion(0.1, 0.2, 0.3),
+        translation: [origin[0] + 3.001, origin[1] - 2.003, origin[2] + 0.007],
+    };
+    let far_pose = Pose {
+        rotation: quaternion(-1.0, 0.5, 0.9),
+        translation: [origin[0] + 2e7 + 1.234, origin[1] + 0.001, origin[2] - 700.021],
+    };
     writer
-        .send_step_and_wait(rigid_step(1, RigidF64, &[(0, near_pose.0, near_pose.1), (1, far_pose.0, far_pose.1)]))
+        .send_step_and_wait(rigid_step(
+            1,
+            RigidF64,
+            &[(0, near_pose.rotation, near_pose.translation), (1, far_pose.rotation, far_pose.translation)],
+        ))
         .await;
     let reply = get_vertices(&server, vertex_request("far", &[])).await.expect("expected vertices");
+    // Two origins of three f64 numbers have 48 bytes.
     assert_eq!((reply.head.origin.as_slice(), reply.head.origin_bytes), (scene.origin.as_slice(), 48));
     assert_eq!(reply.origins[..3], scene.origin);
     let expected =
         [expected_positions(&scene, 0, &q[..2], near_pose), expected_positions(&scene, 1, &q[2..], far_pose)].concat();
     let error = max_distance(&decode_positions(&scene, &reply), &expected);
     assert!(error <= 1e-3, "expected at most 1 mm, got {error} m");
-    // Negative control: a far translation rounded to f32 relative to the scene origin has an error of more than 1 cm.
-    let f32_error = far_pose.1[0] - origin[0] - f64::from((far_pose.1[0] - origin[0]) as f32);
+    // Negative control: the far translation, rounded to f32 relative to the scene origin, has an error of more than 1
+    // cm.
+    let f32_error = far_pose.translation[0] - origin[0] - f64::from((far_pose.translation[0] - origin[0]) as f32);
     assert!(
         scene.unit * f32_error.abs() > 1e-2,
         "expected an f32 rounding error of more than 1 cm, got {f32_error} units"
     );
-    // Also for a selection in another order without normals, and for a selection of one domain.
+    // The same holds for a selection in another order without normals, and for a selection of one domain.
     let selection = Some(v1::VertexSelection { domains: vec![1, 0], positions_only: true, ..Default::default() });
     let swapped_reply = get_vertices(&server, v1::GetVerticesRequest { selection, ..vertex_request("far", &[]) })
         .await
@@ -160,15 +181,21 @@ async fn origin_follows_a_moved_scene_and_survives_a_restart() {
     let server = Server::start(settings()).await;
     let scene = strips();
     server.open("strips").await;
-    let mut writer = server.drive("strips", v1::Policy::Lossless, 0).await;
+    let mut writer = server.drive_lossless("strips").await;
     let poses = [
-        (quaternion(0.0, 0.4, 0.0), [1e7 + 0.004, 5.006, -1e7 - 0.002]),
-        (quaternion(1.0, 0.0, 0.0), [1e7 + 9.5, 0.0, -1e7]),
+        Pose { rotation: quaternion(0.0, 0.4, 0.0), translation: [1e7 + 0.004, 5.006, -1e7 - 0.002] },
+        Pose { rotation: quaternion(1.0, 0.0, 0.0), translation: [1e7 + 9.5, 0.0, -1e7] },
     ];
-    let pose_step =
-        |number| rigid_step(number, RigidF64, &[0, 1].map(|index| (index as u32, poses[index].0, poses[index].1)));
+    let pose_step = |number| {
+        rigid_step(
+            number,
+            RigidF64,
+            &[0, 1].map(|index| (index as u32, poses[index].rotation, poses[index].translation)),
+        )
+    };
     writer.send_step_and_wait(pose_step(4)).await;
     let reply = get_vertices(&server, vertex_request("strips", &[])).await.expect("expected vertices");
+    // The origin is the multiple of 1024 that is nearest to 1e7.
     assert_eq!(
         (reply.head.origin.as_slice(), reply.head.origin_bytes),
         ([9766.0 * 1024.0, 0.0, -9766.0 * 1024.0].as_slice(), 0)
@@ -186,9 +213,9 @@ async fn origin_follows_a_moved_scene_and_survives_a_restart() {
         (4, &reply.positions, &reply.head.origin)
     );
     // The next f64 transform applies to the state restored from the checkpoint.
-    let mut writer = server.drive("strips", v1::Policy::Lossless, 0).await;
-    let new_pose = (poses[1].0, [1e7 + 11.5, 0.001, -1e7]);
-    writer.send_step_and_wait(rigid_step(0, RigidF64, &[(1, new_pose.0, new_pose.1)])).await;
+    let mut writer = server.drive_lossless("strips").await;
+    let new_pose = Pose { rotation: poses[1].rotation, translation: [1e7 + 11.5, 0.001, -1e7] };
+    writer.send_step_and_wait(rigid_step(0, RigidF64, &[(1, new_pose.rotation, new_pose.translation)])).await;
     let reply = get_vertices(&server, vertex_request("strips", &[])).await.expect("expected vertices");
     let expected =
         [expected_positions(&scene, 0, &[], poses[0]), expected_positions(&scene, 1, &[], new_pose)].concat();

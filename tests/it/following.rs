@@ -4,6 +4,7 @@ use modalcast_proto::v1;
 
 use crate::service_harness::{Server, get_vertices, reference_vertices, step, twig};
 
+/// Indices of domains of the scene `twig`. Domain 0 is a strip that nothing follows.
 const BRANCH: u32 = 1;
 const LEAF: u32 = 2;
 const LEAFLET: u32 = 3;
@@ -20,6 +21,10 @@ fn vertex_request(domains: &[u32]) -> v1::GetVerticesRequest {
     v1::GetVerticesRequest { scene: "twig".into(), selection, ..v1::GetVerticesRequest::default() }
 }
 
+/// Numbers of the positions of a domain: four vertices times three axes.
+const DOMAIN_NUMBERS: usize = 12;
+
+/// Row-major 3 x 4 matrix: a rotation by 90 degrees about z, then a translation by (2, 0, -3).
 const ROTATION: [f32; 12] = [0.0, -1.0, 0.0, 2.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, -3.0];
 const TRANSLATION: [f32; 12] = [1.0, 0.0, 0.0, 7.0, 0.0, 1.0, 0.0, 8.0, 0.0, 0.0, 1.0, 9.0];
 
@@ -27,38 +32,40 @@ const TRANSLATION: [f32; 12] = [1.0, 0.0, 0.0, 7.0, 0.0, 1.0, 0.0, 8.0, 0.0, 0.0
 async fn moved_branch_moves_only_its_leaves() {
     let server = Server::start_default().await;
     server.open("twig").await;
-    let mut writer = server.drive("twig", v1::Policy::Lossless, 0).await;
+    let mut writer = server.drive_lossless("twig").await;
     let rest_positions = get_vertices(&server, vertex_request(&[])).await.expect("expected vertices").positions;
     let step = transform_step(0, &[BRANCH], &[ROTATION]);
     writer.send_step_and_wait(step.clone()).await;
     let positions = get_vertices(&server, vertex_request(&[])).await.expect("expected vertices").positions;
     assert_eq!(positions, reference_vertices(&twig(), &[step]).positions);
-    assert_eq!(positions[..12], rest_positions[..12], "expected the other strip not to move");
+    assert_eq!(positions[..DOMAIN_NUMBERS], rest_positions[..DOMAIN_NUMBERS], "expected the other strip not to move");
     // The first vertex of the leaf is the origin of the leaf's frame, which is at (0.5, 1, -0.25) in the branch's
     // frame. The leaflet applies the same frame again within the leaf's frame.
     let rotate = |[x, y, z]: [f32; 3]| [2.0 - y, x, z - 3.0];
-    let first_vertex = |domain: usize| [positions[12 * domain], positions[12 * domain + 1], positions[12 * domain + 2]];
+    let positions_of = |domain: usize| &positions[DOMAIN_NUMBERS * domain..][..DOMAIN_NUMBERS];
+    let first_vertex = |domain: usize| [positions_of(domain)[0], positions_of(domain)[1], positions_of(domain)[2]];
     assert_eq!(first_vertex(LEAF as usize), rotate([0.5, 1.0, -0.25]));
     assert_eq!(first_vertex(LEAFLET as usize), rotate([-0.5, 1.5, -0.5]));
     assert!(
-        (1..4).all(|domain| positions[12 * domain..][..12] != rest_positions[12 * domain..][..12]),
+        (1..4).all(|domain| *positions_of(domain) != rest_positions[DOMAIN_NUMBERS * domain..][..DOMAIN_NUMBERS]),
         "negative control: the branch and its followers move"
     );
     writer.finish().await;
 }
 
-/// A step that contains the transform of a follower is rejected as a whole. Without a list of domains, a step has one
-/// transform per transform root, which excludes followers.
+/// A step that contains the transform of a follower is rejected as a whole. A step without a list of domains has one
+/// transform per transform root, and none for followers.
 #[tokio::test(flavor = "multi_thread")]
 async fn step_with_transform_of_a_follower_is_rejected() {
     let server = Server::start_default().await;
     server.open("twig").await;
-    let mut writer = server.drive("twig", v1::Policy::Lossless, 0).await;
+    let mut writer = server.drive_lossless("twig").await;
     // The transform roots are the two strips.
     let root_step = transform_step(0, &[], &[TRANSLATION, ROTATION]);
     writer.send_step_and_wait(root_step.clone()).await;
     let positions = get_vertices(&server, vertex_request(&[])).await.expect("expected vertices").positions;
     assert_eq!(positions, reference_vertices(&twig(), &[root_step]).positions);
+    // The coordinates of domain 0 are valid, but they must not be applied either.
     let invalid_step = v1::Step {
         q_domains: vec![0],
         q: vec![1; 8].into(),
@@ -77,13 +84,14 @@ async fn step_with_transform_of_a_follower_is_rejected() {
     );
     writer.finish().await;
     // A follower has its own coordinates: the step deforms only the leaf.
-    let mut writer = server.drive("twig", v1::Policy::Lossless, 0).await;
+    let mut writer = server.drive_lossless("twig").await;
     writer.send_step_and_wait(step(2, &[LEAF], &[0.5, -0.25])).await;
     let deformed_positions = get_vertices(&server, vertex_request(&[])).await.expect("expected vertices").positions;
+    let leaf = DOMAIN_NUMBERS * LEAF as usize..DOMAIN_NUMBERS * LEAFLET as usize;
     assert!(
-        deformed_positions[..24] == positions[..24]
-            && deformed_positions[24..36] != positions[24..36]
-            && deformed_positions[36..] == positions[36..]
+        deformed_positions[..leaf.start] == positions[..leaf.start]
+            && deformed_positions[leaf.clone()] != positions[leaf.clone()]
+            && deformed_positions[leaf.end..] == positions[leaf.end..]
     );
     writer.finish().await;
 }

@@ -1,5 +1,5 @@
-//! Frames over the wire: step, size, bytes and deadlines of single frames and of streams. Needs an EGL driver that can
-//! render.
+//! Frames over the wire, as single frames and as streams: step, size, format, pixels and deadlines. These tests need an
+//! EGL driver that can render.
 
 use modalcast::config::{Config, RendererChoice};
 use modalcast_proto::v1;
@@ -7,7 +7,7 @@ use prost::Message as _;
 use tonic::{Code, Status, Streaming};
 use v1::render_frame_request::Step as RequestedStep;
 
-use crate::service_harness::{Server, rejection_details, step, with_timeout};
+use crate::service_harness::{MAX_MESSAGE_BYTES, Server, rejection_details, step, with_timeout};
 
 async fn start_server() -> Server {
     let server = Server::start_with(|config| Config { renderer: RendererChoice::Auto, ..config }).await;
@@ -24,6 +24,7 @@ fn rgba_request() -> v1::RenderFrameRequest {
     v1::RenderFrameRequest { scene: "strips".into(), picture, ..v1::RenderFrameRequest::default() }
 }
 
+/// A frame joined from its chunks.
 struct Frame {
     head: v1::FrameHead,
     bytes: Vec<u8>,
@@ -34,7 +35,7 @@ async fn render(server: &Server, request: v1::RenderFrameRequest) -> Result<Fram
     let mut head = None;
     let mut bytes = Vec::new();
     while let Some(response) = with_timeout(stream.message()).await? {
-        assert!(response.encoded_len() <= (1 << 20) + 4096);
+        assert!(response.encoded_len() <= MAX_MESSAGE_BYTES);
         let chunk = response.chunk.expect("expected a chunk");
         assert_eq!(chunk.offset, bytes.len() as u64);
         head = head.or(chunk.head);
@@ -45,6 +46,7 @@ async fn render(server: &Server, request: v1::RenderFrameRequest) -> Result<Fram
     Ok(Frame { head, bytes })
 }
 
+/// Reads the chunks of the next frame and returns its head; `None` at the end of the stream.
 async fn next_head(stream: &mut Streaming<v1::StreamFramesResponse>) -> Option<v1::FrameHead> {
     let mut head: Option<v1::FrameHead> = None;
     let mut received_bytes = 0;
@@ -62,7 +64,8 @@ async fn next_head(stream: &mut Streaming<v1::StreamFramesResponse>) -> Option<v
 #[tokio::test(flavor = "multi_thread")]
 async fn frame_names_its_step_and_png_equals_rgba() {
     let server = start_server().await;
-    let mut writer = server.drive("strips", v1::Policy::Lossless, 0).await;
+    let mut writer = server.drive_lossless("strips").await;
+    // Run 0 is the time before the first step.
     let rest_frame = render(&server, rgba_request()).await.expect("expected a frame at rest");
     assert_eq!(rest_frame.head.step.map(|step| step.run), Some(0));
     writer.send_step_and_wait(step(5, &[], &[0.9, 0.3, -0.9, 0.2])).await;
@@ -97,20 +100,22 @@ async fn large_frame_is_chunked_for_default_client_limits() {
     assert_eq!((frame.head.width, frame.head.height, frame.head.format()), (1280, 720, v1::Format::Png));
 }
 
-/// A lossless stream delivers every step and ends after the requested number. The steps of a latest stream increase, and
-/// it counts the steps that it skips.
+/// A stream with `lossless` delivery has a frame of every step and ends after the requested number of frames. A stream
+/// with `latest` delivery has frames of increasing steps, and each frame has the number of skipped steps.
 #[tokio::test(flavor = "multi_thread")]
-async fn lossless_frames_are_complete_and_latest_ones_monotonic() {
+async fn lossless_frames_are_complete_and_latest_frames_increase() {
     let server = start_server().await;
-    let subscribe = |delivery: v1::Delivery, frames| v1::StreamFramesRequest {
+    let stream_request = |delivery: v1::Delivery, frames| v1::StreamFramesRequest {
         scene: "strips".into(),
         picture: picture_of_size(32, 32, v1::Format::Png),
         delivery: delivery.into(),
         frames,
     };
     let mut client = server.frames().await;
-    let lossless = client.stream_frames(subscribe(v1::Delivery::Lossless, 12)).await.expect("expected a subscription");
-    let latest = client.stream_frames(subscribe(v1::Delivery::Latest, 0)).await.expect("expected a subscription");
+    // 0 frames mean an endless stream.
+    let lossless =
+        client.stream_frames(stream_request(v1::Delivery::Lossless, 12)).await.expect("expected a subscription");
+    let latest = client.stream_frames(stream_request(v1::Delivery::Latest, 0)).await.expect("expected a subscription");
     let (mut lossless, mut latest) = (lossless.into_inner(), latest.into_inner());
     let mut writer = server.drive("strips", v1::Policy::Lossless, 3).await;
     let send_steps = async {
@@ -130,7 +135,7 @@ async fn lossless_frames_are_complete_and_latest_ones_monotonic() {
         let mut counted_steps = 0;
         while last_number < 12 {
             let head = next_head(&mut latest).await.expect("expected a frame");
-            let number = head.step.expect("expected a valid step").number;
+            let number = head.step.expect("expected a step in the head").number;
             assert!(number > last_number);
             counted_steps += 1 + head.skipped;
             assert_eq!(counted_steps, number, "expected each step to be received or counted as skipped");
@@ -149,11 +154,15 @@ async fn invalid_pictures_are_rejected_and_deadlines_hold() {
     };
     let camera_with_lens = |lens| v1::Camera { lens: Some(lens), ..v1::Camera::default() };
     let y_axis = || vec![0.0, 1.0, 0.0];
+    let two_numbers = vec![0.0; 2];
+    let nan_eye = vec![f64::NAN, 0.0, 1.0];
+    let eye_at_target = vec![0.0; 3];
+    let eye_along_up = vec![0.0, 2.0, 0.0];
     let cameras: Vec<(v1::Camera, &str)> = vec![
-        (camera_at(vec![0.0; 2], y_axis()), "picture: camera.look_at.eye"),
-        (camera_at(vec![f64::NAN, 0.0, 1.0], y_axis()), "picture: camera.look_at"),
-        (camera_at(vec![0.0; 3], y_axis()), "picture: camera.look_at"),
-        (camera_at(vec![0.0, 2.0, 0.0], y_axis()), "picture: camera.look_at"),
+        (camera_at(two_numbers, y_axis()), "picture: camera.look_at.eye"),
+        (camera_at(nan_eye, y_axis()), "picture: camera.look_at"),
+        (camera_at(eye_at_target, y_axis()), "picture: camera.look_at"),
+        (camera_at(eye_along_up, y_axis()), "picture: camera.look_at"),
         (camera_with_lens(v1::camera::Lens::FieldOfView(180.0)), "picture: camera.field_of_view"),
         (camera_with_lens(v1::camera::Lens::Intrinsics(v1::Intrinsics::default())), "picture: camera.intrinsics"),
         (v1::Camera { near: 2.0, far: 1.0, ..v1::Camera::default() }, "picture: camera.near/far"),
@@ -180,15 +189,19 @@ async fn invalid_pictures_are_rejected_and_deadlines_hold() {
         assert_eq!((status.code(), rejection_details(&status).field.as_str()), (Code::InvalidArgument, "picture.size"));
         assert_eq!(rejection_details(&status).given, format!("{width} x {height}"));
     }
-    let late_request =
+    // The next requests wait for a step that is never sent. One has a deadline in the message, the other in a header.
+    let unanswered_request =
         v1::RenderFrameRequest { step: Some(RequestedStep::MinimumStep(1)), deadline_ms: 60, ..rgba_request() };
-    assert_eq!(render(&server, late_request).await.err().map(|status| status.code()), Some(Code::DeadlineExceeded));
-    let mut short_deadline =
+    assert_eq!(
+        render(&server, unanswered_request).await.err().map(|status| status.code()),
+        Some(Code::DeadlineExceeded)
+    );
+    let mut request_with_header =
         tonic::Request::new(v1::RenderFrameRequest { step: Some(RequestedStep::MinimumStep(1)), ..rgba_request() });
     // In this header, "m" means milliseconds.
-    short_deadline.metadata_mut().insert("grpc-timeout", "60m".parse().expect("expected a header value"));
+    request_with_header.metadata_mut().insert("grpc-timeout", "60m".parse().expect("expected a header value"));
     let result = async {
-        let mut stream = server.frames().await.render_frame(short_deadline).await?.into_inner();
+        let mut stream = server.frames().await.render_frame(request_with_header).await?.into_inner();
         stream.message().await
     };
     assert_eq!(with_timeout(result).await.err().map(|status| status.code()), Some(Code::DeadlineExceeded));

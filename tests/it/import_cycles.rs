@@ -1,5 +1,5 @@
-//! Test that the files of each crate import each other without cycles. A module and its submodules may use each other,
-//! because the parent's documentation describes them together.
+//! The files of each crate import each other without cycles. A module and its submodules may use each other, because
+//! the documentation of the module describes them together.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -23,9 +23,10 @@ const CRATE_ROOTS: [&str; 9] = [
 /// A path of module names below the crate root; empty for the root itself.
 type ModulePath = Vec<String>;
 
-/// The imports of one module, each as a path from the crate root.
+/// The imports of one module.
 #[derive(Debug, Default)]
 struct Module {
+    /// Paths of the imported items from the crate root.
     imports: BTreeSet<ModulePath>,
     /// Names that the module re-exports, and the paths of their definitions.
     reexports: BTreeMap<String, ModulePath>,
@@ -54,6 +55,8 @@ impl ImportCollector<'_> {
         Some(base.into_iter().chain(names.cloned()).collect())
     }
 
+    /// Adds the imports of a `use` tree. `prefix` is the path before the tree, and `is_public` tells whether the `use`
+    /// is a re-export.
     fn add_use_tree(&mut self, tree: &syn::UseTree, prefix: &[String], is_public: bool) {
         let extended_path = |name: &syn::Ident| [prefix, &[name.to_string()]].concat();
         let (path, name) = match tree {
@@ -91,7 +94,10 @@ impl<'ast> Visit<'ast> for ImportCollector<'_> {
 
     fn visit_path(&mut self, path: &'ast syn::Path) {
         let segments: Vec<String> = path.segments.iter().map(|segment| segment.ident.to_string()).collect();
-        self.result.imports.extend(self.absolute_path(&segments).filter(|_| segments.len() > 1));
+        // A path of one segment, such as `self`, names no other module.
+        if segments.len() > 1 {
+            self.result.imports.extend(self.absolute_path(&segments));
+        }
         syn::visit::visit_path(self, path);
     }
 
@@ -107,7 +113,7 @@ impl<'ast> Visit<'ast> for ImportCollector<'_> {
         }
     }
 
-    /// Submodules are separate modules.
+    /// [`add_modules`] visits the items of submodules.
     fn visit_item_mod(&mut self, _: &'ast syn::ItemMod) {}
 }
 
@@ -130,7 +136,8 @@ fn file_of_submodule(file: &Path, item: &syn::ItemMod) -> Option<PathBuf> {
     candidates.into_iter().find(|path| path.exists())
 }
 
-/// Adds a module and its submodules to `modules`, except those for tests.
+/// Adds a module and its submodules to `modules`, except submodules for tests. `items` are the items of the module, and
+/// `file` is the file that contains them.
 fn add_modules(modules: &mut CrateModules, module: ModulePath, (file, items): (&Path, &[syn::Item])) {
     let mut collector = ImportCollector { module: &module, result: Module::default() };
     items.iter().for_each(|item| collector.visit_item(item));
@@ -157,10 +164,11 @@ fn parse(file: &Path) -> Vec<syn::Item> {
     syn::parse_file(&text).unwrap_or_else(|error| panic!("{}: {error}", file.display())).items
 }
 
-/// The module that defines the item at `path`: the longest prefix that is a module, after following re-exports.
+/// The module that defines the item at `path`. It is the longest prefix of `path` that is a module, unless that module
+/// re-exports the next name of `path`; then the search continues at the definition of that name.
 fn defining_module(modules: &CrateModules, path: &[String]) -> ModulePath {
     let mut path = path.to_vec();
-    // A chain of re-exports is never longer than the depth of the module tree.
+    // Longer chains of re-exports do not occur.
     for _ in 0..8 {
         let length = (0..=path.len()).rev().find(|length| modules.contains_key(&path[..*length])).unwrap_or_default();
         let (module, remaining_names) = path.split_at(length);
@@ -170,10 +178,10 @@ fn defining_module(modules: &CrateModules, path: &[String]) -> ModulePath {
             None => return module.to_vec(),
         }
     }
-    panic!("a cycle of re-exports at {path:?}");
+    panic!("expected at most 8 re-exports of an item, got more at {path:?}");
 }
 
-/// The imports of each module, without those of its ancestors and descendants.
+/// The modules that each module imports, except its ancestors and descendants.
 fn imports_between_branches(modules: &CrateModules) -> BTreeMap<&ModulePath, BTreeSet<ModulePath>> {
     let targets_of = |path: &ModulePath, module: &Module| -> BTreeSet<ModulePath> {
         let targets = module.imports.iter().map(|import| defining_module(modules, import));
@@ -223,7 +231,7 @@ fn files_of_each_crate_form_no_import_cycle() {
     assert!(cycles_by_crate.is_empty(), "{cycles_by_crate:#?}");
 }
 
-/// Modules of a crate, from module paths and source texts.
+/// Modules of a crate from pairs of a module path and a source text.
 fn parse_crate_modules(texts: &[(&str, &str)]) -> CrateModules {
     let module = |(path, text): &(&str, &str)| {
         let path: ModulePath = path.split("::").filter(|name| !name.is_empty()).map(str::to_owned).collect();

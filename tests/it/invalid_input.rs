@@ -11,15 +11,18 @@ use v1::drive_scene_response::Kind as ResponseKind;
 use v1::upload_scene_request::Part;
 
 use crate::service_harness::{
-    Server, StepWriter, get_vertices, reference_vertices, rejection_details, rigid_step, step, strips, with_timeout,
+    DEFAULT_WINDOW, Server, StepWriter, get_vertices, reference_vertices, rejection_details, rigid_step, step, strips,
+    with_timeout,
 };
 
-/// An invalid step: the name of the case, the step, and the prefixes of field, expected and given.
+/// The name of a case, an invalid step, and the prefixes of the fields `field`, `expected` and `given` of its
+/// rejection.
 type InvalidStep = (&'static str, v1::Step, [&'static str; 3]);
 
 /// The identity rotation as a quaternion x y z w.
 const IDENTITY_QUATERNION: [f32; 4] = [0.0, 0.0, 0.0, 1.0];
 
+/// Invalid steps of the scene `strips`, whose two domains have two modes each. The last valid step has the number 10.
 fn invalid_steps() -> Vec<InvalidStep> {
     let transforms = |domains: &[u32], numbers: &[f32]| v1::Step {
         transform_domains: domains.to_vec(),
@@ -154,15 +157,16 @@ async fn stream_stays_open_after_invalid_steps() {
     server.open("strips").await;
     let request = v1::OpenSceneRequest { source: "strips".into(), scene: "other".into() };
     server.scenes().await.open_scene(request).await.expect("expected the scene to open");
-    let mut other_writer = server.drive("other", Policy::Lossless, 0).await;
-    let mut writer = server.drive("strips", Policy::Lossless, 0).await;
+    let mut other_writer = server.drive_lossless("other").await;
+    let mut writer = server.drive_lossless("strips").await;
     let valid_step = step(10, &[], &[0.1, 0.2, 0.3, 0.4]);
     writer.send_step_and_wait(valid_step.clone()).await;
     let expected_vertices = reference_vertices(&strips(), &[valid_step]);
     let request = v1::GetVerticesRequest { scene: "strips".into(), ..v1::GetVerticesRequest::default() };
-    // A step rejected for overflow still consumes its number, so each case needs a higher one.
+    // A step that is rejected because of overflow consumes its number, so the numbers increase from case to case.
     for (index, (name, mut invalid_step, prefixes)) in invalid_steps().into_iter().chain(invalid_formats()).enumerate()
     {
+        // Two cases have a number that is too low. They keep it.
         let is_decreasing = invalid_step.number < 11;
         invalid_step.number += if is_decreasing { 0 } else { index as u64 };
         let number = invalid_step.number;
@@ -180,6 +184,7 @@ async fn stream_stays_open_after_invalid_steps() {
         assert_eq!((reply.head.origin.as_slice(), reply.origins.len()), ([0.0; 3].as_slice(), 0), "{name}");
         other_writer.send_step_and_wait(step(index as u64, &[0], &[0.5, 0.5])).await;
     }
+    // 1000 is above the numbers of all cases.
     writer.send_step_and_wait(step(1000, &[0], &[0.0, 0.0])).await;
 }
 
@@ -190,36 +195,36 @@ async fn stream_opens_after_rejected_openings() {
     let mut writer = StepWriter::connect(server.channel().await).await;
     writer.send_step(step(1, &[], &[])).await;
     assert!(has_prefixes(&writer.receive_rejection().await, ["kind", "open before the first step", "a step"]));
-    let ResponseKind::Rejection(unknown_scene) = writer.open("nowhere", Policy::Lossless, 0).await else {
+    let ResponseKind::Rejection(unknown_scene) = writer.open("nowhere", Policy::Lossless, DEFAULT_WINDOW).await else {
         panic!("expected a rejection of an unknown scene")
     };
     assert!(has_prefixes(&unknown_scene, ["scene", "an existing scene", "'nowhere'"]), "{unknown_scene:?}");
-    let open = v1::OpenDrive { scene: "strips".into(), policy: 77, window: 0 };
+    let open = v1::OpenDrive { scene: "strips".into(), policy: 77, window: DEFAULT_WINDOW };
     writer.send(RequestKind::Open(open)).await;
     assert!(has_prefixes(&writer.receive_rejection().await, ["open.policy", "a policy of this version", "77"]));
-    assert!(matches!(writer.open("strips", Policy::Lossless, 0).await, ResponseKind::Opened(_)));
-    let ResponseKind::Rejection(second_open) = writer.open("strips", Policy::Lossless, 0).await else {
+    assert!(matches!(writer.open("strips", Policy::Lossless, DEFAULT_WINDOW).await, ResponseKind::Opened(_)));
+    let ResponseKind::Rejection(second_open) = writer.open("strips", Policy::Lossless, DEFAULT_WINDOW).await else {
         panic!("expected a rejection of a second open message")
     };
     assert!(has_prefixes(&second_open, ["open", "one open per stream", "a second open"]), "{second_open:?}");
     writer.send_step_and_wait(step(0, &[0], &[0.0, 0.0])).await;
 }
 
-/// The scene keeps its last valid step, and the other stream on the same connection continues.
+/// An oversized message does not affect the last valid step of its scene, or another stream on the same connection.
 #[tokio::test(flavor = "multi_thread")]
 async fn oversized_message_ends_only_its_own_stream() {
-    let server = Server::start_with(|config| modalcast::config::Config { message_bytes: 64 << 10, ..config }).await;
+    let server = Server::start_with(|config| modalcast::config::Config { message_bytes: 65536, ..config }).await;
     server.open("strips").await;
-    // Both streams share one connection.
     let channel = server.channel().await;
     let request = v1::OpenSceneRequest { source: "strips".into(), scene: "other".into() };
     server.scenes().await.open_scene(request).await.expect("expected the scene to open");
     let mut other_writer = StepWriter::connect(channel.clone()).await;
-    assert!(matches!(other_writer.open("other", Policy::Lossless, 0).await, ResponseKind::Opened(_)));
+    assert!(matches!(other_writer.open("other", Policy::Lossless, DEFAULT_WINDOW).await, ResponseKind::Opened(_)));
     let mut writer = StepWriter::connect(channel).await;
-    assert!(matches!(writer.open("strips", Policy::Lossless, 0).await, ResponseKind::Opened(_)));
+    assert!(matches!(writer.open("strips", Policy::Lossless, DEFAULT_WINDOW).await, ResponseKind::Opened(_)));
     let valid_step = step(1, &[0], &[0.5, 0.25]);
     writer.send_step_and_wait(valid_step.clone()).await;
+    // 80,000 bytes of coordinates.
     writer.send_step(step(2, &[0], &vec![0.0; 20_000])).await;
     let status = with_timeout(writer.replies.message()).await.expect_err("expected the stream to end with an error");
     assert_eq!(status.code(), Code::ResourceExhausted);
@@ -228,7 +233,7 @@ async fn oversized_message_ends_only_its_own_stream() {
     let reply = get_vertices(&server, request).await.expect("expected vertices");
     assert_eq!((reply.step().number, reply.positions), (1, reference_vertices(&strips(), &[valid_step]).positions));
     other_writer.send_step_and_wait(step(1, &[0], &[0.5, 0.5])).await;
-    let mut second_writer = server.drive("strips", Policy::Lossless, 0).await;
+    let mut second_writer = server.drive_lossless("strips").await;
     second_writer.send_step_and_wait(step(0, &[0], &[0.0, 0.0])).await;
 }
 
@@ -237,6 +242,7 @@ async fn invalid_requests_return_code_and_details() {
     let server = Server::start_default().await;
     server.open("strips").await;
     let mut scenes = server.scenes().await;
+    // Status, expected code, and prefixes of `field`, `expected` and `given`.
     let mut rejected_calls = Vec::new();
     let selection = Some(v1::VertexSelection { domains: vec![0, 5], ..Default::default() });
     let request = v1::GetVerticesRequest { scene: "strips".into(), selection, ..v1::GetVerticesRequest::default() };
@@ -281,13 +287,14 @@ async fn invalid_requests_return_code_and_details() {
             rejection_details(&status)
         );
     }
+    // A panic in the loader is an error of its call only.
     let request = v1::OpenSceneRequest { source: "panic".into(), scene: String::new() };
     let status = scenes.open_scene(request).await.expect_err("expected an internal error");
     assert_eq!(status.code(), Code::Internal);
     server.open("strips").await;
 }
 
-/// The messages of a valid upload of one file, `scene.txt`.
+/// The messages of a valid upload of one file, `scene.txt`, which names the source to open.
 fn upload_parts(contents: &[u8]) -> Vec<Part> {
     let header =
         v1::UploadHeader { scene: "up".into(), entry: String::new(), files: 1, total_bytes: contents.len() as u64 };
@@ -302,6 +309,7 @@ async fn upload(server: &Server, parts: Vec<Part>) -> Result<v1::UploadSceneResp
     response.map(tonic::Response::into_inner)
 }
 
+/// The upload of a file that names `strips`, with a modified header or file message.
 fn modified_upload(modify: impl FnOnce(&mut v1::UploadHeader, &mut v1::UploadFile)) -> Vec<Part> {
     let mut parts = upload_parts(b"strips");
     if let [Part::Header(header), Part::File(file), _] = parts.as_mut_slice() {
@@ -319,22 +327,26 @@ async fn invalid_uploads_are_rejected_and_leave_no_files() {
         ("empty stream", vec![], ["part", "a header as the first part", "nothing"]),
         ("no header", upload_parts(b"strips").split_off(1), ["part", "a header as the first part", "a file or chunk"]),
         (
-            "other hash",
+            "wrong hash",
             modified_upload(|_, file| file.sha256 = vec![7; 32].into()),
             ["file.sha256 of 'scene.txt'", "0707", ""],
         ),
-        ("no hash", modified_upload(|_, file| file.sha256 = vec![7; 3].into()), ["file.sha256", "32 bytes", "3 bytes"]),
+        (
+            "hash of 3 bytes",
+            modified_upload(|_, file| file.sha256 = vec![7; 3].into()),
+            ["file.sha256", "32 bytes", "3 bytes"],
+        ),
         ("path outside of the folder", path("../scene.txt"), ["file.path", "a relative path", "\"../scene.txt\""]),
-        ("absolute", path("/etc/scene.txt"), ["file.path", "a relative path", "\"/etc/scene.txt\""]),
-        ("backslashes", path("..\\scene.txt"), ["file.path", "a relative path", ""]),
-        ("truncated", upload_parts(b"strips")[..2].to_vec(), ["file.bytes of 'scene.txt'", "6 bytes", "0 bytes"]),
+        ("absolute path", path("/etc/scene.txt"), ["file.path", "a relative path", "\"/etc/scene.txt\""]),
+        ("backslash in the path", path("..\\scene.txt"), ["file.path", "a relative path", ""]),
+        ("no contents", upload_parts(b"strips")[..2].to_vec(), ["file.bytes of 'scene.txt'", "6 bytes", "0 bytes"]),
         (
             "too few bytes announced",
             modified_upload(|header, _| header.total_bytes = 5),
             ["header.total_bytes", "5", "6"],
         ),
         (
-            "more than the limit",
+            "more bytes than the limit",
             modified_upload(|header, _| header.total_bytes = 1001),
             ["header.total_bytes", "at most 1000", "1001"],
         ),

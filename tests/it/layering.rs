@@ -17,7 +17,8 @@ fn read_usage_table() -> UsageTable {
     parse_usage_table(&fs::read_to_string(repository_root().join("src/lib.rs")).expect("expected src/lib.rs"))
 }
 
-/// Parses the tables in the documentation of `src/lib.rs`.
+/// Parses the tables in the documentation of `src/lib.rs`. Their columns are the name, the contents and the names that
+/// may be used.
 fn parse_usage_table(page: &str) -> UsageTable {
     let names = |cell: &str| -> BTreeSet<String> { cell.split('`').skip(1).step_by(2).map(str::to_owned).collect() };
     let row = |line: &str| {
@@ -116,8 +117,8 @@ fn find_forbidden_uses((package, module): (&str, &str), text: &str, usage_table:
     messages
 }
 
-/// The part of a file to which the table applies. Tests of the renderer may use every module of it: this excludes test
-/// files, and the test module at the end of a file.
+/// The part of a file to which the table applies. Tests of the renderer may use all of its modules, so their files and
+/// the test module at the end of a file are excluded.
 fn governed_text<'a>(package: &str, path: &Path, text: &'a str) -> &'a str {
     let is_test_file = path.file_stem().is_some_and(|stem| stem.to_string_lossy().ends_with("tests"));
     match package {
@@ -139,8 +140,8 @@ fn modules_use_only_what_their_row_names() {
     }
 }
 
-/// Lists the forbidden uses of other tiers of the same module in a text of one tier. They have the form
-/// `crate::module::tier` or `super::tier`.
+/// Lists the uses of a forbidden tier in a source text. `row` is the tier of the text, such as
+/// `modalcast-compute::gpu::tables`. A use of another tier has the form `crate::gpu::launch` or `super::launch`.
 fn find_forbidden_tier_uses(row: &str, text: &str, usage_table: &UsageTable) -> Vec<String> {
     let (parent, tier) = row.rsplit_once("::").expect("expected a row of a tier");
     let module = parent.rsplit("::").next().unwrap_or_default();
@@ -207,7 +208,7 @@ fn module_dependencies_have_no_cycle() {
     }
 }
 
-/// Cargo then enforces the order of the crates.
+/// Cargo permits only the dependencies of the manifest, so the crates have the order of the table.
 #[test]
 fn manifests_depend_on_lower_tiers_only() {
     let usage_table = read_usage_table();
@@ -221,6 +222,7 @@ fn manifests_depend_on_lower_tiers_only() {
             .filter_map(|line| line.split(['.', ' ', '=']).next().filter(|name| name.starts_with("modalcast")))
             .map(str::to_owned)
             .collect();
+        // The name in a row of the crate table is followed by the folder, as in "`modalcast-render` (`src/render`)".
         let row = usage_table.iter().find(|(row, _)| row.starts_with(&format!("{package}` (")) || *row == package);
         assert_eq!(Some(&dependencies), row.map(|(_, used_modules)| used_modules), "{package}");
     }
@@ -260,6 +262,7 @@ const METHOD_TWINS: [(&str, Twin); 3] = [
     ("raster", Twin { file: "src/compute/reference/raster.rs", type_name: "VisibilityBuffer", method: "draw" }),
 ];
 
+/// A method that computes the same result as a kernel on the CPU.
 #[derive(Clone, Copy)]
 struct Twin {
     file: &'static str,
@@ -268,8 +271,8 @@ struct Twin {
 }
 
 impl Twin {
-    /// Whether the file's text defines the method in an `impl` block of the type, and the kernel's `CPU twin:` comment
-    /// names it.
+    /// Whether the text of a source file defines the method in an `impl` block of the type, and the text of a kernel
+    /// names the method in its comment `CPU twin:`.
     fn is_defined_and_named(&self, file: &str, kernel: &str) -> bool {
         let impl_block =
             file.split(&format!("\nimpl {} {{", self.type_name)).nth(1).and_then(|rest| rest.split("\n}\n").next());
@@ -329,7 +332,7 @@ fn every_kernel_has_a_launcher_and_a_twin() {
 }
 
 #[test]
-fn unsafe_code_stays_in_gpu_and_render() {
+fn only_gpu_and_render_have_unsafe_code() {
     for path in list_files(&repository_root().join("src"), &["rs"]) {
         let relative_path = path
             .strip_prefix(repository_root())
@@ -344,7 +347,7 @@ fn unsafe_code_stays_in_gpu_and_render() {
     }
 }
 
-/// Each minimum is the lowest version without a known fault.
+/// The minimum versions are the lowest versions without known security faults.
 #[test]
 fn locked_versions_have_no_known_faults() {
     let lock_file = fs::read_to_string(repository_root().join("Cargo.lock")).expect("expected a lock file");

@@ -1,4 +1,5 @@
-//! Picks and AOV frames (depth, domains, normals, value maps) over the wire. Needs an EGL driver that can render.
+//! Picks, and frames of other outputs than color: depth, domain indices, normals and color maps of values. These tests
+//! need an EGL driver that can render.
 
 use modalcast::config::{Config, RendererChoice};
 use modalcast_client::{
@@ -11,8 +12,12 @@ use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
 
 use crate::service_harness::{Server, far_strips, rigid_step, sheet, state_after_steps, step, strips};
 
-/// Maximum distance of a picked position from the reference, in scene units. The f32 vertices are a few units large.
+/// Maximum distance of a picked position from the reference, in scene units. Coordinates are a few units large, where
+/// numbers in f32 are 5e-7 apart.
 const TOLERANCE: f64 = 2e-6;
+
+/// The identity rotation as a quaternion x y z w.
+const IDENTITY_QUATERNION: [f32; 4] = [0.0, 0.0, 0.0, 1.0];
 
 async fn start_server(source: &str) -> (Server, Client) {
     let server = Server::start_with(|config| Config { renderer: RendererChoice::Auto, ..config }).await;
@@ -29,7 +34,7 @@ fn picture() -> Picture {
     Picture { width: 96, height: 80, camera, ..Picture::default() }
 }
 
-/// Whether the position of a hit lies on the ray of its pixel in that picture.
+/// Whether the position of a hit lies on the ray of its pixel. The constants are those of [`picture`].
 fn is_on_ray(hit: &Hit) -> bool {
     let [x, y] = hit.pixel.map(f64::from);
     let ray = Vector3::new((x + 0.5 - 48.0) / 160.0, (40.0 - y - 0.5) / 160.0, -1.0);
@@ -37,14 +42,15 @@ fn is_on_ray(hit: &Hit) -> bool {
     (point - ray * (ray.dot(&point) / ray.norm_squared())).norm() < TOLERANCE
 }
 
-/// U of a domain, 3n x r, from the scene itself.
+/// The complete U of a domain, with 3 rows per vertex and one column per mode.
 fn mode_matrix(scene: &Scene, domain: u32) -> DMatrix<f64> {
     let shape = &scene.shapes[scene.domains[domain as usize].shape];
     let (rows, rank) = (3 * shape.mesh.rest_positions().len(), shape.modes.rank());
     DMatrix::from_iterator(rows, rank, shape.modes.columns().iter().map(|entry| f64::from(*entry)))
 }
 
-/// U^T A^T f with the complete U: distributes f to the vertices of the triangle by the barycentric coordinates.
+/// Reduced force U^T A^T f of a force f at a hit, with the complete U and the linear part A of the transform. The
+/// barycentric coordinates distribute f to the vertices of the triangle.
 fn project_force(scene: &Scene, hit: &Hit, linear: Matrix3<f64>, force: Vector3<f64>) -> DVector<f64> {
     let mode_matrix = mode_matrix(scene, hit.domain);
     let mut vertex_forces = DVector::zeros(mode_matrix.nrows());
@@ -55,6 +61,7 @@ fn project_force(scene: &Scene, hit: &Hit, linear: Matrix3<f64>, force: Vector3<
     mode_matrix.transpose() * vertex_forces
 }
 
+/// Position of a hit's barycentric coordinates on the f64 reference after some steps.
 fn reference_position(scene: &Scene, steps: &[v1::Step], hit: &Hit) -> Vector3<f64> {
     let positions = reference::deform(scene, &state_after_steps(scene, steps));
     let first_vertex = scene.layout.domains[hit.domain as usize].first_vertex;
@@ -66,15 +73,12 @@ fn reference_position(scene: &Scene, steps: &[v1::Step], hit: &Hit) -> Vector3<f
 async fn reduced_force_of_a_hit_matches_the_complete_modes() {
     let (server, client) = start_server("strips").await;
     let scene = strips();
-    let mut writer = server.drive("strips", v1::Policy::Lossless, 0).await;
-    let sin_45_degrees = std::f32::consts::FRAC_1_SQRT_2;
+    let mut writer = server.drive_lossless("strips").await;
+    // Rotation by 90 degrees about z.
+    let rotation = [0.0, 0.0, std::f32::consts::FRAC_1_SQRT_2, std::f32::consts::FRAC_1_SQRT_2];
     let steps = [
         step(1, &[0, 1], &[0.2, -0.1, 0.15, 0.3]),
-        rigid_step(
-            2,
-            v1::TransformFormat::RigidF32,
-            &[(1, [0.0, 0.0, sin_45_degrees, sin_45_degrees], [1.0, 0.25, -0.5])],
-        ),
+        rigid_step(2, v1::TransformFormat::RigidF32, &[(1, rotation, [1.0, 0.25, -0.5])]),
     ];
     let rest_picks = client
         .pick(&PickRequest::new("strips", PickRectangle::pixel(picture(), 44, 37)))
@@ -89,9 +93,9 @@ async fn reduced_force_of_a_hit_matches_the_complete_modes() {
     assert_eq!(picks.step.number, 2);
     let state = state_after_steps(&scene, &steps);
     let force = Vector3::new(0.3, -2.0, 1.1);
-    let mut counts = [0; 2];
+    let mut hits_of_domains = [0; 2];
     for hit in &picks.hits {
-        counts[hit.domain as usize] += 1;
+        hits_of_domains[hit.domain as usize] += 1;
         let linear = state.transforms[hit.domain as usize].linear();
         let expected_force = project_force(&scene, hit, linear, force);
         let reduced_force = DVector::from_vec(hit.reduced_force(force.into()));
@@ -105,7 +109,7 @@ async fn reduced_force_of_a_hit_matches_the_complete_modes() {
             "{hit:?}"
         );
     }
-    assert!(counts.iter().all(|count| *count > 200), "expected hits of both domains, got {counts:?}");
+    assert!(hits_of_domains.iter().all(|hits| *hits > 200), "expected hits of both domains, got {hits_of_domains:?}");
     let rotated_hit = picks.hits.iter().find(|hit| hit.domain == 1).expect("expected a hit of domain 1");
     let unrotated_force = project_force(&scene, rotated_hit, Matrix3::identity(), force);
     let reduced_force = DVector::from_vec(rotated_hit.reduced_force(force.into()));
@@ -120,8 +124,8 @@ async fn reduced_force_of_a_hit_matches_the_complete_modes() {
     );
 }
 
-/// 4096 hits with their modes reach a client with default limits. Picks in a scene far from the world origin keep their
-/// precision.
+/// 4096 hits with their modes reach a client with default message limits. Picks far from the world origin are exact to
+/// 1e-3 scene units.
 #[tokio::test(flavor = "multi_thread")]
 async fn many_hits_are_chunked_and_far_picks_keep_precision() {
     let (_server, client) = start_server("sheet").await;
@@ -134,6 +138,7 @@ async fn many_hits_are_chunked_and_far_picks_keep_precision() {
         .expect("expected a pick");
     assert_eq!(picks.hits.len(), 64 * 64, "expected the sheet to fill the view");
     let scene = sheet();
+    // Every 97th hit, to save time.
     for hit in picks.hits.iter().step_by(97) {
         let expected_force = project_force(&scene, hit, Matrix3::identity(), Vector3::new(1.0, 2.0, -3.0));
         let reduced_force = DVector::from_vec(hit.reduced_force([1.0, 2.0, -3.0]));
@@ -150,11 +155,13 @@ async fn many_hits_are_chunked_and_far_picks_keep_precision() {
 
     let (server, client) = start_server("far").await;
     let scene = far_strips();
-    let poses = [0, 1].map(|domain| (domain, [0.0, 0.0, 0.0, 1.0], [3e7, -2e7 + 0.125, 2e7]));
+    // Poses are in half meters, the unit of the scene, from the world origin.
+    let domain_translation = [3e7, -2e7 + 0.125, 2e7];
+    let poses = [0, 1].map(|domain| (domain, IDENTITY_QUATERNION, domain_translation));
     let far_step = rigid_step(1, v1::TransformFormat::RigidF64, &poses);
-    server.drive("far", v1::Policy::Lossless, 0).await.send_step_and_wait(far_step.clone()).await;
-    // In scene units from the scene origin.
-    let translation: [f64; 3] = std::array::from_fn(|axis| poses[0].2[axis] - scene.origin[axis] / scene.unit);
+    server.drive_lossless("far").await.send_step_and_wait(far_step.clone()).await;
+    // Cameras and picked positions are in scene units from the scene origin.
+    let translation: [f64; 3] = std::array::from_fn(|axis| domain_translation[axis] - scene.origin[axis] / scene.unit);
     let offset_point = |x: f64, y: f64, z: f64| [translation[0] + x, translation[1] + y, translation[2] + z];
     let view =
         View::LookAt { eye: offset_point(0.4, 0.45, 3.0), target: offset_point(0.4, 0.45, 0.0), up: [0.0, 1.0, 0.0] };
@@ -166,14 +173,17 @@ async fn many_hits_are_chunked_and_far_picks_keep_precision() {
         .expect("expected a pick")
         .hits
         .remove(0);
+    // Both domains of the scene have their square at z = 0, so the camera sees its target.
     let distance = (Vector3::from(hit.position) - Vector3::from(offset_point(0.4, 0.45, 0.0))).norm();
     assert!(distance < 1e-3, "expected the target of the camera, got a distance of {distance} units");
+    // The camera is 3 units of half a meter from its target.
     assert!((hit.depth - 1.5).abs() < 1e-3, "expected a depth of 1.5 m, got {}", hit.depth);
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn invalid_rectangles_outputs_and_steps_are_rejected() {
     let (server, client) = start_server("strips").await;
+    // A rectangle has at most 64 x 64 pixels and lies within the picture of 96 x 80 pixels.
     for (corner, size, field) in [
         ([0, 0], [65, 1], "rectangle.size"),
         ([0, 0], [0, 3], "rectangle.size"),
@@ -185,11 +195,12 @@ async fn invalid_rectangles_outputs_and_steps_are_rejected() {
         let error = client.pick(&request).await.expect_err(field);
         assert_eq!(error.rejection().map(|rejection| rejection.field.as_str()), Some(field), "{error}");
     }
-    let corner = client
+    let corner_picks = client
         .pick(&PickRequest::new("strips", PickRectangle::pixel(picture(), 95, 79)))
         .await
         .expect("expected a pick");
-    assert!(corner.hits.is_empty(), "expected no hit");
+    assert!(corner_picks.hits.is_empty(), "expected no hit at the corner pixel of the picture");
+    // Waits for a step that is never sent.
     let unanswered_request =
         PickRequest::new("strips", PickRectangle::pixel(picture(), 0, 0)).minimum_step(1).deadline_ms(60);
     let error = client.pick(&unanswered_request).await.expect_err("expected a timeout");
@@ -225,7 +236,7 @@ async fn invalid_rectangles_outputs_and_steps_are_rejected() {
 #[tokio::test(flavor = "multi_thread")]
 async fn outputs_have_their_format_and_agree_with_picks() {
     let (server, client) = start_server("strips").await;
-    let mut writer = server.drive("strips", v1::Policy::Lossless, 0).await;
+    let mut writer = server.drive_lossless("strips").await;
     writer.send_step_and_wait(step(1, &[0, 1], &[0.2, -0.1, 0.15, 0.3])).await;
     let render = async |output| {
         let request = FrameRequest::new("strips", Picture { output, ..picture() });
@@ -241,23 +252,28 @@ async fn outputs_have_their_format_and_agree_with_picks() {
         .pick(&PickRequest::new("strips", PickRectangle::pixel(picture(), 20, 10).size(64, 64)))
         .await
         .expect("expected a pick");
+    // The word of 4 bytes with an index.
     let read_word =
         |bytes: &[u8], index: usize| <[u8; 4]>::try_from(&bytes[4 * index..][..4]).expect("expected four bytes");
     let mut different_pixels = 0;
     for hit in &picks.hits {
+        // The picture is 96 pixels wide.
         let index = (hit.pixel[1] * 96 + hit.pixel[0]) as usize;
         let is_same_domain = u32::from_le_bytes(read_word(&domains.bytes, index)) == hit.domain;
         let depth_error = (f64::from(f32::from_le_bytes(read_word(&depth.bytes, index))) / hit.depth - 1.0).abs();
         let normal = (0..3).map(|axis| f64::from(f32::from_le_bytes(read_word(&normals.bytes, 3 * index + axis))));
-        let normal_error = normal.zip(hit.normal).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+        let normal_error =
+            normal.zip(hit.normal).map(|(actual, expected)| (actual - expected).abs()).fold(0.0, f64::max);
         different_pixels += usize::from(!(is_same_domain && depth_error < 1e-5 && normal_error < 1e-5));
     }
+    // At an edge, the two passes may draw different triangles.
     assert!(
         picks.hits.len() > 1000 && different_pixels <= 3,
         "{different_pixels} of {} pixels differ",
         picks.hits.len()
     );
     let color = render(Output::Color).await.bytes;
+    // 0 scales the colors to the maximum of the frame.
     let maps = [
         render(Output::Displacement { scale_max: 0.0 }).await,
         render(Output::Displacement { scale_max: 9.0 }).await,
@@ -269,17 +285,17 @@ async fn outputs_have_their_format_and_agree_with_picks() {
             (map.format, image::load_from_memory(&map.bytes).expect("expected a PNG file").width()),
             (FrameFormat::Png, 96)
         );
-        assert!(map.bytes != color && maps[..index].iter().all(|other| other.bytes != map.bytes), "{index}");
+        assert!(map.bytes != color && maps[..index].iter().all(|other| other.bytes != map.bytes), "map {index}");
     }
 }
 
-/// One domain is far from the other. A camera near either domain picks it with full precision.
+/// The domains are 10,000 km apart along x and z. A camera near a domain picks positions that are exact to 1 mm.
 #[tokio::test(flavor = "multi_thread")]
 async fn distant_domains_are_picked_by_nearby_cameras() {
     let (server, client) = start_server("strips").await;
     let translation = [1e7 + 1.25, 0.0, -1e7];
-    let far_step = rigid_step(1, v1::TransformFormat::RigidF64, &[(1, [0.0, 0.0, 0.0, 1.0], translation)]);
-    server.drive("strips", v1::Policy::Lossless, 0).await.send_step_and_wait(far_step).await;
+    let far_step = rigid_step(1, v1::TransformFormat::RigidF64, &[(1, IDENTITY_QUATERNION, translation)]);
+    server.drive_lossless("strips").await.send_step_and_wait(far_step).await;
     for (domain, center) in [(1, translation), (0, [0.0; 3]), (1, translation)] {
         let offset_point = |x: f64, y: f64, z: f64| [center[0] + x, center[1] + y, center[2] + z];
         let view = View::LookAt {

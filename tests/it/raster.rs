@@ -8,24 +8,44 @@ use modalcast_model::scene::{CullMode, DrawRange, Viewport};
 
 use crate::common::soups::{Soup, all_soups, clip_space_viewport, fan_soup, perspective_viewport};
 
-/// Constants of `kernels/raster.cu`; a test compares them with its text.
+// Constants of `kernels/raster.cu`. A test compares them with the text of the kernel.
+
+/// Maximum number of samples in the rectangle of a triangle that one thread draws.
 const MAX_THREAD_SAMPLES: i32 = 32;
+/// Maximum extent of a triangle that one warp draws, in 1/256 pixel.
 const MAX_WARP_EXTENT: i32 = 16384;
+/// Side of a tile in pixels.
 const TILE_SIZE: i32 = 64;
+/// Maximum number of times that a tile is halved into strips.
 const MAX_STRIP_SPLITS: u32 = 3;
+/// Bits of the tile count in [`RasterTraversal::packed_counts`].
 const TILE_COUNT_BITS: u32 = 40;
 
-/// CPU twin of the raster kernels for one window. The per-thread and per-warp paths use 32-bit edge functions.
+/// Coordinate of the center of a pixel column or row, in 1/256 pixel.
+fn sample_coordinate(index: i32) -> i32 {
+    256 * index + 128
+}
+
+/// The top-left rule: whether a triangle covers samples that are exactly on its edge. Corners are clockwise and y
+/// points down, so a left edge goes up and a top edge goes right.
+fn owns_edge(from: &SnappedVertex, to: &SnappedVertex) -> bool {
+    to.y < from.y || (to.y == from.y && to.x > from.x)
+}
+
+/// CPU twin of the raster kernels for one window. A triangle takes one of three paths: one thread draws it, one warp
+/// draws it, or one warp per tile draws it. The first two paths use 32-bit edge functions.
 struct RasterTraversal<'a> {
     soup: &'a Soup,
+    /// Per sample, as in [`VisibilityBuffer::keys`].
     keys: Vec<u64>,
     /// Triangles of the per-warp path, in any order.
     warp_queue: Vec<u32>,
     /// Triangles of the per-tile path, in any order.
     tile_queue: Vec<TileEntry>,
-    /// Length of `tile_queue` in the high bits, and total number of its tiles in the low [`TILE_COUNT_BITS`] bits.
+    /// Length of `tile_queue` in the high bits, and total number of its tiles in the low [`TILE_COUNT_BITS`] bits. The
+    /// kernel updates both with one atomic addition.
     packed_counts: u64,
-    /// Number of triangles on each path.
+    /// Number of triangles on the per-thread, per-warp and per-tile path.
     triangle_counts: [usize; 3],
 }
 
@@ -39,6 +59,7 @@ struct TileEntry {
 }
 
 impl RasterTraversal<'_> {
+    /// Keeps the key with the smaller depth, and for equal depths the key with the lower triangle.
     fn write_sample(&mut self, column: i32, row: i32, depth: f32, triangle: u32) {
         let index = row as usize * self.soup.viewport.size()[0] as usize + column as usize;
         self.keys[index] = self.keys[index].min(u64::from(depth.to_bits()) << 32 | u64::from(triangle));
@@ -90,15 +111,15 @@ impl RasterTraversal<'_> {
             let product = |(a, b): (i32, i32)| a.checked_mul(b).expect("expected a value within 32 bits");
             product(left).checked_sub(product(right)).expect("expected a value within 32 bits")
         };
+        // The polygon is not clipped, so its fan is one triangle.
         let [a, b, c] = fan_triangles(clipped_polygon)[0];
         let area = edge(&a, &b, c.x, c.y);
         let [x0, y0, x1, y1] = clipped_polygon.samples;
         for (row, column) in (y0..=y1).flat_map(|row| (x0..=x1).map(move |column| (row, column))) {
-            let (x, y) = (256 * column + 128, 256 * row + 128);
-            let is_inside = [(&b, &c), (&c, &a), (&a, &b)].iter().all(|(from, to)| {
-                let owns_edge = to.y < from.y || (to.y == from.y && to.x > from.x);
-                edge(from, to, x, y) >= i32::from(!owns_edge)
-            });
+            let (x, y) = (sample_coordinate(column), sample_coordinate(row));
+            let is_inside = [(&b, &c), (&c, &a), (&a, &b)]
+                .iter()
+                .all(|(from, to)| edge(from, to, x, y) >= i32::from(!owns_edge(from, to)));
             let [weight_b, weight_c] =
                 [edge(&c, &a, x, y), edge(&a, &b, x, y)].map(|edge_value| edge_value as f32 * (1.0 / area as f32));
             let z = a.z + (weight_b * (b.z - a.z) + weight_c * (c.z - a.z));
@@ -108,7 +129,8 @@ impl RasterTraversal<'_> {
         }
     }
 
-    /// Index of the entry of `tile_queue` that contains a tile, found by the 32-way search of a warp.
+    /// Index of the entry of `tile_queue` that contains a tile. Each round is the 32-way search of a warp: the 32 lanes
+    /// look at evenly spaced entries, and the last entry that begins at or before the tile is the new lower end.
     fn find_entry(&self, tile: u64) -> usize {
         let (mut low, mut high) = (0, self.tile_queue.len());
         while high - low > 1 {
@@ -120,11 +142,12 @@ impl RasterTraversal<'_> {
         low
     }
 
-    /// Twin of kernel `raster_tiles`: draws one strip of a queued tile, clipped to the triangle's samples. Skips a strip
-    /// that lies entirely outside an edge.
+    /// Twin of kernel `raster_tiles`: draws the part of a triangle in one strip of a queued tile. Skips a strip that
+    /// lies entirely outside of an edge. A strip is numbered across all tiles, with 2^`strip_splits` strips per tile.
     fn draw_strip(&mut self, strip: u64, strip_splits: u32) {
         let tile = strip >> strip_splits;
         let TileEntry { first_tile, triangle, packed_box } = self.tile_queue[self.find_entry(tile)];
+        // Index of the tile within the box of the triangle, and number of tile columns of the box.
         let (tile_of_entry, columns) = ((tile - first_tile) as u32, (packed_box >> 16 & 255) + 1);
         let strip_height = TILE_SIZE >> strip_splits;
         let first_column = TILE_SIZE * ((packed_box & 255) + tile_of_entry % columns) as i32;
@@ -140,11 +163,11 @@ impl RasterTraversal<'_> {
             (first_row + strip_height - 1).min(y1),
         );
         for triangle_piece in fan_triangles(&clipped_polygon) {
+            // Tests the corner sample of the strip with the largest value of the edge function.
             let is_beyond = |from: &SnappedVertex, to: &SnappedVertex| {
                 let column = if to.y > from.y { first_column } else { last_column };
                 let row = if to.x > from.x { last_row } else { first_row };
-                let owns_edge = to.y < from.y || (to.y == from.y && to.x > from.x);
-                edge(from, to, 256 * column + 128, 256 * row + 128) < i64::from(!owns_edge)
+                edge(from, to, sample_coordinate(column), sample_coordinate(row)) < i64::from(!owns_edge(from, to))
             };
             let [a, b, c] = &triangle_piece;
             if is_beyond(b, c) || is_beyond(c, a) || is_beyond(a, b) {
@@ -161,8 +184,9 @@ impl RasterTraversal<'_> {
     }
 }
 
-/// Runs the twins of `raster`, `raster_warps` and `raster_tiles` with reversed queues and with tiles that are halved
-/// `strip_splits` times. Returns the keys and the number of triangles on each path.
+/// Runs the twins of `raster`, `raster_warps` and `raster_tiles` with tiles that are halved `strip_splits` times.
+/// Triangles and strips are processed in reverse, because the result must not depend on their order. Returns the keys
+/// and the number of triangles on each path.
 fn rasterize_like_kernels(soup: &Soup, strip_splits: u32) -> (Vec<u64>, [usize; 3]) {
     let keys = vec![EMPTY_KEY; soup.viewport.pixel_count()];
     let mut traversal = RasterTraversal {
@@ -189,7 +213,7 @@ fn rasterize_like_kernels(soup: &Soup, strip_splits: u32) -> (Vec<u64>, [usize; 
     (traversal.keys, traversal.triangle_counts)
 }
 
-/// Also, the 32-bit edge functions of the per-thread and per-warp paths do not overflow.
+/// The twin panics if a 32-bit edge function overflows.
 #[test]
 fn all_raster_paths_equal_the_reference() {
     let text = include_str!("../../kernels/raster.cu");
@@ -214,9 +238,17 @@ fn all_raster_paths_equal_the_reference() {
     assert!(path_counts.iter().all(|path| *path > 10), "expected triangles on every path, got {path_counts:?}");
 }
 
-/// Number of triangle pieces that cover each sample. With `is_closed`, a piece covers all samples on its edges; without,
-/// the top-left rule holds.
-fn count_covering_pieces(soup: &Soup, is_closed: bool) -> Vec<usize> {
+/// Which triangle covers a sample on an edge that two triangles share.
+#[derive(Clone, Copy, PartialEq)]
+enum EdgeRule {
+    /// One of the two triangles, by the top-left rule.
+    TopLeft,
+    /// Both triangles.
+    Both,
+}
+
+/// Number of triangle pieces that cover each sample. Clipping divides a triangle into pieces.
+fn count_covering_pieces(soup: &Soup, edge_rule: EdgeRule) -> Vec<usize> {
     let [width, height] = soup.viewport.size().map(|side| side as i32);
     let pieces: Vec<[SnappedVertex; 3]> = (soup.triangles.iter())
         .filter_map(|triangle| clipped_polygon(&soup.viewport, &soup.positions, *triangle, CullMode::None).ok())
@@ -224,21 +256,22 @@ fn count_covering_pieces(soup: &Soup, is_closed: bool) -> Vec<usize> {
         .collect();
     let covers = |piece: &[SnappedVertex; 3], column: i32, row: i32| {
         let [a, b, c] = piece;
-        let is_inside = |from, to| edge(from, to, 256 * column + 128, 256 * row + 128) >= 0;
-        if is_closed {
-            is_inside(a, b) && is_inside(b, c) && is_inside(c, a)
-        } else {
-            depth_at(piece, column, row).is_some()
+        let is_inside = |from, to| edge(from, to, sample_coordinate(column), sample_coordinate(row)) >= 0;
+        match edge_rule {
+            EdgeRule::TopLeft => depth_at(piece, column, row).is_some(),
+            EdgeRule::Both => is_inside(a, b) && is_inside(b, c) && is_inside(c, a),
         }
     };
     let count = |column, row| pieces.iter().filter(|piece| covers(piece, column, row)).count();
-    (0..height).flat_map(|row| (0..width).map(move |column| (column, row))).map(|(x, y)| count(x, y)).collect()
+    let samples = (0..height).flat_map(|row| (0..width).map(move |column| (column, row)));
+    samples.map(|(column, row)| count(column, row)).collect()
 }
 
 #[test]
 fn fan_covers_every_sample_once() {
     let mut soup = fan_soup(clip_space_viewport(128, 128));
-    // The center is on a sample and some spokes run along rows and columns, so many samples lie on edges.
+    // The center of the fan is on a sample, and four of the 40 spokes run along a row or a column of samples, so many
+    // samples lie on edges.
     soup.positions[..2].copy_from_slice(&[1.0 / 128.0, 1.0 / 128.0]);
     for spoke in [0, 10, 20, 30] {
         let position = &mut soup.positions[3 * (1 + spoke)..][..2];
@@ -246,8 +279,8 @@ fn fan_covers_every_sample_once() {
         position[axis] = 1.0 / 128.0;
     }
     soup.positions.chunks_exact_mut(3).for_each(|position| position[2] = 0.0);
-    assert!(count_covering_pieces(&soup, false).iter().all(|count| *count == 1));
-    let shared_samples = count_covering_pieces(&soup, true).iter().filter(|count| **count > 1).count();
+    assert!(count_covering_pieces(&soup, EdgeRule::TopLeft).iter().all(|count| *count == 1));
+    let shared_samples = count_covering_pieces(&soup, EdgeRule::Both).iter().filter(|count| **count > 1).count();
     assert!(
         shared_samples > 100,
         "negative control: without the top-left rule {shared_samples} samples are covered more than once"
@@ -262,19 +295,21 @@ fn fan_clipped_by_near_plane_covers_every_sample_once() {
         let [x, y] = [position[0], position[1]];
         position.copy_from_slice(&[30.0 * x, -1.0, 30.0 * y]);
     }
-    let counts = count_covering_pieces(&soup, false);
+    let counts = count_covering_pieces(&soup, EdgeRule::TopLeft);
     assert!(counts.iter().all(|count| *count <= 1));
-    // The floor ends at a distance of 57, half a row below the horizon. The near plane is at 0.5, so the floor fills all
-    // rows below.
+    // The horizon is between rows 31 and 32. The floor ends at a distance of 57 (30 times the fan's radius of 1.9), one
+    // row below the horizon, and the near plane clips only what is below the image. So the floor covers all samples
+    // from row 34 on.
     let rows = counts.chunks_exact(96).map(|row| row.iter().sum::<usize>()).collect::<Vec<_>>();
     assert!(rows[..32].iter().all(|count| *count == 0) && rows[34..].iter().all(|count| *count == 96), "{rows:?}");
 }
 
-/// A nearer triangle is visible regardless of its id.
+/// A nearer triangle is visible regardless of its id. The depth of clip-space z is 0.5 z + 0.5.
 #[test]
 fn depth_ties_go_to_the_lower_id() {
-    let square = |z: f32| [[-1.0, -1.0, z], [3.0, -1.0, z], [-1.0, 3.0, z]].concat();
-    let positions = [square(0.5), square(0.5), square(0.25), square(0.25)].concat();
+    // Triangles a to d fill the window.
+    let triangle_at = |z: f32| [[-1.0, -1.0, z], [3.0, -1.0, z], [-1.0, 3.0, z]].concat();
+    let positions = [triangle_at(0.5), triangle_at(0.5), triangle_at(0.25), triangle_at(0.25)].concat();
     let draw_ids_and_depths = |triangles: &[[u32; 3]]| {
         let mut raster = VisibilityBuffer::new(clip_space_viewport(4, 4));
         let group = DrawRange { first: 0, triangles: triangles.len() as u32, cull_mode: CullMode::None };
@@ -288,7 +323,7 @@ fn depth_ties_go_to_the_lower_id() {
 }
 
 #[test]
-fn dropped_triangles_report_the_reason() {
+fn culled_triangles_report_the_reason() {
     let viewport = clip_space_viewport(10, 10);
     let cull_reason = |corners: [[f32; 3]; 3], cull_mode: CullMode| {
         clipped_polygon(&viewport, &corners.concat(), [0, 1, 2], cull_mode).err()
@@ -315,11 +350,13 @@ fn plane_depth_and_rectangle_coverage_are_exact() {
     raster.draw(&positions, &[[0, 1, 2]], DrawRange { first: 0, triangles: 1, cull_mode: CullMode::None });
     let [a, b, c] = corners.map(nalgebra::Vector3::from);
     let normal = (b - a).cross(&(c - a));
+    // Half of the vertical field of view is 30 degrees.
     let focal = 1.0 / 30.0_f64.to_radians().tan();
     let (mut samples, mut max_error) = (0, 0.0_f64);
     for (index, depth) in raster.depths().into_iter().enumerate().filter(|(index, _)| raster.ids()[*index].is_some()) {
-        let pixel = |coordinate: usize| (coordinate as f64 + 0.5) / 100.0 - 1.0;
-        let ray = nalgebra::Vector3::new(pixel(index % 200) / focal, -pixel(index / 200) / focal, -1.0);
+        // Where the ray through the sample meets the plane of the triangle.
+        let to_ndc = |pixel: usize| (pixel as f64 + 0.5) / 100.0 - 1.0;
+        let ray = nalgebra::Vector3::new(to_ndc(index % 200) / focal, -to_ndc(index / 200) / focal, -1.0);
         let distance = normal.dot(&a) / normal.dot(&ray);
         let z = (far + near) / (far - near) - 2.0 * far * near / ((far - near) * distance);
         max_error = max_error.max((f64::from(depth) - (0.5 * z + 0.5)).abs());
@@ -330,7 +367,8 @@ fn plane_depth_and_rectangle_coverage_are_exact() {
     assert!(samples > 1000 && max_error < 4e-6, "{samples} samples, maximum error {max_error:e}");
 
     let mut raster = VisibilityBuffer::new(clip_space_viewport(100, 100));
-    let square = [[-0.6, -0.4, 0.0], [0.2, -0.4, 0.0], [0.2, 0.8, 0.0], [-0.6, 0.8, 0.0]].concat();
-    raster.draw(&square, &[[0, 1, 2], [0, 2, 3]], DrawRange { first: 0, triangles: 2, cull_mode: CullMode::Back });
+    // The rectangle is 0.8 x 1.2 in a viewport of 2 x 2, which has 100 x 100 samples.
+    let rectangle = [[-0.6, -0.4, 0.0], [0.2, -0.4, 0.0], [0.2, 0.8, 0.0], [-0.6, 0.8, 0.0]].concat();
+    raster.draw(&rectangle, &[[0, 1, 2], [0, 2, 3]], DrawRange { first: 0, triangles: 2, cull_mode: CullMode::Back });
     assert_eq!(raster.ids().iter().flatten().count(), 40 * 60);
 }

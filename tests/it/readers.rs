@@ -21,10 +21,12 @@ fn vertex_request(scene: &str, selection: v1::VertexSelection) -> v1::GetVertice
     v1::GetVerticesRequest { scene: scene.into(), selection: Some(selection), ..v1::GetVerticesRequest::default() }
 }
 
+/// Selects vertices, displacements and boxes of some domains, or of all domains if the list is empty.
 fn select_vertices_and_attributes(domains: &[u32]) -> v1::VertexSelection {
     v1::VertexSelection { domains: domains.to_vec(), displacements: true, boxes: true, ..Default::default() }
 }
 
+/// Selects displacements and boxes without vertices.
 fn select_attributes(domains: &[u32]) -> v1::VertexSelection {
     v1::VertexSelection { without_vertices: true, ..select_vertices_and_attributes(domains) }
 }
@@ -62,24 +64,26 @@ async fn displacements_and_boxes_come_with_or_without_vertices() {
     for backend in [BackendChoice::Reference, BackendChoice::Cpu] {
         let server = Server::start_with(|config| Config { backend, ..config }).await;
         server.open("attributes").await;
-        let mut writer = server.drive("attributes", Policy::Lossless, 0).await;
+        let mut writer = server.drive_lossless("attributes").await;
         let steps = [step(1, &[1], &[0.5, -0.25]), rotated_step()];
         for index in 0..steps.len() {
             writer.send_step_and_wait(steps[index].clone()).await;
-            let (x, u) = (
+            let (positions, displacements) = (
                 reference_vertices(&strips_with_attributes(), &steps[..=index]).positions,
                 reference_displacements(&steps[..=index]),
             );
             let assert_attributes = |reply: &ReceivedVertices, domains: std::ops::Range<usize>| {
+                // Four vertices of three numbers per domain.
                 let floats = 12 * domains.start..12 * domains.end;
-                assert!(max_abs_error(&reply.displacements, &u[floats.clone()]) < 1e-6);
-                assert!(max_abs_error(&reply.boxes, &compute_boxes(&x[floats])) < 1e-6);
+                assert!(max_abs_error(&reply.displacements, &displacements[floats.clone()]) < 1e-6);
+                assert!(max_abs_error(&reply.boxes, &compute_boxes(&positions[floats])) < 1e-6);
             };
-            // The first request reads only the attributes. The second one reads the vertices of the same step.
+            // The first request reads only the attributes. The second request also reads the vertices of the same step.
             let attributes = get_vertices(&server, vertex_request("attributes", select_attributes(&[])))
                 .await
                 .expect("expected vertices");
             assert!(attributes.positions.is_empty() && attributes.normals.is_empty());
+            // Eight displacements of 12 bytes, and two boxes of 24 bytes.
             assert_eq!(
                 (attributes.head.displacement_bytes, attributes.head.box_bytes, attributes.head.total),
                 (96, 48, 144)
@@ -94,7 +98,7 @@ async fn displacements_and_boxes_come_with_or_without_vertices() {
                 (vertices_and_attributes.normals.len(), vertices_and_attributes.boxes.clone()),
                 (24, compute_boxes(&vertices_and_attributes.positions))
             );
-            assert!(max_abs_error(&vertices_and_attributes.positions, &x) < 1e-6);
+            assert!(max_abs_error(&vertices_and_attributes.positions, &positions) < 1e-6);
             let second_domain = get_vertices(&server, vertex_request("attributes", select_attributes(&[1])))
                 .await
                 .expect("expected vertices");
@@ -124,7 +128,7 @@ async fn box_stream_delivers_every_step() {
     };
     let mut stream =
         server.vertices().await.stream_vertices(request).await.expect("expected a subscription").into_inner();
-    let mut writer = server.drive("attributes", Policy::Lossless, 0).await;
+    let mut writer = server.drive_lossless("attributes").await;
     let steps = [step(1, &[1], &[0.5, -0.25]), rotated_step()];
     for index in 0..steps.len() {
         writer.send_step_and_wait(steps[index].clone()).await;
@@ -138,15 +142,16 @@ async fn box_stream_delivers_every_step() {
     }
 }
 
-/// Step number and vertex data of a message.
+/// Step number and vertex data of an output.
 fn vertices_of_output(output: &modalcast::engine::StepOutput) -> (usize, &DeformedSurface) {
     let modalcast::engine::OutputBody::Vertices(surface) = &output.body else { panic!("expected vertices") };
     (output.step.number as usize, surface)
 }
 
-/// Subscriptions with different attributes receive every step while the next step is computed.
+/// Subscriptions with different attributes receive every step, although later steps are computed meanwhile.
 #[tokio::test(flavor = "multi_thread")]
 async fn subscribers_of_different_attributes_get_every_step() {
+    const STEP_COUNT: u64 = 40;
     let server = Server::start_default().await;
     server.open("attributes").await;
     let scene_handle = server.engine.find("attributes").expect("expected an open scene");
@@ -169,15 +174,14 @@ async fn subscribers_of_different_attributes_get_every_step() {
         .subscribe(OutputSpec::Vertices(VertexAttributes::ALL), Delivery::Latest)
         .await
         .expect("expected a subscription");
-    let steps: Vec<_> = (0..40).map(|number| step(number, &[1], &[0.01 * number as f32, 1.0])).collect();
-    let mut writer = server.drive("attributes", Policy::Lossless, 40).await;
+    let steps: Vec<_> = (0..STEP_COUNT).map(|number| step(number, &[1], &[0.01 * number as f32, 1.0])).collect();
+    let mut writer = server.drive("attributes", Policy::Lossless, STEP_COUNT as u32).await;
     for step in &steps {
         writer.send_step(step.clone()).await;
     }
     let expected_output = |index: usize| {
-        let ReferenceVertices { positions: x, normals: n } =
-            reference_vertices(&strips_with_attributes(), &steps[..=index]);
-        (x, n, reference_displacements(&steps[..=index]))
+        let ReferenceVertices { positions, normals } = reference_vertices(&strips_with_attributes(), &steps[..=index]);
+        (positions, normals, reference_displacements(&steps[..=index]))
     };
     let box_numbers = |surface: &DeformedSurface| -> Vec<f32> {
         surface
@@ -189,31 +193,38 @@ async fn subscribers_of_different_attributes_get_every_step() {
     };
     let output = with_timeout(latest_subscription.next()).await.expect("expected the newest step");
     let (index, surface) = vertices_of_output(&output);
-    let (x, n, u) = expected_output(index);
-    assert!(surface.positions == x && surface.normals == n && box_numbers(surface) == compute_boxes(&x));
-    assert!(max_abs_error(&surface.displacements, &u) < 1e-6);
+    let (positions, normals, displacements) = expected_output(index);
+    assert!(
+        surface.positions == positions
+            && surface.normals == normals
+            && box_numbers(surface) == compute_boxes(&positions)
+    );
+    assert!(max_abs_error(&surface.displacements, &displacements) < 1e-6);
     drop(latest_subscription);
-    for index in 0..40 {
-        let (x, n, u) = expected_output(index);
+    for index in 0..STEP_COUNT as usize {
+        let (positions, normals, displacements) = expected_output(index);
         for (subscription, selection) in subscriptions.iter_mut().zip(selections) {
             let output = with_timeout(subscription.next()).await.expect("expected another message");
             let (number, surface) = vertices_of_output(&output);
             assert_eq!((number, output.skipped), (index, 0));
-            assert!(!selection.positions || surface.positions == x, "step {index}");
-            assert!(!selection.boxes || box_numbers(surface) == compute_boxes(&x), "step {index}");
-            assert!(!selection.displacements || max_abs_error(&surface.displacements, &u) < 1e-6, "step {index}");
-            assert!(!selection.normals || surface.normals == n, "step {index}");
+            assert!(!selection.positions || surface.positions == positions, "step {index}");
+            assert!(!selection.boxes || box_numbers(surface) == compute_boxes(&positions), "step {index}");
+            assert!(
+                !selection.displacements || max_abs_error(&surface.displacements, &displacements) < 1e-6,
+                "step {index}"
+            );
+            assert!(!selection.normals || surface.normals == normals, "step {index}");
         }
     }
     // Negative control: the first two steps differ in positions, boxes and displacements.
-    let (x, _, u) = expected_output(0);
+    let [(positions, _, displacements), (next_positions, _, next_displacements)] = [0, 1].map(expected_output);
     assert!(
-        x != expected_output(1).0
-            && compute_boxes(&x) != compute_boxes(&expected_output(1).0)
-            && max_abs_error(&u, &expected_output(1).2) > 1e-6
+        positions != next_positions
+            && compute_boxes(&positions) != compute_boxes(&next_positions)
+            && max_abs_error(&displacements, &next_displacements) > 1e-6
     );
-    for index in 0..40 {
-        assert!(matches!(writer.receive_reply().await, ResponseKind::Ack(ack) if ack.step == index));
+    for number in 0..STEP_COUNT {
+        assert!(matches!(writer.receive_reply().await, ResponseKind::Ack(ack) if ack.step == number));
     }
     writer.finish().await;
 }
@@ -260,7 +271,7 @@ async fn disabled_attributes_are_rejected_with_option_name() {
 async fn step_with_displacement_overflow_is_rejected() {
     let server = Server::start_with(|config| Config { backend: BackendChoice::Cpu, ..config }).await;
     server.open("attributes").await;
-    let mut writer = server.drive("attributes", Policy::Lossless, 0).await;
+    let mut writer = server.drive_lossless("attributes").await;
     writer.send_step_and_wait(step(1, &[1], &[0.5, -0.25])).await;
     let previous_reply =
         get_vertices(&server, vertex_request("attributes", select_attributes(&[]))).await.expect("expected vertices");

@@ -13,12 +13,13 @@ use crate::service_harness::{Server, TIMEOUT, config, get_vertices, reference_ve
 /// Bytes of the step number in a checkpoint file.
 const CHECKPOINT_STEP_NUMBER: Range<usize> = 16..24;
 
+/// Requests all vertices of a scene.
 fn vertex_request(scene: &str) -> v1::GetVerticesRequest {
     v1::GetVerticesRequest { scene: scene.into(), ..v1::GetVerticesRequest::default() }
 }
 
 fn runtime() -> tokio::runtime::Runtime {
-    tokio::runtime::Builder::new_multi_thread().enable_all().worker_threads(2).build().expect("a runtime")
+    tokio::runtime::Builder::new_multi_thread().enable_all().worker_threads(2).build().expect("expected a runtime")
 }
 
 fn steps() -> [v1::Step; 2] {
@@ -28,7 +29,7 @@ fn steps() -> [v1::Step; 2] {
 /// Opens `strips`, a scene of two domains, sends [`steps`] and returns the positions after the last step.
 async fn send_steps(server: &Server) -> Vec<f32> {
     server.open("strips").await;
-    let mut writer = server.drive("strips", v1::Policy::Lossless, 0).await;
+    let mut writer = server.drive_lossless("strips").await;
     for step in steps() {
         writer.send_step_and_wait(step).await;
     }
@@ -36,7 +37,7 @@ async fn send_steps(server: &Server) -> Vec<f32> {
     get_vertices(server, vertex_request("strips")).await.expect("expected vertices").positions
 }
 
-/// Starts a server on this state folder and returns the step and positions of `strips`. Also checks that a new writer
+/// Starts a server on a state folder and returns the step and positions of `strips`. Also asserts that a new writer
 /// starts a new run.
 fn restore_and_read(state_folder: &Path) -> (v1::StepId, Vec<f32>) {
     runtime().block_on(async {
@@ -47,8 +48,8 @@ fn restore_and_read(state_folder: &Path) -> (v1::StepId, Vec<f32>) {
         let reply =
             get_vertices(&server, vertex_request("strips")).await.expect("expected vertices of the restored scene");
         let restored = (reply.step(), reply.positions);
-        // The first step of a new run may have any number.
-        let mut writer = server.drive("strips", v1::Policy::Lossless, 0).await;
+        // Step numbers need to increase only within a run, so step 0 is valid after step 9 of the previous run.
+        let mut writer = server.drive_lossless("strips").await;
         writer.send_step_and_wait(step(0, &[0], &[0.0, 0.0])).await;
         let reply = get_vertices(&server, vertex_request("strips")).await.expect("expected vertices");
         assert_eq!((reply.step().run, reply.step().number), (restored.0.run + 1, 0));
@@ -111,10 +112,11 @@ fn scene_with_a_damaged_checkpoint_starts_at_rest() {
     });
     let path = folder.path().join("steps/strips.step");
     let mut bytes = std::fs::read(&path).expect("expected a checkpoint file");
+    // Flip one bit, which the hash in the file detects.
     bytes[60] ^= 0x40;
     std::fs::write(&path, bytes).expect("expected to write a file");
     let (step, restored_positions) = restore_and_read(folder.path());
-    assert_eq!(step.run, 0);
+    assert_eq!(step.run, 0, "expected the run before the first step");
     assert_eq!(restored_positions, reference_vertices(&strips(), &[]).positions);
 }
 

@@ -10,10 +10,10 @@ use v1::Array;
 use v1::describe_scene_response::Part;
 
 use crate::service_harness::{
-    Server, get_vertices, reference_vertices, rejection_details, sheet, strips, with_timeout,
+    MAX_MESSAGE_BYTES, Server, get_vertices, reference_vertices, rejection_details, sheet, strips, with_timeout,
 };
 
-/// A source whose first opening waits for a signal and then fails. Later openings take 100 ms and succeed.
+/// A source of scenes. The first opening waits for a signal and then fails. Later openings take 100 ms and succeed.
 struct FailingOnceSource {
     open_count: std::sync::atomic::AtomicUsize,
     fail_signal: std::sync::Mutex<std::sync::mpsc::Receiver<()>>,
@@ -38,7 +38,7 @@ impl SceneSource for FailingOnceSource {
     }
 }
 
-/// Two openings of one name overlap. The first fails, and the second succeeds and registers the scene.
+/// Two calls that open one name overlap. The first call fails, and the second call succeeds and registers the scene.
 #[tokio::test(flavor = "multi_thread")]
 async fn opening_after_a_concurrent_failure_is_registered() {
     let folder = tempfile::tempdir().expect("expected a temporary folder");
@@ -63,9 +63,7 @@ async fn opening_after_a_concurrent_failure_is_registered() {
     server.engine.open("other", "strips").await.expect("expected the name to be free after closing");
 }
 
-/// Size limit of one message in bytes: a chunk of 1 MiB and its envelope.
-const MAX_MESSAGE_BYTES: usize = (1 << 20) + 4096;
-
+/// Describes all domains of a scene. Returns the descriptions and the bytes of each array of each shape.
 async fn describe(server: &Server, scene: &str, arrays: &[Array]) -> (Vec<v1::DomainDescription>, Vec<Vec<u8>>) {
     let arrays = arrays.iter().map(|array| (*array).into()).collect();
     let request = v1::DescribeSceneRequest { scene: scene.into(), domains: vec![], arrays };
@@ -91,6 +89,8 @@ async fn describe(server: &Server, scene: &str, arrays: &[Array]) -> (Vec<v1::Do
     (domains, array_bytes)
 }
 
+/// Reads the rows of U of some vertices, or of all vertices if the list is empty. Numbers are ordered by vertex, axis
+/// and mode.
 async fn read_modes(server: &Server, scene: &str, domain: u32, vertices: &[u32]) -> Vec<f32> {
     let request = v1::ReadModesRequest { scene: scene.into(), domain, vertices: vertices.to_vec() };
     let mut stream = server.scenes().await.read_modes(request).await.expect("expected rows of U").into_inner();
@@ -131,6 +131,7 @@ async fn client_can_read_the_whole_scene() {
         (right.name.as_str(), right.parent, right.attachment_rows.as_slice()),
         ("right", Some(0), [1, 3].as_slice())
     );
+    // A transform of 3 x 4 numbers in f32 has 48 bytes.
     assert_eq!((right.attachment_frame.len(), right.placement.len(), right.shape), (48, 48, 0));
     let modes = &scene.shapes[0].modes;
     let rows = |vertex: usize| (0..3).flat_map(move |axis| (0..2).map(move |mode| modes.entry(vertex, axis, mode)));
@@ -163,6 +164,7 @@ async fn large_replies_are_chunked_for_default_client_limits() {
     let rows = read_modes(&server, "sheet", 0, &[]).await;
     let modes = &scene.shapes[0].modes;
     assert_eq!(rows.len(), modes.columns().len());
+    // A vertex has three rows of four modes. Number 7 is mode 3 of axis 1.
     assert!((0..90_000).all(|vertex| rows[12 * vertex + 7] == modes.entry(vertex, 1, 3)));
     let request = v1::GetVerticesRequest { scene: "sheet".into(), ..v1::GetVerticesRequest::default() };
     let reply = get_vertices(&server, request).await.expect("expected vertices");
@@ -188,7 +190,7 @@ async fn openings_share_one_scene_and_deletion_ends_its_streams() {
     let request = v1::StreamVerticesRequest { scene: "strips".into(), ..v1::StreamVerticesRequest::default() };
     let mut stream =
         server.vertices().await.stream_vertices(request).await.expect("expected a subscription").into_inner();
-    let mut writer = server.drive("strips", v1::Policy::Lossless, 0).await;
+    let mut writer = server.drive_lossless("strips").await;
     let delete_request = v1::DeleteSceneRequest { scene: "strips".into() };
     server.scenes().await.delete_scene(delete_request).await.expect("expected the deletion to succeed");
     let status = with_timeout(stream.message()).await.expect_err("expected a deleted-scene error");
@@ -236,6 +238,7 @@ async fn server_without_renderer_rejects_only_frames() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn health_and_reflection_answer_and_stop_ends_streams() {
+    use tonic_health::pb::health_check_response::ServingStatus;
     use tonic_reflection::pb::v1::ServerReflectionRequest;
     use tonic_reflection::pb::v1::server_reflection_client::ServerReflectionClient;
     use tonic_reflection::pb::v1::server_reflection_request::MessageRequest;
@@ -246,7 +249,7 @@ async fn health_and_reflection_answer_and_stop_ends_streams() {
     for service in ["", "modalcast.v1.StepService"] {
         let request = tonic_health::pb::HealthCheckRequest { service: service.into() };
         let status = health.check(request).await.expect("expected a reply").into_inner();
-        assert_eq!(status.status(), tonic_health::pb::health_check_response::ServingStatus::Serving);
+        assert_eq!(status.status(), ServingStatus::Serving);
     }
     let request = ServerReflectionRequest {
         host: String::new(),
@@ -261,17 +264,17 @@ async fn health_and_reflection_answer_and_stop_ends_streams() {
     for service in ["modalcast.v1.SceneService", "modalcast.v1.FrameService", "grpc.health.v1.Health"] {
         assert!(names.iter().any(|name| name == service), "{service} is not in {names:?}");
     }
-    let mut writer = server.drive("strips", v1::Policy::Lossless, 0).await;
+    let mut writer = server.drive_lossless("strips").await;
     writer.send_step_and_wait(crate::service_harness::step(1, &[0], &[0.0, 0.0])).await;
     let health_stream = health.watch(tonic_health::pb::HealthCheckRequest { service: String::new() }).await;
     let mut health_stream = health_stream.expect("expected a health stream").into_inner();
-    assert_eq!(health_stream.message().await.expect("expected a reply").expect("expected a message").status, 1);
+    let first_status = health_stream.message().await.expect("expected a reply").expect("expected a message");
+    assert_eq!(first_status.status(), ServingStatus::Serving);
+    // The health stream and the step stream end when the server stops.
     let read_until_stop = async {
-        assert_eq!(
-            with_timeout(health_stream.message()).await.expect("expected a reply").expect("expected a message").status,
-            2,
-            "expected NOT_SERVING"
-        );
+        let last_status = with_timeout(health_stream.message()).await;
+        let last_status = last_status.expect("expected a reply").expect("expected a message");
+        assert_eq!(last_status.status(), ServingStatus::NotServing);
         let status = with_timeout(writer.replies.message()).await.expect_err("expected the stream to end");
         assert_eq!(status.code(), tonic::Code::Unavailable);
         drop((health_stream, writer, health, client, replies));

@@ -15,7 +15,7 @@ use v1::Policy;
 use v1::drive_scene_response::Kind as ResponseKind;
 use v1::upload_scene_request::Part;
 
-use crate::service_harness::{Server, StepWriter, TIMEOUT, step, with_timeout};
+use crate::service_harness::{DEFAULT_WINDOW, Server, StepWriter, TIMEOUT, step, with_timeout};
 
 /// Under `POLICY_LATEST` the server merges steps that it has no time to process. Another stream of the same connection
 /// still gets all its acknowledgements.
@@ -26,9 +26,9 @@ async fn latest_policy_merges_excess_steps() {
     server.open("strips").await;
     let channel = server.channel().await;
     let mut fast_writer = StepWriter::connect(channel.clone()).await;
-    assert!(matches!(fast_writer.open("sheet", Policy::Latest, 0).await, ResponseKind::Opened(_)));
+    assert!(matches!(fast_writer.open("sheet", Policy::Latest, DEFAULT_WINDOW).await, ResponseKind::Opened(_)));
     let mut other_writer = StepWriter::connect(channel).await;
-    assert!(matches!(other_writer.open("strips", Policy::Lossless, 0).await, ResponseKind::Opened(_)));
+    assert!(matches!(other_writer.open("strips", Policy::Lossless, DEFAULT_WINDOW).await, ResponseKind::Opened(_)));
     const STEP_COUNT: u64 = 20_000;
     let (sender, mut replies) = fast_writer.split();
     let send_steps = async {
@@ -56,15 +56,16 @@ async fn latest_policy_merges_excess_steps() {
     assert!(skipped > 0 && skipped < STEP_COUNT, "expected some skipped steps, got {skipped} of {STEP_COUNT}");
 }
 
-/// The server ends the stream of a writer that reads no rejections. The connection stays usable.
+/// The server ends the stream of a writer that reads no rejections. Other streams of the connection continue.
 #[tokio::test(flavor = "multi_thread")]
 async fn stream_of_writer_that_reads_no_rejections_ends() {
     let server = Server::start_default().await;
     server.open("strips").await;
     let channel = server.channel().await;
     let mut writer = StepWriter::connect(channel.clone()).await;
-    assert!(matches!(writer.open("strips", Policy::Lossless, 0).await, ResponseKind::Opened(_)));
-    // Enough long rejections to fill every buffer between server and client.
+    assert!(matches!(writer.open("strips", Policy::Lossless, DEFAULT_WINDOW).await, ResponseKind::Opened(_)));
+    // A second open message is rejected. 20,000 rejections that repeat a name of 600 letters fill every buffer between
+    // server and client.
     let open_message = v1::OpenDrive { scene: "x".repeat(600), policy: 0, window: 0 };
     let (sender, mut replies) = writer.split();
     let send_task = tokio::spawn(async move {
@@ -79,7 +80,7 @@ async fn stream_of_writer_that_reads_no_rejections_ends() {
     let acquire_lease = async {
         loop {
             let mut candidate = StepWriter::connect(channel.clone()).await;
-            if matches!(candidate.open("strips", Policy::Lossless, 0).await, ResponseKind::Opened(_)) {
+            if matches!(candidate.open("strips", Policy::Lossless, DEFAULT_WINDOW).await, ResponseKind::Opened(_)) {
                 return candidate;
             }
         }
@@ -104,7 +105,7 @@ async fn stream_of_writer_that_reads_no_rejections_ends() {
 async fn silent_connection_is_closed_and_active_one_is_not() {
     let server = Server::start_with(|config| Config { first_byte_timeout: Duration::from_millis(60), ..config }).await;
     server.open("strips").await;
-    let mut writer = server.drive("strips", Policy::Lossless, 0).await;
+    let mut writer = server.drive_lossless("strips").await;
     let address = server.address.trim_start_matches("http://").to_owned();
     let mut silent_connection = TcpStream::connect(address).await.expect("expected a connection");
     let result = with_timeout(silent_connection.read(&mut [0; 1])).await;
@@ -119,14 +120,14 @@ async fn frozen_writer_loses_its_lease() {
     server.open("strips").await;
     let proxy = FreezableProxy::start(server.address.trim_start_matches("http://").to_owned()).await;
     let mut frozen_writer = StepWriter::connect(proxy.channel().await).await;
-    assert!(matches!(frozen_writer.open("strips", Policy::Lossless, 0).await, ResponseKind::Opened(_)));
+    assert!(matches!(frozen_writer.open("strips", Policy::Lossless, DEFAULT_WINDOW).await, ResponseKind::Opened(_)));
     frozen_writer.send_step_and_wait(step(1, &[0], &[0.1, 0.2])).await;
     proxy.freeze();
     let start = Instant::now();
     let acquire_lease = async {
         loop {
             let mut candidate = StepWriter::connect(server.channel().await).await;
-            if matches!(candidate.open("strips", Policy::Lossless, 0).await, ResponseKind::Opened(_)) {
+            if matches!(candidate.open("strips", Policy::Lossless, DEFAULT_WINDOW).await, ResponseKind::Opened(_)) {
                 return;
             }
         }
@@ -178,6 +179,7 @@ async fn upload_below_minimum_rate_times_out() {
     let header = v1::UploadHeader { scene: "up".into(), entry: String::new(), files: 1, total_bytes: 5000 };
     let file = v1::UploadFile { path: "scene.txt".into(), bytes: 5000, sha256: vec![0; 32].into() };
     let parts = [Part::Header(header), Part::File(file)].into_iter();
+    // One byte per chunk, at most 50 bytes per second.
     let parts = parts.chain(std::iter::repeat_with(|| Part::Chunk(b"x"[..].into())).take(5000));
     let requests = tokio_stream::iter(parts.map(|part| v1::UploadSceneRequest { part: Some(part) }));
     let slow_requests = tokio_stream::StreamExt::throttle(requests, Duration::from_millis(20));
@@ -206,11 +208,11 @@ impl FreezableProxy {
                     TcpStream::connect(&server_address).await.expect("expected a connection to the server");
                 let mut freeze_receiver = task_sender.subscribe();
                 tokio::spawn(async move {
+                    let until_frozen =
+                        async { freeze_receiver.wait_for(|is_frozen| *is_frozen).await.map(drop).unwrap_or_default() };
                     tokio::select! {
                         _ = tokio::io::copy_bidirectional(&mut client, &mut upstream) => {}
-                        () = async { freeze_receiver.wait_for(|is_frozen| *is_frozen).await.map(drop).unwrap_or_default() } => {
-                            tokio::time::sleep(TIMEOUT).await;
-                        }
+                        () = until_frozen => tokio::time::sleep(TIMEOUT).await,
                     }
                 });
             }

@@ -1,5 +1,5 @@
-//! Scene files over the wire: paths cannot leave the repository, an uploaded scene.toml opens, and a rejection names the
-//! invalid file.
+//! Scene files over the wire: paths cannot leave the repository, an uploaded scene.toml opens, and a rejection names
+//! the invalid file.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -12,11 +12,13 @@ use v1::upload_scene_request::Part;
 
 use crate::service_harness::{Server, config, get_vertices, rejection_details, step};
 
+/// An OBJ file of one square with texture coordinates.
 const SQUARE: &str = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nf 1/1 2/2 3/3 4/4\n";
 
 /// Bytes of a NumPy file of f32 in row-major order.
 fn encode_npy(rows: usize, columns: usize, entries: &[f32]) -> Vec<u8> {
     let header = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({rows}, {columns}), }}");
+    // The header has 118 (0x76) bytes, so that the numbers begin at byte 128.
     let padded = format!("{header:<117}\n");
     let mut bytes = b"\x93NUMPY\x01\x00\x76\x00".to_vec();
     bytes.extend_from_slice(padded.as_bytes());
@@ -41,6 +43,7 @@ async fn open(server: &Server, source: &str) -> Result<v1::SceneInfo, Status> {
     Ok(server.scenes().await.open_scene(request).await?.into_inner().scene.expect("expected the scene info"))
 }
 
+/// Uploads files in chunks of 100 bytes.
 async fn upload(server: &Server, entry: &str, files: &[(&str, &[u8])]) -> Result<v1::SceneInfo, Status> {
     let total_bytes = files.iter().map(|(_, bytes)| bytes.len() as u64).sum();
     let header = v1::UploadHeader { scene: "sent".into(), entry: entry.into(), files: files.len() as u32, total_bytes };
@@ -55,9 +58,9 @@ async fn upload(server: &Server, entry: &str, files: &[(&str, &[u8])]) -> Result
     Ok(response.into_inner().scene.expect("expected the scene info"))
 }
 
-/// Sets the single coordinate of a scene to 1.5 and returns the position of the last vertex.
+/// Sets the single coordinate of a scene of [`SQUARE`] to 1.5 and returns the position of the last vertex.
 async fn deform_last_vertex(server: &Server, scene: &str) -> [f32; 3] {
-    let mut writer = server.drive(scene, v1::Policy::Lossless, 0).await;
+    let mut writer = server.drive_lossless(scene).await;
     writer.send_step_and_wait(step(1, &[0], &[1.5])).await;
     let request = v1::GetVerticesRequest { scene: scene.into(), ..v1::GetVerticesRequest::default() };
     let reply = get_vertices(server, request).await.expect("expected vertices");

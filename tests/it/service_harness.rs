@@ -35,6 +35,12 @@ use v1::vertex_service_client::VertexServiceClient;
 /// Maximum time that a test waits for one reply.
 pub(crate) const TIMEOUT: Duration = Duration::from_secs(60);
 
+/// Size limit of one message of the server in bytes: a chunk of 1 MiB and the other fields.
+pub(crate) const MAX_MESSAGE_BYTES: usize = (1 << 20) + 4096;
+
+/// Selects the server's default window: the maximum number of steps without acknowledgement.
+pub(crate) const DEFAULT_WINDOW: u32 = 0;
+
 /// Source of scenes built in code: `strips` (two small domains), `far` (the same, far from the origin), `twig` (with
 /// followers), `attributes` (with displacements and boxes), `sheet` (more than 1 MiB per array) and `panic` (the loader
 /// panics).
@@ -54,6 +60,7 @@ impl SceneSource for SyntheticScenes {
         Ok(scene.into())
     }
 
+    /// Opens the source that a file names.
     fn open_within(&self, folder: &Path, entry: &str) -> Result<OpenedScene> {
         let path = folder.join(if entry.is_empty() { "scene.txt" } else { entry });
         let text = std::fs::read_to_string(path).map_err(|error| invalid("entry", "a file", error))?;
@@ -65,13 +72,14 @@ impl SceneSource for SyntheticScenes {
     }
 }
 
-/// Two squares of four vertices and two modes; `right` is attached to `left`.
+/// Two domains, `left` and `right`, of one shape: a square with four vertices and two modes. `right` is attached to
+/// `left`.
 pub(crate) fn strips() -> Arc<Scene> {
     let (shape, domains) = two_strips(1.0);
     scene("strips", shape, domains)
 }
 
-/// Two strips; the second has a leaf that follows it and a leaflet that follows the leaf.
+/// [`strips`] with two more domains of the same shape: `leaf` follows `right`, and `leaflet` follows `leaf`.
 pub(crate) fn twig() -> Arc<Scene> {
     let (shape, mut domains) = two_strips(1.0);
     let frame = Transform([0.0, -1.0, 0.0, 0.5, 1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1.0, -0.25]);
@@ -81,7 +89,7 @@ pub(crate) fn twig() -> Arc<Scene> {
     scene("twig", shape, domains)
 }
 
-/// [`strips`] in half meters, 17,000 km from the world origin.
+/// [`strips`] with a unit of half a meter. The origin of the scene is 17,000 km from the world origin.
 pub(crate) fn far_strips() -> Arc<Scene> {
     let (shape, domains) = two_strips(1.0);
     let (shapes, materials) = (vec![shape], vec![Material::default()]);
@@ -107,6 +115,7 @@ pub(crate) fn strips_with_attributes() -> Arc<Scene> {
 
 /// The shape and the domains of [`strips`], with the entries of U times `mode_scale`.
 fn two_strips(mode_scale: f32) -> (Shape, Vec<Domain>) {
+    // The values are arbitrary.
     let unscaled_entry = |index: u32| if index.is_multiple_of(5) { 0.5 } else { 0.125 * (index % 3) as f32 };
     let columns = (0..24).map(|index| mode_scale * unscaled_entry(index)).collect();
     let modes = Modes::from_columns(12, 2, columns).expect("expected valid modes");
@@ -140,12 +149,14 @@ fn grid(side: u32) -> Mesh {
     Mesh::from_indexed(positions, normals, uvs, triangles).expect("expected a valid mesh")
 }
 
+/// A domain of shape 0.
 fn domain(name: &str, attachment: Option<Attachment>) -> Domain {
     Domain { attachment, ..Domain::new(name, 0) }
 }
 
+/// A scene of one shape.
 fn scene(name: &str, shape: Shape, domains: Vec<Domain>) -> Arc<Scene> {
-    // A small shadow map, because these tests are about the wire.
+    // A small shadow map saves time; these tests compare no shadows.
     let look = RenderSettings {
         shadow: Some(ShadowSettings { size: 128, ..ShadowSettings::default() }),
         ..RenderSettings::default()
@@ -170,6 +181,7 @@ pub(crate) fn config(state: &Path) -> Config {
 /// A running server.
 pub(crate) struct Server {
     pub(crate) engine: Engine,
+    /// URL with the port.
     pub(crate) address: String,
     stop_sender: Option<oneshot::Sender<()>>,
     task: JoinHandle<Result<()>>,
@@ -183,6 +195,7 @@ impl Server {
         Self::start_with(|config| config).await
     }
 
+    /// Starts a server with changed settings of [`config`] and a new state folder.
     pub(crate) async fn start_with(change: impl FnOnce(Config) -> Config) -> Self {
         let folder = tempfile::tempdir().expect("expected a temporary folder");
         let mut server = Self::start(change(config(folder.path()))).await;
@@ -190,10 +203,12 @@ impl Server {
         server
     }
 
+    /// Starts a server that can open the [`SyntheticScenes`].
     pub(crate) async fn start(config: Config) -> Self {
         Self::start_from(config, Arc::new(SyntheticScenes)).await
     }
 
+    /// Starts a server that can open the scenes of a source.
     pub(crate) async fn start_from(config: Config, source: Arc<dyn SceneSource>) -> Self {
         let config = config.validated().expect("expected valid settings");
         let listener = service::bind(&config).await.expect("expected a free port");
@@ -207,6 +222,7 @@ impl Server {
         Self { engine, address, stop_sender: Some(stop_sender), task, folder: None }
     }
 
+    /// Opens a new connection.
     pub(crate) async fn channel(&self) -> Channel {
         Channel::from_shared(self.address.clone())
             .expect("expected a socket address")
@@ -240,7 +256,12 @@ impl Server {
             .expect("expected the scene info")
     }
 
-    /// Opens a step stream and expects success.
+    /// Opens a step stream with the lossless policy and the default window, and expects success.
+    pub(crate) async fn drive_lossless(&self, scene: &str) -> StepWriter {
+        self.drive(scene, v1::Policy::Lossless, DEFAULT_WINDOW).await
+    }
+
+    /// Opens a step stream and expects success. `window` is the maximum number of steps without acknowledgement.
     pub(crate) async fn drive(&self, scene: &str, policy: v1::Policy, window: u32) -> StepWriter {
         let mut writer = StepWriter::connect(self.channel().await).await;
         let opened = writer.open(scene, policy, window).await;
@@ -277,6 +298,7 @@ impl StepWriter {
         Self { sender, replies }
     }
 
+    /// Requests to drive a scene and returns the reply.
     pub(crate) async fn open(&mut self, scene: &str, policy: v1::Policy, window: u32) -> ResponseKind {
         let open = v1::OpenDrive { scene: scene.into(), policy: policy.into(), window };
         self.send(RequestKind::Open(open)).await;
@@ -331,13 +353,15 @@ impl StepWriter {
     pub(crate) fn disconnect(self) {}
 }
 
-/// A step that sets the coordinates of some domains.
+/// A step at the time `number / 2`. `q` has the coordinates of `q_domains`, or of all domains if `q_domains` is empty.
+/// An empty `q` changes no coordinates.
 pub(crate) fn step(number: u64, q_domains: &[u32], q: &[f32]) -> v1::Step {
     let q = q.iter().flat_map(|number| number.to_le_bytes()).collect::<Vec<u8>>().into();
     v1::Step { number, time: number as f64 * 0.5, q_domains: q_domains.to_vec(), q, ..v1::Step::default() }
 }
 
-/// A step that places domains by quaternions x y z w and translations, in one of the two rigid formats.
+/// A step in one of the two rigid formats. A pose consists of a domain, a rotation as a quaternion x y z w, and a
+/// translation.
 pub(crate) fn rigid_step(number: u64, format: v1::TransformFormat, poses: &[(u32, [f32; 4], [f64; 3])]) -> v1::Step {
     let mut bytes = Vec::new();
     for (_, rotation, translation) in poses {
@@ -355,13 +379,14 @@ pub(crate) fn rigid_step(number: u64, format: v1::TransformFormat, poses: &[(u32
     }
 }
 
+/// Vertices of the f64 reference, rounded to f32.
 #[derive(Debug, PartialEq)]
 pub(crate) struct ReferenceVertices {
     pub(crate) positions: Vec<f32>,
     pub(crate) normals: Vec<f32>,
 }
 
-/// Positions and normals of the reference after some steps.
+/// Positions and normals of the f64 reference after some steps from rest.
 pub(crate) fn reference_vertices(scene: &Scene, steps: &[v1::Step]) -> ReferenceVertices {
     let state = state_after_steps(scene, steps);
     let round_to_f32 = |list: Vec<[f64; 3]>| list.into_flattened().into_iter().map(|number| number as f32).collect();
@@ -371,7 +396,7 @@ pub(crate) fn reference_vertices(scene: &Scene, steps: &[v1::Step]) -> Reference
     }
 }
 
-/// State of the scene after some steps.
+/// State of the scene after some steps from rest.
 pub(crate) fn state_after_steps(scene: &Scene, steps: &[v1::Step]) -> SceneState {
     use v1::TransformFormat as WireFormat;
     let mut state = SceneState::rest(scene);
@@ -422,7 +447,7 @@ pub(crate) async fn get_vertices(
     let mut stream = with_timeout(server.vertices().await.get_vertices(request)).await?.into_inner();
     let mut chunks = Vec::new();
     while let Some(response) = with_timeout(stream.message()).await? {
-        assert!(response.encoded_len() <= (1 << 20) + 4096, "{} bytes", response.encoded_len());
+        assert!(response.encoded_len() <= MAX_MESSAGE_BYTES, "{} bytes", response.encoded_len());
         chunks.push(response.chunk.expect("expected a chunk"));
     }
     Ok(join_chunks(chunks))
@@ -453,6 +478,7 @@ fn join_chunks(mut chunks: Vec<v1::VertexChunk>) -> ReceivedVertices {
         bytes.extend_from_slice(&chunk.data);
     }
     assert_eq!(head.total, bytes.len() as u64);
+    // The order is positions, normals, displacements, boxes, origins.
     let (positions, rest) = bytes.split_at(head.position_bytes as usize);
     let (rest, origins) = rest.split_at(rest.len() - head.origin_bytes as usize);
     let (rest, boxes) = rest.split_at(rest.len() - head.box_bytes as usize);

@@ -1,4 +1,5 @@
-//! Steps over the wire: vertices are those of the acknowledged steps, under both policies.
+//! Steps over the wire: vertices of acknowledged steps, back-pressure, writers that take turns, and requests that wait
+//! for a step.
 
 use modalcast::engine::{Delivery, OutputSpec, StepSelector, Subscription};
 use modalcast_model::deform::VertexAttributes;
@@ -7,7 +8,7 @@ use v1::Policy;
 use v1::drive_scene_response::Kind as ResponseKind;
 
 use crate::service_harness::{
-    Server, get_vertices, next_vertices, reference_vertices, sheet, step, strips, with_timeout,
+    DEFAULT_WINDOW, Server, get_vertices, next_vertices, reference_vertices, sheet, step, strips, with_timeout,
 };
 
 fn vertex_request(scene: &str) -> v1::GetVerticesRequest {
@@ -25,7 +26,7 @@ async fn subscribe_vertices(server: &Server, delivery: Delivery) -> Subscription
 async fn acknowledged_steps_have_vertices_of_the_reference() {
     let server = Server::start_default().await;
     server.open("strips").await;
-    let mut writer = server.drive("strips", Policy::Lossless, 0).await;
+    let mut writer = server.drive_lossless("strips").await;
     let mut rotated_step = step(1, &[1], &[0.5, -0.25]);
     let transform = [0.0_f32, -1.0, 0.0, 2.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, -3.0];
     rotated_step.transform_domains = vec![1];
@@ -67,6 +68,7 @@ async fn lossless_subscriber_gets_every_step_in_order() {
             let vertices =
                 next_vertices(&mut stream).await.expect("expected another message").expect("expected a valid step");
             assert_eq!((vertices.step().number, vertices.head.skipped), (steps[index].number, 0));
+            // The second domain, after the four vertices of the first domain.
             assert_eq!(vertices.positions, reference_vertices(&strips(), &steps[..=index]).positions[12..]);
             assert!(vertices.normals.is_empty());
         }
@@ -169,18 +171,16 @@ async fn stalled_subscriber_is_disconnected_and_writer_continues() {
     assert_eq!(with_timeout(subscription.next()).await.expect_err("expected the subscription to end"), error);
 }
 
-/// Merging does not lose an update: the final state equals that after applying every step.
+/// Merging loses no update: the final state equals the state after applying every step.
 #[tokio::test(flavor = "multi_thread")]
 async fn latest_policy_merges_steps_and_counts_skipped_ones() {
     let server = Server::start_default().await;
     server.open("sheet").await;
     let mut writer = server.drive("sheet", Policy::Latest, 4).await;
-    let transform = |offset: f32| -> Vec<u8> {
-        let matrix = [1.0, 0.0, 0.0, offset, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0_f32];
-        matrix.iter().flat_map(|number| number.to_le_bytes()).collect()
-    };
-    // Only the first step moves the sheet, so a lost step changes the result.
-    let mut steps = vec![v1::Step { transforms: transform(5.0).into(), ..step(1, &[], &[]) }];
+    // A translation by 5 along x. Only the first step moves the sheet, so the loss of this step changes the result.
+    let matrix = [1.0, 0.0, 0.0, 5.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0_f32];
+    let transforms: Vec<u8> = matrix.iter().flat_map(|number| number.to_le_bytes()).collect();
+    let mut steps = vec![v1::Step { transforms: transforms.into(), ..step(1, &[], &[]) }];
     steps.extend((2..=200).map(|number| step(number, &[0], &[0.001 * number as f32, 0.5, 0.0, 1.0])));
     for step in &steps {
         writer.send_step(step.clone()).await;
@@ -204,7 +204,7 @@ async fn latest_policy_merges_steps_and_counts_skipped_ones() {
 async fn latest_subscriber_gets_current_step_and_skip_count() {
     let server = Server::start_default().await;
     server.open("strips").await;
-    let mut writer = server.drive("strips", Policy::Lossless, 0).await;
+    let mut writer = server.drive_lossless("strips").await;
     writer.send_step_and_wait(step(3, &[0], &[0.1, 0.0])).await;
     let mut subscription = subscribe_vertices(&server, Delivery::Latest).await;
     let first_output = with_timeout(subscription.next()).await.expect("expected the current step");
@@ -216,23 +216,24 @@ async fn latest_subscriber_gets_current_step_and_skip_count() {
     assert_eq!((second_output.step.number, second_output.skipped), (8, 4));
 }
 
-/// The rejection of the second writer names the address and the run of the first writer. After that writer has left, the
-/// rejected stream can open the scene.
+/// The rejection of the second writer names the address and the run of the first writer. After the first writer has
+/// left, the second writer can open the scene.
 #[tokio::test(flavor = "multi_thread")]
 async fn second_writer_waits_for_the_first_to_leave() {
     let server = Server::start_default().await;
     server.open("strips").await;
-    let mut first_writer = server.drive("strips", Policy::Lossless, 0).await;
+    let mut first_writer = server.drive_lossless("strips").await;
     first_writer.send_step_and_wait(step(100, &[0], &[0.1, 0.0])).await;
     let mut second_writer = crate::service_harness::StepWriter::connect(server.channel().await).await;
-    let ResponseKind::Rejection(rejection) = second_writer.open("strips", Policy::Lossless, 0).await else {
+    let ResponseKind::Rejection(rejection) = second_writer.open("strips", Policy::Lossless, DEFAULT_WINDOW).await
+    else {
         panic!("expected a rejection")
     };
     assert!(rejection.field.contains("writer"), "{rejection:?}");
     assert!(rejection.given.contains("127.0.0.1") && rejection.given.contains("run 1"), "{rejection:?}");
     first_writer.send_step_and_wait(step(101, &[0], &[0.2, 0.0])).await;
     first_writer.finish().await;
-    // The step numbers of a new run start again.
+    // A new run may start at any step number. The server limits the window to 256 steps.
     let ResponseKind::Opened(opened) = second_writer.open("strips", Policy::Latest, 100_000).await else {
         panic!("expected the stream to open")
     };
@@ -243,7 +244,7 @@ async fn second_writer_waits_for_the_first_to_leave() {
     let open_third = async {
         loop {
             let mut third_writer = crate::service_harness::StepWriter::connect(server.channel().await).await;
-            if let ResponseKind::Opened(opened) = third_writer.open("strips", Policy::Lossless, 0).await {
+            if let ResponseKind::Opened(opened) = third_writer.open("strips", Policy::Lossless, DEFAULT_WINDOW).await {
                 return opened.run;
             }
         }
@@ -258,7 +259,8 @@ async fn requests_of_departed_clients_free_their_slots() {
     let step = Some(v1::get_vertices_request::Step::MinimumStep(99));
     let pending_request = v1::GetVerticesRequest { deadline_ms: 600_000, step, ..vertex_request("strips") };
     let mut client = server.vertices().await;
-    // Eight requests wait for a step that is never sent. Four of them are rejected, and so is every later request.
+    // Eight requests wait for a step that is never sent. The server holds four of them and rejects the others, and
+    // every later request.
     let mut streams = Vec::new();
     for _ in 0..8 {
         streams.push(client.get_vertices(pending_request.clone()).await.expect("expected a stream").into_inner());
@@ -281,12 +283,12 @@ async fn requests_of_departed_clients_free_their_slots() {
     with_timeout(retry).await;
 }
 
-/// A request for a step that has passed is rejected with the number of the step.
+/// A request for a step that has passed is rejected with the requested step and the current step.
 #[tokio::test(flavor = "multi_thread")]
 async fn requests_wait_for_exact_and_minimum_steps() {
     let server = Server::start_default().await;
     server.open("strips").await;
-    let mut writer = server.drive("strips", Policy::Lossless, 0).await;
+    let mut writer = server.drive_lossless("strips").await;
     let scene_handle = server.engine.find("strips").expect("expected an open scene");
     let mut pending_requests =
         [StepSelector::Exact(2), StepSelector::Minimum(3), StepSelector::Exact(5)].map(|selector| {
@@ -316,8 +318,8 @@ async fn requests_wait_for_exact_and_minimum_steps() {
     let rejection = crate::service_harness::rejection_details(&status);
     assert!(rejection.given == "4" && rejection.expected.starts_with('5'), "{rejection:?}");
     let start = std::time::Instant::now();
-    let late_request = v1::GetVerticesRequest { deadline_ms: 80, ..request_step(MinimumStep(99)) };
-    let status = get_vertices(&server, late_request).await.expect_err("expected a timeout");
+    let unanswered_request = v1::GetVerticesRequest { deadline_ms: 80, ..request_step(MinimumStep(99)) };
+    let status = get_vertices(&server, unanswered_request).await.expect_err("expected a timeout");
     assert_eq!(status.code(), tonic::Code::DeadlineExceeded);
     let elapsed = start.elapsed();
     assert!(elapsed < std::time::Duration::from_secs(5), "expected a timeout after 80 ms, got {elapsed:?}");

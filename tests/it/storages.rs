@@ -1,4 +1,5 @@
-//! The CPU deformer stays within its a-priori bounds for every storage type, and its results depend only on the step.
+//! The errors of the CPU deformer are within their a-priori bounds for every storage type of U. Its results do not
+//! depend on threads, tiles or earlier steps.
 
 use std::sync::Arc;
 
@@ -7,7 +8,7 @@ use modalcast_compute::reference;
 use modalcast_compute::storage::bound::{ErrorBoundInput, ShapeErrorModel};
 use modalcast_compute::storage::{QUAD, TILE_QUADS, TiledModes};
 use modalcast_model::deform::{DeformSummary, Deformer};
-use modalcast_model::domain::{Domain, Material, Modes, Shape, Transform};
+use modalcast_model::domain::{Domain, Material, Mesh, Modes, Shape, Transform};
 use modalcast_model::scene::{DeformationSettings, Scene, SceneParts, SceneState, StorageType};
 
 use crate::deformers::{TestRng, random_state, random_strip};
@@ -16,8 +17,8 @@ use crate::deformers::{TestRng, random_state, random_strip};
 const SIZES: [(usize, usize); 9] =
     [(1, 1), (1, 0), (7, 3), (129, 31), (1500, 33), (7, 512), (129, 0), (128, 6), (1500, 1)];
 
-/// A scene of strips of [`SIZES`]. The last two domains are instances of the first and of the fourth shape; the last
-/// one also shares the coordinates of the fourth domain.
+/// A scene of one strip per entry of [`SIZES`], and of two further domains of shapes 0 and 3. The last domain shares
+/// the coordinates of domain 3.
 fn random_scene(deformation: DeformationSettings) -> Arc<Scene> {
     let mut random = TestRng(42);
     let mut parts = SceneParts::named("storages");
@@ -34,17 +35,13 @@ fn random_scene(deformation: DeformationSettings) -> Arc<Scene> {
     Scene::new(parts).expect("expected a valid scene")
 }
 
-/// One domain with these columns of U and rest positions of zero.
+/// A scene of one domain with the given columns of U and rest positions of zero.
 fn scene_from_columns(vertices: usize, columns: Vec<f32>, deformation: DeformationSettings) -> Arc<Scene> {
     let mut parts = SceneParts::named("columns");
     parts.deformation = deformation;
     parts.materials = vec![Material::default()];
     let template = random_strip(vertices, 0, &mut TestRng(1)).mesh;
-    let mesh = modalcast_model::domain::Mesh::new(
-        vec![[0.0; 3]; vertices],
-        template.corners().clone(),
-        template.triangles().to_vec(),
-    );
+    let mesh = Mesh::new(vec![[0.0; 3]; vertices], template.corners().clone(), template.triangles().to_vec());
     let rank = columns.len() / (3 * vertices);
     let modes = Modes::from_columns(3 * vertices, rank, columns).expect("expected valid modes");
     parts.shapes = vec![Shape::new(mesh.expect("expected a valid mesh"), modes).expect("expected a valid shape")];
@@ -76,7 +73,7 @@ fn tile_bounds(scene: &Scene, state: &SceneState, deformer: &CpuDeformer, domain
     (0..tiles.count()).map(|tile| model.tile(tile, &step).total() + truncation_bound).collect()
 }
 
-/// Largest error of each domain relative to the bound of its tile; infinite for NaN.
+/// Largest ratio of an error to the bound of its tile, per domain; infinite for NaN.
 fn error_ratios(scene: &Scene, state: &SceneState, positions: &[f32], deformer: &CpuDeformer) -> Vec<f64> {
     let expected = reference::deform(scene, state);
     let domain_ratio = |domain: usize| {
@@ -94,7 +91,7 @@ fn error_ratios(scene: &Scene, state: &SceneState, positions: &[f32], deformer: 
     (0..scene.domains.len()).map(domain_ratio).collect()
 }
 
-/// Negative control: the positions of the negated coordinates exceed the bound.
+/// Negative control: compared with the reference of the negated coordinates, the errors exceed the bound.
 #[test]
 fn errors_stay_within_bounds_in_every_storage() {
     for storage in StorageType::ALL {
@@ -121,7 +118,7 @@ fn errors_stay_within_bounds_in_every_storage() {
             let mut negated_state = state.clone();
             negated_state.q.iter_mut().for_each(|number| *number = -*number);
             let ratios = error_ratios(&scene, &negated_state, &positions, &deformer);
-            // With truncation, modes may be dropped, and then the sign of their coordinates has no effect.
+            // Without modes, and possibly with truncated modes, the sign of q has no effect.
             let is_sensitive = |domain: usize| scene.rank_of(domain) > 0 && truncation.is_none();
             for domain in (0..ratios.len()).filter(|domain| is_sensitive(*domain)) {
                 assert!(
@@ -179,20 +176,23 @@ fn f32_bits(numbers: &[f32]) -> Vec<u32> {
 
 #[test]
 fn vertices_do_not_depend_on_the_tiling() {
-    // The first 129 vertices of the large shape form the small shape. Their tiles differ in size.
+    // The small shape has the first 129 vertices of the large shape. The second tile has 128 vertices in the large
+    // shape and one vertex in the small shape.
+    let (vertices, first_vertices, rank) = (1500, 129, 9);
     let mut random = TestRng(8);
-    let columns: Vec<f32> = (0..4500 * 9).map(|_| random.next()).collect();
-    let first_columns: Vec<f32> = columns.chunks_exact(4500).flat_map(|column| column[..387].to_vec()).collect();
+    let columns: Vec<f32> = (0..3 * vertices * rank).map(|_| random.next()).collect();
+    let first_columns: Vec<f32> =
+        columns.chunks_exact(3 * vertices).flat_map(|column| column[..3 * first_vertices].to_vec()).collect();
     for storage in [StorageType::F32, StorageType::F16, StorageType::Bf16] {
         let deformation = DeformationSettings { storage, ..DeformationSettings::default() };
         let (large_scene, small_scene) = (
-            scene_from_columns(1500, columns.clone(), deformation),
-            scene_from_columns(129, first_columns.clone(), deformation),
+            scene_from_columns(vertices, columns.clone(), deformation),
+            scene_from_columns(first_vertices, first_columns.clone(), deformation),
         );
         let state = random_state(&large_scene);
         let [large_positions, small_positions] =
             [&large_scene, &small_scene].map(|scene| deform(&mut CpuDeformer::new(scene), &state).1);
-        assert_eq!(f32_bits(&large_positions[..387]), f32_bits(&small_positions), "{storage:?}");
+        assert_eq!(f32_bits(&large_positions[..3 * first_vertices]), f32_bits(&small_positions), "{storage:?}");
     }
 }
 
@@ -215,12 +215,13 @@ fn huge_tiny_and_denormal_q_stay_within_the_bound() {
     }
 }
 
-/// Terms of U q may overflow while their sum is finite. If the sum overflows, the bounds are not finite for that step
-/// only.
+/// A sum U q is correct if its terms overflow and the sum does not. If the sum overflows, the bounds of this step are
+/// not finite.
 #[test]
 fn finite_sums_survive_overflowing_terms() {
-    let mode = |entry: f32| vec![entry; 3 * 5];
-    let columns = [mode(2.0), mode(2.0), mode(1.0)].concat();
+    // u = 2 q0 + 2 q1 + q2 on all axes of five vertices.
+    let column = |entry: f32| vec![entry; 3 * 5];
+    let columns = [column(2.0), column(2.0), column(1.0)].concat();
     for storage in StorageType::ALL {
         for compensated in [false, true] {
             let deformation = DeformationSettings { storage, compensated, ..DeformationSettings::default() };
@@ -232,7 +233,8 @@ fn finite_sums_survive_overflowing_terms() {
             assert!(2.0_f32.mul_add(state.q[1], 2.0_f32.mul_add(state.q[0], 0.0)).is_infinite());
             let (summary, positions) = deform(&mut deformer, &state);
             assert!(summary.bounds.is_finite());
-            // The third mode is rounded by its storage type. The first two modes are equal and cancel.
+            // The first two modes cancel. The entry 1 of the third mode is rounded by at most half a step of int8,
+            // 1/254.
             assert!(positions.iter().all(|number| (number - 0.75).abs() <= 0.75 / 254.0), "{positions:?}");
             state.q = vec![3e38, 0.0, 1.0];
             assert!(!deform(&mut deformer, &state).0.bounds.is_finite());
@@ -260,7 +262,7 @@ fn truncation_budget_in_meters_holds_in_scene_units() {
         state.transforms[0] = Transform([2.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0]);
         let mut deformer = CpuDeformer::new(&scene);
         let (_, positions) = deform(&mut deformer, &state);
-        let truncation = deformer.truncation(0).expect("expected a truncation");
+        let truncation = deformer.truncation(0).expect("expected the truncation of domain 0");
         let retained = truncation.retained().to_vec();
         assert!(truncation.bound() > 0.0 && truncation.bound() <= 1e-3 / unit);
         assert!(retained.len() > 2 && retained.len() < 20, "{retained:?}");

@@ -1,5 +1,5 @@
-//! Frames streamed while later steps are computed: each frame shows its own step, frames keep their order, and a step
-//! is acknowledged after its frames.
+//! Frames that are streamed while later steps are computed. Each frame shows its own step, and frames and
+//! acknowledgements keep the order of the steps.
 
 use std::sync::Arc;
 
@@ -14,10 +14,12 @@ use v1::drive_scene_response::Kind as ResponseKind;
 use crate::service_harness::{Server, state_after_steps, step, strips_with_attributes, with_timeout};
 
 const SIZE: FrameSize = FrameSize::new(48, 32);
+/// Number of steps that a test sends.
 const STEPS: u64 = 30;
 /// Number of the step that is rejected because it overflows.
 const REJECTED_STEP: u64 = 13;
 
+/// Cameras with different fields of view.
 fn cameras(count: usize) -> Vec<Camera> {
     let fitted_camera = Camera::fit_to_scene(&strips_with_attributes(), SIZE.width, SIZE.height);
     (0..count).map(|index| Camera { lens: Lens::FieldOfView(30.0 + 4.0 * index as f64), ..fitted_camera }).collect()
@@ -27,6 +29,7 @@ fn frame_output(camera: Camera) -> OutputSpec {
     OutputSpec::Frame { camera, size: SIZE, frame_output: FrameOutput::Color }
 }
 
+/// Each valid step sets other coordinates of domain 1.
 fn steps() -> Vec<v1::Step> {
     let q = |number: u64| if number == REJECTED_STEP { 1e30 } else { 0.03 * number as f32 };
     (0..STEPS).map(|number| step(number, &[1], &[q(number), 0.5])).collect()
@@ -69,7 +72,8 @@ async fn start_server() -> Server {
     server
 }
 
-/// There are more cameras than frames can be in flight. Every frame shows its step, and replies to steps keep their order.
+/// There are more cameras than frames that can be in flight. Every frame shows its step, and replies keep the order of
+/// the steps.
 #[tokio::test(flavor = "multi_thread")]
 async fn frames_of_many_cameras_show_their_own_step() {
     let (server, cameras) = (start_server().await, cameras(5));

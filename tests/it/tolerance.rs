@@ -1,13 +1,14 @@
 //! Comparison of numbers with a tolerance, and a test that it detects differences.
 
-/// Absolute and relative tolerance.
+/// A number is close to an expected number e if they differ by at most `abs + rel |e|`.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Tolerance {
     pub(crate) abs: f64,
     pub(crate) rel: f64,
 }
 
-/// Describes the first element of `actual` that is not close to that of `expected`. NaN is close to nothing.
+/// Describes the first number of `actual` that is not close to the number of `expected` with the same index. NaN is
+/// close to no number. Empty lists and lists of different lengths also give a description.
 pub(crate) fn find_difference(actual: &[f32], expected: &[f64], tolerance: Tolerance) -> Option<String> {
     if actual.len() != expected.len() || expected.is_empty() {
         return Some(format!("expected {} numbers and at least one, got {}", expected.len(), actual.len()));
@@ -18,7 +19,7 @@ pub(crate) fn find_difference(actual: &[f32], expected: &[f64], tolerance: Toler
     })
 }
 
-/// Largest distance between two lists of points; infinite if a point is not finite.
+/// Largest distance between points of two lists with the same index; infinite if a coordinate is not finite.
 pub(crate) fn max_distance(actual: &[f32], expected: &[[f64; 3]]) -> f64 {
     assert_eq!(actual.len(), 3 * expected.len(), "expected three numbers per point");
     let distance = |(actual, expected): (&[f32], &[f64; 3])| {
