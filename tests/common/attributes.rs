@@ -136,7 +136,7 @@ pub(crate) fn check_separate_reads<D: Deformer>(create_deformer: impl Fn(&Arc<Sc
     .enumerate()
     {
         let (q_domains, transform_domains) = ([1, 6, step as u32 + 8], [2, 6]);
-        partial_steps::apply_random_step(&scene, &mut state, &mut random, &q_domains, &transform_domains);
+        partial_steps::randomize_q_and_transforms(&scene, &mut state, &mut random, &q_domains, &transform_domains);
         let expected = run_step(&mut create_deformer(&scene), &state);
         deformer.deform(&state).expect("expected the step to succeed");
         let actual = deformer.read(requested).expect("expected a surface").clone();
@@ -175,7 +175,7 @@ pub(crate) fn check_separate_readbacks<D: Deformer>(create_deformer: impl Fn(&Ar
     let mut pending = Vec::new();
     for step in 0..20 {
         let (q_domains, transform_domains) = ([1, 6, step % 4 + 8], [2, 6]);
-        partial_steps::apply_random_step(&scene, &mut state, &mut random, &q_domains, &transform_domains);
+        partial_steps::randomize_q_and_transforms(&scene, &mut state, &mut random, &q_domains, &transform_domains);
         let expected = run_step(&mut create_deformer(&scene), &state).surface;
         deformer.deform(&state).expect("expected the step to succeed");
         // Three requests per step. The formulas only vary the combinations of the four attributes.
@@ -209,7 +209,7 @@ pub(crate) fn check_separate_readbacks<D: Deformer>(create_deformer: impl Fn(&Ar
     // Negative control: the next step has other attributes.
     let (last_surface, _) = pending.pop().expect("expected a readback of the last step");
     let (q_domains, transform_domains) = ([1, 6], [2, 6]);
-    partial_steps::apply_random_step(&scene, &mut state, &mut random, &q_domains, &transform_domains);
+    partial_steps::randomize_q_and_transforms(&scene, &mut state, &mut random, &q_domains, &transform_domains);
     let next_surface = run_step(&mut deformer, &state).surface;
     assert!(last_surface.positions != next_surface.positions && last_surface.normals != next_surface.normals);
     assert!(last_surface.displacements != next_surface.displacements && last_surface.boxes != next_surface.boxes);
@@ -284,12 +284,12 @@ pub(crate) fn check_displacement_overflow_rejection(backend: BackendChoice) {
         (context.load_scene(&scene, BackendSettings::default()).expect("expected the scene to load"), Random(107));
     let mut valid_state = SceneState::rest(&scene);
     let (q_domains, transform_domains) = ([1, 4], [4]);
-    partial_steps::apply_random_step(&scene, &mut valid_state, &mut random, &q_domains, &transform_domains);
+    partial_steps::randomize_q_and_transforms(&scene, &mut valid_state, &mut random, &q_domains, &transform_domains);
     loaded_scene.deform(&valid_state).expect("expected a valid step");
     let valid_surface = loaded_scene.surface().expect("expected a surface").clone();
     for domain in [4, 6] {
         let mut overflowing_state = valid_state.clone();
-        partial_steps::apply_random_step(
+        partial_steps::randomize_q_and_transforms(
             &scene,
             &mut overflowing_state,
             &mut random,
@@ -306,7 +306,7 @@ pub(crate) fn check_displacement_overflow_rejection(backend: BackendChoice) {
         assert_eq!(loaded_scene.surface().expect("expected a surface"), &valid_surface);
     }
     // The next valid step sets only q of domain 8.
-    partial_steps::apply_random_step(&scene, &mut valid_state, &mut random, &[8], &[]);
+    partial_steps::randomize_q_and_transforms(&scene, &mut valid_state, &mut random, &[8], &[]);
     loaded_scene.deform(&valid_state).expect("expected a valid step");
     assert_ne!(
         loaded_scene.surface().expect("expected a surface"),

@@ -12,7 +12,7 @@ use modalcast_model::scene::{
 };
 
 use super::attributes::{find_wrong_box, with_displacements_and_boxes};
-use super::partial_steps::apply_random_step;
+use super::partial_steps::randomize_q_and_transforms;
 use super::surfaces::max_abs_error;
 use super::{StepResult, assert_within_bound, domains_beyond_bound, run_step, strip_shape};
 use crate::scenes::{self, NORMAL_MAPPED_MATERIAL, Random};
@@ -158,7 +158,7 @@ pub(crate) fn check_partial_steps_of_roots<D: Deformer>(create_deformer: impl Fn
             let two_roots = [roots[(step * 5 + 20) % 40], roots[(step * 11 + 39) % 40]];
             let transform_domains = if step == 7 { &roots[..] } else { &two_roots[..step % 3] };
             let q_domains: &[u32] = if step % 4 == 1 { &[1, 5, 64] } else { &[] };
-            apply_random_step(&scene, &mut state, &mut random, q_domains, transform_domains);
+            randomize_q_and_transforms(&scene, &mut state, &mut random, q_domains, transform_domains);
             let expected_domains = changed_domains(&scene, q_domains, transform_domains);
             assert_eq!(state.dirty_domains, DirtyDomains::Some(expected_domains.clone()), "step {step}");
             let result = run_step(&mut partial_deformer, &state);

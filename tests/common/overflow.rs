@@ -40,7 +40,7 @@ pub(crate) fn check_overflow_affects_one_step<D: Deformer>(create_deformer: impl
         for coordinate in [f32::MAX, -f32::MAX] {
             let mut overflowing_state = valid_state.clone();
             // A partial step that sets q and the transform of domain 1.
-            partial_steps::apply_random_step(&scene, &mut overflowing_state, &mut random, &[1], &[1]);
+            partial_steps::randomize_q_and_transforms(&scene, &mut overflowing_state, &mut random, &[1], &[1]);
             let first_q = scene.layout.domains[1].first_q;
             overflowing_state.q[first_q..first_q + 2].fill(coordinate);
             overflowing_state.transforms[1] = LARGE_SHEAR;
@@ -50,7 +50,7 @@ pub(crate) fn check_overflow_affects_one_step<D: Deformer>(create_deformer: impl
                 storage.name()
             );
             // The valid state does not contain the overflowing step. Its next step sets q of domain 2 only.
-            partial_steps::apply_random_step(&scene, &mut valid_state, &mut random, &[2], &[]);
+            partial_steps::randomize_q_and_transforms(&scene, &mut valid_state, &mut random, &[2], &[]);
             let result = run_step(&mut deformer, &valid_state);
             assert!(result.bounds.is_finite() && result.difference(&previous_result).is_some());
             assert_eq!(
@@ -72,13 +72,13 @@ pub(crate) fn check_overflow_rejection(backend: BackendChoice) {
         (context.load_scene(&scene, BackendSettings::default()).expect("expected the scene to load"), Random(74));
     let mut valid_state = SceneState::rest(&scene);
     let (q_domains, transform_domains) = ([0, 5], [5]);
-    partial_steps::apply_random_step(&scene, &mut valid_state, &mut random, &q_domains, &transform_domains);
+    partial_steps::randomize_q_and_transforms(&scene, &mut valid_state, &mut random, &q_domains, &transform_domains);
     loaded_scene.deform(&valid_state).expect("expected a valid step");
     let valid_surface = loaded_scene.surface().expect("expected a surface").clone();
     // The engine rejects coordinates of vertices beyond 1e18, so 1e30 is rejected although it does not overflow.
     for (domain, coordinate) in [(5, f32::MAX), (2, -f32::MAX), (5, 1e30)] {
         let mut overflowing_state = valid_state.clone();
-        partial_steps::apply_random_step(&scene, &mut overflowing_state, &mut random, &[domain], &[]);
+        partial_steps::randomize_q_and_transforms(&scene, &mut overflowing_state, &mut random, &[domain], &[]);
         overflowing_state.q[scene.layout.domains[domain as usize].first_q] = coordinate;
         let error = loaded_scene.deform(&overflowing_state).expect_err("expected an overflow error").to_string();
         eprintln!("{error}");
@@ -87,7 +87,7 @@ pub(crate) fn check_overflow_rejection(backend: BackendChoice) {
         assert!(loaded_scene.bounds().is_finite());
     }
     // The next step applies to the last valid state. It sets q of domain 6 only.
-    partial_steps::apply_random_step(&scene, &mut valid_state, &mut random, &[6], &[]);
+    partial_steps::randomize_q_and_transforms(&scene, &mut valid_state, &mut random, &[6], &[]);
     loaded_scene.deform(&valid_state).expect("expected a valid step");
     let next_surface = loaded_scene.surface().expect("expected a surface").clone();
     assert_ne!(next_surface, valid_surface, "expected the step to change vertices");

@@ -40,7 +40,7 @@ fn random_step(scene: &Scene, random: &mut Random, q_domains: &[u32], transform_
 }
 
 /// Applies a random step that sets the coordinates of `q_domains` and the transforms of `transform_domains`.
-pub(crate) fn apply_random_step(
+pub(crate) fn randomize_q_and_transforms(
     scene: &Scene,
     state: &mut SceneState,
     random: &mut Random,
@@ -192,10 +192,10 @@ fn compare_scripted_steps<D: Deformer>(name: &str, scene: &Arc<Scene>, create_de
     for ScriptedStep { q_domains, transform_domains, interruption } in scripted_steps() {
         match interruption {
             Interruption::Nothing => {}
-            Interruption::SkippedStep => apply_random_step(scene, &mut state, &mut random, &[5, 6], &[RIGID_DOMAIN]),
+            Interruption::SkippedStep => randomize_q_and_transforms(scene, &mut state, &mut random, &[5, 6], &[RIGID_DOMAIN]),
             Interruption::Overflow => {
                 let mut overflowing_state = state.clone();
-                apply_random_step(scene, &mut overflowing_state, &mut random, &[12], &[4]);
+                randomize_q_and_transforms(scene, &mut overflowing_state, &mut random, &[12], &[4]);
                 overflowing_state.transforms[4].0.fill(f32::MAX);
                 assert!(!deformers.deform(&overflowing_state, name).bounds.is_finite());
                 assert_eq!(
@@ -205,12 +205,12 @@ fn compare_scripted_steps<D: Deformer>(name: &str, scene: &Arc<Scene>, create_de
                 );
             }
             Interruption::OtherHistory => {
-                apply_random_step(scene, &mut other_state, &mut random, &[2], &[]);
+                randomize_q_and_transforms(scene, &mut other_state, &mut random, &[2], &[]);
                 let other_result = deformers.deform(&other_state, name);
                 assert!(other_result.difference(&previous_result).is_some(), "{name}: expected another result");
             }
         }
-        apply_random_step(scene, &mut state, &mut random, &q_domains, &transform_domains);
+        randomize_q_and_transforms(scene, &mut state, &mut random, &q_domains, &transform_domains);
         let result = deformers.deform(&state, name);
         if !q_domains.is_empty() || !transform_domains.is_empty() {
             assert!(result.difference(&previous_result).is_some(), "{name}: expected the step to change vertices");
@@ -272,7 +272,7 @@ pub(crate) fn relies_on_dirty_list<D: Deformer>(create_deformer: impl Fn(&Arc<Sc
     let mut state = scenes::random_state(&scene, 54);
     let previous_positions = run_step(&mut deformer, &state).surface.positions;
     // The step sets q of two domains. Then one of the two is removed from the list.
-    apply_random_step(&scene, &mut state, &mut Random(55), &[LARGE_DOMAIN, 3], &[]);
+    randomize_q_and_transforms(&scene, &mut state, &mut Random(55), &[LARGE_DOMAIN, 3], &[]);
     assert_eq!(state.dirty_domains, DirtyDomains::Some(vec![3, LARGE_DOMAIN]));
     state.dirty_domains = DirtyDomains::Some(vec![3]);
     let positions = run_step(&mut deformer, &state).surface.positions;

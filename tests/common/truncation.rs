@@ -36,7 +36,7 @@ pub(crate) fn check_error_budget<D: Deformer>(
         let (mut max_bound, mut states_beyond_rounding) = (0.0_f64, 0);
         for step in 0..20 {
             let domains = [step % 8, (step + 5) % 8];
-            partial_steps::apply_random_step(&scene, &mut state, &mut random, &domains, &domains);
+            partial_steps::randomize_q_and_transforms(&scene, &mut state, &mut random, &domains, &domains);
             // Amplitudes decrease with the mode, as for a vibrating body.
             for domain in domains {
                 let layout = scene.layout.domains[domain as usize];

@@ -59,7 +59,7 @@ fn gpu_shears_and_mirrors_equal_the_reference() {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_zero_area_and_missing_uvs_give_unit_directions() {
+fn gpu_zero_area_and_missing_uvs_give_valid_directions() {
     surfaces::check_zero_area_and_missing_uvs(cuda_deformer);
 }
 
@@ -83,7 +83,7 @@ fn gpu_truncation_errors_stay_within_the_budget() {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_mode_near_the_truncation_limit_does_not_flicker() {
+fn gpu_mode_near_the_truncation_limit_keeps_its_status() {
     truncation::check_hysteresis(cuda_deformer);
 }
 
@@ -172,7 +172,7 @@ fn gpu_two_hundred_thousand_domains_take_three_launches() {
     common::assert_within_bound("200,000 domains of 7", &scene, &state, &result.surface.positions, 0.0);
     // A partial step of a thousand domains has the bits of a full step, and no other domain moves.
     let dirty_domains: Vec<u32> = (0..1000).map(|index| index * 199 + 7).collect();
-    partial_steps::apply_random_step(&scene, &mut state, &mut random, &dirty_domains, &dirty_domains[..500]);
+    partial_steps::randomize_q_and_transforms(&scene, &mut state, &mut random, &dirty_domains, &dirty_domains[..500]);
     let partial_result = common::run_step(&mut deformer, &state);
     let mut dirty_state = state.clone();
     dirty_state.mark_all_dirty();
@@ -202,7 +202,7 @@ fn gpu_partial_steps_of_roots_move_their_followers() {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_followers_10000_km_away_keep_the_millimeter() {
+fn gpu_followers_10000_km_away_are_exact_to_1_mm() {
     followers::check_far_followers(cuda_deformer);
 }
 
@@ -248,7 +248,7 @@ fn gpu_two_hundred_thousand_leaves_follow_their_branches() {
     let mut state = scenes::random_state(&scene, 95);
     let result = common::run_step(&mut deformer, &state);
     common::assert_within_bound("200,000 leaves", &scene, &state, &result.surface.positions, 0.0);
-    partial_steps::apply_random_step(&scene, &mut state, &mut random, &[7], &[3, 999]);
+    partial_steps::randomize_q_and_transforms(&scene, &mut state, &mut random, &[7], &[3, 999]);
     let partial_result = common::run_step(&mut deformer, &state);
     common::assert_within_bound(
         "200,000 leaves, two branches moved",

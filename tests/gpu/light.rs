@@ -18,7 +18,7 @@ fn gpu_light_bounds_contain_every_vertex() {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_thin_scene_is_fitted_closely_in_light_space() {
+fn gpu_light_bounds_of_a_thin_scene_are_tight() {
     light_bounds::check_tightness(cuda_deformer);
 }
 

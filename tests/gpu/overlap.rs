@@ -64,7 +64,7 @@ fn states(scene: &Scene) -> Vec<SceneState> {
             transform_domains.retain(|domain| *domain < 20);
             transform_domains.truncate(2);
         }
-        partial_steps::apply_random_step(scene, &mut state, &mut random, &q_domains, &transform_domains);
+        partial_steps::randomize_q_and_transforms(scene, &mut state, &mut random, &q_domains, &transform_domains);
         if step % 17 == 16 {
             state.mark_all_dirty();
         }

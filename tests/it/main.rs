@@ -2,6 +2,7 @@
 
 #[path = "../common/mod.rs"]
 mod common;
+mod attribute_streams;
 mod cpu_checks;
 mod cut_outs;
 mod deformers;
@@ -16,7 +17,6 @@ mod normals;
 mod picks;
 mod pixels;
 mod raster;
-mod readers;
 mod real;
 mod restart;
 #[path = "../gpu/scenes.rs"]

@@ -158,7 +158,7 @@ impl LoadedScene {
             Some(origins) if !origins.is_uniform() => Arc::clone(origins),
             // All domains have the same origin, so the deformer's output is drawn unchanged.
             uniform_origins => {
-                buffers.set_origin(uniform_origins.as_ref().map_or([0.0; 3], |origins| origins.shared_origin()));
+                buffers.set_shared_origin(uniform_origins.as_ref().map_or([0.0; 3], |origins| origins.shared_origin()));
                 buffers.set_step(self.generation);
                 return Ok(BufferContents { bounds: self.bounds, light_bounds: self.light_bounds, is_uploaded });
             }

@@ -158,7 +158,7 @@ impl Renderer {
         self.gl.check("upload")
     }
 
-    /// Uploads positions that are drawn instead of the shared ones until the next [`SceneBuffers::set_origin`]. This is
+    /// Uploads positions that are drawn instead of the shared ones until the next [`SceneBuffers::set_shared_origin`]. This is
     /// for scenes whose domains have separate local origins, so that the shared positions have no common origin.
     /// `positions` are relative to `origin`, which is in scene units from the scene's origin.
     ///

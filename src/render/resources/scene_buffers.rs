@@ -223,7 +223,7 @@ impl SceneBuffers {
 
     /// Sets the origin of the shared positions, in scene units from the scene's origin. Later frames draw the shared
     /// positions instead of rebased ones. Before the first call, positions are relative to the scene's origin.
-    pub fn set_origin(&mut self, origin: [f64; 3]) {
+    pub fn set_shared_origin(&mut self, origin: [f64; 3]) {
         self.origin = origin;
         self.rebased = None;
     }

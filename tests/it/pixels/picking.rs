@@ -244,13 +244,13 @@ fn picks_with_a_distant_origin_or_bad_normals_are_finite() {
         SceneBuilder::new().add_domain(facing_rectangle(-1.0, -1.0, 1.0, 1.0, 0.0), Material::default()).build();
     let mut harness = PickHarness::at_rest(&scene);
     let origin = [1e7, 0.0, -1e7];
-    harness.buffers.set_origin(origin);
+    harness.buffers.set_shared_origin(origin);
     let view = View::LookAt { eye: [1e7, 0.0, 10.0 - 1e7], target: origin, up: [0.0, 1.0, 0.0] };
     let hit = harness.pick(Camera { view, ..front_camera(64) }, 64, [36, 30], [1, 1]).remove(0);
     let [x, y, _] = plane_point(36, 30);
     // Twice the tolerance, because rays at coordinates of 1e7 also have rounding errors in f64.
     assert!(max_difference(hit.position, [1e7 + x, y, -1e7]) < 2.0 * TOLERANCE, "{hit:?}");
-    harness.buffers.set_origin([0.0; 3]);
+    harness.buffers.set_shared_origin([0.0; 3]);
     for normals in [[0.0_f32; 3], [f32::NAN; 3]] {
         let positions = scene.shapes[0].mesh.rest_positions().as_flattened().to_vec();
         let surface =

@@ -409,7 +409,7 @@ fn cameras_share_the_shadow_and_rebased_scenes_use_opengl() {
         "{}",
         count_different_bytes(&rebased_image, &unshared_image)
     );
-    buffers.set_origin([0.0; 3]);
+    buffers.set_shared_origin([0.0; 3]);
     let (restored_image, _) = draw(&mut renderer, &buffers, &second_params);
     assert_eq!(restored_image.raster_backends.visibility, Some(RasterBackend::Cuda));
     assert!(restored_image.rgba == unshared_image.rgba, "expected the image before the upload again");

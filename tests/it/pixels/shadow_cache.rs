@@ -149,7 +149,7 @@ fn upload_bounds_or_origin_invalidate_the_shadow() {
         count_shadow_passes(&renderer.stats().passes)
     });
     assert_eq!(light_bounds_passes, [2, 0, 2, 0], "expected a new shadow map for other light bounds");
-    buffers.set_origin([1024.0, 0.0, 0.0]);
+    buffers.set_shared_origin([1024.0, 0.0, 0.0]);
     assert_eq!([bounds, bounds].map(|bounds| draw(&mut renderer, &buffers, bounds)), [2, 0]);
     // An upload clears the step number, so that every later frame draws its shadow map.
     renderer.upload(&buffers, &surface).expect("expected the upload to succeed");
