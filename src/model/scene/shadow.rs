@@ -66,7 +66,8 @@ pub struct ShadowSettings {
     /// Number of cascades, 1 to 4, each with a map of `size`, split by distance from the camera. Nearer cascades have
     /// finer texels; the last one covers the whole scene. `blur` is in texels of each cascade, so that shadows are
     /// sharper nearby.
-    pub splits: u32,
+    #[serde(rename = "splits")]
+    pub cascades: u32,
     pub fit: ShadowFit,
 }
 
@@ -80,7 +81,7 @@ impl Default for ShadowSettings {
             bleeding: 0.2,
             alpha_threshold: 0.5,
             moments: MomentFormat::default(),
-            splits: 1,
+            cascades: 1,
             fit: ShadowFit::default(),
         }
     }
@@ -131,13 +132,13 @@ impl ShadowSettings {
         if !(0.0..=1.0).contains(&self.alpha_threshold) || !(0.0..=1.0).contains(&self.least_variance) {
             return Err(invalid("look.shadow", "alpha_threshold and least_variance of 0 to 1", format!("{self:?}")));
         }
-        let texels = u64::from(self.size) * u64::from(self.size) * u64::from(self.splits);
-        if !(1..=4).contains(&self.splits) || texels > MAX_TEXELS {
+        let texels = u64::from(self.size) * u64::from(self.size) * u64::from(self.cascades);
+        if !(1..=4).contains(&self.cascades) || texels > MAX_TEXELS {
             let expected = format!("1 to 4 maps of at most {MAX_TEXELS} texels together");
             return Err(invalid(
                 "look.shadow.splits",
                 expected,
-                format!("{} maps of {} x {} texels", self.splits, self.size, self.size),
+                format!("{} maps of {} x {} texels", self.cascades, self.size, self.size),
             ));
         }
         Ok(())
@@ -156,9 +157,9 @@ mod tests {
             (ShadowSettings { size: 15, ..valid_shadow }, "size"),
             (ShadowSettings { blur: f32::NAN, ..valid_shadow }, "blur"),
             (ShadowSettings { bleeding: 1.0, ..valid_shadow }, "bleeding"),
-            (ShadowSettings { splits: 0, ..valid_shadow }, "splits"),
-            (ShadowSettings { splits: 5, ..valid_shadow }, "splits"),
-            (ShadowSettings { splits: 2, size: 16384, ..valid_shadow }, "splits"),
+            (ShadowSettings { cascades: 0, ..valid_shadow }, "splits"),
+            (ShadowSettings { cascades: 5, ..valid_shadow }, "splits"),
+            (ShadowSettings { cascades: 2, size: 16384, ..valid_shadow }, "splits"),
         ];
         for (shadow, field) in invalid_shadows {
             let message = shadow.check().expect_err(field).to_string();

@@ -57,7 +57,7 @@ pub(crate) fn blur(recorder: &mut PassRecorder<'_>, buffers: &SceneBuffers) -> R
         *first_program = buffer_program;
         depths.bind_storage(WORDS_BINDING);
     }
-    for layer in 0..map.shadow.splits {
+    for layer in 0..map.shadow.cascades {
         match (programs.as_slice(), &blurred.horizontal) {
             ([program], None) => {
                 let workgroups = texels_per_workgroup(&map.shadow).map(|side| map.shadow.size.div_ceil(side));
@@ -102,7 +102,7 @@ fn bind_blur(program: &Program, source: &Texture, map: &ShadowMap, layer: u32) {
 
 /// Sets the layer of the bound program. The uniform exists only if the map is split.
 fn set_layer(program: &Program, map: &ShadowMap, layer: u32) {
-    if map.shadow.splits > 1 {
+    if map.shadow.cascades > 1 {
         program.set_layer(layer);
     }
 }

@@ -96,5 +96,5 @@ pub(crate) fn shadow_defines(shadow: &ShadowSettings) -> impl Iterator<Item = &'
 
 /// Define of the number of cascades; none for a map with one cascade.
 fn cascade_define(shadow: &ShadowSettings) -> Option<&'static str> {
-    ["CASCADES 2", "CASCADES 3", "CASCADES 4"].get((shadow.splits as usize).wrapping_sub(2)).copied()
+    ["CASCADES 2", "CASCADES 3", "CASCADES 4"].get((shadow.cascades as usize).wrapping_sub(2)).copied()
 }

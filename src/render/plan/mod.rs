@@ -170,7 +170,7 @@ fn draw_calls(scene: &Scene, groups: &[DrawGroup]) -> usize {
 fn buffer_sizes(scene: &Scene, culling: Culling) -> SceneBufferSet<u64> {
     let (layout, features) = (&scene.layout, scene.features);
     let [vertices, corners, triangles] = [layout.vertices, layout.corners, layout.triangles].map(|count| count as u64);
-    let cascades = scene.look.shadow.filter(|shadow| shadow.splits > 1);
+    let cascades = scene.look.shadow.filter(|shadow| shadow.cascades > 1);
     SceneBufferSet {
         geometry: GeometryBuffers {
             positions: 12 * vertices,

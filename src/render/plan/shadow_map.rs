@@ -15,9 +15,9 @@ pub(crate) struct ShadowTexture {
 pub(crate) fn shadow_textures(shadow: &ShadowSettings, blur_method: BlurMethod) -> Vec<ShadowTexture> {
     let texture = |name, texel_bytes, layers| ShadowTexture { name, texel_bytes, layers };
     let moment_bytes = if shadow.moments == MomentFormat::F16 { 4 } else { 8 };
-    let mut textures = vec![texture("shadow depth", 4, shadow.splits)];
+    let mut textures = vec![texture("shadow depth", 4, shadow.cascades)];
     if shadow.has_moments() {
-        textures.push(texture("shadow moments", moment_bytes, shadow.splits));
+        textures.push(texture("shadow moments", moment_bytes, shadow.cascades));
         if matches!(blur_method, BlurMethod::Rows | BlurMethod::Fragments) {
             textures.push(texture("shadow moments, blurred in x", moment_bytes, 1));
         }

@@ -65,7 +65,7 @@ impl RasterPasses {
     /// visibility pass needs one sample per pixel and no blended triangles, because no depth image is written.
     pub(crate) fn supported(scene: &Scene) -> Self {
         let look = &scene.look;
-        let is_shadow_supported = look.shadow.is_some_and(|shadow| shadow.has_moments() && shadow.splits == 1);
+        let is_shadow_supported = look.shadow.is_some_and(|shadow| shadow.has_moments() && shadow.cascades == 1);
         let has_triangles = scene.layout.triangles > 0;
         Self {
             shadow: has_triangles && is_shadow_supported,

@@ -308,8 +308,8 @@ impl SceneBuffers {
 
     /// Key of the shadow map for this frame; none if other frames cannot share the map.
     pub(crate) fn shadow_key(&self, params: &FrameParams) -> Option<ShadowKey> {
-        let splits = self.scene.look.shadow.map_or(1, |shadow| shadow.splits);
-        self.shadow_cache.key(params, self.origin).filter(|_| splits == 1)
+        let cascades = self.scene.look.shadow.map_or(1, |shadow| shadow.cascades);
+        self.shadow_cache.key(params, self.origin).filter(|_| cascades == 1)
     }
 
     /// Culling method; never the automatic choice.

@@ -35,9 +35,9 @@ impl ShadowMap {
         if shadow.size > max_size {
             return Err(gl::too_large("look.shadow.size", u64::from(max_size), u64::from(shadow.size)));
         }
-        let depth = create_image(gl, &shadow, gl::DEPTH_COMPONENT32F, gl::NEAREST, shadow.splits)?;
+        let depth = create_image(gl, &shadow, gl::DEPTH_COMPONENT32F, gl::NEAREST, shadow.cascades)?;
         let framebuffers =
-            (0..shadow.splits).map(|layer| gl.layer_framebuffer(&depth, true, layer)).collect::<Result<_>>()?;
+            (0..shadow.cascades).map(|layer| gl.layer_framebuffer(&depth, true, layer)).collect::<Result<_>>()?;
         let blurred = if shadow.has_moments() { Some(BlurredMoments::new(gl, &shadow, blur_method)?) } else { None };
         Ok(Self { shadow, blur_method, depth, framebuffers, blurred })
     }
@@ -56,7 +56,7 @@ impl ShadowMap {
 impl BlurredMoments {
     fn new(gl: &Rc<Gl>, shadow: &ShadowSettings, blur_method: BlurMethod) -> Result<Self> {
         let format = if shadow.moments == MomentFormat::F16 { gl::RG16F } else { gl::RG32F };
-        let moments = create_image(gl, shadow, format, gl::LINEAR, shadow.splits)?;
+        let moments = create_image(gl, shadow, format, gl::LINEAR, shadow.cascades)?;
         let horizontal = match blur_method {
             BlurMethod::Auto | BlurMethod::Tiles => None,
             BlurMethod::Rows | BlurMethod::Fragments => Some(create_image(gl, shadow, format, gl::NEAREST, 1)?),
@@ -64,7 +64,7 @@ impl BlurredMoments {
         let mut framebuffers = Vec::new();
         if let Some(horizontal) = horizontal.as_ref().filter(|_| blur_method == BlurMethod::Fragments) {
             framebuffers.push(gl.layer_framebuffer(horizontal, false, 0)?);
-            for layer in 0..shadow.splits {
+            for layer in 0..shadow.cascades {
                 framebuffers.push(gl.layer_framebuffer(&moments, false, layer)?);
             }
         }

@@ -90,7 +90,7 @@ impl ShaderOptions {
 
     /// Cascade lookups; empty if the shadow map is not split.
     pub(crate) fn cascade_source(&self) -> &'static str {
-        if self.features.shadow.is_some_and(|shadow| shadow.splits > 1) { CASCADES } else { "" }
+        if self.features.shadow.is_some_and(|shadow| shadow.cascades > 1) { CASCADES } else { "" }
     }
 
     /// Draws triangles with this blend mode into the shadow map. Opaque triangles need no fragment shader.
@@ -279,9 +279,9 @@ mod tests {
                 !options.sun_visibility().contains("CascadeBlock")
                     && !options.shadow(BlendMode::Opaque).stages[0].1.contains("CascadeBlock")
             );
-            let cascaded = ShaderOptions { features: features(ShadowSettings { splits: 3, ..shadow }), ..options };
+            let cascaded = ShaderOptions { features: features(ShadowSettings { cascades: 3, ..shadow }), ..options };
             assert!(cascaded.sun_visibility().contains("CascadeBlock"));
-            let four_cascades = features(ShadowSettings { splits: 4, ..shadow });
+            let four_cascades = features(ShadowSettings { cascades: 4, ..shadow });
             assert_eq!(four_cascades.defines().last(), Some(&"CASCADES 4"));
         }
     }

@@ -29,7 +29,7 @@ const _: () =
 impl ShadowCascades {
     /// Fits the cascades of one frame. `box_params` and the positions are relative to `origin`.
     pub(crate) fn new(scene: &Scene, params: &FrameParams, box_params: &LightBoxParams, origin: [f64; 3]) -> Self {
-        let count = scene.look.shadow.unwrap_or_default().splits as usize;
+        let count = scene.look.shadow.unwrap_or_default().cascades as usize;
         let whole_box = LightBox::fit(box_params);
         let camera = params.camera.relative_to(origin);
         let (min_depth, max_depth) = visible_depth_range(&camera, box_params);
@@ -188,10 +188,10 @@ mod tests {
 
     #[test]
     fn extreme_cameras_give_finite_cascades() {
-        let scene = |splits: u32| {
+        let scene = |cascades: u32| {
             let mut parts =
                 crate::scene_data::geometry::tests::squares(vec![modalcast_model::domain::Material::default()]);
-            parts.look.shadow = Some(modalcast_model::scene::ShadowSettings { splits, ..Default::default() });
+            parts.look.shadow = Some(modalcast_model::scene::ShadowSettings { cascades, ..Default::default() });
             Scene::new(parts).expect("a valid scene")
         };
         let params_with = |near: f64, far: f64, eye: [f64; 3]| {

@@ -365,11 +365,11 @@ fn triangles_without_a_sample_are_culled() {
 
 #[test]
 fn shadows_of_culled_casters_are_bit_identical() {
-    for (method, splits) in [(ShadowMethod::Standard, 1), (ShadowMethod::Variance, 1), (ShadowMethod::Standard, 3)] {
+    for (method, cascades) in [(ShadowMethod::Standard, 1), (ShadowMethod::Variance, 1), (ShadowMethod::Standard, 3)] {
         let builder = || {
             let mut builder = mixed_builder(1, Transparency::OrderIndependent);
             builder.parts.look.sun = [0.3, 0.8, 0.4];
-            builder.parts.look.shadow = Some(ShadowSettings { size: 128, method, splits, ..ShadowSettings::default() });
+            builder.parts.look.shadow = Some(ShadowSettings { size: 128, method, cascades, ..ShadowSettings::default() });
             builder
         };
         let frames = assert_same_frames(&builder, &|harness| {
@@ -377,10 +377,10 @@ fn shadows_of_culled_casters_are_bit_identical() {
         });
         let shadow_stats = frames[0].culled().shadow;
         assert!(
-            shadow_stats.no_sample > 100 * splits && shadow_stats.back_facing == 0 && shadow_stats.occluded == 0,
+            shadow_stats.no_sample > 100 * cascades && shadow_stats.back_facing == 0 && shadow_stats.occluded == 0,
             "{shadow_stats:?}"
         );
-        assert_eq!(shadow_stats.visible + shadow_stats.culled(), splits * MIXED_TRIANGLES);
+        assert_eq!(shadow_stats.visible + shadow_stats.culled(), cascades * MIXED_TRIANGLES);
     }
 }
 

@@ -96,7 +96,7 @@ fn far_scene_renders_like_the_scene_at_the_origin() {
         (Some(base), grid_position, 0),
         (Some(ShadowSettings { method: ShadowMethod::Standard, ..base }), grid_position, 0),
         (Some(ShadowSettings { method: ShadowMethod::PercentageCloser, ..base }), grid_position, 0),
-        (Some(ShadowSettings { splits: 3, ..base }), grid_position, 0),
+        (Some(ShadowSettings { cascades: 3, ..base }), grid_position, 0),
         (None, FAR_POSITION, 9),
     ];
     for (shadow, position, max_different_pixels) in cases {

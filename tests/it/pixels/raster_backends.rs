@@ -348,7 +348,7 @@ fn opengl_draws_frames_that_compute_does_not_support() {
         RasterBackends { shadow: cuda, visibility: opengl },
         "four samples per pixel"
     );
-    let cascades = ShadowSettings { splits: 2, ..base };
+    let cascades = ShadowSettings { cascades: 2, ..base };
     assert_eq!(raster_backends(yard_builder(Some(cascades), 1)), RasterBackends { shadow: opengl, visibility: cuda });
     let standard = ShadowSettings { method: modalcast_model::scene::ShadowMethod::Standard, ..base };
     assert_eq!(raster_backends(yard_builder(Some(standard), 1)), RasterBackends { shadow: opengl, visibility: cuda });

@@ -14,10 +14,10 @@ use modalcast_render::{FrameParams, Pass, Renderer, SceneBuffers};
 use super::harness::open_renderer;
 use super::shadow::{create_builder, with_square};
 
-/// A cut-out square and an opaque square that float above the ground. `splits` is the number of cascades.
-fn create_scene(splits: u32) -> Arc<Scene> {
+/// A cut-out square and an opaque square that float above the ground. `cascades` is the number of cascades.
+fn create_scene(cascades: u32) -> Arc<Scene> {
     let mut builder = with_square(create_builder(), AlphaMode::Mask { cutoff: 0.5 }, 1.0);
-    builder.parts.look.shadow = Some(ShadowSettings { size: 256, splits, ..ShadowSettings::default() });
+    builder.parts.look.shadow = Some(ShadowSettings { size: 256, cascades, ..ShadowSettings::default() });
     builder.add_domain(super::harness::floor_mesh(0.5, 2.0), Material::default()).build()
 }
 
@@ -111,7 +111,7 @@ fn view_dependent_shadows_are_drawn_for_each_frame() {
     assert_eq!(
         pass_counts(&render_two_steps(&create_scene(2), SceneBuffers::set_step)),
         [2; 4],
-        "expected a shadow map per frame with splits"
+        "expected a shadow map per frame with cascades"
     );
     // Both steps have the number 7.
     let frames = render_two_steps(&create_scene(1), |buffers, _| buffers.set_step(7));

@@ -17,8 +17,8 @@ fn shadow_settings() -> [ShadowSettings; 5] {
         base,
         ShadowSettings { method: ShadowMethod::Standard, ..base },
         ShadowSettings { method: ShadowMethod::PercentageCloser, ..base },
-        ShadowSettings { splits: 4, ..base },
-        ShadowSettings { size: 16, blur: 16.0, splits: 2, method: ShadowMethod::PercentageCloser, ..base },
+        ShadowSettings { cascades: 4, ..base },
+        ShadowSettings { size: 16, blur: 16.0, cascades: 2, method: ShadowMethod::PercentageCloser, ..base },
     ]
 }
 

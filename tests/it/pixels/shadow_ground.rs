@@ -28,7 +28,7 @@ fn ground_is_lit_at_the_border_of_the_map() {
         (BlurMethod::Tiles, base),
         (BlurMethod::Fragments, base),
         (BlurMethod::Auto, ShadowSettings { method: ShadowMethod::PercentageCloser, ..base }),
-        (BlurMethod::Auto, ShadowSettings { splits: 2, ..base }),
+        (BlurMethod::Auto, ShadowSettings { cascades: 2, ..base }),
     ];
     let unshadowed = render_ground(&mut open_renderer(), None, false);
     // Number of bytes that differ by more than two levels.
@@ -78,7 +78,7 @@ fn lit_wall_is_fully_lit_down_to_the_ground() {
             let base = ShadowSettings { size, blur, bleeding: 0.2, ..ShadowSettings::default() };
             for shadow in [
                 base,
-                ShadowSettings { splits: 3, ..base },
+                ShadowSettings { cascades: 3, ..base },
                 ShadowSettings { method: ShadowMethod::PercentageCloser, ..base },
             ] {
                 let [not_lit, _] = count_wall_pixels(shadow, false);

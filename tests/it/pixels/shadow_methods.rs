@@ -214,7 +214,7 @@ fn no_method_shadows_a_lit_surface() {
             ShadowSettings { method: ShadowMethod::Standard, ..base },
             ShadowSettings { method: ShadowMethod::PercentageCloser, ..base },
             ShadowSettings { method: ShadowMethod::PercentageCloser, blur: 4.0, ..base },
-            ShadowSettings { splits: 4, ..base },
+            ShadowSettings { cascades: 4, ..base },
         ];
         for shadow in cases {
             assert_eq!(count_self_shadowed(&[], shadow, sun), 0, "{sun:?} {shadow:?}");
@@ -255,22 +255,22 @@ fn f16_moments_leak_light_near_the_caster() {
     assert!(lit_pixels > 400, "expected more than 400 lit pixels of 4096, got {lit_pixels}");
 }
 
-/// Number of half-lit pixels in the middle column of a close-up of the edge, with `splits` cascades.
-fn count_half_lit(splits: u32) -> usize {
+/// Number of half-lit pixels in the middle column of a close-up of the edge, with `cascades` cascades.
+fn count_half_lit(cascades: u32) -> usize {
     let view = View::LookAt { eye: [0.0, 2.0, 4.0], target: [0.0, 0.0, 1.0], up: [0.0, 1.0, 0.0] };
     let lens = Lens::Intrinsics { fx: 400.0, fy: 400.0, cx: 64.0, cy: 64.0 };
-    let scene = square_scene(ShadowSettings { size: 64, splits, ..variance_settings() });
+    let scene = square_scene(ShadowSettings { size: 64, cascades, ..variance_settings() });
     let frame = render_square(&mut open_renderer(), &scene, Camera { view, lens, near: 0.0, far: 0.0 }, 128);
     let column: Vec<f64> = (0..128).map(|row| sun_visibility(frame.pixel(64, row))).collect();
     assert!(
         column[0] < 0.1 && column[127] > 0.9,
-        "{splits} cascades: expected a dark first row and a lit last row, got {column:?}"
+        "{cascades} cascades: expected a dark first row and a lit last row, got {column:?}"
     );
     column.iter().filter(|sun_visibility| (0.1..0.9).contains(*sun_visibility)).count()
 }
 
 #[test]
-fn splits_give_near_shadows_finer_texels() {
+fn cascades_give_near_shadows_finer_texels() {
     let (pixels_of_one_map, pixels_of_four_maps) = (count_half_lit(1), count_half_lit(4));
     assert!(
         pixels_of_one_map > 30 && pixels_of_four_maps > 0 && 3 * pixels_of_four_maps <= pixels_of_one_map,
@@ -305,9 +305,9 @@ fn unused_shadow_resources_are_not_allocated() {
             ShadowResources { has_blur_pass: false, textures: vec!["shadow depth".into()], has_cascades: false };
         assert_eq!(resources_of(ShadowSettings { method, ..base }), expected);
     }
-    for (splits, has_cascades) in [(1, false), (2, true)] {
+    for (cascades, has_cascades) in [(1, false), (2, true)] {
         let textures = vec!["shadow depth".into(), "shadow moments".into()];
         let expected = ShadowResources { has_blur_pass: true, textures, has_cascades };
-        assert_eq!(resources_of(ShadowSettings { splits, ..base }), expected);
+        assert_eq!(resources_of(ShadowSettings { cascades, ..base }), expected);
     }
 }

@@ -188,9 +188,9 @@ impl RenderVariant {
 
     /// Cascaded maps, which are sharper near the camera. The intended result is the hard shadow, because the width of
     /// the blur varies with the cascade.
-    fn with_splits(size: u32, splits: u32) -> Self {
-        let shadow = ShadowSettings { size, splits, ..ShadowSettings::default() };
-        let name = format!("variance {size}, {splits} splits");
+    fn with_cascades(size: u32, cascades: u32) -> Self {
+        let shadow = ShadowSettings { size, cascades, ..ShadowSettings::default() };
+        let name = format!("variance {size}, {cascades} splits");
         Self {
             name,
             method: ShadowVariant::Variance,
@@ -251,7 +251,7 @@ pub fn all(quick: bool) -> Vec<RenderVariant> {
     }
     variants.extend([2048, 4096].map(RenderVariant::with_f16_moments));
     variants.extend(BLUR_DEVIATIONS[1..].iter().map(|blur| RenderVariant::without_bleeding_reduction(1024, *blur)));
-    variants.extend((2..=4).map(|splits| RenderVariant::with_splits(1024, splits)));
+    variants.extend((2..=4).map(|cascades| RenderVariant::with_cascades(1024, cascades)));
     variants.push(RenderVariant::with_corner_fit(2048));
     let blur_methods = [("tiles", BlurMethod::Tiles), ("rows", BlurMethod::Rows), ("fragments", BlurMethod::Fragments)];
     // Blurs of 25 taps per direction, and of 15.
@@ -287,7 +287,7 @@ fn quick_variants() -> Vec<RenderVariant> {
         RenderVariant::with_standard_map(1024),
         RenderVariant::with_filtered_map(1024, BLUR_DEVIATIONS[1]),
         RenderVariant::with_f16_moments(2048),
-        RenderVariant::with_splits(1024, 3),
+        RenderVariant::with_cascades(1024, 3),
         RenderVariant::with_corner_fit(2048),
         RenderVariant::with_transparency("exact transparency", Transparency::OrderIndependent),
         RenderVariant::with_transparency("two-pass transparency", Transparency::TwoPass),
