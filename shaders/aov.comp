@@ -1,11 +1,12 @@
-// AOV (arbitrary output variable) readback of one field: DEPTH, NORMALS or VALUES.
+// AOV (arbitrary output variable) readback of one field: DEPTH, NORMALS or VALUES. The macro of that name is defined.
 //   ids      (in)  [height][width][SAMPLES]  R32UI, bottom row first
 //   values   (in)  [vertices]                a scalar per vertex, with VALUES
 //   words    (out) top row first, one of
-//     DEPTH    [height][width]           f32 along the view axis times `scale`; infinite without an id
-//     NORMALS  [height][width][3]        f32, unit normal on the visible side; zeros without an id
-//     VALUES   [height][width][SAMPLES]  value times `scale`, and the cosine to the eye, 16 bits each. Both are 0
-//                                        without an id; otherwise the cosine is at least 1 / 65535.
+//     DEPTH    [height][width]           f32: depth along the view axis times `scale`; infinite without an id
+//     NORMALS  [height][width][3]        f32: unit normal of the visible side; zeros without an id
+//     VALUES   [height][width][SAMPLES]  value times `scale`, and the cosine between the normal and the direction to the
+//                                        eye, 16 bits each. Both are 0 without an id; otherwise the cosine is at least
+//                                        1 / 65535.
 layout(local_size_x = WORKGROUP_SIZE) in;
 layout(location = 0) uniform int scale_bits; // `scale` as the bits of a float
 layout(std430, binding = 0) writeonly buffer Words { uint words[]; };
@@ -22,22 +23,17 @@ struct SurfacePoint {
     ivec3 vertices;
 };
 
-SurfacePoint interpolate_surface(int triangle, vec2 ndc) {
+SurfacePoint interpolate_surface(int triangle_index, vec2 ndc) {
+    Triangle triangle = fetch_triangle(triangle_index, ndc);
+    // The derivatives are not used, so the pixel size is 0.
+    Barycentrics bary = compute_barycentrics(triangle.clip[0], triangle.clip[1], triangle.clip[2], vec2(0.0));
     SurfacePoint surface;
-    ivec3 corners = ivec3(texelFetch(triangle_corners, triangle).xyz);
-    surface.vertices = ivec3(texelFetch(triangle_vertices, triangle).xyz);
-    mat3 world, clip, normal;
-    for (int corner = 0; corner < 3; corner++) {
-        world[corner] = texelFetch(positions, surface.vertices[corner]).xyz;
-        vec4 corner_clip = to_clip(world[corner]);
-        clip[corner] = vec3(corner_clip.xy - ndc * corner_clip.w, corner_clip.w);
-        surface.depths[corner] = corner_clip.w;
-        normal[corner] = texelFetch(normals, corners[corner]).xyz;
-    }
-    Barycentrics bary = compute_barycentrics(clip[0], clip[1], clip[2], vec2(0.0));
     surface.weights = bary.weights;
-    surface.world = world * surface.weights;
-    surface.normal = bary.is_front_facing ? normal * surface.weights : -(normal * surface.weights);
+    surface.depths = vec3(triangle.clip[0].z, triangle.clip[1].z, triangle.clip[2].z);
+    surface.world = triangle.world * surface.weights;
+    vec3 normal = triangle.normal * surface.weights;
+    surface.normal = bary.is_front_facing ? normal : -normal;
+    surface.vertices = triangle.vertices;
     return surface;
 }
 

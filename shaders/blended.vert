@@ -1,4 +1,5 @@
-// Projects a corner of a blended triangle. Position, normal and tangent are already deformed.
+// Projects a corner of a blended triangle: a vertex with normal and texture coordinates. Position, normal and tangent
+// are already deformed.
 layout(location = 0) in uint vertex;
 layout(location = 1) in vec3 normal;
 layout(binding = 13) uniform samplerBuffer positions;

@@ -1,6 +1,6 @@
-// Downsamples by two. Texel d is the mean of the texels 2 d - 1 to 2 d + 2 in each direction with weights 1, 3, 3, 1, a
-// quadratic B-spline (pyramid of Burt and Adelson 1983). The weights preserve sum and centroid. The edge texel is
-// repeated outside the image, which also preserves the sum for even sizes.
+// Downsamples by two. Texel d is the mean of the texels 2 d - 1 to 2 d + 2 in each direction with weights 1, 3, 3, 1: a
+// quadratic B-spline (pyramid of Burt and Adelson 1983). The weights preserve sum and centroid. Outside the image the
+// edge texel is repeated. For even sizes, the sum is preserved there too.
 //   source       (in)   [height][width]                RGBA16F
 //   destination  (out)  [ceil height/2][ceil width/2]  RGBA16F
 layout(local_size_x = TILE, local_size_y = TILE) in;

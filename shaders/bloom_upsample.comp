@@ -1,7 +1,8 @@
 // Upsamples by two and adds the result to the next finer level. The nearest two texels in each direction have the
 // weights 3/4 and 1/4 (Chaikin 1974); repeated, this converges to a quadratic B-spline. All levels have the same weight:
-// `source` is the mean of `coarser_levels` levels. With COMPOSITE, adds the glow to the shaded image, from which the
-// shading has subtracted the bloom light: inverts the tone curve, adds the glow, and applies the curve again.
+// `source` is the mean of `coarser_levels` levels, and `destination` becomes the mean of one more. With COMPOSITE,
+// `destination` is the shaded image, from which the shading has subtracted the bloom light: the shader inverts the tone
+// curve, adds the glow, and applies the tone curve again.
 //   source       (in)         [ceil height/2][ceil width/2]  RGBA16F
 //   destination  (in, out)    [height][width]                RGBA16F
 layout(local_size_x = TILE, local_size_y = TILE) in;

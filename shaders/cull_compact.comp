@@ -1,6 +1,6 @@
-// Compacts the triangles whose bits are set, in draw order. A group's list begins at the group's first triangle. The
-// offset of a block is a prefix sum: totals of the preceding superblocks plus bits of the preceding blocks. So the
-// order does not depend on scheduling.
+// Compacts the triangles whose bits are set to index lists in draw order. A group's list begins at the group's first
+// triangle. The offset of a block in the list is a prefix sum: totals of the group's preceding superblocks, plus bits of
+// the preceding blocks in the same superblock. So the order does not depend on scheduling.
 //   indices       (out)  [triangles][3]  of vertices, or of corners
 //   triangle_ids  (out)  [triangles]     index in the draw order, which the fragments write as id
 layout(local_size_x = WORKGROUP_SIZE) in;
@@ -9,7 +9,7 @@ layout(binding = 18) uniform usamplerBuffer triangle_vertices;
 layout(std430, binding = 5) writeonly buffer TriangleIds { uint triangle_ids[]; };
 layout(std430, binding = 6) writeonly buffer Indices { uint indices[]; };
 
-shared uint preceding_count;
+shared uint preceding_count; // visible triangles of the group in preceding blocks
 
 void main() {
     if (workgroup_index() >= groups.count.y) return;

@@ -1,6 +1,8 @@
-// Builds the Hi-Z pyramid: each texel is the farthest depth of 2 x 2 texels of the level below. A dispatch adds four
-// levels to the first one; a workgroup reduces 16 x 16 texels. The levels are stored one after another, each with half
-// the width and height, rounded up. Texels outside the image count as 0, so that they do not change a maximum.
+// Builds the Hi-Z pyramid: each texel is the farthest depth of 2 x 2 texels of the next finer level. The levels are
+// stored one after another, finest first, each with half the width and height, rounded up. A workgroup reduces 16 x 16
+// texels, so a dispatch computes four further levels. The first dispatch (FROM_DEPTH) also writes level 0, the maximum of
+// each pixel's samples; the second begins at level 4. Texels outside the image count as 0, so that they do not change a
+// maximum.
 layout(local_size_x = 16, local_size_y = 16) in;
 layout(location = 0) uniform int size_packed; // width, and height shifted by 16: negative from 32768 on
 layout(std430, binding = 4) buffer DepthPyramid { float depths[]; };
@@ -14,7 +16,7 @@ const int FIRST_LEVEL = 0;
 #else
 const int FIRST_LEVEL = 4;
 #endif
-shared float farthest[16][16];
+shared float farthest[16][16]; // depths of the current level in this workgroup
 
 void main() {
     ivec2 size = ivec2(size_packed & 0xFFFF, size_packed >> 16 & 0xFFFF), texel = ivec2(gl_GlobalInvocationID.xy);
@@ -36,6 +38,7 @@ void main() {
 #endif
     }
     farthest[lane.y][lane.x] = max_depth;
+    // `side`: texels of the next level that the workgroup computes in each direction.
     for (int side = 8; side > 0; side /= 2) {
         memoryBarrierShared();
         barrier();

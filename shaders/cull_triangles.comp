@@ -1,12 +1,17 @@
 // Selects the triangles that the rasterizer must process: all except those that certainly cover no sample. Each bound is
 // widened by the rounding errors between a vertex and its position on the device's subpixel grid, so that culling does
 // not change the image. A triangle that the rasterizer may have to clip is culled only if it lies entirely outside one
-// clip plane.
+// clip plane. The shader has four variants:
+//   (none)         for the camera
+//   CULL_OCCLUDED  for the camera, also against the depth pyramid of the triangles drawn by CULL_PREVIOUS
+//   CULL_PREVIOUS  selects the triangles that were visible in the last frame, without a test
+//   CULL_SHADOW    for the shadow map
 layout(local_size_x = WORKGROUP_SIZE) in;
 layout(location = 0) uniform int size_packed; // width, and height shifted by 16: negative from 32768 on
 layout(binding = 13) uniform samplerBuffer positions;
 layout(binding = 18) uniform usamplerBuffer triangle_vertices;
 
+// Classes of triangles, in the order of the counters.
 const uint VISIBLE = 0u;
 const uint OUTSIDE = 1u;
 const uint BACK_FACING = 2u;
@@ -21,14 +26,14 @@ layout(std430, binding = 2) buffer CullCounters { uint cull_counters[2u * CLASS_
 layout(std430, binding = 3) buffer PreviouslyVisible { uint previously_visible[]; };
 #endif
 
-shared uint mask_words[MASK_WORDS];
+shared uint mask_words[MASK_WORDS]; // bits of the block's visible triangles
 shared uint class_counts[CLASS_COUNT];
 
 #ifndef CULL_PREVIOUS
 // Bound on the difference of two evaluations of a matrix-vector product, relative to the sum of the terms' magnitudes.
-// In each evaluation, four products and three sums round by 2^-24 of that sum.
+// In each evaluation, four products and three sums round by 2^-24 of that sum: 14 roundings, bounded by 2^-20.
 const float ROUNDING = 1.0 / 1048576.0;
-// Error of a float of magnitude 1 after a few operations.
+// Relative error of a float after four roundings: 2^-22.
 const float FLOAT_ERROR = 1.0 / 4194304.0;
 // Above this magnitude of the terms, one evaluation may overflow and another may not.
 const float LARGE = 1e30;
@@ -60,7 +65,7 @@ ClipVertex project_vertex(vec3 world) {
 }
 #endif
 
-// A vertex that is not finite is placed in front of the near plane, as in the vertex shaders.
+// A vertex that is not finite is placed in front of the near plane, as `to_clip` does for the vertex shaders.
 ClipVertex clip_vertex(vec3 world) {
     bool is_not_finite = any(isnan(world)) || any(isinf(world));
     if (is_not_finite) return ClipVertex(vec4(0.0, 0.0, -2.0, 1.0), vec4(0.0));
@@ -70,7 +75,8 @@ ClipVertex clip_vertex(vec3 world) {
 #ifdef CULL_OCCLUDED
 layout(std430, binding = 4) readonly buffer DepthPyramid { float depths[]; };
 
-// Whether all pixels of a rectangle are nearer than `depth` in the pyramid.
+// Whether all pixels of a rectangle have drawn surfaces nearer than `depth`. Looks them up in the finest level in which
+// the rectangle spans at most 4 x 4 texels. `size`: width and height of the image.
 bool is_occluded(uvec2 min_pixel, uvec2 max_pixel, uvec2 size, float depth) {
     uint level = 0u, level_offset = 0u;
     while (level < MAX_LEVEL && any(greaterThan((max_pixel >> level) - (min_pixel >> level), uvec2(3u)))) {
@@ -123,8 +129,8 @@ uint classify_unclipped(ClipVertex corners[3], bool is_single_sided) {
 #ifdef CULL_OCCLUDED
     float min_area = abs(area) - area_error;
     if (!(min_area > 0.0)) return VISIBLE;
-    // `slope` is an upper bound of the depth slope per pixel. `margin` bounds the depth difference of the exact plane and
-    // the plane through the rounded corners, at a sample outside the triangle by up to the rounding error.
+    // `slope` is an upper bound of the depth slope per pixel. `margin` bounds the depth difference between the exact plane
+    // and the plane through the rounded corners, also at a sample that is outside the triangle by the rounding error.
     vec2 depth_change = abs(vec2(depth[1], depth[2]) - depth[0]) + 2.0 * depth_error;
     float slope = (depth_change.x * (abs(edge_ac.x) + abs(edge_ac.y)) + depth_change.y * (abs(edge_ab.x) + abs(edge_ab.y))) / min_area;
     vec2 extent = max_position - min_position;
@@ -172,7 +178,7 @@ void main() {
     memoryBarrierShared();
     barrier();
     uint word = block.index * MASK_WORDS + lane / 32u, bit = 1u << (lane & 31u);
-    if (block.in_range) {
+    if (block.has_triangle) {
 #ifdef CULL_PREVIOUS
         uint triangle_class = (previously_visible[word] & bit) != 0u ? VISIBLE : OUTSIDE;
 #else
@@ -191,7 +197,7 @@ void main() {
     if (lane < MASK_WORDS) {
         bits[block.index * MASK_WORDS + lane] = mask_words[lane];
 #ifdef CULL_OCCLUDED
-        // The occluders of this frame are drawn. Clear the bitmap for the ids of this frame.
+        // This frame's occluders are already drawn. Clear the bitmap, so that the frame's visible triangles can be recorded.
         previously_visible[block.index * MASK_WORDS + lane] = 0u;
 #endif
     }

@@ -6,8 +6,8 @@ layout(std430, binding = 0) writeonly buffer Pixels { uint pixels[]; };
 
 #ifdef DITHER
 // Threshold of ordered dithering for a pixel, in output levels (Bayer 1973). Each of -63/128 to 63/128 in steps of 1/64
-// occurs once in every 8 x 8 pixels. The bits of `rank` alternate between x ^ y and y, lowest bits first. The mean over
-// 8 x 8 pixels is exact to 1/64 level, and a value exactly on a level does not change.
+// occurs once in every 8 x 8 pixels. The bits of `rank`, highest first, are bits 0 of x ^ y and y, then their bits 1, then
+// their bits 2. The mean over 8 x 8 pixels is exact to 1/64 level, and a value exactly on a level does not change.
 float bayer_threshold(ivec2 pixel) {
     uint x = uint(pixel.x ^ pixel.y), y = uint(pixel.y);
     uint rank = (x & 1u) << 5 | (y & 1u) << 4 | (x & 2u) << 2 | (y & 2u) << 1 | (x & 4u) >> 1 | (y & 4u) >> 2;
@@ -24,6 +24,7 @@ void main() {
 #else
     vec3 linear = texelFetch(scene_color, pixel, 0).rgb;
 #endif
+    // sRGB transfer function (IEC 61966-2-1).
     vec3 curve = 1.055 * pow(max(linear, vec3(1e-6)), vec3(1.0 / 2.4)) - 0.055;
     vec3 encoded = mix(curve, 12.92 * linear, lessThanEqual(linear, vec3(0.0031308)));
 #ifdef DITHER

@@ -1,6 +1,6 @@
-// Allocates the list of each pixel. A tile allocates its records contiguously; an exclusive prefix sum over its pixels
-// gives the offset of each list. The order of the tiles varies, but does not affect the image. Appends the tiles with
-// fragments to the tile list.
+// Allocates the list of each pixel. A tile allocates its records contiguously; a prefix sum over its pixels gives the
+// offset of each list. The order of the tiles varies, but does not affect the image. Tiles with fragments are appended
+// to the tile list.
 layout(local_size_x = TILE, local_size_y = TILE) in;
 layout(std430, binding = 2) writeonly buffer Records { uint records[]; };
 shared uint scan[TILE * TILE];
@@ -8,11 +8,10 @@ shared uint per_pixel_limit;
 shared uint tile_first_record;
 shared uint tile_has_fragments;
 
-// Maximum number of records per pixel for which all lists fit the budget; UNBOUNDED if all fragments fit. Let b_k be the
-// number of pixels with k fragments. Raising the limit from k to k + 1 needs a record for each pixel with more than k
-// fragments: the sum of b_j over j > k.
+// Maximum number of records per pixel for which all lists fit the budget; UNBOUNDED if all fragments fit. Raising the
+// limit from k to k + 1 needs one more record for each pixel with more than k fragments.
 uint fit_per_pixel_limit() {
-    if (counters.total[1] == 0u && counters.total[0] <= counters.budget) return UNBOUNDED;
+    if (counters.fragment_total[1] == 0u && counters.fragment_total[0] <= counters.budget) return UNBOUNDED;
     uint pixels_above = 0u;
     for (int bin = 0; bin < BINS; bin++) pixels_above += counters.bins[bin];
     uint record_count = 0u, limit = 0u;
@@ -31,7 +30,7 @@ void main() {
         per_pixel_limit = fit_per_pixel_limit();
         if (gl_WorkGroupID.xy == uvec2(0u)) {
             counters.per_pixel_limit = per_pixel_limit;
-            // Instance counts of the last phase, which runs only if fragments are dropped.
+            // Instance counts of the two draws of the last gather phase, which runs only if fragments are dropped.
             counters.commands[1] = counters.commands[6] = per_pixel_limit == UNBOUNDED ? 0u : 1u;
         }
     }
@@ -43,6 +42,7 @@ void main() {
     uint record_count = min(fragment_count, per_pixel_limit);
     scan[lane] = record_count;
     if (fragment_count > 0u) tile_has_fragments = 1u;
+    // Inclusive prefix sum (Hillis and Steele 1986).
     for (uint stride = 1u; stride < TILE * TILE; stride *= 2u) {
         memoryBarrierShared();
         barrier();
@@ -59,6 +59,7 @@ void main() {
     uint first_record = tile_first_record + scan[lane] - record_count;
     if (is_inside) imageStore(cursors, pixel, uvec4(first_record));
     if (fragment_count > record_count) {
+        // Empty records: the gather passes replace them by atomic minima and maxima.
         for (uint index = first_record; index < first_record + record_count; index++) {
             records[2u * index] = UNBOUNDED;
             records[2u * index + 1u] = 0u;

@@ -1,16 +1,14 @@
 // Adds a fragment of a blended triangle to the list of its pixel. One program runs in three phases, so that all phases see
-// the same fragments: the first counts them and the second fills the lists. For a pixel with more fragments than the
-// limit, the second phase stores only the nearest depths, and the third adds their ids. Early depth tests reject
+// the same fragments. The first phase counts fragments, the second fills the lists. For a pixel with more fragments than
+// the limit, the second phase stores only the nearest depths, and the third adds their ids. Early depth tests reject
 // fragments behind opaque surfaces. Fully transparent fragments are skipped.
 layout(early_fragment_tests) in;
 #if SAMPLES > 1 && defined(POST_DEPTH_COVERAGE)
 // gl_SampleMaskIn contains only samples that pass the depth test.
 layout(post_depth_coverage) in;
 #endif
-#ifdef TEXTURES
-centroid in vec2 uv_image;
-#endif
 layout(std430, binding = 2) buffer Records { uint records[]; };
+// Twins: the constants of the same names in src/render/layout/oit.rs.
 layout(location = 1) uniform int phase;
 const int PHASE_COUNT = 0;
 const int PHASE_FILL = 1;
@@ -19,7 +17,7 @@ uint sample_coverage() {
 #if SAMPLES == 1
     return 1u;
 #elif defined(POST_DEPTH_COVERAGE)
-    return uint(gl_SampleMaskIn[0]) & 15u;
+    return uint(gl_SampleMaskIn[0]) & 15u; // four samples
 #else
     // Reading gl_SampleID runs the shader once for each sample that passes the depth test.
     return 1u << gl_SampleID;
@@ -36,8 +34,8 @@ void insert_depth(uint first_record, uint depth) {
     }
 }
 
-// Inserts an id among the records of equal depth, sorted by descending id. If there are more ids than records, the
-// smallest are dropped.
+// Inserts an id into the records of equal depth, which are sorted by descending id. If there are more ids than records,
+// the smallest ids are dropped.
 void insert_id(uint first_record, uint depth, uint id_and_coverage) {
     for (uint index = 0u; index < counters.per_pixel_limit && id_and_coverage != 0u; index++) {
         if (records[2u * (first_record + index)] != depth) continue;
@@ -47,13 +45,9 @@ void insert_id(uint first_record, uint depth, uint id_and_coverage) {
 }
 
 void main() {
-    float alpha = material_of(current_triangle()).ambient.a;
-#ifdef TEXTURES
-    ivec2 color_image = material_of(current_triangle()).images.xy;
-    vec4 texel = color_texel(color_image, uv_image);
-    if (color_image.x >= 0) alpha *= texel.a;
-#endif
+    float alpha = fragment_alpha(material_of(current_triangle()));
     ivec2 pixel = ivec2(gl_FragCoord.xy);
+    // `abs` turns -0 into 0, whose bits are the smallest.
     uint depth = floatBitsToUint(abs(clamp(gl_FragCoord.z, 0.0, 1.0)));
     uint id_and_coverage = uint(current_triangle()) + 1u << 4 | sample_coverage();
     if (!(alpha > 0.0)) return;

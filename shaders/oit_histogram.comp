@@ -24,8 +24,9 @@ void main() {
         if (local_bins[bin] > 0u) atomicAdd(counters.bins[bin], local_bins[bin]);
     }
     if (lane == 0u && tile_total > 0u) {
-        uint previous_total = atomicAdd(counters.total[0], tile_total);
-        if (previous_total + tile_total < previous_total) atomicAdd(counters.total[1], 1u);
+        uint previous_total = atomicAdd(counters.fragment_total[0], tile_total);
+        bool has_carry = previous_total + tile_total < previous_total;
+        if (has_carry) atomicAdd(counters.fragment_total[1], 1u);
         atomicMax(counters.max_per_pixel, tile_max);
     }
 }

@@ -1,11 +1,11 @@
-// Resolves the list of a pixel to one layer per sample: sorts the fragments, shades them like opaque surfaces, and blends
-// them front to back. A fragment is shaded once, at the center of the samples that it covers.
-//   layers  (out)  [SAMPLES][height][width]  RGBA16F: light of the blended surfaces, transmittance
+// Resolves the list of a pixel to one blend layer per sample: sorts the fragments, shades them like opaque surfaces, and
+// blends them front to back. A fragment is shaded once, at the center of the samples that it covers.
+//   blend_layers  (out)  [SAMPLES][height][width]  RGBA16F: light of the blended surfaces, transmittance
 layout(local_size_x = TILE, local_size_y = TILE) in;
-layout(rgba16f, binding = 3) uniform writeonly image2DArray layers;
+layout(rgba16f, binding = 3) uniform writeonly image2DArray blend_layers;
 layout(std430, binding = 2) buffer Records { uvec2 records[]; };
 
-// Order of a list: nearest first; at equal depth, the latest triangle first.
+// Order of a list: nearest first; at equal depth, the triangle that is drawn last comes first.
 bool is_before(uvec2 a, uvec2 b) { return a.x < b.x || (a.x == b.x && a.y > b.y); }
 
 // For short lists.
@@ -46,6 +46,7 @@ void heap_sort(uint first_record, uint count) {
     }
 }
 
+// Light and opacity of a fragment.
 vec4 shade_fragment(uvec2 record, ivec2 pixel, vec2 pixel_size) {
     vec2 center = vec2(0.0);
     for (int sample_index = 0; sample_index < SAMPLES; sample_index++) {
@@ -57,7 +58,7 @@ vec4 shade_fragment(uvec2 record, ivec2 pixel, vec2 pixel_size) {
 }
 
 void main() {
-    ivec2 size = imageSize(layers).xy;
+    ivec2 size = imageSize(blend_layers).xy;
     ivec2 pixel = listed_pixel();
     if (!has_listed_tile() || any(greaterThanEqual(pixel, size))) return;
     uint fragment_count = imageLoad(fragment_counts, pixel).x;
@@ -65,13 +66,14 @@ void main() {
     uint record_count = min(fragment_count, counters.per_pixel_limit);
     uint first_record = imageLoad(cursors, pixel).x;
     if (fragment_count <= counters.per_pixel_limit) {
-        // This list is unsorted, and its cursor is at its end. Lists above the limit are already sorted.
+        // The gather phases sort only the lists above the limit. They leave the cursor of other lists at the end.
         first_record -= record_count;
+        // At this length, both sorts take a similar number of steps.
         if (record_count <= 32u) insertion_sort(first_record, record_count);
         else heap_sort(first_record, record_count);
     }
-    vec4 sample_layers[SAMPLES];
-    for (int index = 0; index < SAMPLES; index++) sample_layers[index] = vec4(0.0, 0.0, 0.0, 1.0);
+    vec4 sample_blends[SAMPLES];
+    for (int index = 0; index < SAMPLES; index++) sample_blends[index] = vec4(0.0, 0.0, 0.0, 1.0);
     bool is_transparent = true;
     for (uint record_index = 0u; record_index < record_count && is_transparent; record_index++) {
         uvec2 record = records[first_record + record_index];
@@ -79,11 +81,11 @@ void main() {
         is_transparent = false;
         for (int sample_index = 0; sample_index < SAMPLES; sample_index++) {
             if ((record.y >> sample_index & 1u) != 0u) {
-                sample_layers[sample_index].rgb += sample_layers[sample_index].a * color.a * color.rgb;
-                sample_layers[sample_index].a *= 1.0 - color.a;
+                sample_blends[sample_index].rgb += sample_blends[sample_index].a * color.a * color.rgb;
+                sample_blends[sample_index].a *= 1.0 - color.a;
             }
-            is_transparent = is_transparent || sample_layers[sample_index].a > 0.0;
+            is_transparent = is_transparent || sample_blends[sample_index].a > 0.0;
         }
     }
-    for (int index = 0; index < SAMPLES; index++) imageStore(layers, ivec3(pixel, index), sample_layers[index]);
+    for (int index = 0; index < SAMPLES; index++) imageStore(blend_layers, ivec3(pixel, index), sample_blends[index]);
 }

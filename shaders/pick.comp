@@ -1,4 +1,5 @@
-// Reads back the triangles that are visible in a small rectangle of pixels. The host computes the intersections in f64.
+// Reads back the triangles that are visible in a small rectangle of pixels. The host intersects them with view rays in
+// f64.
 //   ids     (in)   [height][width]      R32UI, bottom row first; the rectangle is at the lower left
 //   picked  (out)  [rows][columns][22]  top row first: id, three corners, three positions, three normals
 layout(local_size_x = WORKGROUP_SIZE) in;

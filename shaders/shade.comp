@@ -1,7 +1,7 @@
 // Deferred shading: converts ids to the color of each pixel, in linear light. A triangle is shaded once per pixel, at
 // the center of the samples that see it. The color of a pixel is the mean of its samples after the tone curve.
 //   ids           (in)   [height][width][SAMPLES]  R32UI; NO_ID also for ground that was not rasterized
-//   layers        (in)   [height][width][SAMPLES]  RGBA16F: light of the blended surfaces, transmittance
+//   blend_layers  (in)   [height][width][SAMPLES]  RGBA16F: light of the blended surfaces, transmittance
 //   scene_color   (out)  [height][width]           RGBA16F
 //   bloom_source  (out)  [height][width]           RGBA16F: light above the bloom threshold
 // All images have the bottom row first. The shading runs as two dispatches. The first, with BACKGROUND, covers all tiles
@@ -9,14 +9,14 @@
 // This is for software rasterizers, which execute both sides of every branch: most tiles of most images see no triangle.
 layout(local_size_x = TILE, local_size_y = TILE) in;
 #ifdef OIT
-// Exact transparency: one array layer per sample, written only where there are blended fragments.
-layout(binding = 22) uniform sampler2DArray layers;
+// Exact transparency: one layer of the array per sample, written only where there are blended fragments.
+layout(binding = 22) uniform sampler2DArray blend_layers;
 layout(binding = 23) uniform usampler2D fragment_counts;
 #elif defined(BLEND_LAYERS)
 #if SAMPLES > 1
-layout(binding = 22) uniform sampler2DMS layers;
+layout(binding = 22) uniform sampler2DMS blend_layers;
 #else
-layout(binding = 22) uniform sampler2D layers;
+layout(binding = 22) uniform sampler2D blend_layers;
 #endif
 #endif
 layout(rgba16f, binding = 0) uniform writeonly image2D scene_color;
@@ -80,9 +80,9 @@ vec3 shade_pixel(ivec2 pixel, ivec2 size, uint sample_ids[SAMPLES]) {
         for (int sample_index = 0; sample_index < SAMPLES; sample_index++) {
 #ifdef OIT
             vec4 layer = vec4(0.0, 0.0, 0.0, 1.0);
-            if (has_fragments) layer = texelFetch(layers, ivec3(pixel, sample_index), 0);
+            if (has_fragments) layer = texelFetch(blend_layers, ivec3(pixel, sample_index), 0);
 #else
-            vec4 layer = texelFetch(layers, pixel, sample_index);
+            vec4 layer = texelFetch(blend_layers, pixel, sample_index);
 #endif
             if ((matching_samples >> sample_index & 1u) != 0u) accumulate_sample(sum, layer.rgb + layer.a * light, 1.0);
         }

@@ -1,13 +1,14 @@
-// Projects a corner to the shadow map. Opaque triangles use vertices instead of corners.
+// Projects a corner of a triangle to the shadow map. A corner is a vertex with texture coordinates. With POSITION_ONLY,
+// the index list contains vertices.
 #ifdef POSITION_ONLY
 layout(location = 0) in vec3 position;
 #else
 layout(location = 0) in uint vertex;
 layout(binding = 13) uniform samplerBuffer positions;
 #endif
-#if defined(UVS) && !defined(POSITION_ONLY)
+#if defined(TEXTURES) && !defined(POSITION_ONLY)
 layout(location = 2) in vec2 uv;
-out vec2 uv_image;
+centroid out vec2 uv_image;
 #endif
 #ifdef CASCADES
 layout(location = 1) uniform int layer;
@@ -23,9 +24,10 @@ void main() {
 #ifdef CASCADES
     map_position.xy = to_cascade(map_position.xy, layer);
 #endif
+    // A vertex that is not finite is placed outside the view volume, as in `to_clip`.
     bool is_not_finite = any(isnan(map_position)) || any(isinf(map_position));
     gl_Position = is_not_finite ? vec4(0.0, 0.0, -2.0, 1.0) : vec4(2.0 * map_position - 1.0, 1.0);
-#if defined(UVS) && !defined(POSITION_ONLY)
+#if defined(TEXTURES) && !defined(POSITION_ONLY)
     uv_image = uv;
 #endif
 }

@@ -1,5 +1,5 @@
-// Projects a corner to the screen. Opaque triangles use vertices instead of corners, because more triangles share a
-// vertex than a corner.
+// Projects a corner of a triangle to the screen. A corner is a vertex with texture coordinates. Opaque triangles need
+// none: their index lists contain vertices, because more triangles share a vertex than a corner.
 #ifdef MASK
 layout(location = 0) in uint vertex;
 layout(binding = 13) uniform samplerBuffer positions;

@@ -1,6 +1,7 @@
 // One direction of the Gaussian blur (equation 3.11) for software rasterizers, where texture reads are cheaper than
 // shared memory. The first direction (FROM_DEPTH) reads depth, the second reads the moments that the first wrote. An
 // invocation writes TEXELS_PER_INVOCATION consecutive texels along its direction, so that it reads each input only once.
+// `blur_separable` in src/render/shaders/shadow.rs generates the function `blur`.
 layout(local_size_x = WORKGROUP_SIZE) in;
 layout(FORMAT, binding = 0) uniform writeonly image2D destination;
 

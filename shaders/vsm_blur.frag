@@ -1,4 +1,5 @@
-// One direction of the Gaussian blur with one fragment per texel, as in the thesis. Baseline for the other variants.
+// One direction of the Gaussian blur (equation 3.11) with one fragment per texel, as in the thesis: the baseline of
+// measurements. `blur_separable` in src/render/shaders/shadow.rs generates the function `blur`.
 layout(location = 0) out vec4 blurred;
 
 void main() {

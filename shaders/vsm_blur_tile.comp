@@ -1,8 +1,9 @@
 // Both directions of the Gaussian blur (equation 3.11) in one pass: depth in, blurred moments out. A workgroup writes
-// OUTPUT_COLUMNS x OUTPUT_ROWS texels. It loads their depths and a margin, BAND_ROWS rows at a time, and blurs each row
-// into shared memory. Then it blurs the columns of the result. An invocation computes a segment of
+// OUTPUT_COLUMNS x OUTPUT_ROWS texels. It loads their depths with a margin of RADIUS, a band of BAND_ROWS rows at a time,
+// and blurs each row into shared memory. Then it blurs the columns of the result. An invocation computes a segment of
 // TEXELS_PER_INVOCATION consecutive sums, so that it loads each input only once. The pitch of a row is odd, so that
-// lanes that process different rows access different banks.
+// lanes that process different rows access different banks. `BlurTile` in src/render/shaders/shadow.rs generates the
+// shared arrays `depths` and `rows`, and the functions `blur_row` and `blur_column`.
 layout(local_size_x = WORKGROUP_SIZE) in;
 layout(FORMAT, binding = 0) uniform writeonly image2D destination;
 
@@ -10,11 +11,11 @@ void main() {
     int side = int(frame.shadow.w), lane = int(gl_LocalInvocationIndex);
     ivec2 corner = ivec2(gl_WorkGroupID.xy) * ivec2(OUTPUT_COLUMNS, OUTPUT_ROWS);
     for (int first_row = 0; first_row < OUTPUT_ROWS + 2 * RADIUS; first_row += BAND_ROWS) {
-        int cell_count = min(BAND_ROWS, OUTPUT_ROWS + 2 * RADIUS - first_row) * (OUTPUT_COLUMNS + 2 * RADIUS);
-        for (int cell = lane; cell < cell_count; cell += WORKGROUP_SIZE) {
-            ivec2 cell_position = ivec2(cell % (OUTPUT_COLUMNS + 2 * RADIUS), cell / (OUTPUT_COLUMNS + 2 * RADIUS));
-            ivec2 texel = corner + cell_position + ivec2(-RADIUS, first_row - RADIUS);
-            depths[cell_position.y * DEPTH_PITCH + cell_position.x] = centered_depth(texel, side);
+        int depth_count = min(BAND_ROWS, OUTPUT_ROWS + 2 * RADIUS - first_row) * (OUTPUT_COLUMNS + 2 * RADIUS);
+        for (int index = lane; index < depth_count; index += WORKGROUP_SIZE) {
+            ivec2 band_texel = ivec2(index % (OUTPUT_COLUMNS + 2 * RADIUS), index / (OUTPUT_COLUMNS + 2 * RADIUS));
+            ivec2 texel = corner + band_texel + ivec2(-RADIUS, first_row - RADIUS);
+            depths[band_texel.y * DEPTH_PITCH + band_texel.x] = centered_depth(texel, side);
         }
         memoryBarrierShared();
         barrier();

@@ -1,9 +1,9 @@
-// Evaluates a triangle of the scene's buffers at an image point: perspective-correct barycentric coordinates with
-// analytic derivatives.
-layout(binding = 13) uniform samplerBuffer positions;
-layout(binding = 16) uniform samplerBuffer normals;
-layout(binding = 17) uniform usamplerBuffer triangle_corners;
-layout(binding = 18) uniform usamplerBuffer triangle_vertices;
+// The scene's buffers, and perspective-correct barycentric coordinates with analytic derivatives. A vertex has a
+// position; a corner is a vertex with a normal and texture coordinates.
+layout(binding = 13) uniform samplerBuffer positions;           // [vertices]
+layout(binding = 16) uniform samplerBuffer normals;             // [corners]
+layout(binding = 17) uniform usamplerBuffer triangle_corners;   // [triangles]: three corner indices
+layout(binding = 18) uniform usamplerBuffer triangle_vertices;  // [triangles]: three vertex indices
 
 struct Barycentrics {
     vec3 weights;         // of the three corners; their sum is 1
@@ -12,10 +12,10 @@ struct Barycentrics {
     bool is_front_facing; // whether the front side is visible
 };
 
-// `a`, `b`, `c`: the corners as c_i = (x, y, w) of clip space, relative to the image point. `pixel_size`: size of a
-// pixel in normalized device coordinates. The weight of corner i is proportional to (c_j x c_k).z. These are
-// homogeneous coordinates, so corners behind the camera need no clipping. Subtracting the image point first avoids
-// cancellation for small triangles.
+// `a`, `b`, `c`: (x, y, w) of the corners in clip space, relative to the image point p: (x - p.x w, y - p.y w, w).
+// `pixel_size`: size of a pixel in normalized device coordinates. The weight of `a` is proportional to (b x c).z, and so
+// on. These are homogeneous coordinates, so corners behind the camera need no clipping. Subtracting the image point
+// first avoids cancellation for small triangles.
 Barycentrics compute_barycentrics(vec3 a, vec3 b, vec3 c, vec2 pixel_size) {
     float scale = 1.0 / max(max(abs(a.z), abs(b.z)), max(abs(c.z), 1e-30));
     a *= scale, b *= scale, c *= scale;
@@ -24,10 +24,11 @@ Barycentrics compute_barycentrics(vec3 a, vec3 b, vec3 c, vec2 pixel_size) {
     float sum = edge_values.x + edge_values.y + edge_values.z;
     Barycentrics result;
     result.is_front_facing = sum > 0.0;
-    // The point lies inside except for rounding. For a triangle without area the sum is 0, and any weights are valid.
+    // The point lies inside except for rounding. For a triangle without area the sum is 0; its weights become 1/3.
     result.weights = clamp(edge_values / sum, 0.0, 1.0);
     float weight_sum = result.weights.x + result.weights.y + result.weights.z;
     result.weights = weight_sum > 0.5 ? result.weights / weight_sum : vec3(1.0 / 3.0);
+    // (b x c).z is linear in the image point; x and y of the cross product are its derivatives.
     vec3 edge_ddx = pixel_size.x * vec3(edges[0].x, edges[1].x, edges[2].x);
     vec3 edge_ddy = pixel_size.y * vec3(edges[0].y, edges[1].y, edges[2].y);
     result.ddx = (edge_ddx - result.weights * (edge_ddx.x + edge_ddx.y + edge_ddx.z)) / sum;

@@ -1,31 +1,32 @@
-// Groups and blocks of triangles that culling tests, and its results. A workgroup tests a block: WORKGROUP_SIZE
-// triangles of one group. A superblock is SUPERBLOCK consecutive blocks. Twins: `CullUniforms` and
+// Inputs and results of triangle culling. A group contains the triangles of one indirect draw. A workgroup tests a block:
+// WORKGROUP_SIZE triangles of one group. A superblock is SUPERBLOCK consecutive blocks of one group. Block indices are
+// padded, so that each group begins with a new superblock; no workgroup runs for the padding. Twins: `CullUniforms` and
 // `CullUniforms::empty_draws` in src/render/layout/cull.rs.
 //   commands  [MAX_GROUPS][5]       indexed indirect draws
-//   totals    [superblocks]         number of visible triangles
+//   totals    [superblocks]         number of visible triangles of the superblock
 //   bits      [blocks][MASK_WORDS]  one bit per triangle: whether it is visible
 const uint MASK_WORDS = uint(WORKGROUP_SIZE) / 32u;
 
 layout(std140, binding = 3) uniform GroupBlock {
     uvec4 ranges[MAX_GROUPS]; // first triangle, triangles, first workgroup, first block
-    uvec4 flags[MAX_GROUPS];  // whether it is single-sided; whether it uses vertices only, without corners
-    uvec4 count;              // groups, workgroups, blocks
+    uvec4 flags[MAX_GROUPS];  // x: whether it is single-sided; y: whether its index list contains vertices, not corners
+    uvec4 count;              // number of groups, workgroups, blocks with padding
     vec4 subpixel_step;       // x: step of the rasterizer's subpixel grid, in pixels
 } groups;
 
 layout(std430, binding = 0) buffer CullDraws {
     uint commands[5 * MAX_GROUPS];
-    uint unused[2];
+    uint padding[2];
     uint totals[];
 } draws;
 layout(std430, binding = 1) buffer Bits { uint bits[]; };
 
-// The block of this workgroup.
+// The block of this workgroup, and the triangle of this lane.
 struct Block {
     uint group;
-    uint index;     // among the blocks of all groups
-    uint triangle;  // of this lane, within the group
-    bool in_range;  // whether the group has this triangle
+    uint index;         // among the blocks of all groups, with padding
+    uint triangle;      // index within the group
+    bool has_triangle;  // false for the last lanes of the group's last block
 };
 
 uint workgroup_index() { return gl_WorkGroupID.y * gl_NumWorkGroups.x + gl_WorkGroupID.x; }

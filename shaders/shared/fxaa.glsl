@@ -18,7 +18,7 @@ ivec2 clamp_to_image(ivec2 pixel) { return clamp(pixel, ivec2(0), textureSize(sc
 float luma(ivec2 pixel) { return sqrt(dot(texelFetch(scene_color, clamp_to_image(pixel), 0).rgb, vec3(0.2126, 0.7152, 0.0722))); }
 
 // Searches the end of a pixel's edge in one direction: where the mean luma across the edge differs from `edge_mean`.
-// x: distance from the pixel's center in pixels; y: the difference.
+// x of the result: distance from the pixel's center in pixels; y: the difference at the end.
 vec2 find_edge_end(ivec2 pixel, ivec2 edge_direction, ivec2 across_edge, float edge_mean, float tolerance) {
     float difference = 0.0;
     int steps = 0;
@@ -32,6 +32,7 @@ vec2 find_edge_end(ivec2 pixel, ivec2 edge_direction, ivec2 across_edge, float e
 
 vec3 fxaa_color(ivec2 pixel) {
     vec3 color = texelFetch(scene_color, pixel, 0).rgb;
+    // Luma of the pixel (m, the middle) and of its neighbors (n for north, ne for northeast).
     float m = luma(pixel);
     float n = luma(pixel + ivec2(0, 1)), s = luma(pixel - ivec2(0, 1));
     float e = luma(pixel + ivec2(1, 0)), w = luma(pixel - ivec2(1, 0));
@@ -56,8 +57,8 @@ vec3 fxaa_color(ivec2 pixel) {
     vec2 forward_end = find_edge_end(pixel, edge_direction, across_edge, edge_mean, tolerance);
     vec2 backward_end = find_edge_end(pixel, -edge_direction, across_edge, edge_mean, tolerance);
     vec2 nearest_end = forward_end.x < backward_end.x ? forward_end : backward_end;
-    // The fitted line crosses the center of the row halfway between its ends. At the nearest end, the line is on this
-    // pixel's side only if the row takes the color of the other side there.
+    // The line crosses the boundary of the two rows halfway between the ends. It lies on this pixel's side only if, at the
+    // nearest end, the mean luma changes away from this pixel's luma.
     float blend_weight = 0.0;
     if ((nearest_end.y < 0.0) != (m < edge_mean)) blend_weight = 0.5 - nearest_end.x / (forward_end.x + backward_end.x);
     // A pixel that differs from all its neighbors, such as a thin line or a leaf smaller than a pixel.

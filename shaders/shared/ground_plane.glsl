@@ -3,6 +3,7 @@
 // src/render/uniforms/frame.rs.
 bool ray_hits_ground(vec3 direction) {
     float descent = -dot(direction, frame.up.xyz), eye_height = dot(frame.eye.xyz, frame.up.xyz) - frame.up.w;
+    // The up direction is a coordinate axis; the last factor removes this component.
     vec3 offset = abs(frame.eye.xyz - frame.ground_center.xyz + eye_height / descent * direction) * (1.0 - frame.up.xyz);
     return descent > 0.0 && eye_height > 0.0 && all(lessThanEqual(offset, vec3(frame.ground_center.w)));
 }
@@ -14,7 +15,7 @@ vec3 view_ray(vec2 ndc) { return mat3(frame.world_from_ndc) * vec3(ndc, 1.0); }
 #ifdef HAS_GROUND
 // Depth along a view ray where it meets the ground plane. The ray must hit the ground.
 float ground_ray_depth(vec3 direction) {
-    // The ray points down; rounding must not turn it upwards.
+    // The ray points down, except for rounding.
     float ascent = min(dot(direction, frame.up.xyz), -1e-9 * length(direction));
     return (frame.up.w - dot(frame.eye.xyz, frame.up.xyz)) / ascent;
 }
@@ -24,8 +25,9 @@ float ground_ray_depth(vec3 direction) {
 // the horizon. `slope`: change of the depth per unit of x and y.
 float ground_plane_depth(vec2 ndc, out vec2 slope) {
     float eye_height = dot(frame.eye.xyz, frame.up.xyz) - frame.up.w;
-    // The inverse depth along a ray through (x, y) is descents.x x + descents.y y + descents.z.
+    // The inverse of the ground's depth along a view ray is dot(descents, vec3(ndc, 1)).
     vec3 descents = -frame.up.xyz * mat3(frame.world_from_ndc) / eye_height;
+    // z and w in clip space: of the eye, and of the ground point divided by its depth.
     vec2 eye_zw = (frame.clip_from_world * vec4(frame.eye.xyz, 1.0)).zw;
     vec2 plane_zw = (frame.clip_from_world * vec4(view_ray(ndc), 0.0)).zw + dot(descents, vec3(ndc, 1.0)) * eye_zw;
     slope = eye_zw.x / plane_zw.y * descents.xy;

@@ -1,15 +1,17 @@
 // Material of a triangle, by the triangle's index in the draw order. Twin: `PackedMaterial` in
 // src/render/layout/material.rs.
-//   materials           [materials][4]  RGBA32F: ambient color and array of the normal map; diffuse color and layer of
-//                                       the normal map; specular color and exponent; array and layer of the color
-//                                       texture, alpha, cutoff
-//   triangle_materials  [triangles]     R32UI; not read if all triangles of the draw have one material
+//   materials           [materials][MATERIAL_STRIDE]  RGBA32F, four texels:
+//                         ambient color, texture array of the normal map
+//                         diffuse color, layer of the normal map
+//                         specular color, exponent
+//                         texture array and layer of the color texture, alpha, cutoff
+//   triangle_materials  [triangles]                   R32UI; not read if all triangles of the draw have one material
 // Both are buffer textures, because a software rasterizer fetches eight texels at once, but storage words one by one.
 struct Material {
     vec4 ambient;   // w: alpha
     vec4 diffuse;   // w: cutoff of a mask, or the alpha from which blended triangles are drawn as opaque
     vec4 specular;  // w: exponent
-    ivec4 images;   // array and layer of the color texture, array and layer of the normal map; -1 for none
+    ivec4 images;   // texture array and layer of the color texture, then of the normal map; -1 without texture
 };
 
 layout(binding = 14) uniform samplerBuffer materials;

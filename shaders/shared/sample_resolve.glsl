@@ -1,5 +1,5 @@
-// Accumulates the samples of a pixel. The tone curve (a clamp if the look has none) is applied to each sample, so that
-// one bright sample does not whiten an edge. The curve compresses bright light, so bloom light is extracted before it.
+// Accumulates the samples of a pixel. The tone curve (a clamp if the scene has none) is applied to each sample, so that
+// one bright sample does not whiten an edge. The curve compresses bright light, so bloom light is extracted first.
 struct PixelAccumulator {
     vec3 color;  // sum of the samples after the tone curve
     vec3 bloom;  // sum of the samples' light above the bloom threshold

@@ -24,7 +24,8 @@ vec2 receiver_plane_gradient(vec3 normal, int layer) {
 // Bias that compensates for ground depth leaking into the blurred mean near a contact line. The leak would pull the mean
 // towards the sun, although the ground casts no shadow. Let h be the height above the line in standard deviations of the
 // blur, and k the depth difference of surface and ground per standard deviation. The ground shifts the mean by
-// k (phi(h) - h Q(h)). The bias 0.4 k (1 - h / 2)^2 is an upper bound of this shift up to h = 1.9.
+// k (phi(h) - h Q(h)), with the density phi and the upper tail Q of the normal distribution. The bias
+// 0.4 k (1 - h / 2)^2 is an upper bound of this shift up to h = 1.9.
 float contact_bias(vec3 position, int layer, vec3 normal) {
     vec2 map_position = position.xy;
 #ifdef CASCADES
@@ -72,10 +73,10 @@ float shadow_visibility(vec3 position, int layer, vec3 normal) {
 
 #ifdef SHADOW_FILTERED
 // Percentage-closer filtering: weight of the texels without a caster in front of the point. The weights are a Gaussian
-// centered at the point. TAPS is one half of it, center first, and a trailing 0.
+// centered at the point. TAPS is one half of the Gaussian, center first, with a trailing 0.
 float shadow_visibility(vec3 position, int layer, vec3 normal) {
     vec2 texel = position.xy * frame.shadow.w - 0.5;
-    vec2 base_texel = floor(texel);
+    vec2 base_texel = floor(texel); // the point lies between this texel's center and those of its next neighbors
     vec2 fraction = texel - base_texel;
     vec2 gradient = receiver_plane_gradient(normal, layer);
     float receiver_depth = position.z - depth_bias(layer), lit_weight = 0.0;

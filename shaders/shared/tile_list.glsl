@@ -3,7 +3,7 @@
 layout(std430, binding = 1) buffer TileList {
     uint workgroup_counts[3];  // x, y, z of the dispatch
     uint count;
-    uint tiles[];              // column, and row shifted by 16
+    uint tiles[];              // column in the lower 16 bits, row in the upper
 } tile_list;
 
 // Appends the tile of this workgroup. Only one lane may call it.
@@ -18,7 +18,7 @@ uint listed_tile_index() { return gl_WorkGroupID.y * TILES_PER_ROW + gl_WorkGrou
 // Whether the indirect dispatch has a tile for this workgroup. The last row of workgroups may be incomplete.
 bool has_listed_tile() { return listed_tile_index() < tile_list.count; }
 
-// Pixel of this lane in the tile of this workgroup.
+// Pixel of this lane in the tile of this workgroup. Without a tile, the pixel of another tile.
 ivec2 listed_pixel() {
     uint tile = tile_list.tiles[min(listed_tile_index(), tile_list.count - 1u)];
     return TILE * ivec2(tile & 0xFFFFu, tile >> 16) + ivec2(gl_LocalInvocationID.xy);

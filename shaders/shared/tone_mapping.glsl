@@ -7,7 +7,7 @@ vec3 tone_map(vec3 light) { return 1.0 - 1.0 / (1.0 + light); }
 // Rounding can give exactly 1, so the divisor has a lower bound.
 vec3 inverse_tone_map(vec3 displayed) { return displayed / max(1.0 - displayed, vec3(1.0 / MAX_RADIANCE)); }
 #elif defined(ACES)
-// The result is 1 for light of 7.3 and above. The clamp of the light keeps the squares finite.
+// The result is 1 for light above 7.3. The clamp of the light keeps the squares finite.
 vec3 tone_map(vec3 light) {
     light = min(light, vec3(MAX_RADIANCE));
     return min(light * (2.51 * light + 0.03) / (light * (2.43 * light + 0.59) + 0.14), vec3(1.0));

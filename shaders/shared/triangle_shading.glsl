@@ -8,23 +8,15 @@ layout(binding = 20) uniform samplerBuffer tangents;
 
 vec2 finite_or_zero(vec2 slope) { return any(isnan(slope)) || any(isinf(slope)) ? vec2(0.0) : slope; }
 
-vec4 shade_triangle(int triangle, vec2 ndc, vec2 pixel_size) {
-    ivec3 corners = ivec3(texelFetch(triangle_corners, triangle).xyz);
-    ivec3 vertices = ivec3(texelFetch(triangle_vertices, triangle).xyz);
-    mat3 world, clip, normal;
-    for (int corner = 0; corner < 3; corner++) {
-        world[corner] = texelFetch(positions, vertices[corner]).xyz;
-        vec4 corner_clip = to_clip(world[corner]);
-        clip[corner] = vec3(corner_clip.xy - ndc * corner_clip.w, corner_clip.w);
-        normal[corner] = texelFetch(normals, corners[corner]).xyz;
-    }
-    Barycentrics bary = compute_barycentrics(clip[0], clip[1], clip[2], pixel_size);
-    Material material = material_of(triangle);
+vec4 shade_triangle(int triangle_index, vec2 ndc, vec2 pixel_size) {
+    Triangle triangle = fetch_triangle(triangle_index, ndc);
+    Barycentrics bary = compute_barycentrics(triangle.clip[0], triangle.clip[1], triangle.clip[2], pixel_size);
+    Material material = material_of(triangle_index);
     vec4 tint = vec4(1.0);
-    vec3 geometric_normal = safe_normalize(normal * bary.weights), shading_normal = geometric_normal;
+    vec3 geometric_normal = safe_normalize(triangle.normal * bary.weights), shading_normal = geometric_normal;
 #ifdef UVS
     mat3x2 corner_uvs;
-    for (int corner = 0; corner < 3; corner++) corner_uvs[corner] = texelFetch(uvs, corners[corner]).xy;
+    for (int corner = 0; corner < 3; corner++) corner_uvs[corner] = texelFetch(uvs, triangle.corners[corner]).xy;
     vec2 uv = corner_uvs * bary.weights;
     vec2 uv_ddx = finite_or_zero(corner_uvs * bary.ddx), uv_ddy = finite_or_zero(corner_uvs * bary.ddy);
 #endif
@@ -34,11 +26,11 @@ vec4 shade_triangle(int triangle, vec2 ndc, vec2 pixel_size) {
 #endif
 #ifdef NORMAL_MAPS
     mat3x4 corner_tangents;
-    for (int corner = 0; corner < 3; corner++) corner_tangents[corner] = texelFetch(tangents, corners[corner]);
+    for (int corner = 0; corner < 3; corner++) corner_tangents[corner] = texelFetch(tangents, triangle.corners[corner]);
     vec3 normal_map_texel = normal_texel(material.images.zw, uv, uv_ddx, uv_ddy).xyz;
     if (material.images.z >= 0) shading_normal = apply_normal_map(shading_normal, corner_tangents * bary.weights, normal_map_texel);
 #endif
     shading_normal = bary.is_front_facing ? shading_normal : -shading_normal;
-    vec3 light = phong(material, tint.rgb, shading_normal, geometric_normal, world * bary.weights);
+    vec3 light = phong(material, tint.rgb, shading_normal, geometric_normal, triangle.world * bary.weights);
     return vec4(light, material.ambient.a * tint.a);
 }

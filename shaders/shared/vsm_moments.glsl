@@ -1,5 +1,5 @@
 // Inputs of the variance shadow map's blur: the moments m and m^2, with m = depth - 1/2.
-layout(binding = 0) uniform sampler2DArray source;
+layout(binding = 0) uniform sampler2DArray source; // with FROM_DEPTH depth, else moments that are blurred horizontally
 #ifdef DEPTH_IN_BUFFER
 // Depth from the compute rasterizer, top row first.
 layout(std430, binding = 0) readonly buffer RasterDepths { float raster_depths[]; };
@@ -19,7 +19,8 @@ float ground_moment(ivec2 texel, int side) {
     return clamp(dot(frame.shadow_ground_plane.xy, position) + frame.shadow_ground_plane.z, 0.0, 1.0) - 0.5;
 }
 
-// m at a texel. Outside the map, the nearest texel of the map is used. It is always empty, so m is that of the ground.
+// m at a texel. Outside the map, the nearest texel of the map is used. That texel is always empty, so the result is the
+// ground's m.
 float centered_depth(ivec2 texel, int side) {
     ivec2 inside_texel = clamp(texel, ivec2(0), ivec2(side - 1));
 #ifdef DEPTH_IN_BUFFER
@@ -28,7 +29,7 @@ float centered_depth(ivec2 texel, int side) {
     float depth = texelFetch(source, ivec3(inside_texel, layer), 0).x;
 #endif
     // An empty texel gets the depth of the ground instead of the far plane, although the ground casts no shadow. Then
-    // Chebyshev's bound is exact on the ground: the sum of the blur weights outside the caster.
+    // Chebyshev's bound is exact on the ground: it equals the sum of the blur weights of the empty texels.
     return depth >= 1.0 ? ground_moment(texel, side) : depth - 0.5;
 }
 
@@ -39,7 +40,7 @@ vec2 load_moments(ivec2 texel, int side) {
 #else
     ivec2 inside_texel = clamp(texel, ivec2(0), ivec2(side - 1));
     vec2 sums = texelFetch(source, ivec3(inside_texel, 0), 0).xy;
-    // A row outside the map is the last row, shifted by the depth difference of the ground.
+    // A row outside the map has the moments of the nearest row, shifted by the depth difference of the ground.
     float depth_change = ground_moment(texel, side) - ground_moment(inside_texel, side);
     return sums + depth_change * vec2(1.0, 2.0 * sums.x + depth_change);
 #endif

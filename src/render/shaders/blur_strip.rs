@@ -6,7 +6,7 @@ use std::fmt::Write as _;
 use modalcast_model::scene::ShadowSettings;
 
 /// Largest radius of the blur kernel for which the first of [`STRIP_SHAPES`] is faster. Measured on an H200 with a 4096^2
-/// map: 15 taps take 135 us with the first and 154 us with the second shape, 25 taps take 200 us and 166 us.
+/// map: radius 7 takes 135 us with the first and 154 us with the second shape, radius 12 takes 200 us and 166 us.
 const NARROW_RADIUS: u32 = 9;
 /// Lanes per workgroup and rows per iteration, for narrow and for wide kernels.
 const STRIP_SHAPES: [(u32, u32); 2] = [(64, 4), (128, 8)];
@@ -21,32 +21,36 @@ pub(crate) struct BlurStrip {
     /// Rows that the workgroup writes.
     pub(crate) rows: u32,
     /// Rows per iteration.
-    rows_per_step: u32,
+    rows_per_iteration: u32,
     /// Radius of the blur kernel.
     radius: u32,
 }
 
 impl BlurStrip {
-    /// Fits a strip to the blur of a shadow map; none if the kernel is too wide. A strip also processes 2 `radius` rows that it does not store, so large maps have
-    /// tall strips. Small maps have short strips, because the device needs many workgroups.
+    /// Fits a strip to the blur of a shadow map; none if the kernel is too wide. A strip also processes 2 `radius` rows
+    /// that it does not store, so large maps have tall strips. Small maps have short strips, because the device needs
+    /// many workgroups.
     pub(crate) fn fit(shadow: &ShadowSettings) -> Option<Self> {
         let radius = shadow.blur_radius();
-        let (columns, rows_per_step) = STRIP_SHAPES[usize::from(radius > NARROW_RADIUS)];
+        let (columns, rows_per_iteration) = STRIP_SHAPES[usize::from(radius > NARROW_RADIUS)];
         let input_rows = (shadow.size / 32).clamp(16, 128) + 2 * radius;
-        let rows = input_rows.next_multiple_of(rows_per_step) - 2 * radius;
-        (radius <= MAX_RADIUS).then_some(Self { columns, rows, rows_per_step, radius })
+        let rows = input_rows.next_multiple_of(rows_per_iteration) - 2 * radius;
+        (radius <= MAX_RADIUS).then_some(Self { columns, rows, rows_per_iteration, radius })
     }
 
     /// Bytes of shared memory.
     #[cfg(test)]
     const fn shared_bytes(self) -> u32 {
-        4 * 2 * self.rows_per_step * (self.columns + 2 * self.radius)
+        4 * 2 * self.rows_per_iteration * (self.columns + 2 * self.radius)
     }
 
-    /// Shader source without its head, which defines WORKGROUP_SIZE. `weights`: one half of a Gaussian, center first.
+    /// Shader source without the version and the defines of the format and WORKGROUP_SIZE. `weights`: one half of a
+    /// Gaussian, center first.
     pub(crate) fn text(self, weights: &[f32]) -> String {
-        let Self { rows, rows_per_step, radius, .. } = self;
-        let text = format!("#define OUTPUT_ROWS {rows}\n#define STEP_ROWS {rows_per_step}\n#define RADIUS {radius}\n");
+        let Self { rows, rows_per_iteration, radius, .. } = self;
+        let text = format!(
+            "#define OUTPUT_ROWS {rows}\n#define ITERATION_ROWS {rows_per_iteration}\n#define RADIUS {radius}\n"
+        );
         let body = include_str!("../../../shaders/vsm_blur_strip.comp");
         let parts = [
             ("// @SUMS", self.declare_sums()),
@@ -61,25 +65,25 @@ impl BlurStrip {
         (0..2 * self.radius).map(|sum| format!("vec2 sum{sum} = vec2(0.0);\n")).collect()
     }
 
-    /// Loads the depths of an iteration's rows into shared memory: the column of each lane, then the margins. All loads
-    /// precede the first store, so that their latencies overlap.
+    /// Loads the depths of an iteration's rows into shared memory: the column of each lane, then the left and right
+    /// margins, distributed over all lanes. All loads precede the first store, so that their latencies overlap.
     fn load_depths(self) -> String {
-        let Self { columns, rows_per_step, radius, .. } = self;
+        let Self { columns, rows_per_iteration, radius, .. } = self;
         let row_pitch = columns + 2 * radius;
         let (mut loads, mut stores) = (String::new(), String::new());
-        for row in 0..rows_per_step {
+        for row in 0..rows_per_iteration {
             let texel = format!("corner + ivec2(lane, first_row + {row} - {radius})");
             writeln!(loads, "float depth{row} = centered_depth({texel}, side);").ok();
             writeln!(stores, "depths[buffer_offset + {} + lane] = depth{row};", row * row_pitch + radius).ok();
         }
-        let cell_count = rows_per_step * 2 * radius;
-        for (index, first_cell) in (0..cell_count).step_by(columns as usize).enumerate() {
-            writeln!(loads, "int cell{index} = {first_cell} + lane, row{index} = cell{index} / {};", 2 * radius).ok();
-            writeln!(loads, "int column{index} = cell{index} % {};", 2 * radius).ok();
+        let margin_count = rows_per_iteration * 2 * radius;
+        for (index, first) in (0..margin_count).step_by(columns as usize).enumerate() {
+            writeln!(loads, "int texel{index} = {first} + lane, row{index} = texel{index} / {};", 2 * radius).ok();
+            writeln!(loads, "int column{index} = texel{index} % {};", 2 * radius).ok();
             writeln!(loads, "if (column{index} >= {radius}) column{index} += {columns};").ok();
             writeln!(loads, "float margin{index} = 0.0;").ok();
-            let guard = if first_cell + columns > cell_count {
-                format!("if (cell{index} < {cell_count}) ")
+            let guard = if first + columns > margin_count {
+                format!("if (texel{index} < {margin_count}) ")
             } else {
                 String::new()
             };
@@ -94,12 +98,13 @@ impl BlurStrip {
         loads + &stores
     }
 
-    /// Blurs the rows of an iteration, adds them to the sums that contain them, and stores the complete sums.
+    /// Blurs the rows of an iteration horizontally, adds each row to the vertical sums that contain it, and stores the sums
+    /// that are complete. `sum0` is the oldest sum; an iteration completes one sum per row, and the others move up.
     fn accumulate_rows(self, weights: &[f32]) -> String {
-        let Self { columns, rows_per_step, radius, .. } = self;
+        let Self { columns, rows_per_iteration, radius, .. } = self;
         let weight_at = |position: u32, center: u32| format!("{:?}", weights[position.abs_diff(center) as usize]);
         let mut text = String::new();
-        for row in 0..rows_per_step {
+        for row in 0..rows_per_iteration {
             writeln!(text, "vec2 blurred{row} = vec2(0.0);").ok();
             for tap in 0..=2 * radius {
                 let offset = row * (columns + 2 * radius) + tap;
@@ -110,18 +115,19 @@ impl BlurStrip {
             for sum in row..row + 2 * radius {
                 writeln!(text, "sum{sum} += {} * blurred{row};", weight_at(sum, row + radius)).ok();
             }
-            let last = row + 2 * radius;
-            writeln!(text, "vec2 sum{last} = {} * blurred{row};", weight_at(last, row + radius)).ok();
+            let new_sum = row + 2 * radius;
+            writeln!(text, "vec2 sum{new_sum} = {} * blurred{row};", weight_at(new_sum, row + radius)).ok();
             let texel = format!("corner + ivec2(lane, first_row + {row} - {})", 2 * radius);
-            let first_complete = (2 * radius).saturating_sub(row);
+            // The sums that the first 2 `radius` rows complete belong to rows above the strip.
+            let min_first_row = (2 * radius).saturating_sub(row);
             writeln!(
                 text,
-                "if (first_row >= {first_complete}) imageStore(destination, {texel}, vec4(sum{row}, 0.0, 0.0));"
+                "if (first_row >= {min_first_row}) imageStore(destination, {texel}, vec4(sum{row}, 0.0, 0.0));"
             )
             .ok();
         }
         for sum in 0..2 * radius {
-            writeln!(text, "sum{sum} = sum{};", sum + rows_per_step).ok();
+            writeln!(text, "sum{sum} = sum{};", sum + rows_per_iteration).ok();
         }
         text
     }
@@ -137,9 +143,9 @@ mod tests {
     }
 
     #[test]
-    fn strips_fit_into_shared_memory_and_have_whole_steps() {
-        for step in 0..=160 {
-            let blur = step as f32 / 10.0;
+    fn strips_fit_into_shared_memory_in_whole_iterations() {
+        for tenths in 0..=160 {
+            let blur = tenths as f32 / 10.0;
             for size in [16, 512, 1000, 4096, 16384] {
                 let Some(strip) = strip(blur, size) else {
                     assert!(blur > 8.0, "expected a strip for blur {blur}");
@@ -149,29 +155,29 @@ mod tests {
                     strip.shared_bytes() <= SHARED_BYTES && strip.radius <= MAX_RADIUS && strip.rows >= 16,
                     "{strip:?}"
                 );
-                assert_eq!((strip.rows + 2 * strip.radius) % strip.rows_per_step, 0, "{strip:?}");
+                assert_eq!((strip.rows + 2 * strip.radius) % strip.rows_per_iteration, 0, "{strip:?}");
             }
         }
         assert!(strip(8.1, 1024).is_none(), "expected no strip for a wide kernel");
     }
 
     #[test]
-    fn step_adds_each_row_to_all_its_sums() {
+    fn iteration_adds_each_row_to_all_its_sums() {
         for blur in [0.0, 0.3, 1.5, 2.3, 4.0, 8.0] {
             let (strip, weights) = (strip(blur, 4096).expect("a strip"), gaussian_weights(blur));
             let text = strip.text(&weights);
             let (taps, count) = (2 * strip.radius + 1, |pattern: &str| text.matches(pattern).count() as u32);
             assert_eq!(
                 (count("@"), count("imageStore(destination")),
-                (0, strip.rows_per_step),
+                (0, strip.rows_per_iteration),
                 "{blur}: markers and stores"
             );
             assert_eq!(
                 count("depths[buffer_offset + ") - count("] = "),
-                strip.rows_per_step * taps,
+                strip.rows_per_iteration * taps,
                 "{blur}: depths read"
             );
-            assert_eq!(count(" * blurred"), strip.rows_per_step * taps, "{blur}: sums");
+            assert_eq!(count(" * blurred"), strip.rows_per_iteration * taps, "{blur}: sums");
             let center = format!("{:?} * blurred0", weights[0]);
             let center_sum = format!("sum{} += {center}", strip.radius);
             assert!(text.contains(&center_sum) || strip.radius == 0, "{blur}: the center row has the center weight");

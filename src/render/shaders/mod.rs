@@ -23,13 +23,14 @@ const MATERIAL: &str = include_str!("../../../shaders/shared/material.glsl");
 pub(crate) const TRIANGLE_ID: &str = include_str!("../../../shaders/shared/triangle_id.glsl");
 pub(crate) const VISIBILITY_IDS: &str = include_str!("../../../shaders/shared/visibility_ids.glsl");
 const ALPHA_COVERAGE: &str = include_str!("../../../shaders/shared/alpha_coverage.glsl");
-pub(crate) const SHADOW_CASTER: &str = include_str!("../../../shaders/shared/shadow_caster.glsl");
+pub(crate) const FRAGMENT_ALPHA: &str = include_str!("../../../shaders/shared/fragment_alpha.glsl");
 const OIT_LISTS: &str = include_str!("../../../shaders/shared/oit_lists.glsl");
 const SKY: &str = include_str!("../../../shaders/shared/sky.glsl");
 const GROUND: &str = include_str!("../../../shaders/shared/ground_shading.glsl");
 const GROUND_PLANE: &str = include_str!("../../../shaders/shared/ground_plane.glsl");
 const PHONG: &str = include_str!("../../../shaders/shared/phong.glsl");
 const BARYCENTRICS: &str = include_str!("../../../shaders/shared/barycentrics.glsl");
+const TRIANGLE_FETCH: &str = include_str!("../../../shaders/shared/triangle_fetch.glsl");
 const TRIANGLE_SHADING: &str = include_str!("../../../shaders/shared/triangle_shading.glsl");
 const TILE_LIST: &str = include_str!("../../../shaders/shared/tile_list.glsl");
 
@@ -146,7 +147,8 @@ impl ShaderOptions {
         let head = self.head(&["MASK"]) + &self.material_defines(&[blend_mode]);
         let (material_lookups, sample_defines) =
             (self.material_lookups(&[blend_mode], UvDerivatives::Implicit), self.sample_defines(samples));
-        let fragment = [&head, &material_lookups, TRIANGLE_ID, &sample_defines, ALPHA_COVERAGE, body].concat();
+        let fragment =
+            [&head, &material_lookups, TRIANGLE_ID, FRAGMENT_ALPHA, &sample_defines, ALPHA_COVERAGE, body].concat();
         ProgramSource { label, stages: vertex_and_fragment([&head, FRAME, CLIP, vertex].concat(), fragment) }
     }
 
@@ -176,8 +178,7 @@ impl ShaderOptions {
         let all_modes = [BlendMode::Opaque, BlendMode::Mask, BlendMode::Blend];
         let blend_modes = if self.features.opaque_parts { &all_modes } else { &all_modes[..2] };
         let mut text = self.shading(samples, &[]) + &self.material_defines(blend_modes);
-        text += &[&self.material_lookups(blend_modes, UvDerivatives::Explicit), PHONG, BARYCENTRICS, TRIANGLE_SHADING]
-            .concat();
+        text += &self.triangle_shading(blend_modes);
         text += include_str!("../../../shaders/shade.comp");
         ProgramSource::compute(format!("shade, {samples} samples"), text)
     }
@@ -200,6 +201,12 @@ impl ShaderOptions {
             &self.sample_resolve,
         ]
         .concat()
+    }
+
+    /// GLSL function `shade_triangle`, with the lookups for the materials of these blend modes.
+    fn triangle_shading(&self, blend_modes: &[BlendMode]) -> String {
+        let material_lookups = self.material_lookups(blend_modes, UvDerivatives::Explicit);
+        [&material_lookups, PHONG, BARYCENTRICS, TRIANGLE_FETCH, TRIANGLE_SHADING].concat()
     }
 
     /// Converts the keys of the compute rasterizer to ids.

@@ -1,14 +1,14 @@
 //! Shader sources of exact transparency: gather, histogram, allocate and resolve.
 
 use super::{
-    BARYCENTRICS, CLIP, FRAME, OIT_LISTS, PHONG, ProgramSource, ShaderOptions, TRIANGLE_ID, TRIANGLE_SHADING,
-    UvDerivatives, VERSION, tile_list, vertex_and_fragment,
+    CLIP, FRAGMENT_ALPHA, FRAME, OIT_LISTS, ProgramSource, ShaderOptions, TRIANGLE_ID, UvDerivatives, VERSION,
+    tile_list, vertex_and_fragment,
 };
 use crate::layout::oit::{BINS, HISTOGRAM_TILE};
 use crate::scene_data::geometry::BlendMode;
 
 impl ShaderOptions {
-    /// Counts the blended fragments of each pixel, and appends them to its list.
+    /// Counts the blended fragments of each pixel, or adds them to its list.
     pub(crate) fn oit_gather(&self, samples: u32) -> ProgramSource {
         // Extension directives must precede all other code.
         let post_depth_coverage = samples > 1 && self.post_depth_coverage;
@@ -21,24 +21,19 @@ impl ShaderOptions {
         let (material_lookups, sample_defines) =
             (self.material_lookups(&[BlendMode::Blend], UvDerivatives::Implicit), self.sample_defines(samples));
         let body = include_str!("../../../shaders/oit_gather.frag");
-        let fragment = [&head, &sample_defines, &material_lookups, TRIANGLE_ID, OIT_LISTS, body].concat();
+        let fragment =
+            [&head, &sample_defines, &material_lookups, TRIANGLE_ID, FRAGMENT_ALPHA, OIT_LISTS, body].concat();
         ProgramSource {
             label: format!("oit gather, {samples} samples"),
             stages: vertex_and_fragment(vertex.concat(), fragment),
         }
     }
 
-    /// Sorts, shades and blends each list to one layer per sample.
+    /// Sorts each list, and shades and blends its fragments to one layer per sample.
     pub(crate) fn oit_resolve(&self, samples: u32) -> ProgramSource {
         let mut text = self.head(&[]) + &bins_define() + &tile_list() + &self.material_defines(&[BlendMode::Blend]);
         text += &[&self.sample_defines(samples), FRAME, CLIP, &self.sun_visibility(), OIT_LISTS].concat();
-        text += &[
-            &self.material_lookups(&[BlendMode::Blend], UvDerivatives::Explicit),
-            PHONG,
-            BARYCENTRICS,
-            TRIANGLE_SHADING,
-        ]
-        .concat();
+        text += &self.triangle_shading(&[BlendMode::Blend]);
         text += include_str!("../../../shaders/oit_resolve.comp");
         ProgramSource::compute(format!("oit resolve, {samples} samples"), text)
     }
@@ -58,6 +53,7 @@ pub(crate) fn allocate() -> ProgramSource {
     ProgramSource::compute("oit allocate", text)
 }
 
+/// Defines the number of bins of the histogram.
 fn bins_define() -> String {
     format!("#define BINS {BINS}\n")
 }

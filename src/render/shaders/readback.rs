@@ -1,6 +1,8 @@
 //! Shader sources of readbacks on request: picks, AOVs and visibility ids.
 
-use super::{BARYCENTRICS, CLIP, FRAME, GROUND_PLANE, ProgramSource, ShaderOptions, VERSION, VISIBILITY_IDS};
+use super::{
+    BARYCENTRICS, CLIP, FRAME, GROUND_PLANE, ProgramSource, ShaderOptions, TRIANGLE_FETCH, VERSION, VISIBILITY_IDS,
+};
 use crate::layout::WORKGROUP_SIZE;
 
 impl ShaderOptions {
@@ -12,7 +14,7 @@ impl ShaderOptions {
         text += if has_ground { "#define HAS_GROUND\n" } else { "" };
         text += &self.sample_defines(samples);
         let body = include_str!("../../../shaders/aov.comp");
-        text += &[FRAME, CLIP, VISIBILITY_IDS, GROUND_PLANE, BARYCENTRICS, body].concat();
+        text += &[FRAME, CLIP, VISIBILITY_IDS, GROUND_PLANE, BARYCENTRICS, TRIANGLE_FETCH, body].concat();
         ProgramSource::compute(format!("aov {field}, {samples} samples"), text)
     }
 }

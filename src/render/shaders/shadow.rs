@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 
 use super::blur_strip::BlurStrip;
 use super::{
-    FRAME, ProgramSource, SHADOW_CASTER, ShaderOptions, TRIANGLE_ID, UvDerivatives, VERSION, vertex_and_fragment,
+    FRAGMENT_ALPHA, FRAME, ProgramSource, ShaderOptions, TRIANGLE_ID, UvDerivatives, VERSION, vertex_and_fragment,
 };
 use crate::device::gl;
 use crate::layout::WORKGROUP_SIZE;
@@ -20,7 +20,7 @@ const VSM_MOMENTS: &str = include_str!("../../../shaders/shared/vsm_moments.glsl
 pub(crate) const TEXELS_PER_INVOCATION: u32 = 8;
 /// Lanes of a workgroup that blurs a tile.
 const TILE_WORKGROUP_SIZE: u32 = 256;
-/// Bytes of shared memory that every device gives a workgroup.
+/// Bytes of shared memory that OpenGL 4.3 guarantees to a workgroup.
 pub(crate) const SHARED_BYTES: u32 = 32 << 10;
 
 /// Columns and rows of the map that one workgroup writes when both directions are blurred in one pass.
@@ -34,7 +34,7 @@ pub(crate) fn texels_per_workgroup(shadow: &ShadowSettings) -> [u32; 2] {
 struct BlurTile {
     columns: u32,
     rows: u32,
-    /// Rows of depth that shared memory holds at once.
+    /// Rows of depth that shared memory holds at once; with the margins, a tile has `rows + 2 radius` rows.
     band_rows: u32,
     /// Radius of the blur kernel.
     radius: u32,
@@ -44,12 +44,13 @@ impl BlurTile {
     /// The first candidate that fits into shared memory. A wider blur kernel needs smaller tiles.
     fn fit(shadow: &ShadowSettings) -> Self {
         let radius = shadow.blur_radius();
+        // Columns, rows, and maximum rows per band. 256 is no limit: one band holds all rows, because a second band would
+        // leave most lanes idle.
         let candidates = [(32, 64, 256), (32, 48, 256), (32, 32, 256), (32, 32, 32), (16, 64, 32), (16, 64, 16)];
-        // All rows at once if they fit: a second band would leave most lanes idle.
-        let tiles = candidates.map(|(columns, rows, band_rows)| Self {
+        let tiles = candidates.map(|(columns, rows, max_band_rows)| Self {
             columns,
             rows,
-            band_rows: (rows + 2 * radius).min(band_rows),
+            band_rows: (rows + 2 * radius).min(max_band_rows),
             radius,
         });
         tiles.into_iter().find(|tile| tile.shared_bytes() <= SHARED_BYTES).unwrap_or(tiles[candidates.len() - 1])
@@ -105,7 +106,7 @@ impl ShaderOptions {
             + &self.material_defines(&[blend_mode]);
         let material_lookups = self.material_lookups(&[blend_mode], UvDerivatives::Implicit);
         let body = include_str!("../../../shaders/shadow.frag");
-        let fragment = [&head, FRAME, &material_lookups, TRIANGLE_ID, SHADOW_CASTER, body].concat();
+        let fragment = [&head, FRAME, &material_lookups, TRIANGLE_ID, FRAGMENT_ALPHA, body].concat();
         ProgramSource { label, stages: vertex_and_fragment(vertex(&head), fragment) }
     }
 
@@ -125,9 +126,10 @@ impl ShaderOptions {
         let ProgramSource { label, stages } = self.blur().into_iter().next()?;
         let define_buffer = |text: String| text.replacen('\n', "\n#define DEPTH_IN_BUFFER\n", 1);
         let stages = stages.into_iter().map(|(stage, text)| (stage, define_buffer(text))).collect();
-        Some(ProgramSource { label: label + ", of a buffer", stages })
+        Some(ProgramSource { label: label + ", from a buffer", stages })
     }
 
+    /// Version, defines, and functions that load moments.
     fn blur_head(
         &self,
         shadow: &ShadowSettings,
@@ -149,8 +151,8 @@ impl ShaderOptions {
         let texels_per_invocation = if uses_fragments { 1 } else { TEXELS_PER_INVOCATION };
         let parameters = "ivec2 texel, ivec2 direction, int side";
         let blur_function =
-            blur_function("blur", parameters, &gaussian_weights(shadow.blur), texels_per_invocation, |tap| {
-                format!("load_moments(texel + {tap} * direction, side)")
+            blur_function("blur", parameters, &gaussian_weights(shadow.blur), texels_per_invocation, |offset| {
+                format!("load_moments(texel + {offset} * direction, side)")
             });
         let head = self.blur_head(shadow, defines, WORKGROUP_SIZE, texels_per_invocation) + &blur_function;
         let label = format!("blur, {}", if is_first_direction { "x" } else { "y" });
@@ -180,18 +182,20 @@ impl ShaderOptions {
         writeln!(text, "shared float depths[BAND_ROWS * DEPTH_PITCH];").ok();
         writeln!(text, "shared vec2 rows[(OUTPUT_ROWS + 2 * RADIUS) * ROW_PITCH];").ok();
         writeln!(text, "vec2 to_moments(float m) {{ return vec2(m, m * m); }}").ok();
-        text += &blur_function("blur_row", "int center", weights, TEXELS_PER_INVOCATION, |tap| {
-            format!("to_moments(depths[center + {tap}])")
+        text += &blur_function("blur_row", "int first", weights, TEXELS_PER_INVOCATION, |offset| {
+            format!("to_moments(depths[first + {offset}])")
         });
-        text += &blur_function("blur_column", "int center", weights, TEXELS_PER_INVOCATION, |tap| {
-            format!("rows[center + {tap} * ROW_PITCH]")
+        text += &blur_function("blur_column", "int first", weights, TEXELS_PER_INVOCATION, |offset| {
+            format!("rows[first + {offset} * ROW_PITCH]")
         });
         text += include_str!("../../../shaders/vsm_blur_tile.comp");
         ProgramSource::compute("blur, tiles", text)
     }
 }
 
-/// GLSL function that computes the sums of one blur invocation, unrolled. Each pair of moments is fetched only once.
+/// GLSL function that computes the `texels_per_invocation` blurred texels of an invocation, unrolled. `weights`: one half
+/// of a Gaussian, center first. `fetch` gives the GLSL expression for the moments at an offset from the first of these
+/// texels. Each pair of moments is fetched only once.
 fn blur_function(
     name: &str,
     parameters: &str,
@@ -204,10 +208,10 @@ fn blur_function(
     for index in 0..texels_per_invocation {
         writeln!(text, "    sums[{index}] = vec2(0.0);").ok();
     }
-    for tap in -radius..texels_per_invocation as i32 + radius {
-        writeln!(text, "    moments = {};", fetch(tap)).ok();
+    for offset in -radius..texels_per_invocation as i32 + radius {
+        writeln!(text, "    moments = {};", fetch(offset)).ok();
         for index in 0..texels_per_invocation as i32 {
-            if let Some(weight) = weights.get((tap - index).unsigned_abs() as usize) {
+            if let Some(weight) = weights.get((offset - index).unsigned_abs() as usize) {
                 writeln!(text, "    sums[{index}] += {weight:?} * moments;").ok();
             }
         }
