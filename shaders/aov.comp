@@ -78,6 +78,7 @@ void main() {
     uint output_index = uint(size.y - 1 - pixel.y) * uint(size.x) + uint(pixel.x);
     float scale = intBitsToFloat(scale_bits);
     for (int sample_index = 0; sample_index < SAMPLES; sample_index++) {
+        // Not `load_id`: this pass clears its ids, so each id is valid.
         uint id = texelFetch(ids, pixel, sample_index).x;
         vec2 ndc = 2.0 * (vec2(pixel) + SAMPLE_POSITIONS[sample_index]) / vec2(size) - 1.0;
 #ifdef DEPTH

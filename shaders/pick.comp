@@ -10,6 +10,7 @@ void main() {
     ivec2 size = ivec2(rectangle & 0xFFFF, rectangle >> 16);
     ivec2 pixel = ivec2(gl_GlobalInvocationID.xy);
     if (any(greaterThanEqual(pixel, size))) return;
+    // Word offsets of the rest: 1 for the corners, 4 for the positions, 13 for the normals.
     uint id = texelFetch(ids, pixel, 0).x;
     uint first_word = 22u * uint((size.y - 1 - pixel.y) * size.x + pixel.x);
     picked[first_word] = id;

@@ -10,7 +10,7 @@ use modalcast_model::scene::BoundingBox;
 /// A rectangle of a frame's pixels; (0, 0) is the bottom left pixel. It may be empty.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Region {
-    frame: [u32; 2],
+    frame_size: [u32; 2],
     corner: [u32; 2],
     size: [u32; 2],
 }
@@ -19,8 +19,8 @@ pub(crate) struct Region {
 #[derive(Debug, Default)]
 pub(crate) struct DirtyRegion(Cell<Option<Region>>);
 
-/// Bound on the f32 rounding error of a clip coordinate, relative to the sum of the magnitudes of its products: each
-/// matrix element, each product and three sums are rounded.
+/// Bound on the f32 rounding error of a clip coordinate, relative to the sum of the magnitudes of its products. Its matrix
+/// element, its product and three sums are rounded, by half an epsilon each; the bound allows eight roundings.
 const CLIP_RELATIVE_ERROR: f64 = 8.0 * 0.5 * f32::EPSILON as f64;
 
 /// Margin of the projected bounds in pixels, because a rasterizer moves vertices by up to 1/256 pixel, and a sample may lie
@@ -33,13 +33,13 @@ const DIRTY_MARGIN: u32 = 2;
 
 impl Region {
     /// All pixels of a frame.
-    pub(crate) const fn whole(frame: [u32; 2]) -> Self {
-        Self { frame, corner: [0; 2], size: frame }
+    pub(crate) const fn whole(frame_size: [u32; 2]) -> Self {
+        Self { frame_size, corner: [0; 2], size: frame_size }
     }
 
     /// Region of the frame that can show points in `bounds` if a shader computes clip coordinates in f32. The whole frame
     /// if the bounds reach behind the eye or overflow.
-    pub(crate) fn project(clip_from_world: &Matrix4<f64>, bounds: &BoundingBox, frame: [u32; 2]) -> Self {
+    pub(crate) fn project(clip_from_world: &Matrix4<f64>, bounds: &BoundingBox, frame_size: [u32; 2]) -> Self {
         let corners = bounds.corners().map(|corner| corner.to_homogeneous());
         let magnitudes = corners.iter().map(|corner| clip_from_world.abs() * corner.abs());
         let max_magnitude = magnitudes.fold(Vector4::zeros(), |max: Vector4<f64>, magnitude| max.sup(&magnitude));
@@ -48,31 +48,31 @@ impl Region {
         let min_w = clip_corners.iter().fold(f64::INFINITY, |min, corner| min.min(corner.w)) - clip_error.w;
         let mut coordinates = clip_corners.iter().chain([&clip_error]).flat_map(|corner| corner.iter());
         if !(min_w > 0.0 && coordinates.all(|coordinate| coordinate.is_finite())) {
-            return Self::whole(frame);
+            return Self::whole(frame_size);
         }
         let pixel_ranges = [0, 1].map(|axis| {
             let ndc = clip_corners.map(|corner| corner[axis] / corner.w);
             let (min_ndc, max_ndc) = ndc.iter().fold((f64::MAX, f64::MIN), |(min, max), &x| (min.min(x), max.max(x)));
             let ndc_error = (clip_error[axis] + min_ndc.abs().max(max_ndc.abs()) * clip_error.w) / min_w;
-            let side = f64::from(frame[axis]);
+            let side = f64::from(frame_size[axis]);
             let to_pixel = |ndc: f64, margin: f64| ((0.5 * ndc + 0.5) * side + margin).clamp(0.0, side);
             // No NaN: all coordinates are finite, and w is positive.
             let low = to_pixel(min_ndc - ndc_error, -PROJECTION_MARGIN).floor() as u32;
             [low, to_pixel(max_ndc + ndc_error, PROJECTION_MARGIN).ceil() as u32]
         });
-        Self { frame, corner: pixel_ranges.map(|[low, _]| low), size: pixel_ranges.map(|[low, high]| high - low) }
+        Self { frame_size, corner: pixel_ranges.map(|[low, _]| low), size: pixel_ranges.map(|[low, high]| high - low) }
     }
 
     /// Grows the region by `margin` pixels on each side, clamped to the frame.
     fn expanded(self, margin: u32) -> Self {
         let low = self.corner.map(|coordinate| coordinate.saturating_sub(margin));
-        let high = [0, 1].map(|axis| (self.corner[axis] + self.size[axis] + margin).min(self.frame[axis]));
+        let high = [0, 1].map(|axis| (self.corner[axis] + self.size[axis] + margin).min(self.frame_size[axis]));
         Self { corner: low, size: [high[0] - low[0], high[1] - low[1]], ..self }
     }
 
     /// Width and height of the frame.
-    pub(crate) const fn frame(&self) -> [u32; 2] {
-        self.frame
+    pub(crate) const fn frame_size(&self) -> [u32; 2] {
+        self.frame_size
     }
 
     /// Column and row of the bottom left pixel, width and height.
@@ -202,9 +202,10 @@ mod tests {
 
     #[test]
     fn image_is_dirty_at_first_and_after_mark_all() {
-        let (dirty_region, region) = (DirtyRegion::default(), Region { frame: FRAME, corner: [3, 1], size: [5, 6] });
+        let (dirty_region, region) =
+            (DirtyRegion::default(), Region { frame_size: FRAME, corner: [3, 1], size: [5, 6] });
         assert_eq!(dirty_region.replace(region), None);
-        let region_with_margin = Region { frame: FRAME, corner: [1, 0], size: [9, 9] };
+        let region_with_margin = Region { frame_size: FRAME, corner: [1, 0], size: [9, 9] };
         assert_eq!(dirty_region.replace(Region::whole(FRAME)), Some(region_with_margin));
         assert_eq!(dirty_region.replace(region), Some(Region::whole(FRAME)));
         dirty_region.mark_all();

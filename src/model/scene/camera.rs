@@ -105,8 +105,8 @@ impl Camera {
     pub fn fit_to_scene(scene: &Scene, width: u32, height: u32) -> Self {
         let up = scene.up.vector();
         let to_camera = scene.up.rotation_from_y_up() * Vector3::new(0.42, 0.14, 0.90).normalize();
-        let (bounds, field_of_view) = (scene.rest_bounds, 28.0_f64);
-        let slope = IMAGE_FILL * (field_of_view / 2.0).to_radians().tan();
+        let (bounds, vertical_degrees) = (scene.rest_bounds, 28.0_f64);
+        let slope = IMAGE_FILL * (vertical_degrees / 2.0).to_radians().tan();
         let aspect = f64::from(width.max(1)) / f64::from(height.max(1));
         let right = up.cross(&to_camera).normalize();
         let camera_up = to_camera.cross(&right);
@@ -121,7 +121,7 @@ impl Camera {
         let camera_distance = if max_distance > 0.0 { max_distance } else { 1.0 };
         let eye = bounds.center() + to_camera * camera_distance;
         let view = View::LookAt { eye: eye.coords.into(), target: bounds.center().coords.into(), up: up.into() };
-        Self { view, lens: Lens::FieldOfView(field_of_view), near: 0.0, far: 0.0 }
+        Self { view, lens: Lens::FieldOfView(vertical_degrees), near: 0.0, far: 0.0 }
     }
 
     /// Validates all fields.
@@ -251,6 +251,7 @@ impl Camera {
         let depths = bounds.corners().map(|corner| depth(&corner));
         let farthest = depths.iter().copied().fold(0.0, f64::max);
         let nearest = depths.iter().copied().fold(f64::INFINITY, f64::min);
+        // Four diagonals of ground behind the bounds. `near` is at least far / 10,000 to keep the precision of depth.
         let far = (farthest.max(0.0) + 4.0 * bounds.diagonal()).max(1e-6);
         ((0.5 * nearest).clamp(far * 1e-4, far * 0.5), far)
     }

@@ -47,8 +47,8 @@ impl OrientedBounds {
         let bound = |axis: usize, is_upper: bool| {
             let contribution = |world_axis: usize| {
                 let component = axes[axis][world_axis];
-                component
-                    * if (component >= 0.0) == is_upper { world_box.max[world_axis] } else { world_box.min[world_axis] }
+                let uses_max = (component >= 0.0) == is_upper;
+                component * if uses_max { world_box.max[world_axis] } else { world_box.min[world_axis] }
             };
             contribution(0) + contribution(1) + contribution(2)
         };

@@ -50,7 +50,9 @@ impl Beam {
         }
         for (station, carried_mass) in &self.point_masses {
             for (node, weight) in [(station.element, 1.0 - station.fraction), (station.element + 1, station.fraction)] {
-                for axis in 0..if node == 0 { 0 } else { 3 } {
+                // The mass resists the three translations of a node; the clamped node 0 has no free ones.
+                let free_translations = if node == 0 { 0 } else { 3 };
+                for axis in 0..free_translations {
                     mass[(6 * (node - 1) + axis, 6 * (node - 1) + axis)] += weight * carried_mass;
                 }
             }

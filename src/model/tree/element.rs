@@ -66,6 +66,8 @@ pub(super) fn element_matrices(
     )
 }
 
+/// Stiffness in local axes; `l` is the element's length. The polar moment of a circular section, which resists twist, is
+/// twice its second moment about a diameter.
 fn local_stiffness(l: f64, section: &Section, material: &ElasticConstants) -> Matrix12 {
     let mut matrix = Matrix12::zeros();
     let block = [1.0, -1.0, -1.0, 1.0];
@@ -82,6 +84,7 @@ fn local_stiffness(l: f64, section: &Section, material: &ElasticConstants) -> Ma
     matrix
 }
 
+/// Consistent mass in local axes, with the same symbols as [`local_stiffness`].
 fn local_mass(l: f64, section: &Section, material: &ElasticConstants) -> Matrix12 {
     let mut matrix = Matrix12::zeros();
     let block = [2.0, 1.0, 1.0, 2.0];

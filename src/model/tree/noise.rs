@@ -22,6 +22,7 @@ impl GradientNoise {
         let (sx, sy) = (fade(dx), fade(dy));
         let top_value = corner_value(0, 0) * (1.0 - sx) + corner_value(1, 0) * sx;
         let bottom_value = corner_value(0, 1) * (1.0 - sx) + corner_value(1, 1) * sx;
+        // The factor scales the interpolated values to about -1 to 1.
         1.4 * (top_value * (1.0 - sy) + bottom_value * sy)
     }
 

@@ -80,7 +80,8 @@ fn grow_trunk(random: &mut SplitMix64) -> PartTemplate {
         0.010 + 0.086 * (1.0 - fraction).powf(0.92) + 0.075 * (-centerline.arc_lengths[ring] / 0.22).exp()
     };
     let radii = (0..centerline.points.len()).map(radius).collect();
-    let mut template = wooden_part(PartKind::Trunk, centerline, radii, [24, 10]);
+    let (sides, rank) = (24, 10);
+    let mut template = wooden_part(PartKind::Trunk, centerline, radii, [sides, rank]);
     template.damping = 0.05;
     let phases = [random.uniform(0.0, TAU), random.uniform(0.0, TAU), random.uniform(0.0, TAU)];
     template.add_skin(UvMapping::Bark { repeats: 2 }, |arc_length, angle| {
@@ -134,7 +135,8 @@ fn grow_bough(
     let centerline = Centerline::grow(&growth, random);
     let base_radius = (0.008 + 0.0105 * length).min(max_radius);
     let radii = tapered_radii(&centerline, base_radius, 0.0045);
-    let mut template = wooden_part(PartKind::Branch, centerline, radii, [10, 6]);
+    let (sides, rank) = (10, 6);
+    let mut template = wooden_part(PartKind::Branch, centerline, radii, [sides, rank]);
     template.level = Some(1);
     template.damping = 0.07;
     template.add_skin(UvMapping::Bark { repeats: 1 }, |_, _| 1.0);
@@ -167,7 +169,8 @@ fn grow_twig(length: f64, leaves: &[PartTemplate], random: &mut SplitMix64) -> P
     };
     let centerline = Centerline::grow(&growth, random);
     let radii = tapered_radii(&centerline, 0.0040 + 0.0055 * length, 0.0028);
-    let mut template = wooden_part(PartKind::Branch, centerline, radii, [5, 4]);
+    let (sides, rank) = (5, 4);
+    let mut template = wooden_part(PartKind::Branch, centerline, radii, [sides, rank]);
     template.level = Some(2);
     template.damping = 0.09;
     template.add_skin(UvMapping::Bark { repeats: 1 }, |_, _| 1.0);
@@ -198,6 +201,7 @@ fn attach_leaf_clusters(
     }
 }
 
+/// A part of wood without skin and children, at level 0 and without damping.
 fn wooden_part(kind: PartKind, centerline: Centerline, radii: Vec<f64>, [sides, rank]: [usize; 2]) -> PartTemplate {
     PartTemplate {
         kind,

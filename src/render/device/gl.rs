@@ -29,7 +29,7 @@ use std::rc::Rc;
 use glow::HasContext as _;
 
 pub(crate) use self::barrier::MemoryBarriers;
-pub(crate) use self::clear::{ClearOp, VisibilityDirty};
+pub(crate) use self::clear::{ClearOp, VisibilityDirtyRegions};
 pub(crate) use self::debug::is_enabled as is_debug_enabled;
 pub(crate) use self::fence::Fence;
 pub(crate) use self::limits::Limits;
@@ -159,8 +159,8 @@ pub(crate) struct PipelineState {
     pub(crate) depth_clamp: bool,
     /// Depth is offset away from the camera, so that surfaces in the same plane stay visible.
     pub(crate) polygon_offset: bool,
-    /// Back faces are not drawn.
-    pub(crate) cull: bool,
+    /// Only triangles whose corners appear counterclockwise are drawn.
+    pub(crate) cull_back_faces: bool,
     /// Colors are blended over the existing colors. Alpha accumulates the transmittance: the fraction of the background
     /// that remains visible.
     pub(crate) blend: bool,
@@ -393,19 +393,14 @@ impl Gl {
         self.create_framebuffer(Some(Attachment { image: color, layer: None }), None)
     }
 
-    /// Creates a framebuffer whose only attachment, depth or color, is one layer of an array texture.
-    pub(crate) fn layer_framebuffer(
-        self: &Rc<Self>,
-        image: &Texture,
-        is_depth: bool,
-        layer: u32,
-    ) -> Result<Framebuffer> {
-        let attachment = Attachment { image, layer: Some(layer) };
-        if is_depth {
-            self.create_framebuffer(None, Some(attachment))
-        } else {
-            self.create_framebuffer(Some(attachment), None)
-        }
+    /// Creates a framebuffer whose only attachment is one layer of an array of depth images.
+    pub(crate) fn depth_layer_framebuffer(self: &Rc<Self>, image: &Texture, layer: u32) -> Result<Framebuffer> {
+        self.create_framebuffer(None, Some(Attachment { image, layer: Some(layer) }))
+    }
+
+    /// Creates a framebuffer whose only attachment is one layer of an array of color images.
+    pub(crate) fn color_layer_framebuffer(self: &Rc<Self>, image: &Texture, layer: u32) -> Result<Framebuffer> {
+        self.create_framebuffer(Some(Attachment { image, layer: Some(layer) }), None)
     }
 
     fn create_framebuffer(
@@ -499,11 +494,13 @@ impl Gl {
         set_flag(glow::DEPTH_TEST, true);
         set_flag(glow::DEPTH_CLAMP, state.depth_clamp);
         set_flag(glow::POLYGON_OFFSET_FILL, state.polygon_offset);
-        set_flag(glow::CULL_FACE, state.cull);
+        set_flag(glow::CULL_FACE, state.cull_back_faces);
         set_flag(glow::BLEND, state.blend);
         // SAFETY: sets state; no memory is accessed.
         unsafe {
             gl.depth_func(glow::LEQUAL);
+            // Factor of the depth slope, and rounding steps. Twin: `biased_ground_depth` in
+            // shaders/visibility_unpack.comp.
             gl.polygon_offset(1.0, 8.0);
             gl.depth_mask(state.depth_write);
             let one_minus_alpha = glow::ONE_MINUS_SRC_ALPHA;

@@ -6,24 +6,24 @@ use crate::scene_data::geometry::{BlendMode, DrawGroup};
 use crate::types::{CullStats, FrameCullStats};
 
 /// Triangles per block; one workgroup tests a block.
-pub(crate) const WORKGROUP_SIZE: u32 = 256;
-/// Blocks per super block. The visible triangles of a super block are counted together.
+pub(crate) const TRIANGLES_PER_BLOCK: u32 = 256;
+/// Blocks per superblock. The visible triangles of a superblock are counted together.
 pub(crate) const SUPERBLOCK: u32 = 64;
 /// Maximum number of groups: three blend modes, single- and double-sided.
 pub(crate) const MAX_GROUPS: usize = 6;
 /// Number of counters: five results of the test for the camera, and five for the sun.
 const COUNTER_WORDS: usize = 10;
-pub(crate) const COUNTER_BYTES: usize = 4 * COUNTER_WORDS;
+pub(crate) const CULL_COUNTER_BYTES: usize = 4 * COUNTER_WORDS;
 /// First counter of the camera.
 pub(crate) const CAMERA_COUNTERS: usize = 0;
 /// First counter of the sun.
 pub(crate) const SHADOW_COUNTERS: usize = 5;
-/// The coarsest level of the depth pyramid, with squares of 2^8 pixels.
+/// The coarsest level of the depth pyramid. Its texels are squares of 2^8 pixels.
 pub(crate) const MAX_LEVEL: u32 = 8;
 /// Storage bindings of the culling passes.
 pub(crate) const DRAWS_BINDING: u32 = 0;
 pub(crate) const VISIBLE_BITS_BINDING: u32 = 1;
-pub(crate) const COUNTERS_BINDING: u32 = 2;
+pub(crate) const CULL_COUNTERS_BINDING: u32 = 2;
 pub(crate) const PREVIOUSLY_VISIBLE_BINDING: u32 = 3;
 pub(crate) const PYRAMID_BINDING: u32 = 4;
 pub(crate) const TRIANGLE_IDS_BINDING: u32 = 5;
@@ -32,7 +32,7 @@ pub(crate) const INDICES_BINDING: u32 = 6;
 const MAX_DISPATCH_WIDTH: u32 = 1 << 15;
 /// Words of an indexed indirect draw command.
 const COMMAND_WORDS: usize = 5;
-/// Words of the draw buffer before the totals of the super blocks: the commands and two unused words.
+/// Words of the draw buffer before the totals of the superblocks: the commands and two words of padding.
 const TOTALS_OFFSET: usize = COMMAND_WORDS * MAX_GROUPS + 2;
 
 /// Uniform block of the groups. Twin of `GroupBlock` in `shaders/shared/cull.glsl`.
@@ -43,7 +43,7 @@ pub(crate) struct CullUniforms {
     ranges: [[u32; 4]; MAX_GROUPS],
     /// Per group: whether it is single-sided, and whether its triangles use vertices only, without corners.
     flags: [[u32; 4]; MAX_GROUPS],
-    /// Numbers of groups, workgroups and blocks. Blocks are padded to super blocks.
+    /// Numbers of groups, workgroups and blocks. Blocks are padded to superblocks.
     count: [u32; 4],
     /// Step of the rasterizer's subpixel grid, in pixels.
     subpixel_step: [f32; 4],
@@ -57,11 +57,11 @@ impl CullUniforms {
         let mut uniforms = Self { subpixel_step: [subpixel_step, 0.0, 0.0, 0.0], ..Self::zeroed() };
         let (mut workgroup, mut block) = (0, 0);
         for ((range, flags), group) in uniforms.ranges.iter_mut().zip(&mut uniforms.flags).zip(groups) {
-            *range = [group.first_triangle as u32, group.triangles as u32, workgroup, block];
+            *range = [group.first_triangle as u32, group.triangle_count as u32, workgroup, block];
             *flags = [u32::from(!group.double_sided), u32::from(group.blend_mode == BlendMode::Opaque), 0, 0];
-            let blocks = (group.triangles as u32).div_ceil(WORKGROUP_SIZE);
+            let blocks = (group.triangle_count as u32).div_ceil(TRIANGLES_PER_BLOCK);
             workgroup += blocks;
-            // A super block contains blocks of one group only.
+            // A superblock contains blocks of one group only.
             block += blocks.next_multiple_of(SUPERBLOCK);
         }
         uniforms.count = [groups.len() as u32, workgroup, block, 0];
@@ -75,10 +75,10 @@ impl CullUniforms {
 
     /// Bytes of a bitmap with one bit for every triangle of every block.
     pub(crate) const fn mask_bytes(&self) -> usize {
-        self.count[2] as usize * WORKGROUP_SIZE as usize / 8
+        self.count[2] as usize * TRIANGLES_PER_BLOCK as usize / 8
     }
 
-    /// Bytes of the draw buffer: a draw command per group, then a total per super block.
+    /// Bytes of the draw buffer: a draw command per group, then a total per superblock.
     pub(crate) const fn draws_bytes(&self) -> usize {
         4 * (TOTALS_OFFSET + (self.count[2] / SUPERBLOCK) as usize)
     }
@@ -119,18 +119,19 @@ pub(crate) fn parse_counters(counters: &[u8]) -> FrameCullStats {
 mod tests {
     use super::*;
 
-    fn group(first_triangle: usize, triangles: usize) -> DrawGroup {
-        DrawGroup { blend_mode: BlendMode::Mask, double_sided: true, first_triangle, triangles }
+    fn group(first_triangle: usize, triangle_count: usize) -> DrawGroup {
+        DrawGroup { blend_mode: BlendMode::Mask, double_sided: true, first_triangle, triangle_count }
     }
 
     #[test]
-    fn super_blocks_contain_consecutive_blocks_of_one_group() {
+    fn superblocks_contain_consecutive_blocks_of_one_group() {
+        // Blocks: 1, 65 and 1. Superblocks: 1, 2 and 1.
         let groups = CullUniforms::new(&[group(0, 1), group(1, 256 * 64 + 1), group(16386, 256)], 0.25);
         assert_eq!(groups.ranges[..3], [[0, 1, 0, 0], [1, 16385, 1, 64], [16386, 256, 66, 192]]);
         assert_eq!((groups.count, groups.dispatch_size()), ([3, 67, 256, 0], [67, 1]));
         assert_eq!(groups.mask_bytes(), 256 * 32);
         let draws: Vec<u32> = bytemuck::pod_collect_to_vec(&groups.empty_draws());
-        assert_eq!(draws.len(), 32 + 4);
+        assert_eq!(draws.len(), TOTALS_OFFSET + 4);
         assert_eq!(draws[command_offset(1) / 4..][..5], [0, 1, 3, 0, 0]);
         assert_eq!(
             draws[command_offset(2) / 4..][..10],
@@ -143,7 +144,7 @@ mod tests {
     fn dispatch_of_many_blocks_covers_all_blocks_in_several_rows() {
         let groups = CullUniforms::new(&[group(0, 1 << 26)], 0.0);
         let [columns, rows] = groups.dispatch_size();
-        let blocks = (1 << 26) / WORKGROUP_SIZE;
+        let blocks = (1 << 26) / TRIANGLES_PER_BLOCK;
         assert!(columns <= 65535);
         assert!(columns * rows >= blocks && columns * (rows - 1) < blocks);
     }

@@ -11,20 +11,20 @@ use modalcast_model::scene::Scene;
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Pod, Zeroable)]
 pub(crate) struct PackedMaterial {
-    /// xyz: ambient color. w: index of the texture array with the normal map, -1 without a normal map.
+    /// xyz: ambient color. w: texture array of the normal map, -1 without a normal map.
     ambient_array: [f32; 4],
     /// xyz: diffuse color. w: layer of the normal map.
     diffuse_layer: [f32; 4],
     /// xyz: specular color. w: specular exponent.
     specular_exponent: [f32; 4],
-    /// Array and layer of the color texture, -1 without a color texture; alpha; cutoff.
+    /// Texture array and layer of the color texture, -1 without a color texture; alpha; cutoff.
     color_texture_alpha: [f32; 4],
 }
 
 pub(crate) const MATERIAL_BYTES: usize = size_of::<PackedMaterial>();
 const _: () = assert!(MATERIAL_BYTES == 64, "PackedMaterial differs from shaders/shared/material.glsl");
 
-/// Packs the materials that triangles use. `texture_arrays` are those of colors and those of normals.
+/// Packs the materials that triangles use. `texture_arrays`: arrays of color textures, then those of normal maps.
 pub(crate) fn pack_materials(scene: &Scene, texture_arrays: &[Vec<TextureArray>; 2]) -> Vec<PackedMaterial> {
     let pack_vec4 = |[r, g, b]: [f32; 3], w: f32| [r, g, b, w];
     let find_texture = |arrays: &[TextureArray], texture: Option<usize>| {

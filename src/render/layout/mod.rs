@@ -14,15 +14,15 @@ pub(crate) const POSITION_UNIT: u32 = 13;
 pub(crate) const MATERIAL_UNIT: u32 = 14;
 pub(crate) const TRIANGLE_MATERIAL_UNIT: u32 = 15;
 pub(crate) const CORNER_NORMAL_UNIT: u32 = 16;
-pub(crate) const TRIANGLE_UNIT: u32 = 17;
+pub(crate) const TRIANGLE_CORNER_UNIT: u32 = 17;
 pub(crate) const TRIANGLE_VERTEX_UNIT: u32 = 18;
 pub(crate) const UV_UNIT: u32 = 19;
 pub(crate) const TANGENT_UNIT: u32 = 20;
 pub(crate) const ID_UNIT: u32 = 21;
-/// Light and transmittance of the blended triangles.
-pub(crate) const LAYER_UNIT: u32 = 22;
+/// Blend layers: light and transmittance of the blended triangles.
+pub(crate) const BLEND_LAYER_UNIT: u32 = 22;
 /// Number of blended fragments of each pixel.
-pub(crate) const COUNT_UNIT: u32 = 23;
+pub(crate) const FRAGMENT_COUNT_UNIT: u32 = 23;
 /// Vertex values of AOV readbacks.
 pub(crate) const VALUE_UNIT: u32 = 24;
 /// Ids of the triangles in the culled lists.
@@ -31,7 +31,8 @@ pub(crate) const TRIANGLE_ID_UNIT: u32 = 25;
 pub(crate) const DEPTH_UNIT: u32 = 26;
 /// Texture unit of the image that a blur, bloom or encode program reads.
 pub(crate) const SOURCE_UNIT: u32 = 0;
-/// Maximum number of textures that the shading reads in addition to the scene's images.
+/// Maximum number of textures that the shading reads in addition to the scene's images: the units above, except those of
+/// images, vertex values and culled lists.
 pub(crate) const FIXED_TEXTURE_READS: usize = 13;
 const _: () = assert!(NORMAL_UNIT + MAX_ARRAYS as u32 <= POSITION_UNIT, "texture units overlap");
 
@@ -40,8 +41,10 @@ pub(crate) const FRAME_BLOCK: u32 = 0;
 pub(crate) const CASCADE_BLOCK: u32 = 2;
 pub(crate) const CULL_BLOCK: u32 = 3;
 
-/// Storage bindings of the passes that draw, shade and read back.
+/// Storage binding of the buffer that a conversion reads or writes: pixels, ids, AOV fields, or output of the compute
+/// rasterizer.
 pub(crate) const WORDS_BINDING: u32 = 0;
+/// Storage binding of tile lists.
 pub(crate) const TILES_BINDING: u32 = 1;
 
 /// Invocations of a compute workgroup, along x.
@@ -49,10 +52,10 @@ pub(crate) const WORKGROUP_SIZE: u32 = 64;
 /// Side of the square of pixels that a workgroup shades.
 pub(crate) const TILE: u32 = 8;
 /// Number of workgroups in a row of the dispatch over listed tiles.
-pub(crate) const TILE_ROW: u32 = 64;
-/// Header of an empty tile list: the workgroup counts of the indirect dispatch (TILE_ROW, 0 rows, 1), and the tile
+pub(crate) const TILES_PER_ROW: u32 = 64;
+/// Header of an empty tile list: the workgroup counts of the indirect dispatch (TILES_PER_ROW, 0 rows, 1), and the tile
 /// count.
-pub(crate) const EMPTY_TILE_LIST: [u32; 4] = [TILE_ROW, 0, 1, 0];
+pub(crate) const EMPTY_TILE_LIST: [u32; 4] = [TILES_PER_ROW, 0, 1, 0];
 
 /// Bytes of the tile list of an image: [`EMPTY_TILE_LIST`], then one word per tile.
 pub(crate) fn tile_list_bytes([width, height]: [u32; 2]) -> u64 {

@@ -8,15 +8,15 @@ use crate::types::OitStats;
 pub(crate) const HISTOGRAM_TILE: u32 = 16;
 /// Bins of the histogram over fragments per pixel; the last bin also counts pixels with more fragments.
 pub(crate) const BINS: usize = 256;
-/// Bytes of a fragment: a word of depth, and a word of id and coverage.
+/// Bytes of a record, which stores a fragment: a word of depth, and a word of id and coverage.
 pub(crate) const RECORD_BYTES: u64 = 8;
 /// Storage bindings.
 pub(crate) const RECORDS_BINDING: u32 = 2;
-pub(crate) const COUNTERS_BINDING: u32 = 3;
+pub(crate) const OIT_COUNTERS_BINDING: u32 = 3;
 /// Image units.
-pub(crate) const COUNTS_IMAGE: u32 = 1;
+pub(crate) const FRAGMENT_COUNTS_IMAGE: u32 = 1;
 pub(crate) const CURSORS_IMAGE: u32 = 2;
-pub(crate) const LAYERS_IMAGE: u32 = 3;
+pub(crate) const BLEND_LAYERS_IMAGE: u32 = 3;
 /// Phase of the gather program that counts fragments.
 pub(crate) const PHASE_COUNT: i32 = 0;
 /// Phase of the gather program that stores the fragments of pixels within the limit, and the nearest depths of others.
@@ -28,8 +28,8 @@ pub(crate) const PHASE_FILL_IDS: i32 = 2;
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Pod, Zeroable)]
 pub(crate) struct OitCounters {
-    /// Number of blended fragments, low word first.
-    pub(crate) total: [u32; 2],
+    /// Number of blended fragments of the frame, low word first.
+    pub(crate) fragment_total: [u32; 2],
     /// Maximum number of fragments of a pixel.
     pub(crate) max_per_pixel: u32,
     /// Maximum number of stored fragments per pixel; `u32::MAX` without a limit.
@@ -43,18 +43,18 @@ pub(crate) struct OitCounters {
     pub(crate) commands: [[u32; 5]; 2],
 }
 
-pub(crate) const COUNTERS_HEADER_BYTES: usize = size_of::<OitCounters>();
+pub(crate) const OIT_HEADER_BYTES: usize = size_of::<OitCounters>();
 /// Byte offset of `commands` in [`OitCounters`].
 pub(crate) const COMMANDS_OFFSET: usize = 24;
-pub(crate) const COUNTERS_BYTES: usize = COUNTERS_HEADER_BYTES + 4 * BINS;
-const _: () = assert!(COUNTERS_HEADER_BYTES == 64, "OitCounters differs from shaders/shared/oit_lists.glsl");
+pub(crate) const COUNTERS_BYTES: usize = OIT_HEADER_BYTES + 4 * BINS;
+const _: () = assert!(OIT_HEADER_BYTES == 64, "OitCounters differs from shaders/shared/oit_lists.glsl");
 
 /// Parses the fragment statistics of a frame from the bytes of its [`OitCounters`].
 pub(crate) fn parse_counters(bytes: &[u8]) -> OitStats {
     let mut counters = OitCounters::zeroed();
     // Copy bytes, because `bytes` may be unaligned.
     bytemuck::bytes_of_mut(&mut counters).iter_mut().zip(bytes).for_each(|(target, source)| *target = *source);
-    let [low_word, high_word] = counters.total.map(u64::from);
+    let [low_word, high_word] = counters.fragment_total.map(u64::from);
     let per_pixel_limit = (counters.per_pixel_limit != u32::MAX).then_some(counters.per_pixel_limit);
     OitStats {
         fragments: high_word << 32 | low_word,

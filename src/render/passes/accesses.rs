@@ -92,14 +92,14 @@ impl Access {
 
 type Accesses = &'static [(Resource, Access)];
 
-/// Draws of culled lists.
+/// Draws of visible triangles.
 const VISIBLE_LISTS: Accesses = &[
     (Resource::CullDraws, Access::Indirect),
     (Resource::VisibleIndices, Access::Index),
     (Resource::VisibleTriangleIds, Access::Sampled),
 ];
 
-/// Reset of the culled lists, culling tests and compaction of the lists.
+/// Reset of the lists of visible triangles, culling tests and compaction of the lists.
 const LIST_TRIANGLES: Accesses = &[
     (Resource::CullDraws, Access::Transfer),
     (Resource::CullDraws, Access::StorageWrite),

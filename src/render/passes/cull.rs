@@ -33,7 +33,7 @@ use crate::device::gl::{ClearOp, PipelineState, Program};
 use crate::layout::cull::MAX_LEVEL;
 use crate::layout::{DEPTH_UNIT, TRIANGLE_ID_UNIT, pack_size};
 use crate::pass::Pass;
-use crate::resources::cull::TriangleCuller;
+use crate::resources::cull::CullResources;
 use crate::resources::depth_pyramid::DepthPyramid;
 use crate::resources::programs::OcclusionPrograms;
 use crate::resources::scene_buffers::SceneBuffers;
@@ -51,20 +51,20 @@ const PYRAMID_TILE: u32 = 1 << LEVELS_PER_DISPATCH;
 
 /// Runs the bound culling program, which marks visible triangles, and compacts these to lists. The caller has bound the
 /// inputs.
-fn cull_and_compact(recorder: &PassRecorder<'_>, pass: Pass, culler: &TriangleCuller, compact: &Program) {
-    let [columns, rows] = culler.uniforms.dispatch_size();
+fn cull_and_compact(recorder: &PassRecorder<'_>, pass: Pass, cull_resources: &CullResources, compact: &Program) {
+    let [columns, rows] = cull_resources.uniforms.dispatch_size();
     recorder.gl.dispatch(columns, rows);
     recorder.barrier_within_pass(pass);
     compact.bind(None);
     recorder.gl.dispatch(columns, rows);
-    culler.triangle_ids.bind(TRIANGLE_ID_UNIT);
+    cull_resources.triangle_ids.bind(TRIANGLE_ID_UNIT);
 }
 
 /// Begins a pass that lists triangles: empties the lists and binds the buffers.
-fn begin_lists(recorder: &PassRecorder<'_>, pass: Pass, culler: &TriangleCuller) {
+fn begin_lists(recorder: &PassRecorder<'_>, pass: Pass, cull_resources: &CullResources) {
     recorder.begin(pass);
-    culler.buffers.draws.write(&culler.uniforms.empty_draws());
-    culler.bind();
+    cull_resources.buffers.draws.write(&cull_resources.uniforms.empty_draws());
+    cull_resources.bind();
 }
 
 /// Lists the triangles that may cast a shadow into one layer of the map. `size`: side of the map in texels. `set_layer`
@@ -75,33 +75,35 @@ pub(super) fn cull_shadow_casters(
     size: u32,
     set_layer: impl Fn(&Program),
 ) -> Result<()> {
-    let (Some(culler), Some(programs)) = (&buffers.culler, &buffers.programs.shadow_cull) else { return Ok(()) };
-    begin_lists(recorder, Pass::ShadowCull, culler);
+    let (Some(cull_resources), Some(programs)) = (&buffers.cull_resources, &buffers.programs.shadow_cull) else {
+        return Ok(());
+    };
+    begin_lists(recorder, Pass::ShadowCull, cull_resources);
     programs.cull_triangles.bind(Some(pack_size([size; 2])));
     set_layer(&programs.cull_triangles);
-    cull_and_compact(recorder, Pass::ShadowCull, culler, &programs.compact);
+    cull_and_compact(recorder, Pass::ShadowCull, cull_resources, &programs.compact);
     recorder.check(Pass::ShadowCull)
 }
 
 /// Lists the triangles that the camera may see. Does nothing without culling.
 pub(crate) fn cull_for_camera(recorder: &mut PassRecorder<'_>, frame: &FrameContext<'_>) -> Result<()> {
     let FrameContext { buffers, target, programs, .. } = *frame;
-    let (Some(culler), Some(programs)) = (&buffers.culler, &programs.cull) else { return Ok(()) };
+    let (Some(cull_resources), Some(programs)) = (&buffers.cull_resources, &programs.cull) else { return Ok(()) };
     if let (Some(pyramid), Some(occlusion)) = (&target.depth_pyramid, &programs.occlusion) {
-        begin_lists(recorder, Pass::Occluders, culler);
+        begin_lists(recorder, Pass::Occluders, cull_resources);
         occlusion.cull_previous.bind(None);
-        cull_and_compact(recorder, Pass::Occluders, culler, &programs.compact);
+        cull_and_compact(recorder, Pass::Occluders, cull_resources, &programs.compact);
         recorder.barrier_within_pass(Pass::Occluders);
         draw_occluders(recorder, frame, pyramid);
         build_pyramid(recorder, target, pyramid, occlusion);
         recorder.finish(Pass::Occluders)?;
     }
-    begin_lists(recorder, Pass::Cull, culler);
+    begin_lists(recorder, Pass::Cull, cull_resources);
     if let Some(pyramid) = &target.depth_pyramid {
         pyramid.bind();
     }
     programs.cull_triangles.bind(Some(pack_size([target.desc.width, target.desc.height])));
-    cull_and_compact(recorder, Pass::Cull, culler, &programs.compact);
+    cull_and_compact(recorder, Pass::Cull, cull_resources, &programs.compact);
     recorder.finish(Pass::Cull)
 }
 
@@ -147,9 +149,9 @@ fn build_pyramid(
 pub(super) fn record_visible(recorder: &PassRecorder<'_>, frame: &FrameContext<'_>) -> Result<()> {
     let FrameContext { buffers, target, programs, .. } = *frame;
     let occlusion = programs.cull.as_ref().and_then(|programs| programs.occlusion.as_ref());
-    let (Some(culler), Some(programs)) = (&buffers.culler, occlusion) else { return Ok(()) };
+    let (Some(cull_resources), Some(programs)) = (&buffers.cull_resources, occlusion) else { return Ok(()) };
     recorder.begin(Pass::RecordVisible);
-    culler.bind();
+    cull_resources.bind();
     bind_visibility(target);
     programs.record_visible.bind(None);
     recorder.gl.dispatch(target.desc.width.div_ceil(RECORD_TILE), target.desc.height.div_ceil(RECORD_TILE));

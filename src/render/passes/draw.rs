@@ -16,7 +16,7 @@ use crate::uniforms::frame::FrameUniforms;
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum TriangleSet {
     All,
-    /// The triangles in the culled lists.
+    /// The triangles that passed the culling tests, from the lists of visible triangles.
     Visible,
 }
 
@@ -72,20 +72,20 @@ pub(super) fn draw_groups(
     state: PipelineState,
 ) {
     for (index, group) in groups_of(buffers, draw.blend_mode) {
-        recorder.gl.set_pipeline_state(PipelineState { cull: !group.double_sided, ..state });
+        recorder.gl.set_pipeline_state(PipelineState { cull_back_faces: !group.double_sided, ..state });
         draw.program.bind(Some(first_triangle_of(group, draw.triangles)));
         draw_group(recorder.gl, buffers, index, draw.triangles);
         recorder.stats.draw_calls += 1;
     }
 }
 
-/// Draws the triangles with one blend mode without back-face culling, in one call or in one call per culled list. The
-/// caller has bound the program.
+/// Draws the triangles with one blend mode without back-face culling: all in one call, or visible ones in one call per
+/// list. The caller has bound the program.
 pub(super) fn draw_double_sided(gl: &Gl, buffers: &SceneBuffers, draw: TriangleDraw<'_>) {
     // Only the fragment shader of cut-outs and blended triangles reads the uniform `first_triangle`.
     let has_fragment_shader = draw.blend_mode != BlendMode::Opaque;
     if draw.triangles == TriangleSet::All {
-        let (first, count) = buffers.triangles(draw.blend_mode);
+        let (first, count) = buffers.triangle_range(draw.blend_mode);
         if has_fragment_shader {
             draw.program.set_first_triangle(first as u32);
         }
@@ -102,13 +102,13 @@ pub(super) fn draw_double_sided(gl: &Gl, buffers: &SceneBuffers, draw: TriangleD
     }
 }
 
-/// Selects the culled lists if the scene has them, else all triangles.
+/// Selects the lists of visible triangles if the scene has them, else all triangles.
 pub(super) fn triangle_set(buffers: &SceneBuffers) -> TriangleSet {
-    if buffers.culler.is_some() { TriangleSet::Visible } else { TriangleSet::All }
+    if buffers.cull_resources.is_some() { TriangleSet::Visible } else { TriangleSet::All }
 }
 
-/// Uniform `first_triangle` of `shaders/shared/triangle_id.glsl`: the first triangle of a group, or its complement for a
-/// culled list.
+/// Uniform `first_triangle` of `shaders/shared/triangle_id.glsl`: the first triangle of a group, or its bitwise complement
+/// for a list of visible triangles.
 pub(super) const fn first_triangle_of(group: &DrawGroup, triangles: TriangleSet) -> u32 {
     match triangles {
         TriangleSet::All => group.first_triangle as u32,
@@ -116,13 +116,13 @@ pub(super) const fn first_triangle_of(group: &DrawGroup, triangles: TriangleSet)
     }
 }
 
-/// Draws a group, or the culled list of the group.
+/// Draws a group, or the visible triangles of the group.
 pub(super) fn draw_group(gl: &Gl, buffers: &SceneBuffers, group_index: usize, triangles: TriangleSet) {
     let group = buffers.groups[group_index];
     match triangles {
         TriangleSet::All => {
             if let Some(array) = buffers.vertex_array(group.blend_mode) {
-                gl.draw_indexed(array, group.first_triangle, group.triangles);
+                gl.draw_indexed(array, group.first_triangle, group.triangle_count);
             }
         }
         TriangleSet::Visible => {

@@ -11,7 +11,7 @@ use super::recorder::PassRecorder;
 use crate::device::gl::{BufferCopy, ClearOp, Gl, PipelineState};
 use crate::layout::cull::command_offset;
 use crate::layout::oit::{
-    COMMANDS_OFFSET, COUNTERS_BYTES, COUNTERS_HEADER_BYTES, HISTOGRAM_TILE, LAYERS_IMAGE, OitCounters, PHASE_COUNT,
+    BLEND_LAYERS_IMAGE, COMMANDS_OFFSET, COUNTERS_BYTES, HISTOGRAM_TILE, OIT_HEADER_BYTES, OitCounters, PHASE_COUNT,
     PHASE_FILL, PHASE_FILL_IDS, RECORD_BYTES,
 };
 use crate::layout::{EMPTY_TILE_LIST, TILE};
@@ -29,13 +29,19 @@ fn reset_counters(gl: &Gl, buffers: &SceneBuffers, target: &OitTarget) {
     let mut commands = [[0; 5]; 2];
     for (command, (_, group)) in commands.iter_mut().zip(groups_of(buffers, BlendMode::Blend)) {
         // A `DrawElementsIndirectCommand` without instances; the allocate program sets their number.
-        *command = [3 * group.triangles as u32, 0, 3 * group.first_triangle as u32, 0, 0];
+        *command = [3 * group.triangle_count as u32, 0, 3 * group.first_triangle as u32, 0, 0];
     }
     let budget = (target.records.bytes / RECORD_BYTES) as u32;
-    let header =
-        OitCounters { total: [0; 2], max_per_pixel: 0, per_pixel_limit: u32::MAX, allocated: 0, budget, commands };
+    let header = OitCounters {
+        fragment_total: [0; 2],
+        max_per_pixel: 0,
+        per_pixel_limit: u32::MAX,
+        allocated: 0,
+        budget,
+        commands,
+    };
     let mut bytes = vec![0; COUNTERS_BYTES];
-    bytes[..COUNTERS_HEADER_BYTES].copy_from_slice(bytemuck::bytes_of(&header));
+    bytes[..OIT_HEADER_BYTES].copy_from_slice(bytemuck::bytes_of(&header));
     target.counters.write(&bytes);
     for (command_index, (group_index, _)) in groups_of(buffers, BlendMode::Blend).enumerate() {
         // With culling, the number of indices is that of the visible triangles.
@@ -63,7 +69,7 @@ pub(super) fn draw(
     region: Region,
 ) -> Result<()> {
     let gl = recorder.gl;
-    let [width, height] = region.frame();
+    let [width, height] = region.frame_size();
     let gather = Gather { buffers, target, programs, region };
     recorder.begin(Pass::OitCount);
     reset_counters(gl, buffers, target);
@@ -85,7 +91,7 @@ pub(super) fn draw(
     recorder.finish(Pass::OitFill)?;
     recorder.begin(Pass::OitResolve);
     bind_shadow(buffers);
-    target.layers.bind_image(LAYERS_IMAGE);
+    target.blend_layers.bind_image(BLEND_LAYERS_IMAGE);
     programs.resolve.bind(None);
     gl.dispatch_indirect(&target.tile_list);
     recorder.finish(Pass::OitResolve)
@@ -110,7 +116,7 @@ impl Gather<'_> {
         let Some(vertex_array) = culled_vertex_array.or_else(|| buffers.vertex_array(BlendMode::Blend)) else { return };
         gl.begin_pass(&target.depth_fbo, region, ClearOp::Load);
         for (command_index, (group_index, group)) in groups_of(buffers, BlendMode::Blend).enumerate() {
-            gl.set_pipeline_state(PipelineState { cull: !group.double_sided, ..PipelineState::default() });
+            gl.set_pipeline_state(PipelineState { cull_back_faces: !group.double_sided, ..PipelineState::default() });
             programs.gather.bind(Some(first_triangle_of(group, triangles)));
             programs.gather.set_phase(phase);
             if phase == PHASE_FILL_IDS {

@@ -70,8 +70,10 @@ pub(crate) fn copy_frame(recorder: &PassRecorder<'_>, frame: &FrameContext<'_>, 
     let FrameContext { buffers, target, .. } = *frame;
     recorder.begin(Pass::Read);
     recorder.gl.copy(BufferCopy::first(target.desc.encoded_bytes(), &target.readback_source, staging));
-    let counters =
-        [target.oit.as_ref().map(|oit| &oit.counters), buffers.culler.as_ref().map(|culler| &culler.buffers.counters)];
+    let counters = [
+        target.oit.as_ref().map(|oit| &oit.counters),
+        buffers.cull_resources.as_ref().map(|cull_resources| &cull_resources.buffers.counters),
+    ];
     for (source, range) in counters.into_iter().zip(target.desc.readback_ranges()) {
         if let Some(source) = source.filter(|_| !range.is_empty()) {
             let copy = BufferCopy::first(range.end - range.start, source, staging);

@@ -2,7 +2,7 @@
 
 use super::draw::{bind_shadow, bind_visibility};
 use super::recorder::{FrameContext, PassRecorder};
-use crate::layout::{COUNT_UNIT, EMPTY_TILE_LIST, LAYER_UNIT, TILE, TILES_BINDING};
+use crate::layout::{BLEND_LAYER_UNIT, EMPTY_TILE_LIST, FRAGMENT_COUNT_UNIT, TILE, TILES_BINDING};
 use crate::pass::Pass;
 use modalcast_model::error::Result;
 
@@ -17,11 +17,11 @@ pub(crate) fn draw(recorder: &mut PassRecorder<'_>, frame: &FrameContext<'_>) ->
     bind_shadow(buffers);
     bind_visibility(target);
     if let Some(layer) = &target.blend_layer {
-        layer.color.bind(LAYER_UNIT);
+        layer.color.bind(BLEND_LAYER_UNIT);
     }
     if let Some(oit) = &target.oit {
-        oit.layers.bind(LAYER_UNIT);
-        oit.fragment_counts.bind(COUNT_UNIT);
+        oit.blend_layers.bind(BLEND_LAYER_UNIT);
+        oit.fragment_counts.bind(FRAGMENT_COUNT_UNIT);
     }
     target.scene_color.bind_image(COLOR_IMAGE);
     if let Some(finest_mip) = target.bloom_mips.first() {

@@ -37,7 +37,7 @@ pub(crate) fn draw_depth(recorder: &mut PassRecorder<'_>, buffers: &SceneBuffers
             draw_double_sided(recorder.gl, buffers, TriangleDraw { blend_mode, program, triangles });
         }
     }
-    if buffers.culler.is_some() {
+    if buffers.cull_resources.is_some() {
         recorder.stats.passes.push(Pass::ShadowCull);
     }
     recorder.finish(Pass::Shadow)

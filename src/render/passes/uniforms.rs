@@ -3,7 +3,7 @@
 
 use super::draw::bind_scene;
 use super::recorder::PassRecorder;
-use crate::layout::cull::COUNTER_BYTES;
+use crate::layout::cull::CULL_COUNTER_BYTES;
 use crate::pass::Pass;
 use crate::resources::scene_buffers::SceneBuffers;
 use crate::types::FrameParams;
@@ -14,8 +14,8 @@ use crate::uniforms::frame::{FrameUniforms, light_box_params};
 pub(crate) fn upload(recorder: &PassRecorder<'_>, buffers: &SceneBuffers, params: &FrameParams, frame: &FrameUniforms) {
     recorder.begin(Pass::UniformUpload);
     upload_frame(buffers, frame);
-    if let Some(culler) = &buffers.culler {
-        culler.buffers.counters.write(&[0; COUNTER_BYTES]);
+    if let Some(cull_resources) = &buffers.cull_resources {
+        cull_resources.buffers.counters.write(&[0; CULL_COUNTER_BYTES]);
     }
     if let Some(cascades) = &buffers.uniforms.cascades {
         let box_params = light_box_params(&buffers.scene, params, buffers.origin);

@@ -67,7 +67,7 @@ pub(crate) struct UniformBuffers<T> {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct CullBuffers<T> {
     pub(crate) uniforms: T,
-    /// Indirect draws of the groups, then the number of visible triangles per super block.
+    /// Indirect draws of the groups, then the number of visible triangles per superblock.
     pub(crate) draws: T,
     /// Results of the culling tests, for statistics.
     pub(crate) counters: T,

@@ -2,7 +2,7 @@
 
 use super::buffers::CullBuffers;
 use crate::device::gl::Limits;
-use crate::layout::cull::{COUNTER_BYTES, CullUniforms};
+use crate::layout::cull::{CULL_COUNTER_BYTES, CullUniforms};
 use crate::pass::Pass;
 use crate::scene_data::geometry::groups;
 use modalcast_model::scene::{Culling, Scene};
@@ -12,7 +12,7 @@ use modalcast_model::scene::{Culling, Scene};
 const MIN_TRIANGLES: usize = 1 << 20;
 
 /// Selects the culling method of a scene on a device: the method of the look, or for `Auto` the faster one. `None` if
-/// the lists exceed the largest buffer of the device.
+/// the lists of visible triangles exceed the largest buffer of the device.
 ///
 /// Milliseconds per frame on hardware (H200, 1080p). The almond tree has double-sided leaves and four samples per
 /// pixel.
@@ -64,7 +64,7 @@ pub(crate) fn cull_buffer_sizes(scene: &Scene, culling: Culling) -> Option<CullB
     Some(CullBuffers {
         uniforms: size_of::<CullUniforms>() as u64,
         draws: uniforms.draws_bytes() as u64,
-        counters: COUNTER_BYTES as u64,
+        counters: CULL_COUNTER_BYTES as u64,
         visible_bits: bitmap_bytes,
         triangle_ids: 4 * triangles,
         indices: 12 * triangles,

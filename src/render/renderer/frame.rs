@@ -160,7 +160,7 @@ impl Renderer {
             Ok(())
         })?;
         let rasterizer = buffers.visibility_rasterizer();
-        if buffers.culler.is_some() && rasterizer.is_none() {
+        if buffers.cull_resources.is_some() && rasterizer.is_none() {
             timers.push(self.time_pass(Pass::Cull, || passes::cull::cull_for_camera(recorder, frame))?);
         }
         timers.push(self.time_pass(Pass::Visibility, || match rasterizer {

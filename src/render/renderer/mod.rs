@@ -265,6 +265,7 @@ impl Renderer {
         readback::read_visibility(&recorder, target, &program, &staging)?;
         self.gl.wait("visibility readback", self.frame_timeout)?;
         let id_bytes = staging.read(bytes as usize)?;
+        // The bytes are little-endian.
         let parse_id = |word: &[u8]| word.iter().rev().fold(0, |id, byte| id << 8 | u32::from(*byte));
         let sample_position = if frame.desc.samples > 1 { self.sample_positions[0] } else { [0.5; 2] };
         let size = [frame.desc.width, frame.desc.height];

@@ -5,25 +5,25 @@ use std::rc::Rc;
 use crate::device::gl::{self, Buffer, Gl, Texture, VertexArray};
 use crate::layout::CULL_BLOCK;
 use crate::layout::cull::{
-    COUNTERS_BINDING, CullUniforms, DRAWS_BINDING, INDICES_BINDING, MAX_GROUPS, PREVIOUSLY_VISIBLE_BINDING,
+    CULL_COUNTERS_BINDING, CullUniforms, DRAWS_BINDING, INDICES_BINDING, MAX_GROUPS, PREVIOUSLY_VISIBLE_BINDING,
     TRIANGLE_IDS_BINDING, VISIBLE_BITS_BINDING,
 };
 use crate::plan::buffers::CullBuffers;
 use crate::scene_data::geometry::{BlendMode, DrawGroup};
 use modalcast_model::error::Result;
 
-/// Device resources of triangle culling: the buffers that the culling programs read and write, among them one list of
-/// visible triangles per draw group, and the vertex arrays that draw the lists.
+/// Buffers that the culling programs read and write, among them one list of visible triangles per draw group, and the
+/// vertex arrays that draw the lists.
 #[derive(Debug)]
-pub(crate) struct TriangleCuller {
+pub(crate) struct CullResources {
     pub(crate) buffers: CullBuffers<Buffer>,
     pub(crate) uniforms: CullUniforms,
-    /// Buffer texture over the ids of the listed triangles.
+    /// Buffer texture over the ids of the visible triangles.
     pub(crate) triangle_ids: Texture,
     vertex_arrays: CullVertexArrays,
 }
 
-/// Vertex arrays whose index buffer contains the lists.
+/// Vertex arrays whose index buffer contains the lists of visible triangles.
 #[derive(Debug)]
 pub(crate) struct CullVertexArrays {
     /// Attributes: positions only. Draws opaque triangles.
@@ -32,7 +32,7 @@ pub(crate) struct CullVertexArrays {
     pub(crate) corner_array: Option<VertexArray>,
 }
 
-impl TriangleCuller {
+impl CullResources {
     /// Writes the uniforms, and marks all triangles as not visible in the previous frame.
     pub(crate) fn new(
         gl: &Rc<Gl>,
@@ -54,7 +54,7 @@ impl TriangleCuller {
         })
     }
 
-    /// Vertex array of the listed triangles with this blend mode.
+    /// Vertex array of the visible triangles with this blend mode.
     pub(crate) const fn vertex_array(&self, blend_mode: BlendMode) -> Option<&VertexArray> {
         match blend_mode {
             BlendMode::Opaque => Some(&self.vertex_arrays.position_array),
@@ -68,7 +68,7 @@ impl TriangleCuller {
             &self.buffers;
         draws.bind_storage(DRAWS_BINDING);
         visible_bits.bind_storage(VISIBLE_BITS_BINDING);
-        counters.bind_storage(COUNTERS_BINDING);
+        counters.bind_storage(CULL_COUNTERS_BINDING);
         if let Some(bitmap) = previously_visible {
             bitmap.bind_storage(PREVIOUSLY_VISIBLE_BINDING);
         }

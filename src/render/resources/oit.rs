@@ -8,7 +8,7 @@ use std::rc::Rc;
 use super::target_desc::{BlendStorage, TargetDesc, create_nearest_texture};
 use crate::device::gl::{self, Buffer, Framebuffer, Gl, Limits, Texture, TextureDesc};
 use crate::layout::oit::{
-    COUNTERS_BINDING, COUNTERS_BYTES, COUNTS_IMAGE, CURSORS_IMAGE, RECORD_BYTES, RECORDS_BINDING,
+    COUNTERS_BYTES, CURSORS_IMAGE, FRAGMENT_COUNTS_IMAGE, OIT_COUNTERS_BINDING, RECORD_BYTES, RECORDS_BINDING,
 };
 use crate::layout::{TILES_BINDING, tile_list_bytes};
 use crate::region::DirtyRegion;
@@ -27,7 +27,7 @@ pub(crate) struct OitTarget {
     /// Index of the next record of each pixel.
     pub(crate) cursors: Texture,
     /// Light and transmittance of the blended triangles; one array layer per sample.
-    pub(crate) layers: Texture,
+    pub(crate) blend_layers: Texture,
     /// Framebuffer to clear `fragment_counts`.
     pub(crate) counts_fbo: Framebuffer,
     /// Dirty region of `fragment_counts`.
@@ -73,19 +73,19 @@ impl OitTarget {
             depth_fbo: gl.framebuffer(None, depth)?,
             fragment_counts,
             cursors: create_image(gl::TEXTURE_2D, gl::R32UI, 1)?,
-            layers: create_image(gl::TEXTURE_2D_ARRAY, gl::RGBA16F, samples)?,
+            blend_layers: create_image(gl::TEXTURE_2D_ARRAY, gl::RGBA16F, samples)?,
             records: gl.buffer(RECORD_BYTES * u64::from(budget), gl::STREAM_COPY, None)?,
             counters: gl.buffer(COUNTERS_BYTES as u64, gl::STREAM_COPY, None)?,
             tile_list: gl.buffer(tile_list_bytes([width, height]), gl::STREAM_COPY, None)?,
         })
     }
 
-    /// Binds the images and buffers, except `layers`.
+    /// Binds the images and buffers, except `blend_layers`.
     pub(crate) fn bind(&self) {
-        self.fragment_counts.bind_image_read_write(COUNTS_IMAGE);
+        self.fragment_counts.bind_image_read_write(FRAGMENT_COUNTS_IMAGE);
         self.cursors.bind_image_read_write(CURSORS_IMAGE);
         self.records.bind_storage(RECORDS_BINDING);
-        self.counters.bind_storage(COUNTERS_BINDING);
+        self.counters.bind_storage(OIT_COUNTERS_BINDING);
         self.tile_list.bind_storage(TILES_BINDING);
     }
 }

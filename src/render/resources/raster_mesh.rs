@@ -11,7 +11,7 @@ pub(super) fn raster_geometry(scene: &Scene, positions: GlBuffer, anisotropy: f3
     let geometry = Geometry::new(scene);
     let groups = geometry.groups.iter().map(|group| DrawRange {
         first: group.first_triangle as u32,
-        triangles: group.triangles as u32,
+        triangles: group.triangle_count as u32,
         cull_mode: if group.double_sided { CullMode::None } else { CullMode::Back },
     });
     RasterGeometry {
@@ -34,10 +34,10 @@ fn cut_outs(scene: &Scene, geometry: &Geometry, anisotropy: f32) -> Option<CutOu
         .map(|index| alpha_material(scene, &scene.materials[index], &mut image_textures));
     Some(CutOuts {
         first: first_triangle as u32,
-        uvs: geometry.triangles[first_triangle..].iter().map(|corners| corners.map(uv_of)).collect(),
-        material_indices: match geometry.materials.get(first_triangle..) {
+        uvs: geometry.triangle_corners[first_triangle..].iter().map(|corners| corners.map(uv_of)).collect(),
+        material_indices: match geometry.triangle_materials.get(first_triangle..) {
             Some(materials) => materials.to_vec(),
-            None => vec![0; geometry.triangles.len() - first_triangle],
+            None => vec![0; geometry.triangle_corners.len() - first_triangle],
         },
         materials: materials.collect(),
         images: image_textures.iter().map(|texture| alpha_image(scene, &arrays, *texture)).collect(),
@@ -45,7 +45,7 @@ fn cut_outs(scene: &Scene, geometry: &Geometry, anisotropy: f32) -> Option<CutOu
     })
 }
 
-/// Alpha properties of a material. Appends its texture to `images` if it is not in the list.
+/// Alpha properties of a material. Appends its color texture to `image_textures` if it is not in the list.
 fn alpha_material(scene: &Scene, material: &Material, image_textures: &mut Vec<usize>) -> AlphaMaterial {
     let cutoff = match material.alpha_mode {
         AlphaMode::Opaque => 0.0,

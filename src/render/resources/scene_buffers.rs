@@ -4,7 +4,7 @@ use std::rc::Rc;
 use std::sync::Arc;
 
 use super::compute_rasterizer::{ComputeRasterizer, RasterOutputs, RasterPasses};
-use super::cull::{CullVertexArrays, TriangleCuller};
+use super::cull::{CullResources, CullVertexArrays};
 use super::programs::{PostPrograms, ProgramCompiler, SampleCountPrograms, ScenePrograms};
 use super::raster_mesh;
 use super::shadow_cache::{ShadowCache, ShadowKey};
@@ -13,7 +13,7 @@ use super::texture_arrays::upload_arrays;
 use crate::device::gl::{self, Buffer, Gl, Program, Texture, VertexArray, VertexAttribute};
 use crate::layout::material::{PackedMaterial, pack_materials};
 use crate::layout::{
-    CORNER_NORMAL_UNIT, FIXED_TEXTURE_READS, MATERIAL_UNIT, TANGENT_UNIT, TRIANGLE_MATERIAL_UNIT, TRIANGLE_UNIT,
+    CORNER_NORMAL_UNIT, FIXED_TEXTURE_READS, MATERIAL_UNIT, TANGENT_UNIT, TRIANGLE_CORNER_UNIT, TRIANGLE_MATERIAL_UNIT,
     TRIANGLE_VERTEX_UNIT, UV_UNIT,
 };
 use crate::plan::buffers::{BufferName, GeometryBuffers, MaterialBuffers, SceneBufferSet, UniformBuffers};
@@ -40,7 +40,7 @@ pub struct SceneBuffers {
     _materials: MaterialBuffers<Buffer>,
     pub(crate) uniforms: UniformBuffers<Buffer>,
     /// Lists of visible triangles; present with culling.
-    pub(crate) culler: Option<TriangleCuller>,
+    pub(crate) cull_resources: Option<CullResources>,
     pub(crate) buffer_textures: BufferTextures,
     /// Triangles by blend mode and sidedness, in draw order.
     pub(crate) groups: Vec<DrawGroup>,
@@ -78,7 +78,7 @@ pub(crate) struct RebasedPositions {
     pub(crate) buffer: Buffer,
     view: Texture,
     position_array: VertexArray,
-    /// Vertex array of the culled lists; present with culling.
+    /// Vertex array of the visible triangles; present with culling.
     culled_position_array: Option<VertexArray>,
 }
 
@@ -87,7 +87,7 @@ impl RebasedPositions {
         let buffer = gl.buffer(scene.geometry.positions.bytes, gl::DYNAMIC_DRAW, None)?;
         let view = gl.buffer_texture(&buffer, gl::RGB32F)?;
         let position_array = self::position_array(gl, &buffer, &scene.geometry.triangle_vertices)?;
-        let culled_indices = scene.culler.as_ref().map(|culler| &culler.buffers.indices);
+        let culled_indices = scene.cull_resources.as_ref().map(|cull_resources| &cull_resources.buffers.indices);
         let culled_position_array =
             culled_indices.map(|indices| self::position_array(gl, &buffer, indices)).transpose()?;
         Ok(Self { view, position_array, culled_position_array, buffer })
@@ -137,13 +137,13 @@ impl SceneBuffers {
         };
         // A device without 4x multisampling has no sample positions.
         let samples = if sample_positions.is_empty() { 1 } else { scene.look.samples_per_pixel() };
-        let culler = match culling {
+        let cull_resources = match culling {
             Some(culling) => {
                 let arrays = CullVertexArrays {
                     position_array: position_array(gl, &geometry.positions, &culling.indices)?,
                     corner_array: corner_array(gl, &geometry, &culling.indices)?,
                 };
-                Some(TriangleCuller::new(gl, culling, &mesh.groups, arrays)?)
+                Some(CullResources::new(gl, culling, &mesh.groups, arrays)?)
             }
             None => None,
         };
@@ -154,7 +154,7 @@ impl SceneBuffers {
             buffer_textures: BufferTextures::new(gl, &geometry, &materials)?,
             position_array: position_array(gl, &geometry.positions, &geometry.triangle_vertices)?,
             corner_array: corner_array(gl, &geometry, &geometry.triangles)?,
-            culler,
+            cull_resources,
             geometry,
             _materials: materials,
             uniforms,
@@ -209,10 +209,10 @@ impl SceneBuffers {
     }
 
     /// First triangle and number of triangles with this blend mode; they are contiguous.
-    pub(crate) fn triangles(&self, blend_mode: BlendMode) -> (usize, usize) {
+    pub(crate) fn triangle_range(&self, blend_mode: BlendMode) -> (usize, usize) {
         let mut groups = self.groups.iter().filter(|group| group.blend_mode == blend_mode);
-        let first_range = groups.next().map_or((0, 0), |group| (group.first_triangle, group.triangles));
-        groups.fold(first_range, |(first_triangle, count), group| (first_triangle, count + group.triangles))
+        let first_range = groups.next().map_or((0, 0), |group| (group.first_triangle, group.triangle_count));
+        groups.fold(first_range, |(first_triangle, count), group| (first_triangle, count + group.triangle_count))
     }
 
     /// Domain of a triangle, and its index in the mesh of the domain. `triangle` is an index in the draw order: an id
@@ -243,16 +243,18 @@ impl SceneBuffers {
         }
     }
 
-    /// Vertex array of the culled lists with this blend mode, and the buffer with the indirect draw commands; none without
-    /// culling.
+    /// Vertex array of the visible triangles with this blend mode, and the buffer with the indirect draw commands; none
+    /// without culling.
     pub(crate) fn visible_draws(&self, blend_mode: BlendMode) -> Option<(&VertexArray, &Buffer)> {
-        let culler = self.culler.as_ref()?;
+        let cull_resources = self.cull_resources.as_ref()?;
         let rebased_array = self
             .rebased
             .as_ref()
             .and_then(|rebased| rebased.culled_position_array.as_ref())
             .filter(|_| blend_mode == BlendMode::Opaque);
-        rebased_array.or_else(|| culler.vertex_array(blend_mode)).map(|array| (array, &culler.buffers.draws))
+        rebased_array
+            .or_else(|| cull_resources.vertex_array(blend_mode))
+            .map(|array| (array, &cull_resources.buffers.draws))
     }
 
     /// Attaches a compute rasterizer, which draws all passes that it supports. Does nothing for a scene without such
@@ -391,11 +393,11 @@ fn allocate(
 ) -> Result<SceneBufferSet<Buffer>> {
     sizes.try_map(|name, bytes| {
         let content: Option<&[u8]> = match name {
-            BufferName::CornerVertices => Some(bytemuck::cast_slice(&mesh.vertices)),
-            BufferName::Triangles => Some(bytemuck::cast_slice(&mesh.triangles)),
+            BufferName::CornerVertices => Some(bytemuck::cast_slice(&mesh.corner_vertices)),
+            BufferName::Triangles => Some(bytemuck::cast_slice(&mesh.triangle_corners)),
             BufferName::TriangleVertices => Some(bytemuck::cast_slice(&mesh.triangle_vertices)),
             BufferName::Uvs => Some(bytemuck::cast_slice(&mesh.uvs)),
-            BufferName::TriangleMaterials => Some(bytemuck::cast_slice(&mesh.materials)),
+            BufferName::TriangleMaterials => Some(bytemuck::cast_slice(&mesh.triangle_materials)),
             BufferName::Materials => Some(bytemuck::cast_slice(materials)),
             _ => None,
         };
@@ -409,7 +411,7 @@ impl BufferTextures {
             (MATERIAL_UNIT, gl::RGBA32F, Some(&materials.materials)),
             (TRIANGLE_MATERIAL_UNIT, gl::R32UI, materials.triangle_materials.as_ref()),
             (CORNER_NORMAL_UNIT, gl::RGB32F, Some(&geometry.normals)),
-            (TRIANGLE_UNIT, gl::RGB32UI, Some(&geometry.triangles)),
+            (TRIANGLE_CORNER_UNIT, gl::RGB32UI, Some(&geometry.triangles)),
             (TRIANGLE_VERTEX_UNIT, gl::RGB32UI, Some(&geometry.triangle_vertices)),
             (UV_UNIT, gl::RG32F, geometry.uvs.as_ref()),
             (TANGENT_UNIT, gl::RGBA32F, geometry.tangents.as_ref()),
@@ -424,20 +426,21 @@ impl BufferTextures {
     }
 }
 
-const fn attribute(location: u32, buffer: &Buffer, components: i32, integer: bool) -> VertexAttribute<'_> {
-    VertexAttribute { location, buffer, components, integer }
+const fn f32_attribute(location: u32, buffer: &Buffer, components: i32) -> VertexAttribute<'_> {
+    VertexAttribute { location, buffer, components, integer: false }
 }
 
 /// Vertex array of opaque triangles, which need positions only.
 fn position_array(gl: &Rc<Gl>, positions: &Buffer, indices: &Buffer) -> Result<VertexArray> {
-    gl.vertex_array(Some(indices), &[attribute(0, positions, 3, false)])
+    gl.vertex_array(Some(indices), &[f32_attribute(0, positions, 3)])
 }
 
 /// Vertex array over the corners of cut-out and blended triangles; none without such triangles.
 fn corner_array(gl: &Rc<Gl>, geometry: &GeometryBuffers<Buffer>, indices: &Buffer) -> Result<Option<VertexArray>> {
     let Some(vertices) = &geometry.corner_vertices else { return Ok(None) };
-    let mut attributes = vec![attribute(0, vertices, 1, true), attribute(1, &geometry.normals, 3, false)];
-    attributes.extend(geometry.uvs.as_ref().map(|buffer| attribute(2, buffer, 2, false)));
-    attributes.extend(geometry.tangents.as_ref().map(|buffer| attribute(3, buffer, 4, false)));
+    let vertex_index = VertexAttribute { location: 0, buffer: vertices, components: 1, integer: true };
+    let mut attributes = vec![vertex_index, f32_attribute(1, &geometry.normals, 3)];
+    attributes.extend(geometry.uvs.as_ref().map(|buffer| f32_attribute(2, buffer, 2)));
+    attributes.extend(geometry.tangents.as_ref().map(|buffer| f32_attribute(3, buffer, 4)));
     gl.vertex_array(Some(indices), &attributes).map(Some)
 }

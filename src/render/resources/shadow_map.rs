@@ -37,7 +37,7 @@ impl ShadowMap {
         }
         let depth = create_image(gl, &shadow, gl::DEPTH_COMPONENT32F, gl::NEAREST, shadow.cascades)?;
         let framebuffers =
-            (0..shadow.cascades).map(|layer| gl.layer_framebuffer(&depth, true, layer)).collect::<Result<_>>()?;
+            (0..shadow.cascades).map(|layer| gl.depth_layer_framebuffer(&depth, layer)).collect::<Result<_>>()?;
         let blurred = if shadow.has_moments() { Some(BlurredMoments::new(gl, &shadow, blur_method)?) } else { None };
         Ok(Self { shadow, blur_method, depth, framebuffers, blurred })
     }
@@ -63,9 +63,9 @@ impl BlurredMoments {
         };
         let mut framebuffers = Vec::new();
         if let Some(horizontal) = horizontal.as_ref().filter(|_| blur_method == BlurMethod::Fragments) {
-            framebuffers.push(gl.layer_framebuffer(horizontal, false, 0)?);
+            framebuffers.push(gl.color_layer_framebuffer(horizontal, 0)?);
             for layer in 0..shadow.cascades {
-                framebuffers.push(gl.layer_framebuffer(&moments, false, layer)?);
+                framebuffers.push(gl.color_layer_framebuffer(&moments, layer)?);
             }
         }
         Ok(Self { moments, horizontal, framebuffers })

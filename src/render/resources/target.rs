@@ -7,7 +7,7 @@ use std::rc::Rc;
 use super::depth_pyramid::DepthPyramid;
 use super::oit::OitTarget;
 use super::target_desc::{BlendStorage, TargetDesc, create_image, create_nearest_texture};
-use crate::device::gl::{self, Buffer, Framebuffer, Gl, Texture, TextureDesc, VisibilityDirty};
+use crate::device::gl::{self, Buffer, Framebuffer, Gl, Texture, TextureDesc, VisibilityDirtyRegions};
 use crate::device::readback_ring::ReadbackRing;
 use crate::layout::tile_list_bytes;
 use crate::region::{DirtyRegion, Region};
@@ -21,7 +21,7 @@ pub(crate) struct RenderTarget {
     /// Id of each sample; valid until the next frame, like `depth`.
     pub(crate) ids: Texture,
     pub(crate) visibility_fbo: Framebuffer,
-    pub(crate) dirty_regions: VisibilityDirty,
+    pub(crate) dirty_regions: VisibilityDirtyRegions,
     /// Region of the current frame that may show triangles or rasterized ground.
     pub(crate) draw_region: Cell<Region>,
     pub(crate) blend_layer: Option<BlendLayer>,
@@ -73,7 +73,7 @@ impl RenderTarget {
         Ok(Self {
             desc: TargetDesc { samples, ..desc },
             visibility_fbo: gl.framebuffer(Some(&ids), &depth)?,
-            dirty_regions: VisibilityDirty::default(),
+            dirty_regions: VisibilityDirtyRegions::default(),
             draw_region: Cell::new(Region::whole([width, height])),
             ids,
             blend_layer,

@@ -4,8 +4,8 @@ use std::ops::Range;
 use std::rc::Rc;
 
 use crate::device::gl::{self, Gl, Texture, TextureDesc};
-use crate::layout::cull::COUNTER_BYTES;
-use crate::layout::oit::COUNTERS_HEADER_BYTES;
+use crate::layout::cull::CULL_COUNTER_BYTES;
+use crate::layout::oit::OIT_HEADER_BYTES;
 use modalcast_model::error::Result;
 use modalcast_model::scene::{Culling, RenderSettings};
 
@@ -70,8 +70,8 @@ impl TargetDesc {
     /// buffer. They are empty without fragment lists or culling.
     pub(crate) fn readback_ranges(&self) -> [Range<u64>; 2] {
         let list_bytes =
-            if matches!(self.blend_storage, BlendStorage::FragmentLists(_)) { COUNTERS_HEADER_BYTES as u64 } else { 0 };
-        let cull_bytes = if self.culling == Culling::None { 0 } else { COUNTER_BYTES as u64 };
+            if matches!(self.blend_storage, BlendStorage::FragmentLists(_)) { OIT_HEADER_BYTES as u64 } else { 0 };
+        let cull_bytes = if self.culling == Culling::None { 0 } else { CULL_COUNTER_BYTES as u64 };
         let (list_begin, cull_begin) = (self.encoded_bytes(), self.encoded_bytes() + list_bytes);
         [list_begin..cull_begin, cull_begin..cull_begin + cull_bytes]
     }

@@ -9,6 +9,9 @@ use crate::scene_data::textures::{TextureArray, TextureRole, cutoff, mip_levels}
 use modalcast_model::error::Result;
 use modalcast_model::scene::Scene;
 
+/// Layers that are processed at once. Few, because mipmap chains take much host memory.
+const LAYERS_PER_CHUNK: usize = 8;
+
 /// Creates and fills the texture arrays of one role.
 pub(crate) fn upload_arrays(
     gl: &Rc<Gl>,
@@ -34,17 +37,17 @@ fn upload_array(gl: &Rc<Gl>, scene: &Scene, array: &TextureArray, role: TextureR
         depth: layer_count,
         levels: array.levels(),
     })?;
-    // Process few layers at a time, because mipmap chains take much host memory.
-    for (chunk_index, texture_indices) in array.layers.chunks(8).enumerate() {
+    for (chunk_index, texture_indices) in array.layers.chunks(LAYERS_PER_CHUNK).enumerate() {
         let build_chain = |index: &usize| {
             let cutoff = if role == TextureRole::Color { cutoff(scene, *index) } else { None };
             mip_levels(&scene.textures[*index], array, role, cutoff)
         };
         let chains: Vec<Vec<Vec<u8>>> = texture_indices.par_iter().map(build_chain).collect();
         for (index_in_chunk, chain) in chains.iter().enumerate() {
+            let layer = (LAYERS_PER_CHUNK * chunk_index + index_in_chunk) as u32;
             for (level, rgba) in chain.iter().enumerate() {
                 let size = [(array.width >> level).max(1), (array.height >> level).max(1)];
-                texture.upload_pixels(level as u32, (8 * chunk_index + index_in_chunk) as u32, size, rgba)?;
+                texture.upload_pixels(level as u32, layer, size, rgba)?;
             }
         }
     }

@@ -22,7 +22,7 @@ pub(crate) struct DrawGroup {
     pub(crate) blend_mode: BlendMode,
     pub(crate) double_sided: bool,
     pub(crate) first_triangle: usize,
-    pub(crate) triangles: usize,
+    pub(crate) triangle_count: usize,
 }
 
 /// A range of triangles that is contiguous both in a mesh and in the draw order.
@@ -45,21 +45,21 @@ pub(crate) fn locate_triangle(spans: &[TriangleSpan], triangle: usize) -> Option
 /// Static arrays of a scene. Vertices and corners have the order of the scene's layout, triangles the draw order.
 #[derive(Debug, Default)]
 pub(crate) struct Geometry {
-    /// Vertex of each corner, as an index in the positions of the scene.
-    pub(crate) vertices: Vec<u32>,
+    /// Vertex of each corner, as an index into the positions of the scene.
+    pub(crate) corner_vertices: Vec<u32>,
     /// Texture coordinates of each corner; empty if no material has a texture.
     pub(crate) uvs: Vec<[f32; 2]>,
     /// Corners of each triangle.
-    pub(crate) triangles: Vec<[u32; 3]>,
+    pub(crate) triangle_corners: Vec<[u32; 3]>,
     /// Vertices of each triangle.
     pub(crate) triangle_vertices: Vec<[u32; 3]>,
     /// Material of each triangle, as an index among the used materials; empty if only one is used.
-    pub(crate) materials: Vec<u32>,
+    pub(crate) triangle_materials: Vec<u32>,
     pub(crate) groups: Vec<DrawGroup>,
     /// Sorted by the first triangle.
     pub(crate) spans: Vec<TriangleSpan>,
-    /// Group of each material.
-    group_of: Vec<usize>,
+    /// Index in `groups` of each of the scene's materials.
+    group_of_material: Vec<usize>,
 }
 
 /// Whether the shaders look up the material of each triangle.
@@ -67,7 +67,7 @@ pub(crate) fn uses_material_table(scene: &Scene) -> bool {
     used_materials(scene).len() > 1
 }
 
-/// Draw groups of a scene, and the group of each material. There are at most six groups, sorted by blend mode.
+/// Draw groups of a scene, and the index of each material's group. There are at most six groups, sorted by blend mode.
 pub(crate) fn groups(scene: &Scene) -> (Vec<DrawGroup>, Vec<usize>) {
     let mut groups: Vec<DrawGroup> = Vec::new();
     let mut group_of_material = vec![0; scene.materials.len()];
@@ -79,19 +79,19 @@ pub(crate) fn groups(scene: &Scene) -> (Vec<DrawGroup>, Vec<usize>) {
             .last()
             .is_none_or(|previous| (previous.blend_mode, previous.double_sided) != (blend_mode, double_sided))
         {
-            groups.push(DrawGroup { blend_mode, double_sided, first_triangle: 0, triangles: 0 });
+            groups.push(DrawGroup { blend_mode, double_sided, first_triangle: 0, triangle_count: 0 });
         }
         group_of_material[material] = groups.len() - 1;
     }
     for (domain, layout) in scene.domains.iter().zip(&scene.layout.domains) {
-        for (material, triangles) in spans(domain, layout) {
-            groups[group_of_material[material]].triangles += triangles.len();
+        for (material, triangles) in material_triangle_ranges(domain, layout) {
+            groups[group_of_material[material]].triangle_count += triangles.len();
         }
     }
     let mut first_triangle = 0;
     for group in &mut groups {
         group.first_triangle = first_triangle;
-        first_triangle += group.triangles;
+        first_triangle += group.triangle_count;
     }
     (groups, group_of_material)
 }
@@ -117,18 +117,18 @@ pub(crate) fn used_materials(scene: &Scene) -> Vec<usize> {
 
 impl Geometry {
     pub(crate) fn new(scene: &Scene) -> Self {
-        let (groups, group_of) = groups(scene);
+        let (groups, group_of_material) = groups(scene);
         let layout = &scene.layout;
         let has_uvs = scene.features.textures || scene.features.normal_maps;
         let mut geometry = Self {
-            vertices: Vec::with_capacity(layout.corners),
+            corner_vertices: Vec::with_capacity(layout.corners),
             uvs: Vec::with_capacity(if has_uvs { layout.corners } else { 0 }),
-            triangles: vec![[0; 3]; layout.triangles],
+            triangle_corners: vec![[0; 3]; layout.triangles],
             triangle_vertices: Vec::new(),
-            materials: vec![0; if uses_material_table(scene) { layout.triangles } else { 0 }],
+            triangle_materials: vec![0; if uses_material_table(scene) { layout.triangles } else { 0 }],
             groups,
             spans: Vec::new(),
-            group_of,
+            group_of_material,
         };
         let mut material_indices = vec![0; scene.materials.len()];
         for (material_index, material) in (0..).zip(used_materials(scene)) {
@@ -139,19 +139,19 @@ impl Geometry {
             geometry.add_corners(scene, domain, &scene.layout.domains[index], has_uvs);
             geometry.add_triangles(scene, index, &material_indices, &mut next_triangles);
         }
-        let vertex_of = |corner: u32| geometry.vertices[corner as usize];
-        geometry.triangle_vertices = geometry.triangles.iter().map(|corners| corners.map(vertex_of)).collect();
+        let vertex_of = |corner: u32| geometry.corner_vertices[corner as usize];
+        geometry.triangle_vertices = geometry.triangle_corners.iter().map(|corners| corners.map(vertex_of)).collect();
         geometry.spans.sort_unstable_by_key(|span| span.first);
         geometry
     }
 
     fn add_corners(&mut self, scene: &Scene, domain: &Domain, layout: &DomainLayout, has_uvs: bool) {
         let corners = scene.shapes[domain.shape].mesh.corners();
-        self.vertices.extend(corners.vertices.iter().map(|vertex| vertex + layout.first_vertex as u32));
+        self.corner_vertices.extend(corners.vertices.iter().map(|vertex| vertex + layout.first_vertex as u32));
         if has_uvs {
             self.uvs.extend_from_slice(&corners.uvs);
             // All corners of a mesh without texture coordinates sample the same texel.
-            self.uvs.resize(self.vertices.len(), [0.0; 2]);
+            self.uvs.resize(self.corner_vertices.len(), [0.0; 2]);
         }
     }
 
@@ -160,15 +160,15 @@ impl Geometry {
         let mesh = &scene.shapes[domain.shape].mesh;
         // A mirroring placement reverses the winding of all triangles.
         let is_mirrored = domain.placement.linear().determinant() < 0.0;
-        for (material, range) in spans(domain, layout) {
+        for (material, range) in material_triangle_ranges(domain, layout) {
             let material_properties = &scene.materials[material];
-            let draw_index = &mut next_triangles[self.group_of[material]];
+            let draw_index = &mut next_triangles[self.group_of_material[material]];
             self.spans.push(TriangleSpan { first: *draw_index, domain: index, triangle: range.start });
             for triangle in &mesh.triangles()[range] {
                 let is_reversed = material_properties.double_sided && winding_disagrees(mesh, *triangle);
                 let [a, b, c] = triangle.map(|corner| corner + layout.first_corner as u32);
-                self.triangles[*draw_index] = if is_mirrored == is_reversed { [a, b, c] } else { [a, c, b] };
-                if let Some(material_index) = self.materials.get_mut(*draw_index) {
+                self.triangle_corners[*draw_index] = if is_mirrored == is_reversed { [a, b, c] } else { [a, c, b] };
+                if let Some(material_index) = self.triangle_materials.get_mut(*draw_index) {
                     *material_index = material_indices[material];
                 }
                 *draw_index += 1;
@@ -177,8 +177,11 @@ impl Geometry {
     }
 }
 
-/// Material and triangle range of each material range of a domain.
-fn spans<'a>(domain: &'a Domain, layout: &DomainLayout) -> impl Iterator<Item = (usize, std::ops::Range<usize>)> + 'a {
+/// Material of each material range of a domain, and its triangles in the mesh.
+fn material_triangle_ranges<'a>(
+    domain: &'a Domain,
+    layout: &DomainLayout,
+) -> impl Iterator<Item = (usize, std::ops::Range<usize>)> + 'a {
     let count = layout.triangles;
     let single_range = domain.material_ranges.is_empty().then_some((domain.material, 0..count));
     let range_ends =
@@ -239,14 +242,14 @@ pub(crate) mod tests {
         let geometry = Geometry::new(&scene);
         let blend_modes: Vec<BlendMode> = geometry.groups.iter().map(|group| group.blend_mode).collect();
         assert_eq!(blend_modes, [BlendMode::Opaque, BlendMode::Mask, BlendMode::Blend]);
-        assert_eq!(geometry.groups.iter().map(|group| group.triangles).sum::<usize>(), 600);
+        assert_eq!(geometry.groups.iter().map(|group| group.triangle_count).sum::<usize>(), 600);
         for group in &geometry.groups {
-            for triangle in group.first_triangle..group.first_triangle + group.triangles {
-                let material = &scene.materials[geometry.materials[triangle] as usize];
+            for triangle in group.first_triangle..group.first_triangle + group.triangle_count {
+                let material = &scene.materials[geometry.triangle_materials[triangle] as usize];
                 assert_eq!(pipeline_key(material), (group.blend_mode, group.double_sided));
             }
         }
-        let mut corners = geometry.triangles.as_flattened().to_vec();
+        let mut corners = geometry.triangle_corners.as_flattened().to_vec();
         corners.sort_unstable();
         corners.dedup();
         assert_eq!(corners, (0..1200).collect::<Vec<u32>>());
@@ -259,8 +262,8 @@ pub(crate) mod tests {
         parts.domains[0].material_ranges =
             vec![MaterialRange { first_triangle: 0, material: 1 }, MaterialRange { first_triangle: 1, material: 0 }];
         let geometry = Geometry::new(&Scene::new(parts).expect("a valid scene"));
-        assert_eq!(geometry.materials, [0, 1]);
-        assert_eq!(geometry.triangles, [[0, 2, 3], [0, 1, 2]]);
+        assert_eq!(geometry.triangle_materials, [0, 1]);
+        assert_eq!(geometry.triangle_corners, [[0, 2, 3], [0, 1, 2]]);
         let span = |first, triangle| TriangleSpan { first, domain: 0, triangle };
         assert_eq!(geometry.spans, [span(0, 1), span(1, 0)], "expected the spans of both groups");
     }
@@ -272,9 +275,9 @@ pub(crate) mod tests {
         mirroring.0[0] = -1.0;
         parts.domains[0].placement = mirroring;
         let geometry = Geometry::new(&Scene::new(parts).expect("a valid scene"));
-        assert_eq!(geometry.triangles, [[0, 2, 1], [0, 3, 2]]);
-        assert_eq!(geometry.triangle_vertices, geometry.triangles, "expected one corner per vertex");
-        assert!(geometry.materials.is_empty() && geometry.uvs.is_empty());
+        assert_eq!(geometry.triangle_corners, [[0, 2, 1], [0, 3, 2]]);
+        assert_eq!(geometry.triangle_vertices, geometry.triangle_corners, "expected one corner per vertex");
+        assert!(geometry.triangle_materials.is_empty() && geometry.uvs.is_empty());
     }
 
     #[test]
@@ -286,7 +289,7 @@ pub(crate) mod tests {
                 .expect("a triangle");
             parts.shapes[0] = Shape::new(mesh, Modes::rigid()).expect("rigid");
             let geometry = Geometry::new(&Scene::new(parts).expect("a valid scene"));
-            assert_eq!(geometry.triangles, [expected]);
+            assert_eq!(geometry.triangle_corners, [expected]);
         }
     }
 }

@@ -1,5 +1,6 @@
 //! Generates the shader that blurs a variance shadow map by strips. The code is unrolled with one variable per sum,
-//! because not all compilers keep arrays in registers.
+//! because not all compilers keep arrays in registers. It is inserted into `shaders/vsm_blur_strip.comp`, which declares
+//! the GLSL variables `corner`, `lane`, `side`, `first_row` and `buffer_offset`.
 
 use std::fmt::Write as _;
 

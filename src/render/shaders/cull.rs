@@ -3,7 +3,7 @@
 use std::fmt::Write as _;
 
 use super::{FRAME, ProgramSource, ShaderOptions, VERSION, VISIBILITY_IDS};
-use crate::layout::cull::{CAMERA_COUNTERS, MAX_GROUPS, MAX_LEVEL, SHADOW_COUNTERS, SUPERBLOCK, WORKGROUP_SIZE};
+use crate::layout::cull::{CAMERA_COUNTERS, MAX_GROUPS, MAX_LEVEL, SHADOW_COUNTERS, SUPERBLOCK, TRIANGLES_PER_BLOCK};
 
 const CULL: &str = include_str!("../../../shaders/shared/cull.glsl");
 
@@ -72,7 +72,7 @@ impl ShaderOptions {
         }
         writeln!(
             head,
-            "#define WORKGROUP_SIZE {WORKGROUP_SIZE}\n#define SUPERBLOCK {SUPERBLOCK}u\n#define MAX_GROUPS {MAX_GROUPS}"
+            "#define WORKGROUP_SIZE {TRIANGLES_PER_BLOCK}\n#define SUPERBLOCK {SUPERBLOCK}u\n#define MAX_GROUPS {MAX_GROUPS}"
         )
         .ok();
         writeln!(head, "#define MAX_LEVEL {MAX_LEVEL}u").ok();

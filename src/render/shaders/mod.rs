@@ -12,7 +12,7 @@ use std::fmt::Write as _;
 
 use crate::device::gl;
 use crate::layout::material::MATERIAL_BYTES;
-use crate::layout::{COLOR_UNIT, NORMAL_UNIT, TILE, TILE_ROW};
+use crate::layout::{COLOR_UNIT, NORMAL_UNIT, TILE, TILES_PER_ROW};
 use crate::plan::features::ShaderFeatures;
 use crate::scene_data::geometry::BlendMode;
 use crate::scene_data::textures::TextureRole;
@@ -59,7 +59,7 @@ pub(crate) struct MaterialUse {
     pub(crate) normal_array: Option<usize>,
 }
 
-/// Source text of a program's stages, with the OpenGL type of each stage.
+/// Source text of a program's stages. Each stage is its OpenGL type, such as `COMPUTE_SHADER`, and its text.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub(crate) struct ProgramSource {
     pub(crate) label: String,
@@ -123,7 +123,7 @@ impl ShaderOptions {
         materials.filter_map(array_of).collect()
     }
 
-    /// Number of samples per pixel, and their positions within the pixel.
+    /// GLSL that declares SAMPLES, the number of samples per pixel, and their positions within the pixel.
     pub(crate) fn sample_defines(&self, samples: u32) -> String {
         let pixel_center = vec![[0.5; 2]];
         let positions = if samples > 1 { &self.sample_positions } else { &pixel_center };
@@ -168,7 +168,7 @@ impl ShaderOptions {
 
     /// Shades tiles in which no triangle is visible.
     pub(crate) fn background(&self, samples: u32) -> ProgramSource {
-        let mut text = self.shading(samples, &["BACKGROUND"]);
+        let mut text = self.shading_head(samples, &["BACKGROUND"]);
         text += include_str!("../../../shaders/shade.comp");
         ProgramSource::compute(format!("background, {samples} samples"), text)
     }
@@ -177,14 +177,14 @@ impl ShaderOptions {
     pub(crate) fn shade(&self, samples: u32) -> ProgramSource {
         let all_modes = [BlendMode::Opaque, BlendMode::Mask, BlendMode::Blend];
         let blend_modes = if self.features.opaque_parts { &all_modes } else { &all_modes[..2] };
-        let mut text = self.shading(samples, &[]) + &self.material_defines(blend_modes);
+        let mut text = self.shading_head(samples, &[]) + &self.material_defines(blend_modes);
         text += &self.triangle_shading(blend_modes);
         text += include_str!("../../../shaders/shade.comp");
         ProgramSource::compute(format!("shade, {samples} samples"), text)
     }
 
-    /// Common part of the shading programs, without the material lookups.
-    fn shading(&self, samples: u32, defines: &[&str]) -> String {
+    /// Common part of the shading programs, without the functions that shade triangles.
+    fn shading_head(&self, samples: u32, defines: &[&str]) -> String {
         let mut head = self.head(defines);
         head += &tile_list();
         let ground = if self.features.ground { GROUND } else { "" };
@@ -233,9 +233,9 @@ pub(crate) fn vertex_and_fragment(vertex: String, fragment: String) -> Vec<(u32,
     vec![(gl::VERTEX_SHADER, vertex), (gl::FRAGMENT_SHADER, fragment)]
 }
 
-/// Side of a tile, row length of the dispatch over listed tiles, and the tile list.
+/// GLSL that declares the tile list, with its macros TILE and TILES_PER_ROW.
 fn tile_list() -> String {
-    format!("#define TILE {TILE}\n#define TILES_PER_ROW {TILE_ROW}u\n{TILE_LIST}")
+    format!("#define TILE {TILE}\n#define TILES_PER_ROW {TILES_PER_ROW}u\n{TILE_LIST}")
 }
 
 /// Function `{name}_texel` that samples an image in one of several texture arrays. Implicit derivatives are undefined in

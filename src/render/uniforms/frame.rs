@@ -15,9 +15,9 @@ pub(crate) struct FrameUniforms {
     clip_from_world: [[f32; 4]; 4],
     shadow_from_world: [[f32; 4]; 4],
     world_from_ndc: [[f32; 4]; 4],
-    /// w: whether the camera is above a ground.
+    /// w: 1 if the scene has a ground and the camera is above it, else 0.
     eye: [f32; 4],
-    /// w: 0 if the ground is behind everything else, else 1.
+    /// w: 0 if the ground lies behind all surfaces, so that the shading adds it; else 1.
     to_sun: [f32; 4],
     sunlight: [f32; 4],
     skylight: [f32; 4],
@@ -207,7 +207,8 @@ fn rebased_rest_bounds(scene: &Scene, bounds: BoundingBox, origin: [f64; 3]) -> 
     BoundingBox { min: shifted(rest_bounds.min), max: shifted(rest_bounds.max) }
 }
 
-/// Center of the ground below the scene, and the distance D over which it fades.
+/// Center of the ground below the scene, and the distance D over which it fades. One diagonal away from the center, and
+/// below the camera, the ground keeps at least exp(-(1 / 3.5)^2) = 92 % of its color.
 fn ground_disc(up: usize, rest_bounds: BoundingBox, eye: Vector3<f64>) -> (Vector3<f64>, f64) {
     let mut center = rest_bounds.center().coords;
     center[up] = rest_bounds.min[up];
@@ -290,6 +291,7 @@ mod tests {
             ground_is_behind_scene(&scene, &params, position_origin)
         };
         assert!(is_behind(0.0, 1.0, 0.0) && is_behind(-0.1, 1.0, 0.0) && is_behind(0.0, 1.0, 4096.0));
+        // The tolerance is 4 f32::EPSILON = 4.8e-7 of the largest coordinate.
         assert!(is_behind(2e-7 * max_coordinate, 1.0, 0.0), "expected a tolerance for rounding");
         assert!(
             !is_behind(1e-6 * max_coordinate, 1.0, 0.0) && !is_behind(1e-2, 1.0, 4096.0),

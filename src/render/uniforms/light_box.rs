@@ -81,6 +81,7 @@ impl LightBox {
                 0.5 * (light_bounds.min[axis] + light_bounds.max[axis]),
                 0.5 * (light_bounds.max[axis] - light_bounds.min[axis]),
             );
+            // The lower bound keeps the map of a scene that is flat or a point from having no extent.
             TexelSpan::snap(center, half_extent.max(diagonal / 64.0), params)
         });
         let ground_plane = params.ground.and_then(|height| ground_plane(&axes, params.up, height));
@@ -118,7 +119,8 @@ fn diagonal(params: &LightBoxParams) -> f64 {
     params.bounds.diagonal().max(1e-6).max(1e-6 * params.bounds.center().coords.amax())
 }
 
-/// z of the near and the far plane in light space, quantized like the sides. The near plane is nearest to the sun.
+/// z of the near and the far plane in light space, quantized like the sides, with a margin of 1 % of the diagonal. The
+/// near plane is nearest to the sun.
 fn depth_range(
     params: &LightBoxParams,
     [mut far, nearest]: [f64; 2],
@@ -137,8 +139,9 @@ fn depth_range(
     ((near / step).ceil() * step, ((far - 0.01 * diagonal) / step).floor() * step)
 }
 
-/// Coefficients of the ground's z in light space, a x + b y + c; none if the sun is almost on the horizon.
+/// Coefficients of the ground's z in light space, a x + b y + c; none if the sun is within about 1 degree of the horizon.
 fn ground_plane(axes: &[Vector3<f64>; 3], up: UpAxis, height: f64) -> Option<[f64; 3]> {
+    // `z` is the sine of the sun's elevation.
     let [x, y, z] = axes.map(|axis| axis[up.index()]);
     (z.abs() > 0.02).then(|| [-x / z, -y / z, height / z])
 }

@@ -110,7 +110,9 @@ fn squared_distance_to_polyline(polyline: &[[f64; 3]], point: &Vector3<f64>) -> 
             if squared_length > 0.0 { ((point - start).dot(&direction) / squared_length).clamp(0.0, 1.0) } else { 0.0 };
         (start + direction * fraction - point).norm_squared()
     };
-    polyline.windows(2.min(polyline.len())).map(squared_distance_to_segment).fold(f64::INFINITY, f64::min)
+    // A polyline of one point is a segment of length 0.
+    let points_per_segment = 2.min(polyline.len());
+    polyline.windows(points_per_segment).map(squared_distance_to_segment).fold(f64::INFINITY, f64::min)
 }
 
 #[cfg(test)]

@@ -7,7 +7,7 @@ use crate::region::{DirtyRegion, Region};
 
 /// Dirty regions of an id image and its depth image.
 #[derive(Debug, Default)]
-pub(crate) struct VisibilityDirty {
+pub(crate) struct VisibilityDirtyRegions {
     pub(crate) ids: DirtyRegion,
     pub(crate) depth: DirtyRegion,
 }
@@ -19,7 +19,7 @@ pub(crate) enum ClearOp<'a> {
     /// Depth to 1.
     Depth(Option<&'a DirtyRegion>),
     /// Depth to 1 and ids to 0.
-    DepthAndIds(Option<&'a VisibilityDirty>),
+    DepthAndIds(Option<&'a VisibilityDirtyRegions>),
     /// Color to a value.
     Color([f32; 4], &'a DirtyRegion),
     /// Integer words to 0, without depth.
@@ -42,7 +42,7 @@ impl Gl {
     /// Binds a framebuffer, clears it as `clear` states and sets the scissor, so that later draws affect only `region`.
     pub(crate) fn begin_pass(&self, framebuffer: &Framebuffer, region: Region, clear: ClearOp<'_>) {
         let Some(gl) = self.functions_or_skip() else { return };
-        let [width, height] = region.frame().map(|side| side as i32);
+        let [width, height] = region.frame_size().map(|side| side as i32);
         // SAFETY: sets state with a complete framebuffer.
         unsafe {
             gl.bind_framebuffer(glow::FRAMEBUFFER, Some(framebuffer.name));
@@ -66,7 +66,7 @@ impl Gl {
     /// Clears the dirty region of an attachment and marks `region` as dirty.
     fn clear_region(&self, region: Region, dirty: Option<&DirtyRegion>, value: ClearValue) {
         let previous_region = dirty.and_then(|dirty| dirty.replace(region));
-        self.set_scissor(previous_region.unwrap_or_else(|| Region::whole(region.frame())));
+        self.set_scissor(previous_region.unwrap_or_else(|| Region::whole(region.frame_size())));
         let Some(gl) = self.functions_or_skip() else { return };
         // SAFETY: a clear of a complete framebuffer.
         unsafe {

@@ -5,6 +5,9 @@ use glow::HasContext as _;
 /// GL_SUBPIXEL_BITS, which glow does not define.
 const SUBPIXEL_BITS: u32 = 0x0D50;
 
+/// Maximum anisotropy of texture lookups on hardware.
+const HARDWARE_ANISOTROPY: f32 = 8.0;
+
 /// Limits and features of an OpenGL context.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Limits {
@@ -32,7 +35,8 @@ pub(crate) struct Limits {
     pub(crate) persistent_mapping: bool,
     /// Fractional bits of a vertex position in pixels, at least 4.
     pub(crate) subpixel_bits: u32,
-    /// Maximum anisotropy of texture lookups; 1 if it is not supported or if a software rasterizer draws.
+    /// Maximum anisotropy of texture lookups: [`HARDWARE_ANISOTROPY`], or 1 if the context does not support it or is a
+    /// software rasterizer.
     pub(crate) anisotropy: f32,
 }
 
@@ -67,7 +71,7 @@ impl Limits {
                 persistent_mapping: has_persistent_mapping(gl),
                 subpixel_bits: parameter(SUBPIXEL_BITS),
                 post_depth_coverage: gl.supported_extensions().contains("GL_ARB_post_depth_coverage"),
-                anisotropy: if has_anisotropy && !software { 8.0 } else { 1.0 },
+                anisotropy: if has_anisotropy && !software { HARDWARE_ANISOTROPY } else { 1.0 },
             }
         }
     }

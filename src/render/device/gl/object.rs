@@ -300,14 +300,14 @@ impl Texture {
 }
 
 impl Program {
-    /// Makes the program current. `number`, for example the first triangle, is the uniform at location 0 of programs
-    /// that declare it.
-    pub(crate) fn bind(&self, number: Option<u32>) {
+    /// Makes the program current. `uniform` is the value of the integer uniform at location 0, for example the first
+    /// triangle; none for programs without such a uniform.
+    pub(crate) fn bind(&self, uniform: Option<u32>) {
         let Some(gl) = self.gl.functions_or_skip() else { return };
         // SAFETY: a linked program.
         unsafe { gl.use_program(Some(self.name)) }
-        if let Some(number) = number {
-            self.set_uniform(0, number as i32);
+        if let Some(value) = uniform {
+            self.set_uniform(0, value as i32);
         }
     }
 
@@ -326,10 +326,10 @@ impl Program {
         self.set_uniform(1, layer as i32);
     }
 
-    fn set_uniform(&self, location: u32, number: i32) {
+    fn set_uniform(&self, location: u32, value: i32) {
         let Some(gl) = self.gl.functions_or_skip() else { return };
         // SAFETY: OpenGL reports an error unless a bound program declares an integer at the location.
-        unsafe { gl.uniform_1_i32(Some(&glow::NativeUniformLocation(location)), number) }
+        unsafe { gl.uniform_1_i32(Some(&glow::NativeUniformLocation(location)), value) }
     }
 }
 

@@ -29,12 +29,12 @@ pub(crate) fn coverage(image: &LinearImage, cutoff: f32) -> f32 {
     alphas.iter().filter(|alpha| **alpha >= cutoff).count() as f32 / alphas.len() as f32
 }
 
-/// Finds the cutoff for which the image has the given coverage: the mean of the lowest covered and the highest uncovered alpha, so
-/// that no sample is close to the cutoff.
+/// Finds the cutoff for which the image has the given coverage: the mean of the lowest covered and the highest uncovered
+/// alpha, so that no sample is close to the cutoff.
 fn find_threshold(image: &LinearImage, coverage: f32) -> f32 {
     let mut alphas = sample_alpha(image);
-    let rank = (coverage * alphas.len() as f32).round() as usize;
-    let Some(last_covered) = rank.checked_sub(1) else {
+    let covered_count = (coverage * alphas.len() as f32).round() as usize;
+    let Some(last_covered) = covered_count.checked_sub(1) else {
         // Nothing is covered at level 0, so nothing may be covered here.
         return f32::INFINITY;
     };

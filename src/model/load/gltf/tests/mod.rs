@@ -107,7 +107,7 @@ fn push(list: &mut Value, value: Value) -> usize {
     list.len() - 1
 }
 
-/// A triangle with two targets. The second is sparse without base data and moves only vertex 2.
+/// A triangle with two targets. The second (accessor 2) is sparse without dense values and moves only vertex 2.
 fn morphed_triangle() -> Model {
     let mut model = Model::triangle();
     let dense = model.add_floats("VEC3", 3, &[0.0, 0.0, 1.0, 0.0, 0.0, 2.0, 0.0, 0.0, 3.0]);
@@ -141,6 +141,7 @@ fn position_targets_are_columns_of_u_and_normals_are_ignored() {
 #[test]
 fn sparse_values_replace_dense_values() {
     let mut model = morphed_triangle();
+    // The sparse accessor gets the positions as dense values.
     model.json["accessors"][2]["bufferView"] = 0.into();
     let parts = model.parts();
     assert_eq!(parts.shapes[0].modes.column(1), [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.5, -0.5, 0.25]);
