@@ -1,5 +1,5 @@
 // Index of a fragment's triangle in the draw order. `first_triangle` is the first triangle of the draw call, or, for a
-// culled list, the complement of the list's first entry.
+// list of visible triangles, the bitwise complement of the list's first entry.
 layout(location = 0) uniform int first_triangle;
 #ifdef CULLED
 layout(binding = 25) uniform usamplerBuffer triangle_ids;

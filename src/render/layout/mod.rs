@@ -25,14 +25,14 @@ pub(crate) const BLEND_LAYER_UNIT: u32 = 22;
 pub(crate) const FRAGMENT_COUNT_UNIT: u32 = 23;
 /// Vertex values of AOV readbacks.
 pub(crate) const VALUE_UNIT: u32 = 24;
-/// Ids of the triangles in the culled lists.
+/// Ids of the triangles in the lists of visible triangles.
 pub(crate) const TRIANGLE_ID_UNIT: u32 = 25;
 /// Depth of the samples whose ids are at [`ID_UNIT`].
 pub(crate) const DEPTH_UNIT: u32 = 26;
 /// Texture unit of the image that a blur, bloom or encode program reads.
 pub(crate) const SOURCE_UNIT: u32 = 0;
 /// Maximum number of textures that the shading reads in addition to the scene's images: the units above, except those of
-/// images, vertex values and culled lists.
+/// images, vertex values and triangle ids.
 pub(crate) const FIXED_TEXTURE_READS: usize = 13;
 const _: () = assert!(NORMAL_UNIT + MAX_ARRAYS as u32 <= POSITION_UNIT, "texture units overlap");
 
