@@ -64,7 +64,7 @@ fn scene_keys_override_the_defaults() {
     let shadow = ShadowSettings {
         method: ShadowMethod::PercentageCloser,
         size: 512,
-        splits: 3,
+        cascades: 3,
         moments: MomentFormat::F16,
         ..ShadowSettings::default()
     };
