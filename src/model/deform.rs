@@ -203,7 +203,7 @@ pub trait Deformer {
     /// # Errors
     /// `Fault` if no step was deformed yet, or if the copy from the device fails.
     fn readback(&mut self, attributes: VertexAttributes) -> Result<VertexReadback> {
-        Ok(VertexReadback::ready(Arc::new(self.read(attributes)?.select(attributes))))
+        Ok(VertexReadback::ready(Arc::new(self.surface_with(attributes)?.select(attributes))))
     }
 
     /// Blocks until the readback is complete.
