@@ -70,7 +70,7 @@ fn tile_bounds(scene: &Scene, state: &SceneState, deformer: &CpuDeformer, domain
         compensated: scene.deformation.compensated,
     };
     let model = ShapeErrorModel::new(shape, &tiles);
-    (0..tiles.count()).map(|tile| model.tile(tile, &step).total() + truncation_bound).collect()
+    (0..tiles.count()).map(|tile| model.tile_bound(tile, &step).total() + truncation_bound).collect()
 }
 
 /// Largest ratio of an error to the bound of its tile, per domain; infinite for NaN.

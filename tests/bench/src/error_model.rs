@@ -240,7 +240,7 @@ impl DomainErrorBounds<'_> {
                 let evaluate_tile = || {
                     let tensor_core_bound =
                         self.tensor_core_error.map_or(0.0, |error| error_model.tensor_core_bound(tile, &input, error));
-                    (tile, error_model.tile(tile, &input), tensor_core_bound)
+                    (tile, error_model.tile_bound(tile, &input), tensor_core_bound)
                 };
                 let (_, tile_bound, tensor_core_bound) =
                     cached.filter(|(cached_tile, ..)| *cached_tile == tile).unwrap_or_else(evaluate_tile);

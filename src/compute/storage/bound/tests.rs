@@ -60,7 +60,7 @@ fn error_ratios(shape: &Shape, storage: StorageType, input: &ErrorBoundInput) ->
     let tiles = TiledModes::new(shape, storage);
     let model = ShapeErrorModel::new(shape, &tiles);
     let expected = positions_f64(shape, input);
-    let bounds = |tile: usize| model.tile(tile, input).total();
+    let bounds = |tile: usize| model.tile_bound(tile, input).total();
     assert!((0..tiles.count()).all(|tile| bounds(tile) <= model.domain_bound(input).total()));
     [0, 1].map(|axis_shift| max_error_ratio(&sum_in_f32(shape, &tiles, input, axis_shift), &expected, bounds))
 }
@@ -129,7 +129,7 @@ fn frame_rounding_stays_within_its_bound_and_norm_covers_it() {
         assert!(error(true) <= bound.linear && error(false) <= bound.translation, "seed {seed}");
         assert!(error(true) > 1e-3 * bound.linear, "seed {seed}: {} of {}", error(true), bound.linear);
         for linear in [follower.linear(), got.linear()] {
-            let (largest_singular, norm) = (linear.singular_values().max(), norm(&follower));
+            let (largest_singular, norm) = (linear.singular_values().max(), linear_norm_bound(&follower));
             let limit = largest_singular * (1.0 + 1e-5);
             assert!((largest_singular..=limit).contains(&norm), "expected {largest_singular} to {limit}, got {norm}");
         }
@@ -217,7 +217,7 @@ fn norm_is_a_tight_upper_bound_of_the_largest_singular_value() {
     let check_norm = |linear: nalgebra::Matrix3<f64>| {
         let transform = Transform::from_parts(&linear, &nalgebra::Vector3::zeros());
         let exact = transform.linear().singular_values().max();
-        let norm = norm(&transform.into());
+        let norm = linear_norm_bound(&transform.into());
         let limits = exact * (1.0 - 1e-15)..=exact * (1.0 + 2e-7);
         assert!(limits.contains(&norm), "expected {exact}, got {norm} for {linear}");
     };
@@ -228,5 +228,5 @@ fn norm_is_a_tight_upper_bound_of_the_largest_singular_value() {
         check_norm(nalgebra::Matrix3::from_element(scale));
     }
     (0..1000).for_each(|_| check_norm(nalgebra::Matrix3::from_fn(|_, _| f64::from(rng.next()))));
-    assert_eq!(norm(&Transform([0.0; 12]).into()), 0.0);
+    assert_eq!(linear_norm_bound(&Transform([0.0; 12]).into()), 0.0);
 }
