@@ -33,7 +33,7 @@ fn max_error_over_bound(scene: &Scene, state: &SceneState, positions: &[f32]) ->
             transform: state.composed_transform(scene, domain),
             compensated: false,
         };
-        let bound = error_model.tile(tile, &bound_input).total()
+        let bound = error_model.tile_bound(tile, &bound_input).total()
             + error_model.tensor_core_bound(tile, &bound_input, tensor_core_error);
         let squared_difference =
             |axis: usize| (f64::from(position[axis]) - reference_positions[packed_vertex][axis]).powi(2);
