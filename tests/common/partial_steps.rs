@@ -192,7 +192,9 @@ fn compare_scripted_steps<D: Deformer>(name: &str, scene: &Arc<Scene>, create_de
     for ScriptedStep { q_domains, transform_domains, interruption } in scripted_steps() {
         match interruption {
             Interruption::Nothing => {}
-            Interruption::SkippedStep => randomize_q_and_transforms(scene, &mut state, &mut random, &[5, 6], &[RIGID_DOMAIN]),
+            Interruption::SkippedStep => {
+                randomize_q_and_transforms(scene, &mut state, &mut random, &[5, 6], &[RIGID_DOMAIN])
+            }
             Interruption::Overflow => {
                 let mut overflowing_state = state.clone();
                 randomize_q_and_transforms(scene, &mut overflowing_state, &mut random, &[12], &[4]);

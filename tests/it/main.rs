@@ -1,8 +1,8 @@
 //! Tests that need no GPU, in one binary. The tests that render need an EGL driver; a software driver is enough.
 
+mod attribute_streams;
 #[path = "../common/mod.rs"]
 mod common;
-mod attribute_streams;
 mod cpu_checks;
 mod cut_outs;
 mod deformers;

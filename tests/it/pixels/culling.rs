@@ -369,7 +369,8 @@ fn shadows_of_culled_casters_are_bit_identical() {
         let builder = || {
             let mut builder = mixed_builder(1, Transparency::OrderIndependent);
             builder.parts.look.sun = [0.3, 0.8, 0.4];
-            builder.parts.look.shadow = Some(ShadowSettings { size: 128, method, cascades, ..ShadowSettings::default() });
+            builder.parts.look.shadow =
+                Some(ShadowSettings { size: 128, method, cascades, ..ShadowSettings::default() });
             builder
         };
         let frames = assert_same_frames(&builder, &|harness| {

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use modalcast_bench::kernels::{
-    CublasBenchmark, CublasMethod, KernelBenchmark, KernelSplit, Part, ThesisBenchmark, measure_bandwidth,
+    CublasBenchmark, CublasMethod, KernelBenchmark, KernelSplit, StepPart, ThesisBenchmark, measure_bandwidth,
     time_empty_kernel, time_steps,
 };
 use modalcast_bench::timing::CacheState;
@@ -133,7 +133,7 @@ fn check_single_kernel(ranks: &[usize]) {
                 &[(vertices, rank)],
                 scenes::RandomSceneOptions { instances: 1, normal_maps, rigid_transforms: false },
             );
-            for part in [Part::Uq, Part::Whole] {
+            for part in [StepPart::Uq, StepPart::Whole] {
                 let benchmark = ThesisBenchmark::single(&device, &scene, &random_states(&scene), part)
                     .expect("expected a benchmark");
                 check_benchmark(&device, &scene, &random_states(&scene), &benchmark);
@@ -153,11 +153,11 @@ fn gpu_thesis_grouped_kernels_match_reference_in_all_splits() {
         scenes::RandomSceneOptions { instances: 2, normal_maps: true, rigid_transforms: false },
     );
     for split in KernelSplit::ALL {
-        for part in [Part::Uq, Part::Whole] {
+        for part in [StepPart::Uq, StepPart::Whole] {
             let benchmark = ThesisBenchmark::multi(&device, &scene, &random_states(&scene), (split, part))
                 .expect("expected a benchmark");
             check_benchmark(&device, &scene, &random_states(&scene), &benchmark);
-            assert_eq!(benchmark.launches_per_step(), split.widths().len() + usize::from(part == Part::Whole));
+            assert_eq!(benchmark.launches_per_step(), split.widths().len() + usize::from(part == StepPart::Whole));
         }
     }
     // Without modes, only the vertex update is launched.
@@ -165,9 +165,13 @@ fn gpu_thesis_grouped_kernels_match_reference_in_all_splits() {
         &[(40, 0)],
         scenes::RandomSceneOptions { instances: 3, normal_maps: false, rigid_transforms: true },
     );
-    let update_benchmark =
-        ThesisBenchmark::multi(&device, &rigid_scene, &random_states(&rigid_scene), (KernelSplit::Two, Part::Whole))
-            .expect("expected a benchmark");
+    let update_benchmark = ThesisBenchmark::multi(
+        &device,
+        &rigid_scene,
+        &random_states(&rigid_scene),
+        (KernelSplit::Two, StepPart::Whole),
+    )
+    .expect("expected a benchmark");
     check_benchmark(&device, &rigid_scene, &random_states(&rigid_scene), &update_benchmark);
 }
 
@@ -197,7 +201,7 @@ fn gpu_cublas_matches_reference_with_every_product_kind() {
             CublasMethod::Instances => &instanced_scene,
             _ => &mixed_scene,
         };
-        for part in [Part::Uq, Part::Whole] {
+        for part in [StepPart::Uq, StepPart::Whole] {
             match CublasBenchmark::new(&device, scene, &random_states(scene), (method, part)) {
                 Ok(benchmark) => check_benchmark(&device, scene, &random_states(scene), &benchmark),
                 Err(Error::Unavailable { what: "cuBLAS", reason, .. }) => {
@@ -232,17 +236,27 @@ fn gpu_thesis_kernels_reject_unsupported_scenes() {
             &device,
             &high_rank_scene,
             &random_states(&high_rank_scene),
-            (KernelSplit::Two, Part::Uq)
+            (KernelSplit::Two, StepPart::Uq)
         )),
         "domain 0: modes"
     );
     assert_eq!(
-        invalid_field(ThesisBenchmark::single(&device, &two_domain_scene, &random_states(&two_domain_scene), Part::Uq)),
+        invalid_field(ThesisBenchmark::single(
+            &device,
+            &two_domain_scene,
+            &random_states(&two_domain_scene),
+            StepPart::Uq
+        )),
         "scene.domains"
     );
-    assert_eq!(invalid_field(ThesisBenchmark::single(&device, &high_rank_scene, &[], Part::Uq)), "states");
+    assert_eq!(invalid_field(ThesisBenchmark::single(&device, &high_rank_scene, &[], StepPart::Uq)), "states");
     assert_eq!(
-        invalid_field(ThesisBenchmark::single(&device, &high_rank_scene, &random_states(&two_domain_scene), Part::Uq)),
+        invalid_field(ThesisBenchmark::single(
+            &device,
+            &high_rank_scene,
+            &random_states(&two_domain_scene),
+            StepPart::Uq
+        )),
         "states"
     );
 }
