@@ -19,7 +19,7 @@ fn random_step(scene: &Scene, random: &mut Random, q_domains: &[u32], transform_
     let coordinates: usize = q_domains.iter().map(|domain| scene.rank_of(*domain as usize)).sum();
     let q: Vec<f32> = (0..coordinates).map(|_| random.next_number()).collect();
     let random_transform = |domain: &u32| {
-        let is_mirrored = domain % 3 == 0;
+        let is_mirrored = domain.is_multiple_of(3);
         if domain % 3 == 1 && scene.features.shear {
             random.next_shear().0
         } else {

@@ -148,6 +148,12 @@ fn vertices_of_output(output: &modalcast::engine::StepOutput) -> (usize, &Deform
     (output.step.number as usize, surface)
 }
 
+/// The corners of all boxes, rounded to f32 as on the wire.
+fn box_numbers(surface: &DeformedSurface) -> Vec<f32> {
+    let corners = surface.boxes.iter().flat_map(|bounding_box| [bounding_box.min, bounding_box.max].concat());
+    corners.map(|number| number as f32).collect()
+}
+
 /// Subscriptions with different attributes receive every step, although later steps are computed meanwhile.
 #[tokio::test(flavor = "multi_thread")]
 async fn subscribers_of_different_attributes_get_every_step() {
@@ -182,14 +188,6 @@ async fn subscribers_of_different_attributes_get_every_step() {
     let expected_output = |index: usize| {
         let ReferenceVertices { positions, normals } = reference_vertices(&strips_with_attributes(), &steps[..=index]);
         (positions, normals, reference_displacements(&steps[..=index]))
-    };
-    let box_numbers = |surface: &DeformedSurface| -> Vec<f32> {
-        surface
-            .boxes
-            .iter()
-            .flat_map(|bounding_box| [bounding_box.min, bounding_box.max].concat())
-            .map(|number| number as f32)
-            .collect()
     };
     let output = with_timeout(latest_subscription.next()).await.expect("expected the newest step");
     let (index, surface) = vertices_of_output(&output);
