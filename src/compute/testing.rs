@@ -39,7 +39,7 @@ pub fn shape_with_columns(vertices: usize, rank: usize, columns: Vec<f32>, rng: 
     Shape::new(mesh, modes).expect("a valid shape")
 }
 
-/// A scene with one random shape and one domain for each (vertices, rank).
+/// A scene with one random shape and one domain for each (vertices, rank) of `sizes`. rank is the number of modes.
 pub fn scene(sizes: &[(usize, usize)], deformation: DeformationSettings, rng: &mut TestRng) -> Arc<Scene> {
     let mut parts = SceneParts::named("noise");
     parts.deformation = deformation;
@@ -51,7 +51,8 @@ pub fn scene(sizes: &[(usize, usize)], deformation: DeformationSettings, rng: &m
     Scene::new(parts).expect("a valid scene")
 }
 
-/// One domain for each (vertices, rank, triangles), with random corner normals, and a random state.
+/// A scene with one domain for each (vertices, rank, triangles) of `shapes`, with random corner normals, and a random
+/// state.
 pub fn scene_and_state(shapes: &[(usize, usize, usize)]) -> (Arc<Scene>, SceneState) {
     let mut rng = TestRng(shapes.len() as u64);
     let mut parts = SceneParts::named("noise");
@@ -67,6 +68,8 @@ pub fn scene_and_state(shapes: &[(usize, usize, usize)]) -> (Arc<Scene>, SceneSt
     (scene, state)
 }
 
+/// A shape with one corner per vertex and random normals. The triangles use the corners in order, and start again with
+/// corner 0 after the last one.
 fn shape_with_corners(rng: &mut TestRng, vertices: usize, rank: usize, triangles: usize) -> Shape {
     let rest_positions = (0..vertices).map(|_| [0; 3].map(|_| rng.next())).collect();
     let corners = Corners {
@@ -90,7 +93,7 @@ pub fn displacement_of(scene: &Scene, state: &SceneState, domain: usize, vertex:
     })
 }
 
-/// x = T (x0 + u) of a vertex, in f64.
+/// x = T (x0 + u) of a vertex, in f64. The scene has no followers.
 pub fn position_of(scene: &Scene, state: &SceneState, domain: usize, vertex: usize) -> [f64; 3] {
     let (u, rest) =
         (displacement_of(scene, state, domain, vertex), scene.shape_of(domain).mesh.rest_positions()[vertex]);
@@ -99,7 +102,7 @@ pub fn position_of(scene: &Scene, state: &SceneState, domain: usize, vertex: usi
     (linear * deformed + offset).into()
 }
 
-/// One row of T (x, y, z, 1) with fused multiply-adds, in the order of the batch kernels.
+/// One component of T (x, y, z, 1) with fused multiply-adds, in the order of the batch kernels. `row` is that row of T.
 pub fn transformed_axis(row: &[f32], [x, y, z]: [f32; 3]) -> f32 {
     row[0].mul_add(x, row[1].mul_add(y, row[2].mul_add(z, row[3])))
 }

@@ -8,10 +8,11 @@ use rayon::prelude::*;
 
 use super::simd::run_vectorized;
 
-/// Measures `runs` reads of `bytes` bytes by all rayon threads. Returns the highest bandwidth in GB/s (10^9 bytes per
-/// second). A buffer that fits the last-level cache measures the cache, so compare it with a U of the same size.
+/// Reads a buffer of `bytes` bytes `runs` times with all rayon threads. Returns the highest bandwidth in GB/s (10^9
+/// bytes per second). For a buffer that fits into the last-level cache, this is the bandwidth of the cache. To compare
+/// the result with a deformer, choose the size of its U.
 pub fn read_bandwidth(bytes: usize, runs: usize) -> f64 {
-    // Write the buffer first, because untouched pages all map to one page of zeros.
+    // Write to the buffer before the reads: the system maps all pages that were never written to one page of zeros.
     let mut words = vec![0_u64; bytes.div_ceil(8).max(1)];
     words.par_chunks_mut(TASK_WORDS).enumerate().for_each(|(task, words)| words.fill(task as u64));
     let bytes = 8.0 * words.len() as f64;
@@ -24,12 +25,12 @@ pub fn read_bandwidth(bytes: usize, runs: usize) -> f64 {
     (0..runs.max(1)).map(measure).fold(0.0, f64::max)
 }
 
-/// Number of words that one task reads: 1 MiB.
+/// Number of words of 8 bytes that one task reads: 1 MiB.
 const TASK_WORDS: usize = 1 << 17;
-/// Number of independent sums, so that loads do not wait for additions.
+/// Number of independent sums. With several sums, a load does not wait for the addition before it.
 const LANES: usize = 32;
 
-/// Sums words, so that each is read.
+/// Sums words. The sum forces a read of every word.
 struct SumWords<'a>(&'a [u64]);
 
 impl NullaryFnOnce for SumWords<'_> {

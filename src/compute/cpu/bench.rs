@@ -1,4 +1,4 @@
-//! Benchmark: the deformer's fraction of the memory read bandwidth. Run with
+//! Benchmark: bytes per second that the CPU deformer reads and writes, as a fraction of the read bandwidth. Run with
 //! `cargo test --release -p modalcast-compute cpu::bench -- --ignored --nocapture`.
 
 use std::time::Instant;
@@ -7,7 +7,7 @@ use super::*;
 use crate::testing::{TestRng, scene};
 use modalcast_model::scene::{DeformationSettings, StorageType};
 
-/// The median time of a step in seconds, over 15 steps with different coordinates.
+/// The median time in seconds of 15 steps with different coordinates, after 5 steps to warm up.
 fn median_step(scene: &Arc<Scene>, deformer: &mut CpuDeformer) -> f64 {
     let mut rng = TestRng(3);
     let mut state = SceneState::rest(scene);
@@ -28,13 +28,14 @@ fn median_step(scene: &Arc<Scene>, deformer: &mut CpuDeformer) -> f64 {
 #[test]
 #[ignore = "a measurement"]
 fn prints_fraction_of_read_bandwidth() {
-    // The first size fits the caches: it shows the time of the computation alone.
+    // U of the first size fits into the caches, so its time is that of the computation alone.
     for (vertices, rank) in [(1 << 11, 32), (1 << 20, 10), (1 << 20, 32)] {
         for storage in StorageType::ALL {
             for compensated in [false, true] {
                 let deformation = DeformationSettings { storage, compensated, ..DeformationSettings::default() };
                 let scene = scene(&[(vertices, rank)], deformation, &mut TestRng(1));
                 let mut deformer = CpuDeformer::new(&scene);
+                // The deformer reads U and x0, and writes a position of 12 bytes per vertex.
                 let bytes = deformer.stored_bytes() + 12 * vertices;
                 let bandwidth = bytes as f64 / median_step(&scene, &mut deformer) / 1e9;
                 let read_limit = read_bandwidth(bytes, 10);

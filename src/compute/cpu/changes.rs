@@ -1,7 +1,8 @@
 //! Finds the domains that changed since the previous step, that is, those with any changed bit in q or T.
 //!
-//! The tracker compares values, because the state's list of changes is not sufficient: it misses values that were
-//! written directly. A state of another run may also have the same serial number.
+//! The tracker compares the values of q and T. The state's own list of changes is not sufficient, because it misses
+//! values that were written to the fields directly. Serial numbers are not sufficient either: an unrelated state may have
+//! the same number.
 
 use rayon::prelude::*;
 
@@ -34,6 +35,7 @@ impl ChangeTracker {
         self.flags.par_iter_mut().with_min_len(4096).enumerate().for_each(|(domain, flag)| {
             let layout = &scene.layout.domains[domain];
             let q_range = layout.first_q..layout.first_q + layout.rank;
+            // A domain that follows another one has no T of its own. It changes with the T of its root.
             let root = scene.transform_roots.root_of(domain);
             *flag = as_bytes(&previous_transforms[root].0) != as_bytes(&state.transforms[root].0)
                 || as_bytes(&previous_q[q_range.clone()]) != as_bytes(&state.q[q_range]);
@@ -56,7 +58,7 @@ impl ChangeTracker {
     }
 }
 
-/// Returns the bits to compare: zeros of different sign are equal numbers, but may give sums of different sign.
+/// Returns the bits to compare. As numbers, 0 and -0 are equal, but sums of them may differ in sign.
 fn as_bytes(numbers: &[f32]) -> &[u8] {
     bytemuck::cast_slice(numbers)
 }
@@ -95,13 +97,16 @@ mod tests {
         };
         assert_eq!(update(&state), None, "expected the first step to change all domains");
         assert_eq!(update(&state), Some(vec![]));
+        // Domain 0 has q[0] and q[1], domain 1 has no coordinates, and domain 2 has q[2] to q[4]. 1e-45 is the smallest
+        // subnormal number.
         state.q[3] = 1e-45;
         assert_eq!(update(&state), Some(vec![2]));
+        // Entry 11 of T is the z translation.
         state.q[3] = -0.0;
         state.transforms[1].0[11] = 2.0;
         assert_eq!(update(&state), Some(vec![1, 2]));
         state.q[3] = 0.0;
-        assert_eq!(update(&state), Some(vec![2]), "expected zeros of different sign to differ");
+        assert_eq!(update(&state), Some(vec![2]), "expected 0 to differ from -0");
         state.q.fill(1.0);
         state.transforms[1].0[11] = 3.0;
         assert_eq!(update(&state), None);

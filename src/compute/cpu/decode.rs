@@ -1,9 +1,14 @@
-//! Decodes a chunk of stored planes to columns of f32, `[mode][axis][vertex of the tile]`, which is the stored order of
-//! f32 tiles. The planes of a tile are read sequentially.
+//! Decodes the entries of a chunk (a few modes of one tile) to columns of f32, one column per mode. A column is
+//! `[axis][vertex of the tile]`. Tiles of f32 are stored in this order already.
+//!
+//! The documentation of `crate::storage` defines the stored layout. A chunk has three planes, and a plane has 16 bytes
+//! (a packed word) per quad of four vertices. A packed word has one group of four entries or several: the entries of
+//! the quad's vertices for one mode and axis.
 
 use crate::storage::{PackedWord, TILE_QUADS};
 
-/// Decoded columns, with capacity for the four modes that are added together.
+/// Decoded columns, with capacity for four modes, the largest number that is added together. A column
+/// has 12 numbers per quad: three axes of four vertices.
 pub(super) type Columns = [f32; 4 * 12 * TILE_QUADS];
 
 /// Decodes two modes of f16 exactly, without their factors.
@@ -19,8 +24,9 @@ pub(super) fn unpack_f16(packed_words: &[PackedWord], columns: &mut [f32]) {
 /// Decodes a finite f16 without a branch and without subnormal operands, which would be slow.
 #[inline(always)]
 fn decode_f16(bits: u16) -> f32 {
-    // Change the exponent's bias from 15 to 127 = 15 + 112. A subnormal m 2^-24 becomes x = 2^-15 + m 2^-25, which
-    // 2 x - 2^-14 corrects. For all other numbers, 2 x - 2^-14 is at least x.
+    // Change the exponent's bias from 15 (f16) to 127 = 15 + 112 (f32). This turns a subnormal m 2^-24 into
+    // x = 2^-15 + m 2^-25, and 2 x - 2^-14 is the correct value. For a subnormal, 2 x - 2^-14 is less than x. For all
+    // other numbers it is at least x, and x is correct. The minimum of both is therefore the result.
     let bits = u32::from(bits);
     let x = f32::from_bits((bits << 13 & 0x0fff_e000) + (112 << 23));
     let corrected = x.mul_add(2.0, -MIN_NORMAL_F16);
@@ -41,11 +47,12 @@ pub(super) fn unpack_bf16(packed_words: &[PackedWord], columns: &mut [f32]) {
     }
 }
 
-/// Decodes four modes of 8-bit codes to -127 to 127, without their scales.
+/// Decodes four modes of int8 to integers from -127 to 127, without their scales. The stored code is the integer plus
+/// 128.
 #[inline(always)]
 pub(super) fn unpack_int8(packed_words: &[PackedWord], columns: &mut [f32]) {
     let quads = packed_words.len() / 3;
-    // Separate the four groups of four bytes in each packed word, as `deinterleave` does for 16-bit entries.
+    // Separate the four groups of four bytes in each packed word. (`deinterleave` does this for 16-bit entries.)
     let mut buffer = [0_u32; 12 * TILE_QUADS];
     let buffer = &mut buffer[..12 * quads];
     for (packed_words, groups) in packed_words.chunks_exact(quads).zip(buffer.chunks_exact_mut(4 * quads)) {
@@ -67,7 +74,7 @@ pub(super) fn unpack_int8(packed_words: &[PackedWord], columns: &mut [f32]) {
 #[inline(always)]
 fn deinterleave<'a>(packed_words: &[PackedWord], buffer: &'a mut [u64; 6 * TILE_QUADS]) -> &'a [u64] {
     let quads = packed_words.len() / 3;
-    // Three planes of two groups per quad.
+    // A quad has three planes of two groups each.
     let buffer = &mut buffer[..6 * quads];
     for (packed_words, groups) in packed_words.chunks_exact(quads).zip(buffer.chunks_exact_mut(2 * quads)) {
         let (a, b) = groups.split_at_mut(quads);

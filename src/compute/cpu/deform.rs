@@ -11,7 +11,7 @@ use crate::storage::{QUAD, TILE_QUADS, TiledModes};
 use modalcast_model::domain::Transform;
 use modalcast_model::scene::{Scene, SceneState};
 
-/// Maximum number of vertices of a tile.
+/// Maximum number of vertices of a tile. The tiles of vertices are those of the stored U, of [`TILE_QUADS`] quads.
 pub(super) const MAX_TILE_VERTICES: usize = QUAD * TILE_QUADS;
 
 /// The inputs of a step.
@@ -22,7 +22,7 @@ pub(super) struct DeformInputs<'a> {
     /// Per shape.
     pub(super) shapes: &'a [TiledModes],
     pub(super) retained_modes: Option<&'a RetainedModes>,
-    /// 0, 1, 2 and so on: the chunks of a domain without truncated modes.
+    /// 0, 1, 2 and so on: the indices of the chunks that a domain without truncated modes sums.
     pub(super) all_chunks: &'a [u16],
 }
 
@@ -85,7 +85,7 @@ impl<const COMPENSATED: bool> NullaryFnOnce for DeformTask<'_, COMPENSATED> {
     }
 }
 
-/// The part of one tile in the outputs.
+/// The part of the outputs that belongs to one tile.
 struct TileOutput<'a> {
     positions: &'a mut [f32],
     displacements: Option<&'a mut [f32]>,
@@ -98,42 +98,43 @@ fn deform_tile<const COMPENSATED: bool>(
     scratch: &mut Scratch,
     out: TileOutput,
 ) -> TileBounds {
-    let tiled_modes = inputs.tiles_of(tile);
+    let tiled_modes = inputs.tiled_modes_of(tile);
     let layout = tiled_modes.tile(tile.first_item() / MAX_TILE_VERTICES);
     if tiled_modes.rank() > 0 {
         sum_modes::<COMPENSATED>(tiled_modes, &layout, inputs.mode_selection(tile), scratch);
     } else {
-        scratch.sums[..12 * layout.quads].fill(0.0);
+        scratch.sums[..3 * QUAD * layout.quads].fill(0.0);
     }
     let zero_or_nan =
         out.displacements.map_or(0.0, |displacements| store_displacements(inputs, tile, &scratch.sums, displacements));
     add_rest_positions(&tiled_modes.rest()[layout.first_quad..][..layout.quads], &mut scratch.sums);
     let transform = inputs.state.transform_of(inputs.scene, tile.domain());
-    let tile_bounds = store_positions(&transform, &mut scratch.sums, 4 * layout.quads, out.positions);
+    let tile_bounds = store_positions(&transform, &mut scratch.sums, QUAD * layout.quads, out.positions);
     let tile_bounds =
         if tile_bounds.is_finite() { tile_bounds } else { repair_non_finite(inputs, tile, out.positions) };
     tile_bounds.poison_with(zero_or_nan)
 }
 
-/// Copies the sums of a tile, `[axis][vertex]`, to the displacements of its vertices. Displacements that are not finite
-/// are repaired. Returns the result of [`repair_displacements`], else 0.
+/// Copies the sums of a tile, `[axis][vertex]`, to the displacements of its vertices, and repairs displacements that are
+/// not finite. Returns NaN if a displacement is not finite in f32 even after the repair, else 0.
 #[inline(always)]
 fn store_displacements(inputs: &DeformInputs, tile: &DomainTile, sums: &TileVertices, out: &mut [f32]) -> f32 {
     let axis_stride = tile.item_count().next_multiple_of(QUAD);
     let mut zero_or_nan = 0.0;
     for (vertex, out) in out.chunks_exact_mut(3).enumerate() {
         out.copy_from_slice(&[sums[vertex], sums[axis_stride + vertex], sums[2 * axis_stride + vertex]]);
+        // A finite number times zero is 0; infinity or NaN times zero is NaN.
         zero_or_nan += (out[0] + out[1] + out[2]) * 0.0;
     }
     if zero_or_nan == 0.0 { zero_or_nan } else { repair_displacements(inputs, tile, out) }
 }
 
-/// Sums the displacements that are not finite again in f64. Returns NaN if one of them still is not finite in f32, else
-/// 0.
+/// Computes the displacements that are not finite again, with sums in f64. Returns NaN if one of these displacements is
+/// still not finite in f32, else 0.
 #[cold]
 #[inline(never)]
 fn repair_displacements(inputs: &DeformInputs, tile: &DomainTile, out: &mut [f32]) -> f32 {
-    let (tiled_modes, q) = (inputs.tiles_of(tile), inputs.q_of(tile));
+    let (tiled_modes, q) = (inputs.tiled_modes_of(tile), inputs.q_of(tile));
     let mut zero_or_nan = 0.0;
     for (vertex, out) in out.chunks_exact_mut(3).enumerate() {
         if !out.iter().all(|number| number.is_finite()) {
@@ -146,14 +147,15 @@ fn repair_displacements(inputs: &DeformInputs, tile: &DomainTile, out: &mut [f32
 }
 
 impl<'a> DeformInputs<'a> {
+    /// The stored U of the shape of a tile's domain.
     #[inline(always)]
-    fn tiles_of(&self, tile: &DomainTile) -> &'a TiledModes {
+    fn tiled_modes_of(&self, tile: &DomainTile) -> &'a TiledModes {
         &self.shapes[self.scene.domains[tile.domain()].shape]
     }
 
     #[inline(always)]
     fn mode_selection(&self, tile: &DomainTile) -> ModeSelection<'a> {
-        let chunks = self.tiles_of(tile).chunks();
+        let chunks = self.tiled_modes_of(tile).chunks();
         match self.retained_modes {
             Some(retained_modes) => retained_modes.selection_of(tile.domain()),
             None => ModeSelection { q: self.state.q_of(self.scene, tile.domain()), chunks: &self.all_chunks[..chunks] },
@@ -162,7 +164,7 @@ impl<'a> DeformInputs<'a> {
 
     /// The coordinates of a tile's domain; empty without modes.
     fn q_of(&self, tile: &DomainTile) -> &'a [f32] {
-        if self.tiles_of(tile).rank() > 0 { self.mode_selection(tile).q } else { &[] }
+        if self.tiled_modes_of(tile).rank() > 0 { self.mode_selection(tile).q } else { &[] }
     }
 }
 
@@ -210,7 +212,7 @@ fn store_positions(
 #[cold]
 #[inline(never)]
 fn repair_non_finite(inputs: &DeformInputs, tile: &DomainTile, out: &mut [f32]) -> TileBounds {
-    let tiled_modes = inputs.tiles_of(tile);
+    let tiled_modes = inputs.tiled_modes_of(tile);
     let transform = inputs.state.composed_transform(inputs.scene, tile.domain()).to_f64();
     let q = inputs.q_of(tile);
     let mut tile_bounds = TileBounds::EMPTY;

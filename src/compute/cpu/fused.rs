@@ -1,5 +1,9 @@
-//! Decodes and sums packed entries in vector registers, two quads at a time. This is much faster than the decoded
-//! columns of [`super::sum`] and gives bit-identical results. Only for uncompensated sums on x86.
+//! Decodes and sums stored entries in vector registers, two quads (of four vertices) at a time. [`super::sum`] also has a
+//! path that first decodes columns to memory. This one is much faster and gives bit-identical results, but supports
+//! only x86 and uncompensated sums.
+//!
+//! The documentation of `crate::storage` defines the stored layout. A chunk of modes has three planes, and a plane has 16
+//! bytes (a packed word) per quad. A group is the four entries of a quad for one mode and axis.
 
 use std::arch::x86_64::{__m256, __m256i};
 
@@ -9,8 +13,8 @@ use pulp::x86::V3;
 use super::decode::MIN_NORMAL_F16;
 use crate::storage::{PackedWord, QUAD};
 
-/// Decoder of a storage type. It decodes 32 bytes, one plane of two neighboring quads, to `GROUPS` vectors. Each vector
-/// has the entries of eight vertices for one mode and axis.
+/// Decoder of a storage type. It decodes 32 bytes: the packed words of two quads in one plane. Each of the `GROUPS`
+/// results has one group of both quads, that is, the entries of eight vertices for one mode and axis.
 pub(super) trait Decode<const GROUPS: usize> {
     fn decode(simd: V3, packed_words: __m256i) -> [__m256; GROUPS];
 }
@@ -58,7 +62,8 @@ impl Decode<2> for DecodeBf16 {
 impl Decode<4> for DecodeInt8 {
     #[inline(always)]
     fn decode(simd: V3, packed_words: __m256i) -> [__m256; 4] {
-        // A byte in the mantissa of 2^23 gives 2^23 + byte. One exact subtraction removes 2^23 and the code of zero.
+        // 0x4b00_0000 are the bits of 2^23 in f32. A byte in its lowest mantissa bits gives 2^23 + byte. One exact
+        // subtraction removes 2^23 = 8388608 and 128, the code of zero.
         let exponent_bits = simd.avx._mm256_set1_epi32(0x4b00_0000);
         let bias = simd.avx._mm256_set1_ps(8_388_608.0 + 128.0);
         let mut groups = [bias; 4];
@@ -70,13 +75,15 @@ impl Decode<4> for DecodeInt8 {
     }
 }
 
-/// Shuffle masks that move each 16-bit entry of a group to the upper bits of a word. A mask has indices into the 16
-/// bytes of a quad, and 0x80 for zero bytes.
+/// Per group, the shuffle mask that moves each of its 16-bit entries to the upper half of a 32-bit word. A mask has the
+/// index of a source byte for each target byte, or 0x80 for zero. AVX2 shuffles the 16 bytes of each quad separately,
+/// so both halves of a mask are equal.
 const SHUFFLE_16_BIT: [[u8; 32]; 2] = [shuffle_mask(2, 0), shuffle_mask(2, 1)];
 
-/// Shuffle masks that move each byte of a group to the lower bits of a word.
+/// Per group, the shuffle mask that moves each of its bytes to the lowest byte of a 32-bit word.
 const SHUFFLE_8_BIT: [[u8; 32]; 4] = [shuffle_mask(1, 0), shuffle_mask(1, 1), shuffle_mask(1, 2), shuffle_mask(1, 3)];
 
+/// The shuffle mask of a group of four entries of `entry_bytes` bytes.
 const fn shuffle_mask(entry_bytes: u8, group: u8) -> [u8; 32] {
     let mut mask = [0x80; 32];
     let mut vertex = 0;
@@ -94,8 +101,8 @@ const fn shuffle_mask(entry_bytes: u8, group: u8) -> [u8; 32] {
     mask
 }
 
-/// Adds chunks of a tile to its sums, `[axis][vertex]`. A chunk has three planes and `MODES` scaled coordinates. A
-/// group has the entries of four vertices for one mode and axis.
+/// Adds chunks of a tile to its sums, `[axis][vertex]`. Each of `chunks` has the three planes of a chunk, and the scaled
+/// coordinates of its `MODES` modes. A packed word has `GROUPS` groups.
 #[inline(always)]
 pub(super) fn add_chunks<D: Decode<GROUPS>, const GROUPS: usize, const MODES: usize, const CHUNKS: usize>(
     simd: V3,
@@ -110,7 +117,7 @@ pub(super) fn add_chunks<D: Decode<GROUPS>, const GROUPS: usize, const MODES: us
         add_pair::<D, GROUPS, MODES, CHUNKS>(simd, &chunks, [2 * pair, 2 * pair + 1], [x, y, z]);
     }
     if quads % 2 == 1 {
-        // Process the last quad twice and drop the second result.
+        // Process the last quad as both quads of a pair, and drop the second result.
         let mut padded_sums = [[0.0; 2 * QUAD]; 3];
         let [x_sums, y_sums, z_sums] = &mut padded_sums;
         x_sums[..QUAD].copy_from_slice(x_tail);
@@ -123,7 +130,7 @@ pub(super) fn add_chunks<D: Decode<GROUPS>, const GROUPS: usize, const MODES: us
     }
 }
 
-/// Adds chunks to the sums of two quads, x, y and z of eight vertices.
+/// Adds chunks to the sums of two quads: x, y and z of eight vertices.
 #[inline(always)]
 fn add_pair<D: Decode<GROUPS>, const GROUPS: usize, const MODES: usize, const CHUNKS: usize>(
     simd: V3,
@@ -135,14 +142,15 @@ fn add_pair<D: Decode<GROUPS>, const GROUPS: usize, const MODES: usize, const CH
     let mut axis_sums: [__m256; 3] = [cast(*x), cast(*y), cast(*z)];
     for (packed_words, scaled_q) in chunks {
         let quad_count = packed_words.len() / 3;
-        // Groups are ordered by mode, then axis, so this is the order of the sum.
+        // Groups are ordered by mode, then axis, so each sum adds its modes in ascending order.
         for plane in 0..3 {
             let words = [packed_words[plane * quad_count + quads[0]], packed_words[plane * quad_count + quads[1]]];
             let groups = D::decode(simd, cast(words));
             for (group, entries) in groups.iter().enumerate() {
-                let column = GROUPS * plane + group;
-                let coordinate = simd.avx._mm256_set1_ps(scaled_q[column / 3]);
-                axis_sums[column % 3] = simd.fma._mm256_fmadd_ps(*entries, coordinate, axis_sums[column % 3]);
+                let group_in_chunk = GROUPS * plane + group;
+                let (mode, axis) = (group_in_chunk / 3, group_in_chunk % 3);
+                let coordinate = simd.avx._mm256_set1_ps(scaled_q[mode]);
+                axis_sums[axis] = simd.fma._mm256_fmadd_ps(*entries, coordinate, axis_sums[axis]);
             }
         }
     }

@@ -39,7 +39,7 @@ use retained_modes::RetainedModes;
 use tile::{PackedOutput, PerTileOutput, WorkList};
 use tile_bounds::TileBounds;
 
-/// Maximum number of corners of a tile.
+/// Maximum number of corners of a tile of corners.
 const MAX_TILE_CORNERS: usize = 256;
 
 /// The deformer of the `cpu` backend for one scene.
@@ -47,13 +47,16 @@ const MAX_TILE_CORNERS: usize = 256;
 pub struct CpuDeformer {
     scene: Arc<Scene>,
     bounding_axes: Option<BoundingAxes>,
-    /// Per shape.
+    /// Per shape, its stored U and x0.
     shapes: Vec<TiledModes>,
-    /// 0, 1, 2 and so on: the chunk indices of the shape with the most chunks.
+    /// 0, 1, 2 and so on: the chunk indices of the shape with the most chunks. A chunk is the one to four modes that are
+    /// stored together (`storage`).
     all_chunks: Vec<u16>,
     retained_modes: Option<RetainedModes>,
     changes: ChangeTracker,
+    /// The tiles of vertices.
     vertex_work: WorkList,
+    /// The tiles of corners.
     corner_work: WorkList,
     /// Per tile of vertices.
     tile_bounds: Vec<TileBounds>,
@@ -95,7 +98,7 @@ impl CpuDeformer {
         Self { bounding_axes: axes, ..self }
     }
 
-    /// Bytes of stored U and x0. A full step reads so many bytes if no two domains share a shape.
+    /// Bytes of stored U and x0. A step in which all domains change reads this many bytes if no two domains share a shape.
     pub fn stored_bytes(&self) -> usize {
         self.shapes.iter().map(|tiles| tiles.bytes().len() + size_of_val(tiles.rest())).sum()
     }
@@ -123,7 +126,7 @@ impl CpuDeformer {
         deform::deform(inputs, self.vertex_work.select_changed(&self.changes), outputs);
     }
 
-    /// Updates the boxes of the changed domains from the bounds of their tiles, if the scene keeps boxes.
+    /// Updates the boxes of the changed domains from the bounds of their tiles, if boxes are an output of the scene.
     fn update_boxes(&mut self) {
         let (changes, vertex_work, tile_bounds) = (&self.changes, &self.vertex_work, &self.tile_bounds);
         self.surface.boxes.par_iter_mut().with_min_len(1024).enumerate().for_each(|(domain, bounding_box)| {

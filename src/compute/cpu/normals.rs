@@ -1,8 +1,9 @@
 //! Normals and tangents that follow the deformed triangles. Twin: `reference/normals.rs`, which defines them.
 //!
-//! Each corner reads the ring of its group and sums in the order of the ring, so threads share nothing. Positions and
-//! results are f32. Sums are f64, in which differences and products of two f32 neither overflow nor underflow. This
-//! costs little, because reading the ring takes longer than the arithmetic.
+//! Each corner belongs to a smoothing group. The ring of a group lists its vertex, then the vertices around it
+//! ([`SmoothingGroups`]). Each corner sums the area vectors around its group in the order of the ring, so threads share
+//! no sums. Positions and results are f32. Sums are f64, in which differences and products of two f32 neither overflow
+//! nor underflow. This costs little, because reading the ring takes longer than the arithmetic.
 
 use nalgebra::{Matrix3, Vector3};
 
@@ -12,7 +13,7 @@ use modalcast_model::deform::DeformedSurface;
 use modalcast_model::domain::{RING_START, SmoothingGroups};
 use modalcast_model::scene::{Scene, SceneState};
 
-/// 2^-18, as in the twin: the area of a group must exceed this fraction of its rounding scale.
+/// 2^-18, as in the twin: the area of a group must exceed this fraction of its rounding scale (the B of the twin).
 const RESOLUTION: f64 = 1.0 / 262_144.0;
 
 /// As in the twin: squared length below which the sum of two unit vectors counts as zero.
@@ -23,7 +24,7 @@ const MIN_BISECTOR_SQUARED_LENGTH: f64 = 1e-10;
 pub(super) fn compute_normals(scene: &Scene, state: &SceneState, tiles: &[DomainTile], output: &mut DeformedSurface) {
     let DeformedSurface { positions, normals, tangents, .. } = output;
     let positions = positions.as_slice();
-    // In a scene without tangents, the part of a tile is empty.
+    // In a scene without tangents, the output has a width of 0 numbers per corner.
     let tangents = PackedOutput::new(if scene.features.normal_maps { 4 } else { 0 }, tangents);
     tile::run_parallel(tiles, (PackedOutput::new(3, normals), tangents), &|tiles, (mut normals, mut tangents)| {
         for tile in tiles {
@@ -63,10 +64,11 @@ fn rotate_to_surface(surface: &DeformedDomain, first_corner: usize, normals: &mu
 
 /// The deformed surface of a domain.
 struct DeformedDomain<'a> {
+    /// `None` for a shape without modes, whose normals are rigid.
     smoothing: Option<&'a SmoothingGroups>,
     /// Three f32 per vertex of the domain.
     positions: &'a [f32],
-    /// Transforms area vectors from rest to world.
+    /// Transforms area vectors from rest to world: the cofactors of A, the linear part of T.
     area_transform: Matrix3<f64>,
 }
 

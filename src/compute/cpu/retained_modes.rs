@@ -1,4 +1,4 @@
-//! The modes that each domain sums in a step, in scenes with a truncation budget.
+//! The modes that each domain sums in a step, in scenes with a truncation budget. All other modes are truncated.
 
 use rayon::prelude::*;
 
@@ -12,7 +12,7 @@ use modalcast_model::scene::{Scene, SceneState};
 pub(super) struct RetainedModes {
     /// Maximum error of a vertex by truncation, in scene units.
     budget: f64,
-    /// Per shape and mode.
+    /// Per shape and mode, the largest displacement of a vertex by a unit coordinate, in scene units.
     max_row_norms: Vec<Vec<f64>>,
     domains: Vec<DomainModes>,
 }
@@ -21,14 +21,14 @@ pub(super) struct RetainedModes {
 #[derive(Debug)]
 struct DomainModes {
     truncation: Truncation,
-    /// Zero for truncated modes.
+    /// Coordinates; zero for truncated modes.
     q: Vec<f32>,
-    /// Chunks with at least one retained mode, ascending.
+    /// Chunks (modes that are stored together) with at least one retained mode, ascending.
     chunks: Vec<u16>,
 }
 
 impl RetainedModes {
-    /// Starts without truncated modes. `None` for a scene without a budget.
+    /// Starts with no truncated modes. Returns `None` for a scene without a budget.
     pub(super) fn new(scene: &Scene) -> Option<Self> {
         let budget_meters = scene.deformation.truncation.filter(|_| scene.features.truncation)?;
         let create_domain_modes = |domain| {
@@ -42,7 +42,7 @@ impl RetainedModes {
         })
     }
 
-    /// Updates the domains that changed.
+    /// Selects the modes of the domains that changed.
     pub(super) fn update(&mut self, scene: &Scene, state: &SceneState, changes: &ChangeTracker) {
         let chunk_modes = modes_per_chunk(scene.deformation.storage) as u16;
         let Self { budget, max_row_norms, domains } = self;

@@ -1,5 +1,5 @@
-//! Rigid normals, transformed by the inverse transpose of A, and tangents, transformed by A, in f32. Twin:
-//! `reference/rigid_normals.rs`.
+//! Rigid normals, transformed by the inverse transpose of A, and tangents, transformed by A, in f32. A is the linear
+//! part of T. Twin: `reference/rigid_normals.rs`.
 
 use nalgebra::{Matrix3, Vector3};
 
@@ -27,7 +27,7 @@ pub(super) fn compute_rigid_normals(
 /// Writes the world normals of a tile.
 pub(super) fn write_rigid_normals(scene: &Scene, state: &SceneState, tile: &DomainTile, out: &mut [f32]) {
     let linear = state.composed_transform(scene, tile.domain()).linear();
-    // Without shear, A and its inverse transpose differ only by a positive factor.
+    // Without shear, the inverse transpose of A is A times a positive factor, which normalization removes.
     let normal_transform =
         if scene.features.shear { cofactors(&linear) * linear.determinant().signum() } else { linear };
     let normal_transform = limit_entries(normal_transform);
@@ -62,13 +62,14 @@ fn limit_entries(matrix: Matrix3<f64>) -> Matrix3<f32> {
 /// The cofactors of A: its determinant times its inverse transpose.
 pub(super) fn cofactors(linear: &Matrix3<f64>) -> Matrix3<f64> {
     let cofactor = |row: usize, column: usize| {
+        // Cyclic indices give each 2 x 2 minor its sign.
         let entry = |i: usize, j: usize| linear[((row + i) % 3, (column + j) % 3)];
         entry(1, 1) * entry(2, 2) - entry(1, 2) * entry(2, 1)
     };
     Matrix3::from_fn(cofactor)
 }
 
-/// Divides a vector by its length. Returns +Z if the length is about zero.
+/// Divides a vector by its length. Returns +Z if the length is at most 1e-15, so that no division overflows.
 pub(super) fn normalize_or_z(vector: Vector3<f32>) -> Vector3<f32> {
     let length_squared = vector.norm_squared();
     if length_squared > 1e-30 { vector / length_squared.sqrt() } else { Vector3::z() }

@@ -1,5 +1,5 @@
-//! u = U q of one tile. Each coordinate of a vertex is a chain of fused multiply-adds over the modes in ascending
-//! order.
+//! u = U q of one tile of up to 32 quads (of four vertices). Each component of u is a chain of fused multiply-adds over
+//! the modes in ascending order. U is stored in chunks of one to four modes (`crate::storage`).
 
 use super::decode::{self, Columns};
 #[cfg(target_arch = "x86_64")]
@@ -8,7 +8,7 @@ use crate::storage::{PackedWord, TILE_QUADS, TileLayout, TiledModes};
 use modalcast_model::domain::MAX_RANK;
 use modalcast_model::scene::StorageType;
 
-/// Coordinates of a tile's vertices, `[axis][vertex]`.
+/// Three numbers per vertex of a tile, `[axis][vertex]`. A quad has 12 numbers.
 pub(super) type TileVertices = [f32; 12 * TILE_QUADS];
 
 /// Working memory of a tile's sums, small enough for the L1 cache.
@@ -39,8 +39,9 @@ pub(super) struct ModeSelection<'a> {
     pub(super) chunks: &'a [u16],
 }
 
-/// Writes u to the sums. `COMPENSATED` also accumulates the rounding errors (Ogita, Rump, Oishi, Accurate Sum and Dot
-/// Product, 2005, algorithm Dot2 with a fused multiply-add). The result is as accurate as a sum in twice the precision.
+/// Writes u to the sums. With `COMPENSATED`, it also accumulates the rounding errors: algorithm Dot2 of Ogita, Rump and
+/// Oishi, "Accurate sum and dot product", 2005, with a fused multiply-add. The result is then as accurate as a sum in
+/// twice the precision.
 #[inline(always)]
 pub(super) fn sum_modes<const COMPENSATED: bool>(
     tiled_modes: &TiledModes,
@@ -55,7 +56,7 @@ pub(super) fn sum_modes<const COMPENSATED: bool>(
     sum_columns::<COMPENSATED>(tiled_modes, tile, mode_selection, scratch);
 }
 
-/// Decodes columns to scratch memory, then adds them.
+/// Decodes entries to columns in scratch memory, then adds the columns.
 #[inline(always)]
 fn sum_columns<const COMPENSATED: bool>(
     tiled_modes: &TiledModes,
@@ -85,7 +86,7 @@ fn sum_columns<const COMPENSATED: bool>(
     }
 }
 
-/// Decodes in vector registers, without columns in memory (`fused`).
+/// Decodes entries in vector registers, without columns in memory ([`fused`]).
 #[cfg(target_arch = "x86_64")]
 #[inline(always)]
 fn sum_fused(
@@ -162,7 +163,8 @@ impl<'a> TileChunks<'a> {
 
 #[cfg(target_arch = "x86_64")]
 impl TileChunks<'_> {
-    /// Adds the chunks of a 16-bit type, two at a time. A plane has two groups, and a chunk has two modes.
+    /// Adds the chunks of a 16-bit type, two at a time. The arguments of `add_chunks` are the decoder, 2 groups per packed
+    /// word, 2 modes per chunk, and the number of chunks.
     #[inline(always)]
     fn fuse_packed16<D: fused::Decode<2>>(&self, simd: pulp::x86::V3, sums: &mut [f32]) {
         let with_scaled_q = |chunk: u16| (self.chunk(chunk), self.scaled_q(chunk));
@@ -175,7 +177,7 @@ impl TileChunks<'_> {
         }
     }
 
-    /// Adds the chunks of `Int8`. A plane has four groups, and a chunk has four modes.
+    /// Adds the chunks of `Int8`, one at a time. A packed word has 4 groups, and a chunk has 4 modes.
     #[inline(always)]
     fn fuse_int8(&self, simd: pulp::x86::V3, sums: &mut [f32]) {
         for chunk in self.chunks {
@@ -236,6 +238,7 @@ impl<const COMPENSATED: bool> Sums<'_, COMPENSATED> {
         }
     }
 
+    /// Adds N columns, each multiplied by its scaled coordinate.
     #[expect(clippy::needless_range_loop, reason = "one index for all columns leaves no check inside the loop")]
     #[inline(always)]
     fn add<const N: usize>(&mut self, columns: [&[f32]; N], scaled_q: [f32; N]) {
@@ -262,7 +265,8 @@ impl<const COMPENSATED: bool> Sums<'_, COMPENSATED> {
     }
 }
 
-/// Returns the new sum and the new accumulated rounding error: TwoProduct by fused multiply-add, TwoSum of Knuth.
+/// Adds a product to a compensated sum. Returns the new sum and the new accumulated rounding error. The error of the
+/// product is exact by a fused multiply-add (TwoProduct), the error of the addition by Knuth's TwoSum.
 #[inline(always)]
 fn add_exactly((sum, compensation): (f32, f32), entry: f32, coordinate: f32) -> (f32, f32) {
     let product = entry * coordinate;
@@ -273,7 +277,7 @@ fn add_exactly((sum, compensation): (f32, f32), entry: f32, coordinate: f32) -> 
     (new_sum, compensation + (product_error + sum_error))
 }
 
-/// The first N decoded columns.
+/// The first N decoded columns, each of `length` numbers.
 #[inline(always)]
 fn split_columns<const N: usize>(columns: &Columns, length: usize) -> [&[f32]; N] {
     std::array::from_fn(|mode| &columns[mode * length..][..length])
@@ -285,13 +289,13 @@ mod tests {
     use crate::testing::{TestRng, shape_with_columns};
     use modalcast_model::domain::Shape;
 
-    /// The expected sums of one tile of f32, `[axis][vertex]`.
+    /// The expected sums of one tile of f32, `[axis][vertex]`, by plain loops.
     fn sum_tile(shape: &Shape, tile: &TileLayout, q: &[f32]) -> Vec<f32> {
-        let sum_modes = |vertex: usize, axis: usize| {
+        let expected_sum = |vertex: usize, axis: usize| {
             (0..q.len()).fold(0.0_f32, |sum, mode| shape.modes.entry(vertex, axis, mode).mul_add(q[mode], sum))
         };
         let tile_vertices = || tile.first_vertex..tile.first_vertex + tile.vertices;
-        (0..3).flat_map(|axis| tile_vertices().map(move |vertex| sum_modes(vertex, axis))).collect()
+        (0..3).flat_map(|axis| tile_vertices().map(move |vertex| expected_sum(vertex, axis))).collect()
     }
 
     #[test]
@@ -322,6 +326,7 @@ mod tests {
                         sum_columns::<false>(&tiled_modes, &tile, mode_selection, &mut columns);
                         let bits = |sums: &[f32]| sums.iter().map(|sum| sum.to_bits()).collect::<Vec<_>>();
                         assert_eq!(bits(&fused.sums), bits(&columns.sums), "{storage:?} {vertices} x {rank}");
+                        // Only f32 stores exact entries. In a tile without padding, sums have the order of `sum_tile`.
                         if storage == StorageType::F32 && tile.vertices == 4 * tile.quads {
                             let expected = sum_tile(&shape, &tile, &q);
                             assert_eq!(bits(&fused.sums[..expected.len()]), bits(&expected), "{vertices} x {rank}");

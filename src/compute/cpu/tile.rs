@@ -1,5 +1,6 @@
-//! Divides the packed vertices or corners of a scene into tiles, and each output into the parts of the tiles. Tiles
-//! balance the load between cores, for one large domain as for many small ones.
+//! Divides the vertices or the corners of a scene into tiles, and each output into one part per tile. "Packed" items are
+//! those of all domains, one domain after the other. Tiles balance the load between cores, for one large domain as for
+//! many small ones.
 
 use super::changes::ChangeTracker;
 
@@ -86,7 +87,7 @@ impl WorkList {
 
 /// An output that can be split where a tile begins.
 pub(super) trait SplitOutput: Sized + Send {
-    /// Returns the part before `tile`, and the part from `tile` on.
+    /// Returns the part before the first item of `tile`, and the part from that item on.
     fn split_at_tile(self, tile: &DomainTile) -> (Self, Self);
 }
 
@@ -169,7 +170,7 @@ pub(super) fn run_parallel<O: SplitOutput>(
     output: O,
     process: &(impl Fn(&[DomainTile], O) + Sync),
 ) {
-    // Several runs per core balance the load; a run of many tiles reads memory sequentially.
+    // About 16 runs per core balance the load. A run of many tiles reads memory sequentially.
     let max_run = (tiles.len() / (16 * rayon::current_num_threads())).clamp(4, 1024);
     split_recursive(tiles, output, max_run, process);
 }

@@ -18,7 +18,7 @@ const LANES: usize = 8;
 impl TileBounds {
     pub(super) const EMPTY: Self = Self { min: [f32::INFINITY; 3], max: [f32::NEG_INFINITY; 3] };
 
-    /// Bounds of positions; `axes` are their x, y and z.
+    /// Bounds of positions. `axes` has the x of all positions, then their y and their z.
     #[inline(always)]
     pub(super) fn of_axes(axes: [&[f32]; 3]) -> Self {
         let mut tile_bounds = Self::EMPTY;
@@ -48,7 +48,7 @@ impl TileBounds {
     /// The smallest bounds that contain both.
     #[inline(always)]
     pub(super) fn union(self, other: Self) -> Self {
-        // Empty bounds are infinite but not NaN, and must not make the union NaN.
+        // `add_zero_or_nan(number * 0.0)` would not do: empty bounds are infinite, and must not make the union NaN.
         let zero_or_nan = if self.min[0].is_nan() || other.min[0].is_nan() { f32::NAN } else { 0.0 };
         Self {
             min: std::array::from_fn(|axis| self.min[axis].min(other.min[axis])),
@@ -68,7 +68,7 @@ impl TileBounds {
         tile_bounds.par_iter().with_min_len(4096).copied().reduce(|| Self::EMPTY, Self::union).to_bounds()
     }
 
-    /// Bounds of a scene along these axes. They enclose the boxes of its tiles.
+    /// Bounds of a scene along these axes. They enclose the boxes of its tiles, so they may exceed those of the positions.
     pub(super) fn of_scene_along(tile_bounds: &[Self], axes: &[Vector3<f64>; 3]) -> OrientedBounds {
         let bounds_of_tile = |tile_bounds: &Self| OrientedBounds::enclosing(axes, &tile_bounds.to_bounds());
         tile_bounds
@@ -106,6 +106,7 @@ mod tests {
 
     #[test]
     fn bounds_contain_positions_and_are_nan_for_non_finite_ones() {
+        // `index * 8 % 21` has each number from 0 to 20 once.
         let axes: [Vec<f32>; 3] = [0, 1, 2].map(|axis| (0..21).map(|index| (index * 8 % 21 + axis) as f32).collect());
         let bounds_of = |axes: &[Vec<f32>; 3]| TileBounds::of_axes([&axes[0], &axes[1], &axes[2]]);
         let tile_bounds = bounds_of(&axes);

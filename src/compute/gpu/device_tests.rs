@@ -1,4 +1,4 @@
-//! Tests on a real device: guards after panics, and a lost device.
+//! Tests on a real device: a panic leaves the device usable, and every call on a lost device returns an error.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
@@ -17,6 +17,7 @@ const LOSE_DEVICE: &str = "MODALCAST_TEST_LOSES_DEVICE";
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_steps_run_after_a_panic_during_capture() {
     let device = Device::open(0).expect("a CUDA device");
+    // One domain of 300 vertices, 5 modes and 10 triangles.
     let (scene, state) = scene_and_state(&[(300, 5, 10)]);
     let mut deformer = CudaDeformer::new(&device, &scene, None, CudaDeformerOptions::default()).expect("a deformer");
     let before = deformer.deform(&state).expect("a step").bounds;
@@ -54,7 +55,7 @@ fn gpu_panics_restore_the_current_context() {
     });
 }
 
-/// A device is lost for the whole process, so this test loses it in a child process.
+/// A lost device is lost for the whole process, so the test runs itself in a child process, which loses the device.
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_lost_device_is_an_error_of_every_call_and_no_panic() {
@@ -70,6 +71,7 @@ fn gpu_lost_device_is_an_error_of_every_call_and_no_panic() {
     assert!(output.status.success() && text.contains("1 passed"), "{text}");
 }
 
+/// Loses the device by a kernel that traps, and calls the objects on it.
 fn lose_device() {
     fn is_lost<T>(result: modalcast_model::error::Result<T>) -> bool {
         result.is_err_and(|error| matches!(error, Error::DeviceLost { .. }))

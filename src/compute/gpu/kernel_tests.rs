@@ -14,10 +14,10 @@ type Variant = (Vec<&'static str>, (i32, i32));
 /// Macros of `deform` that are not features of a scene.
 const LAUNCHER_DEFINES: [&str; 1] = ["TILE_LIST"];
 
-/// The compute capability of the H200, which all tested variants are compiled for.
+/// The compute capability of the H200. Every tested variant is compiled for it.
 const SM_90: (i32, i32) = (9, 0);
 
-/// The other capabilities, which only some variants are compiled for.
+/// The other compute capabilities. Only some variants are compiled for them.
 fn other_capabilities() -> impl Iterator<Item = (i32, i32)> {
     CAPABILITIES.into_iter().filter(|capability| *capability != SM_90)
 }
@@ -37,8 +37,8 @@ fn subsets(macros: &[&'static str]) -> Vec<Vec<&'static str>> {
 fn deform_variants(features: &[&'static str]) -> Vec<Variant> {
     let mut variants: Vec<Variant> =
         features.iter().chain(&LAUNCHER_DEFINES).map(|feature| (vec![*feature], SM_90)).collect();
-    // The sum, the items per lane and the kind of normals determine most registers. Kernels for tile lists always have
-    // one item per lane.
+    // Most registers depend on three choices: how modes are summed, how many vertices or corners (items) a lane computes,
+    // and the kind of normals. With TILE_LIST, a lane always has one item.
     let lane_defines: [&[&str]; 3] = [&[], &["ONE_ITEM_PER_LANE"], &["ONE_ITEM_PER_LANE", "TILE_LIST"]];
     let normal_defines: [&[&str]; 4] = [
         &[],
@@ -46,6 +46,7 @@ fn deform_variants(features: &[&'static str]) -> Vec<Variant> {
         &["RIGID_NORMALS", "NORMAL_MAPS"],
         &["RIGID_NORMALS", "CORNER_OFFSETS", "NORMAL_MAPS", "SHEAR"],
     ];
+    // Adds the product of `lane_defines` and `normal_defines`, each with the macros in `sum` and `others`.
     let mut add_variants = |sum: &[&'static str], normal_defines: &[&[&'static str]], others: &[&'static str]| {
         for (lane, normals) in
             lane_defines.iter().flat_map(|lane| normal_defines.iter().map(move |normals| (lane, normals)))
@@ -59,14 +60,14 @@ fn deform_variants(features: &[&'static str]) -> Vec<Variant> {
     for storage in storage_variants() {
         let sum = |options: &[&'static str]| [&["MODES"], storage.as_slice(), options].concat();
         let all_options = ["MODE_TRUNCATION", "COMPENSATED_SUM"];
-        // Both 16-bit types decode with the same registers. For one of them, the sums between the smallest and the
-        // largest are omitted.
+        // bf16 needs the same registers as f16, so bf16 is compiled only with none and with all of the options.
         let mut option_sets = subsets(&all_options);
         option_sets.retain(|options| storage != ["STORE_BF16"] || options.len() != 1);
         for options in &option_sets {
             add_variants(&sum(options), &normal_defines, &[]);
         }
-        // The registers that displacements and followers add to the largest sum.
+        // Registers that displacements or followers add to the largest sum. Entries 1 and 2 of `normal_defines` are rigid
+        // normals without and with normal maps.
         add_variants(&sum(&all_options), &normal_defines[1..3], &["DISPLACEMENTS"]);
         add_variants(&sum(&all_options), &normal_defines[1..3], &["FOLLOWERS"]);
     }
@@ -82,19 +83,20 @@ fn deform_variants(features: &[&'static str]) -> Vec<Variant> {
     variants
 }
 
-/// All variants of `batch` for compute capability 9.0, and for others those with the maximum group size.
+/// All variants of `batch` for compute capability 9.0. For other capabilities, only the variants with groups of 16 domains,
+/// the largest size, which has neither BATCH_4 nor BATCH_8.
 fn batch_variants(features: &[&'static str]) -> Vec<Variant> {
-    let has_one_size = |set: &Vec<&str>| !(set.contains(&"BATCH_4") && set.contains(&"BATCH_8"));
+    let has_one_group_size = |set: &Vec<&str>| !(set.contains(&"BATCH_4") && set.contains(&"BATCH_8"));
     let sm_90_variants = subsets(features)
         .into_iter()
-        .filter(has_one_size)
+        .filter(has_one_group_size)
         .flat_map(|set| storage_variants().map(move |storage| ([set.clone(), storage].concat(), SM_90)));
     let other_variants =
         other_capabilities().flat_map(|capability| storage_variants().map(move |storage| (storage, capability)));
     sm_90_variants.chain(other_variants).collect()
 }
 
-/// All variants of another kernel.
+/// All variants of a kernel that is neither `deform` nor `batch`.
 fn all_variants(features: &[&'static str]) -> Vec<Variant> {
     CAPABILITIES
         .into_iter()
@@ -125,7 +127,7 @@ fn nvrtc_compiles_every_kernel_without_spilling() {
         };
         let describe_spill = |(variant, compiled): (&Variant, CompiledVariant)| {
             let spill_bytes = compiled.spill_bytes();
-            // `sum_modes` of batch.cu may spill its stage counter.
+            // `sum_modes` of batch.cu may spill the counter of its pipeline stages, up to 16 bytes.
             let max_spill_bytes = if kernel.name == "batch" { 16 } else { 0 };
             (spill_bytes > max_spill_bytes).then(|| format!("{variant:?}: {spill_bytes} bytes"))
         };
@@ -142,7 +144,7 @@ fn nvrtc_compiles_every_kernel_without_spilling() {
     }
 }
 
-/// Kernel, macro that adds code, and the macros that it requires. The other macros select among code of similar length.
+/// Kernel, a macro that adds code, and the macros that this macro requires. [`ALTERNATIVES`] has all other macros.
 const ADDED_CODE: [(&str, &str, &[&str]); 14] = [
     ("deform", "MODES", &[]),
     ("deform", "COMPENSATED_SUM", &["MODES"]),
@@ -194,7 +196,7 @@ fn nvrtc_layout_equals_the_host_layout() {
     };
     for constant in layout::layout_constants() {
         compile_assertion(&constant, constant.host).expect("the same value on host and device");
-        compile_assertion(&constant, constant.host ^ 4).expect_err("control: a wrong value");
+        compile_assertion(&constant, constant.host ^ 4).expect_err("negative control: a wrong value");
     }
     nvrtc
         .compile(&CompileJob::new("layout_values", &layout::layout_kernel_source(), &[], (9, 0)))

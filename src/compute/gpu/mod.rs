@@ -1,5 +1,5 @@
-//! The CUDA backend, in three tiers: `launch` (access to the device), `tables` (tables and plan of a scene; pure) and
-//! `executor` (deformer and rasterizer).
+//! The CUDA backend, in three tiers: `launch` (access to the device), `tables` (tables and plan of a scene, computed by
+//! pure functions on the host) and `executor` (deformer and rasterizer).
 //!
 //! The kernels are in `kernels/*.cu`. NVRTC compiles them at run time for the present device, with only the features
 //! that the scene uses ([`plan()`]). A disk cache keeps the machine code. A step is one CUDA graph: a host-to-device
@@ -9,8 +9,10 @@
 //! ```text
 //! inputs -> [apply or batch] -> deform -> bounds -> [normals] -> readback of the bounds
 //! ```
-//! A partial step, which changes few domains, launches `apply`. A full step launches `batch` if the scene has domains
-//! that share a large U. `normals` is launched if normals follow the deformed surface.
+//! `deform` computes positions, and `bounds` the bounding box of all positions. A partial step, which changes few domains,
+//! first launches `apply`, which copies the changed values. A full step launches `batch` if the scene has domains that
+//! share a large U; `batch` computes these domains instead of `deform`. `normals` is launched if normals follow the
+//! deformed surface.
 //!
 //! The server uses this module. Programs that measure single kernels also use [`launch`], [`launchers`] and
 //! [`step_input`].
@@ -32,8 +34,8 @@ pub use tables::device_tables::CudaDeformerOptions;
 pub use tables::layout::{LayoutConstant, layout_constants};
 pub use tables::plan::{BufferDescriptor, BufferRole, DeformPlan, OmittedFeature, plan};
 
-/// The launchers of the kernels, for programs that measure single kernels. The launch functions are unsafe: the header
-/// of a step's values contains the addresses of its outputs.
+/// The launchers of the kernels, for programs that measure single kernels. The launch functions are unsafe, because the
+/// kernels write to the addresses in the step's [`StepHeader`](step_input::StepHeader), which nothing checks.
 pub mod launchers {
     pub use super::executor::launchers::apply::{ApplyKernel, ChangeListBuffer};
     pub use super::executor::launchers::bounds::BoundsKernel;

@@ -2,22 +2,24 @@
 //!
 //! # Definition
 //! For each smoothing group (see [`modalcast_model::domain::SmoothingGroups`]), the area vectors (b - a) x (c - a) of
-//! its triangles are summed twice. The rest sum uses the rest positions and is transformed by the cofactors of A, as
-//! area vectors are. The current sum uses the positions x of this step. The exact normal is the rigid normal of
+//! its triangles are summed twice. The rest sum uses the rest positions. It is transformed by the cofactors of A (the
+//! linear part of T), as area vectors are. The current sum uses the positions x of this step. The exact normal is the rigid normal of
 //! `reference/rigid_normals.rs`, rotated by the smallest rotation that takes the direction of the rest sum to that of
 //! the current sum. It follows that
 //! - at q = 0 the exact normal is the rigid normal, even if the author smoothed, weighted or tilted rest normals;
-//! - where rest normals are those of the triangles, it is the area-weighted normal of the deformed triangles;
-//! - where rest normals oppose the winding, it is the opposite of the area-weighted normal: a rotation that takes g to
-//!   h takes -g to -h;
+//! - where rest normals are those of the triangles, the exact normal is the area-weighted normal of the deformed
+//!   triangles;
+//! - where rest normals oppose the winding, the exact normal is the opposite of that area-weighted normal, because a
+//!   rotation that takes a vector g to h takes -g to -h;
 //! - a mirroring T needs no special case: T transforms both sums alike, and the rigid normal has the sign of its
 //!   determinant;
 //! - corners of one group with the same rest normal keep a common normal: seams stay closed and hard edges stay hard.
 //!
 //! A tangent is rotated by the same rotation, then made orthogonal to the new normal. The bitangent keeps its sign, or
-//! is flipped by a mirroring T as in the rigid case. This takes no memory and no reads beyond those of rigid tangents
+//! is flipped by a mirroring T as in the rigid case. Tangents need no memory and no reads beyond those of rigid tangents
 //! and exact normals. The tangent follows the tilt of the surface. It does not follow rotation or shear within the
-//! surface, which would need texture gradients per triangle: 8 more bytes per entry of every ring.
+//! surface, which would need texture gradients per triangle: 8 more bytes per entry of every ring (the list of vertices
+//! around a group).
 //!
 //! # Fallback
 //! A corner keeps its rigid normal and tangent where no rotation can be determined:
@@ -25,11 +27,11 @@
 //! - its group has no area at rest, or areas that cancel;
 //! - the area of its group in this step is not above [`RESOLUTION`] times B.
 //!
-//! B is the sum of l (l + w) over the two edges of each triangle that meet at the group's vertex. l is the sum of the
-//! absolute components of an edge, and w that of the vertex. Rounding positions to f32 moves an edge by at most 2^-23
+//! B, the rounding scale, is the sum of l (l + w) over the two edges of each triangle that meet at the group's vertex. l
+//! is the sum of the absolute components of an edge, and w is this sum for the position of the vertex. Rounding positions to f32 moves an edge by at most 2^-23
 //! (l + w), and so the sum of area vectors by at most 2^-23 B. For positions that were rounded once, the direction of
-//! the sum is therefore off by at most asin(2^-23 B / |sum|) < asin(2^-5) < 1.8 degrees. A rotation that rounding alone
-//! could cause is not applied. A domain of one meter at 10^7 meters thus has rigid normals, unless the scene's origin
+//! the sum is therefore off by at most asin(2^-23 B / |sum|). This is less than asin(2^-5) < 1.8 degrees if |sum| is
+//! above `RESOLUTION` B = 2^-18 B. A rotation that rounding alone could cause is not applied. A domain of one meter at 10^7 meters thus has rigid normals, unless the scene's origin
 //! is near it.
 //!
 //! Close to half a turn the axis of the smallest rotation is ill-conditioned. Rest normals that differ from the
@@ -146,7 +148,7 @@ struct Area {
     rounding_scale: f64,
 }
 
-/// The areas of all groups.
+/// The area of each group. The result has one element per corner, which is at least the number of groups.
 fn sum_areas(mesh: &Mesh, corner_groups: &[u32], position: impl Fn(usize) -> [f64; 3]) -> Vec<Area> {
     let mut group_areas = vec![Area::default(); corner_groups.len()];
     let l1 = |vector: Vector3<f64>| vector.abs().sum();

@@ -1,10 +1,10 @@
 //! The reference rasterizer: plain loops over samples that define the result of `kernels/raster.cu`.
 //!
 //! Corners are transformed to clip space in f32; each sum and product is rounded separately. Triangles are clipped by
-//! the near plane and a guard band around the window (Sutherland and Hodgman, "Reentrant polygon clipping", 1974), and
+//! the near plane and a guard band (a rectangle around the window that keeps coordinates in range; Sutherland and Hodgman, "Reentrant polygon clipping", 1974), and
 //! their corners are snapped to 1/256 pixel.
 //!
-//! Coverage is then exact, in integers: a triangle covers the samples on the inner side of all its edges. A sample on
+//! Coverage is then computed exactly, in integers: a triangle covers the samples on the inner side of all its edges. A sample on
 //! an edge belongs to the triangle for which it is a top or left edge, so triangles that share an edge cover each
 //! sample exactly once. Depth is z/w, linear in the window, in f32 from the exact edge values. Cut-outs cover only
 //! samples whose alpha is large enough ([`cut_out`]).
@@ -76,29 +76,30 @@ impl VisibilityBuffer {
     }
 
     /// Draws a range of triangles. Positions are three numbers per vertex.
-    pub fn draw(&mut self, positions: &[f32], triangles: &[[u32; 3]], group: DrawRange) {
-        self.draw_filtered(positions, triangles, group, |_, _| true);
+    pub fn draw(&mut self, positions: &[f32], triangles: &[[u32; 3]], range: DrawRange) {
+        self.draw_filtered(positions, triangles, range, |_, _| true);
     }
 
     /// Draws a range of triangles of a mesh with cut-outs.
-    pub fn draw_cut_out(&mut self, positions: &[f32], triangles: &[[u32; 3]], group: DrawRange, cut_outs: &CutOuts) {
+    pub fn draw_cut_out(&mut self, positions: &[f32], triangles: &[[u32; 3]], range: DrawRange, cut_outs: &CutOuts) {
         let window = self.window;
-        self.draw_filtered(positions, triangles, group, |triangle, pixel| {
+        self.draw_filtered(positions, triangles, range, |triangle, pixel| {
             let corners = corners(&window, positions, triangles[triangle as usize]);
             cut_out::passes_alpha_test(cut_outs, &window, triangle, &corners, pixel)
         });
     }
 
+    /// Draws the samples for which `passes_alpha_test(triangle, [column, row])` is true.
     fn draw_filtered(
         &mut self,
         positions: &[f32],
         triangles: &[[u32; 3]],
-        group: DrawRange,
+        range: DrawRange,
         passes_alpha_test: impl Fn(u32, [i32; 2]) -> bool,
     ) {
-        for triangle in group.first..group.first + group.triangles {
+        for triangle in range.first..range.first + range.triangles {
             if let Ok(clipped_polygon) =
-                clipped_polygon(&self.window, positions, triangles[triangle as usize], group.cull_mode)
+                clipped_polygon(&self.window, positions, triangles[triangle as usize], range.cull_mode)
             {
                 self.fill(&clipped_polygon, triangle, |pixel| passes_alpha_test(triangle, pixel));
             }
@@ -259,7 +260,8 @@ fn clip(window: &Viewport, corners: &[[f32; 4]; 3]) -> Vec<[f32; 4]> {
                 });
             }
         }
-        // Rounding may make a polygon slightly concave; a plane adds at most one corner to a convex polygon.
+        // A plane adds at most one corner to a convex polygon: 3 + 5 corners. Rounding may make a polygon slightly
+        // concave, and a plane may then add more corners.
         clipped_polygon.truncate(8);
         polygon = clipped_polygon;
     }
@@ -283,9 +285,9 @@ fn snap(window: &Viewport, [x, y, z, w]: &[f32; 4]) -> SnappedVertex {
     SnappedVertex { x: to_subpixels(window_x), y: to_subpixels(window_y), z: z * inverse_w * 0.5 + 0.5 }
 }
 
-/// The samples in the bounding box of the corners, clipped to the window. The sample of column c is at x = 256 c + 128.
-/// The first column at or after x0 is therefore ceil((x0 - 128) / 256), and the last one at or before x1 is
-/// floor((x1 - 128) / 256).
+/// The samples in the bounding box of the corners, clipped to the window. In units of 1/256 pixel, the sample of column c
+/// is at x = 256 c + 128. The first column at or after x0 is therefore ceil((x0 - 128) / 256) = floor((x0 + 127) / 256),
+/// and the last column at or before x1 is floor((x1 - 128) / 256). A shift by 8 divides by 256 and rounds down.
 fn samples(window: &Viewport, corners: &[SnappedVertex]) -> PixelRect {
     let sample_range = |coordinate_of: fn(&SnappedVertex) -> i32, window_side: u32| {
         let coordinates = || corners.iter().map(coordinate_of);

@@ -1,12 +1,13 @@
-//! Rigid normals, transformed by the inverse transpose of A, and tangents, transformed by A. Both have unit length.
+//! Rigid normals, transformed by the inverse transpose of A, and tangents, transformed by A. A is the linear part of T.
+//! Normals and tangents have unit length.
 //! Twin of `kernels/rigid_normals.cuh`.
 
 use nalgebra::{Matrix3, Vector3};
 
 use modalcast_model::scene::{Scene, SceneState};
 
-/// World unit normals, one per corner. If A is singular, the cofactors still give the direction, and a normal that they
-/// map to zero becomes +Z.
+/// World unit normals, one per corner. If A is singular, the cofactors of A still give the direction. A normal that the
+/// cofactors map to zero becomes +Z.
 pub fn rigid_normals(scene: &Scene, state: &SceneState) -> Vec<[f64; 3]> {
     let mut normals = Vec::with_capacity(scene.layout.corners);
     for domain in 0..scene.domains.len() {
@@ -50,7 +51,7 @@ pub(super) fn cofactors(linear: &Matrix3<f64>) -> Matrix3<f64> {
     Matrix3::from_rows(&[b.cross(&c).transpose(), c.cross(&a).transpose(), a.cross(&b).transpose()])
 }
 
-/// A vector divided by its length; +Z if the length is about zero.
+/// A vector divided by its length; +Z if the length is at most 1e-300, so that no division overflows.
 fn normalize_or_z(vector: Vector3<f64>) -> Vector3<f64> {
     vector.try_normalize(1e-300).unwrap_or_else(Vector3::z)
 }

@@ -1,8 +1,8 @@
 //! The deformer of the `cuda` backend: a step is one graph of copies and kernels, and its bounds are read back with it.
 //!
-//! Steps are double-buffered. A step can be submitted while the previous one is in flight: the host writes its values
-//! while the previous step runs. The host can also fetch the vertices of a step while the next step runs: the next step
-//! then writes another output set.
+//! Steps are double-buffered. A step can be submitted while the previous step is in flight: the host writes the values of
+//! the new step while the previous step runs. The host can also fetch the vertices of a step while the next step runs.
+//! The next step then writes another output set (buffers of positions, normals and tangents).
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -37,7 +37,7 @@ pub const MAX_STEPS_IN_FLIGHT: usize = 2;
 /// A submitted step.
 #[derive(Debug, Clone, Copy)]
 struct StepInFlight {
-    /// Index of its step slot.
+    /// Index in [`CudaDeformer::step_slots`].
     slot: usize,
     submitted: Instant,
 }
@@ -46,19 +46,20 @@ struct StepInFlight {
 ///
 /// Dropping it waits for all steps and copies before any memory that they use is released.
 pub struct CudaDeformer {
+    /// Memory and graphs of the steps in flight; at most [`MAX_STEPS_IN_FLIGHT`].
     step_slots: Vec<StepSlot>,
     device: Arc<Device>,
     plan: DeformPlan,
     kernels: StepKernels,
     inputs: StepInputs,
     output: OutputBuffers,
-    /// u, if the scene keeps displacements. One buffer is sufficient for all output sets, because displacements are
+    /// u, if displacements are an output of the scene. One buffer is sufficient for all output sets, because displacements are
     /// read before the next step is submitted. The same holds for boxes.
     displacements: Option<DeviceBuffer>,
     output_ring: OutputRing,
     /// Steps in flight, oldest first.
     in_flight: VecDeque<StepInFlight>,
-    /// Ring slot of the last step.
+    /// Index in `step_slots` of the last step.
     last_slot: usize,
     readbacks: ReadbackPool,
     /// The readback of the last step and the attributes it copies; `None` after the next step is submitted.
@@ -117,6 +118,7 @@ impl CudaDeformer {
             readbacks: ReadbackPool::default(),
             readback: None,
             surface: PinnedSurface::empty(),
+            // Before the first step there is nothing to copy to the host.
             host_attributes: VertexAttributes::ALL,
             device: Arc::clone(device),
             plan,
@@ -177,8 +179,8 @@ impl CudaDeformer {
     /// Starts the graph of the last full step again, to measure its time.
     ///
     /// # Errors
-    /// `Fault` when the outputs are OpenGL's buffers, which this does not map; when no step was deformed; or when the
-    /// device fails.
+    /// `Fault` when the outputs are OpenGL's buffers, which this function does not map; when there was no step; or when
+    /// the device fails.
     pub fn replay(&self) -> Result<()> {
         if self.output.is_shared() || self.output_ring.shown_output().is_none() {
             let reason = "expected a deformed step in buffers of the deformer".into();
@@ -203,6 +205,8 @@ impl CudaDeformer {
         let target = self.output_ring.begin_step(state);
         let Self { step_slots, kernels, inputs, .. } = self;
         let step_slot = &mut step_slots[slot_index];
+        // The lengths of the lists of a partial step, `None` for a full step. `changed` are the domains that the step
+        // changes. `outdated` are the domains that earlier steps changed in the other output only.
         let list_lengths =
             match (&target.dirty_domains, &state.dirty_domains, &mut step_slot.change_list, &mut kernels.apply) {
                 (Some(outdated), DirtyDomains::Some(changed), Some(list), Some(apply)) => {
@@ -212,12 +216,13 @@ impl CudaDeformer {
             };
         let last_full_step = self.output_ring.update_last_full_step(list_lengths.is_none());
         let header = header(&target, list_lengths, last_full_step);
-        // Shared OpenGL buffers are copied to the back buffer on this stream, so the copy already precedes the step.
+        // A readback of OpenGL's buffers first copies them to a back buffer on this stream, so that copy precedes the
+        // step anyway.
         if target.is_being_read && !self.output.is_shared() {
             self.readbacks.wait_for_reads(&self.device, target.output)?;
         }
-        // A partial step does not write vertices of unchanged domains, and the kernels of normals and boxes read the
-        // positions, so the driver must not discard the contents.
+        // The driver may discard the old contents only if the step writes every vertex and reads none. A partial step does
+        // not write the vertices of unchanged domains. The kernels of normals and boxes read positions.
         let keeps_contents = list_lengths.is_some() || kernels.normals.is_some() || kernels.bounds.boxes.is_some();
         let displacements = self.displacements.as_ref().map_or(0, DeviceBuffer::address);
         let header = StepHeader { displacements, ..header };
@@ -252,8 +257,8 @@ impl CudaDeformer {
         Ok(self.step_slots.len() - 1)
     }
 
-    /// Waits for all steps in flight, and marks all outputs and the values on the device as invalid. A failed step does
-    /// this, too.
+    /// Waits for all steps in flight, and marks all outputs and the values on the device as invalid. This also happens
+    /// after a failed step.
     pub fn invalidate(&mut self) {
         // The error of the failed step is already reported.
         self.device.stream().synchronize().ok();
@@ -291,7 +296,7 @@ impl CudaDeformer {
         })
     }
 
-    /// Copies to `surface` those of the requested attributes of the last step that it does not yet have.
+    /// Copies the requested attributes of the last step to `surface`, except those that were copied before.
     fn download_attributes(&mut self, attributes: VertexAttributes) -> Result<()> {
         let host_attributes = self.host_attributes;
         if (attributes.positions || attributes.normals)

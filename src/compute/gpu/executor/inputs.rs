@@ -17,16 +17,17 @@ use modalcast_model::scene::SceneState;
 pub(crate) struct InputAddresses {
     pub header: u64,
     pub transforms: u64,
-    /// Per domain, its transform root and frame. Constant; only in scenes with followers.
+    /// Per domain, its transform root (the domain whose transform it uses) and the index of its frame. Constant; only in
+    /// scenes with followers.
     pub transform_links: u64,
-    /// Transforms of followers relative to their roots. Constant.
+    /// Per follower, its frame: its constant transform relative to its root.
     pub frames: u64,
     pub q: u64,
     /// Per domain, the step that last changed it.
     pub change_steps: u64,
-    /// Per domain, the number of chunks that it sums. Empty without truncation.
+    /// Per domain, the number of chunks (modes that are stored together) that it sums. Empty without truncation.
     pub retained_counts: u64,
-    /// The chunks that domains sum. Empty without truncation.
+    /// Per domain, the indices of these chunks. Empty without truncation.
     pub retained: u64,
 }
 
@@ -45,7 +46,7 @@ pub struct StepInputs {
 /// Pinned staging buffer for the values of one step.
 pub type StagingBuffer = PinnedBuffer<f32>;
 
-/// The part of the staging buffer to copy.
+/// The part of the staging buffer that a step copies to the device.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum InputPart {
     /// Only the header, for a partial step: `apply` reads the other values from pinned memory.
@@ -118,7 +119,7 @@ impl StepInputs {
     /// holds for each launch of the graph, and `self` exists until the last launch has ended.
     ///
     /// # Errors
-    /// `Fault` when `staging` is not a staging buffer of these inputs, or when the device fails.
+    /// `Fault` when `staging` does not have the length of these inputs, or when the device fails.
     pub unsafe fn send(&self, device: &Device, staging: &StagingBuffer, part: InputPart) -> Result<()> {
         let bytes: &[u8] = bytemuck::cast_slice(staging.as_slice()?);
         if bytes.len() as u64 != self.values.bytes() {
@@ -140,7 +141,7 @@ impl StepInputs {
         self.sizes.total()
     }
 
-    /// Number of chunks of modes that each domain sums in the last step; `None` when all are summed.
+    /// Number of chunks of modes that each domain sums in the last step; `None` in a scene without truncation.
     pub fn retained_chunk_counts(&self) -> Option<&[u32]> {
         self.writer.retained_chunk_counts()
     }

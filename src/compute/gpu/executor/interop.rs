@@ -103,7 +103,7 @@ impl RegisteredBuffer {
         &self.buffer
     }
 
-    /// Announces the purpose of the next mapping to the driver, if it differs from the last one.
+    /// Announces the purpose of the next mapping to the driver, if it differs from the last announced purpose.
     fn set_map_flags(&mut self, access: MapAccess) -> Result<()> {
         use sys::CUgraphicsMapResourceFlags_enum as Flags;
         if self.is_mapped.get() {
@@ -132,14 +132,14 @@ impl RegisteredBuffer {
     /// # Errors
     /// `Fault` when the buffer is smaller than expected.
     fn address(&self) -> Result<u64> {
-        let GlBuffer { name, bytes: expected, .. } = self.buffer;
+        let GlBuffer { name, bytes: expected_bytes, .. } = self.buffer;
         let (mut address, mut bytes) = (0, 0);
         // SAFETY: both pointers are live; the driver rejects a resource that is not mapped.
         unsafe { sys::cuGraphicsResourceGetMappedPointer_v2(&mut address, &mut bytes, self.resource) }
             .result()
             .map_err(cuda_error(STAGE))?;
-        if (bytes as u64) < expected {
-            return Err(fault(STAGE, format!("buffer {name}: expected {expected} bytes, got {bytes}")));
+        if (bytes as u64) < expected_bytes {
+            return Err(fault(STAGE, format!("buffer {name}: expected {expected_bytes} bytes, got {bytes}")));
         }
         Ok(address)
     }

@@ -1,5 +1,5 @@
-//! Double buffering of the outputs: chooses the output (an output set of `output`) that a step writes, and records
-//! which domains of an output are outdated. It does not access the device.
+//! Double buffering of the outputs: chooses the output that a step writes, and records which domains of an output are
+//! outdated. An output is one output set of `output`. This module does not access the device.
 //!
 //! While the host copies one output, the next step writes another, so neither waits. The other output shows an older
 //! step. The ring records which domains have changed since then, and the step computes them again together with its own
@@ -81,7 +81,7 @@ impl OutputRing {
         }
     }
 
-    /// Disables the second output, because the device has no memory for it.
+    /// Disables outputs beyond the current one, because the device has no memory for them.
     pub(super) fn forbid_more_outputs(&mut self) {
         self.max_outputs = self.current_output + 1;
     }
@@ -89,7 +89,8 @@ impl OutputRing {
     /// Begins a step of `state`, which writes [`Self::next_output`]. That output is not valid until [`Self::end_step`].
     pub(super) fn begin_step(&mut self, state: &SceneState) -> StepTarget {
         if self.last_step == u32::MAX {
-            // Old step numbers on the device then look new. This causes unnecessary work once, but no wrong result.
+            // After the restart at 0, old step numbers on the device look new. The kernels then compute domains again that did
+            // not change, once, but no result is wrong.
             self.invalidate();
             (self.last_step, self.last_full_step) = (0, 0);
         }
@@ -126,8 +127,8 @@ impl OutputRing {
         self.last_full_step
     }
 
-    /// Ends the submission of a step. Its output then shows it completely. In all other outputs, the domains that it
-    /// changed are outdated, whether the step was full or partial.
+    /// Ends the submission of a step. The output of the step then shows the step completely. In all other outputs, the
+    /// domains that the step changed are outdated, also if the step was full.
     pub(super) fn end_step(&mut self, state: &SceneState) {
         self.serial = Some(state.serial);
         for (index, output) in self.outputs.iter_mut().enumerate() {
@@ -158,7 +159,7 @@ impl OutputRing {
         self.read_count
     }
 
-    /// Records that the host has seen the end of a readback.
+    /// Records that the host knows that a readback has ended.
     pub(super) fn end_read(&mut self, read_id: u64) {
         self.outputs
             .iter_mut()
@@ -178,7 +179,7 @@ mod tests {
     use super::*;
     use crate::gpu::tables::test_scenes::scene;
 
-    /// A state that follows the previous one by these changes.
+    /// A state whose changes since the state with the previous serial number are in `changed`.
     fn state(serial: u64, changed: &[u32]) -> SceneState {
         let mut state = SceneState::rest(&scene(&[(7, 1)]));
         (state.serial, state.dirty_domains) = (serial, DirtyDomains::Some(changed.to_vec()));
@@ -226,6 +227,7 @@ mod tests {
             let target = step(&mut output_ring, &state(serial, &[serial as u32]));
             output_ring.begin_read();
             assert_eq!(target.dirty_domains, Some(previous_changes), "step {serial}");
+            // Step 1 wrote output 0, step 2 output 1, and so on.
             assert_eq!((target.output, target.shown_step), (usize::from(serial % 2 == 0), target.step - 2));
             assert!(target.is_being_read, "expected an unfinished copy");
             previous_changes = vec![serial as u32];
@@ -234,9 +236,11 @@ mod tests {
 
     #[test]
     fn idle_output_collects_changes_until_the_list_is_full() {
+        // A list has at most 10 changes: one change by each of `steps` steps, and one by the step after them.
         for (steps, fits_list) in [(4, true), (9, true), (10, false)] {
             let mut output_ring = OutputRing::new(2, 10);
-            // Make both outputs valid. Then end the readback of one output, so that the next steps write only that one.
+            // Make both outputs valid. Then end the readback of the current output, so that the next steps write only the
+            // current output, and the other output is idle.
             for serial in 1..5 {
                 step(&mut output_ring, &state(serial, &[]));
                 output_ring.begin_read();
@@ -279,6 +283,7 @@ mod tests {
         output_ring.begin_step(&state(6, &[1]));
         output_ring.invalidate();
         assert_eq!(output_ring.shown_output(), None);
+        // The first step in each of the two outputs is full.
         for (serial, is_full) in [(7, true), (8, true), (9, false), (10, false)] {
             let target = step(&mut output_ring, &state(serial, &[1]));
             assert_eq!(target.dirty_domains.is_none(), is_full, "state {serial}");
@@ -290,6 +295,7 @@ mod tests {
     fn nonconsecutive_states_and_step_overflow_need_full_steps() {
         let mut output_ring = OutputRing::new(2, 10);
         step(&mut output_ring, &state(1, &[]));
+        // A serial number that skips one, is repeated, or decreases.
         for serial in [3, 3, 2] {
             assert_eq!(step(&mut output_ring, &state(serial, &[])).dirty_domains, None, "state {serial}");
         }

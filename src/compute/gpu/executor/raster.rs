@@ -1,10 +1,11 @@
-//! The compute rasterizer: launches `kernels/raster.cu`. For each sample of a window it computes the visible triangle
-//! and its depth, or depth alone, by atomic minima.
+//! The compute rasterizer: launches `kernels/raster.cu`. It computes the visible triangle and its depth, or depth alone,
+//! by atomic minima. A pixel has one sample, at its center.
 //!
-//! A thread draws a triangle whose bounding box has few samples. A warp draws a triangle of up to 64 x 64 pixels. A
-//! larger or clipped triangle is divided into tiles, which warps draw. The queues between the kernels have capacity for
-//! every triangle, so they cannot overflow, and their lengths stay on the device. Samples of cut-outs are tested for
-//! alpha before the atomic minimum. The kernels for meshes without cut-outs are compiled without this code.
+//! A thread draws a small triangle, whose bounding box has at most 32 samples. A warp draws a medium triangle, of up to 64
+//! x 64 pixels. A larger or clipped triangle is divided into tiles of 64 x 64 pixels, which warps draw. Medium and large
+//! triangles wait in two queues. Each queue has capacity for every triangle, so it cannot overflow, and its length stays
+//! on the device. Samples of cut-outs are tested for alpha before the atomic minimum. The kernels for meshes without
+//! cut-outs are compiled without this test.
 //!
 //! | file | content |
 //! |---|---|
@@ -35,10 +36,11 @@ use modalcast_model::scene::{CullMode, DrawRange, Viewport};
 
 /// Threads per block.
 const BLOCK_THREADS: u32 = 128;
-/// Blocks per multiprocessor of the kernels that loop over a queue: at most 2048 threads are resident.
+/// Blocks per multiprocessor of the kernels that loop over a queue: 16 x 128 = 2048 threads, the largest number that is
+/// resident.
 const BLOCKS_PER_SM: u32 = 16;
 
-/// Each 32-bit word of an id sample that no triangle covers.
+/// Value of both 32-bit words (depth and triangle) of a sample of the id pass that no triangle covers.
 const EMPTY_SAMPLE: u32 = u32::MAX;
 
 /// Arguments of all kernels; pointers are device addresses. `kernels/raster.cuh` documents the fields.
@@ -66,7 +68,8 @@ struct RasterArgs {
 
 const _: () = assert!(size_of::<RasterArgs>() == 176, "RasterArgs differs from kernels/raster.cuh");
 
-/// Lengths of the queues, and numbers of triangles by `TriangleBin` of the kernels.
+/// Lengths of the queues, and numbers of triangles by `TriangleBin` of `kernels/raster.cuh`: small, medium, large, or the
+/// reason why the triangle is culled.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Pod, Zeroable)]
 struct RasterCounters {
@@ -126,7 +129,7 @@ pub struct RasterPass<'a> {
     pub window: &'a Viewport,
     /// Device address of three f32 per vertex.
     pub positions: u64,
-    /// Device address of one sample per pixel, [`RasterVariant::bytes`].
+    /// Device address of the samples, one per pixel: [`RasterVariant::bytes`] bytes.
     pub target: u64,
 }
 
@@ -134,7 +137,7 @@ pub struct RasterPass<'a> {
 #[derive(Debug)]
 pub struct RasterPipeline {
     triangles: DeviceBuffer,
-    /// Triangles that a warp draws.
+    /// Indices of triangles that a warp draws.
     medium_queue: DeviceBuffer,
     /// Triangles that are divided into tiles.
     large_queue: DeviceBuffer,
@@ -208,12 +211,13 @@ impl RasterPipeline {
         start(&functions.raster_tiles, self.blocks, args)
     }
 
-    /// Number of launches of a pass over these groups.
+    /// Number of kernel launches of a pass over these groups.
     pub fn launches(&self, groups: &[DrawRange]) -> usize {
         let group_launches = |group: &DrawRange| {
             let (opaque_range, cut_out_range) = self.split(*group);
             usize::from(opaque_range.triangles > 0) + usize::from(cut_out_range.triangles > 0)
         };
+        // `raster_warps` and `raster_tiles` are launched once per pass.
         2 + groups.iter().map(group_launches).sum::<usize>()
     }
 
@@ -226,7 +230,8 @@ impl RasterPipeline {
         (DrawRange { triangles: opaque_count, ..group }, cut_outs)
     }
 
-    /// Numbers of triangles of the last pass, indexed by `TriangleBin` of the kernels; zeros unless the variant counts.
+    /// Numbers of triangles of the last pass, indexed by `TriangleBin` of the kernels. Zeros unless
+    /// [`RasterVariant::count_triangles`] is set.
     ///
     /// # Errors
     /// `Fault` when the device fails.
@@ -266,8 +271,10 @@ impl RasterPipeline {
         let variant = pass.functions.variant;
         let clear_word = if variant.depth_only { 1.0_f32.to_bits() } else { EMPTY_SAMPLE };
         let words = variant.bytes(pass.window) / 4;
-        let counters = (self.counters.address(), 0, size_of::<RasterCounters>() as u64 / 4);
-        for (address, word, word_count) in [(pass.target, clear_word, words), counters] {
+        let counter_words = size_of::<RasterCounters>() as u64 / 4;
+        for (address, word, word_count) in
+            [(pass.target, clear_word, words), (self.counters.address(), 0, counter_words)]
+        {
             let stream = device.stream().cu_stream();
             // SAFETY: the counters are one `RasterCounters`, and the caller guarantees the target. The stream orders
             // the writes before their readers.

@@ -6,7 +6,7 @@
 //! step k+1                   [copy in][kernels]      into the other output set
 //! ```
 //! OpenGL's buffers cannot be double-buffered. They are first copied to a back buffer on the device, which takes a
-//! small part of the readback time. The next step may overwrite them after that copy. There is only one device buffer
+//! small part of the readback time. After that copy, the next step may overwrite OpenGL's buffers. There is only one device buffer
 //! for displacements and one for boxes, so their copies are synchronous.
 //!
 //! Streams, events and memory are allocated on the first fetch.
@@ -237,6 +237,7 @@ impl ReadbackPool {
         let mut copy_numbers: Vec<u64> =
             self.slots.iter().filter(|slot| is_free(slot)).map(|slot| slot.copy_number).collect();
         copy_numbers.sort_unstable();
+        // The copy number of the oldest free slot to keep.
         let oldest_kept = copy_numbers.len().checked_sub(MAX_SPARE_SLOTS).map_or(0, |excess| copy_numbers[excess]);
         self.slots.retain(|slot| !is_free(slot) || slot.copy_number >= oldest_kept || !slot.ready.is_complete());
         // Take the slot with the oldest copy, because that copy has most likely ended.

@@ -38,6 +38,7 @@ pub(super) struct StepSlot {
     pub values: StagingBuffer,
     /// Only in a scene that can have partial steps.
     pub change_list: Option<ChangeListBuffer>,
+    /// The bounds that the step reads back, as unsigned integers in the order of the floats (`box_keys`).
     bounds_keys: PinnedBuffer<u32>,
     /// End of the last step.
     pub done: CudaEvent,
@@ -49,7 +50,7 @@ pub(super) struct StepSlot {
 }
 
 impl StepSlot {
-    /// If `is_timed` is set, the device measures the time of steps from the completion of the map.
+    /// If `is_timed` is set, the device measures the time of a step from the moment when OpenGL's buffers are mapped.
     pub(super) fn new(device: &Device, kernels: &StepKernels, inputs: &StepInputs, is_timed: bool) -> Result<Self> {
         let values = inputs.allocate_staging(device)?;
         let change_list = kernels.apply.as_ref().map(|apply| apply.allocate_list(device)).transpose()?;
@@ -74,8 +75,9 @@ impl StepSlot {
         }
     }
 
-    /// Time of a step that has ended, in milliseconds, without the wait for frames; `None` if steps are not timed. Host
-    /// work after the map counts only while the device waits for it.
+    /// Time of a step that has ended, in milliseconds, without the wait for frames in flight; `None` if steps are not
+    /// timed. It is the host's time before the map plus the device's time after the map. The host's work after the map
+    /// counts only as far as the device waits for it.
     pub(super) fn device_ms(&self) -> Result<Option<f64>> {
         let Some(mapped_event) = &self.mapped_event else { return Ok(None) };
         let ms = mapped_event.elapsed_ms(&self.done).map_err(cuda_error("deform"))?;

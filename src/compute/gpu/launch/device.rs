@@ -10,11 +10,11 @@ use super::context::CurrentContext;
 use super::error::cuda_error;
 use modalcast_model::error::{Error, Result};
 
-/// Minimum CUDA driver version, as cuDriverGetVersion counts (12.0).
+/// Minimum CUDA version of the driver, 12.0, in the encoding of cuDriverGetVersion: 1000 major + 10 minor.
 const MIN_DRIVER_VERSION: i32 = 12_000;
 
-/// A CUDA device. One stream orders all work. Only the readback of vertices has a stream of its own, which events
-/// order.
+/// A CUDA device. One stream orders all work, except readbacks of vertices. They have a second stream, and events order
+/// the work of the two streams.
 #[derive(Debug)]
 pub struct Device {
     context: Arc<CudaContext>,
@@ -44,8 +44,8 @@ impl Device {
 
     fn with_context(ordinal: usize) -> Result<Arc<Self>, DriverError> {
         let context = CudaContext::new(ordinal)?;
-        // SAFETY: event tracking orders accesses from several streams. It is not needed: the stream below orders all
-        // work, and `readback` orders the copies of its second stream by its own events.
+        // SAFETY: event tracking orders the accesses of several streams. It is not needed: the stream below orders all work
+        // but readbacks, and the module `readback` orders the copies of its own stream by its own events.
         unsafe { context.disable_event_tracking() };
         let stream = context.new_stream()?;
         let name = context.name()?;
@@ -141,7 +141,7 @@ fn no_device(ordinal: usize, reason: &str) -> Error {
     Error::Unavailable { what: "CUDA device", reason: format!("device {ordinal}: {reason}"), remedy: remedy.into() }
 }
 
-/// The CUDA version of the driver, as cuDriverGetVersion counts: 13000 is 13.0.
+/// The CUDA version of the driver in the encoding of cuDriverGetVersion: 13000 is 13.0.
 ///
 /// # Errors
 /// `Unavailable` when there is no driver or it does not start.

@@ -10,7 +10,7 @@ use super::device::Device;
 use super::error::cuda_error;
 use modalcast_model::error::Result;
 
-/// First compute capability with programmatic dependent launch.
+/// First compute capability with programmatic dependent launch (PDL).
 const MIN_PDL_CAPABILITY: (i32, i32) = (9, 0);
 
 /// A kernel source file and the macros that enable its optional features.
@@ -25,13 +25,17 @@ pub(crate) struct KernelSource {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum KernelKind {
-    /// Full steps only: domains that share a U, which is read once per group. Only in scenes with such domains.
+    /// Full steps only: computes domains that share a U in groups, and reads U once per group. Only in scenes with such
+    /// domains.
     Batch,
+    /// Positions of all domains that `Batch` does not compute, and rigid normals.
     Deform,
+    /// Bounding box of all positions.
     Bounds,
     /// Normals that follow the surface.
     Normals,
-    /// Partial steps only, before all other launches. Only in scenes that can have partial steps.
+    /// Partial steps only, before all other launches: copies the changed values. Only in scenes that can have partial
+    /// steps.
     Apply,
 }
 

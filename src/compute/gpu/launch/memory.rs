@@ -64,7 +64,7 @@ impl DeviceBuffer {
     /// `Fault` when the range exceeds the buffer, or when the device fails.
     pub fn read<T: Pod>(&self, device: &Device, byte_offset: u64, target: &mut [T]) -> Result<()> {
         self.checked_range(byte_offset, size_of_val(target) as u64)?;
-        // SAFETY: `checked_range` verified that the buffer has so many bytes from `byte_offset` on.
+        // SAFETY: `checked_range` verified that the buffer has the bytes of `target` from `byte_offset` on.
         unsafe { download(device, self.address() + byte_offset, target) }
     }
 

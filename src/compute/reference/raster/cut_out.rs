@@ -1,10 +1,10 @@
 //! The alpha test of cut-outs for one sample. It defines the result of `kernels/cut_out.cuh`.
 //!
-//! The texture coordinates of a sample are weighted sums of those of the corners. The weights are the edge functions of
+//! The texture coordinates of a sample are a weighted sum of the texture coordinates of the corners. The weights are the edge functions of
 //! the corners in homogeneous coordinates (Olano and Greer, "Triangle scan conversion using 2D homogeneous
-//! coordinates", 1997), which are perspective-correct without clipping, also for corners behind the eye. First, the
+//! coordinates", 1997). They are perspective-correct without clipping, also for corners behind the eye. First, the
 //! position of the sample is subtracted from the corners, which avoids cancellation for small triangles far from the
-//! center. All numbers are f32; each sum and product is rounded separately, in the order of the kernel. The image is
+//! center of the window. All numbers are f32; each sum and product is rounded separately, in the order of the kernel. The image is
 //! then filtered trilinearly. The hardware filters with lower precision, and anisotropically if requested.
 
 use modalcast_model::raster::{AlphaImage, CutOuts};
@@ -31,7 +31,7 @@ pub fn footprint(
     let x = corners.map(|[x, _, _, w]| x - sample[0] * w);
     let y = corners.map(|[_, y, _, w]| y - sample[1] * w);
     let w = corners.map(|[.., w]| w);
-    // The cross product of two lists of one number per corner.
+    // The cross product of two vectors that have one component per corner.
     let cross = |a: &[f32; 3], b: &[f32; 3]| {
         [0, 1, 2].map(|index| {
             let (j, k) = ((index + 1) % 3, (index + 2) % 3);
@@ -45,8 +45,9 @@ pub fn footprint(
     let weight_scale = 1.0 / (weights[0] + weights[1] + weights[2]);
     let sum = |terms: [f32; 3]| terms[0] + terms[1] + terms[2];
     let uv = [0, 1].map(|axis| sum([0, 1, 2].map(|index| weights[index] * uvs[index][axis])) * weight_scale);
-    // Derivatives of the weights, times the differences between the texture coordinates of the corners and the sample.
-    // y of the sample decreases with the row, which cancels the minus sign of the derivatives by y.
+    // Sums the derivative of each corner's weight, times the difference between the texture coordinates of the corner and
+    // of the sample. The y of the sample decreases as its row increases, which cancels the minus sign of the derivatives
+    // by y.
     let uv_derivative = |weight_derivatives: [f32; 3], pixel_step: f32| {
         [0, 1].map(|axis| {
             let terms = [0, 1, 2].map(|index| weight_derivatives[index] * (uvs[index][axis] - uv[axis]));

@@ -5,7 +5,8 @@ use modalcast_model::error::{Result, invalid};
 use modalcast_model::raster::{AlphaImage, CutOuts};
 use modalcast_model::scene::DrawRange;
 
-/// Exclusive limit of the number of triangles: a counter has 24 bits for queue entries and 40 bits for tiles.
+/// Exclusive limit of the number of triangles. The 64-bit counter of the large queue has 24 bits for triangles and 40 bits
+/// for their tiles.
 const MAX_TRIANGLES: usize = 1 << 24;
 
 /// Rejects meshes that would cause out-of-bounds reads or queue overflows. Groups must not overlap, because a triangle
@@ -84,6 +85,7 @@ mod tests {
 
     #[test]
     fn cut_outs_with_invalid_indices_or_sizes_are_rejected() {
+        // A valid mesh has four triangles: triangles 2 and 3 are cut-outs.
         let image = AlphaImage { width: 3, height: 2, levels: vec![vec![0; 6], vec![0; 1]] };
         let valid = CutOuts {
             first: 2,

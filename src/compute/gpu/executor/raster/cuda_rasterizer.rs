@@ -114,7 +114,7 @@ impl CudaRasterizer {
     }
 
     /// Draws the depth pass, the id pass or both, with all buffers mapped together.
-    fn draw_windows(&mut self, depth: Option<DrawTarget<'_>>, ids: Option<DrawTarget<'_>>) -> Result<()> {
+    fn draw_passes(&mut self, depth: Option<DrawTarget<'_>>, ids: Option<DrawTarget<'_>>) -> Result<()> {
         let Self { positions, depth: depth_pass, ids: id_pass, interop, pipeline, device } = self;
         let _current = device.enter()?;
         let mut prepared = Vec::new();
@@ -128,7 +128,7 @@ impl CudaRasterizer {
             }
             prepared.push((window, pass_state.prepare(device, interop, pipeline, target)?));
         }
-        // Not `WriteDiscard`: the kernels read the samples that they wrote.
+        // Targets are mapped as `ReadWrite`, not `WriteDiscard`, because the atomic minima also read samples.
         let mut mappings = vec![Mapping { buffer: positions, access: MapAccess::Read }];
         let mut passes = Vec::new();
         for (window, PreparedPass { functions, groups, target }) in prepared {
@@ -151,7 +151,7 @@ impl CudaRasterizer {
 impl Rasterizer for CudaRasterizer {
     /// Draws the requested passes. After a failure the targets are unregistered.
     fn draw(&mut self, depth: Option<DrawTarget<'_>>, ids: Option<DrawTarget<'_>>) -> Result<()> {
-        let result = if depth.is_some() || ids.is_some() { self.draw_windows(depth, ids) } else { Ok(()) };
+        let result = if depth.is_some() || ids.is_some() { self.draw_passes(depth, ids) } else { Ok(()) };
         if result.is_err() {
             self.depth.release(&self.device);
             self.ids.release(&self.device);

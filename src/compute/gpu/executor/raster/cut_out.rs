@@ -15,7 +15,7 @@ use modalcast_model::raster::{AlphaImage, CutOuts};
 /// Maximum anisotropy that the hardware supports.
 const MAX_ANISOTROPY: f32 = 16.0;
 
-/// An entry of the material table. `image` is a texture object, 0 without an image.
+/// An entry of the material table on the device. `image` is the handle of a texture object, or 0 without an image.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Pod, Zeroable)]
 struct AlphaMaterial {
@@ -79,7 +79,7 @@ impl CutOutBuffers {
     }
 }
 
-/// An image as a texture. Dropping it waits for the work on the stream, which may read it.
+/// An image as a texture. Dropping it waits for the work on the stream, because that work may read the texture.
 #[derive(Debug)]
 struct AlphaTexture {
     /// 0 until the texture is created.

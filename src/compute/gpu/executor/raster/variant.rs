@@ -47,6 +47,7 @@ impl RasterVariant {
         }
         let granularity: &[&str] = match self.granularity {
             RasterGranularity::BySize => &[],
+            // 0 samples: no triangle is small. An extent of -1: no triangle is medium either.
             RasterGranularity::Warps => &["MAX_THREAD_SAMPLES=0"],
             RasterGranularity::Tiles => &["MAX_THREAD_SAMPLES=0", "MAX_WARP_EXTENT=-1"],
         };
@@ -65,10 +66,10 @@ mod tests {
     use super::*;
     use crate::testing::{CAPABILITIES, assert_compiles};
 
-    /// Variants that the server compiles.
+    /// Lists of macros that the server compiles.
     const SERVER_WITHOUT_CUT_OUTS: &[&[&str]] = &[&[], &["DEPTH_ONLY"]];
     const SERVER_WITH_CUT_OUTS: &[&[&str]] = &[&["CUT_OUTS"], &["DEPTH_ONLY", "CUT_OUTS"]];
-    /// Variants that only the benchmarks compile.
+    /// Lists of macros that only the benchmarks compile.
     const BENCHMARK_WITHOUT_CUT_OUTS: &[&[&str]] = &[
         &["COUNT_TRIANGLES"],
         &["DEPTH_ONLY", "COUNT_TRIANGLES"],
@@ -77,7 +78,6 @@ mod tests {
         &["COUNT_TRIANGLES", "MAX_THREAD_SAMPLES=0"],
         &["COUNT_TRIANGLES", "MAX_THREAD_SAMPLES=0", "MAX_WARP_EXTENT=-1"],
     ];
-
     const BENCHMARK_WITH_CUT_OUTS: &[&[&str]] = &[
         &["CUT_OUTS", "COUNT_TRIANGLES"],
         &["DEPTH_ONLY", "CUT_OUTS", "COUNT_TRIANGLES"],
@@ -93,6 +93,7 @@ mod tests {
             for count_triangles in [false, true] {
                 for granularity in [RasterGranularity::BySize, RasterGranularity::Warps, RasterGranularity::Tiles] {
                     let variant = RasterVariant { depth_only, count_triangles, granularity };
+                    // `depth_only` ignores the granularity.
                     let is_used_by_server =
                         !count_triangles && (depth_only || granularity == RasterGranularity::BySize);
                     for (has_cut_outs, server_variants, benchmark_variants) in [

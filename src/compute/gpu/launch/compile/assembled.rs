@@ -28,7 +28,7 @@ impl CompiledVariant {
 }
 
 fn spill_bytes(log: &str) -> usize {
-    // The last word of each text but the last is a number of bytes.
+    // Each text but the last one ends with a number of bytes.
     let texts: Vec<&str> = log.split(" bytes spill stores").collect();
     assert!(texts.len() > 1, "expected a report of spills, got: {log}");
     let last_number = |text: &&str| text.rsplit(' ').next().and_then(|word| word.parse::<usize>().ok());
