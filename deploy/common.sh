@@ -6,7 +6,8 @@ fail() { printf 'modalcast: %s\n' "$*" >&2; exit 1; }
 # No `grep -q`: it closes the pipe at the first match, and pipefail reports the broken pipe of ldconfig as a failure.
 has_library() { /sbin/ldconfig -p 2>/dev/null | grep -F "$1" >/dev/null; }
 
-# Installs Debian packages. Fails with their names if the user is not root or the system has no apt-get.
+# Installs the given Debian packages that are missing. Fails with their names if the user is not root or the system has
+# no apt-get.
 require_packages() {
     local missing=()
     for package in "$@"; do
@@ -38,8 +39,8 @@ require_rust() {
     command -v cc >/dev/null || require_packages gcc libc6-dev
 }
 
-# Installs EGL. NVIDIA's driver includes its vendor library. Without that driver, installs Mesa's, which renders on the
-# CPU.
+# Installs EGL and a vendor library of EGL. NVIDIA's driver includes one. Without that driver, installs Mesa's library,
+# which renders on the CPU.
 require_egl() {
     has_library 'libEGL.so.1' || require_packages libegl1
     has_library 'libEGL_nvidia.so.0' && return 0

@@ -118,7 +118,7 @@ pub(crate) fn check_scene_without_modes<D: Deformer>(create_deformer: impl Fn(&A
     assert_eq!(find_wrong_box(&scene, &result), None);
 }
 
-/// A read of some attributes returns their values in the last step. All attributes can be read afterwards.
+/// A read of some attributes returns their values in the last step. A read of all attributes succeeds afterwards.
 pub(crate) fn check_separate_reads<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) {
     let has_many_domains = false;
     let scene = create_scene(with_displacements_and_boxes(DeformationSettings::default()), has_many_domains);
@@ -140,7 +140,7 @@ pub(crate) fn check_separate_reads<D: Deformer>(create_deformer: impl Fn(&Arc<Sc
         let expected = run_step(&mut create_deformer(&scene), &state);
         deformer.deform(&state).expect("expected the step to succeed");
         let actual = deformer.surface_with(requested).expect("expected a surface").clone();
-        // The comparison with the previous step excludes a read that returns old values.
+        // The values must also differ from those of the previous step, so that a read of old values fails.
         let [new_surface, old_surface] = [&expected.surface, &previous.surface];
         if requested.boxes {
             assert!(actual.boxes == new_surface.boxes && new_surface.boxes != old_surface.boxes, "step {step}");

@@ -69,7 +69,7 @@ pub(crate) fn alpha_image(width: u32, height: u32, mut texel: impl FnMut(u32, u3
 /// so that the result does not depend on the texture filter.
 pub(crate) fn uniform_cut_out_soups() -> Vec<CutOutSoup> {
     let mut random = Random(21);
-    // Image 0 is transparent, image 1 is opaque.
+    // Image 0 is transparent, image 1 is opaque. A cutoff of NaN discards every sample.
     let material = |alpha, cutoff, image| AlphaMaterial { alpha, cutoff, image };
     let materials = vec![
         material(1.0, 0.5, Some(0)),

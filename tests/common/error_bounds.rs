@@ -135,6 +135,7 @@ fn error_bounds_reject_wrong_and_non_finite_vertices() {
     let scene = super::scene_of_shapes(shapes, 1, Default::default(), normal_maps);
     let state = crate::scenes::random_state(&scene, 2);
     let positions: Vec<f32> = reference::deform(&scene, &state).as_flattened().iter().map(|x| *x as f32).collect();
+    // `[0; 0]` is the empty list.
     assert_eq!(domains_beyond_bound(&scene, &state, &positions, 0.0), [0; 0]);
     // Vertices 0 to 129 belong to domain 0. Its second tile begins at vertex 128. Vertices from 130 on belong to domain
     // 1.

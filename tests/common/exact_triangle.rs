@@ -19,10 +19,10 @@ pub(crate) struct ExactTriangle {
 }
 
 impl ExactTriangle {
-    /// `clip` maps scene to clip coordinates; `size` is the width and height of the viewport in pixels.
-    pub(crate) fn new(clip: &Matrix4<f64>, size: [u32; 2], corners: [[f32; 3]; 3]) -> Self {
-        let clip_corners =
-            corners.map(|corner| clip * Vector4::new(corner[0].into(), corner[1].into(), corner[2].into(), 1.0));
+    /// `size` is the width and height of the viewport in pixels.
+    pub(crate) fn new(clip_from_scene: &Matrix4<f64>, size: [u32; 2], corners: [[f32; 3]; 3]) -> Self {
+        let clip_corners = corners
+            .map(|corner| clip_from_scene * Vector4::new(corner[0].into(), corner[1].into(), corner[2].into(), 1.0));
         let [half_width, half_height] = size.map(|side| 0.5 * f64::from(side));
         let [a, b, c] = clip_corners.map(|v| Vector3::new(half_width * (v.x + v.w), half_height * (v.w - v.y), v.w));
         let component_of_corners =
@@ -50,6 +50,7 @@ impl ExactTriangle {
 
     /// Depth at a sample, from 0 (near) to 1 (far).
     pub(crate) fn depth(&self, sample: Vector3<f64>) -> f64 {
+        // The edge values are the homogeneous weights of the corners times a common factor, which the quotient removes.
         let edge_values = Vector3::from(self.edges.map(|edge| edge.dot(&sample)));
         0.5 * edge_values.dot(&self.depths) / edge_values.dot(&self.weights) + 0.5
     }

@@ -194,7 +194,8 @@ fn has_moved(scene: &Scene, domain: u32, [previous, current]: [&StepResult; 2]) 
     positions(previous) != positions(current)
 }
 
-/// A step that sets the transform of a domain to an f64 translation.
+/// A step that sets the transform of a domain to an f64 translation: the quaternion of the identity as four f32, then
+/// the translation as three f64.
 fn far_step(domain: u32, translation: [f64; 3]) -> RawStepUpdate {
     let rotation = [0.0_f32, 0.0, 0.0, 1.0].into_iter().flat_map(f32::to_le_bytes);
     let bytes: Vec<u8> = rotation.chain(translation.into_iter().flat_map(f64::to_le_bytes)).collect();
@@ -223,7 +224,7 @@ pub(crate) fn check_far_followers<D: Deformer>(create_deformer: impl Fn(&Arc<Sce
     assert_eq!((scene.transform_roots.root_of(1), state.transforms.len()), (0, 2));
     let result = run_step(&mut create_deformer(&scene), &state);
     let (layout, origin) = (scene.layout.domains[1], state.origin_of(scene.transform_roots.root_of(1)));
-    // The second error is that of world positions rounded to f32.
+    // `max_f32_error` is the error that world positions in f32 would have.
     let [mut max_error, mut max_f32_error] = [0.0_f64; 2];
     for (vertex, rest_position) in scene.shape_of(1).mesh.rest_positions().iter().enumerate() {
         let position_in_root = frame.to_matrix().transform_point(&nalgebra::Point3::from(*rest_position).cast());

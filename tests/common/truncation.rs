@@ -12,9 +12,9 @@ use crate::scenes::{self, Random};
 /// Truncation budget in meters. The scenes of this file have a unit of one meter.
 const BUDGET: f64 = 0.02;
 
-/// Deforms twenty random states; each changes two domains. Errors are within the rounding bound plus the truncation
-/// bound, and the truncation bound is within the budget. `truncation_bound` returns the largest error that the
-/// truncated modes of the last step can cause, in scene units.
+/// Deforms twenty random states, each of which changes two domains. Errors are within the rounding bound plus the
+/// truncation bound, and the truncation bound is within the budget. `truncation_bound` returns the largest error that
+/// the truncated modes of the last step can cause, in scene units.
 pub(crate) fn check_error_budget<D: Deformer>(
     create_deformer: impl Fn(&Arc<Scene>) -> D,
     truncation_bound: impl Fn(&D, &Scene) -> f64,

@@ -1,4 +1,4 @@
-//! Comparisons with the f64 reference. A NaN always fails.
+//! Comparisons with the f64 reference. A comparison with a NaN always fails.
 
 use modalcast_compute::gpu::CudaDeformer;
 use modalcast_compute::reference::{rigid_normals, rigid_tangents};
@@ -7,7 +7,7 @@ use modalcast_model::scene::{BoundingBox, Scene, SceneState};
 
 /// Largest accepted error of a position, relative to the scene's diagonal.
 pub(crate) const MAX_POSITION_ERROR: f64 = 1e-5;
-/// Largest accepted error of a component of a unit vector.
+/// Largest accepted error of a component of a unit vector: a normal or a tangent.
 pub(crate) const MAX_DIRECTION_ERROR: f64 = 1e-5;
 
 /// The largest absolute error, or a description of the first number whose error exceeds `limit`.
@@ -41,7 +41,7 @@ pub(crate) fn assert_equals_reference(
     let reference_positions = modalcast_compute::reference::deform(scene, state);
     let mut bounds = BoundingBox::EMPTY;
     reference_positions.iter().for_each(|position| bounds.include(*position));
-    // At least the smallest normal f32, so that a scene of one point has a tolerance.
+    // At least the smallest normal f32, so that the tolerance of a scene of one point is not 0.
     let diagonal = bounds.diagonal().max(f64::from(f32::MIN_POSITIVE));
     let position_error = max_error(&surface.positions, &reference_positions, MAX_POSITION_ERROR * diagonal)
         .unwrap_or_else(|error| panic!("{name}: {error}"));

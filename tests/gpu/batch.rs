@@ -1,4 +1,5 @@
-//! Batches: domains of one shape for which a kernel reads U once. Each domain has the bits that it has without batches.
+//! A batch is a group of domains of one shape, for which the kernel `batch` reads U once. Its results have the same
+//! bits as those of the kernel `deform`, which reads U once per domain.
 
 use std::sync::Arc;
 
@@ -24,7 +25,8 @@ fn build_scene(parts: SceneParts) -> Arc<Scene> {
     Scene::new(parts).expect("expected a valid scene")
 }
 
-/// Deforms three states of a scene with batches and without, and returns the number of states with a differing bit.
+/// Deforms three states of a scene with batches and without, and returns the number of states whose results differ in a
+/// bit.
 fn count_differing_states(name: &str, scene: &Arc<Scene>) -> usize {
     let [mut batched_deformer, mut separate_deformer] = batched_and_separate(scene);
     assert!(batched_deformer.plan().kernel(KernelKind::Batch).is_some(), "{name}: expected a batch kernel");
@@ -48,7 +50,7 @@ fn count_differing_states(name: &str, scene: &Arc<Scene>) -> usize {
     differing_states
 }
 
-/// Shapes of several sizes and ranks, with several numbers of instances, for every storage type.
+/// Each case has one shape of so many vertices and modes, and so many domains of this shape.
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_batches_have_the_bits_of_separate_domains() {
@@ -75,7 +77,8 @@ fn gpu_batches_have_the_bits_of_separate_domains() {
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_multi_tile_blocks_have_the_bits_of_separate_domains() {
-    // More than 8,192 tiles, so that a block computes two or three of them. The last tile is partly filled.
+    // More than 8,192 tiles of 128 vertices. `batch` has about 4,096 blocks, so a block computes two or three tiles.
+    // The last tile is partly filled.
     for (storage, vertices) in
         [(StorageType::F32, 1_100_007), (StorageType::Int8, 1_100_007), (StorageType::F16, 1_600_001)]
     {
@@ -87,7 +90,8 @@ fn gpu_multi_tile_blocks_have_the_bits_of_separate_domains() {
             .kernel(KernelKind::Batch)
             .expect("expected a batch kernel")
             .blocks as usize;
-        assert!(2 * blocks <= vertices.div_ceil(QUAD * TILE_QUADS) + 1, "{name}: {blocks} blocks");
+        let tiles = vertices.div_ceil(QUAD * TILE_QUADS);
+        assert!(2 * blocks <= tiles + 1, "{name}: expected at most one block per two tiles, got {blocks} blocks");
         assert_eq!(count_differing_states(&name, &scene), 0, "{name}");
     }
 }
@@ -138,7 +142,8 @@ fn gpu_batches_repair_intermediate_overflow() {
         let scene = build_scene(instanced_parts(vertices, 5, 6, deformation));
         let [mut batched_deformer, mut separate_deformer] = batched_and_separate(&scene);
         let mut state = scenes::random_state(&scene, 4);
-        // The sum of domain 1 overflows. The products of domain 3 overflow in f32, although their sum may be finite.
+        // A domain has five coordinates. The sum of domain 1 overflows. The products of domain 3 overflow in f32,
+        // although their sum may be finite.
         state.q[5..10].fill(f32::MAX);
         state.transforms[3] = Transform([2e38, 2e38, -2e38, 0.0, 3e38, -3e38, 3e38, 0.0, 1e38, 1e38, 1e38, 0.0]);
         state.q[15..20].fill(3.0);

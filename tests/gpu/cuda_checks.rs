@@ -11,6 +11,7 @@ use crate::common::{
 use crate::reference_comparison::{cuda_deformer, cuda_deformer_with_batches};
 use crate::scenes::{self, Random};
 
+/// The error bound of the truncated modes, as `check_error_budget` requests it.
 fn truncation_bound(deformer: &CudaDeformer, _: &Scene) -> f64 {
     deformer.truncation_bound()
 }
@@ -212,7 +213,8 @@ fn gpu_overflowing_frame_products_keep_finite_vertices() {
     followers::check_overflowing_frame_products(cuda_deformer);
 }
 
-/// A step copies a thousand transforms instead of two hundred thousand, and the leaves follow their branches.
+/// A step copies the transforms of a thousand branches, not of two hundred thousand leaves, and the leaves follow their
+/// branches.
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_two_hundred_thousand_leaves_follow_their_branches() {
@@ -224,6 +226,7 @@ fn gpu_two_hundred_thousand_leaves_follow_their_branches() {
     ];
     let mut parts = scenes::parts_of_shapes(shapes);
     parts.rigid_transforms = true;
+    // Domains 0 to 999 are branches. The leaves follow them in turn, so a branch has 200 leaves.
     for index in 0..201_000 {
         let parent = index % 1000;
         let frame = random.next_similarity(index % 5 == 0);
@@ -266,5 +269,9 @@ fn gpu_two_hundred_thousand_leaves_follow_their_branches() {
         result.surface.positions[range.clone()] != partial_result.surface.positions[range]
     };
     let moved_domains = (0..scene.domains.len()).filter(|domain| has_moved(*domain)).count();
-    assert_eq!(moved_domains, 2 * 201 + 1, "expected two branches with 200 leaves each, and one deformed branch");
+    assert_eq!(
+        moved_domains,
+        2 * 201 + 1,
+        "expected branches 3 and 999 with 200 leaves each to move, and branch 7 to deform"
+    );
 }

@@ -17,7 +17,7 @@ fn gpu_vertices_with_zero_rows_do_not_move() {
     let shape = scenes::random_shape(&mut random, 700, 9);
     let mut entries = shape.modes.columns().to_vec();
     for (index, entry) in entries.iter_mut().enumerate() {
-        // U has 2100 rows, three per vertex.
+        // `columns` are the columns of U one after another, of 2100 rows each, three per vertex.
         let vertex = index % 2100 / 3;
         // Every third vertex has zero rows, with zeros of both signs.
         if vertex.is_multiple_of(3) {
@@ -36,6 +36,7 @@ fn gpu_vertices_with_zero_rows_do_not_move() {
     state.q.fill(0.0);
     deformer.deform(&state).expect("expected the step to succeed");
     let rest = &deformer.surface().expect("expected a surface").positions;
+    // Both domains have 700 vertices.
     for vertex in 0..1400 {
         let position = |positions: &[f32]| positions[3 * vertex..][..3].to_vec();
         let is_unmoved = have_equal_bits(&position(&deformed), &position(rest));

@@ -1,4 +1,4 @@
-//! OpenGL buffers of a surfaceless context on the CUDA device.
+//! OpenGL buffers for tests, in the context of a renderer on the CUDA device.
 
 use std::any::Any;
 use std::num::NonZeroU32;

@@ -1,4 +1,5 @@
-//! CUDA writes vertices into OpenGL buffers: vertices and images equal those of copied buffers.
+//! CUDA writes vertices into buffers that it shares with OpenGL. Vertices and images equal those of a deformer with
+//! buffers of its own, whose vertices are copied to OpenGL.
 
 use std::sync::Arc;
 

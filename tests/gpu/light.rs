@@ -42,7 +42,8 @@ fn gpu_light_bounds_equal_those_of_tile_boxes() {
                 &deformer.surface().expect("expected a surface").positions,
             );
             let expected = bounds_in_light_space(&scene, positions, TILE_VERTICES);
-            // A bound is a sum of three products in f32, each rounded by at most 2^-23 = 1.2e-7.
+            // A bound is a sum of three products in f32, each with a relative error of at most 2^-23 = 1.2e-7.
+            // `missing` is how far the expected bounds reach beyond the bounds of the device, `excess` the reverse.
             let tolerance = 4e-7 * coordinate_magnitude(&summary.bounds);
             let (missing, excess) = (max_excess(&got, &expected), max_excess(&expected, &got));
             assert!(missing <= 0.0 && excess <= tolerance, "n {vertices}: expected {expected:?}, got {got:?}");

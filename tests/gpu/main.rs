@@ -1,6 +1,6 @@
 //! Tests of the CUDA deformer and the CUDA rasterizer. They are ignored by default because they need a GPU; run them
-//! with `--include-ignored --test-threads=1`. The binary needs no build tree. Real inputs are read from the folder
-//! MODALCAST_DATA.
+//! with `--include-ignored --test-threads=1`. The test binary also runs on a machine without the source tree. It reads
+//! real inputs from the folder MODALCAST_DATA.
 
 mod accuracy;
 mod batch;

@@ -1,4 +1,4 @@
-//! Readbacks that overlap later steps contain the bits of their own step.
+//! Readbacks that run while later steps are computed return the bits of their own step.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -52,7 +52,7 @@ fn random_domains(scene: &Scene, random: &mut Random) -> Vec<u32> {
     (0..scene.domains.len() as u32).filter(|_| random.next_number().abs() < probability).collect()
 }
 
-/// A sequence of states with random dirty domains; every 17th marks every domain dirty.
+/// A sequence of states with random dirty domains. In every 17th state, all domains are dirty.
 fn states(scene: &Scene) -> Vec<SceneState> {
     let mut random = Random(71);
     let mut state = scenes::random_state(scene, 72);
@@ -60,7 +60,7 @@ fn states(scene: &Scene) -> Vec<SceneState> {
         let (q_domains, mut transform_domains) =
             (random_domains(scene, &mut random), random_domains(scene, &mut random));
         if scene.features.followers {
-            // A root also moves its followers, so two roots already change many domains.
+            // Domains 0 to 19 are the roots. A root also moves its followers, so two roots already change many domains.
             transform_domains.retain(|domain| *domain < 20);
             transform_domains.truncate(2);
         }
@@ -139,7 +139,7 @@ fn deformations() -> Vec<DeformationSettings> {
     ]
 }
 
-/// Scenes of all deformations, some of them also with followers.
+/// A scene without followers for each of [`deformations`], and three scenes with followers.
 fn all_scenes() -> Vec<Arc<Scene>> {
     let exact = DeformationSettings { normals: NormalMethod::Exact, ..DeformationSettings::default() };
     let follower_scenes =

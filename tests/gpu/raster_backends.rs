@@ -83,7 +83,8 @@ fn draw_still(scene: &Arc<Scene>, state: &SceneState, backend: RasterBackend) ->
             |mesh: RasterGeometry| Ok(Box::new(CudaRasterizer::new(&device, mesh)?) as Box<dyn Rasterizer>);
         renderer.attach_rasterizer(&mut buffers, create_rasterizer).expect("expected a rasterizer");
     }
-    // The near plane is far enough away that depth precision separates the surfaces.
+    // Depths from 1 to 40 scene units: with a closer near plane, the precision of depth would not separate the
+    // surfaces.
     let camera = Camera { near: 1.0, far: 40.0, ..Camera::fit_to_scene(scene, SIZE[0], SIZE[1]) };
     let params = FrameParams {
         camera,
@@ -110,7 +111,7 @@ fn draw_still(scene: &Arc<Scene>, state: &SceneState, backend: RasterBackend) ->
     StillImage { image, visible_triangles, exact_triangles }
 }
 
-/// Random intersecting triangles in a random state, and the built-in tree with cut-out leaves at rest.
+/// A soup (random intersecting triangles) in a random state, and the built-in tree with cut-out leaves at rest.
 fn scenes_and_states() -> [(&'static str, Arc<Scene>, SceneState); 2] {
     let soup = scenes::random_scene(
         &[(3000, 12), (50, 0), (700, 3)],
@@ -121,6 +122,7 @@ fn scenes_and_states() -> [(&'static str, Arc<Scene>, SceneState); 2] {
     [("soup", soup, random_state), ("tree", tree, rest_state)]
 }
 
+/// The same scene with this shadow, without ground and with one sample per pixel.
 fn with_shadow(scene: &Scene, shadow: Option<ShadowSettings>) -> Arc<Scene> {
     let look = RenderSettings { shadow, ground: None, antialias: Antialiasing::None, ..scene.look };
     Scene::new(SceneParts { look, ..scene.parts() }).expect("expected a valid scene")
@@ -182,6 +184,7 @@ fn gpu_shading_of_equal_ids_equals_opengl() {
                 "{name}, {:?}: {different_count} pixels with equal ids have different colors",
                 shadow.map(|shadow| shadow.size)
             );
+            // 0.2 % of the pixels.
             let limit = got.visible_triangles.len() / 500;
             assert!(
                 different_count <= limit,
@@ -283,6 +286,7 @@ fn gpu_ground_hides_geometry_below_with_both_rasterizers() {
     );
     let uncovered = count_uncovered(&want);
     assert!(uncovered > 20_000, "expected more than 20,000 pixels of ground or sky, got {uncovered}");
+    // 0.05 % of the pixels.
     let limit = got.visible_triangles.len() / 2000;
     assert!(different_count < limit, "expected fewer than {limit} different pixels, got {different_count}");
 }
@@ -318,7 +322,7 @@ fn gpu_resized_cuda_frames_equal_a_fresh_renderer() {
     context.unload_scene(loaded_scene);
 }
 
-/// `RasterPolicy::Fastest` measures which rasterizer is faster.
+/// `RasterPolicy::Fastest` measures both rasterizers and uses the faster one.
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_fastest_rasterizer_draws_frames_of_every_size() {

@@ -49,7 +49,7 @@ fn soup_geometry(positions: GlBuffer, soup: &Soup, cut_outs: Option<CutOuts>) ->
     RasterGeometry { positions, triangles: soup.triangles.clone(), groups: soup.groups.clone(), cut_outs }
 }
 
-/// The bits of the reference depths of all triangles with both faces, as in a depth-only pass.
+/// The bits of the depths that the reference rasterizer draws without culling, as in a depth-only pass.
 fn two_sided_depths(soup: &Soup, cut_outs: Option<&CutOuts>) -> Vec<u32> {
     let mut rasterizer = VisibilityBuffer::new(soup.viewport);
     let all_triangles = DrawRange { first: 0, triangles: soup.triangles.len() as u32, cull_mode: CullMode::None };
@@ -74,6 +74,7 @@ fn gpu_samples_have_the_bits_of_the_reference() {
     for soup in all_soups() {
         let (mut rasterizer, positions) = context.create_rasterizer(&soup, None);
         let pixel_count = soup.viewport.pixel_count() as u64;
+        // A sample of ids has 8 bytes (depth and triangle), a sample of depth 4.
         let (id_target, depth_target) =
             (context.gl.create_buffer(8 * pixel_count), context.gl.create_buffer(4 * pixel_count));
         let (want, want_depths) = (soup.rasterize(), two_sided_depths(&soup, None));
@@ -88,7 +89,7 @@ fn gpu_samples_have_the_bits_of_the_reference() {
         drop(rasterizer);
         drop((positions, id_target, depth_target));
     }
-    // Only the depth pass draws the back faces of all triangles.
+    // The id pass culls back faces in half of the triangles, the depth pass in none.
     assert!(back_faces > 1000, "control: expected more than 1000 samples of back faces, got {back_faces}");
 }
 

@@ -118,7 +118,7 @@ fn gpu_domains_with_shared_q_and_equal_transforms_are_equal() {
     let mut deformer = cuda_deformer(&scene);
     assert_equals_reference("shared q", &scene, &state, &mut deformer);
     let positions = &deformer.surface().expect("expected a surface").positions;
-    // Both domains have the shape with 300 vertices.
+    // Domains 1 and 3 have the shape with 300 vertices, the same q and the same transform.
     let [first, second] =
         [1, 3].map(|domain: usize| &positions[3 * scene.layout.domains[domain].first_vertex..][..3 * 300]);
     assert!(have_equal_bits(first, second));
@@ -132,8 +132,8 @@ fn gpu_bits_do_not_depend_on_history_or_packing() {
         scenes::RandomSceneOptions { instances: 4, normal_maps: true, rigid_transforms: false },
     );
     let (mut state, other_state) = (scenes::random_state(&scene, 20), scenes::random_state(&scene, 21));
-    // The instances of the first shape have the same state. Their vertices start at different offsets within thread
-    // blocks.
+    // Domains 0, 2, 4 and 6 are the instances of the first shape, of rank 37. They get the same state. Their vertices
+    // start at different offsets within thread blocks.
     let q = state.q_of(&scene, 0).to_vec();
     for domain in [2, 4, 6] {
         state.transforms[domain] = state.transforms[0];

@@ -106,7 +106,8 @@ pub(crate) fn random_scene(shapes: &[(usize, usize)], options: RandomSceneOption
     Scene::new(parts).expect("expected a valid scene")
 }
 
-/// A random state: every third domain is sheared if the scene allows it, and every third is mirrored.
+/// A random state. The transforms are, in turn, a similarity, a shear (if the scene allows shear) and a mirrored
+/// similarity.
 pub(crate) fn random_state(scene: &Scene, seed: u64) -> SceneState {
     let mut random = Random(seed);
     let mut state = SceneState::rest(scene);

@@ -41,7 +41,8 @@ impl AffineTransform {
         self.linear * point + self.translation
     }
 
-    /// A rotation by `angle` radians about an axis through the point `center`. The axis is normalized.
+    /// A rotation by `angle` radians about the direction `axis` through the point `center`. `axis` may have any length
+    /// but 0.
     pub fn rotation_about(axis: &Vector3<f64>, angle: f64, center: &Vector3<f64>) -> Self {
         let rotation = nalgebra::Rotation3::from_axis_angle(&nalgebra::Unit::new_normalize(*axis), angle).into_inner();
         Self { linear: rotation, translation: center - rotation * center }

@@ -2,7 +2,7 @@
 //!
 //! The load acts on the middle of the bridge, spread evenly over the sampled vertices there. Its strength is calibrated
 //! so that the deflection at equilibrium is a given fraction of the diagonal of the scene's rest bounds. The run starts
-//! at this equilibrium. The load then pulsates as (1 + cos) / 2.
+//! at this equilibrium. The load then pulsates between its full strength and 0, as (1 + cos(2 pi t / period)) / 2.
 
 use std::f64::consts::TAU;
 
@@ -50,7 +50,7 @@ pub struct BridgeScenario {
     peak_load: DVector<f64>,
     /// The state at step `next_step`.
     state: NewmarkState,
-    /// The step that the next call computes.
+    /// The step that the next call of `compute_next_step` computes.
     next_step: u64,
     /// Force at the peak of the pulse, for unit reduced mass.
     strength: f64,
@@ -74,6 +74,7 @@ impl BridgeScenario {
     /// deform the domain.
     pub fn new(model: Model, force: ReducedForce, settings: &VegaSettings, options: BridgeOptions) -> Result<Self> {
         let rank = force.rank();
+        // The first domain with coordinates of its own and as many modes as the force.
         let domain = model.domains.iter().position(|domain| domain.owns_q && domain.rank == rank);
         let ranks =
             || format!("domains of ranks {:?}", model.domains.iter().map(|domain| domain.rank).collect::<Vec<_>>());

@@ -2,8 +2,8 @@
 //! polynomial of degree three without a constant term. This module also computes its Jacobian and potential.
 //!
 //! File format: four little-endian i32 (r, then the numbers of monomials of degree one, two and three: r, r(r+1)/2 and
-//! r(r+1)(r+2)/6), followed by one f64 matrix per degree, row-major, with one row per force component and one column per
-//! monomial. The monomials q_i q_j (i <= j) and q_i q_j q_k (i <= j <= k) are in lexicographic order.
+//! r(r+1)(r+2)/6), followed by one f64 matrix per degree, row-major, with one row per force component and one column
+//! per monomial. The monomials q_i q_j (i <= j) and q_i q_j q_k (i <= j <= k) are in lexicographic order.
 
 use std::path::Path;
 
@@ -229,11 +229,11 @@ pub(crate) mod tests {
         bytes
     }
 
-    /// Largest relative errors of a Jacobian.
+    /// Errors of a Jacobian, relative to its largest entry.
     struct JacobianErrors {
-        /// Difference from central differences.
+        /// Largest difference from central differences of the force.
         difference: f64,
-        /// Difference from the transpose; above 0 if the force is not a gradient.
+        /// Largest difference from the transpose of the Jacobian; above 0 if the force is not a gradient.
         asymmetry: f64,
     }
 
@@ -260,7 +260,7 @@ pub(crate) mod tests {
             let q = random_vector(seed, 4);
             let JacobianErrors { difference, asymmetry } = jacobian_errors(&force, &q);
             assert!(difference <= 1e-8 && asymmetry <= 1e-14, "difference {difference}, asymmetry {asymmetry}");
-            // Euler's theorem, without the homogeneous terms: the derivative of V along q is q . f(q).
+            // By the chain rule, the derivative of V(s q) with respect to s at s = 1 is q . f(q).
             let slope = (force.potential(&(&q * (1.0 + 1e-6))) - force.potential(&(&q * (1.0 - 1e-6)))) / 2e-6;
             assert!((slope - q.dot(&force.force(&q))).abs() <= 1e-6 * slope.abs().max(1.0), "{slope}");
         }
@@ -274,7 +274,7 @@ pub(crate) mod tests {
     #[test]
     fn truncated_oversized_and_invalid_files_are_rejected() {
         let valid_file = encode_file(&spring_chain(&[1.0, 2.0], 0.1, 0.1));
-        // The header has r in bytes 0 to 3, then the three counts in bytes 4 to 7, 8 to 11 and 12 to 15.
+        // The header has r = 2 in bytes 0 to 3, then the three counts in bytes 4 to 7, 8 to 11 and 12 to 15.
         let replace_byte = |index: usize, byte: u8| {
             let mut bytes = valid_file.clone();
             bytes[index] = byte;
@@ -287,6 +287,7 @@ pub(crate) mod tests {
             (valid_file[..15].to_vec(), "cub.size"),
             (valid_file[..valid_file.len() - 1].to_vec(), "cub.size"),
             ([valid_file.clone(), vec![0]].concat(), "cub.size"),
+            // A negative r, an r above 512, r = 0, and an r that contradicts the counts.
             (replace_byte(3, 0xff), "cub.r"),
             (replace_byte(1, 0xff), "cub.r"),
             (replace_byte(0, 0), "cub.r"),

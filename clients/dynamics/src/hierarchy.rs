@@ -30,7 +30,8 @@ pub fn compute_transforms(
     world_from_domain
 }
 
-/// `parent_from_child`, moved by the rigid transform that fits the displacement of the parent's attachment vertices.
+/// `parent_from_child` at q: its value at rest, moved by the rigid transform that fits the displacement of the parent's
+/// attachment vertices.
 fn deformed_attachment(parent: &DomainModel, joint: &Joint, q: &[f64]) -> AffineTransform {
     if parent.rank == 0 || joint.attachment_samples.is_empty() {
         return joint.parent_from_child;
@@ -66,8 +67,9 @@ impl JointGapMeter {
     }
 }
 
-/// Per domain: the distances between its base vertex and the attachment vertices of its parent. Without attachment
-/// vertices: the distance between its base vertex and the place of this vertex according to `parent_from_child`.
+/// Per domain, the distances between its base vertex and the attachment vertices of its parent. For a parent without
+/// modes or attachment vertices, the distance between the base vertex and its position according to
+/// `parent_from_child`.
 fn joint_distances(model: &Model, q: &[f64], world_from_domain: &[AffineTransform]) -> Vec<Vec<f64>> {
     let domain_distances = |(domain, transform): (&DomainModel, &AffineTransform)| {
         let Some(joint) = &domain.joint else { return vec![] };

@@ -21,10 +21,11 @@ use tokio::sync::watch;
 
 use cli::{Cli, Command, CommonOptions, ForceFileOptions};
 
-/// Maximum number of surface samples per domain of a tree.
+/// Maximum number of surface samples per domain of a tree. A tree may have thousands of domains, and the rows of U of
+/// every sample are fetched from the server.
 const MAX_TREE_SAMPLES: usize = 24;
 
-/// Maximum number of surface samples per domain of other scenes.
+/// Maximum number of surface samples per domain of other scenes, which have few domains.
 const MAX_SAMPLES: usize = 1 << 16;
 
 /// The exit code of a complete run in which the server rejected steps.

@@ -1,5 +1,5 @@
-//! Model of a scene for the dynamics, built from the server's description. It has one `DomainModel` per domain: rank,
-//! joint, surface area, and sampled vertices with their rows of U.
+//! Model of a scene for the dynamics, built from the server's description. It has one `DomainModel` per domain: rank
+//! (number of modes), joint, surface area, and sampled vertices with their rows of U.
 //!
 //! Points and rows of U are in the frame of their domain, lengths in scene units. Parents precede their children.
 
@@ -41,11 +41,13 @@ pub struct Joint {
 #[derive(Debug, Clone, PartialEq)]
 pub struct DomainModel {
     pub name: String,
+    /// r, the number of modes.
     pub rank: usize,
     /// Index of the domain's first coordinate in the vector of all coordinates. Domains that share coordinates have the
     /// same index.
     pub first_coordinate: usize,
-    /// Whether steps carry coordinates for this domain. False if it shares the coordinates of an earlier domain.
+    /// Whether the domain has coordinates of its own, which steps contain. False if it shares the coordinates of an
+    /// earlier domain.
     pub owns_q: bool,
     /// `world_from_domain` at rest.
     pub placement: AffineTransform,
@@ -128,8 +130,8 @@ impl DomainModel {
 }
 
 impl Model {
-    /// Reads a scene from its server. `max_surface_samples` limits the surface samples per domain. A lower limit of at
-    /// least 8 applies if the samples of all domains would have more than 8 Mi entries of U.
+    /// Reads a scene from its server. `max_surface_samples` limits the surface samples per domain. The limit is
+    /// reduced, but not below 8, if the samples of all domains would have more than 8 Mi entries of U.
     ///
     /// # Errors
     /// `Client` as for the calls; `Invalid` if the description contradicts itself.

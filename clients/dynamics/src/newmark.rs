@@ -1,22 +1,22 @@
 //! Implicit time integration of the reduced equations of motion q'' + D q' + s f(q) = load, by Newmark's method with
-//! average acceleration (beta 1/4, gamma 1/2; Newmark 1959). Newton's method with the analytic Jacobian solves each
-//! step.
+//! average acceleration (beta 1/4, gamma 1/2; Newmark 1959). D is the damping matrix and s the scale of the force.
+//! Newton's method with the analytic Jacobian solves each step.
 //!
-//! The reduced mass is the identity. Each step minimizes the objective
+//! The reduced mass is the identity, and V is the potential of f. Each step minimizes the objective
 //!
 //! ```text
 //! c/2 |q - q_p|^2 + 1/(2 d) v(q)^T D v(q) + s V(q) - load . q,    v(q) = v_p + d (q - q_p)
 //! ```
 //!
-//! with the predictors q_p and v_p of the step. Its gradient is Newmark's equation. A static solution has c = d = 0 and
-//! no damping term. A line search along Newton's direction ensures that the objective decreases, so the iteration
-//! cannot diverge.
+//! with the predictors q_p and v_p of the step and the constants c = 4 / h^2 and d = 2 / h for a step of h seconds.
+//! Where the gradient of the objective is 0, Newmark's equation holds. A static solution has c = d = 0 and no damping
+//! term. A line search along Newton's direction ensures that the objective decreases, so the iteration cannot diverge.
 //!
 //! Average acceleration conserves the energy of a linear system exactly and that of a nonlinear system approximately.
 //! The energy error is the spurious gain accumulated over the steps. It may not exceed `ENERGY_TOLERANCE` times the
-//! highest energy so far. A step that would exceed this bound is repeated with backward Euler. The velocity of that
-//! step is scaled down if its energy exceeds the previous energy plus the work of the load. The solution therefore
-//! stays bounded at any step size.
+//! highest energy so far. A step that would exceed this bound is repeated with backward Euler (c = 1 / h^2, d = 1 / h).
+//! The velocity after the repeated step is scaled down if its energy exceeds the previous energy plus the work of the
+//! load. The solution therefore stays bounded at any step size.
 
 use nalgebra::{Cholesky, DMatrix, DVector};
 

@@ -1,7 +1,7 @@
 //! Exact time integration of one mode, q'' + 2 zeta omega q' + omega^2 q = f, with a force that is linear within a
 //! step.
 //!
-//! With time in units of the step h and y = (q, p), p = h q', the mode is the 2 x 2 system y' = M y + h^2 e2 f with
+//! With time in units of the step h, p = h q' and y = (q, p), the mode is the 2 x 2 system y' = M y + h^2 e2 f. Here
 //! w = omega h, M = [[0, 1], [-w^2, -2 zeta w]] and e2 = (0, 1). All coefficients follow from the impulse response
 //! S(t): the free motion is exp(M) = [[C, S], [-w^2 S, S']], the step response is G1 = integral of S, and the ramp
 //! response is G2 = integral of G1. There are three formulas for S. `Response::compute` selects the accurate one by w
@@ -143,6 +143,7 @@ impl Response {
     fn from_real_roots(w: f64, sigma: f64) -> Self {
         let half_distance = ((sigma - w) * (sigma + w)).sqrt();
         let fast_root = -(sigma + half_distance);
+        // The product of the roots is w^2.
         let slow_root = w / fast_root * w;
         let distance = slow_root - fast_root;
         let divided_difference = |function: fn(f64) -> f64| (function(slow_root) - function(fast_root)) / distance;

@@ -120,7 +120,7 @@ pub async fn drive_scene(
         step_number += 1;
         progress_bar.inc(1);
     }
-    // Each flush reports at most one rejection. Repeat until none is left.
+    // Each flush reports at most one rejection. Repeat until no rejection is left.
     while stats.record_rejection(step_stream.flush().await)? {}
     stats.record_acknowledgements(&step_stream);
     let (run_number, window) = (step_stream.run, step_stream.window);

@@ -37,7 +37,7 @@ pub struct SweepScenario {
     steps_per_coordinate: u64,
     /// Per coordinate: the value at which the largest displacement is `displacement_fraction`.
     amplitudes: Vec<f64>,
-    /// The step that the next call computes.
+    /// The step that the next call of `compute_next_step` computes.
     next_step: u64,
     /// Largest displacement so far, in scene units.
     peak_displacement: f64,
@@ -65,8 +65,8 @@ impl SweepScenario {
     }
 
     /// The sine of a coordinate at `coordinate_step` (0 to `steps_per_coordinate` - 1), divided by its largest value at
-    /// any step. The sine is evaluated in the middle of each step. With one step per coordinate it is 0 there, and the
-    /// result is 1.
+    /// any step. The sine is evaluated in the middle of each step. With one step per coordinate, the sine is 0 in the
+    /// middle of that step, and the result is 1 by definition.
     fn normalized_sine(&self, coordinate_step: u64) -> f64 {
         let sine_at = |step: u64| (TAU * (step as f64 + 0.5) / self.steps_per_coordinate as f64).sin();
         let max_sine = (0..self.steps_per_coordinate).map(sine_at).fold(0.0, f64::max);

@@ -92,7 +92,7 @@ pub struct TreeScenario {
     states: Vec<ModeState>,
     /// Per coordinate: force at step `next_step`, at unit strength.
     forces: Vec<f64>,
-    /// The step that the next call computes.
+    /// The step that the next call of `compute_next_step` computes.
     next_step: u64,
     /// The highest sample of each domain that reaches into the crown.
     crown_samples: Vec<SampleIndex>,
@@ -115,7 +115,7 @@ struct UnitResponse {
     coordinates: Vec<Vec<f64>>,
 }
 
-/// The gain of each domain, and the sway that it causes as a fraction of the height.
+/// The gain of each domain, and the sway at these gains as a fraction of the height.
 struct Calibration {
     gains: Vec<f64>,
     sway_fraction: f64,
@@ -239,7 +239,8 @@ impl TreeScenario {
     }
 
     /// Finds the gains at which the peak displacement of the crown is the requested fraction of the height. If the
-    /// bending limits do not allow it, returns the largest gains that they allow.
+    /// bending limits do not allow these gains, returns the largest gains that the limits allow. A `strength` is the
+    /// common factor of all gains, before the bending limits; it is not the wind strength of the options.
     fn find_gains(&self, response: &UnitResponse) -> Calibration {
         let calibrate = |strength: f64| {
             let gains = self.compute_gains(strength, &response.bending);

@@ -29,7 +29,7 @@ fn beam(index: u32, radius: f32) -> FakeDomain {
 /// A server with a trunk, two generations of branches and a rigid leaf. Each is tilted and attached to the last section
 /// of the previous one.
 fn tree_server() -> FakeServer {
-    // A rotation about z by atan(0.6 / 0.8), and a translation to the end of the parent, (0, 1, 0).
+    // A rotation about z by -atan(0.6 / 0.8), and a translation to the end of the parent, (0, 1, 0).
     let (sine, cosine) = (0.6_f32, 0.8_f32);
     let parent_from_child = [cosine, sine, 0.0, 0.0, -sine, cosine, 0.0, 1.0, 0.0, 0.0, 1.0, 0.0];
     let mut domains = vec![];
@@ -113,7 +113,8 @@ async fn tree_sways_and_subscribers_receive_closed_joints() {
     let url = serve(Arc::clone(&server)).await;
     let client = Client::connect(&url).await.expect("a connection");
     let rest_positions = server.output().positions;
-    let request = VertexStreamRequest::new("toy", VertexSelection::default()).replies(90);
+    // `toy` is the only scene of the fake server.
+    let request = VertexStreamRequest::new("toy", VertexSelection::default()).max_replies(90);
     let mut vertex_stream = client.stream_vertices(&request).await.expect("a stream");
     let folder = tempfile::tempdir().expect("a temporary folder");
     let record = folder.path().display().to_string();
@@ -195,7 +196,8 @@ fn vega_folder(name: &str) -> PathBuf {
     data.join("vega").join(name)
 }
 
-/// A domain with the `v` positions of the OBJ file in file order, and U of the `.URendering.float` file, row-major.
+/// A domain with the `v` positions of the OBJ file in file order, and U of the `.URendering.float` file. The file has U
+/// in column-major order, after its numbers of rows and columns; a fake domain has U in row-major order.
 fn vega_domain(name: &str) -> FakeDomain {
     let text = std::fs::read_to_string(vega_folder(name).join(format!("{name}.obj"))).expect("an OBJ file");
     let positions = text.lines().filter_map(|line| line.strip_prefix("v "));
@@ -219,7 +221,8 @@ fn vega_domain(name: &str) -> FakeDomain {
 #[tokio::test(flavor = "multi_thread")]
 #[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
 async fn real_models_deflect_as_requested_and_stay_bounded() {
-    // The lowest frequency of the .cub file (1 Hz and 37.68 Hz) times the base frequency of the .config file.
+    // The lowest frequency of the .cub file (1 Hz and 37.68 Hz) times the base frequency of the .config file (0.25 and
+    // 0.02).
     for (name, expected_hertz) in [("simpleBridge", 0.25), ("A", 37.68 * 0.02)] {
         let url = serve(Arc::new(FakeServer::new(vec![vega_domain(name)]))).await;
         let files = vega_folder(name).display().to_string();

@@ -1,5 +1,5 @@
 //! Assembles chunks into complete replies. The first chunk states the total size of the reply, and each chunk its
-//! offset. Both are checked. A total above the limit is an error before any byte is stored.
+//! offset. The total and the offsets are checked. A total above the limit is an error before any byte is stored.
 
 use std::pin::Pin;
 use std::sync::Arc;

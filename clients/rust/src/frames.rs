@@ -115,13 +115,13 @@ pub struct Frame {
     pub width: u32,
     pub height: u32,
     pub format: FrameFormat,
-    /// A PNG file, or 4 or 12 bytes per pixel.
+    /// A PNG file, or 4 or 12 bytes per pixel, as `format` states.
     pub bytes: Bytes,
     /// Number of steps skipped since the previous frame of the stream.
     pub skipped: u64,
     pub stages: StageTimes,
-    /// The rasterizer of the shadow map. `None` for other outputs than color, and if the map is shared with another frame
-    /// of the step.
+    /// The rasterizer of the shadow map. `None` for other outputs than color, and if the map is shared with another
+    /// frame of the step.
     pub shadow_drawn_by: Option<DrawnBy>,
     /// The rasterizer of the visible triangles. `None` for other outputs than color.
     pub visibility_drawn_by: Option<DrawnBy>,
@@ -153,8 +153,8 @@ impl Client {
         frame.unwrap_or(Err(Error::StreamEnded { awaited_reply: "the first frame" }))
     }
 
-    /// Subscribes to frames. When this returns, the server has accepted the subscription: the client receives every later
-    /// step if the delivery is lossless.
+    /// Subscribes to frames. When this returns, the server has accepted the subscription: the client receives every
+    /// later step if the delivery is lossless.
     ///
     /// # Errors
     /// `Status` if the scene does not exist; `Connect` if the connection is lost.
@@ -163,7 +163,7 @@ impl Client {
             scene: request.scene.clone(),
             picture: Some(request.query.into()),
             delivery: v1::Delivery::from(request.delivery).into(),
-            frames: request.replies,
+            frames: request.max_replies,
         };
         let messages = self.replies(FrameServiceClient::new(self.channel.clone()).stream_frames(wire).await)?;
         Ok(FrameStream(ChunkedReplies::new(messages, |message| message.chunk, self.max_reply_bytes)))
@@ -277,7 +277,8 @@ impl From<Camera> for v1::Camera {
             Lens::FieldOfView(degrees) => WireLens::FieldOfView(degrees),
             Lens::Intrinsics { fx, fy, cx, cy } => WireLens::Intrinsics(v1::Intrinsics { fx, fy, cx, cy }),
         };
-        let (near, far) = camera.clip.unwrap_or_default();
+        // On the wire, 0 and 0 mean that the server fits the clip distances to the scene.
+        let (near, far) = camera.clip.unwrap_or((0.0, 0.0));
         Self { view: Some(view), lens: Some(lens), near, far }
     }
 }

@@ -5,7 +5,7 @@ use std::process::ExitCode;
 
 use crate::error::Error;
 
-/// The exit code of a program that cannot use a local file or resource.
+/// The exit code of a program that cannot use a local file or another local resource.
 const LOCAL_ERROR: u8 = 4;
 
 /// Runs the main task of a program on a new multi-threaded runtime and returns its exit code. Prints an error as
@@ -29,8 +29,8 @@ pub fn run<E: Display>(
     ExitCode::from(code)
 }
 
-/// Maps an error of the client to the exit code that the help texts document: 1 rejected by the server or not encodable,
-/// 3 connection failed or lost, 4 local file error, 5 malformed, truncated or late reply.
+/// Maps an error of the client to the exit code that the help texts document: 1 rejected by the server or not
+/// encodable, 3 connection failed or lost, 4 local file error, 5 malformed, truncated or late reply.
 pub const fn exit_code(error: &Error) -> u8 {
     match error {
         Error::Connect { .. } | Error::Status { code: tonic::Code::Unavailable, .. } => 3,

@@ -77,13 +77,13 @@ pub struct Subscription<Q> {
     pub query: Q,
     pub delivery: Delivery,
     /// Number of replies after which the subscription ends; 0 for no limit.
-    pub replies: u64,
+    pub max_replies: u64,
 }
 
 impl<Q> Subscription<Q> {
     /// A lossless subscription without a limit.
     pub fn new(scene: &str, query: Q) -> Self {
-        Self { scene: scene.to_owned(), query, delivery: Delivery::Lossless, replies: 0 }
+        Self { scene: scene.to_owned(), query, delivery: Delivery::Lossless, max_replies: 0 }
     }
 
     /// Sets [`Self::delivery`].
@@ -93,10 +93,10 @@ impl<Q> Subscription<Q> {
         self
     }
 
-    /// Sets [`Self::replies`].
+    /// Sets [`Self::max_replies`].
     #[must_use]
-    pub fn replies(mut self, replies: u64) -> Self {
-        self.replies = replies;
+    pub fn max_replies(mut self, max_replies: u64) -> Self {
+        self.max_replies = max_replies;
         self
     }
 }
@@ -107,7 +107,7 @@ pub enum Delivery {
     /// Every step, in order; back-pressure from a slow reader slows the writer.
     #[default]
     Lossless,
-    /// The newest step. Each reply states the number of skipped steps.
+    /// The newest step. Each reply states the number of steps skipped since the previous reply.
     Latest,
 }
 

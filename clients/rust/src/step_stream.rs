@@ -32,11 +32,11 @@ pub enum Policy {
     Latest,
 }
 
-/// One acknowledgement: all steps up to this one are done or merged into a newer one.
+/// One acknowledgement: the server has processed all steps up to `step`, or merged them into a newer step.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Ack {
     pub step: u64,
-    /// Number of steps merged into a newer one since the stream began.
+    /// Number of steps merged into a newer step since the stream began.
     pub skipped: u64,
     pub stages: StageTimes,
 }
@@ -50,7 +50,7 @@ pub struct StreamSummary {
     pub sent: u64,
     /// Number of sent steps that the server rejected.
     pub rejected: u64,
-    /// Number of steps merged into a newer one.
+    /// Number of steps merged into a newer step.
     pub skipped: u64,
 }
 
@@ -204,7 +204,8 @@ impl StepStream {
     pub async fn finish(mut self) -> Result<StreamSummary> {
         self.wait_until(|progress, _| progress.in_flight.is_empty()).await?;
         self.requests = None;
-        // The server closes its side after it has released the scene. The timeout covers a server that does not.
+        // The server closes its side after it has released the scene. The timeout ends the wait for a server that never
+        // does.
         let reader_end = async { while self.progress_changes.changed().await.is_ok() {} };
         tokio::time::timeout(Duration::from_secs(5), reader_end).await.ok();
         Ok(self.summary())
@@ -275,7 +276,8 @@ impl Progress {
         );
     }
 
-    /// Removes the rejected step from the steps in flight: the oldest one with its number.
+    /// Removes the rejected step from the steps in flight. If several steps in flight have its number, removes the
+    /// oldest of them.
     fn reject(&mut self, rejection: Rejection) {
         if let Some(index) = self.in_flight.iter().position(|step| Some(*step) == rejection.step) {
             self.in_flight.remove(index);

@@ -18,7 +18,8 @@ use crate::error::{Error, Result, malformed_reply};
 /// Bytes of file content per message: far below 4 MiB, the default limit of gRPC.
 const CHUNK_BYTES: usize = 512 << 10;
 
-/// Maximum depth of nested folders. Deeper ones are an error, so that a cyclic link does not cause an endless recursion.
+/// Maximum depth of nested folders. Deeper ones are an error, so that a cyclic link does not cause an endless
+/// recursion.
 const MAX_FOLDER_DEPTH: usize = 16;
 
 /// One file to upload.
@@ -50,7 +51,8 @@ impl Client {
         let (sender, queue) = mpsc::channel(4);
         let send_task = tokio::task::spawn_blocking(move || send_files(&sender, header, &files));
         let reply = self.reply(self.scenes().upload_scene(ReceiverStream::new(queue)).await);
-        // A read error truncates the upload, and the server rejects it. Report the read error, which is the cause.
+        // A read error truncates the upload, and the server then rejects the upload. Report the read error, because it
+        // is the cause.
         send_task.await.map_err(|error| Error::file(path, error))??;
         reply?.scene.ok_or_else(|| malformed_reply("upload.scene", "a scene", "none"))
     }

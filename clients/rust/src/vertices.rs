@@ -38,8 +38,8 @@ pub struct VertexSetDomain {
 pub struct VertexSet {
     pub step: v1::StepId,
     /// World position of the common origin of all positions, in meters. It equals the scene's origin until f64
-    /// translations move domains far from there. Then it follows the domains and may differ per step. Does not apply if
-    /// `domain_origins` is not empty.
+    /// translations move domains far from the scene's origin. Then the common origin follows the domains and may differ
+    /// per step. Has no meaning if `domain_origins` is not empty.
     pub origin: Vec<f64>,
     /// The origin of each selected domain in meters, if the origins differ; otherwise empty.
     pub domain_origins: Vec<[f64; 3]>,
@@ -68,8 +68,8 @@ impl VertexSet {
         Some(start..start + float_count(domain))
     }
 
-    /// World position of the origin of a selected domain, in meters. `ordinal` is its index in `domains`. A vertex is at
-    /// `domain_origin(ordinal) + unit * position`, where `unit` is [`v1::SceneInfo::unit`].
+    /// World position of the origin of a selected domain, in meters. `ordinal` is its index in `domains`. A vertex is
+    /// at `domain_origin(ordinal) + unit * position`, where `unit` is [`v1::SceneInfo::unit`].
     pub fn domain_origin(&self, ordinal: usize) -> [f64; 3] {
         let common_origin = || std::array::from_fn(|axis| self.origin.get(axis).copied().unwrap_or(0.0));
         self.domain_origins.get(ordinal).copied().unwrap_or_else(common_origin)
@@ -105,7 +105,7 @@ impl Client {
             scene: request.scene.clone(),
             selection: Some(request.query.clone()),
             delivery: v1::Delivery::from(request.delivery).into(),
-            steps: request.replies,
+            steps: request.max_replies,
         };
         let messages = self.replies(VertexServiceClient::new(self.channel.clone()).stream_vertices(wire).await)?;
         Ok(VertexStream(ChunkedReplies::new(messages, |message| message.chunk, self.max_reply_bytes)))

@@ -71,9 +71,9 @@ async fn frame_above_4_mib_arrives_complete_and_names_its_step() {
 #[tokio::test]
 async fn subscription_before_the_first_step_receives_every_step() {
     let (server, client) = connect(one_domain_server(4)).await;
-    let request = FrameStreamRequest::new("toy", picture(600, 600)).replies(20);
+    let request = FrameStreamRequest::new("toy", picture(600, 600)).max_replies(20);
     let mut frames = client.stream_frames(&request).await.expect("a subscription");
-    let request = VertexStreamRequest::new("toy", VertexSelection::default()).replies(20);
+    let request = VertexStreamRequest::new("toy", VertexSelection::default()).max_replies(20);
     let mut sets = client.stream_vertices(&request).await.expect("a subscription");
     let mut step_stream = client.drive("toy", Policy::Lossless, 3).await.expect("a step stream");
     assert_eq!((step_stream.run, step_stream.window), (1, 3));
@@ -87,7 +87,7 @@ async fn subscription_before_the_first_step_receives_every_step() {
         assert_eq!(frames.next().await.expect("a frame").expect("a valid reply").step.number, number);
         let set = sets.next().await.expect("a set").expect("a valid reply");
         assert_eq!((set.step.number, set.float_range(0)), (number, Some(0..12)));
-        // The x coordinate of vertex 1: x0 is 3, and the first entry of its row of U is 6.
+        // The x coordinate of vertex 1: entry 3 of x0 is 3, and entry 6 of U, in the column of q[0], is 6.
         assert_eq!(set.positions[3], 3.0 + 6.0 * number as f32);
     }
     assert!(frames.next().await.is_none() && sets.next().await.is_none());
@@ -245,7 +245,7 @@ fn client_depends_on_neither_cuda_nor_opengl() {
     assert_eq!(count_gpu_dependencies("modalcast-client"), 0);
     assert!(list_dependencies("modalcast-client").iter().any(|name| name == "tonic"), "expected a dependency on tonic");
     let server_count = count_gpu_dependencies("modalcast");
-    assert_eq!(server_count, gpu_packages.len(), "control: expected all of these packages for the server");
+    assert_eq!(server_count, gpu_packages.len(), "control: expected the server to depend on all of {gpu_packages:?}");
 }
 
 struct FetchOutput {
@@ -292,6 +292,7 @@ async fn fetch_saves_files_and_exits_with_documented_codes() {
     assert_eq!((ready, &summary["frames"], summary["stages_ms"]["draw"].as_f64()), ("ready", &3.into(), Some(2.0)));
     for (index, step) in summary["steps"].as_array().expect("steps").iter().enumerate() {
         let bytes = std::fs::read(format!("{frames}/frame_{index:05}.rgba")).expect("a frame");
+        // 20 x 10 pixels of 4 bytes.
         assert_eq!((bytes.len(), u64::from(bytes[0])), (800, step.as_u64().expect("a number") % 256));
     }
     let output = run_fetch(&url, &["vertices", "--scene", "toy", "--count", "2", "--out", &vertices]).await;

@@ -115,8 +115,8 @@ fn deform_tile<const COMPENSATED: bool>(
     tile_bounds.poison_with(zero_or_nan)
 }
 
-/// Copies the sums of a tile, `[axis][vertex]`, to the displacements of its vertices, and repairs displacements that are
-/// not finite. Returns NaN if a displacement is not finite in f32 even after the repair, else 0.
+/// Copies the sums of a tile, `[axis][vertex]`, to the displacements of its vertices, and repairs displacements that
+/// are not finite. Returns NaN if a displacement is not finite in f32 even after the repair, else 0.
 #[inline(always)]
 fn store_displacements(inputs: &DeformInputs, tile: &DomainTile, sums: &TileVertices, out: &mut [f32]) -> f32 {
     let axis_stride = tile.item_count().next_multiple_of(QUAD);

@@ -1,9 +1,9 @@
-//! Decodes and sums stored entries in vector registers, two quads (of four vertices) at a time. [`super::sum`] also has a
-//! path that first decodes columns to memory. This one is much faster and gives bit-identical results, but supports
+//! Decodes and sums stored entries in vector registers, two quads (of four vertices) at a time. [`super::sum`] also has
+//! a path that first decodes columns to memory. This one is much faster and gives bit-identical results, but supports
 //! only x86 and uncompensated sums.
 //!
-//! The documentation of `crate::storage` defines the stored layout. A chunk of modes has three planes, and a plane has 16
-//! bytes (a packed word) per quad. A group is the four entries of a quad for one mode and axis.
+//! The documentation of `crate::storage` defines the stored layout. A chunk of modes has three planes, and a plane has
+//! 16 bytes (a packed word) per quad. A group is the four entries of a quad for one mode and axis.
 
 use std::arch::x86_64::{__m256, __m256i};
 
@@ -101,8 +101,8 @@ const fn shuffle_mask(entry_bytes: u8, group: u8) -> [u8; 32] {
     mask
 }
 
-/// Adds chunks of a tile to its sums, `[axis][vertex]`. Each of `chunks` has the three planes of a chunk, and the scaled
-/// coordinates of its `MODES` modes. A packed word has `GROUPS` groups.
+/// Adds chunks of a tile to its sums, `[axis][vertex]`. Each of `chunks` has the three planes of a chunk, and the
+/// scaled coordinates of its `MODES` modes. A packed word has `GROUPS` groups.
 #[inline(always)]
 pub(super) fn add_chunks<D: Decode<GROUPS>, const GROUPS: usize, const MODES: usize, const CHUNKS: usize>(
     simd: V3,

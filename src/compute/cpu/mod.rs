@@ -49,8 +49,8 @@ pub struct CpuDeformer {
     bounding_axes: Option<BoundingAxes>,
     /// Per shape, its stored U and x0.
     shapes: Vec<TiledModes>,
-    /// 0, 1, 2 and so on: the chunk indices of the shape with the most chunks. A chunk is the one to four modes that are
-    /// stored together (`storage`).
+    /// 0, 1, 2 and so on: the chunk indices of the shape with the most chunks. A chunk is the one to four modes that
+    /// are stored together (`storage`).
     all_chunks: Vec<u16>,
     retained_modes: Option<RetainedModes>,
     changes: ChangeTracker,
@@ -98,7 +98,8 @@ impl CpuDeformer {
         Self { bounding_axes: axes, ..self }
     }
 
-    /// Bytes of stored U and x0. A step in which all domains change reads this many bytes if no two domains share a shape.
+    /// Bytes of stored U and x0. A step in which all domains change reads this many bytes if no two domains share a
+    /// shape.
     pub fn stored_bytes(&self) -> usize {
         self.shapes.iter().map(|tiles| tiles.bytes().len() + size_of_val(tiles.rest())).sum()
     }

@@ -163,8 +163,8 @@ impl<'a> TileChunks<'a> {
 
 #[cfg(target_arch = "x86_64")]
 impl TileChunks<'_> {
-    /// Adds the chunks of a 16-bit type, two at a time. The arguments of `add_chunks` are the decoder, 2 groups per packed
-    /// word, 2 modes per chunk, and the number of chunks.
+    /// Adds the chunks of a 16-bit type, two at a time. The arguments of `add_chunks` are the decoder, 2 groups per
+    /// packed word, 2 modes per chunk, and the number of chunks.
     #[inline(always)]
     fn fuse_packed16<D: fused::Decode<2>>(&self, simd: pulp::x86::V3, sums: &mut [f32]) {
         let with_scaled_q = |chunk: u16| (self.chunk(chunk), self.scaled_q(chunk));

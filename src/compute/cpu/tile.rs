@@ -1,6 +1,6 @@
-//! Divides the vertices or the corners of a scene into tiles, and each output into one part per tile. "Packed" items are
-//! those of all domains, one domain after the other. Tiles balance the load between cores, for one large domain as for
-//! many small ones.
+//! Divides the vertices or the corners of a scene into tiles, and each output into one part per tile. "Packed" items
+//! are those of all domains, one domain after the other. Tiles balance the load between cores, for one large domain as
+//! for many small ones.
 
 use super::changes::ChangeTracker;
 

@@ -37,8 +37,8 @@ fn subsets(macros: &[&'static str]) -> Vec<Vec<&'static str>> {
 fn deform_variants(features: &[&'static str]) -> Vec<Variant> {
     let mut variants: Vec<Variant> =
         features.iter().chain(&LAUNCHER_DEFINES).map(|feature| (vec![*feature], SM_90)).collect();
-    // Most registers depend on three choices: how modes are summed, how many vertices or corners (items) a lane computes,
-    // and the kind of normals. With TILE_LIST, a lane always has one item.
+    // Most registers depend on three choices: how modes are summed, how many vertices or corners (items) a lane
+    // computes, and the kind of normals. With TILE_LIST, a lane always has one item.
     let lane_defines: [&[&str]; 3] = [&[], &["ONE_ITEM_PER_LANE"], &["ONE_ITEM_PER_LANE", "TILE_LIST"]];
     let normal_defines: [&[&str]; 4] = [
         &[],
@@ -66,8 +66,8 @@ fn deform_variants(features: &[&'static str]) -> Vec<Variant> {
         for options in &option_sets {
             add_variants(&sum(options), &normal_defines, &[]);
         }
-        // Registers that displacements or followers add to the largest sum. Entries 1 and 2 of `normal_defines` are rigid
-        // normals without and with normal maps.
+        // Registers that displacements or followers add to the largest sum. Entries 1 and 2 of `normal_defines` are
+        // rigid normals without and with normal maps.
         add_variants(&sum(&all_options), &normal_defines[1..3], &["DISPLACEMENTS"]);
         add_variants(&sum(&all_options), &normal_defines[1..3], &["FOLLOWERS"]);
     }
@@ -83,8 +83,8 @@ fn deform_variants(features: &[&'static str]) -> Vec<Variant> {
     variants
 }
 
-/// All variants of `batch` for compute capability 9.0. For other capabilities, only the variants with groups of 16 domains,
-/// the largest size, which has neither BATCH_4 nor BATCH_8.
+/// All variants of `batch` for compute capability 9.0. For other capabilities, only the variants with groups of 16
+/// domains, the largest size, which has neither BATCH_4 nor BATCH_8.
 fn batch_variants(features: &[&'static str]) -> Vec<Variant> {
     let has_one_group_size = |set: &Vec<&str>| !(set.contains(&"BATCH_4") && set.contains(&"BATCH_8"));
     let sm_90_variants = subsets(features)

@@ -9,10 +9,10 @@
 //! ```text
 //! inputs -> [apply or batch] -> deform -> bounds -> [normals] -> readback of the bounds
 //! ```
-//! `deform` computes positions, and `bounds` the bounding box of all positions. A partial step, which changes few domains,
-//! first launches `apply`, which copies the changed values. A full step launches `batch` if the scene has domains that
-//! share a large U; `batch` computes these domains instead of `deform`. `normals` is launched if normals follow the
-//! deformed surface.
+//! `deform` computes positions, and `bounds` the bounding box of all positions. A partial step, which changes few
+//! domains, first launches `apply`, which copies the changed values. A full step launches `batch` if the scene has
+//! domains that share a large U; `batch` computes these domains instead of `deform`. `normals` is launched if normals
+//! follow the deformed surface.
 //!
 //! The server uses this module. Programs that measure single kernels also use [`launch`], [`launchers`] and
 //! [`step_input`].

@@ -3,9 +3,9 @@
 //! # Definition
 //! For each smoothing group (see [`modalcast_model::domain::SmoothingGroups`]), the area vectors (b - a) x (c - a) of
 //! its triangles are summed twice. The rest sum uses the rest positions. It is transformed by the cofactors of A (the
-//! linear part of T), as area vectors are. The current sum uses the positions x of this step. The exact normal is the rigid normal of
-//! `reference/rigid_normals.rs`, rotated by the smallest rotation that takes the direction of the rest sum to that of
-//! the current sum. It follows that
+//! linear part of T), as area vectors are. The current sum uses the positions x of this step. The exact normal is the
+//! rigid normal of `reference/rigid_normals.rs`, rotated by the smallest rotation that takes the direction of the rest
+//! sum to that of the current sum. It follows that
 //! - at q = 0 the exact normal is the rigid normal, even if the author smoothed, weighted or tilted rest normals;
 //! - where rest normals are those of the triangles, the exact normal is the area-weighted normal of the deformed
 //!   triangles;
@@ -16,10 +16,10 @@
 //! - corners of one group with the same rest normal keep a common normal: seams stay closed and hard edges stay hard.
 //!
 //! A tangent is rotated by the same rotation, then made orthogonal to the new normal. The bitangent keeps its sign, or
-//! is flipped by a mirroring T as in the rigid case. Tangents need no memory and no reads beyond those of rigid tangents
-//! and exact normals. The tangent follows the tilt of the surface. It does not follow rotation or shear within the
-//! surface, which would need texture gradients per triangle: 8 more bytes per entry of every ring (the list of vertices
-//! around a group).
+//! is flipped by a mirroring T as in the rigid case. Tangents need no memory and no reads beyond those of rigid
+//! tangents and exact normals. The tangent follows the tilt of the surface. It does not follow rotation or shear within
+//! the surface, which would need texture gradients per triangle: 8 more bytes per entry of every ring (the list of
+//! vertices around a group).
 //!
 //! # Fallback
 //! A corner keeps its rigid normal and tangent where no rotation can be determined:
@@ -27,11 +27,12 @@
 //! - its group has no area at rest, or areas that cancel;
 //! - the area of its group in this step is not above [`RESOLUTION`] times B.
 //!
-//! B, the rounding scale, is the sum of l (l + w) over the two edges of each triangle that meet at the group's vertex. l
-//! is the sum of the absolute components of an edge, and w is this sum for the position of the vertex. Rounding positions to f32 moves an edge by at most 2^-23
-//! (l + w), and so the sum of area vectors by at most 2^-23 B. For positions that were rounded once, the direction of
-//! the sum is therefore off by at most asin(2^-23 B / |sum|). This is less than asin(2^-5) < 1.8 degrees if |sum| is
-//! above `RESOLUTION` B = 2^-18 B. A rotation that rounding alone could cause is not applied. A domain of one meter at 10^7 meters thus has rigid normals, unless the scene's origin
+//! B, the rounding scale, is the sum of l (l + w) over the two edges of each triangle that meet at the group's vertex.
+//! l is the sum of the absolute components of an edge, and w is this sum for the position of the vertex. Rounding
+//! positions to f32 moves an edge by at most 2^-23 (l + w), and so the sum of area vectors by at most 2^-23 B. For
+//! positions that were rounded once, the direction of the sum is therefore off by at most asin(2^-23 B / |sum|). This
+//! is less than asin(2^-5) < 1.8 degrees if |sum| is above `RESOLUTION` B = 2^-18 B. A rotation that rounding alone
+//! could cause is not applied. A domain of one meter at 10^7 meters thus has rigid normals, unless the scene's origin
 //! is near it.
 //!
 //! Close to half a turn the axis of the smallest rotation is ill-conditioned. Rest normals that differ from the

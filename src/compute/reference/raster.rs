@@ -1,12 +1,12 @@
 //! The reference rasterizer: plain loops over samples that define the result of `kernels/raster.cu`.
 //!
 //! Corners are transformed to clip space in f32; each sum and product is rounded separately. Triangles are clipped by
-//! the near plane and a guard band (a rectangle around the window that keeps coordinates in range; Sutherland and Hodgman, "Reentrant polygon clipping", 1974), and
-//! their corners are snapped to 1/256 pixel.
+//! the near plane and a guard band (a rectangle around the window that keeps coordinates in range; Sutherland and
+//! Hodgman, "Reentrant polygon clipping", 1974), and their corners are snapped to 1/256 pixel.
 //!
-//! Coverage is then computed exactly, in integers: a triangle covers the samples on the inner side of all its edges. A sample on
-//! an edge belongs to the triangle for which it is a top or left edge, so triangles that share an edge cover each
-//! sample exactly once. Depth is z/w, linear in the window, in f32 from the exact edge values. Cut-outs cover only
+//! Coverage is then computed exactly, in integers: a triangle covers the samples on the inner side of all its edges. A
+//! sample on an edge belongs to the triangle for which it is a top or left edge, so triangles that share an edge cover
+//! each sample exactly once. Depth is z/w, linear in the window, in f32 from the exact edge values. Cut-outs cover only
 //! samples whose alpha is large enough ([`cut_out`]).
 
 pub mod cut_out;
@@ -285,9 +285,9 @@ fn snap(window: &Viewport, [x, y, z, w]: &[f32; 4]) -> SnappedVertex {
     SnappedVertex { x: to_subpixels(window_x), y: to_subpixels(window_y), z: z * inverse_w * 0.5 + 0.5 }
 }
 
-/// The samples in the bounding box of the corners, clipped to the window. In units of 1/256 pixel, the sample of column c
-/// is at x = 256 c + 128. The first column at or after x0 is therefore ceil((x0 - 128) / 256) = floor((x0 + 127) / 256),
-/// and the last column at or before x1 is floor((x1 - 128) / 256). A shift by 8 divides by 256 and rounds down.
+/// The samples in the bounding box of the corners, clipped to the window. In units of 1/256 pixel, the sample of column
+/// c is at x = 256 c + 128. The first column at or after x0 is therefore ceil((x0 - 128) / 256) = floor((x0 + 127) /
+/// 256), and the last column at or before x1 is floor((x1 - 128) / 256). A shift by 8 divides by 256 and rounds down.
 fn samples(window: &Viewport, corners: &[SnappedVertex]) -> PixelRect {
     let sample_range = |coordinate_of: fn(&SnappedVertex) -> i32, window_side: u32| {
         let coordinates = || corners.iter().map(coordinate_of);

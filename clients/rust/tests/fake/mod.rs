@@ -23,7 +23,7 @@ pub(crate) struct FakeDomain {
 pub(crate) const IDENTITY: [f32; 12] = [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0];
 
 impl FakeDomain {
-    /// A domain at the origin. Each vertex is one corner, that is, one vertex as drawn.
+    /// A domain at the origin. Each vertex has one corner, that is, one normal.
     pub(crate) fn new(index: u32, rest_positions: Vec<f32>, rank: u32, modes: Vec<f32>) -> Self {
         let vertices = (rest_positions.len() / 3) as u32;
         assert_eq!(modes.len(), rest_positions.len() * rank as usize, "expected 3n rows of U");
@@ -142,7 +142,8 @@ impl FakeServer {
         }
     }
 
-    /// Acquires the writer lease. Returns the number of this writer, counted from 1. Fails if another writer has the lease.
+    /// Acquires the writer lease. Returns the number of this writer, counted from 1. Fails if another writer has the
+    /// lease.
     fn acquire_writer_lease(&self) -> Result<u64, v1::Rejection> {
         let mut state = self.state.lock().unwrap();
         if std::mem::replace(&mut state.has_writer, true) {

@@ -1,8 +1,8 @@
 //! The deformer of the `cuda` backend: a step is one graph of copies and kernels, and its bounds are read back with it.
 //!
-//! Steps are double-buffered. A step can be submitted while the previous step is in flight: the host writes the values of
-//! the new step while the previous step runs. The host can also fetch the vertices of a step while the next step runs.
-//! The next step then writes another output set (buffers of positions, normals and tangents).
+//! Steps are double-buffered. A step can be submitted while the previous step is in flight: the host writes the values
+//! of the new step while the previous step runs. The host can also fetch the vertices of a step while the next step
+//! runs. The next step then writes another output set (buffers of positions, normals and tangents).
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -53,8 +53,8 @@ pub struct CudaDeformer {
     kernels: StepKernels,
     inputs: StepInputs,
     output: OutputBuffers,
-    /// u, if displacements are an output of the scene. One buffer is sufficient for all output sets, because displacements are
-    /// read before the next step is submitted. The same holds for boxes.
+    /// u, if displacements are an output of the scene. One buffer is sufficient for all output sets, because
+    /// displacements are read before the next step is submitted. The same holds for boxes.
     displacements: Option<DeviceBuffer>,
     output_ring: OutputRing,
     /// Steps in flight, oldest first.
@@ -221,8 +221,8 @@ impl CudaDeformer {
         if target.is_being_read && !self.output.is_shared() {
             self.readbacks.wait_for_reads(&self.device, target.output)?;
         }
-        // The driver may discard the old contents only if the step writes every vertex and reads none. A partial step does
-        // not write the vertices of unchanged domains. The kernels of normals and boxes read positions.
+        // The driver may discard the old contents only if the step writes every vertex and reads none. A partial step
+        // does not write the vertices of unchanged domains. The kernels of normals and boxes read positions.
         let keeps_contents = list_lengths.is_some() || kernels.normals.is_some() || kernels.bounds.boxes.is_some();
         let displacements = self.displacements.as_ref().map_or(0, DeviceBuffer::address);
         let header = StepHeader { displacements, ..header };

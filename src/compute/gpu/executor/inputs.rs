@@ -17,8 +17,8 @@ use modalcast_model::scene::SceneState;
 pub(crate) struct InputAddresses {
     pub header: u64,
     pub transforms: u64,
-    /// Per domain, its transform root (the domain whose transform it uses) and the index of its frame. Constant; only in
-    /// scenes with followers.
+    /// Per domain, its transform root (the domain whose transform it uses) and the index of its frame. Constant; only
+    /// in scenes with followers.
     pub transform_links: u64,
     /// Per follower, its frame: its constant transform relative to its root.
     pub frames: u64,

@@ -8,8 +8,8 @@ use crate::gpu::tables::plan::{BufferRole, DeformPlan};
 use modalcast_model::error::{Error, Result, fault};
 use modalcast_model::raster::{GlBuffer, GlVertexBuffers};
 
-/// Device addresses of the outputs. The address of an OpenGL buffer is valid only while the buffer is mapped. `tangents`
-/// is 0 if the scene has no tangents.
+/// Device addresses of the outputs. The address of an OpenGL buffer is valid only while the buffer is mapped.
+/// `tangents` is 0 if the scene has no tangents.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct OutputAddresses {
     pub positions: u64,
@@ -159,7 +159,8 @@ impl OutputBuffers {
         }
     }
 
-    /// Copies a set into `surface_lists` and waits for the copies. Each list must have the length of the plan or be empty.
+    /// Copies a set into `surface_lists` and waits for the copies. Each list must have the length of the plan or be
+    /// empty.
     pub(super) fn read(&mut self, device: &Device, set: usize, surface_lists: SurfaceLists<'_>) -> Result<()> {
         let SurfaceLists { positions, normals, tangents, .. } = surface_lists;
         if let Self::Owned(sets) = self {
@@ -179,8 +180,8 @@ impl OutputBuffers {
         })
     }
 
-    /// Runs `work` with the addresses of an existing set. A shared set is mapped only while `work` runs, so its addresses
-    /// are not valid after `work`. `work` submits to the device's stream.
+    /// Runs `work` with the addresses of an existing set. A shared set is mapped only while `work` runs, so its
+    /// addresses are not valid after `work`. `work` submits to the device's stream.
     pub(super) fn with_addresses(
         &mut self,
         device: &Device,

@@ -89,8 +89,8 @@ impl OutputRing {
     /// Begins a step of `state`, which writes [`Self::next_output`]. That output is not valid until [`Self::end_step`].
     pub(super) fn begin_step(&mut self, state: &SceneState) -> StepTarget {
         if self.last_step == u32::MAX {
-            // After the restart at 0, old step numbers on the device look new. The kernels then compute domains again that did
-            // not change, once, but no result is wrong.
+            // After the restart at 0, old step numbers on the device look new. The kernels then compute domains again
+            // that did not change, once, but no result is wrong.
             self.invalidate();
             (self.last_step, self.last_full_step) = (0, 0);
         }
@@ -239,8 +239,8 @@ mod tests {
         // A list has at most 10 changes: one change by each of `steps` steps, and one by the step after them.
         for (steps, fits_list) in [(4, true), (9, true), (10, false)] {
             let mut output_ring = OutputRing::new(2, 10);
-            // Make both outputs valid. Then end the readback of the current output, so that the next steps write only the
-            // current output, and the other output is idle.
+            // Make both outputs valid. Then end the readback of the current output, so that the next steps write only
+            // the current output, and the other output is idle.
             for serial in 1..5 {
                 step(&mut output_ring, &state(serial, &[]));
                 output_ring.begin_read();

@@ -1,11 +1,11 @@
-//! The compute rasterizer: launches `kernels/raster.cu`. It computes the visible triangle and its depth, or depth alone,
-//! by atomic minima. A pixel has one sample, at its center.
+//! The compute rasterizer: launches `kernels/raster.cu`. It computes the visible triangle and its depth, or depth
+//! alone, by atomic minima. A pixel has one sample, at its center.
 //!
-//! A thread draws a small triangle, whose bounding box has at most 32 samples. A warp draws a medium triangle, of up to 64
-//! x 64 pixels. A larger or clipped triangle is divided into tiles of 64 x 64 pixels, which warps draw. Medium and large
-//! triangles wait in two queues. Each queue has capacity for every triangle, so it cannot overflow, and its length stays
-//! on the device. Samples of cut-outs are tested for alpha before the atomic minimum. The kernels for meshes without
-//! cut-outs are compiled without this test.
+//! A thread draws a small triangle, whose bounding box has at most 32 samples. A warp draws a medium triangle, of up to
+//! 64 x 64 pixels. A larger or clipped triangle is divided into tiles of 64 x 64 pixels, which warps draw. Medium and
+//! large triangles wait in two queues. Each queue has capacity for every triangle, so it cannot overflow, and its
+//! length stays on the device. Samples of cut-outs are tested for alpha before the atomic minimum. The kernels for
+//! meshes without cut-outs are compiled without this test.
 //!
 //! | file | content |
 //! |---|---|
@@ -68,8 +68,8 @@ struct RasterArgs {
 
 const _: () = assert!(size_of::<RasterArgs>() == 176, "RasterArgs differs from kernels/raster.cuh");
 
-/// Lengths of the queues, and numbers of triangles by `TriangleBin` of `kernels/raster.cuh`: small, medium, large, or the
-/// reason why the triangle is culled.
+/// Lengths of the queues, and numbers of triangles by `TriangleBin` of `kernels/raster.cuh`: small, medium, large, or
+/// the reason why the triangle is culled.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Pod, Zeroable)]
 struct RasterCounters {

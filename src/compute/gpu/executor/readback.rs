@@ -6,8 +6,8 @@
 //! step k+1                   [copy in][kernels]      into the other output set
 //! ```
 //! OpenGL's buffers cannot be double-buffered. They are first copied to a back buffer on the device, which takes a
-//! small part of the readback time. After that copy, the next step may overwrite OpenGL's buffers. There is only one device buffer
-//! for displacements and one for boxes, so their copies are synchronous.
+//! small part of the readback time. After that copy, the next step may overwrite OpenGL's buffers. There is only one
+//! device buffer for displacements and one for boxes, so their copies are synchronous.
 //!
 //! Streams, events and memory are allocated on the first fetch.
 

@@ -44,8 +44,8 @@ impl Device {
 
     fn with_context(ordinal: usize) -> Result<Arc<Self>, DriverError> {
         let context = CudaContext::new(ordinal)?;
-        // SAFETY: event tracking orders the accesses of several streams. It is not needed: the stream below orders all work
-        // but readbacks, and the module `readback` orders the copies of its own stream by its own events.
+        // SAFETY: event tracking orders the accesses of several streams. It is not needed: the stream below orders all
+        // work but readbacks, and the module `readback` orders the copies of its own stream by its own events.
         unsafe { context.disable_event_tracking() };
         let stream = context.new_stream()?;
         let name = context.name()?;

@@ -6,9 +6,9 @@ use cudarc::driver::sys::CUresult;
 
 use modalcast_model::error::Error;
 
-/// Whether the context of the device is lost: every later call fails with the same error (the error is "sticky"), and only
-/// a new process can use the device again. These are the errors for which the driver's documentation says "the process
-/// must be terminated and relaunched", and the uncorrectable memory errors.
+/// Whether the context of the device is lost: every later call fails with the same error (the error is "sticky"), and
+/// only a new process can use the device again. These are the errors for which the driver's documentation says "the
+/// process must be terminated and relaunched", and the uncorrectable memory errors.
 const fn is_device_lost(code: CUresult) -> bool {
     matches!(
         code,

@@ -1,11 +1,12 @@
 //! The alpha test of cut-outs for one sample. It defines the result of `kernels/cut_out.cuh`.
 //!
-//! The texture coordinates of a sample are a weighted sum of the texture coordinates of the corners. The weights are the edge functions of
-//! the corners in homogeneous coordinates (Olano and Greer, "Triangle scan conversion using 2D homogeneous
-//! coordinates", 1997). They are perspective-correct without clipping, also for corners behind the eye. First, the
-//! position of the sample is subtracted from the corners, which avoids cancellation for small triangles far from the
-//! center of the window. All numbers are f32; each sum and product is rounded separately, in the order of the kernel. The image is
-//! then filtered trilinearly. The hardware filters with lower precision, and anisotropically if requested.
+//! The texture coordinates of a sample are a weighted sum of the texture coordinates of the corners. The weights are
+//! the edge functions of the corners in homogeneous coordinates (Olano and Greer, "Triangle scan conversion using 2D
+//! homogeneous coordinates", 1997). They are perspective-correct without clipping, also for corners behind the eye.
+//! First, the position of the sample is subtracted from the corners, which avoids cancellation for small triangles far
+//! from the center of the window. All numbers are f32; each sum and product is rounded separately, in the order of the
+//! kernel. The image is then filtered trilinearly. The hardware filters with lower precision, and anisotropically if
+//! requested.
 
 use modalcast_model::raster::{AlphaImage, CutOuts};
 use modalcast_model::scene::Viewport;
@@ -45,9 +46,9 @@ pub fn footprint(
     let weight_scale = 1.0 / (weights[0] + weights[1] + weights[2]);
     let sum = |terms: [f32; 3]| terms[0] + terms[1] + terms[2];
     let uv = [0, 1].map(|axis| sum([0, 1, 2].map(|index| weights[index] * uvs[index][axis])) * weight_scale);
-    // Sums the derivative of each corner's weight, times the difference between the texture coordinates of the corner and
-    // of the sample. The y of the sample decreases as its row increases, which cancels the minus sign of the derivatives
-    // by y.
+    // Sums the derivative of each corner's weight, times the difference between the texture coordinates of the corner
+    // and of the sample. The y of the sample decreases as its row increases, which cancels the minus sign of the
+    // derivatives by y.
     let uv_derivative = |weight_derivatives: [f32; 3], pixel_step: f32| {
         [0, 1].map(|axis| {
             let terms = [0, 1, 2].map(|index| weight_derivatives[index] * (uvs[index][axis] - uv[axis]));

@@ -28,7 +28,7 @@ async fn fetch_single(client: &Client, options: &VerticesOptions, scene: &str) -
 async fn fetch_stream(client: &Client, scene: &str, count: u64, files: &mut OutputFiles<'_>) -> Result<()> {
     let options = files.options;
     let request = VertexStreamRequest::new(scene, vertex_selection(options));
-    let request = request.delivery(options.delivery.into()).replies(count);
+    let request = request.delivery(options.delivery.into()).max_replies(count);
     let mut vertex_stream = client.stream_vertices(&request).await?;
     println!("ready");
     let timeout = Duration::from_secs_f64(options.timeout);
@@ -81,7 +81,7 @@ struct OutputFiles<'a> {
     options: &'a VerticesOptions,
     /// One per array, in the order of [`array_rows`]; empty before the first step.
     writers: Vec<NpyWriter>,
-    /// The origin of the first step. All rows of one array must have the same origin.
+    /// World position of the vertex origin of the first step, in meters. All rows of a file must have the same origin.
     origin: Vec<f64>,
     summary: Summary,
 }

@@ -5,8 +5,8 @@ use modalcast_model::error::{Result, invalid};
 use modalcast_model::raster::{AlphaImage, CutOuts};
 use modalcast_model::scene::DrawRange;
 
-/// Exclusive limit of the number of triangles. The 64-bit counter of the large queue has 24 bits for triangles and 40 bits
-/// for their tiles.
+/// Exclusive limit of the number of triangles. The 64-bit counter of the large queue has 24 bits for triangles and 40
+/// bits for their tiles.
 const MAX_TRIANGLES: usize = 1 << 24;
 
 /// Rejects meshes that would cause out-of-bounds reads or queue overflows. Groups must not overlap, because a triangle
