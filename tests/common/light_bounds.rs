@@ -37,7 +37,7 @@ pub(crate) fn coil_shape(vertices: usize, rank: usize) -> Shape {
     Shape::new(mesh, modes).expect("expected a valid shape")
 }
 
-/// Coils that fill tiles of their own and coils that share tiles.
+/// Large coils with tiles of their own, and coils so small that they share tiles; two domains per coil.
 pub(crate) fn coil_scene(deformation: DeformationSettings) -> Arc<Scene> {
     let normal_maps = false;
     scene_of_shapes(vec![coil_shape(5000, 4), coil_shape(700, 2), coil_shape(9, 1)], 2, deformation, normal_maps)
@@ -76,17 +76,18 @@ fn verify_light_bounds(name: &str, scene: &Scene, result: &StepResult) -> Orient
     let (vertex_box, scene_box) =
         (bounds_in_light_space(scene, &result.surface.positions, 1), scene_box_in_light_space(scene, &result.bounds));
     let magnitude = coordinate_magnitude(&result.bounds);
-    // A tolerance for f64 rounding.
+    // The tolerance is for rounding errors in f64.
     assert!(
         max_excess(&light_box, &vertex_box) <= 1e-12 * magnitude,
         "{name}: expected {light_box:?} to contain {vertex_box:?}"
     );
-    // A tolerance for f32 rounding.
+    // The tolerance is for rounding errors in f32: three products with a relative error of 2^-23 = 1.2e-7 each.
     assert!(
         max_excess(&scene_box, &light_box) <= 4e-7 * magnitude,
         "{name}: expected {light_box:?} within {scene_box:?}"
     );
-    // The scene of one vertex has no diagonal.
+    // Negative control: a box that is smaller than `vertex_box` does not contain it. The scene of one vertex has no
+    // diagonal to shrink.
     let shrunk_box = vertex_box.expanded_by(-1e-3 * result.bounds.diagonal());
     assert!(result.bounds.diagonal() == 0.0 || max_excess(&shrunk_box, &vertex_box) > 0.0, "{name}: negative control");
     light_box

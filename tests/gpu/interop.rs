@@ -18,6 +18,7 @@ fn open_deformer(device: &Arc<Device>, scene: &Arc<Scene>, buffers: Option<GlVer
     CudaDeformer::new(device, scene, buffers, options).expect("expected a CUDA deformer")
 }
 
+/// Opens a renderer and a CUDA device, and creates a scene with normal maps.
 fn open_renderer() -> (Renderer, Arc<Device>, Arc<Scene>) {
     let renderer = Renderer::open(DevicePreference::Cuda(0)).expect("expected an OpenGL context on the CUDA device");
     let scene = scenes::random_scene(
@@ -65,6 +66,7 @@ fn gpu_shared_buffers_are_read_back_during_the_next_step() {
         sharing_deformer.deform(&state).expect("expected the step to succeed");
         copying_deformer.deform(&state).expect("expected the step to succeed");
         let want = copying_deformer.surface().expect("expected a surface").clone();
+        // The readback of this step, and the surface that it must return.
         let readback_and_surface = (
             sharing_deformer.readback(VertexAttributes::POSITIONS_AND_NORMALS).expect("expected a readback to start"),
             want,

@@ -25,7 +25,7 @@ use cli::{Cli, Command, CommonOptions, ForceFileOptions};
 /// every sample are fetched from the server.
 const MAX_TREE_SAMPLES: usize = 24;
 
-/// Maximum number of surface samples per domain of other scenes, which have few domains.
+/// Maximum number of surface samples per domain of other scenes, which usually have few domains.
 const MAX_SAMPLES: usize = 1 << 16;
 
 /// The exit code of a complete run in which the server rejected steps.

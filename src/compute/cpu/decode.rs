@@ -7,8 +7,8 @@
 
 use crate::storage::{PackedWord, TILE_QUADS};
 
-/// Decoded columns, with capacity for four modes, the largest number that is added together. A column
-/// has 12 numbers per quad: three axes of four vertices.
+/// Decoded columns, with capacity for four modes, the largest number that is added together. A column has 12 numbers
+/// per quad: three axes of four vertices.
 pub(super) type Columns = [f32; 4 * 12 * TILE_QUADS];
 
 /// Decodes two modes of f16 exactly, without their factors.

@@ -32,7 +32,7 @@ pub(super) struct DeformOutputs<'a> {
     pub(super) positions: PackedOutput<'a>,
     /// Per tile. Not finite if a position or a displacement of the tile is not finite.
     pub(super) bounds: PerTileOutput<'a, TileBounds>,
-    /// Three f32 per vertex; `None` if the scene does not keep displacements.
+    /// Three f32 per vertex; `None` if displacements are not an output of the scene.
     pub(super) displacements: Option<PackedOutput<'a>>,
 }
 

@@ -36,8 +36,8 @@ use modalcast_model::scene::{CullMode, DrawRange, Viewport};
 
 /// Threads per block.
 const BLOCK_THREADS: u32 = 128;
-/// Blocks per multiprocessor of the kernels that loop over a queue: 16 x 128 = 2048 threads, the largest number that is
-/// resident.
+/// Blocks per multiprocessor of the kernels that loop over a queue: 16 x 128 = 2048 threads, the largest number that
+/// can be resident.
 const BLOCKS_PER_SM: u32 = 16;
 
 /// Value of both 32-bit words (depth and triangle) of a sample of the id pass that no triangle covers.
