@@ -4,8 +4,8 @@
 //! Vertices are read back only on request. [`Deformer::surface`] blocks until they are in host memory;
 //! [`Deformer::readback`] starts a readback that can overlap the next step.
 //!
-//! Three backends implement [`Deformer`]: `reference` (f64, the definition), `cpu` (f32, rayon and SIMD) and `gpu`
-//! (CUDA).
+//! Three backends in the crate `modalcast-compute` implement [`Deformer`]: `reference` (f64, the definition), `cpu`
+//! (f32, rayon and SIMD) and `gpu` (CUDA).
 
 use std::sync::Arc;
 
@@ -156,12 +156,12 @@ pub struct DeformSummary {
     /// Bounds of the same positions along the [`BoundingAxes`] of the deformer, relative to the same origin. `None` if
     /// the deformer was constructed without axes.
     ///
-    /// The bounds contain every vertex. `reference` returns the tight bounds. The other backends first compute the boxes
-    /// of groups of up to 128 vertices, then bound these boxes. Their bounds exceed the tight bounds by less than the
-    /// diagonal of such a box, and extend beyond the corners of `bounds` at most by rounding.
+    /// The bounds contain every vertex. `reference` returns the tight bounds. The other backends first compute the
+    /// world-space boxes of groups of up to 128 vertices, then bound these boxes. Their bounds exceed the tight bounds
+    /// by less than the diagonal of such a box, and extend beyond the corners of `bounds` at most by rounding.
     pub oriented_bounds: Option<OrientedBounds>,
-    /// Milliseconds from the call until the vertices were complete. If they are written to the renderer's own buffers,
-    /// the wait for frames that still read these buffers is not included.
+    /// Milliseconds from the call until the vertices were complete. If the deformer writes to the renderer's own
+    /// buffers, the wait for frames that still read these buffers is not included.
     pub ms: f64,
 }
 

@@ -1,5 +1,6 @@
 //! The error type of the server's crates. The variants distinguish what the caller can correct or retry, what the
-//! operator must repair, and failures of the server itself. Each contains the values that are needed to act on it.
+//! operator must repair, and failures of the server itself. Each variant contains the values that are needed to act on
+//! the error.
 
 /// The error type of the server.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]

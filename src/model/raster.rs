@@ -1,9 +1,9 @@
 //! The trait of the compute rasterizer, the alternative to OpenGL's rasterizer for some passes. The renderer calls it;
-//! `gpu` implements it in CUDA.
+//! the module `gpu` of `modalcast-compute` implements it in CUDA.
 //!
-//! Images have one sample per pixel and rows from top to bottom. `reference::raster` defines the samples of a triangle,
-//! their depths, and the result of the alpha test. Implementations may differ from `reference::raster` in the last bits
-//! of filtered images.
+//! Images have one sample per pixel and rows from top to bottom. The module `reference::raster` of `modalcast-compute`
+//! defines the samples of a triangle, their depths, and the result of the alpha test. Implementations may differ from
+//! it in the last bits of filtered images.
 
 use std::any::Any;
 use std::rc::Rc;
@@ -58,7 +58,7 @@ pub struct RasterGeometry {
     pub positions: GlBuffer,
     /// Vertex indices. The id of a triangle is its index in this list.
     pub triangles: Vec<[u32; 3]>,
-    /// Consecutive ranges that together cover all triangles.
+    /// The draw groups: consecutive ranges that together cover all triangles.
     pub groups: Vec<DrawRange>,
     /// Alpha-tested triangles; `None` if the mesh has none.
     pub cut_outs: Option<CutOuts>,

@@ -38,7 +38,7 @@ impl ComposedTransform {
     }
 
     /// `world_from_domain` in f64, 3x4 row-major. Products of two f32 are exact in f64 and cannot overflow. Sums are
-    /// evaluated from left to right, as on the device, so that both cancel to 0 for the same inputs.
+    /// evaluated from left to right, as in the kernels, so that an entry cancels to 0 either in both or in neither.
     pub fn to_f64(&self) -> [f64; 12] {
         let t = self.root.0.map(f64::from);
         let Some(frame) = self.frame else { return t };
@@ -79,12 +79,14 @@ mod tests {
     #[test]
     fn f64_product_keeps_the_range_and_cancels_to_zero() {
         let scaling = |scale: f32| Transform(Transform::IDENTITY.0.map(|entry| entry * scale));
+        // 1e30^2 overflows f32, and 1e-30^2 underflows it.
         let overflowing = ComposedTransform { root: scaling(1e30), frame: Some(scaling(1e30)) };
         assert_eq!(overflowing.to_f32().0[0], f32::INFINITY);
         assert!((overflowing.to_f64()[0] / 1e60 - 1.0).abs() < 1e-6);
         let underflowing = ComposedTransform { root: scaling(1e-30), frame: Some(scaling(1e-30)) };
         assert_eq!(underflowing.to_f32().0[0], 0.0);
         assert!(underflowing.linear().determinant() > 0.0);
+        // 0.1 * 1 + (-0.1) * 1 is exactly 0.
         let mut opposite_entries = Transform::IDENTITY;
         (opposite_entries.0[0], opposite_entries.0[1]) = (0.1, -0.1);
         let mut column_of_ones = Transform::IDENTITY;

@@ -1,4 +1,5 @@
-//! Phong materials: equation 3.12 of the thesis with clamped dot products, extended by alpha, textures and normal maps.
+//! Phong materials: equation 3.12 of B. Wang's thesis "CUDA Deformers for Model Reduction" with clamped dot products,
+//! extended by alpha, textures and normal maps.
 
 use crate::error::{Result, invalid};
 

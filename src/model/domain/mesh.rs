@@ -88,8 +88,8 @@ impl Mesh {
     }
 }
 
-/// Area-weighted vertex normals, one per corner, for corners without normals. Triangles index corners, and all corners
-/// of a vertex share its normal. The normal is +Z if all triangles at the vertex are degenerate.
+/// Area-weighted vertex normals, one per corner, for meshes without normals. Triangles index corners. All corners of a
+/// vertex have the same normal. The normal is +Z if all triangles at the vertex are degenerate.
 pub fn smooth_normals(rest_positions: &[[f32; 3]], corner_vertices: &[u32], triangles: &[[u32; 3]]) -> Vec<[f32; 3]> {
     let mut normal_sums = vec![nalgebra::Vector3::<f64>::zeros(); rest_positions.len()];
     let position = |vertex: u32| nalgebra::Vector3::from(rest_positions[vertex as usize]).cast::<f64>();
@@ -107,7 +107,7 @@ pub fn smooth_normals(rest_positions: &[[f32; 3]], corner_vertices: &[u32], tria
     corner_vertices.iter().map(normal).collect()
 }
 
-/// Normalizes in f64. A zero vector becomes +Z.
+/// Normalizes in f64. A vector of length 0, or below 1e-30, becomes +Z.
 fn normalize_or_z(normal: [f32; 3]) -> [f32; 3] {
     let normal_f64 = nalgebra::Vector3::from(normal).cast::<f64>();
     normal_f64.try_normalize(1e-30).map_or([0.0, 0.0, 1.0], |unit| unit.cast::<f32>().into())

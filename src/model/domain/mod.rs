@@ -88,21 +88,21 @@ pub struct Attachment {
     pub parent: usize,
     /// `parent_from_child` at rest.
     pub frame: Transform,
-    /// Vertices of the parent near the joint. Clients fit the motion of the joint to their displaced positions. Empty
-    /// for a rigid parent.
+    /// Vertices of the parent near the joint. Clients fit the motion of the joint to the displacements of these
+    /// vertices. Empty for a rigid parent.
     pub rows: Vec<u32>,
 }
 
 /// Attaches a domain to another one by a constant transform: T = T_parent F. The modes of the parent do not affect T.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FollowConstraint {
-    /// Index of the followed domain, smaller than that of the follower. The followed domain may be a follower itself.
+    /// Index of the followed domain, smaller than the follower's index. The followed domain may be a follower itself.
     pub parent: usize,
     /// F, `parent_from_child`.
     pub frame: Transform,
 }
 
-/// The triangles of a domain that have one material. A range ends where the next range begins.
+/// Consecutive triangles of a domain that have one material. A range ends where the next range begins.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct MaterialRange {
     pub first_triangle: usize,
@@ -121,8 +121,8 @@ pub struct Domain {
     /// Ranges of triangles with different materials, ascending. The first range begins at triangle 0. Empty if all
     /// triangles have `material`.
     pub material_ranges: Vec<MaterialRange>,
-    /// `world_from_domain` at rest. [`crate::scene::Scene::new`] replaces the placement of a follower by that of its
-    /// root, composed with its frame.
+    /// `world_from_domain` at rest. [`crate::scene::Scene::new`] replaces the placement of a follower by the placement
+    /// of its root domain times the follower's frame.
     pub placement: Transform,
     pub attachment: Option<Attachment>,
     /// Present if the domain moves with another one. Steps cannot set the transform of such a domain.
@@ -151,7 +151,7 @@ impl Domain {
         }
     }
 
-    /// Indices of the materials of the domain's triangles, one per range.
+    /// Indices of the materials of the domain's triangles: one per range, or `material` if there are no ranges.
     pub fn materials(&self) -> impl Iterator<Item = usize> + '_ {
         let single_material = self.material_ranges.is_empty().then_some(self.material);
         single_material.into_iter().chain(self.material_ranges.iter().map(|range| range.material))

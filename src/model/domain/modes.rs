@@ -119,8 +119,12 @@ mod tests {
 
     #[test]
     fn block_at_point_interpolates_the_rows_of_the_vertices() {
+        // Three vertices and two modes: the entry of component c of vertex v is 3 v + c in mode 0 and 9 + 3 v + c in
+        // mode 1.
         let modes = Modes::from_columns(9, 2, (0..18).map(|entry| entry as f32).collect()).expect("valid modes");
+        // All weight is on vertex 0.
         assert_eq!(modes.block_at_point([2, 0, 1], [0.0, 1.0, 0.0]), [0.0, 9.0, 1.0, 10.0, 2.0, 11.0]);
+        // The mean of the three vertices equals vertex 1.
         let center = [1.0 / 3.0; 3];
         assert_eq!(modes.block_at_point([0, 1, 2], center), [3.0, 12.0, 4.0, 13.0, 5.0, 14.0]);
         assert!(Modes::rigid().block_at_point([0, 1, 2], center).is_empty());

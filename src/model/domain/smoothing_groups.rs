@@ -1,15 +1,15 @@
 //! Smoothing groups of a mesh and the triangles around each group, for the normals of a deformed surface.
 //!
 //! Corners of one vertex whose rest normals agree within 0.1 degrees form a group: a texture seam splits corners but
-//! not groups, a hard edge splits both. The triangles adjacent to a group are stored as a ring: the group's vertex
-//! first, then the fans of the vertices around it, if any. The first vertex of each fan has the flag [`RING_START`]. Two
-//! consecutive vertices of a fan form a triangle with the group's vertex, in winding order. A closed fan of k triangles
-//! repeats its first vertex at the end, so the ring takes k + 2 entries instead of the 2 k of a list of edges, and each
-//! vertex is read once instead of twice.
+//! not groups, a hard edge splits both. The triangles adjacent to a group are stored as a ring: the group's vertex,
+//! then zero or more fans. A fan is a sequence of neighbors of the group's vertex. Two consecutive neighbors form a
+//! triangle with the group's vertex, in winding order. The first neighbor of each fan has the flag [`RING_START`]. A
+//! closed fan of k triangles repeats its first neighbor at the end, so the ring takes k + 2 entries instead of the 2 k
+//! of a list of edges, and each neighbor is read once instead of twice.
 //!
-//! Memory: 4 bytes per corner, and 20 bytes per group (ring offset, vertex and geometric normal). The vertices around a
-//! group take 4 (k + 1) bytes for k triangles in one fan. The worst case is 24 bytes per triangle of the mesh, if no
-//! two triangles of a group share an edge.
+//! Memory: 4 bytes per corner, 20 bytes per group (ring offset, vertex and geometric normal), and 4 (k + 1) bytes per
+//! fan of k triangles. The worst case of the fans is 24 bytes per triangle of the mesh (3 groups x 2 neighbors x 4
+//! bytes), if no two triangles of a group share an edge.
 
 use nalgebra::Vector3;
 
@@ -18,14 +18,16 @@ use super::Mesh;
 /// Flag of the first vertex of each fan of a ring.
 pub const RING_START: u32 = 1 << 31;
 
-/// The largest number of triangles, over all shapes, whose rings a 32-bit index can address.
+/// The largest number of triangles of all shapes together. A triangle adds at most two neighbors to the fans of each of
+/// its three groups, so 32-bit offsets can address all rings.
 pub const MAX_RING_TRIANGLES: usize = 1 << 28;
 
-/// The largest distance of a rest normal from that of its group's representative: the chord of 0.1 degrees.
+/// The largest distance between a rest normal and the rest normal of its group's representative: the chord of 0.1
+/// degrees on the unit sphere.
 const SAME_NORMAL_CHORD: f64 = 1.745_329e-3;
 
-/// A group whose area vectors cancel to less than this fraction of their total length has no geometric normal, for
-/// example a leaf whose two sides share corners.
+/// A group whose area vectors cancel to less than this fraction of their total length has no geometric normal, because
+/// a small deformation would turn it arbitrarily. An example is a leaf whose two sides share corners.
 const CANCELLATION_RATIO: f64 = 1.0 / 1024.0;
 
 /// The smoothing groups of one mesh.
@@ -83,7 +85,7 @@ impl SmoothingGroups {
         &self.rings
     }
 
-    /// The ring of one group: its vertex, then the fans of vertices around it.
+    /// The ring of one group: its vertex, then its fans.
     pub fn ring(&self, group: usize) -> &[u32] {
         &self.rings[self.ring_offsets[group] as usize..self.ring_offsets[group + 1] as usize]
     }
@@ -133,9 +135,9 @@ fn group_representatives(mesh: &Mesh) -> Vec<u32> {
     representative_of_corner
 }
 
-/// The distance of two points in their first `axes` coordinates.
-fn chord_distance(a: [f32; 3], b: [f32; 3], axes: usize) -> f64 {
-    (0..axes).map(|axis| (f64::from(a[axis]) - f64::from(b[axis])).powi(2)).sum::<f64>().sqrt()
+/// The distance of two normals in their first `axis_count` coordinates.
+fn chord_distance(a: [f32; 3], b: [f32; 3], axis_count: usize) -> f64 {
+    (0..axis_count).map(|axis| (f64::from(a[axis]) - f64::from(b[axis])).powi(2)).sum::<f64>().sqrt()
 }
 
 /// Numbers the groups in the order of their first corners. Returns the group of each corner.
@@ -154,9 +156,10 @@ fn number_groups(representative_of_corner: &[u32]) -> Vec<u32> {
     representative_of_corner.iter().map(group_of).collect()
 }
 
-/// The offset of each group's edges, and the opposite edges of all groups. A triangle that contains a vertex twice has
-/// no area in any state and is omitted.
+/// The opposite edges of all groups, sorted by group, and the offset of each group's edges. The offsets come first. A
+/// triangle that contains a vertex twice has no area in any state and is omitted.
 fn opposite_edges_of_groups(mesh: &Mesh, corner_groups: &[u32], group_count: usize) -> (Vec<usize>, Vec<OppositeEdge>) {
+    // For each corner of each triangle: its group, and the edge opposite to it.
     let group_edges = || {
         mesh.triangles().iter().flat_map(|triangle| {
             let [a, b, c] = triangle.map(|corner| mesh.corners().vertices[corner as usize]);
@@ -210,6 +213,7 @@ impl FanBuilder {
         self.ends.clear();
         self.ends.extend(edges.iter().map(|(_, to)| *to));
         self.ends.sort_unstable();
+        // An open fan begins at a vertex where no edge ends.
         for is_open in [true, false] {
             for (begin, _) in edges.iter() {
                 if self.ends.binary_search(begin).is_err() == is_open {
@@ -252,7 +256,7 @@ mod tests {
         edges
     }
 
-    /// A mesh with the given corners (vertex, normal) and triangles over scattered positions.
+    /// A mesh with the given corners (vertex, normal) and triangles. The positions of its 60 vertices are arbitrary.
     fn mesh(corners: &[(u32, [f32; 3])], triangles: Vec<[u32; 3]>) -> Mesh {
         let rest_positions =
             (0..60_u32).map(|index| [index as f32, (index * index % 17) as f32, (index * 5 % 7) as f32]).collect();
@@ -266,12 +270,14 @@ mod tests {
     #[test]
     fn groups_are_independent_of_the_order_of_corners() {
         let tilted_normal = |angle: f32| [angle.to_radians().sin(), 0.0, angle.to_radians().cos()];
+        // At vertex 3, the normals at 0 and 0.09 degrees form a group. The normal at 0.3 degrees is in another one.
         let corners =
             [(3, SIDE), (5, UP), (3, tilted_normal(0.09)), (3, UP), (3, tilted_normal(0.3)), (5, UP), (4, UP)];
         let groups = SmoothingGroups::from_mesh(&mesh(&corners, vec![[0, 1, 6]]));
         assert_eq!(groups.corner_groups(), [0, 1, 2, 2, 3, 1, 4]);
         let mut reversed_corners = corners;
         reversed_corners.reverse();
+        // The same groups, numbered in the order of their first corners.
         assert_eq!(
             SmoothingGroups::from_mesh(&mesh(&reversed_corners, vec![[0, 1, 6]])).corner_groups(),
             [0, 1, 2, 3, 3, 1, 4]
@@ -294,8 +300,10 @@ mod tests {
             for group in 0..groups.group_count() {
                 let mut expected_edges = Vec::new();
                 for (i, triangle) in triangles.iter().flat_map(|triangle| (0..3).map(move |i| (i, triangle))) {
+                    // The triangle, beginning with its corner i.
                     let [a, b, c] = [0, 1, 2].map(|offset| vertex(triangle[(i + offset) % 3]));
-                    if groups.corner_groups()[triangle[i] as usize] as usize == group && a != b && b != c && c != a {
+                    let is_in_group = groups.corner_groups()[triangle[i] as usize] as usize == group;
+                    if is_in_group && a != b && b != c && c != a {
                         assert_eq!(a, groups.ring(group)[0]);
                         expected_edges.push((b, c));
                     }
@@ -308,6 +316,7 @@ mod tests {
 
     #[test]
     fn ring_of_k_triangles_has_k_plus_two_entries() {
+        // One corner, and so one group, per vertex. Group 0 is the center of six triangles; vertex 7 has no triangle.
         let corners: Vec<_> = (0..8).map(|vertex| (vertex, UP)).collect();
         let closed_fan = (1..=6).map(|vertex| [0, vertex, vertex % 6 + 1]).collect();
         let groups = SmoothingGroups::from_mesh(&mesh(&corners, closed_fan));
@@ -334,7 +343,8 @@ mod tests {
         assert_eq!(geometric_normal(vec![[0, 1, 1]]), [0.0; 3], "a repeated vertex");
     }
 
-    /// 100,000 corners at one vertex: a quadratic search for groups would take too long.
+    /// 100,000 corners at one vertex: a quadratic search for groups would take too long. Their normals form a spiral
+    /// around the unit sphere.
     #[test]
     fn many_groups_at_one_vertex_need_linear_memory() {
         let spiral_normal = |index: u32| {
@@ -346,6 +356,7 @@ mod tests {
         let smoothing = SmoothingGroups::from_mesh(&mesh(&corners, vec![[0, 1, 2]; 100_000]));
         assert!(smoothing.group_count() > 50_000, "{} groups", smoothing.group_count());
         let group_count = smoothing.group_count() as u64;
+        // The last 4 bytes are the end of the last ring in `ring_offsets`.
         assert_eq!(
             smoothing.bytes(),
             4 * 100_000 + 20 * group_count + 4,

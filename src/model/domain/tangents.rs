@@ -23,10 +23,11 @@ pub(super) fn lengyel_tangents(mesh: &Mesh) -> Vec<[f32; 4]> {
             }
         }
     }
-    let tangent_of = |((normal, tangent), bitangent): ((&[f32; 3], &Vector3<f64>), &Vector3<f64>)| {
-        orthogonalize(Vector3::from(*normal).cast(), *tangent, *bitangent)
+    let tangent_of = |corner: usize| {
+        let normal = Vector3::from(corners.normals[corner]).cast();
+        orthogonalize(normal, tangent_sums[corner], bitangent_sums[corner])
     };
-    corners.normals.iter().zip(&tangent_sums).zip(&bitangent_sums).map(tangent_of).collect()
+    (0..corners.vertices.len()).map(tangent_of).collect()
 }
 
 /// Derivatives of the position along u and along v over one triangle. `None` if the triangle has no area in (u, v).
@@ -37,7 +38,8 @@ fn uv_gradients(mesh: &Mesh, triangle: [u32; 3]) -> Option<(Vector3<f64>, Vector
     let uv = |corner: u32| corners.uvs[corner as usize].map(f64::from);
     let [a, b, c] = triangle;
     let (edge1, edge2) = (position(b) - position(a), position(c) - position(a));
-    // Corners have v downwards from the top of the image. The tangent frame of a normal map has v upwards.
+    // (s, t): each edge in texture coordinates, in Lengyel's notation. t has the opposite sign of v, because v of a
+    // corner points downwards in the image, and the tangent frame of a normal map has v upwards.
     let (s1, t1) = (uv(b)[0] - uv(a)[0], uv(a)[1] - uv(b)[1]);
     let (s2, t2) = (uv(c)[0] - uv(a)[0], uv(a)[1] - uv(c)[1]);
     let uv_area = s1 * t2 - s2 * t1;
@@ -49,6 +51,7 @@ fn uv_gradients(mesh: &Mesh, triangle: [u32; 3]) -> Option<(Vector3<f64>, Vector
 
 /// The tangent, orthogonalized against the normal, and the sign of the bitangent.
 fn orthogonalize(normal: Vector3<f64>, tangent: Vector3<f64>, bitangent: Vector3<f64>) -> [f32; 4] {
+    // A tangent shorter than 1e-20 counts as zero.
     let projected = (tangent - normal * normal.dot(&tangent)).try_normalize(1e-20);
     let (unit_tangent, sign) = match projected {
         Some(unit_tangent) if normal.cross(&unit_tangent).dot(&bitangent) < 0.0 => (unit_tangent, -1.0),
@@ -58,7 +61,9 @@ fn orthogonalize(normal: Vector3<f64>, tangent: Vector3<f64>, bitangent: Vector3
     [unit_tangent.x as f32, unit_tangent.y as f32, unit_tangent.z as f32, sign]
 }
 
+/// A unit vector orthogonal to the unit vector `normal`.
 fn any_orthogonal(normal: Vector3<f64>) -> Vector3<f64> {
+    // An axis that is not nearly parallel to `normal`.
     let axis = if normal.x.abs() < 0.9 { Vector3::x() } else { Vector3::y() };
     normal.cross(&axis).normalize()
 }

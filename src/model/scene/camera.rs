@@ -54,7 +54,7 @@ impl BoundingBox {
         (Point3::from(self.max) - Point3::from(self.min)).norm()
     }
 
-    /// The eight corners.
+    /// The eight corners. Bit `axis` of a corner's index selects the maximum along that axis.
     pub fn corners(&self) -> [Point3<f64>; 8] {
         std::array::from_fn(|corner| {
             Point3::from(std::array::from_fn(
@@ -133,6 +133,7 @@ impl Camera {
             let forward = Vector3::from(target) - Vector3::from(eye);
             let cross_norm = forward.cross(&Vector3::from(up)).norm();
             let look_at_text = || format!("eye {eye:?}, target {target:?}, up {up:?}");
+            // Below 1e-12, the sine of the angle between `forward` and `up` is rounding error.
             if !(cross_norm.is_finite() && cross_norm > 1e-12 * forward.norm() * Vector3::from(up).norm()) {
                 return Err(invalid(
                     "camera.look_at",
@@ -251,9 +252,11 @@ impl Camera {
         let depths = bounds.corners().map(|corner| depth(&corner));
         let farthest = depths.iter().copied().fold(0.0, f64::max);
         let nearest = depths.iter().copied().fold(f64::INFINITY, f64::min);
-        // Four diagonals of ground behind the bounds. `near` is at least far / 10,000 to keep the precision of depth.
+        // `far` includes four diagonals of ground behind the bounds. `near` is at least far / 10,000 to keep the
+        // precision of depth.
         let far = (farthest.max(0.0) + 4.0 * bounds.diagonal()).max(1e-6);
-        ((0.5 * nearest).clamp(far * 1e-4, far * 0.5), far)
+        let near = (0.5 * nearest).clamp(far * 1e-4, far * 0.5);
+        (near, far)
     }
 }
 
@@ -310,6 +313,7 @@ mod tests {
             (candidate.validated().expect("a valid camera").camera_from_world() - expected).abs().max()
         };
         assert!(error(camera.relative_to(origin)) < 1e-12);
+        // The pose was computed at 1e7, where f64 has a spacing of 2e-9.
         assert!(error(Camera { view: View::Pose(pose), ..camera }.relative_to(origin)) < 1e-7);
         // Control: near 1e7, f32 has a spacing of 1, so a pose that is rounded before the subtraction loses its fraction.
         let rounded_pose = View::Pose(pose.map(|number| f64::from(number as f32)));
@@ -321,7 +325,7 @@ mod tests {
         }
     }
 
-    /// A scene of one triangle whose bounding box has this size.
+    /// A scene of one triangle whose bounding box has the given size.
     fn block(size: [f32; 3]) -> std::sync::Arc<Scene> {
         use crate::domain::{Domain, Material, Mesh, Modes, Shape};
         let rest_positions = vec![[0.0; 3], size, [size[0], 0.0, 0.0]];

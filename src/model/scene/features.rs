@@ -23,7 +23,7 @@ pub struct SceneFeatures {
     pub shear: bool,
     /// Normals are computed from the deformed triangles; requires their adjacency.
     pub exact_normals: bool,
-    /// Modes that are negligible at a step's q are skipped; requires lists of modes.
+    /// Modes that are negligible at a step's q are skipped; requires a list of the remaining modes in every step.
     pub truncation: bool,
     /// Sums over modes are compensated: their rounding errors are accumulated and added.
     pub compensated: bool,

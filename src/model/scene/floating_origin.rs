@@ -9,9 +9,9 @@
 //!
 //! Error bound per axis: rounding a translation contributes at most 2^-13 units at `ORIGIN_REACH`. Each of the three
 //! fused multiply-adds of x = A p + t contributes at most 2^-12 units while the vertex is within 8192 units of its
-//! floating origin. In a scene of meters that is 0.86 mm. The translation of an outlier is at most 512 units per axis,
-//! and the error of its vertices within 1024 units is at most 0.11 mm. The f32 rounding of A and p adds to this bound,
-//! independent of the domain's position.
+//! floating origin. The sum is 7 x 2^-13 units, which is 0.86 mm in a scene of meters. The translation of an outlier is
+//! at most 512 units per axis from its own floating origin, so that within 1024 units the sum is 7 x 2^-16 units or
+//! 0.11 mm. The f32 rounding of A and p adds to this bound, independent of the domain's position.
 //!
 //! A follower has no translation of its own: it uses the floating origin of its transform root. Where this module says
 //! "domain", it means a transform root. Translations have the order of the roots' transforms.
@@ -154,9 +154,11 @@ impl FloatingOrigins {
 
     /// Rebases positions from the floating origins of their domains to `reference_point`, in scene units from the
     /// scene's origin. The result is computed in f64 and rounded to f32 once. `positions` has three numbers per vertex
-    /// in layout order. Also returns the bounds of the domains that are not much farther from `reference_point` than
-    /// the nearest one. Much more distant domains are excluded, because they would make the bounds too large to fit a
-    /// camera or shadow map to.
+    /// in layout order.
+    ///
+    /// Also returns the bounds of the near domains. With d as the distance from `reference_point` to the nearest
+    /// floating origin, a domain is near if the distance of its floating origin is at most [`ORIGIN_REACH`] + 4 d. More
+    /// distant domains would make the bounds too large to fit a camera or shadow map to.
     pub fn rebase_positions(
         &self,
         reference_point: [f64; 3],
@@ -186,7 +188,7 @@ impl FloatingOrigins {
     }
 }
 
-/// The grid point nearest to a point, which is its floating origin if it has one of its own.
+/// The grid point nearest to a point. It is the floating origin of an outlier whose translation is `point`.
 pub fn snap_to_origin_grid(point: [f64; 3]) -> [f64; 3] {
     point.map(|coordinate| (coordinate / ORIGIN_GRID).round() * ORIGIN_GRID)
 }

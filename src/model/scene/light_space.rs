@@ -10,8 +10,8 @@ use nalgebra::Vector3;
 use super::shadow::ShadowFit;
 use super::{BoundingBox, Scene, UpAxis};
 
-/// The x, y and z axes of light space as unit vectors in the world. z is v_l, the direction to the sun, and y points
-/// up. If z is vertical, the choice of y is arbitrary.
+/// The x, y and z axes of light space as unit vectors in the world. z is the direction to the sun (v_l in the thesis),
+/// and y points up. If z is vertical, the choice of y is arbitrary.
 pub fn light_axes(to_sun: Vector3<f64>, up: UpAxis) -> [Vector3<f64>; 3] {
     let horizontal = up.vector().cross(&to_sun);
     let x = horizontal.try_normalize(1e-6).unwrap_or_else(|| {

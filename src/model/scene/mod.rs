@@ -74,7 +74,7 @@ pub struct SceneParts {
     pub deformation: DeformationSettings,
     /// Declares that no step will shear or non-uniformly scale a domain; a step that does is rejected.
     pub rigid_transforms: bool,
-    /// Warnings about input that could not be used, for `inspect` and the log.
+    /// Warnings about input that could not be used, for clients, the command `inspect` and the log.
     pub remarks: Vec<String>,
 }
 
@@ -429,6 +429,7 @@ mod tests {
             let mut parts = square(vec![]);
             let mut domain = parts.domains[0].clone();
             domain.name = "x".repeat(name_bytes);
+            // The names "a" and "b" and the text "y" take 3 bytes.
             domain.metadata.notes = [("a".into(), "x".repeat(notes_bytes - 3)), ("b".into(), "y".into())].into();
             domain.attachment = Some(Attachment { parent: 0, frame: Transform::IDENTITY, rows: vec![3; row_count] });
             parts.domains.push(domain);

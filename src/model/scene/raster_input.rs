@@ -85,6 +85,7 @@ mod tests {
     fn viewport_side_is_limited() {
         let viewport = |width, height| Viewport::new(&Matrix4::identity(), width, height);
         assert!(viewport(0, 1).is_err() && viewport(1, 0).is_err() && viewport(MAX_VIEWPORT_SIDE + 1, 1).is_err());
+        // The half size is (8192, 0.5) pixels, and the guard band ends at 16384 / 8192 = 2.
         let largest_viewport = viewport(MAX_VIEWPORT_SIDE, 1).expect("a valid viewport");
         assert_eq!((largest_viewport.guard_band()[0], largest_viewport.half_size()), (2.0, [8192.0, 0.5]));
     }

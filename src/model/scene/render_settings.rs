@@ -131,7 +131,8 @@ impl Default for RenderSettings {
     fn default() -> Self {
         Self {
             sun: [0.45, 0.80, 0.55],
-            // Sunlight and skylight add up to about 1, so that white surfaces are not clipped to uniform white.
+            // Sunlight and skylight add up to about 1 per channel, so that white surfaces are not clipped to uniform
+            // white.
             sunlight: [0.82, 0.77, 0.69],
             skylight: [0.25, 0.28, 0.33],
             zenith: [0.16, 0.36, 0.72],

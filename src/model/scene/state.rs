@@ -36,9 +36,9 @@ pub struct SceneState {
     pub transforms: Vec<Transform>,
     /// The f64 translations and floating origins. Present after the first step with f64 translations.
     pub origins: Option<Arc<FloatingOrigins>>,
-    /// Number of updates of this state; 0 at rest. If a deformer computed the state with serial s and receives the one
-    /// with serial s + 1, it may compute only the domains in `dirty_domains`. It must compute all domains for any other
-    /// pair of serials, including equal ones, and after a failed step.
+    /// Number of updates of this state; 0 at rest. If a deformer computed the state with serial s and receives the
+    /// state with serial s + 1, it may compute only the domains in `dirty_domains`. It must compute all domains for any
+    /// other pair of serials, including equal serials, and after a failed step.
     pub serial: u64,
     /// The domains that the last update changed.
     pub dirty_domains: DirtyDomains,
@@ -67,8 +67,8 @@ impl SceneState {
     }
 
     /// Applies a step. Domains that the step does not contain keep their values. The cost is proportional to the number
-    /// of domains in the step, their followers, and the domains that share their q. The first step with f64
-    /// translations also visits all transform roots. So do the rare later steps in which [`FloatingOrigins`] searches
+    /// of domains in the step, their followers, and the domains that share their q. Two kinds of steps also visit all
+    /// transform roots: the first step with f64 translations, and the rare steps in which [`FloatingOrigins`] searches
     /// for a floating origin that more roots can share.
     pub fn apply(&mut self, scene: &Scene, update: &StepUpdate) {
         self.step = update.number;
@@ -93,8 +93,8 @@ impl SceneState {
         self.dirty_domains = if is_rebased { DirtyDomains::All } else { DirtyDomains::Some(changed_domains) };
     }
 
-    /// Sets the transforms of a step. Returns true if transforms of other domains were rebased to another floating
-    /// origin.
+    /// Sets the transforms of a step. Returns true if transforms were rebased: converted to another floating origin,
+    /// also for domains that the step does not contain.
     fn apply_transforms(&mut self, transform_roots: &TransformRoots, update: &StepUpdate) -> bool {
         let is_first_f64_step = self.origins.is_none() && update.has_f64_translations();
         if is_first_f64_step {
@@ -109,14 +109,15 @@ impl SceneState {
             }
             return false;
         };
-        // If all roots use the scene's origin, the transforms of other domains are relative to it already.
-        let is_rebased = is_first_f64_step && !origins.is_uniform();
+        // Before the first f64 step, all transforms are relative to the scene's origin. If some root has a floating
+        // origin of its own, they must be rebased.
+        let needs_first_rebase = is_first_f64_step && !origins.is_uniform();
         for (domain, transform, translation) in update.transform_updates() {
             let root = transform_roots.root_of(domain);
             origins.set_translation(root, translation);
             self.transforms[root] = origins.rebase_transform(root, transform);
         }
-        let is_rebased = origins.update_shared_origin() || is_rebased;
+        let is_rebased = origins.update_shared_origin() || needs_first_rebase;
         if is_rebased {
             // Each transform gets its stored f64 translation relative to the floating origin of its root.
             for (root, transform) in self.transforms.iter_mut().enumerate() {

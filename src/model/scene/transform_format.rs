@@ -134,6 +134,7 @@ mod tests {
     fn quaternion_is_normalized_within_the_tolerance() {
         let parse_with_w = |w: f32| parse_rigid_f32(&pack([0.0, 0.0, 0.0, w], [vec![0; 12]])[1..]);
         assert_eq!(parse_with_w(1.0009).expect("a norm within the tolerance").0, Transform::IDENTITY);
+        // A quaternion and its negative are the same rotation.
         assert_eq!(parse_with_w(-0.9991).expect("a norm within the tolerance").0, Transform::IDENTITY);
         for (w, norm_text) in [(1.002, "norm 1.00199"), (0.998, "norm 0.99800"), (0.0, "norm 0"), (3e38, "norm 300000")]
         {
@@ -165,6 +166,7 @@ mod tests {
             let translation = [x, 0.0, 0.0].map(|number| number.to_le_bytes().to_vec());
             parse_rigid_f64(&pack([0.0, 0.0, 0.0, 1.0], translation)[1..], [origin, 0.0, 0.0]).map(drop)
         };
+        // MAX_TRANSLATION is about 1.1e12. It also limits the difference from the scene's origin.
         assert_eq!(parse_at(MAX_TRANSLATION, 0.0), Ok(()));
         for (x, origin) in [(2e12, 0.0), (2e12, 2e12), (1e12, -1e12), (f64::INFINITY, 0.0), (f64::NAN, 0.0)] {
             let message = parse_at(x, origin).expect_err("an invalid translation").to_string();

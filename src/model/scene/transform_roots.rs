@@ -183,7 +183,8 @@ mod tests {
         Domain::new(format!("point {index}"), 0)
     }
 
-    /// Five domains of one vertex. Each pair (child, parent) adds a follower with a frame at x = 1, 2, 3, ...
+    /// Five domains of one vertex. Each pair (child, parent) makes a domain a follower. The frame of the first pair is a
+    /// translation by x = 1, that of the second by x = 2, and so on.
     fn scene_with_followers(pairs: &[(usize, usize)]) -> SceneParts {
         let mut parts = SceneParts::named("points");
         let mesh =
@@ -206,6 +207,8 @@ mod tests {
         let transform_roots = &scene.transform_roots;
         assert_eq!((transform_roots.count(), transform_roots.domains().collect::<Vec<_>>()), (2, vec![0, 3]));
         assert_eq!([0, 1, 2, 3, 4].map(|domain| transform_roots.root_of(domain)), [0, 0, 0, 1, 1]);
+        // Domain 2 follows domain 1, so its frame relative to domain 0 is 1 + 2. Domain 4 has the frame of the third
+        // pair.
         let frames = [0, 1, 2, 3, 4].map(|domain| transform_roots.root_from_domain(domain));
         assert_eq!(frames, [None, Some(translate_x(1.0)), Some(translate_x(3.0)), None, Some(translate_x(3.0))]);
         assert_eq!(
@@ -256,6 +259,7 @@ mod tests {
             let message = build_error(child, parent, 1.0);
             assert!(message.starts_with("domain 2: follows.parent: expected an index below 2"), "{message}");
         }
+        // The frame of domain 2 relative to domain 0 has the entry 1e30^2, which overflows f32.
         assert!(
             build_error(2, 1, 1e30).starts_with("domain 2: follows.frame: transform[0]"),
             "{}",

@@ -89,6 +89,7 @@ fn changed_domains_include_those_that_share_coordinates() {
         state.apply(&scene, &parse_step(&scene, &raw));
         assert_eq!((state.serial, &state.dirty_domains), (serial as u64 + 1, &DirtyDomains::Some(changed_domains)));
     }
+    // The ninth update, after eight steps.
     state.mark_all_dirty();
     assert_eq!((state.serial, &state.dirty_domains), (9, &DirtyDomains::All));
 }
@@ -127,7 +128,7 @@ fn changed_domains_are_complete_and_minimal() {
     }
 }
 
-/// One number per domain that depends on all of its q and T.
+/// For each domain, a weighted sum of all entries of its q and T. The weights distinguish the states of the tests.
 fn fingerprints(scene: &Scene, state: &SceneState) -> Vec<f64> {
     let fingerprint = |domain: usize| {
         let q: f64 = state.q_of(scene, domain).iter().zip([1.0, 10.0]).map(|(q, weight)| f64::from(*q) * weight).sum();
@@ -160,6 +161,7 @@ fn distant_domain_has_its_own_floating_origin() {
         (state.origin_of(0), state.origin_of(2)),
         ([0.0; 3], [9766.0 * ORIGIN_GRID, -9766.0 * ORIGIN_GRID, 0.0])
     );
+    // The translation is within 512 units of its floating origin, where rounding to f32 changes it by at most 2^-16.
     let error = (0..3).map(|axis| (world_position(&state, 2)[axis] - position[axis]).abs()).fold(0.0, f64::max);
     assert!(error <= 2e-5, "{error} units");
     assert!((f64::from(position[0] as f32) - position[0]).abs() > 5e-4, "expected f32 to lose a millimeter");
@@ -203,6 +205,7 @@ fn shared_origin_follows_the_majority_of_the_domains() {
         ([9766.0 * ORIGIN_GRID, 0.0, -9766.0 * ORIGIN_GRID], &DirtyDomains::Some(vec![0, 1, 2, 3]))
     );
     state.apply(&scene, &parse_step(&scene, &f64_step(&[0, 1, 2, 3], &distant_positions(1e7 + 9000.0))));
+    // (1e7 + 9000) / 1024 = 9774.4
     assert_eq!(
         (state.origin_of(0), &state.dirty_domains),
         ([9774.0 * ORIGIN_GRID, 0.0, -9774.0 * ORIGIN_GRID], &DirtyDomains::All)
@@ -222,6 +225,7 @@ fn first_f64_step_rebases_distant_f32_transforms() {
 fn scattered_scene_is_not_searched_in_every_step() {
     let scene = scene(4);
     let positions = [0.0, 1e5, 2e5, 3e5].map(|x| [x, x, x]);
+    // The first step searches for a shared origin. The next search needs four more translations, one per domain.
     let mut state = state_after(&scene, &[f64_step(&[0, 1, 2, 3], &positions)]);
     let shared_origin = state.origins.as_ref().map(|origins| origins.shared_origin());
     for _ in 0..3 {
