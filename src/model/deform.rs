@@ -12,7 +12,8 @@ use std::sync::Arc;
 use crate::error::{Result, fault};
 use crate::scene::{BoundingBox, OrientedBounds, SceneState};
 
-/// Deformed vertices of a whole scene, packed as in [`Layout`](crate::scene::Layout).
+/// Deformed vertices of a whole scene, packed as in [`Layout`](crate::scene::Layout). A corner is a vertex with a
+/// normal and texture coordinates.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct DeformedSurface {
     /// World positions, three numbers per vertex, relative to the floating origin of their domain

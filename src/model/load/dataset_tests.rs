@@ -1,5 +1,5 @@
 //! Tests of the loaders with datasets from other tools. They are ignored by default, because the datasets are not part
-//! of the repository.
+//! of the repository. Expected counts and sizes are properties of the datasets.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -16,21 +16,24 @@ fn open_scene(path: &str) -> Arc<Scene> {
     super::open(&dataset_path(path)).unwrap_or_else(|error| panic!("{path}: {error}")).scene
 }
 
-/// Opens a folder with a `scene.toml` of this text.
+/// Opens a scene whose `scene.toml` has this text.
 fn open_manifest(text: &str) -> crate::error::Result<Arc<Scene>> {
     let folder = tempfile::tempdir().expect("a temporary folder");
     std::fs::write(folder.path().join("scene.toml"), text).expect("a writable file");
     super::open(folder.path().to_str().expect("a UTF-8 path")).map(|opened| opened.scene)
 }
 
+/// The number of vertices that no mode moves.
 fn count_fixed_vertices(scene: &Scene) -> usize {
     let modes = &scene.shapes[0].modes;
-    let is_zero = |vertex: &usize| (0..3 * modes.rank()).all(|entry| modes.entry(*vertex, entry % 3, entry / 3) == 0.0);
-    (0..modes.vertices()).filter(is_zero).count()
+    let is_fixed = |vertex: &usize| {
+        (0..modes.rank()).all(|mode| (0..3).all(|component| modes.entry(*vertex, component, mode) == 0.0))
+    };
+    (0..modes.vertices()).filter(is_fixed).count()
 }
 
 #[test]
-#[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
+#[ignore = "needs the real inputs: MODALCAST_DATA or ../../../shared/data (from this crate)"]
 fn real_simple_bridge_keeps_the_numbering_of_its_file() {
     let scene = open_scene("vega/simpleBridge");
     let layout = scene.layout.domains[0];
@@ -60,7 +63,7 @@ fn real_simple_bridge_keeps_the_numbering_of_its_file() {
 }
 
 #[test]
-#[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
+#[ignore = "needs the real inputs: MODALCAST_DATA or ../../../shared/data (from this crate)"]
 fn real_model_a_has_vertices_that_no_face_uses() {
     let scene = open_scene("vega/A");
     let layout = scene.layout.domains[0];
@@ -72,7 +75,7 @@ fn real_model_a_has_vertices_that_no_face_uses() {
 }
 
 #[test]
-#[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
+#[ignore = "needs the real inputs: MODALCAST_DATA or ../../../shared/data (from this crate)"]
 fn real_sofa_binary_modes_equal_the_text_modes() {
     for (name, vertices, triangles, rank) in
         [("hexaBeam", 320, 492, 8), ("finger", 158, 306, 3), ("diamond", 1628, 3268, 32)]
@@ -85,13 +88,14 @@ fn real_sofa_binary_modes_equal_the_text_modes() {
         let text_scene = open_manifest(&format!("model = '{model}'\nmodes = '{modes}'\n")).expect("a valid scene");
         let pairs = scene.shapes[0].modes.columns().iter().zip(text_scene.shapes[0].modes.columns());
         let max_difference = pairs.map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+        // The text has fewer digits.
         assert!(max_difference <= 1e-5, "{name}: {max_difference}");
     }
     assert_eq!(count_fixed_vertices(&open_scene("sofa/hexaBeam")), 16);
 }
 
 #[test]
-#[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
+#[ignore = "needs the real inputs: MODALCAST_DATA or ../../../shared/data (from this crate)"]
 fn real_ball_is_rejected_with_declared_and_actual_size() {
     let folder_error = super::open(&dataset_path("sofa/ball")).expect_err("no readable mesh").to_string();
     assert!(
@@ -105,7 +109,7 @@ fn real_ball_is_rejected_with_declared_and_actual_size() {
 }
 
 #[test]
-#[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
+#[ignore = "needs the real inputs: MODALCAST_DATA or ../../../shared/data (from this crate)"]
 fn real_almond_has_1447_domains_and_all_faces() {
     let scene = open_scene("plants/almond");
     assert_eq!((scene.domains.len(), scene.layout.triangles), (1447, 37560));
@@ -131,7 +135,7 @@ fn real_almond_has_1447_domains_and_all_faces() {
 }
 
 #[test]
-#[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
+#[ignore = "needs the real inputs: MODALCAST_DATA or ../../../shared/data (from this crate)"]
 fn real_plants_have_the_bounds_of_their_file_and_compact_leaves() {
     for (name, domains, triangles) in [("almond", 1447, 37560), ("bean", 237, 42824)] {
         let scene = open_scene(&format!("plants/{name}"));
@@ -147,7 +151,8 @@ fn real_plants_have_the_bounds_of_their_file_and_compact_leaves() {
             assert!((bounds.min[axis] - scene.rest_bounds.min[axis]).abs() < 1e-6, "{name}");
             assert!((bounds.max[axis] - scene.rest_bounds.max[axis]).abs() < 1e-6, "{name}");
         }
-        // A petiole that is assigned to the wrong leaf is far from the frame of its domain.
+        // A petiole that is assigned to the wrong leaf is far from the origin of its domain. Correctly assigned organs
+        // are within this distance in meters.
         let max_distance = if name == "almond" { 0.2 } else { 0.4 };
         for (index, domain) in scene.domains.iter().enumerate().filter(|(_, domain)| domain.name.starts_with("leaf ")) {
             let distance = |rest_position: &[f32; 3]| nalgebra::Vector3::from(*rest_position).norm();
@@ -162,7 +167,7 @@ fn real_plants_have_the_bounds_of_their_file_and_compact_leaves() {
 }
 
 #[test]
-#[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
+#[ignore = "needs the real inputs: MODALCAST_DATA or ../../../shared/data (from this crate)"]
 fn real_datasets_are_listed_if_their_folder_has_one_model() {
     let repository = super::SceneRepository::new(Some(dataset_path("").as_ref())).expect("an existing folder");
     let names = repository.list();
@@ -176,7 +181,7 @@ fn real_datasets_are_listed_if_their_folder_has_one_model() {
 }
 
 #[test]
-#[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
+#[ignore = "needs the real inputs: MODALCAST_DATA or ../../../shared/data (from this crate)"]
 fn real_fern_is_masked_by_an_override_of_its_texture() {
     let (model, texture) =
         (dataset_path("gltf/fern/fern_02.glb"), dataset_path("gltf/fern/fern_02_basecolor_alpha_1k.derived.png"));

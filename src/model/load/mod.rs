@@ -6,7 +6,7 @@
 //! lists them.
 //!
 //! The modes of an OBJ file are found by their file names in the same folder (`modes::find_sidecar`). An OBJ file is
-//! loaded as a plant if its folder also contains the structure of the plant (`plant`).
+//! loaded as a plant if its folder also contains the two files with the structure of the plant (module `plant`).
 //!
 //! # Conventions
 //! - Rows of U follow the `v` lines of an OBJ file, including unreferenced and coincident vertices.

@@ -119,6 +119,7 @@ mod tests {
             (".hidden/x.obj", TRIANGLE),
             ("notes.txt", ""),
         ]);
+        // The folder `two` has two models, so it is not a scene. `far.obj` is below the listed depth.
         let names = repository.list();
         assert_eq!(names, ["tree", "deep/er/scene", "one", "one/a.obj", "two/b.obj", "two/c.obj"]);
         for name in &names[1..] {

@@ -9,7 +9,7 @@ use crate::scene::SceneParts;
 /// Names of procedural scenes. A folder with such a name can be opened as `./NAME`.
 pub(super) const BUILT_IN: [&str; 1] = ["tree"];
 
-/// A model in a folder, by the name of its main file or, for a plant, its stem.
+/// A model in a folder: the name of its file or, for a plant, the common stem of its files.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum ModelFile {
     Gltf(String),
@@ -93,7 +93,7 @@ pub(super) fn find_models(folder: &AssetDir) -> Vec<ModelFile> {
     names.iter().filter_map(|name| recognize_model(name)).map(|model| detect_plant(model, &names)).collect()
 }
 
-/// Recognizes an OBJ file as a plant if the files of the plant's structure are in the same folder.
+/// Changes an OBJ file to a plant if both files of the plant's structure are among the `names` of its folder.
 fn detect_plant(model: ModelFile, names: &[String]) -> ModelFile {
     let stem = match &model {
         ModelFile::Obj(name) => name.strip_suffix(".obj"),

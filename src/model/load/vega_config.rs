@@ -9,8 +9,8 @@ use crate::error::{Result, invalid};
 const DYNAMICS_KEYS: [&str; 4] =
     ["baseFrequency", "deformableObjectCompliance", "dampingMassCoef", "dampingStiffnessCoef"];
 
-/// Reads the notes on the OBJ file `name`: entries such as `vega.baseFrequency`, and the entry `vega.cubic` with the name
-/// of the file that contains the cubic force polynomials.
+/// Reads the notes on the OBJ file `name`: entries such as `vega.baseFrequency`, and the entry `vega.cubic`, which is
+/// the name of the file with the cubic polynomials of the reduced internal forces.
 ///
 /// # Errors
 /// `Invalid` with the file and the entry that is not a finite number.
@@ -55,6 +55,7 @@ mod tests {
         let files = AssetDir::unrestricted(folder.path());
         assert!(read_notes(&files, "a.obj").expect("no notes").is_empty());
         let config = folder.path().join("a.config");
+        // The last entry has no value.
         std::fs::write(&config, "*baseFrequency\r\n0.25\n\n*windowWidth\n800\n*dampingMassCoef\n")
             .expect("a writable file");
         let message = read_notes(&files, "a.obj").expect_err("a missing value").to_string();

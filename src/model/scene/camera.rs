@@ -315,7 +315,7 @@ mod tests {
         assert!(error(camera.relative_to(origin)) < 1e-12);
         // The pose was computed at 1e7, where f64 has a spacing of 2e-9.
         assert!(error(Camera { view: View::Pose(pose), ..camera }.relative_to(origin)) < 1e-7);
-        // Control: near 1e7, f32 has a spacing of 1, so a pose that is rounded before the subtraction loses its fraction.
+        // Control: near 1e7, f32 has a spacing of 1. A pose that is rounded before the subtraction loses its fraction.
         let rounded_pose = View::Pose(pose.map(|number| f64::from(number as f32)));
         assert!(error(Camera { view: rounded_pose, ..camera }.relative_to(origin)) > 0.05);
         for entry in [f64::NAN, f64::INFINITY] {

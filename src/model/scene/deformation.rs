@@ -14,7 +14,7 @@ pub enum StorageType {
     F16,
     /// 2 bytes with 8 significant bits, and a power-of-two scale per mode.
     Bf16,
-    /// 1 byte, -127 to 127, and a scale per mode and tile of vertices.
+    /// 1 byte, -127 to 127, and a scale per mode and tile (a block of consecutive vertices).
     Int8,
 }
 

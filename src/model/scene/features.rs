@@ -21,7 +21,7 @@ pub struct SceneFeatures {
     pub shadows: bool,
     /// Steps may shear or scale non-uniformly; normals require the inverse transpose.
     pub shear: bool,
-    /// Normals are computed from the deformed triangles; requires their adjacency.
+    /// Normals are computed from the deformed triangles; requires the triangles around each vertex.
     pub exact_normals: bool,
     /// Modes that are negligible at a step's q are skipped; requires a list of the remaining modes in every step.
     pub truncation: bool,

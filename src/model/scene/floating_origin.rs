@@ -94,7 +94,7 @@ impl FloatingOrigins {
         &self.translations
     }
 
-    /// Whether all domains use the shared origin, so that there are no outliers.
+    /// Whether all domains use the shared origin: there are no outliers.
     pub const fn is_uniform(&self) -> bool {
         self.outlier_count == 0
     }

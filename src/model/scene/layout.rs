@@ -12,7 +12,7 @@ pub struct DomainLayout {
     /// First vertex in the packed positions, and the number n of vertices.
     pub first_vertex: usize,
     pub vertices: usize,
-    /// First corner in the packed normals, and the number of corners.
+    /// First corner (a vertex with a normal and texture coordinates) in the packed normals, and the number of corners.
     pub first_corner: usize,
     pub corners: usize,
     /// First triangle in the packed index buffer, and the number of triangles.

@@ -183,8 +183,8 @@ mod tests {
         Domain::new(format!("point {index}"), 0)
     }
 
-    /// Five domains of one vertex. Each pair (child, parent) makes a domain a follower. The frame of the first pair is a
-    /// translation by x = 1, that of the second by x = 2, and so on.
+    /// Five domains of one vertex. Each pair (child, parent) makes a domain a follower. The frame of the first pair is
+    /// a translation by x = 1, the frame of the second by x = 2, and so on.
     fn scene_with_followers(pairs: &[(usize, usize)]) -> SceneParts {
         let mut parts = SceneParts::named("points");
         let mesh =

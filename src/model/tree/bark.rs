@@ -45,12 +45,18 @@ pub(super) fn textures(random: &mut SplitMix64) -> Result<[Texture; 2]> {
     Ok([Texture::new("bark", side, side, colors)?, Texture::new("bark normals", side, side, normals)?])
 }
 
-/// The noise layers of the bark.
+/// The noise layers of the bark. The weights and thresholds in [`Self::height`] and [`Self::color`] are free choices of
+/// the bark's look.
 struct BarkLayers {
+    /// Shift the other layers around the branch.
     warps: [GradientNoise; 2],
+    /// Furrows along the branch: deep ones, then fine ones.
     furrows: [GradientNoise; 2],
+    /// Cracks without a preferred direction.
     cracks: GradientNoise,
+    /// Small variations of height and color.
     grain: [GradientNoise; 2],
+    /// Large spots of color.
     tint: GradientNoise,
 }
 
@@ -132,6 +138,7 @@ mod tests {
             |a: usize, b: usize| (0..SIDE).map(|column| (red(column, a) - red(column, b)).abs()).sum::<f64>();
         assert!(column_difference(SIDE - 1, 0) < 3.0 * column_difference(100, 101) + 1.0);
         assert!(row_difference(SIDE - 1, 0) < 3.0 * row_difference(100, 101) + 1.0);
+        // Control: distant columns differ more.
         assert!(column_difference(0, 101) > 3.0 * column_difference(100, 101));
     }
 

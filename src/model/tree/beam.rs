@@ -14,7 +14,7 @@ pub(super) struct Beam {
     /// N sections, one per element.
     pub(super) sections: Vec<Section>,
     pub(super) elastic: ElasticConstants,
-    /// Carried masses (kg) and their stations.
+    /// Carried masses (kg) and their stations (element, and fraction of its length).
     pub(super) point_masses: Vec<(Station, f64)>,
 }
 
@@ -62,10 +62,10 @@ impl Beam {
 
     /// The `count` lowest modes.
     ///
-    /// K is factored instead of M. Axial stiffness is up to 10^10 times the lowest bending stiffness. With M = L L^T,
-    /// the lowest eigenvalues of L^-1 K L^-T would be smaller than the rounding errors of the highest. With K = L L^T,
-    /// the lowest modes have the largest eigenvalues mu = 1 / lambda of L^-1 M L^-T, which are accurate to full
-    /// precision. For an eigenvector y, phi = L^-T y / sqrt(mu).
+    /// K is factored instead of M, because axial stiffness is up to 10^10 times the lowest bending stiffness. With
+    /// M = L L^T, the lowest eigenvalues of L^-1 K L^-T would be smaller than the rounding errors of the highest. With
+    /// K = L L^T, the lowest modes have the largest eigenvalues mu = 1 / lambda of L^-1 M L^-T, which are accurate to
+    /// full precision. For an eigenvector y of L^-1 M L^-T, phi = L^-T y / sqrt(mu).
     ///
     /// # Errors
     /// `Fault` if K is not positive definite (the beam has no stiffness) or the iteration does not converge.
@@ -105,8 +105,8 @@ pub(super) mod tests {
     pub(in super::super) const WOOD: ElasticConstants =
         ElasticConstants { youngs_modulus: 8e9, shear_modulus: 5e8, density: 800.0 };
 
-    /// A beam of length 1 with different radii at its ends, bent by `bend` radians over its length, in an oblique
-    /// direction.
+    /// A beam along an oblique direction, bent by `bend` radians. Its length is 1 m if it is straight. `radii` are the
+    /// radii at its ends in meters.
     pub(in super::super) fn curved_beam(elements: usize, radii: [f64; 2], bend: f64) -> Beam {
         let orientation = nalgebra::Rotation3::from_euler_angles(0.4, 0.9, -1.3);
         let node_position = |index: usize| {
@@ -197,6 +197,7 @@ pub(super) mod tests {
         let soft_constants = ElasticConstants { shear_modulus: 1e3, ..WOOD };
         let beam = Beam { elastic: soft_constants, ..curved_beam(14, [0.05; 2], 0.0) };
         let omega = beam.solve_modes(1).expect("a converged solution").eigenvalues[0].sqrt();
+        // A shaft of length 1 that is clamped at one end: omega = pi / 2 sqrt(G / rho).
         let expected = std::f64::consts::FRAC_PI_2 * (soft_constants.shear_modulus / soft_constants.density).sqrt();
         assert!((omega / expected - 1.0).abs() <= 1e-3, "expected {expected} rad/s, got {omega}");
     }
@@ -206,6 +207,7 @@ pub(super) mod tests {
         let mut beam = curved_beam(12, [0.02; 2], 0.0);
         let tip_mass = 1000.0 * beam.wood_mass();
         beam.point_masses.push((Station { element: 11, fraction: 1.0 }, tip_mass));
+        // The tip stiffness of a cantilever of length 1: 3 E I.
         let expected_stiffness = 3.0 * WOOD.youngs_modulus * beam.sections[0].moment;
         let eigenvalue = beam.solve_modes(1).expect("a converged solution").eigenvalues[0];
         assert!((eigenvalue * tip_mass / expected_stiffness - 1.0).abs() < 1e-3, "{eigenvalue}");

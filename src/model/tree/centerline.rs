@@ -23,11 +23,11 @@ pub(super) struct GrowthParameters {
     pub(super) start: Vector3<f64>,
     /// Unit direction of the light, opposite to gravity.
     pub(super) up: Vector3<f64>,
-    /// Downward bend by weight, strongest at the root.
+    /// Downward bend by weight, strongest at the root: the total angle of a horizontal branch.
     pub(super) sag: f64,
-    /// Upward bend towards the light, strongest at the tip.
+    /// Upward bend towards the light, strongest at the tip: the total angle of a horizontal branch.
     pub(super) rise: f64,
-    /// Amplitude of the random bends.
+    /// Amplitude of the random bends: the first of the three waves per axis swings the direction by wander / 2.
     pub(super) wander: f64,
 }
 
@@ -140,6 +140,7 @@ fn ring_arc_lengths(growth: &GrowthParameters) -> Vec<f64> {
 /// Change of the tangent by weight and light, per unit of relative length, at a fraction of the length.
 fn gravity_and_light_bend(growth: &GrowthParameters, tangent: &Vector3<f64>, fraction: f64) -> Vector3<f64> {
     let perpendicular_up = growth.up - tangent * tangent.dot(&growth.up);
+    // The factors 2 f and 2 (1 - f) have the integral 1 over the branch.
     perpendicular_up * (2.0 * growth.rise * fraction - 2.0 * growth.sag * (1.0 - fraction))
 }
 
@@ -164,6 +165,7 @@ impl RandomBends {
         let basis = part_orientation(&growth.start, &growth.up);
         let mut wave = |index: usize| {
             let periods = index as f64 + random.uniform(0.6, 1.3);
+            // Integrated along the branch, the wave swings the direction by wander / (2 (1 + index)) radians.
             BendWave {
                 amplitude: growth.wander * std::f64::consts::TAU * periods * 0.5 / (1.0 + index as f64),
                 periods,

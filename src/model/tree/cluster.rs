@@ -15,7 +15,7 @@ const SHOOT: ElasticConstants = ElasticConstants { youngs_modulus: 3.0e9, shear_
 /// Fresh mass of a leaf in kg per m^2 of one side.
 const LEAF_MASS_PER_AREA: f64 = 0.17;
 
-/// The fraction of a blade's area that the leaf in its image covers.
+/// The fraction of a blade (a textured rectangle) that the leaf in its image covers.
 const LEAF_COVERAGE: f64 = 0.55;
 
 /// Ratio of width to length of a blade.
@@ -70,6 +70,7 @@ fn grow_cluster(parameters: ClusterParameters, random: &mut SplitMix64) -> PartT
         wander: 0.12,
     };
     let centerline = Centerline::grow(&growth, random);
+    // 3.6 mm at the base, 1.4 mm at the tip.
     let radii = (0..centerline.points.len()).map(|ring| 0.0036 - 0.0022 * centerline.fraction(ring)).collect();
     let mut template = PartTemplate {
         kind: PartKind::Leaf,
@@ -87,12 +88,14 @@ fn grow_cluster(parameters: ClusterParameters, random: &mut SplitMix64) -> PartT
     };
     template.add_skin(UvMapping::Strip { u: STEM_U }, |_, _| 1.0);
     for leaf in 0..leaf_count {
+        // The lowest leaf is at 16 % of the shoot or above, the last leaf at the tip.
         let fraction = if leaf + 1 == leaf_count {
             1.0
         } else {
             0.16 + 0.84 * (leaf as f64 + random.next_unit() * 0.6) / leaf_count as f64
         };
-        // Azimuths: leaves of a spray alternate between two sides, leaves of a rosette follow the golden angle.
+        // Azimuths: leaves of a spray alternate between two sides. Leaves of a rosette follow the golden angle of 2.4
+        // radians.
         let azimuth = if is_flexible { std::f64::consts::PI * leaf as f64 } else { 2.4 * leaf as f64 };
         let azimuth = azimuth + random.uniform_symmetric(0.7);
         add_leaf(&mut template, fraction, azimuth, leaf_length * random.uniform(0.78, 1.12), random);
@@ -148,7 +151,7 @@ mod tests {
             let (_, metadata) = template.build_shape().expect("a valid shape");
             let hertz = metadata.eigenvalues[0].sqrt() / std::f64::consts::TAU;
             assert!((1.5..12.0).contains(&hertz), "{hertz} Hz");
-            assert!(template.mass() > template.beam().wood_mass() * 1.2);
+            assert!(template.mass() > template.beam().wood_mass() * 1.2, "expected leaves over 20 % of the wood mass");
         }
     }
 

@@ -25,7 +25,8 @@ pub(super) struct Section {
 }
 
 impl Section {
-    /// Mean area and second moment over a truncated cone between two radii.
+    /// Mean area and second moment of a truncated cone. Its radius is linear between the two radii, so that the means
+    /// of r^2 and r^4 have these closed forms.
     pub(super) fn of_cone(radius_a: f64, radius_b: f64) -> Self {
         use std::f64::consts::{FRAC_PI_4, PI};
         let mean_square = (radius_a * radius_a + radius_a * radius_b + radius_b * radius_b) / 3.0;
@@ -66,8 +67,8 @@ pub(super) fn element_matrices(
     )
 }
 
-/// Stiffness in local axes; `l` is the element's length. The polar moment of a circular section, which resists twist, is
-/// twice its second moment about a diameter.
+/// Stiffness in local axes; `l` is the element's length. The polar moment of a circular section, which resists twist,
+/// is twice its second moment about a diameter.
 fn local_stiffness(l: f64, section: &Section, material: &ElasticConstants) -> Matrix12 {
     let mut matrix = Matrix12::zeros();
     let block = [1.0, -1.0, -1.0, 1.0];
@@ -108,8 +109,8 @@ fn add_linear(matrix: &mut Matrix12, dof: usize, block: [f64; 4]) {
     }
 }
 
-/// Adds bending in both planes. The sign of the second plane is negative, because a rotation about y decreases the
-/// slope dz/dx.
+/// Adds bending in both planes: y with the rotation about z, and z with the rotation about y. Terms that couple z with
+/// the rotation change their sign, because a rotation about y decreases the slope dz/dx.
 fn add_bending(matrix: &mut Matrix12, block: &Matrix4<f64>) {
     for (dofs, sign) in [([1, 5, 7, 11], 1.0), ([2, 4, 8, 10], -1.0)] {
         for row in 0..4 {

@@ -13,10 +13,10 @@ const SIDE: usize = 256;
 /// the strip at the right edge into the left edge.
 pub(super) const LEAF_SPAN: [f32; 2] = [0.03, 0.90];
 
-/// The center of the strip for stems.
+/// The texture coordinate u at the center of the strip for stems.
 pub(super) const STEM_U: f32 = 0.965;
 
-/// Left edge of the strip.
+/// The texture coordinate u at the left edge of the strip for stems.
 const STRIP_LEFT: f32 = 0.93;
 
 /// Length of the petiole at the bottom of the image, as a fraction of the height.
@@ -62,7 +62,9 @@ pub(super) fn texture(name: &str, colors: &LeafColors, random: &mut SplitMix64) 
     Texture::new(name, SIDE as u32, SIDE as u32, rgba)
 }
 
-/// Color and coverage at the signed distance `x` from the midrib and the height `y` above the base of the petiole.
+/// Color and coverage at the signed distance `x` from the midrib, as a fraction of the width of [`LEAF_SPAN`], and the
+/// height `y` above the base of the petiole, as a fraction of the height of the image. The weights are free choices of
+/// the leaf's look.
 fn shade_leaf(colors: &LeafColors, x: f32, y: f32) -> ([f32; 3], f32) {
     let blade_fraction = (y - PETIOLE_LENGTH) / (TIP_HEIGHT - PETIOLE_LENGTH);
     let distance = x.abs();
@@ -88,7 +90,7 @@ fn shade_leaf(colors: &LeafColors, x: f32, y: f32) -> ([f32; 3], f32) {
     )
 }
 
-/// Half-width of the blade: egg-shaped with an elongated tip and forward-pointing teeth.
+/// Half-width of the blade at a fraction of its height: egg-shaped with an elongated tip and forward-pointing teeth.
 fn half_width(blade_fraction: f32) -> f32 {
     let blade_fraction = blade_fraction.clamp(0.0, 1.0);
     let egg_profile = (std::f32::consts::PI * blade_fraction.powf(0.74)).sin().max(0.0).powf(0.72);
@@ -126,6 +128,7 @@ mod tests {
         assert!((0.2..0.8).contains(&opaque_fraction), "{opaque_fraction} of the image is opaque");
         let strip_column = (STEM_U * SIDE as f32) as usize;
         assert!((0..SIDE).all(|row| is_opaque(row * SIDE + strip_column)));
+        // The top left pixel is outside the leaf. The pixel at half the height and u = 0.45 is near the midrib.
         assert!(!is_opaque(0) && is_opaque(SIDE / 2 * SIDE + (0.45 * SIDE as f32) as usize));
     }
 

@@ -146,6 +146,7 @@ impl PartPlacer<'_> {
                 .name
                 .split_once(' ')
                 .map_or(String::new(), |(_, parent_path)| format!("{parent_path}."));
+            // 35 % of the leaf clusters have the second leaf material, the one for sunlit leaves.
             let (kind, material) = match child.kind {
                 PartKind::Leaf => ("leaf", BARK_MATERIAL + 1 + usize::from(self.random.next_unit() < 0.35)),
                 PartKind::Trunk | PartKind::Branch => ("branch", BARK_MATERIAL),
@@ -234,7 +235,7 @@ mod tests {
     }
 
     #[test]
-    fn every_seed_gives_a_valid_scene_of_the_documented_size() {
+    fn every_seed_gives_a_valid_scene_of_similar_size() {
         for seed in [0, 7, u64::MAX] {
             let scene = Scene::new(generate_tree(seed)).expect("a valid scene");
             let count = |kind: &str| scene.domains.iter().filter(|domain| note(domain, "kind") == kind).count();
@@ -281,7 +282,7 @@ mod tests {
                 (center.coords - domain.placement.translation()).norm()
             };
             assert!(joint_gap(&attachment.rows) <= 1e-5, "{}: a gap of {}", domain.name, joint_gap(&attachment.rows));
-            // Counterexample: the center of the ring below differs.
+            // Counterexample: the center of the ring below is elsewhere. Rings are consecutive in the rows of a part.
             let row_count = attachment.rows.len() as u32;
             let lower_ring: Vec<u32> = attachment.rows.iter().map(|row| row.saturating_sub(row_count)).collect();
             assert!(joint_gap(&lower_ring) > 1e-3, "{}", domain.name);
@@ -317,6 +318,7 @@ mod tests {
             let Some(lowest) = hertz.first() else { continue };
             let level = domain.metadata.notes.get("level").map(String::as_str);
             assert_eq!(level.is_none(), note(domain, "kind") == "leaf", "expected a level unless the part is a leaf");
+            // Hertz: the trunk, boughs, then twigs and leaf clusters.
             let range = match level {
                 Some("0") => 0.4..1.5,
                 Some("1") => 0.6..6.0,
@@ -333,6 +335,7 @@ mod tests {
         let amplitude = |vertex: usize| Vector3::from_fn(|axis, _| shape.modes.entry(vertex, axis, 0)).norm();
         let vertex_count = shape.mesh.rest_positions().len();
         let largest = (0..vertex_count).map(amplitude).fold(0.0, f32::max);
+        // Vertices are ordered from the base to the tip.
         assert!(amplitude(vertex_count - 1) > 0.95 * largest);
         assert!(amplitude(vertex_count / 4) < 0.3 * largest);
     }

@@ -35,7 +35,7 @@ pub(super) enum UvMapping {
     /// The image repeats a whole number of times around the tube. Along the tube, it repeats such that texels are
     /// square.
     Bark { repeats: u32 },
-    /// One column of the image, along the tube from the bottom of the image to its top.
+    /// One column of the image, along the tube from near the bottom of the image to near its top.
     Strip { u: f32 },
 }
 
@@ -57,7 +57,7 @@ pub(super) struct Blade {
     pub(super) u_range: [f32; 2],
 }
 
-/// Number of quads along a blade. Two quads are side by side.
+/// Number of rows of quadrilaterals along a blade. A row has two quadrilaterals, one on each side of the midrib.
 const BLADE_ROWS: usize = 2;
 
 /// The bark texture scales with the radius of a branch, but not below this radius (meters).
@@ -129,6 +129,7 @@ impl SkinBuilder {
             let fraction = row as f64 / BLADE_ROWS as f64;
             let (sin, cos) = (blade.curl * fraction).sin_cos();
             let normal = blade.normal * cos + blade.forward * sin;
+            // Left edge, midrib and right edge.
             for column in [-1.0, 0.0, 1.0] {
                 let offset = 0.5 * blade.width * column;
                 let lift = normal * (offset.abs() * blade.fold.sin());
@@ -137,6 +138,7 @@ impl SkinBuilder {
                 let u = blade.u_range[0] + (blade.u_range[1] - blade.u_range[0]) * (0.5 + 0.5 * column as f32);
                 self.uvs.push([u, 1.0 - fraction as f32]);
             }
+            // The direction of a row is the direction at its middle.
             let (sin, cos) = (blade.curl * (fraction + 0.5 / BLADE_ROWS as f64)).sin_cos();
             position += (blade.forward * cos - blade.normal * sin) * step;
         }
@@ -257,14 +259,16 @@ mod tests {
         let tube =
             Tube { centerline: &centerline, radii: &[0.05; 9], sides: 8, uv_mapping: UvMapping::Bark { repeats: 3 } };
         skin.add_tube(&tube, |_, _| 1.0);
+        // A ring of 8 sides has 9 corners, because the seam repeats a corner.
         let seam_uvs = |ring: usize| (skin.uvs[9 * ring], skin.uvs[9 * ring + 8]);
         for ring in 0..9 {
             let (left, right) = seam_uvs(ring);
             assert_eq!((left[0], right[0], left[1]), (0.0, 3.0, right[1]));
         }
-        let texels_along = f64::from(seam_uvs(0).0[1] - seam_uvs(8).0[1]);
-        let texels_around = 3.0 / (std::f64::consts::TAU * 0.05);
-        assert!((texels_along / texels_around - 1.0).abs() < 1e-5);
+        // Repetitions of the image per meter. The tube is 1 m long, and its circumference is 2 pi 0.05 m.
+        let repeats_along = f64::from(seam_uvs(0).0[1] - seam_uvs(8).0[1]);
+        let repeats_around = 3.0 / (std::f64::consts::TAU * 0.05);
+        assert!((repeats_along / repeats_around - 1.0).abs() < 1e-5);
     }
 
     #[test]
@@ -273,6 +277,7 @@ mod tests {
         let (station, position, _) = sample_at(&centerline, centerline.fraction(5));
         assert!((position - centerline.points[5]).norm() < 1e-12);
         assert!((station.element, station.fraction) == (2, 0.5));
+        // Ring 5 of two rings per element is in the middle of element 2. The end is the end of element 5.
         let (end_station, position, tangent) = sample_at(&centerline, 1.0);
         assert!((end_station.element, end_station.fraction) == (5, 1.0));
         assert!((position - centerline.points[12]).norm() < 1e-12);

@@ -40,11 +40,13 @@ pub(super) fn section_motion(nodes: &[Vector3<f64>], dofs: &[f64], station: Stat
     };
     let (displacement_a, rotation_a) = (local_vector(element, 0), local_vector(element, 3));
     let (displacement_b, rotation_b) = (local_vector(element + 1, 0), local_vector(element + 1, 3));
+    // Cubic Hermite basis: the weights of the first value, first slope, second value and second slope, and the
+    // derivatives of the weights.
     let value_basis =
         [1.0 - 3.0 * x * x + 2.0 * x.powi(3), x * (1.0 - x).powi(2), x * x * (3.0 - 2.0 * x), x * x * (x - 1.0)];
     let slope_basis = [6.0 * x * (x - 1.0), (1.0 - x) * (1.0 - 3.0 * x), 6.0 * x * (1.0 - x), x * (3.0 * x - 2.0)];
-    let interpolate = |basis: &[f64; 4], [a, da, b, db]: [f64; 4]| {
-        basis[0] * a + basis[1] * length * da + basis[2] * b + basis[3] * length * db
+    let interpolate = |basis: &[f64; 4], [value_a, slope_a, value_b, slope_b]: [f64; 4]| {
+        basis[0] * value_a + basis[1] * length * slope_a + basis[2] * value_b + basis[3] * length * slope_b
     };
     // The slope of y is a rotation about z, and the slope of z is a rotation about -y.
     let (y_values, z_values) = (
@@ -140,11 +142,11 @@ mod tests {
                 assert!((before.rotation - after.rotation).norm() <= 1e-9 * magnitude);
             }
             // The rotation is the derivative of the transverse displacement.
-            let (a, b, h) =
-                (motion_at(3, 0.4 - 1e-5), motion_at(3, 0.4 + 1e-5), 2e-5 * (beam.nodes[4] - beam.nodes[3]).norm());
+            let (before, after) = (motion_at(3, 0.4 - 1e-5), motion_at(3, 0.4 + 1e-5));
+            let distance = 2e-5 * (beam.nodes[4] - beam.nodes[3]).norm();
             let tangent = (beam.nodes[4] - beam.nodes[3]).normalize();
-            let transverse = |v: Vector3<f64>| v - tangent * tangent.dot(&v);
-            let slope = transverse((b.translation - a.translation) / h);
+            let transverse = |vector: Vector3<f64>| vector - tangent * tangent.dot(&vector);
+            let slope = transverse((after.translation - before.translation) / distance);
             let rotated_tangent = transverse(motion_at(3, 0.4).rotation.cross(&tangent));
             assert!((slope - rotated_tangent).norm() <= 1e-6 * slope.norm().max(1e-3), "{slope} {rotated_tangent}");
         }

@@ -1,4 +1,5 @@
-//! The species of the tree: parameters and growth of the templates of all parts. Lengths are in meters.
+//! The species of the tree: parameters and growth of the templates of all parts. Lengths are in meters, angles in
+//! radians. Numbers without a comment are free choices of the tree's shape.
 
 use std::f64::consts::TAU;
 
@@ -50,7 +51,8 @@ pub(super) fn grow_templates(random: &mut SplitMix64) -> Vec<PartTemplate> {
         trunk.attach_child(ChildJoint { ring, direction, template_index: templates.len() }, bough.mass());
         templates.push(bough);
     }
-    // Twigs of medium length form the top of the crown.
+    // Twigs of medium length (templates 4 to 8) form the top of the crown. Each pair is a ring and the angle between
+    // trunk and twig.
     let last_ring = trunk.centerline.points.len() - 1;
     for (ring, angle) in [(last_ring, 0.10), (last_ring - 2, 0.55), (last_ring - 4, 0.65), (last_ring - 6, 0.7)] {
         let side = perpendicular_at(&trunk.centerline, ring, GOLDEN_ANGLE * (ring + BOUGH_COUNT) as f64);
@@ -111,16 +113,14 @@ fn choose_bough_joint(trunk: &PartTemplate, index: usize, random: &mut SplitMix6
     )
 }
 
-/// Grows a bough that starts along `direction` (in the world), with its twigs and leaves. `size` is its length and its
-/// largest radius.
+/// Grows a bough that starts along `direction` (in the world), with its twigs and leaves.
 fn grow_bough(
     direction: &Vector3<f64>,
-    size: [f64; 2],
+    [length, max_radius]: [f64; 2],
     templates: &[PartTemplate],
     [leaf_range, twig_range]: &[std::ops::Range<usize>; 2],
     random: &mut SplitMix64,
 ) -> PartTemplate {
-    let [length, max_radius] = size;
     let growth = GrowthParameters {
         length,
         elements: 12,
@@ -234,7 +234,8 @@ fn perpendicular_at(centerline: &Centerline, ring: usize, azimuth: f64) -> Vecto
     Rotation3::from_axis_angle(&Unit::new_unchecked(centerline.tangents[ring]), azimuth) * centerline.side_vectors[ring]
 }
 
-/// A unit vector perpendicular to the centerline: alternately left and right, and more often tilted up than down.
+/// A unit vector perpendicular to the centerline: left or right depending on the parity of `index`, and more often
+/// tilted up than down.
 fn side_direction(
     centerline: &Centerline,
     ring: usize,

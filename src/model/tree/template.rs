@@ -96,6 +96,7 @@ impl PartTemplate {
         Ok((Shape::new(self.skin.build_mesh()?, modes)?, metadata))
     }
 
+    /// The beam along the centerline. The section of an element is the mean over the cones between its rings.
     pub(super) fn beam(&self) -> Beam {
         let section_of_element = |first_ring: usize| {
             let cones = self.radii[first_ring..=first_ring + self.centerline.rings_per_element]
@@ -121,6 +122,7 @@ impl PartTemplate {
         self.point_masses.iter().map(|(_, mass)| mass).sum()
     }
 
+    /// Notes for clients, by name. Numbers are in SI units.
     fn notes(&self, beam: &Beam) -> BTreeMap<String, String> {
         let kind = match self.kind {
             PartKind::Trunk => "trunk",
@@ -209,6 +211,7 @@ mod tests {
             let last_ring = template.centerline.points.len() - 1;
             for (vertex, normal) in mesh.corners().vertices.iter().zip(&mesh.corners().normals) {
                 let position = Vector3::from(mesh.rest_positions()[*vertex as usize]).cast::<f64>();
+                // The vertex after the last ring is the tip.
                 let center = template.centerline.points[(*vertex as usize / template.sides).min(last_ring)];
                 let outward_component = (position - center).normalize().dot(&Vector3::from(*normal).cast());
                 assert!(outward_component > 0.2, "level {:?}: {outward_component}", template.level);

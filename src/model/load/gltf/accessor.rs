@@ -19,9 +19,9 @@ const F32: u64 = 5126;
 pub(super) struct AttributeFormat {
     /// Whether normalized unsigned integers are accepted in addition to floats.
     pub(super) allows_integers: bool,
-    /// The number of elements, if another accessor determines it. Only in this case, the accessor may lack a buffer view
-    /// (its elements are zero, unless it has sparse values). Otherwise, a large count without data could exhaust the
-    /// memory.
+    /// The required number of elements. `None`: any number, for the positions, which determine the number of the other
+    /// attributes. An accessor without a buffer view, whose elements are zero or sparse, is accepted only for a
+    /// required number. Otherwise, a large count without data could exhaust the memory.
     pub(super) count: Option<usize>,
 }
 
@@ -47,6 +47,7 @@ impl AccessorReader<'_> {
     }
 
     fn decode_vectors_of<const N: usize>(&self, accessor: &Accessor, format: AttributeFormat) -> Result<Vec<[f32; N]>> {
+        // The accessor type with N components.
         check_kind(accessor, ["SCALAR", "VEC2", "VEC3", "VEC4"][N - 1])?;
         let component_type = accessor.component_type;
         let is_normalized_integer = format.allows_integers && accessor.normalized && matches!(component_type, U8 | U16);
@@ -161,7 +162,8 @@ impl AccessorReader<'_> {
     }
 }
 
-/// The bytes of `count` elements of `size` bytes at intervals of `stride` bytes. `count` must be at least 1.
+/// The bytes of `count` elements of `size` bytes at intervals of `stride` bytes, from `offset` in the buffer view.
+/// `count` must be at least 1.
 fn elements(
     view: &[u8],
     offset: usize,

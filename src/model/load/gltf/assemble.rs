@@ -17,10 +17,12 @@ use crate::domain::{Attachment, Domain, Shape, Transform};
 use crate::error::{Result, invalid};
 use crate::scene::{MAX_DOMAINS, SceneParts};
 
-/// The parent of the domains in a node's children: the first domain of the node, or of its nearest ancestor with domains.
+/// The domain to which the domains of a node's children are attached: the first domain of the node or, if the node has
+/// none, of its nearest ancestor with domains.
 #[derive(Debug, Clone, Copy)]
 struct ParentDomain {
     domain: usize,
+    /// From the coordinates of the node to those of the domain.
     domain_from_node: Matrix4<f64>,
 }
 
@@ -148,8 +150,8 @@ impl GltfAssembler<'_> {
         Ok(loaded)
     }
 
-    /// A unique name of a node: `preferred_name` if it is not empty and not used yet; otherwise it contains the index of
-    /// the node.
+    /// A unique name of a node: `preferred_name` if it is not empty and not used yet; otherwise it contains the index
+    /// of the node.
     fn unique_name(&mut self, preferred_name: Option<&String>, node_index: usize) -> String {
         let preferred_name = preferred_name.map(|name| sanitize(name, 120)).filter(|name| !name.is_empty());
         let mut name = preferred_name.unwrap_or_else(|| format!("node {node_index}"));

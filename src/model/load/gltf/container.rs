@@ -9,12 +9,14 @@ use crate::error::{Result, invalid};
 /// The largest number of JSON objects in a document. Each object takes at least two bytes of text but about 300 bytes
 /// of memory.
 const MAX_OBJECTS: usize = 1 << 21;
-/// The largest number of commas. It limits the memory of list elements, as [`MAX_OBJECTS`] does for objects.
+/// The largest number of commas in a document. It limits the memory of list elements, as [`MAX_OBJECTS`] limits the
+/// memory of objects.
 const MAX_COMMAS: usize = 1 << 24;
 /// The largest document that is parsed a second time to locate an error, in bytes.
 const MAX_LOCATABLE_BYTES: usize = 1 << 22;
+/// The first bytes of a GLB. The version, the length of the file and the chunks follow.
 const MAGIC: &[u8] = b"glTF";
-/// Chunk types of a GLB.
+/// Chunk types of a GLB: the characters "JSON" and "BIN\0" as little-endian u32.
 const JSON: u32 = 0x4E4F_534A;
 const BIN: u32 = 0x004E_4942;
 
@@ -54,7 +56,7 @@ pub(super) fn split_container(content: &[u8]) -> Result<Container<'_>> {
     Ok(Container { json, bin: (kind == BIN).then_some(bin) })
 }
 
-/// Type and content of the chunk at `start`, and the start of the next one.
+/// Type and content of the chunk at `start`, and the start of the next chunk.
 fn read_chunk(content: &[u8], start: usize) -> Result<(u32, &[u8], usize)> {
     let length = read_word(content, start, "glb.chunk.length")? as usize;
     let kind = read_word(content, start + 4, "glb.chunk.type")?;

@@ -1,5 +1,5 @@
-//! The supported part of a glTF 2.0 document as plain structures. Values are not validated: indices may be out of range,
-//! and counts may be any 64-bit number. Names follow the specification.
+//! The supported part of a glTF 2.0 document as plain structures. Values are not validated: indices may be out of
+//! range, and counts may be any 64-bit number. Names follow the specification.
 
 use std::collections::BTreeMap;
 

@@ -90,8 +90,8 @@ fn check_roots(root_nodes: &[usize], parents: &[Option<usize>]) -> Result<()> {
     Ok(())
 }
 
-/// Indices of nodes in depth-first order, parents before children, with the position of the parent in this list. No node
-/// is listed twice, because each has at most one parent.
+/// Indices of nodes in depth-first order, parents before children, with the position of the parent in this list. No
+/// node is listed twice, because each has at most one parent.
 fn preorder(nodes: &[Node], roots: &[usize]) -> Vec<(usize, Option<usize>)> {
     let mut order = Vec::new();
     let mut stack: Vec<(usize, Option<usize>)> = roots.iter().rev().map(|root| (*root, None)).collect();
@@ -127,6 +127,7 @@ fn local_matrix(node: &Node) -> Result<Matrix4<f64>> {
     }
     let [x, y, z, w] = node.rotation.unwrap_or([0.0, 0.0, 0.0, 1.0]);
     let rotation = Quaternion::new(w, x, y, z);
+    // The quaternion is normalized below. The tolerance accepts the rounding of all exporters and rejects zeros.
     if !(0.9..=1.1).contains(&rotation.norm()) {
         return Err(invalid("rotation", "a quaternion of length 1", format!("length {}", rotation.norm())));
     }

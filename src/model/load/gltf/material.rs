@@ -1,8 +1,8 @@
 //! Converts glTF's metallic-roughness materials to Phong materials (equation 3.12 of the thesis).
 //!
-//! The inputs are the base color factor c, the metalness m and the roughness p. Both m and p are the product of their
-//! factor and the mean of their texture channel, because Phong's parameters are constant over a surface. With
-//! alpha = p^2 and the reflectance at normal incidence f = 0.04 (1 - m) + c m:
+//! The inputs are the base color factor c, the metalness m and the roughness p. Each of m and p is the product of a
+//! factor and the mean of a texture channel, because Phong's parameters are constant over a surface. With the GGX
+//! parameter alpha = p^2 and the reflectance at normal incidence f = 0.04 (1 - m) + c m:
 //!
 //! ```text
 //! diffuse   = c (1 - m / 2)            half remains for metals, because reflections of surroundings are not rendered
@@ -41,8 +41,8 @@ impl<'a> MaterialConverter<'a> {
         Self { document, texture_loader, materials: Vec::new(), material_indices: HashMap::new() }
     }
 
-    /// The set of texture coordinates of a material: that of the base color texture, otherwise that of the normal map,
-    /// otherwise 0.
+    /// The set of texture coordinates of a material: the set that its base color texture uses or, without this texture,
+    /// the set of its normal map, or else 0.
     ///
     /// # Errors
     /// `Invalid` if the material does not exist.
@@ -54,7 +54,8 @@ impl<'a> MaterialConverter<'a> {
     }
 
     /// Returns the index of a converted material. The first call for a material converts it. `material` is its index in
-    /// the document; `None` is the default material. Without texture coordinates, the converted material has no textures.
+    /// the document; `None` is the default material. Without texture coordinates, the converted material has no
+    /// textures.
     ///
     /// # Errors
     /// `Invalid` with the material and the field.

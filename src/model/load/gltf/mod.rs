@@ -2,8 +2,8 @@
 //! targets become the columns of U (3n x r), weights become q, and nodes become transforms. Units are meters, Y is up.
 //!
 //! The JSON is parsed into our own structures, and all data is read with checked arithmetic. The `gltf` crate (1.4.1)
-//! is not used for three reasons: its validation panics on some inputs, overflowing counts silently yield zero elements,
-//! and it hides extensions that it was not built with.
+//! is not used for three reasons: its validation panics on some inputs, overflowing counts silently yield zero
+//! elements, and it hides extensions that it was not built with.
 
 mod accessor;
 mod assemble;

@@ -168,6 +168,7 @@ impl ManifestAssembler<'_> {
             }
             let manifest = self.manifest;
             self.material_names.insert(material.name.clone());
+            // The override of the name comes last, so that it has precedence over the override of all materials.
             for name in ["*", material.name.clone().as_str()] {
                 if let Some(patch) = manifest.material.get(name) {
                     patch.apply(&mut material, self)?;
@@ -350,8 +351,8 @@ fn up_axis_rotation(model_up: Option<UpAxis>, scene_up: UpAxis) -> Transform {
     Transform::from_parts(rotation.matrix(), &nalgebra::Vector3::zeros())
 }
 
-/// The [`DEFAULT_ATTACHMENT_ROWS`] vertices of a deformable shape nearest to the origin of `frame`, in ascending order.
-/// Empty for a rigid shape.
+/// The [`DEFAULT_ATTACHMENT_ROWS`] vertices of a deformable shape nearest to the translation of `frame`, in ascending
+/// order of their indices. Empty for a rigid shape.
 fn nearest_vertices(shape: &Shape, frame: Transform) -> Vec<u32> {
     if shape.modes.rank() == 0 {
         return Vec::new();

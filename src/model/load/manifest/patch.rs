@@ -102,7 +102,7 @@ mod tests {
     }
 
     /// Applies the overrides in `text` to `material`. The scene has the textures "solid" (index 0, opaque) and "leaf"
-    /// (index 1, transparent).
+    /// (index 1, with alpha 0).
     fn patch_material(text: &str, mut material: Material) -> Result<Material> {
         let texture = |name: &str, alpha: u8| Texture::new(name, 1, 1, vec![1, 2, 3, alpha]).expect("a valid texture");
         let patch: MaterialPatch = toml::from_str(text).map_err(|error| invalid("toml", "a patch", error.message()))?;
@@ -114,6 +114,7 @@ mod tests {
     fn patch_changes_only_the_given_keys() {
         let base = || Material { color_texture: Some(9), specular: [0.5; 3], ..Material::default() };
         assert_eq!(patch_material("", base()).expect("a valid patch"), base());
+        // The empty name removes the color texture. The alpha below 1 selects blending.
         let text = "alpha = 0.5\ncolour_texture = ''\ndiffuse = [1, 0, 0]\nnormal_texture = 'solid'";
         let patched = patch_material(text, base()).expect("a valid patch");
         assert_eq!((patched.color_texture, patched.normal_texture), (None, Some(0)));

@@ -54,9 +54,14 @@ impl Placement {
     }
 
     fn rotation(&self) -> Result<Rotation3<f64>> {
-        let check_length = |field: &str, squared: f64| match squared.is_finite() && squared > 1e-24 {
+        // A length below 1e-12 counts as zero.
+        let check_length = |field: &str, squared_length: f64| match squared_length.is_finite() && squared_length > 1e-24
+        {
             true => Ok(()),
-            false => Err(invalid(field, "finite numbers that are not all zero", format!("length {}", squared.sqrt()))),
+            false => {
+                let given = format!("length {}", squared_length.sqrt());
+                Err(invalid(field, "finite numbers that are not all zero", given))
+            }
         };
         match (self.axis, self.degrees, self.quaternion) {
             (None, None, None) => Ok(Rotation3::identity()),
@@ -94,6 +99,7 @@ mod tests {
 
     #[test]
     fn equivalent_keys_give_equal_transforms() {
+        // A scale of 2, a rotation of 90 degrees about z, and a translation by (1, 2, 3).
         let expected = [0.0, -2.0, 0.0, 1.0, 2.0, 0.0, 0.0, 2.0, 0.0, 0.0, 2.0, 3.0];
         for text in [
             "translation = [1, 2, 3]\naxis = [0, 0, 5]\ndegrees = 90\nscale = 2",

@@ -10,7 +10,9 @@ use crate::scene::{
 
 const TRIANGLE: &str = "mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl red\nf 1 2 3\n";
 
-/// Reads a manifest from a folder with models, modes, materials and images.
+/// Reads a manifest from a folder that also contains two equal models of one triangle with the material `red`, modes
+/// for them (`u.txt`, two modes), modes with a wrong number of entries (`wide.txt`), and an opaque and a transparent
+/// image.
 fn read_manifest(toml: &str) -> Result<SceneDescription> {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let write = |name: &str, text: &str| std::fs::write(folder.path().join(name), text).expect("a writable file");
@@ -94,6 +96,7 @@ fn instances_share_mesh_and_modes_but_not_coordinates_or_names() {
     assert_eq!(parts.domains.iter().map(|domain| domain.shape).collect::<Vec<_>>(), [0, 0, 1]);
     let names: Vec<_> = parts.domains.iter().map(|domain| domain.name.as_str()).collect();
     assert_eq!(names, ["a", "a 2", "b"]);
+    // Each of the two instances has two coordinates of its own.
     let scene = crate::scene::Scene::new(parts).expect("a valid scene");
     assert_eq!((scene.layout.coordinates, scene.layout.domains[1].first_q), (4, 2));
 }
@@ -108,7 +111,9 @@ fn child_attaches_by_frame_or_by_placement() {
     .expect("a valid manifest");
     let [_, by_frame, by_placement] = &parts.domains[..] else { panic!("three domains") };
     let translation = |transform: Transform| transform.translation().map(|x| (x * 1e4).round() / 1e4);
+    // The trunk at (10, 0, 0) is rotated by 90 degrees about z, which maps (1, 0, 0) to (0, 1, 0).
     assert_eq!(translation(by_frame.placement), nalgebra::Vector3::new(10.0, 1.0, 0.0));
+    // Without `rows`, the nearest eight vertices of the parent are used. The trunk has only three.
     for (child, rows) in [(by_frame, &[1][..]), (by_placement, &[0, 1, 2])] {
         let attachment = child.attachment.as_ref().expect("an attachment");
         assert_eq!(translation(attachment.frame), nalgebra::Vector3::x(), "{}", child.name);

@@ -11,7 +11,8 @@ use super::asset_dir::{AssetDir, EntryKind, MAX_MODEL_BYTES};
 use crate::domain::Modes;
 use crate::error::{Result, invalid};
 
-/// Name endings of mode files in order of preference: binary files before text files, which have fewer digits.
+/// Name endings of mode files in order of preference: binary files before text files, which have fewer digits. The
+/// first four can follow the name of an OBJ file; `modes.txt` is SOFA's name.
 const NAME_ENDINGS: [&str; 5] = [".URendering.float", ".U.float", ".npy", ".safetensors", "modes.txt"];
 
 /// Reads the modes in the file `name`. The extension determines the format.
@@ -42,9 +43,10 @@ fn parse_npy(bytes: &[u8]) -> Result<Modes> {
 
 /// Finds the modes of the OBJ file `name` in its folder, if any.
 ///
-/// A file belongs to the OBJ file if its name consists of the OBJ file's name (without `.obj` and `.derived`), optionally
-/// `.U`, and one of the first four [`NAME_ENDINGS`]. If there is no such file and no other OBJ file in the folder, any
-/// file with one of the [`NAME_ENDINGS`] is accepted. The order of the endings decides between several files.
+/// A file belongs to the OBJ file if its name consists of the OBJ file's name (without `.obj` and `.derived`),
+/// optionally `.U`, and one of the first four [`NAME_ENDINGS`]. If there is no such file and no other OBJ file in the
+/// folder, any file with one of the [`NAME_ENDINGS`] is accepted. The order of the endings decides between several
+/// files.
 ///
 /// # Errors
 /// `Invalid` with the candidates if several files have the same ending.

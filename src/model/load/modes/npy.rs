@@ -1,7 +1,7 @@
 //! Parser of NumPy's `.npy` files to arrays of f32.
 //!
-//! The parser of the header only finds known keys. A general parser of Python literals would recurse as deep as brackets
-//! nest, so that a header with many brackets could overflow the stack.
+//! The parser of the header only finds known keys. A general parser of Python literals would recurse as deep as
+//! brackets nest, so that a header with many brackets could overflow the stack.
 
 use crate::error::{Error, Result, invalid};
 
@@ -51,6 +51,8 @@ pub fn parse(bytes: &[u8]) -> Result<NpyArray> {
 /// Splits the file into the text of the header and the data after it.
 fn split_header(bytes: &[u8]) -> Result<(&str, &[u8])> {
     let truncated = || invalid("header", "a complete .npy header", format!("{} bytes", bytes.len()));
+    // Six bytes of magic, then the major and the minor version. Version 1 has a header length of 16 bits, later
+    // versions have 32 bits.
     let magic = bytes.get(..8).ok_or_else(truncated)?;
     if &magic[..6] != b"\x93NUMPY" || !(1..=3).contains(&magic[6]) {
         return Err(invalid("header", "the magic of .npy version 1 to 3", format!("{magic:02x?}")));

@@ -1,5 +1,5 @@
-//! Parser of safetensors files. U is the tensor named `U` or the only tensor of the file, row-major, as f64, f32, f16 or
-//! bf16.
+//! Parser of safetensors files. U is the tensor named `U` or the only tensor of the file, row-major, as f64, f32, f16
+//! or bf16.
 
 use safetensors::{Dtype, SafeTensors};
 
@@ -60,6 +60,8 @@ mod tests {
 
     use super::*;
 
+    /// A file with tensors, each with its name, type, shape and data. Leaks a copy of the data, so that the tensor
+    /// views can borrow it.
     fn serialize_tensors(tensors: &[(&str, Dtype, Vec<usize>, &[u8])]) -> Vec<u8> {
         let view = |(name, dtype, shape, data): &(&str, Dtype, Vec<usize>, &'static [u8])| {
             (name.to_string(), TensorView::new(*dtype, shape.clone(), data).expect("a valid tensor"))
@@ -75,6 +77,7 @@ mod tests {
     fn all_entry_types_give_the_same_column() {
         let f64s: Vec<u8> = [1.0f64, -0.5, 2.0].iter().flat_map(|entry| entry.to_le_bytes()).collect();
         let f32s: Vec<u8> = [1.0f32, -0.5, 2.0].iter().flat_map(|entry| entry.to_le_bytes()).collect();
+        // 1, -0.5 and 2 as binary16, then as bfloat16.
         let f16s: Vec<u8> = [0x3c00u16, 0xb800, 0x4000].iter().flat_map(|entry| entry.to_le_bytes()).collect();
         let bf16s: Vec<u8> = [0x3f80u16, 0xbf00, 0x4000].iter().flat_map(|entry| entry.to_le_bytes()).collect();
         for (dtype, body) in [(Dtype::F64, f64s), (Dtype::F32, f32s), (Dtype::F16, f16s), (Dtype::BF16, bf16s)] {

@@ -155,7 +155,8 @@ impl<'a> ObjMeshBuilder<'a> {
 mod tests {
     use super::*;
 
-    /// Two squares in one plane. The shared edge is duplicated, one vertex is unused, and materials alternate.
+    /// Two squares in one plane, and a triangle on the first square. The squares have their own vertices on their
+    /// common edge, vertex 0 is unused, and materials alternate.
     const SQUARES: &str = "v 9 9 9\nv 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nv 1 0 0\nv 2 0 0\nv 2 1 0\nv 1 1 0\n\
         vt 0 0\nvt 1 1\nusemtl b\nf 2/1 3/1 4/1 5/1\nusemtl a\nf 6 7 8 9\nusemtl b\nf 2/2 3/2 4/2\n";
 
@@ -168,6 +169,7 @@ mod tests {
         let obj = parse_squares();
         let mesh = build_all_faces(&obj).expect("a valid OBJ file").mesh;
         assert_eq!(mesh.rest_positions(), obj.positions);
+        // First both faces of material b, then the face of material a.
         assert_eq!(
             mesh.corners().vertices,
             [1, 2, 3, 4, 1, 2, 3, 5, 6, 7, 8],

@@ -50,7 +50,7 @@ pub(super) fn create_material(
         ambient: statements.ambient.unwrap_or(diffuse),
         diffuse,
         specular: statements.specular.unwrap_or([0.0; 3]),
-        // An exponent below 1 would extend the highlight beyond the light's horizon. Files use 0 for "not specified".
+        // An exponent near 0 would spread the highlight over the whole lit side. Files use 0 for "not specified".
         shininess: statements.exponent.unwrap_or(1.0).clamp(1.0, 1e6),
         alpha,
         color_texture,

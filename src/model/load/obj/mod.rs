@@ -19,6 +19,11 @@ use crate::domain::{Domain, Material, Metadata, Modes, Shape};
 use crate::error::{Result, invalid};
 use crate::scene::SceneParts;
 
+/// The largest number of material names in an error message.
+const MAX_LISTED_NAMES: usize = 16;
+/// The largest number of names of undefined materials in a remark.
+const MAX_LISTED_UNDEFINED: usize = 8;
+
 /// Where the modes of an OBJ file come from.
 #[derive(Debug, Clone, Copy)]
 pub(super) enum ModesSource {
@@ -92,7 +97,8 @@ pub(super) fn add_materials(obj: &ObjFile, files: &AssetDir, parts: &mut ScenePa
                 white_material(name)
             }
             None => {
-                let names = statements_by_name.keys().take(16).map(String::as_str).collect::<Vec<_>>().join(", ");
+                let names = statements_by_name.keys().take(MAX_LISTED_NAMES).map(String::as_str);
+                let names = names.collect::<Vec<_>>().join(", ");
                 return Err(invalid("usemtl", format!("a material of the libraries ({names})"), name));
             }
         };
@@ -100,7 +106,7 @@ pub(super) fn add_materials(obj: &ObjFile, files: &AssetDir, parts: &mut ScenePa
     }
     if !undefined_names.is_empty() {
         let undefined_count = undefined_names.len();
-        undefined_names.truncate(8);
+        undefined_names.truncate(MAX_LISTED_UNDEFINED);
         parts
             .remarks
             .push(format!("undefined materials are white ({undefined_count}): {}", undefined_names.join(", ")));

@@ -10,6 +10,9 @@ use crate::error::{Error, Result, invalid};
 /// The index of a missing texture coordinate or normal of a corner.
 pub(in crate::load) const NO_INDEX: u32 = u32::MAX;
 
+/// The largest number of remarks on unsupported statements, one per key.
+const MAX_REMARKS: usize = 16;
+
 /// One corner of a polygon, as indices into the lists of the file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub(in crate::load) struct Corner {
@@ -184,7 +187,7 @@ impl Parser {
     fn finish(mut self) -> Result<ObjFile> {
         self.obj.check_faces()?;
         let remark = |(key, count): (&String, &usize)| format!("{count} statements '{key}' are not used");
-        self.obj.remarks.extend(self.unsupported_counts.iter().take(16).map(remark));
+        self.obj.remarks.extend(self.unsupported_counts.iter().take(MAX_REMARKS).map(remark));
         Ok(self.obj)
     }
 }
@@ -262,6 +265,7 @@ mod tests {
 
     #[test]
     fn comments_continuations_and_names_with_spaces_are_parsed() {
+        // The third vertex has a color, which is ignored. The material `none` has no face.
         let text = "# head\r\nmtllib my file.mtl\r\nv 0 0 0 # first\r\nv 1 \\\r\n 0 0\r\nv 0 1 0 1 0 0\r\n\
                     usemtl dark bark\r\nf 1 2 \\\n 3\r\nl 1 2\r\nusemtl none\nusemtl light\nf 3 2 1 # back\n";
         let obj = ObjFile::parse(text.as_bytes()).expect("a valid file");

@@ -2,15 +2,16 @@
 
 use nalgebra::{Vector2, Vector3};
 
-/// The largest polygon that is triangulated by ear clipping, which takes cubic time. Larger ones are split into a fan.
+/// The largest polygon that is triangulated by ear clipping, which takes cubic time. A larger polygon is split into a
+/// fan.
 const MAX_EAR_CLIPPING_CORNERS: usize = 256;
 
 /// Splits a polygon into triangles with the polygon's winding, as indices into `points`. There are always two fewer
 /// triangles than points.
 ///
-/// If all triangles of the fan from the first corner have the polygon's orientation, the fan is used. Otherwise a quad
-/// is split along its other diagonal, and a larger polygon by ear clipping in the plane of its normal (Newell's
-/// method).
+/// If all triangles of the fan from the first corner have the polygon's orientation, the fan is used. Otherwise a
+/// quadrilateral is split along its other diagonal, and a larger polygon by ear clipping in the plane of its normal
+/// (Newell's method).
 pub(super) fn triangulate(points: &[[f32; 3]]) -> Vec<[usize; 3]> {
     let fan = |count: usize| (2..count).map(|index| [0, index - 1, index]).collect::<Vec<_>>();
     if points.len() <= 3 {

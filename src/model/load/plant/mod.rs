@@ -18,8 +18,8 @@ use crate::scene::{SceneParts, UpAxis};
 
 /// Reads the plant `stem` in the folder `files`.
 ///
-/// The frame of a domain has the axes of the scene. Its origin is the base of the organ: the first point of a shoot, the
-/// start of a leaf's petiole, or the base of a leaf whose petiole belongs to another leaf.
+/// The frame of a domain has the axes of the scene. Its origin is the base of the organ: the first point of a shoot,
+/// the start of a leaf's petiole, or the base of a leaf whose petiole belongs to another leaf.
 ///
 /// # Errors
 /// `Invalid` with the file, and the expected and given value.
@@ -45,7 +45,7 @@ pub(super) fn read(files: &AssetDir, stem: &str) -> Result<SceneParts> {
     PlantBuilder { obj: &obj, structure: &structure, faces_by_organ, organ_domains: HashMap::new(), parts }.build()
 }
 
-/// The positions of the corners of each object.
+/// For each object id, the positions of the corners of its faces.
 fn positions_by_object(obj: &ObjFile, object_ids: &[u64]) -> BTreeMap<u64, Vec<[f32; 3]>> {
     let mut positions: BTreeMap<u64, Vec<[f32; 3]>> = BTreeMap::new();
     for (face, object_id) in object_ids.iter().enumerate() {
@@ -65,8 +65,8 @@ struct PlantBuilder<'a> {
 }
 
 impl PlantBuilder<'_> {
-    /// Adds the shoots, parents first, then the leaves with a petiole polyline, then the other leaflets. The parent of
-    /// such a leaflet is the leaf with the polyline of the same petiole or, if there is none, the shoot.
+    /// Adds the shoots, parents first, then the leaves with a petiole polyline, then the leaves without one. The parent
+    /// of a leaf without a polyline is the leaf with the polyline of the same petiole or, if there is none, the shoot.
     fn build(mut self) -> Result<SceneParts> {
         let structure = self.structure;
         for index in &structure.parent_first_order {
@@ -123,9 +123,11 @@ fn translation_transform(translation: [f64; 3]) -> Transform {
 mod tests {
     use super::*;
 
-    /// A shoot, a leaf with petiole, its leaflet, and a fruit; two materials.
+    /// Five triangles with two materials, one per object of [`IDS`]. No face uses the last vertex.
     const OBJ: &str = "v 0 0 1\nv 0.1 0 1\nv 0 0.1 2\nv 0 0 2\nv 1 0 2\nv 1 1 2\nv 0.9 0 2\nv 3 3 9\n\
         usemtl bark\nf 1 2 3\nf 4 5 7\nusemtl leaf\nf 5 6 7\nf 7 6 5\nusemtl bark\nf 1 3 2\n";
+    /// The object of each face: the internode of the shoot, a petiole, the petiole's leaf, a leaflet of the same
+    /// petiole, and a fruit.
     const IDS: &str = "1\n4\n2\n3\n5\n";
     const JSON: &str = r#"{
         "objects": {"1": "internode", "2": "leaf", "3": "leaf", "4": "petiole", "5": "fruit"},
@@ -161,6 +163,7 @@ mod tests {
                 )
             })
             .collect();
+        // Name, triangles, parent and material ranges. The fruit belongs to the shoot, the petiole to leaf 2.
         let expected = [("shoot 0", 2, None, 0), ("leaf 2", 2, Some(0), 2), ("leaf 3", 1, Some(1), 0)];
         assert_eq!(domains, expected, "expected the leaf with the petiole as parent of the leaflet");
         assert_eq!(parts.up, UpAxis::Z);

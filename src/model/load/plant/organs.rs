@@ -1,5 +1,6 @@
-//! Assigns each object of a plant to an organ. The organs are the shoots and the leaves; all other objects become parts
-//! of one of them.
+//! Assigns each object of a plant to an organ. An object is a set of faces with one id, such as an internode (the stem
+//! of one shoot), a petiole (leaf stalk) or a fruit. The organs are the shoots and the leaves; every other object
+//! becomes a part of a shoot or leaf.
 
 use std::collections::{BTreeMap, HashMap};
 
@@ -140,6 +141,7 @@ mod tests {
         assert_eq!(organs[&5], Organ::Shoot(0));
         assert_eq!(organs[&9], Organ::Shoot(1));
         assert_eq!(organs[&3], Organ::Leaf(0));
+        // The points of object 10 are the petiole polyline of leaf 1. Object 11 begins 0.5 from the end of shoot 1.
         assert_eq!(organs[&10], Organ::Leaf(1));
         assert_eq!(organs[&11], Organ::Shoot(1));
     }

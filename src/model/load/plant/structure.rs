@@ -13,8 +13,8 @@ pub(super) struct Shoot {
     pub(super) vertices: Vec<[f64; 3]>,
 }
 
-/// A leaf. One leaf per petiole has the petiole's polyline; the other leaflets of that petiole have none. Leaflets of one
-/// petiole have the same `shoot`, `node` and `petiole`.
+/// A leaf or leaflet. Leaflets of one petiole have the same `shoot`, `node` and `petiole`. One of them has the polyline
+/// of the petiole.
 #[derive(Debug, Clone, serde::Deserialize)]
 pub(super) struct Leaf {
     pub(super) object_id: u64,
@@ -54,8 +54,8 @@ impl PlantStructure {
     /// Parses and validates the JSON text.
     ///
     /// # Errors
-    /// `Invalid` with the entry: invalid JSON, an unknown parent, a cycle, a number that exceeds f32, an empty polyline,
-    /// or a leaf that is not an object or is duplicated.
+    /// `Invalid` with the entry: invalid JSON, an unknown parent, a cycle, a number that exceeds f32, an empty
+    /// polyline, or a leaf that is not an object or is duplicated.
     pub(super) fn parse(bytes: &[u8]) -> Result<Self> {
         let file: StructureJson =
             serde_json::from_slice(bytes).map_err(|error| invalid("json", "objects, shoots and leaves", error))?;

@@ -3,7 +3,7 @@
 use serde_json::json;
 
 use super::materials::{encode_png, textured_triangle};
-use super::{F32, Model, U16, morphed_triangle, push};
+use super::{F32, Model, U8, U16, morphed_triangle, push};
 use crate::load::asset_dir::AssetDir;
 use crate::load::gltf::buffers::{GltfBuffers, MEMORY_BUDGET};
 use crate::load::gltf::remarks::ImportRemarks;
@@ -25,7 +25,7 @@ fn complete_model() -> Model {
         "componentType": F32, "type": "VEC3", "count": 3,
         "sparse": {
             "count": 2,
-            "indices": {"bufferView": sparse_indices, "componentType": 5121},
+            "indices": {"bufferView": sparse_indices, "componentType": U8},
             "values": {"bufferView": sparse_values}
         }
     });
@@ -173,7 +173,7 @@ fn invalid_indices_and_non_finite_numbers_are_rejected() {
 fn mode_and_memory_limits_are_checked_before_allocation() {
     let targets: Vec<_> = (0..513).map(|_| json!({"POSITION": 0})).collect();
     assert_rejected(&Model::triangle().with("/meshes/0/primitives/0/targets", targets.into()), "targets");
-    // Use most of the budget before the model is assembled.
+    // Use all but `remaining_budget` bytes of the budget before the model is assembled.
     let model = complete_model();
     let document = container::parse_document(model.json.to_string().as_bytes()).expect("a valid document");
     let folder = AssetDir::unrestricted(&std::env::temp_dir());

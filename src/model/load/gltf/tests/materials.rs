@@ -51,6 +51,7 @@ fn metalness_and_roughness_become_phong_parameters() {
         assert!((channel - 0.16).abs() <= 1e-6, "{channel}");
     }
     assert!((plastic.shininess - 7.5).abs() <= 1e-5, "{}", plastic.shininess);
+    // alpha^2 = 1: a peak of f / 4 with f = the base color, and an exponent of 0 that is clamped to 1.
     let metal = material_with_factors(1.0, 1.0);
     assert_eq!(metal.diffuse, [0.4, 0.2, 0.1]);
     assert_eq!(metal.specular, [0.2, 0.1, 0.05]);

@@ -13,7 +13,7 @@ fn read_dataset(path: &str) -> SceneParts {
 }
 
 #[test]
-#[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
+#[ignore = "needs the real inputs: MODALCAST_DATA or ../../../shared/data (from this crate)"]
 fn real_morph_stress_test_has_a_rigid_and_a_modal_domain() {
     let parts = read_dataset("gltf/MorphStressTest/MorphStressTest.gltf");
     assert_eq!(parts.name, "MorphStressTest");
@@ -43,7 +43,7 @@ fn real_morph_stress_test_has_a_rigid_and_a_modal_domain() {
 }
 
 #[test]
-#[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
+#[ignore = "needs the real inputs: MODALCAST_DATA or ../../../shared/data (from this crate)"]
 fn real_ferns_are_four_masked_plants_with_a_normal_map() {
     let parts = read_dataset("gltf/fern/fern_02.glb");
     let sizes: Vec<_> = parts
