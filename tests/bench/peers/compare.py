@@ -1,5 +1,5 @@
-"""Compares the two programs. Writes their times to peers.json, and an image per scene with three parts side by side: the
-frame of modalcast, the frame of the peer, and four times their difference.
+"""Compares modalcast with the peer, the moderngl program of draw.py. Writes their times to peers.json, and an image per scene
+with three parts side by side: the frame of modalcast, the frame of the peer, and four times their difference.
 """
 
 import json
@@ -44,7 +44,7 @@ def undo_filter(filter_type, line, above):
     if filter_type == 2:
         return line + above
     row, line, above = np.zeros(len(line) + 3, np.int64), line.astype(np.int64), above.astype(np.int64)
-    # `row` starts with one zero pixel, so byte i of the row is row[i + 3].
+    # `row` starts with a zero pixel of three bytes, so byte i of the line is row[i + 3] and its left neighbor row[i].
     for i in range(len(line)):
         left, above_left = row[i], above[i - 3] if i >= 3 else 0
         if filter_type == 1:

@@ -1,8 +1,8 @@
 """A plain moderngl program that draws the scene of mesh.py with a shadow map and one forward pass.
 
 Camera, light and map size come from times.json of `modalcast report render --scene`. For each shadow method, the program
-writes an image and the times to the same folder (peer.json). Times are wall-clock times of a frame with its pixels in host
-memory. The number of frames is that of modalcast.
+writes an image to the same folder, and the times to peer.json. Times are wall-clock times of a frame with its pixels in host
+memory. The program times as many frames as modalcast.
 """
 
 import json
@@ -13,7 +13,7 @@ from pathlib import Path
 import moderngl
 import numpy as np
 
-from mesh import build_mesh, image, write_png
+from mesh import build_mesh, cloth_image, write_png
 
 BLUR_RADIUS = 5  # texels on each side of the center: over three times the standard deviation of 1.5 texels in modalcast
 
@@ -135,7 +135,7 @@ class Peer:
             self.full_screen = gl.vertex_array(self.blur, [])
         else:
             self.framebuffers = [gl.framebuffer(depth_attachment=self.depth)]
-        cloth = image()
+        cloth = cloth_image()
         # 0x8C41 is GL_SRGB8.
         self.cloth = gl.texture(cloth.shape[1::-1], 3, cloth.tobytes(), alignment=1, internal_format=0x8C41)
         self.cloth.build_mipmaps()

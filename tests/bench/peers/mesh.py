@@ -1,7 +1,7 @@
-"""Builds the scene that both programs draw: a field of hills, a knot above it, and one image for both.
+"""Builds the scene that modalcast and the moderngl program draw: a field of hills and a knot above it, with one texture.
 
-Writes it as OBJ, MTL, PNG and two scene files for modalcast. The peer calls `build_mesh` and `image`, so that both programs
-draw the same triangles in the same order.
+Writes the scene as OBJ, MTL, PNG and two scene files for modalcast. The moderngl program (draw.py) calls `build_mesh` and
+`cloth_image`, so that both programs draw the same triangles in the same order.
 """
 
 import struct
@@ -13,7 +13,7 @@ import numpy as np
 
 FIELD = 320  # cells along each side of the field
 KNOT = (900, 40)  # cells along the knot and around it
-IMAGE = 512  # width and height in pixels
+IMAGE = 512  # width and height of the texture in pixels
 
 LOOK = """model = 'mesh.obj'
 ground = false
@@ -78,8 +78,8 @@ def knot():
     return points, circle.reshape(-1, 3), np.stack([u, v], axis=-1).reshape(-1, 2), triangles
 
 
-def image():
-    """The RGB image of the cloth, which repeats without seams."""
+def cloth_image():
+    """The RGB texture of the field and the knot, which repeats without seams."""
     v, u = np.meshgrid((np.arange(IMAGE) + 0.5) / IMAGE, (np.arange(IMAGE) + 0.5) / IMAGE, indexing="ij")
     wave = lambda periods: 0.5 + 0.5 * np.sin(2 * np.pi * periods)
     light = 0.45 + 0.4 * wave(4 * u + wave(2 * v)) * wave(4 * v + wave(2 * u)) + 0.15 * wave(32 * u) * wave(32 * v)
@@ -120,7 +120,7 @@ def write(folder):
     lines += ["f %d/%d/%d %d/%d/%d %d/%d/%d" % tuple(np.repeat(triangle + 1, 3)) for triangle in triangles]
     (folder / "mesh.obj").write_text("\n".join(lines) + "\n")
     (folder / "mesh.mtl").write_text("newmtl cloth\nKa 1 1 1\nKd 1 1 1\nKs 0.2 0.2 0.2\nNs 24\nmap_Kd cloth.png\n")
-    write_png(folder / "cloth.png", image())
+    write_png(folder / "cloth.png", cloth_image())
     for name, shadow in SHADOWS.items():
         (folder / f"{name}.toml").write_text(LOOK.format(shadow=shadow))
 

@@ -17,8 +17,8 @@ use modalcast_model::deform::{Backend, Deformer};
 use modalcast_model::error::{Error, Result};
 use modalcast_model::scene::{DeformationSettings, NormalMethod, Scene, SceneState, StorageType};
 
-/// Peak memory bandwidths of a backend in 10^9 bytes per second, and its launch overhead, measured in the same run.
-/// `None` where a value was not measured.
+/// Peak memory bandwidths of a backend in 10^9 bytes per second, and its launch overhead, measured in the same run as
+/// the variants. `None` where a value was not measured.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 pub struct MemoryBandwidth {
     /// Fastest copy: bytes read plus bytes written.
@@ -75,21 +75,22 @@ pub trait BenchTarget {
 /// A deformer, or the reason why it could not be created.
 type DeformerResult = Result<Box<dyn Deformer>>;
 
-/// Maximum count of numbers in U and x0 for which the reference is measured. On larger scenes, its single thread would
-/// take minutes.
+/// Maximum count of numbers in U and x0 for which the reference is measured. On larger scenes, the single-threaded
+/// reference would take minutes.
 const MAX_REFERENCE_NUMBERS: usize = 1 << 23;
 
-/// The deformers of this machine: the CPU, the slow f64 reference, and CUDA if a device opens.
+/// The variants of this machine: those of the CPU, of the slow f64 reference, and of CUDA if a device opens.
 #[derive(Debug)]
 pub struct LocalMachine {
+    /// The CUDA device, or the reason why it could not be opened.
     device: Result<Arc<Device>>,
-    cuda: MemoryBandwidth,
-    cpu: MemoryBandwidth,
+    cuda_bandwidth: MemoryBandwidth,
+    cpu_bandwidth: MemoryBandwidth,
 }
 
-/// Size of the buffer from which the read bandwidth of all cores is measured. It exceeds the caches of a socket.
+/// Size of the buffer from which the read bandwidth of all cores is measured. 512 MiB exceed the caches of a socket.
 const READ_BYTES: usize = 1 << 29;
-/// Reads of that buffer. The fastest one counts.
+/// Number of reads of the buffer. The fastest one counts.
 const READ_REPETITIONS: usize = 5;
 
 impl LocalMachine {
@@ -103,13 +104,13 @@ impl LocalMachine {
             let [pinned_h2d_gbs, pinned_d2h_gbs] = [pinned_h2d_gbs, pinned_d2h_gbs].map(Some);
             Ok((device, MemoryBandwidth { copy_gbs, read_gbs, empty_us, pinned_h2d_gbs, pinned_d2h_gbs }))
         };
-        let cpu = MemoryBandwidth {
+        let cpu_bandwidth = MemoryBandwidth {
             read_gbs: Some(read_bandwidth(READ_BYTES, READ_REPETITIONS)),
             ..MemoryBandwidth::default()
         };
         match Device::open(0).and_then(measure_device) {
-            Ok((device, cuda)) => Self { device: Ok(device), cuda, cpu },
-            Err(error) => Self { device: Err(error), cuda: MemoryBandwidth::default(), cpu },
+            Ok((device, cuda_bandwidth)) => Self { device: Ok(device), cuda_bandwidth, cpu_bandwidth },
+            Err(error) => Self { device: Err(error), cuda_bandwidth: MemoryBandwidth::default(), cpu_bandwidth },
         }
     }
 }
@@ -141,13 +142,14 @@ impl BenchTarget for LocalMachine {
             // A complete step of the server: upload of q and T, kernels, readback of the bounding boxes.
             let cuda = |scene: &Arc<Scene>| -> DeformerResult {
                 let options = CudaDeformerOptions { batches: workload.batches, bounding_axes: scene.light_axes() };
-                Ok(Box::new(CudaDeformer::new(device, scene, None, options)?))
+                let no_gl_buffers = None;
+                Ok(Box::new(CudaDeformer::new(device, scene, no_gl_buffers, options)?))
             };
             candidates.push(candidate("cuda f32 step", Backend::Cuda, scene.deformation, &cuda));
             if let Some(exact) = exact_normals(scene) {
                 candidates.push(candidate("cuda f32 step, exact normals", Backend::Cuda, exact, &cuda));
             }
-            // The other alternatives are exact normals (above) and storage types (`kernel_variants`).
+            // The alternatives with exact normals are added above, those with other storage types in `kernel_variants`.
             for (name, deformation) in alternative_deformations(scene)
                 .into_iter()
                 .filter(|(_, deformation)| cuda_variants::truncates_or_compensates(deformation))
@@ -167,7 +169,7 @@ impl BenchTarget for LocalMachine {
     }
 
     fn memory_bandwidth(&self, backend: Backend) -> MemoryBandwidth {
-        if backend == Backend::Cuda { self.cuda } else { self.cpu }
+        if backend == Backend::Cuda { self.cuda_bandwidth } else { self.cpu_bandwidth }
     }
 
     fn time_upload(&self, workload: &Workload, replays: usize) -> Option<UploadTiming> {
@@ -175,7 +177,7 @@ impl BenchTarget for LocalMachine {
         let (bytes, timing) =
             kernels::time_upload(device, &workload.scene, &SceneState::rest(&workload.scene), replays).ok()?;
         // 1 GB/s is 1e3 bytes per microsecond.
-        let pinned_copy_us = bytes as f64 / (1e3 * self.cuda.pinned_h2d_gbs?);
+        let pinned_copy_us = bytes as f64 / (1e3 * self.cuda_bandwidth.pinned_h2d_gbs?);
         Some(UploadTiming { bytes, median_us: timing.median_us, of_pinned: timing.median_us / pinned_copy_us })
     }
 
@@ -203,7 +205,7 @@ impl BenchTarget for LocalMachine {
 const TRUNCATION_BUDGETS: [(&str, f64); 3] = [("1e-6", 1e-6), ("1e-5", 1e-5), ("1e-4", 1e-4)];
 
 /// Deformations to measure in addition to the scene's own, by name: other storage types, truncation, compensated
-/// summation and exact normals. Empty when the scene has no modes or does not have the default deformation.
+/// summation and exact normals. Empty when the scene has no modes, or sets a deformation other than the default.
 fn alternative_deformations(scene: &Scene) -> Vec<(String, DeformationSettings)> {
     let default = scene.deformation;
     if !scene.features.modes || default != DeformationSettings::default() {
@@ -259,7 +261,7 @@ mod tests {
 
     #[test]
     fn skips_reference_on_large_scenes() {
-        // U and x0 have 3 x 21 x 2^18 = 16.5 M numbers, more than MAX_REFERENCE_NUMBERS = 8.4 M.
+        // 20 modes and x0 have 21 x 3 x 2^18 = 16.5 M numbers, more than MAX_REFERENCE_NUMBERS = 8.4 M.
         let workload = WorkloadKind::Single { power: 18, rank: 20 }.build(Size::Full).expect("expected a workload");
         assert!(
             LocalMachine::open().variants(&workload, &|_| true).iter().all(|(label, _)| label.name != "reference f64")

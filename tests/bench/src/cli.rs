@@ -42,8 +42,8 @@ const EXAMPLES: &str = "Examples:
 
 const LOADS: &str = "Loads:
   single-P-R          one domain of 2^P vertices and R modes (table 4.4 of the thesis: P is 14 to 22, R is 10 to 30)
-  a, a-positions      one domain of 1.5 M vertices, r = 32, with normals and tangents, or without
-  b                   1,000 domains of 1,500 vertices, with r from 0 to 64
+  a, a-positions      one domain of 1.5 M vertices and 32 modes, with normals and tangents, or without
+  b                   1,000 domains of 1,500 vertices and 0 to 64 modes
   c                   200,000 domains of 7 vertices, 95 % of them rigid
   cancel              one domain whose modes nearly cancel in pairs
   batch               16 instances of one domain of 2^18 vertices and 32 modes
@@ -104,7 +104,7 @@ pub fn run() -> u8 {
         Some(ReportCommand::Render(args)) => render::run(args),
         None => {
             Cli::command().print_help().ok(); // A closed stdout is no error.
-            return 2; // As clap exits after invalid arguments.
+            return 2; // The exit code of clap for invalid arguments.
         }
     })
 }

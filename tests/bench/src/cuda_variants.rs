@@ -1,4 +1,4 @@
-//! Makes variants of the CUDA kernel benchmarks that a workload supports.
+//! Lists the CUDA kernel benchmarks that a workload supports, as variants of the report.
 
 use std::sync::Arc;
 
@@ -26,7 +26,7 @@ const UQ_SUFFIX: &str = " Uq";
 /// Name suffix of the variant that changes one domain in a hundred.
 const ONE_PERCENT_CHANGED: &str = ", 1 % changed";
 
-/// The parts of a step that are measured of cuBLAS and of the kernels of the thesis, each with the name suffix of its
+/// The parts of a step for which cuBLAS and the kernels of the thesis are measured, each with the name suffix of its
 /// variant.
 const PARTS: [(kernels::StepPart, &str); 2] = [(kernels::StepPart::Uq, UQ_SUFFIX), (kernels::StepPart::Whole, "")];
 
@@ -109,8 +109,8 @@ pub(super) fn truncates_or_compensates(deformation: &DeformationSettings) -> boo
     deformation.truncation.is_some() || deformation.compensated
 }
 
-/// Settings of a variant that times the deformer's kernels on full steps. With truncation, it selects the modes of
-/// every state independently of earlier states.
+/// Settings of a variant that times the deformer's kernels on steps that change all domains. With truncation, the
+/// variant selects the modes of every state independently of earlier states.
 pub(super) struct StepVariant {
     pub name: String,
     pub deformation: DeformationSettings,
@@ -235,7 +235,8 @@ fn thesis_variants(device: &Arc<Device>, scene: &Arc<Scene>, is_selected: Varian
         candidate(format!("thesis {} kernels{suffix}", split.widths().len()), create)
     };
     let max_rank = (0..scene.domains.len()).map(|domain| scene.rank_of(domain)).max().unwrap_or(0);
-    // The vertex update writes triangle corners and omits vertices without triangle. Then only u = U q is measured.
+    // The thesis's vertex update writes triangle corners, so it omits vertices that no triangle refers to. A scene with
+    // such vertices is measured for u = U q only.
     let parts = if refers_to_all_vertices(scene) { &PARTS[..] } else { &PARTS[..1] };
     match (scene.domains.len(), max_rank) {
         (1, _) => parts.iter().copied().map(single).collect(),
@@ -259,13 +260,14 @@ fn refers_to_all_vertices(scene: &Scene) -> bool {
     })
 }
 
-/// Whether the scene has normals to compute. Workloads that measure positions only have the minimum of three corners
-/// per shape.
+/// Whether the scene has normals to compute. The shapes of workloads that measure only positions have three corners,
+/// the minimum of a mesh.
 pub(super) fn has_normals(scene: &Scene) -> bool {
     scene.shapes.iter().any(|shape| shape.mesh.corners().vertices.len() > 3)
 }
 
-/// Formula of the memory traffic of an array, for the report. n is vertices, r modes, d domains.
+/// Formula of the memory traffic of an array in bytes, for the report. n is vertices, r modes, d domains. "As packed"
+/// means the bytes of the array on the device.
 fn traffic_formula(array: &str) -> &'static str {
     match array {
         "U" => "as packed: entries of all modes and vertices, filled up to tiles",

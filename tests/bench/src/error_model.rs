@@ -1,5 +1,5 @@
-//! Error model of a deformer: what it replaces in x = T (x0 + U q) before it computes (storage of U, truncation of
-//! modes, 16-bit coordinates), and a-priori bounds on the resulting error.
+//! Error model of a deformer: the operands of x = T (x0 + U q) that the deformer approximates before it computes (U by
+//! its storage type, modes by truncation, q by 16-bit numbers), and a-priori bounds on the resulting error.
 
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -13,7 +13,7 @@ use modalcast_compute::storage::{
 use modalcast_model::error::Result;
 use modalcast_model::scene::{DeformationSettings, DomainLayout, Scene, SceneState, StorageType};
 
-/// Vertices per tile of stored U.
+/// Vertices per tile of stored U. A quad is four consecutive vertices.
 const TILE: usize = QUAD * TILE_QUADS;
 
 /// The error model of one scene, derived from its deformation.
@@ -66,7 +66,7 @@ impl ErrorModel {
         Self { uses_tensor_cores: true, ..self }
     }
 
-    /// Whether nothing in x = T (x0 + U q) is replaced. All such deformers have the same bounds.
+    /// Whether no operand of x = T (x0 + U q) is approximated. All such deformers have the same bounds.
     pub fn is_exact(&self) -> bool {
         !self.has_stored_modes() && !self.truncates()
     }
@@ -81,7 +81,7 @@ impl ErrorModel {
         self.truncation.is_some()
     }
 
-    /// Forgets the truncation of earlier states, which otherwise influences that of the next state.
+    /// Forgets which modes were truncated at earlier states. Otherwise they influence the choice at the next state.
     pub fn reset_truncation(&mut self) {
         if let Some(TruncationState { domains, .. }) = &mut self.truncation {
             domains.iter_mut().for_each(Truncation::reset);
@@ -136,7 +136,10 @@ impl ErrorModel {
     /// The packed coordinates as tensor cores read them: each one rounded to the sum of two 16-bit numbers. `None` when
     /// the deformer does not use tensor cores.
     pub(super) fn split_q(&self, q: &[f64]) -> Option<Vec<f64>> {
-        let split_domain = |(domain, slot): (usize, &DomainLayout)| -> Vec<f64> {
+        if !self.uses_tensor_cores {
+            return None;
+        }
+        let split_domain = |domain: usize, slot: &DomainLayout| -> Vec<f64> {
             // U is stored divided by the factor of each mode, so tensor cores multiply it by q times the factor.
             let factors = self.stored[self.scene.domains[domain].shape].tiles.factors();
             let scaled_q = q[slot.first_q..][..slot.rank].iter().zip(factors).map(|(q, factor)| *q as f32 * factor);
@@ -148,10 +151,10 @@ impl ErrorModel {
                 .collect()
         };
         let mut rounded_q = q.to_vec();
-        for (domain, slot) in self.scene.layout.domains.iter().enumerate().filter(|_| self.uses_tensor_cores) {
-            rounded_q[slot.first_q..][..slot.rank].copy_from_slice(&split_domain((domain, slot)));
+        for (domain, slot) in self.scene.layout.domains.iter().enumerate() {
+            rounded_q[slot.first_q..][..slot.rank].copy_from_slice(&split_domain(domain, slot));
         }
-        self.uses_tensor_cores.then_some(rounded_q)
+        Some(rounded_q)
     }
 }
 
@@ -246,8 +249,9 @@ impl DomainErrorBounds<'_> {
                     cached.filter(|(cached_tile, ..)| *cached_tile == tile).unwrap_or_else(evaluate_tile);
                 cached = Some((tile, tile_bound, tensor_core_bound));
                 // Rounding errors of the sum grow with the stored entries. 1e-4 exceeds their relative growth: 512
-                // modes, the maximum, have about 520 roundings of 6e-8 each.
+                // modes, the maximum, have about 520 roundings of 6e-8 each, 3e-5 in total.
                 let stored = (tile_bound.storage + tile_bound.coordinates) * (1.0 + 1e-4);
+                // The total of the tile also bounds the error of each vertex. The smaller of the two bounds is used.
                 *bound = (*bound + stored).min(tile_bound.total()) + tensor_core_bound;
             }
             *bound += self.truncation;
@@ -301,10 +305,12 @@ mod tests {
             assert!(!stored.is_exact() && stored.tiles(0).is_some());
             let mut bounds = [1e-6; 256];
             stored.bounds(0, &state).widen_bounds(0, bounds.iter_mut());
+            // Any vertex.
             bounds[200]
         };
         let [f16_bound, bf16_bound, int8_bound] =
             [StorageType::F16, StorageType::Bf16, StorageType::Int8].map(widened_bound);
+        // The bound of f16 exceeds ten times the initial bound.
         assert!(
             1e-5 < f16_bound && f16_bound < bf16_bound && f16_bound < int8_bound,
             "{f16_bound} {bf16_bound} {int8_bound}"
@@ -325,6 +331,7 @@ mod tests {
         assert_eq!(stored.split_q(&q), None);
         let tensor_core_model = stored.with_tensor_cores();
         let tensor_core_bound = widened_bound(&tensor_core_model);
+        // Storage in bf16 has a much larger error than tensor cores.
         assert!(
             storage_bound < tensor_core_bound && tensor_core_bound < 1.1 * storage_bound,
             "{storage_bound} {tensor_core_bound}"
@@ -349,6 +356,7 @@ mod tests {
             error_model.truncate(0, &mut q);
             q.iter().filter(|q| **q != 0.0).count()
         };
+        // The workload has 20 modes. None is truncated before the first state.
         assert_eq!(count_nonzero_coordinates(&truncated), 20);
         truncated.update_truncation(&state);
         assert!((1..20).contains(&count_nonzero_coordinates(&truncated)), "{}", count_nonzero_coordinates(&truncated));

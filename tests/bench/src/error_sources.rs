@@ -178,7 +178,8 @@ mod tests {
         WorkloadKind::Single { power: 8, rank: 2 }.build(Size::Full).expect("expected a load")
     }
 
-    /// The sources of the error of `got`, or of a variant that computes in f64 and rounds only its positions.
+    /// The sources of the error of the positions `got`. Without `got`, those of a variant that computes in f64 and
+    /// rounds only its positions.
     fn measure(deformation: DeformationSettings, truth: &ExactState, got: Option<&[f32]>) -> ErrorSources {
         let (scene, state) = (with_deformation(&load().scene, deformation).expect("expected a scene"), truth.state());
         let mut error_model = ErrorModel::of(&scene);
@@ -211,7 +212,7 @@ mod tests {
                 == [ErrorNorms::default(); 5]
         );
         assert!(sources.origin.largest > 0.0 && sources.origin.largest < 1e-6);
-        // f32 rounds 2^-30 off. Entries of U are at most 1, so a vertex moves by at most 2^-30 sqrt(3) = 1.6e-9.
+        // 1 + 2^-30 is 1 in f32. Entries of U are at most 1, so a vertex moves by at most 2^-30 sqrt(3) = 1.6e-9.
         let sources =
             measure(default(), &ExactState { q: vec![1.0 + 2f64.powi(-30), 0.5], ..representable_truth() }, None);
         assert!(
@@ -226,11 +227,12 @@ mod tests {
         assert!(sources.transform.largest > 1e-9 && sources.q.largest == 0.0, "{sources:?}");
         let sources =
             measure(DeformationSettings { storage: StorageType::Int8, ..default() }, &representable_truth(), None);
-        // Upper bound: half a step of 1/127 for coordinates with the sum 1.5, on three axes: sqrt(3) < 1.74.
+        // int8 stores entries of at most 1 with errors of at most 0.5 / 127. The coordinates add up to 1.5, and errors
+        // on three axes have a length of at most sqrt(3) < 1.74 times each of them.
         assert!(sources.storage.largest > 1e-3 && sources.storage.largest < 0.5 / 127.0 * 1.5 * 1.74, "{sources:?}");
         assert_eq!([sources.accumulation, sources.truncation], [ErrorNorms::default(); 2]);
-        // Modes with a total displacement below half of the budget, 0.875, are truncated. Mode 0 moves vertices by up
-        // to sqrt(3) = 1.73, mode 1 by up to 0.5 sqrt(3) = 0.866.
+        // Modes are truncated while their total displacement is below half of the budget: 1.75 / 2 = 0.875. Mode 0
+        // moves vertices by up to sqrt(3) = 1.73, mode 1 by up to 0.5 sqrt(3) = 0.866. Only mode 1 is truncated.
         let sources =
             measure(DeformationSettings { truncation: Some(1.75), ..default() }, &representable_truth(), None);
         assert!(sources.truncation.largest > 0.5 && sources.truncation.largest <= 0.87, "{sources:?}");
@@ -239,7 +241,7 @@ mod tests {
 
     #[test]
     fn counts_unexplained_error_as_accumulation() {
-        // The load has 2^8 vertices near the origin. All positions are wrong by about (1e3, 1e3, 1e3).
+        // The load has 2^8 = 256 vertices near the origin, so positions of (1e3, 1e3, 1e3) are wrong by about as much.
         let got = vec![1e3_f32; 3 * 256];
         let sources =
             measure(DeformationSettings::default(), &WorkloadMotion::new(&load(), None).random_state(0), Some(&got));

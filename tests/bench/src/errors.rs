@@ -109,11 +109,16 @@ pub struct PositionErrors {
 /// Accumulator for [`PositionErrors`], in scene units.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct PositionErrorAccumulator {
+    /// Lengths of the error vectors.
     length: NormAccumulator,
+    /// Projected errors.
     pixels: NormAccumulator,
-    bias: [f64; 3],
-    bound: f64,
-    of_bound: f64,
+    /// Sum of the error vectors.
+    error_sum: [f64; 3],
+    /// Largest bound of a vertex.
+    max_bound: f64,
+    /// Largest quotient of a vertex's error and its own bound.
+    max_of_bound: f64,
     not_finite: u64,
     states: usize,
 }
@@ -138,9 +143,9 @@ impl PositionErrorAccumulator {
         let error: [f64; 3] = std::array::from_fn(|axis| got[axis] - want.position[axis]);
         let length = norm(error);
         self.length.add(length);
-        self.bias = std::array::from_fn(|axis| self.bias[axis] + error[axis]);
-        self.bound = self.bound.max(want.bound);
-        self.of_bound = self.of_bound.max(length / want.bound);
+        self.error_sum = std::array::from_fn(|axis| self.error_sum[axis] + error[axis]);
+        self.max_bound = self.max_bound.max(want.bound);
+        self.max_of_bound = self.max_of_bound.max(length / want.bound);
         if let Some(pixels) = error_scale.pixel_distance(got, want.position) {
             self.pixels.add(pixels);
         }
@@ -150,9 +155,9 @@ impl PositionErrorAccumulator {
         Self {
             length: self.length.join(other.length),
             pixels: self.pixels.join(other.pixels),
-            bias: std::array::from_fn(|axis| self.bias[axis] + other.bias[axis]),
-            bound: self.bound.max(other.bound),
-            of_bound: self.of_bound.max(other.of_bound),
+            error_sum: std::array::from_fn(|axis| self.error_sum[axis] + other.error_sum[axis]),
+            max_bound: self.max_bound.max(other.max_bound),
+            max_of_bound: self.max_of_bound.max(other.max_of_bound),
             not_finite: self.not_finite + other.not_finite,
             states: self.states + other.states,
         }
@@ -166,9 +171,9 @@ impl PositionErrorAccumulator {
             meters,
             of_diagonal: ErrorNorms { largest: share(meters.largest), rms: share(meters.rms) },
             pixels: self.pixels.norms(1.0),
-            bias_meters: self.bias.map(|sum| error_scale.unit * sum / self.length.count.max(1.0)),
-            bound_meters: self.bound * error_scale.unit,
-            of_bound: self.of_bound,
+            bias_meters: self.error_sum.map(|sum| error_scale.unit * sum / self.length.count.max(1.0)),
+            bound_meters: self.max_bound * error_scale.unit,
+            of_bound: self.max_of_bound,
             not_finite: self.not_finite,
             states: self.states,
         }
@@ -220,7 +225,8 @@ const BLOCK: usize = 4096;
 /// Errors of normals and tangents, in degrees.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 pub struct OrientationErrors {
-    /// Against the normals that the variant's deformation defines: rigid ones (by T), or those of the deformed surface.
+    /// Against the normals that the variant's deformation defines: rest normals rotated by T, or those of the deformed
+    /// surface.
     pub normals_degrees: Option<ErrorNorms>,
     /// Against the normals of the deformed surface, whichever normals the variant defines.
     pub normals_to_surface_degrees: Option<ErrorNorms>,
@@ -326,8 +332,8 @@ mod tests {
     use super::*;
     use modalcast_model::scene::{Lens, View};
 
-    /// A scale with 2 meters per scene unit. One pixel is 0.01 scene units at the target: its distance of 10 divided by
-    /// the focal length of 1000 pixels.
+    /// A scale with 2 meters and 100 pixels per scene unit. At the target, one pixel is 0.01 scene units: the distance
+    /// of 10 from the eye divided by the focal length of 1000 pixels.
     fn scale_of_2_meters_and_100_pixels() -> ErrorScale {
         let scene = modalcast_model::load::open("tree").expect("the tree").scene;
         let view = View::LookAt { eye: [0.0, 0.0, 10.0], target: [0.0; 3], up: [0.0, 1.0, 0.0] };
@@ -345,16 +351,19 @@ mod tests {
     fn given_surface_has_the_expected_errors() {
         let error_scale = scale_of_2_meters_and_100_pixels();
         let mut accumulator = PositionErrorAccumulator::default();
-        // The error vectors are (3, 4, 0) and zero. Their lengths are 5 and 0 scene units, or 10 m and 0. The first one
-        // takes 500 pixels.
+        // The error vectors are (3, 4, 0) and zero. Their lengths are 5 and 0 scene units, or 10 m and 0. The length of
+        // 5 takes 500 pixels.
         accumulator.add(
             &error_scale,
             &[3.0, 4.0, 0.0, 1.0, 1.0, 1.0],
             &[reference([0.0; 3], 10.0), reference([1.0; 3], 1.0)],
         );
         let errors = accumulator.errors(&error_scale);
+        // The mean square of the lengths is (25 + 0) / 2 = 12.5.
         assert_eq!((errors.meters.largest, errors.meters.rms), (10.0, 2.0 * 12.5_f64.sqrt()));
+        // 10 m of the diagonal of 20 m.
         assert_eq!(errors.of_diagonal.largest, 0.5);
+        // The mean error vector, 2 m * (3, 4, 0) / 2.
         assert_eq!(errors.bias_meters, [3.0, 4.0, 0.0]);
         assert_eq!((errors.bound_meters, errors.of_bound, errors.states), (20.0, 0.5, 1));
         assert!((errors.pixels.expect("expected a pixel error").largest - 500.0).abs() < 1e-9, "{errors:?}");
@@ -373,6 +382,7 @@ mod tests {
     fn error_above_its_own_bound_fails_despite_larger_bounds() {
         let error_scale = scale_of_2_meters_and_100_pixels();
         let mut accumulator = PositionErrorAccumulator::default();
+        // The error of the first vertex is 1.1. It exceeds the vertex's own bound of 1, but not the other bound of 100.
         let want = [reference([0.0; 3], 1.0), reference([0.0; 3], 100.0)];
         accumulator.add(&error_scale, &[1.1, 0.0, 0.0, 0.0, 0.0, 0.0], &want);
         assert!(!accumulator.errors(&error_scale).passed());
@@ -420,6 +430,7 @@ mod tests {
         let found = accumulator.orientation();
         assert_eq!((found.broken, found.tangents_degrees), (2, Some(ErrorNorms::default())));
         let dot = found.normal_dot_tangent.expect("expected dot products").largest;
+        // The first normal and tangent: (0.6, 0.8, 0) . (1, 0, 0).
         assert!((dot - f64::from(0.6_f32)).abs() < 1e-12, "{dot}");
     }
 }

@@ -29,10 +29,10 @@ pub struct ReferenceVertex {
 
 /// Initial value of vertices that are not evaluated yet.
 const UNSET: ReferenceVertex = ReferenceVertex { position: [0.0; 3], bound: 0.0, condition: 0.0 };
-/// Roundings of an f32 sum x0 + U q in addition to one per mode: for the addition of x0, and for products that are
-/// rounded before they are added.
+/// Roundings of an f32 sum x0 + U q in addition to one per mode. Two would suffice: one for the addition of x0, and one
+/// for a product that is rounded before it is added.
 const EXTRA_ROUNDINGS: usize = 3;
-/// Vertices per tile.
+/// Vertices per tile. Tiles are the units of parallel work in this file; tiles of stored U are smaller.
 const TILE: usize = 512;
 /// Condition number above which an f64 sum is repeated in double-double. Below it, the relative error of the f64 sum is
 /// about 1e6 x 1e-16 = 1e-10, far below the 6e-8 of f32.
@@ -259,7 +259,7 @@ fn map_tiles<T: Copy + Send + Sync>(
             remaining = rest;
         }
     }
-    // Several tiles share a task, because scheduling a task per small domain would cost more than its vertices.
+    // 32 tiles share a task, because scheduling a task for one small domain takes longer than computing its vertices.
     let compute_tile = |tile: &mut Tile<'_, T>| compute(tile.domain, tile.vertices.clone(), tile.out);
     tiles.par_chunks_mut(32).for_each(|tiles| tiles.iter_mut().for_each(compute_tile));
     values
@@ -341,7 +341,7 @@ mod tests {
     fn repeats_cancelling_sum_in_double_double() {
         let columns = vec![1.0, 1.0, 1.0, 2f32.powi(-30), 0.0, 0.0, -1.0, -1.0, -1.0];
         let modes = Modes::from_columns(3, 3, columns).expect("valid modes");
-        // 1e10 + 2^-30 - 1e10: f64 has 53 bits, and 2^-30 is 63 binary places below 1e10.
+        // The first row is 1e10 + 2^-30 - 1e10. f64 has 53 bits, and 2^-30 is 63 binary places below 1e10.
         let sums = sum_modes(0..1, ModeEntries::Exact(&modes), &[1e10, 1.0, 1e10]);
         assert_eq!(sums[0].u, [2f64.powi(-30), 0.0, 0.0]);
     }

@@ -1,5 +1,5 @@
 //! A state in f64. A physics process computes in f64 and sends f32. Errors are therefore measured against the f64
-//! state, and a deformer receives that state rounded to f32.
+//! state, and a deformer receives the same state rounded to f32.
 
 use modalcast_model::domain::Transform;
 use modalcast_model::scene::{DirtyDomains, Scene, SceneState};
@@ -39,7 +39,8 @@ impl ExactState {
         }
     }
 
-    /// `world_from_domain` of a domain. For a follower, this is the product of the transform of its root and its frame.
+    /// `world_from_domain` of a domain. A transform root has a transform of its own. For a follower, the result is the
+    /// product of the transform of its root and its constant frame.
     pub fn transform_of(&self, scene: &Scene, domain: usize) -> [f64; 12] {
         let root_transform = &self.transforms[scene.transform_roots.root_of(domain)];
         match scene.transform_roots.root_from_domain(domain) {

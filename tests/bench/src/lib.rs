@@ -1,15 +1,16 @@
 //! Benchmarks of error against run time for every variant of the deformation, on synthetic scenes or on a scene of the
 //! user. [`render`] does the same for the renderer.
 //!
-//! Validation comes before timing: a variant whose error exceeds its a-priori bound at any vertex of any state is not
-//! timed. The report names the variant and fails.
+//! A workload (`load` in options and reports) is a scene to measure. A variant is one way to deform it: a backend, a
+//! storage type of U and further options. Validation comes before timing: a variant whose error exceeds its a-priori
+//! bound at any vertex of any state is not timed. The report names the variant and fails.
 //!
 //! - [`workloads`] and [`motion`]: seeded synthetic scenes, modal coordinates and transforms;
 //!   [`recorded_trajectory`]: recorded trajectories.
 //! - [`exact_positions`], [`error_model`] and `double_double`: reference positions in f64, on request with the
 //!   approximations of a variant, and a-priori bounds. [`errors`] and [`error_sources`] measure variants against them.
-//! - [`variant`] and [`mod@bench`]: the variants to measure. A new variant implements [`variant::Variant`], and a
-//!   [`bench::BenchTarget`] offers it.
+//! - [`variant`] and [`mod@bench`]: the variants to measure. A new variant implements [`variant::Variant`], and
+//!   [`bench::LocalMachine`] lists it.
 //! - [`table`], [`thesis_comparison`], [`plot`]: the output.
 
 pub mod bench;
@@ -66,7 +67,7 @@ const OVERLAP: &str = "cuda overlap";
 /// Number of states that timed steps rotate through, so that consecutive steps have different inputs.
 const ROTATING_STATES: usize = 8;
 
-/// Settings of a report: scenes, sample counts and variants.
+/// Settings of a report: scenes, variants, numbers of states and of repetitions.
 #[derive(Debug, Clone)]
 pub struct DeformReportOptions {
     pub sources: Vec<WorkloadSource>,
@@ -99,8 +100,8 @@ fn is_selected(patterns: &[String], name: &str) -> bool {
 #[derive(Debug, Clone)]
 pub enum WorkloadSource {
     Synthetic(WorkloadKind),
-    /// A scene given on the command line, and the path of its recorded trajectory. Without a path, the only recording
-    /// next to the scene is used, if there is one.
+    /// A scene given on the command line, and the path of its recorded trajectory. Without a path, the recording next
+    /// to the scene is used, if there is exactly one.
     Scene {
         source: String,
         recording: Option<PathBuf>,
@@ -130,6 +131,7 @@ pub struct WorkloadSummary {
     pub corners: usize,
     pub triangles: usize,
     pub domains: usize,
+    /// Modal coordinates of all domains.
     pub coordinates: usize,
     #[serde(rename = "diagonal_metres")]
     pub diagonal_meters: f64,
@@ -138,11 +140,12 @@ pub struct WorkloadSummary {
     /// Whether the trajectory is recorded; otherwise it is synthetic.
     #[serde(rename = "recorded")]
     pub is_recorded: bool,
+    /// Condition numbers of u = U q at the validated states.
     pub condition: ConditionNumbers,
-    /// Upload of one step to the CUDA device.
+    /// Upload of one step to the CUDA device; `None` without a device.
     #[serde(rename = "ingest")]
     pub upload: Option<UploadTiming>,
-    /// Times of steps with readback of the vertices on the CUDA device, serial and overlapped.
+    /// Times of steps with readback of the vertices, serial and overlapped; `None` without a CUDA device.
     pub overlap: Option<Overlap>,
 }
 

@@ -29,6 +29,8 @@ pub(super) fn markdown(report: &DeformReport) -> String {
     text
 }
 
+/// Headings of the table of variants. "of ..." is a fraction: of the peak copy or read bandwidth, of the scene's
+/// diagonal, or of the a-priori bound.
 const COLUMNS: [&str; 13] = [
     "variant",
     "cache",

@@ -9,8 +9,9 @@ use modalcast_model::scene::{Scene, StorageType};
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Operand {
     pub name: &'static str,
-    /// Formula of the bytes. n is vertices, f triangles, c corners, r modes, d domains, C chunks of K modes, and Q quads
-    /// (groups of four vertices).
+    /// Formula of the bytes. The letters are numbers: n of vertices, f of triangles, c of corners, r of modes, d of
+    /// domains, Q of quads (four consecutive vertices), C of chunks of stored U (K modes each) and `tiles` of tiles of
+    /// stored U (up to 32 quads each).
     pub formula: &'static str,
     pub bytes: u64,
 }
@@ -36,7 +37,7 @@ pub fn minimum_traffic(scene: &Scene) -> Vec<Operand> {
         let (shape, chunk_modes) = (&scene.shapes[domain.shape], modes_per_chunk(scene.deformation.storage));
         let (shape_vertices, chunks) = (shape.mesh.rest_positions().len(), shape.modes.rank().div_ceil(chunk_modes));
         mode_entries += shape.modes.columns().len();
-        // A chunk holds the modes whose entries take 4 bytes per row, or 48 bytes for the 12 rows of a quad.
+        // The K modes of a chunk take 4 bytes per row of U, or 48 bytes for the 12 rows of a quad.
         stored_bytes += 48 * chunks * shape_vertices.div_ceil(QUAD);
         // One f32 per tile and mode, including the padding modes of the last chunk.
         scale_bytes += 4 * chunks * chunk_modes * shape_vertices.div_ceil(QUAD * TILE_QUADS);
@@ -88,6 +89,7 @@ mod tests {
     fn bytes_of_load_a_match_the_formulas() {
         let scene =
             WorkloadKind::OneDomain { has_normal_map: true }.build(Size::Quick).expect("expected a workload").scene;
+        // 1.5 M vertices, divided by 50 for the quick size, and 32 modes.
         let (n, r) = (30_000, 32);
         // U, x0, q, T and x; normals and tangents are read and written.
         let expected = 4 * 3 * n * r + 12 * n + 4 * r + 48 + 12 * n + 2 * 12 * n + 2 * 16 * n;
@@ -102,10 +104,12 @@ mod tests {
                     .expect("expected a scene");
             minimum_traffic(&scene)[0].bytes
         };
+        // 3 n r entries of 2 bytes or 1 byte.
         assert_eq!([StorageType::F16, StorageType::Int8].map(bytes_of_u), [6 * n * r, 3 * n * r]);
         let exact_normals = DeformationSettings { normals: NormalMethod::Exact, ..DeformationSettings::default() };
         let exact_normals = minimum_traffic(&with_deformation(&plain_scene, exact_normals).expect("expected a scene"));
-        // Exact normals read x, one triangle and the vertex index of its three corners instead of three rest normals.
+        // Exact normals read x (12 n bytes), one triangle (12) and the vertex indices of its three corners (4 x 3)
+        // instead of three rest normals (12 x 3).
         assert_eq!(
             total_bytes(&exact_normals),
             total_bytes(&minimum_traffic(&plain_scene)) + 12 * n + 12 + 4 * 3 - 12 * 3

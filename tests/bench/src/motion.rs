@@ -14,11 +14,12 @@ use super::recorded_trajectory::RecordedTrajectory;
 use super::workloads::Workload;
 use modalcast_model::scene::Scene;
 
-/// Largest displacement component of the first mode at one standard deviation, as a fraction of its domain's diagonal.
+/// Largest displacement along an axis by the first mode at one standard deviation, as a fraction of the domain's
+/// diagonal.
 const RELATIVE_AMPLITUDE: f64 = 0.05;
 /// Limit of a domain's random rotation about its placement, radians.
 const MAX_ROTATION: f64 = 0.2;
-/// Limit of a domain's random translation from its placement, as a fraction of its diagonal.
+/// Limit of a domain's random translation from its placement, as a fraction of the domain's diagonal.
 const MAX_RELATIVE_SHIFT: f64 = 0.05;
 /// Steps of a synthetic trajectory.
 const TRAJECTORY_STEPS: usize = 24;
@@ -43,7 +44,7 @@ pub struct WorkloadMotion {
 struct ModeSpread {
     /// Standard deviation of the coordinate.
     deviation: f64,
-    /// Frequency relative to the domain's slowest mode.
+    /// Frequency divided by that of the domain's first mode, at least 1.
     relative_frequency: f64,
 }
 
@@ -148,12 +149,14 @@ impl WorkloadMotion {
 /// The distribution of each coordinate of a domain.
 fn mode_spreads(scene: &Scene, domain: usize) -> Vec<ModeSpread> {
     let (modes, eigenvalues) = (&scene.shape_of(domain).modes, &scene.domains[domain].metadata.eigenvalues);
-    let min_eigenvalue = eigenvalues.first().copied().filter(|value| *value > 0.0 && eigenvalues.len() == modes.rank());
+    // Present if the first eigenvalue is positive and every mode has an eigenvalue.
+    let first_eigenvalue =
+        eigenvalues.first().copied().filter(|value| *value > 0.0 && eigenvalues.len() == modes.rank());
     let amplitude = RELATIVE_AMPLITUDE * diagonal(scene, domain);
     let mode_spread = |mode: usize| {
         // An eigenvalue is the square of an angular frequency.
-        let relative_frequency = min_eigenvalue
-            .map_or((mode + 1) as f64, |min_eigenvalue| (eigenvalues[mode] / min_eigenvalue).max(1.0).sqrt());
+        let relative_frequency = first_eigenvalue
+            .map_or((mode + 1) as f64, |first_eigenvalue| (eigenvalues[mode] / first_eigenvalue).max(1.0).sqrt());
         let max_entry = modes.column(mode).iter().fold(0.0_f32, |max, entry| max.max(entry.abs()));
         // The coordinate of a mode without displacement is arbitrary.
         let deviation = if max_entry > 0.0 { amplitude / f64::from(max_entry) } else { 1.0 };
@@ -199,7 +202,8 @@ mod tests {
         let draws: Vec<f64> = (0..20_000).map(|_| random_normal(&mut rng)).collect();
         let mean = draws.iter().sum::<f64>() / 2e4;
         let variance = draws.iter().map(|draw| draw * draw).sum::<f64>() / 2e4;
-        // At least four standard errors: 1 / sqrt(20,000) for the mean, sqrt(2 / 20,000) for the variance.
+        // The standard errors are 1 / sqrt(20,000) = 0.007 for the mean and sqrt(2 / 20,000) = 0.01 for the variance.
+        // The limits are more than four times as large.
         assert!(mean.abs() < 0.03 && (variance - 1.0).abs() < 0.05, "mean {mean}, variance {variance}");
     }
 

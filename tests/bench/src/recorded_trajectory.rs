@@ -26,13 +26,11 @@ impl RecordedTrajectory {
     /// `NotFound` when a file is missing; `Invalid` when it cannot be parsed or does not match the scene.
     pub fn read(path: &Path, scene: &Scene) -> Result<Self> {
         let name = path.display().to_string();
+        let transforms_path = path.join("transforms.npy");
         let trajectory = match path.is_dir() {
             true => Self {
                 q: read_npy_rows(&path.join("q.npy"))?,
-                transforms: match path.join("transforms.npy") {
-                    file if file.exists() => read_npy_rows(&file)?,
-                    _ => Vec::new(),
-                },
+                transforms: if transforms_path.exists() { read_npy_rows(&transforms_path)? } else { Vec::new() },
             },
             false => Self { q: read_csv_rows(path)?, transforms: Vec::new() },
         };
@@ -50,7 +48,8 @@ impl RecordedTrajectory {
         let Ok(entries) = std::fs::read_dir(folder) else { return Ok(None) };
         let is_recording = |path: &std::path::PathBuf| path.to_string_lossy().ends_with(".q.csv");
         let mut paths: Vec<_> = entries.flatten().map(|entry| entry.path()).filter(is_recording).collect();
-        match (paths.pop(), paths.is_empty()) {
+        let last_path = paths.pop();
+        match (last_path, paths.is_empty()) {
             (Some(path), true) if path.exists() => Self::read(&path, scene).map(Some),
             _ => Ok(None),
         }
@@ -81,7 +80,7 @@ impl RecordedTrajectory {
         self.q.len()
     }
 
-    /// The exact state at a step.
+    /// The exact state at a step. Without recorded transforms, the domains are at their placements.
     pub(super) fn step(&self, scene: &Scene, step: usize) -> ExactState {
         let placement = |domain: u32| scene.domains[domain as usize].placement.0.map(f64::from);
         let placements = || scene.transform_roots.domains().map(placement).collect();
@@ -170,7 +169,8 @@ mod tests {
         let folder = tempfile::tempdir().expect("expected a folder");
         let write = |name: &str, shape: &str, numbers: &[f32]| {
             let mut header = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}");
-            // Magic, version and header length take 10 bytes. The header pads them to a multiple of 64.
+            // Magic, version and header length take 10 bytes. Spaces and a newline fill the header, so that the numbers
+            // start at a multiple of 64 bytes.
             header.push_str(&" ".repeat(63 - (header.len() + 10) % 64));
             header.push('\n');
             let mut bytes = b"\x93NUMPY\x01\x00".to_vec();
@@ -180,6 +180,7 @@ mod tests {
             std::fs::write(folder.path().join(name), bytes).expect("written");
         };
         write("q.npy", "(2, 2)", &[1.0, 2.0, 3.0, 4.0]);
+        // The numbers 0 to 23, so that the transform of the second step starts with 12.
         let numbers: Vec<f32> = (0..24).map(|number| number as f32).collect();
         write("transforms.npy", "(2, 1, 12)", &numbers);
         let trajectory = RecordedTrajectory::read(folder.path(), &scene()).expect("a valid record");

@@ -228,8 +228,8 @@ pub(super) mod tests {
     use crate::error_sources::ErrorSources;
     use crate::errors::{ErrorNorms, OrientationErrors, PositionErrors};
 
-    /// A row with 2,000 bytes of traffic, this median time and this largest error in meters and as a fraction of the
-    /// diagonal.
+    /// A row with 2,000 bytes of traffic and this median time. `error` is the largest error in meters and also as a
+    /// fraction of the diagonal.
     pub(crate) fn row(load: &str, name: &str, cache: CacheState, (median_us, error): (f64, f64)) -> DeformRow {
         let label = VariantLabel { name: name.into(), backend: Backend::Cpu, deformation: Default::default() };
         let norms = ErrorNorms { largest: error, rms: error / 2.0 };
@@ -267,6 +267,7 @@ pub(super) mod tests {
 
     #[test]
     fn bandwidth_is_bytes_per_time_and_relative_to_the_peak() {
+        // 2,000 bytes in 2 us are 1 GB/s.
         let row = row("a", "x", CacheState::Warm, (2.0, 0.1));
         assert_eq!((row.gbs, row.of_copy), (Some(1.0), None));
         let relative = row.relative_to(MemoryBandwidth { copy_gbs: Some(4.0), ..MemoryBandwidth::default() });

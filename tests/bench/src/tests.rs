@@ -102,6 +102,7 @@ fn writes_all_report_files_and_reads_them_back() {
 fn inaccurate_variant_fails_report_and_is_not_timed() {
     let report = measure(0.01);
     assert!(!report.passed());
+    // One failure per workload.
     assert_eq!(report.failed.len(), 2);
     assert!(report.failed[0].starts_with("plant-2: inaccurate: "), "{:?}", report.failed);
     for row in &report.rows {
@@ -121,6 +122,7 @@ fn variant_that_cannot_be_created_fails_report() {
     let report =
         deform(&report_options(vec![WorkloadSource::Synthetic(WorkloadKind::TinyDomains)]), &BrokenTarget, |_| Ok(()))
             .expect("expected a report");
+    // "c" is the name of the workload `TinyDomains`.
     assert_eq!(report.failed, ["c: lost: kernel: expected one that compiles, got none"]);
     assert!(plot::render_png(&plot::draw_svg(&report)).is_ok(), "expected a plot without points");
 }
@@ -196,7 +198,7 @@ fn overlap_fails_report_only_when_vertices_differ() {
     assert_eq!(report_with(3, &[]).failed, ["c: cuda overlap: 3 steps differ"]);
     let passing = report_with(0, &["cuda overlap"]);
     assert!(passing.passed());
-    // serial_us and fetched_us.
+    // serial_us = 4 x 12.5 and fetched_us = 3 x 12.5.
     assert!(markdown::markdown(&passing).contains("50.0 serially, 37.5"));
     assert_eq!(report_with(3, &["cpu*"]).loads[0].overlap, None, "expected no overlap, which is not selected");
 }

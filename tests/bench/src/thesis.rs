@@ -76,10 +76,10 @@ type SizeColumns = [usize; 7];
 /// `t_uq` of CPU and GPU, `t_vb` (table 4.6), `k_uq`, `O_uq` of CPU and GPU in per cent (table 4.7).
 type TimeColumns = [f64; 6];
 
-/// FPS and `t_vbr` of the CPU, FPS, `t_vbr` and s of the GPU (table 4.6), `O_vbr` of both in per cent (table 4.7).
+/// FPS and `t_vbr` of the CPU, FPS, `t_vbr` and s of the GPU (table 4.6), `O_vbr` of CPU and GPU in per cent (table 4.7).
 type RenderColumns = [f64; 7];
 
-/// A plant from its rows of the three tables.
+/// A plant from its rows of the three tables. `kernels` is `n_uqk` of table 4.6.
 const fn plant(
     name: &'static str,
     counts: SizeColumns,
@@ -142,7 +142,7 @@ mod tests {
     #[test]
     fn printed_speedups_are_quotients_of_printed_times() {
         for plant in PLANTS {
-            // One unit of the last printed digit is 0.01.
+            // One unit of the last printed digit is 0.01; 0.011 also allows for the rounding of the printed times.
             let quotient = plant.cpu_uq_ms / plant.gpu_uq_ms;
             assert!((quotient - plant.speedup_uq).abs() <= 0.011, "{}: {quotient}", plant.name);
         }
@@ -150,8 +150,8 @@ mod tests {
 
     #[test]
     fn printed_speedups_and_occupations_follow_from_t_vbr() {
-        // Printed quotients of `t_vbr` of the CPU and of the GPU. They have two digits after the point; occupations are
-        // percentages with two digits after the point.
+        // Printed quotients of `t_vbr` of the CPU and of the GPU, with two digits after the point. Printed occupations are
+        // percentages with two digits after the point, so the fractions have four.
         let speedups = [1.16, 3.48, 40.40, 15.54, 11.41, 27.29, 16.23, 24.96, 19.34, 79.36, 47.58, 19.71];
         for (plant, speedup) in PLANTS.iter().zip(speedups) {
             let ThesisRenderTimes { cpu_vbr_ms, cpu_fps, cpu_vbr_occupation, .. } = plant.drawn;

@@ -22,8 +22,8 @@ use modalcast_model::deform::DeformedSurface;
 use modalcast_model::error::Error;
 use modalcast_model::scene::{Camera, DeformationSettings, NormalMethod, Scene, SceneState};
 
-/// Number of random states for which the error is split into its sources. Few, because each split takes five
-/// evaluations in f64.
+/// Number of random states for which the error is split into its sources. Few, because each split takes at least four
+/// evaluations of the scene in f64.
 const SPLIT_SEEDS: usize = 4;
 
 /// Condition numbers sum |U q| / |u| of the vertices of a workload.
@@ -41,7 +41,7 @@ pub struct ConditionNumbers {
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct ValidationResult {
     pub errors: PositionErrors,
-    /// Error of x(k + 1) - x(k) along the trajectory, meters.
+    /// Error of the displacement x(k + 1) - x(k) between consecutive steps of the trajectory, meters.
     #[serde(rename = "step_metres")]
     pub step_meters: ErrorNorms,
     pub sources: ErrorSources,
@@ -183,7 +183,7 @@ pub fn validate(
     let mut checks: Vec<VariantCheck<'_>> =
         variants.iter_mut().map(|variant| VariantCheck::new(variant.as_mut(), &states)).collect();
     let (scenes, mut conditions) = (NormalScenes::new(workload), ConditionAccumulator::default());
-    // Directions that variants need at the first state are computed in parallel for the groups of later states.
+    // Reference directions that variants needed at the first state. For later states, they are computed in parallel.
     let (mut needs_rigid_directions, mut needs_exact_directions) = (false, false);
     for group in group_states(state_count, workload.scene.layout.vertices + workload.scene.layout.corners) {
         let evaluate = |index: usize| {

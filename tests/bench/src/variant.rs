@@ -55,7 +55,7 @@ pub trait Variant {
     /// `Fault` when the device fails.
     fn surface(&mut self, state_index: usize, state: &SceneState) -> Result<&DeformedSurface>;
 
-    /// Times steps over rotating states; `None` when the variant cannot be timed with this cache.
+    /// Times steps that rotate through `states`; `None` when the variant cannot be timed with this state of the caches.
     ///
     /// # Errors
     /// `Fault` when the device fails.
@@ -121,7 +121,7 @@ impl Variant for DeformerVariant {
     }
 
     fn time(&mut self, states: &[SceneState], cache: CacheState, replays: usize) -> Result<Option<Timing>> {
-        // The flush evicts the caches of the CPU but not those of a device.
+        // For cold caches, `by_wall_clock` evicts the caches of the CPU but not those of a device.
         if cache == CacheState::Cold && self.label.backend == Backend::Cuda {
             return Ok(None);
         }

@@ -53,8 +53,8 @@ pub(super) struct Args {
     /// Frames per median, at least 20 [default: 100, 20 with --quick].
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     replays: Option<u32>,
-    /// Fewer variants (except those named in full), 16 samples per pixel and a smaller field, for machines without a
-    /// GPU.
+    /// For machines without a GPU: fewer variants (besides those that --variant names in full), references of 16
+    /// samples per pixel, and a smaller field.
     #[arg(long)]
     quick: bool,
     /// Draw the figures of the thesis's chapter 4.2 from our own scenes; nothing is measured.
@@ -190,7 +190,8 @@ fn plants_named(name: &str) -> Option<Vec<usize>> {
 
 /// The report as lines of text: rows, readback, plants, minimal passes, rasterizers and failures.
 fn report_lines(report: &RenderReport) -> Vec<String> {
-    // "color" compares with hard shadows; "intended" to "bleeding" compare with the variant's intended result.
+    // "color" compares with hard shadows. "intended" to "bleeding" compare with what the variant should draw, which may
+    // be a filtered shadow.
     let headings = ["frame us", "color", "intended", "light", "penumbra", "bleeding", "flicker", "passed"];
     let mut lines =
         vec![format!("{:<18}{:<40}{}", "load", "variant", headings.map(|word| format!("{word:>10}")).concat())];
@@ -219,6 +220,7 @@ fn report_lines(report: &RenderReport) -> Vec<String> {
             "{load:<18}{unread_fps:.1} frames/s without readback, {ring_fps:.1} with readback: {ring_loss:.1} % fewer"
         )
     }));
+    // The thesis calls vertex updating with rendering t_vbr, and its share of the frame time O_vbr.
     for plant in &report.plants {
         lines.push(format!(
             "{:<18}{:<24}t_vbr {:>9.3} ms{:>10.1} FPS{:>9.1} MB  O_vbr {:>5.1} %",
@@ -233,11 +235,12 @@ fn report_lines(report: &RenderReport) -> Vec<String> {
     for minimal in &report.minimal_passes {
         let (depth, visibility) = (minimal.depth.median_us, minimal.visibility.median_us);
         lines.push(format!(
-            "{:<18}map {}: bare depth {depth:.1} us, bare visibility {visibility:.1} us",
+            "{:<18}shadow map {}: minimal depth pass {depth:.1} us, minimal visibility pass {visibility:.1} us",
             minimal.load, minimal.map_size
         ));
         lines.extend([&minimal.without_culling, &minimal.with_scene_culling].map(|frame| {
-            format!("{:<18}{} takes {:.1} us, {:.1} us beyond both", "", frame.name, frame.frame_us, frame.excess_us)
+            let (name, frame_us, excess_us) = (&frame.name, frame.frame_us, frame.excess_us);
+            format!("{:<18}{name} takes {frame_us:.1} us, {excess_us:.1} us more than both passes", "")
         }));
     }
     lines.extend(report.raster.iter().map(render::RasterComparison::line));

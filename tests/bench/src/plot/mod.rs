@@ -108,8 +108,8 @@ pub fn render_png(svg: &str) -> Result<Vec<u8>> {
     Ok(bytes.into_inner())
 }
 
-/// The point of a row. Warm rows are filled. Variants that compute only a part of a step are excluded from the Pareto
-/// front.
+/// The point of a row. Rows with warm caches are filled and may be on the Pareto front, unless their variant computes
+/// only a part of a step.
 fn row_point(row: &DeformRow) -> Option<Point<'_>> {
     let is_filled = row.cache == CacheState::Warm;
     let (time_us, error) = row.time_and_error()?;
@@ -127,7 +127,7 @@ fn list_variants(rows: &[DeformRow]) -> Vec<(&str, Backend)> {
     variants
 }
 
-/// The marker of a variant: a color per variant, which repeats after [`COLORS`] with another shape.
+/// The marker of a variant. After twelve variants, the colors repeat with another shape.
 fn marker_style(variants: &[(&str, Backend)], name: &str) -> MarkerStyle {
     let index = variants.iter().position(|(variant, _)| *variant == name).unwrap_or(0);
     let backend = variants.get(index).map_or(Backend::Cpu, |(_, backend)| *backend);

@@ -10,7 +10,7 @@ use modalcast_model::error::Result;
 /// Builds a workload of any kind. Plants are built in [`plant`].
 pub(super) fn build(kind: WorkloadKind, size: Size) -> Result<Workload> {
     let reduce_if_quick = |number: usize| if size == Size::Quick { number.div_ceil(QUICK_DIVISOR) } else { number };
-    // The patch of a workload with one domain. It has one corner per vertex.
+    // The patch of a workload with one shape. It has one corner per vertex.
     let sheet_patch = |vertices, rank| PatchSpec {
         vertices,
         rank,

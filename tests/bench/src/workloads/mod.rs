@@ -1,5 +1,5 @@
 //! Synthetic scenes of known sizes, the workloads of the deformation benchmark. They are seeded, so they are identical
-//! on every machine.
+//! on every machine. r is the number of modes of a domain.
 //!
 //! | name | contents |
 //! |---|---|
@@ -8,7 +8,7 @@
 //! | `b` | 1,000 domains of 1,500 vertices, r random from 0 to 64, about 17 on average |
 //! | `c` | 200,000 domains of 7 vertices, 95 % of them rigid |
 //! | `cancel` | one domain of 2^16 vertices whose modes nearly cancel in pairs |
-//! | `batch` | 16 instances of one domain of 2^18 vertices, r = 32: sixteen q per U; compare `single-18-32` |
+//! | `batch` | 16 instances of one domain of 2^18 vertices, r = 32: one U for 16 vectors q (`single-18-32` has one) |
 //! | `plant-1` to `plant-12` | the plants of table 4.5 |
 //! | `plant-1-follows` to `plant-12-follows` | the same plants; leaves follow branches, so only branches have a T |
 //!
@@ -49,7 +49,7 @@ pub enum WorkloadKind {
     Cancelling,
     /// Instances of one shape.
     Batch,
-    /// Index into the thesis's plants.
+    /// Index into [`PLANTS`].
     Plant(usize),
     /// The same plant with leaves that follow its branches.
     FollowingPlant(usize),
@@ -64,7 +64,7 @@ pub struct Workload {
     pub batches: BatchPolicy,
     /// Whether modes 2k and 2k + 1 are nearly equal, so that opposite coordinates nearly cancel.
     pub is_paired: bool,
-    /// Index into the thesis's plants, if the scene is one of them.
+    /// Index into [`PLANTS`], if the scene is one of the thesis's plants.
     pub thesis_plant: Option<usize>,
     /// Deviations from the size that the name states.
     pub remarks: Vec<String>,

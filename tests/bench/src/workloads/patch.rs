@@ -15,7 +15,7 @@ pub(super) const QUICK_DIVISOR: usize = 50;
 /// Parameters of one domain.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct PatchSpec {
-    /// Vertices with modes: rows of U divided by three.
+    /// Mesh vertices. U has three rows per vertex.
     pub(super) vertices: usize,
     pub(super) rank: usize,
     /// Render vertices; each refers to one of `vertices`.
@@ -45,22 +45,22 @@ pub(super) fn part_seed(name: &str, index: usize) -> u64 {
     Rng::with_seed(hash).u64(..)
 }
 
-/// Builds the mesh and the modes of a patch.
+/// Builds the mesh and the modes of a patch. `is_paired`: see [`random_modes`].
 pub(super) fn build_shape(patch: &PatchSpec, is_paired: bool) -> Result<Shape> {
     let mut rng = Rng::with_seed(patch.seed);
-    let columns = (patch.vertices as f64).sqrt().ceil().max(1.0) as usize;
-    let spacing = patch.size / columns as f32;
+    let grid_columns = (patch.vertices as f64).sqrt().ceil().max(1.0) as usize;
+    let spacing = patch.size / grid_columns as f32;
     let positions: Vec<[f32; 3]> = (0..patch.vertices)
         .map(|vertex| {
             let height = 0.1 * patch.size * (rng.f32() - 0.5);
-            [(vertex % columns) as f32 * spacing, (vertex / columns) as f32 * spacing, height]
+            [(vertex % grid_columns) as f32 * spacing, (vertex / grid_columns) as f32 * spacing, height]
         })
         .collect();
     // Corners are distributed evenly over the vertices.
     let vertex_of_corner =
         |corner: usize| (corner * patch.vertices / patch.corners.max(1)).min(patch.vertices - 1) as u32;
     let vertices: Vec<u32> = (0..patch.corners).map(vertex_of_corner).collect();
-    let triangles = patch_triangles(patch, columns);
+    let triangles = patch_triangles(patch, grid_columns);
     let (normals, uvs) = match patch.triangles {
         PatchTopology::SingleTriangle => (vec![[0.0, 0.0, 1.0]; patch.corners], Vec::new()),
         _ => {
@@ -74,15 +74,15 @@ pub(super) fn build_shape(patch: &PatchSpec, is_paired: bool) -> Result<Shape> {
     Shape::new(mesh, random_modes(patch, is_paired)?)
 }
 
-/// Triangles as indices of corners. `columns`: vertices per row of the grid.
-fn patch_triangles(patch: &PatchSpec, columns: usize) -> Vec<[u32; 3]> {
+/// Triangles as indices of corners. `grid_columns`: vertices per row of the grid.
+fn patch_triangles(patch: &PatchSpec, grid_columns: usize) -> Vec<[u32; 3]> {
     // Indices are taken modulo `corners`: a patch may have fewer than three corners, and a strip may start again.
     let corners = patch.corners as u32;
     match patch.triangles {
         PatchTopology::SingleTriangle => vec![[0, 1 % corners, 2 % corners]],
-        PatchTopology::Cells if patch.vertices < 3 || columns < 2 => vec![[0, 1 % corners, 2 % corners]],
+        PatchTopology::Cells if patch.vertices < 3 || grid_columns < 2 => vec![[0, 1 % corners, 2 % corners]],
         PatchTopology::Cells => {
-            let width = columns as u32;
+            let width = grid_columns as u32;
             let cell_triangles = |corner: u32| {
                 let is_inside = corner % width != width - 1;
                 let lower_triangle =
@@ -108,8 +108,8 @@ fn patch_triangles(patch: &PatchSpec, columns: usize) -> Vec<[u32; 3]> {
     }
 }
 
-/// Modes with entries uniform in [-1, 1); every column has its own seed. If `is_paired`, each odd column equals its
-/// left neighbor up to a relative difference of at most 5e-5.
+/// Modes with entries uniform in [-1, 1); every column has its own seed. If `is_paired`, columns 2k and 2k + 1 are
+/// equal up to a relative difference of at most 5e-5.
 fn random_modes(patch: &PatchSpec, is_paired: bool) -> Result<Modes> {
     let rows = 3 * patch.vertices;
     if patch.rank == 0 {
@@ -139,7 +139,7 @@ pub(super) fn build_patch_scene(
     count: usize,
     has_normal_map: bool,
 ) -> Result<std::sync::Arc<Scene>> {
-    // No patch has this index.
+    // usize::MAX is not the index of a patch, so no patch has the same seed.
     let mut rng = Rng::with_seed(part_seed(&name, usize::MAX));
     let side = (count as f64).cbrt().ceil() as usize;
     // Patches of several domains have edges of at most 0.1.

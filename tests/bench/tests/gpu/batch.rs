@@ -17,8 +17,8 @@ use crate::accuracy::have_equal_bits;
 use crate::ensembles::{build_scene, instanced_parts, random_states, with_storage};
 use crate::scenes;
 
-/// Largest ratio of a vertex's error to the error bound of its tile. The bound covers the rounding of U to 16 bits, of
-/// q to pairs of 16-bit numbers, and of the tensor cores' sums.
+/// Largest ratio of a vertex's error to the error bound of its tile (of stored U; a quad is four vertices). The bound
+/// covers the rounding of U to 16 bits, of q to pairs of 16-bit numbers, and of the tensor cores' sums.
 fn max_error_over_bound(scene: &Scene, state: &SceneState, positions: &[f32]) -> f64 {
     let (shape, storage) = (scene.shape_of(0), scene.deformation.storage);
     let tiles = TiledModes::new(shape, storage);
@@ -104,6 +104,7 @@ fn gpu_tensor_core_batches_stay_within_their_bound() {
     );
 }
 
+/// Compares a step of 16 domains that share U with a step of one domain. The limit of 8 is half of 16 separate steps.
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_batch_of_16_takes_less_than_8_times_one_vector() {
@@ -117,6 +118,7 @@ fn gpu_batch_of_16_takes_less_than_8_times_one_vector() {
     };
     for storage in StorageType::ALL {
         let step = BenchmarkStep { batches: BatchPolicy::Always, ..BenchmarkStep::full(StepOutputs::Positions) };
+        // 1.5 M vertices, 32 modes; one domain, then 16.
         let scene = build_scene(instanced_parts(1_500_000, 32, 1, with_storage(storage)));
         let state = scenes::random_state(&scene, 1);
         let single_us = measure_us(&DeformerBenchmark::new(&device, &scene, &[state], step).expect("a benchmark"));

@@ -75,7 +75,8 @@ fn relative_error(scene: &Scene, state: &SceneState, positions: &[f32]) -> Resul
     max_error(&compared_positions, &reference_positions, MAX_POSITION_ERROR * diagonal).map(|error| error / diagonal)
 }
 
-/// Checks the positions of every input set after a launch, and of the last input set after the replays of a timing.
+/// Checks the positions of every input set (the inputs of one state) after a launch, and those of the last input set
+/// after the replays of a timing.
 fn check_benchmark(device: &Device, scene: &Arc<Scene>, states: &[SceneState], benchmark: &dyn KernelBenchmark) {
     let name = benchmark.name();
     assert_eq!(benchmark.input_set_count(), states.len(), "{name}");
@@ -146,7 +147,7 @@ fn check_single_kernel(ranks: &[usize]) {
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_thesis_grouped_kernels_match_reference_in_all_splits() {
     let device = Device::open(0).expect("expected a CUDA device");
-    // Vertices and modes: every rank from 0 to 32 twice.
+    // 66 shapes of (vertices, rank), with every rank from 0 to 32 twice.
     let shapes: Vec<_> = (0..66).map(|index| (1 + index * 29 % 611, index % 33)).collect();
     let scene = scenes::random_scene(
         &shapes,
@@ -179,7 +180,7 @@ fn gpu_thesis_grouped_kernels_match_reference_in_all_splits() {
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_cublas_matches_reference_with_every_product_kind() {
     let device = Device::open(0).expect("expected a CUDA device");
-    // Vertices and modes; ranks are from 0 to 64.
+    // 40 shapes of (vertices, rank), with ranks from 0 to 64.
     let shapes: Vec<_> = (0..40).map(|index| (1 + index * 29 % 611, index * 7 % 65)).collect();
     let mixed_scene = scenes::random_scene(
         &shapes,

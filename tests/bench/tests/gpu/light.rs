@@ -7,7 +7,7 @@ use modalcast_model::scene::Scene;
 
 use crate::scenes::{self, Random};
 
-/// Median times of a step in microseconds: with light-space bounds (of a scene with a shadow), and without.
+/// Median times of a step in microseconds: with light-space bounds, which a scene with a shadow has, and without.
 fn measure_step_us(name: &str, (vertices, rank): (usize, usize), instances: usize) -> [f64; 2] {
     let device = Device::open(0).expect("expected a CUDA device");
     let times_us = [true, false].map(|has_shadow| {

@@ -1,4 +1,4 @@
-//! Steps with readback of the vertices, serial and overlapped.
+//! Steps with readback of the vertices: serial, and overlapped with the next steps.
 
 use modalcast_bench::kernels::{measure_overlap, time_host_writes};
 use modalcast_bench::workloads::Workload;
@@ -19,7 +19,10 @@ fn gpu_overlapped_steps_are_faster_with_identical_vertices() {
     let workload = Workload::new("overlap".to_owned(), scene);
     let measurement = measure_overlap(&device, &workload, &states, 50).expect("a measurement");
     eprintln!("{measurement:#?}");
-    assert_eq!(measurement.differing, 0);
+    assert_eq!(
+        measurement.differing, 0,
+        "expected the vertices of serial steps in every pipelined and overlapped step"
+    );
     let times = [
         measurement.serial_us,
         measurement.fetched_us,

@@ -8,11 +8,12 @@ use modalcast_compute::gpu::{Device, RasterGranularity, RasterVariant};
 use crate::cut_outs::{CutOutSoup, alpha_image, floor_soup, sheet_soup, uniform_cut_out_soups};
 use crate::scenes::Random;
 
-/// Samples whose alpha is closer to the threshold may differ. The tolerance exceeds the sum of two errors, 11/256:
+/// Samples may differ if their alpha is closer to the threshold than this tolerance. It exceeds the sum of two errors,
+/// 3/256 + 8/256:
 /// * The hardware interpolates texels and levels with 8-bit weights (CUDA C++ programming guide, "Texture fetching").
 ///   Three interpolations have an error of up to 3/256.
 /// * The hardware's mip level is assumed to be accurate to 1/16. Alpha of the floor's image differs by at most 1/2
-///   between levels, so the error is at most 1/32.
+///   between levels, so the error is at most 1/32 = 8/256.
 const TOLERANCE: f32 = 1.0 / 16.0;
 
 const GRANULARITIES: [RasterGranularity; 3] =
@@ -86,7 +87,8 @@ fn gpu_sheet_covers_opaque_texels_of_its_mip_level() {
     }
 }
 
-/// Number of differing samples outside of the tolerance of the alpha threshold, and number of samples within it.
+/// Number of samples that differ although their alpha is outside of the tolerance of the threshold, and number of
+/// samples whose alpha is within the tolerance (ambiguous samples).
 fn count_differing_samples(cut_out_soup: &CutOutSoup, keys: &[u64]) -> (usize, usize) {
     let (expected_keys, is_ambiguous) = (cut_out_soup.rasterize().keys, cut_out_soup.ambiguous_samples(TOLERANCE));
     let differing =
@@ -116,6 +118,7 @@ fn gpu_perspective_floor_matches_the_definition() {
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_split_floor_matches_the_definition_at_every_granularity() {
     let device = Device::open(0).expect("expected a CUDA device");
+    // More divisions of the floor's sides give smaller triangles.
     for (divisions, granularity) in [
         (60_u32, RasterGranularity::BySize),
         (12, RasterGranularity::BySize),
