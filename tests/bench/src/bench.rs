@@ -254,6 +254,7 @@ mod tests {
             assert!(names.iter().any(|variant_name| variant_name == name), "{name} is not among {names:?}");
         }
         assert!(machine.memory_bandwidth(Backend::Cpu).read_gbs.is_some_and(|rate| rate > 0.0));
+        // There is a remark if and only if there is no CUDA variant.
         assert_eq!(machine.remarks().is_empty(), names.iter().any(|name| name.starts_with("cuda")));
         let remarks = machine.remarks();
         assert!(remarks.iter().all(|remark| remark.starts_with("no CUDA variants: ")), "{remarks:?}");

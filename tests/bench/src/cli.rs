@@ -199,7 +199,7 @@ mod tests {
     }
 
     #[test]
-    fn defaults_to_all_loads_and_quick_to_fewer_states() {
+    fn measures_all_loads_by_default_and_fewer_states_if_quick() {
         let all = report_options(&args()).expect("valid arguments");
         assert_eq!(
             (all.sources.len(), all.seeds, all.replays, all.size),

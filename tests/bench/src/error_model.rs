@@ -95,6 +95,7 @@ impl ErrorModel {
             // Tasks of 64 domains, because scheduling a task costs more than one domain.
             domains.par_iter_mut().enumerate().with_min_len(64).for_each(|(domain, truncation)| {
                 let max_row_norms = &max_row_norms[scene.domains[domain].shape];
+                // Maximum factor by which T enlarges a displacement.
                 let norm = linear_norm_bound(&state.composed_transform(scene, domain));
                 truncation.update(TruncationInput { q: state.q_of(scene, domain), max_row_norms, norm }, *budget);
             });

@@ -30,7 +30,7 @@ pub struct ReferenceVertex {
 /// Initial value of vertices that are not evaluated yet.
 const UNSET: ReferenceVertex = ReferenceVertex { position: [0.0; 3], bound: 0.0, condition: 0.0 };
 /// Roundings of an f32 sum x0 + U q in addition to one per mode. Two would suffice: one for the addition of x0, and one
-/// for a product that is rounded before it is added.
+/// for a product that is rounded before it is added. The third one is a margin.
 const EXTRA_ROUNDINGS: usize = 3;
 /// Vertices per tile. Tiles are the units of parallel work in this file; tiles of stored U are smaller.
 const TILE: usize = 512;

@@ -118,7 +118,8 @@ impl WorkloadSource {
     }
 }
 
-/// Sizes and properties of one workload in a report.
+/// Sizes and properties of one workload in a report. Here and in the types below, a serialized name that differs from
+/// the field's name is the one of earlier reports (`tests/bench/records`).
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct WorkloadSummary {
     pub name: String,
@@ -348,6 +349,7 @@ fn measure_variants(
 ) -> (ConditionNumbers, Vec<DeformRow>) {
     let (mut variants, mut rows): (Vec<Box<dyn Variant>>, Vec<DeformRow>) = (Vec::new(), Vec::new());
     let is_selected = |name: &str| options.selects(name);
+    // For each variant that is not selected, the list may hold an error. These variants are omitted.
     for (label, candidate) in
         target.variants(workload, &is_selected).into_iter().filter(|(label, _)| is_selected(&label.name))
     {

@@ -95,7 +95,7 @@ impl RecordedTrajectory {
 /// The rows of a `.npy` array of at least two dimensions; all but the first dimension are flattened.
 fn read_npy_rows(path: &Path) -> Result<Vec<Vec<f64>>> {
     let not_found =
-        |error: std::io::Error| Error::NotFound { what: "record", given: format!("{}: {error}", path.display()) };
+        |error: std::io::Error| Error::NotFound { what: "recording", given: format!("{}: {error}", path.display()) };
     let array = parse_numpy(&std::fs::read(path).map_err(not_found)?)?;
     if array.shape.len() < 2 || array.fortran_order {
         let given = format!("{:?}, fortran {}", array.shape, array.fortran_order);
@@ -109,7 +109,7 @@ fn read_npy_rows(path: &Path) -> Result<Vec<Vec<f64>>> {
 /// All columns except the first of a CSV file with a header.
 fn read_csv_rows(path: &Path) -> Result<Vec<Vec<f64>>> {
     let to_error = |error: csv::Error| match error.is_io_error() {
-        true => Error::NotFound { what: "record", given: format!("{}: {error}", path.display()) },
+        true => Error::NotFound { what: "recording", given: format!("{}: {error}", path.display()) },
         false => invalid(path.display().to_string(), "rows of time,q0,q1,...", error),
     };
     let mut reader = csv::Reader::from_path(path).map_err(to_error)?;
@@ -143,7 +143,7 @@ mod tests {
 
     #[test]
     fn columns_after_time_are_coordinates() {
-        let trajectory = read("time,q0,q1\n0,1.5,-2\n1,3,4\n").expect("a valid record");
+        let trajectory = read("time,q0,q1\n0,1.5,-2\n1,3,4\n").expect("a valid recording");
         assert_eq!(trajectory.steps(), 2);
         assert_eq!(trajectory.step(&scene(), 1).q, [3.0, 4.0]);
         assert_eq!(trajectory.step(&scene(), 1).transforms[0][0], 1.0, "at its placement");
@@ -183,7 +183,7 @@ mod tests {
         // The numbers 0 to 23, so that the transform of the second step starts with 12.
         let numbers: Vec<f32> = (0..24).map(|number| number as f32).collect();
         write("transforms.npy", "(2, 1, 12)", &numbers);
-        let trajectory = RecordedTrajectory::read(folder.path(), &scene()).expect("a valid record");
+        let trajectory = RecordedTrajectory::read(folder.path(), &scene()).expect("a valid recording");
         let step = trajectory.step(&scene(), 1);
         assert_eq!((step.q, step.transforms[0][0]), (vec![3.0, 4.0], 12.0));
     }

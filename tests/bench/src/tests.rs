@@ -200,7 +200,7 @@ fn overlap_fails_report_only_when_vertices_differ() {
     assert!(passing.passed());
     // serial_us = 4 x 12.5 and fetched_us = 3 x 12.5.
     assert!(markdown::markdown(&passing).contains("50.0 serially, 37.5"));
-    assert_eq!(report_with(3, &["cpu*"]).loads[0].overlap, None, "expected no overlap, which is not selected");
+    assert_eq!(report_with(3, &["cpu*"]).loads[0].overlap, None, "expected no overlap if it is not selected");
 }
 
 #[test]

@@ -68,6 +68,7 @@ struct VariantCheck<'a> {
     positions: PositionErrorAccumulator,
     orientation: OrientationErrorAccumulator,
     sources: ErrorSourcesAccumulator,
+    /// Errors of the displacements between consecutive steps of the trajectory.
     steps: NormAccumulator,
     /// The variant's positions and the references at the previous step of the trajectory.
     previous: Option<(Vec<f32>, Arc<Vec<ReferenceVertex>>)>,
@@ -437,7 +438,7 @@ mod tests {
         let normals = found.orientation.normals_degrees.expect("expected normals");
         let tangents = found.orientation.tangents_degrees.expect("expected tangents");
         let to_surface = found.orientation.normals_to_surface_degrees.expect("expected normals");
-        assert!(to_surface.largest > 0.1, "rigid normals do not follow the surface: {found:?}");
+        assert!(to_surface.largest > 0.1, "expected rigid normals to differ from surface normals, got {found:?}");
         assert!(normals.largest < 1e-4 && tangents.largest < 1e-4, "{found:?}");
         assert!(found.orientation.normal_dot_tangent.expect("expected dot products").largest < 1e-6, "{found:?}");
         let ErrorSources { storage, q, accumulation, transform, origin, truncation } = found.sources;
@@ -485,8 +486,12 @@ mod tests {
             assert_eq!(found.sources.accumulation, ErrorNorms::default(), "{deformation:?}");
             assert_eq!(found.sources.storage.largest > 0.0, deformation.storage != StorageType::F32);
             assert_eq!(found.sources.truncation.largest > 0.0, deformation.truncation.is_some());
-            assert!(!emulate(deformation, DeformationSettings::default()).passed(), "{deformation:?} is not exact");
+            let declared_exact = emulate(deformation, DeformationSettings::default());
+            assert!(!declared_exact.passed(), "{deformation:?}: expected an error above the bound of exact sums");
         }
-        assert!(!emulate(int8, f16).passed() && !emulate(bf16, f16).passed(), "coarser than declared");
+        assert!(
+            !emulate(int8, f16).passed() && !emulate(bf16, f16).passed(),
+            "expected coarser storage than declared to fail"
+        );
     }
 }

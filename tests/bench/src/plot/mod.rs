@@ -37,6 +37,7 @@ pub(super) const COLORS: [&str; 12] = [
 pub fn draw_svg(report: &DeformReport) -> String {
     let variants = list_variants(&report.rows);
     let workloads: Vec<&str> = report.loads.iter().map(|load| load.name.as_str()).collect();
+    // Panels per row.
     let columns = match workloads.len() {
         0..=3 => workloads.len().max(1),
         4 => 2,
