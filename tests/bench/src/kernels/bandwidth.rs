@@ -15,7 +15,7 @@ const VECTOR_BYTES: u64 = 16;
 /// Macros of the variant of `read` that evicts the L2 cache. The lines that it reads must stay in the cache, so it does
 /// not use streaming loads.
 pub(super) const L2_FLUSH_DEFINES: &[&str] = &["LOADS=8"];
-/// Loads per thread of that variant.
+/// Loads per thread of the variant that evicts the L2 cache, as in [`L2_FLUSH_DEFINES`].
 pub(super) const L2_FLUSH_LOADS: u64 = 8;
 
 pub(super) const SOURCE: BenchmarkSource = BenchmarkSource {
@@ -36,7 +36,7 @@ pub(super) const SOURCE: BenchmarkSource = BenchmarkSource {
     ],
 };
 
-/// Bytes that one block of `copy` or `read` processes, with `loads` loads per thread.
+/// Bytes of a tile, which one block of `copy` or `read` processes with `loads` loads per thread.
 pub(super) const fn tile_bytes(loads: u64) -> u64 {
     BLOCK * loads * VECTOR_BYTES
 }
@@ -94,9 +94,9 @@ mod tests {
     #[test]
     fn copies_every_vector_once_for_any_loads_per_thread() {
         let loads: Vec<u64> = variants().map(|(loads, _)| loads).collect();
-        assert!(loads.len() >= 6, "expected at least 6 variants, got {loads:?}");
+        assert_eq!(loads.len(), SOURCE.define_sets.len() - 1, "expected a variant for every set but the empty one");
         for loads in loads {
-            // Whole tiles for all numbers of loads, because each divides 16.
+            // A whole number of tiles for every variant, because every number of loads divides 16.
             let bytes = 3 * tile_bytes(16);
             let mut vector_indices = twin_of_copy(bytes / tile_bytes(loads), loads);
             vector_indices.sort_unstable();

@@ -2,6 +2,10 @@
 //!
 //! The server does not use this kernel, because its summation order differs from that of `deform`, and because it
 //! rounds each coordinate of q to a pair of 16-bit numbers.
+//!
+//! As in `storage`, a quad is four consecutive vertices, a tile is up to 32 quads, and a chunk is two modes, because U
+//! has 16 bits per entry. In this file and in the kernel, `step` is the index of a matrix product of 16 modes, not a
+//! step of the simulation.
 
 use std::sync::Arc;
 
@@ -34,7 +38,7 @@ pub(super) const SOURCE: BenchmarkSource = BenchmarkSource {
 const MAX_DOMAINS: usize = 32;
 /// Warps per block. A block computes one tile.
 const WARPS: usize = 4;
-/// Modes per matrix product (the k of m16n8k16). The kernel sums all modes in steps, one product per step.
+/// Modes per step, which is one matrix product (the k of m16n8k16).
 const STEP_MODES: usize = 16;
 /// The first compute capability whose tensor cores have the instruction m16n8k16.
 const AMPERE: (i32, i32) = (8, 0);
@@ -61,7 +65,7 @@ const _: () = assert!(size_of::<BatchMmaArgs>() == 192, "BatchMmaArgs differs fr
 // SAFETY: repr(C) without padding or Rust references, laid out as the struct of the same name in the kernel.
 unsafe impl DeviceRepr for BatchMmaArgs {}
 
-/// The kernel for all domains of a scene with one shape, and the inputs of several steps.
+/// The kernel for a scene whose domains share one shape, with several input sets.
 #[derive(Debug)]
 pub struct BatchMmaBenchmark {
     name: String,
@@ -72,7 +76,7 @@ pub struct BatchMmaBenchmark {
     rest: DeviceBuffer,
     positions: DeviceBuffer,
     input_sets: InputSets,
-    /// Kernel arguments with null addresses; [`Self::fill_args`] sets the addresses.
+    /// Kernel arguments with null addresses; [`Self::fill_args`] returns a copy with addresses.
     args: BatchMmaArgs,
     /// Number of domains that the kernel was compiled for.
     batch_size: usize,
@@ -145,7 +149,7 @@ impl KernelBenchmark for BatchMmaBenchmark {
         let mut launch = device.stream().launch_builder(&self.compiled.function);
         let config =
             LaunchConfig { grid_dim: (self.tiles, 1, 1), block_dim: (32 * WARPS as u32, 1, 1), shared_mem_bytes: 0 };
-        // SAFETY: `BatchMmaArgs` is the kernel's only argument. Tiles and x0 belong to the scene's only shape, and each
+        // SAFETY: `BatchMmaArgs` is the kernel's only argument. U and x0 belong to the scene's only shape, and each
         // tile has one block. Split q, T and inverse scales have entries for as many domains as the kernel was compiled
         // for, and split q holds whole steps of modes. `positions` has room for all vertices of every domain.
         unsafe { launch.arg(&args).launch(config) }.map_err(fault_in("batch_mma"))?;
@@ -216,7 +220,8 @@ const fn select_batch_size(domains: usize) -> (usize, Option<&'static str>) {
     }
 }
 
-/// q of each domain, multiplied by the factors of the modes and split into pairs of 16-bit numbers.
+/// q of each domain, multiplied by the factors by which `TiledModes` divided the modes. Each coordinate is split into a
+/// pair of 16-bit numbers: the rounded coordinate and the rounded remainder.
 fn split_coordinates(scene: &Scene, state: &SceneState, tiles: &TiledModes) -> Vec<SplitCoordinates> {
     let split_domain = |domain: usize| {
         let scaled_q = state.q_of(scene, domain).iter().zip(tiles.factors()).map(|(q, factor)| q * factor);
@@ -225,8 +230,8 @@ fn split_coordinates(scene: &Scene, state: &SceneState, tiles: &TiledModes) -> V
     (0..scene.domains.len()).map(split_domain).collect()
 }
 
-/// The fragments of q in the order in which lanes read them: [step][batch_size / 8][lane][4] words. A word holds the
-/// 16-bit numbers of two modes. Numbers beyond the last domain or mode are zero.
+/// The fragments of q in the order in which lanes read them: [step][group of 8 domains][lane][4 words]. A word
+/// holds the 16-bit numbers of two neighboring modes. Numbers beyond the last domain or mode are zero.
 fn pack_fragments(split_q: &[SplitCoordinates], rank: usize, batch_size: usize) -> Vec<u32> {
     let steps = rank.div_ceil(STEP_MODES);
     // A step has a pair of 16-bit numbers for each domain and mode: one word of 32 bits.
@@ -248,7 +253,8 @@ fn pack_fragments(split_q: &[SplitCoordinates], rank: usize, batch_size: usize) 
     words
 }
 
-/// The transforms of all domains, then the scales that undo the scaling of q. Entries beyond the last domain are zero.
+/// The transforms of all domains, 12 numbers each, then one scale per domain that undoes the scaling of q. Entries
+/// beyond the last domain are zero.
 fn pack_transforms_and_scales(state: &SceneState, split_q: &[SplitCoordinates], batch_size: usize) -> Vec<f32> {
     let mut numbers: Vec<f32> = bytemuck::cast_slice(&state.transforms).to_vec();
     numbers.resize(12 * batch_size, 0.0);
@@ -257,7 +263,7 @@ fn pack_transforms_and_scales(state: &SceneState, split_q: &[SplitCoordinates], 
     numbers
 }
 
-/// The arguments with null addresses.
+/// The kernel arguments with null addresses.
 fn args_without_addresses(scene: &Scene, chunks: usize) -> BatchMmaArgs {
     let slots = &scene.layout.domains;
     let mut args = BatchMmaArgs {
@@ -274,6 +280,7 @@ fn args_without_addresses(scene: &Scene, chunks: usize) -> BatchMmaArgs {
 /// Minimum memory traffic of a launch, in bytes.
 fn minimum_traffic(scene: &Scene, tiles: &TiledModes) -> Vec<ArrayTraffic> {
     let (domains, vertices) = (scene.domains.len() as u64, scene.layout.vertices as u64);
+    // A quad of x0 and a T have 12 f32 each, 48 bytes. A position has 3 f32, 12 bytes.
     vec![
         ArrayTraffic::new("U", tiles.bytes().len() as u64),
         ArrayTraffic::new("x0", 48 * tiles.quads() as u64),
@@ -289,7 +296,7 @@ mod warp;
 #[cfg(test)]
 mod tests {
     use super::super::kernel_benchmark::tests::compile_all;
-    use super::warp::{KernelInputs, QUADS, StoreRange, stage_positions, store_staged, sum_modes};
+    use super::warp::{KernelInputs, StoreRange, WARP_QUADS, stage_positions, store_staged, sum_modes};
     use super::*;
     use modalcast_compute::storage::TILE_QUADS;
     use modalcast_compute::testing::{TestRng, position_of, scene_and_state};
@@ -310,7 +317,7 @@ mod tests {
         (scene, state)
     }
 
-    /// Vertices, modes and domains.
+    /// Vertices of the shape, modes and domains of each test scene.
     const SIZES: [(usize, usize, usize); 14] = [
         (1, 3, 1),
         (4, 1, 16),
@@ -328,15 +335,17 @@ mod tests {
         (33, 40, 17),
     ];
 
-    /// CPU twin of `batch_mma`, warp by warp, with fragments, staging buffer and stores; sums in f64.
+    /// CPU twin of `batch_mma`, warp by warp. It uses the kernel's fragments, staging buffer and stores, but sums in
+    /// f64. Positions that no warp stores are NaN.
     fn twin_of_batch_mma(inputs: &KernelInputs, coordinate_count: usize) -> Vec<f32> {
         let mut positions = vec![f32::NAN; coordinate_count];
         let vertices = inputs.args.vertices as usize;
         for (tile, warp) in (0..inputs.tiles.count()).flat_map(|tile| (0..WARPS).map(move |warp| (tile, warp))) {
-            let first_vertex = QUAD * (TILE_QUADS * tile + QUADS * warp);
+            let first_vertex = QUAD * (TILE_QUADS * tile + WARP_QUADS * warp);
             if first_vertex < vertices {
                 let sums = sum_modes(inputs, tile, warp);
-                let coordinates = 3 * (QUAD * QUADS).min(vertices - first_vertex);
+                let coordinates = 3 * (QUAD * WARP_QUADS).min(vertices - first_vertex);
+                // A pass stores four domains.
                 (0..inputs.batch_size / 4).for_each(|pass| {
                     let staged = stage_positions(inputs, &sums, (tile, warp), pass);
                     store_staged(inputs, &staged, StoreRange { first_vertex, coordinates, pass }, &mut positions);
@@ -348,8 +357,8 @@ mod tests {
 
     #[test]
     fn twin_writes_each_position_once_from_its_inputs() {
-        // q has a relative error of up to 2^-22 in f16 and 2^-16 in bf16. The tolerances are about 16 and 6 times as
-        // large, for sums over up to 50 modes and for f32 rounding.
+        // Split q has a relative error of up to 2^-22 (2.4e-7) in f16 and 2^-16 (1.5e-5) in bf16. The tolerances are
+        // about 16 and 6 times as large, for sums over up to 50 modes and for f32 rounding.
         for (storage, tolerance) in [(StorageType::F16, 4e-6), (StorageType::Bf16, 1e-4)] {
             for (vertices, rank, domains) in SIZES {
                 let (scene, state) = instanced_scene(vertices, rank, domains, storage);
@@ -361,7 +370,8 @@ mod tests {
                     let want = stored_position(&scene, &state, &inputs.tiles, (domain, vertex));
                     let is_close = got.iter().zip(want).all(|(got, want)| (f64::from(*got) - want).abs() < tolerance);
                     assert!(is_close, "{storage:?} n {vertices} r {rank} d {domains}: expected {want:?}, got {got:?}");
-                    // Negative control: the next vertex of the next domain has another position.
+                    // Negative control: the next vertex of the next domain has another position. Random positions
+                    // differ by more than 1e-3, ten times the larger tolerance.
                     let next = position_of(&scene, &state, (domain + 1) % domains, (vertex + 1) % vertices);
                     let is_only_vertex = domains == 1 && vertices == 1;
                     let differs = got.iter().zip(next).any(|(got, next)| (f64::from(*got) - next).abs() > 1e-3);

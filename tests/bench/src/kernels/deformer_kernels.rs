@@ -24,12 +24,12 @@ use modalcast_model::scene::{Scene, SceneState};
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum StepOutputs {
-    /// u = U q alone. Batches (domains that share U and are computed together) are not supported. For validation, the
-    /// host computes x = T (x0 + u) in f64.
+    /// u = U q alone. Scenes with batches (domains that share U and are computed together) are rejected. For
+    /// validation, the host computes x = T (x0 + u) in f64.
     Uq,
-    /// Positions, and a bounding box per warp.
+    /// Positions, and the bounding box of each warp's vertices.
     Positions,
-    /// Positions, the bounds of all vertices, normals, and tangents where the scene has normal maps.
+    /// Positions, the bounding box of all vertices, normals, and tangents if the scene has normal maps.
     Whole,
 }
 
@@ -52,7 +52,7 @@ pub struct DeformerBenchmark {
     deform: DeformKernel,
     bounds: BoundsKernel,
     normals: Option<NormalsKernel>,
-    /// Whether a step changes only some of the domains.
+    /// Whether a launch computes only the changed domains.
     is_partial: bool,
     /// One per input set.
     step_inputs: Vec<StepInputs>,
@@ -108,7 +108,7 @@ impl DeformerBenchmark {
         let normals = plan.kernel(KernelKind::Normals).filter(|_| step_outputs == StepOutputs::Whole);
         let normals = normals.map(|kernel| NormalsKernel::new(device, scene, &tables, kernel)).transpose()?;
         let mut deform = plan.require_kernel(KernelKind::Deform)?.clone();
-        remove_defines(&mut deform, step_outputs);
+        select_output_defines(&mut deform, step_outputs);
         let kernels = PositionKernels { deform: &deform, batch: plan.kernel(KernelKind::Batch) };
         let deform = DeformKernel::new(device, scene, kernels, tables)?;
         let outputs = DeviceBuffer::zeroed(device, output_bytes(&plan).iter().sum())?;
@@ -133,7 +133,7 @@ impl DeformerBenchmark {
         };
         let mut staging = None;
         for state in states {
-            // Step 1 computes all domains.
+            // Step 1 is a full step: it computes all domains.
             let header = StepHeader { last_full_step: 1, step: 1, ..benchmark.header() };
             let mut inputs = StepInputs::new(device, benchmark.deform.packer())?;
             let staging = match &mut staging {
@@ -176,25 +176,25 @@ impl DeformerBenchmark {
     }
 
     fn header(&self) -> StepHeader {
-        let [positions, normals, tangents, _] = output_bytes(&self.plan);
+        let [position_bytes, normal_bytes, tangent_bytes, _] = output_bytes(&self.plan);
         let base = self.outputs.address();
-        debug_assert!(positions + normals + tangents > 0);
+        debug_assert!(position_bytes + normal_bytes + tangent_bytes > 0);
         StepHeader {
             positions: base,
-            normals: base + positions,
-            tangents: base + positions + normals,
+            normals: base + position_bytes,
+            tangents: base + position_bytes + normal_bytes,
             // With `Uq`, u is written to the buffer of the positions.
             displacements: if self.step_outputs == StepOutputs::Uq {
                 base
             } else {
-                base + positions + normals + tangents
+                base + position_bytes + normal_bytes + tangent_bytes
             },
             ..StepHeader::default()
         }
     }
 
-    /// Fraction of the chunks of modes that truncation retains, weighted by vertices: the mean over the timed input
-    /// sets. `None` without truncation.
+    /// Fraction of the modes that truncation retains, weighted by vertices: the mean over the timed input sets. `None`
+    /// without truncation. Truncation omits whole chunks: the one, two or four modes that are stored together.
     fn retained_mode_share(&self) -> Option<f64> {
         let per_chunk = modes_per_chunk(self.scene.deformation.storage);
         let weighted_sum = |chunk_count_of: &dyn Fn(usize) -> usize| -> f64 {
@@ -222,8 +222,8 @@ impl DeformerBenchmark {
     }
 }
 
-/// Removes the macros of outputs that are not requested, and adds those of [`StepOutputs::Uq`].
-fn remove_defines(kernel: &mut KernelDescriptor, step_outputs: StepOutputs) {
+/// Removes the macros of outputs that are not requested, and adds the macros of [`StepOutputs::Uq`].
+fn select_output_defines(kernel: &mut KernelDescriptor, step_outputs: StepOutputs) {
     if step_outputs != StepOutputs::Whole {
         kernel.defines.retain(|define| !["RIGID_NORMALS", "CORNER_OFFSETS", "NORMAL_MAPS", "SHEAR"].contains(define));
     }
@@ -246,7 +246,7 @@ fn upload_step(
     device.stream().synchronize().map_err(fault_in("upload"))
 }
 
-/// Bytes of positions, normals, tangents and displacements, each rounded up to the alignment of a float4.
+/// Bytes of positions, normals, tangents and displacements, each rounded up to the 16 bytes of a float4.
 fn output_bytes(plan: &DeformPlan) -> [u64; 4] {
     [BufferRole::Positions, BufferRole::Normals, BufferRole::Tangents, BufferRole::Displacements]
         .map(|role| plan.bytes(role).next_multiple_of(16))
@@ -337,6 +337,7 @@ impl KernelBenchmark for DeformerBenchmark {
         ];
         traffic.push(ArrayTraffic::new("u or x", 12 * vertices));
         if self.scene.features.displacements && self.step_outputs != StepOutputs::Uq {
+            // The scene stores displacements as an output, in addition to positions.
             traffic.push(ArrayTraffic::new("u kept", 12 * vertices));
         }
         if self.step_outputs != StepOutputs::Uq {
@@ -351,8 +352,8 @@ impl KernelBenchmark for DeformerBenchmark {
     }
 
     fn launches_per_step(&self) -> usize {
-        let other_launches = [self.step_outputs == StepOutputs::Whole, self.normals.is_some()].map(usize::from);
-        self.deform.kernels().len() + other_launches[0] + other_launches[1]
+        let bounds_launches = usize::from(self.step_outputs == StepOutputs::Whole);
+        self.deform.kernels().len() + bounds_launches + usize::from(self.normals.is_some())
     }
 
     fn kernel_attributes(&self) -> Vec<KernelAttributes> {

@@ -114,6 +114,7 @@ impl InputSets {
         let mut positions = Vec::with_capacity(3 * self.scene.layout.vertices);
         let mut domain_positions: Vec<[f32; 3]> = Vec::new();
         for domain in 0..self.scene.domains.len() {
+            // Three rows of four numbers.
             let t = state.composed_transform(&self.scene, domain).to_f64();
             let transform_vertex = |(vertex, rest): (usize, &[f32; 3])| {
                 let u = u(domain, vertex);

@@ -1,5 +1,5 @@
-//! The trait of benchmarked kernels, and their compilation. Inputs are uploaded in advance, so that only kernels are
-//! timed.
+//! The trait of kernel benchmarks, and the compilation of their kernels. Inputs are uploaded in advance, so that only
+//! kernels are timed.
 
 use cudarc::driver::CudaFunction;
 use serde::Serialize;
@@ -12,7 +12,8 @@ pub trait KernelBenchmark {
     /// Name in reports.
     fn name(&self) -> String;
 
-    /// Number of uploaded input sets, at least 1. [`Self::launch`] takes an index modulo this number.
+    /// Number of uploaded input sets, at least 1. [`Self::launch`] reduces its `input_set` modulo
+    /// this number.
     fn input_set_count(&self) -> usize;
 
     /// Enqueues the kernels of one step on the stream of the device. The call does not wait, so that a graph can
@@ -22,8 +23,8 @@ pub trait KernelBenchmark {
     /// `Fault` when the device fails.
     fn launch(&self, device: &Device, input_set: usize) -> Result<()>;
 
-    /// Computes the positions of the domains that a launch with this input set skips. Validation calls it before the
-    /// launch.
+    /// Computes the positions of the domains that [`Self::launch`] with this input set skips. Validation calls this
+    /// before `launch`. By default, `launch` skips no domain.
     ///
     /// # Errors
     /// `Fault` when the device fails.
@@ -103,13 +104,13 @@ impl KernelAttributes {
 #[derive(Debug)]
 pub(super) struct BenchmarkSource {
     pub text: &'static str,
-    /// Names of the kernels. [`CompiledKernel`] compiles only the first one.
+    /// Names of the kernels in the file. [`CompiledKernel`] compiles only the first kernel.
     pub functions: &'static [&'static str],
     /// All sets of macros that the file is compiled with.
     pub define_sets: &'static [&'static [&'static str]],
 }
 
-/// A compiled function and its attributes.
+/// A compiled kernel and its attributes.
 #[derive(Debug)]
 pub(super) struct CompiledKernel {
     pub function: CudaFunction,
@@ -131,7 +132,7 @@ pub(super) mod tests {
     use super::*;
     use modalcast_compute::testing::{CAPABILITIES, assert_compiles};
 
-    /// Compiles every function with every set of macros; panics if a kernel spills registers.
+    /// Compiles every kernel with every set of macros. Panics if a kernel does not compile or spills registers.
     pub(in super::super) fn compile_all(source: &BenchmarkSource) {
         assert_compiles(source.text, source.functions, source.define_sets, &CAPABILITIES);
     }

@@ -1,18 +1,18 @@
 //! Benchmarks of CUDA kernels: the server's own kernels on inputs that are uploaded in advance, and kernels that the
-//! server does not use. A benchmark implements `KernelBenchmark`, by which its kernels are timed and its positions are
-//! validated.
+//! server does not use. Every benchmark implements `KernelBenchmark`, the interface for timing its kernels and for
+//! validating its positions.
 //!
 //! | file | contents |
 //! |---|---|
-//! | `kernel_benchmark` | the `KernelBenchmark` trait, and the driver's attributes of kernels |
+//! | `kernel_benchmark` | the `KernelBenchmark` trait, compilation, and attributes such as register counts |
 //! | `input_sets` | inputs of several steps, uploaded before timing starts |
 //! | `timer` | timing by CUDA graphs and events |
 //! | `bandwidth` | kernels that copy, read and fill device memory |
 //! | `device_bandwidth` | peak bandwidths of the device, for comparison |
 //! | `deformer_kernels` | the server's kernels that deform |
-//! | `batch_mma` | one U times many vectors q, by tensor cores |
+//! | `batch_mma` | x = T (x0 + U q) for many domains that share U, by tensor cores |
 //! | `upload` | host-to-device upload of a step's values |
-//! | `overlap` | steps with readback by the host, serial and overlapped |
+//! | `overlap` | steps whose vertices are read back to the host, serial and overlapped |
 //! | `cublas`, `plain_update` | u = U q by cuBLAS, and the update x = T (x0 + u) that follows it |
 //! | `raster` | the server's CUDA rasterizer, without OpenGL |
 //! | `thesis` | the kernels of the thesis |

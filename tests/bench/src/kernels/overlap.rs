@@ -1,4 +1,4 @@
-//! Measures steps with readback of the vertices, serial and overlapped as in figure 3.1 of the thesis.
+//! Measures steps whose vertices are read back to the host, serial and overlapped as in figure 3.1 of the thesis.
 //!
 //! ```text
 //! serial:      write step k, [copy in][kernels], [copy out], write step k+1, ...
@@ -39,9 +39,9 @@ pub struct Overlap {
     pub bytes_in: u64,
     /// Bytes of positions and normals.
     pub bytes_out: u64,
-    /// Host write of a step's values to pinned memory on one core.
+    /// Host write of a step's inputs to pinned memory on one core.
     pub write_one_core_us: f64,
-    /// The same write by the deformer, which uses several cores for large steps.
+    /// Host write as the deformer does it: on several cores for large steps.
     pub write_us: f64,
     /// Device graph: upload, kernels, and readback of the bounds.
     pub graph_us: f64,
@@ -61,8 +61,8 @@ pub struct Overlap {
     pub gain: f64,
     /// Lower limit of an overlapped step: the longest of host write, graph and readback.
     pub ideal_us: f64,
-    /// Number of pipelined and overlapped steps that are missing, or whose vertices differ in any bit from the serial
-    /// ones; must be 0.
+    /// Number of steps of `run_pipelined` and `run_overlapped` that are missing, or whose positions or normals differ
+    /// in any bit from `run_serial`; must be 0.
     pub differing: usize,
 }
 
@@ -159,8 +159,9 @@ fn run_pipelined(
     Ok(())
 }
 
-/// Keeps [`MAX_STEPS_IN_FLIGHT`] steps in flight. Every iteration finishes the oldest step, submits a step, and waits
-/// for the readback of the finished step.
+/// Keeps [`MAX_STEPS_IN_FLIGHT`] steps in flight. An iteration finishes the oldest step, submits a step, and waits for
+/// the readback of the finished step. The first [`MAX_STEPS_IN_FLIGHT`] iterations only submit steps, and as many at
+/// the end only finish them.
 fn run_overlapped(
     deformer: &mut CudaDeformer,
     states: &[SceneState],
@@ -188,7 +189,7 @@ fn run_overlapped(
     Ok(())
 }
 
-/// Number of pipelined and overlapped steps that are missing, or whose vertices differ from the serial ones.
+/// [`Overlap::differing`].
 fn count_differing_steps(deformer: &mut CudaDeformer, states: &[SceneState], steps: usize) -> Result<usize> {
     let mut want = Vec::new();
     run_serial(deformer, states, states.len(), &mut |_, surface| want.push(surface.clone()))?;
@@ -225,7 +226,7 @@ fn time_step_and_readback(deformer: &mut CudaDeformer, states: &[SceneState], st
     Ok([step_times, readback_times].map(median))
 }
 
-/// Bytes of a step's inputs, and the median times in microseconds of writing them on one core and on all cores.
+/// Bytes of a step's inputs, and the median times in microseconds of writing them on one core and as the deformer does.
 fn time_input_writes(
     device: &Device,
     scene: &Arc<Scene>,
@@ -243,7 +244,7 @@ fn time_input_writes(
             writer.write(words, &StepHeader::default(), &states[step % states.len()]);
             elapsed_us(begin)
         };
-        // Warm-up.
+        // An untimed warm-up.
         time_write(0);
         median((0..steps).map(&mut time_write).collect())
     };
@@ -251,7 +252,7 @@ fn time_input_writes(
     Ok((bytes, [single_thread.install(&mut measure), measure()]))
 }
 
-/// Median time in microseconds of the last step's graph, which is replayed between two events.
+/// Median time in microseconds of the deformer's last graph, replayed `steps` times.
 fn time_graph(device: &Device, deformer: &CudaDeformer, steps: usize) -> Result<f64> {
     let mut times = Vec::with_capacity(steps);
     for _ in 0..steps {
@@ -270,7 +271,7 @@ fn median(mut times: Vec<f64>) -> f64 {
     quantile(&mut times, 0.5).unwrap_or(f64::NAN)
 }
 
-/// Times of copying `bytes` to pinned, write-combined memory, microseconds.
+/// Median times in microseconds of copying `bytes` to pinned, write-combined memory.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct HostWrite {
     pub bytes: u64,

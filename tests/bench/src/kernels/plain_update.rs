@@ -31,7 +31,7 @@ struct PlainDomain {
     reserved: u32,
 }
 
-/// Arguments of `plain_update`; pointers are device addresses.
+/// Arguments of `plain_update`; pointers are device addresses. The kernel file describes the arrays.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Pod, Zeroable)]
 struct PlainArgs {
@@ -67,7 +67,7 @@ pub(super) struct PlainUpdate {
 }
 
 impl PlainUpdate {
-    /// `first_u` holds the first float of each domain's u; `None` for domains without modes.
+    /// `first_u` holds the index of each domain's first float in u; `None` for domains without modes.
     pub(super) fn new(device: &Device, scene: &Scene, first_u: &[Option<u64>]) -> Result<Self> {
         let (is_single, vertices) = (scene.domains.len() == 1, scene.layout.vertices);
         let defines: &[&str] = if is_single { &["SINGLE"] } else { &[] };
@@ -204,6 +204,7 @@ mod tests {
                 let got = twin_of_plain_update(&tables, transforms, &u, packed_vertex);
                 let want = position_of(&scene, &state, domain, vertex);
                 for (want, got) in want.iter().zip(got) {
+                    // The tolerance covers f32 rounding.
                     assert!(
                         (want - f64::from(got)).abs() < 1e-5,
                         "domain {domain}, vertex {vertex}: expected {want}, got {got}"

@@ -1,5 +1,5 @@
 //! Benchmarks the CUDA rasterizer without OpenGL. The benchmark owns the buffers of positions and samples, so that the
-//! samples can be read back.
+//! samples can be read back. A sample is the depth of a pixel or, with triangle ids, a key: depth and id in 64 bits.
 
 use super::kernel_benchmark::{ArrayTraffic, KernelAttributes, KernelBenchmark};
 use modalcast_compute::gpu::Device;
@@ -19,18 +19,18 @@ pub struct RasterMesh<'a> {
     pub triangles: &'a [[u32; 3]],
     /// Ranges of triangles to draw, each with its cull mode.
     pub groups: &'a [DrawRange],
+    /// The alpha-tested triangles.
     pub cut_outs: Option<&'a CutOuts>,
 }
 
-/// Number of triangles by outcome. A thread, a warp or several warps draw a triangle, depending on its
-/// size.
+/// Number of triangles by outcome. A thread, a warp or several warps draw a triangle, depending on its size.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct RasterCounts {
     /// Drawn by one thread.
     pub small: u32,
     /// Drawn by one warp.
     pub medium: u32,
-    /// Drawn tile by tile.
+    /// Drawn by several warps, each with some tiles of pixels.
     pub large: u32,
     /// Skipped: a corner is not finite in clip space.
     pub not_finite: u32,
@@ -93,8 +93,8 @@ impl RasterBenchmark {
         })
     }
 
-    /// The samples of the last launch, row by row from the top; empty for depth-only targets. The upper 32 bits of a
-    /// key are the bits of the depth, the lower 32 bits the id of the triangle. A key is all ones where nothing was
+    /// The keys of the last launch, row by row from the top; empty for depth-only targets. The upper 32 bits of a key
+    /// are the bits of the depth, the lower 32 bits are the id of the triangle. A key is all ones where nothing was
     /// drawn.
     ///
     /// # Errors
@@ -105,7 +105,8 @@ impl RasterBenchmark {
         Ok(keys)
     }
 
-    /// The depth of each sample of a depth-only target, 1 where nothing was drawn; otherwise empty.
+    /// The depths of the last launch, row by row from the top, for depth-only targets; otherwise empty. A depth is 1
+    /// where nothing was drawn.
     ///
     /// # Errors
     /// `Fault` when the device fails.

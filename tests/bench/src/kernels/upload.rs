@@ -27,7 +27,7 @@ impl KernelBenchmark for UploadBenchmark {
 
     fn launch(&self, device: &Device, _input_set: usize) -> Result<()> {
         // SAFETY: `time_steps` waits for all replays, so no copy runs when `self` is dropped. Nothing writes the
-        // staging buffer meanwhile.
+        // staging buffer while copies run.
         unsafe { self.inputs.send(device, &self.staging, InputPart::All) }
     }
 
@@ -41,6 +41,7 @@ impl KernelBenchmark for UploadBenchmark {
 /// # Errors
 /// `Fault` when the device fails; `Invalid` when `replays` is 0.
 pub fn time_upload(device: &Device, scene: &Arc<Scene>, state: &SceneState, replays: usize) -> Result<(u64, Timing)> {
+    // `sizes_only` packs wrong values of the right sizes. The values do not affect the time of a copy.
     let mut inputs = StepInputs::new(device, &Arc::new(InputPacker::sizes_only(scene)))?;
     let mut staging = inputs.allocate_staging(device)?;
     inputs.write(&mut staging, &StepHeader::default(), state)?;

@@ -1,4 +1,7 @@
 //! CPU twin of one warp of `kernels/batch_mma.cu`: fragments, staging buffer and stores of all 32 lanes. Sums are f64.
+//!
+//! A group is 8 domains, the columns of one product. Domain pair p of a group is its domains 2 p and 2 p + 1. The
+//! parity of a domain is its index modulo 2.
 
 use super::{
     BatchMmaArgs, STEP_MODES, args_without_addresses, pack_fragments, pack_transforms_and_scales, select_batch_size,
@@ -8,10 +11,10 @@ use modalcast_compute::storage::{PackedWord, TiledModes};
 use modalcast_compute::testing::transformed_axis;
 use modalcast_model::scene::{Scene, SceneState, StorageType};
 
-/// Quads (of four vertices) per warp.
-pub(super) const QUADS: usize = 8;
+/// Quads (four consecutive vertices each) per warp.
+pub(super) const WARP_QUADS: usize = 8;
 /// float4 per domain in the staging buffer: three per quad, and two of padding.
-const STRIDE: usize = 3 * QUADS + 2;
+const STRIDE: usize = 3 * WARP_QUADS + 2;
 
 /// The kernel's inputs.
 pub(super) struct KernelInputs {
@@ -38,7 +41,7 @@ impl KernelInputs {
         }
     }
 
-    /// The 16-bit number with these bits.
+    /// The 16-bit number in the lower half of `bits`.
     fn decode(&self, bits: u32) -> f64 {
         match self.tiles.storage() {
             StorageType::F16 => half::f16::from_bits(bits as u16).to_f64(),
@@ -51,8 +54,11 @@ impl KernelInputs {
 /// lane holds which entries ("Matrix Fragments for mma.m16n8k16"). Lane 4 g + t holds rows g and g + 8 of A and D,
 /// column g of B, and columns 2 t and 2 t + 1 of D.
 fn multiply(inputs: &KernelInputs, a: &[[u32; 4]; 32], b: &[[u32; 2]; 32], d: &mut [[f64; 4]; 32]) {
-    // A register holds two numbers: that of an even k in the lower half, that of an odd k in the upper half.
+    // A register holds two numbers: the number of an even k in the lower half, of the following odd k in the upper
+    // half.
     let decode_half = |register: u32, k: usize| inputs.decode(register >> (16 * (k % 2)) & 0xffff);
+    // The lane that holds entry (row, k) of A, or entry (k, column) of B. In that lane, register row / 8 + 2 (k / 8)
+    // holds the entry of A, and register k / 8 the entry of B.
     let lane_of = |row_or_column: usize, k: usize| 4 * (row_or_column % 8) + k % 8 / 2;
     let entry_of_a = |row: usize, k: usize| decode_half(a[lane_of(row, k)][row / 8 + 2 * (k / 8)], k);
     let entry_of_b = |k: usize, column: usize| decode_half(b[lane_of(column, k)][k / 8], k);
@@ -75,7 +81,8 @@ struct TileQuad {
     quad: usize,
 }
 
-/// A chunk of one quad, 48 bytes, as twelve words of 32 bits; zeros beyond the last chunk.
+/// A chunk (two modes) of one quad as twelve words of 32 bits; zeros beyond the last chunk. The 48 bytes are stored in
+/// three planes of 16 bytes.
 fn load_chunk(inputs: &KernelInputs, tile_quad: TileQuad, chunk: usize) -> [u32; 12] {
     let mut words = [0; 12];
     if chunk < inputs.args.chunks as usize {
@@ -89,7 +96,8 @@ fn load_chunk(inputs: &KernelInputs, tile_quad: TileQuad, chunk: usize) -> [u32;
     words
 }
 
-/// Accumulators: [2 axis + pair of vertices][group of 8 domains][lane][entry of D].
+/// Accumulators: [2 axis + vertex / 2][group of 8 domains][lane][entry of D]. The first index counts pairs of vertices
+/// for each axis, with `vertex` from 0 to 3 in the quad.
 pub(super) type AccumulatorFragments = Vec<Vec<[[f64; 4]; 32]>>;
 
 /// The sums over all modes for the quads of one warp.
@@ -99,18 +107,19 @@ pub(super) fn sum_modes(inputs: &KernelInputs, tile: usize, warp: usize) -> Accu
     let group_count = inputs.batch_size / 8;
     let mut sums: AccumulatorFragments = vec![vec![[[0.0; 4]; 32]; group_count]; 6];
     for step in 0..inputs.tiles.rank().div_ceil(STEP_MODES) {
+        // A step has 8 chunks of two modes. A lane loads chunks lane % 4 and lane % 4 + 4 of them.
         let chunks: Vec<[[u32; 12]; 2]> = (0..32)
             .map(|lane| {
-                let quad = (QUADS * warp + lane / 4).min(tile_quads - 1);
+                let quad = (WARP_QUADS * warp + lane / 4).min(tile_quads - 1);
                 let tile_quad = TileQuad { first_word, tile_quads, quad };
                 [0, 4].map(|offset| load_chunk(inputs, tile_quad, 8 * step + lane % 4 + offset))
             })
             .collect();
-        // Words 0 to 5 of a chunk belong to its first mode, words 6 to 11 to its second mode. Each word holds a pair of
-        // vertices. A register of A holds both modes of one vertex.
-        for (row, sums) in sums.iter_mut().enumerate() {
-            let first_vertex = |words: &[u32; 12]| words[row] & 0xffff | words[6 + row] << 16;
-            let second_vertex = |words: &[u32; 12]| words[row] >> 16 | words[6 + row] & 0xffff_0000;
+        // Words 0 to 5 of a chunk belong to its first mode, words 6 to 11 to its second mode. Word 2 axis + vertex / 2
+        // of a mode holds a pair of vertices. A register of A holds both modes of one vertex.
+        for (pair, sums) in sums.iter_mut().enumerate() {
+            let first_vertex = |words: &[u32; 12]| words[pair] & 0xffff | words[6 + pair] << 16;
+            let second_vertex = |words: &[u32; 12]| words[pair] >> 16 | words[6 + pair] & 0xffff_0000;
             let a: [[u32; 4]; 32] = std::array::from_fn(|lane| {
                 let [low, high] = &chunks[lane];
                 [first_vertex(low), second_vertex(low), first_vertex(high), second_vertex(high)]
@@ -119,7 +128,7 @@ pub(super) fn sum_modes(inputs: &KernelInputs, tile: usize, warp: usize) -> Accu
                 let word = |lane: usize, index: usize| {
                     inputs.fragments[4 * (32 * (group_count * step + group) + lane) + index]
                 };
-                // Words 2 and 3 hold the rounding remainders of q, which are added first.
+                // Words 2 and 3 hold the rounding remainders of q. They are added first, because they are small.
                 for first_word in [2, 0] {
                     let b = std::array::from_fn(|lane| [word(lane, first_word), word(lane, first_word + 1)]);
                     multiply(inputs, &a, &b, sums);
@@ -130,8 +139,8 @@ pub(super) fn sum_modes(inputs: &KernelInputs, tile: usize, warp: usize) -> Accu
     sums
 }
 
-/// The staging buffer of one warp after a pass. A pass stages the positions of four domains: those of equal parity in a
-/// group of 8.
+/// The staging buffer of one warp after a pass: the positions of four domains. Pass p stages the domains of parity p %
+/// 2 in group p / 2.
 pub(super) fn stage_positions(
     inputs: &KernelInputs,
     sums: &AccumulatorFragments,
@@ -140,10 +149,10 @@ pub(super) fn stage_positions(
 ) -> Vec<[f32; 4]> {
     let mut staged = vec![[f32::NAN; 4]; 4 * STRIDE];
     let layout = inputs.tiles.tile(tile);
-    for (quad, domain_pair) in (0..QUADS).flat_map(|quad| (0..4).map(move |domain_pair| (quad, domain_pair))) {
+    for (quad, domain_pair) in (0..WARP_QUADS).flat_map(|quad| (0..4).map(move |domain_pair| (quad, domain_pair))) {
         let (lane, parity) = (4 * quad + domain_pair, pass % 2);
         let domain = 8 * (pass / 2) + 2 * domain_pair + parity;
-        let rest = inputs.tiles.rest()[layout.first_quad + (QUADS * warp + quad).min(layout.quads - 1)];
+        let rest = inputs.tiles.rest()[layout.first_quad + (WARP_QUADS * warp + quad).min(layout.quads - 1)];
         let rows = &inputs.transforms_and_scales[12 * domain..][..12];
         let inverse_scale = inputs.transforms_and_scales[12 * inputs.batch_size + domain];
         let world: Vec<f32> = (0..4)
@@ -155,8 +164,9 @@ pub(super) fn stage_positions(
                 [0, 1, 2].map(|row| transformed_axis(&rows[4 * row..], deformed))
             })
             .collect();
-        for (i, components) in world.chunks_exact(4).enumerate() {
-            staged[STRIDE * domain_pair + 3 * quad + i] = [components[0], components[1], components[2], components[3]];
+        for (vector, components) in world.chunks_exact(4).enumerate() {
+            staged[STRIDE * domain_pair + 3 * quad + vector] =
+                [components[0], components[1], components[2], components[3]];
         }
     }
     staged
@@ -172,10 +182,11 @@ pub(super) struct StoreRange {
     pub pass: usize,
 }
 
-/// Copies the staged positions of four domains to their packed vertices.
+/// Copies the staged positions of four domains to their packed vertices. Eight lanes store one domain: 24 vectors in
+/// three rounds.
 pub(super) fn store_staged(inputs: &KernelInputs, staged: &[[f32; 4]], range: StoreRange, positions: &mut [f32]) {
-    for (lane, i) in (0..32).flat_map(|lane| (0..3).map(move |i| (lane, i))) {
-        let (domain_pair, vector) = (lane / 8, 8 * i + lane % 8);
+    for (lane, round) in (0..32).flat_map(|lane| (0..3).map(move |round| (lane, round))) {
+        let (domain_pair, vector) = (lane / 8, 8 * round + lane % 8);
         let domain = 8 * (range.pass / 2) + 2 * domain_pair + range.pass % 2;
         let is_stored =
             |component: &usize| domain < inputs.args.domains as usize && 4 * vector + component < range.coordinates;

@@ -97,9 +97,9 @@ impl CublasLibrary {
         Ok(Self { library, _cublas_lt: cublas_lt })
     }
 
-    /// Whether cudarc resolves its functions in this library. The system's loader identifies libraries by their
-    /// `SONAME`. cudarc thus gets this library, unless the search path has a library with a name that cudarc tries
-    /// earlier.
+    /// Whether cudarc resolves its functions in this library. cudarc tries a list of library names. The system's loader
+    /// identifies a loaded library by its `SONAME`, so cudarc gets this library, unless the search path has a library
+    /// with a name that is earlier in the list.
     fn is_used_by_cudarc(&self) -> bool {
         // SAFETY: as in `open`.
         if !unsafe { sys::is_culib_present() } {
@@ -128,8 +128,8 @@ fn function_address(library: &Library, function: &[u8]) -> Option<usize> {
     symbol.ok().map(|symbol| *symbol as usize)
 }
 
-/// Sizes of C = A B for column-major matrices on the device: A is rows x inner, B inner x columns. There are `count`
-/// such products at regular strides.
+/// Sizes of `count` products C = A B of column-major matrices on the device: A is rows x inner, B inner x columns. The
+/// matrices of successive products lie at regular strides.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct GemmCall {
     pub rows: i32,
@@ -250,7 +250,8 @@ impl<B> CublasHandle<B> {
         let (handle, transpose) = (self.handle, NO_TRANSPOSE);
         let (a, b, c) = (a as *const f32, b as *const f32, c as *mut f32);
         if use_gemv {
-            check_functions(false, true)?;
+            let (needs_grouped, needs_strided_gemv) = (false, true);
+            check_functions(needs_grouped, needs_strided_gemv)?;
             // SAFETY: the handle is live and the function exists; the caller guarantees the matrices.
             let status = unsafe {
                 sys::cublasSgemvStridedBatched(
@@ -274,7 +275,8 @@ impl<B> CublasHandle<B> {
     /// # Safety
     /// The device arrays hold the device address of a matrix for each product, in the order of the groups.
     pub(super) unsafe fn multiply_grouped(&self, call: &GroupedGemm) -> Result<()> {
-        check_functions(true, false)?;
+        let (needs_grouped, needs_strided_gemv) = (true, false);
+        check_functions(needs_grouped, needs_strided_gemv)?;
         let collect = |get_size: fn(&GemmCall) -> i32| call.groups.iter().map(get_size).collect::<Vec<i32>>();
         let (rows, columns, inner) =
             (collect(|group| group.rows), collect(|group| group.columns), collect(|group| group.inner));
@@ -337,7 +339,8 @@ mod tests {
         }
     }
 
-    /// The name of this test has no prefix `gpu_`, because cuBLAS can be loaded without a device.
+    /// Names of tests that need a device begin with `gpu_`. This test needs none, because cuBLAS can be loaded without
+    /// a device.
     #[test]
     #[ignore = "needs cuBLAS"]
     fn cudarc_uses_the_library_of_the_environment_variable() {

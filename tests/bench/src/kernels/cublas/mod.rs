@@ -1,5 +1,5 @@
-//! u = U q by cuBLAS, for comparison with our kernels, alone or followed by a plain vertex update. cuBLAS is loaded at
-//! run time; only benchmarks use it.
+//! u = U q by cuBLAS, alone or followed by a plain vertex update, for comparison with the server's kernels. cuBLAS is
+//! loaded at run time; only benchmarks use it.
 
 mod batch;
 mod library;
@@ -78,14 +78,16 @@ impl CublasBenchmark {
         Ok(Self { cublas: CublasHandle::new(device, buffers)?, method, part, plan, update, u_offsets })
     }
 
-    /// Enqueues u = U q of all domains. `q` is the address of the coordinates of this input set.
+    /// Enqueues u = U q of all domains. `q` is the address of the coordinates of this input set. Grouped products read
+    /// the pointers of the input set instead.
     fn multiply(&self, q: u64, input_set: usize) -> Result<()> {
         let ProductBuffers { matrices, u, input_sets, pointers } = &self.cublas.buffers;
         if let Some(pointers) = pointers {
             let groups: Vec<GemmCall> = self.plan.batches.iter().map(|batch| batch.call).collect();
             // A pointer has 8 bytes.
-            let q = pointers.q.address() + 8 * pointers.product_count * (input_set % input_sets.count()) as u64;
-            let pointers = [pointers.matrices.address(), q, pointers.u.address()];
+            let q_pointers =
+                pointers.q.address() + 8 * pointers.product_count * (input_set % input_sets.count()) as u64;
+            let pointers = [pointers.matrices.address(), q_pointers, pointers.u.address()];
             // SAFETY: the arrays have a pointer for each product, in the order of the groups, each to memory of the
             // size that `GemmPlan` planned.
             return unsafe { self.cublas.multiply_grouped(&GroupedGemm { groups: &groups, pointers }) };
@@ -93,8 +95,8 @@ impl CublasBenchmark {
         let addresses = [matrices.address(), q, u.address()];
         for batch in &self.plan.batches {
             let operands: [u64; 3] = std::array::from_fn(|operand| addresses[operand] + 4 * batch.offsets[operand]);
-            // SAFETY: the three buffers have the sizes that `GemmPlan` planned, and this batch lies inside them. The
-            // `count` is 1 for both gemv methods and for `Instances`. Both gemv methods have one column.
+            // SAFETY: the three buffers have the sizes that `GemmPlan` planned, and this batch lies inside them.
+            // `count` is 1 for `SgemvColumns`, `SgemvRows` and `Instances`. `columns` is 1 except for `Instances`.
             unsafe {
                 match self.method {
                     CublasMethod::SgemvColumns | CublasMethod::SgemvRows => {

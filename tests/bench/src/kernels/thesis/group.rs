@@ -94,7 +94,7 @@ pub struct LaneCounts {
     pub idle: u64,
 }
 
-/// The lane counts of each kernel of a split. U is not packed for this.
+/// The lane counts of each kernel of a split, computed without packing U. Kernels without domains are left out.
 pub fn count_lanes(scene: &Scene, split: KernelSplit) -> Vec<LaneCounts> {
     let count_for_width = |width: &usize| {
         let (mut groups, mut busy_lanes) = (0, 0);
@@ -115,9 +115,9 @@ const fn belongs_to_width(split: KernelSplit, width: usize, rank: usize) -> bool
 /// Layout of u: one float4 per vertex of the domains with modes, one domain after the other.
 #[derive(Debug)]
 pub(super) struct DisplacementLayout {
-    /// Index of the first vertex of each domain in u; `None` for domains without modes.
+    /// Index of each domain's first vertex in u; `None` for domains without modes.
     pub first_vertices: Vec<Option<u32>>,
-    /// Number of vertices that have a u.
+    /// Number of vertices of the domains with modes.
     pub vertex_count: usize,
 }
 
@@ -172,7 +172,7 @@ pub(super) struct PackedGroups {
     pub meta: Vec<[u32; 4]>,
 }
 
-/// Packs all domains whose groups are `width` lanes wide.
+/// Packs the domains that `split` assigns to groups of `width` lanes.
 pub(super) fn pack_groups(scene: &Scene, split: KernelSplit, width: usize) -> PackedGroups {
     let displacements = DisplacementLayout::of(scene);
     let mut packed = PackedGroups { width, entries: Vec::new(), meta: Vec::new() };
@@ -246,7 +246,9 @@ mod tests {
         // four with 7.
         assert_eq!([1, 2, 4, 8].map(|n_vr| idle_lanes_per_warp(8, n_vr)), [0; 4]);
         assert_eq!([3, 6].map(|n_vr| idle_lanes_per_warp(6, n_vr)), [2, 2]);
+        // With an n_vr of 5, a group has one row: 32 - 5 x 5, 32 - 4 x 5 and 32 - 6 x 5 idle lanes.
         assert_eq!([idle_lanes_per_warp(6, 5), idle_lanes_per_warp(8, 5), idle_lanes_per_warp(5, 5)], [7, 12, 2]);
+        // 32 - 4 x 7 idle lanes with an n_vr of 7. With 3, a group of eight lanes has two rows: 32 - 4 x 2 x 3.
         assert_eq!([idle_lanes_per_warp(8, 7), idle_lanes_per_warp(7, 7), idle_lanes_per_warp(8, 3)], [4, 4, 8]);
     }
 
@@ -273,6 +275,7 @@ mod tests {
                 dropped_cases += usize::from(covered_rows(rows, rows / n_gg, n_gg) < rows);
             }
         }
+        // Of 49 x 8 x 3 cases.
         assert!(dropped_cases > 100, "expected floor to drop rows in over 100 cases, got {dropped_cases}");
     }
 

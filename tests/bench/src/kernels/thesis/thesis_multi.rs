@@ -37,7 +37,8 @@ pub(super) struct MultiDomainKernel {
 
 impl MultiDomainKernel {
     /// # Errors
-    /// `Invalid` when a domain has more modes than a group holds.
+    /// `Invalid` when a domain has more than 32 modes; `Unavailable` when NVRTC is missing; `Fault` when the device
+    /// fails.
     pub(super) fn new(device: &Device, scene: &Scene, split: KernelSplit) -> Result<Self> {
         let slots = &scene.layout.domains;
         if let Some(domain) = slots.iter().position(|slot| slot.rank > MAX_RANK) {
@@ -72,8 +73,8 @@ impl MultiDomainKernel {
             let mut launch = device.stream().launch_builder(&kernel.compiled.function);
             launch.arg(&entries).arg(&meta).arg(&q).arg(&u);
             // SAFETY: these are the kernel's arguments. Entries and metadata have a float4 and a uint4 for each thread,
-            // because `pack_groups` fills whole blocks. It takes all indices in the metadata from one scene, so they
-            // are inside of `u` and `q`.
+            // because `pack_groups` fills whole blocks. All indices in the metadata are those of one scene, so they are
+            // inside of `u` and `q`.
             unsafe { launch.launch(config) }.map_err(fault_in("thesis_multi"))?;
         }
         Ok(())
@@ -106,7 +107,7 @@ mod tests {
     use super::*;
     use modalcast_compute::testing::{displacement_of, scene_and_state};
 
-    /// CPU twin of `thesis_multi`, thread by thread; counts the writes to each number of u.
+    /// CPU twin of `thesis_multi`, thread by thread. It also counts the writes to each number of u.
     fn twin_of_thesis_multi(packed: &PackedGroups, q: &[f32], u: &mut [f32], write_counts: &mut [usize]) {
         for first_lane in (0..packed.meta.len()).step_by(WARP) {
             let is_busy = |lane: &usize| packed.meta[first_lane + lane][0] != IDLE;

@@ -26,7 +26,7 @@ struct RowLines {
     width: usize,
     /// Passes per line: n_vr / 32, rounded up.
     passes: usize,
-    /// Number of lines; each has 32 float4 per pass.
+    /// Number of lines; a line has 32 float4 per pass.
     lines: usize,
 }
 
@@ -175,6 +175,7 @@ mod tests {
         assert!(distinct_indices(129) < 129);
         // The kernel stores q[4 j + i] at index i * 32 + j, as this function does.
         assert!((0..128).all(|index| shared_index_of_q(4 * (index % 32) + index / 32) == index));
+        // The 32 lanes read one component of their float4 of q from 32 banks.
         for component in 0..4 {
             let banks: std::collections::BTreeSet<usize> =
                 (0..32).map(|k| shared_index_of_q(4 * k + component) % 32).collect();
@@ -188,7 +189,9 @@ mod tests {
         let lines = RowLines::new(4, 30);
         assert_eq!((lines.width, lines.passes, lines.lines), (8, 1, 3));
         assert_eq!(WARP * size_of::<[f32; 4]>() % 128, 0);
+        // A rank of 10: three lanes per row, ten rows per line.
         assert_eq!(RowLines::new(4, 10), RowLines { rows: 12, rank: 10, width: 3, passes: 1, lines: 2 });
+        // A rank of 512: a row has 128 float4, four passes of 32 lanes.
         assert_eq!(RowLines::new(1, 512), RowLines { rows: 3, rank: 512, width: 32, passes: 4, lines: 3 });
     }
 

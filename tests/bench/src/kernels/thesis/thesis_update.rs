@@ -29,7 +29,7 @@ const RIGID: u32 = u32::MAX;
 /// consecutive vertices of a warp belong to at most two domains.
 const MIN_TRIANGLES: usize = 3;
 
-/// Arguments of `thesis_update`; pointers are device addresses.
+/// Arguments of `thesis_update`; pointers are device addresses. The kernel file describes the arrays.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Pod, Zeroable)]
 struct UpdateArgs {
@@ -55,8 +55,8 @@ unsafe impl DeviceRepr for UpdateArgs {}
 /// The vertices of unfolded triangles: three per triangle, without sharing.
 #[derive(Debug, Default)]
 struct UnfoldedTriangles {
-    /// Per warp: its two domains, the first of its eight vertices that belongs to the second domain (8 if none does),
-    /// and 0.
+    /// Per warp: its first domain, its second domain, the index from 0 to 7 of its first vertex in the second domain (8
+    /// if there is none), and 0.
     warps: Vec<[u32; 4]>,
     /// Index into u of each vertex, or [`RIGID`].
     sources: Vec<u32>,
@@ -75,6 +75,7 @@ impl UnfoldedTriangles {
         let mut domains = Vec::new();
         for (domain, slot) in scene.layout.domains.iter().enumerate() {
             let shape = scene.shape_of(domain);
+            // A triangle lists corners. A corner is a vertex with one normal.
             let (corners, triangles) = (shape.mesh.corners(), shape.mesh.triangles());
             let triangle_count = triangles.len().max(MIN_TRIANGLES);
             let corner_of = |index: usize| triangles[(index / 3).min(triangles.len() - 1)][index % 3] as usize;
@@ -92,6 +93,7 @@ impl UnfoldedTriangles {
             }
         }
         unfolded.warps = domains.chunks(VERTICES_PER_WARP).map(warp_entry).collect();
+        // The warps of the last block that have no vertices.
         unfolded.warps.resize(
             domains.len().div_ceil(VERTICES_PER_BLOCK) * VERTICES_PER_BLOCK / VERTICES_PER_WARP,
             [0, 0, VERTICES_PER_WARP as u32, 0],
@@ -188,8 +190,8 @@ impl UpdateKernel {
         Ok(())
     }
 
-    /// The positions folded back to packed vertices, three f32 for each of `vertices`. A vertex that no triangle refers
-    /// to was not computed and is NaN.
+    /// The positions of the last launch, copied back to the scene's `vertices` packed vertices, three f32 each. A
+    /// vertex that no triangle refers to was not computed and is NaN.
     pub(super) fn positions(&self, device: &Device, vertices: usize) -> Result<Vec<f32>> {
         let mut unfolded = vec![[0.0_f32; 4]; self.targets.len()];
         self.outputs[0].read(device, 0, &mut unfolded)?;
@@ -254,12 +256,12 @@ mod tests {
 
     #[test]
     fn twin_computes_all_vertices_of_triangles_and_no_others() {
-        // Vertices, modes and triangles of each domain. The first domain has one triangle, where the thesis assumes at
-        // least three. This triangle refers to 3 of the 5 vertices.
+        // Vertices, modes and triangles of each domain. Some domains have fewer triangles than the three that the
+        // thesis assumes, and some have vertices that no triangle refers to.
         let shapes = [(5, 2, 1), (9, 0, 2), (40, 7, 30), (4, 0, 1), (6, 3, 2), (3, 1, 5)];
         let (scene, state) = scene_and_state(&shapes);
         let unfolded = UnfoldedTriangles::of(&scene);
-        // Every domain has at least three triangles.
+        // Domains with one or two triangles are unfolded to three.
         assert_eq!(unfolded.targets.len(), 3 * (3 + 3 + 30 + 3 + 3 + 5));
         let DisplacementLayout { first_vertices, vertex_count } = DisplacementLayout::of(&scene);
         let mut u = vec![[0.0_f32; 4]; vertex_count];
@@ -279,23 +281,25 @@ mod tests {
                 let got = &folded[3 * (slot.first_vertex + vertex)..][..3];
                 nan_count += usize::from(got[0].is_nan());
                 for (want, got) in position_of(&scene, &state, domain, vertex).iter().zip(got) {
-                    // The triangles of the test scene refer to consecutive vertices.
+                    // The triangles of the test scene refer to consecutive vertices. Other vertices are NaN, which
+                    // fails the comparison.
                     let is_corner = vertex < 3 * shapes[domain].2;
                     assert_eq!((want - f64::from(*got)).abs() < 1e-5, is_corner, "domain {domain} vertex {vertex}");
                 }
             }
         }
-        // The first, second and fourth domain have vertices that no triangle refers to.
+        // No triangle refers to 5 - 3 vertices of the first domain, 9 - 6 of the second and 4 - 3 of the fourth.
         assert_eq!(nan_count, 2 + 3 + 1);
     }
 
     #[test]
     fn three_triangles_per_domain_fit_two_matrices_per_warp() {
-        // 50 domains of one triangle, each of which becomes three triangles with 9 unfolded vertices.
+        // 50 domains of one triangle, which is unfolded to three triangles with 9 vertices.
         const UNFOLDED_VERTICES: usize = 50 * 9;
         let (scene, _) = scene_and_state(&[(3, 0, 1); 50]);
         let unfolded = UnfoldedTriangles::of(&scene);
-        let domain = |vertex: usize| unfolded.targets[vertex] / 3;
+        // A domain has three packed vertices.
+        let domain = |unfolded_vertex: usize| unfolded.targets[unfolded_vertex] / 3;
         for (index, [first_domain, second_domain, first_of_second, _]) in
             unfolded.warps.iter().enumerate().take(UNFOLDED_VERTICES / VERTICES_PER_WARP)
         {
@@ -304,7 +308,8 @@ mod tests {
                 assert_eq!(domain(VERTICES_PER_WARP * index + vertex), *expected);
             }
         }
-        assert_eq!(unfolded.warps.len(), UNFOLDED_VERTICES.div_ceil(VERTICES_PER_BLOCK) * 8);
+        let warps_per_block = VERTICES_PER_BLOCK / VERTICES_PER_WARP;
+        assert_eq!(unfolded.warps.len(), UNFOLDED_VERTICES.div_ceil(VERTICES_PER_BLOCK) * warps_per_block);
     }
 
     #[test]
