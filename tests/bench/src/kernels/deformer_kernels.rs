@@ -150,9 +150,12 @@ impl DeformerBenchmark {
     /// Replaces each input set by that of a step that changes only these domains.
     fn apply_changes(&mut self, device: &Device, states: &[SceneState], changed: &[u32]) -> Result<()> {
         let requirement = "a quarter of the domains at most, no truncation, and less work than a whole step";
-        let too_many = || invalid("changed", requirement, changed.len());
-        let mut apply =
-            ApplyKernel::new(device, self.deform.packer(), self.plan.kernel(KernelKind::Apply).ok_or_else(too_many)?)?;
+        let not_partial = || invalid("changed", requirement, changed.len());
+        let mut apply = ApplyKernel::new(
+            device,
+            self.deform.packer(),
+            self.plan.kernel(KernelKind::Apply).ok_or_else(not_partial)?,
+        )?;
         let mut change_list = apply.allocate_list(device)?;
         let full_step = StepHeader { last_full_step: 1, ..self.header() };
         for (inputs, state) in self.step_inputs.iter_mut().zip(states) {
@@ -163,7 +166,7 @@ impl DeformerBenchmark {
                 state,
                 ChangedDomains { changed, outdated: &[] },
             )?;
-            let ChangeListLengths { change_count, dirty_tile_count } = lengths.ok_or_else(too_many)?;
+            let ChangeListLengths { change_count, dirty_tile_count } = lengths.ok_or_else(not_partial)?;
             // The output shows step 1. Step 2 changes the listed domains.
             let header = StepHeader { output_step: 1, step: 2, change_count, dirty_tile_count, ..full_step };
             upload_step(device, (inputs, &mut staging), &header, state)?;

@@ -1,5 +1,7 @@
 //! Measures steps whose vertices are read back to the host, serial and overlapped as in figure 3.1 of the thesis.
 //!
+//! Brackets are work of the device.
+//!
 //! ```text
 //! serial:      write step k, [copy in][kernels], [copy out], write step k+1, ...
 //! overlapped:  while the device computes step k+1, the host writes step k+2, and step k is copied out

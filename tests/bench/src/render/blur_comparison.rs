@@ -93,6 +93,7 @@ mod tests {
 
     #[test]
     fn compares_fragments_with_fastest_compute_of_same_map() {
+        // `Tiles` and `Rows` are compute methods.
         let rows = [
             render_row("a", (4096, BlurMethod::Tiles), 200.0),
             render_row("a", (4096, BlurMethod::Rows), 400.0),

@@ -1,6 +1,6 @@
-//! Compares whole frames with the OpenGL and the CUDA rasterizer in one run. Both draw the scene with its materials, a
-//! variance shadow map and one sample per pixel with FXAA. Frames with CUDA are timed only if both rasterizers agree on
-//! the ids of the visible triangles in nearly all pixels.
+//! Compares whole frames by the OpenGL and by the CUDA rasterizer in one run. Both rasterizers draw the scene with its
+//! materials, a variance shadow map and one sample per pixel with FXAA. Frames with CUDA are timed only if both
+//! rasterizers agree on the ids of the visible triangles in nearly all pixels.
 
 use std::sync::Arc;
 
@@ -183,14 +183,6 @@ impl FrameSetup {
         let image = harness.draw(loaded_scene, self.camera, size)?;
         Ok((image, harness.renderer.read_visibility()?))
     }
-}
-
-/// One message per comparison whose frames were not timed with CUDA.
-pub(super) fn describe_faults(comparisons: &[FrameComparison]) -> Vec<String> {
-    let describe = |FrameComparison { load, differing_ids, pixels, .. }: &FrameComparison| {
-        format!("{load}: expected equal ids, {differing_ids} of {pixels} pixels differ")
-    };
-    comparisons.iter().filter(|comparison| comparison.cuda.is_none()).map(describe).collect()
 }
 
 /// The section of whole frames in `raster.md`.

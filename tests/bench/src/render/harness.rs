@@ -15,7 +15,7 @@ use modalcast_model::raster::{RasterGeometry, Rasterizer};
 use modalcast_model::scene::{BoundingBox, Camera, OrientedBounds, Scene, SceneState};
 use modalcast_render::{DevicePreference, FrameImage, FrameParams, Renderer, SceneBuffers};
 
-/// The first CUDA device with a working compiler, if there is one.
+/// CUDA device 0, if there is one and the kernel compiler works on it.
 pub(super) fn cuda_device() -> Option<Arc<Device>> {
     Device::open(0).ok().filter(|device| device.check_compiler().is_ok())
 }

@@ -81,6 +81,7 @@ mod tests {
         let images = [10, 20, 30].map(|level| [level, level, level, 255].repeat(2));
         let file = encode_grid("three", size, 2, &images).expect("a grid");
         let image = image::load_from_memory(&file.png).expect("a PNG").into_rgb8();
+        // Two columns of 2 pixels and two rows of 1 pixel, with gutters of 8 pixels.
         assert_eq!(image.dimensions(), (2 * 2 + 8, 2 + 8));
         let level = |x, y| image.get_pixel(x, y).0[0];
         assert_eq!([level(0, 0), level(10, 0), level(1, 9), level(11, 9)], [10, 20, 30, 255]);

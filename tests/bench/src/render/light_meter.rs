@@ -1,5 +1,5 @@
-//! Measures the sun visibility of rendered frames. All surfaces of the scene become white and matte; the ratio of a frame
-//! with shadows to one without is the sun visibility.
+//! Measures the sun visibility of rendered frames. All surfaces of the scene become white and matte; the ratio of a
+//! frame with shadows to a frame without shadows is the sun visibility.
 
 use std::sync::Arc;
 

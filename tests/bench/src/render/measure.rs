@@ -1,4 +1,5 @@
-//! Measures one workload: traces its references, compares every variant with them, then measures frame times and flicker.
+//! Measures one workload: traces its references, compares every variant with them, then measures frame times and
+//! flicker.
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -81,7 +82,7 @@ pub struct RenderRow {
     pub image_bytes: u64,
     /// Samples per pixel of the frame.
     pub samples: u32,
-    /// Draw calls of the visibility and blended passes.
+    /// Number of draw calls of the visibility and blended passes.
     pub draws: usize,
     /// Culling counts of the last timed frame, where triangles are culled.
     #[serde(rename = "culled")]
@@ -121,8 +122,8 @@ struct WorkloadContext<'a> {
     moving: MovingReferences,
 }
 
-/// References of the moving scene: one pair per step, unshadowed and with hard shadows. Otherwise the reason why they
-/// were not traced.
+/// References of the moving scene, one pair per step: without shadows, and with hard shadows. `Err` is the reason why
+/// they were not traced.
 type MovingReferences = std::result::Result<Vec<[ReferenceImage; 2]>, String>;
 
 /// All results of one workload.
@@ -327,8 +328,8 @@ impl WorkloadContext<'_> {
         Ok((row, file))
     }
 
-    /// Times the passes of the scene stripped to its mesh, and the frames that they are compared with. The shadow map
-    /// is the largest of the timed rows that differ from the default shadow settings by the size of the map only.
+    /// Times the passes of the scene stripped to its mesh, and the frames that the passes are compared with. The shadow
+    /// map has the size of the largest map among the timed rows with default shadow settings except for the size.
     fn time_minimal_passes(&self, harness: &mut RenderHarness, rows: &[RenderRow]) -> Result<Option<MinimalPasses>> {
         let timed_default_shadow = |row: &RenderRow| {
             let is_default =
@@ -363,7 +364,8 @@ impl WorkloadContext<'_> {
         Ok(Some(passes.with_frame_excess()))
     }
 
-    /// Time of a frame with this shadow map and culling: that of a row with the same settings, or measured now.
+    /// Time of a frame with this shadow map and culling. It is taken from a timed row with the same settings if there
+    /// is one, and otherwise measured now.
     fn frame_baseline(
         &self,
         harness: &mut RenderHarness,
@@ -459,6 +461,7 @@ impl WorkloadContext<'_> {
         for (step, [unshadowed, hard]) in moving.iter().enumerate() {
             harness.deform(loaded_scene, &self.animation.state(step))?;
             let image = harness.draw(loaded_scene, camera, size)?;
+            // The references of the moving scene have no filtered shadows.
             let reference = if variant.intended_reference == ReferenceKind::Unshadowed { unshadowed } else { hard };
             flicker.add_frame(&image.rgba, &reference.colors);
             if let Some(reason) = time_budget.finish_step("frames") {

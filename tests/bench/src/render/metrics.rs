@@ -66,6 +66,7 @@ pub struct LightErrors {
 
 /// Compares the sun visibility pixel by pixel; pixels where either is undefined are skipped.
 pub fn compare_light(rendered: &[Option<f32>], reference: &[Option<f32>]) -> LightErrors {
+    // Per pixel: the rendered and the reference visibility.
     let pairs: Vec<(f32, f32)> =
         rendered.iter().zip(reference).filter_map(|(rendered, reference)| rendered.zip(*reference)).collect();
     let error = |(rendered, reference): &(f32, f32)| (rendered - reference).abs();
@@ -87,8 +88,8 @@ pub fn compare_light(rendered: &[Option<f32>], reference: &[Option<f32>]) -> Lig
     }
 }
 
-/// Measures the flicker of a moving scene: how much a pixel's error changes from frame to frame, on a scale of 0 to 255.
-/// The channel with the largest change counts. A constant error does not flicker.
+/// Measures the flicker of a moving scene: how much a pixel's error changes from frame to frame, on a scale of 0 to
+/// 255. The channel with the largest change counts. A constant error does not flicker.
 #[derive(Debug, Default)]
 pub struct FlickerMeter {
     /// Signed error of each pixel of the last frame; rendered minus reference.
@@ -150,12 +151,14 @@ mod tests {
         let ramp = |shift: i32| -> Vec<Option<f32>> {
             (0..100).map(|pixel| Some(((pixel - 40 - shift) as f32 / 20.0).clamp(0.0, 1.0))).collect()
         };
+        // Pixels 41 to 59 are in the penumbra.
         let unshifted_errors = compare_light(&ramp(0), &ramp(0));
         assert_eq!(
             (unshifted_errors.all_pixels.max, unshifted_errors.penumbra.count, unshifted_errors.bias),
             (0.0, 19, 0.0),
             "control: the same ramp"
         );
+        // A shift by two pixels changes the visibility on the ramp by 2/20.
         let shifted_errors = compare_light(&ramp(2), &ramp(0));
         assert!(
             (shifted_errors.penumbra.max - 0.1).abs() < 1e-6 && shifted_errors.penumbra.mean > 0.09,

@@ -1,5 +1,5 @@
-//! Times the minimal passes of a scene. They are a lower limit of the cost to draw its mesh: one draw of the shadow map's
-//! depth without a fragment shader, and one draw of the frame's ids and depth.
+//! Times the minimal passes of a scene. They are a lower limit of the cost to draw its mesh: one draw of the shadow
+//! map's depth without a fragment shader, and one draw of the frame's ids and depth.
 //!
 //! The scene is stripped to one opaque, two-sided, white material. Culling, images, cut-outs, shadow moments and the
 //! ground are off.
@@ -77,7 +77,7 @@ pub(super) fn strip_to_mesh(scene: &Scene, map_size: u32) -> Result<Arc<Scene>> 
     Scene::new(parts)
 }
 
-/// Whether the shadow pass of a frame was followed by one draw of ids, without a blur between them. `draw_calls` does
+/// Whether a frame began with the shadow pass and one draw of ids, without a blur between them. `draw_calls` does
 /// not count the draws of the shadow pass.
 pub(super) fn is_minimal(stats: &FrameStats) -> bool {
     stats.draw_calls == 1 && stats.passes.starts_with(&[Pass::Shadow, Pass::Visibility])

@@ -11,14 +11,15 @@
 //!   sees its nearest opaque or cut-out surface and the transparent surfaces in front of it, sorted by depth. Shadows
 //!   are cast by one ray per sample to the sun, or by rays that are distributed over the footprint of the blur.
 //! - `harness`, `light_meter`: draw and time frames of the renderer, and measure their sun visibility.
-//! - `readback`: frames per second when each frame is read back.
+//! - `readback`: frames per second when each frame is copied to the host.
 //! - [`metrics`]: errors, light bleeding, flicker.
-//! - `minimal_passes`: times of the depth and visibility passes of the scene stripped to its mesh.
-//! - `blur_comparison`: moments and blur by compute shaders and by fragment shaders.
+//! - `minimal_passes`: times of two passes of the scene stripped to its mesh: the depth of the shadow map, and the
+//!   visibility pass, which writes the depth and the id of the visible triangle of every sample.
+//! - `blur_comparison`: the blurred moments of variance shadow maps, by compute shaders and by fragment shaders.
 //! - `raster_comparison`: the minimal passes by the CUDA rasterizer and by OpenGL; `frame_comparison`: whole frames by
 //!   both.
-//! - [`packing`]: all images in one array as in equation 3.13, and in arrays by size.
-//! - [`plants`]: the plants of table 4.5, deformed and drawn.
+//! - [`packing`]: all images in one texture array as in equation 3.13 of the thesis, or in arrays by size.
+//! - [`plants`]: the plants of table 4.5 of the thesis, deformed and drawn.
 //! - [`frame_times`]: frame times of user-supplied scenes, for comparison with other programs.
 //! - [`figures`]: reproduces figures of the thesis.
 //! - `output`, `markdown`, `comparison_tables`, `raster_report`, `plot`, `image_files`: the files of a report.
@@ -155,6 +156,7 @@ impl ShadowTexelSize {
             shadow_texel_axes(scene, frame_params).map(|axes| axes[0].norm().max(axes[1].norm()))
         };
         let vertex_fit_side = longer_side(frame_params)?;
+        // Without light bounds, the map is fitted to the corners of `bounds`.
         let corner_fit_side = longer_side(&FrameParams { light_bounds: None, ..*frame_params })?;
         scene.look.shadow.map(|shadow| Self { map_size: shadow.size, vertex_fit_side, corner_fit_side })
     }
@@ -167,7 +169,7 @@ pub struct RenderReport {
     pub provenance: Provenance,
     pub renderer: RendererInfo,
     pub size: Size,
-    /// Error bounds against the intended result, for rows without tighter ones.
+    /// Default error bounds against the intended result. [`RenderRow::bounds`] has the bounds of each row.
     pub bounds: variants::ErrorLimits,
     pub loads: Vec<RenderWorkloadSummary>,
     pub rows: Vec<RenderRow>,
@@ -182,8 +184,8 @@ pub struct RenderReport {
     pub blurs: Vec<BlurComparison>,
     /// Plants of the thesis's table 4.5, deformed and drawn.
     pub plants: Vec<PlantResult>,
-    /// Unexpected results, as `workload: variant: reason`: variants that failed unexpectedly or passed although they are
-    /// expected to fail, and rasterizer comparisons with too many differing ids.
+    /// Unexpected results, as `workload: variant: reason`: variants that failed unexpectedly or passed although they
+    /// are expected to fail, and rasterizer comparisons with too many differing ids.
     pub failed: Vec<String>,
     /// Reference images and comparison strips.
     #[serde(skip)]
@@ -219,7 +221,7 @@ pub fn render(options: &RenderReportOptions, mut progress: impl FnMut(&str)) -> 
         plants.push(plants::measure(&mut harness, device.as_ref(), options, *index)?);
     }
     let failed = rows.iter().filter(|row: &&RenderRow| !row.is_as_expected()).map(describe_failure);
-    let failed = failed.chain(raster.iter().filter_map(RasterComparison::describe_fault)).collect();
+    let failed = failed.chain(raster.iter().filter_map(RasterComparison::describe_missing_times)).collect();
     let (provenance, renderer, bounds) =
         (Provenance::collect(), harness.renderer.info().clone(), variants::ERROR_LIMITS);
     let blurs = BlurComparison::pair_rows(&rows);

@@ -12,7 +12,8 @@ use modalcast_model::error::{Result, fault_in};
 
 /// Columns of `report.csv`: the name, and the source of the value. The source is a JSON pointer into a row of
 /// `report.json`, or the name of a pass whose time the column contains. It is empty for `faults`, which [`cell_text`]
-/// joins. `of_aim` in a name means an error against the intended result; other errors are against hard shadows.
+/// joins. `of_aim` in a name means an error against the intended result; other errors are against the reference with
+/// hard shadows. `listed` triangles are passed to the rasterizer, `hidden` triangles are occluded.
 const COLUMNS: [(&str, &str); 55] = [
     ("load", "/load"),
     ("variant", "/name"),
@@ -72,8 +73,8 @@ const COLUMNS: [(&str, &str); 55] = [
 ];
 
 impl RenderReport {
-    /// Writes `report.json`, `report.csv`, `passes.csv` (minimal passes, rasterizers and blurs),
-    /// `plants.csv`, `report.md`, `report.svg`, `report.png` and `pictures/` into a folder, which is created.
+    /// Writes `report.json`, `report.csv`, `passes.csv` (minimal passes, rasterizers and blurs), `plants.csv`,
+    /// `report.md`, `report.svg`, `report.png` and `pictures/` into a folder, which is created.
     ///
     /// # Errors
     /// `Fault` when a file cannot be written.
@@ -165,7 +166,7 @@ fn passes_csv(report: &RenderReport) -> Result<Vec<u8>> {
     encode_csv(header.map(String::from), lines)
 }
 
-/// The CSV of plants, one plant per line: our measurements, then those of the thesis.
+/// The CSV of plants, one plant per line: our measurements, then the measurements of the thesis.
 fn plants_csv(plants: &[PlantResult]) -> Result<Vec<u8>> {
     let header =
         ["load", "species", "full", "backend", "shared", "triangles", "domains", "map_size", "deform_ms", "upload_ms"];

@@ -12,12 +12,11 @@
 //! fragment. Wrapping the coordinates of each triangle is equivalent if no triangle crosses the edge of its image.
 //!
 //! The scale of the equation does not reach the last column and row of an image. [`Packing::CorrectedRepetition`] uses
-//! s = (w / w_t, h / h_t) instead. On the `images` workload, its error is slightly smaller than that of size classes:
-//! 3.93 compared with 4.24 of 255, with software rendering at 640 x 360. The workload shows each image on a panel,
-//! above a floor. It has seven image sizes and the renderer six arrays: the two smallest images, 16 x 16 and 25 x 15,
-//! share an array of 25 x 16 and are stretched to this size. On their panels, where a texel covers several pixels, the
-//! error of size classes is larger by up to 7 of 255. On the floor, the error of size classes is smaller by up to 0.5
-//! of 255.
+//! s = (w / w_t, h / h_t) instead. On the `images` workload, which shows images on panels and on a floor, the error of
+//! the corrected repetition is 3.93 of 255, and the error of size classes is 4.24 (software rendering at 640 x 360).
+//! The workload has seven image sizes. The renderer has six arrays, because the two smallest images, 16 x 16 and
+//! 25 x 15, share an array of 25 x 16 and are stretched to this size. On the panels of these two images, where a texel
+//! covers several pixels, the error of size classes is larger by up to 7. On the floor, it is smaller by up to 0.5.
 
 use std::sync::Arc;
 

@@ -1,12 +1,13 @@
-//! Deforms and draws the plants of table 4.5 and compares the results with the rendering columns of tables 4.6 and 4.7 of
-//! the thesis.
+//! Deforms and draws the plants of table 4.5 of the thesis and compares the results with the rendering columns of its
+//! tables 4.6 and 4.7.
 //!
-//! Definitions of the thesis: `t_vbr` is the time to update the vertices and render them. `O_vbr` is its fraction of the
-//! whole frame. FPS are whole frames per second. s is device memory.
+//! Definitions of the thesis: `t_vbr` is the time to update the vertices and render them. `O_vbr` is the fraction of
+//! the whole frame that is `t_vbr`. FPS are whole frames per second. s is device memory.
 //!
-//! Our `t_vbr` is the sum of three times: a step of the deformer (upload of q and T, and U q), the upload of vertices if
-//! the deformer does not write the renderer's buffers, and all passes except the readback. Our frame also contains the
-//! waits between these and the readback of the pixels. The thesis's frame includes the simulation, ours does not.
+//! Our `t_vbr` is the sum of three times: a step of the deformer (upload of q and T, and U q), the upload of vertices
+//! if the deformer does not write the renderer's buffers, and all passes except the readback. Our frame also contains
+//! the readback of the pixels and the waits between all of these. The thesis's frame includes the simulation, ours does
+//! not.
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -42,7 +43,7 @@ pub struct PlantResult {
     pub shares_buffers: bool,
     pub triangles: usize,
     pub domains: usize,
-    /// Side of its variance shadow map, texels.
+    /// Side of the variance shadow map, texels.
     #[serde(rename = "map")]
     pub map_size: u32,
     /// A step of the deformer.
@@ -72,7 +73,7 @@ struct PlantSetup {
     buffers: SceneBuffers,
 }
 
-/// Measures plant `index`.
+/// Measures the plant `index` of table 4.5, counted from 0.
 pub(super) fn measure(
     harness: &mut RenderHarness,
     device: Option<&Arc<Device>>,

@@ -59,6 +59,7 @@ fn min_samples(report: &RenderReport) -> usize {
     report.loads.iter().map(|workload| workload.samples).min().unwrap_or(0)
 }
 
+/// The point of a row; `None` for a row that was not timed. Every point may be on the Pareto front.
 fn row_point(row: &RenderRow) -> Option<Point<'_>> {
     let (time_us, error) = (row.median_us()?, row.color_errors.mean);
     Some(Point { name: &row.name, time_us, error, is_filled: true, is_candidate: true })

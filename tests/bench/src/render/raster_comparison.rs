@@ -1,6 +1,6 @@
-//! Compares the CUDA rasterizer with OpenGL in one run on two passes: ids with depth, and depth only. An id names the
-//! visible triangle of a sample. The scene is stripped to its mesh and has one sample per pixel. The passes are timed
-//! only if both rasterizers agree on nearly all ids.
+//! Compares the CUDA rasterizer with OpenGL in one run on two passes: ids with depth, and depth only. An id is the
+//! index of the visible triangle of a sample. The scene is stripped to its mesh and has one sample per pixel. The
+//! passes are timed only if both rasterizers agree on nearly all ids.
 
 use std::sync::Arc;
 
@@ -72,7 +72,7 @@ pub struct TriangleCounts {
     pub small: u32,
     /// Drawn by one warp each.
     pub medium: u32,
-    /// Drawn tile by tile.
+    /// Drawn tile by tile, by several warps each.
     pub large: u32,
     /// Not drawn, because they cover no sample.
     pub missed: u32,
@@ -89,7 +89,7 @@ impl From<RasterCounts> for TriangleCounts {
 
 impl RasterComparison {
     /// Describes why the passes were not timed; `None` if they were.
-    pub(super) fn describe_fault(&self) -> Option<String> {
+    pub(super) fn describe_missing_times(&self) -> Option<String> {
         let Self { load, differing_ids, samples, passes, .. } = self;
         passes
             .is_none()
@@ -231,8 +231,8 @@ impl RasterSetup {
         })
     }
 
-    /// Converts ids that OpenGL drew to indices into the triangles of all domains in order, as CUDA numbers them.
-    /// `u32::MAX` where OpenGL drew no triangle.
+    /// Converts ids that OpenGL drew to the ids of the CUDA rasterizer: indices into the triangles of all domains in
+    /// order. `u32::MAX` where OpenGL drew no triangle.
     fn packed_ids(&self, visibility: &[VisibilityId], loaded_scene: &LoadedScene) -> Vec<u32> {
         let domain_layouts = &self.scene.layout.domains;
         let source_triangle = |id: &VisibilityId| match id {
@@ -265,7 +265,7 @@ impl RasterSetup {
         harness: &mut RenderHarness,
         loaded_scene: &LoadedScene,
         device: &Device,
-        [depth_raster, visibility_raster]: [&RasterBenchmark; 2],
+        [map_raster, frame_raster]: [&RasterBenchmark; 2],
     ) -> Result<PassPairs> {
         let passes = harness.time_passes(loaded_scene, self.camera, self.size, self.replays)?;
         let time_pair = |name: &str, raster: &RasterBenchmark| {
@@ -274,10 +274,7 @@ impl RasterSetup {
             let cuda = kernels::time_steps(device, raster, CacheState::Warm, self.replays)?;
             Ok(TimingPair { opengl, cuda })
         };
-        Ok(PassPairs {
-            depth: time_pair("shadow", depth_raster)?,
-            visibility: time_pair("visibility", visibility_raster)?,
-        })
+        Ok(PassPairs { depth: time_pair("shadow", map_raster)?, visibility: time_pair("visibility", frame_raster)? })
     }
 }
 

@@ -183,9 +183,9 @@ impl RayScene {
         Self { triangles: ordered_triangles, normals, tangents, center, radius, bvh, ..self }
     }
 
-    /// The part of a ray from `min_t` to `max_t` in f32, relative to the center of the scene, and the t at its start. A
-    /// ray from afar starts 1.5 radii before its point that is closest to the center, which is still outside of the
-    /// scene.
+    /// The part of a ray from `min_t` to `max_t` in f32, relative to the center of the scene, and the t at the start of
+    /// this part. A ray from afar starts 1.5 radii before its point that is closest to the center. This start is still
+    /// outside of the scene.
     fn box_ray(&self, ray: &Ray, min_t: f64, max_t: f64) -> (BoxRay, f64) {
         let length_squared = ray.direction.norm_squared();
         let closest_t = ray.direction.dot(&(self.center - ray.origin)) / length_squared;
@@ -251,6 +251,7 @@ impl RayScene {
     /// Whether a shadow caster other than triangle `receiver` intersects the ray beyond `min_t`.
     pub(super) fn is_occluded(&self, ray: &Ray, min_t: f64, receiver: Option<usize>) -> bool {
         let (box_ray, _) = self.box_ray(ray, min_t, f64::MAX);
+        // Casters at any distance count.
         let box_ray = BoxRay { tmax: f32::MAX, ..box_ray };
         let occludes = |index: usize| {
             let hit = self.triangles[index].intersect(index, ray).filter(|hit| hit.t > min_t);
@@ -292,7 +293,8 @@ impl RayScene {
         material.alpha_kind == AlphaKind::Blend && (hit.is_front || material.double_sided)
     }
 
-    /// Whether a hit casts a shadow. Both sides of a triangle do, except where alpha is below the shadow's alpha cutoff.
+    /// Whether a hit casts a shadow. Both sides of a triangle do, except where alpha is below the shadow's alpha
+    /// cutoff.
     fn casts_shadow(&self, hit: &Hit) -> bool {
         let material = self.material(hit);
         material.alpha_kind == AlphaKind::Opaque || self.alpha(hit) >= material.shadow_alpha_cutoff

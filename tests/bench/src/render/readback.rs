@@ -1,10 +1,11 @@
 //! Measures the cost of reading every frame back: frames per second without readback, with a blocking readback after
-//! each frame, and with asynchronous readbacks through the ring while the next frames are drawn.
+//! each frame, and with asynchronous readbacks while the next frames are drawn. Asynchronous readbacks go through the
+//! renderer's ring of [`MAX_FRAMES_IN_FLIGHT`] staging buffers.
 //!
-//! All three methods keep at most as many frames in flight as the ring has slots, so that they differ only in the
-//! readback. Rounds of the three methods alternate, and the medians over the rounds are compared. The methods without
-//! readback and through the ring are also measured with a moving scene: the vertices of another step are uploaded
-//! before every frame.
+//! All three methods keep at most [`MAX_FRAMES_IN_FLIGHT`] frames in flight, so that they differ only in the readback.
+//! Rounds of the three methods alternate, and the medians over the rounds are compared. The methods without readback
+//! and through the ring are also measured with a moving scene: the vertices of another step are uploaded before every
+//! frame.
 //!
 //! The readback is validated before it is timed. Frames of two alternating cameras are read through the ring and must
 //! equal, in order, the frames of blocking readbacks. This is checked with and without uploads between the frames.
@@ -98,6 +99,7 @@ pub(super) fn measure(
     let frames = if harness.renderer.info().software { MIN_REPETITIONS } else { options.replays.max(MIN_REPETITIONS) };
     let modes = [ReadbackMode::Unread, ReadbackMode::Blocking, ReadbackMode::Ring].map(|mode| (mode, &still_source));
     let modes = modes.into_iter().chain([ReadbackMode::Unread, ReadbackMode::Ring].map(|mode| (mode, &moving_source)));
+    // The rates of each of the five pairs of mode and source.
     let mut fps = [const { Vec::new() }; 5];
     for _ in 0..ROUNDS {
         for ((mode, source), rates) in modes.clone().zip(&mut fps) {
@@ -172,7 +174,7 @@ fn median(mut rates: Vec<f64>) -> f64 {
     quantile(&mut rates, 0.5).unwrap_or(f64::NAN)
 }
 
-/// Checks that frames that are read through the ring equal those of blocking readbacks, in order.
+/// Checks that frames that are read through the ring equal the frames of blocking readbacks, in order.
 fn validate(harness: &mut RenderHarness, loaded_scene: &LoadedScene, source: &FrameSource) -> Result<()> {
     let mut draw_blocking = |frame: usize| {
         source.upload_step(harness, loaded_scene, frame)?;
@@ -237,7 +239,7 @@ fn measure_round(
     }
 }
 
-/// Draws with as many frames in flight as the ring has slots. `sender` receives each frame's number and pixels, which
+/// Draws with [`MAX_FRAMES_IN_FLIGHT`] frames in flight. `sender` receives each frame's number and pixels, which
 /// are copied on other threads.
 fn draw_pipelined(
     harness: &mut RenderHarness,

@@ -18,8 +18,9 @@ pub(super) enum ShadowModel {
     /// One ray to the sun.
     Hard,
     /// Fraction of unoccluded rays. The ray origins have a Gaussian distribution in the plane perpendicular to the
-    /// light; each of the two vectors is one standard deviation. Origins are projected onto the receiver's tangent plane.
-    /// Casters within half of the origin's offset are ignored, because they are probably the curved receiver itself.
+    /// light; each of the two vectors is one standard deviation. Origins are projected onto the receiver's tangent
+    /// plane. Casters within half of the origin's offset are ignored, because they are probably the curved receiver
+    /// itself.
     Filtered([Vector3<f64>; 2]),
 }
 
@@ -47,7 +48,7 @@ pub(super) struct SampleCounts {
 impl SampleCounts {
     /// 64 samples per pixel.
     pub(super) const FULL: Self = Self { samples_per_side: 8, taps: 1 };
-    /// A quarter of the samples, for machines with few cores. Filtered shadows still have 64 rays per pixel.
+    /// 16 samples per pixel, for machines with few cores. Filtered shadows still have 16 x 4 = 64 rays per pixel.
     pub(super) const QUICK: Self = Self { samples_per_side: 4, taps: 4 };
 }
 
@@ -103,7 +104,7 @@ fn trace_pixel(
     for (index, [dx, dy]) in samples.iter().enumerate() {
         let layers = trace_layers(ray_scene, view, &view.ray(f64::from(x) + dx, f64::from(y) + dy));
         // The number of samples is a power of two, so an odd stride visits all points. With the stride 37, neighboring
-        // samples get points that are far from each other.
+        // samples get points that are far from each other. The offset 11 is arbitrary.
         let sun_samples: Vec<[f64; 2]> =
             (0..taps).map(|tap| gaussian_samples[((index * 37 + 11) % samples.len()) * taps + tap]).collect();
         for (sum, shadow_model) in sums.iter_mut().zip(shadow_models) {

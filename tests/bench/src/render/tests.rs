@@ -59,6 +59,7 @@ fn frame_params(bounds: BoundingBox, side: u32, viewpoint: Viewpoint) -> FramePa
     let camera = Camera {
         view: View::LookAt { eye, target: [0.0; 3], up },
         lens: Lens::Intrinsics { fx: 100.0, fy: 100.0, cx: center, cy: center },
+        // Both planes are fitted to the scene.
         near: 0.0,
         far: 0.0,
     };
@@ -92,6 +93,7 @@ fn pixels_are_as_bright_as_their_covered_area() {
     parts.look.skylight = [1.0; 3];
     let image = trace_images(parts, Viewpoint::Front, &[ShadowModel::Unshadowed], 32).remove(0);
     let area: f64 = (0..32 * 32).map(|pixel| linear_color(&image, pixel).x).sum();
+    // The tolerance allows for 64 samples per pixel along the edges.
     assert!((area - 10.35 * 7.8).abs() < 0.25, "expected an area of 10.35 x 7.8, got {area}");
     let brightness = |column: usize| linear_color(&image, 16 * 32 + column).x;
     assert!((brightness(10) - 0.5).abs() < 1e-6, "{}", brightness(10));
@@ -118,6 +120,7 @@ fn shades_one_pixel_by_equation_3_12() {
         .map(|(ambient, diffuse, specular)| 0.25 * ambient + 0.5 * (cosine * diffuse + cosine.powi(3) * specular));
     let color = linear_color(&image, 20 * 41 + 20);
     for (channel, expected) in color.iter().zip(expected) {
+        // The samples of the pixel are beside its center, so the highlight differs slightly.
         assert!((channel - expected).abs() < 2e-4, "expected {expected}, got {channel}");
     }
 }
@@ -176,7 +179,8 @@ fn shadow_edge(caster: Material) -> SceneParts {
 
 #[test]
 fn hard_and_gaussian_shadow_edges_match_the_formula() {
-    // Deviations of 0.4 in the plane perpendicular to the light: 0.4 / 0.8 on the ground along x.
+    // Standard deviations of 0.4 in the plane perpendicular to the light. The sine of the sun's elevation is 0.8, so
+    // the deviation on the ground along x is 0.4 / 0.8.
     let filter_axes = [Vector3::new(4.0, -3.0, 0.0) / 5.0 * 0.4, Vector3::z() * 0.4];
     let shadow_models = [ShadowModel::Hard, ShadowModel::Filtered(filter_axes), ShadowModel::Unshadowed];
     let images = trace_images(shadow_edge(Material::default()), Viewpoint::Above, &shadow_models, 40);
@@ -185,7 +189,7 @@ fn hard_and_gaussian_shadow_edges_match_the_formula() {
         f64::from(image.sun_visibility[20 * 40 + column].expect("defined sun visibility"))
     };
     assert!((0..40).all(|column| visibility(&unshadowed, column) == 1.0));
-    // The edge is at 20 + 10 x 0.3 = 23 pixels from the left.
+    // With 10 pixels per unit, the edge is at 20 + 10 x 0.3 = 23 pixels from the left.
     assert_eq!((visibility(&hard, 22), visibility(&hard, 23)), (1.0, 0.0));
     let deviation = 10.0 * 0.4 / 0.8;
     for column in 4..40 {
@@ -246,6 +250,7 @@ fn ray_queries_match_a_linear_search_at_any_position() {
                 .filter_map(|triangle| ray_scene.intersect(triangle, &ray))
                 .min_by(|a, b| a.t.total_cmp(&b.t));
             assert_eq!(nearest_hit.map(|hit| hit.t), linear_search_hit.map(|hit| hit.t), "{seed}");
+            // `all_hits` begins with the farthest hit.
             assert_eq!(nearest_hit.map(|hit| hit.t), all_hits.last().map(|hit| hit.t), "{seed}");
             assert_eq!(ray_scene.is_occluded(&ray, 0.0, None), linear_search_hit.is_some(), "{seed}");
         }
@@ -259,6 +264,7 @@ fn drawn_scene_matches_reference_unless_sun_moves() {
     // Variant 1 has a variance map of 512 texels per side.
     let variant = variants::all(true).remove(1);
     let mut harness = RenderHarness::open().expect("EGL and OpenGL 4.3 (libegl1, libegl-mesa0, libgl1-mesa-dri)");
+    // Only the drawn scene has this sun. The reference keeps the sun of the workload.
     let mut color_errors = |sun: [f32; 3]| {
         let look = modalcast_model::scene::RenderSettings { sun, ..variant.settings(animation.scene.look) };
         let lit_scene = light_meter::with_settings(&animation.scene, look).expect("valid settings");
@@ -294,9 +300,9 @@ fn report_measures_selected_variants_and_writes_files() {
     };
     let report = render(&options, |_| {}).expect("a report");
     assert!(report.passed(), "{:?}", report.failed);
-    let [unshadowed, filtered] = &report.rows[..] else { panic!("expected two rows, got {:?}", report.rows) };
+    let [unshadowed, variance] = &report.rows[..] else { panic!("expected two rows, got {:?}", report.rows) };
     assert!(
-        unshadowed.color_errors.mean > 2.0 * filtered.color_errors.mean,
+        unshadowed.color_errors.mean > 2.0 * variance.color_errors.mean,
         "expected a larger error against the shadowed reference without shadows"
     );
     assert!(
@@ -305,7 +311,7 @@ fn report_measures_selected_variants_and_writes_files() {
     );
     // Bytes per texel: 4 of depth, 8 of moments, and 8 of moments that are blurred in x only.
     assert!(
-        filtered.shadow_bytes == 20 * 512 * 512 && filtered.bytes > unshadowed.bytes && unshadowed.shadow_bytes == 0
+        variance.shadow_bytes == 20 * 512 * 512 && variance.bytes > unshadowed.bytes && unshadowed.shadow_bytes == 0
     );
     // Flicker is measured over the 59 changes between 60 images of a quarter of the size, 24 x 13 pixels.
     for row in &report.rows {
@@ -370,6 +376,7 @@ fn exact_transparency_is_closer_to_reference_than_two_pass() {
         replays: 20,
     };
     let report = render(&options, |_| {}).expect("a report");
+    // The square has nothing transparent, so these variants do not apply to it.
     let [exact, two_pass] = &report.rows[..] else { panic!("expected two rows of the panes, got {:?}", report.rows) };
     let [exact_error, two_pass_error] = [exact, two_pass].map(|row| row.intended_color_errors.mean);
     assert!(exact_error < 1.0 && two_pass_error > 3.0 * exact_error, "{exact_error} and {two_pass_error} of 255");

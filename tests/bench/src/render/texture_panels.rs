@@ -7,8 +7,8 @@ use modalcast_model::domain::{Material, Mesh, Texture};
 use modalcast_model::error::Result;
 use modalcast_model::scene::{RenderSettings, SceneParts};
 
-/// Image sizes of the upright panels, from left to right, lower row first. In a frame of default size, a texel of the
-/// smallest image is four pixels wide and a texel of the largest half a pixel.
+/// Image sizes of the upright panels, from left to right, lower row first. In a frame of 640 x 360 pixels, a texel of
+/// the smallest image is four pixels wide and a texel of the largest half a pixel.
 const SIZES: [[u32; 2]; 6] = [[16, 16], [25, 15], [32, 32], [64, 64], [75, 50], [128, 128]];
 /// Repetitions of the image along each side of an upright panel.
 const PANEL_REPETITIONS: usize = 2;
@@ -63,7 +63,7 @@ fn repeated_quads(corner: [f32; 3], sides: [[f32; 3]; 2], repetitions: usize) ->
             [first_corner, first_corner + 2, first_corner + 3],
         ]);
     }
-    // The second side of an upright panel points up, and that of the floor is horizontal.
+    // The second side of an upright panel points up; the second side of the floor is horizontal.
     let normal = if sides[1][1] > 0.0 { [0.0, 0.0, 1.0] } else { [0.0, 1.0, 0.0] };
     let normals = vec![normal; positions.len()];
     Mesh::from_indexed(positions, normals, uvs, triangles)

@@ -4,7 +4,7 @@
 //! | name | contents |
 //! |---|---|
 //! | `square` | a square that floats above the ground; its umbra and penumbra are known |
-//! | `shelf` | the narrow shadow of a square just above the ground, at one end of the depth range |
+//! | `shelf` | the narrow shadow of a square just above the ground, at one end of the shadow map's depth range |
 //! | `panes` | three translucent panes in front of an opaque wall, listed from nearest to farthest |
 //! | `images` | panels with images of many sizes, each repeated |
 //! | `tree` | the built-in tree |
@@ -56,7 +56,7 @@ pub(super) struct AnimatedScene {
 }
 
 /// Seconds between steps.
-const DT: f64 = 1.0 / 60.0;
+const STEP_SECONDS: f64 = 1.0 / 60.0;
 /// Radius of the sliding domain's circle as a fraction of the scene's diagonal.
 const SLIDE_RADIUS: f64 = 0.02;
 /// Factor of the modal amplitudes.
@@ -128,7 +128,8 @@ impl AnimatedScene {
         Self { name: deform_workload.name, workload, scene: deform_workload.scene, motion, sliding_domain }
     }
 
-    /// The camera of the workload's images. It frames the whole scene, except for `shelf` and `images`.
+    /// The camera of the workload's images. It frames the whole scene, except for `shelf` and `images`. A `near` and
+    /// `far` of 0 are fitted to the scene.
     pub(super) fn camera(&self, size: Size) -> Camera {
         match self.workload {
             // The shadow fills half of the image.
@@ -152,8 +153,9 @@ impl AnimatedScene {
         let mut state = SceneState::rest(&self.scene);
         add_sway(&mut state, &self.motion, step);
         if let Some(domain) = self.sliding_domain {
+            let radius = SLIDE_RADIUS * self.scene.rest_bounds.diagonal();
             // Half a turn per second.
-            let (radius, angle) = (SLIDE_RADIUS * self.scene.rest_bounds.diagonal(), TAU * 0.5 * step as f64 * DT);
+            let angle = TAU * 0.5 * step as f64 * STEP_SECONDS;
             let from_y_up = self.scene.up.rotation_from_y_up();
             let offset = from_y_up * Vector3::new(radius * angle.sin(), 0.0, radius * (1.0 - angle.cos()));
             let placement = self.scene.domains[domain].placement.to_matrix();
@@ -166,8 +168,8 @@ impl AnimatedScene {
 
 /// Adds the modal coordinates of a motion's step with reduced amplitudes.
 fn add_sway(state: &mut SceneState, motion: &WorkloadMotion, step: usize) {
-    for (q, displacement) in state.q.iter_mut().zip(motion.trajectory_state(step).q) {
-        *q += (SWAY_AMPLITUDE * displacement) as f32;
+    for (q, coordinate) in state.q.iter_mut().zip(motion.trajectory_state(step).q) {
+        *q += (SWAY_AMPLITUDE * coordinate) as f32;
     }
 }
 
@@ -246,8 +248,9 @@ fn build_square() -> Result<SceneParts> {
 /// x of the shelf's edge, where the visible part of its shadow begins.
 const SHELF_EDGE: f32 = -3.5;
 
-/// Builds a square of two units, 0.03 above the ground; its shadow extends 0.09 beyond its edge. Two slabs set the
-/// ground to height 0 and widen the scene, so that the shadow is near one end of the depth range.
+/// Builds a square of two units, 0.03 above the ground. The sun is at [3, 1, 0], so the shadow extends 3 x 0.03 beyond
+/// the square's edge. Two slabs set the ground to height 0 and widen the scene, so that the shadow is near one end of
+/// the shadow map's depth range.
 fn build_shelf() -> Result<SceneParts> {
     let mut parts = SceneParts::named("shelf");
     let square_at = |half_side: f32, height: f32, x: f32, z: f32| {
@@ -337,6 +340,7 @@ fn build_field(triangle_count: usize) -> Result<SceneParts> {
     let cells_per_side = ((triangle_count as f64 / 2.0).sqrt().round() as usize).max(1);
     let point = |column: usize, row: usize| {
         let [x, z] = [column, row].map(|index| 4.0 * (index as f64 / cells_per_side as f64 - 0.5));
+        // A wave with frequencies along x and z in radians per unit.
         let wave = |fx: f64, fz: f64, phase: f64| (fx * x + fz * z + phase).sin();
         let height = 0.16 * wave(2.1, 1.3, 0.4) + 0.11 * wave(-1.7, 3.1, 1.9) + 0.03 * wave(9.0, 7.0, 0.7);
         [x as f32, (0.4 + height) as f32, z as f32]

@@ -158,6 +158,7 @@ pub(super) fn stage_positions(
         let world: Vec<f32> = (0..4)
             .flat_map(|vertex| {
                 let deformed = [0, 1, 2].map(|axis| {
+                    // In D, the row selects the vertex of the pair, and the column the domain of the domain pair.
                     let sum = sums[2 * axis + vertex / 2][pass / 2][lane][2 * (vertex % 2) + parity] as f32;
                     rest[4 * axis + vertex] + sum * inverse_scale
                 });

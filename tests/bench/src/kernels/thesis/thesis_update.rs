@@ -129,6 +129,7 @@ pub(super) struct UpdateKernel {
     tables: [DeviceBuffer; 5],
     /// Positions, normals and tangents.
     outputs: [DeviceBuffer; 3],
+    /// As [`UnfoldedTriangles::targets`].
     targets: Vec<u32>,
     has_tangents: bool,
     transform_bytes: u64,

@@ -1,4 +1,4 @@
-//! Cameras of the figures. Scenes are Y up, in meters, with the sun to the viewer's right.
+//! Cameras of the figures. Scenes are Y up and in meters. Cameras look towards -z, with the sun to their right.
 
 use nalgebra::Vector3;
 
@@ -13,6 +13,7 @@ const FIELD_OF_VIEW: f64 = 28.0;
 
 fn look_at(eye: Vector3<f64>, target: Vector3<f64>, field_of_view: f64) -> Camera {
     let view = View::LookAt { eye: eye.into(), target: target.into(), up: [0.0, 1.0, 0.0] };
+    // A near and far plane of 0 are fitted to the scene.
     Camera { view, lens: Lens::FieldOfView(field_of_view), near: 0.0, far: 0.0 }
 }
 
@@ -61,16 +62,18 @@ pub(super) fn frame_shadow(scene: &Scene) -> Camera {
     look_at(crown_shadow + Vector3::new(1.2, 4.2, 6.4), crown_shadow + Vector3::new(0.3, 0.0, 0.4), 38.0)
 }
 
-/// A close-up of the leaf nearest to the viewer, from a distance of about 1.4 m.
+/// A close-up, from a distance of about 1.4 m, of the leaf at the front of the tree: the leaf that is farthest in the
+/// direction `to_front`.
 ///
 /// # Errors
 /// `Fault` when the scene has no leaves.
 pub(super) fn leaf_closeup(scene: &Scene) -> Result<Camera> {
-    let to_viewer = Vector3::new(0.30, -0.15, 0.95).normalize();
+    // Towards the front, slightly to the right and down.
+    let to_front = Vector3::new(0.30, -0.15, 0.95).normalize();
     let leaves = scene.domains.iter().filter(|domain| domain.name.starts_with("leaf"));
-    let nearest_leaf = leaves
+    let front_leaf = leaves
         .map(|domain| domain.placement.translation())
-        .max_by(|a, b| a.dot(&to_viewer).total_cmp(&b.dot(&to_viewer)))
+        .max_by(|a, b| a.dot(&to_front).total_cmp(&b.dot(&to_front)))
         .ok_or_else(|| fault("figures", "expected a tree with leaves"))?;
-    Ok(look_at(nearest_leaf + Vector3::new(0.25, 0.25, 1.35), nearest_leaf, 36.0))
+    Ok(look_at(front_leaf + Vector3::new(0.25, 0.25, 1.35), front_leaf, 36.0))
 }

@@ -1,7 +1,8 @@
-//! Generates conifers: a trunk of rings, and whorls of boughs whose sprays are textured quads.
+//! Generates conifers. The trunk is a tube of rings. A whorl is a set of boughs around the trunk at about one height. A
+//! bough consists of sprays: twigs with needles, drawn as textured rectangles.
 //!
-//! One bough is modeled, one meter long; all others are rotated and scaled instances of it. Y is up, lengths are
-//! meters.
+//! One bough of one meter is modeled. All boughs are rotated and scaled instances of this mesh. Y is up, lengths are
+//! meters. Numbers without a comment are chosen by eye.
 
 use std::f64::consts::TAU;
 
@@ -30,7 +31,7 @@ pub(super) struct ConiferParameters {
     pub(super) boughs: usize,
     /// Slope of a bough at its base.
     pub(super) rise: f64,
-    /// Quadratic drop of a bough: the tip of a bough of length 1 is `rise - sag` above its base.
+    /// Quadratic drop of a bough: the tip of a bough of length 1 is at height `rise - sag` relative to its base.
     pub(super) sag: f64,
     /// sRGB, 0 to 255.
     pub(super) needle_color: [f32; 3],
@@ -180,7 +181,7 @@ fn trunk_mesh(parameters: &ConiferParameters) -> Result<Mesh> {
     Mesh::new(positions, corners, triangles)
 }
 
-/// One textured quad of needles.
+/// One textured rectangle of needles.
 struct Spray {
     base: Vector3<f64>,
     direction: Vector3<f64>,
@@ -258,6 +259,7 @@ mod tests {
         let gray = Texture::new("gray", 1, 1, vec![128, 128, 255, 255]).expect("a texture");
         for parameters in [FIR, HEMLOCK, SPRUCE] {
             let parts = build(&parameters, [&gray, &gray]).expect("a conifer");
+            // The trunk, the leader and the boughs.
             assert_eq!(parts.domains.len(), 2 + parameters.whorls * parameters.boughs);
             // Domain 0 is the trunk.
             let lowest_bough =

@@ -13,7 +13,7 @@ pub(super) struct PlantInstance {
     pub(super) species: usize,
     /// Position to the right.
     pub(super) x: f64,
-    /// Position towards the viewer.
+    /// Position towards the camera.
     pub(super) z: f64,
     /// Rotation about the trunk, radians.
     pub(super) rotation: f64,
@@ -67,7 +67,8 @@ fn add_shared_data(forest: &mut SceneParts, species: &SceneParts) -> [usize; 2] 
     [first_shape, first_material]
 }
 
-/// The tree in blossom: leaves of the material `light leaf` become petals, those of `leaf` become light green.
+/// The tree in blossom: leaves of the material `light leaf` become petals, leaves of the material `leaf` become light
+/// green.
 ///
 /// # Errors
 /// Those of `Texture::new`. They do not occur, because each texture keeps its size.
@@ -109,6 +110,7 @@ mod tests {
         let forest = combine_plants("three", &[&tree, &blossom], &instances, tree.look);
         let domain_count = tree.domains.len();
         assert_eq!((forest.shapes.len(), forest.domains.len()), (2 * tree.shapes.len(), 3 * domain_count));
+        // Plant 0 is of species 0, plants 1 and 2 are of species 1.
         for (index, domain) in forest.domains.iter().enumerate() {
             let has_own_parent = domain
                 .attachment

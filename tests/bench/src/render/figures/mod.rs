@@ -2,8 +2,8 @@
 //! twenty trees (4.2), bump mapping (4.3), shadow maps of 4096 and 512 texels per side (4.4, 4.5), and transparency
 //! (4.6). Also draws user-supplied scenes.
 //!
-//! The models are the built-in tree, its blossoming variant, and procedural conifers. Trees with modes bend as in a light
-//! wind.
+//! The models are the built-in tree, the same tree in blossom, and procedural conifers. Trees with modes bend as in a
+//! light wind. Positions, rotations and scales of plants are chosen by eye.
 
 mod cameras;
 mod conifer;
@@ -273,7 +273,7 @@ fn draw_shadow_maps(renderer: &mut FigureRenderer, plants: &FigurePlants) -> Res
     Ok(())
 }
 
-/// Draws figure 4.6: leaves with transparency, and as opaque cards.
+/// Draws figure 4.6: leaves with transparency, and as opaque rectangles.
 fn draw_transparency(renderer: &mut FigureRenderer, plants: &FigurePlants) -> Result<()> {
     let build_scene = |mode: AlphaMode| {
         let mut parts = forest::combine_plants(

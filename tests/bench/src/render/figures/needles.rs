@@ -1,4 +1,5 @@
-//! Draws the texture of a spray: a twig from left to right with needles on both sides.
+//! Draws the texture of a spray: a twig from left to right with needles on both sides. Numbers without a comment are
+//! chosen by eye.
 
 use fastrand::Rng;
 use rayon::prelude::*;
