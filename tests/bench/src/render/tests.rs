@@ -296,7 +296,7 @@ fn report_measures_selected_variants_and_writes_files() {
         variants: vec!["none".into(), "variance 512, blur 4".into()],
         size: Size { width: 96, height: 54 },
         quick: true,
-        replays: 20,
+        replays: 1,
     };
     let report = render(&options, |_| {}).expect("a report");
     assert!(report.passed(), "{:?}", report.failed);
@@ -343,7 +343,7 @@ fn minimal_passes_have_a_baseline_without_culling() {
         variants: vec!["culling triangles".into()],
         size: Size { width: 48, height: 27 },
         quick: true,
-        replays: 20,
+        replays: 1,
     };
     let report = render(&options, |_| {}).expect("a report");
     let ([row], [minimal_passes]) = (&report.rows[..], &report.minimal_passes[..]) else {
@@ -373,7 +373,7 @@ fn exact_transparency_is_closer_to_reference_than_two_pass() {
         variants: vec!["exact transparency".into(), "two-pass transparency".into()],
         size: Size { width: 96, height: 54 },
         quick: true,
-        replays: 20,
+        replays: 1,
     };
     let report = render(&options, |_| {}).expect("a report");
     // The square has nothing transparent, so these variants do not apply to it.
