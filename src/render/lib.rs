@@ -1,22 +1,25 @@
 //! Headless OpenGL renderer: uploads a scene to the device, draws frames of it and reads their pixels back.
 //!
+//! The passes of a frame, in execution order. The *look* of a scene is its render settings. An *id* names the triangle
+//! that is visible in a sample, or the ground. A *tile* is a square of 8 x 8 pixels.
+//!
 //! | pass | output | condition |
 //! |---|---|---|
 //! | raster shadow, raster visibility | shadow depth, visibility or both, drawn by the compute rasterizer ([`RasterBackend`]) | a compute rasterizer is attached |
 //! | shadow cull | lists of the triangles that may cast a shadow (compute) | triangles are culled |
 //! | shadow | depth as seen from the sun, with holes of cut-outs | the look has a shadow |
-//! | blur | depth to moments, blurred in x and in y (compute) | the shadow is a variance map |
+//! | blur | moments of the depth, blurred in x and in y (compute) | the shadow is a variance map |
 //! | occluders | depth of the triangles that were visible in the last frame, and its Hi-Z pyramid (compute) | occlusion culling |
 //! | cull | lists of the triangles that the camera may see (compute) | triangles are culled |
 //! | visibility | triangle id and depth of each sample, with holes of cut-outs | some triangle is not blended |
 //! | record visible | triangles that are visible, as the occluders of the next frame (compute) | occlusion culling |
-//! | unpack | keys of the compute rasterizer, and the ground, to ids (compute) | the compute rasterizer drew the visibility |
-//! | ground | id and depth of the ground | the look has a ground, the camera is above it, and something is below it |
-//! | blended | light of blended triangles in draw order, without depth writes | two-pass transparency, some triangle is blended |
+//! | unpack | ids, converted from the output of the compute rasterizer, with the ground (compute) | the compute rasterizer drew the visibility |
+//! | ground | id and depth of the ground | the look has a ground, the camera is above it, and a vertex may be below it |
+//! | blended | light of the blended triangles, blended in draw order without depth writes | two-pass transparency, some triangle is blended |
 //! | oit count, oit allocate, oit fill | a list of the blended fragments of each pixel | exact transparency, some triangle is blended |
 //! | oit resolve | lists sorted by depth, shaded and blended (compute) | exact transparency, some triangle is blended |
 //! | background | shaded tiles without opaque triangles, and a list of the other tiles (compute) | always |
-//! | shade | Phong shading of the listed tiles; samples to pixels (compute) | some triangle is not blended |
+//! | shade | Phong shading of the listed tiles; the mean of the samples of each pixel (compute) | some triangle is not blended |
 //! | bloom | blurred bright light, added to the shaded image (compute) | the look has a bloom |
 //! | encode | sRGB bytes, top row first, optionally with anti-aliasing and dithering (compute) | always |
 //!
@@ -24,12 +27,12 @@
 //! ([`PendingFrame`]).
 //!
 //! Two outputs are drawn only on request, with programs and buffers that are created on first use. Picking finds the
-//! triangles at a few pixels ([`PendingPick`]). AOV (arbitrary output variable) readbacks deliver numbers instead of colors
-//! ([`AovImage`]).
+//! triangles at a few pixels ([`PendingPick`]). AOV (arbitrary output variable) readbacks deliver numbers instead of
+//! colors ([`AovImage`]).
 //!
-//! Shading is deferred: the rasterizer writes only ids, and each visible triangle is shaded once per pixel. Multisampled
-//! id buffers are not cleared; the depth buffer tells which ids are valid. A frame draws only into the screen region that
-//! the bounds of the vertices can cover, and clears only the region that earlier frames wrote.
+//! Shading is deferred: the rasterizer writes only ids, and each visible triangle is shaded once per pixel.
+//! Multisampled id images are not cleared; an id is valid where the depth is less than 1. A frame draws only into the
+//! screen region that the bounds of the vertices can cover, and clears only the region that earlier frames wrote.
 
 #![cfg_attr(not(test), deny(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::print_stdout))]
 

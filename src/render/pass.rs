@@ -29,7 +29,7 @@ pub enum Pass {
     Visibility,
     /// Records the visible triangles as the occluders of the next frame.
     RecordVisible,
-    /// Converts the keys of the compute rasterizer to ids.
+    /// Converts the keys of the compute rasterizer (triangle and depth) to ids.
     Unpack,
     /// Draws the id and the depth of the ground.
     Ground,
@@ -51,7 +51,7 @@ pub enum Pass {
     Bloom,
     /// Encodes linear light to sRGB bytes.
     Encode,
-    /// Copies the bytes and the statistics to the staging buffer.
+    /// Copies the sRGB bytes and the statistics to the staging buffer.
     Read,
     /// Reads back the id of the first sample of each pixel.
     VisibilityReadback,
@@ -170,9 +170,9 @@ impl RenderStage {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum TimeKey {
     Stage(RenderStage),
-    /// Passes that are timed together have the name of one of them. "visibility" includes the ground and the conversion of
-    /// keys, "cull" the occluders, "blended" the fragment lists, "shade" the background, and "raster shadow" the visibility
-    /// if the compute rasterizer draws both.
+    /// Passes that are timed together have the name of one of them. "visibility" includes the ground and the conversion
+    /// of keys, "cull" the occluders, "blended" the fragment lists, "shade" the background, and "raster shadow" the
+    /// visibility if the compute rasterizer draws both.
     Pass(Pass),
 }
 
@@ -215,7 +215,7 @@ impl FrameTimes {
         self.0.insert(0, (TimeKey::Stage(stage), ms));
     }
 
-    /// Adds to the time of a stage; does nothing if the frame has no such stage.
+    /// Adds `ms` to the time of a stage; does nothing if the frame has no such stage.
     pub(crate) fn add(&mut self, stage: RenderStage, ms: f64) {
         if let Some((_, sum)) = self.0.iter_mut().find(|(key, _)| *key == TimeKey::Stage(stage)) {
             *sum += ms;
@@ -258,6 +258,7 @@ mod tests {
 
     #[test]
     fn stages_are_the_sums_of_their_passes() {
+        // Powers of two, so that each sum shows its terms.
         let passes = [
             (Pass::RasterShadow, 1.0),
             (Pass::Shadow, 2.0),

@@ -1,5 +1,6 @@
-//! Screen region that a scene can cover. Pixels outside it are neither drawn nor cleared for the next frame, because
-//! clearing a 32-bit sample takes as long as drawing one. An H200 clears 14 samples per nanosecond.
+//! Screen region that a scene can cover. Pixels outside the region are neither drawn nor cleared for the next frame.
+//! This saves time, because clearing a 32-bit sample takes as long as drawing it: an H200 clears 14 samples per
+//! nanosecond.
 
 use std::cell::Cell;
 
@@ -10,20 +11,25 @@ use modalcast_model::scene::BoundingBox;
 /// A rectangle of a frame's pixels; (0, 0) is the bottom left pixel. It may be empty.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Region {
+    /// Width and height of the frame.
     frame_size: [u32; 2],
+    /// Column and row of the bottom left pixel.
     corner: [u32; 2],
+    /// Width and height of the region.
     size: [u32; 2],
 }
 
-/// Dirty region of an image: the pixels that may differ from the clear value. Initially all pixels.
+/// Dirty region of an image: the pixels that may differ from the clear value. `None` stands for all pixels, which are
+/// dirty initially.
 #[derive(Debug, Default)]
 pub(crate) struct DirtyRegion(Cell<Option<Region>>);
 
-/// Bound on the f32 rounding error of a clip coordinate, relative to the sum of the magnitudes of its products. Its matrix
-/// element, its product and three sums are rounded, by half an epsilon each; the bound allows eight roundings.
+/// Bound on the f32 rounding error of a clip coordinate, which is a sum of four products. The error is relative to the
+/// sum of the magnitudes of the products. A product is affected by at most five roundings of half an epsilon each: of
+/// its matrix element, of the product and of three sums. The bound allows eight.
 const CLIP_RELATIVE_ERROR: f64 = 8.0 * 0.5 * f32::EPSILON as f64;
 
-/// Margin of the projected bounds in pixels, because a rasterizer moves vertices by up to 1/256 pixel, and a sample may lie
+/// Margin of the projected bounds in pixels, because a rasterizer rounds positions to 1/256 pixel, and a sample may lie
 /// anywhere in its pixel.
 const PROJECTION_MARGIN: f64 = 1.0;
 
@@ -37,8 +43,8 @@ impl Region {
         Self { frame_size, corner: [0; 2], size: frame_size }
     }
 
-    /// Region of the frame that can show points in `bounds` if a shader computes clip coordinates in f32. The whole frame
-    /// if the bounds reach behind the eye or overflow.
+    /// Region of the frame that can show points in `bounds` if a shader computes clip coordinates in f32. The whole
+    /// frame if the bounds reach behind the eye or overflow.
     pub(crate) fn project(clip_from_world: &Matrix4<f64>, bounds: &BoundingBox, frame_size: [u32; 2]) -> Self {
         let corners = bounds.corners().map(|corner| corner.to_homogeneous());
         let magnitudes = corners.iter().map(|corner| clip_from_world.abs() * corner.abs());
@@ -53,6 +59,7 @@ impl Region {
         let pixel_ranges = [0, 1].map(|axis| {
             let ndc = clip_corners.map(|corner| corner[axis] / corner.w);
             let (min_ndc, max_ndc) = ndc.iter().fold((f64::MAX, f64::MIN), |(min, max), &x| (min.min(x), max.max(x)));
+            // Error of a quotient x / w: (error of x + |x / w| times the error of w) / w.
             let ndc_error = (clip_error[axis] + min_ndc.abs().max(max_ndc.abs()) * clip_error.w) / min_w;
             let side = f64::from(frame_size[axis]);
             let to_pixel = |ndc: f64, margin: f64| ((0.5 * ndc + 0.5) * side + margin).clamp(0.0, side);
@@ -103,6 +110,7 @@ mod tests {
 
     fn clip_from_world(eye: [f64; 3], target: [f64; 3], bounds: &BoundingBox) -> Matrix4<f64> {
         let view = View::LookAt { eye, target, up: [0.0, 1.0, 0.0] };
+        // Near and far 0: the planes are fitted to the bounds.
         let camera = Camera { view, lens: Lens::FieldOfView(40.0), near: 0.0, far: 0.0 };
         camera.clip_from_camera(FRAME[0], FRAME[1], bounds) * camera.camera_from_world()
     }
@@ -114,10 +122,11 @@ mod tests {
         [0, 1].map(|axis| (0.5 * clip_position[axis] / clip_position.w + 0.5) * FRAME[axis] as f32)
     }
 
-    /// A cube, and a grid of 6 x 6 x 6 points in it.
+    /// Bounds of a cube, and 6 x 6 x 6 points in it, from face to face.
     fn sample_cube(center: [f64; 3], half_side: f64) -> (BoundingBox, Vec<[f32; 3]>) {
         let (mut bounds, mut points) = (BoundingBox::EMPTY, Vec::new());
         for index in 0..216 {
+            // Six values from -1 to 1 along each axis.
             let step = [index % 6, index / 6 % 6, index / 36].map(|step| f64::from(step) / 2.5 - 1.0);
             let point: [f32; 3] = std::array::from_fn(|axis| (center[axis] + half_side * step[axis]) as f32);
             bounds.include(point.map(f64::from));
@@ -141,11 +150,10 @@ mod tests {
                 let [x, y, width, height] = region.rect().map(|number| number as f32);
                 for point in &points {
                     let pixel = project_to_pixels(&clip, *point);
-                    let is_inside = |coordinate: f32, low: f32, size: f32, side: f32| {
-                        (low..=low + size).contains(&coordinate.clamp(0.0, side))
+                    let is_inside = |axis: usize, low: f32, size: f32| {
+                        (low..=low + size).contains(&pixel[axis].clamp(0.0, FRAME[axis] as f32))
                     };
-                    let is_in_region = is_inside(pixel[0], x, width, 640.0) && is_inside(pixel[1], y, height, 400.0);
-                    assert!(is_in_region, "expected {pixel:?} in {region:?}");
+                    assert!(is_inside(0, x, width) && is_inside(1, y, height), "expected {pixel:?} in {region:?}");
                 }
             }
         }
@@ -160,13 +168,15 @@ mod tests {
         let extreme = |min_or_max: fn(f32, f32) -> f32, axis: usize| {
             points.iter().map(|point| project_to_pixels(&clip, *point)[axis]).reduce(min_or_max).expect("points")
         };
+        // PROJECTION_MARGIN, and up to one pixel because the edges are rounded to whole pixels.
+        let max_distance = 2.01;
         for (edge, tight_edge) in [
             (x, extreme(f32::min, 0)),
             (y, extreme(f32::min, 1)),
             (x + width, extreme(f32::max, 0)),
             (y + height, extreme(f32::max, 1)),
         ] {
-            assert!((edge - tight_edge).abs() <= 2.01, "expected an edge near {tight_edge}, got {edge}");
+            assert!((edge - tight_edge).abs() <= max_distance, "expected an edge near {tight_edge}, got {edge}");
         }
         for target in [[9.0, 0.0, 0.0], [-9.0, 0.0, 0.0], [0.0, 9.0, 0.0], [0.0, -9.0, 0.0]] {
             let [_, _, width, height] = Region::project(&look_at(target), &bounds, FRAME).rect();
@@ -193,7 +203,7 @@ mod tests {
             assert_eq!(Region::project(&(bounds_in_front * overflow), &bounds, FRAME), whole);
         }
         assert_eq!(Region::project(&bounds_in_front, &BoundingBox::EMPTY, FRAME), whole);
-        // At this x, f32 rounding may move the points to any column.
+        // At this x, f32 rounding may move the points to any column. The cube covers about 100 of the 400 rows.
         let (bounds, _) = sample_cube([1e9, 0.0, 0.0], 0.5);
         let [_, y, width, height] =
             Region::project(&clip_from_world([1e9, 0.0, 6.0], [1e9, 0.0, 0.0], &bounds), &bounds, FRAME).rect();
@@ -205,6 +215,7 @@ mod tests {
         let (dirty_region, region) =
             (DirtyRegion::default(), Region { frame_size: FRAME, corner: [3, 1], size: [5, 6] });
         assert_eq!(dirty_region.replace(region), None);
+        // Two pixels more on each side, except at the bottom, where the frame has only one.
         let region_with_margin = Region { frame_size: FRAME, corner: [1, 0], size: [9, 9] };
         assert_eq!(dirty_region.replace(Region::whole(FRAME)), Some(region_with_margin));
         assert_eq!(dirty_region.replace(region), Some(Region::whole(FRAME)));

@@ -38,8 +38,8 @@ pub struct FrameParams {
     /// Bounds of all deformed vertices, in scene units. Geometry outside the bounds may be missing in the frame. Bounds
     /// that are not finite are ignored.
     pub bounds: BoundingBox,
-    /// Bounds of the same vertices in light space. The shadow map is fitted to them, or to the corners of `bounds` if
-    /// there are none.
+    /// Bounds of the same vertices in light space, whose z axis points to the sun. The shadow map is fitted to these
+    /// bounds, or without them to the corners of `bounds`.
     pub light_bounds: Option<OrientedBounds>,
 }
 
@@ -56,16 +56,16 @@ pub struct FrameImage {
 /// Statistics of a frame: the passes that ran and how many triangles they processed.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct FrameStats {
-    /// Passes in execution order. When several frames of one step share a shadow, only the first of them has "shadow"
+    /// Passes in execution order. When several frames of one step share a shadow map, only the first frame has "shadow"
     /// and "blur"; see [`crate::SceneBuffers::set_step`].
     pub passes: Vec<Pass>,
     /// The rasterizer that drew the shadow map and the visibility.
     pub raster_backends: RasterBackends,
-    /// Number of draw calls of the visibility and blended passes.
+    /// Number of draw calls of the occluder, visibility and blended passes.
     pub draw_calls: usize,
     /// Samples per pixel.
     pub samples: u32,
-    /// Fragment list statistics; present with exact transparency.
+    /// Statistics of the fragment lists; present with exact transparency.
     pub oit: Option<OitStats>,
     /// Culling statistics; present when triangles are culled.
     pub culled: Option<FrameCullStats>,
@@ -79,7 +79,7 @@ pub enum RasterBackend {
     Cuda,
 }
 
-/// Rasterizers of a frame's passes; none if the frame has no such pass.
+/// The rasterizer of each pass; none if the frame has no such pass.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, serde::Serialize)]
 pub struct RasterBackends {
     pub shadow: Option<RasterBackend>,
@@ -96,16 +96,17 @@ impl RasterBackend {
     }
 }
 
-/// Fragment statistics of a frame.
+/// Statistics of the blended fragments of a frame with exact transparency.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, serde::Serialize)]
 pub struct OitStats {
     /// Blended fragments that are neither fully transparent nor behind opaque surfaces.
     pub fragments: u64,
-    /// Fragments within the budget. The other fragments, the farthest of their pixels, are not drawn.
+    /// Fragments that fit the budget (`look.fragments`) and are drawn. The farthest fragments of a pixel are dropped
+    /// first.
     pub stored: u64,
     /// Largest number of fragments in a pixel.
     pub max_per_pixel: u32,
-    /// Number of fragments per pixel to which the lists were limited, if the budget was exceeded.
+    /// Maximum number of fragments that each pixel stored; none if all fragments fit the budget.
     pub per_pixel_limit: Option<u32>,
 }
 
@@ -116,19 +117,19 @@ impl OitStats {
     }
 }
 
-/// Numbers of triangles by culling result, for one view. For the shadow map, these are sums over all cascades; they are 0
-/// in frames that reuse a shadow map.
+/// Numbers of triangles by culling result, for one view. The numbers for the shadow map are sums over all cascades, and
+/// 0 in frames that reuse a shadow map.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, serde::Serialize)]
 pub struct CullStats {
     /// Triangles that the rasterizer processes.
     pub visible: u32,
-    /// Outside the view volume, or outside the box of the shadow map.
+    /// Triangles outside the view volume, or outside the box of the shadow map.
     pub outside_view: u32,
     /// Back faces of single-sided materials.
     pub back_facing: u32,
     /// Triangles that cover no sample or have no area.
     pub no_sample: u32,
-    /// Behind the triangles that were visible in the last frame.
+    /// Triangles behind those that were visible in the last frame.
     pub occluded: u32,
 }
 
@@ -153,7 +154,8 @@ pub enum VisibilityId {
     /// Neither triangle nor ground, that is, the sky.
     Background,
     Ground,
-    /// Index of a triangle in the renderer's draw order. [`crate::SceneBuffers::source_triangle`] maps it to its domain.
+    /// Index of a triangle in the renderer's draw order. [`crate::SceneBuffers::source_triangle`] maps it to its
+    /// domain.
     Triangle(usize),
 }
 
@@ -168,28 +170,16 @@ impl VisibilityId {
     }
 }
 
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn background_ground_and_first_triangle_have_different_ids() {
-        assert_eq!(
-            [0, 1, u32::MAX].map(VisibilityId::from_id),
-            [VisibilityId::Background, VisibilityId::Triangle(0), VisibilityId::Ground]
-        );
-    }
-}
-
 /// Implementation of the blur of a variance shadow map. All methods give the same map up to rounding.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum BlurMethod {
     /// `Tiles` on hardware, `Rows` on software rasterizers.
     #[default]
     Auto,
-    /// One compute pass: by strips with sums in registers if the blur is at most 8, else by tiles in shared memory.
+    /// One compute pass: by strips with sums in registers if `look.shadow.blur` is at most 8 texels, else by tiles in
+    /// shared memory.
     Tiles,
-    /// Two compute passes without shared memory.
+    /// Two compute passes without shared memory, first along x, then along y.
     Rows,
     /// Two fragment passes, as in the thesis; a baseline for the benchmark report.
     Fragments,
@@ -203,5 +193,18 @@ impl BlurMethod {
             Self::Auto => Self::Tiles,
             method => method,
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn background_ground_and_first_triangle_have_different_ids() {
+        assert_eq!(
+            [0, 1, u32::MAX].map(VisibilityId::from_id),
+            [VisibilityId::Background, VisibilityId::Triangle(0), VisibilityId::Ground]
+        );
     }
 }

@@ -17,7 +17,8 @@ pub(crate) struct PackedMaterial {
     diffuse_layer: [f32; 4],
     /// xyz: specular color. w: specular exponent.
     specular_exponent: [f32; 4],
-    /// Texture array and layer of the color texture, -1 without a color texture; alpha; cutoff.
+    /// Texture array and layer of the color texture, each -1 without a color texture; alpha; cutoff. The cutoff is the
+    /// alpha from which a cut-out is kept, or from which a blended triangle is drawn as opaque.
     color_texture_alpha: [f32; 4],
 }
 

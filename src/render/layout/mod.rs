@@ -6,7 +6,8 @@ pub(crate) mod oit;
 
 use crate::scene_data::textures::MAX_ARRAYS;
 
-/// Texture units, as the shaders declare them. Color and normal textures take one unit per texture array.
+/// Texture units, as the shaders declare them. Color and normal textures take one unit per texture array, from the
+/// given unit on.
 pub(crate) const SHADOW_UNIT: u32 = 0;
 pub(crate) const COLOR_UNIT: u32 = 1;
 pub(crate) const NORMAL_UNIT: u32 = COLOR_UNIT + MAX_ARRAYS as u32;
@@ -31,8 +32,8 @@ pub(crate) const TRIANGLE_ID_UNIT: u32 = 25;
 pub(crate) const DEPTH_UNIT: u32 = 26;
 /// Texture unit of the image that a blur, bloom or encode program reads.
 pub(crate) const SOURCE_UNIT: u32 = 0;
-/// Maximum number of textures that the shading reads in addition to the scene's images: the units above, except those of
-/// images, vertex values and triangle ids.
+/// Maximum number of textures that the shading reads in addition to the scene's images: one per unit from
+/// [`SHADOW_UNIT`] to [`DEPTH_UNIT`], without the color and normal units, [`VALUE_UNIT`] and [`TRIANGLE_ID_UNIT`].
 pub(crate) const FIXED_TEXTURE_READS: usize = 13;
 const _: () = assert!(NORMAL_UNIT + MAX_ARRAYS as u32 <= POSITION_UNIT, "texture units overlap");
 
@@ -41,8 +42,8 @@ pub(crate) const FRAME_BLOCK: u32 = 0;
 pub(crate) const CASCADE_BLOCK: u32 = 2;
 pub(crate) const CULL_BLOCK: u32 = 3;
 
-/// Storage binding of the buffer that a conversion reads or writes: pixels, ids, AOV fields, or output of the compute
-/// rasterizer.
+/// Storage binding of a buffer of words that a conversion reads or writes: pixels, ids, AOV fields, or the output of
+/// the compute rasterizer.
 pub(crate) const WORDS_BINDING: u32 = 0;
 /// Storage binding of tile lists.
 pub(crate) const TILES_BINDING: u32 = 1;

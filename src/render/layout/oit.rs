@@ -1,10 +1,10 @@
-//! Fragment lists of order-independent transparency.
+//! Bindings, phases and counters of the fragment lists of order-independent transparency.
 
 use bytemuck::{Pod, Zeroable};
 
 use crate::types::OitStats;
 
-/// Side of the square of pixels whose fragments a workgroup counts.
+/// Side of the square of pixels that a workgroup adds to the histogram.
 pub(crate) const HISTOGRAM_TILE: u32 = 16;
 /// Bins of the histogram over fragments per pixel; the last bin also counts pixels with more fragments.
 pub(crate) const BINS: usize = 256;
@@ -19,12 +19,14 @@ pub(crate) const CURSORS_IMAGE: u32 = 2;
 pub(crate) const BLEND_LAYERS_IMAGE: u32 = 3;
 /// Phase of the gather program that counts fragments.
 pub(crate) const PHASE_COUNT: i32 = 0;
-/// Phase of the gather program that stores the fragments of pixels within the limit, and the nearest depths of others.
+/// Phase of the gather program that stores the fragments of pixels within the limit. For the other pixels, it stores
+/// only the nearest depths.
 pub(crate) const PHASE_FILL: i32 = 1;
-/// Phase of the gather program that adds the ids of these nearest depths.
+/// Phase of the gather program that adds the ids to the depths of the pixels above the limit.
 pub(crate) const PHASE_FILL_IDS: i32 = 2;
 
-/// Counters and indirect draws of a frame. Twin of `OitCounters` in `shaders/shared/oit_lists.glsl`, up to its bins.
+/// Counters and indirect draws of a frame. Twin of `OitCounters` in `shaders/shared/oit_lists.glsl` without its last
+/// member, the bins.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Pod, Zeroable)]
 pub(crate) struct OitCounters {
@@ -38,14 +40,16 @@ pub(crate) struct OitCounters {
     pub(crate) allocated: u32,
     /// Maximum number of records.
     pub(crate) budget: u32,
-    /// Indirect draws of [`PHASE_FILL_IDS`], one per group of blended triangles: index count, instances, first index, base
-    /// vertex, base instance.
+    /// Indirect draws of [`PHASE_FILL_IDS`], one per group of blended triangles: index count, instances, first index,
+    /// base vertex, base instance.
     pub(crate) commands: [[u32; 5]; 2],
 }
 
+/// Bytes of the counters buffer before the bins.
 pub(crate) const OIT_HEADER_BYTES: usize = size_of::<OitCounters>();
-/// Byte offset of `commands` in [`OitCounters`].
+/// Byte offset of `commands` in [`OitCounters`], after six words.
 pub(crate) const COMMANDS_OFFSET: usize = 24;
+/// Bytes of the counters buffer.
 pub(crate) const COUNTERS_BYTES: usize = OIT_HEADER_BYTES + 4 * BINS;
 const _: () = assert!(OIT_HEADER_BYTES == 64, "OitCounters differs from shaders/shared/oit_lists.glsl");
 

@@ -1,8 +1,8 @@
 //! Resources that each pass reads and writes, and the memory barriers that follow from them.
 //!
-//! OpenGL orders all accesses, except shader writes to images and storage buffers. Each pass issues a barrier before its
-//! first command ([`barrier_before`]), and a barrier between two of its commands if the second uses outputs of the first
-//! ([`barrier_within`]).
+//! OpenGL orders all accesses, except shader writes to images and storage buffers. Each pass issues a barrier before
+//! its first command ([`barrier_before`]), and a barrier between two of its commands if the second uses outputs of the
+//! first ([`barrier_within`]).
 
 use std::sync::LazyLock;
 
@@ -13,11 +13,12 @@ use crate::pass::Pass;
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Resource {
     ShadowDepth,
-    /// Depth in a buffer, from the compute rasterizer.
+    /// Shadow depth in a buffer, from the compute rasterizer.
     RasterShadowDepth,
     /// Moments that are blurred in x only.
     HorizontalMoments,
     ShadowMoments,
+    /// Indirect draw commands of the lists of visible triangles.
     CullDraws,
     /// Bitmap of the triangles that passed the culling tests.
     CullVisibleBits,
@@ -27,18 +28,25 @@ pub(super) enum Resource {
     VisibleTriangleIds,
     VisibleIndices,
     DepthPyramid,
-    /// Keys from the compute rasterizer.
+    /// Triangle and depth of each pixel, from the compute rasterizer.
     RasterKeys,
+    /// Id of each sample.
     Ids,
+    /// Depth of each sample.
     Depth,
+    /// Blended light of two-pass transparency.
     BlendLayer,
+    /// Number of blended fragments of each pixel.
     OitCounts,
+    /// Index of the next record of each pixel.
     OitCursors,
     OitRecords,
     OitCounters,
+    /// Tiles with blended fragments.
     OitTileList,
+    /// Blended light of exact transparency.
     OitLayers,
-    /// Tiles that the second shading pass shades.
+    /// Tiles with visible triangles.
     ShadeTileList,
     SceneColor,
     BloomMips,
@@ -92,7 +100,7 @@ impl Access {
 
 type Accesses = &'static [(Resource, Access)];
 
-/// Draws of visible triangles.
+/// Draws from the lists of visible triangles.
 const VISIBLE_LISTS: Accesses = &[
     (Resource::CullDraws, Access::Indirect),
     (Resource::VisibleIndices, Access::Index),
@@ -134,12 +142,11 @@ const READ_IDS: Accesses = &[
     (Resource::ReadbackSource, Access::Transfer),
 ];
 
-/// Accesses of each pass, in the order of [`Pass::ALL`]. Resources that no shader of any configuration writes need no
-/// entry.
+/// Accesses of each pass, in the order of [`Pass::ALL`]. Resources that no shader ever writes need no entry.
 const PASS_ACCESSES: [(Pass, &[Accesses]); Pass::ALL.len()] = [
     (Pass::UniformUpload, &[&[(Resource::CullCounters, Access::Transfer)]]),
     (
-        // Also for a draw of both passes.
+        // This pass also draws the visibility if the compute rasterizer draws both.
         Pass::RasterShadow,
         &[&[(Resource::RasterShadowDepth, Access::External), (Resource::RasterKeys, Access::External)]],
     ),
@@ -296,7 +303,7 @@ fn is_written_by_shaders(pass: Pass, resource: Resource) -> bool {
     accesses_of(pass).any(|(accessed, access)| accessed == resource && access.is_shader_write())
 }
 
-/// Barrier for these accesses. All barriers of passes are computed by this function.
+/// Barrier for these accesses.
 fn barrier_of(accesses: impl Iterator<Item = Access>) -> MemoryBarriers {
     accesses.fold(MemoryBarriers::NONE, |kinds, access| kinds | access.barrier())
 }
@@ -311,8 +318,8 @@ fn compute_barrier_within(pass: Pass) -> MemoryBarriers {
     barrier_of(accesses.map(|(_, access)| access))
 }
 
-/// Barrier before the first command of a pass. It covers all resources that shaders write in any pass, including the same
-/// pass of an earlier frame.
+/// Barrier before the first command of a pass. It covers all resources that shaders write in any pass, including the
+/// same pass of an earlier frame.
 pub(super) fn barrier_before(pass: Pass) -> MemoryBarriers {
     static BARRIERS: LazyLock<[MemoryBarriers; Pass::ALL.len()]> =
         LazyLock::new(|| Pass::ALL.map(compute_barrier_before));
@@ -349,6 +356,7 @@ mod tests {
                 }
             }
         }
+        // The loops above must not be empty.
         assert!(pairs > 100, "expected more than 100 pairs of a writer and a reader, got {pairs}");
     }
 

@@ -24,19 +24,21 @@ use crate::types::{FrameParams, FrameStats, VisibilityId};
 use crate::uniforms::frame::FrameUniforms;
 use modalcast_model::error::{Result, fault};
 
-/// Attribute to read back. Blended triangles are ignored. The ground is part of the depth only; the other fields ignore
-/// it.
+/// Words that one parallel task converts: enough to hide the cost of starting the task.
+const WORDS_PER_TASK: usize = 4096;
+
+/// Field to read back. All fields ignore blended triangles. Only the depth contains the ground.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Aov {
-    /// f32: meters along the view axis, not along the ray; infinite where nothing is visible. Includes the ground.
+    /// f32: meters along the view axis, not along the ray; infinite where neither a triangle nor the ground is visible.
     Depth,
     /// u32: index of the domain; `u32::MAX` where no triangle is visible.
     Domains,
     /// Three f32: unit normal on the visible side; zeros where no triangle is visible.
     Normals,
-    /// One word per sample; 0 where no triangle is visible. Lower 16 bits: the interpolated vertex value
-    /// ([`crate::Renderer::upload_vertex_values`]) divided by `largest`, clamped to 0 to 1, as unorm. Upper 16 bits: the
-    /// cosine between the normal and the direction to the eye, as unorm.
+    /// One word per sample, of two 16-bit unorms; 0 where no triangle is visible. Lower half: the interpolated vertex
+    /// value ([`crate::Renderer::upload_vertex_values`]) divided by `largest`, clamped to 0 to 1. Upper half: the
+    /// cosine between the normal and the direction to the eye.
     Values { largest: f32 },
 }
 
@@ -70,7 +72,8 @@ struct AovTarget {
 }
 
 impl Aov {
-    /// Preprocessor macro that selects the field in `shaders/aov.comp`; empty for domains, which another shader reads.
+    /// Macro that selects the field in `shaders/aov.comp`; empty for domains, which `shaders/visibility_readback.comp`
+    /// reads.
     const fn define(self) -> &'static str {
         match self {
             Self::Depth => "DEPTH",
@@ -89,8 +92,8 @@ impl AovReader {
     /// Reads a field for the current content of the scene's buffers; waits at most `timeout`.
     ///
     /// # Errors
-    /// `Invalid` for a camera whose matrices overflow; `Fault` if no values were uploaded, OpenGL reports an error or the
-    /// device does not finish in time.
+    /// `Invalid` for a camera whose matrices overflow; `Fault` if no values were uploaded, OpenGL reports an error or
+    /// the device does not finish in time.
     pub(crate) fn render(
         &mut self,
         programs: &mut ProgramCache,
@@ -110,21 +113,21 @@ impl AovReader {
         };
         let gl = Rc::clone(&self.gl);
         let target = self.ensure_target(desc, words_per_pixel)?;
-        let bytes = 4 * words_per_pixel * u64::from(desc.width) * u64::from(desc.height);
+        let byte_count = 4 * words_per_pixel * u64::from(desc.width) * u64::from(desc.height);
         upload_frame(buffers, &uniforms);
         if let Aov::Values { .. } = field {
             let values = buffers.values.as_ref().ok_or_else(|| fault("aov", "no values were uploaded"))?;
             values.view.bind(VALUE_UNIT);
         }
         let mut recorder = PassRecorder { gl: &gl, stats: &mut FrameStats::default() };
-        let readback = Readback { field, mask: mask.as_deref(), program: &program, bytes };
+        let readback = Readback { field, mask: mask.as_deref(), program: &program, bytes: byte_count };
         let timer =
             gl.time_pass(Pass::Aov.name(), timeout, || readback.record(&mut recorder, buffers, params, target))?;
         gl.wait(Pass::Aov.name(), timeout)?;
         let start = Instant::now();
-        let bytes = target.staging.read(bytes as usize)?;
+        let words = target.staging.read(byte_count as usize)?;
         gl.check(Pass::Aov.name())?;
-        let bytes = if field == Aov::Domains { domain_indices(buffers, bytes) } else { bytes };
+        let bytes = if field == Aov::Domains { domain_indices(buffers, words) } else { words };
         let read_ms = start.elapsed().as_secs_f64() * 1e3;
         let times = FrameTimes::of_stages(&[(RenderStage::Draw, timer.ms()), (RenderStage::Read, read_ms)]);
         Ok(AovImage { width: desc.width, height: desc.height, samples: desc.samples, bytes, times })
@@ -152,7 +155,9 @@ impl AovReader {
 #[derive(Debug)]
 struct Readback<'a> {
     field: Aov,
+    /// Draws the ids of cut-outs; none without such triangles.
     mask: Option<&'a Program>,
+    /// Converts ids to the field.
     program: &'a Program,
     /// Bytes to copy to the staging buffer.
     bytes: u64,
@@ -198,7 +203,7 @@ impl Readback<'_> {
     }
 }
 
-/// Maps ids to the domains of their triangles.
+/// Replaces each id by the domain of its triangle; `u32::MAX` without a triangle.
 fn domain_indices(buffers: &SceneBuffers, ids: Vec<u8>) -> Vec<u8> {
     let mut words: Vec<u32> = bytemuck::pod_collect_to_vec(&ids);
     let spans = &buffers.spans[..];
@@ -208,14 +213,14 @@ fn domain_indices(buffers: &SceneBuffers, ids: Vec<u8>) -> Vec<u8> {
         }
         VisibilityId::Background | VisibilityId::Ground => u32::MAX,
     };
-    words.par_chunks_mut(4096).for_each(|words| {
-        // Neighboring pixels usually have the same id.
-        let mut previous = (0, u32::MAX);
-        for word in words {
-            if *word != previous.0 {
-                previous = (*word, domain_of(*word));
+    words.par_chunks_mut(WORDS_PER_TASK).for_each(|task_words| {
+        // Neighboring pixels usually have the same id. Id 0 is the background.
+        let (mut previous_id, mut previous_domain) = (0, u32::MAX);
+        for word in task_words {
+            if *word != previous_id {
+                (previous_id, previous_domain) = (*word, domain_of(*word));
             }
-            *word = previous.1;
+            *word = previous_domain;
         }
     });
     bytemuck::cast_slice(&words).to_vec()

@@ -1,4 +1,4 @@
-//! Draws blended triangles: in draw order into one layer, or with exact transparency (`oit`).
+//! Draws blended triangles: in draw order into one blend layer, or with exact transparency (`oit`).
 
 use super::draw::{TriangleDraw, bind_shadow, draw_groups, triangle_set};
 use super::recorder::{FrameContext, PassRecorder};
@@ -7,7 +7,7 @@ use crate::pass::Pass;
 use crate::scene_data::geometry::BlendMode;
 use modalcast_model::error::Result;
 
-/// Clear value of the layer: no light, full transmittance.
+/// Clear value of the blend layer: no light, full transmittance.
 const CLEAR_LAYER: [f32; 4] = [0.0, 0.0, 0.0, 1.0];
 
 /// Draws the blended triangles of a scene, if it has any.

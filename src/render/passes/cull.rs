@@ -9,18 +9,19 @@
 //! image. The counts are read back with the pixels.
 //!
 //! # Occlusion culling
-//! The occluders are the triangles that were visible in the last frame. Their depth is drawn at their current positions,
-//! and reduced to a Hi-Z pyramid of farthest depths. All triangles are tested against the pyramid, and those that are
-//! not culled are drawn into cleared images in their original order.
+//! The occluders are the triangles that were visible in the last frame. Their depth is drawn at their current
+//! positions, and reduced to a Hi-Z pyramid of farthest depths. All triangles are tested against the pyramid, and those
+//! that are not culled are drawn into cleared images in their original order.
 //!
 //! The image does not depend on earlier frames: the occluders have the positions of this frame, so a triangle that is
 //! strictly behind them at every sample is not visible. The number of culled triangles does depend on earlier frames.
 //! The first frame has no occluders.
 //!
-//! The occluders are drawn twice, the first time without ids. Drawing them once with ids, and then the other triangles,
-//! is not exact: at equal depths, the later triangle in draw order must win. Fragment shaders cannot read the current
-//! id, and a depth comparison in the shader would force per-sample shading. The depth is cleared between the two draws.
-//! Therefore the depths of both draws need to match only within the margin of the occlusion test, not exactly.
+//! Occluders are drawn twice: first their depth, later their ids among all visible triangles. To draw them once with
+//! ids, and then the other triangles, is not exact: at equal depths, the later triangle in draw order must win.
+//! Fragment shaders cannot read the current id, and a depth comparison in the shader would force per-sample shading.
+//! The depth is cleared between the two draws. Therefore the depths of both draws need to match only within the margin
+//! of the occlusion test, not exactly.
 //!
 //! # Lists
 //! A list begins at the offset of its group. Its triangles are in draw order, because it is compacted with a prefix sum
@@ -43,14 +44,14 @@ use modalcast_model::error::Result;
 
 /// Side of the square of pixels whose triangles a workgroup records as visible.
 const RECORD_TILE: u32 = 8;
-/// Coarser levels that one dispatch adds to the depth pyramid.
+/// Levels that one dispatch computes from the coarsest existing level of the depth pyramid.
 const LEVELS_PER_DISPATCH: u32 = 4;
 const _: () = assert!(2 * LEVELS_PER_DISPATCH == MAX_LEVEL, "two dispatches must build the pyramid");
 /// Side of the square of texels that a workgroup of the depth pyramid reduces.
 const PYRAMID_TILE: u32 = 1 << LEVELS_PER_DISPATCH;
 
-/// Runs the bound culling program, which marks visible triangles, and compacts these to lists. The caller has bound the
-/// inputs.
+/// Runs the bound culling program, which marks visible triangles, and compacts the marked triangles to lists. The
+/// caller has bound the inputs.
 fn cull_and_compact(recorder: &PassRecorder<'_>, pass: Pass, cull_resources: &CullResources, compact: &Program) {
     let [columns, rows] = cull_resources.uniforms.dispatch_size();
     recorder.gl.dispatch(columns, rows);
@@ -107,15 +108,15 @@ pub(crate) fn cull_for_camera(recorder: &mut PassRecorder<'_>, frame: &FrameCont
     recorder.finish(Pass::Cull)
 }
 
-/// Draws the depth of the occluders, which the lists contain.
+/// Draws the depth of the occluders, which are in the lists of visible triangles at this point.
 fn draw_occluders(recorder: &mut PassRecorder<'_>, frame: &FrameContext<'_>, pyramid: &DepthPyramid) {
     let FrameContext { buffers, target, programs, .. } = *frame;
     let clear = ClearOp::Depth(Some(&target.dirty_regions.depth));
     recorder.gl.begin_pass(&pyramid.occluder_fbo, target.draw_region.get(), clear);
-    let blend_modes =
+    let programs_by_mode =
         [(BlendMode::Opaque, buffers.programs.opaque.as_deref()), (BlendMode::Mask, programs.mask.as_deref())];
     let state = PipelineState { depth_write: true, ..PipelineState::default() };
-    for (blend_mode, program) in blend_modes {
+    for (blend_mode, program) in programs_by_mode {
         if let Some(program) = program {
             draw_groups(
                 recorder,
@@ -127,7 +128,7 @@ fn draw_occluders(recorder: &mut PassRecorder<'_>, frame: &FrameContext<'_>, pyr
     }
 }
 
-/// Builds all levels of the pyramid from the current depth.
+/// Builds all levels of the pyramid from the depth of the occluders.
 fn build_pyramid(
     recorder: &PassRecorder<'_>,
     target: &RenderTarget,
@@ -135,14 +136,14 @@ fn build_pyramid(
     programs: &OcclusionPrograms,
 ) {
     let size = [target.desc.width, target.desc.height];
-    let groups = size.map(|side| side.div_ceil(PYRAMID_TILE));
+    let workgroups = size.map(|side| side.div_ceil(PYRAMID_TILE));
     pyramid.bind();
     target.depth.bind(DEPTH_UNIT);
     programs.fine_levels.bind(Some(pack_size(size)));
-    recorder.gl.dispatch(groups[0], groups[1]);
+    recorder.gl.dispatch(workgroups[0], workgroups[1]);
     recorder.barrier_within_pass(Pass::Occluders);
     programs.coarse_levels.bind(Some(pack_size(size)));
-    recorder.gl.dispatch(groups[0].div_ceil(PYRAMID_TILE), groups[1].div_ceil(PYRAMID_TILE));
+    recorder.gl.dispatch(workgroups[0].div_ceil(PYRAMID_TILE), workgroups[1].div_ceil(PYRAMID_TILE));
 }
 
 /// Records the visible triangles as the occluders of the next frame. Does nothing without occlusion culling.

@@ -12,7 +12,7 @@ use crate::scene_data::geometry::{BlendMode, DrawGroup};
 use crate::uniforms::cascades::ShadowCascades;
 use crate::uniforms::frame::FrameUniforms;
 
-/// Triangles of a blend mode that a pass draws.
+/// Which triangles of a blend mode a pass draws.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum TriangleSet {
     All,
@@ -59,7 +59,7 @@ pub(super) fn bind_shadow(buffers: &SceneBuffers) {
     }
 }
 
-/// Draw groups with one blend mode, and their indices.
+/// Draw groups with one blend mode, each with its index among all groups.
 pub(super) fn groups_of(buffers: &SceneBuffers, blend_mode: BlendMode) -> impl Iterator<Item = (usize, &DrawGroup)> {
     buffers.groups.iter().enumerate().filter(move |(_, group)| group.blend_mode == blend_mode)
 }
@@ -79,8 +79,8 @@ pub(super) fn draw_groups(
     }
 }
 
-/// Draws the triangles with one blend mode without back-face culling: all in one call, or visible ones in one call per
-/// list. The caller has bound the program.
+/// Draws the triangles with one blend mode without back-face culling. All triangles take one call, and visible
+/// triangles one call per list. The caller has bound the program.
 pub(super) fn draw_double_sided(gl: &Gl, buffers: &SceneBuffers, draw: TriangleDraw<'_>) {
     // Only the fragment shader of cut-outs and blended triangles reads the uniform `first_triangle`.
     let has_fragment_shader = draw.blend_mode != BlendMode::Opaque;
@@ -107,8 +107,8 @@ pub(super) fn triangle_set(buffers: &SceneBuffers) -> TriangleSet {
     if buffers.cull_resources.is_some() { TriangleSet::Visible } else { TriangleSet::All }
 }
 
-/// Uniform `first_triangle` of `shaders/shared/triangle_id.glsl`: the first triangle of a group, or its bitwise complement
-/// for a list of visible triangles.
+/// Uniform `first_triangle` of `shaders/shared/triangle_id.glsl`: the first triangle of a group, or its bitwise
+/// complement for a list of visible triangles.
 pub(super) const fn first_triangle_of(group: &DrawGroup, triangles: TriangleSet) -> u32 {
     match triangles {
         TriangleSet::All => group.first_triangle as u32,

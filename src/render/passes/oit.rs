@@ -1,10 +1,10 @@
-//! Order-independent transparency by a list of the blended fragments of each pixel. It is exact if all fragments fit the
-//! memory budget. Otherwise, each pixel stores at most `per_pixel_limit` fragments: the nearest ones.
+//! Order-independent transparency by a list of the blended fragments of each pixel. It is exact if all fragments fit
+//! the memory budget. Otherwise, each pixel stores at most `per_pixel_limit` fragments: the nearest ones.
 //!
 //! One pass counts the fragments, a prefix sum allocates a list for each pixel, and another pass fills the lists in any
-//! order. For pixels with more fragments than the limit, the first phase of this pass stores only depths, and a second
-//! phase adds their ids. The lists are sorted by depth and id before blending, so the image does not depend on the order
-//! of the fragments.
+//! order. For pixels with more fragments than the limit, the first phase of the fill pass stores only depths, and a
+//! second phase adds the ids. The lists are sorted by depth and id before blending, so the image does not depend on the
+//! order of the fragments.
 
 use super::draw::{bind_shadow, draw_group, first_triangle_of, groups_of, triangle_set};
 use super::recorder::PassRecorder;
@@ -44,7 +44,7 @@ fn reset_counters(gl: &Gl, buffers: &SceneBuffers, target: &OitTarget) {
     bytes[..OIT_HEADER_BYTES].copy_from_slice(bytemuck::bytes_of(&header));
     target.counters.write(&bytes);
     for (command_index, (group_index, _)) in groups_of(buffers, BlendMode::Blend).enumerate() {
-        // With culling, the number of indices is that of the visible triangles.
+        // With culling, only the visible triangles are drawn: copy the index count from their draw command.
         if let Some((_, visible_draws)) = buffers.visible_draws(BlendMode::Blend) {
             let target_offset = COMMANDS_OFFSET + size_of::<[u32; 5]>() * command_index;
             gl.copy(BufferCopy {
@@ -52,7 +52,7 @@ fn reset_counters(gl: &Gl, buffers: &SceneBuffers, target: &OitTarget) {
                 source_offset: command_offset(group_index) as u64,
                 target: &target.counters,
                 target_offset: target_offset as u64,
-                bytes: size_of::<u32>() as u64,
+                bytes: size_of::<u32>() as u64, // the index count is the first word
             });
         }
     }
@@ -97,7 +97,7 @@ pub(super) fn draw(
     recorder.finish(Pass::OitResolve)
 }
 
-/// Draws all blended triangles with the gather program.
+/// A draw of all blended triangles with the gather program.
 #[derive(Debug)]
 struct Gather<'a> {
     buffers: &'a SceneBuffers,
@@ -107,8 +107,8 @@ struct Gather<'a> {
 }
 
 impl Gather<'_> {
-    /// Draws one phase. `PHASE_FILL_IDS` is needed only if the fragments exceed the budget: it is drawn indirectly, and the
-    /// allocate program otherwise sets its number of instances to 0.
+    /// Draws one phase. `PHASE_FILL_IDS` is needed only if the fragments exceed the budget: it is drawn indirectly, and
+    /// the allocate program otherwise sets its number of instances to 0.
     fn draw(&self, recorder: &mut PassRecorder<'_>, phase: i32) {
         let Self { buffers, target, programs, region } = *self;
         let (gl, triangles) = (recorder.gl, triangle_set(buffers));

@@ -30,7 +30,8 @@ use crate::uniforms::frame::FrameUniforms;
 use modalcast_model::error::Result;
 use modalcast_model::scene::{Camera, PixelRect, Scene};
 
-/// 32-bit words per pixel that `shaders/pick.comp` writes: the id, three corners, their positions and their normals.
+/// 32-bit words per pixel that `shaders/pick.comp` writes: the id (1 word), three corners (3), their positions (9) and
+/// their normals (9).
 const WORDS_PER_PIXEL: usize = 22;
 /// First word of the positions of the three corners, three words each.
 const POSITIONS_WORD: usize = 4;
@@ -38,6 +39,7 @@ const POSITIONS_WORD: usize = 4;
 const NORMALS_WORD: usize = 13;
 /// Maximum width and height of the rectangle, in pixels.
 const MAX_SIDE: u32 = PixelRect::MAX_SIDE;
+/// Bytes of the words of the largest rectangle.
 const MAX_BYTES: u64 = 4 * WORDS_PER_PIXEL as u64 * MAX_SIDE as u64 * MAX_SIDE as u64;
 
 /// The surface point at the center of a pixel.
@@ -77,8 +79,9 @@ pub struct PendingPick {
     scene: Arc<Scene>,
     spans: Rc<[TriangleSpan]>,
     rectangle: PixelRect,
-    /// Camera of the rectangle, relative to `origin`.
+    /// Camera whose image is the rectangle, relative to `origin`.
     camera: Camera,
+    /// Origin of the drawn positions, in scene units from the scene's origin.
     origin: [f64; 3],
 }
 
@@ -186,7 +189,8 @@ impl PixelRays {
         Self { camera_from_world: pick.camera.camera_from_world(), intrinsics }
     }
 
-    /// Ray from the eye through the center of a pixel, in camera space. Its length along the view axis is 1.
+    /// Ray from the eye through the center of a pixel of the rectangle, in camera space. Its length along the view axis
+    /// is 1.
     fn through_pixel(&self, [x, y]: [u32; 2]) -> Vector3<f64> {
         let [fx, fy, cx, cy] = self.intrinsics;
         Vector3::new((f64::from(x) + 0.5 - cx) / fx, (cy - f64::from(y) - 0.5) / fy, -1.0)
@@ -200,7 +204,8 @@ fn find_hit(pick: &PendingPick, rays: &PixelRays, words: &[u32], pixel: [u32; 2]
     let mesh = &pick.scene.shapes[pick.scene.domains[domain].shape].mesh;
     let corners = *mesh.triangles().get(triangle)?;
     let first_corner = pick.scene.layout.domains[domain].first_corner as u32;
-    // The renderer reverses the winding of some triangles; the result uses the order of the mesh.
+    // The renderer reverses the winding of some triangles, but the result has the corner order of the mesh.
+    // `drawn_order` gives the position of each corner of the mesh's triangle among the drawn corners.
     let drawn_corners: [u32; 3] = [words[1], words[2], words[3]];
     let drawn_order = corners.map(|corner| {
         drawn_corners.iter().position(|drawn_corner| *drawn_corner == corner + first_corner).unwrap_or(0)
@@ -216,8 +221,11 @@ fn find_hit(pick: &PendingPick, rays: &PixelRays, words: &[u32], pixel: [u32; 2]
     let interpolate = |first_word: usize| {
         Matrix3::from_columns(&[0, 1, 2].map(|index| corner_vector(first_word, index))) * barycentrics
     };
-    let normal =
-        interpolate(NORMALS_WORD).try_normalize(1e-30).filter(|normal| normal.iter().all(|number| number.is_finite()));
+    // Shorter normals count as zero.
+    let min_length = 1e-30;
+    let normal = interpolate(NORMALS_WORD)
+        .try_normalize(min_length)
+        .filter(|normal| normal.iter().all(|number| number.is_finite()));
     let normal = normal.unwrap_or_default();
     Some(PickHit {
         pixel: [pick.rectangle.x() + pixel[0], pick.rectangle.y() + pixel[1]],
@@ -231,16 +239,17 @@ fn find_hit(pick: &PendingPick, rays: &PixelRays, words: &[u32], pixel: [u32; 2]
     })
 }
 
-/// Barycentric coordinates of the intersection of a ray d from the origin with a triangle, and whether its front side is
-/// visible. The coordinate of corner i is proportional to d . (v_j x v_k). The ray may miss the triangle by the rounding
-/// of the rasterizer (1/256 pixel); negative coordinates are then clamped to 0. The coordinates of a triangle without
-/// screen area are equal.
+/// Barycentric coordinates of the intersection of a ray d from the origin with a triangle, and whether the front side
+/// of the triangle is visible. The coordinate of corner i is proportional to d . (v_j x v_k), where j and k are the
+/// next corners in cyclic order. The ray may miss the triangle by the rounding of the rasterizer (1/256 pixel);
+/// negative coordinates are then clamped to 0. A triangle without screen area has three equal coordinates.
 fn intersect_triangle([a, b, c]: &[Vector3<f64>; 3], ray: &Vector3<f64>) -> ([f64; 3], bool) {
     let volumes = [b.cross(c), c.cross(a), a.cross(b)].map(|normal| ray.dot(&normal));
     let sum: f64 = volumes.iter().sum();
     let clamped = volumes.map(|volume| (volume / sum).max(0.0));
     let clamped_sum: f64 = clamped.iter().sum();
-    // NaN fails the comparison.
+    // The coordinates have the sum 1, and clamping only increases it. The sum is 0 if they are NaN, which `max`
+    // replaces by 0.
     let barycentrics = if clamped_sum > 0.5 && clamped_sum.is_finite() {
         clamped.map(|volume| volume / clamped_sum)
     } else {
@@ -264,7 +273,7 @@ mod tests {
             barycentrics.iter().zip(expected).all(|(got, expected)| (got - expected).abs() < 1e-14),
             "{barycentrics:?}"
         );
-        assert!(is_front_facing, "counter-clockwise");
+        assert!(is_front_facing, "expected the front side of a counterclockwise triangle");
         let reversed = [corners[0], corners[2], corners[1]];
         assert!(!intersect_triangle(&reversed, &(point / -point.z)).1);
     }

@@ -23,7 +23,8 @@ pub(crate) fn bloom(recorder: &mut PassRecorder<'_>, frame: &FrameContext<'_>) -
         recorder.barrier_within_pass(Pass::Bloom);
     }
     let mut source = coarsest_mip;
-    // The destinations are all levels from the second coarsest down to level 1.
+    // The destinations are all levels from the second coarsest to level 1. `coarser_levels`: number of levels whose
+    // mean `source` contains.
     for (coarser_levels, destination) in (1..).zip(mips.iter().skip(1).rev().skip(1)) {
         bloom.upsample.bind(Some(coarser_levels));
         source.bind(SOURCE_UNIT);

@@ -28,6 +28,7 @@ pub(crate) fn draw(
 ) -> Result<()> {
     let FrameContext { buffers, params, .. } = *frame;
     let (scene, origin) = (&buffers.scene, buffers.origin);
+    // Without a shadow map, the size is not used.
     let map_size = scene.look.shadow.map_or(1, |shadow| shadow.size);
     let shadow_viewport = match passes.shadow {
         true => Some(Viewport::new(&shadow_clip_from_positions(scene, params, origin), map_size, map_size)?),

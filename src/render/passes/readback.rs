@@ -1,4 +1,5 @@
-//! Conversion of ids to 32-bit words and their readback: the common part of visibility readback, picking and AOVs.
+//! Converts ids to 32-bit words and reads the words back: the common part of visibility readback, picking and AOVs.
+//! Also copies the pixels of a frame to a staging buffer.
 
 use std::rc::Rc;
 
@@ -26,7 +27,7 @@ pub(super) struct WordPass<'a> {
     pub(super) program: &'a Program,
     /// Uniform at location 0 of programs that have one.
     pub(super) uniform: Option<u32>,
-    /// Width and height in pixels.
+    /// Width and height of the id image in pixels; the program runs once per pixel.
     pub(super) size: [u32; 2],
     pub(super) staging: &'a Buffer,
     /// Bytes to copy to the staging buffer.
@@ -50,7 +51,7 @@ impl IdTarget {
     }
 }
 
-/// Copies the id of the first sample of each pixel to a staging buffer of `desc.encoded_bytes()` bytes, top row first.
+/// Copies the id of the first sample of each pixel to a staging buffer of `desc.frame_bytes()` bytes, top row first.
 pub(crate) fn read_visibility(
     recorder: &PassRecorder<'_>,
     target: &RenderTarget,
@@ -60,7 +61,7 @@ pub(crate) fn read_visibility(
     recorder.begin(Pass::VisibilityReadback);
     bind_visibility(target);
     let size = [target.desc.width, target.desc.height];
-    let bytes = target.desc.encoded_bytes();
+    let bytes = target.desc.frame_bytes();
     let word_pass = WordPass { pass: Pass::VisibilityReadback, program, uniform: None, size, staging, bytes };
     convert_ids(recorder, &target.readback_source, &word_pass)
 }
@@ -69,7 +70,7 @@ pub(crate) fn read_visibility(
 pub(crate) fn copy_frame(recorder: &PassRecorder<'_>, frame: &FrameContext<'_>, staging: &Buffer) -> Result<()> {
     let FrameContext { buffers, target, .. } = *frame;
     recorder.begin(Pass::Read);
-    recorder.gl.copy(BufferCopy::first(target.desc.encoded_bytes(), &target.readback_source, staging));
+    recorder.gl.copy(BufferCopy::first(target.desc.frame_bytes(), &target.readback_source, staging));
     let counters = [
         target.oit.as_ref().map(|oit| &oit.counters),
         buffers.cull_resources.as_ref().map(|cull_resources| &cull_resources.buffers.counters),

@@ -10,7 +10,7 @@ use modalcast_model::error::Result;
 const COLOR_IMAGE: u32 = 0;
 const BLOOM_IMAGE: u32 = 1;
 
-/// Shades tiles without opaque triangles and lists the other tiles; then shades the listed tiles.
+/// Shades tiles in which no triangle is visible and lists the other tiles; then shades the listed tiles.
 pub(crate) fn draw(recorder: &mut PassRecorder<'_>, frame: &FrameContext<'_>) -> Result<()> {
     let FrameContext { buffers, target, programs, .. } = *frame;
     recorder.begin(Pass::Background);

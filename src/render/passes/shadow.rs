@@ -18,7 +18,7 @@ use modalcast_model::error::{Result, fault_in};
 /// Image unit that the blur writes.
 const DESTINATION_IMAGE: u32 = 0;
 
-/// Draws the depth from the sun, layer by layer, unless the compute rasterizer has drawn it.
+/// Draws the depth from the sun, unless the compute rasterizer has drawn it. Each cascade of the map is a layer.
 pub(crate) fn draw_depth(recorder: &mut PassRecorder<'_>, buffers: &SceneBuffers) -> Result<()> {
     let Some(map) = buffers.shadow.as_ref().filter(|_| buffers.shadow_rasterizer().is_none()) else { return Ok(()) };
     recorder.stats.raster_backends.shadow = Some(RasterBackend::OpenGl);
@@ -59,12 +59,14 @@ pub(crate) fn blur(recorder: &mut PassRecorder<'_>, buffers: &SceneBuffers) -> R
     }
     for layer in 0..map.shadow.cascades {
         match (programs.as_slice(), &blurred.horizontal) {
+            // One compute pass blurs in both directions.
             ([program], None) => {
                 let workgroups = texels_per_workgroup(&map.shadow).map(|side| map.shadow.size.div_ceil(side));
                 bind_blur(program, &map.depth, map, layer);
                 blurred.moments.bind_image_layer(DESTINATION_IMAGE, layer);
                 gl.dispatch(workgroups[0], workgroups[1]);
             }
+            // Two compute passes.
             ([x_program, y_program], Some(horizontal)) if blurred.framebuffers.is_empty() => {
                 let (size, invocations_per_line) = (map.shadow.size, map.shadow.size.div_ceil(TEXELS_PER_INVOCATION));
                 // Wait until the previous layer has read `horizontal`.
@@ -77,6 +79,7 @@ pub(crate) fn blur(recorder: &mut PassRecorder<'_>, buffers: &SceneBuffers) -> R
                 blurred.moments.bind_image_layer(DESTINATION_IMAGE, layer);
                 gl.dispatch(size.div_ceil(WORKGROUP_SIZE), invocations_per_line);
             }
+            // Two fragment passes. The first framebuffer is that of `horizontal`.
             ([x_program, y_program], Some(horizontal)) => {
                 gl.set_pipeline_state(PipelineState::default());
                 let framebuffers = [&blurred.framebuffers[0], &blurred.framebuffers[1 + layer as usize]];

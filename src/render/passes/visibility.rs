@@ -11,7 +11,7 @@ use crate::types::{FrameParams, RasterBackend};
 use crate::uniforms::frame::camera_is_above_ground;
 use modalcast_model::error::Result;
 
-/// Parameters of a draw of ids and depth. The framebuffer is at least as large as the region's frame.
+/// Parameters of a draw of ids and depth. The framebuffer must be at least as large as the frame of the region.
 #[derive(Debug)]
 pub(super) struct IdDraw<'a> {
     pub(super) framebuffer: &'a Framebuffer,
@@ -20,7 +20,7 @@ pub(super) struct IdDraw<'a> {
     pub(super) triangles: TriangleSet,
     /// Draws cut-outs; none without such triangles.
     pub(super) mask: Option<&'a Program>,
-    /// Draws the opaque parts of blended triangles; none if they are ignored.
+    /// Draws the opaque parts of blended triangles; none if blended triangles are not drawn.
     pub(super) opaque_parts: Option<&'a Program>,
 }
 
@@ -70,8 +70,8 @@ pub(super) fn draw_ids(recorder: &mut PassRecorder<'_>, buffers: &SceneBuffers, 
     recorder.check(Pass::Visibility)
 }
 
-/// Draws the ground into ids and depth of the bound framebuffer. A frame draws it only if a vertex may be below the
-/// ground; otherwise the shading adds the ground.
+/// Draws the ground into the ids and the depth of the bound framebuffer. A frame calls this only if a vertex may be
+/// below the ground; otherwise the shading adds the ground.
 pub(super) fn draw_ground(recorder: &mut PassRecorder<'_>, buffers: &SceneBuffers, params: &FrameParams) -> Result<()> {
     let Some(program) = buffers.programs.ground.as_ref().filter(|_| camera_is_above_ground(&buffers.scene, params))
     else {

@@ -1,4 +1,7 @@
-//! The buffers of a scene by purpose. A plan holds their sizes, a loaded scene the buffers themselves.
+//! The buffers of a scene by purpose. The type parameter `T` is a size in bytes in a plan, and a buffer in a loaded
+//! scene.
+//!
+//! A corner is a vertex with one normal and one pair of texture coordinates. Several corners can share a vertex.
 
 use std::fmt;
 
@@ -38,11 +41,11 @@ pub(crate) struct GeometryBuffers<T> {
     pub(crate) tangents: Option<T>,
     /// 2 f32 per corner; only with textures or normal maps.
     pub(crate) uvs: Option<T>,
-    /// Three corners per triangle.
+    /// Three corner indices per triangle.
     pub(crate) triangles: T,
-    /// Three vertices per triangle.
+    /// Three vertex indices per triangle.
     pub(crate) triangle_vertices: T,
-    /// Vertex of each corner; only with cut-out or blended triangles.
+    /// Vertex index of each corner; only with cut-out or blended triangles.
     pub(crate) corner_vertices: Option<T>,
 }
 
@@ -63,7 +66,7 @@ pub(crate) struct UniformBuffers<T> {
     pub(crate) cascades: Option<T>,
 }
 
-/// Input and output of triangle culling.
+/// Input and output of triangle culling. `crate::layout::cull` defines groups and superblocks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct CullBuffers<T> {
     pub(crate) uniforms: T,
@@ -126,7 +129,7 @@ impl fmt::Display for BufferName {
 impl<T> CullBuffers<T> {
     /// The buffers with their names, in the order of plans.
     pub(crate) fn named(&self) -> impl Iterator<Item = (BufferName, &T)> {
-        let always = [
+        let required_buffers = [
             (BufferName::CullUniforms, &self.uniforms),
             (BufferName::CullDraws, &self.draws),
             (BufferName::CullCounters, &self.counters),
@@ -134,8 +137,8 @@ impl<T> CullBuffers<T> {
             (BufferName::VisibleTriangleIds, &self.triangle_ids),
             (BufferName::VisibleIndices, &self.indices),
         ];
-        let previous = self.previously_visible.as_ref().map(|buffer| (BufferName::PreviouslyVisible, buffer));
-        always.into_iter().chain(previous)
+        let optional_buffer = self.previously_visible.as_ref().map(|buffer| (BufferName::PreviouslyVisible, buffer));
+        required_buffers.into_iter().chain(optional_buffer)
     }
 }
 
@@ -226,6 +229,7 @@ mod tests {
 
     #[test]
     fn try_map_keeps_each_buffer_in_its_field() {
+        // Each number is the position of the buffer's name in `BufferName`.
         let sizes = SceneBufferSet {
             geometry: GeometryBuffers {
                 positions: 0,

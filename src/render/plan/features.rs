@@ -16,12 +16,12 @@ pub(crate) struct ShaderFeatures {
     pub(crate) blend_layers: bool,
     /// Blended triangles are sorted per pixel; implies `blend_layers`.
     pub(crate) oit: bool,
-    /// Two-pass transparency may draw parts of blended triangles as opaque.
+    /// Two-pass transparency may draw parts of blended triangles as opaque: those of high alpha.
     pub(crate) opaque_parts: bool,
     pub(crate) shadow: Option<ShadowSettings>,
-    /// As resolved for the device; never the automatic choice.
+    /// The method for the device; never `Auto`.
     pub(crate) blur_method: BlurMethod,
-    /// Never the automatic choice.
+    /// The method for the device; never `Auto`.
     pub(crate) culling: Culling,
 }
 
@@ -55,12 +55,8 @@ impl ShaderFeatures {
         ];
         let feature_defines = feature_defines.into_iter().filter_map(|(name, is_enabled)| is_enabled.then_some(name));
         let shadow = self.shadow.iter().flat_map(shadow_defines);
-        let culling: &[&str] = match self.culling {
-            Culling::Occlusion => &["CULLED", "OCCLUSION_CULLING"],
-            Culling::Triangles => &["CULLED"],
-            Culling::None | Culling::Auto => &[],
-        };
-        feature_defines.chain(shadow).chain(culling.iter().copied()).collect()
+        let culling = self.has_culling().then_some("CULLED");
+        feature_defines.chain(shadow).chain(culling).collect()
     }
 
     /// Shadow settings, if the shadow map is a variance shadow map.
@@ -96,5 +92,10 @@ pub(crate) fn shadow_defines(shadow: &ShadowSettings) -> impl Iterator<Item = &'
 
 /// Define of the number of cascades; none for a map with one cascade.
 fn cascade_define(shadow: &ShadowSettings) -> Option<&'static str> {
-    ["CASCADES 2", "CASCADES 3", "CASCADES 4"].get((shadow.cascades as usize).wrapping_sub(2)).copied()
+    match shadow.cascades {
+        2 => Some("CASCADES 2"),
+        3 => Some("CASCADES 3"),
+        4 => Some("CASCADES 4"),
+        _ => None,
+    }
 }

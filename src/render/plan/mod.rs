@@ -1,6 +1,6 @@
 //! Plan of the device resources of a scene: buffers, textures, passes and shader defines. It is derived once from the
-//! scene's [`modalcast_model::scene::SceneFeatures`]. It also lists the omitted features, and the savings of each
-//! omission compared with a scene that uses every feature.
+//! scene's [`modalcast_model::scene::SceneFeatures`]. It also lists the features that the scene does not need, and what
+//! each of these omissions saves.
 //!
 //! The renderer allocates and compiles exactly the resources of the plan. Planning needs no device.
 
@@ -50,11 +50,13 @@ pub struct RenderPlan {
     pub buffers: Vec<Allocation>,
     /// Textures of the scene, by name.
     pub textures: Vec<Allocation>,
-    /// Passes of a frame, in execution order. The ground pass runs only when the camera is above the ground and a vertex
-    /// may be below the ground.
+    /// Passes of a frame, in execution order, without the passes of the compute rasterizer, `UniformUpload`,
+    /// `RecordVisible` and `Read`. The ground pass runs only when the camera is above the ground and a vertex may be
+    /// below the ground.
     pub passes: Vec<Pass>,
-    /// Draw calls of the occluder, visibility and blend passes: at most fourteen, independent of the number of domains
-    /// and materials.
+    /// Draw calls of the occluder, visibility and blend passes, independent of the number of domains and materials. At
+    /// most fourteen: four opaque and cut-out groups as occluders and for the visibility, two blended groups in three
+    /// phases.
     pub draw_calls: usize,
     /// Defines that the shaders are compiled with.
     pub defines: Vec<&'static str>,
@@ -139,8 +141,8 @@ const fn blend_passes(scene: &Scene) -> &'static [Pass] {
     }
 }
 
-/// Whether two-pass transparency may draw parts of blended triangles as opaque: some material reaches the alpha
-/// threshold.
+/// Whether two-pass transparency may draw parts of blended triangles as opaque: the alpha of some material reaches
+/// `look.opaque_alpha`.
 fn has_opaque_parts(scene: &Scene) -> bool {
     let (look, materials) = (scene.look, used_materials(scene));
     let is_opaque_enough = |material: usize| {
@@ -167,6 +169,7 @@ fn draw_calls(scene: &Scene, groups: &[DrawGroup]) -> usize {
     groups.len() + (phases - 1) * blended_groups
 }
 
+/// Sizes of the scene's buffers in bytes. An f32 or a u32 has 4 bytes; [`GeometryBuffers`] states their numbers.
 fn buffer_sizes(scene: &Scene, culling: Culling) -> SceneBufferSet<u64> {
     let (layout, features) = (&scene.layout, scene.features);
     let [vertices, corners, triangles] = [layout.vertices, layout.corners, layout.triangles].map(|count| count as u64);
@@ -193,6 +196,7 @@ fn buffer_sizes(scene: &Scene, culling: Culling) -> SceneBufferSet<u64> {
     }
 }
 
+/// The texture arrays of the materials, and the textures of the shadow map.
 fn textures(scene: &Scene, blur_method: BlurMethod) -> Vec<Allocation> {
     let mut textures = Vec::new();
     for (role, label) in [(TextureRole::Color, "colors"), (TextureRole::Normal, "normals")] {
@@ -231,11 +235,13 @@ fn features(scene: &Scene, blur_method: BlurMethod, culling: Culling) -> ShaderF
     }
 }
 
+/// The features that the scene does not need. Their descriptions count 8 bytes per RGBA16F texel. All levels of the
+/// bloom pyramid together have 4/3 texels per pixel, hence 10.7 bytes.
 fn omitted_features(scene: &Scene, culling: Culling) -> Vec<OmittedFeature> {
     let (features, layout, look) = (scene.features, &scene.layout, &scene.look);
     let shadow_bytes: u64 =
         shadow_allocations(&look.shadow.unwrap_or_default(), BlurMethod::Auto).map(|allocation| allocation.bytes).sum();
-    let corner_bytes = |bytes: usize| (bytes * layout.corners) as u64;
+    let corner_bytes = |bytes_per_corner: usize| (bytes_per_corner * layout.corners) as u64;
     let uv_bytes = if features.textures || features.normal_maps { 0 } else { corner_bytes(8) };
     let omit_unless = |is_needed: bool, feature, bytes, passes: &[Pass], shaders| {
         (!is_needed).then(|| OmittedFeature { feature, bytes, passes: passes.to_vec(), shaders })
@@ -306,7 +312,7 @@ mod tests {
         plan.passes.iter().map(|pass| pass.name()).collect()
     }
 
-    /// A scene that needs every feature.
+    /// Parts of a scene that needs every feature.
     fn full_featured_parts() -> modalcast_model::scene::SceneParts {
         let materials = vec![
             Material { color_texture: Some(0), normal_texture: Some(0), ..Material::default() },
@@ -336,7 +342,11 @@ mod tests {
         let scene_features = ["normal maps", "textures", "mask", "blend", "shadows", "many materials", "ground"];
         assert_eq!(omitted, [&scene_features[..], &["bloom", "tone curve", "fxaa", "culling", "dither"]].concat());
         assert_eq!(plan.omitted[0].bytes, 16 * 4, "expected the tangents of four corners");
-        assert_eq!(plan.omitted[4].bytes, 12 * 1024 * 1024, "expected the shadow map and its moments");
+        assert_eq!(
+            plan.omitted[4].bytes,
+            12 * 1024 * 1024,
+            "expected 4 bytes of depth and 8 bytes of moments per texel"
+        );
     }
 
     #[test]

@@ -8,12 +8,14 @@ use modalcast_model::scene::{MomentFormat, ShadowSettings};
 pub(crate) struct ShadowTexture {
     pub(crate) name: &'static str,
     pub(crate) texel_bytes: u32,
+    /// Number of array layers: one per cascade, or one that all cascades share.
     pub(crate) layers: u32,
 }
 
 /// The textures of a shadow map.
 pub(crate) fn shadow_textures(shadow: &ShadowSettings, blur_method: BlurMethod) -> Vec<ShadowTexture> {
     let texture = |name, texel_bytes, layers| ShadowTexture { name, texel_bytes, layers };
+    // Two moments per texel.
     let moment_bytes = if shadow.moments == MomentFormat::F16 { 4 } else { 8 };
     let mut textures = vec![texture("shadow depth", 4, shadow.cascades)];
     if shadow.has_moments() {

@@ -6,12 +6,12 @@ use crate::resources::scene_buffers::SceneBuffers;
 use crate::types::{FrameParams, RasterBackend, RasterBackends};
 use modalcast_model::error::Result;
 
-/// Frames per combination. The first one warms up; the result is the median of the others.
+/// Frames per combination of rasterizers. The first frame warms up; the result is the median time of the others.
 const TRIAL_FRAMES: usize = 6;
 
 impl Renderer {
-    /// Selects the fastest combination of OpenGL and the compute rasterizer for shadow map and visibility, and returns it.
-    /// All combinations are timed, because the time of one pass depends on the rasterizer of the other. A compute
+    /// Selects the fastest combination of OpenGL and the compute rasterizer for shadow map and visibility, and returns
+    /// it. All combinations are timed, because the time of one pass depends on the rasterizer of the other. A compute
     /// rasterizer that draws no pass is dropped. Without a compute rasterizer, both fields of the result are none.
     ///
     /// # Errors
@@ -50,7 +50,7 @@ impl Renderer {
             }
             rasterizer.enable(combination);
             let ms = self.measure_median_ms(buffers, params)?;
-            // After an error, the compute rasterizer is disabled and the time is that of OpenGL.
+            // An error disables the compute rasterizer. The time is then that of OpenGL, and does not count.
             if rasterizer.enabled() == combination {
                 timings.push((combination, ms));
             }

@@ -1,5 +1,5 @@
-//! Negative controls of culling: a modified culling test that removes too many triangles must change the image. Another
-//! test checks when culling is omitted.
+//! Negative controls of culling: if the culling shader is modified so that it removes too many triangles, the image
+//! must change. Another test checks when culling is omitted.
 
 use std::rc::Rc;
 use std::sync::Arc;
@@ -16,7 +16,8 @@ use modalcast_model::deform::DeformedSurface;
 use modalcast_model::domain::{Material, Mesh, Modes, Shape};
 use modalcast_model::scene::{Camera, Culling, Lens, Scene, View};
 
-/// A sheet of 24 x 24 squares behind a smaller sheet; both are single-sided.
+/// Two single-sided sheets of 24 x 24 squares each. The sheet of side 2 at z = 0.5 hides a part of the sheet of side 4
+/// at z = 0.
 fn sheets() -> Arc<Scene> {
     let mut rest_positions = Vec::new();
     let mut indices = Vec::new();
@@ -45,13 +46,15 @@ fn sheets() -> Arc<Scene> {
     Scene::new(parts).expect("a valid scene")
 }
 
-/// Draws the second frame of a scene, with `original` replaced by `replacement` in the culling shader.
+/// Draws two frames of a scene, with `original` replaced by `replacement` in the culling shader, and returns the
+/// second. The first frame has no occluders, because these are the triangles that were visible in the last frame.
 fn draw_second_frame(scene: &Arc<Scene>, (original, replacement): (&str, &str)) -> Vec<u8> {
     let mut renderer = Renderer::open(DevicePreference::Any).expect("EGL and OpenGL 4.3");
     let (gl, sample_positions) = (Rc::clone(&renderer.gl), renderer.sample_positions.clone());
     let mut has_original = false;
     let compile = &mut |mut source: ProgramSource| {
         for (_, text) in &mut source.stages {
+            // The program that culls for the camera with four samples per pixel.
             has_original |= source.label.starts_with("cull triangles, 4") && text.contains(original);
             *text = text.replace(original, replacement);
         }
@@ -66,6 +69,7 @@ fn draw_second_frame(scene: &Arc<Scene>, (original, replacement): (&str, &str)) 
     renderer.upload(&buffers, &surface).expect("uploads");
     let view = View::LookAt { eye: [0.3, 0.2, 4.0], target: [0.1, 0.0, 0.0], up: [0.0, 1.0, 0.0] };
     let lens = Lens::Intrinsics { fx: 90.0, fy: 90.0, cx: 32.0, cy: 32.0 };
+    // Near and far 0: the planes are fitted to the bounds.
     let camera = Camera { view, lens, near: 0.0, far: 0.0 };
     let params = FrameParams { camera, width: 64, height: 64, bounds: scene.rest_bounds, light_bounds: None };
     renderer.draw(&buffers, &params).expect("draws");
@@ -82,7 +86,7 @@ fn culling_is_omitted_if_lists_exceed_the_buffer_limit() {
         let scene = Scene::new(parts.clone()).expect("a valid scene");
         let sizes = cull_buffer_sizes(&scene, culling).expect("culling buffers");
         let max_buffer_bytes = sizes.named().map(|(_, bytes)| *bytes).max().expect("buffers");
-        assert_eq!(sizes.indices, 12 * scene.layout.triangles as u64);
+        assert_eq!(sizes.indices, 12 * scene.layout.triangles as u64, "expected three u32 per triangle");
         let select_for =
             |max_storage_bytes: u64| select_culling(&scene, &Limits { max_storage_bytes, ..Limits::default() });
         assert_eq!((select_for(max_buffer_bytes), select_for(max_buffer_bytes - 1)), (culling, Culling::None));
@@ -96,13 +100,17 @@ fn culling_is_omitted_if_lists_exceed_the_buffer_limit() {
 #[test]
 fn each_culling_test_that_removes_too_much_changes_the_image() {
     let scene = sheets();
-    // Replaces a word by itself: the original shader.
+    // Replacing a word by itself gives the image of the original shader.
     let expected_image = draw_second_frame(&scene, ("shared", "shared"));
     for replacement in [
+        // Planes of the view volume.
         ("is_below[axis] && lower_distance[axis] < -margin[axis]", "is_below[axis] && lower_distance[axis] < 2.0"),
         ("is_above[axis] && upper_distance[axis] < -margin[axis]", "is_above[axis] && upper_distance[axis] < 2.0"),
+        // Back faces.
         ("area < -area_error", "area < area_error + 20.0"),
+        // Triangles without a sample.
         ("ceil(min_position - sample_position)", "ceil(min_position - sample_position + 8.0)"),
+        // Occlusion: the margin of the depth, and the comparison with the depth pyramid.
         ("nearest - margin))", "nearest + 0.5))"),
         (
             "if (!(depths[level_offset + y * size.x + x] < depth)) return false;",

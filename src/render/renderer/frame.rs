@@ -37,8 +37,8 @@ impl Renderer {
     /// [`crate::MAX_FRAMES_IN_FLIGHT`] frames of one render target may be in flight.
     ///
     /// # Errors
-    /// `Busy` if too many frames are in flight; `Invalid` for a size above the limit or a camera whose matrices overflow;
-    /// `Fault` with the pass if OpenGL reports an error.
+    /// `Busy` if too many frames are in flight; `Invalid` for a size above the limit or a camera whose matrices
+    /// overflow; `Fault` with the pass if OpenGL reports an error.
     pub fn submit(&mut self, buffers: &SceneBuffers, params: &FrameParams) -> Result<PendingFrame> {
         self.submit_frame(buffers, params, true)
     }
@@ -78,13 +78,14 @@ impl Renderer {
                 read_range(cull_range)?.map(|counts| layout::cull::parse_counters(&counts)),
             );
         }
-        // If the compute rasterizer drew the visibility, there are no camera counts. Then the shadow counts are dropped, too.
+        // If the compute rasterizer drew the visibility, there are no camera counts. Then the shadow counts are
+        // dropped, too.
         stats.culled = stats.culled.filter(|_| stats.raster_backends.visibility != Some(RasterBackend::Cuda));
-        let view = staging.map(|staging| staging.view(desc.encoded_bytes() as usize)).transpose()?;
+        let view = staging.map(|staging| staging.view(desc.frame_bytes() as usize)).transpose()?;
         self.gl.check(Pass::Read.name())?;
         warn_of_dropped_fragments(&self.stats, &stats);
         if let Some(culled) = &stats.culled {
-            tracing::trace!(?culled, "triangles before they were drawn");
+            tracing::trace!(?culled, "culled triangles");
         }
         let raster_backends = stats.raster_backends;
         self.stats = stats;
@@ -93,8 +94,13 @@ impl Renderer {
         Ok(MappedPixels { width: desc.width, height: desc.height, view, times, raster_backends })
     }
 
-    /// Records and submits a frame. `is_read`: whether its pixels are read back.
-    fn submit_frame(&mut self, buffers: &SceneBuffers, params: &FrameParams, is_read: bool) -> Result<PendingFrame> {
+    /// Records and submits a frame. `has_readback`: whether its pixels are read back.
+    fn submit_frame(
+        &mut self,
+        buffers: &SceneBuffers,
+        params: &FrameParams,
+        has_readback: bool,
+    ) -> Result<PendingFrame> {
         let _current = self.gl.make_current()?;
         self.check_size(params)?;
         let uniforms = FrameUniforms::new(&buffers.scene, params, buffers.origin)?;
@@ -105,9 +111,9 @@ impl Renderer {
         self.ensure_target(desc)?;
         let programs = buffers.sample_programs(desc.samples, &mut |source| self.programs.program(source))?;
         let Some(target) = self.targets.last() else { return Err(fault("draw", "no target")) };
-        let slot = if is_read { Some(target.readback_ring.acquire(self.frame_timeout)?) } else { None };
-        // If a pass fails or panics, the images are undefined. The target is removed from the cache until all passes are
-        // recorded.
+        let slot = if has_readback { Some(target.readback_ring.acquire(self.frame_timeout)?) } else { None };
+        // If a pass fails or panics, the images of the target are undefined. Therefore the target is not in the cache
+        // until all passes are recorded.
         self.last_frame = None;
         let Some(target) = self.targets.pop() else { return Err(fault("draw", "no target")) };
         let draws_ground = must_draw_ground(buffers, params);
@@ -150,6 +156,7 @@ impl Renderer {
                     Ok(timer) => timers.push(timer),
                     // OpenGL cannot draw on a lost device either.
                     Err(error @ Error::DeviceLost { .. }) => return Err(error),
+                    // OpenGL then draws these passes, below.
                     Err(error) => rasterizer.disable(&error),
                 }
             }
@@ -174,7 +181,7 @@ impl Renderer {
         Ok(timers)
     }
 
-    /// Times the passes that `commands` records. They are reported as `pass`, which is one of them.
+    /// Times the passes that `commands` records, and reports the time under `pass`, which is one of these passes.
     fn time_pass(&self, pass: Pass, commands: impl FnOnce() -> Result<()>) -> Result<(Pass, PassTimer)> {
         let commands = || {
             #[cfg(test)]
@@ -184,7 +191,8 @@ impl Renderer {
         self.gl.time_pass(pass.name(), self.frame_timeout, commands).map(|timer| (pass, timer))
     }
 
-    /// Copies the pixels, then the fragment and culling counters, to the staging buffer. Does nothing without a slot.
+    /// Copies the pixels, then the fragment and culling counters, to the staging buffer of the slot. Does nothing
+    /// without a slot.
     fn record_readback(
         &self,
         recorder: &PassRecorder<'_>,
@@ -197,10 +205,10 @@ impl Renderer {
     }
 }
 
-/// Whether the ground must be rasterized.
+/// Whether the ground must be rasterized. Otherwise the shading adds visible ground to samples without an id.
 fn must_draw_ground(buffers: &SceneBuffers, params: &FrameParams) -> bool {
     let scene = &buffers.scene;
-    // The bounds of a rebased scene exclude distant domains.
+    // The bounds of a rebased scene exclude distant domains, which may be below the ground.
     let is_ground_behind_scene = buffers.rebased.is_none() && ground_is_behind_scene(scene, params, buffers.origin);
     scene.look.ground.is_some() && camera_is_above_ground(scene, params) && !is_ground_behind_scene
 }

@@ -48,6 +48,7 @@ pub struct Renderer {
     info: RendererInfo,
     gl: Rc<Gl>,
     programs: ProgramCache,
+    /// Sample positions within a pixel with four samples; empty on a device without 4x multisampling.
     sample_positions: Vec<[f32; 2]>,
     blur_method: BlurMethod,
     /// Cached render targets, least recently used first.
@@ -137,7 +138,8 @@ impl Renderer {
         drop(buffers);
     }
 
-    /// Uploads a deformed surface from host memory into the shared buffers.
+    /// Uploads a deformed surface from host memory into the vertex buffers, which a deformer on the device can write
+    /// instead ([`SceneBuffers::vertex_buffers`]).
     ///
     /// # Errors
     /// `Fault` if the length of an array differs from its buffer, or OpenGL reports an error.
@@ -158,9 +160,10 @@ impl Renderer {
         self.gl.check("upload")
     }
 
-    /// Uploads positions that are drawn instead of the shared ones until the next [`SceneBuffers::set_shared_origin`]. This is
-    /// for scenes whose domains have separate local origins, so that the shared positions have no common origin.
-    /// `positions` are relative to `origin`, which is in scene units from the scene's origin.
+    /// Uploads positions relative to one `origin`, which is in scene units from the scene's origin. They are drawn
+    /// instead of the shared positions (those in [`SceneBuffers::vertex_buffers`]) until the next
+    /// [`SceneBuffers::set_shared_origin`]. This is for scenes in which each domain has a local origin, so that the
+    /// shared positions have no common origin.
     ///
     /// # Errors
     /// `Fault` if the number of positions is wrong, or OpenGL reports an error.
@@ -198,11 +201,12 @@ impl Renderer {
         self.gl.check("upload")
     }
 
-    /// Attaches a compute rasterizer to a scene, which draws all passes that it supports. Does nothing for a scene without
-    /// such passes.
+    /// Attaches a compute rasterizer to a scene, which draws all passes that it supports. Does nothing for a scene
+    /// without such passes.
     ///
     /// # Errors
-    /// Errors of `create_rasterizer` and [`Rasterizer::precompile`], and `Fault` of OpenGL. OpenGL then draws all passes.
+    /// Errors of `create_rasterizer` and [`Rasterizer::precompile`], and `Fault` of OpenGL. OpenGL then draws all
+    /// passes.
     pub fn attach_rasterizer(
         &mut self,
         buffers: &mut SceneBuffers,
@@ -235,8 +239,8 @@ impl Renderer {
         self.picker.finish(pick, self.frame_timeout)
     }
 
-    /// Reads a field for the current content of the scene's buffers. Depth, domains and normals are sampled at pixel
-    /// centers.
+    /// Reads an AOV field for the current content of the scene's buffers. Depth, domains and normals are sampled at
+    /// pixel centers.
     ///
     /// # Errors
     /// `Invalid` for a size above the limit or a camera whose matrices overflow; `Fault` if no values were uploaded,
@@ -259,7 +263,7 @@ impl Renderer {
         let program = self.programs.program(shaders::readback::visibility_readback(frame.desc.samples))?;
         let target = self.targets.iter().find(|target| target.desc == frame.desc).ok_or_else(no_frame)?;
         // Uses a temporary staging buffer, because the ring may be full of frames in flight.
-        let bytes = target.desc.encoded_bytes();
+        let bytes = target.desc.frame_bytes();
         let staging = self.gl.buffer(bytes, gl::STREAM_READ, None)?;
         let recorder = PassRecorder { gl: &self.gl, stats: &mut FrameStats::default() };
         readback::read_visibility(&recorder, target, &program, &staging)?;
@@ -269,6 +273,7 @@ impl Renderer {
         let parse_id = |word: &[u8]| word.iter().rev().fold(0, |id, byte| id << 8 | u32::from(*byte));
         let sample_position = if frame.desc.samples > 1 { self.sample_positions[0] } else { [0.5; 2] };
         let size = [frame.desc.width, frame.desc.height];
+        // Ground that was not rasterized has no id. It is visible where the view ray of a sample without an id hits it.
         let sees_ground = |pixel: u32| frame.uniforms.ray_hits_ground(ndc_from_pixel(pixel, size, sample_position));
         let ids = id_bytes.chunks_exact(4).zip(0..).map(|(word, pixel)| match VisibilityId::from_id(parse_id(word)) {
             VisibilityId::Background if sees_ground(pixel) => VisibilityId::Ground,
@@ -287,7 +292,8 @@ impl Renderer {
         Err(invalid("frame.size", format!("1 to {limit} pixels a side"), got))
     }
 
-    /// Moves the target with this description to the end of the cache, and creates it if it is not cached.
+    /// Moves the target with this description to the end of the cache. Creates it if it is not cached, after dropping
+    /// the least recently used target of a full cache.
     fn ensure_target(&mut self, desc: TargetDesc) -> Result<()> {
         if let Some(index) = self.targets.iter().position(|target| target.desc == desc) {
             self.targets[index..].rotate_left(1);
@@ -301,7 +307,7 @@ impl Renderer {
     }
 }
 
-/// Fails if the number of values of an uploaded array is wrong.
+/// Fails if an array to upload does not have the expected length.
 fn check_length(name: &str, numbers: &[f32], expected: u64) -> Result<()> {
     if numbers.len() as u64 == expected {
         return Ok(());
@@ -309,8 +315,8 @@ fn check_length(name: &str, numbers: &[f32], expected: u64) -> Result<()> {
     Err(fault("upload", format!("expected {expected} numbers of {name}, got {}", numbers.len())))
 }
 
-/// Normalized device coordinates of a point in a pixel. `pixel` counts row by row from the top left. `sample_position` is
-/// relative to the pixel's lower left corner, 0 to 1.
+/// Normalized device coordinates of a point in a pixel. `pixel` counts row by row from the top left. `sample_position`
+/// is relative to the pixel's lower left corner, 0 to 1.
 fn ndc_from_pixel(pixel: u32, [width, height]: [u32; 2], sample_position: [f32; 2]) -> [f64; 2] {
     let (column, row) = (pixel % width, height - 1 - pixel / width);
     let to_ndc = |coordinate: u32, offset: f32, side: u32| {

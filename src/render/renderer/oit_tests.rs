@@ -10,14 +10,15 @@ use modalcast_model::deform::DeformedSurface;
 use modalcast_model::domain::{AlphaMode, Material};
 use modalcast_model::scene::{BoundingBox, Camera, Scene, Transparency};
 
-/// Draws an opaque square between two glass squares into 64 x 64 pixels; returns the pixels and the renderer.
+/// Draws a red square between two squares of `alpha_mode` into 64 x 64 pixels; returns the pixels and the renderer.
+/// `post_depth_coverage`: if the device supports it, list one fragment per pixel instead of one per sample.
 fn draw_glass(transparency: Transparency, alpha_mode: AlphaMode, post_depth_coverage: bool) -> (Vec<u8>, Renderer) {
     let glass = Material { alpha: 0.5, alpha_mode, double_sided: true, ..Material::default() };
     let mut parts = squares(vec![Material { diffuse: [0.9, 0.2, 0.1], ..Material::default() }, glass.clone(), glass]);
     // No shadow: light must not vary within a pixel, because fragments per pixel and fragments per sample are shaded at
     // different points of it.
     (parts.look.transparency, parts.look.shadow) = (transparency, None);
-    // Slightly rotated, so that edges cross pixels.
+    // The squares are rotated, so that their edges cross pixels. The angles are in radians.
     let corner = |z: f32, angle: f32, [x, y]: [f32; 2]| {
         let (sine, cosine) = angle.sin_cos();
         [cosine * x - sine * y, sine * x + cosine * y, z]
@@ -52,7 +53,8 @@ fn per_pixel_and_per_sample_fragments_give_the_same_image() {
     let (pixel_shaded, pixel_renderer) = draw_glass(Transparency::OrderIndependent, AlphaMode::Blend, true);
     let (sample_shaded, sample_renderer) = draw_glass(Transparency::OrderIndependent, AlphaMode::Blend, false);
     let max_difference = pixel_shaded.iter().zip(&sample_shaded).map(|(a, b)| a.abs_diff(*b)).max();
-    assert!(max_difference <= Some(2), "expected a difference of at most 2 levels, got {max_difference:?}");
+    assert!(max_difference <= Some(2), "expected a difference of at most 2 levels of 255, got {max_difference:?}");
+    // Each pixel has four samples. The factor is less than four, because edges cover only some samples of a pixel.
     let [pixel_fragments, sample_fragments] =
         [&pixel_renderer, &sample_renderer].map(|renderer| renderer.stats().oit.expect("list statistics").fragments);
     assert!(

@@ -12,14 +12,14 @@ use crate::resources::target_desc::TargetDesc;
 use crate::types::{FrameImage, FrameStats, RasterBackends};
 use modalcast_model::error::{Error, Result};
 
-/// Bytes that a task copies: enough to hide the cost of starting the task.
+/// Bytes that one parallel task copies: enough to hide the cost of starting the task.
 const COPY_CHUNK_BYTES: usize = 1 << 20;
 
 /// A frame in flight. Dropping it abandons the frame.
 #[derive(Debug)]
 pub struct PendingFrame {
     pub(super) desc: TargetDesc,
-    /// None for a frame whose pixels are not read back.
+    /// The slot of the staging buffer; none for a frame whose pixels are not read back.
     pub(super) slot: Option<ReadbackSlot>,
     pub(super) fence: Fence,
     /// Passes in execution order, each with its timer.
@@ -31,8 +31,8 @@ pub struct PendingFrame {
     pub(super) first_wait: Cell<Option<Instant>>,
 }
 
-/// Pixels of a finished frame in a mapped staging buffer. Any thread may copy them. The ring cannot reuse the staging
-/// buffer while this value exists, so copy them soon.
+/// Pixels of a finished frame in a mapped staging buffer. Any thread may copy them. No other frame
+/// can use the staging buffer while this value exists, so copy the pixels soon.
 #[derive(Debug)]
 pub struct MappedPixels {
     pub(super) width: u32,
@@ -80,7 +80,7 @@ impl PendingFrame {
 }
 
 impl MappedPixels {
-    /// Adds the time of the upload before the frame, in milliseconds.
+    /// Adds the time of the vertex upload that preceded the frame, in milliseconds.
     #[must_use]
     pub fn with_upload_time(mut self, ms: f64) -> Self {
         self.times.insert_first(RenderStage::Upload, ms);

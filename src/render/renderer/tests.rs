@@ -1,4 +1,5 @@
-//! Tests of frames in flight. In these tests, the renderer does not wait between passes, even on a software device.
+//! Tests of frames in flight: readback, time limits, panics and lost contexts. In these tests, the renderer does not
+//! wait between passes, even on a software device.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::rc::Rc;
@@ -85,6 +86,7 @@ fn frames_in_flight_keep_their_vertices_and_counts() {
         assert!(image.times.iter().all(|(_, ms)| ms.is_finite() && ms >= 0.0), "{:?}", image.times);
         frames.push((rgba, fragments));
     }
+    // `frames[0]` has the widest glass.
     assert!(frames[0] != frames[1] && frames[1] != frames[2] && frames[0].1 > frames[2].1, "expected different frames");
 }
 
@@ -96,7 +98,7 @@ fn frames_in_flight_are_limited_per_target() {
     for _ in 0..5 {
         renderer.draw(&buffers, &params).expect("draws");
     }
-    assert_eq!(staging_count(&renderer), 1);
+    assert_eq!(staging_count(&renderer), 1, "expected one staging buffer for frames that are read one by one");
     let unread_frames: Vec<_> =
         (0..5).map(|_| renderer.submit_without_readback(&buffers, &params).expect("submits")).collect();
     for pending_frame in unread_frames {
@@ -108,7 +110,7 @@ fn frames_in_flight_are_limited_per_target() {
     let error = renderer.submit(&buffers, &params).expect_err("a full ring");
     assert_eq!(error, Error::Busy { queue: "frames in flight", limit: 3 });
     let smaller_params = FrameParams { width: 32, height: 32, ..params };
-    renderer.draw(&buffers, &smaller_params).expect("a ring of its own");
+    renderer.draw(&buffers, &smaller_params).expect("a staging buffer of the smaller target");
     let first_image = renderer.read_image(pending_frames.remove(0)).expect("draws");
     pending_frames.push(renderer.submit(&buffers, &params).expect("a free slot"));
     drop(pending_frames.remove(0));
@@ -130,6 +132,7 @@ fn timeout_names_the_pass_and_the_next_frame_is_drawn() {
         renderer.gl.wait("test", Duration::from_secs(60)).expect("a finished frame");
         let timed: Vec<Pass> = pending_frame.passes.iter().map(|(pass, _)| *pass).collect();
         assert_eq!(timed, passes);
+        // As if the device had stopped in the pass `failing_index`.
         pending_frame.fence = renderer.gl.broken_fence();
         for (_, timer) in &mut pending_frame.passes[failing_index..] {
             *timer = renderer.gl.unstarted_timer();
@@ -141,7 +144,7 @@ fn timeout_names_the_pass_and_the_next_frame_is_drawn() {
         assert_eq!(stage, passes[failing_index].name());
         let last = if failing_index == 0 { "none".to_owned() } else { format!("'{}'", passes[failing_index - 1]) };
         assert!(reason.ends_with(&format!("; last finished pass: {last}")), "{reason}");
-        // Discards the errors of querying objects that do not exist.
+        // Discards the errors of reading timers that were never started.
         renderer.gl.check("test").ok();
         renderer.draw(&buffers, &params).expect("draws");
     }
@@ -152,6 +155,7 @@ fn failed_frame_drops_its_render_target() {
     let (mut renderer, scene, mut buffers) = load_renderer();
     let params = params(&scene, 64);
     let expected_rgba = renderer.draw(&buffers, &params).expect("draws").rgba;
+    // Without its programs, the blur fails.
     let blur_programs = std::mem::take(&mut buffers.programs.blur);
     let Err(Error::Fault { stage, .. }) = renderer.draw(&buffers, &params) else { panic!("expected a fault") };
     assert_eq!((stage, renderer.targets.len()), ("blur", 0));
@@ -164,6 +168,7 @@ fn frame_that_exceeds_its_time_limit_is_ready() {
     let (mut renderer, scene, buffers) = load_renderer();
     renderer.frame_timeout = Duration::from_millis(5);
     let pending_frame = renderer.submit_without_readback(&buffers, &params(&scene, 64)).expect("submits");
+    // The clock starts at the first poll.
     pending_frame.is_ready();
     thread::sleep(Duration::from_millis(6));
     assert!(pending_frame.time_left().is_zero() && pending_frame.is_ready_within(Duration::from_secs(60)));
@@ -173,6 +178,7 @@ fn frame_that_exceeds_its_time_limit_is_ready() {
 fn frame_is_readable_after_its_target_was_freed() {
     let (mut renderer, scene, buffers) = load_renderer();
     let pending_frame = renderer.submit(&buffers, &params(&scene, 64)).expect("submits");
+    // Eight targets, more than the cache holds.
     for side in 32..40 {
         renderer.draw(&buffers, &params(&scene, side)).expect("draws");
     }
@@ -208,7 +214,7 @@ fn threads_copy_pixels_while_the_renderer_is_dropped() {
             pixels.into_image()
         })
     };
-    // The fourth frame waits until the first was copied.
+    // A ring has three staging buffers, so the fourth frame waits until a thread has copied the first.
     let readers: Vec<_> = (0..4).map(|_| spawn_reader(&mut renderer, &buffers)).collect();
     renderer.unload(buffers);
     drop(renderer);
@@ -245,8 +251,9 @@ fn other_scenes_are_drawn_after_a_panic_within_a_frame() {
     parts.look.samples = 1;
     let panicking_scene = Scene::new(parts).expect("a valid scene");
     let panicking_buffers = renderer.load(&panicking_scene).expect("loads");
-    // A second renderer, whose context is current before and after.
+    // A second renderer, whose context is current before and after each frame of the first.
     let (mut other_renderer, _, other_buffers) = load_renderer();
+    // More panics than frames fit into the ring, so that leaked slots would be noticed.
     for _ in 0..MAX_FRAMES_IN_FLIGHT + 2 {
         renderer.injected_panic = Some(Pass::Shade);
         let result =
@@ -259,6 +266,7 @@ fn other_scenes_are_drawn_after_a_panic_within_a_frame() {
     }
 }
 
+/// An occupied context is current on another thread.
 #[test]
 fn calls_fail_while_the_context_is_occupied_and_work_afterwards() {
     let (mut renderer, scene, buffers) = load_renderer();

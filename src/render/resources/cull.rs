@@ -44,7 +44,7 @@ impl CullResources {
         let uniforms = CullUniforms::new(groups, gl.limits.subpixel_step());
         buffers.uniforms.write(bytemuck::bytes_of(&uniforms));
         if let Some(bitmap) = &buffers.previously_visible {
-            bitmap.write(&vec![0; uniforms.mask_bytes()]);
+            bitmap.write(&vec![0; uniforms.bitmap_bytes()]);
         }
         Ok(Self {
             triangle_ids: gl.buffer_texture(&buffers.triangle_ids, gl::R32UI)?,
