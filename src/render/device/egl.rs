@@ -34,6 +34,7 @@ const DRIVER_NAME: i32 = 0x335E;
 const CONTEXT_FLAGS: i32 = 0x30FC;
 /// EGL_CONTEXT_OPENGL_DEBUG_BIT_KHR.
 const DEBUG_BIT: i32 = 1;
+/// What the user can do if EGL is missing.
 const REMEDY: &str = "Install libegl1 with libegl-mesa0 and libgl1-mesa-dri (Mesa's software rasterizer), or the NVIDIA \
                       driver's libEGL_nvidia.so.0 with its vendor file 10_nvidia.json in /usr/share/glvnd/egl_vendor.d";
 
@@ -148,6 +149,7 @@ impl EglApi {
         devices[..count.min(devices.len())].to_vec()
     }
 
+    /// A string that EGL reports for a device.
     fn query_text(&self, device: EglHandle, name: i32) -> Option<String> {
         let query_string = self.query_string?;
         // SAFETY: the device came from eglQueryDevicesEXT; the result is null or a string that lives as long as EGL.
@@ -225,7 +227,7 @@ pub(crate) fn candidates() -> Result<Vec<Candidate>> {
     Ok(candidates)
 }
 
-/// Error that no candidate is suitable. `attempts` describe the candidates that were tried.
+/// The error if no candidate is suitable. `attempts` describe the candidates that were tried.
 pub(crate) fn no_device_error(expected: &str, attempts: &[String]) -> Error {
     let attempts = if attempts.is_empty() { "EGL has no device".to_string() } else { attempts.join("; ") };
     unavailable(format!("no context on {expected}: {attempts}"))
@@ -255,6 +257,7 @@ impl Context {
             3,
             egl::CONTEXT_OPENGL_PROFILE_MASK,
             egl::CONTEXT_OPENGL_CORE_PROFILE_BIT,
+            // NONE ends the list, so the bit after it is not read.
             if is_debug { CONTEXT_FLAGS } else { egl::NONE },
             DEBUG_BIT,
             egl::NONE,
@@ -317,7 +320,8 @@ impl Drop for ContextHandle {
     fn drop(&mut self) {
         let Ok(api) = api() else { return };
         let _lock = lock_contexts();
-        // The reference count of a context is 0 while it is dropped. If another context is current, it stays current.
+        // While this context is dropped, its reference count is 0. Another context that is current has a higher count,
+        // and stays current.
         if CURRENT_CONTEXT.with(|current| current.borrow().strong_count()) == 0 {
             api.instance.make_current(self.display, None, None, None).ok();
         }
@@ -351,7 +355,9 @@ pub(crate) mod testing {
     }
 
     impl Context {
+        /// Makes the context current on another thread until the returned value is dropped.
         pub(crate) fn occupy(&self) -> OccupiedContext {
+            // Addresses as integers, because pointers cannot be sent to another thread.
             let handles = [self.handle.display.as_ptr() as usize, self.handle.context.as_ptr() as usize];
             let instance = &api().expect("EGL").instance;
             if self.is_current() {

@@ -24,7 +24,7 @@ pub struct EglDevice {
     pub renderer: Option<String>,
     /// GL_VERSION; `None` if no context could be created.
     pub version: Option<String>,
-    /// Whether the device draws on the CPU. If no context could be created, this is what EGL reports.
+    /// Whether the device draws on the CPU. From the context, or from EGL if no context could be created.
     pub software: bool,
     /// Reason why no context could be created.
     pub problem: Option<String>,
@@ -38,6 +38,7 @@ pub fn devices() -> Result<Vec<EglDevice>> {
     Ok(candidates()?.into_iter().map(describe_device).collect())
 }
 
+/// Describes a candidate, after trying to create a context on it.
 fn describe_device(candidate: Candidate) -> EglDevice {
     let (limits, problem) = match open_candidate(&candidate) {
         Ok(gl) => (Some(gl.limits.clone()), None),
@@ -79,6 +80,7 @@ pub(crate) fn open(preference: DevicePreference) -> Result<(Rc<Gl>, Option<i32>)
     Err(selection_error(preference, &attempts))
 }
 
+/// The error if no candidate matches the preference.
 fn selection_error(preference: DevicePreference, attempts: &[String]) -> Error {
     match preference {
         DevicePreference::Cuda(ordinal) => {

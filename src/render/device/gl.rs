@@ -57,7 +57,7 @@ pub(crate) struct Gl {
     pub(crate) limits: Limits,
     /// glGetGraphicsResetStatus; `None` if the context does not have it.
     reset_status: Option<GetResetStatus>,
-    /// The first error of a command that was not issued since the last check.
+    /// Why a command was not issued: the first reason since the last check.
     skipped_error: RefCell<Option<String>>,
     /// Whether a leak of objects is already logged.
     is_leak_logged: Cell<bool>,
@@ -219,11 +219,11 @@ impl Gl {
     /// Like [`Self::functions`], for commands that return nothing. If the context cannot be made current, the next
     /// check returns the error.
     fn functions_or_skip(&self) -> Option<Functions<'_>> {
-        self.functions().map_err(|error| self.skip(error.to_string())).ok()
+        self.functions().map_err(|error| self.record_skipped(error.to_string())).ok()
     }
 
-    /// Records the error of a command that is not issued; the next check returns the first one.
-    fn skip(&self, reason: String) {
+    /// Records the error of a command that is not issued; the next check returns the first of these errors.
+    fn record_skipped(&self, reason: String) {
         self.skipped_error.borrow_mut().get_or_insert(reason);
     }
 
@@ -235,6 +235,7 @@ impl Gl {
         }
     }
 
+    /// Logs the first leak of an object.
     fn log_leak(&self, error: &Error) {
         if !self.is_leak_logged.replace(true) {
             tracing::warn!(%error, "OpenGL objects are not deleted before their context");
@@ -255,7 +256,7 @@ impl Gl {
         match unsafe { gl.get_error() } {
             glow::NO_ERROR => Ok(()),
             glow::OUT_OF_MEMORY => Err(fault(stage, "OpenGL is out of memory")),
-            glow::CONTEXT_LOST => Err(self.loss(stage).unwrap_or_else(|| {
+            glow::CONTEXT_LOST => Err(self.device_lost_error(stage).unwrap_or_else(|| {
                 let reason = "OpenGL reports a lost context".into();
                 Error::DeviceLost { stage, reason }
             })),
@@ -264,7 +265,7 @@ impl Gl {
     }
 
     /// `DeviceLost` with the reason if the context is lost: the device was reset, and all objects are gone.
-    fn loss(&self, stage: &'static str) -> Option<Error> {
+    fn device_lost_error(&self, stage: &'static str) -> Option<Error> {
         let (status, _current) = (self.reset_status?, self.functions().ok()?);
         // SAFETY: the address is that of glGetGraphicsResetStatus of the current context; a query without side effects.
         let reason = match unsafe { status() } {
@@ -290,8 +291,8 @@ impl Gl {
         }
     }
 
-    /// Creates a buffer of `bytes` bytes, at least 4 because OpenGL has no empty buffers. Its content is `data`, or
-    /// undefined without data.
+    /// Creates a buffer of `bytes` bytes; if `bytes` is less than 4, of 4 bytes, because OpenGL has no empty buffers.
+    /// Its content is `data`, or undefined without data.
     ///
     /// # Errors
     /// `Fault` when the data has another length, the buffer exceeds 2 GiB, or OpenGL fails.
@@ -343,7 +344,7 @@ impl Gl {
         self.check("texture").map(|()| texture)
     }
 
-    /// Creates a buffer texture over a complete buffer. It keeps the buffer alive.
+    /// Creates a buffer texture over a complete buffer. The texture keeps the buffer alive.
     pub(crate) fn buffer_texture(self: &Rc<Self>, buffer: &Buffer, format: u32) -> Result<Texture> {
         let gl = self.functions()?;
         let target = glow::TEXTURE_BUFFER;
@@ -382,7 +383,7 @@ impl Gl {
         }
     }
 
-    /// Creates a framebuffer of complete images.
+    /// Creates a framebuffer with a depth attachment and an optional color attachment. Each is a complete texture.
     pub(crate) fn framebuffer(self: &Rc<Self>, color: Option<&Texture>, depth: &Texture) -> Result<Framebuffer> {
         let depth = Attachment { image: depth, layer: None };
         self.create_framebuffer(color.map(|image| Attachment { image, layer: None }), Some(depth))
@@ -435,7 +436,7 @@ impl Gl {
         }
     }
 
-    /// Creates a vertex array of an index buffer and attributes. It keeps their buffers alive.
+    /// Creates a vertex array of an index buffer and attributes. The vertex array keeps the buffers alive.
     pub(crate) fn vertex_array(
         self: &Rc<Self>,
         index_buffer: Option<&Buffer>,
@@ -508,7 +509,8 @@ impl Gl {
         }
     }
 
-    /// Draws `triangles` triangles of the index buffer of `array`, from triangle `first` on.
+    /// Draws `triangles` triangles of the index buffer of `array`, from triangle `first` on. A triangle has three u32
+    /// indices.
     pub(crate) fn draw_indexed(&self, array: &VertexArray, first: usize, triangles: usize) {
         let Some(gl) = self.functions_or_skip() else { return };
         // SAFETY: the indices come from validated meshes and stay below the number of elements of each attribute.
@@ -532,18 +534,19 @@ impl Gl {
 
     /// Runs the bound compute program. Its writes are visible to later accesses only after a [`Self::barrier`] of their
     /// kind.
-    pub(crate) fn dispatch(&self, groups_x: u32, groups_y: u32) {
+    pub(crate) fn dispatch(&self, workgroups_x: u32, workgroups_y: u32) {
         let Some(gl) = self.functions_or_skip() else { return };
         // SAFETY: the shaders check their own bounds.
-        unsafe { gl.dispatch_compute(groups_x, groups_y, 1) }
+        unsafe { gl.dispatch_compute(workgroups_x, workgroups_y, 1) }
     }
 
-    /// Like [`Self::dispatch`]. The first three words of `groups` are the numbers of workgroups in x, y and z.
-    pub(crate) fn dispatch_indirect(&self, groups: &Buffer) {
+    /// Like [`Self::dispatch`]. The first three words of `workgroup_counts` are the numbers of workgroups in x, y and
+    /// z.
+    pub(crate) fn dispatch_indirect(&self, workgroup_counts: &Buffer) {
         let Some(gl) = self.functions_or_skip() else { return };
         // SAFETY: the buffer holds more than three words; the shaders check their own bounds.
         unsafe {
-            gl.bind_buffer(glow::DISPATCH_INDIRECT_BUFFER, Some(groups.name()));
+            gl.bind_buffer(glow::DISPATCH_INDIRECT_BUFFER, Some(workgroup_counts.name()));
             gl.dispatch_compute_indirect(0);
         }
     }
@@ -553,7 +556,7 @@ impl Gl {
         let BufferCopy { source, source_offset, target, target_offset, bytes } = copy;
         let range_ends = [source_offset.checked_add(bytes), target_offset.checked_add(bytes)];
         if range_ends.into_iter().zip([source, target]).any(|(end, buffer)| end.is_none_or(|end| end > buffer.bytes)) {
-            return self.skip(format!("expected a copy inside of both buffers, got {copy:?}"));
+            return self.record_skipped(format!("expected a copy inside of both buffers, got {copy:?}"));
         }
         let Some(gl) = self.functions_or_skip() else { return };
         let (read_binding, write_binding) = (glow::COPY_READ_BUFFER, glow::COPY_WRITE_BUFFER);
@@ -580,7 +583,7 @@ impl Gl {
     }
 }
 
-/// `Invalid`: a size exceeds a limit of the device.
+/// `Invalid`, because a size exceeds a limit of the device.
 pub(crate) fn too_large(field: &str, limit: u64, got: u64) -> Error {
     modalcast_model::error::invalid(field, format!("at most {limit} on this device"), got)
 }

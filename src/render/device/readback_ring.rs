@@ -16,7 +16,7 @@ pub const MAX_FRAMES_IN_FLIGHT: usize = 3;
 #[derive(Debug)]
 pub(crate) struct ReadbackRing {
     gl: Rc<Gl>,
-    /// Size of each buffer.
+    /// Size of each buffer in bytes.
     bytes: u64,
     /// Number of allocated buffers.
     allocated: Cell<usize>,
@@ -36,8 +36,8 @@ impl ReadbackRing {
         Rc::new(Self { gl: Rc::clone(gl), bytes, allocated: Cell::new(0), free: RefCell::default() })
     }
 
-    /// Takes a free staging buffer for a frame, or allocates one. If the ring is full, this waits at most `limit` for
-    /// the reader of the oldest buffer without a frame in flight.
+    /// Takes a free staging buffer for a frame, or allocates one. If all buffers are in use, waits at most `limit` for
+    /// the reader of the oldest buffer without a frame in flight. A reader is a thread that copies pixels.
     ///
     /// # Errors
     /// `Busy` when all buffers have frames in flight or the reader exceeds `limit`; `Fault` of OpenGL.

@@ -1,8 +1,8 @@
 //! A compute rasterizer that draws selected passes instead of OpenGL, and its output buffers.
 //!
-//! The compute rasterizer writes into OpenGL buffers: depth for the blur, and visibility keys that a compute pass
-//! converts to ids. All later passes are the same as with OpenGL. A scene has these resources only if its backend
-//! settings select a compute rasterizer.
+//! The compute rasterizer writes into OpenGL buffers: depth for the blur, and visibility keys, which a compute pass
+//! converts to ids. A key is the triangle and the depth of a pixel. All later passes are the same as with OpenGL. A
+//! scene has these resources only if its backend settings select a compute rasterizer.
 
 use std::cell::{Cell, Ref, RefCell};
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -25,14 +25,14 @@ pub(crate) struct RasterPasses {
 /// A compute rasterizer and its output buffers.
 #[derive(Debug)]
 pub(crate) struct ComputeRasterizer {
-    /// Keeps handles to the buffers that it has registered.
+    /// Owns handles to the buffers that it has registered.
     rasterizer: RefCell<Box<dyn Rasterizer>>,
     outputs: RasterOutputs,
     enabled: Cell<RasterPasses>,
 }
 
-/// Output buffers of a compute rasterizer, and the programs that read them. An output is absent if the compute rasterizer
-/// does not support its pass.
+/// Output buffers of a compute rasterizer, and the programs that read them. An output is absent if the compute
+/// rasterizer does not support its pass.
 #[derive(Debug)]
 pub(crate) struct RasterOutputs {
     shadow: Option<ShadowDepths>,
@@ -43,26 +43,27 @@ pub(crate) struct RasterOutputs {
 #[derive(Debug)]
 struct ShadowDepths {
     buffer: Buffer,
-    /// The first pass of the blur, reading `buffer`.
+    /// The program of the first blur pass, which reads `buffer`.
     blur: Rc<Program>,
 }
 
 /// Visibility keys of a frame.
 #[derive(Debug)]
 struct VisibilityKeys {
-    /// Sized for the largest frame so far.
+    /// Sized for the largest frame so far; none before the first frame.
     buffer: RefCell<Option<Buffer>>,
+    /// The program that converts keys to ids.
     unpack: Rc<Program>,
 }
 
-/// Bytes of a key.
+/// Bytes of a key: a word of the triangle's index, and a word of the depth's bits.
 const KEY_BYTES: u64 = 8;
 
 impl RasterPasses {
     pub(crate) const NONE: Self = Self { shadow: false, visibility: false };
 
-    /// The passes of a scene that a compute rasterizer may draw. The shadow pass needs moments and only one cascade. The
-    /// visibility pass needs one sample per pixel and no blended triangles, because no depth image is written.
+    /// The passes of a scene that a compute rasterizer may draw. The shadow pass needs moments and only one cascade.
+    /// The visibility pass needs one sample per pixel and no blended triangles, because no depth image is written.
     pub(crate) fn supported(scene: &Scene) -> Self {
         let look = &scene.look;
         let is_shadow_supported = look.shadow.is_some_and(|shadow| shadow.has_moments() && shadow.cascades == 1);
@@ -114,7 +115,7 @@ impl RasterOutputs {
 }
 
 impl ComputeRasterizer {
-    /// Draws all passes that have an output.
+    /// Enables all passes that have an output.
     pub(crate) fn new(rasterizer: Box<dyn Rasterizer>, outputs: RasterOutputs) -> Self {
         let enabled = Cell::new(outputs.passes());
         Self { rasterizer: RefCell::new(rasterizer), outputs, enabled }
@@ -158,9 +159,11 @@ impl ComputeRasterizer {
             }
             None => None,
         };
+        // `Rasterizer::draw` borrows the handles.
         let depths = depths.as_ref().map(|(shadow_viewport, buffer)| (*shadow_viewport, buffer));
         let keys = keys.as_ref().map(|(frame_viewport, buffer)| (*frame_viewport, buffer));
-        // A panic is converted to an error, so that the caller disables the rasterizer and draws this frame with OpenGL.
+        // A panic is converted to an error, so that the caller disables the rasterizer and draws this frame with
+        // OpenGL.
         catch_unwind(AssertUnwindSafe(|| self.rasterizer.borrow_mut().draw(depths, keys)))
             .unwrap_or_else(|_| Err(fault("rasterize", "the compute rasterizer panicked")))
     }
@@ -189,7 +192,7 @@ impl ComputeRasterizer {
 }
 
 impl VisibilityKeys {
-    /// Returns a handle to the buffer, after it was reallocated if it is smaller than `bytes`.
+    /// Returns a handle to the buffer. Reallocates the buffer if it is smaller than `bytes`.
     fn reserve(&self, gl: &Rc<Gl>, bytes: u64) -> Result<GlBuffer> {
         let mut buffer = self.buffer.borrow_mut();
         match buffer.take().filter(|buffer| buffer.bytes >= bytes) {

@@ -28,7 +28,7 @@ pub(crate) struct CullResources {
 pub(crate) struct CullVertexArrays {
     /// Attributes: positions only. Draws opaque triangles.
     pub(crate) position_array: VertexArray,
-    /// Attributes: all of each corner. Draws cut-out and blended triangles; none without such triangles.
+    /// Attributes: all attributes of a corner. Draws cut-out and blended triangles; none without such triangles.
     pub(crate) corner_array: Option<VertexArray>,
 }
 

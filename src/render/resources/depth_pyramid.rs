@@ -45,8 +45,9 @@ mod tests {
 
     #[test]
     fn level_sizes_are_halved_and_rounded_up() {
-        assert_eq!(count_texels([1, 1]), 9);
+        assert_eq!(count_texels([1, 1]), 9, "expected one texel in each of nine levels");
         assert_eq!(count_texels([256, 256]), (0..=8).map(|level| 1 << (2 * level)).sum::<u64>());
+        // 3 x 5, 2 x 3, 1 x 2, and six levels of 1 x 1.
         assert_eq!(count_texels([3, 5]), 15 + 6 + 2 + 6);
     }
 }

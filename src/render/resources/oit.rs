@@ -1,7 +1,8 @@
 //! Fragment lists of exact order-independent transparency, in bounded memory.
 //!
-//! The memory budget is a number of fragments. When a frame has more, each pixel keeps only its nearest fragments, up to
-//! a limit that all pixels share: the largest limit for which all lists fit, at most 256. Dropped fragments are counted.
+//! The memory budget is a number of fragments. When a frame has more, each pixel keeps only its nearest fragments, up
+//! to a limit that all pixels share: the largest limit for which all lists fit, at most 256. Dropped fragments are
+//! counted.
 
 use std::rc::Rc;
 
@@ -15,8 +16,9 @@ use crate::region::DirtyRegion;
 use modalcast_model::error::Result;
 use modalcast_model::scene::{MAX_FRAGMENTS, RenderSettings, Scene, Transparency};
 
+/// Default budget of a frame, in fragments per pixel.
 const DEFAULT_FRAGMENTS_PER_PIXEL: u64 = 8;
-/// Minimum of the default budget of a frame.
+/// Minimum of the default budget of a frame, in fragments.
 const MIN_FRAGMENTS: u64 = 1 << 20;
 
 /// Images and buffers of exact transparency for one [`TargetDesc`].
@@ -32,11 +34,11 @@ pub(crate) struct OitTarget {
     pub(crate) counts_fbo: Framebuffer,
     /// Dirty region of `fragment_counts`.
     pub(crate) dirty_region: DirtyRegion,
-    /// Depth-only framebuffer for the depth test.
+    /// Framebuffer with the frame's depth only, for the depth test.
     pub(crate) depth_fbo: Framebuffer,
     /// Fragments of all lists, one record each.
     pub(crate) records: Buffer,
-    /// Counters, and indirect draw commands for the ids.
+    /// [`crate::layout::oit::OitCounters`] and the histogram bins.
     pub(crate) counters: Buffer,
     /// Tiles with blended fragments, for an indirect dispatch.
     pub(crate) tile_list: Buffer,
@@ -105,6 +107,7 @@ mod tests {
 
     #[test]
     fn budget_is_bounded_by_the_buffer_size() {
+        // A record has 8 bytes, so a buffer of 2^27 bytes has space for 2^24 records.
         let limits = |max_storage_bytes: u64| Limits { max_storage_bytes, ..Limits::default() };
         let budget_for = |fragments: Option<u32>, max_storage_bytes: u64, size: [u32; 2]| {
             budget(&limits(max_storage_bytes), &RenderSettings { fragments, ..RenderSettings::default() }, size)

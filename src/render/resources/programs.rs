@@ -25,7 +25,7 @@ pub(crate) struct ProgramCache {
 /// Programs that do not depend on the samples per pixel. An optional program is absent if the scene does not need it.
 #[derive(Debug)]
 pub(crate) struct ScenePrograms {
-    /// In execution order; empty if the shadow map has no moments.
+    /// Programs of the blur in execution order; empty if the shadow map has no moments.
     pub(crate) blur: Vec<Rc<Program>>,
     /// Draws shadow casters; one each for opaque, cut-out and blended triangles.
     pub(crate) shadow: [Option<Rc<Program>>; 3],
@@ -46,11 +46,11 @@ pub(crate) struct SampleCountPrograms {
     /// other parts.
     pub(crate) opaque_parts: Option<Rc<Program>>,
     pub(crate) blended: Option<Rc<Program>>,
-    /// Exact transparency.
+    /// Programs of exact transparency.
     pub(crate) oit: Option<OitPrograms>,
     pub(crate) background: Rc<Program>,
     pub(crate) shade: Option<Rc<Program>>,
-    /// Triangle culling.
+    /// Programs of triangle culling.
     pub(crate) cull: Option<CullPrograms>,
 }
 
@@ -91,14 +91,14 @@ pub(crate) struct OitPrograms {
     pub(crate) resolve: Rc<Program>,
 }
 
-/// Post-processing programs of one look.
+/// Post-processing programs for the look (the render settings) of a scene.
 #[derive(Debug)]
 pub(crate) struct PostPrograms {
     pub(crate) encode: Rc<Program>,
     pub(crate) bloom: Option<BloomPrograms>,
 }
 
-/// Bloom programs. `composite` is the last upsampling, onto the scene color.
+/// Bloom programs. `composite` is the last upsampling, which adds the bloom to the scene color.
 #[derive(Debug)]
 pub(crate) struct BloomPrograms {
     pub(crate) downsample: Rc<Program>,
@@ -111,8 +111,8 @@ impl ProgramCache {
         Self { gl: Rc::clone(gl), programs: HashMap::new() }
     }
 
-    /// Returns the program of a source, compiled unless it is cached. A full cache first drops all programs that no scene
-    /// uses, or all programs if every one is used.
+    /// Returns the program of a source, compiled unless it is cached. A full cache first drops all programs that no
+    /// scene uses, or all programs if every one is used.
     ///
     /// # Errors
     /// `Fault` with the compiler's log.

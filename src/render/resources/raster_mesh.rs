@@ -6,7 +6,7 @@ use modalcast_model::domain::{AlphaMode, Material};
 use modalcast_model::raster::{AlphaImage, AlphaMaterial, CutOuts, GlBuffer, RasterGeometry};
 use modalcast_model::scene::{CullMode, DrawRange, Scene};
 
-/// The mesh of a scene, over the shared position buffer.
+/// The mesh of a scene. `positions`: the buffer of the deformed positions.
 pub(super) fn raster_geometry(scene: &Scene, positions: GlBuffer, anisotropy: f32) -> RasterGeometry {
     let geometry = Geometry::new(scene);
     let groups = geometry.groups.iter().map(|group| DrawRange {
@@ -93,7 +93,11 @@ mod tests {
         let scene = Scene::new(parts).expect("a valid scene");
         let geometry = Geometry::new(&scene);
         let cut_out_data = cut_outs(&scene, &geometry, 8.0).expect("cut-outs");
-        assert_eq!((cut_out_data.first, cut_out_data.uvs.len()), (2, 4), "the opaque square comes first");
+        assert_eq!(
+            (cut_out_data.first, cut_out_data.uvs.len()),
+            (2, 4),
+            "expected four triangles after the two of the opaque square"
+        );
         assert_eq!(cut_out_data.uvs[0], [[0.0, 1.0], [1.0, 1.0], [1.0, 0.0]]);
         let material_of = |triangle: usize| cut_out_data.materials[cut_out_data.material_indices[triangle] as usize];
         assert_eq!(
@@ -103,8 +107,9 @@ mod tests {
         assert_eq!(
             (material_of(0).image, material_of(2).image, cut_out_data.images.len()),
             (Some(0), Some(0), 1),
-            "one shared image, none of the opaque material"
+            "expected one shared image, and none of the opaque material"
         );
+        // Texture 1 has two texels, so it has two mipmap levels.
         assert_eq!((cut_out_data.images[0].levels.len(), &cut_out_data.images[0].levels[0]), (2, &vec![100, 255]));
         let opaque = Scene::new(squares(vec![Material::default()])).expect("a valid scene");
         assert_eq!(cut_outs(&opaque, &Geometry::new(&opaque), 8.0), None);

@@ -35,6 +35,8 @@ pub struct SceneBuffers {
     /// that it has registered.
     pub(crate) compute_rasterizer: Option<ComputeRasterizer>,
     pub(crate) scene: Arc<Scene>,
+    /// The deformed positions in it are the shared positions: a deformer may write the buffer directly
+    /// ([`Self::vertex_buffers`]).
     pub(crate) geometry: GeometryBuffers<Buffer>,
     /// Keeps the buffers of the buffer textures alive.
     _materials: MaterialBuffers<Buffer>,
@@ -58,10 +60,11 @@ pub struct SceneBuffers {
     pub(crate) post: PostPrograms,
     /// Programs for the look's number of samples per pixel.
     sample_programs: SampleCountPrograms,
+    /// Parameters of the shader sources, to compile further programs.
     options: ShaderOptions,
     /// Maps ranges of the draw order to the meshes of the domains.
     pub(crate) spans: Rc<[TriangleSpan]>,
-    /// Origin of the positions, in scene units from the scene's origin.
+    /// Origin of the positions that are drawn, in scene units from the scene's origin.
     pub(crate) origin: [f64; 3],
     /// Rebased positions that are drawn instead of the shared ones.
     pub(crate) rebased: Option<RebasedPositions>,
@@ -72,7 +75,7 @@ pub struct SceneBuffers {
     plan_allocations: Vec<Allocation>,
 }
 
-/// Positions rebased to one origin, for scenes whose domains have separate local origins.
+/// Positions rebased to one origin, for scenes in which each domain has a local origin.
 #[derive(Debug)]
 pub(crate) struct RebasedPositions {
     pub(crate) buffer: Buffer,
@@ -83,11 +86,12 @@ pub(crate) struct RebasedPositions {
 }
 
 impl RebasedPositions {
-    pub(crate) fn new(gl: &Rc<Gl>, scene: &SceneBuffers) -> Result<Self> {
-        let buffer = gl.buffer(scene.geometry.positions.bytes, gl::DYNAMIC_DRAW, None)?;
+    pub(crate) fn new(gl: &Rc<Gl>, scene_buffers: &SceneBuffers) -> Result<Self> {
+        let buffer = gl.buffer(scene_buffers.geometry.positions.bytes, gl::DYNAMIC_DRAW, None)?;
         let view = gl.buffer_texture(&buffer, gl::RGB32F)?;
-        let position_array = self::position_array(gl, &buffer, &scene.geometry.triangle_vertices)?;
-        let culled_indices = scene.cull_resources.as_ref().map(|cull_resources| &cull_resources.buffers.indices);
+        let position_array = self::position_array(gl, &buffer, &scene_buffers.geometry.triangle_vertices)?;
+        let culled_indices =
+            scene_buffers.cull_resources.as_ref().map(|cull_resources| &cull_resources.buffers.indices);
         let culled_position_array =
             culled_indices.map(|indices| self::position_array(gl, &buffer, indices)).transpose()?;
         Ok(Self { view, position_array, culled_position_array, buffer })
@@ -105,7 +109,7 @@ pub(crate) struct VertexValues {
 #[derive(Debug)]
 pub(crate) struct BufferTextures {
     positions: Texture,
-    /// Texture unit and view.
+    /// Views of the other buffers, each with its texture unit.
     pub(crate) unit_views: Vec<(u32, Texture)>,
 }
 
@@ -261,7 +265,8 @@ impl SceneBuffers {
     /// passes.
     ///
     /// # Errors
-    /// Errors of `create_rasterizer` and [`Rasterizer::precompile`], and `Fault` of OpenGL. OpenGL then draws all passes.
+    /// Errors of `create_rasterizer` and [`Rasterizer::precompile`], and `Fault` of OpenGL. OpenGL then draws all
+    /// passes.
     pub(crate) fn attach_rasterizer(
         &mut self,
         gl: &Rc<Gl>,
@@ -282,8 +287,8 @@ impl SceneBuffers {
         Ok(())
     }
 
-    /// The compute rasterizer and the passes that it draws; none if OpenGL draws all passes. This includes rebased scenes,
-    /// because the compute rasterizer has registered only the shared positions.
+    /// The compute rasterizer and the passes that it draws; none if OpenGL draws all passes. OpenGL draws all passes of
+    /// rebased scenes, because the compute rasterizer has registered only the shared positions.
     pub(crate) fn active_rasterizer(&self) -> Option<(&ComputeRasterizer, RasterPasses)> {
         let compute_rasterizer = self.compute_rasterizer.as_ref().filter(|_| self.rebased.is_none())?;
         let enabled = compute_rasterizer.enabled();
@@ -302,8 +307,8 @@ impl SceneBuffers {
     }
 
     /// Sets the step whose vertices the buffers contain. Frames with the same step, bounds and origin share one shadow
-    /// map, unless it is split into cascades, which follow the camera. Code that writes the buffers directly must set
-    /// another step afterwards. An upload clears the step; then every frame draws its shadow map.
+    /// map, unless the map is split into cascades, which follow the camera. Code that writes the buffers directly must
+    /// set another step afterwards. An upload clears the step; then every frame draws its shadow map.
     pub fn set_step(&self, step: u64) {
         self.shadow_cache.set_step(step);
     }
@@ -314,7 +319,7 @@ impl SceneBuffers {
         self.shadow_cache.key(params, self.origin).filter(|_| cascades == 1)
     }
 
-    /// Culling method; never the automatic choice.
+    /// Culling method; never `Auto`.
     pub(crate) const fn culling(&self) -> Culling {
         self.options.features.culling
     }
@@ -426,6 +431,7 @@ impl BufferTextures {
     }
 }
 
+/// A vertex attribute of `components` f32.
 const fn f32_attribute(location: u32, buffer: &Buffer, components: i32) -> VertexAttribute<'_> {
     VertexAttribute { location, buffer, components, integer: false }
 }
@@ -435,7 +441,8 @@ fn position_array(gl: &Rc<Gl>, positions: &Buffer, indices: &Buffer) -> Result<V
     gl.vertex_array(Some(indices), &[f32_attribute(0, positions, 3)])
 }
 
-/// Vertex array over the corners of cut-out and blended triangles; none without such triangles.
+/// Vertex array over the corners of cut-out and blended triangles; none without such triangles. The locations are those
+/// in `shaders/visibility.vert` and `shaders/blended.vert`.
 fn corner_array(gl: &Rc<Gl>, geometry: &GeometryBuffers<Buffer>, indices: &Buffer) -> Result<Option<VertexArray>> {
     let Some(vertices) = &geometry.corner_vertices else { return Ok(None) };
     let vertex_index = VertexAttribute { location: 0, buffer: vertices, components: 1, integer: true };

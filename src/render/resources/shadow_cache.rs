@@ -1,5 +1,5 @@
-//! Reuse of the shadow map between the frames of a step. A map that does not depend on the camera is drawn again only if
-//! the vertices, their origin or the bounds change. The look of a scene never changes.
+//! Reuse of the shadow map between the frames of a step. A map that does not depend on the camera is drawn again only
+//! if the vertices, their origin or the bounds change. The look of a scene never changes.
 
 use std::cell::Cell;
 
@@ -42,13 +42,13 @@ impl ShadowCache {
         Some(ShadowKey { step, bounds: params.bounds, light_bounds: params.light_bounds, origin })
     }
 
-    /// Whether the map must be drawn to show this content.
+    /// Whether the map must be drawn to get this content.
     pub(crate) fn is_stale(&self, key: Option<ShadowKey>) -> bool {
         key.is_none() || key != self.content.get()
     }
 
-    /// Calls `draw` unless the map already shows this content, and returns whether the map was drawn. A map whose drawing
-    /// failed has no valid content.
+    /// Calls `draw` unless the map already has this content, and returns whether the map was drawn. If `draw` fails,
+    /// the content is invalid.
     pub(crate) fn draw_if_stale(&self, key: Option<ShadowKey>, draw: impl FnOnce() -> Result<()>) -> Result<bool> {
         let is_stale = self.is_stale(key);
         self.content.take();

@@ -1,5 +1,5 @@
-//! Render target of a frame: ids, depth and blended layer of each sample, the scene color, and the buffers for its
-//! readback.
+//! Render target of a frame: ids, depth and blended light of each sample, the scene color, and the buffers for the
+//! readback of the frame.
 
 use std::cell::Cell;
 use std::rc::Rc;
@@ -32,7 +32,7 @@ pub(crate) struct RenderTarget {
     pub(crate) scene_color: Texture,
     /// Bloom pyramid; empty without bloom. Level 0 has the size of the frame.
     pub(crate) bloom_mips: Vec<Texture>,
-    /// Output of the encoder: RGBA8, top row first.
+    /// Output of the encode pass: RGBA8, top row first.
     pub(crate) readback_source: Buffer,
     /// Staging buffers for the readback of `readback_source`.
     pub(crate) readback_ring: Rc<ReadbackRing>,
@@ -51,8 +51,9 @@ pub(crate) struct BlendLayer {
 
 impl RenderTarget {
     pub(crate) fn new(gl: &Rc<Gl>, desc: TargetDesc) -> Result<Self> {
-        let TargetDesc { width, height, samples, blend_storage, .. } = desc;
+        let TargetDesc { width, height, blend_storage, .. } = desc;
         let (ids, depth) = (create_image(gl, desc, gl::R32UI)?, create_image(gl, desc, gl::DEPTH_COMPONENT32F)?);
+        let [_, cull_range] = desc.readback_ranges();
         let create_layer = |color: Texture| {
             Ok(BlendLayer {
                 framebuffer: gl.framebuffer(Some(&color), &depth)?,
@@ -69,9 +70,8 @@ impl RenderTarget {
             BlendStorage::FragmentLists(budget) => Some(OitTarget::new(gl, desc, budget, &depth)?),
             BlendStorage::None | BlendStorage::SingleLayer => None,
         };
-        let bytes = desc.encoded_bytes();
         Ok(Self {
-            desc: TargetDesc { samples, ..desc },
+            desc,
             visibility_fbo: gl.framebuffer(Some(&ids), &depth)?,
             dirty_regions: VisibilityDirtyRegions::default(),
             draw_region: Cell::new(Region::whole([width, height])),
@@ -81,8 +81,8 @@ impl RenderTarget {
             tile_list: gl.buffer(tile_list_bytes([width, height]), gl::STREAM_COPY, None)?,
             scene_color: create_image(gl, TargetDesc { samples: 1, ..desc }, gl::RGBA16F)?,
             bloom_mips: create_bloom_mips(gl, desc)?,
-            readback_source: gl.buffer(bytes, gl::STREAM_COPY, None)?,
-            readback_ring: ReadbackRing::new(gl, desc.readback_ranges()[1].end),
+            readback_source: gl.buffer(desc.frame_bytes(), gl::STREAM_COPY, None)?,
+            readback_ring: ReadbackRing::new(gl, cull_range.end),
             depth_pyramid: if desc.culling == Culling::Occlusion {
                 Some(DepthPyramid::new(gl, desc, &depth)?)
             } else {

@@ -9,8 +9,8 @@ use crate::layout::oit::OIT_HEADER_BYTES;
 use modalcast_model::error::Result;
 use modalcast_model::scene::{Culling, RenderSettings};
 
-/// Maximum number of pixels of a multisampled frame. Larger frames have one sample per pixel. With four samples of depth,
-/// ids and a blended layer, these pixels take 704 MiB of device memory.
+/// Maximum number of pixels of a multisampled frame. Larger frames have one sample per pixel. A sample takes 16 bytes:
+/// 4 of depth, 4 of ids and 8 of a blend layer. With four samples, these pixels take 704 MiB of device memory.
 const MAX_MULTISAMPLED_PIXELS: u64 = 11 << 20;
 
 /// Properties of a frame that determine its images and buffers.
@@ -22,7 +22,7 @@ pub(crate) struct TargetDesc {
     pub(crate) blend_storage: BlendStorage,
     /// Levels of the bloom pyramid that are smaller than the frame.
     pub(crate) bloom_levels: u32,
-    /// Culling method; never the automatic choice.
+    /// Culling method; never `Auto`.
     pub(crate) culling: Culling,
 }
 
@@ -53,16 +53,16 @@ impl TargetDesc {
         Self { blend_storage, bloom_levels, ..Self::ids_and_depth(gl, [width, height], look.samples_per_pixel()) }
     }
 
-    /// Target with ids and depth only. It has `samples` samples per pixel if the device and the frame size allow it, else
-    /// one.
+    /// Target with ids and depth only. It has `samples` samples per pixel if the device and the frame size allow it,
+    /// else one.
     pub(crate) fn ids_and_depth(gl: &Gl, [width, height]: [u32; 2], samples: u32) -> Self {
         let is_supported =
             u64::from(width) * u64::from(height) <= MAX_MULTISAMPLED_PIXELS && samples <= gl.limits.max_samples;
         Self { width, height, samples: if is_supported { samples } else { 1 }, ..Self::EMPTY }
     }
 
-    /// Bytes of the encoded frame.
-    pub(crate) fn encoded_bytes(&self) -> u64 {
+    /// Bytes of a frame with one 32-bit word per pixel: encoded colors, or ids.
+    pub(crate) fn frame_bytes(&self) -> u64 {
         4 * u64::from(self.width) * u64::from(self.height)
     }
 
@@ -72,7 +72,7 @@ impl TargetDesc {
         let list_bytes =
             if matches!(self.blend_storage, BlendStorage::FragmentLists(_)) { OIT_HEADER_BYTES as u64 } else { 0 };
         let cull_bytes = if self.culling == Culling::None { 0 } else { CULL_COUNTER_BYTES as u64 };
-        let (list_begin, cull_begin) = (self.encoded_bytes(), self.encoded_bytes() + list_bytes);
+        let (list_begin, cull_begin) = (self.frame_bytes(), self.frame_bytes() + list_bytes);
         [list_begin..cull_begin, cull_begin..cull_begin + cull_bytes]
     }
 }

@@ -9,7 +9,7 @@ use crate::scene_data::textures::{TextureArray, TextureRole, cutoff, mip_levels}
 use modalcast_model::error::Result;
 use modalcast_model::scene::Scene;
 
-/// Layers that are processed at once. Few, because mipmap chains take much host memory.
+/// Layers whose mipmap levels are computed at once. Few, because mipmap chains take much host memory.
 const LAYERS_PER_CHUNK: usize = 8;
 
 /// Creates and fills the texture arrays of one role.
@@ -42,6 +42,7 @@ fn upload_array(gl: &Rc<Gl>, scene: &Scene, array: &TextureArray, role: TextureR
             let cutoff = if role == TextureRole::Color { cutoff(scene, *index) } else { None };
             mip_levels(&scene.textures[*index], array, role, cutoff)
         };
+        // RGBA8 pixels of each layer and level.
         let chains: Vec<Vec<Vec<u8>>> = texture_indices.par_iter().map(build_chain).collect();
         for (index_in_chunk, chain) in chains.iter().enumerate() {
             let layer = (LAYERS_PER_CHUNK * chunk_index + index_in_chunk) as u32;

@@ -1,7 +1,9 @@
 //! Converts the domains of a scene to static arrays: corner indices sorted into draw groups, vertex and texture
 //! coordinates of each corner, and material of each triangle.
 //!
-//! Triangles are grouped by pipeline state, so that the number of draw calls does not grow with the number of domains.
+//! Triangles are grouped by pipeline state (blend mode and sidedness), so that the number of draw calls does not grow
+//! with the number of domains. The draw order is the order of the triangles in the groups. A corner is a vertex with
+//! one normal and one pair of texture coordinates.
 
 use nalgebra::Vector3;
 
@@ -16,7 +18,7 @@ pub(crate) enum BlendMode {
     Blend,
 }
 
-/// A contiguous range of triangles that one call draws.
+/// A contiguous range of triangles in the draw order that one call draws.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct DrawGroup {
     pub(crate) blend_mode: BlendMode,
@@ -35,7 +37,7 @@ pub(crate) struct TriangleSpan {
     pub(crate) triangle: usize,
 }
 
-/// Domain of a triangle, and its index in the mesh of the domain. `triangle` is its index in the draw order.
+/// Finds a triangle by its index in the draw order. Returns its domain, and its index in the mesh of the domain.
 pub(crate) fn locate_triangle(spans: &[TriangleSpan], triangle: usize) -> Option<(usize, usize)> {
     let end = spans.partition_point(|span| span.first <= triangle);
     let span = spans.get(end.checked_sub(1)?)?;
@@ -49,14 +51,14 @@ pub(crate) struct Geometry {
     pub(crate) corner_vertices: Vec<u32>,
     /// Texture coordinates of each corner; empty if no material has a texture.
     pub(crate) uvs: Vec<[f32; 2]>,
-    /// Corners of each triangle.
+    /// Corner indices of each triangle.
     pub(crate) triangle_corners: Vec<[u32; 3]>,
-    /// Vertices of each triangle.
+    /// Vertex indices of each triangle.
     pub(crate) triangle_vertices: Vec<[u32; 3]>,
-    /// Material of each triangle, as an index among the used materials; empty if only one is used.
+    /// Material of each triangle, as an index in [`used_materials`]; empty if only one material is used.
     pub(crate) triangle_materials: Vec<u32>,
     pub(crate) groups: Vec<DrawGroup>,
-    /// Sorted by the first triangle.
+    /// Maps the draw order to the meshes of the domains. Sorted by the first triangle.
     pub(crate) spans: Vec<TriangleSpan>,
     /// Index in `groups` of each of the scene's materials.
     group_of_material: Vec<usize>,
@@ -96,7 +98,7 @@ pub(crate) fn groups(scene: &Scene) -> (Vec<DrawGroup>, Vec<usize>) {
     (groups, group_of_material)
 }
 
-/// Pipeline state of a material.
+/// Pipeline state of a material: its blend mode, and whether it is double-sided.
 fn pipeline_key(material: &Material) -> (BlendMode, bool) {
     (blend_mode(material), material.double_sided)
 }
@@ -134,6 +136,7 @@ impl Geometry {
         for (material_index, material) in (0..).zip(used_materials(scene)) {
             material_indices[material] = material_index;
         }
+        // Per group: index in the draw order of the next triangle.
         let mut next_triangles: Vec<usize> = geometry.groups.iter().map(|group| group.first_triangle).collect();
         for (index, domain) in scene.domains.iter().enumerate() {
             geometry.add_corners(scene, domain, &scene.layout.domains[index], has_uvs);
@@ -167,6 +170,7 @@ impl Geometry {
             for triangle in &mesh.triangles()[range] {
                 let is_reversed = material_properties.double_sided && winding_disagrees(mesh, *triangle);
                 let [a, b, c] = triangle.map(|corner| corner + layout.first_corner as u32);
+                // Two reversals cancel each other.
                 self.triangle_corners[*draw_index] = if is_mirrored == is_reversed { [a, b, c] } else { [a, c, b] };
                 if let Some(material_index) = self.triangle_materials.get_mut(*draw_index) {
                     *material_index = material_indices[material];
@@ -177,7 +181,7 @@ impl Geometry {
     }
 }
 
-/// Material of each material range of a domain, and its triangles in the mesh.
+/// Material ranges of a domain. Each is a material and the range of its triangles in the domain's mesh.
 fn material_triangle_ranges<'a>(
     domain: &'a Domain,
     layout: &DomainLayout,
@@ -202,8 +206,8 @@ fn winding_disagrees(mesh: &modalcast_model::domain::Mesh, triangle: [u32; 3]) -
         |corner: u32| Vector3::from(mesh.rest_positions()[corners.vertices[corner as usize] as usize]).cast::<f64>();
     let normal_of = |corner: u32| Vector3::from(corners.normals[corner as usize]).cast::<f64>();
     let [a, b, c] = triangle;
-    let area = (position_of(b) - position_of(a)).cross(&(position_of(c) - position_of(a)));
-    area.dot(&(normal_of(a) + normal_of(b) + normal_of(c))) < 0.0
+    let area_vector = (position_of(b) - position_of(a)).cross(&(position_of(c) - position_of(a)));
+    area_vector.dot(&(normal_of(a) + normal_of(b) + normal_of(c))) < 0.0
 }
 
 #[cfg(test)]
@@ -249,6 +253,7 @@ pub(crate) mod tests {
                 assert_eq!(pipeline_key(material), (group.blend_mode, group.double_sided));
             }
         }
+        // Each square has two triangles and four corners.
         let mut corners = geometry.triangle_corners.as_flattened().to_vec();
         corners.sort_unstable();
         corners.dedup();
@@ -264,6 +269,7 @@ pub(crate) mod tests {
         let geometry = Geometry::new(&Scene::new(parts).expect("a valid scene"));
         assert_eq!(geometry.triangle_materials, [0, 1]);
         assert_eq!(geometry.triangle_corners, [[0, 2, 3], [0, 1, 2]]);
+        // The second triangle is opaque, so it comes first in the draw order.
         let span = |first, triangle| TriangleSpan { first, domain: 0, triangle };
         assert_eq!(geometry.spans, [span(0, 1), span(1, 0)], "expected the spans of both groups");
     }
@@ -271,6 +277,7 @@ pub(crate) mod tests {
     #[test]
     fn mirrored_placement_reverses_the_winding() {
         let mut parts = squares(vec![material(AlphaMode::Opaque, false)]);
+        // Mirrors x.
         let mut mirroring = Transform::IDENTITY;
         mirroring.0[0] = -1.0;
         parts.domains[0].placement = mirroring;
@@ -285,6 +292,7 @@ pub(crate) mod tests {
         for (double_sided, expected) in [(true, [0, 2, 1]), (false, [0, 1, 2])] {
             let mut parts = squares(vec![material(AlphaMode::Opaque, double_sided)]);
             let rest_positions = parts.shapes[0].mesh.rest_positions().to_vec();
+            // The winding of the triangle gives +z, its normals are -z.
             let mesh = Mesh::from_indexed(rest_positions, vec![[0.0, 0.0, -1.0]; 4], vec![], vec![[0, 1, 2]])
                 .expect("a triangle");
             parts.shapes[0] = Shape::new(mesh, Modes::rigid()).expect("rigid");

@@ -1,9 +1,9 @@
-//! Packs the images of a scene into a bounded number of texture arrays, one layer per image and role.
+//! Packs the images of a scene into a bounded number of texture arrays, one layer per image and role (color or normal).
 //!
-//! Images of the same size share an array. If there are more sizes than [`MAX_ARRAYS`], the smallest array is merged into
-//! the array for which this wastes the fewest texels, and images are enlarged to the common size. Texture coordinates do
-//! not change, because they run from 0 to 1. Colors are stored as sRGB, normal maps as linear values. For cut-outs, the
-//! mipmap levels preserve the covered fraction of the image (`coverage`).
+//! Images of the same size share an array. If there are more sizes than [`MAX_ARRAYS`], the smallest array is merged
+//! into the array for which this wastes the fewest texels, and images are enlarged to the common size. Texture
+//! coordinates do not change, because they run from 0 to 1. Colors are stored as sRGB, normal maps as linear values.
+//! For cut-outs, the mipmap levels preserve the covered fraction of the image (`coverage`).
 
 mod coverage;
 
@@ -15,21 +15,21 @@ use modalcast_model::scene::Scene;
 
 use super::geometry::used_materials;
 
-/// Maximum number of arrays per role. Color arrays, normal arrays and the shadow map together need fewer than the sixteen
+/// Maximum number of arrays per role. The arrays of both roles and the shadow map together need fewer than the sixteen
 /// texture units that OpenGL guarantees to a fragment shader.
 pub(crate) const MAX_ARRAYS: usize = 6;
 
 /// Maximum bytes of all arrays with their mipmap levels. For comparison, 512 images of 4096 x 4096 take 46 GB.
 const MAX_TEXTURE_BYTES: u64 = 8 << 30;
 
-/// Content of an image.
+/// What an image contains.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum TextureRole {
     Color,
     Normal,
 }
 
-/// A texture array.
+/// A texture array whose layers have the same size.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct TextureArray {
     pub(crate) width: u32,
@@ -38,7 +38,7 @@ pub(crate) struct TextureArray {
     pub(crate) layers: Vec<usize>,
 }
 
-/// Location of a material's image: array and layer.
+/// Location of an image: index of the array, index of the layer.
 pub(crate) type ArrayLayer = (usize, usize);
 
 impl TextureArray {
@@ -95,7 +95,7 @@ pub(crate) fn check_texture_budget(texture_arrays: &[Vec<TextureArray>; 2]) -> R
     ))
 }
 
-/// Location of a texture in its arrays.
+/// Location of a texture; none if no array contains it.
 pub(crate) fn find_layer(arrays: &[TextureArray], texture: usize) -> Option<ArrayLayer> {
     arrays
         .iter()
@@ -103,7 +103,7 @@ pub(crate) fn find_layer(arrays: &[TextureArray], texture: usize) -> Option<Arra
         .find_map(|(index, array)| array.layers.iter().position(|layer| *layer == texture).map(|layer| (index, layer)))
 }
 
-/// One array per image size.
+/// One array per image size. Each texture is given by index, width and height.
 fn group_by_size(texture_sizes: impl Iterator<Item = (usize, u32, u32)>) -> Vec<TextureArray> {
     let mut arrays: Vec<TextureArray> = Vec::new();
     for (texture, width, height) in texture_sizes {
@@ -122,6 +122,7 @@ fn merge_arrays(mut arrays: Vec<TextureArray>, limit: usize) -> Vec<TextureArray
         arrays.sort_by_key(|array| std::cmp::Reverse(area(array.width, array.height)));
         let Some(smallest) = arrays.pop() else { break };
         let merged_size = |array: &TextureArray| (array.width.max(smallest.width), array.height.max(smallest.height));
+        // Texels that are added to all layers of `array`, and to one layer of the smallest array.
         let wasted_texels = |array: &TextureArray| {
             let (width, height) = merged_size(array);
             let enlargement = area(width, height) - area(array.width, array.height);
@@ -138,6 +139,7 @@ fn merge_arrays(mut arrays: Vec<TextureArray>, limit: usize) -> Vec<TextureArray
 /// Cutoff for the alpha of a texture's texels, if only cut-outs with the same cutoff use the texture.
 pub(crate) fn cutoff(scene: &Scene, texture: usize) -> Option<f32> {
     let materials = used_materials(scene).into_iter().map(|material| &scene.materials[material]);
+    // The shader multiplies the alpha of a texel by that of the material before the comparison.
     let cutoff_of = |material: &modalcast_model::domain::Material| match material.alpha_mode {
         AlphaMode::Mask { cutoff } => Some(cutoff / material.alpha),
         _ => None,
@@ -148,8 +150,8 @@ pub(crate) fn cutoff(scene: &Scene, texture: usize) -> Option<f32> {
         .then_some(common_cutoff)
 }
 
-/// All mipmap levels of an image at the size of its array, RGBA8, level 0 first. With a cutoff, all levels have the same
-/// coverage.
+/// All mipmap levels of an image at the size of its array, RGBA8, level 0 first. With a cutoff, all levels have the
+/// same coverage.
 pub(crate) fn mip_levels(
     texture: &Texture,
     array: &TextureArray,
@@ -195,6 +197,7 @@ impl LinearImage {
         Self { width: texture.width(), height: texture.height(), texels }
     }
 
+    /// The texel at (x, y), or the nearest texel for coordinates above the maximum.
     fn texel_at(&self, x: u32, y: u32) -> [f32; 4] {
         self.texels[(y.min(self.height - 1) * self.width + x.min(self.width - 1)) as usize]
     }
@@ -219,6 +222,7 @@ impl LinearImage {
 
     /// Enlarges the image bilinearly, with repeat wrapping like the sampler.
     fn enlarged(&self, width: u32, height: u32) -> Self {
+        // Along one axis: the two source texels around a destination texel, and the weight of the second.
         let interpolate = |destination: u32, destination_count: u32, source_count: u32| {
             let position = (destination as f32 + 0.5) * source_count as f32 / destination_count as f32 - 0.5;
             let low = position.floor();
@@ -247,7 +251,7 @@ impl LinearImage {
     /// Texels as RGBA8.
     fn bytes(&self, role: TextureRole) -> Vec<u8> {
         static SRGB: OnceLock<Vec<u8>> = OnceLock::new();
-        // With 65536 entries, the largest step of the curve, at black, is a twentieth of a byte.
+        // With 65536 entries, the largest step between entries, at black, is a twentieth of a byte level.
         let table =
             SRGB.get_or_init(|| (0..=65535).map(|step| byte(srgb_from_linear(step as f32 / 65535.0))).collect());
         let encode = |value: f32| match role {
@@ -258,8 +262,8 @@ impl LinearImage {
     }
 }
 
-/// Weights of the texels 2x, 2x + 1 and 2x + 2 in texel x of the halved side. For odd sides, a texel covers more than two
-/// texels; a mean of pairs would drop the last column and shift the others.
+/// Weights of the texels 2x, 2x + 1 and 2x + 2 in texel x of the halved side. If `side` is odd, a texel of the halved
+/// side covers more than two texels; a mean of pairs would drop the last texel and shift the others.
 fn downsample_weights(side: u32) -> Vec<[f32; 3]> {
     let half_side = (side / 2).max(1);
     let weights_of = |x: u32| match side {
@@ -270,11 +274,12 @@ fn downsample_weights(side: u32) -> Vec<[f32; 3]> {
     (0..half_side).map(weights_of).collect()
 }
 
-/// Converts 0 to 1 to a byte, rounded.
+/// Converts a value from 0 to 1 to a byte, rounded.
 fn byte(value: f32) -> u8 {
     (value * 255.0 + 0.5) as u8
 }
 
+/// Mean of texels with weights. The weights of colors are multiplied by alpha, unless all texels are transparent.
 fn alpha_weighted_mean(weighted_texels: &[([f32; 4], f32)]) -> [f32; 4] {
     let alpha: f32 = weighted_texels.iter().map(|(texel, weight)| texel[3] * weight).sum();
     let mut mean = [0.0, 0.0, 0.0, alpha];
@@ -338,6 +343,7 @@ mod tests {
 
     #[test]
     fn images_above_the_budget_are_rejected_with_their_sizes() {
+        // A full mipmap chain has about 4/3 times the texels of level 0, with 4 bytes each.
         let array = |side, count| TextureArray { width: side, height: side, layers: (0..count).collect() };
         let error = check_texture_budget(&[vec![array(16, 1), array(4096, 512)], vec![]])
             .expect_err("46 GB exceed the budget")
@@ -367,6 +373,7 @@ mod tests {
         for (level, rgba) in chain.iter().enumerate() {
             assert!(rgba.chunks_exact(4).all(|texel| texel[..3] == [0, 200, 0]), "level {level}: {rgba:?}");
         }
+        // A quarter of the texels has an alpha of 255.
         assert_eq!(chain[2], [0, 200, 0, 64]);
     }
 
@@ -408,6 +415,7 @@ mod tests {
         let texture = image(2, 2, |x, y| [255 * x as u8, 255 * y as u8, 0, 255]);
         let array = TextureArray { width: 7, height: 3, layers: vec![0] };
         let chain = mip_levels(&texture, &array, TextureRole::Normal, None);
+        // Levels of 7 x 3, 3 x 1 and 1 x 1 texels, with 4 bytes each.
         assert_eq!((chain[0].len(), chain.len(), chain[2].len()), (84, 3, 4));
         assert_eq!(array.bytes(), 4 * (21 + 3 + 1));
         let constant = image(1, 1, |_, _| [9, 99, 199, 255]);

@@ -1,17 +1,18 @@
 //! Generates the shader that blurs a variance shadow map by strips. The code is unrolled with one variable per sum,
-//! because not all compilers keep arrays in registers. It is inserted into `shaders/vsm_blur_strip.comp`, which declares
-//! the GLSL variables `corner`, `lane`, `side`, `first_row` and `buffer_offset`.
+//! because not all compilers keep arrays in registers. It is inserted into `shaders/vsm_blur_strip.comp`, which
+//! declares the GLSL variables `corner`, `lane`, `side`, `first_row` and `buffer_offset`.
 
 use std::fmt::Write as _;
 
 use modalcast_model::scene::ShadowSettings;
 
-/// Largest radius of the blur kernel for which the first of [`STRIP_SHAPES`] is faster. Measured on an H200 with a 4096^2
-/// map: radius 7 takes 135 us with the first and 154 us with the second shape, radius 12 takes 200 us and 166 us.
+/// Largest radius of the blur kernel for which the first of [`STRIP_SHAPES`] is used. Measured on an H200 with a map of
+/// 4096 x 4096 texels: a radius of 7 takes 135 us with the first shape and 154 us with the second, a radius of 12 takes
+/// 200 us and 166 us.
 const NARROW_RADIUS: u32 = 9;
-/// Lanes per workgroup and rows per iteration, for narrow and for wide kernels.
+/// Lanes per workgroup and rows per iteration: first for narrow kernels, then for wide kernels.
 const STRIP_SHAPES: [(u32, u32); 2] = [(64, 4), (128, 8)];
-/// Largest radius whose sums fit into the registers of a lane.
+/// Largest radius of the blur kernel whose 2 `radius` + 1 sums fit into the registers of a lane.
 const MAX_RADIUS: u32 = 24;
 
 /// Strip of the map that a workgroup blurs, in texels.
@@ -29,8 +30,8 @@ pub(crate) struct BlurStrip {
 
 impl BlurStrip {
     /// Fits a strip to the blur of a shadow map; none if the kernel is too wide. A strip also processes 2 `radius` rows
-    /// that it does not store, so large maps have tall strips. Small maps have short strips, because the device needs
-    /// many workgroups.
+    /// that it does not write. Large maps have tall strips, so that this overhead is small. Small maps have short
+    /// strips, because the device needs many workgroups.
     pub(crate) fn fit(shadow: &ShadowSettings) -> Option<Self> {
         let radius = shadow.blur_radius();
         let (columns, rows_per_iteration) = STRIP_SHAPES[usize::from(radius > NARROW_RADIUS)];
@@ -99,8 +100,9 @@ impl BlurStrip {
         loads + &stores
     }
 
-    /// Blurs the rows of an iteration horizontally, adds each row to the vertical sums that contain it, and stores the sums
-    /// that are complete. `sum0` is the oldest sum; an iteration completes one sum per row, and the others move up.
+    /// Blurs the rows of an iteration horizontally, adds each row to the vertical sums that contain it, and stores the
+    /// sums that are complete. `sum0` is the oldest sum. An iteration completes one sum per row; the remaining sums are
+    /// then renumbered from 0.
     fn accumulate_rows(self, weights: &[f32]) -> String {
         let Self { columns, rows_per_iteration, radius, .. } = self;
         let weight_at = |position: u32, center: u32| format!("{:?}", weights[position.abs_diff(center) as usize]);
@@ -145,6 +147,7 @@ mod tests {
 
     #[test]
     fn strips_fit_into_shared_memory_in_whole_iterations() {
+        // Blurs from 0 to 16 texels.
         for tenths in 0..=160 {
             let blur = tenths as f32 / 10.0;
             for size in [16, 512, 1000, 4096, 16384] {
@@ -159,7 +162,7 @@ mod tests {
                 assert_eq!((strip.rows + 2 * strip.radius) % strip.rows_per_iteration, 0, "{strip:?}");
             }
         }
-        assert!(strip(8.1, 1024).is_none(), "expected no strip for a wide kernel");
+        assert!(strip(8.1, 1024).is_none(), "expected no strip for a radius of 25 texels");
     }
 
     #[test]
@@ -173,6 +176,7 @@ mod tests {
                 (0, strip.rows_per_iteration),
                 "{blur}: markers and stores"
             );
+            // Stores to `depths` contain "] = ", loads do not.
             assert_eq!(
                 count("depths[buffer_offset + ") - count("] = "),
                 strip.rows_per_iteration * taps,
@@ -181,7 +185,10 @@ mod tests {
             assert_eq!(count(" * blurred"), strip.rows_per_iteration * taps, "{blur}: sums");
             let center = format!("{:?} * blurred0", weights[0]);
             let center_sum = format!("sum{} += {center}", strip.radius);
-            assert!(text.contains(&center_sum) || strip.radius == 0, "{blur}: the center row has the center weight");
+            assert!(
+                text.contains(&center_sum) || strip.radius == 0,
+                "{blur}: expected the center weight of the center row"
+            );
         }
     }
 }

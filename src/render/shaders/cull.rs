@@ -8,7 +8,7 @@ use crate::layout::cull::{CAMERA_COUNTERS, MAX_GROUPS, MAX_LEVEL, SHADOW_COUNTER
 const CULL: &str = include_str!("../../../shaders/shared/cull.glsl");
 
 impl ShaderOptions {
-    /// Tests which triangles the camera may see; with occlusion culling also against the depth pyramid.
+    /// Tests which triangles the camera may see. With occlusion culling, also tests them against the depth pyramid.
     pub(crate) fn cull_triangles(&self, samples: u32) -> ProgramSource {
         let defines: &[&str] = if self.features.has_occlusion_culling() { &["CULL_OCCLUDED"] } else { &[] };
         let head = self.cull_head(defines)
@@ -55,7 +55,8 @@ impl ShaderOptions {
         )
     }
 
-    /// Builds the first levels of the depth pyramid from the depth, or further levels from them.
+    /// Builds the first levels of the depth pyramid from the depth; or, unless `is_first_dispatch`, the remaining
+    /// levels.
     pub(crate) fn depth_pyramid(&self, samples: u32, is_first_dispatch: bool) -> ProgramSource {
         let head =
             self.cull_head(if is_first_dispatch { &["FROM_DEPTH"] } else { &[] }) + &self.sample_defines(samples);

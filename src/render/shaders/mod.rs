@@ -43,7 +43,7 @@ pub(crate) struct ShaderOptions {
     pub(crate) features: ShaderFeatures,
     /// The materials that triangles use.
     pub(crate) used_materials: Vec<MaterialUse>,
-    /// Sample positions within a multisampled pixel.
+    /// Sample positions within a pixel with four samples, 0 to 1.
     pub(crate) sample_positions: Vec<[f32; 2]>,
     /// GLSL that accumulates the samples of a pixel, see [`post::sample_resolve`].
     pub(crate) sample_resolve: String,
@@ -51,7 +51,7 @@ pub(crate) struct ShaderOptions {
     pub(crate) post_depth_coverage: bool,
 }
 
-/// A material that triangles use: their blend mode, and the texture arrays of its images.
+/// A material that triangles use: its blend mode, and the indices of the texture arrays with its images.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct MaterialUse {
     pub(crate) blend_mode: BlendMode,
@@ -80,12 +80,13 @@ impl ShaderOptions {
         for define in self.features.defines().iter().chain(defines) {
             writeln!(text, "#define {define}").ok();
         }
+        // Number of texels of a material; a texel has 16 bytes.
         writeln!(text, "#define MATERIAL_STRIDE {}", MATERIAL_BYTES / 16).ok();
         text
     }
 
-    /// Defines for triangles with these blend modes: undefines image features that they do not use, and replaces the
-    /// material lookup by a constant if they have one material.
+    /// Defines for triangles with these blend modes. Undefines image features that their materials do not use. If there
+    /// is only one material, replaces the material lookup by a constant.
     pub(crate) fn material_defines(&self, blend_modes: &[BlendMode]) -> String {
         let mut materials = (0..).zip(&self.used_materials).filter(|(_, used)| blend_modes.contains(&used.blend_mode));
         let mut text = match (materials.next(), materials.next()) {
@@ -106,14 +107,14 @@ impl ShaderOptions {
         text
     }
 
-    /// Lookup functions for the materials of these blend modes and their images.
+    /// Lookup functions for the materials with these blend modes, and for the images of these materials.
     pub(crate) fn material_lookups(&self, blend_modes: &[BlendMode], derivatives: UvDerivatives) -> String {
         let colors = sampler("color", COLOR_UNIT, &self.arrays(blend_modes, TextureRole::Color), derivatives);
         let normals = sampler("normal", NORMAL_UNIT, &self.arrays(blend_modes, TextureRole::Normal), derivatives);
         [MATERIAL, &colors, &normals].concat()
     }
 
-    /// Texture arrays of the images that materials with these blend modes use in a role.
+    /// Indices of the texture arrays whose images the materials with these blend modes use in a role.
     fn arrays(&self, blend_modes: &[BlendMode], role: TextureRole) -> BTreeSet<usize> {
         let array_of = |material: &MaterialUse| match role {
             TextureRole::Color => material.color_array,
@@ -152,7 +153,7 @@ impl ShaderOptions {
         ProgramSource { label, stages: vertex_and_fragment([&head, FRAME, CLIP, vertex].concat(), fragment) }
     }
 
-    /// Draws the layer of the blended triangles, except the parts that were drawn as opaque.
+    /// Draws the blended triangles into the blend layer, except the parts that were drawn as opaque.
     pub(crate) fn blended(&self, samples: u32) -> ProgramSource {
         let head = self.head(&[]) + &self.material_defines(&[BlendMode::Blend]);
         let material_lookups = self.material_lookups(&[BlendMode::Blend], UvDerivatives::Implicit);
@@ -238,8 +239,8 @@ fn tile_list() -> String {
     format!("#define TILE {TILE}\n#define TILES_PER_ROW {TILES_PER_ROW}u\n{TILE_LIST}")
 }
 
-/// Function `{name}_texel` that samples an image in one of several texture arrays. Implicit derivatives are undefined in
-/// divergent control flow, so with several arrays the derivatives are computed before the array is selected.
+/// Function `{name}_texel` that samples an image in one of several texture arrays. Implicit derivatives are undefined
+/// in divergent control flow, so with several arrays the derivatives are computed before the array is selected.
 fn sampler(name: &str, unit: u32, arrays: &BTreeSet<usize>, derivatives: UvDerivatives) -> String {
     let mut text = String::new();
     let Some(first) = arrays.first() else { return text };
@@ -268,9 +269,9 @@ fn sampler(name: &str, unit: u32, arrays: &BTreeSet<usize>, derivatives: UvDeriv
 /// How a lookup gets the derivatives of texture coordinates.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum UvDerivatives {
-    /// From differences between the fragments of a quad.
+    /// From differences between neighboring fragments (`texture`, or `dFdx` and `dFdy`).
     Implicit,
-    /// As arguments.
+    /// From the caller, as arguments.
     Explicit,
 }
 
@@ -325,7 +326,7 @@ mod tests {
     fn shading_contains_only_features_of_the_scene() {
         let plain_options = ShaderOptions { features: ShaderFeatures::NONE, ..options(AlphaMode::Opaque) };
         let [background, shading] = [plain_options.background(4), plain_options.shade(4)].map(text);
-        assert!(!background.contains("vec4 shade_triangle("), "the background contains no triangle");
+        assert!(!background.contains("vec4 shade_triangle("), "expected no triangle in the background");
         assert!(shading.contains("vec4 shade_triangle("));
         for text in [&background, &shading] {
             assert!(!text.contains("vec3 shade_ground(") && !text.contains("textureGrad"));

@@ -8,7 +8,8 @@ use crate::layout::oit::{BINS, HISTOGRAM_TILE};
 use crate::scene_data::geometry::BlendMode;
 
 impl ShaderOptions {
-    /// Counts the blended fragments of each pixel, or adds them to its list.
+    /// Counts the blended fragments of each pixel, or adds them to the list of the pixel; see the phases in
+    /// `layout::oit`.
     pub(crate) fn oit_gather(&self, samples: u32) -> ProgramSource {
         // Extension directives must precede all other code.
         let post_depth_coverage = samples > 1 && self.post_depth_coverage;
@@ -29,7 +30,7 @@ impl ShaderOptions {
         }
     }
 
-    /// Sorts each list, and shades and blends its fragments to one layer per sample.
+    /// Sorts each list, and shades and blends its fragments to one blend layer per sample.
     pub(crate) fn oit_resolve(&self, samples: u32) -> ProgramSource {
         let mut text = self.head(&[]) + &bins_define() + &tile_list() + &self.material_defines(&[BlendMode::Blend]);
         text += &[&self.sample_defines(samples), FRAME, CLIP, &self.sun_visibility(), OIT_LISTS].concat();

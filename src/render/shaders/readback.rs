@@ -6,7 +6,8 @@ use super::{
 use crate::layout::WORKGROUP_SIZE;
 
 impl ShaderOptions {
-    /// Computes an AOV field from the ids: `DEPTH` and `NORMALS` for one sample per pixel, `VALUES` for all samples.
+    /// Computes an AOV field from the ids. `field`: `DEPTH` or `NORMALS` (one sample per pixel), or `VALUES` (all
+    /// samples).
     pub(crate) fn aov(&self, field: &'static str, samples: u32) -> ProgramSource {
         let mut text = format!("{VERSION}#define WORKGROUP_SIZE {WORKGROUP_SIZE}\n#define {field}\n");
         // Only the depth field contains the ground.
@@ -19,7 +20,7 @@ impl ShaderOptions {
     }
 }
 
-/// Copies the triangles that are visible in a rectangle of pixels.
+/// Copies id, corners, positions and normals of the triangles that are visible in a rectangle of pixels.
 pub(crate) fn pick() -> ProgramSource {
     let head = format!("{VERSION}#define WORKGROUP_SIZE {WORKGROUP_SIZE}\n#define SAMPLES 1\n");
     let body = [&head, VISIBILITY_IDS, BARYCENTRICS, include_str!("../../../shaders/pick.comp")].concat();

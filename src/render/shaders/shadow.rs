@@ -18,7 +18,7 @@ const VSM_MOMENTS: &str = include_str!("../../../shaders/shared/vsm_moments.glsl
 
 /// Consecutive texels along the direction of the blur that an invocation writes.
 pub(crate) const TEXELS_PER_INVOCATION: u32 = 8;
-/// Lanes of a workgroup that blurs a tile.
+/// Number of lanes of a workgroup that blurs a tile.
 const TILE_WORKGROUP_SIZE: u32 = 256;
 /// Bytes of shared memory that OpenGL 4.3 guarantees to a workgroup.
 pub(crate) const SHARED_BYTES: u32 = 32 << 10;
@@ -34,7 +34,8 @@ pub(crate) fn texels_per_workgroup(shadow: &ShadowSettings) -> [u32; 2] {
 struct BlurTile {
     columns: u32,
     rows: u32,
-    /// Rows of depth that shared memory holds at once; with the margins, a tile has `rows + 2 radius` rows.
+    /// Rows of a band: the rows of depth that shared memory holds at once. A tile and its margins have
+    /// `rows + 2 * radius` rows, in one or more bands.
     band_rows: u32,
     /// Radius of the blur kernel.
     radius: u32,
@@ -44,8 +45,8 @@ impl BlurTile {
     /// The first candidate that fits into shared memory. A wider blur kernel needs smaller tiles.
     fn fit(shadow: &ShadowSettings) -> Self {
         let radius = shadow.blur_radius();
-        // Columns, rows, and maximum rows per band. 256 is no limit: one band holds all rows, because a second band would
-        // leave most lanes idle.
+        // Columns, rows, and maximum rows per band. A maximum of 256 means one band for all rows, because a second band
+        // would leave most lanes idle.
         let candidates = [(32, 64, 256), (32, 48, 256), (32, 32, 256), (32, 32, 32), (16, 64, 32), (16, 64, 16)];
         let tiles = candidates.map(|(columns, rows, max_band_rows)| Self {
             columns,
@@ -56,17 +57,18 @@ impl BlurTile {
         tiles.into_iter().find(|tile| tile.shared_bytes() <= SHARED_BYTES).unwrap_or(tiles[candidates.len() - 1])
     }
 
-    /// Floats from one row of depths to the next; odd, which avoids bank conflicts.
+    /// Floats from the start of one row of depths to the next. An odd number avoids bank conflicts.
     const fn depth_pitch(&self) -> u32 {
         (self.columns + 2 * self.radius) | 1
     }
 
-    /// Moment pairs from one blurred row to the next.
+    /// Moment pairs from the start of one blurred row to the next.
     const fn row_pitch(&self) -> u32 {
         self.columns + 1
     }
 
-    /// Bytes of shared memory.
+    /// Bytes of shared memory: a float per depth of a band, and a moment pair of two floats per texel that is blurred
+    /// in x.
     const fn shared_bytes(&self) -> u32 {
         4 * self.band_rows * self.depth_pitch() + 8 * (self.rows + 2 * self.radius) * self.row_pitch()
     }
@@ -110,7 +112,7 @@ impl ShaderOptions {
         ProgramSource { label, stages: vertex_and_fragment(vertex(&head), fragment) }
     }
 
-    /// The programs that blur a variance shadow map, in execution order; none for other shadow methods.
+    /// The programs that blur a variance shadow map, in execution order; empty for other shadow methods.
     pub(crate) fn blur(&self) -> Vec<ProgramSource> {
         let Some(shadow) = self.features.variance_shadow() else { return Vec::new() };
         match self.features.blur_method {
@@ -121,9 +123,10 @@ impl ShaderOptions {
         }
     }
 
-    /// The first blur program, for depth in a storage buffer; none for other shadow methods.
+    /// The first blur program, for depth in a storage buffer; none if the shadow is no variance map.
     pub(crate) fn blur_from_buffer(&self) -> Option<ProgramSource> {
         let ProgramSource { label, stages } = self.blur().into_iter().next()?;
+        // Inserts the define after the first line, which is the version.
         let define_buffer = |text: String| text.replacen('\n', "\n#define DEPTH_IN_BUFFER\n", 1);
         let stages = stages.into_iter().map(|(stage, text)| (stage, define_buffer(text))).collect();
         Some(ProgramSource { label: label + ", from a buffer", stages })
@@ -193,9 +196,9 @@ impl ShaderOptions {
     }
 }
 
-/// GLSL function that computes the `texels_per_invocation` blurred texels of an invocation, unrolled. `weights`: one half
-/// of a Gaussian, center first. `fetch` gives the GLSL expression for the moments at an offset from the first of these
-/// texels. Each pair of moments is fetched only once.
+/// GLSL function that computes the `texels_per_invocation` blurred texels of an invocation, unrolled. `weights`: one
+/// half of a Gaussian, center first. `fetch` gives the GLSL expression for the moments at an offset from the first of
+/// these texels. Each pair of moments is fetched only once.
 fn blur_function(
     name: &str,
     parameters: &str,
@@ -219,8 +222,8 @@ fn blur_function(
     text + "}\n"
 }
 
-/// One half of a normalized Gaussian (equation 3.11 in one dimension), center first, truncated at three standard
-/// deviations. `filter_deviation` is in texels.
+/// One half of a normalized Gaussian (equation 3.11 of the thesis in one dimension), center first, truncated at three
+/// standard deviations. `filter_deviation` is in texels.
 pub(crate) fn gaussian_weights(filter_deviation: f32) -> Vec<f32> {
     let filter_deviation = f64::from(filter_deviation);
     let radius = (3.0 * filter_deviation).ceil() as i32;
@@ -259,7 +262,11 @@ mod tests {
             );
         }
         let default = BlurTile::fit(&ShadowSettings::default());
-        assert_eq!((default.rows, default.band_rows), (64, 74), "the default blur has the largest tile, in one band");
+        assert_eq!(
+            (default.rows, default.band_rows),
+            (64, 74),
+            "expected one band of 64 rows and twice the radius of 5"
+        );
     }
 
     #[test]

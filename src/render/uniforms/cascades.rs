@@ -1,5 +1,6 @@
-//! Cascades of a split shadow map (parallel-split shadow maps, Zhang et al. 2006). The view volume is split by distance.
-//! Each part has a cascade: a map of a part of the light box. The last cascade covers the whole light box.
+//! Cascades of a split shadow map (parallel-split shadow maps, Zhang et al. 2006). The view volume is split by depth.
+//! Each part has a cascade: a map of the part of the light box (`light_box`) that casts shadows there. The last cascade
+//! covers the whole light box. All depths are distances from the camera along the view axis, in scene units.
 
 use bytemuck::{Pod, Zeroable};
 use nalgebra::{Point3, Vector3};
@@ -10,16 +11,16 @@ use modalcast_model::scene::{Camera, Scene};
 
 /// Weight of the logarithmic split scheme; the uniform scheme has the remaining weight.
 const SPLIT_LAMBDA: f64 = 0.5;
-/// Minimum distance at which the first part begins, relative to the farthest point.
+/// Minimum depth at which the first part begins, relative to the depth of the farthest point.
 const MIN_NEAR_FRACTION: f64 = 1e-3;
 
 /// Uniform block of the cascades. Twin of `CascadeBlock` in `shaders/shared/shadow_cascades.glsl`.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 pub(crate) struct ShadowCascades {
-    /// Per cascade: scale and offset from coordinates of the whole map to those of the cascade.
+    /// Per cascade: the map from coordinates of the whole map to those of the cascade. x, y: scale. z, w: offset.
     scale_offsets: [[f32; 4]; 4],
-    /// Per cascade: depth from the camera at which it ends; infinite for the last one.
+    /// Per cascade: depth at which it ends; infinite for the last cascade.
     end_depths: [f32; 4],
 }
 
@@ -56,7 +57,9 @@ fn visible_depth_range(camera: &Camera, box_params: &LightBoxParams) -> (f64, f6
     let view = camera.camera_from_world();
     let depths = box_params.bounds.corners().map(|corner| -view.transform_point(&corner).z);
     let mut near = depths.into_iter().fold(f64::INFINITY, f64::min);
+    // Positive, as the logarithmic scheme needs it.
     let mut far = depths.into_iter().fold(f64::NEG_INFINITY, f64::max).max(1e-6);
+    // A camera with far = 0 has planes that are fitted to the bounds.
     if camera.far > 0.0 {
         (near, far) = (near.max(camera.near), far.min(camera.far).max(camera.near));
     }
@@ -72,7 +75,8 @@ fn split_depths(near: f64, far: f64, count: usize) -> Vec<f64> {
     (1..count).map(split_depth).collect()
 }
 
-/// Bounding sphere of the view volume between two depths. Its radius does not depend on the direction of the camera.
+/// Center and radius of the bounding sphere of the view volume between two depths. The radius does not depend on the
+/// direction of the camera.
 fn bounding_sphere(
     camera: &Camera,
     params: &FrameParams,
@@ -85,6 +89,7 @@ fn bounding_sphere(
     let corners: [Point3<f64>; 8] = std::array::from_fn(|corner| {
         let sign = |bit: usize| if corner >> bit & 1 == 0 { -1.0 } else { 1.0 };
         let depth = if corner < 4 { near_depth } else { far_depth };
+        // Inverse of the projection: depth * ndc = P[axis][axis] * coordinate - P[axis][2] * depth, with ndc = -1 or 1.
         let coordinate =
             |axis: usize| depth * (sign(axis) + clip_from_camera[(axis, 2)]) / clip_from_camera[(axis, axis)];
         world_from_camera.transform_point(&Point3::new(coordinate(0), coordinate(1), -depth))
@@ -93,7 +98,8 @@ fn bounding_sphere(
     (center, corners.iter().map(|corner| (corner - center).norm()).fold(0.0, f64::max))
 }
 
-/// Sides of a cascade that encloses a sphere; none if it would not be finer than the whole map, or is not finite.
+/// Sides of a cascade that encloses a sphere, given by center and radius. None if the cascade would not be finer than
+/// the whole map, or if the sphere is not finite.
 fn fit_cascade(
     whole_box: &LightBox,
     box_params: &LightBoxParams,
@@ -108,7 +114,7 @@ fn fit_cascade(
     })
 }
 
-/// Scale and offset from coordinates of the whole map to those of the cascade.
+/// Scale and offset from coordinates of the whole map to those of the cascade, as in [`ShadowCascades`].
 fn cascade_transform(whole_sides: &[TexelSpan; 2], cascade_sides: &[TexelSpan; 2]) -> [f32; 4] {
     let scale = [0, 1].map(|axis: usize| whole_sides[axis].half_length / cascade_sides[axis].half_length);
     let offset = [0, 1]
@@ -162,6 +168,7 @@ mod tests {
                 .expect("a cascade")
         };
         let first_sides = fit_at(&params(0.0));
+        // A camera that turns, and moves along x.
         for step in 0..100 {
             let mut params = params(0.03 * f64::from(step));
             let (center, radius) = bounding_sphere(&params.camera, &params, 2.0, 8.0, &box_params);
@@ -175,7 +182,8 @@ mod tests {
                 );
                 let texel = 2.0 * first_sides[axis].half_length / box_params.size;
                 let shift = (sides[axis].low - first_sides[axis].low) / texel;
-                assert!((shift - shift.round()).abs() < 1e-6, "moves by {shift} texels");
+                assert!((shift - shift.round()).abs() < 1e-6, "expected a whole number of texels, got {shift}");
+                // The sphere is that of the camera before its move.
                 let center_coordinate = whole_box.axes[axis].dot(&center.coords);
                 let unmoved_side = fit_cascade(&whole_box, &box_params, &(center, radius)).expect("a cascade")[axis];
                 assert!(
@@ -199,6 +207,7 @@ mod tests {
             FrameParams { camera: Camera { view, lens: Lens::FieldOfView(100.0), near, far }, ..params(0.0) }
         };
         let point = BoundingBox { min: [5.0; 3], max: [5.0; 3] };
+        // Near and far 0: the planes are fitted to the bounds.
         for params in [
             params_with(1e-6, 1e9, [0.0; 3]),
             params_with(0.0, 0.0, [0.0, 0.0, -900.0]),

@@ -15,33 +15,33 @@ pub(crate) struct FrameUniforms {
     clip_from_world: [[f32; 4]; 4],
     shadow_from_world: [[f32; 4]; 4],
     world_from_ndc: [[f32; 4]; 4],
-    /// w: 1 if the scene has a ground and the camera is above it, else 0.
+    /// xyz: position of the camera. w: 1 if the scene has a ground and the camera is above it, else 0.
     eye: [f32; 4],
-    /// w: 0 if the ground lies behind all surfaces, so that the shading adds it; else 1.
+    /// xyz: direction to the sun. w: 0 if the ground lies behind all surfaces, so that the shading adds it; else 1.
     to_sun: [f32; 4],
     sunlight: [f32; 4],
     skylight: [f32; 4],
     zenith: [f32; 4],
     horizon: [f32; 4],
-    /// w: height of the ground.
+    /// xyz: up axis. w: height of the ground.
     up: [f32; 4],
     /// xyz: color. w: fade distance.
     ground: [f32; 4],
-    /// w: half the side of the ground's square.
+    /// xyz: center. w: half the side of the ground's square.
     ground_center: [f32; 4],
     /// Minimum variance, light bleeding reduction, alpha threshold, side of the map in texels.
     shadow: [f32; 4],
-    /// xyz: [`LightBox::ground`]. w: side of a texel in scene units.
+    /// xyz: [`LightBox::ground`]. w: side of a shadow map texel in scene units.
     shadow_ground_plane: [f32; 4],
 }
 
 const _: () = assert!(size_of::<FrameUniforms>() == 368, "FrameUniforms differs from shaders/shared/frame.glsl");
 
 /// Half the side of the ground's square, in multiples of the fade distance D. The ground's weight is exp(-(d / D)^2) at
-/// distance d, so at the border its color is exactly that of the horizon.
+/// distance d. At the border it is exp(-36), so the rounded color is that of the horizon.
 const GROUND_EXTENT: f64 = 6.0;
 
-/// Vertices below the ground by at most this tolerance count as on the ground. In multiples of f32::EPSILON times the
+/// Vertices below the ground by at most this tolerance count as on the ground. The unit is f32::EPSILON times the
 /// largest coordinate, because positions are sums in f32. Rasterized ground has a polygon offset for the same reason
 /// (`PipelineState::polygon_offset`).
 const GROUND_TOLERANCE_EPSILONS: f64 = 4.0;
@@ -63,7 +63,7 @@ impl FrameUniforms {
         let rebased_camera = params.camera.relative_to(origin);
         let camera_from_world = rebased_camera.camera_from_world();
         let clip_from_camera = clip_from_camera(scene, params, origin);
-        let (center, fade_distance) = ground_disc(scene.up.index(), rest_bounds, rebased_camera.eye());
+        let (center, fade_distance) = ground_center_and_fade(scene.up.index(), rest_bounds, rebased_camera.eye());
         let color = |[r, g, b]: [f32; 3], w: f64| [r, g, b, w as f32];
         let frame = Self {
             clip_from_world: (clip_from_camera * camera_from_world).cast().into(),
@@ -93,8 +93,8 @@ impl FrameUniforms {
         }
     }
 
-    /// Whether the view ray through a point in normalized device coordinates hits the ground. Used for samples without an
-    /// id, if the ground was not rasterized. Twin of `ray_hits_ground` in `shaders/shared/ground_plane.glsl`.
+    /// Whether the view ray through a point in normalized device coordinates hits the ground. Used for samples without
+    /// an id, if the ground was not rasterized. Twin of `ray_hits_ground` in `shaders/shared/ground_plane.glsl`.
     pub(crate) fn ray_hits_ground(&self, ndc: [f64; 2]) -> bool {
         let to_vector3 = |vector4: [f32; 4]| Vector3::new(vector4[0], vector4[1], vector4[2]).cast::<f64>();
         let [x, y, forward] = [0, 1, 2].map(|column| to_vector3(self.world_from_ndc[column]));
@@ -157,8 +157,8 @@ pub(crate) fn light_box_params(scene: &Scene, params: &FrameParams, origin: [f64
     }
 }
 
-/// Sides of a shadow map texel in world space: two vectors along x and y of the map, in scene units. None if the look has
-/// no shadow. Valid for positions relative to the scene's origin.
+/// Sides of a shadow map texel in world space: two vectors along x and y of the map, in scene units. None if the look
+/// has no shadow. Valid for positions relative to the scene's origin.
 pub fn shadow_texel_axes(scene: &Scene, params: &FrameParams) -> Option<[Vector3<f64>; 2]> {
     let shadow = scene.look.shadow?;
     let shadow_from_world = LightBox::fit(&light_box_params(scene, params, [0.0; 3])).shadow_from_world;
@@ -194,8 +194,9 @@ pub(crate) fn ground_is_behind_scene(scene: &Scene, params: &FrameParams, origin
         && min_height >= ground_height
 }
 
-/// Rest bounds relative to `origin`. An origin other than 0 means that the scene moved far away. Then the rest bounds are
-/// moved to the center of the current bounds, but keep their height, which is that of the ground.
+/// Rest bounds relative to `origin`. An origin other than 0 means that the scene moved far away. Then the rest bounds
+/// are moved horizontally to the center of the current bounds. Their height above the world's origin does not change,
+/// because the ground is at their lower end.
 fn rebased_rest_bounds(scene: &Scene, bounds: BoundingBox, origin: [f64; 3]) -> BoundingBox {
     let rest_bounds = scene.rest_bounds;
     if origin == [0.0; 3] {
@@ -207,9 +208,10 @@ fn rebased_rest_bounds(scene: &Scene, bounds: BoundingBox, origin: [f64; 3]) -> 
     BoundingBox { min: shifted(rest_bounds.min), max: shifted(rest_bounds.max) }
 }
 
-/// Center of the ground below the scene, and the distance D over which it fades. One diagonal away from the center, and
-/// below the camera, the ground keeps at least exp(-(1 / 3.5)^2) = 92 % of its color.
-fn ground_disc(up: usize, rest_bounds: BoundingBox, eye: Vector3<f64>) -> (Vector3<f64>, f64) {
+/// Center of the ground below the scene, and the distance D over which the ground fades. D is 3.5 times the diagonal of
+/// the scene or the camera's horizontal distance, whichever is larger. So the ground keeps at least exp(-(1 / 3.5)^2) =
+/// 92 % of its color up to there. `up`: index of the up axis.
+fn ground_center_and_fade(up: usize, rest_bounds: BoundingBox, eye: Vector3<f64>) -> (Vector3<f64>, f64) {
     let mut center = rest_bounds.center().coords;
     center[up] = rest_bounds.min[up];
     let mut offset = eye - center;
@@ -230,7 +232,7 @@ fn world_from_ndc(clip_from_camera: &Matrix4<f64>, camera_from_world: &Matrix4<f
     (world_from_camera * camera_from_ndc).to_homogeneous()
 }
 
-/// Boolean as a shader number.
+/// Boolean as a number for shaders.
 const fn flag(condition: bool) -> f64 {
     if condition { 1.0 } else { 0.0 }
 }
@@ -254,8 +256,8 @@ mod tests {
         let (clip_from_camera, camera_from_world) =
             (camera.clip_from_camera(320, 200, &BoundingBox::EMPTY), camera.camera_from_world());
         let point = nalgebra::Point3::new(0.3, -0.2, 0.7);
-        let ndc = (clip_from_camera * camera_from_world * point.to_homogeneous()).scale(1.0);
-        let ndc = Vector3::new(ndc.x / ndc.w, ndc.y / ndc.w, 1.0);
+        let clip = clip_from_camera * camera_from_world * point.to_homogeneous();
+        let ndc = Vector3::new(clip.x / clip.w, clip.y / clip.w, 1.0);
         let direction = world_from_ndc(&clip_from_camera, &camera_from_world).fixed_view::<3, 3>(0, 0) * ndc;
         let expected = (point.coords - camera.eye()).normalize();
         assert!((direction.normalize() - expected).norm() < 1e-12, "expected {expected}, got {direction}");
@@ -269,6 +271,7 @@ mod tests {
         let bounds = BoundingBox { min: shifted(rest_bounds.min), max: shifted(rest_bounds.max) };
         assert_eq!(rebased_rest_bounds(&scene, bounds, [0.0; 3]), rest_bounds, "expected no shift without an origin");
         let rebased_rest_bounds = rebased_rest_bounds(&scene, bounds, [1024.0, 2048.0, 0.0]);
+        // y is the up axis.
         let expected = |corner: [f64; 3]| [corner[0] + 3.0, corner[1] - 2048.0, corner[2] - 7.0];
         assert_eq!(rebased_rest_bounds, BoundingBox { min: expected(rest_bounds.min), max: expected(rest_bounds.max) });
     }
@@ -278,6 +281,8 @@ mod tests {
         let scene = Scene::new(squares(vec![Material::default()])).expect("a valid scene");
         let (rest_bounds, up) = (scene.rest_bounds, scene.up.index());
         let max_coordinate = rest_bounds.min[up].abs().max(rest_bounds.max[up].abs());
+        // Lowers the lowest vertex by `lowering`. `camera_height` is above the ground, `origin_height` above the
+        // world's origin.
         let is_behind = |lowering: f64, camera_height: f64, origin_height: f64| {
             let camera = Camera::fit_to_scene(&scene, 64, 64);
             let mut params = FrameParams { camera, width: 64, height: 64, bounds: rest_bounds, light_bounds: None };
@@ -295,13 +300,16 @@ mod tests {
         assert!(is_behind(2e-7 * max_coordinate, 1.0, 0.0), "expected a tolerance for rounding");
         assert!(
             !is_behind(1e-6 * max_coordinate, 1.0, 0.0) && !is_behind(1e-2, 1.0, 4096.0),
-            "a vertex is below the ground"
+            "expected the ground not to be behind a vertex that is below it"
         );
-        assert!(!is_behind(0.0, 0.0, 0.0) && !is_behind(0.0, -1.0, 0.0), "the camera is not above");
+        assert!(
+            !is_behind(0.0, 0.0, 0.0) && !is_behind(0.0, -1.0, 0.0),
+            "expected no ground behind the scene for a camera at the ground or below"
+        );
     }
 
     #[test]
-    fn overflowed_bounds_are_replaced_overflowed_cameras_rejected() {
+    fn replaces_overflowed_bounds_and_rejects_overflowed_cameras() {
         let scene = Scene::new(squares(vec![Material::default()])).expect("a valid scene");
         let mut params = FrameParams {
             camera: Camera::fit_to_scene(&scene, 64, 64),

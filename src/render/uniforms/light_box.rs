@@ -3,16 +3,17 @@
 //!
 //! The z axis of light space is v_l, the direction to the sun; its y axis points up in the world. The box is
 //! axis-aligned in light space and symmetric about its center in x and y. It encloses the light-space bounds of the
-//! vertices, or, in frames without these bounds, the corners of the world-space bounds, as in the thesis. The far plane is
-//! moved until the box contains the whole shadow on the ground. All sides are quantized to steps that are fixed in the
-//! world, so that shadow edges do not crawl while the scene sways.
+//! vertices, or, in frames without these bounds, the corners of the world-space bounds, as in the thesis. The far plane
+//! is moved until the box contains the whole shadow on the ground. All sides are quantized to steps that are fixed in
+//! the world, so that shadow edges do not crawl while the scene sways.
 
 use nalgebra::{Matrix4, Vector3};
 
 use modalcast_model::scene::{BoundingBox, OrientedBounds, UpAxis, light_axes};
 
-/// Maximum distance between the near plane and the ground's part of the far plane, in diagonals of the bounds. A grazing
-/// sun would move the far plane to infinity. Receivers beyond the far plane are still shaded correctly.
+/// Maximum distance from the near plane to the ground at the corners of the map, in diagonals of the bounds. Without
+/// this limit, a grazing sun would move the far plane to infinity. Receivers beyond the far plane are still shaded
+/// correctly.
 const MAX_GROUND_DEPTH: f64 = 8.0;
 
 /// The fitted shadow map.
@@ -21,7 +22,8 @@ pub(crate) struct LightBox {
     /// World space to the map: x and y are 0 to 1 across the map; z is 0 at the plane nearest to the sun and 1 at the
     /// farthest plane.
     pub(crate) shadow_from_world: Matrix4<f64>,
-    /// Coefficients a, b and c of the depth of the ground at (x, y) of the map: a x + b y + c; (0, 0, 1) without a ground.
+    /// Coefficients a, b and c of the depth of the ground at (x, y) of the map: a x + b y + c; (0, 0, 1) without a
+    /// ground.
     pub(crate) ground: [f64; 3],
     /// Axes x, y and z of light space.
     pub(crate) axes: [Vector3<f64>; 3],
@@ -81,7 +83,7 @@ impl LightBox {
                 0.5 * (light_bounds.min[axis] + light_bounds.max[axis]),
                 0.5 * (light_bounds.max[axis] - light_bounds.min[axis]),
             );
-            // The lower bound keeps the map of a scene that is flat or a point from having no extent.
+            // The minimum gives the map an extent even if the scene is flat or a point.
             TexelSpan::snap(center, half_extent.max(diagonal / 64.0), params)
         });
         let ground_plane = params.ground.and_then(|height| ground_plane(&axes, params.up, height));
@@ -95,6 +97,7 @@ impl LightBox {
         }
         shadow_from_world.fixed_view_mut::<1, 3>(2, 0).copy_from(&(-axes[2] / depth_extent).transpose());
         shadow_from_world[(2, 3)] = near / depth_extent;
+        // The depth is linear in x and y of the map, so its values at three corners determine the coefficients.
         let ground = ground_plane.map_or([0.0, 0.0, 1.0], |[a, b, c]| {
             let depth = |x: f64, y: f64| (near - (a * x + b * y + c)) / depth_extent;
             let [x, y] = sides;
@@ -119,8 +122,9 @@ fn diagonal(params: &LightBoxParams) -> f64 {
     params.bounds.diagonal().max(1e-6).max(1e-6 * params.bounds.center().coords.amax())
 }
 
-/// z of the near and the far plane in light space, quantized like the sides, with a margin of 1 % of the diagonal. The
-/// near plane is nearest to the sun.
+/// z of the near and the far plane in light space, quantized to a 64th of the largest power of two that is at most the
+/// diagonal, with a margin of 1 % of the diagonal. The near plane is nearest to the sun. `far` and `nearest`: smallest
+/// and largest z of the bounds.
 fn depth_range(
     params: &LightBoxParams,
     [mut far, nearest]: [f64; 2],
@@ -139,11 +143,13 @@ fn depth_range(
     ((near / step).ceil() * step, ((far - 0.01 * diagonal) / step).floor() * step)
 }
 
-/// Coefficients of the ground's z in light space, a x + b y + c; none if the sun is within about 1 degree of the horizon.
+/// Coefficients a, b and c of the ground's z in light space: a x + b y + c. None if the sun is within about 1 degree of
+/// the horizon.
 fn ground_plane(axes: &[Vector3<f64>; 3], up: UpAxis, height: f64) -> Option<[f64; 3]> {
-    // `z` is the sine of the sun's elevation.
-    let [x, y, z] = axes.map(|axis| axis[up.index()]);
-    (z.abs() > 0.02).then(|| [-x / z, -y / z, height / z])
+    // A point (x, y, z) in light space has the height x * x_rise + y * y_rise + z * z_rise.
+    let [x_rise, y_rise, z_rise] = axes.map(|axis| axis[up.index()]);
+    // `z_rise` is the sine of the sun's elevation.
+    (z_rise.abs() > 0.02).then(|| [-x_rise / z_rise, -y_rise / z_rise, height / z_rise])
 }
 
 #[cfg(test)]
@@ -187,7 +193,8 @@ mod tests {
         }
     }
 
-    /// Points of an ellipsoid inside the bounds of [`test_params`]; each axis is scaled.
+    /// Points of an ellipsoid around the center of the bounds of [`test_params`]. `scale`: its half axes. The points
+    /// form a spiral with steps of about the golden angle, 2.4 radians.
     fn ellipsoid_points(scale: [f64; 3]) -> Vec<Point3<f64>> {
         let point = |index: u32| {
             let (angle, height) = (2.4 * f64::from(index), f64::from(index) / 250.0 - 1.0);
@@ -224,6 +231,7 @@ mod tests {
                     assert!((0.0..=1.0).contains(&map_position.z), "{sun} {map_position}");
                 }
             }
+            // A quarter of the map's area.
             let area = |light_box: &LightBox| light_box.sides[0].half_length * light_box.sides[1].half_length;
             assert!(area(&light_box) < 0.9 * area(&corner_box), "{sun}");
         }
@@ -249,9 +257,10 @@ mod tests {
         assert!(center.iter().all(|number| (0.0..=1.0).contains(number)), "{center}");
     }
 
-    /// Tracks a fixed point in the texel grid of the map while the bounds sway and grow slowly. Returns its largest
-    /// movement between steps, in fractions of a texel, and the number of steps at which the map changed its quantized
-    /// size, which are excluded from the movement.
+    /// Tracks a fixed point in the texel grid of the map while the bounds sway and grow slowly. `map_position` gives
+    /// the position of the point in the map, 0 to 1. Returns the largest movement of the point between two steps, in
+    /// texels without whole texels, and the number of steps at which the map changed its quantized size. These steps do
+    /// not count as movement.
     fn measure_crawl(uses_light_bounds: bool, map_position: impl Fn(&LightBoxParams) -> [f64; 2]) -> (f64, usize) {
         let mut params = test_params(Vector3::new(0.4, 0.8, 0.5), Some(0.0));
         let (mut previous, mut max_movement, mut size_changes): (Option<([f64; 2], f64)>, f64, usize) = (None, 0.0, 0);
@@ -260,7 +269,7 @@ mod tests {
             params.bounds.max =
                 [1.0 + 0.05 * phase.sin(), 3.0 + 0.02 * (0.7 * phase).cos(), 2.0 + 1e-4 * f64::from(step)];
             let [x, y, z] = params.bounds.max;
-            // Scaled so that the size does not oscillate around a quantization step.
+            // The factor keeps the size from oscillating around a quantization step.
             params.light_bounds =
                 measure_light_bounds(&params, &ellipsoid_points([x, 0.5 * y, z].map(|scale| 0.95 * scale)))
                     .filter(|_| uses_light_bounds);
@@ -274,6 +283,7 @@ mod tests {
                         - (texel_position[axis] - previous_position[axis]).round())
                     .abs()
                 };
+                // The sum of the half lengths changes with the size.
                 if previous_half_length_sum == half_length_sum {
                     max_movement = max_movement.max(movement(0)).max(movement(1))
                 } else {
@@ -313,10 +323,12 @@ mod tests {
 
     #[test]
     fn quantized_length_exceeds_the_length_by_at_most_a_sixteenth() {
+        // A sixteenth is 0.0625; the rest is rounding.
+        let max_ratio = 1.0626;
         for step in -200..200 {
             let length = 1.37_f64.powi(step);
             assert!(
-                next_length_step(length) > length && next_length_step(length) <= length * 1.0626,
+                next_length_step(length) > length && next_length_step(length) <= length * max_ratio,
                 "{length}: {}",
                 next_length_step(length)
             );

@@ -12,7 +12,7 @@ pub(crate) struct VisibilityDirtyRegions {
     pub(crate) depth: DirtyRegion,
 }
 
-/// The initialization of a framebuffer by a pass. If the dirty region is known, only this region is cleared, otherwise
+/// How a pass initializes its framebuffer. With a dirty region, only this region of the image is cleared; without one,
 /// the complete image.
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum ClearOp<'a> {
@@ -22,7 +22,7 @@ pub(crate) enum ClearOp<'a> {
     DepthAndIds(Option<&'a VisibilityDirtyRegions>),
     /// Color to a value.
     Color([f32; 4], &'a DirtyRegion),
-    /// Integer words to 0, without depth.
+    /// Integer words to 0; the depth is not cleared.
     Uint(&'a DirtyRegion),
     /// The content is kept.
     Load,

@@ -42,7 +42,7 @@ impl Fence {
         self.is_done_within(Duration::ZERO)
     }
 
-    /// Like [`Self::is_done`], after waiting at most `limit`.
+    /// Like [`Self::is_done`], after waiting at most `limit` or one second, whichever is shorter.
     pub(crate) fn is_done_within(&self, limit: Duration) -> bool {
         self.poll("fence", limit).unwrap_or(true)
     }
@@ -62,7 +62,7 @@ impl Fence {
         Ok(())
     }
 
-    /// Whether the commands are complete, after waiting at most `limit`, and at most one second.
+    /// Whether the commands are complete, after waiting at most `limit` or one second, whichever is shorter.
     fn poll(&self, stage: &'static str, limit: Duration) -> Result<bool> {
         // glow has 32 bits for the nanoseconds, so one call waits at most one second.
         let timeout_ns = limit.min(Duration::from_secs(1)).as_nanos() as i32;
@@ -74,7 +74,9 @@ impl Fence {
         match status {
             glow::ALREADY_SIGNALED | glow::CONDITION_SATISFIED => Ok(true),
             glow::TIMEOUT_EXPIRED => Ok(false),
-            _ => Err(self.gl.loss(stage).unwrap_or_else(|| fault(stage, "the wait for the device failed"))),
+            _ => {
+                Err(self.gl.device_lost_error(stage).unwrap_or_else(|| fault(stage, "the wait for the device failed")))
+            }
         }
     }
 }
@@ -102,7 +104,8 @@ mod tests {
     use crate::device::gl::TextureDesc;
     use crate::{DevicePreference, device};
 
-    /// Draws an image that takes long; in software, on threads of the driver.
+    /// Draws an image that takes longer than a millisecond: `iterations` sines per pixel. A software driver draws it on
+    /// its own threads.
     fn draw_for_long(gl: &Rc<Gl>, iterations: u32) {
         let (target, format) = (glow::TEXTURE_2D, glow::RGBA8);
         let desc = TextureDesc { target, format, width: 2048, height: 2048, depth: 1, levels: 1 };

@@ -19,7 +19,8 @@ pub(crate) struct Limits {
     pub(crate) software: bool,
     /// Maximum side of textures and viewports, in pixels.
     pub(crate) max_side: u32,
-    /// Maximum number of samples per pixel that color, depth and integer images all support.
+    /// Maximum number of samples per pixel that color, depth and integer images all support: the minimum of three
+    /// limits.
     pub(crate) max_samples: u32,
     /// Maximum number of textures that one compute shader can read.
     pub(crate) max_compute_textures: u32,
@@ -33,7 +34,7 @@ pub(crate) struct Limits {
     pub(crate) post_depth_coverage: bool,
     /// Whether buffers can stay mapped while the device writes them (OpenGL 4.4).
     pub(crate) persistent_mapping: bool,
-    /// Fractional bits of a vertex position in pixels, at least 4.
+    /// Number of fractional bits of a vertex position in pixels; OpenGL guarantees 4.
     pub(crate) subpixel_bits: u32,
     /// Maximum anisotropy of texture lookups: [`HARDWARE_ANISOTROPY`], or 1 if the context does not support it or is a
     /// software rasterizer.

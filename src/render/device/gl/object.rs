@@ -1,5 +1,6 @@
-//! Buffers, textures, programs, framebuffers and vertex arrays. Each owns its OpenGL name and deletes it when dropped.
-//! An object that refers to other objects shares ownership of their names, so that they are deleted after it.
+//! Buffers, textures, programs, framebuffers and vertex arrays. Each owns its OpenGL name (the integer that identifies
+//! the object) and deletes the object when dropped. An object that refers to other objects shares their ownership, so
+//! that they are deleted later.
 
 use std::rc::Rc;
 
@@ -16,7 +17,7 @@ pub(crate) struct Buffer {
     pub(crate) bytes: u64,
 }
 
-/// The name of a buffer. It is deleted once no [`Buffer`], no other object and no other API refers to it.
+/// The name of a buffer. The buffer is deleted once no [`Buffer`], no other object and no other API refers to it.
 #[derive(Debug)]
 pub(super) struct BufferObject {
     pub(super) gl: Rc<Gl>,
@@ -43,7 +44,7 @@ pub(crate) struct Texture {
     pub(crate) desc: TextureDesc,
 }
 
-/// The name of a texture. It is deleted once no [`Texture`] and no framebuffer refers to it.
+/// The name of a texture. The texture is deleted once no [`Texture`] and no framebuffer refers to it.
 #[derive(Debug)]
 struct TextureObject {
     gl: Rc<Gl>,
@@ -84,7 +85,7 @@ struct ReadMapping<'a> {
 }
 
 impl<'a> ReadMapping<'a> {
-    /// Maps the first bytes of a buffer, at least one. Waits for pending writes.
+    /// Maps the first `bytes` bytes of a buffer; `bytes` must be at least 1. Waits for pending writes.
     fn new(buffer: &'a Buffer, bytes: usize) -> Result<Self> {
         let (gl, name) = (buffer.object.gl.functions()?, buffer.name());
         // SAFETY: OpenGL rejects a range that is not inside the buffer or that is already mapped.
@@ -140,7 +141,7 @@ impl Buffer {
     pub(crate) fn write(&self, data: &[u8]) {
         let gl = &self.object.gl;
         if data.len() as u64 > self.bytes {
-            return gl.skip(format!("expected a write of at most {} bytes, got {}", self.bytes, data.len()));
+            return gl.record_skipped(format!("expected a write of at most {} bytes, got {}", self.bytes, data.len()));
         }
         let Some(gl) = gl.functions_or_skip() else { return };
         // SAFETY: the data fits into the buffer.
@@ -150,10 +151,10 @@ impl Buffer {
         }
     }
 
-    /// Copies the first bytes to the host. Waits for pending writes.
+    /// Copies the first `bytes` bytes to the host. Waits for pending writes.
     ///
     /// # Errors
-    /// `Fault` when the buffer is smaller or cannot be mapped.
+    /// `Fault` when the buffer is smaller than `bytes` or cannot be mapped.
     pub(crate) fn read(&self, bytes: usize) -> Result<Vec<u8>> {
         if bytes as u64 > self.bytes {
             return Err(fault("read", format!("expected at most {} bytes, got {bytes}", self.bytes)));
@@ -175,7 +176,7 @@ impl Buffer {
     pub(crate) fn bind_uniform(&self, binding: u32, bytes: usize) {
         let gl = &self.object.gl;
         if bytes as u64 > self.bytes {
-            return gl.skip(format!("expected at most {} bytes of uniforms, got {bytes}", self.bytes));
+            return gl.record_skipped(format!("expected at most {} bytes of uniforms, got {bytes}", self.bytes));
         }
         let Some(gl) = gl.functions_or_skip() else { return };
         // SAFETY: binding points below the 36 that every context has; the range is inside the buffer.
@@ -222,7 +223,7 @@ impl Texture {
         &self.object.gl
     }
 
-    /// Uploads RGBA8 pixels to one layer of one mipmap level, row by row from the first.
+    /// Uploads the RGBA8 pixels of one layer of one mipmap level, row by row. Row 0 has the texture coordinate v = 0.
     pub(crate) fn upload_pixels(&self, level: u32, layer: u32, size: [u32; 2], rgba: &[u8]) -> Result<()> {
         let [width, height] = size.map(|side| side as i32);
         if rgba.len() != 4 * width as usize * height as usize {
@@ -244,7 +245,7 @@ impl Texture {
         self.gl().check("texture")
     }
 
-    /// Sets sampler parameters, which are pairs of OpenGL parameter and value.
+    /// Sets sampler parameters, which are pairs of OpenGL parameter and value, and the maximum anisotropy.
     pub(crate) fn set_sampling(&self, parameters: &[(u32, u32)], anisotropy: f32) {
         let Some(gl) = self.gl().functions_or_skip() else { return };
         // SAFETY: plain parameters of a texture of this context.
@@ -300,7 +301,7 @@ impl Texture {
 }
 
 impl Program {
-    /// Makes the program current. `uniform` is the value of the integer uniform at location 0, for example the first
+    /// Makes the program current. `uniform`: value of the integer uniform at location 0, for example the first
     /// triangle; none for programs without such a uniform.
     pub(crate) fn bind(&self, uniform: Option<u32>) {
         let Some(gl) = self.gl.functions_or_skip() else { return };

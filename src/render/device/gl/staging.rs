@@ -19,11 +19,11 @@ pub(crate) struct StagingBuffer {
     pub(crate) buffer: Buffer,
     /// Address of the persistent mapping; `None` if the context does not support it.
     mapping: Option<*const u8>,
-    /// Disconnects when the current reader is done; `None` without a reader.
+    /// Disconnects when the current reader (a [`ReadbackView`]) is dropped; `None` without a reader.
     reader: RefCell<Option<Receiver<()>>>,
 }
 
-/// The buffer of a dropped staging buffer that a reader still uses.
+/// The buffer of a dropped staging buffer from which a reader still copies.
 pub(super) struct RetiredBuffer {
     /// Keeps the mapping valid.
     _object: Rc<BufferObject>,
@@ -86,7 +86,7 @@ impl StagingBuffer {
     /// command may write the buffer while the view exists.
     ///
     /// # Errors
-    /// `Fault` when the buffer is smaller or cannot be mapped.
+    /// `Fault` when the buffer is smaller than `bytes` or cannot be mapped.
     pub(crate) fn view(&self, bytes: usize) -> Result<ReadbackView> {
         if bytes as u64 > self.buffer.bytes {
             return Err(fault("readback", format!("expected at most {} bytes, got {bytes}", self.buffer.bytes)));

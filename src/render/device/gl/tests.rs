@@ -61,6 +61,7 @@ fn commands_are_not_issued_while_the_context_is_occupied() {
     buffer.write(&[9; 4]);
     // Both contexts use the same names: a deletion on the wrong context would delete `other_buffer`.
     let name = leaked.name();
+    // The buffer cannot be deleted now, so it leaks.
     drop(leaked);
     assert!(is_buffer_alive(&other, other_buffer.name()));
     other.check("test").expect("no error of the other context");

@@ -51,7 +51,7 @@ impl Gl {
         Ok(timer)
     }
 
-    /// Takes a query from the pool, or creates one.
+    /// Takes a query from the pool; creates one if the pool is empty.
     fn acquire_query(&self) -> Result<glow::Query> {
         let free_query = self.free_queries.borrow_mut().pop();
         let gl = self.functions()?;

@@ -1,16 +1,17 @@
 //! Coverage-preserving mipmap levels of cut-outs (after Castano, "Computing alpha mipmaps", 2010).
 //!
 //! The coverage of an image is the fraction with an alpha at or above the cutoff, sampled bilinearly as in the shaders.
-//! With plain averages, coarse levels are covered completely if more than half of an image is covered, and small leaves
-//! grow into the polygons that carry them; otherwise leaves vanish. Therefore the alpha of each level is scaled until its
-//! coverage equals that of level 0. Alpha is clamped to 1, so the result is not exact if alpha is raised.
+//! With plain averages, an image of which more than half is covered becomes covered completely in coarse levels: leaves
+//! grow into the polygons that carry them. If less than half is covered, leaves vanish. Therefore the alpha of each
+//! level is scaled until its coverage equals that of level 0. Alpha is clamped to 1, so the result is not exact if
+//! alpha is raised.
 
 use super::LinearImage;
 
-/// Minimum number of samples along each side of a level.
+/// Minimum number of samples of alpha along each side of a level.
 const MIN_SAMPLES_PER_SIDE: u32 = 256;
 
-/// Scales the alpha of all levels except level 0.
+/// Scales the alpha of all levels except level 0, so that they have the coverage of level 0.
 pub(crate) fn preserve_coverage(chain: &mut [LinearImage], cutoff: f32) {
     let Some((finest, coarser_levels)) = chain.split_first_mut() else { return };
     let target_coverage = coverage(finest, cutoff);
@@ -29,8 +30,8 @@ pub(crate) fn coverage(image: &LinearImage, cutoff: f32) -> f32 {
     alphas.iter().filter(|alpha| **alpha >= cutoff).count() as f32 / alphas.len() as f32
 }
 
-/// Finds the cutoff for which the image has the given coverage: the mean of the lowest covered and the highest uncovered
-/// alpha, so that no sample is close to the cutoff.
+/// Finds the cutoff for which the image has the given coverage. It is the mean of the lowest covered and the highest
+/// uncovered alpha, so that no sample is close to it.
 fn find_threshold(image: &LinearImage, coverage: f32) -> f32 {
     let mut alphas = sample_alpha(image);
     let covered_count = (coverage * alphas.len() as f32).round() as usize;
@@ -71,7 +72,7 @@ mod tests {
     use modalcast_model::domain::Texture;
     use modalcast_model::scene::SceneParts;
 
-    /// Coverage of each level, computed from its bytes.
+    /// Coverage of each mipmap level, computed from its bytes. `is_preserved`: whether the levels are scaled.
     fn level_coverages(texture: &Texture, cutoff: f32, is_preserved: bool) -> Vec<f32> {
         let array = TextureArray { width: texture.width(), height: texture.height(), layers: vec![0] };
         let chain = mip_levels(texture, &array, TextureRole::Color, is_preserved.then_some(cutoff));
@@ -84,6 +85,7 @@ mod tests {
         chain.iter().enumerate().map(coverage_of).collect()
     }
 
+    /// An opaque disc in 64 x 64 transparent texels. `radius` is in halves of the side.
     fn disc(radius: f32) -> Texture {
         let offset = |index: u32| (index as f32 + 0.5) / 32.0 - 1.0;
         let alpha = |index: u32| 255 * u8::from(offset(index % 64).hypot(offset(index / 64)) < radius);
@@ -92,14 +94,15 @@ mod tests {
     }
 
     #[test]
-    fn levels_down_to_four_texels_preserve_coverage() {
+    fn levels_down_to_four_by_four_texels_preserve_coverage() {
         for (radius, cutoff) in [(0.4, 0.5), (0.9, 0.5), (0.7, 0.2)] {
             let texture = disc(radius);
             let max_error = |is_preserved: bool| {
                 let coverages = level_coverages(&texture, cutoff, is_preserved);
+                // Sides of 64, 32, 16, 8 and 4 texels.
                 coverages[..5].iter().map(|coverage| (coverage - coverages[0]).abs()).fold(0.0, f32::max)
             };
-            assert!(max_error(true) < 0.02, "{radius} {cutoff}: off by {}", max_error(true));
+            assert!(max_error(true) < 0.02, "{radius} {cutoff}: expected an error below 0.02, got {}", max_error(true));
             assert!(
                 max_error(false) > 0.06,
                 "{radius} {cutoff}: expected a larger error without preservation, got {}",
@@ -119,6 +122,7 @@ mod tests {
     fn cutoff_exists_only_if_all_materials_agree() {
         use crate::scene_data::geometry::tests::squares;
         use modalcast_model::domain::{AlphaMode, Material};
+        // One material per alpha mode and alpha.
         let cutoff_of = |modes: &[(AlphaMode, f32)]| {
             let material = |(alpha_mode, alpha): &(AlphaMode, f32)| Material {
                 alpha_mode: *alpha_mode,
@@ -131,10 +135,10 @@ mod tests {
             super::super::cutoff(&modalcast_model::scene::Scene::new(parts).expect("a valid scene"), 0)
         };
         let mask = |cutoff: f32| AlphaMode::Mask { cutoff };
-        assert_eq!(cutoff_of(&[(mask(0.5), 1.0), (mask(0.4), 0.8)]), Some(0.5));
+        assert_eq!(cutoff_of(&[(mask(0.5), 1.0), (mask(0.4), 0.8)]), Some(0.5), "expected cutoff / alpha");
         for modes in [[mask(0.5), AlphaMode::Opaque], [mask(0.5), mask(0.6)], [AlphaMode::Blend, AlphaMode::Blend]] {
             assert_eq!(cutoff_of(&modes.map(|mode| (mode, 1.0))), None, "{modes:?}");
         }
-        assert_eq!(cutoff_of(&[(mask(0.5), 0.3)]), None, "a cutoff above 1 covers nothing");
+        assert_eq!(cutoff_of(&[(mask(0.5), 0.3)]), None, "expected none, because a cutoff above 1 covers nothing");
     }
 }
