@@ -223,12 +223,11 @@ fn blur_function(
 }
 
 /// One half of a normalized Gaussian (equation 3.11 of the thesis in one dimension), center first, truncated at three
-/// standard deviations. `filter_deviation` is in texels.
-pub(crate) fn gaussian_weights(filter_deviation: f32) -> Vec<f32> {
-    let filter_deviation = f64::from(filter_deviation);
-    let radius = (3.0 * filter_deviation).ceil() as i32;
-    let gaussian =
-        |step: i32| if step == 0 { 1.0 } else { (-0.5 * (f64::from(step) / filter_deviation).powi(2)).exp() };
+/// standard deviations. `blur` is the standard deviation in texels ([`ShadowSettings::blur`]).
+pub(crate) fn gaussian_weights(blur: f32) -> Vec<f32> {
+    let blur = f64::from(blur);
+    let radius = (3.0 * blur).ceil() as i32;
+    let gaussian = |step: i32| if step == 0 { 1.0 } else { (-0.5 * (f64::from(step) / blur).powi(2)).exp() };
     let sum: f64 = (-radius..=radius).map(gaussian).sum();
     (0..=radius).map(|step| (gaussian(step) / sum) as f32).collect()
 }
@@ -240,12 +239,12 @@ mod tests {
 
     #[test]
     fn gaussian_weights_decrease_and_sum_to_one() {
-        for filter_deviation in [0.0, 0.3, 2.0, 16.0] {
-            let weights = gaussian_weights(filter_deviation);
+        for blur in [0.0, 0.3, 2.0, 16.0] {
+            let weights = gaussian_weights(blur);
             let sum = weights[0] + 2.0 * weights[1..].iter().sum::<f32>();
-            assert!((sum - 1.0).abs() < 1e-5, "deviation {filter_deviation}: expected a sum of 1, got {sum}");
+            assert!((sum - 1.0).abs() < 1e-5, "blur {blur}: expected a sum of 1, got {sum}");
             assert!(weights.is_sorted_by(|a, b| a >= b));
-            let shadow = ShadowSettings { blur: filter_deviation, ..ShadowSettings::default() };
+            let shadow = ShadowSettings { blur, ..ShadowSettings::default() };
             assert_eq!(shadow.blur_radius() as usize, weights.len() - 1);
         }
         assert_eq!(gaussian_weights(0.0), [1.0]);
