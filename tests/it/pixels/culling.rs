@@ -263,7 +263,8 @@ fn culling_handles_non_finite_and_huge_positions() {
 #[test]
 fn culling_handles_far_scenes_and_extreme_clip_planes() {
     // Clip planes of 0 are fitted to the bounds.
-    for (shift, near, far) in [(1e4, 0.0, 0.0), (1e7, 0.0, 0.0), (0.0, 1e-6, 1e9), (0.0, 8.9, 9.1)] {
+    // At 1e7 the numbers of f32 are 1 apart, so that the triangles lose their area and nothing may remain to be drawn.
+    for (shift, near, far) in [(1e4, 0.0, 0.0), (1e6, 0.0, 0.0), (1e7, 0.0, 0.0), (0.0, 1e-6, 1e9), (0.0, 8.9, 9.1)] {
         let frames = assert_same_frames(&|| mixed_builder(4, Transparency::OrderIndependent), &|harness| {
             harness.move_vertices(|[x, y, z]| [x + shift as f32, y, z]);
             harness.bounds.min[0] += shift;
@@ -272,7 +273,10 @@ fn culling_handles_far_scenes_and_extreme_clip_planes() {
             (0..3).map(|_| harness.draw(camera, [SIZE, SIZE])).collect()
         });
         let triangle_pixels = frames[2].ids.iter().filter(|id| matches!(id, VisibilityId::Triangle(_))).count();
-        assert!(triangle_pixels > 0, "expected triangles at a shift of {shift}, near {near}, far {far}");
+        assert!(
+            triangle_pixels > 0 || shift == 1e7,
+            "expected triangles at a shift of {shift}, near {near}, far {far}"
+        );
     }
 }
 
