@@ -1,5 +1,5 @@
-//! Displacements and boxes over the wire: the server sends them with or without vertices if the scene enables them, and
-//! rejects requests for disabled ones.
+//! Displacements u = U q and bounding boxes over the wire. If the scene enables them, the server sends them with or
+//! without the vertices. It rejects requests for disabled attributes.
 
 use modalcast::config::{BackendChoice, Config};
 use modalcast::engine::{Delivery, OutputSpec};
@@ -17,34 +17,41 @@ use crate::service_harness::{
     state_after_steps, step, strips_with_attributes, with_timeout,
 };
 
+/// Maximum error of positions and displacements in scene units. The values are below 8, where numbers in f32 are 5e-7
+/// apart.
+const TOLERANCE: f32 = 1e-6;
+
 fn vertex_request(scene: &str, selection: v1::VertexSelection) -> v1::GetVerticesRequest {
     v1::GetVerticesRequest { scene: scene.into(), selection: Some(selection), ..v1::GetVerticesRequest::default() }
 }
 
-/// Selects vertices, displacements and boxes of some domains, or of all domains if the list is empty.
+/// Selects vertices, displacements and boxes of the listed domains, or of all domains if the list is empty.
 fn select_vertices_and_attributes(domains: &[u32]) -> v1::VertexSelection {
     v1::VertexSelection { domains: domains.to_vec(), displacements: true, boxes: true, ..Default::default() }
 }
 
-/// Selects displacements and boxes without vertices.
+/// Selects displacements and boxes of the listed domains, without vertices. An empty list selects all domains.
 fn select_attributes(domains: &[u32]) -> v1::VertexSelection {
     v1::VertexSelection { without_vertices: true, ..select_vertices_and_attributes(domains) }
 }
 
-/// Displacements u of the f64 reference after some steps.
+/// Displacements of the f64 reference after `steps`, for the scene that the test server opens as `attributes`.
 fn reference_displacements(steps: &[v1::Step]) -> Vec<f32> {
     let scene = strips_with_attributes();
     let u = reference::displacements(&scene, &state_after_steps(&scene, steps));
     u.into_flattened().into_iter().map(|number| number as f32).collect()
 }
 
-/// Bounding boxes of consecutive domains with four vertices each.
+/// Numbers of the positions of a domain, or of its displacements: four vertices times three axes.
+const DOMAIN_NUMBERS: usize = 12;
+
+/// Bounding boxes of consecutive domains, computed from their positions. A box is its minimum, then its maximum.
 fn compute_boxes(positions: &[f32]) -> Vec<f32> {
     let min_and_max = |positions| {
         let BoundingBox { min, max } = BoundingBox::from_positions(positions);
         [min, max].concat().into_iter().map(|number| number as f32)
     };
-    positions.chunks_exact(12).flat_map(min_and_max).collect()
+    positions.chunks_exact(DOMAIN_NUMBERS).flat_map(min_and_max).collect()
 }
 
 fn max_abs_error(numbers: &[f32], expected_numbers: &[f32]) -> f32 {
@@ -52,8 +59,10 @@ fn max_abs_error(numbers: &[f32], expected_numbers: &[f32]) -> f32 {
     numbers.iter().zip(expected_numbers).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max)
 }
 
-/// A step that rotates and moves the second domain, so that its u differs from x - x0.
+/// A step that sets q of both domains, and rotates and moves domain 1. The displacements u of domain 1 thus differ from
+/// x - x0.
 fn rotated_step() -> v1::Step {
+    // Row-major 3 x 4 matrix: a rotation by 90 degrees about z, then a translation by (2, 0, -3).
     let matrix = [0.0_f32, -1.0, 0.0, 2.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, -3.0];
     let transforms = matrix.iter().flat_map(|number| number.to_le_bytes()).collect::<Vec<u8>>().into();
     v1::Step { transform_domains: vec![1], transforms, ..step(2, &[0, 1], &[0.25, -0.5, 0.75, 0.125]) }
@@ -68,15 +77,15 @@ async fn displacements_and_boxes_come_with_or_without_vertices() {
         let steps = [step(1, &[1], &[0.5, -0.25]), rotated_step()];
         for index in 0..steps.len() {
             writer.send_step_and_wait(steps[index].clone()).await;
-            let (positions, displacements) = (
+            let (expected_positions, expected_displacements) = (
                 reference_vertices(&strips_with_attributes(), &steps[..=index]).positions,
                 reference_displacements(&steps[..=index]),
             );
             let assert_attributes = |reply: &ReceivedVertices, domains: std::ops::Range<usize>| {
-                // Four vertices of three numbers per domain.
-                let floats = 12 * domains.start..12 * domains.end;
-                assert!(max_abs_error(&reply.displacements, &displacements[floats.clone()]) < 1e-6);
-                assert!(max_abs_error(&reply.boxes, &compute_boxes(&positions[floats])) < 1e-6);
+                let numbers = DOMAIN_NUMBERS * domains.start..DOMAIN_NUMBERS * domains.end;
+                let expected_boxes = compute_boxes(&expected_positions[numbers.clone()]);
+                assert!(max_abs_error(&reply.displacements, &expected_displacements[numbers]) < TOLERANCE);
+                assert!(max_abs_error(&reply.boxes, &expected_boxes) < TOLERANCE);
             };
             // The first request reads only the attributes. The second request also reads the vertices of the same step.
             let attributes = get_vertices(&server, vertex_request("attributes", select_attributes(&[])))
@@ -94,11 +103,9 @@ async fn displacements_and_boxes_come_with_or_without_vertices() {
                     .await
                     .expect("expected vertices");
             assert_attributes(&vertices_and_attributes, 0..2);
-            assert_eq!(
-                (vertices_and_attributes.normals.len(), vertices_and_attributes.boxes.clone()),
-                (24, compute_boxes(&vertices_and_attributes.positions))
-            );
-            assert!(max_abs_error(&vertices_and_attributes.positions, &positions) < 1e-6);
+            assert_eq!(vertices_and_attributes.normals.len(), 2 * DOMAIN_NUMBERS);
+            assert_eq!(vertices_and_attributes.boxes, compute_boxes(&vertices_and_attributes.positions));
+            assert!(max_abs_error(&vertices_and_attributes.positions, &expected_positions) < TOLERANCE);
             let second_domain = get_vertices(&server, vertex_request("attributes", select_attributes(&[1])))
                 .await
                 .expect("expected vertices");
@@ -109,7 +116,7 @@ async fn displacements_and_boxes_come_with_or_without_vertices() {
             assert!(vertices.displacements.is_empty() && vertices.boxes.is_empty());
             assert_eq!(vertices.positions, vertices_and_attributes.positions);
         }
-        // Negative control: other steps give other displacements.
+        // Negative control: the second step changes the displacements.
         assert!(max_abs_error(&reference_displacements(&steps[..1]), &reference_displacements(&steps)) > 0.1);
         writer.finish().await;
     }
@@ -117,6 +124,7 @@ async fn displacements_and_boxes_come_with_or_without_vertices() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn box_stream_delivers_every_step() {
+    // The deformer of this server is the f64 reference, so the boxes are exactly equal.
     let server = Server::start_default().await;
     server.open("attributes").await;
     let selection = v1::VertexSelection { boxes: true, without_vertices: true, ..Default::default() };
@@ -154,7 +162,8 @@ fn box_numbers(surface: &DeformedSurface) -> Vec<f32> {
     corners.map(|number| number as f32).collect()
 }
 
-/// Subscriptions with different attributes receive every step, although later steps are computed meanwhile.
+/// Lossless subscriptions with different attributes receive every step, although the server computes later steps in the
+/// meantime.
 #[tokio::test(flavor = "multi_thread")]
 async fn subscribers_of_different_attributes_get_every_step() {
     const STEP_COUNT: u64 = 40;
@@ -189,7 +198,8 @@ async fn subscribers_of_different_attributes_get_every_step() {
         let ReferenceVertices { positions, normals } = reference_vertices(&strips_with_attributes(), &steps[..=index]);
         (positions, normals, reference_displacements(&steps[..=index]))
     };
-    let output = with_timeout(latest_subscription.next()).await.expect("expected the newest step");
+    // The first output may show any step, because the server may skip steps for this subscription.
+    let output = with_timeout(latest_subscription.next()).await.expect("expected a step");
     let (index, surface) = vertices_of_output(&output);
     let (positions, normals, displacements) = expected_output(index);
     assert!(
@@ -197,7 +207,7 @@ async fn subscribers_of_different_attributes_get_every_step() {
             && surface.normals == normals
             && box_numbers(surface) == compute_boxes(&positions)
     );
-    assert!(max_abs_error(&surface.displacements, &displacements) < 1e-6);
+    assert!(max_abs_error(&surface.displacements, &displacements) < TOLERANCE);
     drop(latest_subscription);
     for index in 0..STEP_COUNT as usize {
         let (positions, normals, displacements) = expected_output(index);
@@ -208,7 +218,7 @@ async fn subscribers_of_different_attributes_get_every_step() {
             assert!(!selection.positions || surface.positions == positions, "step {index}");
             assert!(!selection.boxes || box_numbers(surface) == compute_boxes(&positions), "step {index}");
             assert!(
-                !selection.displacements || max_abs_error(&surface.displacements, &displacements) < 1e-6,
+                !selection.displacements || max_abs_error(&surface.displacements, &displacements) < TOLERANCE,
                 "step {index}"
             );
             assert!(!selection.normals || surface.normals == normals, "step {index}");
@@ -219,7 +229,7 @@ async fn subscribers_of_different_attributes_get_every_step() {
     assert!(
         positions != next_positions
             && compute_boxes(&positions) != compute_boxes(&next_positions)
-            && max_abs_error(&displacements, &next_displacements) > 1e-6
+            && max_abs_error(&displacements, &next_displacements) > TOLERANCE
     );
     for number in 0..STEP_COUNT {
         assert!(matches!(writer.receive_reply().await, ResponseKind::Ack(ack) if ack.step == number));
@@ -228,10 +238,12 @@ async fn subscribers_of_different_attributes_get_every_step() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn disabled_attributes_are_rejected_with_option_name() {
+async fn disabled_and_empty_selections_are_rejected() {
     let server = Server::start_default().await;
+    // This scene enables neither displacements nor boxes.
     server.open("strips").await;
-    for (selection, field, option) in [
+    // The third selection is empty: no vertices, and no attribute instead of them.
+    for (selection, field, expected) in [
         (
             v1::VertexSelection { displacements: true, ..Default::default() },
             "displacements",
@@ -246,25 +258,24 @@ async fn disabled_attributes_are_rejected_with_option_name() {
     ] {
         let error = get_vertices(&server, vertex_request("strips", selection.clone()))
             .await
-            .expect_err("expected a disabled-attribute error");
+            .expect_err("expected a rejected selection");
         let rejection = rejection_details(&error);
         assert_eq!(
             (error.code(), rejection.field.as_str()),
             (Code::InvalidArgument, format!("selection.{field}").as_str())
         );
-        assert!(rejection.expected.contains(option), "{rejection:?}");
+        assert!(rejection.expected.contains(expected), "{rejection:?}");
         let request = v1::StreamVerticesRequest {
             scene: "strips".into(),
             selection: Some(selection),
             ..v1::StreamVerticesRequest::default()
         };
-        let error =
-            server.vertices().await.stream_vertices(request).await.expect_err("expected a disabled-attribute error");
+        let error = server.vertices().await.stream_vertices(request).await.expect_err("expected a rejected selection");
         assert_eq!(rejection_details(&error), rejection);
     }
 }
 
-/// A step with an overflowing displacement is rejected, and the state before it stays readable.
+/// A step whose displacements overflow is rejected, and the previous state stays readable.
 #[tokio::test(flavor = "multi_thread")]
 async fn step_with_displacement_overflow_is_rejected() {
     let server = Server::start_with(|config| Config { backend: BackendChoice::Cpu, ..config }).await;
@@ -273,7 +284,7 @@ async fn step_with_displacement_overflow_is_rejected() {
     writer.send_step_and_wait(step(1, &[1], &[0.5, -0.25])).await;
     let previous_reply =
         get_vertices(&server, vertex_request("attributes", select_attributes(&[]))).await.expect("expected vertices");
-    // The transform scales x into the range of f32, but u overflows.
+    // The entries of U are up to 2, so u = U q overflows. x = T (x0 + u) would be finite, because T scales by 1e-24.
     let matrix = [1e-24_f32, 0.0, 0.0, 0.0, 0.0, 1e-24, 0.0, 0.0, 0.0, 0.0, 1e-24, 0.0];
     let transforms = matrix.iter().flat_map(|number| number.to_le_bytes()).collect::<Vec<u8>>().into();
     let overflowing_step = v1::Step { transform_domains: vec![1], transforms, ..step(2, &[1], &[f32::MAX; 2]) };
@@ -291,5 +302,8 @@ fn reference_deformer_has_displacements_and_boxes() {
     let reference = |scene: &std::sync::Arc<_>| ReferenceDeformer::new(scene).with_bounding_axes(scene.light_axes());
     attributes::check_displacements_and_boxes(reference);
     attributes::check_scene_without_modes(reference);
-    assert!(!reference(&strips_with_attributes()).shares_buffers());
+    assert!(
+        !reference(&strips_with_attributes()).shares_buffers(),
+        "expected a deformer that does not write to the renderer's buffers"
+    );
 }

@@ -1,4 +1,5 @@
-//! Runs the checks of `tests/common` on the CPU deformer.
+//! Runs the checks of `tests/common` on the CPU deformer. In test names, "the bound" is the a-priori error bound of a
+//! deformed vertex, and "the reference" is the f64 reference deformer.
 
 use std::sync::Arc;
 
@@ -43,7 +44,7 @@ fn finite_sums_survive_intermediate_overflow() {
 }
 
 #[test]
-fn zero_tiles_do_not_move() {
+fn tiles_with_zero_modes_do_not_move() {
     extreme_values::check_zero_tiles(cpu_deformer);
 }
 
@@ -73,17 +74,18 @@ fn overflow_error_names_the_domain() {
 }
 
 #[test]
-fn truncation_errors_stay_within_the_budget() {
+fn truncation_errors_stay_within_the_error_budget() {
     truncation::check_error_budget(cpu_deformer, truncation_bound);
 }
 
 #[test]
-fn mode_near_the_truncation_limit_keeps_its_status() {
+fn mode_near_the_limit_is_truncated_at_most_once() {
     truncation::check_hysteresis(cpu_deformer);
 }
 
 #[test]
 fn partial_steps_have_the_bits_of_full_steps() {
+    // Only the CUDA deformer has a batch policy.
     partial_steps::check_partial_steps(|scene, _batch_policy| cpu_deformer(scene));
     assert!(
         !partial_steps::relies_on_dirty_list(cpu_deformer),
@@ -92,7 +94,7 @@ fn partial_steps_have_the_bits_of_full_steps() {
 }
 
 #[test]
-fn displacements_are_within_bound_and_boxes_tight() {
+fn displacements_are_within_bound_and_boxes_are_tight() {
     attributes::check_displacements_and_boxes(cpu_deformer);
 }
 
@@ -118,17 +120,17 @@ fn displacement_overflow_error_names_the_domain() {
 }
 
 #[test]
-fn domain_bits_do_not_depend_on_neighbors() {
+fn vertex_bits_do_not_depend_on_other_domains() {
     neighbors::check_independence_of_neighbors(cpu_deformer);
 }
 
 #[test]
-fn followers_have_the_bits_of_equivalent_roots() {
+fn followers_have_the_bits_of_equivalent_transform_roots() {
     followers::check_frames(cpu_deformer);
 }
 
 #[test]
-fn partial_steps_of_roots_move_their_followers() {
+fn partial_steps_of_transform_roots_move_their_followers() {
     followers::check_partial_steps_of_roots(cpu_deformer);
 }
 
@@ -138,21 +140,21 @@ fn followers_10000_km_away_are_exact_to_1_mm() {
 }
 
 #[test]
-fn overflowing_frame_products_keep_finite_vertices() {
+fn overflow_in_products_of_frames_keeps_vertices_finite() {
     followers::check_overflowing_frame_products(cpu_deformer);
 }
 
 #[test]
-fn light_bounds_contain_every_vertex() {
+fn light_space_bounds_contain_every_vertex() {
     light_bounds::check_containment(|scene, _batch_policy| cpu_deformer(scene));
 }
 
 #[test]
-fn light_bounds_of_a_thin_scene_are_tight() {
+fn light_space_bounds_of_a_thin_scene_are_tight() {
     light_bounds::check_tightness(cpu_deformer);
 }
 
 #[test]
-fn light_bounds_need_a_shadow_and_report_overflow() {
+fn light_space_bounds_need_a_shadow_and_report_overflow() {
     light_bounds::check_missing_shadow_and_overflow(cpu_deformer);
 }

@@ -1,5 +1,6 @@
-//! Alpha tests of cut-outs in the reference rasterizer. A footprint is the texture coordinates at a sample and their
-//! derivatives by pixel column (x) and row (y).
+//! Alpha tests of cut-outs in the reference rasterizer. A soup is a list of triangles that need not form a surface. Its
+//! viewport has one sample per pixel, at the center. The footprint of a sample consists of the texture coordinates
+//! there and of their derivatives by pixel column (x) and row (y).
 
 use modalcast_compute::reference::raster::cut_out::{Footprint, alpha, footprint};
 use modalcast_compute::reference::raster::{VisibilityBuffer, corners};
@@ -10,8 +11,9 @@ use nalgebra::{Matrix3, Vector3};
 use crate::common::cut_outs::{alpha_image, floor_soup, sheet_soup, uniform_cut_out_soups};
 use crate::common::soups::{clip_space_viewport, perspective_viewport};
 
-/// Texture coordinates where the ray through a point of the image meets the plane of a triangle, in f64. `x` and `y`
-/// are in pixels. The camera is that of [`perspective_viewport`], with a vertical field of view of 60 degrees.
+/// Texture coordinates where the ray through a point of the viewport meets the plane of a triangle, in f64. `x` and `y`
+/// are in pixels from the upper left corner. The camera is the one of [`perspective_viewport`]: at the origin, with a
+/// vertical field of view of 60 degrees.
 fn ray_cast_uv(viewport: &Viewport, triangle: [[f64; 3]; 3], uvs: [[f64; 2]; 3], [x, y]: [f64; 2]) -> [f64; 2] {
     let [width, height] = viewport.size().map(f64::from);
     let focal = 1.0 / 30.0_f64.to_radians().tan();
@@ -34,7 +36,8 @@ struct FootprintCase {
 }
 
 impl FootprintCase {
-    /// Largest error of the footprint's texture coordinates, and of their derivatives against central differences.
+    /// Largest error of the footprint's texture coordinates, and largest difference between its derivatives and central
+    /// differences.
     fn max_errors(&self) -> (f64, f64) {
         let positions: Vec<f32> = self.triangle.as_flattened().iter().map(|number| *number as f32).collect();
         let corners = corners(&self.viewport, &positions, [0, 1, 2]);
@@ -46,16 +49,16 @@ impl FootprintCase {
         let max_error = |actual: [f32; 2], expected: [f64; 2]| {
             (0..2).map(|axis| (f64::from(actual[axis]) - expected[axis]).abs()).fold(0.0, f64::max)
         };
-        // Points 1e-3 pixels before and after the center.
+        // Texture coordinates at 1e-3 pixels after and before the center.
         let central_difference =
-            |upper: [f64; 2], lower: [f64; 2]| [0, 1].map(|axis| (upper[axis] - lower[axis]) / 2e-3);
-        let column_error = max_error(result.duv_dx, central_difference(uv_at(1e-3, 0.0), uv_at(-1e-3, 0.0)));
-        let row_error = max_error(result.duv_dy, central_difference(uv_at(0.0, 1e-3), uv_at(0.0, -1e-3)));
-        (max_error(result.uv, uv_at(0.0, 0.0)), column_error.max(row_error))
+            |after: [f64; 2], before: [f64; 2]| [0, 1].map(|axis| (after[axis] - before[axis]) / 2e-3);
+        let dx_error = max_error(result.duv_dx, central_difference(uv_at(1e-3, 0.0), uv_at(-1e-3, 0.0)));
+        let dy_error = max_error(result.duv_dy, central_difference(uv_at(0.0, 1e-3), uv_at(0.0, -1e-3)));
+        (max_error(result.uv, uv_at(0.0, 0.0)), dx_error.max(dy_error))
     }
 }
 
-/// One triangle is tilted, the other has corners behind the eye.
+/// The two triangles are a tilted one and one with two corners behind the eye.
 #[test]
 fn footprints_match_ray_cast_texture_coordinates() {
     let viewport = perspective_viewport(192, 128, 0.1, 100.0);
@@ -72,27 +75,30 @@ fn footprints_match_ray_cast_texture_coordinates() {
             max_derivative_error = max_derivative_error.max(derivative_error);
         }
     }
+    // Texture coordinates are up to 5, where numbers in f32 are 5e-7 apart. The limits allow for several roundings.
     assert!(
         max_uv_error < 1e-5 && max_derivative_error < 1e-4,
         "error of texture coordinates {max_uv_error}, of derivatives {max_derivative_error}"
     );
-    // Projecting the corners to z = -1 makes the interpolation affine.
+    // Negative control: a triangle whose corners are projected to the plane z = -1 covers the same pixels, but its
+    // texture coordinates are interpolated without perspective.
     let affine_uv = ray_cast_uv(&viewport, tilted_triangle.map(|[x, y, z]| [-x / z, -y / z, -1.0]), uvs, [90.5, 60.5]);
     let perspective_uv = ray_cast_uv(&viewport, tilted_triangle, uvs, [90.5, 60.5]);
     assert!(
         (affine_uv[0] - perspective_uv[0]).abs() > 0.05,
-        "negative control: without perspective {affine_uv:?}, with perspective {perspective_uv:?}"
+        "expected a difference, got {affine_uv:?} without perspective and {perspective_uv:?} with perspective"
     );
 }
 
 #[test]
-fn small_triangles_at_window_border_keep_precision() {
-    // The window is 16384 pixels wide. The triangle lies in the last column and is 1/50 pixel in size.
+fn small_triangles_at_viewport_border_keep_precision() {
+    // The triangle lies in the last column, around the center of the pixel. Its width and height are 1/50 pixel.
     let viewport = clip_space_viewport(16384, 64);
     let pixel = [16383, 1];
+    // Clip space is 2 units wide and high, so a pixel is 1/8192 units wide and 1/32 units high.
     let center = [1.0 - 0.5 / 8192.0, 1.0 - 1.5 / 32.0];
-    let size = [0.01 / 8192.0, 0.01 / 32.0];
-    let position = |x: f64, y: f64| [center[0] + size[0] * x, center[1] + size[1] * y, 0.0];
+    let half_size = [0.01 / 8192.0, 0.01 / 32.0];
+    let position = |x: f64, y: f64| [center[0] + half_size[0] * x, center[1] + half_size[1] * y, 0.0];
     let positions: Vec<f32> = [position(-1.0, -1.0), position(1.0, -1.0), position(0.0, 1.0)]
         .as_flattened()
         .iter()
@@ -100,12 +106,13 @@ fn small_triangles_at_window_border_keep_precision() {
         .collect();
     let result =
         footprint(&viewport, &corners(&viewport, &positions, [0, 1, 2]), &[[0.0, 0.0], [1.0, 0.0], [0.5, 1.0]], pixel);
-    // Near 1, numbers in f32 are 2^-24 apart, which is 1/2048 pixel here. Each corner thus moves by up to 1/4096 pixel,
-    // 1.2 % of the triangle's side. The texture coordinate u changes by 1 over 1/50 pixel.
+    // Below 1, numbers in f32 are 2^-24 apart, which is 1/2048 pixel. Rounding to f32 thus moves each corner by up to
+    // 1/4096 pixel, 1.2 % of the triangle's width. The texture coordinate u changes by 1 over this width of 1/50 pixel.
     assert!((result.uv[0] - 0.5).abs() < 0.06 && (result.uv[1] - 0.5).abs() < 0.06, "{result:?}");
     assert!((result.duv_dx[0] / 50.0 - 1.0).abs() < 0.1, "{result:?}");
-    // This triangle lies less than 1/100 pixel to the right of the sample, and rasterizers may draw the sample because
-    // of rounding. It gets the texture coordinates of the nearest point of the triangle, not extrapolated coordinates.
+    // The shifted triangle lies less than 1/100 pixel to the right of the sample. Rasterizers may draw the sample
+    // because of rounding. The sample gets the texture coordinates of the nearest point of the triangle, not
+    // extrapolated ones.
     let shifted_positions = [position(0.2, -1.0), position(2.0, -1.0), position(1.2, 1.0)]
         .as_flattened()
         .iter()
@@ -120,7 +127,8 @@ fn small_triangles_at_window_border_keep_precision() {
     assert!((0.0..=1.0).contains(&result.uv[0]) && (0.0..=1.0).contains(&result.uv[1]), "{result:?}");
 }
 
-/// Triangles without area, overflowing corners and texture coordinates that are not finite give a zero footprint.
+/// The footprint is zero for a triangle without area, for corners whose products overflow or underflow, and for texture
+/// coordinates that are not finite or whose difference overflows.
 #[test]
 fn degenerate_footprints_are_zero() {
     let viewport = clip_space_viewport(8, 8);
@@ -162,25 +170,29 @@ fn alpha_images_repeat_and_filter_trilinearly() {
     };
     let assert_close =
         |actual: f32, expected: f32| assert!((actual - expected).abs() < 1e-6, "expected {expected}, got {actual}");
-    // Texel centers of level 0 are at u = 1/8, 3/8, 5/8 and 7/8. A texel has the width 1/4, so level 0 is used up to a
-    // derivative of 1/4, level 1 at 1/2 and level 2 from 1 on.
+    // Texel centers of level 0 are at u = 1/8, 3/8, 5/8 and 7/8. A texel of level 0 is 1/4 wide, so level 0 is used up
+    // to du_dx = 1/4, level 1 at 1/2, and level 2 from 1 on. Between these values, the two levels are blended.
     assert_close(alpha_at(0.125, 0.0), 0.0);
     assert_close(alpha_at(0.375, 0.25), 0.2);
     assert_close(alpha_at(0.5, 0.1), 0.3);
-    // Halfway between the last texel and the first texel of the next repetition.
+    // u = 0 is halfway between the last texel of a repetition and the first texel of the next one.
     assert_close(alpha_at(0.0, 0.0), 0.3);
     for repeat in [-2.0, 1.0, 5.0] {
         assert_close(alpha_at(0.375 + repeat, 0.0), 0.2);
     }
+    // Level 1.
     assert_close(alpha_at(0.375, 0.5), 1.0);
     // Halfway between levels 0 and 1.
     assert_close(alpha_at(0.375, 0.25 * 2.0_f32.sqrt()), 0.6);
+    // Level 2.
     assert_close(alpha_at(0.375, 1.0), 0.0);
     assert_close(alpha_at(0.375, 1e30), 0.0);
+    // Level 0.
     assert_close(alpha_at(0.375, f32::MIN_POSITIVE), 0.2);
 }
 
-/// A sheet with one sample per texel reproduces its image row by row; at half the size it reproduces level 1.
+/// A sheet that is drawn with one sample per texel covers the samples of its opaque texels. At half the size, these are
+/// the texels of mip level 1.
 #[test]
 fn sheet_reproduces_its_image_at_levels_0_and_1() {
     let mut random = crate::scenes::Random(3);
@@ -203,9 +215,9 @@ fn uniform_images_keep_all_or_nothing_of_a_triangle() {
     let mut different_samples = 0;
     for cut_out_soup in uniform_cut_out_soups() {
         let (soup, cut_outs) = (&cut_out_soup.soup, &cut_out_soup.cut_outs);
-        // Whether the alpha test keeps all samples of a material; otherwise it discards all. The materials have these
-        // values of alpha times image alpha, and of the cutoff: (0, 0.5), (1, 0.5), (0.25, 0.5), (0, 0), (0.75, 0.75),
-        // (0.5, 0.75) and (1, NaN).
+        // For each of the seven materials, whether the alpha test keeps all samples; otherwise it discards all. It
+        // keeps a sample if the alpha (material times image) is at least the cutoff. The alphas and cutoffs are (0,
+        // 0.5), (1, 0.5), (0.25, 0.5), (0, 0), (0.75, 0.75), (0.5, 0.75) and (1, NaN).
         let is_material_opaque = [false, true, false, true, true, false, false];
         let mut expected = VisibilityBuffer::new(soup.viewport);
         for group in &soup.groups {
@@ -221,14 +233,15 @@ fn uniform_images_keep_all_or_nothing_of_a_triangle() {
         }
         let rasterized = cut_out_soup.rasterize();
         assert!(rasterized.keys == expected.keys, "{}", soup.name);
+        // A key holds the depth and the triangle of a sample.
         different_samples +=
             rasterized.keys.iter().zip(&soup.rasterize().keys).filter(|(key, plain_key)| key != plain_key).count();
     }
     assert!(different_samples > 10_000, "negative control: {different_samples} samples differ without cut-outs");
 }
 
-/// The wall is visible through the cut-outs of the floor. Few samples are ambiguous (their alpha is near the cutoff).
-/// Splitting the floor into smaller triangles changes few samples.
+/// The wall is visible through the holes of the floor, which are its transparent texels. Few samples are ambiguous
+/// (their alpha is near the cutoff). Splitting the floor into 40 x 40 rectangles changes few samples.
 #[test]
 fn wall_shows_through_holes_of_the_floor() {
     let cut_out_soup = floor_soup(1);
@@ -238,7 +251,7 @@ fn wall_shows_through_holes_of_the_floor() {
     let ids = cut_out_soup.rasterize().ids();
     let wall_samples = ids.iter().filter(|id| is_wall(id)).count();
     let floor_samples = ids.iter().filter(|id| is_floor(id)).count();
-    // Samples of the floor without its cut-outs.
+    // Samples of the floor without its alpha test.
     let opaque_samples = cut_out_soup.soup.rasterize().ids().iter().filter(|id| is_floor(id)).count();
     assert!(
         floor_samples > opaque_samples / 5 && floor_samples < opaque_samples * 4 / 5 && wall_samples > 1000,

@@ -1,4 +1,5 @@
-//! The CPU deformer equals the f64 reference, and the reference equals closed-form results.
+//! The CPU deformer equals the f64 reference deformer up to f32 rounding, and the reference deformer equals closed-form
+//! results.
 
 use std::sync::Arc;
 
@@ -20,7 +21,7 @@ impl TestRng {
     }
 }
 
-/// A strip of triangles between random vertices, with random modes.
+/// A strip of triangles between random vertices, with random modes. Corner i of the mesh is at vertex i.
 pub(crate) fn random_strip(vertices: usize, rank: usize, random: &mut TestRng) -> Shape {
     let rest_positions: Vec<[f32; 3]> = (0..vertices).map(|_| [random.next(), random.next(), random.next()]).collect();
     let normals = rest_positions.iter().map(|_| [random.next(), random.next(), random.next() + 2.0]).collect();
@@ -81,21 +82,23 @@ fn cpu_equals_reference_for_all_sizes_ranks_and_transforms() {
     assert!(error <= 1e-6, "expected a position error of at most 1e-6 of the diagonal, got {error}");
     // Random transforms can be ill-conditioned, which amplifies f32 rounding (6e-8).
     let tolerance = Tolerance { abs: 2e-5, rel: 0.0 };
+    // Rigid normals and tangents are the rest normals and tangents, changed by the transform but not by U q.
     let normals = reference::rigid_normals(&scene, &state).into_flattened();
     assert_eq!(find_difference(&surface.normals, &normals, tolerance), None);
     let tangents = reference::rigid_tangents(&scene, &state).into_flattened();
     assert_eq!(find_difference(&surface.tangents, &tangents, tolerance), None);
+    let margin = 1e-6 * diagonal;
     for point in &reference_positions {
-        let margin = 1e-6 * diagonal;
         for (coordinate, (min, max)) in point.iter().zip(summary.bounds.min.iter().zip(&summary.bounds.max)) {
             assert!((min - margin..=max + margin).contains(coordinate), "{coordinate} is outside {min} to {max}");
         }
     }
 }
 
-/// Negative control: a wrong coordinate, a missing mode and swapped transforms each cause an error.
+/// Negative control: a wrong coordinate, a coordinate set to zero and swapped transforms each change vertices by more
+/// than 1e-3.
 #[test]
-fn wrong_q_transform_or_missing_mode_is_detected() {
+fn wrong_coordinates_and_transforms_are_detected() {
     let scene = strips_scene(&SIZES);
     let state = random_state(&scene);
     let reference_positions = reference::deform(&scene, &state);
@@ -106,12 +109,13 @@ fn wrong_q_transform_or_missing_mode_is_detected() {
         cpu.deform(&wrong_state).expect("expected the step to succeed");
         max_distance(&cpu.surface().expect("expected a surface").positions, &reference_positions)
     };
+    // Coordinate 30 belongs to the shape with 257 vertices.
     assert!(error_after(&|state| state.q[30] += 0.01) > 1e-3);
     assert!(error_after(&|state| *state.q.last_mut().expect("expected coordinates") = 0.0) > 1e-3);
     assert!(error_after(&|state| state.transforms.swap(4, 5)) > 1e-3);
 }
 
-/// q = 0 gives the rest positions. A single nonzero coordinate adds its column of U times the coordinate.
+/// q = 0 gives the rest positions. A single nonzero coordinate of q adds the coordinate times the same column of U.
 #[test]
 fn reference_is_linear_in_q() {
     let scene = strips_scene(&[(50, 6)]);
@@ -126,14 +130,13 @@ fn reference_is_linear_in_q() {
     for vertex in 0..50 {
         for axis in 0..3 {
             assert_eq!(rest_positions[vertex][axis], f64::from(mesh_positions[vertex][axis]));
-            let column = f64::from(modes.entry(vertex, axis, 4));
-            assert!((unit_positions[vertex][axis] - rest_positions[vertex][axis] - column).abs() < 1e-12);
-            assert!((scaled_positions[vertex][axis] - rest_positions[vertex][axis] + 2.5 * column).abs() < 1e-12);
+            let entry = f64::from(modes.entry(vertex, axis, 4));
+            assert!((unit_positions[vertex][axis] - rest_positions[vertex][axis] - entry).abs() < 1e-12);
+            assert!((scaled_positions[vertex][axis] - rest_positions[vertex][axis] + 2.5 * entry).abs() < 1e-12);
         }
     }
 }
 
-/// The normal of a sheared plane stays orthogonal to it. As a negative control, the untransformed normal does not.
 #[test]
 fn normals_stay_orthogonal_to_a_sheared_plane() {
     let mut parts = SceneParts::named("plane");
@@ -145,11 +148,13 @@ fn normals_stay_orthogonal_to_a_sheared_plane() {
     parts.domains = vec![Domain::new("plane", 0)];
     let scene = Scene::new(parts).expect("expected a valid scene");
     let mut state = SceneState::rest(&scene);
-    // z += x tilts the plane about y. The linear part A maps the normal (0, 0, 1) to itself, which is wrong.
+    // The row-major 3 x 4 transform becomes z' = z + x, which tilts the plane about the y axis. Its linear part A maps
+    // the normal (0, 0, 1) to itself, which is not the normal of the tilted plane.
     state.transforms[0].0[8] = 1.0;
     let mut cpu = CpuDeformer::new(&scene);
     cpu.deform(&state).expect("expected the step to succeed");
     let surface = cpu.surface().expect("expected a surface");
+    // From vertex 0, which is at the origin, to vertex 1.
     let edge = [surface.positions[3], surface.positions[4], surface.positions[5]];
     let dot = |normal: &[f32]| -> f32 { normal.iter().zip(edge).map(|(a, b)| a * b).sum() };
     assert!(dot(&surface.normals[..3]).abs() < 1e-6);
@@ -166,6 +171,7 @@ fn only_overflow_makes_bounds_non_finite() {
         cpu.deform(&state).expect("expected the step to succeed").bounds
     };
     assert!(bounds_at(1e30).is_finite());
+    // The largest f32 is 3.4e38, so sums of three modes overflow.
     assert!(!bounds_at(3e38).is_finite());
     assert!(bounds_at(1e-42).is_finite(), "expected finite bounds for denormal q");
     assert!(bounds_at(0.0).is_finite());
@@ -173,12 +179,12 @@ fn only_overflow_makes_bounds_non_finite() {
 
 /// Repeated steps give the same bits. Vertices whose rows of U are zero have the same bits as at q = 0.
 #[test]
-fn runs_are_bit_identical_and_zero_rows_do_not_move() {
+fn repeated_steps_are_bit_identical_and_zero_rows_stay() {
     let mut parts = SceneParts::named("clamped");
     let (vertices, rank) = (300, 8);
     let mut shape = random_strip(vertices, rank, &mut TestRng(3));
     let mut columns = shape.modes.columns().to_vec();
-    // The rows of the first ten vertices.
+    // U has three rows per vertex. Its first 30 rows belong to ten vertices.
     for mode in 0..rank {
         columns[3 * vertices * mode..][..30].fill(0.0);
     }
@@ -197,6 +203,7 @@ fn runs_are_bit_identical_and_zero_rows_do_not_move() {
     state.transforms = SceneState::rest(&scene).transforms;
     let positions = deform(&state);
     assert_eq!(positions, deform(&state));
+    // Vertices 0 to 9 do not move, but vertex 10 does.
     assert_eq!(positions[..30], rest_positions[..30]);
     assert_ne!(positions[30..33], rest_positions[30..33]);
 }

@@ -1,5 +1,5 @@
-//! The three wire formats of transforms give the same vertices. Vertices 10,000 km from the origin have errors of at
-//! most 1 mm.
+//! The three wire formats of transforms (affine f32, rigid f32 and rigid f64) give the same vertices. Vertices 10,000
+//! km from the origin have errors of at most 1 mm.
 
 use modalcast::config::{BackendChoice, Config};
 use modalcast_model::scene::Scene;
@@ -12,7 +12,7 @@ use crate::service_harness::{
     step, strips,
 };
 
-/// Pose of a domain.
+/// Pose of a domain in scene units.
 #[derive(Clone, Copy)]
 struct Pose {
     /// Quaternion x y z w.
@@ -30,17 +30,17 @@ fn quaternion(roll: f64, pitch: f64, yaw: f64) -> [f32; 4] {
     [rotation.i, rotation.j, rotation.k, rotation.w].map(|number| number as f32)
 }
 
-/// World positions in meters, computed in f64: unit (R (x0 + U q) + t).
+/// World positions of a domain in meters, computed in f64 as unit * (R (x0 + U q) + t). `unit` is the length of a scene
+/// unit in meters.
 fn expected_positions(scene: &Scene, domain: usize, q: &[f32], pose: Pose) -> Vec<Vector3<f64>> {
     let [x, y, z, w] = pose.rotation.map(f64::from);
     let rotation = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
     let shape = scene.shape_of(domain);
     let world_position = |(vertex, rest_position): (usize, &[f32; 3])| {
         let deformed_position = Vector3::from_fn(|axis, _| {
-            let modes = q.iter().enumerate();
-            let displacement: f64 =
-                modes.map(|(mode, q)| f64::from(shape.modes.entry(vertex, axis, mode)) * f64::from(*q)).sum();
-            f64::from(rest_position[axis]) + displacement
+            let products =
+                q.iter().enumerate().map(|(mode, q)| f64::from(shape.modes.entry(vertex, axis, mode)) * f64::from(*q));
+            f64::from(rest_position[axis]) + products.sum::<f64>()
         });
         scene.unit * (rotation * deformed_position + Vector3::from(pose.translation))
     };
@@ -52,7 +52,7 @@ fn decode_positions(scene: &Scene, reply: &ReceivedVertices) -> Vec<Vector3<f64>
     let mut positions = reply.positions.chunks_exact(3);
     let mut world_positions = Vec::new();
     for (index, vertices) in reply.head.vertices.iter().enumerate() {
-        // One origin per domain, or one origin in the head for all domains.
+        // Origins are in meters: one per domain, or one in the head for all domains.
         let origin = if reply.origins.is_empty() { &reply.head.origin } else { &reply.origins[3 * index..][..3] };
         let origin = Vector3::from_column_slice(origin);
         for position in positions.by_ref().take(*vertices as usize) {
@@ -72,11 +72,12 @@ async fn start_cpu_server() -> Server {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn transform_formats_agree_at_any_byte_alignment() {
+async fn transform_formats_give_equal_vertices() {
     let server = Server::start_default().await;
     server.open("strips").await;
     let mut writer = server.drive_lossless("strips").await;
     let pose = Pose { rotation: quaternion(0.3, -0.8, 2.0), translation: [1.5, -2.25, 1e3] };
+    // The pose as an affine 3 x 4 matrix.
     let matrix =
         state_after_steps(&strips(), &[rigid_step(0, RigidF32, &[(1, pose.rotation, pose.translation)])]).transforms[1];
     let affine_step = |format: v1::TransformFormat| v1::Step {
@@ -94,7 +95,8 @@ async fn transform_formats_agree_at_any_byte_alignment() {
     let expected_vertices = reference_vertices(&strips(), &steps[..1]);
     for (number, mut step) in steps.into_iter().enumerate() {
         step.number = number as u64;
-        // An odd number of bytes before the transforms changes their alignment within the message.
+        // Every other step has further fields before the transforms, so that their alignment in the message differs.
+        // The coordinates are zero, as at rest.
         if number % 2 == 1 {
             step.q_domains = vec![0];
             step.q = vec![0; 8].into();
@@ -121,8 +123,8 @@ async fn far_scene_and_far_domain_keep_millimeter_precision() {
     let mut writer = server.drive_lossless("far").await;
     let q = [0.25, -0.5, 0.125, 0.75_f32];
     writer.send_step_and_wait(step(0, &[], &q)).await;
-    // Poses are in half meters, the unit of the scene, from the world origin. The first domain is near the scene
-    // origin, the second is 10,000 km from it along x.
+    // Translations are relative to the world origin, in scene units of half a meter. Domain 0 is near the scene origin.
+    // Domain 1 is 2e7 units (10,000 km) from the scene origin along x.
     let origin = scene.origin.map(|meters| meters / scene.unit);
     let near_pose = Pose {
         rotation: quaternion(0.1, 0.2, 0.3),
@@ -147,14 +149,15 @@ async fn far_scene_and_far_domain_keep_millimeter_precision() {
         [expected_positions(&scene, 0, &q[..2], near_pose), expected_positions(&scene, 1, &q[2..], far_pose)].concat();
     let error = max_distance(&decode_positions(&scene, &reply), &expected);
     assert!(error <= 1e-3, "expected at most 1 mm, got {error} m");
-    // Negative control: the far translation, rounded to f32 relative to the scene origin, has an error of more than 1
-    // cm.
-    let f32_error = far_pose.translation[0] - origin[0] - f64::from((far_pose.translation[0] - origin[0]) as f32);
+    // Negative control: rounding the far translation from the scene origin to f32 causes an error of more than 1 cm.
+    let far_x = far_pose.translation[0] - origin[0];
+    let f32_error = far_x - f64::from(far_x as f32);
     assert!(
         scene.unit * f32_error.abs() > 1e-2,
         "expected an f32 rounding error of more than 1 cm, got {f32_error} units"
     );
-    // The same holds for a selection in another order without normals, and for a selection of one domain.
+    // A selection of the domains in reverse order without normals, and a selection of one domain, have the same
+    // precision.
     let selection = Some(v1::VertexSelection { domains: vec![1, 0], positions_only: true, ..Default::default() });
     let swapped_reply = get_vertices(&server, v1::GetVerticesRequest { selection, ..vertex_request("far", &[]) })
         .await
@@ -165,7 +168,7 @@ async fn far_scene_and_far_domain_keep_millimeter_precision() {
         swapped_reply.normals.is_empty() && max_distance(&decode_positions(&scene, &swapped_reply), &expected) <= 1e-3
     );
     let near_reply = get_vertices(&server, vertex_request("far", &[0])).await.expect("expected vertices");
-    assert_eq!(near_reply.head.origin_bytes, 0);
+    assert_eq!(near_reply.head.origin_bytes, 0, "expected one origin, in the head");
     assert!(
         max_distance(&decode_positions(&scene, &near_reply), &expected_positions(&scene, 0, &q[..2], near_pose))
             <= 1e-3
@@ -195,7 +198,7 @@ async fn origin_follows_a_moved_scene_and_survives_a_restart() {
     };
     writer.send_step_and_wait(pose_step(4)).await;
     let reply = get_vertices(&server, vertex_request("strips", &[])).await.expect("expected vertices");
-    // The origin is the multiple of 1024 that is nearest to 1e7.
+    // Origins are multiples of 1024. The nearest one to 1e7 is 9766 * 1024.
     assert_eq!(
         (reply.head.origin.as_slice(), reply.head.origin_bytes),
         ([9766.0 * 1024.0, 0.0, -9766.0 * 1024.0].as_slice(), 0)
@@ -212,7 +215,7 @@ async fn origin_follows_a_moved_scene_and_survives_a_restart() {
         (restored_reply.step().number, &restored_reply.positions, &restored_reply.head.origin),
         (4, &reply.positions, &reply.head.origin)
     );
-    // The next f64 transform applies to the state restored from the checkpoint.
+    // The next step changes only domain 1. Domain 0 keeps the pose that the restart restored.
     let mut writer = server.drive_lossless("strips").await;
     let new_pose = Pose { rotation: poses[1].rotation, translation: [1e7 + 11.5, 0.001, -1e7] };
     writer.send_step_and_wait(rigid_step(0, RigidF64, &[(1, new_pose.rotation, new_pose.translation)])).await;

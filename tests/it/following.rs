@@ -1,15 +1,19 @@
-//! Followers over the wire: a leaf that follows a branch, and a leaflet that follows the leaf.
+//! Followers over the wire: a leaf that follows a branch, and a leaflet that follows the leaf. A follower has a fixed
+//! frame relative to its parent. A domain that follows no other domain is a transform root and has a transform of its
+//! own.
 
 use modalcast_proto::v1;
 
 use crate::service_harness::{Server, get_vertices, reference_vertices, step, twig};
 
-/// Indices of domains of the scene `twig`. Domain 0 is a strip that nothing follows.
+/// Indices of domains of the scene `twig`, where the branch is named `right`. Domain 0, `left`, is a strip that no
+/// domain follows.
 const BRANCH: u32 = 1;
 const LEAF: u32 = 2;
 const LEAFLET: u32 = 3;
 
-/// A step that sets the transforms of domains; each transform is a row-major 3 x 4 matrix.
+/// A step that sets the transforms of the listed domains, or of all transform roots if the list is empty. Each
+/// transform is a row-major 3 x 4 matrix.
 fn transform_step(number: u64, domains: &[u32], transforms: &[[f32; 12]]) -> v1::Step {
     let transforms =
         transforms.as_flattened().iter().flat_map(|number| number.to_le_bytes()).collect::<Vec<u8>>().into();
@@ -25,27 +29,28 @@ fn vertex_request(domains: &[u32]) -> v1::GetVerticesRequest {
 const DOMAIN_NUMBERS: usize = 12;
 
 /// Row-major 3 x 4 matrix: a rotation by 90 degrees about z, then a translation by (2, 0, -3).
-const ROTATION: [f32; 12] = [0.0, -1.0, 0.0, 2.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, -3.0];
+const ROTATION_AND_SHIFT: [f32; 12] = [0.0, -1.0, 0.0, 2.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, -3.0];
+/// Row-major 3 x 4 matrix: a translation by (7, 8, 9).
 const TRANSLATION: [f32; 12] = [1.0, 0.0, 0.0, 7.0, 0.0, 1.0, 0.0, 8.0, 0.0, 0.0, 1.0, 9.0];
 
 #[tokio::test(flavor = "multi_thread")]
-async fn moved_branch_moves_only_its_leaves() {
+async fn moved_branch_moves_only_itself_and_its_followers() {
     let server = Server::start_default().await;
     server.open("twig").await;
     let mut writer = server.drive_lossless("twig").await;
     let rest_positions = get_vertices(&server, vertex_request(&[])).await.expect("expected vertices").positions;
-    let step = transform_step(0, &[BRANCH], &[ROTATION]);
+    let step = transform_step(0, &[BRANCH], &[ROTATION_AND_SHIFT]);
     writer.send_step_and_wait(step.clone()).await;
     let positions = get_vertices(&server, vertex_request(&[])).await.expect("expected vertices").positions;
     assert_eq!(positions, reference_vertices(&twig(), &[step]).positions);
     assert_eq!(positions[..DOMAIN_NUMBERS], rest_positions[..DOMAIN_NUMBERS], "expected the other strip not to move");
     // The first vertex of the leaf is the origin of the leaf's frame, which is at (0.5, 1, -0.25) in the branch's
-    // frame. The leaflet applies the same frame again within the leaf's frame.
-    let rotate = |[x, y, z]: [f32; 3]| [2.0 - y, x, z - 3.0];
+    // frame. The leaflet has the same frame relative to the leaf. The frame maps (0.5, 1, -0.25) to (-0.5, 1.5, -0.5).
+    let transformed = |[x, y, z]: [f32; 3]| [2.0 - y, x, z - 3.0];
     let positions_of = |domain: usize| &positions[DOMAIN_NUMBERS * domain..][..DOMAIN_NUMBERS];
     let first_vertex = |domain: usize| [positions_of(domain)[0], positions_of(domain)[1], positions_of(domain)[2]];
-    assert_eq!(first_vertex(LEAF as usize), rotate([0.5, 1.0, -0.25]));
-    assert_eq!(first_vertex(LEAFLET as usize), rotate([-0.5, 1.5, -0.5]));
+    assert_eq!(first_vertex(LEAF as usize), transformed([0.5, 1.0, -0.25]));
+    assert_eq!(first_vertex(LEAFLET as usize), transformed([-0.5, 1.5, -0.5]));
     assert!(
         (1..4).all(|domain| *positions_of(domain) != rest_positions[DOMAIN_NUMBERS * domain..][..DOMAIN_NUMBERS]),
         "negative control: the branch and its followers move"
@@ -53,23 +58,23 @@ async fn moved_branch_moves_only_its_leaves() {
     writer.finish().await;
 }
 
-/// A step that contains the transform of a follower is rejected as a whole. A step without a list of domains has one
-/// transform per transform root, and none for followers.
+/// A step with the transform of a follower is rejected as a whole. A step without a list of domains has one transform
+/// per transform root, and none for followers.
 #[tokio::test(flavor = "multi_thread")]
 async fn step_with_transform_of_a_follower_is_rejected() {
     let server = Server::start_default().await;
     server.open("twig").await;
     let mut writer = server.drive_lossless("twig").await;
     // The transform roots are the two strips.
-    let root_step = transform_step(0, &[], &[TRANSLATION, ROTATION]);
+    let root_step = transform_step(0, &[], &[TRANSLATION, ROTATION_AND_SHIFT]);
     writer.send_step_and_wait(root_step.clone()).await;
     let positions = get_vertices(&server, vertex_request(&[])).await.expect("expected vertices").positions;
     assert_eq!(positions, reference_vertices(&twig(), &[root_step]).positions);
-    // The coordinates of domain 0 are valid, but they must not be applied either.
+    // The coordinates q of domain 0 are valid (`vec![1; 8]` is two small f32), but must not be applied either.
     let invalid_step = v1::Step {
         q_domains: vec![0],
         q: vec![1; 8].into(),
-        ..transform_step(1, &[BRANCH, LEAFLET], &[TRANSLATION, ROTATION])
+        ..transform_step(1, &[BRANCH, LEAFLET], &[TRANSLATION, ROTATION_AND_SHIFT])
     };
     writer.send_step(invalid_step).await;
     let rejection = writer.receive_rejection().await;

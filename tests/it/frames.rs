@@ -65,13 +65,14 @@ async fn next_head(stream: &mut Streaming<v1::StreamFramesResponse>) -> Option<v
 async fn frame_names_its_step_and_png_equals_rgba() {
     let server = start_server().await;
     let mut writer = server.drive_lossless("strips").await;
-    // Run 0 is the time before the first step.
+    // The frame is of run 0, because no writer has sent a step. The first writer starts run 1.
     let rest_frame = render(&server, rgba_request()).await.expect("expected a frame at rest");
     assert_eq!(rest_frame.head.step.map(|step| step.run), Some(0));
     writer.send_step_and_wait(step(5, &[], &[0.9, 0.3, -0.9, 0.2])).await;
     let rgba_frame =
         render(&server, v1::RenderFrameRequest { step: Some(RequestedStep::ExactStep(5)), ..rgba_request() }).await;
     let rgba_frame = rgba_frame.expect("expected a frame");
+    // `step` sets the time to half of the number.
     assert_eq!(rgba_frame.head.step, Some(v1::StepId { run: 1, number: 5, time: 2.5 }));
     assert_eq!((rgba_frame.head.width, rgba_frame.head.height, rgba_frame.bytes.len()), (64, 48, 64 * 48 * 4));
     assert_ne!(rgba_frame.bytes, rest_frame.bytes, "expected another image than at rest");
@@ -112,9 +113,9 @@ async fn lossless_frames_are_complete_and_latest_frames_increase() {
         frames,
     };
     let mut client = server.frames().await;
-    // 0 frames mean an endless stream.
     let lossless =
         client.stream_frames(stream_request(v1::Delivery::Lossless, 12)).await.expect("expected a subscription");
+    // 0 frames mean an endless stream.
     let latest = client.stream_frames(stream_request(v1::Delivery::Latest, 0)).await.expect("expected a subscription");
     let (mut lossless, mut latest) = (lossless.into_inner(), latest.into_inner());
     let mut writer = server.drive("strips", v1::Policy::Lossless, 3).await;
@@ -146,7 +147,7 @@ async fn lossless_frames_are_complete_and_latest_frames_increase() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn invalid_pictures_are_rejected_and_deadlines_hold() {
+async fn invalid_pictures_and_missed_deadlines_are_errors() {
     let server = start_server().await;
     let camera_at = |eye: Vec<f64>, up: Vec<f64>| v1::Camera {
         view: Some(v1::camera::View::LookAt(v1::LookAt { eye, target: vec![0.0; 3], up })),
@@ -158,6 +159,7 @@ async fn invalid_pictures_are_rejected_and_deadlines_hold() {
     let nan_eye = vec![f64::NAN, 0.0, 1.0];
     let eye_at_target = vec![0.0; 3];
     let eye_along_up = vec![0.0, 2.0, 0.0];
+    // Invalid cameras, and the beginning of the field in the rejection.
     let cameras: Vec<(v1::Camera, &str)> = vec![
         (camera_at(two_numbers, y_axis()), "picture: camera.look_at.eye"),
         (camera_at(nan_eye, y_axis()), "picture: camera.look_at"),
@@ -189,7 +191,8 @@ async fn invalid_pictures_are_rejected_and_deadlines_hold() {
         assert_eq!((status.code(), rejection_details(&status).field.as_str()), (Code::InvalidArgument, "picture.size"));
         assert_eq!(rejection_details(&status).given, format!("{width} x {height}"));
     }
-    // The next requests wait for a step that is never sent. One has a deadline in the message, the other in a header.
+    // The next two requests wait for a step that is never sent. The first has its deadline in the message, the second
+    // in the gRPC header `grpc-timeout`.
     let unanswered_request =
         v1::RenderFrameRequest { step: Some(RequestedStep::MinimumStep(1)), deadline_ms: 60, ..rgba_request() };
     assert_eq!(
@@ -198,7 +201,7 @@ async fn invalid_pictures_are_rejected_and_deadlines_hold() {
     );
     let mut request_with_header =
         tonic::Request::new(v1::RenderFrameRequest { step: Some(RequestedStep::MinimumStep(1)), ..rgba_request() });
-    // In this header, "m" means milliseconds.
+    // 60 milliseconds.
     request_with_header.metadata_mut().insert("grpc-timeout", "60m".parse().expect("expected a header value"));
     let result = async {
         let mut stream = server.frames().await.render_frame(request_with_header).await?.into_inner();

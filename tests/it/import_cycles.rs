@@ -1,5 +1,5 @@
-//! The files of each crate import each other without cycles. A module and its submodules may use each other, because
-//! the documentation of the module describes them together.
+//! The modules of each crate import each other without cycles. Only a module and its submodules may use each other,
+//! because the documentation of the module describes them together.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -28,7 +28,7 @@ type ModulePath = Vec<String>;
 struct Module {
     /// Paths of the imported items from the crate root.
     imports: BTreeSet<ModulePath>,
-    /// Names that the module re-exports, and the paths of their definitions.
+    /// Maps each name that the module re-exports to the path that the `pub use` names.
     reexports: BTreeMap<String, ModulePath>,
 }
 
@@ -49,6 +49,7 @@ impl ImportCollector<'_> {
             "self" | "super" => self.module.clone(),
             _ => return None,
         };
+        // Each `super` removes one name.
         let super_count = segments.iter().take_while(|segment| *segment == "super").count();
         base.truncate(base.len().checked_sub(super_count)?);
         let names = segments.iter().filter(|name| !["crate", "self", "super"].contains(&name.as_str()));
@@ -76,7 +77,7 @@ impl ImportCollector<'_> {
     }
 }
 
-/// Whether the item is compiled for tests only.
+/// Whether an item has the attribute `#[cfg(test)]`.
 fn is_test_only(attributes: &[syn::Attribute]) -> bool {
     attributes.iter().any(|attribute| {
         attribute.path().is_ident("cfg")
@@ -149,6 +150,7 @@ fn add_modules(modules: &mut CrateModules, module: ModulePath, (file, items): (&
         }
         let path = [module.as_slice(), &[item.ident.to_string()]].concat();
         match &item.content {
+            // An inline module is in the same file.
             Some((_, items)) => add_modules(modules, path, (file, items)),
             None => {
                 let file = file_of_submodule(file, item).unwrap_or_else(|| panic!("{path:?} has no file"));
@@ -168,7 +170,7 @@ fn parse(file: &Path) -> Vec<syn::Item> {
 /// re-exports the next name of `path`; then the search continues at the definition of that name.
 fn defining_module(modules: &CrateModules, path: &[String]) -> ModulePath {
     let mut path = path.to_vec();
-    // Longer chains of re-exports do not occur.
+    // Each round resolves one re-export. No item has more than 8.
     for _ in 0..8 {
         let length = (0..=path.len()).rev().find(|length| modules.contains_key(&path[..*length])).unwrap_or_default();
         let (module, remaining_names) = path.split_at(length);
@@ -182,7 +184,7 @@ fn defining_module(modules: &CrateModules, path: &[String]) -> ModulePath {
 }
 
 /// The modules that each module imports, except its ancestors and descendants.
-fn imports_between_branches(modules: &CrateModules) -> BTreeMap<&ModulePath, BTreeSet<ModulePath>> {
+fn imports_of_unrelated_modules(modules: &CrateModules) -> BTreeMap<&ModulePath, BTreeSet<ModulePath>> {
     let targets_of = |path: &ModulePath, module: &Module| -> BTreeSet<ModulePath> {
         let targets = module.imports.iter().map(|import| defining_module(modules, import));
         targets.filter(|target| !target.starts_with(path) && !path.starts_with(target)).collect()
@@ -208,8 +210,9 @@ fn reachable_modules<'a>(
 
 /// The sets of modules that import each other in a cycle.
 fn find_cycles(modules: &CrateModules) -> BTreeSet<BTreeSet<String>> {
-    let edges = imports_between_branches(modules);
+    let edges = imports_of_unrelated_modules(modules);
     let reachable: BTreeMap<_, _> = edges.keys().map(|module| (*module, reachable_modules(&edges, module))).collect();
+    // The strongly connected component of a module: the modules that it reaches and that reach it.
     let component = |module: &ModulePath| -> BTreeSet<String> {
         let members = reachable[module].iter().filter(|other| reachable[**other].contains(module));
         members.map(|other| other.join("::")).collect()
@@ -218,7 +221,7 @@ fn find_cycles(modules: &CrateModules) -> BTreeSet<BTreeSet<String>> {
 }
 
 #[test]
-fn files_of_each_crate_form_no_import_cycle() {
+fn modules_of_each_crate_form_no_import_cycle() {
     let cycles_of = |root: &str| {
         let file = Path::new(env!("CARGO_MANIFEST_DIR")).join(root);
         let mut modules = CrateModules::new();
@@ -231,7 +234,7 @@ fn files_of_each_crate_form_no_import_cycle() {
     assert!(cycles_by_crate.is_empty(), "{cycles_by_crate:#?}");
 }
 
-/// Modules of a crate from pairs of a module path and a source text.
+/// The modules of a crate. Each pair is a module path and the source text of the module.
 fn parse_crate_modules(texts: &[(&str, &str)]) -> CrateModules {
     let module = |(path, text): &(&str, &str)| {
         let path: ModulePath = path.split("::").filter(|name| !name.is_empty()).map(str::to_owned).collect();
@@ -263,7 +266,7 @@ fn import_cycles_are_detected() {
 }
 
 #[test]
-fn parents_children_and_tests_form_no_cycle() {
+fn submodules_and_test_imports_form_no_cycle() {
     let parent_and_child = parse_crate_modules(&[("", ""), ("a", "pub use self::b::B;"), ("a::b", "use super::A;")]);
     assert_eq!(find_cycles(&parent_and_child), BTreeSet::new());
     let test_import =

@@ -22,7 +22,8 @@ type InvalidStep = (&'static str, v1::Step, [&'static str; 3]);
 /// The identity rotation as a quaternion x y z w.
 const IDENTITY_QUATERNION: [f32; 4] = [0.0, 0.0, 0.0, 1.0];
 
-/// Invalid steps of the scene `strips`, whose two domains have two modes each. The last valid step has the number 10.
+/// Invalid steps of the scene `strips`, whose two domains have two modes each. "T" in the names is a transform. The
+/// last valid step has the number 10.
 fn invalid_steps() -> Vec<InvalidStep> {
     let transforms = |domains: &[u32], numbers: &[f32]| v1::Step {
         transform_domains: domains.to_vec(),
@@ -46,7 +47,7 @@ fn invalid_steps() -> Vec<InvalidStep> {
             ["step.q of domain 'right', mode 0", "a finite", "inf"],
         ),
         (
-            "q moves a vertex out of range",
+            "q moves a vertex beyond 1e18",
             step(11, &[1], &[f32::MAX, 0.0]),
             ["step.q of domain 'right'", "q and transform", "vertex"],
         ),
@@ -80,10 +81,11 @@ fn invalid_steps() -> Vec<InvalidStep> {
     ]
 }
 
-/// Invalid steps in the rigid transform formats, and steps with a format that does not match their bytes.
-fn invalid_formats() -> Vec<InvalidStep> {
+/// Invalid steps in the rigid transform formats, and steps whose bytes do not match their format.
+fn invalid_transform_steps() -> Vec<InvalidStep> {
     let step_with_format = |format: i32| v1::Step {
         transform_domains: vec![0],
+        // The size of an affine transform: 12 numbers in f32.
         transforms: vec![0; 48].into(),
         transform_format: format,
         ..step(11, &[], &[])
@@ -138,7 +140,7 @@ fn invalid_formats() -> Vec<InvalidStep> {
             ["step.transforms of domain 'right': translation[0]", "at most 1.09", "-1000000000"],
         ),
         (
-            "q moves a vertex out of range at a far origin",
+            "q moves a vertex of a far scene beyond 1e18",
             overflowing_step,
             ["step.q of domain 'right'", "q and transform", "vertex"],
         ),
@@ -163,10 +165,13 @@ async fn stream_stays_open_after_invalid_steps() {
     writer.send_step_and_wait(valid_step.clone()).await;
     let expected_vertices = reference_vertices(&strips(), &[valid_step]);
     let request = v1::GetVerticesRequest { scene: "strips".into(), ..v1::GetVerticesRequest::default() };
-    // A step that is rejected because of overflow consumes its number, so the numbers increase from case to case.
-    for (index, (name, mut invalid_step, prefixes)) in invalid_steps().into_iter().chain(invalid_formats()).enumerate()
+    // A step that moves a vertex beyond 1e18 is rejected, but its number counts as used. So the numbers increase from
+    // case to case.
+    for (index, (name, mut invalid_step, prefixes)) in
+        invalid_steps().into_iter().chain(invalid_transform_steps()).enumerate()
     {
-        // Two cases have a number that is too low. They keep it.
+        // The two cases that test a number that is too low keep their number. The limit in their rejection depends on
+        // the earlier cases.
         let is_decreasing = invalid_step.number < 11;
         invalid_step.number += if is_decreasing { 0 } else { index as u64 };
         let number = invalid_step.number;
@@ -181,10 +186,14 @@ async fn stream_stays_open_after_invalid_steps() {
             (10, &expected_vertices.positions, &expected_vertices.normals),
             "{name}"
         );
-        assert_eq!((reply.head.origin.as_slice(), reply.origins.len()), ([0.0; 3].as_slice(), 0), "{name}");
+        assert_eq!(
+            (reply.head.origin.as_slice(), reply.origins.len()),
+            ([0.0; 3].as_slice(), 0),
+            "{name}: expected the origin of a scene that has not moved"
+        );
         other_writer.send_step_and_wait(step(index as u64, &[0], &[0.5, 0.5])).await;
     }
-    // 1000 is above the numbers of all cases.
+    // 1000 is above the numbers of all invalid steps.
     writer.send_step_and_wait(step(1000, &[0], &[0.0, 0.0])).await;
 }
 
@@ -242,7 +251,7 @@ async fn invalid_requests_return_code_and_details() {
     let server = Server::start_default().await;
     server.open("strips").await;
     let mut scenes = server.scenes().await;
-    // Status, expected code, and prefixes of `field`, `expected` and `given`.
+    // Status, expected code, and prefixes of the fields `field`, `expected` and `given` of the rejection.
     let mut rejected_calls = Vec::new();
     let selection = Some(v1::VertexSelection { domains: vec![0, 5], ..Default::default() });
     let request = v1::GetVerticesRequest { scene: "strips".into(), selection, ..v1::GetVerticesRequest::default() };
@@ -287,14 +296,14 @@ async fn invalid_requests_return_code_and_details() {
             rejection_details(&status)
         );
     }
-    // A panic in the loader is an error of its call only.
+    // A panic in the loader fails only its own call.
     let request = v1::OpenSceneRequest { source: "panic".into(), scene: String::new() };
     let status = scenes.open_scene(request).await.expect_err("expected an internal error");
     assert_eq!(status.code(), Code::Internal);
     server.open("strips").await;
 }
 
-/// The messages of a valid upload of one file, `scene.txt`, which names the source to open.
+/// The messages of a valid upload of one file, `scene.txt`. Its contents name the source to open.
 fn upload_parts(contents: &[u8]) -> Vec<Part> {
     let header =
         v1::UploadHeader { scene: "up".into(), entry: String::new(), files: 1, total_bytes: contents.len() as u64 };
@@ -309,7 +318,7 @@ async fn upload(server: &Server, parts: Vec<Part>) -> Result<v1::UploadSceneResp
     response.map(tonic::Response::into_inner)
 }
 
-/// The upload of a file that names `strips`, with a modified header or file message.
+/// An upload of `scene.txt` with the contents "strips", after a change of the header or of the file message.
 fn modified_upload(modify: impl FnOnce(&mut v1::UploadHeader, &mut v1::UploadFile)) -> Vec<Part> {
     let mut parts = upload_parts(b"strips");
     if let [Part::Header(header), Part::File(file), _] = parts.as_mut_slice() {
@@ -322,7 +331,8 @@ fn modified_upload(modify: impl FnOnce(&mut v1::UploadHeader, &mut v1::UploadFil
 async fn invalid_uploads_are_rejected_and_leave_no_files() {
     let server = Server::start_with(|config| modalcast::config::Config { upload_bytes: 1000, ..config }).await;
     let uploads = server.engine.config().state.join("uploads");
-    let path = |path: &'static str| modified_upload(move |_, file| file.path = path.into());
+    let upload_to = |path: &'static str| modified_upload(move |_, file| file.path = path.into());
+    // Name of the case, messages, and prefixes of the fields `field`, `expected` and `given` of the rejection.
     let cases: Vec<(&str, Vec<Part>, [&str; 3])> = vec![
         ("empty stream", vec![], ["part", "a header as the first part", "nothing"]),
         ("no header", upload_parts(b"strips").split_off(1), ["part", "a header as the first part", "a file or chunk"]),
@@ -336,9 +346,9 @@ async fn invalid_uploads_are_rejected_and_leave_no_files() {
             modified_upload(|_, file| file.sha256 = vec![7; 3].into()),
             ["file.sha256", "32 bytes", "3 bytes"],
         ),
-        ("path outside of the folder", path("../scene.txt"), ["file.path", "a relative path", "\"../scene.txt\""]),
-        ("absolute path", path("/etc/scene.txt"), ["file.path", "a relative path", "\"/etc/scene.txt\""]),
-        ("backslash in the path", path("..\\scene.txt"), ["file.path", "a relative path", ""]),
+        ("path outside of the folder", upload_to("../scene.txt"), ["file.path", "a relative path", "\"../scene.txt\""]),
+        ("absolute path", upload_to("/etc/scene.txt"), ["file.path", "a relative path", "\"/etc/scene.txt\""]),
+        ("backslash in the path", upload_to("..\\scene.txt"), ["file.path", "a relative path", ""]),
         ("no contents", upload_parts(b"strips")[..2].to_vec(), ["file.bytes of 'scene.txt'", "6 bytes", "0 bytes"]),
         (
             "too few bytes announced",
@@ -358,7 +368,7 @@ async fn invalid_uploads_are_rejected_and_leave_no_files() {
             ["header.entry", "a relative path", "\"../x\""],
         ),
         ("missing entry", modified_upload(|header, _| header.entry = "x".into()), ["entry", "a file", ""]),
-        ("unknown source in the file", upload_parts(b"lunch"), ["scene", "an existing scene", "lunch"]),
+        ("file names an unknown source", upload_parts(b"nothing"), ["scene", "an existing scene", "nothing"]),
     ];
     for (name, parts, prefixes) in cases {
         let status = upload(&server, parts).await.expect_err(name);
@@ -378,7 +388,8 @@ async fn invalid_uploads_are_rejected_and_leave_no_files() {
     assert_eq!(std::fs::read_dir(&uploads).expect("expected an uploads folder").count(), 0);
 }
 
-/// Status details are sent in an HTTP/2 header, so a rejection of a very long input is truncated.
+/// Status details are sent in an HTTP/2 header, whose size is limited. A rejection that repeats a very long input is
+/// truncated.
 #[tokio::test(flavor = "multi_thread")]
 async fn rejection_details_fit_into_a_header() {
     let server = Server::start_default().await;

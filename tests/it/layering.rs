@@ -1,5 +1,5 @@
-//! Checks of the tables in `src/lib.rs` and of the layout of the repository: modules use only the modules of their row,
-//! and every kernel has a launcher and a CPU twin.
+//! Checks of the tables in `src/lib.rs` and of the layout of the repository: a module uses only the modules that its
+//! row of the table names, and every CUDA kernel has a launcher and a CPU twin (a CPU function with the same result).
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -17,9 +17,10 @@ fn read_usage_table() -> UsageTable {
     parse_usage_table(&fs::read_to_string(repository_root().join("src/lib.rs")).expect("expected src/lib.rs"))
 }
 
-/// Parses the tables in the documentation of `src/lib.rs`. Their columns are the name, the contents and the names that
-/// may be used.
+/// Parses the tables in the documentation of `src/lib.rs`. The columns of a table are the name, the contents and the
+/// names that may be used.
 fn parse_usage_table(page: &str) -> UsageTable {
+    // The names of a cell are between backquotes.
     let names = |cell: &str| -> BTreeSet<String> { cell.split('`').skip(1).step_by(2).map(str::to_owned).collect() };
     let row = |line: &str| {
         let cells: Vec<&str> = line.strip_prefix("//! | `")?.split('|').collect();
@@ -45,7 +46,7 @@ fn list_files(folder: &Path, extensions: &[&str]) -> Vec<PathBuf> {
     paths
 }
 
-/// Folders of `src` that are separate crates.
+/// Folders of `src` that are crates of their own.
 const CRATE_FOLDERS: [&str; 3] = ["compute", "model", "render"];
 
 /// Crate and top-level module of a file of `src`, named as in the table. `None` for the root file of a crate and for
@@ -101,8 +102,8 @@ fn split_group(group: &str) -> Vec<&str> {
     entries
 }
 
-/// Lists the forbidden uses in a text: modules of the same crate that the module's row does not name, and
-/// `modalcast_proto` outside of `service`.
+/// Lists the forbidden uses in the text of a module: modules of the same crate that the row of the module does not
+/// name, and `modalcast_proto` outside of `service`.
 fn find_forbidden_uses((package, module): (&str, &str), text: &str, usage_table: &UsageTable) -> Vec<String> {
     let row = |module: &str| usage_table.get(&format!("{package}::{module}"));
     let Some(allowed_modules) = row(module) else { return vec![format!("{package}::{module} is not in the table")] };
@@ -140,8 +141,9 @@ fn modules_use_only_what_their_row_names() {
     }
 }
 
-/// Lists the uses of a forbidden tier in a source text. `row` is the tier of the text, such as
-/// `modalcast-compute::gpu::tables`. A use of another tier has the form `crate::gpu::launch` or `super::launch`.
+/// Lists the uses of a forbidden tier (a submodule with its own row) in a source text. `row` is the tier of the text,
+/// such as `modalcast-compute::gpu::tables`. A use of another tier has the form `crate::gpu::launch` or
+/// `super::launch`.
 fn find_forbidden_tier_uses(row: &str, text: &str, usage_table: &UsageTable) -> Vec<String> {
     let (parent, tier) = row.rsplit_once("::").expect("expected a row of a tier");
     let module = parent.rsplit("::").next().unwrap_or_default();
@@ -152,7 +154,7 @@ fn find_forbidden_tier_uses(row: &str, text: &str, usage_table: &UsageTable) -> 
 }
 
 #[test]
-fn tiers_of_a_module_use_only_what_their_row_names() {
+fn tiers_of_the_gpu_module_use_only_what_their_row_names() {
     let usage_table = read_usage_table();
     let tiers: Vec<&String> = usage_table.keys().filter(|row| row.starts_with("modalcast-compute::gpu::")).collect();
     assert_eq!(tiers.len(), 3, "{tiers:?}");
@@ -190,8 +192,8 @@ fn forbidden_uses_of_tiers_are_detected() {
 #[test]
 fn module_dependencies_have_no_cycle() {
     let usage_table = read_usage_table();
-    // Module names are unique across the crates. Repeatedly remove a module that uses none of the remaining ones. The
-    // table becomes empty unless there is a cycle.
+    // Module names are unique across the crates. Repeatedly remove a module that uses none of the remaining modules. No
+    // such module exists in a cycle.
     let name = |row: &String| row.rsplit("::").next().unwrap_or_default().to_owned();
     let mut remaining: BTreeMap<String, BTreeSet<String>> = usage_table
         .iter()
@@ -208,9 +210,9 @@ fn module_dependencies_have_no_cycle() {
     }
 }
 
-/// Cargo permits only the dependencies of the manifest, so the crates have the order of the table.
+/// The dependencies in the manifest of a crate are those of its row. Cargo permits no others.
 #[test]
-fn manifests_depend_on_lower_tiers_only() {
+fn manifests_have_the_dependencies_of_the_table() {
     let usage_table = read_usage_table();
     for (folder, package) in
         [("src/compute", "modalcast-compute"), ("src/render", "modalcast-render"), ("src/model", "modalcast-model")]
@@ -250,7 +252,7 @@ fn forbidden_uses_are_detected() {
 }
 
 /// Whether the CPU twin of a kernel is a `twin_of_` function in the tests of its launcher, instead of a separate file.
-/// This holds for kernels that only the benchmarks launch, and for variants of another kernel with the same result.
+/// These kernels are launched only by the benchmarks, or have the same result as another kernel.
 fn has_twin_in_launcher_tests(name: &str) -> bool {
     name.starts_with("thesis_") || ["bandwidth", "plain_update", "batch", "batch_mma"].contains(&name)
 }
@@ -273,9 +275,9 @@ struct Twin {
 impl Twin {
     /// Whether the text of a source file defines the method in an `impl` block of the type, and the text of a kernel
     /// names the method in its comment `CPU twin:`.
-    fn is_defined_and_named(&self, file: &str, kernel: &str) -> bool {
+    fn is_defined_and_named(&self, source: &str, kernel: &str) -> bool {
         let impl_block =
-            file.split(&format!("\nimpl {} {{", self.type_name)).nth(1).and_then(|rest| rest.split("\n}\n").next());
+            source.split(&format!("\nimpl {} {{", self.type_name)).nth(1).and_then(|rest| rest.split("\n}\n").next());
         let has_method =
             impl_block.is_some_and(|impl_block| impl_block.contains(&format!("\n    pub fn {}(", self.method)));
         let qualified_name = format!("{}::{}.", self.type_name, self.method);
@@ -296,7 +298,7 @@ fn missing_or_unnamed_twin_method_is_detected() {
 
 #[test]
 fn every_kernel_has_a_launcher_and_a_twin() {
-    // Kernels of the server, then kernels of the benchmarks.
+    // Paths of the kernels of the server and of the benchmarks, each with the folder of its launcher.
     let mut kernel_folders = Vec::new();
     for (kernels, launchers) in [("kernels", "src/compute/gpu"), ("tests/bench/kernels", "tests/bench/src/kernels")] {
         let paths = list_files(&repository_root().join(kernels), &["cu"]);
@@ -314,16 +316,17 @@ fn every_kernel_has_a_launcher_and_a_twin() {
             continue;
         }
         if let Some((_, twin)) = METHOD_TWINS.iter().find(|(kernel, _)| *kernel == name) {
-            let [file, text] = [&repository_root().join(twin.file), &kernel]
+            let [twin_source, kernel_source] = [&repository_root().join(twin.file), &kernel]
                 .map(|path| fs::read_to_string(path).expect("expected a readable file"));
             assert!(
-                twin.is_defined_and_named(&file, &text),
+                twin.is_defined_and_named(&twin_source, &kernel_source),
                 "expected {name} to have the CPU twin {}::{} and to name it",
                 twin.type_name,
                 twin.method
             );
             continue;
         }
+        // Other kernels have a twin in f64 (the reference) and a twin in f32 (the CPU deformer).
         for folder in ["src/compute/reference", "src/compute/cpu"] {
             let twin = repository_root().join(folder).join(format!("{name}.rs"));
             assert!(twin.exists(), "{} is missing", twin.display());
@@ -349,7 +352,7 @@ fn only_gpu_and_render_have_unsafe_code() {
 
 /// The minimum versions are the lowest versions without known security faults.
 #[test]
-fn locked_versions_have_no_known_faults() {
+fn locked_versions_have_no_known_security_faults() {
     let lock_file = fs::read_to_string(repository_root().join("Cargo.lock")).expect("expected a lock file");
     let minimum_versions = [
         ("h2", "0.4.16"),

@@ -8,18 +8,19 @@ use modalcast_model::load;
 use modalcast_model::scene::{BoundingBox, Camera, OrientedBounds, Scene, SceneState};
 use modalcast_render::{FrameParams, shadow_texel_axes};
 
-/// Side lengths of a shadow map texel in scene units. Without light bounds, the map is fitted to the corners of
-/// `bounds`.
+/// Side lengths of a shadow map texel in scene units. The map is fitted to `light_bounds` (the bounds in light space),
+/// or without these to the corners of `bounds`.
 fn texel_size(scene: &Scene, bounds: BoundingBox, light_bounds: Option<OrientedBounds>) -> [f64; 2] {
     let params =
         FrameParams { camera: Camera::fit_to_scene(scene, 64, 64), width: 64, height: 64, bounds, light_bounds };
     shadow_texel_axes(scene, &params).expect("expected a scene with a shadow").map(|side| side.norm())
 }
 
-/// Texels fitted to the light-space boxes of tiles (groups of up to 128 vertices) have less than half the area of
-/// texels fitted to the corners of the scene bounds, and less than 1.2 times the area of texels fitted to the vertices.
+/// The deformer gives the light-space boxes of tiles (groups of up to 128 vertices). Texels of a map fitted to these
+/// boxes have less than half the area of texels of a map fitted to the corners of the scene bounds, and less than 1.2
+/// times the area of texels of a map fitted to the vertices.
 #[test]
-fn light_space_fit_halves_shadow_texels_of_the_tree() {
+fn light_space_fit_halves_the_shadow_texels_of_the_tree() {
     let scene = load::open("tree").expect("expected the built-in scene").scene;
     let state = SceneState::rest(&scene);
     let reference_summary = ReferenceDeformer::new(&scene)

@@ -1,5 +1,6 @@
-//! Picks, and frames of other outputs than color: depth, domain indices, normals and color maps of values. These tests
-//! need an EGL driver that can render.
+//! Picks, and frames of outputs other than color: depth, domain indices, normals and color maps of values. A pick
+//! answers a rectangle of pixels with one hit (a point of a surface) per pixel that shows a surface. These tests need
+//! an EGL driver that can render.
 
 use modalcast::config::{Config, RendererChoice};
 use modalcast_client::{
@@ -26,7 +27,8 @@ async fn start_server(source: &str) -> (Server, Client) {
     (server, client)
 }
 
-/// A camera in front of the strips, 40 pixels per unit at z = 0.
+/// A picture of the strips by a camera 4 units in front of them. The focal length of 160 pixels gives 160 / 4 = 40
+/// pixels per unit at z = 0.
 fn picture() -> Picture {
     let view = View::LookAt { eye: [0.5, 0.5, 4.0], target: [0.5, 0.5, 0.0], up: [0.0, 1.0, 0.0] };
     let lens = Lens::Intrinsics { fx: 160.0, fy: 160.0, cx: 48.0, cy: 40.0 };
@@ -34,7 +36,8 @@ fn picture() -> Picture {
     Picture { width: 96, height: 80, camera, ..Picture::default() }
 }
 
-/// Whether the position of a hit lies on the ray of its pixel. The constants are those of [`picture`].
+/// Whether the position of a hit lies on the ray of its pixel, up to [`TOLERANCE`]. The numbers are those of
+/// [`picture`].
 fn is_on_ray(hit: &Hit) -> bool {
     let [x, y] = hit.pixel.map(f64::from);
     let ray = Vector3::new((x + 0.5 - 48.0) / 160.0, (40.0 - y - 0.5) / 160.0, -1.0);
@@ -49,8 +52,8 @@ fn mode_matrix(scene: &Scene, domain: u32) -> DMatrix<f64> {
     DMatrix::from_iterator(rows, rank, shape.modes.columns().iter().map(|entry| f64::from(*entry)))
 }
 
-/// Reduced force U^T A^T f of a force f at a hit, with the complete U and the linear part A of the transform. The
-/// barycentric coordinates distribute f to the vertices of the triangle.
+/// Reduced force U^T A^T f of a force f at a hit, with the complete U and the linear part A of the transform. f is
+/// distributed to the vertices of the triangle by the barycentric coordinates.
 fn project_force(scene: &Scene, hit: &Hit, linear: Matrix3<f64>, force: Vector3<f64>) -> DVector<f64> {
     let mode_matrix = mode_matrix(scene, hit.domain);
     let mut vertex_forces = DVector::zeros(mode_matrix.nrows());
@@ -61,7 +64,8 @@ fn project_force(scene: &Scene, hit: &Hit, linear: Matrix3<f64>, force: Vector3<
     mode_matrix.transpose() * vertex_forces
 }
 
-/// Position of a hit's barycentric coordinates on the f64 reference after some steps.
+/// Position of a hit on the f64 reference surface after some steps, from the hit's triangle and barycentric
+/// coordinates.
 fn reference_position(scene: &Scene, steps: &[v1::Step], hit: &Hit) -> Vector3<f64> {
     let positions = reference::deform(scene, &state_after_steps(scene, steps));
     let first_vertex = scene.layout.domains[hit.domain as usize].first_vertex;
@@ -80,6 +84,7 @@ async fn reduced_force_of_a_hit_matches_the_complete_modes() {
         step(1, &[0, 1], &[0.2, -0.1, 0.15, 0.3]),
         rigid_step(2, v1::TransformFormat::RigidF32, &[(1, rotation, [1.0, 0.25, -0.5])]),
     ];
+    // Pixel (44, 37) shows the strips before and after the steps.
     let rest_picks = client
         .pick(&PickRequest::new("strips", PickRectangle::pixel(picture(), 44, 37)))
         .await
@@ -109,6 +114,7 @@ async fn reduced_force_of_a_hit_matches_the_complete_modes() {
             "{hit:?}"
         );
     }
+    // Each square covers about 40 x 40 = 1600 pixels; both may be partly hidden or outside of the rectangle.
     assert!(hits_of_domains.iter().all(|hits| *hits > 200), "expected hits of both domains, got {hits_of_domains:?}");
     let rotated_hit = picks.hits.iter().find(|hit| hit.domain == 1).expect("expected a hit of domain 1");
     let unrotated_force = project_force(&scene, rotated_hit, Matrix3::identity(), force);
@@ -200,7 +206,7 @@ async fn invalid_rectangles_outputs_and_steps_are_rejected() {
         .await
         .expect("expected a pick");
     assert!(corner_picks.hits.is_empty(), "expected no hit at the corner pixel of the picture");
-    // Waits for a step that is never sent.
+    // This request waits for a step that is never sent.
     let unanswered_request =
         PickRequest::new("strips", PickRectangle::pixel(picture(), 0, 0)).minimum_step(1).deadline_ms(60);
     let error = client.pick(&unanswered_request).await.expect_err("expected a timeout");
@@ -252,7 +258,7 @@ async fn outputs_have_their_format_and_agree_with_picks() {
         .pick(&PickRequest::new("strips", PickRectangle::pixel(picture(), 20, 10).size(64, 64)))
         .await
         .expect("expected a pick");
-    // The word of 4 bytes with an index.
+    // The word of 4 bytes at an index.
     let read_word =
         |bytes: &[u8], index: usize| <[u8; 4]>::try_from(&bytes[4 * index..][..4]).expect("expected four bytes");
     let mut different_pixels = 0;
@@ -266,14 +272,14 @@ async fn outputs_have_their_format_and_agree_with_picks() {
             normal.zip(hit.normal).map(|(actual, expected)| (actual - expected).abs()).fold(0.0, f64::max);
         different_pixels += usize::from(!(is_same_domain && depth_error < 1e-5 && normal_error < 1e-5));
     }
-    // At an edge, the two passes may draw different triangles.
+    // At an edge, the pass for picks and the pass for frames may draw different triangles.
     assert!(
         picks.hits.len() > 1000 && different_pixels <= 3,
         "{different_pixels} of {} pixels differ",
         picks.hits.len()
     );
     let color = render(Output::Color).await.bytes;
-    // 0 scales the colors to the maximum of the frame.
+    // `scale_max` is the value at the bright end of the color map; 0 means the maximum of the frame.
     let maps = [
         render(Output::Displacement { scale_max: 0.0 }).await,
         render(Output::Displacement { scale_max: 9.0 }).await,
@@ -289,13 +295,15 @@ async fn outputs_have_their_format_and_agree_with_picks() {
     }
 }
 
-/// The domains are 10,000 km apart along x and z. A camera near a domain picks positions that are exact to 1 mm.
+/// The domains are 10,000 km apart along x and along z. A camera 3 m from a domain picks positions that are exact to 1
+/// mm.
 #[tokio::test(flavor = "multi_thread")]
 async fn distant_domains_are_picked_by_nearby_cameras() {
     let (server, client) = start_server("strips").await;
     let translation = [1e7 + 1.25, 0.0, -1e7];
     let far_step = rigid_step(1, v1::TransformFormat::RigidF64, &[(1, IDENTITY_QUATERNION, translation)]);
     server.drive_lossless("strips").await.send_step_and_wait(far_step).await;
+    // The third pick is like the first, after a camera far away from it.
     for (domain, center) in [(1, translation), (0, [0.0; 3]), (1, translation)] {
         let offset_point = |x: f64, y: f64, z: f64| [center[0] + x, center[1] + y, center[2] + z];
         let view = View::LookAt {

@@ -1,4 +1,6 @@
-//! Tests of the reference rasterizer against geometry, and of a CPU twin of the raster kernels against the reference.
+//! Tests of the reference rasterizer, and of a CPU twin of the kernels in `kernels/raster.cu`, which must give the same
+//! result as the reference rasterizer. A soup is a list of triangles with a viewport. A viewport has one sample per
+//! pixel, at the center.
 
 use modalcast_compute::reference::raster::{
     ClippedPolygon, CullReason, EMPTY_KEY, SnappedVertex, VisibilityBuffer, clipped_polygon, depth_at, edge,
@@ -12,7 +14,7 @@ use crate::common::soups::{Soup, all_soups, clip_space_viewport, fan_soup, persp
 
 /// Maximum number of samples in the rectangle of a triangle that one thread draws.
 const MAX_THREAD_SAMPLES: i32 = 32;
-/// Maximum extent of a triangle that one warp draws, in 1/256 pixel.
+/// Maximum extent of a triangle that one warp draws, in 1/256 pixel: 64 pixels.
 const MAX_WARP_EXTENT: i32 = 16384;
 /// Side of a tile in pixels.
 const TILE_SIZE: i32 = 64;
@@ -32,11 +34,12 @@ fn owns_edge(from: &SnappedVertex, to: &SnappedVertex) -> bool {
     to.y < from.y || (to.y == from.y && to.x > from.x)
 }
 
-/// CPU twin of the raster kernels for one window. A triangle takes one of three paths: one thread draws it, one warp
-/// draws it, or one warp per tile draws it. The first two paths use 32-bit edge functions.
+/// CPU twin of the raster kernels for one viewport. A triangle takes one of three paths: one thread draws it, one warp
+/// draws it, or one warp per tile draws it. The first two paths use 32-bit edge functions, the third 64-bit ones. A
+/// tile is a square of [`TILE_SIZE`] pixels. It may be divided into strips of rows.
 struct RasterTraversal<'a> {
     soup: &'a Soup,
-    /// Per sample, as in [`VisibilityBuffer::keys`].
+    /// Per sample, as in [`VisibilityBuffer::keys`]: the bits of the depth above the triangle index.
     keys: Vec<u64>,
     /// Triangles of the per-warp path, in any order.
     warp_queue: Vec<u32>,
@@ -54,7 +57,7 @@ struct TileEntry {
     /// Number of tiles of all earlier entries.
     first_tile: u64,
     triangle: u32,
-    /// Column and row of the first tile, and number of tile columns minus 1; one byte each.
+    /// Column and row of the first tile, and number of tile columns minus 1; one byte each, from the lowest byte.
     packed_box: u32,
 }
 
@@ -69,7 +72,7 @@ impl RasterTraversal<'_> {
         clipped_polygon(&self.soup.viewport, &self.soup.positions, self.soup.triangles[triangle as usize], cull_mode)
     }
 
-    /// Twin of kernel `raster`: draws a small triangle, and queues any other.
+    /// Twin of kernel `raster`: draws a small triangle, and queues a larger one.
     fn bin_triangle(&mut self, triangle: u32, cull_mode: CullMode) {
         let Ok(clipped_polygon) = self.clipped_polygon(triangle, cull_mode) else { return };
         let extent = |coordinate: fn(&SnappedVertex) -> i32| {
@@ -104,12 +107,13 @@ impl RasterTraversal<'_> {
         }
     }
 
-    /// Draws a triangle with 32-bit edge functions. Panics if one overflows.
+    /// Draws a triangle with 32-bit edge functions. Panics if an edge function overflows.
     fn draw_32_bits(&mut self, clipped_polygon: &ClippedPolygon, triangle: u32) {
         let edge = |from: &SnappedVertex, to: &SnappedVertex, x: i32, y: i32| -> i32 {
-            let [left, right] = [(to.x - from.x, y - from.y), (to.y - from.y, x - from.x)];
-            let product = |(a, b): (i32, i32)| a.checked_mul(b).expect("expected a value within 32 bits");
-            product(left).checked_sub(product(right)).expect("expected a value within 32 bits")
+            let product = |a: i32, b: i32| a.checked_mul(b).expect("expected a value within 32 bits");
+            product(to.x - from.x, y - from.y)
+                .checked_sub(product(to.y - from.y, x - from.x))
+                .expect("expected a value within 32 bits")
         };
         // The polygon is not clipped, so its fan is one triangle.
         let [a, b, c] = fan_triangles(clipped_polygon)[0];
@@ -117,6 +121,7 @@ impl RasterTraversal<'_> {
         let [x0, y0, x1, y1] = clipped_polygon.samples;
         for (row, column) in (y0..=y1).flat_map(|row| (x0..=x1).map(move |column| (row, column))) {
             let (x, y) = (sample_coordinate(column), sample_coordinate(row));
+            // The edge function is positive inside of the edge and zero on it.
             let is_inside = [(&b, &c), (&c, &a), (&a, &b)]
                 .iter()
                 .all(|(from, to)| edge(from, to, x, y) >= i32::from(!owns_edge(from, to)));
@@ -129,8 +134,9 @@ impl RasterTraversal<'_> {
         }
     }
 
-    /// Index of the entry of `tile_queue` that contains a tile. Each round is the 32-way search of a warp: the 32 lanes
-    /// look at evenly spaced entries, and the last entry that begins at or before the tile is the new lower end.
+    /// Index of the entry of `tile_queue` that contains a tile. Each round of the loop is a 32-way search by a warp:
+    /// the 32 lanes look at evenly spaced entries, and the last of these that begins at or before the tile is the new
+    /// lower end.
     fn find_entry(&self, tile: u64) -> usize {
         let (mut low, mut high) = (0, self.tile_queue.len());
         while high - low > 1 {
@@ -143,11 +149,12 @@ impl RasterTraversal<'_> {
     }
 
     /// Twin of kernel `raster_tiles`: draws the part of a triangle in one strip of a queued tile. Skips a strip that
-    /// lies entirely outside of an edge. A strip is numbered across all tiles, with 2^`strip_splits` strips per tile.
+    /// lies entirely outside of an edge. Strips are numbered across all queued tiles; a tile has 2^`strip_splits`
+    /// strips.
     fn draw_strip(&mut self, strip: u64, strip_splits: u32) {
         let tile = strip >> strip_splits;
         let TileEntry { first_tile, triangle, packed_box } = self.tile_queue[self.find_entry(tile)];
-        // Index of the tile within the box of the triangle, and number of tile columns of the box.
+        // Index of the tile within the box of the triangle, row by row, and number of tile columns of the box.
         let (tile_of_entry, columns) = ((tile - first_tile) as u32, (packed_box >> 16 & 255) + 1);
         let strip_height = TILE_SIZE >> strip_splits;
         let first_column = TILE_SIZE * ((packed_box & 255) + tile_of_entry % columns) as i32;
@@ -163,7 +170,8 @@ impl RasterTraversal<'_> {
             (first_row + strip_height - 1).min(y1),
         );
         for triangle_piece in fan_triangles(&clipped_polygon) {
-            // Tests the corner sample of the strip with the largest value of the edge function.
+            // Whether the whole strip is outside of the edge: the corner sample with the largest edge function is
+            // outside.
             let is_beyond = |from: &SnappedVertex, to: &SnappedVertex| {
                 let column = if to.y > from.y { first_column } else { last_column };
                 let row = if to.x > from.x { last_row } else { first_row };
@@ -185,8 +193,8 @@ impl RasterTraversal<'_> {
 }
 
 /// Runs the twins of `raster`, `raster_warps` and `raster_tiles` with tiles that are halved `strip_splits` times.
-/// Triangles and strips are processed in reverse, because the result must not depend on their order. Returns the keys
-/// and the number of triangles on each path.
+/// Triangles and strips are processed in reverse order, because the result must not depend on the order. Returns the
+/// keys of the samples and the number of triangles on each path.
 fn rasterize_like_kernels(soup: &Soup, strip_splits: u32) -> (Vec<u64>, [usize; 3]) {
     let keys = vec![EMPTY_KEY; soup.viewport.pixel_count()];
     let mut traversal = RasterTraversal {
@@ -202,6 +210,7 @@ fn rasterize_like_kernels(soup: &Soup, strip_splits: u32) -> (Vec<u64>, [usize; 
             .rev()
             .for_each(|triangle| traversal.bin_triangle(triangle, group.cull_mode));
     }
+    // Twin of kernel `raster_warps`. Queued triangles have passed back-face culling.
     for triangle in std::mem::take(&mut traversal.warp_queue) {
         let clipped_polygon =
             traversal.clipped_polygon(triangle, CullMode::None).expect("expected a triangle that is not culled");
@@ -275,39 +284,38 @@ fn fan_covers_every_sample_once() {
     soup.positions[..2].copy_from_slice(&[1.0 / 128.0, 1.0 / 128.0]);
     for spoke in [0, 10, 20, 30] {
         let position = &mut soup.positions[3 * (1 + spoke)..][..2];
+        // Spokes 0 and 20 are horizontal, so their y is set. Spokes 10 and 30 are vertical, so their x is set.
         let axis = usize::from(spoke % 20 == 0);
         position[axis] = 1.0 / 128.0;
     }
     soup.positions.chunks_exact_mut(3).for_each(|position| position[2] = 0.0);
     assert!(count_covering_pieces(&soup, EdgeRule::TopLeft).iter().all(|count| *count == 1));
     let shared_samples = count_covering_pieces(&soup, EdgeRule::Both).iter().filter(|count| **count > 1).count();
-    assert!(
-        shared_samples > 100,
-        "negative control: without the top-left rule {shared_samples} samples are covered more than once"
-    );
+    assert!(shared_samples > 100, "negative control: expected many samples on shared edges, got {shared_samples}");
 }
 
 #[test]
 fn fan_clipped_by_near_plane_covers_every_sample_once() {
     let mut soup = fan_soup(perspective_viewport(96, 64, 0.5, 100.0));
-    // A floor one unit below the eye that continues behind it.
+    // The fan becomes a floor one unit below the eye, which continues behind the eye.
     for position in soup.positions.chunks_exact_mut(3) {
         let [x, y] = [position[0], position[1]];
         position.copy_from_slice(&[30.0 * x, -1.0, 30.0 * y]);
     }
     let counts = count_covering_pieces(&soup, EdgeRule::TopLeft);
     assert!(counts.iter().all(|count| *count <= 1));
-    // The horizon is between rows 31 and 32. The floor ends at a distance of 57 (30 times the fan's radius of 1.9), one
-    // row below the horizon, and the near plane clips only what is below the image. So the floor covers all samples
-    // from row 34 on.
+    // The image is 96 samples wide and 64 high. The horizon is between rows 31 and 32. The floor ends at a distance of
+    // 57 (30 times the fan's radius of 1.9), one row below the horizon. The near plane clips only the part of the floor
+    // below the image. So the floor covers all samples from row 34 on.
     let rows = counts.chunks_exact(96).map(|row| row.iter().sum::<usize>()).collect::<Vec<_>>();
     assert!(rows[..32].iter().all(|count| *count == 0) && rows[34..].iter().all(|count| *count == 96), "{rows:?}");
 }
 
-/// A nearer triangle is visible regardless of its id. The depth of clip-space z is 0.5 z + 0.5.
+/// The id of a triangle is its index in the list that is drawn. A nearer triangle is visible regardless of its id. The
+/// depth of clip-space z is 0.5 z + 0.5.
 #[test]
 fn depth_ties_go_to_the_lower_id() {
-    // Triangles a to d fill the window.
+    // Triangles a to d fill the viewport. a and b are at z = 0.5, c and d at z = 0.25.
     let triangle_at = |z: f32| [[-1.0, -1.0, z], [3.0, -1.0, z], [-1.0, 3.0, z]].concat();
     let positions = [triangle_at(0.5), triangle_at(0.5), triangle_at(0.25), triangle_at(0.25)].concat();
     let draw_ids_and_depths = |triangles: &[[u32; 3]]| {
@@ -318,6 +326,7 @@ fn depth_ties_go_to_the_lower_id() {
     };
     let [a, b, c, d] = [[0, 1, 2], [3, 4, 5], [6, 7, 8], [9, 10, 11]];
     assert_eq!(draw_ids_and_depths(&[a, b]), (vec![Some(0); 16], vec![0.75; 16]));
+    // c has the id 1 and d has the id 3.
     assert_eq!(draw_ids_and_depths(&[a, c, b, d]), (vec![Some(1); 16], vec![0.625; 16]));
     assert_eq!(draw_ids_and_depths(&[]), (vec![None; 16], vec![1.0; 16]));
 }
@@ -337,6 +346,7 @@ fn culled_triangles_report_the_reason() {
     assert_eq!(cull_reason(front.map(|[x, y, z]| [x + 2.0, y, z]), CullMode::None), Some(CullReason::OutsideFrustum));
     assert_eq!(cull_reason(front.map(|[x, y, z]| [x, y, z + 1.5]), CullMode::None), Some(CullReason::OutsideFrustum));
     assert_eq!(cull_reason([front[0], front[0], front[1]], CullMode::None), Some(CullReason::Degenerate));
+    // This triangle of 1/4 pixel is at the center of the viewport, between four samples.
     assert_eq!(cull_reason(front.map(|[x, y, z]| [0.05 * x, 0.05 * y, z]), CullMode::None), Some(CullReason::NoSample));
 }
 
@@ -352,9 +362,10 @@ fn plane_depth_and_rectangle_coverage_are_exact() {
     let normal = (b - a).cross(&(c - a));
     // Half of the vertical field of view is 30 degrees.
     let focal = 1.0 / 30.0_f64.to_radians().tan();
+    // Number of samples that the triangle covers, and largest error of their depth.
     let (mut samples, mut max_error) = (0, 0.0_f64);
     for (index, depth) in raster.depths().into_iter().enumerate().filter(|(index, _)| raster.ids()[*index].is_some()) {
-        // Where the ray through the sample meets the plane of the triangle.
+        // The depth where the ray through the sample meets the plane of the triangle.
         let to_ndc = |pixel: usize| (pixel as f64 + 0.5) / 100.0 - 1.0;
         let ray = nalgebra::Vector3::new(to_ndc(index % 200) / focal, -to_ndc(index / 200) / focal, -1.0);
         let distance = normal.dot(&a) / normal.dot(&ray);
@@ -362,8 +373,8 @@ fn plane_depth_and_rectangle_coverage_are_exact() {
         max_error = max_error.max((f64::from(depth) - (0.5 * z + 0.5)).abs());
         samples += 1;
     }
-    // Corners move by up to 1/512 pixel when they are snapped, and the depth of this plane changes by less than 1e-3
-    // per pixel.
+    // Corners move by up to 1/512 pixel per axis when they are snapped. The depth of this plane changes by less than
+    // 1e-3 per pixel and axis, so the error is below 2 * 1e-3 / 512 = 4e-6.
     assert!(samples > 1000 && max_error < 4e-6, "{samples} samples, maximum error {max_error:e}");
 
     let mut raster = VisibilityBuffer::new(clip_space_viewport(100, 100));

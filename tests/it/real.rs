@@ -1,5 +1,5 @@
-//! Tests on real inputs from `MODALCAST_DATA` or `../shared/data`: deformers agree with the f64 reference on every
-//! input with modes, directly and over gRPC.
+//! Tests on real inputs (models of other projects) in the folder `MODALCAST_DATA`, by default `../shared/data`. On
+//! every input with modes U, deformers agree with the f64 reference. The tests call deformers directly and over gRPC.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -19,10 +19,10 @@ use crate::tolerance::max_distance;
 /// Real inputs with modes.
 const MODAL_INPUTS: [&str; 5] = ["vega/simpleBridge", "vega/A", "gltf/MorphStressTest", "sofa/hexaBeam", "sofa/finger"];
 
-/// Largest displacement of the test states relative to the scene's diagonal. It is slightly above [`MIN_DISPLACEMENT`]
-/// because the scaling of q is rounded to f32.
+/// Largest displacement of the test states, relative to the scene's diagonal. It is slightly above
+/// [`MIN_DISPLACEMENT`], because q is rounded to f32 after it is scaled.
 const DISPLACEMENT: f64 = 0.0501;
-/// The tests require a displacement of at least 5 % of the diagonal, so that errors of U q are visible.
+/// Required displacement of the test states, relative to the scene's diagonal. 5 % make errors of U q visible.
 const MIN_DISPLACEMENT: f64 = 0.05;
 
 fn input_path(path: &str) -> String {
@@ -67,7 +67,8 @@ fn assert_cpu_equals_reference(scene: &Arc<Scene>) {
     for (domain, layout) in scene.layout.domains.iter().enumerate() {
         let modes = &scene.shape_of(domain).modes;
         for vertex in 0..layout.vertices {
-            let range = 3 * (layout.first_vertex + vertex)..3 * (layout.first_vertex + vertex) + 3;
+            let first_number = 3 * (layout.first_vertex + vertex);
+            let range = first_number..first_number + 3;
             let has_zero_rows = (0..3).all(|axis| (0..layout.rank).all(|mode| modes.entry(vertex, axis, mode) == 0.0));
             let is_moved = deformed_positions[range.clone()] != rest_positions[range];
             assert!(!has_zero_rows || !is_moved, "expected vertex {vertex} of domain {domain} not to move");
@@ -94,9 +95,9 @@ fn real_modal_inputs_agree_with_their_reference() {
     }
 }
 
-/// Opens every modal input on a server with this backend, drives one step over gRPC and compares the streamed vertices
-/// with the reference.
-async fn assert_stream_equals_reference(backend: BackendChoice) {
+/// Opens every modal input and the built-in tree on a server with this backend, sends one step over gRPC, and compares
+/// the received vertices with the reference.
+async fn assert_received_vertices_equal_reference(backend: BackendChoice) {
     let state_folder = tempfile::tempdir().expect("expected a temporary folder");
     let repository = Arc::new(
         load::SceneRepository::new(Some(Path::new(&input_path("")))).expect("expected the folder of real inputs"),
@@ -115,7 +116,7 @@ async fn assert_stream_equals_reference(backend: BackendChoice) {
         assert_eq!(reply.step().number, 1);
         let reference_positions = reference::deform(&scene, &deformed_state);
         let error = max_distance(&reply.positions, &reference_positions) / scene.rest_bounds.diagonal();
-        println!("{source}: error of vertices streamed by {backend:?}: {error:.2e} of the diagonal");
+        println!("{source}: error of vertices received from {backend:?}: {error:.2e} of the diagonal");
         assert!(error <= 1e-5, "{source}: expected an error of at most 1e-5 of the diagonal, got {error}");
         let rest_positions = reference::deform(&scene, &SceneState::rest(&scene));
         assert!(
@@ -128,14 +129,14 @@ async fn assert_stream_equals_reference(backend: BackendChoice) {
 
 #[tokio::test(flavor = "multi_thread")]
 #[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
-async fn cpu_streamed_vertices_of_real_inputs_equal_the_reference() {
-    assert_stream_equals_reference(BackendChoice::Cpu).await;
+async fn cpu_vertices_of_real_inputs_equal_the_reference() {
+    assert_received_vertices_equal_reference(BackendChoice::Cpu).await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
 #[ignore = "needs an NVIDIA GPU and the real inputs"]
-async fn gpu_streamed_vertices_of_real_inputs_equal_the_reference() {
-    assert_stream_equals_reference(BackendChoice::Cuda).await;
+async fn gpu_vertices_of_real_inputs_equal_the_reference() {
+    assert_received_vertices_equal_reference(BackendChoice::Cuda).await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -152,7 +153,7 @@ async fn real_malformed_modes_are_rejected_and_the_server_continues() {
     let repository =
         Arc::new(load::SceneRepository::new(Some(repository_folder.path())).expect("expected a repository"));
     let server = Server::start_from(config(state_folder.path()), repository).await;
-    // `modes.txt` declares 684 x 32 numbers in its header, but its lines have 35.
+    // The loader reads `modes.txt` beside the OBJ file. Its header declares 684 x 32 numbers, but its lines have 35.
     let open_request = |source: &str| v1::OpenSceneRequest { source: source.into(), scene: String::new() };
     let status = server
         .scenes()

@@ -10,7 +10,7 @@ use v1::upload_scene_request::Part;
 
 use crate::service_harness::{Server, TIMEOUT, config, get_vertices, reference_vertices, step, strips};
 
-/// Bytes of the step number in a checkpoint file.
+/// Byte range of the step number in a checkpoint file.
 const CHECKPOINT_STEP_NUMBER: Range<usize> = 16..24;
 
 /// Requests all vertices of a scene.
@@ -22,6 +22,7 @@ fn runtime() -> tokio::runtime::Runtime {
     tokio::runtime::Builder::new_multi_thread().enable_all().worker_threads(2).build().expect("expected a runtime")
 }
 
+/// The second step has the number 9 and the time 4.5.
 fn steps() -> [v1::Step; 2] {
     [step(4, &[], &[0.1, 0.2, 0.3, 0.4]), step(9, &[1], &[0.5, -0.5])]
 }
@@ -37,8 +38,8 @@ async fn send_steps(server: &Server) -> Vec<f32> {
     get_vertices(server, vertex_request("strips")).await.expect("expected vertices").positions
 }
 
-/// Starts a server on a state folder and returns the step and positions of `strips`. Also asserts that a new writer
-/// starts a new run.
+/// Starts a server on a state folder and returns the restored step and positions of `strips`. Also asserts that a new
+/// writer starts a new run (the steps of one writer).
 fn restore_and_read(state_folder: &Path) -> (v1::StepId, Vec<f32>) {
     runtime().block_on(async {
         let start = Instant::now();
@@ -94,6 +95,7 @@ fn killed_server_restores_the_last_checkpoint() {
         }
         positions
     });
+    // Ends the tasks of the first server without a clean stop.
     drop(first_runtime);
     for state_folder in [copied_folder.path(), folder.path()] {
         let (step, restored_positions) = restore_and_read(state_folder);
@@ -112,7 +114,7 @@ fn scene_with_a_damaged_checkpoint_starts_at_rest() {
     });
     let path = folder.path().join("steps/strips.step");
     let mut bytes = std::fs::read(&path).expect("expected a checkpoint file");
-    // Flip one bit, which the hash in the file detects.
+    // Flip one bit. The file contains a hash, so the server detects the change.
     bytes[60] ^= 0x40;
     std::fs::write(&path, bytes).expect("expected to write a file");
     let (step, restored_positions) = restore_and_read(folder.path());
@@ -130,8 +132,9 @@ fn catalog_write_failure_fails_the_call() {
         let server = Server::start(config(folder.path())).await;
         let mut scenes = server.scenes().await;
         scenes.open_scene(open_request("strips")).await.expect("expected the scene to open");
+        // The server writes the catalog to `scenes.new` and renames it to `scenes.json`. A folder named `scenes.new`
+        // makes the writing fail.
         let obstacle = folder.path().join("scenes.new");
-        // The server writes `scenes.new` and renames it. A folder of that name makes this fail.
         std::fs::create_dir(&obstacle).expect("expected to create a folder");
         let status = scenes.delete_scene(delete_request()).await.expect_err("expected the deletion to fail");
         assert_eq!(status.code(), tonic::Code::Internal, "{status:?}");

@@ -38,7 +38,7 @@ impl SceneSource for FailingOnceSource {
     }
 }
 
-/// Two calls that open one name overlap. The first call fails, and the second call succeeds and registers the scene.
+/// Two calls that open the same name overlap. The first call fails. The second call succeeds and registers the scene.
 #[tokio::test(flavor = "multi_thread")]
 async fn opening_after_a_concurrent_failure_is_registered() {
     let folder = tempfile::tempdir().expect("expected a temporary folder");
@@ -50,6 +50,8 @@ async fn opening_after_a_concurrent_failure_is_registered() {
         tokio::spawn(async move { engine.open("strips", "").await })
     };
     let first_opening = open();
+    // The second opening starts while the first one is in the loader. It has 50 ms to arrive before the first one
+    // fails.
     while source.open_count.load(std::sync::atomic::Ordering::SeqCst) == 0 {
         tokio::time::sleep(std::time::Duration::from_millis(1)).await;
     }
@@ -63,7 +65,7 @@ async fn opening_after_a_concurrent_failure_is_registered() {
     server.engine.open("other", "strips").await.expect("expected the name to be free after closing");
 }
 
-/// Describes all domains of a scene. Returns the descriptions and the bytes of each array of each shape.
+/// Describes all domains of a scene. Returns the descriptions, and the bytes of every requested array of every domain.
 async fn describe(server: &Server, scene: &str, arrays: &[Array]) -> (Vec<v1::DomainDescription>, Vec<Vec<u8>>) {
     let arrays = arrays.iter().map(|array| (*array).into()).collect();
     let request = v1::DescribeSceneRequest { scene: scene.into(), domains: vec![], arrays };
@@ -123,6 +125,7 @@ async fn client_can_read_the_whole_scene() {
         bytemuck::cast_slice(&mesh.corners().uvs).to_vec(),
         bytemuck::cast_slice(&mesh.corners().normals).to_vec(),
     ];
+    // The two domains have the same shape.
     assert_eq!(array_bytes, [expected_bytes.clone(), expected_bytes].concat());
     let [left, right] = domains.as_slice() else { panic!("{domains:?}") };
     assert_eq!((left.name.as_str(), left.vertices, left.rank, left.parent), ("left", 4, 2, None));
@@ -149,7 +152,10 @@ async fn description_contains_followed_domains_and_frames() {
         domains[2].placement, domains[2].follow_frame,
         "expected the placement to equal the follow frame, because the followed domain is at the world origin"
     );
-    assert_ne!(domains[3].placement, domains[3].follow_frame, "expected a world placement");
+    assert_ne!(
+        domains[3].placement, domains[3].follow_frame,
+        "expected the placement of the leaflet in the world, not relative to the leaf"
+    );
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -201,7 +207,7 @@ async fn openings_share_one_scene_and_deletion_ends_its_streams() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn scene_limit_holds_and_a_deleted_scene_frees_a_slot() {
+async fn scene_above_the_limit_opens_only_after_a_deletion() {
     let server = Server::start_with(|config| modalcast::config::Config { open_scenes: 1, ..config }).await;
     server.open("strips").await;
     let second_scene = v1::OpenSceneRequest { source: "sheet".into(), scene: String::new() };
@@ -229,6 +235,7 @@ async fn server_without_renderer_rejects_only_frames() {
     assert_eq!((info.backend.as_str(), info.software), ("reference", false));
     assert!(info.renderer.contains("switched off"), "{}", info.renderer);
     let limits = info.limits.expect("expected the limits");
+    // 1 MiB is the setting of `config`, the others are defaults.
     assert_eq!((limits.message_bytes, limits.window, limits.scenes), (1 << 20, 256, 16));
     let request = v1::StreamFramesRequest { scene: "strips".into(), ..v1::StreamFramesRequest::default() };
     let status = server.frames().await.stream_frames(request).await.expect_err("expected an error without a renderer");
@@ -277,6 +284,7 @@ async fn health_and_reflection_answer_and_stop_ends_streams() {
         assert_eq!(last_status.status(), ServingStatus::NotServing);
         let status = with_timeout(writer.replies.message()).await.expect_err("expected the stream to end");
         assert_eq!(status.code(), tonic::Code::Unavailable);
+        // The server waits until its clients have disconnected.
         drop((health_stream, writer, health, client, replies));
     };
     let (result, ()) = tokio::join!(server.stop(), read_until_stop);

@@ -1,5 +1,5 @@
-//! Transport faults and timeouts: more steps than the server can process, silent connections, frozen peers and clients
-//! that do not read. Only the faulty client is disconnected.
+//! Transport faults and timeouts: more steps than the server can process, silent connections, frozen clients and
+//! clients that do not read. The server disconnects only the faulty client.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -17,10 +17,11 @@ use v1::upload_scene_request::Part;
 
 use crate::service_harness::{DEFAULT_WINDOW, Server, StepWriter, TIMEOUT, step, with_timeout};
 
-/// Under `POLICY_LATEST` the server merges steps that it has no time to process. Another stream of the same connection
-/// still gets all its acknowledgements.
+/// Under the policy `latest`, the server merges steps that it has no time to process. Another stream of the same
+/// connection still gets all its acknowledgements.
 #[tokio::test(flavor = "multi_thread")]
 async fn latest_policy_merges_excess_steps() {
+    const STEP_COUNT: u64 = 20_000;
     let server = Server::start_default().await;
     server.open("sheet").await;
     server.open("strips").await;
@@ -29,7 +30,6 @@ async fn latest_policy_merges_excess_steps() {
     assert!(matches!(fast_writer.open("sheet", Policy::Latest, DEFAULT_WINDOW).await, ResponseKind::Opened(_)));
     let mut other_writer = StepWriter::connect(channel).await;
     assert!(matches!(other_writer.open("strips", Policy::Lossless, DEFAULT_WINDOW).await, ResponseKind::Opened(_)));
-    const STEP_COUNT: u64 = 20_000;
     let (sender, mut replies) = fast_writer.split();
     let send_steps = async {
         for number in 1..=STEP_COUNT {
@@ -64,8 +64,8 @@ async fn stream_of_writer_that_reads_no_rejections_ends() {
     let channel = server.channel().await;
     let mut writer = StepWriter::connect(channel.clone()).await;
     assert!(matches!(writer.open("strips", Policy::Lossless, DEFAULT_WINDOW).await, ResponseKind::Opened(_)));
-    // A second open message is rejected. 20,000 rejections that repeat a name of 600 letters fill every buffer between
-    // server and client.
+    // Every further open message is rejected. 20,000 rejections that repeat a scene name of 600 letters (12 MB) fill
+    // every buffer between server and client.
     let open_message = v1::OpenDrive { scene: "x".repeat(600), policy: 0, window: 0 };
     let (sender, mut replies) = writer.split();
     let send_task = tokio::spawn(async move {
@@ -76,7 +76,7 @@ async fn stream_of_writer_that_reads_no_rejections_ends() {
             }
         }
     });
-    // The client reads nothing until it has lost its writer lease and another client has acquired it.
+    // The first client reads nothing until another client has acquired the writer lease of the scene.
     let acquire_lease = async {
         loop {
             let mut candidate = StepWriter::connect(channel.clone()).await;
@@ -115,6 +115,7 @@ async fn silent_connection_is_closed_and_active_one_is_not() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn frozen_writer_loses_its_lease() {
+    // The server pings a connection every 100 ms and closes it after 100 ms without an answer.
     let (keepalive_interval, keepalive_timeout) = (Duration::from_millis(100), Duration::from_millis(100));
     let server = Server::start_with(|config| Config { keepalive_interval, keepalive_timeout, ..config }).await;
     server.open("strips").await;
@@ -139,6 +140,7 @@ async fn frozen_writer_loses_its_lease() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn server_stops_in_time_despite_unread_streams() {
+    // A stopping server gives its streams this time to end.
     let drain_timeout = Duration::from_millis(300);
     let server = Server::start_with(|config| Config { drain_timeout, ..config }).await;
     server.open("sheet").await;
@@ -179,7 +181,7 @@ async fn upload_below_minimum_rate_times_out() {
     let header = v1::UploadHeader { scene: "up".into(), entry: String::new(), files: 1, total_bytes: 5000 };
     let file = v1::UploadFile { path: "scene.txt".into(), bytes: 5000, sha256: vec![0; 32].into() };
     let parts = [Part::Header(header), Part::File(file)].into_iter();
-    // One byte per chunk, at most 50 bytes per second.
+    // One byte per chunk, at most 50 bytes per second. The minimum rate is a constant of the server.
     let parts = parts.chain(std::iter::repeat_with(|| Part::Chunk(b"x"[..].into())).take(5000));
     let requests = tokio_stream::iter(parts.map(|part| v1::UploadSceneRequest { part: Some(part) }));
     let slow_requests = tokio_stream::StreamExt::throttle(requests, Duration::from_millis(20));

@@ -1,5 +1,5 @@
-//! Scene files over the wire: paths cannot leave the repository, an uploaded scene.toml opens, and a rejection names
-//! the invalid file.
+//! Scene files over the wire: paths cannot leave the scene repository (the server's folder of scenes), an uploaded
+//! `scene.toml` opens, and the rejection of an invalid file says what is wrong.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -26,7 +26,7 @@ fn encode_npy(rows: usize, columns: usize, entries: &[f32]) -> Vec<u8> {
     bytes
 }
 
-/// One mode that moves the last vertex by 2 along z.
+/// A NumPy file of U for [`SQUARE`]: one mode that moves the last of the four vertices by 2 along z.
 fn lift_mode() -> Vec<u8> {
     let mut entries = [0.0; 12];
     entries[11] = 2.0;
@@ -43,7 +43,7 @@ async fn open(server: &Server, source: &str) -> Result<v1::SceneInfo, Status> {
     Ok(server.scenes().await.open_scene(request).await?.into_inner().scene.expect("expected the scene info"))
 }
 
-/// Uploads files in chunks of 100 bytes.
+/// Uploads files in chunks of 100 bytes as the scene `sent`. An empty `entry` lets the server choose the file to open.
 async fn upload(server: &Server, entry: &str, files: &[(&str, &[u8])]) -> Result<v1::SceneInfo, Status> {
     let total_bytes = files.iter().map(|(_, bytes)| bytes.len() as u64).sum();
     let header = v1::UploadHeader { scene: "sent".into(), entry: entry.into(), files: files.len() as u32, total_bytes };
@@ -58,7 +58,8 @@ async fn upload(server: &Server, entry: &str, files: &[(&str, &[u8])]) -> Result
     Ok(response.into_inner().scene.expect("expected the scene info"))
 }
 
-/// Sets the single coordinate of a scene of [`SQUARE`] to 1.5 and returns the position of the last vertex.
+/// Sets the single coordinate of a scene of [`SQUARE`] to 1.5 and returns the position of the last vertex. Its rest
+/// position is (0, 1, 0), and [`lift_mode`] moves it by 1.5 * 2 = 3 along z.
 async fn deform_last_vertex(server: &Server, scene: &str) -> [f32; 3] {
     let mut writer = server.drive_lossless(scene).await;
     writer.send_step_and_wait(step(1, &[0], &[1.5])).await;
@@ -68,7 +69,7 @@ async fn deform_last_vertex(server: &Server, scene: &str) -> [f32; 3] {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn repository_paths_open_and_cannot_escape() {
+async fn paths_within_the_repository_open_and_others_do_not() {
     let (state_folder, parent_folder) = (
         tempfile::tempdir().expect("expected a temporary folder"),
         tempfile::tempdir().expect("expected a temporary folder"),
@@ -127,7 +128,7 @@ async fn invalid_files_are_rejected_and_leave_no_files() {
     type Files<'a> = Vec<(&'a str, &'a [u8])>;
     let too_few_rows = encode_npy(9, 1, &[0.0; 9]);
     let nan_modes = encode_npy(12, 1, &[f32::NAN; 12]);
-    // Name of the case, files, and words that the error must contain.
+    // Name of the case, files, and two words that the error must contain. An empty word is contained in every error.
     let cases: Vec<(&str, Files<'_>, [&str; 2])> = vec![
         ("rows that are not 3n", vec![("a.obj", square), ("a.npy", &too_few_rows)], ["rows", "12"]),
         ("truncated modes", vec![("a.obj", square), ("a.npy", truncated_modes)], ["a.npy", ""]),

@@ -41,9 +41,9 @@ pub(crate) const MAX_MESSAGE_BYTES: usize = (1 << 20) + 4096;
 /// Selects the server's default window: the maximum number of steps without acknowledgement.
 pub(crate) const DEFAULT_WINDOW: u32 = 0;
 
-/// Source of scenes built in code: `strips` (two small domains), `far` (the same, far from the origin), `twig` (with
-/// followers), `attributes` (with displacements and boxes), `sheet` (more than 1 MiB per array) and `panic` (the loader
-/// panics).
+/// Source of scenes built in code: `strips` (two small domains), `far` (`strips` far from the world origin), `twig`
+/// (with followers), `attributes` (with displacements and boxes), `sheet` (more than 1 MiB per array) and `panic` (the
+/// loader panics).
 pub(crate) struct SyntheticScenes;
 
 impl SceneSource for SyntheticScenes {
@@ -60,7 +60,7 @@ impl SceneSource for SyntheticScenes {
         Ok(scene.into())
     }
 
-    /// Opens the source that a file names.
+    /// Opens the source whose name is the text of a file; an empty `entry` means `scene.txt`.
     fn open_within(&self, folder: &Path, entry: &str) -> Result<OpenedScene> {
         let path = folder.join(if entry.is_empty() { "scene.txt" } else { entry });
         let text = std::fs::read_to_string(path).map_err(|error| invalid("entry", "a file", error))?;
@@ -115,11 +115,12 @@ pub(crate) fn strips_with_attributes() -> Arc<Scene> {
 
 /// The shape and the domains of [`strips`], with the entries of U times `mode_scale`.
 fn two_strips(mode_scale: f32) -> (Shape, Vec<Domain>) {
-    // The values are arbitrary.
+    // 12 rows (four vertices times three axes) and two columns of arbitrary numbers up to 0.5.
     let unscaled_entry = |index: u32| if index.is_multiple_of(5) { 0.5 } else { 0.125 * (index % 3) as f32 };
     let columns = (0..24).map(|index| mode_scale * unscaled_entry(index)).collect();
     let modes = Modes::from_columns(12, 2, columns).expect("expected valid modes");
     let shape = Shape::new(grid(2), modes).expect("expected a valid shape");
+    // An attachment and metadata are sent to clients, but do not change the vertices.
     let attachment = Attachment { parent: 0, frame: Transform::IDENTITY, rows: vec![1, 3] };
     let notes = [("species".to_owned(), "none".to_owned())].into();
     let metadata = Metadata { eigenvalues: vec![1.0, 4.0], notes };
@@ -141,9 +142,9 @@ fn grid(side: u32) -> Mesh {
     let positions =
         (0..side * side).map(|index| [(index % side) as f32, (index / side) as f32, 0.0]).collect::<Vec<_>>();
     let uvs = positions.iter().map(|[x, y, _]| [x / side as f32, y / side as f32]).collect();
-    let cells = (0..(side - 1) * (side - 1)).map(|cell| cell % (side - 1) + cell / (side - 1) * side);
-    let triangles = cells
-        .flat_map(|index| [[index, index + 1, index + side], [index + 1, index + side + 1, index + side]])
+    let first_vertices = (0..(side - 1) * (side - 1)).map(|cell| cell % (side - 1) + cell / (side - 1) * side);
+    let triangles = first_vertices
+        .flat_map(|vertex| [[vertex, vertex + 1, vertex + side], [vertex + 1, vertex + side + 1, vertex + side]])
         .collect();
     let normals = vec![[0.0, 0.0, 1.0]; positions.len()];
     Mesh::from_indexed(positions, normals, uvs, triangles).expect("expected a valid mesh")
@@ -156,7 +157,7 @@ fn domain(name: &str, attachment: Option<Attachment>) -> Domain {
 
 /// A scene of one shape.
 fn scene(name: &str, shape: Shape, domains: Vec<Domain>) -> Arc<Scene> {
-    // A small shadow map saves time; these tests compare no shadows.
+    // A small shadow map saves time. The tests do not check shadows.
     let look = RenderSettings {
         shadow: Some(ShadowSettings { size: 128, ..ShadowSettings::default() }),
         ..RenderSettings::default()
@@ -166,7 +167,8 @@ fn scene(name: &str, shape: Shape, domains: Vec<Domain>) -> Arc<Scene> {
     Scene::new(parts).expect("expected a valid scene")
 }
 
-/// Settings of a test server: reference deformer, no renderer, any free port.
+/// Settings of a test server: reference deformer, no renderer, any free port. `state` is the folder of persistent
+/// state.
 pub(crate) fn config(state: &Path) -> Config {
     Config {
         listen: ([127, 0, 0, 1], 0).into(),
@@ -195,7 +197,7 @@ impl Server {
         Self::start_with(|config| config).await
     }
 
-    /// Starts a server with changed settings of [`config`] and a new state folder.
+    /// Starts a server with the settings of [`config`] after `change`, and a new state folder.
     pub(crate) async fn start_with(change: impl FnOnce(Config) -> Config) -> Self {
         let folder = tempfile::tempdir().expect("expected a temporary folder");
         let mut server = Self::start(change(config(folder.path()))).await;
@@ -298,7 +300,8 @@ impl StepWriter {
         Self { sender, replies }
     }
 
-    /// Requests to drive a scene and returns the reply.
+    /// Requests to drive a scene and returns the reply. `window` is the maximum number of steps without
+    /// acknowledgement.
     pub(crate) async fn open(&mut self, scene: &str, policy: v1::Policy, window: u32) -> ResponseKind {
         let open = v1::OpenDrive { scene: scene.into(), policy: policy.into(), window };
         self.send(RequestKind::Open(open)).await;
@@ -349,7 +352,7 @@ impl StepWriter {
         (self.sender, self.replies)
     }
 
-    /// Drops the stream without closing it properly.
+    /// Drops both directions of the stream. Unlike [`Self::finish`], does not wait for the server.
     pub(crate) fn disconnect(self) {}
 }
 
@@ -360,8 +363,8 @@ pub(crate) fn step(number: u64, q_domains: &[u32], q: &[f32]) -> v1::Step {
     v1::Step { number, time: number as f64 * 0.5, q_domains: q_domains.to_vec(), q, ..v1::Step::default() }
 }
 
-/// A step in one of the two rigid formats. A pose consists of a domain, a rotation as a quaternion x y z w, and a
-/// translation.
+/// A step in one of the two rigid formats. Each of `poses` consists of a domain, a rotation as a quaternion x y z w,
+/// and a translation.
 pub(crate) fn rigid_step(number: u64, format: v1::TransformFormat, poses: &[(u32, [f32; 4], [f64; 3])]) -> v1::Step {
     let mut bytes = Vec::new();
     for (_, rotation, translation) in poses {
@@ -420,14 +423,14 @@ pub(crate) fn state_after_steps(scene: &Scene, steps: &[v1::Step]) -> SceneState
     state
 }
 
-/// Vertex data joined from chunks.
+/// Vertex data of one step, joined from chunks.
 #[derive(Debug)]
 pub(crate) struct ReceivedVertices {
     pub(crate) head: v1::VertexHead,
     pub(crate) positions: Vec<f32>,
     pub(crate) normals: Vec<f32>,
     pub(crate) displacements: Vec<f32>,
-    /// Six numbers per selected domain.
+    /// Six numbers per selected domain: minimum, then maximum.
     pub(crate) boxes: Vec<f32>,
     /// Three numbers per selected domain; empty if the head's origin applies to all domains.
     pub(crate) origins: Vec<f64>,
@@ -478,7 +481,8 @@ fn join_chunks(mut chunks: Vec<v1::VertexChunk>) -> ReceivedVertices {
         bytes.extend_from_slice(&chunk.data);
     }
     assert_eq!(head.total, bytes.len() as u64);
-    // The order is positions, normals, displacements, boxes, origins.
+    // The order is positions, normals, displacements, boxes, origins. The head has no size of the normals, so the last
+    // three arrays are split off the end.
     let (positions, rest) = bytes.split_at(head.position_bytes as usize);
     let (rest, origins) = rest.split_at(rest.len() - head.origin_bytes as usize);
     let (rest, boxes) = rest.split_at(rest.len() - head.box_bytes as usize);

@@ -1,4 +1,4 @@
-//! Steps over the wire: vertices of acknowledged steps, back-pressure, writers that take turns, and requests that wait
+//! Steps over the wire: vertices of acknowledged steps, back-pressure, one writer after another, and requests that wait
 //! for a step.
 
 use modalcast::engine::{Delivery, OutputSpec, StepSelector, Subscription};
@@ -28,6 +28,7 @@ async fn acknowledged_steps_have_vertices_of_the_reference() {
     server.open("strips").await;
     let mut writer = server.drive_lossless("strips").await;
     let mut rotated_step = step(1, &[1], &[0.5, -0.25]);
+    // Row-major 3 x 4 matrix: a rotation by 90 degrees about z, then a translation by (2, 0, -3).
     let transform = [0.0_f32, -1.0, 0.0, 2.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, -3.0];
     rotated_step.transform_domains = vec![1];
     rotated_step.transforms = transform.iter().flat_map(|number| number.to_le_bytes()).collect::<Vec<u8>>().into();
@@ -42,12 +43,12 @@ async fn acknowledged_steps_have_vertices_of_the_reference() {
         let expected_step = v1::StepId { run: 1, number: steps[index].number, time: steps[index].time };
         assert_eq!(reply.step(), expected_step);
     }
-    // Negative control: other steps give other vertices.
+    // Negative control: the last step changes the vertices.
     assert_ne!(reference_vertices(&strips(), &steps[..2]), reference_vertices(&strips(), &steps));
     writer.finish().await;
 }
 
-/// The stream ends after the requested number of steps.
+/// The stream ends after the requested number of 30 steps, although the writer sends 40.
 #[tokio::test(flavor = "multi_thread")]
 async fn lossless_subscriber_gets_every_step_in_order() {
     let server = Server::start_default().await;
@@ -68,7 +69,7 @@ async fn lossless_subscriber_gets_every_step_in_order() {
             let vertices =
                 next_vertices(&mut stream).await.expect("expected another message").expect("expected a valid step");
             assert_eq!((vertices.step().number, vertices.head.skipped), (steps[index].number, 0));
-            // The second domain, after the four vertices of the first domain.
+            // Domain 1 follows the 12 numbers of domain 0: four vertices times three axes.
             assert_eq!(vertices.positions, reference_vertices(&strips(), &steps[..=index]).positions[12..]);
             assert!(vertices.normals.is_empty());
         }
@@ -93,7 +94,7 @@ async fn overlapped_steps_keep_their_order_and_vertices() {
     }
     let steps: Vec<_> = (0..40).map(|number| step(number, &[1], &[0.01 * number as f32, 1.0])).collect();
     let mut writer = server.drive("strips", Policy::Lossless, 40).await;
-    // All steps are sent at once, so that a step is always queued.
+    // All steps are sent at once. While the server computes a step, the next one is thus queued.
     for step in &steps {
         writer.send_step(step.clone()).await;
     }
@@ -111,7 +112,7 @@ async fn overlapped_steps_keep_their_order_and_vertices() {
         index
     };
     let mut latest_subscription = subscriptions.pop().expect("expected three subscriptions");
-    let latest_index = check_output(&with_timeout(latest_subscription.next()).await.expect("expected the newest step"));
+    let latest_index = check_output(&with_timeout(latest_subscription.next()).await.expect("expected a step"));
     drop(latest_subscription);
     assert!(latest_index < 40);
     for index in 0..40 {
@@ -133,8 +134,8 @@ async fn unread_lossless_subscription_applies_back_pressure() {
     server.open("strips").await;
     let mut subscription = subscribe_vertices(&server, Delivery::Lossless).await;
     let mut writer = server.drive("strips", Policy::Lossless, 2).await;
-    // Two steps are queued in the subscription. The third is computed but not acknowledged, the fourth waits, and the
-    // fifth exceeds the window.
+    // Steps 1 and 2 are queued in the subscription. Step 3 is computed but not acknowledged, step 4 waits, and step 5
+    // exceeds the window of two steps.
     writer.send_step_and_wait(step(1, &[0], &[0.1, 0.0])).await;
     writer.send_step_and_wait(step(2, &[0], &[0.2, 0.0])).await;
     for number in 3..=5 {
@@ -177,7 +178,8 @@ async fn latest_policy_merges_steps_and_counts_skipped_ones() {
     let server = Server::start_default().await;
     server.open("sheet").await;
     let mut writer = server.drive("sheet", Policy::Latest, 4).await;
-    // A translation by 5 along x. Only the first step moves the sheet, so the loss of this step changes the result.
+    // Row-major 3 x 4 matrix: a translation by 5 along x. Only step 1 moves the sheet, so the final vertices show
+    // whether step 1 was lost.
     let matrix = [1.0, 0.0, 0.0, 5.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0_f32];
     let transforms: Vec<u8> = matrix.iter().flat_map(|number| number.to_le_bytes()).collect();
     let mut steps = vec![v1::Step { transforms: transforms.into(), ..step(1, &[], &[]) }];
@@ -217,9 +219,9 @@ async fn latest_subscriber_gets_current_step_and_skip_count() {
 }
 
 /// The rejection of the second writer names the address and the run of the first writer. After the first writer has
-/// left, the second writer can open the scene.
+/// ended its stream, the second writer can drive the scene.
 #[tokio::test(flavor = "multi_thread")]
-async fn second_writer_waits_for_the_first_to_leave() {
+async fn second_writer_is_rejected_until_the_first_ends() {
     let server = Server::start_default().await;
     server.open("strips").await;
     let mut first_writer = server.drive_lossless("strips").await;
@@ -240,6 +242,7 @@ async fn second_writer_waits_for_the_first_to_leave() {
     assert_eq!((opened.run, opened.window), (2, 256));
     assert_eq!(opened.scene.and_then(|scene| scene.last_step).map(|step| (step.run, step.number)), Some((1, 101)));
     second_writer.send_step_and_wait(step(0, &[0], &[0.3, 0.0])).await;
+    // Ending the stream without waiting also releases the scene, after a short time.
     second_writer.disconnect();
     let open_third = async {
         loop {
@@ -253,14 +256,14 @@ async fn second_writer_waits_for_the_first_to_leave() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn requests_of_departed_clients_free_their_slots() {
+async fn canceled_requests_do_not_count_as_pending() {
     let server = Server::start_with(|config| modalcast::config::Config { max_pending_requests: 4, ..config }).await;
     server.open("strips").await;
     let step = Some(v1::get_vertices_request::Step::MinimumStep(99));
     let pending_request = v1::GetVerticesRequest { deadline_ms: 600_000, step, ..vertex_request("strips") };
     let mut client = server.vertices().await;
-    // Eight requests wait for a step that is never sent. The server holds four of them and rejects the others, and
-    // every later request.
+    // Eight requests wait for a step that is never sent. The server keeps four of them pending. It rejects the other
+    // four and every later request.
     let mut streams = Vec::new();
     for _ in 0..8 {
         streams.push(client.get_vertices(pending_request.clone()).await.expect("expected a stream").into_inner());
@@ -278,12 +281,14 @@ async fn requests_of_departed_clients_free_their_slots() {
     }
     let error = get_vertices(&server, vertex_request("strips")).await.expect_err("expected a busy error");
     assert_eq!(error.code(), tonic::Code::ResourceExhausted);
+    // Cancels the four pending requests. The server then accepts requests again.
     pending_requests.shutdown().await;
     let retry = async { while get_vertices(&server, vertex_request("strips")).await.is_err() {} };
     with_timeout(retry).await;
 }
 
-/// A request for a step that has passed is rejected with the requested step and the current step.
+/// A request for exactly one step, or for a step with at least a given number, waits until the step is computed. A
+/// request for an earlier step than the current one is rejected.
 #[tokio::test(flavor = "multi_thread")]
 async fn requests_wait_for_exact_and_minimum_steps() {
     let server = Server::start_default().await;
@@ -310,6 +315,7 @@ async fn requests_wait_for_exact_and_minimum_steps() {
     for pending_request in pending_requests {
         step_numbers.push(with_timeout(pending_request).await.expect("expected the requested step").step.number);
     }
+    // The request for at least step 3 gets step 4, because there is no step 3.
     assert_eq!(step_numbers, [2, 4, 5]);
     let request_step = |step| v1::GetVerticesRequest { step: Some(step), ..vertex_request("strips") };
     use v1::get_vertices_request::Step::{ExactStep, MinimumStep};

@@ -1,5 +1,6 @@
 //! The errors of the CPU deformer are within their a-priori bounds for every storage type of U. Its results do not
-//! depend on threads, tiles or earlier steps.
+//! depend on threads, tiles or earlier steps. A quad is four consecutive vertices; a tile has up to 32 quads of one
+//! shape.
 
 use std::sync::Arc;
 
@@ -17,8 +18,8 @@ use crate::deformers::{TestRng, random_state, random_strip};
 const SIZES: [(usize, usize); 9] =
     [(1, 1), (1, 0), (7, 3), (129, 31), (1500, 33), (7, 512), (129, 0), (128, 6), (1500, 1)];
 
-/// A scene of one strip per entry of [`SIZES`], and of two further domains of shapes 0 and 3. The last domain shares
-/// the coordinates of domain 3.
+/// A scene of one strip per entry of [`SIZES`], and of two further domains of shapes 0 and 3. The last domain uses the
+/// coordinates q of domain 3.
 fn random_scene(deformation: DeformationSettings) -> Arc<Scene> {
     let mut random = TestRng(42);
     let mut parts = SceneParts::named("storages");
@@ -64,25 +65,25 @@ fn tile_bounds(scene: &Scene, state: &SceneState, deformer: &CpuDeformer, domain
         truncation_bound = truncation.bound();
         (0..q.len()).filter(|mode| !truncation.retained().contains(&(*mode as u16))).for_each(|mode| q[mode] = 0.0);
     }
-    let step = ErrorBoundInput {
+    let input = ErrorBoundInput {
         q: &q,
         transform: state.composed_transform(scene, domain),
         compensated: scene.deformation.compensated,
     };
     let model = ShapeErrorModel::new(shape, &tiles);
-    (0..tiles.count()).map(|tile| model.tile_bound(tile, &step).total() + truncation_bound).collect()
+    (0..tiles.count()).map(|tile| model.tile_bound(tile, &input).total() + truncation_bound).collect()
 }
 
-/// Largest ratio of an error to the bound of its tile, per domain; infinite for NaN.
+/// For each domain, the largest ratio of a vertex error to the bound of the tile of the vertex; infinite for NaN.
 fn error_ratios(scene: &Scene, state: &SceneState, positions: &[f32], deformer: &CpuDeformer) -> Vec<f64> {
     let expected = reference::deform(scene, state);
     let domain_ratio = |domain: usize| {
         let layout = scene.layout.domains[domain];
         let bounds = tile_bounds(scene, state, deformer, domain);
         let vertex_ratio = |vertex: usize| {
-            let packed_vertex = layout.first_vertex + vertex;
+            let scene_vertex = layout.first_vertex + vertex;
             let squared_error =
-                |axis: usize| (f64::from(positions[3 * packed_vertex + axis]) - expected[packed_vertex][axis]).powi(2);
+                |axis: usize| (f64::from(positions[3 * scene_vertex + axis]) - expected[scene_vertex][axis]).powi(2);
             let ratio = (0..3).map(squared_error).sum::<f64>().sqrt() / bounds[vertex / (QUAD * TILE_QUADS)];
             if ratio.is_nan() { f64::INFINITY } else { ratio }
         };
@@ -91,10 +92,11 @@ fn error_ratios(scene: &Scene, state: &SceneState, positions: &[f32], deformer: 
     (0..scene.domains.len()).map(domain_ratio).collect()
 }
 
-/// Negative control: compared with the reference of the negated coordinates, the errors exceed the bound.
+/// Negative control: compared with the reference at -q, the errors exceed the bound.
 #[test]
 fn errors_stay_within_bounds_in_every_storage() {
     for storage in StorageType::ALL {
+        // The truncation budget is in meters.
         for (compensated, truncation) in [(false, None), (true, None), (false, Some(0.02)), (true, Some(0.02))] {
             let scene = random_scene(DeformationSettings {
                 storage,
@@ -103,7 +105,7 @@ fn errors_stay_within_bounds_in_every_storage() {
                 ..DeformationSettings::default()
             });
             let mut state = random_state(&scene);
-            // Decreasing amplitudes, so that some modes may be truncated.
+            // Amplitudes decrease from 1 to 2^-12 over all coordinates, so that some modes may be truncated.
             let coordinate_count = state.q.len() as f32;
             state
                 .q
@@ -118,7 +120,7 @@ fn errors_stay_within_bounds_in_every_storage() {
             let mut negated_state = state.clone();
             negated_state.q.iter_mut().for_each(|number| *number = -*number);
             let ratios = error_ratios(&scene, &negated_state, &positions, &deformer);
-            // Without modes, and possibly with truncated modes, the sign of q has no effect.
+            // The sign of q has no effect on a domain without modes, and may have none if modes are truncated.
             let is_sensitive = |domain: usize| scene.rank_of(domain) > 0 && truncation.is_none();
             for domain in (0..ratios.len()).filter(|domain| is_sensitive(*domain)) {
                 assert!(
@@ -142,11 +144,13 @@ fn positions_do_not_depend_on_threads_or_earlier_steps() {
         for step in 0..6 {
             // Steps 0 to 3 change q of one domain and one transform. Step 4 changes all of q and one transform, and
             // step 5 changes nothing.
-            let layout = scene.layout.domains[[0, 4, 8, 3, 0, 0][step]];
+            let deformed_domain = [0, 4, 8, 3, 0, 0][step];
+            let layout = scene.layout.domains[deformed_domain];
             let changed_q = if step == 4 { 0..state.q.len() } else { layout.first_q..layout.first_q + layout.rank };
             if step < 5 {
+                let moved_domain = [1, 6, 10, 3, 5][step];
                 state.q[changed_q].iter_mut().for_each(|number| *number = random.next());
-                state.transforms[[1, 6, 10, 3, 5][step]].0[3] += 0.5;
+                state.transforms[moved_domain].0[3] += 0.5;
             }
             let (summary, positions) = deform(&mut reused_deformer, &state);
             for threads in [1, 2, 5] {
@@ -176,8 +180,8 @@ fn f32_bits(numbers: &[f32]) -> Vec<u32> {
 
 #[test]
 fn vertices_do_not_depend_on_the_tiling() {
-    // The small shape has the first 129 vertices of the large shape. The second tile has 128 vertices in the large
-    // shape and one vertex in the small shape.
+    // The small shape has the first 129 vertices of the large shape. A tile has up to 128 vertices. The second tile has
+    // 128 vertices in the large shape and one vertex in the small shape.
     let (vertices, first_vertices, rank) = (1500, 129, 9);
     let mut random = TestRng(8);
     let columns: Vec<f32> = (0..3 * vertices * rank).map(|_| random.next()).collect();
@@ -202,6 +206,7 @@ fn huge_tiny_and_denormal_q_stay_within_the_bound() {
         for compensated in [false, true] {
             let scene = random_scene(DeformationSettings { storage, compensated, ..DeformationSettings::default() });
             let mut deformer = CpuDeformer::new(&scene);
+            // Numbers below 1.2e-38 are denormal; 1e-45 rounds to the smallest one.
             for scale in [1e30, 1e-38, 1e-42, 1e-45, 0.0] {
                 let mut state = random_state(&scene);
                 state.q.iter_mut().for_each(|number| *number *= scale);
@@ -215,8 +220,8 @@ fn huge_tiny_and_denormal_q_stay_within_the_bound() {
     }
 }
 
-/// A sum U q is correct if its terms overflow and the sum does not. If the sum overflows, the bounds of this step are
-/// not finite.
+/// A sum U q is correct if its terms overflow f32 but the sum does not. If the sum overflows, the bounds of the step
+/// are not finite.
 #[test]
 fn finite_sums_survive_overflowing_terms() {
     // u = 2 q0 + 2 q1 + q2 on all axes of five vertices.
@@ -233,8 +238,8 @@ fn finite_sums_survive_overflowing_terms() {
             assert!(2.0_f32.mul_add(state.q[1], 2.0_f32.mul_add(state.q[0], 0.0)).is_infinite());
             let (summary, positions) = deform(&mut deformer, &state);
             assert!(summary.bounds.is_finite());
-            // The first two modes cancel. The entry 1 of the third mode is rounded by at most half a step of int8,
-            // 1/254.
+            // The first two modes cancel, so u = 0.75. In int8, the entry 1 of the third mode is rounded by at most
+            // half a quantization step of 1/127.
             assert!(positions.iter().all(|number| (number - 0.75).abs() <= 0.75 / 254.0), "{positions:?}");
             state.q = vec![3e38, 0.0, 1.0];
             assert!(!deform(&mut deformer, &state).0.bounds.is_finite());
@@ -259,6 +264,7 @@ fn truncation_budget_in_meters_holds_in_scene_units() {
         let scene = Scene::new(parts).expect("expected a valid scene");
         let mut state = SceneState::rest(&scene);
         state.q.iter_mut().enumerate().for_each(|(mode, number)| *number = f32::exp2(-(mode as f32)));
+        // The transform doubles x, and the budget applies to the transformed vertices.
         state.transforms[0] = Transform([2.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0]);
         let mut deformer = CpuDeformer::new(&scene);
         let (_, positions) = deform(&mut deformer, &state);
@@ -267,7 +273,7 @@ fn truncation_budget_in_meters_holds_in_scene_units() {
         assert!(truncation.bound() > 0.0 && truncation.bound() <= 1e-3 / unit);
         assert!(retained.len() > 2 && retained.len() < 20, "{retained:?}");
         assert!(error_ratios(&scene, &state, &positions, &deformer)[0] <= 1.0);
-        // Truncated modes contribute nothing: the result has the bits of a state with zeros for these modes.
+        // The result has the same bits as without truncation, with q = 0 for the truncated modes.
         let mut zeroed_state = state.clone();
         (0..24).filter(|mode| !retained.contains(&(*mode as u16))).for_each(|mode| zeroed_state.q[mode] = 0.0);
         let untruncated_scene = copy_without_truncation(&scene);

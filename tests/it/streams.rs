@@ -1,5 +1,5 @@
-//! Frames that are streamed while later steps are computed. Each frame shows its own step, and frames and
-//! acknowledgements keep the order of the steps.
+//! Frame streams while later steps are computed. Each frame shows the step that it names. Frames and acknowledgements
+//! keep the order of the steps.
 
 use std::sync::Arc;
 
@@ -16,10 +16,10 @@ use crate::service_harness::{Server, state_after_steps, step, strips_with_attrib
 const SIZE: FrameSize = FrameSize::new(48, 32);
 /// Number of steps that a test sends.
 const STEPS: u64 = 30;
-/// Number of the step that is rejected because it overflows.
+/// Number of the step that is rejected because it moves vertices out of range.
 const REJECTED_STEP: u64 = 13;
 
-/// Cameras with different fields of view.
+/// Cameras at the same place with different fields of view.
 fn cameras(count: usize) -> Vec<Camera> {
     let fitted_camera = Camera::fit_to_scene(&strips_with_attributes(), SIZE.width, SIZE.height);
     (0..count).map(|index| Camera { lens: Lens::FieldOfView(30.0 + 4.0 * index as f64), ..fitted_camera }).collect()
@@ -29,7 +29,7 @@ fn frame_output(camera: Camera) -> OutputSpec {
     OutputSpec::Frame { camera, size: SIZE, frame_output: FrameOutput::Color }
 }
 
-/// Each valid step sets other coordinates of domain 1.
+/// Every step sets both coordinates of domain 1; the value of the first coordinate differs per step.
 fn steps() -> Vec<v1::Step> {
     let q = |number: u64| if number == REJECTED_STEP { 1e30 } else { 0.03 * number as f32 };
     (0..STEPS).map(|number| step(number, &[1], &[q(number), 0.5])).collect()
@@ -41,7 +41,8 @@ struct StepImages {
     images: Vec<Vec<u8>>,
 }
 
-/// Images of every valid step, rendered one by one.
+/// Images of every valid step, each rendered before the next step is computed. A step sets all coordinates that differ
+/// from rest, so its state does not depend on earlier steps.
 fn reference_images(cameras: &[Camera]) -> Vec<StepImages> {
     let (scene, steps) = (strips_with_attributes(), steps());
     let config = Config { backend: BackendChoice::Cpu, ..Config::default() };
@@ -72,8 +73,8 @@ async fn start_server() -> Server {
     server
 }
 
-/// There are more cameras than frames that can be in flight. Every frame shows its step, and replies keep the order of
-/// the steps.
+/// There are more cameras than frames that can be in flight. Every frame shows the step that it names, and replies keep
+/// the order of the steps.
 #[tokio::test(flavor = "multi_thread")]
 async fn frames_of_many_cameras_show_their_own_step() {
     let (server, cameras) = (start_server().await, cameras(5));
@@ -148,6 +149,7 @@ async fn closing_a_scene_delivers_frames_in_flight() {
     let output = with_timeout(subscription.next()).await.expect("expected a frame");
     assert!(frame_bytes(&output) == expected_images[0].images[0]);
     with_timeout(server.engine.close("attributes")).await.expect("expected the scene to close");
+    // The subscription ends after the frames of some of the 12 steps. No frame is missing in between.
     let mut number = 1;
     while let Ok(output) = with_timeout(subscription.next()).await {
         assert_eq!(output.step.number, number);

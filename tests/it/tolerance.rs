@@ -1,4 +1,4 @@
-//! Comparison of numbers with a tolerance, and a test that it detects differences.
+//! Comparison of numbers with a tolerance, and a test that the comparison detects differences.
 
 /// A number is close to an expected number e if they differ by at most `abs + rel |e|`.
 #[derive(Clone, Copy, Debug)]
