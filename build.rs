@@ -13,7 +13,7 @@ fn main() {
         collect_files(Path::new(source), &mut paths);
     }
     paths.sort();
-    // The hash FNV-1a, 64 bits, with its standard offset basis and prime.
+    // The 64-bit FNV-1a hash. The first constant is its offset basis, the second its prime.
     let hash = paths
         .iter()
         .flat_map(|path| fs::read(path).unwrap_or_default())

@@ -19,10 +19,10 @@ pub enum BackendChoice {
     Reference,
 }
 
-/// The OpenGL renderer.
+/// The device of the OpenGL renderer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, clap::ValueEnum)]
 pub enum RendererChoice {
-    /// The CUDA device in use, else any GPU, else Mesa's software rasterizer.
+    /// The GPU of the CUDA backend if CUDA is in use, else any GPU, else Mesa's software rasterizer.
     #[default]
     Auto,
     /// Mesa's software rasterizer.
@@ -54,11 +54,11 @@ pub struct Config {
     pub frame_side: u32,
     /// Limit on open scenes.
     pub open_scenes: usize,
-    /// Default acknowledgment window of a step stream, in steps.
+    /// Default window of a step stream: the maximum number of steps without acknowledgement.
     pub window: u32,
-    /// Largest acknowledgment window that a client may request.
+    /// Largest window that a client may request.
     pub max_window: u32,
-    /// Limit on the total size of one upload.
+    /// Limit on the total size of one upload, in bytes.
     pub upload_bytes: u64,
     /// Limit on the number of files of one upload.
     pub upload_files: u32,
@@ -162,7 +162,7 @@ impl Config {
     }
 }
 
-/// A configuration whose limits are in their ranges. Only [`Config::validated`] creates one.
+/// A configuration whose limits are in their ranges, created by [`Config::validated`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct ValidatedConfig(Config);
 

@@ -25,7 +25,7 @@ pub enum Stage {
 }
 
 impl Stage {
-    /// Name of the stage in logs and replies.
+    /// Name of the stage in logs, replies and reports.
     pub const fn name(self) -> &'static str {
         match self {
             Self::Parse => "parse",

@@ -2,8 +2,8 @@
 
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
-/// Locks a mutex, even if another thread panicked while it held the lock. Only for state that remains valid after a
-/// panic: each critical section changes its state by single operations.
+/// Locks a mutex, even if another thread panicked while it held the lock. Only for state that a panic cannot leave
+/// half-changed: each operation of a critical section leaves the state valid.
 pub(super) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

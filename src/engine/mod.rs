@@ -55,10 +55,10 @@ use crate::config::{Config, ValidatedConfig};
 use modalcast_model::error::{Error, Result, invalid};
 use modalcast_model::load::OpenedScene;
 
-/// Scenes that are read from disk concurrently.
+/// Maximum number of scenes that are read from disk concurrently.
 const MAX_CONCURRENT_LOADS: usize = 2;
 
-/// Uploads that may be in progress at a time.
+/// Maximum number of uploads in progress at a time.
 const MAX_CONCURRENT_UPLOADS: usize = 8;
 
 /// Handle to the engine. A clone is shallow: all clones share one device thread and one set of scenes.
@@ -108,7 +108,7 @@ impl Engine {
         Ok((engine, step))
     }
 
-    /// [`Self::start`] with the function that opens the devices on the device thread.
+    /// [`Self::start`], but `open_device` opens the devices. It runs on the device thread.
     async fn start_with_device(
         config: Arc<ValidatedConfig>,
         source: Arc<dyn SceneSource>,
@@ -312,8 +312,8 @@ impl Engine {
         openings.join_all().await;
     }
 
-    /// Opens a scene, once for all concurrent callers. Runs in a separate task, so that a cancelled caller does not
-    /// cancel the opening.
+    /// Opens a scene. Concurrent calls with the same name share one opening. The opening runs in a separate task, so
+    /// that a cancelled caller does not cancel the opening.
     async fn open_once(
         &self,
         name: String,
@@ -323,7 +323,7 @@ impl Engine {
         self.check_running()?;
         let engine = self.clone();
         let work = async move {
-            // An upload must not join the opening of another scene.
+            // A new upload must not join the opening of an earlier scene with the same name.
             let must_be_new = upload.is_some();
             let entry = engine.shared.registry.reserve(&name, &provenance, must_be_new)?;
             let opened = entry.get_or_open(|| engine.open_or_discard(name.clone(), provenance, upload)).await;
@@ -404,7 +404,8 @@ impl Engine {
         })
     }
 
-    /// Reads a scene's files. A panic in a loader becomes a `Fault` of this call.
+    /// Reads a scene's files. First moves the files of a new `upload` to the upload folder. A panic in a loader becomes
+    /// a `Fault` of this call.
     async fn read_scene_files(
         &self,
         name: &str,
@@ -432,6 +433,7 @@ impl Engine {
 
     /// Stops a scene and removes its checkpoint, its uploaded files, its catalog entry and its name.
     async fn close_scene(&self, name: &str) -> Result<()> {
+        // The outer `Option` tells whether the name is reserved, the inner one whether the scene is loaded.
         let entry = self.shared.registry.find_entry(name);
         match entry.as_ref().map(|entry| entry.scene_handle()) {
             Some(Some(scene_handle)) if scene_handle.is_closing() => return Err(scene_not_open(name)),

@@ -12,12 +12,12 @@ use modalcast_model::error::{Error, Result};
 use modalcast_model::load::OpenedScene;
 use modalcast_model::scene::{DeformationSettings, Scene, SceneParts, SceneState};
 
-/// Two strips of two triangles with two modes each; the second is attached to the first.
+/// Two domains, `left` and `right`. Each is a square of two triangles with two modes. `right` is attached to `left`.
 pub(super) fn two_strips() -> Arc<Scene> {
     strips(DeformationSettings::default())
 }
 
-/// The same scene with displacements and boxes enabled.
+/// [`two_strips`] with displacements and boxes enabled.
 pub(super) fn strips_with_attributes() -> Arc<Scene> {
     strips(DeformationSettings { displacements: true, boxes: true, ..DeformationSettings::default() })
 }
@@ -38,7 +38,7 @@ fn strips(deformation: DeformationSettings) -> Arc<Scene> {
         .expect("expected a valid scene")
 }
 
-/// A fault of [`FaultyDeformer`]. A state whose first coordinate is [`Self::q`] triggers it.
+/// A fault of [`FaultyDeformer`]. A state whose first coordinate is [`Self::q`] triggers the fault.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum InjectedFault {
     PanicInDeform,
@@ -75,7 +75,7 @@ impl Deformer for FaultyDeformer {
         Backend::Reference
     }
 
-    /// Selects the fault of the state. `readback` and `wait_readback` inject their faults later.
+    /// Selects the fault that the state triggers. Faults of `readback` and `wait_readback` occur when these are called.
     fn deform(&mut self, state: &SceneState) -> Result<DeformSummary> {
         self.fault = InjectedFault::ALL.into_iter().find(|fault| state.q[0] == fault.q());
         match self.fault {

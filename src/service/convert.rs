@@ -44,7 +44,7 @@ pub(super) fn wire_scene_summary(scene_handle: &SceneHandle) -> v1::SceneInfo {
     }
 }
 
-/// The remaining bytes of a limit on the encoded size of a list of strings.
+/// Number of bytes that remain of a limit on the encoded size of a list of strings.
 pub(super) struct ByteBudget(usize);
 
 impl ByteBudget {
@@ -62,7 +62,7 @@ impl ByteBudget {
     }
 }
 
-/// The remarks of a scene within [`MAX_REMARK_BYTES`].
+/// The remarks of the loader on a scene, up to [`MAX_REMARK_BYTES`].
 fn list_remarks(scene: &Scene) -> Vec<String> {
     let mut budget = ByteBudget::new(MAX_REMARK_BYTES);
     let mut remarks: Vec<String> =
@@ -132,7 +132,7 @@ pub(super) fn parse_delivery(number: i32) -> Result<Delivery> {
     }
 }
 
-/// Validates a picture. Returns the output to render and its wire format. The output is an [`OutputSpec::Frame`].
+/// Validates a picture. Returns an [`OutputSpec::Frame`] and the wire format of the frame.
 pub(super) fn parse_picture(
     engine: &Engine,
     scene: &Scene,

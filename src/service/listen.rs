@@ -15,8 +15,8 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::transport::server::{Connected, TcpConnectInfo};
 
-/// Connections with received data that may be queued for the server. Further connections wait until the queue has
-/// capacity.
+/// Maximum number of connections that have sent their first byte and are queued for the server. Further connections
+/// wait until the queue has capacity.
 const READY_QUEUE_CAPACITY: usize = 16;
 
 /// Pause of the listener after a failed accept.

@@ -37,8 +37,8 @@ pub(super) fn respond_to_pick(
     }))
 }
 
-/// Splits a reply into at least one message. A message is larger than `max_chunk_bytes` only if it has a single hit or
-/// because of its head.
+/// Splits a reply into at least one message. The hits of a message have at most `max_chunk_bytes` bytes, unless a
+/// single hit is larger. The head of the first message is not counted.
 fn split_reply(picks: &PickResult, scene: &Scene, max_chunk_bytes: usize) -> Vec<v1::PickResponse> {
     let head = v1::PickHead {
         step: Some(wire_step_id(picks.step)),

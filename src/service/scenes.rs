@@ -128,7 +128,7 @@ impl UploadTimeBudget {
         Ok(part)
     }
 
-    /// Adds the time in which the slowest accepted client sends `bytes` bytes.
+    /// Adds the time in which a client with the rate [`MIN_UPLOAD_RATE`] sends `bytes` bytes.
     fn refill(&mut self, bytes: usize) {
         let refill_time = Duration::from_secs_f64(bytes as f64 / MIN_UPLOAD_RATE);
         self.remaining = self.max_wait.min(self.remaining + refill_time);

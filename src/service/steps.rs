@@ -15,7 +15,8 @@ use super::stream::{Deadline, ReplySender, ReplyStream, respond};
 use crate::engine::{Engine, StepReport, WriterSession};
 use modalcast_model::error::{Error, Result, invalid};
 
-/// Limit on replies that are buffered for a client that does not read. Beyond it, the stream ends with an error.
+/// Maximum number of replies that are buffered for a client that does not read. A further reply ends the stream with an
+/// error.
 const MAX_PENDING_REPLIES: usize = 256;
 
 /// Implementation of `StepService`.

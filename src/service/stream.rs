@@ -18,7 +18,7 @@ use modalcast_model::error::{Error, Result};
 /// A reply stream.
 pub(super) type ReplyStream<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
 
-/// Messages of a reply that may be buffered for the connection.
+/// Maximum number of messages of a reply that are buffered for the connection.
 const REPLY_CAPACITY: usize = 2;
 
 /// Sender of a reply stream. Sending waits while the client reads slowly (back-pressure).
@@ -63,12 +63,12 @@ where
     let (sender, replies) = mpsc::channel(REPLY_CAPACITY + 1);
     // Reserved for the error of `work`, so that it can be sent even if the channel is full.
     let error_permit = sender.clone().try_reserve_owned();
-    let disconnect_watch = sender.clone();
+    let disconnect_watcher = sender.clone();
     let work = work(ReplySender(sender));
     let task = tokio::spawn(async move {
         tokio::select! {
             result = work => result,
-            () = disconnect_watch.closed() => Err(disconnected_status()),
+            () = disconnect_watcher.closed() => Err(disconnected_status()),
         }
     });
     tokio::spawn(async move {
@@ -124,7 +124,7 @@ struct TimeLimit {
 
 impl Deadline {
     /// The deadline of a single request: the smaller of `ms` (milliseconds; 0 means unset) and the `grpc-timeout`
-    /// header, else the configured default; limited to the configured maximum.
+    /// header. If both are unset, the configured default. At most the configured maximum.
     pub(super) fn of_request(metadata: &MetadataMap, ms: u32, config: &Config) -> Self {
         let requested = (ms > 0).then(|| Duration::from_millis(ms.into()));
         let duration = requested.into_iter().chain(grpc_timeout(metadata)).min().unwrap_or(config.deadline);
@@ -207,7 +207,7 @@ mod tests {
     }
 
     #[test]
-    fn request_has_the_shortest_given_limit_up_to_the_maximum() {
+    fn request_has_its_shortest_limit_up_to_the_maximum() {
         let config = Config::default();
         let limit_ms = |deadline: Deadline| deadline.limit.map(|limit| limit.ms);
         let metadata = |grpc_timeout: &'static str| {

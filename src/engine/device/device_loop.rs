@@ -37,11 +37,11 @@ use modalcast_render::{FrameImage, MAX_FRAMES_IN_FLIGHT, PendingPick, PickHit};
 
 /// How long the thread waits for a frame before it checks the command queue again.
 const POLL_INTERVAL: Duration = Duration::from_micros(100);
-/// Threads that copy pixels.
+/// Number of threads that copy pixels.
 const COPY_THREADS: usize = 2;
-/// Picks in flight. A further pick first waits for the oldest one.
+/// Maximum number of picks in flight. A further pick first waits for the oldest one.
 const MAX_PICKS_IN_FLIGHT: usize = 16;
-/// Vertex readbacks in flight: one of the current command, and one of the command before it.
+/// Maximum number of vertex readbacks in flight: one of the current command, and one of the command before it.
 const MAX_VERTEX_READBACKS_IN_FLIGHT: usize = 2;
 
 /// State owned by the device thread: the device context, the loaded scenes and the readbacks in flight.
@@ -201,7 +201,7 @@ impl DeviceLoop {
         }
     }
 
-    /// Submits a frame. Waits for the oldest frame first if the ring is full.
+    /// Submits a frame. Waits for the oldest frame first if every slot of the ring buffer is in flight.
     fn draw(&mut self, id: SceneId, camera: Camera, size: FrameSize, reply: Reply<FrameImage>) {
         while self.frames.is_full() {
             self.finish_oldest_frame();
@@ -251,8 +251,8 @@ impl DeviceLoop {
         }
     }
 
-    /// Answers one readback in flight. Waits for vertices, or for a pick if no frame is in flight. Waits for a frame for
-    /// at most [`POLL_INTERVAL`], and answers nothing if the frame is not ready by then.
+    /// Answers one readback in flight. Waits for vertices, or for a pick if no frame is in flight. Waits for a frame
+    /// for at most [`POLL_INTERVAL`], and answers nothing if the frame is not ready by then.
     fn finish_one(&mut self) {
         if !self.vertices.is_empty() {
             self.finish_oldest_vertices();
@@ -342,7 +342,7 @@ mod tests {
         Arc::new(state)
     }
 
-    /// Deforms a scene to a state and returns the positions.
+    /// Deforms a scene to a state and reads the positions.
     async fn deform_and_read(handle: &DeviceHandle, id: SceneId, state: &Arc<SceneState>) -> Result<Vec<f32>> {
         handle.deform(id, state).wait().await?;
         handle.read_vertices(id, POSITIONS).wait().await.map(|vertices| vertices.surface.positions.clone())

@@ -44,9 +44,9 @@ impl DeviceThread {
         open_scenes: usize,
         open_device: impl FnOnce() -> Result<DeviceContext> + Send + 'static,
     ) -> Result<Self> {
-        // A scene queues at most MAX_FRAMES_IN_FLIGHT frames, one vertex readback, the next step and the command that
-        // opens it. 8 commands are a reserve. The queue is therefore full only if more than `open_scenes` scenes use
-        // the device.
+        // A scene queues at most MAX_FRAMES_IN_FLIGHT frames and 3 other commands: a vertex readback, the next step and
+        // the command that loads the scene. 8 further commands are a reserve. So the queue is full only if more than
+        // `open_scenes` scenes use the device.
         let capacity = (3 + MAX_FRAMES_IN_FLIGHT) * open_scenes + 8;
         let (commands, inbox) = mpsc::channel(capacity);
         let (info_sender, info_receiver) = oneshot::channel();

@@ -99,6 +99,7 @@ mod tests {
     fn panicking_poll_drops_only_the_polled_readback() {
         let mut queue = InFlightQueue::<FakeReadback, u32>::new(3);
         let mut answers = Vec::new();
+        // The first readback is the oldest.
         for pending in [FakeReadback::Panics, FakeReadback::Ready, FakeReadback::Busy] {
             let (reply, answer) = oneshot::channel();
             queue.push(pending, reply);

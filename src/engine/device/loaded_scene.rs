@@ -27,7 +27,7 @@ pub(in crate::engine) struct BufferContents {
     /// Bounds of the vertices in light space. `None` in a camera-relative frame, because the deformer computed them
     /// relative to the domains' floating origins.
     light_bounds: Option<OrientedBounds>,
-    /// Whether vertices were uploaded to fill the buffers.
+    /// Whether vertices had to be uploaded to fill the buffers.
     pub(in crate::engine) is_uploaded: bool,
 }
 
@@ -146,7 +146,7 @@ impl LoadedScene {
     }
 
     /// Creates the buffers on first use and fills them with the last deformation. If the domains have different
-    /// origins, the positions are made relative to the origin nearest the camera.
+    /// floating origins, the positions are rebased: they are made relative to one origin near the eye of `camera`.
     pub(in crate::engine) fn fill_buffers(
         &mut self,
         renderer: &mut Renderer,
@@ -156,7 +156,8 @@ impl LoadedScene {
         let Some(buffers) = &mut self.buffers else { return Err(no_buffers_error()) };
         let origins = match &self.current_state.origins {
             Some(origins) if !origins.is_uniform() => Arc::clone(origins),
-            // All domains have the same origin, so the deformer's output is drawn unchanged.
+            // All domains have the same origin (the scene's origin if `None`), so the deformer's output is drawn
+            // unchanged.
             uniform_origins => {
                 buffers.set_shared_origin(uniform_origins.as_ref().map_or([0.0; 3], |origins| origins.shared_origin()));
                 buffers.set_step(self.generation);

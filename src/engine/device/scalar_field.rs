@@ -13,7 +13,7 @@ use modalcast_model::scene::{Scene, SceneState};
 /// rounding errors.
 const MIN_SCALE_FRACTION: f64 = 1e-5;
 
-/// Limits of the end of a scale. A client may request the same range.
+/// Limits of the value at the end of a scale. The values that clients may request have the same limits.
 const MIN_SCALE: f64 = 1e-30;
 const MAX_SCALE: f64 = 1e30;
 
@@ -97,7 +97,7 @@ mod tests {
     use crate::engine::testing;
     use modalcast_compute::reference;
 
-    /// The second strip is placed by a rotation and a scale of 2 and is deformed by its first mode.
+    /// The second strip is rotated, scaled by 2 and deformed by its first mode. The first strip is at rest.
     #[test]
     fn displacements_and_mode_shapes_match_the_entries_of_u() {
         let scene = testing::two_strips();
@@ -130,7 +130,8 @@ mod tests {
             fit_legend(&scene, FrameOutput::Displacement { scale_max }, displacements).scale_max
         };
         let fitted_max = legend_max(0.0, &displacements);
-        // The scale ends at 1, 2, 2.5 or 5 times a power of ten; neighbors differ by at most a factor of 2.
+        // The scale ends at 1, 2, 2.5 or 5 times a power of ten. These ends differ by at most a factor of 2, so the end
+        // is at most 2 times the largest value; 2.5 leaves a margin.
         assert!(fitted_max >= f64::from(max_displacement) && fitted_max <= 2.5 * f64::from(max_displacement));
         assert_eq!(legend_max(3.0, &displacements), 3.0);
         let max_of_rounding_errors = legend_max(0.0, &[1e-9]);

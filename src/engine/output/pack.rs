@@ -1,4 +1,4 @@
-//! Packs vertices into bytes for the wire. Runs on the blocking pool.
+//! Packs vertices into bytes for the wire, on the blocking pool.
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -15,13 +15,14 @@ use modalcast_render::RasterBackends;
 // Vertices are copied in memory order, and the wire format is little-endian.
 const _: () = assert!(cfg!(target_endian = "little"), "expected a little-endian target");
 
-/// Limit on the domains of one vertex reply. It bounds the first message, which contains two counts per domain.
+/// Limit on the domains of one vertex reply. It bounds the size of the first message, which contains the index and two
+/// counts of every selected domain.
 const MAX_DOMAINS: usize = 65_536;
 
-/// Size of a vector: 3 f32.
+/// Size of a vector in bytes: 3 f32.
 const VECTOR_BYTES: usize = 12;
 
-/// Size of a domain's box: 6 f32.
+/// Size of a domain's bounding box in bytes: 6 f32.
 const BOX_BYTES: u64 = 24;
 
 /// Vertices as bytes, and the origin of their positions.
@@ -177,7 +178,10 @@ fn pack(surface: &DeformedSurface, selection: &VertexSelection) -> Vec<u8> {
     let mut bytes = Vec::with_capacity(VECTOR_BYTES * corner_count + bytes_without_normals as usize);
     // `range` gives the index of a domain's first vector in `numbers`, and the number of its vectors.
     let mut append_attribute = |is_selected: bool, numbers: &[f32], range: &dyn Fn(&DomainLayout) -> (usize, usize)| {
-        for domain in selection.domains.iter().filter(|_| is_selected) {
+        if !is_selected {
+            return;
+        }
+        for domain in &selection.domains {
             let (first_vector, count) = range(&layout.domains[*domain as usize]);
             bytes.extend_from_slice(bytemuck::cast_slice(&numbers[3 * first_vector..][..3 * count]));
         }
@@ -187,11 +191,13 @@ fn pack(surface: &DeformedSurface, selection: &VertexSelection) -> Vec<u8> {
     append_attribute(attributes.positions, &surface.positions, &vertex_range);
     append_attribute(attributes.normals, &surface.normals, &corner_range);
     append_attribute(attributes.displacements, &surface.displacements, &vertex_range);
-    for domain in selection.domains.iter().filter(|_| attributes.boxes) {
-        let BoundingBox { min, max } = surface.boxes[*domain as usize];
-        // The bounds are f32 values stored as f64, so the conversion is exact.
-        let bounds_f32 = [min, max].map(|bound| bound.map(|number| number as f32));
-        bytes.extend_from_slice(bytemuck::cast_slice(&bounds_f32));
+    if attributes.boxes {
+        for domain in &selection.domains {
+            let BoundingBox { min, max } = surface.boxes[*domain as usize];
+            // The bounds are f32 values stored as f64, so the conversion is exact.
+            let bounds_f32 = [min, max].map(|bound| bound.map(|number| number as f32));
+            bytes.extend_from_slice(bytemuck::cast_slice(&bounds_f32));
+        }
     }
     bytes
 }
@@ -214,7 +220,7 @@ mod tests {
             normals: numbers_from(100.0, 24),
             ..DeformedSurface::default()
         };
-        // Each strip has four vertices and four corners: 12 numbers of positions and 12 of normals.
+        // Each strip has four vertices and four corners. Numbers 12 to 23 of each list belong to the second strip.
         let selection = VertexSelection::new(&scene, vec![1], VertexAttributes::POSITIONS_AND_NORMALS)
             .expect("expected a valid selection");
         let floats: Vec<f32> = bytemuck::pod_collect_to_vec(&pack(&surface, &selection));

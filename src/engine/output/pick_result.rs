@@ -1,5 +1,5 @@
-//! The result of a pick, with the data that a client needs to apply a force at the point: the rows of U, and A, the
-//! linear part of the transform.
+//! The result of a pick, with the data that a client needs to apply a force at a picked point: the 3 x r block of U at
+//! the point (r is the number of modes), and the linear part A of the transform.
 
 use std::sync::Arc;
 
@@ -30,7 +30,7 @@ pub(in crate::engine) fn with_transforms(state: &SceneState, scene: &Scene, hits
     hits.into_iter().map(add_transform).collect()
 }
 
-/// Adds the block of U to every hit if `with_modes` is true.
+/// Adds to every hit the block of U at its point if `with_modes` is true.
 ///
 /// # Errors
 /// `Fault` when `output` is not a pick.
@@ -40,9 +40,11 @@ pub async fn resolve_picks(output: StepOutput, scene: &Arc<Scene>, with_modes: b
     };
     let scene = Arc::clone(scene);
     let add_modes = move || {
-        for modal_hit in hits.iter_mut().filter(|_| with_modes) {
-            let shape = &scene.shapes[scene.domains[modal_hit.hit.domain].shape];
-            modal_hit.modes = shape.modes.block_at_point(modal_hit.hit.vertices, modal_hit.hit.barycentrics);
+        if with_modes {
+            for modal_hit in &mut hits {
+                let shape = &scene.shapes[scene.domains[modal_hit.hit.domain].shape];
+                modal_hit.modes = shape.modes.block_at_point(modal_hit.hit.vertices, modal_hit.hit.barycentrics);
+            }
         }
         Ok(hits)
     };

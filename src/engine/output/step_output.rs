@@ -32,11 +32,13 @@ pub enum OutputSpec {
 pub enum FrameOutput {
     #[default]
     Color,
-    /// For this and the next two quantities, see [`modalcast_render::Aov`].
+    /// [`modalcast_render::Aov::Depth`], in meters.
     Depth,
+    /// [`modalcast_render::Aov::Domains`]: indices of domains.
     Domains,
+    /// [`modalcast_render::Aov::Normals`].
     Normals,
-    /// |u| as a color map.
+    /// The length |u| of the displacement as a color map.
     Displacement {
         /// The value at the bright end of the scale in meters; 0 fits the scale to each frame.
         scale_max: f64,

@@ -17,7 +17,7 @@
 //! |---|---|---|
 //! | `Idle` | no step is in progress | the writer has queued a step |
 //! | `Deforming` | the device computes the step, readbacks of the previous step are delivered, messages wait | the device answers |
-//! | `Delivering` | the step is the current one, its writer waits for the acknowledgement | every lossless subscriber has received the step, or the writer cannot be blocked |
+//! | `Delivering` | the step is the current one, its writer waits for the acknowledgement | every lossless subscriber has received the step, or the writer is not lossless or has disconnected |
 //!
 //! Single requests and subscribers are served in `Idle` and in `Delivering`. In every state the actor ends, and
 //! [`SceneActor::close`] consumes it, when
@@ -253,7 +253,7 @@ impl SceneActor {
     }
 
     fn receive(&mut self, message: Message) {
-        // A failed send below means that the caller no longer waits; its reply is dropped.
+        // A failed `send` below means that the caller no longer waits.
         match message {
             Message::AcquireWriter { peer, policy, window, reply } => {
                 reply.send(self.acquire_writer(peer, policy, window)).ok();

@@ -119,6 +119,9 @@ mod tests {
     use crate::engine::output::step_output::OutputSpec;
     use modalcast_model::deform::VertexAttributes;
 
+    /// Limit of an [`EncodedSubscription`] that takes all frames.
+    const ALL_FRAMES: u64 = 0;
+
     fn subscribe(delivery: Delivery) -> (Subscriber, Subscription) {
         Subscription::new(OutputSpec::Vertices(VertexAttributes::POSITIONS_AND_NORMALS), delivery, Arc::default())
     }
@@ -136,7 +139,8 @@ mod tests {
         frames.next().await.expect("expected an encoded frame").expect("expected a frame before the end")
     }
 
-    /// Sends frames of decreasing size while the subscriber has credits. Returns how many were sent.
+    /// Sends frames while the subscriber has credits. Returns how many were sent. The size of the frames decreases, so
+    /// that later frames could be encoded before earlier ones.
     async fn send_until_full(subscriber: &Subscriber, frames: &mut EncodedSubscription) -> usize {
         for number in 0..20 {
             poll_without_frame(frames).await;
@@ -157,7 +161,7 @@ mod tests {
         {
             let (encoder, thread_permits) = paused_encoder(cores);
             let (subscriber, subscription) = subscribe(delivery);
-            let mut frames = EncodedSubscription::new(subscription, encoder, FrameFormat::Png, 0);
+            let mut frames = EncodedSubscription::new(subscription, encoder, FrameFormat::Png, ALL_FRAMES);
             let sent = send_until_full(&subscriber, &mut frames).await;
             assert_eq!(frames.encodings.len(), max_encodings, "{delivery:?}");
             assert_eq!(sent, max_encodings + buffered, "{delivery:?}");
@@ -172,7 +176,7 @@ mod tests {
     async fn frame_that_reaches_the_byte_limit_is_encoded_alone() {
         let (encoder, _thread_permits) = paused_encoder(4);
         let (subscriber, subscription) = subscribe(Delivery::Lossless);
-        let mut frames = EncodedSubscription::new(subscription, encoder, FrameFormat::Png, 0);
+        let mut frames = EncodedSubscription::new(subscription, encoder, FrameFormat::Png, ALL_FRAMES);
         let large_image = modalcast_render::FrameImage {
             width: 1,
             height: 1,
@@ -193,7 +197,7 @@ mod tests {
     async fn end_is_reported_after_the_held_frames() {
         let (encoder, thread_permits) = paused_encoder(4);
         let (subscriber, subscription) = subscribe(Delivery::Lossless);
-        let mut frames = EncodedSubscription::new(subscription, encoder, FrameFormat::Png, 0);
+        let mut frames = EncodedSubscription::new(subscription, encoder, FrameFormat::Png, ALL_FRAMES);
         send_frame(&subscriber, noise_frame(0, 32));
         send_frame(&subscriber, noise_frame(1, 4));
         let end_error = Error::NotFound { what: "scene", given: "'closed'".into() };

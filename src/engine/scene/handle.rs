@@ -186,6 +186,7 @@ impl SceneHandle {
         self.mailbox.send(Message::Panic).await.ok();
     }
 
+    /// Sends a message to the actor and waits for the reply.
     async fn call<T>(&self, create_message: impl FnOnce(oneshot::Sender<Result<T>>) -> Message) -> Result<T> {
         let (reply, answer) = oneshot::channel();
         match self.mailbox.try_send(create_message(reply)) {
@@ -216,7 +217,7 @@ pub struct WriterSession {
     scene: Arc<Scene>,
     /// This writer is the scene's `run`-th writer, counted from 1.
     pub run: u64,
-    /// Steps that may be unacknowledged at a time.
+    /// Maximum number of unacknowledged steps.
     pub window: u32,
     pub policy: Policy,
     /// Number of the last accepted step.

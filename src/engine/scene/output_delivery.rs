@@ -1,5 +1,5 @@
 //! Delivery of a scene's outputs: to single requests whose step has been reached, and to subscribers that have not
-//! received the current step yet.
+//! received the current step yet. A subscriber receives one result per credit ([`super::subscriber`]).
 
 use std::mem;
 use std::sync::Arc;
@@ -36,7 +36,7 @@ pub(super) struct DeliveryMode {
     /// A lossless subscriber without a credit blocks the writer. It is disconnected after `Config::stall_timeout`.
     pub applies_back_pressure: bool,
     /// Another step is queued. Readbacks of vertices and of at most [`MAX_FRAMES_IN_FLIGHT`] frames are only started
-    /// and are delivered while that step is computed.
+    /// now, and are delivered while the queued step is computed.
     pub overlaps_next_step: bool,
 }
 
@@ -68,6 +68,7 @@ impl OutputDelivery {
             return Err(Error::Busy { queue: "subscribers of the scene", limit });
         }
         let receives_current = subscriber.delivery == Delivery::Latest && current.state.run > 0;
+        // Counts as if the subscriber had received the step before its first one.
         subscriber.delivered_step_count =
             if receives_current { current.step_count.saturating_sub(1) } else { current.step_count };
         self.subscribers.push(subscriber);
@@ -160,8 +161,8 @@ impl OutputDelivery {
         self.drop_closed_subscribers();
     }
 
-    /// Delivers readbacks until the device has computed the next step. Afterwards only frames of the current step may
-    /// be in flight.
+    /// Delivers readbacks until the device answers `pending_reply`, which is the next step. Afterwards only frames of
+    /// the step in `current` may be in flight.
     pub(super) async fn deliver_during<T>(
         &mut self,
         pending_reply: &mut PendingReply<T>,
@@ -509,12 +510,12 @@ mod tests {
     struct ServedFrames {
         /// Width of the frame that is requested while the first frame is still in flight.
         early_frame_width: Option<u32>,
-        /// First the frames of the slow subscriber, then those of the fast one.
+        /// First the frames of the slow subscriber, then the frames of the fast subscriber.
         received: Vec<ReceivedFrame>,
     }
 
     /// Delivers the second step to a slow subscriber (width 16), whose frame of the first step is in flight, and to a
-    /// fast one (width 24), which has credits.
+    /// fast subscriber (width 24), which has credits.
     async fn serve_slow_and_fast(slow_delivery: Delivery) -> ServedFrames {
         let (slow_subscriber, mut slow_subscription) = subscribe(slow_delivery, 16);
         let (fast_subscriber, mut fast_subscription) = subscribe(Delivery::Lossless, 24);
@@ -522,7 +523,7 @@ mod tests {
         timeout(Duration::ZERO, slow_subscription.next()).await.expect_err("expected no frame yet");
         let (mut delivery, mut device) = delivery_to(vec![slow_subscriber]);
         delivery.serve_subscribers(&current_step(1), WITH_NEXT_STEP).await;
-        // A generous timeout, because the request must arrive. The shorter ones below wait for requests that may not.
+        // The request must arrive, so the timeout is long. The timeouts below are short, because no request may arrive.
         let first_request = next_draw_request(&mut device, 10_000).await.expect("expected the first frame");
         delivery.subscribers.push(fast_subscriber);
         let second_step = current_step(2);
@@ -562,6 +563,7 @@ mod tests {
     #[tokio::test]
     async fn lossless_subscriber_receives_its_frames_in_order() {
         let served = serve_slow_and_fast(Delivery::Lossless).await;
+        // The slow subscriber is served first. Its second frame is requested only after its first one is delivered.
         assert_eq!(served.early_frame_width, None);
         let expected = [(16, 1), (16, 2), (24, 2)].map(|(width, step)| ReceivedFrame { width, step });
         assert_eq!(served.received, expected);

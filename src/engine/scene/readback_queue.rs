@@ -1,7 +1,7 @@
 //! Device-to-host readbacks in flight. Vertices are read back while the next step is computed. Frames are drawn and
-//! read back while the next step is computed and its frames are submitted. Readbacks are delivered in order as they
-//! complete. In the diagrams `read` is the transfer of the pixels to host-readable memory, and `upload` is the copy of
-//! the new vertices into OpenGL buffers.
+//! read back while the next step is computed and the frames of the next step are submitted. Readbacks are delivered in
+//! the order in which they were started. In the diagrams, `k` is the number of a step, `read` is the transfer of the
+//! pixels to host-readable memory, and `upload` is the copy of the new vertices into OpenGL buffers.
 //!
 //! A deformer with its own vertex memory computes concurrently with the frames in flight:
 //!
@@ -82,7 +82,7 @@ pub(super) struct PendingReadback {
     stages: StageTimes,
     origins: Option<Arc<FloatingOrigins>>,
     recipients: Vec<Recipient>,
-    /// The step whose acknowledgement follows this readback, because it is the last one of the step.
+    /// The step that is acknowledged after this readback, if this is the last readback of the step.
     step_to_acknowledge: Option<CompletedStep>,
 }
 
@@ -179,8 +179,8 @@ impl ReadbackQueue {
         self.flush_before(u64::MAX).await;
     }
 
-    /// Delivers readbacks until no vertices are in flight. The next step is submitted before its predecessor's vertices
-    /// are delivered, but the results of the next step must not overtake them.
+    /// Delivers readbacks until no vertices are in flight, so that the results of the next step, which is already
+    /// submitted, cannot overtake these vertices.
     pub(super) async fn flush_vertices(&mut self) {
         while self.pending.iter().any(|pending| matches!(pending.readback, Readback::Vertices(_))) {
             self.deliver_oldest().await;

@@ -110,10 +110,10 @@ impl Drop for WriterLease {
 struct QueueState {
     queued: VecDeque<QueuedStep>,
     /// Numbers of the steps that were taken and not yet reported, oldest first. There are several while readbacks of
-    /// the earlier ones are in flight.
+    /// the older steps are in flight.
     in_progress: VecDeque<u64>,
     reports: VecDeque<StepReport>,
-    /// Number of steps that were merged into later ones.
+    /// Number of steps that were merged into later ones since the stream began.
     skipped: u64,
     is_lease_dropped: bool,
     /// The error with which the scene ended the queue.
@@ -181,9 +181,9 @@ impl StepQueue {
             Ok(stages) => StepReport::Done { step, skipped, stages },
             Err(error) => StepReport::Rejected { step, error },
         };
-        // Under `latest` a writer may read reports slowly. A `Done` also covers the older steps, so it replaces a
-        // waiting `Done` once `window` reports wait. `Rejected` is never replaced. If more than `window` reports wait,
-        // a further report that replaces none is dropped and ends the queue.
+        // Under `latest`, a writer may read its reports slowly. A `Done` also covers all older steps. Once `window`
+        // reports wait, it therefore replaces the newest report if that is a `Done`. A `Rejected` is never replaced. If
+        // more than `window` reports wait, the further report is dropped and the queue ends with an error.
         let replaces_newest =
             matches!((state.reports.back(), &report), (Some(StepReport::Done { .. }), StepReport::Done { .. }));
         if state.reports.len() >= self.window && replaces_newest {
@@ -264,7 +264,7 @@ mod tests {
     use crate::engine::testing;
     use modalcast_model::scene::{RawStepUpdate, SceneState};
 
-    /// A step that sets the two coordinates of one strip.
+    /// A step that sets the two coordinates of one domain of [`testing::two_strips`].
     fn step(number: u64, domain: u32, q: [f32; 2]) -> QueuedStep {
         let scene = testing::two_strips();
         let q = bytes::Bytes::copy_from_slice(bytemuck::cast_slice(&q));

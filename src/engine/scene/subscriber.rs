@@ -1,9 +1,10 @@
 //! A subscription to a scene: a bounded channel with credit-based flow control. The scene owns the [`Subscriber`],
 //! which sends results. The reply stream owns the [`Subscription`], which receives them and grants credits.
 //!
-//! The channel buffers at most two results. With [`Delivery::Latest`] a result is produced only after
-//! [`Subscription::next`] was polled. If the future of `next` is dropped, the next call returns the result that the
-//! dropped one requested, even if the scene has completed a later step since.
+//! A credit permits the scene to send one more result. The channel buffers at most two results. With
+//! [`Delivery::Latest`], [`Subscription::next`] grants a credit when it is polled, so a result is produced only then.
+//! If the future of `next` is dropped, the next call returns the result that the dropped future has requested, even if
+//! the scene has completed a later step since.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
@@ -14,7 +15,8 @@ use tokio::sync::{Notify, mpsc, watch};
 use crate::engine::output::step_output::{OutputSpec, StepOutput};
 use modalcast_model::error::{Error, Result, fault};
 
-/// Results that a lossless subscriber may leave unread before it blocks the writer. Also the capacity of the channel.
+/// Number of results that a lossless subscriber may leave unread before it blocks the writer. Also the capacity of the
+/// channel.
 pub(super) const LOSSLESS_CREDITS: usize = 2;
 
 /// Which steps a subscriber receives.
@@ -168,7 +170,7 @@ impl Subscription {
     }
 
     /// Waits until the scene disconnects the subscriber, and returns the reason. Pends forever if the subscription ends
-    /// otherwise.
+    /// in another way.
     pub async fn disconnected(&self) -> Error {
         let mut end_receiver = self.end.clone();
         let is_immediate = |end: &Option<EndReason>| end.as_ref().is_some_and(|end| end.is_immediate);

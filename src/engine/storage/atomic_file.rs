@@ -10,7 +10,7 @@ pub(super) fn write_atomic(path: &Path, bytes: &[u8]) -> io::Result<()> {
     let temporary = path.with_extension("new");
     let mut file = File::create(&temporary)?;
     file.write_all(bytes)?;
-    // Without the sync a power failure could leave an empty file under the new name.
+    // Without this sync, a power failure after the rename could leave an empty file at `path`.
     file.sync_all()?;
     fs::rename(&temporary, path)?;
     match path.parent() {

@@ -25,8 +25,8 @@ const WRITE_INTERVAL: Duration = Duration::from_millis(100);
 /// counts of coordinates and of transforms (u64), q (f32), the transforms (12 f32 each), and the SHA-256 of all bytes
 /// before the hash. Little-endian.
 const MAGIC: &[u8; 8] = b"MCSTEP01";
-/// Magic number of a checkpoint with floating origins. Between the transforms and the hash it contains the shared origin
-/// (3 f64) and one translation (3 f64) per transform.
+/// Magic number of a checkpoint with floating origins. Between the transforms and the hash, the file contains the
+/// shared origin (3 f64) and one translation (3 f64) per transform.
 const MAGIC_ORIGINS: &[u8; 8] = b"MCSTEP02";
 /// The magic number and five numbers of 8 bytes.
 const HEADER_BYTES: usize = 8 + 5 * 8;
@@ -275,7 +275,7 @@ mod tests {
         let state = deformed_state(&scene);
         let bytes = encode(&state);
         assert_eq!(decode(&bytes, &scene).expect("expected a valid checkpoint"), state);
-        // A byte of the magic number, of the run, of q and of the hash.
+        // One byte each of the magic number, the run, q and the hash.
         for index in [0, 9, HEADER_BYTES + 2, bytes.len() - 1] {
             let mut damaged_bytes = bytes.clone();
             damaged_bytes[index] ^= 1;
@@ -301,7 +301,7 @@ mod tests {
         state.apply(&scene, &StepUpdate::parse(&scene, &raw).expect("expected a valid step"));
         let bytes = encode(&state);
         let restored_state = decode(&bytes, &scene).expect("expected a valid checkpoint");
-        // The nearest multiple of 1024, the spacing of floating origins, to the translation 1e7 + 0.125.
+        // Floating origins are multiples of 1024. The nearest one to the translation 1e7 + 0.125 is 9766 * 1024.
         let expected_origin = [9766.0 * 1024.0, 0.0, 0.0];
         assert_eq!((&restored_state, restored_state.origin_of(1)), (&state, expected_origin));
         assert_ne!(

@@ -1,6 +1,6 @@
-//! Writes uploaded files into a new temporary folder, which their paths cannot leave. Sizes and SHA-256 hashes are
-//! checked against the declared ones. Dropping an unfinished [`Upload`] removes its folder in the background.
-//! [`Upload::discard`] removes the folder before it returns.
+//! Writes uploaded files into a new temporary folder. The paths of the files cannot leave the folder. Sizes and SHA-256
+//! hashes must equal the values that the client has declared. Dropping an unfinished [`Upload`] removes its folder in
+//! the background. [`Upload::discard`] removes the folder before it returns.
 
 use std::collections::BTreeSet;
 use std::fs::{self, File};
@@ -297,7 +297,7 @@ mod tests {
     fn wrong_sizes_and_hashes_are_rejected_and_leave_no_files() {
         let folder = tempfile::tempdir().expect("expected a temporary folder");
         type UploadCalls = fn(&mut Upload) -> Result<()>;
-        // The header declares one file and 4 bytes.
+        // The header declares one file and 4 bytes. Each case is a sequence of calls and the beginning of its error.
         let calls: [(UploadCalls, &str); 7] = [
             (|upload| upload.begin_file("a", 5, &sha256_of(b"")), "header.total_bytes"),
             (|upload| upload.begin_file("a", 4, b"short"), "file.sha256"),

@@ -6,7 +6,7 @@ use crate::engine::{FrameFormat, FrameOutput, validate_mode};
 use modalcast_model::error::{Result, invalid};
 use modalcast_model::scene::Scene;
 
-/// Limit on the end of a color map's scale. The lower limit is 1 / `MAX_SCALE`.
+/// Upper limit of the value at the end of a color map's scale. The lower limit is 1 / `MAX_SCALE`.
 const MAX_SCALE: f64 = 1e30;
 
 /// Parses the output and the format of a picture. Fails if the output does not have this format.
@@ -34,6 +34,7 @@ pub(super) fn parse_output(scene: &Scene, picture: &v1::Picture) -> Result<(Fram
 fn parse_format(frame_output: FrameOutput, number: i32) -> Result<FrameFormat> {
     let requested_format =
         v1::Format::try_from(number).map_err(|_| invalid("picture.format", "a format of this version", number))?;
+    // The only format of the output, as wire and engine types; `None` for outputs with a choice.
     let required_format = match frame_output {
         FrameOutput::Color | FrameOutput::Displacement { .. } | FrameOutput::ModeShape { .. } => None,
         FrameOutput::Depth => Some((v1::Format::F32, FrameFormat::F32)),
