@@ -1,5 +1,5 @@
-//! Rendered pixels compared with arithmetic. Most tests have a negative control: a changed input that must change the
-//! result. The tests run on any EGL driver, including Mesa's llvmpipe.
+//! Rendered pixels are compared with values that the tests compute. Most tests have a negative control: a changed input
+//! that must change the result. The tests run on any EGL driver, including Mesa's llvmpipe.
 
 mod aov;
 mod below_ground;

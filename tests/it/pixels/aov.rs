@@ -1,5 +1,5 @@
-//! Readbacks of AOVs (arbitrary output variables: depth, domain indices, normals and vertex values), compared with
-//! arithmetic.
+//! Readbacks of AOVs (arbitrary output variables: depth, domain indices, normals and vertex values) equal the values
+//! that the tests compute.
 
 use modalcast_model::domain::{AlphaMode, Material};
 use modalcast_model::scene::{Camera, Ground, Lens, View};
@@ -8,7 +8,8 @@ use nalgebra::Vector3;
 
 use super::harness::{SceneBuilder, facing_rectangle, floor_mesh, front_camera, open_renderer};
 
-/// Reads an AOV of a scene at rest in a square image. For [`Aov::Values`], the value of each vertex is its x.
+/// Reads an AOV of a scene at rest in a square image with side `size`. For [`Aov::Values`], the value of each vertex is
+/// its x coordinate. Then the function also asserts that missing values and too few values are errors.
 fn read_aov(builder: SceneBuilder, camera: Camera, size: u32, aov: Aov) -> AovImage {
     let scene = builder.build();
     let mut renderer = open_renderer();
@@ -18,6 +19,7 @@ fn read_aov(builder: SceneBuilder, camera: Camera, size: u32, aov: Aov) -> AovIm
         let mesh = &scene.shapes[domain.shape].mesh;
         assert_eq!(layout.first_vertex, surface.positions.len() / 3);
         surface.positions.extend(mesh.rest_positions().as_flattened());
+        // The meshes of these tests have one corner per vertex.
         surface.normals.extend(mesh.corners().normals.as_flattened());
     }
     renderer.upload(&buffers, &surface).expect("expected the upload to succeed");
@@ -35,7 +37,7 @@ fn decode_f32(image: &AovImage) -> Vec<f32> {
     bytemuck::pod_collect_to_vec(&image.bytes)
 }
 
-/// A camera for 64 x 64 pixels that looks down at the plane y = 0 from height 5.
+/// A camera for 64 x 64 pixels that looks down at the plane y = 0 from height 5. Its focal length is 60 pixels.
 fn oblique_camera() -> Camera {
     let view = View::LookAt { eye: [3.0, 5.0, 4.0], target: [0.0, 0.0, -6.0], up: [0.0, 1.0, 0.0] };
     Camera { view, lens: Lens::Intrinsics { fx: 60.0, fy: 60.0, cx: 32.0, cy: 32.0 }, near: 0.0, far: 0.0 }
@@ -44,11 +46,11 @@ fn oblique_camera() -> Camera {
 /// Depth along the view axis where the ray of a pixel of [`oblique_camera`] intersects the plane y = 0; `None` for rays
 /// that do not go down.
 fn depth_of_floor(x: u32, y: u32) -> Option<f64> {
-    // From the eye to the target of the camera.
+    // The vector from the eye to the target of the camera.
     let forward = Vector3::new(-3.0, -5.0, -10.0_f64).normalize();
     let right = forward.cross(&Vector3::y()).normalize();
     let up = right.cross(&forward);
-    // The component of the ray along `forward` is 1, so its parameter is the depth.
+    // The component of the ray along `forward` is 1. So the depth is the factor by which the ray reaches the plane.
     let ray = forward + (f64::from(x) + 0.5 - 32.0) / 60.0 * right + (32.0 - f64::from(y) - 0.5) / 60.0 * up;
     (ray.y < 0.0).then(|| -5.0 / ray.y)
 }
@@ -70,16 +72,18 @@ fn depth_is_in_meters_along_the_view_axis() {
             Aov::Depth,
         );
         assert_eq!((image.width, image.height, image.samples), (64, 64, 1));
-        let (mut covered_pixels, mut max_error) = (0, 0.0_f64);
+        let (mut covered_pixels, mut max_relative_error) = (0, 0.0_f64);
         for (pixel, depth) in decode_f32(&image).into_iter().enumerate() {
             let expected = depth_of_floor(pixel as u32 % 64, pixel as u32 / 64).map(|scene_units| scene_units * unit);
             if depth.is_finite() {
                 covered_pixels += 1;
                 let expected = expected.expect("expected depth below the horizon only");
-                max_error = max_error.max((f64::from(depth) / expected - 1.0).abs());
+                max_relative_error = max_relative_error.max((f64::from(depth) / expected - 1.0).abs());
             }
         }
-        assert!(covered_pixels > 2000 && max_error < 1e-4, "{covered_pixels} pixels, relative error {max_error:e}");
+        // More than 2000 of the 4096 pixels are below the horizon.
+        assert!(covered_pixels > 2000, "{covered_pixels} pixels");
+        assert!(max_relative_error < 1e-4, "expected only rounding errors of f32, got {max_relative_error:e}");
         assert_eq!(decode_f32(&image)[0], f32::INFINITY, "expected infinite depth in the sky at the top left");
     }
 }
@@ -95,20 +99,22 @@ fn domain_indices_do_not_depend_on_the_drawing_order() {
         .add_domain(facing_rectangle(1.0, 0.0, 2.0, 1.0, 0.0), Material::default());
     let ids: Vec<u32> = bytemuck::pod_collect_to_vec(&read_aov(builder, front_camera(64), 64, Aov::Domains).bytes);
     let id_at = |x: usize, y: usize| ids[64 * y + x];
-    assert_eq!([id_at(17, 26), id_at(47, 26), id_at(32, 26)], [1, 2, u32::MAX]);
+    let [cut_out_id, opaque_id, background_id] = [id_at(17, 26), id_at(47, 26), id_at(32, 26)];
+    assert_eq!([cut_out_id, opaque_id, background_id], [1, 2, u32::MAX]);
     assert_eq!(ids.iter().filter(|id| **id == 1).count(), 100, "expected 10 x 10 pixels of domain 1");
 }
 
 #[test]
-fn normals_face_the_viewer_and_are_zero_elsewhere() {
+fn normals_face_the_camera_and_are_zero_elsewhere() {
     let double_sided = Material { double_sided: true, ..Material::default() };
     let builder = SceneBuilder::new().add_domain(facing_rectangle(-2.0, -2.0, 0.0, 2.0, 0.0), double_sided);
     let view_from_behind = View::LookAt { eye: [0.0, 0.0, -10.0], target: [0.0; 3], up: [0.0, 1.0, 0.0] };
     let normals =
         decode_f32(&read_aov(builder, Camera { view: view_from_behind, ..front_camera(64) }, 64, Aov::Normals));
     let normal_at = |x: usize, y: usize| &normals[3 * (64 * y + x)..][..3];
-    // Seen from behind, the square covers columns 32 to 51.
-    assert_eq!((normal_at(40, 30), normal_at(20, 30)), (&[0.0, 0.0, -1.0][..], &[0.0; 3][..]));
+    // Seen from behind, the rectangle covers columns 32 to 51.
+    let (rectangle_normal, sky_normal) = (normal_at(40, 30), normal_at(20, 30));
+    assert_eq!((rectangle_normal, sky_normal), (&[0.0, 0.0, -1.0][..], &[0.0; 3][..]));
     let mut builder = SceneBuilder::new();
     builder.parts.look.ground = Some(Ground::default());
     let normals = decode_f32(&read_aov(
@@ -121,6 +127,8 @@ fn normals_face_the_viewer_and_are_zero_elsewhere() {
     assert_eq!(bottom_center, [0.0; 3], "expected zeros on the ground");
 }
 
+/// A sample stores the value of a vertex divided by `largest`, clamped to 0 to 1, as a 16-bit number. The value of each
+/// vertex is its x coordinate.
 #[test]
 fn values_are_interpolated_linearly_and_clamped() {
     for (samples, largest) in [(1, 2.0), (4, 1.0)] {
@@ -137,11 +145,12 @@ fn values_are_interpolated_linearly_and_clamped() {
         // The square covers columns 12 to 51; its border is excluded.
         for x in 13..51_usize {
             let pixel_samples = &image_samples[samples as usize * (64 * 30 + x)..][..samples as usize];
+            // The lower 16 bits of a sample are its value.
             let mean = pixel_samples.iter().map(|sample| f64::from(sample & 0xFFFF) / 65535.0).sum::<f64>()
                 / f64::from(samples);
             let expected = ((x as f64 + 0.5 - 32.0) / 10.0 / f64::from(largest)).clamp(0.0, 1.0);
-            // A value is stored in 16 bits, in steps of 1.5e-5. Near 0 and 1, clamping some samples of a pixel changes
-            // their mean.
+            // Values have steps of 1 / 65535, about 1.5e-5. Near 0 and 1, only some samples of a pixel are clamped,
+            // which changes their mean.
             let tolerance = if (0.05..0.95).contains(&expected) { 1e-4 } else { 0.1 };
             assert!((mean - expected).abs() < tolerance, "{x}: expected {expected}, got {mean}");
             // The upper 16 bits are the cosine between the normal and the direction to the eye, at least 0.98 here.

@@ -15,28 +15,28 @@ use super::harness::{SceneBuilder, facing_rectangle, front_camera, open_renderer
 /// Side of the image in pixels.
 const SIZE: u32 = 64;
 
-/// A wall of 40 x 30 pixels on the ground.
+/// A wall that is 4 units wide and 3 units high and stands on the ground plane y = 0.
 fn wall_scene(samples: u32, ground: Option<Ground>) -> Arc<Scene> {
     let mut builder = SceneBuilder::new();
     (builder.parts.look.ground, builder.parts.look.samples) = (ground, samples);
     builder.add_domain(facing_rectangle(-2.0, 0.0, 2.0, 3.0, 0.0), Material::default()).build()
 }
 
-/// A camera slightly above the ground, so that the ground can hide the geometry below it.
+/// A camera 3 units above the ground. From there, the ground hides the geometry below it.
 fn camera_above_ground() -> Camera {
     Camera { view: View::LookAt { eye: [0.0, 3.0, 10.0], target: [0.0; 3], up: [0.0, 1.0, 0.0] }, ..front_camera(SIZE) }
 }
 
-/// Readbacks of all pixels.
+/// Readbacks of all pixels of an image.
 #[derive(Debug, PartialEq)]
 struct Readbacks {
-    /// The 32-bit words of an AOV.
+    /// The AOV as 32-bit words.
     aov_words: Vec<u32>,
     hits: Vec<PickHit>,
 }
 
-/// Reads back an AOV and picks, with the wall lowered by half of its height. The wall then covers about 1,050 pixels,
-/// half of them below the ground.
+/// Lowers the wall by half of its height, and reads back an AOV and the picks of all pixels. The wall covers about
+/// 1,050 pixels, half of them below the ground.
 fn read_aov_and_picks(scene: &Arc<Scene>, aov: Aov) -> Readbacks {
     let mut state = SceneState::rest(scene);
     state.transforms[0] = Transform::from_matrix(&Matrix4::new_translation(&Vector3::new(0.0, -1.5, 0.0)));
@@ -79,9 +79,13 @@ fn depth_includes_the_ground() {
         count_infinite(&depths_without_ground) > count_infinite(&depths_with_ground) + 1000,
         "expected the depth of the ground beside the wall"
     );
-    let nearer_pixels = depths_with_ground
+    // Without ground, a finite depth is the depth of the wall.
+    let pixels_of_hidden_wall = depths_with_ground
         .iter()
         .zip(&depths_without_ground)
-        .filter(|(with_ground, wall_depth)| wall_depth.is_finite() && with_ground < wall_depth);
-    assert!(nearer_pixels.count() > 400, "expected the depth of the ground in front of the lower part of the wall");
+        .filter(|(depth, wall_depth)| wall_depth.is_finite() && depth < wall_depth);
+    assert!(
+        pixels_of_hidden_wall.count() > 400,
+        "expected the depth of the ground in front of the lower part of the wall"
+    );
 }

@@ -1,5 +1,9 @@
 //! Culled frames are bit-identical to frames without culling and do not depend on earlier frames. The numbers of culled
 //! triangles equal the expected ones.
+//!
+//! `Culling::Triangles` culls triangles outside the view, back faces, and triangles that cover no sample.
+//! `Culling::Occlusion` also culls triangles behind those that were visible in the previous frame. So the first frame
+//! of a scene has no occlusion culling.
 
 use std::sync::{Arc, OnceLock};
 
@@ -39,7 +43,7 @@ struct CullHarness {
     renderer: Renderer,
     buffers: SceneBuffers,
     scene: Arc<Scene>,
-    /// Bounds that a frame is drawn with.
+    /// Bounds that the renderer receives with each frame, in scene units.
     bounds: BoundingBox,
 }
 
@@ -55,7 +59,7 @@ impl CullHarness {
         harness
     }
 
-    /// Moves every vertex to a function of its rest position. The bounds stay as they are.
+    /// Moves every vertex to `position(rest_position)`. `bounds` do not change.
     fn move_vertices(&mut self, position: impl Fn([f32; 3]) -> [f32; 3]) {
         let mut surface = DeformedSurface::default();
         for domain in &self.scene.domains {
@@ -97,7 +101,7 @@ fn random_triangles(seed: u64, count: usize, extent: f32) -> Mesh {
     let mut random = fastrand::Rng::with_seed(seed);
     let mut triangles = Vec::new();
     for _ in 0..count {
-        // A random number in -limit to limit.
+        // A random number from -limit to limit.
         let mut random_within = |limit: f32| limit * (2.0 * random.f32() - 1.0);
         let triangle_size = 10.0_f32.powf(random_within(1.5) - 1.0);
         let center: [f32; 3] = [random_within(extent), random_within(extent), random_within(extent)];
@@ -159,16 +163,16 @@ fn assert_same_frames(
         for culled in [&with_triangle_culling[index], &with_occlusion[index]] {
             assert!(culled.ids == expected.ids, "frame {index}: expected the same visible triangles");
             assert!(culled.rgba == expected.rgba, "frame {index}: expected the same colors");
-            assert!(culled.stats.oit == expected.stats.oit, "frame {index}: expected the same fragment lists");
+            assert!(culled.stats.oit == expected.stats.oit, "frame {index}: expected the same fragment counts");
         }
     }
     with_occlusion
 }
 
-/// Eye and target of cameras.
+/// Positions (eye, target) of cameras.
 const CAMERAS: [([f64; 3], [f64; 3]); 5] = [
     ([0.0, 1.0, 9.0], [0.0; 3]),
-    // Almost the same view.
+    // Almost the view of the first camera.
     ([0.0, 1.2, 9.0], [0.1, 0.0, 0.0]),
     // From the opposite side.
     ([-1.0, 2.0, -9.0], [0.0; 3]),
@@ -185,15 +189,17 @@ fn culled_frames_are_bit_identical_after_camera_moves() {
         [(1, Transparency::OrderIndependent), (4, Transparency::OrderIndependent), (4, Transparency::TwoPass)]
     {
         let frames = assert_same_frames(&|| mixed_builder(samples, transparency), &|harness| {
+            // Frame 5 shows the first camera again.
             let cameras = CAMERAS.into_iter().chain([CAMERAS[0]]);
             cameras.map(|(eye, target)| harness.draw(camera_at(eye, target), [SIZE, SIZE])).collect()
         });
         let camera_stats: Vec<_> = frames.iter().map(|frame| frame.culled().camera).collect();
-        // The minimum numbers show that each reason for culling occurs.
         assert_eq!(camera_stats[0].occluded, 0, "expected no occlusion culling in the first frame");
+        // The minimum numbers show that each reason for culling occurs.
         assert!(camera_stats[1].occluded > 100, "{camera_stats:?}");
         assert!(camera_stats.iter().all(|stats| stats.visible > 0 && stats.no_sample > 50), "{camera_stats:?}");
-        assert!(camera_stats[0].back_facing > 100 && camera_stats[3].outside_view > 500, "{camera_stats:?}");
+        let from_scene_center = camera_stats[3];
+        assert!(camera_stats[0].back_facing > 100 && from_scene_center.outside_view > 500, "{camera_stats:?}");
         assert!(frames[0].rgba == frames[5].rgba, "expected the same frame of the same camera");
         assert!(
             camera_stats.iter().all(|stats| stats.visible + stats.culled() == MIXED_TRIANGLES),
@@ -202,7 +208,8 @@ fn culled_frames_are_bit_identical_after_camera_moves() {
     }
 }
 
-/// The lists are longer than the blocks and super blocks of the prefix sum that compacts them.
+/// Visible triangles are compacted to lists with a prefix sum over blocks and superblocks of triangles. The lists of
+/// this test span several superblocks.
 #[test]
 fn long_triangle_lists_keep_their_order() {
     let builder = || {
@@ -244,7 +251,7 @@ fn culled_frames_of_moving_scenes_are_bit_identical() {
 
 #[test]
 fn culling_handles_non_finite_and_huge_positions() {
-    // Replaces y of about one in `interval` vertices. The bits of x select the vertices.
+    // Replaces y of about one in `interval` vertices. The bits of x select them like a random number.
     let replace_y = |value: f32, interval: u32| {
         move |[x, y, z]: [f32; 3]| if (x.to_bits() / 8).is_multiple_of(interval) { [x, value, z] } else { [x, y, z] }
     };
@@ -262,7 +269,7 @@ fn culling_handles_non_finite_and_huge_positions() {
 
 #[test]
 fn culling_handles_far_scenes_and_extreme_clip_planes() {
-    // Clip planes of 0 are fitted to the bounds.
+    // Clip planes of 0 are fitted to the bounds. The last planes lie on both sides of the scene's center at distance 9.
     // At 1e7 the numbers of f32 are 1 apart, so that the triangles lose their area and nothing may remain to be drawn.
     for (shift, near, far) in [(1e4, 0.0, 0.0), (1e6, 0.0, 0.0), (1e7, 0.0, 0.0), (0.0, 1e-6, 1e9), (0.0, 8.9, 9.1)] {
         let frames = assert_same_frames(&|| mixed_builder(4, Transparency::OrderIndependent), &|harness| {
@@ -284,7 +291,7 @@ fn culling_handles_far_scenes_and_extreme_clip_planes() {
 fn huge_triangles_and_a_lone_triangle_are_not_culled() {
     let huge_builder = || {
         let wall = |z: f32| [[-1e5, -1e5, z], [1e5, -1e5, z], [0.0, 1e5, z]];
-        // From the background to behind the eye.
+        // From behind the walls at z = -20 to behind the eye at z = 20.
         let crossing_triangle = [[-3.0, -1.0, 20.0], [3.0, -1.0, 20.0], [0.0, -1.0, -20.0]];
         let mesh = separate_triangles(&[
             wall(-2.0),
@@ -343,7 +350,7 @@ fn hidden_count_equals_triangles_behind_the_square() {
     // From behind, nothing is hidden, and the two triangles of the square face away.
     let stats_from_behind = harness.draw(camera_at([0.0, 0.0, -12.0], [0.0; 3]), [SIZE, SIZE]).culled().camera;
     assert_eq!((stats_from_behind.back_facing, stats_from_behind.occluded), (2, 0));
-    // For a camera that looks away, everything is outside of the frustum.
+    // For a camera that looks away, all triangles are outside the view frustum.
     let stats_looking_away = harness.draw(camera_at([0.0, 0.0, 12.0], [0.0, 0.0, 30.0]), [SIZE, SIZE]).culled().camera;
     assert_eq!((stats_looking_away.outside_view, stats_looking_away.visible), (HALF_HIDDEN_TRIANGLES, 0));
 }
@@ -430,7 +437,8 @@ fn picks_aovs_and_rebased_frames_do_not_depend_on_culling() {
         let pick = harness.renderer.begin_pick(&harness.buffers, &params, rectangle).expect("expected a pick to start");
         let hits = harness.renderer.finish_pick(pick).expect("expected hits");
         let depth = harness.renderer.render_aov(&harness.buffers, &params, Aov::Depth).expect("expected AOVs").bytes;
-        // The shift by 0.75 and the origin at 0.25 together move the scene by 1 along x.
+        // `upload_rebased` takes positions relative to an origin of their own. The shift by 0.75 and the origin at 0.25
+        // together move the scene by 1 along x.
         let rest_positions = harness.scene.shapes.iter().flat_map(|shape| shape.mesh.rest_positions());
         let shifted_positions: Vec<f32> = rest_positions.flat_map(|[x, y, z]| [x + 0.75, *y, *z]).collect();
         harness
@@ -473,6 +481,6 @@ fn culled_draw_calls_do_not_grow_with_domains() {
         assert_eq!(frame.stats.draw_calls, harness.buffers.plan().draw_calls);
         frame.stats.draw_calls
     };
-    // One draw call in each of the occluder pass and the visibility pass.
+    // The occluder pass and the visibility pass have one draw call each.
     assert_eq!((draw_calls(1), draw_calls(40)), (2, 2));
 }

@@ -1,5 +1,4 @@
-//! Test that a scanned almond tree has the same image with and without culling. The test prints the times of the
-//! passes.
+//! A scanned almond tree has the same image with and without culling. The test prints the times of the passes.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -22,10 +21,10 @@ fn replace_look(scene: &Scene, look: RenderSettings) -> Arc<Scene> {
     Scene::new(SceneParts { look, ..scene.parts() }).expect("expected a valid scene")
 }
 
-/// The result of [`FRAME_COUNT`] identical frames.
+/// The image that [`FRAME_COUNT`] frames share, and their statistics.
 struct DrawnFrames {
     rgba: Vec<u8>,
-    /// Names of some passes and their median times in milliseconds.
+    /// Names of the passes that culling affects, and their median times in milliseconds.
     pass_times: Vec<(&'static str, f64)>,
     cull_stats: Option<FrameCullStats>,
 }
@@ -42,7 +41,8 @@ fn draw_frames(renderer: &mut Renderer, scene: &Arc<Scene>) -> DrawnFrames {
         (0..FRAME_COUNT).map(|_| renderer.draw(&buffers, &params).expect("expected a frame")).collect();
     assert!(images.iter().all(|image| image.rgba == images[0].rgba), "expected identical frames");
     let median_time = |name: &'static str| {
-        let pass_time = |times: &FrameTimes| times.iter().find(|(key, _)| key.name() == name).map_or(0.0, |(_, ms)| ms);
+        let pass_time =
+            |times: &FrameTimes| times.iter().find(|(stage, _)| stage.name() == name).map_or(0.0, |(_, ms)| ms);
         // The first frame is excluded, because occlusion culling needs a previous frame.
         let mut times: Vec<f64> = images[1..].iter().map(|image| pass_time(&image.times)).collect();
         times.sort_by(f64::total_cmp);
@@ -68,7 +68,7 @@ fn real_almond_has_the_same_image_with_culling() {
             shadow: Some(ShadowSettings { size: 2048, ..ShadowSettings::default() }),
             ..scene.look
         };
-        // Set by the first culling mode, `Culling::None`.
+        // The image of the first culling mode, `Culling::None`.
         let mut unculled_image = None;
         for culling in [Culling::None, Culling::Triangles, Culling::Occlusion] {
             let DrawnFrames { rgba, pass_times, cull_stats } =

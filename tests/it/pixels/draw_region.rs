@@ -100,6 +100,7 @@ fn scenes_sharing_a_target_do_not_affect_each_other() {
     builder.parts.look.sunlight = [0.9, 0.3, 0.2];
     let glass = Material { alpha_mode: AlphaMode::Blend, alpha: 0.6, double_sided: true, ..Material::default() };
     let wall = Material { double_sided: true, ..Material::default() };
+    // Five narrow vertical walls.
     let builder = (0..5).fold(builder, |builder, index| {
         builder.add_domain(
             facing_rectangle(0.2 * index as f32 - 0.7, -0.8, 0.2 * index as f32 - 0.6, 0.9, 0.1),
@@ -111,6 +112,7 @@ fn scenes_sharing_a_target_do_not_affect_each_other() {
     let mut shared_renderer = open_renderer();
     let buffers = [0, 1].map(|index| load_at_rest(&mut shared_renderer, &scenes[index]));
     for (frame_index, shift) in [[0.0; 2], [30.0, 20.0], [-25.0, -30.0], [12.0, 3.0]].into_iter().enumerate() {
+        // The two scenes take turns.
         let (index, mut new_renderer) = (frame_index % 2, open_renderer());
         let new_buffers = load_at_rest(&mut new_renderer, &scenes[index]);
         let bounds = scenes[index].rest_bounds;
@@ -128,15 +130,16 @@ fn geometry_outside_the_bounds_leaves_no_stale_pixels() {
         let scene = test_scene(|look| look.transparency = transparency);
         let mut renderer = open_renderer();
         let buffers = load_at_rest(&mut renderer, &scene);
-        // These bounds are smaller than the scene on all sides. With the two shifts, the edges of the drawn region lie
-        // inside and at the border of a quad of 2 x 2 pixels.
+        // These bounds are smaller than the scene on all sides. Each edge of the drawn region lies inside a block of 2
+        // x 2 pixels with one of the two shifts, and between two blocks with the other shift.
         let small_bounds = BoundingBox { min: [-0.3, -0.3, -0.5], max: [0.1, 0.2, -0.4] };
-        let mut draw = |shift: [f64; 2]| draw_frame(&mut renderer, &buffers, shifted_camera(shift), small_bounds);
+        let mut draw_shifted =
+            |shift: [f64; 2]| draw_frame(&mut renderer, &buffers, shifted_camera(shift), small_bounds);
         for shift in [[0.0; 2], [1.0; 2]] {
-            let first_frame = draw(shift);
-            assert!(draw([30.0, 20.0]) != first_frame, "negative control: a shifted camera");
+            let first_frame = draw_shifted(shift);
+            assert!(draw_shifted([30.0, 20.0]) != first_frame, "negative control: a shifted camera");
             assert!(
-                draw(shift) == first_frame && draw(shift) == first_frame,
+                draw_shifted(shift) == first_frame && draw_shifted(shift) == first_frame,
                 "expected the same frame again at {shift:?}"
             );
         }

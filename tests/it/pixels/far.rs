@@ -1,4 +1,5 @@
-//! Images ten thousand kilometers from the scene origin equal those at the origin.
+//! Images ten thousand kilometers from the scene origin equal those at the origin. A scene unit is one meter here. The
+//! vertices of a far domain are relative to a floating origin, a grid point near the domain, so that f32 suffices.
 
 use std::sync::Arc;
 
@@ -14,14 +15,15 @@ use modalcast_render::FrameImage;
 
 use super::harness::{SceneBuilder, facing_rectangle, floor_mesh};
 
-/// A position that is not on the grid of floating origins ([`ORIGIN_GRID`]) and not representable in f32.
+/// A position that is not on the grid of floating origins and not representable in f32. [`ORIGIN_GRID`] is the spacing
+/// of this grid.
 const FAR_POSITION: [f64; 3] = [1e7 + 1.3, 0.0, -1e7 - 2.7];
 
 fn open_context() -> DeviceContext {
     DeviceContext::open(&Config { backend: BackendChoice::Cpu, ..Config::default() }).expect("expected a renderer")
 }
 
-/// The rest state with some domains moved by an f64 translation.
+/// The rest state with `domains` (indices) moved by an f64 translation.
 fn move_domains(scene: &Scene, domains: &[u32], [x, y, z]: [f64; 3]) -> SceneState {
     // `RigidF64`: a quaternion (x, y, z, w) in f32, here the identity, then a translation in f64.
     let transform_bytes = || {
@@ -86,24 +88,27 @@ fn table_scene(shadow: Option<ShadowSettings>) -> Arc<Scene> {
 #[test]
 fn far_scene_renders_like_the_scene_at_the_origin() {
     let mut context = open_context();
-    // About ten thousand kilometers in each direction. Texels of a shadow map are aligned to a grid that is fixed in
-    // the world. So the edge of a shadow looks the same only after a move by multiples of the texel size.
+    // About ten thousand kilometers along x and z. Texels of a shadow map are aligned to a grid that is fixed in the
+    // world. So the edge of a shadow looks the same only after a move by multiples of the texel size.
     let grid_position = [9766.0 * ORIGIN_GRID, 0.0, -9767.0 * ORIGIN_GRID];
     // Off the grid, rounding moves positions by up to 1/500 pixel. A sample that is closer to an edge may change sides,
     // which affects at most one pixel in a thousand: 9 of 96 x 96.
-    let base = ShadowSettings::default();
+    let default_shadow = ShadowSettings::default();
     let cases = [
-        (Some(base), grid_position, 0),
-        (Some(ShadowSettings { method: ShadowMethod::Standard, ..base }), grid_position, 0),
-        (Some(ShadowSettings { method: ShadowMethod::PercentageCloser, ..base }), grid_position, 0),
-        (Some(ShadowSettings { cascades: 3, ..base }), grid_position, 0),
+        (Some(default_shadow), grid_position, 0),
+        (Some(ShadowSettings { method: ShadowMethod::Standard, ..default_shadow }), grid_position, 0),
+        (Some(ShadowSettings { method: ShadowMethod::PercentageCloser, ..default_shadow }), grid_position, 0),
+        (Some(ShadowSettings { cascades: 3, ..default_shadow }), grid_position, 0),
         (None, FAR_POSITION, 9),
     ];
     for (shadow, position, max_different_pixels) in cases {
         let scene = table_scene(shadow);
         let origin_frame = draw_frame(&mut context, &scene, &SceneState::rest(&scene), &camera_at([0.0; 3]));
         let far_state = move_domains(&scene, &[0, 1], position);
-        assert!(far_state.origins.as_ref().is_some_and(|origins| origins.is_uniform()));
+        assert!(
+            far_state.origins.as_ref().is_some_and(|origins| origins.is_uniform()),
+            "expected one floating origin for both domains"
+        );
         let far_frame = draw_frame(&mut context, &scene, &far_state, &camera_at(position));
         let ImageDifference { max_levels, different_pixels } = compare_images(&origin_frame, &far_frame);
         assert!(
@@ -139,7 +144,10 @@ fn distant_domains_are_seen_by_nearby_cameras() {
     // Indices in `frames`.
     let (gray, red, both) = (0, 1, 2);
     let separated_state = move_domains(&scene, &[1], FAR_POSITION);
-    assert!(separated_state.origins.as_ref().is_some_and(|origins| !origins.is_uniform()));
+    assert!(
+        separated_state.origins.as_ref().is_some_and(|origins| !origins.is_uniform()),
+        "expected a floating origin per domain"
+    );
     let mut loaded_scene = context.load_scene(&scene, BackendSettings::default()).expect("expected the scene to load");
     // Draws the scene of both domains and returns the largest difference from each of `frames`, in levels.
     let mut compare_with_frames = |state: &SceneState, target| {

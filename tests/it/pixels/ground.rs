@@ -1,5 +1,5 @@
-//! The ground is rasterized by a pass of its own only if geometry may be below it. Otherwise the shading intersects the
-//! view rays of samples without a triangle with the ground plane. Both ways give the same image.
+//! The ground is rasterized by a pass of its own only if geometry may be below it. Otherwise the shading intersects
+//! view rays with the ground plane, in samples without a triangle. Both ways give the same image.
 
 use std::sync::Arc;
 
@@ -46,7 +46,7 @@ struct Frame {
 }
 
 impl Frame {
-    /// Renders the scene at rest, lowered by `lowering`, with `min_y` as the lower bound in y.
+    /// Renders the scene at rest, lowered by `lowering`. The renderer is told that no vertex is below y = `min_y`.
     fn new(renderer: &mut Renderer, scene: &Arc<Scene>, camera: Camera, lowering: f32, min_y: f64) -> Self {
         let buffers = renderer.load(scene).expect("expected the scene to load");
         let collect_from_meshes = |attribute: fn(&modalcast_model::domain::Mesh) -> &[[f32; 3]]| -> Vec<f32> {
@@ -88,8 +88,8 @@ impl Frame {
     }
 }
 
-/// Lower bound in y that requires the ground pass. It is farther below the ground than the tolerance for rounding,
-/// which is about 1e-6 here, and too close to the ground to affect the shadow map or the depth range.
+/// Lower bound in y that requires the ground pass. It is farther below the ground than the renderer's tolerance for
+/// rounding, about 1e-6 for these scenes, and too close to the ground to affect the shadow map or the depth range.
 const BELOW_GROUND: f64 = -1e-5;
 
 #[test]
@@ -129,11 +129,12 @@ fn ground_hides_geometry_below_and_is_one_sided() {
     let camera = camera_at([0.5, 1.0, 7.0]);
     let mut draw_frame =
         |camera: Camera, lowering: f32, min_y: f64| Frame::new(&mut renderer, &scene, camera, lowering, min_y);
+    // Both frames lower the scene by 0.7. Only the bounds of the first frame extend below the ground.
     let (frame_with_pass, frame_without_pass) = (draw_frame(camera, 0.7, -0.7), draw_frame(camera, 0.7, 0.0));
     assert_eq!([frame_with_pass.draws_ground(), frame_without_pass.draws_ground()], [true, false]);
     let [colors, ids] = frame_without_pass.count_differences(&frame_with_pass);
     assert!(colors > 200 && ids > 100, "negative control: {colors} colors and {ids} ids differ");
-    // The camera is below the ground, which is not visible from there.
+    // From below, the ground is not visible.
     let frame_from_below = draw_frame(camera_at([0.5, -1.0, 7.0]), 0.0, 0.0);
     assert!(!frame_from_below.draws_ground() && frame_from_below.ids.iter().all(|id| *id != VisibilityId::Ground));
     let nan_bounds_frame = draw_frame(camera, 0.0, f64::NAN);
@@ -144,7 +145,7 @@ fn ground_hides_geometry_below_and_is_one_sided() {
 fn geometry_on_the_ground_is_visible_despite_rounding() {
     let (scene, mut renderer) = (test_scene(|_| {}), open_renderer());
     let camera = camera_at([1.0, 5.0, 4.0]);
-    // Rounding lowers the scene and its bounds by 4e-7.
+    // The scene and its bounds are lowered by 4e-7, an error that rounding can cause.
     let frame = Frame::new(&mut renderer, &scene, camera, 4e-7, -4e-7);
     assert!(!frame.draws_ground());
     let frame_with_pass = Frame::new(&mut renderer, &scene, camera, 4e-7, BELOW_GROUND);

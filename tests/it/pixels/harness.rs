@@ -97,12 +97,13 @@ fn rectangle(positions: Vec<[f32; 3]>, normal: [f32; 3]) -> Mesh {
 }
 
 /// A camera at z = 10 with ten pixels per unit in the plane z = 0 and the origin at the center of the image. `size` is
-/// the side of the image in pixels. Clip planes of 0 are fitted to the bounds.
+/// the side of the image in pixels.
 pub(super) fn front_camera(size: u32) -> Camera {
     let center = f64::from(size) / 2.0;
     Camera {
         view: View::LookAt { eye: [0.0, 0.0, 10.0], target: [0.0; 3], up: [0.0, 1.0, 0.0] },
         lens: Lens::Intrinsics { fx: 100.0, fy: 100.0, cx: center, cy: center },
+        // Clip planes of 0 are fitted to the bounds of the frame.
         near: 0.0,
         far: 0.0,
     }
@@ -160,18 +161,18 @@ impl RenderedFrame {
     }
 }
 
-/// The planned passes without the ground pass, which a frame skips if no geometry is below the ground.
-pub(super) fn planned_passes_above_ground(scene: &Scene) -> Vec<Pass> {
+/// The planned passes without the ground pass. A frame skips the ground pass if no geometry is below the ground.
+pub(super) fn planned_passes_without_ground(scene: &Scene) -> Vec<Pass> {
     plan(scene).passes.into_iter().filter(|pass| *pass != Pass::Ground).collect()
 }
 
-/// The sRGB level (IEC 61966-2-1), in 0 to 255 and not rounded, of a linear value.
+/// The sRGB level of a linear value (IEC 61966-2-1), from 0 to 255 and not rounded.
 pub(super) fn encode_srgb(linear: f64) -> f64 {
     let linear = linear.clamp(0.0, 1.0);
     255.0 * if linear <= 0.003_130_8 { 12.92 * linear } else { 1.055 * linear.powf(1.0 / 2.4) - 0.055 }
 }
 
-/// Linear value of an sRGB level.
+/// The linear value of an sRGB level, from 0 to 1.
 pub(super) fn decode_srgb(level: u8) -> f64 {
     let encoded = f64::from(level) / 255.0;
     if encoded <= 0.040_45 { encoded / 12.92 } else { ((encoded + 0.055) / 1.055).powf(2.4) }

@@ -1,5 +1,8 @@
-//! Overlapping blended triangles: with order-independent transparency (OIT), the order in the scene does not affect the
-//! image; with two-pass transparency, triangles are blended in scene order.
+//! Overlapping blended triangles. With order-independent transparency (OIT), the order in the scene does not affect the
+//! image. With two-pass transparency, triangles are blended in scene order.
+//!
+//! OIT stores the blended fragments of each pixel in a list, sorts the list by depth, and blends it. The fragment
+//! budget of a scene is the number of fragments that all lists of a frame can store together.
 
 use std::sync::Arc;
 
@@ -27,7 +30,8 @@ fn create_builder(transparency: Transparency, samples: u32) -> SceneBuilder {
     builder
 }
 
-/// A pane at depth z. In every depth, it covers 40 x 40 = 1600 pixels at the center of a [`front_camera`] image.
+/// A pane in the plane of the given z. For every z, it covers 40 x 40 = 1600 pixels at the center of a [`front_camera`]
+/// image.
 fn pane(z: f32) -> Mesh {
     // The camera is at z = 10. At z = 0, four units are 40 pixels.
     let half_side = 2.0 * (10.0 - z) / 10.0;
@@ -172,22 +176,22 @@ fn cut_outs_and_glass_keep_their_depth_order() {
 
 #[test]
 fn edges_of_glass_and_opaque_surfaces_are_multisampled() {
-    // `edge_position` is the right edge of a strip within pixel column 32. The strip covers this fraction of the
-    // column.
-    for (edge_position, coverage) in [(0.25_f32, 0.25), (0.5, 0.5), (0.75, 0.75)] {
-        let strip = || facing_rectangle(-1.0, -1.0, 0.1 * edge_position, 1.0, 0.0);
+    // A strip ends within pixel column 32, which is 0.1 units wide and begins at x = 0. `coverage` is the fraction of
+    // the column that the strip covers.
+    for coverage in [0.25, 0.5, 0.75] {
+        let strip = || facing_rectangle(-1.0, -1.0, 0.1 * coverage as f32, 1.0, 0.0);
         let render_with = |builder: SceneBuilder| render(&builder.build()).pixel(32, 30);
         let glass_pixel = render_with(
             create_builder(Transparency::OrderIndependent, 4).add_domain(strip(), glass_material([1.0; 3], 0.5)),
         );
-        assert!(is_close(glass_pixel, [0.5 * coverage; 3], 1.0), "{edge_position}: {glass_pixel:?}");
+        assert!(is_close(glass_pixel, [0.5 * coverage; 3], 1.0), "{coverage}: {glass_pixel:?}");
         let opaque_pixel = render_with(
             create_builder(Transparency::OrderIndependent, 4)
                 .add_domain(strip(), unlit_material([1.0; 3]))
                 .add_domain(pane(-1.0), glass_material(RED, 0.5)),
         );
         let expected = RED.map(|channel| coverage + (1.0 - coverage) * 0.5 * f64::from(channel));
-        assert!(is_close(opaque_pixel, expected, 1.0), "{edge_position}: {opaque_pixel:?} instead of {expected:?}");
+        assert!(is_close(opaque_pixel, expected, 1.0), "{coverage}: {opaque_pixel:?} instead of {expected:?}");
     }
     // This strip covers a quarter of the pixel, but not its center.
     let builder = create_builder(Transparency::OrderIndependent, 1)
@@ -205,8 +209,8 @@ fn triangles_of_one_pane_show_no_seam() {
     assert_eq!(oit_stats(&frame).max_per_pixel, 2, "expected fragments of both triangles on the diagonal");
 }
 
-/// A stack of layers with different colors and opacities. `order` maps the index of a layer in the scene to its index
-/// in depth, counted from the farthest.
+/// A stack of `count` layers with different colors and alphas. `depth_index` of a layer counts from the farthest layer.
+/// `order` maps the index of a layer in the scene to its `depth_index`.
 fn layer_stack(count: u32, order: impl Fn(u32) -> u32, modify_builder: impl Fn(&mut SceneBuilder)) -> Arc<Scene> {
     let mut builder = create_builder(Transparency::OrderIndependent, 1);
     modify_builder(&mut builder);
@@ -218,7 +222,7 @@ fn add_layer(builder: SceneBuilder, depth_index: u32, count: u32, opacity_scale:
     builder.add_domain(pane(-3.0 + 0.05 * depth_index as f32), glass_material(color, opacity_scale * alpha))
 }
 
-/// Color and alpha of a layer of a stack of `count` layers.
+/// Color and alpha of one of `count` layers.
 fn layer(depth_index: u32, count: u32) -> ([f32; 3], f32) {
     let shade = depth_index as f32 / count as f32;
     ([shade, 1.0 - shade, 0.5], 0.1 + 0.2 * shade)
@@ -236,8 +240,8 @@ fn nearest_layers(count: u32, visible_count: u32) -> Arc<Scene> {
 
 #[test]
 fn long_fragment_lists_are_sorted() {
-    // Lists of up to 32 fragments are sorted by insertion sort, longer lists by heap sort. No count is a multiple of 7,
-    // so that `index * 7 % count` is a permutation.
+    // Insertion sort is used for lists of up to 32 fragments, and heap sort for longer lists. No count is a multiple of
+    // 7, so that `index * 7 % count` is a permutation.
     for count in [31, 32, 33, 34, 61, 97] {
         let sorted_frame = render(&layer_stack(count, |index| index, |_| ()));
         let shuffled_frame = render(&layer_stack(count, |index| index * 7 % count, |_| ()));
@@ -258,14 +262,14 @@ fn long_fragment_lists_are_sorted() {
     }
 }
 
-/// Each pixel keeps its nearest fragments, and the statistics count the dropped ones.
+/// The statistics contain the number of dropped fragments.
 #[test]
-fn fragments_over_budget_keep_the_nearest() {
+fn nearest_fragments_are_kept_over_budget() {
     let render_limited = |budget: Option<u32>, order: fn(u32) -> u32| {
         render(&layer_stack(10, order, |builder| builder.parts.look.fragments = budget))
     };
     let complete_frame = render_limited(None, |index| index);
-    // Ten layers of 1600 pixels are 16,000 fragments. The limit is the budget divided by 1600 pixels, rounded down.
+    // Ten layers of 1600 pixels are 16,000 fragments. The limit per pixel is budget / 1600, rounded down.
     for (budget, per_pixel_limit) in [(8000, 5), (9599, 5), (9600, 6), (1600, 1), (1599, 0), (1, 0)] {
         let frame = render_limited(Some(budget), |index| index);
         let stored = 1600 * u64::from(per_pixel_limit);
@@ -309,6 +313,7 @@ fn latest_of_coplanar_layers_are_kept_over_budget() {
 fn scene_over_budget_is_deterministic() {
     let scene = layer_stack(
         40,
+        // Because 40 is not a multiple of 7, this is a permutation.
         |index| index * 7 % 40,
         |builder| {
             (builder.parts.look.fragments, builder.parts.look.samples) = (Some(20_000), 4);

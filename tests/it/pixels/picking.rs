@@ -1,4 +1,5 @@
-//! Picks compared with arithmetic: triangle, barycentric coordinates, position, and pixels without a hit.
+//! A pick returns the surface points in a rectangle of pixels. Triangles, barycentric coordinates and positions of hits
+//! equal values that the tests compute.
 
 use std::sync::Arc;
 
@@ -11,8 +12,7 @@ use nalgebra::Vector3;
 
 use super::harness::{SceneBuilder, facing_rectangle, floor_mesh, front_camera, open_renderer};
 
-/// Tolerance of hit positions in scene units. Positions are computed in f64 from f32 vertices, so that only the
-/// vertices are rounded to f32.
+/// Tolerance of hit positions in scene units. Hits are computed in f64, and only the vertices are rounded to f32.
 const TOLERANCE: f64 = 1e-6;
 
 struct PickHarness {
@@ -41,7 +41,8 @@ impl PickHarness {
         FrameParams { camera, width: size, height: size, bounds: self.bounds, light_bounds: None }
     }
 
-    /// Hits in the rectangle with the top left pixel `corner` and this size, in a square image with side `image_size`.
+    /// Hits in a rectangle of `size` pixels, with `corner` as its top left pixel, of a square image with side
+    /// `image_size`.
     fn pick(&mut self, camera: Camera, image_size: u32, corner: [u32; 2], size: [u32; 2]) -> Vec<PickHit> {
         let rectangle = PixelRect::within([image_size; 2], corner, size).expect("expected a valid rectangle");
         let frame_params = self.frame_params(camera, image_size);
@@ -76,7 +77,7 @@ fn pick_has_domain_triangle_position_normal_and_depth() {
         "{hit:?}"
     );
     assert!((hit.depth - 10.0).abs() < TOLERANCE);
-    // The corners are (-2, -1), (2, -1), (2, 1), and the barycentric coordinates sum to 1.
+    // The triangle has the corners (-2, -1), (2, -1) and (2, 1). The barycentric coordinates sum to 1.
     let [first_weight, third_weight] = [(2.0 - x) / 4.0, (y + 1.0) / 2.0];
     assert!(
         max_difference(hit.barycentrics, [first_weight, 1.0 - first_weight - third_weight, third_weight]) < TOLERANCE,
@@ -121,7 +122,8 @@ fn pick_follows_the_deformed_surface() {
         state.q[0] = q;
         let hit = PickHarness::with_state(&scene, &state).pick(front_camera(64), 64, [36, 27], [1, 1]).remove(0);
         let (z, [x, y, _]) = (f64::from(q), plane_point(36, 27));
-        // The ray from the eye at (0, 0, 10) through (x, y, 0) intersects the mesh, which is now at depth z.
+        // The ray from the eye at (0, 0, 10) through (x, y, 0) intersects the mesh, which is now in the plane of this
+        // z.
         let expected = [x * (10.0 - z) / 10.0, y * (10.0 - z) / 10.0, z];
         assert!(
             max_difference(hit.position, expected) < TOLERANCE && (hit.depth - 10.0 + z).abs() < TOLERANCE,
@@ -156,6 +158,7 @@ fn picks_agree_with_the_visibility_of_the_frame() {
             let hits = harness.pick(camera, 100, corner, size);
             for y in corner[1]..corner[1] + size[1] {
                 for x in corner[0]..corner[0] + size[0] {
+                    // As (domain, triangle of the domain).
                     let visible_triangle = match frame_ids[(100 * y + x) as usize] {
                         VisibilityId::Triangle(index) => harness.buffers.source_triangle(index),
                         _ => None,
@@ -176,7 +179,7 @@ fn picks_agree_with_the_visibility_of_the_frame() {
     }
 }
 
-/// A surface behind a hole is hit.
+/// A pick through a hole hits the surface behind it.
 #[test]
 fn holes_glass_sky_and_ground_are_not_hit() {
     let mut builder = SceneBuilder::new();
@@ -237,7 +240,8 @@ fn concurrent_picks_finish_in_any_order() {
     }
 }
 
-/// Picks of scenes with a distant origin return world positions. Zero or NaN normals give a zero normal.
+/// The shared origin is the point that uploaded positions are relative to. Hits are in world coordinates. Vertex
+/// normals of zero or NaN give hits with a zero normal.
 #[test]
 fn picks_with_a_distant_origin_or_bad_normals_are_finite() {
     let scene =
@@ -251,10 +255,14 @@ fn picks_with_a_distant_origin_or_bad_normals_are_finite() {
     // Twice the tolerance, because rays at coordinates of 1e7 also have rounding errors in f64.
     assert!(max_difference(hit.position, [1e7 + x, y, -1e7]) < 2.0 * TOLERANCE, "{hit:?}");
     harness.buffers.set_shared_origin([0.0; 3]);
-    for normals in [[0.0_f32; 3], [f32::NAN; 3]] {
+    for vertex_normal in [[0.0_f32; 3], [f32::NAN; 3]] {
         let positions = scene.shapes[0].mesh.rest_positions().as_flattened().to_vec();
-        let surface =
-            DeformedSurface { positions, normals: normals.repeat(4), tangents: vec![], ..DeformedSurface::default() };
+        let surface = DeformedSurface {
+            positions,
+            normals: vertex_normal.repeat(4),
+            tangents: vec![],
+            ..DeformedSurface::default()
+        };
         harness.renderer.upload(&harness.buffers, &surface).expect("expected the upload to succeed");
         let hit = harness.pick(front_camera(64), 64, [30, 30], [1, 1]).remove(0);
         assert_eq!(hit.normal.map(f64::abs), [0.0; 3]);

@@ -1,4 +1,4 @@
-//! Tone curves, bloom, antialiasing and dithering, compared with arithmetic.
+//! Tone curves, bloom, antialiasing and dithering give the colors that the tests compute.
 
 use modalcast_compute::reference::ReferenceDeformer;
 use modalcast_model::deform::{DeformedSurface, Deformer as _};
@@ -8,7 +8,7 @@ use modalcast_render::{FrameParams, Pass};
 
 use super::harness::{
     RenderedFrame, SceneBuilder, decode_srgb, encode_srgb, facing_rectangle, front_camera, is_close, open_renderer,
-    planned_passes_above_ground, render, render_sized, render_square,
+    planned_passes_without_ground, render, render_sized, render_square,
 };
 
 /// A builder with one sample per pixel. Surfaces of [`white_material`] have the linear color `light`. `modify_look`
@@ -75,7 +75,8 @@ fn tone_curves_have_their_known_values() {
     );
 }
 
-/// Sum of the linear red values of all pixels, and centroid of the red light in pixels from the top left.
+/// The sum of the linear red values of all pixels, and the centroid (x, y) of the red light in pixels from the top
+/// left.
 fn sum_and_centroid(frame: &RenderedFrame) -> (f64, [f64; 2]) {
     let (mut sum, mut moment) = (0.0, [0.0; 2]);
     for y in 0..frame.image.height {
@@ -99,7 +100,8 @@ fn bloom_of_one_pixel_keeps_its_light_and_centroid() {
         render_sized(&mut open_renderer(), &scene, front_camera(64), size)
     };
     let full_bloom = |threshold: f32, levels: u32| Some(Bloom { threshold, strength: 1.0, levels });
-    // Blurred pixels stay below white, so that no light is clipped. The sum tolerance of 1 % is for rounding to 8 bits.
+    // Blurred pixels stay below white, so that no light is clipped. Rounding to 8 bits changes the sum by less than 1
+    // %.
     for (size, levels, light, threshold) in
         [([64, 64], 3, 8.0, 0.0), ([61, 67], 3, 8.0, 0.0), ([64, 64], 1, 8.0, 0.0), ([64, 64], 2, 1.2, 0.6)]
     {
@@ -136,7 +138,7 @@ fn bloom_is_symmetric_and_respects_its_threshold() {
             );
         }
     }
-    // Beside the square, which covers columns 31 and 32.
+    // This pixel is beside the square, which covers columns 31 and 32.
     let [r, g, b] = frame.pixel(36, 32);
     assert!(r > g && g > b && b > 0, "expected bloom with the hue of its light, got {r} {g} {b}");
     let unbloomed_frame = render(
@@ -156,8 +158,8 @@ fn bright_edges_stay_antialiased_with_bloom() {
     let render_with = |bloom: Option<Bloom>| {
         let builder = builder_with_light([50.0; 3], |look| RenderSettings { bloom, samples: 4, ..look });
         let glass = Material { alpha_mode: AlphaMode::Blend, alpha: 0.25, ambient: [0.0; 3], ..white_material() };
-        // A lamp that covers the right half of the pixels of column 32. The upper half of the lamp is behind dark
-        // glass, but still brighter than white.
+        // The left edge of the lamp halves the pixels of column 32. The upper half of the lamp is behind dark glass,
+        // but still brighter than white.
         let scene = builder
             .add_domain(facing_rectangle(0.05, -2.0, 2.0, 2.0, 0.0), white_material())
             .add_domain(facing_rectangle(-2.0, 0.0, 2.0, 2.0, 0.1), glass);
@@ -199,8 +201,8 @@ fn render_rhombus(antialias: Antialiasing, samples: u32, scale: u32) -> Rendered
     )
 }
 
-/// Mean difference from a reference of 8 times the resolution, in levels. A pixel is compared with the average linear
-/// light of its 8 x 8 reference pixels.
+/// Mean difference from a reference image of 8 times the resolution, in levels. A pixel is compared with the average
+/// linear light of its 8 x 8 reference pixels.
 fn mean_error(frame: &RenderedFrame, reference: &RenderedFrame) -> f64 {
     let expected_level = |x: u32, y: u32| {
         let light = |i: u32| decode_srgb(reference.pixel(8 * x + i % 8, 8 * y + i / 8)[0]);
@@ -218,8 +220,9 @@ fn fxaa_smooths_slanted_edges_and_keeps_flat_areas() {
     let [aliased_error, fxaa_error, msaa_error] =
         [&aliased_frame, &fxaa_frame, &render_rhombus(Antialiasing::Msaa, 4, 1)]
             .map(|frame| mean_error(frame, &reference));
+    // FXAA draws one sample per pixel, although the scene has 4.
     assert_eq!((aliased_frame.stats.samples, fxaa_frame.stats.samples), (1, 1));
-    // FXAA must remove more than half of the error, MSAA at least 40 %.
+    // FXAA must remove at least 55 % of the error, MSAA at least 40 %.
     assert!(
         fxaa_error < 0.45 * aliased_error,
         "error in levels: one sample {aliased_error}, FXAA {fxaa_error}, MSAA {msaa_error}"
@@ -232,7 +235,7 @@ fn fxaa_smooths_slanted_edges_and_keeps_flat_areas() {
     let mut changed_pixels = 0;
     for (x, y) in (1..63).flat_map(|x| (1..63).map(move |y| (x, y))) {
         let pixel = aliased_frame.pixel(x, y);
-        // The 3 x 3 pixels around the pixel have one color.
+        // The pixel and its 8 neighbors have one color.
         let is_flat = (0..9).all(|i| aliased_frame.pixel(x + i % 3 - 1, y + i / 3 - 1) == pixel);
         assert!(!is_flat || fxaa_frame.pixel(x, y) == pixel, "({x}, {y}): expected no change in a uniform area");
         changed_pixels += usize::from(fxaa_frame.pixel(x, y) != pixel);
@@ -240,7 +243,7 @@ fn fxaa_smooths_slanted_edges_and_keeps_flat_areas() {
     assert!(changed_pixels > 100, "negative control: expected changed edges, got {changed_pixels} pixels");
 }
 
-/// Linear colors of the sky: close to each other, and between two levels in each channel.
+/// Linear colors of the sky. They are close to each other, and each channel is between two levels.
 const SKY_ZENITH: [f64; 3] = [0.2985, 0.06, 0.41];
 const SKY_HORIZON: [f64; 3] = [0.2988, 0.0601, 0.4103];
 
@@ -325,7 +328,7 @@ fn post_processing_is_deterministic() {
     let all_effects = scene(with_all_effects(RenderSettings::default()));
     let mut renderer = open_renderer();
     let first_frame = render_square(&mut renderer, &all_effects, front_camera(96), 96);
-    assert_eq!(first_frame.stats.passes, planned_passes_above_ground(&all_effects));
+    assert_eq!(first_frame.stats.passes, planned_passes_without_ground(&all_effects));
     assert!(first_frame.stats.passes.contains(&Pass::Bloom));
     let plain_frame = render_square(&mut renderer, &scene(RenderSettings::default()), front_camera(96), 96);
     assert!(!plain_frame.stats.passes.contains(&Pass::Bloom));
@@ -354,7 +357,7 @@ fn nan_and_infinite_light_affect_no_other_pixel() {
             let mut deformer = ReferenceDeformer::new(&scene);
             let bounds = deformer.deform(&SceneState::rest(&scene)).expect("expected the step to succeed").bounds;
             let rest_surface = deformer.surface().expect("expected a surface").clone();
-            // Renders the scene with this normal at the four corners of the lamp.
+            // Renders the scene with `normal` at the four corners of the lamp.
             let mut render_with = |normal: [f32; 3]| {
                 let mut surface = DeformedSurface { normals: rest_surface.normals.clone(), ..rest_surface.clone() };
                 surface.normals[..12].copy_from_slice(&normal.repeat(4));

@@ -1,5 +1,5 @@
-//! The reference rasterizer compared with OpenGL: triangle ids differ only where two triangles have equal depth or
-//! where a sample lies on an edge.
+//! The reference rasterizer draws the triangle ids that OpenGL draws. Ids may differ only where two triangles have
+//! equal depth, and where a sample lies on an edge.
 
 use std::sync::Arc;
 
@@ -26,12 +26,13 @@ fn random_scene(seed: u64) -> (Arc<Scene>, Vec<[u32; 3]>) {
     let mut random = Random(seed);
     let mut positions = Vec::new();
     for index in 0..1500 {
-        // One triangle in four has no area, except that one in 60 is large instead.
         let size = match index % 4 {
             0 => 0.02,
             1 => 0.1,
             2 => 0.5,
+            // One triangle in 60.
             _ if index % 60 == 3 => 3.0,
+            // The triangle has no area.
             _ => 0.0,
         };
         let center = random.next_triple().map(|number| 3.0 * number);
@@ -68,7 +69,7 @@ fn ids_equal_opengl_except_on_edges_and_depth_ties() {
             .draw(&buffers, &FrameParams { camera, width, height, bounds, light_bounds: None })
             .expect("expected a frame");
         assert_eq!(renderer.stats().samples, 1);
-        // Index of a visible triangle in the mesh.
+        // The index that a visible triangle has in the mesh.
         let triangle_index = |id: &VisibilityId| match id {
             VisibilityId::Triangle(index) => buffers.source_triangle(*index).map(|(_, triangle)| triangle as u32),
             _ => None,
@@ -91,10 +92,11 @@ fn ids_equal_opengl_except_on_edges_and_depth_ties() {
         let differences = compare_ids(&rasterize_ids(&clip), &opengl_ids, &exact_triangles, SIZE[0], DEPTH_TOLERANCE);
         let covered_samples = opengl_ids.iter().flatten().count();
         eprintln!("eye {eye:?}: {covered_samples} covered samples, {differences:?}");
+        // `wrong` counts different ids that neither an edge nor a depth tie explains.
         assert!(covered_samples > 5000 && differences.wrong == 0, "{covered_samples} covered samples, {differences:?}");
         assert!(differences.edges + differences.ties < covered_samples / 100, "{differences:?}");
 
-        // The image is two units wide in normalized device coordinates.
+        // The image is 2 wide in normalized device coordinates, so a pixel is 2 / width, and this shift 1/20 pixel.
         let mut shift = Matrix4::identity();
         shift[(0, 3)] = 0.1 / f64::from(width);
         let shifted_differences =

@@ -95,6 +95,7 @@ impl Rasterizer for ReferenceRasterizer {
             self.write(target, bytemuck::cast_slice(&self.rasterize(viewport, &[all_triangles]).depths()))?;
         }
         let Some((viewport, target)) = ids else { return Ok(()) };
+        // A key of a sample contains its depth and its triangle id.
         self.write(target, bytemuck::cast_slice(&self.rasterize(viewport, &self.mesh.groups).keys))
     }
 }
@@ -142,7 +143,7 @@ fn draw_frame_with(renderer: &mut Renderer, scene: &Arc<Scene>, camera: Camera, 
     DrawnFrame { image, ids, stats, allocations }
 }
 
-/// Makes the scene of `buffers` use the rasterizer.
+/// Makes the scene of `buffers` use `backend`.
 fn attach_backend(renderer: &mut Renderer, buffers: &mut SceneBuffers, backend: Backend) {
     if let Backend::Compute(x_offset) = backend {
         let create_rasterizer =
@@ -151,7 +152,7 @@ fn attach_backend(renderer: &mut Renderer, buffers: &mut SceneBuffers, backend: 
     }
 }
 
-/// Domain 0 is a wall, domain 1 a horizontal square above the ground, and domain 2 a square in the plane of the ground.
+/// Domain 0 is a wall, domain 1 a floating horizontal square, and domain 2 a square in the plane of the ground.
 fn yard_builder(shadow: Option<ShadowSettings>, samples: u32) -> SceneBuilder {
     let mut builder = SceneBuilder::new();
     let defaults = modalcast_model::scene::RenderSettings::default();
@@ -200,6 +201,7 @@ fn compute_rasterized_frame_equals_opengl() {
             opengl_frame.stats.raster_backends,
             RasterBackends { shadow: Some(RasterBackend::OpenGl), visibility: Some(RasterBackend::OpenGl) }
         );
+        // `RasterShadow` draws the shadow depths and the visibility keys. `Unpack` converts the keys to visibility ids.
         assert_eq!(compute_frame.stats.passes[..3], [Pass::RasterShadow, Pass::Blur, Pass::Unpack]);
         assert!(
             !compute_frame.stats.passes.contains(&Pass::Ground)
@@ -227,7 +229,8 @@ fn compute_rasterized_frame_equals_opengl() {
             different_ids <= 12 && different_bytes <= 60,
             "{blur_method:?}: {different_ids} ids, {different_bytes} bytes differ"
         );
-        // The image is two units wide in normalized device coordinates: 0.02 units are 1.92 pixels.
+        // The image is 2 wide in normalized device coordinates, so that a shift by 0.02 is 0.02 / 2 * 192 = 1.92
+        // pixels.
         let shifted_frame = draw_frame(Backend::Compute(0.02));
         let (different_ids, different_bytes) = (
             count_differences(&shifted_frame.ids, &opengl_frame.ids),
@@ -363,7 +366,8 @@ fn opengl_draws_frames_that_compute_does_not_support() {
     );
 }
 
-/// Cameras of one step share its shadow. OpenGL draws a rebased scene until the scene returns to the shared positions.
+/// Frames of one step share its shadow. `upload_rebased` replaces the positions that OpenGL and the compute rasterizer
+/// share, until `set_shared_origin`. Until then, OpenGL draws the scene.
 #[test]
 fn cameras_share_the_shadow_and_rebased_scenes_use_opengl() {
     let scene = yard_builder(Some(ShadowSettings { size: 256, ..ShadowSettings::default() }), 1).build();
@@ -386,10 +390,12 @@ fn cameras_share_the_shadow_and_rebased_scenes_use_opengl() {
     };
     let (first_params, second_params) = (create_params([1.4, 1.9, 4.0]), create_params([-2.0, 1.2, 3.0]));
     let unshared_image = renderer.draw(&buffers, &second_params).expect("expected a frame");
+    // From here on, all frames are of step 7.
     buffers.set_step(7);
     let draw = |renderer: &mut Renderer, buffers: &SceneBuffers, params: &FrameParams| {
         let image = renderer.draw(buffers, params).expect("expected a frame");
-        (image, renderer.stats().passes[..2].to_vec())
+        let first_passes = renderer.stats().passes[..2].to_vec();
+        (image, first_passes)
     };
     assert_eq!(draw(&mut renderer, &buffers, &first_params).1, [Pass::RasterShadow, Pass::Blur]);
     let (shared_image, passes) = draw(&mut renderer, &buffers, &second_params);
@@ -412,7 +418,7 @@ fn cameras_share_the_shadow_and_rebased_scenes_use_opengl() {
     buffers.set_shared_origin([0.0; 3]);
     let (restored_image, _) = draw(&mut renderer, &buffers, &second_params);
     assert_eq!(restored_image.raster_backends.visibility, Some(RasterBackend::Cuda));
-    assert!(restored_image.rgba == unshared_image.rgba, "expected the image before the upload again");
+    assert!(restored_image.rgba == unshared_image.rgba, "expected the same image as before `upload_rebased`");
 }
 
 /// A rasterizer whose draw calls return the result of `failure`.
@@ -433,7 +439,8 @@ impl Rasterizer for FailingRasterizer {
     }
 }
 
-/// Draws `frame_count` frames of a scene with a [`FailingRasterizer`]. Returns them and the number of its draw calls.
+/// Draws `frame_count` frames of a scene with a [`FailingRasterizer`]. Returns the frames and the number of the
+/// rasterizer's draw calls.
 fn draw_with_failing_rasterizer(
     scene: &Arc<Scene>,
     failure: fn() -> Result<()>,

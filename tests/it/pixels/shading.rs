@@ -55,12 +55,14 @@ fn first_texture_row_is_the_top_of_the_surface() {
     let image = builder.add_texture(2, 2, |x, y| [255 * x as u8, 255 * y as u8, 0, 255]);
     let material = Material { color_texture: Some(image), ..Material::default() };
     let frame = render(&builder.add_domain(facing_rectangle(-3.0, -3.0, 3.0, 3.0, 0.0), material).build());
-    // These four pixels show the centers of the four texels. The colors are red and green, each either 0 or lit: level
-    // 225.
-    for (x, y, color) in [(17, 17, [0.0, 0.0]), (46, 17, [1.0, 0.0]), (17, 46, [0.0, 1.0]), (46, 46, [1.0, 1.0])] {
+    // These four pixels show the centers of the four texels. In a texel, red and green are each 0 or 255. Light changes
+    // level 255 to 225.
+    for (x, y, has_red, has_green) in
+        [(17, 17, false, false), (46, 17, true, false), (17, 46, false, true), (46, 46, true, true)]
+    {
         let [r, g, b] = frame.pixel(x, y);
         assert!(b == 0, "{x} {y}");
-        assert!((f64::from(r) > 150.0) == (color[0] > 0.5) && (f64::from(g) > 150.0) == (color[1] > 0.5), "{x} {y}");
+        assert!((r > 150) == has_red && (g > 150) == has_green, "{x} {y}");
     }
 }
 
@@ -83,7 +85,7 @@ fn expected_phong(look: &RenderSettings, material: &Material, point: Vector3<f64
 }
 
 #[test]
-fn phong_shading_equals_f64_arithmetic() {
+fn phong_shading_equals_its_formula_in_f64() {
     let material = Material {
         ambient: [0.9, 0.2, 0.1],
         diffuse: [0.1, 0.5, 0.3],
@@ -149,9 +151,9 @@ fn normal_map_changes_shading_and_a_flat_one_does_not() {
         is_close(render_with(Some([128, 128, 255, 255])).pixel(32, 32), expected(0.8), 1.0),
         "expected no effect of a flat normal map"
     );
-    // Tangent space: x along u, y against v, z along the normal. Components are encoded as 128 + 127 n, so 204 is 0.6,
-    // 52 is -0.6, and 230 is 0.8. The cosine is 0.36 + 0.64 for a normal (0.6, 0, 0.8), -0.36 + 0.64 for (-0.6, 0,
-    // 0.8), and 0.64 for (0, 0.6, 0.8).
+    // Tangent space: x along u, y against v, z along the normal. A component n is encoded as 128 + 127 n, so 204 is
+    // 0.6, 52 is -0.6, and 230 is 0.8. The cosine is 0.36 + 0.64 = 1 for a normal (0.6, 0, 0.8), -0.36 + 0.64 = 0.28
+    // for (-0.6, 0, 0.8), and 0.64 for (0, 0.6, 0.8).
     assert!(
         is_close(render_with(Some([204, 128, 230, 255])).pixel(32, 32), expected(1.0), 1.0),
         "expected a brighter surface with the normal tilted towards the sun"
@@ -176,7 +178,8 @@ fn plus_y_of_a_normal_map_points_up_the_image() {
         let material = Material { normal_texture: Some(image), ..matte_material([1.0; 3]) };
         render(&builder.add_domain(facing_rectangle(-2.0, -2.0, 2.0, 2.0, 0.0), material).build()).pixel(32, 32)
     };
-    // The encoded normals are (0, 0.6, 0.8), towards the sun, and (0, -0.6, 0.8), with a cosine of -0.36 + 0.64.
+    // Green 204 encodes the normal (0, 0.6, 0.8), towards the sun. Green 52 encodes (0, -0.6, 0.8), whose cosine with
+    // the sun is -0.36 + 0.64 = 0.28.
     assert!(is_close(render_with(204), [0.75; 3], 1.0) && is_close(render_with(52), [0.25 + 0.5 * 0.28; 3], 2.0));
 }
 
@@ -194,6 +197,7 @@ fn cut_out_shows_the_background_and_opaque_does_not() {
     let cut_out = render_leaf(AlphaMode::Mask { cutoff: 0.5 });
     assert_eq!(cut_out.pixel(32, 32), [0; 3]);
     assert!(is_close(cut_out.pixel(15, 15), [0.75, 0.0, 0.0], 1.0));
+    // The leaf covers 40 x 40 = 1600 pixels.
     let hole_pixels = cut_out.count_pixels(|pixel| pixel == [0; 3]) - (64 * 64 - 1600);
     assert!((360..=440).contains(&hole_pixels), "expected a hole of about 20 x 20 pixels, got {hole_pixels}");
     let opaque = render_leaf(AlphaMode::Opaque);
@@ -202,7 +206,7 @@ fn cut_out_shows_the_background_and_opaque_does_not() {
 }
 
 #[test]
-fn two_blended_layers_equal_arithmetic() {
+fn two_blended_layers_have_the_computed_color() {
     let render_layers = |near_alpha: f32, far_alpha: f32, alpha_mode: AlphaMode| {
         let layer = |diffuse, alpha| Material { alpha, alpha_mode, ..matte_material(diffuse) };
         let scene = SceneBuilder::new()
@@ -244,7 +248,7 @@ fn two_pass_blending_writes_no_depth() {
             .build();
         render(&scene).pixel(32, 32)
     };
-    // The second pane is blended over the first one, also behind it: 0.5 of green, and 0.25 of red.
+    // The green pane is blended over the red pane, even if it is behind: 0.5 of green, and 0.5 x 0.5 of red.
     for second_z in [-1.0, 1.0] {
         assert!(
             is_close(render_with(second_z), [0.75 * 0.25, 0.75 * 0.5, 0.0], 1.0),
@@ -254,7 +258,7 @@ fn two_pass_blending_writes_no_depth() {
     }
 }
 
-/// The normal of a back face points to the viewer.
+/// A back face is shaded with a normal that points to the camera.
 #[test]
 fn only_double_sided_back_faces_are_drawn() {
     let render_from_behind = |double_sided: bool| {
@@ -288,7 +292,7 @@ fn textures_of_many_sizes_keep_their_materials() {
     let frame = render_square(&mut open_renderer(), &builder.build(), front_camera(64), 64);
 
     for (index, [r, g, _]) in colors.into_iter().enumerate() {
-        // Each rectangle is 6 pixels wide; the first one begins at column 5.
+        // Each rectangle is 6 pixels wide. The first rectangle begins at column 5.
         let pixel = frame.pixel(5 + 6 * index as u32 + 3, 32);
         let expected = [0.75 * decode_srgb(r), 0.75 * decode_srgb(g), 0.0];
         assert!(is_close(pixel, expected, 1.0), "texture {index}: {pixel:?}");

@@ -1,4 +1,4 @@
-//! Shadows of the default shadow map, a variance shadow map, on the ground.
+//! Shadows on the ground with the default method, a variance shadow map.
 
 use modalcast_model::domain::{AlphaMode, Material};
 use modalcast_model::scene::{Camera, Ground, Lens, ShadowSettings, UpAxis, View};
@@ -33,15 +33,15 @@ fn render_from_above(builder: SceneBuilder) -> RenderedFrame {
     render_square(&mut open_renderer(), &builder.build(), camera, 64)
 }
 
-/// Renders from above the shadow of the square that [`with_square`] adds. The sun comes from the side, so that the
-/// square does not hide its shadow.
+/// Adds the square of [`with_square`] and renders its shadow from above. The sun shines obliquely, so that the square
+/// does not hide its shadow.
 fn render_square_shadow(builder: SceneBuilder, alpha_mode: AlphaMode, alpha: f32) -> RenderedFrame {
     render_from_above(with_square(builder, alpha_mode, alpha))
 }
 
 /// Adds a square with a side of two units at height 4, and tilts the sun so that the shadow of the square on the ground
-/// covers x and z of -1 to 1. The cosine between the sun and the up axis is 4/5. For materials that use alpha, the
-/// center of the square is a hole of half its side.
+/// extends from -1 to 1 in x and z. The cosine between the sun and the up axis is 4/5. For materials that use alpha,
+/// the center of the square is a hole of half its side.
 pub(super) fn with_square(mut builder: SceneBuilder, alpha_mode: AlphaMode, alpha: f32) -> SceneBuilder {
     builder.parts.look.sun = [3.0, 4.0, 0.0];
     let is_in_hole = |x: u32, y: u32| (16..48).contains(&x) && (16..48).contains(&y);
@@ -110,6 +110,7 @@ fn shadow_of_a_floating_square_has_only_ambient_light() {
 fn shadow_removes_diffuse_and_specular_light() {
     let floor = Material { ambient: [0.9, 0.5, 0.2], specular: [0.5; 3], shininess: 1.0, ..Material::default() };
     let frame = render_square_shadow(create_builder().add_domain(floor_mesh(3.0, 0.0), floor), AlphaMode::Opaque, 1.0);
+    // Only skylight, 0.25, remains.
     assert!(is_close(frame.pixel(32, 32), [0.25 * 0.9, 0.25 * 0.5, 0.25 * 0.2], 1.0), "{:?}", frame.pixel(32, 32));
     let [r, g, b] = frame.pixel(32, 8);
     assert!(
@@ -194,7 +195,9 @@ fn blended_surface_casts_above_the_alpha_threshold() {
     );
 }
 
-/// Light-bleeding reduction is applied to the bound.
+/// Chebyshev's inequality bounds the visible fraction of a texel by variance / (variance + d^2), with d the depth of
+/// the ground minus the mean depth of the texel. Light-bleeding reduction maps the bound linearly, so that `bleeding`
+/// becomes 0 and 1 remains 1.
 #[test]
 fn unblurred_texel_gives_the_chebyshev_bound() {
     // The caster is a square at height 4 that covers the whole map. With an alpha of 0 and an alpha threshold of 0, the
@@ -212,9 +215,9 @@ fn unblurred_texel_gives_the_chebyshev_bound() {
         let transparent_material = Material { alpha_mode: AlphaMode::Blend, alpha: 0.0, ..Material::default() };
         render_from_above(builder.add_domain(floor_mesh(5.1, 4.0), transparent_material)).pixel(32, 32)
     };
-    // Height of the square as a fraction of the depth range. The near plane is 1 % of the bounds' diagonal, which is
-    // 14.97, above the square, and the far plane is as much below the ground. Both are rounded outwards to multiples of
-    // 1/8: heights 4.25 and -0.25.
+    // Height of the square as a fraction of the depth range. The margin above the square and below the ground is 1 % of
+    // the diagonal of the bounds, 0.15. The near and the far plane are then rounded outwards to multiples of 1/8:
+    // heights 4.25 and -0.25.
     let depth_difference = 4.0 / (4.25 + 0.25);
     for (least_variance, bleeding) in [(0.5_f32, 0.0_f32), (0.1, 0.0), (0.5, 0.2), (0.02, 0.3)] {
         let variance = f64::from(least_variance);
@@ -237,14 +240,14 @@ fn blur_widens_the_edge_of_a_shadow() {
         builder.parts.look.shadow =
             Some(ShadowSettings { size: 256, blur, bleeding: 0.0, ..ShadowSettings::default() });
         let frame = render_square_shadow(builder, AlphaMode::Opaque, 1.0);
-        // Rows 8 to 55 of the image column through the center of the shadow.
+        // Rows 8 to 55 of the image column through the center of the shadow, which is in row 32.
         let levels: Vec<f64> = (8..56).map(|y| f64::from(frame.pixel(32, y)[0])).collect();
-        let (dark_level, light_level) = (levels[24], levels[0]);
+        let (dark_level, light_level) = (levels[32 - 8], levels[0]);
         let penumbra_pixels =
             levels.iter().filter(|level| **level > dark_level + 4.0 && **level < light_level - 4.0).count();
         assert!(
             levels[..20].windows(2).all(|pair| pair[0] >= pair[1] - 1.0),
-            "expected decreasing light towards the center, got {levels:?}"
+            "expected decreasing light towards the center of the shadow, got {levels:?}"
         );
         penumbra_pixels
     };
