@@ -1,5 +1,5 @@
-//! Exact normals and tangents, which follow the deformed triangles (rigid normals follow only the transform of the
-//! domain). The f64 reference is compared with closed-form normals, and the CPU deformer with the reference.
+//! Exact normals and tangents follow the deformed triangles. Rigid normals follow only the transform of the domain. The
+//! tests compare the f64 reference with closed-form normals, and the CPU deformer with the reference.
 
 mod extremes;
 mod fixtures;
@@ -10,8 +10,8 @@ use modalcast_model::scene::NormalMethod;
 use nalgebra::{Matrix3, Rotation3, Vector3};
 
 use fixtures::{
-    angle_degrees, cube, deform_on_cpu, max_angle_degrees, reference_normals_and_tangents, scene, scene_with_normals,
-    shape_with_mode, sheet, sphere, state, tube, uniform_q_state,
+    angle_degrees, create_scene, create_state, cube, deform_on_cpu, max_angle_degrees, reference_normals_and_tangents,
+    scene_with_normals, shape_with_mode, sheet, sphere, tube, uniform_q_state,
 };
 
 /// Maximum angle between CPU and reference normals or tangents, in degrees.
@@ -37,7 +37,7 @@ fn transform_normal(linear: Matrix3<f64>, normal: [f64; 3]) -> [f64; 3] {
 /// Negative control: rigid normals differ by more than 40 degrees.
 #[test]
 fn bent_strip_has_normals_and_tangents_of_its_parabola() {
-    let scene = scene(vec![shape_with_mode(sheet(33, 5), parabola)]);
+    let scene = create_scene(vec![shape_with_mode(sheet(33, 5), parabola)]);
     let state = uniform_q_state(&scene, 0.5);
     let (normals, tangents) = reference_normals_and_tangents(&scene, &state);
     let surface = deform_on_cpu(&scene, &state);
@@ -68,7 +68,7 @@ fn bent_strip_has_normals_and_tangents_of_its_parabola() {
 
 #[test]
 fn sheared_box_has_face_normals_and_hard_edges() {
-    let scene = scene(vec![shape_with_mode(cube(), |[_, y, z]| [z - 0.5 * y, 0.0, 0.3 * z])]);
+    let scene = create_scene(vec![shape_with_mode(cube(), |[_, y, z]| [z - 0.5 * y, 0.0, 0.3 * z])]);
     // The identity plus the gradient of the mode, for q = 1.
     let deformation_gradient = Matrix3::new(1.0, -0.5, 1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.3);
     let corners = scene.shapes[0].mesh.corners();
@@ -78,7 +78,7 @@ fn sheared_box_has_face_normals_and_hard_edges() {
         "expected a smoothing group for each of the 24 corners"
     );
     for linear in linear_parts() {
-        let state = state(&scene, 1.0, linear, [1.0, 2.0, 3.0]);
+        let state = create_state(&scene, 1.0, linear, [1.0, 2.0, 3.0]);
         let (normals, _) = reference_normals_and_tangents(&scene, &state);
         for (normal, rest_normal) in normals.iter().zip(&corners.normals) {
             let error =
@@ -97,7 +97,7 @@ fn stretched_sphere_has_normals_of_the_ellipsoid() {
     // The identity plus the gradient of the mode below, for q = 1.
     let stretch = Matrix3::from_diagonal(&Vector3::new(2.0, 1.0, 0.5));
     let errors = [3, 4, 5].map(|level| {
-        let scene = scene(vec![shape_with_mode(sphere(level), |[x, _, z]| [x, 0.0, -0.5 * z])]);
+        let scene = create_scene(vec![shape_with_mode(sphere(level), |[x, _, z]| [x, 0.0, -0.5 * z])]);
         let state = uniform_q_state(&scene, 1.0);
         let (normals, _) = reference_normals_and_tangents(&scene, &state);
         let mesh = &scene.shapes[0].mesh;
@@ -115,11 +115,11 @@ fn stretched_sphere_has_normals_of_the_ellipsoid() {
         assert!(max_error(&rigid_normals) > 30.0, "negative control: rigid normals differ");
         max_error(&normals)
     });
-    // Smaller triangles approximate the smooth surface better.
+    // Each level halves the edges of the triangles. Smaller triangles approximate the smooth surface better.
     assert!(errors[1] < 0.75 * errors[0] && errors[2] < 0.75 * errors[1] && errors[2] < 2.0, "{errors:?} degrees");
 }
 
-/// Rest normals may be arbitrary: the first shape has random normals.
+/// Rest normals may be arbitrary. So the first shape has random normals.
 #[test]
 fn exact_normals_equal_rigid_normals_at_zero_q() {
     let mut mesh = sheet(9, 9);
@@ -130,9 +130,9 @@ fn exact_normals_equal_rigid_normals_at_zero_q() {
     let triangles = mesh.triangles().to_vec();
     mesh = modalcast_model::domain::Mesh::from_indexed(rest_positions, normals, corners.uvs, triangles)
         .expect("expected a valid mesh");
-    let scene = scene(vec![shape_with_mode(mesh, parabola), shape_with_mode(cube(), parabola)]);
+    let scene = create_scene(vec![shape_with_mode(mesh, parabola), shape_with_mode(cube(), parabola)]);
     for linear in linear_parts() {
-        let mut state = state(&scene, 0.0, linear, [1.0, -2.0, 0.5]);
+        let mut state = create_state(&scene, 0.0, linear, [1.0, -2.0, 0.5]);
         let (rigid_normals, rigid_tangents) =
             (reference::rigid_normals(&scene, &state), reference::rigid_tangents(&scene, &state));
         let (normals, tangents) = reference_normals_and_tangents(&scene, &state);
@@ -154,18 +154,20 @@ fn exact_normals_equal_rigid_normals_at_zero_q() {
     }
 }
 
-/// Corners on both sides of a seam of texture coordinates form one smoothing group. Negative control: corners with
-/// different rest normals are not grouped, and their exact normals differ by more than 2 degrees.
+/// Corners of a vertex that have the same rest normal form a smoothing group and share an exact normal. Negative
+/// control: on the second tube, rest normals on both sides of the seam differ, and exact normals differ by more than 2
+/// degrees.
 #[test]
 fn both_sides_of_a_uv_seam_share_one_normal() {
     let displacement = |[x, _, z]: [f32; 3]| [2.0 * x + z, 0.0, -0.5 * z * z];
     let mut max_seam_angles = [0.0_f64; 2];
+    // `tilt` is the angle in degrees between the rest normals on both sides of the seam.
     for (max_angle, tilt) in max_seam_angles.iter_mut().zip([0.0, 0.2]) {
-        let scene = scene(vec![shape_with_mode(tube(16, 4, tilt), displacement)]);
+        let scene = create_scene(vec![shape_with_mode(tube(16, 4, tilt), displacement)]);
         let state = uniform_q_state(&scene, 0.7);
         let (normals, _) = reference_normals_and_tangents(&scene, &state);
         let cpu_normals = deform_on_cpu(&scene, &state).normals;
-        // A row of the tube has 16 columns and 17 corners; the first and the last corner are on the seam.
+        // A row of the tube has 16 columns and 17 corners. The first and the last corner share a vertex on the seam.
         for row in 0..4 {
             let (first_corner, last_corner) = (17 * row, 17 * row + 16);
             *max_angle = max_angle.max(angle_degrees(normals[first_corner], normals[last_corner]));
@@ -188,7 +190,7 @@ fn rest_normals_opposite_to_the_winding_stay_opposite() {
         vec![],
         mesh.triangles().to_vec(),
     );
-    let scene = scene(vec![
+    let scene = create_scene(vec![
         shape_with_mode(mesh, parabola),
         shape_with_mode(flipped_mesh.expect("expected a valid mesh"), parabola),
     ]);
@@ -199,13 +201,13 @@ fn rest_normals_opposite_to_the_winding_stay_opposite() {
     }
 }
 
-/// A mirroring transform also flips the bitangent sign (w).
+/// A mirroring transform also flips the bitangent sign, the fourth number of a tangent.
 #[test]
 fn transform_applies_inverse_transpose_to_normals() {
-    let scene = scene(vec![shape_with_mode(sheet(9, 9), |[x, y, _]| [0.1 * y, 0.0, x * x - 0.4 * y])]);
+    let scene = create_scene(vec![shape_with_mode(sheet(9, 9), |[x, y, _]| [0.1 * y, 0.0, x * x - 0.4 * y])]);
     let (normals, tangents) = reference_normals_and_tangents(&scene, &uniform_q_state(&scene, 0.6));
     for linear in linear_parts() {
-        let state = state(&scene, 0.6, linear, [5.0, 1.0, -3.0]);
+        let state = create_state(&scene, 0.6, linear, [5.0, 1.0, -3.0]);
         let (transformed_normals, transformed_tangents) = reference_normals_and_tangents(&scene, &state);
         for (transformed_normal, normal) in transformed_normals.iter().zip(&normals) {
             assert!(angle_degrees(*transformed_normal, transform_normal(linear, *normal)) < 1e-4);
@@ -233,12 +235,12 @@ fn tangents_are_unit_and_orthogonal_to_normals() {
         sheet(5, 5).triangles().to_vec(),
     );
     let wave = |[x, y, _]: [f32; 3]| [0.2 * y * y, 0.1 * x, (3.0 * x + y).sin()];
-    let scene = scene(vec![
+    let scene = create_scene(vec![
         shape_with_mode(mesh_without_uvs.expect("expected a valid mesh"), wave),
         shape_with_mode(sheet(17, 17), wave),
     ]);
     for linear in linear_parts() {
-        let state = state(&scene, 0.4, linear, [0.0; 3]);
+        let state = create_state(&scene, 0.4, linear, [0.0; 3]);
         let surface = deform_on_cpu(&scene, &state);
         for (corner, (normal, tangent)) in
             surface.normals.chunks_exact(3).zip(surface.tangents.chunks_exact(4)).enumerate()
@@ -263,11 +265,11 @@ fn only_deformable_shapes_have_smoothing_groups() {
     let rigid_shape = modalcast_model::domain::Shape::new(sheet(3, 3), modalcast_model::domain::Modes::rigid())
         .expect("expected a valid shape");
     let shapes = || vec![shape_with_mode(sheet(3, 3), parabola), rigid_shape.clone()];
-    let exact_scene = scene(shapes());
+    let exact_scene = create_scene(shapes());
     assert!(exact_scene.features.exact_normals);
     assert!(exact_scene.shapes[0].smoothing().is_some() && exact_scene.shapes[1].smoothing().is_none());
-    // The rigid shape has the last 9 of 18 corners.
-    let state = state(&exact_scene, 0.5, linear_parts()[2], [0.0; 3]);
+    // The rigid shape has the last 9 of 18 corners. A corner has three numbers in `surface.normals`.
+    let state = create_state(&exact_scene, 0.5, linear_parts()[2], [0.0; 3]);
     let surface = deform_on_cpu(&exact_scene, &state);
     let rigid_normals = reference::rigid_normals(&exact_scene, &state);
     assert!(

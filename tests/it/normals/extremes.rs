@@ -6,17 +6,18 @@ use modalcast_model::scene::Scene;
 use nalgebra::{Matrix3, Vector3};
 
 use super::fixtures::{
-    angle_degrees, deform_on_cpu, max_angle_degrees, reference_normals_and_tangents, scene, shape_with_mode, sheet,
-    state, tube, uniform_q_state,
+    angle_degrees, create_scene, create_state, deform_on_cpu, max_angle_degrees, reference_normals_and_tangents,
+    shape_with_mode, sheet, tube, uniform_q_state,
 };
 use super::{MAX_ANGLE_DEGREES, linear_parts, parabola};
 
-/// Bound of the relative rounding error of a position, 2 x 2^-23. It is larger than that of a single rounding, because
-/// the CPU deformer rounds several times.
+/// Bound of the relative rounding error of a position: 2 x 2^-23. A single rounding has a bound of 2^-24, but the CPU
+/// deformer rounds several times.
 const ROUNDING_BOUND: f64 = 2.0 / 8_388_608.0;
 
-/// Largest ratio of the angular error of a normal to its bound. The bound and the letters l and w are those of
-/// "Fallback" in `src/compute/reference/normals.rs`; l and m belong to the two edges of a triangle at a corner.
+/// Largest ratio of the angular error of a normal to its bound. The section "Fallback" of
+/// `src/compute/reference/normals.rs` defines the bound and the letters l, w and B. Here, l and m are the letters l of
+/// the two edges of a triangle at a corner.
 fn max_error_ratio(scene: &Scene, positions: &[[f64; 3]], normals: &[f32], reference_normals: &[[f64; 3]]) -> f64 {
     let mesh = &scene.shapes[0].mesh;
     // Per corner: the sum of the area vectors of its triangles, and the sum B of their rounding bounds.
@@ -54,9 +55,9 @@ fn collapsed_sheet_keeps_its_rigid_normals() {
     let collapse =
         |axes: [f32; 3]| move |rest_position: [f32; 3]| [0, 1, 2].map(|axis| -axes[axis] * rest_position[axis]);
     for axes in [[1.0, 0.0, 0.0], [1.0, 1.0, 1.0]] {
-        let scene = scene(vec![shape_with_mode(sheet(9, 9), collapse(axes))]);
+        let scene = create_scene(vec![shape_with_mode(sheet(9, 9), collapse(axes))]);
         for linear in linear_parts() {
-            let state = state(&scene, 1.0, linear, [0.0; 3]);
+            let state = create_state(&scene, 1.0, linear, [0.0; 3]);
             let (normals, tangents) = reference_normals_and_tangents(&scene, &state);
             assert_eq!(normals, reference::rigid_normals(&scene, &state));
             assert_eq!(tangents, reference::rigid_tangents(&scene, &state));
@@ -65,8 +66,9 @@ fn collapsed_sheet_keeps_its_rigid_normals() {
             assert!(surface.tangents.iter().all(|number| number.is_finite()));
         }
     }
-    // Almost collapsed to a line: x becomes 0.001 x and z becomes 0.002 x, so that the normal is (-0.002, 0, 0.001).
-    let narrow_scene = scene(vec![shape_with_mode(sheet(9, 9), |[x, _, _]| [-0.999 * x, 0.0, 0.002 * x])]);
+    // Almost collapsed to a line: x becomes 0.001 x and z becomes 0.002 x, so that the normal has the direction
+    // (-0.002, 0, 0.001).
+    let narrow_scene = create_scene(vec![shape_with_mode(sheet(9, 9), |[x, _, _]| [-0.999 * x, 0.0, 0.002 * x])]);
     let (normals, _) = reference_normals_and_tangents(&narrow_scene, &uniform_q_state(&narrow_scene, 1.0));
     assert!(normals.iter().all(|normal| angle_degrees(*normal, [-0.002, 0.0, 0.001]) < 0.01));
     assert!(
@@ -92,7 +94,7 @@ fn zero_area_triangles_do_not_change_normals() {
             corners.uvs,
             triangles,
         );
-        scene(vec![shape_with_mode(mesh.expect("expected a valid mesh"), |[x, y, _]| [0.0, 0.0, x + 0.5 * y])])
+        create_scene(vec![shape_with_mode(mesh.expect("expected a valid mesh"), |[x, y, _]| [0.0, 0.0, x + 0.5 * y])])
     };
     let (degenerate_scene, original_scene) = (scene_of_triangles(triangles), scene_of_triangles(original_triangles));
     let state = uniform_q_state(&degenerate_scene, 0.8);
@@ -110,12 +112,12 @@ fn zero_area_triangles_do_not_change_normals() {
 
 #[test]
 fn normals_do_not_depend_on_the_scale_of_a_domain() {
-    let scene = scene(vec![shape_with_mode(sheet(17, 9), parabola)]);
+    let scene = create_scene(vec![shape_with_mode(sheet(17, 9), parabola)]);
     for linear in linear_parts() {
         let (unscaled_normals, unscaled_tangents) =
-            reference_normals_and_tangents(&scene, &state(&scene, 0.5, linear, [0.0; 3]));
+            reference_normals_and_tangents(&scene, &create_state(&scene, 0.5, linear, [0.0; 3]));
         for scale in [1e-40, 1e-30, 1e-20, 1e18, 1e30, 1e37] {
-            let state = state(&scene, 0.5, linear * scale, [0.0; 3]);
+            let state = create_state(&scene, 0.5, linear * scale, [0.0; 3]);
             let surface = deform_on_cpu(&scene, &state);
             // Positions of 1e-40 are denormal, with about five significant digits.
             let tolerance = if scale < 1e-38 { 0.1 } else { MAX_ANGLE_DEGREES };
@@ -136,12 +138,12 @@ fn normals_do_not_depend_on_the_scale_of_a_domain() {
 /// Small domains, whose shape is lost when their positions are rounded to f32, have rigid normals.
 #[test]
 fn normals_far_from_the_origin_stay_within_their_bound() {
-    let scene = scene(vec![shape_with_mode(tube(24, 6, 0.0), |[x, y, _]| [0.2 * y * y, 0.1 * x, 0.3 * x * y])]);
+    let scene = create_scene(vec![shape_with_mode(tube(24, 6, 0.0), |[x, y, _]| [0.2 * y * y, 0.1 * x, 0.3 * x * y])]);
     let translation = [1e7, -1e7, 1e7];
     // `size` scales the domain. `keeps_shape` is false if the rounding of positions at 1e7 hides its shape.
     for (size, keeps_shape) in [(1e6, true), (1e5, true), (1.0, false), (1e-3, false)] {
         for linear in linear_parts() {
-            let state = state(&scene, 0.3, linear * size, translation);
+            let state = create_state(&scene, 0.3, linear * size, translation);
             let positions = reference::deform(&scene, &state);
             let (normals, _) = reference_normals_and_tangents(&scene, &state);
             let rigid_normals = reference::rigid_normals(&scene, &state);
@@ -160,10 +162,10 @@ fn normals_far_from_the_origin_stay_within_their_bound() {
 
 #[test]
 fn overflow_and_half_turns_give_unit_normals() {
-    let scene = scene(vec![shape_with_mode(tube(16, 4, 0.0), |[x, y, z]| [-2.0 * x, y, -2.0 * z])]);
+    let scene = create_scene(vec![shape_with_mode(tube(16, 4, 0.0), |[x, y, z]| [-2.0 * x, y, -2.0 * z])]);
     for q in [1.0, 1e30, 3e38, -3e38] {
         for scale in [1.0, 1e-30, 1e10] {
-            let surface = deform_on_cpu(&scene, &state(&scene, q, Matrix3::identity() * scale, [0.0; 3]));
+            let surface = deform_on_cpu(&scene, &create_state(&scene, q, Matrix3::identity() * scale, [0.0; 3]));
             for (normal, tangent) in surface.normals.chunks_exact(3).zip(surface.tangents.chunks_exact(4)) {
                 let length = |vector: &[f32]| vector.iter().map(|number| number * number).sum::<f32>().sqrt();
                 assert!((length(normal) - 1.0).abs() < 1e-6, "q {q}, scale {scale}: {normal:?}");
@@ -171,9 +173,9 @@ fn overflow_and_half_turns_give_unit_normals() {
             }
         }
     }
-    // At q = 1, the mode rotates the tube by 180 degrees about y. The tube has 16 sides, so that a rest normal differs
-    // from the normals of its triangles by at most 11.25 degrees. Close to half a turn, the error of the rotation is at
-    // most twice that angle.
+    // At q = 1, the mode rotates the tube by 180 degrees about y and stretches it along y. The tube has 16 sides, so
+    // that a rest normal differs from the normals of its triangles by at most 360 / 16 / 2 = 11.25 degrees. Close to
+    // half a turn, the error of the rotation is at most twice that angle.
     let (normals, _) = reference_normals_and_tangents(&scene, &uniform_q_state(&scene, 1.0));
     for (normal, rest_normal) in normals.iter().zip(&scene.shapes[0].mesh.corners().normals) {
         assert!(angle_degrees(*normal, rest_normal.map(f64::from)) >= 180.0 - 22.5);

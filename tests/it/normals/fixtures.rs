@@ -11,7 +11,7 @@ use nalgebra::{Matrix3, Vector3};
 /// Rest normal of a sheet.
 pub(crate) const UP: [f32; 3] = [0.0, 0.0, 1.0];
 
-/// A shape with one mode. `displacement` returns its displacement at a rest position.
+/// A shape with one mode. `displacement` returns the displacement of the mode at a rest position.
 pub(crate) fn shape_with_mode(mesh: Mesh, displacement: impl Fn([f32; 3]) -> [f32; 3]) -> Shape {
     let column: Vec<f32> = mesh.rest_positions().iter().flat_map(|position| displacement(*position)).collect();
     let modes = Modes::from_columns(column.len(), 1, column).expect("expected valid modes");
@@ -39,9 +39,9 @@ pub(crate) fn grid_triangles(columns: u32, rows: u32) -> Vec<[u32; 3]> {
         .collect()
 }
 
-/// A tube about y with `columns` sides and `rows` rings of vertices. A row has one corner more than vertices: its first
-/// and its last corner share a vertex, as at a seam of texture coordinates. The normals of the last corners are rotated
-/// by `tilt` degrees.
+/// A tube about y with `columns` sides and `rows` rows of vertices. A row has one corner more than vertices: its first
+/// and its last corner share a vertex, as at a seam of texture coordinates. The normal of the last corner of each row
+/// is rotated by `tilt` degrees.
 pub(crate) fn tube(columns: u32, rows: u32, tilt: f32) -> Mesh {
     let column_angle = |column: u32| column as f32 / columns as f32 * std::f32::consts::TAU;
     let rest_positions = (0..rows).flat_map(|row| {
@@ -57,12 +57,12 @@ pub(crate) fn tube(columns: u32, rows: u32, tilt: f32) -> Mesh {
     Mesh::new(rest_positions.collect(), corners, grid_triangles(columns + 1, rows)).expect("expected a valid mesh")
 }
 
-/// A unit cube of 8 vertices and 24 corners, four for each face; every edge is hard.
+/// A unit cube of 8 vertices and 24 corners, four for each face. Every edge is hard.
 pub(crate) fn cube() -> Mesh {
     // Bit `axis` of the index of a vertex is its coordinate on that axis.
     let rest_positions = (0..8_u8).map(|vertex| [0, 1, 2].map(|axis| f32::from(vertex >> axis & 1))).collect();
     let (mut corners, mut triangles) = (Corners::default(), Vec::new());
-    // The face with coordinate `side` on `axis`.
+    // Each face has the coordinate `side`, 0 or 1, on `axis`.
     for (axis, side) in (0..3_usize).flat_map(|axis| [(axis, 0_u32), (axis, 1)]) {
         let (second_bit, third_bit) = (1_u32 << ((axis + 1) % 3), 1_u32 << ((axis + 2) % 3));
         let first_corner = corners.vertices.len() as u32;
@@ -70,8 +70,8 @@ pub(crate) fn cube() -> Mesh {
         let mut normal = [0.0; 3];
         normal[axis] = if side == 1 { 1.0 } else { -1.0 };
         corners.normals.extend([normal; 4]);
-        let quad_triangles = if side == 1 { [[0, 1, 2], [0, 2, 3]] } else { [[0, 2, 1], [0, 3, 2]] };
-        triangles.extend(quad_triangles.map(|triangle| triangle.map(|corner| first_corner + corner)));
+        let face_triangles = if side == 1 { [[0, 1, 2], [0, 2, 3]] } else { [[0, 2, 1], [0, 3, 2]] };
+        triangles.extend(face_triangles.map(|triangle| triangle.map(|corner| first_corner + corner)));
     }
     Mesh::new(rest_positions, corners, triangles).expect("expected a valid mesh")
 }
@@ -88,7 +88,7 @@ pub(crate) fn sphere(level: u32) -> Mesh {
         triangles = triangles.into_iter().flat_map(split_triangle).collect();
     }
     let mut rest_positions: Vec<[f32; 3]> = Vec::new();
-    // Index of the vertex at a position; adds the vertex if there is none.
+    // Index of the vertex at a position. Adds a vertex if there is none.
     let mut vertex_index = |position: Vector3<f64>| {
         let position: [f32; 3] = position.cast::<f32>().into();
         let is_near = |other: &[f32; 3]| (0..3).all(|axis| (other[axis] - position[axis]).abs() < 1e-5);
@@ -113,12 +113,12 @@ fn octahedron_faces() -> Vec<[Vector3<f64>; 3]> {
     signs.map(triangle).collect()
 }
 
-/// A scene of shapes with exact normals; shapes with texture coordinates have a normal map.
-pub(crate) fn scene(shapes: Vec<Shape>) -> Arc<Scene> {
+/// A scene of shapes with exact normals. Shapes with texture coordinates have a normal map.
+pub(crate) fn create_scene(shapes: Vec<Shape>) -> Arc<Scene> {
     scene_with_normals(shapes, NormalMethod::Exact)
 }
 
-/// A scene of shapes with rigid or exact normals; shapes with texture coordinates have a normal map.
+/// A scene of shapes with rigid or exact normals. Shapes with texture coordinates have a normal map.
 pub(crate) fn scene_with_normals(shapes: Vec<Shape>, normals: NormalMethod) -> Arc<Scene> {
     let mut parts = SceneParts::named("bent");
     parts.deformation.normals = normals;
@@ -130,7 +130,7 @@ pub(crate) fn scene_with_normals(shapes: Vec<Shape>, normals: NormalMethod) -> A
 }
 
 /// A state in which every reduced coordinate is q and every transform has the given linear part and translation.
-pub(crate) fn state(scene: &Scene, q: f32, linear: Matrix3<f64>, translation: [f64; 3]) -> SceneState {
+pub(crate) fn create_state(scene: &Scene, q: f32, linear: Matrix3<f64>, translation: [f64; 3]) -> SceneState {
     let mut state = SceneState::rest(scene);
     state.q.fill(q);
     state.transforms.fill(Transform::from_parts(&linear, &translation.into()));
@@ -139,7 +139,7 @@ pub(crate) fn state(scene: &Scene, q: f32, linear: Matrix3<f64>, translation: [f
 
 /// The rest state with every reduced coordinate set to q.
 pub(crate) fn uniform_q_state(scene: &Scene, q: f32) -> SceneState {
-    state(scene, q, Matrix3::identity(), [0.0; 3])
+    create_state(scene, q, Matrix3::identity(), [0.0; 3])
 }
 
 /// The surface that the CPU deformer computes for a state.
@@ -162,7 +162,8 @@ pub(crate) fn angle_degrees(a: [f64; 3], b: [f64; 3]) -> f64 {
     a.cross(&b).norm().atan2(a.dot(&b)).to_degrees()
 }
 
-/// Largest angle in degrees between f32 triples and directions; infinite if a triple is NaN or not of unit length.
+/// Largest angle in degrees between normals and expected normals. It is infinite if a normal is NaN or not of unit
+/// length.
 pub(crate) fn max_angle_degrees(normals: &[f32], expected_normals: &[[f64; 3]]) -> f64 {
     assert_eq!(normals.len(), 3 * expected_normals.len(), "expected three numbers per direction");
     let angle = |(normal, expected): (&[f32], &[f64; 3])| {

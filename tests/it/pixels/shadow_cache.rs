@@ -1,4 +1,4 @@
-//! Frames of one step share one shadow map. They equal frames for which the shadow map is drawn anew.
+//! Frames of one step share one shadow map. They equal frames of a new renderer, which draws its own shadow map.
 
 use std::sync::Arc;
 
@@ -14,7 +14,7 @@ use modalcast_render::{FrameParams, Pass, Renderer, SceneBuffers};
 use super::harness::open_renderer;
 use super::shadow::{create_builder, with_square};
 
-/// A cut-out square and an opaque square that float above the ground. `cascades` is the number of cascades.
+/// A cut-out square and an opaque square that float above the ground, with a shadow map of `cascades` cascades.
 fn create_scene(cascades: u32) -> Arc<Scene> {
     let mut builder = with_square(create_builder(), AlphaMode::Mask { cutoff: 0.5 }, 1.0);
     builder.parts.look.shadow = Some(ShadowSettings { size: 256, cascades, ..ShadowSettings::default() });
@@ -60,8 +60,8 @@ struct Frame {
     shadow_passes: usize,
 }
 
-/// Frames of both cameras at step 1, at rest, and at step 2, shifted. `set_step` may pass the step number to the
-/// buffers.
+/// Frames of both cameras at step 1, where the scene is at rest, and at step 2, where it is shifted. `set_step`
+/// receives the buffers and the step number after each upload.
 fn render_two_steps(scene: &Arc<Scene>, set_step: impl Fn(&SceneBuffers, u64)) -> Vec<Frame> {
     let mut renderer = open_renderer();
     let buffers = renderer.load(scene).expect("expected the scene to load");
@@ -99,11 +99,12 @@ fn cameras_of_one_step_share_its_shadow() {
     );
 }
 
-/// Each frame draws the shadow map if the map depends on the view, as with cascades, or if the step has no number. The
-/// map is also drawn again if the bounds change and the step number does not.
+/// Each frame draws the shadow map if the map depends on the view, as with cascades, or if the step has no number. If
+/// only the bounds change and the step number does not, the map is also drawn again.
 #[test]
 fn view_dependent_shadows_are_drawn_for_each_frame() {
     assert_eq!(
+        // `SceneBuffers::set_step` is not called.
         pass_counts(&render_two_steps(&create_scene(1), |_, _| ())),
         [2; 4],
         "expected a shadow map per frame without a step number"
@@ -151,7 +152,7 @@ fn upload_bounds_or_origin_invalidate_the_shadow() {
     assert_eq!(light_bounds_passes, [2, 0, 2, 0], "expected a new shadow map for other light bounds");
     buffers.set_shared_origin([1024.0, 0.0, 0.0]);
     assert_eq!([bounds, bounds].map(|bounds| draw(&mut renderer, &buffers, bounds)), [2, 0]);
-    // An upload clears the step number, so that every later frame draws its shadow map.
+    // An upload clears the step number. Without a number, every frame draws its shadow map.
     renderer.upload(&buffers, &surface).expect("expected the upload to succeed");
     assert_eq!([bounds, bounds].map(|bounds| draw(&mut renderer, &buffers, bounds)), [2, 2]);
 }
@@ -180,7 +181,8 @@ fn frames_of_an_engine_step_share_its_shadow() {
     );
     let last_domain = scene.domains.len() - 1;
     let rest_state = state.clone();
-    state.transforms[last_domain].0[3] = 2.0; // x of the translation
+    // x of the translation, element 3 of the row-major 3 x 4 matrix.
+    state.transforms[last_domain].0[3] = 2.0;
     loaded_scene.deform(&state).expect("expected the step to succeed");
     let second_frames = draw_frames(&mut context, &mut loaded_scene);
     assert_eq!(pass_counts(&second_frames), [2, 0], "expected a shadow pass for a new step");

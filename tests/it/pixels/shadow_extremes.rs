@@ -27,8 +27,8 @@ fn triangle(corners: [[f32; 3]; 3]) -> Mesh {
         .expect("expected a valid mesh")
 }
 
-/// Renders meshes with this sun and shadow map. The default sky is bright and lights all surfaces, so that only NaN
-/// gives black pixels. `clip_planes` are the near and far distances; without them, both are fitted to the bounds.
+/// Renders meshes with the given sun and shadow map. The default sky is bright and lights all surfaces, so that only
+/// NaN gives black pixels. `clip_planes` are the near and far distances; without them, both are fitted to the bounds.
 fn render_scene(meshes: &[Mesh], sun: [f32; 3], shadow: ShadowSettings, clip_planes: Option<(f64, f64)>) -> FrameImage {
     let mut builder = SceneBuilder::new();
     builder.parts.look = RenderSettings { sun, shadow: Some(shadow), ..RenderSettings::default() };
@@ -106,8 +106,8 @@ fn static_shadow_does_not_flicker_while_bounds_grow() {
                 frames.windows(2).map(|pair| count_different_pixels(&pair[0], &pair[1])).collect();
             let changed_frames = changes.iter().filter(|change| **change > 0).count();
             // Over 60 frames the bounds grow by 0.25 scene units along x and by 0.125 along z. The extent of the map is
-            // quantized: each of its two sides and its depth range grow in two steps, and each step changes one frame.
-            // A map that is not quantized would change every frame.
+            // quantized: its width, its height and its depth range grow in about two steps each, and each step changes
+            // one frame. A map that is not quantized would change all 59 later frames.
             assert!(
                 changed_frames <= 10,
                 "{method:?}: expected at most 10 changed frames, got {changed_frames}: {changes:?}"
@@ -130,7 +130,7 @@ fn render_growing_bounds(scene: &std::sync::Arc<Scene>, has_light_bounds: bool) 
     renderer.upload(&buffers, deformer.surface().expect("expected a surface")).expect("expected the upload to succeed");
     let view = View::LookAt { eye: [3.0, 4.0, 5.0], target: [-0.3, 0.0, -0.3], up: [0.0, 1.0, 0.0] };
     let camera = Camera { view, lens: Lens::FieldOfView(30.0), near: 1.0, far: 30.0 };
-    // Frame 59 is the last.
+    // The growth is 0 in frame 0 and 0.125 in the last frame, frame 59.
     let bounds_of_frame = |frame: u32| {
         let growth = 0.125 * f64::from(frame) / 59.0;
         BoundingBox {

@@ -1,5 +1,5 @@
-//! The shadow of a straight edge on the ground for every shadow method, compared with f64 arithmetic. The edge is the
-//! line z = 1 on the ground, where the shadow of the square of [`with_square`] ends.
+//! The edge of a shadow on the ground, for every shadow method, equals the edge that the tests compute in f64. The edge
+//! is the line z = 1, where the shadow of the square of [`with_square`] ends.
 
 use modalcast_model::domain::{AlphaMode, Material, Mesh};
 use modalcast_model::scene::{Camera, Lens, MomentFormat, Scene, ShadowMethod, ShadowSettings, View};
@@ -12,8 +12,8 @@ use super::shadow::{create_builder, with_square};
 
 /// Pixels per unit of the ground in the image of the edge.
 const PIXELS_PER_UNIT: f64 = 100.0;
-/// Half the extent of the light box along z, across the edge. The bounds extend to z = 5. The box rounds lengths from 4
-/// to 8 up to the next larger multiple of 4 / 16.
+/// Half the extent of the light box along z, across the edge. The bounds extend to z = 5. A half extent from 4 to 8 is
+/// rounded up to the next larger multiple of 4 / 16.
 const LIGHT_BOX_HALF_EXTENT: f64 = 5.25;
 
 /// A variance shadow map with a blur of 2 texels.
@@ -21,7 +21,7 @@ fn variance_settings() -> ShadowSettings {
     ShadowSettings { size: 256, blur: 2.0, bleeding: 0.0, ..ShadowSettings::default() }
 }
 
-/// Side of a shadow map texel along z, in scene units. The light box fits the map without its empty border.
+/// Side of a shadow map texel along z, in scene units. The light box covers the map except for its empty border.
 fn texel_size(shadow: &ShadowSettings) -> f64 {
     // Texels at each border that contain no caster.
     let empty_border = f64::from(shadow.blur_radius()) + 1.0;
@@ -39,7 +39,7 @@ fn render_edge(shadow: ShadowSettings) -> RenderedFrame {
     render_edge_with_blur(BlurMethod::Auto, shadow)
 }
 
-/// [`render_edge`] with this blur method.
+/// [`render_edge`] with the given blur method.
 fn render_edge_with_blur(blur_method: BlurMethod, shadow: ShadowSettings) -> RenderedFrame {
     let mut renderer = open_renderer();
     renderer.set_blur_method(blur_method);
@@ -95,13 +95,13 @@ fn filtered_and_variance_maps_give_the_blurred_edge() {
     ];
     for (method, shadow) in cases {
         let visibility = visibility_profile(&render_edge_with_blur(method, shadow), 32);
-        // Largest error in the middle column, if the edge were shifted by `-shift`.
+        // Largest error of the middle column, compared with an edge at z = 1 - shift.
         let max_error = |shift: f64| {
             let error =
                 |row: u32| (visibility[row as usize] - expected_visibility(&shadow, ground_z(row) + shift)).abs();
             (0..64).map(error).fold(0.0, f64::max)
         };
-        // One level of 255 is 0.019 of the sunlight at most, so that rounding to a level is off by 0.0095 at most.
+        // One level of 255 is at most 0.019 of the sunlight, so rounding to a level causes an error of at most 0.0095.
         assert!(
             max_error(0.0) < 0.012,
             "{method:?}, {shadow:?}: expected a maximum error below 0.012, got {}",
@@ -126,14 +126,14 @@ fn all_blur_methods_agree() {
             max_difference(&rows),
             max_difference(&fragments)
         );
-        // One texel wider, or narrower for 16, the largest blur.
+        // The other blur is one texel wider. For 16, the largest blur, it is one texel narrower.
         let other_blur =
             render_edge(ShadowSettings { size, blur: (blur + 1.0).min(15.0), ..variance_settings() }).image.rgba;
         assert!(max_difference(&other_blur) > 1, "negative control: expected a different image with another blur");
     }
 }
 
-/// z where half of the sunlight arrives, interpolated linearly between two rows.
+/// z where half of the sunlight reaches the ground, interpolated linearly between two rows.
 fn edge_z(visibility_profile: &[f64]) -> f64 {
     let row = visibility_profile
         .iter()
@@ -144,11 +144,12 @@ fn edge_z(visibility_profile: &[f64]) -> f64 {
 }
 
 #[test]
-fn shadow_edges_are_within_their_stated_distance() {
+fn shadow_edges_are_at_their_expected_distance() {
     let base = variance_settings();
-    // Expected distances are in texels. Bleeding reduction by 0.2 maps the bound 0.6 to half of the sunlight. The
-    // normal distribution reaches 0.6 at 0.2533 standard deviations, and the standard deviation of the blur is 2
-    // texels.
+    // Expected distances of the edge from z = 1, in texels. Without bleeding reduction, the Chebyshev bound equals the
+    // blurred fraction of lit texels, because the depths are those of the square and of the ground. Bleeding reduction
+    // by 0.2 maps the bound 0.6 to half of the sunlight. The normal distribution reaches 0.6 at 0.2533 standard
+    // deviations, and the standard deviation of the blur is 2 texels.
     let cases = [
         (ShadowSettings { method: ShadowMethod::Standard, ..base }, 0.0),
         (ShadowSettings { method: ShadowMethod::PercentageCloser, ..base }, 0.0),
@@ -160,7 +161,7 @@ fn shadow_edges_are_within_their_stated_distance() {
         for (shadow, expected_offset) in cases {
             let shadow = ShadowSettings { size, ..shadow };
             let offset = (edge_z(&visibility_profile(&render_edge(shadow), 32)) - 1.0) / texel_size(&shadow);
-            // The tolerance is half a texel, for the sampling of the caster, and one pixel.
+            // The tolerance is one pixel, plus half a texel because the shadow map samples the square at texel centers.
             let pixel = 1.0 / PIXELS_PER_UNIT / texel_size(&shadow);
             assert!(
                 (offset - expected_offset).abs() <= 0.5 + pixel,
@@ -190,7 +191,7 @@ fn only_standard_maps_have_hard_edges() {
     }
 }
 
-/// Number of pixels of a square that are not fully lit. The square has six units per side at height 2, casts a shadow
+/// Number of pixels that are not fully lit, on a square with a side of six units at height 2. The square casts a shadow
 /// and receives shadows. `casters` are added to the scene.
 fn count_self_shadowed(casters: &[Mesh], shadow: ShadowSettings, sun: [f32; 3]) -> usize {
     let mut builder = create_builder();
@@ -232,9 +233,9 @@ fn count_lit_in_umbra(moments: MomentFormat) -> usize {
     let mut builder = create_builder();
     builder.parts.look.shadow = Some(ShadowSettings { size: 2048, blur: 0.5, moments, ..ShadowSettings::default() });
     builder.parts.look.sun = [3.0, 1.0, 0.0];
-    // The square is far from the center of the depth range, where f16 is coarse. With the sun at (3, 1, 0) and the
-    // square at height 0.03, the shadow extends 0.09 beyond the edge of the square at x = -3.5. The camera shows a part
-    // of it: 64 pixels of 0.001 around x = -3.545.
+    // The depth of the square is far from the center of the depth range, so that f16 is coarse there. With the sun at
+    // (3, 1, 0) and the square at height 0.03, the shadow extends 0.09 units beyond the edge of the square at x = -3.5.
+    // The camera shows the middle of these 0.09 units: 64 pixels of 0.001 units around x = -3.545.
     let mut positions = floor_mesh(1.0, 0.03).rest_positions().to_vec();
     positions.iter_mut().for_each(|vertex| vertex[0] -= 2.5);
     let mesh = Mesh::from_indexed(positions, vec![[0.0, 1.0, 0.0]; 4], vec![], vec![[0, 1, 2], [0, 2, 3]])

@@ -1,5 +1,5 @@
-//! The visibility buffer, which holds the triangle id of each sample: coverage, texture derivatives, ids, and
-//! degenerate triangles.
+//! The visibility buffer contains the triangle id of each sample. The tests check coverage, texture derivatives, ids,
+//! and degenerate triangles.
 
 use std::sync::Arc;
 
@@ -27,22 +27,32 @@ fn create_builder() -> SceneBuilder {
 
 #[test]
 fn edge_covers_the_samples_on_its_side() {
-    // The strip ends within pixel column 32, at the fraction `edge` of the column. The four samples of a pixel lie at
-    // 1/8, 3/8, 5/8 and 7/8 of its width, in some order.
-    for (edge, coverage) in [(0.25_f32, 0.25), (0.5, 0.5), (0.75, 0.75)] {
+    // The strip ends within pixel column 32, which is 0.1 units wide and begins at x = 0. `coverage` is the fraction of
+    // the column that the strip covers. The four samples of a pixel lie at 1/8, 3/8, 5/8 and 7/8 of its width.
+    for coverage in [0.25, 0.5, 0.75] {
         let render_with = |samples: u32| {
             let mut builder = create_builder();
             builder.parts.look.samples = samples;
             render(
-                &builder.add_domain(facing_rectangle(-1.0, -1.0, 0.1 * edge, 1.0, 0.0), unlit_material(None)).build(),
+                &builder
+                    .add_domain(facing_rectangle(-1.0, -1.0, 0.1 * coverage as f32, 1.0, 0.0), unlit_material(None))
+                    .build(),
             )
         };
         let multisampled = render_with(4);
         assert_eq!(multisampled.stats.samples, 4);
-        assert!(is_close(multisampled.pixel(32, 30), [coverage; 3], 1.0), "{edge}: {:?}", multisampled.pixel(32, 30));
+        assert!(
+            is_close(multisampled.pixel(32, 30), [coverage; 3], 1.0),
+            "{coverage}: {:?}",
+            multisampled.pixel(32, 30)
+        );
         let single_sample = render_with(1);
         assert_eq!(single_sample.stats.samples, 1);
-        assert!([[0; 3], [255; 3]].contains(&single_sample.pixel(32, 30)), "{edge}: {:?}", single_sample.pixel(32, 30));
+        assert!(
+            [[0; 3], [255; 3]].contains(&single_sample.pixel(32, 30)),
+            "{coverage}: {:?}",
+            single_sample.pixel(32, 30)
+        );
     }
 }
 
@@ -100,12 +110,14 @@ fn render_stripes(size: u32, max_uv: f32) -> RenderedFrame {
     render(&builder.add_domain(mesh, unlit_material(Some(image))).build())
 }
 
-/// Pixels of the square of [`render_stripes`] that one triangle fills: not at its border and not on its diagonal.
+/// Pixels of the square of [`render_stripes`] that one triangle fills. Pixels at the border of the square and on its
+/// diagonal, x + y = 63, are excluded.
 fn inner_pixels() -> impl Iterator<Item = (u32, u32)> {
     (13..51_u32).flat_map(|y| (13..51_u32).map(move |x| (x, y))).filter(|(x, y)| (x + y).abs_diff(63) > 1)
 }
 
-/// One texel per pixel reads level 0; four texels per pixel read level 2, their mean.
+/// With one texel per pixel, mip level 0 is read. With four texels per pixel and axis, level 2 is read, the mean of 4 x
+/// 4 texels.
 #[test]
 fn mip_level_follows_texels_per_pixel() {
     let level_0 = render_stripes(40, 1.0);
@@ -176,8 +188,8 @@ fn texture_coordinates_are_perspective_correct() {
 /// Shading follows equations 3.12 and 3.14 of the thesis with corrections.
 #[test]
 fn equations_3_12_and_3_14_hold_with_corrections() {
-    // Equation 3.12 reflects v_e, the direction to the eye, at the normal. As printed, v_e points away from the eye.
-    // With the sun from the left and the eye in the middle, the highlight is on the left.
+    // Equation 3.12 reflects v_e at the normal. As printed, v_e points away from the eye. The corrected v_e points to
+    // the eye. With the sun from the left and the eye in the middle, the highlight is on the left.
     let sun = Vector3::new(-0.3, 0.0, 1.0).normalize();
     let mut builder = SceneBuilder::new();
     builder.parts.look.sun = sun.cast::<f32>().into();
@@ -227,7 +239,7 @@ fn visibility_ids_are_triangles_the_ground_or_background() {
     let ids = renderer.read_visibility().expect("expected visibility ids");
     assert_eq!(ids.len(), 64 * 64);
     let buffers = renderer.load(&scene).expect("expected the scene to load");
-    // Domain of the triangle at a pixel, and its index in the mesh of the domain.
+    // Domain of the triangle at a pixel, and index of the triangle in the mesh of the domain.
     let source_at = |x: usize, y: usize| match ids[64 * y + x] {
         VisibilityId::Triangle(index) => buffers.source_triangle(index),
         _ => None,
@@ -263,7 +275,7 @@ fn scene_with_512_textures_is_drawn_in_one_call() {
     }
 }
 
-/// Renders the square of a scene with this normal and tangent at all corners. With `is_flattened`, the square has no
+/// Renders the square of a scene with `normal` and `tangent` at all corners. With `is_flattened`, the square has no
 /// area on the screen.
 fn render_with_normals(scene: &Arc<Scene>, normal: [f32; 3], tangent: [f32; 4], is_flattened: bool) -> Vec<u8> {
     let mut renderer = open_renderer();
