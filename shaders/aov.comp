@@ -1,11 +1,12 @@
 // AOV (arbitrary output variable) readback of one field: DEPTH, NORMALS or VALUES. The macro of that name is defined.
-//   ids      (in)  [height][width][SAMPLES]  R32UI, bottom row first
+// SAMPLES is 1 with DEPTH and NORMALS.
+//   ids      (in)  [height][width][SAMPLES]  R32UI, bottom row first; NO_ID where no surface is visible
 //   values   (in)  [vertices]                a scalar per vertex, with VALUES
 //   words    (out) top row first, one of
-//     DEPTH    [height][width]           f32: depth along the view axis times `scale`; infinite without an id
-//     NORMALS  [height][width][3]        f32: unit normal of the visible side; zeros without an id
+//     DEPTH    [height][width]           f32: depth along the view axis times `scale`; infinite with NO_ID
+//     NORMALS  [height][width][3]        f32: unit normal of the visible side; zeros with NO_ID
 //     VALUES   [height][width][SAMPLES]  value times `scale`, and the cosine between the normal and the direction to the
-//                                        eye, 16 bits each. Both are 0 without an id; otherwise the cosine is at least
+//                                        eye, 16 bits each. Both are 0 with NO_ID. Otherwise the cosine is at least
 //                                        1 / 65535.
 layout(local_size_x = WORKGROUP_SIZE) in;
 layout(location = 0) uniform int scale_bits; // `scale` as the bits of a float
@@ -20,7 +21,7 @@ struct SurfacePoint {
     vec3 depths;     // of the corners, along the view axis
     vec3 world;
     vec3 normal;     // on the visible side; not normalized
-    ivec3 vertices;
+    ivec3 vertices;  // indices of the corners' vertices
 };
 
 SurfacePoint interpolate_surface(int triangle_index, vec2 ndc) {
@@ -44,7 +45,7 @@ vec3 normalize_or_zero(vec3 v) {
 
 #ifdef DEPTH
 float depth_of(uint id, vec2 ndc) {
-    if (id == NO_ID) return uintBitsToFloat(0x7F800000u);
+    if (id == NO_ID) return uintBitsToFloat(0x7F800000u); // infinity
 #ifdef HAS_GROUND
     if (id == GROUND_ID) return ground_ray_depth(view_ray(ndc));
 #endif
@@ -78,7 +79,7 @@ void main() {
     uint output_index = uint(size.y - 1 - pixel.y) * uint(size.x) + uint(pixel.x);
     float scale = intBitsToFloat(scale_bits);
     for (int sample_index = 0; sample_index < SAMPLES; sample_index++) {
-        // Not `load_id`: this pass clears its ids, so each id is valid.
+        // No depth test as in `load_id`: this pass clears its ids, so each id is valid.
         uint id = texelFetch(ids, pixel, sample_index).x;
         vec2 ndc = 2.0 * (vec2(pixel) + SAMPLE_POSITIONS[sample_index]) / vec2(size) - 1.0;
 #ifdef DEPTH

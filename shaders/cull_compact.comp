@@ -1,6 +1,7 @@
-// Compacts the triangles whose bits are set to index lists in draw order. A group's list begins at the group's first
-// triangle. The offset of a block in the list is a prefix sum: totals of the group's preceding superblocks, plus bits of
-// the preceding blocks in the same superblock. So the order does not depend on scheduling.
+// Writes the index lists of the visible triangles, those whose bits are set, in draw order. A group's list begins at
+// the index of the group's first triangle. The offset of a block in the list is the number of visible triangles before
+// it: the totals of the group's preceding superblocks, plus the bits of the preceding blocks in the same superblock. So
+// the order does not depend on scheduling. `shared/cull.glsl` defines groups, blocks and superblocks.
 //   indices       (out)  [triangles][3]  of vertices, or of corners
 //   triangle_ids  (out)  [triangles]     index in the draw order, which the fragments write as id
 layout(local_size_x = WORKGROUP_SIZE) in;
@@ -26,6 +27,7 @@ void main() {
     if (partial_sum > 0u) atomicAdd(preceding_count, partial_sum);
     memoryBarrierShared();
     barrier();
+    // `lower_lanes`: mask of the lanes before this lane in its word. `lower_lanes + 1` is the bit of this lane.
     uint lane_word = block_word + lane / 32u, lower_lanes = (1u << (lane & 31u)) - 1u;
     uint mask = bits[lane_word];
     if ((mask & (lower_lanes + 1u)) == 0u) return;

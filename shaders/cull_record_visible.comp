@@ -1,8 +1,10 @@
-// Records in a bitmap the triangles that are visible in at least one sample: the occluders of the next frame.
+// Records in a bitmap the triangles that are visible in at least one sample: the occluders of the next frame. The
+// bitmap has one bit for each triangle of each block. `shared/cull.glsl` defines groups and blocks.
 layout(local_size_x = 8, local_size_y = 8) in;
 layout(std430, binding = 3) buffer PreviouslyVisible { uint previously_visible[]; };
 
 void record_triangle(uint triangle) {
+    // The last group whose first triangle is not after `triangle`.
     uint group = groups.count.x - 1u;
     while (group > 0u && triangle < groups.ranges[group].x) group--;
     uint bit_index = groups.ranges[group].w * uint(WORKGROUP_SIZE) + triangle - groups.ranges[group].x;

@@ -1,13 +1,13 @@
-// Selects the triangles that the rasterizer must process: all except those that certainly cover no sample. Each bound is
-// widened by the rounding errors between a vertex and its position on the device's subpixel grid, so that culling does
-// not change the image. A triangle that the rasterizer may have to clip is culled only if it lies entirely outside one
-// clip plane. The shader has four variants:
+// Selects the triangles that the rasterizer must process: all except those that certainly cover no sample. Each bound
+// is widened by the rounding errors between a vertex and its position on the device's subpixel grid, so that culling
+// does not change the image. A triangle that the rasterizer may have to clip is culled only if it lies entirely outside
+// one clip plane. The shader has four variants:
 //   (none)         for the camera
-//   CULL_OCCLUDED  for the camera, also against the depth pyramid of the triangles drawn by CULL_PREVIOUS
 //   CULL_PREVIOUS  selects the triangles that were visible in the last frame, without a test
+//   CULL_OCCLUDED  for the camera, also against the depth pyramid of the triangles that CULL_PREVIOUS selected
 //   CULL_SHADOW    for the shadow map
 layout(local_size_x = WORKGROUP_SIZE) in;
-layout(location = 0) uniform int size_packed; // width, and height shifted by 16: negative from 32768 on
+layout(location = 0) uniform int size_packed; // width in the lower 16 bits, height in the upper 16
 layout(binding = 13) uniform samplerBuffer positions;
 layout(binding = 18) uniform usamplerBuffer triangle_vertices;
 
@@ -20,6 +20,7 @@ const uint OCCLUDED = 4u;
 const uint CLASS_COUNT = 5u;
 
 #ifndef CULL_PREVIOUS
+// Numbers of triangles by class: of the camera, then of the shadow map. FIRST_COUNTER is 0 or CLASS_COUNT.
 layout(std430, binding = 2) buffer CullCounters { uint cull_counters[2u * CLASS_COUNT]; };
 #endif
 #if defined(CULL_PREVIOUS) || defined(CULL_OCCLUDED)
@@ -31,7 +32,8 @@ shared uint class_counts[CLASS_COUNT];
 
 #ifndef CULL_PREVIOUS
 // Bound on the difference of two evaluations of a matrix-vector product, relative to the sum of the terms' magnitudes.
-// In each evaluation, four products and three sums round by 2^-24 of that sum: 14 roundings, bounded by 2^-20.
+// In each evaluation, four products and three sums round by 2^-24 of that sum: 14 roundings, which are less than
+// 16 x 2^-24 = 2^-20.
 const float ROUNDING = 1.0 / 1048576.0;
 // Relative error of a float after four roundings: 2^-22.
 const float FLOAT_ERROR = 1.0 / 4194304.0;
@@ -75,8 +77,8 @@ ClipVertex clip_vertex(vec3 world) {
 #ifdef CULL_OCCLUDED
 layout(std430, binding = 4) readonly buffer DepthPyramid { float depths[]; };
 
-// Whether all pixels of a rectangle have drawn surfaces nearer than `depth`. Looks them up in the finest level in which
-// the rectangle spans at most 4 x 4 texels. `size`: width and height of the image.
+// Whether all pixels of a rectangle have drawn surfaces nearer than `depth`. Reads the finest level of the depth
+// pyramid in which the rectangle spans at most 4 x 4 texels. `size`: width and height of the image.
 bool is_occluded(uvec2 min_pixel, uvec2 max_pixel, uvec2 size, float depth) {
     uint level = 0u, level_offset = 0u;
     while (level < MAX_LEVEL && any(greaterThan((max_pixel >> level) - (min_pixel >> level), uvec2(3u)))) {
@@ -103,6 +105,7 @@ uint classify_unclipped(ClipVertex corners[3], bool is_single_sided) {
     for (int corner = 0; corner < 3; corner++) {
         vec4 clip = corners[corner].clip, error_bound = corners[corner].error_bound;
         vec3 ndc = clip.xyz / clip.w;
+        // Bound on the error of the quotient, plus its own rounding.
         vec3 ndc_error = (error_bound.xyz + abs(ndc) * error_bound.w) / (clip.w - error_bound.w) + FLOAT_ERROR * abs(ndc);
         position[corner] = (0.5 * ndc.xy + 0.5) * size;
         depth[corner] = 0.5 * ndc.z + 0.5;
@@ -114,6 +117,8 @@ uint classify_unclipped(ClipVertex corners[3], bool is_single_sided) {
     pixel_error += max(size.x, size.y) * FLOAT_ERROR + groups.subpixel_step.x;
     vec2 min_position = min(position[0], min(position[1], position[2])) - pixel_error;
     vec2 max_position = max(position[0], max(position[1], position[2])) + pixel_error;
+    // Samples lie at all integers plus a sample position. The bounding box contains one if an integer remains in x and
+    // in y.
     bool covers_sample = false;
     for (int sample_index = 0; sample_index < SAMPLES; sample_index++) {
         vec2 sample_position = SAMPLE_POSITIONS[sample_index];
@@ -122,6 +127,7 @@ uint classify_unclipped(ClipVertex corners[3], bool is_single_sided) {
     if (!covers_sample) return NO_SAMPLE;
     vec2 edge_ab = position[1] - position[0], edge_ac = position[2] - position[0];
     float area = edge_ab.x * edge_ac.y - edge_ab.y * edge_ac.x; // twice the signed area
+    // A component of an edge is off by at most 2 `pixel_error`. The error of the two products follows.
     float area_magnitude = abs(edge_ab.x * edge_ac.y) + abs(edge_ab.y * edge_ac.x);
     float area_error = 2.0 * pixel_error * (abs(edge_ab.x) + abs(edge_ab.y) + abs(edge_ac.x) + abs(edge_ac.y))
         + 8.0 * pixel_error * pixel_error + FLOAT_ERROR * area_magnitude;
@@ -129,8 +135,9 @@ uint classify_unclipped(ClipVertex corners[3], bool is_single_sided) {
 #ifdef CULL_OCCLUDED
     float min_area = abs(area) - area_error;
     if (!(min_area > 0.0)) return VISIBLE;
-    // `slope` is an upper bound of the depth slope per pixel. `margin` bounds the depth difference between the exact plane
-    // and the plane through the rounded corners, also at a sample that is outside the triangle by the rounding error.
+    // `slope` is an upper bound of the depth slope per pixel. `margin` bounds the depth difference between the exact
+    // plane and the plane through the rounded corners, also at a sample that is outside the triangle by the rounding
+    // error. `reach` bounds the distances, in pixels, that the rasterizer multiplies by the slope with rounding.
     vec2 depth_change = abs(vec2(depth[1], depth[2]) - depth[0]) + 2.0 * depth_error;
     float slope = (depth_change.x * (abs(edge_ac.x) + abs(edge_ac.y)) + depth_change.y * (abs(edge_ab.x) + abs(edge_ab.y))) / min_area;
     vec2 extent = max_position - min_position;
@@ -197,12 +204,14 @@ void main() {
     if (lane < MASK_WORDS) {
         bits[block.index * MASK_WORDS + lane] = mask_words[lane];
 #ifdef CULL_OCCLUDED
-        // This frame's occluders are already drawn. Clear the bitmap, so that the frame's visible triangles can be recorded.
+        // This frame's occluders are already drawn. Clear the bitmap, so that the frame's visible triangles can be
+        // recorded.
         previously_visible[block.index * MASK_WORDS + lane] = 0u;
 #endif
     }
     // Integer sums do not depend on the order of the workgroups.
     if (lane == 0u && class_counts[VISIBLE] > 0u) {
+        // The first of a command's 5 words is its number of indices.
         atomicAdd(draws.commands[5u * block.group], 3u * class_counts[VISIBLE]);
         atomicAdd(draws.totals[block.index / SUPERBLOCK], class_counts[VISIBLE]);
     }

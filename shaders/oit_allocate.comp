@@ -1,6 +1,6 @@
-// Allocates the list of each pixel. A tile allocates its records contiguously; a prefix sum over its pixels gives the
-// offset of each list. The order of the tiles varies, but does not affect the image. Tiles with fragments are appended
-// to the tile list.
+// Allocates the list of each pixel. A list has one record per fragment. A tile of pixels allocates its records
+// contiguously, and a prefix sum over its pixels gives the offset of each list. The order of the tiles varies, but does
+// not affect the image. Tiles with fragments are appended to the tile list.
 layout(local_size_x = TILE, local_size_y = TILE) in;
 layout(std430, binding = 2) writeonly buffer Records { uint records[]; };
 shared uint scan[TILE * TILE];
@@ -11,6 +11,7 @@ shared uint tile_has_fragments;
 // Maximum number of records per pixel for which all lists fit the budget; UNBOUNDED if all fragments fit. Raising the
 // limit from k to k + 1 needs one more record for each pixel with more than k fragments.
 uint fit_per_pixel_limit() {
+    // `fragment_total[1]` is the high word of the total.
     if (counters.fragment_total[1] == 0u && counters.fragment_total[0] <= counters.budget) return UNBOUNDED;
     uint pixels_above = 0u;
     for (int bin = 0; bin < BINS; bin++) pixels_above += counters.bins[bin];

@@ -1,7 +1,7 @@
-// Adds a fragment of a blended triangle to the list of its pixel. One program runs in three phases, so that all phases see
-// the same fragments. The first phase counts fragments, the second fills the lists. For a pixel with more fragments than
-// the limit, the second phase stores only the nearest depths, and the third adds their ids. Early depth tests reject
-// fragments behind opaque surfaces. Fully transparent fragments are skipped.
+// Adds a fragment of a blended triangle to the list of its pixel. One program runs in three phases, so that all phases
+// see the same fragments. The first phase counts fragments, the second fills the lists. For a pixel with more fragments
+// than the limit, the second phase stores only the nearest depths, and the third adds their ids. Early depth tests
+// reject fragments behind opaque surfaces. Fully transparent fragments are skipped.
 layout(early_fragment_tests) in;
 #if SAMPLES > 1 && defined(POST_DEPTH_COVERAGE)
 // gl_SampleMaskIn contains only samples that pass the depth test.
@@ -55,13 +55,13 @@ void main() {
         imageAtomicAdd(fragment_counts, pixel, 1u);
         return;
     }
-    bool is_below_limit = imageLoad(fragment_counts, pixel).x <= counters.per_pixel_limit;
-    if (is_below_limit && phase == PHASE_FILL) {
+    bool is_within_limit = imageLoad(fragment_counts, pixel).x <= counters.per_pixel_limit;
+    if (is_within_limit && phase == PHASE_FILL) {
         uint record = imageAtomicAdd(cursors, pixel, 1u);
         records[2u * record] = depth;
         records[2u * record + 1u] = id_and_coverage;
     }
-    if (is_below_limit) return;
+    if (is_within_limit) return;
     uint first_record = imageLoad(cursors, pixel).x;
     if (phase == PHASE_FILL) insert_depth(first_record, depth);
     else insert_id(first_record, depth, id_and_coverage);

@@ -1,5 +1,5 @@
-// Resolves the list of a pixel to one blend layer per sample: sorts the fragments, shades them like opaque surfaces, and
-// blends them front to back. A fragment is shaded once, at the center of the samples that it covers.
+// Resolves the list of a pixel to one blend layer per sample: sorts the fragments, shades them like opaque surfaces,
+// and blends them front to back. A fragment is shaded once, at the center of the samples that it covers.
 //   blend_layers  (out)  [SAMPLES][height][width]  RGBA16F: light of the blended surfaces, transmittance
 layout(local_size_x = TILE, local_size_y = TILE) in;
 layout(rgba16f, binding = 3) uniform writeonly image2DArray blend_layers;
@@ -66,7 +66,7 @@ void main() {
     uint record_count = min(fragment_count, counters.per_pixel_limit);
     uint first_record = imageLoad(cursors, pixel).x;
     if (fragment_count <= counters.per_pixel_limit) {
-        // The gather phases sort only the lists above the limit. They leave the cursor of other lists at the end.
+        // The gather phases sort only the lists above the limit. They leave the cursor of a shorter list at its end.
         first_record -= record_count;
         // At this length, both sorts take a similar number of steps.
         if (record_count <= 32u) insertion_sort(first_record, record_count);
@@ -74,6 +74,7 @@ void main() {
     }
     vec4 sample_blends[SAMPLES];
     for (int index = 0; index < SAMPLES; index++) sample_blends[index] = vec4(0.0, 0.0, 0.0, 1.0);
+    // Whether a sample still transmits light, so that farther fragments are visible.
     bool is_transparent = true;
     for (uint record_index = 0u; record_index < record_count && is_transparent; record_index++) {
         uvec2 record = records[first_record + record_index];

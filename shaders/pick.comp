@@ -1,7 +1,7 @@
 // Reads back the triangles that are visible in a small rectangle of pixels. The host intersects them with view rays in
 // f64.
 //   ids     (in)   [height][width]      R32UI, bottom row first; the rectangle is at the lower left
-//   picked  (out)  [rows][columns][22]  top row first: id, three corners, three positions, three normals
+//   picked  (out)  [rows][columns][22]  top row first: id, 3 corners, 3 positions, 3 normals: 1 + 3 + 9 + 9 words
 layout(local_size_x = WORKGROUP_SIZE) in;
 layout(location = 0) uniform int rectangle; // columns, and rows shifted by 16
 layout(std430, binding = 0) writeonly buffer Words { uint picked[]; };
@@ -10,11 +10,11 @@ void main() {
     ivec2 size = ivec2(rectangle & 0xFFFF, rectangle >> 16);
     ivec2 pixel = ivec2(gl_GlobalInvocationID.xy);
     if (any(greaterThanEqual(pixel, size))) return;
-    // Word offsets of the rest: 1 for the corners, 4 for the positions, 13 for the normals.
     uint id = texelFetch(ids, pixel, 0).x;
     uint first_word = 22u * uint((size.y - 1 - pixel.y) * size.x + pixel.x);
     picked[first_word] = id;
     if (id == NO_ID) return;
+    // Word offsets: 1 for the corners, 4 for the positions, 13 for the normals.
     ivec3 corners = ivec3(texelFetch(triangle_corners, int(id - 1u)).xyz);
     ivec3 vertices = ivec3(texelFetch(triangle_vertices, int(id - 1u)).xyz);
     for (int corner = 0; corner < 3; corner++) {

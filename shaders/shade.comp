@@ -4,9 +4,10 @@
 //   blend_layers  (in)   [height][width][SAMPLES]  RGBA16F: light of the blended surfaces, transmittance
 //   scene_color   (out)  [height][width]           RGBA16F
 //   bloom_source  (out)  [height][width]           RGBA16F: light above the bloom threshold
-// All images have the bottom row first. The shading runs as two dispatches. The first, with BACKGROUND, covers all tiles
-// of pixels: it shades tiles that see only sky and ground, and lists the other tiles. The second covers the listed tiles.
-// This is for software rasterizers, which execute both sides of every branch: most tiles of most images see no triangle.
+// All images have the bottom row first. The shading runs as two dispatches. The first, with BACKGROUND, covers all
+// tiles of pixels: it shades tiles that see only sky and ground, and lists the other tiles. The second covers the
+// listed tiles. This is for software rasterizers, which execute both sides of every branch: most tiles of most images
+// see no triangle.
 layout(local_size_x = TILE, local_size_y = TILE) in;
 #ifdef OIT
 // Exact transparency: one layer of the array per sample, written only where there are blended fragments.
@@ -31,6 +32,7 @@ shared uint tile_has_triangle;
 uint sample_id(ivec2 pixel, int sample_index, ivec2 size) {
     uint id = load_id(pixel, sample_index);
 #ifdef HAS_GROUND
+    // `eye.w` is 1 if the camera is above the ground.
     if (id == NO_ID && frame.eye.w > 0.0) {
         vec2 ndc = 2.0 * (vec2(pixel) + SAMPLE_POSITIONS[sample_index]) / vec2(size) - 1.0;
         if (ray_hits_ground(view_ray(ndc))) id = GROUND_ID;
@@ -59,8 +61,8 @@ vec3 shade_pixel(ivec2 pixel, ivec2 size, uint sample_ids[SAMPLES]) {
 #ifdef OIT
     bool has_fragments = texelFetch(fragment_counts, pixel, 0).x > 0u;
 #endif
-    // Each iteration shades one distinct id. A `while` loop would run once more on a software rasterizer, which executes
-    // the body for inactive lanes.
+    // Each iteration shades one distinct id. A `while` loop would run once more on a software rasterizer, which
+    // executes the body for inactive lanes.
     do {
         uint id = NO_ID;
         for (int sample_index = SAMPLES - 1; sample_index >= 0; sample_index--) {

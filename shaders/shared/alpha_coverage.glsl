@@ -1,11 +1,12 @@
 // Bit mask of the samples of a pixel that a cut-out surface covers. A sample is covered if its alpha, extrapolated from
 // the pixel center by screen-space derivatives, reaches the cutoff. Alpha to coverage is not available for integer
-// render targets. Where alpha changes fast, as on a leaf seen edge-on, the slope is clamped, so that alpha 0 still covers
-// no sample and alpha 1 covers all of them.
+// render targets. Where alpha changes fast, as on a leaf seen edge-on, the slope is clamped, so that alpha 0 still
+// covers no sample and alpha 1 covers all of them.
 int covered_samples(float alpha, float cutoff) {
 #if SAMPLES > 1
     vec2 slope = vec2(dFdx(alpha), dFdy(alpha));
-    // A sample is at most half a pixel from the center in x and in y.
+    // A sample is at most half a pixel from the center in x and in y. So its alpha differs from `alpha` by at most half
+    // of `max_slope`.
     float max_slope = 2.0 * min(cutoff, 1.0 - cutoff);
     slope *= min(1.0, max_slope / max(abs(slope.x) + abs(slope.y), 1e-6));
     int mask = 0;

@@ -13,6 +13,7 @@ vec3 extract_bloom(vec3 light) {
 }
 #endif
 
+// Adds `count` samples that have the same light.
 void accumulate_sample(inout PixelAccumulator sum, vec3 light, float count) {
 #ifdef EXPOSURE
     light *= EXPOSURE;

@@ -11,19 +11,21 @@ vec2 cascade_scale(int layer) { return vec2(1.0); }
 
 // Slope of the surface plane in the map: change of depth per texel in x and in y.
 vec2 receiver_plane_gradient(vec3 normal, int layer) {
-    // The rows of the map's matrix are the scaled axes of light space; the third points away from the sun.
+    // The rows a_i of the map's matrix are the scaled axes of light space. The third row points away from the sun. A
+    // point x has the map coordinates p_i = a_i . x, up to offsets. The plane of a surface with normal n is therefore
+    // sum_i p_i (n . a_i) / (a_i . a_i) = constant. The result is the gradient of p_2 as a function of p_0 and p_1.
     mat3 axes = transpose(mat3(frame.shadow_from_world));
     vec3 light_normal = vec3(dot(normal, axes[0]), dot(normal, axes[1]), dot(normal, axes[2]));
     vec3 axis_squares = vec3(dot(axes[0], axes[0]), dot(axes[1], axes[1]), dot(axes[2], axes[2]));
-    // Slopes steeper than ten to one are clamped; the sun is at a grazing angle there.
+    // Slopes steeper than ten to one, where the sun is at a grazing angle, are clamped.
     float clamped_z = max(abs(light_normal.z), 0.1 * sqrt(axis_squares.z)) * (light_normal.z < 0.0 ? -1.0 : 1.0);
     return -(light_normal.xy / axis_squares.xy) * (axis_squares.z / clamped_z) / (frame.shadow.w * cascade_scale(layer));
 }
 
 #ifdef SHADOW_VARIANCE
-// Bias that compensates for ground depth leaking into the blurred mean near a contact line. The leak would pull the mean
-// towards the sun, although the ground casts no shadow. Let h be the height above the line in standard deviations of the
-// blur, and k the depth difference of surface and ground per standard deviation. The ground shifts the mean by
+// Bias that compensates for ground depth leaking into the blurred mean near a contact line. The leak would pull the
+// mean towards the sun, although the ground casts no shadow. Let h be the height above the line in standard deviations
+// of the blur, and k the depth difference of surface and ground per standard deviation. The ground shifts the mean by
 // k (phi(h) - h Q(h)), with the density phi and the upper tail Q of the normal distribution. The bias
 // 0.4 k (1 - h / 2)^2 is an upper bound of this shift up to h = 1.9.
 float contact_bias(vec3 position, int layer, vec3 normal) {
@@ -48,9 +50,9 @@ float shadow_visibility(vec3 position, int layer, vec3 normal) {
     return clamp((bound - frame.shadow.y) / (1.0 - frame.shadow.y), 0.0, 1.0);
 }
 #else
-// Bias of the comparison. A texel is compared with the plane of the surface instead of the depth of the point, so that a
-// slope does not shadow itself. A caster must be at least the side of a texel in front of that plane. This covers curved
-// surfaces, whose triangles deviate from their normals, and the rounding of depth.
+// Bias of the comparison. A texel is compared with the plane of the surface instead of the depth of the point, so that
+// a slope does not shadow itself. A caster must be at least the side of a texel in front of that plane. This covers
+// curved surfaces, whose triangles deviate from their normals. 4e-7 is for the rounding of depth.
 float depth_bias(int layer) {
     vec3 light_depth_gradient = vec3(frame.shadow_from_world[0].z, frame.shadow_from_world[1].z, frame.shadow_from_world[2].z);
     vec2 layer_scale = cascade_scale(layer);
