@@ -1,5 +1,5 @@
-//! `modalcast inspect`: prints the content of a scene, the features that it uses, and the memory and passes that the
-//! omission of unused features saves.
+//! `modalcast inspect`: prints the content of a scene, the features that it uses, and the memory and passes that are
+//! saved because unused features are omitted.
 
 use serde::Serialize;
 use serde_json::{Value, json};
@@ -40,14 +40,15 @@ pub(super) fn run(args: &Args) -> Outcome {
     Ok(true)
 }
 
-/// Bytes of a domain's shape in host memory: rest positions, corners, triangles, U, and the vertex rings if the normals
-/// need them.
+/// Bytes of a domain's shape in host memory: rest positions, corners, triangles, U, and the smoothing groups if the
+/// normals need them.
 fn shape_bytes(scene: &Scene, domain: usize) -> usize {
     let shape = scene.shape_of(domain);
     let corners = shape.mesh.corners();
     // Vertex index, normal, texture coordinates and tangent.
     let bytes_per_corner =
         4 + 12 + if corners.uvs.is_empty() { 0 } else { 8 } + if shape.tangents().is_empty() { 0 } else { 16 };
+    // Three f32 per position, three u32 per triangle, and one f32 per entry of U.
     12 * shape.mesh.rest_positions().len()
         + bytes_per_corner * corners.vertices.len()
         + 12 * shape.mesh.triangles().len()
@@ -88,7 +89,7 @@ struct DomainReport<'a> {
     /// Host memory of the domain's shape.
     bytes: usize,
     shape: usize,
-    /// Index of the domain on the other side of the joint.
+    /// Index of the domain that this domain is attached to.
     parent: Option<usize>,
     /// Index of the domain whose transform this domain follows.
     follows: Option<usize>,
@@ -137,7 +138,10 @@ fn totals(scene: &Scene) -> Value {
     let mut is_counted = vec![false; scene.shapes.len()];
     let mut bytes = 0;
     for (index, domain) in scene.domains.iter().enumerate() {
-        bytes += if std::mem::replace(&mut is_counted[domain.shape], true) { 0 } else { shape_bytes(scene, index) };
+        if !is_counted[domain.shape] {
+            is_counted[domain.shape] = true;
+            bytes += shape_bytes(scene, index);
+        }
     }
     json!({
         "domains": scene.domains.len(),
@@ -286,7 +290,7 @@ mod tests {
         serde_json::from_str::<UniqueKeys>(&text).map(drop).expect("expected unique keys");
         assert!(
             serde_json::from_str::<UniqueKeys>(r#"[{"a": {"b": 1, "b": null}}]"#).is_err(),
-            "control: expected an error"
+            "negative control: expected an error for the repeated key 'b'"
         );
         let value: Value = serde_json::from_str(&text).expect("expected JSON");
         assert!(value["deformation"]["storage"].is_string(), "{}", value["deformation"]);

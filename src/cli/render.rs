@@ -134,7 +134,7 @@ fn read_coordinates(scene: &Scene, path: &PathBuf) -> Result<Vec<f32>> {
         return Err(Error::NotFound { what: "q", given: path.display().to_string() });
     }
     let file_bytes = fs::metadata(path).map_err(|error| invalid(&field, "a .npy file", error))?.len();
-    // Entries of f64 and at most 64 KiB of header. The size is checked before the file is read into memory.
+    // 8 bytes per f64 entry, and at most 64 KiB of header. The size is checked before the file is read into memory.
     let max_bytes = 8 * scene.layout.coordinates as u64 + 65536;
     if file_bytes > max_bytes {
         return Err(invalid(&field, format!("{expected}: at most {max_bytes} bytes"), format!("{file_bytes} bytes")));

@@ -23,17 +23,17 @@ pub fn viridis(fraction: f32) -> [f32; 3] {
     })
 }
 
-/// Gray level of the background, linear.
+/// Linear gray of the background.
 const BACKGROUND: f32 = 0.87;
 /// The fraction of the light that does not depend on the orientation of the surface.
 const AMBIENT_FRACTION: f32 = 0.62;
 
-/// Converts the samples of an AOV of values to RGBA8 sRGB. A sample is one word, 0 for the background. Otherwise its
-/// lower 16 bits are the value as a fraction of the axis, and its upper 16 bits are the cosine of the angle between
-/// normal and view direction. Both are scaled by 65535.
+/// Converts the samples of an AOV (arbitrary output variable) of values to RGBA8 sRGB. A sample is one word, 0 for the
+/// background. Otherwise its lower 16 bits are the value as a fraction of the axis, and its upper 16 bits are the
+/// cosine of the angle between the normal and the direction to the camera. Both are scaled by 65535.
 ///
-/// A surface that faces the camera has exactly the viridis color. An inclined surface has up to 38 % less light, so that
-/// the shape is visible. A pixel is the mean of its samples in linear light.
+/// A surface that faces the camera has exactly the viridis color. An inclined surface has up to 38 % less light
+/// (1 - `AMBIENT_FRACTION`), so that the shape is visible. A pixel is the mean of its samples in linear light.
 pub fn apply_colormap(words: &[u32], samples: usize) -> Vec<u8> {
     let linear_color = |word: u32| match word {
         0 => [BACKGROUND; 3],
@@ -101,7 +101,7 @@ mod tests {
     #[test]
     fn apply_colormap_shades_surfaces_and_averages_samples() {
         let facing_word = |value: u32| 0xFFFF_0000 | value;
-        // The value is 0, as in the first pixel; the cosine is nearly 0.
+        // The value is 0, as in the first pixel, and the cosine is 1 / 65535.
         let edge_on_word = 0x0001_0000;
         let rgba = apply_colormap(&[facing_word(0), facing_word(65535), 0, edge_on_word], 1);
         let expected = |fraction: f32| viridis(fraction).map(|channel| (255.0 * channel).round() as u8);

@@ -11,7 +11,7 @@ use modalcast_model::error::{Result, fault_in};
 pub struct Legend {
     /// The quantity and its unit.
     pub title: String,
-    /// The value at the bright end of the axis; the dark end is 0.
+    /// The value at the bright end of the axis. The value at the dark end is 0.
     pub scale_max: f64,
 }
 
@@ -102,7 +102,7 @@ impl Canvas<'_> {
         let [right, bottom] =
             [left + rectangle.width * self.pixels_per_unit, top + rectangle.height * self.pixels_per_unit];
         let radius = radius * self.pixels_per_unit;
-        // Each corner: its point, and the directions of the incoming and the outgoing edge.
+        // Each corner, clockwise: its point, and the directions of the incoming and the outgoing edge.
         let corners = [
             (point(right, top), point(1.0, 0.0), point(0.0, 1.0)),
             (point(right, bottom), point(0.0, 1.0), point(-1.0, 0.0)),
@@ -140,6 +140,7 @@ impl Canvas<'_> {
     fn draw_text(&mut self, text: &str, baseline: Baseline, font_size: f32) {
         let font = self.font.clone();
         let em = font.units_per_em().unwrap_or(font.height_unscaled());
+        // A `PxScale` is the height of the font, which differs from the em square.
         let px_scale = PxScale::from(font_size * self.pixels_per_unit * font.height_unscaled() / em);
         let scaled_font = font.as_scaled(px_scale);
         let mut pen_x = 0.0;
@@ -233,7 +234,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn nice_ceiling_and_ticks_give_round_numbers() {
+    fn rounded_scales_and_tick_labels_are_round_numbers() {
         let rounded = [0.013, 0.2, 0.21, 3.0, 7.0, 1e-9, 1e9, 0.0, f64::NAN].map(round_up_scale);
         for (actual, expected) in rounded.iter().zip([0.02, 0.2, 0.25, 5.0, 10.0, 1e-9, 1e9, 1.0, 1.0]) {
             assert!((actual / expected - 1.0).abs() < 1e-9, "expected {expected}, got {actual}");

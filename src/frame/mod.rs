@@ -21,9 +21,9 @@ pub fn draw_color_map(word_bytes: &[u8], samples: u32, size: [u32; 2], legend: &
     Ok(rgba)
 }
 
-/// Encodes RGBA8 sRGB pixels, top row first, as PNG. The file has no alpha channel if every pixel is opaque. Uses filter
-/// Sub with fast compression. On rendered frames this takes a quarter of the time of adaptive filters and yields smaller
-/// files.
+/// Encodes RGBA8 sRGB pixels, top row first, as PNG. The file has no alpha channel if every pixel is opaque. Uses
+/// filter Sub with fast compression. On rendered frames this takes a quarter of the time of adaptive filters and yields
+/// smaller files.
 ///
 /// # Errors
 /// `Fault` when the encoder fails.
@@ -70,6 +70,7 @@ mod tests {
 
     #[test]
     fn png_round_trip_keeps_pixels_and_drops_opaque_alpha() {
+        // 5 x 3 pixels of four bytes.
         let translucent: Vec<u8> = (0..4 * 5 * 3).map(|byte| byte as u8 * 4).collect();
         let mut opaque = translucent.clone();
         opaque.chunks_exact_mut(4).for_each(|pixel| pixel[3] = 255);

@@ -21,15 +21,15 @@ pub(super) struct Evaluation {
     renderer: String,
     steps: usize,
     steps_per_second: f64,
-    /// Median milliseconds per stage.
+    /// Names and median milliseconds of the stages.
     stages: Vec<(String, f64)>,
-    /// Largest distance to the reference, in scene units and as a fraction of the diagonal.
+    /// Largest distance of a received vertex from the reference, in scene units and as a fraction of the diagonal.
     error: f64,
     relative_error: f64,
-    /// Largest distance from the rest position, in scene units and as a fraction of the diagonal.
+    /// Largest distance of a received vertex from its rest position, in scene units and as a fraction of the diagonal.
     displacement: f64,
     relative_displacement: f64,
-    /// Largest distance from the rest position in the top tenth of the scene, as a fraction of the scene's height.
+    /// The displacement of the top tenth of the scene alone, as a fraction of the scene's height.
     sway: f64,
     /// Largest [`Joint::gap`], as a fraction of the diagonal. `None` without joints.
     joint_gap: Option<f64>,
@@ -198,7 +198,7 @@ impl MinimumMotion {
 struct Joint {
     /// Index of the child's transform.
     transform_index: usize,
-    /// Vertices of the ring in the packed positions.
+    /// Vertices of the ring, as indices in the positions of the whole scene.
     ring: Vec<usize>,
 }
 
@@ -210,7 +210,7 @@ impl Joint {
         let diagonal = scene.rest_bounds.diagonal();
         let joint = |(child, domain): (usize, &modalcast_model::domain::Domain)| {
             let attachment = domain.attachment.as_ref().filter(|attachment| !attachment.rows.is_empty())?;
-            // A child that follows another domain has no transform of its own.
+            // A child that follows another domain has no transform of its own. Its gap is not checked.
             let transform_index = scene
                 .transform_roots
                 .root_from_domain(child)
