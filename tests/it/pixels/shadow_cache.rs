@@ -186,7 +186,7 @@ fn frames_of_an_engine_step_share_its_shadow() {
     loaded_scene.deform(&state).expect("expected the step to succeed");
     let second_frames = draw_frames(&mut context, &mut loaded_scene);
     assert_eq!(pass_counts(&second_frames), [2, 0], "expected a shadow pass for a new step");
-    // A step that fails, because the positions overflow.
+    // This step fails: the squares of such positions overflow f32.
     state.transforms[last_domain].0[3] = 1e30;
     loaded_scene.deform(&state).expect_err("expected an overflow error");
     let third_frames = draw_frames(&mut context, &mut loaded_scene);
