@@ -30,7 +30,8 @@ impl CutOutSoup {
         let (soup, cut_outs) = (&self.soup, &self.cut_outs);
         let mut is_ambiguous = vec![false; soup.viewport.pixel_count()];
         for (triangle, cull_mode) in soup.groups.iter().flat_map(|group| {
-            (group.first..group.first + group.triangles).map(move |triangle| (triangle, group.cull_mode))
+            (group.first_triangle..group.first_triangle + group.triangle_count)
+                .map(move |triangle| (triangle, group.cull_mode))
         }) {
             let Some(cut_out_index) = triangle.checked_sub(cut_outs.first) else { continue };
             let vertices = soup.triangles[triangle as usize];
@@ -108,7 +109,7 @@ pub(crate) fn sheet_soup(side: u32, image: AlphaImage) -> CutOutSoup {
         images: vec![image],
         anisotropy: 1.0,
     };
-    let groups = vec![DrawRange { first: 0, triangles: 2, cull_mode: CullMode::Back }];
+    let groups = vec![DrawRange { first_triangle: 0, triangle_count: 2, cull_mode: CullMode::Back }];
     CutOutSoup {
         soup: Soup { name: "sheet", positions, triangles, groups, viewport: clip_space_viewport(side, side) },
         cut_outs,
@@ -143,8 +144,8 @@ pub(crate) fn floor_soup(divisions: u32) -> CutOutSoup {
     };
     let viewport: Viewport = perspective_viewport(192, 128, 0.1, 100.0);
     let groups = vec![
-        DrawRange { first: 0, triangles: 2, cull_mode: CullMode::Back },
-        DrawRange { first: 2, triangles: triangles.len() as u32 - 2, cull_mode: CullMode::None },
+        DrawRange { first_triangle: 0, triangle_count: 2, cull_mode: CullMode::Back },
+        DrawRange { first_triangle: 2, triangle_count: triangles.len() as u32 - 2, cull_mode: CullMode::None },
     ];
     CutOutSoup { soup: Soup { name: "floor", positions, triangles, groups, viewport }, cut_outs }
 }

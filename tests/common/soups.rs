@@ -24,8 +24,8 @@ impl Soup {
         let first_half = triangles.len() as u32 / 2;
         let second_half = triangles.len() as u32 - first_half;
         let groups = vec![
-            DrawRange { first: 0, triangles: first_half, cull_mode: CullMode::None },
-            DrawRange { first: first_half, triangles: second_half, cull_mode: CullMode::Back },
+            DrawRange { first_triangle: 0, triangle_count: first_half, cull_mode: CullMode::None },
+            DrawRange { first_triangle: first_half, triangle_count: second_half, cull_mode: CullMode::Back },
         ];
         Self { name, positions, triangles, groups, viewport }
     }
@@ -86,7 +86,7 @@ pub(crate) fn fan_soup(viewport: Viewport) -> Soup {
     }
     let triangles = (0..spokes).map(|spoke| [0, 1 + spoke, 1 + (spoke + 1) % spokes]).collect();
     let mut soup = Soup::new("fan", positions, triangles, viewport);
-    soup.groups = vec![DrawRange { first: 0, triangles: spokes, cull_mode: CullMode::None }];
+    soup.groups = vec![DrawRange { first_triangle: 0, triangle_count: spokes, cull_mode: CullMode::None }];
     soup
 }
 

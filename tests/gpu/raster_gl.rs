@@ -52,7 +52,8 @@ fn soup_geometry(positions: GlBuffer, soup: &Soup, cut_outs: Option<CutOuts>) ->
 /// The bits of the depths that the reference rasterizer draws without culling, as in a depth-only pass.
 fn two_sided_depths(soup: &Soup, cut_outs: Option<&CutOuts>) -> Vec<u32> {
     let mut rasterizer = VisibilityBuffer::new(soup.viewport);
-    let all_triangles = DrawRange { first: 0, triangles: soup.triangles.len() as u32, cull_mode: CullMode::None };
+    let all_triangles =
+        DrawRange { first_triangle: 0, triangle_count: soup.triangles.len() as u32, cull_mode: CullMode::None };
     match cut_outs {
         Some(cut_outs) => rasterizer.draw_cut_out(&soup.positions, &soup.triangles, all_triangles, cut_outs),
         None => rasterizer.draw(&soup.positions, &soup.triangles, all_triangles),
@@ -231,7 +232,8 @@ fn gpu_positions_shared_with_a_deformer_are_drawn() {
     .expect("expected a CUDA deformer");
     assert!(deformer.shares_buffers(), "expected shared buffers");
     let triangles = scene.triangle_vertices();
-    let all_triangles = DrawRange { first: 0, triangles: triangles.len() as u32, cull_mode: CullMode::None };
+    let all_triangles =
+        DrawRange { first_triangle: 0, triangle_count: triangles.len() as u32, cull_mode: CullMode::None };
     let geometry =
         RasterGeometry { positions, triangles: triangles.clone(), groups: vec![all_triangles], cut_outs: None };
     let mut rasterizer = CudaRasterizer::new(&context.device, geometry)

@@ -221,12 +221,15 @@ fn uniform_images_keep_all_or_nothing_of_a_triangle() {
         let is_material_opaque = [false, true, false, true, true, false, false];
         let mut expected = VisibilityBuffer::new(soup.viewport);
         for group in &soup.groups {
-            for triangle in group.first..group.first + group.triangles {
+            for triangle in group.first_triangle..group.first_triangle + group.triangle_count {
                 let cut_out_index = triangle.checked_sub(cut_outs.first);
                 let material = cut_out_index.map(|index| cut_outs.material_indices[index as usize]);
                 if material.is_none_or(|material| is_material_opaque[material as usize]) {
-                    let range =
-                        modalcast_model::scene::DrawRange { first: triangle, triangles: 1, cull_mode: group.cull_mode };
+                    let range = modalcast_model::scene::DrawRange {
+                        first_triangle: triangle,
+                        triangle_count: 1,
+                        cull_mode: group.cull_mode,
+                    };
                     expected.draw(&soup.positions, &soup.triangles, range);
                 }
             }

@@ -206,7 +206,7 @@ fn rasterize_like_kernels(soup: &Soup, strip_splits: u32) -> (Vec<u64>, [usize; 
         triangle_counts: [0; 3],
     };
     for group in &soup.groups {
-        (group.first..group.first + group.triangles)
+        (group.first_triangle..group.first_triangle + group.triangle_count)
             .rev()
             .for_each(|triangle| traversal.bin_triangle(triangle, group.cull_mode));
     }
@@ -320,7 +320,7 @@ fn depth_ties_go_to_the_lower_id() {
     let positions = [triangle_at(0.5), triangle_at(0.5), triangle_at(0.25), triangle_at(0.25)].concat();
     let draw_ids_and_depths = |triangles: &[[u32; 3]]| {
         let mut raster = VisibilityBuffer::new(clip_space_viewport(4, 4));
-        let group = DrawRange { first: 0, triangles: triangles.len() as u32, cull_mode: CullMode::None };
+        let group = DrawRange { first_triangle: 0, triangle_count: triangles.len() as u32, cull_mode: CullMode::None };
         raster.draw(&positions, triangles, group);
         (raster.ids(), raster.depths())
     };
@@ -357,7 +357,11 @@ fn plane_depth_and_rectangle_coverage_are_exact() {
     let corners = [[-2.0, -2.0, -4.0], [2.0, -2.0, -9.0], [-1.0, 3.0, -20.0]];
     let mut raster = VisibilityBuffer::new(viewport);
     let positions = corners.map(|corner| corner.map(|number: f64| number as f32)).concat();
-    raster.draw(&positions, &[[0, 1, 2]], DrawRange { first: 0, triangles: 1, cull_mode: CullMode::None });
+    raster.draw(
+        &positions,
+        &[[0, 1, 2]],
+        DrawRange { first_triangle: 0, triangle_count: 1, cull_mode: CullMode::None },
+    );
     let [a, b, c] = corners.map(nalgebra::Vector3::from);
     let normal = (b - a).cross(&(c - a));
     // Half of the vertical field of view is 30 degrees.
@@ -380,6 +384,10 @@ fn plane_depth_and_rectangle_coverage_are_exact() {
     let mut raster = VisibilityBuffer::new(clip_space_viewport(100, 100));
     // The rectangle is 0.8 x 1.2 in a viewport of 2 x 2, which has 100 x 100 samples.
     let rectangle = [[-0.6, -0.4, 0.0], [0.2, -0.4, 0.0], [0.2, 0.8, 0.0], [-0.6, 0.8, 0.0]].concat();
-    raster.draw(&rectangle, &[[0, 1, 2], [0, 2, 3]], DrawRange { first: 0, triangles: 2, cull_mode: CullMode::Back });
+    raster.draw(
+        &rectangle,
+        &[[0, 1, 2], [0, 2, 3]],
+        DrawRange { first_triangle: 0, triangle_count: 2, cull_mode: CullMode::Back },
+    );
     assert_eq!(raster.ids().iter().flatten().count(), 40 * 60);
 }

@@ -97,7 +97,7 @@ impl VisibilityBuffer {
         range: DrawRange,
         passes_alpha_test: impl Fn(u32, [i32; 2]) -> bool,
     ) {
-        for triangle in range.first..range.first + range.triangles {
+        for triangle in range.first_triangle..range.first_triangle + range.triangle_count {
             if let Ok(clipped_polygon) =
                 clipped_polygon(&self.window, positions, triangles[triangle as usize], range.cull_mode)
             {

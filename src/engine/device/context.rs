@@ -244,7 +244,7 @@ impl DeviceContext {
         let params = loaded_scene.fill_buffers(renderer, &camera)?.frame_params(camera, size);
         let legend = loaded_scene.upload_scalar_field(renderer, frame_output)?;
         let aov = match (frame_output, &legend) {
-            (_, Some(legend)) => Aov::Values { largest: legend.scale_max as f32 },
+            (_, Some(legend)) => Aov::Values { scale_max: legend.scale_max as f32 },
             (FrameOutput::Depth, _) => Aov::Depth,
             (FrameOutput::Normals, _) => Aov::Normals,
             _ => Aov::Domains,

@@ -155,7 +155,7 @@ impl LoadedScene {
         let is_uploaded = self.fill_without_rebase(renderer)?;
         let Some(buffers) = &mut self.buffers else { return Err(no_buffers_error()) };
         let origins = match &self.current_state.origins {
-            Some(origins) if !origins.is_uniform() => Arc::clone(origins),
+            Some(origins) if !origins.has_no_outliers() => Arc::clone(origins),
             // All domains have the same origin (the scene's origin if `None`), so the deformer's output is drawn
             // unchanged.
             uniform_origins => {

@@ -95,7 +95,7 @@ impl FloatingOrigins {
     }
 
     /// Whether all domains use the shared origin: there are no outliers.
-    pub const fn is_uniform(&self) -> bool {
+    pub const fn has_no_outliers(&self) -> bool {
         self.outlier_count == 0
     }
 

@@ -71,9 +71,9 @@ pub enum CullMode {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct DrawRange {
     /// Index of the first triangle.
-    pub first: u32,
+    pub first_triangle: u32,
     /// Number of triangles.
-    pub triangles: u32,
+    pub triangle_count: u32,
     pub cull_mode: CullMode,
 }
 

@@ -111,7 +111,7 @@ impl SceneState {
         };
         // Before the first f64 step, all transforms are relative to the scene's origin. If some root has a floating
         // origin of its own, they must be rebased.
-        let needs_first_rebase = is_first_f64_step && !origins.is_uniform();
+        let needs_first_rebase = is_first_f64_step && !origins.has_no_outliers();
         for (domain, transform, translation) in update.transform_updates() {
             let root = transform_roots.root_of(domain);
             origins.set_translation(root, translation);

@@ -37,9 +37,9 @@ pub enum Aov {
     /// Three f32: unit normal on the visible side; zeros where no triangle is visible.
     Normals,
     /// One word per sample, of two 16-bit unorms; 0 where no triangle is visible. Lower half: the interpolated vertex
-    /// value ([`crate::Renderer::upload_vertex_values`]) divided by `largest`, clamped to 0 to 1. Upper half: the
+    /// value ([`crate::Renderer::upload_vertex_values`]) divided by `scale_max`, clamped to 0 to 1. Upper half: the
     /// cosine between the normal and the direction to the eye.
-    Values { largest: f32 },
+    Values { scale_max: f32 },
 }
 
 /// Result of a readback: 32-bit words, top row first.
@@ -188,7 +188,7 @@ impl Readback<'_> {
         }
         let scale = match self.field {
             Aov::Depth => Some(buffers.scene.unit as f32),
-            Aov::Values { largest } => Some(largest.recip()),
+            Aov::Values { scale_max } => Some(scale_max.recip()),
             Aov::Domains | Aov::Normals => None,
         };
         let word_pass = WordPass {

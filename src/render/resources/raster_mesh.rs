@@ -10,8 +10,8 @@ use modalcast_model::scene::{CullMode, DrawRange, Scene};
 pub(super) fn raster_geometry(scene: &Scene, positions: GlBuffer, anisotropy: f32) -> RasterGeometry {
     let geometry = Geometry::new(scene);
     let groups = geometry.groups.iter().map(|group| DrawRange {
-        first: group.first_triangle as u32,
-        triangles: group.triangle_count as u32,
+        first_triangle: group.first_triangle as u32,
+        triangle_count: group.triangle_count as u32,
         cull_mode: if group.double_sided { CullMode::None } else { CullMode::Back },
     });
     RasterGeometry {

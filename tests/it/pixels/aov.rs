@@ -138,7 +138,7 @@ fn values_are_interpolated_linearly_and_clamped() {
             builder.add_domain(facing_rectangle(-2.0, -2.0, 2.0, 2.0, 0.0), Material::default()),
             front_camera(64),
             64,
-            Aov::Values { largest },
+            Aov::Values { scale_max: largest },
         );
         assert_eq!(frame.samples, samples);
         let image_samples: Vec<u32> = bytemuck::pod_collect_to_vec(&frame.bytes);
@@ -185,7 +185,7 @@ fn aovs_allocate_on_demand_and_do_not_change_frames() {
         initial_allocations.len() + 1,
         "expected one new allocation for the values"
     );
-    for aov in [Aov::Depth, Aov::Domains, Aov::Normals, Aov::Values { largest: 3.0 }] {
+    for aov in [Aov::Depth, Aov::Domains, Aov::Normals, Aov::Values { scale_max: 3.0 }] {
         renderer.render_aov(&buffers, &params, aov).expect("expected AOVs");
         assert_eq!(renderer.draw(&buffers, &params).expect("expected a frame").rgba, expected_rgba);
         assert_eq!(renderer.stats(), &expected_stats);

@@ -57,7 +57,7 @@ fn read_aov_and_picks(scene: &Arc<Scene>, aov: Aov) -> Readbacks {
 #[test]
 fn picks_and_aovs_other_than_depth_ignore_the_ground() {
     for (samples, aov) in
-        [(1, Aov::Domains), (1, Aov::Normals), (1, Aov::Values { largest: 1.0 }), (4, Aov::Values { largest: 1.0 })]
+        [(1, Aov::Domains), (1, Aov::Normals), (1, Aov::Values { scale_max: 1.0 }), (4, Aov::Values { scale_max: 1.0 })]
     {
         let [with_ground, without_ground] =
             [Some(Ground::default()), None].map(|ground| read_aov_and_picks(&wall_scene(samples, ground), aov));

@@ -106,7 +106,7 @@ fn far_scene_renders_like_the_scene_at_the_origin() {
         let origin_frame = draw_frame(&mut context, &scene, &SceneState::rest(&scene), &camera_at([0.0; 3]));
         let far_state = move_domains(&scene, &[0, 1], position);
         assert!(
-            far_state.origins.as_ref().is_some_and(|origins| origins.is_uniform()),
+            far_state.origins.as_ref().is_some_and(|origins| origins.has_no_outliers()),
             "expected one floating origin for both domains"
         );
         let far_frame = draw_frame(&mut context, &scene, &far_state, &camera_at(position));
@@ -145,7 +145,7 @@ fn distant_domains_are_seen_by_nearby_cameras() {
     let (gray, red, both) = (0, 1, 2);
     let separated_state = move_domains(&scene, &[1], FAR_POSITION);
     assert!(
-        separated_state.origins.as_ref().is_some_and(|origins| !origins.is_uniform()),
+        separated_state.origins.as_ref().is_some_and(|origins| !origins.has_no_outliers()),
         "expected a floating origin per domain"
     );
     let mut loaded_scene = context.load_scene(&scene, BackendSettings::default()).expect("expected the scene to load");

@@ -85,7 +85,8 @@ fn ids_equal_opengl_except_on_edges_and_depth_ties() {
         let rasterize_ids = |clip: &Matrix4<f64>| {
             let mut raster =
                 VisibilityBuffer::new(Viewport::new(clip, width, height).expect("expected a valid viewport"));
-            let all_triangles = DrawRange { first: 0, triangles: triangles.len() as u32, cull_mode: CullMode::None };
+            let all_triangles =
+                DrawRange { first_triangle: 0, triangle_count: triangles.len() as u32, cull_mode: CullMode::None };
             raster.draw(&surface.positions, &triangles, all_triangles);
             raster.ids()
         };

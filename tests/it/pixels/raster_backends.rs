@@ -90,8 +90,11 @@ impl Rasterizer for ReferenceRasterizer {
 
     fn draw(&mut self, depth: Option<DrawTarget<'_>>, ids: Option<DrawTarget<'_>>) -> Result<()> {
         if let Some((viewport, target)) = depth {
-            let all_triangles =
-                DrawRange { first: 0, triangles: self.mesh.triangles.len() as u32, cull_mode: CullMode::None };
+            let all_triangles = DrawRange {
+                first_triangle: 0,
+                triangle_count: self.mesh.triangles.len() as u32,
+                cull_mode: CullMode::None,
+            };
             self.write(target, bytemuck::cast_slice(&self.rasterize(viewport, &[all_triangles]).depths()))?;
         }
         let Some((viewport, target)) = ids else { return Ok(()) };

@@ -196,14 +196,14 @@ impl RasterPipeline {
             for (function, range) in
                 [(Some(&functions.raster), opaque_range), (functions.raster_cut_outs.as_ref(), cut_out_range)]
             {
-                if let Some(function) = function.filter(|_| range.triangles > 0) {
+                if let Some(function) = function.filter(|_| range.triangle_count > 0) {
                     let args = RasterArgs {
-                        first_triangle: range.first,
-                        triangle_count: range.triangles,
+                        first_triangle: range.first_triangle,
+                        triangle_count: range.triangle_count,
                         culls_back_faces: u32::from(range.cull_mode == CullMode::Back),
                         ..args
                     };
-                    start(function, range.triangles.div_ceil(BLOCK_THREADS), args)?;
+                    start(function, range.triangle_count.div_ceil(BLOCK_THREADS), args)?;
                 }
             }
         }
@@ -215,7 +215,7 @@ impl RasterPipeline {
     pub fn launches(&self, groups: &[DrawRange]) -> usize {
         let group_launches = |group: &DrawRange| {
             let (opaque_range, cut_out_range) = self.split(*group);
-            usize::from(opaque_range.triangles > 0) + usize::from(cut_out_range.triangles > 0)
+            usize::from(opaque_range.triangle_count > 0) + usize::from(cut_out_range.triangle_count > 0)
         };
         // `raster_warps` and `raster_tiles` are launched once per pass.
         2 + groups.iter().map(group_launches).sum::<usize>()
@@ -224,10 +224,13 @@ impl RasterPipeline {
     /// Splits a group into opaque triangles and cut-outs.
     fn split(&self, group: DrawRange) -> (DrawRange, DrawRange) {
         let first_cut_out = self.cut_outs.as_ref().map_or(u32::MAX, |cut_outs| cut_outs.first);
-        let opaque_count = first_cut_out.saturating_sub(group.first).min(group.triangles);
-        let cut_outs =
-            DrawRange { first: group.first + opaque_count, triangles: group.triangles - opaque_count, ..group };
-        (DrawRange { triangles: opaque_count, ..group }, cut_outs)
+        let opaque_count = first_cut_out.saturating_sub(group.first_triangle).min(group.triangle_count);
+        let cut_outs = DrawRange {
+            first_triangle: group.first_triangle + opaque_count,
+            triangle_count: group.triangle_count - opaque_count,
+            ..group
+        };
+        (DrawRange { triangle_count: opaque_count, ..group }, cut_outs)
     }
 
     /// Numbers of triangles of the last pass, indexed by `TriangleBin` of the kernels. Zeros unless

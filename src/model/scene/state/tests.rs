@@ -147,7 +147,7 @@ fn near_translations_keep_the_scene_origin() {
     let state = state_after(&scene, &[f64_step(&[0, 1], &[[4096.0, -4096.0, 0.1], [1.0, 2.0, 3.0]])]);
     assert_eq!((state.origin_of(0), state.transforms[0].0[11]), ([0.0; 3], 0.1));
     assert_eq!(state.dirty_domains, DirtyDomains::Some(vec![0, 1]));
-    assert!(state.origins.is_some_and(|origins| origins.is_uniform()));
+    assert!(state.origins.is_some_and(|origins| origins.has_no_outliers()));
 }
 
 #[test]
@@ -190,7 +190,7 @@ fn shared_origin_follows_the_majority_of_the_domains() {
     let mut state = state_after(&scene, &steps);
     assert_eq!((state.serial, &state.dirty_domains), (2, &DirtyDomains::All), "expected all transforms to be rebased");
     assert_eq!(
-        state.origins.as_ref().map(|origins| (origins.shared_origin(), origins.is_uniform())),
+        state.origins.as_ref().map(|origins| (origins.shared_origin(), origins.has_no_outliers())),
         Some((state.origin_of(0), false))
     );
     assert_eq!((state.origin_of(4), world_position(&state, 4)), ([0.0; 3], [0.0; 3]));

@@ -202,7 +202,8 @@ impl RasterSetup {
         let frame_params = loaded_scene.frame_params(self.camera, self.size);
         let triangles = self.scene.triangle_vertices();
         let positions = loaded_scene.surface()?.positions.clone();
-        let draw_ranges = [DrawRange { first: 0, triangles: triangles.len() as u32, cull_mode: CullMode::None }];
+        let draw_ranges =
+            [DrawRange { first_triangle: 0, triangle_count: triangles.len() as u32, cull_mode: CullMode::None }];
         let mesh = RasterMesh { positions: &positions, triangles: &triangles, groups: &draw_ranges, cut_outs: None };
         let (frame_viewport, map_viewport) = (self.frame_viewport(&frame_params)?, self.map_viewport(&frame_params)?);
         let frame_variant = RasterVariant::default();

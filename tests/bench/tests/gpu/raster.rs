@@ -24,7 +24,7 @@ fn launch_raster(device: &Device, soup: &Soup, variant: RasterVariant) -> Raster
 fn count_expected_triangles(soup: &Soup) -> ([u32; 5], u32) {
     let (mut counts_by_reason, mut drawn) = ([0; 5], 0);
     for group in &soup.groups {
-        for triangle in &soup.triangles[group.first as usize..][..group.triangles as usize] {
+        for triangle in &soup.triangles[group.first_triangle as usize..][..group.triangle_count as usize] {
             match clipped_polygon(&soup.viewport, &soup.positions, *triangle, group.cull_mode) {
                 Ok(_) => drawn += 1,
                 Err(CullReason::NotFinite) => counts_by_reason[0] += 1,

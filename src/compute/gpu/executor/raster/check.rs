@@ -24,8 +24,8 @@ pub fn check_mesh(vertices: u64, triangles: &[[u32; 3]], groups: &[DrawRange]) -
     }
     let mut previous_end = 0;
     for group in groups {
-        let group_end = group.first as usize + group.triangles as usize;
-        if (group.first as usize) < previous_end || group_end > triangle_count {
+        let group_end = group.first_triangle as usize + group.triangle_count as usize;
+        if (group.first_triangle as usize) < previous_end || group_end > triangle_count {
             let expected = format!("ascending, disjoint groups within {triangle_count} triangles");
             return Err(invalid("groups", expected, format!("{group:?}")));
         }
@@ -118,7 +118,11 @@ mod tests {
 
     #[test]
     fn meshes_with_invalid_indices_or_groups_are_rejected() {
-        let group = |first, triangles| DrawRange { first, triangles, cull_mode: CullMode::None };
+        let group = |first, triangles| DrawRange {
+            first_triangle: first,
+            triangle_count: triangles,
+            cull_mode: CullMode::None,
+        };
         let is_valid = |triangles: &[[u32; 3]], groups: &[DrawRange]| check_mesh(3, triangles, groups).is_ok();
         let triangles = [[0, 1, 2], [2, 1, 0]];
         assert!(is_valid(&triangles, &[group(0, 1), group(1, 1)]));

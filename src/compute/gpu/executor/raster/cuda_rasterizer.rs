@@ -101,7 +101,8 @@ impl CudaRasterizer {
         }
         let _current = device.enter()?;
         let interop = GlInterop::open(device, &mesh.positions)?;
-        let all_triangles = DrawRange { first: 0, triangles: mesh.triangles.len() as u32, cull_mode: CullMode::None };
+        let all_triangles =
+            DrawRange { first_triangle: 0, triangle_count: mesh.triangles.len() as u32, cull_mode: CullMode::None };
         let depth_variant = RasterVariant { depth_only: true, ..RasterVariant::default() };
         Ok(Self {
             positions: interop.register(device, mesh.positions)?,
