@@ -1,54 +1,63 @@
-// x = T_b (x0 + U q_b) for a group of up to BATCH_SIZE domains b that share a shape, its members. The group reads U once.
-//   blocks          the work of each block: a group, and a range of tiles of its shape (layout.cuh)          (in)
-//   groups          per group its members, and the offsets of its U and x0                                   (in)
+// x = T_b (x0 + U q_b) for groups of up to BATCH_SIZE domains b with the same shape (mesh and U). The domains of a
+// group are its members. The kernel reads U once per group.
+//
+// A quad is four consecutive vertices, a tile up to 32 quads of a shape, a chunk a few modes (chunk.cuh).
+//   blocks          the work of each block: a group, and a range of tiles of its shape                       (in)
+//   groups          per group: its members, and the offsets of the U and x0 of its shape (layout.cuh)        (in)
 //   members         the members of all groups                                                                (in)
-//   words           U, per tile [chunk_count][3][tile_quads] words of 16 bytes (chunk.cuh)                   (in)
-//   rest_positions  x0, per tile [3][tile_quads][4] f32                                                      (in)
-//   scales          with STORE_INT8: per tile of U and mode                                                  (in)
+//   words           U, per tile of a shape [chunk][3][quad] words of 16 bytes                                (in)
+//   rest_positions  x0, per tile of a shape [axis][quad][vertex in the quad] f32                             (in)
+//   scales          with STORE_INT8: one scale per tile of a shape and mode                                  (in)
 //   transforms, transform_links, frames, q  as for `deform`                                                  (in)
 //   positions       [vertices][3] f32, address in the header                                                 (out)
-//   boxes           [tiles of deform][4][6] u32, as `deform` writes them; the boxes of half a tile without
-//                   vertices keep the zeros of their allocation                                              (out)
-// Launch: a block of WARPS warps for each range of tiles of a group. Dynamic shared memory: WARPS `WarpStorage`, one
-// `BlockStorage`, and q. CPU twin: the tests of src/compute/gpu/executor/launchers/batch.rs.
+//   boxes           [tiles of deform][4 boxes][6 keys] u32, as `deform` writes them. Each of the two warps of a tile
+//                   writes two of its four boxes. A warp without vertices writes none: its boxes keep the zeros of
+//                   their allocation                                                                         (out)
+// Launch: a block of WARPS warps per `BatchBlock`. Dynamic shared memory: a `WarpStorage` per warp, one `BlockStorage`,
+// and q. CPU twin: the tests of src/compute/gpu/executor/launchers/batch.rs.
 //
-// Each vertex sums its modes in order, from +0, by fused multiply-adds, as in `deform`, so the results are bit-identical.
-// A result that is not finite in f32 is computed again in f64.
+// Each vertex sums its modes in order, from +0, by fused multiply-adds, as in `deform`, so the results are
+// bit-identical. A result that is not finite in f32 is computed again in f64.
 //
-// Design, for 16 members; numbers are per warp and mode. A vertex needs 48 multiply-adds. Shared memory delivers 128
-// bytes per cycle to a multiprocessor, which issues 4 instructions per cycle.
-// - With one vertex per lane, a lane would load 16 + 3 numbers for 48 multiply-adds: 19 cycles of loads, 12 of arithmetic.
-// - With two vertices per lane, it loads 16 + 6 numbers for 96 multiply-adds: 22 cycles of loads, 24 of arithmetic. This is
-//   balanced. (Entries of 2 bytes take no more cycles, although they use only half of the 16 bytes of a quad.)
+// Design, for 16 members. Per mode, a vertex needs 3 axes x 16 members = 48 multiply-adds. A multiprocessor receives
+// 128 bytes per cycle from shared memory (one f32 for each lane of a warp), and issues 4 warp instructions per cycle.
+// Cycles per warp and mode:
+// - One vertex per lane: a lane loads 16 q and 3 entries of U: 19 cycles. Arithmetic takes 48 / 4 = 12 cycles.
+// - Two vertices per lane: a lane loads 16 q and 6 entries: 22 cycles. Arithmetic takes 96 / 4 = 24 cycles. The kernel
+//   therefore computes two vertices per lane. (Narrower entries load no faster than f32, because of bank conflicts.)
 // A lane thus has 96 sums and about 128 registers, which limits a multiprocessor to 16 warps. So few warps saturate the
-// memory bandwidth only if loads in flight need no registers. Therefore each warp copies U to shared memory asynchronously,
-// RING_STAGES stages of 3 KB ahead. That is 144 KB per multiprocessor, and a latency of 1 us at 5 TB/s needs 38 KB.
+// memory bandwidth only if loads in flight need no registers. Therefore each warp copies U to shared memory
+// asynchronously, RING_STAGES stages ahead. In flight per multiprocessor: 16 warps x 3 stages x 3 KB = 144 KB. Needed
+// at 5 TB/s and a latency of 1 us: 5 MB for the device, 38 KB for each of 132 multiprocessors.
 #include "batch_load.cuh"
 #include "ordered_float.cuh"
 
-// Target number of resident blocks per multiprocessor. Registers limit it where shared memory is large enough.
+// Number of resident blocks per multiprocessor for which the compiler limits the registers. A block has two warps.
 #if __CUDA_ARCH__ == 900
 constexpr unsigned MIN_BLOCKS_PER_SM = BATCH_SIZE == 16 ? 8 : 10;
 #elif __CUDA_ARCH__ == 800 || __CUDA_ARCH__ == 1000
-// Three warps per scheduler: the compiler needs more registers for these architectures.
+// 12 warps instead of 16: the compiler needs more registers for these architectures.
 constexpr unsigned MIN_BLOCKS_PER_SM = 6;
 #else
+// Other architectures have less shared memory: 100 KB on sm_86 and sm_89. A block takes 21 KB and its q.
 constexpr unsigned MIN_BLOCKS_PER_SM = 4;
 #endif
 
-// Unroll factor of the loop over chunks. The compiler then interleaves the loads and sums of at least two modes.
+// Unroll factor of the loop over chunks. An unrolled iteration has at least two modes, so that the compiler can
+// interleave the loads of one mode with the sums of another.
 constexpr unsigned CHUNK_UNROLL = CHUNK_MODES < 2 ? 2 : 1;
 
-// One axis of a lane's two vertices.
+// The same component (x, y or z) of a lane's two vertices.
 struct VertexPair {
     float values[2];
 };
 
-// Loads the entries of a lane's two vertices. `mode_axis` is mode * 3 + axis, and `chunk` is the lane's first byte in the
-// chunk.
+// Loads the entries of U of a lane's two vertices for one mode and axis; `mode_axis` is mode * 3 + axis. `chunk` is the
+// first byte of the two vertices in a chunk in shared memory, where the words of a quad are WARP_QUADS words apart.
 __device__ __forceinline__ VertexPair load_vertex_pair(const char* chunk, unsigned mode_axis) {
     const unsigned byte_offset = 4 * ENTRY_BYTES * mode_axis;
     const char* entries = chunk + byte_offset / 16 * (16 * WARP_QUADS) + byte_offset % 16;
+    // `decode_entry` takes the 12 registers of a whole chunk; the two entries are in the first ones.
     unsigned registers[12] = {};
 #if defined(STORE_INT8)
     registers[0] = *(const unsigned short*)entries;
@@ -70,9 +79,10 @@ __device__ __forceinline__ VertexPair load_vertex_pair(const char* chunk, unsign
     return pair;
 }
 
-// [2 * axis + vertex][member]
+// u of a lane's two vertices for all members: [2 * axis + vertex][member].
 typedef float Sums[6][BATCH_SIZE];
 
+// Adds one mode to the sums of the members `first_member` to `first_member + 3`. `pairs` has the entries of each axis.
 __device__ __forceinline__ void add_four_members(Sums& sums, unsigned first_member, const VertexPair (&pairs)[3],
                                                  const float4& q_of_members) {
     const float weights[4] = {q_of_members.x, q_of_members.y, q_of_members.z, q_of_members.w};
@@ -85,6 +95,7 @@ __device__ __forceinline__ void add_four_members(Sums& sums, unsigned first_memb
     }
 }
 
+// Adds all modes of a chunk. `q_of_members` is the first mode of the chunk in [mode][member / 4].
 __device__ __forceinline__ void add_chunk(Sums& sums, const char* chunk, const float4* q_of_members) {
 #pragma unroll
     for (unsigned mode = 0; mode < CHUNK_MODES; ++mode) {
@@ -97,9 +108,10 @@ __device__ __forceinline__ void add_chunk(Sums& sums, const char* chunk, const f
     }
 }
 
-// Sums all modes, stage by stage. At the start, copies of RING_STAGES stages are in flight. With 16-bit entries all registers
-// are in use, and the stage counter spills to local memory: a few bytes, once per stage.
+// Sums all modes, stage by stage. The caller has started the copies of the first RING_STAGES stages. With 16-bit
+// entries all registers are in use, and the stage counter spills to local memory: a few bytes, once per stage.
 __device__ __forceinline__ void sum_modes(const WarpSlice& slice, WarpStorage& storage, const float4* q, Sums& sums) {
+    // Two lanes share a quad, which has 16 bytes in each row of words.
     const unsigned lane_offset = 16 * (lane_id() / 2) + 2 * ENTRY_BYTES * (lane_id() % 2);
 #pragma unroll 1
     for (unsigned stage = 0; STAGE_CHUNKS * stage < slice.chunk_count; ++stage) {
@@ -109,7 +121,7 @@ __device__ __forceinline__ void sum_modes(const WarpSlice& slice, WarpStorage& s
 #pragma unroll CHUNK_UNROLL
         for (unsigned i = 0; i < chunk_count; ++i) {
             add_chunk(sums, chunk, q);
-            chunk += 3 * 16 * WARP_QUADS;
+            chunk += 3 * 16 * WARP_QUADS; // three rows of words of 16 bytes
             q += CHUNK_MODES * (BATCH_SIZE / 4);
         }
         __syncwarp();
@@ -136,12 +148,12 @@ __device__ __forceinline__ unsigned count_lane_vertices(const WarpSlice& slice) 
     return slice.vertex_count > 2 * lane_id() ? min(2u, slice.vertex_count - 2 * lane_id()) : 0;
 }
 
-// Address of the two boxes of this warp's half of a tile, among the four boxes per tile that `deform` writes.
+// Address of the two boxes of this warp's half of a tile. A tile has four boxes of six keys, as in `deform`.
 __device__ __forceinline__ unsigned* warp_box_keys(const BatchArgs& args, const WarpSlice& slice, const BatchMember& member) {
     return args.boxes + 24 * (size_t)(member.first_tile + slice.tile) + 12 * (threadIdx.x / 32);
 }
 
-// Writes x of a lane's two vertices of one member to the staging buffer, [vertex][3].
+// Computes x of a lane's two vertices for one member, and writes it to `staged`, [vertex of the warp][3].
 __device__ __forceinline__ void stage_member(const RestPositionPair& rest, const BlockStorage& block, const Sums& sums, unsigned member,
                                              float* staged) {
     const Affine& t = block.transforms[member];
@@ -161,9 +173,11 @@ __device__ __forceinline__ void stage_member(const RestPositionPair& rest, const
     }
 }
 
-// Computes the boxes of the two staged members. Each half warp reduces one member, with four vertices per lane. After
-// the first exchange a lane has either the lower or the upper sides, so later exchanges move three numbers. A box ignores
-// NaN. If a position is not finite, `repair_non_finite` computes the boxes again.
+// Computes the boxes of the two staged members, `first_member` and the next. Each half warp (16 lanes) reduces one
+// member, with four vertices (three float4) per lane. The lower sides of a box are maxima of -x, -y, -z, the upper
+// sides maxima of x, y, z. In the first exchange, eight lanes of a half warp take over the lower sides and eight the
+// upper sides, so later exchanges move three numbers instead of six. The maxima ignore NaN: if a position is not
+// finite, this function sets `has_non_finite`, and `repair_non_finite` computes the boxes again.
 __device__ __forceinline__ void write_two_boxes(const BatchArgs& args, WarpSlice& slice, const BlockStorage& block,
                                                 unsigned first_member, const float4* staged) {
     const float NEGATIVE_INFINITY = __uint_as_float(0xff800000u);
@@ -200,7 +214,8 @@ __device__ __forceinline__ void write_two_boxes(const BatchArgs& args, WarpSlice
             sides[axis] = fmaxf(sides[axis], __shfl_xor_sync(0xffffffffu, sides[axis], lane_offset));
         }
     }
-    // Six of eight lanes write three sides of the box twice: half a tile has two of the tile's four boxes.
+    // All eight lanes of a quarter warp have the same three sides. Six of them write these sides to two boxes, because
+    // half a tile has two of the tile's four boxes.
     const unsigned axis = half_lane % 8 % 3, box_copy = half_lane % 8 / 3;
     if (box_copy < 2 && member < slice.member_count) {
         const float side = axis == 0 ? sides[0] : axis == 1 ? sides[1] : sides[2];
@@ -208,12 +223,13 @@ __device__ __forceinline__ void write_two_boxes(const BatchArgs& args, WarpSlice
     }
 }
 
-// Keeps the compiler from moving loads across this call, because parallel loads would need more registers than there are.
+// Keeps the compiler from moving loads across this call. Loads in parallel would need more registers than are
+// available.
 __device__ __forceinline__ void fence_loads() {
     __syncwarp();
 }
 
-// Stores the two staged members, 48 words of 16 bytes each.
+// Stores the two staged members: 48 float4 each, for 64 vertices.
 __device__ __forceinline__ void store_two_members(float* first_output, float* second_output, const float4* staged) {
     const unsigned lane = lane_id();
     float4 *first_vectors = (float4*)first_output, *second_vectors = (float4*)second_output;
@@ -242,8 +258,9 @@ __device__ __forceinline__ void store_floats(const WarpSlice& slice, const Block
     }
 }
 
-// Stages and stores two members at a time, alternating between two halves of the ring. The barrier separates the reads of
-// a half from the next writes to it.
+// Stages and stores two members at a time. The ring of U is no longer needed, so its memory is the staging buffer. The
+// loop alternates between two halves of this buffer: a barrier lies between the reads of a half and the next writes to
+// it.
 __device__ __forceinline__ void store_members(const BatchArgs& args, WarpSlice& slice, WarpStorage& storage,
                                               const BlockStorage& block, const Sums& sums) {
 #pragma unroll
@@ -254,7 +271,7 @@ __device__ __forceinline__ void store_members(const BatchArgs& args, WarpSlice& 
             RestPositionPair rest;
             rest.load(storage);
             stage_member(rest, block, sums, member, staged);
-            // A missing second member has a zero transform.
+            // Without a second member, `load_members` has stored a zero transform, and the result is not stored.
             stage_member(rest, block, sums, member + 1, staged + 3 * WARP_VERTICES);
             const BatchMember &first = block.members[member], &second = block.members[member + 1];
             __syncwarp();
@@ -268,7 +285,8 @@ __device__ __forceinline__ void store_members(const BatchArgs& args, WarpSlice& 
     }
 }
 
-// Computes x of one vertex of this lane in f64 and rounds it once.
+// Computes x of one vertex of this lane in f64 and rounds it once. The member's coordinate of mode m is at
+// q[m * BATCH_SIZE].
 __device__ __forceinline__ float3 position_f64(const BatchArgs& args, const WarpSlice& slice, const BatchMember& member,
                                                  const float* q, unsigned vertex) {
     const unsigned quad = lane_id() / 2, vertex_in_quad = 2 * (lane_id() % 2) + vertex;
@@ -296,8 +314,8 @@ __device__ __forceinline__ void write_box(const BatchArgs& args, const WarpSlice
     }
 }
 
-// Recomputes the positions of a warp that are not finite, and the boxes of all members. Reads and writes the output. NaN has
-// the largest key, so a position with a NaN gives a box with a NaN.
+// Recomputes the positions of a warp that are not finite, and the boxes of all members. Reads the positions back from
+// the output. NaN has the largest key, so a position with a NaN gives a box with a NaN.
 __device__ __noinline__ void repair_non_finite(const BatchArgs& args, const BlockStorage& block, const float* q) {
     const WarpSlice& slice = block.slices[threadIdx.x / 32];
     const unsigned vertex_count = count_lane_vertices(slice);
@@ -321,7 +339,7 @@ __device__ __noinline__ void repair_non_finite(const BatchArgs& args, const Bloc
     }
 }
 
-// Computes the slice of this warp. The caller has started the copies of its U and x0.
+// Computes the slice of this warp. The caller has started the copies of the slice's U and x0.
 __device__ __forceinline__ void compute_slice(const BatchArgs& args, uint4* shared) {
     WarpStorage& storage = warp_storage(shared);
     BlockStorage& block = block_storage(shared);

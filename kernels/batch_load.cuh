@@ -1,9 +1,10 @@
-// Shared memory of a block of `batch`, and the loads of U, x0, T and q. Twin: the tests of
-// src/compute/gpu/executor/launchers/batch.rs.
+// Shared memory of a block of `batch`, and the loads of U, x0, T and q. batch.cu defines groups, members and tiles. A
+// word has 16 bytes. Twin: the tests of src/compute/gpu/executor/launchers/batch.rs.
 #pragma once
 #include "chunk.cuh"
 #include "transform.cuh"
 
+// Maximum number of members of a group.
 #if defined(BATCH_4)
 constexpr unsigned BATCH_SIZE = 4;
 #elif defined(BATCH_8)
@@ -15,16 +16,17 @@ constexpr unsigned BATCH_SIZE = 16;
 constexpr unsigned WARPS = 2;
 constexpr unsigned WARP_QUADS = TILE_QUADS / WARPS;
 constexpr unsigned WARP_VERTICES = 4 * WARP_QUADS;
-// U passes through a ring buffer with a capacity of RING_STAGES stages. A stage is STAGE_CHUNKS chunks of all quads of the
-// warp. A word has 16 bytes.
+// U passes through a ring buffer with a capacity of RING_STAGES stages. A stage is STAGE_CHUNKS chunks of all quads of
+// the warp: 192 words, 3 KB.
 constexpr unsigned STAGE_CHUNKS = 4;
 constexpr unsigned RING_STAGES = 3;
 constexpr unsigned STAGE_QUAD_WORDS = 3 * STAGE_CHUNKS; // words of a stage per quad
 constexpr unsigned STAGE_WORDS = STAGE_QUAD_WORDS * WARP_QUADS;
+
 // Shared memory of a warp.
 struct WarpStorage {
     uint4 ring[RING_STAGES * STAGE_WORDS]; // stages of U, later the staging buffer of x
-    float4 rest_positions[3 * WARP_QUADS];
+    float4 rest_positions[3 * WARP_QUADS]; // [axis][quad]
 };
 static_assert(sizeof(WarpStorage) == 9984, "WarpStorage differs from src/compute/gpu/tables/kernels.rs");
 
@@ -76,16 +78,18 @@ struct WarpSlice {
     unsigned member_count;
     unsigned first_member;
     unsigned first_scale; // of the tile
-    unsigned tile;
+    unsigned tile;           // counted from the first tile of the shape
     unsigned end_tile;       // one past the block's last tile
     unsigned has_non_finite; // 1 if a result is not finite
     unsigned group;
-    float* positions; // address of `first_vertex` in the output of a domain whose `BatchMember::first_vertex` is 0
+    // Output address of the slice for a member that begins at packed vertex 0. `output_pointer` adds the member's
+    // offset.
+    float* positions;
 };
 
-// Shared memory of a block, after the `WarpStorage` of its warps. In a group with fewer than BATCH_SIZE members, the unused
-// entries are zero. After this struct follows the array q, [modes][BATCH_SIZE] f32; with STORE_INT8, q is multiplied by the
-// scales of the tile.
+// Shared memory of a block, after the `WarpStorage` of its warps. In a group with fewer than BATCH_SIZE members, the
+// unused entries are zero. The array q, [mode][member] f32, follows this struct. With STORE_INT8, q is multiplied by
+// the scales of the tile.
 struct BlockStorage {
     Affine transforms[BATCH_SIZE];
     BatchMember members[BATCH_SIZE];
@@ -106,7 +110,7 @@ __device__ __forceinline__ float4* shared_q(uint4* shared) {
     return (float4*)(&block_storage(shared) + 1);
 }
 
-// This warp's part of a tile. `tile` counts from the first tile of the group's shape.
+// Describes this warp's part of a tile. `tile` and `end_tile` count from the first tile of the group's shape.
 __device__ __forceinline__ WarpSlice load_warp_slice(const BatchArgs& args, unsigned group, unsigned tile, unsigned end_tile) {
     // The two halves of a `BatchGroup`, with its fields in the order of layout.cuh.
     const uint4 low_words = __ldg((const uint4*)(args.groups + group));
@@ -132,7 +136,8 @@ __device__ __forceinline__ WarpSlice load_warp_slice(const BatchArgs& args, unsi
     return slice;
 }
 
-// Starts the copies of a stage, [STAGE_QUAD_WORDS][WARP_QUADS]. Lanes beyond the last quad copy the last quad again.
+// Starts the copies of a stage to the ring, as [word of the quad: STAGE_QUAD_WORDS][quad: WARP_QUADS]. With each copy,
+// a warp copies two words of every quad. Lanes beyond the last quad copy the last quad again.
 __device__ __forceinline__ void copy_stage(const WarpSlice& slice, WarpStorage& storage, unsigned stage) {
     constexpr unsigned WORDS_PER_COPY = 32 / WARP_QUADS, COPY_COUNT = STAGE_WORDS / 32;
     const unsigned quad_word = STAGE_QUAD_WORDS * stage + lane_id() / WARP_QUADS;
@@ -155,9 +160,10 @@ __device__ __forceinline__ void copy_stage(const WarpSlice& slice, WarpStorage& 
     }
 }
 
-// Starts the copies of x0, [axis][WARP_QUADS].
+// Starts the copies of x0, as [axis][quad: WARP_QUADS].
 __device__ __forceinline__ void copy_rest(const WarpSlice& slice, WarpStorage& storage) {
-    // Every lane takes two iterations, so that the loop can be unrolled. Copies beyond the end of x0 are disabled.
+    // x0 has 48 words. Every lane takes two iterations, so that the loop can be unrolled. Copies beyond the end of x0
+    // are disabled.
 #pragma unroll
     for (unsigned i = lane_id(); i < lane_id() + 3 * WARP_QUADS; i += 32) {
         const float4* source =
@@ -169,7 +175,7 @@ __device__ __forceinline__ void copy_rest(const WarpSlice& slice, WarpStorage& s
 // Number of consecutive threads that load T and q of one member.
 constexpr unsigned THREADS_PER_MEMBER = 32 * WARPS / BATCH_SIZE;
 
-// Loads T and the members of a block's group. Returns the index of the first q of this thread's member.
+// Loads the members of a block's group and their T. Returns `first_q` of this thread's member, 0 if it has none.
 __device__ __forceinline__ unsigned load_members(const BatchArgs& args, const WarpSlice& slice, BlockStorage& block) {
     const unsigned member_index = threadIdx.x / THREADS_PER_MEMBER;
     BatchMember member = {};
@@ -186,7 +192,7 @@ __device__ __forceinline__ unsigned load_members(const BatchArgs& args, const Wa
     return member.first_q;
 }
 
-// Loads all modes of q of this thread's member. The threads of a member share the modes.
+// Loads q of this thread's member. The threads of a member share its modes.
 __device__ __forceinline__ void load_q(const BatchArgs& args, const WarpSlice& slice, unsigned first_q, float* q) {
     const unsigned member_index = threadIdx.x / THREADS_PER_MEMBER, mode_count = slice.chunk_count * CHUNK_MODES;
 #pragma unroll 8
@@ -199,15 +205,16 @@ __device__ __forceinline__ void load_q(const BatchArgs& args, const WarpSlice& s
     }
 }
 
-// Prepares a tile: starts the copies of U and x0, and writes the slice to shared memory. For the block's first tile, also
-// loads T, the members and q. With STORE_INT8, loads q again for each tile, because each tile has its own scales.
+// Prepares a tile: starts the copies of U and x0, and writes the slice to shared memory. For the block's first tile
+// (`is_first`), also loads the members, T and q. With STORE_INT8, loads q again for each tile, because each tile has
+// its own scales.
 __device__ __forceinline__ void load_tile_async(const BatchArgs& args, const WarpSlice& slice, uint4* shared, bool is_first) {
     BlockStorage& block = block_storage(shared);
     if (lane_id() == 0) {
         block.slices[threadIdx.x / 32] = slice;
     }
     if (slice.quad_count > 0) {
-        // x0 belongs to the first copy group. The copy groups of stages beyond the last chunk are empty.
+        // The first copy group contains x0 and stage 0. The copy groups of stages beyond the last chunk are empty.
         copy_rest(slice, warp_storage(shared));
 #pragma unroll
         for (unsigned stage = 0; stage < RING_STAGES; ++stage) {

@@ -1,20 +1,21 @@
-// Reduces the per-tile boxes that `deform` wrote to one bounding box of all positions. Tiles that this step skips keep the
-// boxes of an earlier step. With ORIENTED_BOUNDS, also computes the bounds along `bounding_axes` from the same boxes. With
-// DOMAIN_BOXES, also computes one box per segment of a domain: from tile boxes, or from vertices if the domain shares a tile
-// with others.
-//   boxes          [box_count][6] u32: `float_to_ordered` maxima of -x, -y, -z, x, y, z; four per tile        (in)
+// Reduces the boxes that `deform` and `batch` wrote, four per tile, to one bounding box of all positions. Tiles that a
+// partial step skips keep their boxes from an earlier step. With ORIENTED_BOUNDS, also computes the bounds along
+// `bounding_axes` from the same boxes. With DOMAIN_BOXES, also computes one box per segment, a part of a domain. The
+// items of a segment are boxes, or vertices if the domain shares a tile with other domains.
+//   boxes          [box_count][6] u32: `float_to_ordered` maxima of -x, -y, -z, x, y, z                       (in)
 //   bounding_axes  with ORIENTED_BOUNDS: three orthogonal unit vectors                                        (in)
 //   bounds         in the header: the maxima of all boxes; zeros before the launch                            (in, out)
-//   segments       with DOMAIN_BOXES: parts of domains; each is reduced to one box                            (in)
+//   segments       with DOMAIN_BOXES: `BoxSegment`s, each of which is reduced to one box                      (in)
 //   change_steps   with DOMAIN_BOXES: per domain, the step that last changed it                               (in)
 //   positions      with DOMAIN_BOXES: address in the header                                                   (in)
 //   segment_boxes  with DOMAIN_BOXES: [segments][6] u32, like `boxes`; only those of dirty domains are written (out)
 // Launch: BLOCK threads per block, any number of blocks. CPU twin: BoundingBox::union.
+// BoundingBox is in src/model/scene/camera.rs.
 //
-// Oriented bounds: the signs of an axis select the farthest corner of a tile's box along the axis, so each extreme costs
-// three multiply-adds. These round outward, so that the bounds along the f32 axes contain every vertex. The bounds of a
-// tile exceed the extent of its vertices by less than the diagonal of its box. Projecting every vertex in `deform` would
-// give tight bounds, but `deform` has no spare registers.
+// Oriented bounds: the signs of an axis's components select the corner of a tile's box that is farthest along the axis,
+// so each extreme costs three multiply-adds. They round outward, so that the bounds along the f32 axes contain every
+// vertex. The bounds of a tile exceed the extent of its vertices by less than the diagonal of its box. Projecting every
+// vertex in `deform` would give tight bounds, but `deform` has no spare registers.
 #include "dependent_launch.cuh"
 #include "layout.cuh"
 #include "ordered_float.cuh"
@@ -23,7 +24,7 @@
 // Threads that reduce one segment together.
 constexpr unsigned THREADS_PER_SEGMENT = 8;
 
-// Merges one tile box or vertex of a segment into the running maxima.
+// Merges one item of a segment, a box or a vertex, into the running maxima.
 __device__ __forceinline__ void merge_item(const BoundsArgs& args, const BoxSegment& segment, unsigned item,
                                            unsigned (&keys)[6]) {
     if (segment.is_vertex_range) {
@@ -43,7 +44,8 @@ __device__ __forceinline__ void merge_item(const BoundsArgs& args, const BoxSegm
     }
 }
 
-// Each group of THREADS_PER_SEGMENT threads reduces one segment at a time, so its threads stay converged in the loop.
+// Each group of THREADS_PER_SEGMENT threads reduces one segment at a time, so that the threads of a group do not
+// diverge.
 __device__ __forceinline__ void compute_segment_boxes(const BoundsArgs& args) {
     const unsigned group_rank = threadIdx.x % THREADS_PER_SEGMENT;
     const unsigned group_mask = 0xffu << threadIdx.x % 32 / THREADS_PER_SEGMENT * THREADS_PER_SEGMENT;
@@ -53,6 +55,7 @@ __device__ __forceinline__ void compute_segment_boxes(const BoundsArgs& args) {
         if (!is_dirty(args.header, args.change_steps, segment.domain)) {
             continue;
         }
+        // Key 0 is below the key of every number.
         unsigned keys[6] = {0, 0, 0, 0, 0, 0};
         for (unsigned item = group_rank; item < segment.item_count; item += THREADS_PER_SEGMENT) {
             merge_item(args, segment, item, keys);
@@ -70,7 +73,7 @@ __device__ __forceinline__ void compute_segment_boxes(const BoundsArgs& args) {
 }
 #endif
 
-// Keys of `StepHeader::bounds` that are computed.
+// Number of keys of `StepHeader::bounds` that this variant computes.
 #ifdef ORIENTED_BOUNDS
 constexpr unsigned KEY_COUNT = 12;
 #else
@@ -78,8 +81,8 @@ constexpr unsigned KEY_COUNT = 6;
 #endif
 
 #ifdef ORIENTED_BOUNDS
-// The maxima of -a x and of a x along an axis a, for one of the four lanes that hold a tile's boxes. Lane 3 duplicates
-// the axis of lane 2.
+// The maxima of -dot(a, x) and dot(a, x) for an axis a and the positions x, as keys. Four consecutive lanes hold the
+// four boxes of a tile. Lane i of the four computes the maxima along axis i; lane 3 repeats axis 2.
 struct OrientedExtent {
     float axis[3];
     unsigned extent_keys[2];
@@ -92,9 +95,9 @@ struct OrientedExtent {
         extent_keys[0] = extent_keys[1] = 0;
     }
 
-    // Merges a tile's boxes; all four lanes must call this. The tile's box may be stored four times or as four partial
-    // boxes, so only the union of the four is defined. Reducing the four boxes first makes the result independent of
-    // which domains a step changed.
+    // Merges the boxes of a tile, one per lane; all four lanes must call this. Depending on the variant of `deform`,
+    // the four boxes are copies of the tile's box, or its parts. Their union is the same in both cases. Uniting them
+    // first therefore makes the result independent of the variant that computed a tile.
     __device__ __forceinline__ void merge_tile(unsigned (&box)[6]) {
         const unsigned tile_lane_mask = 0xfu << threadIdx.x % 32 / 4 * 4;
 #pragma unroll
@@ -102,7 +105,7 @@ struct OrientedExtent {
             box[side] = max(box[side], __shfl_xor_sync(tile_lane_mask, box[side], 1));
             box[side] = max(box[side], __shfl_xor_sync(tile_lane_mask, box[side], 2));
         }
-        // A tile without TILE_VERTICES computes no positions; its box keys are 0.
+        // The keys are 0 if the tile has no vertices (`WarpTile::kind` lacks TILE_VERTICES).
         if (box[0] == 0) {
             return;
         }
@@ -118,8 +121,8 @@ struct OrientedExtent {
         extent_keys[1] = max(extent_keys[1], float_to_ordered(axis_max));
     }
 
-    // Reduces over the lanes of a warp with the same axis (lane % 4); lanes 0 to 2 then hold x, y and z. All lanes must
-    // call this.
+    // Reduces over the lanes of a warp with the same axis, i = lane % 4. Lanes 0 to 2 then write the maxima along axes
+    // 0 to 2. All lanes must call this.
     __device__ __forceinline__ void reduce_into(unsigned* block_maxima) {
 #pragma unroll
         for (unsigned extreme = 0; extreme < 2; ++extreme) {
@@ -180,8 +183,8 @@ extern "C" __global__ void __launch_bounds__(BLOCK) bounds(const __grid_constant
     oriented_extent.reduce_into(block_maxima + 6);
 #endif
     __syncthreads();
-    // Compare before the atomic: the stored maximum already exceeds that of most blocks, so most contended atomics are
-    // skipped. The value read may be stale, but it only grows, so no maximum is lost.
+    // Compare before the atomic: the maximum in the header already exceeds the maxima of most blocks, so most contended
+    // atomics are skipped. The value read may be stale, but the maximum only grows, so no update is lost.
     if (threadIdx.x < KEY_COUNT && block_maxima[threadIdx.x] > *(volatile unsigned*)(args.header->bounds + threadIdx.x)) {
         atomicMax(args.header->bounds + threadIdx.x, block_maxima[threadIdx.x]);
     }

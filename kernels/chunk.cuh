@@ -1,5 +1,6 @@
-// Storage format of U: a chunk of 48 bytes, three words of 16 bytes, holds the entries of one quad (4 vertices) for as
-// many modes as fit. Entry e = (mode * 3 + axis) * 4 + vertex. Twin: src/compute/storage.
+// Storage format of U. A chunk is CHUNK_MODES consecutive modes. Its entries for one quad (four vertices) take 48
+// bytes: three words of 16 bytes. Entry (mode, axis, vertex) has the index (mode * 3 + axis) * 4 + vertex in the 48
+// bytes. Twin: src/compute/storage.
 #pragma once
 
 #if defined(STORE_F16) || defined(STORE_BF16)
@@ -11,7 +12,8 @@ constexpr unsigned CHUNK_MODES = 1;
 #endif
 constexpr unsigned ENTRY_BYTES = 4 / CHUNK_MODES;
 
-// Decodes the entry in the lowest bits of `bits`. The result is not yet multiplied by the factor or scale of its mode.
+// Decodes the entry in the lowest bits of `bits`. With 16-bit entries, the host has multiplied q by the factor of the
+// mode. With STORE_INT8, the caller multiplies by the scale.
 __device__ __forceinline__ float decode_bits(unsigned bits) {
 #if defined(STORE_F16)
     float number;
@@ -28,7 +30,8 @@ __device__ __forceinline__ float decode_bits(unsigned bits) {
 #endif
 }
 
-// Decodes one entry of a chunk in registers. `entry` must be a compile-time constant, so that the array stays in registers.
+// Decodes the entry with index `entry` of a chunk in registers. `entry` must be a compile-time constant, because an
+// array with a variable index would be in local memory.
 __device__ __forceinline__ float decode_entry(const unsigned (&registers)[12], unsigned entry) {
     const unsigned bits = registers[entry / CHUNK_MODES];
 #if defined(STORE_INT8)
@@ -39,8 +42,8 @@ __device__ __forceinline__ float decode_entry(const unsigned (&registers)[12], u
 #endif
 }
 
-// Loads the entry (mode, axis, vertex) of a chunk. `words` points to the first 16-byte word of the quad's chunk. The next
-// word of the chunk is `word_stride` words later.
+// Loads the entry (mode, axis, vertex) of a chunk. `words` points to the first of the quad's three words. They are
+// `word_stride` words apart.
 __device__ __forceinline__ float load_entry(const uint4* words, unsigned word_stride, unsigned mode, unsigned axis,
                                             unsigned vertex) {
     const unsigned byte_offset = ((mode * 3 + axis) * 4) * ENTRY_BYTES;

@@ -1,11 +1,12 @@
-// Alpha test of cut-out triangles at their samples.
+// Alpha test of cut-out triangles at their samples: a sample passes if the alpha of its material and texture reaches
+// the cutoff.
 //
 // The texture coordinates of a sample are weighted sums of those of the corners. The weights are the edge functions of
 // the corners in homogeneous coordinates (Olano and Greer, "Triangle scan conversion using 2D homogeneous coordinates",
-// 1997). They are perspective-correct without clipping, also for corners behind the eye. They are computed relative to the
-// sample, so that a small triangle far from the center of the image keeps its precision. No product overflows or
-// underflows as long as w is between 2^-50 and 2^50. Twin: src/compute/reference/raster/cut_out.rs, with the same bits
-// up to the texture filter.
+// 1997). They are perspective-correct without clipping, also for corners behind the eye. They are computed relative to
+// the sample, because a small triangle far from the center of the image would otherwise lose precision. No product
+// overflows or underflows as long as w is between 2^-50 and 2^50. Twin: src/compute/reference/raster/cut_out.rs, with
+// the same bits except for the texture filter.
 #pragma once
 
 #include "raster.cuh"
@@ -66,7 +67,7 @@ struct AlphaTest {
     }
 
     __device__ float sample_alpha(const RasterArgs& args, int column, int row) const {
-        // The size of a pixel in normalized device coordinates: 2 / width, 2 / height.
+        // Size of a pixel in normalized device coordinates: 2 / width and 2 / height.
         const float step_x = __frcp_rn(args.half_width), step_y = __frcp_rn(args.half_height);
         const float sample_x = add_rn(mul_rn(add_rn((float)column, 0.5f), step_x), -1.0f);
         const float sample_y = add_rn(1.0f, -mul_rn(add_rn((float)row, 0.5f), step_y));
@@ -82,16 +83,18 @@ struct AlphaTest {
             edge_weights[i] = cross2(relative_x[j], relative_y[j], relative_x[k], relative_y[k]);
         }
         const float inverse_edge_sum = __frcp_rn(sum3(edge_weights[0], edge_weights[1], edge_weights[2]));
-        // Coverage uses snapped corners, so a covered sample may lie outside the unsnapped ones. Clamp its weights to zero.
+        // Coverage uses the snapped triangle, so a covered sample may lie outside of the exact triangle. Clamp its
+        // negative weights to zero.
         const float weight_a = fmaxf(mul_rn(edge_weights[0], inverse_edge_sum), 0.0f);
         const float weight_b = fmaxf(mul_rn(edge_weights[1], inverse_edge_sum), 0.0f);
         const float weight_c = fmaxf(mul_rn(edge_weights[2], inverse_edge_sum), 0.0f);
         const float inverse_weight_sum = __frcp_rn(sum3(weight_a, weight_b, weight_c));
         float2 uv = {mul_rn(sum3(mul_rn(weight_a, u[0]), mul_rn(weight_b, u[1]), mul_rn(weight_c, u[2])), inverse_weight_sum),
                      mul_rn(sum3(mul_rn(weight_a, v[0]), mul_rn(weight_b, v[1]), mul_rn(weight_c, v[2])), inverse_weight_sum)};
-        // Derivatives of uv by column and row: sums of the derivatives of the weights, times the texture coordinates of the
-        // corners relative to those of the sample. `sample_y` decreases with the row, which cancels the minus sign of the
-        // derivative by y.
+        // Derivatives of uv by column (dx) and row (dy). With the edge functions e_i and their sum s, d uv = sum_i d
+        // e_i (uv_i - uv) / s, where uv_i is the texture coordinate of corner i. From relative_x = x - sample_x * w
+        // follows d e_i / d sample_x = cross2(relative_y[j], relative_y[k], w[j], w[k]). The derivative by sample_y has
+        // a minus sign, which is canceled because sample_y decreases with the row.
         float2 uv_dx = {0.0f, 0.0f}, uv_dy = {0.0f, 0.0f};
 #pragma unroll
         for (unsigned i = 0; i < 3; ++i) {

@@ -1,51 +1,60 @@
-// The main kernel of a step: x = T (x0 + U q) for every vertex of every domain of a scene, and with RIGID_NORMALS also the
-// rigid normals and tangents of every corner. One launch covers all domains by a flat list of tiles. Also computes a
-// bounding box of each warp's x.
-//   tiles, mixed_quads  the work of each warp (layout.cuh)                                                       (in)
-//   words            U, per tile [chunk_count][3][quad_count] words of 16 bytes (chunk.cuh)                      (in)
-//   rest_positions   x0, per tile of one domain [3][quad_count][4] f32, per quad of a mixed tile [3][4] f32      (in)
+// The main kernel of a step: x = T (x0 + U q) for every vertex of every domain of a scene, and with RIGID_NORMALS also
+// the rigid normals and tangents of every corner. Also computes four bounding boxes of x per tile. One launch covers
+// all domains.
+//
+// A quad is four consecutive vertices or corners of a domain. A tile, the work of one warp (of four warps with
+// ONE_ITEM_PER_LANE), is up to 32 quads: of one domain, or of several small domains (a mixed tile). A chunk is a few
+// modes.
+//   tiles, mixed_quads  the tiles of all domains, and the quads of mixed tiles (layout.cuh)                      (in)
+//   words            U, per tile [chunk][3][quad] words of 16 bytes (chunk.cuh)                                  (in)
+//   rest_positions   x0, per tile of one domain [axis][quad][vertex in the quad] f32, per quad of a mixed tile
+//                    [axis][vertex in the quad] f32                                                              (in)
 //   rest_normals     with RIGID_NORMALS: rest normals in the same layout                                         (in)
 //   rest_tangents    with RIGID_NORMALS and NORMAL_MAPS: rest tangents in the same layout, but with four
 //                    components: x, y, z and the sign of the bitangent                                           (in)
-//   corner_offsets   with CORNER_OFFSETS: per domain, offset from a packed vertex to its packed corner           (in)
+//   corner_offsets   with CORNER_OFFSETS, [domains]: index of the first corner minus index of the first vertex   (in)
 //   transforms       [roots][3] float4: the rows of T of each transform root, relative to its floating origin (an
 //                    f64 point that stays on the host)                                                           (in)
-//   transform_links  with FOLLOWERS: per domain its transform root (the domain whose T it uses), and the index of
-//                    its frame, or NO_FRAME for a root                                                           (in)
-//   frames           with FOLLOWERS: [followers][3] float4, the rows of each follower's constant transform to its
-//                    root. Without FOLLOWERS, every domain is a root                                             (in)
-//   q                packed coordinates; with STORE_F16 and STORE_BF16 multiplied by the factor of their mode    (in)
-//   scales           with STORE_INT8: per tile of U and mode                                                     (in)
-//   retained_counts, retained  with MODE_TRUNCATION: per domain the number of chunks to sum, and their ascending
-//                    indices                                                                                     (in)
-//   tile_list        with TILE_LIST: the tiles to compute, whose number is in the header                         (in)
+//   transform_links  with FOLLOWERS, [domains]: the domain's transform root (the domain whose T it uses), and the
+//                    index of its frame, or NO_FRAME for a root. Without FOLLOWERS, every domain is a root       (in)
+//   frames           with FOLLOWERS: [followers][3] float4, the rows of each follower's frame, its constant
+//                    transform relative to its root                                                              (in)
+//   q                the coordinates of all domains; with STORE_F16 and STORE_BF16 multiplied by the factor of
+//                    their mode                                                                                  (in)
+//   scales           with STORE_INT8: one scale per tile of U and mode                                           (in)
+//   retained_counts  with MODE_TRUNCATION, [domains]: number of chunks that the domain sums                      (in)
+//   retained         with MODE_TRUNCATION, [chunks of all domains] u16: the ascending indices of these chunks    (in)
+//   tile_list        with TILE_LIST: indices of the tiles to compute; their number is in the header              (in)
 //   positions        [vertices][3] f32, address in the header                                                    (out)
 //   normals          [corners][3] f32, address in the header                                                     (out)
 //   tangents         [corners] float4, address in the header                                                     (out)
 //   displacements    with DISPLACEMENTS: u, [vertices][3] f32 in the domain's frame, address in the header. With
 //                    DISPLACEMENTS_ONLY (benchmarks) the only output, and u is not recomputed in f64             (out)
-//   boxes            [tiles][4][6] u32: `float_to_ordered` maxima of -x, -y, -z, x, y, z                         (out)
-// Launch: WARPS warps per block, WARPS_PER_TILE warps for each of `tile_count` tiles; with TILE_LIST any number of blocks.
+//   boxes            [tiles][4 boxes][6 keys] u32: `float_to_ordered` maxima of -x, -y, -z, x, y, z. Four warps of a
+//                    tile write one box each; a single warp writes its box four times                            (out)
+// Launch: WARPS warps per block, WARPS_PER_TILE warps for each of `tile_count` tiles; with TILE_LIST any number of
+// blocks.
 // CPU twin: src/compute/reference/deform.rs.
-// Further macros: MODES (a domain has modes), SHEAR (a transform may have shear or a non-uniform scale), ONE_ITEM_PER_LANE
-// (a tile has four warps instead of one) and COMPENSATED_SUM (at `Sums`).
+// Further macros: MODES (a domain has modes), SHEAR (a transform may have shear or a non-uniform scale),
+// ONE_ITEM_PER_LANE (a tile has four warps instead of one) and COMPENSATED_SUM (described at `Sums`).
 //
 // Determinism: each vertex sums its modes in order, from +0, by fused multiply-adds, independent of the tile and the
-// lane, so runs agree bit by bit. A result that is not finite in f32 is computed again in f64, so the output is not finite
-// only if f32 cannot represent it. The box is then NaN, also if only a displacement is not finite.
+// lane, so runs agree bit by bit. A result that is not finite in f32 is computed again in f64. An output that is still
+// not finite exceeds the range of f32. Its box is then NaN, also if only a displacement is not finite.
 #include "dependent_launch.cuh"
 #include "chunk.cuh"
 #include "ordered_float.cuh"
 #include "rigid_normals.cuh"
 
-// Maximum number of chunks that a lane loads before it sums the first. A lane with one item loads a quarter of a chunk, so
-// it has registers for more chunks.
+// Number of chunks that a lane loads before it sums the first one. With one item per lane, a lane loads a quarter of
+// the bytes per chunk, so it has registers for more chunks.
 #ifdef ONE_ITEM_PER_LANE
 #define PREFETCH_CHUNKS (16 / CHUNK_MODES)
 #else
 #define PREFETCH_CHUNKS 4
 #endif
-// Warps per block. Tiles with modes read long contiguous ranges and are fastest in blocks of one warp.
+// Warps per block. Twin: `block_threads` in src/compute/gpu/tables/kernels.rs. Tiles with modes read long contiguous
+// ranges and are fastest in blocks of one warp.
 #if defined(MODES) || defined(SHEAR) || defined(TILE_LIST)
 constexpr unsigned WARPS = 1;
 #else
@@ -55,7 +64,7 @@ constexpr unsigned WARPS = 2;
 // architecture (src/compute/gpu/tables/occupancy.rs).
 
 #ifdef MODES
-// Per mode of a chunk, the factor of its entries: q, with STORE_INT8 multiplied by the scale of the tile.
+// Per mode of a chunk, the weight of its entries in the sum: q, with STORE_INT8 multiplied by the scale of the tile.
 struct ChunkWeights {
     float values[CHUNK_MODES];
 };
@@ -79,7 +88,7 @@ __device__ __forceinline__ ChunkWeights load_chunk_weights(const DeformArgs& arg
     return weights;
 }
 
-// Sums of products, three per vertex. COMPENSATED_SUM also accumulates the rounding errors (Ogita, Rump and Oishi,
+// u of a lane's vertices, [axis][vertex]. COMPENSATED_SUM also accumulates the rounding errors (Ogita, Rump and Oishi,
 // "Accurate sum and dot product", algorithm Dot2), which doubles the registers of the sums.
 struct Sums {
     float values[FLOATS_PER_LANE];
@@ -116,7 +125,7 @@ struct Sums {
     }
 };
 
-// A lane's part of a chunk. The `words` of `load` point to the first word of the lane's quad in the chunk.
+// The entries of a chunk for a lane's items. `load` gets a pointer to the first of the three words of the lane's quad.
 #ifdef ONE_ITEM_PER_LANE
 struct Chunk {
     float entries[3 * CHUNK_MODES];
@@ -160,7 +169,7 @@ __device__ __forceinline__ void add_chunk(Sums& sums, const Chunk& chunk, const 
     }
 }
 
-// The chunks that a domain sums: all of them, or with MODE_TRUNCATION the retained ones.
+// Indices of the chunks that a domain sums: all of them, or with MODE_TRUNCATION the retained ones.
 struct ChunkIndices {
     unsigned count;
 #ifdef MODE_TRUNCATION
@@ -168,6 +177,7 @@ struct ChunkIndices {
 #endif
     __device__ __forceinline__ ChunkIndices(const DeformArgs& args, const LaneSlice& slice) : count(slice.chunk_count) {
 #ifdef MODE_TRUNCATION
+        // `retained` has capacity for every chunk of a domain, and q has CHUNK_MODES coordinates per chunk.
         retained = args.retained + slice.first_q / CHUNK_MODES;
         count = slice.chunk_count == 0 || slice.item_count == 0 ? 0 : __ldg(args.retained_counts + slice.domain);
 #endif
@@ -181,7 +191,7 @@ struct ChunkIndices {
     }
 };
 
-// Adds COUNT chunks, from index `i` of `chunk_indices` on, and advances `i`. Loads all COUNT chunks before it sums the first
+// Adds the next COUNT chunks, from `chunk_indices[i]` on, and advances `i`. Loads all of them before it sums the first
 // one.
 template <unsigned COUNT>
 __device__ __forceinline__ void sum_chunks(const DeformArgs& args, const LaneSlice& slice,
@@ -206,6 +216,7 @@ __device__ __forceinline__ void sum_modes(const DeformArgs& args, const LaneSlic
     while (i + PREFETCH_CHUNKS <= chunk_indices.count) {
         sum_chunks<PREFETCH_CHUNKS>(args, slice, chunk_indices, i, sums);
     }
+    // Fewer than PREFETCH_CHUNKS chunks remain: one call for each bit of their number.
     const unsigned remaining_chunks = chunk_indices.count - i;
     if (PREFETCH_CHUNKS > 8 && remaining_chunks & 8) {
         sum_chunks<8>(args, slice, chunk_indices, i, sums);
@@ -222,7 +233,7 @@ __device__ __forceinline__ void sum_modes(const DeformArgs& args, const LaneSlic
 }
 #endif
 
-// Computes u of one vertex of this lane in f64.
+// Computes u of one vertex of this lane in f64. `vertex` is below ITEMS_PER_LANE.
 __device__ __forceinline__ void sum_modes_f64(const DeformArgs& args, const LaneSlice& slice, unsigned vertex, double (&u)[3]) {
     for (unsigned axis = 0; axis < 3; ++axis) {
         u[axis] = 0.0;
@@ -240,8 +251,8 @@ __device__ __forceinline__ void sum_modes_f64(const DeformArgs& args, const Lane
     }
 }
 
-// Computes x of one vertex of this lane in f64 and rounds it once. The result can be finite although an intermediate value
-// overflowed in f32.
+// Computes x of one vertex of this lane in f64 and rounds it once. The result can be finite although an intermediate
+// value overflowed in f32.
 __device__ __noinline__ float3 position_f64(const DeformArgs& args, unsigned tile, unsigned tile_warp, unsigned vertex) {
     const LaneSlice slice = load_lane_slice(args, tile, tile_warp);
     const float* rest_position = item_pointer(args.rest_positions, slice, 3);
@@ -254,8 +265,8 @@ __device__ __noinline__ float3 position_f64(const DeformArgs& args, unsigned til
 }
 
 #if defined(DISPLACEMENTS) && defined(MODES)
-// Recomputes u of one vertex in f64 if the output is not finite. The warp stored the output before its last barrier. A
-// component that is still not finite sets the box to NaN, because x itself may be finite.
+// Recomputes u of one vertex in f64 if the stored u is not finite. The warp stored u before its last barrier. If a
+// component is still not finite, sets the keys of its axis to NaN, so that the box reports it: x itself may be finite.
 __device__ __noinline__ void repair_displacement(const DeformArgs& args, unsigned tile, unsigned tile_warp, unsigned vertex,
                                                unsigned (&keys)[6]) {
     const LaneSlice slice = load_lane_slice(args, tile, tile_warp);
@@ -274,8 +285,8 @@ __device__ __noinline__ void repair_displacement(const DeformArgs& args, unsigne
 }
 #endif
 
-// Computes the bounding box of a lane's positions, as six `float_to_ordered` keys. Positions beyond `count` are replaced by
-// the first position.
+// Computes the bounding box of a lane's positions, as six `float_to_ordered` keys. Positions beyond `count` are
+// replaced by the first position.
 __device__ __forceinline__ void compute_lane_box_keys(const float (&positions)[FLOATS_PER_LANE], unsigned count,
                                                       unsigned (&keys)[6]) {
 #pragma unroll
@@ -292,8 +303,8 @@ __device__ __forceinline__ void compute_lane_box_keys(const float (&positions)[F
     }
 }
 
-// Recomputes those of `count` staged positions that are not finite, in f64. Then computes the keys of the lane's box. NaN
-// has the largest key, so a position with a NaN gives a box with a NaN.
+// Recomputes in f64 those of a lane's `count` staged positions that are not finite. Then computes the keys of the
+// lane's box. NaN has the largest key, so a position with a NaN gives a box with a NaN.
 __device__ __noinline__ void repair_non_finite(const DeformArgs& args, unsigned tile, unsigned tile_warp,
                                                float* positions, unsigned count, unsigned (&keys)[6]) {
     for (unsigned side = 0; side < 6; ++side) {
@@ -304,7 +315,7 @@ __device__ __noinline__ void repair_non_finite(const DeformArgs& args, unsigned 
         if (!isfinite(position[0]) || !isfinite(position[1]) || !isfinite(position[2])) {
             const float3 repaired_position = position_f64(args, tile, tile_warp, vertex);
 #if defined(DISPLACEMENTS) && defined(MODES)
-            // If u is not finite in f32, neither is x, so u needs this check only here.
+            // If u is not finite in f32, then x is not finite either. So it suffices to check u here.
             repair_displacement(args, tile, tile_warp, vertex, keys);
 #endif
             position[0] = repaired_position.x;
@@ -318,7 +329,7 @@ __device__ __noinline__ void repair_non_finite(const DeformArgs& args, unsigned 
     }
 }
 
-// Shared memory of a warp: its staging buffer, and per lane the box keys after a repair of vertices in f64.
+// Shared memory of a warp: its staging buffer, and per lane the box keys that `repair_non_finite` computes.
 struct WarpShared {
     OutputStaging staging;
     unsigned repaired_keys[32][6];
@@ -366,7 +377,7 @@ __device__ __forceinline__ void write_positions(const DeformArgs& args, WarpShar
         }
     }
     store_staged_triples(args.header->positions, shared.staging, slice);
-    // A tile has four boxes. With four warps, each writes one; with one warp, it writes the same box four times.
+    // A tile has four boxes of six keys. Each of four warps writes one box; a single warp writes its box four times.
     const unsigned key = reduce_box_keys(keys);
     if (lane_id() < 6 * ITEMS_PER_LANE) {
         args.boxes[24 * (size_t)tile + 6 * tile_warp + lane_id()] = key;
@@ -394,6 +405,7 @@ __device__ __forceinline__ void compute_tile(const DeformArgs& args, WarpShared&
     if (slice.kind & TILE_VERTICES) {
         float displacements[FLOATS_PER_LANE] = {};
         VertexInputs inputs;
+        // With one item per lane, a lane has registers to load x0 and T before the sum.
 #if defined(MODES) && defined(ONE_ITEM_PER_LANE)
         inputs.load(args, slice);
         compute_displacements(args, slice, displacements);

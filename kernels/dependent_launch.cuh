@@ -1,7 +1,7 @@
-// Programmatic dependent launch (compute capability 9.0 and later; src/compute/gpu/launch/kernel.rs): a kernel may start
-// while the last blocks of the previous kernel on its stream still run. A kernel that is launched so must not access memory
-// before `wait_for_prerequisite_grids`, and must call `launch_dependent_grids` only after that. The third kernel of a
-// chain therefore starts after the first is complete.
+// Programmatic dependent launch (compute capability 9.0 and later; src/compute/gpu/launch/kernel.rs): a kernel may
+// start while the last blocks of the previous kernel on its stream still run. A kernel with such a launch must not
+// access memory before it calls `wait_for_prerequisite_grids`, and must call `launch_dependent_grids` only after this
+// wait. In a chain of three kernels, the third one therefore starts after the first one is complete.
 #pragma once
 
 // Returns when the previous kernel is complete and its writes are visible.
@@ -11,7 +11,7 @@ __device__ __forceinline__ void wait_for_prerequisite_grids() {
 #endif
 }
 
-// The next kernel may start when every block has called this or has exited.
+// Allows the next kernel to start when every block has called this function or has exited.
 __device__ __forceinline__ void launch_dependent_grids() {
 #if __CUDA_ARCH__ >= 900
     asm volatile("griddepcontrol.launch_dependents;" ::: "memory");

@@ -1,10 +1,12 @@
-// Transformation of directions by the linear part A of a transform: normals by the inverse transpose, tangents by A.
-// Without SHEAR every A is a rotation or reflection times a uniform scale, which transforms normals like tangents.
+// Transformation of directions by the linear part A of a transform T: normals by the inverse transpose of A, tangents
+// by A. Without SHEAR, every A is a rotation or reflection times a uniform scale, which transforms normals like
+// tangents. deform.cu describes the macros.
 //
-// A is computed in f64, because its cofactors and determinant lose precision to cancellation if A is nearly singular, and
-// the sign of the determinant decides which side a surface faces. Products of two f32 are exact in f64, and every other
-// operation is rounded as in the CPU twin (no fused multiply-add), so both give zero for the same inputs. No intermediate
-// value overflows or underflows. A of a follower is the product of two matrices, also computed in f64.
+// A is computed in f64, because its cofactors and determinant lose precision to cancellation if A is nearly singular,
+// and the sign of the determinant decides which side a surface faces. Products of two f32 are exact in f64, and every
+// other operation is rounded as in the CPU twin (no fused multiply-add). The determinant thus has the sign that the
+// twin computes, and is zero for the same inputs. No intermediate value overflows or underflows. A of a follower is the
+// product of two matrices, also computed in f64. CPU twin: src/compute/reference/rigid_normals.rs.
 #pragma once
 #include "transform.cuh"
 
@@ -12,6 +14,7 @@ struct Mat3d {
     double3 row0, row1, row2;
 };
 
+// a d - b c
 __device__ inline double minor2x2(double a, double b, double c, double d) {
     return __dsub_rn(__dmul_rn(a, d), __dmul_rn(b, c));
 }
@@ -25,7 +28,7 @@ __device__ inline double3 linear_part_of_row(const float4& row) {
 }
 
 #ifdef FOLLOWERS
-// A row of T times the linear part of the frame F.
+// A row of T times the linear part of the frame F, the follower's constant transform relative to its root.
 __device__ inline double3 multiply_linear_row(const float4& row, const Affine& f) {
     const double3 t = linear_part_of_row(row);
     return make_double3(dot(t, make_double3(f.row0.x, f.row1.x, f.row2.x)), dot(t, make_double3(f.row0.y, f.row1.y, f.row2.y)),
@@ -33,6 +36,7 @@ __device__ inline double3 multiply_linear_row(const float4& row, const Affine& f
 }
 #endif
 
+// A of a domain.
 __device__ inline Mat3d load_linear_part(const Transforms& transforms, unsigned domain) {
 #ifdef FOLLOWERS
     const TransformLink link = load_transform_link(transforms, domain);
@@ -56,8 +60,8 @@ __device__ inline double determinant_sign(const Mat3d& m) {
 }
 
 // v / |v|, or +Z if v is zero. v is first multiplied by the power of two that brings its largest component into [1, 2).
-// This rounds nothing. A number with the exponent bits e is at least 2^(e - 1023), so the power of two has the exponent bits
-// 1023 - (e - 1023) = 2046 - e.
+// This rounds nothing. A number with the exponent bits e is at least 2^(e - 1023), so the power of two has the exponent
+// bits 1023 - (e - 1023) = 2046 - e.
 __device__ inline float3 normalize(const double3& v) {
     const double max_component = fmax(fmax(fabs(v.x), fabs(v.y)), fabs(v.z));
     if (!(max_component > 0.0)) {

@@ -1,8 +1,15 @@
-// Structs and constants that host and kernels share. Twin: src/compute/gpu/tables/layout.rs; tests compare the size of every
-// struct and the offset of every field. The first comment of a kernel describes the arrays of its arguments.
+// Structs and constants that host and kernels share. Twin: src/compute/gpu/tables/layout.rs; tests compare the size of
+// every struct and the offset of every field. The first comment of a kernel describes the arrays of its arguments.
 //
-// A quad is 4 consecutive vertices or corners of one domain. A mixed tile has quads of several domains. The packed index of
-// a vertex, corner or coordinate counts those of all preceding domains too.
+// Terms:
+// - A shape is a mesh with its modes U. Several domains can use one shape.
+// - An item is a vertex or a corner (a vertex of a triangle, with its normal). A quad is four consecutive items of a
+//   domain.
+// - A tile is up to 32 quads, the work of one warp. A mixed tile has quads of several domains.
+// - The tables of all domains are concatenated: the packed index of a vertex or corner counts the vertices or corners
+//   of all preceding domains too.
+// - A field `first_X` is the index of the first element in the table of X: `first_word` in `words`, `first_q` in `q`. An
+//   index of a quad refers to the quads of `rest_positions`, `rest_normals` and `rest_tangents`.
 #pragma once
 
 // Threads per block of `apply`, `bounds` and `normals`, and packed corners per block of `normals`.
@@ -25,30 +32,29 @@ struct StepHeader {
     float* normals;
     float4* tangents;
     float* displacements;
-    unsigned output_step;      // the output buffers contain all changes up to this step
-    unsigned last_full_step;   // the last full step, which computed all domains
-    unsigned step;             // number of this step, from 1
+    unsigned output_step;      // the output buffers contain all changes up to this step, before the launch
+    unsigned last_full_step;   // number of the last full step, which computes all domains
+    unsigned step;             // number of this step, counted from 1
     unsigned change_count;     // number of `Change` entries for `apply`
     unsigned dirty_tile_count; // number of tiles in the tile list
     unsigned reserved[3];
-    // `float_to_ordered` maxima of -x, -y, -z, x, y, z, and with ORIENTED_BOUNDS the same along `BoundsArgs::bounding_axes`.
-    // The host sends zeros.
+    // Output of `bounds`, zero before the launch: `float_to_ordered` maxima of -x, -y, -z, x, y, z of all positions.
+    // With ORIENTED_BOUNDS, six more maxima, with the coordinates along `BoundsArgs::bounding_axes` instead of x, y, z.
     unsigned bounds[12];
 };
 static_assert(sizeof(StepHeader) == 112, "StepHeader differs from src/compute/gpu/tables/layout.rs");
 
-// Bit fields of `WarpTile::kind`: the number of items of the last quad (0 in a mixed tile), whether the tile computes
-// positions, and whether it computes normals and tangents. A tile with both flags computes corner i of a shape together
-// with vertex i. An item is a vertex, or a corner in a tile without vertices.
-constexpr unsigned LAST_QUAD_ITEMS = 7;
-constexpr unsigned TILE_VERTICES = 8;
-constexpr unsigned TILE_CORNERS = 16;
+// Bit masks of `WarpTile::kind`. A tile with TILE_VERTICES and TILE_CORNERS computes corner i of a shape together with
+// vertex i; its items are vertices. The items of a tile with only TILE_CORNERS are corners.
+constexpr unsigned LAST_QUAD_ITEMS = 7; // number of items of the last quad, 1 to 4; 0 in a mixed tile
+constexpr unsigned TILE_VERTICES = 8;   // the tile computes positions
+constexpr unsigned TILE_CORNERS = 16;   // the tile computes normals and tangents
 
-// The work of one warp: up to 32 quads and their part of U, [chunk_count][3][quad_count] words of 16 bytes.
+// A tile. Its part of U is [chunk_count][3][quad_count] words of 16 bytes.
 struct WarpTile {
-    unsigned long long first_word; // first word of U
+    unsigned long long first_word;
     unsigned first_item;           // packed index of the first item; in a mixed tile, first entry of `mixed_quads`
-    unsigned rest_quad;            // first quad of x0, normals and tangents
+    unsigned rest_quad;            // index of the first quad
     unsigned domain;
     unsigned first_q;
     unsigned first_scale;
@@ -61,32 +67,33 @@ static_assert(sizeof(WarpTile) == 32, "WarpTile differs from src/compute/gpu/tab
 // A quad of a mixed tile.
 struct MixedQuad {
     unsigned first_item;    // packed index of the first item
-    unsigned rest_quad;     // quad of x0, normals and tangents
-    unsigned packed_domain; // 4 * index of the domain + number of items - 1
+    unsigned rest_quad;     // index of the quad
+    unsigned packed_domain; // 4 * index of the domain + number of items of the quad - 1
     unsigned first_q;
 };
 static_assert(sizeof(MixedQuad) == 16, "MixedQuad differs from src/compute/gpu/tables/layout.rs");
 
 // Offsets of a domain for `normals`. Domains of one shape differ only in `first_corner` and `first_vertex`.
 struct NormalSlot {
-    unsigned first_corner; // packed corner
-    unsigned first_normal; // in `rest_normals`
-    unsigned first_tangent; // in `rest_tangents`, or NO_TANGENTS
-    unsigned first_vertex; // packed vertex
-    unsigned first_corner_group; // in `corner_groups`, or NO_GROUPS
+    unsigned first_corner;       // packed index
+    unsigned first_normal;       // index into a plane of `rest_normals`
+    unsigned first_tangent;      // index into `rest_tangents`, or NO_TANGENTS
+    unsigned first_vertex;       // packed index
+    unsigned first_corner_group; // index into `corner_groups`, or NO_GROUPS
 };
 static_assert(sizeof(NormalSlot) == 20, "NormalSlot differs from src/compute/gpu/tables/layout.rs");
 
 // An entry of the list of changed domains that `apply` reads.
 struct Change {
     unsigned domain;
-    unsigned first_q;     // in the packed coordinates
+    unsigned first_q;     // index into `q`
     unsigned q_count;     // number of coordinates
-    unsigned first_new_q; // in `new_q`
+    unsigned first_new_q; // index into `new_q`
 };
 static_assert(sizeof(Change) == 16, "Change differs from src/compute/gpu/tables/layout.rs");
 
-// The transform root of a domain, and its frame: its constant transform relative to that root. Used only with FOLLOWERS.
+// The transform root of a domain (the domain whose transform it uses), and the frame of a follower: its constant
+// transform relative to its root. Used only with FOLLOWERS.
 struct TransformLink {
     unsigned root;  // index into `transforms`
     unsigned frame; // index into `frames`, or NO_FRAME
@@ -117,12 +124,12 @@ struct DeformArgs {
 };
 static_assert(sizeof(DeformArgs) == 152, "DeformArgs differs from src/compute/gpu/tables/layout.rs");
 
-// A group of domains (its members) of one shape, for which `batch` reads U once.
+// A group of domains of one shape, for which `batch` reads U once. The domains are the members of the group.
 struct BatchGroup {
     unsigned long long first_word;
-    unsigned rest_quad; // first quad of x0
+    unsigned rest_quad; // index of the shape's first quad
     unsigned first_scale;
-    unsigned vertex_count; // of the shape
+    unsigned vertex_count; // number of vertices of the shape
     unsigned first_member;
     unsigned chunk_count;
     unsigned member_count;
@@ -131,10 +138,10 @@ static_assert(sizeof(BatchGroup) == 32, "BatchGroup differs from src/compute/gpu
 
 // A domain of a group.
 struct BatchMember {
-    unsigned first_vertex; // packed vertex
+    unsigned first_vertex; // packed index
     unsigned first_q;
     unsigned domain;
-    unsigned first_tile; // first tile of the domain in `deform`, for its boxes
+    unsigned first_tile; // index of the domain's first tile in the list of `deform`; locates the domain's boxes
 };
 static_assert(sizeof(BatchMember) == 16, "BatchMember differs from src/compute/gpu/tables/layout.rs");
 
@@ -165,7 +172,7 @@ static_assert(sizeof(BatchArgs) == 96, "BatchArgs differs from src/compute/gpu/t
 
 // A part of a domain that `bounds` reduces to one box.
 struct BoxSegment {
-    unsigned first_item; // first packed vertex, or first box of `deform`
+    unsigned first_item; // packed index of the first vertex, or index of the first box in `boxes`
     unsigned item_count;
     unsigned domain;
     unsigned is_vertex_range; // 1: the items are vertices, 0: the items are boxes
@@ -220,13 +227,14 @@ struct NormalsArgs {
 };
 static_assert(sizeof(NormalsArgs) == 120, "NormalsArgs differs from src/compute/gpu/tables/layout.rs");
 
-// Whether a domain changed after the output buffers were last written.
+// Whether a domain changed after the step that the output buffers contain.
 __device__ inline bool is_dirty(const StepHeader* header, const unsigned* change_steps, unsigned domain) {
     return max(__ldg(&header->last_full_step), __ldg(change_steps + domain)) > __ldg(&header->output_step);
 }
 
-// Finds the domain of a packed corner: the last slot that begins at or before it. `first_domains[b]` is the domain of the
-// first corner of block b, and the last entry is the last domain. A block inside one domain needs no search.
+// Finds the domain of a packed corner, for the blocks of `normals`: the last slot that begins at or before the corner.
+// `first_domains[b]` is the domain of the first corner of block b, and the last entry is the last domain. A block
+// inside one domain needs no search.
 __device__ inline unsigned find_domain(const NormalSlot* slots, const unsigned* first_domains, unsigned corner) {
     unsigned low = first_domains[blockIdx.x];
     unsigned high = first_domains[blockIdx.x + 1];
@@ -241,8 +249,9 @@ __device__ inline unsigned find_domain(const NormalSlot* slots, const unsigned* 
     return low;
 }
 
-// Writes three floats per item of the block as one contiguous range, so that warps write whole 32-byte sectors. The caller
-// must synchronize the block between writing `staged` and this call.
+// Copies three floats per item of the block from `staged` to `packed`, as one contiguous range, so that warps write
+// whole sectors of 32 bytes. `item_count` is the number of items of all blocks. The caller must synchronize the block
+// between its writes to `staged` and this call.
 __device__ inline void store_triples(float* packed, const float* staged, unsigned item_count) {
     const unsigned first_item = blockIdx.x * BLOCK;
     const unsigned float_count = 3 * min(BLOCK, item_count - first_item);

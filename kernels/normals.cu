@@ -1,37 +1,50 @@
 // Unit normals and tangents that follow the deformed triangles, for every corner of every domain, in one launch.
-//   rest_normals   [3][rest_corner_count] f32, one plane per axis                                       (in)
-//   rest_tangents  [..] float4: unit tangent, sign of the bitangent; read only with NORMAL_MAPS         (in)
-//   transforms     [roots][3] float4: the rows of world_from_domain; A is their first three columns   (in)
+//
+// A shape is a mesh with its modes. A smoothing group is the corners of one vertex that share a normal. Its ring lists
+// the vertex (the center), and then fans: runs of neighboring vertices, in which two consecutive ones form a triangle
+// with the center (src/model/domain/smoothing_groups.rs). An area vector has the direction of a triangle's normal, and
+// its length is twice the area of the triangle. The direction of the sum of a group's area vectors is the geometric
+// normal of the group.
+//   slots          [domains] offsets of the domain (layout.cuh)                                         (in)
+//   first_domains  per block of this launch the domain of its first corner, then the last domain        (in)
+//   rest_normals   [3 axes][corners of all shapes] f32                                                  (in)
+//   rest_tangents  with NORMAL_MAPS: per corner of a shape with tangents a float4, unit tangent and sign of the
+//                  bitangent                                                                            (in)
+//   transforms     [roots][3] float4: the rows of T of each transform root                              (in)
 //   transform_links, frames  with FOLLOWERS, as for `deform`                                            (in)
-//   corner_groups  [..] u32: the smoothing group of each corner of a shape that has groups              (in)
-//   ring_offsets, rings  [group_count + 1] u32 offsets into the rings: src/model/domain/smoothing_groups.rs (in)
-//   group_normals  [3][group_count] f32: geometric unit normals at rest, zeros if undefined             (in)
+//   change_steps   [domains] u32: the step that last changed the domain                                 (in)
+//   corner_groups  per corner of a shape that has groups, the index of its smoothing group              (in)
+//   ring_offsets   [group_count + 1] u32: index of the first entry of each ring, then the end of the last one (in)
+//   rings          u32: the rings of all groups. The first vertex of each fan has the flag RING_START   (in)
+//   group_normals  [3 axes][group_count] f32: unit normals of the groups at rest, zeros if undefined    (in)
 //   positions      [vertices][3] f32, world, of this step; address in the header                        (in)
 //   normals        [corners][3] f32, world; address in the header                                       (out)
-//   tangents       [corners] float4, world; zeros for shapes without tangents; only with NORMAL_MAPS (out)
+//   tangents       with NORMAL_MAPS: [corners] float4, world, zeros for shapes without tangents; address in the
+//                  header                                                                               (out)
 // Launch: BLOCK threads per block, a thread per packed corner, ceil(corners / BLOCK) blocks over all domains. A block
 // is skipped if none of its domains has changed since this output was written. CPU twin:
 // src/compute/reference/normals.rs, which defines the result.
 //
-// Each corner has a thread, so the corners of one group repeat its sum with data from the cache. A separate pass over
-// groups would write and read 12 bytes per group and cost a launch, which pays off only with two or more corners per
-// group on average. With groups of k triangles and one corner each, the DRAM traffic per corner is 4 bytes of
-// `corner_groups`, 4 of `ring_offsets`, 4 (k + 2) of `rings`, 12 of `group_normals`, 12 of positions, and 24 of the rest
-// normal and the result: 88 bytes at k = 6.
+// Each corner has a thread, so the corners of one group repeat its sum, with data from the cache. A separate pass over
+// the groups would write and read 12 bytes per group and cost a launch. This pays off only with two or more corners per
+// group on average. DRAM traffic per corner, for groups of one corner and k triangles: 4 bytes of `corner_groups`, 4 of
+// `ring_offsets`, 4 (k + 2) of `rings`, 12 of `group_normals`, 12 of positions, 12 of the rest normal and 12 of the
+// result. The sum is 88 bytes at k = 6.
 //
 // Each thread sums in the order of the ring, without atomics, so runs agree bit by bit. Sums are f64. Differences and
-// products of two f32 are then exact or nearly exact and cannot overflow or underflow, so large, small and distant domains
-// need no scaling.
+// products of two f32 are then exact or nearly exact and cannot overflow or underflow, so large, small and distant
+// domains need no scaling.
 #include "dependent_launch.cuh"
 #include "direction.cuh"
 
-// 2^-18: the area vector of a group is defined if it is longer than this fraction of B, which bounds its rounding error. The
-// twin has the derivation.
+// 2^-18: the area sum of a group has a defined direction if it is longer than this fraction of B (`rounding_scale`
+// below), which is proportional to the bound of its rounding error. The twin has the derivation.
 constexpr double RESOLUTION = 1.0 / 262144.0;
-// Two unit vectors are opposite if the squared length of their sum is below this, as in the twin.
+// Two unit vectors are opposite if the length of their sum is below 1e-5 (1e-10 is its square), as in the twin.
 constexpr float MIN_BISECTOR_SQUARED_LENGTH = 1e-10f;
 
-// The smallest rotation of the surface at a corner: from the rigid to the deformed unit normal.
+// The smallest rotation that takes the rigid unit normal of a group to its deformed unit normal. The rigid normal is
+// that at rest, transformed by T. Without a defined rotation, the surface keeps its rigid normals.
 struct ShortestArc {
     float3 rigid_normal, deformed_normal;
     bool is_defined;
@@ -59,14 +72,16 @@ __device__ double l1_norm(const double3& v) {
     return fabs(v.x) + fabs(v.y) + fabs(v.z);
 }
 
-// The area vectors of a group's triangles. A triangle with the edges e and f from the center c has the area vector e x f.
+// The sum of the area vectors of a group. For a triangle with the edges e and f from the center c, the area vector is
+// the cross product of e and f.
 struct Area {
     double3 sum;
-    // B: the sum of l (l + |c|) over both edges of each triangle, for the length l of an edge, in the L1 norm.
+    // B: the sum of l (l + |c|) over the edges e and f of each triangle, where l is the length of the edge. Lengths are
+    // L1 norms.
     double rounding_scale;
 };
 
-// The first entry of a ring is the center. The other entries are the vertices of the fans around it.
+// Sums the area vectors of the triangles of the ring from `ring` to `end`.
 __device__ Area sum_areas(const unsigned* ring, const unsigned* end, const float* positions) {
     const double3 center = load_position(positions, __ldg(ring));
     const double center_norm = l1_norm(center);
@@ -90,6 +105,7 @@ __device__ Area sum_areas(const unsigned* ring, const unsigned* end, const float
     return {sum, rounding_scale};
 }
 
+// The rotation of the surface at a packed corner.
 __device__ ShortestArc compute_surface_rotation(const NormalsArgs& args, const NormalSlot& slot, const Mat3d& linear,
                                                 unsigned corner) {
     ShortestArc rotation = {{0.0f, 0.0f, 0.0f}, {0.0f, 0.0f, 0.0f}, false};
@@ -115,17 +131,16 @@ __device__ ShortestArc compute_surface_rotation(const NormalsArgs& args, const N
     if (!rotation.is_defined) {
         return rotation;
     }
-    // The area sum transforms by the cofactor matrix, the rest normal by the inverse transpose. Their directions differ by
-    // the sign of the determinant.
+    // The cofactor matrix transforms area sums, the inverse transpose transforms rest normals. The two matrices differ
+    // by the factor of the determinant, so the directions differ by its sign.
     const double sign = determinant_sign(linear);
     rotation.deformed_normal = normalize(make_double3(sign * sum.x, sign * sum.y, sign * sum.z));
     rotation.rigid_normal = transform_normal(linear, normal);
     return rotation;
 }
 
-// Applies the smallest rotation that takes the rigid to the deformed normal: the component along the rigid normal becomes
-// a component along the deformed normal, and the perpendicular component is reflected at the plane perpendicular to their
-// bisector.
+// Applies a rotation to v. The component of v along the rigid normal becomes a component along the deformed normal. The
+// perpendicular component is reflected at the plane perpendicular to the bisector of the two normals.
 __device__ float3 rotate(const ShortestArc& rotation, const float3& v) {
     const float normal_component = dot(rotation.rigid_normal, v);
     const float3 perpendicular = add_scaled(v, rotation.rigid_normal, -normal_component);
@@ -140,8 +155,8 @@ __device__ float3 normalize(const float3& v) {
     return multiply(v, 1.0f / sqrtf(dot(v, v)));
 }
 
-// The normalized tangent without its component along the normal. If the tangent is parallel to the normal (within 1e-6
-// rad), any unit vector perpendicular to the normal.
+// The normalized tangent without its component along the normal. If the tangent is parallel to the normal within 1e-6
+// rad (1e-12 is its square), returns any unit vector perpendicular to the normal.
 __device__ float3 orthogonalize(const float3& tangent, const float3& normal) {
     const float3 perpendicular = add_scaled(tangent, normal, -dot(normal, tangent));
     if (dot(perpendicular, perpendicular) > 1e-12f) {

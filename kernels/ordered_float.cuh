@@ -1,8 +1,9 @@
-// Order-preserving integer keys of floats, so that integer maxima give float maxima. Twin: src/compute/gpu/tables/box_keys.rs.
+// Order-preserving integer keys of floats, so that integer maxima give float maxima. Twin:
+// src/compute/gpu/tables/box_keys.rs.
 #pragma once
 
-// The key of a number: its bits with the sign bit inverted, or all bits inverted if it is negative. Keys increase with x and
-// are never 0. x must not be NaN.
+// The key of x, which must not be NaN: the bits of x with the sign bit inverted, or with all bits inverted if x is
+// negative. Keys increase with x and are never 0.
 __device__ inline unsigned non_nan_to_ordered(float x) {
     const unsigned bits = __float_as_uint(x);
     return bits ^ (unsigned)((int)bits >> 31 | (int)0x80000000u);
@@ -18,7 +19,7 @@ __device__ inline float ordered_to_float(unsigned key) {
     return __uint_as_float(key >> 31 ? key & 0x7fffffffu : ~key);
 }
 
-// The maximum of a key over the warp.
+// The maximum of `key` over the lanes of the warp. All lanes must call this function.
 __device__ inline unsigned warp_max(unsigned key) {
 #if __CUDA_ARCH__ >= 800
     return __reduce_max_sync(0xffffffffu, key);
@@ -30,7 +31,7 @@ __device__ inline unsigned warp_max(unsigned key) {
 #endif
 }
 
-// Reduces each of six keys to its maximum over the warp. Lane i returns the maximum of key i % 6.
+// Reduces the six keys of a box (layout.cuh) to their maxima over the warp. Lane i returns the maximum of keys[i % 6].
 __device__ inline unsigned reduce_box_keys(const unsigned (&keys)[6]) {
     const unsigned side = threadIdx.x % 32 % 6;
     unsigned lane_key = 0;

@@ -1,19 +1,22 @@
-// Compute rasterizer: one sample per pixel. For each sample it finds the minimum depth and the index of the triangle with
-// that depth, by an atomic minimum of `depth << 32 | triangle`. The result does not depend on the order of execution.
-//   raster           a thread per triangle of a range: culls it, draws it if its rectangle has few samples, or queues it
+// Compute rasterizer: one sample per pixel. For each sample it finds the minimum depth and the index of the triangle
+// with that depth, by an atomic minimum of `depth << 32 | triangle`. The result does not depend on the order of
+// execution. A tile is 64 x 64 samples of the window.
+//   raster           a thread per triangle of a range: culls the triangle, draws it if its rectangle has few samples,
+//                    or appends it to the medium or the large queue
 //   raster_cut_outs  the same for cut-out triangles
-//   raster_warps     a warp per triangle of the medium queue
-//   raster_tiles     a warp per tile of a triangle of the large queue, or per strip of a tile if there are few tiles; also
-//                    draws clipped triangles
+//   raster_warps     draws the triangles of the medium queue, with a warp per triangle
+//   raster_tiles     draws the triangles of the large queue, which contains all clipped triangles, with a warp per tile
+//                    of a triangle, or per strip of a tile if there are few tiles
 // Macros:
 //   DEPTH_ONLY          the target is f32 depth without triangle indices: a shadow map
 //   CUT_OUTS            triangles from `first_cut_out` on are cut-outs, which pass an alpha test before the atomic
 //   COUNT_TRIANGLES     count the triangles per `TriangleBin`
 //   MAX_THREAD_SAMPLES  maximum number of samples in the rectangle of a triangle that a thread draws
-//   MAX_WARP_EXTENT     maximum extent, in 1/256 pixel, of a triangle that a warp draws; at most 16384, so that 32 bits
-//                       hold its edge functions
-// Launch: BLOCK threads per block. raster and raster_cut_outs need a thread per triangle; the others loop over their queue,
-// with any number of blocks. CPU twin: VisibilityBuffer::draw.
+//   MAX_WARP_EXTENT     maximum width and height, in 1/256 pixel, of a triangle that a warp draws; at most 16384, so
+//                       that 32 bits hold its edge functions
+// Launch: BLOCK threads per block. raster and raster_cut_outs need a thread per triangle. raster_warps and raster_tiles
+// loop over their queues, with any number of blocks. CPU twin: VisibilityBuffer::draw.
+// VisibilityBuffer is in src/compute/reference/raster.rs.
 #include "cut_out.cuh"
 
 #ifndef MAX_THREAD_SAMPLES
@@ -26,14 +29,14 @@
 constexpr unsigned BLOCK = 128, WARPS = BLOCK / 32;
 constexpr int TILE_SIZE = 64;
 constexpr unsigned MAX_STRIP_SPLITS = 3;  // a tile is halved at most three times, into strips of 8 rows
-constexpr unsigned TILE_COUNT_BITS = 40;  // of `RasterCounters::large_count`
+constexpr unsigned TILE_COUNT_BITS = 40;  // low bits of `RasterCounters::large_count`, with the number of tiles
 
-// The bin of a triangle and its setup. Fields from `is_flipped` on are valid only for unclipped triangles.
+// The bin of a triangle and its setup. The fields from `is_flipped` on are valid only for unclipped triangles.
 struct BinnedTriangle {
     TriangleBin bin;
     PixelRect rect;
-    bool is_flipped;
-    long long doubled_area;
+    bool is_flipped;        // whether a, b, c are counterclockwise on the screen
+    long long doubled_area; // not negative
     SnappedVertex a, b, c;
 };
 
@@ -41,8 +44,8 @@ __device__ inline bool is_empty(const PixelRect& rect) {
     return rect.x0 > rect.x1 || rect.y0 > rect.y1;
 }
 
-// Culls a triangle by its area and its samples. Returns LARGE if the triangle is not culled; `setup_unclipped` may replace
-// this by a smaller bin.
+// Culls a triangle by its signed area (positive if clockwise on the screen) and its samples. Returns LARGE if the
+// triangle is not culled; `setup_unclipped` may replace LARGE by a smaller bin.
 __device__ inline TriangleBin classify_by_area(const RasterArgs& args, long long doubled_area, const PixelRect& rect) {
     return doubled_area == 0                                ? DEGENERATE
            : args.culls_back_faces == 1 && doubled_area > 0 ? BACK_FACING
@@ -50,8 +53,8 @@ __device__ inline TriangleBin classify_by_area(const RasterArgs& args, long long
                                                             : LARGE;
 }
 
-// Setup of a clipped triangle. It is in a struct of its own in local memory, so that the many unclipped triangles keep their
-// setup in registers.
+// Setup of a clipped triangle. This struct is in local memory, because its address is passed to a function that is not
+// inlined. The setup of the many unclipped triangles is a separate struct, so that it stays in registers.
 struct ClippedSetup {
     TriangleBin bin;
     PixelRect rect;
@@ -104,6 +107,7 @@ __device__ inline void classify_triangle(const RasterArgs& args, unsigned triang
     }
 }
 
+// Draws a triangle with one thread. AlphaTestPolicy is `OpaqueTest` or `AlphaTest`.
 template <typename AlphaTestPolicy>
 __device__ inline void draw_small(const RasterArgs& args, const BinnedTriangle& binned, unsigned triangle) {
     const TriangleSetup<int> setup(binned.a, binned.b, binned.c, binned.is_flipped, (int)binned.doubled_area);
@@ -134,8 +138,8 @@ __device__ inline void push_medium(const RasterArgs& args, bool is_medium, unsig
     }
 }
 
-// Appends a triangle to the large queue. One atomic returns both the index of the entry and its first tile, so the first
-// tiles ascend with the entries.
+// Appends a triangle to the large queue. One atomic counts the entry and its tiles, and returns the previous counts:
+// the index of the entry and its first tile. The first tiles therefore ascend with the entries.
 __device__ inline void push_large(const RasterArgs& args, const PixelRect& rect, unsigned triangle) {
     const unsigned x = rect.x0 / TILE_SIZE, y = rect.y0 / TILE_SIZE;
     const unsigned column_count = rect.x1 / TILE_SIZE - x + 1, row_count = rect.y1 / TILE_SIZE - y + 1;
@@ -148,7 +152,7 @@ __device__ inline void push_large(const RasterArgs& args, const PixelRect& rect,
     ((LargeTriangle*)args.large_queue)[previous >> TILE_COUNT_BITS] = entry;
 }
 
-// Counts the bins of all lanes of a warp. All lanes must call this.
+// Counts the triangles of a warp per bin. All lanes must call this. Does nothing without COUNT_TRIANGLES.
 __device__ inline void count_bins(const RasterArgs& args, TriangleBin bin) {
 #ifdef COUNT_TRIANGLES
     for (unsigned bin_index = 0; bin_index < NO_BIN; ++bin_index) {
@@ -160,7 +164,7 @@ __device__ inline void count_bins(const RasterArgs& args, TriangleBin bin) {
 #endif
 }
 
-// Culls, draws or queues this thread's triangle.
+// Culls, draws or queues this thread's triangle of the range.
 template <typename AlphaTestPolicy>
 __device__ inline void draw_range(const RasterArgs& args) {
     const unsigned index = blockIdx.x * BLOCK + threadIdx.x, triangle = args.first_triangle + index;
@@ -190,7 +194,7 @@ extern "C" __global__ void __launch_bounds__(BLOCK) raster_cut_outs(const __grid
 }
 #endif
 
-// Draws a triangle with a warp, which tests 8 x 4 samples at a time.
+// Draws an unclipped triangle with a warp, which tests 8 x 4 samples at a time.
 template <typename AlphaTestPolicy>
 __device__ inline void draw_medium(const RasterArgs& args, unsigned triangle) {
     float4 corners[3];
@@ -218,7 +222,7 @@ __device__ inline bool is_cut_out(const RasterArgs& args, unsigned triangle) {
 #endif
 }
 
-// At least four resident blocks per multiprocessor limit the registers.
+// The compiler limits the registers so that at least four blocks are resident per multiprocessor.
 extern "C" __global__ void __launch_bounds__(BLOCK, 4) raster_warps(const __grid_constant__ RasterArgs args) {
     const unsigned queue_length = ((const RasterCounters*)args.counters)->medium_count, warp_count = gridDim.x * WARPS;
     for (unsigned index = blockIdx.x * WARPS + threadIdx.x / 32; index < queue_length; index += warp_count) {
@@ -231,8 +235,8 @@ extern "C" __global__ void __launch_bounds__(BLOCK, 4) raster_warps(const __grid
     }
 }
 
-// Finds the last entry of the large queue whose first tile is at or before `tile`, the index of a tile among the tiles of
-// all entries. The warp tests 32 entries at a time.
+// Finds the last entry of the large queue whose first tile is at or before `tile`, the index of a tile among the tiles
+// of all entries. The warp tests 32 entries at a time.
 __device__ inline LargeTriangle find_large_triangle(const RasterArgs& args, unsigned entry_count, unsigned long long tile) {
     const LargeTriangle* queue = (const LargeTriangle*)args.large_queue;
     unsigned low = 0, high = entry_count;
@@ -245,6 +249,7 @@ __device__ inline LargeTriangle find_large_triangle(const RasterArgs& args, unsi
     return queue[low];
 }
 
+// Loads a triangle, and clips it unless all corners are inside the guard band.
 __device__ inline void load_clipped_polygon(const RasterArgs& args, unsigned triangle, ClippedPolygon& polygon) {
     float4 corners[3];
     load_triangle(args, triangle, corners);
@@ -291,22 +296,24 @@ __device__ inline void draw_tile(const RasterArgs& args, const AlphaTestPolicy& 
     }
 }
 
-// The work of all warps. Like `TileJob`, it is in shared memory to save registers.
+// The work of all warps: jobs, each of which is one tile or strip of one triangle. This struct and `TileJob` are in
+// shared memory to save registers.
 struct TileSchedule {
     unsigned long long job_count;
     unsigned entry_count;
     unsigned strip_splits; // number of times that each tile is halved
 };
 
-// The work of a warp in one iteration: the part of a polygon inside a tile or strip.
+// The work of a warp in one iteration: the part of a clipped triangle inside a tile or strip.
 struct TileJob {
     ClippedPolygon polygon;
-    PixelRect rect;
+    PixelRect rect; // intersection of the tile or strip with the rectangle of the polygon
     unsigned triangle;
 };
 
-// A warp needs 128 iterations for a whole tile of 64 x 64 samples. If there are fewer tiles than warps, one tile would
-// determine the run time, so tiles are split into strips.
+// A warp needs 64 x 64 / 32 = 128 iterations for a whole tile. If there are fewer tiles than warps, the time for one
+// tile would be the run time of the kernel. Tiles are then halved into strips, as long as there is a warp for every
+// strip.
 __device__ inline void schedule_tiles(const RasterArgs& args, TileSchedule& schedule) {
     const unsigned long long large_count = ((const RasterCounters*)args.counters)->large_count;
     const unsigned long long tile_count = large_count & ((1ull << TILE_COUNT_BITS) - 1);
@@ -330,8 +337,8 @@ __device__ inline void load_tile_job(const RasterArgs& args, const TileSchedule&
     job.triangle = entry.triangle;
 }
 
-// Draws a polygon as a fan of triangles, which have the orientation of the polygon. Rounding may invert a triangle. It is
-// then skipped, because the other triangles cover all of its samples.
+// Draws a polygon as a fan of triangles, which have the orientation of the polygon. A triangle that rounding has
+// inverted is skipped, because the other triangles of the fan cover all of its samples.
 template <typename AlphaTestPolicy>
 __device__ inline void draw_fan(const RasterArgs& args, const TileJob& job) {
     const ClippedPolygon& polygon = job.polygon;
@@ -346,7 +353,7 @@ __device__ inline void draw_fan(const RasterArgs& args, const TileJob& job) {
     }
 }
 
-// At least five resident blocks per multiprocessor limit the registers.
+// The compiler limits the registers so that at least five blocks are resident per multiprocessor.
 extern "C" __global__ void __launch_bounds__(BLOCK, 5) raster_tiles(const __grid_constant__ RasterArgs args) {
     __shared__ TileSchedule schedule;
     __shared__ TileJob jobs[WARPS];

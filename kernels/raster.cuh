@@ -1,29 +1,30 @@
 // Triangle setup of the compute rasterizer: corners in clip space, clipping, snapping to 1/256 pixel, edge functions
 // and depth. Every float sum and product is rounded separately (no fused multiply-add), so that host and device give
-// the same bits. In window coordinates y points down, and the first sample is at (1/2, 1/2). raster.cu describes the macros
-// DEPTH_ONLY and CUT_OUTS. Twin: src/compute/reference/raster.rs.
+// the same bits. In window coordinates (pixels) y points down. Each pixel has one sample, at its center; that of the
+// first pixel is at (1/2, 1/2). raster.cu describes the macros DEPTH_ONLY and CUT_OUTS. Twin:
+// src/compute/reference/raster.rs.
 #pragma once
 
 constexpr int SUBPIXEL_STEPS = 256;  // per pixel
-constexpr unsigned MAX_CORNERS = 8;  // three, and at most one more for each of the five clip planes
-constexpr float MIN_W = 0x1p-100f;   // 1 / w overflows below about 2^-128; the rest is a margin
+constexpr unsigned MAX_CORNERS = 8;  // of a clipped triangle: three, and at most one more for each of five clip planes
+constexpr float MIN_W = 0x1p-100f;   // smallest accepted w; 1 / w overflows below about 2^-128, so 2^-100 has a margin
 
 // Device addresses and parameters of a launch. Twin: src/compute/gpu/executor/raster.rs.
 struct RasterArgs {
     unsigned long long positions;        // [vertices][3] f32
-    unsigned long long triangles;        // [triangles][3] u32: vertices
-    unsigned long long target;           // [height][width] u64: depth << 32 | triangle; with DEPTH_ONLY f32: depth (in, out)
+    unsigned long long triangles;        // [triangles][3] u32: indices of vertices
+    unsigned long long target;           // [height][width] u64: depth << 32 | triangle; with DEPTH_ONLY f32 depth (in, out)
     unsigned long long medium_queue;     // [triangles] u32: triangles that `raster` leaves to `raster_warps`
     unsigned long long large_queue;      // [triangles] LargeTriangle: triangles that `raster` leaves to `raster_tiles`
     unsigned long long counters;         // RasterCounters: lengths of the queues
     unsigned long long uvs;              // with CUT_OUTS: [triangles - first_cut_out][3][2] f32
     unsigned long long material_indices; // with CUT_OUTS: [triangles - first_cut_out] u32: indices into `materials`
-    unsigned long long materials;        // with CUT_OUTS: AlphaMaterial
+    unsigned long long materials;        // with CUT_OUTS: [materials] AlphaMaterial
     float clip_from_position[16];        // row-major
     float half_width, half_height;       // half the size of the window, in pixels
     float guard_x, guard_y;              // half the size of the guard band in x / w and y / w
     unsigned width, height;              // pixels
-    unsigned first_triangle, triangle_count; // range of this launch
+    unsigned first_triangle, triangle_count; // range that this launch draws
     unsigned culls_back_faces;           // 1: only front faces (counterclockwise with y up) are drawn
     unsigned first_cut_out;              // with CUT_OUTS: the first cut-out triangle; all later ones are cut-outs too
 };
@@ -32,7 +33,7 @@ struct RasterArgs {
 struct LargeTriangle {
     unsigned long long first_tile; // number of tiles of all preceding entries
     unsigned triangle;
-    unsigned tile_rect;            // x and y of the first tile, and number of tile columns - 1; 8 bits each from bit 0
+    unsigned tile_rect;            // column and row of the first tile, and number of tile columns - 1; 8 bits each from bit 0
 };
 
 struct RasterCounters {
@@ -41,24 +42,26 @@ struct RasterCounters {
     unsigned bin_counts[8];         // by TriangleBin, only with COUNT_TRIANGLES
 };
 
-// How a triangle is drawn (the first three), or why it is not drawn. NO_BIN: the thread has no triangle.
+// How a triangle is drawn (SMALL by a thread, MEDIUM by a warp, LARGE by a warp per tile), or why it is not drawn.
+// NO_BIN: the thread has no triangle.
 enum TriangleBin { SMALL, MEDIUM, LARGE, NOT_FINITE, OUTSIDE_FRUSTUM, DEGENERATE, BACK_FACING, NO_SAMPLE, NO_BIN };
 
 struct SnappedVertex {
-    int x, y; // 1/256 pixel
+    int x, y; // in 1/256 pixel
     float z;  // window depth, 0 to 1
 };
 
 struct ClippedPolygon {
-    unsigned count;
+    unsigned count; // number of corners; 0 if nothing remains
     SnappedVertex corners[MAX_CORNERS];
 };
 
-// A rectangle of samples; x1 and y1 are included.
+// Columns x0 to x1 and rows y0 to y1 of pixels, all included. Empty if x0 > x1 or y0 > y1.
 struct PixelRect {
     int x0, y0, x1, y1;
 };
 
+// Product and sum, each rounded to nearest. The compiler does not fuse them.
 __device__ inline float mul_rn(float a, float b) {
     return __fmul_rn(a, b);
 }
@@ -67,6 +70,7 @@ __device__ inline float add_rn(float a, float b) {
     return __fadd_rn(a, b);
 }
 
+// Position of a vertex in clip space.
 __device__ inline float4 to_clip(const RasterArgs& args, unsigned vertex) {
     const float* position = (const float*)args.positions + 3 * (size_t)vertex;
     const float x = __ldg(position), y = __ldg(position + 1), z = __ldg(position + 2);
@@ -79,6 +83,7 @@ __device__ inline float4 to_clip(const RasterArgs& args, unsigned vertex) {
     return clip;
 }
 
+// Loads the corners of a triangle in clip space.
 __device__ inline void load_triangle(const RasterArgs& args, unsigned triangle, float4 (&corners)[3]) {
     const unsigned* vertices = (const unsigned*)args.triangles + 3 * (size_t)triangle;
 #pragma unroll
@@ -102,8 +107,8 @@ __device__ inline bool is_outside(const float4 (&corners)[3]) {
            (corners[0].z < -corners[0].w && corners[1].z < -corners[1].w && corners[2].z < -corners[2].w);
 }
 
-// Signed distance to a clip plane, not negative on the inner side. Plane 0 is the near plane; planes 1 to 4 are the sides of
-// the guard band.
+// Signed distance of a corner from a clip plane; at least 0 on the inner side. Plane 0 is the near plane. Planes 1 to 4
+// are the sides of the guard band, the region around the window inside which snapped coordinates cannot overflow.
 __device__ inline float plane_distance(const RasterArgs& args, float4 corner, unsigned plane) {
     const float x = mul_rn(args.guard_x, corner.w), y = mul_rn(args.guard_y, corner.w);
     return plane == 0 ? add_rn(corner.z, corner.w) : plane == 1 ? add_rn(x, -corner.x) : plane == 2 ? add_rn(x, corner.x)
@@ -116,6 +121,7 @@ __device__ inline bool is_inside_guard_band(const RasterArgs& args, float4 corne
            add_rn(y, -corner.y) >= 0.0f && add_rn(y, corner.y) >= 0.0f && corner.w >= MIN_W;
 }
 
+// Projects a corner to the window and rounds x and y to 1/256 pixel.
 __device__ inline SnappedVertex snap(const RasterArgs& args, float4 corner) {
     const float inverse_w = __frcp_rn(corner.w);
     const float x = add_rn(mul_rn(mul_rn(corner.x, inverse_w), args.half_width), args.half_width);
@@ -127,8 +133,8 @@ __device__ inline SnappedVertex snap(const RasterArgs& args, float4 corner) {
     return snapped;
 }
 
-// Intersection of an edge with a clip plane. It is always computed from the inside end, so that both triangles of an edge
-// get the same bits.
+// Intersection of an edge with a clip plane. It is always computed from the inside end, so that both triangles that
+// share an edge get the same bits.
 __device__ inline float4 clip_edge(float4 inside, float4 outside, float inside_distance, float outside_distance) {
     const float t = __fdiv_rn(inside_distance, add_rn(inside_distance, -outside_distance));
     float4 intersection;
@@ -139,8 +145,8 @@ __device__ inline float4 clip_edge(float4 inside, float4 outside, float inside_d
     return intersection;
 }
 
-// Sutherland-Hodgman clipping by the near plane and the guard band. The polygon has no corners if nothing remains. Not
-// inlined, because few triangles are clipped.
+// Sutherland-Hodgman clipping by the near plane and the guard band, from one of two corner lists to the other for each
+// plane. Not inlined, because few triangles are clipped.
 __device__ __noinline__ void clip_triangle(const RasterArgs& args, float4 a, float4 b, float4 c, ClippedPolygon& polygon) {
     float4 corner_lists[2][MAX_CORNERS];
     unsigned corner_count = 3, source = 0;
@@ -179,9 +185,9 @@ __device__ inline long long doubled_area(const SnappedVertex& a, const SnappedVe
     return (long long)(b.x - a.x) * (c.y - a.y) - (long long)(b.y - a.y) * (c.x - a.x);
 }
 
-// The samples inside a rectangle in 1/256 pixel, clipped to the window. The sample of column c is at x = 256 c + 128. The
-// first column at or after x0 is therefore ceil((x0 - 128) / 256), and the last one at or before x1 is
-// floor((x1 - 128) / 256).
+// The pixels of the window whose samples lie inside a rectangle, which is given in 1/256 pixel. The sample of column c
+// is at x = 256 c + 128. The first column whose sample is at or after x0 is therefore ceil((x0 - 128) / 256), and the
+// last one whose sample is at or before x1 is floor((x1 - 128) / 256).
 __device__ inline PixelRect pixel_rect(const RasterArgs& args, int x0, int y0, int x1, int y1) {
     constexpr int HALF_PIXEL = SUBPIXEL_STEPS / 2;
     return {max(0, (x0 + HALF_PIXEL - 1) >> 8), max(0, (y0 + HALF_PIXEL - 1) >> 8),
@@ -210,15 +216,16 @@ __device__ inline PixelRect pixel_rect(const RasterArgs& args, const ClippedPoly
     return pixel_rect(args, x0, y0, x1, y1);
 }
 
-// A triangle with its corners clockwise on the screen. EdgeInt must be wide enough for the edge functions at all tested
-// samples.
+// A triangle with its corners clockwise on the screen. EdgeInt is the type of edge functions; it must be wide enough
+// for their values at all tested samples.
 template <typename EdgeInt>
 struct TriangleSetup {
     SnappedVertex a, b, c;
     float inverse_area, depth_ab, depth_ac; // depth_ab and depth_ac: depth differences from a to b and from a to c
     int min_edge_a, min_edge_b, min_edge_c; // `min_covered_edge` of the edge opposite to a, b and c
 
-    // Minimum of the edge function at covered samples: 0 for a top or left edge, which includes samples on the edge, else 1.
+    // Minimum of the edge function at covered samples. It is 0 for a top or left edge, because such an edge covers the
+    // samples on it, else 1.
     __device__ static int min_covered_edge(const SnappedVertex& start, const SnappedVertex& end) {
         return end.y < start.y || (end.y == start.y && end.x > start.x) ? 0 : 1;
     }
@@ -237,12 +244,14 @@ struct TriangleSetup {
         min_edge_c = min_covered_edge(a, b);
     }
 
-    // Twice the area of the triangle (start, end, (x, y)): positive on the inner side of the edge.
+    // Twice the signed area of the triangle with the corners `start`, `end` and (x, y), which are in 1/256 pixel.
+    // Positive on the inner side of the edge.
     __device__ static EdgeInt edge_function(const SnappedVertex& start, const SnappedVertex& end, int x, int y) {
         return (EdgeInt)(end.x - start.x) * (y - start.y) - (EdgeInt)(end.y - start.y) * (x - start.x);
     }
 
-    // Whether a pixel's sample lies inside the triangle and not behind the far plane. Sets `depth`, clamped to at least 0.
+    // Whether a pixel's sample lies inside the triangle and not behind the far plane. Sets `depth`, clamped to at least
+    // 0.
     __device__ bool covers(int column, int row, float& depth) const {
         const int x = SUBPIXEL_STEPS * column + SUBPIXEL_STEPS / 2, y = SUBPIXEL_STEPS * row + SUBPIXEL_STEPS / 2;
         const EdgeInt edge_b = edge_function(c, a, x, y), edge_c = edge_function(a, b, x, y);
@@ -256,9 +265,9 @@ struct TriangleSetup {
     }
 };
 
-// Writes a sample if it is nearer than the target's. Depths are not negative, so their bits have the order of the numbers.
-// The plain read may be stale, but the target only decreases: if the comparison fails, the atomic would change nothing. The
-// alpha texture is read only for samples that pass the comparison.
+// Writes a sample if it is nearer than the target's. Depths are not negative, so their bits have the order of the
+// numbers. The plain read may be stale, but the target only decreases: if the comparison fails, the atomic would change
+// nothing. The alpha texture is read only for samples that pass the comparison.
 template <typename AlphaTestPolicy>
 __device__ inline void write_sample(const RasterArgs& args, const AlphaTestPolicy& alpha_test, int column, int row,
                                     float depth, unsigned triangle) {

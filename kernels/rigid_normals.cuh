@@ -1,10 +1,10 @@
-// Rigid normals and tangents of a tile: the rest normals and tangents, transformed by T without U q (equation 3.8 of the
-// thesis). Normals are transformed by the inverse transpose of A, tangents by A. A reflection flips the sign of the
-// bitangent. CPU twin: src/compute/reference/rigid_normals.rs.
+// Rigid normals and tangents of a tile: the rest normals and tangents, transformed by T without U q (equation 3.8 of
+// the thesis). A is the linear part of T. Normals are transformed by the inverse transpose of A, tangents by A. A
+// reflection flips the sign of the bitangent. CPU twin: src/compute/reference/rigid_normals.rs.
 //
-// A lane's matrix is scaled by a power of two so that its largest entry is about 1. If a transformed unit vector is then
-// shorter than 0.1, it has lost precision in f32 and is computed again in f64. deform.cu includes this file and describes
-// the macros.
+// The matrix of a lane is scaled by a power of two so that its largest entry is about 1. If the matrix then makes a
+// unit vector shorter than 0.1, the result has lost precision in f32 and is computed again in f64. deform.cu includes
+// this file and describes the macros.
 #pragma once
 #include "warp_tile.cuh"
 #include "direction.cuh"
@@ -16,8 +16,8 @@ struct Mat3f {
     float3 row0, row1, row2;
 };
 
-// The power of two that scales a positive number to [1, 2), or as near as f32 allows. A number with the exponent bits e has
-// the exponent e - 127, so the power of two has the exponent bits 127 - (e - 127) = 254 - e.
+// The power of two that scales a positive number to [1, 2), or as near as f32 allows. A number with the exponent bits e
+// has the exponent e - 127, so the power of two has the exponent bits 127 - (e - 127) = 254 - e.
 __device__ __forceinline__ float power_of_two_scale(float max_entry) {
     const unsigned exponent = __float_as_uint(max_entry) >> 23;
     return __uint_as_float(max(254 - (int)exponent, 1) << 23);
@@ -27,8 +27,8 @@ __device__ __forceinline__ float max_abs(float a, float b, float c) {
     return fmaxf(fmaxf(fabsf(a), fabsf(b)), fabsf(c));
 }
 
-// The linear part of a transform, scaled so that its largest entry is about 1. The scale is a power of two and thus rounds
-// nothing.
+// The linear part of a transform, scaled so that its largest entry is about 1. The scale is a power of two and thus
+// rounds nothing.
 __device__ __forceinline__ Mat3f to_scaled_mat3f(const Affine& t) {
     const float4 a = t.row0, b = t.row1, c = t.row2;
     const float max_entry = fmaxf(fmaxf(max_abs(a.x, a.y, a.z), max_abs(b.x, b.y, b.z)), max_abs(c.x, c.y, c.z));
@@ -38,6 +38,7 @@ __device__ __forceinline__ Mat3f to_scaled_mat3f(const Affine& t) {
 }
 
 #ifdef FOLLOWERS
+// A row of the linear part of T times that of the frame F.
 __device__ __forceinline__ float4 compose_linear_row(const float3& t, const Mat3f& f) {
     return make_float4(fmaf(t.x, f.row0.x, fmaf(t.y, f.row1.x, t.z * f.row2.x)),
                        fmaf(t.x, f.row0.y, fmaf(t.y, f.row1.y, t.z * f.row2.y)),
@@ -45,7 +46,8 @@ __device__ __forceinline__ float4 compose_linear_row(const float3& t, const Mat3
 }
 #endif
 
-// The scaled linear part of T of a domain. Both factors of a follower's T are scaled before the product, to avoid overflow.
+// The scaled linear part of T of a domain. Both factors of a follower's T are scaled before the product, to avoid
+// overflow.
 __device__ __forceinline__ Mat3f load_scaled_linear_part(const Transforms& transforms, unsigned domain) {
 #ifdef FOLLOWERS
     const TransformLink link = load_transform_link(transforms, domain);
@@ -75,16 +77,17 @@ __device__ __forceinline__ Mat3f to_scaled_mat3f(const Mat3d& m) {
             make_float3(m.row2.x * scale, m.row2.y * scale, m.row2.z * scale)};
 }
 
+// The cofactor matrix times the sign of the determinant: the inverse transpose times a positive number.
 __device__ __forceinline__ Mat3d signed_cofactors(const Mat3d& m) {
     const double sign = determinant_sign(m);
     return {signed_cross(m.row1, m.row2, sign), signed_cross(m.row2, m.row0, sign), signed_cross(m.row0, m.row1, sign)};
 }
 #endif
 
-// Repeats the transformation in f64 for the corners in the bit mask `imprecise_corners`. The other corners of the lane
-// keep their results, so that the result of a corner does not depend on its lane. `rest_directions` points to the x
-// component of the lane's first direction; its y component is `axis_stride` floats later. `component_count` is 3 for normals
-// and 4 for tangents.
+// Repeats the transformation in f64 for the corners of a lane in the bit mask `imprecise_corners`. The other corners
+// keep their results, so that the result of a corner does not depend on the corners in the same lane. `rest_directions`
+// points to the x component of the lane's first direction; the y component is `axis_stride` floats later.
+// `component_count` is the number of staged floats per direction: 3 for normals and 4 for tangents.
 __device__ __noinline__ void retransform_directions_f64(Transforms transforms, unsigned domain,
                                                         const float* rest_directions, unsigned axis_stride,
                                         float* staged_directions, unsigned imprecise_corners, unsigned component_count) {
@@ -101,7 +104,8 @@ __device__ __noinline__ void retransform_directions_f64(Transforms transforms, u
     }
 }
 
-// Transforms and normalizes a direction. Sets `corner_bit` in `imprecise_corners` if the result lost too much precision.
+// Transforms and normalizes a direction. Sets the bit `corner_bit` in `imprecise_corners` if the result lost too much
+// precision.
 __device__ __forceinline__ float3 transform_direction_f32(const Mat3f& m, float x, float y, float z, unsigned corner_bit,
                                                           unsigned& imprecise_corners) {
     const float3 v = make_float3(fmaf(m.row0.x, x, fmaf(m.row0.y, y, m.row0.z * z)),
@@ -110,7 +114,7 @@ __device__ __forceinline__ float3 transform_direction_f32(const Mat3f& m, float 
     const float squared_length = fmaf(v.x, v.x, fmaf(v.y, v.y, v.z * v.z));
     // A NaN counts as short.
     imprecise_corners |= squared_length > MIN_SQUARED_LENGTH ? 0 : corner_bit;
-    // `rsqrtf` is accurate to two units in the last place.
+    // The error of `rsqrtf` is at most two units in the last place.
     const float inverse_length = rsqrtf(squared_length);
     return make_float3(v.x * inverse_length, v.y * inverse_length, v.z * inverse_length);
 }
@@ -178,7 +182,7 @@ __device__ __forceinline__ void write_rigid_directions(const DeformArgs& args, O
                                                        const LaneSlice& slice, const RestNormals& rest_normals) {
     unsigned first_corner = slice.first_item;
 #ifdef CORNER_OFFSETS
-    // `first_item` is then the packed index of a vertex.
+    // In a tile with vertices, `first_item` is the packed index of a vertex.
     if (slice.kind & TILE_VERTICES) {
         first_corner += __ldg(args.corner_offsets + slice.domain);
     }

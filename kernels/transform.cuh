@@ -1,6 +1,6 @@
-// The transform T of a domain. With FOLLOWERS, T of a follower is the transform of its transform root times its frame, a
-// constant transform from the follower to the root. CPU twin: src/model/domain/composed_transform.rs, which defines the
-// order of operations; results are bit-identical.
+// The transform T of a domain. With FOLLOWERS, a domain can be a follower of another domain, its transform root. T of a
+// follower is the transform of the root times the follower's frame F, a constant transform relative to the root.
+// CPU twin: src/model/domain/composed_transform.rs, which defines the order of operations; results are bit-identical.
 #pragma once
 #include "layout.cuh"
 
@@ -11,10 +11,10 @@ struct Affine {
 
 // Tables from which T is composed.
 struct Transforms {
-    const float4* rows; // [roots][3]
+    const float4* rows; // [roots][3]: rows of T
 #ifdef FOLLOWERS
     const TransformLink* transform_links;
-    const float4* frames; // [followers][3]
+    const float4* frames; // [followers][3]: rows of F
 #endif
 };
 
@@ -27,6 +27,7 @@ __device__ __forceinline__ Transforms transforms_of(const Args& args) {
 #endif
 }
 
+// The transform with index `index` in a table of three rows per transform.
 __device__ __forceinline__ Affine load_affine(const float4* table, unsigned index) {
     const float4* rows = table + 3 * (size_t)index;
     return {__ldg(rows), __ldg(rows + 1), __ldg(rows + 2)};
@@ -38,7 +39,7 @@ __device__ __forceinline__ TransformLink load_transform_link(const Transforms& t
     return {link.x, link.y};
 }
 
-// A row of T times a column (x, y, z) of the linear part of the frame F.
+// A row of T times a column (x, y, z) of the linear part of F.
 __device__ __forceinline__ float dot_row_column(const float4& t, float x, float y, float z) {
     return fmaf(t.x, x, fmaf(t.y, y, __fmul_rn(t.z, z)));
 }
@@ -51,6 +52,7 @@ __device__ __forceinline__ float4 compose_row(const float4& t, const Affine& f) 
 }
 #endif
 
+// T of a domain.
 __device__ __forceinline__ Affine load_transform(const Transforms& transforms, unsigned domain) {
 #ifdef FOLLOWERS
     const TransformLink link = load_transform_link(transforms, domain);
@@ -70,6 +72,7 @@ __device__ __forceinline__ float transform_row(const float4& row, float x, float
     return fmaf(row.x, x, fmaf(row.y, y, fmaf(row.z, z, row.w)));
 }
 
+// Multiplies the three rows of a transform by a point.
 __device__ __forceinline__ void transform_point_f64(const float4* rows, const double (&point)[3], double (&world)[3]) {
     for (unsigned axis = 0; axis < 3; ++axis) {
         const float4 row = rows[axis];
@@ -77,7 +80,7 @@ __device__ __forceinline__ void transform_point_f64(const float4* rows, const do
     }
 }
 
-// Transforms a point by T of a domain in f64 and rounds the result once. Overwrites `point`.
+// Transforms a point by T of a domain in f64 and rounds the result once. May overwrite `point`.
 __device__ __forceinline__ float3 transform_domain_point_f64(const Transforms& transforms, unsigned domain,
                                                              double (&point)[3]) {
     double world[3];

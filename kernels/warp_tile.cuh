@@ -1,4 +1,5 @@
-// Assignment of the items (vertices or corners) of a tile to lanes, and coalesced stores of the results.
+// Assignment of the items (vertices or corners) of a tile to lanes, and coalesced stores of the results. layout.cuh
+// defines tiles, mixed tiles and quads.
 #pragma once
 #include "layout.cuh"
 
@@ -18,25 +19,25 @@ __device__ __forceinline__ unsigned lane_id() {
 // One lane's part of a tile.
 struct LaneSlice {
     unsigned kind;       // as in `WarpTile`
-    unsigned quad;       // in the tile
-    unsigned quad_count; // of the tile
+    unsigned quad;       // index of the lane's quad in the tile
+    unsigned quad_count; // number of quads of the tile
     unsigned chunk_count;
-    unsigned long long first_word; // of the tile
-    unsigned item_in_quad;         // first item of the lane in its quad
+    unsigned long long first_word; // first word of U of the tile
+    unsigned item_in_quad;         // index of the lane's first item in its quad
     unsigned first_item;           // packed index of the lane's first vertex, or corner in a tile without vertices
     unsigned item_count;           // number of items to write
     unsigned domain;
-    unsigned warp_item_count;  // items of the warp in a tile of one domain; 0 in a mixed tile
-    unsigned rest_quad;        // quad of x0, normals and tangents: first quad of the tile, or the lane's quad in a mixed tile
-    unsigned component_stride; // number of float4 vectors from one component of a quad to the next component
+    unsigned warp_item_count;  // number of items of all lanes of the warp in a tile of one domain; 0 in a mixed tile
+    unsigned rest_quad;        // index of the tile's first quad in the rest tables; in a mixed tile, of the lane's quad
+    unsigned component_stride; // number of float4 vectors from one component of a quad in a rest table to the next one
     unsigned first_q;
     unsigned first_scale;
 };
 
-// This lane's part of a tile. A lane without an item has `item_count` 0 and reads quad 0. `tile_warp` is the index of the
-// warp in its tile.
+// Describes this lane's part of a tile. A lane without an item has `item_count` 0 and reads quad 0. `tile_warp` is the
+// index of the warp in its tile.
 __device__ __forceinline__ LaneSlice load_lane_slice(const DeformArgs& args, unsigned tile, unsigned tile_warp) {
-    // The two halves of a `WarpTile`; below, `quad_words` is a `MixedQuad`. Their fields are in the order of layout.cuh.
+    // The two halves of a `WarpTile`, with its fields in the order of layout.cuh.
     const uint4 low_words = __ldg((const uint4*)(args.tiles + tile));
     const uint4 high_words = __ldg((const uint4*)(args.tiles + tile) + 1);
     const unsigned tile_lane = tile_warp * 32 + lane_id();
@@ -63,6 +64,7 @@ __device__ __forceinline__ LaneSlice load_lane_slice(const DeformArgs& args, uns
         slice.first_scale = high_words.z;
     } else {
         const unsigned mixed_quad = low_words.z + (slice.quad < slice.quad_count ? slice.quad : 0);
+        // A `MixedQuad`, with its fields in the order of layout.cuh.
         const uint4 quad_words = __ldg((const uint4*)(args.mixed_quads + mixed_quad));
         quad_items = slice.quad < slice.quad_count ? 1 + quad_words.z % 4 : 0;
         slice.first_item = quad_words.x;
@@ -83,8 +85,8 @@ __device__ __forceinline__ LaneSlice load_lane_slice(const DeformArgs& args, uns
 
 // Staging buffer of a warp in shared memory, for coalesced stores.
 struct OutputStaging {
-    float4 vectors[32 * ITEMS_PER_LANE]; // [lane][item][component]; capacity for four components per item
-    uint2 item_ranges[32];               // per lane: first packed item and number of items
+    float4 vectors[32 * ITEMS_PER_LANE]; // floats [lane][item][component], with three or four components per item
+    uint2 item_ranges[32];               // per lane: packed index of its first item (x) and number of its items (y)
 };
 
 __device__ __forceinline__ float* staged_floats(OutputStaging& staging) {
@@ -108,15 +110,17 @@ __device__ __forceinline__ void stage_triples(OutputStaging& staging, const Lane
     staging.item_ranges[lane_id()] = make_uint2(first_item, slice.item_count);
 }
 
-// Stores the staged triples so that whole 32-byte sectors are written. The items of a tile of one domain are contiguous. A
-// lane writes 16 bytes at a time if the output is aligned, else 4 bytes.
+// Stores the staged triples so that whole sectors of 32 bytes are written. The items of a tile of one domain are
+// contiguous in the output: a lane writes 16 bytes at a time if the output is aligned, else 4 bytes. In a mixed tile, a
+// lane writes 4 bytes at a time.
 __device__ __forceinline__ void store_staged_triples(float* packed, OutputStaging& staging, const LaneSlice& slice) {
     __syncwarp();
     if (slice.kind & LAST_QUAD_ITEMS) {
         const unsigned first_item = staging.item_ranges[0].x, float_count = 3 * slice.warp_item_count;
         float* output = packed + 3 * (size_t)first_item;
         const unsigned vector_count = first_item % 4 == 0 ? float_count / 4 : 0;
-        // The loop has a constant bound, the vectors of a full warp (32 * FLOATS_PER_LANE / 4), so that it can be unrolled.
+        // The loop has a constant bound, the vectors of a full warp (32 * FLOATS_PER_LANE / 4), so that it can be
+        // unrolled.
 #pragma unroll
         for (unsigned i = lane_id(); i < 8 * FLOATS_PER_LANE; i += 32) {
             if (i < vector_count) {
@@ -127,8 +131,8 @@ __device__ __forceinline__ void store_staged_triples(float* packed, OutputStagin
             __stcs(output + i, staged_floats(staging)[i]);
         }
     } else {
-        // Staged float 32 k + lane belongs to lane (32 k + lane) / FLOATS_PER_LANE. The pattern repeats after three values
-        // of k, shifted by a whole number of lanes.
+        // In iteration k, lane i writes the staged float 32 k + i, which lane (32 k + i) / FLOATS_PER_LANE staged. The
+        // pattern repeats after three iterations (96 floats), shifted by 96 / FLOATS_PER_LANE lanes, a whole number.
         unsigned owner_lane[3], number_in_lane[3];
 #pragma unroll
         for (unsigned k = 0; k < 3; ++k) {
@@ -146,7 +150,7 @@ __device__ __forceinline__ void store_staged_triples(float* packed, OutputStagin
     __syncwarp();
 }
 
-// Stores the staged quadruples to the items of the last `stage_triples`.
+// Stores four staged components per item, to the item ranges of the last `stage_triples`.
 __device__ __forceinline__ void store_staged_quadruples(float4* packed, OutputStaging& staging) {
     __syncwarp();
 #pragma unroll
@@ -165,8 +169,9 @@ struct LaneItems {
     float values[ITEMS_PER_LANE];
 };
 
-// Pointer to the first component of a lane's first item. The table holds [component_count][quad_count] float4 per tile of
-// one domain, or [component_count] float4 per quad of a mixed tile.
+// Pointer to the first component of a lane's first item in a rest table (x0, normals or tangents). Such a table has
+// [component][quad] float4 per tile of one domain, and [component] float4 per quad of a mixed tile. A float4 has one
+// component of the four items of a quad.
 __device__ __forceinline__ const float* item_pointer(const float4* table, const LaneSlice& slice, unsigned component_count) {
     const unsigned quad = slice.kind & LAST_QUAD_ITEMS ? slice.quad : 0;
     return (const float*)(table + component_count * (size_t)slice.rest_quad + quad) + slice.item_in_quad;
