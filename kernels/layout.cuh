@@ -8,8 +8,8 @@
 // - A tile is up to 32 quads, the work of one warp. A mixed tile has quads of several domains.
 // - The tables of all domains are concatenated: the packed index of a vertex or corner counts the vertices or corners
 //   of all preceding domains too.
-// - A field `first_X` is the index of the first element in the table of X: `first_word` in `words`, `first_q` in `q`. An
-//   index of a quad refers to the quads of `rest_positions`, `rest_normals` and `rest_tangents`.
+// - A field `first_X` is the index of the first element in the table of X: `first_word` in `words`, `first_q` in `q`.
+//   An index of a quad refers to the quads of `rest_positions`, `rest_normals` and `rest_tangents`.
 #pragma once
 
 // Threads per block of `apply`, `bounds` and `normals`, and packed corners per block of `normals`.

@@ -1,12 +1,12 @@
 // Bandwidth kernels and helpers for timing.
 //   fill          writes pseudo-random words; one thread per word
 //   copy          copies `src` to `dst`; its memory traffic is twice the size of a buffer
-//   read          reads all of `src`. A conditional store that never executes keeps the compiler from removing the loads.
-//   delay         delays the stream by a number of nanoseconds; one thread
+//   read          reads all of `src`. A store whose condition is never true keeps the compiler from removing the loads.
+//   delay         occupies the stream for a number of nanoseconds; one thread
 //   empty_kernel  does nothing; one thread
-// Launch of copy and read: BLOCK threads per block, LOADS vectors (uint4) per thread, one block per tile of BLOCK * LOADS
-// vectors. Buffers are whole tiles. With STREAMING, loads and stores have evict-first cache hints. Without it, loads use
-// the read-only cache.
+// Launch of copy and read: BLOCK threads per block, LOADS vectors (uint4) per thread. The number of vectors of a buffer
+// is a multiple of BLOCK * LOADS. With STREAMING, loads and stores have evict-first cache hints. Without STREAMING, loads
+// use the read-only cache.
 //
 // CPU twins: the tests of tests/bench/src/kernels/bandwidth.rs.
 #ifndef LOADS
@@ -66,8 +66,8 @@ extern "C" __global__ void __launch_bounds__(BLOCK) read(const uint4* src, uint4
     }
 }
 
-// Hashes the index with the finalizer of MurmurHash3. The top bit is cleared, so that no word is all ones and the store
-// in `read` never executes.
+// The value of a word is a hash of its index: the finalizer of MurmurHash3. The top bit is cleared. No word is then all
+// ones, so the store in `read` never executes.
 extern "C" __global__ void __launch_bounds__(BLOCK) fill(unsigned* dst, unsigned long long words) {
     const size_t index = (size_t)blockIdx.x * BLOCK + threadIdx.x;
     if (index < words) {

@@ -1,34 +1,42 @@
-// x = T_b (x0 + U q_b) for up to BATCH_SIZE domains b of one shape, by tensor cores.
-//   words           U in 16 bits per entry, per tile [chunks][3][tile_quads] words of 16 bytes (chunk.cuh)  (in)
-//   rest            x0, [quads][12] f32: 4 x, 4 y, 4 z                                                   (in)
-//   transforms      [BATCH_SIZE][3] float4: the rows of T; zeros where there is no domain                (in)
-//   inverse_scales  [BATCH_SIZE] f32: powers of two that undo the scaling of q                           (in)
-//   split_q         every coordinate as a pair of 16-bit numbers: the rounded coordinate, and the rounded
-//                   remainder. [steps][BATCH_SIZE / 8][32 lanes] words of 16 bytes. The word of a lane
-//                   belongs to domain lane / 4 of the group of 8, and to the modes 2 (lane % 4) + {0, 1, 8, 9}
-//                   of the step; first the four rounded coordinates, then the four remainders            (in)
-//   positions       [vertices][3] f32; domain b begins at vertex `first_vertices[b]`                     (out)
+// x = T_b (x0 + U q_b) for up to BATCH_SIZE domains b of one shape (mesh and U), by tensor cores.
+//
+// A quad is four consecutive vertices, a tile up to 32 quads, a chunk two modes, a step 16 modes (8 chunks). A group is
+// 8 domains.
+//   words           U in 16 bits per entry, per tile [chunk][3][quad] words of 16 bytes (kernels/chunk.cuh)  (in)
+//   rest            x0, [quads][12] f32: x of the four vertices, then y, then z                              (in)
+//   transforms      [BATCH_SIZE][3] float4: the rows of T; zeros where there is no domain                    (in)
+//   inverse_scales  [BATCH_SIZE] f32: per domain, the power of two that undoes the scaling of its q          (in)
+//   split_q         q, each coordinate as a pair of 16-bit numbers: the rounded coordinate, and the rounded
+//                   remainder. [step][group][lane] words of 16 bytes. The word of a lane belongs to domain
+//                   lane / 4 of the group, and to the modes 2 (lane % 4) + {0, 1, 8, 9} of the step: first
+//                   the four rounded coordinates, then the four remainders                                   (in)
+//   positions       [vertices][3] f32; domain b begins at vertex `first_vertices[b]`                         (out)
 // Launch: one block of WARPS warps per tile (tests/bench/src/kernels/batch_mma.rs). CPU twin: the tests of that file.
 //
-// The sum over all modes takes steps of 16 modes, with one matrix product (mma.m16n8k16) per step.
+// A matrix product (mma.m16n8k16) sums the 16 modes of a step for the 8 domains of a group.
 //
-// The result is not bit-identical to that of `deform`: q has 22 bits (f16) or 16 bits (bf16), and a tensor core sums the
-// 16 products of a step in its own order and with its own rounding. The a-priori error bound covers both. Unlike `deform`,
-// this kernel does not recompute overflowing sums in f64.
+// The result is not bit-identical to that of `deform`: q has 22 bits (f16) or 16 bits (bf16), and a tensor core sums
+// the 16 products of a step in its own order and with its own rounding. The a-priori error bound covers both effects.
+// Unlike `deform`, this kernel does not recompute overflowing sums in f64.
 //
-// Design. The U of a quad (four vertices) and a chunk (two modes) has 12 rows (axis, vertex) and two columns. For
-// mma.m16n8k16, a lane provides rows g and g + 8 at columns 2 t + {0, 1, 8, 9}, with g = lane / 4 and t = lane % 4. The
-// sums do not depend on which vertices and modes these rows and columns stand for. Here a lane provides quad g and chunks
-// t and t + 4. It loads both chunks with six loads of 16 bytes, in whole lines of 128 bytes. It forms the fragments of
-// six products with one byte permutation per register. U does not pass through shared memory. A lane receives all 12 sums
-// of quad g for a quarter of the domains, so it computes the positions of whole vertices. The sums of 16 domains, two
-// steps of U, and q take 160 registers. This allows 12 warps per multiprocessor, with 72 KB in flight.
+// Design. The left matrix of a product has 16 rows and 16 columns (modes). A lane provides the rows g and g + 8 at the
+// columns 2 t + {0, 1, 8, 9}, with g = lane / 4 and t = lane % 4. The sums do not depend on which vertices the rows and
+// which modes the columns stand for. Here, row g is a vertex of quad g, and row g + 8 the next vertex of the same quad.
+// The columns of a lane are the modes of the chunks t and t + 4. The eight quads of a warp thus need six products per
+// group: one for each axis and pair of vertices. A lane loads both chunks of its quad with six loads of 16 bytes; the
+// loads of a warp are whole lines of 128 bytes. One byte permutation per register turns them into the operands of the
+// six products. U does not pass through shared memory. A lane receives all 12 sums of quad g (3 axes x 4 vertices) for
+// a quarter of the domains, so it computes the positions of whole vertices. The sums of 16 domains, two steps of U, and
+// q take 160 registers. This allows 12 warps per multiprocessor. In flight per multiprocessor:
+// 12 warps x 2 steps x 8 chunks x 8 quads x 48 bytes = 72 KB.
+// Types of the two operands of a matrix product.
 #if defined(STORE_BF16)
 #define OPERANDS "bf16.bf16"
 #else
 #define OPERANDS "f16.f16"
 #endif
 
+// The number of resident blocks per multiprocessor limits the registers: with more domains, a lane has more sums.
 #if defined(BATCH_8)
 constexpr unsigned BATCH_SIZE = 8;
 constexpr unsigned MIN_BLOCKS_PER_SM = 4;
@@ -40,14 +48,14 @@ constexpr unsigned BATCH_SIZE = 16;
 constexpr unsigned MIN_BLOCKS_PER_SM = 3;
 #endif
 constexpr unsigned MAX_DOMAINS = 32;
-constexpr unsigned GROUPS = BATCH_SIZE / 8; // groups of 8 domains, the columns of one product
+constexpr unsigned GROUPS = BATCH_SIZE / 8; // groups of 8 domains, the columns of the right matrix of a product
 
 constexpr unsigned WARPS = 4;                // per block
 constexpr unsigned QUADS = 8;                // per warp
 constexpr unsigned TILE_QUADS = WARPS * QUADS;
-constexpr unsigned STEP_CHUNKS = 8;          // chunks of two modes per step
-// float4 per domain in the staging buffer: three per quad, and two of padding, which keep the lanes of a quarter warp in
-// different banks.
+constexpr unsigned STEP_CHUNKS = 8;          // per step
+// float4 per domain in the staging buffer: three per quad, and two of padding, so that the 8 lanes of a quarter warp
+// access different banks.
 constexpr unsigned STRIDE = 3 * QUADS + 2;
 
 // Twin: tests/bench/src/kernels/batch_mma.rs.
@@ -61,8 +69,8 @@ struct BatchMmaArgs {
     unsigned first_vertices[MAX_DOMAINS]; // index of each domain's first vertex in `positions`
     unsigned domains;    // number of domains
     unsigned vertices;   // number of vertices of the shape
-    unsigned chunks;     // number of chunks of modes
-    unsigned is_aligned; // whether every domain's positions are 16-byte aligned
+    unsigned chunks;     // number of chunks of the shape
+    unsigned is_aligned; // 1 if the positions of every domain begin at a multiple of 16 bytes
 };
 static_assert(sizeof(BatchMmaArgs) == 192, "BatchMmaArgs differs from tests/bench/src/kernels/batch_mma.rs");
 
@@ -73,14 +81,14 @@ __device__ __forceinline__ unsigned lane_id() {
 
 // The part of a tile that a warp computes.
 struct WarpPart {
-    const uint4* words;    // words of the lane's quad
+    const uint4* words;    // first word of the lane's quad
     unsigned tile_quads;   // number of quads of the tile
     unsigned rest_quad;    // index of the lane's quad in the shape
     unsigned first_vertex; // index of the warp's first vertex in the shape
     unsigned coordinates;  // number of coordinates of the warp's vertices, three per vertex
 };
 
-// A lane beyond the last quad reads that quad again; its results are not stored.
+// Describes the part of this warp. A lane beyond the last quad reads the last quad again; its results are not stored.
 __device__ __forceinline__ WarpPart warp_part(const BatchMmaArgs& args) {
     const unsigned first_tile_quad = TILE_QUADS * blockIdx.x, first_warp_quad = QUADS * (threadIdx.x / 32);
     WarpPart part;
@@ -93,13 +101,14 @@ __device__ __forceinline__ WarpPart warp_part(const BatchMmaArgs& args) {
     return part;
 }
 
-// Two modes of a quad. Word 2 axis + pair holds a pair of vertices for the first mode, word 6 + 2 axis + pair for the
-// second mode.
+// Two modes of a quad, as 12 words of 32 bits with two entries each. Words 0 to 5 belong to the first mode, words 6 to 11 to the second
+// mode. Word 2 axis + pair of a mode has the entries of the vertices 2 pair and 2 pair + 1.
 struct Chunk {
     unsigned words[12];
 };
 
-// Loads zeros beyond the last chunk, because NaN or infinity times a zero coordinate is not zero.
+// Loads a chunk; beyond the last chunk, loads zeros. Its coordinates are zero there, but memory beyond the last chunk
+// may contain NaN or infinity, whose product with zero is not zero.
 __device__ __forceinline__ void load_chunk(Chunk& chunk, const BatchMmaArgs& args, const WarpPart& part, unsigned index) {
 #pragma unroll
     for (unsigned plane = 0; plane < 3; ++plane) {
@@ -123,9 +132,11 @@ __device__ __forceinline__ void load_step(Step& step, const BatchMmaArgs& args, 
     load_chunk(step.high, args, part, chunk + 4);
 }
 
-// [2 axis + pair of vertices][group of 8 domains][2 (vertex in the pair) + parity of the domain]
+// Sums of the lane's quad: [2 axis + pair of vertices][group][2 (vertex in the pair) + parity]. A lane has two of the
+// eight domains of a group: 2 (lane % 4) + parity.
 typedef float Sums[6][GROUPS][4];
 
+// Adds the product of the lane's entries `u` and coordinates `q0` and `q1` to `sum`. All lanes must call this.
 __device__ __forceinline__ void multiply(float (&sum)[4], const unsigned (&u)[4], unsigned q0, unsigned q1) {
     asm("mma.sync.aligned.m16n8k16.row.col.f32." OPERANDS ".f32 {%0, %1, %2, %3}, {%4, %5, %6, %7}, {%8, %9}, "
         "{%0, %1, %2, %3};"
@@ -133,7 +144,8 @@ __device__ __forceinline__ void multiply(float (&sum)[4], const unsigned (&u)[4]
         : "r"(u[0]), "r"(u[1]), "r"(u[2]), "r"(u[3]), "r"(q0), "r"(q1));
 }
 
-// Adds the modes of a step to the sums. The rounding remainders of q are added first, because they are small.
+// Adds the modes of a step to the sums. The products with the rounding remainders of q (z, w) come before those with
+// the rounded coordinates (x, y), because they are smaller.
 __device__ __forceinline__ void add_step(Sums& sums, const Step& step, const uint4* split_q) {
     uint4 q[GROUPS];
 #pragma unroll
@@ -158,7 +170,7 @@ __device__ __forceinline__ void add_step(Sums& sums, const Step& step, const uin
     }
 }
 
-// Sums all modes. The loads of two steps are in flight.
+// Sums all modes. Loads run up to two steps ahead of the sums.
 __device__ __forceinline__ void sum_modes(const BatchMmaArgs& args, const WarpPart& part, Sums& sums) {
     const unsigned steps = (args.chunks + STEP_CHUNKS - 1) / STEP_CHUNKS;
     const uint4* split_q = args.split_q;
@@ -181,7 +193,8 @@ __device__ __forceinline__ float transform_row(const float4& row, float x, float
     return fmaf(row.x, x, fmaf(row.y, y, fmaf(row.z, z, row.w)));
 }
 
-// Computes the positions of the lane's quad for one domain and writes them to the staging buffer, 48 bytes.
+// Computes the positions of the lane's quad for one domain and writes them to `staged`, three float4. `rest` and `u`
+// are [axis][vertex].
 __device__ __forceinline__ void stage_positions(const BatchMmaArgs& args, const float4 (&rest)[3], const float (&u)[3][4],
                                       unsigned domain, float4* staged) {
     const float4* rows = args.transforms + 3 * domain;
@@ -206,7 +219,7 @@ __device__ __forceinline__ void stage_positions(const BatchMmaArgs& args, const 
     }
 }
 
-// Writes the staged positions of four domains: `first_domain` plus 0, 2, 4 and 6. Eight lanes write one domain, in
+// Stores the staged positions of the four domains `first_domain` + 0, 2, 4 and 6. Eight lanes store one domain, in
 // coalesced stores of 128 bytes.
 __device__ __forceinline__ void store_staged(const BatchMmaArgs& args, const WarpPart& part, unsigned first_domain,
                                       const float4* staged) {
@@ -233,7 +246,7 @@ __device__ __forceinline__ void store_staged(const BatchMmaArgs& args, const War
     }
 }
 
-// Computes and writes the positions of all domains, four domains at a time.
+// Computes and stores the positions of all domains. A pass computes the four domains of a group that have equal parity.
 __device__ __forceinline__ void store_positions(const BatchMmaArgs& args, const WarpPart& part, const Sums& sums,
                                          float4* staged) {
     float4 rest[3];

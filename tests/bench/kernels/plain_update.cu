@@ -1,7 +1,7 @@
 // x = T (x0 + u) of every vertex of every domain, for a u that cuBLAS computed.
 //   domains         [domains] PlainDomain                                                                        (in)
 //   vertex_domains  [vertices] u32: the domain of each vertex; not read with SINGLE (scenes of one domain)       (in)
-//   rest            x0, [vertices][3] f32                                                                        (in)
+//   rest            x0, [vertices][3] f32 in the domain's frame                                                  (in)
 //   transforms      [domains][3] float4: rows of T                                                               (in)
 //   u               f32, three per vertex of a domain with modes                                                 (in)
 //   positions       x, [vertices][3] f32                                                                         (out)

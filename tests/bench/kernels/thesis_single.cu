@@ -1,8 +1,10 @@
 // BASELINE: u = U q of one domain as in chapter 3.2.1 of the thesis. For comparison only.
-//   lines   [lines][passes][32] float4: rows of U, four modes per float4. A line holds as many whole rows as
-//           fit into 32 lanes. It has one pass, or several if a row has more than 32 float4                      (in)
+//   lines   [line][pass][lane] float4: rows of U, four modes per float4. A line is the work of a warp: as many
+//           whole rows as fit into 32 lanes. If a row has more than 32 float4, a line is one row, in several passes
+//           of 32 float4                                                                                         (in)
 //   q       [rank] f32                                                                                           (in)
 //   u       [vertices] float4; the fourth number is not written                                                  (out)
+//   rows    number of rows of U, three per vertex
 // Launch: 256 threads per block, one warp per line, ceil(lines / 8) blocks. The thesis does not cover rows of more than
 // 32 float4 (rank above 128). This kernel sums them in several passes and applies equation 3.3 to each pass.
 //

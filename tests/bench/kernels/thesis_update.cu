@@ -1,15 +1,16 @@
-// BASELINE: the vertex update of chapter 3.2.3 of the thesis: x = T (x0 + u), and T applied to normals and tangents. The
-// triangles are unfolded: they share no vertices. For comparison only.
-//   warps       [ceil(vertices / 64) * 8] uint4 per warp: its two domains, the first of its eight vertices that
+// BASELINE: the vertex update of chapter 3.2.3 of the thesis: x = T (x0 + u), and T applied to normals and tangents.
+// The triangles are unfolded: they share no vertices. For comparison only. A warp computes eight vertices, of one or
+// two domains.
+//   warps       [warps] uint4: the warp's first and second domain, the first of its eight vertices (0 to 7) that
 //               belongs to the second domain (8 if none does), and an unused number                              (in)
-//   sources     [vertices] u32: index into u, or RIGID for a vertex without modes                                (in)
+//   sources     [vertices] u32: index of the vertex's float4 in u, or RIGID for a vertex without modes           (in)
 //   rest_positions, rest_normals, and with TANGENTS rest_tangents
 //               [vertices] float4; the fourth number of a position is 1, of a direction 0                        (in)
 //   transforms  [domains][4] float4: rows of T                                                                   (in)
 //   u           float4 per vertex of the domains with modes; the fourth number is 0                              (in)
 //   positions, normals, tangents  [vertices] float4                                                              (out)
-// Launch: 256 threads per block, four threads per vertex; ceil(vertices / 64) blocks. A thread computes one element of
-// the vertex's float4.
+// Launch: 256 threads (8 warps) per block, four threads per vertex; ceil(vertices / 64) blocks. Each of the four
+// threads computes one element of the vertex's float4.
 // CPU twin: the tests of tests/bench/src/kernels/thesis/thesis_update.rs.
 constexpr unsigned LANES = 32;
 constexpr unsigned WARPS = 8;
@@ -32,11 +33,12 @@ struct UpdateArgs {
 };
 static_assert(sizeof(UpdateArgs) == 88, "UpdateArgs differs from tests/bench/src/kernels/thesis/thesis_update.rs");
 
-__device__ float dot4(const float* row, const float* rest) {
-    return row[0] * rest[0] + row[1] * rest[1] + row[2] * rest[2] + row[3] * rest[3];
+__device__ float dot4(const float* row, const float* vector) {
+    return row[0] * vector[0] + row[1] * vector[1] + row[2] * vector[2] + row[3] * vector[3];
 }
 
 extern "C" __global__ void __launch_bounds__(WARPS * LANES) thesis_update(const UpdateArgs args) {
+    // T of the first and second domain of each warp, row by row.
     __shared__ float matrices[WARPS][2][16];
     __shared__ float rest_positions[VERTICES][4];
     __shared__ float rest_normals[VERTICES][4];
