@@ -5,8 +5,8 @@
 //   delay         occupies the stream for a number of nanoseconds; one thread
 //   empty_kernel  does nothing; one thread
 // Launch of copy and read: BLOCK threads per block, LOADS vectors (uint4) per thread. The number of vectors of a buffer
-// is a multiple of BLOCK * LOADS. With STREAMING, loads and stores have evict-first cache hints. Without STREAMING, loads
-// use the read-only cache.
+// is a multiple of BLOCK * LOADS. With STREAMING, loads and stores have evict-first cache hints. Without STREAMING,
+// loads use the read-only cache.
 //
 // CPU twins: the tests of tests/bench/src/kernels/bandwidth.rs.
 #ifndef LOADS

@@ -101,8 +101,8 @@ __device__ __forceinline__ WarpPart warp_part(const BatchMmaArgs& args) {
     return part;
 }
 
-// Two modes of a quad, as 12 words of 32 bits with two entries each. Words 0 to 5 belong to the first mode, words 6 to 11 to the second
-// mode. Word 2 axis + pair of a mode has the entries of the vertices 2 pair and 2 pair + 1.
+// Two modes of a quad, as 12 words of 32 bits with two entries each. Words 0 to 5 belong to the first mode, words 6 to
+// 11 to the second mode. Word 2 axis + pair of a mode has the entries of the vertices 2 pair and 2 pair + 1.
 struct Chunk {
     unsigned words[12];
 };

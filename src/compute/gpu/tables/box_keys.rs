@@ -5,7 +5,7 @@ use nalgebra::Vector3;
 
 use modalcast_model::scene::{BoundingBox, OrientedBounds};
 
-/// The bounding axes as arguments of `bounds`; zeros without any.
+/// The bounding axes as arguments of `bounds`; zeros if there are none.
 pub(crate) fn axes_to_f32(axes: Option<[Vector3<f64>; 3]>) -> [f32; 9] {
     let axes = axes.unwrap_or_default();
     std::array::from_fn(|index| axes[index / 3][index % 3] as f32)
@@ -13,9 +13,9 @@ pub(crate) fn axes_to_f32(axes: Option<[Vector3<f64>; 3]>) -> [f32; 9] {
 
 /// The bounds along the bounding axes, from the last six of twelve keys; `None` when there are only six keys.
 ///
-/// The kernel rounds its sums outward, but its axes are f32. A component of a unit vector in f32 has an error of at
-/// most 2^-25, so each bound has an error of at most 2^-25 times the sum of the largest absolute x, y and z. This
-/// function widens the bounds by twice that.
+/// The kernel rounds its sums outward, but its axes are rounded to f32. A component of a unit vector then has an error
+/// of at most 2^-25, so each bound has an error of at most 2^-25 times the sum of the largest absolute x, y and z. This
+/// function widens the bounds by twice that error, 2^-24 = `f32::EPSILON` / 2 times the sum.
 pub(crate) fn oriented_bounds_from_keys(keys: &[u32]) -> Option<OrientedBounds> {
     let (world, oriented) = keys.split_at_checked(6).filter(|(_, oriented)| oriented.len() == 6)?;
     let world = bounds_from_keys(world);

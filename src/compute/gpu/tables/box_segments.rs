@@ -1,8 +1,8 @@
 //! Bounding boxes per domain: the segments that `bounds` reduces to boxes, and their union per domain. Pure.
 //!
-//! A domain with tiles of its own is split into segments of tiles, whose boxes `deform` computed. A domain that shares
-//! a tile is one segment, a range of its positions. So one domain of millions of vertices keeps as many threads busy as
-//! 200,000 small domains. The host unites the few boxes of a large domain.
+//! A domain with tiles of its own is split into segments of consecutive tiles, whose boxes `deform` computed. A domain
+//! that shares a tile with other domains is one segment, the range of its vertices. One domain of millions of vertices
+//! thus keeps as many threads busy as 200,000 small domains. The host unites the boxes of the segments of a domain.
 
 use super::box_keys::bounds_from_keys;
 use super::layout::{BoxSegment, LAST_QUAD_ITEMS};
@@ -41,8 +41,8 @@ pub(crate) const fn box_bytes(segment_count: usize) -> u64 {
     (segment_count * 4 * BOX_KEYS) as u64
 }
 
-/// Computes one box per domain. `domains` has the domain of each segment, in ascending order, and `keys` the box of
-/// each segment.
+/// Computes one box per domain. `domains` has the domain of each segment, in ascending order, and `keys` has the box of
+/// each segment. Every domain has a segment.
 pub(crate) fn unite_boxes(domains: &[u32], keys: &[u32], boxes: &mut Vec<BoundingBox>) {
     boxes.clear();
     for (domain, keys) in domains.iter().zip(keys.chunks_exact(BOX_KEYS)) {
@@ -106,11 +106,13 @@ mod tests {
         // ones.
         let key = |x: f32| if x.is_sign_negative() { !x.to_bits() } else { x.to_bits() | 1 << 31 };
         let cube_keys = |min: f32, max: f32| [[key(-min); 3], [key(max); 3]].concat();
+        // One segment of domain 0, two of domain 1.
         let keys = [cube_keys(-1.0, 2.0), cube_keys(0.5, 0.75), cube_keys(-3.0, 0.25)].concat();
-        let mut boxes = vec![BoundingBox::EMPTY; 7];
+        let mut boxes = vec![BoundingBox::EMPTY; 7]; // old content, which is overwritten
         unite_boxes(&[0, 1, 1], &keys, &mut boxes);
         let cube = |min: f64, max: f64| BoundingBox { min: [min; 3], max: [max; 3] };
         assert_eq!(boxes, [cube(-1.0, 2.0), cube(-3.0, 0.75)]);
+        // A NaN in the last of the 18 keys, the maximum of z.
         let keys_with_nan = [&keys[..17], &[u32::MAX]].concat();
         unite_boxes(&[0, 1, 1], &keys_with_nan, &mut boxes);
         assert!(boxes[0].is_finite() && !boxes[1].is_finite());

@@ -1,5 +1,5 @@
-//! The lists of a partial step, which `apply` reads from pinned memory: changed domains with their new transforms and
-//! coordinates, and the tiles to compute. Pure.
+//! The lists of a partial step (a step that changes few domains), which `apply` reads from pinned memory: changed
+//! domains with their new transforms and coordinates, and the dirty tiles, which `deform` then computes. Pure.
 //!
 //! ```text
 //! [changes][new transforms: 12 words each][new q][dirty tiles]
@@ -9,8 +9,8 @@ use super::input_packing::InputPacker;
 use super::layout::Change;
 use modalcast_model::scene::{Scene, SceneState};
 
-/// A partial step changes at most 1 / `MAX_CHANGED_DIVISOR` of the domains. With more changes, copying the whole state
-/// is faster.
+/// A partial step changes at most 1 / `MAX_CHANGED_DIVISOR` of the domains. With more changes, a full step is faster,
+/// which copies the values of all domains.
 const MAX_CHANGED_DIVISOR: usize = 4;
 
 /// Lengths of the lists of a step.
@@ -25,7 +25,7 @@ const CHANGE_WORDS: usize = size_of::<Change>() / 4;
 const TRANSFORM_WORDS: usize = 12;
 
 /// Maximum number of changed domains in a partial step. 0 if all steps are full, because the scene has too few domains
-/// or truncates modes. The set of truncated modes depends on q and is uploaded only with the whole state.
+/// or truncates modes: the set of truncated modes depends on q, and only a full step uploads it.
 pub(crate) const fn max_changed_domains(scene: &Scene) -> usize {
     if scene.features.truncation { 0 } else { scene.domains.len() / MAX_CHANGED_DIVISOR }
 }
@@ -36,8 +36,9 @@ pub(crate) fn max_change_entries(scene: &Scene) -> usize {
     max_changed_domains(scene).min(domain_count)
 }
 
-/// Whether a changed domain needs a [`Change`]. A follower without modes has neither a transform nor coordinates of its
-/// own, so only its tiles are listed. But exact normals and boxes need the step of its last change.
+/// Whether a changed domain needs a [`Change`]. A follower (a domain that uses the transform of its root) without modes
+/// has neither a transform nor coordinates of its own, so only its tiles are listed. But exact normals and boxes need
+/// the step of its last change, which a [`Change`] records.
 fn needs_entry(scene: &Scene, domain: usize) -> bool {
     let features = scene.features;
     let has_own_values =
@@ -56,11 +57,12 @@ pub(crate) struct ChangeListLayout {
 }
 
 impl ChangeListLayout {
-    /// `max_changes`: maximum number of [`Change`]s; `coordinates` and `tiles`: their numbers in the scene.
-    pub(crate) const fn new(max_changes: usize, coordinates: usize, tiles: usize) -> Self {
+    /// A layout with capacity for `max_changes` [`Change`]s, and for all coordinates and tiles of the scene.
+    pub(crate) const fn new(max_changes: usize, coordinate_count: usize, tile_count: usize) -> Self {
         let transforms = CHANGE_WORDS * max_changes;
         let q = transforms + TRANSFORM_WORDS * max_changes;
-        Self { transforms, q, tiles: q + coordinates, word_count: q + coordinates + tiles }
+        let tiles = q + coordinate_count;
+        Self { transforms, q, tiles, word_count: tiles + tile_count }
     }
 
     /// Bytes of the lists.
@@ -74,7 +76,8 @@ impl ChangeListLayout {
 pub struct ChangedDomains<'a> {
     /// Domains that the step changes.
     pub changed: &'a [u32],
-    /// Further domains that are outdated in the output. Their values are already on the device.
+    /// Other domains, which earlier steps changed but which are outdated in the output buffers of this step. Their
+    /// transforms and coordinates are already on the device.
     pub outdated: &'a [u32],
 }
 
@@ -82,9 +85,9 @@ pub struct ChangedDomains<'a> {
 #[derive(Debug)]
 pub(crate) struct ChangeListWriter {
     layout: ChangeListLayout,
-    /// Per tile, the number of the last tile list that contains it.
+    /// Per tile, the number of the last tile list that contains the tile; 0 if there is none.
     last_lists: Vec<u32>,
-    /// Number of the current tile list.
+    /// Number of the current tile list, counted from 1.
     list_number: u32,
 }
 
@@ -195,7 +198,8 @@ mod tests {
         // In a scene without modes, exact normals would not be computed.
         sizes[7].1 = 1;
         let max_entries = |deformation| max_change_entries(&scene_with_followers(&sizes, deformation));
-        // A quarter of sixteen domains may change. One domain is the transform root, and two have coordinates.
+        // A quarter of sixteen domains may change. Without exact normals and boxes, only three domains need entries:
+        // the transform root, and the two domains of the last shape, which have coordinates.
         assert_eq!([defaults, exact, boxes, displacements].map(max_entries), [3, 4, 4, 3]);
         assert_eq!(max_change_entries(&scene_with_deformation(&sizes, defaults)), 4, "a scene without followers");
         assert_eq!(max_changed_domains(&scene_with_followers(&sizes, defaults)), 4, "followers also change");

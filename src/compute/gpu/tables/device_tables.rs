@@ -37,10 +37,11 @@ pub struct DeviceTables {
     pub(crate) segments: Vec<BoxSegment>,
     /// x0, three float4 per quad.
     pub(crate) rest_positions: Vec<[f32; 4]>,
-    /// Normals and tangents at rest, three and four float4 per quad; empty where `deform` computes none.
+    /// Normals at rest, three float4 per quad; empty if `deform` computes no normals.
     pub(crate) rest_normals: Vec<[f32; 4]>,
+    /// Tangents at rest, four float4 per quad; empty if `deform` computes no tangents.
     pub(crate) rest_tangents: Vec<[f32; 4]>,
-    /// Only if normals follow the surface.
+    /// The tables of `normals`; only if normals follow the surface.
     pub(crate) normals: Option<NormalTables>,
     pub(crate) transform_links: Vec<TransformLink>,
     /// Sizes of the values of a step.
@@ -77,7 +78,7 @@ impl DeviceTables {
 #[derive(Debug)]
 pub(crate) struct NormalTables {
     pub slots: Vec<NormalSlot>,
-    /// The first domain of each block of corners.
+    /// Per block of `normals`, the domain of its first corner; then the last domain.
     pub first_domains: Vec<u32>,
     /// One plane per axis.
     pub rest_normals: Vec<f32>,

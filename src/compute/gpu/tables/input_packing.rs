@@ -1,11 +1,12 @@
-//! The input values of a step. The host writes them once to pinned memory, in the layout of the device buffer. Several
-//! cores write large steps. Pure.
+//! The input values of a step. The host writes them to pinned memory, in the layout of the device buffer. Several cores
+//! write large steps. Pure.
 //!
 //! ```text
 //! [header][transforms: 12 f32 per transform root][q, padded to whole chunks of modes][retained counts][retained chunks]
 //! ```
-//! With truncation, each domain has the number and the indices of its retained chunks. Without truncation, these two
-//! parts are empty. The pinned memory is write-combined: the host writes it from front to back and never reads it.
+//! A chunk is a few modes that are stored together. With modal truncation, a domain sums only its retained chunks;
+//! their numbers and indices are uploaded. Without truncation, these two parts are empty. The pinned memory is
+//! write-combined: the host writes it from front to back and never reads it.
 
 use std::sync::Arc;
 
@@ -17,12 +18,12 @@ use super::work::{CoordinateLayout, DomainTiles};
 use crate::storage::{Truncation, TruncationInput, bound, max_row_norms, modes_per_chunk};
 use modalcast_model::scene::{Scene, SceneState};
 
-/// Packs the modal coordinates of a scene into the layout of the device.
+/// Packs the modal coordinates q of a scene into the layout of the device.
 #[derive(Debug)]
 pub struct InputPacker {
     pub(crate) scene: Arc<Scene>,
     pub(crate) coordinates: CoordinateLayout,
-    /// Per shape, the factors of its modes; empty unless the storage has factors.
+    /// Per shape, the factors of its modes, by which q is multiplied; empty unless the storage type has factors.
     pub(crate) factors: Vec<Vec<f32>>,
     pub(crate) dirty_tile_layout: DirtyTileLayout,
 }
@@ -34,8 +35,8 @@ pub(crate) struct DirtyTileLayout {
     pub domain_tiles: Vec<DomainTiles>,
     /// Number of all tiles.
     pub tile_count: usize,
-    /// Cost of a full step in tiles of `deform`, the limit of a partial step. A tile of a batch counts as several,
-    /// because `batch` computes it for every member.
+    /// Cost of a full step in tiles of `deform`. A step with more dirty tiles is a full step. A tile of `batch` counts
+    /// as several tiles, because `batch` computes it for several domains.
     pub full_step_cost: usize,
 }
 
@@ -65,11 +66,11 @@ impl InputSizes {
     }
 }
 
-/// Writes the values of steps in buffer order. Pure.
+/// Writes the values of steps in buffer order.
 #[derive(Debug)]
 pub struct InputWriter {
     packer: Arc<InputPacker>,
-    /// Only with truncation.
+    /// The retained chunks; only with truncation.
     chunk_selection: Option<ChunkSelection>,
 }
 
@@ -113,8 +114,8 @@ pub(crate) fn transform_links(scene: &Scene) -> Vec<TransformLink> {
 }
 
 impl InputPacker {
-    /// A packer without factors and tiles. Its steps have the sizes of the scene's steps, but wrong values. For
-    /// measurements of the upload.
+    /// A packer without factors and tiles, for measurements of the upload. Its steps have the sizes of the scene's
+    /// steps, but wrong values.
     pub fn sizes_only(scene: &Arc<Scene>) -> Self {
         Self {
             scene: Arc::clone(scene),
@@ -159,23 +160,25 @@ impl InputPacker {
     }
 }
 
-/// Minimum number of domains per parallel task of the truncation. A domain takes a few microseconds.
+/// Minimum number of domains per parallel task of the truncation. A domain takes a few microseconds, so a task takes
+/// long compared to its start.
 const MIN_DOMAINS_PER_TASK: usize = 64;
 
 /// Modal truncation: selects the chunks of modes that each domain sums.
 #[derive(Debug)]
 struct ChunkSelection {
-    /// Error budget, scene units.
+    /// Maximum error of a vertex, in scene units.
     budget: f64,
-    /// Per shape and mode.
+    /// `[shape][mode]`, from [`max_row_norms`].
     max_row_norms: Vec<Vec<f64>>,
     /// Per domain.
     truncations: Vec<Truncation>,
-    /// Maximum of the error bounds of all domains, scene units.
+    /// Maximum of the error bounds of all domains, in scene units.
     bound: f64,
-    /// Per domain, the number of retained chunks.
+    /// Per domain, the number of retained chunks; padded to a multiple of four.
     counts: Vec<u32>,
-    /// Indices of the retained chunks, two u16 per word.
+    /// Indices of the retained chunks, two u16 per word. Those of a domain begin at the index of its first chunk among
+    /// the chunks of all domains.
     chunks: Vec<u32>,
 }
 
@@ -191,8 +194,8 @@ impl ChunkSelection {
         }
     }
 
-    /// Selects and writes the retained chunks: those with at least one retained mode. The other modes of such a chunk
-    /// are read with it and thus summed too.
+    /// Selects and writes the retained chunks: those with at least one retained mode. The truncated modes of a retained
+    /// chunk are summed too, because the kernel reads whole chunks.
     fn write(&mut self, packer: &InputPacker, state: &SceneState, writer: &mut SliceWriter) {
         let scene = &packer.scene;
         let chunk_modes = modes_per_chunk(scene.deformation.storage);
@@ -277,7 +280,7 @@ mod tests {
                 pool.install(|| InputWriter::new(&packer).write(&mut words, &StepHeader::default(), &state));
                 let mut expected = expected_words(&packer, &state);
                 assert!(words == expected, "{shapes} shapes, {cores} cores");
-                let changed_word = 24;
+                let changed_word = 24; // any word
                 expected[changed_word] += 1.0;
                 assert!(words != expected, "control: expected the comparison to detect a changed word");
             }

@@ -1,4 +1,6 @@
 //! The kernels of a step: their sources, and the macros and grid sizes for a scene. Pure.
+//!
+//! A tile is the work of one warp of `deform`, up to 32 quads of four vertices. An item is a vertex or a corner.
 
 use super::change_list::max_change_entries;
 use super::device_tables::DeviceTables;
@@ -48,19 +50,19 @@ pub(crate) const KERNELS: [KernelSource; 5] = [
 /// The macros that select the storage type of U; f32 has none.
 pub(crate) const STORAGE_DEFINES: [&str; 3] = ["STORE_F16", "STORE_BF16", "STORE_INT8"];
 
-/// Below this number of tiles a lane computes one item instead of four, because one warp per tile would not fill the
-/// device. The number is eight warps for each multiprocessor of a large device.
+/// Below this number of tiles, a lane of `deform` computes one item instead of four, and four warps share a tile: one
+/// warp per tile would not fill the device. 1024 is about eight warps for each of 132 multiprocessors.
 const MIN_FOUR_ITEM_TILES: usize = 1024;
 
-/// Smaller maximum group sizes that `batch` can be compiled for, in ascending order, with their macros. The default is
-/// [`MAX_BATCH_SIZE`].
+/// Maximum group sizes, other than the default [`MAX_BATCH_SIZE`], that `batch` can be compiled for, and their macros.
+/// In ascending order.
 const SMALLER_BATCHES: [(usize, &str); 2] = [(4, "BATCH_4"), (8, "BATCH_8")];
 
 /// Warps per block of `batch`.
 pub(crate) const BATCH_WARPS: usize = 2;
 /// Bytes of `WarpStorage` and `WarpSlice` in `kernels/batch_load.cuh`, per warp.
 const WARP_BYTES: usize = 9984 + 72;
-/// Bytes of a transform and a `BatchMember`, per member.
+/// Bytes of a transform (48) and a `BatchMember` (16), per member.
 const MEMBER_BYTES: usize = 64;
 
 /// The macro of a storage type.
@@ -78,7 +80,8 @@ pub(crate) const fn has_one_item_per_lane(work: &WorkList) -> bool {
     work.full_step_tiles < MIN_FOUR_ITEM_TILES
 }
 
-/// Threads per block of `deform`: those of WARPS warps, a constant of its source. The launcher verifies the number.
+/// Threads per block of `deform`. Twin of the constant WARPS in `kernels/deform.cu`. The launcher compares the number
+/// with the compiled kernel.
 fn block_threads(defines: &[&str]) -> u32 {
     let has_one_warp = ["MODES", "SHEAR", "TILE_LIST"].iter().any(|name| defines.contains(name));
     WARP_THREADS * if has_one_warp { 1 } else { 2 }
@@ -90,7 +93,8 @@ pub(crate) fn deform_blocks(kernel: &KernelDescriptor, tile_count: usize) -> u32
     warps.div_ceil((kernel.threads / WARP_THREADS) as usize) as u32
 }
 
-/// The kernels of a scene in launch order, except `apply`, which is last.
+/// The kernels of a scene in launch order. Exception: `apply` is last in the list, but a partial step launches it
+/// first.
 pub(crate) fn plan_kernels(scene: &Scene, tables: &DeviceTables) -> Vec<KernelDescriptor> {
     let (features, work, segments) = (scene.features, &tables.work, &tables.segments);
     let [deform, batch, bounds, apply, normals] = KERNELS;
@@ -108,7 +112,7 @@ pub(crate) fn plan_kernels(scene: &Scene, tables: &DeviceTables) -> Vec<KernelDe
         KernelDescriptor { kind, name: kernel.name, defines, blocks, threads: BLOCK, source }
     };
     let box_blocks = (4 * work.tiles.len()).div_ceil(BLOCK as usize).min(MAX_GRID_BLOCKS / 4);
-    // Eight threads reduce one segment and mostly wait for memory, so more blocks hide the latency.
+    // Eight threads reduce one segment. They mostly wait for memory, so more blocks hide the latency.
     let segment_blocks = segments.len().div_ceil(BLOCK as usize / 8).min(4 * MAX_GRID_BLOCKS);
     let bounds_blocks = if features.boxes { box_blocks.max(segment_blocks) } else { box_blocks };
     let batch = (!work.batched.blocks.is_empty()).then(|| describe_batch(scene, &work.batched, batch));
@@ -159,8 +163,8 @@ fn deform_defines(scene: &Scene, work: &WorkList) -> Vec<&'static str> {
     defines.chain(storage_define(scene.deformation.storage).filter(|_| features.modes)).collect()
 }
 
-/// Two blocks on each of 132 multiprocessors, the size of a large device. The maximum grids of kernels that loop over
-/// lists are multiples or fractions of this number.
+/// Two blocks on each of 132 multiprocessors, as many as an H200 has. The maximum grids of kernels that loop over lists
+/// are multiples or fractions of this number.
 const MAX_GRID_BLOCKS: usize = 264;
 
 /// The kernel `batch` of a scene with batches.
@@ -201,6 +205,7 @@ mod tests {
         // 64 KiB is the shared memory of the smallest supported device.
         assert!(batch_shared_bytes(&tables(modalcast_model::domain::MAX_RANK), &[]) <= 64 << 10);
         assert_eq!(batch_shared_bytes(&tables(0), &["BATCH_4"]), BATCH_WARPS * WARP_BYTES + 64 * 4);
+        // Three chunks of four modes, for 16 members, four bytes each.
         let q_bytes = batch_shared_bytes(&tables(3), &["STORE_INT8"]) - batch_shared_bytes(&tables(0), &[]);
         assert_eq!(q_bytes, 4 * 16 * 12);
     }

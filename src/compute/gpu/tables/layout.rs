@@ -22,10 +22,11 @@ pub(crate) const NO_GROUPS: u32 = u32::MAX;
 /// [`TransformLink::frame`] of a domain that is its own transform root.
 pub(crate) const NO_FRAME: u32 = TransformRoots::NO_FRAME;
 
-/// Bit fields of [`WarpTile::kind`]: the number of items of the last quad (0 in a mixed tile), and whether the tile
-/// computes vertices and corners.
+/// Bit mask of [`WarpTile::kind`]: the number of items (vertices or corners) of the last quad; 0 in a mixed tile.
 pub(crate) const LAST_QUAD_ITEMS: u8 = 7;
+/// Bit of [`WarpTile::kind`]: the tile computes positions.
 pub(crate) const TILE_VERTICES: u8 = 8;
+/// Bit of [`WarpTile::kind`]: the tile computes normals and tangents.
 pub(crate) const TILE_CORNERS: u8 = 16;
 
 /// The start of a step's inputs; pointers are device addresses.
@@ -80,7 +81,8 @@ pub(crate) struct Change {
     pub first_new_q: u32,
 }
 
-/// The transform root of a domain and its frame relative to that root; only in scenes with followers.
+/// The transform root of a domain (the domain whose transform it uses), and the frame of a follower (its constant
+/// transform relative to its root); only in scenes with followers.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
 pub(crate) struct TransformLink {
@@ -114,7 +116,7 @@ pub(crate) struct DeformArgs {
     pub reserved: u32,
 }
 
-/// Domains of one shape, for which `batch` reads U once.
+/// A group of domains of one shape, its members, for which `batch` reads U once.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
 pub(crate) struct BatchGroup {
@@ -206,7 +208,7 @@ pub(crate) struct ApplyArgs {
     pub tile_list: u64,
 }
 
-/// Offsets of the corners of one domain, and of the vertices that `normals` gathers around them.
+/// Offsets of the corners and vertices of one domain in the tables of `normals`.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
 pub(crate) struct NormalSlot {
@@ -322,13 +324,13 @@ pub fn layout_constants() -> Vec<LayoutConstant> {
     list
 }
 
-/// The start of a source that evaluates the expressions of [`LayoutConstant`]s. NVRTC has no `offsetof`, so `OFFSET` is
-/// defined as its usual expansion.
+/// The start of a CUDA source that evaluates the expressions of [`LayoutConstant`]s. NVRTC has no `offsetof`, so
+/// `OFFSET` computes the address of a field in a struct at address 0.
 pub(crate) const PRELUDE: &str =
     "#include \"layout.cuh\"\n#define OFFSET(type, field) __INTADDR__(&(((type*)0)->field))\n";
 
-/// Source of a kernel `layout_values` that writes the device's value of every layout constant, in order, to its only
-/// argument.
+/// Source of a kernel `layout_values`, which writes the device's value of every layout constant to its argument, in the
+/// order of [`layout_constants`].
 pub(crate) fn layout_kernel_source() -> String {
     let line = |(index, constant): (usize, &LayoutConstant)| {
         format!("    values[{index}] = (unsigned)({});\n", constant.expression)

@@ -1,10 +1,11 @@
-//! The tables of a scene on the device, the plan of its kernels and buffers, and the input values of its steps. Pure:
-//! tested without a GPU.
+//! The tables of a scene on the device, the plan of its kernels and buffers, and the input values of its steps. All
+//! functions are pure and are tested without a GPU.
 //!
 //! | file | content |
 //! |---|---|
 //! | `layout` | the structs that host and kernels share |
-//! | `work`, `normal_tables`, `rings`, `box_segments` | the tables that the kernels read |
+//! | `work` | the tiles (the work of each warp) of `deform`, and the groups of domains for `batch` |
+//! | `normal_tables`, `rings`, `box_segments` | the tables of `normals` and `bounds` |
 //! | `device_tables` | all tables of a scene, built once |
 //! | `kernels`, `occupancy` | macros, grids and tuning of the kernels |
 //! | `plan` | kernels, buffers in bytes, launches |

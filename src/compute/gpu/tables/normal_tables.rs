@@ -1,10 +1,11 @@
-//! Tables of `normals`, derived from a scene: slots, blocks, rest normals and tangents. Pure.
+//! Tables of `normals`, derived from a scene: the offsets of each domain (its slot), the domains of each block of the
+//! kernel, rest normals and tangents. Pure.
 
 use super::layout::{BLOCK, NO_TANGENTS};
 use modalcast_model::domain::Domain;
 use modalcast_model::scene::{DomainLayout, Scene};
 
-/// Offsets of the corners of one domain. Instances share `first_normal` and `first_tangent`.
+/// Offsets of the corners of one domain. Instances (domains of one shape) share `first_normal` and `first_tangent`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct CornerSlot {
     pub first_corner: u32,
@@ -72,7 +73,7 @@ mod tests {
     use super::super::test_scenes::scene_with_normal_map;
     use super::*;
 
-    /// (vertices, rank) of each shape.
+    /// (vertices, rank) of each shape. Domains 2 s and 2 s + 1 use shape s.
     const SHAPES: [(usize, usize); 4] = [(7, 2), (300, 0), (8, 5), (513, 1)];
 
     #[test]

@@ -3,7 +3,7 @@
 /// The macro of the number of blocks.
 const MIN_BLOCKS_DEFINE: &str = "MIN_BLOCKS_PER_SM";
 
-/// First compute capability of the last column of [`MIN_BLOCKS`].
+/// First compute capability of the column [`MinBlocks::sm_90`].
 const SM_90: (i32, i32) = (9, 0);
 
 /// Resident blocks per multiprocessor of the variants that define all of `macros`.
@@ -70,7 +70,7 @@ pub(crate) fn deform_tuning(defines: &[&str], capability: (i32, i32)) -> String 
 mod tests {
     use super::*;
 
-    /// The same numbers by nested conditions, as an independent definition.
+    /// The numbers of [`MIN_BLOCKS`] by nested conditions, as an independent definition.
     fn min_blocks_by_conditions(defines: &[&str], capability: (i32, i32)) -> u32 {
         let has = |name: &str| defines.contains(&name);
         let has_16_bit_storage = has("STORE_F16") || has("STORE_BF16");

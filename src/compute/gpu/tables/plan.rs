@@ -1,4 +1,5 @@
-//! The plan of a scene on the device: kernels with their macros, buffers in bytes, launches and copies. Pure.
+//! The plan of a scene on the device: kernels with their macros, buffers in bytes, launches and copies. Pure. The
+//! module `work` describes tiles, quads and batches.
 
 use serde::Serialize;
 
@@ -18,7 +19,7 @@ use modalcast_model::scene::Scene;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum BufferRole {
-    /// U of every shape, in tiles.
+    /// U of every shape, in packed words of 16 bytes.
     ModeWords,
     /// x0 of every shape.
     RestPositions,
@@ -30,7 +31,7 @@ pub enum BufferRole {
     MixedQuads,
     /// Per domain, offset from its first vertex to its first corner; only if an offset differs from zero.
     CornerOffsets,
-    /// Groups of domains, and the work of each block of `batch`.
+    /// Groups of domains that share U, and the work of each block of `batch`.
     Batches,
     /// Four bounding boxes per tile.
     WarpBoxes,
@@ -42,13 +43,13 @@ pub enum BufferRole {
     RestTangents,
     /// The smoothing group of each corner; only if normals follow the surface.
     CornerGroups,
-    /// Vertices around each smoothing group, and the offset of each group's ring.
+    /// The ring of vertices around each smoothing group, and the offset of each ring.
     RingTables,
     /// The geometric normal of each smoothing group at rest.
     GroupNormals,
-    /// Offsets of each domain's corners.
+    /// Offsets of each domain in the tables of `normals`.
     CornerSlots,
-    /// The first domain of each block of corners.
+    /// Per block of `normals`, the domain of its first corner.
     CornerBlocks,
     /// Header, transforms and q of a step.
     Inputs,
@@ -73,11 +74,11 @@ pub struct BufferDescriptor {
 /// An optional feature that the scene does not use.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 pub struct OmittedFeature {
-    /// The flag of [`modalcast_model::scene::SceneFeatures`] that is off, or "batches".
+    /// The flag of [`modalcast_model::scene::SceneFeatures`] that is off, or "batches" or "shadows".
     pub feature: &'static str,
     /// Code and data that are not compiled, computed or stored.
     pub what: &'static str,
-    /// Device bytes saved, without the rings of `normals`: their length is unknown until they are built.
+    /// Device bytes saved. They do not include the rings of `normals`, whose length is unknown until they are built.
     pub bytes: u64,
 }
 
@@ -91,7 +92,7 @@ pub struct DeformPlan {
     pub bytes_in: u64,
     /// Bytes that each step copies back, without the vertices: six keys of four bytes per box.
     pub bytes_out: u64,
-    /// Pinned bytes of the lists of a partial step; 0 for a scene whose steps are always full.
+    /// Bytes of pinned host memory for the lists of a partial step; 0 for a scene whose steps are always full.
     pub change_list_bytes: u64,
     pub omitted: Vec<OmittedFeature>,
 }
@@ -220,7 +221,7 @@ impl DeformPlan {
         self.kernels.iter().find(|kernel| kernel.kind == kind)
     }
 
-    /// The kernel of a kind that every scene has.
+    /// The kernel of a kind that every scene has; `Fault` if it is missing.
     pub fn require_kernel(&self, kind: KernelKind) -> Result<&KernelDescriptor> {
         let missing = || Error::Fault { stage: "plan", reason: format!("no kernel for {kind:?}") };
         self.kernel(kind).ok_or_else(missing)

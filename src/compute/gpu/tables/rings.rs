@@ -1,4 +1,5 @@
-//! Tables of `normals` for smoothing groups: the ring of vertices around each group. Pure.
+//! Tables of `normals` for smoothing groups (the corners of one vertex that share a normal): the ring of vertices
+//! around each group. [`SmoothingGroups`] describes groups and rings. Pure.
 
 use super::layout::{NO_GROUPS, NormalSlot};
 use super::normal_tables::{self, CornerSlot};
@@ -10,7 +11,7 @@ use modalcast_model::scene::{DomainLayout, Scene};
 pub(crate) struct RingTables {
     /// The group of each corner of the shapes that have groups.
     pub corner_groups: Vec<u32>,
-    /// Offset of each group's ring, and the end of the last one.
+    /// Offset of each group's ring in `rings`, and the end of the last ring.
     pub ring_offsets: Vec<u32>,
     /// Entries of the rings of all groups: vertices of their shape, some with the flag `RING_START`.
     pub rings: Vec<u32>,
@@ -35,11 +36,11 @@ impl RingTables {
         let mut tables = Self::default();
         for groups in smoothing_groups(scene) {
             // Every index fits in u32, because a scene has at most `MAX_RING_TRIANGLES` triangles in rings.
-            let (first_group, ring_base) = (tables.ring_offsets.len() as u32, tables.rings.len() as u32);
+            let (first_group, first_entry) = (tables.ring_offsets.len() as u32, tables.rings.len() as u32);
             tables.corner_groups.extend(groups.corner_groups().iter().map(|group| first_group + group));
             tables
                 .ring_offsets
-                .extend(groups.ring_offsets()[..groups.group_count()].iter().map(|offset| ring_base + offset));
+                .extend(groups.ring_offsets()[..groups.group_count()].iter().map(|offset| first_entry + offset));
             tables.rings.extend_from_slice(groups.rings());
         }
         tables.ring_offsets.push(tables.rings.len() as u32);
@@ -79,6 +80,7 @@ mod tests {
 
     #[test]
     fn corners_have_rings_and_normals_of_their_groups() {
+        // Domains 2 s and 2 s + 1 use shape s.
         let scene = scene_with_exact_normals(&[(7, 2), (300, 0), (8, 5), (513, 1)]);
         let (tables, slots) = (RingTables::new(&scene), normal_slots(&scene));
         let group_count = tables.ring_offsets.len() - 1;

@@ -6,13 +6,13 @@ use std::ops::Range;
 use bytemuck::Pod;
 use rayon::prelude::*;
 
-/// Lists of at least so many bytes are written by several cores. The benchmark `modalcast report deform` measures one
-/// and several cores below and above this limit (table `host_writes`).
+/// Minimum number of bytes of a list that several cores write. The benchmark `modalcast report deform` measures one and
+/// several cores below and above this limit (table `host_writes`).
 pub const PARALLEL_THRESHOLD: usize = 1 << 20;
-/// Words per parallel part: long contiguous writes, but enough parts for many cores.
+/// Minimum number of 32-bit words per parallel part (128 KiB): long contiguous writes, but enough parts for many cores.
 const PART_WORDS: usize = 1 << 15;
 
-/// Writes a list from front to back. The field is the part that is not yet written.
+/// Writes a list of 32-bit words from front to back. The field is the part that is not yet written.
 pub(crate) struct SliceWriter<'a>(&'a mut [f32]);
 
 impl<'a> SliceWriter<'a> {
@@ -49,9 +49,9 @@ pub fn parallel_copy(target: &mut [f32], source: &[f32]) {
     parts.for_each(|(target, source)| target.copy_from_slice(source));
 }
 
-/// Fills a list of items with `fill(items, part)`, where `items` are the indices of the items of a part. Item i begins
-/// at word `item_offsets[i]`; the offsets ascend. A large list is split between items into parts that several cores
-/// fill.
+/// Fills a list with `fill(items, part)`: `part` is a part of the list, and `items` are the indices of the items in it.
+/// Item i begins at word `item_offsets[i]`; the offsets ascend. A large list is split between items into parts, which
+/// several cores fill.
 pub(crate) fn fill_parts(list: &mut [f32], item_offsets: &[u32], fill: impl Fn(Range<usize>, &mut [f32]) + Sync) {
     if size_of_val(list) < PARALLEL_THRESHOLD {
         fill(0..item_offsets.len(), list);
@@ -99,9 +99,11 @@ mod tests {
 
     #[test]
     fn every_item_and_word_belongs_to_one_part() {
+        // Lists of more than 262,144 words (`PARALLEL_THRESHOLD`) have several parts.
         for lengths in [vec![1; 400_000], vec![0; 5], vec![300_000, 0, 0, 7, 200_000, 0], vec![4; 3]] {
             let item_offsets: Vec<u32> =
                 lengths.iter().scan(0, |sum, length| Some(std::mem::replace(sum, *sum + length))).collect();
+            // Three words after the last item belong to the last part.
             let word_count = lengths.iter().sum::<u32>() as usize + 3;
             let mut list = vec![-1.0; word_count];
             let item_count = std::sync::atomic::AtomicUsize::new(0);

@@ -1,5 +1,5 @@
-//! Small scenes for tests. `shapes` lists the number of vertices and the rank of each shape. Unless stated otherwise,
-//! two domains use each shape, and the corners of a shape differ from its vertices.
+//! Small scenes for tests. `shapes` lists the number of vertices and the rank (number of modes) of each shape. Unless
+//! stated otherwise, domains 2 s and 2 s + 1 use shape s, and a shape of n vertices has n + 2 corners.
 
 use std::sync::Arc;
 
@@ -70,7 +70,7 @@ pub(crate) fn scene_with_exact_normals(shapes: &[(usize, usize)]) -> Arc<Scene> 
     Scene::new(parts).expect("a scene")
 }
 
-/// A scene that keeps displacements and boxes for readers.
+/// A scene that keeps displacements and domain boxes for readback.
 pub(crate) fn scene_with_readbacks(shapes: &[(usize, usize)]) -> Arc<Scene> {
     let mut parts = parts(shapes);
     (parts.deformation.displacements, parts.deformation.boxes) = (true, true);

@@ -1,5 +1,5 @@
-//! Launches `kernels/apply.cu`, which reads new transforms and coordinates of changed domains directly from pinned
-//! memory.
+//! Launches `kernels/apply.cu`, the first kernel of a partial step (a step that changes few domains). The kernel reads
+//! the new transforms and coordinates of changed domains directly from pinned host memory.
 
 use cudarc::driver::{CudaFunction, LaunchConfig};
 
@@ -12,7 +12,7 @@ use crate::gpu::tables::layout::ApplyArgs;
 use modalcast_model::error::Result;
 use modalcast_model::scene::SceneState;
 
-/// The kernel, and the writer of the lists that it reads over the bus.
+/// The kernel, and the writer of the lists that the kernel reads.
 #[derive(Debug)]
 pub struct ApplyKernel {
     function: CudaFunction,
@@ -20,7 +20,7 @@ pub struct ApplyKernel {
     writer: ChangeListWriter,
 }
 
-/// Pinned memory for the lists of one step.
+/// Pinned memory for the lists of one step (`tables::change_list`).
 pub type ChangeListBuffer = PinnedBuffer<u32>;
 
 impl ApplyKernel {
@@ -40,8 +40,8 @@ impl ApplyKernel {
         PinnedBuffer::zeroed(device, self.writer.layout().word_count, PinnedUse::ToDevice)
     }
 
-    /// Writes the lists of a partial step. The caller has waited for the last launch with `list`. Returns `None` when
-    /// the changes exceed the capacity of the lists, or when a full step is less work.
+    /// Writes the lists of a partial step to `list`. The caller has waited until the last launch with `list` has ended.
+    /// Returns `None` when the changes exceed the capacity of the lists, or when a full step is less work.
     ///
     /// # Errors
     /// `Fault` when the device fails.
@@ -55,12 +55,13 @@ impl ApplyKernel {
         Ok(self.writer.write(list.as_mut_slice()?, packer, state, domains))
     }
 
-    /// Starts the kernel, which updates the values of `inputs` and copies the tile list to that of `deform`. The header
-    /// among the values has the lengths of the lists.
+    /// Starts the kernel, which updates the values of `inputs` and copies the dirty tiles of `list` to the tile list of
+    /// `deform`. The header in `inputs` has the lengths of the lists.
     ///
     /// # Safety
     /// `list` is from [`Self::allocate_list`]. [`Self::write`] wrote it for the packer of `inputs` and `deform`, or the
-    /// header has lengths of 0. All of them exist, and `list` is not written, until the kernel has ended.
+    /// header has lengths of 0. `list`, `inputs` and `deform` exist, and `list` is not written, until the kernel has
+    /// ended.
     ///
     /// # Errors
     /// `Fault` when the device fails.
@@ -73,13 +74,13 @@ impl ApplyKernel {
     ) -> Result<()> {
         let (values, layout) = (inputs.addresses(), self.writer.layout());
         let changes = list.address()?;
-        let address_of = |first_word: usize| changes + 4 * first_word as u64;
+        let address_of_word = |word: usize| changes + 4 * word as u64;
         let args = ApplyArgs {
             header: values.header,
             changes,
-            new_transforms: address_of(layout.transforms),
-            new_q: address_of(layout.q),
-            dirty_tiles: address_of(layout.tiles),
+            new_transforms: address_of_word(layout.transforms),
+            new_q: address_of_word(layout.q),
+            dirty_tiles: address_of_word(layout.tiles),
             transform_links: values.transform_links,
             transforms: values.transforms,
             q: values.q,
@@ -87,8 +88,8 @@ impl ApplyKernel {
             tile_list: deform.tile_list(),
         };
         // SAFETY: the kernel's only argument is an `ApplyArgs`. Pinned memory has the same address on host and device
-        // (unified addressing). The lists refer to domains and coordinates of the scene of the buffers. The caller
-        // keeps lists and buffers.
+        // (unified addressing). The lists refer to domains and coordinates of the same scene as `inputs`. The caller
+        // keeps `list`, `inputs` and `deform` until the kernel has ended.
         unsafe { launch_kernel(device, &self.function, self.config, LaunchOrder::Serial, &args) }
     }
 }

@@ -1,5 +1,5 @@
-//! Launches `kernels/batch.cu`: x = T_b (x0 + U q_b) for groups of domains b that share a shape. The kernel reads U
-//! once per group, and also computes a box of each warp's vertices.
+//! Launches `kernels/batch.cu`: x = T_b (x0 + U q_b) for groups of domains b that share a shape (mesh and U). The
+//! kernel reads U once per group, and also computes bounding boxes of x.
 
 use cudarc::driver::sys::CUfunction_attribute;
 use cudarc::driver::{CudaFunction, LaunchConfig};
@@ -36,7 +36,8 @@ impl BatchKernel {
     pub(super) fn new(device: &Device, kernel: &KernelDescriptor, batched: &BatchTables) -> Result<Self> {
         let function = kernel.compile(device)?;
         let shared_bytes = batch_shared_bytes(batched, &kernel.defines);
-        // Give all of the L1 cache to shared memory, so that registers alone limit the number of resident blocks.
+        // Give all of the L1 cache (100 percent) to shared memory, so that registers alone limit the number of resident
+        // blocks.
         let carveout = CUfunction_attribute::CU_FUNC_ATTRIBUTE_PREFERRED_SHARED_MEMORY_CARVEOUT;
         let max_shared_bytes = CUfunction_attribute::CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES;
         for (attribute, value) in [(carveout, 100), (max_shared_bytes, shared_bytes as i32)] {
@@ -54,8 +55,8 @@ impl BatchKernel {
     /// Starts the kernel.
     ///
     /// # Safety
-    /// `values` and `shared` are those of the scene of this launcher. The header among the values has the address of
-    /// positions of this scene. All of them exist until the kernel has ended.
+    /// `values` and `shared` belong to the scene of this launcher. The header has the address of the positions of this
+    /// scene. All of these buffers exist until the kernel has ended.
     pub(super) unsafe fn launch(
         &self,
         device: &Device,
@@ -101,7 +102,8 @@ mod tests {
     use modalcast_model::backend_settings::BatchPolicy;
     use modalcast_model::scene::{DeformationSettings, Scene, SceneParts, SceneState, StorageType};
 
-    /// A scene of random shapes with these (vertices, rank), and a random state. `instances` domains use each shape.
+    /// A scene of random shapes, one for each (vertices, rank) of `shapes`, and a random state. `instances` domains use
+    /// each shape.
     fn ensemble(storage: StorageType, shapes: &[(usize, usize)], instances: usize) -> (Arc<Scene>, SceneState) {
         let shapes_scene =
             scene_and_state(&shapes.iter().map(|(vertices, rank)| (*vertices, *rank, 1)).collect::<Vec<_>>()).0;
@@ -117,7 +119,7 @@ mod tests {
         (scene, state)
     }
 
-    /// Emulates `batch` block by block. Returns the positions.
+    /// Emulates `batch` block by block. Returns the positions; those that it does not write are NaN.
     fn twin_of_batch(tables: &Tables) -> Vec<f32> {
         let mut positions = vec![f32::NAN; 3 * tables.scene.layout.vertices];
         let tiles = tables
@@ -138,7 +140,7 @@ mod tests {
         positions
     }
 
-    /// x of a vertex by the same arithmetic, directly from the U of the shape.
+    /// x of a vertex by the same arithmetic as in the kernel, directly from the U of the shape.
     fn x_of(scene: &Scene, state: &SceneState, domain: usize, vertex: usize) -> [f32; 3] {
         let (shape, q) = (scene.shape_of(domain), state.q_of(scene, domain));
         let rest = shape.mesh.rest_positions()[vertex];
@@ -149,7 +151,8 @@ mod tests {
         [0, 1, 2].map(|row| transformed_axis(&state.transforms[domain].0[4 * row..], deformed))
     }
 
-    /// (vertices, rank) of the shapes of a scene, and the number of domains of each shape.
+    /// The scenes of the tests: (vertices, rank) of each shape, and the number of domains that use each shape. A warp
+    /// computes 64 vertices, a tile has 128 vertices, and a group has at most 16 domains.
     const ENSEMBLES: [(&[(usize, usize)], usize); 6] = [
         (&[(1, 3), (63, 13)], 2),
         (&[(64, 4), (300, 0)], 16),
@@ -185,6 +188,8 @@ mod tests {
 
     #[test]
     fn batch_decodes_entries_of_every_storage() {
+        // Tolerances for f32, f16, bf16 and int8. Entries and coordinates are random numbers from -1 to 1. A wrong
+        // entry would typically change x by some tenths.
         for (storage, tolerance) in StorageType::ALL.into_iter().zip([1e-5, 1e-2, 8e-2, 8e-2]) {
             for (shapes, instances) in ENSEMBLES {
                 let (scene, state) = ensemble(storage, shapes, instances);
@@ -204,6 +209,7 @@ mod tests {
 
     #[test]
     fn groups_have_similar_sizes_and_are_adjacent_within_a_tile() {
+        // A shape of 261 vertices has three tiles. Its 40 domains need three groups of at most 16.
         let (scene, _) = ensemble(StorageType::F32, &[(261, 12)], 40);
         let work = WorkList::new(&scene, &CoordinateLayout::new(&scene), BatchPolicy::Always);
         let sizes: Vec<u32> = work.batched.groups.iter().map(|group| group.member_count).collect();
@@ -224,6 +230,7 @@ mod tests {
 
     #[test]
     fn blocks_of_large_scenes_cover_each_tile_once() {
+        // 6001 + 3000 tiles of 128 vertices are more than twice `TARGET_BLOCKS`, but less than three times.
         let (scene, _) = ensemble(StorageType::F32, &[(128 * 6001, 1), (128 * 3000, 1)], 2);
         let batched = WorkList::new(&scene, &CoordinateLayout::new(&scene), BatchPolicy::Always).batched;
         assert!(
@@ -245,6 +252,7 @@ mod tests {
             let kernel = plan.kernel(KernelKind::Batch).expect("a batch kernel").clone();
             (kernel.defines.join(" "), kernel.blocks)
         };
+        // A block per tile and group: three tiles, and two groups for 17 domains.
         assert_eq!(defines(2), ("STORE_F16 BATCH_4".into(), 3));
         assert_eq!(defines(8), ("STORE_F16 BATCH_8".into(), 3));
         assert_eq!(defines(17), ("STORE_F16".into(), 6));

@@ -1,6 +1,6 @@
-//! Launches `kernels/bounds.cu`, which reduces the boxes of `deform` to the bounds of all positions. It also computes
-//! the bounds along the bounding axes of the deformer if it has any, and the box of each domain if the scene keeps
-//! boxes.
+//! Launches `kernels/bounds.cu`, which reduces the boxes that `deform` writes to the bounds of all positions. If the
+//! deformer has bounding axes, the kernel also computes the bounds along these axes. If the scene keeps boxes, the
+//! kernel also computes the box of each domain.
 
 use cudarc::driver::{CudaFunction, LaunchConfig};
 
@@ -18,14 +18,14 @@ use modalcast_model::error::Result;
 pub struct BoundsKernel {
     function: CudaFunction,
     config: LaunchConfig,
-    /// Axes of the second box of the result; `None` if the result has one box.
+    /// Axes of the second box of the result, in addition to the world's axes; `None` if the result has one box.
     axes: Option<BoundingAxes>,
-    /// Only in a scene that keeps boxes.
+    /// The box of each domain; only in a scene that keeps boxes.
     pub(crate) boxes: Option<DomainBoxes>,
 }
 
 impl BoundsKernel {
-    /// Compiles the kernel. If `deform` has segments of domains, the kernel also computes a box of each domain.
+    /// Compiles the kernel and, if `deform` has segments of domains, allocates their boxes.
     ///
     /// # Errors
     /// As [`Device::function`]; `Fault` when the device has not enough memory.
@@ -48,35 +48,36 @@ impl BoundsKernel {
         &self.function
     }
 
-    /// Number of words of the result: six keys per box.
+    /// Number of 32-bit words of the result: six keys for the bounds along the world's axes, and six for those along
+    /// the bounding axes.
     pub(crate) const fn words(&self) -> usize {
         if self.axes.is_some() { 12 } else { 6 }
     }
 
-    /// Starts the kernel on the boxes of `deform`; it writes its result into the header among the values of `inputs`.
+    /// Starts the kernel on the boxes of `deform`. The kernel writes its result into the header in `inputs`.
     ///
     /// # Safety
-    /// `inputs` and `deform` are those of one scene, that of this launcher. The header has the address of positions of
-    /// this scene if it keeps boxes. All of them exist until the kernel has ended.
+    /// `inputs` and `deform` belong to the scene of this launcher. If the scene keeps boxes, the header has the address
+    /// of its positions. `inputs`, `deform` and the positions exist until the kernel has ended.
     ///
     /// # Errors
     /// `Fault` when the device fails.
     pub unsafe fn launch(&self, device: &Device, inputs: &StepInputs, deform: &DeformKernel) -> Result<()> {
-        let (values, warp_boxes) = (inputs.addresses(), deform.boxes());
+        let (values, tile_boxes) = (inputs.addresses(), deform.boxes());
         let segment_addresses = self.boxes.as_ref().map(DomainBoxes::addresses).unwrap_or_default();
         let args = BoundsArgs {
             header: values.header,
-            boxes: warp_boxes.address,
+            boxes: tile_boxes.address,
             segments: segment_addresses.segments,
             change_steps: values.change_steps,
             segment_boxes: segment_addresses.boxes,
-            box_count: warp_boxes.count,
+            box_count: tile_boxes.count,
             segment_count: segment_addresses.count,
             bounding_axes: axes_to_f32(self.axes),
             reserved: 0,
         };
         // SAFETY: the kernel's only argument is a `BoundsArgs`. `boxes` has six words for each of `box_count` boxes,
-        // and `segment_boxes` has six for each segment. Segments refer to boxes, vertices and domains of the same
+        // and `segment_boxes` has six words for each segment. Segments refer to boxes, vertices and domains of the same
         // scene. The kernel calls `wait_for_prerequisite_grids` before it accesses memory.
         unsafe { launch_kernel(device, &self.function, self.config, LaunchOrder::Dependent, &args) }
     }

@@ -1,5 +1,5 @@
-//! Launches `kernels/deform.cu`: x = T (x0 + U q) of all domains at once, their rigid normals and tangents, and a box
-//! of each warp's vertices.
+//! Launches `kernels/deform.cu`: x = T (x0 + U q) of all domains at once, their rigid normals and tangents, and four
+//! bounding boxes per tile. A tile is the work of one warp of the kernel (`tables::work`).
 
 use std::sync::Arc;
 
@@ -19,10 +19,12 @@ use crate::storage::{PackedWord, TiledModes};
 use modalcast_model::error::{Error, Result};
 use modalcast_model::scene::Scene;
 
-/// Approximate cost of one batched tile of a group, in units of a tile of `deform`.
+/// Approximate cost of one tile in `batch`, which computes it for all members of a group, in units of a tile of
+/// `deform`.
 const DEFORM_TILES_PER_BATCH_TILE: usize = 2;
 
-/// Minimum number of words of U per upload. Bounds the staging memory while U is packed.
+/// Minimum number of 16-byte words of U per upload (64 MiB), except for the last upload. Packed words are uploaded as
+/// soon as they are so many, which bounds the host memory.
 const UPLOAD_WORDS: usize = 1 << 22;
 
 /// The descriptors of the kernels that write positions.
@@ -33,11 +35,11 @@ pub struct PositionKernels<'a> {
     pub batch: Option<&'a KernelDescriptor>,
 }
 
-/// The bounding boxes of warps on the device.
+/// The bounding boxes of all tiles on the device.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct WarpBoxes {
+pub(super) struct TileBoxes {
     pub address: u64,
-    /// Number of boxes.
+    /// Number of boxes, four per tile.
     pub count: u32,
 }
 
@@ -48,7 +50,7 @@ pub struct DeformKernel {
     config: LaunchConfig,
     /// The kernel for groups of domains that share U; only in a scene with batches.
     batch: Option<BatchKernel>,
-    /// The function for a tile list; only in a scene that can have partial steps.
+    /// The variant of the kernel that computes the tiles of a list; only in a scene that can have partial steps.
     list_function: Option<CudaFunction>,
     tiles: DeviceBuffer,
     mixed_quads: DeviceBuffer,
@@ -64,7 +66,8 @@ pub struct DeformKernel {
     boxes: DeviceBuffer,
     /// Number of tiles.
     tile_count: u32,
-    /// Number of leading tiles that this kernel computes in a full step. `batch` computes the other tiles.
+    /// Number of leading tiles that this kernel computes in a full step. `batch` computes the other tiles with
+    /// vertices.
     full_step_tiles: u32,
     /// Index of the first quad that has normals.
     first_direction_quad: u64,
@@ -146,9 +149,9 @@ impl DeformKernel {
         self.segments.as_deref()
     }
 
-    /// The boxes of all warps of all tiles.
-    pub(super) fn boxes(&self) -> WarpBoxes {
-        WarpBoxes { address: self.boxes.address(), count: 4 * self.tile_count }
+    /// The boxes of all tiles.
+    pub(super) fn boxes(&self) -> TileBoxes {
+        TileBoxes { address: self.boxes.address(), count: 4 * self.tile_count }
     }
 
     /// Address of the tile list that `apply` writes.
@@ -167,7 +170,8 @@ impl DeformKernel {
     /// # Safety
     /// `inputs` has the layout of [`Self::packer`] and contains a full step when the kernels run. Its header has the
     /// addresses of the outputs that the kernels write, with the sizes of the scene: positions; normals and tangents if
-    /// they are rigid; displacements if the scene keeps them. All of them exist until the kernels have ended.
+    /// they are rigid; displacements if the scene keeps them. `inputs` and the outputs exist until the kernels have
+    /// ended.
     ///
     /// # Errors
     /// `Fault` when the device fails.
@@ -185,11 +189,11 @@ impl DeformKernel {
         unsafe { self.launch_variant(device, inputs, &self.function, self.config) }
     }
 
-    /// Starts the kernel on the tiles of the list, whose length is in the header. A block has one warp, and a tile has
-    /// four warps, as in the function for tile lists.
+    /// Starts the kernel on the tiles of the tile list, whose length is in the header. In the variant for lists, a
+    /// block has one warp, and a tile has four warps.
     ///
     /// # Safety
-    /// As [`Self::launch`]; in addition, `apply` has written the list of that step.
+    /// As [`Self::launch`]; in addition, `apply` has written the tile list of this step when the kernel runs.
     ///
     /// # Errors
     /// `Fault` when the scene's steps are always full, or when the device fails.
@@ -203,8 +207,10 @@ impl DeformKernel {
         unsafe { self.launch_variant(device, inputs, function, config) }
     }
 
+    /// Starts `function`, a variant of the kernel.
+    ///
     /// # Safety
-    /// As [`Self::launch`], or as [`Self::launch_tile_list`] for the function for lists.
+    /// As [`Self::launch`], or as [`Self::launch_tile_list`] for the variant for lists.
     unsafe fn launch_variant(
         &self,
         device: &Device,
@@ -245,7 +251,7 @@ impl DeformKernel {
     }
 }
 
-/// Compiles a variant with the tuning for the device.
+/// Compiles a variant with these macros, tuned for the device.
 fn compile(device: &Device, kernel: &KernelDescriptor, defines: &[&str]) -> Result<CudaFunction> {
     let tuning = deform_tuning(defines, device.capability());
     let defines: Vec<&str> = defines.iter().copied().chain([tuning.as_str()]).collect();
@@ -274,8 +280,8 @@ fn compile_list_function(device: &Device, kernel: &KernelDescriptor) -> Result<C
     compile(device, kernel, &list_defines)
 }
 
-/// Maximum number of blocks that loop over a tile list: 12 resident blocks on each of 132 multiprocessors, the size of
-/// a large device.
+/// Maximum number of blocks that loop over a tile list: 12 resident blocks on each of 132 multiprocessors, as many as
+/// an H200 has.
 const MAX_LIST_BLOCKS: u32 = 132 * 12;
 
 /// Uploads U source by source, and collects the scales and factors of all shapes.
@@ -305,7 +311,7 @@ impl<'a> ModeUploader<'a> {
         })
     }
 
-    /// Encodes the words of a source, and uploads the pending words if they are many.
+    /// Encodes the words of a source, and uploads the pending words if there are at least [`UPLOAD_WORDS`].
     fn add(&mut self, source: &WordSource) -> Result<()> {
         match source {
             WordSource::Shape(shape) => {

@@ -1,4 +1,4 @@
-//! The bounding box of each domain on the device, and its readback.
+//! The bounding box of each domain: boxes of its segments (parts of a domain) on the device, and their readback.
 
 use crate::gpu::launch::{Device, DeviceBuffer, PinnedBuffer, PinnedUse};
 use crate::gpu::tables::box_segments::{BOX_KEYS, box_bytes, unite_boxes};
@@ -10,14 +10,16 @@ use modalcast_model::scene::BoundingBox;
 #[derive(Debug)]
 pub(crate) struct DomainBoxes {
     segments: DeviceBuffer,
+    /// Per segment its box, as six keys (`tables::box_keys`).
     boxes: DeviceBuffer,
     /// The domain of each segment.
     domains: Vec<u32>,
-    /// Pinned memory for the readback, allocated on the first read.
+    /// Pinned copy of `boxes`, allocated on the first read.
     keys: Option<PinnedBuffer<u32>>,
 }
 
-/// Addresses of the segments and their boxes, and the number of segments; zeros without boxes.
+/// Addresses of the segments and of their boxes, and the number of segments. The default, zeros, is for a scene that
+/// keeps no boxes.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct DomainBoxAddresses {
     pub segments: u64,
@@ -43,7 +45,7 @@ impl DomainBoxes {
         }
     }
 
-    /// Copies the boxes of all domains, and waits for the copy.
+    /// Reads the boxes of all segments back, waits for the copy, and writes one box per domain to `boxes`.
     pub(crate) fn read(&mut self, device: &Device, boxes: &mut Vec<BoundingBox>) -> Result<()> {
         let keys = match &mut self.keys {
             Some(keys) => keys,

@@ -9,7 +9,7 @@ use crate::gpu::tables::layout::NormalsArgs;
 use modalcast_model::error::{Error, Result};
 use modalcast_model::scene::Scene;
 
-/// The kernel and its constant tables, which `NormalTables` and its `RingTables` document.
+/// The kernel and its constant tables. `NormalTables` and `RingTables` describe them.
 #[derive(Debug)]
 pub struct NormalsKernel {
     function: CudaFunction,
@@ -64,11 +64,12 @@ impl NormalsKernel {
         &self.function
     }
 
-    /// Starts the kernel after the one that writes the positions.
+    /// Starts the kernel. The caller has started the kernel that writes the positions.
     ///
     /// # Safety
-    /// `inputs` is of the scene of this launcher. The header among its values has the addresses of positions, normals
-    /// and, with normal maps, tangents of the sizes of this scene. All of them exist until the kernel has ended.
+    /// `inputs` belongs to the scene of this launcher. The header in `inputs` has the addresses of positions, normals
+    /// and, with normal maps, tangents, with the sizes of this scene. `inputs` and these outputs exist until the kernel
+    /// has ended.
     ///
     /// # Errors
     /// `Fault` when the device fails.

@@ -1,4 +1,5 @@
-//! Tests of the plans of scenes.
+//! Tests of the plans of scenes. In these scenes, two domains use each shape, and a shape of n vertices has n + 2
+//! corners (`test_scenes`). Expected bytes are written as products of sizes and counts.
 
 use super::super::kernels::storage_define;
 use super::super::rings::RingTables;
@@ -33,10 +34,11 @@ fn unused_features_are_not_compiled_or_stored() {
     );
     assert_eq!(minimal.bytes(BufferRole::Tangents) + minimal.bytes(BufferRole::RestTangents), 0);
     assert_eq!((minimal.bytes(BufferRole::ModeWords), minimal.bytes(BufferRole::Scales)), (0, 0));
-    assert_eq!(minimal.bytes_in, 112 + 48 * 4, "a header and four transforms, no q");
+    assert_eq!(minimal.bytes_in, 112 + 48 * 4, "a header and four transforms, but no q");
     let omitted: Vec<_> = minimal.omitted.iter().map(|omitted| omitted.feature).collect();
     let never_used = ["truncation", "exact_normals", "compensated", "followers", "displacements", "boxes", "batches"];
     assert_eq!(omitted, [&["modes", "normal_maps", "shear"][..], &never_used].concat());
+    // Shapes have 9 + 302 = 311 corners, domains twice as many.
     assert_eq!(minimal.omitted[1].bytes, 16 * (311 + 622), "rest and world tangents of every corner");
 }
 
@@ -48,8 +50,9 @@ fn used_features_are_compiled_and_stored() {
         ["MODES", "ONE_ITEM_PER_LANE", "RIGID_NORMALS", "CORNER_OFFSETS", "NORMAL_MAPS", "SHEAR"]
     );
     assert_eq!(full.bytes(BufferRole::Tangents), 16 * 2 * (9 + 302));
-    assert_eq!(full.bytes(BufferRole::RestTangents), 64 * (3 + 76), "a quad of four corners each");
-    assert_eq!(full.bytes_in, 112 + 48 * 4 + 4 * 4);
+    assert_eq!(full.bytes(BufferRole::RestTangents), 64 * (3 + 76), "64 bytes per quad of four corners");
+    assert_eq!(full.bytes_in, 112 + 48 * 4 + 4 * 4, "a header, four transforms and four coordinates");
+    // Of the eleven optional features, this scene uses modes, normal maps, shear and shadows.
     assert_eq!(full.omitted.len(), 7);
 }
 
@@ -60,7 +63,7 @@ fn followers_upload_no_transforms_but_keep_frames() {
     let followers = plan(&scene_with_followers(&sizes, DeformationSettings::default()));
     assert_eq!(independent.bytes_in, 112 + 48 * 4 + 4 * 4);
     assert_eq!(followers.bytes_in, 112 + 48 + 4 * 4, "three of four domains follow");
-    assert_eq!(followers.bytes(BufferRole::FollowerFrames), 8 * 4 + 48 * 3);
+    assert_eq!(followers.bytes(BufferRole::FollowerFrames), 8 * 4 + 48 * 3, "four links and three frames");
     assert_eq!(independent.bytes(BufferRole::FollowerFrames), 0);
     let count_macros =
         |plan: &DeformPlan| defines(plan).iter().filter(|(_, macros)| macros.contains(&"FOLLOWERS")).count();
@@ -75,6 +78,7 @@ fn storage_selects_the_bytes_and_the_macro_of_u() {
         assert_eq!(plan.kernels[0].defines.last().copied(), storage_define(storage).or(Some("SHEAR")));
         plan.bytes(BufferRole::ModeWords)
     };
+    // 75 quads of 48 bytes per chunk. Eight modes are eight, four, four and two chunks.
     assert_eq!(StorageType::ALL.map(bytes), [75 * 48 * 8, 75 * 48 * 4, 75 * 48 * 4, 75 * 48 * 2]);
 }
 
@@ -106,7 +110,7 @@ fn exact_normals_add_a_kernel_and_its_tables() {
         0
     );
     let omitted = rigid.omitted.iter().find(|omitted| omitted.feature == "exact_normals").expect("an omitted feature");
-    assert_eq!(omitted.bytes, 4 * (9 + 515) + 20 * 6, "corner groups and slots");
+    assert_eq!(omitted.bytes, 4 * (9 + 515) + 20 * 6, "corner groups, and slots of six domains");
 }
 
 #[test]
@@ -115,7 +119,7 @@ fn readbacks_add_buffers_and_macros_but_no_kernels() {
     let without_readbacks = plan(&scene_with_storage(&sizes, StorageType::F32));
     let with_readbacks = plan(&scene_with_readbacks(&sizes));
     let roles = [BufferRole::Displacements, BufferRole::BoxSegments, BufferRole::DomainBoxes];
-    // Two domains of each shape, with one segment each.
+    // Four domains have one segment of 16 bytes each, and one box of 24 bytes per segment.
     assert_eq!(roles.map(|role| without_readbacks.bytes(role)), [0; 3]);
     assert_eq!(roles.map(|role| with_readbacks.bytes(role)), [12 * 2 * (7 + 300), 16 * 4, 24 * 4]);
     assert_eq!(with_readbacks.total_bytes() - without_readbacks.total_bytes(), 12 * 2 * (7 + 300) + 40 * 4);
@@ -138,7 +142,7 @@ fn readbacks_add_buffers_and_macros_but_no_kernels() {
     assert_eq!([omitted_bytes("displacements"), omitted_bytes("boxes")], [Some(12 * 2 * (7 + 300)), Some(40 * 4)]);
 }
 
-/// The macros of displacements and boxes.
+/// The macros of displacements (in `deform`) and boxes (in `bounds`).
 const READBACK_DEFINES: [&str; 2] = ["DISPLACEMENTS", "DOMAIN_BOXES"];
 
 #[test]

@@ -10,15 +10,17 @@ use modalcast_model::scene::Scene;
 /// Maximum number of domains of a group.
 pub(crate) const MAX_BATCH_SIZE: usize = 16;
 
-/// With `BatchPolicy::Auto`, a shape has batches when its U has at least so many bytes, about a third of a large
-/// device's L2 cache. On an H200, `batch` and `deform` took the same time for two domains with a U of 20 MB.
+/// With `BatchPolicy::Auto`, the domains of a shape are deformed in batches when its U has at least so many bytes,
+/// about a third of the L2 cache of a large device. On an H200, `batch` and `deform` took the same time for two domains
+/// with a U of 20 MB.
 const MIN_SHAPE_BYTES: u64 = 16 << 20;
-/// A shape also has batches when all its domains together would read at least so many bytes of U. Below both limits it
-/// is faster to read U again from the cache, because a batch uses few warps for a long time. On an H200, `batch` and
-/// `deform` took the same time at about 100 MB for shapes of 16,000 vertices.
+/// With `BatchPolicy::Auto`, the domains of a shape are also deformed in batches when `deform` would read at least so
+/// many bytes of U for all of them. Below both limits, `deform` is faster: it reads U again from the cache, whereas a
+/// batch uses few warps for a long time. On an H200, `batch` and `deform` took the same time at about 100 MB for shapes
+/// of 16,000 vertices.
 const MIN_READ_BYTES: u64 = 128 << 20;
 
-/// Number of blocks that keep a large device busy to the end. With more work, a block processes up to
+/// Number of blocks that keep a large device busy until the kernel ends. With more work, a block processes up to
 /// [`MAX_TILES_PER_BLOCK`] consecutive tiles, for which it loads T and q once.
 const TARGET_BLOCKS: usize = 4096;
 const MAX_TILES_PER_BLOCK: usize = 8;
@@ -54,13 +56,13 @@ pub(crate) fn batched_shapes(scene: &Scene, policy: BatchPolicy) -> Vec<bool> {
 }
 
 impl BatchTables {
-    /// Number of tiles of all groups.
+    /// Number of tiles of all groups. A tile counts once for each group of its shape.
     pub(crate) fn tiles(&self) -> usize {
         self.blocks.iter().map(|block| (block.end_tile - block.first_tile) as usize).sum()
     }
 
-    /// Groups the domains of an existing work list. Per shape, `is_batched` tells whether it has batches, and
-    /// `first_words` is its first word of U.
+    /// Groups the domains of a work list. Per shape, `is_batched` tells whether its domains are deformed in batches,
+    /// and `first_words` has its first word of U.
     pub(crate) fn new(
         scene: &Scene,
         work: &WorkList,
@@ -80,7 +82,7 @@ impl BatchTables {
         for shape_index in shape_indices {
             let (shape, users) = (&scene.shapes[shape_index], &users[shape_index]);
             let first_group = tables.groups.len();
-            // Split evenly, so that no group is nearly empty.
+            // Split the domains evenly, so that no group is nearly empty.
             let group_count = users.len().div_ceil(MAX_BATCH_SIZE);
             for domains in users.chunks(users.len().div_ceil(group_count)) {
                 tables.groups.push(BatchGroup {
@@ -101,7 +103,8 @@ impl BatchTables {
                 tables.max_members = tables.max_members.max(domains.len());
             }
             tables.max_chunks = tables.max_chunks.max(chunk_count(scene, shape));
-            // The groups of a shape have adjacent blocks for the same tiles, so that they read U from the cache.
+            // The blocks of all groups of a shape for the same tiles are adjacent, so that all but the first of them
+            // read U from the cache.
             let groups = first_group as u32..tables.groups.len() as u32;
             let tile_count = tile_count(shape_index) as u32;
             tables.blocks.extend((0..tile_count).step_by(tiles_per_block).flat_map(|first_tile| {

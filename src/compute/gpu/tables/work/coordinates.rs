@@ -3,13 +3,13 @@
 use crate::storage::modes_per_chunk;
 use modalcast_model::scene::{DomainLayout, Scene, StorageType};
 
-/// Offsets of the coordinates of each domain on the device. The coordinates of a domain are padded to whole chunks
-/// unless the layout of the scene's state is used.
+/// Offsets of the coordinates of each domain on the device. The coordinates of a domain are padded to whole chunks of
+/// modes, unless the layout is that of the scene's state.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct CoordinateLayout {
     /// Per domain, the offset of its first coordinate.
     pub first_q: Vec<u32>,
-    /// Number of all coordinates, a multiple of four.
+    /// Number of all coordinates with padding, a multiple of four.
     pub total: usize,
     /// Whether the layout equals that of the scene's state.
     pub is_scene_order: bool,

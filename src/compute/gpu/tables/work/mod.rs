@@ -1,12 +1,15 @@
-//! The work list of `deform`, derived from a scene: one tile per warp. Pure.
+//! The work list of `deform`, derived from a scene: a list of tiles, each of which is the work of one warp. Pure.
 //!
-//! The items of a tile are vertices or corners. Where corner i of a shape is its vertex i, one tile computes both.
+//! A quad is four consecutive items, which are vertices or corners. A tile is up to `TILE_QUADS` quads. Where corner i
+//! of a shape is its vertex i, one tile computes both. A chunk is a few modes that are stored together.
 //!
-//! A shape has tiles of its own if it has more than `MAX_SHARED_QUADS` quads, or if it has modes and several domains
-//! use it. Its U is then stored once. The quads of other domains with the same number of chunks fill tiles together
-//! (mixed tiles), so that 200,000 small domains keep all lanes busy. Tiles with the most chunks come first, because a
-//! long tile that begins last would delay the end of the step. Tiles with vertices of batched domains come after all
-//! others: a full step leaves them to `batch`, and the tile list of a partial step refers to them.
+//! A domain has tiles of its own if its shape has more than `MAX_SHARED_QUADS` quads, or if the shape has modes and
+//! several domains use it. The U of the shape is then stored once. The quads of all other domains with the same number
+//! of chunks fill tiles together (mixed tiles), so that 200,000 small domains keep all lanes busy.
+//!
+//! Tiles with the most chunks come first, because a long tile that begins last would delay the end of the step. Tiles
+//! with vertices of batched domains come after all other tiles: in a full step, `batch` computes their vertices instead
+//! of `deform`. In a partial step, `deform` computes them, because the tile list can refer to them.
 
 pub(crate) mod batches;
 mod coordinates;
@@ -32,7 +35,7 @@ const MAX_SHARED_QUADS: usize = TILE_QUADS / 2;
 /// Vertices per quad.
 const QUAD: usize = crate::storage::QUAD;
 
-/// A section of the words of U. The sections are stored one after the other.
+/// A section of the stored U. The sections are stored one after the other.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum WordSource {
     /// All tiles of a shape.
@@ -48,7 +51,7 @@ pub(crate) struct TileSpan {
     pub count: u32,
 }
 
-/// The tiles of a domain, or the mixed tile that contains it.
+/// The tiles of a domain, or the mixed tile that contains the domain.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(crate) struct DomainTiles {
     /// Tiles with vertices.
@@ -64,14 +67,16 @@ pub(crate) struct WorkList {
     /// Per shape, whether one tile computes vertices and corners. False for batched shapes, whose vertices and corners
     /// are computed by different kernels.
     pub corners_match: Vec<bool>,
-    /// Number of leading tiles that `deform` computes in a full step. `batch` computes the others.
+    /// Number of leading tiles that `deform` computes in a full step. `batch` computes the other tiles.
     pub full_step_tiles: usize,
-    /// Of `full_step_tiles`, the number of leading tiles with vertices.
+    /// Length of the shortest prefix of these tiles that contains all of them with vertices. A shorter launch may omit
+    /// the tiles after the prefix, which have only corners.
     pub vertex_tiles: usize,
     pub batched: BatchTables,
     pub mixed_quads: Vec<MixedQuad>,
     /// Per mixed quad, its first scale; empty unless the storage is `Int8`.
     pub mixed_quad_scales: Vec<u32>,
+    /// The sections of U, in the order of storage.
     pub sources: Vec<WordSource>,
     /// Number of 16-byte words of U.
     pub word_count: u64,
@@ -79,7 +84,7 @@ pub(crate) struct WorkList {
     /// Per shape, its first scale.
     pub first_scales: Vec<u32>,
     pub scale_count: u64,
-    /// Per domain.
+    /// The tiles of each domain.
     pub domain_tiles: Vec<DomainTiles>,
     /// Per domain, the wrapping offset from its first vertex to its first corner; empty when all offsets are zero.
     pub corner_offsets: Vec<u32>,
@@ -97,17 +102,17 @@ pub(crate) fn has_rigid_normals(scene: &Scene) -> bool {
     !scene.features.exact_normals
 }
 
-/// The number of chunks and the flags of a tile. All domains of a mixed tile have the same class.
+/// The number of chunks and the flags of a tile. In a mixed tile, they are the same for all domains.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 struct TileClass {
     chunks: usize,
-    /// Flags of [`WarpTile::kind`].
+    /// `TILE_VERTICES`, `TILE_CORNERS` or both, as in [`WarpTile::kind`].
     flags: u8,
 }
 
 /// A tile before its offsets are assigned.
 enum PendingTile {
-    /// The `tile`-th tile of a domain.
+    /// Tile number `tile` of a domain that has tiles of its own; the number counts from 0.
     Owned { domain: usize, tile: usize },
     /// A mixed tile of all items of these domains.
     Mixed(Vec<usize>),
@@ -188,7 +193,8 @@ impl WorkList {
         }
     }
 
-    /// The first word of a shape that has tiles of its own. The first call for a shape allocates its words.
+    /// The first word of U of a shape whose domains have tiles of their own. The first call for a shape allocates its
+    /// words.
     fn allocate_words(&mut self, scene: &Scene, shape: usize, chunks: usize, first_words: &mut [Option<u64>]) -> u64 {
         if chunks == 0 {
             return 0;
@@ -201,7 +207,7 @@ impl WorkList {
         })
     }
 
-    /// Device bytes of the boxes of all warps: four per tile, six keys each.
+    /// Device bytes of the bounding boxes of all tiles: four boxes per tile, six keys of four bytes each.
     pub(crate) const fn box_bytes(&self) -> u64 {
         96 * self.tiles.len() as u64
     }
@@ -216,7 +222,7 @@ impl WorkList {
         span.count += 1;
     }
 
-    /// The `tile`-th tile of a domain, without its first word.
+    /// Tile number `tile` of a domain, with `first_word` 0.
     fn tile_of_domain(
         &self,
         scene: &Scene,
@@ -290,12 +296,12 @@ impl WorkList {
     }
 }
 
-/// Items of a domain.
+/// The items of a domain: its vertices or its corners.
 struct ItemRange {
     item_count: usize,
-    /// First packed vertex or corner.
+    /// Index of the first item among the vertices or corners of all domains.
     first_item: u32,
-    /// First quad of x0, normals and tangents.
+    /// Index of the first quad in the tables of x0, normals and tangents.
     rest_quad: u32,
 }
 
@@ -311,7 +317,7 @@ fn count_users(scene: &Scene) -> Vec<usize> {
     user_counts
 }
 
-/// Per shape, whether its vertices have tiles of their own.
+/// Per shape, whether the vertices of its domains have tiles of their own.
 fn shapes_with_own_tiles(scene: &Scene) -> Vec<bool> {
     let has_tiles = |(shape, user_count): (&Shape, usize)| {
         has_own_tiles(shape.mesh.rest_positions().len()) || (shape.modes.rank() > 0 && user_count > 1)
@@ -326,7 +332,7 @@ struct OpenTile {
     quad_count: usize,
 }
 
-/// Every tile with its class, in the order of the domains.
+/// Every tile with its class. Mixed tiles are collected over all domains.
 fn pending_tiles(scene: &Scene, corners_match: &[bool]) -> Vec<(TileClass, PendingTile)> {
     let shape_has_tiles = shapes_with_own_tiles(scene);
     let mut tiles = Vec::new();
@@ -378,8 +384,8 @@ fn chunk_count(scene: &Scene, shape: &Shape) -> usize {
     shape.modes.rank().div_ceil(modes_per_chunk(scene.deformation.storage))
 }
 
-/// U of a mixed tile, `[chunk][3][quad]` over the quads of all shapes. Each shape has one tile `[chunk][3][quad]`, and
-/// all have the same number of chunks.
+/// U of a mixed tile, packed words `[chunk][3][quad]` with the quads of all of `shapes`. Each of them has one tile
+/// `[chunk][3][quad]`, and all have the same number of chunks.
 pub(crate) fn mix_tiles(shapes: &[TiledModes]) -> Vec<PackedWord> {
     let row_count = 3 * shapes.first().map_or(0, TiledModes::chunks);
     let mut words = Vec::with_capacity(shapes.iter().map(|tiles| tiles.packed_words().len()).sum());

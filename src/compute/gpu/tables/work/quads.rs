@@ -1,14 +1,16 @@
-//! Layout of x0, normals and tangents at rest on the device, in quads as `deform` reads them. Pure.
+//! Layout of x0, normals and tangents at rest on the device, in quads (four vertices or corners) as `deform` reads
+//! them. Pure.
 
 use super::{QUAD, WorkList, has_own_tiles, has_rigid_normals, shapes_with_own_tiles};
 use crate::storage::TILE_QUADS;
 use modalcast_model::domain::Shape;
 use modalcast_model::scene::Scene;
 
-/// Offsets of the quads of x0, normals and tangents. Three kinds of quads follow each other:
-/// 1. x0 of the vertices of shapes whose corners do not match their vertices,
-/// 2. x0, normals and tangents of shapes whose corner i is vertex i,
-/// 3. normals and tangents of the corners of shapes whose corners do not match.
+/// Indices of the quads of x0, normals and tangents. A shape matches if its corner i is its vertex i. Three kinds of
+/// quads follow each other:
+/// 1. x0 of shapes that do not match,
+/// 2. x0, normals and tangents of shapes that match,
+/// 3. normals and tangents of shapes that do not match.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct QuadLayout {
     /// Per shape, its first quad of x0.
@@ -17,14 +19,14 @@ pub(crate) struct QuadLayout {
     pub corner_quads: Vec<u32>,
     /// Number of quads with x0: kinds 1 and 2.
     pub position_quad_count: u64,
-    /// First quad with normals, of kind 2.
+    /// First quad with normals: the first of kind 2.
     pub first_direction_quad: u64,
     /// Number of quads of all kinds.
     pub quad_count: u64,
 }
 
 impl QuadLayout {
-    /// `corners_match`: per shape, whether one tile computes vertices and corners.
+    /// `corners_match`: per shape, whether the shape matches and one tile computes its vertices and corners.
     pub(crate) fn new(scene: &Scene, corners_match: &[bool]) -> Self {
         let has_rigid_normals = has_rigid_normals(scene);
         let shapes = || scene.shapes.iter().zip(corners_match);
@@ -38,18 +40,20 @@ impl QuadLayout {
         let unmatched_corner_counts = shapes()
             .map(|(shape, corners_match)| if has_rigid_normals && !*corners_match { corner_count(shape) } else { 0 });
         let mut quad_count = 0;
-        let unmatched_vertices = append_quads(unmatched_vertex_counts, &mut quad_count);
+        let first_unmatched_vertex_quads = append_quads(unmatched_vertex_counts, &mut quad_count);
         let first_direction_quad = quad_count;
-        let matching_items = append_quads(matching_counts, &mut quad_count);
+        let first_matching_quads = append_quads(matching_counts, &mut quad_count);
         let position_quad_count = quad_count;
-        let unmatched_corners = append_quads(unmatched_corner_counts, &mut quad_count);
+        let first_unmatched_corner_quads = append_quads(unmatched_corner_counts, &mut quad_count);
         let select = |unmatched: &[u32]| {
-            let shapes = corners_match.iter().zip(&matching_items).zip(unmatched);
-            shapes.map(|((corners_match, matching), other)| if *corners_match { *matching } else { *other }).collect()
+            let shapes = corners_match.iter().zip(&first_matching_quads).zip(unmatched);
+            shapes
+                .map(|((corners_match, matching), unmatched)| if *corners_match { *matching } else { *unmatched })
+                .collect()
         };
         Self {
-            vertex_quads: select(&unmatched_vertices),
-            corner_quads: select(&unmatched_corners),
+            vertex_quads: select(&first_unmatched_vertex_quads),
+            corner_quads: select(&first_unmatched_corner_quads),
             position_quad_count,
             first_direction_quad,
             quad_count,
@@ -57,7 +61,7 @@ impl QuadLayout {
     }
 }
 
-/// Appends the quads of each shape, and returns the first quad of each.
+/// Appends the quads of each shape, and returns the index of the first quad of each shape.
 fn append_quads(item_counts: impl Iterator<Item = usize>, quad_count: &mut u64) -> Vec<u32> {
     let append_shape = |item_count: usize| {
         let first_quad = *quad_count;
@@ -78,8 +82,8 @@ pub(crate) fn rest_positions(scene: &Scene, work: &WorkList) -> Vec<[f32; 4]> {
     positions
 }
 
-/// Normals and tangents at rest of all shapes, three and four float4 per quad, from the first quad that has normals.
-/// Both are empty without rigid normals; tangents are also empty without normal maps.
+/// Normals at rest (three float4 per quad) and tangents at rest (four float4 per quad) of all shapes, from the first
+/// quad that has normals. Both are empty without rigid normals; tangents are also empty without normal maps.
 pub(crate) fn rest_directions(scene: &Scene, work: &WorkList) -> [Vec<[f32; 4]>; 2] {
     if !has_rigid_normals(scene) {
         return [Vec::new(), Vec::new()];
@@ -115,7 +119,7 @@ fn arrange_for_tiles<const N: usize>(quads: &[[[f32; 4]; N]], has_own_tiles: boo
     quads.chunks(TILE_QUADS).flat_map(transpose).collect()
 }
 
-/// Quads `[component][item]` of a list of items. The padding is zero.
+/// Groups a list of items into quads `[component][item]`. The padding of the last quad is zero.
 fn quads_of_items<const N: usize>(items: &[[f32; N]]) -> Vec<[[f32; 4]; N]> {
     let mut quads = vec![[[0.0; 4]; N]; items.len().div_ceil(QUAD)];
     for (index, item) in items.iter().enumerate() {

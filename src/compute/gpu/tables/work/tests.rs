@@ -1,11 +1,12 @@
-//! Tests that read the work list of `deform` in the same way as the kernel.
+//! Tests that read the work list of `deform` in the same way as the kernel. In most test scenes, two domains use each
+//! shape (`test_scenes`).
 
 use super::super::layout::LAST_QUAD_ITEMS;
 use super::super::test_scenes::{scene, scene_with_matching_corners, scene_with_storage, scene_without_sharing};
 use super::*;
 use std::sync::Arc;
 
-/// The tables that `deform` reads.
+/// The tables of U and x0 that `deform` reads.
 pub(crate) struct LoadedTables {
     pub words: Vec<PackedWord>,
     pub scales: Vec<f32>,
@@ -41,14 +42,14 @@ pub(crate) fn load_tables(scene: &Scene, work: &WorkList) -> LoadedTables {
 /// A quad of a tile, as `load_lane_slice` of the kernel derives it.
 struct Quad {
     domain: usize,
-    /// First packed vertex or corner.
+    /// Index of the first item among the vertices or corners of all domains.
     first_item: u32,
     item_count: usize,
-    /// First quad of the tile, or this quad in a mixed tile.
+    /// Index of the first quad of the tile in the table of x0; in a mixed tile, of this quad.
     rest_quad: u32,
     /// Index of this quad relative to `rest_quad`.
     quad_in_tile: usize,
-    /// Quads between the components of x0.
+    /// Number of float4 vectors from one component of x0 to the next one.
     component_stride: usize,
     first_q: u32,
     first_scale: u32,
@@ -84,7 +85,7 @@ fn load_quad(work: &WorkList, tile: &WarpTile, quad: usize) -> Quad {
     }
 }
 
-/// Checks that one tile computes each packed corner, and that it finds the rest normal of the corner.
+/// Checks that exactly one tile computes each corner, and that the tile finds the rest normal of the corner.
 fn check_corners(scene: &Scene, work: &WorkList) {
     let mut tile_counts = vec![0; scene.layout.corners];
     for tile in work.tiles.iter().filter(|tile| tile.kind & TILE_CORNERS > 0) {
@@ -106,8 +107,8 @@ fn check_corners(scene: &Scene, work: &WorkList) {
     assert!(tile_counts.iter().all(|count| *count == 1), "expected one tile per corner");
 }
 
-/// Reads the work list as the kernel does. Checks that one tile computes each vertex, and that it finds x0, the entries
-/// of U and q of the vertex.
+/// Reads the work list as the kernel does. Checks that exactly one tile computes each vertex, and that the tile finds
+/// x0, q and the entries of U of the vertex.
 fn check_work_list(scene: &Arc<Scene>) -> WorkList {
     let coordinates = CoordinateLayout::new(scene);
     let work = WorkList::new(scene, &coordinates, BatchPolicy::default());
@@ -135,6 +136,7 @@ fn check_work_list(scene: &Arc<Scene>) -> WorkList {
                     for mode in 0..shape.modes.rank() {
                         let entry = load_entry(scene, &loaded, (tile, quad_index), &quad, [mode, axis, item]);
                         let expected = shape.modes.entry(vertex, axis, mode);
+                        // More than the rounding error of int8: 1/254 of the largest entry of the tile and mode.
                         let tolerance = expected.abs() / 100.0 + 1.0;
                         assert!((entry - expected).abs() <= tolerance, "expected {expected}, got {entry}");
                     }
@@ -188,9 +190,10 @@ fn small_domains_share_tiles_unless_they_share_modes() {
     };
     // Two domains of each shape. With modes they share U and have tiles of their own.
     let work = check_work_list(&scene(&[(7, 0); 40]));
-    assert_eq!(vertex_tiles(&work).len(), 80 * 2 / 32);
+    assert_eq!(vertex_tiles(&work).len(), 80 * 2 / 32, "80 domains of two quads, 32 quads per tile");
     assert!(vertex_tiles(&work).iter().all(|tile| (tile.kind & LAST_QUAD_ITEMS, tile.quad_count) == (0, 32)));
     let work = check_work_list(&scene(&[(7, 3); 40]));
+    // 40 shapes of two quads, three chunks, and three words per quad and chunk.
     assert_eq!((vertex_tiles(&work).len(), work.word_count), (80, 40 * 2 * 3 * 3));
     let work = check_work_list(&scene_without_sharing(&[(7, 3); 80]));
     assert_eq!((vertex_tiles(&work).len(), work.word_count), (80 * 2 / 32, 80 * 2 * 3 * 3));

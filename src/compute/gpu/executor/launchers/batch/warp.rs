@@ -1,4 +1,5 @@
-//! Emulates a warp of `kernels/batch.cu` in lockstep, with its ring of stages and its coalesced stores.
+//! Emulates a warp of `kernels/batch.cu` in lockstep, with its ring buffer for U and its coalesced stores. As in the
+//! kernel, a stage of the ring has a few chunks of modes, and the domains of a group are its members.
 
 use crate::testing::transformed_axis;
 use std::sync::Arc;
@@ -13,7 +14,7 @@ use crate::storage::{PackedWord, TILE_QUADS, modes_per_chunk};
 use modalcast_model::backend_settings::BatchPolicy;
 use modalcast_model::scene::{Scene, SceneState, StorageType};
 
-/// Quads of a warp.
+/// Quads (four vertices each) of a warp.
 const WARP_QUADS: usize = TILE_QUADS / BATCH_WARPS;
 /// Vertices of a warp.
 const WARP_VERTICES: usize = 4 * WARP_QUADS;
@@ -23,7 +24,7 @@ const STAGE_CHUNKS: usize = 4;
 const STAGE_WORDS: usize = 3 * STAGE_CHUNKS * WARP_QUADS;
 /// Stages of the ring.
 const RING_STAGES: usize = 3;
-/// Content of memory that no result may depend on: a NaN in every storage type except `Int8`.
+/// Content of unwritten memory, on which no result may depend: a NaN in every storage type except `Int8`.
 const POISON: PackedWord = PackedWord([0xff; 16]);
 
 /// The inputs of the kernel.
@@ -58,7 +59,7 @@ pub(super) struct Warp<'a> {
     tables: &'a Tables,
     pub group: BatchGroup,
     tile: usize,
-    /// Index of the warp's first word of U.
+    /// Index of the first word of the warp's first quad in U.
     first_word: usize,
     /// Number of quads of the tile.
     tile_quads: usize,
@@ -66,7 +67,7 @@ pub(super) struct Warp<'a> {
     warp_quad: usize,
     /// Number of quads of the warp.
     pub quads: usize,
-    /// Index of the warp's first vertex in its domain.
+    /// Index of the warp's first vertex in the shape.
     first_vertex: usize,
     ring: Vec<PackedWord>,
 }
@@ -93,20 +94,20 @@ impl<'a> Warp<'a> {
         self.tables.work.batched.members[self.group.first_member as usize + index]
     }
 
-    /// Copies a stage of U to the ring: `3 * STAGE_CHUNKS` rows of the words of the warp's quads.
+    /// Copies a stage of U to the ring: `3 * STAGE_CHUNKS` rows, each with one word of every quad of the warp.
     fn copy_stage(&mut self, stage: usize) {
         let ring_word = stage % RING_STAGES * STAGE_WORDS;
         self.ring[ring_word..][..STAGE_WORDS].fill(POISON);
-        for (lane, step) in (0..32).flat_map(|lane| (0..STAGE_WORDS / 32).map(move |step| (lane, step))) {
-            let row = 3 * STAGE_CHUNKS * stage + lane / WARP_QUADS + step * (32 / WARP_QUADS);
+        for (lane, copy) in (0..32).flat_map(|lane| (0..STAGE_WORDS / 32).map(move |copy| (lane, copy))) {
+            let row = 3 * STAGE_CHUNKS * stage + lane / WARP_QUADS + copy * (32 / WARP_QUADS);
             if row < 3 * self.group.chunk_count as usize {
                 let word = self.first_word + row * self.tile_quads + (lane % WARP_QUADS).min(self.quads - 1);
-                self.ring[ring_word + lane + 32 * step] = self.tables.loaded.words[word];
+                self.ring[ring_word + lane + 32 * copy] = self.tables.loaded.words[word];
             }
         }
     }
 
-    /// Decodes the entry of U at a byte of the ring.
+    /// Decodes the entry of U at a byte of the ring, without the scale of `Int8`.
     fn entry(&self, byte: usize) -> f32 {
         let bytes: &[u8] = bytemuck::cast_slice(&self.ring);
         let first_bytes = [bytes[byte], bytes.get(byte + 1).copied().unwrap_or(0)];
@@ -150,12 +151,14 @@ impl<'a> Warp<'a> {
         sums
     }
 
-    /// Positions of two domains as the warp stages them before the stores, `[domain][vertex][3]`.
+    /// Positions of the members `member` and `member + 1` as the warp stages them before the stores:
+    /// `[member][vertex][3]`. Those of a missing second member are NaN.
     pub(super) fn staged(&self, sums: &[[[f32; MAX_BATCH_SIZE]; 6]], member: usize) -> Vec<f32> {
         let mut staged = vec![f32::NAN; 2 * 3 * WARP_VERTICES];
         let first_rest_vector = 3 * (self.group.rest_quad as usize + TILE_QUADS * self.tile);
-        for (lane, item) in (0..32).flat_map(|lane| (0..4).map(move |item| (lane, item))) {
-            let (member_offset, vertex) = (item / 2, item % 2);
+        // A lane stages two vertices of two members.
+        for (lane, position) in (0..32).flat_map(|lane| (0..4).map(move |position| (lane, position))) {
+            let (member_offset, vertex) = (position / 2, position % 2);
             if member + member_offset >= self.group.member_count as usize {
                 continue;
             }
@@ -187,15 +190,16 @@ impl<'a> Warp<'a> {
         let are_aligned =
             || (0..2).all(|member_offset| self.member(member + member_offset).first_vertex.is_multiple_of(4));
         if vertices == WARP_VERTICES && member + 1 < members && are_aligned() {
-            for (lane, step) in (0..32).flat_map(|lane| (0..12).map(move |step| (lane, step))) {
-                let (word, word_component) = (step / 4, step % 4);
-                let (target_member, target_word) = match word {
+            // Each lane makes three stores of 16 bytes, four components each.
+            for (lane, lane_component) in (0..32).flat_map(|lane| (0..12).map(move |component| (lane, component))) {
+                let (store, word_component) = (lane_component / 4, lane_component % 4);
+                let (target_member, target_word) = match store {
                     0 => (member, lane),
                     1 if lane < 16 => (member, 32 + lane),
                     1 => (member + 1, lane - 16),
                     _ => (member + 1, 16 + lane),
                 };
-                let staged_component = staged[4 * (32 * word + lane) + word_component];
+                let staged_component = staged[4 * (32 * store + lane) + word_component];
                 put_component(target_member, 4 * target_word + word_component, staged_component);
             }
             return;
