@@ -1,11 +1,12 @@
-//! A-priori bounds of the error of a deformer's x, one number per source of error.
+//! A-priori bounds of the error of a deformer's x = T (x0 + U q), one number per source of error. A is the linear part
+//! of T.
 //!
 //! The sum of a vertex is a chain of fused multiply-adds from +0 over its modes in ascending order, then `+ x0`, then
 //! three fused multiply-adds per row of T, all in f32. With the unit roundoff e = 2^-24 and gamma_k = k e / (1 - k e),
 //! the error of a chain of k roundings is at most gamma_k times the sum of the magnitudes of its terms (Higham,
 //! Accuracy and Stability of Numerical Algorithms, 2nd ed., 2002, sections 2.2 and 3.1), plus 2^-150 for every rounding
-//! that underflows. The error of a compensated sum s is at most e |s| + gamma_k^2 sum|terms| (Ogita, Rump, Oishi,
-//! Accurate Sum and Dot Product, 2005, proposition 5.5), plus 5 k 2^-149.
+//! that underflows. The error of a compensated sum s of k terms is at most e |s| + gamma_k^2 sum|terms| (Ogita, Rump,
+//! Oishi, Accurate Sum and Dot Product, 2005, proposition 5.5), plus 5 k 2^-149.
 //!
 //! T of a follower is a product T_m F of the transform T_m of its root and its frame F. [`ComposedTransform::to_f32`]
 //! defines its rounding: three roundings per entry. The error of an entry of the linear part is at most
@@ -25,11 +26,12 @@ use modalcast_model::scene::StorageType;
 const ROUND_UP: f64 = 1.0 + 1e-12;
 /// e, the unit roundoff of f32.
 const UNIT_ROUNDOFF: f64 = 1.0 / (1 << 24) as f64;
-/// 2^-150, half of the smallest f32.
+/// 2^-150, half of the smallest positive f32: the maximum error of a rounding that underflows.
 const UNDERFLOW: f64 = f64::from_bits((1023 - 150) << 52);
+/// Ratio of the norm of a vector to its largest component, at most.
 const SQRT_3: f64 = 1.732_050_807_568_878;
 
-/// Maximum error of a vertex of one tile or domain by source, in scene units.
+/// Bounds of the error of any vertex of one tile or domain, one per source of error, in scene units.
 #[derive(Debug, Clone, Copy, Default, PartialEq, serde::Serialize)]
 pub struct ErrorBound {
     /// Rounding of the entries of U to the storage type, by at most half a step each.
@@ -72,6 +74,7 @@ pub struct ErrorBoundInput<'a> {
     pub q: &'a [f32],
     /// As returned by `modalcast_model::scene::SceneState::composed_transform`.
     pub transform: ComposedTransform,
+    /// Whether the sum over the modes is compensated.
     pub compensated: bool,
 }
 
@@ -80,7 +83,7 @@ pub struct ErrorBoundInput<'a> {
 struct ModeErrorTerms {
     /// Largest norm of the three decoded entries of a vertex.
     max_row_norm: f64,
-    /// Maximum rounding error of an entry.
+    /// Maximum rounding error of an entry: half the spacing of stored values.
     half_step: f64,
     /// Decoded entries are stored entries times this factor.
     factor: f32,
@@ -89,9 +92,9 @@ struct ModeErrorTerms {
 /// Sums over the modes of one tile, before multiplication by A.
 #[derive(Debug, Clone, Copy, Default)]
 struct ModeSums {
-    /// Error of one axis from rounding U.
+    /// Error of one axis of u from rounding U.
     storage: f64,
-    /// Error from rounding scaled coordinates.
+    /// Error of u (its norm) from rounding scaled coordinates.
     coordinates: f64,
     /// Upper bound of the sum of the magnitudes of all terms.
     magnitude_sum: f64,
@@ -145,7 +148,7 @@ impl ShapeErrorModel {
         self.bound_from_sums(tile, input, sums)
     }
 
-    /// Additional error of the vertices of tile `tile` when its sums are computed by tensor cores, in scene units.
+    /// Bound of the additional error of the vertices of tile `tile` when tensor cores compute its sums, in scene units.
     pub fn tensor_core_bound(&self, tile: usize, input: &ErrorBoundInput, error: TensorCoreError) -> f64 {
         let modes = || self.modes[self.rank * tile..][..self.rank].iter().zip(input.q);
         let scaled_coordinate = |(mode, q): (&ModeErrorTerms, &f32)| f64::from(q.abs() * mode.factor);
@@ -176,7 +179,8 @@ impl ShapeErrorModel {
         let storage = SQRT_3 * sums.storage * ROUND_UP;
         let [coordinates, magnitude_sum, term_count] =
             [sums.coordinates, sums.magnitude_sum, sums.term_count].map(|number| number * ROUND_UP);
-        // The factor 2 of underflow errors covers their growth by later roundings.
+        // For a plain sum, the factor 2 covers the growth of underflow errors by later roundings. For a compensated
+        // sum, 10 UNDERFLOW is 5 * 2^-149 of the documentation of this module.
         let accumulation = match input.compensated {
             false => gamma(term_count) * magnitude_sum + 2.0 * SQRT_3 * term_count * UNDERFLOW,
             true => {
@@ -193,6 +197,7 @@ impl ShapeErrorModel {
         let translation_norm = rounded_transform.translation().norm() * ROUND_UP;
         let frame_error = frame_rounding_error(&input.transform);
         let frame = (frame_error.linear * (max_deformed_norm + rest) + frame_error.translation) * ROUND_UP;
+        // 6 UNDERFLOW: three roundings, with the factor 2 again.
         let transform =
             gamma(3.0) * (linear_norm * (max_deformed_norm + rest) + translation_norm) + 6.0 * SQRT_3 * UNDERFLOW;
         let [storage, coordinates, accumulation, rest] =
@@ -210,7 +215,7 @@ struct FrameError {
     translation: f64,
 }
 
-/// The rounding error of a follower's transform; zero for a transform root.
+/// The bound of the rounding error of a follower's transform; zero for a transform root.
 fn frame_rounding_error(transform: &ComposedTransform) -> FrameError {
     let Some(frame) = transform.frame else { return FrameError::default() };
     let magnitudes = ComposedTransform {
@@ -229,13 +234,13 @@ fn frame_rounding_error(transform: &ComposedTransform) -> FrameError {
     }
 }
 
-/// Upper bound of `||A||_2` for the exact A and for A as deformers round it. The bound is too large by at most a
-/// relative 1e-7, and for a follower also by the rounding error of the product with its frame.
+/// Upper bound of `||A||_2`, both for the exact A and for A as deformers round it. The bound is too large by a relative
+/// 1e-7 at most, and for a follower also by the rounding error of the product with its frame.
 pub fn linear_norm_bound(transform: &ComposedTransform) -> f64 {
     (spectral_norm(&transform.to_f32()) + frame_rounding_error(transform).linear) * ROUND_UP
 }
 
-/// Upper bound of `||A||_2`, too large by at most a relative 1e-7: the square root of the largest eigenvalue of A^T A,
+/// Upper bound of `||A||_2`, too large by a relative 1e-7 at most: the square root of the largest eigenvalue of A^T A,
 /// computed by the trigonometric formula for 3x3 matrices (Smith, Eigenvalues of a symmetric 3x3 matrix, 1961).
 fn spectral_norm(transform: &Transform) -> f64 {
     let linear = transform.linear();
@@ -259,7 +264,7 @@ fn spectral_norm(transform: &Transform) -> f64 {
     eigenvalue.sqrt() * max_entry * (1.0 + 5e-8)
 }
 
-/// gamma_k of f32.
+/// gamma_k of f32, for k `roundings`.
 fn gamma(roundings: f64) -> f64 {
     roundings * UNIT_ROUNDOFF / (1.0 - roundings * UNIT_ROUNDOFF)
 }
@@ -281,7 +286,8 @@ fn mode_error_terms(shape: &Shape, tiles: &TiledModes, tile: usize, mode: usize)
     }
 }
 
-/// The largest row norm in units of the factor; 0 for a mode of zeros.
+/// The largest norm of the three stored entries of a vertex, before multiplication by the factor; 0 for a mode of
+/// zeros.
 fn stored_row_norm(mode: &ModeErrorTerms) -> f64 {
     if mode.factor > 0.0 { mode.max_row_norm / f64::from(mode.factor) } else { 0.0 }
 }
@@ -295,17 +301,19 @@ fn factor(tiles: &TiledModes, tile: usize, mode: usize) -> f32 {
     }
 }
 
-/// Maximum rounding error of an entry of a tile in the storage type; `max_entry` is the tile's largest magnitude.
+/// Maximum rounding error of an entry of one mode in a tile; `max_entry` is the largest magnitude of these entries.
 fn half_step(tiles: &TiledModes, tile: usize, mode: usize, max_entry: f32) -> f64 {
     let factor = f64::from(factor(tiles, tile, mode));
-    // Half the spacing is 2^-11 (f16) or 2^-8 (bf16) times the power of two at or below the entry. The smallest spacing
-    // of f16 is 2^-24, that of bf16 is 2^-133.
+    // Half the spacing of stored values near an entry is 2^-11 (f16) or 2^-8 (bf16) times the power of two at or below
+    // the magnitude of the entry, but at least half the smallest spacing: 2^-24 / 2 (f16) or 2^-133 / 2 (bf16), times
+    // the factor.
     let power_of_two = f64::exp2(f64::from(super::quantize::floor_log2(max_entry)));
     match tiles.storage() {
         _ if max_entry == 0.0 => 0.0,
         StorageType::F32 => 0.0,
         StorageType::F16 => (power_of_two * f64::exp2(-11.0)).max(factor * f64::exp2(-25.0)),
-        // The smallest spacing, and not half of it, because the value may be rounded twice: to f32, then to bf16.
+        // The whole smallest spacing 2^-133 instead of half, because the value may be rounded twice: to f32, then to
+        // bf16.
         StorageType::Bf16 => (power_of_two * f64::exp2(-8.0)).max(factor * f64::exp2(-133.0)),
         StorageType::Int8 => factor / 2.0 * ROUND_UP,
     }

@@ -1,4 +1,5 @@
-//! Encodes columns of U as planes of a storage type, in parallel over tiles.
+//! Encodes the entries of U in a storage type, in parallel over tiles. The module `storage` describes tiles, planes and
+//! chunks.
 
 use half::{bf16, f16};
 use rayon::prelude::*;
@@ -7,7 +8,7 @@ use super::{PackedWord, QUAD, TILE_QUADS, TileLayout, modes_per_chunk};
 use modalcast_model::domain::Modes;
 use modalcast_model::scene::StorageType;
 
-/// Packs x0 of up to four vertices; element `4 axis + vertex`.
+/// Packs x0 of up to four vertices, at the indices `4 axis + vertex`.
 pub(super) fn rest_quad(vertices: &[[f32; 3]]) -> [f32; 12] {
     let mut quad = [0.0; 12];
     for (vertex, position) in vertices.iter().enumerate() {
@@ -16,9 +17,10 @@ pub(super) fn rest_quad(vertices: &[[f32; 3]]) -> [f32; 12] {
     quad
 }
 
-/// Factors 2^s per mode such that the largest stored entry lies in [2^14, 2^15) for `F16`, in [1, 2) for `Bf16`; 1 for
-/// a mode of zeros. s is at least -149, where 2^s is the smallest f32. Columns below 2^-135 therefore have smaller
-/// stored entries, without loss of precision.
+/// Per mode the factor 2^s, by which stored entries are multiplied. The largest stored entry lies in [2^14, 2^15) for
+/// `F16` and in [1, 2) for `Bf16`; the factor of a mode of zeros is 1. s is at least -149, because 2^-149 is the
+/// smallest positive f32. With `F16`, modes with entries below 2^-135 therefore have smaller stored entries, without
+/// loss of precision.
 pub(super) fn factors(modes: &Modes, storage: StorageType) -> Vec<f32> {
     let stored_exponent = match storage {
         StorageType::F16 => 14,
@@ -32,7 +34,7 @@ pub(super) fn factors(modes: &Modes, storage: StorageType) -> Vec<f32> {
     (0..modes.rank()).into_par_iter().map(factor).collect()
 }
 
-/// Writes the planes of `F32`, `F16` or `Bf16`, which must be zero before.
+/// Encodes U as `F32`, `F16` or `Bf16`. `packed_words` must be zero before the call.
 pub(super) fn encode_floats(
     modes: &Modes,
     tiles: &[TileLayout],
@@ -54,7 +56,7 @@ pub(super) fn encode_floats(
     });
 }
 
-/// Writes the planes and scales of `Int8`.
+/// Encodes U as `Int8`, and writes the scale of each tile and mode.
 pub(super) fn encode_int8(modes: &Modes, tiles: &[TileLayout], packed_words: &mut [PackedWord], scales: &mut [f32]) {
     let scales_per_tile = modes.rank().next_multiple_of(modes_per_chunk(StorageType::Int8));
     let encoded_tiles =
@@ -67,16 +69,16 @@ pub(super) fn encode_int8(modes: &Modes, tiles: &[TileLayout], packed_words: &mu
         let scales = &*scales;
         write_planes(modes, tile, StorageType::Int8, packed_words, |mode, entry| match scales[mode] {
             0.0 => [ZERO_CODE],
-            // The code is at most 127 away from that of zero, because the scale was rounded up.
+            // The code differs from `ZERO_CODE` by at most 127, because the scale was rounded up.
             scale => [((f64::from(entry) / f64::from(scale)).round() + f64::from(ZERO_CODE)) as u8],
         });
     });
 }
 
-/// The code of zero.
+/// The stored code of an entry of zero with `Int8`.
 const ZERO_CODE: u8 = 128;
 
-/// Iterates in parallel over tiles and their planes. Only the last tile of a shape may be shorter.
+/// Iterates in parallel over tiles and their packed words. Only the last tile of a shape may have fewer quads.
 fn par_tiles<'a>(
     modes: &Modes,
     storage: StorageType,
@@ -92,7 +94,7 @@ fn tile_entries<'a>(modes: &'a Modes, tile: &TileLayout, mode: usize) -> &'a [f3
     &modes.column(mode)[3 * tile.first_vertex..][..3 * tile.vertices]
 }
 
-/// Encodes every entry of a tile into its planes. `encode` gets the mode and the entry.
+/// Writes every entry of a tile to its place in the packed words of the tile. `encode` gets the mode and the entry.
 fn write_planes<const SIZE: usize>(
     modes: &Modes,
     tile: &TileLayout,
@@ -113,7 +115,8 @@ fn write_planes<const SIZE: usize>(
     }
 }
 
-/// 1/127 of the largest magnitude, rounded up, so that 127 steps reach it. A tile of zeros has step 0.
+/// The scale of `Int8`: 1/127 of the largest magnitude, rounded up, so that 127 steps reach the largest entry. 0 for
+/// entries of zero.
 fn quantization_step(max_magnitude: f32) -> f32 {
     let exact = f64::from(max_magnitude) / 127.0;
     let nearest = exact as f32;

@@ -1,9 +1,12 @@
-//! Splits each coordinate into two numbers of U's type, for tensor cores with U in 16 bits.
+//! Splits each coordinate of q into two 16-bit numbers, for sums by tensor cores with U in 16 bits. Both numbers have
+//! the type of U, f16 or bf16.
 //!
 //! A number x becomes h = round(x) and l = round(x - h). For a type with p significant bits, |x - h| <= 2^-p |x|.
-//! Unless l is denormal, |x - h - l| <= 2^-2p |x|: 2^-22 |x| with f16, 2^-16 |x| with bf16. All coordinates of a domain
-//! are first multiplied by one power of two, so that the largest lies in [2^13, 2^14). Then nothing overflows f16. If l
-//! is denormal, the error is at most 2^-25, which is 2^-38 of the largest coordinate.
+//! Unless l is denormal, |x - h - l| <= 2^-2p |x|: 2^-22 |x| with f16 (p = 11), 2^-16 |x| with bf16 (p = 8).
+//!
+//! All coordinates of a domain are first multiplied by one power of two, so that the largest coordinate lies in
+//! [2^13, 2^14). Then no coordinate overflows f16. If l is denormal, the error is at most 2^-25, which is at most 2^-38
+//! times the largest coordinate.
 
 use half::{bf16, f16};
 
@@ -39,7 +42,7 @@ impl SplitCoordinates {
         Self { storage, pairs: scaled_q.iter().map(split).collect(), exponent }
     }
 
-    /// Bits of h and l of a mode.
+    /// The bits of h and l of a mode.
     pub fn pair(&self, mode: usize) -> [u16; 2] {
         self.pairs[mode]
     }
@@ -56,23 +59,24 @@ impl SplitCoordinates {
     }
 }
 
-/// Relative error bounds of products by tensor cores, in addition to the storage error of U.
+/// Relative error bounds of U q by tensor cores, in addition to the storage error of U.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TensorCoreError {
-    /// Relative to each coordinate.
+    /// Error of each coordinate by the split, relative to the coordinate.
     pub coordinate: f64,
-    /// For each coordinate, relative to the largest coordinate of the domain.
+    /// Further error of each coordinate if l is denormal, relative to the largest coordinate of the domain.
     pub floor: f64,
-    /// Relative to the sum of the magnitudes of all terms.
+    /// Error of the sum, relative to the sum of the magnitudes of all terms.
     pub sum: f64,
 }
 
-/// 2^-23: the relative loss of truncating an addend that is aligned to the exponent of the largest.
+/// 2^-23: the maximum error of truncating a term that is aligned to the exponent of the largest term, relative to the
+/// largest term.
 const TRUNCATION_ERROR: f64 = 1.0 / (1 << 23) as f64;
-/// Number of modes per matrix product.
+/// Number of modes per matrix product (mma.m16n8k16).
 const MMA_MODES: usize = 16;
-/// Upper bound of the number of truncations in a product of 16 terms, computed at once or in two halves. Each term, the
-/// previous sum and the result are truncated.
+/// Upper bound of the number of truncations in a matrix product of 16 terms. A tensor core sums the terms at once or in
+/// two halves of 8. It truncates each term, and in each half the previous sum and the result: 16 + 2 * 2 = 20.
 const TRUNCATIONS: f64 = 20.0;
 
 impl TensorCoreError {
@@ -80,16 +84,18 @@ impl TensorCoreError {
     ///
     /// A tensor core multiplies exactly, aligns all terms and the previous sum to the largest of them, and truncates
     /// (Fasi, Higham, Mikaitis, Pranesh, Numerical behavior of NVIDIA tensor cores, PeerJ Computer Science 7:e330,
-    /// 2021). A product therefore loses at most `TRUNCATIONS` units of the sum of all magnitudes, and there are two
-    /// products for every 16 modes, one per number of the split.
+    /// 2021). A matrix product therefore has an error of at most `TRUNCATIONS * TRUNCATION_ERROR` times the sum of
+    /// all magnitudes. There are two matrix products for every 16 modes, one for h and one for l.
     pub fn of(storage: StorageType, rank: usize) -> Self {
         let coordinate = f64::from(if storage == StorageType::F16 { -22_i8 } else { -16 }).exp2();
         let sum = 2.0 * rank.div_ceil(MMA_MODES) as f64 * TRUNCATIONS * TRUNCATION_ERROR;
-        // The magnitudes are those of rounded coordinates, so their errors compound slightly.
+        // The last factor covers that the tensor core sums rounded coordinates and partial sums, whose magnitudes may be
+        // slightly larger than the exact ones.
         Self { coordinate, floor: f64::from(-25 - TOP_EXPONENT).exp2(), sum: sum * (1.0 + 2.0 * sum + 1e-4) }
     }
 
-    /// Lower limit of the largest coordinate in the `floor` bound.
+    /// Smallest value of the largest coordinate to which `floor` is relative: smaller largest coordinates count as this
+    /// value.
     pub(super) fn min_largest_coordinate() -> f64 {
         f64::from(MIN_EXPONENT).exp2()
     }
@@ -159,7 +165,7 @@ mod tests {
         assert_eq!(
             (wide.decode_coordinate(2), wide.decode_coordinate(3)),
             (0.0, 0.0),
-            "expected values of 2^-253 of the largest to become 0"
+            "expected values below 2^-253 times the largest to become 0"
         );
         assert_eq!(SplitCoordinates::new(&[3.0], StorageType::F16).decode_coordinate(0), 3.0);
     }

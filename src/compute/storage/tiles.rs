@@ -1,4 +1,5 @@
-//! The tiles of one shape, and the decoded value of an entry.
+//! The tiles of one shape, and the decoded values of their entries. The documentation of the parent module describes
+//! the layout.
 
 use std::ops::Range;
 
@@ -8,12 +9,13 @@ use super::{QUAD, TILE_QUADS, modes_per_chunk, quantize};
 use modalcast_model::domain::Shape;
 use modalcast_model::scene::StorageType;
 
-/// 16 bytes of one quad and chunk, in one plane: one lane loads them at once.
+/// The 16 bytes of one quad and chunk in one plane. A lane of a warp loads them at once.
 #[repr(C, align(16))]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, bytemuck::Pod, bytemuck::Zeroable)]
 pub struct PackedWord(pub [u8; 16]);
 
-/// Offsets and sizes of one tile. C is the number of chunks, K the number of modes per chunk, W the number of quads.
+/// Offsets and sizes of one tile. C is the number of chunks of the shape, K the number of modes per chunk, W the number
+/// of quads of the tile.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct TileLayout {
     /// Index of the first quad in the shape.
@@ -30,7 +32,7 @@ pub struct TileLayout {
     pub first_scale: usize,
 }
 
-/// U and x0 of one shape in tiles. The documentation of the module `storage` describes the layout.
+/// U and x0 of one shape in tiles.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TiledModes {
     storage: StorageType,
@@ -39,14 +41,16 @@ pub struct TiledModes {
     packed_words: Vec<PackedWord>,
     scales: Vec<f32>,
     factors: Vec<f32>,
+    /// As returned by [`Self::rest`].
     rest: Vec<[f32; 12]>,
 }
 
 impl TiledModes {
     /// Rounds a shape's U to the storage type.
     ///
-    /// `F16` and `Bf16` divide each mode by a power of two first, so that its largest entry lies in [2^14, 2^15) or in
-    /// [1, 2). `Int8` divides each mode of each tile by 1/127 of its largest entry, rounded up.
+    /// Before the rounding, `F16` and `Bf16` divide each mode by a power of two (its factor), so that its largest entry
+    /// lies in [2^14, 2^15) or in [1, 2). `Int8` divides each mode of each tile by its scale, 1/127 of its largest entry
+    /// rounded up.
     pub fn new(shape: &Shape, storage: StorageType) -> Self {
         let rest = shape.mesh.rest_positions();
         let rank = shape.modes.rank();
@@ -118,12 +122,12 @@ impl TiledModes {
         }
     }
 
-    /// The planes of all tiles without gaps: `48 C Q` bytes.
+    /// The packed words of all tiles without gaps: `3 C Q` words.
     pub fn packed_words(&self) -> &[PackedWord] {
         &self.packed_words
     }
 
-    /// The planes as bytes, for the upload to a device.
+    /// The packed words as `48 C Q` bytes, for the upload to a device.
     pub fn bytes(&self) -> &[u8] {
         bytemuck::cast_slice(&self.packed_words)
     }
@@ -135,29 +139,31 @@ impl TiledModes {
         first..first + 48 * self.chunks() * layout.quads
     }
 
-    /// `Int8`: the value of one code step per tile and mode, `[tile][C K]`, zero for padding modes. Else empty.
+    /// With `Int8`, the difference between values of consecutive codes per tile and mode, `[tile][C K]`; zero for
+    /// padding modes. Empty for other storage types.
     pub fn scales(&self) -> &[f32] {
         &self.scales
     }
 
-    /// `F16` and `Bf16`: per mode, the power of two by which decoding multiplies its stored entries. Else empty.
+    /// With `F16` and `Bf16`, the power of two per mode by which decoding multiplies its stored entries. Empty for
+    /// other storage types.
     pub fn factors(&self) -> &[f32] {
         &self.factors
     }
 
-    /// x0 per quad, element `4 axis + vertex in quad`.
+    /// x0 per quad, with the coordinate of an axis and a vertex of the quad at the index `4 axis + vertex`.
     pub fn rest(&self) -> &[[f32; 12]] {
         &self.rest
     }
 
-    /// The stored entry of vertex `vertex`, axis `axis`, mode `mode`: exact in f64.
+    /// The stored entry of vertex `vertex`, axis `axis` and mode `mode`, times its factor or scale. Exact in f64.
     pub fn decode_entry(&self, vertex: usize, axis: usize, mode: usize) -> f64 {
         let chunk_modes = modes_per_chunk(self.storage);
         let (quad, tile) = (vertex / QUAD, vertex / QUAD / TILE_QUADS);
         let layout = self.tile(tile);
-        let element = (mode % chunk_modes * 3 + axis) * QUAD + vertex % QUAD;
+        let entry = (mode % chunk_modes * 3 + axis) * QUAD + vertex % QUAD;
         let entry_bytes = 4 / chunk_modes;
-        let (plane, byte) = (element * entry_bytes / 16, element * entry_bytes % 16);
+        let (plane, byte) = (entry * entry_bytes / 16, entry * entry_bytes % 16);
         let word =
             layout.first_packed_word + (mode / chunk_modes * 3 + plane) * layout.quads + quad - layout.first_quad;
         let bytes = &self.packed_words[word].0[byte..byte + entry_bytes];
@@ -268,17 +274,19 @@ mod tests {
         let tiles = TiledModes::new(&shape, StorageType::F32);
         let float =
             |offset: usize| f32::from_ne_bytes(tiles.bytes()[offset..offset + 4].try_into().expect("four bytes"));
-        // Three quads: mode 2, axis 1, vertex 6 is in quad 1 at position 2.
+        // Three quads. Vertex 6 is vertex 2 of quad 1. In f32, a chunk is one mode and a plane is one axis.
         assert_eq!(float(((2 * 3 + 1) * 3 + 1) * 16 + 2 * 4), shape.modes.entry(6, 1, 2));
         assert_eq!(tiles.rest()[1][4 + 2], shape.mesh.rest_positions()[6][1]);
         assert_eq!(tiles.rest()[2][1], 0.0);
         let tiles = TiledModes::new(&shape, StorageType::Int8);
-        // Mode 2, axis 1 is group 7 of 4 bytes in chunk 0: plane 1, bytes 12 to 15.
+        // Mode 2 and axis 1 are group 2 * 3 + 1 = 7 of 4 bytes in chunk 0: plane 1, bytes 12 to 15. The word has the
+        // index plane * 3 + quad.
         let code = tiles.packed_words()[3 + 1].0[12 + 2];
         let expected = (shape.modes.entry(6, 1, 2) / tiles.scales()[2]).round() + 128.0;
         assert_eq!(f32::from(code), expected);
         let tiles = TiledModes::new(&shape, StorageType::F16);
-        // Mode 3 is the second mode of chunk 1, and its axis 1 is group 4 of 8 bytes: plane 2, bytes 0 to 7.
+        // Mode 3 is the second mode of chunk 1, and its axis 1 is group 3 + 1 = 4 of 8 bytes: plane 2, bytes 0 to 7. A
+        // chunk has 9 words.
         let bytes = &tiles.packed_words()[9 + 2 * 3 + 1].0[4..6];
         let stored = f16::from_ne_bytes([bytes[0], bytes[1]]).to_f32();
         assert_eq!(f16::from_f32(shape.modes.entry(6, 1, 3) / tiles.factors()[3]).to_f32(), stored);

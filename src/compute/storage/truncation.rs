@@ -2,9 +2,10 @@
 //!
 //! Leaving out a set D of modes moves no vertex by more than `||A||_2 sum_{j in D} |q_j| max_i ||U_ij||_2`, where A is
 //! the linear part of T, and U_ij is the block of three entries of vertex i and mode j. This follows from the triangle
-//! inequality. Hysteresis prevents popping of a mode whose q oscillates around a limit. A mode is
-//! truncated only while all truncated modes together stay within half the budget. It is restored when they exceed the
-//! whole budget.
+//! inequality.
+//!
+//! Hysteresis prevents popping of a mode whose q oscillates around a limit: a mode becomes truncated only if all
+//! truncated modes together stay within half the error budget, and is restored when they exceed the whole budget.
 
 use modalcast_model::domain::Modes;
 
@@ -27,7 +28,7 @@ pub struct TruncationInput<'a> {
     pub q: &'a [f32],
     /// From [`max_row_norms`].
     pub max_row_norms: &'a [f64],
-    /// Upper bound of `||A||_2`, from [`super::bound::linear_norm_bound`].
+    /// Upper bound of `||A||_2` for the domain's transform, from [`super::bound::linear_norm_bound`].
     pub norm: f64,
 }
 
@@ -59,7 +60,7 @@ impl Truncation {
         }
     }
 
-    /// Resets to the initial state: keeps all modes until the next update.
+    /// Resets to the initial state, in which no mode is truncated.
     pub fn reset(&mut self) {
         *self = Self::new(self.is_truncated.len());
     }
@@ -85,12 +86,14 @@ impl Truncation {
         &self.retained
     }
 
-    /// Maximum error of any vertex from the truncated modes, in scene units. Within the budget.
+    /// Upper bound of the error of any vertex by the truncated modes, in scene units. At most the budget of the last
+    /// update.
     pub const fn bound(&self) -> f64 {
         self.bound
     }
 
-    /// Restores the costliest truncated modes until the other truncated modes fit the budget. Returns their total cost.
+    /// Restores the costliest truncated modes until the remaining truncated modes fit the budget. Returns the total
+    /// cost of the remaining ones.
     fn restore_modes(&mut self, budget: f64) -> f64 {
         let mut total = 0.0;
         for mode in self.modes_by_cost.iter().map(|mode| usize::from(*mode)) {
@@ -103,7 +106,8 @@ impl Truncation {
         total
     }
 
-    /// Truncates the cheapest modes while the total cost fits the budget. Returns the total cost.
+    /// Truncates the cheapest retained modes while the total cost of all truncated modes fits the budget. `total` is
+    /// the cost of the modes that are already truncated. Returns the new total cost.
     fn truncate_modes(&mut self, mut total: f64, budget: f64) -> f64 {
         for mode in self.modes_by_cost.iter().map(|mode| usize::from(*mode)) {
             if self.is_truncated[mode] {
@@ -130,7 +134,7 @@ mod tests {
         truncation.update(TruncationInput { q, max_row_norms, norm: 1.0 }, budget);
     }
 
-    /// The largest displacement of a vertex by all modes but `retained`.
+    /// The largest displacement of a vertex by all modes that are not in `retained`.
     fn max_truncated_displacement(shape: &Shape, q: &[f32], retained: &[u16]) -> f64 {
         let truncated_modes = || (0..q.len()).filter(|mode| !retained.contains(&(*mode as u16)));
         let coordinate_sum = |vertex: usize, axis: usize| -> f64 {
@@ -157,7 +161,7 @@ mod tests {
                 assert!(error <= truncation.bound() && truncation.bound() <= budget, "seed {seed}: {error}");
                 assert!(truncation.retained().is_sorted());
                 truncated_count += rank - truncation.retained().len();
-                // With one more truncated mode than reported, the error often exceeds the bound, so this test can fail.
+                // Control: with the first retained mode truncated too, the error often exceeds the bound.
                 let fewer_modes = truncation.retained().split_first().map_or(&[][..], |(_, others)| others);
                 exceeded_count += usize::from(max_truncated_displacement(&shape, &q, fewer_modes) > truncation.bound());
             }
@@ -182,6 +186,7 @@ mod tests {
 
     #[test]
     fn hysteresis_prevents_flicker_of_a_mode_near_the_limit() {
+        // The cost of mode 1 oscillates around 0.5, half the budget of 1.
         let oscillation = |step: i32| (0.5 + 0.1 * f64::from(step).sin()) as f32;
         let mut truncation = Truncation::new(2);
         let (mut changes, mut naive_changes) = (0, 0);
@@ -192,7 +197,7 @@ mod tests {
             update(&mut truncation, &q, &[1.0, 1.0], 1.0);
             changes += usize::from(truncation.retained() != previous_modes);
             previous_modes = truncation.retained().to_vec();
-            // Without hysteresis, every mode that fits half the budget is truncated.
+            // A new `Truncation` has no hysteresis: it truncates every mode that fits half the budget.
             let mut naive = Truncation::new(2);
             update(&mut naive, &q, &[1.0, 1.0], 1.0);
             naive_changes += usize::from(naive.retained().len() != naive_previous_count);
@@ -204,6 +209,7 @@ mod tests {
 
     #[test]
     fn mode_is_truncated_below_half_and_restored_above_full_budget() {
+        // Per step, the coordinate of the only mode and the number of retained modes. The budget is 1.
         let mut truncation = Truncation::new(1);
         let mut retained = |q: f32| {
             update(&mut truncation, &[q], &[1.0], 1.0);

@@ -1,3 +1,5 @@
+//! Tests of the error bounds: errors stay within their bounds, and deliberately wrong results exceed them.
+
 use super::*;
 use crate::testing::{TestRng, shape, shape_with_columns};
 
@@ -6,8 +8,8 @@ fn transform(rng: &mut TestRng) -> ComposedTransform {
     Transform(std::array::from_fn(|_| 2.0 * rng.next())).into()
 }
 
-/// World positions by the f32 sums that the module describes, on stored entries. Reads axis `axis + axis_shift` of U in
-/// place of `axis`.
+/// World positions by the f32 sums that the module `bound` describes, with stored entries of U. For `axis`, reads the
+/// entries of axis `axis + axis_shift`: 0 is correct, 1 is the control with swapped axes.
 fn sum_in_f32(shape: &Shape, tiles: &TiledModes, input: &ErrorBoundInput, axis_shift: usize) -> Vec<[f32; 3]> {
     let t = input.transform.to_f32().0;
     let position = |vertex: usize| {
@@ -31,7 +33,7 @@ fn sum_in_f32(shape: &Shape, tiles: &TiledModes, input: &ErrorBoundInput, axis_s
     (0..tiles.vertices()).map(position).collect()
 }
 
-/// World positions by f64 sums on the entries of U before their rounding to the storage type.
+/// World positions by f64 sums, with the entries of U before their rounding to the storage type.
 fn positions_f64(shape: &Shape, input: &ErrorBoundInput) -> Vec<[f64; 3]> {
     let t = input.transform.to_f64();
     let position = |vertex: usize| {
@@ -45,7 +47,7 @@ fn positions_f64(shape: &Shape, input: &ErrorBoundInput) -> Vec<[f64; 3]> {
     (0..shape.mesh.rest_positions().len()).map(position).collect()
 }
 
-/// The largest ratio of a vertex's error to the bound of its tile; infinite for a NaN.
+/// The largest ratio of a vertex's error to the bound of its tile; infinite if a ratio is NaN.
 fn max_error_ratio(got: &[[f32; 3]], expected: &[[f64; 3]], bounds: impl Fn(usize) -> f64) -> f64 {
     let ratio = |(vertex, (got, expected)): (usize, (&[f32; 3], &[f64; 3]))| {
         let error = norm_f64([0, 1, 2].map(|axis| f64::from(got[axis]) - expected[axis]));
@@ -55,7 +57,7 @@ fn max_error_ratio(got: &[[f32; 3]], expected: &[[f64; 3]], bounds: impl Fn(usiz
     got.iter().zip(expected).enumerate().map(ratio).fold(0.0, f64::max)
 }
 
-/// Ratios of error to bound, for correct axes and for swapped axes.
+/// The largest ratios of error to bound, for correct axes and for swapped axes.
 fn error_ratios(shape: &Shape, storage: StorageType, input: &ErrorBoundInput) -> [f64; 2] {
     let tiles = TiledModes::new(shape, storage);
     let model = ShapeErrorModel::new(shape, &tiles);
@@ -67,6 +69,7 @@ fn error_ratios(shape: &Shape, storage: StorageType, input: &ErrorBoundInput) ->
 
 #[test]
 fn bound_holds_for_every_storage_and_fails_for_swapped_axes() {
+    // (vertices, rank)
     let sizes = [(1, 1), (1, 512), (7, 3), (130, 31), (129, 33), (40, 5), (5, 512), (300, 1)];
     for seed in 0..120_u64 {
         let mut rng = TestRng(seed);
@@ -106,11 +109,11 @@ fn bound_of_a_follower_holds_and_fails_for_a_wrong_frame() {
             frameless_ratio > 1.0,
             "seed {seed}: expected an error above the bound without the frame, got {frameless_ratio}"
         );
-        // A frame with ten mantissa bits.
+        // Control: a frame whose entries are truncated to ten mantissa bits.
         let coarse = Transform(frame.0.map(|entry| f32::from_bits(entry.to_bits() & 0xffff_e000)));
         coarse_failures += usize::from(ratio(ComposedTransform { root, frame: Some(coarse) }) > 1.0);
     }
-    assert!(largest_ratio > 0.01, "expected a bound below 100 times the error, got the ratio {largest_ratio}");
+    assert!(largest_ratio > 0.01, "expected an error above 1/100 of the bound, got {largest_ratio} times the bound");
     assert_eq!(coarse_failures, 120);
 }
 
@@ -127,6 +130,7 @@ fn frame_rounding_stays_within_its_bound_and_norm_covers_it() {
             entries.map(|index| (f64::from(got.0[index]) - expected[index]).powi(2)).sum::<f64>().sqrt()
         };
         assert!(error(true) <= bound.linear && error(false) <= bound.translation, "seed {seed}");
+        // The bound is not far too large.
         assert!(error(true) > 1e-3 * bound.linear, "seed {seed}: {} of {}", error(true), bound.linear);
         for linear in [follower.linear(), got.linear()] {
             let (largest_singular, norm) = (linear.singular_values().max(), linear_norm_bound(&follower));
@@ -141,6 +145,7 @@ fn frame_rounding_stays_within_its_bound_and_norm_covers_it() {
 fn f16_columns_of_very_different_scales_keep_their_precision() {
     let mut rng = TestRng(9);
     let scale = |mode: usize| 10_f32.powi(6 - 4 * mode as i32);
+    // Four modes of 200 vertices, that is, 600 entries each. The scales are 1e6, 1e2, 1e-2 and 1e-6.
     let columns: Vec<f32> =
         (0..4).flat_map(|mode| (0..600).map(move |_| mode)).map(|mode| rng.next() * scale(mode)).collect();
     let shape = shape_with_columns(200, 4, columns, &mut rng);
@@ -157,8 +162,9 @@ fn f16_columns_of_very_different_scales_keep_their_precision() {
 #[test]
 fn denormal_zero_and_extreme_values_stay_within_the_bound() {
     let mut rng = TestRng(11);
-    // Mode 0 is denormal, mode 1 is zero in the first tile, mode 2 is zero everywhere. Mode 3 has one entry far below
-    // the rest, and all of its second tile is too small for f16.
+    // 200 vertices have 600 rows of U; a tile has 3 * 128 rows. Mode 0 is denormal, mode 1 is zero in the first tile,
+    // mode 2 is zero everywhere. In mode 3, the entry of row 5 is far below the other entries of the first tile, and
+    // all entries of the second tile underflow in f16.
     let entry = |mode: usize, row: usize, value: f32| match mode {
         0 => value * 1e-41,
         1 if row < 3 * 128 => 0.0,
@@ -181,9 +187,9 @@ fn denormal_zero_and_extreme_values_stay_within_the_bound() {
             let [correct, swapped] = error_ratios(&shape, storage, &input);
             assert!(correct <= 1.0, "{storage:?} {q:?}: expected at most the bound, got {correct} times it");
             // Without a term of mode 1, swapped axes may stay within the bound.
-            let may_hold = q[1] < 1e-40;
+            let swapped_may_hold = q[1] < 1e-40;
             assert!(
-                swapped > 1.0 || may_hold,
+                swapped > 1.0 || swapped_may_hold,
                 "{storage:?} {q:?}: expected more than the bound, got {swapped} times it"
             );
         }

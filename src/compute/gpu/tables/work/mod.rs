@@ -69,8 +69,7 @@ pub(crate) struct WorkList {
     pub corners_match: Vec<bool>,
     /// Number of leading tiles that `deform` computes in a full step. `batch` computes the other tiles.
     pub full_step_tiles: usize,
-    /// Length of the shortest prefix of these tiles that contains all of them with vertices. A shorter launch may omit
-    /// the tiles after the prefix, which have only corners.
+    /// Of these tiles, the number of tiles with vertices. They precede the tiles that have only corners.
     pub vertex_tiles: usize,
     pub batched: BatchTables,
     pub mixed_quads: Vec<MixedQuad>,
