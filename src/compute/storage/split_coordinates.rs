@@ -89,8 +89,8 @@ impl TensorCoreError {
     pub fn of(storage: StorageType, rank: usize) -> Self {
         let coordinate = f64::from(if storage == StorageType::F16 { -22_i8 } else { -16 }).exp2();
         let sum = 2.0 * rank.div_ceil(MMA_MODES) as f64 * TRUNCATIONS * TRUNCATION_ERROR;
-        // The last factor covers that the tensor core sums rounded coordinates and partial sums, whose magnitudes may be
-        // slightly larger than the exact ones.
+        // The last factor: the tensor core sums rounded coordinates and partial sums, whose magnitudes may be slightly
+        // larger than the exact ones.
         Self { coordinate, floor: f64::from(-25 - TOP_EXPONENT).exp2(), sum: sum * (1.0 + 2.0 * sum + 1e-4) }
     }
 

@@ -49,8 +49,8 @@ impl TiledModes {
     /// Rounds a shape's U to the storage type.
     ///
     /// Before the rounding, `F16` and `Bf16` divide each mode by a power of two (its factor), so that its largest entry
-    /// lies in [2^14, 2^15) or in [1, 2). `Int8` divides each mode of each tile by its scale, 1/127 of its largest entry
-    /// rounded up.
+    /// lies in [2^14, 2^15) or in [1, 2). `Int8` divides each mode of each tile by its scale, which is 1/127 of the
+    /// largest entry, rounded up.
     pub fn new(shape: &Shape, storage: StorageType) -> Self {
         let rest = shape.mesh.rest_positions();
         let rank = shape.modes.rank();

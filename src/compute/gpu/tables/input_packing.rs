@@ -5,7 +5,7 @@
 //! [header][transforms: 12 f32 per transform root][q, padded to whole chunks of modes][retained counts][retained chunks]
 //! ```
 //! A chunk is a few modes that are stored together. With modal truncation, a domain sums only its retained chunks;
-//! their numbers and indices are uploaded. Without truncation, these two parts are empty. The pinned memory is
+//! their numbers and indices are uploaded. Without truncation, the last two parts are empty. The pinned memory is
 //! write-combined: the host writes it from front to back and never reads it.
 
 use std::sync::Arc;

@@ -6,8 +6,8 @@ use crate::storage::TILE_QUADS;
 use modalcast_model::domain::Shape;
 use modalcast_model::scene::Scene;
 
-/// Indices of the quads of x0, normals and tangents. A shape matches if its corner i is its vertex i. Three kinds of
-/// quads follow each other:
+/// Indices of the quads of x0, normals and tangents. A shape matches if one tile computes its vertex i and its corner
+/// i ([`WorkList::corners_match`]). Three kinds of quads follow each other:
 /// 1. x0 of shapes that do not match,
 /// 2. x0, normals and tangents of shapes that match,
 /// 3. normals and tangents of shapes that do not match.
@@ -26,7 +26,7 @@ pub(crate) struct QuadLayout {
 }
 
 impl QuadLayout {
-    /// `corners_match`: per shape, whether the shape matches and one tile computes its vertices and corners.
+    /// `corners_match`: per shape, whether the shape matches.
     pub(crate) fn new(scene: &Scene, corners_match: &[bool]) -> Self {
         let has_rigid_normals = has_rigid_normals(scene);
         let shapes = || scene.shapes.iter().zip(corners_match);
