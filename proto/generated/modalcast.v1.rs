@@ -19,13 +19,14 @@ pub struct SceneInfo {
     /// The name that all other calls use.
     #[prost(string, tag = "1")]
     pub scene: ::prost::alloc::string::String,
-    /// The source that was opened, or "uploaded" with the entry path, if any.
+    /// The source that was opened. For an uploaded scene: "uploaded: " and the entry path, or "uploaded" without entry.
     #[prost(string, tag = "2")]
     pub source: ::prost::alloc::string::String,
     #[prost(uint32, tag = "3")]
     pub domains: u32,
     #[prost(uint64, tag = "4")]
     pub vertices: u64,
+    /// Number of corners: vertices with a normal and texture coordinates, as defined at Array.
     #[prost(uint64, tag = "5")]
     pub corners: u64,
     #[prost(uint64, tag = "6")]
@@ -191,7 +192,7 @@ pub struct DomainDescription {
     /// parent_from_child at rest: 12 little-endian f32, row-major 3x4; empty without parent.
     #[prost(bytes = "bytes", tag = "8")]
     pub attachment_frame: ::prost::bytes::Bytes,
-    /// Vertices of the parent that determine the attachment frame when the parent is deformed.
+    /// Vertices of the parent near the joint. A client fits the motion of the attachment frame to their displacements.
     #[prost(uint32, repeated, tag = "9")]
     pub attachment_rows: ::prost::alloc::vec::Vec<u32>,
     /// world_from_domain at rest: 12 little-endian f32, row-major 3x4.
@@ -212,12 +213,12 @@ pub struct DomainDescription {
         ::prost::alloc::string::String,
         ::prost::alloc::string::String,
     >,
-    /// A domain with a smaller index that this domain follows. In every step its world_from_domain is that of the other
-    /// domain times `follow_frame`, computed in f32. A step must not send a transform for it, but may send its
-    /// coordinates.
+    /// A domain with a smaller index that this domain follows: in every step, the world_from_domain of this domain is the
+    /// world_from_domain of the followed domain times `follow_frame`, computed in f32. A step must not contain a transform
+    /// for this domain, but may contain its coordinates.
     #[prost(uint32, optional, tag = "15")]
     pub follows: ::core::option::Option<u32>,
-    /// parent_from_child: 12 little-endian f32, row-major 3x4; empty if `follows` is unset.
+    /// followed_from_follower: 12 little-endian f32, row-major 3x4; empty if `follows` is unset.
     #[prost(bytes = "bytes", tag = "16")]
     pub follow_frame: ::prost::bytes::Bytes,
 }
@@ -423,7 +424,7 @@ pub mod scene_service_client {
         }
         /// Uploads files and opens them as a scene. The parts are one `header`, then for each file one `file` and its
         /// `chunk`s. Waiting for the client consumes a time budget of 30 s. Every 32 KiB that the client sends adds 1 s to the
-        /// budget, up to 30 s. The call fails with DEADLINE_EXCEEDED when the budget is used up.
+        /// budget, which never exceeds 30 s. The call fails with DEADLINE_EXCEEDED when the budget is used up.
         pub async fn upload_scene(
             &mut self,
             request: impl tonic::IntoStreamingRequest<
@@ -574,7 +575,7 @@ pub mod scene_service_server {
         >;
         /// Uploads files and opens them as a scene. The parts are one `header`, then for each file one `file` and its
         /// `chunk`s. Waiting for the client consumes a time budget of 30 s. Every 32 KiB that the client sends adds 1 s to the
-        /// budget, up to 30 s. The call fails with DEADLINE_EXCEEDED when the budget is used up.
+        /// budget, which never exceeds 30 s. The call fails with DEADLINE_EXCEEDED when the budget is used up.
         async fn upload_scene(
             &self,
             request: tonic::Request<tonic::Streaming<super::UploadSceneRequest>>,
@@ -1075,7 +1076,11 @@ pub struct Rejection {
     #[prost(string, tag = "4")]
     pub given: ::prost::alloc::string::String,
 }
-/// Duration of one stage of the work. Stages: parse, queue, deform, upload, shadow, draw, read, encode, copy.
+/// Duration of one stage of the work. The stages:
+///
+/// * parse: validation of the step; queue: its wait in the step queue; deform: computation of the vertices
+/// * upload: vertices to OpenGL; shadow: shadow map; draw: all other passes; read: readback of pixels
+/// * encode: PNG encoding or packing of vertices; copy: readback of vertices
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct StageTime {
     #[prost(string, tag = "1")]
@@ -1422,7 +1427,7 @@ pub struct Step {
     /// Domains whose coordinates are in `q`, each once. If empty and `q` is not empty: all domains in order.
     #[prost(uint32, repeated, tag = "3")]
     pub q_domains: ::prost::alloc::vec::Vec<u32>,
-    /// r finite little-endian f32 per domain, concatenated.
+    /// r finite little-endian f32 per domain, concatenated; r is DomainDescription.rank.
     #[prost(bytes = "bytes", tag = "4")]
     pub q: ::prost::bytes::Bytes,
     /// Domains whose transforms are in `transforms`, each once. If empty and `transforms` is not empty: all domains in
@@ -1482,12 +1487,13 @@ pub struct Acknowledgement {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
 #[repr(i32)]
 pub enum Policy {
-    /// POLICY_LOSSLESS.
+    /// Means POLICY_LOSSLESS.
     Unspecified = 0,
-    /// Every step is deformed, in order, and delivered to each lossless subscriber. A step beyond the window is rejected.
+    /// Every step is deformed, in order, and delivered to each lossless subscriber. A step that exceeds the window is
+    /// rejected.
     Lossless = 1,
-    /// Steps that arrive while another one is computed are merged and counted as skipped. The merged step has the same
-    /// effect as applying all of them in order.
+    /// Steps that arrive while an earlier step is computed are merged into the newest one. All but the newest are counted
+    /// as skipped. The merged step has the same effect as applying all of them in order.
     Latest = 2,
 }
 impl Policy {
@@ -1520,7 +1526,7 @@ impl Policy {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
 #[repr(i32)]
 pub enum TransformFormat {
-    /// TRANSFORM_FORMAT_AFFINE_F32.
+    /// Means TRANSFORM_FORMAT_AFFINE_F32.
     Unspecified = 0,
     /// 48 bytes: 12 f32, row-major 3x4. The translation is relative to the scene's origin (SceneInfo.origin).
     AffineF32 = 1,
@@ -1528,8 +1534,8 @@ pub enum TransformFormat {
     RigidF32 = 2,
     /// 40 bytes: a quaternion, then the translation as 3 f64, in scene units from the WORLD's origin: the client does not
     /// subtract the scene's origin. The server computes translation - SceneInfo.origin / SceneInfo.unit in f64 and rounds
-    /// to f32 once, relative to an origin near the domain, so that millimeters are resolved at 10^7 m. Both the
-    /// translation and the difference must be at most 2^40 units in magnitude on each axis.
+    /// to f32 once, relative to an origin near the domain, so that millimeters are resolved at 10^7 m. The translation and
+    /// its difference from the scene's origin must both be at most 2^40 units in magnitude on each axis.
     RigidF64 = 3,
 }
 impl TransformFormat {
@@ -1869,7 +1875,7 @@ pub mod step_service_server {
         const NAME: &'static str = SERVICE_NAME;
     }
 }
-/// Size, camera, output and encoding of a frame.
+/// What a frame shows, and its encoding.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct Picture {
     /// Size in pixels: 1 to Limits.frame_side on each side; 0 x 0 means 1280 x 720.
@@ -1889,14 +1895,15 @@ pub struct Picture {
     pub mode: u32,
     /// The value at the bright end of a color map, 1e-30 to 1e30 meters (OUTPUT_DISPLACEMENT) or meters per unit of q
     /// (OUTPUT_MODE_SHAPE). 0 fits the scale to each frame: it ends at the largest value, rounded up to 1, 2, 2.5 or 5
-    /// times a power of ten. For displacements it ends at 1e-5 of the scene's diagonal or above. Set a value in a stream,
-    /// because a fitted scale changes from frame to frame. Must be 0 for outputs that are not color maps.
+    /// times a power of ten. A fitted scale of displacements ends at 1e-5 of the diagonal of the scene's rest bounds or
+    /// above. Set a value in a stream, because a fitted scale changes from frame to frame. Must be 0 for outputs that are
+    /// not color maps.
     #[prost(double, tag = "7")]
     pub largest: f64,
 }
 /// An unset view or lens is taken from the camera that frames the scene's rest bounds. Positions are in scene units
-/// relative to the scene's origin (SceneInfo.origin). The server keeps them in f64 and converts to f32 only relative to
-/// the origin of the drawn vertices.
+/// relative to the scene's origin (SceneInfo.origin). The server keeps the camera in f64 and subtracts the origin of the
+/// drawn vertices (VertexHead.origin) before it rounds to f32.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct Camera {
     /// Near and far plane, distances in scene units with 0 \< near \< far; both 0 fits them to the scene.
@@ -1965,13 +1972,13 @@ pub struct RenderFrameRequest {
     /// grpc-timeout, the shorter one applies.
     #[prost(uint32, tag = "5")]
     pub deadline_ms: u32,
-    /// The step to render. Unset: the current one, or the rest state before the first step.
+    /// The step to render. Unset: the current step, or the rest state before the first step. For runs, see StepId.
     #[prost(oneof = "render_frame_request::Step", tags = "3, 4")]
     pub step: ::core::option::Option<render_frame_request::Step>,
 }
 /// Nested message and enum types in `RenderFrameRequest`.
 pub mod render_frame_request {
-    /// The step to render. Unset: the current one, or the rest state before the first step.
+    /// The step to render. Unset: the current step, or the rest state before the first step. For runs, see StepId.
     #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Oneof)]
     pub enum Step {
         /// Waits for exactly this step of the current run; FAILED_PRECONDITION if the scene has already passed it.
@@ -2034,8 +2041,8 @@ pub struct FrameHead {
     pub skipped: u64,
     #[prost(message, repeated, tag = "7")]
     pub stages: ::prost::alloc::vec::Vec<StageTime>,
-    /// For color frames: the rasterizer of the shadow map, and the rasterizer of the visible surfaces. The former is
-    /// unspecified if the frame reuses the shadow map of another frame of its step.
+    /// For color frames: the rasterizer of the shadow map, and the rasterizer of the visible surfaces. `shadow_drawn_by`
+    /// is unspecified if the frame reuses the shadow map of another frame of its step.
     #[prost(enumeration = "DrawnBy", tag = "8")]
     pub shadow_drawn_by: i32,
     #[prost(enumeration = "DrawnBy", tag = "9")]
@@ -2149,9 +2156,9 @@ pub struct Hit {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
 #[repr(i32)]
 pub enum Output {
-    /// OUTPUT_COLOUR.
+    /// Means OUTPUT_COLOUR.
     Unspecified = 0,
-    /// Shaded color, as the scene's look defines it.
+    /// Shaded color: lights, shadows, ground and post-processing as in the table `look` of the scene's scene.toml.
     Colour = 1,
     /// FORMAT_F32: distance along the view axis (not along the ray) in meters, relative error at most 1e-4; infinity where
     /// there is no surface.
@@ -2161,8 +2168,8 @@ pub enum Output {
     /// FORMAT_F32X3: the interpolated unit normal in world axes, facing the camera, without normal maps; zeros where there
     /// is no surface.
     Normals = 4,
-    /// A color map (viridis) with a legend of |u| in meters: the distance of each point from T x0, its position if the
-    /// domain is rigid. The error is that of the drawn vertices plus rounding to 1/65535 of the scale. Surfaces that are
+    /// A color map (viridis) of |u| in meters with a legend: the distance of each point from T x0, its position without
+    /// deformation. The error is the error of the drawn vertices plus rounding to 1/65535 of the scale. Surfaces that are
     /// inclined to the view direction are darker.
     Displacement = 5,
     /// A color map of one column of U: the norm of its three entries at each point, in meters per unit of q.
@@ -2203,7 +2210,7 @@ impl Output {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
 #[repr(i32)]
 pub enum Format {
-    /// FORMAT_PNG for color and color maps, else the format of the output.
+    /// Means FORMAT_PNG for color and color maps, else the only format of the output.
     Unspecified = 0,
     /// 8-bit sRGB PNG, without alpha if every pixel is opaque.
     Png = 1,
@@ -2248,7 +2255,7 @@ impl Format {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
 #[repr(i32)]
 pub enum Delivery {
-    /// DELIVERY_LATEST.
+    /// Means DELIVERY_LATEST.
     Unspecified = 0,
     /// Every step from the next one on, in order. A slow subscriber blocks the writer of a lossless step stream
     /// (back-pressure) and is disconnected if it blocks the writer for 30 s. Under a POLICY_LATEST writer a slow
@@ -2428,8 +2435,9 @@ pub mod frame_service_client {
                 .insert(GrpcMethod::new("modalcast.v1.FrameService", "RenderFrame"));
             self.inner.server_streaming(req, path, codec).await
         }
-        /// Renders a frame per step. Each frame is sent in chunks of at most 1 MiB. The first chunk of a frame has its head.
-        /// The subscription is active when the response headers arrive, so the next step is delivered.
+        /// Renders a frame for each step that `delivery` selects. Each frame is sent in chunks of at most 1 MiB. The first
+        /// chunk of a frame has its head. The subscription is active when the response headers arrive, so the next step is
+        /// delivered.
         pub async fn stream_frames(
             &mut self,
             request: impl tonic::IntoRequest<super::StreamFramesRequest>,
@@ -2516,8 +2524,9 @@ pub mod frame_service_server {
             >
             + std::marker::Send
             + 'static;
-        /// Renders a frame per step. Each frame is sent in chunks of at most 1 MiB. The first chunk of a frame has its head.
-        /// The subscription is active when the response headers arrive, so the next step is delivered.
+        /// Renders a frame for each step that `delivery` selects. Each frame is sent in chunks of at most 1 MiB. The first
+        /// chunk of a frame has its head. The subscription is active when the response headers arrive, so the next step is
+        /// delivered.
         async fn stream_frames(
             &self,
             request: tonic::Request<super::StreamFramesRequest>,
@@ -2812,7 +2821,7 @@ pub struct VertexSelection {
     #[prost(bool, tag = "4")]
     pub boxes: bool,
     /// Omit positions and normals; at least one of `displacements` and `boxes` must be set. The server then copies only
-    /// these from its device.
+    /// the displacements or boxes from its device.
     #[prost(bool, tag = "5")]
     pub without_vertices: bool,
 }
@@ -2825,13 +2834,13 @@ pub struct GetVerticesRequest {
     /// As in RenderFrameRequest.
     #[prost(uint32, tag = "5")]
     pub deadline_ms: u32,
-    /// The step to return. Unset: the current one, or the rest state before the first step.
+    /// The step to return. Unset: the current step, or the rest state before the first step. For runs, see StepId.
     #[prost(oneof = "get_vertices_request::Step", tags = "3, 4")]
     pub step: ::core::option::Option<get_vertices_request::Step>,
 }
 /// Nested message and enum types in `GetVerticesRequest`.
 pub mod get_vertices_request {
-    /// The step to return. Unset: the current one, or the rest state before the first step.
+    /// The step to return. Unset: the current step, or the rest state before the first step. For runs, see StepId.
     #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Oneof)]
     pub enum Step {
         /// Waits for exactly this step of the current run; FAILED_PRECONDITION if the scene has already passed it.
@@ -2876,16 +2885,17 @@ pub struct VertexChunk {
     pub data: ::prost::bytes::Bytes,
 }
 /// Head of the reply for one step. The bytes of the reply are the requested parts in this order, each for all selected
-/// domains:
+/// domains. A corner is a vertex with its normal and texture coordinates (see Array).
 ///
 /// * positions: 3 little-endian f32 per vertex, in row order of U, scene units. The world position of a vertex in meters
 ///   is origin + SceneInfo.unit * position.
 /// * normals: 3 little-endian f32 per corner, in world axes.
 /// * displacements: u = U q, 3 little-endian f32 per vertex, in row order of U, in scene units and in the domain's own
 ///   frame. The position of a vertex is T (x0 + u).
-/// * boxes: 6 little-endian f32 per selected domain, the minimum x, y, z of its positions, then the maximum, relative to
+/// * boxes: 6 little-endian f32 per selected domain: the minimum x, y, z of its positions, then the maximum, relative to
 ///   the same origin as the positions.
-/// * origins: 3 little-endian f64 per selected domain, meters; present if `origin_bytes` is not 0.
+/// * origins: 3 little-endian f64 per selected domain, the origin of its positions in meters; present if `origin_bytes`
+///   is not 0.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct VertexHead {
     #[prost(message, optional, tag = "1")]
@@ -3038,8 +3048,8 @@ pub mod vertex_service_client {
                 .insert(GrpcMethod::new("modalcast.v1.VertexService", "GetVertices"));
             self.inner.server_streaming(req, path, codec).await
         }
-        /// Returns the vertices of every step, each in chunks of at most 1 MiB. The subscription is active when the response
-        /// headers arrive, so the next step is delivered.
+        /// Returns the vertices of each step that `delivery` selects, in chunks of at most 1 MiB. The subscription is active
+        /// when the response headers arrive, so the next step is delivered.
         pub async fn stream_vertices(
             &mut self,
             request: impl tonic::IntoRequest<super::StreamVerticesRequest>,
@@ -3099,8 +3109,8 @@ pub mod vertex_service_server {
             >
             + std::marker::Send
             + 'static;
-        /// Returns the vertices of every step, each in chunks of at most 1 MiB. The subscription is active when the response
-        /// headers arrive, so the next step is delivered.
+        /// Returns the vertices of each step that `delivery` selects, in chunks of at most 1 MiB. The subscription is active
+        /// when the response headers arrive, so the next step is delivered.
         async fn stream_vertices(
             &self,
             request: tonic::Request<super::StreamVerticesRequest>,
