@@ -75,6 +75,7 @@ def main(out, folders):
         difference = np.abs(our_image.astype(int) - peer_image).max(axis=2)
         amplified = np.repeat(np.clip(4 * difference, 0, 255).astype(np.uint8)[..., None], 3, axis=2)
         write_png(out / f"{name}-beside.png", np.concatenate([our_image, peer_image, amplified], axis=1))
+        # "whole" is the time of a frame with its pixels in host memory.
         our_times = [our_round["scenes"][index]["whole"] for our_round, _ in rounds]
         peer_times = [peer_round["scenes"][name]["whole"] for _, peer_round in rounds]
         ratios = [peer_time["median_us"] / our_time["median_us"] for our_time, peer_time in zip(our_times, peer_times)]

@@ -62,6 +62,7 @@ pub(super) fn kernel_variants(
         let suffix = match outputs {
             StepOutputs::Uq => UQ_SUFFIX,
             StepOutputs::Positions => " positions",
+            // Positions, normals and tangents.
             StepOutputs::Whole => "",
         };
         let name = format!("cuda {}{suffix}", storage.name());
@@ -339,6 +340,7 @@ impl Variant for BenchmarkVariant {
         self.error_model.reset_truncation();
         self.error_model.update_truncation(state);
         let benchmark = self.benchmark()?;
+        // A step that changes few domains computes only these. The other domains must also be at this state.
         benchmark.compute_skipped_domains(&self.device, state_index)?;
         benchmark.launch(&self.device, state_index)?;
         self.surface.positions = benchmark.positions(&self.device)?;

@@ -273,7 +273,7 @@ mod tests {
     }
 
     #[test]
-    fn default_deformation_replaces_nothing() {
+    fn default_deformation_approximates_nothing() {
         let (exact, state) = model_and_state(DeformationSettings::default());
         assert!(exact.is_exact() && exact.tiles(0).is_none());
         let mut bounds = [1.0, 2.0];

@@ -231,8 +231,8 @@ mod tests {
         // on three axes have a length of at most sqrt(3) < 1.74 times each of them.
         assert!(sources.storage.largest > 1e-3 && sources.storage.largest < 0.5 / 127.0 * 1.5 * 1.74, "{sources:?}");
         assert_eq!([sources.accumulation, sources.truncation], [ErrorNorms::default(); 2]);
-        // Modes are truncated while their total displacement is below half of the budget: 1.75 / 2 = 0.875. Mode 0
-        // moves vertices by up to sqrt(3) = 1.73, mode 1 by up to 0.5 sqrt(3) = 0.866. Only mode 1 is truncated.
+        // The truncated modes together may displace a vertex by half of the budget, 1.75 / 2 = 0.875. Mode 0 moves
+        // vertices by up to sqrt(3) = 1.73, mode 1 by up to 0.5 sqrt(3) = 0.866. Only mode 1 is truncated.
         let sources =
             measure(DeformationSettings { truncation: Some(1.75), ..default() }, &representable_truth(), None);
         assert!(sources.truncation.largest > 0.5 && sources.truncation.largest <= 0.87, "{sources:?}");

@@ -129,6 +129,7 @@ pub struct WorkloadSummary {
     pub is_full_size: bool,
     pub remarks: Vec<String>,
     pub vertices: usize,
+    /// Render vertices: each refers to one of `vertices` and has a normal.
     pub corners: usize,
     pub triangles: usize,
     pub domains: usize,

@@ -163,8 +163,9 @@ impl<'a> StateSample<'a> {
     }
 }
 
-/// Maximum number of vertices plus corners of a group of states. A vertex takes 40 bytes and a corner up to 112, so a
-/// group takes at most 1.9 GB.
+/// Maximum number of vertices plus corners of a group of states. A vertex takes 40 bytes, the size of its reference. A
+/// corner takes up to 112 bytes: rigid and exact normals of 24 bytes, rigid and exact tangents of 32 bytes. A group
+/// takes at most 2^24 x 112 bytes = 1.9 GB.
 const MAX_GROUP_ITEMS: usize = 1 << 24;
 
 /// Validates the variants at `seeds` random states and at no more than `steps` states of the trajectory, at every

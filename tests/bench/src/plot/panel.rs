@@ -208,7 +208,7 @@ impl<'a> Panel<'a> {
     /// Finds free space for a label of this width near a point: to its right or left, else above or below it.
     fn find_label_area(&self, (x, y): (f64, f64), width: f64, occupied: &[Rectangle]) -> Option<Rectangle> {
         let height = LABEL_SIZE + 3.0;
-        // Top left corners to try, in this order.
+        // Top left corners to try, in this order. The distances are SVG units, chosen by eye.
         let side_corners = [(x + 12.0, y - height / 2.0), (x - 12.0 - width, y - height / 2.0)];
         let vertical_corners = [14.0, 28.0, 42.0].into_iter().flat_map(|distance| {
             let tops = [y - distance - height / 2.0 - 4.0, y + distance - height / 2.0 + 4.0];

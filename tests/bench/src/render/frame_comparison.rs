@@ -41,12 +41,12 @@ pub struct FrameComparison {
     /// Color differences from OpenGL's image, 0 to 255.
     #[serde(rename = "colours")]
     pub color_errors: ErrorDistribution,
-    /// Times of OpenGL with automatic culling; "frame" is the sum without readback.
+    /// Times per pass of OpenGL with automatic culling; "frame" is the sum without readback.
     pub opengl: Vec<PassTime>,
-    /// Culling counts of OpenGL's last timed frame, where triangles are culled.
+    /// Culling counts of OpenGL's last timed frame; `None` if culling is off.
     #[serde(rename = "culled")]
     pub cull_stats: Option<FrameCullStats>,
-    /// Times with CUDA; `None` where too many ids differ.
+    /// Times per pass with CUDA; `None` if too many ids differ.
     pub cuda: Option<Vec<PassTime>>,
 }
 
@@ -211,8 +211,8 @@ pub(super) fn markdown(comparisons: &[FrameComparison]) -> String {
     let mut text = format!(
         "\n## Whole frames\n\nOne sample per pixel with FXAA, by OpenGL with automatic culling and by the CUDA \
          rasterizer where it supports the pass, in the same run. Times of passes: OpenGL / CUDA, us. \"shadow\" \
-         includes \"raster shadow\" (by CUDA only) and \"blur\". A frame is not timed with CUDA if more than {} % of \
-         its ids differ.\n\n",
+         includes \"raster shadow\" (by CUDA only) and \"blur\"; \"encode\" converts linear colors to sRGB bytes. A \
+         frame is not timed with CUDA if more than {} % of its ids differ.\n\n",
         100.0 * MAX_DIFFERING_FRACTION
     );
     let row = |frame: &FrameComparison| {

@@ -51,8 +51,8 @@ pub(super) fn meter_scene(scene: &Scene) -> Result<Arc<Scene>> {
     Scene::new(parts)
 }
 
-/// Sun visibility per pixel from frames of [`meter_scene`] with and without shadows, both RGBA. At [`MIN_SUNLIGHT`] the
-/// resolution of 8-bit sRGB is 1 %; brighter pixels have a better resolution.
+/// Sun visibility per pixel from frames of [`meter_scene`] with and without shadows, both RGBA. At [`MIN_SUNLIGHT`],
+/// rounding to 8-bit sRGB changes the sunlight by up to 1.2 %; for brighter pixels, by less.
 pub(super) fn read_sun_visibility(shadowed: &[u8], unshadowed: &[u8]) -> Vec<Option<f32>> {
     // The frames are gray, so one channel is enough.
     let sunlight = |pixel: &[u8]| linear_from_srgb(f64::from(pixel[1]) / 255.0);

@@ -37,8 +37,9 @@ const EXPLANATION: &str = "Color errors are the largest difference of the three 
 columns compare with hard shadow rays, `intended colour` with the intended result of the variant: no shadow, a hard \
 shadow, or the hard shadow filtered by the blur's footprint. `intended light`, `penumbra` and `bleeding` compare the \
 sun visibility with the intended result; `bleeding` is the mean sun visibility in the umbra. `flicker` is the change \
-of the color error from step to step. `frame` is the time of all passes except the readback. Culling passes the \
-`listed` triangles to the rasterizer; `hidden` triangles are occluded by the depth of the last frame.\n";
+of the color error from step to step. `frame` is the time of all passes except the readback. `encode` converts linear \
+colors to sRGB bytes. Culling passes the `listed` triangles to the rasterizer; `hidden` triangles are occluded by the \
+triangles that were visible in the last frame.\n";
 
 const HEADER: [&str; 25] = [
     "variant",

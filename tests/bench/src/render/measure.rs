@@ -84,7 +84,7 @@ pub struct RenderRow {
     pub samples: u32,
     /// Number of draw calls of the visibility and blended passes.
     pub draws: usize,
-    /// Culling counts of the last timed frame, where triangles are culled.
+    /// Culling counts of the last timed frame; `None` if culling is off.
     #[serde(rename = "culled")]
     pub cull_stats: Option<FrameCullStats>,
 }
@@ -329,7 +329,8 @@ impl WorkloadContext<'_> {
     }
 
     /// Times the passes of the scene stripped to its mesh, and the frames that the passes are compared with. The shadow
-    /// map has the size of the largest map among the timed rows with default shadow settings except for the size.
+    /// map is as large as the largest map of the timed rows. Rows count only if all their shadow settings except for
+    /// the size are the defaults.
     fn time_minimal_passes(&self, harness: &mut RenderHarness, rows: &[RenderRow]) -> Result<Option<MinimalPasses>> {
         let timed_default_shadow = |row: &RenderRow| {
             let is_default =

@@ -5,7 +5,7 @@
 use serde::Serialize;
 
 /// A reference pixel is in the penumbra when its sun visibility is between this value and 1 minus this value. A single
-/// sample of 64 changes the sun visibility by less than this value.
+/// one of 64 samples changes the sun visibility by less, 1/64 = 0.016.
 const MIN_PENUMBRA_VISIBILITY: f32 = 0.02;
 /// A reference pixel is in the umbra when its sun visibility is at most this value, which allows for rounding. It is
 /// outside of shadows when its sun visibility is at least 1 minus this value.

@@ -16,7 +16,8 @@
 //! the corrected repetition is 3.93 of 255, and the error of size classes is 4.24 (software rendering at 640 x 360).
 //! The workload has seven image sizes. The renderer has six arrays, because the two smallest images, 16 x 16 and
 //! 25 x 15, share an array of 25 x 16 and are stretched to this size. On the panels of these two images, where a texel
-//! covers several pixels, the error of size classes is larger by up to 7. On the floor, it is smaller by up to 0.5.
+//! covers several pixels, the error of size classes is larger than that of the corrected repetition, by up to 7 of 255.
+//! On the floor, the error of size classes is smaller, by up to 0.5 of 255.
 
 use std::sync::Arc;
 

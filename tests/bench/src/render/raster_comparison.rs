@@ -327,7 +327,7 @@ mod tests {
             loaded_scene.surface().expect("a surface").positions.clone(),
         );
         let triangles = setup.scene.triangle_vertices();
-        // Row-major.
+        // A row-major matrix of 4 x 4.
         let clip_from_world = viewport.clip_from_positions();
         let clip_coordinate = |row: usize, point: [f32; 3]| {
             (0..3).map(|axis| clip_from_world[4 * row + axis] * point[axis]).sum::<f32>() + clip_from_world[4 * row + 3]
@@ -340,9 +340,10 @@ mod tests {
             let [x, y] =
                 [0, 1].map(|axis| corners.map(|point| clip_coordinate(axis, point) / clip_coordinate(3, point)));
             let sample = [(pixel % 160) as f32 + 0.5, (pixel / 160) as f32 + 0.5];
-            let contains_sample = |corners: [f32; 3], center: f32, tolerance: f32| {
-                corners.iter().any(|corner| *corner <= center + tolerance)
-                    && corners.iter().any(|corner| *corner >= center - tolerance)
+            // Compares along one axis, in normalized device coordinates.
+            let contains_sample = |corners: [f32; 3], coordinate: f32, tolerance: f32| {
+                corners.iter().any(|corner| *corner <= coordinate + tolerance)
+                    && corners.iter().any(|corner| *corner >= coordinate - tolerance)
             };
             // The frame of 160 x 90 pixels extends from -1 to 1; the tolerance is half a pixel.
             let is_inside = contains_sample(x, sample[0] / 80.0 - 1.0, 1.0 / 160.0)

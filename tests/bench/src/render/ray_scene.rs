@@ -251,7 +251,7 @@ impl RayScene {
     /// Whether a shadow caster other than triangle `receiver` intersects the ray beyond `min_t`.
     pub(super) fn is_occluded(&self, ray: &Ray, min_t: f64, receiver: Option<usize>) -> bool {
         let (box_ray, _) = self.box_ray(ray, min_t, f64::MAX);
-        // Casters at any distance count.
+        // Casters at any distance count. `box_ray` has rounded f64::MAX to infinity; the BVH gets a finite limit.
         let box_ray = BoxRay { tmax: f32::MAX, ..box_ray };
         let occludes = |index: usize| {
             let hit = self.triangles[index].intersect(index, ray).filter(|hit| hit.t > min_t);

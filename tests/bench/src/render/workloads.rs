@@ -108,6 +108,7 @@ impl RenderWorkload {
     /// # Errors
     /// Errors of [`Scene::new`] and of generating the tree.
     pub(super) fn build(self) -> Result<AnimatedScene> {
+        // Sliding domains: the square, the red pane, the first panel, the poles of the field.
         let (scene, sliding_domain) = match self {
             Self::Square => (Scene::new(build_square()?)?, Some(1)),
             Self::Shelf => (Scene::new(build_shelf()?)?, None),

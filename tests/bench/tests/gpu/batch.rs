@@ -17,8 +17,9 @@ use crate::accuracy::have_equal_bits;
 use crate::ensembles::{build_scene, instanced_parts, random_states, with_storage};
 use crate::scenes;
 
-/// Largest ratio of a vertex's error to the error bound of its tile (of stored U; a quad is four vertices). The bound
-/// covers the rounding of U to 16 bits, of q to pairs of 16-bit numbers, and of the tensor cores' sums.
+/// Largest ratio of a vertex's error to the error bound of its tile. A tile of stored U has [`TILE_QUADS`] quads, and a
+/// quad is four consecutive vertices. The bound covers the rounding of U to 16 bits, of q to pairs of 16-bit numbers,
+/// and of the tensor cores' sums.
 fn max_error_over_bound(scene: &Scene, state: &SceneState, positions: &[f32]) -> f64 {
     let (shape, storage) = (scene.shape_of(0), scene.deformation.storage);
     let tiles = TiledModes::new(shape, storage);

@@ -91,7 +91,8 @@ fn check_benchmark(device: &Device, scene: &Arc<Scene>, states: &[SceneState], b
         );
         eprintln!("{name} input set {input_set}: {error:.2e} of the diagonal");
     }
-    // The replays rotate through the input sets, so the last replay runs the last input set.
+    // The replays rotate through the input sets. Their number is a multiple of the number of input sets, so the last
+    // replay runs the last input set.
     for cache in [CacheState::Warm, CacheState::Cold] {
         benchmark.launch(device, 0).expect("expected a launch");
         let timing =

@@ -23,6 +23,7 @@ fn launch_raster(device: &Device, soup: &Soup, variant: RasterVariant) -> Raster
 /// triangles that it draws.
 fn count_expected_triangles(soup: &Soup) -> ([u32; 5], u32) {
     let (mut counts_by_reason, mut drawn) = ([0; 5], 0);
+    // A group is a range of triangles with one cull mode.
     for group in &soup.groups {
         for triangle in &soup.triangles[group.first_triangle as usize..][..group.triangle_count as usize] {
             match clipped_polygon(&soup.viewport, &soup.positions, *triangle, group.cull_mode) {
@@ -47,6 +48,7 @@ fn gpu_samples_match_definition_at_every_granularity() {
         for granularity in [RasterGranularity::BySize, RasterGranularity::Warps, RasterGranularity::Tiles] {
             for count_triangles in [false, true] {
                 let variant = RasterVariant { granularity, count_triangles, ..RasterVariant::default() };
+                // The key of a sample holds its depth (upper 32 bits) and its triangle (lower 32 bits).
                 let keys = launch_raster(&device, &soup, variant).keys(&device).expect("expected the id keys");
                 let differing = keys.iter().zip(&definition.keys).filter(|(key, expected)| key != expected).count();
                 assert_eq!(differing, 0, "{} with {variant:?}: expected {} equal samples", soup.name, keys.len());

@@ -29,6 +29,7 @@ fn launch_raster(device: &Device, cut_out_soup: &CutOutSoup, variant: RasterVari
     raster
 }
 
+/// The key of each sample: depth in the upper and triangle in the lower 32 bits, or `u64::MAX` without a triangle.
 fn read_keys(device: &Device, cut_out_soup: &CutOutSoup, granularity: RasterGranularity) -> Vec<u64> {
     let variant = RasterVariant { granularity, ..RasterVariant::default() };
     launch_raster(device, cut_out_soup, variant).keys(device).expect("expected the id keys")
@@ -43,6 +44,7 @@ fn read_depth_bits(device: &Device, cut_out_soup: &CutOutSoup) -> Vec<u32> {
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_uniform_images_match_the_definition_bitwise() {
     let device = Device::open(0).expect("expected a CUDA device");
+    // Each image has one alpha value, so texture filtering has no effect.
     for cut_out_soup in uniform_cut_out_soups() {
         let definition = cut_out_soup.rasterize();
         for granularity in GRANULARITIES {
@@ -70,6 +72,7 @@ fn gpu_uniform_images_match_the_definition_bitwise() {
 fn gpu_sheet_covers_opaque_texels_of_its_mip_level() {
     let device = Device::open(0).expect("expected a CUDA device");
     let mut random = Random(3);
+    // Texels of all levels are independent. About half are transparent, because numbers are uniform in -1 to 1.
     let image = alpha_image(64, 64, |_, _, _| if random.next_number() < 0.0 { 0 } else { 255 });
     for level in [0, 1] {
         for granularity in GRANULARITIES {
@@ -151,7 +154,7 @@ fn gpu_anisotropic_filtering_keeps_more_of_far_stripes() {
     });
     let count_floor_samples = |cut_out_soup: &CutOutSoup| {
         let keys = read_keys(&device, cut_out_soup, RasterGranularity::BySize);
-        // The low 32 bits are the triangle; the floor follows the two triangles of the wall.
+        // The floor follows the two triangles of the wall.
         keys.iter().filter(|key| **key != u64::MAX && **key as u32 >= 2).count()
     };
     let isotropic_samples = count_floor_samples(&cut_out_soup);
