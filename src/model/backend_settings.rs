@@ -1,6 +1,6 @@
 //! Settings of the backends: which implementation computes a scene, and how. They are not part of a
-//! [`Scene`](crate::scene::Scene), because they change run time and memory. They change vertices and images only by
-//! rounding, which includes the coverage of samples next to an edge.
+//! [`Scene`](crate::scene::Scene), because they do not define its result: they change run time and memory, but vertices
+//! and images only by rounding. Rounding can decide whether a triangle covers a sample next to its edge.
 
 use crate::scene::{DeformationSettings, RenderSettings};
 
@@ -40,7 +40,8 @@ pub enum BatchPolicy {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct BackendSettings {
     pub raster: RasterPolicy,
-    /// Batching in the CUDA deformer. Ignored with truncation, compensated sums or stored displacements.
+    /// Batching in the CUDA deformer. Ignored with truncation, compensated sums or stored displacements
+    /// ([`DeformationSettings`]).
     pub batches: BatchPolicy,
 }
 

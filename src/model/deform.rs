@@ -98,7 +98,8 @@ impl std::fmt::Debug for VertexReadback {
 }
 
 impl VertexReadback {
-    /// A readback in flight. The deformer identifies it by [`Self::writes_to`].
+    /// A readback in flight, which the device writes to `surface`. The deformer that started it recognizes it by
+    /// [`Self::writes_to`].
     pub const fn pending(surface: Arc<DeformedSurface>) -> Self {
         Self { surface, is_ready: false }
     }

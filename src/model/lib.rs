@@ -1,5 +1,6 @@
-//! The scene model: meshes, modes U, materials, scenes and steps as plain values, the loaders that read them from
-//! files, and the traits that deformers and rasterizers implement. This crate uses neither CUDA nor OpenGL.
+//! The scene model as plain values: meshes, modes U, materials, scenes, and steps (new coordinates q and transforms T).
+//! Also the loaders that read scenes from files, and the traits that deformers and rasterizers implement. This crate
+//! uses neither CUDA nor OpenGL.
 
 #![cfg_attr(not(test), deny(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::print_stdout))]
 

@@ -32,7 +32,8 @@ pub struct GlBuffer {
     pub owner: Rc<dyn GlBufferOwner>,
 }
 
-/// The OpenGL buffers that receive deformed vertices, so that no upload is needed.
+/// The OpenGL buffers that receive deformed vertices, so that no upload is needed. A corner is a vertex with a normal
+/// and texture coordinates.
 #[derive(Debug, Clone)]
 pub struct GlVertexBuffers {
     /// 3 f32 per vertex.
@@ -112,8 +113,8 @@ pub trait Rasterizer: std::fmt::Debug {
     /// faces of every triangle.
     ///
     /// Ids are one u64 per sample. The upper half contains the bits of the nearest depth, the lower half the index of
-    /// the triangle. A sample without a triangle has all bits set. The id pass draws the faces that the triangle's
-    /// group ([`RasterGeometry::groups`]) selects.
+    /// the triangle. A sample without a triangle has all bits set. The cull mode of the triangle's group
+    /// ([`RasterGeometry::groups`]) decides whether the id pass draws its back face.
     ///
     /// # Errors
     /// `Fault` if the device fails, or if a buffer is unknown or smaller than its viewport.

@@ -38,7 +38,7 @@ impl ComposedTransform {
     }
 
     /// `world_from_domain` in f64, 3x4 row-major. Products of two f32 are exact in f64 and cannot overflow. Sums are
-    /// evaluated from left to right, as in the kernels, so that an entry cancels to 0 either in both or in neither.
+    /// evaluated from left to right, as in the kernels. Thus an entry that cancels to 0 here is also 0 in the kernels.
     pub fn to_f64(&self) -> [f64; 12] {
         let t = self.root.0.map(f64::from);
         let Some(frame) = self.frame else { return t };

@@ -122,7 +122,7 @@ pub struct Domain {
     /// triangles have `material`.
     pub material_ranges: Vec<MaterialRange>,
     /// `world_from_domain` at rest. [`crate::scene::Scene::new`] replaces the placement of a follower by the placement
-    /// of its root domain times the follower's frame.
+    /// of its root (the last domain in the chain of followed domains) times the follower's frame relative to the root.
     pub placement: Transform,
     pub attachment: Option<Attachment>,
     /// Present if the domain moves with another one. Steps cannot set the transform of such a domain.

@@ -19,7 +19,7 @@ use super::Mesh;
 pub const RING_START: u32 = 1 << 31;
 
 /// The largest number of triangles of all shapes together. A triangle adds at most two neighbors to the fans of each of
-/// its three groups, so 32-bit offsets can address all rings.
+/// its three groups. 2^28 triangles x 3 groups x 2 neighbors are 1.6e9 entries, which 32-bit offsets can address.
 pub const MAX_RING_TRIANGLES: usize = 1 << 28;
 
 /// The largest distance between a rest normal and the rest normal of its group's representative: the chord of 0.1

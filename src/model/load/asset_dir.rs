@@ -10,7 +10,7 @@ use crate::error::{Result, invalid};
 pub(super) const MAX_MODEL_BYTES: u64 = 2 << 30;
 /// The largest image file in bytes.
 pub(super) const MAX_IMAGE_BYTES: u64 = 256 << 20;
-/// The largest text description in bytes.
+/// The largest text file other than a mesh or matrix in bytes, such as an MTL library.
 pub(super) const MAX_TEXT_BYTES: u64 = 64 << 20;
 
 /// The largest number of directory entries that are read.

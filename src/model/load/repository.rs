@@ -119,9 +119,10 @@ mod tests {
             (".hidden/x.obj", TRIANGLE),
             ("notes.txt", ""),
         ]);
-        // The folder `two` has two models, so it is not a scene. `far.obj` is below the listed depth.
+        // The folder `two` has two models, so it is not a scene. `far.obj` is six folders deep; the listing ends at four.
         let names = repository.list();
         assert_eq!(names, ["tree", "deep/er/scene", "one", "one/a.obj", "two/b.obj", "two/c.obj"]);
+        // All names but that of the built-in tree.
         for name in &names[1..] {
             let opened = repository.open(name).unwrap_or_else(|error| panic!("{name}: {error}"));
             assert_eq!(opened.scene.domains.len(), 1);

@@ -1,4 +1,4 @@
-//! Reads notes for simulations from Vega's files next to a model (`NAME.config`, `NAME.cub`).
+//! Reads notes (named values that clients can query) from Vega's files next to a model: `NAME.config`, `NAME.cub`.
 
 use std::collections::BTreeMap;
 

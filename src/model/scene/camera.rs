@@ -121,6 +121,7 @@ impl Camera {
         let camera_distance = if max_distance > 0.0 { max_distance } else { 1.0 };
         let eye = bounds.center() + to_camera * camera_distance;
         let view = View::LookAt { eye: eye.coords.into(), target: bounds.center().coords.into(), up: up.into() };
+        // Near and far are fitted to the scene, because both are 0.
         Self { view, lens: Lens::FieldOfView(vertical_degrees), near: 0.0, far: 0.0 }
     }
 

@@ -37,7 +37,8 @@ impl StorageType {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum NormalMethod {
-    /// Normals of the rest state, transformed by T alone (equation 3.8 of the thesis).
+    /// Normals of the rest state, transformed by T alone (equation 3.8 of B. Wang's thesis, "CUDA Deformers for Model
+    /// Reduction").
     #[default]
     Rigid,
     /// Area-weighted normals of the deformed triangles (defined in `reference/normals.rs`).

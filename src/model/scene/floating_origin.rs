@@ -23,8 +23,8 @@ use super::{BoundingBox, Scene};
 use crate::domain::Transform;
 use crate::error::{Result, invalid};
 
-/// Spacing of floating origins in scene units. A power of two, so that their coordinates are exact in f64 and often in
-/// f32.
+/// Spacing of floating origins in scene units. It is a power of two, so that their coordinates are exact in f64, and up
+/// to 2^34 units (2^24 times the spacing) also in f32.
 pub const ORIGIN_GRID: f64 = 1024.0;
 
 /// The largest distance, per axis and in scene units, between the shared origin and the translation of a domain that

@@ -75,7 +75,7 @@ impl Layout {
             }
             layout.domains.push(domain_layout);
         }
-        // Device indices have 32 bits and address up to four numbers per vertex and corner.
+        // Device code uses 32-bit indices for arrays of up to four numbers per vertex, corner or triangle.
         let largest_count = layout.vertices.max(layout.corners).max(layout.triangles);
         if largest_count > (u32::MAX / 4) as usize {
             return Err(invalid(

@@ -1,5 +1,5 @@
-//! Light space: the coordinate axes of the sun's shadow map (section 3.3.1 of the thesis), and bounding boxes along
-//! these axes.
+//! Light space: the coordinate axes of the sun's shadow map (section 3.3.1 of B. Wang's thesis, "CUDA Deformers for
+//! Model Reduction"), and bounding boxes along these axes.
 //!
 //! With `ShadowFit::Corners`, the shadow map is fitted to the eight corners of the world-space bounding box, as in the
 //! thesis. With `ShadowFit::Vertices`, the box in light space is tighter: it bounds the vertices, or the corners of the

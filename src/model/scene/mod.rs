@@ -174,7 +174,7 @@ impl Scene {
         Ok(Arc::new(scene))
     }
 
-    /// The packed vertex indices of each triangle, in layout order.
+    /// Per triangle of all domains, in layout order, the indices of its vertices (not corners) in the packed positions.
     pub fn triangle_vertices(&self) -> Vec<[u32; 3]> {
         let vertices_of_domain = |domain: usize| {
             let (mesh, first_vertex) = (&self.shape_of(domain).mesh, self.layout.domains[domain].first_vertex as u32);

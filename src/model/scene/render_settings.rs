@@ -57,10 +57,10 @@ pub const MAX_FRAGMENTS: u32 = (1 << 28) - 1;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Hash, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Transparency {
-    /// The two-pass method of the thesis (chapter 3.3). The first pass draws fragments whose alpha is at least
-    /// [`RenderSettings::opaque_alpha`], with depth writes. The second pass blends the others over them without depth
-    /// writes. Blended triangles are drawn in index-buffer order: one-sided before double-sided, then by domain, then
-    /// by triangle.
+    /// The two-pass method of B. Wang's thesis, "CUDA Deformers for Model Reduction" (chapter 3.3). The first pass
+    /// draws fragments whose alpha is at least [`RenderSettings::opaque_alpha`], with depth writes. The second pass
+    /// blends the others over them without depth writes. Blended triangles are drawn in index-buffer order: one-sided
+    /// before double-sided, then by domain, then by triangle.
     TwoPass,
     /// Order-independent transparency: per pixel, a list of all blended fragments, sorted by depth. Depths are compared
     /// at the pixel center. At equal depths, the later triangle in the index buffer is in front.

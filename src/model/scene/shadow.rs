@@ -1,4 +1,4 @@
-//! Settings of a scene's shadow map.
+//! Settings of a scene's shadow map. "The thesis" is B. Wang, "CUDA Deformers for Model Reduction".
 
 use crate::error::{Result, invalid};
 
@@ -15,8 +15,9 @@ pub enum ShadowMethod {
     /// the map. An occluder closer than one texel side to the surface behind it casts no shadow.
     Standard,
     /// Percentage-closer filtering: the fraction of surrounding depths behind the receiver, weighted by the Gaussian of
-    /// `blur`. Soft edges, half dark within half a texel of the true edge, no light bleeding, at the cost of
-    /// (6 blur + 2)^2 depths per pixel. As with `Standard`, an occluder closer than one texel side casts no shadow.
+    /// `blur`. Soft edges, half dark within half a texel of the true edge, no light bleeding. A pixel reads
+    /// (6 blur + 2)^2 depths: 2 x 3 blur + 1 taps per axis, and one more for bilinear weights. As with `Standard`, an
+    /// occluder closer than one texel side casts no shadow.
     #[serde(rename = "filtered")]
     PercentageCloser,
 }

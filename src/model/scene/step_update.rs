@@ -1,4 +1,5 @@
-//! One step of a writer. It is validated once against its scene, so that later code can rely on it.
+//! One step: the values that a writer (the simulation that drives a scene) sends. It is validated once against its
+//! scene, so that later code can rely on it.
 
 use std::collections::BTreeMap;
 
@@ -152,8 +153,8 @@ fn parse_coordinates(scene: &Scene, raw: &RawStepUpdate) -> Result<(Vec<Coordina
 type ParsedTransforms = (Vec<(u32, Transform)>, Vec<(u32, [f64; 3])>);
 
 fn parse_transforms(scene: &Scene, raw: &RawStepUpdate) -> Result<ParsedTransforms> {
-    let is_for_all_domains = raw.transform_domains.is_empty() && !raw.transforms.is_empty();
-    let domains = match is_for_all_domains {
+    let is_for_all_roots = raw.transform_domains.is_empty() && !raw.transforms.is_empty();
+    let domains = match is_for_all_roots {
         true => scene.transform_roots.domains().collect(),
         false => parse_domain_list(scene, "step.transform_domains", &raw.transform_domains)?,
     };

@@ -9,7 +9,8 @@ use crate::error::{Result, invalid};
 /// that a larger deviation is an error of the sender.
 const NORM_TOLERANCE: f64 = 1e-3;
 
-/// The largest f64 translation per axis, in scene units. Up to there, f64 numbers are at most 1.3e-4 units apart.
+/// The largest f64 translation per axis, in scene units. Below this limit, neighboring f64 numbers differ by at most
+/// 2^-13 units, which is about 0.1 mm in a scene of meters.
 pub(super) const MAX_TRANSLATION: f64 = (1_u64 << 40) as f64;
 
 /// The encoding of the transforms of a step.

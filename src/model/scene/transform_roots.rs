@@ -35,7 +35,7 @@ impl TransformRoots {
     pub const NO_FRAME: u32 = u32::MAX;
 
     /// Flattens chains of followers to their roots, and sets the placement of each follower to its root's placement
-    /// times its frame. The domains are validated, and parents precede their children. Products of frames are computed
+    /// times its frame. The caller has checked that every parent precedes its children. Products of frames are computed
     /// in f64 and rounded once.
     ///
     /// # Errors

@@ -78,6 +78,7 @@ impl BarkLayers {
         // The zero crossings of the noise form long, wavering furrows. Those of the finer noise are shallow.
         let deep_furrow = smoothstep(0.0, 0.34, self.furrows[0].sample(warped_u, v).abs());
         let fine_furrow = smoothstep(0.0, 0.36, self.furrows[1].sample(warped_u, v).abs());
+        // Sampled at (v, u) instead of (u, v), so that v is not shifted in the same way as u.
         let crack = smoothstep(0.0, 0.16, self.cracks.sample(warped_u, v + 0.02 * self.warps[1].sample(v, u)).abs());
         let grain = 0.6 * self.grain[0].sample(warped_u, v) + 0.4 * self.grain[1].sample(u, v);
         let plate = deep_furrow.powf(0.7) * (0.58 + 0.42 * fine_furrow) * (0.80 + 0.20 * crack);

@@ -141,6 +141,7 @@ pub(super) mod tests {
 
     #[test]
     fn modes_solve_the_eigenproblem_at_every_slenderness() {
+        // The ratio of length to diameter at the base. The length is about 1 m.
         for slenderness in [10.0, 60.0, 2000.0] {
             for (bend, taper) in [(0.0, 1.0), (0.0, 0.1), (1.2, 1.0), (1.2, 0.1)] {
                 let radius = 0.5 / slenderness;

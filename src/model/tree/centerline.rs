@@ -1,5 +1,5 @@
-//! The centerline of a branch: a curve that is generated from a start direction and bends, and sampled once per ring of
-//! the skin.
+//! The centerline of a branch: a curve that is generated from a start direction and bends. It has one sample per ring
+//! of the skin (the circle of vertices around a point of the centerline).
 
 use nalgebra::{Rotation3, Vector3};
 
@@ -23,9 +23,9 @@ pub(super) struct GrowthParameters {
     pub(super) start: Vector3<f64>,
     /// Unit direction of the light, opposite to gravity.
     pub(super) up: Vector3<f64>,
-    /// Downward bend by weight, strongest at the root: the total angle of a horizontal branch.
+    /// The angle by which weight bends a horizontal branch downwards in total. The bend is strongest at the root.
     pub(super) sag: f64,
-    /// Upward bend towards the light, strongest at the tip: the total angle of a horizontal branch.
+    /// The angle by which a horizontal branch bends upwards to the light in total. The bend is strongest at the tip.
     pub(super) rise: f64,
     /// Amplitude of the random bends: the first of the three waves per axis swings the direction by wander / 2.
     pub(super) wander: f64,
@@ -63,6 +63,7 @@ impl Centerline {
             let step = (centerline.arc_lengths[ring] - centerline.arc_lengths[ring - 1]) / STEPS_PER_RING as f64;
             for substep in 0..STEPS_PER_RING {
                 let fraction = (centerline.arc_lengths[ring - 1] + (substep as f64 + 0.5) * step) / growth.length;
+                // Change of the tangent per unit of relative length.
                 let relative_bend = gravity_and_light_bend(growth, &tangent, fraction) + random_bends.sample(fraction);
                 let next_tangent = (tangent + relative_bend * (step / growth.length)).normalize();
                 point += (tangent + next_tangent).normalize() * step;
@@ -221,6 +222,7 @@ pub(super) mod tests {
     #[test]
     fn branch_without_bends_is_straight() {
         let centerline = Centerline::grow(&straight_growth(3.0, 6, 2), &mut SplitMix64::new(1));
+        // 6 elements x 2 rings, and the ring at the tip.
         assert_eq!(centerline.points.len(), 13);
         assert!((centerline.points[12] - Vector3::new(0.0, 3.0, 0.0)).norm() < 1e-12);
         assert_eq!(centerline.nodes().len(), 7);

@@ -1,4 +1,5 @@
-//! Templates of leaf clusters: a green shoot with leaf blades. Sprays bend with two modes, rosettes are rigid.
+//! Templates of leaf clusters: a green shoot with leaf blades. Sprays bend with two modes, rosettes are rigid. Lengths
+//! are in meters, angles in radians. Numbers without a comment are free choices of the cluster's shape.
 
 use nalgebra::{Rotation3, Unit, Vector3};
 

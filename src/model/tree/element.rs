@@ -172,6 +172,7 @@ mod tests {
         assert!((thin_section.area - std::f64::consts::PI).abs() < 1e-12);
         assert!((thin_section.moment - std::f64::consts::FRAC_PI_4).abs() < 1e-12);
         assert!(cone_section.area < thick_section.area && cone_section.area > thin_section.area);
+        // The mean of r^2 between the radii 2 and 1 is (2^2 + 2 x 1 + 1^2) / 3.
         assert!((cone_section.area - std::f64::consts::PI * 7.0 / 3.0).abs() < 1e-12);
     }
 }

@@ -1,5 +1,6 @@
 //! Procedural leaf texture from a seed: a 256 x 256 sRGB image with alpha. It shows one leaf with its tip at the top,
-//! and an opaque strip at the right edge, which is the texture of stems.
+//! and an opaque strip at the right edge, which is the texture of stems. Numbers without a comment are free choices of
+//! the leaf's look.
 
 use super::noise::{GradientNoise, lerp_color, smoothstep};
 use super::random::SplitMix64;
@@ -63,8 +64,7 @@ pub(super) fn texture(name: &str, colors: &LeafColors, random: &mut SplitMix64) 
 }
 
 /// Color and coverage at the signed distance `x` from the midrib, as a fraction of the width of [`LEAF_SPAN`], and the
-/// height `y` above the base of the petiole, as a fraction of the height of the image. The weights are free choices of
-/// the leaf's look.
+/// height `y` above the base of the petiole, as a fraction of the height of the image.
 fn shade_leaf(colors: &LeafColors, x: f32, y: f32) -> ([f32; 3], f32) {
     let blade_fraction = (y - PETIOLE_LENGTH) / (TIP_HEIGHT - PETIOLE_LENGTH);
     let distance = x.abs();

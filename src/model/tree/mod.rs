@@ -2,7 +2,8 @@
 //!
 //! A trunk of 6.8 m carries boughs and twigs, boughs carry twigs, and boughs and twigs carry leaf clusters. Every
 //! wooden part is a clamped Euler-Bernoulli beam along its centerline, loaded with the masses of its children at their
-//! joints. The modes of the beam are lifted to the part's skin. Modes are mass-orthonormal in kg, so that modal forces
+//! joints. The modes of the beam are lifted to the part's skin, its surface mesh. The skin consists of rings: each ring
+//! is the circle of vertices around one point of the centerline. Modes are mass-orthonormal in kg, so that modal forces
 //! are U^T f with f in newtons.
 //!
 //! The coordinate frame of a part has its origin at the center of the part's base, +Y along the start of the

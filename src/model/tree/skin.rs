@@ -1,4 +1,5 @@
-//! Builder of a part's skin: tubes around centerlines, and leaf blades. Every vertex has a station on the beam.
+//! Builder of a part's skin: tubes around centerlines, and leaf blades. Every vertex has a station: the position along
+//! the beam whose section moves the vertex.
 
 use nalgebra::Vector3;
 
@@ -274,10 +275,11 @@ mod tests {
     #[test]
     fn sample_at_a_fraction_is_on_the_centerline() {
         let centerline = winding_centerline();
+        // With two rings per element, ring 5 is in the middle of element 2.
         let (station, position, _) = sample_at(&centerline, centerline.fraction(5));
         assert!((position - centerline.points[5]).norm() < 1e-12);
         assert!((station.element, station.fraction) == (2, 0.5));
-        // Ring 5 of two rings per element is in the middle of element 2. The end is the end of element 5.
+        // The tip is ring 12, at the end of the last element.
         let (end_station, position, tangent) = sample_at(&centerline, 1.0);
         assert!((end_station.element, end_station.fraction) == (5, 1.0));
         assert!((position - centerline.points[12]).norm() < 1e-12);

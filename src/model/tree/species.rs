@@ -51,8 +51,8 @@ pub(super) fn grow_templates(random: &mut SplitMix64) -> Vec<PartTemplate> {
         trunk.attach_child(ChildJoint { ring, direction, template_index: templates.len() }, bough.mass());
         templates.push(bough);
     }
-    // Twigs of medium length (templates 4 to 8) form the top of the crown. Each pair is a ring and the angle between
-    // trunk and twig.
+    // Twigs of medium length (twig templates 4 to 8) form the top of the crown. Each pair is a ring and the angle
+    // between trunk and twig.
     let last_ring = trunk.centerline.points.len() - 1;
     for (ring, angle) in [(last_ring, 0.10), (last_ring - 2, 0.55), (last_ring - 4, 0.65), (last_ring - 6, 0.7)] {
         let side = perpendicular_at(&trunk.centerline, ring, GOLDEN_ANGLE * (ring + BOUGH_COUNT) as f64);
@@ -201,7 +201,8 @@ fn attach_leaf_clusters(
     }
 }
 
-/// A part of wood without skin and children, at level 0 and without damping.
+/// A part of wood with `sides` vertices per ring and `rank` modes. It has level 0, and no skin, children or damping
+/// yet.
 fn wooden_part(kind: PartKind, centerline: Centerline, radii: Vec<f64>, [sides, rank]: [usize; 2]) -> PartTemplate {
     PartTemplate {
         kind,

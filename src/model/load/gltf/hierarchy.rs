@@ -119,6 +119,7 @@ fn local_matrix(node: &Node) -> Result<Matrix4<f64>> {
     if let Some(matrix) = node.matrix {
         let matrix = Matrix4::from_column_slice(&matrix);
         let last_row = matrix.row(3).into_owned();
+        // The tolerance accepts the f32 rounding of exporters and rejects perspective matrices.
         if (last_row - nalgebra::RowVector4::new(0.0, 0.0, 0.0, 1.0)).amax() > 1e-5 {
             let given: Vec<f64> = last_row.iter().copied().collect();
             return Err(invalid("matrix", "a last row of 0, 0, 0, 1", format!("{given:?}")));

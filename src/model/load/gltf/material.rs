@@ -1,4 +1,4 @@
-//! Converts glTF's metallic-roughness materials to Phong materials (equation 3.12 of the thesis).
+//! Converts glTF's metallic-roughness materials to Phong materials ([`Material`]).
 //!
 //! The inputs are the base color factor c, the metalness m and the roughness p. Each of m and p is the product of a
 //! factor and the mean of a texture channel, because Phong's parameters are constant over a surface. With the GGX

@@ -47,6 +47,7 @@ mod tests {
         (0..100).for_each(|index| remarks.add(format!("other {index}")));
         let list = remarks.into_list();
         assert_eq!((list.len(), list[0].as_str()), (MAX_REMARKS + 1, "same[31m"));
+        // 1 + 100 different remarks, of which 64 are stored.
         assert_eq!(list[MAX_REMARKS], "and 37 more remarks");
     }
 }

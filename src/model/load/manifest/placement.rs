@@ -99,7 +99,8 @@ mod tests {
 
     #[test]
     fn equivalent_keys_give_equal_transforms() {
-        // A scale of 2, a rotation of 90 degrees about z, and a translation by (1, 2, 3).
+        // A scale of 2, a rotation of 90 degrees about z, and a translation by (1, 2, 3). The axis and the quaternion
+        // need not have length 1.
         let expected = [0.0, -2.0, 0.0, 1.0, 2.0, 0.0, 0.0, 2.0, 0.0, 0.0, 2.0, 3.0];
         for text in [
             "translation = [1, 2, 3]\naxis = [0, 0, 5]\ndegrees = 90\nscale = 2",

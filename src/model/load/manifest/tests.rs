@@ -33,6 +33,8 @@ fn read_parts(toml: &str) -> Result<SceneParts> {
     read_manifest(toml).map(|description| description.parts)
 }
 
+/// Some keys and values differ from the names in Rust: `splits` is the number of cascades, the method "filtered" is
+/// [`ShadowMethod::PercentageCloser`], and the culling "depth" is [`Culling::Occlusion`].
 #[test]
 fn scene_keys_override_the_defaults() {
     let SceneDescription { parts, backends } = read_manifest(

@@ -41,7 +41,8 @@ pub(super) fn parse(bytes: &[u8]) -> Result<Modes> {
     Modes::from_rows(rows, rank, &entries)
 }
 
-/// IEEE 754 binary16 to f32, exact.
+/// IEEE 754 binary16 to f32, exact. A binary16 has a sign bit, 5 exponent bits with bias 15, and 10 fraction bits. The
+/// fraction is read as a whole number, so the exponent of 2 is `exponent` - 15 - 10.
 fn f16_to_f32(bits: u16) -> f32 {
     let sign = if bits & 0x8000 == 0 { 1.0 } else { -1.0 };
     let (exponent, fraction) = (i32::from(bits >> 10 & 0x1f), f32::from(bits & 0x3ff));

@@ -82,10 +82,10 @@ impl PlantStructure {
     fn check_polylines(&self) -> Result<()> {
         let shoots = self.shoots.iter().map(|shoot| (format!("shoot {}", shoot.id), &shoot.vertices[..]));
         let leaves = self.leaves.iter().flat_map(|leaf| {
-            let polyline = leaf.petiole_vertices.as_deref().unwrap_or(std::slice::from_ref(&leaf.base));
             // The base of a leaf is checked as a polyline of one point.
             let base_point = std::slice::from_ref(&leaf.base);
-            [polyline, base_point].map(|polyline| (format!("leaf {}", leaf.object_id), polyline))
+            let petiole = leaf.petiole_vertices.as_deref().unwrap_or(base_point);
+            [petiole, base_point].map(|polyline| (format!("leaf {}", leaf.object_id), polyline))
         });
         for (name, polyline) in shoots.chain(leaves) {
             if polyline.is_empty() || !polyline.as_flattened().iter().all(|coordinate| (*coordinate as f32).is_finite())
@@ -176,6 +176,7 @@ mod tests {
         PlantStructure::parse(text.as_bytes())
     }
 
+    /// A shoot with the unknown key `more`, which the parser must ignore.
     fn shoot_json(id: i64, parent: i64) -> String {
         format!(r#"{{"id": {id}, "parent": {parent}, "vertices": [[0, 0, 0]], "more": 1}}"#)
     }

@@ -54,6 +54,8 @@ fn complete_model_is_valid() {
 
 #[test]
 fn out_of_range_numbers_are_rejected_by_field() {
+    // The size in bytes of 2^62 positions (12 bytes each) or 2^63 indices (2 bytes each) overflows 64 bits. The size of
+    // 2^62 / 12 positions or 2^62 indices does not overflow, but exceeds the buffer view.
     let two_to_62 = 1_u64 << 62;
     let two_to_63 = 1_u64 << 63;
     let u64_max = u64::MAX;

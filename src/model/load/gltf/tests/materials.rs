@@ -17,7 +17,7 @@ pub(super) fn encode_png(pixel: [u8; 4]) -> Vec<u8> {
 }
 
 /// A triangle with two sets of texture coordinates, one image as textures 0 and 1, and one material. Texture 1 has an
-/// unsupported sampler, which clamps to the edge (OpenGL's `GL_CLAMP_TO_EDGE` is 33071).
+/// unsupported sampler, which clamps to the edge (OpenGL's `GL_CLAMP_TO_EDGE` is 33071; `GL_LINEAR` is 9729).
 pub(super) fn textured_triangle(material: Value) -> Model {
     let mut model = Model::triangle();
     let first_uvs = model.add_floats("VEC2", 3, &[0.0, 0.0, 1.0, 0.0, 0.0, 1.0]);

@@ -10,6 +10,7 @@ use crate::error::Result;
 use crate::load::asset_dir::AssetDir;
 use crate::scene::{Scene, SceneParts};
 
+// Component types of glTF.
 const U8: u64 = 5121;
 const U16: u64 = 5123;
 const U32: u64 = 5125;

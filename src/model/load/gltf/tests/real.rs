@@ -1,4 +1,5 @@
-//! Tests with real models. They are ignored by default, because the datasets are not part of the repository.
+//! Tests with real models. They are ignored by default, because the datasets are not part of the repository. Expected
+//! names, sizes and translations are properties of the datasets.
 
 use std::path::PathBuf;
 
