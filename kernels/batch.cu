@@ -5,14 +5,14 @@
 //   blocks          the work of each block: a group, and a range of tiles of its shape                       (in)
 //   groups          per group: its members, and the offsets of the U and x0 of its shape (layout.cuh)        (in)
 //   members         the members of all groups                                                                (in)
-//   words           U, per tile of a shape [chunk][3][quad] words of 16 bytes                                (in)
+//   words           U, per tile of a shape [chunk][3 words of a quad][quad], 16 bytes per word               (in)
 //   rest_positions  x0, per tile of a shape [axis][quad][vertex in the quad] f32                             (in)
 //   scales          with STORE_INT8: one scale per tile of a shape and mode                                  (in)
-//   transforms, transform_links, frames, q  as for `deform`                                                  (in)
+//   transforms, transform_links, frames, q  as described in deform.cu                                        (in)
 //   positions       [vertices][3] f32, address in the header                                                 (out)
-//   boxes           [tiles of deform][4 boxes][6 keys] u32, as `deform` writes them. Each of the two warps of a tile
-//                   writes two of its four boxes. A warp without vertices writes none: its boxes keep the zeros of
-//                   their allocation                                                                         (out)
+//   boxes           [tiles of `deform`][4 boxes][6 keys] u32: `float_to_ordered` keys of the maxima of -x, -y, -z,
+//                   x, y, z. Each of the two warps of a tile writes its box twice. A warp without vertices writes
+//                   none: its two boxes keep the zeros of their allocation                                   (out)
 // Launch: a block of WARPS warps per `BatchBlock`. Dynamic shared memory: a `WarpStorage` per warp, one `BlockStorage`,
 // and q. CPU twin: the tests of src/compute/gpu/executor/launchers/batch.rs.
 //
@@ -32,14 +32,16 @@
 #include "batch_load.cuh"
 #include "ordered_float.cuh"
 
-// Number of resident blocks per multiprocessor for which the compiler limits the registers. A block has two warps.
+// Number of resident blocks per multiprocessor for which the compiler limits the registers. A block has two warps and
+// 21 KB of shared memory, plus its q. On sm_90, registers allow 8 blocks with 16 members. With fewer members, the
+// shared memory of 228 KB allows 10.
 #if __CUDA_ARCH__ == 900
 constexpr unsigned MIN_BLOCKS_PER_SM = BATCH_SIZE == 16 ? 8 : 10;
 #elif __CUDA_ARCH__ == 800 || __CUDA_ARCH__ == 1000
-// 12 warps instead of 16: the compiler needs more registers for these architectures.
+// 6 blocks instead of 8: the compiler needs more registers for these architectures.
 constexpr unsigned MIN_BLOCKS_PER_SM = 6;
 #else
-// Other architectures have less shared memory: 100 KB on sm_86 and sm_89. A block takes 21 KB and its q.
+// Other architectures have less shared memory: 100 KB on sm_86 and sm_89.
 constexpr unsigned MIN_BLOCKS_PER_SM = 4;
 #endif
 
@@ -134,7 +136,7 @@ __device__ __forceinline__ void sum_modes(const WarpSlice& slice, WarpStorage& s
 
 // x0 of a lane's two vertices.
 struct RestPositionPair {
-    float2 x, y, z;
+    float2 x, y, z; // each with the coordinate of the first vertex, then of the second
     __device__ __forceinline__ void load(const WarpStorage& storage) {
         const float* rest_positions = (const float*)(storage.rest_positions + lane_id() / 2) + 2 * (lane_id() % 2);
         x = *(const float2*)rest_positions;
@@ -148,7 +150,7 @@ __device__ __forceinline__ unsigned count_lane_vertices(const WarpSlice& slice) 
     return slice.vertex_count > 2 * lane_id() ? min(2u, slice.vertex_count - 2 * lane_id()) : 0;
 }
 
-// Address of the two boxes of this warp's half of a tile. A tile has four boxes of six keys, as in `deform`.
+// Address of the two boxes of this warp's half of a tile. A tile has four boxes of six keys, 24 keys.
 __device__ __forceinline__ unsigned* warp_box_keys(const BatchArgs& args, const WarpSlice& slice, const BatchMember& member) {
     return args.boxes + 24 * (size_t)(member.first_tile + slice.tile) + 12 * (threadIdx.x / 32);
 }
@@ -175,9 +177,9 @@ __device__ __forceinline__ void stage_member(const RestPositionPair& rest, const
 
 // Computes the boxes of the two staged members, `first_member` and the next. Each half warp (16 lanes) reduces one
 // member, with four vertices (three float4) per lane. The lower sides of a box are maxima of -x, -y, -z, the upper
-// sides maxima of x, y, z. In the first exchange, eight lanes of a half warp take over the lower sides and eight the
-// upper sides, so later exchanges move three numbers instead of six. The maxima ignore NaN: if a position is not
-// finite, this function sets `has_non_finite`, and `repair_non_finite` computes the boxes again.
+// sides maxima of x, y, z. After the first exchange, lanes 0 to 7 of a half warp reduce only the lower sides, and lanes
+// 8 to 15 only the upper sides, so later exchanges move three numbers instead of six. The maxima ignore NaN: if a
+// position is not finite, this function sets `has_non_finite`, and `repair_non_finite` computes the boxes again.
 __device__ __forceinline__ void write_two_boxes(const BatchArgs& args, WarpSlice& slice, const BlockStorage& block,
                                                 unsigned first_member, const float4* staged) {
     const float NEGATIVE_INFINITY = __uint_as_float(0xff800000u);
@@ -305,7 +307,7 @@ __device__ __forceinline__ float3 position_f64(const BatchArgs& args, const Warp
     return transform_domain_point_f64(transforms_of(args), member.domain, point);
 }
 
-// Writes the box of one member's vertices in this warp.
+// Writes the box of one member's vertices in this warp, to both boxes of the warp. Lane i of 12 writes key i % 6.
 __device__ __forceinline__ void write_box(const BatchArgs& args, const WarpSlice& slice, const BatchMember& member,
                                           const unsigned (&keys)[6]) {
     const unsigned key = reduce_box_keys(keys);

@@ -1,5 +1,5 @@
 // Shared memory of a block of `batch`, and the loads of U, x0, T and q. batch.cu defines groups, members and tiles. A
-// word has 16 bytes. Twin: the tests of src/compute/gpu/executor/launchers/batch.rs.
+// word has 16 bytes. CPU implementation with the same steps: the tests of src/compute/gpu/executor/launchers/batch.rs.
 #pragma once
 #include "chunk.cuh"
 #include "transform.cuh"
@@ -74,16 +74,16 @@ struct WarpSlice {
     unsigned quad_count;          // number of quads of the slice; may be 0
     unsigned first_vertex;        // in the shape
     unsigned vertex_count;        // number of vertices of the slice
-    unsigned chunk_count;
-    unsigned member_count;
-    unsigned first_member;
-    unsigned first_scale; // of the tile
+    unsigned chunk_count;    // of the shape
+    unsigned member_count;   // of the group
+    unsigned first_member;   // index of the group's first member in `members`
+    unsigned first_scale;    // index of the tile's first scale in `scales`
     unsigned tile;           // counted from the first tile of the shape
     unsigned end_tile;       // one past the block's last tile
     unsigned has_non_finite; // 1 if a result is not finite
-    unsigned group;
-    // Output address of the slice for a member that begins at packed vertex 0. `output_pointer` adds the member's
-    // offset.
+    unsigned group;          // index in `groups`
+    // Output address of the slice for a member whose first vertex is vertex 0 of the output. `output_pointer` adds the
+    // offset of the member's first vertex.
     float* positions;
 };
 
@@ -136,8 +136,8 @@ __device__ __forceinline__ WarpSlice load_warp_slice(const BatchArgs& args, unsi
     return slice;
 }
 
-// Starts the copies of a stage to the ring, as [word of the quad: STAGE_QUAD_WORDS][quad: WARP_QUADS]. With each copy,
-// a warp copies two words of every quad. Lanes beyond the last quad copy the last quad again.
+// Starts the copies of a stage to the ring, as [STAGE_QUAD_WORDS words of a quad][WARP_QUADS quads]. With each copy, a
+// warp copies two words of every quad. Lanes beyond the last quad copy the last quad again.
 __device__ __forceinline__ void copy_stage(const WarpSlice& slice, WarpStorage& storage, unsigned stage) {
     constexpr unsigned WORDS_PER_COPY = 32 / WARP_QUADS, COPY_COUNT = STAGE_WORDS / 32;
     const unsigned quad_word = STAGE_QUAD_WORDS * stage + lane_id() / WARP_QUADS;
@@ -160,7 +160,7 @@ __device__ __forceinline__ void copy_stage(const WarpSlice& slice, WarpStorage& 
     }
 }
 
-// Starts the copies of x0, as [axis][quad: WARP_QUADS].
+// Starts the copies of x0 to shared memory, as [3 axes][WARP_QUADS quads].
 __device__ __forceinline__ void copy_rest(const WarpSlice& slice, WarpStorage& storage) {
     // x0 has 48 words. Every lane takes two iterations, so that the loop can be unrolled. Copies beyond the end of x0
     // are disabled.

@@ -1,8 +1,9 @@
-// Reduces the boxes that `deform` and `batch` wrote, four per tile, to one bounding box of all positions. Tiles that a
-// partial step skips keep their boxes from an earlier step. With ORIENTED_BOUNDS, also computes the bounds along
+// Reduces the boxes that `deform` and `batch` wrote, four per tile, to one bounding box of all positions. A partial
+// step computes only some of the tiles; all other tiles keep their boxes from an earlier step. A key is an unsigned
+// integer that increases with a float (ordered_float.cuh). With ORIENTED_BOUNDS, also computes the bounds along
 // `bounding_axes` from the same boxes. With DOMAIN_BOXES, also computes one box per segment, a part of a domain. The
 // items of a segment are boxes, or vertices if the domain shares a tile with other domains.
-//   boxes          [box_count][6] u32: `float_to_ordered` maxima of -x, -y, -z, x, y, z                       (in)
+//   boxes          [box_count][6] u32: keys of the maxima of -x, -y, -z, x, y, z                              (in)
 //   bounding_axes  with ORIENTED_BOUNDS: three orthogonal unit vectors                                        (in)
 //   bounds         in the header: the maxima of all boxes; zeros before the launch                            (in, out)
 //   segments       with DOMAIN_BOXES: `BoxSegment`s, each of which is reduced to one box                      (in)
@@ -48,6 +49,7 @@ __device__ __forceinline__ void merge_item(const BoundsArgs& args, const BoxSegm
 // diverge.
 __device__ __forceinline__ void compute_segment_boxes(const BoundsArgs& args) {
     const unsigned group_rank = threadIdx.x % THREADS_PER_SEGMENT;
+    // The 8 lanes of this thread's group.
     const unsigned group_mask = 0xffu << threadIdx.x % 32 / THREADS_PER_SEGMENT * THREADS_PER_SEGMENT;
     const unsigned group_count = gridDim.x * (BLOCK / THREADS_PER_SEGMENT);
     for (unsigned i = (blockIdx.x * BLOCK + threadIdx.x) / THREADS_PER_SEGMENT; i < args.segment_count; i += group_count) {
@@ -88,6 +90,7 @@ struct OrientedExtent {
     unsigned extent_keys[2];
 
     __device__ __forceinline__ void load_axis(const BoundsArgs& args) {
+        // Axis 2 for lane 3.
         const float* bounding_axis = args.bounding_axes + 3 * min(threadIdx.x % 4, 2u);
         axis[0] = bounding_axis[0];
         axis[1] = bounding_axis[1];
@@ -95,9 +98,9 @@ struct OrientedExtent {
         extent_keys[0] = extent_keys[1] = 0;
     }
 
-    // Merges the boxes of a tile, one per lane; all four lanes must call this. Depending on the variant of `deform`,
-    // the four boxes are copies of the tile's box, or its parts. Their union is the same in both cases. Uniting them
-    // first therefore makes the result independent of the variant that computed a tile.
+    // Merges the boxes of a tile, one per lane; all four lanes must call this. Depending on the kernel that computed
+    // the tile, the four boxes are copies of the tile's box, or boxes of its parts. The union of the four is the same
+    // in both cases. It is computed first, so that the result does not depend on the kernel.
     __device__ __forceinline__ void merge_tile(unsigned (&box)[6]) {
         const unsigned tile_lane_mask = 0xfu << threadIdx.x % 32 / 4 * 4;
 #pragma unroll

@@ -12,8 +12,9 @@ constexpr unsigned CHUNK_MODES = 1;
 #endif
 constexpr unsigned ENTRY_BYTES = 4 / CHUNK_MODES;
 
-// Decodes the entry in the lowest bits of `bits`. With 16-bit entries, the host has multiplied q by the factor of the
-// mode. With STORE_INT8, the caller multiplies by the scale.
+// Decodes the entry in the lowest bits of `bits`. Decoded entries are U divided by a power of two per mode (16-bit
+// entries) or by a scale per mode and tile (STORE_INT8). The host has multiplied q by the power of two; the kernel
+// multiplies q by the scale.
 __device__ __forceinline__ float decode_bits(unsigned bits) {
 #if defined(STORE_F16)
     float number;

@@ -41,8 +41,9 @@ struct AlphaTest {
     AlphaMaterial material;
 
     __device__ AlphaTest(const RasterArgs& args, unsigned triangle) {
-        const unsigned cut_out = triangle - args.first_cut_out;
-        const uint4 material_words = __ldg((const uint4*)args.materials + __ldg((const unsigned*)args.material_indices + cut_out));
+        const unsigned cut_out_index = triangle - args.first_cut_out;
+        const unsigned material_index = __ldg((const unsigned*)args.material_indices + cut_out_index);
+        const uint4 material_words = __ldg((const uint4*)args.materials + material_index);
         material.image = (unsigned long long)material_words.y << 32 | material_words.x;
         material.alpha = __uint_as_float(material_words.z);
         material.cutoff = __uint_as_float(material_words.w);
@@ -56,7 +57,7 @@ struct AlphaTest {
             x[i] = corners[i].x;
             y[i] = corners[i].y;
             w[i] = corners[i].w;
-            const float2 uv = __ldg((const float2*)args.uvs + 3 * (size_t)cut_out + i);
+            const float2 uv = __ldg((const float2*)args.uvs + 3 * (size_t)cut_out_index + i);
             u[i] = uv.x;
             v[i] = uv.y;
         }
@@ -91,10 +92,11 @@ struct AlphaTest {
         const float inverse_weight_sum = __frcp_rn(sum3(weight_a, weight_b, weight_c));
         float2 uv = {mul_rn(sum3(mul_rn(weight_a, u[0]), mul_rn(weight_b, u[1]), mul_rn(weight_c, u[2])), inverse_weight_sum),
                      mul_rn(sum3(mul_rn(weight_a, v[0]), mul_rn(weight_b, v[1]), mul_rn(weight_c, v[2])), inverse_weight_sum)};
-        // Derivatives of uv by column (dx) and row (dy). With the edge functions e_i and their sum s, d uv = sum_i d
-        // e_i (uv_i - uv) / s, where uv_i is the texture coordinate of corner i. From relative_x = x - sample_x * w
-        // follows d e_i / d sample_x = cross2(relative_y[j], relative_y[k], w[j], w[k]). The derivative by sample_y has
-        // a minus sign, which is canceled because sample_y decreases with the row.
+        // Derivatives of uv by column (dx) and row (dy). uv = sum_i e_i uv_i / s, with the edge functions e_i
+        // (`edge_weights`), their sum s, and the texture coordinates uv_i of corner i. With ' for a derivative:
+        // uv' = sum_i e_i' (uv_i - uv) / s. From relative_x = x - sample_x * w follows the derivative of e_i by
+        // sample_x: cross2(relative_y[j], relative_y[k], w[j], w[k]). The derivative by sample_y has a minus sign,
+        // which is canceled because sample_y decreases with the row.
         float2 uv_dx = {0.0f, 0.0f}, uv_dy = {0.0f, 0.0f};
 #pragma unroll
         for (unsigned i = 0; i < 3; ++i) {

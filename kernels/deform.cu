@@ -1,6 +1,6 @@
-// The main kernel of a step: x = T (x0 + U q) for every vertex of every domain of a scene, and with RIGID_NORMALS also
-// the rigid normals and tangents of every corner. Also computes four bounding boxes of x per tile. One launch covers
-// all domains.
+// The main kernel of a step: x = T (x0 + U q) for every vertex of every domain of a scene. With RIGID_NORMALS also the
+// rigid normals and tangents of every corner: the rest normals and tangents, transformed by T without U q. Also
+// computes four bounding boxes of x per tile. One launch covers all domains.
 //
 // A quad is four consecutive vertices or corners of a domain. A tile, the work of one warp (of four warps with
 // ONE_ITEM_PER_LANE), is up to 32 quads: of one domain, or of several small domains (a mixed tile). A chunk is a few
@@ -177,7 +177,8 @@ struct ChunkIndices {
 #endif
     __device__ __forceinline__ ChunkIndices(const DeformArgs& args, const LaneSlice& slice) : count(slice.chunk_count) {
 #ifdef MODE_TRUNCATION
-        // `retained` has capacity for every chunk of a domain, and q has CHUNK_MODES coordinates per chunk.
+        // `retained` has an entry for every CHUNK_MODES coordinates of q, so that no chunk list overflows when every
+        // chunk is retained. The list of a domain begins at the entry of its first coordinate.
         retained = args.retained + slice.first_q / CHUNK_MODES;
         count = slice.chunk_count == 0 || slice.item_count == 0 ? 0 : __ldg(args.retained_counts + slice.domain);
 #endif
@@ -427,7 +428,7 @@ __device__ __forceinline__ void compute_tile(const DeformArgs& args, WarpShared&
         inputs.load(args, slice);
 #endif
 #ifdef RIGID_NORMALS
-        // Load the normals before the positions are stored, so that the load and the store are in flight together.
+        // Load the rest normals before the positions are stored, so that both transfers are in flight together.
         if (slice.kind & TILE_CORNERS) {
             normals.load(args, slice);
         }

@@ -1,12 +1,13 @@
 // Transformation of directions by the linear part A of a transform T: normals by the inverse transpose of A, tangents
-// by A. Without SHEAR, every A is a rotation or reflection times a uniform scale, which transforms normals like
-// tangents. deform.cu describes the macros.
+// by A. Without SHEAR, the linear part of every T is a rotation or reflection times a uniform scale, which transforms
+// normals like tangents. deform.cu describes the macros.
 //
-// A is computed in f64, because its cofactors and determinant lose precision to cancellation if A is nearly singular,
-// and the sign of the determinant decides which side a surface faces. Products of two f32 are exact in f64, and every
-// other operation is rounded as in the CPU twin (no fused multiply-add). The determinant thus has the sign that the
-// twin computes, and is zero for the same inputs. No intermediate value overflows or underflows. A of a follower is the
-// product of two matrices, also computed in f64. CPU twin: src/compute/reference/rigid_normals.rs.
+// A is computed in f64, because its cofactors and determinant lose precision to cancellation if A is nearly singular.
+// The sign of the determinant decides which side a surface faces. Products of two f32 are exact in f64, and every other
+// operation is rounded as in the CPU twin (no fused multiply-add). The determinant thus has the sign that the twin
+// computes, and is zero for the same inputs. No intermediate value overflows or underflows. For a follower (a domain
+// whose T depends on another domain), A is the product of two matrices, also computed in f64. CPU twin:
+// src/compute/reference/rigid_normals.rs.
 #pragma once
 #include "transform.cuh"
 
@@ -36,7 +37,7 @@ __device__ inline double3 multiply_linear_row(const float4& row, const Affine& f
 }
 #endif
 
-// A of a domain.
+// The linear part of T of a domain.
 __device__ inline Mat3d load_linear_part(const Transforms& transforms, unsigned domain) {
 #ifdef FOLLOWERS
     const TransformLink link = load_transform_link(transforms, domain);

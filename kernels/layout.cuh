@@ -1,11 +1,15 @@
-// Structs and constants that host and kernels share. Twin: src/compute/gpu/tables/layout.rs; tests compare the size of
-// every struct and the offset of every field. The first comment of a kernel describes the arrays of its arguments.
+// Structs and constants that host and kernels share. The host's copy is src/compute/gpu/tables/layout.rs; tests compare
+// the size of every struct and the offset of every field. The comment at the top of each kernel file describes the
+// arrays in the kernel's arguments.
 //
 // Terms:
 // - A shape is a mesh with its modes U. Several domains can use one shape.
 // - An item is a vertex or a corner (a vertex of a triangle, with its normal). A quad is four consecutive items of a
 //   domain.
 // - A tile is up to 32 quads, the work of one warp. A mixed tile has quads of several domains.
+// - A chunk is 1, 2 or 4 modes, depending on the storage type of U (chunk.cuh).
+// - A full step computes all domains. A partial step computes only the dirty tiles: those of domains that changed after
+//   the step that the output buffers contain.
 // - The tables of all domains are concatenated: the packed index of a vertex or corner counts the vertices or corners
 //   of all preceding domains too.
 // - A field `first_X` is the index of the first element in the table of X: `first_word` in `words`, `first_q` in `q`.
@@ -32,11 +36,11 @@ struct StepHeader {
     float* normals;
     float4* tangents;
     float* displacements;
-    unsigned output_step;      // the output buffers contain all changes up to this step, before the launch
-    unsigned last_full_step;   // number of the last full step, which computes all domains
+    unsigned output_step;      // number of the last step that the output buffers contain before the launch
+    unsigned last_full_step;   // number of the last full step
     unsigned step;             // number of this step, counted from 1
     unsigned change_count;     // number of `Change` entries for `apply`
-    unsigned dirty_tile_count; // number of tiles in the tile list
+    unsigned dirty_tile_count; // number of entries of `tile_list`
     unsigned reserved[3];
     // Output of `bounds`, zero before the launch: `float_to_ordered` maxima of -x, -y, -z, x, y, z of all positions.
     // With ORIENTED_BOUNDS, six more maxima, with the coordinates along `BoundsArgs::bounding_axes` instead of x, y, z.
@@ -44,8 +48,9 @@ struct StepHeader {
 };
 static_assert(sizeof(StepHeader) == 112, "StepHeader differs from src/compute/gpu/tables/layout.rs");
 
-// Bit masks of `WarpTile::kind`. A tile with TILE_VERTICES and TILE_CORNERS computes corner i of a shape together with
-// vertex i; its items are vertices. The items of a tile with only TILE_CORNERS are corners.
+// Bit masks of `WarpTile::kind`. The items of a tile with TILE_VERTICES are vertices. If such a tile also has
+// TILE_CORNERS, then it also computes the corners of the shape with the same indices as its vertices. The items of a
+// tile with only TILE_CORNERS are corners.
 constexpr unsigned LAST_QUAD_ITEMS = 7; // number of items of the last quad, 1 to 4; 0 in a mixed tile
 constexpr unsigned TILE_VERTICES = 8;   // the tile computes positions
 constexpr unsigned TILE_CORNERS = 16;   // the tile computes normals and tangents
@@ -57,7 +62,7 @@ struct WarpTile {
     unsigned rest_quad;            // index of the first quad
     unsigned domain;
     unsigned first_q;
-    unsigned first_scale;
+    unsigned first_scale;          // in a mixed tile, `mixed_quad_scales` is used instead
     unsigned short chunk_count;
     unsigned char quad_count;
     unsigned char kind;
@@ -76,7 +81,7 @@ static_assert(sizeof(MixedQuad) == 16, "MixedQuad differs from src/compute/gpu/t
 // Offsets of a domain for `normals`. Domains of one shape differ only in `first_corner` and `first_vertex`.
 struct NormalSlot {
     unsigned first_corner;       // packed index
-    unsigned first_normal;       // index into a plane of `rest_normals`
+    unsigned first_normal;       // index into each of the three parts (x, y, z) of `rest_normals`
     unsigned first_tangent;      // index into `rest_tangents`, or NO_TANGENTS
     unsigned first_vertex;       // packed index
     unsigned first_corner_group; // index into `corner_groups`, or NO_GROUPS
@@ -110,14 +115,14 @@ struct DeformArgs {
     const float4* rest_tangents;
     const unsigned* corner_offsets;
     const float* scales;
-    const unsigned* mixed_quad_scales;
+    const unsigned* mixed_quad_scales; // per mixed quad, `first_scale`
     const float4* transforms;
     const TransformLink* transform_links;
     const float4* frames;
     const float* q;
     const unsigned* tile_list;
-    const unsigned* retained_counts;
-    const unsigned short* retained;
+    const unsigned* retained_counts; // per domain, number of its retained chunks, which are not truncated
+    const unsigned short* retained;  // indices of the retained chunks
     unsigned* boxes;
     unsigned tile_count;
     unsigned reserved;
@@ -141,7 +146,7 @@ struct BatchMember {
     unsigned first_vertex; // packed index
     unsigned first_q;
     unsigned domain;
-    unsigned first_tile; // index of the domain's first tile in the list of `deform`; locates the domain's boxes
+    unsigned first_tile; // index of the domain's first tile among the tiles of `deform`, four boxes each in `boxes`
 };
 static_assert(sizeof(BatchMember) == 16, "BatchMember differs from src/compute/gpu/tables/layout.rs");
 
@@ -220,9 +225,9 @@ struct NormalsArgs {
     const unsigned* ring_offsets;
     const unsigned* rings;
     const float* group_normals;
-    unsigned corner_count;
-    unsigned rest_corner_count;
-    unsigned group_count;
+    unsigned corner_count;      // of all domains
+    unsigned rest_corner_count; // of all shapes
+    unsigned group_count;       // smoothing groups of all shapes
     unsigned reserved;
 };
 static_assert(sizeof(NormalsArgs) == 120, "NormalsArgs differs from src/compute/gpu/tables/layout.rs");
@@ -232,9 +237,9 @@ __device__ inline bool is_dirty(const StepHeader* header, const unsigned* change
     return max(__ldg(&header->last_full_step), __ldg(change_steps + domain)) > __ldg(&header->output_step);
 }
 
-// Finds the domain of a packed corner, for the blocks of `normals`: the last slot that begins at or before the corner.
-// `first_domains[b]` is the domain of the first corner of block b, and the last entry is the last domain. A block
-// inside one domain needs no search.
+// Finds the domain of a packed corner in a block of `normals`: the last domain whose first corner is at or before the
+// corner. `first_domains[b]` is the domain of the first corner of block b, and the last entry is the last domain. A
+// block inside one domain needs no search.
 __device__ inline unsigned find_domain(const NormalSlot* slots, const unsigned* first_domains, unsigned corner) {
     unsigned low = first_domains[blockIdx.x];
     unsigned high = first_domains[blockIdx.x + 1];

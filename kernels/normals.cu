@@ -12,7 +12,7 @@
 //                  bitangent                                                                            (in)
 //   transforms     [roots][3] float4: the rows of T of each transform root                              (in)
 //   transform_links, frames  with FOLLOWERS, as for `deform`                                            (in)
-//   change_steps   [domains] u32: the step that last changed the domain                                 (in)
+//   change_steps   [domains] u32: number of the step that last changed the domain                       (in)
 //   corner_groups  per corner of a shape that has groups, the index of its smoothing group              (in)
 //   ring_offsets   [group_count + 1] u32: index of the first entry of each ring, then the end of the last one (in)
 //   rings          u32: the rings of all groups. The first vertex of each fan has the flag RING_START   (in)
@@ -22,7 +22,7 @@
 //   tangents       with NORMAL_MAPS: [corners] float4, world, zeros for shapes without tangents; address in the
 //                  header                                                                               (out)
 // Launch: BLOCK threads per block, a thread per packed corner, ceil(corners / BLOCK) blocks over all domains. A block
-// is skipped if none of its domains has changed since this output was written. CPU twin:
+// returns early if none of its domains has changed since its part of `normals` was last written. CPU twin:
 // src/compute/reference/normals.rs, which defines the result.
 //
 // Each corner has a thread, so the corners of one group repeat its sum, with data from the cache. A separate pass over
@@ -44,7 +44,7 @@ constexpr double RESOLUTION = 1.0 / 262144.0;
 constexpr float MIN_BISECTOR_SQUARED_LENGTH = 1e-10f;
 
 // The smallest rotation that takes the rigid unit normal of a group to its deformed unit normal. The rigid normal is
-// that at rest, transformed by T. Without a defined rotation, the surface keeps its rigid normals.
+// the normal at rest, transformed by T. Without a defined rotation, the surface keeps its rigid normals.
 struct ShortestArc {
     float3 rigid_normal, deformed_normal;
     bool is_defined;
@@ -113,10 +113,10 @@ __device__ ShortestArc compute_surface_rotation(const NormalsArgs& args, const N
         return rotation;
     }
     const unsigned group = __ldg(args.corner_groups + slot.first_corner_group + (corner - slot.first_corner));
-    const float* rest_normal = args.group_normals + group;
-    const size_t plane_stride = args.group_count;
-    const double3 normal = make_double3(__ldg(rest_normal), __ldg(rest_normal + plane_stride),
-                                        __ldg(rest_normal + 2 * plane_stride));
+    const float* group_normal = args.group_normals + group;
+    const size_t axis_stride = args.group_count;
+    const double3 normal = make_double3(__ldg(group_normal), __ldg(group_normal + axis_stride),
+                                        __ldg(group_normal + 2 * axis_stride));
     if (normal.x == 0.0 && normal.y == 0.0 && normal.z == 0.0) {
         return rotation;
     }
@@ -162,6 +162,7 @@ __device__ float3 orthogonalize(const float3& tangent, const float3& normal) {
     if (dot(perpendicular, perpendicular) > 1e-12f) {
         return normalize(perpendicular);
     }
+    // The cross product of the normal with the x axis, or with the y axis if the normal is close to the x axis.
     return normalize(fabsf(normal.x) < 0.9f ? make_float3(0.0f, normal.z, -normal.y)
                                           : make_float3(-normal.z, 0.0f, normal.x));
 }
@@ -179,9 +180,9 @@ extern "C" __global__ void __launch_bounds__(BLOCK) normals(const __grid_constan
         const Mat3d linear = load_linear_part(transforms_of(args), domain);
         const ShortestArc rotation = compute_surface_rotation(args, slot, linear, corner);
         const float* rest_normal = args.rest_normals + slot.first_normal + (corner - slot.first_corner);
-        const size_t plane_stride = args.rest_corner_count;
-        float3 normal = transform_normal(linear, make_double3(__ldg(rest_normal), __ldg(rest_normal + plane_stride),
-                                                              __ldg(rest_normal + 2 * plane_stride)));
+        const size_t axis_stride = args.rest_corner_count;
+        float3 normal = transform_normal(linear, make_double3(__ldg(rest_normal), __ldg(rest_normal + axis_stride),
+                                                              __ldg(rest_normal + 2 * axis_stride)));
         if (rotation.is_defined) {
             normal = normalize(rotate(rotation, normal));
         }

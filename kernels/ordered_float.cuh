@@ -31,7 +31,8 @@ __device__ inline unsigned warp_max(unsigned key) {
 #endif
 }
 
-// Reduces the six keys of a box (layout.cuh) to their maxima over the warp. Lane i returns the maximum of keys[i % 6].
+// Reduces the six keys of a box (the maxima of -x, -y, -z, x, y, z) to their maxima over the warp. Lane i returns the
+// maximum of keys[i % 6].
 __device__ inline unsigned reduce_box_keys(const unsigned (&keys)[6]) {
     const unsigned side = threadIdx.x % 32 % 6;
     unsigned lane_key = 0;

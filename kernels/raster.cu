@@ -12,8 +12,8 @@
 //   CUT_OUTS            triangles from `first_cut_out` on are cut-outs, which pass an alpha test before the atomic
 //   COUNT_TRIANGLES     count the triangles per `TriangleBin`
 //   MAX_THREAD_SAMPLES  maximum number of samples in the rectangle of a triangle that a thread draws
-//   MAX_WARP_EXTENT     maximum width and height, in 1/256 pixel, of a triangle that a warp draws; at most 16384, so
-//                       that 32 bits hold its edge functions
+//   MAX_WARP_EXTENT     maximum width and height, in 1/256 pixel, of a triangle that a warp draws; at most 16384 (64
+//                       pixels), so that 32 bits hold its edge functions, at most 2 * 16384^2 = 2^29
 // Launch: BLOCK threads per block. raster and raster_cut_outs need a thread per triangle. raster_warps and raster_tiles
 // loop over their queues, with any number of blocks. CPU twin: VisibilityBuffer::draw.
 // VisibilityBuffer is in src/compute/reference/raster.rs.
@@ -235,8 +235,8 @@ extern "C" __global__ void __launch_bounds__(BLOCK, 4) raster_warps(const __grid
     }
 }
 
-// Finds the last entry of the large queue whose first tile is at or before `tile`, the index of a tile among the tiles
-// of all entries. The warp tests 32 entries at a time.
+// Finds the entry of the large queue that contains `tile`, the index of a tile among the tiles of all entries: the last
+// entry whose first tile is at or before `tile`. The warp tests 32 entries at a time.
 __device__ inline LargeTriangle find_large_triangle(const RasterArgs& args, unsigned entry_count, unsigned long long tile) {
     const LargeTriangle* queue = (const LargeTriangle*)args.large_queue;
     unsigned low = 0, high = entry_count;

@@ -1,7 +1,7 @@
 // Triangle setup of the compute rasterizer: corners in clip space, clipping, snapping to 1/256 pixel, edge functions
 // and depth. Every float sum and product is rounded separately (no fused multiply-add), so that host and device give
-// the same bits. In window coordinates (pixels) y points down. Each pixel has one sample, at its center; that of the
-// first pixel is at (1/2, 1/2). raster.cu describes the macros DEPTH_ONLY and CUT_OUTS. Twin:
+// the same bits. In window coordinates (pixels) y points down. Each pixel has one sample, at its center: the sample of
+// the first pixel is at (1/2, 1/2). raster.cu describes the macros DEPTH_ONLY and CUT_OUTS. Twin:
 // src/compute/reference/raster.rs.
 #pragma once
 
@@ -29,7 +29,7 @@ struct RasterArgs {
     unsigned first_cut_out;              // with CUT_OUTS: the first cut-out triangle; all later ones are cut-outs too
 };
 
-// A triangle of the large queue.
+// An entry of the large queue. A tile is 64 x 64 pixels of the window.
 struct LargeTriangle {
     unsigned long long first_tile; // number of tiles of all preceding entries
     unsigned triangle;
@@ -39,7 +39,7 @@ struct LargeTriangle {
 struct RasterCounters {
     unsigned medium_count, pad;
     unsigned long long large_count; // number of entries << TILE_COUNT_BITS (raster.cu) | number of tiles of all entries
-    unsigned bin_counts[8];         // by TriangleBin, only with COUNT_TRIANGLES
+    unsigned bin_counts[8];         // number of triangles per TriangleBin, only with COUNT_TRIANGLES
 };
 
 // How a triangle is drawn (SMALL by a thread, MEDIUM by a warp, LARGE by a warp per tile), or why it is not drawn.

@@ -1,8 +1,8 @@
 // Rigid normals and tangents of a tile: the rest normals and tangents, transformed by T without U q (equation 3.8 of
-// the thesis). A is the linear part of T. Normals are transformed by the inverse transpose of A, tangents by A. A
-// reflection flips the sign of the bitangent. CPU twin: src/compute/reference/rigid_normals.rs.
+// the thesis). Normals are transformed by the inverse transpose of the linear part of T, tangents by the linear part. A
+// T with a reflection flips the sign of the bitangent. CPU twin: src/compute/reference/rigid_normals.rs.
 //
-// The matrix of a lane is scaled by a power of two so that its largest entry is about 1. If the matrix then makes a
+// Each lane scales its matrix by a power of two, so that the largest entry is about 1. If the scaled matrix makes a
 // unit vector shorter than 0.1, the result has lost precision in f32 and is computed again in f64. deform.cu includes
 // this file and describes the macros.
 #pragma once

@@ -11,10 +11,10 @@ struct Affine {
 
 // Tables from which T is composed.
 struct Transforms {
-    const float4* rows; // [roots][3]: rows of T
+    const float4* rows; // [roots][3]: the three rows of T of each transform root
 #ifdef FOLLOWERS
     const TransformLink* transform_links;
-    const float4* frames; // [followers][3]: rows of F
+    const float4* frames; // [followers][3]: the three rows of F of each follower
 #endif
 };
 
@@ -67,7 +67,7 @@ __device__ __forceinline__ Affine load_transform(const Transforms& transforms, u
 #endif
 }
 
-// A row of T times a point.
+// A row of T times the point (x, y, z): one coordinate of the transformed point.
 __device__ __forceinline__ float transform_row(const float4& row, float x, float y, float z) {
     return fmaf(row.x, x, fmaf(row.y, y, fmaf(row.z, z, row.w)));
 }

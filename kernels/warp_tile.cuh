@@ -28,7 +28,9 @@ struct LaneSlice {
     unsigned item_count;           // number of items to write
     unsigned domain;
     unsigned warp_item_count;  // number of items of all lanes of the warp in a tile of one domain; 0 in a mixed tile
-    unsigned rest_quad;        // index of the tile's first quad in the rest tables; in a mixed tile, of the lane's quad
+    // Index of the tile's first quad (in a mixed tile, of the lane's quad) in the rest tables: x0, rest normals and
+    // rest tangents.
+    unsigned rest_quad;
     unsigned component_stride; // number of float4 vectors from one component of a quad in a rest table to the next one
     unsigned first_q;
     unsigned first_scale;
@@ -170,8 +172,8 @@ struct LaneItems {
 };
 
 // Pointer to the first component of a lane's first item in a rest table (x0, normals or tangents). Such a table has
-// [component][quad] float4 per tile of one domain, and [component] float4 per quad of a mixed tile. A float4 has one
-// component of the four items of a quad.
+// [component][quad] float4 per tile of one domain, and [component] float4 per quad of a mixed tile. A float4 has the
+// same component of the four items of a quad.
 __device__ __forceinline__ const float* item_pointer(const float4* table, const LaneSlice& slice, unsigned component_count) {
     const unsigned quad = slice.kind & LAST_QUAD_ITEMS ? slice.quad : 0;
     return (const float*)(table + component_count * (size_t)slice.rest_quad + quad) + slice.item_in_quad;

@@ -13,7 +13,8 @@
 //   positions       [vertices][3] f32; domain b begins at vertex `first_vertices[b]`                         (out)
 // Launch: one block of WARPS warps per tile (tests/bench/src/kernels/batch_mma.rs). CPU twin: the tests of that file.
 //
-// A matrix product (mma.m16n8k16) sums the 16 modes of a step for the 8 domains of a group.
+// A matrix product (mma.m16n8k16) sums the 16 modes of a step for the 8 domains of a group. Its left matrix has entries
+// of U, its right matrix has coordinates of q.
 //
 // The result is not bit-identical to that of `deform`: q has 22 bits (f16) or 16 bits (bf16), and a tensor core sums
 // the 16 products of a step in its own order and with its own rounding. The a-priori error bound covers both effects.
@@ -29,7 +30,8 @@
 // a quarter of the domains, so it computes the positions of whole vertices. The sums of 16 domains, two steps of U, and
 // q take 160 registers. This allows 12 warps per multiprocessor. In flight per multiprocessor:
 // 12 warps x 2 steps x 8 chunks x 8 quads x 48 bytes = 72 KB.
-// Types of the two operands of a matrix product.
+
+// Types of the entries of the left and the right matrix of a product.
 #if defined(STORE_BF16)
 #define OPERANDS "bf16.bf16"
 #else
@@ -107,17 +109,17 @@ struct Chunk {
     unsigned words[12];
 };
 
-// Loads a chunk; beyond the last chunk, loads zeros. Its coordinates are zero there, but memory beyond the last chunk
-// may contain NaN or infinity, whose product with zero is not zero.
+// Loads a chunk; beyond the last chunk, sets zeros. The coordinates of modes beyond the last chunk are zero, but memory
+// there may contain NaN or infinity, whose product with zero is not zero.
 __device__ __forceinline__ void load_chunk(Chunk& chunk, const BatchMmaArgs& args, const WarpPart& part, unsigned index) {
 #pragma unroll
-    for (unsigned plane = 0; plane < 3; ++plane) {
-        const uint4* src = part.words + (3 * (size_t)index + plane) * part.tile_quads;
+    for (unsigned i = 0; i < 3; ++i) {
+        const uint4* src = part.words + (3 * (size_t)index + i) * part.tile_quads;
         const uint4 word = index < args.chunks ? __ldcs(src) : make_uint4(0, 0, 0, 0);
-        chunk.words[4 * plane] = word.x;
-        chunk.words[4 * plane + 1] = word.y;
-        chunk.words[4 * plane + 2] = word.z;
-        chunk.words[4 * plane + 3] = word.w;
+        chunk.words[4 * i] = word.x;
+        chunk.words[4 * i + 1] = word.y;
+        chunk.words[4 * i + 2] = word.z;
+        chunk.words[4 * i + 3] = word.w;
     }
 }
 
@@ -133,7 +135,7 @@ __device__ __forceinline__ void load_step(Step& step, const BatchMmaArgs& args, 
 }
 
 // Sums of the lane's quad: [2 axis + pair of vertices][group][2 (vertex in the pair) + parity]. A lane has two of the
-// eight domains of a group: 2 (lane % 4) + parity.
+// eight domains of a group: 2 (lane % 4) + parity, with a parity of 0 or 1.
 typedef float Sums[6][GROUPS][4];
 
 // Adds the product of the lane's entries `u` and coordinates `q0` and `q1` to `sum`. All lanes must call this.

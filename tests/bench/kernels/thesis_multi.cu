@@ -2,14 +2,14 @@
 // WIDTH (w_g in the thesis) consecutive lanes of a warp, which compute one or several rows of U q. A lane multiplies
 // four modes.
 //   entries  [lanes of all warps] float4: U'' of all domains of one group width, four modes of a row of U per
-//            lane                                                                                                (in)
+//            lane. U'' has the rows of U, padded to whole float4, in the order in which groups compute them      (in)
 //   meta     [lanes of all warps] uint4: index of the row's result in u, counted in floats, or IDLE; index of the
 //            lane's four coordinates in q, counted in float4; n_vr, the number of lanes per row of U; an unused
 //            number                                                                                              (in)
 //   q        coordinates of each domain, padded to whole float4                                                  (in)
 //   u        float4 per vertex of the domains with modes; the fourth number is not written                       (out)
 // Launch: 256 threads per block, one thread per lane; the lanes fill whole blocks.
-// tests/bench/src/kernels/thesis/group.rs explains U'' and n_vr, and packs the inputs.
+// tests/bench/src/kernels/thesis/group.rs packs the inputs.
 //
 // CPU twin: the tests of tests/bench/src/kernels/thesis/thesis_multi.rs.
 #ifndef WIDTH

@@ -36,7 +36,7 @@ pub(super) const SOURCE: BenchmarkSource = BenchmarkSource {
     ],
 };
 
-/// Bytes of a tile, which one block of `copy` or `read` processes with `loads` loads per thread.
+/// Bytes of a tile, the work of one block of `copy` or `read` with `loads` loads per thread.
 pub(super) const fn tile_bytes(loads: u64) -> u64 {
     BLOCK * loads * VECTOR_BYTES
 }

@@ -230,8 +230,9 @@ fn split_coordinates(scene: &Scene, state: &SceneState, tiles: &TiledModes) -> V
     (0..scene.domains.len()).map(split_domain).collect()
 }
 
-/// The fragments of q in the order in which lanes read them: [step][group of 8 domains][lane][4 words]. A word
-/// holds the 16-bit numbers of two neighboring modes. Numbers beyond the last domain or mode are zero.
+/// The fragments of q (the parts of a matrix that single lanes hold) in the order in which lanes read them:
+/// [step][group of 8 domains][lane][4 words]. A word holds the 16-bit numbers of two neighboring modes. Numbers beyond
+/// the last domain or mode are zero.
 fn pack_fragments(split_q: &[SplitCoordinates], rank: usize, batch_size: usize) -> Vec<u32> {
     let steps = rank.div_ceil(STEP_MODES);
     // A step has a pair of 16-bit numbers for each domain and mode: one word of 32 bits.
@@ -270,6 +271,7 @@ fn args_without_addresses(scene: &Scene, chunks: usize) -> BatchMmaArgs {
         domains: slots.len() as u32,
         vertices: slots[0].vertices as u32,
         chunks: chunks as u32,
+        // Positions of four vertices have 48 bytes, a multiple of 16.
         is_aligned: u32::from(slots.iter().all(|slot| slot.first_vertex.is_multiple_of(QUAD))),
         ..BatchMmaArgs::zeroed()
     };
@@ -364,12 +366,13 @@ mod tests {
                 let (scene, state) = instanced_scene(vertices, rank, domains, storage);
                 let inputs = KernelInputs::pack(&scene, &state);
                 let positions = twin_of_batch_mma(&inputs, 3 * scene.layout.vertices);
+                let size = format!("{storage:?}, {vertices} vertices, {rank} modes, {domains} domains");
                 for (packed_vertex, got) in positions.chunks_exact(3).enumerate() {
                     let (domain, vertex) = (packed_vertex / vertices, packed_vertex % vertices);
                     // The expected position uses U as stored, so that the rounding of U is not part of the error.
                     let want = stored_position(&scene, &state, &inputs.tiles, (domain, vertex));
                     let is_close = got.iter().zip(want).all(|(got, want)| (f64::from(*got) - want).abs() < tolerance);
-                    assert!(is_close, "{storage:?} n {vertices} r {rank} d {domains}: expected {want:?}, got {got:?}");
+                    assert!(is_close, "{size}: expected {want:?}, got {got:?}");
                     // Negative control: the next vertex of the next domain has another position. Random positions
                     // differ by more than 1e-3, ten times the larger tolerance.
                     let next = position_of(&scene, &state, (domain + 1) % domains, (vertex + 1) % vertices);

@@ -160,6 +160,7 @@ impl DeformerBenchmark {
         let full_step = StepHeader { last_full_step: 1, ..self.header() };
         for (inputs, state) in self.step_inputs.iter_mut().zip(states) {
             let mut staging = inputs.allocate_staging(device)?;
+            // No domain is outdated: step 1 computed all domains.
             let lengths = apply.write(
                 &mut change_list,
                 self.deform.packer(),
@@ -167,7 +168,7 @@ impl DeformerBenchmark {
                 ChangedDomains { changed, outdated: &[] },
             )?;
             let ChangeListLengths { change_count, dirty_tile_count } = lengths.ok_or_else(not_partial)?;
-            // The output shows step 1. Step 2 changes the listed domains.
+            // The output buffers contain step 1. Step 2 changes the listed domains.
             let header = StepHeader { output_step: 1, step: 2, change_count, dirty_tile_count, ..full_step };
             upload_step(device, (inputs, &mut staging), &header, state)?;
             // SAFETY: `change_list` was written above with the packer that `deform` and `inputs` use. The next
@@ -196,8 +197,9 @@ impl DeformerBenchmark {
         }
     }
 
-    /// Fraction of the modes that truncation retains, weighted by vertices: the mean over the timed input sets. `None`
-    /// without truncation. Truncation omits whole chunks: the one, two or four modes that are stored together.
+    /// Fraction of the modes that truncation retains, weighted by vertices: the mean over the first [`MAX_GRAPHS`]
+    /// input sets, which are timed. `None` without truncation. Truncation omits whole chunks: the one, two or four
+    /// modes that are stored together.
     fn retained_mode_share(&self) -> Option<f64> {
         let per_chunk = modes_per_chunk(self.scene.deformation.storage);
         let weighted_sum = |chunk_count_of: &dyn Fn(usize) -> usize| -> f64 {
@@ -331,6 +333,7 @@ impl KernelBenchmark for DeformerBenchmark {
 
     fn traffic(&self) -> Vec<ArrayTraffic> {
         let StepCounts { vertices, coordinates, transform_bytes, mode_bytes, rest_bytes } = self.counts;
+        // The part of U that truncation retains.
         let retained_traffic = |share: f64| ArrayTraffic::new("U kept", (share * mode_bytes as f64) as u64);
         let mode_traffic = self.retained_mode_share().map_or(ArrayTraffic::new("U", mode_bytes), retained_traffic);
         let mut traffic = vec![

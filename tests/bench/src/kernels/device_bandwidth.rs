@@ -47,7 +47,8 @@ pub struct DeviceBandwidth {
 /// `Unavailable` when NVRTC is missing; `Fault` when the device fails or `copy` does not copy.
 pub fn measure_bandwidth(device: &Device) -> Result<DeviceBandwidth> {
     let (free, _) = device.memory()?;
-    // Variants have up to 16 loads per thread. A buffer of whole tiles of 16 loads has whole tiles of every variant.
+    // A block processes one tile, of a size proportional to the variant's loads per thread: 1, 2, 4, 8 or 16. A buffer
+    // of whole tiles of 16 loads therefore has whole tiles of every variant.
     let max_tile_bytes = tile_bytes(16);
     let bytes = (MAX_BUFFER.min(free as u64 / 8) / max_tile_bytes).max(1) * max_tile_bytes;
     let src = random_buffer(device, bytes)?;

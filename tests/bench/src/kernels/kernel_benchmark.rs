@@ -23,8 +23,9 @@ pub trait KernelBenchmark {
     /// `Fault` when the device fails.
     fn launch(&self, device: &Device, input_set: usize) -> Result<()>;
 
-    /// Computes the positions of the domains that [`Self::launch`] with this input set skips. Validation calls this
-    /// before `launch`. By default, `launch` skips no domain.
+    /// Computes the positions of the domains that [`Self::launch`] with this input set does not compute, because the
+    /// step changes only some domains. Validation calls this before `launch`. By default, `launch` computes all
+    /// domains.
     ///
     /// # Errors
     /// `Fault` when the device fails.

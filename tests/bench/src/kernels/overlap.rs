@@ -180,6 +180,7 @@ fn run_overlapped(
             deformer.submit(&states[step % states.len()])?;
             readbacks.push_back(deformer.readback(VertexAttributes::POSITIONS_AND_NORMALS)?);
         }
+        // With more readbacks than steps in flight, the oldest readback belongs to the step that `finish` completed.
         let is_oldest_finished = readbacks.len() > MAX_STEPS_IN_FLIGHT || step >= steps;
         if let Some(finished_step) = finished_step
             && is_oldest_finished

@@ -116,7 +116,7 @@ impl RasterBenchmark {
         Ok(depths)
     }
 
-    /// Triangle counts of the last launch; zeros unless counting is enabled.
+    /// Triangle counts of the last launch; zeros without [`RasterVariant::count_triangles`].
     ///
     /// # Errors
     /// `Fault` when the device fails.

@@ -26,7 +26,8 @@ pub(super) const MAX_GRAPHS: usize = 8;
 /// Warm-up time before timing, so that the device reaches its clock rates.
 const WARM_UP: Duration = Duration::from_millis(30);
 
-/// Size of the buffer that evicts the L2 cache, in multiples of the size of the cache.
+/// Size of the buffer that evicts the L2 cache, in multiples of the size of the cache. Reading as many bytes as the
+/// cache has might leave some of the old lines in it.
 const L2_FLUSH_FACTOR: u64 = 4;
 
 /// Times steps of a benchmark. Each input set has a CUDA graph. The graphs are replayed in rotation. An event before

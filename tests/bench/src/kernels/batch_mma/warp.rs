@@ -50,12 +50,13 @@ impl KernelInputs {
     }
 }
 
-/// Adds the product of fragments A and B to D, as the PTX instruction `mma.m16n8k16` does. The PTX manual defines which
-/// lane holds which entries ("Matrix Fragments for mma.m16n8k16"). Lane 4 g + t holds rows g and g + 8 of A and D,
-/// column g of B, and columns 2 t and 2 t + 1 of D.
+/// Adds the product of the matrices A (entries of U) and B (coordinates of q) to matrix D, as the PTX instruction
+/// `mma.m16n8k16` does. `a`, `b` and `d` hold the fragment of each lane, the part of the matrix in the registers of the
+/// lane. The PTX manual defines which lane holds which entries ("Matrix Fragments for mma.m16n8k16"). Lane 4 g + t
+/// holds rows g and g + 8 of A and D, column g of B, and columns 2 t and 2 t + 1 of D.
 fn multiply(inputs: &KernelInputs, a: &[[u32; 4]; 32], b: &[[u32; 2]; 32], d: &mut [[f64; 4]; 32]) {
-    // A register holds two numbers: the number of an even k in the lower half, of the following odd k in the upper
-    // half.
+    // k is a column of A and a row of B. A register holds two numbers: the number of an even k in the lower half, of
+    // the following odd k in the upper half.
     let decode_half = |register: u32, k: usize| inputs.decode(register >> (16 * (k % 2)) & 0xffff);
     // The lane that holds entry (row, k) of A, or entry (k, column) of B. In that lane, register row / 8 + 2 (k / 8)
     // holds the entry of A, and register k / 8 the entry of B.
@@ -139,8 +140,8 @@ pub(super) fn sum_modes(inputs: &KernelInputs, tile: usize, warp: usize) -> Accu
     sums
 }
 
-/// The staging buffer of one warp after a pass: the positions of four domains. Pass p stages the domains of parity p %
-/// 2 in group p / 2.
+/// The staging buffer of one warp after a pass: the positions of four domains. Pass p stages the domains of group p / 2
+/// with parity p % 2.
 pub(super) fn stage_positions(
     inputs: &KernelInputs,
     sums: &AccumulatorFragments,

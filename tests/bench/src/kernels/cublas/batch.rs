@@ -218,8 +218,8 @@ mod tests {
     use super::*;
     use modalcast_compute::testing::{displacement_of, scene_and_state};
 
-    /// Emulates cuBLAS on a batch: C = A B for strided matrices. A is row-major if `by_rows`, otherwise column-major. B
-    /// and C are column-major.
+    /// Emulates cuBLAS on a batch: C = A B for strided matrices. `a` (U) is row-major if `by_rows`, otherwise
+    /// column-major. `b` (q) and `c` (u) are column-major.
     fn multiply(batch: &GemmBatch, by_rows: bool, [a, b]: [&[f32]; 2], c: &mut [f32]) {
         let GemmCall { rows, inner, columns, lead, count, strides } = batch.call;
         let start_of = |first: u64, stride: i64, index: i32| first as usize + stride as usize * index as usize;
@@ -261,7 +261,7 @@ mod tests {
             for vertex in 0..scene.layout.domains[domain].vertices {
                 for (axis, want) in displacement_of(scene, state, domain, vertex).iter().enumerate() {
                     let got = f64::from(u[*offset as usize + 3 * vertex + axis]);
-                    // f32 sums of up to 12 products of numbers from -1 to 1 have errors below 1e-5.
+                    // Ten times the error bound of f32 sums of up to 12 products of numbers from -1 to 1.
                     assert!((got - want).abs() < 1e-4, "{} domain {domain} vertex {vertex}", method.name());
                 }
             }

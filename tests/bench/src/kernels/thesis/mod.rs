@@ -64,8 +64,8 @@ impl ThesisBenchmark {
     /// The kernels for many domains, followed by the vertex update for [`StepPart::Whole`].
     ///
     /// # Errors
-    /// `Invalid` when a domain has more than 32 modes, [`StepPart::Uq`] is requested and no domain has modes, or there is
-    /// no state; `Unavailable` when NVRTC is missing; `Fault` when the device fails.
+    /// `Invalid` when a domain has more than 32 modes, no domain has modes but [`StepPart::Uq`] is requested, or there
+    /// is no state; `Unavailable` when NVRTC is missing; `Fault` when the device fails.
     pub fn multi(
         device: &Device,
         scene: &Arc<Scene>,
@@ -121,8 +121,8 @@ impl KernelBenchmark for ThesisBenchmark {
         self.update.as_ref().map_or(Ok(()), |update| update.launch(device, inputs.transforms, u))
     }
 
-    /// For [`StepPart::Whole`], a vertex that no triangle refers to is NaN, because the vertex update computes the vertices
-    /// of triangles only.
+    /// For [`StepPart::Whole`], a vertex that no triangle refers to is NaN, because the vertex update computes the
+    /// vertices of triangles only.
     fn positions(&self, device: &Device) -> Result<Vec<f32>> {
         if let Some(update) = &self.update {
             return update.positions(device, self.vertices);
