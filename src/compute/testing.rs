@@ -10,7 +10,8 @@ pub use crate::gpu::{CAPABILITIES, CompiledVariant, assert_compiles};
 use modalcast_model::domain::{Corners, Domain, Material, Mesh, Modes, Shape};
 use modalcast_model::scene::{DeformationSettings, Scene, SceneParts, SceneState};
 
-/// Deterministic random numbers from -1 to 1: the linear congruential generator of Knuth's MMIX.
+/// Deterministic random numbers from -1 to 1: the linear congruential generator of Knuth's MMIX. The field is the state
+/// of the generator, at first the seed.
 #[derive(Debug)]
 pub struct TestRng(pub u64);
 
@@ -29,7 +30,8 @@ pub fn shape(vertices: usize, rank: usize, rng: &mut TestRng) -> Shape {
     shape_with_columns(vertices, rank, columns, rng)
 }
 
-/// A shape with random vertices and these columns of U.
+/// A shape with random vertices and these columns of U, `3 * vertices` entries per mode. Its only triangle is
+/// degenerate.
 pub fn shape_with_columns(vertices: usize, rank: usize, columns: Vec<f32>, rng: &mut TestRng) -> Shape {
     let rest_positions: Vec<[f32; 3]> = (0..vertices).map(|_| [rng.next(), rng.next(), rng.next()]).collect();
     let normals = vec![[0.0, 0.0, 1.0]; vertices];
@@ -93,10 +95,10 @@ pub fn displacement_of(scene: &Scene, state: &SceneState, domain: usize, vertex:
     })
 }
 
-/// x = T (x0 + u) of a vertex, in f64. The scene has no followers.
+/// x = T (x0 + u) of a vertex, in f64. No domain of the scene may follow another one.
 pub fn position_of(scene: &Scene, state: &SceneState, domain: usize, vertex: usize) -> [f64; 3] {
-    let (u, rest) =
-        (displacement_of(scene, state, domain, vertex), scene.shape_of(domain).mesh.rest_positions()[vertex]);
+    let u = displacement_of(scene, state, domain, vertex);
+    let rest = scene.shape_of(domain).mesh.rest_positions()[vertex];
     let (linear, offset) = (state.transforms[domain].linear(), state.transforms[domain].translation());
     let deformed = nalgebra::Vector3::from([0, 1, 2].map(|axis| f64::from(rest[axis]) + u[axis]));
     (linear * deformed + offset).into()

@@ -1,8 +1,8 @@
 //! Finds the domains that changed since the previous step, that is, those with any changed bit in q or T.
 //!
 //! The tracker compares the values of q and T. The state's own list of changes is not sufficient, because it misses
-//! values that were written to the fields directly. Serial numbers are not sufficient either: an unrelated state may
-//! have the same number.
+//! values that were written to the fields directly. The serial numbers of states are not sufficient either: an
+//! unrelated state may have the same number.
 
 use rayon::prelude::*;
 

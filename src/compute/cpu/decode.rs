@@ -2,8 +2,8 @@
 //! `[axis][vertex of the tile]`. Tiles of f32 are stored in this order already.
 //!
 //! The documentation of `crate::storage` defines the stored layout. A chunk has three planes, and a plane has 16 bytes
-//! (a packed word) per quad of four vertices. A packed word has one group of four entries or several: the entries of
-//! the quad's vertices for one mode and axis.
+//! (a packed word) per quad of four vertices. A group is the four entries of a quad for one mode and axis. A packed
+//! word has one group (f32), two groups (f16 and bf16) or four groups (int8).
 
 use crate::storage::{PackedWord, TILE_QUADS};
 

@@ -1,6 +1,6 @@
 //! Decodes and sums stored entries in vector registers, two quads (of four vertices) at a time. [`super::sum`] also has
-//! a path that first decodes columns to memory. This one is much faster and gives bit-identical results, but supports
-//! only x86 and uncompensated sums.
+//! a path that first decodes columns to memory. The code of this module is much faster and gives bit-identical results,
+//! but supports only x86 and uncompensated sums.
 //!
 //! The documentation of `crate::storage` defines the stored layout. A chunk of modes has three planes, and a plane has
 //! 16 bytes (a packed word) per quad. A group is the four entries of a quad for one mode and axis.
@@ -112,6 +112,8 @@ pub(super) fn add_chunks<D: Decode<GROUPS>, const GROUPS: usize, const MODES: us
     let quads = sums.len() / (3 * QUAD);
     let (x, yz) = sums.split_at_mut(QUAD * quads);
     let (y, z) = yz.split_at_mut(QUAD * quads);
+    // x, y and z become arrays of eight sums, one per pair of quads. The tails have the last quad if its pair is
+    // missing.
     let ((x, x_tail), (y, y_tail), (z, z_tail)) = (x.as_chunks_mut(), y.as_chunks_mut(), z.as_chunks_mut());
     for (pair, ((x, y), z)) in x.iter_mut().zip(y).zip(z).enumerate() {
         add_pair::<D, GROUPS, MODES, CHUNKS>(simd, &chunks, [2 * pair, 2 * pair + 1], [x, y, z]);

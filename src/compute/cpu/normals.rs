@@ -1,9 +1,10 @@
 //! Normals and tangents that follow the deformed triangles. Twin: `reference/normals.rs`, which defines them.
 //!
-//! Each corner belongs to a smoothing group. The ring of a group lists its vertex, then the vertices around it
-//! ([`SmoothingGroups`]). Each corner sums the area vectors around its group in the order of the ring, so threads share
-//! no sums. Positions and results are f32. Sums are f64, in which differences and products of two f32 neither overflow
-//! nor underflow. This costs little, because reading the ring takes longer than the arithmetic.
+//! Each corner belongs to a smoothing group. The ring of a group lists its vertex, then the vertices around it in fans:
+//! two consecutive vertices of a fan form a triangle with the group's vertex. The first vertex of a fan has the flag
+//! [`RING_START`] ([`SmoothingGroups`]). Each corner sums the area vectors around its group in the order of the ring,
+//! so threads share no sums. Positions and results are f32. Sums are f64, in which differences and products of two f32
+//! neither overflow nor underflow. This costs little, because reading the ring takes longer than the arithmetic.
 
 use nalgebra::{Matrix3, Vector3};
 
@@ -141,6 +142,7 @@ impl ShortestArc {
 /// A tangent without its component along the normal; if nothing remains, any unit vector perpendicular to the normal.
 fn orthogonalize(tangent: Vector3<f64>, normal: Vector3<f64>) -> Vector3<f64> {
     let projected = tangent - normal * normal.dot(&tangent);
+    // An axis that is not nearly parallel to the normal.
     let axis = if normal.x.abs() < 0.9 { Vector3::x() } else { Vector3::y() };
     projected.try_normalize(1e-6).unwrap_or_else(|| normal.cross(&axis).normalize())
 }

@@ -4,8 +4,8 @@
 use modalcast_model::domain::Shape;
 use modalcast_model::scene::{Scene, SceneState};
 
-/// World positions relative to the floating origins of their domains, three f64 per vertex, in the packed order of the
-/// scene's layout.
+/// World positions, three f64 per vertex, in the packed order of the scene's layout: one domain after the other. The
+/// positions of a domain are relative to its floating origin ([`SceneState::origin_of`]).
 pub fn deform(scene: &Scene, state: &SceneState) -> Vec<[f64; 3]> {
     let mut positions = Vec::with_capacity(scene.layout.vertices);
     for domain in 0..scene.domains.len() {
@@ -24,7 +24,8 @@ pub fn deform(scene: &Scene, state: &SceneState) -> Vec<[f64; 3]> {
     positions
 }
 
-/// u = U q of every vertex in the frame of its domain, three f64 each, in the packed order of the scene's layout.
+/// u = U q of every vertex in the frame of its domain, before T is applied: three f64 per vertex, in the packed order
+/// of the scene's layout.
 pub fn displacements(scene: &Scene, state: &SceneState) -> Vec<[f64; 3]> {
     let mut displacements = Vec::with_capacity(scene.layout.vertices);
     for domain in 0..scene.domains.len() {

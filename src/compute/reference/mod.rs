@@ -36,8 +36,8 @@ impl ReferenceDeformer {
         Self { bounding_axes: axes, ..self }
     }
 
-    /// Computes displacements and boxes if they are outputs of the scene. Displacements that overflow f32 make the
-    /// bounds NaN.
+    /// Computes displacements u and one box per domain, if they are outputs of the scene. Displacements that overflow
+    /// f32 make `bounds` NaN.
     fn compute_attributes(&mut self, state: &SceneState, bounds: &mut BoundingBox) {
         let (scene, surface) = (&self.scene, &mut self.surface);
         if scene.features.displacements {

@@ -18,8 +18,8 @@
 //! A tangent is rotated by the same rotation, then made orthogonal to the new normal. The bitangent keeps its sign, or
 //! is flipped by a mirroring T as in the rigid case. Tangents need no memory and no reads beyond those of rigid
 //! tangents and exact normals. The tangent follows the tilt of the surface. It does not follow rotation or shear within
-//! the surface, which would need texture gradients per triangle: 8 more bytes per entry of every ring (the list of
-//! vertices around a group).
+//! the surface, which would need texture gradients per triangle. A kernel would have to read 8 more bytes for each
+//! vertex around a group.
 //!
 //! # Fallback
 //! A corner keeps its rigid normal and tangent where no rotation can be determined:
@@ -108,11 +108,12 @@ fn rotate_normal(rotation: &ShortestArc, rigid_normal: [f64; 3]) -> Vector3<f64>
 /// A tangent without its component along the normal; if nothing remains, any unit vector perpendicular to the normal.
 fn orthogonalize(tangent: Vector3<f64>, normal: Vector3<f64>) -> Vector3<f64> {
     let projected = tangent - normal * normal.dot(&tangent);
+    // An axis that is not nearly parallel to the normal.
     let axis = if normal.x.abs() < 0.9 { Vector3::x() } else { Vector3::y() };
     if projected.norm() > 1e-6 { projected.normalize() } else { normal.cross(&axis).normalize() }
 }
 
-/// Calls `process` with each packed corner for which the rotation of the surface can be determined.
+/// Calls `process` with the packed index of each corner whose rotation can be determined, and with the rotation.
 fn for_each_rotated_corner(
     scene: &Scene,
     state: &SceneState,
@@ -130,6 +131,7 @@ fn for_each_rotated_corner(
         let area_transform = cofactors(&state.composed_transform(scene, domain).linear());
         for (corner, group) in smoothing.corner_groups().iter().enumerate() {
             let group = *group as usize;
+            // The geometric normal of a group without area at rest is zero.
             let has_normal = smoothing.normals()[group] != [0.0; 3];
             let is_resolved = current_areas[group].sum.norm() > RESOLUTION * current_areas[group].rounding_scale;
             if !has_normal || !is_resolved {

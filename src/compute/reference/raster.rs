@@ -64,8 +64,9 @@ pub struct ClippedPolygon {
 #[derive(Debug, Clone, PartialEq)]
 pub struct VisibilityBuffer {
     window: Viewport,
-    /// Row by row from the top. The upper 32 bits are the bits of the depth, the lower 32 bits the triangle.
-    /// [`EMPTY_KEY`] where no triangle covers the sample.
+    /// Row by row from the top. The upper 32 bits are the bits of the depth, the lower 32 bits the triangle. The bits
+    /// of non-negative floats have the order of the floats, so the smallest key has the smallest depth. [`EMPTY_KEY`]
+    /// where no triangle covers the sample.
     pub keys: Vec<u64>,
 }
 
@@ -165,6 +166,7 @@ pub fn clipped_polygon(
     if doubled_area == 0 {
         return Err(CullReason::Degenerate);
     }
+    // The corners of a front face are counterclockwise.
     if cull_mode == CullMode::Back && doubled_area > 0 {
         return Err(CullReason::BackFacing);
     }
@@ -215,7 +217,7 @@ fn min_covered_edge(start: &SnappedVertex, end: &SnappedVertex) -> i64 {
     i64::from(!(end.y < start.y || (end.y == start.y && end.x > start.x)))
 }
 
-/// Twice the signed area in (1/256 pixel)^2, positive if the corners are clockwise on the screen.
+/// Twice the signed area of a triangle in (1/256 pixel)^2, positive if the corners are clockwise on the screen.
 fn doubled_area(triangle: &[SnappedVertex; 3]) -> i64 {
     edge(&triangle[0], &triangle[1], triangle[2].x, triangle[2].y)
 }

@@ -144,6 +144,7 @@ mod tests {
                     let high = decode(split.pair(mode)[0], storage) * f64::from(split.inverse_scale());
                     high_part_exceeds_bound |= (high - coordinate).abs() > max_error;
                 }
+                // Subnormal coordinates have few bits, which the high part alone may represent.
                 assert!(
                     high_part_exceeds_bound || exponent < -120,
                     "{storage:?} 2^{exponent}: expected the high part alone to exceed the bound"
@@ -158,6 +159,7 @@ mod tests {
         let zeros = SplitCoordinates::new(&[0.0, -0.0], StorageType::F16);
         assert_eq!((zeros.decode_coordinate(0), zeros.decode_coordinate(1)), (0.0, 0.0));
         let wide = SplitCoordinates::new(&[f32::MAX, -f32::MAX, f32::MIN_POSITIVE, 1e-45], StorageType::F16);
+        // 3e-7 is above 2^-22, the relative error of a split coordinate in f16.
         assert!(
             (wide.decode_coordinate(0) / f64::from(f32::MAX) - 1.0).abs() < 3e-7
                 && wide.decode_coordinate(1) == -wide.decode_coordinate(0)

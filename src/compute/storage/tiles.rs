@@ -274,10 +274,12 @@ mod tests {
         let tiles = TiledModes::new(&shape, StorageType::F32);
         let float =
             |offset: usize| f32::from_ne_bytes(tiles.bytes()[offset..offset + 4].try_into().expect("four bytes"));
-        // Three quads. Vertex 6 is vertex 2 of quad 1. In f32, a chunk is one mode and a plane is one axis.
+        // The entry of vertex 6, axis 1 and mode 2. Nine vertices are three quads; vertex 6 is vertex 2 of quad 1. In
+        // f32, a chunk is one mode and a plane is one axis. The entry is in word (2 * 3 planes + 1) * 3 quads + 1 of 16
+        // bytes, behind two entries of 4 bytes.
         assert_eq!(float(((2 * 3 + 1) * 3 + 1) * 16 + 2 * 4), shape.modes.entry(6, 1, 2));
         assert_eq!(tiles.rest()[1][4 + 2], shape.mesh.rest_positions()[6][1]);
-        assert_eq!(tiles.rest()[2][1], 0.0);
+        assert_eq!(tiles.rest()[2][1], 0.0, "expected padding after vertex 8, the only vertex of quad 2");
         let tiles = TiledModes::new(&shape, StorageType::Int8);
         // Mode 2 and axis 1 are group 2 * 3 + 1 = 7 of 4 bytes in chunk 0: plane 1, bytes 12 to 15. The word has the
         // index plane * 3 + quad.

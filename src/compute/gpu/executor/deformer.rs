@@ -1,4 +1,5 @@
-//! The deformer of the `cuda` backend: a step is one graph of copies and kernels, and its bounds are read back with it.
+//! The deformer of the `cuda` backend: a step is one graph of copies and kernels. The graph also reads back the bounds
+//! of the step.
 //!
 //! Steps are double-buffered. A step can be submitted while the previous step is in flight: the host writes the values
 //! of the new step while the previous step runs. The host can also fetch the vertices of a step while the next step
@@ -335,7 +336,8 @@ impl CudaDeformer {
     }
 }
 
-/// The header of a step, without the addresses of its outputs.
+/// The header of a step, without the addresses of its outputs. A full step writes all outputs, so its `output_step`
+/// is 0.
 fn header(target: &StepTarget, list_lengths: Option<ChangeListLengths>, last_full_step: u32) -> StepHeader {
     let lengths = list_lengths.unwrap_or_default();
     StepHeader {

@@ -246,7 +246,7 @@ mod tests {
                 output_ring.begin_read();
             }
             let idle = 1 - output_ring.current_output;
-            output_ring.end_read(4);
+            output_ring.end_read(4); // the number of the last readback
             for serial in 5..5 + steps {
                 assert_ne!(step(&mut output_ring, &state(serial, &[serial as u32])).output, idle);
             }

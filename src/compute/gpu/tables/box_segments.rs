@@ -1,15 +1,17 @@
 //! Bounding boxes per domain: the segments that `bounds` reduces to boxes, and their union per domain. Pure.
 //!
 //! A domain with tiles of its own is split into segments of consecutive tiles, whose boxes `deform` computed. A domain
-//! that shares a tile with other domains is one segment, the range of its vertices. One domain of millions of vertices
-//! thus keeps as many threads busy as 200,000 small domains. The host unites the boxes of the segments of a domain.
+//! that shares a tile with other domains is one segment, the range of its vertices. An item of a segment is therefore a
+//! box or a vertex (`BoxSegment::is_vertex_range`). One domain of millions of vertices thus keeps as many threads busy
+//! as 200,000 small domains. The host unites the boxes of the segments of a domain.
 
 use super::box_keys::bounds_from_keys;
 use super::layout::{BoxSegment, LAST_QUAD_ITEMS};
 use super::work::WorkList;
 use modalcast_model::scene::{BoundingBox, Scene};
 
-/// Maximum number of tiles of a segment. Each tile has four boxes.
+/// Maximum number of tiles of a segment. Each tile has four boxes, because up to four warps of `deform` share a tile
+/// and each warp writes a box.
 const MAX_SEGMENT_TILES: u32 = 32;
 
 /// Number of keys of a box.
@@ -20,7 +22,7 @@ pub(crate) fn box_segments(scene: &Scene, work: &WorkList) -> Vec<BoxSegment> {
     let mut segments = Vec::with_capacity(scene.domains.len());
     for (index, (tiles, layout)) in work.domain_tiles.iter().zip(&scene.layout.domains).enumerate() {
         let (domain, span) = (index as u32, tiles.vertices);
-        // In a mixed tile, which the domain shares with others, this bit field is 0.
+        // The number of items of the last quad is stored as 0 in a mixed tile, which several domains share.
         if work.tiles[span.first as usize].kind & LAST_QUAD_ITEMS == 0 {
             let (first_item, item_count) = (layout.first_vertex as u32, layout.vertices as u32);
             segments.push(BoxSegment { first_item, item_count, domain, is_vertex_range: 1 });

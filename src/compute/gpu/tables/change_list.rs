@@ -37,8 +37,8 @@ pub(crate) fn max_change_entries(scene: &Scene) -> usize {
 }
 
 /// Whether a changed domain needs a [`Change`]. A follower (a domain that uses the transform of its root) without modes
-/// has neither a transform nor coordinates of its own, so only its tiles are listed. But exact normals and boxes need
-/// the step of its last change, which a [`Change`] records.
+/// has neither a transform nor coordinates of its own, so only its tiles are listed. But with exact normals or boxes,
+/// the kernels need the number of the step that last changed the follower, and only an entry makes `apply` record it.
 fn needs_entry(scene: &Scene, domain: usize) -> bool {
     let features = scene.features;
     let has_own_values =

@@ -2,7 +2,7 @@
 //! write large steps. Pure.
 //!
 //! ```text
-//! [header][transforms: 12 f32 per transform root][q, padded to whole chunks of modes][retained counts][retained chunks]
+//! [header][transforms: 12 f32 per transform root][q, padded to whole chunks][retained counts][retained chunks]
 //! ```
 //! A chunk is a few modes that are stored together. With modal truncation, a domain sums only its retained chunks;
 //! their numbers and indices are uploaded. Without truncation, the last two parts are empty. The pinned memory is
@@ -40,7 +40,8 @@ pub(crate) struct DirtyTileLayout {
     pub full_step_cost: usize,
 }
 
-/// Sizes in bytes of the parts after the header, in buffer order. Each is a multiple of 16 bytes.
+/// Sizes in bytes of the parts after the header, in buffer order: 48 bytes per transform, f32 coordinates, u32 counts
+/// and u16 chunk indices. Each part is padded to a multiple of 16 bytes.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct InputSizes {
     pub transforms: u64,
@@ -145,8 +146,8 @@ impl InputPacker {
         });
     }
 
-    /// Passes the coordinates of one domain to `put`, multiplied by the factors of their modes and padded to whole
-    /// chunks.
+    /// Passes the coordinates of one domain to `put`, multiplied by the factors of their modes. Pads them to whole
+    /// chunks, unless the device has them in the order of the scene's state, which has no padding.
     pub(crate) fn put_q(&self, domain: usize, q: &[f32], mut put: impl FnMut(f32)) {
         let factors = &self.factors[self.scene.domains[domain].shape];
         // The factor is a power of two, so the product is exact unless it overflows or underflows f32.

@@ -54,13 +54,13 @@ pub(crate) const STORAGE_DEFINES: [&str; 3] = ["STORE_F16", "STORE_BF16", "STORE
 /// warp per tile would not fill the device. 1024 is about eight warps for each of 132 multiprocessors.
 const MIN_FOUR_ITEM_TILES: usize = 1024;
 
-/// Maximum group sizes, other than the default [`MAX_BATCH_SIZE`], that `batch` can be compiled for, and their macros.
-/// In ascending order.
+/// Group sizes below [`MAX_BATCH_SIZE`]: the maximum number of domains of a group, and the macro that compiles `batch`
+/// for it. In ascending order.
 const SMALLER_BATCHES: [(usize, &str); 2] = [(4, "BATCH_4"), (8, "BATCH_8")];
 
 /// Warps per block of `batch`.
 pub(crate) const BATCH_WARPS: usize = 2;
-/// Bytes of `WarpStorage` and `WarpSlice` in `kernels/batch_load.cuh`, per warp.
+/// Bytes per warp: `WarpStorage` (9984) and `WarpSlice` (72) in `kernels/batch_load.cuh`.
 const WARP_BYTES: usize = 9984 + 72;
 /// Bytes of a transform (48) and a `BatchMember` (16), per member.
 const MEMBER_BYTES: usize = 64;
@@ -81,7 +81,7 @@ pub(crate) const fn has_one_item_per_lane(work: &WorkList) -> bool {
 }
 
 /// Threads per block of `deform`. Twin of the constant WARPS in `kernels/deform.cu`. The launcher compares the number
-/// with the compiled kernel.
+/// of threads with the compiled kernel. TILE_LIST selects the variant for the tile lists of partial steps.
 fn block_threads(defines: &[&str]) -> u32 {
     let has_one_warp = ["MODES", "SHEAR", "TILE_LIST"].iter().any(|name| defines.contains(name));
     WARP_THREADS * if has_one_warp { 1 } else { 2 }

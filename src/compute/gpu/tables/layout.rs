@@ -1,5 +1,8 @@
 //! The structs that host and kernels share, field by field as in `kernels/layout.cuh`, which documents the fields. Both
 //! sides assert the sizes, and tests compare the offsets.
+//!
+//! An item is a vertex or a corner, and a quad is four consecutive items. A tile is up to 32 quads, the work of one
+//! warp; a mixed tile has quads of several domains. A field `first_x` is the index of the first element in the table x.
 
 use bytemuck::{Pod, Zeroable};
 
@@ -37,12 +40,16 @@ pub struct StepHeader {
     pub normals: u64,
     pub tangents: u64,
     pub displacements: u64,
+    /// The step that the outputs show before the launch; 0 for a full step, which writes all outputs.
     pub output_step: u32,
+    /// Number of the last step that computed all domains.
     pub last_full_step: u32,
+    /// Number of this step, counted from 1.
     pub step: u32,
     pub change_count: u32,
     pub dirty_tile_count: u32,
     pub reserved: [u32; 3],
+    /// Output of `bounds`: two boxes of six keys (`box_keys`).
     pub bounds: [u32; 12],
 }
 
@@ -67,6 +74,7 @@ pub(crate) struct WarpTile {
 pub(crate) struct MixedQuad {
     pub first_item: u32,
     pub rest_quad: u32,
+    /// Four times the domain, plus the number of items of the quad, minus 1.
     pub packed_domain: u32,
     pub first_q: u32,
 }

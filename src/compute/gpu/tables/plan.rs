@@ -90,7 +90,8 @@ pub struct DeformPlan {
     pub buffers: Vec<BufferDescriptor>,
     /// Bytes that a full step copies to the device.
     pub bytes_in: u64,
-    /// Bytes that each step copies back, without the vertices: six keys of four bytes per box.
+    /// Bytes that each step copies back, without the vertices: the box of the scene, and with bounding axes a second
+    /// box along them. A box has six keys of four bytes.
     pub bytes_out: u64,
     /// Bytes of pinned host memory for the lists of a partial step; 0 for a scene whose steps are always full.
     pub change_list_bytes: u64,

@@ -68,8 +68,8 @@ pub fn alpha(cut_outs: &CutOuts, triangle: u32, footprint: &Footprint) -> f32 {
     material.alpha * texture_alpha
 }
 
-/// Whether a triangle with these corners in clip space covers a pixel's sample. Always true for triangles before the
-/// first cut-out.
+/// Whether a triangle with these corners in clip space passes the alpha test at a pixel's sample. Always true for
+/// triangles before the first cut-out, which are opaque.
 pub(super) fn passes_alpha_test(
     cut_outs: &CutOuts,
     window: &Viewport,

@@ -114,7 +114,7 @@ fn bound_of_a_follower_holds_and_fails_for_a_wrong_frame() {
         coarse_failures += usize::from(ratio(ComposedTransform { root, frame: Some(coarse) }) > 1.0);
     }
     assert!(largest_ratio > 0.01, "expected an error above 1/100 of the bound, got {largest_ratio} times the bound");
-    assert_eq!(coarse_failures, 120);
+    assert_eq!(coarse_failures, 120, "expected every truncated frame to exceed the bound");
 }
 
 #[test]
@@ -125,13 +125,15 @@ fn frame_rounding_stays_within_its_bound_and_norm_covers_it() {
         let root = Transform(transform(&mut rng).root.0.map(|entry| entry * scale));
         let follower = ComposedTransform { root, frame: Some(transform(&mut rng).root) };
         let (got, expected, bound) = (follower.to_f32(), follower.to_f64(), frame_rounding_error(&follower));
-        let error = |is_linear: bool| {
-            let entries = (0..12).filter(|index| (index % 4 != 3) == is_linear);
+        let error_of = |columns: std::ops::Range<usize>| {
+            let entries = (0..12_usize).filter(|index| columns.contains(&(index % 4)));
             entries.map(|index| (f64::from(got.0[index]) - expected[index]).powi(2)).sum::<f64>().sqrt()
         };
-        assert!(error(true) <= bound.linear && error(false) <= bound.translation, "seed {seed}");
+        // Columns 0 to 2 of T are the linear part, column 3 is the translation.
+        let (linear_error, translation_error) = (error_of(0..3), error_of(3..4));
+        assert!(linear_error <= bound.linear && translation_error <= bound.translation, "seed {seed}");
         // The bound is not far too large.
-        assert!(error(true) > 1e-3 * bound.linear, "seed {seed}: {} of {}", error(true), bound.linear);
+        assert!(linear_error > 1e-3 * bound.linear, "seed {seed}: {linear_error} of {}", bound.linear);
         for linear in [follower.linear(), got.linear()] {
             let (largest_singular, norm) = (linear.singular_values().max(), linear_norm_bound(&follower));
             let limit = largest_singular * (1.0 + 1e-5);

@@ -24,7 +24,7 @@ use modalcast_model::scene::Scene;
 const DEFORM_TILES_PER_BATCH_TILE: usize = 2;
 
 /// Minimum number of 16-byte words of U per upload (64 MiB), except for the last upload. Packed words are uploaded as
-/// soon as they are so many, which bounds the host memory.
+/// soon as there are this many, which bounds the host memory.
 const UPLOAD_WORDS: usize = 1 << 22;
 
 /// The descriptors of the kernels that write positions.

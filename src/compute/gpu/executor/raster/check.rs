@@ -9,8 +9,8 @@ use modalcast_model::scene::DrawRange;
 /// bits for their tiles.
 const MAX_TRIANGLES: usize = 1 << 24;
 
-/// Rejects meshes that would cause out-of-bounds reads or queue overflows. Groups must not overlap, because a triangle
-/// must not be queued twice.
+/// Rejects meshes that would cause out-of-bounds reads or queue overflows. Groups (the ranges of triangles that are
+/// drawn) must not overlap, because a triangle must not be queued twice.
 ///
 /// # Errors
 /// `Invalid` with the name of the invalid field.
@@ -104,6 +104,7 @@ mod tests {
             change(&mut changed);
             check_cut_outs(triangles, &changed).is_err()
         };
+        // With three or five triangles, there would be one or three cut-outs.
         assert!(is_rejected(3, |_| ()) && is_rejected(5, |_| ()));
         assert!(is_rejected(4, |cut_outs| cut_outs.first = 1));
         assert!(is_rejected(4, |cut_outs| cut_outs.material_indices[1] = 2));

@@ -39,7 +39,7 @@ fn unused_features_are_not_compiled_or_stored() {
     let never_used = ["truncation", "exact_normals", "compensated", "followers", "displacements", "boxes", "batches"];
     assert_eq!(omitted, [&["modes", "normal_maps", "shear"][..], &never_used].concat());
     // Shapes have 9 + 302 = 311 corners, domains twice as many.
-    assert_eq!(minimal.omitted[1].bytes, 16 * (311 + 622), "rest and world tangents of every corner");
+    assert_eq!(minimal.omitted[1].bytes, 16 * (311 + 622), "`normal_maps`: rest and world tangents of every corner");
 }
 
 #[test]
@@ -89,7 +89,7 @@ fn exact_normals_add_a_kernel_and_its_tables() {
     let normals = plan.kernel(KernelKind::Normals).expect("the kernel `normals`");
     assert_eq!((normals.name, normals.defines.as_slice()), ("normals", ["SHEAR"].as_slice()));
     assert_eq!(plan.kernels[0].defines, ["MODES", "ONE_ITEM_PER_LANE"]);
-    assert_eq!(plan.launches(), 4);
+    assert_eq!(plan.launches(), 4, "a partial step launches `apply`, `deform`, `bounds` and `normals`");
     for (role, bytes) in [
         (BufferRole::CornerSlots, size_of_val(super::super::rings::normal_slots(&scene).as_slice())),
         (BufferRole::CornerGroups, size_of_val(rings.corner_groups.as_slice())),
@@ -119,7 +119,7 @@ fn readbacks_add_buffers_and_macros_but_no_kernels() {
     let without_readbacks = plan(&scene_with_storage(&sizes, StorageType::F32));
     let with_readbacks = plan(&scene_with_readbacks(&sizes));
     let roles = [BufferRole::Displacements, BufferRole::BoxSegments, BufferRole::DomainBoxes];
-    // Four domains have one segment of 16 bytes each, and one box of 24 bytes per segment.
+    // Four domains have one segment of 16 bytes each, and one box of 24 bytes per segment: 40 bytes together.
     assert_eq!(roles.map(|role| without_readbacks.bytes(role)), [0; 3]);
     assert_eq!(roles.map(|role| with_readbacks.bytes(role)), [12 * 2 * (7 + 300), 16 * 4, 24 * 4]);
     assert_eq!(with_readbacks.total_bytes() - without_readbacks.total_bytes(), 12 * 2 * (7 + 300) + 40 * 4);
@@ -132,6 +132,7 @@ fn readbacks_add_buffers_and_macros_but_no_kernels() {
     let count_macros = |kernel: usize| {
         with_readbacks.kernels[kernel].defines.iter().filter(|name| READBACK_DEFINES.contains(name)).count()
     };
+    // Kernels 0, 1 and 2 are `deform`, `bounds` and `apply`.
     assert_eq!([count_macros(0), count_macros(1), count_macros(2)], [1, 1, 0]);
     assert_eq!(
         (with_readbacks.launches(), with_readbacks.bytes_in, with_readbacks.bytes_out),

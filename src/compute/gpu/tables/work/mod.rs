@@ -69,7 +69,8 @@ pub(crate) struct WorkList {
     pub corners_match: Vec<bool>,
     /// Number of leading tiles that `deform` computes in a full step. `batch` computes the other tiles.
     pub full_step_tiles: usize,
-    /// Of these tiles, the number of tiles with vertices. They precede the tiles that have only corners.
+    /// Number of tiles with vertices among the first `full_step_tiles` tiles, where they precede the tiles with only
+    /// corners.
     pub vertex_tiles: usize,
     pub batched: BatchTables,
     pub mixed_quads: Vec<MixedQuad>,
@@ -85,7 +86,8 @@ pub(crate) struct WorkList {
     pub scale_count: u64,
     /// The tiles of each domain.
     pub domain_tiles: Vec<DomainTiles>,
-    /// Per domain, the wrapping offset from its first vertex to its first corner; empty when all offsets are zero.
+    /// Per domain, the offset from its first vertex to its first corner, modulo 2^32 because it may be negative; empty
+    /// when all offsets are zero.
     pub corner_offsets: Vec<u32>,
 }
 
@@ -258,6 +260,7 @@ impl WorkList {
                 self.mixed_quads.push(MixedQuad {
                     first_item: range.first_item + (QUAD * quad) as u32,
                     rest_quad: range.rest_quad + quad as u32,
+                    // The domain, and in the two lowest bits the number of items minus 1.
                     packed_domain: (QUAD * domain + quad_items - 1) as u32,
                     first_q: coordinates.first_q[*domain],
                 });
@@ -368,7 +371,7 @@ fn pending_tiles(scene: &Scene, corners_match: &[bool]) -> Vec<(TileClass, Pendi
     tiles
 }
 
-/// Per domain, the wrapping offset from its first vertex to its first corner; empty when all offsets are zero.
+/// As [`WorkList::corner_offsets`].
 fn corner_offsets(scene: &Scene) -> Vec<u32> {
     let offset = |layout: &DomainLayout| (layout.first_corner as u32).wrapping_sub(layout.first_vertex as u32);
     let offsets: Vec<u32> = scene.layout.domains.iter().map(offset).collect();
@@ -383,8 +386,8 @@ fn chunk_count(scene: &Scene, shape: &Shape) -> usize {
     shape.modes.rank().div_ceil(modes_per_chunk(scene.deformation.storage))
 }
 
-/// U of a mixed tile, packed words `[chunk][3][quad]` with the quads of all of `shapes`. Each of them has one tile
-/// `[chunk][3][quad]`, and all have the same number of chunks.
+/// U of a mixed tile: packed words `[chunk][plane][quad]` with the quads of all of `shapes`. Each shape has one tile
+/// `[chunk][plane][quad]` of three planes, and all shapes have the same number of chunks.
 pub(crate) fn mix_tiles(shapes: &[TiledModes]) -> Vec<PackedWord> {
     let row_count = 3 * shapes.first().map_or(0, TiledModes::chunks);
     let mut words = Vec::with_capacity(shapes.iter().map(|tiles| tiles.packed_words().len()).sum());

@@ -94,7 +94,8 @@ impl<'a> Warp<'a> {
         self.tables.work.batched.members[self.group.first_member as usize + index]
     }
 
-    /// Copies a stage of U to the ring: `3 * STAGE_CHUNKS` rows, each with one word of every quad of the warp.
+    /// Copies a stage of U to the ring: `3 * STAGE_CHUNKS` rows, each with one word of every quad of the warp. Lanes
+    /// beyond the last quad copy the last quad again.
     fn copy_stage(&mut self, stage: usize) {
         let ring_word = stage % RING_STAGES * STAGE_WORDS;
         self.ring[ring_word..][..STAGE_WORDS].fill(POISON);
@@ -119,7 +120,8 @@ impl<'a> Warp<'a> {
         }
     }
 
-    /// Sums of all lanes, `[lane][2 * axis + vertex][member]`.
+    /// Sums of all lanes, `[lane][2 * axis + vertex][member]`. A lane sums two vertices: lanes 2 i and 2 i + 1 have the
+    /// first and the second half of quad i.
     pub(super) fn sums(&mut self) -> Vec<[[f32; MAX_BATCH_SIZE]; 6]> {
         let chunks = self.group.chunk_count as usize;
         let chunk_modes = modes_per_chunk(self.tables.scene.deformation.storage);
@@ -133,8 +135,11 @@ impl<'a> Warp<'a> {
                 let mode_index = (STAGE_CHUNKS * stage + chunk) * chunk_modes + mode;
                 let scale = scales.get(self.tile * chunks * chunk_modes + mode_index).copied().unwrap_or(1.0);
                 for (lane, sums) in sums.iter_mut().enumerate() {
+                    // The first byte of the lane's half of a word, in the first row of the stage.
                     let lane_byte = 16 * (stage % RING_STAGES * STAGE_WORDS + lane / 2) + 2 * entry_bytes * (lane % 2);
                     for (axis, vertex) in (0..3).flat_map(|axis| (0..2).map(move |vertex| (axis, vertex))) {
+                        // The offset of the quad's entries of this mode and axis in the 48 bytes of a chunk. Each 16
+                        // bytes are one word, and consecutive words are one row apart.
                         let chunk_byte = 4 * entry_bytes * (3 * mode + axis);
                         let entry_byte = chunk_byte / 16 * (16 * WARP_QUADS) + chunk_byte % 16 + vertex * entry_bytes;
                         let entry = self.entry(lane_byte + chunk * (3 * 16 * WARP_QUADS) + entry_byte);
@@ -152,7 +157,7 @@ impl<'a> Warp<'a> {
     }
 
     /// Positions of the members `member` and `member + 1` as the warp stages them before the stores:
-    /// `[member][vertex][3]`. Those of a missing second member are NaN.
+    /// `[member][vertex][axis]`. Positions of a missing second member are NaN.
     pub(super) fn staged(&self, sums: &[[[f32; MAX_BATCH_SIZE]; 6]], member: usize) -> Vec<f32> {
         let mut staged = vec![f32::NAN; 2 * 3 * WARP_VERTICES];
         let first_rest_vector = 3 * (self.group.rest_quad as usize + TILE_QUADS * self.tile);
@@ -190,7 +195,8 @@ impl<'a> Warp<'a> {
         let are_aligned =
             || (0..2).all(|member_offset| self.member(member + member_offset).first_vertex.is_multiple_of(4));
         if vertices == WARP_VERTICES && member + 1 < members && are_aligned() {
-            // Each lane makes three stores of 16 bytes, four components each.
+            // The positions of a member are 64 * 3 components, 48 words of 16 bytes. Each of the 32 lanes stores three
+            // of the 96 words of both members.
             for (lane, lane_component) in (0..32).flat_map(|lane| (0..12).map(move |component| (lane, component))) {
                 let (store, word_component) = (lane_component / 4, lane_component % 4);
                 let (target_member, target_word) = match store {
