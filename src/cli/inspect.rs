@@ -89,9 +89,9 @@ struct DomainReport<'a> {
     /// Host memory of the domain's shape.
     bytes: usize,
     shape: usize,
-    /// Index of the domain that this domain is attached to.
+    /// Index of the parent domain at the joint of this domain. The server does not move a child with its parent.
     parent: Option<usize>,
-    /// Index of the domain whose transform this domain follows.
+    /// Index of the domain whose transform determines the transform of this domain.
     follows: Option<usize>,
     material: &'a str,
 }

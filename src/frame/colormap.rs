@@ -1,10 +1,11 @@
 //! Color mapping: viridis, and the conversion of an AOV of values to RGBA8 sRGB.
 
-/// The viridis color map. Maps a fraction of the axis to encoded sRGB with channels from 0 to 1. A fraction outside of
-/// 0 to 1 is clamped. The map is perceptually uniform and suitable for color-blind readers.
+/// The viridis color map. Maps a fraction of the axis (the range of values from 0 to `Legend::scale_max`) to encoded
+/// sRGB with channels from 0 to 1. A fraction outside of 0 to 1 is clamped. The map is perceptually uniform and
+/// suitable for color-blind readers.
 ///
 /// The map is by Smith and van der Walt (matplotlib, 2015). The polynomial of degree six is Matt Zucker's fit
-/// (shadertoy.com/view/WlfXRN, CC0). Its colors differ from the table by at most 0.02 per channel.
+/// (shadertoy.com/view/WlfXRN, CC0). Its colors differ from matplotlib's table by at most 0.02 per channel.
 pub fn viridis(fraction: f32) -> [f32; 3] {
     const COEFFICIENTS: [[f32; 3]; 7] = [
         [0.277_727_33, 0.005_407_344_5, 0.334_099_8],

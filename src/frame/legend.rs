@@ -57,6 +57,7 @@ pub fn draw(rgba: &mut [u8], [width, height]: [u32; 2], legend: &Legend) -> Resu
     canvas.fill_rectangle(&BAR, 0.0, 1.0, |x| {
         viridis((x - BAR.left) / BAR.width).map(|channel| (255.0 * channel).round() as u8)
     });
+    // A tick is 1.2 layout units wide and 5 high. The baseline of its label is 19 units below the bar.
     for (position, label) in compute_ticks(legend.scale_max) {
         let (x, y) = (BAR.left + position as f32 * BAR.width, BAR.top + BAR.height);
         canvas.fill_rectangle(&Rectangle { left: x - 0.6, top: y, width: 1.2, height: 5.0 }, 0.0, 1.0, |_| TEXT_COLOR);

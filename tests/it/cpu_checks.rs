@@ -85,7 +85,7 @@ fn mode_near_the_limit_is_truncated_at_most_once() {
 
 #[test]
 fn partial_steps_have_the_bits_of_full_steps() {
-    // Only the CUDA deformer has a batch policy.
+    // Only the CUDA deformer has a batch policy (whether it deforms domains that share U together).
     partial_steps::check_partial_steps(|scene, _batch_policy| cpu_deformer(scene));
     assert!(
         !partial_steps::relies_on_dirty_list(cpu_deformer),

@@ -27,6 +27,7 @@ pub(crate) fn random_strip(vertices: usize, rank: usize, random: &mut TestRng) -
     let normals = rest_positions.iter().map(|_| [random.next(), random.next(), random.next() + 2.0]).collect();
     let uvs = rest_positions.iter().map(|_| [random.next(), random.next()]).collect();
     let corners = Corners { vertices: (0..vertices as u32).collect(), normals, uvs };
+    // The last two triangles repeat the last vertex, so that a strip of one vertex also has a triangle.
     let last_vertex = vertices as u32 - 1;
     let triangles = (0..vertices as u32)
         .map(|vertex| [vertex, (vertex + 1).min(last_vertex), (vertex + 2).min(last_vertex)])

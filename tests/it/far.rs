@@ -149,7 +149,7 @@ async fn far_scene_and_far_domain_keep_millimeter_precision() {
         [expected_positions(&scene, 0, &q[..2], near_pose), expected_positions(&scene, 1, &q[2..], far_pose)].concat();
     let error = max_distance(&decode_positions(&scene, &reply), &expected);
     assert!(error <= 1e-3, "expected at most 1 mm, got {error} m");
-    // Negative control: rounding the far translation from the scene origin to f32 causes an error of more than 1 cm.
+    // Negative control: f32 cannot hold the translation of domain 1 from the scene origin with an error below 1 cm.
     let far_x = far_pose.translation[0] - origin[0];
     let f32_error = far_x - f64::from(far_x as f32);
     assert!(

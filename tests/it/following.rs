@@ -43,7 +43,7 @@ async fn moved_branch_moves_only_itself_and_its_followers() {
     writer.send_step_and_wait(step.clone()).await;
     let positions = get_vertices(&server, vertex_request(&[])).await.expect("expected vertices").positions;
     assert_eq!(positions, reference_vertices(&twig(), &[step]).positions);
-    assert_eq!(positions[..DOMAIN_NUMBERS], rest_positions[..DOMAIN_NUMBERS], "expected the other strip not to move");
+    assert_eq!(positions[..DOMAIN_NUMBERS], rest_positions[..DOMAIN_NUMBERS], "expected domain 0 not to move");
     // The first vertex of the leaf is the origin of the leaf's frame, which is at (0.5, 1, -0.25) in the branch's
     // frame. The leaflet has the same frame relative to the leaf. The frame maps (0.5, 1, -0.25) to (-0.5, 1.5, -0.5).
     let transformed = |[x, y, z]: [f32; 3]| [2.0 - y, x, z - 3.0];
@@ -65,7 +65,7 @@ async fn step_with_transform_of_a_follower_is_rejected() {
     let server = Server::start_default().await;
     server.open("twig").await;
     let mut writer = server.drive_lossless("twig").await;
-    // The transform roots are the two strips.
+    // The transform roots are domain 0 and the branch.
     let root_step = transform_step(0, &[], &[TRANSLATION, ROTATION_AND_SHIFT]);
     writer.send_step_and_wait(root_step.clone()).await;
     let positions = get_vertices(&server, vertex_request(&[])).await.expect("expected vertices").positions;

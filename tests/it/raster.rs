@@ -12,9 +12,10 @@ use crate::common::soups::{Soup, all_soups, clip_space_viewport, fan_soup, persp
 
 // Constants of `kernels/raster.cu`. A test compares them with the text of the kernel.
 
-/// Maximum number of samples in the rectangle of a triangle that one thread draws.
+/// Maximum number of samples in the bounding rectangle of a triangle that one thread draws. One warp, or one
+/// warp per tile, draws a triangle with a larger rectangle.
 const MAX_THREAD_SAMPLES: i32 = 32;
-/// Maximum extent of a triangle that one warp draws, in 1/256 pixel: 64 pixels.
+/// Maximum width and maximum height of a triangle that one warp draws, in 1/256 pixel: 64 pixels.
 const MAX_WARP_EXTENT: i32 = 16384;
 /// Side of a tile in pixels.
 const TILE_SIZE: i32 = 64;
@@ -73,12 +74,13 @@ impl RasterTraversal<'_> {
     }
 
     /// Twin of kernel `raster`: draws a small triangle, and queues a larger one.
-    fn bin_triangle(&mut self, triangle: u32, cull_mode: CullMode) {
+    fn draw_or_queue(&mut self, triangle: u32, cull_mode: CullMode) {
         let Ok(clipped_polygon) = self.clipped_polygon(triangle, cull_mode) else { return };
         let extent = |coordinate: fn(&SnappedVertex) -> i32| {
             let coordinates = || clipped_polygon.corners.iter().map(coordinate);
             coordinates().max().expect("expected corners") - coordinates().min().expect("expected corners")
         };
+        // The first and the last column and row of samples in the bounding box.
         let [x0, y0, x1, y1] = clipped_polygon.samples;
         let fits_32_bits = !clipped_polygon.is_clipped
             && extent(|corner| corner.x) <= MAX_WARP_EXTENT
@@ -115,7 +117,8 @@ impl RasterTraversal<'_> {
                 .checked_sub(product(to.y - from.y, x - from.x))
                 .expect("expected a value within 32 bits")
         };
-        // The polygon is not clipped, so its fan is one triangle.
+        // A fan divides a polygon into triangles that share its first corner. The polygon is not clipped, so its fan
+        // is one triangle.
         let [a, b, c] = fan_triangles(clipped_polygon)[0];
         let area = edge(&a, &b, c.x, c.y);
         let [x0, y0, x1, y1] = clipped_polygon.samples;
@@ -208,7 +211,7 @@ fn rasterize_like_kernels(soup: &Soup, strip_splits: u32) -> (Vec<u64>, [usize; 
     for group in &soup.groups {
         (group.first_triangle..group.first_triangle + group.triangle_count)
             .rev()
-            .for_each(|triangle| traversal.bin_triangle(triangle, group.cull_mode));
+            .for_each(|triangle| traversal.draw_or_queue(triangle, group.cull_mode));
     }
     // Twin of kernel `raster_warps`. Queued triangles have passed back-face culling.
     for triangle in std::mem::take(&mut traversal.warp_queue) {

@@ -11,16 +11,17 @@ use super::fixtures::{
 };
 use super::{MAX_ANGLE_DEGREES, linear_parts, parabola};
 
-/// Bound of the relative rounding error of a position: 2 x 2^-23. A single rounding has a bound of 2^-24, but the CPU
-/// deformer rounds several times.
+/// Bound of the rounding error of a sum of area vectors, as a fraction of the rounding scale B of [`max_error_ratio`].
+/// If each position is rounded once, the bound is 2^-23. It is doubled, because the CPU deformer rounds several times.
 const ROUNDING_BOUND: f64 = 2.0 / 8_388_608.0;
 
 /// Largest ratio of the angular error of a normal to its bound. The section "Fallback" of
-/// `src/compute/reference/normals.rs` defines the bound and the letters l, w and B. Here, l and m are the letters l of
-/// the two edges of a triangle at a corner.
+/// `src/compute/reference/normals.rs` derives the bound. At a corner of a triangle, l and m are the sums of the
+/// absolute components of the two edges, and w is this sum for the position of the corner. The rounding scale B of a
+/// normal is the sum of l (l + w) + m (m + w) over the triangles at the corner.
 fn max_error_ratio(scene: &Scene, positions: &[[f64; 3]], normals: &[f32], reference_normals: &[[f64; 3]]) -> f64 {
     let mesh = &scene.shapes[0].mesh;
-    // Per corner: the sum of the area vectors of its triangles, and the sum B of their rounding bounds.
+    // Per corner: the sum of the area vectors of its triangles, and their rounding scale B.
     let mut corner_sums = vec![(Vector3::zeros(), 0.0); reference_normals.len()];
     for triangle in mesh.triangles() {
         for corner in 0..3 {

@@ -9,7 +9,7 @@ use nalgebra::Vector3;
 use super::harness::{SceneBuilder, facing_rectangle, floor_mesh, front_camera, open_renderer};
 
 /// Reads an AOV of a scene at rest in a square image with side `size`. For [`Aov::Values`], the value of each vertex is
-/// its x coordinate. Then the function also asserts that missing values and too few values are errors.
+/// its x coordinate, and the function also asserts that missing values and too few values are errors.
 fn read_aov(builder: SceneBuilder, camera: Camera, size: u32, aov: Aov) -> AovImage {
     let scene = builder.build();
     let mut renderer = open_renderer();
@@ -37,7 +37,8 @@ fn decode_f32(image: &AovImage) -> Vec<f32> {
     bytemuck::pod_collect_to_vec(&image.bytes)
 }
 
-/// A camera for 64 x 64 pixels that looks down at the plane y = 0 from height 5. Its focal length is 60 pixels.
+/// A camera for 64 x 64 pixels that looks down at the plane y = 0 from height 5. Its focal length is 60 pixels. Its
+/// clip planes of 0 are fitted to the bounds.
 fn oblique_camera() -> Camera {
     let view = View::LookAt { eye: [3.0, 5.0, 4.0], target: [0.0, 0.0, -6.0], up: [0.0, 1.0, 0.0] };
     Camera { view, lens: Lens::Intrinsics { fx: 60.0, fy: 60.0, cx: 32.0, cy: 32.0 }, near: 0.0, far: 0.0 }
@@ -99,6 +100,7 @@ fn domain_indices_do_not_depend_on_the_drawing_order() {
         .add_domain(facing_rectangle(1.0, 0.0, 2.0, 1.0, 0.0), Material::default());
     let ids: Vec<u32> = bytemuck::pod_collect_to_vec(&read_aov(builder, front_camera(64), 64, Aov::Domains).bytes);
     let id_at = |x: usize, y: usize| ids[64 * y + x];
+    // Pixels at the center of domain 1, at the center of domain 2, and between both domains.
     let [cut_out_id, opaque_id, background_id] = [id_at(17, 26), id_at(47, 26), id_at(32, 26)];
     assert_eq!([cut_out_id, opaque_id, background_id], [1, 2, u32::MAX]);
     assert_eq!(ids.iter().filter(|id| **id == 1).count(), 100, "expected 10 x 10 pixels of domain 1");
@@ -127,18 +129,18 @@ fn normals_face_the_camera_and_are_zero_elsewhere() {
     assert_eq!(bottom_center, [0.0; 3], "expected zeros on the ground");
 }
 
-/// A sample stores the value of a vertex divided by `largest`, clamped to 0 to 1, as a 16-bit number. The value of each
-/// vertex is its x coordinate.
+/// A sample stores the value of a vertex divided by `scale_max`, clamped to 0 to 1, as a 16-bit number. The value of
+/// each vertex is its x coordinate.
 #[test]
 fn values_are_interpolated_linearly_and_clamped() {
-    for (samples, largest) in [(1, 2.0), (4, 1.0)] {
+    for (samples, scale_max) in [(1, 2.0), (4, 1.0)] {
         let mut builder = SceneBuilder::new();
         builder.parts.look.samples = samples;
         let frame = read_aov(
             builder.add_domain(facing_rectangle(-2.0, -2.0, 2.0, 2.0, 0.0), Material::default()),
             front_camera(64),
             64,
-            Aov::Values { scale_max: largest },
+            Aov::Values { scale_max },
         );
         assert_eq!(frame.samples, samples);
         let image_samples: Vec<u32> = bytemuck::pod_collect_to_vec(&frame.bytes);
@@ -148,7 +150,7 @@ fn values_are_interpolated_linearly_and_clamped() {
             // The lower 16 bits of a sample are its value.
             let mean = pixel_samples.iter().map(|sample| f64::from(sample & 0xFFFF) / 65535.0).sum::<f64>()
                 / f64::from(samples);
-            let expected = ((x as f64 + 0.5 - 32.0) / 10.0 / f64::from(largest)).clamp(0.0, 1.0);
+            let expected = ((x as f64 + 0.5 - 32.0) / 10.0 / f64::from(scale_max)).clamp(0.0, 1.0);
             // Values have steps of 1 / 65535, about 1.5e-5. Near 0 and 1, only some samples of a pixel are clamped,
             // which changes their mean.
             let tolerance = if (0.05..0.95).contains(&expected) { 1e-4 } else { 0.1 };

@@ -130,8 +130,9 @@ fn geometry_outside_the_bounds_leaves_no_stale_pixels() {
         let scene = test_scene(|look| look.transparency = transparency);
         let mut renderer = open_renderer();
         let buffers = load_at_rest(&mut renderer, &scene);
-        // These bounds are smaller than the scene on all sides. Each edge of the drawn region lies inside a block of 2
-        // x 2 pixels with one of the two shifts, and between two blocks with the other shift.
+        // These bounds are smaller than the scene on all sides. Rasterizers process blocks of 2 x 2 pixels and may draw
+        // beyond the edges of the region. So the two shifts differ by one pixel: each edge lies inside a block with one
+        // shift, and between two blocks with the other shift.
         let small_bounds = BoundingBox { min: [-0.3, -0.3, -0.5], max: [0.1, 0.2, -0.4] };
         let mut draw_shifted =
             |shift: [f64; 2]| draw_frame(&mut renderer, &buffers, shifted_camera(shift), small_bounds);

@@ -41,7 +41,7 @@ fn move_domains(scene: &Scene, domains: &[u32], [x, y, z]: [f64; 3]) -> SceneSta
     state
 }
 
-/// A camera that looks obliquely from above at a square around `target`.
+/// A camera that looks obliquely from above at a square around `target`. Clip planes of 0 are fitted to the bounds.
 fn camera_at(target: [f64; 3]) -> Camera {
     let eye = [target[0] + 1.7, target[1] + 2.1, target[2] + 3.3];
     let view = View::LookAt { eye, target: [target[0], target[1] + 0.2, target[2]], up: [0.0, 1.0, 0.0] };

@@ -33,6 +33,7 @@ fn test_scene(modify_look: impl FnOnce(&mut RenderSettings)) -> Arc<Scene> {
         .build()
 }
 
+/// A camera at `eye` that looks at the objects. Clip planes of 0 are fitted to the bounds.
 fn camera_at(eye: [f64; 3]) -> Camera {
     let view = View::LookAt { eye, target: [0.0, 0.8, 0.0], up: [0.0, 1.0, 0.0] };
     Camera { view, lens: Lens::FieldOfView(50.0), near: 0.0, far: 0.0 }
@@ -46,7 +47,8 @@ struct Frame {
 }
 
 impl Frame {
-    /// Renders the scene at rest, lowered by `lowering`. The renderer is told that no vertex is below y = `min_y`.
+    /// Renders the scene at rest, lowered by `lowering`. `min_y` is the lower bound of y that the
+    /// renderer receives.
     fn new(renderer: &mut Renderer, scene: &Arc<Scene>, camera: Camera, lowering: f32, min_y: f64) -> Self {
         let buffers = renderer.load(scene).expect("expected the scene to load");
         let collect_from_meshes = |attribute: fn(&modalcast_model::domain::Mesh) -> &[[f32; 3]]| -> Vec<f32> {

@@ -96,8 +96,8 @@ fn rectangle(positions: Vec<[f32; 3]>, normal: [f32; 3]) -> Mesh {
     Mesh::from_indexed(positions, vec![normal; 4], uvs, vec![[0, 1, 2], [0, 2, 3]]).expect("expected a valid mesh")
 }
 
-/// A camera at z = 10 with ten pixels per unit in the plane z = 0 and the origin at the center of the image. `size` is
-/// the side of the image in pixels.
+/// A camera at z = 10 with the origin at the center of the image. `size` is the side of the image in pixels. The focal
+/// length is 100 pixels, so a unit in the plane z = 0, at distance 10, is ten pixels long.
 pub(super) fn front_camera(size: u32) -> Camera {
     let center = f64::from(size) / 2.0;
     Camera {
@@ -126,6 +126,7 @@ pub(super) fn render_sized(
     camera: Camera,
     [width, height]: [u32; 2],
 ) -> RenderedFrame {
+    // The bounds along the axes of the light are the bounds in light space, to which the shadow map is fitted.
     let mut deformer = ReferenceDeformer::new(scene).with_bounding_axes(scene.light_axes());
     let DeformSummary { bounds, oriented_bounds: light_bounds, .. } =
         deformer.deform(&SceneState::rest(scene)).expect("expected the step to succeed");

@@ -339,25 +339,26 @@ fn two_passes_draw_alpha_above_threshold_as_opaque() {
         // The farther pane comes later in the scene, so only the depth test keeps it behind.
         render(&builder.add_domain(pane(0.0), leaf).add_domain(pane(-1.0), glass_material(RED, 0.5)).build())
     };
-    // No alpha reaches the threshold of 1.5, so that all fragments are blended in scene order.
-    let (split_frame, unsplit_frame) = (render_with(0.95), render_with(1.5));
-    assert!(is_close(split_frame.pixel(42, 30), GREEN.map(f64::from), 1.0), "{:?}", split_frame.pixel(42, 30));
+    // With a threshold of 0.95, the right half of the leaf is drawn as opaque. No alpha reaches the threshold of 1.5,
+    // so that all fragments are blended in scene order.
+    let (mixed_frame, blended_frame) = (render_with(0.95), render_with(1.5));
+    assert!(is_close(mixed_frame.pixel(42, 30), GREEN.map(f64::from), 1.0), "{:?}", mixed_frame.pixel(42, 30));
     assert!(
-        is_close(unsplit_frame.pixel(42, 30), blend(&[(GREEN, 1.0), (RED, 0.5)]), 2.0),
+        is_close(blended_frame.pixel(42, 30), blend(&[(GREEN, 1.0), (RED, 0.5)]), 2.0),
         "negative control: {:?}",
-        unsplit_frame.pixel(42, 30)
+        blended_frame.pixel(42, 30)
     );
     let blended_color = blend(&[(GREEN, 128.0 / 255.0), (RED, 0.5)]);
     // Pixel (22, 30) is near the center of the half-transparent texel.
     assert!(
-        is_close(split_frame.pixel(22, 30), blended_color, 2.0),
+        is_close(mixed_frame.pixel(22, 30), blended_color, 2.0),
         "expected blending in scene order, got {:?}",
-        split_frame.pixel(22, 30)
+        mixed_frame.pixel(22, 30)
     );
-    assert_eq!((split_frame.stats.draw_calls, unsplit_frame.stats.draw_calls), (2, 1));
-    assert_eq!(unsplit_frame.stats.passes, [Pass::Blended, Pass::Background, Pass::Encode]);
+    assert_eq!((mixed_frame.stats.draw_calls, blended_frame.stats.draw_calls), (2, 1));
+    assert_eq!(blended_frame.stats.passes, [Pass::Blended, Pass::Background, Pass::Encode]);
     assert_eq!(
-        split_frame.stats.passes,
+        mixed_frame.stats.passes,
         [Pass::Visibility, Pass::Blended, Pass::Background, Pass::Shade, Pass::Encode]
     );
 }

@@ -111,10 +111,10 @@ fn mirrored_domains_keep_vertex_order_in_picks() {
 #[test]
 fn pick_follows_the_deformed_surface() {
     let mesh = facing_rectangle(-1.0, -1.0, 1.0, 1.0, 0.0);
-    // One mode, which moves the four vertices along z.
-    let columns = (0..12).map(|row| if row % 3 == 2 { 1.0 } else { 0.0 }).collect();
+    // One mode, which moves the four vertices along z. Its column has the rows x, y and z of each vertex.
+    let column = (0..12).map(|row| if row % 3 == 2 { 1.0 } else { 0.0 }).collect();
     let mut builder = SceneBuilder::new().add_domain(mesh.clone(), Material::default());
-    builder.parts.shapes[0] = Shape::new(mesh, Modes::from_columns(12, 1, columns).expect("expected valid modes"))
+    builder.parts.shapes[0] = Shape::new(mesh, Modes::from_columns(12, 1, column).expect("expected valid modes"))
         .expect("expected a valid shape");
     let scene = builder.build();
     let mut state = SceneState::rest(&scene);
@@ -149,6 +149,7 @@ fn picks_agree_with_the_visibility_of_the_frame() {
     let mut harness = PickHarness::at_rest(&scene);
     let view = View::LookAt { eye: [3.0, 4.0, 9.0], target: [0.2, 0.5, 0.0], up: [0.0, 1.0, 0.0] };
     for lens in [Lens::FieldOfView(40.0), Lens::Intrinsics { fx: 120.0, fy: 130.0, cx: 50.0, cy: 44.0 }] {
+        // Clip planes of 0 are fitted to the bounds.
         let camera = Camera { view, lens, near: 0.0, far: 0.0 };
         let frame_params = harness.frame_params(camera, 100);
         harness.renderer.draw(&harness.buffers, &frame_params).expect("expected a frame");

@@ -138,7 +138,7 @@ fn bloom_is_symmetric_and_respects_its_threshold() {
             );
         }
     }
-    // This pixel is beside the square, which covers columns 31 and 32.
+    // Pixel (36, 32) is beside the square, which covers columns 31 and 32.
     let [r, g, b] = frame.pixel(36, 32);
     assert!(r > g && g > b && b > 0, "expected bloom with the hue of its light, got {r} {g} {b}");
     let unbloomed_frame = render(
@@ -158,8 +158,8 @@ fn bright_edges_stay_antialiased_with_bloom() {
     let render_with = |bloom: Option<Bloom>| {
         let builder = builder_with_light([50.0; 3], |look| RenderSettings { bloom, samples: 4, ..look });
         let glass = Material { alpha_mode: AlphaMode::Blend, alpha: 0.25, ambient: [0.0; 3], ..white_material() };
-        // The left edge of the lamp halves the pixels of column 32. The upper half of the lamp is behind dark glass,
-        // but still brighter than white.
+        // A bright square whose left edge halves the pixels of column 32. The upper half of the square is behind dark
+        // glass, but still brighter than white.
         let scene = builder
             .add_domain(facing_rectangle(0.05, -2.0, 2.0, 2.0, 0.0), white_material())
             .add_domain(facing_rectangle(-2.0, 0.0, 2.0, 2.0, 0.1), glass);

@@ -35,6 +35,7 @@ fn random_scene(seed: u64) -> (Arc<Scene>, Vec<[u32; 3]>) {
             // The triangle has no area.
             _ => 0.0,
         };
+        // `next_triple` gives three numbers from -1 to 1.
         let center = random.next_triple().map(|number| 3.0 * number);
         for _ in 0..3 {
             let offset = random.next_triple();

@@ -98,7 +98,7 @@ impl Rasterizer for ReferenceRasterizer {
             self.write(target, bytemuck::cast_slice(&self.rasterize(viewport, &[all_triangles]).depths()))?;
         }
         let Some((viewport, target)) = ids else { return Ok(()) };
-        // A key of a sample contains its depth and its triangle id.
+        // A sample has a 64-bit key: the bits of its depth above its triangle id.
         self.write(target, bytemuck::cast_slice(&self.rasterize(viewport, &self.mesh.groups).keys))
     }
 }
@@ -223,7 +223,7 @@ fn compute_rasterized_frame_equals_opengl() {
             count_ids(|id| *id == VisibilityId::Ground) > 5000
                 && count_ids(|id| matches!(id, VisibilityId::Triangle(_))) > 2000
         );
-        // Only samples on edges may differ: a few of 192 x 128.
+        // Only samples on edges may differ: a few of 192 x 128 pixels with one sample each.
         let (different_ids, different_bytes) = (
             count_differences(&compute_frame.ids, &opengl_frame.ids),
             count_different_bytes(&compute_frame.image, &opengl_frame.image),
@@ -369,8 +369,9 @@ fn opengl_draws_frames_that_compute_does_not_support() {
     );
 }
 
-/// Frames of one step share its shadow. `upload_rebased` replaces the positions that OpenGL and the compute rasterizer
-/// share, until `set_shared_origin`. Until then, OpenGL draws the scene.
+/// Frames of one step share its shadow. Rebased positions are relative to an origin of their own. `upload_rebased`
+/// gives them to OpenGL only, so OpenGL draws the scene until `set_shared_origin`. Then both rasterizers use the
+/// positions that they share.
 #[test]
 fn cameras_share_the_shadow_and_rebased_scenes_use_opengl() {
     let scene = yard_builder(Some(ShadowSettings { size: 256, ..ShadowSettings::default() }), 1).build();

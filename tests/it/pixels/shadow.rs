@@ -22,7 +22,8 @@ pub(super) fn create_builder() -> SceneBuilder {
         .add_domain(facing_rectangle(-5.1, 0.0, -5.0, 0.1, -5.0), Material::default())
 }
 
-/// Renders with a camera at height 20 that looks down, with ten pixels per unit on the ground.
+/// Renders with a camera at height 20 that looks down, with ten pixels per unit on the ground. Clip planes of 0
+/// are fitted to the bounds.
 fn render_from_above(builder: SceneBuilder) -> RenderedFrame {
     let camera = Camera {
         view: View::LookAt { eye: [0.0, 20.0, 0.0], target: [0.0; 3], up: [0.0, 0.0, -1.0] },

@@ -78,7 +78,7 @@ fn render_two_steps(scene: &Arc<Scene>, set_step: impl Fn(&SceneBuffers, u64)) -
     frames
 }
 
-fn pass_counts(frames: &[Frame]) -> Vec<usize> {
+fn shadow_pass_counts(frames: &[Frame]) -> Vec<usize> {
     frames.iter().map(|frame| frame.shadow_passes).collect()
 }
 
@@ -86,7 +86,7 @@ fn pass_counts(frames: &[Frame]) -> Vec<usize> {
 fn cameras_of_one_step_share_its_shadow() {
     let scene = create_scene(1);
     let frames = render_two_steps(&scene, SceneBuffers::set_step);
-    assert_eq!(pass_counts(&frames), [2, 0, 2, 0], "expected shadow and blur once per step");
+    assert_eq!(shadow_pass_counts(&frames), [2, 0, 2, 0], "expected shadow and blur once per step");
     let [first_camera, second_camera] = cameras(&scene);
     for (frame, (shift, camera)) in
         frames.iter().zip([(0.0, first_camera), (0.0, second_camera), (0.7, first_camera), (0.7, second_camera)])
@@ -99,24 +99,24 @@ fn cameras_of_one_step_share_its_shadow() {
     );
 }
 
-/// Each frame draws the shadow map if the map depends on the view, as with cascades, or if the step has no number. If
-/// only the bounds change and the step number does not, the map is also drawn again.
+/// The shadow map is drawn for each frame if it depends on the view, as with cascades, or if the step has no number. It
+/// is drawn again if the bounds change, even if the step number does not.
 #[test]
 fn view_dependent_shadows_are_drawn_for_each_frame() {
     assert_eq!(
         // `SceneBuffers::set_step` is not called.
-        pass_counts(&render_two_steps(&create_scene(1), |_, _| ())),
+        shadow_pass_counts(&render_two_steps(&create_scene(1), |_, _| ())),
         [2; 4],
         "expected a shadow map per frame without a step number"
     );
     assert_eq!(
-        pass_counts(&render_two_steps(&create_scene(2), SceneBuffers::set_step)),
+        shadow_pass_counts(&render_two_steps(&create_scene(2), SceneBuffers::set_step)),
         [2; 4],
         "expected a shadow map per frame with cascades"
     );
     // Both steps have the number 7.
     let frames = render_two_steps(&create_scene(1), |buffers, _| buffers.set_step(7));
-    assert_eq!(pass_counts(&frames), [2, 0, 2, 0], "expected a shadow map per step with other bounds");
+    assert_eq!(shadow_pass_counts(&frames), [2, 0, 2, 0], "expected a shadow map per step with other bounds");
 }
 
 #[test]
@@ -173,9 +173,9 @@ fn frames_of_an_engine_step_share_its_shadow() {
     let mut state = SceneState::rest(&scene);
     loaded_scene.deform(&state).expect("expected the step to succeed");
     let first_frames = draw_frames(&mut context, &mut loaded_scene);
-    assert_eq!(pass_counts(&first_frames), [2, 0]);
+    assert_eq!(shadow_pass_counts(&first_frames), [2, 0]);
     assert_eq!(
-        pass_counts(&draw_frames(&mut context, &mut loaded_scene)),
+        shadow_pass_counts(&draw_frames(&mut context, &mut loaded_scene)),
         [0, 0],
         "expected no shadow pass for the same step"
     );
@@ -185,7 +185,7 @@ fn frames_of_an_engine_step_share_its_shadow() {
     state.transforms[last_domain].0[3] = 2.0;
     loaded_scene.deform(&state).expect("expected the step to succeed");
     let second_frames = draw_frames(&mut context, &mut loaded_scene);
-    assert_eq!(pass_counts(&second_frames), [2, 0], "expected a shadow pass for a new step");
+    assert_eq!(shadow_pass_counts(&second_frames), [2, 0], "expected a shadow pass for a new step");
     // This step fails: the squares of such positions overflow f32.
     state.transforms[last_domain].0[3] = 1e30;
     loaded_scene.deform(&state).expect_err("expected an overflow error");

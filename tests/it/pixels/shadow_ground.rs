@@ -20,6 +20,7 @@ fn render_ground(renderer: &mut Renderer, shadow: Option<ShadowSettings>, has_ca
     builder.parts.look.shadow = shadow;
     let builder = if has_caster { with_square(builder, AlphaMode::Opaque, 1.0) } else { builder };
     let view = View::LookAt { eye: [0.0, 20.0, 0.0], target: [0.0; 3], up: [0.0, 0.0, -1.0] };
+    // Clip planes of 0 are fitted to the bounds.
     let lens = Lens::Intrinsics { fx: 120.0, fy: 120.0, cx: 80.0, cy: 80.0 };
     render_square(renderer, &builder.build(), Camera { view, lens, near: 0.0, far: 0.0 }, 160)
 }
@@ -55,8 +56,9 @@ fn ground_is_lit_at_the_border_of_the_map() {
     );
 }
 
-/// Renders a wall that extends from below the ground to above it. Returns the number of its pixels that are not fully
-/// lit, and the number of its pixels that are not fully dark. With `has_caster`, a shadow covers the wall.
+/// Renders a wall that stands on the ground. The ground is at y = -1, the lowest point of the scene. Returns the number
+/// of pixels of the wall that are not fully lit, and the number that are not fully dark. With `has_caster`, a shadow
+/// covers the wall.
 fn count_wall_pixels(shadow: ShadowSettings, has_caster: bool) -> [usize; 2] {
     let mut builder = create_builder();
     builder.parts.look.sun = [0.0, 3.0, 4.0];

@@ -12,8 +12,8 @@ use super::shadow::{create_builder, with_square};
 
 /// Pixels per unit of the ground in the image of the edge.
 const PIXELS_PER_UNIT: f64 = 100.0;
-/// Half the extent of the light box along z, across the edge. The bounds extend to z = 5. A half extent from 4 to 8 is
-/// rounded up to the next larger multiple of 4 / 16.
+/// Half the extent of the light box along z, across the edge. The bounds extend to z = 5. Half extents from 4 to 8 are
+/// quantized to multiples of 4 / 16 = 0.25, and 5 becomes the next larger multiple.
 const LIGHT_BOX_HALF_EXTENT: f64 = 5.25;
 
 /// A variance shadow map with a blur of 2 texels.
@@ -34,7 +34,8 @@ fn square_scene(shadow: ShadowSettings) -> std::sync::Arc<Scene> {
     with_square(builder, AlphaMode::Opaque, 1.0).build()
 }
 
-/// Renders the edge from straight above. Row 32 of the image begins at the edge.
+/// Renders the edge from straight above. Row 32 of the image begins at the edge. Clip planes of 0 are fitted to the
+/// bounds, here and below.
 fn render_edge(shadow: ShadowSettings) -> RenderedFrame {
     render_edge_with_blur(BlurMethod::Auto, shadow)
 }

@@ -1,6 +1,6 @@
-//! A rendered frame equals a recorded image, which a person has checked. The image, `tests/snapshots/tree.png`, is the
-//! output of `modalcast render tree --size 104x78 --eye 1.5,1.9,2.5 --target 0,1.8,0 --field-of-view 45` on
-//! llvmpipe.
+//! A rendered frame equals the recorded image `tests/snapshots/tree.png` up to a tolerance. A person has checked the
+//! image. The command that rendered it, on llvmpipe, is
+//! `modalcast render tree --size 104x78 --eye 1.5,1.9,2.5 --target 0,1.8,0 --field-of-view 45`.
 
 use modalcast_model::load;
 use modalcast_model::scene::{Camera, Lens, View};
@@ -32,7 +32,8 @@ fn compare_images(image: &[u8], snapshot: &[u8]) -> DifferenceStats {
     DifferenceStats { mean, percentile_99: levels[levels.len() * 99 / 100], max: levels[levels.len() - 1] }
 }
 
-/// Renders the tree close to its trunk: normal map of the bark, cut-out leaves, shadow, ground and sky.
+/// Renders the tree close to its trunk: normal map of the bark, cut-out leaves, shadow, ground and sky. Clip planes of
+/// 0 are fitted to the bounds of the scene.
 fn render_tree(eye: [f64; 3]) -> FrameImage {
     let scene = load::open("tree").expect("expected the built-in scene").scene;
     let view = View::LookAt { eye, target: [0.0, 1.8, 0.0], up: [0.0, 1.0, 0.0] };

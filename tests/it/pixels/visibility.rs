@@ -188,8 +188,9 @@ fn texture_coordinates_are_perspective_correct() {
 /// Shading follows equations 3.12 and 3.14 of the thesis with corrections.
 #[test]
 fn equations_3_12_and_3_14_hold_with_corrections() {
-    // Equation 3.12 reflects v_e at the normal. As printed, v_e points away from the eye. The corrected v_e points to
-    // the eye. With the sun from the left and the eye in the middle, the highlight is on the left.
+    // Equation 3.12 reflects v_e, the direction between the eye and the shaded point, at the normal. As printed, v_e
+    // points away from the eye. The corrected v_e points to the eye. With the sun from the left and the eye in the
+    // middle, the highlight is on the left.
     let sun = Vector3::new(-0.3, 0.0, 1.0).normalize();
     let mut builder = SceneBuilder::new();
     builder.parts.look.sun = sun.cast::<f32>().into();
