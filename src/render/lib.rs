@@ -1,7 +1,8 @@
 //! Headless OpenGL renderer: uploads a scene to the device, draws frames of it and reads their pixels back.
 //!
 //! The passes of a frame, in execution order. The *look* of a scene is its render settings. An *id* names the triangle
-//! that is visible in a sample, or the ground. A *tile* is a square of 8 x 8 pixels.
+//! that is visible in a sample, or the ground. A *tile* is a square of 8 x 8 pixels. A *cut-out* is an alpha-tested
+//! triangle.
 //!
 //! | pass | output | condition |
 //! |---|---|---|

@@ -75,8 +75,8 @@ pub(crate) struct Context {
 }
 
 /// Keeps a context current on this thread. When the guard is dropped, also by a panic that unwinds, the previous
-/// context becomes current again. If there was none, the context stays current, because each switch flushes the
-/// commands of the device.
+/// context becomes current again. If there was none, the context stays current, because releasing a context flushes its
+/// commands.
 #[derive(Debug)]
 #[must_use = "the previous context becomes current again when the guard is dropped"]
 pub(crate) struct CurrentContext {

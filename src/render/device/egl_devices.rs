@@ -1,4 +1,4 @@
-//! EGL devices: describes all of them for `doctor`, and selects one.
+//! EGL devices: describes all of them for `modalcast doctor`, and selects one.
 
 use std::rc::Rc;
 
@@ -94,6 +94,7 @@ fn selection_error(preference: DevicePreference, attempts: &[String]) -> Error {
 /// The candidates to try, best first. The flag states whether the context must draw in software (`true`) or on hardware
 /// (`false`); `None` allows both.
 fn rank_candidates(candidates: Vec<Candidate>, preference: DevicePreference) -> Vec<(Candidate, Option<bool>)> {
+    // CUDA devices first, then other devices with a DRM node, which usually are GPUs.
     let hardware_rank = |candidate: &Candidate| match (candidate.cuda_device, &candidate.drm_node) {
         (Some(_), _) => 0,
         (None, Some(_)) => 1,

@@ -63,7 +63,7 @@ pub(crate) struct Gl {
     is_leak_logged: Cell<bool>,
     /// Pool of timer queries that are not in use.
     free_queries: RefCell<Vec<glow::Query>>,
-    /// Buffers of dropped staging buffers. They are freed once their readers are done.
+    /// Buffers of dropped staging buffers from which a thread still copies. They are freed afterwards.
     retired_buffers: RefCell<Vec<staging::RetiredBuffer>>,
 }
 
@@ -336,6 +336,7 @@ impl Gl {
             match desc.target {
                 glow::TEXTURE_2D_ARRAY => gl.tex_storage_3d(desc.target, levels, desc.format, width, height, depth),
                 glow::TEXTURE_2D_MULTISAMPLE => {
+                    // Here, `depth` is the number of samples.
                     gl.tex_storage_2d_multisample(desc.target, depth, desc.format, width, height, true);
                 }
                 _ => gl.tex_storage_2d(desc.target, levels, desc.format, width, height),
@@ -500,8 +501,8 @@ impl Gl {
         // SAFETY: sets state; no memory is accessed.
         unsafe {
             gl.depth_func(glow::LEQUAL);
-            // Factor of the depth slope, and rounding steps. Twin: `biased_ground_depth` in
-            // shaders/visibility_unpack.comp.
+            // Depth offset: 1 x the change of depth over a pixel + 8 rounding steps of depth. Twin:
+            // `biased_ground_depth` in shaders/visibility_unpack.comp.
             gl.polygon_offset(1.0, 8.0);
             gl.depth_mask(state.depth_write);
             let one_minus_alpha = glow::ONE_MINUS_SRC_ALPHA;

@@ -44,7 +44,8 @@ const TOTALS_OFFSET: usize = COMMAND_WORDS * MAX_GROUPS + 2;
 pub(crate) struct CullUniforms {
     /// Per group: first triangle, number of triangles, first workgroup, first block.
     ranges: [[u32; 4]; MAX_GROUPS],
-    /// Per group: whether it is single-sided, and whether its index list contains vertices instead of corners.
+    /// Per group: whether it is single-sided, and whether its index list contains vertices (opaque groups) instead of
+    /// corners. A corner is a vertex with one normal and one pair of texture coordinates.
     flags: [[u32; 4]; MAX_GROUPS],
     /// Numbers of groups, of workgroups, and of blocks including the padding of each group to whole superblocks.
     count: [u32; 4],

@@ -30,10 +30,11 @@ pub(crate) const VALUE_UNIT: u32 = 24;
 pub(crate) const TRIANGLE_ID_UNIT: u32 = 25;
 /// Depth of the samples whose ids are at [`ID_UNIT`].
 pub(crate) const DEPTH_UNIT: u32 = 26;
-/// Texture unit of the image that a blur, bloom or encode program reads.
+/// Texture unit of the image that a program of the blur, the bloom or the sRGB encoding reads.
 pub(crate) const SOURCE_UNIT: u32 = 0;
-/// Maximum number of textures that the shading reads in addition to the scene's images: one per unit from
-/// [`SHADOW_UNIT`] to [`DEPTH_UNIT`], without the color and normal units, [`VALUE_UNIT`] and [`TRIANGLE_ID_UNIT`].
+/// Maximum number of textures that the shading reads in addition to the scene's images: one for each of the 27 units
+/// from [`SHADOW_UNIT`] to [`DEPTH_UNIT`], except the 12 color and normal units, [`VALUE_UNIT`] and
+/// [`TRIANGLE_ID_UNIT`].
 pub(crate) const FIXED_TEXTURE_READS: usize = 13;
 const _: () = assert!(NORMAL_UNIT + MAX_ARRAYS as u32 <= POSITION_UNIT, "texture units overlap");
 

@@ -1,4 +1,7 @@
 //! Bindings, phases and counters of the fragment lists of order-independent transparency.
+//!
+//! The gather program (`shaders/oit_gather.frag`) draws the blended triangles in three phases. The limit is the maximum
+//! number of fragments that each pixel may store ([`OitCounters::per_pixel_limit`]).
 
 use bytemuck::{Pod, Zeroable};
 
@@ -19,10 +22,10 @@ pub(crate) const CURSORS_IMAGE: u32 = 2;
 pub(crate) const BLEND_LAYERS_IMAGE: u32 = 3;
 /// Phase of the gather program that counts fragments.
 pub(crate) const PHASE_COUNT: i32 = 0;
-/// Phase of the gather program that stores the fragments of pixels within the limit. For the other pixels, it stores
-/// only the nearest depths.
+/// Phase of the gather program that stores the fragments of all pixels with at most as many fragments as the limit. For
+/// pixels with more, it stores only the depths of the nearest fragments.
 pub(crate) const PHASE_FILL: i32 = 1;
-/// Phase of the gather program that adds the ids to the depths of the pixels above the limit.
+/// Phase of the gather program that adds the triangle ids in pixels with more fragments than the limit.
 pub(crate) const PHASE_FILL_IDS: i32 = 2;
 
 /// Counters and indirect draws of a frame. Twin of `OitCounters` in `shaders/shared/oit_lists.glsl` without its last

@@ -15,7 +15,7 @@ pub(super) enum Resource {
     ShadowDepth,
     /// Shadow depth in a buffer, from the compute rasterizer.
     RasterShadowDepth,
-    /// Moments that are blurred in x only.
+    /// Moments of the shadow depth, blurred in x only.
     HorizontalMoments,
     ShadowMoments,
     /// Indirect draw commands of the lists of visible triangles.
@@ -38,8 +38,9 @@ pub(super) enum Resource {
     BlendLayer,
     /// Number of blended fragments of each pixel.
     OitCounts,
-    /// Index of the next record of each pixel.
+    /// Index of the next fragment record of each pixel.
     OitCursors,
+    /// Fragments of all lists, one record each.
     OitRecords,
     OitCounters,
     /// Tiles with blended fragments.

@@ -34,7 +34,7 @@ pub enum Aov {
     Depth,
     /// u32: index of the domain; `u32::MAX` where no triangle is visible.
     Domains,
-    /// Three f32: unit normal on the visible side; zeros where no triangle is visible.
+    /// Three f32: unit normal that points to the visible side; zeros where no triangle is visible.
     Normals,
     /// One word per sample, of two 16-bit unorms; 0 where no triangle is visible. Lower half: the interpolated vertex
     /// value ([`crate::Renderer::upload_vertex_values`]) divided by `scale_max`, clamped to 0 to 1. Upper half: the
@@ -187,6 +187,7 @@ impl Readback<'_> {
             draw_ground(recorder, buffers, params)?;
         }
         let scale = match self.field {
+            // Meters per scene unit.
             Aov::Depth => Some(buffers.scene.unit as f32),
             Aov::Values { scale_max } => Some(scale_max.recip()),
             Aov::Domains | Aov::Normals => None,

@@ -1,4 +1,5 @@
-//! Draws blended triangles: in draw order into one blend layer, or with exact transparency (`oit`).
+//! Draws blended triangles: in draw order into one blend layer (an image of their light and transmittance), or with
+//! exact transparency into fragment lists (`oit`).
 
 use super::draw::{TriangleDraw, bind_shadow, draw_groups, triangle_set};
 use super::recorder::{FrameContext, PassRecorder};

@@ -17,16 +17,17 @@
 //! strictly behind them at every sample is not visible. The number of culled triangles does depend on earlier frames.
 //! The first frame has no occluders.
 //!
-//! Occluders are drawn twice: first their depth, later their ids among all visible triangles. To draw them once with
-//! ids, and then the other triangles, is not exact: at equal depths, the later triangle in draw order must win.
-//! Fragment shaders cannot read the current id, and a depth comparison in the shader would force per-sample shading.
+//! Occluders are drawn twice: first their depth, later their ids among all visible triangles. Drawing them once with
+//! ids, and then the other triangles, would not be exact: at equal depths, the later triangle in draw order must win.
+//! A fragment shader cannot decide this: it cannot read the id that is already in the image, and a depth comparison in
+//! the shader would force per-sample shading.
 //! The depth is cleared between the two draws. Therefore the depths of both draws need to match only within the margin
 //! of the occlusion test, not exactly.
 //!
 //! # Lists
-//! A list begins at the offset of its group. Its triangles are in draw order, because it is compacted with a prefix sum
-//! over the bitmap of visible triangles, not with atomics. It contains vertex indices, so that triangles still share
-//! transformed vertices. Fragments get the id of their triangle with one texel fetch.
+//! The list of a group begins at the index of the group's first triangle. Its triangles are in draw order, because it
+//! is compacted with a prefix sum over the bitmap of visible triangles, not with atomics. It contains vertex indices,
+//! so that triangles still share transformed vertices. Fragments get the id of their triangle with one texel fetch.
 
 use super::draw::{TriangleDraw, TriangleSet, bind_visibility, draw_groups};
 use super::recorder::{FrameContext, PassRecorder};

@@ -107,8 +107,8 @@ struct Gather<'a> {
 }
 
 impl Gather<'_> {
-    /// Draws one phase. `PHASE_FILL_IDS` is needed only if the fragments exceed the budget: it is drawn indirectly, and
-    /// the allocate program otherwise sets its number of instances to 0.
+    /// Draws one phase. `PHASE_FILL_IDS` is needed only if the fragments exceed the budget. Therefore it is drawn
+    /// indirectly: the allocate program sets its number of instances to 1 if it is needed, else to 0.
     fn draw(&self, recorder: &mut PassRecorder<'_>, phase: i32) {
         let Self { buffers, target, programs, region } = *self;
         let (gl, triangles) = (recorder.gl, triangle_set(buffers));

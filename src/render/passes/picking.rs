@@ -221,7 +221,7 @@ fn find_hit(pick: &PendingPick, rays: &PixelRays, words: &[u32], pixel: [u32; 2]
     let interpolate = |first_word: usize| {
         Matrix3::from_columns(&[0, 1, 2].map(|index| corner_vector(first_word, index))) * barycentrics
     };
-    // Shorter normals count as zero.
+    // Shorter normals count as zero: their direction is lost in rounding.
     let min_length = 1e-30;
     let normal = interpolate(NORMALS_WORD)
         .try_normalize(min_length)

@@ -1,4 +1,5 @@
-//! Passes of the compute rasterizer: the draws, and the conversion of visibility keys to ids.
+//! Passes of the compute rasterizer: the draws, and the conversion of visibility keys to ids. A key is the triangle and
+//! the depth of a pixel.
 
 use super::recorder::{FrameContext, PassRecorder};
 use crate::layout::{TILE, WORDS_BINDING};

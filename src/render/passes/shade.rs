@@ -1,4 +1,4 @@
-//! Deferred shading of the visible surfaces.
+//! Deferred shading of the visible surfaces, by tiles (squares of 8 x 8 pixels).
 
 use super::draw::{bind_shadow, bind_visibility};
 use super::recorder::{FrameContext, PassRecorder};

@@ -50,7 +50,7 @@ pub(crate) fn blur(recorder: &mut PassRecorder<'_>, buffers: &SceneBuffers) -> R
     let gl = recorder.gl;
     let mut programs: Vec<&Program> = buffers.programs.blur.iter().map(AsRef::as_ref).collect();
     recorder.begin(Pass::Blur);
-    // If the compute rasterizer drew the depth, the first blur program reads its buffer.
+    // If the compute rasterizer drew the depth, a program that reads the depth from a buffer replaces the first one.
     if let (Some((depths, buffer_program)), Some(first_program)) =
         (buffers.shadow_rasterizer().and_then(ComputeRasterizer::blur_input), programs.first_mut())
     {
@@ -79,7 +79,8 @@ pub(crate) fn blur(recorder: &mut PassRecorder<'_>, buffers: &SceneBuffers) -> R
                 blurred.moments.bind_image_layer(DESTINATION_IMAGE, layer);
                 gl.dispatch(size.div_ceil(WORKGROUP_SIZE), invocations_per_line);
             }
-            // Two fragment passes. The first framebuffer is that of `horizontal`.
+            // Two fragment passes. Framebuffer 0 is that of `horizontal`; framebuffer 1 + i is that of layer i of
+            // `moments`.
             ([x_program, y_program], Some(horizontal)) => {
                 gl.set_pipeline_state(PipelineState::default());
                 let framebuffers = [&blurred.framebuffers[0], &blurred.framebuffers[1 + layer as usize]];

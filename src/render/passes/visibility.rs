@@ -27,7 +27,7 @@ pub(super) struct IdDraw<'a> {
 /// Draws the id and depth of each sample. `draws_ground`: whether the ground must be rasterized.
 pub(crate) fn draw(recorder: &mut PassRecorder<'_>, frame: &FrameContext<'_>, draws_ground: bool) -> Result<()> {
     let FrameContext { buffers, target, programs, params } = *frame;
-    // Multisampled ids are not cleared: the depth tells which ids are valid.
+    // Multisampled ids are not cleared, which saves time: shaders also read the depth, which tells which ids are valid.
     let clear = match target.desc.samples {
         1 => ClearOp::DepthAndIds(Some(&target.dirty_regions)),
         _ => ClearOp::Depth(Some(&target.dirty_regions.depth)),

@@ -37,13 +37,13 @@ pub(crate) struct GeometryBuffers<T> {
     pub(crate) positions: T,
     /// 3 f32 per corner, deformed.
     pub(crate) normals: T,
-    /// 4 f32 per corner, deformed; only with normal maps.
+    /// 4 f32 per corner (tangent and sign of the bitangent), deformed; only with normal maps.
     pub(crate) tangents: Option<T>,
     /// 2 f32 per corner; only with textures or normal maps.
     pub(crate) uvs: Option<T>,
-    /// Three corner indices per triangle.
+    /// Three corner indices per triangle; they select normals, tangents and texture coordinates.
     pub(crate) triangles: T,
-    /// Three vertex indices per triangle.
+    /// Three vertex indices per triangle; they select positions.
     pub(crate) triangle_vertices: T,
     /// Vertex index of each corner; only with cut-out or blended triangles.
     pub(crate) corner_vertices: Option<T>,

@@ -59,8 +59,9 @@ pub(crate) fn cull_buffer_sizes(scene: &Scene, culling: Culling) -> Option<CullB
     if culling == Culling::None {
         return None;
     }
-    // The subpixel step is irrelevant to the sizes.
-    let uniforms = CullUniforms::new(&groups(scene).0, 0.0);
+    let (groups, _) = groups(scene);
+    // The subpixel step, here 0, is irrelevant to the sizes.
+    let uniforms = CullUniforms::new(&groups, 0.0);
     let (triangles, bitmap_bytes) = (scene.layout.triangles as u64, uniforms.bitmap_bytes() as u64);
     Some(CullBuffers {
         uniforms: size_of::<CullUniforms>() as u64,

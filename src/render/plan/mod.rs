@@ -55,8 +55,8 @@ pub struct RenderPlan {
     /// below the ground.
     pub passes: Vec<Pass>,
     /// Draw calls of the occluder, visibility and blend passes, independent of the number of domains and materials. At
-    /// most fourteen: four opaque and cut-out groups as occluders and for the visibility, two blended groups in three
-    /// phases.
+    /// most 4 + 4 + 2 x 3 = 14: four opaque and cut-out groups, once as occluders and once for the visibility, and two
+    /// blended groups in three phases.
     pub draw_calls: usize,
     /// Defines that the shaders are compiled with.
     pub defines: Vec<&'static str>,
@@ -345,7 +345,7 @@ mod tests {
         assert_eq!(
             plan.omitted[4].bytes,
             12 * 1024 * 1024,
-            "expected 4 bytes of depth and 8 bytes of moments per texel"
+            "expected 4 bytes of depth and 8 bytes of moments for each of 1024 x 1024 texels"
         );
     }
 

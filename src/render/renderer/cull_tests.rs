@@ -102,6 +102,7 @@ fn each_culling_test_that_removes_too_much_changes_the_image() {
     let scene = sheets();
     // Replacing a word by itself gives the image of the original shader.
     let expected_image = draw_second_frame(&scene, ("shared", "shared"));
+    // Each replacement makes one culling test remove visible triangles.
     for replacement in [
         // Planes of the view volume.
         ("is_below[axis] && lower_distance[axis] < -margin[axis]", "is_below[axis] && lower_distance[axis] < 2.0"),

@@ -208,7 +208,8 @@ impl Renderer {
 /// Whether the ground must be rasterized. Otherwise the shading adds visible ground to samples without an id.
 fn must_draw_ground(buffers: &SceneBuffers, params: &FrameParams) -> bool {
     let scene = &buffers.scene;
-    // The bounds of a rebased scene exclude distant domains, which may be below the ground.
+    // The bounds of a rebased scene (drawn with positions relative to one chosen origin) exclude distant domains, which
+    // may be below the ground.
     let is_ground_behind_scene = buffers.rebased.is_none() && ground_is_behind_scene(scene, params, buffers.origin);
     scene.look.ground.is_some() && camera_is_above_ground(scene, params) && !is_ground_behind_scene
 }
@@ -216,6 +217,7 @@ fn must_draw_ground(buffers: &SceneBuffers, params: &FrameParams) -> bool {
 /// Region of the frame that may show triangles or rasterized ground.
 fn draw_region(buffers: &SceneBuffers, params: &FrameParams, draws_ground: bool) -> Region {
     let size = [params.width, params.height];
+    // The bounds of a rebased scene exclude distant domains, and the ground is larger than all bounds.
     if buffers.rebased.is_some() || draws_ground {
         return Region::whole(size);
     }

@@ -11,7 +11,8 @@ use modalcast_model::domain::{AlphaMode, Material};
 use modalcast_model::scene::{BoundingBox, Camera, Scene, Transparency};
 
 /// Draws a red square between two squares of `alpha_mode` into 64 x 64 pixels; returns the pixels and the renderer.
-/// `post_depth_coverage`: if the device supports it, list one fragment per pixel instead of one per sample.
+/// `post_depth_coverage`: if the device supports it, list one fragment of a triangle per pixel instead of one per
+/// sample.
 fn draw_glass(transparency: Transparency, alpha_mode: AlphaMode, post_depth_coverage: bool) -> (Vec<u8>, Renderer) {
     let glass = Material { alpha: 0.5, alpha_mode, double_sided: true, ..Material::default() };
     let mut parts = squares(vec![Material { diffuse: [0.9, 0.2, 0.1], ..Material::default() }, glass.clone(), glass]);

@@ -35,7 +35,7 @@ pub struct SceneBuffers {
     /// that it has registered.
     pub(crate) compute_rasterizer: Option<ComputeRasterizer>,
     pub(crate) scene: Arc<Scene>,
-    /// The deformed positions in it are the shared positions: a deformer may write the buffer directly
+    /// Its deformed positions are called shared positions, because a deformer may write their buffer directly
     /// ([`Self::vertex_buffers`]).
     pub(crate) geometry: GeometryBuffers<Buffer>,
     /// Keeps the buffers of the buffer textures alive.

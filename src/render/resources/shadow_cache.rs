@@ -1,5 +1,6 @@
-//! Reuse of the shadow map between the frames of a step. A map that does not depend on the camera is drawn again only
-//! if the vertices, their origin or the bounds change. The look of a scene never changes.
+//! Reuse of the shadow map between the frames of a step, that is, of one state of the vertices. A map that does not
+//! depend on the camera is drawn again only if the vertices, their origin or the bounds change. The look of a scene
+//! never changes.
 
 use std::cell::Cell;
 

@@ -14,6 +14,7 @@ use modalcast_model::scene::{DomainLayout, Scene};
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) enum BlendMode {
     Opaque,
+    /// Cut-outs: fragments with an alpha below the cutoff are discarded.
     Mask,
     Blend,
 }
@@ -51,9 +52,9 @@ pub(crate) struct Geometry {
     pub(crate) corner_vertices: Vec<u32>,
     /// Texture coordinates of each corner; empty if no material has a texture.
     pub(crate) uvs: Vec<[f32; 2]>,
-    /// Corner indices of each triangle.
+    /// Corner indices of each triangle; they select normals and texture coordinates.
     pub(crate) triangle_corners: Vec<[u32; 3]>,
-    /// Vertex indices of each triangle.
+    /// Vertex indices of each triangle; they select positions.
     pub(crate) triangle_vertices: Vec<[u32; 3]>,
     /// Material of each triangle, as an index in [`used_materials`]; empty if only one material is used.
     pub(crate) triangle_materials: Vec<u32>,

@@ -15,8 +15,8 @@ use modalcast_model::scene::Scene;
 
 use super::geometry::used_materials;
 
-/// Maximum number of arrays per role. The arrays of both roles and the shadow map together need fewer than the sixteen
-/// texture units that OpenGL guarantees to a fragment shader.
+/// Maximum number of arrays per role. The arrays of both roles and the shadow map together need 6 + 6 + 1 texture
+/// units; OpenGL guarantees sixteen to a fragment shader.
 pub(crate) const MAX_ARRAYS: usize = 6;
 
 /// Maximum bytes of all arrays with their mipmap levels. For comparison, 512 images of 4096 x 4096 take 46 GB.
@@ -269,6 +269,7 @@ fn downsample_weights(side: u32) -> Vec<[f32; 3]> {
     let weights_of = |x: u32| match side {
         1 => [1.0, 0.0, 0.0],
         side if side % 2 == 0 => [0.5, 0.5, 0.0],
+        // Texel x covers the interval from x side / half_side to (x + 1) side / half_side.
         side => [half_side - x, half_side, x + 1].map(|weight| weight as f32 / side as f32),
     };
     (0..half_side).map(weights_of).collect()

@@ -1,6 +1,7 @@
-//! Generates the shader that blurs a variance shadow map by strips. The code is unrolled with one variable per sum,
-//! because not all compilers keep arrays in registers. It is inserted into `shaders/vsm_blur_strip.comp`, which
-//! declares the GLSL variables `corner`, `lane`, `side`, `first_row` and `buffer_offset`.
+//! Generates the shader that blurs a variance shadow map by strips. A workgroup blurs a strip of consecutive rows, with
+//! one column per lane (an invocation of the workgroup). The code is unrolled with one variable per sum, because not
+//! all compilers keep arrays in registers. It is inserted into `shaders/vsm_blur_strip.comp`, which declares the GLSL
+//! variables `corner`, `lane`, `side`, `first_row` and `buffer_offset`.
 
 use std::fmt::Write as _;
 
@@ -40,14 +41,14 @@ impl BlurStrip {
         (radius <= MAX_RADIUS).then_some(Self { columns, rows, rows_per_iteration, radius })
     }
 
-    /// Bytes of shared memory.
+    /// Bytes of shared memory: two buffers of f32 depths of an iteration's rows, with margins.
     #[cfg(test)]
     const fn shared_bytes(self) -> u32 {
-        4 * 2 * self.rows_per_iteration * (self.columns + 2 * self.radius)
+        2 * 4 * self.rows_per_iteration * (self.columns + 2 * self.radius)
     }
 
-    /// Shader source without the version and the defines of the format and WORKGROUP_SIZE. `weights`: one half of a
-    /// Gaussian, center first.
+    /// Defines of the strip, and the shader body. The caller prepends the version, the defines FORMAT and
+    /// WORKGROUP_SIZE, and `centered_depth`. `weights`: one half of a Gaussian, center first.
     pub(crate) fn text(self, weights: &[f32]) -> String {
         let Self { rows, rows_per_iteration, radius, .. } = self;
         let text = format!(
@@ -78,6 +79,8 @@ impl BlurStrip {
             writeln!(loads, "float depth{row} = centered_depth({texel}, side);").ok();
             writeln!(stores, "depths[buffer_offset + {} + lane] = depth{row};", row * row_pitch + radius).ok();
         }
+        // A row has `radius` margin texels to the left of the strip, then `radius` to the right. Each lane loads one
+        // margin texel per iteration of this loop.
         let margin_count = rows_per_iteration * 2 * radius;
         for (index, first) in (0..margin_count).step_by(columns as usize).enumerate() {
             writeln!(loads, "int texel{index} = {first} + lane, row{index} = texel{index} / {};", 2 * radius).ok();
@@ -152,6 +155,7 @@ mod tests {
             let blur = tenths as f32 / 10.0;
             for size in [16, 512, 1000, 4096, 16384] {
                 let Some(strip) = strip(blur, size) else {
+                    // The radius is 3 blur, rounded up; a blur of 8 texels has MAX_RADIUS.
                     assert!(blur > 8.0, "expected a strip for blur {blur}");
                     continue;
                 };

@@ -11,7 +11,7 @@ impl ShaderOptions {
     /// Counts the blended fragments of each pixel, or adds them to the list of the pixel; see the phases in
     /// `layout::oit`.
     pub(crate) fn oit_gather(&self, samples: u32) -> ProgramSource {
-        // Extension directives must precede all other code.
+        // An extension directive must precede all code except other directives.
         let post_depth_coverage = samples > 1 && self.post_depth_coverage;
         let defines: &[&str] = if post_depth_coverage { &["MASK", "POST_DEPTH_COVERAGE"] } else { &["MASK"] };
         let extension = if post_depth_coverage { "#extension GL_ARB_post_depth_coverage : require\n" } else { "" };

@@ -18,7 +18,7 @@ const VSM_MOMENTS: &str = include_str!("../../../shaders/shared/vsm_moments.glsl
 
 /// Consecutive texels along the direction of the blur that an invocation writes.
 pub(crate) const TEXELS_PER_INVOCATION: u32 = 8;
-/// Number of lanes of a workgroup that blurs a tile.
+/// Number of lanes (invocations) of a workgroup that blurs a tile.
 const TILE_WORKGROUP_SIZE: u32 = 256;
 /// Bytes of shared memory that OpenGL 4.3 guarantees to a workgroup.
 pub(crate) const SHARED_BYTES: u32 = 32 << 10;
@@ -86,6 +86,7 @@ impl ShaderOptions {
             let taps = gaussian_weights(shadow.blur);
             writeln!(text, "#define RADIUS {}", taps.len() - 1).ok();
             let tap_list: String = taps.iter().map(|weight| format!("{weight:?}, ")).collect();
+            // The shader also reads the tap after the last one.
             writeln!(text, "const float TAPS[RADIUS + 2] = float[]({tap_list}0.0);").ok();
         }
         text + self.cascade_source() + SUN_VISIBILITY
@@ -252,8 +253,9 @@ mod tests {
 
     #[test]
     fn tiles_fit_into_shared_memory() {
-        for step in 0..=160 {
-            let tile = BlurTile::fit(&ShadowSettings { blur: step as f32 / 10.0, ..ShadowSettings::default() });
+        // Blurs from 0 to 16 texels.
+        for tenths in 0..=160 {
+            let tile = BlurTile::fit(&ShadowSettings { blur: tenths as f32 / 10.0, ..ShadowSettings::default() });
             let bytes = tile.shared_bytes();
             assert!(bytes <= SHARED_BYTES, "{tile:?}: {bytes} bytes");
             assert!(

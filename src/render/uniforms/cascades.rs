@@ -89,7 +89,8 @@ fn bounding_sphere(
     let corners: [Point3<f64>; 8] = std::array::from_fn(|corner| {
         let sign = |bit: usize| if corner >> bit & 1 == 0 { -1.0 } else { 1.0 };
         let depth = if corner < 4 { near_depth } else { far_depth };
-        // Inverse of the projection: depth * ndc = P[axis][axis] * coordinate - P[axis][2] * depth, with ndc = -1 or 1.
+        // Inverse of the projection matrix P = clip_from_camera, with ndc = -1 or 1:
+        // depth * ndc = P[axis][axis] * coordinate - P[axis][2] * depth.
         let coordinate =
             |axis: usize| depth * (sign(axis) + clip_from_camera[(axis, 2)]) / clip_from_camera[(axis, axis)];
         world_from_camera.transform_point(&Point3::new(coordinate(0), coordinate(1), -depth))
@@ -114,7 +115,8 @@ fn fit_cascade(
     })
 }
 
-/// Scale and offset from coordinates of the whole map to those of the cascade, as in [`ShadowCascades`].
+/// Scale and offset from coordinates of the whole map to those of the cascade, as in [`ShadowCascades`]. A point at p
+/// on an axis has the map coordinate (p - low) / (2 half_length).
 fn cascade_transform(whole_sides: &[TexelSpan; 2], cascade_sides: &[TexelSpan; 2]) -> [f32; 4] {
     let scale = [0, 1].map(|axis: usize| whole_sides[axis].half_length / cascade_sides[axis].half_length);
     let offset = [0, 1]
@@ -183,7 +185,7 @@ mod tests {
                 let texel = 2.0 * first_sides[axis].half_length / box_params.size;
                 let shift = (sides[axis].low - first_sides[axis].low) / texel;
                 assert!((shift - shift.round()).abs() < 1e-6, "expected a whole number of texels, got {shift}");
-                // The sphere is that of the camera before its move.
+                // The sphere of the camera before its move must lie inside its cascade.
                 let center_coordinate = whole_box.axes[axis].dot(&center.coords);
                 let unmoved_side = fit_cascade(&whole_box, &box_params, &(center, radius)).expect("a cascade")[axis];
                 assert!(

@@ -162,6 +162,7 @@ pub(crate) fn light_box_params(scene: &Scene, params: &FrameParams, origin: [f64
 pub fn shadow_texel_axes(scene: &Scene, params: &FrameParams) -> Option<[Vector3<f64>; 2]> {
     let shadow = scene.look.shadow?;
     let shadow_from_world = LightBox::fit(&light_box_params(scene, params, [0.0; 3])).shadow_from_world;
+    // One texel is a step of 1 / size in a map coordinate, which is the product of a matrix row and the position.
     let texel_axis = |row: usize| {
         let row_vector = shadow_from_world.fixed_view::<1, 3>(row, 0).transpose();
         row_vector / (row_vector.norm_squared() * f64::from(shadow.size))
@@ -210,7 +211,7 @@ fn rebased_rest_bounds(scene: &Scene, bounds: BoundingBox, origin: [f64; 3]) -> 
 
 /// Center of the ground below the scene, and the distance D over which the ground fades. D is 3.5 times the diagonal of
 /// the scene or the camera's horizontal distance, whichever is larger. So the ground keeps at least exp(-(1 / 3.5)^2) =
-/// 92 % of its color up to there. `up`: index of the up axis.
+/// 92 % of its color up to that distance. `up`: index of the up axis.
 fn ground_center_and_fade(up: usize, rest_bounds: BoundingBox, eye: Vector3<f64>) -> (Vector3<f64>, f64) {
     let mut center = rest_bounds.center().coords;
     center[up] = rest_bounds.min[up];

@@ -231,9 +231,8 @@ mod tests {
                     assert!((0.0..=1.0).contains(&map_position.z), "{sun} {map_position}");
                 }
             }
-            // A quarter of the map's area.
-            let area = |light_box: &LightBox| light_box.sides[0].half_length * light_box.sides[1].half_length;
-            assert!(area(&light_box) < 0.9 * area(&corner_box), "{sun}");
+            let quarter_area = |light_box: &LightBox| light_box.sides[0].half_length * light_box.sides[1].half_length;
+            assert!(quarter_area(&light_box) < 0.9 * quarter_area(&corner_box), "{sun}");
         }
     }
 
@@ -241,6 +240,7 @@ mod tests {
     fn distant_ground_and_horizontal_sun_give_a_finite_box() {
         for (sun, ground) in [
             (Vector3::x(), Some(-0.5)),
+            // Slightly above the elevation at which `ground_plane` gives none.
             (Vector3::new(1.0, 0.021, 0.0), Some(-1e9)),
             (-Vector3::y(), Some(0.0)),
             (Vector3::y(), None),
@@ -257,10 +257,10 @@ mod tests {
         assert!(center.iter().all(|number| (0.0..=1.0).contains(number)), "{center}");
     }
 
-    /// Tracks a fixed point in the texel grid of the map while the bounds sway and grow slowly. `map_position` gives
-    /// the position of the point in the map, 0 to 1. Returns the largest movement of the point between two steps, in
-    /// texels without whole texels, and the number of steps at which the map changed its quantized size. These steps do
-    /// not count as movement.
+    /// Tracks a fixed point in the texel grid of the map while the bounds sway, and grow by 0.04 along z.
+    /// `map_position` gives the position of the point in the map, 0 to 1. Returns the largest movement of the point
+    /// between two steps, in texels without whole texels, and the number of steps at which the map changed its
+    /// quantized size. These steps do not count as movement.
     fn measure_crawl(uses_light_bounds: bool, map_position: impl Fn(&LightBoxParams) -> [f64; 2]) -> (f64, usize) {
         let mut params = test_params(Vector3::new(0.4, 0.8, 0.5), Some(0.0));
         let (mut previous, mut max_movement, mut size_changes): (Option<([f64; 2], f64)>, f64, usize) = (None, 0.0, 0);
@@ -269,7 +269,7 @@ mod tests {
             params.bounds.max =
                 [1.0 + 0.05 * phase.sin(), 3.0 + 0.02 * (0.7 * phase).cos(), 2.0 + 1e-4 * f64::from(step)];
             let [x, y, z] = params.bounds.max;
-            // The factor keeps the size from oscillating around a quantization step.
+            // The factor 0.95 keeps the size from oscillating around a quantization step.
             params.light_bounds =
                 measure_light_bounds(&params, &ellipsoid_points([x, 0.5 * y, z].map(|scale| 0.95 * scale)))
                     .filter(|_| uses_light_bounds);
@@ -318,6 +318,7 @@ mod tests {
                 (axes[axis].dot(&point.coords) - low) / (high - low)
             })
         });
+        // A movement without whole texels is at most 0.5.
         assert!(max_movement > 0.3, "expected an unquantized box to move its texels, got {max_movement}");
     }
 

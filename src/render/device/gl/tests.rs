@@ -59,7 +59,7 @@ fn commands_are_not_issued_while_the_context_is_occupied() {
         assert!(error.contains("eglMakeCurrent"), "{error}");
     }
     buffer.write(&[9; 4]);
-    // Both contexts use the same names: a deletion on the wrong context would delete `other_buffer`.
+    // Both contexts number their buffers alike: a deletion on the wrong context would delete `other_buffer`.
     let name = leaked.name();
     // The buffer cannot be deleted now, so it leaks.
     drop(leaked);
@@ -127,6 +127,7 @@ fn buffers_live_until_the_last_reference_is_dropped() {
 #[test]
 fn timer_queries_end_when_their_commands_fail_or_panic() {
     let mut gl = open();
+    // On hardware, passes are timed with queries.
     Rc::get_mut(&mut gl).expect("not shared").limits.software = false;
     let time_commands = |commands: &dyn Fn() -> Result<()>| gl.time_pass("test", Duration::from_secs(60), commands);
     time_commands(&|| Err(fault("test", "injected"))).expect_err("the error of the commands");
