@@ -68,7 +68,7 @@ pub(crate) fn alpha_image(width: u32, height: u32, mut texel: impl FnMut(u32, u3
 
 /// [`all_soups`] with cut-outs: the last two thirds of the triangles are alpha-tested. Each image has one alpha value,
 /// so that the result does not depend on the texture filter.
-pub(crate) fn uniform_cut_out_soups() -> Vec<CutOutSoup> {
+pub(crate) fn constant_alpha_soups() -> Vec<CutOutSoup> {
     let mut random = Random(21);
     // Image 0 is transparent, image 1 is opaque. A cutoff of NaN discards every sample.
     let material = |alpha, cutoff, image| AlphaMaterial { alpha, cutoff, image };

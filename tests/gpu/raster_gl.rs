@@ -9,7 +9,7 @@ use modalcast_model::deform::Deformer as _;
 use modalcast_model::raster::{CutOuts, GlBuffer, RasterGeometry, Rasterizer};
 use modalcast_model::scene::{CullMode, DrawRange, Viewport};
 
-use crate::common::cut_outs::uniform_cut_out_soups;
+use crate::common::cut_outs::constant_alpha_soups;
 use crate::common::soups::{Soup, all_soups, clip_space_viewport};
 use crate::gl::GlContext;
 use crate::scenes;
@@ -99,7 +99,7 @@ fn gpu_samples_have_the_bits_of_the_reference() {
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_uniform_cut_outs_have_the_bits_of_the_reference() {
     let context = GpuContext::open();
-    for cut_out_soup in uniform_cut_out_soups() {
+    for cut_out_soup in constant_alpha_soups() {
         let soup = &cut_out_soup.soup;
         let (mut rasterizer, _) = context.create_rasterizer(soup, Some(cut_out_soup.cut_outs.clone()));
         let pixel_count = soup.viewport.pixel_count() as u64;

@@ -43,7 +43,7 @@ fn reference_displacements(steps: &[v1::Step]) -> Vec<f32> {
 }
 
 /// Numbers of the positions of a domain, or of its displacements: four vertices times three axes.
-const DOMAIN_NUMBERS: usize = 12;
+const NUMBERS_PER_DOMAIN: usize = 12;
 
 /// Bounding boxes of consecutive domains, computed from their positions. A box is its minimum, then its maximum.
 fn compute_boxes(positions: &[f32]) -> Vec<f32> {
@@ -51,7 +51,7 @@ fn compute_boxes(positions: &[f32]) -> Vec<f32> {
         let BoundingBox { min, max } = BoundingBox::from_positions(positions);
         [min, max].concat().into_iter().map(|number| number as f32)
     };
-    positions.chunks_exact(DOMAIN_NUMBERS).flat_map(min_and_max).collect()
+    positions.chunks_exact(NUMBERS_PER_DOMAIN).flat_map(min_and_max).collect()
 }
 
 fn max_abs_error(numbers: &[f32], expected_numbers: &[f32]) -> f32 {
@@ -82,7 +82,7 @@ async fn displacements_and_boxes_come_with_or_without_vertices() {
                 reference_displacements(&steps[..=index]),
             );
             let assert_attributes = |reply: &ReceivedVertices, domains: std::ops::Range<usize>| {
-                let numbers = DOMAIN_NUMBERS * domains.start..DOMAIN_NUMBERS * domains.end;
+                let numbers = NUMBERS_PER_DOMAIN * domains.start..NUMBERS_PER_DOMAIN * domains.end;
                 let expected_boxes = compute_boxes(&expected_positions[numbers.clone()]);
                 assert!(max_abs_error(&reply.displacements, &expected_displacements[numbers]) < TOLERANCE);
                 assert!(max_abs_error(&reply.boxes, &expected_boxes) < TOLERANCE);
@@ -103,7 +103,7 @@ async fn displacements_and_boxes_come_with_or_without_vertices() {
                     .await
                     .expect("expected vertices");
             assert_attributes(&vertices_and_attributes, 0..2);
-            assert_eq!(vertices_and_attributes.normals.len(), 2 * DOMAIN_NUMBERS);
+            assert_eq!(vertices_and_attributes.normals.len(), 2 * NUMBERS_PER_DOMAIN);
             assert_eq!(vertices_and_attributes.boxes, compute_boxes(&vertices_and_attributes.positions));
             assert!(max_abs_error(&vertices_and_attributes.positions, &expected_positions) < TOLERANCE);
             let second_domain = get_vertices(&server, vertex_request("attributes", select_attributes(&[1])))

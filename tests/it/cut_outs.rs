@@ -8,7 +8,7 @@ use modalcast_model::raster::{AlphaImage, AlphaMaterial, CutOuts};
 use modalcast_model::scene::Viewport;
 use nalgebra::{Matrix3, Vector3};
 
-use crate::common::cut_outs::{alpha_image, floor_soup, sheet_soup, uniform_cut_out_soups};
+use crate::common::cut_outs::{alpha_image, floor_soup, sheet_soup, constant_alpha_soups};
 use crate::common::soups::{clip_space_viewport, perspective_viewport};
 
 /// Texture coordinates where the ray through a point of the viewport meets the plane of a triangle, in f64. `x` and `y`
@@ -215,7 +215,7 @@ fn sheet_reproduces_its_image_at_levels_0_and_1() {
 #[test]
 fn uniform_images_keep_all_or_nothing_of_a_triangle() {
     let mut different_samples = 0;
-    for cut_out_soup in uniform_cut_out_soups() {
+    for cut_out_soup in constant_alpha_soups() {
         let (soup, cut_outs) = (&cut_out_soup.soup, &cut_out_soup.cut_outs);
         // For each of the seven materials, whether the alpha test keeps all samples; otherwise it discards all. It
         // keeps a sample if the alpha (material times image) is at least the cutoff. The alphas and cutoffs are (0,

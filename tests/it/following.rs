@@ -26,7 +26,7 @@ fn vertex_request(domains: &[u32]) -> v1::GetVerticesRequest {
 }
 
 /// Numbers of the positions of a domain: four vertices times three axes.
-const DOMAIN_NUMBERS: usize = 12;
+const NUMBERS_PER_DOMAIN: usize = 12;
 
 /// Row-major 3 x 4 matrix: a rotation by 90 degrees about z, then a translation by (2, 0, -3).
 const ROTATION_AND_SHIFT: [f32; 12] = [0.0, -1.0, 0.0, 2.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, -3.0];
@@ -43,16 +43,16 @@ async fn moved_branch_moves_only_itself_and_its_followers() {
     writer.send_step_and_wait(step.clone()).await;
     let positions = get_vertices(&server, vertex_request(&[])).await.expect("expected vertices").positions;
     assert_eq!(positions, reference_vertices(&twig(), &[step]).positions);
-    assert_eq!(positions[..DOMAIN_NUMBERS], rest_positions[..DOMAIN_NUMBERS], "expected domain 0 not to move");
+    assert_eq!(positions[..NUMBERS_PER_DOMAIN], rest_positions[..NUMBERS_PER_DOMAIN], "expected domain 0 not to move");
     // The first vertex of the leaf is the origin of the leaf's frame, which is at (0.5, 1, -0.25) in the branch's
     // frame. The leaflet has the same frame relative to the leaf. The frame maps (0.5, 1, -0.25) to (-0.5, 1.5, -0.5).
     let transformed = |[x, y, z]: [f32; 3]| [2.0 - y, x, z - 3.0];
-    let positions_of = |domain: usize| &positions[DOMAIN_NUMBERS * domain..][..DOMAIN_NUMBERS];
+    let positions_of = |domain: usize| &positions[NUMBERS_PER_DOMAIN * domain..][..NUMBERS_PER_DOMAIN];
     let first_vertex = |domain: usize| [positions_of(domain)[0], positions_of(domain)[1], positions_of(domain)[2]];
     assert_eq!(first_vertex(LEAF as usize), transformed([0.5, 1.0, -0.25]));
     assert_eq!(first_vertex(LEAFLET as usize), transformed([-0.5, 1.5, -0.5]));
     assert!(
-        (1..4).all(|domain| *positions_of(domain) != rest_positions[DOMAIN_NUMBERS * domain..][..DOMAIN_NUMBERS]),
+        (1..4).all(|domain| *positions_of(domain) != rest_positions[NUMBERS_PER_DOMAIN * domain..][..NUMBERS_PER_DOMAIN]),
         "negative control: the branch and its followers move"
     );
     writer.finish().await;
@@ -92,7 +92,7 @@ async fn step_with_transform_of_a_follower_is_rejected() {
     let mut writer = server.drive_lossless("twig").await;
     writer.send_step_and_wait(step(2, &[LEAF], &[0.5, -0.25])).await;
     let deformed_positions = get_vertices(&server, vertex_request(&[])).await.expect("expected vertices").positions;
-    let leaf = DOMAIN_NUMBERS * LEAF as usize..DOMAIN_NUMBERS * LEAFLET as usize;
+    let leaf = NUMBERS_PER_DOMAIN * LEAF as usize..NUMBERS_PER_DOMAIN * LEAFLET as usize;
     assert!(
         deformed_positions[..leaf.start] == positions[..leaf.start]
             && deformed_positions[leaf.clone()] != positions[leaf.clone()]

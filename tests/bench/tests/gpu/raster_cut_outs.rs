@@ -5,7 +5,7 @@
 use modalcast_bench::kernels::{KernelBenchmark as _, RasterBenchmark, RasterMesh};
 use modalcast_compute::gpu::{Device, RasterGranularity, RasterVariant};
 
-use crate::cut_outs::{CutOutSoup, alpha_image, floor_soup, sheet_soup, uniform_cut_out_soups};
+use crate::cut_outs::{CutOutSoup, alpha_image, floor_soup, sheet_soup, constant_alpha_soups};
 use crate::scenes::Random;
 
 /// Samples may differ if their alpha is closer to the threshold than this tolerance. It exceeds the sum of two errors,
@@ -45,7 +45,7 @@ fn read_depth_bits(device: &Device, cut_out_soup: &CutOutSoup) -> Vec<u32> {
 fn gpu_uniform_images_match_the_definition_bitwise() {
     let device = Device::open(0).expect("expected a CUDA device");
     // Each image has one alpha value, so texture filtering has no effect.
-    for cut_out_soup in uniform_cut_out_soups() {
+    for cut_out_soup in constant_alpha_soups() {
         let definition = cut_out_soup.rasterize();
         for granularity in GRANULARITIES {
             let keys = read_keys(&device, &cut_out_soup, granularity);
