@@ -71,8 +71,8 @@ fn nearest_rotation(correlation: &Matrix3<f64>) -> Matrix3<f64> {
     let svd = correlation.svd(compute_u, compute_v);
     let (Some(left), Some(right)) = (svd.u, svd.v_t) else { return Matrix3::identity() };
     let singular_values = svd.singular_values;
-    // Singular values are sums of squared distances. With this tolerance, points count as collinear if they are more
-    // than 3e4 times as long as wide.
+    // Singular values are sums of squared distances, so 1e-9 is the square of a ratio of lengths. Points count as
+    // collinear if their extent in one direction is more than sqrt(1e9) = 3e4 times the extent in any other direction.
     let has_rank_two = singular_values[0].is_normal() && singular_values[1] > 1e-9 * singular_values[0];
     if !has_rank_two {
         return Matrix3::identity();
@@ -140,6 +140,7 @@ mod tests {
         assert!((rotated_once - Vector3::new(1.0, 1.0, 0.0)).norm() <= 1e-15);
         let entries = quarter_turn.to_row_major();
         assert_eq!(AffineTransform::from_row_major(&entries).to_row_major(), entries);
+        // A half turn about (1, 0, 0) moves (2, 0, 0) to the origin.
         let rotated_twice = quarter_turn.compose(&quarter_turn).apply(&Vector3::new(2.0, 0.0, 0.0));
         assert!((rotated_twice - Vector3::zeros()).norm() <= 1e-15);
     }

@@ -46,13 +46,13 @@ pub struct BridgeScenario {
     options: BridgeOptions,
     /// Index of the deforming domain.
     domain: usize,
-    /// Reduced load at the peak of the pulse.
+    /// Reduced load U^T f of the force f at the peak of the pulse.
     peak_load: DVector<f64>,
     /// The state at step `next_step`.
     state: NewmarkState,
     /// The step that the next call of `compute_next_step` computes.
     next_step: u64,
-    /// Force at the peak of the pulse, for unit reduced mass.
+    /// Magnitude of the force at the peak of the pulse, in the units in which the reduced mass matrix is the identity.
     strength: f64,
     /// Deflection at equilibrium as a fraction of the diagonal of the scene's rest bounds.
     static_deflection_fraction: f64,
@@ -180,7 +180,8 @@ fn compute_unit_load(model: &Model, domain: &DomainModel, load_direction: LoadDi
     let (min, max) = axis_coordinates
         .fold((f64::MAX, f64::MIN), |(min, max), coordinate| (min.min(coordinate), max.max(coordinate)));
     let local_direction = domain.placement.linear.transpose() * load_direction.unit_vector(model);
-    // `half_width` is a fraction of the bridge's length.
+    // The samples at most `half_width` from the middle, where `half_width` is a fraction of the bridge's length: 0.05
+    // selects the middle tenth, and 1.0 the whole bridge.
     let unit_load_within = |half_width: f64| {
         let is_within = |coordinate: f64| (coordinate - 0.5 * (min + max)).abs() <= half_width * (max - min);
         let samples: Vec<_> =
@@ -255,8 +256,8 @@ mod tests {
     const OPTIONS: BridgeOptions =
         BridgeOptions { dt: 1.0 / 60.0, deflection_fraction: 0.03, period: 2.0, load_direction: LoadDirection::Across };
 
-    /// A bridge whose deforming domain has two modes, as many as the force: two springs with the eigenvalues 40 and 90
-    /// (rad/s)^2, coupled by a quartic (30) and a cubic (4) potential.
+    /// A bridge whose force has rank 2, as the first domain of the model. The force consists of two springs with the
+    /// eigenvalues 40 and 90 (rad/s)^2, coupled by a quartic (30) and a cubic (4) potential.
     fn two_mode_bridge() -> BridgeScenario {
         let force = spring_chain(&[40.0, 90.0], 30.0, 4.0);
         BridgeScenario::new(four_domain_model(), force, &VegaSettings::default(), OPTIONS).expect("a valid scenario")

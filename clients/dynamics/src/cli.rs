@@ -152,10 +152,11 @@ pub(crate) struct WindOptions {
 
 #[derive(Debug, Clone, Args)]
 pub(crate) struct ForceFileOptions {
-    /// Vega's file of reduced cubic forces.
+    /// The file of reduced cubic forces that the FEM library Vega exported.
     #[arg(long, value_name = "FILE.cub")]
     pub(crate) cubic: Option<PathBuf>,
-    /// Vega's settings. Default: the .config file next to the file of cubic forces, if it exists.
+    /// Vega's file of frequency scale and damping. Default: the .config file next to the file of cubic forces, if it
+    /// exists.
     #[arg(long, value_name = "FILE.config")]
     pub(crate) config: Option<PathBuf>,
     /// Folder to search for the file of cubic forces.
@@ -228,7 +229,7 @@ fn parse_positive(text: &str) -> Result<f64, String> {
     if number > 0.0 { Ok(number) } else { Err("expected a positive number".into()) }
 }
 
-/// Parses a fraction of a length of the scene, from 0 to 0.5.
+/// Parses a displacement as a fraction of the scene's diagonal or height, from 0 to 0.5.
 fn parse_fraction(text: &str) -> Result<f64, String> {
     let number = parse_non_negative(text)?;
     if number <= 0.5 { Ok(number) } else { Err("expected 0 to 0.5".into()) }

@@ -1,5 +1,6 @@
-//! Reduced StVK (Saint Venant-Kirchhoff) forces of r coordinates, read from a `.cub` file. The force f(q) is a
-//! polynomial of degree three without a constant term. This module also computes its Jacobian and potential.
+//! Reduced StVK (Saint Venant-Kirchhoff) forces of r coordinates, read from a `.cub` file of the FEM library Vega. The
+//! force f(q) is a polynomial of degree three without a constant term. This module also computes its Jacobian and
+//! potential.
 //!
 //! File format: four little-endian i32 (r, then the numbers of monomials of degree one, two and three: r, r(r+1)/2 and
 //! r(r+1)(r+2)/6), followed by one f64 matrix per degree, row-major, with one row per force component and one column
@@ -223,6 +224,7 @@ pub(crate) mod tests {
         for count in [force.rank, linear_count, quadratic_count, cubic_count] {
             bytes.extend((count as i32).to_le_bytes());
         }
+        // nalgebra stores columns, so the slice of the transpose has the rows of the block.
         let linear = force.linear_block.transpose();
         let blocks = linear.as_slice().iter().chain(&force.quadratic_block).chain(&force.cubic_block);
         blocks.for_each(|number| bytes.extend(number.to_le_bytes()));
@@ -265,6 +267,8 @@ pub(crate) mod tests {
             assert!((slope - q.dot(&force.force(&q))).abs() <= 1e-6 * slope.abs().max(1.0), "{slope}");
         }
         assert_eq!(force.force(&DVector::zeros(4)), DVector::zeros(4));
+        // In the gradient of a potential, the coefficient of q_0 q_0 q_1 in component 0 determines the coefficient of
+        // q_0 q_0 q_0 in component 1. Change only the first.
         let mut non_gradient = force;
         non_gradient.cubic_block[1] += 50.0;
         let asymmetry = jacobian_errors(&non_gradient, &random_vector(1, 4)).asymmetry;
@@ -313,6 +317,7 @@ pub(crate) mod tests {
         for name in ["simpleBridge", "A"] {
             let path = data_folder().join(format!("vega/{name}/{name}.cub"));
             let force = ReducedForce::read(&path).expect("a valid file");
+            // Both models have 20 modes.
             assert_eq!((force.rank(), force.force(&DVector::zeros(20)).norm()), (20, 0.0));
             for seed in 0..6 {
                 let JacobianErrors { difference, asymmetry } = jacobian_errors(&force, &random_vector(seed, 20));

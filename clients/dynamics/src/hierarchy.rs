@@ -44,7 +44,7 @@ fn deformed_attachment(parent: &DomainModel, joint: &Joint, q: &[f64]) -> Affine
 }
 
 /// Measures how far joints open: by how much the distances between a child's base vertex and the attachment vertices of
-/// its parent differ from their values at rest. The base vertex is the vertex nearest to the domain's origin.
+/// its parent differ from their values at rest. The base vertex is the child's vertex nearest to the child's origin.
 #[derive(Debug, Clone)]
 pub struct JointGapMeter {
     /// Distances at rest, per domain and attachment vertex.
@@ -67,9 +67,9 @@ impl JointGapMeter {
     }
 }
 
-/// Per domain, the distances between its base vertex and the attachment vertices of its parent. For a parent without
-/// modes or attachment vertices, the distance between the base vertex and its position according to
-/// `parent_from_child`.
+/// Per domain, the distances between its base vertex and the attachment vertices of its parent. If the parent has no
+/// modes or no attachment vertices, the list has one distance: between the base vertex and its position according to
+/// `parent_from_child`. A domain without a parent has none.
 fn joint_distances(model: &Model, q: &[f64], world_from_domain: &[AffineTransform]) -> Vec<Vec<f64>> {
     let domain_distances = |(domain, transform): (&DomainModel, &AffineTransform)| {
         let Some(joint) = &domain.joint else { return vec![] };
@@ -106,12 +106,14 @@ pub(crate) mod tests {
             for vertex in 0..6 {
                 let angle = f64::from(vertex) * std::f64::consts::PI / 3.0;
                 let (x, z) = (radius * angle.cos(), radius * angle.sin());
-                // Per unit of q, the displacement is y^2 sideways, so that it is 1 at the tip. Its slope is 2 y.
+                // Three rows (x, y, z) of two modes. Per unit of q, a section moves sideways by y^2, which is 1 at the
+                // tip. The section rotates by the slope 2 y, which moves its vertices along y.
                 let mode_rows = vec![y * y, 0.0, -2.0 * y * x, -2.0 * y * z, 0.0, y * y];
                 samples.push(Sample { rest_position: Vector3::new(x, y, z), mode_rows });
             }
         }
         let surface_sample_count = samples.len();
+        // The base sample, at the origin.
         samples.push(Sample { rest_position: Vector3::zeros(), mode_rows: vec![0.0; 6] });
         DomainModel {
             name: "beam".into(),
@@ -172,6 +174,7 @@ pub(crate) mod tests {
         let gap_meter = JointGapMeter::new(&model);
         for q in [[0.1, 0.05, -0.08, 0.1, 0.1, -0.1], [-0.12, 0.0, 0.1, 0.1, -0.05, 0.1]] {
             let world_from_domain = compute_transforms(&model, &q, &[]);
+            // A small gap remains, because the fitted transform is rigid, but a linear mode stretches rotated sections.
             let gap = gap_meter.max_gap(&model, &q, &world_from_domain);
             assert!(gap <= 1e-3 * model.diagonal(), "gap {gap}, diagonal {}", model.diagonal());
             for transform in &world_from_domain {

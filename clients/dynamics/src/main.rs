@@ -150,7 +150,8 @@ fn create_bridge_scenario(model: Model, files: &ForceFileOptions, options: Bridg
 }
 
 /// Finds the file of reduced forces: the file of `--cubic`, else the file in `--files` that the note `vega.cubic` of a
-/// domain names, else the only .cub file in `--files`. `None` if there is no file or the choice is not unique.
+/// domain names (notes are metadata in the scene's description), else the only .cub file in `--files`. `None` if there
+/// is no file or the choice is not unique.
 fn find_force_file(model: &Model, files: &ForceFileOptions) -> Option<PathBuf> {
     if let Some(path) = &files.cubic {
         return Some(path.clone());

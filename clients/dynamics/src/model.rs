@@ -101,7 +101,7 @@ impl Sample {
         &self.mode_rows[component * rank..][..rank]
     }
 
-    /// The displacement of this vertex per unit of one coordinate: a column of the three rows of U.
+    /// The displacement of this vertex per unit of the coordinate of `mode`: one column of the vertex's rows of U.
     pub fn column(&self, mode: usize, rank: usize) -> Vector3<f64> {
         Vector3::from_fn(|component, _| self.mode_rows[component * rank + mode])
     }
@@ -139,6 +139,8 @@ impl Model {
         let description_without_arrays = client.describe(scene, &[]).await?;
         let has_modes = description_without_arrays.domains.iter().any(|domain| domain.rank > 0);
         let has_eigenvalues = description_without_arrays.domains.iter().any(|domain| !domain.eigenvalues.is_empty());
+        // Sampling needs rest positions. The tree scenario also needs triangles, for surface areas; only scenes with
+        // eigenvalues use it.
         let description = match (has_modes, has_eigenvalues) {
             (false, _) => description_without_arrays,
             (true, false) => client.describe(scene, &[DomainArray::RestPositions]).await?,
@@ -154,6 +156,7 @@ impl Model {
         let selections = select_vertices(&description, max_surface_samples)?;
         let mut mode_rows_by_vertices = BTreeMap::new();
         for (domain, selection) in description.domains.iter().zip(&selections) {
+            // Domains of the same shape have the same U. Equal rows are fetched once.
             let key = (domain.shape, selection.vertices.clone());
             if domain.rank > 0 && !mode_rows_by_vertices.contains_key(&key) {
                 let mode_rows = client.read_modes(scene, domain.index, &selection.vertices).await?;
@@ -367,6 +370,7 @@ fn surface_area(domain: &Domain) -> f64 {
 fn bounds_diagonal(domain: &Domain) -> f64 {
     let points = (0..(domain.rest_positions.len() / 3) as u32).map(|vertex| rest_position(domain, vertex));
     let bounds = points.fold(None, |bounds: Option<(Vector3<f64>, Vector3<f64>)>, point| {
+        // `inf` and `sup` are the minimum and the maximum per component.
         Some(bounds.map_or((point, point), |(min, max)| (min.inf(&point), max.sup(&point))))
     });
     bounds.map_or(0.0, |(min, max)| (max - min).norm())

@@ -150,6 +150,7 @@ impl ReducedSystem {
         let balanced_energy = |next_state: &NewmarkState| {
             let displacement = &next_state.q - &state.q;
             let work = 0.5 * (start_load + end_load).dot(&displacement);
+            // The damping force D v times the displacement, at the mean velocity v = displacement / dt.
             let dissipated = (&self.damping * &displacement).dot(&displacement) / dt;
             self.energy(state) + work - dissipated
         };
@@ -172,11 +173,13 @@ impl ReducedSystem {
         }
         next_state.a = end_load - &self.damping * &next_state.v - self.force.force(&next_state.q) * self.scale;
         let max_energy = state.max_energy.max(self.energy(&next_state));
+        // A repeated step resets a positive energy error. A negative one remains.
         NewmarkState { energy_error: state.energy_error.min(0.0), max_energy, ..next_state }
     }
 
     fn step_average_acceleration(&self, state: &NewmarkState, dt: f64, load: &DVector<f64>) -> NewmarkState {
         let (inertia_coefficient, velocity_coefficient) = (4.0 / (dt * dt), 2.0 / dt);
+        // Newmark's predictors: q + h v + h^2 (1/2 - beta) a and v + h (1 - gamma) a.
         let predicted_q = &state.q + &state.v * dt + &state.a * (0.25 * dt * dt);
         let predicted_v = &state.v + &state.a * (0.5 * dt);
         let objective = StepObjective { inertia_coefficient, velocity_coefficient, predicted_q, predicted_v, load };
@@ -270,7 +273,7 @@ impl ReducedSystem {
         let stiffness = (&jacobian + jacobian.transpose()) * (0.5 * self.scale);
         let hessian =
             &identity * objective.inertia_coefficient + &self.damping * objective.velocity_coefficient + stiffness;
-        // The shift grows from 1e-6 of the largest entry by a factor of 10 per attempt.
+        // After an attempt without shift, the shift grows from 1e-6 of the largest entry by a factor of 10 per attempt.
         let mut shift = 0.0;
         for _ in 0..40 {
             if let Some(cholesky) = Cholesky::new(&hessian + &identity * shift) {
@@ -278,6 +281,7 @@ impl ReducedSystem {
             }
             shift = (10.0 * shift).max(1e-6 * hessian.abs().max());
         }
+        // Fallback: the direction of steepest descent.
         -gradient
     }
 }
@@ -306,12 +310,15 @@ mod tests {
         spring_chain(&[40.0, 90.0], 30.0, 4.0)
     }
 
+    /// The coordinates from which [`two_springs`] is released.
+    const RELEASED_Q: [f64; 2] = [0.8, -0.3];
+
     /// Deflects and releases [`two_springs`]. Returns the system and its state after one second.
     fn simulate_release(steps_per_second: u32) -> (ReducedSystem, NewmarkState) {
         let system = undamped_system(two_springs());
         let no_load = DVector::zeros(2);
         let dt = 1.0 / f64::from(steps_per_second);
-        let mut state = system.static_state(DVector::from_column_slice(&[0.8, -0.3]));
+        let mut state = system.static_state(DVector::from_column_slice(&RELEASED_Q));
         // The load that holds this state is released, so the initial acceleration is -f(q).
         state.a = -system.force.force(&state.q);
         let final_state =
@@ -332,7 +339,7 @@ mod tests {
     #[test]
     fn damping_alone_dissipates_energy() {
         let (system, final_state) = simulate_release(1000);
-        let initial_energy = system.scale * system.force.potential(&DVector::from_column_slice(&[0.8, -0.3]));
+        let initial_energy = system.scale * system.force.potential(&DVector::from_column_slice(&RELEASED_Q));
         assert!(
             (system.energy(&final_state) / initial_energy - 1.0).abs() <= 1e-3,
             "{}",
@@ -341,7 +348,7 @@ mod tests {
         let settings = VegaSettings { damping_mass: 0.5, damping_stiffness: 0.01, ..VegaSettings::default() };
         let damped_system = ReducedSystem::new(two_springs(), &settings).expect("a positive definite stiffness");
         let no_load = DVector::zeros(2);
-        let mut state = damped_system.static_state(DVector::from_column_slice(&[0.8, -0.3]));
+        let mut state = damped_system.static_state(DVector::from_column_slice(&RELEASED_Q));
         for _ in 0..2000 {
             let next = damped_system.advance(&state, 0.01, constant_load(&no_load));
             assert!(damped_system.energy(&next) <= damped_system.energy(&state) * (1.0 + 1e-3) + 1e-12);
@@ -381,6 +388,7 @@ mod tests {
                 let (start_load, end_load) = (load(step), load(step + 1));
                 let next = system.advance(&state, dt, LoadChange { start: &start_load, end: &end_load });
                 work += 0.5 * (start_load + end_load).dot(&(&next.q - &state.q)).abs();
+                // The exact energy is at most the absolute work. The factor of 4 leaves room for the integration error.
                 let energy = system.energy(&next);
                 assert!(
                     energy.is_finite() && energy <= 4.0 * work + 1e-6,
@@ -400,6 +408,7 @@ mod tests {
             for seed in 0..4 {
                 let mut state = system.rest_state();
                 state.v = random_vector(seed, 3) * 20.0;
+                // The exact energy is constant. A gain of 10 percent has room for several times `ENERGY_TOLERANCE`.
                 let limit = 1.1 * system.energy(&state);
                 for step in 0..1500 {
                     state = system.advance(&state, dt, constant_load(&no_load));

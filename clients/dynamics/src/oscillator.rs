@@ -118,6 +118,7 @@ impl Response {
     /// Underdamped, critically damped and slightly overdamped modes, whose roots are complex or close together:
     /// e^-sigma times cosine and sine, or cosh and sinh.
     fn from_complex_roots(w: f64, sigma: f64) -> Self {
+        // d is h times the damped angular frequency: d^2 = w^2 - sigma^2.
         let d_squared = (w - sigma) * (w + sigma);
         let d = d_squared.abs().sqrt();
         let decay = (-sigma).exp();
@@ -190,7 +191,8 @@ mod tests {
         hertz.into_iter().flat_map(move |f| steps.into_iter().flat_map(move |h| ZETAS.map(|zeta| (f, h, zeta))))
     }
 
-    /// An independent solution: fourth-order Runge-Kutta in 20,000 small steps.
+    /// An independent solution of q'' + damping q' + eigenvalue q = force after h seconds: fourth-order Runge-Kutta in
+    /// 20,000 small steps.
     fn integrate_runge_kutta(
         eigenvalue: f64,
         damping: f64,
@@ -226,6 +228,7 @@ mod tests {
         let start = ModeState { q: 0.3, v: -0.2 };
         for w in [1e-4, 0.02, 0.5, 0.9, 1.1, 3.0, 20.0] {
             for zeta in ZETAS {
+                // w = omega h, eigenvalue = omega^2 and damping = 2 zeta omega.
                 let (h, eigenvalue) = (0.25, (w / 0.25) * (w / 0.25));
                 let damping = 2.0 * zeta * w / h;
                 // The Runge-Kutta solution is too inaccurate for stronger damping.

@@ -73,16 +73,20 @@ pub struct RunSummary {
 /// Statistics of a run: acknowledgements, rejections and sent bytes.
 #[derive(Default)]
 struct RunStats {
+    /// Times of the server's processing stages, from the acknowledgements.
     stage_samples: StageSamples,
+    /// Texts of the first `MAX_REJECTIONS` rejections.
     rejections: Vec<String>,
     acknowledgement_count: u64,
+    /// Bytes of coordinates and transforms in all sent steps.
     payload_bytes: u64,
 }
 
 /// Drives a scene until all steps are done or `stop_receiver` receives true.
 ///
 /// # Errors
-/// `Client` if the scene has another writer, the stream ends, or a record cannot be written. Errors of the scenario.
+/// `Client` if the scene has another writer, the stream ends, or a record cannot be written. Errors of the scenario are
+/// returned unchanged.
 pub async fn drive_scene(
     client: &Client,
     scenario: &mut dyn Scenario,
@@ -110,6 +114,7 @@ pub async fn drive_scene(
         }
         let step =
             add_changes(scenario.model(), Step::new(step_number, time), last_sent_values.as_ref(), &current_values);
+        // A rejection arrives late: it may concern this step or an earlier one.
         let is_rejected = stats.record_rejection(step_stream.step(&step).await)?;
         stats.payload_bytes += step.payload_bytes() as u64;
         stats.record_acknowledgements(&step_stream);
@@ -260,7 +265,7 @@ mod tests {
         // Six coordinates and four 3x4 matrices in f32.
         assert_eq!((all_values.q.len(), all_values.transforms.len()), (6 * 4, 4 * 48));
         let mut changed_values = rest_values.clone();
-        // Coordinate 3 belongs to domain 1.
+        // Coordinate 3 belongs to domain 1; the changed transform is the one of domain 3.
         (changed_values.q[3], changed_values.transforms[3][7]) = (1.0, 2.0);
         let changes = encode_step(Some(&rest_values), &changed_values);
         assert_eq!((changes.q_domains, changes.transform_domains), (vec![1], vec![3]));

@@ -57,6 +57,8 @@ impl SweepScenario {
         }
         let amplitude = |displacement: f64| if displacement > 0.0 { target_displacement / displacement } else { 0.0 };
         let amplitudes = displacements_per_unit.into_iter().map(amplitude).collect();
+        // A run of known length gives each mode the same number of steps, but at most one second. In an unlimited run,
+        // each mode takes one second.
         let max_rank = model.domains.iter().map(|domain| domain.rank as u64).max().unwrap_or(0).max(1);
         let steps_per_second = (1.0 / options.dt).clamp(1.0, 1e6) as u64;
         let steps_per_coordinate = options.steps.map_or(steps_per_second, |steps| steps / max_rank);
@@ -135,7 +137,7 @@ impl Scenario for SweepScenario {
     }
 }
 
-/// The largest displacement of a sample per unit of a coordinate, in world axes.
+/// The largest displacement of a sample of `domain` per unit of the coordinate of `mode`, in scene units.
 fn displacement_per_unit(domain: &DomainModel, mode: usize) -> f64 {
     let world_displacement = |column: Vector3<f64>| (domain.placement.linear * column).norm();
     domain.samples.iter().map(|sample| world_displacement(sample.column(mode, domain.rank))).fold(0.0, f64::max)
@@ -184,6 +186,7 @@ mod tests {
         let options = SweepOptions { dt: 0.5, steps: None, displacement_fraction: 0.06 };
         let mut sweep = SweepScenario::new(model, options);
         let mut values = StepValues::default();
+        // The second step is at 0.5 s: a quarter of the period, where the angle is largest.
         (0..2).for_each(|_| sweep.compute_next_step(&mut values).expect("the next step"));
         let first_transform = AffineTransform::from_row_major(&values.transforms[0]);
         let model = &sweep.model;

@@ -1,5 +1,7 @@
 //! A tree that sways in the wind. Each mode is integrated exactly. The force of a mode is U^T times the wind pressure
-//! on the surface samples, plus the forces of child domains at their joints. `hierarchy` computes the transforms.
+//! on the surface samples, plus the forces of child domains at their joints. `hierarchy` computes the transforms. A
+//! trunk is a domain without a parent, and a branch is a domain with a parent. A leaf is a branch without modes and
+//! children.
 //!
 //! The load is calibrated to a given sway. A calibration run first applies the same wind at unit strength. The modes
 //! are linear, so their response scales with the strength. The strength is then chosen so that the peak of the crown's
@@ -57,7 +59,8 @@ pub struct TreeOptions {
     pub seed: u64,
 }
 
-/// Reduced loads of one domain per unit of wind pressure, and of its parent per unit of force at the joint.
+/// Factors from the wind pressure to the loads of a domain's modes, and from the force at the domain's joint to the
+/// loads of its parent's modes.
 struct WindLoad {
     /// Per mode: U^T times a unit pressure downwind.
     downwind: Vec<f64>,
@@ -168,8 +171,8 @@ impl TreeScenario {
         self.next_step += 1;
     }
 
-    /// Computes the generalized forces at a time in seconds. Children follow their parents, so the reverse order
-    /// accumulates the forces of all descendants.
+    /// Computes the generalized forces at a time in seconds. A child has a larger index than its parent. In reverse
+    /// order, the forces of all descendants of a domain are therefore complete before its own joint needs them.
     fn compute_forces(&self, time: f64) -> Vec<f64> {
         let mut forces = vec![0.0; self.model.coordinate_count];
         // Per domain: the force on it and its descendants, in world axes.
@@ -207,7 +210,8 @@ impl TreeScenario {
 
     /// Runs at unit strength, records the response, and resets the state.
     fn record_unit_response(&mut self) -> UnitResponse {
-        // 20 s, but at least 60 and at most 1200 steps.
+        // 20 s, but at least 60 and at most 1200 steps, and not longer than the run. Step 0 of the run is the rest
+        // state, so n steps take n - 1 advances.
         let max_steps = (20.0 / self.options.dt).clamp(60.0, 1200.0) as u64;
         let step_count =
             self.options.steps.map_or(max_steps, |step_count| step_count.saturating_sub(1).clamp(1, max_steps));
@@ -230,6 +234,7 @@ impl TreeScenario {
                 recorded_states.push((trunk_displacement, q));
             }
         }
+        // Largest trunk displacement first.
         recorded_states.sort_by(|(a_displacement, _), (b_displacement, _)| b_displacement.total_cmp(a_displacement));
         recorded_states.truncate(CALIBRATION_STATES);
         self.states.fill(ModeState::default());
@@ -320,6 +325,7 @@ impl TreeScenario {
         for joint in self.model.domains.iter().filter_map(|domain| domain.joint.as_ref()) {
             has_children[joint.parent] = true;
         }
+        // Wind above strength 2 does not rotate leaves further.
         let max_angle = FLUTTER_ANGLE * self.options.wind_strength.clamp(0.0, 2.0);
         let leaf_rotation = |(index, domain): (usize, &DomainModel)| {
             let is_leaf = domain.rank == 0 && domain.joint.is_some() && !has_children[index];
@@ -466,7 +472,7 @@ mod tests {
     fn crown_sways_as_calibrated_and_joints_stay_closed() {
         for (dt, steps) in [(1.0 / 60.0, 60), (1.0 / 60.0, 600), (1.0 / 30.0, 90), (0.5, 40)] {
             let (tree, values) = run_tree(TreeOptions { dt, steps: Some(steps), ..OPTIONS });
-            // The calibration aims at 0.05 and sees only some of the states.
+            // The calibration aims at 0.05. It evaluates only some of the states, so the sway of the run can differ.
             assert!((0.03..=0.08).contains(&tree.peak_sway), "dt {dt}, {steps} steps: {}", tree.peak_sway);
             assert!(tree.max_gap <= 1e-3 * tree.model.diagonal(), "{}", tree.max_gap);
             assert!(values[0].q.iter().all(|coordinate| *coordinate == 0.0));

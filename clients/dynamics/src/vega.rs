@@ -1,4 +1,5 @@
-//! Settings from Vega's `.config` files. A setting is a line `*name`, followed by a line with its value.
+//! Settings from `.config` files of the FEM library Vega. A setting is a line `*name`, followed by a line with its
+//! value.
 
 use std::path::Path;
 

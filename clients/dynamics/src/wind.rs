@@ -30,7 +30,7 @@ pub const DOWNWIND_CHANNEL: u64 = 0;
 /// The crosswind channel of [`Wind::turbulence`].
 pub const CROSSWIND_CHANNEL: u64 = 1;
 
-/// Time at which all gusts peak together at distance 0, in seconds.
+/// Time at which all gusts peak together at the downwind position 0, in seconds.
 const PEAK_TIME: f64 = 0.55;
 
 /// Time in which the wind rises from 0 to its full pressure, in seconds.
@@ -83,7 +83,7 @@ impl Wind {
     }
 }
 
-/// A smooth step: 0 if x is below 0, 1 if x is above 1.
+/// A smooth step: 0 if x is below 0, 1 if x is above 1, and a cubic polynomial in between.
 fn smoothstep(x: f64) -> f64 {
     let x = x.clamp(0.0, 1.0);
     x * x * (3.0 - 2.0 * x)
@@ -127,6 +127,7 @@ mod tests {
                 let time = f64::from(*step) * 0.01;
                 wind.pressure(time, 0, downwind_position).downwind - 0.15 * wind.turbulence(time, 0, DOWNWIND_CHANNEL)
             };
+            // Start after 0.4 s, when the wind has reached its full pressure.
             (40..300).max_by(|a, b| gust_pressure(a).total_cmp(&gust_pressure(b))).unwrap_or(0)
         };
         // A delay of 0.2 s per scene unit over 2 units, in steps of 0.01 s.

@@ -137,7 +137,7 @@ async fn tree_sways_and_subscribers_receive_closed_joints() {
     for step in 0..90 {
         let vertex_set = vertex_stream.next().await.expect("a set of vertices").expect("a valid set");
         assert_eq!(vertex_set.step.number, step);
-        // The first section of a child is at the last section of its parent.
+        // A child's first vertex is at the last section of its parent. Every domain but the last has 54 vertices.
         for child in 1..4 {
             for vertex in 0..6 {
                 let (parent_vertex, child_vertex) = (54 * (child - 1) + 48 + vertex, 54 * child);
@@ -178,6 +178,8 @@ async fn auto_selects_tree_or_sweep_by_scene() {
     }
 }
 
+/// The expected codes are those of `modalcast-sim --help`: 1 rejected by the server, 2 command line, 3 connection, 4
+/// local file, 5 invalid content.
 #[tokio::test(flavor = "multi_thread")]
 async fn errors_exit_with_documented_codes() {
     let url = serve(Arc::new(tree_server())).await;
@@ -232,6 +234,7 @@ async fn real_models_deflect_as_requested_and_stay_bounded() {
             assert!(sim_output.exit_code == 0 && sim_output.stderr.contains("bridge"), "{}", sim_output.stderr);
             let report = sim_output.report();
             let number = |field: &str| report[field].as_f64().expect("a number");
+            // The default of --deflection is 0.03.
             assert!((number("deflection_of_diagonal") - 0.03).abs() <= 1e-4, "{report}");
             assert!((0.02..0.3).contains(&number("peak_of_diagonal")), "{report}");
             let lowest_hertz = report["frequencies_hz"][0].as_f64().expect("a number");

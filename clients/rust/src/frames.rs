@@ -44,7 +44,7 @@ pub enum Output {
     Domains,
     /// Unit normals; zeros in the background.
     Normals,
-    /// |u| as a color map with a legend. `scale_max` is the value at the bright end in meters; 0 selects the maximum of
+    /// |u| as a color map with a legend. `scale_max` is the value at the bright end in meters; 0 fits the color map to
     /// each frame.
     Displacement { scale_max: f64 },
     /// The norm of each vertex's three entries in column `mode` of U, as a color map with a legend. `scale_max` is as
@@ -73,7 +73,7 @@ pub enum Lens {
     Intrinsics { fx: f64, fy: f64, cx: f64, cy: f64 },
 }
 
-/// A camera. `clip` is the near and far distance in scene units; `None` fits them to the scene.
+/// A camera. `clip` is the pair of near and far distance in scene units; `None` lets the server fit both to the scene.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Camera {
     pub view: View,
@@ -250,7 +250,8 @@ impl From<Picture> for v1::Picture {
             Output::Displacement { scale_max } => (v1::Output::Displacement, 0, scale_max),
             Output::ModeShape { mode, scale_max } => (v1::Output::ModeShape, mode, scale_max),
         };
-        // `Unspecified` selects the only format of depth, domains and normals, and PNG for the other outputs.
+        // `Unspecified` selects the only format of depth, domains and normals, and PNG for the other outputs. The
+        // server rejects the number formats for the other outputs.
         let format = match (picture.output, picture.format) {
             (Output::Depth | Output::Domains | Output::Normals, _) | (_, FrameFormat::Png) => v1::Format::Unspecified,
             (_, FrameFormat::Rgba) => v1::Format::Rgba,

@@ -1,4 +1,4 @@
-//! Writes NumPy files of f32 rows incrementally. The header has space for the largest number of rows.
+//! Writes NumPy files of f32 rows incrementally. The header has space for the digits of any number of rows.
 //! [`Writer::finish`] rewrites the header with the final number.
 
 use std::fs::File;

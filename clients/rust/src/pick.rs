@@ -1,5 +1,5 @@
-//! Picking: the surface point at a pixel of a picture, and U interpolated at that point, which projects a force there
-//! onto the modes.
+//! Picking: the surface point at a pixel of a picture, and U interpolated at that point. The interpolated U projects a
+//! force at the point onto the modes.
 
 use modalcast_proto::v1;
 use v1::frame_service_client::FrameServiceClient;
@@ -71,12 +71,13 @@ pub struct Hit {
     pub barycentric: [f64; 3],
     /// In scene units, relative to the scene's origin.
     pub position: [f64; 3],
-    /// Unit length, on the visible side.
+    /// Unit normal in world axes, facing the camera; zeros if the vertex normals cancel.
     pub normal: [f64; 3],
     /// In meters along the view axis.
     pub depth: f64,
     /// A, the linear part of the domain's transform, row-major 3x3.
     pub linear: [f32; 9],
+    /// r, the number of columns of U.
     pub rank: usize,
     /// 3 x `rank`, row-major: U interpolated at the point; empty if the request omits it.
     pub modes: Vec<f32>,

@@ -1,4 +1,5 @@
-//! Scene descriptions and rows of U as owned values. Arrays are assembled from chunks and checked against the counts.
+//! Scene descriptions and rows of U. Arrays are assembled from chunks. Their lengths are checked against the counts in
+//! the description.
 
 use std::collections::BTreeMap;
 
@@ -127,6 +128,7 @@ impl Client {
         let mut assembler = Assembler::new("modes", self.max_reply_bytes);
         let mut complete_reply = None;
         while let Some(message) = messages.next().await? {
+            // Every message has the rank and the total. The assembler expects them on the first chunk only.
             let head = (!assembler.is_open()).then_some((message.rank, message.total));
             let reply = assembler.push(Chunk { head, offset: message.offset, data: message.data })?;
             complete_reply = reply.or(complete_reply);
@@ -142,6 +144,7 @@ impl Client {
         if !vertices.is_empty() && bytes.len() as u64 != expected_bytes {
             return Err(malformed_reply("modes.total", format!("{expected_bytes} bytes"), bytes.len()));
         }
+        // With a rank of 0, only an empty reply passes: 0 is the only multiple of 0.
         if !(bytes.len() as u64).is_multiple_of(vertex_bytes) {
             return Err(malformed_reply("modes.total", format!("a multiple of {vertex_bytes} bytes"), bytes.len()));
         }
@@ -300,6 +303,7 @@ fn decode_domain(wire: v1::DomainDescription) -> Result<Domain> {
         Some(parent) => Some(Attachment {
             parent: parent as usize,
             parent_from_child: decode_transform("attachment_frame", &wire.attachment_frame)?,
+            // Despite their name, `attachment_rows` are vertices, not rows of U.
             parent_vertices: wire.attachment_rows.clone(),
         }),
     };

@@ -169,7 +169,8 @@ mod tests {
         let rigid_f32 = DomainTransform::RigidF32 { rotation, translation: [1.0, 2.0, 3.0] };
         let rigid_f64 = DomainTransform::RigidF64 { rotation, translation: [1e7, 2.0, 3.25] };
         let step = Step::new(0, 0.0).domain_transform(4, &rigid_f32).domain_transform(2, &rigid_f32);
-        assert_eq!((step.check_formats().is_ok(), step.payload_bytes()), (true, 56));
+        // Two rigid f32 transforms of 28 bytes.
+        assert_eq!((step.check_formats().is_ok(), step.payload_bytes()), (true, 2 * 28));
         let wire = step.clone().to_wire();
         assert_eq!(
             (wire.transform_domains.as_slice(), wire.transform_format()),

@@ -47,7 +47,7 @@ impl Client {
                 .map_err(|_| Error::file(path, format!("expected fewer than 2^32 files, got {}", files.len())))?,
             total_bytes: files.iter().map(|file| file.header.bytes).sum(),
         };
-        // When the queue is full, reading the files waits.
+        // At most 4 messages (2 MiB) are queued. When the queue is full, `send_files` waits.
         let (sender, queue) = mpsc::channel(4);
         let send_task = tokio::task::spawn_blocking(move || send_files(&sender, header, &files));
         let reply = self.reply(self.scenes().upload_scene(ReceiverStream::new(queue)).await);

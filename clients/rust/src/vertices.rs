@@ -37,9 +37,9 @@ pub struct VertexSetDomain {
 #[derive(Debug, Clone, PartialEq)]
 pub struct VertexSet {
     pub step: v1::StepId,
-    /// World position of the common origin of all positions, in meters. It equals the scene's origin until f64
-    /// translations move domains far from the scene's origin. Then the common origin follows the domains and may differ
-    /// per step. Has no meaning if `domain_origins` is not empty.
+    /// World position of the common origin of all positions, in meters; meaningless if `domain_origins` is not empty.
+    /// The common origin equals the scene's origin until f64 translations move domains far away. Then it follows the
+    /// domains and may change from step to step.
     pub origin: Vec<f64>,
     /// The origin of each selected domain in meters, if the origins differ; otherwise empty.
     pub domain_origins: Vec<[f64; 3]>,
@@ -179,7 +179,8 @@ fn decode_vertex_set(head: v1::VertexHead, bytes: &[u8]) -> Result<VertexSet> {
     })
 }
 
-/// The bytes of a reply, split by the sizes in its head.
+/// The bytes of a reply, in the order of the fields. The head has the sizes of all sections but `normals`. The normals
+/// are the remaining bytes.
 struct ReplySections<'a> {
     positions: &'a [u8],
     normals: &'a [u8],
@@ -193,7 +194,7 @@ fn split_reply<'a>(head: &v1::VertexHead, bytes: &'a [u8]) -> Result<ReplySectio
     let float3_bytes = |counts: &[u32]| 12 * counts.iter().map(|count| u64::from(*count)).sum::<u64>();
     let vertex_bytes = float3_bytes(&head.vertices);
     let normal_bytes = float3_bytes(&head.corners);
-    // A box has six f32, an origin three f64.
+    // A box has six f32 and an origin three f64: 24 bytes each.
     let domain_bytes = 24 * head.domains.len() as u64;
     for (field, section_bytes, complete_bytes) in [
         ("vertices.position_bytes", head.position_bytes, vertex_bytes),

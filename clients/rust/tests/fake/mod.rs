@@ -88,7 +88,9 @@ struct State {
     /// Number of writers so far.
     run: u64,
     has_writer: bool,
+    /// Per domain: r coordinates.
     q: Vec<Vec<f32>>,
+    /// Per domain: T, row-major 3x4.
     transforms: Vec<Vec<f32>>,
     last_step: Option<v1::StepId>,
 }
@@ -164,6 +166,7 @@ impl FakeServer {
         if step.q.len() != q_bytes {
             return reject("step.q", format!("{q_bytes} bytes"), format!("{} bytes", step.q.len()));
         }
+        // 12 f32 per transform. The fake server supports no other format.
         let transform_bytes = 48 * step.transform_domains.len();
         if step.transforms.len() != transform_bytes {
             return reject(

@@ -57,6 +57,7 @@ impl Service<http::Request<tonic::body::Body>> for Router {
             Some("StepService") => StepServiceServer::new(service).call(request),
             Some("FrameService") => FrameServiceServer::new(service).call(request),
             Some("VertexService") => VertexServiceServer::new(service).call(request),
+            // `ServerService`, which also answers unknown services with an error.
             _ => ServerServiceServer::new(service).call(request),
         }
     }

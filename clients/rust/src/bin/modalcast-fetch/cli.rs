@@ -82,7 +82,8 @@ pub(crate) struct PictureOptions {
     /// Index of the column of U for `--output mode-shape`, from 0.
     #[arg(long, requires = "output", default_value_t = 0)]
     mode: u32,
-    /// Value at the bright end of the color map; 0 selects the maximum of each frame.
+    /// Value at the bright end of the color map, in meters (`displacement`) or meters per unit of q (`mode-shape`); 0
+    /// fits the color map to each frame.
     #[arg(long = "largest", value_name = "VALUE", requires = "output", default_value_t = 0.0)]
     scale_max: f64,
     /// Encoding of color pictures: PNG, or raw RGBA8 (top row first, sRGB).
@@ -218,7 +219,7 @@ pub(crate) struct VerticesOptions {
     /// NumPy file for positions, float32, steps x vertices x 3.
     #[arg(long, value_name = "FILE.npy")]
     pub(crate) out: PathBuf,
-    /// NumPy file for normals, float32, steps x corners x 3. A vertex has one corner per normal.
+    /// NumPy file for normals, float32, steps x corners x 3. A corner is a vertex with one of its normals.
     #[arg(long, value_name = "FILE.npy")]
     pub(crate) normals: Option<PathBuf>,
     /// NumPy file for u = U q, float32, steps x vertices x 3. Requires deform.displacements in scene.toml.

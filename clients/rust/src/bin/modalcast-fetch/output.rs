@@ -1,4 +1,4 @@
-//! Output of the commands: summaries on standard output, as text or as one line of JSON, and progress on standard error.
+//! Output of the commands: summaries as text or as one line of JSON on standard output, and progress on standard error.
 
 use std::time::Instant;
 
@@ -29,7 +29,9 @@ pub(crate) struct Summary {
     start: Instant,
     /// `None` before the first reply.
     reply_times: Option<ReplyTimes>,
+    /// Step number of each reply.
     step_numbers: Vec<u64>,
+    /// Run of each reply: the number of the writer that sent its step.
     run_numbers: Vec<u64>,
     bytes: u64,
     skipped: u64,

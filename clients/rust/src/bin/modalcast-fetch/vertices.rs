@@ -62,7 +62,7 @@ struct ArrayRow<'a> {
 
 /// The rows of all arrays that the options select.
 fn array_rows<'a>(options: &'a VerticesOptions, set: &'a VertexSet) -> Vec<ArrayRow<'a>> {
-    // Six numbers per domain: the minimum and the maximum, three coordinates each.
+    // Six numbers per domain: minimum x, y, z and maximum x, y, z.
     let boxes = set.boxes.as_flattened().as_flattened();
     let vector_row = |path: Option<&'a PathBuf>, numbers: &'a [f32]| {
         path.map(|path| ArrayRow { path, shape: vec![numbers.len() / 3, 3], numbers })
