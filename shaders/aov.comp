@@ -3,11 +3,11 @@
 //   ids      (in)  [height][width][SAMPLES]  R32UI, bottom row first; NO_ID where no surface is visible
 //   values   (in)  [vertices]                a scalar per vertex, with VALUES
 //   words    (out) top row first, one of
-//     DEPTH    [height][width]           f32: depth along the view axis times `scale`; infinite with NO_ID
+//     DEPTH    [height][width]           f32: depth along the view axis times `scale`, in meters; infinite with NO_ID
 //     NORMALS  [height][width][3]        f32: unit normal of the visible side; zeros with NO_ID
-//     VALUES   [height][width][SAMPLES]  value times `scale`, and the cosine between the normal and the direction to the
-//                                        eye, 16 bits each. Both are 0 with NO_ID. Otherwise the cosine is at least
-//                                        1 / 65535.
+//     VALUES   [height][width][SAMPLES]  two 16-bit fixed-point numbers from 0 to 1. Low half: value times `scale`.
+//                                        High half: cosine between the normal and the direction to the eye, at least
+//                                        1 / 65535 (the smallest nonzero number). Both are 0 with NO_ID.
 layout(local_size_x = WORKGROUP_SIZE) in;
 layout(location = 0) uniform int scale_bits; // `scale` as the bits of a float
 layout(std430, binding = 0) writeonly buffer Words { uint words[]; };
@@ -30,6 +30,7 @@ SurfacePoint interpolate_surface(int triangle_index, vec2 ndc) {
     Barycentrics bary = compute_barycentrics(triangle.clip[0], triangle.clip[1], triangle.clip[2], vec2(0.0));
     SurfacePoint surface;
     surface.weights = bary.weights;
+    // A column of `clip` is (x, y, w), and w is the depth along the view axis.
     surface.depths = vec3(triangle.clip[0].z, triangle.clip[1].z, triangle.clip[2].z);
     surface.world = triangle.world * surface.weights;
     vec3 normal = triangle.normal * surface.weights;
@@ -79,7 +80,7 @@ void main() {
     uint output_index = uint(size.y - 1 - pixel.y) * uint(size.x) + uint(pixel.x);
     float scale = intBitsToFloat(scale_bits);
     for (int sample_index = 0; sample_index < SAMPLES; sample_index++) {
-        // No depth test as in `load_id`: this pass clears its ids, so each id is valid.
+        // Unlike `load_id`, this line reads no depth: the ids of this pass are cleared, so each id is valid.
         uint id = texelFetch(ids, pixel, sample_index).x;
         vec2 ndc = 2.0 * (vec2(pixel) + SAMPLE_POSITIONS[sample_index]) / vec2(size) - 1.0;
 #ifdef DEPTH

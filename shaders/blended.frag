@@ -1,8 +1,8 @@
 // Blends a translucent surface over the surfaces drawn before it. The render target accumulates light in rgb and
 // transmittance in alpha. Shading is the same as for opaque surfaces.
 in vec3 world;
-// Centroid sampling: at the edge of a triangle the pixel center may lie outside it, where texture coordinates wrap
-// around and normals overshoot.
+// Centroid sampling: the center of a pixel at the edge of a triangle may lie outside of the triangle. Extrapolation to
+// this center could give wrong texture coordinates and normals.
 centroid in vec3 normal_world;
 #ifdef UVS
 centroid in vec2 uv_image;
@@ -26,7 +26,7 @@ void main() {
 #endif
     normal = gl_FrontFacing ? normal : -normal;
 #ifdef OPAQUE_PARTS
-    // Samples that reach the threshold were already drawn as opaque.
+    // Samples whose alpha reaches the threshold `diffuse.a` were already drawn as opaque.
     keep_uncovered_samples(material.ambient.a * tint.a, material.diffuse.a);
 #endif
     color = vec4(phong(material, tint.rgb, normal, geometric_normal, world), material.ambient.a * tint.a);

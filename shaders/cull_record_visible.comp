@@ -7,6 +7,7 @@ void record_triangle(uint triangle) {
     // The last group whose first triangle is not after `triangle`.
     uint group = groups.count.x - 1u;
     while (group > 0u && triangle < groups.ranges[group].x) group--;
+    // `x` is the group's first triangle, `w` its first block. A block has WORKGROUP_SIZE bits.
     uint bit_index = groups.ranges[group].w * uint(WORKGROUP_SIZE) + triangle - groups.ranges[group].x;
     uint mask = 1u << (bit_index & 31u);
     if ((previously_visible[bit_index / 32u] & mask) == 0u) atomicOr(previously_visible[bit_index / 32u], mask);

@@ -2,10 +2,10 @@
 // is widened by the rounding errors between a vertex and its position on the device's subpixel grid, so that culling
 // does not change the image. A triangle that the rasterizer may have to clip is culled only if it lies entirely outside
 // one clip plane. The shader has four variants:
-//   (none)         for the camera
+//   (none)         tests triangles for the camera
 //   CULL_PREVIOUS  selects the triangles that were visible in the last frame, without a test
-//   CULL_OCCLUDED  for the camera, also against the depth pyramid of the triangles that CULL_PREVIOUS selected
-//   CULL_SHADOW    for the shadow map
+//   CULL_OCCLUDED  tests triangles for the camera, and against the depth pyramid of those that CULL_PREVIOUS selected
+//   CULL_SHADOW    tests triangles for the shadow map
 layout(local_size_x = WORKGROUP_SIZE) in;
 layout(location = 0) uniform int size_packed; // width in the lower 16 bits, height in the upper 16
 layout(binding = 13) uniform samplerBuffer positions;
@@ -32,8 +32,8 @@ shared uint class_counts[CLASS_COUNT];
 
 #ifndef CULL_PREVIOUS
 // Bound on the difference of two evaluations of a matrix-vector product, relative to the sum of the terms' magnitudes.
-// In each evaluation, four products and three sums round by 2^-24 of that sum: 14 roundings, which are less than
-// 16 x 2^-24 = 2^-20.
+// Each evaluation has four products and three sums, and each of these 7 operations rounds by at most 2^-24 of the sum
+// of the magnitudes. Two evaluations have 14 roundings: less than 16 x 2^-24 = 2^-20.
 const float ROUNDING = 1.0 / 1048576.0;
 // Relative error of a float after four roundings: 2^-22.
 const float FLOAT_ERROR = 1.0 / 4194304.0;
@@ -98,7 +98,7 @@ bool is_occluded(uvec2 min_pixel, uvec2 max_pixel, uvec2 size, float depth) {
 }
 #endif
 
-// Class of a triangle whose corners are all inside the clip planes.
+// Class of a triangle whose corners are all inside the clip planes. `position` is in pixels, `depth` from 0 to 1.
 uint classify_unclipped(ClipVertex corners[3], bool is_single_sided) {
     vec2 size = vec2(size_packed & 0xFFFF, size_packed >> 16 & 0xFFFF), position[3];
     float nearest = 1.0, depth[3], depth_error = 0.0, pixel_error = 0.0;
@@ -127,7 +127,8 @@ uint classify_unclipped(ClipVertex corners[3], bool is_single_sided) {
     if (!covers_sample) return NO_SAMPLE;
     vec2 edge_ab = position[1] - position[0], edge_ac = position[2] - position[0];
     float area = edge_ab.x * edge_ac.y - edge_ab.y * edge_ac.x; // twice the signed area
-    // A component of an edge is off by at most 2 `pixel_error`. The error of the two products follows.
+    // With e = `pixel_error`, a component of an edge is off by at most 2 e. A product a b of two components is then off
+    // by at most 2 e (|a| + |b|) + 4 e^2. The area is the difference of two products.
     float area_magnitude = abs(edge_ab.x * edge_ac.y) + abs(edge_ab.y * edge_ac.x);
     float area_error = 2.0 * pixel_error * (abs(edge_ab.x) + abs(edge_ab.y) + abs(edge_ac.x) + abs(edge_ac.y))
         + 8.0 * pixel_error * pixel_error + FLOAT_ERROR * area_magnitude;
@@ -135,9 +136,10 @@ uint classify_unclipped(ClipVertex corners[3], bool is_single_sided) {
 #ifdef CULL_OCCLUDED
     float min_area = abs(area) - area_error;
     if (!(min_area > 0.0)) return VISIBLE;
-    // `slope` is an upper bound of the depth slope per pixel. `margin` bounds the depth difference between the exact
-    // plane and the plane through the rounded corners, also at a sample that is outside the triangle by the rounding
-    // error. `reach` bounds the distances, in pixels, that the rasterizer multiplies by the slope with rounding.
+    // `slope` is an upper bound of the depth slope per pixel, from Cramer's rule for the plane through the corners.
+    // `margin` bounds the depth difference between the exact plane and the plane through the rounded corners, also at a
+    // sample that is outside the triangle by the rounding error. `reach` bounds the distances, in pixels, that the
+    // rasterizer multiplies by the slope with rounding.
     vec2 depth_change = abs(vec2(depth[1], depth[2]) - depth[0]) + 2.0 * depth_error;
     float slope = (depth_change.x * (abs(edge_ac.x) + abs(edge_ac.y)) + depth_change.y * (abs(edge_ab.x) + abs(edge_ab.y))) / min_area;
     vec2 extent = max_position - min_position;
@@ -154,6 +156,7 @@ uint classify_triangle(uint triangle, bool is_single_sided) {
     uvec3 vertices = texelFetch(triangle_vertices, int(triangle)).xyz;
     ClipVertex corners[3];
     vec3 world[3];
+    // For x, y and z of clip space: whether all corners are certainly below -w, or above w.
     bvec3 is_below = bvec3(true), is_above = bvec3(true);
     bool is_inside = true;
     for (int corner = 0; corner < 3; corner++) {
@@ -171,6 +174,7 @@ uint classify_triangle(uint triangle, bool is_single_sided) {
     }
     if (any(is_below) || any(is_above)) return OUTSIDE;
     if (!is_inside) return VISIBLE;
+    // A triangle with two equal corners has no area.
     if (world[0] == world[1] || world[1] == world[2] || world[2] == world[0]) return NO_SAMPLE;
     return classify_unclipped(corners, is_single_sided);
 }

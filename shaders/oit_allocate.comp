@@ -1,6 +1,7 @@
-// Allocates the list of each pixel. A list has one record per fragment. A tile of pixels allocates its records
-// contiguously, and a prefix sum over its pixels gives the offset of each list. The order of the tiles varies, but does
-// not affect the image. Tiles with fragments are appended to the tile list.
+// Allocates the list of each pixel. A list has one record per fragment, but at most `per_pixel_limit` records. A tile
+// (TILE x TILE pixels) allocates the records of its lists contiguously, and a prefix sum over its pixels gives the
+// offset of each list. The order of the tiles varies, but does not affect the image. Tiles with fragments are appended
+// to the tile list.
 layout(local_size_x = TILE, local_size_y = TILE) in;
 layout(std430, binding = 2) writeonly buffer Records { uint records[]; };
 shared uint scan[TILE * TILE];
@@ -13,6 +14,7 @@ shared uint tile_has_fragments;
 uint fit_per_pixel_limit() {
     // `fragment_total[1]` is the high word of the total.
     if (counters.fragment_total[1] == 0u && counters.fragment_total[0] <= counters.budget) return UNBOUNDED;
+    // Number of pixels with more than `limit` fragments. Bin b counts the pixels with b + 1 fragments.
     uint pixels_above = 0u;
     for (int bin = 0; bin < BINS; bin++) pixels_above += counters.bins[bin];
     uint record_count = 0u, limit = 0u;
@@ -31,7 +33,8 @@ void main() {
         per_pixel_limit = fit_per_pixel_limit();
         if (gl_WorkGroupID.xy == uvec2(0u)) {
             counters.per_pixel_limit = per_pixel_limit;
-            // Instance counts of the two draws of the last gather phase, which runs only if fragments are dropped.
+            // Word 1 of a draw's five words is its instance count. The two draws of the last gather phase run only if a
+            // pixel has more fragments than the limit.
             counters.commands[1] = counters.commands[6] = per_pixel_limit == UNBOUNDED ? 0u : 1u;
         }
     }
@@ -60,7 +63,8 @@ void main() {
     uint first_record = tile_first_record + scan[lane] - record_count;
     if (is_inside) imageStore(cursors, pixel, uvec4(first_record));
     if (fragment_count > record_count) {
-        // Empty records: the gather passes replace them by atomic minima and maxima.
+        // Empty records. The gather phases lower the depth by atomic minima, and raise the id and coverage by atomic
+        // maxima. So the initial depth is the largest word, and the initial id and coverage is 0.
         for (uint index = first_record; index < first_record + record_count; index++) {
             records[2u * index] = UNBOUNDED;
             records[2u * index + 1u] = 0u;

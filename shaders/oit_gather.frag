@@ -1,7 +1,8 @@
 // Adds a fragment of a blended triangle to the list of its pixel. One program runs in three phases, so that all phases
 // see the same fragments. The first phase counts fragments, the second fills the lists. For a pixel with more fragments
-// than the limit, the second phase stores only the nearest depths, and the third adds their ids. Early depth tests
-// reject fragments behind opaque surfaces. Fully transparent fragments are skipped.
+// than the limit, the second phase stores only the nearest depths, and the third stores the ids of these depths. Early
+// depth tests reject fragments behind opaque surfaces. Fully transparent fragments are skipped. Record i of the frame
+// is records[2 i], the depth, and records[2 i + 1], the id and the sample coverage.
 layout(early_fragment_tests) in;
 #if SAMPLES > 1 && defined(POST_DEPTH_COVERAGE)
 // gl_SampleMaskIn contains only samples that pass the depth test.
@@ -12,6 +13,7 @@ layout(std430, binding = 2) buffer Records { uint records[]; };
 layout(location = 1) uniform int phase;
 const int PHASE_COUNT = 0;
 const int PHASE_FILL = 1;
+// The third phase, PHASE_FILL_IDS, has the value 2.
 
 uint sample_coverage() {
 #if SAMPLES == 1
@@ -25,8 +27,8 @@ uint sample_coverage() {
 }
 
 // Inserts a depth into the sorted list of a pixel, which keeps the nearest depths. Each record takes the minimum of its
-// depth and the inserted one; the maximum goes on to the next record. The result does not depend on the order of the
-// fragments.
+// depth and the inserted depth; the maximum is inserted into the next record. An empty record has the depth UNBOUNDED.
+// The result does not depend on the order of the fragments.
 void insert_depth(uint first_record, uint depth) {
     for (uint index = 0u; index < counters.per_pixel_limit && depth != UNBOUNDED; index++) {
         uint previous = atomicMin(records[2u * (first_record + index)], depth);
@@ -47,7 +49,7 @@ void insert_id(uint first_record, uint depth, uint id_and_coverage) {
 void main() {
     float alpha = fragment_alpha(material_of(current_triangle()));
     ivec2 pixel = ivec2(gl_FragCoord.xy);
-    // `abs` turns -0 into 0, whose bits are the smallest.
+    // Depths are compared as unsigned integers, so `abs` turns -0 (bits 0x80000000) into 0.
     uint depth = floatBitsToUint(abs(clamp(gl_FragCoord.z, 0.0, 1.0)));
     uint id_and_coverage = uint(current_triangle()) + 1u << 4 | sample_coverage();
     if (!(alpha > 0.0)) return;

@@ -1,4 +1,5 @@
-// Histogram of the number of blended fragments per pixel, and their total.
+// Histogram of the number of blended fragments per pixel, and the total number of fragments. Bin b counts the pixels
+// with b + 1 fragments; the last bin also counts pixels with more. A workgroup adds TILE_SIDE x TILE_SIDE pixels.
 layout(local_size_x = TILE_SIDE, local_size_y = TILE_SIDE) in;
 shared uint local_bins[BINS];
 shared uint tile_total;

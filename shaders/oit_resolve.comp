@@ -3,6 +3,7 @@
 //   blend_layers  (out)  [SAMPLES][height][width]  RGBA16F: light of the blended surfaces, transmittance
 layout(local_size_x = TILE, local_size_y = TILE) in;
 layout(rgba16f, binding = 3) uniform writeonly image2DArray blend_layers;
+// x: depth; y: triangle index plus 1 in the upper 28 bits, sample coverage in the lower 4.
 layout(std430, binding = 2) buffer Records { uvec2 records[]; };
 
 // Order of a list: nearest first; at equal depth, the triangle that is drawn last comes first.
@@ -46,7 +47,7 @@ void heap_sort(uint first_record, uint count) {
     }
 }
 
-// Light and opacity of a fragment.
+// Light and opacity of a fragment, shaded at the mean position of the samples that it covers.
 vec4 shade_fragment(uvec2 record, ivec2 pixel, vec2 pixel_size) {
     vec2 center = vec2(0.0);
     for (int sample_index = 0; sample_index < SAMPLES; sample_index++) {
@@ -66,7 +67,8 @@ void main() {
     uint record_count = min(fragment_count, counters.per_pixel_limit);
     uint first_record = imageLoad(cursors, pixel).x;
     if (fragment_count <= counters.per_pixel_limit) {
-        // The gather phases sort only the lists above the limit. They leave the cursor of a shorter list at its end.
+        // The gather phases sort only the lists of pixels above the limit. For other pixels, filling has advanced the
+        // cursor to the end of the list.
         first_record -= record_count;
         // At this length, both sorts take a similar number of steps.
         if (record_count <= 32u) insertion_sort(first_record, record_count);

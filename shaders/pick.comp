@@ -1,9 +1,9 @@
 // Reads back the triangles that are visible in a small rectangle of pixels. The host intersects them with view rays in
 // f64.
-//   ids     (in)   [height][width]      R32UI, bottom row first; the rectangle is at the lower left
-//   picked  (out)  [rows][columns][22]  top row first: id, 3 corners, 3 positions, 3 normals: 1 + 3 + 9 + 9 words
+//   ids     (in)   [height][width]      R32UI, bottom row first; only the rectangle, at the lower left, is drawn
+//   picked  (out)  [rows][columns][22]  top row first: id, 3 corner indices, 3 positions, 3 normals (1 + 3 + 9 + 9)
 layout(local_size_x = WORKGROUP_SIZE) in;
-layout(location = 0) uniform int rectangle; // columns, and rows shifted by 16
+layout(location = 0) uniform int rectangle; // columns in the lower 16 bits, rows in the upper 16
 layout(std430, binding = 0) writeonly buffer Words { uint picked[]; };
 
 void main() {

@@ -1,6 +1,6 @@
 // Deferred shading: converts ids to the color of each pixel, in linear light. A triangle is shaded once per pixel, at
 // the center of the samples that see it. The color of a pixel is the mean of its samples after the tone curve.
-//   ids           (in)   [height][width][SAMPLES]  R32UI; NO_ID also for ground that was not rasterized
+//   ids           (in)   [height][width][SAMPLES]  R32UI; NO_ID for sky, and for ground that was not rasterized
 //   blend_layers  (in)   [height][width][SAMPLES]  RGBA16F: light of the blended surfaces, transmittance
 //   scene_color   (out)  [height][width]           RGBA16F
 //   bloom_source  (out)  [height][width]           RGBA16F: light above the bloom threshold

@@ -1,5 +1,5 @@
-// Discards fragments that cast no shadow: those below the cutoff of a cut-out material (MASK), or below the alpha
-// threshold of blended materials (t_alpha of the thesis).
+// Discards fragments that cast no shadow. Their alpha is below the cutoff of a cut-out material (MASK), or below the
+// threshold `frame.shadow.z` of blended materials (t_alpha of the thesis).
 void main() {
     Material material = material_of(current_triangle());
 #ifdef MASK

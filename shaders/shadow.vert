@@ -1,5 +1,5 @@
 // Projects a corner of a triangle to the shadow map. A corner is a vertex with texture coordinates. With POSITION_ONLY,
-// the index list contains vertices.
+// the index list contains vertices instead of corners, and the vertex buffer contains positions.
 #ifdef POSITION_ONLY
 layout(location = 0) in vec3 position;
 #else

@@ -1,5 +1,6 @@
-// Projects a corner of a triangle to the screen. A corner is a vertex with texture coordinates. Opaque triangles need
-// none: their index lists contain vertices, because more triangles share a vertex than a corner.
+// Projects a corner of a triangle to the screen. A corner is a vertex with texture coordinates. Without MASK, texture
+// coordinates are not needed: the index list contains vertices instead of corners. There are fewer vertices, and more
+// triangles share each of them.
 #ifdef MASK
 layout(location = 0) in uint vertex;
 layout(binding = 13) uniform samplerBuffer positions;

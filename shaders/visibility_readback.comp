@@ -1,4 +1,4 @@
-// Packs the id of the first sample of each pixel, top row first.
+// Copies the id of the first sample of each pixel to a buffer, top row first.
 //   ids      (in)   [height][width][SAMPLES]  R32UI, bottom row first
 //   ids_out  (out)  [height][width]
 layout(local_size_x = WORKGROUP_SIZE) in;

@@ -27,7 +27,7 @@ void main() {
     bool is_empty = key == uvec2(0xFFFFFFFFu);
     uint id = is_empty ? NO_ID : key.x + 1u;
 #ifdef HAS_GROUND
-    // If the ground lies behind everything else, the shading adds it instead.
+    // `to_sun.w` is 0 if the ground lies behind all surfaces. Then the shading adds the ground, and this pass must not.
     vec2 pixel_size = 2.0 / vec2(size);
     float depth = frame.to_sun.w == 0.0 ? 2.0 : biased_ground_depth((vec2(pixel) + 0.5) * pixel_size - 1.0, pixel_size);
     if (depth <= (is_empty ? 1.0 : uintBitsToFloat(key.y))) id = GROUND_ID;

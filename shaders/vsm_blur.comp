@@ -1,7 +1,7 @@
-// One direction of the Gaussian blur (equation 3.11) for software rasterizers, where texture reads are cheaper than
-// shared memory. The first direction (FROM_DEPTH) reads depth, the second reads the moments that the first wrote. An
-// invocation writes TEXELS_PER_INVOCATION consecutive texels along its direction, so that it reads each input only once.
-// `blur_separable` in src/render/shaders/shadow.rs generates the function `blur`.
+// One direction of the Gaussian blur (equation 3.11 of the thesis) for software rasterizers, where texture reads are
+// cheaper than shared memory. The first direction (FROM_DEPTH) reads depth, the second reads the moments that the first
+// wrote. An invocation writes TEXELS_PER_INVOCATION consecutive texels along its direction, so that it reads each input
+// only once. `blur_separable` in src/render/shaders/shadow.rs generates the function `blur`.
 layout(local_size_x = WORKGROUP_SIZE) in;
 layout(FORMAT, binding = 0) uniform writeonly image2D destination;
 
@@ -13,6 +13,7 @@ void main() {
 #else
     const ivec2 direction = ivec2(0, 1);
 #endif
+    // First texel of this invocation: multiplies its index along the direction by TEXELS_PER_INVOCATION.
     texel += (TEXELS_PER_INVOCATION - 1) * texel * direction;
     if (texel.x >= side) return;
     vec2 sums[TEXELS_PER_INVOCATION];

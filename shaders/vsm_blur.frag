@@ -1,5 +1,5 @@
-// One direction of the Gaussian blur (equation 3.11) with one fragment per texel, as in the thesis: the baseline of
-// measurements. `blur_separable` in src/render/shaders/shadow.rs generates the function `blur`.
+// One direction of the Gaussian blur (equation 3.11 of the thesis) with one fragment per texel, as in the thesis: the
+// baseline of measurements. `blur_separable` in src/render/shaders/shadow.rs generates the function `blur`.
 layout(location = 0) out vec4 blurred;
 
 void main() {

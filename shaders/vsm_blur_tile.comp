@@ -1,9 +1,9 @@
-// Both directions of the Gaussian blur (equation 3.11) in one pass: depth in, blurred moments out. A workgroup writes
-// OUTPUT_COLUMNS x OUTPUT_ROWS texels. It loads their depths with a margin of RADIUS, a band of BAND_ROWS rows at a
-// time, and blurs each row into shared memory. Then it blurs the columns of the result. An invocation computes a
-// segment of TEXELS_PER_INVOCATION consecutive sums, so that it loads each input only once. The pitch of a row is odd,
-// so that lanes that process different rows access different banks of shared memory. `BlurTile` in
-// src/render/shaders/shadow.rs generates the shared arrays `depths` and `rows`, and the functions `blur_row` and
+// Both directions of the Gaussian blur (equation 3.11 of the thesis) in one pass: depth in, blurred moments out. A
+// workgroup writes OUTPUT_COLUMNS x OUTPUT_ROWS texels. It loads their depths with a margin of RADIUS, a band of
+// BAND_ROWS rows at a time, and blurs each row into shared memory. Then it blurs the columns of the result. An
+// invocation computes a segment of TEXELS_PER_INVOCATION consecutive sums, so that it loads each input only once. The
+// pitch of a row is odd, so that lanes that process different rows access different banks of shared memory. `BlurTile`
+// in src/render/shaders/shadow.rs generates the shared arrays `depths` and `rows`, and the functions `blur_row` and
 // `blur_column`.
 layout(local_size_x = WORKGROUP_SIZE) in;
 layout(FORMAT, binding = 0) uniform writeonly image2D destination;

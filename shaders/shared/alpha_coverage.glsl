@@ -5,8 +5,8 @@
 int covered_samples(float alpha, float cutoff) {
 #if SAMPLES > 1
     vec2 slope = vec2(dFdx(alpha), dFdy(alpha));
-    // A sample is at most half a pixel from the center in x and in y. So its alpha differs from `alpha` by at most half
-    // of `max_slope`.
+    // A sample is at most half a pixel from the center in x and in y. So with the clamped slope, its alpha differs from
+    // `alpha` by at most half of `max_slope`: by the cutoff or 1 - cutoff, whichever is less.
     float max_slope = 2.0 * min(cutoff, 1.0 - cutoff);
     slope *= min(1.0, max_slope / max(abs(slope.x) + abs(slope.y), 1e-6));
     int mask = 0;

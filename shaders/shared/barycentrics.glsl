@@ -13,9 +13,9 @@ struct Barycentrics {
 };
 
 // `a`, `b`, `c`: (x, y, w) of the corners in clip space, relative to the image point p: (x - p.x w, y - p.y w, w).
-// `pixel_size`: size of a pixel in normalized device coordinates. The weight of `a` is proportional to (b x c).z, and so
-// on. These are homogeneous coordinates, so corners behind the camera need no clipping. Subtracting the image point
-// first avoids cancellation for small triangles.
+// `pixel_size`: size of a pixel in normalized device coordinates. The weights of `a`, `b` and `c` are proportional to
+// (b x c).z, (c x a).z and (a x b).z. These are homogeneous coordinates, so corners behind the camera need no clipping.
+// Subtracting the image point first avoids cancellation for small triangles.
 Barycentrics compute_barycentrics(vec3 a, vec3 b, vec3 c, vec2 pixel_size) {
     float scale = 1.0 / max(max(abs(a.z), abs(b.z)), max(abs(c.z), 1e-30));
     a *= scale, b *= scale, c *= scale;
@@ -24,7 +24,8 @@ Barycentrics compute_barycentrics(vec3 a, vec3 b, vec3 c, vec2 pixel_size) {
     float sum = edge_values.x + edge_values.y + edge_values.z;
     Barycentrics result;
     result.is_front_facing = sum > 0.0;
-    // The point lies inside except for rounding. For a triangle without area the sum is 0; its weights become 1/3.
+    // The image point lies in the triangle except for rounding. For a triangle without area, the sum is 0, and the
+    // weights become 1/3.
     result.weights = clamp(edge_values / sum, 0.0, 1.0);
     float weight_sum = result.weights.x + result.weights.y + result.weights.z;
     result.weights = weight_sum > 0.5 ? result.weights / weight_sum : vec3(1.0 / 3.0);

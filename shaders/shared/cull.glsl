@@ -2,15 +2,15 @@
 // WORKGROUP_SIZE triangles of one group. A superblock is SUPERBLOCK consecutive blocks of one group. Block indices are
 // padded, so that each group begins with a new superblock; no workgroup runs for the padding. Twins: `CullUniforms` and
 // `CullUniforms::empty_draws` in src/render/layout/cull.rs.
-//   commands  [MAX_GROUPS][5]       indexed indirect draws
+//   commands  [MAX_GROUPS][5]       indirect draws: index count, instances, first index, base vertex, base instance
 //   totals    [superblocks]         number of visible triangles of the superblock
 //   bits      [blocks][MASK_WORDS]  one bit per triangle: whether it is visible
 const uint MASK_WORDS = uint(WORKGROUP_SIZE) / 32u;
 
 layout(std140, binding = 3) uniform GroupBlock {
     uvec4 ranges[MAX_GROUPS]; // first triangle, triangles, first workgroup, first block
-    uvec4 flags[MAX_GROUPS];  // x: whether it is single-sided; y: whether its index list contains vertices, not corners
-    uvec4 count;              // number of groups, workgroups, blocks with padding
+    uvec4 flags[MAX_GROUPS];  // x: 1 for a single-sided group; y: 1 if its index list contains vertices, 0 for corners
+    uvec4 count;              // numbers of groups, of workgroups, of blocks with padding
     vec4 subpixel_step;       // x: step of the rasterizer's subpixel grid, in pixels
 } groups;
 

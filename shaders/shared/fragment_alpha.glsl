@@ -1,7 +1,7 @@
-// Alpha of a fragment: that of its material times that of its texel.
+// Alpha of a fragment: alpha of the material times alpha of the texel.
 #ifdef TEXTURES
-// Centroid sampling: at the edge of a triangle the pixel center may lie outside it, where texture coordinates wrap
-// around.
+// Centroid sampling: the center of a pixel at the edge of a triangle may lie outside of the triangle. Extrapolation to
+// this center could give wrong texture coordinates.
 centroid in vec2 uv_image;
 #endif
 

@@ -11,8 +11,9 @@ layout(std140, binding = 0) uniform FrameBlock {
     vec4 zenith;
     vec4 horizon;
     vec4 up;                   // a coordinate axis; w: height of the ground
-    vec4 ground;               // color; w: distance D over which it fades: its weight is exp(-(d / D)^2) at distance d
+    vec4 ground;               // color; w: fade length D: at distance d from the center, its weight is exp(-(d / D)^2)
     vec4 ground_center;        // w: half the side of the ground's square
     vec4 shadow;               // minimum variance, light bleeding reduction, alpha threshold, side of the map in texels
-    vec4 shadow_ground_plane;  // (a, b, c): the ground's depth at (x, y) of the map is a x + b y + c; w: side of a texel
+    // xyz: (a, b, c), the ground's depth at (x, y) of the map is a x + b y + c; w: side of a texel, in scene units.
+    vec4 shadow_ground_plane;
 } frame;

@@ -17,7 +17,8 @@ ivec2 clamp_to_image(ivec2 pixel) { return clamp(pixel, ivec2(0), textureSize(sc
 // Perceptual luma, 0 to 1: the square root approximates the sRGB curve.
 float luma(ivec2 pixel) { return sqrt(dot(texelFetch(scene_color, clamp_to_image(pixel), 0).rgb, vec3(0.2126, 0.7152, 0.0722))); }
 
-// Searches the end of a pixel's edge in one direction: where the mean luma across the edge differs from `edge_mean`.
+// Searches the end of a pixel's edge in one direction: where the mean luma across the edge differs from `edge_mean` by
+// at least `tolerance`.
 // x of the result: distance from the pixel's center in pixels; y: the difference at the end.
 vec2 find_edge_end(ivec2 pixel, ivec2 edge_direction, ivec2 across_edge, float edge_mean, float tolerance) {
     float difference = 0.0;

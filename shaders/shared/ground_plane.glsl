@@ -1,9 +1,10 @@
 // Whether a view ray hits the ground from above, within a square around the scene. If the ray is almost level, the
-// intersection may not be finite; then the comparison fails. Twin: `FrameUniforms::ray_hits_ground` in
+// intersection may not be finite; then the result is false. Twin: `FrameUniforms::ray_hits_ground` in
 // src/render/uniforms/frame.rs.
 bool ray_hits_ground(vec3 direction) {
     float descent = -dot(direction, frame.up.xyz), eye_height = dot(frame.eye.xyz, frame.up.xyz) - frame.up.w;
-    // The up direction is a coordinate axis; the last factor removes this component.
+    // Distance of the intersection from the center of the square, per axis. The up direction is a coordinate axis, and
+    // the last factor sets this component to 0.
     vec3 offset = abs(frame.eye.xyz - frame.ground_center.xyz + eye_height / descent * direction) * (1.0 - frame.up.xyz);
     return descent > 0.0 && eye_height > 0.0 && all(lessThanEqual(offset, vec3(frame.ground_center.w)));
 }

@@ -1,6 +1,6 @@
 // Lists of blended fragments per pixel, and their counters. Twin: `OitCounters` in src/render/layout/oit.rs.
 //   fragment_counts  [height][width]  R32UI: blended fragments of the pixel
-//   cursors          [height][width]  R32UI: index of the pixel's next record
+//   cursors          [height][width]  R32UI: index of the first record of the pixel's list that is not filled yet
 //   records          [budget][2]      depth; triangle index plus 1 in the upper 28 bits, sample coverage in the lower 4
 // The depth is stored as the bits of a float from 0 to 1, which have the same order as the float. A sorted list begins
 // with the nearest record; at equal depth, with the latest triangle.
@@ -12,7 +12,7 @@ layout(std430, binding = 3) buffer OitCounters {
     uint per_pixel_limit;    // maximum number of records per pixel; UNBOUNDED without a limit
     uint allocated;          // allocated records
     uint budget;             // capacity of `records`
-    uint commands[10];       // two indirect draws of the last gather phase, for pixels with more fragments than the limit
+    uint commands[10];       // two indirect draws, 5 words each, of the last gather phase
     uint bins[BINS];         // pixels with 1, 2, 3 ... fragments; the last bin also counts pixels with more
 } counters;
-const uint UNBOUNDED = 0xFFFFFFFFu;
+const uint UNBOUNDED = 0xFFFFFFFFu; // no limit; also the depth of an empty record

@@ -1,7 +1,7 @@
 // Cascades of a shadow map that is split by distance from the camera. A cascade is a layer that covers a part of the
 // whole map. Twin: `ShadowCascades` in src/render/uniforms/cascades.rs.
 layout(std140, binding = 2) uniform CascadeBlock {
-    vec4 scale_offsets[4]; // scale and offset from the whole map to the layer
+    vec4 scale_offsets[4]; // scale (xy) and offset (zw) from the whole map to the layer
     vec4 end_depths;       // depth along the view axis at which each cascade ends; unused for the last one
 } cascades;
 

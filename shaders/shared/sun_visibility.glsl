@@ -1,5 +1,6 @@
 // `sun_visibility`: fraction of the sun's light that reaches a surface point, for all shadow methods. It uses no
-// derivatives, so that fragment and compute shaders can call it. NaN inputs give a finite result.
+// derivatives, so that fragment and compute shaders can call it. NaN inputs give a finite result. A map position is x,
+// y and depth in the shadow map, each from 0 to 1. With cascades, x and y are those of the point's layer.
 #ifdef SHADOWS
 layout(binding = 0) uniform sampler2DArray shadow_map;
 
@@ -45,17 +46,19 @@ float shadow_visibility(vec3 position, int layer, vec3 normal) {
     vec2 moments = textureLod(shadow_map, vec3(position.xy, float(layer)), 0.0).xy;
     float excess_depth = clamp(position.z, 0.0, 1.0) - 0.5 - moments.x - contact_bias(position, layer, normal);
     if (!(excess_depth > 0.0)) return 1.0;
+    // `frame.shadow`: minimum variance in x, light bleeding reduction in y.
     float variance = max(moments.y - moments.x * moments.x, frame.shadow.x);
     float bound = variance / (variance + excess_depth * excess_depth);
     return clamp((bound - frame.shadow.y) / (1.0 - frame.shadow.y), 0.0, 1.0);
 }
 #else
-// Bias of the comparison. A texel is compared with the plane of the surface instead of the depth of the point, so that
-// a slope does not shadow itself. A caster must be at least the side of a texel in front of that plane. This covers
+// Bias of the comparison. A texel's depth is compared with the depth of the surface plane at the texel's center, so a
+// slope does not shadow itself. A caster must be in front of that plane by at least the side of a texel. This covers
 // curved surfaces, whose triangles deviate from their normals. 4e-7 is for the rounding of depth.
 float depth_bias(int layer) {
     vec3 light_depth_gradient = vec3(frame.shadow_from_world[0].z, frame.shadow_from_world[1].z, frame.shadow_from_world[2].z);
     vec2 layer_scale = cascade_scale(layer);
+    // `shadow_ground_plane.w`: side of a texel in scene units. The gradient is the change of depth per scene unit.
     return frame.shadow_ground_plane.w / min(layer_scale.x, layer_scale.y) * length(light_depth_gradient) + 4e-7;
 }
 
@@ -83,6 +86,7 @@ float shadow_visibility(vec3 position, int layer, vec3 normal) {
     vec2 gradient = receiver_plane_gradient(normal, layer);
     float receiver_depth = position.z - depth_bias(layer), lit_weight = 0.0;
     for (int y = -RADIUS; y <= RADIUS; y += 2) {
+        // Weights of rows y and y + 1, interpolated between Gaussians that are centered at rows 0 and 1.
         vec2 row_weights = mix(vec2(TAPS[abs(y)], TAPS[abs(y + 1)]), vec2(TAPS[abs(y - 1)], TAPS[abs(y)]), fraction.y);
         for (int x = -RADIUS; x <= RADIUS; x += 2) {
             vec2 column_weights = mix(vec2(TAPS[abs(x)], TAPS[abs(x + 1)]), vec2(TAPS[abs(x - 1)], TAPS[abs(x)]), fraction.x);

@@ -1,5 +1,5 @@
-// Index of a fragment's triangle in the draw order. `first_triangle` is the first triangle of the draw call, or, for a
-// list of visible triangles, the bitwise complement of the list's first entry.
+// Index of a fragment's triangle in the draw order. `first_triangle` is the first triangle of the draw call. For a list
+// of visible triangles, it is the bitwise complement of the index of the list's first entry in `triangle_ids`.
 layout(location = 0) uniform int first_triangle;
 #ifdef CULLED
 layout(binding = 25) uniform usamplerBuffer triangle_ids;

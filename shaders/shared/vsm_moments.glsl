@@ -1,5 +1,5 @@
 // Inputs of the variance shadow map's blur: the moments m and m^2, with m = depth - 1/2.
-layout(binding = 0) uniform sampler2DArray source; // with FROM_DEPTH depth, else moments that are blurred horizontally
+layout(binding = 0) uniform sampler2DArray source; // with FROM_DEPTH: depth; else: horizontally blurred moments
 #ifdef DEPTH_IN_BUFFER
 // Depth from the compute rasterizer, top row first.
 layout(std430, binding = 0) readonly buffer RasterDepths { float raster_depths[]; };
@@ -19,8 +19,8 @@ float ground_moment(ivec2 texel, int side) {
     return clamp(dot(frame.shadow_ground_plane.xy, position) + frame.shadow_ground_plane.z, 0.0, 1.0) - 0.5;
 }
 
-// m at a texel. Outside the map, the nearest texel of the map is used. That texel is always empty, so the result is the
-// ground's m.
+// m at a texel. A texel outside the map has the depth of the nearest texel of the map. No caster is drawn at the border
+// of the map, so that texel is empty, and the result is the ground's m.
 float centered_depth(ivec2 texel, int side) {
     ivec2 inside_texel = clamp(texel, ivec2(0), ivec2(side - 1));
 #ifdef DEPTH_IN_BUFFER

@@ -201,12 +201,12 @@ pub(crate) fn check_separate_readbacks<D: Deformer>(create_deformer: impl Fn(&Ar
                     |(requested, is_equal, is_empty): &(bool, bool, bool)| *is_equal || !requested && *is_empty;
                 assert!(
                     comparisons.iter().all(is_valid) && actual.tangents.is_empty(),
-                    "before step {step}: {requested:?}, {comparisons:?}"
+                    "the step before step {step}: {requested:?}, {comparisons:?}"
                 );
             }
         }
     }
-    // Negative control: the next step has other attributes.
+    // Negative control: the next step changes the values of all attributes.
     let (last_surface, _) = pending.pop().expect("expected a readback of the last step");
     let (q_domains, transform_domains) = ([1, 6], [2, 6]);
     partial_steps::randomize_q_and_transforms(&scene, &mut state, &mut random, &q_domains, &transform_domains);

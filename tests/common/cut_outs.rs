@@ -9,7 +9,7 @@ use modalcast_model::scene::{CullMode, DrawRange, Viewport};
 use super::soups::{Soup, all_soups, clip_space_viewport, perspective_viewport};
 use crate::scenes::Random;
 
-/// A soup whose triangles from `cut_outs.first` on are alpha-tested.
+/// A soup whose triangles from index `cut_outs.first` on are alpha-tested.
 pub(crate) struct CutOutSoup {
     pub(crate) soup: Soup,
     pub(crate) cut_outs: CutOuts,
@@ -41,10 +41,12 @@ impl CutOutSoup {
             let (corners, uvs) =
                 (corners(&soup.viewport, &soup.positions, vertices), &cut_outs.uvs[cut_out_index as usize]);
             let cutoff = cut_outs.materials[cut_outs.material_indices[cut_out_index as usize] as usize].cutoff;
+            // The samples that the polygon may cover are in columns x0 to x1 and rows y0 to y1.
             let [x0, y0, x1, y1] = clipped_polygon.samples;
             for clipped_triangle in fan_triangles(&clipped_polygon) {
                 for (row, column) in (y0..=y1).flat_map(|row| (x0..=x1).map(move |column| (row, column))) {
                     if depth_at(&clipped_triangle, column, row).is_some() {
+                        // Texture coordinates of the sample and their derivatives, which the texture filter needs.
                         let footprint = footprint(&soup.viewport, &corners, uvs, [column, row]);
                         let is_near_cutoff = (alpha(cut_outs, triangle, &footprint) - cutoff).abs() <= tolerance;
                         is_ambiguous[row as usize * soup.viewport.size()[0] as usize + column as usize] |=
@@ -116,8 +118,10 @@ pub(crate) fn sheet_soup(side: u32, image: AlphaImage) -> CutOutSoup {
     }
 }
 
-/// A floor one unit below the camera, split into `divisions` x `divisions` rectangles, and an opaque wall at its far
-/// end. The floor extends behind the camera. Its image is smooth, so that filters of low precision differ little.
+/// A floor one unit below the camera, split into `divisions` x `divisions` rectangles, and an opaque wall beyond its
+/// far end. The camera is at the origin and looks along -z. The floor extends from z = 9, behind the camera, to
+/// z = -20; the wall is at z = -20.5. The alpha image of the floor is smooth, so that filters of low precision differ
+/// little.
 pub(crate) fn floor_soup(divisions: u32) -> CutOutSoup {
     // Vertices 0 to 3 and triangles 0 and 1 are the wall.
     let mut positions = [[-20.0, -9.0, -20.5], [20.0, -9.0, -20.5], [20.0, 9.0, -20.5], [-20.0, 9.0, -20.5]].concat();
@@ -150,8 +154,8 @@ pub(crate) fn floor_soup(divisions: u32) -> CutOutSoup {
     CutOutSoup { soup: Soup { name: "floor", positions, triangles, groups, viewport }, cut_outs }
 }
 
-/// The sum of one sine wave per axis. The amplitude differs per mip level, so that tests detect a read of a wrong
-/// level.
+/// An alpha image: the sum of one sine wave per axis. The amplitude differs per mip level, so that tests detect a read
+/// of a wrong level.
 fn wave_image() -> AlphaImage {
     let sine = |texel: u32, side: u32| (std::f32::consts::TAU * (texel as f32 + 0.5) / side as f32).sin();
     alpha_image(64, 32, |level, column, row| {

@@ -6,14 +6,14 @@ use nalgebra::{Matrix3, Matrix4, Vector3, Vector4};
 /// Grid spacing of snapped corners in pixels: rasterizers round corners to 8 sub-pixel bits.
 const SNAP_STEP: f64 = 1.0 / 256.0;
 
-/// A triangle in homogeneous window coordinates (x w, y w, w), with x and y in pixels.
+/// A triangle in homogeneous window coordinates (x w, y w, w), with x and y in pixels, y downwards.
 pub(crate) struct ExactTriangle {
     /// Edge functions as vectors: the dot product with a sample (x, y, 1) is zero on the edge.
     edges: [Vector3<f64>; 3],
     /// Clip-space z of the corners.
-    depths: Vector3<f64>,
+    clip_z: Vector3<f64>,
     /// Clip-space w of the corners.
-    weights: Vector3<f64>,
+    clip_w: Vector3<f64>,
     /// Determinant of the corners; its sign is the winding order.
     signed_area: f64,
 }
@@ -30,8 +30,8 @@ impl ExactTriangle {
         let signed_area = Matrix3::from_columns(&[a, b, c]).determinant();
         Self {
             edges: [b.cross(&c), c.cross(&a), a.cross(&b)],
-            depths: component_of_corners(|corner| corner.z),
-            weights: component_of_corners(|corner| corner.w),
+            clip_z: component_of_corners(|corner| corner.z),
+            clip_w: component_of_corners(|corner| corner.w),
             signed_area,
         }
     }
@@ -50,9 +50,10 @@ impl ExactTriangle {
 
     /// Depth at a sample, from 0 (near) to 1 (far).
     pub(crate) fn depth(&self, sample: Vector3<f64>) -> f64 {
-        // The edge values are the homogeneous weights of the corners times a common factor, which the quotient removes.
+        // The edge values are the barycentric weights of the corners times a common factor, which the quotient removes.
+        // The quotient is z / w in clip space, from -1 to 1.
         let edge_values = Vector3::from(self.edges.map(|edge| edge.dot(&sample)));
-        0.5 * edge_values.dot(&self.depths) / edge_values.dot(&self.weights) + 0.5
+        0.5 * edge_values.dot(&self.clip_z) / edge_values.dot(&self.clip_w) + 0.5
     }
 }
 

@@ -190,7 +190,8 @@ pub(crate) fn check_intermediate_overflow<D: Deformer>(create_deformer: impl Fn(
     }
 }
 
-/// A tile whose rows of U are all zero does not move, although no quantization scale fits it.
+/// A tile (128 vertices) whose rows of U are all zero does not move, although its largest entry, which sets the
+/// quantization scale, is 0.
 pub(crate) fn check_zero_tiles<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) {
     let (vertices, rank) = (300, 6);
     // Rows of the second tile; a tile has 128 vertices.

@@ -31,6 +31,7 @@ fn random_frame(random: &mut Random, index: usize, is_rigid: bool) -> Transform 
     let is_mirrored = index.is_multiple_of(3);
     let mut frame = random.next_similarity(is_mirrored);
     if !is_rigid && index.is_multiple_of(2) {
+        // Row 0, column 1, and row 2, column 0 of the 3 x 4 matrix.
         frame.0[1] += 0.3 * random.next_number();
         frame.0[8] -= 0.2 * random.next_number();
     }
@@ -38,7 +39,8 @@ fn random_frame(random: &mut Random, index: usize, is_rigid: bool) -> Transform 
 }
 
 /// Parts of a scene with `count` domains. The indices divisible by 3 are transform roots. Each other domain follows a
-/// random earlier domain, which is a root or a follower. With `is_rigid`, no transform may have shear.
+/// random earlier domain, which is a root or a follower. With `is_rigid`, transforms may have no shear, but a uniform
+/// scale and a reflection.
 pub(crate) fn follower_scene_parts(count: usize, deformation: DeformationSettings, is_rigid: bool) -> SceneParts {
     let mut random = Random(count as u64);
     let mut shapes: Vec<Shape> =
@@ -154,7 +156,7 @@ pub(crate) fn check_partial_steps_of_roots<D: Deformer>(create_deformer: impl Fn
         let roots: Vec<u32> = scene.transform_roots.domains().collect();
         let mut partial_steps = 0;
         for step in 0..12 {
-            // No, one or two of the 40 roots, or all of them in step 7.
+            // The step moves no root, one or two of the 40 roots, or in step 7 all roots.
             let two_roots = [roots[(step * 5 + 20) % 40], roots[(step * 11 + 39) % 40]];
             let transform_domains = if step == 7 { &roots[..] } else { &two_roots[..step % 3] };
             let q_domains: &[u32] = if step % 4 == 1 { &[1, 5, 64] } else { &[] };
@@ -207,8 +209,8 @@ fn far_step(domain: u32, translation: [f64; 3]) -> RawStepUpdate {
     }
 }
 
-/// The positions of a follower are relative to the floating origin of its root, so a far follower is as precise as one
-/// near the scene's origin.
+/// The positions of a follower are relative to its root's origin, which is an f64 point. So a far follower is as
+/// precise as a follower near the scene's origin.
 pub(crate) fn check_far_followers<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) {
     let mut random = Random(64);
     let mut parts = scenes::parts_of_shapes(vec![strip_shape(&mut random, 50, 0)]);
@@ -243,8 +245,8 @@ pub(crate) fn check_far_followers<D: Deformer>(create_deformer: impl Fn(&Arc<Sce
     );
 }
 
-/// Positions are finite and correct if entries of T_root F exceed f32: both have a scale of 1e25, and rest positions of
-/// 1e-20 keep x in range.
+/// Positions are finite and correct if entries of T_root F exceed f32. T_root and F have a scale of 1e25 each. Rest
+/// positions of 1e-20 give coordinates x of about 1e30, which are in the range of f32.
 pub(crate) fn check_overflowing_frame_products<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) {
     let mut random = Random(65);
     let rest_positions: Vec<[f32; 3]> =

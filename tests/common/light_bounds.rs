@@ -86,8 +86,8 @@ fn verify_light_bounds(name: &str, scene: &Scene, result: &StepResult) -> Orient
         max_excess(&scene_box, &light_box) <= 4e-7 * magnitude,
         "{name}: expected {light_box:?} within {scene_box:?}"
     );
-    // Negative control: a box that is smaller than `vertex_box` does not contain it. The scene of one vertex has no
-    // diagonal to shrink.
+    // Negative control: a box that is smaller than `vertex_box` does not contain `vertex_box`. The scene of one vertex
+    // has a diagonal of 0, so its box cannot shrink.
     let shrunk_box = vertex_box.expanded_by(-1e-3 * result.bounds.diagonal());
     assert!(result.bounds.diagonal() == 0.0 || max_excess(&shrunk_box, &vertex_box) > 0.0, "{name}: negative control");
     light_box
@@ -98,8 +98,8 @@ fn scene_box_in_light_space(scene: &Scene, bounds: &BoundingBox) -> OrientedBoun
     OrientedBounds::enclosing(&scene.light_axes().expect("expected a scene with a shadow"), bounds)
 }
 
-/// Light bounds contain every vertex of random, smooth, distant and tiny scenes, of a scene with one vertex, and of a
-/// scene with several domains per tile.
+/// Light bounds contain every vertex of coils, of a scene of one vertex, and of a scene with several domains per tile.
+/// Each scene is also moved far from the origin, and then scaled by 1e-20.
 pub(crate) fn check_containment<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>, BatchPolicy) -> D) {
     let default_policy = BatchPolicy::default();
     let cases = [

@@ -61,8 +61,8 @@ pub(crate) fn clip_space_viewport(width: u32, height: u32) -> Viewport {
     Viewport::new(&Matrix4::identity(), width, height).expect("expected a valid viewport")
 }
 
-/// Positions of triangles with random corners around random centers. Centers are within `extent` of the origin, corners
-/// within `size` of their center per axis.
+/// Positions of triangles with random corners around random centers. Per axis, centers are within `extent` of the
+/// origin, and corners within `size` of their center.
 fn scattered_triangles(random: &mut Random, count: usize, extent: f32, size: [f32; 3]) -> Vec<f32> {
     let mut positions = Vec::with_capacity(9 * count);
     for _ in 0..count {
@@ -90,7 +90,7 @@ pub(crate) fn fan_soup(viewport: Viewport) -> Soup {
     soup
 }
 
-/// Triangles with a repeated vertex or collinear corners, which have no area, and a few triangles with an area.
+/// Triangles without area, because a vertex repeats or the corners are collinear, and a few triangles with an area.
 fn degenerate_soup() -> Soup {
     let mut positions = scattered_triangles(&mut Random(9), 8, 0.8, [0.6; 3]);
     positions.extend([[-0.9, -0.9, 0.0], [0.0, 0.0, 0.1], [0.9, 0.9, 0.2]].concat());
@@ -105,7 +105,7 @@ fn degenerate_soup() -> Soup {
 pub(crate) fn all_soups() -> Vec<Soup> {
     let random = &mut Random(5);
     let mut non_finite = scattered_triangles(random, 600, 1.0, [0.3; 3]);
-    // Each value replaces about every 61st coordinate.
+    // Each value replaces one of 61 to 64 coordinates. `f32::MAX` is finite, but its clip-space position may overflow.
     for (index, value) in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, f32::MAX].into_iter().enumerate() {
         (index..non_finite.len()).step_by(61 + index).for_each(|coordinate| non_finite[coordinate] = value);
     }

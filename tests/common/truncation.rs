@@ -71,8 +71,9 @@ fn count_mode_toggles(storage: StorageType, mut deform: impl FnMut(&Arc<Scene>, 
     let (vertices, rank, oscillating_mode) = (5, 8, 4);
     let mut columns = vec![0.0; 3 * vertices * rank];
     for vertex in 0..vertices {
-        // Mode 0 moves every vertex along y, the oscillating mode moves it along x. All modes of a chunk with a
-        // retained mode are summed. A chunk has at most four modes, so mode 4 is in another chunk than mode 0.
+        // Mode 0 moves every vertex along y, the oscillating mode moves it along x. A chunk is up to four consecutive
+        // modes. If one mode of a chunk is retained, all its modes are summed, so mode 4 must be in another chunk than
+        // mode 0.
         columns[3 * vertex + 1] = 1.0;
         columns[3 * vertices * oscillating_mode + 3 * vertex] = 1.0;
     }

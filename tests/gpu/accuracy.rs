@@ -5,7 +5,7 @@ use modalcast_compute::reference::{rigid_normals, rigid_tangents};
 use modalcast_model::deform::{DeformSummary, Deformer};
 use modalcast_model::scene::{BoundingBox, Scene, SceneState};
 
-/// Largest accepted error of a position, relative to the scene's diagonal.
+/// Largest accepted error of a position, relative to the scene's diagonal: the guarantee in README.md.
 pub(crate) const MAX_POSITION_ERROR: f64 = 1e-5;
 /// Largest accepted error of a component of a unit vector: a normal or a tangent.
 pub(crate) const MAX_DIRECTION_ERROR: f64 = 1e-5;

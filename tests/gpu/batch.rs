@@ -77,7 +77,7 @@ fn gpu_batches_have_the_bits_of_separate_domains() {
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_multi_tile_blocks_have_the_bits_of_separate_domains() {
-    // More than 8,192 tiles of 128 vertices. `batch` has about 4,096 blocks, so a block computes two or three tiles.
+    // More than 8,192 tiles of 128 vertices. `batch` has about 4,096 thread blocks, so a block computes several tiles.
     // The last tile is partly filled.
     for (storage, vertices) in
         [(StorageType::F32, 1_100_007), (StorageType::Int8, 1_100_007), (StorageType::F16, 1_600_001)]
@@ -90,6 +90,7 @@ fn gpu_multi_tile_blocks_have_the_bits_of_separate_domains() {
             .kernel(KernelKind::Batch)
             .expect("expected a batch kernel")
             .blocks as usize;
+        // A tile has TILE_QUADS quads, and a quad has QUAD vertices.
         let tiles = vertices.div_ceil(QUAD * TILE_QUADS);
         assert!(2 * blocks <= tiles + 1, "{name}: expected at most one block per two tiles, got {blocks} blocks");
         assert_eq!(count_differing_states(&name, &scene), 0, "{name}");
@@ -108,6 +109,7 @@ fn gpu_batches_have_the_bits_of_separate_domains_with_features() {
             0 => strip_shape(&mut random, *vertices, *rank),
             _ => scenes::random_shape(&mut random, *vertices, *rank),
         });
+        // 19 domains per shape. `parts` gets copies of the shapes and domains of this scene.
         let scene = scene_of_shapes(shapes.collect(), 19, deformation, normal_maps);
         let mut parts = scenes::parts_of_shapes(scene.shapes.clone());
         (parts.domains, parts.deformation) = (scene.domains.clone(), deformation);
@@ -125,9 +127,11 @@ fn gpu_batches_have_the_bits_of_separate_domains_with_features() {
     ] {
         let name = format!("{deformation:?}, normal maps {normal_maps}");
         assert_eq!(count_differing_states(&name, &build_scene(mixed_parts(deformation, normal_maps))), 0, "{name}");
+        // Covers followers with and without shear.
+        let is_rigid = !normal_maps;
         let name = format!("followers, {name}");
         assert_eq!(
-            count_differing_states(&name, &build_scene(follower_scene_parts(90, deformation, !normal_maps))),
+            count_differing_states(&name, &build_scene(follower_scene_parts(90, deformation, is_rigid))),
             0,
             "{name}"
         );

@@ -61,8 +61,8 @@ fn gpu_dropped_deformers_release_their_memory() {
         deform_once();
     }
     let (free_after, _) = device.memory().expect("expected the free memory");
-    // If deformers leaked, the memory of 200 deformers would be missing. The tolerance of eight is for memory that the
-    // driver keeps.
+    // If deformers leaked, the memory of 200 deformers would be missing. The tolerance, the memory of eight deformers,
+    // is for memory that the driver keeps.
     assert!(
         (free_before as u64) < free_after as u64 + 8 * bytes,
         "expected about {free_before} free bytes after 200 scenes, got {free_after}"

@@ -49,7 +49,7 @@ fn gpu_vertices_with_zero_rows_do_not_move() {
 fn gpu_bounds_show_axis_and_sign_of_an_overflow() {
     let mut random = Random(4);
     let shape = scenes::random_shape(&mut random, 1000, 1);
-    // The only mode moves one vertex along x and y.
+    // The only mode moves vertex 517 along x and y.
     let mut column = vec![0.0; 3000];
     column[3 * 517] = 2.0;
     column[3 * 517 + 1] = 2.0;
@@ -92,6 +92,7 @@ fn gpu_directions_of_singular_transforms_equal_the_reference() {
     parts.domains = vec![scenes::new_domain(0, NORMAL_MAPPED_MATERIAL); linear_parts.len()];
     let scene = Scene::new(parts).expect("expected a valid scene");
     let mut state = SceneState::rest(&scene);
+    // T is 3 x 4 and row-major. Its last column, the translation, is 0.
     for (transform, [a, b, c, d, e, f, g, h, i]) in state.transforms.iter_mut().zip(linear_parts) {
         *transform = Transform([a, b, c, 0.0, d, e, f, 0.0, g, h, i, 0.0]);
     }

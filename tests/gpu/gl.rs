@@ -28,6 +28,7 @@ impl std::fmt::Debug for OwnedBuffer {
 }
 
 impl GlBufferOwner for OwnedBuffer {
+    // The context is always current.
     fn make_current(&self) -> Result<Box<dyn Any>> {
         Ok(Box::new(()))
     }
@@ -61,7 +62,7 @@ impl GlContext {
         buffer
     }
 
-    /// Creates a buffer of at least 16 bytes in which all bits are one.
+    /// Creates a buffer of `bytes` bytes, but at least 16, in which all bits are one.
     pub(crate) fn create_buffer(&self, bytes: u64) -> GlBuffer {
         let ones = vec![u8::MAX; bytes.max(16) as usize];
         // SAFETY: the context is current on this thread, as in all calls below.
@@ -74,7 +75,8 @@ impl GlContext {
         self.buffer_handle(name, ones.len() as u64)
     }
 
-    /// A handle of `bytes` bytes that owns the buffer of this name, which may be unknown to OpenGL.
+    /// A handle with a stated size of `bytes` bytes, which deletes the buffer `name` when dropped. Tests also pass a
+    /// name that is unknown to OpenGL.
     pub(crate) fn buffer_handle(&self, name: u32, bytes: u64) -> GlBuffer {
         GlBuffer { name, bytes, owner: Rc::new(OwnedBuffer { api: Rc::clone(&self.api), name }) }
     }

@@ -1,5 +1,6 @@
 //! CUDA writes vertices into buffers that it shares with OpenGL. Vertices and images equal those of a deformer with
-//! buffers of its own, whose vertices are copied to OpenGL.
+//! buffers of its own, whose vertices are copied to OpenGL. An output is a set of device buffers for the vertices of
+//! one step.
 
 use std::sync::Arc;
 
@@ -98,6 +99,7 @@ fn gpu_frames_of_shared_and_uploaded_buffers_are_equal() {
     );
     let mut sharing_deformer = open_deformer(&device, &scene, Some(shared_scene.vertex_buffers()));
     let bounds = sharing_deformer.deform(&state).expect("expected the step to succeed").bounds;
+    // A camera for a square image also shows the scene in other sizes.
     let params = FrameParams {
         camera: Camera::fit_to_scene(&scene, 64, 64),
         width: 320,

@@ -29,6 +29,7 @@ fn tube(random: &mut Random, columns: u32, rows: u32, rank: usize) -> Shape {
     let mut corners = Corners::default();
     // A row of vertices has two rows of corners: one for the triangles below it, then one for the triangles above it.
     // Where their normals differ, the row is a hard edge. A row of corners has one more column, for the seam.
+    // `is_below`: whether the corner row is for the triangles below the row of vertices.
     for (row, is_below) in (0..rows).flat_map(|row| [(row, true), (row, false)]) {
         let normal_y = if row % 5 == 0 && !is_below { 0.4 } else { 0.0 };
         for column in 0..=columns {
@@ -154,6 +155,7 @@ fn gpu_exact_normals_equal_the_reference() {
         let scene = scene_with_exact_normals(shapes.clone(), options);
         let mut deformer = cuda_deformer(&scene);
         assert!(deformer.plan().kernels.iter().any(|kernel| kernel.name == "normals"));
+        // A ring lists the triangles around a corner. Only exact normals need rings.
         assert!(deformer.plan().bytes(BufferRole::RingTables) > 0);
         let name = format!("normal maps {normal_maps}, rigid transforms {rigid_transforms}");
         assert_equals_reference(&name, &scene, &scenes::random_state(&scene, 5), &mut deformer);
@@ -196,7 +198,7 @@ fn gpu_exact_normals_equal_rigid_ones_without_deformation() {
     assert!(max_angle_degrees(deformed, &rigid_normals(&scene, &state)) > 5.0, "negative control");
 }
 
-/// Bits depend neither on earlier steps nor on the packed position of an instance.
+/// The bits of an instance depend neither on earlier steps nor on the instance's place in the packed arrays.
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_exact_normals_are_unit_and_deterministic() {
@@ -206,7 +208,7 @@ fn gpu_exact_normals_are_unit_and_deterministic() {
         RandomSceneOptions { instances: 3, normal_maps: true, rigid_transforms: false },
     );
     let (mut state, other_state) = (scenes::random_state(&scene, 7), scenes::random_state(&scene, 8));
-    // Domains 1, 3 and 5 are the instances of the tube, of rank 5. They get the same state.
+    // Domains 1, 3 and 5 are the instances of the tube, of rank 5. They get the same q and transform.
     let q = state.q_of(&scene, 1).to_vec();
     for domain in [3, 5] {
         state.transforms[domain] = state.transforms[1];
@@ -255,6 +257,7 @@ fn gpu_seams_share_a_normal_and_hard_edges_stay_hard() {
     for corner_row in 1..23 {
         assert!(have_equal_bits(normal_at(corner_row, 0), normal_at(corner_row, 24)), "corner row {corner_row}");
     }
+    // Between the normals of this corner row and of the next one, at column 5.
     let squared_distance = |corner_row: usize| {
         (0..3).map(|axis| (normal_at(corner_row, 5)[axis] - normal_at(corner_row + 1, 5)[axis]).powi(2)).sum::<f32>()
     };

@@ -1,4 +1,5 @@
-//! Readbacks that run while later steps are computed return the bits of their own step.
+//! Readbacks that run while later steps are computed return the bits of their own step. An output is a set of device
+//! buffers for the vertices of one step. A deformer allocates a second output when a step begins during a readback.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -18,13 +19,15 @@ use crate::scenes::{self, Random};
 /// Number of states per scene.
 const STEPS: usize = 50;
 
-/// Sixty domains: some of several tiles, some of few quads, some without modes.
+/// Sixty domains: some of several tiles of 128 vertices, some of few quads (four consecutive vertices), some without
+/// modes.
 fn mixed_scene(deformation: DeformationSettings) -> Arc<Scene> {
     let mut random = Random(70);
     let mut shapes: Vec<_> = (0..16).map(|index| strip_shape(&mut random, 5 + index % 9, index % 5)).collect();
     shapes.push(scenes::random_shape(&mut random, 900, 33));
     shapes.extend((0..3).map(|index| scenes::random_shape(&mut random, 40 + index, 2)));
-    scene_of_shapes(shapes, 3, deformation, false)
+    let normal_maps = false;
+    scene_of_shapes(shapes, 3, deformation, normal_maps)
 }
 
 /// Sixty domains: the first twenty are transform roots, and each other domain follows one of them.
@@ -33,9 +36,9 @@ fn follower_scene(deformation: DeformationSettings) -> Arc<Scene> {
     let mut parts =
         scenes::parts_of_shapes((0..20).map(|index| strip_shape(&mut random, 5 + 20 * index, index % 3)).collect());
     parts.deformation = deformation;
-    let follow = |index: usize, random: &mut Random| FollowConstraint {
-        parent: index % 20,
-        frame: random.next_similarity(index.is_multiple_of(2)),
+    let follow = |index: usize, random: &mut Random| {
+        let is_mirrored = index.is_multiple_of(2);
+        FollowConstraint { parent: index % 20, frame: random.next_similarity(is_mirrored) }
     };
     let domain = |index: usize| Domain {
         name: format!("domain {index}"),
@@ -46,7 +49,7 @@ fn follower_scene(deformation: DeformationSettings) -> Arc<Scene> {
     Scene::new(parts).expect("expected a valid scene")
 }
 
-/// A random set of domains without duplicates, in ascending order.
+/// A random set of less than a tenth of the domains on average, in ascending order.
 fn random_domains(scene: &Scene, random: &mut Random) -> Vec<u32> {
     let probability = random.next_number().abs() / 10.0;
     (0..scene.domains.len() as u32).filter(|_| random.next_number().abs() < probability).collect()
@@ -111,7 +114,7 @@ impl Reader<'_> {
             let Some((step, readback)) = self.pending.pop_front() else { break };
             let surface = deformer.wait_readback(&readback).expect("expected the readback to complete");
             assert!(equals_without_tangents(&surface, &self.want[step]), "step {step}");
-            // A second wait returns the same memory.
+            // A second wait for the same readback returns the same memory.
             assert!(Arc::ptr_eq(
                 &surface,
                 &deformer.wait_readback(&readback).expect("expected the completed readback")
@@ -309,11 +312,12 @@ fn gpu_second_output_exists_only_for_overlapped_reads() {
     assert_eq!(deformer.outputs(), 1, "with readbacks that complete before the next step");
     let readback = deformer.readback(VertexAttributes::ALL).expect("expected a readback to start");
     deformer.deform(&states[20]).expect("expected the step to succeed");
+    // `surface` has already copied the vertices to the host, so the readback does not read the output.
     assert_eq!(deformer.outputs(), 1, "with a readback of an already copied surface");
     deformer.wait_readback(&readback).expect("expected the completed readback");
     let readback = deformer.readback(VertexAttributes::ALL).expect("expected a readback to start");
     deformer.deform(&states[21]).expect("expected the step to succeed");
-    assert_eq!(deformer.outputs(), 2);
+    assert_eq!(deformer.outputs(), 2, "with a step that begins during a readback");
     deformer.wait_readback(&readback).expect("expected the readback to complete");
 }
 

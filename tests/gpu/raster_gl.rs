@@ -1,5 +1,6 @@
 //! The CUDA rasterizer on OpenGL buffers, compared with the reference rasterizer. A soup is a list of triangles that
-//! are hard to rasterize, with a viewport.
+//! are hard to rasterize, with a viewport. `CudaRasterizer::draw` takes the target of the depth pass, then the target
+//! of the id pass; each may be `None`.
 
 use std::sync::Arc;
 
@@ -32,13 +33,13 @@ impl GpuContext {
         (CudaRasterizer::new(&self.device, geometry).expect("expected a rasterizer"), positions)
     }
 
-    /// The key of each sample: the bits of its depth, then the index of its triangle.
+    /// The key of each sample: the bits of its depth in the upper half, the index of its triangle in the lower half.
     fn draw_ids(&self, rasterizer: &mut CudaRasterizer, viewport: &Viewport, target: &GlBuffer) -> Vec<u64> {
         rasterizer.draw(None, Some((viewport, target))).expect("expected a frame");
         self.gl.read(target, viewport.pixel_count())
     }
 
-    /// The bits of the depth of each sample.
+    /// The bits of the depth of each sample, without culling.
     fn draw_depths(&self, rasterizer: &mut CudaRasterizer, viewport: &Viewport, target: &GlBuffer) -> Vec<u32> {
         rasterizer.draw(Some((viewport, target)), None).expect("expected a frame");
         self.gl.read(target, viewport.pixel_count())
@@ -90,11 +91,12 @@ fn gpu_samples_have_the_bits_of_the_reference() {
         drop(rasterizer);
         drop((positions, id_target, depth_target));
     }
-    // The id pass culls back faces in half of the triangles, the depth pass in none.
+    // The id pass culls the back faces of half of the triangles, the depth pass culls none. So the depths of the two
+    // passes differ at the samples of culled back faces.
     assert!(back_faces > 1000, "control: expected more than 1000 samples of back faces, got {back_faces}");
 }
 
-/// Compares the id pass and the depth pass.
+/// Each image of these cut-outs has the same alpha at all texels. The test compares the id pass and the depth pass.
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_uniform_cut_outs_have_the_bits_of_the_reference() {
@@ -163,7 +165,8 @@ fn gpu_targets_may_be_resized_and_reuse_buffer_names() {
         context.gl.write(id_target, &vec![0_u64; soup.viewport.pixel_count()]);
         assert_eq!(
             count_differences(&context.draw_ids(&mut rasterizer, &soup.viewport, id_target), &soup.rasterize().keys),
-            0
+            0,
+            "alternating targets"
         );
     }
 }

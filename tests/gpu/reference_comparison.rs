@@ -43,6 +43,7 @@ fn gpu_vertices_equal_reference_at_every_size_and_rank() {
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_every_feature_combination_equals_the_reference() {
+    // Each of the eight sets has one bit per feature.
     for (modes, normal_maps, rigid_transforms) in (0..8).map(|set| (set & 1 != 0, set & 2 != 0, set & 4 != 0)) {
         let rank = if modes { 5 } else { 0 };
         let scene = scenes::random_scene(
@@ -132,8 +133,8 @@ fn gpu_bits_do_not_depend_on_history_or_packing() {
         scenes::RandomSceneOptions { instances: 4, normal_maps: true, rigid_transforms: false },
     );
     let (mut state, other_state) = (scenes::random_state(&scene, 20), scenes::random_state(&scene, 21));
-    // Domains 0, 2, 4 and 6 are the instances of the first shape, of rank 37. They get the same state. Their vertices
-    // start at different offsets within thread blocks.
+    // Domains 0, 2, 4 and 6 are the instances of the first shape, of rank 37. They get the same q and transform. Their
+    // vertices start at different offsets within thread blocks.
     let q = state.q_of(&scene, 0).to_vec();
     for domain in [2, 4, 6] {
         state.transforms[domain] = state.transforms[0];

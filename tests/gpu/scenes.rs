@@ -10,7 +10,7 @@ use nalgebra::{Matrix3, Rotation3, Vector3};
 pub(crate) struct Random(pub(crate) u64);
 
 impl Random {
-    /// Uniform in -1 to 1.
+    /// Uniform in -1 to 1: 24 random bits, as a multiple of 2^-23.
     pub(crate) fn next_number(&mut self) -> f32 {
         self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
         let mut z = (self.0 ^ self.0 >> 30).wrapping_mul(0xbf58_476d_1ce4_e5b9);
@@ -46,6 +46,7 @@ impl Random {
 /// vertices.
 pub(crate) fn random_shape(random: &mut Random, vertices: usize, rank: usize) -> Shape {
     let rest_positions = (0..vertices).map(|_| random.next_triple()).collect();
+    // The factor 7 scatters consecutive corners over the vertices.
     let corner_count = vertices + 3;
     let corners = Corners {
         vertices: (0..corner_count).map(|corner| (corner * 7 % vertices) as u32).collect(),
@@ -86,7 +87,7 @@ pub(crate) struct RandomSceneOptions {
     pub(crate) instances: usize,
     /// Whether every other shape has a normal map.
     pub(crate) normal_maps: bool,
-    /// Whether transforms must be rigid.
+    /// Whether the scene permits no shear. Uniform scale and reflection are permitted.
     pub(crate) rigid_transforms: bool,
 }
 
