@@ -8,7 +8,7 @@ use modalcast_model::raster::{AlphaImage, AlphaMaterial, CutOuts};
 use modalcast_model::scene::Viewport;
 use nalgebra::{Matrix3, Vector3};
 
-use crate::common::cut_outs::{alpha_image, floor_soup, sheet_soup, constant_alpha_soups};
+use crate::common::cut_outs::{alpha_image, constant_alpha_soups, floor_soup, sheet_soup};
 use crate::common::soups::{clip_space_viewport, perspective_viewport};
 
 /// Texture coordinates where the ray through a point of the viewport meets the plane of a triangle, in f64. `x` and `y`

@@ -52,7 +52,8 @@ async fn moved_branch_moves_only_itself_and_its_followers() {
     assert_eq!(first_vertex(LEAF as usize), transformed([0.5, 1.0, -0.25]));
     assert_eq!(first_vertex(LEAFLET as usize), transformed([-0.5, 1.5, -0.5]));
     assert!(
-        (1..4).all(|domain| *positions_of(domain) != rest_positions[NUMBERS_PER_DOMAIN * domain..][..NUMBERS_PER_DOMAIN]),
+        (1..4)
+            .all(|domain| *positions_of(domain) != rest_positions[NUMBERS_PER_DOMAIN * domain..][..NUMBERS_PER_DOMAIN]),
         "negative control: the branch and its followers move"
     );
     writer.finish().await;

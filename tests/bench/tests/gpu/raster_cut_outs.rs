@@ -5,7 +5,7 @@
 use modalcast_bench::kernels::{KernelBenchmark as _, RasterBenchmark, RasterMesh};
 use modalcast_compute::gpu::{Device, RasterGranularity, RasterVariant};
 
-use crate::cut_outs::{CutOutSoup, alpha_image, floor_soup, sheet_soup, constant_alpha_soups};
+use crate::cut_outs::{CutOutSoup, alpha_image, constant_alpha_soups, floor_soup, sheet_soup};
 use crate::scenes::Random;
 
 /// Samples may differ if their alpha is closer to the threshold than this tolerance. It exceeds the sum of two errors,
