@@ -76,9 +76,17 @@ pub fn finish(outcome: Outcome) -> u8 {
 
 fn exit_code(error: &Error) -> u8 {
     match error {
-        Error::Invalid { .. } => 3,
-        Error::NotFound { .. } | Error::Gone { .. } => 4,
-        Error::Taken { .. } | Error::Busy { .. } | Error::Unavailable { .. } => 5,
+        Error::Invalid { .. } | Error::InvalidFile { .. } | Error::UnexpectedMessage { .. } => 3,
+        Error::NotFound { .. } | Error::StepPassed { .. } => 4,
+        Error::NameTaken { .. }
+        | Error::LeaseTaken { .. }
+        | Error::LeaseLost { .. }
+        | Error::WindowFull { .. }
+        | Error::Busy { .. }
+        | Error::LimitReached { .. }
+        | Error::SlowReader { .. }
+        | Error::Unavailable { .. }
+        | Error::ShuttingDown => 5,
         Error::Deadline { .. } | Error::Fault { .. } | Error::DeviceLost { .. } => 6,
     }
 }

@@ -25,14 +25,19 @@ pub use output::frame_encoder::{EncodedOutput, FrameEncoder, FrameFormat};
 pub use output::pack::{PackedVertices, VertexSelection, pack_vertices, validate_domains};
 pub use output::pick_result::{PickResult, resolve_picks};
 pub use output::step_output::{FrameOutput, ModalHit, OutputBody, OutputSpec, StepId, StepOutput};
+pub use scene::delivery::Delivery;
 pub use scene::encoded_subscription::EncodedSubscription;
 pub use scene::handle::{SceneHandle, WriterSession};
+pub use scene::lease::{InitialState, LeaseRequest, LeaseToken};
 pub use scene::message::StepSelector;
-pub use scene::step_queue::{Policy, StepReport};
-pub use scene::subscriber::{Delivery, Subscription};
+pub use scene::step_queue::{Overflow, StepReport};
+pub use scene::subscriber::Subscription;
 pub use source::SceneSource;
 pub use storage::scene_catalog::{SceneProvenance, validate_scene_name};
 pub use storage::upload::{Upload, UploadHeader};
+
+#[cfg(test)]
+pub(crate) use testing::lossless_lease;
 
 pub use modalcast_render::{RasterBackend, RasterBackends};
 
@@ -50,6 +55,7 @@ use self::registry::Registry;
 use self::scene::actor::SceneServices;
 use self::scene::handle::OpenParams;
 use self::storage::checkpoint_store::CheckpointStore;
+use self::storage::run_counter::RunCounter;
 use self::storage::scene_catalog::SceneCatalog;
 use crate::config::{Config, ValidatedConfig};
 use modalcast_model::error::{Error, Result, invalid};
@@ -115,16 +121,17 @@ impl Engine {
         open_device: impl FnOnce() -> Result<DeviceContext> + Send + 'static,
     ) -> Result<Self> {
         let state = config.state.clone();
-        let (scene_catalog, checkpoints) = run_blocking("state folder", move || {
+        let (scene_catalog, checkpoints, run_counter) = run_blocking("state folder", move || {
             let scene_catalog = SceneCatalog::open(&state)?;
+            let run_counter = Arc::new(RunCounter::open(&state)?);
             let checkpoints = CheckpointStore::start(scene_catalog.checkpoint_folder())?;
-            Ok((scene_catalog, Arc::new(checkpoints)))
+            Ok((scene_catalog, Arc::new(checkpoints), run_counter))
         })
         .await?;
         let DeviceThread { handle, info, thread: device_thread } =
             DeviceThread::start(config.open_scenes, open_device).await?;
         let shared = Shared {
-            services: SceneServices { device: handle, checkpoints, config: Arc::clone(&config) },
+            services: SceneServices { device: handle, checkpoints, run_counter, config: Arc::clone(&config) },
             registry: Registry::new(config.open_scenes),
             config,
             source,
@@ -167,7 +174,7 @@ impl Engine {
     /// name is already open from the same source, returns the open scene.
     ///
     /// # Errors
-    /// `Taken` when the name belongs to another source, `Busy` when too many scenes are open, and the errors of
+    /// `NameTaken` when the name belongs to another source, `LimitReached` when too many scenes are open, and the errors of
     /// [`SceneSource::open`].
     pub async fn open(&self, source: &str, name: &str) -> Result<Arc<SceneHandle>> {
         let name = if name.is_empty() {
@@ -181,7 +188,7 @@ impl Engine {
     /// The open scene with this name.
     ///
     /// # Errors
-    /// `NotFound` when no open scene has this name, `Unavailable` when the server is shutting down, `DeviceLost`.
+    /// `NotFound` when no open scene has this name, `ShuttingDown` when the server is shutting down, `DeviceLost`.
     pub fn find(&self, name: &str) -> Result<Arc<SceneHandle>> {
         self.check_running()?;
         self.shared.registry.find(name)
@@ -204,8 +211,8 @@ impl Engine {
     /// Begins an upload.
     ///
     /// # Errors
-    /// `Invalid` for a malformed name or entry path and for counts or sizes over the limits; `Taken` when the name is
-    /// in use; `Busy` when too many uploads are in progress; `Fault` of the disk.
+    /// `Invalid` for a malformed name or entry path and for counts or sizes over the limits; `NameTaken` when the name
+    /// is in use; `Busy` when too many uploads are in progress; `Fault` of the disk.
     pub async fn begin_upload(&self, header: UploadHeader) -> Result<Upload> {
         self.check_running()?;
         validate_scene_name(&header.scene)?;
@@ -218,7 +225,7 @@ impl Engine {
             return Err(invalid("header.total_bytes", expected, header.total_bytes));
         }
         self.shared.registry.check_name_free(&header.scene)?;
-        let too_many_uploads = |_| Error::Busy { queue: "list of uploads in progress", limit: MAX_CONCURRENT_UPLOADS };
+        let too_many_uploads = |_| Error::Busy { queue: "queue of uploads", limit: MAX_CONCURRENT_UPLOADS };
         let permit = Arc::clone(&self.shared.upload_permits).try_acquire_owned().map_err(too_many_uploads)?;
         let upload_folder = config.state.join("uploads");
         run_blocking("upload", move || Upload::begin(&upload_folder, header, permit)).await
@@ -227,7 +234,7 @@ impl Engine {
     /// Opens a complete upload as a scene. On failure the uploaded files are removed.
     ///
     /// # Errors
-    /// `Invalid` naming the missing or malformed file; `Taken` when another scene was opened under the name since
+    /// `Invalid` naming the missing or malformed file; `NameTaken` when another scene was opened under the name since
     /// [`Self::begin_upload`].
     pub async fn finish_upload(&self, upload: Upload) -> Result<Arc<SceneHandle>> {
         let check_upload = move || match upload.check_complete() {
@@ -254,14 +261,14 @@ impl Engine {
         tokio::spawn(work).await.map_err(modalcast_model::error::fault_in("close"))?
     }
 
-    /// Ends every stream with `Unavailable`, writes outstanding checkpoints, joins the device thread and releases the
+    /// Ends every stream with `ShuttingDown`, writes outstanding checkpoints, joins the device thread and releases the
     /// state folder.
     pub async fn shutdown(&self) {
         if self.shared.is_stopping.swap(true, Ordering::AcqRel) {
             return;
         }
         for scene_handle in self.list() {
-            scene_handle.stop(server_stopping_error()).await;
+            scene_handle.stop(Error::ShuttingDown).await;
         }
         let engine = self.clone();
         let stop_threads = move || {
@@ -289,10 +296,10 @@ impl Engine {
     }
 
     /// # Errors
-    /// `Unavailable` when the server is shutting down, `DeviceLost`.
+    /// `ShuttingDown`, `DeviceLost`.
     fn check_running(&self) -> Result<()> {
         if self.is_stopping() {
-            return Err(server_stopping_error());
+            return Err(Error::ShuttingDown);
         }
         self.shared.services.device.loss().error().map_or(Ok(()), Err)
     }
@@ -369,6 +376,9 @@ impl Engine {
             tracing::warn!(scene = name, %error, "the checkpoint could not be loaded; the scene starts at rest");
             None
         });
+        if let Some(state) = &restored_state {
+            self.shared.services.run_counter.continue_after(state.run);
+        }
         let id = self.shared.next_scene_id.fetch_add(1, Ordering::Relaxed);
         let params = OpenParams {
             name: name.into(),
@@ -412,7 +422,7 @@ impl Engine {
         provenance: &SceneProvenance,
         upload: Option<Upload>,
     ) -> Result<OpenedScene> {
-        let semaphore_closed = |_| server_stopping_error();
+        let semaphore_closed = |_| Error::ShuttingDown;
         let _permit = self.shared.load_permits.acquire().await.map_err(semaphore_closed)?;
         let source = Arc::clone(&self.shared.source);
         let upload_folder = self.shared.scene_catalog.upload_folder(name);
@@ -428,7 +438,7 @@ impl Engine {
                 source.open_within(&upload_folder, &entry)
             }
         };
-        run_blocking("load", read).await
+        run_blocking("load", || read().map_err(Error::into_file_error)).await
     }
 
     /// Stops a scene and removes its checkpoint, its uploaded files, its catalog entry and its name.
@@ -461,11 +471,6 @@ impl Engine {
 
 fn scene_not_open(name: &str) -> Error {
     Error::NotFound { what: "scene", given: format!("'{name}'") }
-}
-
-fn server_stopping_error() -> Error {
-    let remedy = "Try again when it is running again".into();
-    Error::Unavailable { what: "server", reason: "it is shutting down".into(), remedy }
 }
 
 #[cfg(test)]
@@ -512,7 +517,7 @@ mod tests {
     }
 
     async fn acquire_writer(scene_handle: &SceneHandle) -> WriterSession {
-        scene_handle.drive("test".into(), Policy::Lossless, 4).await.expect("expected the writer lease")
+        scene_handle.drive("test", lossless_lease(4)).await.expect("expected the writer lease")
     }
 
     fn is_done(report: &Result<StepReport>) -> bool {
@@ -530,7 +535,7 @@ mod tests {
         assert!(is_done(&send_step(&mut faulty_writer, 1, 0.25).await));
         assert!(is_done(&send_step(&mut control_writer, 1, 0.25).await));
         await_within_limit(subscription.next()).await.expect("control: expected the first step");
-        let request = faulty_scene.request_output(StepSelector::Exact(99), POSITIONS);
+        let request = faulty_scene.request_output(StepSelector::Exact { run: 0, number: 99 }, POSITIONS);
         let (output, ()) = await_within_limit(async { tokio::join!(request, faulty_scene.inject_panic()) }).await;
 
         let is_panic = |error: &Error| matches!(error, Error::Fault { reason, .. } if reason.contains("panicked"));

@@ -60,7 +60,7 @@ impl Registry {
     /// `must_be_new` an existing reservation is an error. The call ends with [`Self::release`].
     ///
     /// # Errors
-    /// `Taken` when the name is reserved for another provenance, `Busy` when too many scenes are open.
+    /// `NameTaken` when the name is reserved for another provenance, `LimitReached` when too many scenes are open.
     pub(super) fn reserve(
         &self,
         name: &str,
@@ -78,7 +78,7 @@ impl Registry {
             };
         }
         if entries.len() >= self.max_scenes {
-            return Err(Error::Busy { queue: "list of open scenes", limit: self.max_scenes });
+            return Err(Error::LimitReached { objects: "open scenes", limit: self.max_scenes });
         }
         let entry = Arc::new(RegistryEntry {
             provenance: provenance.clone(),
@@ -90,7 +90,7 @@ impl Registry {
     }
 
     /// # Errors
-    /// `Taken` when the name is reserved.
+    /// `NameTaken` when the name is reserved.
     pub(super) fn check_name_free(&self, name: &str) -> Result<()> {
         self.lock().get(name).map_or(Ok(()), |entry| Err(name_taken_error(name, entry)))
     }
@@ -150,5 +150,5 @@ impl Registry {
 }
 
 fn name_taken_error(name: &str, entry: &RegistryEntry) -> Error {
-    Error::Taken { what: "scene name", holder: format!("'{name}' belongs to '{}'", entry.provenance.label()) }
+    Error::NameTaken { name: name.into(), owner: entry.provenance.label() }
 }

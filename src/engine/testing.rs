@@ -3,6 +3,9 @@
 use std::path::Path;
 use std::sync::Arc;
 
+use super::scene::delivery::Delivery;
+use super::scene::lease::{InitialState, LeaseRequest};
+use super::scene::step_queue::Overflow;
 use super::source::SceneSource;
 use modalcast_compute::reference::ReferenceDeformer;
 use modalcast_model::backend_settings::BackendSettings;
@@ -126,5 +129,17 @@ impl SceneSource for StripsSource {
 
     fn list(&self) -> Vec<String> {
         vec!["strips".into()]
+    }
+}
+
+/// A request for the lease of a lossless writer.
+pub(crate) const fn lossless_lease(window: u32) -> LeaseRequest {
+    LeaseRequest {
+        delivery: Delivery::Lossless,
+        overflow: Overflow::Block,
+        window,
+        token: None,
+        takes_over: false,
+        initial_state: InitialState::Keep,
     }
 }

@@ -5,27 +5,52 @@
 /// The error type of the server.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum Error {
-    /// The caller sent an invalid value.
+    /// The caller sent an invalid value. `field` is its path in the request, such as `step.q_domains[1]`, or its place
+    /// in a file.
     #[error("{field}: expected {expected}, got {given}")]
     Invalid { field: String, expected: String, given: String },
+    /// A file of a scene has invalid content. `location` names the file and the place in it.
+    #[error("{location}: expected {expected}, got {given}")]
+    InvalidFile { location: String, expected: String, given: String },
+    /// A message arrived that is not allowed at this point of its stream.
+    #[error("unexpected message: expected {expected}, got {given}")]
+    UnexpectedMessage { expected: &'static str, given: &'static str },
     /// The caller named an object that does not exist.
     #[error("{what} not found: {given}")]
     NotFound { what: &'static str, given: String },
-    /// Another client uses the resource. A later attempt may succeed.
-    #[error("{what} is in use: {holder}")]
-    Taken { what: &'static str, holder: String },
+    /// Another scene has the name. `owner` is the source of that scene.
+    #[error("the scene name '{name}' belongs to '{owner}'")]
+    NameTaken { name: String, owner: String },
+    /// Another writer holds the lease of the scene.
+    #[error("the writer lease is held by run {run} since {seconds} s")]
+    LeaseTaken { run: u64, seconds: u64 },
+    /// The writer with this run has taken over the lease.
+    #[error("the writer of run {run} has taken over the lease")]
+    LeaseLost { run: u64 },
     /// The requested step has already been superseded.
-    #[error("{what}: expected {expected}, got {given}")]
-    Gone { what: &'static str, expected: String, given: String },
+    #[error("{field}: expected {expected}, got {given}")]
+    StepPassed { field: &'static str, expected: String, given: String },
+    /// Too many steps of a step stream are unacknowledged.
+    #[error("the window is full: expected at most {limit} steps without acknowledgement, got {given}")]
+    WindowFull { limit: usize, given: usize },
     /// A queue is full. A later attempt may succeed.
     #[error("{queue} is full ({limit})")]
     Busy { queue: &'static str, limit: usize },
+    /// As many objects exist as the configuration allows.
+    #[error("at most {limit} {objects} are allowed")]
+    LimitReached { objects: &'static str, limit: usize },
+    /// The caller has not read its replies in time.
+    #[error("{queue} is full ({limit}), because the client does not read it")]
+    SlowReader { queue: &'static str, limit: usize },
     /// The caller's deadline expired before the result was available.
     #[error("{what}: expected within {ms} ms, got none")]
     Deadline { what: String, ms: u64 },
     /// A resource or program is missing; the operator must install, mount or free it.
     #[error("{what} is not available: {reason}. {remedy}")]
     Unavailable { what: &'static str, reason: String, remedy: String },
+    /// The server is shutting down.
+    #[error("the server is shutting down. Try again when it is running again")]
+    ShuttingDown,
     /// An internal error, or a failure of the device or a library.
     #[error("{stage} failed: {reason}")]
     Fault { stage: &'static str, reason: String },
@@ -54,6 +79,26 @@ pub fn fault_in<E: std::fmt::Display>(stage: &'static str) -> impl Fn(E) -> Erro
 }
 
 impl Error {
+    /// Converts an [`Error::Invalid`] of a loader, whose field is a place in a file, to an [`Error::InvalidFile`]. Other
+    /// variants remain unchanged.
+    pub fn into_file_error(self) -> Self {
+        match self {
+            Self::Invalid { field: location, expected, given } => Self::InvalidFile { location, expected, given },
+            other => other,
+        }
+    }
+
+    /// Prefixes the field of an [`Error::Invalid`] with the path of the message that contains it: `near` becomes
+    /// `camera.near`. Other variants remain unchanged.
+    pub fn in_message(self, path: &str) -> Self {
+        match self {
+            Self::Invalid { field, expected, given } => {
+                Self::Invalid { field: format!("{path}.{field}"), expected, given }
+            }
+            other => other,
+        }
+    }
+
     /// Prefixes the field of an [`Error::Invalid`] with its location, such as a file, so that the message contains the
     /// whole path. Other variants remain unchanged.
     pub fn prefix_field(self, location: &str) -> Self {

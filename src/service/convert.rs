@@ -4,7 +4,8 @@
 use modalcast_proto::v1;
 
 use crate::engine::{
-    self, Delivery, Engine, FrameFormat, OutputSpec, Policy, RasterBackend, SceneHandle, StepId, StepSelector,
+    self, Delivery, Engine, FrameFormat, InitialState, LeaseRequest, LeaseToken, OutputSpec, Overflow, RasterBackend,
+    SceneHandle, StepId, StepSelector, WriterSession,
 };
 use crate::telemetry::StageTimes;
 use modalcast_model::error::{Result, invalid};
@@ -107,28 +108,65 @@ pub(super) fn parse_step(step: v1::Step) -> Result<RawStepUpdate> {
     })
 }
 
-/// Parses a policy; unspecified means lossless.
-pub(super) fn parse_policy(number: i32) -> Result<Policy> {
-    match v1::Policy::try_from(number) {
-        Ok(v1::Policy::Unspecified | v1::Policy::Lossless) => Ok(Policy::Lossless),
-        Ok(v1::Policy::Latest) => Ok(Policy::Latest),
-        Err(_) => Err(invalid("open.policy", "a policy of this version", number)),
-    }
-}
-
-pub(super) const fn wire_policy(policy: Policy) -> v1::Policy {
-    match policy {
-        Policy::Lossless => v1::Policy::Lossless,
-        Policy::Latest => v1::Policy::Latest,
-    }
-}
-
-/// Parses a delivery; unspecified means latest.
-pub(super) fn parse_delivery(number: i32) -> Result<Delivery> {
+/// Parses the delivery of a stream, which must be named.
+pub(super) fn parse_delivery(field: &str, number: i32) -> Result<Delivery> {
     match v1::Delivery::try_from(number) {
         Ok(v1::Delivery::Lossless) => Ok(Delivery::Lossless),
-        Ok(v1::Delivery::Unspecified | v1::Delivery::Latest) => Ok(Delivery::Latest),
-        Err(_) => Err(invalid("delivery", "a delivery of this version", number)),
+        Ok(v1::Delivery::Latest) => Ok(Delivery::Latest),
+        Ok(v1::Delivery::Unspecified) => {
+            let expected = "DELIVERY_LOSSLESS (every step) or DELIVERY_LATEST (the newest step)";
+            Err(invalid(field, expected, "DELIVERY_UNSPECIFIED"))
+        }
+        Err(_) => Err(invalid(field, "a delivery of this version", number)),
+    }
+}
+
+/// Parses the request of a writer for the lease of a scene. A window of 0 means `default_window`.
+pub(super) fn parse_lease_request(open: &v1::OpenDrive, default_window: u32) -> Result<LeaseRequest> {
+    let overflow = match v1::Overflow::try_from(open.overflow) {
+        Ok(v1::Overflow::Unspecified | v1::Overflow::Block) => Overflow::Block,
+        Ok(v1::Overflow::Reject) => Overflow::Reject,
+        Err(_) => return Err(invalid("open.overflow", "an overflow of this version", open.overflow)),
+    };
+    let initial_state = match v1::InitialState::try_from(open.initial_state) {
+        Ok(v1::InitialState::Unspecified | v1::InitialState::Keep) => InitialState::Keep,
+        Ok(v1::InitialState::Reset) => InitialState::Reset,
+        Err(_) => return Err(invalid("open.initial_state", "an initial state of this version", open.initial_state)),
+    };
+    let is_token_given = !open.lease_token.is_empty();
+    let token = is_token_given.then(|| LeaseToken::parse("open.lease_token", &open.lease_token)).transpose()?;
+    Ok(LeaseRequest {
+        delivery: parse_delivery("open.delivery", open.delivery)?,
+        overflow,
+        window: if open.window == 0 { default_window } else { open.window },
+        token,
+        takes_over: open.take_over,
+        initial_state,
+    })
+}
+
+/// The reply to a writer that has acquired the lease: the settings in effect.
+pub(super) fn wire_opened(writer: &WriterSession, request: &LeaseRequest, scene_handle: &SceneHandle) -> v1::Opened {
+    let delivery = match request.delivery {
+        Delivery::Lossless => v1::Delivery::Lossless,
+        Delivery::Latest => v1::Delivery::Latest,
+    };
+    let overflow = match request.overflow {
+        Overflow::Block => v1::Overflow::Block,
+        Overflow::Reject => v1::Overflow::Reject,
+    };
+    let initial_state = match request.initial_state {
+        InitialState::Keep => v1::InitialState::Keep,
+        InitialState::Reset => v1::InitialState::Reset,
+    };
+    v1::Opened {
+        run: writer.run,
+        delivery: delivery.into(),
+        overflow: overflow.into(),
+        window: writer.window,
+        lease_token: writer.token.as_bytes().to_vec().into(),
+        initial_state: initial_state.into(),
+        scene: Some(wire_scene_info(scene_handle)),
     }
 }
 
@@ -147,12 +185,12 @@ pub(super) fn parse_picture(
     let max_side = engine.frame_side();
     if !(1..=max_side).contains(&width) || !(1..=max_side).contains(&height) {
         let expected = format!("1 to {max_side} pixels per side, or 0 x 0 for 1280 x 720");
-        return Err(invalid("picture.size", expected, format!("{width} x {height}")));
+        return Err(invalid("picture.width", expected, format!("{width} x {height}")));
     }
     let fit_to_scene = Camera::fit_to_scene(scene, width, height);
     let camera = match picture.camera {
         None => fit_to_scene,
-        Some(camera) => camera::parse_camera(fit_to_scene, camera).map_err(|error| error.prefix_field("picture"))?,
+        Some(camera) => camera::parse_camera(fit_to_scene, camera).map_err(|error| error.in_message("picture"))?,
     };
     Ok((OutputSpec::Frame { camera, size: FrameSize::new(width, height), frame_output }, format))
 }
@@ -187,30 +225,22 @@ pub(super) const fn wire_format(format: FrameFormat) -> v1::Format {
     }
 }
 
-/// Converts the optional `step` of a request to a [`StepSelector`]. A macro, because each request has its own `Step`
-/// type.
-macro_rules! step_selector_from {
-    ($($step:path),+) => {$(
-        impl From<Option<$step>> for StepSelector {
-            fn from(step: Option<$step>) -> Self {
-                use $step as Step;
-                match step {
-                    None => Self::Current,
-                    Some(Step::ExactStep(number)) => Self::Exact(number),
-                    Some(Step::MinimumStep(number)) => Self::Minimum(number),
-                }
-            }
-        }
-    )+};
+/// Converts the optional step of a single request.
+pub(super) const fn parse_step_selector(selector: Option<v1::StepSelector>) -> StepSelector {
+    use v1::step_selector::Number;
+    match selector {
+        Some(v1::StepSelector { run, number: Some(Number::Exact(number)) }) => StepSelector::Exact { run, number },
+        Some(v1::StepSelector { run, number: Some(Number::Minimum(number)) }) => StepSelector::Minimum { run, number },
+        Some(v1::StepSelector { number: None, .. }) | None => StepSelector::Current,
+    }
 }
-step_selector_from!(v1::pick_request::Step, v1::render_frame_request::Step, v1::get_vertices_request::Step);
 
 /// Describes the requested step, for errors.
 pub(super) fn describe_step_selector(selector: StepSelector, scene: &str) -> String {
     match selector {
         StepSelector::Current => format!("the current step of scene '{scene}'"),
-        StepSelector::Exact(number) => format!("step {number} of scene '{scene}'"),
-        StepSelector::Minimum(number) => format!("step {number} or later of scene '{scene}'"),
+        StepSelector::Exact { number, .. } => format!("step {number} of scene '{scene}'"),
+        StepSelector::Minimum { number, .. } => format!("step {number} or later of scene '{scene}'"),
     }
 }
 

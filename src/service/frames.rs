@@ -5,12 +5,13 @@ use modalcast_proto::v1;
 use tonic::{Request, Response, Status};
 
 use super::convert::{
-    describe_step_selector, parse_delivery, parse_picture, wire_format, wire_raster_backend, wire_stages, wire_step_id,
+    describe_step_selector, parse_delivery, parse_picture, parse_step_selector, wire_format, wire_raster_backend,
+    wire_stages, wire_step_id,
 };
 use super::picks;
 use super::status::to_status;
 use super::stream::{Deadline, ReplySender, ReplyStream, chunks_with_head, respond};
-use crate::engine::{EncodedOutput, EncodedSubscription, Engine, FrameFormat, OutputSpec, StepSelector};
+use crate::engine::{EncodedOutput, EncodedSubscription, Engine, FrameFormat, OutputSpec};
 
 /// Implementation of `FrameService`.
 pub(super) struct FrameServiceImpl(pub(super) Engine);
@@ -28,7 +29,7 @@ impl v1::frame_service_server::FrameService for FrameServiceImpl {
         let request = request.into_inner();
         let scene_handle = self.0.find(&request.scene).map_err(to_status)?;
         let (output_spec, format) = parse_picture(&self.0, &scene_handle.scene, request.picture).map_err(to_status)?;
-        let selector = StepSelector::from(request.step);
+        let selector = parse_step_selector(request.step);
         let (max_chunk_bytes, encoder) = (config.chunk_bytes, self.0.encoder().clone());
         Ok(respond(move |reply_sender| async move {
             let work = async {
@@ -61,7 +62,7 @@ impl v1::frame_service_server::FrameService for FrameServiceImpl {
         let request = request.into_inner();
         let scene_handle = self.0.find(&request.scene).map_err(to_status)?;
         let (output_spec, format) = parse_picture(&self.0, &scene_handle.scene, request.picture).map_err(to_status)?;
-        let delivery = parse_delivery(request.delivery).map_err(to_status)?;
+        let delivery = parse_delivery("delivery", request.delivery).map_err(to_status)?;
         // Subscribe before the response headers are sent, so that a client can rely on receiving the next step.
         let subscription = scene_handle.subscribe(output_spec, delivery).await.map_err(to_status)?;
         let frames = EncodedSubscription::new(subscription, self.0.encoder().clone(), format, request.frames);

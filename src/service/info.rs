@@ -3,6 +3,7 @@
 use modalcast_proto::v1;
 use tonic::{Request, Response, Status};
 
+use super::connection::MAX_DRIVES;
 use crate::engine::Engine;
 
 /// Implementation of `ServerService`.
@@ -27,6 +28,7 @@ impl v1::server_service_server::ServerService for ServerServiceImpl {
             window: config.max_window,
             upload_bytes: config.upload_bytes,
             deadline_ms: u32::try_from(config.deadline.as_millis()).unwrap_or(u32::MAX),
+            drives: MAX_DRIVES as u32,
         };
         Ok(Response::new(v1::GetServerInfoResponse {
             version: env!("CARGO_PKG_VERSION").into(),

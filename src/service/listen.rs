@@ -3,7 +3,6 @@
 //! out.
 
 use std::io;
-use std::net::SocketAddr;
 use std::pin::Pin;
 use std::sync::Arc;
 use std::task::{Context, Poll};
@@ -13,7 +12,9 @@ use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
 use tokio_stream::wrappers::ReceiverStream;
-use tonic::transport::server::{Connected, TcpConnectInfo};
+use tonic::transport::server::Connected;
+
+use super::connection::ConnectionInfo;
 
 /// Maximum number of connections that have sent their first byte and are queued for the server. Further connections
 /// wait until the queue has capacity.
@@ -26,7 +27,7 @@ const ACCEPT_RETRY_DELAY: Duration = Duration::from_millis(50);
 #[derive(Debug)]
 pub(super) struct Connection {
     stream: TcpStream,
-    remote: SocketAddr,
+    info: ConnectionInfo,
     /// Counts against the limit on connections until the connection is dropped.
     _permit: OwnedSemaphorePermit,
 }
@@ -64,7 +65,7 @@ async fn accept(listener: &TcpListener, permits: &Arc<Semaphore>) -> io::Result<
     let permit = Arc::clone(permits).acquire_owned().await.map_err(io::Error::other)?;
     let (stream, remote) = listener.accept().await?;
     stream.set_nodelay(true)?;
-    Ok(Connection { stream, remote, _permit: permit })
+    Ok(Connection { stream, info: ConnectionInfo::new(remote), _permit: permit })
 }
 
 /// Forwards a connection once it has sent its first byte. Drops it if it sends nothing within `first_byte_timeout`.
@@ -81,10 +82,10 @@ async fn await_first_byte(
 }
 
 impl Connected for Connection {
-    type ConnectInfo = TcpConnectInfo;
+    type ConnectInfo = ConnectionInfo;
 
-    fn connect_info(&self) -> TcpConnectInfo {
-        TcpConnectInfo { local_addr: self.stream.local_addr().ok(), remote_addr: Some(self.remote) }
+    fn connect_info(&self) -> ConnectionInfo {
+        self.info.clone()
     }
 }
 

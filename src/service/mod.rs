@@ -1,6 +1,7 @@
 //! The gRPC services, which translate between wire messages and engine types. This is the only module that uses the
 //! protobuf types.
 
+mod connection;
 mod convert;
 mod describe;
 mod frames;
@@ -160,7 +161,7 @@ mod tests {
     use tonic_health::pb::health_client::HealthClient;
 
     use super::*;
-    use crate::engine::Policy;
+    use crate::engine::lossless_lease;
 
     async fn check_health(client: &mut HealthClient<Channel>) -> i32 {
         let request = HealthCheckRequest { service: String::new() };
@@ -184,8 +185,7 @@ mod tests {
         let mut client = HealthClient::new(endpoint.connect().await.expect("expected a connection"));
         assert_eq!(check_health(&mut client).await, ServingStatus::Serving as i32);
         let scene_handle = engine.find("strips").expect("expected an open scene");
-        let mut writer =
-            scene_handle.drive("test".into(), Policy::Lossless, 4).await.expect("expected the writer lease");
+        let mut writer = scene_handle.drive("test", lossless_lease(4)).await.expect("expected the writer lease");
         writer.push_step(&step).expect("expected an accepted step");
         let wait_for_not_serving = async {
             while check_health(&mut client).await != ServingStatus::NotServing as i32 {

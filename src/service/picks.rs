@@ -4,10 +4,10 @@ use bytes::Bytes;
 use modalcast_proto::v1;
 use tonic::Status;
 
-use super::convert::{describe_step_selector, parse_pick, wire_stages, wire_step_id};
+use super::convert::{describe_step_selector, parse_pick, parse_step_selector, wire_stages, wire_step_id};
 use super::status::to_status;
 use super::stream::{Deadline, ReplyStream, respond};
-use crate::engine::{Engine, ModalHit, PickResult, StepSelector, resolve_picks};
+use crate::engine::{Engine, ModalHit, PickResult, resolve_picks};
 use modalcast_model::scene::Scene;
 
 /// Upper bound on the encoded size of a hit without its modes, in bytes.
@@ -21,7 +21,7 @@ pub(super) fn respond_to_pick(
 ) -> Result<tonic::Response<ReplyStream<v1::PickResponse>>, Status> {
     let scene_handle = engine.find(&request.scene).map_err(to_status)?;
     let output_spec = parse_pick(engine, &scene_handle.scene, &request).map_err(to_status)?;
-    let selector = StepSelector::from(request.step);
+    let selector = parse_step_selector(request.step);
     let max_chunk_bytes = engine.config().chunk_bytes;
     Ok(respond(move |reply_sender| async move {
         let work = async {

@@ -12,7 +12,7 @@ use super::describe;
 use super::status::{to_status, transport_status};
 use super::stream::{ReplyStream, catch_panic};
 use crate::engine::{Engine, Upload};
-use modalcast_model::error::{Error, Result, fault_in, invalid};
+use modalcast_model::error::{Error, Result, fault_in};
 
 /// Limit in bytes on the source names in one list.
 const MAX_SOURCE_BYTES: usize = 512 << 10;
@@ -50,7 +50,12 @@ impl v1::scene_service_server::SceneService for SceneServiceImpl {
             }
             return Err(error_status);
         }
-        let upload = upload.ok_or_else(|| to_status(invalid("part", "a header as the first part", "nothing")))?;
+        let upload = upload.ok_or_else(|| {
+            to_status(Error::UnexpectedMessage {
+                expected: "a header as the first part",
+                given: "the end of the stream",
+            })
+        })?;
         let engine = self.0.clone();
         catch_panic(async move {
             let scene_handle = engine.finish_upload(upload).await?;
@@ -147,7 +152,9 @@ async fn receive_parts(
         budget.wait(parts.message()).await?.map_err(|status| transport_status(status, max_message_bytes))?
     {
         budget.refill(request.encoded_len());
-        let part = request.part.ok_or_else(|| to_status(invalid("part", "header, file or chunk", "none")))?;
+        let part = request.part.ok_or_else(|| {
+            to_status(Error::UnexpectedMessage { expected: "header, file or chunk", given: "an empty message" })
+        })?;
         *upload = Some(receive_part(engine, upload.take(), part).await.map_err(to_status)?);
     }
     Ok(())
@@ -157,14 +164,18 @@ async fn receive_parts(
 async fn receive_part(engine: &Engine, upload: Option<Upload>, part: Part) -> Result<Upload> {
     let (mut upload, part) = match (upload, part) {
         (None, Part::Header(header)) => return engine.begin_upload(parse_upload_header(header)).await,
-        (None, _) => return Err(invalid("part", "a header as the first part", "a file or chunk")),
+        (None, _) => {
+            return Err(Error::UnexpectedMessage { expected: "a header as the first part", given: "a file or chunk" });
+        }
         (Some(upload), part) => (upload, part),
     };
     let process_part = move || {
         let result = match part {
             Part::File(file) => upload.begin_file(&file.path, file.bytes, &file.sha256),
             Part::Chunk(bytes) => upload.write_chunk(&bytes),
-            Part::Header(_) => Err(invalid("part", "one header per upload", "a second header")),
+            Part::Header(_) => {
+                Err(Error::UnexpectedMessage { expected: "one header per upload", given: "a second header" })
+            }
         };
         match result {
             Ok(()) => Ok(upload),

@@ -1,15 +1,27 @@
-//! Converts errors to gRPC statuses and to rejections. The details of a status contain the serialized `Rejection` of
-//! the same error.
+//! Converts errors to gRPC statuses with the details of `google.rpc`, and to rejections on streams. Both carry the same
+//! reason, field and texts.
 
-use modalcast_proto::v1::Rejection;
-use prost::Message as _;
+use std::collections::HashMap;
+use std::time::Duration;
+
+use modalcast_proto::v1::{Reason, Rejection};
 use tonic::{Code, Status};
+use tonic_types::{ErrorDetails, StatusExt as _};
 
 use modalcast_model::error::Error;
 
 /// Limit in characters on each text of a rejection. Clients control parts of the text, and statuses are sent in HTTP/2
 /// headers.
-const MAX_TEXT_CHARS: usize = 512;
+const MAX_TEXT_CHARS: usize = 256;
+
+/// `ErrorInfo.domain` of all errors of this server.
+const ERROR_DOMAIN: &str = "modalcast";
+
+/// `RetryInfo` of a full queue. The queues of a scene are emptied at every step or frame.
+const QUEUE_RETRY_DELAY: Duration = Duration::from_millis(100);
+
+/// `RetryInfo` while the server shuts down, which includes the time of a restart.
+const RESTART_RETRY_DELAY: Duration = Duration::from_secs(5);
 
 fn truncate_text(text: String) -> String {
     match text.char_indices().nth(MAX_TEXT_CHARS) {
@@ -18,37 +30,137 @@ fn truncate_text(text: String) -> String {
     }
 }
 
-/// Converts an error to a rejection. `step` is the number of the rejected step, if any.
+/// Everything that a client learns about an error.
+struct ErrorReport {
+    code: Code,
+    reason: Reason,
+    /// Path of the invalid field. Empty if no field is invalid.
+    field: String,
+    expected: String,
+    given: String,
+    /// Metadata besides `expected` and `given`; the comment of the reason in `errors.proto` names the keys.
+    metadata: Vec<(&'static str, String)>,
+    retry_delay: Option<Duration>,
+}
+
+impl ErrorReport {
+    fn new(code: Code, reason: Reason, expected: impl Into<String>, given: impl Into<String>) -> Self {
+        let (expected, given) = (expected.into(), given.into());
+        Self { code, reason, field: String::new(), expected, given, metadata: Vec::new(), retry_delay: None }
+    }
+
+    fn with_field(self, field: impl Into<String>) -> Self {
+        Self { field: field.into(), ..self }
+    }
+
+    fn with_metadata<const N: usize>(self, metadata: [(&'static str, String); N]) -> Self {
+        Self { metadata: metadata.into(), ..self }
+    }
+
+    fn of(error: &Error) -> Self {
+        // No wildcard, so that a new error variant requires a decision here.
+        match error.clone() {
+            Error::Invalid { field, expected, given } => {
+                Self::new(Code::InvalidArgument, Reason::InvalidField, expected, given).with_field(field)
+            }
+            Error::InvalidFile { location, expected, given } => {
+                Self::new(Code::InvalidArgument, Reason::InvalidFile, expected, given)
+                    .with_metadata([("location", location)])
+            }
+            Error::UnexpectedMessage { expected, given } => {
+                Self::new(Code::InvalidArgument, Reason::UnexpectedMessage, expected, given)
+            }
+            Error::NotFound { what, given } => {
+                Self::new(Code::NotFound, Reason::SceneNotFound, format!("an existing {what}"), given)
+            }
+            Error::NameTaken { name, owner } => {
+                let given = format!("'{name}', which belongs to '{owner}'");
+                Self::new(Code::AlreadyExists, Reason::SceneNameTaken, "a free scene name", given)
+            }
+            Error::LeaseTaken { run, seconds } => {
+                let given = format!("the lease of run {run}, held for {seconds} s");
+                Self::new(Code::AlreadyExists, Reason::WriterLeaseTaken, "a free writer lease", given)
+            }
+            Error::LeaseLost { run } => {
+                let given = format!("the lease of run {run}");
+                Self::new(Code::Aborted, Reason::LeaseLost, "the lease of this stream", given)
+            }
+            Error::StepPassed { field, expected, given } => {
+                Self::new(Code::FailedPrecondition, Reason::StepPassed, expected, given).with_field(field)
+            }
+            Error::WindowFull { limit, given } => {
+                let expected = format!("at most {limit} steps without acknowledgement");
+                Self::new(Code::ResourceExhausted, Reason::WindowFull, expected, given.to_string())
+            }
+            Error::Busy { queue, limit } => {
+                let report = Self::new(Code::ResourceExhausted, Reason::QueueFull, "capacity", "a full queue")
+                    .with_metadata([("queue", queue.into()), ("limit", limit.to_string())]);
+                Self { retry_delay: Some(QUEUE_RETRY_DELAY), ..report }
+            }
+            Error::LimitReached { objects, limit } => {
+                let expected = format!("at most {limit} {objects}");
+                Self::new(Code::ResourceExhausted, Reason::LimitReached, expected, "one more")
+                    .with_metadata([("object", objects.into()), ("limit", limit.to_string())])
+            }
+            Error::SlowReader { queue, limit } => Self::new(
+                Code::ResourceExhausted,
+                Reason::SlowReader,
+                "a client that reads its replies",
+                "a full queue",
+            )
+            .with_metadata([("queue", queue.into()), ("limit", limit.to_string())]),
+            Error::Deadline { what, ms } => {
+                let expected = format!("{what} within {ms} ms");
+                Self::new(Code::DeadlineExceeded, Reason::DeadlineExpired, expected, "no reply in time")
+            }
+            Error::Unavailable { what, reason, remedy } => {
+                Self::new(Code::Unavailable, Reason::ResourceMissing, what, reason).with_metadata([("remedy", remedy)])
+            }
+            Error::ShuttingDown => {
+                let report = Self::new(Code::Unavailable, Reason::ShuttingDown, "a running server", "a shutdown");
+                Self { retry_delay: Some(RESTART_RETRY_DELAY), ..report }
+            }
+            Error::DeviceLost { stage, reason } => {
+                let given = format!("{stage}: {reason}");
+                Self::new(Code::Unavailable, Reason::DeviceLost, "a restart of the server", given)
+            }
+            Error::Fault { stage, reason } => {
+                Self::new(Code::Internal, Reason::Internal, "no internal error", format!("{stage}: {reason}"))
+            }
+        }
+    }
+
+    fn into_status(self, message: String) -> Status {
+        let texts = [("expected", self.expected), ("given", self.given)].into_iter().chain(self.metadata);
+        let metadata: HashMap<String, String> =
+            texts.map(|(key, text)| (key.to_owned(), truncate_text(text))).collect();
+        let mut details = ErrorDetails::with_error_info(self.reason.as_str_name(), ERROR_DOMAIN, metadata);
+        let message = truncate_text(message);
+        if !self.field.is_empty() {
+            details.add_bad_request_violation(truncate_text(self.field), message.clone());
+        }
+        if let Some(delay) = self.retry_delay {
+            details.set_retry_info(Some(delay));
+        }
+        Status::with_error_details(self.code, message, details)
+    }
+}
+
+/// Converts an error to a rejection on a stream. `step` is the number of the rejected step, if any.
 pub(super) fn to_rejection(step: Option<u64>, error: &Error) -> Rejection {
-    let (field, expected, given) = match error.clone() {
-        Error::Invalid { field, expected, given } => (field, expected, given),
-        Error::NotFound { what, given } => (what.into(), format!("an existing {what}"), given),
-        Error::Taken { what, holder } => (what.into(), format!("a free {what}"), holder),
-        Error::Gone { what, expected, given } => (what.into(), expected, given),
-        Error::Busy { queue, limit } => (queue.into(), format!("at most {limit}"), "one more".into()),
-        Error::Deadline { what, ms } => (what, format!("completion within {ms} ms"), "no completion in time".into()),
-        Error::Unavailable { what, reason, remedy } => (what.into(), remedy, reason),
-        Error::Fault { stage, reason } => (stage.into(), "no internal error".into(), reason),
-        Error::DeviceLost { stage, reason } => (stage.into(), "a restart of the server".into(), reason),
-    };
-    Rejection { step, field: truncate_text(field), expected: truncate_text(expected), given: truncate_text(given) }
+    let ErrorReport { reason, field, expected, given, .. } = ErrorReport::of(error);
+    Rejection {
+        step,
+        reason: reason.into(),
+        field: truncate_text(field),
+        expected: truncate_text(expected),
+        given: truncate_text(given),
+    }
 }
 
 /// Converts an error to a gRPC status.
 pub(super) fn to_status(error: Error) -> Status {
-    // No wildcard, so that a new error variant requires a decision here.
-    let code = match error {
-        Error::Invalid { .. } => Code::InvalidArgument,
-        Error::NotFound { .. } => Code::NotFound,
-        Error::Taken { .. } => Code::AlreadyExists,
-        Error::Gone { .. } => Code::FailedPrecondition,
-        Error::Busy { .. } => Code::ResourceExhausted,
-        Error::Deadline { .. } => Code::DeadlineExceeded,
-        Error::Unavailable { .. } | Error::DeviceLost { .. } => Code::Unavailable,
-        Error::Fault { .. } => Code::Internal,
-    };
-    let details = to_rejection(None, &error);
-    Status::with_details(code, truncate_text(error.to_string()), details.encode_to_vec().into())
+    ErrorReport::of(&error).into_status(error.to_string())
 }
 
 /// Converts a transport error of a client's stream. Tonic reports a message over the size limit as `OUT_OF_RANGE`.
@@ -57,13 +169,9 @@ pub(super) fn transport_status(stream_status: Status, max_message_bytes: usize) 
     if stream_status.code() != Code::OutOfRange {
         return stream_status;
     }
-    let details = Rejection {
-        step: None,
-        field: "message".into(),
-        expected: format!("at most {max_message_bytes} bytes"),
-        given: stream_status.message().into(),
-    };
-    Status::with_details(Code::ResourceExhausted, stream_status.message(), details.encode_to_vec().into())
+    let expected = format!("at most {max_message_bytes} bytes");
+    ErrorReport::new(Code::ResourceExhausted, Reason::MessageTooLarge, expected, stream_status.message())
+        .into_status(stream_status.message().to_owned())
 }
 
 #[cfg(test)]
@@ -71,12 +179,28 @@ mod tests {
     use super::*;
 
     #[test]
-    fn status_contains_the_rejection_and_is_small() {
+    fn status_names_field_and_reason_and_fits_into_a_header() {
         let error = modalcast_model::error::invalid("step.q", "8 bytes", "x".repeat(100_000));
+        let rejection = to_rejection(Some(7), &error);
         let status = to_status(error);
         assert_eq!(status.code(), Code::InvalidArgument);
-        let details = Rejection::decode(status.details()).expect("expected a rejection");
-        assert_eq!((details.field.as_str(), details.expected.as_str()), ("step.q", "8 bytes"));
+        let error_info = status.get_details_error_info().expect("expected an ErrorInfo");
+        assert_eq!((error_info.reason.as_str(), error_info.domain.as_str()), ("REASON_INVALID_FIELD", "modalcast"));
+        assert_eq!(error_info.metadata["expected"], "8 bytes");
+        let bad_request = status.get_details_bad_request().expect("expected a BadRequest");
+        assert_eq!(bad_request.field_violations[0].field, "step.q");
+        assert!(status.get_details_retry_info().is_none());
         assert!(status.message().len() + status.details().len() < 4096);
+        assert_eq!((rejection.step, rejection.reason()), (Some(7), Reason::InvalidField));
+        assert_eq!((rejection.field.as_str(), &rejection.given), ("step.q", &error_info.metadata["given"]));
+    }
+
+    #[test]
+    fn only_errors_that_a_retry_can_mend_have_a_retry_delay() {
+        let delay = |error| to_status(error).get_details_retry_info().and_then(|info| info.retry_delay);
+        assert_eq!(delay(Error::Busy { queue: "device", limit: 4 }), Some(QUEUE_RETRY_DELAY));
+        assert_eq!(delay(Error::ShuttingDown), Some(RESTART_RETRY_DELAY));
+        assert_eq!(delay(Error::LimitReached { objects: "open scenes", limit: 4 }), None);
+        assert_eq!(delay(Error::NotFound { what: "scene", given: "'a'".into() }), None);
     }
 }

@@ -1,23 +1,28 @@
-//! `StepService`: one bidirectional stream per physics process. The task of the stream always reads, so that a slow
-//! scene never blocks the connection. A step that cannot be accepted is answered with a rejection, and the stream
-//! remains open.
+//! `StepService`: one bidirectional stream per physics process. A stream that blocks is not read while its window is full,
+//! so that the flow control of HTTP/2 slows the client down. Every other stream is always read, and a step that cannot be
+//! accepted is answered with a rejection. The stream remains open.
 
 use std::collections::VecDeque;
 
 use modalcast_proto::v1;
 use modalcast_proto::v1::drive_scene_request::Kind as RequestKind;
 use modalcast_proto::v1::drive_scene_response::Kind as ResponseKind;
+use tokio::sync::OwnedSemaphorePermit;
 use tonic::{Request, Response, Status, Streaming};
 
-use super::convert::{parse_policy, parse_step, wire_policy, wire_scene_info, wire_stages};
+use super::connection::ConnectionInfo;
+use super::convert::{parse_lease_request, parse_step, wire_opened, wire_stages};
 use super::status::{to_rejection, to_status, transport_status};
 use super::stream::{Deadline, ReplySender, ReplyStream, respond};
 use crate::engine::{Engine, StepReport, WriterSession};
-use modalcast_model::error::{Error, Result, invalid};
+use modalcast_model::error::{Error, Result, fault};
 
 /// Maximum number of replies that are buffered for a client that does not read. A further reply ends the stream with an
 /// error.
 const MAX_PENDING_REPLIES: usize = 256;
+
+/// Number of buffered replies above which acknowledgements are merged.
+const MAX_PENDING_ACKS: usize = 64;
 
 /// Implementation of `StepService`.
 pub(super) struct StepServiceImpl(pub(super) Engine);
@@ -30,11 +35,14 @@ impl v1::step_service_server::StepService for StepServiceImpl {
         &self,
         request: Request<Streaming<v1::DriveSceneRequest>>,
     ) -> Result<Response<Self::DriveSceneStream>, Status> {
-        let peer = request.remote_addr().map_or_else(|| "a local client".into(), |address| address.to_string());
+        let connection = request.extensions().get::<ConnectionInfo>().cloned();
+        let connection = connection.ok_or_else(|| to_status(fault("connection", "expected its address, got none")))?;
+        let drive_permit = connection.acquire_drive().map_err(to_status)?;
         let deadline = Deadline::of_stream(request.metadata());
         let session = DriveSession {
             engine: self.0.clone(),
-            peer,
+            peer: connection.address(),
+            _drive_permit: drive_permit,
             inbound: request.into_inner(),
             writer: None,
             replies: VecDeque::new(),
@@ -46,8 +54,10 @@ impl v1::step_service_server::StepService for StepServiceImpl {
 /// The state of one step stream.
 struct DriveSession {
     engine: Engine,
-    /// Address of the client, for errors.
+    /// Address of the client, for the log.
     peer: String,
+    /// Counts this stream among those of its connection.
+    _drive_permit: OwnedSemaphorePermit,
     inbound: Streaming<v1::DriveSceneRequest>,
     /// The writer lease, once it is acquired.
     writer: Option<WriterSession>,
@@ -65,15 +75,16 @@ impl DriveSession {
                 return Ok(());
             }
             // Without capacity, reports wait in the step queue.
+            let may_read = self.writer.as_ref().is_none_or(WriterSession::may_read_step);
             let has_reply_capacity = self.replies.len() < MAX_PENDING_REPLIES;
             tokio::select! {
-                message = self.inbound.message(), if is_receiving => match message {
+                message = self.inbound.message(), if is_receiving && may_read => match message {
                     Ok(Some(message)) => self.receive(message).await?,
                     Ok(None) => is_receiving = false,
                     Err(status) => return Err(transport_status(status, self.engine.config().message_bytes)),
                 },
                 report = next_report(self.writer.as_ref()), if has_reply_capacity => match report {
-                    Ok(report) => self.replies.push_back(to_response(report)),
+                    Ok(report) => self.push_report(report),
                     Err(error) => return self.close_with_error(&reply_sender, error).await,
                 },
                 permit = reply_sender.reserve(), if !self.replies.is_empty() => {
@@ -98,7 +109,7 @@ impl DriveSession {
                 let number = step.number;
                 self.push_step(step).err().map(|error| (Some(number), error))
             }
-            None => Some((None, invalid("kind", "open or step", "neither"))),
+            None => Some((None, Error::UnexpectedMessage { expected: "open or step", given: "an empty message" })),
         };
         if let Some((step, error)) = rejected {
             self.push_reply(ResponseKind::Rejection(to_rejection(step, &error)))?;
@@ -108,18 +119,12 @@ impl DriveSession {
 
     async fn open(&mut self, open: v1::OpenDrive) -> Result<()> {
         if self.writer.is_some() {
-            return Err(invalid("open", "one open per stream", format!("a second open, of '{}'", open.scene)));
+            return Err(Error::UnexpectedMessage { expected: "one open per stream", given: "a second open" });
         }
-        let policy = parse_policy(open.policy)?;
         let scene_handle = self.engine.find(&open.scene)?;
-        let window = if open.window == 0 { self.engine.config().window } else { open.window };
-        let writer = scene_handle.drive(self.peer.clone(), policy, window).await?;
-        let opened = v1::Opened {
-            run: writer.run,
-            policy: wire_policy(writer.policy).into(),
-            window: writer.window,
-            scene: Some(wire_scene_info(&scene_handle)),
-        };
+        let request = parse_lease_request(&open, self.engine.config().window)?;
+        let writer = scene_handle.drive(&self.peer, request.clone()).await?;
+        let opened = wire_opened(&writer, &request, &scene_handle);
         self.writer = Some(writer);
         self.replies.push_back(v1::DriveSceneResponse { kind: Some(ResponseKind::Opened(opened)) });
         Ok(())
@@ -128,13 +133,24 @@ impl DriveSession {
     fn push_step(&mut self, step: v1::Step) -> Result<()> {
         match &mut self.writer {
             Some(writer) => writer.push_step(&parse_step(step)?),
-            None => Err(invalid("kind", "open before the first step", "a step")),
+            None => Err(Error::UnexpectedMessage { expected: "open before the first step", given: "a step" }),
         }
+    }
+
+    /// Appends a report. An acknowledgement also covers all earlier steps. If many replies wait, it replaces one that is
+    /// not sent yet, so that a client that reads nothing can continue to send steps.
+    fn push_report(&mut self, report: StepReport) {
+        let response = to_response(report);
+        let is_ack = |response: &v1::DriveSceneResponse| matches!(response.kind, Some(ResponseKind::Ack(_)));
+        if self.replies.len() >= MAX_PENDING_ACKS && is_ack(&response) && self.replies.back().is_some_and(is_ack) {
+            self.replies.pop_back();
+        }
+        self.replies.push_back(response);
     }
 
     fn push_reply(&mut self, kind: ResponseKind) -> Result<(), Status> {
         if self.replies.len() >= MAX_PENDING_REPLIES {
-            return Err(to_status(Error::Busy { queue: "replies not read by the client", limit: MAX_PENDING_REPLIES }));
+            return Err(to_status(Error::SlowReader { queue: "queue of replies", limit: MAX_PENDING_REPLIES }));
         }
         self.replies.push_back(v1::DriveSceneResponse { kind: Some(kind) });
         Ok(())

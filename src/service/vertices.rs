@@ -6,12 +6,10 @@ use std::sync::Arc;
 use modalcast_proto::v1;
 use tonic::{Request, Response, Status};
 
-use super::convert::{describe_step_selector, parse_delivery, wire_stages, wire_step_id};
+use super::convert::{describe_step_selector, parse_delivery, parse_step_selector, wire_stages, wire_step_id};
 use super::status::to_status;
 use super::stream::{Deadline, ReplySender, ReplyStream, chunks_with_head, respond};
-use crate::engine::{
-    Engine, OutputSpec, PackedVertices, SceneHandle, StepSelector, Subscription, VertexSelection, pack_vertices,
-};
+use crate::engine::{Engine, OutputSpec, PackedVertices, SceneHandle, Subscription, VertexSelection, pack_vertices};
 use modalcast_model::deform::VertexAttributes;
 
 /// Implementation of `VertexService`.
@@ -30,7 +28,7 @@ impl v1::vertex_service_server::VertexService for VertexServiceImpl {
         let request = request.into_inner();
         let scene_handle = self.0.find(&request.scene).map_err(to_status)?;
         let selection = parse_selection(&scene_handle, request.selection)?;
-        let selector = StepSelector::from(request.step);
+        let selector = parse_step_selector(request.step);
         let max_chunk_bytes = config.chunk_bytes;
         Ok(respond(move |reply_sender| async move {
             let work = async {
@@ -58,7 +56,7 @@ impl v1::vertex_service_server::VertexService for VertexServiceImpl {
         let request = request.into_inner();
         let scene_handle = self.0.find(&request.scene).map_err(to_status)?;
         let selection = parse_selection(&scene_handle, request.selection)?;
-        let delivery = parse_delivery(request.delivery).map_err(to_status)?;
+        let delivery = parse_delivery("delivery", request.delivery).map_err(to_status)?;
         // Subscribe before the response headers are sent, so that a client can rely on receiving the next step.
         let subscription =
             scene_handle.subscribe(OutputSpec::Vertices(selection.attributes), delivery).await.map_err(to_status)?;

@@ -8,7 +8,6 @@ use modalcast_model::deform::{DeformedSurface, Deformer, VertexAttributes};
 use modalcast_model::scene::BoundingBox;
 use modalcast_proto::v1;
 use tonic::Code;
-use v1::Policy;
 use v1::drive_scene_response::Kind as ResponseKind;
 
 use crate::common::attributes;
@@ -190,7 +189,7 @@ async fn subscribers_of_different_attributes_get_every_step() {
         .await
         .expect("expected a subscription");
     let steps: Vec<_> = (0..STEP_COUNT).map(|number| step(number, &[1], &[0.01 * number as f32, 1.0])).collect();
-    let mut writer = server.drive("attributes", Policy::Lossless, STEP_COUNT as u32).await;
+    let mut writer = server.drive("attributes", v1::Delivery::Lossless, STEP_COUNT as u32).await;
     for step in &steps {
         writer.send_step(step.clone()).await;
     }
@@ -268,6 +267,7 @@ async fn disabled_and_empty_selections_are_rejected() {
         let request = v1::StreamVerticesRequest {
             scene: "strips".into(),
             selection: Some(selection),
+            delivery: v1::Delivery::Latest.into(),
             ..v1::StreamVerticesRequest::default()
         };
         let error = server.vertices().await.stream_vertices(request).await.expect_err("expected a rejected selection");
@@ -290,7 +290,7 @@ async fn step_with_displacement_overflow_is_rejected() {
     let overflowing_step = v1::Step { transform_domains: vec![1], transforms, ..step(2, &[1], &[f32::MAX; 2]) };
     writer.send_step(overflowing_step).await;
     let rejection = writer.receive_rejection().await;
-    assert!(rejection.field.contains("domain 'right'"), "{rejection:?}");
+    assert!(rejection.field == "step.q" && rejection.given.contains("domain 'right'"), "{rejection:?}");
     let reply =
         get_vertices(&server, vertex_request("attributes", select_attributes(&[]))).await.expect("expected vertices");
     assert_eq!((reply.displacements, reply.boxes), (previous_reply.displacements, previous_reply.boxes));

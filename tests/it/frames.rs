@@ -5,9 +5,10 @@ use modalcast::config::{Config, RendererChoice};
 use modalcast_proto::v1;
 use prost::Message as _;
 use tonic::{Code, Status, Streaming};
-use v1::render_frame_request::Step as RequestedStep;
 
-use crate::service_harness::{MAX_MESSAGE_BYTES, Server, rejection_details, step, with_timeout};
+use crate::service_harness::{
+    MAX_MESSAGE_BYTES, Server, exact_step, minimum_step, rejection_details, step, with_timeout,
+};
 
 async fn start_server() -> Server {
     let server = Server::start_with(|config| Config { renderer: RendererChoice::Auto, ..config }).await;
@@ -69,8 +70,7 @@ async fn frame_names_its_step_and_png_equals_rgba() {
     let rest_frame = render(&server, rgba_request()).await.expect("expected a frame at rest");
     assert_eq!(rest_frame.head.step.map(|step| step.run), Some(0));
     writer.send_step_and_wait(step(5, &[], &[0.9, 0.3, -0.9, 0.2])).await;
-    let rgba_frame =
-        render(&server, v1::RenderFrameRequest { step: Some(RequestedStep::ExactStep(5)), ..rgba_request() }).await;
+    let rgba_frame = render(&server, v1::RenderFrameRequest { step: exact_step(5), ..rgba_request() }).await;
     let rgba_frame = rgba_frame.expect("expected a frame");
     // `step` sets the time to half of the number.
     assert_eq!(rgba_frame.head.step, Some(v1::StepId { run: 1, number: 5, time: 2.5 }));
@@ -118,7 +118,7 @@ async fn lossless_frames_are_complete_and_latest_frames_increase() {
     // 0 frames mean an endless stream.
     let latest = client.stream_frames(stream_request(v1::Delivery::Latest, 0)).await.expect("expected a subscription");
     let (mut lossless, mut latest) = (lossless.into_inner(), latest.into_inner());
-    let mut writer = server.drive("strips", v1::Policy::Lossless, 3).await;
+    let mut writer = server.drive("strips", v1::Delivery::Lossless, 3).await;
     let send_steps = async {
         for number in 1..=12 {
             writer.send_step_and_wait(step(number, &[0], &[0.1 * number as f32, 0.0])).await;
@@ -161,20 +161,20 @@ async fn invalid_pictures_and_missed_deadlines_are_errors() {
     let eye_along_up = vec![0.0, 2.0, 0.0];
     // Invalid cameras, and the beginning of the field in the rejection.
     let cameras: Vec<(v1::Camera, &str)> = vec![
-        (camera_at(two_numbers, y_axis()), "picture: camera.look_at.eye"),
-        (camera_at(nan_eye, y_axis()), "picture: camera.look_at"),
-        (camera_at(eye_at_target, y_axis()), "picture: camera.look_at"),
-        (camera_at(eye_along_up, y_axis()), "picture: camera.look_at"),
-        (camera_with_lens(v1::camera::Lens::FieldOfView(180.0)), "picture: camera.field_of_view"),
-        (camera_with_lens(v1::camera::Lens::Intrinsics(v1::Intrinsics::default())), "picture: camera.intrinsics"),
-        (v1::Camera { near: 2.0, far: 1.0, ..v1::Camera::default() }, "picture: camera.near/far"),
-        (v1::Camera { near: f64::NAN, ..v1::Camera::default() }, "picture: camera.near/far"),
+        (camera_at(two_numbers, y_axis()), "picture.camera.look_at.eye"),
+        (camera_at(nan_eye, y_axis()), "picture.camera.look_at"),
+        (camera_at(eye_at_target, y_axis()), "picture.camera.look_at"),
+        (camera_at(eye_along_up, y_axis()), "picture.camera.look_at"),
+        (camera_with_lens(v1::camera::Lens::FieldOfView(180.0)), "picture.camera.field_of_view"),
+        (camera_with_lens(v1::camera::Lens::Intrinsics(v1::Intrinsics::default())), "picture.camera.intrinsics"),
+        (v1::Camera { near: 2.0, far: 1.0, ..v1::Camera::default() }, "picture.camera.near"),
+        (v1::Camera { near: f64::NAN, ..v1::Camera::default() }, "picture.camera.near"),
         (
             v1::Camera {
                 view: Some(v1::camera::View::Pose(v1::Pose { world_from_camera: vec![0.0; 12] })),
                 ..v1::Camera::default()
             },
-            "picture: camera.pose",
+            "picture.camera.pose",
         ),
     ];
     for (camera, field) in cameras {
@@ -188,19 +188,21 @@ async fn invalid_pictures_and_missed_deadlines_are_errors() {
         let invalid_request =
             v1::RenderFrameRequest { picture: picture_of_size(width, height, v1::Format::Png), ..rgba_request() };
         let status = render(&server, invalid_request).await.err().expect("expected an invalid-size error");
-        assert_eq!((status.code(), rejection_details(&status).field.as_str()), (Code::InvalidArgument, "picture.size"));
+        assert_eq!(
+            (status.code(), rejection_details(&status).field.as_str()),
+            (Code::InvalidArgument, "picture.width")
+        );
         assert_eq!(rejection_details(&status).given, format!("{width} x {height}"));
     }
     // The next two requests wait for a step that is never sent. The first has its deadline in the message, the second
     // in the gRPC header `grpc-timeout`.
-    let unanswered_request =
-        v1::RenderFrameRequest { step: Some(RequestedStep::MinimumStep(1)), deadline_ms: 60, ..rgba_request() };
+    let unanswered_request = v1::RenderFrameRequest { step: minimum_step(1), deadline_ms: 60, ..rgba_request() };
     assert_eq!(
         render(&server, unanswered_request).await.err().map(|status| status.code()),
         Some(Code::DeadlineExceeded)
     );
     let mut request_with_header =
-        tonic::Request::new(v1::RenderFrameRequest { step: Some(RequestedStep::MinimumStep(1)), ..rgba_request() });
+        tonic::Request::new(v1::RenderFrameRequest { step: minimum_step(1), ..rgba_request() });
     // 60 milliseconds.
     request_with_header.metadata_mut().insert("grpc-timeout", "60m".parse().expect("expected a header value"));
     let result = async {

@@ -2,10 +2,9 @@
 //! stream stays open, and other clients are not affected.
 
 use modalcast_proto::v1;
-use prost::Message as _;
 use sha2::{Digest as _, Sha256};
 use tonic::Code;
-use v1::Policy;
+use v1::Delivery;
 use v1::drive_scene_request::Kind as RequestKind;
 use v1::drive_scene_response::Kind as ResponseKind;
 use v1::upload_scene_request::Part;
@@ -15,8 +14,7 @@ use crate::service_harness::{
     with_timeout,
 };
 
-/// The name of a case, an invalid step, and the prefixes of the fields `field`, `expected` and `given` of its
-/// rejection.
+/// The name of a case, an invalid step, the field of its rejection, and the prefixes of `expected` and `given`.
 type InvalidStep = (&'static str, v1::Step, [&'static str; 3]);
 
 /// The identity rotation as a quaternion x y z w.
@@ -36,21 +34,21 @@ fn invalid_steps() -> Vec<InvalidStep> {
     truncated_q.q = truncated_q.q.slice(..7);
     let nan_time = v1::Step { time: f64::NAN, ..step(11, &[0], &[0.0, 0.0]) };
     vec![
-        ("q too short", step(11, &[1], &[0.5]), ["step.q of domain 'right'", "8 bytes (2 coordinates)", "4 bytes"]),
-        ("q too long", step(11, &[0], &[0.5; 3]), ["step.q of domain 'left'", "8 bytes (2 coordinates)", "12 bytes"]),
+        ("q too short", step(11, &[1], &[0.5]), ["step.q", "8 bytes (2 coordinates of domain 'right')", "4 bytes"]),
+        ("q too long", step(11, &[0], &[0.5; 3]), ["step.q", "8 bytes (2 coordinates of domain 'left')", "12 bytes"]),
         ("q of all domains is too short", step(11, &[], &[0.5; 3]), ["step.q", "16 bytes (4 coordinates)", "12 bytes"]),
-        ("q cut within a number", truncated_q, ["step.q of domain 'left'", "8 bytes", "7 bytes"]),
-        ("NaN in q", step(11, &[0], &[0.0, f32::NAN]), ["step.q of domain 'left', mode 1", "a finite number", "NaN"]),
+        ("q cut within a number", truncated_q, ["step.q", "8 bytes", "7 bytes"]),
+        (
+            "NaN in q",
+            step(11, &[0], &[0.0, f32::NAN]),
+            ["step.q[1]", "a finite number", "NaN for mode 1 of domain 'left'"],
+        ),
         (
             "infinity in q",
             step(11, &[1], &[f32::INFINITY, 0.0]),
-            ["step.q of domain 'right', mode 0", "a finite", "inf"],
+            ["step.q[0]", "a finite", "inf for mode 0 of domain 'right'"],
         ),
-        (
-            "q moves a vertex beyond 1e18",
-            step(11, &[1], &[f32::MAX, 0.0]),
-            ["step.q of domain 'right'", "q and transform", "vertex"],
-        ),
+        ("q moves a vertex beyond 1e18", step(11, &[1], &[f32::MAX, 0.0]), ["step.q", "q and transform", "vertex"]),
         ("unknown domain in q", step(11, &[0, 2], &[0.0; 4]), ["step.q_domains[1]", "an index below 2", "2"]),
         ("unknown domain in T", transforms(&[9], &[0.0; 12]), ["step.transform_domains[0]", "an index below 2", "9"]),
         (
@@ -73,7 +71,7 @@ fn invalid_steps() -> Vec<InvalidStep> {
         (
             "infinity in T",
             transforms(&[1], &infinite_transform),
-            ["step.transforms of domain 'right': transform[7]", "a finite", "inf"],
+            ["step.transforms[0].transform[7]", "a finite", "inf"],
         ),
         ("NaN time", nan_time, ["step.time", "a finite number", "NaN"]),
         ("decreasing step number", step(9, &[0], &[0.0; 2]), ["step.number", "a number above 10", "9"]),
@@ -112,43 +110,39 @@ fn invalid_transform_steps() -> Vec<InvalidStep> {
         (
             "zero quaternion",
             rigid_step(11, v1::TransformFormat::RigidF32, &[(1, [0.0; 4], [0.0; 3])]),
-            ["step.transforms of domain 'right': rotation", "a quaternion x y z w of norm 1", "norm 0"],
+            ["step.transforms[0].rotation", "a quaternion x y z w of norm 1", "norm 0"],
         ),
         (
             "quaternion of norm 2",
             rigid_step(11, v1::TransformFormat::RigidF64, &[(0, [0.0, 2.0, 0.0, 0.0], [0.0; 3])]),
-            ["step.transforms of domain 'left': rotation", "a quaternion x y z w of norm 1", "norm 2"],
+            ["step.transforms[0].rotation", "a quaternion x y z w of norm 1", "norm 2"],
         ),
         (
             "NaN in a quaternion",
             rigid_step(11, v1::TransformFormat::RigidF64, &[(1, [0.0, f32::NAN, 0.0, 1.0], [0.0; 3])]),
-            ["step.transforms of domain 'right': rotation[1]", "a finite", "NaN"],
+            ["step.transforms[0].rotation[1]", "a finite", "NaN"],
         ),
         (
             "infinity in an f32 translation",
             rigid_step(11, v1::TransformFormat::RigidF32, &[(0, IDENTITY_QUATERNION, [0.0, 1e300, 0.0])]),
-            ["step.transforms of domain 'left': translation[1]", "a finite", "inf"],
+            ["step.transforms[0].translation[1]", "a finite", "inf"],
         ),
         (
             "infinity in an f64 translation",
             rigid_step(11, v1::TransformFormat::RigidF64, &[(0, IDENTITY_QUATERNION, [0.0, 0.0, f64::NEG_INFINITY])]),
-            ["step.transforms of domain 'left': translation[2]", "a finite", "-inf"],
+            ["step.transforms[0].translation[2]", "a finite", "-inf"],
         ),
         (
             "f64 translation above the limit",
             rigid_step(11, v1::TransformFormat::RigidF64, &[(1, IDENTITY_QUATERNION, [-1e300, 0.0, 0.0])]),
-            ["step.transforms of domain 'right': translation[0]", "at most 1.09", "-1000000000"],
+            ["step.transforms[0].translation[0]", "at most 1.09", "-1000000000"],
         ),
-        (
-            "q moves a vertex of a far scene beyond 1e18",
-            overflowing_step,
-            ["step.q of domain 'right'", "q and transform", "vertex"],
-        ),
+        ("q moves a vertex of a far scene beyond 1e18", overflowing_step, ["step.q", "q and transform", "vertex"]),
     ]
 }
 
-fn has_prefixes(rejection: &v1::Rejection, [field, expected, given]: [&str; 3]) -> bool {
-    rejection.field.starts_with(field) && rejection.expected.starts_with(expected) && rejection.given.starts_with(given)
+fn matches_texts(rejection: &v1::Rejection, [field, expected, given]: [&str; 3]) -> bool {
+    rejection.field == field && rejection.expected.starts_with(expected) && rejection.given.starts_with(given)
 }
 
 /// Every invalid step is rejected with its field and leaves the state unchanged. The same stream and the stream of
@@ -178,7 +172,7 @@ async fn stream_stays_open_after_invalid_steps() {
         writer.send_step(invalid_step).await;
         let rejection = writer.receive_rejection().await;
         let prefixes = if is_decreasing { [prefixes[0], "a number above", prefixes[2]] } else { prefixes };
-        assert!(has_prefixes(&rejection, prefixes), "{name}: {rejection:?}");
+        assert!(matches_texts(&rejection, prefixes), "{name}: {rejection:?}");
         assert_eq!(rejection.step, Some(number), "{name}");
         let reply = get_vertices(&server, request.clone()).await.expect("expected vertices");
         assert_eq!(
@@ -203,19 +197,20 @@ async fn stream_opens_after_rejected_openings() {
     server.open("strips").await;
     let mut writer = StepWriter::connect(server.channel().await).await;
     writer.send_step(step(1, &[], &[])).await;
-    assert!(has_prefixes(&writer.receive_rejection().await, ["kind", "open before the first step", "a step"]));
-    let ResponseKind::Rejection(unknown_scene) = writer.open("nowhere", Policy::Lossless, DEFAULT_WINDOW).await else {
+    assert!(matches_texts(&writer.receive_rejection().await, ["", "open before the first step", "a step"]));
+    let ResponseKind::Rejection(unknown_scene) = writer.open("nowhere", Delivery::Lossless, DEFAULT_WINDOW).await
+    else {
         panic!("expected a rejection of an unknown scene")
     };
-    assert!(has_prefixes(&unknown_scene, ["scene", "an existing scene", "'nowhere'"]), "{unknown_scene:?}");
-    let open = v1::OpenDrive { scene: "strips".into(), policy: 77, window: DEFAULT_WINDOW };
+    assert!(matches_texts(&unknown_scene, ["", "an existing scene", "'nowhere'"]), "{unknown_scene:?}");
+    let open = v1::OpenDrive { scene: "strips".into(), delivery: 77, ..v1::OpenDrive::default() };
     writer.send(RequestKind::Open(open)).await;
-    assert!(has_prefixes(&writer.receive_rejection().await, ["open.policy", "a policy of this version", "77"]));
-    assert!(matches!(writer.open("strips", Policy::Lossless, DEFAULT_WINDOW).await, ResponseKind::Opened(_)));
-    let ResponseKind::Rejection(second_open) = writer.open("strips", Policy::Lossless, DEFAULT_WINDOW).await else {
+    assert!(matches_texts(&writer.receive_rejection().await, ["open.delivery", "a delivery of this version", "77"]));
+    assert!(matches!(writer.open("strips", Delivery::Lossless, DEFAULT_WINDOW).await, ResponseKind::Opened(_)));
+    let ResponseKind::Rejection(second_open) = writer.open("strips", Delivery::Lossless, DEFAULT_WINDOW).await else {
         panic!("expected a rejection of a second open message")
     };
-    assert!(has_prefixes(&second_open, ["open", "one open per stream", "a second open"]), "{second_open:?}");
+    assert!(matches_texts(&second_open, ["", "one open per stream", "a second open"]), "{second_open:?}");
     writer.send_step_and_wait(step(0, &[0], &[0.0, 0.0])).await;
 }
 
@@ -228,9 +223,9 @@ async fn oversized_message_ends_only_its_own_stream() {
     let request = v1::OpenSceneRequest { source: "strips".into(), scene: "other".into() };
     server.scenes().await.open_scene(request).await.expect("expected the scene to open");
     let mut other_writer = StepWriter::connect(channel.clone()).await;
-    assert!(matches!(other_writer.open("other", Policy::Lossless, DEFAULT_WINDOW).await, ResponseKind::Opened(_)));
+    assert!(matches!(other_writer.open("other", Delivery::Lossless, DEFAULT_WINDOW).await, ResponseKind::Opened(_)));
     let mut writer = StepWriter::connect(channel).await;
-    assert!(matches!(writer.open("strips", Policy::Lossless, DEFAULT_WINDOW).await, ResponseKind::Opened(_)));
+    assert!(matches!(writer.open("strips", Delivery::Lossless, DEFAULT_WINDOW).await, ResponseKind::Opened(_)));
     let valid_step = step(1, &[0], &[0.5, 0.25]);
     writer.send_step_and_wait(valid_step.clone()).await;
     // 80,000 bytes of coordinates.
@@ -259,7 +254,7 @@ async fn invalid_requests_return_code_and_details() {
     rejected_calls.push((status, Code::InvalidArgument, ["selection.domains[1]", "an index below 2", "5"]));
     let request = v1::GetVerticesRequest { scene: "nowhere".into(), ..v1::GetVerticesRequest::default() };
     let status = get_vertices(&server, request).await.expect_err("expected an unknown-scene error");
-    rejected_calls.push((status, Code::NotFound, ["scene", "an existing scene", "'nowhere'"]));
+    rejected_calls.push((status, Code::NotFound, ["", "an existing scene", "'nowhere'"]));
     let request = v1::ReadModesRequest { scene: "strips".into(), domain: 2, vertices: vec![] };
     let status = scenes.read_modes(request).await.expect_err("expected an unknown-domain error");
     rejected_calls.push((status, Code::InvalidArgument, ["domain", "an index below 2", "2"]));
@@ -274,7 +269,7 @@ async fn invalid_requests_return_code_and_details() {
     rejected_calls.push((status, Code::InvalidArgument, ["arrays", "arrays of this version", "99"]));
     let request = v1::OpenSceneRequest { source: "nothing".into(), scene: String::new() };
     let status = scenes.open_scene(request).await.expect_err("expected an unknown-source error");
-    rejected_calls.push((status, Code::NotFound, ["scene", "an existing scene", "nothing"]));
+    rejected_calls.push((status, Code::NotFound, ["", "an existing scene", "nothing"]));
     let request = v1::OpenSceneRequest { source: "strips".into(), scene: "../x".into() };
     let status = scenes.open_scene(request).await.expect_err("expected an invalid-name error");
     rejected_calls.push((status, Code::InvalidArgument, ["scene", "1 to 64 of", "\"../x\""]));
@@ -283,15 +278,15 @@ async fn invalid_requests_return_code_and_details() {
     rejected_calls.push((
         status,
         Code::AlreadyExists,
-        ["scene name", "a free scene name", "'strips' belongs to 'strips'"],
+        ["", "a free scene name", "'strips', which belongs to 'strips'"],
     ));
     let request = v1::DeleteSceneRequest { scene: "nowhere".into() };
     let status = scenes.delete_scene(request).await.expect_err("expected an unknown-scene error");
-    rejected_calls.push((status, Code::NotFound, ["scene", "an existing scene", "'nowhere'"]));
+    rejected_calls.push((status, Code::NotFound, ["", "an existing scene", "'nowhere'"]));
     for (status, code, prefixes) in rejected_calls {
         assert_eq!(status.code(), code, "{status:?}");
         assert!(
-            has_prefixes(&rejection_details(&status), prefixes),
+            matches_texts(&rejection_details(&status), prefixes),
             "expected {prefixes:?}, got {:?}",
             rejection_details(&status)
         );
@@ -334,13 +329,9 @@ async fn invalid_uploads_are_rejected_and_leave_no_files() {
     let upload_to = |path: &'static str| modified_upload(move |_, file| file.path = path.into());
     // Name of the case, messages, and prefixes of the fields `field`, `expected` and `given` of the rejection.
     let cases: Vec<(&str, Vec<Part>, [&str; 3])> = vec![
-        ("empty stream", vec![], ["part", "a header as the first part", "nothing"]),
-        ("no header", upload_parts(b"strips").split_off(1), ["part", "a header as the first part", "a file or chunk"]),
-        (
-            "wrong hash",
-            modified_upload(|_, file| file.sha256 = vec![7; 32].into()),
-            ["file.sha256 of 'scene.txt'", "0707", ""],
-        ),
+        ("empty stream", vec![], ["", "a header as the first part", "the end of the stream"]),
+        ("no header", upload_parts(b"strips").split_off(1), ["", "a header as the first part", "a file or chunk"]),
+        ("wrong hash", modified_upload(|_, file| file.sha256 = vec![7; 32].into()), ["file.sha256", "0707", ""]),
         (
             "hash of 3 bytes",
             modified_upload(|_, file| file.sha256 = vec![7; 3].into()),
@@ -349,7 +340,7 @@ async fn invalid_uploads_are_rejected_and_leave_no_files() {
         ("path outside of the folder", upload_to("../scene.txt"), ["file.path", "a relative path", "\"../scene.txt\""]),
         ("absolute path", upload_to("/etc/scene.txt"), ["file.path", "a relative path", "\"/etc/scene.txt\""]),
         ("backslash in the path", upload_to("..\\scene.txt"), ["file.path", "a relative path", ""]),
-        ("no contents", upload_parts(b"strips")[..2].to_vec(), ["file.bytes of 'scene.txt'", "6 bytes", "0 bytes"]),
+        ("no contents", upload_parts(b"strips")[..2].to_vec(), ["file.bytes", "6 bytes", "0 bytes for 'scene.txt'"]),
         (
             "too few bytes announced",
             modified_upload(|header, _| header.total_bytes = 5),
@@ -367,12 +358,12 @@ async fn invalid_uploads_are_rejected_and_leave_no_files() {
             modified_upload(|header, _| header.entry = "../x".into()),
             ["header.entry", "a relative path", "\"../x\""],
         ),
-        ("missing entry", modified_upload(|header, _| header.entry = "x".into()), ["entry", "a file", ""]),
-        ("file names an unknown source", upload_parts(b"nothing"), ["scene", "an existing scene", "nothing"]),
+        ("missing entry", modified_upload(|header, _| header.entry = "x".into()), ["", "a file", ""]),
+        ("file names an unknown source", upload_parts(b"nothing"), ["", "an existing scene", "nothing"]),
     ];
     for (name, parts, prefixes) in cases {
         let status = upload(&server, parts).await.expect_err(name);
-        assert!(has_prefixes(&rejection_details(&status), prefixes), "{name}: {:?}", rejection_details(&status));
+        assert!(matches_texts(&rejection_details(&status), prefixes), "{name}: {:?}", rejection_details(&status));
         assert_eq!(
             std::fs::read_dir(&uploads).expect("expected an uploads folder").count(),
             0,
@@ -396,5 +387,6 @@ async fn rejection_details_fit_into_a_header() {
     let request = v1::OpenSceneRequest { source: "x".repeat(500_000), scene: "name".into() };
     let status = server.scenes().await.open_scene(request).await.expect_err("expected an unknown-source error");
     assert_eq!(status.code(), Code::NotFound);
-    assert!(rejection_details(&status).encoded_len() < 4096);
+    assert!(rejection_details(&status).given.ends_with("..."));
+    assert!(status.details().len() + status.message().len() < 4096);
 }

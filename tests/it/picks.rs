@@ -190,12 +190,9 @@ async fn many_hits_are_chunked_and_far_picks_keep_precision() {
 async fn invalid_rectangles_outputs_and_steps_are_rejected() {
     let (server, client) = start_server("strips").await;
     // A rectangle has at most 64 x 64 pixels and lies within the picture of 96 x 80 pixels.
-    for (corner, size, field) in [
-        ([0, 0], [65, 1], "rectangle.size"),
-        ([0, 0], [0, 3], "rectangle.size"),
-        ([95, 79], [2, 1], "rectangle"),
-        ([96, 0], [1, 1], "rectangle"),
-    ] {
+    for (corner, size, field) in
+        [([0, 0], [65, 1], "width"), ([0, 0], [0, 3], "width"), ([95, 79], [2, 1], "x"), ([96, 0], [1, 1], "x")]
+    {
         let request =
             PickRequest::new("strips", PickRectangle::pixel(picture(), corner[0], corner[1]).size(size[0], size[1]));
         let error = client.pick(&request).await.expect_err(field);

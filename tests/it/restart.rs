@@ -53,7 +53,7 @@ fn restore_and_read(state_folder: &Path) -> (v1::StepId, Vec<f32>) {
         let mut writer = server.drive_lossless("strips").await;
         writer.send_step_and_wait(step(0, &[0], &[0.0, 0.0])).await;
         let reply = get_vertices(&server, vertex_request("strips")).await.expect("expected vertices");
-        assert_eq!((reply.step().run, reply.step().number), (restored.0.run + 1, 0));
+        assert!(reply.step().run > restored.0.run && reply.step().number == 0, "{:?}", reply.step());
         restored
     })
 }

@@ -193,7 +193,11 @@ async fn openings_share_one_scene_and_deletion_ends_its_streams() {
         .into_inner();
     assert_eq!(list.scenes.iter().map(|scene| scene.scene.as_str()).collect::<Vec<_>>(), ["strips"]);
     assert_eq!(list.sources, ["panic", "sheet", "strips"]);
-    let request = v1::StreamVerticesRequest { scene: "strips".into(), ..v1::StreamVerticesRequest::default() };
+    let request = v1::StreamVerticesRequest {
+        scene: "strips".into(),
+        delivery: v1::Delivery::Latest.into(),
+        ..v1::StreamVerticesRequest::default()
+    };
     let mut stream =
         server.vertices().await.stream_vertices(request).await.expect("expected a subscription").into_inner();
     let mut writer = server.drive_lossless("strips").await;
@@ -214,7 +218,7 @@ async fn scene_above_the_limit_opens_only_after_a_deletion() {
     let status = server.scenes().await.open_scene(second_scene).await.expect_err("expected a scene-limit error");
     assert_eq!(
         (status.code(), rejection_details(&status).expected.as_str()),
-        (tonic::Code::ResourceExhausted, "at most 1")
+        (tonic::Code::ResourceExhausted, "at most 1 open scenes")
     );
     server
         .scenes()
@@ -237,7 +241,11 @@ async fn server_without_renderer_rejects_only_frames() {
     let limits = info.limits.expect("expected the limits");
     // 1 MiB is the setting of `config`, the others are defaults.
     assert_eq!((limits.message_bytes, limits.window, limits.scenes), (1 << 20, 256, 16));
-    let request = v1::StreamFramesRequest { scene: "strips".into(), ..v1::StreamFramesRequest::default() };
+    let request = v1::StreamFramesRequest {
+        scene: "strips".into(),
+        delivery: v1::Delivery::Latest.into(),
+        ..v1::StreamFramesRequest::default()
+    };
     let status = server.frames().await.stream_frames(request).await.expect_err("expected an error without a renderer");
     assert_eq!(status.code(), tonic::Code::Unavailable);
     assert!(rejection_details(&status).given.contains("switched off"));

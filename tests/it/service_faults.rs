@@ -11,7 +11,7 @@ use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::watch;
 use tonic::Code;
 use tonic::transport::Channel;
-use v1::Policy;
+use v1::Delivery;
 use v1::drive_scene_response::Kind as ResponseKind;
 use v1::upload_scene_request::Part;
 
@@ -27,9 +27,9 @@ async fn latest_policy_merges_excess_steps() {
     server.open("strips").await;
     let channel = server.channel().await;
     let mut fast_writer = StepWriter::connect(channel.clone()).await;
-    assert!(matches!(fast_writer.open("sheet", Policy::Latest, DEFAULT_WINDOW).await, ResponseKind::Opened(_)));
+    assert!(matches!(fast_writer.open("sheet", Delivery::Latest, DEFAULT_WINDOW).await, ResponseKind::Opened(_)));
     let mut other_writer = StepWriter::connect(channel).await;
-    assert!(matches!(other_writer.open("strips", Policy::Lossless, DEFAULT_WINDOW).await, ResponseKind::Opened(_)));
+    assert!(matches!(other_writer.open("strips", Delivery::Lossless, DEFAULT_WINDOW).await, ResponseKind::Opened(_)));
     let (sender, mut replies) = fast_writer.split();
     let send_steps = async {
         for number in 1..=STEP_COUNT {
@@ -63,13 +63,12 @@ async fn stream_of_writer_that_reads_no_rejections_ends() {
     server.open("strips").await;
     let channel = server.channel().await;
     let mut writer = StepWriter::connect(channel.clone()).await;
-    assert!(matches!(writer.open("strips", Policy::Lossless, DEFAULT_WINDOW).await, ResponseKind::Opened(_)));
-    // Every further open message is rejected. 20,000 rejections that repeat a scene name of 600 letters (12 MB) fill
-    // every buffer between server and client.
-    let open_message = v1::OpenDrive { scene: "x".repeat(600), policy: 0, window: 0 };
+    assert!(matches!(writer.open("strips", Delivery::Lossless, DEFAULT_WINDOW).await, ResponseKind::Opened(_)));
+    // A second open message is rejected. The rejections fill every buffer between server and client.
+    let open_message = v1::OpenDrive::default();
     let (sender, mut replies) = writer.split();
     let send_task = tokio::spawn(async move {
-        for _ in 0..20_000 {
+        for _ in 0..100_000 {
             let kind = Some(v1::drive_scene_request::Kind::Open(open_message.clone()));
             if sender.send(v1::DriveSceneRequest { kind }).await.is_err() {
                 return;
@@ -80,7 +79,7 @@ async fn stream_of_writer_that_reads_no_rejections_ends() {
     let acquire_lease = async {
         loop {
             let mut candidate = StepWriter::connect(channel.clone()).await;
-            if matches!(candidate.open("strips", Policy::Lossless, DEFAULT_WINDOW).await, ResponseKind::Opened(_)) {
+            if matches!(candidate.open("strips", Delivery::Lossless, DEFAULT_WINDOW).await, ResponseKind::Opened(_)) {
                 return candidate;
             }
         }
@@ -121,14 +120,14 @@ async fn frozen_writer_loses_its_lease() {
     server.open("strips").await;
     let proxy = FreezableProxy::start(server.address.trim_start_matches("http://").to_owned()).await;
     let mut frozen_writer = StepWriter::connect(proxy.channel().await).await;
-    assert!(matches!(frozen_writer.open("strips", Policy::Lossless, DEFAULT_WINDOW).await, ResponseKind::Opened(_)));
+    assert!(matches!(frozen_writer.open("strips", Delivery::Lossless, DEFAULT_WINDOW).await, ResponseKind::Opened(_)));
     frozen_writer.send_step_and_wait(step(1, &[0], &[0.1, 0.2])).await;
     proxy.freeze();
     let start = Instant::now();
     let acquire_lease = async {
         loop {
             let mut candidate = StepWriter::connect(server.channel().await).await;
-            if matches!(candidate.open("strips", Policy::Lossless, DEFAULT_WINDOW).await, ResponseKind::Opened(_)) {
+            if matches!(candidate.open("strips", Delivery::Lossless, DEFAULT_WINDOW).await, ResponseKind::Opened(_)) {
                 return;
             }
         }
@@ -151,7 +150,7 @@ async fn server_stops_in_time_despite_unread_streams() {
     };
     // A subscriber that never reads, and a writer that never reads its replies.
     let unread_stream = server.vertices().await.stream_vertices(request).await.expect("expected a subscription");
-    let unread_writer = server.drive("sheet", Policy::Lossless, 8).await;
+    let unread_writer = server.drive("sheet", Delivery::Lossless, 8).await;
     for number in 1..=8 {
         unread_writer.send_step(step(number, &[], &[])).await;
     }

@@ -24,6 +24,7 @@ use tokio::task::JoinHandle;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::Streaming;
 use tonic::transport::Channel;
+use tonic_types::StatusExt as _;
 
 use v1::drive_scene_request::Kind as RequestKind;
 use v1::drive_scene_response::Kind as ResponseKind;
@@ -258,15 +259,15 @@ impl Server {
             .expect("expected the scene info")
     }
 
-    /// Opens a step stream with the lossless policy and the default window, and expects success.
+    /// Opens a step stream with lossless delivery and the default window, and expects success.
     pub(crate) async fn drive_lossless(&self, scene: &str) -> StepWriter {
-        self.drive(scene, v1::Policy::Lossless, DEFAULT_WINDOW).await
+        self.drive(scene, v1::Delivery::Lossless, DEFAULT_WINDOW).await
     }
 
     /// Opens a step stream and expects success. `window` is the maximum number of steps without acknowledgement.
-    pub(crate) async fn drive(&self, scene: &str, policy: v1::Policy, window: u32) -> StepWriter {
+    pub(crate) async fn drive(&self, scene: &str, delivery: v1::Delivery, window: u32) -> StepWriter {
         let mut writer = StepWriter::connect(self.channel().await).await;
-        let opened = writer.open(scene, policy, window).await;
+        let opened = writer.open(scene, delivery, window).await;
         assert!(matches!(opened, ResponseKind::Opened(_)), "{opened:?}");
         writer
     }
@@ -302,8 +303,8 @@ impl StepWriter {
 
     /// Requests to drive a scene and returns the reply. `window` is the maximum number of steps without
     /// acknowledgement.
-    pub(crate) async fn open(&mut self, scene: &str, policy: v1::Policy, window: u32) -> ResponseKind {
-        let open = v1::OpenDrive { scene: scene.into(), policy: policy.into(), window };
+    pub(crate) async fn open(&mut self, scene: &str, delivery: v1::Delivery, window: u32) -> ResponseKind {
+        let open = v1::OpenDrive { scene: scene.into(), delivery: delivery.into(), window, ..v1::OpenDrive::default() };
         self.send(RequestKind::Open(open)).await;
         self.receive_reply().await
     }
@@ -493,7 +494,28 @@ fn join_chunks(mut chunks: Vec<v1::VertexChunk>) -> ReceivedVertices {
     ReceivedVertices { positions, normals, displacements, boxes, origins, head }
 }
 
-/// Decodes the rejection in the details of a status.
+/// Selects exactly this step of the latest run.
+pub(crate) const fn exact_step(number: u64) -> Option<v1::StepSelector> {
+    Some(v1::StepSelector { run: 0, number: Some(v1::step_selector::Number::Exact(number)) })
+}
+
+/// Selects this step of the latest run or a later one.
+pub(crate) const fn minimum_step(number: u64) -> Option<v1::StepSelector> {
+    Some(v1::StepSelector { run: 0, number: Some(v1::step_selector::Number::Minimum(number)) })
+}
+
+/// The standard details of a status, as a rejection.
 pub(crate) fn rejection_details(status: &tonic::Status) -> v1::Rejection {
-    v1::Rejection::decode(status.details()).expect("expected a rejection in the status details")
+    let error_info = status.get_details_error_info().expect("expected an ErrorInfo in the status details");
+    assert_eq!(error_info.domain, "modalcast");
+    let text =
+        |key: &str| error_info.metadata.get(key).cloned().unwrap_or_else(|| panic!("expected {key} in {status:?}"));
+    let violations = status.get_details_bad_request().map_or_else(Vec::new, |bad_request| bad_request.field_violations);
+    v1::Rejection {
+        step: None,
+        reason: v1::Reason::from_str_name(&error_info.reason).expect("expected a known reason").into(),
+        field: violations.first().map_or_else(String::new, |violation| violation.field.clone()),
+        expected: text("expected"),
+        given: text("given"),
+    }
 }

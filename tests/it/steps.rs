@@ -4,11 +4,11 @@
 use modalcast::engine::{Delivery, OutputSpec, StepSelector, Subscription};
 use modalcast_model::deform::VertexAttributes;
 use modalcast_proto::v1;
-use v1::Policy;
 use v1::drive_scene_response::Kind as ResponseKind;
 
 use crate::service_harness::{
-    DEFAULT_WINDOW, Server, get_vertices, next_vertices, reference_vertices, sheet, step, strips, with_timeout,
+    DEFAULT_WINDOW, Server, StepWriter, exact_step, get_vertices, minimum_step, next_vertices, reference_vertices,
+    sheet, step, strips, with_timeout,
 };
 
 fn vertex_request(scene: &str) -> v1::GetVerticesRequest {
@@ -62,7 +62,7 @@ async fn lossless_subscriber_gets_every_step_in_order() {
     // Subscribing needs no step and no writer.
     let mut stream =
         server.vertices().await.stream_vertices(request).await.expect("expected a subscription").into_inner();
-    let mut writer = server.drive("strips", Policy::Lossless, 4).await;
+    let mut writer = server.drive("strips", v1::Delivery::Lossless, 4).await;
     let steps: Vec<_> = (0..40).map(|number| step(number * 2, &[1], &[0.01 * number as f32, 1.0])).collect();
     let read_steps = async {
         for index in 0..30 {
@@ -93,7 +93,7 @@ async fn overlapped_steps_keep_their_order_and_vertices() {
         subscriptions.push(subscribe_vertices(&server, delivery).await);
     }
     let steps: Vec<_> = (0..40).map(|number| step(number, &[1], &[0.01 * number as f32, 1.0])).collect();
-    let mut writer = server.drive("strips", Policy::Lossless, 40).await;
+    let mut writer = server.drive("strips", v1::Delivery::Lossless, 40).await;
     // All steps are sent at once. While the server computes a step, the next one is thus queued.
     for step in &steps {
         writer.send_step(step.clone()).await;
@@ -133,7 +133,11 @@ async fn unread_lossless_subscription_applies_back_pressure() {
     let server = Server::start_default().await;
     server.open("strips").await;
     let mut subscription = subscribe_vertices(&server, Delivery::Lossless).await;
-    let mut writer = server.drive("strips", Policy::Lossless, 2).await;
+    let mut writer = StepWriter::connect(server.channel().await).await;
+    let (delivery, overflow) = (v1::Delivery::Lossless.into(), v1::Overflow::Reject.into());
+    let open = v1::OpenDrive { scene: "strips".into(), delivery, overflow, window: 2, ..v1::OpenDrive::default() };
+    writer.send(v1::drive_scene_request::Kind::Open(open)).await;
+    assert!(matches!(writer.receive_reply().await, ResponseKind::Opened(_)));
     // Steps 1 and 2 are queued in the subscription. Step 3 is computed but not acknowledged, step 4 waits, and step 5
     // exceeds the window of two steps.
     writer.send_step_and_wait(step(1, &[0], &[0.1, 0.0])).await;
@@ -142,7 +146,7 @@ async fn unread_lossless_subscription_applies_back_pressure() {
         writer.send_step(step(number, &[0], &[number as f32 / 10.0, 0.0])).await;
     }
     let rejection = writer.receive_rejection().await;
-    assert_eq!((rejection.step, rejection.field.as_str()), (Some(5), "window"));
+    assert_eq!((rejection.step, rejection.reason()), (Some(5), v1::Reason::WindowFull));
     assert_eq!(rejection.expected, "at most 2 steps without acknowledgement");
     // Reading releases the remaining steps. The rejected step was not applied.
     for number in 1..=4 {
@@ -161,12 +165,12 @@ async fn stalled_subscriber_is_disconnected_and_writer_continues() {
     let server = Server::start_with(|config| modalcast::config::Config { stall_timeout, ..config }).await;
     server.open("strips").await;
     let mut subscription = subscribe_vertices(&server, Delivery::Lossless).await;
-    let mut writer = server.drive("strips", Policy::Lossless, 1).await;
+    let mut writer = server.drive("strips", v1::Delivery::Lossless, 1).await;
     for number in 1..=6 {
         writer.send_step_and_wait(step(number, &[0], &[0.1, 0.0])).await;
     }
     let error = with_timeout(subscription.disconnected()).await;
-    assert!(matches!(error, modalcast_model::error::Error::Busy { .. }), "{error}");
+    assert!(matches!(error, modalcast_model::error::Error::SlowReader { .. }), "{error}");
     with_timeout(subscription.next()).await.expect("expected the first queued step");
     with_timeout(subscription.next()).await.expect("expected the second queued step");
     assert_eq!(with_timeout(subscription.next()).await.expect_err("expected the subscription to end"), error);
@@ -177,7 +181,7 @@ async fn stalled_subscriber_is_disconnected_and_writer_continues() {
 async fn latest_policy_merges_steps_and_counts_skipped_ones() {
     let server = Server::start_default().await;
     server.open("sheet").await;
-    let mut writer = server.drive("sheet", Policy::Latest, 4).await;
+    let mut writer = server.drive("sheet", v1::Delivery::Latest, 4).await;
     // Row-major 3 x 4 matrix: a translation by 5 along x. Only step 1 moves the sheet, so the final vertices show
     // whether step 1 was lost.
     let matrix = [1.0, 0.0, 0.0, 5.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0_f32];
@@ -226,17 +230,18 @@ async fn second_writer_is_rejected_until_the_first_ends() {
     server.open("strips").await;
     let mut first_writer = server.drive_lossless("strips").await;
     first_writer.send_step_and_wait(step(100, &[0], &[0.1, 0.0])).await;
-    let mut second_writer = crate::service_harness::StepWriter::connect(server.channel().await).await;
-    let ResponseKind::Rejection(rejection) = second_writer.open("strips", Policy::Lossless, DEFAULT_WINDOW).await
+    let mut second_writer = StepWriter::connect(server.channel().await).await;
+    let ResponseKind::Rejection(rejection) = second_writer.open("strips", v1::Delivery::Lossless, DEFAULT_WINDOW).await
     else {
         panic!("expected a rejection")
     };
-    assert!(rejection.field.contains("writer"), "{rejection:?}");
-    assert!(rejection.given.contains("127.0.0.1") && rejection.given.contains("run 1"), "{rejection:?}");
+    assert_eq!(rejection.reason(), v1::Reason::WriterLeaseTaken);
+    assert!(rejection.given.contains("run 1"), "{rejection:?}");
+    assert!(!format!("{rejection:?}").contains("127.0.0.1"), "the address of a client is private: {rejection:?}");
     first_writer.send_step_and_wait(step(101, &[0], &[0.2, 0.0])).await;
     first_writer.finish().await;
     // A new run may start at any step number. The server limits the window to 256 steps.
-    let ResponseKind::Opened(opened) = second_writer.open("strips", Policy::Latest, 100_000).await else {
+    let ResponseKind::Opened(opened) = second_writer.open("strips", v1::Delivery::Latest, 100_000).await else {
         panic!("expected the stream to open")
     };
     assert_eq!((opened.run, opened.window), (2, 256));
@@ -246,8 +251,10 @@ async fn second_writer_is_rejected_until_the_first_ends() {
     second_writer.disconnect();
     let open_third = async {
         loop {
-            let mut third_writer = crate::service_harness::StepWriter::connect(server.channel().await).await;
-            if let ResponseKind::Opened(opened) = third_writer.open("strips", Policy::Lossless, DEFAULT_WINDOW).await {
+            let mut third_writer = StepWriter::connect(server.channel().await).await;
+            if let ResponseKind::Opened(opened) =
+                third_writer.open("strips", v1::Delivery::Lossless, DEFAULT_WINDOW).await
+            {
                 return opened.run;
             }
         }
@@ -259,7 +266,7 @@ async fn second_writer_is_rejected_until_the_first_ends() {
 async fn canceled_requests_do_not_count_as_pending() {
     let server = Server::start_with(|config| modalcast::config::Config { max_pending_requests: 4, ..config }).await;
     server.open("strips").await;
-    let step = Some(v1::get_vertices_request::Step::MinimumStep(99));
+    let step = minimum_step(99);
     let pending_request = v1::GetVerticesRequest { deadline_ms: 600_000, step, ..vertex_request("strips") };
     let mut client = server.vertices().await;
     // Eight requests wait for a step that is never sent. The server keeps four of them pending. It rejects the other
@@ -295,12 +302,14 @@ async fn requests_wait_for_exact_and_minimum_steps() {
     server.open("strips").await;
     let mut writer = server.drive_lossless("strips").await;
     let scene_handle = server.engine.find("strips").expect("expected an open scene");
-    let mut pending_requests =
-        [StepSelector::Exact(2), StepSelector::Minimum(3), StepSelector::Exact(5)].map(|selector| {
-            Box::pin(
-                scene_handle.request_output(selector, OutputSpec::Vertices(VertexAttributes::POSITIONS_AND_NORMALS)),
-            )
-        });
+    let mut pending_requests = [
+        StepSelector::Exact { run: 0, number: 2 },
+        StepSelector::Minimum { run: 0, number: 3 },
+        StepSelector::Exact { run: 0, number: 5 },
+    ]
+    .map(|selector| {
+        Box::pin(scene_handle.request_output(selector, OutputSpec::Vertices(VertexAttributes::POSITIONS_AND_NORMALS)))
+    });
     for pending_request in &mut pending_requests {
         // One poll registers the request.
         assert!(
@@ -317,14 +326,14 @@ async fn requests_wait_for_exact_and_minimum_steps() {
     }
     // The request for at least step 3 gets step 4, because there is no step 3.
     assert_eq!(step_numbers, [2, 4, 5]);
-    let request_step = |step| v1::GetVerticesRequest { step: Some(step), ..vertex_request("strips") };
-    use v1::get_vertices_request::Step::{ExactStep, MinimumStep};
-    let status = get_vertices(&server, request_step(ExactStep(4))).await.expect_err("expected an error of a past step");
+    let request_step = |step| v1::GetVerticesRequest { step, ..vertex_request("strips") };
+    let status =
+        get_vertices(&server, request_step(exact_step(4))).await.expect_err("expected an error of a past step");
     assert_eq!(status.code(), tonic::Code::FailedPrecondition);
     let rejection = crate::service_harness::rejection_details(&status);
-    assert!(rejection.given == "4" && rejection.expected.starts_with('5'), "{rejection:?}");
+    assert!(rejection.given == "4" && rejection.expected.starts_with("run 1, step 5"), "{rejection:?}");
     let start = std::time::Instant::now();
-    let unanswered_request = v1::GetVerticesRequest { deadline_ms: 80, ..request_step(MinimumStep(99)) };
+    let unanswered_request = v1::GetVerticesRequest { deadline_ms: 80, ..request_step(minimum_step(99)) };
     let status = get_vertices(&server, unanswered_request).await.expect_err("expected a timeout");
     assert_eq!(status.code(), tonic::Code::DeadlineExceeded);
     let elapsed = start.elapsed();

@@ -8,7 +8,6 @@ use modalcast::engine::{Delivery, DeviceContext, FrameOutput, OutputBody, Output
 use modalcast_model::backend_settings::BackendSettings;
 use modalcast_model::scene::{Camera, FrameSize, Lens};
 use modalcast_proto::v1;
-use v1::Policy;
 use v1::drive_scene_response::Kind as ResponseKind;
 
 use crate::service_harness::{Server, state_after_steps, step, strips_with_attributes, with_timeout};
@@ -96,7 +95,7 @@ async fn frames_of_many_cameras_show_their_own_step() {
     );
     let _unread_subscription =
         scene_handle.subscribe(frame_output(cameras[0]), Delivery::Latest).await.expect("expected a subscription");
-    let mut writer = server.drive("attributes", Policy::Lossless, 40).await;
+    let mut writer = server.drive("attributes", v1::Delivery::Lossless, 40).await;
     for step in steps() {
         writer.send_step(step).await;
     }
@@ -141,7 +140,7 @@ async fn closing_a_scene_delivers_frames_in_flight() {
     let scene_handle = Arc::clone(&server.engine.find("attributes").expect("expected an open scene"));
     let mut subscription =
         scene_handle.subscribe(frame_output(cameras[0]), Delivery::Lossless).await.expect("expected a subscription");
-    let writer = server.drive("attributes", Policy::Lossless, 40).await;
+    let writer = server.drive("attributes", v1::Delivery::Lossless, 40).await;
     for step in steps().into_iter().take(12) {
         writer.send_step(step).await;
     }

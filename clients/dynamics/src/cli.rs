@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
-use modalcast_client::Policy;
+use modalcast_client::Delivery;
 use modalcast_dynamics::bridge::LoadDirection;
 
 const EXAMPLES: &str = "\
@@ -97,10 +97,11 @@ pub(crate) struct CommonOptions {
     pub(crate) dt: f64,
     /// lossless: process every step; latest: skip to the newest step.
     #[arg(long, value_enum, default_value = "lossless")]
-    pub(crate) policy: PolicyOption,
-    /// Maximum number of steps in flight; 0 selects the server's default.
-    #[arg(long, default_value_t = 0)]
-    pub(crate) window: u32,
+    pub(crate) delivery: DeliveryOption,
+    /// Wait for acknowledgements, so that at most this many steps are in flight. 0 selects the server's default. Without
+    /// this option the server slows the process down by flow control.
+    #[arg(long, value_name = "STEPS")]
+    pub(crate) window: Option<u32>,
     /// Run in real time instead of as fast as possible.
     #[arg(long)]
     pub(crate) realtime: bool,
@@ -113,16 +114,16 @@ pub(crate) struct CommonOptions {
 }
 
 #[derive(Debug, Clone, Copy, ValueEnum)]
-pub(crate) enum PolicyOption {
+pub(crate) enum DeliveryOption {
     Lossless,
     Latest,
 }
 
-impl From<PolicyOption> for Policy {
-    fn from(option: PolicyOption) -> Self {
+impl From<DeliveryOption> for Delivery {
+    fn from(option: DeliveryOption) -> Self {
         match option {
-            PolicyOption::Lossless => Self::Lossless,
-            PolicyOption::Latest => Self::Latest,
+            DeliveryOption::Lossless => Self::Lossless,
+            DeliveryOption::Latest => Self::Latest,
         }
     }
 }

@@ -70,7 +70,7 @@ async fn run_scenario(arguments: &Cli) -> Result<RunSummary> {
     let options = RunOptions {
         steps: common.step_count(),
         dt: common.dt,
-        policy: common.policy.into(),
+        delivery: common.delivery.into(),
         window: common.window,
         realtime: common.realtime,
         record_folder: common.record.clone(),

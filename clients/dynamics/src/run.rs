@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
 use modalcast_client::npy::Writer as NpyWriter;
-use modalcast_client::{Client, Error as ClientError, Policy, StageSamples, Step, StepStream};
+use modalcast_client::{Client, Delivery, DriveRequest, Error as ClientError, StageSamples, Step, StepStream};
 use serde_json::{Value, json};
 use tokio::sync::watch;
 
@@ -51,9 +51,9 @@ pub struct RunOptions {
     pub steps: Option<u64>,
     /// Seconds per step.
     pub dt: f64,
-    pub policy: Policy,
+    pub delivery: Delivery,
     /// Maximum number of steps in flight. 0 selects the server's default.
-    pub window: u32,
+    pub window: Option<u32>,
     /// Whether to run in real time.
     pub realtime: bool,
     /// Folder for q.npy (steps x coordinates) and transforms.npy (steps x domains x 12), f32.
@@ -94,7 +94,9 @@ pub async fn drive_scene(
     stop_receiver: &watch::Receiver<bool>,
 ) -> Result<RunSummary> {
     let scene = scenario.model().scene.clone();
-    let mut step_stream = client.drive(&scene, options.policy, options.window).await?;
+    let request = DriveRequest::new(&scene, options.delivery);
+    let request = options.window.into_iter().fold(request, DriveRequest::window);
+    let mut step_stream = client.drive(&request).await?;
     let create_recorder = |folder| Recorder::create(folder, scenario.model());
     let mut recorder = options.record_folder.as_deref().map(create_recorder).transpose()?;
     let progress_bar = create_progress_bar(options.steps);

@@ -170,7 +170,7 @@ async fn auto_selects_tree_or_sweep_by_scene() {
         let server = Arc::new(server);
         let rest_positions = server.output().positions;
         let url = serve(Arc::clone(&server)).await;
-        let arguments = ["auto", "--scene", "toy", "--open", "toy", "--steps", "25", "--policy", "latest", "--json"];
+        let arguments = ["auto", "--scene", "toy", "--open", "toy", "--steps", "25", "--delivery", "latest", "--json"];
         let sim_output = run_sim(&url, &arguments).await;
         assert!(sim_output.exit_code == 0 && sim_output.stderr.contains(scenario), "{}", sim_output.stderr);
         assert_eq!(sim_output.report()["steps_sent"].as_u64(), Some(25));

@@ -1,7 +1,8 @@
 //! Errors of the client. A rejection by the server names the field, the expected value and the received value.
 
 use modalcast_proto::v1;
-use prost::Message as _;
+pub use modalcast_proto::v1::Reason;
+use tonic_types::StatusExt as _;
 
 /// The result type of this crate.
 pub type Result<T, E = Error> = std::result::Result<T, E>;
@@ -11,6 +12,9 @@ pub type Result<T, E = Error> = std::result::Result<T, E>;
 pub struct Rejection {
     /// The number of the rejected step; `None` for other requests.
     pub step: Option<u64>,
+    /// `Unspecified` if the server is newer than this client and has sent an unknown reason.
+    pub reason: Reason,
+    /// Path of the invalid field in the request; empty if no field is invalid.
     pub field: String,
     pub expected: String,
     pub given: String,
@@ -18,7 +22,25 @@ pub struct Rejection {
 
 impl From<v1::Rejection> for Rejection {
     fn from(wire: v1::Rejection) -> Self {
-        Self { step: wire.step, field: wire.field, expected: wire.expected, given: wire.given }
+        let reason = wire.reason();
+        Self { step: wire.step, reason, field: wire.field, expected: wire.expected, given: wire.given }
+    }
+}
+
+impl Rejection {
+    /// Reads the standard details of an error status. `None` if the status is not from a modalcast server.
+    fn from_details(status: &tonic::Status) -> Option<Self> {
+        let mut error_info = status.get_details_error_info().filter(|error_info| error_info.domain == "modalcast")?;
+        let violations = status.get_details_bad_request().map(|bad_request| bad_request.field_violations);
+        let mut metadata = |key| error_info.metadata.remove(key).unwrap_or_default();
+        let (expected, given) = (metadata("expected"), metadata("given"));
+        Some(Self {
+            step: None,
+            reason: Reason::from_str_name(&error_info.reason).unwrap_or(Reason::Unspecified),
+            field: violations.and_then(|mut list| list.pop()).map_or_else(String::new, |violation| violation.field),
+            expected,
+            given,
+        })
     }
 }
 
@@ -27,7 +49,10 @@ impl std::fmt::Display for Rejection {
         if let Some(step) = self.step {
             write!(out, "step {step}: ")?;
         }
-        write!(out, "{}: expected {}, got {}", self.field, self.expected, self.given)
+        if !self.field.is_empty() {
+            write!(out, "{}: ", self.field)?;
+        }
+        write!(out, "expected {}, got {}", self.expected, self.given)
     }
 }
 
@@ -87,13 +112,8 @@ impl Error {
         if is_connection_lost(&status) {
             return Self::Connect { url: url.to_owned(), reason: describe_causes(&status) };
         }
-        let has_details = !status.details().is_empty();
-        let rejection = has_details.then(|| v1::Rejection::decode(status.details()).ok()).flatten();
-        Self::Status {
-            code: status.code(),
-            message: status.message().to_owned(),
-            rejection: rejection.map(|wire| Box::new(wire.into())),
-        }
+        let rejection = Rejection::from_details(&status).map(Box::new);
+        Self::Status { code: status.code(), message: status.message().to_owned(), rejection }
     }
 }
 
@@ -117,15 +137,31 @@ pub(crate) fn describe_causes(error: &dyn std::error::Error) -> String {
 
 #[cfg(test)]
 mod tests {
+    use std::collections::HashMap;
+
+    use tonic_types::ErrorDetails;
+
     use super::*;
 
     #[test]
     fn only_valid_status_details_become_a_rejection() {
-        let wire = v1::Rejection { step: Some(4), field: "q".into(), expected: "80".into(), given: "79".into() };
-        let status = |details: Vec<u8>| tonic::Status::with_details(tonic::Code::InvalidArgument, "no", details.into());
-        let error = Error::from_status(status(wire.encode_to_vec()), "server:1");
-        assert_eq!(error.rejection().map(ToString::to_string).as_deref(), Some("step 4: q: expected 80, got 79"));
-        assert_eq!(Error::from_status(status(vec![0xff, 0xff, 0xff]), "server:1").rejection(), None);
+        let details = |domain: &str| {
+            let texts = [("expected", "80 bytes"), ("given", "79 bytes")];
+            let metadata: HashMap<String, String> =
+                texts.iter().map(|(key, text)| ((*key).to_owned(), (*text).to_owned())).collect();
+            let mut details = ErrorDetails::with_error_info("REASON_INVALID_FIELD", domain, metadata);
+            details.add_bad_request_violation("q", "wrong length");
+            tonic::Status::with_error_details(tonic::Code::InvalidArgument, "no", details)
+        };
+        let error = Error::from_status(details("modalcast"), "server:1");
+        let rejection = error.rejection().expect("expected a rejection");
+        assert_eq!(
+            (rejection.reason, rejection.to_string().as_str()),
+            (Reason::InvalidField, "q: expected 80 bytes, got 79 bytes")
+        );
+        assert_eq!(Error::from_status(details("other.service"), "server:1").rejection(), None);
+        let invalid_details = tonic::Status::with_details(tonic::Code::Internal, "no", vec![0xff; 3].into());
+        assert_eq!(Error::from_status(invalid_details, "server:1").rejection(), None);
         assert_eq!(Error::from_status(tonic::Status::not_found("scene"), "server:1").rejection(), None);
     }
 }

@@ -141,11 +141,10 @@ impl Client {
     /// `Status` if the scene or the step does not exist or the deadline passed; `Malformed` if the reply contradicts
     /// itself; `Connect` if the connection is lost.
     pub async fn render_frame(&self, request: &FrameRequest) -> Result<Frame> {
-        use v1::render_frame_request::Step;
         let wire = v1::RenderFrameRequest {
             scene: request.scene.clone(),
             picture: Some(request.query.into()),
-            step: request.step.to_wire(Step::ExactStep, Step::MinimumStep),
+            step: request.step.to_wire(),
             deadline_ms: request.deadline_ms,
         };
         let messages = self.replies(FrameServiceClient::new(self.channel.clone()).render_frame(wire).await)?;

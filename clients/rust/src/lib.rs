@@ -17,7 +17,7 @@ mod upload;
 mod vertices;
 
 pub use client::{Client, REPLY_LIMIT, SceneList, ServerInfo};
-pub use error::{Error, Rejection, Result};
+pub use error::{Error, Reason, Rejection, Result};
 pub use frames::{
     Camera, DrawnBy, Frame, FrameFormat, FrameRequest, FrameStream, FrameStreamRequest, Lens, Output, Picture, View,
 };
@@ -28,7 +28,7 @@ pub use request::{Delivery, StepRequest, StepSelector, Subscription};
 pub use scene::{Attachment, Domain, DomainArray, ModeRows, SceneDescription};
 pub use stages::{StageSamples, StageTimes};
 pub use step::{DomainTransform, Step};
-pub use step_stream::{Ack, Policy, StepStream, StreamSummary};
+pub use step_stream::{Ack, DriveRequest, StepStream, StreamSummary};
 pub use tonic::Code;
 pub use vertices::{VertexRequest, VertexSelection, VertexSet, VertexSetDomain, VertexStream, VertexStreamRequest};
 

@@ -103,12 +103,11 @@ impl Client {
     /// `Status` if the scene or the step does not exist, the rectangle is outside the picture, or the deadline passed;
     /// `Malformed` if the reply contradicts itself; `Connect` if the connection is lost.
     pub async fn pick(&self, request: &PickRequest) -> Result<PickResult> {
-        use v1::pick_request::Step;
         let PickRectangle { picture, x, y, width, height, omit_modes } = request.query;
         let wire = v1::PickRequest {
             scene: request.scene.clone(),
             picture: Some(picture.into()),
-            step: request.step.to_wire(Step::ExactStep, Step::MinimumStep),
+            step: request.step.to_wire(),
             deadline_ms: request.deadline_ms,
             x,
             y,

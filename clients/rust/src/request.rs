@@ -9,20 +9,20 @@ pub enum StepSelector {
     /// The newest state; the rest state before the first step.
     #[default]
     Current,
-    /// Exactly this step of the current run. The server rejects a step that it no longer has.
-    Exact(u64),
-    /// This step of the current run or a later one.
-    Minimum(u64),
+    /// Exactly this step. The server rejects a step that it no longer has. A run of 0 is that of the latest writer.
+    Exact { run: u64, number: u64 },
+    /// This step or a later one. The steps of a later run come after those of an earlier one.
+    Minimum { run: u64, number: u64 },
 }
 
 impl StepSelector {
-    /// Converts to the field `step` of a wire request. Each request message has its own type `S` of this field; `exact`
-    /// and `minimum` construct its variants.
-    pub(crate) fn to_wire<S>(self, exact: fn(u64) -> S, minimum: fn(u64) -> S) -> Option<S> {
+    /// Converts to the field `step` of a wire request.
+    pub(crate) const fn to_wire(self) -> Option<v1::StepSelector> {
+        use v1::step_selector::Number;
         match self {
             Self::Current => None,
-            Self::Exact(step) => Some(exact(step)),
-            Self::Minimum(step) => Some(minimum(step)),
+            Self::Exact { run, number } => Some(v1::StepSelector { run, number: Some(Number::Exact(number)) }),
+            Self::Minimum { run, number } => Some(v1::StepSelector { run, number: Some(Number::Minimum(number)) }),
         }
     }
 }
@@ -50,16 +50,16 @@ impl<Q> StepRequest<Q> {
         self
     }
 
-    /// Selects [`StepSelector::Exact`].
+    /// Selects [`StepSelector::Exact`] of the latest run.
     #[must_use]
-    pub fn exact_step(self, step: u64) -> Self {
-        self.step(StepSelector::Exact(step))
+    pub fn exact_step(self, number: u64) -> Self {
+        self.step(StepSelector::Exact { run: 0, number })
     }
 
-    /// Selects [`StepSelector::Minimum`].
+    /// Selects [`StepSelector::Minimum`] of the latest run.
     #[must_use]
-    pub fn minimum_step(self, step: u64) -> Self {
-        self.step(StepSelector::Minimum(step))
+    pub fn minimum_step(self, number: u64) -> Self {
+        self.step(StepSelector::Minimum { run: 0, number })
     }
 
     /// Sets [`Self::deadline_ms`].
@@ -101,13 +101,13 @@ impl<Q> Subscription<Q> {
     }
 }
 
-/// Which steps a subscriber receives.
+/// Which steps a stream carries.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub enum Delivery {
-    /// Every step, in order; back-pressure from a slow reader slows the writer.
+    /// Every step, in order. A slow reader slows the writer down.
     #[default]
     Lossless,
-    /// The newest step. Each reply states the number of steps skipped since the previous reply.
+    /// The newest step. A reader skips steps, and the steps of a writer are merged; both are counted.
     Latest,
 }
 
@@ -125,18 +125,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn step_selector_converts_to_the_variants_of_each_message() {
-        use v1::{get_vertices_request, render_frame_request};
+    fn last_selector_of_a_request_is_sent() {
         let request = StepRequest::new("toy", ()).minimum_step(3).exact_step(7).deadline_ms(20);
-        // The last selector wins.
-        assert_eq!((request.step, request.deadline_ms), (StepSelector::Exact(7), 20));
-        let frame_step = |step: StepSelector| {
-            step.to_wire(render_frame_request::Step::ExactStep, render_frame_request::Step::MinimumStep)
-        };
-        assert_eq!(frame_step(request.step), Some(render_frame_request::Step::ExactStep(7)));
-        assert_eq!(frame_step(StepSelector::Current), None);
-        let selector = StepSelector::Minimum(4);
-        let step = selector.to_wire(get_vertices_request::Step::ExactStep, get_vertices_request::Step::MinimumStep);
-        assert_eq!(step, Some(get_vertices_request::Step::MinimumStep(4)));
+        assert_eq!((request.step, request.deadline_ms), (StepSelector::Exact { run: 0, number: 7 }, 20));
+        let wire = request.step.to_wire().expect("expected a selector");
+        assert_eq!((wire.run, wire.number), (0, Some(v1::step_selector::Number::Exact(7))));
+        let wire = StepSelector::Minimum { run: 2, number: 4 }.to_wire().expect("expected a selector");
+        assert_eq!((wire.run, wire.number), (2, Some(v1::step_selector::Number::Minimum(4))));
+        assert_eq!(StepSelector::Current.to_wire(), None);
     }
 }

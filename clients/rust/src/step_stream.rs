@@ -16,6 +16,7 @@ use v1::drive_scene_response::Kind as ResponseKind;
 use crate::assemble::Replies;
 use crate::client::Client;
 use crate::error::{Error, Rejection, Result, malformed_reply};
+use crate::request::Delivery;
 use crate::stages::{self, StageTimes};
 use crate::step::Step;
 
@@ -23,13 +24,70 @@ use crate::step::Step;
 /// dropped; [`StreamSummary::rejected`] counts all rejections.
 const MAX_STORED: usize = 1024;
 
-/// How the server handles steps that arrive faster than it processes them.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Policy {
-    /// Every step is deformed, in order, and delivered to each lossless subscriber.
-    Lossless,
-    /// Only the newest state is processed; steps in between are merged into it and counted.
-    Latest,
+/// Steps that wait inside this process for the connection.
+const QUEUED_STEPS: usize = 8;
+
+/// Describes a step stream before it is opened.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct DriveRequest {
+    scene: String,
+    delivery: Delivery,
+    window: Option<u32>,
+    lease_token: Vec<u8>,
+    takes_over: bool,
+    resets: bool,
+}
+
+impl DriveRequest {
+    /// A writer of the scene that starts from the current state. With [`Delivery::Lossless`], sending waits while the
+    /// server has no capacity.
+    pub fn new(scene: &str, delivery: Delivery) -> Self {
+        let (window, lease_token) = (None, Vec::new());
+        Self { scene: scene.to_owned(), delivery, window, lease_token, takes_over: false, resets: false }
+    }
+
+    /// Limits the steps in flight (sent and not yet acknowledged): [`StepStream::step`] waits for acknowledgements.
+    /// 0 selects the server's default. The server may grant fewer.
+    #[must_use]
+    pub fn window(mut self, steps: u32) -> Self {
+        self.window = Some(steps);
+        self
+    }
+
+    /// Replaces the writer that has this token, which is [`StepStream::lease_token`] of an earlier stream.
+    #[must_use]
+    pub fn lease_token(mut self, token: &[u8]) -> Self {
+        self.lease_token = token.to_vec();
+        self
+    }
+
+    /// Replaces any writer of the scene.
+    #[must_use]
+    pub fn take_over(mut self) -> Self {
+        self.takes_over = true;
+        self
+    }
+
+    /// Lets the first step start from the rest state.
+    #[must_use]
+    pub fn reset(mut self) -> Self {
+        self.resets = true;
+        self
+    }
+
+    fn to_wire(&self) -> v1::OpenDrive {
+        let overflow = if self.window.is_some() { v1::Overflow::Reject } else { v1::Overflow::Block };
+        let initial_state = if self.resets { v1::InitialState::Reset } else { v1::InitialState::Keep };
+        v1::OpenDrive {
+            scene: self.scene.clone(),
+            delivery: v1::Delivery::from(self.delivery).into(),
+            overflow: overflow.into(),
+            window: self.window.unwrap_or_default(),
+            lease_token: self.lease_token.clone().into(),
+            take_over: self.takes_over,
+            initial_state: initial_state.into(),
+        }
+    }
 }
 
 /// One acknowledgement: the server has processed all steps up to `step`, or merged them into a newer step.
@@ -74,10 +132,13 @@ struct Progress {
 
 /// A step stream to one scene. Dropping it ends the stream and releases the scene.
 pub struct StepStream {
-    /// The number of this run; every new writer of the scene increments it.
+    /// The run of this writer; later writers of the server have larger runs.
     pub run: u64,
-    /// Maximum number of steps in flight: sent and not yet acknowledged.
-    pub window: usize,
+    /// Maximum number of steps in flight: sent and not yet acknowledged. `None` if the server slows this client down by
+    /// flow control instead.
+    pub window: Option<usize>,
+    /// Identifies this writer: a later stream with this token replaces it at once, for example after a lost connection.
+    pub lease_token: Vec<u8>,
     /// The scene at the time the stream opened.
     pub scene: v1::SceneInfo,
     requests: Option<mpsc::Sender<v1::DriveSceneRequest>>,
@@ -89,20 +150,14 @@ pub struct StepStream {
 }
 
 impl Client {
-    /// Opens a step stream and makes this client the writer of the scene. A `window` of 0 selects the server's default;
-    /// [`StepStream::window`] is the granted window.
+    /// Opens a step stream and makes this client the writer of the scene.
     ///
     /// # Errors
     /// `Rejected` or `Status` if the scene does not exist or has another writer.
-    pub async fn drive(&self, scene: &str, policy: Policy, window: u32) -> Result<StepStream> {
-        let policy = match policy {
-            Policy::Lossless => v1::Policy::Lossless,
-            Policy::Latest => v1::Policy::Latest,
-        };
+    pub async fn drive(&self, request: &DriveRequest) -> Result<StepStream> {
         // When the queue is full, sending a step waits.
-        let (requests, queue) = mpsc::channel(64);
-        let open = v1::OpenDrive { scene: scene.to_owned(), policy: policy.into(), window };
-        let open_request = v1::DriveSceneRequest { kind: Some(RequestKind::Open(open)) };
+        let (requests, queue) = mpsc::channel(QUEUED_STEPS);
+        let open_request = v1::DriveSceneRequest { kind: Some(RequestKind::Open(request.to_wire())) };
         requests
             .send(open_request)
             .await
@@ -122,7 +177,8 @@ impl Client {
         let reader = tokio::spawn(read_replies(replies, Arc::clone(&progress), change_sender));
         Ok(StepStream {
             run: opened.run,
-            window: (opened.window as usize).max(1),
+            window: request.window.map(|_| (opened.window as usize).max(1)),
+            lease_token: opened.lease_token.to_vec(),
             scene: opened.scene.unwrap_or_default(),
             requests: Some(requests),
             progress,
@@ -134,7 +190,7 @@ impl Client {
 }
 
 impl StepStream {
-    /// Sends a step as soon as the window has capacity.
+    /// Sends a step as soon as the server or the window has capacity.
     ///
     /// # Errors
     /// `Rejected` reports the oldest unreported rejection. It names the rejected step, usually an earlier one; the step
@@ -142,7 +198,7 @@ impl StepStream {
     /// not sent because its transforms have several formats; the stream stays open. Every other error ends the stream.
     pub async fn step(&mut self, step: &Step) -> Result<()> {
         step.check_formats()?;
-        self.wait_until(|progress, window| progress.in_flight.len() < window).await?;
+        self.wait_until(|progress, window| window.is_none_or(|window| progress.in_flight.len() < window)).await?;
         lock(&self.progress).in_flight.push_back(step.number());
         let message = v1::DriveSceneRequest { kind: Some(RequestKind::Step(step.to_wire())) };
         let requests = self.requests.as_ref().ok_or(Error::StreamEnded { awaited_reply: "the reply to this step" })?;
@@ -212,7 +268,7 @@ impl StepStream {
     }
 
     /// Waits until `condition` holds for the progress and the window. Fails if the stream has ended.
-    async fn wait_until(&mut self, condition: impl Fn(&Progress, usize) -> bool) -> Result<()> {
+    async fn wait_until(&mut self, condition: impl Fn(&Progress, Option<usize>) -> bool) -> Result<()> {
         loop {
             // Mark the last change as seen before `progress` is read, so that a later change ends the wait below.
             self.progress_changes.borrow_and_update();
@@ -303,9 +359,16 @@ fn lock(progress: &Mutex<Progress>) -> MutexGuard<'_, Progress> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::error::Reason;
 
     fn rejection(step: u64) -> Rejection {
-        Rejection { step: Some(step), field: "q".into(), expected: "4 bytes".into(), given: "3 bytes".into() }
+        Rejection {
+            step: Some(step),
+            reason: Reason::InvalidField,
+            field: "q".into(),
+            expected: "4 bytes".into(),
+            given: "3 bytes".into(),
+        }
     }
 
     #[test]

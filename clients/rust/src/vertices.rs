@@ -83,11 +83,10 @@ impl Client {
     /// `Status` if the scene, a domain or the step does not exist, the scene does not enable a requested attribute, or
     /// the deadline passed; `Malformed` if the reply contradicts itself; `Connect` if the connection is lost.
     pub async fn get_vertices(&self, request: &VertexRequest) -> Result<VertexSet> {
-        use v1::get_vertices_request::Step;
         let wire = v1::GetVerticesRequest {
             scene: request.scene.clone(),
             selection: Some(request.query.clone()),
-            step: request.step.to_wire(Step::ExactStep, Step::MinimumStep),
+            step: request.step.to_wire(),
             deadline_ms: request.deadline_ms,
         };
         let messages = self.replies(VertexServiceClient::new(self.channel.clone()).get_vertices(wire).await)?;

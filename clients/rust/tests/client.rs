@@ -7,7 +7,8 @@ use std::time::Duration;
 
 use fake::{FakeDomain, FakeServer, serve};
 use modalcast_client::{
-    Client, DomainArray, DrawnBy, Error, FrameFormat, FrameRequest, FrameStreamRequest, Picture, Policy, Step,
+    Client, Delivery, DomainArray, DrawnBy, DriveRequest, Error, FrameFormat, FrameRequest, FrameStreamRequest,
+    Picture, Step,
 };
 use modalcast_client::{VertexRequest, VertexSelection, VertexStreamRequest};
 use tokio::sync::Semaphore;
@@ -56,7 +57,7 @@ async fn arrays_and_modes_above_4_mib_arrive_complete() {
 #[tokio::test]
 async fn frame_above_4_mib_arrives_complete_and_names_its_step() {
     let (_, client) = connect(one_domain_server(4)).await;
-    let mut step_stream = client.drive("toy", Policy::Lossless, 0).await.expect("a step stream");
+    let mut step_stream = client.drive(&DriveRequest::new("toy", Delivery::Lossless)).await.expect("a step stream");
     step_stream.step(&Step::new(5, 0.1).q(0, &[1.0, 2.0])).await.expect("a sent step");
     step_stream.flush().await.expect("acknowledged steps");
     let request = FrameRequest::new("toy", picture(1920, 1080)).minimum_step(5);
@@ -75,8 +76,9 @@ async fn subscription_before_the_first_step_receives_every_step() {
     let mut frames = client.stream_frames(&request).await.expect("a subscription");
     let request = VertexStreamRequest::new("toy", VertexSelection::default()).max_replies(20);
     let mut sets = client.stream_vertices(&request).await.expect("a subscription");
-    let mut step_stream = client.drive("toy", Policy::Lossless, 3).await.expect("a step stream");
-    assert_eq!((step_stream.run, step_stream.window), (1, 3));
+    let mut step_stream =
+        client.drive(&DriveRequest::new("toy", Delivery::Lossless).window(3)).await.expect("a step stream");
+    assert_eq!((step_stream.run, step_stream.window), (1, Some(3)));
     for number in 0..20 {
         step_stream.step(&Step::new(number, 0.0).q(0, &[number as f32, 0.0])).await.expect("a sent step");
     }
@@ -99,7 +101,8 @@ async fn step_beyond_the_window_waits_for_an_acknowledgement() {
     let mut slow_server = one_domain_server(4);
     (slow_server.window, slow_server.ack_permits) = (2, Semaphore::new(0));
     let (server, client) = connect(slow_server).await;
-    let mut step_stream = client.drive("toy", Policy::Lossless, 0).await.expect("a step stream");
+    let mut step_stream =
+        client.drive(&DriveRequest::new("toy", Delivery::Lossless).window(0)).await.expect("a step stream");
     let step = |number| Step::new(number, 0.0).q(0, &[0.0, 0.0]);
     step_stream.step(&step(0)).await.expect("capacity in the window");
     step_stream.step(&step(1)).await.expect("capacity in the window");
@@ -114,7 +117,7 @@ async fn step_beyond_the_window_waits_for_an_acknowledgement() {
 #[tokio::test]
 async fn rejected_step_is_a_typed_error_and_stream_stays_open() {
     let (server, client) = connect(one_domain_server(4)).await;
-    let mut step_stream = client.drive("toy", Policy::Lossless, 0).await.expect("a step stream");
+    let mut step_stream = client.drive(&DriveRequest::new("toy", Delivery::Lossless)).await.expect("a step stream");
     step_stream.step(&Step::new(0, 0.0).q(0, &[1.0])).await.ok();
     let error = step_stream.flush().await.expect_err("one of two coordinates");
     let rejection = error.rejection().expect("a rejection").clone();
@@ -129,12 +132,16 @@ async fn rejected_step_is_a_typed_error_and_stream_stays_open() {
 #[tokio::test]
 async fn second_writer_is_rejected_until_the_first_is_dropped() {
     let (_, client) = connect(one_domain_server(4)).await;
-    let first_writer = client.drive("toy", Policy::Lossless, 0).await.expect("a step stream");
-    let error = client.drive("toy", Policy::Latest, 0).await.err().expect("a rejection of the second writer");
+    let first_writer = client.drive(&DriveRequest::new("toy", Delivery::Lossless)).await.expect("a step stream");
+    let error = client
+        .drive(&DriveRequest::new("toy", Delivery::Latest))
+        .await
+        .err()
+        .expect("a rejection of the second writer");
     assert!(error.to_string().contains("another run"), "{error}");
     drop(first_writer);
     let start = std::time::Instant::now();
-    while let Err(error) = client.drive("toy", Policy::Latest, 0).await {
+    while let Err(error) = client.drive(&DriveRequest::new("toy", Delivery::Latest)).await {
         assert!(start.elapsed() < Duration::from_secs(5), "{error}");
         tokio::time::sleep(Duration::from_millis(20)).await;
     }
@@ -186,7 +193,7 @@ async fn lost_connection_names_the_server_in_calls_and_streams() {
     let server = serve(Arc::new(one_domain_server(4))).await;
     let (url, mut connections) = forward(&server).await;
     let client = Client::connect(&url).await.expect("a connection");
-    let mut step_stream = client.drive("toy", Policy::Lossless, 0).await.expect("a step stream");
+    let mut step_stream = client.drive(&DriveRequest::new("toy", Delivery::Lossless)).await.expect("a step stream");
     let request = FrameStreamRequest::new("toy", picture(8, 8));
     let mut frames = client.stream_frames(&request).await.expect("a subscription");
     connections.shutdown().await;
@@ -272,7 +279,7 @@ async fn fetch_saves_files_and_exits_with_documented_codes() {
     let client = Client::connect(&url).await.expect("a connection");
     let folder = tempfile::tempdir().expect("a folder");
     let path = |name: &str| folder.path().join(name).display().to_string();
-    let mut step_stream = client.drive("toy", Policy::Lossless, 0).await.expect("a step stream");
+    let mut step_stream = client.drive(&DriveRequest::new("toy", Delivery::Lossless)).await.expect("a step stream");
     // The time at which the program subscribes is unknown, so send steps until it ends.
     let send_task = tokio::spawn(async move {
         for number in 0.. {

@@ -134,7 +134,7 @@ fn run_processes(args: &Args, input: &DemoScene, temporary_folder: &std::path::P
         &frame_count,
         "--dt",
         &dt,
-        "--policy",
+        "--delivery",
         "lossless",
         "--record",
         &record_folder,

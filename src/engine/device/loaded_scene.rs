@@ -280,9 +280,9 @@ impl LoadedScene {
             .partition_point(|domain_layout| domain_layout.first_vertex <= vertex)
             .saturating_sub(1);
         let max_q = state.q_of(&scene, domain).iter().fold(0.0_f32, |max, q| max.max(q.abs()));
-        let given = format!("vertex {vertex} out of range, largest |q| {max_q:e}");
-        let field = format!("step.q of domain '{}'", scene.domains[domain].name);
-        Ok(invalid(field, format!("q and transform that keep every vertex within {MAX_COORDINATE:e}"), given))
+        let name = &scene.domains[domain].name;
+        let given = format!("vertex {vertex} of domain '{name}' out of range, largest |q| {max_q:e}");
+        Ok(invalid("step.q", format!("q and transform that keep every vertex within {MAX_COORDINATE:e}"), given))
     }
 }
 
@@ -324,7 +324,10 @@ mod tests {
             let mut overflowing_state = valid_state.clone();
             overflowing_state.q[first_q_of_right_strip] = q;
             let error = loaded_scene.deform(&overflowing_state).expect_err("expected an overflow").to_string();
-            assert!(error.starts_with("step.q of domain 'right'"), "expected the right strip, got {error}");
+            assert!(
+                error.starts_with("step.q: ") && error.contains("'right'"),
+                "expected the right strip, got {error}"
+            );
             assert_eq!(loaded_scene.surface().expect("expected vertices"), &expected_surface);
             assert!(loaded_scene.bounds().is_finite() && loaded_scene.light_bounds == expected_bounds);
         }

@@ -35,15 +35,18 @@ use std::time::Instant;
 use tokio::sync::{Notify, mpsc, oneshot, watch};
 
 use super::current_step::CurrentStep;
-use super::message::{AcquiredLease, Message};
+use super::lease::{AcquiredLease, InitialState, LeaseRequest, LeaseToken, WriterLease};
+use super::message::Message;
 use super::output_delivery::{DeliveryMode, OutputDelivery, SceneOnDevice};
-use super::step_queue::{CompletedStep, Policy, QueuedStep, StepQueue, WriterLease};
+use super::step_queue::{CompletedStep, QueuedStep, StepQueue};
 use crate::config::ValidatedConfig;
+use crate::engine::blocking::run_blocking;
 use crate::engine::catch_unwind::catch_unwind_async;
 use crate::engine::device::command::SceneId;
 use crate::engine::device::handle::{DeviceHandle, PendingReply};
 use crate::engine::output::step_output::StepId;
 use crate::engine::storage::checkpoint_store::{CheckpointStore, SceneCheckpoints};
+use crate::engine::storage::run_counter::RunCounter;
 use crate::telemetry::{Stage, StageTimes};
 use modalcast_model::deform::DeformSummary;
 use modalcast_model::error::{Error, Result, fault};
@@ -54,6 +57,7 @@ use modalcast_model::scene::{Scene, SceneState};
 pub(in crate::engine) struct SceneServices {
     pub device: DeviceHandle,
     pub checkpoints: Arc<CheckpointStore>,
+    pub run_counter: Arc<RunCounter>,
     pub config: Arc<ValidatedConfig>,
 }
 
@@ -76,8 +80,7 @@ pub(super) struct ActorParams {
 /// The current writer of a scene.
 struct Writer {
     step_queue: Arc<StepQueue>,
-    /// Address of the client, for errors.
-    peer: String,
+    token: LeaseToken,
     acquired_at: Instant,
 }
 
@@ -117,8 +120,11 @@ pub(super) struct SceneActor {
     id: SceneId,
     scene: Arc<Scene>,
     device: DeviceHandle,
+    run_counter: Arc<RunCounter>,
     /// The run of the latest writer; 0 before the first writer.
     run: u64,
+    /// Whether the next step starts from the rest state instead of the current one.
+    starts_from_rest: bool,
     writer: Option<Writer>,
     phase: StepPhase,
     current: CurrentStep,
@@ -134,7 +140,7 @@ pub(super) struct SceneActor {
 impl SceneActor {
     pub(super) fn new(params: ActorParams, services: SceneServices) -> Self {
         let ActorParams { name, id, scene, state, wake, last_step, failure, on_failure } = params;
-        let SceneServices { device, checkpoints, config } = services;
+        let SceneServices { device, checkpoints, run_counter, config } = services;
         let scene_on_device = SceneOnDevice { name: name.clone(), id, scene: Arc::clone(&scene) };
         Self {
             delivery: OutputDelivery::new(scene_on_device, device.clone(), &config),
@@ -143,7 +149,9 @@ impl SceneActor {
             id,
             scene,
             device,
+            run_counter,
             run: state.run,
+            starts_from_rest: false,
             writer: None,
             phase: StepPhase::Idle,
             current: CurrentStep::of_opened_scene(state),
@@ -174,8 +182,8 @@ impl SceneActor {
                 error = self.device.loss().wait() => return ActorEnd::DeviceLost(error),
                 message = mailbox.recv() => match message {
                     Some(Message::Stop { error, done }) => return ActorEnd::Stopped { error, done: Some(done) },
-                    Some(message) => self.receive(message),
-                    None => return ActorEnd::Stopped { error: server_stopped_error(), done: None },
+                    Some(message) => self.receive(message).await,
+                    None => return ActorEnd::Stopped { error: Error::ShuttingDown, done: None },
                 },
                 () = self.wake.notified() => {}
                 () = sleep_until(stall_deadline) => {}
@@ -218,7 +226,10 @@ impl SceneActor {
         let Some(queued_step) = writer.step_queue.take() else { return false };
         let stages = queued_step.stages();
         let QueuedStep { update, merged, .. } = queued_step;
-        let mut state = SceneState::clone(&self.current.state);
+        let mut state = match self.starts_from_rest {
+            true => SceneState::rest(&self.scene),
+            false => SceneState::clone(&self.current.state),
+        };
         state.run = self.run;
         state.apply(&self.scene, &update);
         let state = Arc::new(state);
@@ -238,6 +249,7 @@ impl SceneActor {
         match deformed {
             Ok(deformed) => {
                 stages.push((Stage::Deform, deformed.ms));
+                self.starts_from_rest = false;
                 self.checkpoints.save(&state);
                 self.last_step.send_replace(Some(StepId::of(&state)));
                 self.current = CurrentStep { state, step_count: self.current.step_count + 1 + merged, stages };
@@ -252,11 +264,11 @@ impl SceneActor {
         }
     }
 
-    fn receive(&mut self, message: Message) {
+    async fn receive(&mut self, message: Message) {
         // A failed `send` below means that the caller no longer waits.
         match message {
-            Message::AcquireWriter { peer, policy, window, reply } => {
-                reply.send(self.acquire_writer(peer, policy, window)).ok();
+            Message::AcquireWriter { request, reply } => {
+                reply.send(self.acquire_writer(request).await).ok();
             }
             Message::Subscribe { subscriber, reply } => {
                 reply.send(self.delivery.add_subscriber(subscriber, &self.current)).ok();
@@ -269,17 +281,32 @@ impl SceneActor {
         }
     }
 
-    /// Admits one writer at a time; a writer whose queue is closed is replaced.
-    fn acquire_writer(&mut self, peer: String, policy: Policy, window: u32) -> Result<AcquiredLease> {
-        if let Some(writer) = self.writer.as_ref().filter(|writer| !writer.step_queue.is_closed()) {
-            let seconds = writer.acquired_at.elapsed().as_secs();
-            let holder = format!("{} has held it for {seconds} s (run {})", writer.peer, self.run);
-            return Err(Error::Taken { what: "writer lease", holder });
+    /// Admits one writer at a time. A writer replaces one whose queue is closed, one with the same token, and any writer
+    /// if it asks for that.
+    ///
+    /// # Errors
+    /// `LeaseTaken`; `Fault` when the run or the token cannot be created. The present writer then keeps the lease.
+    async fn acquire_writer(&mut self, request: LeaseRequest) -> Result<AcquiredLease> {
+        let LeaseRequest { delivery, overflow, window, token, takes_over, initial_state } = request;
+        let present_writer = self.writer.as_ref().filter(|writer| !writer.step_queue.is_closed());
+        if let Some(writer) = present_writer
+            && !takes_over
+            && token.as_ref() != Some(&writer.token)
+        {
+            return Err(Error::LeaseTaken { run: self.run, seconds: writer.acquired_at.elapsed().as_secs() });
         }
-        self.run += 1;
-        let step_queue = Arc::new(StepQueue::new(policy, window, Arc::clone(&self.wake)));
-        self.writer = Some(Writer { step_queue: Arc::clone(&step_queue), peer, acquired_at: Instant::now() });
-        Ok(AcquiredLease { lease: WriterLease { step_queue }, run: self.run })
+        let token = token.map_or_else(LeaseToken::random, Ok)?;
+        let run_counter = Arc::clone(&self.run_counter);
+        let run = run_blocking("counter of runs", move || run_counter.next()).await?;
+        if let Some(writer) = &self.writer {
+            writer.step_queue.end(Error::LeaseLost { run });
+        }
+        self.run = run;
+        self.starts_from_rest = initial_state == InitialState::Reset;
+        let step_queue = Arc::new(StepQueue::new(delivery, overflow, window, Arc::clone(&self.wake)));
+        let (acquired_at, lease) = (Instant::now(), WriterLease { step_queue: Arc::clone(&step_queue) });
+        self.writer = Some(Writer { step_queue, token: token.clone(), acquired_at });
+        Ok(AcquiredLease { lease, token, run })
     }
 
     /// Whether another step is queued. If so, readbacks of the current step are only started and overlap with the
@@ -332,10 +359,6 @@ impl SceneActor {
         self.failure.set(error.clone()).ok(); // A scene fails once.
         mem::replace(&mut self.on_failure, Box::new(|| {}))();
     }
-}
-
-fn server_stopped_error() -> Error {
-    Error::Unavailable { what: "scene", reason: "the server stops".into(), remedy: "Try again later".into() }
 }
 
 async fn sleep_until(deadline: Option<Instant>) {

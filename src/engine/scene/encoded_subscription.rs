@@ -4,7 +4,8 @@ use std::collections::VecDeque;
 
 use tokio::task::JoinHandle;
 
-use super::subscriber::{Delivery, Subscription};
+use super::delivery::Delivery;
+use super::subscriber::Subscription;
 use crate::engine::output::frame_encoder::{EncodedOutput, FrameEncoder, FrameFormat};
 use crate::engine::output::step_output::{OutputBody, StepOutput};
 use modalcast_model::error::{Error, Result, fault_in};

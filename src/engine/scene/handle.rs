@@ -8,9 +8,11 @@ use tokio::sync::mpsc::error::TrySendError;
 use tokio::sync::{Notify, mpsc, oneshot, watch};
 
 use super::actor::{ActorParams, SceneActor, SceneServices};
-use super::message::{AcquiredLease, Message, StepRequest, StepSelector};
-use super::step_queue::{Policy, QueuedStep, StepReport, WriterLease};
-use super::subscriber::{Delivery, Subscription};
+use super::delivery::Delivery;
+use super::lease::{AcquiredLease, LeaseRequest, LeaseToken, WriterLease};
+use super::message::{Message, StepRequest, StepSelector};
+use super::step_queue::{QueuedStep, StepReport};
+use super::subscriber::Subscription;
 use crate::engine::device::command::SceneId;
 use crate::engine::output::step_output::{OutputSpec, StepId, StepOutput};
 use crate::engine::storage::scene_catalog::SceneProvenance;
@@ -112,25 +114,25 @@ impl SceneHandle {
         *self.last_step.borrow()
     }
 
-    /// Acquires the writer lease. `peer` is the address of the client, for errors. The window is clamped to the range
+    /// Acquires the writer lease. `peer` is the address of the client, for the log. The window is clamped to the range
     /// from 1 to the configured limit.
     ///
     /// # Errors
-    /// `Taken` naming the current writer and how long it has held the lease; `NotFound` when the scene is closed;
-    /// `Busy` when the mailbox is full.
-    pub async fn drive(&self, peer: String, policy: Policy, window: u32) -> Result<WriterSession> {
-        let window = window.clamp(1, self.max_window);
-        let AcquiredLease { lease, run } =
-            self.call(|reply| Message::AcquireWriter { peer, policy, window, reply }).await?;
-        tracing::info!(scene = self.name, run, ?policy, "driven by a new writer");
-        Ok(WriterSession { lease, scene: Arc::clone(&self.scene), run, window, policy, last_number: None })
+    /// `LeaseTaken` with the run of the current writer and how long it has held the lease; `NotFound` when the scene is
+    /// closed; `Busy` when the mailbox is full; `Fault` when the run cannot be written to disk.
+    pub async fn drive(&self, peer: &str, request: LeaseRequest) -> Result<WriterSession> {
+        let request = LeaseRequest { window: request.window.clamp(1, self.max_window), ..request };
+        let (delivery, window) = (request.delivery, request.window);
+        let AcquiredLease { lease, token, run } = self.call(|reply| Message::AcquireWriter { request, reply }).await?;
+        tracing::info!(scene = self.name, run, peer, ?delivery, "driven by a new writer");
+        Ok(WriterSession { lease, scene: Arc::clone(&self.scene), run, window, token, last_number: None })
     }
 
     /// Subscribes to the scene's steps. The subscription is active when this returns.
     ///
     /// # Errors
-    /// `Unavailable` when frames are requested and there is no renderer; `Busy` when there are too many subscribers or
-    /// the mailbox is full; `NotFound` when the scene is closed.
+    /// `Unavailable` when frames are requested and there is no renderer; `LimitReached` when there are too many
+    /// subscribers; `Busy` when the mailbox is full; `NotFound` when the scene is closed.
     pub async fn subscribe(&self, spec: OutputSpec, delivery: Delivery) -> Result<Subscription> {
         self.check_spec(&spec)?;
         let (subscriber, subscription) = Subscription::new(spec, delivery, Arc::clone(&self.wake));
@@ -142,8 +144,8 @@ impl SceneHandle {
     /// already being produced.
     ///
     /// # Errors
-    /// `Gone` when the exact step has passed; `Unavailable` when there is no renderer; `Busy` when too many requests
-    /// wait; `NotFound` when the scene is closed.
+    /// `StepPassed` when the exact step has passed; `Unavailable` when there is no renderer; `Busy` when too many
+    /// requests wait; `NotFound` when the scene is closed.
     pub async fn request_output(&self, selector: StepSelector, spec: OutputSpec) -> Result<StepOutput> {
         self.check_spec(&spec)?;
         self.call(|reply| Message::Request(StepRequest { selector, spec, reply })).await
@@ -215,11 +217,11 @@ impl SceneHandle {
 pub struct WriterSession {
     lease: WriterLease,
     scene: Arc<Scene>,
-    /// This writer is the scene's `run`-th writer, counted from 1.
+    /// The run of this writer. Later writers of the server have larger runs.
     pub run: u64,
     /// Maximum number of unacknowledged steps.
     pub window: u32,
-    pub policy: Policy,
+    pub token: LeaseToken,
     /// Number of the last accepted step.
     last_number: Option<u64>,
 }
@@ -228,7 +230,7 @@ impl WriterSession {
     /// Validates and queues a step. A rejected step has no effect.
     ///
     /// # Errors
-    /// `Invalid` for a malformed step or a step beyond the window; the error with which the server ended the stream.
+    /// `Invalid` for a malformed step; `WindowFull` for a step beyond the window; the error with which the server ended the stream.
     pub fn push_step(&mut self, raw: &RawStepUpdate) -> Result<()> {
         let begin = Instant::now();
         if let Some(last_number) = self.last_number.filter(|last_number| raw.number <= *last_number) {
@@ -238,6 +240,11 @@ impl WriterSession {
         self.lease.step_queue.push(QueuedStep::new(update, ms_since(begin)))?;
         self.last_number = Some(raw.number);
         Ok(())
+    }
+
+    /// Whether the writer may read another step now. If not, it may after the next report.
+    pub fn may_read_step(&self) -> bool {
+        self.lease.step_queue.may_read_step()
     }
 
     /// Waits for the next report. Cancel-safe.

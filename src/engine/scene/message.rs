@@ -2,19 +2,26 @@
 
 use tokio::sync::oneshot;
 
-use super::step_queue::{Policy, WriterLease};
+use super::lease::{AcquiredLease, LeaseRequest};
 use super::subscriber::Subscriber;
 use crate::engine::output::step_output::{OutputSpec, StepOutput};
 use modalcast_model::error::{Error, Result};
 
-/// The step that a single request asks for. Step numbers refer to the current run.
+/// The step that a single request asks for. A run of 0 is that of the latest writer. The steps of a later run come after
+/// those of an earlier one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum StepSelector {
     Current,
-    /// The step with this number.
-    Exact(u64),
-    /// The current step, as soon as its number is at least this one.
-    Minimum(u64),
+    /// The step with this run and number.
+    Exact {
+        run: u64,
+        number: u64,
+    },
+    /// The current step, as soon as it is this one or a later one.
+    Minimum {
+        run: u64,
+        number: u64,
+    },
 }
 
 /// A single request that is waiting for its step.
@@ -25,21 +32,11 @@ pub(super) struct StepRequest {
     pub reply: oneshot::Sender<Result<StepOutput>>,
 }
 
-/// The writer lease and the run that it begins.
-#[derive(Debug)]
-pub(super) struct AcquiredLease {
-    pub lease: WriterLease,
-    /// The writer is the scene's `run`-th writer, counted from 1.
-    pub run: u64,
-}
-
 /// A message to a scene's actor. The mailbox is bounded. When it is full, `Stop` waits for capacity and every other
 /// message is answered with `Busy`.
 pub(super) enum Message {
     AcquireWriter {
-        peer: String,
-        policy: Policy,
-        window: u32,
+        request: LeaseRequest,
         reply: oneshot::Sender<Result<AcquiredLease>>,
     },
     Subscribe {

@@ -2,8 +2,10 @@
 
 pub(super) mod actor;
 mod current_step;
+pub(super) mod delivery;
 pub(super) mod encoded_subscription;
 pub(super) mod handle;
+pub(super) mod lease;
 pub(super) mod message;
 mod output_delivery;
 mod readback_queue;

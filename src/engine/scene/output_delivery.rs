@@ -1,15 +1,17 @@
 //! Delivery of a scene's outputs: to single requests whose step has been reached, and to subscribers that have not
 //! received the current step yet. A subscriber receives one result per credit ([`super::subscriber`]).
 
+use std::cmp::Ordering;
 use std::mem;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use super::current_step::CurrentStep;
+use super::delivery::Delivery;
 use super::message::{StepRequest, StepSelector};
 use super::readback_queue::{PendingReadback, Readback, ReadbackQueue, Recipient};
 use super::step_queue::CompletedStep;
-use super::subscriber::{Delivery, LOSSLESS_CREDITS, Subscriber};
+use super::subscriber::{LOSSLESS_CREDITS, Subscriber};
 use crate::config::Config;
 use crate::engine::device::command::{CopiedVertices, SceneId};
 use crate::engine::device::handle::{DeviceHandle, PendingReply};
@@ -60,12 +62,12 @@ impl OutputDelivery {
     /// Adds a subscriber. With [`Delivery::Latest`] it receives the current step unless the scene has had no step.
     ///
     /// # Errors
-    /// `Busy` when the scene has too many subscribers.
+    /// `LimitReached` when the scene has too many subscribers.
     pub(super) fn add_subscriber(&mut self, mut subscriber: Subscriber, current: &CurrentStep) -> Result<()> {
         self.drop_closed_subscribers();
         let limit = self.max_subscribers;
         if self.subscribers.len() >= limit {
-            return Err(Error::Busy { queue: "subscribers of the scene", limit });
+            return Err(Error::LimitReached { objects: "subscribers of one scene", limit });
         }
         let receives_current = subscriber.delivery == Delivery::Latest && current.state.run > 0;
         // Counts as if the subscriber had received the step before its first one.
@@ -347,7 +349,7 @@ impl OutputProducer {
         if !is_within_timeout {
             let (scene, seconds) = (&self.scene_on_device.name, self.stall_timeout.as_secs());
             tracing::warn!(scene, seconds, "a lossless subscriber did not read and is disconnected");
-            let error = Error::Busy { queue: "queue of unread results of this subscriber", limit: LOSSLESS_CREDITS };
+            let error = Error::SlowReader { queue: "queue of results of this subscriber", limit: LOSSLESS_CREDITS };
             subscriber.disconnect(error);
         }
         is_within_timeout
@@ -390,23 +392,27 @@ impl OutputProducer {
     /// Whether a request can be answered now. `run` is the run of the latest writer.
     ///
     /// # Errors
-    /// `Gone` when the scene has passed the requested exact step.
+    /// `StepPassed` when the scene has passed the requested exact step.
     fn is_reached(&self, selector: StepSelector, current: &CurrentStep, run: u64) -> Result<bool> {
-        let is_of_this_run = current.state.run == run && run > 0;
-        let current_number = is_of_this_run.then_some(current.state.step);
-        match (selector, current_number) {
-            (StepSelector::Current, _) => Ok(true),
-            (StepSelector::Exact(requested), Some(current_number)) if current_number > requested => Err(Error::Gone {
-                what: "exact_step",
-                expected: format!(
-                    "{current_number} (the current step of scene '{}') or later",
-                    self.scene_on_device.name
-                ),
-                given: requested.to_string(),
-            }),
-            (StepSelector::Exact(requested), Some(current_number)) => Ok(current_number == requested),
-            (StepSelector::Minimum(requested), Some(current_number)) => Ok(current_number >= requested),
-            (StepSelector::Exact(_) | StepSelector::Minimum(_), None) => Ok(false),
+        let current_step = (current.state.run > 0).then_some((current.state.run, current.state.step));
+        let compare = |requested_run: u64, number: u64| {
+            let requested_run = if requested_run == 0 { run } else { requested_run };
+            // Before the first step every requested step is in the future.
+            current_step.map_or(Ordering::Less, |current_step| current_step.cmp(&(requested_run, number)))
+        };
+        match selector {
+            StepSelector::Current => Ok(true),
+            StepSelector::Minimum { run, number } => Ok(compare(run, number) != Ordering::Less),
+            StepSelector::Exact { run, number } => match compare(run, number) {
+                Ordering::Less => Ok(false),
+                Ordering::Equal => Ok(true),
+                Ordering::Greater => {
+                    let (name, state) = (&self.scene_on_device.name, &current.state);
+                    let expected =
+                        format!("run {}, step {} (the current one of scene '{name}') or later", state.run, state.step);
+                    Err(Error::StepPassed { field: "step.exact", expected, given: number.to_string() })
+                }
+            },
         }
     }
 

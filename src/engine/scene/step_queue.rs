@@ -1,5 +1,6 @@
 //! The bounded queue of steps from one writer to its scene, and the queue of reports back to the writer. The window
-//! bounds both: `lossless` rejects a step beyond the window, `latest` merges a step into the one already queued.
+//! bounds both: a lossless queue rejects a step beyond the window, or the writer waits for capacity before it reads the
+//! step; a `latest` queue merges a step into the one already queued.
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, MutexGuard};
@@ -7,18 +8,23 @@ use std::time::Instant;
 
 use tokio::sync::Notify;
 
+use super::delivery::Delivery;
 use crate::engine::lock::lock;
 use crate::telemetry::{Stage, StageTimes, ms_since};
-use modalcast_model::error::{Error, Result, invalid};
+use modalcast_model::error::{Error, Result};
 use modalcast_model::scene::StepUpdate;
 
-/// What happens to steps that arrive faster than the scene completes them.
+/// Limit in bytes on the queued steps of one writer. A step is accepted as long as the steps before it are below the
+/// limit, so the queue holds at most one message more.
+const MAX_QUEUED_BYTES: usize = 16 << 20;
+
+/// What happens to a lossless step for which the window has no capacity.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Policy {
-    /// Every step is deformed, in order.
-    Lossless,
-    /// Queued steps are merged into one whose effect on the state equals applying all of them in order.
-    Latest,
+pub enum Overflow {
+    /// The stream is not read until there is capacity.
+    Block,
+    /// The step is rejected.
+    Reject,
 }
 
 /// An accepted step in the queue.
@@ -60,7 +66,8 @@ pub enum StepReport {
 /// The step queue, shared by a writer's handle and its scene. The lock is never held across an await.
 #[derive(Debug)]
 pub(in crate::engine) struct StepQueue {
-    policy: Policy,
+    delivery: Delivery,
+    overflow: Overflow,
     /// Maximum number of steps that are queued, in progress, or whose report the writer has not taken.
     window: usize,
     state: Mutex<QueueState>,
@@ -84,7 +91,7 @@ impl CompletedStep {
 
     /// Whether subscribers may block the writer: only a writer that is lossless and still connected.
     pub(super) fn applies_back_pressure(&self) -> bool {
-        self.step_queue.policy() == Policy::Lossless && !self.step_queue.is_closed()
+        self.step_queue.delivery == Delivery::Lossless && !self.step_queue.is_closed()
     }
 
     /// Reports the step to its writer as done. Steps of a queue are acknowledged in the order in which they were taken.
@@ -93,25 +100,20 @@ impl CompletedStep {
     }
 }
 
-/// The writer's lease on a scene. Dropping it closes the queue and admits the next writer. A reply that carries the
-/// lease is dropped if the client has disconnected, which also releases the lease.
+/// A step that was taken and is not yet reported.
 #[derive(Debug)]
-pub(in crate::engine) struct WriterLease {
-    pub step_queue: Arc<StepQueue>,
-}
-
-impl Drop for WriterLease {
-    fn drop(&mut self) {
-        self.step_queue.close();
-    }
+struct StepInProgress {
+    number: u64,
+    bytes: usize,
 }
 
 #[derive(Debug, Default)]
 struct QueueState {
     queued: VecDeque<QueuedStep>,
-    /// Numbers of the steps that were taken and not yet reported, oldest first. There are several while readbacks of
-    /// the older steps are in flight.
-    in_progress: VecDeque<u64>,
+    /// Oldest first. There are several while readbacks of the earlier ones are in flight.
+    in_progress: VecDeque<StepInProgress>,
+    /// Size of the steps that are queued or in progress.
+    bytes: usize,
     reports: VecDeque<StepReport>,
     /// Number of steps that were merged into later ones since the stream began.
     skipped: u64,
@@ -120,38 +122,52 @@ struct QueueState {
     end_error: Option<Error>,
 }
 
-impl StepQueue {
-    pub(in crate::engine) fn new(policy: Policy, window: u32, scene_wake: Arc<Notify>) -> Self {
-        let window = window.max(1) as usize;
-        Self { policy, window, state: Mutex::default(), scene_wake, writer_wake: Notify::new() }
+impl QueueState {
+    fn unacknowledged(&self) -> usize {
+        self.queued.len() + self.in_progress.len() + self.reports.len()
     }
 
-    pub(in crate::engine) const fn policy(&self) -> Policy {
-        self.policy
+    fn drop_queued(&mut self) {
+        self.bytes -= self.queued.drain(..).map(|step| step.update.bytes()).sum::<usize>();
+    }
+}
+
+impl StepQueue {
+    pub(in crate::engine) fn new(delivery: Delivery, overflow: Overflow, window: u32, scene_wake: Arc<Notify>) -> Self {
+        let window = window.max(1) as usize;
+        Self { delivery, overflow, window, state: Mutex::default(), scene_wake, writer_wake: Notify::new() }
+    }
+
+    /// Whether the writer may read another step: always, unless it must wait for capacity.
+    pub(in crate::engine) fn may_read_step(&self) -> bool {
+        let must_wait = self.delivery == Delivery::Lossless && self.overflow == Overflow::Block;
+        !must_wait || self.has_capacity(&self.lock())
     }
 
     /// Queues a step.
     ///
     /// # Errors
-    /// `Invalid` naming the window when the step is beyond it, or the error that ended the queue.
+    /// `WindowFull` when the step is beyond the window, or the error that ended the queue.
     pub(in crate::engine) fn push(&self, step: QueuedStep) -> Result<()> {
         let mut state = self.lock();
         if let Some(error) = &state.end_error {
             return Err(error.clone());
         }
-        match (self.policy, state.queued.pop_back()) {
-            (Policy::Latest, Some(previous)) => {
+        match (self.delivery, state.queued.pop_back()) {
+            (Delivery::Latest, Some(previous)) => {
                 state.skipped += 1;
                 let merged = previous.merged + 1;
-                state.queued.push_back(QueuedStep {
-                    update: step.update.merged_with_older(&previous.update),
-                    merged,
-                    ..step
-                });
+                state.bytes -= previous.update.bytes();
+                let update = step.update.merged_with_older(&previous.update);
+                state.bytes += update.bytes();
+                state.queued.push_back(QueuedStep { update, merged, ..step });
             }
             (_, previous) => {
                 state.queued.extend(previous);
-                self.check_window(&state, step.update.number)?;
+                if self.delivery == Delivery::Lossless && !self.has_capacity(&state) {
+                    return Err(Error::WindowFull { limit: self.window, given: state.unacknowledged() + 1 });
+                }
+                state.bytes += step.update.bytes();
                 state.queued.push_back(step);
             }
         }
@@ -163,7 +179,7 @@ impl StepQueue {
     pub(in crate::engine) fn take(&self) -> Option<QueuedStep> {
         let mut state = self.lock();
         let step = state.queued.pop_front()?;
-        state.in_progress.push_back(step.update.number);
+        state.in_progress.push_back(StepInProgress { number: step.update.number, bytes: step.update.bytes() });
         Some(step)
     }
 
@@ -175,7 +191,8 @@ impl StepQueue {
     /// Reports the outcome of the oldest step in progress. Does nothing if no step is in progress.
     pub(super) fn report(&self, outcome: Result<StageTimes>) {
         let mut state = self.lock();
-        let Some(step) = state.in_progress.pop_front() else { return };
+        let Some(StepInProgress { number: step, bytes }) = state.in_progress.pop_front() else { return };
+        state.bytes -= bytes;
         let skipped = state.skipped;
         let report = match outcome {
             Ok(stages) => StepReport::Done { step, skipped, stages },
@@ -190,7 +207,9 @@ impl StepQueue {
             state.reports.pop_back();
         }
         if state.reports.len() > self.window {
-            state.end_error.get_or_insert(Error::Busy { queue: "replies not read by the writer", limit: self.window });
+            state
+                .end_error
+                .get_or_insert(Error::SlowReader { queue: "queue of reports to the writer", limit: self.window });
         } else {
             state.reports.push_back(report);
         }
@@ -226,7 +245,7 @@ impl StepQueue {
     pub(in crate::engine) fn close(&self) {
         let mut state = self.lock();
         state.is_lease_dropped = true;
-        state.queued.clear();
+        state.drop_queued();
         self.scene_wake.notify_one();
     }
 
@@ -240,17 +259,13 @@ impl StepQueue {
     pub(in crate::engine) fn end(&self, error: Error) {
         let mut state = self.lock();
         state.end_error.get_or_insert(error);
-        state.queued.clear();
+        state.drop_queued();
         self.writer_wake.notify_one();
     }
 
-    fn check_window(&self, state: &QueueState, number: u64) -> Result<()> {
-        let unacknowledged = state.queued.len() + state.in_progress.len() + state.reports.len();
-        if self.policy == Policy::Lossless && unacknowledged >= self.window {
-            let expected = format!("at most {} steps without acknowledgement", self.window);
-            return Err(invalid("window", expected, format!("step {number} as number {}", unacknowledged + 1)));
-        }
-        Ok(())
+    /// Whether the window and the limit on bytes have capacity for a step.
+    fn has_capacity(&self, state: &QueueState) -> bool {
+        state.unacknowledged() < self.window && state.bytes < MAX_QUEUED_BYTES
     }
 
     fn lock(&self) -> MutexGuard<'_, QueueState> {
@@ -262,6 +277,7 @@ impl StepQueue {
 mod tests {
     use super::*;
     use crate::engine::testing;
+    use modalcast_model::error::invalid;
     use modalcast_model::scene::{RawStepUpdate, SceneState};
 
     /// A step that sets the two coordinates of one domain of [`testing::two_strips`].
@@ -274,11 +290,11 @@ mod tests {
 
     #[test]
     fn lossless_queue_rejects_steps_beyond_the_window() {
-        let step_queue = StepQueue::new(Policy::Lossless, 2, Arc::default());
+        let step_queue = StepQueue::new(Delivery::Lossless, Overflow::Reject, 2, Arc::default());
         step_queue.push(step(1, 0, [0.0; 2])).expect("expected capacity for the first step");
         step_queue.push(step(2, 0, [0.0; 2])).expect("expected capacity for the second step");
-        let error = step_queue.push(step(3, 0, [0.0; 2])).expect_err("expected a full window").to_string();
-        assert!(error.starts_with("window: expected at most 2"), "{error}");
+        let error = step_queue.push(step(3, 0, [0.0; 2])).expect_err("expected a full window");
+        assert_eq!(error, Error::WindowFull { limit: 2, given: 3 });
         assert_eq!(step_queue.take().map(|step| step.update.number), Some(1));
         step_queue.report(Ok(vec![]));
         assert!(step_queue.push(step(3, 0, [0.0; 2])).is_err(), "expected a full window until the report is taken");
@@ -287,9 +303,42 @@ mod tests {
     }
 
     #[test]
+    fn blocked_writer_may_read_a_step_when_a_report_is_taken() {
+        let step_queue = StepQueue::new(Delivery::Lossless, Overflow::Block, 1, Arc::default());
+        assert!(step_queue.may_read_step());
+        step_queue.push(step(1, 0, [0.0; 2])).expect("expected capacity for the first step");
+        assert!(!step_queue.may_read_step());
+        step_queue.take().expect("expected the queued step");
+        step_queue.report(Ok(vec![]));
+        assert!(!step_queue.may_read_step(), "expected no capacity until the report is taken");
+        step_queue.lock().reports.clear();
+        assert!(step_queue.may_read_step());
+        let rejecting_queue = StepQueue::new(Delivery::Lossless, Overflow::Reject, 1, Arc::default());
+        rejecting_queue.push(step(1, 0, [0.0; 2])).expect("expected capacity for the first step");
+        assert!(rejecting_queue.may_read_step(), "a step beyond the window is read and rejected");
+    }
+
+    #[test]
+    fn queued_bytes_are_counted_until_the_step_is_reported() {
+        let step_queue = StepQueue::new(Delivery::Lossless, Overflow::Reject, 4, Arc::default());
+        let step_bytes = step(1, 0, [0.0; 2]).update.bytes();
+        assert!(step_bytes >= 8, "two coordinates of 4 bytes");
+        for number in 1..=3 {
+            step_queue.push(step(number, 0, [0.0; 2])).expect("expected capacity");
+        }
+        assert_eq!(step_queue.lock().bytes, 3 * step_bytes);
+        step_queue.take().expect("expected a queued step");
+        assert_eq!(step_queue.lock().bytes, 3 * step_bytes);
+        step_queue.report(Ok(vec![]));
+        assert_eq!(step_queue.lock().bytes, 2 * step_bytes);
+        step_queue.close();
+        assert_eq!(step_queue.lock().bytes, 0);
+    }
+
+    #[test]
     fn merged_step_has_the_effect_of_all_its_steps() {
         let scene = testing::two_strips();
-        let step_queue = StepQueue::new(Policy::Latest, 1, Arc::default());
+        let step_queue = StepQueue::new(Delivery::Latest, Overflow::Block, 1, Arc::default());
         let mut expected_state = SceneState::rest(&scene);
         for step in [step(1, 0, [1.0, 2.0]), step(2, 1, [3.0, 4.0]), step(5, 0, [5.0, 6.0])] {
             expected_state.apply(&scene, &step.update);
@@ -304,7 +353,7 @@ mod tests {
 
     #[tokio::test]
     async fn slow_latest_writer_receives_the_newest_report() {
-        let step_queue = StepQueue::new(Policy::Latest, 2, Arc::default());
+        let step_queue = StepQueue::new(Delivery::Latest, Overflow::Block, 2, Arc::default());
         for number in 1..=9 {
             step_queue.push(step(number, 0, [0.0; 2])).expect("expected an accepted step");
             step_queue.take().expect("expected the queued step");
@@ -323,7 +372,7 @@ mod tests {
 
     #[tokio::test]
     async fn writer_that_reads_no_rejections_is_disconnected() {
-        let step_queue = StepQueue::new(Policy::Latest, 1, Arc::default());
+        let step_queue = StepQueue::new(Delivery::Latest, Overflow::Block, 1, Arc::default());
         for number in 1..=3 {
             if step_queue.push(step(number, 0, [0.0; 2])).is_ok() {
                 step_queue.take();
@@ -332,7 +381,7 @@ mod tests {
         }
         assert!(matches!(step_queue.next_report().await, Ok(StepReport::Rejected { step: 1, .. })));
         assert!(matches!(step_queue.next_report().await, Ok(StepReport::Rejected { step: 2, .. })));
-        assert!(matches!(step_queue.next_report().await, Err(Error::Busy { limit: 1, .. })));
-        assert!(matches!(step_queue.push(step(4, 0, [0.0; 2])), Err(Error::Busy { .. })));
+        assert!(matches!(step_queue.next_report().await, Err(Error::SlowReader { limit: 1, .. })));
+        assert!(matches!(step_queue.push(step(4, 0, [0.0; 2])), Err(Error::SlowReader { .. })));
     }
 }

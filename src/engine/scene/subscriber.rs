@@ -12,22 +12,13 @@ use std::time::Instant;
 
 use tokio::sync::{Notify, mpsc, watch};
 
+use super::delivery::Delivery;
 use crate::engine::output::step_output::{OutputSpec, StepOutput};
 use modalcast_model::error::{Error, Result, fault};
 
 /// Number of results that a lossless subscriber may leave unread before it blocks the writer. Also the capacity of the
 /// channel.
 pub(super) const LOSSLESS_CREDITS: usize = 2;
-
-/// Which steps a subscriber receives.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Delivery {
-    /// Every step from the next one on, in order. A slow subscriber blocks a writer with `Policy::Lossless`. If the
-    /// writer has `Policy::Latest`, a slow subscriber skips steps.
-    Lossless,
-    /// The newest step, starting with the current one if the scene has had a step.
-    Latest,
-}
 
 /// Why a subscription ends.
 #[derive(Debug, Clone)]

@@ -1,6 +1,8 @@
-//! The state folder: the catalog of open scenes, the checkpoints of their steps, and uploaded files.
+//! The state folder: the catalog of open scenes, the checkpoints of their steps, the counter of runs, and uploaded
+//! files.
 
 mod atomic_file;
 pub(super) mod checkpoint_store;
+pub(super) mod run_counter;
 pub(super) mod scene_catalog;
 pub(super) mod upload;

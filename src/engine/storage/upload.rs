@@ -88,7 +88,7 @@ impl Upload {
         validate_path("file.path", path)?;
         let sha256: [u8; 32] = sha256
             .try_into()
-            .map_err(|_| invalid(format!("file.sha256 of '{path}'"), "32 bytes", format!("{} bytes", sha256.len())))?;
+            .map_err(|_| invalid("file.sha256", "32 bytes", format!("{} bytes for '{path}'", sha256.len())))?;
         if !self.paths.insert(path.to_owned()) {
             return Err(invalid("file.path", "a path that was not sent yet", path));
         }
@@ -176,9 +176,9 @@ impl Upload {
         let given: [u8; 32] = open_file.hasher.finalize().into();
         if given != open_file.declared_sha256 {
             return Err(invalid(
-                format!("file.sha256 of '{}'", open_file.path),
+                "file.sha256",
                 hex(&open_file.declared_sha256),
-                hex(&given),
+                format!("{} for '{}'", hex(&given), open_file.path),
             ));
         }
         Ok(())
@@ -189,12 +189,9 @@ impl Upload {
         match &self.open_file {
             None => Ok(()),
             Some(open_file) => {
-                let given = format!("{} bytes", open_file.declared_bytes - open_file.remaining_bytes);
-                Err(invalid(
-                    format!("file.bytes of '{}'", open_file.path),
-                    format!("{} bytes", open_file.declared_bytes),
-                    given,
-                ))
+                let received_bytes = open_file.declared_bytes - open_file.remaining_bytes;
+                let given = format!("{received_bytes} bytes for '{}'", open_file.path);
+                Err(invalid("file.bytes", format!("{} bytes", open_file.declared_bytes), given))
             }
         }
     }

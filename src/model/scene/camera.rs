@@ -146,7 +146,11 @@ impl Camera {
         if let View::Pose(pose) = self.view
             && !(pose.iter().all(|number| number.is_finite()) && invert_pose(pose).is_some())
         {
-            return Err(invalid("camera.pose", "a finite, invertible transform", format!("{pose:?}")));
+            return Err(invalid(
+                "camera.pose.world_from_camera",
+                "a finite, invertible transform",
+                format!("{pose:?}"),
+            ));
         }
         match self.lens {
             Lens::FieldOfView(degrees) if !(degrees > 0.1 && degrees < 179.0) => {
@@ -167,9 +171,9 @@ impl Camera {
         let is_ordered = self.near > 0.0 && self.far > self.near && self.far.is_finite();
         if !(is_fitted || is_ordered) {
             return Err(invalid(
-                "camera.near/far",
+                "camera.near",
                 "0 < near < far, or both 0",
-                format!("{} / {}", self.near, self.far),
+                format!("near {}, far {}", self.near, self.far),
             ));
         }
         Ok(self)

@@ -23,12 +23,12 @@ impl PixelRect {
         let ([x, y], [width, height]) = (corner, size);
         if !size.iter().all(|side| (1..=Self::MAX_SIDE).contains(side)) {
             let expected = format!("1 to {} pixels a side", Self::MAX_SIDE);
-            return Err(invalid("rectangle.size", expected, format!("{width} x {height}")));
+            return Err(invalid("width", expected, format!("{width} x {height}")));
         }
         let end = |axis: usize| u64::from(corner[axis]) + u64::from(size[axis]);
         if (0..2).any(|axis| end(axis) > u64::from(image[axis])) {
             let expected = format!("pixels inside the image of {} x {}", image[0], image[1]);
-            return Err(invalid("rectangle", expected, format!("{width} x {height} pixels at ({x}, {y})")));
+            return Err(invalid("x", expected, format!("{width} x {height} pixels at ({x}, {y})")));
         }
         Ok(Self { x, y, width, height })
     }
@@ -60,11 +60,11 @@ mod tests {
             assert_eq!(create(corner, size).map(|rect| rect.size()), Ok(size));
         }
         for (corner, size, field) in [
-            ([99, 79], [2, 1], "rectangle:"),
-            ([0, 80], [1, 1], "rectangle:"),
-            ([u32::MAX, 0], [1, 1], "rectangle:"),
-            ([0, 0], [0, 1], "rectangle.size:"),
-            ([0, 0], [1, 65], "rectangle.size:"),
+            ([99, 79], [2, 1], "x:"),
+            ([0, 80], [1, 1], "x:"),
+            ([u32::MAX, 0], [1, 1], "x:"),
+            ([0, 0], [0, 1], "width:"),
+            ([0, 0], [1, 65], "width:"),
         ] {
             let message = create(corner, size).expect_err(field);
             assert!(message.starts_with(field), "expected an error about {field}, got {message}");

@@ -50,6 +50,14 @@ pub struct StepUpdate {
 }
 
 impl StepUpdate {
+    /// Size of the values of the step in memory, in bytes.
+    pub const fn bytes(&self) -> usize {
+        size_of_val(self.spans.as_slice())
+            + size_of_val(self.values.as_slice())
+            + size_of_val(self.transforms.as_slice())
+            + size_of_val(self.translations.as_slice())
+    }
+
     /// Validates a step against its scene.
     ///
     /// # Errors
@@ -132,18 +140,19 @@ fn parse_coordinates(scene: &Scene, raw: &RawStepUpdate) -> Result<(Vec<Coordina
         coordinate_count += rank;
     }
     if raw.q.len() != 4 * coordinate_count {
-        let field = match spans.as_slice() {
-            [span] => format!("step.q of domain '{}'", scene.domains[span.domain as usize].name),
-            _ => "step.q".into(),
+        let domain = match spans.as_slice() {
+            [span] => format!(" of domain '{}'", scene.domains[span.domain as usize].name),
+            _ => String::new(),
         };
-        let expected_bytes = format!("{} bytes ({coordinate_count} coordinates)", 4 * coordinate_count);
-        return Err(invalid(field, expected_bytes, format!("{} bytes", raw.q.len())));
+        let expected_bytes = format!("{} bytes ({coordinate_count} coordinates{domain})", 4 * coordinate_count);
+        return Err(invalid("step.q", expected_bytes, format!("{} bytes", raw.q.len())));
     }
     let values = decode_f32_values(&raw.q);
     for CoordinateSpan { domain, first, rank } in &spans {
         if let Some(mode) = values[*first..][..*rank].iter().position(|number| !number.is_finite()) {
-            let field = format!("step.q of domain '{}', mode {mode}", scene.domains[*domain as usize].name);
-            return Err(invalid(field, "a finite number", values[first + mode]));
+            let name = &scene.domains[*domain as usize].name;
+            let given = format!("{} for mode {mode} of domain '{name}'", values[first + mode]);
+            return Err(invalid(format!("step.q[{}]", first + mode), "a finite number", given));
         }
     }
     Ok((spans, values))
@@ -167,14 +176,14 @@ fn parse_transforms(scene: &Scene, raw: &RawStepUpdate) -> Result<ParsedTransfor
     }
     let origin = scene.origin.map(|meters| meters / scene.unit);
     let (mut transforms, mut translations) = (Vec::with_capacity(domains.len()), Vec::new());
-    for (domain, bytes) in domains.into_iter().zip(raw.transforms.chunks_exact(transform_bytes)) {
+    for (index, (domain, bytes)) in domains.into_iter().zip(raw.transforms.chunks_exact(transform_bytes)).enumerate() {
         let parsed = match raw.transform_format {
             TransformFormat::Affine => parse_affine(scene, bytes),
             TransformFormat::RigidF32 => transform_format::parse_rigid_f32(bytes),
             TransformFormat::RigidF64 => transform_format::parse_rigid_f64(bytes, origin),
         };
-        let field = || format!("step.transforms of domain '{}'", scene.domains[domain as usize].name);
-        let (transform, translation) = parsed.map_err(|error| error.prefix_field(&field()))?;
+        let (transform, translation) =
+            parsed.map_err(|error| error.in_message(&format!("step.transforms[{index}]")))?;
         transforms.push((domain, transform));
         translations.extend(translation.map(|translation| (domain, translation)));
     }

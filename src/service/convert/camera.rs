@@ -14,7 +14,9 @@ pub(super) fn parse_camera(default_camera: Camera, camera: v1::Camera) -> Result
             target: parse_numbers("camera.look_at.target", &look_at.target)?,
             up: parse_numbers("camera.look_at.up", &look_at.up)?,
         },
-        Some(v1::camera::View::Pose(pose)) => View::Pose(parse_numbers("camera.pose", &pose.world_from_camera)?),
+        Some(v1::camera::View::Pose(pose)) => {
+            View::Pose(parse_numbers("camera.pose.world_from_camera", &pose.world_from_camera)?)
+        }
     };
     let lens = match camera.lens {
         None => default_camera.lens,

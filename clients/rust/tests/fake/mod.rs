@@ -2,11 +2,13 @@
 
 mod serve;
 
+use std::collections::HashMap;
 use std::sync::Mutex;
 
 use modalcast_proto::v1;
 use tokio::sync::{Semaphore, broadcast};
 use tonic::Status;
+use tonic_types::{ErrorDetails, StatusExt as _};
 
 pub(crate) use serve::serve;
 
@@ -220,13 +222,17 @@ pub(crate) fn rejection(
     expected: impl ToString,
     given: impl ToString,
 ) -> v1::Rejection {
-    v1::Rejection { step, field: field.into(), expected: expected.to_string(), given: given.to_string() }
+    let reason = v1::Reason::InvalidField.into();
+    v1::Rejection { step, reason, field: field.into(), expected: expected.to_string(), given: given.to_string() }
 }
 
 /// A gRPC status with a rejection in its details.
 fn rejection_status(code: tonic::Code, rejection: &v1::Rejection) -> Status {
-    let details = prost::Message::encode_to_vec(rejection);
-    Status::with_details(code, format!("{}: {}", rejection.field, rejection.given), details.into())
+    let texts = [("expected", &rejection.expected), ("given", &rejection.given)];
+    let metadata: HashMap<String, String> = texts.map(|(key, text)| (key.to_owned(), text.clone())).into();
+    let mut details = ErrorDetails::with_error_info(rejection.reason().as_str_name(), "modalcast", metadata);
+    details.add_bad_request_violation(rejection.field.clone(), "invalid");
+    Status::with_error_details(code, format!("{}: {}", rejection.field, rejection.given), details)
 }
 
 /// Decodes little-endian f32 at any alignment.

@@ -211,7 +211,13 @@ impl FakeService {
                         has_lease = true;
                         let window = if open.window == 0 { self.0.window } else { open.window.min(self.0.window) };
                         let scene = Some(self.0.info());
-                        ResponseKind::Opened(v1::Opened { run, policy: open.policy, window, scene })
+                        ResponseKind::Opened(v1::Opened {
+                            run,
+                            delivery: open.delivery,
+                            window,
+                            scene,
+                            ..v1::Opened::default()
+                        })
                     }
                 },
                 Some(RequestKind::Step(step)) => match self.0.apply(&step) {

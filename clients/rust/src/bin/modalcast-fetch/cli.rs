@@ -179,12 +179,15 @@ pub(crate) struct FrameStreamOptions {
 /// Options that select the step.
 #[derive(Debug, Args)]
 pub(crate) struct StepOptions {
-    /// Number of the step in the current run.
+    /// Number of the step.
     #[arg(long, conflicts_with = "min_step")]
     pub(crate) step: Option<u64>,
-    /// Smallest accepted step number in the current run: the reply has this step or a later one.
+    /// Smallest accepted step number: the reply has this step or a later one.
     #[arg(long)]
     pub(crate) min_step: Option<u64>,
+    /// Run of the step; 0 selects the run of the latest writer.
+    #[arg(long, default_value_t = 0)]
+    pub(crate) run: u64,
     /// How long the server may wait for the step, in milliseconds; 0 selects the server's default.
     #[arg(long, default_value_t = 0)]
     pub(crate) deadline_ms: u32,
@@ -192,8 +195,12 @@ pub(crate) struct StepOptions {
 
 impl StepOptions {
     pub(crate) fn selector(&self) -> StepSelector {
-        let exact = self.step.map(StepSelector::Exact);
-        exact.or(self.min_step.map(StepSelector::Minimum)).unwrap_or_default()
+        let run = self.run;
+        match (self.step, self.min_step) {
+            (Some(number), _) => StepSelector::Exact { run, number },
+            (None, Some(number)) => StepSelector::Minimum { run, number },
+            (None, None) => StepSelector::Current,
+        }
     }
 }
 

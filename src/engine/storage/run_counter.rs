@@ -1,0 +1,96 @@
+//! The numbers of runs. Every writer of the server gets a new one. It is on disk before the writer learns it, so that no
+//! number is used twice, also after a crash.
+
+use std::fs;
+use std::io::ErrorKind;
+use std::path::{Path, PathBuf};
+use std::sync::Mutex;
+
+use super::atomic_file::write_atomic;
+use crate::engine::lock::lock;
+use modalcast_model::error::{Error, Result, fault_in};
+
+/// Name of the file in the state folder: the last run as decimal digits.
+const FILE_NAME: &str = "last_run";
+
+/// The last run of the server, in memory and on disk.
+#[derive(Debug)]
+pub(in crate::engine) struct RunCounter {
+    path: PathBuf,
+    last_run: Mutex<u64>,
+}
+
+impl RunCounter {
+    /// Reads the counter of a state folder. A folder without one has had no run.
+    ///
+    /// # Errors
+    /// `Unavailable` when the file cannot be read or is damaged.
+    pub(in crate::engine) fn open(state_folder: &Path) -> Result<Self> {
+        let path = state_folder.join(FILE_NAME);
+        let unavailable = |reason: String| Error::Unavailable {
+            what: "counter of runs",
+            reason: format!("{}: {reason}", path.display()),
+            remedy: "Write a number into the file that is above every run that clients have seen".into(),
+        };
+        let last_run = match fs::read_to_string(&path) {
+            Ok(text) => text.trim().parse().map_err(|_| unavailable(format!("expected a number, got {text:?}")))?,
+            Err(error) if error.kind() == ErrorKind::NotFound => 0,
+            Err(error) => return Err(unavailable(error.to_string())),
+        };
+        Ok(Self { path, last_run: Mutex::new(last_run) })
+    }
+
+    /// Returns a new run, larger than all before. Blocks on the disk.
+    ///
+    /// # Errors
+    /// `Fault` when the number cannot be written; no later run has it.
+    pub(in crate::engine) fn next(&self) -> Result<u64> {
+        let mut last_run = lock(&self.last_run);
+        *last_run += 1;
+        write_atomic(&self.path, last_run.to_string().as_bytes()).map_err(fault_in("counter of runs"))?;
+        Ok(*last_run)
+    }
+
+    /// Continues after `run`, which a checkpoint contains, if the counter is behind it.
+    pub(in crate::engine) fn continue_after(&self, run: u64) {
+        let mut last_run = lock(&self.last_run);
+        *last_run = run.max(*last_run);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn open(folder: &Path) -> RunCounter {
+        RunCounter::open(folder).expect("expected a counter")
+    }
+
+    #[test]
+    fn runs_increase_also_after_the_counter_is_opened_again() {
+        let folder = tempfile::tempdir().expect("expected a temporary folder");
+        let counter = open(folder.path());
+        assert_eq!([counter.next(), counter.next()], [Ok(1), Ok(2)]);
+        // A crash: the counter is not closed.
+        let counter = open(folder.path());
+        assert_eq!(counter.next(), Ok(3));
+        counter.continue_after(2);
+        assert_eq!(counter.next(), Ok(4));
+        counter.continue_after(10);
+        assert_eq!(counter.next(), Ok(11));
+    }
+
+    #[test]
+    fn damaged_counter_is_not_replaced_by_zero() {
+        let folder = tempfile::tempdir().expect("expected a temporary folder");
+        fs::write(folder.path().join(FILE_NAME), "12x").expect("expected a written file");
+        assert!(matches!(RunCounter::open(folder.path()), Err(Error::Unavailable { .. })));
+    }
+
+    #[test]
+    fn run_that_cannot_be_written_is_not_returned() {
+        let folder = tempfile::tempdir().expect("expected a temporary folder");
+        let counter = open(&folder.path().join("missing"));
+        assert!(matches!(counter.next(), Err(Error::Fault { .. })));
+    }
+}

@@ -1,0 +1,41 @@
+//! What the server knows about the connection of a call.
+
+use std::net::SocketAddr;
+use std::sync::Arc;
+
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+
+use modalcast_model::error::{Error, Result};
+
+/// Limit on the step streams of one connection. A stream that blocks is not read, and h2 buffers up to a stream window
+/// (64 KiB) of its frames. h2 charges 256 - f bytes for each buffered frame of f bytes, and closes the connection if the
+/// charges exceed half of the connection window (8 MiB). The smallest frame of a step has f = 9 bytes: 5 bytes of gRPC
+/// and a step with nothing but its number. One stream is then charged 64 KiB / 9 * (256 - 9) = 1.8 MB, so four are safe.
+pub(super) const MAX_DRIVES: usize = 4;
+
+/// A connection, in the extensions of each of its calls.
+#[derive(Debug, Clone)]
+pub(super) struct ConnectionInfo {
+    remote: SocketAddr,
+    drive_permits: Arc<Semaphore>,
+}
+
+impl ConnectionInfo {
+    pub(super) fn new(remote: SocketAddr) -> Self {
+        Self { remote, drive_permits: Arc::new(Semaphore::new(MAX_DRIVES)) }
+    }
+
+    /// The address of the client, for the log. It is never sent to another client.
+    pub(super) fn address(&self) -> String {
+        self.remote.to_string()
+    }
+
+    /// Counts a step stream until the permit is dropped.
+    ///
+    /// # Errors
+    /// `LimitReached` when the connection has [`MAX_DRIVES`] step streams.
+    pub(super) fn acquire_drive(&self) -> Result<OwnedSemaphorePermit> {
+        let too_many = |_| Error::LimitReached { objects: "step streams of one connection", limit: MAX_DRIVES };
+        Arc::clone(&self.drive_permits).try_acquire_owned().map_err(too_many)
+    }
+}

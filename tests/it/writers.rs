@@ -1,0 +1,304 @@
+//! Writers of a scene: flow control of their streams, leases, runs and initial states.
+
+use std::time::Duration;
+
+use modalcast::config::Config;
+use modalcast::engine::{Delivery as EngineDelivery, OutputSpec, Subscription};
+use modalcast_model::deform::VertexAttributes;
+use modalcast_proto::v1;
+use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::watch;
+use tonic::Code;
+use tonic::transport::Channel;
+use v1::drive_scene_request::Kind as RequestKind;
+use v1::drive_scene_response::Kind as ResponseKind;
+use v1::step_service_client::StepServiceClient;
+use v1::{Delivery, InitialState, OpenDrive, Overflow, Reason};
+
+use crate::service_harness::{
+    Server, StepWriter, config, get_vertices, reference_vertices, rejection_details, step, strips, with_timeout,
+};
+
+fn lossless(scene: &str) -> OpenDrive {
+    OpenDrive { scene: scene.into(), delivery: Delivery::Lossless.into(), ..OpenDrive::default() }
+}
+
+async fn open(server: &Server, open: OpenDrive) -> (StepWriter, ResponseKind) {
+    let mut writer = StepWriter::connect(server.channel().await).await;
+    writer.send(RequestKind::Open(open)).await;
+    let reply = writer.receive_reply().await;
+    (writer, reply)
+}
+
+async fn open_successfully(server: &Server, request: OpenDrive) -> (StepWriter, v1::Opened) {
+    match open(server, request).await {
+        (writer, ResponseKind::Opened(opened)) => (writer, opened),
+        (_, other) => panic!("expected the stream to open, got {other:?}"),
+    }
+}
+
+async fn rejection_of(server: &Server, request: OpenDrive) -> v1::Rejection {
+    match open(server, request).await {
+        (_, ResponseKind::Rejection(rejection)) => rejection,
+        (_, other) => panic!("expected a rejection, got {other:?}"),
+    }
+}
+
+/// A lossless subscription. It blocks the writer after two steps unless it is read.
+async fn subscribe(server: &Server, scene: &str) -> Subscription {
+    let scene_handle = server.engine.find(scene).expect("expected an open scene");
+    let spec = OutputSpec::Vertices(VertexAttributes::POSITIONS_AND_NORMALS);
+    scene_handle.subscribe(spec, EngineDelivery::Lossless).await.expect("expected a subscription")
+}
+
+/// A plain client writes on and reads nothing in the meantime. It is slowed down, and no step is refused or lost.
+#[tokio::test(flavor = "multi_thread")]
+async fn blocking_writer_that_writes_on_loses_no_step() {
+    const STEPS: u64 = 400;
+    let server = Server::start_default().await;
+    server.open("strips").await;
+    let mut subscription = subscribe(&server, "strips").await;
+    let (writer, opened) = open_successfully(&server, OpenDrive { window: 2, ..lossless("strips") }).await;
+    assert_eq!((opened.delivery(), opened.overflow(), opened.window), (Delivery::Lossless, Overflow::Block, 2));
+    let (sender, mut replies) = writer.split();
+    let sending = tokio::spawn(async move {
+        for number in 1..=STEPS {
+            let kind = Some(RequestKind::Step(step(number, &[0], &[number as f32, 0.0])));
+            sender.send(v1::DriveSceneRequest { kind }).await.expect("expected an open stream");
+        }
+        sender
+    });
+    // The subscriber has two credits, and the step after them blocks.
+    tokio::time::sleep(Duration::from_millis(200)).await;
+    let last_step = server.engine.find("strips").expect("expected an open scene").last_step();
+    assert!(last_step.is_some_and(|step| step.number <= 3), "expected a blocked writer, got {last_step:?}");
+    for number in 1..=STEPS {
+        let output = with_timeout(subscription.next()).await.expect("expected another step");
+        assert_eq!((output.step.number, output.skipped), (number, 0));
+    }
+    let sender = with_timeout(sending).await.expect("expected no panic");
+    drop(sender);
+    let mut last_ack = 0;
+    while let Some(reply) = with_timeout(replies.message()).await.expect("expected no error") {
+        match reply.kind {
+            Some(ResponseKind::Ack(ack)) => last_ack = ack.step,
+            other => panic!("expected only acknowledgements, got {other:?}"),
+        }
+    }
+    assert_eq!(last_ack, STEPS);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn rejecting_writer_learns_that_the_window_is_full() {
+    let server = Server::start_default().await;
+    server.open("strips").await;
+    let _unread_subscription = subscribe(&server, "strips").await;
+    let request = OpenDrive { window: 2, overflow: Overflow::Reject.into(), ..lossless("strips") };
+    let (mut writer, _) = open_successfully(&server, request).await;
+    for number in 1..=12 {
+        writer.send_step(step(number, &[0], &[0.5, 0.0])).await;
+    }
+    let rejection = loop {
+        match writer.receive_reply().await {
+            ResponseKind::Ack(_) => {}
+            ResponseKind::Rejection(rejection) => break rejection,
+            ResponseKind::Opened(_) => panic!("expected one opening"),
+        }
+    };
+    assert_eq!((rejection.reason(), rejection.field.as_str()), (Reason::WindowFull, ""));
+    assert!(rejection.step.is_some_and(|number| number > 2), "{rejection:?}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn stream_without_a_delivery_is_rejected_with_the_choices() {
+    let server = Server::start_default().await;
+    server.open("strips").await;
+    let rejection = rejection_of(&server, OpenDrive { delivery: 0, ..lossless("strips") }).await;
+    assert_eq!((rejection.reason(), rejection.field.as_str()), (Reason::InvalidField, "open.delivery"));
+    assert!(rejection.expected.contains("DELIVERY_LOSSLESS") && rejection.expected.contains("DELIVERY_LATEST"));
+    let request = v1::StreamVerticesRequest { scene: "strips".into(), ..v1::StreamVerticesRequest::default() };
+    let status = server.vertices().await.stream_vertices(request).await.expect_err("expected an error");
+    assert_eq!((status.code(), rejection_details(&status).field.as_str()), (Code::InvalidArgument, "delivery"));
+}
+
+/// The first writer's connection stays open, as after a crash that the server has not noticed.
+#[tokio::test(flavor = "multi_thread")]
+async fn token_replaces_the_own_predecessor_at_once() {
+    let server = Server::start_default().await;
+    server.open("strips").await;
+    let (mut first_writer, first_opened) = open_successfully(&server, lossless("strips")).await;
+    first_writer.send_step_and_wait(step(1, &[0], &[1.0, 0.0])).await;
+    let other_token = OpenDrive { lease_token: vec![1; 16].into(), ..lossless("strips") };
+    for request in [lossless("strips"), other_token.clone()] {
+        assert_eq!(rejection_of(&server, request).await.reason(), Reason::WriterLeaseTaken);
+    }
+    let same_token = OpenDrive { lease_token: first_opened.lease_token.clone(), ..lossless("strips") };
+    let (mut second_writer, second_opened) = open_successfully(&server, same_token).await;
+    assert_eq!(second_opened.lease_token, first_opened.lease_token);
+    assert!(second_opened.run > first_opened.run);
+    let status = with_timeout(first_writer.replies.message()).await.expect_err("expected the first stream to end");
+    assert_eq!((status.code(), rejection_details(&status).reason()), (Code::Aborted, Reason::LeaseLost));
+    second_writer.send_step_and_wait(step(1, &[0], &[2.0, 0.0])).await;
+    let (_third_writer, third_opened) = open_successfully(&server, OpenDrive { take_over: true, ..other_token }).await;
+    assert_eq!(third_opened.lease_token, [1_u8; 16].as_slice());
+    let status = with_timeout(second_writer.replies.message()).await.expect_err("expected the second stream to end");
+    assert_eq!(rejection_details(&status).reason(), Reason::LeaseLost);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn malformed_lease_tokens_are_rejected() {
+    let server = Server::start_default().await;
+    server.open("strips").await;
+    for bytes in [1, 15, 65] {
+        let request = OpenDrive { lease_token: vec![1; bytes].into(), ..lossless("strips") };
+        let rejection = rejection_of(&server, request).await;
+        assert_eq!((rejection.reason(), rejection.field.as_str()), (Reason::InvalidField, "open.lease_token"));
+    }
+}
+
+/// Every server is stopped without a shutdown, as by `kill -9`, and the next one uses the same state folder.
+#[tokio::test(flavor = "multi_thread")]
+async fn runs_never_repeat_on_any_scene_or_after_a_crash() {
+    let state = tempfile::tempdir().expect("expected a temporary folder");
+    let mut runs = Vec::new();
+    for _ in 0..3 {
+        let server = Server::start(config(state.path())).await;
+        server.open("strips").await;
+        server.open("sheet").await;
+        for scene in ["strips", "sheet", "strips"] {
+            let (writer, opened) = open_successfully(&server, OpenDrive { take_over: true, ..lossless(scene) }).await;
+            runs.push(opened.run);
+            writer.disconnect();
+        }
+        server.stop().await.expect("expected the state folder to be released");
+    }
+    assert!(runs.is_sorted_by(|run, next| run < next), "{runs:?}");
+    assert_eq!(runs.len(), 9);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn first_step_starts_from_the_current_or_the_rest_state() {
+    let server = Server::start_default().await;
+    server.open("strips").await;
+    let (mut writer, _) = open_successfully(&server, lossless("strips")).await;
+    let first_step = step(1, &[0], &[0.5, 0.25]);
+    writer.send_step_and_wait(first_step.clone()).await;
+    writer.finish().await;
+    let second_step = step(2, &[1], &[0.125, 1.0]);
+    let cases = [
+        (InitialState::Reset, vec![second_step.clone()]),
+        // The reset of the case before has removed the first step, so it is sent again.
+        (InitialState::Keep, vec![first_step.clone(), second_step.clone()]),
+    ];
+    for (initial_state, steps) in cases {
+        let request = OpenDrive { initial_state: initial_state.into(), ..lossless("strips") };
+        let (mut writer, opened) = open_successfully(&server, request).await;
+        assert_eq!(opened.initial_state(), initial_state);
+        for step in &steps {
+            writer.send_step_and_wait(step.clone()).await;
+        }
+        let request = v1::GetVerticesRequest { scene: "strips".into(), ..v1::GetVerticesRequest::default() };
+        let reply = get_vertices(&server, request).await.expect("expected vertices");
+        assert_eq!(reply.positions, reference_vertices(&strips(), &steps).positions, "{initial_state:?}");
+        writer.finish().await;
+    }
+}
+
+/// A proxy to a server that delays everything that the server sends until `open` is true.
+async fn start_delaying_proxy(server_address: String, mut open: watch::Receiver<bool>) -> String {
+    let listener = TcpListener::bind(("127.0.0.1", 0)).await.expect("expected a free port");
+    let address = format!("http://{}", listener.local_addr().expect("expected a socket address"));
+    tokio::spawn(async move {
+        let (client, _) = listener.accept().await.expect("expected a client");
+        let server = TcpStream::connect(server_address.trim_start_matches("http://")).await.expect("expected a server");
+        let (mut from_client, mut to_client) = client.into_split();
+        let (mut from_server, mut to_server) = server.into_split();
+        tokio::spawn(async move { tokio::io::copy(&mut from_client, &mut to_server).await });
+        let mut buffer = vec![0; 1 << 16];
+        while let Ok(bytes @ 1..) = from_server.read(&mut buffer).await {
+            open.wait_for(|is_open| *is_open).await.expect("expected the sender of the test");
+            to_client.write_all(&buffer[..bytes]).await.expect("expected an open connection");
+        }
+    });
+    address
+}
+
+/// On a connection with a long round trip, the steps in flight are bounded by flow control (64 KiB), not by the window
+/// of 8 steps: the server completes 500 steps before the client has received any acknowledgement of them.
+#[tokio::test(flavor = "multi_thread")]
+async fn steps_do_not_wait_for_acknowledgements_of_a_distant_server() {
+    const STEPS: u64 = 500;
+    let server = Server::start_default().await;
+    server.open("strips").await;
+    let (open_sender, is_open) = watch::channel(true);
+    let proxy_address = start_delaying_proxy(server.address.clone(), is_open).await;
+    let channel = Channel::from_shared(proxy_address).expect("expected a URL").connect().await;
+    let mut writer = StepWriter::connect(channel.expect("expected a connection")).await;
+    writer.send(RequestKind::Open(lossless("strips"))).await;
+    assert!(matches!(writer.receive_reply().await, ResponseKind::Opened(opened) if opened.window == 8));
+    open_sender.send(false).expect("expected a running proxy");
+    for number in 1..=STEPS {
+        with_timeout(writer.send_step(step(number, &[0], &[number as f32, 0.0]))).await;
+    }
+    let scene_handle = server.engine.find("strips").expect("expected an open scene");
+    let completed = async {
+        while scene_handle.last_step().is_none_or(|step| step.number < STEPS) {
+            tokio::time::sleep(Duration::from_millis(2)).await;
+        }
+    };
+    with_timeout(completed).await;
+    open_sender.send(true).expect("expected a running proxy");
+    let mut last_ack = 0;
+    while last_ack < STEPS {
+        match writer.receive_reply().await {
+            ResponseKind::Ack(ack) => last_ack = ack.step,
+            other => panic!("expected an acknowledgement, got {other:?}"),
+        }
+    }
+}
+
+/// Four blocked step streams of one connection, each with as many of the smallest steps as flow control admits, leave
+/// the connection usable. A fifth stream is refused.
+#[tokio::test(flavor = "multi_thread")]
+async fn blocked_streams_of_tiny_steps_keep_the_connection_alive() {
+    let stall_timeout = Duration::from_secs(600);
+    let server = Server::start_with(|config| Config { stall_timeout, ..config }).await;
+    let channel = server.channel().await;
+    let mut blocked = Vec::new();
+    for name in ["a", "b", "c", "d"] {
+        let request = v1::OpenSceneRequest { source: "strips".into(), scene: name.into() };
+        server.scenes().await.open_scene(request).await.expect("expected the scene to open");
+        let subscription = subscribe(&server, name).await;
+        let mut writer = StepWriter::connect(channel.clone()).await;
+        writer.send(RequestKind::Open(OpenDrive { window: 1, ..lossless(name) })).await;
+        assert!(matches!(writer.receive_reply().await, ResponseKind::Opened(_)));
+        let (sender, replies) = writer.split();
+        let sending = tokio::spawn(async move {
+            for number in 0..20_000 {
+                let kind = Some(RequestKind::Step(v1::Step { number, ..v1::Step::default() }));
+                if sender.send(v1::DriveSceneRequest { kind }).await.is_err() {
+                    return;
+                }
+            }
+        });
+        blocked.push((subscription, replies, sending));
+    }
+    // Long enough for every stream to fill its window of 64 KiB.
+    tokio::time::sleep(Duration::from_secs(2)).await;
+    assert!(blocked.iter().all(|(_, _, sending)| !sending.is_finished()), "expected blocked streams");
+    let mut client = v1::vertex_service_client::VertexServiceClient::new(channel.clone());
+    let request = v1::GetVerticesRequest { scene: "a".into(), ..v1::GetVerticesRequest::default() };
+    let mut reply = with_timeout(client.get_vertices(request)).await.expect("expected a live connection").into_inner();
+    assert!(with_timeout(reply.message()).await.expect("expected vertices").is_some());
+    let no_requests = tokio_stream::pending::<v1::DriveSceneRequest>();
+    let status = with_timeout(StepServiceClient::new(channel.clone()).drive_scene(no_requests)).await;
+    let status = status.expect_err("expected a limit on the step streams of a connection");
+    assert_eq!((status.code(), rejection_details(&status).reason()), (Code::ResourceExhausted, Reason::LimitReached));
+    // Another connection has a limit of its own.
+    let (_, reply) = open(&server, lossless("a")).await;
+    assert!(matches!(reply, ResponseKind::Rejection(rejection) if rejection.reason() == Reason::WriterLeaseTaken));
+    for (_, _, sending) in blocked {
+        sending.abort();
+    }
+}
