@@ -15,7 +15,7 @@ pub(super) fn parse_output(scene: &Scene, picture: &v1::Picture) -> Result<(Fram
         .map_err(|_| invalid("picture.output", "an output of this version", picture.output))?;
     let is_color_map = matches!(output, v1::Output::Displacement | v1::Output::ModeShape);
     let scale_max = picture.largest;
-    if scale_max != 0.0 && !(is_color_map && (1.0 / MAX_SCALE..MAX_SCALE).contains(&scale_max)) {
+    if scale_max != 0.0 && !(is_color_map && (1.0 / MAX_SCALE..=MAX_SCALE).contains(&scale_max)) {
         let expected = format!("0, or for a color map {:e} to {MAX_SCALE:e}", 1.0 / MAX_SCALE);
         return Err(invalid("picture.largest", expected, scale_max));
     }
