@@ -2607,29 +2607,23 @@ pub mod frame_service_server {
         const NAME: &'static str = SERVICE_NAME;
     }
 }
-#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+#[derive(Clone, PartialEq, ::prost::Message)]
 pub struct VertexSelection {
-    /// Domain indices in the order of the reply; empty: all domains in order. At most 65536 and at most as many as the
-    /// scene has.
+    /// Domain indices in the order of the reply; empty: all domains in order. At most as many as the scene has.
     #[prost(uint32, repeated, tag = "1")]
     pub domains: ::prost::alloc::vec::Vec<u32>,
-    /// Omit the normals.
-    #[prost(bool, tag = "2")]
-    pub positions_only: bool,
-    /// Also send the displacements u = U q of the selected domains. Rejected unless the scene computes them
-    /// (deform.displacements = true in its scene.toml).
-    #[prost(bool, tag = "3")]
-    pub displacements: bool,
-    /// Also send the bounding box of each selected domain. Rejected unless the scene computes them (deform.boxes = true in
-    /// its scene.toml).
-    #[prost(bool, tag = "4")]
-    pub boxes: bool,
-    /// Omit positions and normals; at least one of `displacements` and `boxes` must be set. The server then copies only
-    /// the displacements or boxes from its device.
-    #[prost(bool, tag = "5")]
-    pub without_vertices: bool,
+    /// The attributes to send, each once; empty: ATTRIBUTE_POSITIONS and ATTRIBUTE_NORMALS, both ENCODING_F32.
+    #[prost(message, repeated, tag = "2")]
+    pub attributes: ::prost::alloc::vec::Vec<SelectedAttribute>,
 }
-#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+#[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct SelectedAttribute {
+    #[prost(enumeration = "Attribute", tag = "1")]
+    pub attribute: i32,
+    #[prost(enumeration = "Encoding", tag = "2")]
+    pub encoding: i32,
+}
+#[derive(Clone, PartialEq, ::prost::Message)]
 pub struct GetVerticesRequest {
     #[prost(string, tag = "1")]
     pub scene: ::prost::alloc::string::String,
@@ -2644,10 +2638,20 @@ pub struct GetVerticesRequest {
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct GetVerticesResponse {
-    #[prost(message, optional, tag = "1")]
-    pub chunk: ::core::option::Option<VertexChunk>,
+    #[prost(oneof = "get_vertices_response::Part", tags = "1, 2")]
+    pub part: ::core::option::Option<get_vertices_response::Part>,
 }
-#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+/// Nested message and enum types in `GetVerticesResponse`.
+pub mod get_vertices_response {
+    #[derive(Clone, PartialEq, ::prost::Oneof)]
+    pub enum Part {
+        #[prost(message, tag = "1")]
+        Layout(super::VertexLayout),
+        #[prost(message, tag = "2")]
+        Chunk(super::VertexChunk),
+    }
+}
+#[derive(Clone, PartialEq, ::prost::Message)]
 pub struct StreamVerticesRequest {
     #[prost(string, tag = "1")]
     pub scene: ::prost::alloc::string::String,
@@ -2665,66 +2669,174 @@ pub struct StreamVerticesRequest {
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct StreamVerticesResponse {
-    #[prost(message, optional, tag = "1")]
-    pub chunk: ::core::option::Option<VertexChunk>,
+    #[prost(oneof = "stream_vertices_response::Part", tags = "1, 2")]
+    pub part: ::core::option::Option<stream_vertices_response::Part>,
+}
+/// Nested message and enum types in `StreamVerticesResponse`.
+pub mod stream_vertices_response {
+    #[derive(Clone, PartialEq, ::prost::Oneof)]
+    pub enum Part {
+        #[prost(message, tag = "1")]
+        Layout(super::VertexLayout),
+        #[prost(message, tag = "2")]
+        Chunk(super::VertexChunk),
+    }
+}
+/// The selected domains, in the order of the reply. A layout of many domains arrives in several parts of at most 65,536
+/// domains, one after the other.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct VertexLayout {
+    #[prost(uint32, repeated, tag = "1")]
+    pub domains: ::prost::alloc::vec::Vec<u32>,
+    /// Number of vertices and of corners of each of these domains.
+    #[prost(uint32, repeated, tag = "2")]
+    pub vertices: ::prost::alloc::vec::Vec<u32>,
+    #[prost(uint32, repeated, tag = "3")]
+    pub corners: ::prost::alloc::vec::Vec<u32>,
+    /// Whether further parts follow.
+    #[prost(bool, tag = "4")]
+    pub has_more: bool,
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct VertexChunk {
     /// Set on the first chunk of a step only.
     #[prost(message, optional, tag = "1")]
     pub head: ::core::option::Option<VertexHead>,
-    /// Offset of `data` in the reply for this step, in bytes.
+    /// Offset of `data` in the bytes of this step.
     #[prost(uint64, tag = "2")]
     pub offset: u64,
     #[prost(bytes = "bytes", tag = "3")]
     pub data: ::prost::bytes::Bytes,
 }
-/// Head of the reply for one step. The bytes of the reply are the requested parts in this order, each for all selected
-/// domains. A corner is a vertex with its normal and texture coordinates (see Array).
-///
-/// * positions: 3 little-endian f32 per vertex, in row order of U, scene units. The world position of a vertex in meters
-///   is origin + SceneInfo.unit * position.
-/// * normals: 3 little-endian f32 per corner, in world axes.
-/// * displacements: u = U q, 3 little-endian f32 per vertex, in row order of U, in scene units and in the domain's own
-///   frame. The position of a vertex is T (x0 + u).
-/// * boxes: 6 little-endian f32 per selected domain: the minimum x, y, z of its positions, then the maximum, relative to
-///   the same origin as the positions.
-/// * origins: 3 little-endian f64 per selected domain, the origin of its positions in meters; present if `origin_bytes`
-///   is not 0.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct VertexHead {
     #[prost(message, optional, tag = "1")]
     pub step: ::core::option::Option<StepId>,
-    /// Three numbers: the origin of this reply's positions in the world, meters. It is SceneInfo.origin until a step with
-    /// f64 translations moves domains far from that origin; then it follows the domains and may differ from step to step.
-    #[prost(double, repeated, tag = "2")]
-    pub origin: ::prost::alloc::vec::Vec<f64>,
-    /// The selected domains in the order of the reply, and their vertex and corner counts.
-    #[prost(uint32, repeated, tag = "3")]
-    pub domains: ::prost::alloc::vec::Vec<u32>,
-    #[prost(uint32, repeated, tag = "4")]
-    pub vertices: ::prost::alloc::vec::Vec<u32>,
-    #[prost(uint32, repeated, tag = "5")]
-    pub corners: ::prost::alloc::vec::Vec<u32>,
-    /// Size of the positions (0 without them) and of the whole reply, in bytes.
-    #[prost(uint64, tag = "6")]
-    pub position_bytes: u64,
-    #[prost(uint64, tag = "7")]
+    /// What the bytes of the step contain, in the order of their offsets and without gaps.
+    #[prost(message, repeated, tag = "2")]
+    pub sections: ::prost::alloc::vec::Vec<VertexSection>,
+    /// Size of all sections in bytes.
+    #[prost(uint64, tag = "3")]
     pub total: u64,
     /// Steps skipped since the previous step of this stream.
-    #[prost(uint64, tag = "8")]
+    #[prost(uint64, tag = "4")]
     pub skipped: u64,
-    #[prost(message, repeated, tag = "9")]
+    #[prost(message, repeated, tag = "5")]
     pub stages: ::prost::alloc::vec::Vec<StageTime>,
-    /// Size of the per-domain origins at the end of the reply. 0 if `origin` applies to all selected domains, else 24
-    /// bytes per selected domain; `origin` then does not apply to all of them.
-    #[prost(uint64, tag = "10")]
-    pub origin_bytes: u64,
-    /// Size of the displacements and of the boxes in bytes; 0 if not requested.
-    #[prost(uint64, tag = "11")]
-    pub displacement_bytes: u64,
-    #[prost(uint64, tag = "12")]
-    pub box_bytes: u64,
+}
+#[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct VertexSection {
+    #[prost(enumeration = "Attribute", tag = "1")]
+    pub attribute: i32,
+    #[prost(enumeration = "Encoding", tag = "2")]
+    pub encoding: i32,
+    /// Offset and size in the bytes of the step.
+    #[prost(uint64, tag = "3")]
+    pub offset: u64,
+    #[prost(uint64, tag = "4")]
+    pub bytes: u64,
+}
+/// An attribute of the vertices. Its vectors are stored for all selected domains one after the other. A vertex v of a
+/// domain has rows 3v, 3v + 1 and 3v + 2 of U; a corner is a vertex with its normal and texture coordinates (see Array).
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
+#[repr(i32)]
+pub enum Attribute {
+    /// Rejected.
+    Unspecified = 0,
+    /// One vector per vertex, in scene units. The world position in meters is origin + SceneInfo.unit * vector, where
+    /// ATTRIBUTE_ORIGINS has the origin.
+    Positions = 1,
+    /// One unit vector per corner, in world axes.
+    Normals = 2,
+    /// u = U q, one vector per vertex, in scene units and in the domain's own frame: a vertex is at T (x0 + u). Rejected
+    /// unless the scene computes them (deform.displacements = true in its scene.toml).
+    Displacements = 3,
+    /// Two vectors per selected domain: the minimum x, y, z of its positions, then the maximum, relative to the origin of
+    /// the positions. Rejected unless the scene computes them (deform.boxes = true in its scene.toml).
+    Boxes = 4,
+    /// 3 f64 in meters: the world position of the origin of all positions, or 3 f64 per selected domain if the origins
+    /// differ. It is SceneInfo.origin until a step with f64 translations moves domains far from that origin; then it
+    /// follows the domains. Sent without being selected: in the first step of a reply and whenever it has changed.
+    Origins = 5,
+}
+impl Attribute {
+    /// String value of the enum field names used in the ProtoBuf definition.
+    ///
+    /// The values are not transformed in any way and thus are considered stable
+    /// (if the ProtoBuf definition does not change) and safe for programmatic use.
+    pub fn as_str_name(&self) -> &'static str {
+        match self {
+            Self::Unspecified => "ATTRIBUTE_UNSPECIFIED",
+            Self::Positions => "ATTRIBUTE_POSITIONS",
+            Self::Normals => "ATTRIBUTE_NORMALS",
+            Self::Displacements => "ATTRIBUTE_DISPLACEMENTS",
+            Self::Boxes => "ATTRIBUTE_BOXES",
+            Self::Origins => "ATTRIBUTE_ORIGINS",
+        }
+    }
+    /// Creates an enum from field names used in the ProtoBuf definition.
+    pub fn from_str_name(value: &str) -> ::core::option::Option<Self> {
+        match value {
+            "ATTRIBUTE_UNSPECIFIED" => Some(Self::Unspecified),
+            "ATTRIBUTE_POSITIONS" => Some(Self::Positions),
+            "ATTRIBUTE_NORMALS" => Some(Self::Normals),
+            "ATTRIBUTE_DISPLACEMENTS" => Some(Self::Displacements),
+            "ATTRIBUTE_BOXES" => Some(Self::Boxes),
+            "ATTRIBUTE_ORIGINS" => Some(Self::Origins),
+            _ => None,
+        }
+    }
+}
+/// How the vectors of an attribute are stored. All numbers are little-endian.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
+#[repr(i32)]
+pub enum Encoding {
+    /// Means ENCODING_F32.
+    Unspecified = 0,
+    /// 3 f32, 12 bytes a vector.
+    F32 = 1,
+    /// 3 f16, 6 bytes a vector. Each number is rounded to the nearest f16: the error is at most 2^-11 of its magnitude, or
+    /// 2^-25 below 2^-14. Numbers above 65504 become infinite. Not for boxes.
+    F16 = 2,
+    /// 3 u16, 6 bytes a vector, for positions and displacements. 256 consecutive vectors of the section (at its end fewer)
+    /// share a box of 6 f32, its minimum and its maximum. The section has all boxes first. A number n stands for
+    /// minimum + n / 65535 * (maximum - minimum), and its error is at most (maximum - minimum) / 131070 per axis, plus the
+    /// rounding of that expression to f32.
+    U16Box = 3,
+    /// 2 i16, 4 bytes a vector, for normals: octahedral. n = (x, y, z) / (|x| + |y| + |z|) is mapped to (x, y), and to
+    /// ((1 - |y|) sign(x), (1 - |x|) sign(y)) if z \< 0, times 32767 and rounded. The angle to the unit normal is at most
+    /// 0.004 degrees. The zero vector becomes (0, 0, 1).
+    OctahedralI16 = 4,
+    /// Numbers of 8 bytes, only for ATTRIBUTE_ORIGINS.
+    F64 = 5,
+}
+impl Encoding {
+    /// String value of the enum field names used in the ProtoBuf definition.
+    ///
+    /// The values are not transformed in any way and thus are considered stable
+    /// (if the ProtoBuf definition does not change) and safe for programmatic use.
+    pub fn as_str_name(&self) -> &'static str {
+        match self {
+            Self::Unspecified => "ENCODING_UNSPECIFIED",
+            Self::F32 => "ENCODING_F32",
+            Self::F16 => "ENCODING_F16",
+            Self::U16Box => "ENCODING_U16_BOX",
+            Self::OctahedralI16 => "ENCODING_OCTAHEDRAL_I16",
+            Self::F64 => "ENCODING_F64",
+        }
+    }
+    /// Creates an enum from field names used in the ProtoBuf definition.
+    pub fn from_str_name(value: &str) -> ::core::option::Option<Self> {
+        match value {
+            "ENCODING_UNSPECIFIED" => Some(Self::Unspecified),
+            "ENCODING_F32" => Some(Self::F32),
+            "ENCODING_F16" => Some(Self::F16),
+            "ENCODING_U16_BOX" => Some(Self::U16Box),
+            "ENCODING_OCTAHEDRAL_I16" => Some(Self::OctahedralI16),
+            "ENCODING_F64" => Some(Self::F64),
+            _ => None,
+        }
+    }
 }
 /// Generated client implementations.
 pub mod vertex_service_client {
@@ -2737,7 +2849,8 @@ pub mod vertex_service_client {
     )]
     use tonic::codegen::*;
     use tonic::codegen::http::Uri;
-    /// Deformed vertices, and attributes computed with them.
+    /// Deformed vertices, and attributes computed with them. A reply begins with the layout, which holds for all its steps.
+    /// The bytes of each step follow in chunks of at most 1 MiB, the first one with the head of the step.
     #[derive(Debug, Clone)]
     pub struct VertexServiceClient<T> {
         inner: tonic::client::Grpc<T>,
@@ -2818,7 +2931,7 @@ pub mod vertex_service_client {
             self.inner = self.inner.max_encoding_message_size(limit);
             self
         }
-        /// Returns the vertices of one step in chunks of at most 1 MiB.
+        /// Returns the vertices of one step.
         pub async fn get_vertices(
             &mut self,
             request: impl tonic::IntoRequest<super::GetVerticesRequest>,
@@ -2843,8 +2956,8 @@ pub mod vertex_service_client {
                 .insert(GrpcMethod::new("modalcast.v1.VertexService", "GetVertices"));
             self.inner.server_streaming(req, path, codec).await
         }
-        /// Returns the vertices of each step that `delivery` selects, in chunks of at most 1 MiB. The subscription is active
-        /// when the response headers arrive, so the next step is delivered.
+        /// Returns the vertices of each step that `delivery` selects. The subscription is active when the response headers
+        /// arrive, so the next step is delivered.
         pub async fn stream_vertices(
             &mut self,
             request: impl tonic::IntoRequest<super::StreamVerticesRequest>,
@@ -2890,7 +3003,7 @@ pub mod vertex_service_server {
             >
             + std::marker::Send
             + 'static;
-        /// Returns the vertices of one step in chunks of at most 1 MiB.
+        /// Returns the vertices of one step.
         async fn get_vertices(
             &self,
             request: tonic::Request<super::GetVerticesRequest>,
@@ -2904,8 +3017,8 @@ pub mod vertex_service_server {
             >
             + std::marker::Send
             + 'static;
-        /// Returns the vertices of each step that `delivery` selects, in chunks of at most 1 MiB. The subscription is active
-        /// when the response headers arrive, so the next step is delivered.
+        /// Returns the vertices of each step that `delivery` selects. The subscription is active when the response headers
+        /// arrive, so the next step is delivered.
         async fn stream_vertices(
             &self,
             request: tonic::Request<super::StreamVerticesRequest>,
@@ -2914,7 +3027,8 @@ pub mod vertex_service_server {
             tonic::Status,
         >;
     }
-    /// Deformed vertices, and attributes computed with them.
+    /// Deformed vertices, and attributes computed with them. A reply begins with the layout, which holds for all its steps.
+    /// The bytes of each step follow in chunks of at most 1 MiB, the first one with the head of the step.
     #[derive(Debug)]
     pub struct VertexServiceServer<T> {
         inner: Arc<T>,

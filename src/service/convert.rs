@@ -13,6 +13,9 @@ use modalcast_model::scene::{Camera, FrameSize, PixelRect, RawStepUpdate, Scene,
 
 mod camera;
 mod output;
+mod vertices;
+
+pub(super) use vertices::{parse_vertex_selection, wire_sections};
 
 /// Limit in bytes on the remarks in one scene description.
 const MAX_REMARK_BYTES: usize = 64 << 10;

@@ -27,8 +27,8 @@ use crate::config::Config;
 use crate::engine::Engine;
 use modalcast_model::error::{Error, Result, fault_in};
 
-/// Largest message that the server sends, in bytes: a chunk of at most 1 MiB and its head. The head of a vertex reply
-/// lists up to 65 536 domains with their counts.
+/// Largest message that the server sends, in bytes: a chunk of at most 1 MiB and its head, or the layout of 65,536
+/// domains.
 const MAX_REPLY_BYTES: usize = 3 << 20;
 
 /// Binds the configured address.

@@ -13,7 +13,7 @@ use v1::drive_scene_response::Kind as ResponseKind;
 use crate::common::attributes;
 use crate::service_harness::{
     ReceivedVertices, ReferenceVertices, Server, get_vertices, next_vertices, reference_vertices, rejection_details,
-    state_after_steps, step, strips_with_attributes, with_timeout,
+    select, state_after_steps, step, strips_with_attributes, with_timeout,
 };
 
 /// Maximum error of positions and displacements in scene units. The values are below 8, where numbers in f32 are 5e-7
@@ -26,12 +26,13 @@ fn vertex_request(scene: &str, selection: v1::VertexSelection) -> v1::GetVertice
 
 /// Selects vertices, displacements and boxes of the listed domains, or of all domains if the list is empty.
 fn select_vertices_and_attributes(domains: &[u32]) -> v1::VertexSelection {
-    v1::VertexSelection { domains: domains.to_vec(), displacements: true, boxes: true, ..Default::default() }
+    use v1::Attribute::{Boxes, Displacements, Normals, Positions};
+    select(domains, &[Positions, Normals, Displacements, Boxes]).expect("expected a selection")
 }
 
 /// Selects displacements and boxes of the listed domains, without vertices. An empty list selects all domains.
 fn select_attributes(domains: &[u32]) -> v1::VertexSelection {
-    v1::VertexSelection { without_vertices: true, ..select_vertices_and_attributes(domains) }
+    select(domains, &[v1::Attribute::Displacements, v1::Attribute::Boxes]).expect("expected a selection")
 }
 
 /// Displacements of the f64 reference after `steps`, for the scene that the test server opens as `attributes`.
@@ -91,11 +92,9 @@ async fn displacements_and_boxes_come_with_or_without_vertices() {
                 .await
                 .expect("expected vertices");
             assert!(attributes.positions.is_empty() && attributes.normals.is_empty());
-            // Eight displacements of 12 bytes, and two boxes of 24 bytes.
-            assert_eq!(
-                (attributes.head.displacement_bytes, attributes.head.box_bytes, attributes.head.total),
-                (96, 48, 144)
-            );
+            // Eight displacements of 12 bytes, two boxes and an origin of 24 bytes.
+            let section_bytes: Vec<u64> = attributes.head.sections.iter().map(|section| section.bytes).collect();
+            assert_eq!((section_bytes, attributes.head.total), (vec![96, 48, 24], 168));
             assert_attributes(&attributes, 0..2);
             let vertices_and_attributes =
                 get_vertices(&server, vertex_request("attributes", select_vertices_and_attributes(&[])))
@@ -121,15 +120,80 @@ async fn displacements_and_boxes_come_with_or_without_vertices() {
     }
 }
 
+/// Requests vertices of the sheet with and without compact encodings through the client. Each error is within the bound
+/// that `vertices.proto` states, and the compact reply has less than half of the bytes.
+#[tokio::test(flavor = "multi_thread")]
+async fn compact_encodings_stay_within_their_bounds() {
+    use modalcast_client::{Attribute, Client, Encoding, VertexRequest, VertexSelection};
+    let server = Server::start_default().await;
+    server.open("sheet").await;
+    let mut writer = server.drive_lossless("sheet").await;
+    writer.send_step_and_wait(step(1, &[0], &[20.0, -3.0, 0.5, 7.0])).await;
+    let client = Client::connect(&server.address).await.expect("expected a connection");
+    let get = async |vectors, normals| {
+        let selection = VertexSelection::default()
+            .encoded_attribute(Attribute::Positions, vectors)
+            .encoded_attribute(Attribute::Normals, normals);
+        client.get_vertices(&VertexRequest::new("sheet", selection)).await.expect("expected vertices")
+    };
+    let exact = get(Encoding::F32, Encoding::F32).await;
+    let compact = get(Encoding::U16Box, Encoding::OctahedralI16).await;
+    let half = get(Encoding::F16, Encoding::F16).await;
+    assert_eq!((exact.positions.len(), exact.common_origin()), (3 * 300 * 300, Some([0.0; 3])));
+    for (block, compact_block) in exact.positions.chunks(3 * 256).zip(compact.positions.chunks(3 * 256)) {
+        for axis in 0..3 {
+            let coordinates = || block.iter().skip(axis).step_by(3).copied();
+            let (min, max) = (coordinates().fold(f32::MAX, f32::min), coordinates().fold(f32::MIN, f32::max));
+            // Plus the rounding of the decoded number to f32.
+            let bound = (max - min) / 131_070.0 + max.abs().max(min.abs()) * f32::EPSILON;
+            let compact_coordinates = compact_block.iter().skip(axis).step_by(3);
+            let errors = coordinates().zip(compact_coordinates).map(|(exact, compact)| (exact - compact).abs());
+            assert!(errors.fold(0.0, f32::max) <= bound);
+        }
+    }
+    for (number, half_number) in exact.positions.iter().zip(&half.positions) {
+        assert!((number - half_number).abs() <= (number.abs() / 2048.0).max(2.0_f32.powi(-25)));
+    }
+    let max_angle = |normals: &[f32]| {
+        let vector = |numbers: &[f32]| nalgebra::Vector3::from_column_slice(numbers).cast::<f64>();
+        let pairs = exact.normals.chunks_exact(3).zip(normals.chunks_exact(3));
+        pairs.map(|(a, b)| vector(a).normalize().cross(&vector(b)).norm().asin().to_degrees()).fold(0.0, f64::max)
+    };
+    assert!(max_angle(&compact.normals) <= 0.004 && max_angle(&half.normals) <= 0.05);
+    let ratio = compact.encoded_bytes as f64 / exact.encoded_bytes as f64;
+    assert!(ratio < 0.43, "10 bytes a vertex and the boxes instead of 24 bytes, got {ratio}");
+    assert_ne!(compact.positions, exact.positions, "control: the encoding is not exact");
+}
+
+/// The layout of many domains arrives in several parts, before the first step.
+#[tokio::test(flavor = "multi_thread")]
+async fn stream_of_70000_domains_has_one_layout() {
+    use modalcast_client::{Attribute, Client, VertexSelection, VertexStreamRequest};
+    let server = Server::start_with(|config| Config { backend: BackendChoice::Cpu, ..config }).await;
+    server.open("crowd").await;
+    let client = Client::connect(&server.address).await.expect("expected a connection");
+    let selection = VertexSelection::default().attribute(Attribute::Positions);
+    let request = VertexStreamRequest::new("crowd", selection);
+    let mut vertex_stream = client.stream_vertices(&request).await.expect("expected a subscription");
+    let mut writer = server.drive_lossless("crowd").await;
+    for number in 1..=2 {
+        writer.send_step_and_wait(step(number, &[69_999], &[number as f32, 0.0])).await;
+        let set = with_timeout(vertex_stream.next()).await.expect("expected a step").expect("expected vertices");
+        assert_eq!((set.step.number, set.domains.len(), set.domains[69_999].index), (number, 70_000, 69_999));
+        assert_eq!(set.positions.len(), 70_000 * NUMBERS_PER_DOMAIN);
+        let (first_domain, last_domain) = (&set.positions[..12], &set.positions[69_999 * 12..]);
+        assert_ne!(first_domain, last_domain, "the step moves only the last domain");
+    }
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn box_stream_delivers_every_step() {
     // The deformer of this server is the f64 reference, so the boxes are exactly equal.
     let server = Server::start_default().await;
     server.open("attributes").await;
-    let selection = v1::VertexSelection { boxes: true, without_vertices: true, ..Default::default() };
     let request = v1::StreamVerticesRequest {
         scene: "attributes".into(),
-        selection: Some(selection),
+        selection: select(&[], &[v1::Attribute::Boxes]),
         delivery: v1::Delivery::Lossless.into(),
         steps: 2,
     };
@@ -237,24 +301,21 @@ async fn subscribers_of_different_attributes_get_every_step() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn disabled_and_empty_selections_are_rejected() {
+async fn disabled_and_repeated_attributes_are_rejected() {
     let server = Server::start_default().await;
     // This scene enables neither displacements nor boxes.
     server.open("strips").await;
-    // The third selection is empty: no vertices, and no attribute instead of them.
     for (selection, field, expected) in [
+        (select(&[], &[v1::Attribute::Displacements]), "attributes[0].attribute", "deform.displacements = true"),
         (
-            v1::VertexSelection { displacements: true, ..Default::default() },
-            "displacements",
-            "deform.displacements = true",
+            select(&[], &[v1::Attribute::Positions, v1::Attribute::Boxes]),
+            "attributes[1].attribute",
+            "deform.boxes = true",
         ),
-        (v1::VertexSelection { boxes: true, ..Default::default() }, "boxes", "deform.boxes = true"),
-        (
-            v1::VertexSelection { without_vertices: true, ..Default::default() },
-            "without_vertices",
-            "displacements or boxes",
-        ),
+        (select(&[], &[v1::Attribute::Unspecified]), "attributes[0].attribute", "an attribute of this version"),
+        (select(&[], &[v1::Attribute::Positions; 2]), "attributes[1]", "each attribute once"),
     ] {
+        let selection = selection.expect("expected a selection");
         let error = get_vertices(&server, vertex_request("strips", selection.clone()))
             .await
             .expect_err("expected a rejected selection");

@@ -8,8 +8,8 @@ use nalgebra::{Quaternion, UnitQuaternion, Vector3};
 use v1::TransformFormat::{AffineF32, RigidF32, RigidF64, Unspecified};
 
 use crate::service_harness::{
-    ReceivedVertices, Server, config, far_strips, get_vertices, reference_vertices, rigid_step, state_after_steps,
-    step, strips,
+    ReceivedVertices, Server, config, far_strips, get_vertices, reference_vertices, rigid_step, select,
+    state_after_steps, step, strips,
 };
 
 /// Pose of a domain in scene units.
@@ -21,7 +21,7 @@ struct Pose {
 }
 
 fn vertex_request(scene: &str, domains: &[u32]) -> v1::GetVerticesRequest {
-    let selection = Some(v1::VertexSelection { domains: domains.to_vec(), ..Default::default() });
+    let selection = select(domains, &[]);
     v1::GetVerticesRequest { scene: scene.into(), selection, ..v1::GetVerticesRequest::default() }
 }
 
@@ -51,9 +51,9 @@ fn expected_positions(scene: &Scene, domain: usize, q: &[f32], pose: Pose) -> Ve
 fn decode_positions(scene: &Scene, reply: &ReceivedVertices) -> Vec<Vector3<f64>> {
     let mut positions = reply.positions.chunks_exact(3);
     let mut world_positions = Vec::new();
-    for (index, vertices) in reply.head.vertices.iter().enumerate() {
-        // Origins are in meters: one per domain, or one in the head for all domains.
-        let origin = if reply.origins.is_empty() { &reply.head.origin } else { &reply.origins[3 * index..][..3] };
+    for (index, vertices) in reply.layout.vertices.iter().enumerate() {
+        // Origins are in meters: one per domain, or one for all domains.
+        let origin = if reply.origins.len() == 3 { &reply.origins[..] } else { &reply.origins[3 * index..][..3] };
         let origin = Vector3::from_column_slice(origin);
         for position in positions.by_ref().take(*vertices as usize) {
             world_positions.push(origin + scene.unit * Vector3::from_column_slice(position).cast::<f64>());
@@ -108,7 +108,7 @@ async fn transform_formats_give_equal_vertices() {
             (&expected_vertices.positions, &expected_vertices.normals),
             "step {number}"
         );
-        assert_eq!((reply.head.origin.as_slice(), reply.origins.len()), ([0.0; 3].as_slice(), 0));
+        assert_eq!(reply.origins, [0.0; 3]);
     }
     // Negative control: another rotation gives other vertices.
     let other_step = rigid_step(9, RigidF32, &[(1, quaternion(0.3, -0.8, 2.1), pose.translation)]);
@@ -142,9 +142,7 @@ async fn far_scene_and_far_domain_keep_millimeter_precision() {
         ))
         .await;
     let reply = get_vertices(&server, vertex_request("far", &[])).await.expect("expected vertices");
-    // Two origins of three f64 numbers have 48 bytes.
-    assert_eq!((reply.head.origin.as_slice(), reply.head.origin_bytes), (scene.origin.as_slice(), 48));
-    assert_eq!(reply.origins[..3], scene.origin);
+    assert_eq!((reply.origins.len(), &reply.origins[..3]), (6, scene.origin.as_slice()));
     let expected =
         [expected_positions(&scene, 0, &q[..2], near_pose), expected_positions(&scene, 1, &q[2..], far_pose)].concat();
     let error = max_distance(&decode_positions(&scene, &reply), &expected);
@@ -158,7 +156,7 @@ async fn far_scene_and_far_domain_keep_millimeter_precision() {
     );
     // A selection of the domains in reverse order without normals, and a selection of one domain, have the same
     // precision.
-    let selection = Some(v1::VertexSelection { domains: vec![1, 0], positions_only: true, ..Default::default() });
+    let selection = select(&[1, 0], &[v1::Attribute::Positions]);
     let swapped_reply = get_vertices(&server, v1::GetVerticesRequest { selection, ..vertex_request("far", &[]) })
         .await
         .expect("expected vertices");
@@ -168,7 +166,7 @@ async fn far_scene_and_far_domain_keep_millimeter_precision() {
         swapped_reply.normals.is_empty() && max_distance(&decode_positions(&scene, &swapped_reply), &expected) <= 1e-3
     );
     let near_reply = get_vertices(&server, vertex_request("far", &[0])).await.expect("expected vertices");
-    assert_eq!(near_reply.head.origin_bytes, 0, "expected one origin, in the head");
+    assert_eq!(near_reply.origins.len(), 3, "expected one origin");
     assert!(
         max_distance(&decode_positions(&scene, &near_reply), &expected_positions(&scene, 0, &q[..2], near_pose))
             <= 1e-3
@@ -199,10 +197,7 @@ async fn origin_follows_a_moved_scene_and_survives_a_restart() {
     writer.send_step_and_wait(pose_step(4)).await;
     let reply = get_vertices(&server, vertex_request("strips", &[])).await.expect("expected vertices");
     // Origins are multiples of 1024. The nearest one to 1e7 is 9766 * 1024.
-    assert_eq!(
-        (reply.head.origin.as_slice(), reply.head.origin_bytes),
-        ([9766.0 * 1024.0, 0.0, -9766.0 * 1024.0].as_slice(), 0)
-    );
+    assert_eq!(reply.origins, [9766.0 * 1024.0, 0.0, -9766.0 * 1024.0]);
     let expected =
         [expected_positions(&scene, 0, &[], poses[0]), expected_positions(&scene, 1, &[], poses[1])].concat();
     let error = max_distance(&decode_positions(&scene, &reply), &expected);
@@ -212,8 +207,8 @@ async fn origin_follows_a_moved_scene_and_survives_a_restart() {
     let server = Server::start(settings()).await;
     let restored_reply = get_vertices(&server, vertex_request("strips", &[])).await.expect("expected vertices");
     assert_eq!(
-        (restored_reply.step().number, &restored_reply.positions, &restored_reply.head.origin),
-        (4, &reply.positions, &reply.head.origin)
+        (restored_reply.step().number, &restored_reply.positions, &restored_reply.origins),
+        (4, &reply.positions, &reply.origins)
     );
     // The next step changes only domain 1. Domain 0 keeps the pose that the restart restored.
     let mut writer = server.drive_lossless("strips").await;
@@ -222,5 +217,5 @@ async fn origin_follows_a_moved_scene_and_survives_a_restart() {
     let reply = get_vertices(&server, vertex_request("strips", &[])).await.expect("expected vertices");
     let expected =
         [expected_positions(&scene, 0, &[], poses[0]), expected_positions(&scene, 1, &[], new_pose)].concat();
-    assert!(reply.origins.is_empty() && max_distance(&decode_positions(&scene, &reply), &expected) <= 1e-3);
+    assert!(reply.origins.len() == 3 && max_distance(&decode_positions(&scene, &reply), &expected) <= 1e-3);
 }

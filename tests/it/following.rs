@@ -4,7 +4,7 @@
 
 use modalcast_proto::v1;
 
-use crate::service_harness::{Server, get_vertices, reference_vertices, step, twig};
+use crate::service_harness::{Server, get_vertices, reference_vertices, select, step, twig};
 
 /// Indices of domains of the scene `twig`, where the branch is named `right`. Domain 0, `left`, is a strip that no
 /// domain follows.
@@ -21,7 +21,7 @@ fn transform_step(number: u64, domains: &[u32], transforms: &[[f32; 12]]) -> v1:
 }
 
 fn vertex_request(domains: &[u32]) -> v1::GetVerticesRequest {
-    let selection = Some(v1::VertexSelection { domains: domains.to_vec(), positions_only: true, ..Default::default() });
+    let selection = select(domains, &[v1::Attribute::Positions]);
     v1::GetVerticesRequest { scene: "twig".into(), selection, ..v1::GetVerticesRequest::default() }
 }
 

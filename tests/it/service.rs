@@ -10,7 +10,8 @@ use v1::Array;
 use v1::describe_scene_response::Part;
 
 use crate::service_harness::{
-    MAX_MESSAGE_BYTES, Server, get_vertices, reference_vertices, rejection_details, sheet, strips, with_timeout,
+    MAX_MESSAGE_BYTES, Server, get_vertices, next_vertices, reference_vertices, rejection_details, sheet, strips,
+    with_timeout,
 };
 
 /// A source of scenes. The first opening waits for a signal and then fails. Later openings take 100 ms and succeed.
@@ -203,7 +204,7 @@ async fn openings_share_one_scene_and_deletion_ends_its_streams() {
     let mut writer = server.drive_lossless("strips").await;
     let delete_request = v1::DeleteSceneRequest { scene: "strips".into() };
     server.scenes().await.delete_scene(delete_request).await.expect("expected the deletion to succeed");
-    let status = with_timeout(stream.message()).await.expect_err("expected a deleted-scene error");
+    let status = next_vertices(&mut stream).await.expect_err("expected a deleted-scene error");
     assert_eq!((status.code(), rejection_details(&status).given.as_str()), (tonic::Code::NotFound, "'strips'"));
     let status = with_timeout(writer.replies.message()).await.expect_err("expected a deleted-scene error");
     assert_eq!(status.code(), tonic::Code::NotFound);

@@ -43,8 +43,8 @@ pub(crate) const MAX_MESSAGE_BYTES: usize = (1 << 20) + 4096;
 pub(crate) const DEFAULT_WINDOW: u32 = 0;
 
 /// Source of scenes built in code: `strips` (two small domains), `far` (`strips` far from the world origin), `twig`
-/// (with followers), `attributes` (with displacements and boxes), `sheet` (more than 1 MiB per array) and `panic` (the
-/// loader panics).
+/// (with followers), `attributes` (with displacements and boxes), `sheet` (more than 1 MiB per array), `crowd`
+/// (70,000 domains) and `panic` (the loader panics).
 pub(crate) struct SyntheticScenes;
 
 impl SceneSource for SyntheticScenes {
@@ -55,6 +55,7 @@ impl SceneSource for SyntheticScenes {
             "twig" => twig(),
             "attributes" => strips_with_attributes(),
             "sheet" => sheet(),
+            "crowd" => crowd(),
             "panic" => panic!("intended panic of the loader"),
             _ => return Err(Error::NotFound { what: "scene", given: source.into() }),
         };
@@ -112,6 +113,13 @@ pub(crate) fn strips_with_attributes() -> Arc<Scene> {
     let (shapes, materials) = (vec![shape], vec![Material::default()]);
     Scene::new(SceneParts { shapes, materials, domains, deformation, ..SceneParts::named("attributes") })
         .expect("expected a valid scene")
+}
+
+/// 70,000 squares of one shape, more than one part of a vertex layout has.
+pub(crate) fn crowd() -> Arc<Scene> {
+    let (shape, _) = two_strips(1.0);
+    let domains = (0..70_000).map(|index: u32| domain(&index.to_string(), None)).collect();
+    scene("crowd", shape, domains)
 }
 
 /// The shape and the domains of [`strips`], with the entries of U times `mode_scale`.
@@ -427,13 +435,15 @@ pub(crate) fn state_after_steps(scene: &Scene, steps: &[v1::Step]) -> SceneState
 /// Vertex data of one step, joined from chunks.
 #[derive(Debug)]
 pub(crate) struct ReceivedVertices {
+    /// Empty for a step of a stream.
+    pub(crate) layout: v1::VertexLayout,
     pub(crate) head: v1::VertexHead,
     pub(crate) positions: Vec<f32>,
     pub(crate) normals: Vec<f32>,
     pub(crate) displacements: Vec<f32>,
     /// Six numbers per selected domain: minimum, then maximum.
     pub(crate) boxes: Vec<f32>,
-    /// Three numbers per selected domain; empty if the head's origin applies to all domains.
+    /// Three numbers for all domains or for each selected domain; empty if they have not changed.
     pub(crate) origins: Vec<f64>,
 }
 
@@ -443,27 +453,45 @@ impl ReceivedVertices {
     }
 }
 
+/// A selection of attributes as f32.
+pub(crate) fn select(domains: &[u32], attributes: &[v1::Attribute]) -> Option<v1::VertexSelection> {
+    let to_wire = |attribute: &v1::Attribute| v1::SelectedAttribute { attribute: (*attribute).into(), encoding: 0 };
+    Some(v1::VertexSelection { domains: domains.to_vec(), attributes: attributes.iter().map(to_wire).collect() })
+}
+
 /// Requests the vertices of a scene.
 pub(crate) async fn get_vertices(
     server: &Server,
     request: v1::GetVerticesRequest,
 ) -> Result<ReceivedVertices, tonic::Status> {
+    use v1::get_vertices_response::Part;
     let mut stream = with_timeout(server.vertices().await.get_vertices(request)).await?.into_inner();
-    let mut chunks = Vec::new();
+    let (mut received_layout, mut chunks) = (None, Vec::new());
     while let Some(response) = with_timeout(stream.message()).await? {
         assert!(response.encoded_len() <= MAX_MESSAGE_BYTES, "{} bytes", response.encoded_len());
-        chunks.push(response.chunk.expect("expected a chunk"));
+        match response.part.expect("expected a part") {
+            Part::Layout(layout) => {
+                assert!(chunks.is_empty() && !layout.has_more);
+                received_layout = Some(layout);
+            }
+            Part::Chunk(chunk) => chunks.push(chunk),
+        }
     }
-    Ok(join_chunks(chunks))
+    let layout = received_layout.expect("expected a layout before the first chunk");
+    Ok(ReceivedVertices { layout, ..join_chunks(chunks) })
 }
 
-/// Reads the next step of a vertex stream; `None` at its end.
+/// Reads the next step of a vertex stream; `None` at its end. Skips the layout.
 pub(crate) async fn next_vertices(
     stream: &mut Streaming<v1::StreamVerticesResponse>,
 ) -> Result<Option<ReceivedVertices>, tonic::Status> {
+    use v1::stream_vertices_response::Part;
     let mut chunks = Vec::<v1::VertexChunk>::new();
     while let Some(response) = with_timeout(stream.message()).await? {
-        chunks.push(response.chunk.expect("expected a chunk"));
+        match response.part.expect("expected a part") {
+            Part::Layout(_) => continue,
+            Part::Chunk(chunk) => chunks.push(chunk),
+        }
         let total = chunks[0].head.as_ref().expect("expected a head as the first message").total;
         if chunks.iter().map(|chunk| chunk.data.len() as u64).sum::<u64>() == total {
             return Ok(Some(join_chunks(chunks)));
@@ -482,16 +510,25 @@ fn join_chunks(mut chunks: Vec<v1::VertexChunk>) -> ReceivedVertices {
         bytes.extend_from_slice(&chunk.data);
     }
     assert_eq!(head.total, bytes.len() as u64);
-    // The order is positions, normals, displacements, boxes, origins. The head has no size of the normals, so the last
-    // three arrays are split off the end.
-    let (positions, rest) = bytes.split_at(head.position_bytes as usize);
-    let (rest, origins) = rest.split_at(rest.len() - head.origin_bytes as usize);
-    let (rest, boxes) = rest.split_at(rest.len() - head.box_bytes as usize);
-    let (normals, displacements) = rest.split_at(rest.len() - head.displacement_bytes as usize);
-    let floats = |bytes: &[u8]| bytemuck::pod_collect_to_vec::<u8, f32>(bytes);
-    let origins = bytemuck::pod_collect_to_vec::<u8, f64>(origins);
-    let [positions, normals, displacements, boxes] = [positions, normals, displacements, boxes].map(floats);
-    ReceivedVertices { positions, normals, displacements, boxes, origins, head }
+    // The sections follow each other without gaps.
+    let ends = head.sections.iter().map(|section| section.offset + section.bytes);
+    assert!(
+        head.sections.iter().map(|section| section.offset).eq([0].into_iter().chain(ends).take(head.sections.len()))
+    );
+    let section = |attribute: v1::Attribute| -> &[u8] {
+        let section = head.sections.iter().find(|section| section.attribute() == attribute);
+        section.map_or(&[], |section| &bytes[section.offset as usize..][..section.bytes as usize])
+    };
+    let floats = |attribute: v1::Attribute| bytemuck::pod_collect_to_vec::<u8, f32>(section(attribute));
+    ReceivedVertices {
+        layout: v1::VertexLayout::default(),
+        positions: floats(v1::Attribute::Positions),
+        normals: floats(v1::Attribute::Normals),
+        displacements: floats(v1::Attribute::Displacements),
+        boxes: floats(v1::Attribute::Boxes),
+        origins: bytemuck::pod_collect_to_vec::<u8, f64>(section(v1::Attribute::Origins)),
+        head,
+    }
 }
 
 /// Selects exactly this step of the latest run.

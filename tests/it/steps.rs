@@ -8,7 +8,7 @@ use v1::drive_scene_response::Kind as ResponseKind;
 
 use crate::service_harness::{
     DEFAULT_WINDOW, Server, StepWriter, exact_step, get_vertices, minimum_step, next_vertices, reference_vertices,
-    sheet, step, strips, with_timeout,
+    select, sheet, step, strips, with_timeout,
 };
 
 fn vertex_request(scene: &str) -> v1::GetVerticesRequest {
@@ -55,7 +55,7 @@ async fn lossless_subscriber_gets_every_step_in_order() {
     server.open("strips").await;
     let request = v1::StreamVerticesRequest {
         scene: "strips".into(),
-        selection: Some(v1::VertexSelection { domains: vec![1], positions_only: true, ..Default::default() }),
+        selection: select(&[1], &[v1::Attribute::Positions]),
         delivery: v1::Delivery::Lossless.into(),
         steps: 30,
     };

@@ -42,7 +42,7 @@ impl<M> Replies<M> {
         self.messages.message().await.map_err(|status| Error::from_status(status, &self.url))
     }
 
-    fn poll(&mut self, context: &mut Context<'_>) -> Poll<Option<Result<M>>> {
+    pub(crate) fn poll(&mut self, context: &mut Context<'_>) -> Poll<Option<Result<M>>> {
         let message = ready!(Pin::new(&mut self.messages).poll_next(context));
         Poll::Ready(message.map(|message| message.map_err(|status| Error::from_status(status, &self.url))))
     }

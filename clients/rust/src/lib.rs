@@ -14,6 +14,7 @@ mod stages;
 mod step;
 mod step_stream;
 mod upload;
+mod vertex_encoding;
 mod vertices;
 
 pub use client::{Client, REPLY_LIMIT, SceneList, ServerInfo};
@@ -30,7 +31,9 @@ pub use stages::{StageSamples, StageTimes};
 pub use step::{DomainTransform, Step};
 pub use step_stream::{Ack, DriveRequest, StepStream, StreamSummary};
 pub use tonic::Code;
-pub use vertices::{VertexRequest, VertexSelection, VertexSet, VertexSetDomain, VertexStream, VertexStreamRequest};
+pub use vertices::{
+    Attribute, Encoding, VertexRequest, VertexSelection, VertexSet, VertexSetDomain, VertexStream, VertexStreamRequest,
+};
 
 /// Compiles the client code in the project's README as a doctest.
 #[cfg(doctest)]

@@ -3,21 +3,61 @@
 
 use std::ops::Range;
 use std::pin::Pin;
-use std::task::{Context, Poll};
+use std::sync::Arc;
+use std::task::{Context, Poll, ready};
+
+pub use modalcast_proto::v1::{Attribute, Encoding};
 
 use bytes::Bytes;
 use modalcast_proto::v1;
 use v1::vertex_service_client::VertexServiceClient;
 
-use crate::assemble::{Chunk, ChunkedReplies, WireChunk, decode};
+use crate::assemble::{Assembler, Chunk, Replies, decode};
 use crate::client::Client;
 use crate::error::{Error, Result, malformed_reply};
 use crate::request::{StepRequest, Subscription};
 use crate::stages::{self, StageTimes};
+use crate::vertex_encoding::decode_vectors;
 
-/// The domains and attributes to return. The default is positions and normals of all domains. The server rejects
+/// The domains and attributes to return. The default is positions and normals of all domains, as f32. The server rejects
 /// attributes that `deform` in scene.toml does not enable.
-pub use modalcast_proto::v1::VertexSelection;
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct VertexSelection {
+    /// Domain indices in the order of the reply; empty for all domains.
+    pub domains: Vec<u32>,
+    /// Each attribute once, with its encoding; empty for positions and normals as f32.
+    pub attributes: Vec<(Attribute, Encoding)>,
+}
+
+impl VertexSelection {
+    /// Selects domains by index.
+    #[must_use]
+    pub fn domains(mut self, domains: &[u32]) -> Self {
+        self.domains = domains.to_vec();
+        self
+    }
+
+    /// Adds an attribute as f32.
+    #[must_use]
+    pub fn attribute(self, attribute: Attribute) -> Self {
+        self.encoded_attribute(attribute, Encoding::F32)
+    }
+
+    /// Adds an attribute with an encoding that may take fewer bytes; its documentation states the error.
+    #[must_use]
+    pub fn encoded_attribute(mut self, attribute: Attribute, encoding: Encoding) -> Self {
+        self.attributes.push((attribute, encoding));
+        self
+    }
+
+    fn to_wire(&self) -> v1::VertexSelection {
+        let to_wire = |(attribute, encoding): &(Attribute, Encoding)| v1::SelectedAttribute {
+            attribute: (*attribute).into(),
+            encoding: (*encoding).into(),
+        };
+        v1::VertexSelection { domains: self.domains.clone(), attributes: self.attributes.iter().map(to_wire).collect() }
+    }
+}
 
 /// A request for the vertices of one step.
 pub type VertexRequest = StepRequest<VertexSelection>;
@@ -37,24 +77,24 @@ pub struct VertexSetDomain {
 #[derive(Debug, Clone, PartialEq)]
 pub struct VertexSet {
     pub step: v1::StepId,
-    /// World position of the common origin of all positions, in meters; meaningless if `domain_origins` is not empty.
-    /// The common origin equals the scene's origin until f64 translations move domains far away. Then it follows the
-    /// domains and may change from step to step.
-    pub origin: Vec<f64>,
-    /// The origin of each selected domain in meters, if the origins differ; otherwise empty.
-    pub domain_origins: Vec<[f64; 3]>,
-    /// The selected domains, in the order of all arrays.
-    pub domains: Vec<VertexSetDomain>,
-    /// Three numbers per vertex in scene units, selected domains concatenated; empty if omitted.
+    /// World position in meters of the common origin of all positions, or of the origin of each selected domain if the
+    /// origins differ. The common origin equals that of the scene until f64 translations move domains far from there.
+    /// Then it follows the domains and may differ per step.
+    pub origins: Arc<[[f64; 3]]>,
+    /// The selected domains, in the order of all arrays. All sets of a stream share them.
+    pub domains: Arc<[VertexSetDomain]>,
+    /// Three numbers per vertex in scene units, selected domains concatenated; empty unless selected.
     pub positions: Vec<f32>,
-    /// Three numbers per corner; empty if omitted.
+    /// Three numbers per corner; empty unless selected.
     pub normals: Vec<f32>,
-    /// u = U q, three numbers per vertex in the frame of its domain; empty unless requested.
+    /// u = U q, three numbers per vertex in the frame of its domain; empty unless selected.
     pub displacements: Vec<f32>,
-    /// Per selected domain the minimum and the maximum x, y, z of its positions; empty unless requested.
+    /// Per selected domain the minimum and the maximum x, y, z of its positions; empty unless selected.
     pub boxes: Vec<[[f32; 3]; 2]>,
     /// Number of steps skipped since the previous set of the stream.
     pub skipped: u64,
+    /// Size of the set on the wire in bytes, without messages and heads.
+    pub encoded_bytes: u64,
     pub stages: StageTimes,
 }
 
@@ -68,11 +108,18 @@ impl VertexSet {
         Some(start..start + float_count(domain))
     }
 
-    /// World position of the origin of a selected domain, in meters. `ordinal` is its index in `domains`. A vertex is
-    /// at `domain_origin(ordinal) + unit * position`, where `unit` is [`v1::SceneInfo::unit`].
+    /// World position of the origin of all positions, in meters. `None` if the origins of the domains differ.
+    pub fn common_origin(&self) -> Option<[f64; 3]> {
+        match &*self.origins {
+            [origin] => Some(*origin),
+            _ => None,
+        }
+    }
+
+    /// World position of the origin of a selected domain, in meters. `ordinal` is its index in `domains`. A vertex is at
+    /// `domain_origin(ordinal) + unit * position`, where `unit` is [`v1::SceneInfo::unit`].
     pub fn domain_origin(&self, ordinal: usize) -> [f64; 3] {
-        let common_origin = || std::array::from_fn(|axis| self.origin.get(axis).copied().unwrap_or(0.0));
-        self.domain_origins.get(ordinal).copied().unwrap_or_else(common_origin)
+        self.common_origin().or_else(|| self.origins.get(ordinal).copied()).unwrap_or_default()
     }
 }
 
@@ -85,12 +132,13 @@ impl Client {
     pub async fn get_vertices(&self, request: &VertexRequest) -> Result<VertexSet> {
         let wire = v1::GetVerticesRequest {
             scene: request.scene.clone(),
-            selection: Some(request.query.clone()),
+            selection: Some(request.query.to_wire()),
             step: request.step.to_wire(),
             deadline_ms: request.deadline_ms,
         };
         let messages = self.replies(VertexServiceClient::new(self.channel.clone()).get_vertices(wire).await)?;
-        let set = ChunkedReplies::new(messages, |message| message.chunk, self.max_reply_bytes).next().await;
+        let mut sets = VertexReplies::new(messages, single_part, self.max_reply_bytes);
+        let set = std::future::poll_fn(|context| sets.poll(context)).await;
         set.unwrap_or(Err(Error::StreamEnded { awaited_reply: "the vertices of the step" }))
     }
 
@@ -102,22 +150,22 @@ impl Client {
     pub async fn stream_vertices(&self, request: &VertexStreamRequest) -> Result<VertexStream> {
         let wire = v1::StreamVerticesRequest {
             scene: request.scene.clone(),
-            selection: Some(request.query.clone()),
+            selection: Some(request.query.to_wire()),
             delivery: v1::Delivery::from(request.delivery).into(),
             steps: request.max_replies,
         };
         let messages = self.replies(VertexServiceClient::new(self.channel.clone()).stream_vertices(wire).await)?;
-        Ok(VertexStream(ChunkedReplies::new(messages, |message| message.chunk, self.max_reply_bytes)))
+        Ok(VertexStream(VertexReplies::new(messages, stream_part, self.max_reply_bytes)))
     }
 }
 
 /// A stream of vertex sets; dropping it unsubscribes.
-pub struct VertexStream(ChunkedReplies<v1::StreamVerticesResponse, v1::VertexChunk>);
+pub struct VertexStream(VertexReplies<v1::StreamVerticesResponse>);
 
 impl VertexStream {
     /// The vertices of the next step, or `None` after the requested number of steps.
     pub async fn next(&mut self) -> Option<Result<VertexSet>> {
-        self.0.next().await
+        std::future::poll_fn(|context| self.0.poll(context)).await
     }
 }
 
@@ -129,177 +177,294 @@ impl tokio_stream::Stream for VertexStream {
     }
 }
 
-impl WireChunk for v1::VertexChunk {
-    type Head = v1::VertexHead;
-    type Reply = VertexSet;
-    const NAME: &'static str = "vertices";
-
-    fn into_chunk(self) -> Chunk<Self::Head> {
-        let head = self.head.map(|head| {
-            let total = head.total;
-            (head, total)
-        });
-        Chunk { head, offset: self.offset, data: self.data }
-    }
-
-    fn decode_reply(head: Self::Head, bytes: Bytes) -> Result<VertexSet> {
-        decode_vertex_set(head, &bytes)
-    }
+/// A message of a vertex reply. Both calls have messages of this form.
+enum Part {
+    Layout(v1::VertexLayout),
+    Chunk(v1::VertexChunk),
 }
 
-fn decode_vertex_set(head: v1::VertexHead, bytes: &[u8]) -> Result<VertexSet> {
-    let domain_count = head.domains.len();
-    if head.vertices.len() != domain_count || head.corners.len() != domain_count {
-        return Err(malformed_reply(
-            "vertices.domains",
-            format!("{domain_count} vertex counts and {domain_count} corner counts"),
-            format!("{} and {}", head.vertices.len(), head.corners.len()),
-        ));
-    }
-    let sections = split_reply(&head, bytes)?;
-    let counts = head.vertices.iter().zip(&head.corners);
-    let domains = head.domains.iter().zip(counts);
-    let domain = |(index, (vertex_count, corner_count)): (&u32, (&u32, &u32))| VertexSetDomain {
-        index: *index,
-        vertex_count: *vertex_count,
-        corner_count: *corner_count,
-    };
-    Ok(VertexSet {
-        step: head.step.ok_or_else(|| malformed_reply("vertices.step", "a step", "none"))?,
-        origin: head.origin,
-        domain_origins: decode("vertices.origins", sections.origins)?,
-        domains: domains.map(domain).collect(),
-        positions: decode("vertices.positions", sections.positions)?,
-        normals: decode("vertices.normals", sections.normals)?,
-        displacements: decode("vertices.displacements", sections.displacements)?,
-        boxes: decode("vertices.boxes", sections.boxes)?,
-        skipped: head.skipped,
-        stages: stages::from_wire(head.stages),
+fn single_part(message: v1::GetVerticesResponse) -> Option<Part> {
+    use v1::get_vertices_response::Part as Wire;
+    message.part.map(|part| match part {
+        Wire::Layout(layout) => Part::Layout(layout),
+        Wire::Chunk(chunk) => Part::Chunk(chunk),
     })
 }
 
-/// The bytes of a reply, in the order of the fields. The head has the sizes of all sections but `normals`. The normals
-/// are the remaining bytes.
-struct ReplySections<'a> {
-    positions: &'a [u8],
-    normals: &'a [u8],
-    displacements: &'a [u8],
-    boxes: &'a [u8],
-    origins: &'a [u8],
+fn stream_part(message: v1::StreamVerticesResponse) -> Option<Part> {
+    use v1::stream_vertices_response::Part as Wire;
+    message.part.map(|part| match part {
+        Wire::Layout(layout) => Part::Layout(layout),
+        Wire::Chunk(chunk) => Part::Chunk(chunk),
+    })
 }
 
-fn split_reply<'a>(head: &v1::VertexHead, bytes: &'a [u8]) -> Result<ReplySections<'a>> {
-    // Size of three f32 per item.
-    let float3_bytes = |counts: &[u32]| 12 * counts.iter().map(|count| u64::from(*count)).sum::<u64>();
-    let vertex_bytes = float3_bytes(&head.vertices);
-    let normal_bytes = float3_bytes(&head.corners);
-    // A box has six f32 and an origin three f64: 24 bytes each.
-    let domain_bytes = 24 * head.domains.len() as u64;
-    for (field, section_bytes, complete_bytes) in [
-        ("vertices.position_bytes", head.position_bytes, vertex_bytes),
-        ("vertices.displacement_bytes", head.displacement_bytes, vertex_bytes),
-        ("vertices.box_bytes", head.box_bytes, domain_bytes),
-        ("vertices.origin_bytes", head.origin_bytes, domain_bytes),
-    ] {
-        if section_bytes != 0 && section_bytes != complete_bytes {
-            return Err(malformed_reply(field, format!("0 or {complete_bytes}"), section_bytes));
+/// Turns messages `M` into vertex sets. Keeps what holds for all sets of a reply: the layout, and the last origins. An
+/// error ends the stream.
+struct VertexReplies<M> {
+    messages: Replies<M>,
+    part_of: fn(M) -> Option<Part>,
+    layout: Layout,
+    origins: Option<Arc<[[f64; 3]]>>,
+    assembler: Assembler<v1::VertexHead>,
+    has_ended: bool,
+}
+
+impl<M> VertexReplies<M> {
+    fn new(messages: Replies<M>, part_of: fn(M) -> Option<Part>, max_reply_bytes: u64) -> Self {
+        let (layout, assembler) = (Layout::Incomplete(Vec::new()), Assembler::new("vertices", max_reply_bytes));
+        Self { messages, part_of, layout, origins: None, assembler, has_ended: false }
+    }
+
+    /// Polls for the next complete set.
+    fn poll(&mut self, context: &mut Context<'_>) -> Poll<Option<Result<VertexSet>>> {
+        while !self.has_ended {
+            let set = match ready!(self.messages.poll(context)) {
+                Some(message) => message.and_then(|message| self.add_message(message)),
+                None if self.assembler.is_open() => {
+                    Err(Error::StreamEnded { awaited_reply: "the last chunk of a reply" })
+                }
+                None => {
+                    self.has_ended = true;
+                    return Poll::Ready(None);
+                }
+            };
+            self.has_ended = set.is_err();
+            if let Some(set) = set.transpose() {
+                return Poll::Ready(Some(set));
+            }
+        }
+        Poll::Ready(None)
+    }
+
+    /// Adds a message. Returns the set that it completes.
+    fn add_message(&mut self, message: M) -> Result<Option<VertexSet>> {
+        match (self.part_of)(message) {
+            None => Err(malformed_reply("vertices.part", "a layout or a chunk", "none")),
+            Some(Part::Layout(layout)) => self.layout.add(&layout).map(|()| None),
+            Some(Part::Chunk(chunk)) => {
+                let head = chunk.head.map(|head| {
+                    let total = head.total;
+                    (head, total)
+                });
+                match self.assembler.push(Chunk { head, offset: chunk.offset, data: chunk.data })? {
+                    Some((head, bytes)) => self.decode_set(head, &bytes).map(Some),
+                    None => Ok(None),
+                }
+            }
         }
     }
-    let total = bytes.len() as u64;
-    let bytes_without_normals = head.position_bytes + head.displacement_bytes + head.box_bytes + head.origin_bytes;
-    let bytes_with_normals = bytes_without_normals + normal_bytes;
-    if total != bytes_without_normals && total != bytes_with_normals {
-        let expected = format!("{bytes_without_normals} or {bytes_with_normals}");
-        return Err(malformed_reply("vertices.total", expected, total));
+
+    fn decode_set(&mut self, head: v1::VertexHead, bytes: &Bytes) -> Result<VertexSet> {
+        let Layout::Complete(domains) = &self.layout else {
+            return Err(malformed_reply("vertices.layout", "a complete layout before the first step", "none"));
+        };
+        let set = decode_vertex_set(head, bytes, domains, self.origins.take())?;
+        self.origins = Some(Arc::clone(&set.origins));
+        Ok(set)
     }
-    let (positions, rest) = bytes.split_at(head.position_bytes as usize);
-    let (normals, rest) = rest.split_at((total - bytes_without_normals) as usize);
-    let (displacements, rest) = rest.split_at(head.displacement_bytes as usize);
-    let (boxes, origins) = rest.split_at(head.box_bytes as usize);
-    Ok(ReplySections { positions, normals, displacements, boxes, origins })
+}
+
+/// The selected domains of a reply.
+enum Layout {
+    /// The parts received so far.
+    Incomplete(Vec<VertexSetDomain>),
+    Complete(Arc<[VertexSetDomain]>),
+}
+
+impl Layout {
+    fn add(&mut self, part: &v1::VertexLayout) -> Result<()> {
+        let Self::Incomplete(domains) = self else {
+            return Err(malformed_reply("vertices.layout", "one complete layout", "a further part"));
+        };
+        let count = part.domains.len();
+        if part.vertices.len() != count || part.corners.len() != count {
+            return Err(malformed_reply(
+                "vertices.layout",
+                format!("{count} vertex counts and {count} corner counts"),
+                format!("{} and {}", part.vertices.len(), part.corners.len()),
+            ));
+        }
+        let counts = part.vertices.iter().zip(&part.corners);
+        domains.extend(part.domains.iter().zip(counts).map(|(index, (vertex_count, corner_count))| VertexSetDomain {
+            index: *index,
+            vertex_count: *vertex_count,
+            corner_count: *corner_count,
+        }));
+        if !part.has_more {
+            *self = Self::Complete(std::mem::take(domains).into());
+        }
+        Ok(())
+    }
+}
+
+/// Decodes the sections of a step. `origins` are those of the previous step.
+fn decode_vertex_set(
+    head: v1::VertexHead,
+    bytes: &[u8],
+    domains: &Arc<[VertexSetDomain]>,
+    mut origins: Option<Arc<[[f64; 3]]>>,
+) -> Result<VertexSet> {
+    let sum = |count: fn(&VertexSetDomain) -> u32| domains.iter().map(|domain| count(domain) as usize).sum::<usize>();
+    let (vertex_count, corner_count) = (sum(|domain| domain.vertex_count), sum(|domain| domain.corner_count));
+    let (mut positions, mut normals, mut displacements, mut boxes) = (vec![], vec![], vec![], vec![]);
+    let mut offset = 0;
+    for (index, section) in head.sections.iter().enumerate() {
+        let field = format!("vertices.sections[{index}]");
+        let end = section.offset.checked_add(section.bytes).filter(|end| *end <= bytes.len() as u64);
+        let Some(end) = end.filter(|_| section.offset == offset) else {
+            let expected = format!("a section at {offset} within {} bytes", bytes.len());
+            return Err(malformed_reply(field, expected, format!("{} bytes at {}", section.bytes, section.offset)));
+        };
+        let section_bytes = &bytes[offset as usize..end as usize];
+        offset = end;
+        let vectors = |count: usize| decode_vectors(&field, section.encoding(), count, section_bytes);
+        match section.attribute() {
+            Attribute::Positions => positions = vectors(vertex_count)?,
+            Attribute::Normals => normals = vectors(corner_count)?,
+            Attribute::Displacements => displacements = vectors(vertex_count)?,
+            Attribute::Boxes => {
+                vectors(2 * domains.len())?;
+                boxes = decode(&field, section_bytes)?;
+            }
+            Attribute::Origins => {
+                let received_origins: Vec<[f64; 3]> = decode(&field, section_bytes)?;
+                if received_origins.len() != 1 && received_origins.len() != domains.len() {
+                    let expected = format!("1 or {} origins", domains.len());
+                    return Err(malformed_reply(field, expected, received_origins.len()));
+                }
+                origins = Some(received_origins.into());
+            }
+            // An attribute of a newer server.
+            Attribute::Unspecified => {}
+        }
+    }
+    if offset != bytes.len() as u64 {
+        return Err(malformed_reply("vertices.total", offset, bytes.len()));
+    }
+    Ok(VertexSet {
+        step: head.step.ok_or_else(|| malformed_reply("vertices.step", "a step", "none"))?,
+        origins: origins.ok_or_else(|| malformed_reply("vertices.origins", "origins in the first step", "none"))?,
+        domains: Arc::clone(domains),
+        positions,
+        normals,
+        displacements,
+        boxes,
+        skipped: head.skipped,
+        encoded_bytes: bytes.len() as u64,
+        stages: stages::from_wire(head.stages),
+    })
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    /// The head of a reply with two domains. The first has one vertex and no corner. The second has no vertex and one
-    /// corner.
-    fn two_domain_head(origin_bytes: u64) -> v1::VertexHead {
-        v1::VertexHead {
-            step: Some(v1::StepId::default()),
-            origin: vec![1.0, 2.0, 3.0],
-            domains: vec![4, 7],
-            vertices: vec![1, 0],
-            corners: vec![0, 1],
-            position_bytes: 12,
-            origin_bytes,
-            ..Default::default()
-        }
+    /// The first domain has one vertex and no corner. The second has no vertex and one corner.
+    fn two_domains() -> Arc<[VertexSetDomain]> {
+        let domain = |index, vertex_count, corner_count| VertexSetDomain { index, vertex_count, corner_count };
+        [domain(4, 1, 0), domain(7, 0, 1)].into()
     }
 
-    #[test]
-    fn vertex_set_reports_the_origin_of_each_domain() {
-        let vertex_and_normal = [1.5_f32, 2.5, 3.5, 0.0, 0.0, 1.0].into_iter().flat_map(f32::to_le_bytes);
-        let origins = [1e7_f64, 0.0, -1.0, 8.0, 9.0, 1e300].into_iter().flat_map(f64::to_le_bytes);
-        let reply: Vec<u8> = vertex_and_normal.clone().chain(origins).collect();
-        let set = decode_vertex_set(two_domain_head(48), &reply).expect("a valid reply");
-        assert_eq!((set.positions.as_slice(), set.normals.len()), ([1.5, 2.5, 3.5].as_slice(), 3));
-        assert_eq!([set.domain_origin(0), set.domain_origin(1)], [[1e7, 0.0, -1.0], [8.0, 9.0, 1e300]]);
-        assert_eq!([set.float_range(0), set.float_range(1), set.float_range(2)], [Some(0..3), Some(3..3), None]);
-        let reply_without_normals = [&reply[..12], &reply[24..]].concat();
-        let set = decode_vertex_set(two_domain_head(48), &reply_without_normals).expect("a valid reply");
-        assert_eq!((set.normals.len(), set.domain_origin(1)), (0, [8.0, 9.0, 1e300]));
-        let reply_without_origins: Vec<u8> = vertex_and_normal.collect();
-        let set = decode_vertex_set(two_domain_head(0), &reply_without_origins).expect("a valid reply");
-        assert_eq!((set.domain_origins.len(), set.domain_origin(1)), (0, [1.0, 2.0, 3.0]));
-    }
-
-    /// A valid reply has 12 bytes of positions, optionally 12 bytes of normals, and 0 or 48 bytes of origins.
-    #[test]
-    fn malformed_origins_report_their_field() {
-        for (origin_bytes, length, field) in
-            [(24, 48, "origin_bytes"), (u64::MAX, 72, "origin_bytes"), (48, 24, "total"), (0, 72, "total")]
-        {
-            let error =
-                decode_vertex_set(two_domain_head(origin_bytes), &vec![0; length]).expect_err(field).to_string();
-            assert!(error.contains(field), "{error}");
-        }
-    }
-
-    #[test]
-    fn decodes_displacements_and_boxes_with_and_without_positions() {
-        let float_bytes = |first: u16, count: u16| (first..first + count).flat_map(|x| f32::from(x).to_le_bytes());
-        let head = |position_bytes| v1::VertexHead {
-            position_bytes,
-            displacement_bytes: 12,
-            box_bytes: 48,
-            ..two_domain_head(0)
+    /// A head whose sections follow each other.
+    fn head(sections: &[(Attribute, Encoding, u64)]) -> v1::VertexHead {
+        let mut offset = 0;
+        let wire_section = |(attribute, encoding, bytes): &(Attribute, Encoding, u64)| {
+            let section = v1::VertexSection {
+                attribute: (*attribute).into(),
+                encoding: (*encoding).into(),
+                offset,
+                bytes: *bytes,
+            };
+            offset += bytes;
+            section
         };
-        let positions_and_normals = float_bytes(0, 3).chain(float_bytes(10, 3));
-        let reply: Vec<u8> = positions_and_normals.chain(float_bytes(20, 3)).chain(float_bytes(30, 12)).collect();
-        let set = decode_vertex_set(head(12), &reply).expect("a valid reply");
-        assert_eq!((set.positions.as_slice(), set.normals.as_slice()), (&[0.0, 1.0, 2.0][..], &[10.0, 11.0, 12.0][..]));
-        assert_eq!(set.displacements, [20.0, 21.0, 22.0]);
-        let boxes = [[[30.0, 31.0, 32.0], [33.0, 34.0, 35.0]], [[36.0, 37.0, 38.0], [39.0, 40.0, 41.0]]];
-        assert_eq!(set.boxes, boxes);
-        let set_without_positions = decode_vertex_set(head(0), &reply[24..]).expect("a valid reply");
-        assert_eq!((set_without_positions.displacements, set_without_positions.boxes), (set.displacements, set.boxes));
-        assert!(set_without_positions.positions.is_empty() && set_without_positions.normals.is_empty());
+        let sections = sections.iter().map(wire_section).collect();
+        v1::VertexHead { step: Some(v1::StepId::default()), sections, ..Default::default() }
+    }
+
+    fn float_bytes(first: u16, count: u16) -> Vec<u8> {
+        (first..first + count).flat_map(|x| f32::from(x).to_le_bytes()).collect()
+    }
+
+    const POSITIONS: (Attribute, Encoding, u64) = (Attribute::Positions, Encoding::F32, 12);
+    const NORMALS: (Attribute, Encoding, u64) = (Attribute::Normals, Encoding::F32, 12);
+
+    #[test]
+    fn origins_are_kept_until_they_are_sent_again() {
+        let origins = |numbers: &[f64]| numbers.iter().flat_map(|number| number.to_le_bytes()).collect::<Vec<u8>>();
+        let per_domain = origins(&[1e7, 0.0, -1.0, 8.0, 9.0, 1e300]);
+        let sections = [POSITIONS, NORMALS, (Attribute::Origins, Encoding::F64, 48)];
+        let bytes = [float_bytes(1, 3), float_bytes(5, 3), per_domain].concat();
+        let set = decode_vertex_set(head(&sections), &bytes, &two_domains(), None).expect("a valid reply");
+        assert_eq!((set.positions.as_slice(), set.normals.as_slice()), (&[1.0, 2.0, 3.0][..], &[5.0, 6.0, 7.0][..]));
+        assert_eq!([set.domain_origin(0), set.domain_origin(1)], [[1e7, 0.0, -1.0], [8.0, 9.0, 1e300]]);
+        assert_eq!(set.common_origin(), None);
+        assert_eq!([set.float_range(0), set.float_range(1), set.float_range(2)], [Some(0..3), Some(3..3), None]);
+        let positions_only = decode_vertex_set(head(&[POSITIONS]), &bytes[..12], &two_domains(), Some(set.origins));
+        assert_eq!(positions_only.expect("a valid reply").domain_origin(1), [8.0, 9.0, 1e300]);
+        let common = [(Attribute::Origins, Encoding::F64, 24)];
+        let set = decode_vertex_set(head(&common), &origins(&[1.0, 2.0, 3.0]), &two_domains(), None);
+        let set = set.expect("a valid reply");
+        assert_eq!((set.common_origin(), set.domain_origin(1)), (Some([1.0, 2.0, 3.0]), [1.0, 2.0, 3.0]));
+        assert!(set.positions.is_empty() && set.boxes.is_empty());
     }
 
     #[test]
-    fn malformed_sizes_report_their_field() {
-        // With positions, normals, displacements and boxes, a valid reply has 12 + 12 + 12 + 48 = 84 bytes.
-        for (position_bytes, displacement_bytes, box_bytes, field) in [
-            (0, 12, 24, "box_bytes"),
-            (0, 24, 48, "displacement_bytes"),
-            (24, 12, 48, "position_bytes"),
-            (12, 0, 0, "total"),
+    fn decodes_boxes_and_encoded_attributes() {
+        let sections = [
+            (Attribute::Displacements, Encoding::F16, 6),
+            (Attribute::Boxes, Encoding::F32, 48),
+            (Attribute::Origins, Encoding::F64, 24),
+        ];
+        let bytes = [vec![0, 0x3c, 0, 0xc0, 0, 0], float_bytes(30, 12), vec![0; 24]].concat();
+        let set = decode_vertex_set(head(&sections), &bytes, &two_domains(), None).expect("a valid reply");
+        assert_eq!(set.displacements, [1.0, -2.0, 0.0]);
+        let boxes = [[[30.0, 31.0, 32.0], [33.0, 34.0, 35.0]], [[36.0, 37.0, 38.0], [39.0, 40.0, 41.0]]];
+        assert_eq!((set.boxes.as_slice(), set.encoded_bytes), (&boxes[..], 78));
+    }
+
+    #[test]
+    fn malformed_sections_report_their_field() {
+        let origins = (Attribute::Origins, Encoding::F64, 24);
+        let overlapping = v1::VertexHead {
+            sections: vec![v1::VertexSection { attribute: 1, encoding: 1, offset: 4, bytes: 12 }],
+            ..head(&[])
+        };
+        let overflowing = v1::VertexHead {
+            sections: vec![v1::VertexSection { attribute: 1, encoding: 1, offset: 0, bytes: u64::MAX }],
+            ..head(&[])
+        };
+        for (head, length, field) in [
+            (head(&[(Attribute::Positions, Encoding::F32, 24), origins]), 48, "sections[0].bytes"),
+            (head(&[POSITIONS, (Attribute::Boxes, Encoding::F32, 24)]), 36, "sections[1].bytes"),
+            (head(&[POSITIONS, (Attribute::Origins, Encoding::F64, 72)]), 84, "sections[1]"),
+            (head(&[POSITIONS, origins]), 24, "sections[1]"),
+            (head(&[POSITIONS, origins]), 40, "total"),
+            (head(&[POSITIONS]), 12, "origins"),
+            (overlapping, 16, "sections[0]"),
+            (overflowing, 16, "sections[0]"),
         ] {
-            let head = v1::VertexHead { position_bytes, displacement_bytes, box_bytes, ..two_domain_head(0) };
-            let error = decode_vertex_set(head, &[0; 84]).expect_err(field).to_string();
-            assert!(error.contains(field), "{error}");
+            let error = decode_vertex_set(head, &vec![0; length], &two_domains(), None).expect_err(field).to_string();
+            assert!(error.contains(field), "expected {field}, got {error}");
         }
+    }
+
+    #[test]
+    fn layout_arrives_in_parts_and_once() {
+        let part = |first: u32, has_more| v1::VertexLayout {
+            domains: vec![first, first + 1],
+            vertices: vec![3, 4],
+            corners: vec![5, 6],
+            has_more,
+        };
+        let mut layout = Layout::Incomplete(Vec::new());
+        layout.add(&part(0, true)).expect("a valid part");
+        layout.add(&part(2, false)).expect("a valid part");
+        let Layout::Complete(domains) = &layout else { panic!("expected a complete layout") };
+        assert_eq!((domains.len(), domains[3]), (4, VertexSetDomain { index: 3, vertex_count: 4, corner_count: 6 }));
+        assert!(layout.add(&part(4, false)).is_err(), "expected one layout");
+        let wrong_counts = v1::VertexLayout { vertices: vec![1], ..part(0, false) };
+        assert!(Layout::Incomplete(Vec::new()).add(&wrong_counts).is_err());
     }
 }

@@ -5,3 +5,4 @@ pub(super) mod frame_encoder;
 pub(super) mod pack;
 pub(super) mod pick_result;
 pub(super) mod step_output;
+pub(super) mod vertex_encoding;

@@ -296,8 +296,10 @@ impl VertexService for FakeService {
         request: Request<v1::GetVerticesRequest>,
     ) -> Result<Response<Self::GetVerticesStream>, Status> {
         self.check_scene(&request.into_inner().scene)?;
-        let chunks = self.encode_vertices(&self.0.output());
-        Ok(stream_messages(chunks.into_iter().map(|chunk| v1::GetVerticesResponse { chunk: Some(chunk) }).collect()))
+        use v1::get_vertices_response::Part;
+        let chunks = self.encode_vertices(&self.0.output()).into_iter().map(Part::Chunk);
+        let parts = [Part::Layout(self.vertex_layout())].into_iter().chain(chunks);
+        Ok(stream_messages(parts.map(|part| v1::GetVerticesResponse { part: Some(part) }).collect()))
     }
 
     type StreamVerticesStream = ResponseStream<v1::StreamVerticesResponse>;
@@ -313,14 +315,17 @@ impl VertexService for FakeService {
         let (sender, receiver) = tokio::sync::mpsc::channel(4);
         let service = self.clone();
         tokio::spawn(async move {
+            use v1::stream_vertices_response::Part;
             let mut outputs = Box::pin(outputs);
-            while let Some(output) = outputs.next().await {
-                for chunk in service.encode_vertices(&output) {
-                    let result = sender.send(Ok(v1::StreamVerticesResponse { chunk: Some(chunk) })).await;
-                    if result.is_err() {
+            let mut parts = vec![Part::Layout(service.vertex_layout())];
+            loop {
+                for part in parts {
+                    if sender.send(Ok(v1::StreamVerticesResponse { part: Some(part) })).await.is_err() {
                         return;
                     }
                 }
+                let Some(output) = outputs.next().await else { return };
+                parts = service.encode_vertices(&output).into_iter().map(Part::Chunk).collect();
             }
         });
         Ok(Response::new(Box::pin(ReceiverStream::new(receiver))))
@@ -328,16 +333,32 @@ impl VertexService for FakeService {
 }
 
 impl FakeService {
-    /// The positions of all domains, without normals, in chunks.
-    fn encode_vertices(&self, output: &StepOutput) -> Vec<v1::VertexChunk> {
-        let bytes = pack(&output.positions);
-        let mut head = Some(v1::VertexHead {
-            step: Some(output.step),
-            origin: vec![0.0; 3],
+    fn vertex_layout(&self) -> v1::VertexLayout {
+        v1::VertexLayout {
             domains: (0..self.0.domains.len() as u32).collect(),
             vertices: self.0.domains.iter().map(|domain| domain.wire.vertices).collect(),
             corners: self.0.domains.iter().map(|domain| domain.wire.corners).collect(),
-            position_bytes: bytes.len() as u64,
+            has_more: false,
+        }
+    }
+
+    /// The positions of all domains, without normals, in chunks.
+    fn encode_vertices(&self, output: &StepOutput) -> Vec<v1::VertexChunk> {
+        let positions = pack(&output.positions);
+        let section = |attribute: v1::Attribute, encoding: v1::Encoding, offset, bytes| v1::VertexSection {
+            attribute: attribute.into(),
+            encoding: encoding.into(),
+            offset,
+            bytes,
+        };
+        let position_bytes = positions.len() as u64;
+        let bytes = [positions, pack(&[0.0_f64; 3])].concat();
+        let mut head = Some(v1::VertexHead {
+            step: Some(output.step),
+            sections: vec![
+                section(v1::Attribute::Positions, v1::Encoding::F32, 0, position_bytes),
+                section(v1::Attribute::Origins, v1::Encoding::F64, position_bytes, 24),
+            ],
             total: bytes.len() as u64,
             ..Default::default()
         });

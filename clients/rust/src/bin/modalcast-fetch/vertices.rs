@@ -4,14 +4,15 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use modalcast_client::npy::Writer as NpyWriter;
-use modalcast_client::{Client, Error, Result, VertexRequest, VertexSelection, VertexSet, VertexStreamRequest};
+use modalcast_client::{Attribute, Client, Encoding, Error, Result};
+use modalcast_client::{VertexRequest, VertexSelection, VertexSet, VertexStreamRequest};
 
 use crate::cli::VerticesOptions;
 use crate::output::{ReceivedReply, Summary, create_progress_bar, open_scene};
 
 pub(crate) async fn fetch(client: &Client, options: &VerticesOptions, as_json: bool) -> Result<()> {
     let scene = open_scene(client, &options.scene).await?;
-    let mut files = OutputFiles { options, writers: Vec::new(), origin: vec![], summary: Summary::new() };
+    let mut files = OutputFiles { options, writers: Vec::new(), origin: None, summary: Summary::new() };
     match options.count {
         None => files.write_vertex_set(&fetch_single(client, options, &scene).await?)?,
         Some(count) => fetch_stream(client, &scene, count, &mut files).await?,
@@ -44,13 +45,17 @@ async fn fetch_stream(client: &Client, scene: &str, count: u64, files: &mut Outp
 }
 
 fn vertex_selection(options: &VerticesOptions) -> VertexSelection {
-    VertexSelection {
-        domains: options.domains.clone(),
-        positions_only: options.normals.is_none(),
-        displacements: options.displacements.is_some(),
-        boxes: options.boxes.is_some(),
-        without_vertices: false,
-    }
+    let (vectors, normals) =
+        if options.compact { (Encoding::U16Box, Encoding::OctahedralI16) } else { (Encoding::F32, Encoding::F32) };
+    let attributes = [
+        (true, Attribute::Positions, vectors),
+        (options.normals.is_some(), Attribute::Normals, normals),
+        (options.displacements.is_some(), Attribute::Displacements, vectors),
+        (options.boxes.is_some(), Attribute::Boxes, Encoding::F32),
+    ];
+    let selected = attributes.into_iter().filter(|(is_selected, ..)| *is_selected);
+    let domains = VertexSelection::default().domains(&options.domains);
+    selected.fold(domains, |selection, (_, attribute, encoding)| selection.encoded_attribute(attribute, encoding))
 }
 
 /// The numbers of one array in one step: one row of its file.
@@ -82,7 +87,7 @@ struct OutputFiles<'a> {
     /// One per array, in the order of [`array_rows`]; empty before the first step.
     writers: Vec<NpyWriter>,
     /// World position of the vertex origin of the first step, in meters. All rows of a file must have the same origin.
-    origin: Vec<f64>,
+    origin: Option<[f64; 3]>,
     summary: Summary,
 }
 
@@ -91,9 +96,9 @@ impl OutputFiles<'_> {
         let rows = array_rows(self.options, set);
         if self.writers.is_empty() {
             self.writers = rows.iter().map(|row| NpyWriter::create(row.path, &row.shape)).collect::<Result<_>>()?;
-            self.origin = set.origin.clone();
+            self.origin = set.common_origin();
         }
-        if set.origin != self.origin || !set.domain_origins.is_empty() {
+        if self.origin.is_none() || set.common_origin() != self.origin {
             let step = set.step.number;
             let reason = format!(
                 "step {step}: expected the origin of the previous steps, got a different one or one per domain"
@@ -101,14 +106,18 @@ impl OutputFiles<'_> {
             return Err(Error::file(&self.options.out, reason));
         }
         self.writers.iter_mut().zip(&rows).try_for_each(|(writer, row)| writer.write_row(row.numbers))?;
-        let bytes = rows.iter().map(|row| size_of_val(row.numbers) as u64).sum();
-        self.summary.add(&ReceivedReply { step_id: set.step, bytes, skipped: set.skipped, stages: &set.stages });
+        self.summary.add(&ReceivedReply {
+            step_id: set.step,
+            bytes: set.encoded_bytes,
+            skipped: set.skipped,
+            stages: &set.stages,
+        });
         Ok(())
     }
 
     fn finish(self, as_json: bool) -> Result<()> {
         self.writers.into_iter().try_for_each(|writer| writer.finish().map(drop))?;
-        self.summary.print("vertex_sets", &self.options.out, Some(self.origin), as_json);
+        self.summary.print("vertex_sets", &self.options.out, self.origin.map(Vec::from), as_json);
         Ok(())
     }
 }
