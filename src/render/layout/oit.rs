@@ -1,7 +1,7 @@
 //! Bindings, phases and counters of the fragment lists of order-independent transparency.
 //!
-//! The gather program (`shaders/oit_gather.frag`) draws the blended triangles in three phases. The limit is the maximum
-//! number of fragments that each pixel may store ([`OitCounters::per_pixel_limit`]).
+//! The gather program (`shaders/oit_gather.frag`) draws the blended triangles in three phases. Each pixel may store a
+//! maximum number of fragments, which is called the limit below ([`OitCounters::per_pixel_limit`]).
 
 use bytemuck::{Pod, Zeroable};
 
@@ -25,7 +25,8 @@ pub(crate) const PHASE_COUNT: i32 = 0;
 /// Phase of the gather program that stores the fragments of all pixels with at most as many fragments as the limit. For
 /// pixels with more, it stores only the depths of the nearest fragments.
 pub(crate) const PHASE_FILL: i32 = 1;
-/// Phase of the gather program that adds the triangle ids in pixels with more fragments than the limit.
+/// Phase of the gather program for pixels with more fragments than the limit. It writes the triangle ids into the
+/// records whose depths [`PHASE_FILL`] has stored.
 pub(crate) const PHASE_FILL_IDS: i32 = 2;
 
 /// Counters and indirect draws of a frame. Twin of `OitCounters` in `shaders/shared/oit_lists.glsl` without its last
@@ -43,8 +44,8 @@ pub(crate) struct OitCounters {
     pub(crate) allocated: u32,
     /// Maximum number of records.
     pub(crate) budget: u32,
-    /// Indirect draws of [`PHASE_FILL_IDS`], one per group of blended triangles: index count, instances, first index,
-    /// base vertex, base instance.
+    /// Indirect draws of [`PHASE_FILL_IDS`], for the blended triangles with and without culling of back faces. Numbers
+    /// of a draw: index count, instances, first index, base vertex, base instance.
     pub(crate) commands: [[u32; 5]; 2],
 }
 

@@ -7,12 +7,12 @@ use crate::pass::Pass;
 use crate::scene_data::geometry::groups;
 use modalcast_model::scene::{Culling, Scene};
 
-/// Minimum number of triangles of a scene that is culled on hardware by default. It lies between the two measurements
-/// of the field at `select_culling`: culling is slower with 262,144 triangles, and faster with 3 M.
+/// Minimum number of triangles of a scene that is culled on hardware by default. It lies between two measurements of a
+/// benchmark scene (at `select_culling`): culling is slower with 262,144 triangles, and faster with 3 M.
 const MIN_TRIANGLES: usize = 1 << 20;
 
-/// Selects the culling method of a scene on a device: the method of the look, or for `Auto` the faster one. `None` if
-/// the lists of visible triangles exceed the largest buffer of the device.
+/// Selects the culling method of a scene on a device: the method that the scene names, or for `Auto` the faster one.
+/// `None` if the lists of visible triangles exceed the largest buffer of the device.
 ///
 /// Milliseconds per frame on hardware (H200, 1080p). The field is a scene of the benchmarks. The almond tree has
 /// double-sided leaves and four samples per pixel.
@@ -39,8 +39,8 @@ pub(crate) fn select_culling(scene: &Scene, limits: &Limits) -> Culling {
 }
 
 /// Whether cut-outs sample a texture at the centroid of their covered samples. Mesa's rasterizer takes the centroid of
-/// the samples that also pass the depth test. Culling hidden triangles therefore moves the centroid of about one pixel
-/// in a million.
+/// the samples that also pass the depth test. A hidden triangle that is drawn first makes samples fail that test, so
+/// its culling moves the centroid in about one pixel of a million.
 fn interpolates_at_centroid(scene: &Scene) -> bool {
     scene.look.samples_per_pixel() > 1 && scene.features.mask && scene.features.textures
 }

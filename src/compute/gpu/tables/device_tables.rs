@@ -1,4 +1,5 @@
-//! All constant tables of a scene on the device. The plan counts their bytes, and the launchers upload them. Pure.
+//! All constant tables of a scene on the device. The plan counts their bytes, and the launchers upload them. A quad is
+//! four consecutive vertices or corners of a domain.
 
 use super::box_segments::box_segments;
 use super::change_list::max_change_entries;
@@ -46,7 +47,8 @@ pub struct DeviceTables {
     pub(crate) transform_links: Vec<TransformLink>,
     /// Sizes of the values of a step.
     pub(crate) inputs: InputSizes,
-    /// Capacity of the tile list of a partial step; 0 for a scene whose steps are always full.
+    /// Capacity of the list of tiles that a partial step computes, a step that changes few domains. 0 for a scene whose
+    /// steps always compute all tiles.
     pub(crate) tile_list_capacity: usize,
     /// Axes along which `bounds` reduces the boxes in addition to the world's axes.
     pub(crate) bounding_axes: Option<BoundingAxes>,
@@ -78,12 +80,14 @@ impl DeviceTables {
 #[derive(Debug)]
 pub(crate) struct NormalTables {
     pub slots: Vec<NormalSlot>,
-    /// Per block of `normals`, the domain of its first corner; then the last domain.
+    /// For each block of threads of `normals`, the domain of the first corner that the block computes. One more entry,
+    /// the last domain, ends the list.
     pub first_domains: Vec<u32>,
-    /// One plane per axis.
+    /// All x, then all y, then all z, unlike [`DeviceTables::rest_normals`].
     pub rest_normals: Vec<f32>,
     /// Empty without normal maps.
     pub rest_tangents: Vec<[f32; 4]>,
+    /// The neighbors of each vertex in the order around it.
     pub rings: RingTables,
 }
 

@@ -1,12 +1,13 @@
-//! The input values of a step. The host writes them to pinned memory, in the layout of the device buffer. Several cores
-//! write large steps. Pure.
+//! The input values of a step, in the layout of the device buffer. The host writes them to pinned memory, with several
+//! cores if the step is large.
 //!
 //! ```text
 //! [header][transforms: 12 f32 per transform root][q, padded to whole chunks][retained counts][retained chunks]
 //! ```
-//! A chunk is a few modes that are stored together. With modal truncation, a domain sums only its retained chunks;
-//! their numbers and indices are uploaded. Without truncation, the last two parts are empty. The pinned memory is
-//! write-combined: the host writes it from front to back and never reads it.
+//! A transform root is a domain that follows no other domain; a follower has the transform of its root times a constant
+//! frame. A chunk is a few modes that are stored together. With modal truncation, a domain sums only its retained
+//! chunks; their numbers and indices are uploaded. Without truncation, the last two parts are empty. The pinned memory
+//! is write-combined: the host writes it from front to back and never reads it.
 
 use std::sync::Arc;
 
@@ -28,15 +29,16 @@ pub struct InputPacker {
     pub(crate) dirty_tile_layout: DirtyTileLayout,
 }
 
-/// Tiles of each domain, from which a partial step derives its tile list.
+/// Tiles of each domain. A partial step, which changes few domains, derives from them the list of tiles to compute, the
+/// dirty tiles. A full step computes all tiles.
 #[derive(Debug, Default)]
 pub(crate) struct DirtyTileLayout {
     /// Per domain.
     pub domain_tiles: Vec<DomainTiles>,
     /// Number of all tiles.
     pub tile_count: usize,
-    /// Cost of a full step in tiles of `deform`. A step with more dirty tiles is a full step. A tile of `batch` counts
-    /// as several tiles, because `batch` computes it for several domains.
+    /// Cost of a full step, counted in tiles of the kernel `deform`. A step with more dirty tiles is computed as a full
+    /// step. A full step may use the kernel `batch`, whose tile counts as several, because it has several domains.
     pub full_step_cost: usize,
 }
 
@@ -104,7 +106,7 @@ impl InputWriter {
     }
 }
 
-/// Transform root and frame of each domain; empty in a scene without followers.
+/// Per domain, the index of its transform root and that of its constant frame; empty in a scene without followers.
 pub(crate) fn transform_links(scene: &Scene) -> Vec<TransformLink> {
     scene
         .transform_roots
@@ -126,7 +128,9 @@ impl InputPacker {
         }
     }
 
-    /// Writes all coordinates in the layout of the device, and zeros the padding at the end.
+    /// Writes all coordinates in the layout of the device. If that is the order of the scene's state (U in f32, no
+    /// truncation, and therefore no factors), they are copied, and the padding at the end is zeroed. Otherwise each
+    /// domain is padded to whole chunks.
     fn write_q(&self, state: &SceneState, device_q: &mut [f32]) {
         if self.coordinates.is_scene_order {
             let mut writer = SliceWriter::new(device_q);
@@ -146,8 +150,8 @@ impl InputPacker {
         });
     }
 
-    /// Passes the coordinates of one domain to `put`, multiplied by the factors of their modes. Pads them to whole
-    /// chunks, unless the device has them in the order of the scene's state, which has no padding.
+    /// Passes the coordinates of one domain to `put`, multiplied by the factors of their modes. Then passes zeros up to
+    /// whole chunks, unless the device has the coordinates in the order of the scene's state.
     pub(crate) fn put_q(&self, domain: usize, q: &[f32], mut put: impl FnMut(f32)) {
         let factors = &self.factors[self.scene.domains[domain].shape];
         // The factor is a power of two, so the product is exact unless it overflows or underflows f32.
@@ -161,8 +165,8 @@ impl InputPacker {
     }
 }
 
-/// Minimum number of domains per parallel task of the truncation. A domain takes a few microseconds, so a task takes
-/// long compared to its start.
+/// Minimum number of domains per parallel task of the truncation. A domain takes a few microseconds, so that a task
+/// takes much longer than starting it.
 const MIN_DOMAINS_PER_TASK: usize = 64;
 
 /// Modal truncation: selects the chunks of modes that each domain sums.
@@ -178,8 +182,8 @@ struct ChunkSelection {
     bound: f64,
     /// Per domain, the number of retained chunks; padded to a multiple of four.
     counts: Vec<u32>,
-    /// Indices of the retained chunks, two u16 per word. Those of a domain begin at the index of its first chunk among
-    /// the chunks of all domains.
+    /// Indices of the retained chunks, two u16 per word. Each domain has a fixed place for all its chunks, of which the
+    /// first `counts` are used. It begins at the index of the domain's first chunk among the chunks of all domains.
     chunks: Vec<u32>,
 }
 
