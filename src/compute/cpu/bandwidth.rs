@@ -12,7 +12,7 @@ use super::simd::run_vectorized;
 /// bytes per second). For a buffer that fits into the last-level cache, this is the bandwidth of the cache. To compare
 /// the result with a deformer, choose the size of its U.
 pub fn read_bandwidth(bytes: usize, runs: usize) -> f64 {
-    // Write to the buffer before the reads: the system maps all pages that were never written to one page of zeros.
+    // Write to the buffer before the reads: until a page is written, the system backs it by one shared page of zeros.
     let mut words = vec![0_u64; bytes.div_ceil(8).max(1)];
     words.par_chunks_mut(TASK_WORDS).enumerate().for_each(|(task, words)| words.fill(task as u64));
     let bytes = 8.0 * words.len() as f64;
@@ -27,7 +27,8 @@ pub fn read_bandwidth(bytes: usize, runs: usize) -> f64 {
 
 /// Number of words of 8 bytes that one task reads: 1 MiB.
 const TASK_WORDS: usize = 1 << 17;
-/// Number of independent sums. With several sums, a load does not wait for the addition before it.
+/// Number of independent sums. With a single sum, each addition would wait for the one before it, which is slower than
+/// memory.
 const LANES: usize = 32;
 
 /// Sums words. The sum forces a read of every word.

@@ -18,7 +18,8 @@ use modalcast_model::domain::{AlphaMode, Material};
 use modalcast_model::error::Error;
 use modalcast_model::scene::{Camera, Scene, Transparency};
 
-/// A renderer that behaves as on hardware: it times passes with queries, so that submitted frames are in flight.
+/// A renderer that behaves as on hardware. A software renderer waits after every pass to time it; this one times passes
+/// with queries, so that submitted frames stay in flight.
 fn open() -> Renderer {
     let (mut gl, cuda_device) = device::open(DevicePreference::Any).expect("EGL");
     Rc::get_mut(&mut gl).expect("the only reference").limits.software = false;
@@ -118,7 +119,8 @@ fn frames_in_flight_are_limited_per_target() {
     for pending_frame in pending_frames {
         assert!(renderer.read_image(pending_frame).expect("draws").rgba == first_image.rgba);
     }
-    assert!(!renderer.read_visibility().expect("a staging buffer outside the ring").is_empty());
+    // A readback of ids does not use the ring of the frames.
+    assert!(!renderer.read_visibility().expect("ids of the last frame").is_empty());
 }
 
 #[test]
@@ -137,7 +139,7 @@ fn timeout_names_the_pass_and_the_next_frame_is_drawn() {
         for (_, timer) in &mut pending_frame.passes[failing_index..] {
             *timer = renderer.gl.unstarted_timer();
         }
-        assert!(pending_frame.is_ready(), "expected a timed-out frame to be ready");
+        assert!(pending_frame.is_ready(), "reading a frame that timed out must not wait");
         let Err(Error::Fault { stage, reason }) = renderer.read_image(pending_frame) else {
             panic!("expected a fault")
         };
@@ -164,7 +166,7 @@ fn failed_frame_drops_its_render_target() {
 }
 
 #[test]
-fn frame_that_exceeds_its_time_limit_is_ready() {
+fn reading_a_frame_beyond_its_time_limit_does_not_wait() {
     let (mut renderer, scene, buffers) = load_renderer();
     renderer.frame_timeout = Duration::from_millis(5);
     let pending_frame = renderer.submit_without_readback(&buffers, &params(&scene, 64)).expect("submits");
@@ -184,7 +186,8 @@ fn frame_is_readable_after_its_target_was_freed() {
     }
     assert!(renderer.targets.iter().all(|target| target.desc.width != 64));
     let pixels = renderer.map_pixels(pending_frame).expect("draws");
-    renderer.draw(&buffers, &params(&scene, 41)).expect("draws while the freed pixels are mapped");
+    renderer.draw(&buffers, &params(&scene, 41)).expect("draws while the pixels are mapped");
+    // The staging buffer of the freed target lives until its pixels are copied.
     assert_eq!(renderer.gl.retired_buffer_count(), 1);
     assert!(pixels.into_image().rgba == draw_frame(0.0).0);
     renderer.draw(&buffers, &params(&scene, 42)).expect("draws");
