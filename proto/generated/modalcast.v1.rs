@@ -3281,7 +3281,7 @@ pub struct Limits {
     #[prost(uint32, tag = "6")]
     pub deadline_ms: u32,
     /// Number of DriveScene streams that one connection may have open. The limit keeps HTTP/2 flow control safe: a blocked
-    /// stream of the smallest steps occupies an eighth of the connection's budget for small frames.
+    /// stream of the smallest steps uses a fifth of the connection's budget for small frames.
     #[prost(uint32, tag = "7")]
     pub drives: u32,
 }

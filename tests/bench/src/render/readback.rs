@@ -316,7 +316,7 @@ mod tests {
         let rates = measure(&mut harness, &options, RenderWorkload::Square).expect("rates");
         assert!(rates.unread_fps > 0.0 && rates.blocking_fps > 0.0 && rates.ring_fps > 0.0, "{rates:?}");
         assert!(rates.moving_unread_fps > 0.0 && rates.moving_ring_fps > 0.0 && rates.moving_ring_loss < 100.0);
-        assert!(rates.ring_loss < 100.0 && rates.blocking_loss < 100.0 && rates.frames >= 20);
+        assert!(rates.ring_loss < 100.0 && rates.blocking_loss < 100.0 && rates.frames == MIN_REPETITIONS);
         let markdown = readback_section(std::slice::from_ref(&rates));
         assert!(markdown.lines().any(|line| line.contains("square") && line.contains('%')), "{markdown}");
         // The loss is 100 (1 - 0.95) with the rounding of f64.
