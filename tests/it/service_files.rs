@@ -1,5 +1,5 @@
 //! Scene files over the wire: paths cannot leave the scene repository (the server's folder of scenes), an uploaded
-//! `scene.toml` opens, and the rejection of an invalid file says what is wrong.
+//! `scene.toml` opens, and the rejection of an invalid file names the invalid value.
 
 use std::path::Path;
 use std::sync::Arc;

@@ -39,8 +39,8 @@ pub trait Scenario {
     /// `Invalid` if the values are not finite.
     fn compute_next_step(&mut self, values: &mut StepValues) -> Result<()>;
 
-    /// Results so far. The keys depend on the scenario; each scenario has the key `load`, a description of what moves
-    /// the scene.
+    /// Results so far. The keys depend on the scenario; each scenario has the key `load`, which
+    /// names the motion or the force.
     fn report(&self) -> Report;
 }
 

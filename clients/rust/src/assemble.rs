@@ -42,7 +42,7 @@ impl<M> Replies<M> {
         self.messages.message().await.map_err(|status| Error::from_status(status, &self.url))
     }
 
-    pub(crate) fn poll(&mut self, context: &mut Context<'_>) -> Poll<Option<Result<M>>> {
+    fn poll(&mut self, context: &mut Context<'_>) -> Poll<Option<Result<M>>> {
         let message = ready!(Pin::new(&mut self.messages).poll_next(context));
         Poll::Ready(message.map(|message| message.map_err(|status| Error::from_status(status, &self.url))))
     }
@@ -138,27 +138,35 @@ impl<H> Assembler<H> {
     }
 }
 
-/// Turns a server stream of messages `M` with chunks `C` into a stream of complete replies. An error ends the stream.
-pub(crate) struct ChunkedReplies<M, C: WireChunk> {
+/// Decodes the messages `M` of a stream to replies.
+pub(crate) trait ReplyDecoder<M> {
+    type Reply;
+
+    /// Adds a message. Returns the reply that it completes.
+    fn add_message(&mut self, message: M) -> Result<Option<Self::Reply>>;
+
+    /// Whether a reply has begun and not ended.
+    fn is_open(&self) -> bool;
+}
+
+/// Turns a server stream of messages `M` into a stream of complete replies. An error ends the stream.
+pub(crate) struct DecodedReplies<M, D> {
     messages: Replies<M>,
-    /// Extracts the chunk of a message.
-    chunk_of: fn(M) -> Option<C>,
-    assembler: Assembler<C::Head>,
+    decoder: D,
     has_ended: bool,
 }
 
-impl<M, C: WireChunk> ChunkedReplies<M, C> {
-    pub(crate) const fn new(messages: Replies<M>, chunk_of: fn(M) -> Option<C>, limit: u64) -> Self {
-        Self { messages, chunk_of, assembler: Assembler::new(C::NAME, limit), has_ended: false }
+impl<M, D: ReplyDecoder<M>> DecodedReplies<M, D> {
+    pub(crate) const fn new(messages: Replies<M>, decoder: D) -> Self {
+        Self { messages, decoder, has_ended: false }
     }
 
     /// Polls for the next complete reply.
-    pub(crate) fn poll(&mut self, context: &mut Context<'_>) -> Poll<Option<Result<C::Reply>>> {
+    pub(crate) fn poll(&mut self, context: &mut Context<'_>) -> Poll<Option<Result<D::Reply>>> {
         while !self.has_ended {
             let reply = match ready!(self.messages.poll(context)) {
-                Some(Ok(message)) => self.add_message(message),
-                Some(Err(error)) => Err(error),
-                None if self.assembler.is_open() => {
+                Some(message) => message.and_then(|message| self.decoder.add_message(message)),
+                None if self.decoder.is_open() => {
                     Err(Error::StreamEnded { awaited_reply: "the last chunk of a reply" })
                 }
                 None => {
@@ -175,11 +183,28 @@ impl<M, C: WireChunk> ChunkedReplies<M, C> {
     }
 
     /// The next complete reply.
-    pub(crate) async fn next(&mut self) -> Option<Result<C::Reply>> {
+    pub(crate) async fn next(&mut self) -> Option<Result<D::Reply>> {
         std::future::poll_fn(|context| self.poll(context)).await
     }
+}
 
-    /// Adds the chunk of a message. Returns the complete reply after its last chunk.
+/// Decodes messages that contain one chunk `C` each.
+pub(crate) struct ChunkDecoder<M, C: WireChunk> {
+    /// Extracts the chunk of a message.
+    chunk_of: fn(M) -> Option<C>,
+    assembler: Assembler<C::Head>,
+}
+
+impl<M, C: WireChunk> ChunkDecoder<M, C> {
+    /// A decoder of replies of at most `limit` bytes.
+    pub(crate) const fn new(chunk_of: fn(M) -> Option<C>, limit: u64) -> Self {
+        Self { chunk_of, assembler: Assembler::new(C::NAME, limit) }
+    }
+}
+
+impl<M, C: WireChunk> ReplyDecoder<M> for ChunkDecoder<M, C> {
+    type Reply = C::Reply;
+
     fn add_message(&mut self, message: M) -> Result<Option<C::Reply>> {
         let missing_chunk = || malformed_reply(format!("{}.chunk", C::NAME), "a chunk", "none");
         let chunk = (self.chunk_of)(message).ok_or_else(missing_chunk)?;
@@ -187,6 +212,10 @@ impl<M, C: WireChunk> ChunkedReplies<M, C> {
             Some((head, bytes)) => C::decode_reply(head, bytes).map(Some),
             None => Ok(None),
         }
+    }
+
+    fn is_open(&self) -> bool {
+        self.assembler.is_open()
     }
 }
 

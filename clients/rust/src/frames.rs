@@ -7,7 +7,7 @@ use bytes::Bytes;
 use modalcast_proto::v1;
 use v1::frame_service_client::FrameServiceClient;
 
-use crate::assemble::{Chunk, ChunkedReplies, WireChunk};
+use crate::assemble::{Chunk, ChunkDecoder, DecodedReplies, WireChunk};
 use crate::client::Client;
 use crate::error::{Error, Result, malformed_reply};
 use crate::request::{StepRequest, Subscription};
@@ -148,7 +148,12 @@ impl Client {
             deadline_ms: request.deadline_ms,
         };
         let messages = self.replies(FrameServiceClient::new(self.channel.clone()).render_frame(wire).await)?;
-        let frame = ChunkedReplies::new(messages, |message| message.chunk, self.max_reply_bytes).next().await;
+        let frame = DecodedReplies::new(
+            messages,
+            ChunkDecoder::new(|message: v1::RenderFrameResponse| message.chunk, self.max_reply_bytes),
+        )
+        .next()
+        .await;
         frame.unwrap_or(Err(Error::StreamEnded { awaited_reply: "the first frame" }))
     }
 
@@ -165,12 +170,17 @@ impl Client {
             frames: request.max_replies,
         };
         let messages = self.replies(FrameServiceClient::new(self.channel.clone()).stream_frames(wire).await)?;
-        Ok(FrameStream(ChunkedReplies::new(messages, |message| message.chunk, self.max_reply_bytes)))
+        Ok(FrameStream(DecodedReplies::new(
+            messages,
+            ChunkDecoder::new(|message: v1::StreamFramesResponse| message.chunk, self.max_reply_bytes),
+        )))
     }
 }
 
 /// A stream of frames; dropping it unsubscribes.
-pub struct FrameStream(ChunkedReplies<v1::StreamFramesResponse, v1::FrameChunk>);
+pub struct FrameStream(
+    DecodedReplies<v1::StreamFramesResponse, ChunkDecoder<v1::StreamFramesResponse, v1::FrameChunk>>,
+);
 
 impl FrameStream {
     /// The next frame, or `None` after the requested number of frames.

@@ -19,10 +19,14 @@ const BOX_BYTES: usize = 24;
 /// `Malformed` when the size does not fit the encoding and the number of vectors.
 pub(crate) fn decode_vectors(field: &str, encoding: Encoding, vector_count: usize, bytes: &[u8]) -> Result<Vec<f32>> {
     let expected_bytes = match encoding {
-        Encoding::Unspecified | Encoding::F32 => 12 * vector_count,
-        Encoding::F16 => 6 * vector_count,
-        Encoding::U16Box => BOX_BYTES * vector_count.div_ceil(BOX_VECTORS) + 6 * vector_count,
-        Encoding::OctahedralI16 => 4 * vector_count,
+        // Saturating, because the server may claim any number of vectors.
+        Encoding::Unspecified | Encoding::F32 => vector_count.saturating_mul(12),
+        Encoding::F16 => vector_count.saturating_mul(6),
+        Encoding::U16Box => {
+            let box_bytes = vector_count.div_ceil(BOX_VECTORS).saturating_mul(BOX_BYTES);
+            box_bytes.saturating_add(vector_count.saturating_mul(6))
+        }
+        Encoding::OctahedralI16 => vector_count.saturating_mul(4),
         Encoding::F64 => return Err(malformed_reply(field, "an encoding of vectors", "F64")),
     };
     if bytes.len() != expected_bytes {
@@ -109,6 +113,7 @@ mod tests {
     fn sections_of_a_wrong_size_are_rejected() {
         for encoding in [Encoding::F32, Encoding::F16, Encoding::U16Box, Encoding::OctahedralI16, Encoding::F64] {
             assert!(decode_vectors("p", encoding, 2, &[0; 7]).is_err(), "{encoding:?}");
+            assert!(decode_vectors("p", encoding, usize::MAX, &[0; 7]).is_err(), "{encoding:?}");
         }
     }
 }

@@ -4,7 +4,7 @@
 use std::ops::Range;
 use std::pin::Pin;
 use std::sync::Arc;
-use std::task::{Context, Poll, ready};
+use std::task::{Context, Poll};
 
 pub use modalcast_proto::v1::{Attribute, Encoding};
 
@@ -12,7 +12,7 @@ use bytes::Bytes;
 use modalcast_proto::v1;
 use v1::vertex_service_client::VertexServiceClient;
 
-use crate::assemble::{Assembler, Chunk, Replies, decode};
+use crate::assemble::{Assembler, Chunk, DecodedReplies, ReplyDecoder, decode};
 use crate::client::Client;
 use crate::error::{Error, Result, malformed_reply};
 use crate::request::{StepRequest, Subscription};
@@ -137,8 +137,7 @@ impl Client {
             deadline_ms: request.deadline_ms,
         };
         let messages = self.replies(VertexServiceClient::new(self.channel.clone()).get_vertices(wire).await)?;
-        let mut sets = VertexReplies::new(messages, single_part, self.max_reply_bytes);
-        let set = std::future::poll_fn(|context| sets.poll(context)).await;
+        let set = DecodedReplies::new(messages, VertexDecoder::new(single_part, self.max_reply_bytes)).next().await;
         set.unwrap_or(Err(Error::StreamEnded { awaited_reply: "the vertices of the step" }))
     }
 
@@ -155,17 +154,17 @@ impl Client {
             steps: request.max_replies,
         };
         let messages = self.replies(VertexServiceClient::new(self.channel.clone()).stream_vertices(wire).await)?;
-        Ok(VertexStream(VertexReplies::new(messages, stream_part, self.max_reply_bytes)))
+        Ok(VertexStream(DecodedReplies::new(messages, VertexDecoder::new(stream_part, self.max_reply_bytes))))
     }
 }
 
 /// A stream of vertex sets; dropping it unsubscribes.
-pub struct VertexStream(VertexReplies<v1::StreamVerticesResponse>);
+pub struct VertexStream(DecodedReplies<v1::StreamVerticesResponse, VertexDecoder<v1::StreamVerticesResponse>>);
 
 impl VertexStream {
     /// The vertices of the next step, or `None` after the requested number of steps.
     pub async fn next(&mut self) -> Option<Result<VertexSet>> {
-        std::future::poll_fn(|context| self.0.poll(context)).await
+        self.0.next().await
     }
 }
 
@@ -199,49 +198,40 @@ fn stream_part(message: v1::StreamVerticesResponse) -> Option<Part> {
     })
 }
 
-/// Turns messages `M` into vertex sets. Keeps what holds for all sets of a reply: the layout, and the last origins. An
-/// error ends the stream.
-struct VertexReplies<M> {
-    messages: Replies<M>,
+/// Decodes messages `M` to vertex sets. Keeps what holds for all sets of a reply: the layout, and the last origins.
+struct VertexDecoder<M> {
     part_of: fn(M) -> Option<Part>,
     layout: Layout,
+    /// Limit on the domains of the layout, so that its size in memory is at most that of a reply.
+    max_domains: u64,
     origins: Option<Arc<[[f64; 3]]>>,
     assembler: Assembler<v1::VertexHead>,
-    has_ended: bool,
 }
 
-impl<M> VertexReplies<M> {
-    fn new(messages: Replies<M>, part_of: fn(M) -> Option<Part>, max_reply_bytes: u64) -> Self {
+impl<M> VertexDecoder<M> {
+    fn new(part_of: fn(M) -> Option<Part>, max_reply_bytes: u64) -> Self {
         let (layout, assembler) = (Layout::Incomplete(Vec::new()), Assembler::new("vertices", max_reply_bytes));
-        Self { messages, part_of, layout, origins: None, assembler, has_ended: false }
+        let max_domains = max_reply_bytes / size_of::<VertexSetDomain>() as u64;
+        Self { part_of, layout, max_domains, origins: None, assembler }
     }
 
-    /// Polls for the next complete set.
-    fn poll(&mut self, context: &mut Context<'_>) -> Poll<Option<Result<VertexSet>>> {
-        while !self.has_ended {
-            let set = match ready!(self.messages.poll(context)) {
-                Some(message) => message.and_then(|message| self.add_message(message)),
-                None if self.assembler.is_open() => {
-                    Err(Error::StreamEnded { awaited_reply: "the last chunk of a reply" })
-                }
-                None => {
-                    self.has_ended = true;
-                    return Poll::Ready(None);
-                }
-            };
-            self.has_ended = set.is_err();
-            if let Some(set) = set.transpose() {
-                return Poll::Ready(Some(set));
-            }
-        }
-        Poll::Ready(None)
+    fn decode_set(&mut self, head: v1::VertexHead, bytes: &Bytes) -> Result<VertexSet> {
+        let Layout::Complete(domains) = &self.layout else {
+            return Err(malformed_reply("vertices.layout", "a complete layout before the first step", "none"));
+        };
+        let set = decode_vertex_set(head, bytes, domains, self.origins.take())?;
+        self.origins = Some(Arc::clone(&set.origins));
+        Ok(set)
     }
+}
 
-    /// Adds a message. Returns the set that it completes.
+impl<M> ReplyDecoder<M> for VertexDecoder<M> {
+    type Reply = VertexSet;
+
     fn add_message(&mut self, message: M) -> Result<Option<VertexSet>> {
         match (self.part_of)(message) {
             None => Err(malformed_reply("vertices.part", "a layout or a chunk", "none")),
-            Some(Part::Layout(layout)) => self.layout.add(&layout).map(|()| None),
+            Some(Part::Layout(layout)) => self.layout.add(&layout, self.max_domains).map(|()| None),
             Some(Part::Chunk(chunk)) => {
                 let head = chunk.head.map(|head| {
                     let total = head.total;
@@ -255,13 +245,8 @@ impl<M> VertexReplies<M> {
         }
     }
 
-    fn decode_set(&mut self, head: v1::VertexHead, bytes: &Bytes) -> Result<VertexSet> {
-        let Layout::Complete(domains) = &self.layout else {
-            return Err(malformed_reply("vertices.layout", "a complete layout before the first step", "none"));
-        };
-        let set = decode_vertex_set(head, bytes, domains, self.origins.take())?;
-        self.origins = Some(Arc::clone(&set.origins));
-        Ok(set)
+    fn is_open(&self) -> bool {
+        self.assembler.is_open()
     }
 }
 
@@ -273,11 +258,15 @@ enum Layout {
 }
 
 impl Layout {
-    fn add(&mut self, part: &v1::VertexLayout) -> Result<()> {
+    fn add(&mut self, part: &v1::VertexLayout, max_domains: u64) -> Result<()> {
         let Self::Incomplete(domains) = self else {
             return Err(malformed_reply("vertices.layout", "one complete layout", "a further part"));
         };
         let count = part.domains.len();
+        if (domains.len() + count) as u64 > max_domains {
+            let expected = format!("at most {max_domains} domains");
+            return Err(malformed_reply("vertices.layout", expected, domains.len() + count));
+        }
         if part.vertices.len() != count || part.corners.len() != count {
             return Err(malformed_reply(
                 "vertices.layout",
@@ -459,12 +448,13 @@ mod tests {
             has_more,
         };
         let mut layout = Layout::Incomplete(Vec::new());
-        layout.add(&part(0, true)).expect("a valid part");
-        layout.add(&part(2, false)).expect("a valid part");
+        layout.add(&part(0, true), 4).expect("a valid part");
+        layout.add(&part(2, false), 4).expect("a valid part");
         let Layout::Complete(domains) = &layout else { panic!("expected a complete layout") };
         assert_eq!((domains.len(), domains[3]), (4, VertexSetDomain { index: 3, vertex_count: 4, corner_count: 6 }));
-        assert!(layout.add(&part(4, false)).is_err(), "expected one layout");
+        assert!(layout.add(&part(4, false), 10).is_err(), "expected one layout");
         let wrong_counts = v1::VertexLayout { vertices: vec![1], ..part(0, false) };
-        assert!(Layout::Incomplete(Vec::new()).add(&wrong_counts).is_err());
+        assert!(Layout::Incomplete(Vec::new()).add(&wrong_counts, 10).is_err());
+        assert!(Layout::Incomplete(Vec::new()).add(&part(0, true), 1).is_err(), "expected a limit on the domains");
     }
 }

@@ -108,6 +108,25 @@ impl VertexSelection {
         }
     }
 
+    /// Number of vectors of an attribute in the selected domains.
+    fn vector_count(&self, attribute: Attribute) -> usize {
+        match attribute {
+            Attribute::Positions | Attribute::Displacements => {
+                self.counts().map(|(vertices, _)| vertices as usize).sum()
+            }
+            Attribute::Normals => self.counts().map(|(_, corners)| corners as usize).sum(),
+            Attribute::Boxes => 2 * self.domains.len(),
+            Attribute::Origins => 0,
+        }
+    }
+
+    /// Size of all selected attributes in bytes, without origins.
+    fn encoded_bytes(&self) -> usize {
+        let section_bytes =
+            |(attribute, encoding): &(Attribute, Encoding)| encoding.encoded_bytes(self.vector_count(*attribute));
+        self.attributes.iter().map(section_bytes).sum()
+    }
+
     /// Vertex and corner count of each selected domain.
     pub fn counts(&self) -> impl Iterator<Item = (u32, u32)> {
         let domain_layouts = &self.scene.layout.domains;
@@ -198,7 +217,7 @@ fn pack(
     selection: &VertexSelection,
     origins: Option<&[[f64; 3]]>,
 ) -> (Vec<Section>, Vec<u8>) {
-    let (mut sections, mut bytes) = (Vec::new(), Vec::new());
+    let (mut sections, mut bytes) = (Vec::new(), Vec::with_capacity(selection.encoded_bytes() + 24));
     let mut end_section = |attribute: Attribute, encoding: Encoding, offset: usize, bytes: &[u8]| {
         let (offset, end) = (offset as u64, bytes.len() as u64);
         sections.push(Section { attribute, encoding, offset, bytes: end - offset });
@@ -225,11 +244,12 @@ fn gather<'a>(surface: &'a DeformedSurface, selection: &VertexSelection, attribu
         if is_whole {
             return Cow::Borrowed(numbers);
         }
-        let domain_numbers = selection.domains.iter().flat_map(|domain| {
+        let mut gathered = Vec::with_capacity(3 * selection.vector_count(attribute));
+        for domain in &selection.domains {
             let (first_vector, count) = range(&layout.domains[*domain as usize]);
-            &numbers[3 * first_vector..][..3 * count]
-        });
-        Cow::Owned(domain_numbers.copied().collect())
+            gathered.extend_from_slice(&numbers[3 * first_vector..][..3 * count]);
+        }
+        Cow::Owned(gathered)
     };
     let vertex_range = |domain_layout: &DomainLayout| (domain_layout.first_vertex, domain_layout.vertices);
     let corner_range = |domain_layout: &DomainLayout| (domain_layout.first_corner, domain_layout.corners);
@@ -317,6 +337,7 @@ mod tests {
             end += section.bytes;
         }
         assert_eq!(end, bytes.len() as u64);
+        assert_eq!(bytes.len(), selection.encoded_bytes() + 24, "one origin of 24 bytes");
         assert_eq!(bytemuck::pod_collect_to_vec::<u8, f64>(&bytes[bytes.len() - 24..]), [1e7, 0.0, -3.0]);
         let boxes = bytemuck::pod_collect_to_vec::<u8, f32>(&bytes[88..112]);
         assert_eq!(boxes, [-1.0, -1.0, -1.0, 2.0, 2.0, 2.0]);

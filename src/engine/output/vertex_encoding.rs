@@ -21,6 +21,19 @@ pub enum Encoding {
 /// Number of consecutive vectors that share a box.
 const BOX_VECTORS: usize = 256;
 
+impl Encoding {
+    /// Size of vectors in bytes.
+    pub(super) const fn encoded_bytes(self, vector_count: usize) -> usize {
+        match self {
+            Self::F32 => 12 * vector_count,
+            Self::F16 => 6 * vector_count,
+            Self::U16Box => size_of::<[[f32; 3]; 2]>() * vector_count.div_ceil(BOX_VECTORS) + 6 * vector_count,
+            Self::OctahedralI16 => 4 * vector_count,
+            Self::F64 => 24 * vector_count,
+        }
+    }
+}
+
 /// Appends vectors, three numbers each, to `bytes`.
 pub(super) fn encode_vectors(encoding: Encoding, numbers: &[f32], bytes: &mut Vec<u8>) {
     match encoding {
@@ -36,7 +49,7 @@ pub(super) fn encode_vectors(encoding: Encoding, numbers: &[f32], bytes: &mut Ve
 fn encode_f16(numbers: &[f32], bytes: &mut Vec<u8>) {
     let mut rounded = vec![f16::ZERO; numbers.len()];
     rounded.convert_from_f32_slice(numbers);
-    bytes.extend(rounded.iter().flat_map(|number| number.to_le_bytes()));
+    bytes.extend_from_slice(bytemuck::cast_slice(rounded.reinterpret_cast()));
 }
 
 fn encode_u16_boxes(numbers: &[f32], bytes: &mut Vec<u8>) {
@@ -73,13 +86,14 @@ fn bounds_of(numbers: &[f32]) -> [[f32; 3]; 2] {
 /// Octahedral projection (Cigolle et al., "A Survey of Efficient Representations for Independent Unit Vectors", JCGT
 /// 2014): onto the octahedron |x| + |y| + |z| = 1, whose lower half is folded over the diagonals of the square.
 fn encode_octahedral(numbers: &[f32], bytes: &mut Vec<u8>) {
-    let codes = numbers.as_chunks::<3>().0.iter().flat_map(|[x, y, z]| {
+    let project = |[x, y, z]: &[f32; 3]| {
         let norm = x.abs() + y.abs() + z.abs();
         let [x, y, z] = if norm > 0.0 { [x / norm, y / norm, z / norm] } else { [0.0, 0.0, 1.0] };
         let folded = if z < 0.0 { [(1.0 - y.abs()).copysign(x), (1.0 - x.abs()).copysign(y)] } else { [x, y] };
-        folded.map(|number| ((number * f32::from(i16::MAX)).round() as i16).to_le_bytes())
-    });
-    bytes.extend(codes.flatten());
+        folded.map(|number| (number * f32::from(i16::MAX)).round() as i16)
+    };
+    let codes: Vec<[i16; 2]> = numbers.as_chunks::<3>().0.iter().map(project).collect();
+    bytes.extend_from_slice(bytemuck::cast_slice(&codes));
 }
 
 #[cfg(test)]
@@ -95,6 +109,7 @@ mod tests {
     fn encoded(encoding: Encoding, numbers: &[f32]) -> Vec<u8> {
         let mut bytes = Vec::new();
         encode_vectors(encoding, numbers, &mut bytes);
+        assert_eq!(bytes.len(), encoding.encoded_bytes(numbers.len() / 3));
         bytes
     }
 

@@ -1,6 +1,6 @@
 //! The supported part of a glTF 2.0 document as plain structures. Values are not validated: indices may be out of
-//! range, and counts may be any 64-bit number. Names follow the specification. Fields of type `IgnoredAny` are only
-//! counted or checked for presence, because the loader does not support what they describe.
+//! range, and counts may be any 64-bit number. Names follow the specification. Fields of type `IgnoredAny` belong to
+//! features that the loader does not support; they are only counted or checked for presence.
 
 use std::collections::BTreeMap;
 
