@@ -162,8 +162,7 @@ pub struct DeformSummary {
     /// world-space boxes of groups of up to 128 vertices, then bound these boxes. Their bounds exceed the tight bounds
     /// by less than the diagonal of such a box, and extend beyond the corners of `bounds` at most by rounding.
     pub oriented_bounds: Option<OrientedBounds>,
-    /// Milliseconds from the call until the vertices were complete. If the deformer writes to the renderer's own
-    /// buffers, the wait for frames that still read these buffers is not included.
+    /// Milliseconds from the call until the vertices were complete.
     pub ms: f64,
 }
 
@@ -178,9 +177,18 @@ pub trait Deformer {
     /// `Fault` if the device fails.
     fn deform(&mut self, state: &SceneState) -> Result<DeformSummary>;
 
-    /// Whether the output is written to the renderer's own buffers, so that no upload is needed.
-    fn shares_buffers(&self) -> bool {
+    /// Whether [`Self::fill_gl_buffers`] can fill the renderer's buffers, so that no upload is needed.
+    fn fills_gl_buffers(&self) -> bool {
         false
+    }
+
+    /// Copies positions, normals and tangents of the last [`Self::deform`] to the renderer's buffers on the device,
+    /// without waiting. OpenGL commands issued earlier read the old contents, and later ones the new contents.
+    ///
+    /// # Errors
+    /// `Fault` unless [`Self::fills_gl_buffers`], or if the device fails.
+    fn fill_gl_buffers(&mut self) -> Result<()> {
+        Err(fault("interop", "expected a deformer that fills OpenGL's buffers"))
     }
 
     /// The vertices of the last [`Self::deform`], in host memory. Blocks until they are complete.

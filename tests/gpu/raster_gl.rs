@@ -233,7 +233,7 @@ fn gpu_positions_shared_with_a_deformer_are_drawn() {
         CudaDeformerOptions::with_bounding_axes(scene.light_axes()),
     )
     .expect("expected a CUDA deformer");
-    assert!(deformer.shares_buffers(), "expected shared buffers");
+    assert!(deformer.fills_gl_buffers(), "expected a deformer that fills the buffers");
     let triangles = scene.triangle_vertices();
     let all_triangles =
         DrawRange { first_triangle: 0, triangle_count: triangles.len() as u32, cull_mode: CullMode::None };
@@ -245,6 +245,7 @@ fn gpu_positions_shared_with_a_deformer_are_drawn() {
     let id_target = context.gl.create_buffer(8 * viewport.pixel_count() as u64);
     for seed in 0..10 {
         deformer.deform(&scenes::random_state(&scene, seed)).expect("expected the step to succeed");
+        deformer.fill_gl_buffers().expect("expected filled buffers");
         let got = context.draw_ids(&mut rasterizer, &viewport, &id_target);
         let mut want = VisibilityBuffer::new(viewport);
         want.draw(&deformer.surface().expect("expected a surface").positions, &triangles, all_triangles);

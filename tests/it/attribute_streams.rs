@@ -364,7 +364,7 @@ fn reference_deformer_has_displacements_and_boxes() {
     attributes::check_displacements_and_boxes(reference);
     attributes::check_scene_without_modes(reference);
     assert!(
-        !reference(&strips_with_attributes()).shares_buffers(),
-        "expected a deformer that does not write to the renderer's buffers"
+        !reference(&strips_with_attributes()).fills_gl_buffers(),
+        "expected a deformer that does not fill the renderer's buffers"
     );
 }

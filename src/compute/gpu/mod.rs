@@ -3,8 +3,8 @@
 //!
 //! The kernels are in `kernels/*.cu`. NVRTC compiles them at run time for the present device, with only the features
 //! that the scene uses ([`plan()`]). A disk cache keeps the machine code. A step is one CUDA graph: a host-to-device
-//! copy, at most four kernel launches for any number of domains, and a readback of the bounds. The kernels write
-//! directly to OpenGL's buffers if the driver can share them.
+//! copy, at most four kernel launches for any number of domains, and a readback of the bounds. A step that is drawn is
+//! copied to OpenGL's buffers on the device if the driver can share them.
 //!
 //! ```text
 //! inputs -> [apply or batch] -> deform -> bounds -> [normals] -> readback of the bounds

@@ -126,7 +126,7 @@ impl DeviceContext {
         }
     }
 
-    /// Creates the deformer of a scene. If the deformer writes to OpenGL buffers, creates the buffers, too.
+    /// Creates the deformer of a scene. If the deformer can fill OpenGL buffers, creates the buffers, too.
     fn create_deformer(
         &mut self,
         scene: &Arc<Scene>,

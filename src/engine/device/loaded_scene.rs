@@ -44,8 +44,7 @@ pub struct LoadedScene {
     scene: Arc<Scene>,
     deformer: Box<dyn Deformer>,
     buffers: Option<SceneBuffers>,
-    /// Whether the vertices of the last deformation were uploaded to the buffers. Remains false if the deformer writes
-    /// the buffers itself.
+    /// Whether the buffers hold the vertices of the last deformation.
     buffers_are_current: bool,
     bounds: BoundingBox,
     /// Bounds of the same vertices in light space. `None` if the scene has no shadow.
@@ -213,21 +212,25 @@ impl LoadedScene {
         Ok(Some(legend))
     }
 
-    /// Creates the buffers on first use and uploads the vertices unless the deformer writes the buffers itself. Does
-    /// not rebase positions. Returns whether vertices were uploaded.
+    /// Creates the buffers on first use. Copies the vertices to them on the device if the deformer can, else uploads
+    /// them, once per deformation. Does not rebase positions. Returns whether vertices were uploaded.
     fn fill_without_rebase(&mut self, renderer: &mut Renderer) -> Result<bool> {
-        let writes_buffers_itself = self.deformer.shares_buffers();
         let buffers = match self.buffers.take() {
             Some(buffers) => buffers,
             None => renderer.load(&self.scene)?,
         };
         let buffers = self.buffers.insert(buffers);
-        if self.buffers_are_current || writes_buffers_itself {
+        if self.buffers_are_current {
             return Ok(false);
         }
-        renderer.upload(buffers, self.deformer.surface_with(VertexAttributes::POSITIONS_AND_NORMALS)?)?;
+        let needs_upload = !self.deformer.fills_gl_buffers();
+        if needs_upload {
+            renderer.upload(buffers, self.deformer.surface_with(VertexAttributes::POSITIONS_AND_NORMALS)?)?;
+        } else {
+            self.deformer.fill_gl_buffers()?;
+        }
         self.buffers_are_current = true;
-        Ok(true)
+        Ok(needs_upload)
     }
 
     /// Attaches a compute rasterizer to the scene's buffers. OpenGL draws the passes that it does not support.

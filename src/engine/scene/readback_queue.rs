@@ -3,22 +3,13 @@
 //! the order in which they were started. In the diagrams, `k` is the number of a step, `read` is the transfer of the
 //! pixels to host-readable memory, and `upload` is the copy of the new vertices into OpenGL buffers.
 //!
-//! A deformer with its own vertex memory computes concurrently with the frames in flight:
+//! Deformers have their own vertex memory, so they compute concurrently with the frames in flight. `upload` is ordered
+//! after the readback of frame k. Frame k is copied out, encoded and sent while frame k+1 is drawn.
 //!
 //! ```text
 //! deformer  [deform k+1  ]          [deform k+2  ]
 //! OpenGL    [draw k][read k][upload][draw k+1][read k+1][upload]
-//! ```
-//!
-//! A deformer that writes into OpenGL buffers cannot overlap with frames on the device: mapping the buffers is ordered
-//! after all OpenGL commands issued before, including the readback of frame k. Only the host's work overlaps. Step k+1
-//! is recorded and submitted while frame k is drawn, and starts on the device as soon as frame k is read. Frame k is
-//! copied out, encoded and sent while frame k+1 is drawn.
-//!
-//! ```text
-//! device    [draw k][read k][deform k+1] [draw k+1][read k+1][deform k+2]
-//! host      [submit k+1]                 [submit k+2]
-//! frame k                                [copy out, encode, send]
+//! frame k                           [copy out, encode, send]
 //! ```
 
 use std::collections::VecDeque;

@@ -10,12 +10,11 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use super::inputs::StepInputs;
-use super::interop::MapAccess;
 use super::launchers::apply::ApplyKernel;
 use super::launchers::bounds::BoundsKernel;
 use super::launchers::deform::{DeformKernel, PositionKernels};
 use super::launchers::normals::NormalsKernel;
-use super::output::{OutputAccess, OutputBuffers, output_sizes};
+use super::output::{OutputAddresses, OutputBuffers, output_sizes};
 use super::output_ring::{OutputRing, StepTarget};
 use super::pinned_surface::{PinnedSurface, SurfaceLengths};
 use super::readback::{ReadbackPool, ReadbackRequest, SynchronousLists};
@@ -41,6 +40,8 @@ struct StepInFlight {
     /// Index in [`CudaDeformer::step_slots`].
     slot: usize,
     submitted: Instant,
+    /// Milliseconds of the host's work before it mapped OpenGL's buffers; `None` if the step did not map them.
+    ms_before_map: Option<f64>,
 }
 
 /// The CUDA deformer of one scene. It stays on the thread that created it, which owns the OpenGL context.
@@ -68,10 +69,15 @@ pub struct CudaDeformer {
     surface: PinnedSurface,
     /// Attributes of `surface` that show the last step.
     host_attributes: VertexAttributes,
+    /// Whether OpenGL's buffers hold the last step.
+    gl_buffers_are_current: bool,
+    /// Whether [`Deformer::fill_gl_buffers`] was called after the last step. The next step then fills the buffers, too.
+    is_drawn: bool,
 }
 
 impl CudaDeformer {
-    /// Uploads a scene to the device. Steps write directly into `gl_buffers` if the driver can register them.
+    /// Uploads a scene to the device. Drawn steps are copied to `gl_buffers` on the device if the driver can register
+    /// them.
     ///
     /// # Errors
     /// `Fault` when the device fails; `Unavailable` when NVRTC is missing or the device's memory is too small.
@@ -105,8 +111,8 @@ impl CudaDeformer {
         let output = OutputBuffers::new(device, &plan, gl_buffers)?;
         let inputs = StepInputs::new(device, kernels.deform.packer())?;
         Ok(Self {
-            step_slots: vec![StepSlot::new(device, &kernels, &inputs, output.is_shared())?],
-            output_ring: OutputRing::new(output.max_sets(), max_changed_domains(scene)),
+            step_slots: vec![StepSlot::new(device, &kernels, &inputs)?],
+            output_ring: OutputRing::new(OutputBuffers::MAX_SETS, max_changed_domains(scene)),
             inputs,
             kernels,
             output,
@@ -121,6 +127,8 @@ impl CudaDeformer {
             surface: PinnedSurface::empty(),
             // Before the first step there is nothing to copy to the host.
             host_attributes: VertexAttributes::ALL,
+            gl_buffers_are_current: false,
+            is_drawn: false,
             device: Arc::clone(device),
             plan,
         })
@@ -157,9 +165,9 @@ impl CudaDeformer {
         let submitted = Instant::now();
         // If a panic unwinds from `start`, the step may run although it is not in `in_flight`: wait for it.
         let guard = WaitForStream::new(self.device.stream());
-        let slot = self.start(state, submitted).inspect_err(|_| self.invalidate())?;
-        self.in_flight.push_back(StepInFlight { slot, submitted });
-        self.last_slot = slot;
+        let step = self.start(state, submitted).inspect_err(|_| self.invalidate())?;
+        self.last_slot = step.slot;
+        self.in_flight.push_back(step);
         guard.disarm();
         Ok(())
     }
@@ -170,28 +178,32 @@ impl CudaDeformer {
     /// `Fault` when no step is in flight, or of the device. Afterwards no step is in flight.
     pub fn finish(&mut self) -> Result<DeformSummary> {
         let missing_step = || Error::Fault { stage: "deform", reason: "expected a step in flight, got none".into() };
-        let StepInFlight { slot, submitted } = self.in_flight.pop_front().ok_or_else(missing_step)?;
+        let StepInFlight { slot, submitted, ms_before_map } = self.in_flight.pop_front().ok_or_else(missing_step)?;
         let (bounds, oriented_bounds) = self.step_slots[slot].wait().inspect_err(|_| self.invalidate())?;
-        let elapsed_ms = submitted.elapsed().as_secs_f64() * 1e3;
-        let device_ms = self.step_slots[slot].device_ms().inspect_err(|_| self.invalidate())?;
-        Ok(DeformSummary { bounds, oriented_bounds, ms: device_ms.unwrap_or(elapsed_ms) })
+        let ms = match ms_before_map {
+            None => submitted.elapsed().as_secs_f64() * 1e3,
+            Some(ms_before_map) => {
+                ms_before_map + self.step_slots[slot].ms_since_mapped().inspect_err(|_| self.invalidate())?
+            }
+        };
+        Ok(DeformSummary { bounds, oriented_bounds, ms })
     }
 
     /// Starts the graph of the last full step again, to measure its time.
     ///
     /// # Errors
-    /// `Fault` when the outputs are OpenGL's buffers, which this function does not map; when there was no step; or when
-    /// the device fails.
+    /// `Fault` when there was no step, or when the device fails.
     pub fn replay(&self) -> Result<()> {
-        if self.output.is_shared() || self.output_ring.shown_output().is_none() {
-            let reason = "expected a deformed step in buffers of the deformer".into();
-            return Err(Error::Fault { stage: "replay", reason });
+        if self.output_ring.shown_output().is_none() {
+            return Err(Error::Fault { stage: "replay", reason: "expected a deformed step, got none".into() });
         }
         self.step_slots[self.last_slot].launch(StepKind::Full)
     }
 
-    /// Writes the values of a step and starts its graph. Returns the step slot.
-    fn start(&mut self, state: &SceneState, submitted: Instant) -> Result<usize> {
+    /// Writes the values of a step and starts its graph. If the last step was drawn, also fills OpenGL's buffers.
+    fn start(&mut self, state: &SceneState, submitted: Instant) -> Result<StepInFlight> {
+        let fills_gl_buffers = std::mem::take(&mut self.is_drawn);
+        self.gl_buffers_are_current = false;
         let _current = self.device.enter()?;
         let set = self.output_ring.next_output();
         match self.output.ensure_set(&self.device, &self.plan, set) {
@@ -217,35 +229,32 @@ impl CudaDeformer {
             };
         let last_full_step = self.output_ring.update_last_full_step(list_lengths.is_none());
         let header = header(&target, list_lengths, last_full_step);
-        // A readback of OpenGL's buffers first copies them to a back buffer on this stream, so that copy precedes the
-        // step anyway.
-        if target.is_being_read && !self.output.is_shared() {
+        if target.is_being_read {
             self.readbacks.wait_for_reads(&self.device, target.output)?;
         }
-        // The driver may discard the old contents only if the step writes every vertex and reads none. A partial step
-        // does not write the vertices of unchanged domains. The kernels of normals and boxes read positions.
-        let keeps_contents = list_lengths.is_some() || kernels.normals.is_some() || kernels.bounds.boxes.is_some();
+        let OutputAddresses { positions, normals, tangents } = self.output.addresses(target.output);
         let displacements = self.displacements.as_ref().map_or(0, DeviceBuffer::address);
-        let header = StepHeader { displacements, ..header };
-        let access = if keeps_contents { MapAccess::ReadWrite } else { MapAccess::WriteDiscard };
-        step_slot.host_ms = submitted.elapsed().as_secs_f64() * 1e3;
-        self.output.with_addresses(&self.device, OutputAccess { set: target.output, access }, |addresses| {
-            step_slot.record_mapped(&self.device)?;
-            let header = StepHeader {
-                positions: addresses.positions,
-                normals: addresses.normals,
-                tangents: addresses.tangents,
-                ..header
-            };
-            match list_lengths {
-                Some(_) => StepInputs::write_header(&mut step_slot.values, &header)?,
-                None => inputs.write(&mut step_slot.values, &header, state)?,
-            }
-            step_slot.launch(if list_lengths.is_some() { StepKind::Partial } else { StepKind::Full })
-        })?;
-        step_slot.done.record(self.device.stream()).map_err(cuda_error("deform"))?;
+        let header = StepHeader { positions, normals, tangents, displacements, ..header };
+        match list_lengths {
+            Some(_) => StepInputs::write_header(&mut step_slot.values, &header)?,
+            None => inputs.write(&mut step_slot.values, &header, state)?,
+        }
+        let step_kind = if list_lengths.is_some() { StepKind::Partial } else { StepKind::Full };
+        let ms_before_map = fills_gl_buffers.then(|| submitted.elapsed().as_secs_f64() * 1e3);
+        if fills_gl_buffers {
+            let (device, stream) = (&self.device, self.device.stream());
+            self.output.copy_to_gl_after(device, target.output, || {
+                step_slot.record_mapped(device)?;
+                step_slot.launch(step_kind)?;
+                step_slot.done.record(stream).map_err(cuda_error("deform"))
+            })?;
+        } else {
+            step_slot.launch(step_kind)?;
+            step_slot.done.record(self.device.stream()).map_err(cuda_error("deform"))?;
+        }
+        self.gl_buffers_are_current = fills_gl_buffers;
         self.output_ring.end_step(state);
-        Ok(slot_index)
+        Ok(StepInFlight { slot: slot_index, submitted, ms_before_map })
     }
 
     /// Returns a step slot whose step has ended; allocates one if all are in flight.
@@ -254,7 +263,7 @@ impl CudaDeformer {
         if let Some(slot) = (0..self.step_slots.len()).find(is_free) {
             return Ok(slot);
         }
-        self.step_slots.push(StepSlot::new(&self.device, &self.kernels, &self.inputs, self.output.is_shared())?);
+        self.step_slots.push(StepSlot::new(&self.device, &self.kernels, &self.inputs)?);
         Ok(self.step_slots.len() - 1)
     }
 
@@ -265,6 +274,7 @@ impl CudaDeformer {
         self.device.stream().synchronize().ok();
         self.readbacks.synchronize();
         self.in_flight.clear();
+        self.gl_buffers_are_current = false;
         self.readback = None;
         self.output_ring.invalidate();
     }
@@ -369,8 +379,18 @@ impl Deformer for CudaDeformer {
         }
     }
 
-    fn shares_buffers(&self) -> bool {
-        self.output.is_shared()
+    fn fills_gl_buffers(&self) -> bool {
+        self.output.has_gl_buffers()
+    }
+
+    fn fill_gl_buffers(&mut self) -> Result<()> {
+        let missing_step = || Error::Fault { stage: "interop", reason: "expected a deformed step, got none".into() };
+        let set = self.output_ring.shown_output().ok_or_else(missing_step)?;
+        if !self.gl_buffers_are_current {
+            self.output.copy_to_gl_after(&self.device, set, || Ok(()))?;
+        }
+        (self.gl_buffers_are_current, self.is_drawn) = (true, true);
+        Ok(())
     }
 
     fn surface(&mut self) -> Result<&DeformedSurface> {

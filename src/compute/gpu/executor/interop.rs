@@ -1,11 +1,10 @@
-//! CUDA-OpenGL interop: OpenGL buffers as device memory. They are registered once, mapped together for each step, and
-//! unmapped before the next draw.
+//! CUDA-OpenGL interop: OpenGL buffers as device memory. They are registered once. Those of the vertices are mapped
+//! together for each step that is drawn, and unmapped before the draw.
 //!
 //! Map and unmap order the two APIs on the device, so the host never waits. OpenGL commands issued before a map
 //! complete before CUDA work that is submitted to the stream after it. CUDA work submitted before an unmap completes
-//! before OpenGL commands that are issued after it. A frame may therefore be in flight when the next step is submitted:
-//! the step waits on the device until the frame is drawn and its pixels are read back. A step never runs concurrently
-//! with a frame that uses its buffers. The reported time of a step excludes this wait (`step_slot`).
+//! before OpenGL commands that are issued after it. A frame may therefore be in flight when the buffers are mapped for
+//! the next one: the copy of the vertices waits on the device until the frame is drawn and its pixels are read back.
 
 use std::cell::Cell;
 use std::ffi::{c_int, c_uint};

@@ -1,15 +1,21 @@
-//! Output buffers: OpenGL's buffers if CUDA can register them, else own buffers. An output set is one buffer each of
-//! positions, normals and tangents.
+//! Output buffers: the sets that steps write, and the OpenGL buffers to which a drawn step is copied on the device. An
+//! output set is one buffer each of positions, normals and tangents.
+//!
+//! Steps do not write OpenGL's buffers themselves, because mapping them makes the GPU change between the contexts of CUDA
+//! and OpenGL. That takes longer than the step of a small scene, so only steps that are drawn pay for it. While every
+//! step is drawn, the copy is submitted together with the step, so that the GPU changes its context once for both.
+
+use cudarc::driver::result;
 
 use super::interop::{GlInterop, MapAccess, Mapping, RegisteredBuffer, with_mapped};
 use super::pinned_surface::SurfaceLists;
-use crate::gpu::launch::{Device, DeviceBuffer, download};
+use crate::gpu::launch::error::cuda_error;
+use crate::gpu::launch::{Device, DeviceBuffer};
 use crate::gpu::tables::plan::{BufferRole, DeformPlan};
 use modalcast_model::error::{Error, Result, fault};
 use modalcast_model::raster::{GlBuffer, GlVertexBuffers};
 
-/// Device addresses of the outputs. The address of an OpenGL buffer is valid only while the buffer is mapped.
-/// `tangents` is 0 if the scene has no tangents.
+/// Device addresses of an output set. `tangents` is 0 if the scene has no tangents.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct OutputAddresses {
     pub positions: u64,
@@ -17,28 +23,21 @@ pub(super) struct OutputAddresses {
     pub tangents: u64,
 }
 
-/// The output sets. Each buffer of a set has at least the bytes of the plan.
+/// The output sets and the buffers that OpenGL draws from.
 #[derive(Debug)]
-pub(super) enum OutputBuffers {
+pub(super) struct OutputBuffers {
     /// One set. A second set is added when a step is submitted while the host reads the first.
-    Owned(Vec<OutputSet>),
-    /// One set: the buffers that OpenGL draws from.
-    Shared(RegisteredOutputs),
+    sets: Vec<OutputSet>,
+    /// `None` if CUDA cannot write OpenGL's buffers.
+    gl_buffers: Option<RegisteredOutputs>,
 }
 
-/// A set of owned buffers.
+/// Buffers that a step writes. Each has the bytes of the plan.
 #[derive(Debug)]
 pub(super) struct OutputSet {
     positions: DeviceBuffer,
     normals: DeviceBuffer,
     tangents: Option<DeviceBuffer>,
-}
-
-/// An access to an output set.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct OutputAccess {
-    pub set: usize,
-    pub access: MapAccess,
 }
 
 /// Bytes of positions, normals and tangents.
@@ -101,48 +100,67 @@ impl RegisteredOutputs {
         &mut self,
         device: &Device,
         access: MapAccess,
-        work: impl FnOnce(OutputAddresses) -> Result<()>,
+        work: impl FnOnce(&[u64]) -> Result<()>,
     ) -> Result<()> {
         let Self { positions, normals, tangents } = self;
         let buffers = [positions, normals].into_iter().chain(tangents);
         let mut mappings: Vec<Mapping<'_>> = buffers.map(|buffer| Mapping { buffer, access }).collect();
-        with_mapped(device, &mut mappings, |addresses| {
-            let address = |index: usize| addresses.get(index).copied().unwrap_or(0);
-            work(OutputAddresses { positions: address(0), normals: address(1), tangents: address(2) })
+        with_mapped(device, &mut mappings, work)
+    }
+
+    /// Maps the buffers, runs `submit_step`, and copies an output set into the buffers, on the device's stream.
+    fn copy_after(&mut self, device: &Device, set: &OutputSet, submit_step: impl FnOnce() -> Result<()>) -> Result<()> {
+        self.with_addresses(device, MapAccess::WriteDiscard, |targets| {
+            submit_step()?;
+            let sources = [Some(&set.positions), Some(&set.normals), set.tangents.as_ref()];
+            for (source, target) in sources.into_iter().flatten().zip(targets) {
+                // SAFETY: the mapping checks that the target has the bytes of the plan, which are those of the source.
+                // The deformer owns both, and waits for its stream before it drops them. The buffers do not overlap.
+                unsafe {
+                    result::memcpy_dtod_async(
+                        *target,
+                        source.address(),
+                        source.bytes() as usize,
+                        device.stream().cu_stream(),
+                    )
+                }
+                .map_err(cuda_error("interop"))?;
+            }
+            Ok(())
         })
     }
 }
 
 impl OutputBuffers {
-    /// Registers OpenGL's buffers if they are given. If this fails, logs the error and allocates own buffers.
+    /// Maximum number of sets.
+    pub(super) const MAX_SETS: usize = 2;
+
+    /// Allocates a set, and registers OpenGL's buffers if they are given. If that fails, logs the error.
     ///
     /// # Errors
     /// `Fault` when the device has not enough memory; `DeviceLost`.
     pub(super) fn new(device: &Device, plan: &DeformPlan, gl_buffers: Option<GlVertexBuffers>) -> Result<Self> {
-        match gl_buffers.map(|buffers| RegisteredOutputs::register(device, buffers, output_sizes(plan))) {
-            Some(Ok(outputs)) => return Ok(Self::Shared(outputs)),
-            Some(Err(lost @ Error::DeviceLost { .. })) => return Err(lost),
-            Some(Err(error)) => tracing::warn!(%error, "vertices are copied: CUDA cannot write into OpenGL's buffers"),
-            None => {}
-        }
-        Ok(Self::Owned(vec![OutputSet::new(device, plan)?]))
+        let gl_buffers =
+            match gl_buffers.map(|buffers| RegisteredOutputs::register(device, buffers, output_sizes(plan))) {
+                Some(Ok(registered)) => Some(registered),
+                Some(Err(lost @ Error::DeviceLost { .. })) => return Err(lost),
+                Some(Err(error)) => {
+                    tracing::warn!(%error, "vertices are uploaded: CUDA cannot write OpenGL's buffers");
+                    None
+                }
+                None => None,
+            };
+        Ok(Self { sets: vec![OutputSet::new(device, plan)?], gl_buffers })
     }
 
-    pub(super) const fn is_shared(&self) -> bool {
-        matches!(self, Self::Shared(_))
-    }
-
-    /// Maximum number of sets.
-    pub(super) const fn max_sets(&self) -> usize {
-        if self.is_shared() { 1 } else { 2 }
+    /// Whether OpenGL's buffers can be filled on the device.
+    pub(super) const fn has_gl_buffers(&self) -> bool {
+        self.gl_buffers.is_some()
     }
 
     /// Number of allocated sets.
-    pub(super) fn count(&self) -> usize {
-        match self {
-            Self::Owned(sets) => sets.len(),
-            Self::Shared(_) => 1,
-        }
+    pub(super) const fn count(&self) -> usize {
+        self.sets.len()
     }
 
     /// Allocates a set unless it exists.
@@ -150,58 +168,40 @@ impl OutputBuffers {
     /// # Errors
     /// `Fault` when the device has not enough memory; the existing sets remain unchanged.
     pub(super) fn ensure_set(&mut self, device: &Device, plan: &DeformPlan, set: usize) -> Result<()> {
-        match self {
-            Self::Owned(sets) if sets.len() <= set => {
-                sets.push(OutputSet::new(device, plan)?);
-                Ok(())
-            }
-            _ => Ok(()),
+        if self.sets.len() <= set {
+            self.sets.push(OutputSet::new(device, plan)?);
         }
+        Ok(())
+    }
+
+    /// Runs `submit_step`, which submits the step that writes a set, and copies the set into OpenGL's buffers. Both are
+    /// on the device's stream: after all OpenGL commands issued before, and before all OpenGL commands issued later.
+    ///
+    /// # Errors
+    /// The error of `submit_step`; `Fault` without OpenGL's buffers, or when the device fails.
+    pub(super) fn copy_to_gl_after(
+        &mut self,
+        device: &Device,
+        set: usize,
+        submit_step: impl FnOnce() -> Result<()>,
+    ) -> Result<()> {
+        let missing_buffers = || fault("interop", "expected OpenGL buffers that CUDA can write, got none");
+        let gl_buffers = self.gl_buffers.as_mut().ok_or_else(missing_buffers)?;
+        gl_buffers.copy_after(device, &self.sets[set], submit_step)
     }
 
     /// Copies a set into `surface_lists` and waits for the copies. Each list must have the length of the plan or be
     /// empty.
-    pub(super) fn read(&mut self, device: &Device, set: usize, surface_lists: SurfaceLists<'_>) -> Result<()> {
+    pub(super) fn read(&self, device: &Device, set: usize, surface_lists: SurfaceLists<'_>) -> Result<()> {
         let SurfaceLists { positions, normals, tangents, .. } = surface_lists;
-        if let Self::Owned(sets) = self {
-            let buffers = &sets[set];
-            buffers.positions.read(device, 0, positions)?;
-            buffers.normals.read(device, 0, normals)?;
-            return buffers.tangents.as_ref().map_or(Ok(()), |buffer| buffer.read(device, 0, tangents));
-        }
-        self.with_addresses(device, OutputAccess { set, access: MapAccess::Read }, |addresses| {
-            // SAFETY: each mapping checks that the outputs have the bytes of the plan. The lists have these sizes or
-            // are empty.
-            unsafe {
-                download(device, addresses.positions, positions)?;
-                download(device, addresses.normals, normals)?;
-                download(device, addresses.tangents, tangents)
-            }
-        })
+        let buffers = &self.sets[set];
+        buffers.positions.read(device, 0, positions)?;
+        buffers.normals.read(device, 0, normals)?;
+        buffers.tangents.as_ref().map_or(Ok(()), |buffer| buffer.read(device, 0, tangents))
     }
 
-    /// Runs `work` with the addresses of an existing set. A shared set is mapped only while `work` runs, so its
-    /// addresses are not valid after `work`. `work` submits to the device's stream.
-    pub(super) fn with_addresses(
-        &mut self,
-        device: &Device,
-        OutputAccess { set, access }: OutputAccess,
-        work: impl FnOnce(OutputAddresses) -> Result<()>,
-    ) -> Result<()> {
-        match self {
-            Self::Shared(outputs) => outputs.with_addresses(device, access, work),
-            Self::Owned(sets) => work(sets[set].addresses()),
-        }
-    }
-
-    /// The addresses of an existing set that is not shared. They are valid while the set exists.
-    ///
-    /// # Errors
-    /// `Fault` when the outputs are OpenGL's buffers, which have addresses only while they are mapped.
-    pub(super) fn owned_addresses(&self, set: usize) -> Result<OutputAddresses> {
-        match self {
-            Self::Owned(sets) => Ok(sets[set].addresses()),
-            Self::Shared(_) => Err(fault("fetch", "expected buffers of the deformer, got OpenGL's buffers")),
-        }
+    /// The addresses of an existing set. They are valid while the set exists.
+    pub(super) fn addresses(&self, set: usize) -> OutputAddresses {
+        self.sets[set].addresses()
     }
 }

@@ -5,9 +5,7 @@
 //! copy k                     [copy out      ]
 //! step k+1                   [copy in][kernels]      into the other output set
 //! ```
-//! OpenGL's buffers cannot be double-buffered. They are first copied to a back buffer on the device, which takes a
-//! small part of the readback time. After that copy, the next step may overwrite OpenGL's buffers. There is only one
-//! device buffer for displacements and one for boxes, so their copies are synchronous.
+//! There is only one device buffer for displacements and one for boxes, so their copies are synchronous.
 //!
 //! Streams, events and memory are allocated on the first fetch.
 
@@ -15,12 +13,11 @@ use std::sync::Arc;
 
 use cudarc::driver::{CudaEvent, CudaStream, result};
 
-use super::interop::MapAccess;
-use super::output::{OutputAccess, OutputBuffers};
+use super::output::{OutputAddresses, OutputBuffers};
 use super::pinned_surface::{PinnedSurface, SurfaceLengths};
+use crate::gpu::launch::Device;
 use crate::gpu::launch::cleanup::WaitForStream;
 use crate::gpu::launch::error::cuda_error;
-use crate::gpu::launch::{Device, DeviceBuffer};
 use modalcast_model::deform::{DeformedSurface, VertexReadback};
 use modalcast_model::error::{Error, Result};
 use modalcast_model::scene::BoundingBox;
@@ -37,20 +34,8 @@ pub(super) struct ReadbackPool {
     slots: Vec<ReadbackSlot>,
     /// Number of copies started.
     started_copies: u64,
-    /// Per output set, the end of the last copy from it; with OpenGL's buffers, the end of the last copy from the back
-    /// buffer.
+    /// Per output set, the end of the last copy from it.
     read_done: Vec<CudaEvent>,
-    /// Only with OpenGL's buffers. Allocated on the first readback.
-    back_buffer: Option<BackBuffer>,
-}
-
-/// A copy of OpenGL's buffers on the device.
-#[derive(Debug)]
-struct BackBuffer {
-    /// Positions and normals; each is allocated on its first use.
-    parts: [Option<DeviceBuffer>; 2],
-    /// End of the last copy into the back buffer.
-    filled: CudaEvent,
 }
 
 /// A host slot: the memory of one readback.
@@ -86,20 +71,13 @@ pub(super) struct SynchronousLists<'a> {
     pub boxes: &'a mut Vec<BoundingBox>,
 }
 
-/// Device addresses from which a readback copies.
-#[derive(Debug, Clone, Copy)]
-struct ReadbackSource {
-    positions: u64,
-    normals: u64,
-}
-
 impl ReadbackPool {
     /// Starts the copy of the requested positions and normals. Meanwhile `copy_other_lists` fills the other lists. If
     /// it fails or panics, the copy has ended before this returns.
     pub(super) fn start(
         &mut self,
         device: &Device,
-        output: &mut OutputBuffers,
+        output: &OutputBuffers,
         request: ReadbackRequest<'_>,
         copy_other_lists: impl FnOnce(SynchronousLists<'_>) -> Result<()>,
     ) -> Result<VertexReadback> {
@@ -142,9 +120,9 @@ impl ReadbackPool {
     fn prepare_source(
         &mut self,
         device: &Device,
-        output: &mut OutputBuffers,
+        output: &OutputBuffers,
         request: &ReadbackRequest<'_>,
-    ) -> Result<ReadbackSource> {
+    ) -> Result<OutputAddresses> {
         let to_fault = cuda_error(STAGE);
         let copy_stream = match &self.stream {
             Some(stream) => Arc::clone(stream),
@@ -153,56 +131,9 @@ impl ReadbackPool {
         while self.read_done.len() <= request.set {
             self.read_done.push(device.context().new_event(None).map_err(&to_fault)?);
         }
-        if output.is_shared() {
-            return self.fill_back_buffer(device, output, request, &copy_stream);
-        }
         copy_stream.wait(request.step_done).map_err(&to_fault)?;
         // The sets live until the deformer is dropped, which waits for the copies first.
-        let addresses = output.owned_addresses(request.set)?;
-        Ok(ReadbackSource { positions: addresses.positions, normals: addresses.normals })
-    }
-
-    /// Copies OpenGL's buffers to the back buffer and makes `copy_stream` wait for that copy. Returns the addresses of
-    /// the copies.
-    fn fill_back_buffer(
-        &mut self,
-        device: &Device,
-        output: &mut OutputBuffers,
-        request: &ReadbackRequest<'_>,
-        copy_stream: &CudaStream,
-    ) -> Result<ReadbackSource> {
-        let bytes = [request.lengths.positions, request.lengths.normals].map(|length| 4 * length);
-        self.wait_for_reads(device, request.set)?;
-        let back_buffer = match &mut self.back_buffer {
-            Some(back_buffer) => back_buffer,
-            empty => empty.insert(BackBuffer {
-                parts: [None, None],
-                filled: device.context().new_event(None).map_err(cuda_error(STAGE))?,
-            }),
-        };
-        let mut copy_addresses = [0; 2];
-        for ((part, bytes), copy_address) in
-            back_buffer.parts.iter_mut().zip(bytes).zip(&mut copy_addresses).filter(|((_, bytes), _)| *bytes > 0)
-        {
-            *copy_address = match part {
-                Some(part) => part.address(),
-                empty => empty.insert(DeviceBuffer::zeroed(device, bytes as u64)?).address(),
-            };
-        }
-        output.with_addresses(device, OutputAccess { set: request.set, access: MapAccess::Read }, |outputs| {
-            let copies = [outputs.positions, outputs.normals].into_iter().zip(copy_addresses).zip(bytes);
-            for ((output_address, copy_address), bytes) in copies.filter(|(_, bytes)| *bytes > 0) {
-                // SAFETY: outputs and back buffer have the bytes of the plan for each requested list. Both live until
-                // the stream is synchronized.
-                unsafe { result::memcpy_dtod_async(copy_address, output_address, bytes, device.stream().cu_stream()) }
-                    .map_err(cuda_error(STAGE))?;
-            }
-            Ok(())
-        })?;
-        back_buffer.filled.record(device.stream()).map_err(cuda_error(STAGE))?;
-        copy_stream.wait(&back_buffer.filled).map_err(cuda_error(STAGE))?;
-        let [positions, normals] = copy_addresses;
-        Ok(ReadbackSource { positions, normals })
+        Ok(output.addresses(request.set))
     }
 
     /// Waits for a copy. Returns its surface and the number of its readback.

@@ -42,16 +42,14 @@ pub(super) struct StepSlot {
     bounds_keys: PinnedBuffer<u32>,
     /// End of the last step.
     pub done: CudaEvent,
-    /// Recorded when the last step's map of OpenGL's buffers is complete. The map waits for frames in flight. Only with
-    /// OpenGL's buffers.
+    /// Begin of the last step on the device, if OpenGL's buffers were mapped before it. The map waits for frames in
+    /// flight.
     mapped_event: Option<CudaEvent>,
-    /// Host time of the step before it requested the map, in milliseconds.
-    pub host_ms: f64,
 }
 
 impl StepSlot {
-    /// If `is_timed` is set, the device measures the time of a step from the moment when OpenGL's buffers are mapped.
-    pub(super) fn new(device: &Device, kernels: &StepKernels, inputs: &StepInputs, is_timed: bool) -> Result<Self> {
+    /// Allocates the memory and captures the graphs.
+    pub(super) fn new(device: &Device, kernels: &StepKernels, inputs: &StepInputs) -> Result<Self> {
         let values = inputs.allocate_staging(device)?;
         let change_list = kernels.apply.as_ref().map(|apply| apply.allocate_list(device)).transpose()?;
         let mut bounds_keys = PinnedBuffer::zeroed(device, kernels.bounds.words(), PinnedUse::FromDevice)?;
@@ -61,27 +59,30 @@ impl StepSlot {
             .as_ref()
             .map(|change_list| capture(device, || submission.submit(device, Some(change_list))))
             .transpose()?;
-        let new_event = |flags| device.context().new_event(flags).map_err(cuda_error("allocate"));
-        let flags = is_timed.then_some(CUevent_flags::CU_EVENT_DEFAULT);
-        let (mapped_event, done) = (flags.map(|flags| new_event(Some(flags))).transpose()?, new_event(flags)?);
-        Ok(Self { full_graph, partial_graph, values, change_list, bounds_keys, done, mapped_event, host_ms: 0.0 })
+        let done = new_timed_event(device)?;
+        Ok(Self { full_graph, partial_graph, values, change_list, bounds_keys, done, mapped_event: None })
     }
 
-    /// Records on the stream that the outputs are mapped and the step may write them.
-    pub(super) fn record_mapped(&self, device: &Device) -> Result<()> {
-        match &self.mapped_event {
-            Some(mapped_event) => mapped_event.record(device.stream()).map_err(cuda_error("deform")),
-            None => Ok(()),
-        }
+    /// Records on the stream that OpenGL's buffers are mapped, which the step begins with.
+    pub(super) fn record_mapped(&mut self, device: &Device) -> Result<()> {
+        let event = match self.mapped_event.take() {
+            Some(event) => event,
+            None => new_timed_event(device)?,
+        };
+        event.record(device.stream()).map_err(cuda_error("deform"))?;
+        self.mapped_event = Some(event);
+        Ok(())
     }
 
-    /// Time of a step that has ended, in milliseconds, without the wait for frames in flight; `None` if steps are not
-    /// timed. It is the host's time before the map plus the device's time after the map. The host's work after the map
-    /// counts only as far as the device waits for it.
-    pub(super) fn device_ms(&self) -> Result<Option<f64>> {
-        let Some(mapped_event) = &self.mapped_event else { return Ok(None) };
-        let ms = mapped_event.elapsed_ms(&self.done).map_err(cuda_error("deform"))?;
-        Ok(Some(self.host_ms + f64::from(ms)))
+    /// Milliseconds from [`Self::record_mapped`] of the last step to the end of this step, which has ended. The host's
+    /// work in between counts only as far as the device waits for it.
+    ///
+    /// # Errors
+    /// `Fault` without [`Self::record_mapped`], or when the device fails.
+    pub(super) fn ms_since_mapped(&self) -> Result<f64> {
+        let missing_event = || Error::Fault { stage: "deform", reason: "expected a mapped step, got none".into() };
+        let mapped_event = self.mapped_event.as_ref().ok_or_else(missing_event)?;
+        mapped_event.elapsed_ms(&self.done).map(f64::from).map_err(cuda_error("deform"))
     }
 
     /// Starts the graph of a full or partial step on the device's stream. The caller has written the values.
@@ -100,6 +101,11 @@ impl StepSlot {
         let keys = self.bounds_keys.as_slice()?;
         Ok((bounds_from_keys(keys), oriented_bounds_from_keys(keys)))
     }
+}
+
+/// An event that records when it is reached.
+fn new_timed_event(device: &Device) -> Result<CudaEvent> {
+    device.context().new_event(Some(CUevent_flags::CU_EVENT_DEFAULT)).map_err(cuda_error("allocate"))
 }
 
 /// Whether a step computes all domains, or those of its change list.

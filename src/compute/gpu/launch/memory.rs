@@ -94,7 +94,7 @@ impl DeviceBuffer {
 ///
 /// # Safety
 /// `address` is that of at least as many bytes of device memory as `target` has.
-pub(crate) unsafe fn download<T: Pod>(device: &Device, address: u64, target: &mut [T]) -> Result<()> {
+unsafe fn download<T: Pod>(device: &Device, address: u64, target: &mut [T]) -> Result<()> {
     if target.is_empty() {
         return Ok(());
     }

@@ -28,6 +28,6 @@ pub use compile::{CAPABILITIES, CompiledVariant, assert_compiles};
 pub use device::Device;
 pub use kernel::{KernelDescriptor, KernelKind, LaunchOrder, launch_kernel};
 pub(crate) use kernel::{KernelSource, KernelText};
+pub(crate) use memory::PageLock;
 pub use memory::{DeviceBuffer, PinnedBuffer, PinnedUse};
-pub(crate) use memory::{PageLock, download};
 pub use probe::{DeviceInfo, Probe, probe};

@@ -147,7 +147,7 @@ fn plant_section(plants: &[PlantResult]) -> String {
         "thesis",
     ];
     let vertex_transfer =
-        if first_plant.shares_buffers { "vertices stay on the device" } else { "vertices are uploaded" };
+        if first_plant.fills_gl_buffers { "vertices stay on the device" } else { "vertices are uploaded" };
     let mut text = format!(
         "\n## The plants of table 4.5, deformed and drawn\n\nDeformed by {}, {vertex_transfer}; a variance shadow map of {}. \
          t_vbr: deforming, uploading and rendering; FPS: whole frames with readback of the pixels; s: device memory of \
@@ -174,7 +174,7 @@ fn plant_cells(plant: &PlantResult) -> [String; 14] {
         plant.triangles.to_string(),
         plant.domains.to_string(),
         format_ms(plant.deform.median_us),
-        if plant.shares_buffers { dash() } else { format_ms(plant.upload.median_us) },
+        if plant.fills_gl_buffers { dash() } else { format_ms(plant.upload.median_us) },
         format_ms(plant.render.median_us),
         format_ms(plant.vbr.median_us),
         thesis.gpu_vbr_ms.to_string(),

@@ -180,7 +180,7 @@ fn plants_csv(plants: &[PlantResult]) -> Result<Vec<u8>> {
             plant.thesis.name.into(),
             plant.is_full_size.to_string(),
             plant.backend.name().into(),
-            plant.shares_buffers.to_string(),
+            plant.fills_gl_buffers.to_string(),
         ];
         let sizes = [plant.triangles, plant.domains, plant.map_size as usize].map(|number| number.to_string());
         let times = [plant.deform, plant.upload, plant.render, plant.vbr, plant.frame].map(median_ms);

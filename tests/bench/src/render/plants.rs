@@ -21,7 +21,7 @@ use crate::thesis::{PLANTS, ThesisPlant};
 use crate::timing::{MIN_REPETITIONS, Timing};
 use crate::workloads::{Size as WorkloadSize, Workload, WorkloadKind};
 use modalcast_compute::cpu::CpuDeformer;
-use modalcast_compute::gpu::{self, BufferRole, CudaDeformer, CudaDeformerOptions, Device};
+use modalcast_compute::gpu::{CudaDeformer, CudaDeformerOptions, Device};
 use modalcast_model::deform::{Backend, DeformSummary, Deformer, VertexAttributes};
 use modalcast_model::error::{Result, fault};
 use modalcast_model::scene::{Camera, RenderSettings, Scene, SceneState, ShadowSettings};
@@ -38,9 +38,9 @@ pub struct PlantResult {
     /// How the plant differs from its row in table 4.5.
     pub remarks: Vec<String>,
     pub backend: Backend,
-    /// Whether the deformer writes the renderer's buffers, so that vertices do not pass through the host.
+    /// Whether the deformer fills the renderer's buffers, so that vertices do not pass through the host.
     #[serde(rename = "shared")]
-    pub shares_buffers: bool,
+    pub fills_gl_buffers: bool,
     pub triangles: usize,
     pub domains: usize,
     /// Side of the variance shadow map, texels.
@@ -48,7 +48,7 @@ pub struct PlantResult {
     pub map_size: u32,
     /// A step of the deformer.
     pub deform: Timing,
-    /// Upload of the vertices; 0 with shared buffers.
+    /// Upload of the vertices; 0 if the deformer fills the renderer's buffers.
     pub upload: Timing,
     /// Shadow and draw passes.
     pub render: Timing,
@@ -58,17 +58,17 @@ pub struct PlantResult {
     pub fps: f64,
     /// `O_vbr`: the fraction of the frame that is `t_vbr`.
     pub occupation: f64,
-    /// s: device memory of the renderer and the deformer, bytes; shared buffers count once.
+    /// s: device memory of the renderer and the deformer, bytes.
     pub bytes: u64,
 }
 
 /// Number of different states that the frames cycle through.
 const STATES: usize = 8;
 
-/// A plant's deformer and renderer buffers. The deformer is dropped first, because it may write the buffers.
+/// A plant's deformer and renderer buffers. The deformer is dropped first, because it may have registered the buffers.
 struct PlantSetup {
     deformer: Box<dyn Deformer>,
-    /// Device bytes of the deformer, without shared buffers.
+    /// Device bytes of the deformer.
     deformer_bytes: u64,
     buffers: SceneBuffers,
 }
@@ -89,7 +89,7 @@ pub(super) fn measure(
     let mut setup = create_setup(harness, device, &scene)?;
     let timings = time_frames(harness, &mut setup, &scene, options, &states)?;
     let PlantSetup { deformer, deformer_bytes, buffers } = setup;
-    let (backend, shares_buffers) = (deformer.backend(), deformer.shares_buffers());
+    let (backend, fills_gl_buffers) = (deformer.backend(), deformer.fills_gl_buffers());
     let bytes = deformer_bytes + buffers.plan().bytes();
     drop(deformer);
     harness.renderer.unload(buffers);
@@ -99,7 +99,7 @@ pub(super) fn measure(
         is_full_size: workload_size == WorkloadSize::Full,
         remarks: workload.remarks,
         backend,
-        shares_buffers,
+        fills_gl_buffers,
         triangles: scene.layout.triangles,
         domains: scene.domains.len(),
         map_size,
@@ -138,17 +138,7 @@ fn create_setup(harness: &mut RenderHarness, device: Option<&Arc<Device>>, scene
     let vertex_buffers = if is_same_device { Some(buffers.vertex_buffers()) } else { None };
     let deformer =
         CudaDeformer::new(device, scene, vertex_buffers, CudaDeformerOptions::with_bounding_axes(scene.light_axes()))?;
-    Ok(PlantSetup {
-        deformer_bytes: unshared_bytes(deformer.plan(), deformer.shares_buffers()),
-        deformer: Box::new(deformer),
-        buffers,
-    })
-}
-
-/// Device bytes of a deformer, without outputs that it shares with the renderer.
-fn unshared_bytes(plan: &gpu::DeformPlan, shares_buffers: bool) -> u64 {
-    let outputs = [BufferRole::Positions, BufferRole::Normals, BufferRole::Tangents].map(|role| plan.bytes(role));
-    plan.total_bytes() - if shares_buffers { outputs.iter().sum() } else { 0 }
+    Ok(PlantSetup { deformer_bytes: deformer.plan().total_bytes(), deformer: Box::new(deformer), buffers })
 }
 
 /// Times of one frame in microseconds, or their distributions over many frames.
@@ -209,7 +199,9 @@ fn time_frame(
     let deform = elapsed_us(frame_begin);
     let begin = Instant::now();
     let mut upload = 0.0;
-    if !setup.deformer.shares_buffers() {
+    if setup.deformer.fills_gl_buffers() {
+        setup.deformer.fill_gl_buffers()?;
+    } else {
         harness
             .renderer
             .upload(&setup.buffers, setup.deformer.surface_with(VertexAttributes::POSITIONS_AND_NORMALS)?)?;
@@ -240,7 +232,7 @@ mod tests {
         // Plant 1 is the conifer of table 4.5.
         let plant = measure(&mut harness, None, &options, 1).expect("a result");
         assert_eq!(
-            (plant.thesis.name, plant.is_full_size, plant.backend, plant.shares_buffers),
+            (plant.thesis.name, plant.is_full_size, plant.backend, plant.fills_gl_buffers),
             ("Conifer", false, Backend::Cpu, false)
         );
         assert!(plant.vbr.median_us > plant.deform.median_us && plant.render.median_us > 0.0);
@@ -249,14 +241,5 @@ mod tests {
         assert!((plant.occupation - plant.vbr.median_us / plant.frame.median_us).abs() < 1e-12);
         assert!((plant.fps * plant.frame.median_us - 1e6).abs() < 1.0);
         assert_eq!(plant.frame.replays, MIN_REPETITIONS);
-    }
-
-    #[test]
-    fn shared_output_buffers_count_once() {
-        let scene = WorkloadKind::Plant(0).build(WorkloadSize::Quick).expect("a workload").scene;
-        let plan = gpu::plan(&scene, CudaDeformerOptions::with_bounding_axes(scene.light_axes()));
-        // 12 bytes per position of a vertex and per normal of a corner; the plant has no tangents.
-        let output_bytes = 12 * (scene.layout.vertices + scene.layout.corners) as u64;
-        assert_eq!(unshared_bytes(&plan, false) - unshared_bytes(&plan, true), output_bytes);
     }
 }
