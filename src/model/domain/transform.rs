@@ -63,12 +63,12 @@ impl Transform {
 
     /// The linear part A.
     pub fn linear(self) -> Matrix3<f64> {
-        self.to_matrix().fixed_view::<3, 3>(0, 0).into_owned()
+        Matrix3::from_fn(|row, column| f64::from(self.0[4 * row + column]))
     }
 
     /// The last column, in scene units.
     pub fn translation(self) -> Vector3<f64> {
-        self.to_matrix().fixed_view::<3, 1>(0, 3).into_owned()
+        Vector3::from_fn(|row, _| f64::from(self.0[4 * row + 3]))
     }
 
     /// `a_from_c = a_from_b * b_from_c`, computed in f64 and rounded once.
@@ -85,9 +85,11 @@ impl Transform {
     /// entry. Rounding A to f32 causes deviations of about 1e-7 s^2. Normals of such a domain transform like directions.
     pub fn is_similarity(self) -> bool {
         let linear = self.linear();
-        let gram = linear.transpose() * linear;
-        let squared_scale = gram.trace() / 3.0;
-        (gram - Matrix3::identity() * squared_scale).abs().max() <= 1e-4 * squared_scale.max(f64::MIN_POSITIVE)
+        let [a, b, c] = [0, 1, 2].map(|column| linear.column(column).into_owned());
+        let squared_scale = (a.dot(&a) + b.dot(&b) + c.dot(&c)) / 3.0;
+        let limit = 1e-4 * squared_scale.max(f64::MIN_POSITIVE);
+        let has_equal_scales = [a, b, c].iter().all(|column| (column.dot(column) - squared_scale).abs() <= limit);
+        has_equal_scales && [a.dot(&b), a.dot(&c), b.dot(&c)].iter().all(|product| product.abs() <= limit)
     }
 }
 

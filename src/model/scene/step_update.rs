@@ -1,13 +1,19 @@
 //! One step: the values that a writer (the simulation that drives a scene) sends. It is validated once against its
-//! scene, so that later code can rely on it.
+//! scene, so that later code can rely on it. Large steps are validated on all cores.
 
 use std::collections::BTreeMap;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use rayon::prelude::*;
 
 use super::transform_format::{self, ParsedTransform};
 use super::transform_roots::check_transform_targets;
 use super::{Scene, TransformFormat};
 use crate::domain::Transform;
 use crate::error::{Error, Result, invalid};
+
+/// Number of transforms that one thread parses at least. Smaller steps are parsed on the calling thread.
+const MIN_TRANSFORMS_PER_THREAD: usize = 4096;
 
 /// A step as received, not yet validated.
 #[derive(Debug, Clone, Default)]
@@ -175,17 +181,32 @@ fn parse_transforms(scene: &Scene, raw: &RawStepUpdate) -> Result<ParsedTransfor
         return Err(invalid("step.transforms", expected, format!("{} bytes", raw.transforms.len())));
     }
     let origin = scene.origin.map(|meters| meters / scene.unit);
-    let (mut transforms, mut translations) = (Vec::with_capacity(domains.len()), Vec::new());
-    for (index, (domain, bytes)) in domains.into_iter().zip(raw.transforms.chunks_exact(transform_bytes)).enumerate() {
-        let parsed = match raw.transform_format {
-            TransformFormat::Affine => parse_affine(scene, bytes),
-            TransformFormat::RigidF32 => transform_format::parse_rigid_f32(bytes),
-            TransformFormat::RigidF64 => transform_format::parse_rigid_f64(bytes, origin),
-        };
-        let (transform, translation) =
-            parsed.map_err(|error| error.in_message(&format!("step.transforms[{index}]")))?;
-        transforms.push((domain, transform));
-        translations.extend(translation.map(|translation| (domain, translation)));
+    let parse = |bytes: &[u8]| match raw.transform_format {
+        TransformFormat::Affine => parse_affine(scene, bytes),
+        TransformFormat::RigidF32 => transform_format::parse_rigid_f32(bytes),
+        TransformFormat::RigidF64 => transform_format::parse_rigid_f64(bytes, origin),
+    };
+    let encoded_transforms = raw.transforms.par_chunks_exact(transform_bytes).with_min_len(MIN_TRANSFORMS_PER_THREAD);
+    let first_invalid = AtomicUsize::new(usize::MAX);
+    let parse_or_note = |(index, (domain, bytes)): (usize, (&u32, &[u8]))| {
+        let (transform, translation) = parse(bytes).unwrap_or_else(|_| {
+            first_invalid.fetch_min(index, Ordering::Relaxed);
+            (Transform::IDENTITY, None)
+        });
+        ((*domain, transform), translation.map(|translation| (*domain, translation)))
+    };
+    let parsed = encoded_transforms.zip(&domains).map(|(bytes, domain)| (domain, bytes)).enumerate().map(parse_or_note);
+    let (transforms, translations) = match raw.transform_format {
+        TransformFormat::RigidF64 => {
+            let (transforms, translations): (Vec<_>, Vec<_>) = parsed.unzip();
+            (transforms, translations.into_iter().flatten().collect())
+        }
+        _ => (parsed.map(|(transform, _)| transform).collect(), vec![]),
+    };
+    // Parsing the first invalid transform again gives its error.
+    let first_invalid = first_invalid.into_inner();
+    if let Some(bytes) = raw.transforms.chunks_exact(transform_bytes).nth(first_invalid) {
+        parse(bytes).map_err(|error| error.in_message(&format!("step.transforms[{first_invalid}]")))?;
     }
     Ok((transforms, translations))
 }

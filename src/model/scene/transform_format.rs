@@ -1,6 +1,6 @@
 //! Parsers of received transforms: affine matrices, or a quaternion and a translation in f32 or f64.
 
-use nalgebra::{Matrix3, Quaternion, UnitQuaternion, Vector3};
+use nalgebra::{Matrix3, Vector3};
 
 use crate::domain::Transform;
 use crate::error::{Result, invalid};
@@ -70,22 +70,41 @@ pub(super) fn parse_rigid_f64(bytes: &[u8], origin: [f64; 3]) -> Result<ParsedTr
     Ok((Transform::from_parts(&linear, &Vector3::from(relative)), Some(relative)))
 }
 
-fn rotation_matrix([x, y, z, w]: [f32; 4]) -> Result<Matrix3<f64>> {
-    check_finite("rotation", &[x, y, z, w].map(f64::from))?;
-    let quaternion = Quaternion::new(w, x, y, z).cast::<f64>();
-    let norm = quaternion.norm();
-    if (norm - 1.0).abs() > NORM_TOLERANCE {
-        let expected = format!("a quaternion x y z w of norm 1 within {NORM_TOLERANCE}");
-        return Err(invalid("rotation", expected, format!("norm {norm}")));
+/// The matrix of a quaternion that is normalized in f64.
+fn rotation_matrix(quaternion: [f32; 4]) -> Result<Matrix3<f64>> {
+    let [x, y, z, w] = quaternion.map(f64::from);
+    let squared_norm = x * x + y * y + z * z + w * w;
+    let norm = squared_norm.sqrt();
+    if (norm - 1.0).abs() <= NORM_TOLERANCE {
+        // Equal to normalizing the quaternion first, without the square root and four divisions.
+        let scale = 2.0 / squared_norm;
+        let (sx, sy, sz) = (scale * x, scale * y, scale * z);
+        let (xx, xy, xz, wx) = (sx * x, sx * y, sx * z, sx * w);
+        let (yy, yz, wy) = (sy * y, sy * z, sy * w);
+        let (zz, wz) = (sz * z, sz * w);
+        return Ok(Matrix3::new(
+            1.0 - (yy + zz),
+            xy - wz,
+            xz + wy,
+            xy + wz,
+            1.0 - (xx + zz),
+            yz - wx,
+            xz - wy,
+            yz + wx,
+            1.0 - (xx + yy),
+        ));
     }
-    Ok(UnitQuaternion::from_quaternion(quaternion).to_rotation_matrix().into_inner())
+    check_finite("rotation", &[x, y, z, w])?;
+    let expected = format!("a quaternion x y z w of norm 1 within {NORM_TOLERANCE}");
+    Err(invalid("rotation", expected, format!("norm {norm}")))
 }
 
 fn check_finite(field: &str, list: &[f64]) -> Result<()> {
-    match list.iter().position(|number| !number.is_finite()) {
-        None => Ok(()),
-        Some(index) => Err(invalid(format!("{field}[{index}]"), "a finite number", list[index])),
+    if list.iter().all(|number| number.is_finite()) {
+        return Ok(());
     }
+    let index = list.iter().position(|number| !number.is_finite()).unwrap_or(0);
+    Err(invalid(format!("{field}[{index}]"), "a finite number", list[index]))
 }
 
 fn decode_f32_array<const N: usize>(bytes: &[u8]) -> [f32; N] {
@@ -103,6 +122,8 @@ fn decode_array<T, const N: usize, const S: usize>(bytes: &[u8], read: fn([u8; S
 
 #[cfg(test)]
 mod tests {
+    use nalgebra::UnitQuaternion;
+
     use super::*;
 
     /// Encodes a transform with an offset of one byte, so that no number is aligned.
