@@ -3,9 +3,13 @@
 //! vertices, and `parent_from_child` at rest.
 
 use nalgebra::Vector3;
+use rayon::prelude::*;
 
 use crate::affine::{AffineTransform, fit_rigid_transform};
 use crate::model::{DomainModel, Joint, Model};
+
+/// Minimum number of domains that one thread processes.
+pub const MIN_DOMAINS_PER_THREAD: usize = 64;
 
 /// Computes `world_from_domain` of every domain at the coordinates `q` of the scene. `local_transforms` has an optional
 /// motion of each domain within its own frame, for example the rotation of a leaf about its stalk. The list may be
@@ -15,14 +19,29 @@ pub fn compute_transforms(
     q: &[f64],
     local_transforms: &[Option<AffineTransform>],
 ) -> Vec<AffineTransform> {
+    compose_transforms(model, &deformed_attachments(model, q), local_transforms)
+}
+
+/// `parent_from_child` of every domain at q. For a domain without a parent this is its placement in the world.
+pub fn deformed_attachments(model: &Model, q: &[f64]) -> Vec<AffineTransform> {
+    let attachment = |domain: &DomainModel| match &domain.joint {
+        None => domain.placement,
+        Some(joint) => deformed_attachment(&model.domains[joint.parent], joint, q),
+    };
+    model.domains.par_iter().with_min_len(MIN_DOMAINS_PER_THREAD).map(attachment).collect()
+}
+
+/// [`compute_transforms`] from the result of [`deformed_attachments`].
+pub fn compose_transforms(
+    model: &Model,
+    attachments: &[AffineTransform],
+    local_transforms: &[Option<AffineTransform>],
+) -> Vec<AffineTransform> {
     let mut world_from_domain: Vec<AffineTransform> = Vec::with_capacity(model.domains.len());
-    for (index, domain) in model.domains.iter().enumerate() {
+    for (index, (domain, attachment)) in model.domains.iter().zip(attachments).enumerate() {
         let world_from_attached = match &domain.joint {
-            None => domain.placement,
-            Some(joint) => {
-                let parent_from_child = deformed_attachment(&model.domains[joint.parent], joint, q);
-                world_from_domain[joint.parent].compose(&parent_from_child)
-            }
+            None => *attachment,
+            Some(joint) => world_from_domain[joint.parent].compose(attachment),
         };
         let local_transform = local_transforms.get(index).and_then(Option::as_ref);
         world_from_domain.push(local_transform.map_or(world_from_attached, |local| world_from_attached.compose(local)));
@@ -88,7 +107,8 @@ fn joint_distances(model: &Model, q: &[f64], world_from_domain: &[AffineTransfor
         };
         joint.attachment_samples.iter().map(distance).collect()
     };
-    model.domains.iter().zip(world_from_domain).map(domain_distances).collect()
+    let domains = model.domains.par_iter().with_min_len(MIN_DOMAINS_PER_THREAD);
+    domains.zip(world_from_domain).map(domain_distances).collect()
 }
 
 #[cfg(test)]

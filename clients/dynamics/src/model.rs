@@ -7,9 +7,11 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use modalcast_client::{Client, Domain, DomainArray, ModeRows, SceneDescription};
 use nalgebra::Vector3;
+use rayon::prelude::*;
 
 use crate::affine::AffineTransform;
 use crate::error::{Result, invalid_input};
+use crate::hierarchy::MIN_DOMAINS_PER_THREAD;
 
 /// Maximum number of entries of U in the surface samples of all domains together: 64 MiB of f64.
 const MAX_MODE_ENTRIES: usize = 8 << 20;
@@ -250,7 +252,8 @@ impl Model {
             let origin_displacement = (transform.translation - domain.placement.translation).norm();
             domain.surface_samples().iter().map(sample_displacement).fold(origin_displacement, f64::max)
         };
-        self.domains.iter().zip(world_from_domain).map(domain_displacement).fold(0.0, f64::max)
+        let domains = self.domains.par_iter().with_min_len(MIN_DOMAINS_PER_THREAD);
+        domains.zip(world_from_domain).map(domain_displacement).reduce(|| 0.0, f64::max)
     }
 }
 

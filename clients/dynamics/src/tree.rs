@@ -9,11 +9,14 @@
 //! its diagonal, because linear modes do not represent large bending.
 
 use nalgebra::Vector3;
+use rayon::prelude::*;
 use serde_json::json;
 
 use crate::affine::AffineTransform;
 use crate::error::{Result, invalid_input};
-use crate::hierarchy::{JointGapMeter, compute_transforms};
+use crate::hierarchy::{
+    JointGapMeter, MIN_DOMAINS_PER_THREAD, compose_transforms, compute_transforms, deformed_attachments,
+};
 use crate::model::{DomainModel, Model};
 use crate::oscillator::{ModeState, Oscillator};
 use crate::run::{Report, Scenario, StepValues};
@@ -91,10 +94,8 @@ pub struct TreeScenario {
     loads: Vec<WindLoad>,
     /// Per domain: factor from the response at unit strength to the coordinates.
     gains: Vec<f64>,
-    /// Per coordinate: state at step `next_step`, at unit strength.
-    states: Vec<ModeState>,
-    /// Per coordinate: force at step `next_step`, at unit strength.
-    forces: Vec<f64>,
+    /// The response at step `next_step`.
+    response: Response,
     /// The step that the next call of `compute_next_step` computes.
     next_step: u64,
     /// The highest sample of each domain that reaches into the crown.
@@ -102,12 +103,63 @@ pub struct TreeScenario {
     gap_meter: JointGapMeter,
     /// Sway that the calibration predicts, as a fraction of the height.
     calibrated_sway: f64,
-    /// Largest sway so far, as a fraction of the height.
-    peak_sway: f64,
-    /// Largest displacement so far, in scene units.
-    peak_displacement: f64,
-    /// Largest opening of a joint so far, in scene units.
-    max_gap: f64,
+    /// Peaks of all steps but the last one.
+    earlier_peaks: Peaks,
+    /// The last step, which is measured while the next one is computed.
+    last_step: Option<SentStep>,
+}
+
+/// The wind and the response to it at one time, at unit strength.
+struct Response {
+    /// Per coordinate.
+    states: Vec<ModeState>,
+    /// Per coordinate.
+    forces: Vec<f64>,
+    /// Per domain.
+    pressures: Vec<WindPressure>,
+}
+
+/// Coordinates and transforms of a step, as the server receives them: rounded to f32.
+struct SentStep {
+    q: Vec<f64>,
+    world_from_domain: Vec<AffineTransform>,
+}
+
+/// Largest values of a run or of one step.
+#[derive(Debug, Clone, Copy, Default)]
+struct Peaks {
+    /// Sway of the crown, as a fraction of the height.
+    sway: f64,
+    /// Displacement of a domain's origin or of a surface sample, in scene units.
+    displacement: f64,
+    /// Opening of a joint, in scene units.
+    gap: f64,
+}
+
+impl Peaks {
+    const fn max(self, other: Self) -> Self {
+        Self {
+            sway: self.sway.max(other.sway),
+            displacement: self.displacement.max(other.displacement),
+            gap: self.gap.max(other.gap),
+        }
+    }
+}
+
+impl Response {
+    /// The rest state without wind, at step 0.
+    fn at_rest(model: &Model) -> Self {
+        Self {
+            states: vec![ModeState::default(); model.coordinate_count],
+            forces: vec![0.0; model.coordinate_count],
+            pressures: vec![WindPressure::default(); model.domains.len()],
+        }
+    }
+
+    /// Per coordinate.
+    fn q(&self) -> Vec<f64> {
+        self.states.iter().map(|state| state.q).collect()
+    }
 }
 
 /// The response to the wind at unit strength, recorded by the calibration run.
@@ -144,15 +196,13 @@ impl TreeScenario {
             oscillators: create_oscillators(&model, options.dt)?,
             loads: model.domains.iter().map(|domain| compute_wind_load(&model, domain, &wind)).collect(),
             gains: vec![1.0; model.domains.len()],
-            states: vec![ModeState::default(); model.coordinate_count],
-            forces: vec![0.0; model.coordinate_count],
+            response: Response::at_rest(&model),
             next_step: 0,
             crown_samples: select_crown(&model),
             gap_meter: JointGapMeter::new(&model),
             calibrated_sway: 0.0,
-            peak_sway: 0.0,
-            peak_displacement: 0.0,
-            max_gap: 0.0,
+            earlier_peaks: Peaks::default(),
+            last_step: None,
             model,
         };
         let response = tree.record_unit_response();
@@ -163,23 +213,33 @@ impl TreeScenario {
 
     /// Advances every mode by one step at unit strength.
     fn advance(&mut self) {
-        let next_forces = self.compute_forces(self.options.dt * (self.next_step + 1) as f64);
-        for (coordinate, state) in self.states.iter_mut().enumerate() {
-            *state = self.oscillators[coordinate].advance(*state, self.forces[coordinate], next_forces[coordinate]);
-        }
-        self.forces = next_forces;
+        self.response = self.next_response();
         self.next_step += 1;
     }
 
-    /// Computes the generalized forces at a time in seconds. A child has a larger index than its parent. In reverse
-    /// order, the forces of all descendants of a domain are therefore complete before its own joint needs them.
-    fn compute_forces(&self, time: f64) -> Vec<f64> {
+    /// The response one step after `next_step`.
+    fn next_response(&self) -> Response {
+        let time = self.options.dt * (self.next_step + 1) as f64;
+        let pressure = |(index, load): (usize, &WindLoad)| self.wind.pressure(time, index, load.downwind_position);
+        let loads = self.loads.par_iter().with_min_len(MIN_DOMAINS_PER_THREAD);
+        let pressures: Vec<WindPressure> = loads.enumerate().map(pressure).collect();
+        let forces = self.compute_forces(&pressures);
+        let Response { states, forces: last_forces, .. } = &self.response;
+        let advance = |(coordinate, state): (usize, &ModeState)| {
+            self.oscillators[coordinate].advance(*state, last_forces[coordinate], forces[coordinate])
+        };
+        Response { states: states.iter().enumerate().map(advance).collect(), forces, pressures }
+    }
+
+    /// Computes the generalized forces of the wind. A child has a larger index than its parent. In reverse order, the
+    /// forces of all descendants of a domain are therefore complete before its own joint needs them.
+    fn compute_forces(&self, pressures: &[WindPressure]) -> Vec<f64> {
         let mut forces = vec![0.0; self.model.coordinate_count];
         // Per domain: the force on it and its descendants, in world axes.
         let mut subtree_forces = vec![Vector3::zeros(); self.model.domains.len()];
         for (index, domain) in self.model.domains.iter().enumerate().rev() {
             let load = &self.loads[index];
-            let WindPressure { downwind, crosswind } = self.wind.pressure(time, index, load.downwind_position);
+            let WindPressure { downwind, crosswind } = pressures[index];
             for mode in 0..domain.rank {
                 forces[domain.first_coordinate + mode] +=
                     downwind * load.downwind[mode] + crosswind * load.crosswind[mode];
@@ -221,7 +281,7 @@ impl TreeScenario {
         let mut recorded_states = vec![];
         for step in 0..step_count {
             self.advance();
-            let q: Vec<f64> = self.states.iter().map(|state| state.q).collect();
+            let q = self.response.q();
             let domains = &self.model.domains;
             let displacements: Vec<f64> =
                 domains.iter().map(|domain| elastic_displacement(domain, domain.q(&q))).collect();
@@ -237,8 +297,7 @@ impl TreeScenario {
         // Largest trunk displacement first.
         recorded_states.sort_by(|(a_displacement, _), (b_displacement, _)| b_displacement.total_cmp(a_displacement));
         recorded_states.truncate(CALIBRATION_STATES);
-        self.states.fill(ModeState::default());
-        self.forces.fill(0.0);
+        self.response = Response::at_rest(&self.model);
         self.next_step = 0;
         UnitResponse { bending, coordinates: recorded_states.into_iter().map(|(_, q)| q).collect() }
     }
@@ -319,8 +378,25 @@ impl TreeScenario {
         displacement_sum.norm() / (self.crown_samples.len().max(1) as f64 * self.model.height())
     }
 
-    /// Small rotations of rigid leaves about their bases, at a time in seconds. `None` for the other domains.
-    fn leaf_rotations(&self, time: f64) -> Vec<Option<AffineTransform>> {
+    /// The largest values of a step.
+    fn measure(&self, step: &SentStep) -> Peaks {
+        let SentStep { q, world_from_domain } = step;
+        Peaks {
+            sway: self.crown_sway(q, world_from_domain),
+            displacement: self.model.max_displacement(q, world_from_domain),
+            gap: self.gap_meter.max_gap(&self.model, q, world_from_domain),
+        }
+    }
+
+    /// The largest values of all steps.
+    fn peaks(&self) -> Peaks {
+        let last_peaks = self.last_step.as_ref().map(|step| self.measure(step));
+        last_peaks.map_or(self.earlier_peaks, |last_peaks| self.earlier_peaks.max(last_peaks))
+    }
+
+    /// Small rotations of rigid leaves about their bases at step `next_step`. `None` for the other domains.
+    fn leaf_rotations(&self) -> Vec<Option<AffineTransform>> {
+        let time = self.options.dt * self.next_step as f64;
         let mut has_children = vec![false; self.model.domains.len()];
         for joint in self.model.domains.iter().filter_map(|domain| domain.joint.as_ref()) {
             has_children[joint.parent] = true;
@@ -330,7 +406,7 @@ impl TreeScenario {
         let leaf_rotation = |(index, domain): (usize, &DomainModel)| {
             let is_leaf = domain.rank == 0 && domain.joint.is_some() && !has_children[index];
             (is_leaf && max_angle > 0.0).then(|| {
-                let pressure = self.wind.pressure(time, index, self.loads[index].downwind_position).downwind;
+                let pressure = self.response.pressures[index].downwind;
                 let turbulence = self.wind.turbulence(time, index, CROSSWIND_CHANNEL);
                 let axis = domain.placement.linear.transpose() * self.wind.crosswind;
                 let angle = max_angle * (0.5 * pressure + 0.5 * pressure.abs() * turbulence);
@@ -347,22 +423,23 @@ impl Scenario for TreeScenario {
     }
 
     fn compute_next_step(&mut self, values: &mut StepValues) -> Result<()> {
-        let unit_q: Vec<f64> = self.states.iter().map(|state| state.q).collect();
-        let q = self.scale_response(&unit_q, &self.gains);
-        let leaf_rotations = self.leaf_rotations(self.options.dt * self.next_step as f64);
-        let world_from_domain = compute_transforms(&self.model, &q, &leaf_rotations);
+        let q = self.scale_response(&self.response.q(), &self.gains);
+        // These depend only on the response of this step and on the last step, so they run concurrently.
+        let compute_attachments = || deformed_attachments(&self.model, &q);
+        let measure_last_step = || self.peaks();
+        let ((attachments, earlier_peaks), (leaf_rotations, next_response)) = rayon::join(
+            || rayon::join(compute_attachments, measure_last_step),
+            || rayon::join(|| self.leaf_rotations(), || self.next_response()),
+        );
+        let world_from_domain = compose_transforms(&self.model, &attachments, &leaf_rotations);
         if let Some(coordinate) = q.iter().find(|coordinate| !coordinate.is_finite()) {
             return Err(invalid_input("q", "finite coordinates", coordinate));
         }
         values.q = q.iter().map(|coordinate| *coordinate as f32).collect();
         values.transforms = world_from_domain.iter().map(|transform| transform.to_row_major()).collect();
-        // The report refers to the transforms that the server receives, which are rounded to f32.
-        let sent_transforms: Vec<AffineTransform> =
-            values.transforms.iter().map(AffineTransform::from_row_major).collect();
-        self.peak_sway = self.peak_sway.max(self.crown_sway(&q, &sent_transforms));
-        self.peak_displacement = self.peak_displacement.max(self.model.max_displacement(&q, &sent_transforms));
-        self.max_gap = self.max_gap.max(self.gap_meter.max_gap(&self.model, &q, &sent_transforms));
-        self.advance();
+        let world_from_domain = values.transforms.iter().map(AffineTransform::from_row_major).collect();
+        (self.earlier_peaks, self.last_step) = (earlier_peaks, Some(SentStep { q, world_from_domain }));
+        (self.response, self.next_step) = (next_response, self.next_step + 1);
         Ok(())
     }
 
@@ -374,13 +451,14 @@ impl Scenario for TreeScenario {
             self.calibrated_sway,
             self.scale_bending_limit(MAX_BRANCH_BENDING),
         );
+        let peaks = self.peaks();
         Report::from_iter([
             ("load".to_owned(), json!(load_description)),
-            ("crown_sway_of_height".to_owned(), json!(self.peak_sway)),
-            ("peak_of_height".to_owned(), json!(self.peak_displacement / self.model.height())),
-            ("peak_of_diagonal".to_owned(), json!(self.peak_displacement / self.model.diagonal())),
-            ("joint_gap_max".to_owned(), json!(self.max_gap)),
-            ("joint_gap_of_diagonal".to_owned(), json!(self.max_gap / self.model.diagonal())),
+            ("crown_sway_of_height".to_owned(), json!(peaks.sway)),
+            ("peak_of_height".to_owned(), json!(peaks.displacement / self.model.height())),
+            ("peak_of_diagonal".to_owned(), json!(peaks.displacement / self.model.diagonal())),
+            ("joint_gap_max".to_owned(), json!(peaks.gap)),
+            ("joint_gap_of_diagonal".to_owned(), json!(peaks.gap / self.model.diagonal())),
         ])
     }
 }
@@ -473,8 +551,9 @@ mod tests {
         for (dt, steps) in [(1.0 / 60.0, 60), (1.0 / 60.0, 600), (1.0 / 30.0, 90), (0.5, 40)] {
             let (tree, values) = run_tree(TreeOptions { dt, steps: Some(steps), ..OPTIONS });
             // The calibration aims at 0.05. It evaluates only some of the states, so the sway of the run can differ.
-            assert!((0.03..=0.08).contains(&tree.peak_sway), "dt {dt}, {steps} steps: {}", tree.peak_sway);
-            assert!(tree.max_gap <= 1e-3 * tree.model.diagonal(), "{}", tree.max_gap);
+            let peaks = tree.peaks();
+            assert!((0.03..=0.08).contains(&peaks.sway), "dt {dt}, {steps} steps: {peaks:?}");
+            assert!(peaks.gap <= 1e-3 * tree.model.diagonal(), "{peaks:?}");
             assert!(values[0].q.iter().all(|coordinate| *coordinate == 0.0));
             assert_eq!(values[9].transforms.len(), 4);
         }
@@ -483,9 +562,9 @@ mod tests {
     #[test]
     fn sway_increases_with_the_wind() {
         let (calm_tree, _) = run_tree(TreeOptions { wind_strength: 0.0, ..OPTIONS });
-        assert!(calm_tree.peak_displacement <= 1e-6, "{}", calm_tree.peak_displacement);
-        let half_sway = run_tree(TreeOptions { wind_strength: 0.5, ..OPTIONS }).0.peak_sway;
-        let full_sway = run_tree(OPTIONS).0.peak_sway;
+        assert!(calm_tree.peaks().displacement <= 1e-6, "{:?}", calm_tree.peaks());
+        let half_sway = run_tree(TreeOptions { wind_strength: 0.5, ..OPTIONS }).0.peaks().sway;
+        let full_sway = run_tree(OPTIONS).0.peaks().sway;
         assert!(half_sway < 0.7 * full_sway && half_sway > 0.01, "half {half_sway}, full {full_sway}");
     }
 
@@ -503,8 +582,9 @@ mod tests {
             for _ in 0..400 {
                 tree.compute_next_step(&mut values).expect("finite coordinates");
             }
-            let is_bounded = tree.peak_displacement <= 0.5 * tree.model.diagonal();
-            assert!(is_bounded && tree.peak_sway > 0.0, "dt {dt}: {}", tree.peak_displacement);
+            let peaks = tree.peaks();
+            let is_bounded = peaks.displacement <= 0.5 * tree.model.diagonal();
+            assert!(is_bounded && peaks.sway > 0.0, "dt {dt}: {peaks:?}");
         }
     }
 

@@ -50,7 +50,7 @@ pub struct Wind {
 }
 
 /// Components of the dimensionless pressure along the two horizontal directions of a wind.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct WindPressure {
     pub downwind: f64,
     pub crosswind: f64,
