@@ -3237,6 +3237,580 @@ pub mod vertex_service_server {
         const NAME: &'static str = SERVICE_NAME;
     }
 }
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct GetStateRequest {
+    #[prost(string, tag = "1")]
+    pub scene: ::prost::alloc::string::String,
+    /// The step to return. Unset: the current step, or the rest state before the first step.
+    #[prost(message, optional, tag = "2")]
+    pub step: ::core::option::Option<StepSelector>,
+    /// Deadline in milliseconds for the whole reply, at most 600000; 0: Limits.deadline_ms. If the call also has a
+    /// grpc-timeout, the shorter one applies.
+    #[prost(uint32, tag = "3")]
+    pub deadline_ms: u32,
+}
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct GetStateResponse {
+    #[prost(message, optional, tag = "1")]
+    pub chunk: ::core::option::Option<StateChunk>,
+}
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct StreamStatesRequest {
+    #[prost(string, tag = "1")]
+    pub scene: ::prost::alloc::string::String,
+    /// DELIVERY_LOSSLESS: every step from the next one on. If the writer is lossless too, a slow subscriber blocks it, and
+    /// is disconnected with REASON_SLOW_READER when it has blocked the writer for 30 s. If the writer sends only latest
+    /// steps, a slow subscriber skips steps. DELIVERY_LATEST: the newest step, beginning with the current one if the scene
+    /// has had a step.
+    #[prost(enumeration = "Delivery", tag = "2")]
+    pub delivery: i32,
+    /// The largest number of states per second, 0.001 to 1000; 0: no limit. Must be 0 with DELIVERY_LOSSLESS.
+    #[prost(double, tag = "3")]
+    pub max_hz: f64,
+    /// Number of states after which the stream ends; 0: no limit.
+    #[prost(uint64, tag = "4")]
+    pub steps: u64,
+}
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct StreamStatesResponse {
+    #[prost(oneof = "stream_states_response::Part", tags = "1, 2")]
+    pub part: ::core::option::Option<stream_states_response::Part>,
+}
+/// Nested message and enum types in `StreamStatesResponse`.
+pub mod stream_states_response {
+    #[derive(Clone, PartialEq, ::prost::Oneof)]
+    pub enum Part {
+        /// The first message of the stream, and only that one.
+        #[prost(message, tag = "1")]
+        Settings(super::StateSettings),
+        #[prost(message, tag = "2")]
+        Chunk(super::StateChunk),
+    }
+}
+/// The settings in effect of a stream of states, as in the request.
+#[derive(Clone, Copy, PartialEq, ::prost::Message)]
+pub struct StateSettings {
+    #[prost(enumeration = "Delivery", tag = "1")]
+    pub delivery: i32,
+    #[prost(double, tag = "2")]
+    pub max_hz: f64,
+    #[prost(uint64, tag = "3")]
+    pub steps: u64,
+}
+/// A part of a state, in the order of the offsets.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct StateChunk {
+    /// Set on the first chunk of a state only.
+    #[prost(message, optional, tag = "1")]
+    pub head: ::core::option::Option<StateHead>,
+    /// Offset of `data` in the bytes of the state.
+    #[prost(uint64, tag = "2")]
+    pub offset: u64,
+    /// At most 1 MiB. A state without sections is one chunk with a head and no data.
+    #[prost(bytes = "bytes", tag = "3")]
+    pub data: ::prost::bytes::Bytes,
+}
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct StateHead {
+    /// The step of the state.
+    #[prost(message, optional, tag = "1")]
+    pub step: ::core::option::Option<StepId>,
+    /// Steps skipped since the previous state of this stream.
+    #[prost(uint64, tag = "2")]
+    pub skipped: u64,
+    /// Whether the state has every domain. If not, the values of the domains that it does not have are those of the
+    /// previous state of this stream.
+    #[prost(bool, tag = "3")]
+    pub complete: bool,
+    /// What the bytes of the state contain, in the order of their offsets and without gaps. Empty sections are left out.
+    #[prost(message, repeated, tag = "4")]
+    pub sections: ::prost::alloc::vec::Vec<StateSection>,
+    /// Size of all sections in bytes.
+    #[prost(uint64, tag = "5")]
+    pub total: u64,
+    #[prost(message, repeated, tag = "6")]
+    pub stages: ::prost::alloc::vec::Vec<StageTime>,
+}
+#[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct StateSection {
+    #[prost(enumeration = "StateContent", tag = "1")]
+    pub content: i32,
+    /// Offset and size in the bytes of the state.
+    #[prost(uint64, tag = "2")]
+    pub offset: u64,
+    #[prost(uint64, tag = "3")]
+    pub bytes: u64,
+}
+/// The content of a section. All numbers are little-endian. A client ignores sections with contents that it does not
+/// know.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
+#[repr(i32)]
+pub enum StateContent {
+    Unspecified = 0,
+    /// u32: indices of the domains with coordinates in STATE_CONTENT_Q, ascending.
+    QDomains = 1,
+    /// f32: q of each of these domains, r numbers each (DomainDescription.rank), concatenated.
+    Q = 2,
+    /// u32: indices of the domains with transforms in STATE_CONTENT_TRANSFORMS, ascending.
+    TransformDomains = 3,
+    /// 12 f32 for each of these domains: world_from_domain, row-major 3x4, in scene units relative to the origin of the
+    /// domain (STATE_CONTENT_ORIGINS).
+    Transforms = 4,
+    /// 3 f64 in meters: the world position of the origin of all transforms. If the origins differ, 3 f64 for each domain
+    /// of the scene that follows no other one, in the order of the domains; a follower has the origin of the domain that
+    /// it follows. A vertex is at origin + SceneInfo.unit * T (x0 + U q). The origin is SceneInfo.origin until a step with
+    /// f64 translations moves domains far from there; then it follows the domains. Sent in the first state and whenever an
+    /// origin has changed.
+    Origins = 5,
+}
+impl StateContent {
+    /// String value of the enum field names used in the ProtoBuf definition.
+    ///
+    /// The values are not transformed in any way and thus are considered stable
+    /// (if the ProtoBuf definition does not change) and safe for programmatic use.
+    pub fn as_str_name(&self) -> &'static str {
+        match self {
+            Self::Unspecified => "STATE_CONTENT_UNSPECIFIED",
+            Self::QDomains => "STATE_CONTENT_Q_DOMAINS",
+            Self::Q => "STATE_CONTENT_Q",
+            Self::TransformDomains => "STATE_CONTENT_TRANSFORM_DOMAINS",
+            Self::Transforms => "STATE_CONTENT_TRANSFORMS",
+            Self::Origins => "STATE_CONTENT_ORIGINS",
+        }
+    }
+    /// Creates an enum from field names used in the ProtoBuf definition.
+    pub fn from_str_name(value: &str) -> ::core::option::Option<Self> {
+        match value {
+            "STATE_CONTENT_UNSPECIFIED" => Some(Self::Unspecified),
+            "STATE_CONTENT_Q_DOMAINS" => Some(Self::QDomains),
+            "STATE_CONTENT_Q" => Some(Self::Q),
+            "STATE_CONTENT_TRANSFORM_DOMAINS" => Some(Self::TransformDomains),
+            "STATE_CONTENT_TRANSFORMS" => Some(Self::Transforms),
+            "STATE_CONTENT_ORIGINS" => Some(Self::Origins),
+            _ => None,
+        }
+    }
+}
+/// Generated client implementations.
+pub mod state_service_client {
+    #![allow(
+        unused_variables,
+        dead_code,
+        missing_docs,
+        clippy::wildcard_imports,
+        clippy::let_unit_value,
+    )]
+    use tonic::codegen::*;
+    use tonic::codegen::http::Uri;
+    /// The state of a scene at a step: the coordinates q and the transforms T of its domains. A client that has x0 and U
+    /// (DescribeScene, ReadModes) computes the vertices x = T (x0 + U q) by itself. A state has a few numbers per domain, so
+    /// it is much smaller than the vertices of the step.
+    ///
+    /// A state has the vocabulary of Step, so that recorded states can be sent as steps again: while the origin of the
+    /// transforms is SceneInfo.origin, the sections of a state are the fields q_domains, q, transform_domains and transforms
+    /// of a Step with TRANSFORM_FORMAT_AFFINE_F32.
+    ///
+    /// * Domains that share their coordinates (DomainDescription.shares_q_with) are not listed with q: they have the q of
+    ///  the domain that they name, which may itself share them.
+    /// * Domains that follow another one (DomainDescription.follows) are not listed with transforms: their transform is that
+    ///  of the domain that they follow, times their follow_frame.
+    #[derive(Debug, Clone)]
+    pub struct StateServiceClient<T> {
+        inner: tonic::client::Grpc<T>,
+    }
+    impl StateServiceClient<tonic::transport::Channel> {
+        /// Attempt to create a new client by connecting to a given endpoint.
+        pub async fn connect<D>(dst: D) -> Result<Self, tonic::transport::Error>
+        where
+            D: TryInto<tonic::transport::Endpoint>,
+            D::Error: Into<StdError>,
+        {
+            let conn = tonic::transport::Endpoint::new(dst)?.connect().await?;
+            Ok(Self::new(conn))
+        }
+    }
+    impl<T> StateServiceClient<T>
+    where
+        T: tonic::client::GrpcService<tonic::body::Body>,
+        T::Error: Into<StdError>,
+        T::ResponseBody: Body<Data = Bytes> + std::marker::Send + 'static,
+        <T::ResponseBody as Body>::Error: Into<StdError> + std::marker::Send,
+    {
+        pub fn new(inner: T) -> Self {
+            let inner = tonic::client::Grpc::new(inner);
+            Self { inner }
+        }
+        pub fn with_origin(inner: T, origin: Uri) -> Self {
+            let inner = tonic::client::Grpc::with_origin(inner, origin);
+            Self { inner }
+        }
+        pub fn with_interceptor<F>(
+            inner: T,
+            interceptor: F,
+        ) -> StateServiceClient<InterceptedService<T, F>>
+        where
+            F: tonic::service::Interceptor,
+            T::ResponseBody: Default,
+            T: tonic::codegen::Service<
+                http::Request<tonic::body::Body>,
+                Response = http::Response<
+                    <T as tonic::client::GrpcService<tonic::body::Body>>::ResponseBody,
+                >,
+            >,
+            <T as tonic::codegen::Service<
+                http::Request<tonic::body::Body>,
+            >>::Error: Into<StdError> + std::marker::Send + std::marker::Sync,
+        {
+            StateServiceClient::new(InterceptedService::new(inner, interceptor))
+        }
+        /// Compress requests with the given encoding.
+        ///
+        /// This requires the server to support it otherwise it might respond with an
+        /// error.
+        #[must_use]
+        pub fn send_compressed(mut self, encoding: CompressionEncoding) -> Self {
+            self.inner = self.inner.send_compressed(encoding);
+            self
+        }
+        /// Enable decompressing responses.
+        #[must_use]
+        pub fn accept_compressed(mut self, encoding: CompressionEncoding) -> Self {
+            self.inner = self.inner.accept_compressed(encoding);
+            self
+        }
+        /// Limits the maximum size of a decoded message.
+        ///
+        /// Default: `4MB`
+        #[must_use]
+        pub fn max_decoding_message_size(mut self, limit: usize) -> Self {
+            self.inner = self.inner.max_decoding_message_size(limit);
+            self
+        }
+        /// Limits the maximum size of an encoded message.
+        ///
+        /// Default: `usize::MAX`
+        #[must_use]
+        pub fn max_encoding_message_size(mut self, limit: usize) -> Self {
+            self.inner = self.inner.max_encoding_message_size(limit);
+            self
+        }
+        /// Returns the complete state of one step.
+        pub async fn get_state(
+            &mut self,
+            request: impl tonic::IntoRequest<super::GetStateRequest>,
+        ) -> std::result::Result<
+            tonic::Response<tonic::codec::Streaming<super::GetStateResponse>>,
+            tonic::Status,
+        > {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = tonic_prost::ProstCodec::default();
+            let path = http::uri::PathAndQuery::from_static(
+                "/modalcast.v1.StateService/GetState",
+            );
+            let mut req = request.into_request();
+            req.extensions_mut()
+                .insert(GrpcMethod::new("modalcast.v1.StateService", "GetState"));
+            self.inner.server_streaming(req, path, codec).await
+        }
+        /// Returns the state of each step that `delivery` selects. The first message has the settings in effect. The first
+        /// state is complete. Each later one has only the domains whose q or transform differs in any bit from the state that
+        /// this stream has sent before, also if steps were skipped in between. The subscription is active when the response
+        /// headers arrive, so the next step is delivered.
+        pub async fn stream_states(
+            &mut self,
+            request: impl tonic::IntoRequest<super::StreamStatesRequest>,
+        ) -> std::result::Result<
+            tonic::Response<tonic::codec::Streaming<super::StreamStatesResponse>>,
+            tonic::Status,
+        > {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = tonic_prost::ProstCodec::default();
+            let path = http::uri::PathAndQuery::from_static(
+                "/modalcast.v1.StateService/StreamStates",
+            );
+            let mut req = request.into_request();
+            req.extensions_mut()
+                .insert(GrpcMethod::new("modalcast.v1.StateService", "StreamStates"));
+            self.inner.server_streaming(req, path, codec).await
+        }
+    }
+}
+/// Generated server implementations.
+pub mod state_service_server {
+    #![allow(
+        unused_variables,
+        dead_code,
+        missing_docs,
+        clippy::wildcard_imports,
+        clippy::let_unit_value,
+    )]
+    use tonic::codegen::*;
+    /// Generated trait containing gRPC methods that should be implemented for use with StateServiceServer.
+    #[async_trait]
+    pub trait StateService: std::marker::Send + std::marker::Sync + 'static {
+        /// Server streaming response type for the GetState method.
+        type GetStateStream: tonic::codegen::tokio_stream::Stream<
+                Item = std::result::Result<super::GetStateResponse, tonic::Status>,
+            >
+            + std::marker::Send
+            + 'static;
+        /// Returns the complete state of one step.
+        async fn get_state(
+            &self,
+            request: tonic::Request<super::GetStateRequest>,
+        ) -> std::result::Result<tonic::Response<Self::GetStateStream>, tonic::Status>;
+        /// Server streaming response type for the StreamStates method.
+        type StreamStatesStream: tonic::codegen::tokio_stream::Stream<
+                Item = std::result::Result<super::StreamStatesResponse, tonic::Status>,
+            >
+            + std::marker::Send
+            + 'static;
+        /// Returns the state of each step that `delivery` selects. The first message has the settings in effect. The first
+        /// state is complete. Each later one has only the domains whose q or transform differs in any bit from the state that
+        /// this stream has sent before, also if steps were skipped in between. The subscription is active when the response
+        /// headers arrive, so the next step is delivered.
+        async fn stream_states(
+            &self,
+            request: tonic::Request<super::StreamStatesRequest>,
+        ) -> std::result::Result<
+            tonic::Response<Self::StreamStatesStream>,
+            tonic::Status,
+        >;
+    }
+    /// The state of a scene at a step: the coordinates q and the transforms T of its domains. A client that has x0 and U
+    /// (DescribeScene, ReadModes) computes the vertices x = T (x0 + U q) by itself. A state has a few numbers per domain, so
+    /// it is much smaller than the vertices of the step.
+    ///
+    /// A state has the vocabulary of Step, so that recorded states can be sent as steps again: while the origin of the
+    /// transforms is SceneInfo.origin, the sections of a state are the fields q_domains, q, transform_domains and transforms
+    /// of a Step with TRANSFORM_FORMAT_AFFINE_F32.
+    ///
+    /// * Domains that share their coordinates (DomainDescription.shares_q_with) are not listed with q: they have the q of
+    ///  the domain that they name, which may itself share them.
+    /// * Domains that follow another one (DomainDescription.follows) are not listed with transforms: their transform is that
+    ///  of the domain that they follow, times their follow_frame.
+    #[derive(Debug)]
+    pub struct StateServiceServer<T> {
+        inner: Arc<T>,
+        accept_compression_encodings: EnabledCompressionEncodings,
+        send_compression_encodings: EnabledCompressionEncodings,
+        max_decoding_message_size: Option<usize>,
+        max_encoding_message_size: Option<usize>,
+    }
+    impl<T> StateServiceServer<T> {
+        pub fn new(inner: T) -> Self {
+            Self::from_arc(Arc::new(inner))
+        }
+        pub fn from_arc(inner: Arc<T>) -> Self {
+            Self {
+                inner,
+                accept_compression_encodings: Default::default(),
+                send_compression_encodings: Default::default(),
+                max_decoding_message_size: None,
+                max_encoding_message_size: None,
+            }
+        }
+        pub fn with_interceptor<F>(
+            inner: T,
+            interceptor: F,
+        ) -> InterceptedService<Self, F>
+        where
+            F: tonic::service::Interceptor,
+        {
+            InterceptedService::new(Self::new(inner), interceptor)
+        }
+        /// Enable decompressing requests with the given encoding.
+        #[must_use]
+        pub fn accept_compressed(mut self, encoding: CompressionEncoding) -> Self {
+            self.accept_compression_encodings.enable(encoding);
+            self
+        }
+        /// Compress responses with the given encoding, if the client supports it.
+        #[must_use]
+        pub fn send_compressed(mut self, encoding: CompressionEncoding) -> Self {
+            self.send_compression_encodings.enable(encoding);
+            self
+        }
+        /// Limits the maximum size of a decoded message.
+        ///
+        /// Default: `4MB`
+        #[must_use]
+        pub fn max_decoding_message_size(mut self, limit: usize) -> Self {
+            self.max_decoding_message_size = Some(limit);
+            self
+        }
+        /// Limits the maximum size of an encoded message.
+        ///
+        /// Default: `usize::MAX`
+        #[must_use]
+        pub fn max_encoding_message_size(mut self, limit: usize) -> Self {
+            self.max_encoding_message_size = Some(limit);
+            self
+        }
+    }
+    impl<T, B> tonic::codegen::Service<http::Request<B>> for StateServiceServer<T>
+    where
+        T: StateService,
+        B: Body + std::marker::Send + 'static,
+        B::Error: Into<StdError> + std::marker::Send + 'static,
+    {
+        type Response = http::Response<tonic::body::Body>;
+        type Error = std::convert::Infallible;
+        type Future = BoxFuture<Self::Response, Self::Error>;
+        fn poll_ready(
+            &mut self,
+            _cx: &mut Context<'_>,
+        ) -> Poll<std::result::Result<(), Self::Error>> {
+            Poll::Ready(Ok(()))
+        }
+        fn call(&mut self, req: http::Request<B>) -> Self::Future {
+            match req.uri().path() {
+                "/modalcast.v1.StateService/GetState" => {
+                    #[allow(non_camel_case_types)]
+                    struct GetStateSvc<T: StateService>(pub Arc<T>);
+                    impl<
+                        T: StateService,
+                    > tonic::server::ServerStreamingService<super::GetStateRequest>
+                    for GetStateSvc<T> {
+                        type Response = super::GetStateResponse;
+                        type ResponseStream = T::GetStateStream;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::ResponseStream>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<super::GetStateRequest>,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as StateService>::get_state(&inner, request).await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = GetStateSvc(inner);
+                        let codec = tonic_prost::ProstCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.server_streaming(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                "/modalcast.v1.StateService/StreamStates" => {
+                    #[allow(non_camel_case_types)]
+                    struct StreamStatesSvc<T: StateService>(pub Arc<T>);
+                    impl<
+                        T: StateService,
+                    > tonic::server::ServerStreamingService<super::StreamStatesRequest>
+                    for StreamStatesSvc<T> {
+                        type Response = super::StreamStatesResponse;
+                        type ResponseStream = T::StreamStatesStream;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::ResponseStream>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<super::StreamStatesRequest>,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as StateService>::stream_states(&inner, request).await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = StreamStatesSvc(inner);
+                        let codec = tonic_prost::ProstCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.server_streaming(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                _ => {
+                    Box::pin(async move {
+                        let mut response = http::Response::new(
+                            tonic::body::Body::default(),
+                        );
+                        let headers = response.headers_mut();
+                        headers
+                            .insert(
+                                tonic::Status::GRPC_STATUS,
+                                (tonic::Code::Unimplemented as i32).into(),
+                            );
+                        headers
+                            .insert(
+                                http::header::CONTENT_TYPE,
+                                tonic::metadata::GRPC_CONTENT_TYPE,
+                            );
+                        Ok(response)
+                    })
+                }
+            }
+        }
+    }
+    impl<T> Clone for StateServiceServer<T> {
+        fn clone(&self) -> Self {
+            let inner = self.inner.clone();
+            Self {
+                inner,
+                accept_compression_encodings: self.accept_compression_encodings,
+                send_compression_encodings: self.send_compression_encodings,
+                max_decoding_message_size: self.max_decoding_message_size,
+                max_encoding_message_size: self.max_encoding_message_size,
+            }
+        }
+    }
+    /// Generated gRPC service name
+    pub const SERVICE_NAME: &str = "modalcast.v1.StateService";
+    impl<T> tonic::server::NamedService for StateServiceServer<T> {
+        const NAME: &'static str = SERVICE_NAME;
+    }
+}
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct GetServerInfoRequest {}
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]

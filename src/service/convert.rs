@@ -1,6 +1,8 @@
 //! Conversions between wire messages and engine types. `wire_` functions create messages, `parse_` functions read them.
 //! Numbers from the wire are untrusted until a constructor of `modalcast_model::scene` has validated them.
 
+use std::time::Duration;
+
 use modalcast_proto::v1;
 
 use crate::engine::{
@@ -121,6 +123,15 @@ pub(super) fn parse_delivery(field: &str, number: i32) -> Result<Delivery> {
             Err(invalid(field, expected, "DELIVERY_UNSPECIFIED"))
         }
         Err(_) => Err(invalid(field, "a delivery of this version", number)),
+    }
+}
+
+/// Parses a limit on the rate of a stream. Returns the minimum interval; 0 means no limit for both.
+pub(super) fn parse_max_hz(field: &str, max_hz: f64) -> Result<Duration> {
+    match max_hz {
+        0.0 => Ok(Duration::ZERO),
+        0.001..=1000.0 => Ok(Duration::from_secs_f64(1.0 / max_hz)),
+        _ => Err(invalid(field, "0.001 to 1000, or 0 for no limit", max_hz)),
     }
 }
 

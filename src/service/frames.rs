@@ -105,7 +105,7 @@ fn frame_chunks(
     let (width, height) = match output_spec {
         OutputSpec::Frame { size, .. } => (size.width, size.height),
         // `parse_picture` returns frames only.
-        OutputSpec::Vertices(_) | OutputSpec::Pick { .. } => (0, 0),
+        OutputSpec::Vertices(_) | OutputSpec::Pick { .. } | OutputSpec::State => (0, 0),
     };
     let head = v1::FrameHead {
         step: Some(wire_step_id(frame.step)),

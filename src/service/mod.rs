@@ -10,6 +10,7 @@ mod listen;
 mod picks;
 mod routes;
 mod scenes;
+mod states;
 mod status;
 mod steps;
 mod stream;
@@ -99,7 +100,7 @@ pub async fn serve(
 async fn set_health(health: &HealthReporter, is_serving: bool) {
     use tonic_health::ServingStatus::{NotServing, Serving};
     let status = if is_serving { Serving } else { NotServing };
-    let services = ["SceneService", "StepService", "FrameService", "VertexService", "ServerService"];
+    let services = ["SceneService", "StepService", "FrameService", "VertexService", "StateService", "ServerService"];
     // The empty name stands for the whole server.
     for name in services.map(|service| format!("modalcast.v1.{service}")).into_iter().chain([String::new()]) {
         health.set_service_status(name, status).await;
@@ -128,6 +129,7 @@ fn routes(engine: &Engine, config: &Config) -> Result<Routes> {
     use v1::frame_service_server::FrameServiceServer;
     use v1::scene_service_server::SceneServiceServer;
     use v1::server_service_server::ServerServiceServer;
+    use v1::state_service_server::StateServiceServer;
     use v1::step_service_server::StepServiceServer;
     use v1::vertex_service_server::VertexServiceServer;
     // A macro, because the generated servers share no trait for these methods.
@@ -148,7 +150,8 @@ fn routes(engine: &Engine, config: &Config) -> Result<Routes> {
         .with(with_limits!(SceneServiceServer::new(scenes::SceneServiceImpl(engine.clone()))))
         .with(with_limits!(StepServiceServer::new(steps::StepServiceImpl(engine.clone()))))
         .with(with_limits!(FrameServiceServer::new(frames::FrameServiceImpl(engine.clone()))))
-        .with(with_limits!(VertexServiceServer::new(vertices::VertexServiceImpl(engine.clone())))))
+        .with(with_limits!(VertexServiceServer::new(vertices::VertexServiceImpl(engine.clone()))))
+        .with(with_limits!(StateServiceServer::new(states::StateServiceImpl(engine.clone())))))
 }
 
 #[cfg(test)]

@@ -85,8 +85,8 @@ impl FrameEncoder {
                 self.run(encode_map).await.map(|(bytes, ms)| (bytes, Some(ms)))?
             }
             OutputBody::Aov(image, None) => (image.bytes.into(), None),
-            OutputBody::Vertices(_) | OutputBody::Pick(_) => {
-                return Err(fault("encode", "expected a frame, got vertices or a pick"));
+            OutputBody::Vertices(_) | OutputBody::Pick(_) | OutputBody::State(_) => {
+                return Err(fault("encode", "expected a frame, got another output"));
             }
         };
         stages.extend(ms.map(|ms| (Stage::Encode, ms)));

@@ -25,6 +25,8 @@ pub enum OutputSpec {
         picture: FrameSize,
         rectangle: PixelRect,
     },
+    /// q and the transforms. The device does no work for them.
+    State,
 }
 
 /// The quantity that a frame shows.
@@ -76,6 +78,7 @@ pub enum OutputBody {
     /// Values instead of colors. With a legend the values are drawn as a color map.
     Aov(AovImage, Option<Legend>),
     Pick(Vec<ModalHit>),
+    State(Arc<SceneState>),
 }
 
 /// The output of one step for one [`OutputSpec`].

@@ -90,7 +90,7 @@ impl EncodedSubscription {
         let pixel_bytes = match &output.body {
             OutputBody::Frame(frame) => frame.rgba.len(),
             OutputBody::Aov(image, _) => image.bytes.len(),
-            OutputBody::Vertices(_) | OutputBody::Pick(_) => 0,
+            OutputBody::Vertices(_) | OutputBody::Pick(_) | OutputBody::State(_) => 0,
         };
         let (encoder, format) = (self.encoder.clone(), self.format);
         let task = tokio::spawn(async move { encoder.encode(output, format).await });

@@ -355,7 +355,7 @@ impl OutputProducer {
         is_within_timeout
     }
 
-    /// Draws, picks or copies the current step. A copy also includes `other_attributes`, which other subscribers
+    /// Draws, picks, copies or shares the current step. A copy also includes `other_attributes`, which other subscribers
     /// request.
     async fn produce(
         &mut self,
@@ -385,6 +385,7 @@ impl OutputProducer {
                 stages.push((Stage::Copy, copy_ms));
                 OutputBody::Vertices(surface)
             }
+            OutputSpec::State => OutputBody::State(Arc::clone(&current.state)),
         };
         Ok(StepOutput { step: current.id(), skipped: 0, stages, origins: current.state.origins.clone(), body })
     }

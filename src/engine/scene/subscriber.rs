@@ -4,11 +4,11 @@
 //! A credit permits the scene to send one more result. The channel buffers at most two results. With
 //! [`Delivery::Latest`], [`Subscription::next`] grants a credit when it is polled, so a result is produced only then.
 //! If the future of `next` is dropped, the next call returns the result that the dropped future has requested, even if
-//! the scene has completed a later step since.
+//! the scene has completed a later step since. [`Subscription::with_min_interval`] delays the credit.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use tokio::sync::{Notify, mpsc, watch};
 
@@ -111,6 +111,10 @@ pub struct Subscription {
     delivery: Delivery,
     /// Whether a `Latest` subscription has granted a credit whose result was not received yet.
     has_granted_credit: bool,
+    /// Minimum time between a result and the credit for the next one.
+    min_interval: Duration,
+    /// Earliest time of the next credit of a `Latest` subscription; `None` if it may be granted at once.
+    next_credit_at: Option<Instant>,
     credits: Arc<AtomicUsize>,
     results: mpsc::Receiver<Result<StepOutput>>,
     end: watch::Receiver<Option<EndReason>>,
@@ -135,7 +139,25 @@ impl Subscription {
             is_error_sent: Arc::default(),
             end: end_sender,
         };
-        (subscriber, Self { delivery, has_granted_credit: false, credits, results, end, scene_wake })
+        let subscription = Self {
+            delivery,
+            has_granted_credit: false,
+            min_interval: Duration::ZERO,
+            next_credit_at: None,
+            credits,
+            results,
+            end,
+            scene_wake,
+        };
+        (subscriber, subscription)
+    }
+
+    /// Limits the rate of a [`Delivery::Latest`] subscription: the credit for a result is granted at the earliest this
+    /// time after the previous result. No effect on a lossless one.
+    #[must_use]
+    pub fn with_min_interval(mut self, min_interval: Duration) -> Self {
+        self.min_interval = min_interval;
+        self
     }
 
     /// Which steps the subscription receives.
@@ -149,6 +171,9 @@ impl Subscription {
     /// The error with which the subscription has ended.
     pub async fn next(&mut self) -> Result<StepOutput> {
         if self.delivery == Delivery::Latest && !self.has_granted_credit {
+            if let Some(next_credit_at) = self.next_credit_at {
+                self.sleep_until(next_credit_at).await?;
+            }
             self.has_granted_credit = true;
             self.grant_credit();
         }
@@ -156,6 +181,8 @@ impl Subscription {
         self.has_granted_credit = false;
         if self.delivery == Delivery::Lossless {
             self.grant_credit();
+        } else if !self.min_interval.is_zero() {
+            self.next_credit_at = Instant::now().checked_add(self.min_interval);
         }
         result.unwrap_or_else(|| Err(self.end_error()))
     }
@@ -169,6 +196,18 @@ impl Subscription {
             Ok(Some(end)) => end.error,
             // The scene has ended without disconnecting the subscriber, so buffered results may still be read.
             _ => std::future::pending().await,
+        }
+    }
+
+    /// Waits for a time. Cancel-safe.
+    ///
+    /// # Errors
+    /// The error with which the subscription ends in the meantime.
+    async fn sleep_until(&mut self, time: Instant) -> Result<()> {
+        tokio::select! {
+            () = tokio::time::sleep_until(time.into()) => Ok(()),
+            // No credit is granted, so no result arrives.
+            _ = self.results.recv() => Err(self.end_error()),
         }
     }
 

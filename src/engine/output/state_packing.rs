@@ -1,0 +1,190 @@
+//! Packs the state of a step into bytes for the wire, on the blocking pool: all domains, or those that differ from the
+//! state that the client has received before.
+
+use std::sync::Arc;
+use std::time::Instant;
+
+use bytes::Bytes;
+
+use super::step_output::{OutputBody, StepId, StepOutput};
+use crate::engine::blocking::run_blocking;
+use crate::telemetry::{Stage, StageTimes, ms_since};
+use modalcast_model::error::{Result, fault};
+use modalcast_model::scene::{Scene, SceneState};
+
+/// The content of a [`StateSection`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum StateContent {
+    /// u32 indices of domains that own coordinates.
+    QDomains,
+    /// f32 coordinates of these domains.
+    Q,
+    /// u32 indices of transform roots.
+    TransformDomains,
+    /// 12 f32 per transform root.
+    Transforms,
+    /// 3 f64 in meters for all transform roots, or for each of them.
+    Origins,
+}
+
+/// A part of the bytes of a state.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct StateSection {
+    pub content: StateContent,
+    pub offset: u64,
+    pub bytes: u64,
+}
+
+/// The state of a step as bytes.
+#[derive(Debug, Clone)]
+pub struct PackedState {
+    pub step: StepId,
+    /// Steps that the subscriber skipped since its last output.
+    pub skipped: u64,
+    pub stages: StageTimes,
+    /// Whether the bytes have every domain.
+    pub is_complete: bool,
+    /// In the order of their offsets, without gaps. Empty sections are omitted.
+    pub sections: Vec<StateSection>,
+    pub bytes: Bytes,
+    /// The state that was packed.
+    pub state: Arc<SceneState>,
+}
+
+/// Packs the domains whose coordinates or transforms differ in any bit from `previous`, the state that the client has.
+/// Packs all domains if there is none.
+///
+/// # Errors
+/// `Fault` when `output` is not a state.
+pub async fn pack_state(
+    output: StepOutput,
+    scene: &Arc<Scene>,
+    previous: Option<Arc<SceneState>>,
+) -> Result<PackedState> {
+    let OutputBody::State(state) = output.body else {
+        return Err(fault("encode", "expected a state, got another output"));
+    };
+    let begin = Instant::now();
+    let (scene, packed_state, is_complete) = (Arc::clone(scene), Arc::clone(&state), previous.is_none());
+    let pack_on_pool = move || Ok(pack(&scene, &packed_state, previous.as_deref()));
+    let StateBytes { sections, bytes } = run_blocking("encode", pack_on_pool).await?;
+    let mut stages = output.stages;
+    stages.push((Stage::Encode, ms_since(begin)));
+    let (step, skipped) = (output.step, output.skipped);
+    Ok(PackedState { step, skipped, stages, is_complete, sections, bytes: bytes.into(), state })
+}
+
+/// Sections, and their bytes.
+#[derive(Debug, Default)]
+struct StateBytes {
+    sections: Vec<StateSection>,
+    bytes: Vec<u8>,
+}
+
+impl StateBytes {
+    fn append(&mut self, content: StateContent, section_bytes: &[u8]) {
+        if !section_bytes.is_empty() {
+            let (offset, bytes) = (self.bytes.len() as u64, section_bytes.len() as u64);
+            self.sections.push(StateSection { content, offset, bytes });
+            self.bytes.extend_from_slice(section_bytes);
+        }
+    }
+}
+
+fn pack(scene: &Scene, state: &SceneState, previous: Option<&SceneState>) -> StateBytes {
+    let mut packed = StateBytes::default();
+    let (mut domains, mut q) = (Vec::<u32>::new(), Vec::<f32>::new());
+    for domain in (0..scene.domains.len()).filter(|domain| scene.domains[*domain].shares_q_with.is_none()) {
+        let domain_q = state.q_of(scene, domain);
+        if previous.map_or(!domain_q.is_empty(), |previous| !are_bits_equal(domain_q, previous.q_of(scene, domain))) {
+            domains.push(domain as u32);
+            q.extend_from_slice(domain_q);
+        }
+    }
+    packed.append(StateContent::QDomains, bytemuck::cast_slice(&domains));
+    packed.append(StateContent::Q, bytemuck::cast_slice(&q));
+    domains.clear();
+    let mut transforms = Vec::new();
+    for (root, transform) in state.transforms.iter().enumerate() {
+        if previous.is_none_or(|previous| !are_bits_equal(&transform.0, &previous.transforms[root].0)) {
+            domains.push(scene.transform_roots.domain(root));
+            transforms.push(*transform);
+        }
+    }
+    packed.append(StateContent::TransformDomains, bytemuck::cast_slice(&domains));
+    packed.append(StateContent::Transforms, bytemuck::cast_slice(&transforms));
+    let origins = origins_in_meters(scene, state);
+    if previous.is_none_or(|previous| origins_in_meters(scene, previous) != origins) {
+        packed.append(StateContent::Origins, bytemuck::cast_slice(&origins));
+    }
+    packed
+}
+
+/// Whether two lists have the same bits, so that 0 differs from -0.
+fn are_bits_equal(a: &[f32], b: &[f32]) -> bool {
+    bytemuck::cast_slice::<f32, u32>(a) == bytemuck::cast_slice::<f32, u32>(b)
+}
+
+/// The world position of the origin of all transforms in meters, or of the origin of each transform root if they
+/// differ.
+fn origins_in_meters(scene: &Scene, state: &SceneState) -> Vec<[f64; 3]> {
+    let to_meters = |origin: [f64; 3]| std::array::from_fn(|axis| scene.origin[axis] + scene.unit * origin[axis]);
+    match &state.origins {
+        None => vec![scene.origin],
+        Some(origins) if origins.has_no_outliers() => vec![to_meters(origins.shared_origin())],
+        Some(origins) => (0..state.transforms.len()).map(|root| to_meters(origins.origin_of(root))).collect(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::engine::testing;
+    use modalcast_model::domain::Transform;
+
+    fn section_bytes(packed: &StateBytes, content: StateContent) -> Option<&[u8]> {
+        let section = packed.sections.iter().find(|section| section.content == content)?;
+        Some(&packed.bytes[section.offset as usize..][..section.bytes as usize])
+    }
+
+    #[test]
+    fn complete_state_has_all_domains_and_no_gaps() {
+        let scene = testing::two_strips();
+        let mut state = SceneState::rest(&scene);
+        state.q = vec![1.0, 2.0, 3.0, 4.0];
+        let packed = pack(&scene, &state, None);
+        let mut end = 0;
+        for section in &packed.sections {
+            assert_eq!(section.offset, end);
+            end += section.bytes;
+        }
+        assert_eq!((end, packed.sections.len()), (packed.bytes.len() as u64, 5));
+        let u32_section =
+            |content| section_bytes(&packed, content).map(bytemuck::pod_collect_to_vec::<u8, u32>).unwrap_or_default();
+        assert_eq!(u32_section(StateContent::QDomains), [0, 1]);
+        assert_eq!(u32_section(StateContent::TransformDomains), [0, 1]);
+        assert_eq!(section_bytes(&packed, StateContent::Q), Some(bytemuck::cast_slice(&state.q)));
+        assert_eq!(section_bytes(&packed, StateContent::Transforms), Some(bytemuck::cast_slice(&state.transforms)));
+        assert_eq!(section_bytes(&packed, StateContent::Origins), Some(&[0; 24][..]));
+    }
+
+    #[test]
+    fn later_state_has_only_the_domains_with_other_bits() {
+        let scene = testing::two_strips();
+        let previous = SceneState::rest(&scene);
+        assert!(pack(&scene, &previous, Some(&previous)).sections.is_empty());
+        let mut state = previous.clone();
+        // Equal to 0 as a number, but with another bit.
+        state.q[3] = -0.0;
+        let packed = pack(&scene, &state, Some(&previous));
+        let domain_one = 1_u32.to_le_bytes();
+        assert_eq!(section_bytes(&packed, StateContent::QDomains), Some(&domain_one[..]));
+        assert_eq!(section_bytes(&packed, StateContent::Q), Some(bytemuck::cast_slice(&[0.0_f32, -0.0])));
+        assert_eq!(packed.sections.len(), 2);
+        state = previous.clone();
+        state.transforms[1] = Transform([2.0; 12]);
+        let packed = pack(&scene, &state, Some(&previous));
+        assert_eq!(section_bytes(&packed, StateContent::TransformDomains), Some(&domain_one[..]));
+        assert_eq!(packed.bytes.len(), 4 + 48);
+    }
+}

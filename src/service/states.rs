@@ -1,0 +1,140 @@
+//! `StateService`: q and transforms of one step with a deadline, or of the steps of a stream. A state has a head with
+//! its sections, and is sent in chunks.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use modalcast_proto::v1;
+use tonic::{Request, Response, Status};
+use v1::stream_states_response::Part;
+
+use super::convert::{
+    describe_step_selector, parse_delivery, parse_max_hz, parse_step_selector, wire_stages, wire_step_id,
+};
+use super::status::to_status;
+use super::stream::{Deadline, ReplySender, ReplyStream, chunks_with_head, respond};
+use crate::engine::{Delivery, Engine, OutputSpec, PackedState, StateContent, StateSection, Subscription, pack_state};
+use modalcast_model::error::{Result as ModelResult, invalid};
+use modalcast_model::scene::Scene;
+
+/// Implementation of `StateService`.
+pub(super) struct StateServiceImpl(pub(super) Engine);
+
+#[tonic::async_trait]
+impl v1::state_service_server::StateService for StateServiceImpl {
+    type GetStateStream = ReplyStream<v1::GetStateResponse>;
+
+    async fn get_state(&self, request: Request<v1::GetStateRequest>) -> Result<Response<Self::GetStateStream>, Status> {
+        let config = self.0.config();
+        let deadline = Deadline::of_request(request.metadata(), request.get_ref().deadline_ms, config);
+        let request = request.into_inner();
+        let scene_handle = self.0.find(&request.scene).map_err(to_status)?;
+        let selector = parse_step_selector(request.step);
+        let max_chunk_bytes = config.chunk_bytes;
+        Ok(respond(move |reply_sender| async move {
+            let work = async {
+                let output = scene_handle.request_output(selector, OutputSpec::State).await.map_err(to_status)?;
+                let packed = pack_state(output, &scene_handle.scene, None).await.map_err(to_status)?;
+                for chunk in state_chunks(&packed, max_chunk_bytes) {
+                    reply_sender.send(v1::GetStateResponse { chunk: Some(chunk) }).await?;
+                }
+                Ok(())
+            };
+            deadline.enforce(&describe_step_selector(selector, &scene_handle.name), work).await
+        }))
+    }
+
+    type StreamStatesStream = ReplyStream<v1::StreamStatesResponse>;
+
+    async fn stream_states(
+        &self,
+        request: Request<v1::StreamStatesRequest>,
+    ) -> Result<Response<Self::StreamStatesStream>, Status> {
+        let deadline = Deadline::of_stream(request.metadata());
+        let request = request.into_inner();
+        let scene_handle = self.0.find(&request.scene).map_err(to_status)?;
+        let delivery = parse_delivery("delivery", request.delivery).map_err(to_status)?;
+        let min_interval = parse_state_interval(&request, delivery).map_err(to_status)?;
+        // Subscribe before the response headers are sent, so that a client can rely on receiving the next step.
+        let subscription = scene_handle.subscribe(OutputSpec::State, delivery).await.map_err(to_status)?;
+        let subscription = subscription.with_min_interval(min_interval);
+        let settings = v1::StateSettings { delivery: request.delivery, max_hz: request.max_hz, steps: request.steps };
+        let scene = Arc::clone(&scene_handle.scene);
+        let state_stream = StateStream { scene, max_chunk_bytes: self.0.config().chunk_bytes, settings };
+        Ok(respond(move |reply_sender| {
+            deadline.enforce("the stream of states", state_stream.run(subscription, reply_sender))
+        }))
+    }
+}
+
+/// The minimum time between two states of a stream.
+fn parse_state_interval(request: &v1::StreamStatesRequest, delivery: Delivery) -> ModelResult<Duration> {
+    let min_interval = parse_max_hz("max_hz", request.max_hz)?;
+    if delivery == Delivery::Lossless && !min_interval.is_zero() {
+        return Err(invalid("max_hz", "0 with DELIVERY_LOSSLESS, which has every step", request.max_hz));
+    }
+    Ok(min_interval)
+}
+
+/// Parameters of a stream of states.
+struct StateStream {
+    scene: Arc<Scene>,
+    max_chunk_bytes: usize,
+    settings: v1::StateSettings,
+}
+
+impl StateStream {
+    async fn run(
+        self,
+        mut subscription: Subscription,
+        reply_sender: ReplySender<v1::StreamStatesResponse>,
+    ) -> Result<(), Status> {
+        let to_response = |part| v1::StreamStatesResponse { part: Some(part) };
+        reply_sender.send(to_response(Part::Settings(self.settings))).await?;
+        let (mut sent_states, mut sent_state) = (0, None);
+        while self.settings.steps == 0 || sent_states < self.settings.steps {
+            let output = tokio::select! {
+                output = subscription.next() => output.map_err(to_status)?,
+                () = reply_sender.closed() => return Ok(()),
+            };
+            let packed = pack_state(output, &self.scene, sent_state).await.map_err(to_status)?;
+            for chunk in state_chunks(&packed, self.max_chunk_bytes) {
+                tokio::select! {
+                    sent = reply_sender.send(to_response(Part::Chunk(chunk))) => sent?,
+                    error = subscription.disconnected() => return Err(to_status(error)),
+                }
+            }
+            sent_state = Some(packed.state);
+            sent_states += 1;
+        }
+        Ok(())
+    }
+}
+
+/// Splits a state into chunks, of which the first has the head.
+fn state_chunks(packed: &PackedState, max_chunk_bytes: usize) -> impl Iterator<Item = v1::StateChunk> + use<> {
+    let head = v1::StateHead {
+        step: Some(wire_step_id(packed.step)),
+        skipped: packed.skipped,
+        complete: packed.is_complete,
+        sections: packed.sections.iter().map(wire_section).collect(),
+        total: packed.bytes.len() as u64,
+        stages: wire_stages(&packed.stages),
+    };
+    chunks_with_head(head, packed.bytes.clone(), max_chunk_bytes, |head, offset, data| v1::StateChunk {
+        head,
+        offset,
+        data,
+    })
+}
+
+fn wire_section(section: &StateSection) -> v1::StateSection {
+    let content = match section.content {
+        StateContent::QDomains => v1::StateContent::QDomains,
+        StateContent::Q => v1::StateContent::Q,
+        StateContent::TransformDomains => v1::StateContent::TransformDomains,
+        StateContent::Transforms => v1::StateContent::Transforms,
+        StateContent::Origins => v1::StateContent::Origins,
+    };
+    v1::StateSection { content: content.into(), offset: section.offset, bytes: section.bytes }
+}
