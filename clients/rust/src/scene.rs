@@ -23,6 +23,15 @@ pub struct Attachment {
     pub parent_vertices: Vec<u32>,
 }
 
+/// The domain whose transform a domain follows.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Follow {
+    /// Index of the followed domain.
+    pub leader: usize,
+    /// The transform of the follower is that of the leader times this one, row-major 3x4.
+    pub leader_from_follower: [f32; 12],
+}
+
 /// One domain: n vertices, r modes, and arrays. Arrays that were not requested are empty.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Domain {
@@ -37,6 +46,8 @@ pub struct Domain {
     pub corner_count: usize,
     pub triangle_count: usize,
     pub attachment: Option<Attachment>,
+    /// Steps must not contain a transform of a domain that follows another one.
+    pub follow: Option<Follow>,
     /// `world_from_domain` at rest, row-major 3x4.
     pub placement: [f32; 12],
     /// A domain with a smaller index, with which this domain shares its coordinates.
@@ -307,6 +318,13 @@ fn decode_domain(wire: v1::DomainDescription) -> Result<Domain> {
             parent_vertices: wire.attachment_rows.clone(),
         }),
     };
+    let follow = match wire.follows {
+        None => None,
+        Some(leader) => Some(Follow {
+            leader: leader as usize,
+            leader_from_follower: decode_transform("follow_frame", &wire.follow_frame)?,
+        }),
+    };
     if !wire.eigenvalues.is_empty() && wire.eigenvalues.len() != wire.rank as usize {
         let field = format!("domain '{}': eigenvalues", wire.name);
         return Err(malformed_reply(field, format!("none or {}", wire.rank), wire.eigenvalues.len()));
@@ -315,6 +333,7 @@ fn decode_domain(wire: v1::DomainDescription) -> Result<Domain> {
         index: wire.domain as usize,
         placement: decode_transform("placement", &wire.placement)?,
         attachment,
+        follow,
         vertex_count: wire.vertices as usize,
         rank: wire.rank as usize,
         corner_count: wire.corners as usize,
