@@ -236,7 +236,8 @@ pub struct SceneInfo {
     /// Meters per scene unit.
     #[prost(double, tag = "9")]
     pub unit: f64,
-    /// Three numbers: the origin of all transforms in the world, meters.
+    /// Three numbers in meters: the position in the world of the scene's origin, to which transforms and positions are
+    /// relative. A position p in scene units is at origin + unit * p in the world.
     #[prost(double, repeated, tag = "10")]
     pub origin: ::prost::alloc::vec::Vec<f64>,
     /// Rest bounds in scene units relative to `origin`: min x, y, z, max x, y, z.
@@ -373,13 +374,13 @@ pub struct DomainDescription {
     /// The domain that this one is attached to; unset if it is not attached.
     #[prost(uint32, optional, tag = "7")]
     pub parent: ::core::option::Option<u32>,
-    /// parent_from_child at rest: 12 little-endian f32, row-major 3x4; empty without parent.
+    /// parent_from_child at rest: 12 little-endian f32, row-major 3x4, translation in scene units; empty without parent.
     #[prost(bytes = "bytes", tag = "8")]
     pub attachment_frame: ::prost::bytes::Bytes,
     /// Vertices of the parent near the joint. A client fits the motion of the attachment frame to their displacements.
     #[prost(uint32, repeated, tag = "9")]
-    pub attachment_rows: ::prost::alloc::vec::Vec<u32>,
-    /// world_from_domain at rest: 12 little-endian f32, row-major 3x4.
+    pub attachment_vertices: ::prost::alloc::vec::Vec<u32>,
+    /// world_from_domain at rest: 12 little-endian f32, row-major 3x4, translation in scene units.
     #[prost(bytes = "bytes", tag = "10")]
     pub placement: ::prost::bytes::Bytes,
     /// A domain with a smaller index whose coordinates this domain shares.
@@ -402,7 +403,8 @@ pub struct DomainDescription {
     /// for this domain, but may contain its coordinates.
     #[prost(uint32, optional, tag = "15")]
     pub follows: ::core::option::Option<u32>,
-    /// followed_from_follower: 12 little-endian f32, row-major 3x4; empty if `follows` is unset.
+    /// followed_from_follower: 12 little-endian f32, row-major 3x4, translation in scene units; empty if `follows` is
+    /// unset.
     #[prost(bytes = "bytes", tag = "16")]
     pub follow_frame: ::prost::bytes::Bytes,
 }
@@ -440,7 +442,8 @@ pub struct ReadModesResponse {
     pub offset: u64,
     #[prost(uint64, tag = "3")]
     pub total: u64,
-    /// Little-endian f32: three rows of r entries for each requested vertex. A message contains whole vertices.
+    /// Little-endian f32 in scene units per unit of q: three rows of r entries for each requested vertex. A message
+    /// contains whole vertices.
     #[prost(bytes = "bytes", tag = "4")]
     pub data: ::prost::bytes::Bytes,
 }
@@ -454,7 +457,7 @@ pub enum Array {
     Indices = 1,
     /// u32 vertex v of each corner; vertex v has rows 3v, 3v + 1 and 3v + 2 of U.
     CornerVertices = 2,
-    /// f32 rest positions x0, three per vertex, scene units.
+    /// f32 rest positions x0, three per vertex, in scene units and in the domain's own frame.
     RestPositions = 3,
     /// f32 texture coordinates, two per corner, (0, 0) at the top left; empty if the domain has none.
     Uvs = 4,
@@ -501,6 +504,14 @@ pub mod scene_service_client {
     use tonic::codegen::*;
     use tonic::codegen::http::Uri;
     /// Opens, uploads, lists, closes and describes scenes.
+    ///
+    /// Units of lengths, for all files of this package: a length is in scene units, of which each is SceneInfo.unit meters,
+    /// unless the comment of its field says meters. Positions, translations, displacements u = U q, bounds, cameras and clip
+    /// planes are in scene units. Three kinds of values are in meters: the positions of origins in the world
+    /// (SceneInfo.origin, ATTRIBUTE_ORIGINS), depths (OUTPUT_DEPTH, Hit.depth), and the values of color maps
+    /// (Picture.largest). Positions and transforms are relative to the scene's origin unless a comment names another one. A
+    /// transform is a row-major 3x4 matrix whose last column is the translation in scene units; `a_from_b` maps coordinates
+    /// in frame b to coordinates in frame a.
     #[derive(Debug, Clone)]
     pub struct SceneServiceClient<T> {
         inner: tonic::client::Grpc<T>,
@@ -809,6 +820,14 @@ pub mod scene_service_server {
         ) -> std::result::Result<tonic::Response<Self::ReadModesStream>, tonic::Status>;
     }
     /// Opens, uploads, lists, closes and describes scenes.
+    ///
+    /// Units of lengths, for all files of this package: a length is in scene units, of which each is SceneInfo.unit meters,
+    /// unless the comment of its field says meters. Positions, translations, displacements u = U q, bounds, cameras and clip
+    /// planes are in scene units. Three kinds of values are in meters: the positions of origins in the world
+    /// (SceneInfo.origin, ATTRIBUTE_ORIGINS), depths (OUTPUT_DEPTH, Hit.depth), and the values of color maps
+    /// (Picture.largest). Positions and transforms are relative to the scene's origin unless a comment names another one. A
+    /// transform is a row-major 3x4 matrix whose last column is the translation in scene units; `a_from_b` maps coordinates
+    /// in frame b to coordinates in frame a.
     #[derive(Debug)]
     pub struct SceneServiceServer<T> {
         inner: Arc<T>,
@@ -1251,7 +1270,7 @@ pub struct Step {
     /// Domains whose coordinates are in `q`, each once. If empty and `q` is not empty: all domains in order.
     #[prost(uint32, repeated, tag = "3")]
     pub q_domains: ::prost::alloc::vec::Vec<u32>,
-    /// r finite little-endian f32 per domain, concatenated; r is DomainDescription.rank.
+    /// r finite little-endian f32 per domain, concatenated; r is DomainDescription.rank. U q is in scene units.
     #[prost(bytes = "bytes", tag = "4")]
     pub q: ::prost::bytes::Bytes,
     /// Domains whose transforms are in `transforms`, each once. If empty and `transforms` is not empty: all domains in
@@ -1260,6 +1279,7 @@ pub struct Step {
     #[prost(uint32, repeated, tag = "5")]
     pub transform_domains: ::prost::alloc::vec::Vec<u32>,
     /// world_from_domain of each listed domain in `transform_format`, concatenated, little-endian, at any alignment.
+    /// Translations are in scene units.
     #[prost(bytes = "bytes", tag = "6")]
     pub transforms: ::prost::bytes::Bytes,
     /// The format of all transforms of the step.
@@ -1379,25 +1399,27 @@ impl InitialState {
         }
     }
 }
-/// Packing of `transforms`. Lengths are in scene units (SceneInfo.unit meters each).
+/// Packing of `transforms`. Translations are in scene units in all formats.
 ///
-/// A quaternion is a rotation x, y, z, w (w is the real part), 4 f32. Its norm may differ from 1 by at most 0.001; a
-/// larger difference is rejected. The server normalizes the quaternion in f64 and rounds the rotation matrix to f32
-/// once.
+/// A quaternion x y z w is a rotation in 4 f32 in this order: w, the real part, is last. Its norm may differ from 1 by
+/// at most 0.001; a larger difference is rejected. The server normalizes the quaternion in f64 and rounds the rotation
+/// matrix to f32 once.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
 #[repr(i32)]
 pub enum TransformFormat {
     /// Means TRANSFORM_FORMAT_AFFINE_F32.
     Unspecified = 0,
-    /// 48 bytes: 12 f32, row-major 3x4. The translation is relative to the scene's origin (SceneInfo.origin).
+    /// 48 bytes: 12 f32, row-major 3x4. The translation, the last column, is in scene units from the scene's origin
+    /// (SceneInfo.origin).
     AffineF32 = 1,
-    /// 28 bytes: a quaternion, then the translation as 3 f32, relative to the scene's origin.
-    RigidF32 = 2,
-    /// 40 bytes: a quaternion, then the translation as 3 f64, in scene units from the WORLD's origin: the client does not
-    /// subtract the scene's origin. The server computes translation - SceneInfo.origin / SceneInfo.unit in f64 and rounds
-    /// to f32 once, relative to an origin near the domain, so that millimeters are resolved at 10^7 m. The translation and
-    /// its difference from the scene's origin must both be at most 2^40 units in magnitude on each axis.
-    RigidF64 = 3,
+    /// 28 bytes: a quaternion x y z w as 4 f32, then the translation as 3 f32 in scene units from the scene's origin.
+    QuaternionXyzwF32 = 2,
+    /// 40 bytes: a quaternion x y z w as 4 f32, then the translation as 3 f64 in scene units from the WORLD's origin: the
+    /// client does not subtract the scene's origin. The server computes translation - SceneInfo.origin / SceneInfo.unit in
+    /// f64 and rounds to f32 once, relative to an origin near the domain, so that millimeters are resolved at 10^7 m. The
+    /// translation and its difference from the scene's origin must both be at most 2^40 scene units in magnitude on each
+    /// axis.
+    QuaternionXyzwF64 = 3,
 }
 impl TransformFormat {
     /// String value of the enum field names used in the ProtoBuf definition.
@@ -1408,8 +1430,8 @@ impl TransformFormat {
         match self {
             Self::Unspecified => "TRANSFORM_FORMAT_UNSPECIFIED",
             Self::AffineF32 => "TRANSFORM_FORMAT_AFFINE_F32",
-            Self::RigidF32 => "TRANSFORM_FORMAT_RIGID_F32",
-            Self::RigidF64 => "TRANSFORM_FORMAT_RIGID_F64",
+            Self::QuaternionXyzwF32 => "TRANSFORM_FORMAT_QUATERNION_XYZW_F32",
+            Self::QuaternionXyzwF64 => "TRANSFORM_FORMAT_QUATERNION_XYZW_F64",
         }
     }
     /// Creates an enum from field names used in the ProtoBuf definition.
@@ -1417,8 +1439,8 @@ impl TransformFormat {
         match value {
             "TRANSFORM_FORMAT_UNSPECIFIED" => Some(Self::Unspecified),
             "TRANSFORM_FORMAT_AFFINE_F32" => Some(Self::AffineF32),
-            "TRANSFORM_FORMAT_RIGID_F32" => Some(Self::RigidF32),
-            "TRANSFORM_FORMAT_RIGID_F64" => Some(Self::RigidF64),
+            "TRANSFORM_FORMAT_QUATERNION_XYZW_F32" => Some(Self::QuaternionXyzwF32),
+            "TRANSFORM_FORMAT_QUATERNION_XYZW_F64" => Some(Self::QuaternionXyzwF64),
             _ => None,
         }
     }
@@ -1797,7 +1819,8 @@ pub mod camera {
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct LookAt {
-    /// Three numbers each. `eye` and `target` must differ, and `up` must not be parallel to the line between them.
+    /// Three numbers each; `eye` and `target` are positions in scene units, and `up` is a direction of any length. `eye`
+    /// and `target` must differ, and `up` must not be parallel to the line between them.
     #[prost(double, repeated, tag = "1")]
     pub eye: ::prost::alloc::vec::Vec<f64>,
     #[prost(double, repeated, tag = "2")]
@@ -1807,7 +1830,8 @@ pub struct LookAt {
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct Pose {
-    /// 12 numbers, a row-major 3x4 invertible transform. Camera axes: x right, y up, looking along -z.
+    /// 12 numbers, a row-major 3x4 invertible transform, translation in scene units. Camera axes: x right, y up, looking
+    /// along -z.
     #[prost(double, repeated, tag = "1")]
     pub world_from_camera: ::prost::alloc::vec::Vec<f64>,
 }
@@ -1984,8 +2008,8 @@ pub struct Hit {
     /// r, the number of columns of U.
     #[prost(uint32, tag = "11")]
     pub rank: u32,
-    /// U at the point: 3 x rank little-endian f32, row-major, interpolated from the scene's untruncated modes. A force f
-    /// at the point, in world axes, acts on the domain's coordinates as f_q = U^T A^T f.
+    /// U at the point: 3 x rank little-endian f32 in scene units per unit of q, row-major, interpolated from the scene's
+    /// untruncated modes. A force f at the point, in world axes, acts on the domain's coordinates as f_q = U^T A^T f.
     #[prost(bytes = "bytes", tag = "12")]
     pub modes: ::prost::bytes::Bytes,
 }
@@ -2751,8 +2775,8 @@ pub enum Attribute {
     /// u = U q, one vector per vertex, in scene units and in the domain's own frame: a vertex is at T (x0 + u). Rejected
     /// unless the scene computes them (deform.displacements = true in its scene.toml).
     Displacements = 3,
-    /// Two vectors per selected domain: the minimum x, y, z of its positions, then the maximum, relative to the origin of
-    /// the positions. Rejected unless the scene computes them (deform.boxes = true in its scene.toml).
+    /// Two vectors per selected domain in scene units: the minimum x, y, z of its positions, then the maximum, relative to
+    /// the origin of the positions. Rejected unless the scene computes them (deform.boxes = true in its scene.toml).
     Boxes = 4,
     /// 3 f64 in meters: the world position of the origin of all positions, or 3 f64 per selected domain if the origins
     /// differ. It is SceneInfo.origin until a step with f64 translations moves domains far from that origin; then it

@@ -34,7 +34,7 @@ fn strips(deformation: DeformationSettings) -> Arc<Scene> {
     let modes = Modes::from_columns(12, 2, entries).expect("expected valid modes");
     let shape = Shape::new(mesh, modes).expect("expected a valid shape");
     let domain = |name: &str, attachment| Domain { attachment, ..Domain::new(name, 0) };
-    let joint = Attachment { parent: 0, frame: Transform::IDENTITY, rows: vec![1, 2] };
+    let joint = Attachment { parent: 0, frame: Transform::IDENTITY, vertices: vec![1, 2] };
     let domains = vec![domain("left", None), domain("right", Some(joint))];
     let (shapes, materials) = (vec![shape], vec![Material::default()]);
     Scene::new(SceneParts { shapes, materials, domains, deformation, ..SceneParts::named("strips") })

@@ -98,8 +98,8 @@ pub(super) const fn wire_raster_backend(backend: Option<RasterBackend>) -> v1::D
 pub(super) fn parse_step(step: v1::Step) -> Result<RawStepUpdate> {
     let transform_format = match v1::TransformFormat::try_from(step.transform_format) {
         Ok(v1::TransformFormat::Unspecified | v1::TransformFormat::AffineF32) => TransformFormat::Affine,
-        Ok(v1::TransformFormat::RigidF32) => TransformFormat::RigidF32,
-        Ok(v1::TransformFormat::RigidF64) => TransformFormat::RigidF64,
+        Ok(v1::TransformFormat::QuaternionXyzwF32) => TransformFormat::QuaternionXyzwF32,
+        Ok(v1::TransformFormat::QuaternionXyzwF64) => TransformFormat::QuaternionXyzwF64,
         Err(_) => return Err(invalid("step.transform_format", "a format of this version", step.transform_format)),
     };
     Ok(RawStepUpdate {

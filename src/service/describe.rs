@@ -143,7 +143,7 @@ fn describe_domain(scene: &Scene, index: u32) -> v1::DomainDescription {
         triangles: domain_layout.triangles as u32,
         parent: attachment.map(|attachment| attachment.parent as u32),
         attachment_frame: attachment.map(|attachment| transform_bytes(&attachment.frame)).unwrap_or_default(),
-        attachment_rows: attachment.map(|attachment| attachment.rows.clone()).unwrap_or_default(),
+        attachment_vertices: attachment.map(|attachment| attachment.vertices.clone()).unwrap_or_default(),
         placement: transform_bytes(&domain.placement),
         shares_q_with: domain.shares_q_with.map(|other_domain| other_domain as u32),
         shape: domain.shape as u32,

@@ -204,7 +204,7 @@ fn far_step(domain: u32, translation: [f64; 3]) -> RawStepUpdate {
     RawStepUpdate {
         transform_domains: vec![domain],
         transforms: bytes.into(),
-        transform_format: TransformFormat::RigidF64,
+        transform_format: TransformFormat::QuaternionXyzwF64,
         ..RawStepUpdate::default()
     }
 }

@@ -5,7 +5,7 @@ use modalcast::config::{BackendChoice, Config};
 use modalcast_model::scene::Scene;
 use modalcast_proto::v1;
 use nalgebra::{Quaternion, UnitQuaternion, Vector3};
-use v1::TransformFormat::{AffineF32, RigidF32, RigidF64, Unspecified};
+use v1::TransformFormat::{AffineF32, QuaternionXyzwF32, QuaternionXyzwF64, Unspecified};
 
 use crate::service_harness::{
     ReceivedVertices, Server, config, far_strips, get_vertices, reference_vertices, rigid_step, select,
@@ -79,7 +79,8 @@ async fn transform_formats_give_equal_vertices() {
     let pose = Pose { rotation: quaternion(0.3, -0.8, 2.0), translation: [1.5, -2.25, 1e3] };
     // The pose as an affine 3 x 4 matrix.
     let matrix =
-        state_after_steps(&strips(), &[rigid_step(0, RigidF32, &[(1, pose.rotation, pose.translation)])]).transforms[1];
+        state_after_steps(&strips(), &[rigid_step(0, QuaternionXyzwF32, &[(1, pose.rotation, pose.translation)])])
+            .transforms[1];
     let affine_step = |format: v1::TransformFormat| v1::Step {
         transform_domains: vec![1],
         transforms: bytemuck::cast_slice::<f32, u8>(&matrix.0).to_vec().into(),
@@ -89,8 +90,8 @@ async fn transform_formats_give_equal_vertices() {
     let steps = [
         affine_step(Unspecified),
         affine_step(AffineF32),
-        rigid_step(0, RigidF32, &[(1, pose.rotation, pose.translation)]),
-        rigid_step(0, RigidF64, &[(1, pose.rotation, pose.translation)]),
+        rigid_step(0, QuaternionXyzwF32, &[(1, pose.rotation, pose.translation)]),
+        rigid_step(0, QuaternionXyzwF64, &[(1, pose.rotation, pose.translation)]),
     ];
     let expected_vertices = reference_vertices(&strips(), &steps[..1]);
     for (number, mut step) in steps.into_iter().enumerate() {
@@ -111,7 +112,7 @@ async fn transform_formats_give_equal_vertices() {
         assert_eq!(reply.origins, [0.0; 3]);
     }
     // Negative control: another rotation gives other vertices.
-    let other_step = rigid_step(9, RigidF32, &[(1, quaternion(0.3, -0.8, 2.1), pose.translation)]);
+    let other_step = rigid_step(9, QuaternionXyzwF32, &[(1, quaternion(0.3, -0.8, 2.1), pose.translation)]);
     assert_ne!(reference_vertices(&strips(), &[other_step]).positions, expected_vertices.positions);
 }
 
@@ -137,7 +138,7 @@ async fn far_scene_and_far_domain_keep_millimeter_precision() {
     writer
         .send_step_and_wait(rigid_step(
             1,
-            RigidF64,
+            QuaternionXyzwF64,
             &[(0, near_pose.rotation, near_pose.translation), (1, far_pose.rotation, far_pose.translation)],
         ))
         .await;
@@ -190,7 +191,7 @@ async fn origin_follows_a_moved_scene_and_survives_a_restart() {
     let pose_step = |number| {
         rigid_step(
             number,
-            RigidF64,
+            QuaternionXyzwF64,
             &[0, 1].map(|index| (index as u32, poses[index].rotation, poses[index].translation)),
         )
     };
@@ -213,7 +214,7 @@ async fn origin_follows_a_moved_scene_and_survives_a_restart() {
     // The next step changes only domain 1. Domain 0 keeps the pose that the restart restored.
     let mut writer = server.drive_lossless("strips").await;
     let new_pose = Pose { rotation: poses[1].rotation, translation: [1e7 + 11.5, 0.001, -1e7] };
-    writer.send_step_and_wait(rigid_step(0, RigidF64, &[(1, new_pose.rotation, new_pose.translation)])).await;
+    writer.send_step_and_wait(rigid_step(0, QuaternionXyzwF64, &[(1, new_pose.rotation, new_pose.translation)])).await;
     let reply = get_vertices(&server, vertex_request("strips", &[])).await.expect("expected vertices");
     let expected =
         [expected_positions(&scene, 0, &[], poses[0]), expected_positions(&scene, 1, &[], new_pose)].concat();

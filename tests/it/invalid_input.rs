@@ -91,50 +91,54 @@ fn invalid_transform_steps() -> Vec<InvalidStep> {
     let step_with_known_format = |format: v1::TransformFormat| step_with_format(format.into());
     let overflowing_step = rigid_step(
         11,
-        v1::TransformFormat::RigidF64,
+        v1::TransformFormat::QuaternionXyzwF64,
         &[(0, IDENTITY_QUATERNION, [1e7; 3]), (1, IDENTITY_QUATERNION, [1e7; 3])],
     );
     let overflowing_step = v1::Step { q_domains: vec![1], q: step(11, &[1], &[f32::MAX, 0.0]).q, ..overflowing_step };
     vec![
         ("unknown format", step_with_format(9), ["step.transform_format", "a format of this version", "9"]),
         (
-            "affine bytes in format RigidF32",
-            step_with_known_format(v1::TransformFormat::RigidF32),
+            "affine bytes in format QuaternionXyzwF32",
+            step_with_known_format(v1::TransformFormat::QuaternionXyzwF32),
             ["step.transforms", "28 bytes (1 tr", "48 bytes"],
         ),
         (
-            "affine bytes in format RigidF64",
-            step_with_known_format(v1::TransformFormat::RigidF64),
+            "affine bytes in format QuaternionXyzwF64",
+            step_with_known_format(v1::TransformFormat::QuaternionXyzwF64),
             ["step.transforms", "40 bytes (1 tr", "48 bytes"],
         ),
         (
             "zero quaternion",
-            rigid_step(11, v1::TransformFormat::RigidF32, &[(1, [0.0; 4], [0.0; 3])]),
+            rigid_step(11, v1::TransformFormat::QuaternionXyzwF32, &[(1, [0.0; 4], [0.0; 3])]),
             ["step.transforms[0].rotation", "a quaternion x y z w of norm 1", "norm 0"],
         ),
         (
             "quaternion of norm 2",
-            rigid_step(11, v1::TransformFormat::RigidF64, &[(0, [0.0, 2.0, 0.0, 0.0], [0.0; 3])]),
+            rigid_step(11, v1::TransformFormat::QuaternionXyzwF64, &[(0, [0.0, 2.0, 0.0, 0.0], [0.0; 3])]),
             ["step.transforms[0].rotation", "a quaternion x y z w of norm 1", "norm 2"],
         ),
         (
             "NaN in a quaternion",
-            rigid_step(11, v1::TransformFormat::RigidF64, &[(1, [0.0, f32::NAN, 0.0, 1.0], [0.0; 3])]),
+            rigid_step(11, v1::TransformFormat::QuaternionXyzwF64, &[(1, [0.0, f32::NAN, 0.0, 1.0], [0.0; 3])]),
             ["step.transforms[0].rotation[1]", "a finite", "NaN"],
         ),
         (
             "infinity in an f32 translation",
-            rigid_step(11, v1::TransformFormat::RigidF32, &[(0, IDENTITY_QUATERNION, [0.0, 1e300, 0.0])]),
+            rigid_step(11, v1::TransformFormat::QuaternionXyzwF32, &[(0, IDENTITY_QUATERNION, [0.0, 1e300, 0.0])]),
             ["step.transforms[0].translation[1]", "a finite", "inf"],
         ),
         (
             "infinity in an f64 translation",
-            rigid_step(11, v1::TransformFormat::RigidF64, &[(0, IDENTITY_QUATERNION, [0.0, 0.0, f64::NEG_INFINITY])]),
+            rigid_step(
+                11,
+                v1::TransformFormat::QuaternionXyzwF64,
+                &[(0, IDENTITY_QUATERNION, [0.0, 0.0, f64::NEG_INFINITY])],
+            ),
             ["step.transforms[0].translation[2]", "a finite", "-inf"],
         ),
         (
             "f64 translation above the limit",
-            rigid_step(11, v1::TransformFormat::RigidF64, &[(1, IDENTITY_QUATERNION, [-1e300, 0.0, 0.0])]),
+            rigid_step(11, v1::TransformFormat::QuaternionXyzwF64, &[(1, IDENTITY_QUATERNION, [-1e300, 0.0, 0.0])]),
             ["step.transforms[0].translation[0]", "at most 1.09", "-1000000000"],
         ),
         ("q moves a vertex of a far scene beyond 1e18", overflowing_step, ["step.q", "q and transform", "vertex"]),

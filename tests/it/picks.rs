@@ -82,7 +82,7 @@ async fn reduced_force_of_a_hit_matches_the_complete_modes() {
     let rotation = [0.0, 0.0, std::f32::consts::FRAC_1_SQRT_2, std::f32::consts::FRAC_1_SQRT_2];
     let steps = [
         step(1, &[0, 1], &[0.2, -0.1, 0.15, 0.3]),
-        rigid_step(2, v1::TransformFormat::RigidF32, &[(1, rotation, [1.0, 0.25, -0.5])]),
+        rigid_step(2, v1::TransformFormat::QuaternionXyzwF32, &[(1, rotation, [1.0, 0.25, -0.5])]),
     ];
     // Pixel (44, 37) shows the strips before and after the steps.
     let rest_picks = client
@@ -164,7 +164,7 @@ async fn many_hits_are_chunked_and_far_picks_keep_precision() {
     // Poses are in half meters, the unit of the scene, from the world origin.
     let domain_translation = [3e7, -2e7 + 0.125, 2e7];
     let poses = [0, 1].map(|domain| (domain, IDENTITY_QUATERNION, domain_translation));
-    let far_step = rigid_step(1, v1::TransformFormat::RigidF64, &poses);
+    let far_step = rigid_step(1, v1::TransformFormat::QuaternionXyzwF64, &poses);
     server.drive_lossless("far").await.send_step_and_wait(far_step.clone()).await;
     // Cameras and picked positions are in scene units from the scene origin.
     let translation: [f64; 3] = std::array::from_fn(|axis| domain_translation[axis] - scene.origin[axis] / scene.unit);
@@ -298,7 +298,7 @@ async fn outputs_have_their_format_and_agree_with_picks() {
 async fn distant_domains_are_picked_by_nearby_cameras() {
     let (server, client) = start_server("strips").await;
     let translation = [1e7 + 1.25, 0.0, -1e7];
-    let far_step = rigid_step(1, v1::TransformFormat::RigidF64, &[(1, IDENTITY_QUATERNION, translation)]);
+    let far_step = rigid_step(1, v1::TransformFormat::QuaternionXyzwF64, &[(1, IDENTITY_QUATERNION, translation)]);
     server.drive_lossless("strips").await.send_step_and_wait(far_step).await;
     // The third pick is like the first, after a camera far away from it.
     for (domain, center) in [(1, translation), (0, [0.0; 3]), (1, translation)] {

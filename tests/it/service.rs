@@ -132,7 +132,7 @@ async fn client_can_read_the_whole_scene() {
     assert_eq!((left.name.as_str(), left.vertices, left.rank, left.parent), ("left", 4, 2, None));
     assert_eq!((left.eigenvalues.as_slice(), left.notes["species"].as_str()), ([1.0, 4.0].as_slice(), "none"));
     assert_eq!(
-        (right.name.as_str(), right.parent, right.attachment_rows.as_slice()),
+        (right.name.as_str(), right.parent, right.attachment_vertices.as_slice()),
         ("right", Some(0), [1, 3].as_slice())
     );
     // A transform of 3 x 4 numbers in f32 has 48 bytes.

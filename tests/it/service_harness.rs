@@ -130,7 +130,7 @@ fn two_strips(mode_scale: f32) -> (Shape, Vec<Domain>) {
     let modes = Modes::from_columns(12, 2, columns).expect("expected valid modes");
     let shape = Shape::new(grid(2), modes).expect("expected a valid shape");
     // An attachment and metadata are sent to clients, but do not change the vertices.
-    let attachment = Attachment { parent: 0, frame: Transform::IDENTITY, rows: vec![1, 3] };
+    let attachment = Attachment { parent: 0, frame: Transform::IDENTITY, vertices: vec![1, 3] };
     let notes = [("species".to_owned(), "none".to_owned())].into();
     let metadata = Metadata { eigenvalues: vec![1.0, 4.0], notes };
     let left = Domain { metadata, ..domain("left", None) };
@@ -379,7 +379,9 @@ pub(crate) fn rigid_step(number: u64, format: v1::TransformFormat, poses: &[(u32
     for (_, rotation, translation) in poses {
         bytes.extend(rotation.iter().flat_map(|number| number.to_le_bytes()));
         match format {
-            v1::TransformFormat::RigidF64 => bytes.extend(translation.iter().flat_map(|number| number.to_le_bytes())),
+            v1::TransformFormat::QuaternionXyzwF64 => {
+                bytes.extend(translation.iter().flat_map(|number| number.to_le_bytes()))
+            }
             _ => bytes.extend(translation.iter().flat_map(|number| (*number as f32).to_le_bytes())),
         }
     }
@@ -415,8 +417,8 @@ pub(crate) fn state_after_steps(scene: &Scene, steps: &[v1::Step]) -> SceneState
     for step in steps.iter().cloned() {
         let transform_format = match step.transform_format() {
             WireFormat::Unspecified | WireFormat::AffineF32 => TransformFormat::Affine,
-            WireFormat::RigidF32 => TransformFormat::RigidF32,
-            WireFormat::RigidF64 => TransformFormat::RigidF64,
+            WireFormat::QuaternionXyzwF32 => TransformFormat::QuaternionXyzwF32,
+            WireFormat::QuaternionXyzwF64 => TransformFormat::QuaternionXyzwF64,
         };
         let raw_update = RawStepUpdate {
             number: step.number,

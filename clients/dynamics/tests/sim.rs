@@ -46,7 +46,7 @@ fn tree_server() -> FakeServer {
             domain.wire.parent = Some(index - 1);
             domain.wire.attachment_frame = pack(&parent_from_child).into();
             // The last of the nine sections.
-            domain.wire.attachment_rows = (48..54).collect();
+            domain.wire.attachment_vertices = (48..54).collect();
         }
         domain.wire.placement = pack(&placement).into();
         let eigenvalue = |hertz: f64| (2.0 * std::f64::consts::PI * hertz).powi(2);

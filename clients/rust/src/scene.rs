@@ -314,8 +314,7 @@ fn decode_domain(wire: v1::DomainDescription) -> Result<Domain> {
         Some(parent) => Some(Attachment {
             parent: parent as usize,
             parent_from_child: decode_transform("attachment_frame", &wire.attachment_frame)?,
-            // Despite their name, `attachment_rows` are vertices, not rows of U.
-            parent_vertices: wire.attachment_rows.clone(),
+            parent_vertices: wire.attachment_vertices.clone(),
         }),
     };
     let follow = match wire.follows {

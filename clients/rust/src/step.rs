@@ -13,10 +13,10 @@ pub enum DomainTransform {
     /// allows it.
     Affine([f32; 12]),
     /// 28 bytes: the rotation, then a translation relative to the scene's origin.
-    RigidF32 { rotation: [f32; 4], translation: [f32; 3] },
+    QuaternionXyzwF32 { rotation: [f32; 4], translation: [f32; 3] },
     /// 40 bytes: the rotation, then a translation relative to the world's origin. The server subtracts the scene's
     /// origin in f64. Resolves millimeters at 10,000 km.
-    RigidF64 { rotation: [f32; 4], translation: [f64; 3] },
+    QuaternionXyzwF64 { rotation: [f32; 4], translation: [f64; 3] },
 }
 
 impl DomainTransform {
@@ -24,19 +24,19 @@ impl DomainTransform {
         match self {
             // Means affine, also to a server that does not know the other formats.
             Self::Affine(_) => v1::TransformFormat::Unspecified,
-            Self::RigidF32 { .. } => v1::TransformFormat::RigidF32,
-            Self::RigidF64 { .. } => v1::TransformFormat::RigidF64,
+            Self::QuaternionXyzwF32 { .. } => v1::TransformFormat::QuaternionXyzwF32,
+            Self::QuaternionXyzwF64 { .. } => v1::TransformFormat::QuaternionXyzwF64,
         }
     }
 
     fn append_to(&self, bytes: &mut BytesMut) {
         match self {
             Self::Affine(entries) => append_numbers(bytes, entries),
-            Self::RigidF32 { rotation, translation } => {
+            Self::QuaternionXyzwF32 { rotation, translation } => {
                 append_numbers(bytes, rotation);
                 append_numbers(bytes, translation);
             }
-            Self::RigidF64 { rotation, translation } => {
+            Self::QuaternionXyzwF64 { rotation, translation } => {
                 append_numbers(bytes, rotation);
                 append_numbers(bytes, translation);
             }
@@ -164,31 +164,31 @@ mod tests {
     }
 
     #[test]
-    fn rigid_transforms_start_with_rotation_and_do_not_mix() {
+    fn quaternion_formats_start_with_rotation_and_do_not_mix() {
         let rotation = [0.0, 0.6, 0.0, 0.8];
-        let rigid_f32 = DomainTransform::RigidF32 { rotation, translation: [1.0, 2.0, 3.0] };
-        let rigid_f64 = DomainTransform::RigidF64 { rotation, translation: [1e7, 2.0, 3.25] };
-        let step = Step::new(0, 0.0).domain_transform(4, &rigid_f32).domain_transform(2, &rigid_f32);
-        // Two rigid f32 transforms of 28 bytes.
+        let quaternion_f32 = DomainTransform::QuaternionXyzwF32 { rotation, translation: [1.0, 2.0, 3.0] };
+        let quaternion_f64 = DomainTransform::QuaternionXyzwF64 { rotation, translation: [1e7, 2.0, 3.25] };
+        let step = Step::new(0, 0.0).domain_transform(4, &quaternion_f32).domain_transform(2, &quaternion_f32);
+        // Two f32 transforms of 28 bytes.
         assert_eq!((step.check_formats().is_ok(), step.payload_bytes()), (true, 2 * 28));
         let wire = step.clone().to_wire();
         assert_eq!(
             (wire.transform_domains.as_slice(), wire.transform_format()),
-            ([4, 2].as_slice(), v1::TransformFormat::RigidF32)
+            ([4, 2].as_slice(), v1::TransformFormat::QuaternionXyzwF32)
         );
         // The y component of the rotation, and the z component of the translation.
         assert_eq!(
             (&wire.transforms[4..8], &wire.transforms[24..28]),
             (&0.6_f32.to_le_bytes()[..], &3.0_f32.to_le_bytes()[..])
         );
-        let wire = Step::new(0, 0.0).domain_transform(1, &rigid_f64).to_wire();
-        assert_eq!((wire.transforms.len(), wire.transform_format()), (40, v1::TransformFormat::RigidF64));
+        let wire = Step::new(0, 0.0).domain_transform(1, &quaternion_f64).to_wire();
+        assert_eq!((wire.transforms.len(), wire.transform_format()), (40, v1::TransformFormat::QuaternionXyzwF64));
         // The real part of the rotation, and the x component of the translation.
         assert_eq!(
             (&wire.transforms[12..16], &wire.transforms[16..24]),
             (&0.8_f32.to_le_bytes()[..], &1e7_f64.to_le_bytes()[..])
         );
-        for step in [step.clone().domain_transform(1, &rigid_f64), step.transform(1, &[0.0; 12])] {
+        for step in [step.clone().domain_transform(1, &quaternion_f64), step.transform(1, &[0.0; 12])] {
             let error = step.check_formats().expect_err("mixed formats").to_string();
             assert_eq!(error, "step 0 cannot be sent: expected transforms of one format, got several");
         }

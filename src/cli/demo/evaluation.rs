@@ -209,7 +209,7 @@ impl Joint {
         let state = SceneState::rest(scene);
         let diagonal = scene.rest_bounds.diagonal();
         let joint = |(child, domain): (usize, &modalcast_model::domain::Domain)| {
-            let attachment = domain.attachment.as_ref().filter(|attachment| !attachment.rows.is_empty())?;
+            let attachment = domain.attachment.as_ref().filter(|attachment| !attachment.vertices.is_empty())?;
             // A child that follows another domain has no transform of its own. Its gap is not checked.
             let transform_index = scene
                 .transform_roots
@@ -219,7 +219,7 @@ impl Joint {
             let first_vertex = scene.layout.domains[attachment.parent].first_vertex;
             let joint = Self {
                 transform_index,
-                ring: attachment.rows.iter().map(|row| first_vertex + *row as usize).collect(),
+                ring: attachment.vertices.iter().map(|vertex| first_vertex + *vertex as usize).collect(),
             };
             let center = center(joint.ring.iter().map(|vertex| rest_positions[*vertex]));
             // The tolerance allows for the f32 rounding of rest positions.

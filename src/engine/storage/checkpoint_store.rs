@@ -294,7 +294,7 @@ mod tests {
         let raw = RawStepUpdate {
             transform_domains: vec![1],
             transforms: rotation.chain(translation).collect(),
-            transform_format: TransformFormat::RigidF64,
+            transform_format: TransformFormat::QuaternionXyzwF64,
             ..RawStepUpdate::default()
         };
         let mut state = deformed_state(&scene);

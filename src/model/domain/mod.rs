@@ -90,7 +90,7 @@ pub struct Attachment {
     pub frame: Transform,
     /// Vertices of the parent near the joint. Clients fit the motion of the joint to the displacements of these
     /// vertices. Empty for a rigid parent.
-    pub rows: Vec<u32>,
+    pub vertices: Vec<u32>,
 }
 
 /// Attaches a domain to another one by a constant transform: T = T_parent F. The modes of the parent do not affect T.

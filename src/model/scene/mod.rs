@@ -46,7 +46,7 @@ use crate::error::{Result, invalid};
 /// The largest number of domains in a scene.
 pub const MAX_DOMAINS: usize = 1 << 20;
 
-/// The largest size of a domain's name. With [`MAX_NOTES_BYTES`] and [`MAX_ATTACHMENT_ROWS`], it keeps the description
+/// The largest size of a domain's name. With [`MAX_NOTES_BYTES`] and [`MAX_ATTACHMENT_VERTICES`], it keeps the description
 /// of a domain within one gRPC message.
 const MAX_NAME_BYTES: usize = 4 << 10;
 
@@ -54,7 +54,7 @@ const MAX_NAME_BYTES: usize = 4 << 10;
 const MAX_NOTES_BYTES: usize = 64 << 10;
 
 /// The largest number of parent vertices that define an attachment frame.
-const MAX_ATTACHMENT_ROWS: usize = 4096;
+const MAX_ATTACHMENT_VERTICES: usize = 4096;
 
 /// The input of [`Scene::new`], as a loader produces it.
 #[derive(Debug, Clone, Default)]
@@ -253,12 +253,12 @@ fn check_domain(parts: &SceneParts, index: usize) -> Result<()> {
         // A parent precedes its children, so that the hierarchy has no cycles and one pass in order can compose it.
         check_index("parent", attachment.parent, index)?;
         let vertices = parts.shapes[parts.domains[attachment.parent].shape].mesh.rest_positions().len();
-        if attachment.rows.len() > MAX_ATTACHMENT_ROWS {
-            let expected = format!("at most {MAX_ATTACHMENT_ROWS} vertices");
-            return Err(invalid("attachment.rows", expected, attachment.rows.len()));
+        if attachment.vertices.len() > MAX_ATTACHMENT_VERTICES {
+            let expected = format!("at most {MAX_ATTACHMENT_VERTICES} vertices");
+            return Err(invalid("attachment.vertices", expected, attachment.vertices.len()));
         }
-        for row in &attachment.rows {
-            check_index("attachment.rows", *row as usize, vertices)?;
+        for vertex in &attachment.vertices {
+            check_index("attachment.vertices", *vertex as usize, vertices)?;
         }
     }
     Ok(())
@@ -425,13 +425,14 @@ mod tests {
 
     #[test]
     fn oversized_names_notes_and_attachments_are_rejected() {
-        let build_scene = |name_bytes: usize, notes_bytes: usize, row_count: usize| {
+        let build_scene = |name_bytes: usize, notes_bytes: usize, vertex_count: usize| {
             let mut parts = square(vec![]);
             let mut domain = parts.domains[0].clone();
             domain.name = "x".repeat(name_bytes);
             // The names "a" and "b" and the text "y" take 3 bytes.
             domain.metadata.notes = [("a".into(), "x".repeat(notes_bytes - 3)), ("b".into(), "y".into())].into();
-            domain.attachment = Some(Attachment { parent: 0, frame: Transform::IDENTITY, rows: vec![3; row_count] });
+            domain.attachment =
+                Some(Attachment { parent: 0, frame: Transform::IDENTITY, vertices: vec![3; vertex_count] });
             parts.domains.push(domain);
             Scene::new(parts).map(drop).map_err(|error| error.to_string())
         };
@@ -440,7 +441,7 @@ mod tests {
             |field, limit, actual| Err(format!("domain 1: {field}: expected at most {limit}, got {actual}"));
         assert_eq!(build_scene(4097, 65536, 4096), rejection("name", "4096 bytes", 4097));
         assert_eq!(build_scene(4096, 65537, 4096), rejection("notes", "65536 bytes in all", 65537));
-        assert_eq!(build_scene(4096, 65536, 4097), rejection("attachment.rows", "4096 vertices", 4097));
+        assert_eq!(build_scene(4096, 65536, 4097), rejection("attachment.vertices", "4096 vertices", 4097));
     }
 
     #[test]

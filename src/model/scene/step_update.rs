@@ -183,8 +183,8 @@ fn parse_transforms(scene: &Scene, raw: &RawStepUpdate) -> Result<ParsedTransfor
     let origin = scene.origin.map(|meters| meters / scene.unit);
     let parse = |bytes: &[u8]| match raw.transform_format {
         TransformFormat::Affine => parse_affine(scene, bytes),
-        TransformFormat::RigidF32 => transform_format::parse_rigid_f32(bytes),
-        TransformFormat::RigidF64 => transform_format::parse_rigid_f64(bytes, origin),
+        TransformFormat::QuaternionXyzwF32 => transform_format::parse_quaternion_f32(bytes),
+        TransformFormat::QuaternionXyzwF64 => transform_format::parse_quaternion_f64(bytes, origin),
     };
     let encoded_transforms = raw.transforms.par_chunks_exact(transform_bytes).with_min_len(MIN_TRANSFORMS_PER_THREAD);
     let first_invalid = AtomicUsize::new(usize::MAX);
@@ -197,7 +197,7 @@ fn parse_transforms(scene: &Scene, raw: &RawStepUpdate) -> Result<ParsedTransfor
     };
     let parsed = encoded_transforms.zip(&domains).map(|(bytes, domain)| (domain, bytes)).enumerate().map(parse_or_note);
     let (transforms, translations) = match raw.transform_format {
-        TransformFormat::RigidF64 => {
+        TransformFormat::QuaternionXyzwF64 => {
             let (transforms, translations): (Vec<_>, Vec<_>) = parsed.unzip();
             (transforms, translations.into_iter().flatten().collect())
         }

@@ -162,7 +162,7 @@ impl PartPlacer<'_> {
             domain.attachment = Some(Attachment {
                 parent,
                 frame: Transform::from_matrix(&parent_from_child.to_homogeneous()),
-                rows: templates[template_index].ring_rows(child_joint.ring),
+                vertices: templates[template_index].ring_vertices(child_joint.ring),
             });
             self.domains.push(domain);
             self.place_children(self.domains.len() - 1, child_joint.template_index, &world_from_child);
@@ -276,16 +276,22 @@ mod tests {
             let attachment = domain.attachment.as_ref().expect("a parent for every part but the trunk");
             let parent = &parts.domains[attachment.parent];
             let rest_positions = parts.shapes[parent.shape].mesh.rest_positions();
-            let joint_gap = |rows: &[u32]| {
+            let joint_gap = |vertices: &[u32]| {
                 let sum: Vector3<f64> =
-                    rows.iter().map(|row| Vector3::from(rest_positions[*row as usize]).cast::<f64>()).sum();
-                let center = parent.placement.to_matrix().transform_point(&(sum / rows.len() as f64).into());
+                    vertices.iter().map(|vertex| Vector3::from(rest_positions[*vertex as usize]).cast::<f64>()).sum();
+                let center = parent.placement.to_matrix().transform_point(&(sum / vertices.len() as f64).into());
                 (center.coords - domain.placement.translation()).norm()
             };
-            assert!(joint_gap(&attachment.rows) <= 1e-5, "{}: a gap of {}", domain.name, joint_gap(&attachment.rows));
-            // Counterexample: the center of the ring below is elsewhere. Rings are consecutive in the rows of a part.
-            let row_count = attachment.rows.len() as u32;
-            let lower_ring: Vec<u32> = attachment.rows.iter().map(|row| row.saturating_sub(row_count)).collect();
+            assert!(
+                joint_gap(&attachment.vertices) <= 1e-5,
+                "{}: a gap of {}",
+                domain.name,
+                joint_gap(&attachment.vertices)
+            );
+            // Counterexample: the center of the ring below is elsewhere. Rings are consecutive in the vertices of a part.
+            let vertex_count = attachment.vertices.len() as u32;
+            let lower_ring: Vec<u32> =
+                attachment.vertices.iter().map(|vertex| vertex.saturating_sub(vertex_count)).collect();
             assert!(joint_gap(&lower_ring) > 1e-3, "{}", domain.name);
         }
         assert!(parts.domains[0].attachment.is_none());

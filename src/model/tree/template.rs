@@ -70,8 +70,8 @@ impl PartTemplate {
     }
 
     /// The vertices of a ring of the tube. The tube must be the first geometry of the skin.
-    pub(super) fn ring_rows(&self, ring: usize) -> Vec<u32> {
-        (ring * self.sides..(ring + 1) * self.sides).map(|row| row as u32).collect()
+    pub(super) fn ring_vertices(&self, ring: usize) -> Vec<u32> {
+        (ring * self.sides..(ring + 1) * self.sides).map(|vertex| vertex as u32).collect()
     }
 
     /// Adds a tube around the centerline. For `radius_factor`, see [`SkinBuilder::add_tube`].
@@ -177,17 +177,17 @@ mod tests {
             let beam = template.beam();
             let beam_modes = beam.solve_modes(template.rank).expect("a converged solution");
             let ring_mean = |ring: usize, mode: usize| {
-                let rows = template.ring_rows(ring);
-                let count = rows.len() as f64;
-                let row_vector =
-                    |row: u32| Vector3::from_fn(|axis, _| f64::from(shape.modes.entry(row as usize, axis, mode)));
-                rows.into_iter().map(row_vector).sum::<Vector3<f64>>() / count
+                let vertices = template.ring_vertices(ring);
+                let count = vertices.len() as f64;
+                let vertex_vector =
+                    |vertex: u32| Vector3::from_fn(|axis, _| f64::from(shape.modes.entry(vertex as usize, axis, mode)));
+                vertices.into_iter().map(vertex_vector).sum::<Vector3<f64>>() / count
             };
             for mode in 0..template.rank {
-                let base_rows = template.ring_rows(0);
+                let base_vertices = template.ring_vertices(0);
                 let is_zero =
-                    |row: &u32| (0..3).all(|axis| shape.modes.entry(*row as usize, axis, mode).to_bits() == 0);
-                assert!(base_rows.iter().all(is_zero), "expected a clamped base");
+                    |vertex: &u32| (0..3).all(|axis| shape.modes.entry(*vertex as usize, axis, mode).to_bits() == 0);
+                assert!(base_vertices.iter().all(is_zero), "expected a clamped base");
                 let dofs: Vec<f64> = beam_modes.mode_shapes.column(mode).iter().copied().collect();
                 let max_entry = beam_modes.mode_shapes.column(mode).amax();
                 for ring in 1..template.centerline.points.len() {

@@ -25,7 +25,7 @@ fn open_context() -> DeviceContext {
 
 /// The rest state with `domains` (indices) moved by an f64 translation.
 fn move_domains(scene: &Scene, domains: &[u32], [x, y, z]: [f64; 3]) -> SceneState {
-    // `RigidF64`: a quaternion (x, y, z, w) in f32, here the identity, then a translation in f64.
+    // `QuaternionXyzwF64`: a quaternion (x, y, z, w) in f32, here the identity, then a translation in f64.
     let transform_bytes = || {
         let quaternion = [0.0, 0.0, 0.0, 1.0_f32].into_iter().flat_map(f32::to_le_bytes);
         quaternion.chain([x, y, z].into_iter().flat_map(f64::to_le_bytes))
@@ -33,7 +33,7 @@ fn move_domains(scene: &Scene, domains: &[u32], [x, y, z]: [f64; 3]) -> SceneSta
     let raw_update = RawStepUpdate {
         transform_domains: domains.to_vec(),
         transforms: domains.iter().flat_map(|_| transform_bytes()).collect(),
-        transform_format: TransformFormat::RigidF64,
+        transform_format: TransformFormat::QuaternionXyzwF64,
         ..RawStepUpdate::default()
     };
     let mut state = SceneState::rest(scene);

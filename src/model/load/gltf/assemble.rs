@@ -178,8 +178,8 @@ impl GltfAssembler<'_> {
 
 fn create_attachment(parent_domain: &ParentDomain) -> Result<Attachment> {
     let frame = to_transform(&parent_domain.domain_from_node)?;
-    // Without rows, because morph targets do not move the frame of a node in glTF.
-    Ok(Attachment { parent: parent_domain.domain, frame, rows: vec![] })
+    // Without vertices, because morph targets do not move the frame of a node in glTF.
+    Ok(Attachment { parent: parent_domain.domain, frame, vertices: vec![] })
 }
 
 fn to_transform(matrix: &Matrix4<f64>) -> Result<Transform> {

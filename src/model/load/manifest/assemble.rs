@@ -16,8 +16,8 @@ use crate::load::obj::ModesSource;
 use crate::load::{modes, source, texture_cache};
 use crate::scene::{MAX_DOMAINS, SceneParts, UpAxis};
 
-/// Number of parent vertices that carry the domains of an entry without `rows`.
-const DEFAULT_ATTACHMENT_ROWS: usize = 8;
+/// Number of parent vertices that carry the domains of an entry without `parent_vertices`.
+const DEFAULT_ATTACHMENT_VERTICES: usize = 8;
 /// The largest number of names in an error message.
 const MAX_LISTED_NAMES: usize = 16;
 
@@ -226,9 +226,9 @@ impl ManifestAssembler<'_> {
     /// The index of the entry's parent, or `None` for an entry without a parent.
     fn find_parent(&self, entry: &DomainEntry) -> Result<Option<usize>> {
         let Some(name) = &entry.parent else {
-            return match (&entry.frame, &entry.rows) {
+            return match (&entry.frame, &entry.parent_vertices) {
                 (None, None) => Ok(None),
-                _ => Err(invalid("parent", "a parent for the keys frame and rows", "none")),
+                _ => Err(invalid("parent", "a parent for the keys frame and parent_vertices", "none")),
             };
         };
         if entry.frame.is_some() && entry.placement.is_some() {
@@ -243,11 +243,11 @@ impl ManifestAssembler<'_> {
         let parent_from_world = parent_domain.placement.inverse();
         let singular_placement = || invalid("parent", "a parent whose placement has an inverse", &parent_domain.name);
         let frame = parent_from_world.ok_or_else(singular_placement)?.compose(world_from_child);
-        let rows = match &entry.rows {
-            Some(rows) => rows.clone(),
+        let vertices = match &entry.parent_vertices {
+            Some(vertices) => vertices.clone(),
             None => nearest_vertices(&self.parts.shapes[parent_domain.shape], frame),
         };
-        Ok(Attachment { parent, frame, rows })
+        Ok(Attachment { parent, frame, vertices })
     }
 
     /// Gives the entry its own copies of the materials that it overrides.
@@ -351,7 +351,7 @@ fn up_axis_rotation(model_up: Option<UpAxis>, scene_up: UpAxis) -> Transform {
     Transform::from_parts(rotation.matrix(), &nalgebra::Vector3::zeros())
 }
 
-/// The [`DEFAULT_ATTACHMENT_ROWS`] vertices of a deformable shape nearest to the translation of `frame`, in ascending
+/// The [`DEFAULT_ATTACHMENT_VERTICES`] vertices of a deformable shape nearest to the translation of `frame`, in ascending
 /// order of their indices. Empty for a rigid shape.
 fn nearest_vertices(shape: &Shape, frame: Transform) -> Vec<u32> {
     if shape.modes.rank() == 0 {
@@ -363,7 +363,7 @@ fn nearest_vertices(shape: &Shape, frame: Transform) -> Vec<u32> {
         |vertex: u32| (nalgebra::Vector3::from(rest_positions[vertex as usize]).cast::<f64>() - origin).norm_squared();
     let mut vertices: Vec<u32> = (0..rest_positions.len() as u32).collect();
     vertices.sort_by(|a, b| squared_distance(*a).total_cmp(&squared_distance(*b)));
-    vertices.truncate(DEFAULT_ATTACHMENT_ROWS);
+    vertices.truncate(DEFAULT_ATTACHMENT_VERTICES);
     vertices.sort_unstable();
     vertices
 }

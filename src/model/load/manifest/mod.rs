@@ -52,7 +52,7 @@
 //! up = "z"                   # up axis of the model; the model is rotated to the up axis of the scene
 //! parent = "trunk"           # a domain of an earlier entry
 //! frame = { translation = [0, 1, 0] }   # parent_from_model, instead of a placement
-//! rows = [3, 4, 5]           # vertices of the parent that carry it; default: the nearest eight of a deformable parent
+//! parent_vertices = [3, 4, 5]   # the vertices that carry it; default: the nearest eight of a deformable parent
 //! material = { diffuse = [1, 0, 0] }    # overrides for this entry only
 //! eigenvalues = [39.5]       # (rad/s)^2, one per mode of a single domain; stored for clients
 //! notes = { source = "scan" }   # strings, stored for clients
@@ -128,7 +128,7 @@ struct DomainEntry {
     /// `parent_from_model`.
     frame: Option<Placement>,
     /// Vertices of the parent that carry the model.
-    rows: Option<Vec<u32>>,
+    parent_vertices: Option<Vec<u32>>,
     /// Name prefix of the domains that move rigidly with their parent.
     follows: Option<String>,
     material: Option<MaterialPatch>,

@@ -107,7 +107,7 @@ fn instances_share_mesh_and_modes_but_not_coordinates_or_names() {
 fn child_attaches_by_frame_or_by_placement() {
     let parts = read_parts(
         "[[domain]]\nname = 'trunk'\nmodel = 'a.obj'\nmodes = 'u.txt'\nplacement = { translation = [10, 0, 0], axis = [0, 0, 1], degrees = 90 }\n\
-         [[domain]]\nname = 'by frame'\nmodel = 'b.obj'\nparent = 'trunk'\nframe.translation = [1, 0, 0]\nrows = [1]\n\
+         [[domain]]\nname = 'by frame'\nmodel = 'b.obj'\nparent = 'trunk'\nframe.translation = [1, 0, 0]\nparent_vertices = [1]\n\
          [[domain]]\nname = 'by place'\nmodel = 'b.obj'\nparent = 'trunk'\nplacement.translation = [10, 1, 0]\n",
     )
     .expect("a valid manifest");
@@ -115,11 +115,11 @@ fn child_attaches_by_frame_or_by_placement() {
     let translation = |transform: Transform| transform.translation().map(|x| (x * 1e4).round() / 1e4);
     // The trunk at (10, 0, 0) is rotated by 90 degrees about z, which maps (1, 0, 0) to (0, 1, 0).
     assert_eq!(translation(by_frame.placement), nalgebra::Vector3::new(10.0, 1.0, 0.0));
-    // Without `rows`, the nearest eight vertices of the parent are used. The trunk has only three.
-    for (child, rows) in [(by_frame, &[1][..]), (by_placement, &[0, 1, 2])] {
+    // Without `parent_vertices`, the nearest eight vertices of the parent are used. The trunk has only three.
+    for (child, vertices) in [(by_frame, &[1][..]), (by_placement, &[0, 1, 2])] {
         let attachment = child.attachment.as_ref().expect("an attachment");
         assert_eq!(translation(attachment.frame), nalgebra::Vector3::x(), "{}", child.name);
-        assert_eq!((attachment.parent, &attachment.rows[..]), (0, rows), "{}", child.name);
+        assert_eq!((attachment.parent, &attachment.vertices[..]), (0, vertices), "{}", child.name);
     }
 }
 
@@ -202,7 +202,10 @@ fn invalid_manifest_is_rejected_with_line_or_entry() {
             "domain 0 ('a.obj'): material 'red': colour_texture: file 'x.png'",
         ),
         ("[[domain]]\nmodel = 'a.obj'\nparent = 'x'\n", "domain 0 ('a.obj'): parent: expected the name of a domain"),
-        ("[[domain]]\nmodel = 'a.obj'\nrows = [1]\n", "domain 0 ('a.obj'): parent: expected a parent for the keys"),
+        (
+            "[[domain]]\nmodel = 'a.obj'\nparent_vertices = [1]\n",
+            "domain 0 ('a.obj'): parent: expected a parent for the keys",
+        ),
         (
             "[[domain]]\nmodel = 'a.obj'\neigenvalues = [1]\n",
             "domain 0 ('a.obj'): eigenvalues: expected one domain, and one finite",

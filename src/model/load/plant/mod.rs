@@ -99,7 +99,7 @@ impl PlantBuilder<'_> {
             parent.and_then(|parent| self.organ_domains.get(&parent)).map(|(index, parent_origin)| Attachment {
                 parent: *index,
                 frame: translation_transform([0, 1, 2].map(|axis| origin[axis] - parent_origin[axis])),
-                rows: Vec::new(),
+                vertices: Vec::new(),
             });
         self.organ_domains.insert(organ, (self.parts.domains.len(), origin));
         let kind = if matches!(organ, Organ::Shoot(_)) { "shoot" } else { "leaf" };

@@ -38,7 +38,7 @@ fn f64_step(domains: &[u32], translations: &[[f64; 3]]) -> RawStepUpdate {
     RawStepUpdate {
         transform_domains: domains.to_vec(),
         transforms: translations.iter().flat_map(encode).collect(),
-        transform_format: TransformFormat::RigidF64,
+        transform_format: TransformFormat::QuaternionXyzwF64,
         ..RawStepUpdate::default()
     }
 }

@@ -200,7 +200,7 @@ fn nodes_are_placed_and_attached_to_the_nearest_ancestor_mesh() {
     assert_close(&parts.domains[2].placement.0, &[1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 5.0, 0.0, 0.0, 1.0, 0.0]);
     // The translation of "leaf" by 1 along z, then the rotation of "joint" by 90 degrees about z.
     let attachment = parts.domains[1].attachment.as_ref().expect("an attachment to the root");
-    assert_eq!((attachment.parent, attachment.rows.len()), (0, 0));
+    assert_eq!((attachment.parent, attachment.vertices.len()), (0, 0));
     assert_close(&attachment.frame.0, &[0.0, -1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0]);
     let world_from_leaf = parts.domains[0].placement.compose(attachment.frame);
     assert_close(&world_from_leaf.0, &parts.domains[1].placement.0);
