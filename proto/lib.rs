@@ -8,4 +8,8 @@ pub mod v1 {
 
     /// Encoded file descriptors, for the reflection service.
     pub const DESCRIPTORS: &[u8] = include_bytes!("generated/descriptors.bin");
+
+    /// `GetServerInfoResponse.protocol_version` of this contract. Increase it with every change after which a client of
+    /// the previous contract no longer works.
+    pub const PROTOCOL_VERSION: u32 = 1;
 }

@@ -3839,6 +3839,7 @@ pub mod state_service_server {
 pub struct GetServerInfoRequest {}
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct GetServerInfoResponse {
+    /// Version of the program, for people.
     #[prost(string, tag = "1")]
     pub version: ::prost::alloc::string::String,
     /// The deformer in use: "cpu", "cuda" or "reference".
@@ -3855,6 +3856,14 @@ pub struct GetServerInfoResponse {
     pub software: bool,
     #[prost(message, optional, tag = "6")]
     pub limits: ::core::option::Option<Limits>,
+    /// Version of this contract. It changes when clients of the previous version no longer work; additions that old
+    /// clients can ignore do not change it. A client compares it with its own version first, and makes no other call if
+    /// they differ. Versions start at 1.
+    #[prost(uint32, tag = "7")]
+    pub protocol_version: u32,
+    /// What this server can do, each feature once.
+    #[prost(enumeration = "Feature", repeated, tag = "8")]
+    pub features: ::prost::alloc::vec::Vec<i32>,
 }
 /// Limits of the server. A request beyond a limit is rejected with an error that names the limit (errors.proto).
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
@@ -3883,6 +3892,36 @@ pub struct Limits {
     #[prost(uint32, tag = "7")]
     pub drives: u32,
 }
+/// A capability that not every server of the same protocol version has. A client tests for a feature before it depends
+/// on it, and ignores values that it does not know.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
+#[repr(i32)]
+pub enum Feature {
+    Unspecified = 0,
+    /// FrameService renders frames and AOVs and answers picks. A server without a renderer lacks this feature, and rejects
+    /// these calls with REASON_RESOURCE_MISSING.
+    Frames = 1,
+}
+impl Feature {
+    /// String value of the enum field names used in the ProtoBuf definition.
+    ///
+    /// The values are not transformed in any way and thus are considered stable
+    /// (if the ProtoBuf definition does not change) and safe for programmatic use.
+    pub fn as_str_name(&self) -> &'static str {
+        match self {
+            Self::Unspecified => "FEATURE_UNSPECIFIED",
+            Self::Frames => "FEATURE_FRAMES",
+        }
+    }
+    /// Creates an enum from field names used in the ProtoBuf definition.
+    pub fn from_str_name(value: &str) -> ::core::option::Option<Self> {
+        match value {
+            "FEATURE_UNSPECIFIED" => Some(Self::Unspecified),
+            "FEATURE_FRAMES" => Some(Self::Frames),
+            _ => None,
+        }
+    }
+}
 /// Generated client implementations.
 pub mod server_service_client {
     #![allow(
@@ -3894,7 +3933,7 @@ pub mod server_service_client {
     )]
     use tonic::codegen::*;
     use tonic::codegen::http::Uri;
-    /// Version, devices and limits of the server.
+    /// Version, features, devices and limits of the server.
     #[derive(Debug, Clone)]
     pub struct ServerServiceClient<T> {
         inner: tonic::client::Grpc<T>,
@@ -4022,7 +4061,7 @@ pub mod server_service_server {
             tonic::Status,
         >;
     }
-    /// Version, devices and limits of the server.
+    /// Version, features, devices and limits of the server.
     #[derive(Debug)]
     pub struct ServerServiceServer<T> {
         inner: Arc<T>,

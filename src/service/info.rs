@@ -1,10 +1,10 @@
-//! `ServerService`: version, devices and limits of the server.
+//! `ServerService`: version, features, devices and limits of the server.
 
 use modalcast_proto::v1;
 use tonic::{Request, Response, Status};
 
 use super::connection::MAX_DRIVES;
-use crate::engine::Engine;
+use crate::engine::{Engine, EngineInfo};
 
 /// Implementation of `ServerService`.
 pub(super) struct ServerServiceImpl(pub(super) Engine);
@@ -37,6 +37,39 @@ impl v1::server_service_server::ServerService for ServerServiceImpl {
             renderer,
             software: is_software,
             limits: Some(limits),
+            protocol_version: v1::PROTOCOL_VERSION,
+            features: list_features(info).into_iter().map(Into::into).collect(),
         }))
+    }
+}
+
+/// The features of a server with these devices.
+fn list_features(info: &EngineInfo) -> Vec<v1::Feature> {
+    let mut features = vec![];
+    if info.renderer.is_ok() {
+        features.push(v1::Feature::Frames);
+    }
+    features
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use modalcast_model::deform::Backend;
+    use modalcast_model::error::fault;
+    use modalcast_render::RendererInfo;
+
+    #[test]
+    fn only_a_server_with_a_renderer_has_frames() {
+        let renderer = RendererInfo {
+            renderer: "test".into(),
+            version: "4.6".into(),
+            software: true,
+            cuda_device: None,
+            max_side: 1,
+        };
+        let info = |renderer| EngineInfo { backend: Backend::Cpu, device: "none".into(), renderer };
+        assert_eq!(list_features(&info(Ok(renderer))), [v1::Feature::Frames]);
+        assert_eq!(list_features(&info(Err(fault("renderer", "none")))), []);
     }
 }

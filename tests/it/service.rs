@@ -239,6 +239,8 @@ async fn server_without_renderer_rejects_only_frames() {
         client.get_server_info(v1::GetServerInfoRequest {}).await.expect("expected the server info").into_inner();
     assert_eq!((info.backend.as_str(), info.software), ("reference", false));
     assert!(info.renderer.contains("switched off"), "{}", info.renderer);
+    assert_eq!(info.protocol_version, v1::PROTOCOL_VERSION);
+    assert!(!info.features.contains(&v1::Feature::Frames.into()), "{:?}", info.features);
     let limits = info.limits.expect("expected the limits");
     // 1 MiB is the setting of `config`, the others are defaults.
     assert_eq!((limits.message_bytes, limits.window, limits.scenes), (1 << 20, 256, 16));

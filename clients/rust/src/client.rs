@@ -42,10 +42,12 @@ pub struct Client {
     url: Arc<str>,
 }
 
-/// Version, devices and limits of a server.
+/// Version, features, devices and limits of a server.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ServerInfo {
     pub version: String,
+    /// What the server can do. Features that this client does not know are left out.
+    pub features: Vec<v1::Feature>,
     /// The deformer in use: `cpu`, `cuda` or `reference`.
     pub backend: String,
     /// The CUDA device, or the reason why there is none.
@@ -65,11 +67,20 @@ pub struct SceneList {
     pub sources: Vec<String>,
 }
 
+impl ServerInfo {
+    /// Whether the server has a feature.
+    pub fn has_feature(&self, feature: v1::Feature) -> bool {
+        self.features.contains(&feature)
+    }
+}
+
 impl Client {
-    /// Connects, with a timeout of five seconds. `url` is `http://host:port` or `host:port`.
+    /// Connects, with a timeout of five seconds, and checks that the server has the protocol version of this client.
+    /// `url` is `http://host:port` or `host:port`.
     ///
     /// # Errors
-    /// `Connect` if the URL is invalid or no server answers.
+    /// `Connect` if the URL is invalid or no server answers; `ProtocolVersion` if the server has another version;
+    /// `Status` if the server is not a modalcast server.
     pub async fn connect(url: &str) -> Result<Self> {
         let connect_error =
             |error: tonic::transport::Error| Error::Connect { url: url.to_owned(), reason: describe_causes(&error) };
@@ -83,18 +94,27 @@ impl Client {
             .http2_keep_alive_interval(KEEP_ALIVE)
             .keep_alive_timeout(KEEP_ALIVE);
         let channel = endpoint.connect().await.map_err(connect_error)?;
-        Ok(Self { channel, max_reply_bytes: REPLY_LIMIT, url: url.into() })
+        let client = Self { channel, max_reply_bytes: REPLY_LIMIT, url: url.into() };
+        let no_answer = |_| Error::Connect { url: url.to_owned(), reason: "the server does not answer calls".into() };
+        let info = tokio::time::timeout(CONNECT_TIMEOUT, client.get_server_info()).await.map_err(no_answer)??;
+        match info.protocol_version {
+            v1::PROTOCOL_VERSION => Ok(client),
+            server => Err(Error::ProtocolVersion { url: url.to_owned(), client: v1::PROTOCOL_VERSION, server }),
+        }
     }
 
-    /// Connects, and retries until a server answers or `timeout` has passed.
+    /// Connects, and retries until a server answers or `timeout` has passed. An answer with another protocol version
+    /// ends the attempts.
     ///
     /// # Errors
-    /// `Connect` with the reason of the last attempt.
+    /// As for [`Self::connect`], with the reason of the last attempt.
     pub async fn connect_with_retry(url: &str, timeout: Duration) -> Result<Self> {
         let start = Instant::now();
         loop {
             match Self::connect(url).await {
-                Err(_) if start.elapsed() < timeout => tokio::time::sleep(RETRY_INTERVAL).await,
+                Err(Error::Connect { .. } | Error::Status { .. }) if start.elapsed() < timeout => {
+                    tokio::time::sleep(RETRY_INTERVAL).await;
+                }
                 result => return result,
             }
         }
@@ -107,14 +127,14 @@ impl Client {
         self
     }
 
-    /// Gets backend, renderer and limits of the server.
+    /// Gets features, backend, renderer and limits of the server.
     ///
     /// # Errors
     /// `Status` if the server rejects the call; `Connect` if the connection is lost.
     pub async fn server_info(&self) -> Result<ServerInfo> {
-        let mut service = v1::server_service_client::ServerServiceClient::new(self.channel.clone());
-        let wire = self.reply(service.get_server_info(v1::GetServerInfoRequest {}).await)?;
+        let wire = self.get_server_info().await?;
         Ok(ServerInfo {
+            features: wire.features().filter(|feature| *feature != v1::Feature::Unspecified).collect(),
             version: wire.version,
             backend: wire.backend,
             device: wire.device,
@@ -151,6 +171,11 @@ impl Client {
     pub async fn delete_scene(&self, scene: &str) -> Result<()> {
         let request = v1::DeleteSceneRequest { scene: scene.to_owned() };
         self.reply(self.scenes().delete_scene(request).await).map(drop)
+    }
+
+    async fn get_server_info(&self) -> Result<v1::GetServerInfoResponse> {
+        let mut service = v1::server_service_client::ServerServiceClient::new(self.channel.clone());
+        self.reply(service.get_server_info(v1::GetServerInfoRequest {}).await)
     }
 
     pub(crate) fn scenes(&self) -> v1::scene_service_client::SceneServiceClient<Channel> {

@@ -24,7 +24,7 @@ pub use frames::{
     Camera, DrawnBy, Frame, FrameFormat, FrameRequest, FrameStream, FrameStreamRequest, Lens, Output, Picture, View,
 };
 pub use modalcast_proto::v1;
-pub use modalcast_proto::v1::{SceneInfo, StepId};
+pub use modalcast_proto::v1::{Feature, PROTOCOL_VERSION, SceneInfo, StepId};
 pub use pick::{Hit, PickRectangle, PickRequest, PickResult};
 pub use request::{Delivery, StepRequest, StepSelector, Subscription};
 pub use scene::{Attachment, Domain, DomainArray, Follow, ModeRows, SceneDescription};

@@ -30,10 +30,13 @@ pub fn run<E: Display>(
 }
 
 /// Maps an error of the client to the exit code that the help texts document: 1 rejected by the server or not
-/// encodable, 3 connection failed or lost, 4 local file error, 5 malformed, truncated or late reply.
+/// encodable, 3 connection failed or lost, or a server of another protocol version, 4 local file error, 5 malformed,
+/// truncated or late reply.
 pub const fn exit_code(error: &Error) -> u8 {
     match error {
-        Error::Connect { .. } | Error::Status { code: tonic::Code::Unavailable, .. } => 3,
+        Error::Connect { .. }
+        | Error::ProtocolVersion { .. }
+        | Error::Status { code: tonic::Code::Unavailable, .. } => 3,
         Error::Status { .. } | Error::Rejected(_) | Error::Step { .. } => 1,
         Error::File { .. } => LOCAL_ERROR,
         Error::Malformed { .. } | Error::StreamEnded { .. } | Error::Deadline { .. } => 5,

@@ -7,8 +7,8 @@ use std::time::Duration;
 
 use fake::{FakeDomain, FakeServer, serve};
 use modalcast_client::{
-    Client, Delivery, DomainArray, DrawnBy, DriveRequest, Error, FrameFormat, FrameRequest, FrameStreamRequest,
-    Picture, Step,
+    Client, Delivery, DomainArray, DrawnBy, DriveRequest, Error, Feature, FrameFormat, FrameRequest,
+    FrameStreamRequest, Picture, Step, v1,
 };
 use modalcast_client::{VertexRequest, VertexSelection, VertexStreamRequest};
 use tokio::sync::Semaphore;
@@ -169,6 +169,25 @@ async fn rejected_calls_report_the_details_of_the_server() {
     }
     assert!(matches!(Client::connect("http://127.0.0.1:1").await, Err(Error::Connect { .. })));
     assert!(matches!(Client::connect("not a url").await, Err(Error::Connect { .. })));
+}
+
+#[tokio::test]
+async fn server_of_another_protocol_version_is_an_error_with_both_numbers() {
+    for version in [0, v1::PROTOCOL_VERSION + 1] {
+        let mut server = one_domain_server(4);
+        server.protocol_version = version;
+        let url = serve(Arc::new(server)).await;
+        // The wait would last an hour if the client tried again.
+        let error = Client::connect_with_retry(&url, Duration::from_secs(3600)).await.expect_err("another version");
+        assert!(matches!(error, Error::ProtocolVersion { server, .. } if server == version), "{error}");
+        let expected = format!("expected a server of protocol version {}, got version {version}", v1::PROTOCOL_VERSION);
+        assert!(error.to_string().ends_with(&expected), "{error}");
+        assert_eq!(run_fetch(&url, &["info"]).await.exit_code, 3);
+    }
+    let (_, client) = connect(one_domain_server(4)).await;
+    let info = client.server_info().await.expect("an answer");
+    assert_eq!(info.features, [Feature::Frames], "expected the unknown feature to be left out");
+    assert!(info.has_feature(Feature::Frames));
 }
 
 /// Forwards connections on a free port to a server. Returns the URL of that port. Dropping the tasks closes every

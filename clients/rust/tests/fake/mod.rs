@@ -73,6 +73,8 @@ pub(crate) struct FakeServer {
     pub(crate) domains: Vec<FakeDomain>,
     /// Rest bounds: minimum x, y, z, then maximum x, y, z.
     pub(crate) bounds: [f64; 6],
+    /// The version that the server reports.
+    pub(crate) protocol_version: u32,
     /// The largest window of a step stream.
     pub(crate) window: u32,
     /// Number of acknowledgements that may still be sent; unlimited unless a test restricts it.
@@ -115,6 +117,7 @@ impl FakeServer {
         Self {
             domains,
             bounds,
+            protocol_version: v1::PROTOCOL_VERSION,
             window: 8,
             ack_permits: Semaphore::new(Semaphore::MAX_PERMITS),
             steps: Mutex::default(),

@@ -80,8 +80,14 @@ impl ServerService for FakeService {
         _: Request<v1::GetServerInfoRequest>,
     ) -> Result<Response<v1::GetServerInfoResponse>, Status> {
         let limits = v1::Limits { message_bytes: 4 << 20, window: self.0.window, ..Default::default() };
-        let info = v1::GetServerInfoResponse { backend: "fake".into(), limits: Some(limits), ..Default::default() };
-        Ok(Response::new(info))
+        Ok(Response::new(v1::GetServerInfoResponse {
+            backend: "fake".into(),
+            limits: Some(limits),
+            protocol_version: self.0.protocol_version,
+            // A feature of this contract, and one of a later contract.
+            features: vec![v1::Feature::Frames.into(), 9999],
+            ..Default::default()
+        }))
     }
 }
 

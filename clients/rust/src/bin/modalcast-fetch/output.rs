@@ -3,7 +3,7 @@
 use std::time::Instant;
 
 use indicatif::{ProgressBar, ProgressStyle};
-use modalcast_client::{Client, Result, SceneInfo, SceneList, StageSamples, StageTimes, StepId};
+use modalcast_client::{Client, Result, SceneInfo, SceneList, StageSamples, StageTimes, StepId, v1};
 use serde_json::{Value, json};
 
 use crate::cli::SceneOptions;
@@ -122,8 +122,10 @@ pub(crate) async fn print_info(client: &Client, as_json: bool) -> Result<()> {
             "message_bytes": limits.message_bytes, "frame_side": limits.frame_side, "scenes": limits.scenes,
             "window": limits.window, "upload_bytes": limits.upload_bytes, "deadline_ms": limits.deadline_ms,
         });
+        let features: Vec<_> = info.features.iter().map(v1::Feature::as_str_name).collect();
         let summary = json!({
-            "version": info.version, "backend": info.backend, "device": info.device, "renderer": info.renderer,
+            "version": info.version, "protocol_version": v1::PROTOCOL_VERSION, "features": features,
+            "backend": info.backend, "device": info.device, "renderer": info.renderer,
             "software": info.is_software_renderer, "limits": limits,
         });
         println!("{summary}");
@@ -138,6 +140,9 @@ pub(crate) async fn print_info(client: &Client, as_json: bool) -> Result<()> {
     println!("window    at most {} steps", limits.window);
     println!("upload    at most {} bytes", limits.upload_bytes);
     println!("deadline  {} ms by default", limits.deadline_ms);
+    for feature in &info.features {
+        println!("feature   {}", feature.as_str_name());
+    }
     Ok(())
 }
 
