@@ -1881,6 +1881,11 @@ pub struct StreamFramesRequest {
     /// Number of frames after which the stream ends; 0: no limit.
     #[prost(uint64, tag = "4")]
     pub frames: u64,
+    /// Maximum number of frames per second, finite and above 0; 0: no limit. The frames that are sent are the newest ones, and
+    /// those in between are skipped and counted. After a wait for a step, two frames may follow each other faster. Only with
+    /// DELIVERY_LATEST: DELIVERY_LOSSLESS sends every step, so a limit is rejected.
+    #[prost(double, tag = "5")]
+    pub max_hz: f64,
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct StreamFramesResponse {
@@ -2690,6 +2695,11 @@ pub struct StreamVerticesRequest {
     /// Number of steps after which the stream ends; 0: no limit.
     #[prost(uint64, tag = "4")]
     pub steps: u64,
+    /// Maximum number of steps per second, finite and above 0; 0: no limit. The steps that are sent are the newest ones, and
+    /// those in between are skipped and counted. After a wait for a step, two steps may follow each other faster. Only with
+    /// DELIVERY_LATEST: DELIVERY_LOSSLESS sends every step, so a limit is rejected.
+    #[prost(double, tag = "5")]
+    pub max_hz: f64,
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct StreamVerticesResponse {

@@ -27,7 +27,7 @@ pub use output::pick_result::{PickResult, resolve_picks};
 pub use output::state_packing::{PackedState, StateContent, StateSection, pack_state};
 pub use output::step_output::{FrameOutput, ModalHit, OutputBody, OutputSpec, StepId, StepOutput};
 pub use output::vertex_encoding::Encoding;
-pub use scene::delivery::Delivery;
+pub use scene::delivery::{Delivery, StreamDelivery};
 pub use scene::encoded_subscription::EncodedSubscription;
 pub use scene::handle::{SceneHandle, WriterSession};
 pub use scene::lease::{InitialState, LeaseRequest, LeaseToken};

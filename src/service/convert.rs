@@ -7,7 +7,7 @@ use modalcast_proto::v1;
 
 use crate::engine::{
     self, Delivery, Engine, FrameFormat, InitialState, LeaseRequest, LeaseToken, OutputSpec, Overflow, RasterBackend,
-    SceneHandle, StepId, StepSelector, WriterSession,
+    SceneHandle, StepId, StepSelector, StreamDelivery, WriterSession,
 };
 use crate::telemetry::StageTimes;
 use modalcast_model::error::{Result, invalid};
@@ -113,6 +113,11 @@ pub(super) fn parse_step(step: v1::Step) -> Result<RawStepUpdate> {
     })
 }
 
+/// Parses the delivery of a subscription, which must be named, and the limit on its rate.
+pub(super) fn parse_stream_delivery(delivery: i32, max_hz: f64) -> Result<StreamDelivery> {
+    StreamDelivery::new(parse_delivery("delivery", delivery)?, max_hz)
+}
+
 /// Parses the delivery of a stream, which must be named.
 pub(super) fn parse_delivery(field: &str, number: i32) -> Result<Delivery> {
     match v1::Delivery::try_from(number) {
@@ -123,15 +128,6 @@ pub(super) fn parse_delivery(field: &str, number: i32) -> Result<Delivery> {
             Err(invalid(field, expected, "DELIVERY_UNSPECIFIED"))
         }
         Err(_) => Err(invalid(field, "a delivery of this version", number)),
-    }
-}
-
-/// Parses a limit on the rate of a stream. Returns the minimum interval; 0 means no limit for both.
-pub(super) fn parse_max_hz(field: &str, max_hz: f64) -> Result<Duration> {
-    match max_hz {
-        0.0 => Ok(Duration::ZERO),
-        0.001..=1000.0 => Ok(Duration::from_secs_f64(1.0 / max_hz)),
-        _ => Err(invalid(field, "0.001 to 1000, or 0 for no limit", max_hz)),
     }
 }
 

@@ -5,8 +5,8 @@ use modalcast_proto::v1;
 use tonic::{Request, Response, Status};
 
 use super::convert::{
-    describe_step_selector, parse_delivery, parse_picture, parse_step_selector, wire_format, wire_raster_backend,
-    wire_stages, wire_step_id,
+    describe_step_selector, parse_picture, parse_step_selector, parse_stream_delivery, wire_format,
+    wire_raster_backend, wire_stages, wire_step_id,
 };
 use super::picks;
 use super::status::to_status;
@@ -62,7 +62,7 @@ impl v1::frame_service_server::FrameService for FrameServiceImpl {
         let request = request.into_inner();
         let scene_handle = self.0.find(&request.scene).map_err(to_status)?;
         let (output_spec, format) = parse_picture(&self.0, &scene_handle.scene, request.picture).map_err(to_status)?;
-        let delivery = parse_delivery("delivery", request.delivery).map_err(to_status)?;
+        let delivery = parse_stream_delivery(request.delivery, request.max_hz).map_err(to_status)?;
         // Subscribe before the response headers are sent, so that a client can rely on receiving the next step.
         let subscription = scene_handle.subscribe(output_spec, delivery).await.map_err(to_status)?;
         let frames = EncodedSubscription::new(subscription, self.0.encoder().clone(), format, request.frames);

@@ -2,19 +2,17 @@
 //! its sections, and is sent in chunks.
 
 use std::sync::Arc;
-use std::time::Duration;
 
 use modalcast_proto::v1;
 use tonic::{Request, Response, Status};
 use v1::stream_states_response::Part;
 
 use super::convert::{
-    describe_step_selector, parse_delivery, parse_max_hz, parse_step_selector, wire_stages, wire_step_id,
+    describe_step_selector, parse_step_selector, parse_stream_delivery, wire_stages, wire_step_id,
 };
 use super::status::to_status;
 use super::stream::{Deadline, ReplySender, ReplyStream, chunks_with_head, respond};
-use crate::engine::{Delivery, Engine, OutputSpec, PackedState, StateContent, StateSection, Subscription, pack_state};
-use modalcast_model::error::{Result as ModelResult, invalid};
+use crate::engine::{Engine, OutputSpec, PackedState, StateContent, StateSection, Subscription, pack_state};
 use modalcast_model::scene::Scene;
 
 /// Implementation of `StateService`.
@@ -53,11 +51,9 @@ impl v1::state_service_server::StateService for StateServiceImpl {
         let deadline = Deadline::of_stream(request.metadata());
         let request = request.into_inner();
         let scene_handle = self.0.find(&request.scene).map_err(to_status)?;
-        let delivery = parse_delivery("delivery", request.delivery).map_err(to_status)?;
-        let min_interval = parse_state_interval(&request, delivery).map_err(to_status)?;
+        let delivery = parse_stream_delivery(request.delivery, request.max_hz).map_err(to_status)?;
         // Subscribe before the response headers are sent, so that a client can rely on receiving the next step.
         let subscription = scene_handle.subscribe(OutputSpec::State, delivery).await.map_err(to_status)?;
-        let subscription = subscription.with_min_interval(min_interval);
         let settings = v1::StateSettings { delivery: request.delivery, max_hz: request.max_hz, steps: request.steps };
         let scene = Arc::clone(&scene_handle.scene);
         let state_stream = StateStream { scene, max_chunk_bytes: self.0.config().chunk_bytes, settings };
@@ -65,15 +61,6 @@ impl v1::state_service_server::StateService for StateServiceImpl {
             deadline.enforce("the stream of states", state_stream.run(subscription, reply_sender))
         }))
     }
-}
-
-/// The minimum time between two states of a stream.
-fn parse_state_interval(request: &v1::StreamStatesRequest, delivery: Delivery) -> ModelResult<Duration> {
-    let min_interval = parse_max_hz("max_hz", request.max_hz)?;
-    if delivery == Delivery::Lossless && !min_interval.is_zero() {
-        return Err(invalid("max_hz", "0 with DELIVERY_LOSSLESS, which has every step", request.max_hz));
-    }
-    Ok(min_interval)
 }
 
 /// Parameters of a stream of states.

@@ -9,8 +9,8 @@ use v1::get_vertices_response::Part as SinglePart;
 use v1::stream_vertices_response::Part as StreamPart;
 
 use super::convert::{
-    describe_step_selector, parse_delivery, parse_step_selector, parse_vertex_selection, wire_sections, wire_stages,
-    wire_step_id,
+    describe_step_selector, parse_step_selector, parse_stream_delivery, parse_vertex_selection, wire_sections,
+    wire_stages, wire_step_id,
 };
 use super::status::to_status;
 use super::stream::{Deadline, ReplySender, ReplyStream, chunks_with_head, respond};
@@ -65,7 +65,7 @@ impl v1::vertex_service_server::VertexService for VertexServiceImpl {
         let request = request.into_inner();
         let scene_handle = self.0.find(&request.scene).map_err(to_status)?;
         let selection = parse_vertex_selection(&scene_handle.scene, request.selection).map_err(to_status)?;
-        let delivery = parse_delivery("delivery", request.delivery).map_err(to_status)?;
+        let delivery = parse_stream_delivery(request.delivery, request.max_hz).map_err(to_status)?;
         let spec = OutputSpec::Vertices(selection.vertex_attributes());
         // Subscribe before the response headers are sent, so that a client can rely on receiving the next step.
         let subscription = scene_handle.subscribe(spec, delivery).await.map_err(to_status)?;

@@ -196,6 +196,7 @@ async fn box_stream_delivers_every_step() {
         selection: select(&[], &[v1::Attribute::Boxes]),
         delivery: v1::Delivery::Lossless.into(),
         steps: 2,
+        max_hz: 0.0,
     };
     let mut stream =
         server.vertices().await.stream_vertices(request).await.expect("expected a subscription").into_inner();

@@ -111,6 +111,7 @@ async fn lossless_frames_are_complete_and_latest_frames_increase() {
         picture: picture_of_size(32, 32, v1::Format::Png),
         delivery: delivery.into(),
         frames,
+        max_hz: 0.0,
     };
     let mut client = server.frames().await;
     let lossless =

@@ -28,6 +28,7 @@ mod service_files;
 mod service_harness;
 mod steps;
 mod storages;
+mod stream_settings;
 mod streams;
 mod tolerance;
 mod writers;

@@ -58,6 +58,7 @@ async fn lossless_subscriber_gets_every_step_in_order() {
         selection: select(&[1], &[v1::Attribute::Positions]),
         delivery: v1::Delivery::Lossless.into(),
         steps: 30,
+        max_hz: 0.0,
     };
     // Subscribing needs no step and no writer.
     let mut stream =

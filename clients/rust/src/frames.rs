@@ -168,6 +168,7 @@ impl Client {
             picture: Some(request.query.into()),
             delivery: v1::Delivery::from(request.delivery).into(),
             frames: request.max_replies,
+            max_hz: request.max_hz,
         };
         let messages = self.replies(FrameServiceClient::new(self.channel.clone()).stream_frames(wire).await)?;
         Ok(FrameStream(DecodedReplies::new(

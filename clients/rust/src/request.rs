@@ -78,12 +78,14 @@ pub struct Subscription<Q> {
     pub delivery: Delivery,
     /// Number of replies after which the subscription ends; 0 for no limit.
     pub max_replies: u64,
+    /// Maximum number of replies per second; 0 for no limit. The server accepts a limit only with [`Delivery::Latest`].
+    pub max_hz: f64,
 }
 
 impl<Q> Subscription<Q> {
     /// A lossless subscription without a limit.
     pub fn new(scene: &str, query: Q) -> Self {
-        Self { scene: scene.to_owned(), query, delivery: Delivery::Lossless, max_replies: 0 }
+        Self { scene: scene.to_owned(), query, delivery: Delivery::Lossless, max_replies: 0, max_hz: 0.0 }
     }
 
     /// Sets [`Self::delivery`].
@@ -97,6 +99,13 @@ impl<Q> Subscription<Q> {
     #[must_use]
     pub fn max_replies(mut self, max_replies: u64) -> Self {
         self.max_replies = max_replies;
+        self
+    }
+
+    /// Sets [`Self::max_hz`].
+    #[must_use]
+    pub fn max_hz(mut self, max_hz: f64) -> Self {
+        self.max_hz = max_hz;
         self
     }
 }

@@ -152,6 +152,7 @@ impl Client {
             selection: Some(request.query.to_wire()),
             delivery: v1::Delivery::from(request.delivery).into(),
             steps: request.max_replies,
+            max_hz: request.max_hz,
         };
         let messages = self.replies(VertexServiceClient::new(self.channel.clone()).stream_vertices(wire).await)?;
         Ok(VertexStream(DecodedReplies::new(messages, VertexDecoder::new(stream_part, self.max_reply_bytes))))

@@ -77,7 +77,7 @@ impl EncodedSubscription {
     }
 
     fn has_capacity(&self) -> bool {
-        let max_encodings = match self.subscription.delivery() {
+        let max_encodings = match self.subscription.delivery().delivery() {
             Delivery::Lossless => self.encoder.cores(),
             Delivery::Latest => MAX_LATEST_ENCODINGS,
         };
@@ -124,7 +124,8 @@ mod tests {
     const ALL_FRAMES: u64 = 0;
 
     fn subscribe(delivery: Delivery) -> (Subscriber, Subscription) {
-        Subscription::new(OutputSpec::Vertices(VertexAttributes::POSITIONS_AND_NORMALS), delivery, Arc::default())
+        let spec = OutputSpec::Vertices(VertexAttributes::POSITIONS_AND_NORMALS);
+        Subscription::new(spec, delivery.into(), Arc::default())
     }
 
     fn send_frame(subscriber: &Subscriber, frame: StepOutput) {

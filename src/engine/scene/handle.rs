@@ -8,7 +8,7 @@ use tokio::sync::mpsc::error::TrySendError;
 use tokio::sync::{Notify, mpsc, oneshot, watch};
 
 use super::actor::{ActorParams, SceneActor, SceneServices};
-use super::delivery::Delivery;
+use super::delivery::StreamDelivery;
 use super::lease::{AcquiredLease, LeaseRequest, LeaseToken, WriterLease};
 use super::message::{Message, StepRequest, StepSelector};
 use super::step_queue::{QueuedStep, StepReport};
@@ -133,9 +133,9 @@ impl SceneHandle {
     /// # Errors
     /// `Unavailable` when frames are requested and there is no renderer; `LimitReached` when there are too many
     /// subscribers; `Busy` when the mailbox is full; `NotFound` when the scene is closed.
-    pub async fn subscribe(&self, spec: OutputSpec, delivery: Delivery) -> Result<Subscription> {
+    pub async fn subscribe(&self, spec: OutputSpec, delivery: impl Into<StreamDelivery>) -> Result<Subscription> {
         self.check_spec(&spec)?;
-        let (subscriber, subscription) = Subscription::new(spec, delivery, Arc::clone(&self.wake));
+        let (subscriber, subscription) = Subscription::new(spec, delivery.into(), Arc::clone(&self.wake));
         self.call(|reply| Message::Subscribe { subscriber, reply }).await?;
         Ok(subscription)
     }

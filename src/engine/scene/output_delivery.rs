@@ -488,7 +488,7 @@ mod tests {
         let camera = Camera::fit_to_scene(&testing::two_strips(), width, 8);
         Subscription::new(
             OutputSpec::Frame { camera, size: FrameSize::new(width, 8), frame_output: FrameOutput::Color },
-            delivery,
+            delivery.into(),
             Arc::default(),
         )
     }

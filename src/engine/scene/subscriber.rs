@@ -3,8 +3,9 @@
 //!
 //! A credit permits the scene to send one more result. The channel buffers at most two results. With
 //! [`Delivery::Latest`], [`Subscription::next`] grants a credit when it is polled, so a result is produced only then.
+//! A limit on the rate delays this credit, so nothing is drawn or copied that is not sent.
 //! If the future of `next` is dropped, the next call returns the result that the dropped future has requested, even if
-//! the scene has completed a later step since. [`Subscription::with_min_interval`] delays the credit.
+//! the scene has completed a later step since.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
@@ -12,7 +13,7 @@ use std::time::{Duration, Instant};
 
 use tokio::sync::{Notify, mpsc, watch};
 
-use super::delivery::Delivery;
+use super::delivery::{Delivery, StreamDelivery};
 use crate::engine::output::step_output::{OutputSpec, StepOutput};
 use modalcast_model::error::{Error, Result, fault};
 
@@ -108,13 +109,10 @@ impl Subscriber {
 /// The receiver of a subscription, owned by a reply stream.
 #[derive(Debug)]
 pub struct Subscription {
-    delivery: Delivery,
+    delivery: StreamDelivery,
     /// Whether a `Latest` subscription has granted a credit whose result was not received yet.
     has_granted_credit: bool,
-    /// Minimum time between a result and the credit for the next one.
-    min_interval: Duration,
-    /// Earliest time of the next credit of a `Latest` subscription; `None` if it may be granted at once.
-    next_credit_at: Option<Instant>,
+    rate_limiter: Option<RateLimiter>,
     credits: Arc<AtomicUsize>,
     results: mpsc::Receiver<Result<StepOutput>>,
     end: watch::Receiver<Option<EndReason>>,
@@ -124,14 +122,18 @@ pub struct Subscription {
 
 impl Subscription {
     /// Creates both ends of a subscription. `scene_wake` is notified whenever the subscription grants a credit.
-    pub(in crate::engine) fn new(spec: OutputSpec, delivery: Delivery, scene_wake: Arc<Notify>) -> (Subscriber, Self) {
-        let initial_credits = if delivery == Delivery::Lossless { LOSSLESS_CREDITS } else { 0 };
+    pub(in crate::engine) fn new(
+        spec: OutputSpec,
+        delivery: StreamDelivery,
+        scene_wake: Arc<Notify>,
+    ) -> (Subscriber, Self) {
+        let initial_credits = if delivery.delivery() == Delivery::Lossless { LOSSLESS_CREDITS } else { 0 };
         let credits = Arc::new(AtomicUsize::new(initial_credits));
         let (result_sender, results) = mpsc::channel(LOSSLESS_CREDITS);
         let (end_sender, end) = watch::channel(None);
         let subscriber = Subscriber {
             spec,
-            delivery,
+            delivery: delivery.delivery(),
             delivered_step_count: 0,
             stalled_since: None,
             credits: Arc::clone(&credits),
@@ -139,29 +141,15 @@ impl Subscription {
             is_error_sent: Arc::default(),
             end: end_sender,
         };
-        let subscription = Self {
-            delivery,
-            has_granted_credit: false,
-            min_interval: Duration::ZERO,
-            next_credit_at: None,
-            credits,
-            results,
-            end,
-            scene_wake,
-        };
+        let rate_limiter =
+            delivery.min_interval().map(|interval| RateLimiter { interval, next_credit: Instant::now() });
+        let subscription =
+            Self { delivery, has_granted_credit: false, rate_limiter, credits, results, end, scene_wake };
         (subscriber, subscription)
     }
 
-    /// Limits the rate of a [`Delivery::Latest`] subscription: the credit for a result is granted at the earliest this
-    /// time after the previous result. No effect on a lossless one.
-    #[must_use]
-    pub fn with_min_interval(mut self, min_interval: Duration) -> Self {
-        self.min_interval = min_interval;
-        self
-    }
-
-    /// Which steps the subscription receives.
-    pub(in crate::engine) const fn delivery(&self) -> Delivery {
+    /// Which steps the subscription receives, and the limit on their rate.
+    pub const fn delivery(&self) -> StreamDelivery {
         self.delivery
     }
 
@@ -170,21 +158,36 @@ impl Subscription {
     /// # Errors
     /// The error with which the subscription has ended.
     pub async fn next(&mut self) -> Result<StepOutput> {
-        if self.delivery == Delivery::Latest && !self.has_granted_credit {
-            if let Some(next_credit_at) = self.next_credit_at {
-                self.sleep_until(next_credit_at).await?;
+        let result = match self.delivery.delivery() {
+            Delivery::Lossless => {
+                let result = self.results.recv().await;
+                self.grant_credit();
+                result
+            }
+            Delivery::Latest => self.receive_latest().await,
+        };
+        result.unwrap_or_else(|| Err(self.end_error()))
+    }
+
+    /// Grants a credit, if necessary after a wait for the rate limit, and waits for its result. `None` if the
+    /// subscription has ended. Cancel-safe.
+    async fn receive_latest(&mut self) -> Option<Result<StepOutput>> {
+        if !self.has_granted_credit {
+            tokio::select! {
+                biased;
+                () = wait_for_credit(self.rate_limiter.as_ref()) => {}
+                // The subscription ends during the wait. Without a credit, no other result arrives.
+                end = self.results.recv() => return end,
             }
             self.has_granted_credit = true;
             self.grant_credit();
         }
         let result = self.results.recv().await;
         self.has_granted_credit = false;
-        if self.delivery == Delivery::Lossless {
-            self.grant_credit();
-        } else if !self.min_interval.is_zero() {
-            self.next_credit_at = Instant::now().checked_add(self.min_interval);
+        if let Some(rate_limiter) = &mut self.rate_limiter {
+            rate_limiter.record_result(Instant::now());
         }
-        result.unwrap_or_else(|| Err(self.end_error()))
+        result
     }
 
     /// Waits until the scene disconnects the subscriber, and returns the reason. Pends forever if the subscription ends
@@ -199,18 +202,6 @@ impl Subscription {
         }
     }
 
-    /// Waits for a time. Cancel-safe.
-    ///
-    /// # Errors
-    /// The error with which the subscription ends in the meantime.
-    async fn sleep_until(&mut self, time: Instant) -> Result<()> {
-        tokio::select! {
-            () = tokio::time::sleep_until(time.into()) => Ok(()),
-            // No credit is granted, so no result arrives.
-            _ = self.results.recv() => Err(self.end_error()),
-        }
-    }
-
     fn grant_credit(&self) {
         self.credits.fetch_add(1, Ordering::AcqRel);
         self.scene_wake.notify_one();
@@ -219,6 +210,31 @@ impl Subscription {
     fn end_error(&self) -> Error {
         let end = self.end.borrow();
         end.as_ref().map_or_else(|| fault("scene", "the scene ended without an error"), |end| end.error.clone())
+    }
+}
+
+/// Limits the rate of the credits of a `Latest` subscription.
+#[derive(Debug)]
+struct RateLimiter {
+    /// Time between two credits at the maximum rate.
+    interval: Duration,
+    /// When the next credit may be granted.
+    next_credit: Instant,
+}
+
+impl RateLimiter {
+    /// Schedules the next credit. The times of the credits form a grid, so that the time from a credit to its result
+    /// does not reduce the rate. The grid begins again with a result that arrives more than an interval after its
+    /// credit.
+    fn record_result(&mut self, received_at: Instant) {
+        let is_on_grid = received_at.saturating_duration_since(self.next_credit) <= self.interval;
+        self.next_credit = if is_on_grid { self.next_credit } else { received_at } + self.interval;
+    }
+}
+
+async fn wait_for_credit(rate_limiter: Option<&RateLimiter>) {
+    if let Some(rate_limiter) = rate_limiter {
+        tokio::time::sleep_until(rate_limiter.next_credit.into()).await;
     }
 }
 
@@ -241,8 +257,14 @@ mod tests {
         Ok(StepOutput { step, skipped: 0, stages: vec![], origins: None, body: OutputBody::Vertices(Arc::default()) })
     }
 
-    fn subscribe(delivery: Delivery) -> (Subscriber, Subscription) {
-        Subscription::new(OutputSpec::Vertices(VertexAttributes::POSITIONS_AND_NORMALS), delivery, Arc::default())
+    fn subscribe(delivery: impl Into<StreamDelivery>) -> (Subscriber, Subscription) {
+        let spec = OutputSpec::Vertices(VertexAttributes::POSITIONS_AND_NORMALS);
+        Subscription::new(spec, delivery.into(), Arc::default())
+    }
+
+    /// A limit that a test never reaches: one result in 1000 s.
+    fn slow_delivery() -> StreamDelivery {
+        StreamDelivery::new(Delivery::Latest, 1e-3).expect("expected a valid limit")
     }
 
     #[tokio::test]
@@ -266,6 +288,45 @@ mod tests {
         }
         assert!(subscriber.has_credit() && subscriber.take_permit().send(output(4)) && !subscriber.has_credit());
         assert_eq!(subscription.next().await.expect("expected the sent result").step.number, 4);
+    }
+
+    #[tokio::test]
+    async fn rate_limit_delays_the_credit_after_a_result() {
+        for (delivery, grants_second_credit) in [(slow_delivery(), false), (Delivery::Latest.into(), true)] {
+            let (subscriber, mut subscription) = subscribe(delivery);
+            for (number, grants_credit) in [(1, true), (2, grants_second_credit)] {
+                tokio::time::timeout(Duration::ZERO, subscription.next()).await.expect_err("expected no result yet");
+                assert_eq!(subscriber.has_credit(), grants_credit, "{delivery:?}, result {number}");
+                if grants_credit {
+                    subscriber.take_permit().send(output(number));
+                    subscription.next().await.expect("expected the sent result");
+                }
+            }
+        }
+    }
+
+    #[tokio::test]
+    async fn end_is_reported_while_the_rate_limit_delays_a_credit() {
+        let (subscriber, mut subscription) = subscribe(slow_delivery());
+        tokio::time::timeout(Duration::ZERO, subscription.next()).await.expect_err("expected no result yet");
+        subscriber.take_permit().send(output(1));
+        subscription.next().await.expect("expected the sent result");
+        let error = Error::NotFound { what: "scene", given: "'closed'".into() };
+        subscriber.end(error.clone());
+        drop(subscriber);
+        let end = tokio::time::timeout(Duration::from_secs(60), subscription.next()).await;
+        assert_eq!(end.expect("expected the end before the next credit").expect_err("expected the end"), error);
+    }
+
+    #[test]
+    fn credits_keep_their_grid_until_a_result_is_late() {
+        let (start, interval) = (Instant::now(), Duration::from_millis(100));
+        let at = |ms| start + Duration::from_millis(ms);
+        let mut rate_limiter = RateLimiter { interval, next_credit: start };
+        for (received_ms, next_credit_ms) in [(30, 100), (200, 200), (301, 401), (401, 501), (600, 601)] {
+            rate_limiter.record_result(at(received_ms));
+            assert_eq!(rate_limiter.next_credit, at(next_credit_ms), "result after {received_ms} ms");
+        }
     }
 
     #[tokio::test]
