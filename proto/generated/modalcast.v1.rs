@@ -1863,8 +1863,16 @@ pub struct RenderFrameRequest {
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct RenderFrameResponse {
-    #[prost(message, optional, tag = "1")]
-    pub chunk: ::core::option::Option<FrameChunk>,
+    #[prost(oneof = "render_frame_response::Part", tags = "1")]
+    pub part: ::core::option::Option<render_frame_response::Part>,
+}
+/// Nested message and enum types in `RenderFrameResponse`.
+pub mod render_frame_response {
+    #[derive(Clone, PartialEq, ::prost::Oneof)]
+    pub enum Part {
+        #[prost(message, tag = "1")]
+        Chunk(super::FrameChunk),
+    }
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct StreamFramesRequest {
@@ -1889,8 +1897,34 @@ pub struct StreamFramesRequest {
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct StreamFramesResponse {
-    #[prost(message, optional, tag = "1")]
-    pub chunk: ::core::option::Option<FrameChunk>,
+    #[prost(oneof = "stream_frames_response::Part", tags = "1, 2")]
+    pub part: ::core::option::Option<stream_frames_response::Part>,
+}
+/// Nested message and enum types in `StreamFramesResponse`.
+pub mod stream_frames_response {
+    #[derive(Clone, PartialEq, ::prost::Oneof)]
+    pub enum Part {
+        #[prost(message, tag = "1")]
+        Settings(super::FrameStreamSettings),
+        #[prost(message, tag = "2")]
+        Chunk(super::FrameChunk),
+    }
+}
+/// The settings of a stream after defaults are resolved. Sent once, as the first reply.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct FrameStreamSettings {
+    #[prost(enumeration = "Delivery", tag = "1")]
+    pub delivery: i32,
+    /// Maximum number of frames per second; 0: no limit.
+    #[prost(double, tag = "2")]
+    pub max_hz: f64,
+    /// Number of frames after which the stream ends; 0: no limit.
+    #[prost(uint64, tag = "3")]
+    pub frames: u64,
+    /// Size, format, output and the complete camera: view and lens are set. `near` and `far` remain 0 if the server fits
+    /// them to the scene, and `largest` remains 0 if it is fitted to each frame.
+    #[prost(message, optional, tag = "4")]
+    pub picture: ::core::option::Option<Picture>,
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct FrameChunk {
@@ -2268,9 +2302,9 @@ pub mod frame_service_client {
                 .insert(GrpcMethod::new("modalcast.v1.FrameService", "RenderFrame"));
             self.inner.server_streaming(req, path, codec).await
         }
-        /// Renders a frame for each step that `delivery` selects. Each frame is sent in chunks of at most 1 MiB. The first
-        /// chunk of a frame has its head. The subscription is active when the response headers arrive, so the next step is
-        /// delivered.
+        /// Renders a frame for each step that `delivery` selects. The first reply has the settings in effect. Each frame is
+        /// sent in chunks of at most 1 MiB. The first chunk of a frame has its head. The subscription is active when the
+        /// response headers arrive, so the next step is delivered.
         pub async fn stream_frames(
             &mut self,
             request: impl tonic::IntoRequest<super::StreamFramesRequest>,
@@ -2357,9 +2391,9 @@ pub mod frame_service_server {
             >
             + std::marker::Send
             + 'static;
-        /// Renders a frame for each step that `delivery` selects. Each frame is sent in chunks of at most 1 MiB. The first
-        /// chunk of a frame has its head. The subscription is active when the response headers arrive, so the next step is
-        /// delivered.
+        /// Renders a frame for each step that `delivery` selects. The first reply has the settings in effect. Each frame is
+        /// sent in chunks of at most 1 MiB. The first chunk of a frame has its head. The subscription is active when the
+        /// response headers arrive, so the next step is delivered.
         async fn stream_frames(
             &self,
             request: tonic::Request<super::StreamFramesRequest>,
@@ -2703,7 +2737,7 @@ pub struct StreamVerticesRequest {
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct StreamVerticesResponse {
-    #[prost(oneof = "stream_vertices_response::Part", tags = "1, 2")]
+    #[prost(oneof = "stream_vertices_response::Part", tags = "1, 2, 3")]
     pub part: ::core::option::Option<stream_vertices_response::Part>,
 }
 /// Nested message and enum types in `StreamVerticesResponse`.
@@ -2711,10 +2745,24 @@ pub mod stream_vertices_response {
     #[derive(Clone, PartialEq, ::prost::Oneof)]
     pub enum Part {
         #[prost(message, tag = "1")]
-        Layout(super::VertexLayout),
+        Settings(super::VertexStreamSettings),
         #[prost(message, tag = "2")]
+        Layout(super::VertexLayout),
+        #[prost(message, tag = "3")]
         Chunk(super::VertexChunk),
     }
+}
+/// The settings of a stream. Sent once, as the first reply.
+#[derive(Clone, Copy, PartialEq, ::prost::Message)]
+pub struct VertexStreamSettings {
+    #[prost(enumeration = "Delivery", tag = "1")]
+    pub delivery: i32,
+    /// Maximum number of steps per second; 0: no limit.
+    #[prost(double, tag = "2")]
+    pub max_hz: f64,
+    /// Number of steps after which the stream ends; 0: no limit.
+    #[prost(uint64, tag = "3")]
+    pub steps: u64,
 }
 /// The selected domains, in the order of the reply. A layout of many domains arrives in several parts of at most 65,536
 /// domains, one after the other.
@@ -2884,7 +2932,7 @@ pub mod vertex_service_client {
     use tonic::codegen::*;
     use tonic::codegen::http::Uri;
     /// Deformed vertices, and attributes computed with them. A reply begins with the layout, which holds for all its steps.
-    /// The bytes of each step follow in chunks of at most 1 MiB, the first one with the head of the step.
+    /// The reply of a stream has the settings in effect before the layout. The bytes of each step follow in chunks of at most 1 MiB, the first one with the head of the step.
     #[derive(Debug, Clone)]
     pub struct VertexServiceClient<T> {
         inner: tonic::client::Grpc<T>,
@@ -3062,7 +3110,7 @@ pub mod vertex_service_server {
         >;
     }
     /// Deformed vertices, and attributes computed with them. A reply begins with the layout, which holds for all its steps.
-    /// The bytes of each step follow in chunks of at most 1 MiB, the first one with the head of the step.
+    /// The reply of a stream has the settings in effect before the layout. The bytes of each step follow in chunks of at most 1 MiB, the first one with the head of the step.
     #[derive(Debug)]
     pub struct VertexServiceServer<T> {
         inner: Arc<T>,

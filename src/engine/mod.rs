@@ -25,7 +25,7 @@ pub use output::frame_encoder::{EncodedOutput, FrameEncoder, FrameFormat};
 pub use output::pack::{Attribute, Origins, PackedVertices, Section, VertexSelection, pack_vertices, validate_domains};
 pub use output::pick_result::{PickResult, resolve_picks};
 pub use output::state_packing::{PackedState, StateContent, StateSection, pack_state};
-pub use output::step_output::{FrameOutput, ModalHit, OutputBody, OutputSpec, StepId, StepOutput};
+pub use output::step_output::{FrameOutput, ModalHit, OutputBody, OutputSpec, PictureSpec, StepId, StepOutput};
 pub use output::vertex_encoding::Encoding;
 pub use scene::delivery::{Delivery, StreamDelivery};
 pub use scene::encoded_subscription::EncodedSubscription;

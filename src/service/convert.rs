@@ -1,13 +1,12 @@
 //! Conversions between wire messages and engine types. `wire_` functions create messages, `parse_` functions read them.
 //! Numbers from the wire are untrusted until a constructor of `modalcast_model::scene` has validated them.
 
-use std::time::Duration;
 
 use modalcast_proto::v1;
 
 use crate::engine::{
-    self, Delivery, Engine, FrameFormat, InitialState, LeaseRequest, LeaseToken, OutputSpec, Overflow, RasterBackend,
-    SceneHandle, StepId, StepSelector, StreamDelivery, WriterSession,
+    self, Delivery, Engine, FrameFormat, InitialState, LeaseRequest, LeaseToken, OutputSpec, Overflow, PictureSpec,
+    RasterBackend, SceneHandle, StepId, StepSelector, StreamDelivery, WriterSession,
 };
 use crate::telemetry::StageTimes;
 use modalcast_model::error::{Result, invalid};
@@ -17,6 +16,7 @@ mod camera;
 mod output;
 mod vertices;
 
+pub(super) use output::wire_format;
 pub(super) use vertices::{parse_vertex_selection, wire_sections};
 
 /// Limit in bytes on the remarks in one scene description.
@@ -155,12 +155,15 @@ pub(super) fn parse_lease_request(open: &v1::OpenDrive, default_window: u32) -> 
     })
 }
 
-/// The reply to a writer that has acquired the lease: the settings in effect.
-pub(super) fn wire_opened(writer: &WriterSession, request: &LeaseRequest, scene_handle: &SceneHandle) -> v1::Opened {
-    let delivery = match request.delivery {
+pub(super) const fn wire_delivery(delivery: Delivery) -> v1::Delivery {
+    match delivery {
         Delivery::Lossless => v1::Delivery::Lossless,
         Delivery::Latest => v1::Delivery::Latest,
-    };
+    }
+}
+
+/// The reply to a writer that has acquired the lease: the settings in effect.
+pub(super) fn wire_opened(writer: &WriterSession, request: &LeaseRequest, scene_handle: &SceneHandle) -> v1::Opened {
     let overflow = match request.overflow {
         Overflow::Block => v1::Overflow::Block,
         Overflow::Reject => v1::Overflow::Reject,
@@ -171,7 +174,7 @@ pub(super) fn wire_opened(writer: &WriterSession, request: &LeaseRequest, scene_
     };
     v1::Opened {
         run: writer.run,
-        delivery: delivery.into(),
+        delivery: wire_delivery(request.delivery).into(),
         overflow: overflow.into(),
         window: writer.window,
         lease_token: writer.token.as_bytes().to_vec().into(),
@@ -180,14 +183,17 @@ pub(super) fn wire_opened(writer: &WriterSession, request: &LeaseRequest, scene_
     }
 }
 
-/// Validates a picture. Returns an [`OutputSpec::Frame`] and the wire format of the frame.
-pub(super) fn parse_picture(
-    engine: &Engine,
-    scene: &Scene,
-    picture: Option<v1::Picture>,
-) -> Result<(OutputSpec, FrameFormat)> {
+/// A requested picture and the format of its frames.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct RequestedPicture {
+    pub spec: PictureSpec,
+    pub format: FrameFormat,
+}
+
+/// Validates a picture. An unset picture is the default one.
+pub(super) fn parse_picture(engine: &Engine, scene: &Scene, picture: Option<v1::Picture>) -> Result<RequestedPicture> {
     let picture = picture.unwrap_or_default();
-    let (frame_output, format) = output::parse_output(scene, &picture)?;
+    let (output, format) = output::parse_output(scene, &picture)?;
     let (width, height) = match (picture.width, picture.height) {
         (0, 0) => (1280, 720),
         size => size,
@@ -202,7 +208,7 @@ pub(super) fn parse_picture(
         None => fit_to_scene,
         Some(camera) => camera::parse_camera(fit_to_scene, camera).map_err(|error| error.in_message("picture"))?,
     };
-    Ok((OutputSpec::Frame { camera, size: FrameSize::new(width, height), frame_output }, format))
+    Ok(RequestedPicture { spec: PictureSpec { camera, size: FrameSize::new(width, height), output }, format })
 }
 
 /// Validates a pick request. Returns an [`OutputSpec::Pick`].
@@ -214,9 +220,7 @@ pub(super) fn parse_pick(engine: &Engine, scene: &Scene, request: &v1::PickReque
         camera: picture.camera,
         ..v1::Picture::default()
     });
-    let (OutputSpec::Frame { camera, size: picture, .. }, _) = parse_picture(engine, scene, size_and_camera)? else {
-        return Err(invalid("picture", "a picture", "none"));
-    };
+    let PictureSpec { camera, size: picture, .. } = parse_picture(engine, scene, size_and_camera)?.spec;
     let size = match (request.width, request.height) {
         (0, 0) => [1, 1],
         (width, height) => [width, height],
@@ -225,13 +229,14 @@ pub(super) fn parse_pick(engine: &Engine, scene: &Scene, request: &v1::PickReque
     Ok(OutputSpec::Pick { camera, picture, rectangle })
 }
 
-pub(super) const fn wire_format(format: FrameFormat) -> v1::Format {
-    match format {
-        FrameFormat::Png => v1::Format::Png,
-        FrameFormat::Rgba => v1::Format::Rgba,
-        FrameFormat::F32 => v1::Format::F32,
-        FrameFormat::U32 => v1::Format::U32,
-        FrameFormat::F32x3 => v1::Format::F32x3,
+/// A picture with all defaults resolved.
+pub(super) fn wire_picture(RequestedPicture { spec, format }: &RequestedPicture) -> v1::Picture {
+    v1::Picture {
+        width: spec.size.width,
+        height: spec.size.height,
+        format: wire_format(*format).into(),
+        camera: Some(camera::wire_camera(&spec.camera)),
+        ..output::wire_output(spec.output)
     }
 }
 

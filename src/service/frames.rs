@@ -3,15 +3,17 @@
 
 use modalcast_proto::v1;
 use tonic::{Request, Response, Status};
+use v1::render_frame_response::Part as SinglePart;
+use v1::stream_frames_response::Part as StreamPart;
 
 use super::convert::{
-    describe_step_selector, parse_picture, parse_step_selector, parse_stream_delivery, wire_format,
-    wire_raster_backend, wire_stages, wire_step_id,
+    RequestedPicture, describe_step_selector, parse_picture, parse_step_selector, parse_stream_delivery, wire_delivery,
+    wire_format, wire_picture, wire_raster_backend, wire_stages, wire_step_id,
 };
 use super::picks;
 use super::status::to_status;
 use super::stream::{Deadline, ReplySender, ReplyStream, chunks_with_head, respond};
-use crate::engine::{EncodedOutput, EncodedSubscription, Engine, FrameFormat, OutputSpec};
+use crate::engine::{EncodedOutput, EncodedSubscription, Engine, OutputSpec, StreamDelivery};
 
 /// Implementation of `FrameService`.
 pub(super) struct FrameServiceImpl(pub(super) Engine);
@@ -28,15 +30,16 @@ impl v1::frame_service_server::FrameService for FrameServiceImpl {
         let deadline = Deadline::of_request(request.metadata(), request.get_ref().deadline_ms, config);
         let request = request.into_inner();
         let scene_handle = self.0.find(&request.scene).map_err(to_status)?;
-        let (output_spec, format) = parse_picture(&self.0, &scene_handle.scene, request.picture).map_err(to_status)?;
+        let picture = parse_picture(&self.0, &scene_handle.scene, request.picture).map_err(to_status)?;
         let selector = parse_step_selector(request.step);
         let (max_chunk_bytes, encoder) = (config.chunk_bytes, self.0.encoder().clone());
         Ok(respond(move |reply_sender| async move {
             let work = async {
-                let output = scene_handle.request_output(selector, output_spec).await.map_err(to_status)?;
-                let frame = encoder.encode(output, format).await.map_err(to_status)?;
-                for chunk in frame_chunks(&frame, output_spec, format, max_chunk_bytes) {
-                    reply_sender.send(v1::RenderFrameResponse { chunk: Some(chunk) }).await?;
+                let spec = OutputSpec::Frame(picture.spec);
+                let output = scene_handle.request_output(selector, spec).await.map_err(to_status)?;
+                let frame = encoder.encode(output, picture.format).await.map_err(to_status)?;
+                for chunk in frame_chunks(&frame, &picture, max_chunk_bytes) {
+                    reply_sender.send(v1::RenderFrameResponse { part: Some(SinglePart::Chunk(chunk)) }).await?;
                 }
                 Ok(())
             };
@@ -61,36 +64,58 @@ impl v1::frame_service_server::FrameService for FrameServiceImpl {
         let deadline = Deadline::of_stream(request.metadata());
         let request = request.into_inner();
         let scene_handle = self.0.find(&request.scene).map_err(to_status)?;
-        let (output_spec, format) = parse_picture(&self.0, &scene_handle.scene, request.picture).map_err(to_status)?;
+        let picture = parse_picture(&self.0, &scene_handle.scene, request.picture).map_err(to_status)?;
         let delivery = parse_stream_delivery(request.delivery, request.max_hz).map_err(to_status)?;
         // Subscribe before the response headers are sent, so that a client can rely on receiving the next step.
-        let subscription = scene_handle.subscribe(output_spec, delivery).await.map_err(to_status)?;
-        let frames = EncodedSubscription::new(subscription, self.0.encoder().clone(), format, request.frames);
-        let max_chunk_bytes = self.0.config().chunk_bytes;
-        let split_frame = move |frame: &EncodedOutput| frame_chunks(frame, output_spec, format, max_chunk_bytes);
-        Ok(respond(move |reply_sender| {
-            deadline.enforce("the frame stream", send_frames(frames, split_frame, reply_sender))
-        }))
+        let subscription =
+            scene_handle.subscribe(OutputSpec::Frame(picture.spec), delivery).await.map_err(to_status)?;
+        let frames = EncodedSubscription::new(subscription, self.0.encoder().clone(), picture.format, request.frames);
+        let frame_stream =
+            FrameStream { picture, delivery, max_frames: request.frames, max_chunk_bytes: self.0.config().chunk_bytes };
+        Ok(respond(move |reply_sender| deadline.enforce("the frame stream", frame_stream.run(frames, reply_sender))))
     }
 }
 
-/// Sends frames in chunks until the subscription ends, the client disconnects, or the scene disconnects the subscriber.
-async fn send_frames<C: Iterator<Item = v1::FrameChunk>>(
-    mut frames: EncodedSubscription,
-    split_frame: impl Fn(&EncodedOutput) -> C,
-    reply_sender: ReplySender<v1::StreamFramesResponse>,
-) -> Result<(), Status> {
-    loop {
-        let frame = tokio::select! {
-            frame = frames.next() => frame.map_err(to_status)?,
-            () = reply_sender.closed() => return Ok(()),
-        };
-        let Some(frame) = frame else { return Ok(()) };
-        for chunk in split_frame(&frame) {
-            tokio::select! {
-                sent = reply_sender.send(v1::StreamFramesResponse { chunk: Some(chunk) }) => sent?,
-                error = frames.disconnected() => return Err(to_status(error)),
+/// Parameters of a frame stream.
+struct FrameStream {
+    picture: RequestedPicture,
+    delivery: StreamDelivery,
+    /// Number of frames to send. 0 means no limit.
+    max_frames: u64,
+    max_chunk_bytes: usize,
+}
+
+impl FrameStream {
+    /// Sends the settings, then frames in chunks until the subscription ends, the client disconnects, or the scene
+    /// disconnects the subscriber.
+    async fn run(
+        self,
+        mut frames: EncodedSubscription,
+        reply_sender: ReplySender<v1::StreamFramesResponse>,
+    ) -> Result<(), Status> {
+        let to_response = |part| v1::StreamFramesResponse { part: Some(part) };
+        reply_sender.send(to_response(StreamPart::Settings(self.settings()))).await?;
+        loop {
+            let frame = tokio::select! {
+                frame = frames.next() => frame.map_err(to_status)?,
+                () = reply_sender.closed() => return Ok(()),
+            };
+            let Some(frame) = frame else { return Ok(()) };
+            for chunk in frame_chunks(&frame, &self.picture, self.max_chunk_bytes) {
+                tokio::select! {
+                    sent = reply_sender.send(to_response(StreamPart::Chunk(chunk))) => sent?,
+                    error = frames.disconnected() => return Err(to_status(error)),
+                }
             }
+        }
+    }
+
+    fn settings(&self) -> v1::FrameStreamSettings {
+        v1::FrameStreamSettings {
+            delivery: wire_delivery(self.delivery.delivery()).into(),
+            max_hz: self.delivery.max_hz(),
+            frames: self.max_frames,
+            picture: Some(wire_picture(&self.picture)),
         }
     }
 }
@@ -98,20 +123,14 @@ async fn send_frames<C: Iterator<Item = v1::FrameChunk>>(
 /// Splits a frame into chunks, of which the first has the head.
 fn frame_chunks(
     frame: &EncodedOutput,
-    output_spec: OutputSpec,
-    format: FrameFormat,
+    picture: &RequestedPicture,
     max_chunk_bytes: usize,
 ) -> impl Iterator<Item = v1::FrameChunk> + use<> {
-    let (width, height) = match output_spec {
-        OutputSpec::Frame { size, .. } => (size.width, size.height),
-        // `parse_picture` returns frames only.
-        OutputSpec::Vertices(_) | OutputSpec::Pick { .. } | OutputSpec::State => (0, 0),
-    };
     let head = v1::FrameHead {
         step: Some(wire_step_id(frame.step)),
-        width,
-        height,
-        format: wire_format(format).into(),
+        width: picture.spec.size.width,
+        height: picture.spec.size.height,
+        format: wire_format(picture.format).into(),
         total: frame.bytes.len() as u64,
         skipped: frame.skipped,
         stages: wire_stages(&frame.stages),

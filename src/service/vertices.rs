@@ -9,8 +9,8 @@ use v1::get_vertices_response::Part as SinglePart;
 use v1::stream_vertices_response::Part as StreamPart;
 
 use super::convert::{
-    describe_step_selector, parse_step_selector, parse_stream_delivery, parse_vertex_selection, wire_sections,
-    wire_stages, wire_step_id,
+    describe_step_selector, parse_step_selector, parse_stream_delivery, parse_vertex_selection, wire_delivery,
+    wire_sections, wire_stages, wire_step_id,
 };
 use super::status::to_status;
 use super::stream::{Deadline, ReplySender, ReplyStream, chunks_with_head, respond};
@@ -92,6 +92,13 @@ impl VertexStream {
         reply_sender: ReplySender<v1::StreamVerticesResponse>,
     ) -> Result<(), Status> {
         let to_response = |part| v1::StreamVerticesResponse { part: Some(part) };
+        let delivery = subscription.delivery();
+        let settings = v1::VertexStreamSettings {
+            delivery: wire_delivery(delivery.delivery()).into(),
+            max_hz: delivery.max_hz(),
+            steps: self.max_steps,
+        };
+        reply_sender.send(to_response(StreamPart::Settings(settings))).await?;
         for layout in layout_parts(&self.selection) {
             reply_sender.send(to_response(StreamPart::Layout(layout))).await?;
         }

@@ -37,7 +37,7 @@ async fn render(server: &Server, request: v1::RenderFrameRequest) -> Result<Fram
     let mut bytes = Vec::new();
     while let Some(response) = with_timeout(stream.message()).await? {
         assert!(response.encoded_len() <= MAX_MESSAGE_BYTES);
-        let chunk = response.chunk.expect("expected a chunk");
+        let Some(v1::render_frame_response::Part::Chunk(chunk)) = response.part else { panic!("expected a chunk") };
         assert_eq!(chunk.offset, bytes.len() as u64);
         head = head.or(chunk.head);
         bytes.extend_from_slice(&chunk.data);
@@ -47,12 +47,12 @@ async fn render(server: &Server, request: v1::RenderFrameRequest) -> Result<Fram
     Ok(Frame { head, bytes })
 }
 
-/// Reads the chunks of the next frame and returns its head; `None` at the end of the stream.
+/// Reads the chunks of the next frame and returns its head; `None` at the end of the stream. Skips the settings.
 async fn next_head(stream: &mut Streaming<v1::StreamFramesResponse>) -> Option<v1::FrameHead> {
     let mut head: Option<v1::FrameHead> = None;
     let mut received_bytes = 0;
     while let Some(response) = with_timeout(stream.message()).await.expect("expected another message") {
-        let chunk = response.chunk.expect("expected a chunk");
+        let Some(v1::stream_frames_response::Part::Chunk(chunk)) = response.part else { continue };
         received_bytes += chunk.data.len() as u64;
         head = head.or(chunk.head);
         if head.as_ref().is_some_and(|head| head.total == received_bytes) {

@@ -491,7 +491,7 @@ pub(crate) async fn next_vertices(
     let mut chunks = Vec::<v1::VertexChunk>::new();
     while let Some(response) = with_timeout(stream.message()).await? {
         match response.part.expect("expected a part") {
-            Part::Layout(_) => continue,
+            Part::Settings(_) | Part::Layout(_) => continue,
             Part::Chunk(chunk) => chunks.push(chunk),
         }
         let total = chunks[0].head.as_ref().expect("expected a head as the first message").total;

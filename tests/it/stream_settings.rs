@@ -1,12 +1,15 @@
-//! The settings of frame and vertex streams: the limit on the rate. The tests with frames need an EGL driver that can
-//! render.
+//! The settings of frame and vertex streams: the limit on the rate, and the first reply, which has the settings in
+//! effect. The tests with frames need an EGL driver that can render.
 
 use std::time::{Duration, Instant};
 
+use modalcast::config::{Config, RendererChoice};
+use modalcast_client::{Client, Delivery, FrameStreamRequest, Output, Picture, VertexSelection, VertexStreamRequest};
+use modalcast_model::scene::{Camera, Lens, View};
 use modalcast_proto::v1;
 use tonic::{Code, Status};
 
-use crate::service_harness::{Server, next_vertices, rejection_details, step, with_timeout};
+use crate::service_harness::{Server, next_vertices, rejection_details, step, strips, with_timeout};
 
 fn vertex_request(delivery: v1::Delivery, max_hz: f64) -> v1::StreamVerticesRequest {
     v1::StreamVerticesRequest { scene: "strips".into(), delivery: delivery.into(), max_hz, ..Default::default() }
@@ -88,4 +91,41 @@ async fn invalid_rate_limits_are_rejected() {
         assert_eq!((status.code(), rejection.field.as_str()), (Code::InvalidArgument, "max_hz"), "{delivery:?}");
         assert_eq!(rejection.reason(), v1::Reason::InvalidField);
     }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn first_reply_has_the_settings_in_effect() {
+    let server = Server::start_with(|config| Config { renderer: RendererChoice::Auto, ..config }).await;
+    server.open("strips").await;
+    let client = Client::connect(&server.address).await.expect("expected a connection");
+    let request = VertexStreamRequest::new("strips", VertexSelection::default());
+    let request = request.delivery(Delivery::Latest).max_hz(12.5).max_replies(3);
+    let vertices = client.stream_vertices(&request).await.expect("expected a subscription");
+    let (delivery, max_hz, steps) = (v1::Delivery::Latest.into(), 12.5, 3);
+    assert_eq!(*vertices.settings(), v1::VertexStreamSettings { delivery, max_hz, steps });
+    let request = FrameStreamRequest::new("strips", Picture::default()).max_replies(7);
+    let frames = client.stream_frames(&request).await.expect("expected a subscription");
+    let settings = frames.settings();
+    assert_eq!((settings.delivery(), settings.max_hz, settings.frames), (v1::Delivery::Lossless, 0.0, 7));
+    let camera = Camera::fit_to_scene(&strips(), 1280, 720);
+    let (View::LookAt { eye, target, up }, Lens::FieldOfView(degrees)) = (camera.view, camera.lens) else {
+        panic!("expected a camera with a target and a field of view")
+    };
+    let look_at = v1::LookAt { eye: eye.into(), target: target.into(), up: up.into() };
+    let (view, lens) = (v1::camera::View::LookAt(look_at), v1::camera::Lens::FieldOfView(degrees));
+    let expected_picture = v1::Picture {
+        width: 1280,
+        height: 720,
+        format: v1::Format::Png.into(),
+        camera: Some(v1::Camera { view: Some(view), lens: Some(lens), near: 0.0, far: 0.0 }),
+        output: v1::Output::Colour.into(),
+        ..v1::Picture::default()
+    };
+    assert_eq!(settings.picture, Some(expected_picture));
+    let output = Output::ModeShape { mode: 1, scale_max: 0.25 };
+    let request = FrameStreamRequest::new("strips", Picture { output, ..Picture::default() }.size(32, 24));
+    let frames = client.stream_frames(&request).await.expect("expected a subscription");
+    let picture = frames.settings().picture.as_ref().expect("expected a picture");
+    assert_eq!((picture.width, picture.height, picture.format()), (32, 24, v1::Format::Png));
+    assert_eq!((picture.output(), picture.mode, picture.largest), (v1::Output::ModeShape, 1, 0.25));
 }

@@ -4,7 +4,7 @@
 use std::sync::Arc;
 
 use modalcast::config::{BackendChoice, Config, RendererChoice};
-use modalcast::engine::{Delivery, DeviceContext, FrameOutput, OutputBody, OutputSpec, StepOutput};
+use modalcast::engine::{Delivery, DeviceContext, FrameOutput, OutputBody, OutputSpec, PictureSpec, StepOutput};
 use modalcast_model::backend_settings::BackendSettings;
 use modalcast_model::scene::{Camera, FrameSize, Lens};
 use modalcast_proto::v1;
@@ -25,7 +25,7 @@ fn cameras(count: usize) -> Vec<Camera> {
 }
 
 fn frame_output(camera: Camera) -> OutputSpec {
-    OutputSpec::Frame { camera, size: SIZE, frame_output: FrameOutput::Color }
+    OutputSpec::Frame(PictureSpec { camera, size: SIZE, output: FrameOutput::Color })
 }
 
 /// Every step sets both coordinates of domain 1; the value of the first coordinate differs per step.

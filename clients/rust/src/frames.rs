@@ -6,6 +6,7 @@ use std::task::{Context, Poll};
 use bytes::Bytes;
 use modalcast_proto::v1;
 use v1::frame_service_client::FrameServiceClient;
+use v1::stream_frames_response::Part as StreamPart;
 
 use crate::assemble::{Chunk, ChunkDecoder, DecodedReplies, WireChunk};
 use crate::client::Client;
@@ -148,12 +149,7 @@ impl Client {
             deadline_ms: request.deadline_ms,
         };
         let messages = self.replies(FrameServiceClient::new(self.channel.clone()).render_frame(wire).await)?;
-        let frame = DecodedReplies::new(
-            messages,
-            ChunkDecoder::new(|message: v1::RenderFrameResponse| message.chunk, self.max_reply_bytes),
-        )
-        .next()
-        .await;
+        let frame = DecodedReplies::new(messages, ChunkDecoder::new(single_chunk, self.max_reply_bytes)).next().await;
         frame.unwrap_or(Err(Error::StreamEnded { awaited_reply: "the first frame" }))
     }
 
@@ -170,23 +166,42 @@ impl Client {
             frames: request.max_replies,
             max_hz: request.max_hz,
         };
-        let messages = self.replies(FrameServiceClient::new(self.channel.clone()).stream_frames(wire).await)?;
-        Ok(FrameStream(DecodedReplies::new(
-            messages,
-            ChunkDecoder::new(|message: v1::StreamFramesResponse| message.chunk, self.max_reply_bytes),
-        )))
+        let mut messages = self.replies(FrameServiceClient::new(self.channel.clone()).stream_frames(wire).await)?;
+        let settings = match messages.next().await?.and_then(|message| message.part) {
+            Some(StreamPart::Settings(settings)) => settings,
+            part => return Err(malformed_reply("frame.part", "the settings of the stream", format!("{part:?}"))),
+        };
+        let frames = DecodedReplies::new(messages, ChunkDecoder::new(stream_chunk, self.max_reply_bytes));
+        Ok(FrameStream { settings, frames })
+    }
+}
+
+fn single_chunk(message: v1::RenderFrameResponse) -> Option<v1::FrameChunk> {
+    message.part.map(|v1::render_frame_response::Part::Chunk(chunk)| chunk)
+}
+
+fn stream_chunk(message: v1::StreamFramesResponse) -> Option<v1::FrameChunk> {
+    match message.part {
+        Some(StreamPart::Chunk(chunk)) => Some(chunk),
+        Some(StreamPart::Settings(_)) | None => None,
     }
 }
 
 /// A stream of frames; dropping it unsubscribes.
-pub struct FrameStream(
-    DecodedReplies<v1::StreamFramesResponse, ChunkDecoder<v1::StreamFramesResponse, v1::FrameChunk>>,
-);
+pub struct FrameStream {
+    settings: v1::FrameStreamSettings,
+    frames: DecodedReplies<v1::StreamFramesResponse, ChunkDecoder<v1::StreamFramesResponse, v1::FrameChunk>>,
+}
 
 impl FrameStream {
+    /// The settings in effect, with all defaults resolved by the server.
+    pub const fn settings(&self) -> &v1::FrameStreamSettings {
+        &self.settings
+    }
+
     /// The next frame, or `None` after the requested number of frames.
     pub async fn next(&mut self) -> Option<Result<Frame>> {
-        self.0.next().await
+        self.frames.next().await
     }
 }
 
@@ -194,7 +209,7 @@ impl tokio_stream::Stream for FrameStream {
     type Item = Result<Frame>;
 
     fn poll_next(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Self::Item>> {
-        self.0.poll(context)
+        self.frames.poll(context)
     }
 }
 

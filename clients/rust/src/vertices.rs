@@ -154,18 +154,31 @@ impl Client {
             steps: request.max_replies,
             max_hz: request.max_hz,
         };
-        let messages = self.replies(VertexServiceClient::new(self.channel.clone()).stream_vertices(wire).await)?;
-        Ok(VertexStream(DecodedReplies::new(messages, VertexDecoder::new(stream_part, self.max_reply_bytes))))
+        let mut messages = self.replies(VertexServiceClient::new(self.channel.clone()).stream_vertices(wire).await)?;
+        let settings = match messages.next().await?.and_then(|message| message.part) {
+            Some(v1::stream_vertices_response::Part::Settings(settings)) => settings,
+            part => return Err(malformed_reply("vertices.part", "the settings of the stream", format!("{part:?}"))),
+        };
+        let sets = DecodedReplies::new(messages, VertexDecoder::new(stream_part, self.max_reply_bytes));
+        Ok(VertexStream { settings, sets })
     }
 }
 
 /// A stream of vertex sets; dropping it unsubscribes.
-pub struct VertexStream(DecodedReplies<v1::StreamVerticesResponse, VertexDecoder<v1::StreamVerticesResponse>>);
+pub struct VertexStream {
+    settings: v1::VertexStreamSettings,
+    sets: DecodedReplies<v1::StreamVerticesResponse, VertexDecoder<v1::StreamVerticesResponse>>,
+}
 
 impl VertexStream {
+    /// The settings in effect.
+    pub const fn settings(&self) -> &v1::VertexStreamSettings {
+        &self.settings
+    }
+
     /// The vertices of the next step, or `None` after the requested number of steps.
     pub async fn next(&mut self) -> Option<Result<VertexSet>> {
-        self.0.next().await
+        self.sets.next().await
     }
 }
 
@@ -173,7 +186,7 @@ impl tokio_stream::Stream for VertexStream {
     type Item = Result<VertexSet>;
 
     fn poll_next(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Self::Item>> {
-        self.0.poll(context)
+        self.sets.poll(context)
     }
 }
 
@@ -193,10 +206,11 @@ fn single_part(message: v1::GetVerticesResponse) -> Option<Part> {
 
 fn stream_part(message: v1::StreamVerticesResponse) -> Option<Part> {
     use v1::stream_vertices_response::Part as Wire;
-    message.part.map(|part| match part {
-        Wire::Layout(layout) => Part::Layout(layout),
-        Wire::Chunk(chunk) => Part::Chunk(chunk),
-    })
+    match message.part? {
+        Wire::Layout(layout) => Some(Part::Layout(layout)),
+        Wire::Chunk(chunk) => Some(Part::Chunk(chunk)),
+        Wire::Settings(_) => None,
+    }
 }
 
 /// Decodes messages `M` to vertex sets. Keeps what holds for all sets of a reply: the layout, and the last origins.

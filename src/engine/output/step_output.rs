@@ -12,11 +12,7 @@ use modalcast_render::{AovImage, FrameTimes, PickHit, RenderStage, TimeKey};
 /// The output that a client requests of a step.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum OutputSpec {
-    Frame {
-        camera: Camera,
-        size: FrameSize,
-        frame_output: FrameOutput,
-    },
+    Frame(PictureSpec),
     Vertices(VertexAttributes),
     /// The surface points at the pixels of a rectangle.
     Pick {
@@ -27,6 +23,14 @@ pub enum OutputSpec {
     },
     /// q and the transforms. The device does no work for them.
     State,
+}
+
+/// What a picture shows. Equal pictures of a step have the same pixels.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PictureSpec {
+    pub camera: Camera,
+    pub size: FrameSize,
+    pub output: FrameOutput,
 }
 
 /// The quantity that a frame shows.

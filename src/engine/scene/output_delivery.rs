@@ -16,7 +16,7 @@ use crate::config::Config;
 use crate::engine::device::command::{CopiedVertices, SceneId};
 use crate::engine::device::handle::{DeviceHandle, PendingReply};
 use crate::engine::output::pick_result::with_transforms;
-use crate::engine::output::step_output::{FrameOutput, OutputBody, OutputSpec, StepOutput, stage_times};
+use crate::engine::output::step_output::{FrameOutput, OutputBody, OutputSpec, PictureSpec, StepOutput, stage_times};
 use crate::telemetry::Stage;
 use modalcast_model::deform::{DeformedSurface, VertexAttributes};
 use modalcast_model::error::{Error, Result};
@@ -293,7 +293,7 @@ impl OutputProducer {
     /// of the same view that is in flight for another subscriber, or a new frame. A round starts at most
     /// [`MAX_FRAMES_IN_FLIGHT`] new frames. Returns whether the subscriber was added to a frame.
     fn start_frame(&mut self, subscriber: &mut Subscriber, round: &mut DeliveryRound<'_>) -> bool {
-        let OutputSpec::Frame { camera, size, frame_output: FrameOutput::Color } = subscriber.spec else {
+        let OutputSpec::Frame(PictureSpec { camera, size, output: FrameOutput::Color }) = subscriber.spec else {
             return false;
         };
         let step_count = round.current.step_count;
@@ -366,13 +366,13 @@ impl OutputProducer {
         let mut stages = current.stages.clone();
         let (id, device) = (self.scene_on_device.id, &self.device);
         let body = match *spec {
-            OutputSpec::Frame { camera, size, frame_output: FrameOutput::Color } => {
+            OutputSpec::Frame(PictureSpec { camera, size, output: FrameOutput::Color }) => {
                 let image = device.begin_draw(id, camera, size).wait().await?;
                 stages.extend(stage_times(&image.times));
                 OutputBody::Frame(Arc::new(image.into()))
             }
-            OutputSpec::Frame { camera, size, frame_output } => {
-                let (aov, legend) = device.render_aov(id, camera, size, frame_output).await?;
+            OutputSpec::Frame(PictureSpec { camera, size, output }) => {
+                let (aov, legend) = device.render_aov(id, camera, size, output).await?;
                 stages.extend(stage_times(&aov.times));
                 OutputBody::Aov(aov, legend)
             }
@@ -487,7 +487,7 @@ mod tests {
     fn subscribe(delivery: Delivery, width: u32) -> (Subscriber, Subscription) {
         let camera = Camera::fit_to_scene(&testing::two_strips(), width, 8);
         Subscription::new(
-            OutputSpec::Frame { camera, size: FrameSize::new(width, 8), frame_output: FrameOutput::Color },
+            OutputSpec::Frame(PictureSpec { camera, size: FrameSize::new(width, 8), output: FrameOutput::Color }),
             delivery.into(),
             Arc::default(),
         )

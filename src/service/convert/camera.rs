@@ -1,4 +1,4 @@
-//! Parses a camera from the wire.
+//! Converts cameras.
 
 use modalcast_proto::v1;
 
@@ -25,6 +25,21 @@ pub(super) fn parse_camera(default_camera: Camera, camera: v1::Camera) -> Result
     };
     // If `near` and `far` are 0, the renderer fits the clipping planes to the scene.
     Camera { view, lens, near: camera.near, far: camera.far }.validated()
+}
+
+/// A camera with its view and lens.
+pub(super) fn wire_camera(camera: &Camera) -> v1::Camera {
+    let view = match camera.view {
+        View::LookAt { eye, target, up } => {
+            v1::camera::View::LookAt(v1::LookAt { eye: eye.into(), target: target.into(), up: up.into() })
+        }
+        View::Pose(pose) => v1::camera::View::Pose(v1::Pose { world_from_camera: pose.into() }),
+    };
+    let lens = match camera.lens {
+        Lens::FieldOfView(degrees) => v1::camera::Lens::FieldOfView(degrees),
+        Lens::Intrinsics { fx, fy, cx, cy } => v1::camera::Lens::Intrinsics(v1::Intrinsics { fx, fy, cx, cy }),
+    };
+    v1::Camera { view: Some(view), lens: Some(lens), near: camera.near, far: camera.far }
 }
 
 /// Converts a list to an array of N numbers.

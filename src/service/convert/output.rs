@@ -1,4 +1,4 @@
-//! Parses the output and the format of a picture from the wire.
+//! Converts the output and the format of a picture.
 
 use modalcast_proto::v1;
 
@@ -51,5 +51,28 @@ fn parse_format(frame_output: FrameOutput, number: i32) -> Result<FrameFormat> {
             let expected = format!("{} or unspecified for this output", wire_format.as_str_name());
             Err(invalid("picture.format", expected, requested_format.as_str_name()))
         }
+    }
+}
+
+/// A picture with only the fields of its output.
+pub(super) fn wire_output(output: FrameOutput) -> v1::Picture {
+    let (wire_output, mode, largest) = match output {
+        FrameOutput::Color => (v1::Output::Colour, 0, 0.0),
+        FrameOutput::Depth => (v1::Output::Depth, 0, 0.0),
+        FrameOutput::Domains => (v1::Output::Domains, 0, 0.0),
+        FrameOutput::Normals => (v1::Output::Normals, 0, 0.0),
+        FrameOutput::Displacement { scale_max } => (v1::Output::Displacement, 0, scale_max),
+        FrameOutput::ModeShape { mode, scale_max } => (v1::Output::ModeShape, mode, scale_max),
+    };
+    v1::Picture { output: wire_output.into(), mode, largest, ..v1::Picture::default() }
+}
+
+pub(crate) const fn wire_format(format: FrameFormat) -> v1::Format {
+    match format {
+        FrameFormat::Png => v1::Format::Png,
+        FrameFormat::Rgba => v1::Format::Rgba,
+        FrameFormat::F32 => v1::Format::F32,
+        FrameFormat::U32 => v1::Format::U32,
+        FrameFormat::F32x3 => v1::Format::F32x3,
     }
 }

@@ -257,7 +257,7 @@ impl FrameService for FakeService {
         let request = request.into_inner();
         self.check_scene(&request.scene)?;
         let chunks = encode_frame(&self.0.output(), &request.picture.unwrap_or_default());
-        Ok(stream_messages(chunks.into_iter().map(|chunk| v1::RenderFrameResponse { chunk: Some(chunk) }).collect()))
+        Ok(stream_messages(chunks.into_iter().map(frame_reply).collect()))
     }
 
     type PickStream = ResponseStream<v1::PickResponse>;
@@ -279,14 +279,17 @@ impl FrameService for FakeService {
         let outputs = BroadcastStream::new(self.0.outputs.subscribe()).filter_map(Result::ok).take(limit);
         let (sender, receiver) = tokio::sync::mpsc::channel(4);
         tokio::spawn(async move {
+            use v1::stream_frames_response::Part;
             let mut outputs = Box::pin(outputs);
-            while let Some(output) = outputs.next().await {
-                for chunk in encode_frame(&output, &picture) {
-                    let result = sender.send(Ok(v1::StreamFramesResponse { chunk: Some(chunk) })).await;
-                    if result.is_err() {
+            let mut parts = vec![Part::Settings(v1::FrameStreamSettings::default())];
+            loop {
+                for part in parts {
+                    if sender.send(Ok(v1::StreamFramesResponse { part: Some(part) })).await.is_err() {
                         return;
                     }
                 }
+                let Some(output) = outputs.next().await else { return };
+                parts = encode_frame(&output, &picture).into_iter().map(Part::Chunk).collect();
             }
         });
         Ok(Response::new(Box::pin(ReceiverStream::new(receiver))))
@@ -323,7 +326,8 @@ impl VertexService for FakeService {
         tokio::spawn(async move {
             use v1::stream_vertices_response::Part;
             let mut outputs = Box::pin(outputs);
-            let mut parts = vec![Part::Layout(service.vertex_layout())];
+            let settings = v1::VertexStreamSettings { steps: request.steps, ..Default::default() };
+            let mut parts = vec![Part::Settings(settings), Part::Layout(service.vertex_layout())];
             loop {
                 for part in parts {
                     if sender.send(Ok(v1::StreamVerticesResponse { part: Some(part) })).await.is_err() {
@@ -371,6 +375,10 @@ impl FakeService {
         let chunk = |ByteChunk { offset, data, .. }| v1::VertexChunk { head: head.take(), offset, data };
         split_bytes(bytes).into_iter().map(chunk).collect()
     }
+}
+
+fn frame_reply(chunk: v1::FrameChunk) -> v1::RenderFrameResponse {
+    v1::RenderFrameResponse { part: Some(v1::render_frame_response::Part::Chunk(chunk)) }
 }
 
 /// An RGBA frame in chunks. Every byte is the low byte of the step number.
