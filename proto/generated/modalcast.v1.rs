@@ -1851,8 +1851,10 @@ pub struct Intrinsics {
 pub struct RenderFrameRequest {
     #[prost(string, tag = "1")]
     pub scene: ::prost::alloc::string::String,
-    #[prost(message, optional, tag = "2")]
-    pub picture: ::core::option::Option<Picture>,
+    /// 1 to 16 pictures of one step, with at most Limits.frame_side * Limits.frame_side pixels in total; empty: one picture
+    /// with all fields unset. Pictures that differ only in their format are drawn once.
+    #[prost(message, repeated, tag = "2")]
+    pub pictures: ::prost::alloc::vec::Vec<Picture>,
     /// The step to render. Unset: the current step, or the rest state before the first step.
     #[prost(message, optional, tag = "3")]
     pub step: ::core::option::Option<StepSelector>,
@@ -1878,19 +1880,20 @@ pub mod render_frame_response {
 pub struct StreamFramesRequest {
     #[prost(string, tag = "1")]
     pub scene: ::prost::alloc::string::String,
-    #[prost(message, optional, tag = "2")]
-    pub picture: ::core::option::Option<Picture>,
+    /// As in RenderFrameRequest.
+    #[prost(message, repeated, tag = "2")]
+    pub pictures: ::prost::alloc::vec::Vec<Picture>,
     /// DELIVERY_LOSSLESS: every step from the next one on. If the writer is lossless too, a slow subscriber blocks it, and
     /// is disconnected with REASON_SLOW_READER when it has blocked the writer for 30 s. If the writer sends only latest
     /// steps, a slow subscriber skips steps. DELIVERY_LATEST: the newest step, beginning with the current one if the scene
     /// has had a step.
     #[prost(enumeration = "Delivery", tag = "3")]
     pub delivery: i32,
-    /// Number of frames after which the stream ends; 0: no limit.
+    /// Number of steps after which the stream ends; 0: no limit.
     #[prost(uint64, tag = "4")]
-    pub frames: u64,
-    /// Maximum number of frames per second, finite and above 0; 0: no limit. The frames that are sent are the newest ones, and
-    /// those in between are skipped and counted. After a wait for a step, two frames may follow each other faster. Only with
+    pub steps: u64,
+    /// Maximum number of steps per second, finite and above 0; 0: no limit. The steps that are sent are the newest ones, and
+    /// those in between are skipped and counted. After a wait for a step, two steps may follow each other faster. Only with
     /// DELIVERY_LATEST: DELIVERY_LOSSLESS sends every step, so a limit is rejected.
     #[prost(double, tag = "5")]
     pub max_hz: f64,
@@ -1915,16 +1918,16 @@ pub mod stream_frames_response {
 pub struct FrameStreamSettings {
     #[prost(enumeration = "Delivery", tag = "1")]
     pub delivery: i32,
-    /// Maximum number of frames per second; 0: no limit.
+    /// Maximum number of steps per second; 0: no limit.
     #[prost(double, tag = "2")]
     pub max_hz: f64,
-    /// Number of frames after which the stream ends; 0: no limit.
+    /// Number of steps after which the stream ends; 0: no limit.
     #[prost(uint64, tag = "3")]
-    pub frames: u64,
-    /// Size, format, output and the complete camera: view and lens are set. `near` and `far` remain 0 if the server fits
-    /// them to the scene, and `largest` remains 0 if it is fitted to each frame.
-    #[prost(message, optional, tag = "4")]
-    pub picture: ::core::option::Option<Picture>,
+    pub steps: u64,
+    /// Size, format, output and complete camera of each picture: view and lens are set. `near` and `far` remain 0 if the
+    /// server fits them to the scene, and `largest` remains 0 if it is fitted to each frame.
+    #[prost(message, repeated, tag = "4")]
+    pub pictures: ::prost::alloc::vec::Vec<Picture>,
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct FrameChunk {
@@ -1951,7 +1954,7 @@ pub struct FrameHead {
     /// Size of the encoded frame in bytes.
     #[prost(uint64, tag = "5")]
     pub total: u64,
-    /// Steps skipped since the previous frame of this stream.
+    /// Steps skipped since the previous step of this stream; 0 for all pictures of a step but the first.
     #[prost(uint64, tag = "6")]
     pub skipped: u64,
     #[prost(message, repeated, tag = "7")]
@@ -1962,6 +1965,9 @@ pub struct FrameHead {
     pub shadow_drawn_by: i32,
     #[prost(enumeration = "DrawnBy", tag = "9")]
     pub visibility_drawn_by: i32,
+    /// Index of the frame's picture in the request, from 0.
+    #[prost(uint32, tag = "10")]
+    pub picture: u32,
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct PickRequest {
@@ -2277,7 +2283,8 @@ pub mod frame_service_client {
             self.inner = self.inner.max_encoding_message_size(limit);
             self
         }
-        /// Renders one frame and returns it in chunks of at most 1 MiB.
+        /// Renders one frame for each picture of the request, all of the same step, and returns them in the order of the
+        /// pictures. Each frame is sent in chunks of at most 1 MiB. The first chunk of a frame has its head.
         pub async fn render_frame(
             &mut self,
             request: impl tonic::IntoRequest<super::RenderFrameRequest>,
@@ -2302,7 +2309,8 @@ pub mod frame_service_client {
                 .insert(GrpcMethod::new("modalcast.v1.FrameService", "RenderFrame"));
             self.inner.server_streaming(req, path, codec).await
         }
-        /// Renders a frame for each step that `delivery` selects. The first reply has the settings in effect. Each frame is
+        /// Renders one frame for each picture and each step that `delivery` selects. The first reply has the settings in
+        /// effect. The frames of a step follow in the order of the pictures, and precede those of the next step. Each frame is
         /// sent in chunks of at most 1 MiB. The first chunk of a frame has its head. The subscription is active when the
         /// response headers arrive, so the next step is delivered.
         pub async fn stream_frames(
@@ -2377,7 +2385,8 @@ pub mod frame_service_server {
             >
             + std::marker::Send
             + 'static;
-        /// Renders one frame and returns it in chunks of at most 1 MiB.
+        /// Renders one frame for each picture of the request, all of the same step, and returns them in the order of the
+        /// pictures. Each frame is sent in chunks of at most 1 MiB. The first chunk of a frame has its head.
         async fn render_frame(
             &self,
             request: tonic::Request<super::RenderFrameRequest>,
@@ -2391,7 +2400,8 @@ pub mod frame_service_server {
             >
             + std::marker::Send
             + 'static;
-        /// Renders a frame for each step that `delivery` selects. The first reply has the settings in effect. Each frame is
+        /// Renders one frame for each picture and each step that `delivery` selects. The first reply has the settings in
+        /// effect. The frames of a step follow in the order of the pictures, and precede those of the next step. Each frame is
         /// sent in chunks of at most 1 MiB. The first chunk of a frame has its head. The subscription is active when the
         /// response headers arrive, so the next step is delivered.
         async fn stream_frames(

@@ -1,7 +1,6 @@
 //! Conversions between wire messages and engine types. `wire_` functions create messages, `parse_` functions read them.
 //! Numbers from the wire are untrusted until a constructor of `modalcast_model::scene` has validated them.
 
-
 use modalcast_proto::v1;
 
 use crate::engine::{
@@ -190,9 +189,36 @@ pub(super) struct RequestedPicture {
     pub format: FrameFormat,
 }
 
-/// Validates a picture. An unset picture is the default one.
-pub(super) fn parse_picture(engine: &Engine, scene: &Scene, picture: Option<v1::Picture>) -> Result<RequestedPicture> {
-    let picture = picture.unwrap_or_default();
+/// Maximum number of pictures of a request.
+const MAX_PICTURES: usize = 16;
+
+/// Validates the pictures of a request. An empty list is one default picture.
+pub(super) fn parse_pictures(
+    engine: &Engine,
+    scene: &Scene,
+    pictures: Vec<v1::Picture>,
+) -> Result<Vec<RequestedPicture>> {
+    if pictures.len() > MAX_PICTURES {
+        return Err(invalid("pictures", format!("at most {MAX_PICTURES} pictures"), pictures.len()));
+    }
+    let pictures = if pictures.is_empty() { vec![v1::Picture::default()] } else { pictures };
+    let parse = |(index, picture)| {
+        parse_picture(engine, scene, picture).map_err(|error| error.in_message(&format!("pictures[{index}]")))
+    };
+    let pictures = pictures.into_iter().enumerate().map(parse).collect::<Result<Vec<_>>>()?;
+    let pixel_count =
+        |picture: &RequestedPicture| u64::from(picture.spec.size.width) * u64::from(picture.spec.size.height);
+    let total_pixels: u64 = pictures.iter().map(pixel_count).sum();
+    // As many as the largest single picture has, so that several pictures need no more memory than one may need.
+    let max_pixels = u64::from(engine.frame_side()).pow(2);
+    if total_pixels > max_pixels {
+        return Err(invalid("pictures", format!("at most {max_pixels} pixels in total"), total_pixels));
+    }
+    Ok(pictures)
+}
+
+/// Validates a picture. The field of an error is relative to the picture.
+fn parse_picture(engine: &Engine, scene: &Scene, picture: v1::Picture) -> Result<RequestedPicture> {
     let (output, format) = output::parse_output(scene, &picture)?;
     let (width, height) = match (picture.width, picture.height) {
         (0, 0) => (1280, 720),
@@ -201,12 +227,12 @@ pub(super) fn parse_picture(engine: &Engine, scene: &Scene, picture: Option<v1::
     let max_side = engine.frame_side();
     if !(1..=max_side).contains(&width) || !(1..=max_side).contains(&height) {
         let expected = format!("1 to {max_side} pixels per side, or 0 x 0 for 1280 x 720");
-        return Err(invalid("picture.width", expected, format!("{width} x {height}")));
+        return Err(invalid("width", expected, format!("{width} x {height}")));
     }
     let fit_to_scene = Camera::fit_to_scene(scene, width, height);
     let camera = match picture.camera {
         None => fit_to_scene,
-        Some(camera) => camera::parse_camera(fit_to_scene, camera).map_err(|error| error.in_message("picture"))?,
+        Some(camera) => camera::parse_camera(fit_to_scene, camera)?,
     };
     Ok(RequestedPicture { spec: PictureSpec { camera, size: FrameSize::new(width, height), output }, format })
 }
@@ -214,13 +240,11 @@ pub(super) fn parse_picture(engine: &Engine, scene: &Scene, picture: Option<v1::
 /// Validates a pick request. Returns an [`OutputSpec::Pick`].
 pub(super) fn parse_pick(engine: &Engine, scene: &Scene, request: &v1::PickRequest) -> Result<OutputSpec> {
     // A pick ignores the output and the format of its picture.
-    let size_and_camera = request.picture.clone().map(|picture| v1::Picture {
-        width: picture.width,
-        height: picture.height,
-        camera: picture.camera,
-        ..v1::Picture::default()
-    });
-    let PictureSpec { camera, size: picture, .. } = parse_picture(engine, scene, size_and_camera)?.spec;
+    let picture = request.picture.clone().unwrap_or_default();
+    let size_and_camera =
+        v1::Picture { width: picture.width, height: picture.height, camera: picture.camera, ..v1::Picture::default() };
+    let picture = parse_picture(engine, scene, size_and_camera).map_err(|error| error.in_message("picture"))?;
+    let PictureSpec { camera, size: picture, .. } = picture.spec;
     let size = match (request.width, request.height) {
         (0, 0) => [1, 1],
         (width, height) => [width, height],

@@ -7,13 +7,13 @@ use v1::render_frame_response::Part as SinglePart;
 use v1::stream_frames_response::Part as StreamPart;
 
 use super::convert::{
-    RequestedPicture, describe_step_selector, parse_picture, parse_step_selector, parse_stream_delivery, wire_delivery,
-    wire_format, wire_picture, wire_raster_backend, wire_stages, wire_step_id,
+    RequestedPicture, describe_step_selector, parse_pictures, parse_step_selector, parse_stream_delivery,
+    wire_delivery, wire_format, wire_picture, wire_raster_backend, wire_stages, wire_step_id,
 };
 use super::picks;
 use super::status::to_status;
 use super::stream::{Deadline, ReplySender, ReplyStream, chunks_with_head, respond};
-use crate::engine::{EncodedOutput, EncodedSubscription, Engine, OutputSpec, StreamDelivery};
+use crate::engine::{EncodedFrame, EncodedSubscription, Engine, OutputSpec, StepPicture, StreamDelivery};
 
 /// Implementation of `FrameService`.
 pub(super) struct FrameServiceImpl(pub(super) Engine);
@@ -30,16 +30,17 @@ impl v1::frame_service_server::FrameService for FrameServiceImpl {
         let deadline = Deadline::of_request(request.metadata(), request.get_ref().deadline_ms, config);
         let request = request.into_inner();
         let scene_handle = self.0.find(&request.scene).map_err(to_status)?;
-        let picture = parse_picture(&self.0, &scene_handle.scene, request.picture).map_err(to_status)?;
+        let pictures = parse_pictures(&self.0, &scene_handle.scene, request.pictures).map_err(to_status)?;
         let selector = parse_step_selector(request.step);
         let (max_chunk_bytes, encoder) = (config.chunk_bytes, self.0.encoder().clone());
         Ok(respond(move |reply_sender| async move {
             let work = async {
-                let spec = OutputSpec::Frame(picture.spec);
-                let output = scene_handle.request_output(selector, spec).await.map_err(to_status)?;
-                let frame = encoder.encode(output, picture.format).await.map_err(to_status)?;
-                for chunk in frame_chunks(&frame, &picture, max_chunk_bytes) {
-                    reply_sender.send(v1::RenderFrameResponse { part: Some(SinglePart::Chunk(chunk)) }).await?;
+                let output = scene_handle.request_output(selector, output_spec(&pictures)).await.map_err(to_status)?;
+                for (step_picture, picture) in StepPicture::of_output(output).map_err(to_status)?.zip(&pictures) {
+                    let frame = encoder.encode(step_picture, picture.format).await.map_err(to_status)?;
+                    for chunk in frame_chunks(&frame, picture, max_chunk_bytes) {
+                        reply_sender.send(v1::RenderFrameResponse { part: Some(SinglePart::Chunk(chunk)) }).await?;
+                    }
                 }
                 Ok(())
             };
@@ -64,24 +65,24 @@ impl v1::frame_service_server::FrameService for FrameServiceImpl {
         let deadline = Deadline::of_stream(request.metadata());
         let request = request.into_inner();
         let scene_handle = self.0.find(&request.scene).map_err(to_status)?;
-        let picture = parse_picture(&self.0, &scene_handle.scene, request.picture).map_err(to_status)?;
+        let pictures = parse_pictures(&self.0, &scene_handle.scene, request.pictures).map_err(to_status)?;
         let delivery = parse_stream_delivery(request.delivery, request.max_hz).map_err(to_status)?;
         // Subscribe before the response headers are sent, so that a client can rely on receiving the next step.
-        let subscription =
-            scene_handle.subscribe(OutputSpec::Frame(picture.spec), delivery).await.map_err(to_status)?;
-        let frames = EncodedSubscription::new(subscription, self.0.encoder().clone(), picture.format, request.frames);
+        let subscription = scene_handle.subscribe(output_spec(&pictures), delivery).await.map_err(to_status)?;
+        let formats = pictures.iter().map(|picture| picture.format).collect();
+        let frames = EncodedSubscription::new(subscription, self.0.encoder().clone(), formats, request.steps);
         let frame_stream =
-            FrameStream { picture, delivery, max_frames: request.frames, max_chunk_bytes: self.0.config().chunk_bytes };
+            FrameStream { pictures, delivery, max_steps: request.steps, max_chunk_bytes: self.0.config().chunk_bytes };
         Ok(respond(move |reply_sender| deadline.enforce("the frame stream", frame_stream.run(frames, reply_sender))))
     }
 }
 
 /// Parameters of a frame stream.
 struct FrameStream {
-    picture: RequestedPicture,
+    pictures: Vec<RequestedPicture>,
     delivery: StreamDelivery,
-    /// Number of frames to send. 0 means no limit.
-    max_frames: u64,
+    /// Number of steps to send. 0 means no limit.
+    max_steps: u64,
     max_chunk_bytes: usize,
 }
 
@@ -101,7 +102,9 @@ impl FrameStream {
                 () = reply_sender.closed() => return Ok(()),
             };
             let Some(frame) = frame else { return Ok(()) };
-            for chunk in frame_chunks(&frame, &self.picture, self.max_chunk_bytes) {
+            // The encoder numbers the frames by the same list of pictures.
+            let Some(picture) = self.pictures.get(frame.picture as usize) else { continue };
+            for chunk in frame_chunks(&frame, picture, self.max_chunk_bytes) {
                 tokio::select! {
                     sent = reply_sender.send(to_response(StreamPart::Chunk(chunk))) => sent?,
                     error = frames.disconnected() => return Err(to_status(error)),
@@ -114,15 +117,19 @@ impl FrameStream {
         v1::FrameStreamSettings {
             delivery: wire_delivery(self.delivery.delivery()).into(),
             max_hz: self.delivery.max_hz(),
-            frames: self.max_frames,
-            picture: Some(wire_picture(&self.picture)),
+            steps: self.max_steps,
+            pictures: self.pictures.iter().map(wire_picture).collect(),
         }
     }
 }
 
+fn output_spec(pictures: &[RequestedPicture]) -> OutputSpec {
+    OutputSpec::Frames(pictures.iter().map(|picture| picture.spec).collect())
+}
+
 /// Splits a frame into chunks, of which the first has the head.
 fn frame_chunks(
-    frame: &EncodedOutput,
+    EncodedFrame { picture: picture_index, output: frame }: &EncodedFrame,
     picture: &RequestedPicture,
     max_chunk_bytes: usize,
 ) -> impl Iterator<Item = v1::FrameChunk> + use<> {
@@ -136,6 +143,7 @@ fn frame_chunks(
         stages: wire_stages(&frame.stages),
         shadow_drawn_by: wire_raster_backend(frame.raster_backends.shadow).into(),
         visibility_drawn_by: wire_raster_backend(frame.raster_backends.visibility).into(),
+        picture: *picture_index,
     };
     chunks_with_head(head, frame.bytes.clone(), max_chunk_bytes, |head, offset, data| v1::FrameChunk {
         head,

@@ -7,9 +7,7 @@ use modalcast_proto::v1;
 use tonic::{Request, Response, Status};
 use v1::stream_states_response::Part;
 
-use super::convert::{
-    describe_step_selector, parse_step_selector, parse_stream_delivery, wire_stages, wire_step_id,
-};
+use super::convert::{describe_step_selector, parse_step_selector, parse_stream_delivery, wire_stages, wire_step_id};
 use super::status::to_status;
 use super::stream::{Deadline, ReplySender, ReplyStream, chunks_with_head, respond};
 use crate::engine::{Engine, OutputSpec, PackedState, StateContent, StateSection, Subscription, pack_state};

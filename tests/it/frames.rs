@@ -16,13 +16,13 @@ async fn start_server() -> Server {
     server
 }
 
-fn picture_of_size(width: u32, height: u32, format: v1::Format) -> Option<v1::Picture> {
-    Some(v1::Picture { width, height, format: format.into(), ..v1::Picture::default() })
+fn picture_of_size(width: u32, height: u32, format: v1::Format) -> Vec<v1::Picture> {
+    vec![v1::Picture { width, height, format: format.into(), ..v1::Picture::default() }]
 }
 
 fn rgba_request() -> v1::RenderFrameRequest {
-    let picture = picture_of_size(64, 48, v1::Format::Rgba);
-    v1::RenderFrameRequest { scene: "strips".into(), picture, ..v1::RenderFrameRequest::default() }
+    let pictures = picture_of_size(64, 48, v1::Format::Rgba);
+    v1::RenderFrameRequest { scene: "strips".into(), pictures, ..v1::RenderFrameRequest::default() }
 }
 
 /// A frame joined from its chunks.
@@ -76,7 +76,7 @@ async fn frame_names_its_step_and_png_equals_rgba() {
     assert_eq!(rgba_frame.head.step, Some(v1::StepId { run: 1, number: 5, time: 2.5 }));
     assert_eq!((rgba_frame.head.width, rgba_frame.head.height, rgba_frame.bytes.len()), (64, 48, 64 * 48 * 4));
     assert_ne!(rgba_frame.bytes, rest_frame.bytes, "expected another image than at rest");
-    let png_request = v1::RenderFrameRequest { picture: picture_of_size(64, 48, v1::Format::Png), ..rgba_request() };
+    let png_request = v1::RenderFrameRequest { pictures: picture_of_size(64, 48, v1::Format::Png), ..rgba_request() };
     let png_frame = render(&server, png_request).await.expect("expected a frame");
     let decoded_png = image::load_from_memory(&png_frame.bytes).expect("expected a PNG file").into_rgba8();
     assert_eq!(decoded_png.into_raw(), rgba_frame.bytes);
@@ -93,10 +93,10 @@ async fn frame_names_its_step_and_png_equals_rgba() {
 async fn large_frame_is_chunked_for_default_client_limits() {
     let server = start_server().await;
     let large_request =
-        v1::RenderFrameRequest { picture: picture_of_size(1600, 1000, v1::Format::Rgba), ..rgba_request() };
+        v1::RenderFrameRequest { pictures: picture_of_size(1600, 1000, v1::Format::Rgba), ..rgba_request() };
     let frame = render(&server, large_request).await.expect("expected a frame");
     assert_eq!(frame.bytes.len(), 1600 * 1000 * 4);
-    let default_request = v1::RenderFrameRequest { picture: None, ..rgba_request() };
+    let default_request = v1::RenderFrameRequest { pictures: vec![], ..rgba_request() };
     let frame = render(&server, default_request).await.expect("expected a frame");
     assert_eq!((frame.head.width, frame.head.height, frame.head.format()), (1280, 720, v1::Format::Png));
 }
@@ -106,17 +106,17 @@ async fn large_frame_is_chunked_for_default_client_limits() {
 #[tokio::test(flavor = "multi_thread")]
 async fn lossless_frames_are_complete_and_latest_frames_increase() {
     let server = start_server().await;
-    let stream_request = |delivery: v1::Delivery, frames| v1::StreamFramesRequest {
+    let stream_request = |delivery: v1::Delivery, steps| v1::StreamFramesRequest {
         scene: "strips".into(),
-        picture: picture_of_size(32, 32, v1::Format::Png),
+        pictures: picture_of_size(32, 32, v1::Format::Png),
         delivery: delivery.into(),
-        frames,
+        steps,
         max_hz: 0.0,
     };
     let mut client = server.frames().await;
     let lossless =
         client.stream_frames(stream_request(v1::Delivery::Lossless, 12)).await.expect("expected a subscription");
-    // 0 frames mean an endless stream.
+    // 0 steps mean an endless stream.
     let latest = client.stream_frames(stream_request(v1::Delivery::Latest, 0)).await.expect("expected a subscription");
     let (mut lossless, mut latest) = (lossless.into_inner(), latest.into_inner());
     let mut writer = server.drive("strips", v1::Delivery::Lossless, 3).await;
@@ -162,36 +162,36 @@ async fn invalid_pictures_and_missed_deadlines_are_errors() {
     let eye_along_up = vec![0.0, 2.0, 0.0];
     // Invalid cameras, and the beginning of the field in the rejection.
     let cameras: Vec<(v1::Camera, &str)> = vec![
-        (camera_at(two_numbers, y_axis()), "picture.camera.look_at.eye"),
-        (camera_at(nan_eye, y_axis()), "picture.camera.look_at"),
-        (camera_at(eye_at_target, y_axis()), "picture.camera.look_at"),
-        (camera_at(eye_along_up, y_axis()), "picture.camera.look_at"),
-        (camera_with_lens(v1::camera::Lens::FieldOfView(180.0)), "picture.camera.field_of_view"),
-        (camera_with_lens(v1::camera::Lens::Intrinsics(v1::Intrinsics::default())), "picture.camera.intrinsics"),
-        (v1::Camera { near: 2.0, far: 1.0, ..v1::Camera::default() }, "picture.camera.near"),
-        (v1::Camera { near: f64::NAN, ..v1::Camera::default() }, "picture.camera.near"),
+        (camera_at(two_numbers, y_axis()), "pictures[0].camera.look_at.eye"),
+        (camera_at(nan_eye, y_axis()), "pictures[0].camera.look_at"),
+        (camera_at(eye_at_target, y_axis()), "pictures[0].camera.look_at"),
+        (camera_at(eye_along_up, y_axis()), "pictures[0].camera.look_at"),
+        (camera_with_lens(v1::camera::Lens::FieldOfView(180.0)), "pictures[0].camera.field_of_view"),
+        (camera_with_lens(v1::camera::Lens::Intrinsics(v1::Intrinsics::default())), "pictures[0].camera.intrinsics"),
+        (v1::Camera { near: 2.0, far: 1.0, ..v1::Camera::default() }, "pictures[0].camera.near"),
+        (v1::Camera { near: f64::NAN, ..v1::Camera::default() }, "pictures[0].camera.near"),
         (
             v1::Camera {
                 view: Some(v1::camera::View::Pose(v1::Pose { world_from_camera: vec![0.0; 12] })),
                 ..v1::Camera::default()
             },
-            "picture.camera.pose",
+            "pictures[0].camera.pose",
         ),
     ];
     for (camera, field) in cameras {
         let mut invalid_request = rgba_request();
-        invalid_request.picture.as_mut().expect("expected a picture").camera = Some(camera);
+        invalid_request.pictures[0].camera = Some(camera);
         let status = render(&server, invalid_request).await.err().expect(field);
         assert_eq!(status.code(), Code::InvalidArgument, "{status:?}");
         assert!(rejection_details(&status).field.starts_with(field), "expected {field}, got {status:?}");
     }
     for (width, height) in [(0, 48), (48, 0), (1_000_000, 48), (48, u32::MAX)] {
         let invalid_request =
-            v1::RenderFrameRequest { picture: picture_of_size(width, height, v1::Format::Png), ..rgba_request() };
+            v1::RenderFrameRequest { pictures: picture_of_size(width, height, v1::Format::Png), ..rgba_request() };
         let status = render(&server, invalid_request).await.err().expect("expected an invalid-size error");
         assert_eq!(
             (status.code(), rejection_details(&status).field.as_str()),
-            (Code::InvalidArgument, "picture.width")
+            (Code::InvalidArgument, "pictures[0].width")
         );
         assert_eq!(rejection_details(&status).given, format!("{width} x {height}"));
     }

@@ -16,6 +16,7 @@ mod layering;
 mod light;
 mod normals;
 mod picks;
+mod pictures;
 mod pixels;
 mod raster;
 mod real;

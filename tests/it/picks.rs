@@ -223,14 +223,14 @@ async fn invalid_rectangles_outputs_and_steps_are_rejected() {
     let nan_scale = v1::Picture { largest: f64::NAN, ..wire_picture(v1::Output::Displacement, v1::Format::Png) };
     let unknown_output = v1::Picture { output: 99, ..v1::Picture::default() };
     for (picture, field) in [
-        (depth_as_png, "picture.format"),
-        (colour_as_floats, "picture.format"),
-        (missing_mode, "picture.mode"),
-        (scaled_depth, "picture.largest"),
-        (nan_scale, "picture.largest"),
-        (unknown_output, "picture.output"),
+        (depth_as_png, "pictures[0].format"),
+        (colour_as_floats, "pictures[0].format"),
+        (missing_mode, "pictures[0].mode"),
+        (scaled_depth, "pictures[0].largest"),
+        (nan_scale, "pictures[0].largest"),
+        (unknown_output, "pictures[0].output"),
     ] {
-        let request = v1::RenderFrameRequest { scene: "strips".into(), picture: Some(picture), ..Default::default() };
+        let request = v1::RenderFrameRequest { scene: "strips".into(), pictures: vec![picture], ..Default::default() };
         let status = server.frames().await.render_frame(request).await.expect_err(field);
         assert_eq!(crate::service_harness::rejection_details(&status).field, field);
     }

@@ -99,14 +99,14 @@ async fn first_reply_has_the_settings_in_effect() {
     server.open("strips").await;
     let client = Client::connect(&server.address).await.expect("expected a connection");
     let request = VertexStreamRequest::new("strips", VertexSelection::default());
-    let request = request.delivery(Delivery::Latest).max_hz(12.5).max_replies(3);
+    let request = request.delivery(Delivery::Latest).max_hz(12.5).max_steps(3);
     let vertices = client.stream_vertices(&request).await.expect("expected a subscription");
     let (delivery, max_hz, steps) = (v1::Delivery::Latest.into(), 12.5, 3);
     assert_eq!(*vertices.settings(), v1::VertexStreamSettings { delivery, max_hz, steps });
-    let request = FrameStreamRequest::new("strips", Picture::default()).max_replies(7);
+    let request = FrameStreamRequest::new("strips", Picture::default()).max_steps(7);
     let frames = client.stream_frames(&request).await.expect("expected a subscription");
     let settings = frames.settings();
-    assert_eq!((settings.delivery(), settings.max_hz, settings.frames), (v1::Delivery::Lossless, 0.0, 7));
+    assert_eq!((settings.delivery(), settings.max_hz, settings.steps), (v1::Delivery::Lossless, 0.0, 7));
     let camera = Camera::fit_to_scene(&strips(), 1280, 720);
     let (View::LookAt { eye, target, up }, Lens::FieldOfView(degrees)) = (camera.view, camera.lens) else {
         panic!("expected a camera with a target and a field of view")
@@ -121,11 +121,11 @@ async fn first_reply_has_the_settings_in_effect() {
         output: v1::Output::Colour.into(),
         ..v1::Picture::default()
     };
-    assert_eq!(settings.picture, Some(expected_picture));
+    assert_eq!(settings.pictures, [expected_picture]);
     let output = Output::ModeShape { mode: 1, scale_max: 0.25 };
     let request = FrameStreamRequest::new("strips", Picture { output, ..Picture::default() }.size(32, 24));
     let frames = client.stream_frames(&request).await.expect("expected a subscription");
-    let picture = frames.settings().picture.as_ref().expect("expected a picture");
+    let picture = &frames.settings().pictures[0];
     assert_eq!((picture.width, picture.height, picture.format()), (32, 24, v1::Format::Png));
     assert_eq!((picture.output(), picture.mode, picture.largest), (v1::Output::ModeShape, 1, 0.25));
 }

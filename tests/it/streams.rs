@@ -4,7 +4,9 @@
 use std::sync::Arc;
 
 use modalcast::config::{BackendChoice, Config, RendererChoice};
-use modalcast::engine::{Delivery, DeviceContext, FrameOutput, OutputBody, OutputSpec, PictureSpec, StepOutput};
+use modalcast::engine::{
+    Delivery, DeviceContext, FrameOutput, OutputBody, OutputSpec, PictureSpec, Pixels, StepOutput,
+};
 use modalcast_model::backend_settings::BackendSettings;
 use modalcast_model::scene::{Camera, FrameSize, Lens};
 use modalcast_proto::v1;
@@ -25,7 +27,7 @@ fn cameras(count: usize) -> Vec<Camera> {
 }
 
 fn frame_output(camera: Camera) -> OutputSpec {
-    OutputSpec::Frame(PictureSpec { camera, size: SIZE, output: FrameOutput::Color })
+    OutputSpec::Frames([PictureSpec { camera, size: SIZE, output: FrameOutput::Color }].into())
 }
 
 /// Every step sets both coordinates of domain 1; the value of the first coordinate differs per step.
@@ -60,8 +62,9 @@ fn reference_images(cameras: &[Camera]) -> Vec<StepImages> {
 }
 
 fn frame_bytes(output: &StepOutput) -> &[u8] {
-    let OutputBody::Frame(image) = &output.body else { panic!("expected a frame") };
-    &image.rgba
+    let OutputBody::Frames(pictures) = &output.body else { panic!("expected frames") };
+    let Pixels::Color(rgba) = &pictures[0].pixels else { panic!("expected a color picture") };
+    rgba
 }
 
 async fn start_server() -> Server {
@@ -131,6 +134,44 @@ async fn frames_of_many_cameras_show_their_own_step() {
             && expected_images[0].images[0] != expected_images[0].images[1],
         "negative control: steps and cameras differ"
     );
+    writer.finish().await;
+}
+
+/// Each output of a subscription to several cameras has one image per camera, all of the step that it names. Another
+/// subscription to one of the cameras shares its images.
+#[tokio::test(flavor = "multi_thread")]
+async fn pictures_of_one_subscription_show_the_same_step() {
+    let (server, cameras) = (start_server().await, cameras(5));
+    let scene_handle = server.engine.find("attributes").expect("expected an open scene");
+    let color = |camera: &Camera| PictureSpec { camera: *camera, size: SIZE, output: FrameOutput::Color };
+    let depth = PictureSpec { output: FrameOutput::Depth, ..color(&cameras[0]) };
+    let pictures = cameras.iter().map(color).chain([depth]).collect();
+    let subscribe =
+        async |spec| scene_handle.subscribe(spec, Delivery::Lossless).await.expect("expected a subscription");
+    let mut all_cameras = subscribe(OutputSpec::Frames(pictures)).await;
+    let mut last_camera = subscribe(frame_output(cameras[4])).await;
+    let mut writer = server.drive("attributes", v1::Delivery::Lossless, 40).await;
+    for step in steps() {
+        writer.send_step(step).await;
+    }
+    for StepImages { step: number, images } in reference_images(&cameras) {
+        let output = with_timeout(all_cameras.next()).await.expect("expected another output");
+        assert_eq!((output.step.number, output.skipped), (number, 0));
+        let OutputBody::Frames(pictures) = output.body else { panic!("expected frames") };
+        assert_eq!(pictures.len(), 6);
+        for (picture, image) in pictures.iter().zip(&images) {
+            let Pixels::Color(rgba) = &picture.pixels else { panic!("expected a color picture") };
+            assert!(rgba == image, "step {number}");
+        }
+        assert!(matches!(pictures[5].pixels, Pixels::Values(_)));
+        let output = with_timeout(last_camera.next()).await.expect("expected another output");
+        let OutputBody::Frames(single_picture) = output.body else { panic!("expected frames") };
+        assert!(Arc::ptr_eq(&single_picture[0], &pictures[4]), "expected one drawing of step {number}");
+        assert!(!Arc::ptr_eq(&single_picture[0], &pictures[3]), "control: another camera");
+    }
+    for _ in 0..STEPS {
+        writer.receive_reply().await;
+    }
     writer.finish().await;
 }
 

@@ -114,7 +114,7 @@ async fn tree_sways_and_subscribers_receive_closed_joints() {
     let client = Client::connect(&url).await.expect("a connection");
     let rest_positions = server.output().positions;
     // `toy` is the only scene of the fake server.
-    let request = VertexStreamRequest::new("toy", VertexSelection::default()).max_replies(90);
+    let request = VertexStreamRequest::new("toy", VertexSelection::default()).max_steps(90);
     let mut vertex_stream = client.stream_vertices(&request).await.expect("a stream");
     let folder = tempfile::tempdir().expect("a temporary folder");
     let record = folder.path().display().to_string();

@@ -17,8 +17,11 @@ use crate::stages::{self, StageTimes};
 /// A request for one frame.
 pub type FrameRequest = StepRequest<Picture>;
 
-/// A subscription to one frame per step.
-pub type FrameStreamRequest = Subscription<Picture>;
+/// A request for the frames of several pictures of one step.
+pub type FramesRequest = StepRequest<Pictures>;
+
+/// A subscription to one frame per step and picture.
+pub type FrameStreamRequest = Subscription<Pictures>;
 
 /// Encoding of the bytes of a frame, top row first: 8-bit sRGB (`Png`, `Rgba`), or numbers.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -108,17 +111,35 @@ impl Picture {
     }
 }
 
+/// The pictures of a request, 1 to 16. A single picture converts to a list of one.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Pictures(pub Vec<Picture>);
+
+impl From<Picture> for Pictures {
+    fn from(picture: Picture) -> Self {
+        Self(vec![picture])
+    }
+}
+
+impl From<Vec<Picture>> for Pictures {
+    fn from(pictures: Vec<Picture>) -> Self {
+        Self(pictures)
+    }
+}
+
 /// One frame.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Frame {
     /// The step that the frame shows.
     pub step: v1::StepId,
+    /// Index of the frame's picture in the request.
+    pub picture: usize,
     pub width: u32,
     pub height: u32,
     pub format: FrameFormat,
     /// A PNG file, or 4 or 12 bytes per pixel, as `format` states.
     pub bytes: Bytes,
-    /// Number of steps skipped since the previous frame of the stream.
+    /// Number of steps skipped since the previous step of the stream; 0 for all pictures of a step but the first.
     pub skipped: u64,
     pub stages: StageTimes,
     /// The rasterizer of the shadow map. `None` for other outputs than color, and if the map is shared with another
@@ -142,15 +163,36 @@ impl Client {
     /// `Status` if the scene or the step does not exist or the deadline passed; `Malformed` if the reply contradicts
     /// itself; `Connect` if the connection is lost.
     pub async fn render_frame(&self, request: &FrameRequest) -> Result<Frame> {
+        let StepRequest { scene, query, step, deadline_ms } = request;
+        let frames_request =
+            FramesRequest { scene: scene.clone(), query: (*query).into(), step: *step, deadline_ms: *deadline_ms };
+        let mut frames = self.render_frames(&frames_request).await?;
+        frames.pop().ok_or(Error::StreamEnded { awaited_reply: "the frame" })
+    }
+
+    /// Renders one frame per picture, all of the same step, and returns them in the order of the pictures.
+    ///
+    /// # Errors
+    /// As for [`Self::render_frame`].
+    pub async fn render_frames(&self, request: &FramesRequest) -> Result<Vec<Frame>> {
         let wire = v1::RenderFrameRequest {
             scene: request.scene.clone(),
-            picture: Some(request.query.into()),
+            pictures: request.query.to_wire(),
             step: request.step.to_wire(),
             deadline_ms: request.deadline_ms,
         };
         let messages = self.replies(FrameServiceClient::new(self.channel.clone()).render_frame(wire).await)?;
-        let frame = DecodedReplies::new(messages, ChunkDecoder::new(single_chunk, self.max_reply_bytes)).next().await;
-        frame.unwrap_or(Err(Error::StreamEnded { awaited_reply: "the first frame" }))
+        let mut replies = DecodedReplies::new(messages, ChunkDecoder::new(single_chunk, self.max_reply_bytes));
+        let mut frames = Vec::new();
+        while let Some(frame) = replies.next().await {
+            frames.push(frame?);
+        }
+        let expected_count = request.query.0.len().max(1);
+        if frames.len() == expected_count {
+            Ok(frames)
+        } else {
+            Err(Error::StreamEnded { awaited_reply: "all frames" })
+        }
     }
 
     /// Subscribes to frames. When this returns, the server has accepted the subscription: the client receives every
@@ -161,9 +203,9 @@ impl Client {
     pub async fn stream_frames(&self, request: &FrameStreamRequest) -> Result<FrameStream> {
         let wire = v1::StreamFramesRequest {
             scene: request.scene.clone(),
-            picture: Some(request.query.into()),
+            pictures: request.query.to_wire(),
             delivery: v1::Delivery::from(request.delivery).into(),
-            frames: request.max_replies,
+            steps: request.max_steps,
             max_hz: request.max_hz,
         };
         let mut messages = self.replies(FrameServiceClient::new(self.channel.clone()).stream_frames(wire).await)?;
@@ -199,7 +241,8 @@ impl FrameStream {
         &self.settings
     }
 
-    /// The next frame, or `None` after the requested number of frames.
+    /// The next frame, or `None` after the requested number of steps. The frames of a step arrive in the order of the
+    /// pictures.
     pub async fn next(&mut self) -> Option<Result<Frame>> {
         self.frames.next().await
     }
@@ -245,6 +288,7 @@ impl WireChunk for v1::FrameChunk {
         let step = head.step.ok_or_else(|| malformed_reply("frame.step", "a step", "none"))?;
         Ok(Frame {
             step,
+            picture: head.picture as usize,
             width: head.width,
             height: head.height,
             format,
@@ -262,6 +306,12 @@ const fn decode_drawn_by(wire: v1::DrawnBy) -> Option<DrawnBy> {
         v1::DrawnBy::Unspecified => None,
         v1::DrawnBy::Opengl => Some(DrawnBy::OpenGl),
         v1::DrawnBy::Cuda => Some(DrawnBy::Cuda),
+    }
+}
+
+impl Pictures {
+    fn to_wire(&self) -> Vec<v1::Picture> {
+        self.0.iter().copied().map(Into::into).collect()
     }
 }
 

@@ -21,7 +21,8 @@ mod vertices;
 pub use client::{Client, REPLY_LIMIT, SceneList, ServerInfo};
 pub use error::{Error, Reason, Rejection, Result};
 pub use frames::{
-    Camera, DrawnBy, Frame, FrameFormat, FrameRequest, FrameStream, FrameStreamRequest, Lens, Output, Picture, View,
+    Camera, DrawnBy, Frame, FrameFormat, FrameRequest, FrameStream, FrameStreamRequest, FramesRequest, Lens, Output,
+    Picture, Pictures, View,
 };
 pub use modalcast_proto::v1;
 pub use modalcast_proto::v1::{Feature, PROTOCOL_VERSION, SceneInfo, StepId};

@@ -39,8 +39,8 @@ pub struct StepRequest<Q> {
 
 impl<Q> StepRequest<Q> {
     /// A request for the newest state, with the server's default deadline.
-    pub fn new(scene: &str, query: Q) -> Self {
-        Self { scene: scene.to_owned(), query, step: StepSelector::Current, deadline_ms: 0 }
+    pub fn new(scene: &str, query: impl Into<Q>) -> Self {
+        Self { scene: scene.to_owned(), query: query.into(), step: StepSelector::Current, deadline_ms: 0 }
     }
 
     /// Sets [`Self::step`].
@@ -76,16 +76,16 @@ pub struct Subscription<Q> {
     pub scene: String,
     pub query: Q,
     pub delivery: Delivery,
-    /// Number of replies after which the subscription ends; 0 for no limit.
-    pub max_replies: u64,
-    /// Maximum number of replies per second; 0 for no limit. The server accepts a limit only with [`Delivery::Latest`].
+    /// Number of steps after which the subscription ends; 0 for no limit.
+    pub max_steps: u64,
+    /// Maximum number of steps per second; 0 for no limit. The server accepts a limit only with [`Delivery::Latest`].
     pub max_hz: f64,
 }
 
 impl<Q> Subscription<Q> {
     /// A lossless subscription without a limit.
-    pub fn new(scene: &str, query: Q) -> Self {
-        Self { scene: scene.to_owned(), query, delivery: Delivery::Lossless, max_replies: 0, max_hz: 0.0 }
+    pub fn new(scene: &str, query: impl Into<Q>) -> Self {
+        Self { scene: scene.to_owned(), query: query.into(), delivery: Delivery::Lossless, max_steps: 0, max_hz: 0.0 }
     }
 
     /// Sets [`Self::delivery`].
@@ -95,10 +95,10 @@ impl<Q> Subscription<Q> {
         self
     }
 
-    /// Sets [`Self::max_replies`].
+    /// Sets [`Self::max_steps`].
     #[must_use]
-    pub fn max_replies(mut self, max_replies: u64) -> Self {
-        self.max_replies = max_replies;
+    pub fn max_steps(mut self, max_steps: u64) -> Self {
+        self.max_steps = max_steps;
         self
     }
 
@@ -135,7 +135,7 @@ mod tests {
 
     #[test]
     fn last_selector_of_a_request_is_sent() {
-        let request = StepRequest::new("toy", ()).minimum_step(3).exact_step(7).deadline_ms(20);
+        let request = StepRequest::<()>::new("toy", ()).minimum_step(3).exact_step(7).deadline_ms(20);
         assert_eq!((request.step, request.deadline_ms), (StepSelector::Exact { run: 0, number: 7 }, 20));
         let wire = request.step.to_wire().expect("expected a selector");
         assert_eq!((wire.run, wire.number), (0, Some(v1::step_selector::Number::Exact(7))));

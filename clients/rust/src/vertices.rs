@@ -151,7 +151,7 @@ impl Client {
             scene: request.scene.clone(),
             selection: Some(request.query.to_wire()),
             delivery: v1::Delivery::from(request.delivery).into(),
-            steps: request.max_replies,
+            steps: request.max_steps,
             max_hz: request.max_hz,
         };
         let mut messages = self.replies(VertexServiceClient::new(self.channel.clone()).stream_vertices(wire).await)?;

@@ -72,9 +72,9 @@ async fn frame_above_4_mib_arrives_complete_and_names_its_step() {
 #[tokio::test]
 async fn subscription_before_the_first_step_receives_every_step() {
     let (server, client) = connect(one_domain_server(4)).await;
-    let request = FrameStreamRequest::new("toy", picture(600, 600)).max_replies(20);
+    let request = FrameStreamRequest::new("toy", picture(600, 600)).max_steps(20);
     let mut frames = client.stream_frames(&request).await.expect("a subscription");
-    let request = VertexStreamRequest::new("toy", VertexSelection::default()).max_replies(20);
+    let request = VertexStreamRequest::new("toy", VertexSelection::default()).max_steps(20);
     let mut sets = client.stream_vertices(&request).await.expect("a subscription");
     let mut step_stream =
         client.drive(&DriveRequest::new("toy", Delivery::Lossless).window(3)).await.expect("a step stream");

@@ -23,11 +23,7 @@ const MAX_SCALE: f64 = 1e30;
 /// `Invalid` when every domain has fewer modes.
 pub fn validate_mode(scene: &Scene, mode: u32) -> Result<u32> {
     let max_rank = scene.layout.domains.iter().map(|domain| domain.rank).max().unwrap_or(0);
-    if (mode as usize) < max_rank {
-        Ok(mode)
-    } else {
-        Err(invalid("picture.mode", format!("an index below {max_rank}"), mode))
-    }
+    if (mode as usize) < max_rank { Ok(mode) } else { Err(invalid("mode", format!("an index below {max_rank}"), mode)) }
 }
 
 /// |u| of every vertex in meters: the distance of its deformed position from T x0, the position that it has if the

@@ -1,6 +1,7 @@
 //! Encodes frames for the wire as PNG or raw pixels. All streams share one encoder, which uses at most one thread per
 //! core.
 
+use std::borrow::Cow;
 use std::num::NonZero;
 use std::sync::Arc;
 use std::time::Instant;
@@ -8,13 +9,13 @@ use std::time::Instant;
 use bytes::Bytes;
 use tokio::sync::Semaphore;
 
-use super::color_frame::ColorFrame;
+use super::rendered_picture::{Pixels, RenderedPicture};
 use super::step_output::{OutputBody, StepId, StepOutput};
 use crate::engine::blocking::run_blocking;
-use crate::frame::{self, Legend};
+use crate::frame;
 use crate::telemetry::{Stage, StageTimes, ms_since};
 use modalcast_model::error::{Result, fault, fault_in};
-use modalcast_render::{AovImage, RasterBackends};
+use modalcast_render::RasterBackends;
 
 /// Wire format of pixels. Multi-byte values are little-endian; the top row comes first.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -50,6 +51,47 @@ pub struct FrameEncoder {
     cores: usize,
 }
 
+/// A picture of a step that is not encoded yet.
+#[derive(Debug)]
+pub struct StepPicture {
+    pub step: StepId,
+    /// Steps that the subscriber skipped since its last output; 0 for all pictures of a step but the first.
+    pub skipped: u64,
+    /// Stage times of the step, without those of the picture.
+    pub stages: StageTimes,
+    /// Index of the picture in the request.
+    pub index: u32,
+    pub picture: Arc<RenderedPicture>,
+}
+
+impl StepPicture {
+    /// Separates the pictures of an output.
+    ///
+    /// # Errors
+    /// `Fault` when `output` has no frames.
+    pub fn of_output(output: StepOutput) -> Result<impl Iterator<Item = Self>> {
+        let StepOutput { step, skipped, stages, body: OutputBody::Frames(pictures), .. } = output else {
+            return Err(fault("encode", "expected frames, got another output"));
+        };
+        let separate = move |(picture, index)| Self {
+            step,
+            skipped: if index == 0 { skipped } else { 0 },
+            stages: stages.clone(),
+            index,
+            picture,
+        };
+        Ok(pictures.into_iter().zip(0..).map(separate))
+    }
+}
+
+/// An encoded picture of a step.
+#[derive(Debug, Clone)]
+pub struct EncodedFrame {
+    /// Index of the picture in the request.
+    pub picture: u32,
+    pub output: EncodedOutput,
+}
+
 impl FrameEncoder {
     /// An encoder for this machine: one thread per core.
     pub(in crate::engine) fn per_core() -> Self {
@@ -65,42 +107,34 @@ impl FrameEncoder {
         self.cores
     }
 
-    /// Encodes a color frame or an AOV.
+    /// Encodes a picture.
     ///
     /// # Errors
-    /// `Fault` when the PNG encoder fails, or when `output` is neither a color frame nor an AOV.
-    pub async fn encode(&self, output: StepOutput, format: FrameFormat) -> Result<EncodedOutput> {
-        let mut stages = output.stages;
-        let mut raster_backends = RasterBackends::default();
-        let (bytes, ms) = match output.body {
-            OutputBody::Frame(frame) => {
-                raster_backends = frame.raster_backends;
-                match format {
-                    FrameFormat::Png => self.encode_png_once(&frame).await.map(|(bytes, ms)| (bytes, Some(ms)))?,
-                    _ => (frame.rgba.clone(), None),
-                }
-            }
-            OutputBody::Aov(image, Some(legend)) => {
-                let encode_map = move || encode_color_map(&image, &legend, format);
-                self.run(encode_map).await.map(|(bytes, ms)| (bytes, Some(ms)))?
-            }
-            OutputBody::Aov(image, None) => (image.bytes.into(), None),
-            OutputBody::Vertices(_) | OutputBody::Pick(_) | OutputBody::State(_) => {
-                return Err(fault("encode", "expected a frame, got another output"));
+    /// `Fault` when the encoder fails.
+    pub async fn encode(&self, step_picture: StepPicture, format: FrameFormat) -> Result<EncodedFrame> {
+        let StepPicture { step, skipped, mut stages, index, picture } = step_picture;
+        stages.extend(picture.stages.iter().copied());
+        let bytes = match (&picture.pixels, format) {
+            (Pixels::Color(rgba), FrameFormat::Rgba) => rgba.clone(),
+            (Pixels::Values(bytes), _) => bytes.clone(),
+            (Pixels::Color(_) | Pixels::ColorMap(..), _) => {
+                let (bytes, ms) = self.encode_once(&picture, format).await?;
+                stages.push((Stage::Encode, ms));
+                bytes
             }
         };
-        stages.extend(ms.map(|ms| (Stage::Encode, ms)));
-        Ok(EncodedOutput { step: output.step, skipped: output.skipped, stages, raster_backends, bytes })
+        let output = EncodedOutput { step, skipped, stages, raster_backends: picture.raster_backends, bytes };
+        Ok(EncodedFrame { picture: index, output })
     }
 
-    /// Returns the PNG of a frame and the milliseconds that encoding took. The first caller encodes the frame. If this
-    /// caller is cancelled, the next caller encodes the frame.
-    async fn encode_png_once(&self, frame: &Arc<ColorFrame>) -> Result<(Bytes, f64)> {
-        let encode_png = || {
-            let frame = Arc::clone(frame);
-            self.run(move || frame::encode_png(frame.width, frame.height, &frame.rgba))
+    /// Returns the encoding of a picture and the milliseconds that encoding took. The first caller encodes the picture.
+    /// If this caller is cancelled, the next caller encodes the picture.
+    async fn encode_once(&self, picture: &Arc<RenderedPicture>, format: FrameFormat) -> Result<(Bytes, f64)> {
+        let encode = || {
+            let picture = Arc::clone(picture);
+            self.run(move || encode_pixels(&picture, format))
         };
-        frame.png.get_or_try_init(encode_png).await.cloned()
+        picture.encoding(format).get_or_try_init(encode).await.cloned()
     }
 
     /// Runs work on a blocking thread as soon as the thread limit permits. Returns the bytes and the run time in
@@ -116,12 +150,24 @@ impl FrameEncoder {
     }
 }
 
-/// Draws a color map with its legend and encodes it.
-fn encode_color_map(image: &AovImage, legend: &Legend, format: FrameFormat) -> Result<Vec<u8>> {
-    let size = [image.width, image.height];
-    // `samples` is the number of samples per pixel.
-    let rgba = frame::draw_color_map(&image.bytes, image.samples, size, legend)?;
-    if format == FrameFormat::Png { frame::encode_png(size[0], size[1], &rgba) } else { Ok(rgba) }
+/// Encodes a picture; draws a color map with its legend first.
+fn encode_pixels(picture: &RenderedPicture, format: FrameFormat) -> Result<Vec<u8>> {
+    let (width, height) = (picture.width, picture.height);
+    let rgba = match &picture.pixels {
+        Pixels::Color(rgba) => Cow::Borrowed(&rgba[..]),
+        // `samples` is the number of samples per pixel.
+        Pixels::ColorMap(image, legend) => {
+            Cow::Owned(frame::draw_color_map(&image.bytes, image.samples, [width, height], legend)?)
+        }
+        Pixels::Values(_) => return Err(fault("encode", "expected colors, got values")),
+    };
+    match format {
+        FrameFormat::Png => frame::encode_png(width, height, &rgba),
+        FrameFormat::Rgba => Ok(rgba.into_owned()),
+        FrameFormat::F32 | FrameFormat::U32 | FrameFormat::F32x3 => {
+            Err(fault("encode", "expected a format of colors, got a format of numbers"))
+        }
+    }
 }
 
 #[cfg(test)]
@@ -141,7 +187,13 @@ pub(in crate::engine) mod tests {
             raster_backends: RasterBackends::default(),
         };
         let step = StepId { run: 1, number, time: 0.0 };
-        StepOutput { step, skipped: 0, stages: vec![], origins: None, body: OutputBody::Frame(Arc::new(image.into())) }
+        let body = OutputBody::Frames(vec![Arc::new(image.into())]);
+        StepOutput { step, skipped: 0, stages: vec![], origins: None, body }
+    }
+
+    /// The first picture of an output.
+    fn first_picture(output: &StepOutput) -> StepPicture {
+        StepPicture::of_output(output.clone()).expect("expected frames").next().expect("expected a picture")
     }
 
     /// An encoder without thread permits. It encodes once the test adds permits to the semaphore.
@@ -155,10 +207,10 @@ pub(in crate::engine) mod tests {
         let encoder = FrameEncoder::new(2);
         let output = noise_frame(1, 16);
         let encode_twice = async |format| {
-            let first = encoder.encode(output.clone(), format);
-            let second = encoder.encode(output.clone(), format);
+            let first = encoder.encode(first_picture(&output), format);
+            let second = encoder.encode(first_picture(&output), format);
             let (first, second) = tokio::join!(first, second);
-            (first.expect("expected an encoded frame"), second.expect("expected an encoded frame"))
+            (first.expect("expected an encoded frame").output, second.expect("expected an encoded frame").output)
         };
         for format in [FrameFormat::Png, FrameFormat::Rgba] {
             let (first, second) = encode_twice(format).await;
@@ -166,7 +218,8 @@ pub(in crate::engine) mod tests {
             assert_eq!(first.bytes.len(), second.bytes.len(), "{format:?}");
             assert_eq!(first.stages, second.stages, "{format:?}");
         }
-        let other_frame = encoder.encode(noise_frame(1, 16), FrameFormat::Png).await.expect("expected a PNG");
+        let other_frame = encoder.encode(first_picture(&noise_frame(1, 16)), FrameFormat::Png).await;
+        let other_frame = other_frame.expect("expected a PNG").output;
         let (shared, _) = encode_twice(FrameFormat::Png).await;
         assert_eq!(other_frame.bytes, shared.bytes);
         assert_ne!(
@@ -180,11 +233,11 @@ pub(in crate::engine) mod tests {
     async fn next_subscriber_encodes_after_a_cancelled_one() {
         let (encoder, thread_permits) = paused_encoder(1);
         let output = noise_frame(2, 8);
-        let first = encoder.encode(output.clone(), FrameFormat::Png);
+        let first = encoder.encode(first_picture(&output), FrameFormat::Png);
         let timeout = std::time::Duration::from_millis(20);
         tokio::time::timeout(timeout, first).await.expect_err("expected no PNG without a thread");
         thread_permits.add_permits(1);
-        let second = encoder.encode(output, FrameFormat::Png).await.expect("expected a PNG");
-        assert!(image::load_from_memory(&second.bytes).is_ok());
+        let second = encoder.encode(first_picture(&output), FrameFormat::Png).await.expect("expected a PNG");
+        assert!(image::load_from_memory(&second.output.bytes).is_ok());
     }
 }

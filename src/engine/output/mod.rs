@@ -1,9 +1,9 @@
 //! Outputs of steps: frames, AOVs, picks, vertices and states, and their encoding for the wire off the device thread.
 
-pub(super) mod color_frame;
 pub(super) mod frame_encoder;
 pub(super) mod pack;
 pub(super) mod pick_result;
+pub(super) mod rendered_picture;
 pub(super) mod state_packing;
 pub(super) mod step_output;
 pub(super) mod vertex_encoding;

@@ -2,17 +2,17 @@
 
 use std::sync::Arc;
 
-use super::color_frame::ColorFrame;
-use crate::frame::Legend;
+use super::rendered_picture::RenderedPicture;
 use crate::telemetry::{Stage, StageTimes};
 use modalcast_model::deform::{DeformedSurface, VertexAttributes};
 use modalcast_model::scene::{Camera, FloatingOrigins, FrameSize, PixelRect, SceneState};
-use modalcast_render::{AovImage, FrameTimes, PickHit, RenderStage, TimeKey};
+use modalcast_render::{FrameTimes, PickHit, RenderStage, TimeKey};
 
 /// The output that a client requests of a step.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub enum OutputSpec {
-    Frame(PictureSpec),
+    /// At least one picture.
+    Frames(Arc<[PictureSpec]>),
     Vertices(VertexAttributes),
     /// The surface points at the pixels of a rectangle.
     Pick {
@@ -25,7 +25,7 @@ pub enum OutputSpec {
     State,
 }
 
-/// What a picture shows. Equal pictures of a step have the same pixels.
+/// What a picture shows. Equal pictures of a step have equal pixels.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PictureSpec {
     pub camera: Camera,
@@ -77,10 +77,9 @@ impl StepId {
 /// The content of an output.
 #[derive(Debug, Clone)]
 pub enum OutputBody {
-    Frame(Arc<ColorFrame>),
+    /// One per picture of the [`OutputSpec`], in the same order.
+    Frames(Vec<Arc<RenderedPicture>>),
     Vertices(Arc<DeformedSurface>),
-    /// Values instead of colors. With a legend the values are drawn as a color map.
-    Aov(AovImage, Option<Legend>),
     Pick(Vec<ModalHit>),
     State(Arc<SceneState>),
 }

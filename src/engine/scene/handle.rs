@@ -168,7 +168,7 @@ impl SceneHandle {
 
     fn check_spec(&self, spec: &OutputSpec) -> Result<()> {
         match (spec, &self.frames_unavailable) {
-            (OutputSpec::Frame(_) | OutputSpec::Pick { .. }, Some(error)) => Err(error.clone()),
+            (OutputSpec::Frames(_) | OutputSpec::Pick { .. }, Some(error)) => Err(error.clone()),
             _ => Ok(()),
         }
     }

@@ -2,6 +2,7 @@
 //! received the current step yet. A subscriber receives one result per credit ([`super::subscriber`]).
 
 use std::cmp::Ordering;
+use std::collections::VecDeque;
 use std::mem;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -9,14 +10,15 @@ use std::time::{Duration, Instant};
 use super::current_step::CurrentStep;
 use super::delivery::Delivery;
 use super::message::{StepRequest, StepSelector};
-use super::readback_queue::{PendingReadback, Readback, ReadbackQueue, Recipient};
+use super::readback_queue::{PendingFrames, PendingReadback, PictureRecipient, ReadbackQueue, Recipient};
 use super::step_queue::CompletedStep;
 use super::subscriber::{LOSSLESS_CREDITS, Subscriber};
 use crate::config::Config;
 use crate::engine::device::command::{CopiedVertices, SceneId};
 use crate::engine::device::handle::{DeviceHandle, PendingReply};
 use crate::engine::output::pick_result::with_transforms;
-use crate::engine::output::step_output::{FrameOutput, OutputBody, OutputSpec, PictureSpec, StepOutput, stage_times};
+use crate::engine::output::rendered_picture::RenderedPicture;
+use crate::engine::output::step_output::{FrameOutput, OutputBody, OutputSpec, PictureSpec, StepOutput};
 use crate::telemetry::Stage;
 use modalcast_model::deform::{DeformedSurface, VertexAttributes};
 use modalcast_model::error::{Error, Result};
@@ -37,8 +39,8 @@ pub(super) struct OutputDelivery {
 pub(super) struct DeliveryMode {
     /// A lossless subscriber without a credit blocks the writer. It is disconnected after `Config::stall_timeout`.
     pub applies_back_pressure: bool,
-    /// Another step is queued. Readbacks of vertices and of at most [`MAX_FRAMES_IN_FLIGHT`] frames are only started
-    /// now, and are delivered while the queued step is computed.
+    /// Another step is queued. Readbacks of vertices are only started now, and are delivered while the queued step is
+    /// computed. Readbacks of frames are always only started.
     pub overlaps_next_step: bool,
 }
 
@@ -122,8 +124,8 @@ impl OutputDelivery {
         }
     }
 
-    /// Delivers the current step to every subscriber with a credit. Subscribers with the same view share one frame, and
-    /// subscribers to vertices share one copy.
+    /// Delivers the current step to every subscriber with a credit. Subscribers with equal pictures share one drawing,
+    /// and subscribers to vertices share one copy.
     pub(super) async fn serve_subscribers(&mut self, current: &CurrentStep, mode: DeliveryMode) {
         let attributes = self.combined_attributes(current);
         let starts_shared_copy = mode.overlaps_next_step && !self.producer.cached_attributes().contains(attributes);
@@ -133,8 +135,8 @@ impl OutputDelivery {
             attributes,
             starts_shared_copy,
             vertex_recipients: Vec::new(),
-            started_frames: Vec::new(),
-            drawn_frames: Vec::new(),
+            started_pictures: VecDeque::new(),
+            drawn_pictures: Vec::new(),
         };
         let mut index = 0;
         while let Some(subscriber) = self.subscribers.get_mut(index) {
@@ -144,16 +146,12 @@ impl OutputDelivery {
                 self.subscribers.remove(index);
             }
         }
-        let DeliveryRound { vertex_recipients, started_frames, .. } = round;
+        let DeliveryRound { vertex_recipients, started_pictures, .. } = round;
         if !vertex_recipients.is_empty() {
-            let pending_vertices = self.producer.device.read_vertices(self.producer.scene_on_device.id, attributes);
-            self.producer.readbacks.push(PendingReadback::new(
-                current,
-                Readback::Vertices(pending_vertices),
-                vertex_recipients,
-            ));
+            let reply = self.producer.device.read_vertices(self.producer.scene_on_device.id, attributes);
+            self.producer.readbacks.push(PendingReadback::of_vertices(current, reply, vertex_recipients));
         }
-        started_frames.into_iter().for_each(|frame| self.producer.readbacks.push(frame));
+        started_pictures.into_iter().for_each(|picture| self.producer.readbacks.push(picture));
         self.drop_closed_subscribers();
     }
 
@@ -240,10 +238,10 @@ struct DeliveryRound<'a> {
     /// Whether the round ends by starting one copy of `attributes` for all `vertex_recipients`.
     starts_shared_copy: bool,
     vertex_recipients: Vec<Recipient>,
-    /// Frames that this round started.
-    started_frames: Vec<PendingReadback>,
-    /// Frames that this round has drawn and delivered. Later subscribers with the same view receive the same frame.
-    drawn_frames: Vec<(OutputSpec, StepOutput)>,
+    /// Pictures that this round started and that are in flight, oldest first; at most [`MAX_FRAMES_IN_FLIGHT`].
+    started_pictures: VecDeque<PendingReadback>,
+    /// Pictures that this round has drawn. Later subscribers with an equal picture receive the same pixels.
+    drawn_pictures: Vec<(PictureSpec, Arc<RenderedPicture>)>,
 }
 
 /// Identifies a scene that is loaded on the device.
@@ -277,64 +275,82 @@ impl OutputProducer {
     /// Delivers the current step to one subscriber, or starts the delivery. Returns false if the subscriber must be
     /// dropped.
     async fn serve(&mut self, subscriber: &mut Subscriber, round: &mut DeliveryRound<'_>) -> bool {
-        // `round.attributes` lacks the attributes of a subscriber that received its credit after the round had begun.
-        let is_covered = |attributes: VertexAttributes| round.attributes.contains(attributes);
-        if round.starts_shared_copy && attributes_for(subscriber, round.current).is_some_and(is_covered) {
-            round.vertex_recipients.push(Recipient::take_credit_of(subscriber, round.current.step_count));
-            return true;
-        }
-        if round.mode.overlaps_next_step && self.start_frame(subscriber, round) {
-            return true;
-        }
-        self.serve_now(subscriber, round).await
-    }
-
-    /// Adds a subscriber with a credit to a frame of the current step that is delivered asynchronously. This is a frame
-    /// of the same view that is in flight for another subscriber, or a new frame. A round starts at most
-    /// [`MAX_FRAMES_IN_FLIGHT`] new frames. Returns whether the subscriber was added to a frame.
-    fn start_frame(&mut self, subscriber: &mut Subscriber, round: &mut DeliveryRound<'_>) -> bool {
-        let OutputSpec::Frame(PictureSpec { camera, size, output: FrameOutput::Color }) = subscriber.spec else {
-            return false;
-        };
-        let step_count = round.current.step_count;
-        if subscriber.delivered_step_count == step_count || !subscriber.has_credit() {
-            return false;
-        }
-        let has_same_view = |pending: &&mut PendingReadback| pending.is_frame_of(step_count, &subscriber.spec);
-        if let Some(pending_frame) = self.readbacks.iter_mut().chain(&mut round.started_frames).find(has_same_view) {
-            pending_frame.add_recipient(Recipient::take_credit_of(subscriber, step_count));
-            return true;
-        }
-        if round.started_frames.len() >= MAX_FRAMES_IN_FLIGHT {
-            return false;
-        }
-        let pending_image = self.device.begin_draw(self.scene_on_device.id, camera, size);
-        let readback = Readback::Frame(subscriber.spec, pending_image);
-        let recipients = vec![Recipient::take_credit_of(subscriber, step_count)];
-        round.started_frames.push(PendingReadback::new(round.current, readback, recipients));
-        true
-    }
-
-    /// Produces the current step for one subscriber and delivers it. Returns false if the subscriber must be dropped.
-    async fn serve_now(&mut self, subscriber: &mut Subscriber, round: &mut DeliveryRound<'_>) -> bool {
-        let current = round.current;
-        if subscriber.delivered_step_count == current.step_count {
+        if subscriber.delivered_step_count == round.current.step_count {
             return true;
         }
         if !subscriber.has_credit() {
             return self.check_stall(subscriber, round.mode);
         }
+        // `round.attributes` lacks the attributes of a subscriber that received its credit after the round had begun.
+        let is_covered = |attributes: VertexAttributes| round.attributes.contains(attributes);
+        if round.starts_shared_copy && attributes_for(subscriber, round.current).is_some_and(is_covered) {
+            round.vertex_recipients.push(Recipient::take_credit_of(subscriber, round.current));
+            return true;
+        }
+        if let OutputSpec::Frames(pictures) = &subscriber.spec {
+            let pictures = Arc::clone(pictures);
+            self.start_frames(subscriber, &pictures, round).await;
+            return true;
+        }
+        self.serve_now(subscriber, round).await
+    }
+
+    /// Starts the pictures of the current step for one subscriber, which receives them when the last one is there. Color
+    /// pictures are delivered asynchronously; all others are there when this returns.
+    async fn start_frames(
+        &mut self,
+        subscriber: &mut Subscriber,
+        pictures: &[PictureSpec],
+        round: &mut DeliveryRound<'_>,
+    ) {
+        if pictures.iter().all(|picture| picture.output != FrameOutput::Color) {
+            // Results arrive in the order of the steps, and the result of this step is not delivered asynchronously.
+            self.readbacks.flush_for(subscriber).await;
+        }
+        let frames = PendingFrames::new(Recipient::take_credit_of(subscriber, round.current), pictures.len());
+        for (index, picture) in pictures.iter().enumerate() {
+            self.start_picture(picture, frames.picture(index), round).await;
+        }
+    }
+
+    /// Draws a picture of the current step for a recipient. An equal picture of another recipient is shared. At most
+    /// [`MAX_FRAMES_IN_FLIGHT`] color pictures are in flight; a further one waits for the oldest.
+    async fn start_picture(&mut self, spec: &PictureSpec, recipient: PictureRecipient, round: &mut DeliveryRound<'_>) {
+        let step_count = round.current.step_count;
+        if let Some((_, picture)) = round.drawn_pictures.iter().find(|(drawn_spec, _)| drawn_spec == spec) {
+            return recipient.receive(Ok(Arc::clone(picture)));
+        }
+        let recipients_of_equal = self
+            .readbacks
+            .iter_mut()
+            .chain(&mut round.started_pictures)
+            .find_map(|pending| pending.recipients_of(step_count, spec));
+        if let Some(recipients) = recipients_of_equal {
+            return recipients.push(recipient);
+        }
+        if spec.output == FrameOutput::Color {
+            if round.started_pictures.len() >= MAX_FRAMES_IN_FLIGHT
+                && let Some(oldest) = round.started_pictures.pop_front()
+            {
+                self.readbacks.flush_before(step_count).await;
+                round.drawn_pictures.extend(oldest.deliver().await);
+            }
+            let reply = self.device.begin_draw(self.scene_on_device.id, spec.camera, spec.size);
+            round.started_pictures.push_back(PendingReadback::of_picture(round.current, *spec, reply, recipient));
+            return;
+        }
+        let picture = self.draw(spec).await.map(Arc::new);
+        round.drawn_pictures.extend(picture.iter().map(|picture| (*spec, Arc::clone(picture))));
+        recipient.receive(picture);
+    }
+
+    /// Produces the current step for one subscriber with a credit and delivers it. Returns false if the subscriber must
+    /// be dropped.
+    async fn serve_now(&mut self, subscriber: &mut Subscriber, round: &DeliveryRound<'_>) -> bool {
         // Results arrive in the order of the steps, so deliver the subscriber's readbacks in flight first.
         self.readbacks.flush_for(subscriber).await;
-        let skipped = subscriber.mark_delivered(current.step_count);
-        let drawn_frame = round.drawn_frames.iter().find(|(spec, _)| *spec == subscriber.spec);
-        let output = match drawn_frame {
-            Some((_, output)) => Ok(output.clone()),
-            None => self.produce(&subscriber.spec, current, round.attributes).await,
-        };
-        if let (None, Ok(output @ StepOutput { body: OutputBody::Frame(_), .. })) = (drawn_frame, &output) {
-            round.drawn_frames.push((subscriber.spec, output.clone()));
-        }
+        let skipped = subscriber.mark_delivered(round.current.step_count);
+        let output = self.produce(&subscriber.spec, round.current, round.attributes).await;
         subscriber.take_permit().send(output.map(|output| StepOutput { skipped, ..output }))
     }
 
@@ -364,30 +380,42 @@ impl OutputProducer {
         other_attributes: VertexAttributes,
     ) -> Result<StepOutput> {
         let mut stages = current.stages.clone();
-        let (id, device) = (self.scene_on_device.id, &self.device);
-        let body = match *spec {
-            OutputSpec::Frame(PictureSpec { camera, size, output: FrameOutput::Color }) => {
-                let image = device.begin_draw(id, camera, size).wait().await?;
-                stages.extend(stage_times(&image.times));
-                OutputBody::Frame(Arc::new(image.into()))
-            }
-            OutputSpec::Frame(PictureSpec { camera, size, output }) => {
-                let (aov, legend) = device.render_aov(id, camera, size, output).await?;
-                stages.extend(stage_times(&aov.times));
-                OutputBody::Aov(aov, legend)
-            }
+        let body = match spec {
+            OutputSpec::Frames(pictures) => OutputBody::Frames(self.draw_all(pictures).await?),
             OutputSpec::Pick { camera, picture, rectangle } => {
-                let hits = device.pick(id, camera, picture, rectangle).await?;
+                let hits = self.device.pick(self.scene_on_device.id, *camera, *picture, *rectangle).await?;
                 OutputBody::Pick(with_transforms(&current.state, &self.scene_on_device.scene, hits))
             }
             OutputSpec::Vertices(attributes) => {
-                let CachedVertices { surface, copy_ms, .. } = self.copy_vertices(attributes, other_attributes).await?;
+                let CachedVertices { surface, copy_ms, .. } = self.copy_vertices(*attributes, other_attributes).await?;
                 stages.push((Stage::Copy, copy_ms));
                 OutputBody::Vertices(surface)
             }
             OutputSpec::State => OutputBody::State(Arc::clone(&current.state)),
         };
         Ok(StepOutput { step: current.id(), skipped: 0, stages, origins: current.state.origins.clone(), body })
+    }
+
+    /// Draws pictures of the current step. Equal pictures are drawn once.
+    async fn draw_all(&self, pictures: &[PictureSpec]) -> Result<Vec<Arc<RenderedPicture>>> {
+        let mut drawn = Vec::with_capacity(pictures.len());
+        for (index, picture) in pictures.iter().enumerate() {
+            drawn.push(match pictures[..index].iter().position(|earlier| earlier == picture) {
+                Some(equal) => Arc::clone(&drawn[equal]),
+                None => Arc::new(self.draw(picture).await?),
+            });
+        }
+        Ok(drawn)
+    }
+
+    /// Draws a picture of the current step.
+    async fn draw(&self, picture: &PictureSpec) -> Result<RenderedPicture> {
+        let (id, PictureSpec { camera, size, output }) = (self.scene_on_device.id, *picture);
+        if output == FrameOutput::Color {
+            return self.device.begin_draw(id, camera, size).wait().await.map(RenderedPicture::from);
+        }
+        let (image, legend) = self.device.render_aov(id, camera, size, output).await?;
+        Ok(RenderedPicture::from_aov(image, legend))
     }
 
     /// Whether a request can be answered now. `run` is the run of the latest writer.
@@ -487,7 +515,9 @@ mod tests {
     fn subscribe(delivery: Delivery, width: u32) -> (Subscriber, Subscription) {
         let camera = Camera::fit_to_scene(&testing::two_strips(), width, 8);
         Subscription::new(
-            OutputSpec::Frame(PictureSpec { camera, size: FrameSize::new(width, 8), output: FrameOutput::Color }),
+            OutputSpec::Frames(
+                [PictureSpec { camera, size: FrameSize::new(width, 8), output: FrameOutput::Color }].into(),
+            ),
             delivery.into(),
             Arc::default(),
         )
@@ -551,10 +581,10 @@ mod tests {
         let ((), early_frame_width) = tokio::join!(deliver, draw);
         let mut received = Vec::new();
         for subscription in [&mut slow_subscription, &mut fast_subscription] {
-            while let Ok(Ok(StepOutput { step, body: OutputBody::Frame(image), .. })) =
+            while let Ok(Ok(StepOutput { step, body: OutputBody::Frames(pictures), .. })) =
                 timeout(Duration::ZERO, subscription.next()).await
             {
-                received.push(ReceivedFrame { width: image.width, step: step.number });
+                received.push(ReceivedFrame { width: pictures[0].width, step: step.number });
             }
         }
         ServedFrames { early_frame_width, received }
@@ -570,8 +600,8 @@ mod tests {
     #[tokio::test]
     async fn lossless_subscriber_receives_its_frames_in_order() {
         let served = serve_slow_and_fast(Delivery::Lossless).await;
-        // The slow subscriber is served first. Its second frame is requested only after its first one is delivered.
-        assert_eq!(served.early_frame_width, None);
+        // The slow subscriber is served first. Its second frame is requested while its first one is in flight.
+        assert_eq!(served.early_frame_width, Some(16));
         let expected = [(16, 1), (16, 2), (24, 2)].map(|(width, step)| ReceivedFrame { width, step });
         assert_eq!(served.received, expected);
     }
@@ -605,8 +635,8 @@ mod tests {
         let mut received_widths = Vec::new();
         for mut subscription in subscriptions {
             let output = timeout(Duration::from_secs(10), subscription.next()).await.expect("expected a frame in time");
-            let Ok(StepOutput { body: OutputBody::Frame(frame), .. }) = output else { panic!("expected a frame") };
-            received_widths.push(frame.width);
+            let Ok(StepOutput { body: OutputBody::Frames(pictures), .. }) = output else { panic!("expected frames") };
+            received_widths.push(pictures[0].width);
         }
         SharedFrames { drawn_count, received_widths }
     }

@@ -13,95 +13,227 @@
 //! ```
 
 use std::collections::VecDeque;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex};
 
 use super::current_step::CurrentStep;
 use super::step_queue::CompletedStep;
 use super::subscriber::{SendPermit, Subscriber};
 use crate::engine::device::command::CopiedVertices;
 use crate::engine::device::handle::PendingReply;
-use crate::engine::output::step_output::{OutputBody, OutputSpec, StepId, StepOutput, stage_times};
+use crate::engine::lock::lock;
+use crate::engine::output::rendered_picture::RenderedPicture;
+use crate::engine::output::step_output::{OutputBody, PictureSpec, StepId, StepOutput};
 use crate::telemetry::{Stage, StageTimes};
 use modalcast_model::error::Result;
 use modalcast_model::scene::FloatingOrigins;
 use modalcast_render::FrameImage;
 
-/// The pending result of a readback.
-pub(super) enum Readback {
-    Vertices(PendingReply<CopiedVertices>),
-    Frame(OutputSpec, PendingReply<FrameImage>),
+/// A subscriber that waits for one result of the current step.
+#[derive(Debug)]
+pub(super) struct Recipient {
+    permit: SendPermit,
+    step: StepId,
+    /// Steps that the subscriber skipped since its last result.
+    skipped: u64,
+    /// Stage times up to the deformation.
+    stages: StageTimes,
+    origins: Option<Arc<FloatingOrigins>>,
 }
 
-impl Readback {
-    /// Waits for the result; returns it with its stage times. Cancel-safe.
-    async fn recv(&mut self) -> Result<(OutputBody, StageTimes)> {
-        match self {
-            Self::Vertices(pending_vertices) => {
-                let CopiedVertices { surface, copy_ms } = pending_vertices.recv().await?;
-                Ok((OutputBody::Vertices(surface), vec![(Stage::Copy, copy_ms)]))
+impl Recipient {
+    /// Takes one of the subscriber's credits, and marks the current step as delivered to it.
+    pub(super) fn take_credit_of(subscriber: &mut Subscriber, current: &CurrentStep) -> Self {
+        Self {
+            skipped: subscriber.mark_delivered(current.step_count),
+            permit: subscriber.take_permit(),
+            step: current.id(),
+            stages: current.stages.clone(),
+            origins: current.state.origins.clone(),
+        }
+    }
+
+    /// Sends the result with the stage times of the readback. An error ends the subscription.
+    fn send(self, result: Result<(OutputBody, StageTimes)>) {
+        let Self { permit, step, skipped, mut stages, origins } = self;
+        permit.send(result.map(|(body, readback_stages)| {
+            stages.extend(readback_stages);
+            StepOutput { step, skipped, stages, origins, body }
+        }));
+    }
+}
+
+/// The pictures of one step for one subscriber. They are sent together as soon as the last one is there.
+#[derive(Debug, Clone)]
+pub(super) struct PendingFrames(Arc<Mutex<CollectedPictures>>);
+
+#[derive(Debug)]
+struct CollectedPictures {
+    /// `None` after the pictures or an error were sent.
+    recipient: Option<Recipient>,
+    /// In the order of the request; `None` for a picture that is not there yet.
+    pictures: Vec<Option<Arc<RenderedPicture>>>,
+}
+
+impl PendingFrames {
+    pub(super) fn new(recipient: Recipient, picture_count: usize) -> Self {
+        let collected = CollectedPictures { recipient: Some(recipient), pictures: vec![None; picture_count] };
+        Self(Arc::new(Mutex::new(collected)))
+    }
+
+    /// The part of these frames that receives the picture at an index.
+    pub(super) fn picture(&self, index: usize) -> PictureRecipient {
+        PictureRecipient { frames: self.clone(), index }
+    }
+}
+
+/// A part of [`PendingFrames`].
+#[derive(Debug)]
+pub(super) struct PictureRecipient {
+    frames: PendingFrames,
+    index: usize,
+}
+
+impl PictureRecipient {
+    /// Adds the picture, and sends all pictures if it is the last one. Sends an error at once.
+    pub(super) fn receive(self, picture: Result<Arc<RenderedPicture>>) {
+        let mut collected = lock(&self.frames.0);
+        let frames = match picture {
+            Ok(picture) => {
+                collected.pictures[self.index] = Some(picture);
+                collected.pictures.iter().cloned().collect::<Option<Vec<_>>>().map(Ok)
             }
-            Self::Frame(_, pending_image) => {
-                let image = pending_image.recv().await?;
-                let stages = stage_times(&image.times);
-                Ok((OutputBody::Frame(Arc::new(image.into())), stages))
-            }
+            Err(error) => Some(Err(error)),
+        };
+        if let Some(frames) = frames
+            && let Some(recipient) = collected.recipient.take()
+        {
+            recipient.send(frames.map(|pictures| (OutputBody::Frames(pictures), Vec::new())));
+        }
+    }
+
+    fn is_for(&self, subscriber: &Subscriber) -> bool {
+        lock(&self.frames.0).recipient.as_ref().is_some_and(|recipient| recipient.permit.belongs_to(subscriber))
+    }
+}
+
+/// The answer of the device to a readback, and the recipients of the answer.
+struct InFlight<T, R> {
+    reply: PendingReply<T>,
+    /// The answer, once it is there.
+    answer: Option<Result<T>>,
+    recipients: Vec<R>,
+}
+
+impl<T, R> InFlight<T, R> {
+    const fn new(reply: PendingReply<T>, recipients: Vec<R>) -> Self {
+        Self { reply, answer: None, recipients }
+    }
+
+    /// Waits for the answer. Cancel-safe.
+    async fn wait(&mut self) {
+        if self.answer.is_none() {
+            self.answer = Some(self.reply.recv().await);
         }
     }
 }
 
-/// A subscriber of a readback in flight.
-#[derive(Debug)]
-pub(super) struct Recipient {
-    permit: SendPermit,
-    /// Steps that the subscriber skipped since its last result.
-    skipped: u64,
+enum Readback {
+    Vertices(InFlight<CopiedVertices, Recipient>),
+    Picture(PictureSpec, InFlight<FrameImage, PictureRecipient>),
 }
 
-impl Recipient {
-    /// Takes one of the subscriber's credits, and marks the scene's `step_count`-th step as delivered to it.
-    pub(super) fn take_credit_of(subscriber: &mut Subscriber, step_count: u64) -> Self {
-        Self { skipped: subscriber.mark_delivered(step_count), permit: subscriber.take_permit() }
-    }
-}
-
-/// A device-to-host readback in flight and its subscribers.
+/// A readback in flight.
 pub(super) struct PendingReadback {
     readback: Readback,
     /// The scene's step count when the readback was started.
     step_count: u64,
-    step: StepId,
-    stages: StageTimes,
-    origins: Option<Arc<FloatingOrigins>>,
-    recipients: Vec<Recipient>,
     /// The step that is acknowledged after this readback, if this is the last readback of the step.
     step_to_acknowledge: Option<CompletedStep>,
 }
 
 impl PendingReadback {
-    /// A readback of the current step that was just started.
-    pub(super) fn new(current: &CurrentStep, readback: Readback, recipients: Vec<Recipient>) -> Self {
-        Self {
-            readback,
-            step_count: current.step_count,
-            step: current.id(),
-            stages: current.stages.clone(),
-            origins: current.state.origins.clone(),
-            recipients,
-            step_to_acknowledge: None,
+    /// A copy of the current step's vertices that was just started.
+    pub(super) fn of_vertices(
+        current: &CurrentStep,
+        reply: PendingReply<CopiedVertices>,
+        recipients: Vec<Recipient>,
+    ) -> Self {
+        Self::new(current, Readback::Vertices(InFlight::new(reply, recipients)))
+    }
+
+    /// A color picture of the current step whose drawing was just started.
+    pub(super) fn of_picture(
+        current: &CurrentStep,
+        spec: PictureSpec,
+        reply: PendingReply<FrameImage>,
+        recipient: PictureRecipient,
+    ) -> Self {
+        Self::new(current, Readback::Picture(spec, InFlight::new(reply, vec![recipient])))
+    }
+
+    const fn new(current: &CurrentStep, readback: Readback) -> Self {
+        Self { readback, step_count: current.step_count, step_to_acknowledge: None }
+    }
+
+    /// The recipients of this picture of the scene's `step_count`-th step; `None` if this is another readback.
+    pub(super) fn recipients_of(
+        &mut self,
+        step_count: u64,
+        picture: &PictureSpec,
+    ) -> Option<&mut Vec<PictureRecipient>> {
+        match &mut self.readback {
+            Readback::Picture(spec, in_flight) if self.step_count == step_count && spec == picture => {
+                Some(&mut in_flight.recipients)
+            }
+            _ => None,
         }
     }
 
-    /// Whether this is a color frame of the view in the scene's `step_count`-th step.
-    pub(super) fn is_frame_of(&self, step_count: u64, view: &OutputSpec) -> bool {
-        self.step_count == step_count && matches!(&self.readback, Readback::Frame(spec, _) if spec == view)
+    /// Waits for the answer of the device. Cancel-safe.
+    async fn wait(&mut self) {
+        match &mut self.readback {
+            Readback::Vertices(in_flight) => in_flight.wait().await,
+            Readback::Picture(_, in_flight) => in_flight.wait().await,
+        }
     }
 
-    pub(super) fn add_recipient(&mut self, recipient: Recipient) {
-        self.recipients.push(recipient);
+    /// Sends the answer, which must be there, to all recipients. Returns the picture, if it is one.
+    fn send(self) -> Option<(PictureSpec, Arc<RenderedPicture>)> {
+        let picture = match self.readback {
+            Readback::Vertices(InFlight { answer, recipients, .. }) => {
+                let vertices = answer?.map(|CopiedVertices { surface, copy_ms }| {
+                    (OutputBody::Vertices(surface), vec![(Stage::Copy, copy_ms)])
+                });
+                recipients.into_iter().for_each(|recipient| recipient.send(vertices.clone()));
+                None
+            }
+            Readback::Picture(spec, InFlight { answer, recipients, .. }) => {
+                let picture = answer?.map(|image| Arc::new(RenderedPicture::from(image)));
+                recipients.into_iter().for_each(|recipient| recipient.receive(picture.clone()));
+                picture.ok().map(|picture| (spec, picture))
+            }
+        };
+        if let Some(step) = self.step_to_acknowledge {
+            step.acknowledge();
+        }
+        picture
+    }
+
+    /// Waits for the answer of the device and sends it to all recipients. Returns the picture, if it is one.
+    pub(super) async fn deliver(mut self) -> Option<(PictureSpec, Arc<RenderedPicture>)> {
+        self.wait().await;
+        self.send()
     }
 
     fn is_for(&self, subscriber: &Subscriber) -> bool {
-        self.recipients.iter().any(|recipient| recipient.permit.belongs_to(subscriber))
+        match &self.readback {
+            Readback::Vertices(in_flight) => {
+                in_flight.recipients.iter().any(|recipient| recipient.permit.belongs_to(subscriber))
+            }
+            Readback::Picture(_, in_flight) => {
+                in_flight.recipients.iter().any(|recipient| recipient.is_for(subscriber))
+            }
+        }
     }
 }
 
@@ -139,22 +271,9 @@ impl ReadbackQueue {
     /// Waits for the oldest readback and delivers it. Cancel-safe.
     pub(super) async fn deliver_oldest(&mut self) {
         let Some(oldest) = self.pending.front_mut() else { return };
-        let result = oldest.readback.recv().await;
-        let Some(PendingReadback { step, stages, origins, recipients, step_to_acknowledge, .. }) =
-            self.pending.pop_front()
-        else {
-            return;
-        };
-        for Recipient { permit, skipped } in recipients {
-            let (step_stages, origins) = (stages.clone(), origins.clone());
-            let output = result.clone().map(|(body, readback_stages)| {
-                let stages = step_stages.into_iter().chain(readback_stages).collect();
-                StepOutput { step, skipped, stages, origins, body }
-            });
-            permit.send(output);
-        }
-        if let Some(step) = step_to_acknowledge {
-            step.acknowledge();
+        oldest.wait().await;
+        if let Some(oldest) = self.pending.pop_front() {
+            oldest.send();
         }
     }
 

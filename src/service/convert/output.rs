@@ -9,15 +9,16 @@ use modalcast_model::scene::Scene;
 /// Upper limit of the value at the end of a color map's scale. The lower limit is 1 / `MAX_SCALE`.
 const MAX_SCALE: f64 = 1e30;
 
-/// Parses the output and the format of a picture. Fails if the output does not have this format.
+/// Parses the output and the format of a picture. Fails if the output does not have this format. The field of an error
+/// is relative to the picture.
 pub(super) fn parse_output(scene: &Scene, picture: &v1::Picture) -> Result<(FrameOutput, FrameFormat)> {
     let output = v1::Output::try_from(picture.output)
-        .map_err(|_| invalid("picture.output", "an output of this version", picture.output))?;
+        .map_err(|_| invalid("output", "an output of this version", picture.output))?;
     let is_color_map = matches!(output, v1::Output::Displacement | v1::Output::ModeShape);
     let scale_max = picture.largest;
     if scale_max != 0.0 && !(is_color_map && (1.0 / MAX_SCALE..=MAX_SCALE).contains(&scale_max)) {
         let expected = format!("0, or for a color map {:e} to {MAX_SCALE:e}", 1.0 / MAX_SCALE);
-        return Err(invalid("picture.largest", expected, scale_max));
+        return Err(invalid("largest", expected, scale_max));
     }
     let frame_output = match output {
         v1::Output::Unspecified | v1::Output::Colour => FrameOutput::Color,
@@ -33,7 +34,7 @@ pub(super) fn parse_output(scene: &Scene, picture: &v1::Picture) -> Result<(Fram
 /// Parses a format. Unspecified is PNG for color frames and color maps, else the only format of the output.
 fn parse_format(frame_output: FrameOutput, number: i32) -> Result<FrameFormat> {
     let requested_format =
-        v1::Format::try_from(number).map_err(|_| invalid("picture.format", "a format of this version", number))?;
+        v1::Format::try_from(number).map_err(|_| invalid("format", "a format of this version", number))?;
     // The only format of the output, as wire and engine types; `None` for outputs with a choice.
     let required_format = match frame_output {
         FrameOutput::Color | FrameOutput::Displacement { .. } | FrameOutput::ModeShape { .. } => None,
@@ -44,12 +45,12 @@ fn parse_format(frame_output: FrameOutput, number: i32) -> Result<FrameFormat> {
     match (required_format, requested_format) {
         (None, v1::Format::Unspecified | v1::Format::Png) => Ok(FrameFormat::Png),
         (None, v1::Format::Rgba) => Ok(FrameFormat::Rgba),
-        (None, other) => Err(invalid("picture.format", "PNG or RGBA for this output", other.as_str_name())),
+        (None, other) => Err(invalid("format", "FORMAT_PNG or FORMAT_RGBA for this output", other.as_str_name())),
         (Some((_, format)), v1::Format::Unspecified) => Ok(format),
         (Some((wire_format, format)), _) if wire_format == requested_format => Ok(format),
         (Some((wire_format, _)), _) => {
             let expected = format!("{} or unspecified for this output", wire_format.as_str_name());
-            Err(invalid("picture.format", expected, requested_format.as_str_name()))
+            Err(invalid("format", expected, requested_format.as_str_name()))
         }
     }
 }

@@ -256,7 +256,7 @@ impl FrameService for FakeService {
     ) -> Result<Response<Self::RenderFrameStream>, Status> {
         let request = request.into_inner();
         self.check_scene(&request.scene)?;
-        let chunks = encode_frame(&self.0.output(), &request.picture.unwrap_or_default());
+        let chunks = encode_frames(&self.0.output(), &request.pictures);
         Ok(stream_messages(chunks.into_iter().map(frame_reply).collect()))
     }
 
@@ -274,8 +274,7 @@ impl FrameService for FakeService {
     ) -> Result<Response<Self::StreamFramesStream>, Status> {
         let request = request.into_inner();
         self.check_scene(&request.scene)?;
-        let picture = request.picture.unwrap_or_default();
-        let limit = if request.frames == 0 { usize::MAX } else { request.frames as usize };
+        let limit = if request.steps == 0 { usize::MAX } else { request.steps as usize };
         let outputs = BroadcastStream::new(self.0.outputs.subscribe()).filter_map(Result::ok).take(limit);
         let (sender, receiver) = tokio::sync::mpsc::channel(4);
         tokio::spawn(async move {
@@ -289,7 +288,7 @@ impl FrameService for FakeService {
                     }
                 }
                 let Some(output) = outputs.next().await else { return };
-                parts = encode_frame(&output, &picture).into_iter().map(Part::Chunk).collect();
+                parts = encode_frames(&output, &request.pictures).into_iter().map(Part::Chunk).collect();
             }
         });
         Ok(Response::new(Box::pin(ReceiverStream::new(receiver))))
@@ -381,8 +380,13 @@ fn frame_reply(chunk: v1::FrameChunk) -> v1::RenderFrameResponse {
     v1::RenderFrameResponse { part: Some(v1::render_frame_response::Part::Chunk(chunk)) }
 }
 
+/// One frame per picture, in chunks.
+fn encode_frames(output: &StepOutput, pictures: &[v1::Picture]) -> Vec<v1::FrameChunk> {
+    pictures.iter().zip(0..).flat_map(|(picture, index)| encode_frame(output, picture, index)).collect()
+}
+
 /// An RGBA frame in chunks. Every byte is the low byte of the step number.
-fn encode_frame(output: &StepOutput, picture: &v1::Picture) -> Vec<v1::FrameChunk> {
+fn encode_frame(output: &StepOutput, picture: &v1::Picture, index: u32) -> Vec<v1::FrameChunk> {
     let (width, height) = (picture.width.max(1), picture.height.max(1));
     let bytes = vec![output.step.number as u8; 4 * (width * height) as usize];
     let mut head = Some(v1::FrameHead {
@@ -395,6 +399,7 @@ fn encode_frame(output: &StepOutput, picture: &v1::Picture) -> Vec<v1::FrameChun
         stages: vec![v1::StageTime { stage: "draw".into(), milliseconds: 2.0 }],
         shadow_drawn_by: v1::DrawnBy::Unspecified.into(),
         visibility_drawn_by: v1::DrawnBy::Cuda.into(),
+        picture: index,
     });
     let chunk = |ByteChunk { offset, data, .. }| v1::FrameChunk { head: head.take(), offset, data };
     split_bytes(bytes).into_iter().map(chunk).collect()

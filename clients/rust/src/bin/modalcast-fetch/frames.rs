@@ -13,7 +13,7 @@ pub(crate) async fn fetch_stream(client: &Client, options: &FrameStreamOptions, 
     let scene = open_scene(client, &options.scene).await?;
     std::fs::create_dir_all(&options.out).map_err(|error| Error::file(&options.out, error))?;
     let request = FrameStreamRequest::new(&scene, options.picture.picture());
-    let request = request.delivery(options.delivery.into()).max_replies(options.count);
+    let request = request.delivery(options.delivery.into()).max_steps(options.count);
     let mut frames = client.stream_frames(&request).await?;
     println!("ready");
     let timeout = Duration::from_secs_f64(options.timeout);

@@ -1,0 +1,81 @@
+//! The pixels of one picture of a step and their encodings.
+
+use std::sync::{Arc, Mutex};
+
+use bytes::Bytes;
+use tokio::sync::OnceCell;
+
+use super::frame_encoder::FrameFormat;
+use super::step_output::stage_times;
+use crate::engine::lock::lock;
+use crate::frame::Legend;
+use crate::telemetry::StageTimes;
+use modalcast_render::{AovImage, FrameImage, RasterBackends};
+
+/// The pixels of one picture of a step. All readers of equal pictures share them, and share each encoding, which is
+/// computed once, on first use.
+#[derive(Debug)]
+pub struct RenderedPicture {
+    pub width: u32,
+    pub height: u32,
+    pub pixels: Pixels,
+    /// Times of the stages from the upload to the readback.
+    pub(super) stages: StageTimes,
+    /// The rasterizers that drew a color picture; default for others.
+    pub(super) raster_backends: RasterBackends,
+    /// At most one entry per format.
+    encodings: Mutex<Vec<(FrameFormat, SharedEncoding)>>,
+}
+
+/// An encoded picture and the milliseconds that encoding took. Empty until the first encoding has ended.
+pub(super) type SharedEncoding = Arc<OnceCell<(Bytes, f64)>>;
+
+/// The content of a picture.
+#[derive(Debug)]
+pub enum Pixels {
+    /// RGBA8 sRGB, top row first.
+    Color(Bytes),
+    /// Little-endian numbers, top row first.
+    Values(Bytes),
+    /// Values that are drawn as a color map.
+    ColorMap(AovImage, Legend),
+}
+
+impl RenderedPicture {
+    /// A picture of an AOV. With a legend its values are drawn as a color map.
+    pub(in crate::engine) fn from_aov(image: AovImage, legend: Option<Legend>) -> Self {
+        let (width, height, stages) = (image.width, image.height, stage_times(&image.times));
+        let pixels = match legend {
+            Some(legend) => Pixels::ColorMap(image, legend),
+            None => Pixels::Values(image.bytes.into()),
+        };
+        Self { width, height, pixels, stages, raster_backends: RasterBackends::default(), encodings: Mutex::default() }
+    }
+
+    /// Size of the pixels in bytes.
+    pub(in crate::engine) fn pixel_bytes(&self) -> usize {
+        match &self.pixels {
+            Pixels::Color(bytes) | Pixels::Values(bytes) => bytes.len(),
+            Pixels::ColorMap(image, _) => image.bytes.len(),
+        }
+    }
+
+    /// The encoding in a format, which the caller computes if it is empty.
+    pub(super) fn encoding(&self, format: FrameFormat) -> SharedEncoding {
+        let mut encodings = lock(&self.encodings);
+        if let Some((_, encoding)) = encodings.iter().find(|(encoded_format, _)| *encoded_format == format) {
+            return Arc::clone(encoding);
+        }
+        let encoding = SharedEncoding::default();
+        encodings.push((format, Arc::clone(&encoding)));
+        encoding
+    }
+}
+
+impl From<FrameImage> for RenderedPicture {
+    fn from(image: FrameImage) -> Self {
+        let FrameImage { width, height, rgba, times, raster_backends } = image;
+        let (pixels, stages) = (Pixels::Color(rgba.into()), stage_times(&times));
+        Self { width, height, pixels, stages, raster_backends, encodings: Mutex::default() }
+    }
+}
