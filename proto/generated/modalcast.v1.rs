@@ -140,6 +140,8 @@ pub enum Reason {
     Internal = 17,
     /// ABORTED: another writer has taken over the lease of the scene, and the stream ends.
     LeaseLost = 18,
+    /// NOT_FOUND: no content has the requested SHA-256.
+    ContentNotFound = 19,
 }
 impl Reason {
     /// String value of the enum field names used in the ProtoBuf definition.
@@ -167,6 +169,7 @@ impl Reason {
             Self::DeviceLost => "REASON_DEVICE_LOST",
             Self::Internal => "REASON_INTERNAL",
             Self::LeaseLost => "REASON_LEASE_LOST",
+            Self::ContentNotFound => "REASON_CONTENT_NOT_FOUND",
         }
     }
     /// Creates an enum from field names used in the ProtoBuf definition.
@@ -191,6 +194,7 @@ impl Reason {
             "REASON_DEVICE_LOST" => Some(Self::DeviceLost),
             "REASON_INTERNAL" => Some(Self::Internal),
             "REASON_LEASE_LOST" => Some(Self::LeaseLost),
+            "REASON_CONTENT_NOT_FOUND" => Some(Self::ContentNotFound),
             _ => None,
         }
     }
@@ -325,16 +329,22 @@ pub struct DeleteSceneResponse {}
 pub struct DescribeSceneRequest {
     #[prost(string, tag = "1")]
     pub scene: ::prost::alloc::string::String,
-    /// Domain indices; empty: all domains in order.
+    /// Domain indices; empty: all domains in order. The reply describes these domains, and the shapes, materials and
+    /// textures that they use.
     #[prost(uint32, repeated, tag = "2")]
     pub domains: ::prost::alloc::vec::Vec<u32>,
-    /// Arrays to send after the descriptions, at most 5: for each domain, each array in this order.
+    /// Arrays to send after the descriptions, each at most once: for each described shape, each array in this order.
     #[prost(enumeration = "Array", repeated, tag = "3")]
     pub arrays: ::prost::alloc::vec::Vec<i32>,
+    /// Whether descriptions contain the hashes of arrays and textures. The server computes the hashes of the whole scene
+    /// at the first request that needs them, which takes time in proportion to the size of the scene, and keeps them while
+    /// the scene is open.
+    #[prost(bool, tag = "4")]
+    pub hashes: bool,
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct DescribeSceneResponse {
-    #[prost(oneof = "describe_scene_response::Part", tags = "1, 2, 3")]
+    #[prost(oneof = "describe_scene_response::Part", tags = "1, 2, 3, 4, 5, 6")]
     pub part: ::core::option::Option<describe_scene_response::Part>,
 }
 /// Nested message and enum types in `DescribeSceneResponse`.
@@ -344,15 +354,130 @@ pub mod describe_scene_response {
         #[prost(message, tag = "1")]
         Scene(super::SceneInfo),
         #[prost(message, tag = "2")]
-        Domains(super::DomainDescriptions),
+        Shapes(super::ShapeDescriptions),
         #[prost(message, tag = "3")]
+        Materials(super::MaterialDescriptions),
+        #[prost(message, tag = "4")]
+        Textures(super::TextureDescriptions),
+        #[prost(message, tag = "5")]
+        Domains(super::DomainDescriptions),
+        #[prost(message, tag = "6")]
         Chunk(super::ArrayChunk),
     }
+}
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct ShapeDescriptions {
+    #[prost(message, repeated, tag = "1")]
+    pub shapes: ::prost::alloc::vec::Vec<ShapeDescription>,
+}
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct MaterialDescriptions {
+    #[prost(message, repeated, tag = "1")]
+    pub materials: ::prost::alloc::vec::Vec<MaterialDescription>,
+}
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct TextureDescriptions {
+    #[prost(message, repeated, tag = "1")]
+    pub textures: ::prost::alloc::vec::Vec<TextureDescription>,
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct DomainDescriptions {
     #[prost(message, repeated, tag = "1")]
     pub domains: ::prost::alloc::vec::Vec<DomainDescription>,
+}
+/// A mesh and its modes U. Domains that are instances of one object share a shape.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct ShapeDescription {
+    /// Index of the shape in the scene.
+    #[prost(uint32, tag = "1")]
+    pub shape: u32,
+    /// n: U has 3n rows.
+    #[prost(uint32, tag = "2")]
+    pub vertices: u32,
+    /// r: U has r columns. 0 for a rigid shape.
+    #[prost(uint32, tag = "3")]
+    pub rank: u32,
+    #[prost(uint32, tag = "4")]
+    pub corners: u32,
+    #[prost(uint32, tag = "5")]
+    pub triangles: u32,
+    /// Squared angular frequencies in (rad/s)^2, one per mode; empty if unknown.
+    #[prost(double, repeated, tag = "6")]
+    pub eigenvalues: ::prost::alloc::vec::Vec<f64>,
+    /// All arrays of the shape.
+    #[prost(message, repeated, tag = "7")]
+    pub arrays: ::prost::alloc::vec::Vec<ArrayDescription>,
+}
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct ArrayDescription {
+    #[prost(enumeration = "Array", tag = "1")]
+    pub array: i32,
+    /// Size of the array; 0 for an empty array.
+    #[prost(uint64, tag = "2")]
+    pub bytes: u64,
+    /// SHA-256 of the array's bytes, 32 bytes; empty unless hashes were requested.
+    #[prost(bytes = "bytes", tag = "3")]
+    pub sha256: ::prost::bytes::Bytes,
+}
+/// A Phong material. Colors are linear, red, green and blue from 0 to 1. A surface with unit normal n, unit direction to
+/// the light l and unit direction to the viewer v has the color
+/// ambient * skylight + sunlight * (diffuse * max(n.l, 0) + specular * max(r.v, 0)^shininess), r = 2 (n.l) n - l.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct MaterialDescription {
+    /// Index of the material in the scene.
+    #[prost(uint32, tag = "1")]
+    pub material: u32,
+    #[prost(string, tag = "2")]
+    pub name: ::prost::alloc::string::String,
+    /// Three numbers each.
+    #[prost(float, repeated, tag = "3")]
+    pub ambient: ::prost::alloc::vec::Vec<f32>,
+    #[prost(float, repeated, tag = "4")]
+    pub diffuse: ::prost::alloc::vec::Vec<f32>,
+    #[prost(float, repeated, tag = "5")]
+    pub specular: ::prost::alloc::vec::Vec<f32>,
+    /// Phong exponent, 0 to 10^6.
+    #[prost(float, tag = "6")]
+    pub shininess: f32,
+    /// 0 (invisible) to 1 (opaque); used as `alpha_mode` says.
+    #[prost(float, tag = "7")]
+    pub alpha: f32,
+    #[prost(enumeration = "AlphaMode", tag = "8")]
+    pub alpha_mode: i32,
+    /// ALPHA_MODE_MASK: fragments with a smaller alpha are not drawn. 0 otherwise.
+    #[prost(float, tag = "9")]
+    pub alpha_cutoff: f32,
+    /// Whether back faces are drawn too, with their normal flipped towards the viewer.
+    #[prost(bool, tag = "10")]
+    pub double_sided: bool,
+    /// Index of the texture whose texels multiply ambient, diffuse and alpha; its colors are sRGB, its alpha is linear.
+    /// Textures repeat outside of 0 to 1.
+    #[prost(uint32, optional, tag = "11")]
+    pub color_texture: ::core::option::Option<u32>,
+    /// Index of the tangent-space normal map with linear values: x right, y up (OpenGL's convention), z out of the
+    /// surface, each mapped from -1..1 to 0..255.
+    #[prost(uint32, optional, tag = "12")]
+    pub normal_texture: ::core::option::Option<u32>,
+}
+/// An image of width x height RGBA8 pixels, 4 bytes each, without padding, top row first. ReadContent returns the
+/// pixels.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct TextureDescription {
+    /// Index of the texture in the scene.
+    #[prost(uint32, tag = "1")]
+    pub texture: u32,
+    #[prost(string, tag = "2")]
+    pub name: ::prost::alloc::string::String,
+    #[prost(uint32, tag = "3")]
+    pub width: u32,
+    #[prost(uint32, tag = "4")]
+    pub height: u32,
+    /// Size of the pixels: 4 * width * height.
+    #[prost(uint64, tag = "5")]
+    pub bytes: u64,
+    /// SHA-256 of the pixels, 32 bytes; empty unless hashes were requested.
+    #[prost(bytes = "bytes", tag = "6")]
+    pub sha256: ::prost::bytes::Bytes,
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct DomainDescription {
@@ -361,57 +486,71 @@ pub struct DomainDescription {
     pub domain: u32,
     #[prost(string, tag = "2")]
     pub name: ::prost::alloc::string::String,
-    /// n: U has 3n rows.
+    /// Index of the shape: mesh and modes.
     #[prost(uint32, tag = "3")]
-    pub vertices: u32,
-    /// r: U has r columns.
+    pub shape: u32,
+    /// Index of the material of all triangles, unless `material_ranges` is set.
     #[prost(uint32, tag = "4")]
-    pub rank: u32,
-    #[prost(uint32, tag = "5")]
-    pub corners: u32,
-    #[prost(uint32, tag = "6")]
-    pub triangles: u32,
+    pub material: u32,
+    /// Ranges of triangles with different materials, ascending; the first one begins at triangle 0. Empty if all triangles
+    /// have `material`.
+    #[prost(message, repeated, tag = "5")]
+    pub material_ranges: ::prost::alloc::vec::Vec<MaterialRange>,
+    /// world_from_domain at rest: 12 little-endian f32, row-major 3x4, translation in scene units.
+    #[prost(bytes = "bytes", tag = "6")]
+    pub placement: ::prost::bytes::Bytes,
+    /// q at rest, the state before the first step: r little-endian f32; empty if all are 0.
+    #[prost(bytes = "bytes", tag = "7")]
+    pub rest_q: ::prost::bytes::Bytes,
     /// The domain that this one is attached to; unset if it is not attached.
-    #[prost(uint32, optional, tag = "7")]
+    #[prost(uint32, optional, tag = "8")]
     pub parent: ::core::option::Option<u32>,
     /// parent_from_child at rest: 12 little-endian f32, row-major 3x4, translation in scene units; empty without parent.
-    #[prost(bytes = "bytes", tag = "8")]
+    #[prost(bytes = "bytes", tag = "9")]
     pub attachment_frame: ::prost::bytes::Bytes,
     /// Vertices of the parent near the joint. A client fits the motion of the attachment frame to their displacements.
-    #[prost(uint32, repeated, tag = "9")]
+    #[prost(uint32, repeated, tag = "10")]
     pub attachment_vertices: ::prost::alloc::vec::Vec<u32>,
-    /// world_from_domain at rest: 12 little-endian f32, row-major 3x4, translation in scene units.
-    #[prost(bytes = "bytes", tag = "10")]
-    pub placement: ::prost::bytes::Bytes,
-    /// A domain with a smaller index whose coordinates this domain shares.
+    /// A domain with a smaller index that this domain follows: in every step, the world_from_domain of this domain is the
+    /// world_from_domain of the followed domain times `follow_frame`, computed in f32. A step must not contain a transform
+    /// for this domain, but may contain its coordinates.
     #[prost(uint32, optional, tag = "11")]
+    pub follows: ::core::option::Option<u32>,
+    /// followed_from_follower: 12 little-endian f32, row-major 3x4, translation in scene units. Empty if `follows` is
+    /// unset, or if `attachment_frame` is this transform.
+    #[prost(bytes = "bytes", tag = "12")]
+    pub follow_frame: ::prost::bytes::Bytes,
+    /// A domain with a smaller index whose coordinates this domain shares.
+    #[prost(uint32, optional, tag = "13")]
     pub shares_q_with: ::core::option::Option<u32>,
-    /// Index of the mesh and modes; instances of one shape have the same index.
-    #[prost(uint32, tag = "12")]
-    pub shape: u32,
-    /// Squared angular frequencies in (rad/s)^2, one per mode; empty if unknown.
-    #[prost(double, repeated, tag = "13")]
-    pub eigenvalues: ::prost::alloc::vec::Vec<f64>,
+    /// The eigenvalues of this domain; unset if they are those of its shape.
+    #[prost(message, optional, tag = "14")]
+    pub eigenvalues: ::core::option::Option<Eigenvalues>,
     /// Free-form metadata of the scene's author.
-    #[prost(map = "string, string", tag = "14")]
+    #[prost(map = "string, string", tag = "15")]
     pub notes: ::std::collections::HashMap<
         ::prost::alloc::string::String,
         ::prost::alloc::string::String,
     >,
-    /// A domain with a smaller index that this domain follows: in every step, the world_from_domain of this domain is the
-    /// world_from_domain of the followed domain times `follow_frame`, computed in f32. A step must not contain a transform
-    /// for this domain, but may contain its coordinates.
-    #[prost(uint32, optional, tag = "15")]
-    pub follows: ::core::option::Option<u32>,
-    /// followed_from_follower: 12 little-endian f32, row-major 3x4, translation in scene units; empty if `follows` is
-    /// unset.
-    #[prost(bytes = "bytes", tag = "16")]
-    pub follow_frame: ::prost::bytes::Bytes,
+}
+/// Consecutive triangles with one material. A range ends where the next one begins.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct MaterialRange {
+    #[prost(uint32, tag = "1")]
+    pub first_triangle: u32,
+    #[prost(uint32, tag = "2")]
+    pub material: u32,
+}
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct Eigenvalues {
+    /// Squared angular frequencies in (rad/s)^2, one per mode; empty if unknown.
+    #[prost(double, repeated, tag = "1")]
+    pub values: ::prost::alloc::vec::Vec<f64>,
 }
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct ArrayChunk {
     #[prost(uint32, tag = "1")]
-    pub domain: u32,
+    pub shape: u32,
     #[prost(enumeration = "Array", tag = "2")]
     pub array: i32,
     /// Offset of `data` in the array, and size of the whole array, both in bytes. An empty array is one empty chunk.
@@ -419,7 +558,32 @@ pub struct ArrayChunk {
     pub offset: u64,
     #[prost(uint64, tag = "4")]
     pub total: u64,
+    /// At most 1 MiB.
     #[prost(bytes = "bytes", tag = "5")]
+    pub data: ::prost::bytes::Bytes,
+}
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct ReadContentRequest {
+    #[prost(string, tag = "1")]
+    pub scene: ::prost::alloc::string::String,
+    /// 1 to 4096 hashes of 32 bytes from ArrayDescription.sha256 and TextureDescription.sha256. A hash that no array and
+    /// no texture of the scene has is rejected with REASON_CONTENT_NOT_FOUND before any content is sent.
+    #[prost(bytes = "bytes", repeated, tag = "2")]
+    pub sha256: ::prost::alloc::vec::Vec<::prost::bytes::Bytes>,
+}
+/// A chunk of one array or texture. The contents are sent one after the other, in the order of the request.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct ReadContentResponse {
+    /// Index of the hash in the request.
+    #[prost(uint32, tag = "1")]
+    pub item: u32,
+    /// Offset of `data` in the content, and size of the whole content, both in bytes. An empty array is one empty chunk.
+    #[prost(uint64, tag = "2")]
+    pub offset: u64,
+    #[prost(uint64, tag = "3")]
+    pub total: u64,
+    /// At most 1 MiB.
+    #[prost(bytes = "bytes", tag = "4")]
     pub data: ::prost::bytes::Bytes,
 }
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
@@ -447,8 +611,8 @@ pub struct ReadModesResponse {
     #[prost(bytes = "bytes", tag = "4")]
     pub data: ::prost::bytes::Bytes,
 }
-/// Arrays of a domain's mesh, little-endian. A corner is a vertex with its normal and texture coordinates; a vertex may
-/// have several corners.
+/// Arrays of a shape, little-endian. A corner is a vertex with its normal and texture coordinates; a vertex may have
+/// several corners.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
 #[repr(i32)]
 pub enum Array {
@@ -459,10 +623,13 @@ pub enum Array {
     CornerVertices = 2,
     /// f32 rest positions x0, three per vertex, in scene units and in the domain's own frame.
     RestPositions = 3,
-    /// f32 texture coordinates, two per corner, (0, 0) at the top left; empty if the domain has none.
+    /// f32 texture coordinates, two per corner, (0, 0) at the top left; empty if the shape has none.
     Uvs = 4,
-    /// f32 rest normals, three per corner.
+    /// f32 rest normals, three per corner: unit vectors in the domain's own frame.
     RestNormals = 5,
+    /// f32 entries of U, row-major 3n x r, in scene units per unit of q: all modes, before any truncation or conversion
+    /// that the server applies; empty if r is 0. ReadModes returns selected rows.
+    Modes = 6,
 }
 impl Array {
     /// String value of the enum field names used in the ProtoBuf definition.
@@ -477,6 +644,7 @@ impl Array {
             Self::RestPositions => "ARRAY_REST_POSITIONS",
             Self::Uvs => "ARRAY_UVS",
             Self::RestNormals => "ARRAY_REST_NORMALS",
+            Self::Modes => "ARRAY_MODES",
         }
     }
     /// Creates an enum from field names used in the ProtoBuf definition.
@@ -488,6 +656,43 @@ impl Array {
             "ARRAY_REST_POSITIONS" => Some(Self::RestPositions),
             "ARRAY_UVS" => Some(Self::Uvs),
             "ARRAY_REST_NORMALS" => Some(Self::RestNormals),
+            "ARRAY_MODES" => Some(Self::Modes),
+            _ => None,
+        }
+    }
+}
+/// How the alpha of a material is used, as in glTF.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
+#[repr(i32)]
+pub enum AlphaMode {
+    Unspecified = 0,
+    /// Alpha is ignored.
+    Opaque = 1,
+    /// Fragments below the cutoff are not drawn and cast no shadow. All others are opaque.
+    Mask = 2,
+    /// Blended by alpha over the opaque surfaces.
+    Blend = 3,
+}
+impl AlphaMode {
+    /// String value of the enum field names used in the ProtoBuf definition.
+    ///
+    /// The values are not transformed in any way and thus are considered stable
+    /// (if the ProtoBuf definition does not change) and safe for programmatic use.
+    pub fn as_str_name(&self) -> &'static str {
+        match self {
+            Self::Unspecified => "ALPHA_MODE_UNSPECIFIED",
+            Self::Opaque => "ALPHA_MODE_OPAQUE",
+            Self::Mask => "ALPHA_MODE_MASK",
+            Self::Blend => "ALPHA_MODE_BLEND",
+        }
+    }
+    /// Creates an enum from field names used in the ProtoBuf definition.
+    pub fn from_str_name(value: &str) -> ::core::option::Option<Self> {
+        match value {
+            "ALPHA_MODE_UNSPECIFIED" => Some(Self::Unspecified),
+            "ALPHA_MODE_OPAQUE" => Some(Self::Opaque),
+            "ALPHA_MODE_MASK" => Some(Self::Mask),
+            "ALPHA_MODE_BLEND" => Some(Self::Blend),
             _ => None,
         }
     }
@@ -695,7 +900,8 @@ pub mod scene_service_client {
                 .insert(GrpcMethod::new("modalcast.v1.SceneService", "DeleteScene"));
             self.inner.unary(req, path, codec).await
         }
-        /// Describes a scene: one `scene` part, then `domains` parts, then `chunk` parts with the requested arrays.
+        /// Describes a scene: one `scene` part, then the `shapes`, `materials`, `textures` and `domains` parts in this order,
+        /// then `chunk` parts with the requested arrays. A list may be split into several parts; an empty list has none.
         pub async fn describe_scene(
             &mut self,
             request: impl tonic::IntoRequest<super::DescribeSceneRequest>,
@@ -718,6 +924,32 @@ pub mod scene_service_client {
             let mut req = request.into_request();
             req.extensions_mut()
                 .insert(GrpcMethod::new("modalcast.v1.SceneService", "DescribeScene"));
+            self.inner.server_streaming(req, path, codec).await
+        }
+        /// Returns arrays and pixels of textures by the hashes in the description of the scene, so that a client that stores
+        /// them by hash receives each only once.
+        pub async fn read_content(
+            &mut self,
+            request: impl tonic::IntoRequest<super::ReadContentRequest>,
+        ) -> std::result::Result<
+            tonic::Response<tonic::codec::Streaming<super::ReadContentResponse>>,
+            tonic::Status,
+        > {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = tonic_prost::ProstCodec::default();
+            let path = http::uri::PathAndQuery::from_static(
+                "/modalcast.v1.SceneService/ReadContent",
+            );
+            let mut req = request.into_request();
+            req.extensions_mut()
+                .insert(GrpcMethod::new("modalcast.v1.SceneService", "ReadContent"));
             self.inner.server_streaming(req, path, codec).await
         }
         /// Returns selected rows of a domain's U, so that a client without the scene's files can compute U^T f.
@@ -799,12 +1031,28 @@ pub mod scene_service_server {
             >
             + std::marker::Send
             + 'static;
-        /// Describes a scene: one `scene` part, then `domains` parts, then `chunk` parts with the requested arrays.
+        /// Describes a scene: one `scene` part, then the `shapes`, `materials`, `textures` and `domains` parts in this order,
+        /// then `chunk` parts with the requested arrays. A list may be split into several parts; an empty list has none.
         async fn describe_scene(
             &self,
             request: tonic::Request<super::DescribeSceneRequest>,
         ) -> std::result::Result<
             tonic::Response<Self::DescribeSceneStream>,
+            tonic::Status,
+        >;
+        /// Server streaming response type for the ReadContent method.
+        type ReadContentStream: tonic::codegen::tokio_stream::Stream<
+                Item = std::result::Result<super::ReadContentResponse, tonic::Status>,
+            >
+            + std::marker::Send
+            + 'static;
+        /// Returns arrays and pixels of textures by the hashes in the description of the scene, so that a client that stores
+        /// them by hash receives each only once.
+        async fn read_content(
+            &self,
+            request: tonic::Request<super::ReadContentRequest>,
+        ) -> std::result::Result<
+            tonic::Response<Self::ReadContentStream>,
             tonic::Status,
         >;
         /// Server streaming response type for the ReadModes method.
@@ -1117,6 +1365,52 @@ pub mod scene_service_server {
                     let inner = self.inner.clone();
                     let fut = async move {
                         let method = DescribeSceneSvc(inner);
+                        let codec = tonic_prost::ProstCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.server_streaming(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                "/modalcast.v1.SceneService/ReadContent" => {
+                    #[allow(non_camel_case_types)]
+                    struct ReadContentSvc<T: SceneService>(pub Arc<T>);
+                    impl<
+                        T: SceneService,
+                    > tonic::server::ServerStreamingService<super::ReadContentRequest>
+                    for ReadContentSvc<T> {
+                        type Response = super::ReadContentResponse;
+                        type ResponseStream = T::ReadContentStream;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::ResponseStream>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<super::ReadContentRequest>,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as SceneService>::read_content(&inner, request).await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = ReadContentSvc(inner);
                         let codec = tonic_prost::ProstCodec::default();
                         let mut grpc = tonic::server::Grpc::new(codec)
                             .apply_compression_config(
@@ -3969,6 +4263,8 @@ pub enum Feature {
     /// FrameService renders frames and AOVs and answers picks. A server without a renderer lacks this feature, and rejects
     /// these calls with REASON_RESOURCE_MISSING.
     Frames = 1,
+    /// DescribeScene returns hashes, and ReadContent returns arrays and textures by their hashes.
+    ContentHashes = 2,
 }
 impl Feature {
     /// String value of the enum field names used in the ProtoBuf definition.
@@ -3979,6 +4275,7 @@ impl Feature {
         match self {
             Self::Unspecified => "FEATURE_UNSPECIFIED",
             Self::Frames => "FEATURE_FRAMES",
+            Self::ContentHashes => "FEATURE_CONTENT_HASHES",
         }
     }
     /// Creates an enum from field names used in the ProtoBuf definition.
@@ -3986,6 +4283,7 @@ impl Feature {
         match value {
             "FEATURE_UNSPECIFIED" => Some(Self::Unspecified),
             "FEATURE_FRAMES" => Some(Self::Frames),
+            "FEATURE_CONTENT_HASHES" => Some(Self::ContentHashes),
             _ => None,
         }
     }

@@ -7,6 +7,7 @@
 
 mod blocking;
 mod catch_unwind;
+mod content;
 mod device;
 mod lock;
 mod output;
@@ -17,6 +18,7 @@ mod storage;
 #[cfg(test)]
 mod testing;
 
+pub use content::{ContentHash, ContentHashes, SceneContent, ShapeArray, hex, parse_hash};
 pub use device::context::{DeviceContext, EngineInfo};
 pub use device::loaded_scene::LoadedScene;
 pub use device::scalar_field::validate_mode;

@@ -18,6 +18,9 @@ pub enum Error {
     /// The caller named an object that does not exist.
     #[error("{what} not found: {given}")]
     NotFound { what: &'static str, given: String },
+    /// No content has the hash that the caller named. `what` describes the contents that were searched.
+    #[error("{field}: expected the SHA-256 of an existing {what}, got {sha256}")]
+    ContentNotFound { field: String, what: &'static str, sha256: String },
     /// Another scene has the name. `owner` is the source of that scene.
     #[error("the scene name '{name}' belongs to '{owner}'")]
     NameTaken { name: String, owner: String },

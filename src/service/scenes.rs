@@ -95,6 +95,17 @@ impl v1::scene_service_server::SceneService for SceneServiceImpl {
         describe::respond_with_description(scene_handle, request, self.0.config().chunk_bytes).map_err(to_status)
     }
 
+    type ReadContentStream = ReplyStream<v1::ReadContentResponse>;
+
+    async fn read_content(
+        &self,
+        request: Request<v1::ReadContentRequest>,
+    ) -> Result<Response<Self::ReadContentStream>, Status> {
+        let request = request.into_inner();
+        let scene_handle = self.0.find(&request.scene).map_err(to_status)?;
+        describe::respond_with_content(scene_handle, request, self.0.config().chunk_bytes).await.map_err(to_status)
+    }
+
     type ReadModesStream = ReplyStream<v1::ReadModesResponse>;
 
     async fn read_modes(

@@ -73,6 +73,10 @@ impl ErrorReport {
             Error::NotFound { what, given } => {
                 Self::new(Code::NotFound, Reason::SceneNotFound, format!("an existing {what}"), given)
             }
+            Error::ContentNotFound { field, what, sha256 } => {
+                let expected = format!("the SHA-256 of an existing {what}");
+                Self::new(Code::NotFound, Reason::ContentNotFound, expected, sha256).with_field(field)
+            }
             Error::NameTaken { name, owner } => {
                 let given = format!("'{name}', which belongs to '{owner}'");
                 Self::new(Code::AlreadyExists, Reason::SceneNameTaken, "a free scene name", given)
@@ -81,10 +85,7 @@ impl ErrorReport {
                 let given = format!("the lease of run {run}, held for {seconds} s");
                 Self::new(Code::AlreadyExists, Reason::WriterLeaseTaken, "a free writer lease", given)
             }
-            Error::LeaseLost { run } => {
-                let given = format!("the lease of run {run}");
-                Self::new(Code::Aborted, Reason::LeaseLost, "the lease of this stream", given)
-            }
+            Error::LeaseLost { run } => Self::lease_lost(run),
             Error::StepPassed { field, expected, given } => {
                 Self::new(Code::FailedPrecondition, Reason::StepPassed, expected, given).with_field(field)
             }
@@ -102,13 +103,11 @@ impl ErrorReport {
                 Self::new(Code::ResourceExhausted, Reason::LimitReached, expected, "one more")
                     .with_metadata([("object", objects.into()), ("limit", limit.to_string())])
             }
-            Error::SlowReader { queue, limit } => Self::new(
-                Code::ResourceExhausted,
-                Reason::SlowReader,
-                "a client that reads its replies",
-                "a full queue",
-            )
-            .with_metadata([("queue", queue.into()), ("limit", limit.to_string())]),
+            Error::SlowReader { queue, limit } => {
+                let expected = "a client that reads its replies";
+                Self::new(Code::ResourceExhausted, Reason::SlowReader, expected, "a full queue")
+                    .with_metadata([("queue", queue.into()), ("limit", limit.to_string())])
+            }
             Error::Deadline { what, ms } => {
                 let expected = format!("{what} within {ms} ms");
                 Self::new(Code::DeadlineExceeded, Reason::DeadlineExpired, expected, "no reply in time")
@@ -128,6 +127,11 @@ impl ErrorReport {
                 Self::new(Code::Internal, Reason::Internal, "no internal error", format!("{stage}: {reason}"))
             }
         }
+    }
+
+    fn lease_lost(run: u64) -> Self {
+        let given = format!("the lease of run {run}");
+        Self::new(Code::Aborted, Reason::LeaseLost, "the lease of this stream", given)
     }
 
     fn into_status(self, message: String) -> Status {

@@ -261,12 +261,12 @@ async fn invalid_requests_return_code_and_details() {
     let request = v1::ReadModesRequest { scene: "strips".into(), domain: 0, vertices: vec![0, 4] };
     let status = scenes.read_modes(request).await.expect_err("expected an unknown-vertex error");
     rejected_calls.push((status, Code::InvalidArgument, ["vertices[1]", "an index below 4", "4"]));
-    let request = v1::DescribeSceneRequest { scene: "strips".into(), domains: vec![7], arrays: vec![] };
+    let request = v1::DescribeSceneRequest { scene: "strips".into(), domains: vec![7], ..Default::default() };
     let status = scenes.describe_scene(request).await.expect_err("expected an unknown-domain error");
     rejected_calls.push((status, Code::InvalidArgument, ["domains[0]", "an index below 2", "7"]));
-    let request = v1::DescribeSceneRequest { scene: "strips".into(), domains: vec![], arrays: vec![99] };
+    let request = v1::DescribeSceneRequest { scene: "strips".into(), arrays: vec![99], ..Default::default() };
     let status = scenes.describe_scene(request).await.expect_err("expected an unknown-array error");
-    rejected_calls.push((status, Code::InvalidArgument, ["arrays", "arrays of this version", "99"]));
+    rejected_calls.push((status, Code::InvalidArgument, ["arrays[0]", "an array of this version", "99"]));
     let request = v1::OpenSceneRequest { source: "nothing".into(), scene: String::new() };
     let status = scenes.open_scene(request).await.expect_err("expected an unknown-source error");
     rejected_calls.push((status, Code::NotFound, ["", "an existing scene", "nothing"]));

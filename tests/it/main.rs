@@ -6,6 +6,7 @@ mod common;
 mod cpu_checks;
 mod cut_outs;
 mod deformers;
+mod descriptions;
 mod error_reasons;
 mod far;
 mod following;

@@ -66,30 +66,40 @@ async fn opening_after_a_concurrent_failure_is_registered() {
     server.engine.open("other", "strips").await.expect("expected the name to be free after closing");
 }
 
-/// Describes all domains of a scene. Returns the descriptions, and the bytes of every requested array of every domain.
-async fn describe(server: &Server, scene: &str, arrays: &[Array]) -> (Vec<v1::DomainDescription>, Vec<Vec<u8>>) {
+/// A description of all domains of a scene.
+#[derive(Default)]
+struct Description {
+    shapes: Vec<v1::ShapeDescription>,
+    domains: Vec<v1::DomainDescription>,
+    /// The bytes of every requested array of every shape.
+    array_bytes: Vec<Vec<u8>>,
+}
+
+async fn describe(server: &Server, scene: &str, arrays: &[Array]) -> Description {
     let arrays = arrays.iter().map(|array| (*array).into()).collect();
-    let request = v1::DescribeSceneRequest { scene: scene.into(), domains: vec![], arrays };
+    let request = v1::DescribeSceneRequest { scene: scene.into(), arrays, ..Default::default() };
     let mut stream = server.scenes().await.describe_scene(request).await.expect("expected a description").into_inner();
-    let mut domains = Vec::new();
-    let mut array_bytes: Vec<Vec<u8>> = Vec::new();
+    let mut description = Description::default();
     while let Some(response) = with_timeout(stream.message()).await.expect("expected another message") {
         assert!(response.encoded_len() <= MAX_MESSAGE_BYTES);
         match response.part.expect("expected a part") {
             Part::Scene(info) => assert_eq!(info.scene, scene),
-            Part::Domains(part) => domains.extend(part.domains),
+            Part::Shapes(part) => description.shapes.extend(part.shapes),
+            Part::Domains(part) => description.domains.extend(part.domains),
+            Part::Materials(part) => assert_eq!(part.materials.len(), 1),
+            Part::Textures(part) => panic!("expected no textures, got {part:?}"),
             Part::Chunk(chunk) => {
                 if chunk.offset == 0 {
-                    array_bytes.push(Vec::new());
+                    description.array_bytes.push(Vec::new());
                 }
-                let array = array_bytes.last_mut().expect("expected an array that starts at offset 0");
+                let array = description.array_bytes.last_mut().expect("expected an array that starts at offset 0");
                 assert_eq!(chunk.offset, array.len() as u64);
                 array.extend_from_slice(&chunk.data);
                 assert!(array.len() as u64 <= chunk.total);
             }
         }
     }
-    (domains, array_bytes)
+    description
 }
 
 /// Reads the rows of U of some vertices, or of all vertices if the list is empty. Numbers are ordered by vertex, axis
@@ -116,7 +126,7 @@ async fn client_can_read_the_whole_scene() {
     assert_eq!((info.domains, info.vertices, info.corners, info.triangles, info.coordinates), (2, 8, 8, 4, 4));
     assert_eq!((info.up.as_str(), info.unit, info.last_step), ("y", 1.0, None));
     let arrays = [Array::Indices, Array::CornerVertices, Array::RestPositions, Array::Uvs, Array::RestNormals];
-    let (domains, array_bytes) = describe(&server, "strips", &arrays).await;
+    let Description { shapes, domains, array_bytes } = describe(&server, "strips", &arrays).await;
     let scene = strips();
     let mesh = &scene.shapes[0].mesh;
     let expected_bytes: [Vec<u8>; 5] = [
@@ -127,10 +137,11 @@ async fn client_can_read_the_whole_scene() {
         bytemuck::cast_slice(&mesh.corners().normals).to_vec(),
     ];
     // The two domains have the same shape.
-    assert_eq!(array_bytes, [expected_bytes.clone(), expected_bytes].concat());
+    assert_eq!(array_bytes, expected_bytes);
+    let [shape] = shapes.as_slice() else { panic!("{shapes:?}") };
+    assert_eq!((shape.vertices, shape.rank, shape.eigenvalues.as_slice()), (4, 2, [1.0, 4.0].as_slice()));
     let [left, right] = domains.as_slice() else { panic!("{domains:?}") };
-    assert_eq!((left.name.as_str(), left.vertices, left.rank, left.parent), ("left", 4, 2, None));
-    assert_eq!((left.eigenvalues.as_slice(), left.notes["species"].as_str()), ([1.0, 4.0].as_slice(), "none"));
+    assert_eq!((left.name.as_str(), left.parent, left.notes["species"].as_str()), ("left", None, "none"));
     assert_eq!(
         (right.name.as_str(), right.parent, right.attachment_vertices.as_slice()),
         ("right", Some(0), [1, 3].as_slice())
@@ -146,7 +157,7 @@ async fn client_can_read_the_whole_scene() {
 async fn description_contains_followed_domains_and_frames() {
     let server = Server::start_default().await;
     server.open("twig").await;
-    let (domains, _) = describe(&server, "twig", &[]).await;
+    let Description { domains, .. } = describe(&server, "twig", &[]).await;
     assert_eq!(domains.iter().map(|domain| domain.follows).collect::<Vec<_>>(), [None, None, Some(1), Some(2)]);
     assert_eq!(domains.iter().map(|domain| domain.follow_frame.len()).collect::<Vec<_>>(), [0, 0, 48, 48]);
     assert_eq!(
@@ -164,7 +175,7 @@ async fn large_replies_are_chunked_for_default_client_limits() {
     let server = Server::start_default().await;
     server.open("sheet").await;
     let scene = sheet();
-    let (_, array_bytes) = describe(&server, "sheet", &[Array::Indices, Array::RestPositions]).await;
+    let Description { array_bytes, .. } = describe(&server, "sheet", &[Array::Indices, Array::RestPositions]).await;
     let mesh = &scene.shapes[0].mesh;
     assert_eq!(array_bytes[0], bytemuck::cast_slice::<_, u8>(mesh.triangles()));
     assert_eq!(array_bytes[1], bytemuck::cast_slice::<_, u8>(mesh.rest_positions()));

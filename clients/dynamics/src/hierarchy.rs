@@ -13,7 +13,7 @@ pub const MIN_DOMAINS_PER_THREAD: usize = 64;
 
 /// Computes `world_from_domain` of every domain at the coordinates `q` of the scene. `local_transforms` has an optional
 /// motion of each domain within its own frame, for example the rotation of a leaf about its stalk. The list may be
-/// shorter than the list of domains.
+/// shorter than the list of domains. A domain that follows another one has no motion of its own.
 pub fn compute_transforms(
     model: &Model,
     q: &[f64],
@@ -39,6 +39,11 @@ pub fn compose_transforms(
 ) -> Vec<AffineTransform> {
     let mut world_from_domain: Vec<AffineTransform> = Vec::with_capacity(model.domains.len());
     for (index, (domain, attachment)) in model.domains.iter().zip(attachments).enumerate() {
+        if let Some(follow) = &domain.follow {
+            let follower = world_from_domain[follow.leader].compose(&follow.leader_from_follower);
+            world_from_domain.push(follower);
+            continue;
+        }
         let world_from_attached = match &domain.joint {
             None => *attachment,
             Some(joint) => world_from_domain[joint.parent].compose(attachment),
@@ -142,6 +147,7 @@ pub(crate) mod tests {
             owns_q: true,
             placement,
             joint,
+            follow: None,
             eigenvalues: vec![30.0, 35.0],
             notes: BTreeMap::new(),
             area: radius,

@@ -5,7 +5,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use modalcast_client::{Client, Domain, DomainArray, ModeRows, SceneDescription};
+use modalcast_client::{Client, Domain, ModeRows, SceneDescription, Shape, ShapeArray};
 use nalgebra::Vector3;
 use rayon::prelude::*;
 
@@ -39,6 +39,14 @@ pub struct Joint {
     pub attachment_samples: Vec<usize>,
 }
 
+/// The domain whose transform a domain follows.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct FollowedDomain {
+    /// Index of the followed domain.
+    pub leader: usize,
+    pub leader_from_follower: AffineTransform,
+}
+
 /// One domain of the scene.
 #[derive(Debug, Clone, PartialEq)]
 pub struct DomainModel {
@@ -54,6 +62,8 @@ pub struct DomainModel {
     /// `world_from_domain` at rest.
     pub placement: AffineTransform,
     pub joint: Option<Joint>,
+    /// Present if the domain follows another one. Steps must not contain its transform.
+    pub follow: Option<FollowedDomain>,
     /// (rad/s)^2 per mode; empty when unknown.
     pub eigenvalues: Vec<f64>,
     /// Free-form metadata of the scene's author, by name.
@@ -145,10 +155,10 @@ impl Model {
         // eigenvalues use it.
         let description = match (has_modes, has_eigenvalues) {
             (false, _) => description_without_arrays,
-            (true, false) => client.describe(scene, &[DomainArray::RestPositions]).await?,
+            (true, false) => client.describe(scene, &[ShapeArray::RestPositions]).await?,
             (true, true) => {
                 client
-                    .describe(scene, &[DomainArray::RestPositions, DomainArray::Indices, DomainArray::CornerVertices])
+                    .describe(scene, &[ShapeArray::RestPositions, ShapeArray::Indices, ShapeArray::CornerVertices])
                     .await?
             }
         };
@@ -193,10 +203,12 @@ impl Model {
             };
             let owns_q = domain.shares_q_with.is_none();
             coordinate_count += if owns_q { domain.rank } else { 0 };
-            let samples = create_samples(domain, selection, mode_rows(domain, &selection.vertices))?;
-            let mut domain_model = create_domain_model(domain, selection, samples);
+            let shape = description.shape_of(domain);
+            let samples = create_samples(domain, shape, selection, mode_rows(domain, &selection.vertices))?;
+            let mut domain_model = create_domain_model(domain, shape, selection, samples);
             (domain_model.first_coordinate, domain_model.owns_q) = (first_coordinate, owns_q);
             domain_model.joint = create_joint(domain, &selections);
+            domain_model.follow = create_follow(domain, domains.len())?;
             domains.push(domain_model);
         }
         let info = &description.info;
@@ -274,7 +286,7 @@ fn select_vertices(description: &SceneDescription, max_surface_samples: usize) -
             let field = format!("parent of '{}'", domain.name);
             return Err(invalid_input(field, format!("an index below {index}"), attachment.parent));
         }
-        let limit = domains[attachment.parent].vertex_count;
+        let limit = description.shape_of(&domains[attachment.parent]).vertex_count;
         if let Some(vertex) = attachment.parent_vertices.iter().find(|vertex| **vertex as usize >= limit) {
             let field = format!("attachment vertices of '{}'", domain.name);
             return Err(invalid_input(field, format!("vertices below {limit}"), vertex));
@@ -282,14 +294,15 @@ fn select_vertices(description: &SceneDescription, max_surface_samples: usize) -
         attachment_vertices[attachment.parent].extend(&attachment.parent_vertices);
     }
     let select_for_domain = |(domain, attachment_vertices): (&Domain, BTreeSet<u32>)| {
-        if domain.rest_positions.is_empty() {
+        let shape = description.shape_of(domain);
+        if shape.rest_positions.is_empty() {
             return SelectedVertices { vertices: vec![], surface_sample_count: 0 };
         }
-        let surface_sample_count = domain.vertex_count.min(max_surface_samples);
-        let spread_vertex = |ordinal: usize| (ordinal * domain.vertex_count / surface_sample_count) as u32;
+        let surface_sample_count = shape.vertex_count.min(max_surface_samples);
+        let spread_vertex = |ordinal: usize| (ordinal * shape.vertex_count / surface_sample_count) as u32;
         let mut vertices: Vec<u32> = (0..surface_sample_count).map(spread_vertex).collect();
         let surface_vertices: BTreeSet<u32> = vertices.iter().copied().collect();
-        let joint_vertices = attachment_vertices.into_iter().chain([base_vertex(domain)]).collect::<BTreeSet<_>>();
+        let joint_vertices = attachment_vertices.into_iter().chain([base_vertex(shape)]).collect::<BTreeSet<_>>();
         vertices.extend(joint_vertices.difference(&surface_vertices));
         SelectedVertices { vertices, surface_sample_count }
     };
@@ -297,18 +310,23 @@ fn select_vertices(description: &SceneDescription, max_surface_samples: usize) -
 }
 
 /// Index of the vertex nearest to the domain's origin.
-fn base_vertex(domain: &Domain) -> u32 {
+fn base_vertex(shape: &Shape) -> u32 {
     let norm_squared =
-        |vertex: u32| domain.rest_positions[3 * vertex as usize..][..3].iter().map(|x| x * x).sum::<f32>();
-    (0..domain.vertex_count as u32).min_by(|a, b| norm_squared(*a).total_cmp(&norm_squared(*b))).unwrap_or(0)
+        |vertex: u32| shape.rest_positions[3 * vertex as usize..][..3].iter().map(|x| x * x).sum::<f32>();
+    (0..shape.vertex_count as u32).min_by(|a, b| norm_squared(*a).total_cmp(&norm_squared(*b))).unwrap_or(0)
 }
 
-fn rest_position(domain: &Domain, vertex: u32) -> Vector3<f64> {
-    Vector3::from_fn(|component, _| f64::from(domain.rest_positions[3 * vertex as usize + component]))
+fn rest_position(shape: &Shape, vertex: u32) -> Vector3<f64> {
+    Vector3::from_fn(|component, _| f64::from(shape.rest_positions[3 * vertex as usize + component]))
 }
 
 /// The samples of a domain's selected vertices. They have no rows of U if `mode_rows` is `None`.
-fn create_samples(domain: &Domain, selection: &SelectedVertices, mode_rows: Option<&ModeRows>) -> Result<Vec<Sample>> {
+fn create_samples(
+    domain: &Domain,
+    shape: &Shape,
+    selection: &SelectedVertices,
+    mode_rows: Option<&ModeRows>,
+) -> Result<Vec<Sample>> {
     let sample = |(ordinal, vertex): (usize, &u32)| {
         let rows = match mode_rows {
             Some(mode_rows) => mode_rows.rows_of(ordinal).ok_or_else(|| {
@@ -319,14 +337,19 @@ fn create_samples(domain: &Domain, selection: &SelectedVertices, mode_rows: Opti
             None => &[],
         };
         let mode_rows = rows.iter().map(|entry| f64::from(*entry)).collect();
-        Ok(Sample { rest_position: rest_position(domain, *vertex), mode_rows })
+        Ok(Sample { rest_position: rest_position(shape, *vertex), mode_rows })
     };
     selection.vertices.iter().enumerate().map(sample).collect()
 }
 
-/// Creates the model of a domain. The caller sets `joint`, `first_coordinate` and `owns_q`.
-fn create_domain_model(domain: &Domain, selection: &SelectedVertices, samples: Vec<Sample>) -> DomainModel {
-    let base_vertex = (!samples.is_empty()).then(|| base_vertex(domain));
+/// Creates the model of a domain. The caller sets `joint`, `follow`, `first_coordinate` and `owns_q`.
+fn create_domain_model(
+    domain: &Domain,
+    shape: &Shape,
+    selection: &SelectedVertices,
+    samples: Vec<Sample>,
+) -> DomainModel {
+    let base_vertex = (!samples.is_empty()).then(|| base_vertex(shape));
     DomainModel {
         name: domain.name.clone(),
         rank: domain.rank,
@@ -334,10 +357,11 @@ fn create_domain_model(domain: &Domain, selection: &SelectedVertices, samples: V
         owns_q: true,
         placement: AffineTransform::from_row_major(&domain.placement),
         joint: None,
+        follow: None,
         eigenvalues: domain.eigenvalues.clone(),
         notes: domain.notes.clone(),
-        area: surface_area(domain),
-        diagonal: bounds_diagonal(domain),
+        area: surface_area(shape),
+        diagonal: bounds_diagonal(shape),
         base_sample: base_vertex
             .and_then(|base_vertex| selection.vertices.iter().position(|vertex| *vertex == base_vertex)),
         samples,
@@ -356,22 +380,33 @@ fn create_joint(domain: &Domain, selections: &[SelectedVertices]) -> Option<Join
     Some(Joint { parent: attachment.parent, parent_from_child, attachment_samples })
 }
 
-/// The surface area of a domain's mesh; 0 without a mesh.
-fn surface_area(domain: &Domain) -> f64 {
-    if domain.corner_vertices.is_empty() {
+/// The domain that the domain with index `index` follows. Leaders precede their followers.
+fn create_follow(domain: &Domain, index: usize) -> Result<Option<FollowedDomain>> {
+    let Some(follow) = &domain.follow else { return Ok(None) };
+    if follow.leader >= index {
+        let field = format!("domain that '{}' follows", domain.name);
+        return Err(invalid_input(field, format!("an index below {index}"), follow.leader));
+    }
+    let leader_from_follower = AffineTransform::from_row_major(&follow.leader_from_follower);
+    Ok(Some(FollowedDomain { leader: follow.leader, leader_from_follower }))
+}
+
+/// The surface area of a mesh; 0 without a mesh.
+fn surface_area(shape: &Shape) -> f64 {
+    if shape.corner_vertices.is_empty() {
         return 0.0;
     }
-    let position = |corner: &u32| rest_position(domain, domain.corner_vertices[*corner as usize]);
+    let position = |corner: &u32| rest_position(shape, shape.corner_vertices[*corner as usize]);
     let triangle_area = |corners: &[u32]| {
         let [a, b, c] = [position(&corners[0]), position(&corners[1]), position(&corners[2])];
         0.5 * (b - a).cross(&(c - a)).norm()
     };
-    domain.indices.chunks_exact(3).map(triangle_area).sum()
+    shape.indices.chunks_exact(3).map(triangle_area).sum()
 }
 
-/// The diagonal of a domain's bounds at rest; 0 without rest positions.
-fn bounds_diagonal(domain: &Domain) -> f64 {
-    let points = (0..(domain.rest_positions.len() / 3) as u32).map(|vertex| rest_position(domain, vertex));
+/// The diagonal of a shape's bounds at rest; 0 without rest positions.
+fn bounds_diagonal(shape: &Shape) -> f64 {
+    let points = (0..(shape.rest_positions.len() / 3) as u32).map(|vertex| rest_position(shape, vertex));
     let bounds = points.fold(None, |bounds: Option<(Vector3<f64>, Vector3<f64>)>, point| {
         // `inf` and `sup` are the minimum and the maximum per component.
         Some(bounds.map_or((point, point), |(min, max)| (min.inf(&point), max.sup(&point))))

@@ -153,7 +153,8 @@ pub async fn drive_scene(
     Ok(RunSummary { sent_steps: stream_summary.sent, rejected_steps: stream_summary.rejected, report })
 }
 
-/// Adds to a step the values whose bits changed since the last step sent, or all values if there is none.
+/// Adds to a step the values whose bits changed since the last step sent, or all values if there is none. A domain that
+/// follows another one has no transform in steps.
 fn add_changes(
     model: &Model,
     mut step: Step,
@@ -168,6 +169,9 @@ fn add_changes(
         });
         if domain.owns_q && domain.rank > 0 && q_changed {
             step.set_q(index as u32, &current_values.q[range]);
+        }
+        if domain.follow.is_some() {
+            continue;
         }
         let transform = &current_values.transforms[index];
         if last_sent_values.is_none_or(|last_sent_values| !are_equal(&last_sent_values.transforms[index], transform)) {

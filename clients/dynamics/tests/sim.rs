@@ -8,7 +8,7 @@ mod fake;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use fake::{FakeDomain, FakeServer, IDENTITY, pack, serve};
+use fake::{FakeDomain, FakeServer, IDENTITY, compose, pack, serve};
 use modalcast_client::{Client, VertexSelection, VertexStreamRequest};
 
 /// A beam of length 1 along y with two bending modes: nine sections of six vertices, 54 vertices in all.
@@ -33,7 +33,7 @@ fn tree_server() -> FakeServer {
     let (sine, cosine) = (0.6_f32, 0.8_f32);
     let parent_from_child = [cosine, sine, 0.0, 0.0, -sine, cosine, 0.0, 1.0, 0.0, 0.0, 1.0, 0.0];
     let mut domains = vec![];
-    let mut placement = IDENTITY;
+    let mut placement = IDENTITY.to_vec();
     for index in 0..4 {
         let radius = 0.05 / (index + 1) as f32;
         let mut domain = beam(index, radius);
@@ -51,21 +51,12 @@ fn tree_server() -> FakeServer {
         domain.wire.placement = pack(&placement).into();
         let eigenvalue = |hertz: f64| (2.0 * std::f64::consts::PI * hertz).powi(2);
         if index < 3 {
-            domain.wire.eigenvalues = vec![eigenvalue(0.9), eigenvalue(1.1)];
+            domain.shape.eigenvalues = vec![eigenvalue(0.9), eigenvalue(1.1)];
             domain.wire.notes.insert("damping_ratio".into(), "0.05".into());
         }
         domains.push(domain);
     }
     FakeServer::new(domains)
-}
-
-/// The product of two affine transforms, row-major 3x4.
-fn compose(a: &[f32; 12], b: &[f32; 12]) -> [f32; 12] {
-    std::array::from_fn(|index| {
-        let (row, column) = (index / 4, index % 4);
-        let sum: f32 = (0..3).map(|k| a[4 * row + k] * b[4 * k + column]).sum();
-        sum + if column == 3 { a[4 * row + 3] } else { 0.0 }
-    })
 }
 
 /// The result of a run of `modalcast-sim`.
@@ -159,10 +150,33 @@ async fn tree_sways_and_subscribers_receive_closed_joints() {
     assert_eq!(fake::decode_f32(&steps[40].q), q[40 * 6..41 * 6]);
 }
 
+/// The server rejects transforms of the leaf, which follows the last branch.
+#[tokio::test(flavor = "multi_thread")]
+async fn followers_get_no_transforms_and_move_with_their_leaders() {
+    let mut server = tree_server();
+    let leaf = &mut server.domains[3].wire;
+    (leaf.follows, leaf.follow_frame) = (Some(2), leaf.attachment_frame.clone());
+    let server = Arc::new(server);
+    let rest_positions = server.output().positions;
+    let url = serve(Arc::clone(&server)).await;
+    for scenario in ["sweep", "tree"] {
+        let sim_output = run_sim(&url, &[scenario, "--scene", "toy", "--steps", "30", "--json"]).await;
+        assert_eq!(sim_output.exit_code, 0, "{}", sim_output.stderr);
+        let report = sim_output.report();
+        assert_eq!((report["steps_sent"].as_u64(), report["rejected"].as_u64()), (Some(30), Some(0)), "{report}");
+    }
+    let steps = server.steps.lock().expect("lock");
+    assert!(steps.iter().any(|step| step.transform_domains.contains(&2)), "expected transforms of the last branch");
+    assert!(!steps.iter().any(|step| step.transform_domains.contains(&3)), "expected no transform of the leaf");
+    // The leaf has the last three vertices.
+    let positions = server.output().positions;
+    assert_ne!(positions[positions.len() - 9..], rest_positions[positions.len() - 9..], "expected the leaf to move");
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn auto_selects_tree_or_sweep_by_scene() {
     let mut server_without_eigenvalues = tree_server();
-    server_without_eigenvalues.domains.iter_mut().for_each(|domain| domain.wire.eigenvalues.clear());
+    server_without_eigenvalues.domains.iter_mut().for_each(|domain| domain.shape.eigenvalues.clear());
     let triangle = vec![-1.0, 0.0, -1.0, 1.0, 2.0, 1.0, 0.0, 1.0, 0.0];
     let rigid_server = FakeServer::new(vec![FakeDomain::new(0, triangle, 0, vec![])]);
     for (server, scenario) in [(tree_server(), "tree"), (server_without_eigenvalues, "sweep"), (rigid_server, "sweep")]

@@ -3,6 +3,8 @@
 
 mod assemble;
 mod client;
+mod content;
+mod description;
 mod error;
 mod frames;
 pub mod npy;
@@ -19,6 +21,7 @@ mod vertex_encoding;
 mod vertices;
 
 pub use client::{Client, REPLY_LIMIT, SceneList, ServerInfo};
+pub use content::ContentHash;
 pub use error::{Error, Reason, Rejection, Result};
 pub use frames::{
     Camera, DrawnBy, Frame, FrameFormat, FrameRequest, FrameStream, FrameStreamRequest, FramesRequest, Lens, Output,
@@ -28,7 +31,10 @@ pub use modalcast_proto::v1;
 pub use modalcast_proto::v1::{Feature, PROTOCOL_VERSION, SceneInfo, StepId};
 pub use pick::{Hit, PickRectangle, PickRequest, PickResult};
 pub use request::{Delivery, StepRequest, StepSelector, Subscription};
-pub use scene::{Attachment, Domain, DomainArray, Follow, ModeRows, SceneDescription};
+pub use scene::{
+    AlphaMode, Attachment, DescriptionRequest, Domain, Follow, Material, MaterialRange, ModeRows, SceneDescription,
+    Shape, ShapeArray, Texture,
+};
 pub use stages::{StageSamples, StageTimes};
 pub use states::{SceneState, StateLayout, StateStream, StateStreamRequest};
 pub use step::{DomainTransform, Step};

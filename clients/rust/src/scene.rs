@@ -1,17 +1,22 @@
-//! Scene descriptions and rows of U. Arrays are assembled from chunks. Their lengths are checked against the counts in
-//! the description.
+//! Scene descriptions: domains, and the shapes, materials and textures that they share; and rows of U.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::PathBuf;
 
 use bytes::Bytes;
 use modalcast_proto::v1;
 
 use crate::assemble::{Assembler, Chunk, decode};
 use crate::client::Client;
+use crate::content::ContentHash;
+use crate::description::DescriptionBuilder;
 use crate::error::{Error, Result, malformed_reply};
 
-/// The arrays of a domain that [`Client::describe`] can fetch.
-pub use modalcast_proto::v1::Array as DomainArray;
+/// The arrays of a shape that [`Client::describe`] can fetch.
+pub use modalcast_proto::v1::Array as ShapeArray;
+
+/// How the alpha of a material is used.
+pub use modalcast_proto::v1::AlphaMode;
 
 /// The attachment of a domain to its parent.
 #[derive(Debug, Clone, PartialEq)]
@@ -32,11 +37,48 @@ pub struct Follow {
     pub leader_from_follower: [f32; 12],
 }
 
-/// One domain: n vertices, r modes, and arrays. Arrays that were not requested are empty.
+/// Consecutive triangles with one material. A range ends where the next one begins.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct MaterialRange {
+    pub first_triangle: usize,
+    /// Index into [`SceneDescription::materials`].
+    pub material: usize,
+}
+
+/// One domain of a scene. Its mesh and modes are those of its shape.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Domain {
+    /// Index in the scene.
     pub index: usize,
     pub name: String,
+    /// Index into [`SceneDescription::shapes`].
+    pub shape: usize,
+    /// r, the number of modes of the shape.
+    pub rank: usize,
+    /// Index into [`SceneDescription::materials`]: the material of all triangles, unless there are ranges.
+    pub material: usize,
+    /// Ranges of triangles with different materials, ascending; empty if all triangles have `material`.
+    pub material_ranges: Vec<MaterialRange>,
+    pub attachment: Option<Attachment>,
+    /// Steps must not contain a transform of a domain that follows another one.
+    pub follow: Option<Follow>,
+    /// `world_from_domain` at rest, row-major 3x4.
+    pub placement: [f32; 12],
+    /// q at rest: r numbers, or none if all are 0.
+    pub rest_q: Vec<f32>,
+    /// Index in the scene of an earlier domain, with which this domain shares its coordinates.
+    pub shares_q_with: Option<usize>,
+    /// (rad/s)^2, one per mode; empty when unknown.
+    pub eigenvalues: Vec<f64>,
+    /// Free-form metadata of the scene's author, by name.
+    pub notes: BTreeMap<String, String>,
+}
+
+/// A mesh of n vertices and its r modes. Arrays that were not requested are empty.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Shape {
+    /// Index in the scene.
+    pub index: usize,
     /// n, the number of vertices: U has 3n rows.
     pub vertex_count: usize,
     /// r, the number of modes: U has r columns.
@@ -45,19 +87,8 @@ pub struct Domain {
     /// several corners.
     pub corner_count: usize,
     pub triangle_count: usize,
-    pub attachment: Option<Attachment>,
-    /// Steps must not contain a transform of a domain that follows another one.
-    pub follow: Option<Follow>,
-    /// `world_from_domain` at rest, row-major 3x4.
-    pub placement: [f32; 12],
-    /// A domain with a smaller index, with which this domain shares its coordinates.
-    pub shares_q_with: Option<usize>,
-    /// Identifies the mesh and U; instances of one shape have the same value.
-    pub shape: usize,
-    /// (rad/s)^2, one per mode; empty when unknown.
-    pub eigenvalues: Vec<f64>,
-    /// Free-form metadata of the scene's author, by name.
-    pub notes: BTreeMap<String, String>,
+    /// Hashes of the arrays, if hashes were requested.
+    pub hashes: Vec<(ShapeArray, ContentHash)>,
     /// Corner indices, three per triangle.
     pub indices: Vec<u32>,
     /// Vertex of each corner. Vertex v has the rows 3v, 3v + 1 and 3v + 2 of U.
@@ -68,13 +99,113 @@ pub struct Domain {
     pub uvs: Vec<f32>,
     /// Three numbers per corner, in the frame of the domain.
     pub rest_normals: Vec<f32>,
+    /// U: 3n x r entries, row-major.
+    pub modes: Vec<f32>,
 }
 
-/// A scene and its domains.
+/// A Phong material. Colors are linear.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Material {
+    /// Index in the scene.
+    pub index: usize,
+    pub name: String,
+    pub ambient: [f32; 3],
+    pub diffuse: [f32; 3],
+    pub specular: [f32; 3],
+    /// Phong exponent.
+    pub shininess: f32,
+    pub alpha: f32,
+    pub alpha_mode: AlphaMode,
+    /// With [`AlphaMode::Mask`], fragments with a smaller alpha are not drawn.
+    pub alpha_cutoff: f32,
+    pub double_sided: bool,
+    /// Index into [`SceneDescription::textures`]: sRGB colors that multiply ambient and diffuse, and alpha.
+    pub color_texture: Option<usize>,
+    /// Index into [`SceneDescription::textures`]: a tangent-space normal map with linear values.
+    pub normal_texture: Option<usize>,
+}
+
+/// An image of RGBA8 pixels.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Texture {
+    /// Index in the scene.
+    pub index: usize,
+    pub name: String,
+    pub width: u32,
+    pub height: u32,
+    /// Hash of the pixels, if hashes were requested.
+    pub hash: Option<ContentHash>,
+    /// Four bytes per pixel, top row first; empty unless [`DescriptionRequest::textures`] was set.
+    pub pixels: Bytes,
+}
+
+/// A scene, and the shapes, materials and textures of the described domains, each once.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SceneDescription {
     pub info: v1::SceneInfo,
+    pub shapes: Vec<Shape>,
+    pub materials: Vec<Material>,
+    pub textures: Vec<Texture>,
     pub domains: Vec<Domain>,
+}
+
+impl SceneDescription {
+    /// The shape of a domain of this description.
+    pub fn shape_of(&self, domain: &Domain) -> &Shape {
+        &self.shapes[domain.shape]
+    }
+}
+
+/// What [`Client::describe_with`] fetches.
+#[derive(Debug, Clone, PartialEq)]
+pub struct DescriptionRequest {
+    scene: String,
+    domains: Vec<u32>,
+    arrays: Vec<ShapeArray>,
+    hashes: bool,
+    textures: bool,
+    cache: Option<PathBuf>,
+}
+
+impl DescriptionRequest {
+    /// All domains of a scene, without arrays.
+    pub fn new(scene: &str) -> Self {
+        let (domains, arrays) = (vec![], vec![]);
+        Self { scene: scene.to_owned(), domains, arrays, hashes: false, textures: false, cache: None }
+    }
+
+    /// Selects domains by their indices; an empty list selects all.
+    #[must_use]
+    pub fn domains(self, domains: &[u32]) -> Self {
+        Self { domains: domains.to_vec(), ..self }
+    }
+
+    /// Fetches arrays of each shape.
+    #[must_use]
+    pub fn arrays(self, arrays: &[ShapeArray]) -> Self {
+        Self { arrays: arrays.to_vec(), ..self }
+    }
+
+    /// Fetches the hashes of all arrays and textures, for [`Client::read_content`].
+    #[must_use]
+    pub const fn hashes(mut self) -> Self {
+        self.hashes = true;
+        self
+    }
+
+    /// Fetches the pixels of the textures.
+    #[must_use]
+    pub const fn textures(mut self) -> Self {
+        self.textures = true;
+        self
+    }
+
+    /// Stores arrays and pixels as files in `folder`, one per SHA-256, and reads those that are already there instead
+    /// of fetching them. Nothing removes files from the folder; the caller may do so at any time.
+    #[must_use]
+    pub fn cache(self, folder: impl Into<PathBuf>) -> Self {
+        Self { cache: Some(folder.into()), ..self }
+    }
 }
 
 /// Selected rows of U: three rows of r entries for each requested vertex.
@@ -95,35 +226,68 @@ impl ModeRows {
 }
 
 impl Client {
-    /// Gets the description of all domains of a scene, with the requested arrays.
+    /// Gets the description of all domains of a scene, with the requested arrays of their shapes.
     ///
     /// # Errors
     /// `Status` if the scene does not exist; `Malformed` if lengths and counts contradict each other.
-    pub async fn describe(&self, scene: &str, arrays: &[DomainArray]) -> Result<SceneDescription> {
-        self.describe_domains(scene, &[], arrays).await
+    pub async fn describe(&self, scene: &str, arrays: &[ShapeArray]) -> Result<SceneDescription> {
+        self.describe_with(&DescriptionRequest::new(scene).arrays(arrays)).await
     }
 
-    /// As [`Self::describe`], for selected domain indices; an empty list selects all.
+    /// As [`Self::describe`], with a selection of domains, hashes, textures or a cache.
     ///
     /// # Errors
-    /// As [`Self::describe`].
-    pub async fn describe_domains(
-        &self,
-        scene: &str,
-        domains: &[u32],
-        arrays: &[DomainArray],
-    ) -> Result<SceneDescription> {
-        let request = v1::DescribeSceneRequest {
-            scene: scene.to_owned(),
-            domains: domains.to_vec(),
-            arrays: arrays.iter().map(|array| *array as i32).collect(),
+    /// As [`Self::describe`]; `File` if the cache cannot be written.
+    pub async fn describe_with(&self, request: &DescriptionRequest) -> Result<SceneDescription> {
+        // With a cache, arrays are fetched by their hashes. Pixels always are.
+        let arrays_in_reply = if request.cache.is_some() { &[][..] } else { &request.arrays };
+        let wire_request = v1::DescribeSceneRequest {
+            scene: request.scene.clone(),
+            domains: request.domains.clone(),
+            arrays: arrays_in_reply.iter().map(|array| *array as i32).collect(),
+            hashes: request.hashes || request.textures || request.cache.is_some(),
         };
-        let mut messages = self.replies(self.scenes().describe_scene(request).await)?;
+        let mut messages = self.replies(self.scenes().describe_scene(wire_request).await)?;
         let mut builder = DescriptionBuilder::new(self.max_reply_bytes);
         while let Some(message) = messages.next().await? {
             builder.add_message(message)?;
         }
-        builder.finish(arrays)
+        let mut description = builder.finish()?;
+        self.fetch_description_contents(request, &mut description).await?;
+        description.check_arrays(&request.arrays)?;
+        Ok(description)
+    }
+
+    /// Fetches the arrays and pixels of a description that the reply did not contain.
+    async fn fetch_description_contents(
+        &self,
+        request: &DescriptionRequest,
+        description: &mut SceneDescription,
+    ) -> Result<()> {
+        let arrays = if request.cache.is_some() { &request.arrays[..] } else { &[] };
+        if arrays.is_empty() && !request.textures {
+            return Ok(());
+        }
+        let textures = if request.textures { &mut description.textures[..] } else { &mut [] };
+        let mut hashes: BTreeSet<ContentHash> = textures.iter().filter_map(|texture| texture.hash).collect();
+        for shape in &description.shapes {
+            hashes.extend(arrays.iter().filter_map(|array| shape.hash_of(*array)));
+        }
+        let contents = self.fetch_contents(&request.scene, hashes, request.cache.as_deref()).await?;
+        let content = |hash: Option<ContentHash>| {
+            let bytes = hash.and_then(|hash| contents.get(&hash)).cloned();
+            bytes.ok_or_else(|| malformed_reply("describe.sha256", "32 bytes", "none"))
+        };
+        for texture in textures {
+            texture.pixels = content(texture.hash)?;
+        }
+        for shape in &mut description.shapes {
+            for array in arrays {
+                let bytes = content(shape.hash_of(*array))?;
+                shape.set_array(*array, &bytes)?;
+            }
+        }
+        Ok(())
     }
 
     /// Gets the rows of U of selected vertices of a domain; an empty list selects all.
@@ -161,187 +325,4 @@ impl Client {
         }
         Ok(ModeRows { rank: rank as usize, rows: decode("modes.data", &bytes)? })
     }
-}
-
-/// Identifies an array of a description.
-#[derive(Clone, Copy, PartialEq)]
-struct ArrayKey {
-    domain: u32,
-    /// A value of [`DomainArray`], or an unknown number.
-    array: i32,
-}
-
-impl std::fmt::Display for ArrayKey {
-    fn fmt(&self, out: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        match DomainArray::try_from(self.array) {
-            Ok(array) => write!(out, "{} of domain {}", array.as_str_name(), self.domain),
-            Err(_) => write!(out, "array {} of domain {}", self.array, self.domain),
-        }
-    }
-}
-
-/// An array whose last chunk has not been received.
-struct PartialArray {
-    key: ArrayKey,
-    assembler: Assembler<()>,
-}
-
-/// Assembles a description from its messages.
-struct DescriptionBuilder {
-    /// Maximum size of all arrays together, in bytes.
-    limit: u64,
-    received_bytes: u64,
-    info: Option<v1::SceneInfo>,
-    domains: Vec<Domain>,
-    /// From a domain's index in the scene to its index in `domains`.
-    domain_ordinals: BTreeMap<u32, usize>,
-    partial_array: Option<PartialArray>,
-}
-
-impl DescriptionBuilder {
-    const fn new(limit: u64) -> Self {
-        let domain_ordinals = BTreeMap::new();
-        Self { limit, received_bytes: 0, info: None, domains: vec![], domain_ordinals, partial_array: None }
-    }
-
-    fn add_message(&mut self, message: v1::DescribeSceneResponse) -> Result<()> {
-        use v1::describe_scene_response::Part;
-        match message.part {
-            Some(Part::Scene(info)) => self.info = Some(info),
-            Some(Part::Domains(list)) => {
-                for wire in list.domains {
-                    self.domain_ordinals.insert(wire.domain, self.domains.len());
-                    self.domains.push(decode_domain(wire)?);
-                }
-            }
-            Some(Part::Chunk(chunk)) => self.add_chunk(chunk)?,
-            None => return Err(malformed_reply("describe.part", "a part", "none")),
-        }
-        Ok(())
-    }
-
-    /// Adds a chunk of an array. The chunks of one array are consecutive.
-    fn add_chunk(&mut self, chunk: v1::ArrayChunk) -> Result<()> {
-        let key = ArrayKey { domain: chunk.domain, array: chunk.array };
-        let mut assembler = match self.partial_array.take() {
-            Some(partial) if partial.key == key => partial.assembler,
-            Some(partial) => {
-                return Err(malformed_reply("describe.chunk", format!("the next chunk of {}", partial.key), key));
-            }
-            None => Assembler::new("describe.chunk", self.limit),
-        };
-        let head = (!assembler.is_open()).then_some(((), chunk.total));
-        match assembler.push(Chunk { head, offset: chunk.offset, data: chunk.data })? {
-            None => self.partial_array = Some(PartialArray { key, assembler }),
-            Some(((), bytes)) => self.store_array(key, &bytes)?,
-        }
-        Ok(())
-    }
-
-    fn store_array(&mut self, key: ArrayKey, bytes: &[u8]) -> Result<()> {
-        const FIELD: &str = "describe.chunk.data";
-        self.received_bytes = self.received_bytes.saturating_add(bytes.len() as u64);
-        if self.received_bytes > self.limit {
-            let expected = format!("at most {} bytes of arrays", self.limit);
-            return Err(malformed_reply("describe.chunk", expected, self.received_bytes));
-        }
-        let ordinal = self.domain_ordinals.get(&key.domain);
-        let Some(domain) = ordinal.and_then(|ordinal| self.domains.get_mut(*ordinal)) else {
-            return Err(malformed_reply("describe.chunk.domain", "a domain described before", key.domain));
-        };
-        match DomainArray::try_from(key.array) {
-            Ok(DomainArray::Indices) => domain.indices = decode(FIELD, bytes)?,
-            Ok(DomainArray::CornerVertices) => domain.corner_vertices = decode(FIELD, bytes)?,
-            Ok(DomainArray::RestPositions) => domain.rest_positions = decode(FIELD, bytes)?,
-            Ok(DomainArray::Uvs) => domain.uvs = decode(FIELD, bytes)?,
-            Ok(DomainArray::RestNormals) => domain.rest_normals = decode(FIELD, bytes)?,
-            _ => return Err(malformed_reply("describe.chunk.array", "a known array", key.array)),
-        }
-        Ok(())
-    }
-
-    fn finish(self, arrays: &[DomainArray]) -> Result<SceneDescription> {
-        if self.partial_array.is_some() {
-            return Err(Error::StreamEnded { awaited_reply: "the last chunk of an array" });
-        }
-        let info = self.info.ok_or_else(|| malformed_reply("describe.scene", "a scene", "none"))?;
-        for domain in &self.domains {
-            for array in arrays {
-                domain.check_array(*array)?;
-            }
-        }
-        Ok(SceneDescription { info, domains: self.domains })
-    }
-}
-
-impl Domain {
-    /// Checks that a requested array has the length given by the counts, and that its indices are within range.
-    fn check_array(&self, array: DomainArray) -> Result<()> {
-        let (length, expected_length) = match array {
-            DomainArray::Indices => (self.indices.len(), 3 * self.triangle_count),
-            DomainArray::CornerVertices => (self.corner_vertices.len(), self.corner_count),
-            DomainArray::RestPositions => (self.rest_positions.len(), 3 * self.vertex_count),
-            DomainArray::RestNormals => (self.rest_normals.len(), 3 * self.corner_count),
-            // Texture coordinates are optional.
-            DomainArray::Uvs if self.uvs.is_empty() => (0, 0),
-            DomainArray::Uvs => (self.uvs.len(), 2 * self.corner_count),
-            DomainArray::Unspecified => (0, 0),
-        };
-        let field = |name: &str| format!("domain '{}': {name}", self.name);
-        if length != expected_length {
-            return Err(malformed_reply(field(array.as_str_name()), format!("{expected_length} numbers"), length));
-        }
-        for (name, indices, limit) in [
-            ("indices", &self.indices, self.corner_count),
-            ("corner_vertices", &self.corner_vertices, self.vertex_count),
-        ] {
-            if let Some(index) = indices.iter().find(|index| **index as usize >= limit) {
-                return Err(malformed_reply(field(name), format!("indices below {limit}"), index));
-            }
-        }
-        Ok(())
-    }
-}
-
-/// Converts a domain from its wire format.
-fn decode_domain(wire: v1::DomainDescription) -> Result<Domain> {
-    let decode_transform = |field: &str, bytes: &[u8]| {
-        let error = |_| malformed_reply(format!("domain '{}': {field}", wire.name), "48 bytes", bytes.len());
-        bytemuck::try_pod_read_unaligned::<[f32; 12]>(bytes).map_err(error)
-    };
-    let attachment = match wire.parent {
-        None => None,
-        Some(parent) => Some(Attachment {
-            parent: parent as usize,
-            parent_from_child: decode_transform("attachment_frame", &wire.attachment_frame)?,
-            parent_vertices: wire.attachment_vertices.clone(),
-        }),
-    };
-    let follow = match wire.follows {
-        None => None,
-        Some(leader) => Some(Follow {
-            leader: leader as usize,
-            leader_from_follower: decode_transform("follow_frame", &wire.follow_frame)?,
-        }),
-    };
-    if !wire.eigenvalues.is_empty() && wire.eigenvalues.len() != wire.rank as usize {
-        let field = format!("domain '{}': eigenvalues", wire.name);
-        return Err(malformed_reply(field, format!("none or {}", wire.rank), wire.eigenvalues.len()));
-    }
-    Ok(Domain {
-        index: wire.domain as usize,
-        placement: decode_transform("placement", &wire.placement)?,
-        attachment,
-        follow,
-        vertex_count: wire.vertices as usize,
-        rank: wire.rank as usize,
-        corner_count: wire.corners as usize,
-        triangle_count: wire.triangles as usize,
-        shares_q_with: wire.shares_q_with.map(|owner| owner as usize),
-        shape: wire.shape as usize,
-        name: wire.name,
-        eigenvalues: wire.eigenvalues,
-        notes: wire.notes.into_iter().collect(),
-        ..Domain::default()
-    })
 }

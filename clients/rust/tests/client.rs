@@ -7,8 +7,8 @@ use std::time::Duration;
 
 use fake::{FakeDomain, FakeServer, serve};
 use modalcast_client::{
-    Client, Delivery, DomainArray, DrawnBy, DriveRequest, Error, Feature, FrameFormat, FrameRequest,
-    FrameStreamRequest, Picture, Step, v1,
+    Client, Delivery, DrawnBy, DriveRequest, Error, Feature, FrameFormat, FrameRequest, FrameStreamRequest, Picture,
+    ShapeArray, Step, v1,
 };
 use modalcast_client::{VertexRequest, VertexSelection, VertexStreamRequest};
 use tokio::sync::Semaphore;
@@ -34,12 +34,13 @@ async fn connect(server: FakeServer) -> (Arc<FakeServer>, Client) {
 async fn arrays_and_modes_above_4_mib_arrive_complete() {
     let (server, client) = connect(one_domain_server(300_000)).await;
     let description = client
-        .describe("toy", &[DomainArray::RestPositions, DomainArray::Indices, DomainArray::Uvs])
+        .describe("toy", &[ShapeArray::RestPositions, ShapeArray::Indices, ShapeArray::Uvs, ShapeArray::Modes])
         .await
         .expect("a description");
-    assert_eq!(description.domains[0].rest_positions, server.domains[0].rest_positions);
-    assert_eq!(description.domains[0].indices.len(), 3 * description.domains[0].triangle_count);
-    assert!(description.domains[0].uvs.is_empty());
+    let shape = description.shape_of(&description.domains[0]);
+    assert_eq!((&shape.rest_positions, &shape.modes), (&server.domains[0].rest_positions, &server.domains[0].modes));
+    assert_eq!(shape.indices.len(), 3 * shape.triangle_count);
+    assert!(shape.uvs.is_empty());
     let rows = client.read_modes("toy", 0, &[]).await.expect("rows of U");
     assert_eq!((rows.rank, &rows.rows), (2, &server.domains[0].modes));
     // A vertex has three rows of two entries.

@@ -5,7 +5,7 @@ use std::sync::{Arc, OnceLock};
 use std::time::Instant;
 
 use tokio::sync::mpsc::error::TrySendError;
-use tokio::sync::{Notify, mpsc, oneshot, watch};
+use tokio::sync::{Notify, OnceCell, mpsc, oneshot, watch};
 
 use super::actor::{ActorParams, SceneActor, SceneServices};
 use super::delivery::StreamDelivery;
@@ -13,6 +13,8 @@ use super::lease::{AcquiredLease, LeaseRequest, LeaseToken, WriterLease};
 use super::message::{Message, StepRequest, StepSelector};
 use super::step_queue::{QueuedStep, StepReport};
 use super::subscriber::Subscription;
+use crate::engine::blocking::run_blocking;
+use crate::engine::content::ContentHashes;
 use crate::engine::device::command::SceneId;
 use crate::engine::output::step_output::{OutputSpec, StepId, StepOutput};
 use crate::engine::storage::scene_catalog::SceneProvenance;
@@ -42,6 +44,8 @@ pub struct SceneHandle {
     is_stopping: AtomicBool,
     /// The error with which the scene has failed.
     failure: Arc<OnceLock<Error>>,
+    /// Computed when a client first asks for them.
+    content_hashes: OnceCell<Arc<ContentHashes>>,
 }
 
 /// Arguments of [`SceneHandle::open`].
@@ -106,7 +110,21 @@ impl SceneHandle {
             wake,
             is_stopping,
             failure,
+            content_hashes: OnceCell::new(),
         })
+    }
+
+    /// The hashes of the scene's arrays and textures. The first call computes them on the blocking pool; later and
+    /// concurrent calls share the result.
+    ///
+    /// # Errors
+    /// `Fault` when the computation panics.
+    pub async fn content_hashes(&self) -> Result<Arc<ContentHashes>> {
+        let compute = || {
+            let scene = Arc::clone(&self.scene);
+            run_blocking("hash", move || Ok(Arc::new(ContentHashes::of_scene(&scene))))
+        };
+        self.content_hashes.get_or_try_init(compute).await.cloned()
     }
 
     /// The last completed step, if there is one.

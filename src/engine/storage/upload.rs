@@ -12,6 +12,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use sha2::{Digest as _, Sha256};
 use tokio::sync::OwnedSemaphorePermit;
 
+use crate::engine::content::hex;
 use modalcast_model::error::{Result, fault, fault_in, invalid};
 
 /// Limit on the length of a path in bytes.
@@ -227,10 +228,6 @@ fn validate_path(field: &str, path: &str) -> Result<()> {
         return Err(invalid(field, expected, format!("{path:?}")));
     }
     Ok(())
-}
-
-fn hex(bytes: &[u8]) -> String {
-    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
 #[cfg(test)]

@@ -46,9 +46,12 @@ use crate::error::{Result, invalid};
 /// The largest number of domains in a scene.
 pub const MAX_DOMAINS: usize = 1 << 20;
 
-/// The largest size of a domain's name. With [`MAX_NOTES_BYTES`] and [`MAX_ATTACHMENT_VERTICES`], it keeps the description
-/// of a domain within one gRPC message.
+/// The largest size of the name of a domain, a material or a texture. With [`MAX_NOTES_BYTES`],
+/// [`MAX_MATERIAL_RANGES`] and [`MAX_ATTACHMENT_VERTICES`], it keeps each description within one gRPC message.
 const MAX_NAME_BYTES: usize = 4 << 10;
+
+/// The largest number of material ranges of a domain.
+const MAX_MATERIAL_RANGES: usize = 65_536;
 
 /// The largest size of all notes of a domain together, names included.
 const MAX_NOTES_BYTES: usize = 64 << 10;
@@ -138,6 +141,7 @@ impl Scene {
             return Err(invalid("scene.origin", "finite numbers", format!("{:?}", parts.origin)));
         }
         parts.materials = parts.materials.into_iter().map(Material::validated).collect::<Result<_>>()?;
+        check_names(&parts)?;
         check_textures(&parts)?;
         for index in 0..parts.domains.len() {
             check_domain(&parts, index).map_err(|error| error.prefix_field(&format!("domain {index}")))?;
@@ -204,6 +208,19 @@ impl Scene {
             }
         }
         bounds
+    }
+}
+
+/// Limits the sizes of the names of materials and textures.
+fn check_names(parts: &SceneParts) -> Result<()> {
+    let materials = parts.materials.iter().map(|material| ("material", &material.name));
+    let textures = parts.textures.iter().map(|texture| ("texture", &texture.name));
+    match materials.chain(textures).find(|(_, name)| name.len() > MAX_NAME_BYTES) {
+        None => Ok(()),
+        Some((kind, name)) => {
+            let expected = format!("at most {MAX_NAME_BYTES} bytes");
+            Err(invalid(format!("{kind}: name"), expected, format!("{} bytes", name.len())))
+        }
     }
 }
 
@@ -277,6 +294,10 @@ fn check_text_sizes(domain: &Domain) -> Result<()> {
 }
 
 fn check_material_ranges(parts: &SceneParts, domain: &Domain) -> Result<()> {
+    if domain.material_ranges.len() > MAX_MATERIAL_RANGES {
+        let expected = format!("at most {MAX_MATERIAL_RANGES} ranges");
+        return Err(invalid("material_ranges", expected, domain.material_ranges.len()));
+    }
     let triangle_count = parts.shapes[domain.shape].mesh.triangles().len();
     for (index, range) in domain.material_ranges.iter().enumerate() {
         let previous_start = index.checked_sub(1).map(|previous| domain.material_ranges[previous].first_triangle);

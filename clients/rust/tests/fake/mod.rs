@@ -12,10 +12,12 @@ use tonic_types::{ErrorDetails, StatusExt as _};
 
 pub(crate) use serve::serve;
 
-/// One domain: its description, rest positions (3 per vertex) and U (3n x r, row-major).
+/// One domain and its shape, which no other domain has: their descriptions, rest positions (3 per vertex) and U (3n x r,
+/// row-major).
 #[derive(Debug, Clone, Default)]
 pub(crate) struct FakeDomain {
     pub(crate) wire: v1::DomainDescription,
+    pub(crate) shape: v1::ShapeDescription,
     pub(crate) rest_positions: Vec<f32>,
     pub(crate) modes: Vec<f32>,
     pub(crate) indices: Vec<u32>,
@@ -32,18 +34,22 @@ impl FakeDomain {
         // A triangle strip: triangle i has the corners i, i + 1 and i + 2.
         let indices: Vec<u32> =
             (0..vertices.saturating_sub(2)).flat_map(|first_vertex| first_vertex..first_vertex + 3).collect();
-        let wire = v1::DomainDescription {
-            domain: index,
-            name: format!("domain {index}"),
+        let shape = v1::ShapeDescription {
+            shape: index,
             vertices,
             rank,
             corners: vertices,
             triangles: (indices.len() / 3) as u32,
-            placement: pack(&IDENTITY).into(),
-            shape: index,
             ..Default::default()
         };
-        Self { wire, rest_positions, modes, indices }
+        let wire = v1::DomainDescription {
+            domain: index,
+            name: format!("domain {index}"),
+            shape: index,
+            placement: pack(&IDENTITY).into(),
+            ..Default::default()
+        };
+        Self { wire, shape, rest_positions, modes, indices }
     }
 
     /// World positions T (x0 + U q); `transform` is T, row-major 3x4.
@@ -101,12 +107,12 @@ struct State {
 
 impl FakeServer {
     pub(crate) fn new(domains: Vec<FakeDomain>) -> Self {
-        let q = domains.iter().map(|domain| vec![0.0; domain.wire.rank as usize]).collect();
+        let q = domains.iter().map(|domain| vec![0.0; domain.shape.rank as usize]).collect();
         let transforms = domains.iter().map(|domain| decode_f32(&domain.wire.placement)).collect();
         let positions: Vec<f32> = domains
             .iter()
             .flat_map(|domain| {
-                domain.positions(&vec![0.0; domain.wire.rank as usize], &decode_f32(&domain.wire.placement))
+                domain.positions(&vec![0.0; domain.shape.rank as usize], &decode_f32(&domain.wire.placement))
             })
             .collect();
         let mut bounds = [f64::MAX, f64::MAX, f64::MAX, f64::MIN, f64::MIN, f64::MIN];
@@ -129,17 +135,16 @@ impl FakeServer {
     }
 
     pub(crate) fn info(&self) -> v1::SceneInfo {
-        let sum = |count: fn(&v1::DomainDescription) -> u32| {
-            self.domains.iter().map(|domain| u64::from(count(&domain.wire))).sum::<u64>()
-        };
+        let sum =
+            |count: fn(&FakeDomain) -> u32| self.domains.iter().map(|domain| u64::from(count(domain))).sum::<u64>();
         v1::SceneInfo {
             scene: "toy".into(),
             source: "toy".into(),
             domains: self.domains.len() as u32,
-            vertices: sum(|wire| wire.vertices),
-            corners: sum(|wire| wire.corners),
-            triangles: sum(|wire| wire.triangles),
-            coordinates: sum(|wire| if wire.shares_q_with.is_some() { 0 } else { wire.rank }),
+            vertices: sum(|domain| domain.shape.vertices),
+            corners: sum(|domain| domain.shape.corners),
+            triangles: sum(|domain| domain.shape.triangles),
+            coordinates: sum(|domain| if domain.wire.shares_q_with.is_some() { 0 } else { domain.shape.rank }),
             up: "y".into(),
             unit: 1.0,
             origin: vec![0.0; 3],
@@ -166,7 +171,7 @@ impl FakeServer {
 
     /// Applies a step atomically, or returns the rejection.
     fn apply(&self, step: &v1::Step) -> Result<(), v1::Rejection> {
-        let reject = |field, expected: String, given| Err(rejection(Some(step.number), field, expected, given));
+        let reject = |field, expected: String, given: String| Err(rejection(Some(step.number), field, expected, given));
         let q_bytes = 4 * step.q_domains.iter().map(|index| self.rank(*index)).sum::<usize>();
         if step.q.len() != q_bytes {
             return reject("step.q", format!("{q_bytes} bytes"), format!("{} bytes", step.q.len()));
@@ -179,6 +184,10 @@ impl FakeServer {
                 format!("{transform_bytes} bytes"),
                 format!("{} bytes", step.transforms.len()),
             );
+        }
+        let is_follower = |index: &&u32| self.domains[**index as usize].wire.follows.is_some();
+        if let Some(follower) = step.transform_domains.iter().find(is_follower) {
+            return reject("step.transform_domains", "domains that follow no other".into(), follower.to_string());
         }
         let (q, transforms) = (decode_f32(&step.q), decode_f32(&step.transforms));
         if !q.iter().chain(&transforms).all(|number| number.is_finite()) {
@@ -203,7 +212,7 @@ impl FakeServer {
     }
 
     fn rank(&self, domain: u32) -> usize {
-        self.domains[domain as usize].wire.rank as usize
+        self.domains[domain as usize].shape.rank as usize
     }
 
     /// The state after the last step.
@@ -213,8 +222,14 @@ impl FakeServer {
             let owner = self.domains[index].wire.shares_q_with.map_or(index, |owner| owner as usize);
             &state.q[owner]
         };
+        let mut transforms = state.transforms.clone();
+        for (index, domain) in self.domains.iter().enumerate() {
+            if let Some(leader) = domain.wire.follows {
+                transforms[index] = compose(&transforms[leader as usize], &decode_f32(&domain.wire.follow_frame));
+            }
+        }
         let domains = self.domains.iter().enumerate();
-        let positions = domains.flat_map(|(index, domain)| domain.positions(q(index), &state.transforms[index]));
+        let positions = domains.flat_map(|(index, domain)| domain.positions(q(index), &transforms[index]));
         StepOutput { step: state.last_step.unwrap_or_default(), positions: positions.collect() }
     }
 }
@@ -236,6 +251,16 @@ fn rejection_status(code: tonic::Code, rejection: &v1::Rejection) -> Status {
     let mut details = ErrorDetails::with_error_info(rejection.reason().as_str_name(), "modalcast", metadata);
     details.add_bad_request_violation(rejection.field.clone(), "invalid");
     Status::with_error_details(code, format!("{}: {}", rejection.field, rejection.given), details)
+}
+
+/// The product of two affine transforms, row-major 3x4.
+pub(crate) fn compose(a: &[f32], b: &[f32]) -> Vec<f32> {
+    let entry = |index: usize| {
+        let (row, column) = (index / 4, index % 4);
+        let sum: f32 = (0..3).map(|k| a[4 * row + k] * b[4 * k + column]).sum();
+        sum + if column == 3 { a[4 * row + 3] } else { 0.0 }
+    };
+    (0..12).map(entry).collect()
 }
 
 /// Decodes little-endian f32 at any alignment.

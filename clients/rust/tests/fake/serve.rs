@@ -142,24 +142,46 @@ impl SceneService for FakeService {
         let request = request.into_inner();
         self.check_scene(&request.scene)?;
         let mut parts = vec![Part::Scene(self.0.info())];
+        // Every domain has the default material 0.
+        let color = || vec![1.0; 3];
+        let material = v1::MaterialDescription {
+            name: "white".into(),
+            ambient: color(),
+            diffuse: color(),
+            specular: color(),
+            ..Default::default()
+        };
+        parts.push(Part::Materials(v1::MaterialDescriptions { materials: vec![material] }));
         for domain in &self.0.domains {
+            parts.push(Part::Shapes(v1::ShapeDescriptions { shapes: vec![domain.shape.clone()] }));
             parts.push(Part::Domains(v1::DomainDescriptions { domains: vec![domain.wire.clone()] }));
         }
         for domain in &self.0.domains {
             for array in &request.arrays {
                 let bytes = match v1::Array::try_from(*array) {
                     Ok(v1::Array::Indices) => pack(&domain.indices),
-                    Ok(v1::Array::CornerVertices) => pack(&(0..domain.wire.vertices).collect::<Vec<_>>()),
+                    Ok(v1::Array::CornerVertices) => pack(&(0..domain.shape.vertices).collect::<Vec<_>>()),
                     Ok(v1::Array::RestPositions) => pack(&domain.rest_positions),
+                    Ok(v1::Array::Modes) => pack(&domain.modes),
                     _ => vec![],
                 };
                 for ByteChunk { offset, total, data } in split_bytes(bytes) {
-                    let (domain, array) = (domain.wire.domain, *array);
-                    parts.push(Part::Chunk(v1::ArrayChunk { domain, array, offset, total, data }));
+                    let (shape, array) = (domain.shape.shape, *array);
+                    parts.push(Part::Chunk(v1::ArrayChunk { shape, array, offset, total, data }));
                 }
             }
         }
         Ok(stream_messages(parts.into_iter().map(|part| v1::DescribeSceneResponse { part: Some(part) }).collect()))
+    }
+
+    type ReadContentStream = ResponseStream<v1::ReadContentResponse>;
+
+    /// The fake server computes no hashes.
+    async fn read_content(
+        &self,
+        _: Request<v1::ReadContentRequest>,
+    ) -> Result<Response<Self::ReadContentStream>, Status> {
+        Err(Status::unimplemented("read_content"))
     }
 
     type ReadModesStream = ResponseStream<v1::ReadModesResponse>;
@@ -171,14 +193,14 @@ impl SceneService for FakeService {
         let request = request.into_inner();
         self.check_scene(&request.scene)?;
         let domain = &self.0.domains[request.domain as usize];
-        let entries_per_vertex = 3 * domain.wire.rank as usize;
-        let all_vertices: Vec<u32> = (0..domain.wire.vertices).collect();
+        let entries_per_vertex = 3 * domain.shape.rank as usize;
+        let all_vertices: Vec<u32> = (0..domain.shape.vertices).collect();
         let vertices = if request.vertices.is_empty() { all_vertices } else { request.vertices };
         let mut bytes = vec![];
         for vertex in vertices {
             bytes.extend(pack(&domain.modes[entries_per_vertex * vertex as usize..][..entries_per_vertex]));
         }
-        let rank = domain.wire.rank;
+        let rank = domain.shape.rank;
         let message = |ByteChunk { offset, total, data }| v1::ReadModesResponse { rank, offset, total, data };
         Ok(stream_messages(split_bytes(bytes).into_iter().map(message).collect()))
     }
@@ -345,8 +367,8 @@ impl FakeService {
     fn vertex_layout(&self) -> v1::VertexLayout {
         v1::VertexLayout {
             domains: (0..self.0.domains.len() as u32).collect(),
-            vertices: self.0.domains.iter().map(|domain| domain.wire.vertices).collect(),
-            corners: self.0.domains.iter().map(|domain| domain.wire.corners).collect(),
+            vertices: self.0.domains.iter().map(|domain| domain.shape.vertices).collect(),
+            corners: self.0.domains.iter().map(|domain| domain.shape.corners).collect(),
             has_more: false,
         }
     }
