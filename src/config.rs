@@ -66,7 +66,7 @@ pub struct Config {
     pub deadline: Duration,
     /// Largest deadline of a single request.
     pub max_deadline: Duration,
-    /// Limit on the frame and vertex streams of one scene.
+    /// Limit on the frame, vertex and state streams of one scene.
     pub max_subscribers: usize,
     /// Limit on the single requests that wait for a step of one scene.
     pub max_pending_requests: usize,

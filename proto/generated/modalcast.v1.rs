@@ -3650,7 +3650,9 @@ pub struct StreamStatesRequest {
     /// has had a step.
     #[prost(enumeration = "Delivery", tag = "2")]
     pub delivery: i32,
-    /// The largest number of states per second, 0.001 to 1000; 0: no limit. Must be 0 with DELIVERY_LOSSLESS.
+    /// Maximum number of states per second, finite and above 0; 0: no limit. The states that are sent are the newest ones,
+    /// and the steps in between are skipped and counted. After a wait for a step, two states may follow each other faster.
+    /// Only with DELIVERY_LATEST: DELIVERY_LOSSLESS sends every step, so a limit is rejected.
     #[prost(double, tag = "3")]
     pub max_hz: f64,
     /// Number of states after which the stream ends; 0: no limit.
@@ -4194,6 +4196,508 @@ pub mod state_service_server {
     /// Generated gRPC service name
     pub const SERVICE_NAME: &str = "modalcast.v1.StateService";
     impl<T> tonic::server::NamedService for StateServiceServer<T> {
+        const NAME: &'static str = SERVICE_NAME;
+    }
+}
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct ApplyForcesRequest {
+    #[prost(string, tag = "1")]
+    pub scene: ::prost::alloc::string::String,
+    /// A token of 16 to 64 random bytes that the client keeps. It identifies the owner of the forces across calls and
+    /// connections. The server does not show it to others, so that nobody else can change the forces.
+    #[prost(bytes = "bytes", tag = "2")]
+    pub owner: ::prost::bytes::Bytes,
+    /// All forces of the owner, at most 16.
+    #[prost(message, repeated, tag = "3")]
+    pub forces: ::prost::alloc::vec::Vec<Force>,
+    /// Time in milliseconds after which the forces expire, at most 10000; 0: 500.
+    #[prost(uint32, tag = "4")]
+    pub lifetime_ms: u32,
+}
+#[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct ApplyForcesResponse {
+    /// The number that stands for the owner in StreamForces; 0 if the owner has no forces. A client that had no forces
+    /// gets a new number.
+    #[prost(uint64, tag = "1")]
+    pub owner: u64,
+    /// The lifetime in effect in milliseconds.
+    #[prost(uint32, tag = "2")]
+    pub lifetime_ms: u32,
+}
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct Force {
+    /// Chosen by the owner, to recognize the force in StreamForces; each id once.
+    #[prost(uint64, tag = "1")]
+    pub id: u64,
+    /// Index of the domain on which the force acts.
+    #[prost(uint32, tag = "2")]
+    pub domain: u32,
+    /// Must be set.
+    #[prost(oneof = "force::Kind", tags = "3, 4")]
+    pub kind: ::core::option::Option<force::Kind>,
+}
+/// Nested message and enum types in `Force`.
+pub mod force {
+    /// Must be set.
+    #[derive(Clone, PartialEq, ::prost::Oneof)]
+    pub enum Kind {
+        #[prost(message, tag = "3")]
+        Surface(super::SurfaceForce),
+        #[prost(message, tag = "4")]
+        Modal(super::ModalForce),
+    }
+}
+/// A force at a point of the surface that moves with the surface. The fields of a Hit describe such a point.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct SurfaceForce {
+    /// Index of the triangle in the domain's mesh.
+    #[prost(uint32, tag = "1")]
+    pub triangle: u32,
+    /// Three barycentric coordinates in the order of the triangle's vertices, each 0 to 1, with sum 1, all within 0.001.
+    #[prost(double, repeated, tag = "2")]
+    pub barycentric: ::prost::alloc::vec::Vec<f64>,
+    /// Three numbers: the force f in newtons, in world axes, each at most 1e30 in magnitude.
+    #[prost(double, repeated, tag = "3")]
+    pub vector: ::prost::alloc::vec::Vec<f64>,
+}
+/// A force on the coordinates of a domain.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct ModalForce {
+    /// f_q: r finite little-endian f32; r is DomainDescription.rank.
+    #[prost(bytes = "bytes", tag = "1")]
+    pub f_q: ::prost::bytes::Bytes,
+}
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct StreamForcesRequest {
+    #[prost(string, tag = "1")]
+    pub scene: ::prost::alloc::string::String,
+    /// Maximum number of replies per second, finite and above 0; 0: no limit. The forces that are sent are the newest ones.
+    #[prost(double, tag = "2")]
+    pub max_hz: f64,
+}
+/// All forces in a scene. The first reply has the present ones, which may be none.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct StreamForcesResponse {
+    /// The step with whose transforms f_q of surface forces was computed. Unset if there are no surface forces.
+    #[prost(message, optional, tag = "1")]
+    pub step: ::core::option::Option<StepId>,
+    /// Ordered by owner; the forces of an owner have the order of ApplyForcesRequest.
+    #[prost(message, repeated, tag = "2")]
+    pub forces: ::prost::alloc::vec::Vec<AppliedForce>,
+}
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct AppliedForce {
+    /// A number per owner; see ApplyForcesResponse.
+    #[prost(uint64, tag = "1")]
+    pub owner: u64,
+    /// The force as the owner has set it. The f_q of a modal force is left out here.
+    #[prost(message, optional, tag = "2")]
+    pub force: ::core::option::Option<Force>,
+    /// The force on the domain's coordinates: r little-endian f32. For a surface force U^T A^T f, where U is interpolated
+    /// at the point from the scene's untruncated modes, as in Hit.modes, and A is the linear part of the domain's
+    /// transform at `step`. Lengths in U are in scene units. A number that f32 cannot represent is infinite.
+    #[prost(bytes = "bytes", tag = "3")]
+    pub f_q: ::prost::bytes::Bytes,
+}
+/// Generated client implementations.
+pub mod force_service_client {
+    #![allow(
+        unused_variables,
+        dead_code,
+        missing_docs,
+        clippy::wildcard_imports,
+        clippy::let_unit_value,
+    )]
+    use tonic::codegen::*;
+    use tonic::codegen::http::Uri;
+    /// Forces that viewers apply to a scene, for the physics process that drives the scene. The server does not simulate: it
+    /// validates the forces, stores them until they expire, and reports them.
+    #[derive(Debug, Clone)]
+    pub struct ForceServiceClient<T> {
+        inner: tonic::client::Grpc<T>,
+    }
+    impl ForceServiceClient<tonic::transport::Channel> {
+        /// Attempt to create a new client by connecting to a given endpoint.
+        pub async fn connect<D>(dst: D) -> Result<Self, tonic::transport::Error>
+        where
+            D: TryInto<tonic::transport::Endpoint>,
+            D::Error: Into<StdError>,
+        {
+            let conn = tonic::transport::Endpoint::new(dst)?.connect().await?;
+            Ok(Self::new(conn))
+        }
+    }
+    impl<T> ForceServiceClient<T>
+    where
+        T: tonic::client::GrpcService<tonic::body::Body>,
+        T::Error: Into<StdError>,
+        T::ResponseBody: Body<Data = Bytes> + std::marker::Send + 'static,
+        <T::ResponseBody as Body>::Error: Into<StdError> + std::marker::Send,
+    {
+        pub fn new(inner: T) -> Self {
+            let inner = tonic::client::Grpc::new(inner);
+            Self { inner }
+        }
+        pub fn with_origin(inner: T, origin: Uri) -> Self {
+            let inner = tonic::client::Grpc::with_origin(inner, origin);
+            Self { inner }
+        }
+        pub fn with_interceptor<F>(
+            inner: T,
+            interceptor: F,
+        ) -> ForceServiceClient<InterceptedService<T, F>>
+        where
+            F: tonic::service::Interceptor,
+            T::ResponseBody: Default,
+            T: tonic::codegen::Service<
+                http::Request<tonic::body::Body>,
+                Response = http::Response<
+                    <T as tonic::client::GrpcService<tonic::body::Body>>::ResponseBody,
+                >,
+            >,
+            <T as tonic::codegen::Service<
+                http::Request<tonic::body::Body>,
+            >>::Error: Into<StdError> + std::marker::Send + std::marker::Sync,
+        {
+            ForceServiceClient::new(InterceptedService::new(inner, interceptor))
+        }
+        /// Compress requests with the given encoding.
+        ///
+        /// This requires the server to support it otherwise it might respond with an
+        /// error.
+        #[must_use]
+        pub fn send_compressed(mut self, encoding: CompressionEncoding) -> Self {
+            self.inner = self.inner.send_compressed(encoding);
+            self
+        }
+        /// Enable decompressing responses.
+        #[must_use]
+        pub fn accept_compressed(mut self, encoding: CompressionEncoding) -> Self {
+            self.inner = self.inner.accept_compressed(encoding);
+            self
+        }
+        /// Limits the maximum size of a decoded message.
+        ///
+        /// Default: `4MB`
+        #[must_use]
+        pub fn max_decoding_message_size(mut self, limit: usize) -> Self {
+            self.inner = self.inner.max_decoding_message_size(limit);
+            self
+        }
+        /// Limits the maximum size of an encoded message.
+        ///
+        /// Default: `usize::MAX`
+        #[must_use]
+        pub fn max_encoding_message_size(mut self, limit: usize) -> Self {
+            self.inner = self.inner.max_encoding_message_size(limit);
+            self
+        }
+        /// Sets all forces of one owner in a scene. An empty list removes them. Each call starts the lifetime again; forces
+        /// that are not renewed expire, so that a viewer that disappears does not push forever.
+        ///
+        /// REASON_LIMIT_REACHED: more than 16 forces, or forces of a further owner while 32 owners have forces in the scene.
+        /// REASON_INVALID_FIELD: an invalid force; nothing changes.
+        pub async fn apply_forces(
+            &mut self,
+            request: impl tonic::IntoRequest<super::ApplyForcesRequest>,
+        ) -> std::result::Result<
+            tonic::Response<super::ApplyForcesResponse>,
+            tonic::Status,
+        > {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = tonic_prost::ProstCodec::default();
+            let path = http::uri::PathAndQuery::from_static(
+                "/modalcast.v1.ForceService/ApplyForces",
+            );
+            let mut req = request.into_request();
+            req.extensions_mut()
+                .insert(GrpcMethod::new("modalcast.v1.ForceService", "ApplyForces"));
+            self.inner.unary(req, path, codec).await
+        }
+        /// Returns the present forces of all owners, and then all forces again after every change: forces were set, removed or
+        /// have expired, or a step has changed f_q. A reader that is slower skips sets and receives the newest one. A renewal
+        /// without a change is not reported. A scene may have 32 of these streams (REASON_LIMIT_REACHED).
+        pub async fn stream_forces(
+            &mut self,
+            request: impl tonic::IntoRequest<super::StreamForcesRequest>,
+        ) -> std::result::Result<
+            tonic::Response<tonic::codec::Streaming<super::StreamForcesResponse>>,
+            tonic::Status,
+        > {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = tonic_prost::ProstCodec::default();
+            let path = http::uri::PathAndQuery::from_static(
+                "/modalcast.v1.ForceService/StreamForces",
+            );
+            let mut req = request.into_request();
+            req.extensions_mut()
+                .insert(GrpcMethod::new("modalcast.v1.ForceService", "StreamForces"));
+            self.inner.server_streaming(req, path, codec).await
+        }
+    }
+}
+/// Generated server implementations.
+pub mod force_service_server {
+    #![allow(
+        unused_variables,
+        dead_code,
+        missing_docs,
+        clippy::wildcard_imports,
+        clippy::let_unit_value,
+    )]
+    use tonic::codegen::*;
+    /// Generated trait containing gRPC methods that should be implemented for use with ForceServiceServer.
+    #[async_trait]
+    pub trait ForceService: std::marker::Send + std::marker::Sync + 'static {
+        /// Sets all forces of one owner in a scene. An empty list removes them. Each call starts the lifetime again; forces
+        /// that are not renewed expire, so that a viewer that disappears does not push forever.
+        ///
+        /// REASON_LIMIT_REACHED: more than 16 forces, or forces of a further owner while 32 owners have forces in the scene.
+        /// REASON_INVALID_FIELD: an invalid force; nothing changes.
+        async fn apply_forces(
+            &self,
+            request: tonic::Request<super::ApplyForcesRequest>,
+        ) -> std::result::Result<
+            tonic::Response<super::ApplyForcesResponse>,
+            tonic::Status,
+        >;
+        /// Server streaming response type for the StreamForces method.
+        type StreamForcesStream: tonic::codegen::tokio_stream::Stream<
+                Item = std::result::Result<super::StreamForcesResponse, tonic::Status>,
+            >
+            + std::marker::Send
+            + 'static;
+        /// Returns the present forces of all owners, and then all forces again after every change: forces were set, removed or
+        /// have expired, or a step has changed f_q. A reader that is slower skips sets and receives the newest one. A renewal
+        /// without a change is not reported. A scene may have 32 of these streams (REASON_LIMIT_REACHED).
+        async fn stream_forces(
+            &self,
+            request: tonic::Request<super::StreamForcesRequest>,
+        ) -> std::result::Result<
+            tonic::Response<Self::StreamForcesStream>,
+            tonic::Status,
+        >;
+    }
+    /// Forces that viewers apply to a scene, for the physics process that drives the scene. The server does not simulate: it
+    /// validates the forces, stores them until they expire, and reports them.
+    #[derive(Debug)]
+    pub struct ForceServiceServer<T> {
+        inner: Arc<T>,
+        accept_compression_encodings: EnabledCompressionEncodings,
+        send_compression_encodings: EnabledCompressionEncodings,
+        max_decoding_message_size: Option<usize>,
+        max_encoding_message_size: Option<usize>,
+    }
+    impl<T> ForceServiceServer<T> {
+        pub fn new(inner: T) -> Self {
+            Self::from_arc(Arc::new(inner))
+        }
+        pub fn from_arc(inner: Arc<T>) -> Self {
+            Self {
+                inner,
+                accept_compression_encodings: Default::default(),
+                send_compression_encodings: Default::default(),
+                max_decoding_message_size: None,
+                max_encoding_message_size: None,
+            }
+        }
+        pub fn with_interceptor<F>(
+            inner: T,
+            interceptor: F,
+        ) -> InterceptedService<Self, F>
+        where
+            F: tonic::service::Interceptor,
+        {
+            InterceptedService::new(Self::new(inner), interceptor)
+        }
+        /// Enable decompressing requests with the given encoding.
+        #[must_use]
+        pub fn accept_compressed(mut self, encoding: CompressionEncoding) -> Self {
+            self.accept_compression_encodings.enable(encoding);
+            self
+        }
+        /// Compress responses with the given encoding, if the client supports it.
+        #[must_use]
+        pub fn send_compressed(mut self, encoding: CompressionEncoding) -> Self {
+            self.send_compression_encodings.enable(encoding);
+            self
+        }
+        /// Limits the maximum size of a decoded message.
+        ///
+        /// Default: `4MB`
+        #[must_use]
+        pub fn max_decoding_message_size(mut self, limit: usize) -> Self {
+            self.max_decoding_message_size = Some(limit);
+            self
+        }
+        /// Limits the maximum size of an encoded message.
+        ///
+        /// Default: `usize::MAX`
+        #[must_use]
+        pub fn max_encoding_message_size(mut self, limit: usize) -> Self {
+            self.max_encoding_message_size = Some(limit);
+            self
+        }
+    }
+    impl<T, B> tonic::codegen::Service<http::Request<B>> for ForceServiceServer<T>
+    where
+        T: ForceService,
+        B: Body + std::marker::Send + 'static,
+        B::Error: Into<StdError> + std::marker::Send + 'static,
+    {
+        type Response = http::Response<tonic::body::Body>;
+        type Error = std::convert::Infallible;
+        type Future = BoxFuture<Self::Response, Self::Error>;
+        fn poll_ready(
+            &mut self,
+            _cx: &mut Context<'_>,
+        ) -> Poll<std::result::Result<(), Self::Error>> {
+            Poll::Ready(Ok(()))
+        }
+        fn call(&mut self, req: http::Request<B>) -> Self::Future {
+            match req.uri().path() {
+                "/modalcast.v1.ForceService/ApplyForces" => {
+                    #[allow(non_camel_case_types)]
+                    struct ApplyForcesSvc<T: ForceService>(pub Arc<T>);
+                    impl<
+                        T: ForceService,
+                    > tonic::server::UnaryService<super::ApplyForcesRequest>
+                    for ApplyForcesSvc<T> {
+                        type Response = super::ApplyForcesResponse;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::Response>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<super::ApplyForcesRequest>,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as ForceService>::apply_forces(&inner, request).await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = ApplyForcesSvc(inner);
+                        let codec = tonic_prost::ProstCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.unary(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                "/modalcast.v1.ForceService/StreamForces" => {
+                    #[allow(non_camel_case_types)]
+                    struct StreamForcesSvc<T: ForceService>(pub Arc<T>);
+                    impl<
+                        T: ForceService,
+                    > tonic::server::ServerStreamingService<super::StreamForcesRequest>
+                    for StreamForcesSvc<T> {
+                        type Response = super::StreamForcesResponse;
+                        type ResponseStream = T::StreamForcesStream;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::ResponseStream>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<super::StreamForcesRequest>,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as ForceService>::stream_forces(&inner, request).await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = StreamForcesSvc(inner);
+                        let codec = tonic_prost::ProstCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.server_streaming(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                _ => {
+                    Box::pin(async move {
+                        let mut response = http::Response::new(
+                            tonic::body::Body::default(),
+                        );
+                        let headers = response.headers_mut();
+                        headers
+                            .insert(
+                                tonic::Status::GRPC_STATUS,
+                                (tonic::Code::Unimplemented as i32).into(),
+                            );
+                        headers
+                            .insert(
+                                http::header::CONTENT_TYPE,
+                                tonic::metadata::GRPC_CONTENT_TYPE,
+                            );
+                        Ok(response)
+                    })
+                }
+            }
+        }
+    }
+    impl<T> Clone for ForceServiceServer<T> {
+        fn clone(&self) -> Self {
+            let inner = self.inner.clone();
+            Self {
+                inner,
+                accept_compression_encodings: self.accept_compression_encodings,
+                send_compression_encodings: self.send_compression_encodings,
+                max_decoding_message_size: self.max_decoding_message_size,
+                max_encoding_message_size: self.max_encoding_message_size,
+            }
+        }
+    }
+    /// Generated gRPC service name
+    pub const SERVICE_NAME: &str = "modalcast.v1.ForceService";
+    impl<T> tonic::server::NamedService for ForceServiceServer<T> {
         const NAME: &'static str = SERVICE_NAME;
     }
 }

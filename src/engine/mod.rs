@@ -31,6 +31,8 @@ pub use output::step_output::{FrameOutput, ModalHit, OutputBody, OutputSpec, Pic
 pub use output::vertex_encoding::Encoding;
 pub use scene::delivery::{Delivery, StreamDelivery};
 pub use scene::encoded_subscription::EncodedSubscription;
+pub use scene::force_subscription::{ForceReport, ForceSubscription};
+pub use scene::forces::{AppliedForce, Force, ForceKind, ForceOwner, ForceUpdate, check_force_count};
 pub use scene::handle::{SceneHandle, WriterSession};
 pub use scene::lease::{InitialState, LeaseRequest, LeaseToken};
 pub use scene::message::StepSelector;

@@ -4,6 +4,7 @@
 mod connection;
 mod convert;
 mod describe;
+mod forces;
 mod frames;
 mod info;
 mod listen;
@@ -100,7 +101,15 @@ pub async fn serve(
 async fn set_health(health: &HealthReporter, is_serving: bool) {
     use tonic_health::ServingStatus::{NotServing, Serving};
     let status = if is_serving { Serving } else { NotServing };
-    let services = ["SceneService", "StepService", "FrameService", "VertexService", "StateService", "ServerService"];
+    let services = [
+        "SceneService",
+        "StepService",
+        "FrameService",
+        "VertexService",
+        "StateService",
+        "ForceService",
+        "ServerService",
+    ];
     // The empty name stands for the whole server.
     for name in services.map(|service| format!("modalcast.v1.{service}")).into_iter().chain([String::new()]) {
         health.set_service_status(name, status).await;
@@ -126,6 +135,7 @@ fn transport(config: &Config) -> Server {
 }
 
 fn routes(engine: &Engine, config: &Config) -> Result<Routes> {
+    use v1::force_service_server::ForceServiceServer;
     use v1::frame_service_server::FrameServiceServer;
     use v1::scene_service_server::SceneServiceServer;
     use v1::server_service_server::ServerServiceServer;
@@ -151,7 +161,8 @@ fn routes(engine: &Engine, config: &Config) -> Result<Routes> {
         .with(with_limits!(StepServiceServer::new(steps::StepServiceImpl(engine.clone()))))
         .with(with_limits!(FrameServiceServer::new(frames::FrameServiceImpl(engine.clone()))))
         .with(with_limits!(VertexServiceServer::new(vertices::VertexServiceImpl(engine.clone()))))
-        .with(with_limits!(StateServiceServer::new(states::StateServiceImpl(engine.clone())))))
+        .with(with_limits!(StateServiceServer::new(states::StateServiceImpl(engine.clone()))))
+        .with(with_limits!(ForceServiceServer::new(forces::ForceServiceImpl(engine.clone())))))
 }
 
 #[cfg(test)]

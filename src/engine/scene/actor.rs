@@ -44,7 +44,6 @@ use crate::engine::blocking::run_blocking;
 use crate::engine::catch_unwind::catch_unwind_async;
 use crate::engine::device::command::SceneId;
 use crate::engine::device::handle::{DeviceHandle, PendingReply};
-use crate::engine::output::step_output::StepId;
 use crate::engine::storage::checkpoint_store::{CheckpointStore, SceneCheckpoints};
 use crate::engine::storage::run_counter::RunCounter;
 use crate::telemetry::{Stage, StageTimes};
@@ -69,8 +68,8 @@ pub(super) struct ActorParams {
     pub state: Arc<SceneState>,
     /// Wakes the actor: a step is queued, the writer has disconnected, or a subscriber has capacity.
     pub wake: Arc<Notify>,
-    /// Receives the last completed step.
-    pub last_step: watch::Sender<Option<StepId>>,
+    /// Receives the state of every completed step.
+    pub current_state: watch::Sender<Arc<SceneState>>,
     /// Receives the error with which the scene fails.
     pub failure: Arc<OnceLock<Error>>,
     /// Called when the scene has failed.
@@ -130,7 +129,7 @@ pub(super) struct SceneActor {
     current: CurrentStep,
     delivery: OutputDelivery,
     checkpoints: SceneCheckpoints,
-    last_step: watch::Sender<Option<StepId>>,
+    current_state: watch::Sender<Arc<SceneState>>,
     /// See [`ActorParams::wake`].
     wake: Arc<Notify>,
     failure: Arc<OnceLock<Error>>,
@@ -139,7 +138,7 @@ pub(super) struct SceneActor {
 
 impl SceneActor {
     pub(super) fn new(params: ActorParams, services: SceneServices) -> Self {
-        let ActorParams { name, id, scene, state, wake, last_step, failure, on_failure } = params;
+        let ActorParams { name, id, scene, state, wake, current_state, failure, on_failure } = params;
         let SceneServices { device, checkpoints, run_counter, config } = services;
         let scene_on_device = SceneOnDevice { name: name.clone(), id, scene: Arc::clone(&scene) };
         Self {
@@ -155,7 +154,7 @@ impl SceneActor {
             writer: None,
             phase: StepPhase::Idle,
             current: CurrentStep::of_opened_scene(state),
-            last_step,
+            current_state,
             wake,
             failure,
             on_failure,
@@ -251,7 +250,7 @@ impl SceneActor {
                 stages.push((Stage::Deform, deformed.ms));
                 self.starts_from_rest = false;
                 self.checkpoints.save(&state);
-                self.last_step.send_replace(Some(StepId::of(&state)));
+                self.current_state.send_replace(Arc::clone(&state));
                 self.current = CurrentStep { state, step_count: self.current.step_count + 1 + merged, stages };
                 self.delivery.drop_cached_vertices();
                 self.phase = StepPhase::Delivering(CompletedStep::new(step_queue, self.current.stages.clone()));

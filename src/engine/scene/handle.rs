@@ -1,6 +1,5 @@
 //! Handle to one open scene: the immutable description of the scene, and a sender to the bounded mailbox of its task.
 
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, OnceLock};
 use std::time::Instant;
 
@@ -9,6 +8,8 @@ use tokio::sync::{Notify, OnceCell, mpsc, oneshot, watch};
 
 use super::actor::{ActorParams, SceneActor, SceneServices};
 use super::delivery::StreamDelivery;
+use super::force_subscription::ForceSubscription;
+use super::forces::{ForceChannel, ForceUpdate};
 use super::lease::{AcquiredLease, LeaseRequest, LeaseToken, WriterLease};
 use super::message::{Message, StepRequest, StepSelector};
 use super::step_queue::{QueuedStep, StepReport};
@@ -38,10 +39,14 @@ pub struct SceneHandle {
     /// Limit on the steps that a writer may leave unacknowledged.
     max_window: u32,
     mailbox: mpsc::Sender<Message>,
-    last_step: watch::Receiver<Option<StepId>>,
+    /// The state of the last completed step, or the rest state.
+    current_state: watch::Receiver<Arc<SceneState>>,
+    /// Created when forces are applied or read for the first time.
+    forces: OnceLock<Arc<ForceChannel>>,
     /// Wakes the actor when a subscription grants a credit or is dropped.
     wake: Arc<Notify>,
-    is_stopping: AtomicBool,
+    /// The error of [`Self::stop`], if it was called.
+    stop_error: OnceLock<Error>,
     /// The error with which the scene has failed.
     failure: Arc<OnceLock<Error>>,
     /// Computed when a client first asks for them.
@@ -84,20 +89,19 @@ impl SceneHandle {
         let wake = Arc::new(Notify::new());
         let max_window = services.config.max_window;
         let failure = Arc::new(OnceLock::new());
-        let (last_step_sender, last_step) = watch::channel((state.run > 0).then(|| StepId::of(&state)));
+        let (state_sender, current_state) = watch::channel(Arc::clone(&state));
         let actor = ActorParams {
             name: name.clone(),
             id,
             scene: Arc::clone(&scene),
             state,
             wake: Arc::clone(&wake),
-            last_step: last_step_sender,
+            current_state: state_sender,
             failure: Arc::clone(&failure),
             on_failure,
         };
         let (mailbox, inbox) = mpsc::channel(MAILBOX_CAPACITY);
         tokio::spawn(SceneActor::new(actor, services).run(inbox));
-        let is_stopping = AtomicBool::new(false);
         Ok(Self {
             name,
             provenance,
@@ -106,9 +110,10 @@ impl SceneHandle {
             frames_unavailable,
             max_window,
             mailbox,
-            last_step,
+            current_state,
+            forces: OnceLock::new(),
             wake,
-            is_stopping,
+            stop_error: OnceLock::new(),
             failure,
             content_hashes: OnceCell::new(),
         })
@@ -129,7 +134,8 @@ impl SceneHandle {
 
     /// The last completed step, if there is one.
     pub fn last_step(&self) -> Option<StepId> {
-        *self.last_step.borrow()
+        let state = self.current_state.borrow();
+        (state.run > 0).then(|| StepId::of(&state))
     }
 
     /// Acquires the writer lease. `peer` is the address of the client, for the log. The window is clamped to the range
@@ -169,9 +175,37 @@ impl SceneHandle {
         self.call(|reply| Message::Request(StepRequest { selector, spec, reply })).await
     }
 
+    /// Sets all forces of an owner. Returns the number that stands for the owner, or 0 if it has no forces now. The
+    /// scene's task is not involved.
+    ///
+    /// # Errors
+    /// `LimitReached` when too many owners have forces.
+    pub fn apply_forces(&self, update: &ForceUpdate) -> Result<u64> {
+        self.force_channel().apply(update)
+    }
+
+    /// Subscribes to the forces of the scene, at the rate of `delivery`. Only the newest forces are delivered.
+    ///
+    /// # Errors
+    /// `LimitReached` when the scene has too many readers.
+    pub fn subscribe_to_forces(self: &Arc<Self>, delivery: StreamDelivery) -> Result<ForceSubscription> {
+        let (channel, states) = (Arc::clone(self.force_channel()), self.current_state.clone());
+        ForceSubscription::new(Arc::clone(self), channel, states, delivery.min_interval())
+    }
+
+    fn force_channel(&self) -> &Arc<ForceChannel> {
+        self.forces.get_or_init(Arc::default)
+    }
+
+    /// Waits until the scene has ended and returns the error. Cancel-safe.
+    pub(super) async fn ended(&self) -> Error {
+        self.mailbox.closed().await;
+        self.end_error()
+    }
+
     /// Ends every stream of the scene with `error` and frees the scene. Returns after the scene is freed.
     pub(in crate::engine) async fn stop(&self, error: Error) {
-        self.is_stopping.store(true, Ordering::Release);
+        self.stop_error.set(error.clone()).ok(); // The error of the first call remains.
         let (done, stopped) = oneshot::channel();
         // A closed mailbox means that the scene's task has already ended.
         if self.mailbox.send(Message::Stop { error, done }).await.is_ok() {
@@ -181,7 +215,7 @@ impl SceneHandle {
 
     /// Whether [`Self::stop`] was called or the scene has failed.
     pub(in crate::engine) fn is_closing(&self) -> bool {
-        self.is_stopping.load(Ordering::Acquire) || self.failure().is_some()
+        self.stop_error.get().is_some() || self.failure().is_some()
     }
 
     fn check_spec(&self, spec: &OutputSpec) -> Result<()> {
@@ -226,7 +260,7 @@ impl SceneHandle {
     /// The error of calls after the actor has ended.
     fn end_error(&self) -> Error {
         let scene_closed = || Error::NotFound { what: "scene", given: format!("closed scene '{}'", self.name) };
-        self.failure().cloned().unwrap_or_else(scene_closed)
+        self.failure().or_else(|| self.stop_error.get()).cloned().unwrap_or_else(scene_closed)
     }
 }
 

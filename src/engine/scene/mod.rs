@@ -1,9 +1,12 @@
-//! One open scene: its actor, the queue of steps from the writer, and the delivery of outputs to subscribers.
+//! One open scene: its actor, the queue of steps from the writer, the delivery of outputs to subscribers, and the
+//! forces that viewers apply.
 
 pub(super) mod actor;
 mod current_step;
 pub(super) mod delivery;
 pub(super) mod encoded_subscription;
+pub(super) mod force_subscription;
+pub(super) mod forces;
 pub(super) mod handle;
 pub(super) mod lease;
 pub(super) mod message;
