@@ -6,6 +6,7 @@ mod client;
 mod content;
 mod description;
 mod error;
+mod forces;
 mod frames;
 pub mod npy;
 mod pick;
@@ -23,6 +24,7 @@ mod vertices;
 pub use client::{Client, REPLY_LIMIT, SceneList, ServerInfo};
 pub use content::ContentHash;
 pub use error::{Error, Reason, Rejection, Result};
+pub use forces::{AppliedForce, Force, ForceKind, ForceRequest, ForceSet, ForceStream, SurfaceForce};
 pub use frames::{
     Camera, DrawnBy, Frame, FrameFormat, FrameRequest, FrameStream, FrameStreamRequest, FramesRequest, Lens, Output,
     Picture, Pictures, View,
