@@ -48,6 +48,8 @@ pub struct BridgeScenario {
     domain: usize,
     /// Reduced load U^T f of the force f at the peak of the pulse.
     peak_load: DVector<f64>,
+    /// Reduced load of the viewers' forces.
+    viewer_load: DVector<f64>,
     /// The state at step `next_step`.
     state: NewmarkState,
     /// The step that the next call of `compute_next_step` computes.
@@ -88,6 +90,7 @@ impl BridgeScenario {
             options,
             domain,
             peak_load: unit_load * equilibrium.strength,
+            viewer_load: DVector::zeros(rank),
             state: system.static_state(equilibrium.q),
             next_step: 0,
             strength: equilibrium.strength,
@@ -109,7 +112,7 @@ impl BridgeScenario {
     /// The reduced load at a step.
     fn compute_load(&self, step: u64) -> DVector<f64> {
         let time = step as f64 * self.options.dt;
-        &self.peak_load * (0.5 + 0.5 * (TAU * time / self.options.period).cos())
+        &self.peak_load * (0.5 + 0.5 * (TAU * time / self.options.period).cos()) + &self.viewer_load
     }
 }
 
@@ -130,6 +133,12 @@ impl Scenario for BridgeScenario {
             values.transforms.iter().map(AffineTransform::from_row_major).collect();
         self.peak_displacement = self.peak_displacement.max(self.model.max_displacement(&q, &world_from_domain));
         self.advance();
+        Ok(())
+    }
+
+    fn set_viewer_forces(&mut self, forces: &[f64]) -> Result<()> {
+        let first_coordinate = self.model.domains[self.domain].first_coordinate;
+        self.viewer_load.copy_from_slice(&forces[first_coordinate..][..self.system.rank()]);
         Ok(())
     }
 
@@ -275,6 +284,23 @@ mod tests {
         (0..40).for_each(|_| bridge.compute_next_step(&mut last_values).expect("the next step"));
         assert!(first_values.q != last_values.q && first_values.transforms == last_values.transforms);
         assert!(bridge.peak_displacement / bridge.model.diagonal() < 0.2);
+    }
+
+    #[test]
+    fn viewer_forces_change_the_motion() {
+        let run = |forces: Option<[f64; 6]>| {
+            let (mut bridge, mut values) = (two_mode_bridge(), StepValues::default());
+            for _ in 0..20 {
+                forces.iter().for_each(|forces| bridge.set_viewer_forces(forces).expect("a scenario with forces"));
+                bridge.compute_next_step(&mut values).expect("the next step");
+            }
+            values.q
+        };
+        let free_q = run(None);
+        assert_eq!(run(Some([0.0; 6])), free_q);
+        assert_eq!(run(Some([0.0, 0.0, 1.0, 1.0, 1.0, 1.0])), free_q, "expected no effect on the bridge");
+        let pushed_q = run(Some([5.0, 0.0, 0.0, 0.0, 0.0, 0.0]));
+        assert!(pushed_q[0] > free_q[0] + 1e-3, "pushed {pushed_q:?}, free {free_q:?}");
     }
 
     #[test]

@@ -105,6 +105,9 @@ pub(crate) struct CommonOptions {
     /// Run in real time instead of as fast as possible.
     #[arg(long)]
     pub(crate) realtime: bool,
+    /// Add the forces that viewers apply to the scene (ApplyForces) to those of the tree or the bridge.
+    #[arg(long)]
+    pub(crate) forces: bool,
     /// Write q.npy (steps x coordinates) and transforms.npy (steps x domains x 12), float32, into this folder.
     #[arg(long, value_name = "DIR")]
     pub(crate) record: Option<PathBuf>,

@@ -14,6 +14,7 @@
 //! | `newmark` | implicit time integration of the reduced equations of motion |
 //! | `bridge` | a bridge under a pulsating load |
 //! | `sweep` | motion for any scene: moves one coordinate after another, or rocks a rigid scene |
+//! | `viewer_forces` | reads the forces that viewers apply |
 //! | `run` | sends a scenario as a step stream, optionally records it, and reports the results |
 
 #![cfg_attr(not(test), deny(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::print_stdout))]
@@ -30,6 +31,7 @@ pub mod run;
 pub mod sweep;
 pub mod tree;
 pub mod vega;
+pub mod viewer_forces;
 pub mod wind;
 
 pub use error::{Error, Result, invalid_input};

@@ -73,6 +73,7 @@ async fn run_scenario(arguments: &Cli) -> Result<RunSummary> {
         delivery: common.delivery.into(),
         window: common.window,
         realtime: common.realtime,
+        applies_viewer_forces: common.forces,
         record_folder: common.record.clone(),
     };
     drive_scene(&client, scenario.as_mut(), &options, &stop_receiver).await

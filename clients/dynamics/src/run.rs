@@ -10,8 +10,9 @@ use modalcast_client::{Client, Delivery, DriveRequest, Error as ClientError, Sta
 use serde_json::{Value, json};
 use tokio::sync::watch;
 
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, invalid_input};
 use crate::model::Model;
+use crate::viewer_forces::ViewerForces;
 
 /// Named results of a scenario or a run.
 pub type Report = serde_json::Map<String, Value>;
@@ -39,6 +40,19 @@ pub trait Scenario {
     /// `Invalid` if the values are not finite.
     fn compute_next_step(&mut self, values: &mut StepValues) -> Result<()>;
 
+    /// Sets the forces of viewers, which act in all later steps in addition to the load of the scenario: one number per
+    /// coordinate of the scene.
+    ///
+    /// # Errors
+    /// `Invalid` if the motion of the scenario does not follow from forces.
+    fn set_viewer_forces(&mut self, _forces: &[f64]) -> Result<()> {
+        Err(invalid_input(
+            "--forces",
+            "a scenario whose motion follows from forces (tree or bridge)",
+            "another scenario",
+        ))
+    }
+
     /// Results so far. The keys depend on the scenario; each scenario has the key `load`, which
     /// names the motion or the force.
     fn report(&self) -> Report;
@@ -56,6 +70,8 @@ pub struct RunOptions {
     pub window: Option<u32>,
     /// Whether to run in real time.
     pub realtime: bool,
+    /// Whether the forces of viewers act on the scene.
+    pub applies_viewer_forces: bool,
     /// Folder for q.npy (steps x coordinates) and transforms.npy (steps x domains x 12), f32.
     pub record_folder: Option<PathBuf>,
 }
@@ -94,6 +110,10 @@ pub async fn drive_scene(
     stop_receiver: &watch::Receiver<bool>,
 ) -> Result<RunSummary> {
     let scene = scenario.model().scene.clone();
+    let mut viewer_forces = match options.applies_viewer_forces {
+        true => Some(ViewerForces::subscribe(client, &scene).await?),
+        false => None,
+    };
     let request = DriveRequest::new(&scene, options.delivery);
     let request = options.window.into_iter().fold(request, DriveRequest::window);
     let mut step_stream = client.drive(&request).await?;
@@ -107,6 +127,11 @@ pub async fn drive_scene(
     let mut current_values = StepValues::default();
     let mut step_number = 0;
     while options.steps.is_none_or(|steps| step_number < steps) && !*stop_receiver.borrow() {
+        if let Some(viewer_forces) = &mut viewer_forces
+            && let Some(forces) = viewer_forces.take_changed(scenario.model()).await?
+        {
+            scenario.set_viewer_forces(&forces)?;
+        }
         scenario.compute_next_step(&mut current_values)?;
         let time = step_number as f64 * options.dt;
         if options.realtime {

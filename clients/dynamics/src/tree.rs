@@ -96,6 +96,8 @@ pub struct TreeScenario {
     gains: Vec<f64>,
     /// The response at step `next_step`.
     response: Response,
+    /// The response to the forces of viewers; `None` until there are any.
+    viewer_response: Option<ViewerResponse>,
     /// The step that the next call of `compute_next_step` computes.
     next_step: u64,
     /// The highest sample of each domain that reaches into the crown.
@@ -107,6 +109,31 @@ pub struct TreeScenario {
     earlier_peaks: Peaks,
     /// The last step, which is measured while the next one is computed.
     last_step: Option<SentStep>,
+}
+
+/// The response of every mode to the forces of viewers. The modes are linear, so it adds to the response to the wind,
+/// and the gains do not scale it. A force acts on its own domain only: joints do not transmit it to the parent.
+struct ViewerResponse {
+    /// Per coordinate.
+    forces: Vec<f64>,
+    /// Per coordinate: state at step `next_step`.
+    states: Vec<ModeState>,
+}
+
+impl ViewerResponse {
+    /// Adds the response to coordinates and rounds them to f32, as the server receives them.
+    fn add_to(&self, q: &mut [f64]) {
+        for (coordinate, state) in q.iter_mut().zip(&self.states) {
+            *coordinate = f64::from((*coordinate + state.q) as f32);
+        }
+    }
+
+    /// Advances every mode by one step under constant forces.
+    fn advance(&mut self, oscillators: &[Oscillator]) {
+        for ((state, force), oscillator) in self.states.iter_mut().zip(&self.forces).zip(oscillators) {
+            *state = oscillator.advance(*state, *force, *force);
+        }
+    }
 }
 
 /// The wind and the response to it at one time, at unit strength.
@@ -197,6 +224,7 @@ impl TreeScenario {
             loads: model.domains.iter().map(|domain| compute_wind_load(&model, domain, &wind)).collect(),
             gains: vec![1.0; model.domains.len()],
             response: Response::at_rest(&model),
+            viewer_response: None,
             next_step: 0,
             crown_samples: select_crown(&model),
             gap_meter: JointGapMeter::new(&model),
@@ -423,7 +451,10 @@ impl Scenario for TreeScenario {
     }
 
     fn compute_next_step(&mut self, values: &mut StepValues) -> Result<()> {
-        let q = self.scale_response(&self.response.q(), &self.gains);
+        let mut q = self.scale_response(&self.response.q(), &self.gains);
+        if let Some(viewer_response) = &self.viewer_response {
+            viewer_response.add_to(&mut q);
+        }
         // These depend only on the response of this step and on the last step, so they run concurrently.
         let compute_attachments = || deformed_attachments(&self.model, &q);
         let measure_last_step = || self.peaks();
@@ -440,6 +471,21 @@ impl Scenario for TreeScenario {
         let world_from_domain = values.transforms.iter().map(AffineTransform::from_row_major).collect();
         (self.earlier_peaks, self.last_step) = (earlier_peaks, Some(SentStep { q, world_from_domain }));
         (self.response, self.next_step) = (next_response, self.next_step + 1);
+        if let Some(viewer_response) = &mut self.viewer_response {
+            viewer_response.advance(&self.oscillators);
+        }
+        Ok(())
+    }
+
+    fn set_viewer_forces(&mut self, forces: &[f64]) -> Result<()> {
+        if self.viewer_response.is_none() && forces.iter().all(|force| *force == 0.0) {
+            return Ok(());
+        }
+        let viewer_response = self.viewer_response.get_or_insert_with(|| ViewerResponse {
+            forces: Vec::new(),
+            states: vec![ModeState::default(); self.oscillators.len()],
+        });
+        viewer_response.forces = forces.to_vec();
         Ok(())
     }
 
@@ -585,6 +631,29 @@ mod tests {
             let peaks = tree.peaks();
             let is_bounded = peaks.displacement <= 0.5 * tree.model.diagonal();
             assert!(is_bounded && peaks.sway > 0.0, "dt {dt}: {peaks:?}");
+        }
+    }
+
+    #[test]
+    fn viewer_force_deflects_its_domain_in_addition_to_the_wind() {
+        let run = |wind_strength: f64, force: f64| {
+            let options = TreeOptions { wind_strength, ..OPTIONS };
+            let mut tree = TreeScenario::new(four_domain_model(), options).expect("a valid scenario");
+            let mut values = StepValues::default();
+            for _ in 0..30 {
+                tree.set_viewer_forces(&[0.0, 0.0, force, 0.0, 0.0, 0.0]).expect("a scenario with forces");
+                tree.compute_next_step(&mut values).expect("finite coordinates");
+            }
+            values.q
+        };
+        let (pushed_q, calm_q) = (run(0.0, 2.0), run(0.0, 0.0));
+        assert_eq!(calm_q, [0.0; 6], "control");
+        // Coordinate 2 is the first one of domain 1.
+        assert!(pushed_q[2] > 1e-4, "{pushed_q:?}");
+        assert!(pushed_q.iter().enumerate().all(|(coordinate, q)| coordinate == 2 || *q == 0.0), "{pushed_q:?}");
+        let (windy_q, both_q) = (run(1.0, 0.0), run(1.0, 2.0));
+        for ((both, windy), pushed) in both_q.iter().zip(&windy_q).zip(&pushed_q) {
+            assert!((both - (windy + pushed)).abs() <= 1e-5 * (1.0 + both.abs()), "{both_q:?}");
         }
     }
 

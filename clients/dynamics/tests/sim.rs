@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use fake::{FakeDomain, FakeServer, IDENTITY, compose, pack, serve};
-use modalcast_client::{Client, VertexSelection, VertexStreamRequest};
+use modalcast_client::{Client, VertexSelection, VertexStreamRequest, v1};
 
 /// A beam of length 1 along y with two bending modes: nine sections of six vertices, 54 vertices in all.
 fn beam(index: u32, radius: f32) -> FakeDomain {
@@ -190,6 +190,28 @@ async fn auto_selects_tree_or_sweep_by_scene() {
         assert_eq!(sim_output.report()["steps_sent"].as_u64(), Some(25));
         assert_ne!(server.output().positions, rest_positions, "expected positions of {scenario} to change");
     }
+}
+
+/// Without wind, only the force of a viewer moves the tree. The sweep has no forces.
+#[tokio::test(flavor = "multi_thread")]
+async fn forces_of_viewers_act_on_request() {
+    let mut server = tree_server();
+    let force = v1::Force { id: 1, domain: 0, kind: None };
+    server.forces = vec![v1::AppliedForce { owner: 1, force: Some(force), f_q: pack(&[2.0_f32, 0.0]).into() }];
+    let server = Arc::new(server);
+    let rest_positions = server.output().positions;
+    // Vertex 48 is at the end of the trunk. Its modes move it along x and z, and the force acts on the first one.
+    let displacement = || server.output().positions[3 * 48] - rest_positions[3 * 48];
+    let url = serve(Arc::clone(&server)).await;
+    let arguments = ["tree", "--scene", "toy", "--steps", "20", "--wind", "0", "--json"];
+    let sim_output = run_sim(&url, &arguments).await;
+    assert_eq!(sim_output.exit_code, 0, "{}", sim_output.stderr);
+    assert_eq!(displacement(), 0.0, "control: expected no motion without --forces");
+    let sim_output = run_sim(&url, &[&arguments[..], &["--forces"]].concat()).await;
+    assert_eq!(sim_output.exit_code, 0, "{}", sim_output.stderr);
+    assert!(displacement() > 1e-3, "{}", displacement());
+    let sim_output = run_sim(&url, &["sweep", "--scene", "toy", "--steps", "2", "--forces"]).await;
+    assert!(sim_output.exit_code == 5 && sim_output.stderr.contains("--forces"), "{}", sim_output.stderr);
 }
 
 /// The expected codes are those of `modalcast-sim --help`: 1 rejected by the server, 2 command line, 3 connection, 4

@@ -87,6 +87,8 @@ pub(crate) struct FakeServer {
     pub(crate) ack_permits: Semaphore,
     /// The accepted steps.
     pub(crate) steps: Mutex<Vec<v1::Step>>,
+    /// The forces on the scene, which a test sets.
+    pub(crate) forces: Vec<v1::AppliedForce>,
     /// Paths and bytes of the files of the last upload.
     pub(crate) uploaded_files: Mutex<Vec<(String, Vec<u8>)>>,
     /// The state after each step, for the subscribers.
@@ -127,6 +129,7 @@ impl FakeServer {
             window: 8,
             ack_permits: Semaphore::new(Semaphore::MAX_PERMITS),
             steps: Mutex::default(),
+            forces: Vec::new(),
             uploaded_files: Mutex::default(),
             // More steps than any test sends, so that no subscriber misses one.
             outputs: broadcast::channel(1 << 14).0,

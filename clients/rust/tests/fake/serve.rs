@@ -11,6 +11,7 @@ use tokio_stream::StreamExt as _;
 use tokio_stream::wrappers::{BroadcastStream, ReceiverStream, TcpListenerStream};
 use tonic::codegen::{BoxFuture, Service, http};
 use tonic::{Request, Response, Status, Streaming};
+use v1::force_service_server::{ForceService, ForceServiceServer};
 use v1::frame_service_server::{FrameService, FrameServiceServer};
 use v1::scene_service_server::{SceneService, SceneServiceServer};
 use v1::server_service_server::{ServerService, ServerServiceServer};
@@ -36,7 +37,7 @@ pub(crate) async fn serve(fake_server: Arc<FakeServer>) -> String {
 #[derive(Clone)]
 struct FakeService(Arc<FakeServer>);
 
-/// Routes calls to the five services by their path.
+/// Routes calls to the services by their path.
 #[derive(Clone)]
 struct Router(FakeService);
 
@@ -56,6 +57,7 @@ impl Service<http::Request<tonic::body::Body>> for Router {
             Some("SceneService") => SceneServiceServer::new(service).call(request),
             Some("StepService") => StepServiceServer::new(service).call(request),
             Some("FrameService") => FrameServiceServer::new(service).call(request),
+            Some("ForceService") => ForceServiceServer::new(service).call(request),
             Some("VertexService") => VertexServiceServer::new(service).call(request),
             // `ServerService`, which also answers unknown services with an error.
             _ => ServerServiceServer::new(service).call(request),
@@ -88,6 +90,29 @@ impl ServerService for FakeService {
             features: vec![v1::Feature::Frames.into(), 9999],
             ..Default::default()
         }))
+    }
+}
+
+#[tonic::async_trait]
+impl ForceService for FakeService {
+    async fn apply_forces(
+        &self,
+        _: Request<v1::ApplyForcesRequest>,
+    ) -> Result<Response<v1::ApplyForcesResponse>, Status> {
+        Err(Status::unimplemented("the forces of the fake server are set by the test"))
+    }
+
+    type StreamForcesStream = ResponseStream<v1::StreamForcesResponse>;
+
+    /// Sends the forces of the server once.
+    async fn stream_forces(
+        &self,
+        request: Request<v1::StreamForcesRequest>,
+    ) -> Result<Response<Self::StreamForcesStream>, Status> {
+        self.check_scene(&request.into_inner().scene)?;
+        let forces = v1::StreamForcesResponse { step: None, forces: self.0.forces.clone() };
+        let stream = tokio_stream::once(Ok(forces)).chain(tokio_stream::pending());
+        Ok(Response::new(Box::pin(stream)))
     }
 }
 

@@ -1,0 +1,108 @@
+//! Forces that viewers apply to the scene while a scenario runs. A task reads the stream of forces; a run takes the
+//! newest ones before each step.
+
+use modalcast_client::{AppliedForce, Client, Error as ClientError, ForceSet};
+use tokio::sync::watch;
+use tokio::task::JoinHandle;
+
+use crate::error::{Result, invalid_input};
+use crate::model::Model;
+
+/// The forces of all viewers, read by a task that ends with this object.
+pub struct ViewerForces {
+    newest: watch::Receiver<ForceSet>,
+    /// Returns the error that has ended the stream.
+    task: JoinHandle<ClientError>,
+}
+
+impl ViewerForces {
+    /// Subscribes to the forces on a scene. When this returns, the present forces have arrived.
+    ///
+    /// # Errors
+    /// `Client` as for the calls.
+    pub async fn subscribe(client: &Client, scene: &str) -> Result<Self> {
+        let mut stream = client.stream_forces(scene, 0.0).await?;
+        let ended = || ClientError::StreamEnded { awaited_reply: "the next forces" };
+        let present_forces = stream.next().await.unwrap_or_else(|| Err(ended()))?;
+        let (sender, mut newest) = watch::channel(present_forces);
+        newest.mark_changed();
+        let task = tokio::spawn(async move {
+            loop {
+                match stream.next().await.unwrap_or_else(|| Err(ended())) {
+                    Ok(forces) => sender.send_replace(forces),
+                    Err(error) => return error,
+                };
+            }
+        });
+        Ok(Self { newest, task })
+    }
+
+    /// The sum of all forces, one number per coordinate of the scene; `None` if it has not changed since the last call.
+    ///
+    /// # Errors
+    /// `Client` if the stream has ended; `Invalid` if a force does not fit to the model or is not finite.
+    pub async fn take_changed(&mut self, model: &Model) -> Result<Option<Vec<f64>>> {
+        match self.newest.has_changed() {
+            Ok(true) => sum_forces(model, &self.newest.borrow_and_update().forces).map(Some),
+            Ok(false) => Ok(None),
+            // The task has dropped its sender.
+            Err(_) => {
+                let error = (&mut self.task).await;
+                Err(error.unwrap_or(ClientError::StreamEnded { awaited_reply: "the next forces" }).into())
+            }
+        }
+    }
+}
+
+impl Drop for ViewerForces {
+    fn drop(&mut self) {
+        self.task.abort();
+    }
+}
+
+/// The sum of forces per coordinate of the scene. Domains that share coordinates add to the same numbers.
+fn sum_forces(model: &Model, forces: &[AppliedForce]) -> Result<Vec<f64>> {
+    let mut sum = vec![0.0; model.coordinate_count];
+    for (index, force) in forces.iter().enumerate() {
+        let domain = model.domains.get(force.domain as usize).filter(|domain| domain.rank == force.f_q.len());
+        let Some(domain) = domain else {
+            let given = format!("{} numbers for domain {}", force.f_q.len(), force.domain);
+            return Err(invalid_input(format!("forces[{index}].f_q"), "a number per mode of a domain", given));
+        };
+        for (total, component) in sum[domain.first_coordinate..].iter_mut().zip(&force.f_q) {
+            *total += f64::from(*component);
+        }
+    }
+    match sum.iter().find(|component| !component.is_finite()) {
+        None => Ok(sum),
+        Some(component) => Err(invalid_input("forces", "finite forces on the coordinates", component)),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::hierarchy::tests::four_domain_model;
+
+    fn force(domain: u32, f_q: &[f32]) -> AppliedForce {
+        AppliedForce { owner: 1, id: 1, domain, surface: None, f_q: f_q.to_vec() }
+    }
+
+    #[test]
+    fn forces_add_up_per_coordinate() {
+        // Domains 0 to 2 have two coordinates each, and domain 3 none.
+        let model = four_domain_model();
+        let forces = [force(1, &[1.0, 2.0]), force(0, &[4.0, 8.0]), force(1, &[0.5, 0.25]), force(3, &[])];
+        assert_eq!(sum_forces(&model, &forces).expect("valid forces"), [4.0, 8.0, 1.5, 2.25, 0.0, 0.0]);
+        assert_eq!(sum_forces(&model, &[]).expect("no forces"), [0.0; 6]);
+    }
+
+    #[test]
+    fn forces_of_another_rank_are_rejected() {
+        let model = four_domain_model();
+        for invalid_force in [force(0, &[1.0]), force(4, &[]), force(3, &[1.0]), force(0, &[1.0, f32::INFINITY])] {
+            let error = sum_forces(&model, &[invalid_force]).expect_err("an invalid force").to_string();
+            assert!(error.contains("forces"), "{error}");
+        }
+    }
+}
