@@ -1,6 +1,7 @@
 //! Command line of `modalcast-report`, the program that `modalcast report` starts.
 
 mod render;
+mod stream;
 
 use std::path::PathBuf;
 
@@ -13,7 +14,7 @@ use modalcast::cli::options::with_spinner;
 use modalcast::cli::{EXIT_CODES, Outcome, finish, print_line};
 use modalcast_model::error::Result;
 
-/// Measures error against run time on this machine and writes tables and plots.
+/// Measures error against run time, and what reaches a client, on this machine. Writes tables and plots.
 #[derive(Debug, Parser)]
 #[command(name = "modalcast report", version, after_help = format!("{EXAMPLES}\n\n{EXIT_CODES}"))]
 struct Cli {
@@ -28,6 +29,12 @@ struct Cli {
 enum ReportCommand {
     Deform(DeformArgs),
     Render(render::Args),
+    Stream(stream::Args),
+    /// Runs as a child process of a report. The job is JSON.
+    #[command(hide = true)]
+    Peer {
+        job: String,
+    },
 }
 
 const EXAMPLES: &str = "Examples:
@@ -38,7 +45,8 @@ const EXAMPLES: &str = "Examples:
   modalcast report deform --out report --load c --load plants --variant 'cuda overlap'
   modalcast report deform --out report --scene path/to/finger
   modalcast report deform --out report --scene tree --trajectory path/to/record
-  modalcast report render --out report --quick";
+  modalcast report render --out report --quick
+  modalcast report stream --out report --quick";
 
 const LOADS: &str = "Loads:
   single-P-R          one domain of 2^P vertices and R modes (table 4.4 of the thesis: P is 14 to 22, R is 10 to 30)
@@ -102,6 +110,8 @@ pub fn run() -> u8 {
     finish(match &cli.report {
         Some(ReportCommand::Deform(args)) => run_deform(args),
         Some(ReportCommand::Render(args)) => render::run(args),
+        Some(ReportCommand::Stream(args)) => stream::run(args),
+        Some(ReportCommand::Peer { job }) => stream::run_peer(job),
         None => {
             Cli::command().print_help().ok(); // A closed stdout is no error.
             return 2; // The exit code of clap for invalid arguments.

@@ -1,5 +1,5 @@
 //! Benchmarks of error against run time for every variant of the deformation, on synthetic scenes or on a scene of the
-//! user. [`render`] does the same for the renderer.
+//! user. [`render`] does the same for the renderer, and [`stream`] measures what reaches a client.
 //!
 //! A workload (`load` in options and reports) is a scene to measure. A variant is one way to deform it: a backend, a
 //! storage type of U and further options. Validation comes before timing: a variant whose error exceeds its a-priori
@@ -27,10 +27,12 @@ mod markdown;
 mod markdown_table;
 pub mod memory_traffic;
 pub mod motion;
+mod output_files;
 pub mod plot;
 pub mod provenance;
 pub mod recorded_trajectory;
 pub mod render;
+pub mod stream;
 pub mod table;
 #[cfg(test)]
 mod testing;
@@ -51,6 +53,7 @@ use modalcast_model::deform::Backend;
 use modalcast_model::error::{Result, fault_in};
 use modalcast_model::load::{self, OpenedScene};
 use motion::WorkloadMotion;
+use output_files::write_files;
 use provenance::Provenance;
 use recorded_trajectory::RecordedTrajectory;
 use table::DeformRow;
@@ -389,9 +392,10 @@ impl DeformReport {
     }
 
     /// Writes `report.json`, `report.csv`, `report.md`, `report.svg` and `report.png` into a folder, which is created.
-    /// Each file is written under a temporary name and then renamed, so that files with the final names are complete.
+    ///
+    /// # Errors
+    /// `Fault` when a file cannot be written.
     pub fn write(&self, folder: &Path) -> Result<()> {
-        std::fs::create_dir_all(folder).map_err(fault_in("report"))?;
         let svg = plot::draw_svg(self);
         let files = [
             ("report.json", serde_json::to_vec_pretty(self).map_err(fault_in("report"))?),
@@ -400,13 +404,7 @@ impl DeformReport {
             ("report.png", plot::render_png(&svg)?),
             ("report.svg", svg.into_bytes()),
         ];
-        for (name, bytes) in files {
-            let (path, temporary_path) = (folder.join(name), folder.join(format!("{name}.part")));
-            std::fs::write(&temporary_path, bytes)
-                .and_then(|()| std::fs::rename(&temporary_path, path))
-                .map_err(fault_in("report"))?;
-        }
-        Ok(())
+        write_files(folder, files)
     }
 }
 

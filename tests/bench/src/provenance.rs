@@ -51,6 +51,11 @@ impl Provenance {
     }
 }
 
+/// UTC date and time of now, such as `2026-11-22T17:04:05Z`; empty if the program `date` is missing.
+pub fn utc_date() -> String {
+    run_program("date", &["-u", "+%Y-%m-%dT%H:%M:%SZ"]).unwrap_or_default()
+}
+
 /// Runs a program and returns its trimmed standard output; `None` when it cannot be started or fails.
 fn run_program(program: &str, arguments: &[&str]) -> Option<String> {
     let output = Command::new(program).args(arguments).output().ok().filter(|output| output.status.success())?;
@@ -73,6 +78,13 @@ mod tests {
         assert_eq!(run_program("no-such-program", &[]), None);
         assert_eq!(run_program("false", &[]), None);
         assert_eq!(run_program("echo", &["x"]).as_deref(), Some("x"));
+    }
+
+    #[test]
+    fn date_has_the_form_of_iso_8601() {
+        let form: String =
+            utc_date().chars().map(|letter| if letter.is_ascii_digit() { '0' } else { letter }).collect();
+        assert_eq!(form, "0000-00-00T00:00:00Z");
     }
 
     #[test]

@@ -1,0 +1,165 @@
+//! The cases of the report. Cases of one scene follow each other, because they share a server.
+
+use super::StreamReportOptions;
+use super::delay::DelayedStream;
+use super::rates::Viewers;
+use super::session::SceneSource;
+use super::viewer::Content;
+use crate::workloads::Size;
+
+/// The width and the height of the pictures of a quick report are divided by this number.
+const QUICK_DIVISOR: u32 = 4;
+
+/// One case.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Case {
+    /// The name states the full sizes; a quick report has smaller pictures.
+    pub(super) name: &'static str,
+    pub(super) scene: SceneSource,
+    pub(super) measurement: Measurement,
+}
+
+/// What a case measures.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Measurement {
+    /// Rate of viewers, or of steps without viewers.
+    Rate(Option<Viewers>),
+    /// Time from a step to its frame, over this number of steps.
+    FrameLatency(Content, u64),
+    /// Time from a step to its acknowledgement, over this number of steps.
+    AcknowledgementLatency(u64),
+    /// Vertices beside a plain TCP connection.
+    Socket,
+    /// Rate over a connection with a long round trip.
+    Delay(DelayedStream),
+    VertexEncodings,
+    PictureEncodings(Content),
+}
+
+/// The contents that several cases have.
+struct Contents {
+    png_1080p: Content,
+    png_720p: Content,
+    png_360p: Content,
+    raw_1080p: Content,
+}
+
+impl Contents {
+    fn of(size: Size) -> Self {
+        let divisor = match size {
+            Size::Full => 1,
+            Size::Quick => QUICK_DIVISOR,
+        };
+        let png = |width, height| Content::Png { width: width / divisor, height: height / divisor };
+        Self {
+            png_1080p: png(1920, 1080),
+            png_720p: png(1280, 720),
+            png_360p: png(640, 360),
+            raw_1080p: Content::Rgba { width: 1920 / divisor, height: 1080 / divisor },
+        }
+    }
+}
+
+/// Steps of the latency of frames and of acknowledgements.
+const fn latency_steps(size: Size) -> [u64; 2] {
+    match size {
+        Size::Full => [10_000, 2_000],
+        Size::Quick => [200, 200],
+    }
+}
+
+/// All cases. Scenes of a folder are included if the options name the folder.
+pub(super) fn all(options: &StreamReportOptions) -> Vec<Case> {
+    let contents = Contents::of(options.size);
+    let mut cases = tree_cases(&contents, options.size);
+    if options.scenes.is_some() {
+        cases.extend(repository_cases(&contents, options.size));
+    }
+    cases.push(Case { name: "grid-socket", scene: SceneSource::Grid, measurement: Measurement::Socket });
+    cases
+}
+
+fn tree_cases(contents: &Contents, size: Size) -> Vec<Case> {
+    let rate = |content, count, views| Measurement::Rate(Some(Viewers { content, count, views }));
+    let [frames, acknowledgements] = latency_steps(size);
+    let delayed_replies = |content| Measurement::Delay(DelayedStream::Replies(content));
+    let cases = [
+        ("tree-png-1080p", rate(contents.png_1080p, 1, 1)),
+        ("tree-png-720p", rate(contents.png_720p, 1, 1)),
+        ("tree-png-360p", rate(contents.png_360p, 1, 1)),
+        ("tree-raw-1080p", rate(contents.raw_1080p, 1, 1)),
+        ("tree-png-360p-8-viewers", rate(contents.png_360p, 8, 1)),
+        ("tree-png-360p-32-viewers", rate(contents.png_360p, 32, 1)),
+        ("tree-png-360p-32-viewers-4-views", rate(contents.png_360p, 32, 4)),
+        ("tree-vertices", rate(Content::Positions, 1, 1)),
+        ("tree-vertices-compact", rate(Content::CompactPositions, 1, 1)),
+        ("tree-steps", Measurement::Rate(None)),
+        ("tree-acknowledgements", Measurement::AcknowledgementLatency(acknowledgements)),
+        ("tree-latency", Measurement::FrameLatency(contents.png_1080p, frames)),
+        ("tree-socket", Measurement::Socket),
+        ("tree-delay-steps", Measurement::Delay(DelayedStream::Steps)),
+        ("tree-delay-vertices", delayed_replies(Content::Positions)),
+        ("tree-delay-png-1080p", delayed_replies(contents.png_1080p)),
+        ("tree-vertex-encodings", Measurement::VertexEncodings),
+        ("tree-picture-encodings", Measurement::PictureEncodings(contents.raw_1080p)),
+    ];
+    cases.map(|(name, measurement)| Case { name, scene: SceneSource::Tree, measurement }).into()
+}
+
+fn repository_cases(contents: &Contents, size: Size) -> Vec<Case> {
+    const ALMOND: SceneSource = SceneSource::Repository("plants/almond");
+    const BRIDGE: SceneSource = SceneSource::Repository("vega/simpleBridge");
+    let rate = |content| Measurement::Rate(Some(Viewers::one(content)));
+    let [frames, _] = latency_steps(size);
+    let cases = [
+        ("almond-png-1080p", ALMOND, rate(contents.png_1080p)),
+        ("almond-vertices", ALMOND, rate(Content::Positions)),
+        ("almond-vertices-compact", ALMOND, rate(Content::CompactPositions)),
+        ("almond-steps", ALMOND, Measurement::Rate(None)),
+        ("almond-latency", ALMOND, Measurement::FrameLatency(contents.png_1080p, frames)),
+        ("almond-vertex-encodings", ALMOND, Measurement::VertexEncodings),
+        ("almond-picture-encodings", ALMOND, Measurement::PictureEncodings(contents.raw_1080p)),
+        ("bridge-png-720p", BRIDGE, rate(contents.png_720p)),
+        ("bridge-vertices", BRIDGE, rate(Content::Positions)),
+        ("bridge-steps", BRIDGE, Measurement::Rate(None)),
+    ];
+    cases.map(|(name, scene, measurement)| Case { name, scene, measurement }).into()
+}
+
+/// Lines that describe the cases, for the help text.
+pub(crate) const CASE_HELP: &str = "Cases:
+  tree-png-1080p, tree-png-720p, tree-png-360p, tree-raw-1080p, tree-vertices, tree-vertices-compact
+                 frames or positions per second at one viewer
+  tree-png-360p-8-viewers, -32-viewers, -32-viewers-4-views
+                 frames per second at the slowest viewer
+  tree-steps, tree-acknowledgements
+                 steps per second without viewers, and the time from a step to its acknowledgement
+  tree-latency   time from a step to its PNG of 1920x1080, with a step every 16.7 ms
+  tree-socket, grid-socket
+                 positions beside a plain TCP connection; the grid has 1.5 M vertices
+  tree-delay-steps, tree-delay-vertices, tree-delay-png-1080p
+                 rates over a connection with a round trip of 50 ms
+  tree-vertex-encodings, tree-picture-encodings
+                 bytes, times and errors of encodings
+  almond-*, bridge-*
+                 scenes of --scenes: png, vertices, steps, and of the almond also latency and encodings";
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_are_unique_and_cases_of_a_scene_follow_each_other() {
+        let options =
+            StreamReportOptions { scenes: Some("data".into()), cases: vec![], steps: 1, repeat: 1, size: Size::Full };
+        let cases = all(&options);
+        for (index, case) in cases.iter().enumerate() {
+            assert!(cases[..index].iter().all(|other| other.name != case.name), "{}", case.name);
+        }
+        let mut scenes: Vec<&str> = cases.iter().map(|case| case.scene.name()).collect();
+        scenes.dedup();
+        assert_eq!(scenes, ["tree", "plants/almond", "vega/simpleBridge", "grid"]);
+        let without_folder = all(&StreamReportOptions { scenes: None, ..options });
+        assert!(without_folder.iter().all(|case| !matches!(case.scene, SceneSource::Repository(_))));
+    }
+}

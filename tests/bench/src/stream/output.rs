@@ -1,0 +1,205 @@
+//! Output files of a report: JSON, CSV, Markdown, and the plot as SVG and PNG.
+
+use std::path::Path;
+
+use super::delay::DelayResult;
+use super::latency::LatencyResult;
+use super::picture_encodings::PictureEncodingRow;
+use super::rates::RateResult;
+use super::socket::SocketComparison;
+use super::vertex_encodings::VertexEncodingRow;
+use super::{CaseReport, CaseResult, StreamReport, markdown, plot};
+use crate::output_files::write_files;
+use crate::plot::render_png;
+use modalcast_model::error::{Result, fault_in};
+
+/// Columns of `report.csv`. Every number of a case has a row of its own, with all data that describe the case.
+const COLUMNS: [&str; 14] = [
+    "case",
+    "variant",
+    "quantity",
+    "value",
+    "unit",
+    "scene",
+    "look",
+    "samples",
+    "shadow_map",
+    "server",
+    "machine",
+    "date",
+    "build",
+    "command",
+];
+
+/// One number of a case.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Quantity {
+    /// What the number is about, for cases with several variants: an encoding or a stage. Empty for others.
+    pub(super) variant: String,
+    pub(super) name: &'static str,
+    pub(super) value: f64,
+    pub(super) unit: &'static str,
+}
+
+fn quantity(name: &'static str, value: f64, unit: &'static str) -> Quantity {
+    Quantity { variant: String::new(), name, value, unit }
+}
+
+/// The same numbers for a variant.
+fn of_variant(variant: &str, quantities: impl IntoIterator<Item = Quantity>) -> Vec<Quantity> {
+    quantities.into_iter().map(|quantity| Quantity { variant: variant.to_owned(), ..quantity }).collect()
+}
+
+impl StreamReport {
+    /// Writes `report.json`, `report.csv`, `report.md`, `report.svg` and `report.png` into a folder, which is created.
+    ///
+    /// # Errors
+    /// `Fault` when a file cannot be written.
+    pub fn write(&self, folder: &Path) -> Result<()> {
+        let svg = plot::draw_svg(self);
+        let files = [
+            ("report.json", serde_json::to_vec_pretty(self).map_err(fault_in("report"))?),
+            ("report.csv", csv(&self.cases)?),
+            ("report.md", markdown::markdown(self).into_bytes()),
+            ("report.png", render_png(&svg)?),
+            ("report.svg", svg.into_bytes()),
+        ];
+        write_files(folder, files)
+    }
+}
+
+fn csv(cases: &[CaseReport]) -> Result<Vec<u8>> {
+    let mut writer = csv::Writer::from_writer(Vec::new());
+    writer.write_record(COLUMNS).map_err(fault_in("report"))?;
+    for case in cases {
+        for quantity in case.result.quantities() {
+            writer.write_record(csv_record(case, &quantity)).map_err(fault_in("report"))?;
+        }
+    }
+    writer.into_inner().map_err(fault_in("report"))
+}
+
+fn csv_record(case: &CaseReport, quantity: &Quantity) -> [String; COLUMNS.len()] {
+    let look = case.look.as_ref();
+    [
+        case.name.to_owned(),
+        quantity.variant.clone(),
+        quantity.name.to_owned(),
+        quantity.value.to_string(),
+        quantity.unit.to_owned(),
+        case.scene.to_owned(),
+        look.map_or_else(String::new, super::SceneLook::line),
+        look.map_or_else(String::new, |look| look.samples.to_string()),
+        look.and_then(|look| look.shadow_map).map_or_else(String::new, |side| side.to_string()),
+        case.server.clone(),
+        case.machine.clone(),
+        case.date.clone(),
+        case.build.to_owned(),
+        case.command.clone(),
+    ]
+}
+
+impl CaseResult {
+    /// All numbers of the result.
+    pub(super) fn quantities(&self) -> Vec<Quantity> {
+        match self {
+            Self::Rate(result) => rate_quantities(result),
+            Self::Latency(result) => latency_quantities(result),
+            Self::Socket(result) => socket_quantities(result),
+            Self::Delay(result) => delay_quantities(result),
+            Self::VertexEncodings(rows) => rows.iter().flat_map(vertex_quantities).collect(),
+            Self::PictureEncodings(rows) => rows.iter().flat_map(picture_quantities).collect(),
+        }
+    }
+}
+
+fn rate_quantities(result: &RateResult) -> Vec<Quantity> {
+    let mut quantities = vec![
+        quantity("rate", result.per_second, "1/s"),
+        quantity("steps", result.steps as f64, "1"),
+        quantity("viewers", result.viewers as f64, "1"),
+        quantity("views", result.views as f64, "1"),
+        quantity("rate of the physics process in this run", result.steps_per_second, "1/s"),
+        quantity("skipped steps", result.skipped as f64, "1"),
+        quantity("rate / rate of the slowest stage", result.of_slowest_stage, "1"),
+    ];
+    quantities.extend(result.reply_bytes.map(|bytes| quantity("reply", bytes, "B")));
+    quantities.extend(result.runs.iter().map(|rate| quantity("rate of one run", *rate, "1/s")));
+    for (view, stages) in result.stages_ms.iter().enumerate() {
+        for (stage, ms) in stages {
+            let variant = format!("view {view}: {stage}");
+            quantities.extend(of_variant(&variant, [quantity("median time", f64::from(*ms), "ms")]));
+        }
+    }
+    for rate in &result.stage_rates {
+        let numbers = [quantity("stage time", rate.ms, "ms"), quantity("stage rate", rate.per_second, "1/s")];
+        quantities.extend(of_variant(&format!("{} of {}", rate.stages, rate.resource), numbers));
+    }
+    quantities
+}
+
+fn latency_quantities(result: &LatencyResult) -> Vec<Quantity> {
+    let mut quantities = vec![
+        quantity("p50", result.p50_ms, "ms"),
+        quantity("p90", result.p90_ms, "ms"),
+        quantity("p99", result.p99_ms, "ms"),
+        quantity("max", result.max_ms, "ms"),
+        quantity("delayed steps", result.delayed_steps as f64, "1"),
+    ];
+    quantities = of_variant(&format!("{} to {}", result.from, result.to), quantities);
+    quantities.push(quantity("steps", result.steps as f64, "1"));
+    quantities.extend(result.period_ms.map(|ms| quantity("period", ms, "ms")));
+    quantities.extend(result.steps_per_second.map(|rate| quantity("rate of steps from memory", rate, "1/s")));
+    quantities
+}
+
+fn socket_quantities(result: &SocketComparison) -> Vec<Quantity> {
+    vec![
+        quantity("reply", result.reply_bytes as f64, "B"),
+        quantity("chunk", result.chunk_bytes as f64, "B"),
+        quantity("replies", result.replies as f64, "1"),
+        quantity("rate of the stream", result.stream_per_second, "1/s"),
+        quantity("rate of single requests", result.request_per_second, "1/s"),
+        quantity("rate of the socket", result.socket_per_second, "1/s"),
+        quantity("stream / socket", result.stream_of_socket, "1"),
+        quantity("single requests / socket", result.request_of_socket, "1"),
+        quantity("bandwidth of the stream", result.stream_bytes_per_second, "B/s"),
+        quantity("bandwidth of the socket", result.socket_bytes_per_second, "B/s"),
+    ]
+}
+
+fn delay_quantities(result: &DelayResult) -> Vec<Quantity> {
+    vec![
+        quantity("round trip", result.round_trip_ms as f64, "ms"),
+        quantity("steps", result.steps as f64, "1"),
+        quantity("bytes per step", result.bytes, "B"),
+        quantity("rate without a proxy", result.direct_per_second, "1/s"),
+        quantity("rate through a proxy without delay", result.undelayed_per_second, "1/s"),
+        quantity("rate with delay", result.delayed_per_second, "1/s"),
+        quantity("rate with delay / without", result.of_undelayed, "1"),
+    ]
+}
+
+fn vertex_quantities(row: &VertexEncodingRow) -> Vec<Quantity> {
+    let unit = row.error_unit();
+    let numbers = [
+        quantity("bytes", row.bytes as f64, "B"),
+        quantity("time to pack", row.pack_ms, "ms"),
+        quantity("time to decode", row.decode_ms, "ms"),
+        quantity("largest error", row.errors.largest, unit),
+        quantity("rms error", row.errors.rms, unit),
+        quantity("largest bound", row.errors.bound, unit),
+        quantity("largest error / bound", row.errors.of_bound, "1"),
+    ];
+    of_variant(&format!("{} {}", row.attribute, row.encoding), numbers)
+}
+
+fn picture_quantities(row: &PictureEncodingRow) -> Vec<Quantity> {
+    let numbers = [
+        quantity("bytes", row.bytes as f64, "B"),
+        quantity("time to encode", row.ms, "ms"),
+        quantity("largest error", row.largest_error, "level"),
+        quantity("rms error", row.rms_error, "level"),
+    ];
+    of_variant(&row.encoder, numbers)
+}

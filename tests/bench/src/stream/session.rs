@@ -1,0 +1,211 @@
+//! A server in its own process with one open scene, and a client of it.
+
+use std::cell::OnceCell;
+use std::ffi::OsString;
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+
+use modalcast_client::{Client, SceneInfo, ServerInfo};
+use serde::Serialize;
+use serde_json::Value;
+use tempfile::TempDir;
+use tokio::runtime::Runtime;
+
+use super::grid;
+use super::motion::Motion;
+use super::processes::{Process, Program, arguments};
+use super::{StreamReportOptions, peers};
+use modalcast_model::backend_settings::LookTable;
+use modalcast_model::error::{Error, Result, fault_in};
+use modalcast_model::load::{self, OpenedScene};
+
+/// The name of every scene on its server.
+pub(super) const SCENE: &str = "scene";
+
+/// The scene of a case.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum SceneSource {
+    /// The built-in tree.
+    Tree,
+    /// A scene in the folder `--scenes`.
+    Repository(&'static str),
+    /// A generated grid ([`grid`]), which is not drawn.
+    Grid,
+}
+
+impl SceneSource {
+    /// The name that clients open.
+    pub(super) const fn name(self) -> &'static str {
+        match self {
+            Self::Tree => "tree",
+            Self::Repository(path) => path,
+            Self::Grid => grid::NAME,
+        }
+    }
+}
+
+/// The look of a scene, from its settings.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct SceneLook {
+    /// The table `look` of the scene with all defaults.
+    pub look: Value,
+    /// Samples per pixel.
+    pub samples: u32,
+    /// Side of the shadow map in texels; `None` without shadows.
+    pub shadow_map: Option<u32>,
+}
+
+impl SceneLook {
+    fn of(source: &str) -> Result<Self> {
+        let OpenedScene { scene, backends } = load::open(source)?;
+        let settings = scene.look;
+        Ok(Self {
+            look: serde_json::to_value(LookTable { settings, raster: backends.raster }).map_err(fault_in("report"))?,
+            samples: settings.samples,
+            shadow_map: settings.shadow.map(|shadow| shadow.size),
+        })
+    }
+
+    /// The choices that determine the cost of a frame, in one line.
+    pub fn line(&self) -> String {
+        let text = |pointer: &str| match self.look.pointer(pointer) {
+            Some(Value::String(text)) => text.clone(),
+            Some(other) => other.to_string(),
+            None => "none".into(),
+        };
+        let shadow = self.shadow_map.map_or("no shadows".into(), |size| {
+            format!("{} shadow map of {size}x{size} fitted to {}", text("/shadow/method"), text("/shadow/fit"))
+        });
+        format!("{}, antialias {}, raster {}", shadow, text("/antialias"), text("/raster"))
+    }
+}
+
+/// A running server with one open scene.
+pub(super) struct Session {
+    pub(super) source: SceneSource,
+    pub(super) runtime: Runtime,
+    pub(super) client: Client,
+    pub(super) server_info: ServerInfo,
+    pub(super) scene_info: SceneInfo,
+    /// `None` for a scene that is not drawn.
+    pub(super) look: Option<SceneLook>,
+    pub(super) address: SocketAddr,
+    /// Folder in which `modalcast-sim` finds the force file of the scene.
+    files: PathBuf,
+    /// Steps per second of the physics process, if the server does not slow it down.
+    pub(super) physics_per_second: OnceCell<f64>,
+    /// Steps to send without computing them.
+    motion: OnceCell<Motion>,
+    server: Process,
+    /// The server's state, recorded motion, and generated scenes.
+    work: TempDir,
+}
+
+impl Session {
+    /// Starts a server and opens the scene.
+    ///
+    /// # Errors
+    /// `Fault` when the server fails; errors of loading the scene.
+    pub(super) fn open(source: SceneSource, options: &StreamReportOptions) -> Result<Self> {
+        let work = create_work_folder()?;
+        let (repository, look) = match source {
+            SceneSource::Tree => (None, Some(SceneLook::of(source.name())?)),
+            SceneSource::Repository(path) => {
+                let folder = options.scenes.clone().unwrap_or_default();
+                let look = SceneLook::of(&folder.join(path).to_string_lossy())?;
+                (Some(folder), Some(look))
+            }
+            SceneSource::Grid => {
+                grid::write(work.path(), grid::side(options.size))?;
+                (Some(work.path().to_owned()), None)
+            }
+        };
+        let mut server = start_server(work.path(), repository.as_deref(), look.is_some())?;
+        let url = server.wait_for("listening on ")?;
+        let address = url.trim_start_matches("http://").parse().map_err(fault_in("report"))?;
+        let runtime = peers::start_runtime()?;
+        let opened = runtime.block_on(async {
+            let client = Client::connect(&url).await?;
+            let (server_info, scene_info) =
+                (client.server_info().await?, client.open_scene(source.name(), SCENE).await?);
+            modalcast_client::Result::Ok((client, server_info, scene_info))
+        });
+        let (client, server_info, scene_info) =
+            opened.map_err(|error: modalcast_client::Error| server.failure(&error.to_string()))?;
+        Ok(Self {
+            source,
+            runtime,
+            client,
+            server_info,
+            scene_info,
+            look,
+            address,
+            files: repository.unwrap_or_default().join(source.name()),
+            physics_per_second: OnceCell::new(),
+            motion: OnceCell::new(),
+            server,
+            work,
+        })
+    }
+
+    /// The URL of the server.
+    pub(super) fn url(&self) -> String {
+        format!("http://{}", self.address)
+    }
+
+    /// Ends the session after an error of a case. If the server has ended, the error also contains its standard error.
+    pub(super) fn explain(mut self, error: Error) -> Error {
+        if self.server.has_ended() { self.server.failure(&error.to_string()) } else { error }
+    }
+
+    /// Starts `modalcast-sim` with further options.
+    ///
+    /// # Errors
+    /// Those of [`Process::start`].
+    pub(super) fn start_physics(&self, steps: u64, further_options: &[OsString]) -> Result<Process> {
+        let (url, steps) = (self.url(), steps.to_string());
+        let mut list = arguments([&"auto", &"--server", &url, &"--scene", &SCENE, &"--steps", &steps, &"--json"]);
+        list.extend(arguments([&"--files", &self.files]));
+        list.extend_from_slice(further_options);
+        Process::start(Program::Physics, &list)
+    }
+
+    /// Steps to send from memory: recorded ones of `modalcast-sim`, or generated ones for the grid.
+    ///
+    /// # Errors
+    /// `Fault` when the recording fails.
+    pub(super) fn motion(&self, steps: u64) -> Result<&Motion> {
+        if let Some(motion) = self.motion.get() {
+            return Ok(motion);
+        }
+        let description = self.runtime.block_on(self.client.describe(SCENE, &[])).map_err(fault_in("report"))?;
+        let motion = match self.source {
+            SceneSource::Grid => Motion::oscillation(&description, steps),
+            SceneSource::Tree | SceneSource::Repository(_) => {
+                let folder = self.work.path().join("record");
+                self.start_physics(steps, &arguments([&"--record", &folder]))?.finish::<Value>()?;
+                Motion::read(&folder, &description)?
+            }
+        };
+        Ok(self.motion.get_or_init(|| motion))
+    }
+}
+
+/// A folder in memory if the machine has one, because the server writes its state there.
+fn create_work_folder() -> Result<TempDir> {
+    let memory = Path::new("/dev/shm");
+    let in_memory = memory.is_dir().then(|| tempfile::tempdir_in(memory)).and_then(std::io::Result::ok);
+    in_memory.map_or_else(tempfile::tempdir, Ok).map_err(fault_in("report"))
+}
+
+fn start_server(work: &Path, repository: Option<&Path>, draws: bool) -> Result<Process> {
+    let state = work.join("state");
+    let mut list = arguments([&"serve", &"--listen", &"127.0.0.1:0", &"--state", &state]);
+    if let Some(repository) = repository {
+        list.extend(arguments([&"--scenes", &repository]));
+    }
+    if !draws {
+        list.extend(arguments([&"--renderer", &"off"]));
+    }
+    Process::start(Program::Server, &list)
+}

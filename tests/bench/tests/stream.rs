@@ -1,0 +1,80 @@
+//! The report `stream` as a program, with the other programs of the workspace. They are in the same folder if the tests
+//! of the workspace were built, or after `cargo build --workspace --bins`.
+
+use std::path::Path;
+use std::process::Command;
+
+use serde_json::Value;
+
+/// Runs a quick report of few steps. Returns the exit code and its output.
+fn run_report(folder: &Path, cases: &[&str]) -> (Option<i32>, String) {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_modalcast-report"));
+    command.args(["stream", "--quick", "--steps", "6", "--out"]).arg(folder);
+    cases.iter().for_each(|case| {
+        command.args(["--case", case]);
+    });
+    let output = command.output().expect("expected a run of the report");
+    let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
+    (output.status.code(), format!("{}{}", text(&output.stdout), text(&output.stderr)))
+}
+
+fn read(folder: &Path, name: &str) -> Vec<u8> {
+    std::fs::read(folder.join(name)).unwrap_or_else(|error| panic!("{name}: {error}"))
+}
+
+#[test]
+fn quick_report_is_complete_and_consistent() {
+    let folder = tempfile::tempdir().expect("expected a folder");
+    let cases = ["tree-vertices-compact", "tree-png-360p", "tree-socket"];
+    let (code, output) = run_report(folder.path(), &cases);
+    assert_eq!(code, Some(0), "{output}");
+    let report: Value = serde_json::from_slice(&read(folder.path(), "report.json")).expect("expected JSON");
+    assert_eq!(
+        (&report["missing"], &report["failed"], &report["full"]),
+        (&Value::Array(vec![]), &Value::Array(vec![]), &Value::Bool(false))
+    );
+    let case = |name: &str| {
+        let mut reports = report["cases"].as_array().expect("expected cases").iter();
+        reports.find(|case| case["name"] == name).cloned().unwrap_or_else(|| panic!("expected {name}"))
+    };
+    for name in cases {
+        let case = case(name);
+        assert_eq!((&case["look"]["samples"], &case["build"]), (&Value::from(4), &report["build"]), "{case}");
+        assert!(case["look"]["shadow_map"].as_u64().is_some_and(|side| side >= 16), "{case}");
+        for field in ["machine", "server", "date", "command"] {
+            assert!(case[field].as_str().is_some_and(|text| !text.is_empty()), "{field} of {case}");
+        }
+    }
+    let png = &case("tree-png-360p")["result"]["rate"];
+    assert_eq!((&png["content"], &png["steps"], &png["skipped"]), (&"PNG 160x90".into(), &6.into(), &0.into()));
+    let number = |value: &Value| value.as_f64().filter(|number| *number > 0.0).expect("expected a positive number");
+    let slowest = &png["stage_rates"][0];
+    assert!(
+        (number(&png["of_slowest_stage"]) - number(&png["per_second"]) / number(&slowest["per_second"])).abs() < 1e-9
+    );
+    for stage in ["draw", "shadow", "encode"] {
+        number(&png["stages_ms"][0][stage]);
+    }
+    // Both are positions of the same vertices: 12 bytes as f32, and about 6 bytes as 16-bit numbers.
+    let compact_bytes = number(&case("tree-vertices-compact")["result"]["rate"]["reply_bytes"]);
+    let socket = &case("tree-socket")["result"]["socket"];
+    let bytes = number(&socket["reply_bytes"]);
+    assert!((0.5 * bytes..0.6 * bytes).contains(&compact_bytes), "{compact_bytes} of {bytes}");
+    let quotient = number(&socket["stream_per_second"]) / number(&socket["socket_per_second"]);
+    assert!((number(&socket["stream_of_socket"]) - quotient).abs() < 1e-9 * quotient, "{socket}");
+    let csv = String::from_utf8(read(folder.path(), "report.csv")).expect("expected text");
+    let markdown = String::from_utf8(read(folder.path(), "report.md")).expect("expected text");
+    for name in cases {
+        assert!(csv.contains(&format!("\n{name},")) && markdown.contains(&format!("\n| {name} |")), "{name}");
+    }
+    assert!(String::from_utf8(read(folder.path(), "report.svg")).expect("expected text").contains("tree-png-360p"));
+    assert!(image::load_from_memory(&read(folder.path(), "report.png")).is_ok());
+}
+
+#[test]
+fn unknown_case_is_an_error_without_files() {
+    let folder = tempfile::tempdir().expect("expected a folder");
+    let (code, output) = run_report(folder.path(), &["tree-gif"]);
+    assert!(code == Some(3) && output.contains("tree-vertices-compact"), "{code:?} {output}");
+    assert!(!folder.path().join("report.json").exists());
+}
