@@ -69,7 +69,7 @@ async fn time_frames(url: &str, motion: &Motion, content: Content, steps: u64) -
     let (sender, viewer) = (connect(url).await?, connect(url).await?);
     let picture = viewer::picture(&viewer, SCENE, content, 0).await?;
     let picture = picture.ok_or_else(|| fault("report", "expected a picture"))?;
-    let request = FrameStreamRequest::new(SCENE, picture).max_replies(WARM_UP_STEPS + steps);
+    let request = FrameStreamRequest::new(SCENE, picture).max_steps(WARM_UP_STEPS + steps);
     let mut frames = viewer.stream_frames(&request).await.map_err(fault_in("report"))?;
     let mut writer = motion::open_writer(&sender, None).await?;
     let (mut times_ms, mut delayed_steps, mut start) = (Vec::new(), 0, Instant::now());

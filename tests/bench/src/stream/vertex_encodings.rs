@@ -222,7 +222,7 @@ struct StreamTimes {
 }
 
 async fn time_stream(client: &Client, motion: &Motion, steps: u64, case: (Attribute, Encoding)) -> Result<StreamTimes> {
-    let request = VertexStreamRequest::new(SCENE, selection(case)).max_replies(steps);
+    let request = VertexStreamRequest::new(SCENE, selection(case)).max_steps(steps);
     let mut vertices = client.stream_vertices(&request).await.map_err(fault_in("report"))?;
     let mut writer = motion::open_writer(client, None).await?;
     let (mut stages, mut decode_times_ms, mut bytes) = (StageSamples::default(), Vec::new(), 0);

@@ -188,7 +188,7 @@ async fn turned_camera(client: &Client, scene: &str, view: u32) -> Result<Camera
 async fn receive_frames(client: &Client, job: &ViewerJob, collector: &mut Collector) -> Result<()> {
     let picture = picture(client, &job.scene, job.content, job.view).await?;
     let picture = picture.ok_or_else(|| fault("viewer", "expected a picture"))?;
-    let request = FrameStreamRequest::new(&job.scene, picture).max_replies(job.replies);
+    let request = FrameStreamRequest::new(&job.scene, picture).max_steps(job.replies);
     let mut frames = client.stream_frames(&request).await.map_err(fault_in("viewer"))?;
     print_line("ready");
     while let Some(frame) = frames.next().await {
@@ -199,7 +199,7 @@ async fn receive_frames(client: &Client, job: &ViewerJob, collector: &mut Collec
 }
 
 async fn receive_positions(client: &Client, job: &ViewerJob, collector: &mut Collector) -> Result<()> {
-    let request = VertexStreamRequest::new(&job.scene, job.content.vertex_selection()).max_replies(job.replies);
+    let request = VertexStreamRequest::new(&job.scene, job.content.vertex_selection()).max_steps(job.replies);
     let mut vertices = client.stream_vertices(&request).await.map_err(fault_in("viewer"))?;
     print_line("ready");
     while let Some(set) = vertices.next().await {
