@@ -4,7 +4,7 @@
 use std::sync::Arc;
 
 use modalcast_client::{
-    Attribute, Client, Delivery, DomainArray, Error as ClientError, Reason, SceneDescription, SceneState, StateLayout,
+    Attribute, Client, Delivery, Error as ClientError, Reason, SceneDescription, SceneState, ShapeArray, StateLayout,
     StateStream, StateStreamRequest, StepRequest, VertexSelection, VertexStreamRequest,
 };
 use modalcast_proto::v1;
@@ -43,7 +43,7 @@ struct Deformer {
 
 impl Deformer {
     async fn fetch(client: &Client, scene: &str) -> Self {
-        let arrays = [DomainArray::RestPositions];
+        let arrays = [ShapeArray::RestPositions];
         let description = client.describe(scene, &arrays).await.expect("expected a description");
         let mut modes = Vec::new();
         for domain in &description.domains {
@@ -55,7 +55,7 @@ impl Deformer {
     /// x = T (x0 + U q) of all vertices of a domain: three numbers each, in f64.
     fn positions(&self, state: &SceneState, domain: usize) -> Vec<f64> {
         let (q, matrix) = (state.q(domain).expect("expected q"), state.transform(domain).expect("expected T"));
-        let rest_positions = &self.description.domains[domain].rest_positions;
+        let rest_positions = &self.description.shape_of(&self.description.domains[domain]).rest_positions;
         let displacement = |row: usize| -> f64 {
             let entries = &self.modes[domain][row * q.len()..][..q.len()];
             entries.iter().zip(q).map(|(entry, q)| f64::from(*entry) * f64::from(*q)).sum()

@@ -140,7 +140,7 @@ pub struct Texture {
 }
 
 /// A scene, and the shapes, materials and textures of the described domains, each once.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub struct SceneDescription {
     pub info: v1::SceneInfo,
     pub shapes: Vec<Shape>,

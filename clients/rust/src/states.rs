@@ -439,7 +439,8 @@ mod tests {
             Domain { follow: follow(1), shares_q_with: Some(0), ..domain(2, 2) },
         ];
         let info = v1::SceneInfo { domains: 3, ..Default::default() };
-        StateLayout::new(&SceneDescription { info, domains }).expect("a valid description")
+        StateLayout::new(&SceneDescription { info, domains, ..SceneDescription::default() })
+            .expect("a valid description")
     }
 
     fn decoder() -> StateDecoder<v1::GetStateResponse> {
@@ -522,7 +523,7 @@ mod tests {
     fn layout_needs_all_domains_and_earlier_leaders() {
         let description = |domains: Vec<Domain>| {
             let info = v1::SceneInfo { domains: 1, ..Default::default() };
-            StateLayout::new(&SceneDescription { info, domains })
+            StateLayout::new(&SceneDescription { info, domains, ..SceneDescription::default() })
         };
         assert!(description(vec![Domain::default()]).is_ok());
         assert!(description(vec![]).is_err());

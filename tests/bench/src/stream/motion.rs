@@ -136,14 +136,14 @@ pub(super) async fn measure_rate(client: &Client, motion: &Motion, steps: u64) -
 #[cfg(test)]
 mod tests {
     use super::*;
+    use modalcast_client::Domain;
     use modalcast_client::npy::Writer;
-    use modalcast_client::{Domain, SceneInfo};
 
     /// Domains of 2, 2 (shared with the first) and 1 coordinates.
     fn description() -> SceneDescription {
         let domain = |index, rank, shares_q_with| Domain { index, rank, shares_q_with, ..Domain::default() };
         let domains = vec![domain(0, 2, None), domain(1, 2, Some(0)), domain(2, 1, None)];
-        SceneDescription { info: SceneInfo::default(), domains }
+        SceneDescription { domains, ..SceneDescription::default() }
     }
 
     fn write_rows(path: &Path, shape: &[usize], rows: &[Vec<f32>]) {

@@ -149,6 +149,7 @@ mod tests {
             device: String::new(),
             renderer: String::new(),
             is_software_renderer: software,
+            features: vec![],
             limits: Default::default(),
         }
     }
