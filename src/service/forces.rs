@@ -42,7 +42,7 @@ impl v1::force_service_server::ForceService for ForceServiceImpl {
         let request = request.into_inner();
         let scene_handle = self.0.find(&request.scene).map_err(to_status)?;
         let delivery = parse_stream_delivery(v1::Delivery::Latest.into(), request.max_hz).map_err(to_status)?;
-        let subscription = scene_handle.subscribe_to_forces(delivery).map_err(to_status)?;
+        let subscription = ForceSubscription::new(scene_handle, delivery).map_err(to_status)?;
         Ok(respond(move |reply_sender| {
             deadline.enforce("the stream of forces", send_reports(subscription, reply_sender))
         }))

@@ -5,6 +5,7 @@ use std::time::{Duration, Instant};
 
 use tokio::sync::watch;
 
+use super::delivery::StreamDelivery;
 use super::forces::{AppliedForce, ForceChannel, ForceSet};
 use super::handle::SceneHandle;
 use crate::engine::blocking::run_blocking;
@@ -37,15 +38,14 @@ pub struct ForceSubscription {
 }
 
 impl ForceSubscription {
+    /// Subscribes to the forces of a scene, at the rate of `delivery`.
+    ///
     /// # Errors
     /// `LimitReached` when the scene has too many readers.
-    pub(super) fn new(
-        scene_handle: Arc<SceneHandle>,
-        channel: Arc<ForceChannel>,
-        states: watch::Receiver<Arc<SceneState>>,
-        min_interval: Option<Duration>,
-    ) -> Result<Self> {
-        let sets = channel.subscribe()?;
+    pub fn new(scene_handle: Arc<SceneHandle>, delivery: StreamDelivery) -> Result<Self> {
+        let channel = Arc::clone(scene_handle.force_channel());
+        let (sets, states) = (channel.subscribe()?, scene_handle.watch_state());
+        let min_interval = delivery.min_interval();
         Ok(Self { scene_handle, channel, sets, states, min_interval, next_report_at: None, reported_forces: None })
     }
 

@@ -8,7 +8,6 @@ use tokio::sync::{Notify, OnceCell, mpsc, oneshot, watch};
 
 use super::actor::{ActorParams, SceneActor, SceneServices};
 use super::delivery::StreamDelivery;
-use super::force_subscription::ForceSubscription;
 use super::forces::{ForceChannel, ForceUpdate};
 use super::lease::{AcquiredLease, LeaseRequest, LeaseToken, WriterLease};
 use super::message::{Message, StepRequest, StepSelector};
@@ -184,17 +183,13 @@ impl SceneHandle {
         self.force_channel().apply(update)
     }
 
-    /// Subscribes to the forces of the scene, at the rate of `delivery`. Only the newest forces are delivered.
-    ///
-    /// # Errors
-    /// `LimitReached` when the scene has too many readers.
-    pub fn subscribe_to_forces(self: &Arc<Self>, delivery: StreamDelivery) -> Result<ForceSubscription> {
-        let (channel, states) = (Arc::clone(self.force_channel()), self.current_state.clone());
-        ForceSubscription::new(Arc::clone(self), channel, states, delivery.min_interval())
+    pub(super) fn force_channel(&self) -> &Arc<ForceChannel> {
+        self.forces.get_or_init(Arc::default)
     }
 
-    fn force_channel(&self) -> &Arc<ForceChannel> {
-        self.forces.get_or_init(Arc::default)
+    /// A receiver of the state of every completed step, and before the first one of the present state.
+    pub(super) fn watch_state(&self) -> watch::Receiver<Arc<SceneState>> {
+        self.current_state.clone()
     }
 
     /// Waits until the scene has ended and returns the error. Cancel-safe.
