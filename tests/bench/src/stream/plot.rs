@@ -75,7 +75,7 @@ fn draw_bars(svg: &mut String, top: f64, rates: &[(&str, &RateResult)]) {
             y + 21.0
         );
         let number_x = left + bar_width.max(stage_x - left) + 8.0;
-        write_text(svg, (number_x, y + 15.0), TEXT_STYLE, &format!("{:.0}", result.per_second));
+        write_text(svg, (number_x, y + 15.0), TEXT_STYLE, &format!("{:.1}", result.per_second));
     }
 }
 
@@ -97,11 +97,12 @@ fn encoding_panels(report: &StreamReport) -> Vec<(String, Vec<&VertexEncodingRow
 
 /// Draws the errors of encodings against their times. The error of f32 is 0, which is drawn at the lower end.
 fn draw_encodings(svg: &mut String, corner: (f64, f64), title: &str, rows: &[&VertexEncodingRow]) {
-    let point = |row: &&'_ VertexEncodingRow| (row.encoding, 1e3 * (row.pack_ms + row.decode_ms), row.errors.largest);
-    let points = rows.iter().map(point).map(|(name, time_us, error)| Point {
+    let names: Vec<String> =
+        rows.iter().map(|row| format!("{}, {} kB", row.encoding, row.bytes.div_ceil(1000))).collect();
+    let points = rows.iter().zip(&names).map(|(row, name)| Point {
         name,
-        time_us,
-        error,
+        time_us: 1e3 * (row.pack_ms + row.decode_ms),
+        error: row.errors.largest,
         is_filled: true,
         is_candidate: true,
     });
@@ -109,7 +110,7 @@ fn draw_encodings(svg: &mut String, corner: (f64, f64), title: &str, rows: &[&Ve
     let error_label = format!("largest error, {unit}");
     let labels = ["time to pack and to decode", error_label.as_str()];
     let marker_style = |name: &str| MarkerStyle {
-        color: COLORS[rows.iter().position(|row| row.encoding == name).unwrap_or(0) % COLORS.len()],
+        color: COLORS[names.iter().position(|other| other == name).unwrap_or(0) % COLORS.len()],
         backend: Backend::Cpu,
         color_reuse: 0,
     };

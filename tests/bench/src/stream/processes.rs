@@ -222,6 +222,17 @@ mod tests {
         assert!(error.contains("got 'text'"), "{error}");
     }
 
+    /// Linux kills the process as it does when the report itself is killed.
+    #[test]
+    fn process_ends_with_the_thread_that_started_it() {
+        let mut process = std::thread::spawn(|| shell("sleep 1000")).join().expect("expected no panic");
+        let deadline = Instant::now() + Duration::from_secs(60);
+        while !process.has_ended() {
+            assert!(Instant::now() < deadline, "expected the end of the process");
+            std::thread::sleep(Duration::from_millis(5));
+        }
+    }
+
     #[test]
     fn dropping_kills_the_process() {
         let process = shell("echo ready; sleep 1000");
