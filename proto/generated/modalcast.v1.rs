@@ -142,6 +142,8 @@ pub enum Reason {
     LeaseLost = 18,
     /// NOT_FOUND: no content has the requested SHA-256.
     ContentNotFound = 19,
+    /// NOT_FOUND: no running frame stream has this id, or the stream has ended.
+    StreamNotFound = 20,
 }
 impl Reason {
     /// String value of the enum field names used in the ProtoBuf definition.
@@ -170,6 +172,7 @@ impl Reason {
             Self::Internal => "REASON_INTERNAL",
             Self::LeaseLost => "REASON_LEASE_LOST",
             Self::ContentNotFound => "REASON_CONTENT_NOT_FOUND",
+            Self::StreamNotFound => "REASON_STREAM_NOT_FOUND",
         }
     }
     /// Creates an enum from field names used in the ProtoBuf definition.
@@ -195,6 +198,7 @@ impl Reason {
             "REASON_INTERNAL" => Some(Self::Internal),
             "REASON_LEASE_LOST" => Some(Self::LeaseLost),
             "REASON_CONTENT_NOT_FOUND" => Some(Self::ContentNotFound),
+            "REASON_STREAM_NOT_FOUND" => Some(Self::StreamNotFound),
             _ => None,
         }
     }
@@ -2183,7 +2187,8 @@ pub struct StreamFramesRequest {
     /// has had a step.
     #[prost(enumeration = "Delivery", tag = "3")]
     pub delivery: i32,
-    /// Number of steps after which the stream ends; 0: no limit.
+    /// Number of steps after which the stream ends; 0: no limit. A step that is sent again because of a moved camera counts
+    /// again.
     #[prost(uint64, tag = "4")]
     pub steps: u64,
     /// Maximum number of steps per second, finite and above 0; 0: no limit. The steps that are sent are the newest ones, and
@@ -2222,6 +2227,35 @@ pub struct FrameStreamSettings {
     /// server fits them to the scene, and `largest` remains 0 if it is fitted to each frame.
     #[prost(message, repeated, tag = "4")]
     pub pictures: ::prost::alloc::vec::Vec<Picture>,
+    /// 16 random bytes that identify the stream in UpdateFrameStream. Everybody who knows them can move the cameras, and
+    /// the server tells them to nobody else.
+    #[prost(bytes = "bytes", tag = "5")]
+    pub stream: ::prost::bytes::Bytes,
+}
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct UpdateFrameStreamRequest {
+    /// FrameStreamSettings.stream. REASON_STREAM_NOT_FOUND if no stream has this id or the stream has ended.
+    #[prost(bytes = "bytes", tag = "1")]
+    pub stream: ::prost::bytes::Bytes,
+    /// The pictures whose cameras change, each once; at least one. The others keep their cameras.
+    #[prost(message, repeated, tag = "2")]
+    pub cameras: ::prost::alloc::vec::Vec<PictureCamera>,
+}
+/// A new camera of a picture of a stream.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct PictureCamera {
+    /// Index of the picture in the request of the stream, from 0.
+    #[prost(uint32, tag = "1")]
+    pub picture: u32,
+    /// Unset: a camera that frames the scene's rest bounds.
+    #[prost(message, optional, tag = "2")]
+    pub camera: ::core::option::Option<Camera>,
+}
+#[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct UpdateFrameStreamResponse {
+    /// All frames of the stream with this FrameHead.camera_version or a larger one show the update.
+    #[prost(uint64, tag = "1")]
+    pub camera_version: u64,
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct FrameChunk {
@@ -2248,7 +2282,8 @@ pub struct FrameHead {
     /// Size of the encoded frame in bytes.
     #[prost(uint64, tag = "5")]
     pub total: u64,
-    /// Steps skipped since the previous step of this stream; 0 for all pictures of a step but the first.
+    /// Steps skipped since the previous step of this stream; 0 for all pictures of a step but the first, and for a step
+    /// that is sent again because of a moved camera.
     #[prost(uint64, tag = "6")]
     pub skipped: u64,
     #[prost(message, repeated, tag = "7")]
@@ -2262,6 +2297,9 @@ pub struct FrameHead {
     /// Index of the frame's picture in the request, from 0.
     #[prost(uint32, tag = "10")]
     pub picture: u32,
+    /// Number of updates of the stream's cameras that the frame shows; 0 before the first one and in RenderFrame.
+    #[prost(uint64, tag = "11")]
+    pub camera_version: u64,
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct PickRequest {
@@ -2631,6 +2669,35 @@ pub mod frame_service_client {
                 .insert(GrpcMethod::new("modalcast.v1.FrameService", "StreamFrames"));
             self.inner.server_streaming(req, path, codec).await
         }
+        /// Moves cameras of a running stream. The next frames show them. If no step arrives, the stream sends the current step
+        /// again with the moved cameras, also if its delivery is lossless; before the first step it sends the rest state.
+        /// Updates in quick succession are merged. Unary, so that browsers can call it over grpc-web.
+        pub async fn update_frame_stream(
+            &mut self,
+            request: impl tonic::IntoRequest<super::UpdateFrameStreamRequest>,
+        ) -> std::result::Result<
+            tonic::Response<super::UpdateFrameStreamResponse>,
+            tonic::Status,
+        > {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = tonic_prost::ProstCodec::default();
+            let path = http::uri::PathAndQuery::from_static(
+                "/modalcast.v1.FrameService/UpdateFrameStream",
+            );
+            let mut req = request.into_request();
+            req.extensions_mut()
+                .insert(
+                    GrpcMethod::new("modalcast.v1.FrameService", "UpdateFrameStream"),
+                );
+            self.inner.unary(req, path, codec).await
+        }
         /// Returns the point on the deformed surface at the center of each pixel of a small rectangle, with the data that a
         /// client needs to apply a force at that point. The first message has the head and the first hits. Further hits follow
         /// in messages of at most about 1 MiB.
@@ -2703,6 +2770,16 @@ pub mod frame_service_server {
             request: tonic::Request<super::StreamFramesRequest>,
         ) -> std::result::Result<
             tonic::Response<Self::StreamFramesStream>,
+            tonic::Status,
+        >;
+        /// Moves cameras of a running stream. The next frames show them. If no step arrives, the stream sends the current step
+        /// again with the moved cameras, also if its delivery is lossless; before the first step it sends the rest state.
+        /// Updates in quick succession are merged. Unary, so that browsers can call it over grpc-web.
+        async fn update_frame_stream(
+            &self,
+            request: tonic::Request<super::UpdateFrameStreamRequest>,
+        ) -> std::result::Result<
+            tonic::Response<super::UpdateFrameStreamResponse>,
             tonic::Status,
         >;
         /// Server streaming response type for the Pick method.
@@ -2884,6 +2961,52 @@ pub mod frame_service_server {
                                 max_encoding_message_size,
                             );
                         let res = grpc.server_streaming(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                "/modalcast.v1.FrameService/UpdateFrameStream" => {
+                    #[allow(non_camel_case_types)]
+                    struct UpdateFrameStreamSvc<T: FrameService>(pub Arc<T>);
+                    impl<
+                        T: FrameService,
+                    > tonic::server::UnaryService<super::UpdateFrameStreamRequest>
+                    for UpdateFrameStreamSvc<T> {
+                        type Response = super::UpdateFrameStreamResponse;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::Response>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<super::UpdateFrameStreamRequest>,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as FrameService>::update_frame_stream(&inner, request)
+                                    .await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = UpdateFrameStreamSvc(inner);
+                        let codec = tonic_prost::ProstCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.unary(method, req).await;
                         Ok(res)
                     };
                     Box::pin(fut)

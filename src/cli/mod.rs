@@ -77,7 +77,7 @@ pub fn finish(outcome: Outcome) -> u8 {
 fn exit_code(error: &Error) -> u8 {
     match error {
         Error::Invalid { .. } | Error::InvalidFile { .. } | Error::UnexpectedMessage { .. } => 3,
-        Error::NotFound { .. } | Error::ContentNotFound { .. } | Error::StepPassed { .. } => 4,
+        Error::NotFound { .. } | Error::ContentNotFound { .. } | Error::StreamNotFound | Error::StepPassed { .. } => 4,
         Error::NameTaken { .. }
         | Error::LeaseTaken { .. }
         | Error::LeaseLost { .. }

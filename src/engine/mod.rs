@@ -27,12 +27,15 @@ pub use output::pack::{Attribute, Origins, PackedVertices, Section, VertexSelect
 pub use output::pick_result::{PickResult, resolve_picks};
 pub use output::rendered_picture::{Pixels, RenderedPicture};
 pub use output::state_packing::{PackedState, StateContent, StateSection, pack_state};
-pub use output::step_output::{FrameOutput, ModalHit, OutputBody, OutputSpec, PictureSpec, StepId, StepOutput};
+pub use output::step_output::{
+    FrameOutput, ModalHit, OutputBody, OutputSpec, PictureSpec, StepFrames, StepId, StepOutput,
+};
 pub use output::vertex_encoding::Encoding;
 pub use scene::delivery::{Delivery, StreamDelivery};
 pub use scene::encoded_subscription::EncodedSubscription;
 pub use scene::force_subscription::{ForceReport, ForceSubscription};
 pub use scene::forces::{AppliedForce, Force, ForceKind, ForceOwner, ForceUpdate, check_force_count};
+pub use scene::frame_stream::{CameraControl, FrameStreamEntry, FrameStreamRegistration, StreamId};
 pub use scene::handle::{SceneHandle, WriterSession};
 pub use scene::lease::{InitialState, LeaseRequest, LeaseToken};
 pub use scene::message::StepSelector;
@@ -59,6 +62,7 @@ use self::device::handle::DeviceThread;
 use self::lock::lock;
 use self::registry::Registry;
 use self::scene::actor::SceneServices;
+use self::scene::frame_stream::FrameStreamRegistry;
 use self::scene::handle::OpenParams;
 use self::storage::checkpoint_store::CheckpointStore;
 use self::storage::run_counter::RunCounter;
@@ -86,6 +90,7 @@ struct Shared {
     encoder: FrameEncoder,
     services: SceneServices,
     registry: Registry,
+    frame_streams: Arc<FrameStreamRegistry>,
     load_permits: Semaphore,
     upload_permits: Arc<Semaphore>,
     next_scene_id: AtomicU64,
@@ -139,6 +144,7 @@ impl Engine {
         let shared = Shared {
             services: SceneServices { device: handle, checkpoints, run_counter, config: Arc::clone(&config) },
             registry: Registry::new(config.open_scenes),
+            frame_streams: Arc::default(),
             config,
             source,
             info,
@@ -198,6 +204,22 @@ impl Engine {
     pub fn find(&self, name: &str) -> Result<Arc<SceneHandle>> {
         self.check_running()?;
         self.shared.registry.find(name)
+    }
+
+    /// Registers a frame stream, so that its cameras can be moved until the registration is dropped.
+    ///
+    /// # Errors
+    /// `Fault` when the operating system returns no random bytes.
+    pub fn register_frame_stream(&self, entry: FrameStreamEntry) -> Result<FrameStreamRegistration> {
+        self.shared.frame_streams.register(entry)
+    }
+
+    /// The running frame stream with this id.
+    ///
+    /// # Errors
+    /// `StreamNotFound` when there is none.
+    pub fn find_frame_stream(&self, id: StreamId) -> Result<Arc<FrameStreamEntry>> {
+        self.shared.frame_streams.find(id)
     }
 
     /// All open scenes, sorted by name.

@@ -21,6 +21,9 @@ pub enum Error {
     /// No content has the hash that the caller named. `what` describes the contents that were searched.
     #[error("{field}: expected the SHA-256 of an existing {what}, got {sha256}")]
     ContentNotFound { field: String, what: &'static str, sha256: String },
+    /// No running frame stream has the id that the caller sent. The stream may have ended.
+    #[error("no running frame stream has this id")]
+    StreamNotFound,
     /// Another scene has the name. `owner` is the source of that scene.
     #[error("the scene name '{name}' belongs to '{owner}'")]
     NameTaken { name: String, owner: String },

@@ -229,12 +229,39 @@ fn parse_picture(engine: &Engine, scene: &Scene, picture: v1::Picture) -> Result
         let expected = format!("1 to {max_side} pixels per side, or 0 x 0 for 1280 x 720");
         return Err(invalid("width", expected, format!("{width} x {height}")));
     }
-    let fit_to_scene = Camera::fit_to_scene(scene, width, height);
-    let camera = match picture.camera {
-        None => fit_to_scene,
-        Some(camera) => camera::parse_camera(fit_to_scene, camera)?,
-    };
-    Ok(RequestedPicture { spec: PictureSpec { camera, size: FrameSize::new(width, height), output }, format })
+    let size = FrameSize::new(width, height);
+    let camera = parse_picture_camera(scene, size, picture.camera)?;
+    Ok(RequestedPicture { spec: PictureSpec { camera, size, output }, format })
+}
+
+/// Validates the camera of a picture. An unset camera is fitted to the scene.
+fn parse_picture_camera(scene: &Scene, size: FrameSize, camera: Option<v1::Camera>) -> Result<Camera> {
+    let fit_to_scene = Camera::fit_to_scene(scene, size.width, size.height);
+    camera.map_or(Ok(fit_to_scene), |camera| camera::parse_camera(fit_to_scene, camera))
+}
+
+/// Validates new cameras of a stream's pictures. Returns the index of each picture with its camera.
+pub(super) fn parse_moved_cameras(
+    scene: &Scene,
+    pictures: &[PictureSpec],
+    cameras: Vec<v1::PictureCamera>,
+) -> Result<Vec<(usize, Camera)>> {
+    if cameras.is_empty() {
+        return Err(invalid("cameras", "at least one camera", "none"));
+    }
+    let mut moved_cameras = Vec::<(usize, Camera)>::with_capacity(cameras.len().min(pictures.len()));
+    for (position, v1::PictureCamera { picture: index, camera }) in cameras.into_iter().enumerate() {
+        let picture = pictures.get(index as usize);
+        let is_repeated = moved_cameras.iter().any(|(moved_index, _)| *moved_index == index as usize);
+        let Some(picture) = picture.filter(|_| !is_repeated) else {
+            let expected = format!("an index below {}, each once", pictures.len());
+            return Err(invalid(format!("cameras[{position}].picture"), expected, index));
+        };
+        let camera = parse_picture_camera(scene, picture.size, camera)
+            .map_err(|error| error.in_message(&format!("cameras[{position}]")))?;
+        moved_cameras.push((index as usize, camera));
+    }
+    Ok(moved_cameras)
 }
 
 /// Validates a pick request. Returns an [`OutputSpec::Pick`].

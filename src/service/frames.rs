@@ -1,19 +1,26 @@
-//! `FrameService`: single frames with a deadline, frame streams and picks. Every frame names its step and is sent in
+//! `FrameService`: single frames with a deadline, frame streams with movable cameras, and picks. Every frame names its step and is sent in
 //! chunks.
 
+use std::sync::Arc;
+
+use bytes::Bytes;
 use modalcast_proto::v1;
 use tonic::{Request, Response, Status};
 use v1::render_frame_response::Part as SinglePart;
 use v1::stream_frames_response::Part as StreamPart;
 
 use super::convert::{
-    RequestedPicture, describe_step_selector, parse_pictures, parse_step_selector, parse_stream_delivery,
-    wire_delivery, wire_format, wire_picture, wire_raster_backend, wire_stages, wire_step_id,
+    RequestedPicture, describe_step_selector, parse_moved_cameras, parse_pictures, parse_step_selector,
+    parse_stream_delivery, wire_delivery, wire_format, wire_picture, wire_raster_backend, wire_stages, wire_step_id,
 };
 use super::picks;
 use super::status::to_status;
 use super::stream::{Deadline, ReplySender, ReplyStream, chunks_with_head, respond};
-use crate::engine::{EncodedFrame, EncodedSubscription, Engine, OutputSpec, StepPicture, StreamDelivery};
+use crate::engine::{
+    EncodedFrame, EncodedSubscription, Engine, FrameStreamEntry, FrameStreamRegistration, OutputSpec, StepPicture,
+    StreamDelivery, StreamId,
+};
+use modalcast_model::error::fault;
 
 /// Implementation of `FrameService`.
 pub(super) struct FrameServiceImpl(pub(super) Engine);
@@ -56,6 +63,18 @@ impl v1::frame_service_server::FrameService for FrameServiceImpl {
         picks::respond_to_pick(&self.0, deadline, request.into_inner())
     }
 
+    async fn update_frame_stream(
+        &self,
+        request: Request<v1::UpdateFrameStreamRequest>,
+    ) -> Result<Response<v1::UpdateFrameStreamResponse>, Status> {
+        let v1::UpdateFrameStreamRequest { stream, cameras } = request.into_inner();
+        let id = StreamId::parse("stream", &stream).map_err(to_status)?;
+        let FrameStreamEntry { scene, cameras: camera_control } = &*self.0.find_frame_stream(id).map_err(to_status)?;
+        let moved_cameras = parse_moved_cameras(scene, &camera_control.pictures(), cameras).map_err(to_status)?;
+        let camera_version = camera_control.move_cameras(&moved_cameras);
+        Ok(Response::new(v1::UpdateFrameStreamResponse { camera_version }))
+    }
+
     type StreamFramesStream = ReplyStream<v1::StreamFramesResponse>;
 
     async fn stream_frames(
@@ -69,16 +88,26 @@ impl v1::frame_service_server::FrameService for FrameServiceImpl {
         let delivery = parse_stream_delivery(request.delivery, request.max_hz).map_err(to_status)?;
         // Subscribe before the response headers are sent, so that a client can rely on receiving the next step.
         let subscription = scene_handle.subscribe(output_spec(&pictures), delivery).await.map_err(to_status)?;
+        let cameras = subscription.cameras().cloned().ok_or_else(|| to_status(fault("frames", "expected cameras")))?;
+        let entry = FrameStreamEntry { scene: Arc::clone(&scene_handle.scene), cameras };
+        let registration = self.0.register_frame_stream(entry).map_err(to_status)?;
         let formats = pictures.iter().map(|picture| picture.format).collect();
         let frames = EncodedSubscription::new(subscription, self.0.encoder().clone(), formats, request.steps);
-        let frame_stream =
-            FrameStream { pictures, delivery, max_steps: request.steps, max_chunk_bytes: self.0.config().chunk_bytes };
+        let frame_stream = FrameStream {
+            registration,
+            pictures,
+            delivery,
+            max_steps: request.steps,
+            max_chunk_bytes: self.0.config().chunk_bytes,
+        };
         Ok(respond(move |reply_sender| deadline.enforce("the frame stream", frame_stream.run(frames, reply_sender))))
     }
 }
 
 /// Parameters of a frame stream.
 struct FrameStream {
+    /// Ends with this stream.
+    registration: FrameStreamRegistration,
     pictures: Vec<RequestedPicture>,
     delivery: StreamDelivery,
     /// Number of steps to send. 0 means no limit.
@@ -119,6 +148,7 @@ impl FrameStream {
             max_hz: self.delivery.max_hz(),
             steps: self.max_steps,
             pictures: self.pictures.iter().map(wire_picture).collect(),
+            stream: Bytes::copy_from_slice(self.registration.id.as_bytes()),
         }
     }
 }
@@ -129,7 +159,7 @@ fn output_spec(pictures: &[RequestedPicture]) -> OutputSpec {
 
 /// Splits a frame into chunks, of which the first has the head.
 fn frame_chunks(
-    EncodedFrame { picture: picture_index, output: frame }: &EncodedFrame,
+    EncodedFrame { picture: picture_index, camera_version, output: frame }: &EncodedFrame,
     picture: &RequestedPicture,
     max_chunk_bytes: usize,
 ) -> impl Iterator<Item = v1::FrameChunk> + use<> {
@@ -144,6 +174,7 @@ fn frame_chunks(
         shadow_drawn_by: wire_raster_backend(frame.raster_backends.shadow).into(),
         visibility_drawn_by: wire_raster_backend(frame.raster_backends.visibility).into(),
         picture: *picture_index,
+        camera_version: *camera_version,
     };
     chunks_with_head(head, frame.bytes.clone(), max_chunk_bytes, |head, offset, data| v1::FrameChunk {
         head,

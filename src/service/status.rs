@@ -53,6 +53,10 @@ impl ErrorReport {
         Self { field: field.into(), ..self }
     }
 
+    fn with_retry_delay(self, delay: Duration) -> Self {
+        Self { retry_delay: Some(delay), ..self }
+    }
+
     fn with_metadata<const N: usize>(self, metadata: [(&'static str, String); N]) -> Self {
         Self { metadata: metadata.into(), ..self }
     }
@@ -77,6 +81,9 @@ impl ErrorReport {
                 let expected = format!("the SHA-256 of an existing {what}");
                 Self::new(Code::NotFound, Reason::ContentNotFound, expected, sha256).with_field(field)
             }
+            Error::StreamNotFound => {
+                Self::new(Code::NotFound, Reason::StreamNotFound, "the id of a running frame stream", "another id")
+            }
             Error::NameTaken { name, owner } => {
                 let given = format!("'{name}', which belongs to '{owner}'");
                 Self::new(Code::AlreadyExists, Reason::SceneNameTaken, "a free scene name", given)
@@ -94,9 +101,9 @@ impl ErrorReport {
                 Self::new(Code::ResourceExhausted, Reason::WindowFull, expected, given.to_string())
             }
             Error::Busy { queue, limit } => {
-                let report = Self::new(Code::ResourceExhausted, Reason::QueueFull, "capacity", "a full queue")
-                    .with_metadata([("queue", queue.into()), ("limit", limit.to_string())]);
-                Self { retry_delay: Some(QUEUE_RETRY_DELAY), ..report }
+                Self::new(Code::ResourceExhausted, Reason::QueueFull, "capacity", "a full queue")
+                    .with_metadata([("queue", queue.into()), ("limit", limit.to_string())])
+                    .with_retry_delay(QUEUE_RETRY_DELAY)
             }
             Error::LimitReached { objects, limit } => {
                 let expected = format!("at most {limit} {objects}");
@@ -115,10 +122,8 @@ impl ErrorReport {
             Error::Unavailable { what, reason, remedy } => {
                 Self::new(Code::Unavailable, Reason::ResourceMissing, what, reason).with_metadata([("remedy", remedy)])
             }
-            Error::ShuttingDown => {
-                let report = Self::new(Code::Unavailable, Reason::ShuttingDown, "a running server", "a shutdown");
-                Self { retry_delay: Some(RESTART_RETRY_DELAY), ..report }
-            }
+            Error::ShuttingDown => Self::new(Code::Unavailable, Reason::ShuttingDown, "a running server", "a shutdown")
+                .with_retry_delay(RESTART_RETRY_DELAY),
             Error::DeviceLost { stage, reason } => {
                 let given = format!("{stage}: {reason}");
                 Self::new(Code::Unavailable, Reason::DeviceLost, "a restart of the server", given)

@@ -16,6 +16,7 @@ mod import_cycles;
 mod invalid_input;
 mod layering;
 mod light;
+mod moved_cameras;
 mod normals;
 mod picks;
 mod pictures;

@@ -106,6 +106,7 @@ async fn first_reply_has_the_settings_in_effect() {
     let request = FrameStreamRequest::new("strips", Picture::default()).max_steps(7);
     let frames = client.stream_frames(&request).await.expect("expected a subscription");
     let settings = frames.settings();
+    assert_eq!(settings.stream.len(), 16);
     assert_eq!((settings.delivery(), settings.max_hz, settings.steps), (v1::Delivery::Lossless, 0.0, 7));
     let camera = Camera::fit_to_scene(&strips(), 1280, 720);
     let (View::LookAt { eye, target, up }, Lens::FieldOfView(degrees)) = (camera.view, camera.lens) else {

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use modalcast::config::{BackendChoice, Config, RendererChoice};
 use modalcast::engine::{
-    Delivery, DeviceContext, FrameOutput, OutputBody, OutputSpec, PictureSpec, Pixels, StepOutput,
+    Delivery, DeviceContext, FrameOutput, OutputBody, OutputSpec, PictureSpec, Pixels, StepFrames, StepOutput,
 };
 use modalcast_model::backend_settings::BackendSettings;
 use modalcast_model::scene::{Camera, FrameSize, Lens};
@@ -62,8 +62,8 @@ fn reference_images(cameras: &[Camera]) -> Vec<StepImages> {
 }
 
 fn frame_bytes(output: &StepOutput) -> &[u8] {
-    let OutputBody::Frames(pictures) = &output.body else { panic!("expected frames") };
-    let Pixels::Color(rgba) = &pictures[0].pixels else { panic!("expected a color picture") };
+    let OutputBody::Frames(frames) = &output.body else { panic!("expected frames") };
+    let Pixels::Color(rgba) = &frames.pictures[0].pixels else { panic!("expected a color picture") };
     rgba
 }
 
@@ -157,7 +157,7 @@ async fn pictures_of_one_subscription_show_the_same_step() {
     for StepImages { step: number, images } in reference_images(&cameras) {
         let output = with_timeout(all_cameras.next()).await.expect("expected another output");
         assert_eq!((output.step.number, output.skipped), (number, 0));
-        let OutputBody::Frames(pictures) = output.body else { panic!("expected frames") };
+        let OutputBody::Frames(StepFrames { pictures, .. }) = output.body else { panic!("expected frames") };
         assert_eq!(pictures.len(), 6);
         for (picture, image) in pictures.iter().zip(&images) {
             let Pixels::Color(rgba) = &picture.pixels else { panic!("expected a color picture") };
@@ -165,9 +165,9 @@ async fn pictures_of_one_subscription_show_the_same_step() {
         }
         assert!(matches!(pictures[5].pixels, Pixels::Values(_)));
         let output = with_timeout(last_camera.next()).await.expect("expected another output");
-        let OutputBody::Frames(single_picture) = output.body else { panic!("expected frames") };
-        assert!(Arc::ptr_eq(&single_picture[0], &pictures[4]), "expected one drawing of step {number}");
-        assert!(!Arc::ptr_eq(&single_picture[0], &pictures[3]), "control: another camera");
+        let OutputBody::Frames(single) = output.body else { panic!("expected frames") };
+        assert!(Arc::ptr_eq(&single.pictures[0], &pictures[4]), "expected one drawing of step {number}");
+        assert!(!Arc::ptr_eq(&single.pictures[0], &pictures[3]), "control: another camera");
     }
     for _ in 0..STEPS {
         writer.receive_reply().await;

@@ -134,6 +134,8 @@ pub struct Frame {
     pub step: v1::StepId,
     /// Index of the frame's picture in the request.
     pub picture: usize,
+    /// Number of updates of the stream's cameras that the frame shows; 0 for a single request.
+    pub camera_version: u64,
     pub width: u32,
     pub height: u32,
     pub format: FrameFormat,
@@ -216,6 +218,25 @@ impl Client {
         let frames = DecodedReplies::new(messages, ChunkDecoder::new(stream_chunk, self.max_reply_bytes));
         Ok(FrameStream { settings, frames })
     }
+
+    /// Moves cameras of a running stream, each given by the index of its picture; `None` selects a camera that shows the
+    /// whole scene. `stream` is the id in [`FrameStream::settings`]. Returns the [`Frame::camera_version`] from which on
+    /// frames show the update. If the scene is static, the stream sends its current step again.
+    ///
+    /// # Errors
+    /// `Status` if the stream has ended or a camera is invalid; `Connect` if the connection is lost.
+    pub async fn update_frame_stream(&self, stream: &[u8], cameras: &[(u32, Option<Camera>)]) -> Result<u64> {
+        let to_wire = |(picture, camera): &(u32, Option<Camera>)| v1::PictureCamera {
+            picture: *picture,
+            camera: camera.map(Into::into),
+        };
+        let wire = v1::UpdateFrameStreamRequest {
+            stream: Bytes::copy_from_slice(stream),
+            cameras: cameras.iter().map(to_wire).collect(),
+        };
+        let reply = FrameServiceClient::new(self.channel.clone()).update_frame_stream(wire).await;
+        Ok(self.reply(reply)?.camera_version)
+    }
 }
 
 fn single_chunk(message: v1::RenderFrameResponse) -> Option<v1::FrameChunk> {
@@ -289,6 +310,7 @@ impl WireChunk for v1::FrameChunk {
         Ok(Frame {
             step,
             picture: head.picture as usize,
+            camera_version: head.camera_version,
             width: head.width,
             height: head.height,
             format,

@@ -10,7 +10,7 @@ use bytes::Bytes;
 use tokio::sync::Semaphore;
 
 use super::rendered_picture::{Pixels, RenderedPicture};
-use super::step_output::{OutputBody, StepId, StepOutput};
+use super::step_output::{OutputBody, StepFrames, StepId, StepOutput};
 use crate::engine::blocking::run_blocking;
 use crate::frame;
 use crate::telemetry::{Stage, StageTimes, ms_since};
@@ -61,6 +61,8 @@ pub struct StepPicture {
     pub stages: StageTimes,
     /// Index of the picture in the request.
     pub index: u32,
+    /// Number of updates of the cameras that the picture shows.
+    pub camera_version: u64,
     pub picture: Arc<RenderedPicture>,
 }
 
@@ -70,14 +72,16 @@ impl StepPicture {
     /// # Errors
     /// `Fault` when `output` has no frames.
     pub fn of_output(output: StepOutput) -> Result<impl Iterator<Item = Self>> {
-        let StepOutput { step, skipped, stages, body: OutputBody::Frames(pictures), .. } = output else {
+        let StepOutput { step, skipped, stages, body: OutputBody::Frames(frames), .. } = output else {
             return Err(fault("encode", "expected frames, got another output"));
         };
+        let StepFrames { pictures, camera_version } = frames;
         let separate = move |(picture, index)| Self {
             step,
             skipped: if index == 0 { skipped } else { 0 },
             stages: stages.clone(),
             index,
+            camera_version,
             picture,
         };
         Ok(pictures.into_iter().zip(0..).map(separate))
@@ -89,6 +93,8 @@ impl StepPicture {
 pub struct EncodedFrame {
     /// Index of the picture in the request.
     pub picture: u32,
+    /// Number of updates of the cameras that the frame shows.
+    pub camera_version: u64,
     pub output: EncodedOutput,
 }
 
@@ -112,7 +118,7 @@ impl FrameEncoder {
     /// # Errors
     /// `Fault` when the encoder fails.
     pub async fn encode(&self, step_picture: StepPicture, format: FrameFormat) -> Result<EncodedFrame> {
-        let StepPicture { step, skipped, mut stages, index, picture } = step_picture;
+        let StepPicture { step, skipped, mut stages, index, camera_version, picture } = step_picture;
         stages.extend(picture.stages.iter().copied());
         let bytes = match (&picture.pixels, format) {
             (Pixels::Color(rgba), FrameFormat::Rgba) => rgba.clone(),
@@ -124,7 +130,7 @@ impl FrameEncoder {
             }
         };
         let output = EncodedOutput { step, skipped, stages, raster_backends: picture.raster_backends, bytes };
-        Ok(EncodedFrame { picture: index, output })
+        Ok(EncodedFrame { picture: index, camera_version, output })
     }
 
     /// Returns the encoding of a picture and the milliseconds that encoding took. The first caller encodes the picture.
@@ -187,7 +193,7 @@ pub(in crate::engine) mod tests {
             raster_backends: RasterBackends::default(),
         };
         let step = StepId { run: 1, number, time: 0.0 };
-        let body = OutputBody::Frames(vec![Arc::new(image.into())]);
+        let body = OutputBody::Frames(StepFrames { pictures: vec![Arc::new(image.into())], camera_version: 0 });
         StepOutput { step, skipped: 0, stages: vec![], origins: None, body }
     }
 

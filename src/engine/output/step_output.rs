@@ -77,11 +77,19 @@ impl StepId {
 /// The content of an output.
 #[derive(Debug, Clone)]
 pub enum OutputBody {
-    /// One per picture of the [`OutputSpec`], in the same order.
-    Frames(Vec<Arc<RenderedPicture>>),
+    Frames(StepFrames),
     Vertices(Arc<DeformedSurface>),
     Pick(Vec<ModalHit>),
     State(Arc<SceneState>),
+}
+
+/// All pictures of one step.
+#[derive(Debug, Clone)]
+pub struct StepFrames {
+    /// One per picture of the [`OutputSpec`], in the same order.
+    pub pictures: Vec<Arc<RenderedPicture>>,
+    /// Number of updates of the cameras that the pictures show; 0 for a single request.
+    pub camera_version: u64,
 }
 
 /// The output of one step for one [`OutputSpec`].

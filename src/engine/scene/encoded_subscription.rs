@@ -121,7 +121,7 @@ mod tests {
     use super::super::subscriber::Subscriber;
     use super::*;
     use crate::engine::output::frame_encoder::tests::{noise_frame, paused_encoder};
-    use crate::engine::output::step_output::{OutputBody, OutputSpec};
+    use crate::engine::output::step_output::{OutputBody, OutputSpec, StepFrames};
     use modalcast_model::deform::VertexAttributes;
 
     /// Limit of an [`EncodedSubscription`] that takes all steps.
@@ -197,9 +197,9 @@ mod tests {
         for number in 0..MAX_LATEST_STEPS as u64 {
             poll_without_frame(&mut frames).await;
             let output = noise_frame(number, 16);
-            let OutputBody::Frames(mut pictures) = output.body else { panic!("expected frames") };
-            pictures.push(Arc::clone(&pictures[0]));
-            send_frame(&subscriber, StepOutput { skipped: 5, body: OutputBody::Frames(pictures), ..output });
+            let OutputBody::Frames(mut frames) = output.body else { panic!("expected frames") };
+            frames.pictures.push(Arc::clone(&frames.pictures[0]));
+            send_frame(&subscriber, StepOutput { skipped: 5, body: OutputBody::Frames(frames), ..output });
         }
         poll_without_frame(&mut frames).await;
         assert!(frames.encodings.len() == 2 * MAX_LATEST_STEPS && !subscriber.has_credit());
@@ -228,7 +228,7 @@ mod tests {
             times: modalcast_render::FrameTimes::default(),
             raster_backends: modalcast_render::RasterBackends::default(),
         };
-        let body = OutputBody::Frames(vec![Arc::new(large_image.into())]);
+        let body = OutputBody::Frames(StepFrames { pictures: vec![Arc::new(large_image.into())], camera_version: 0 });
         let large_frame = StepOutput { body, ..noise_frame(0, 1) };
         send_frame(&subscriber, large_frame);
         send_frame(&subscriber, noise_frame(1, 4));

@@ -7,6 +7,7 @@ pub(super) mod delivery;
 pub(super) mod encoded_subscription;
 pub(super) mod force_subscription;
 pub(super) mod forces;
+pub(super) mod frame_stream;
 pub(super) mod handle;
 pub(super) mod lease;
 pub(super) mod message;

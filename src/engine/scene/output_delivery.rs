@@ -9,6 +9,7 @@ use std::time::{Duration, Instant};
 
 use super::current_step::CurrentStep;
 use super::delivery::Delivery;
+use super::frame_stream::CameraState;
 use super::message::{StepRequest, StepSelector};
 use super::readback_queue::{PendingFrames, PendingReadback, PictureRecipient, ReadbackQueue, Recipient};
 use super::step_queue::CompletedStep;
@@ -18,7 +19,7 @@ use crate::engine::device::command::{CopiedVertices, SceneId};
 use crate::engine::device::handle::{DeviceHandle, PendingReply};
 use crate::engine::output::pick_result::with_transforms;
 use crate::engine::output::rendered_picture::RenderedPicture;
-use crate::engine::output::step_output::{FrameOutput, OutputBody, OutputSpec, PictureSpec, StepOutput};
+use crate::engine::output::step_output::{FrameOutput, OutputBody, OutputSpec, PictureSpec, StepFrames, StepOutput};
 use crate::telemetry::Stage;
 use modalcast_model::deform::{DeformedSurface, VertexAttributes};
 use modalcast_model::error::{Error, Result};
@@ -275,11 +276,14 @@ impl OutputProducer {
     /// Delivers the current step to one subscriber, or starts the delivery. Returns false if the subscriber must be
     /// dropped.
     async fn serve(&mut self, subscriber: &mut Subscriber, round: &mut DeliveryRound<'_>) -> bool {
-        if subscriber.delivered_step_count == round.current.step_count {
+        let is_new_step = subscriber.delivered_step_count < round.current.step_count;
+        // The frame of a queued step will show a moved camera, too.
+        let redraws = !round.mode.overlaps_next_step && subscriber.has_moved_camera();
+        if !is_new_step && !redraws {
             return true;
         }
         if !subscriber.has_credit() {
-            return self.check_stall(subscriber, round.mode);
+            return !is_new_step || self.check_stall(subscriber, round.mode);
         }
         // `round.attributes` lacks the attributes of a subscriber that received its credit after the round had begun.
         let is_covered = |attributes: VertexAttributes| round.attributes.contains(attributes);
@@ -287,9 +291,8 @@ impl OutputProducer {
             round.vertex_recipients.push(Recipient::take_credit_of(subscriber, round.current));
             return true;
         }
-        if let OutputSpec::Frames(pictures) = &subscriber.spec {
-            let pictures = Arc::clone(pictures);
-            self.start_frames(subscriber, &pictures, round).await;
+        if let Some(cameras) = subscriber.take_pictures() {
+            self.start_frames(subscriber, &cameras, round).await;
             return true;
         }
         self.serve_now(subscriber, round).await
@@ -300,15 +303,15 @@ impl OutputProducer {
     async fn start_frames(
         &mut self,
         subscriber: &mut Subscriber,
-        pictures: &[PictureSpec],
+        cameras: &CameraState,
         round: &mut DeliveryRound<'_>,
     ) {
-        if pictures.iter().all(|picture| picture.output != FrameOutput::Color) {
+        if cameras.pictures.iter().all(|picture| picture.output != FrameOutput::Color) {
             // Results arrive in the order of the steps, and the result of this step is not delivered asynchronously.
             self.readbacks.flush_for(subscriber).await;
         }
-        let frames = PendingFrames::new(Recipient::take_credit_of(subscriber, round.current), pictures.len());
-        for (index, picture) in pictures.iter().enumerate() {
+        let frames = PendingFrames::new(Recipient::take_credit_of(subscriber, round.current), cameras);
+        for (index, picture) in cameras.pictures.iter().enumerate() {
             self.start_picture(picture, frames.picture(index), round).await;
         }
     }
@@ -381,7 +384,9 @@ impl OutputProducer {
     ) -> Result<StepOutput> {
         let mut stages = current.stages.clone();
         let body = match spec {
-            OutputSpec::Frames(pictures) => OutputBody::Frames(self.draw_all(pictures).await?),
+            OutputSpec::Frames(pictures) => {
+                OutputBody::Frames(StepFrames { pictures: self.draw_all(pictures).await?, camera_version: 0 })
+            }
             OutputSpec::Pick { camera, picture, rectangle } => {
                 let hits = self.device.pick(self.scene_on_device.id, *camera, *picture, *rectangle).await?;
                 OutputBody::Pick(with_transforms(&current.state, &self.scene_on_device.scene, hits))
@@ -581,10 +586,10 @@ mod tests {
         let ((), early_frame_width) = tokio::join!(deliver, draw);
         let mut received = Vec::new();
         for subscription in [&mut slow_subscription, &mut fast_subscription] {
-            while let Ok(Ok(StepOutput { step, body: OutputBody::Frames(pictures), .. })) =
+            while let Ok(Ok(StepOutput { step, body: OutputBody::Frames(frames), .. })) =
                 timeout(Duration::ZERO, subscription.next()).await
             {
-                received.push(ReceivedFrame { width: pictures[0].width, step: step.number });
+                received.push(ReceivedFrame { width: frames.pictures[0].width, step: step.number });
             }
         }
         ServedFrames { early_frame_width, received }
@@ -635,10 +640,34 @@ mod tests {
         let mut received_widths = Vec::new();
         for mut subscription in subscriptions {
             let output = timeout(Duration::from_secs(10), subscription.next()).await.expect("expected a frame in time");
-            let Ok(StepOutput { body: OutputBody::Frames(pictures), .. }) = output else { panic!("expected frames") };
-            received_widths.push(pictures[0].width);
+            let Ok(StepOutput { body: OutputBody::Frames(frames), .. }) = output else { panic!("expected frames") };
+            received_widths.push(frames.pictures[0].width);
         }
         SharedFrames { drawn_count, received_widths }
+    }
+
+    /// A camera that moves after the frame of the current step is drawn again, unless another step is queued.
+    #[tokio::test]
+    async fn moved_camera_redraws_the_step_if_no_step_is_queued() {
+        for (mode, is_redrawn) in [(WITHOUT_NEXT_STEP, true), (WITH_NEXT_STEP, false)] {
+            let (subscriber, mut subscription) = subscribe(Delivery::Lossless, 16);
+            let cameras = subscription.cameras().expect("expected the cameras of frames").clone();
+            let (mut delivery, mut device) = delivery_to(vec![subscriber]);
+            let step = current_step(1);
+            for (camera_version, is_drawn) in [(0, true), (3, is_redrawn)] {
+                while camera_version > 0 && cameras.move_cameras(&[]) < camera_version {}
+                delivery.serve_subscribers(&step, mode).await;
+                let request = next_draw_request(&mut device, if is_drawn { 10_000 } else { 100 }).await;
+                assert_eq!(request.is_some(), is_drawn, "{mode:?}, version {camera_version}");
+                let Some(request) = request else { continue };
+                answer(request);
+                delivery.flush().await;
+                let output = subscription.next().await.expect("expected frames");
+                let OutputBody::Frames(frames) = output.body else { panic!("expected frames") };
+                let received = (output.step.number, output.skipped, frames.camera_version);
+                assert_eq!(received, (1, 0, camera_version), "{mode:?}");
+            }
+        }
     }
 
     #[tokio::test]

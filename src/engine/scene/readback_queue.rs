@@ -16,13 +16,14 @@ use std::collections::VecDeque;
 use std::sync::{Arc, Mutex};
 
 use super::current_step::CurrentStep;
+use super::frame_stream::CameraState;
 use super::step_queue::CompletedStep;
 use super::subscriber::{SendPermit, Subscriber};
 use crate::engine::device::command::CopiedVertices;
 use crate::engine::device::handle::PendingReply;
 use crate::engine::lock::lock;
 use crate::engine::output::rendered_picture::RenderedPicture;
-use crate::engine::output::step_output::{OutputBody, PictureSpec, StepId, StepOutput};
+use crate::engine::output::step_output::{OutputBody, PictureSpec, StepFrames, StepId, StepOutput};
 use crate::telemetry::{Stage, StageTimes};
 use modalcast_model::error::Result;
 use modalcast_model::scene::FloatingOrigins;
@@ -72,11 +73,18 @@ struct CollectedPictures {
     recipient: Option<Recipient>,
     /// In the order of the request; `None` for a picture that is not there yet.
     pictures: Vec<Option<Arc<RenderedPicture>>>,
+    camera_version: u64,
 }
 
 impl PendingFrames {
-    pub(super) fn new(recipient: Recipient, picture_count: usize) -> Self {
-        let collected = CollectedPictures { recipient: Some(recipient), pictures: vec![None; picture_count] };
+    /// Frames of the pictures in `cameras`, none of which is there yet.
+    pub(super) fn new(recipient: Recipient, cameras: &CameraState) -> Self {
+        let CameraState { pictures, camera_version } = cameras;
+        let collected = CollectedPictures {
+            recipient: Some(recipient),
+            pictures: vec![None; pictures.len()],
+            camera_version: *camera_version,
+        };
         Self(Arc::new(Mutex::new(collected)))
     }
 
@@ -107,7 +115,9 @@ impl PictureRecipient {
         if let Some(frames) = frames
             && let Some(recipient) = collected.recipient.take()
         {
-            recipient.send(frames.map(|pictures| (OutputBody::Frames(pictures), Vec::new())));
+            let camera_version = collected.camera_version;
+            recipient
+                .send(frames.map(|pictures| (OutputBody::Frames(StepFrames { pictures, camera_version }), Vec::new())));
         }
     }
 

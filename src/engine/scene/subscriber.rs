@@ -14,6 +14,7 @@ use std::time::{Duration, Instant};
 use tokio::sync::{Notify, mpsc, watch};
 
 use super::delivery::{Delivery, StreamDelivery};
+use super::frame_stream::{CameraControl, CameraState};
 use crate::engine::output::step_output::{OutputSpec, StepOutput};
 use modalcast_model::error::{Error, Result, fault};
 
@@ -38,6 +39,10 @@ pub(in crate::engine) struct Subscriber {
     pub delivered_step_count: u64,
     /// When this subscriber began to block the writer.
     pub stalled_since: Option<Instant>,
+    /// The pictures with their present cameras; `None` for other outputs than frames.
+    cameras: Option<watch::Receiver<CameraState>>,
+    /// The version of the cameras in this subscriber's last result.
+    delivered_camera_version: u64,
     /// Number of results that may be sent now. The subscription grants credits.
     credits: Arc<AtomicUsize>,
     results: mpsc::Sender<Result<StepOutput>>,
@@ -81,9 +86,25 @@ impl Subscriber {
         self.results.is_closed() || self.is_error_sent.load(Ordering::Acquire)
     }
 
-    /// Records the delivery of the scene's `step_count`-th step. Returns how many steps the subscriber has skipped.
+    /// Whether a camera has moved since the last result.
+    pub(in crate::engine) fn has_moved_camera(&self) -> bool {
+        let is_newer =
+            |cameras: &watch::Receiver<CameraState>| cameras.borrow().camera_version > self.delivered_camera_version;
+        self.cameras.as_ref().is_some_and(is_newer)
+    }
+
+    /// The pictures with their present cameras, whose version is recorded as delivered. `None` for other outputs than
+    /// frames.
+    pub(in crate::engine) fn take_pictures(&mut self) -> Option<CameraState> {
+        let state = self.cameras.as_ref()?.borrow().clone();
+        self.delivered_camera_version = state.camera_version;
+        Some(state)
+    }
+
+    /// Records the delivery of the scene's `step_count`-th step. Returns how many steps the subscriber has skipped. A
+    /// step may be delivered again with moved cameras.
     pub(in crate::engine) fn mark_delivered(&mut self, step_count: u64) -> u64 {
-        let skipped = step_count - self.delivered_step_count - 1;
+        let skipped = (step_count - self.delivered_step_count).saturating_sub(1);
         self.delivered_step_count = step_count;
         self.stalled_since = None;
         skipped
@@ -110,6 +131,7 @@ impl Subscriber {
 #[derive(Debug)]
 pub struct Subscription {
     delivery: StreamDelivery,
+    cameras: Option<CameraControl>,
     /// Whether a `Latest` subscription has granted a credit whose result was not received yet.
     has_granted_credit: bool,
     rate_limiter: Option<RateLimiter>,
@@ -131,11 +153,17 @@ impl Subscription {
         let credits = Arc::new(AtomicUsize::new(initial_credits));
         let (result_sender, results) = mpsc::channel(LOSSLESS_CREDITS);
         let (end_sender, end) = watch::channel(None);
+        let cameras = match &spec {
+            OutputSpec::Frames(pictures) => Some(CameraControl::new(Arc::clone(pictures), Arc::clone(&scene_wake))),
+            _ => None,
+        };
         let subscriber = Subscriber {
             spec,
             delivery: delivery.delivery(),
             delivered_step_count: 0,
             stalled_since: None,
+            cameras: cameras.as_ref().map(CameraControl::receiver),
+            delivered_camera_version: 0,
             credits: Arc::clone(&credits),
             results: result_sender,
             is_error_sent: Arc::default(),
@@ -144,13 +172,18 @@ impl Subscription {
         let rate_limiter =
             delivery.min_interval().map(|interval| RateLimiter { interval, next_credit: Instant::now() });
         let subscription =
-            Self { delivery, has_granted_credit: false, rate_limiter, credits, results, end, scene_wake };
+            Self { delivery, cameras, has_granted_credit: false, rate_limiter, credits, results, end, scene_wake };
         (subscriber, subscription)
     }
 
     /// Which steps the subscription receives, and the limit on their rate.
     pub const fn delivery(&self) -> StreamDelivery {
         self.delivery
+    }
+
+    /// Moves the cameras of a subscription to frames; `None` for other outputs.
+    pub const fn cameras(&self) -> Option<&CameraControl> {
+        self.cameras.as_ref()
     }
 
     /// Waits for the next result. Cancel-safe.

@@ -313,6 +313,13 @@ impl FrameService for FakeService {
         Err(Status::unimplemented("the fake server does not pick"))
     }
 
+    async fn update_frame_stream(
+        &self,
+        _: Request<v1::UpdateFrameStreamRequest>,
+    ) -> Result<Response<v1::UpdateFrameStreamResponse>, Status> {
+        Err(Status::unimplemented("the fake server does not move cameras"))
+    }
+
     type StreamFramesStream = ResponseStream<v1::StreamFramesResponse>;
 
     async fn stream_frames(
@@ -447,6 +454,7 @@ fn encode_frame(output: &StepOutput, picture: &v1::Picture, index: u32) -> Vec<v
         shadow_drawn_by: v1::DrawnBy::Unspecified.into(),
         visibility_drawn_by: v1::DrawnBy::Cuda.into(),
         picture: index,
+        camera_version: 0,
     });
     let chunk = |ByteChunk { offset, data, .. }| v1::FrameChunk { head: head.take(), offset, data };
     split_bytes(bytes).into_iter().map(chunk).collect()
