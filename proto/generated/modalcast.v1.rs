@@ -140,10 +140,10 @@ pub enum Reason {
     Internal = 17,
     /// ABORTED: another writer has taken over the lease of the scene, and the stream ends.
     LeaseLost = 18,
-    /// NOT_FOUND: no content has the requested SHA-256.
-    ContentNotFound = 19,
     /// NOT_FOUND: no running frame stream has this id, or the stream has ended.
-    StreamNotFound = 20,
+    StreamNotFound = 19,
+    /// NOT_FOUND: no content has the requested SHA-256.
+    ContentNotFound = 20,
 }
 impl Reason {
     /// String value of the enum field names used in the ProtoBuf definition.
@@ -171,8 +171,8 @@ impl Reason {
             Self::DeviceLost => "REASON_DEVICE_LOST",
             Self::Internal => "REASON_INTERNAL",
             Self::LeaseLost => "REASON_LEASE_LOST",
-            Self::ContentNotFound => "REASON_CONTENT_NOT_FOUND",
             Self::StreamNotFound => "REASON_STREAM_NOT_FOUND",
+            Self::ContentNotFound => "REASON_CONTENT_NOT_FOUND",
         }
     }
     /// Creates an enum from field names used in the ProtoBuf definition.
@@ -197,8 +197,8 @@ impl Reason {
             "REASON_DEVICE_LOST" => Some(Self::DeviceLost),
             "REASON_INTERNAL" => Some(Self::Internal),
             "REASON_LEASE_LOST" => Some(Self::LeaseLost),
-            "REASON_CONTENT_NOT_FOUND" => Some(Self::ContentNotFound),
             "REASON_STREAM_NOT_FOUND" => Some(Self::StreamNotFound),
+            "REASON_CONTENT_NOT_FOUND" => Some(Self::ContentNotFound),
             _ => None,
         }
     }
@@ -306,11 +306,28 @@ pub struct UploadFile {
     /// SHA-256 of the file's content, 32 bytes.
     #[prost(bytes = "bytes", tag = "3")]
     pub sha256: ::prost::bytes::Bytes,
+    /// The file has no chunks: the server copies the content from an uploaded scene (FindUploadedFiles) and verifies it.
+    /// Fails with REASON_CONTENT_NOT_FOUND if no uploaded scene has the content any more; the client can then upload the
+    /// scene again with the content. The size counts for UploadHeader.total_bytes.
+    #[prost(bool, tag = "4")]
+    pub reuse: bool,
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct UploadSceneResponse {
     #[prost(message, optional, tag = "1")]
     pub scene: ::core::option::Option<SceneInfo>,
+}
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct FindUploadedFilesRequest {
+    /// 1 to 4096 SHA-256 hashes of file contents, 32 bytes each.
+    #[prost(bytes = "bytes", repeated, tag = "1")]
+    pub sha256: ::prost::alloc::vec::Vec<::prost::bytes::Bytes>,
+}
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct FindUploadedFilesResponse {
+    /// For each hash, whether a file of an uploaded scene has this content. DeleteScene removes the files of its scene.
+    #[prost(bool, repeated, tag = "1")]
+    pub found: ::prost::alloc::vec::Vec<bool>,
 }
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct ListScenesRequest {}
@@ -855,6 +872,33 @@ pub mod scene_service_client {
                 .insert(GrpcMethod::new("modalcast.v1.SceneService", "UploadScene"));
             self.inner.client_streaming(req, path, codec).await
         }
+        /// Tells which file contents the server already has, so that a client need not send them (UploadFile.reuse).
+        pub async fn find_uploaded_files(
+            &mut self,
+            request: impl tonic::IntoRequest<super::FindUploadedFilesRequest>,
+        ) -> std::result::Result<
+            tonic::Response<super::FindUploadedFilesResponse>,
+            tonic::Status,
+        > {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = tonic_prost::ProstCodec::default();
+            let path = http::uri::PathAndQuery::from_static(
+                "/modalcast.v1.SceneService/FindUploadedFiles",
+            );
+            let mut req = request.into_request();
+            req.extensions_mut()
+                .insert(
+                    GrpcMethod::new("modalcast.v1.SceneService", "FindUploadedFiles"),
+                );
+            self.inner.unary(req, path, codec).await
+        }
         pub async fn list_scenes(
             &mut self,
             request: impl tonic::IntoRequest<super::ListScenesRequest>,
@@ -1012,6 +1056,14 @@ pub mod scene_service_server {
             request: tonic::Request<tonic::Streaming<super::UploadSceneRequest>>,
         ) -> std::result::Result<
             tonic::Response<super::UploadSceneResponse>,
+            tonic::Status,
+        >;
+        /// Tells which file contents the server already has, so that a client need not send them (UploadFile.reuse).
+        async fn find_uploaded_files(
+            &self,
+            request: tonic::Request<super::FindUploadedFilesRequest>,
+        ) -> std::result::Result<
+            tonic::Response<super::FindUploadedFilesResponse>,
             tonic::Status,
         >;
         async fn list_scenes(
@@ -1244,6 +1296,52 @@ pub mod scene_service_server {
                                 max_encoding_message_size,
                             );
                         let res = grpc.client_streaming(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                "/modalcast.v1.SceneService/FindUploadedFiles" => {
+                    #[allow(non_camel_case_types)]
+                    struct FindUploadedFilesSvc<T: SceneService>(pub Arc<T>);
+                    impl<
+                        T: SceneService,
+                    > tonic::server::UnaryService<super::FindUploadedFilesRequest>
+                    for FindUploadedFilesSvc<T> {
+                        type Response = super::FindUploadedFilesResponse;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::Response>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<super::FindUploadedFilesRequest>,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as SceneService>::find_uploaded_files(&inner, request)
+                                    .await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = FindUploadedFilesSvc(inner);
+                        let codec = tonic_prost::ProstCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.unary(method, req).await;
                         Ok(res)
                     };
                     Box::pin(fut)
@@ -4892,6 +4990,8 @@ pub enum Feature {
     Frames = 1,
     /// DescribeScene returns hashes, and ReadContent returns arrays and textures by their hashes.
     ContentHashes = 2,
+    /// FindUploadedFiles answers, and uploads accept UploadFile.reuse.
+    UploadReuse = 3,
 }
 impl Feature {
     /// String value of the enum field names used in the ProtoBuf definition.
@@ -4903,6 +5003,7 @@ impl Feature {
             Self::Unspecified => "FEATURE_UNSPECIFIED",
             Self::Frames => "FEATURE_FRAMES",
             Self::ContentHashes => "FEATURE_CONTENT_HASHES",
+            Self::UploadReuse => "FEATURE_UPLOAD_REUSE",
         }
     }
     /// Creates an enum from field names used in the ProtoBuf definition.
@@ -4911,6 +5012,7 @@ impl Feature {
             "FEATURE_UNSPECIFIED" => Some(Self::Unspecified),
             "FEATURE_FRAMES" => Some(Self::Frames),
             "FEATURE_CONTENT_HASHES" => Some(Self::ContentHashes),
+            "FEATURE_UPLOAD_REUSE" => Some(Self::UploadReuse),
             _ => None,
         }
     }

@@ -54,7 +54,7 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 
-use tokio::sync::Semaphore;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
 use self::blocking::run_blocking;
 use self::device::command::SceneId;
@@ -67,6 +67,7 @@ use self::scene::handle::OpenParams;
 use self::storage::checkpoint_store::CheckpointStore;
 use self::storage::run_counter::RunCounter;
 use self::storage::scene_catalog::SceneCatalog;
+use self::storage::upload::CompleteUpload;
 use crate::config::{Config, ValidatedConfig};
 use modalcast_model::error::{Error, Result, invalid};
 use modalcast_model::load::OpenedScene;
@@ -252,11 +253,29 @@ impl Engine {
             let expected = format!("at most {} bytes", config.upload_bytes);
             return Err(invalid("header.total_bytes", expected, header.total_bytes));
         }
-        self.shared.registry.check_name_free(&header.scene)?;
+        let permit = self.permit_upload(&header.scene)?;
+        let (upload_folder, hash_lists) = (self.shared.scene_catalog.uploads(), self.shared.scene_catalog.hash_lists());
+        run_blocking("upload", move || Upload::begin(&upload_folder, hash_lists, header, permit)).await
+    }
+
+    /// Checks that a scene with this name may be uploaded, and counts the upload until the permit is dropped.
+    fn permit_upload(&self, scene: &str) -> Result<OwnedSemaphorePermit> {
+        self.shared.registry.check_name_free(scene)?;
         let too_many_uploads = |_| Error::Busy { queue: "queue of uploads", limit: MAX_CONCURRENT_UPLOADS };
-        let permit = Arc::clone(&self.shared.upload_permits).try_acquire_owned().map_err(too_many_uploads)?;
-        let upload_folder = config.state.join("uploads");
-        run_blocking("upload", move || Upload::begin(&upload_folder, header, permit)).await
+        Arc::clone(&self.shared.upload_permits).try_acquire_owned().map_err(too_many_uploads)
+    }
+
+    /// For each hash, whether a file of an uploaded scene has this content.
+    ///
+    /// # Errors
+    /// `Fault` when the search panics.
+    pub async fn find_uploaded_files(&self, hashes: Vec<ContentHash>) -> Result<Vec<bool>> {
+        let hash_lists = self.shared.scene_catalog.hash_lists();
+        let find = move || {
+            let files = hash_lists.read();
+            Ok(hashes.iter().map(|hash| files.contains_key(hash)).collect())
+        };
+        run_blocking("upload", find).await
     }
 
     /// Opens a complete upload as a scene. On failure the uploaded files are removed.
@@ -265,15 +284,11 @@ impl Engine {
     /// `Invalid` naming the missing or malformed file; `NameTaken` when another scene was opened under the name since
     /// [`Self::begin_upload`].
     pub async fn finish_upload(&self, upload: Upload) -> Result<Arc<SceneHandle>> {
-        let check_upload = move || match upload.check_complete() {
-            Ok(()) => Ok(upload),
-            Err(error) => {
-                upload.discard();
-                Err(error)
-            }
-        };
-        let upload = run_blocking("upload", check_upload).await?;
-        let (name, entry) = (upload.header.scene.clone(), upload.header.entry.clone());
+        self.open_upload(run_blocking("upload", move || upload.finish()).await?).await
+    }
+
+    async fn open_upload(&self, upload: CompleteUpload) -> Result<Arc<SceneHandle>> {
+        let (name, entry) = (upload.scene.clone(), upload.entry.clone());
         self.open_once(name, SceneProvenance::Upload { entry }, Some(upload)).await
     }
 
@@ -353,7 +368,7 @@ impl Engine {
         &self,
         name: String,
         provenance: SceneProvenance,
-        upload: Option<Upload>,
+        upload: Option<CompleteUpload>,
     ) -> Result<Arc<SceneHandle>> {
         self.check_running()?;
         let engine = self.clone();
@@ -377,13 +392,18 @@ impl Engine {
         &self,
         name: String,
         provenance: SceneProvenance,
-        upload: Option<Upload>,
+        upload: Option<CompleteUpload>,
     ) -> Result<Arc<SceneHandle>> {
         let is_new_upload = upload.is_some();
         let result = self.load_scene(&name, &provenance, upload).await;
         if result.is_err() && is_new_upload {
             let upload_folder = self.shared.scene_catalog.upload_folder(&name);
-            run_blocking("upload", move || Ok(std::fs::remove_dir_all(upload_folder).ok())).await?;
+            let hash_lists = self.shared.scene_catalog.hash_lists();
+            let remove = move || {
+                hash_lists.remove(&name);
+                Ok(std::fs::remove_dir_all(upload_folder).ok())
+            };
+            run_blocking("upload", remove).await?;
         }
         result.map(Arc::new)
     }
@@ -393,7 +413,7 @@ impl Engine {
         &self,
         name: &str,
         provenance: &SceneProvenance,
-        upload: Option<Upload>,
+        upload: Option<CompleteUpload>,
     ) -> Result<SceneHandle> {
         let OpenedScene { scene, backends } = self.read_scene_files(name, provenance, upload).await?;
         let (engine, scene_name, shared_scene) = (self.clone(), name.to_owned(), Arc::clone(&scene));
@@ -448,7 +468,7 @@ impl Engine {
         &self,
         name: &str,
         provenance: &SceneProvenance,
-        upload: Option<Upload>,
+        upload: Option<CompleteUpload>,
     ) -> Result<OpenedScene> {
         let semaphore_closed = |_| Error::ShuttingDown;
         let _permit = self.shared.load_permits.acquire().await.map_err(semaphore_closed)?;
@@ -461,7 +481,7 @@ impl Engine {
                 if let Some(upload) = upload {
                     // A checkpoint of an older scene with this name does not apply to the new one.
                     engine.shared.services.checkpoints.remove(&scene_name);
-                    upload.commit(&upload_folder)?;
+                    upload.commit(&upload_folder, &engine.shared.scene_catalog.hash_lists())?;
                 }
                 source.open_within(&upload_folder, &entry)
             }
@@ -484,6 +504,7 @@ impl Engine {
             engine.shared.services.checkpoints.remove(&scene_name);
             // Fails for a scene of the repository, which has no such folder.
             std::fs::remove_dir_all(engine.shared.scene_catalog.upload_folder(&scene_name)).ok();
+            engine.shared.scene_catalog.hash_lists().remove(&scene_name);
             engine.shared.scene_catalog.remove(&scene_name)
         })
         .await;

@@ -1,11 +1,12 @@
 //! Conversions between wire messages and engine types. `wire_` functions create messages, `parse_` functions read them.
 //! Numbers from the wire are untrusted until a constructor of `modalcast_model::scene` has validated them.
 
+use bytes::Bytes;
 use modalcast_proto::v1;
 
 use crate::engine::{
-    self, Delivery, Engine, FrameFormat, InitialState, LeaseRequest, LeaseToken, OutputSpec, Overflow, PictureSpec,
-    RasterBackend, SceneHandle, StepId, StepSelector, StreamDelivery, WriterSession,
+    self, ContentHash, Delivery, Engine, FrameFormat, InitialState, LeaseRequest, LeaseToken, OutputSpec, Overflow,
+    PictureSpec, RasterBackend, SceneHandle, StepId, StepSelector, StreamDelivery, WriterSession, parse_hash,
 };
 use crate::telemetry::StageTimes;
 use modalcast_model::error::{Result, invalid};
@@ -308,6 +309,17 @@ pub(super) fn describe_step_selector(selector: StepSelector, scene: &str) -> Str
         StepSelector::Exact { number, .. } => format!("step {number} of scene '{scene}'"),
         StepSelector::Minimum { number, .. } => format!("step {number} or later of scene '{scene}'"),
     }
+}
+
+/// Limit on the hashes of one request.
+const MAX_HASHES: usize = 4096;
+
+/// Parses the field `sha256` of a request for contents.
+pub(super) fn parse_hashes(list: &[Bytes]) -> Result<Vec<ContentHash>> {
+    if list.is_empty() || list.len() > MAX_HASHES {
+        return Err(invalid("sha256", format!("1 to {MAX_HASHES} hashes"), list.len()));
+    }
+    list.iter().enumerate().map(|(index, bytes)| parse_hash(&format!("sha256[{index}]"), bytes)).collect()
 }
 
 pub(super) fn parse_upload_header(header: v1::UploadHeader) -> engine::UploadHeader {

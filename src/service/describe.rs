@@ -8,16 +8,13 @@ use modalcast_proto::v1;
 use modalcast_proto::v1::describe_scene_response::Part;
 use tonic::{Response, Status};
 
-use super::convert::wire_scene_info;
+use super::convert::{parse_hashes, wire_scene_info};
 use super::status::to_status;
 use super::stream::{ReplySender, ReplyStream, respond};
-use crate::engine::{ContentHashes, SceneContent, SceneHandle, ShapeArray, hex, parse_hash, validate_domains};
+use crate::engine::{ContentHash, ContentHashes, SceneContent, SceneHandle, ShapeArray, hex, validate_domains};
 use modalcast_model::domain::{AlphaMode, Domain, Material, MaterialRange, Transform};
 use modalcast_model::error::{Error, Result, invalid};
 use modalcast_model::scene::Scene;
-
-/// Limit on the hashes of one request for content.
-const MAX_CONTENT_ITEMS: usize = 4096;
 
 /// Replies with the descriptions of the selected domains and of everything that they use, and with the requested
 /// arrays.
@@ -73,17 +70,16 @@ pub(super) async fn respond_with_content(
     request: v1::ReadContentRequest,
     max_chunk_bytes: usize,
 ) -> Result<Response<ReplyStream<v1::ReadContentResponse>>> {
-    if request.sha256.is_empty() || request.sha256.len() > MAX_CONTENT_ITEMS {
-        return Err(invalid("sha256", format!("1 to {MAX_CONTENT_ITEMS} hashes"), request.sha256.len()));
-    }
+    let requested_hashes = parse_hashes(&request.sha256)?;
     let hashes = scene_handle.content_hashes().await?;
-    let find_content = |(index, sha256): (usize, &Bytes)| {
-        let field = format!("sha256[{index}]");
-        let hash = parse_hash(&field, sha256)?;
-        let what = "array or texture of the scene";
-        hashes.find(&hash).ok_or_else(|| Error::ContentNotFound { field, what, sha256: hex(&hash) })
+    let find_content = |(index, hash): (usize, &ContentHash)| {
+        let not_found = || {
+            let field = format!("sha256[{index}]");
+            Error::ContentNotFound { field, what: "array or texture of the scene", sha256: hex(hash) }
+        };
+        hashes.find(hash).ok_or_else(not_found)
     };
-    let items: Vec<SceneContent> = request.sha256.iter().enumerate().map(find_content).collect::<Result<_>>()?;
+    let items: Vec<SceneContent> = requested_hashes.iter().enumerate().map(find_content).collect::<Result<_>>()?;
     Ok(respond(move |reply_sender: ReplySender<v1::ReadContentResponse>| async move {
         for (item, content) in items.into_iter().enumerate() {
             let size = content.size(&scene_handle.scene);

@@ -45,7 +45,7 @@ impl v1::server_service_server::ServerService for ServerServiceImpl {
 
 /// The features of a server with these devices.
 fn list_features(info: &EngineInfo) -> Vec<v1::Feature> {
-    let mut features = vec![v1::Feature::ContentHashes];
+    let mut features = vec![v1::Feature::ContentHashes, v1::Feature::UploadReuse];
     if info.renderer.is_ok() {
         features.push(v1::Feature::Frames);
     }
@@ -69,7 +69,8 @@ mod tests {
             max_side: 1,
         };
         let info = |renderer| EngineInfo { backend: Backend::Cpu, device: "none".into(), renderer };
-        assert_eq!(list_features(&info(Ok(renderer))), [v1::Feature::ContentHashes, v1::Feature::Frames]);
-        assert_eq!(list_features(&info(Err(fault("renderer", "none")))), [v1::Feature::ContentHashes]);
+        let always = [v1::Feature::ContentHashes, v1::Feature::UploadReuse];
+        assert_eq!(list_features(&info(Err(fault("renderer", "none")))), always);
+        assert_eq!(list_features(&info(Ok(renderer))), [&always[..], &[v1::Feature::Frames]].concat());
     }
 }

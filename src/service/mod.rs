@@ -15,6 +15,7 @@ mod states;
 mod status;
 mod steps;
 mod stream;
+mod uploads;
 mod vertices;
 
 use modalcast_proto::v1;

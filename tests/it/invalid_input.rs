@@ -303,7 +303,7 @@ fn upload_parts(contents: &[u8]) -> Vec<Part> {
     let header =
         v1::UploadHeader { scene: "up".into(), entry: String::new(), files: 1, total_bytes: contents.len() as u64 };
     let sha256 = Sha256::digest(contents).to_vec().into();
-    let file = v1::UploadFile { path: "scene.txt".into(), bytes: contents.len() as u64, sha256 };
+    let file = v1::UploadFile { path: "scene.txt".into(), bytes: contents.len() as u64, sha256, reuse: false };
     vec![Part::Header(header), Part::File(file), Part::Chunk(contents.to_vec().into())]
 }
 
@@ -330,7 +330,7 @@ async fn invalid_uploads_are_rejected_and_leave_no_files() {
     // Name of the case, messages, and prefixes of the fields `field`, `expected` and `given` of the rejection.
     let cases: Vec<(&str, Vec<Part>, [&str; 3])> = vec![
         ("empty stream", vec![], ["", "a header as the first part", "the end of the stream"]),
-        ("no header", upload_parts(b"strips").split_off(1), ["", "a header as the first part", "a file or chunk"]),
+        ("no header", upload_parts(b"strips").split_off(1), ["", "a header as the first part", "another part"]),
         ("wrong hash", modified_upload(|_, file| file.sha256 = vec![7; 32].into()), ["file.sha256", "0707", ""]),
         (
             "hash of 3 bytes",

@@ -159,6 +159,7 @@ fn restart_restores_uploads_but_not_deleted_scenes() {
             path: "deep/scene.txt".into(),
             bytes: 6,
             sha256: Sha256::digest(b"strips").to_vec().into(),
+            reuse: false,
         };
         let header =
             v1::UploadHeader { scene: "mine".into(), entry: "deep/scene.txt".into(), files: 1, total_bytes: 6 };

@@ -178,7 +178,7 @@ async fn silent_upload_times_out_and_leaves_no_files() {
 async fn upload_below_minimum_rate_times_out() {
     let server = Server::start_with(|config| Config { stall_timeout: Duration::from_millis(400), ..config }).await;
     let header = v1::UploadHeader { scene: "up".into(), entry: String::new(), files: 1, total_bytes: 5000 };
-    let file = v1::UploadFile { path: "scene.txt".into(), bytes: 5000, sha256: vec![0; 32].into() };
+    let file = v1::UploadFile { path: "scene.txt".into(), bytes: 5000, sha256: vec![0; 32].into(), reuse: false };
     let parts = [Part::Header(header), Part::File(file)].into_iter();
     // One byte per chunk, at most 50 bytes per second. The minimum rate is a constant of the server.
     let parts = parts.chain(std::iter::repeat_with(|| Part::Chunk(b"x"[..].into())).take(5000));

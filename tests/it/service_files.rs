@@ -50,7 +50,12 @@ async fn upload(server: &Server, entry: &str, files: &[(&str, &[u8])]) -> Result
     let mut parts = vec![Part::Header(header)];
     for (path, bytes) in files {
         let sha256 = Sha256::digest(bytes).to_vec().into();
-        parts.push(Part::File(v1::UploadFile { path: (*path).into(), bytes: bytes.len() as u64, sha256 }));
+        parts.push(Part::File(v1::UploadFile {
+            path: (*path).into(),
+            bytes: bytes.len() as u64,
+            sha256,
+            reuse: false,
+        }));
         parts.extend(bytes.chunks(100).map(|chunk| Part::Chunk(chunk.to_vec().into())));
     }
     let requests = parts.into_iter().map(|part| v1::UploadSceneRequest { part: Some(part) }).collect::<Vec<_>>();
@@ -158,4 +163,59 @@ async fn invalid_files_are_rejected_and_leave_no_files() {
     }
     assert!(server.engine.list().is_empty());
     upload(&server, "", &[("a.obj", square)]).await.expect("expected the upload to succeed after rejected ones");
+}
+
+/// Uploads files as the scene `copy` without their content.
+async fn upload_hashes(server: &Server, files: &[(&str, &[u8])]) -> Result<v1::SceneInfo, Status> {
+    let total_bytes = files.iter().map(|(_, bytes)| bytes.len() as u64).sum();
+    let header =
+        v1::UploadHeader { scene: "copy".into(), files: files.len() as u32, total_bytes, ..Default::default() };
+    let file = |(path, bytes): &(&str, &[u8])| v1::UploadFile {
+        path: (*path).into(),
+        bytes: bytes.len() as u64,
+        sha256: Sha256::digest(bytes).to_vec().into(),
+        reuse: true,
+    };
+    let parts = [Part::Header(header)].into_iter().chain(files.iter().map(|named| Part::File(file(named))));
+    let requests = parts.map(|part| v1::UploadSceneRequest { part: Some(part) }).collect::<Vec<_>>();
+    let response = server.scenes().await.upload_scene(tokio_stream::iter(requests)).await?;
+    Ok(response.into_inner().scene.expect("expected the scene info"))
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn uploaded_files_are_reused_until_their_scene_is_deleted() {
+    let (state_folder, repository_folder) = (
+        tempfile::tempdir().expect("expected a temporary folder"),
+        tempfile::tempdir().expect("expected a temporary folder"),
+    );
+    let modes = lift_mode();
+    let files: [(&str, &[u8]); 2] = [("a.obj", SQUARE.as_bytes()), ("a.npy", &modes)];
+    let first_server = start_server(state_folder.path(), repository_folder.path()).await;
+    upload(&first_server, "", &files).await.expect("expected the upload to succeed");
+    first_server.stop().await.expect("expected the server to stop");
+    // The hashes survive a restart.
+    let server = start_server(state_folder.path(), repository_folder.path()).await;
+    let find = async |content: &[u8]| {
+        let sha256 = vec![Sha256::digest(content).to_vec().into(), Sha256::digest("unknown").to_vec().into()];
+        let request = v1::FindUploadedFilesRequest { sha256 };
+        server.scenes().await.find_uploaded_files(request).await.expect("expected an answer").into_inner().found
+    };
+    assert_eq!(find(&modes).await, [true, false]);
+    upload_hashes(&server, &files).await.expect("expected the upload to succeed without content");
+    assert_eq!(deform_last_vertex(&server, "copy").await, [0.0, 1.0, 3.0]);
+    let status = upload_hashes(&server, &[("b.obj", b"unknown")]).await.expect_err("expected a taken name");
+    assert_eq!(status.code(), Code::AlreadyExists);
+    for scene in ["sent", "copy"] {
+        assert_eq!(find(&modes).await, [true, false], "expected the files of {scene}");
+        let request = v1::DeleteSceneRequest { scene: scene.into() };
+        server.scenes().await.delete_scene(request).await.expect("expected the scene to close");
+    }
+    assert_eq!(find(&modes).await, [false, false]);
+    let status = upload_hashes(&server, &files).await.expect_err("expected an unknown content");
+    let rejection = rejection_details(&status);
+    assert_eq!((status.code(), rejection.reason()), (Code::NotFound, v1::Reason::ContentNotFound));
+    assert_eq!(rejection.field, "file.sha256");
+    let request = v1::FindUploadedFilesRequest { sha256: vec![] };
+    let status = server.scenes().await.find_uploaded_files(request).await.expect_err("expected an empty list");
+    assert_eq!(rejection_details(&status).field, "sha256");
 }

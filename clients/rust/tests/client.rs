@@ -243,6 +243,28 @@ async fn upload_sends_every_file_under_its_relative_path() {
     assert!(matches!(client.upload_scene("/none".as_ref(), "mine", "").await, Err(Error::File { .. })));
 }
 
+#[tokio::test]
+async fn upload_sends_known_contents_only_if_the_server_loses_them() {
+    use sha2::Digest as _;
+    let folder = tempfile::tempdir().expect("a folder");
+    std::fs::write(folder.path().join("a.obj"), "known").expect("a file");
+    std::fs::write(folder.path().join("b.obj"), "new").expect("a file");
+    // The bytes of a.obj that the server receives. A server with `None` does not know the call.
+    for (known_hashes, loses_contents, received) in [
+        (Some(vec![sha2::Sha256::digest("known").to_vec()]), false, ""),
+        (Some(vec![sha2::Sha256::digest("known").to_vec()]), true, "known"),
+        (Some(vec![]), false, "known"),
+        (None, false, "known"),
+    ] {
+        let mut server = one_domain_server(4);
+        (server.known_hashes, server.loses_contents) = (known_hashes, loses_contents);
+        let (server, client) = connect(server).await;
+        client.upload_scene(folder.path(), "mine", "").await.expect("an upload");
+        let expected = [("a.obj".into(), received.as_bytes().to_vec()), ("b.obj".into(), b"new".to_vec())];
+        assert_eq!(*server.uploaded_files.lock().expect("lock"), expected);
+    }
+}
+
 /// `package` and its transitive dependencies, from the lock file of the workspace.
 fn list_dependencies(package: &str) -> Vec<String> {
     let lock_file =

@@ -6,3 +6,5 @@ pub(super) mod checkpoint_store;
 pub(super) mod run_counter;
 pub(super) mod scene_catalog;
 pub(super) mod upload;
+mod upload_folder;
+pub(super) mod uploaded_files;

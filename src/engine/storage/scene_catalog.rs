@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use std::sync::{Mutex, MutexGuard};
 
 use super::atomic_file::write_atomic;
+use super::uploaded_files::HashLists;
 use crate::engine::lock::lock;
 use modalcast_model::error::{Error, Result, fault_in, invalid};
 
@@ -81,9 +82,19 @@ impl SceneCatalog {
         self.folder.join("steps")
     }
 
+    /// The folder of all uploads.
+    pub(in crate::engine) fn uploads(&self) -> PathBuf {
+        self.folder.join("uploads")
+    }
+
     /// The folder of an upload's files.
     pub(in crate::engine) fn upload_folder(&self, name: &str) -> PathBuf {
-        self.folder.join("uploads").join(name)
+        self.uploads().join(name)
+    }
+
+    /// The hashes of the files of all uploads.
+    pub(in crate::engine) fn hash_lists(&self) -> HashLists {
+        HashLists::new(self.folder.join("upload-hashes"), self.uploads())
     }
 
     /// Releases the lock, so that another server may use the folder.

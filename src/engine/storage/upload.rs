@@ -1,27 +1,27 @@
-//! Writes uploaded files into a new temporary folder. The paths of the files cannot leave the folder. Sizes and SHA-256
-//! hashes must equal the values that the client has declared. Dropping an unfinished [`Upload`] removes its folder in
-//! the background. [`Upload::discard`] removes the folder before it returns.
+//! Writes uploaded files into a temporary folder. The paths of the files cannot leave the folder. Sizes and SHA-256
+//! hashes must equal the values that the client has declared. Files that the server already has are copied from the
+//! uploads of other scenes.
 
-use std::collections::BTreeSet;
+use std::collections::BTreeMap;
 use std::fs::{self, File};
-use std::io::{self, ErrorKind, Write as _};
-use std::mem;
-use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::io::{self, ErrorKind, Read as _, Write as _};
+use std::path::Path;
 
 use sha2::{Digest as _, Sha256};
 use tokio::sync::OwnedSemaphorePermit;
 
-use crate::engine::content::hex;
-use modalcast_model::error::{Result, fault, fault_in, invalid};
+use super::upload_folder::UploadFolder;
+use super::uploaded_files::{HashLists, UploadedFiles};
+use crate::engine::content::{ContentHash, hex, parse_hash};
+use modalcast_model::error::{Error, Result, fault, fault_in, invalid};
 
 /// Limit on the length of a path in bytes.
 const MAX_PATH_BYTES: usize = 240;
 /// Limit on the number of components of a path, including the file name.
 const MAX_PATH_DEPTH: usize = 16;
 
-/// Number of uploads so far. Makes the names of temporary folders unique.
-static UPLOAD_COUNTER: AtomicU64 = AtomicU64::new(0);
+/// Bytes of a reused file that are copied at a time.
+const COPY_CHUNK_BYTES: usize = 1 << 20;
 
 /// The header of an upload, which declares the files that the client is going to send.
 #[derive(Debug, Clone, Default)]
@@ -39,16 +39,42 @@ pub struct UploadHeader {
 /// An upload in progress. Its methods block on the disk.
 #[derive(Debug)]
 pub struct Upload {
-    pub(in crate::engine) header: UploadHeader,
-    /// The temporary folder; empty after it was moved or removed.
-    folder: PathBuf,
-    /// Paths of the files so far.
-    paths: BTreeSet<String>,
+    header: UploadHeader,
+    folder: UploadFolder,
+    /// Hashes of the files so far, by their paths.
+    hashes: BTreeMap<String, ContentHash>,
     /// Sum of the declared sizes of the files so far, in bytes.
     declared_bytes: u64,
     open_file: Option<OpenFile>,
-    /// Counts against the limit on concurrent uploads until the folder is moved or removed.
-    permit: Option<OwnedSemaphorePermit>,
+    hash_lists: HashLists,
+    /// The files of other uploads. Read when the client first reuses a file.
+    uploaded_files: Option<UploadedFiles>,
+}
+
+/// A complete upload that is not at its final place yet.
+#[derive(Debug)]
+pub(in crate::engine) struct CompleteUpload {
+    pub(in crate::engine) scene: String,
+    /// The path to open. An empty path means the folder.
+    pub(in crate::engine) entry: String,
+    pub(super) folder: UploadFolder,
+    /// Hashes of the files that later uploads may reuse, by their paths.
+    pub(super) hashes: BTreeMap<String, ContentHash>,
+}
+
+impl CompleteUpload {
+    /// Moves the folder to `target_folder`. Replaces the earlier upload in that folder and its list of hashes.
+    pub(in crate::engine) fn commit(self, target_folder: &Path, hash_lists: &HashLists) -> Result<()> {
+        hash_lists.remove(&self.scene);
+        self.folder.move_to(target_folder)?;
+        if self.hashes.is_empty() {
+            return Ok(());
+        }
+        if let Err(error) = hash_lists.write(&self.scene, &self.hashes) {
+            tracing::warn!(scene = self.scene, %error, "the files of the upload cannot be reused");
+        }
+        Ok(())
+    }
 }
 
 /// The file that is being received.
@@ -69,14 +95,25 @@ impl Upload {
     ///
     /// # Errors
     /// `Invalid` for a malformed entry path, `Fault` of the disk.
-    pub(in crate::engine) fn begin(uploads: &Path, header: UploadHeader, permit: OwnedSemaphorePermit) -> Result<Self> {
+    pub(in crate::engine) fn begin(
+        uploads: &Path,
+        hash_lists: HashLists,
+        header: UploadHeader,
+        permit: OwnedSemaphorePermit,
+    ) -> Result<Self> {
         if !header.entry.is_empty() {
             validate_path("header.entry", &header.entry)?;
         }
-        let count = UPLOAD_COUNTER.fetch_add(1, Ordering::Relaxed);
-        let folder = uploads.join(format!(".{}-{count}", header.scene));
-        fs::create_dir_all(&folder).map_err(fault_in("upload"))?;
-        Ok(Self { header, folder, paths: BTreeSet::new(), declared_bytes: 0, open_file: None, permit: Some(permit) })
+        let folder = UploadFolder::create(uploads, &header.scene, permit)?;
+        Ok(Self {
+            header,
+            folder,
+            hashes: BTreeMap::new(),
+            declared_bytes: 0,
+            open_file: None,
+            hash_lists,
+            uploaded_files: None,
+        })
     }
 
     /// Begins the next file. `bytes` is its size; `sha256` must have 32 bytes.
@@ -87,20 +124,18 @@ impl Upload {
     pub fn begin_file(&mut self, path: &str, bytes: u64, sha256: &[u8]) -> Result<()> {
         self.check_file_complete()?;
         validate_path("file.path", path)?;
-        let sha256: [u8; 32] = sha256
-            .try_into()
-            .map_err(|_| invalid("file.sha256", "32 bytes", format!("{} bytes for '{path}'", sha256.len())))?;
-        if !self.paths.insert(path.to_owned()) {
+        let sha256 = parse_hash("file.sha256", sha256)?;
+        if self.hashes.insert(path.to_owned(), sha256).is_some() {
             return Err(invalid("file.path", "a path that was not sent yet", path));
         }
-        if self.paths.len() > self.header.files as usize {
-            return Err(invalid("header.files", self.header.files.to_string(), self.paths.len()));
+        if self.hashes.len() > self.header.files as usize {
+            return Err(invalid("header.files", self.header.files.to_string(), self.hashes.len()));
         }
         self.declared_bytes = self.declared_bytes.saturating_add(bytes);
         if self.declared_bytes > self.header.total_bytes {
             return Err(invalid("header.total_bytes", self.header.total_bytes.to_string(), self.declared_bytes));
         }
-        let file_path = self.folder.join(path);
+        let file_path = self.folder.path().join(path);
         let path_conflict = |error: io::Error| match error.kind() {
             ErrorKind::AlreadyExists | ErrorKind::NotADirectory | ErrorKind::InvalidFilename => {
                 invalid("file.path", "a path that does not conflict with another file", path)
@@ -122,6 +157,41 @@ impl Upload {
         self.finish_file_if_complete()
     }
 
+    /// Adds a file whose content an uploaded scene has, by copying it. The arguments are those of [`Self::begin_file`].
+    ///
+    /// # Errors
+    /// `ContentNotFound` when no uploaded scene has the content, or its file has changed; otherwise as for
+    /// [`Self::begin_file`].
+    pub fn reuse_file(&mut self, path: &str, bytes: u64, sha256: &[u8]) -> Result<()> {
+        let hash = parse_hash("file.sha256", sha256)?;
+        let not_found = || {
+            let field = "file.sha256".into();
+            Error::ContentNotFound { field, what: "uploaded file", sha256: hex(&hash) }
+        };
+        let files = self.uploaded_files.get_or_insert_with(|| self.hash_lists.read());
+        let mut source =
+            files.get(&hash).into_iter().flatten().find_map(|path| File::open(path).ok()).ok_or_else(not_found)?;
+        self.begin_file(path, bytes, sha256)?;
+        // The content is verified like that of a sent file.
+        self.copy_content(&mut source).map_err(|error| match error {
+            Error::Invalid { .. } => not_found(),
+            other => other,
+        })
+    }
+
+    /// Copies the content of the current file.
+    fn copy_content(&mut self, source: &mut File) -> Result<()> {
+        let mut buffer = vec![0; COPY_CHUNK_BYTES];
+        while self.open_file.is_some() {
+            let length = source.read(&mut buffer).map_err(fault_in("upload"))?;
+            if length == 0 {
+                break;
+            }
+            self.write_chunk(&buffer[..length])?;
+        }
+        self.check_file_complete()
+    }
+
     /// Appends bytes to the current file.
     ///
     /// # Errors
@@ -141,14 +211,24 @@ impl Upload {
         self.finish_file_if_complete()
     }
 
-    /// Checks that all declared files and bytes have arrived.
+    /// Completes the upload. On failure, removes its files.
     ///
     /// # Errors
     /// `Invalid` naming the header field or file that does not match.
-    pub(in crate::engine) fn check_complete(&self) -> Result<()> {
+    pub(in crate::engine) fn finish(self) -> Result<CompleteUpload> {
+        if let Err(error) = self.check_complete() {
+            self.discard();
+            return Err(error);
+        }
+        let Self { header: UploadHeader { scene, entry, .. }, folder, hashes, .. } = self;
+        Ok(CompleteUpload { scene, entry, folder, hashes })
+    }
+
+    /// Checks that all declared files and bytes have arrived.
+    fn check_complete(&self) -> Result<()> {
         self.check_file_complete()?;
-        if self.paths.len() != self.header.files as usize {
-            return Err(invalid("header.files", self.header.files.to_string(), self.paths.len()));
+        if self.hashes.len() != self.header.files as usize {
+            return Err(invalid("header.files", self.header.files.to_string(), self.hashes.len()));
         }
         if self.declared_bytes != self.header.total_bytes {
             return Err(invalid("header.total_bytes", self.header.total_bytes.to_string(), self.declared_bytes));
@@ -156,19 +236,9 @@ impl Upload {
         Ok(())
     }
 
-    /// Moves the folder to `target_folder`. Replaces the earlier upload in that folder.
-    pub(in crate::engine) fn commit(mut self, target_folder: &Path) -> Result<()> {
-        if target_folder.exists() {
-            fs::remove_dir_all(target_folder).map_err(fault_in("upload"))?;
-        }
-        fs::rename(&self.folder, target_folder).map_err(fault_in("upload"))?;
-        self.folder = PathBuf::new();
-        Ok(())
-    }
-
-    /// Removes the folder. Blocks on the disk.
-    pub fn discard(mut self) {
-        fs::remove_dir_all(mem::take(&mut self.folder)).ok(); // The next start removes leftovers.
+    /// Removes the files. Blocks on the disk.
+    pub fn discard(self) {
+        self.folder.discard();
     }
 
     /// Checks the hash of the open file and closes it once all of its bytes have arrived.
@@ -198,25 +268,6 @@ impl Upload {
     }
 }
 
-impl Drop for Upload {
-    /// Removes the folder. On a thread of a tokio runtime, removes it on the blocking pool.
-    fn drop(&mut self) {
-        let folder = mem::take(&mut self.folder);
-        if folder.as_os_str().is_empty() {
-            return;
-        }
-        let permit = self.permit.take();
-        let remove = move || {
-            fs::remove_dir_all(folder).ok(); // The next start removes leftovers.
-            drop(permit);
-        };
-        match tokio::runtime::Handle::try_current() {
-            Ok(runtime) => drop(runtime.spawn_blocking(remove)),
-            Err(_) => remove(),
-        }
-    }
-}
-
 /// Checks that a path is relative, uses forward slashes and consists of plain names.
 fn validate_path(field: &str, path: &str) -> Result<()> {
     let is_plain_name =
@@ -233,13 +284,17 @@ fn validate_path(field: &str, path: &str) -> Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use modalcast_model::error::Error;
 
     fn begin_upload(folder: &Path, files: u32, total_bytes: u64) -> Upload {
         let header = UploadHeader { scene: "s".into(), entry: String::new(), files, total_bytes };
         let permits = std::sync::Arc::new(tokio::sync::Semaphore::new(1));
         let permit = permits.try_acquire_owned().expect("expected a free permit");
-        Upload::begin(folder, header, permit).expect("expected a temporary folder")
+        Upload::begin(folder, lists(folder), header, permit).expect("expected a temporary folder")
+    }
+
+    /// The lists are in the folder `.lists`.
+    fn lists(folder: &Path) -> HashLists {
+        HashLists::new(folder.join(".lists"), folder.to_owned())
     }
 
     fn sha256_of(bytes: &[u8]) -> Vec<u8> {
@@ -254,10 +309,40 @@ mod tests {
         upload.write_chunk(b"he").expect("expected an accepted chunk");
         upload.write_chunk(b"llo").expect("expected an accepted chunk");
         upload.begin_file("empty", 0, &sha256_of(b"")).expect("expected a new file");
-        upload.check_complete().expect("expected a complete upload");
-        upload.commit(&folder.path().join("target")).expect("expected to move the folder");
+        let upload = upload.finish().expect("expected a complete upload");
+        upload.commit(&folder.path().join("target"), &lists(folder.path())).expect("expected to move the folder");
         assert_eq!(fs::read(folder.path().join("target/a/b.txt")).expect("expected the file"), b"hello");
-        assert_eq!(fs::read_dir(folder.path()).expect("expected a folder").count(), 1);
+        // The target and the folder of lists.
+        assert_eq!(fs::read_dir(folder.path()).expect("expected a folder").count(), 2);
+    }
+
+    #[test]
+    fn reused_file_is_copied_and_verified() {
+        let folder = tempfile::tempdir().expect("expected a temporary folder");
+        let lists = lists(folder.path());
+        let mut upload = begin_upload(folder.path(), 1, 5);
+        upload.begin_file("b.txt", 5, &sha256_of(b"hello")).expect("expected a new file");
+        upload.write_chunk(b"hello").expect("expected an accepted chunk");
+        // The folder of a scene has the name of the scene.
+        let target = folder.path().join("s");
+        upload.finish().and_then(|upload| upload.commit(&target, &lists)).expect("expected a complete upload");
+        let reuse = |bytes: u64, content: &[u8]| {
+            let mut upload = begin_upload(folder.path(), 1, bytes);
+            upload.reuse_file("copy", bytes, &sha256_of(content)).map(|()| {
+                upload.check_complete().expect("expected a complete upload");
+                fs::read(upload.folder.path().join("copy")).expect("expected the copy")
+            })
+        };
+        assert_eq!(reuse(5, b"hello").expect("expected a known file"), b"hello");
+        // An unknown content, and sizes that contradict the content.
+        for (bytes, content) in [(5, b"other"), (4, b"hello"), (6, b"hello")] {
+            let error = reuse(bytes, content).expect_err("expected an unknown content");
+            assert!(matches!(error, Error::ContentNotFound { .. }), "{error}");
+        }
+        fs::write(target.join("b.txt"), "HELLO").expect("expected a written file");
+        assert!(matches!(reuse(5, b"hello"), Err(Error::ContentNotFound { .. })), "expected a changed file");
+        fs::remove_file(target.join("b.txt")).expect("expected to remove a file");
+        assert!(matches!(reuse(5, b"hello"), Err(Error::ContentNotFound { .. })), "expected a missing file");
     }
 
     #[test]
@@ -282,8 +367,8 @@ mod tests {
         let folder = tempfile::tempdir().expect("expected a temporary folder");
         let mut upload = begin_upload(folder.path(), 1, 0);
         // No user, root included, can create a folder below a symbolic link that points to itself.
-        fs::remove_dir(&upload.folder).expect("expected the temporary folder");
-        std::os::unix::fs::symlink(&upload.folder, &upload.folder).expect("expected a new link");
+        fs::remove_dir(upload.folder.path()).expect("expected the temporary folder");
+        std::os::unix::fs::symlink(upload.folder.path(), upload.folder.path()).expect("expected a new link");
         assert!(matches!(upload.begin_file("a/b", 0, &sha256_of(b"")), Err(Error::Fault { .. })));
     }
 

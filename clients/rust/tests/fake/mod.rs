@@ -89,8 +89,12 @@ pub(crate) struct FakeServer {
     pub(crate) steps: Mutex<Vec<v1::Step>>,
     /// The forces on the scene, which a test sets.
     pub(crate) forces: Vec<v1::AppliedForce>,
-    /// Paths and bytes of the files of the last upload.
+    /// Paths and bytes of the files of the last upload. Reused files have no bytes.
     pub(crate) uploaded_files: Mutex<Vec<(String, Vec<u8>)>>,
+    /// Hashes of the contents that the server claims to have. `None`: it does not know this call.
+    pub(crate) known_hashes: Option<Vec<Vec<u8>>>,
+    /// Whether the server no longer has these contents when the upload arrives.
+    pub(crate) loses_contents: bool,
     /// The state after each step, for the subscribers.
     pub(crate) outputs: broadcast::Sender<StepOutput>,
     state: Mutex<State>,
@@ -131,6 +135,8 @@ impl FakeServer {
             steps: Mutex::default(),
             forces: Vec::new(),
             uploaded_files: Mutex::default(),
+            known_hashes: None,
+            loses_contents: false,
             // More steps than any test sends, so that no subscriber misses one.
             outputs: broadcast::channel(1 << 14).0,
             state: Mutex::new(State { run: 0, has_writer: false, q, transforms, last_step: None }),

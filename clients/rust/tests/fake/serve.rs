@@ -135,6 +135,11 @@ impl SceneService for FakeService {
         let mut files: Vec<(String, Vec<u8>)> = vec![];
         while let Some(message) = stream.message().await? {
             match message.part {
+                Some(Part::File(file)) if file.reuse && self.0.loses_contents => {
+                    let reason = v1::Reason::ContentNotFound.into();
+                    let lost = v1::Rejection { reason, ..rejection(None, "file.sha256", "a known hash", "another") };
+                    return Err(rejection_status(tonic::Code::NotFound, &lost));
+                }
                 Some(Part::File(file)) => files.push((file.path, vec![])),
                 Some(Part::Chunk(chunk)) => files.last_mut().expect("a file before its first chunk").1.extend(chunk),
                 Some(Part::Header(_)) | None => {}
@@ -142,6 +147,16 @@ impl SceneService for FakeService {
         }
         *self.0.uploaded_files.lock().unwrap() = files;
         Ok(Response::new(v1::UploadSceneResponse { scene: Some(self.0.info()) }))
+    }
+
+    async fn find_uploaded_files(
+        &self,
+        request: Request<v1::FindUploadedFilesRequest>,
+    ) -> Result<Response<v1::FindUploadedFilesResponse>, Status> {
+        let Some(known_hashes) = &self.0.known_hashes else { return Err(Status::unimplemented("find_uploaded_files")) };
+        let is_known = |hash: &Bytes| known_hashes.iter().any(|known| known[..] == hash[..]);
+        let found = request.into_inner().sha256.iter().map(is_known).collect();
+        Ok(Response::new(v1::FindUploadedFilesResponse { found }))
     }
 
     async fn list_scenes(&self, _: Request<v1::ListScenesRequest>) -> Result<Response<v1::ListScenesResponse>, Status> {

@@ -1,0 +1,154 @@
+//! Receives the stream of `UploadScene`.
+
+use std::time::{Duration, Instant};
+
+use modalcast_proto::v1;
+use modalcast_proto::v1::upload_scene_request::Part as FilesPart;
+use tonic::{Status, Streaming};
+
+use super::convert::parse_upload_header;
+use super::status::{to_status, transport_status};
+use crate::engine::{Engine, Upload};
+use modalcast_model::error::{Error, Result, fault_in};
+
+/// The lowest sustained upload rate that the server accepts, in bytes per second: 32 KiB/s.
+const MIN_UPLOAD_RATE: f64 = 32768.0;
+
+/// An upload whose parts arrive in a stream.
+pub(super) trait StreamedUpload: Sized + Send + 'static {
+    type Request: prost::Message + Default + 'static;
+    type Part: Send + 'static;
+
+    /// The part that a message contains.
+    fn part_of(request: Self::Request) -> Option<Self::Part>;
+
+    /// Begins an upload with its first part, which must be a header.
+    fn begin(engine: &Engine, part: Self::Part) -> impl Future<Output = Result<Self>> + Send;
+
+    /// Adds a later part. Blocks on the disk.
+    fn add_part(&mut self, part: Self::Part) -> Result<()>;
+
+    /// Removes the files. Blocks on the disk.
+    fn discard(self);
+}
+
+const fn missing_header() -> Error {
+    Error::UnexpectedMessage { expected: "a header as the first part", given: "another part" }
+}
+
+const fn second_header() -> Error {
+    Error::UnexpectedMessage { expected: "one header per upload", given: "a second header" }
+}
+
+impl StreamedUpload for Upload {
+    type Request = v1::UploadSceneRequest;
+    type Part = FilesPart;
+
+    fn part_of(request: Self::Request) -> Option<FilesPart> {
+        request.part
+    }
+
+    async fn begin(engine: &Engine, part: FilesPart) -> Result<Self> {
+        match part {
+            FilesPart::Header(header) => engine.begin_upload(parse_upload_header(header)).await,
+            _ => Err(missing_header()),
+        }
+    }
+
+    fn add_part(&mut self, part: FilesPart) -> Result<()> {
+        match part {
+            FilesPart::File(file) if file.reuse => self.reuse_file(&file.path, file.bytes, &file.sha256),
+            FilesPart::File(file) => self.begin_file(&file.path, file.bytes, &file.sha256),
+            FilesPart::Chunk(bytes) => self.write_chunk(&bytes),
+            FilesPart::Header(_) => Err(second_header()),
+        }
+    }
+
+    fn discard(self) {
+        Self::discard(self);
+    }
+}
+
+/// Receives all parts of an upload until the client closes its side. On failure, removes the files of the upload.
+pub(super) async fn receive_upload<U: StreamedUpload>(
+    engine: &Engine,
+    parts: Streaming<U::Request>,
+) -> Result<U, Status> {
+    let mut upload = None;
+    if let Err(error_status) = receive_parts(engine, parts, &mut upload).await {
+        if let Some(upload) = upload {
+            // If the removal fails, the next start of the server removes the files.
+            tokio::task::spawn_blocking(move || U::discard(upload)).await.ok();
+        }
+        return Err(error_status);
+    }
+    upload.ok_or_else(|| {
+        to_status(Error::UnexpectedMessage { expected: "a header as the first part", given: "the end of the stream" })
+    })
+}
+
+/// Receives the parts of an upload. After an error the caller discards `upload`.
+async fn receive_parts<U: StreamedUpload>(
+    engine: &Engine,
+    mut parts: Streaming<U::Request>,
+    upload: &mut Option<U>,
+) -> Result<(), Status> {
+    use prost::Message as _;
+    let max_message_bytes = engine.config().message_bytes;
+    let mut budget = UploadTimeBudget::new(engine.config().stall_timeout);
+    while let Some(request) =
+        budget.wait(parts.message()).await?.map_err(|status| transport_status(status, max_message_bytes))?
+    {
+        budget.refill(request.encoded_len());
+        let part = U::part_of(request)
+            .ok_or_else(|| to_status(Error::UnexpectedMessage { expected: "a part", given: "an empty message" }))?;
+        *upload = Some(receive_part(engine, upload.take(), part).await.map_err(to_status)?);
+    }
+    Ok(())
+}
+
+/// Processes one part of an upload. Discards the upload if that fails. Disk access runs on the blocking pool.
+async fn receive_part<U: StreamedUpload>(engine: &Engine, upload: Option<U>, part: U::Part) -> Result<U> {
+    let Some(mut upload) = upload else { return U::begin(engine, part).await };
+    let process_part = move || match upload.add_part(part) {
+        Ok(()) => Ok(upload),
+        Err(error) => {
+            U::discard(upload);
+            Err(error)
+        }
+    };
+    tokio::task::spawn_blocking(process_part).await.map_err(fault_in("upload"))?
+}
+
+/// Time budget for waiting on an upload (a token bucket). Waiting consumes it, and received bytes refill it. A client
+/// that sends nothing or too slowly therefore cannot hold its upload permit and disk space forever.
+struct UploadTimeBudget {
+    /// The full budget.
+    max_wait: Duration,
+    remaining: Duration,
+}
+
+impl UploadTimeBudget {
+    const fn new(max_wait: Duration) -> Self {
+        Self { max_wait, remaining: max_wait }
+    }
+
+    /// Waits for the client. Only this wait consumes the budget; processing the received data does not.
+    ///
+    /// # Errors
+    /// `DEADLINE_EXCEEDED` when the budget is used up.
+    async fn wait<T>(&mut self, part: impl Future<Output = T>) -> Result<T, Status> {
+        let begin = Instant::now();
+        let ms = self.max_wait.as_millis() as u64;
+        let deadline_status = |_| to_status(Error::Deadline { what: "the upload".into(), ms });
+        let part = tokio::time::timeout(self.remaining, part).await.map_err(deadline_status)?;
+        self.remaining = self.remaining.saturating_sub(begin.elapsed());
+        Ok(part)
+    }
+
+    /// Adds the time in which a client with the rate [`MIN_UPLOAD_RATE`] sends `bytes` bytes.
+    fn refill(&mut self, bytes: usize) {
+        let refill_time = Duration::from_secs_f64(bytes as f64 / MIN_UPLOAD_RATE);
+        self.remaining = self.max_wait.min(self.remaining + refill_time);
+    }
+}
