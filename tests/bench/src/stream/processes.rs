@@ -152,9 +152,16 @@ impl Process {
         }
     }
 
-    /// Whether the process has ended.
-    pub(super) fn has_ended(&mut self) -> bool {
-        matches!(self.child.try_wait(), Ok(Some(_)))
+    /// Waits for the end of the process, at most for a time. Returns whether it has ended.
+    pub(super) fn ends_within(&mut self, limit: Duration) -> bool {
+        let deadline = Instant::now() + limit;
+        loop {
+            let has_ended = matches!(self.child.try_wait(), Ok(Some(_)));
+            if has_ended || Instant::now() >= deadline {
+                return has_ended;
+            }
+            std::thread::sleep(Duration::from_millis(5));
+        }
     }
 
     /// Ends the process and describes its failure, with the end of its standard error.
@@ -225,12 +232,9 @@ mod tests {
     /// Linux kills the process as it does when the report itself is killed.
     #[test]
     fn process_ends_with_the_thread_that_started_it() {
+        assert!(!shell("sleep 1000").ends_within(Duration::from_millis(50)), "control: this thread goes on");
         let mut process = std::thread::spawn(|| shell("sleep 1000")).join().expect("expected no panic");
-        let deadline = Instant::now() + Duration::from_secs(60);
-        while !process.has_ended() {
-            assert!(Instant::now() < deadline, "expected the end of the process");
-            std::thread::sleep(Duration::from_millis(5));
-        }
+        assert!(process.ends_within(Duration::from_secs(60)), "expected the end of the process");
     }
 
     #[test]

@@ -4,6 +4,7 @@ use std::cell::OnceCell;
 use std::ffi::OsString;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use modalcast_client::{Client, SceneInfo, ServerInfo};
 use serde::Serialize;
@@ -21,6 +22,9 @@ use modalcast_model::load::{self, OpenedScene};
 
 /// The name of every scene on its server.
 pub(super) const SCENE: &str = "scene";
+
+/// Longest time between the end of the server's connections and its own end.
+const SERVER_END: Duration = Duration::from_secs(1);
 
 /// The scene of a case.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -155,7 +159,7 @@ impl Session {
 
     /// Ends the session after an error of a case. If the server has ended, the error also contains its standard error.
     pub(super) fn explain(mut self, error: Error) -> Error {
-        if self.server.has_ended() { self.server.failure(&error.to_string()) } else { error }
+        if self.server.ends_within(SERVER_END) { self.server.failure(&error.to_string()) } else { error }
     }
 
     /// Starts `modalcast-sim` with further options.

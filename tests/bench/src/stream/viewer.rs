@@ -99,16 +99,15 @@ impl Collector {
     /// # Errors
     /// `Fault` when the step of a lossless stream is not the one after the previous step.
     fn add(&mut self, step: StepId, bytes: u64, skipped: u64, stages: &StageTimes) -> Result<()> {
-        let now = Instant::now();
-        self.times = Some((self.times.map_or(now, |(first, _)| first), now));
         if let Some(last_step) = self.last_step.replace(step.number).filter(|last_step| last_step + 1 != step.number) {
             return Err(fault("report", format!("expected step {}, got {}", last_step + 1, step.number)));
         }
-        self.add_same_step(bytes, skipped, stages);
+        self.add_any_step(bytes, skipped, stages);
         Ok(())
     }
 
-    fn add_same_step(&mut self, bytes: u64, skipped: u64, stages: &StageTimes) {
+    /// Adds a reply whose step need not follow the previous one.
+    fn add_any_step(&mut self, bytes: u64, skipped: u64, stages: &StageTimes) {
         let now = Instant::now();
         self.times = Some((self.times.map_or(now, |(first, _)| first), now));
         self.replies += 1;
@@ -214,7 +213,7 @@ async fn request_positions(client: &Client, job: &ViewerJob, collector: &mut Col
     let request = VertexRequest::new(&job.scene, job.content.vertex_selection());
     for _ in 0..job.replies {
         let set = client.get_vertices(&request).await.map_err(fault_in("viewer"))?;
-        collector.add_same_step(set.encoded_bytes, set.skipped, &set.stages);
+        collector.add_any_step(set.encoded_bytes, set.skipped, &set.stages);
     }
     Ok(())
 }
