@@ -22,7 +22,8 @@ pub use content::{ContentHash, ContentHashes, SceneContent, ShapeArray, hex, par
 pub use device::context::{DeviceContext, EngineInfo};
 pub use device::loaded_scene::LoadedScene;
 pub use device::scalar_field::validate_mode;
-pub use output::frame_encoder::{EncodedFrame, EncodedOutput, FrameEncoder, FrameFormat, StepPicture};
+pub use output::frame_encoder::{EncodedFrame, EncodedOutput, FrameEncoder, StepPicture};
+pub use output::frame_format::FrameFormat;
 pub use output::pack::{Attribute, Origins, PackedVertices, Section, VertexSelection, pack_vertices, validate_domains};
 pub use output::pick_result::{PickResult, resolve_picks};
 pub use output::rendered_picture::{Pixels, RenderedPicture};

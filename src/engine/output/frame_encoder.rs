@@ -9,6 +9,7 @@ use std::time::Instant;
 use bytes::Bytes;
 use tokio::sync::Semaphore;
 
+use super::frame_format::FrameFormat;
 use super::rendered_picture::{Pixels, RenderedPicture};
 use super::step_output::{OutputBody, StepFrames, StepId, StepOutput};
 use crate::engine::blocking::run_blocking;
@@ -16,20 +17,6 @@ use crate::frame;
 use crate::telemetry::{Stage, StageTimes, ms_since};
 use modalcast_model::error::{Result, fault, fault_in};
 use modalcast_render::RasterBackends;
-
-/// Wire format of pixels. Multi-byte values are little-endian; the top row comes first.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum FrameFormat {
-    Png,
-    /// RGBA8 sRGB.
-    Rgba,
-    /// One f32 per pixel: depth.
-    F32,
-    /// One u32 per pixel: domain indices.
-    U32,
-    /// Three f32 per pixel: normals.
-    F32x3,
-}
 
 /// An encoded result of one step.
 #[derive(Debug, Clone)]

@@ -1,6 +1,7 @@
 //! Outputs of steps: frames, AOVs, picks, vertices and states, and their encoding for the wire off the device thread.
 
 pub(super) mod frame_encoder;
+pub(super) mod frame_format;
 pub(super) mod pack;
 pub(super) mod pick_result;
 pub(super) mod rendered_picture;

@@ -5,12 +5,11 @@ use std::sync::{Arc, Mutex};
 use bytes::Bytes;
 use tokio::sync::OnceCell;
 
-use super::frame_encoder::FrameFormat;
-use super::step_output::stage_times;
+use super::frame_format::FrameFormat;
 use crate::engine::lock::lock;
 use crate::frame::Legend;
-use crate::telemetry::StageTimes;
-use modalcast_render::{AovImage, FrameImage, RasterBackends};
+use crate::telemetry::{Stage, StageTimes};
+use modalcast_render::{AovImage, FrameImage, FrameTimes, RasterBackends, RenderStage, TimeKey};
 
 /// The pixels of one picture of a step. All readers of equal pictures share them, and share each encoding, which is
 /// computed once, on first use.
@@ -78,4 +77,16 @@ impl From<FrameImage> for RenderedPicture {
         let (pixels, stages) = (Pixels::Color(rgba.into()), stage_times(&times));
         Self { width, height, pixels, stages, raster_backends, encodings: Mutex::default() }
     }
+}
+
+/// The times of a frame's stages. The times of its passes are omitted.
+fn stage_times(times: &FrameTimes) -> StageTimes {
+    let stage_of_key = |key: TimeKey| match key {
+        TimeKey::Stage(RenderStage::Upload) => Some(Stage::Upload),
+        TimeKey::Stage(RenderStage::Shadow) => Some(Stage::Shadow),
+        TimeKey::Stage(RenderStage::Draw) => Some(Stage::Draw),
+        TimeKey::Stage(RenderStage::Read) => Some(Stage::Read),
+        TimeKey::Pass(_) => None,
+    };
+    times.iter().filter_map(|(key, ms)| Some((stage_of_key(key)?, ms))).collect()
 }

@@ -3,10 +3,10 @@
 use std::sync::Arc;
 
 use super::rendered_picture::RenderedPicture;
-use crate::telemetry::{Stage, StageTimes};
+use crate::telemetry::StageTimes;
 use modalcast_model::deform::{DeformedSurface, VertexAttributes};
 use modalcast_model::scene::{Camera, FloatingOrigins, FrameSize, PixelRect, SceneState};
-use modalcast_render::{FrameTimes, PickHit, RenderStage, TimeKey};
+use modalcast_render::PickHit;
 
 /// The output that a client requests of a step.
 #[derive(Debug, Clone, PartialEq)]
@@ -114,16 +114,4 @@ pub struct ModalHit {
     /// The 3 x r block of U at the point, row-major. A force f at the point (world axes) acts on the coordinates as
     /// f_q = U^T A^T f.
     pub modes: Vec<f32>,
-}
-
-/// The times of a frame's stages. The times of its passes are omitted.
-pub(in crate::engine) fn stage_times(times: &FrameTimes) -> StageTimes {
-    let stage_of_key = |key: TimeKey| match key {
-        TimeKey::Stage(RenderStage::Upload) => Some(Stage::Upload),
-        TimeKey::Stage(RenderStage::Shadow) => Some(Stage::Shadow),
-        TimeKey::Stage(RenderStage::Draw) => Some(Stage::Draw),
-        TimeKey::Stage(RenderStage::Read) => Some(Stage::Read),
-        TimeKey::Pass(_) => None,
-    };
-    times.iter().filter_map(|(key, ms)| Some((stage_of_key(key)?, ms))).collect()
 }

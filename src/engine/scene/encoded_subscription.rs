@@ -7,7 +7,8 @@ use tokio::task::JoinHandle;
 
 use super::delivery::Delivery;
 use super::subscriber::Subscription;
-use crate::engine::output::frame_encoder::{EncodedFrame, FrameEncoder, FrameFormat, StepPicture};
+use crate::engine::output::frame_encoder::{EncodedFrame, FrameEncoder, StepPicture};
+use crate::engine::output::frame_format::FrameFormat;
 use crate::engine::output::step_output::StepOutput;
 use modalcast_model::error::{Error, Result, fault_in};
 
