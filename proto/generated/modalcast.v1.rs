@@ -2179,6 +2179,9 @@ pub struct Picture {
     /// not color maps.
     #[prost(double, tag = "7")]
     pub largest: f64,
+    /// Quality of FORMAT_JPEG, 1 (smallest frame) to 100 (smallest error); 0 means 90. Must be 0 for other formats.
+    #[prost(uint32, tag = "8")]
+    pub jpeg_quality: u32,
 }
 /// An unset view or lens is taken from the camera that frames the scene's rest bounds. Positions are in scene units
 /// relative to the scene's origin (SceneInfo.origin). The server keeps the camera in f64 and subtracts the origin of the
@@ -2247,8 +2250,8 @@ pub struct Intrinsics {
 pub struct RenderFrameRequest {
     #[prost(string, tag = "1")]
     pub scene: ::prost::alloc::string::String,
-    /// 1 to 16 pictures of one step, with at most Limits.frame_side * Limits.frame_side pixels in total; empty: one picture
-    /// with all fields unset. Pictures that differ only in their format are drawn once.
+    /// 1 to 16 pictures of one step, with at most Limits.frame_side * Limits.frame_side pixels in total; empty: one
+    /// picture with all fields unset. Pictures that differ only in their format are drawn once.
     #[prost(message, repeated, tag = "2")]
     pub pictures: ::prost::alloc::vec::Vec<Picture>,
     /// The step to render. Unset: the current step, or the rest state before the first step.
@@ -2285,13 +2288,14 @@ pub struct StreamFramesRequest {
     /// has had a step.
     #[prost(enumeration = "Delivery", tag = "3")]
     pub delivery: i32,
-    /// Number of steps after which the stream ends; 0: no limit. A step that is sent again because of a moved camera counts
-    /// again.
+    /// Number of steps after which the stream ends; 0: no limit. A step that is sent again because of a moved camera
+    /// counts again.
     #[prost(uint64, tag = "4")]
     pub steps: u64,
-    /// Maximum number of steps per second, finite and above 0; 0: no limit. The steps that are sent are the newest ones, and
-    /// those in between are skipped and counted. After a wait for a step, two steps may follow each other faster. Only with
-    /// DELIVERY_LATEST: DELIVERY_LOSSLESS sends every step, so a limit is rejected.
+    /// Maximum number of steps per second, finite and above 0; 0: no limit. The steps that are sent are the newest ones,
+    /// and those in between are skipped and counted. Also limits the steps that are sent again because of a moved camera.
+    /// After a wait for a step, two steps may follow each other faster. Only with DELIVERY_LATEST: DELIVERY_LOSSLESS sends
+    /// every step, so a limit is rejected.
     #[prost(double, tag = "5")]
     pub max_hz: f64,
 }
@@ -2543,8 +2547,8 @@ impl Output {
         }
     }
 }
-/// Encoding of a frame. Color and color maps are PNG or RGBA. Every other output has exactly one format. Multi-byte
-/// values are little-endian; rows are stored without padding, top row first.
+/// Encoding of a frame. Color and color maps are PNG, JPEG or RGBA. Every other output has exactly one format. Values of
+/// several bytes are little-endian; rows are stored without padding, top row first.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
 #[repr(i32)]
 pub enum Format {
@@ -2560,6 +2564,9 @@ pub enum Format {
     U32 = 4,
     /// Three f32 per pixel, 12 bytes.
     F32x3 = 5,
+    /// 8-bit sRGB baseline JPEG (JFIF), without alpha. Below a quality of 90 the chroma has half the resolution in both
+    /// directions (4:2:0), else the full one.
+    Jpeg = 6,
 }
 impl Format {
     /// String value of the enum field names used in the ProtoBuf definition.
@@ -2574,6 +2581,7 @@ impl Format {
             Self::F32 => "FORMAT_F32",
             Self::U32 => "FORMAT_U32",
             Self::F32x3 => "FORMAT_F32X3",
+            Self::Jpeg => "FORMAT_JPEG",
         }
     }
     /// Creates an enum from field names used in the ProtoBuf definition.
@@ -2585,6 +2593,7 @@ impl Format {
             "FORMAT_F32" => Some(Self::F32),
             "FORMAT_U32" => Some(Self::U32),
             "FORMAT_F32X3" => Some(Self::F32x3),
+            "FORMAT_JPEG" => Some(Self::Jpeg),
             _ => None,
         }
     }
@@ -2767,8 +2776,8 @@ pub mod frame_service_client {
                 .insert(GrpcMethod::new("modalcast.v1.FrameService", "StreamFrames"));
             self.inner.server_streaming(req, path, codec).await
         }
-        /// Moves cameras of a running stream. The next frames show them. If no step arrives, the stream sends the current step
-        /// again with the moved cameras, also if its delivery is lossless; before the first step it sends the rest state.
+        /// Moves cameras of a running stream. The next frames show them. If no step arrives, the stream sends all pictures of
+        /// the current step again, also if its delivery is lossless; before the first step it sends the rest state.
         /// Updates in quick succession are merged. Unary, so that browsers can call it over grpc-web.
         pub async fn update_frame_stream(
             &mut self,
@@ -2870,8 +2879,8 @@ pub mod frame_service_server {
             tonic::Response<Self::StreamFramesStream>,
             tonic::Status,
         >;
-        /// Moves cameras of a running stream. The next frames show them. If no step arrives, the stream sends the current step
-        /// again with the moved cameras, also if its delivery is lossless; before the first step it sends the rest state.
+        /// Moves cameras of a running stream. The next frames show them. If no step arrives, the stream sends all pictures of
+        /// the current step again, also if its delivery is lossless; before the first step it sends the rest state.
         /// Updates in quick succession are merged. Unary, so that browsers can call it over grpc-web.
         async fn update_frame_stream(
             &self,
@@ -3254,9 +3263,9 @@ pub struct StreamVerticesRequest {
     /// Number of steps after which the stream ends; 0: no limit.
     #[prost(uint64, tag = "4")]
     pub steps: u64,
-    /// Maximum number of steps per second, finite and above 0; 0: no limit. The steps that are sent are the newest ones, and
-    /// those in between are skipped and counted. After a wait for a step, two steps may follow each other faster. Only with
-    /// DELIVERY_LATEST: DELIVERY_LOSSLESS sends every step, so a limit is rejected.
+    /// Maximum number of steps per second, finite and above 0; 0: no limit. The steps that are sent are the newest ones,
+    /// and those in between are skipped and counted. After a wait for a step, two steps may follow each other faster. Only
+    /// with DELIVERY_LATEST: DELIVERY_LOSSLESS sends every step, so a limit is rejected.
     #[prost(double, tag = "5")]
     pub max_hz: f64,
 }
@@ -3457,7 +3466,8 @@ pub mod vertex_service_client {
     use tonic::codegen::*;
     use tonic::codegen::http::Uri;
     /// Deformed vertices, and attributes computed with them. A reply begins with the layout, which holds for all its steps.
-    /// The reply of a stream has the settings in effect before the layout. The bytes of each step follow in chunks of at most 1 MiB, the first one with the head of the step.
+    /// The reply of a stream has the settings in effect before the layout. The bytes of each step follow in chunks of at most
+    /// 1 MiB, the first one with the head of the step.
     #[derive(Debug, Clone)]
     pub struct VertexServiceClient<T> {
         inner: tonic::client::Grpc<T>,
@@ -3635,7 +3645,8 @@ pub mod vertex_service_server {
         >;
     }
     /// Deformed vertices, and attributes computed with them. A reply begins with the layout, which holds for all its steps.
-    /// The reply of a stream has the settings in effect before the layout. The bytes of each step follow in chunks of at most 1 MiB, the first one with the head of the step.
+    /// The reply of a stream has the settings in effect before the layout. The bytes of each step follow in chunks of at most
+    /// 1 MiB, the first one with the head of the step.
     #[derive(Debug)]
     pub struct VertexServiceServer<T> {
         inner: Arc<T>,

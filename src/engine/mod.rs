@@ -23,7 +23,7 @@ pub use device::context::{DeviceContext, EngineInfo};
 pub use device::loaded_scene::LoadedScene;
 pub use device::scalar_field::validate_mode;
 pub use output::frame_encoder::{EncodedFrame, EncodedOutput, FrameEncoder, StepPicture};
-pub use output::frame_format::FrameFormat;
+pub use output::frame_format::{FrameFormat, JpegQuality};
 pub use output::pack::{Attribute, Origins, PackedVertices, Section, VertexSelection, pack_vertices, validate_domains};
 pub use output::pick_result::{PickResult, resolve_picks};
 pub use output::rendered_picture::{Pixels, RenderedPicture};

@@ -1,4 +1,4 @@
-//! Converts AOVs of values to color maps and encodes pixels as PNG. All functions are pure, so they run off the device
+//! Converts AOVs of values to color maps and encodes pixels as PNG or JPEG. All functions are pure, so they run off the device
 //! thread.
 
 mod colormap;
@@ -7,7 +7,7 @@ mod legend;
 pub use colormap::{apply_colormap, viridis};
 pub use legend::{Legend, draw as draw_legend, round_up_scale};
 
-use modalcast_model::error::Result;
+use modalcast_model::error::{Result, fault_in};
 
 /// Converts an AOV of values to RGBA8 sRGB pixels with a legend. `word_bytes` contains native-endian u32 words with the
 /// layout of [`apply_colormap`], `samples` words per pixel. `size` is the width and height in pixels.
@@ -32,6 +32,21 @@ pub fn encode_png(width: u32, height: u32, rgba: &[u8]) -> Result<Vec<u8>> {
         Some(rgb) => write_png(width, height, png::ColorType::Rgb, &rgb),
         None => write_png(width, height, png::ColorType::Rgba, rgba),
     }
+}
+
+/// Encodes RGBA8 sRGB pixels, top row first, as baseline JPEG without alpha. `quality` is 1 to 100. Below 90 the chroma
+/// has half the resolution in both directions.
+///
+/// # Errors
+/// `Fault` when a side has more than 65,535 pixels or the encoder fails.
+pub fn encode_jpeg(width: u32, height: u32, rgba: &[u8], quality: u8) -> Result<Vec<u8>> {
+    let to_u16 = |side: u32| u16::try_from(side).map_err(fault_in("encode"));
+    let mut bytes = Vec::with_capacity(rgba.len() / 16);
+    let mut encoder = jpeg_encoder::Encoder::new(&mut bytes, quality);
+    encoder.set_chroma_subsampling_method(jpeg_encoder::ChromaSubsamplingMethod::Average);
+    let (width, height) = (to_u16(width)?, to_u16(height)?);
+    encoder.encode(rgba, width, height, jpeg_encoder::ColorType::Rgba).map_err(fault_in("encode"))?;
+    Ok(bytes)
 }
 
 /// The pixels without alpha; `None` unless every alpha is 255.
@@ -67,6 +82,31 @@ fn write_png(width: u32, height: u32, color: png::ColorType, pixels: &[u8]) -> R
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// Mean difference of the color channels, 0 to 255. Alpha is ignored.
+    fn mean_error(rgb: &[u8], rgba: &[u8]) -> f64 {
+        let channels = rgba.as_chunks::<4>().0.iter().flat_map(|pixel| &pixel[..3]);
+        let sum: u64 = rgb.iter().zip(channels).map(|(a, b)| u64::from(a.abs_diff(*b))).sum();
+        sum as f64 / rgb.len() as f64
+    }
+
+    #[test]
+    fn jpeg_error_is_small_and_decreases_with_quality() {
+        let (width, height) = (61, 47);
+        // Colored waves of different lengths, in both directions.
+        let wave = |position: u32, length: f64| 128.0 + 100.0 * (f64::from(position) / length).sin();
+        let pixel = |x: u32, y: u32| [wave(x, 3.0) as u8, wave(y, 5.0) as u8, wave(x + y, 4.0) as u8, 255];
+        let rgba: Vec<u8> = (0..width * height).flat_map(|index| pixel(index % width, index / width)).collect();
+        let error_at = |quality| {
+            let bytes = encode_jpeg(width, height, &rgba, quality).expect("expected an encoded JPEG");
+            let decoded = image::load_from_memory(&bytes).expect("expected a decodable JPEG").into_rgb8();
+            assert_eq!(decoded.dimensions(), (width, height));
+            mean_error(&decoded, &rgba)
+        };
+        let errors = [100, 95, 60, 1].map(error_at);
+        assert!(errors[0] < 2.0 && errors.is_sorted_by(|a, b| a < b), "{errors:?}");
+        assert!(encode_jpeg(65_536, 1, &[0; 4 * 65_536], 90).is_err());
+    }
 
     #[test]
     fn png_round_trip_keeps_pixels_and_drops_opaque_alpha() {

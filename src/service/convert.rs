@@ -283,10 +283,15 @@ pub(super) fn parse_pick(engine: &Engine, scene: &Scene, request: &v1::PickReque
 
 /// A picture with all defaults resolved.
 pub(super) fn wire_picture(RequestedPicture { spec, format }: &RequestedPicture) -> v1::Picture {
+    let jpeg_quality = match format {
+        FrameFormat::Jpeg(quality) => quality.get().into(),
+        FrameFormat::Png | FrameFormat::Rgba | FrameFormat::F32 | FrameFormat::U32 | FrameFormat::F32x3 => 0,
+    };
     v1::Picture {
         width: spec.size.width,
         height: spec.size.height,
         format: wire_format(*format).into(),
+        jpeg_quality,
         camera: Some(camera::wire_camera(&spec.camera)),
         ..output::wire_output(spec.output)
     }

@@ -65,6 +65,9 @@ async fn errors_of_calls() -> Vec<(Code, Reason, Status)> {
     let mut frame = server.frames().await.render_frame(frame_request).await.expect("expected a stream").into_inner();
     let no_renderer = with_timeout(frame.message()).await.expect_err("expected an error");
     errors.push((Code::Unavailable, Reason::ResourceMissing, no_renderer));
+    let update = v1::UpdateFrameStreamRequest { stream: vec![7; 16].into(), cameras: Vec::new() };
+    let unknown_stream = server.frames().await.update_frame_stream(update).await.expect_err("expected an error");
+    errors.push((Code::NotFound, Reason::StreamNotFound, unknown_stream));
     errors.push((Code::Internal, Reason::Internal, open_error(&server, "panic", "").await));
     server.open("attributes").await;
     errors.push((Code::ResourceExhausted, Reason::LimitReached, open_error(&server, "sheet", "").await));

@@ -114,6 +114,37 @@ async fn skipped_steps_are_counted_by_the_first_picture() {
     tokio::join!(send_steps, receive_frames);
 }
 
+/// Mean difference of the color channels of two images, 0 to 255.
+fn mean_error(image: &[u8], other: &[u8]) -> f64 {
+    let decode = |bytes| image::load_from_memory(bytes).expect("expected a decodable image").into_rgb8().into_raw();
+    let (image, other) = (decode(image), decode(other));
+    assert_eq!(image.len(), other.len());
+    image.iter().zip(&other).map(|(a, b)| f64::from(a.abs_diff(*b))).sum::<f64>() / image.len() as f64
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn jpeg_error_is_small_and_decreases_with_quality() {
+    let (_server, client) = start_server().await;
+    let color = Picture { camera: camera(0.5), ..Picture::default() }.size(160, 120);
+    for output in [Output::Color, Output::ModeShape { mode: 1, scale_max: 0.0 }] {
+        let png = Picture { output, ..color };
+        let jpeg = |jpeg_quality| Picture { jpeg_quality, ..png.format(FrameFormat::Jpeg) };
+        let request = FramesRequest::new("strips", vec![png, jpeg(100), jpeg(0), jpeg(90), jpeg(5)]);
+        let frames = client.render_frames(&request).await.expect("expected frames");
+        assert!(frames[1..].iter().all(|frame| frame.format == FrameFormat::Jpeg));
+        assert_eq!(frames[2].bytes, frames[3].bytes, "expected 90 as the default");
+        let errors = [1, 3, 4].map(|index: usize| mean_error(&frames[index].bytes, &frames[0].bytes));
+        assert!(errors[1] < 2.0, "{output:?}: {errors:?}");
+        assert!(errors.is_sorted_by(|a, b| a < b), "expected larger errors at lower quality: {output:?}, {errors:?}");
+        assert!(frames[4].bytes.len() < frames[1].bytes.len());
+        let other_picture = Picture { camera: camera(2.5), ..png };
+        let other_frame = client.render_frame(&FrameRequest::new("strips", other_picture)).await;
+        let other_frame = other_frame.expect("expected a frame");
+        let control = mean_error(&frames[3].bytes, &other_frame.bytes);
+        assert!(control > 2.0, "negative control: {control} against another camera");
+    }
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn invalid_lists_of_pictures_are_rejected() {
     let (_server, client) = start_server().await;
@@ -129,6 +160,7 @@ async fn invalid_lists_of_pictures_are_rejected() {
         (vec![small, small.format(FrameFormat::F32)], "pictures[1].format"),
         (vec![small, missing_mode], "pictures[1].mode"),
         (vec![small.size(8, 0)], "pictures[0].width"),
+        (vec![Picture { jpeg_quality: 101, ..small.format(FrameFormat::Jpeg) }], "pictures[0].jpeg_quality"),
     ] {
         let error: Error = render(pictures).await.expect_err(field);
         assert_eq!(error.rejection().expect("expected a rejection").field, field);

@@ -23,11 +23,13 @@ pub type FramesRequest = StepRequest<Pictures>;
 /// A subscription to one frame per step and picture.
 pub type FrameStreamRequest = Subscription<Pictures>;
 
-/// Encoding of the bytes of a frame, top row first: 8-bit sRGB (`Png`, `Rgba`), or numbers.
+/// Encoding of the bytes of a frame, top row first: 8-bit sRGB (`Png`, `Jpeg`, `Rgba`), or numbers.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub enum FrameFormat {
     #[default]
     Png,
+    /// Without alpha; see [`Picture::jpeg_quality`].
+    Jpeg,
     Rgba,
     /// Little-endian f32, one per pixel: the only format of [`Output::Depth`].
     F32,
@@ -93,6 +95,8 @@ pub struct Picture {
     pub format: FrameFormat,
     pub camera: Option<Camera>,
     pub output: Output,
+    /// For [`FrameFormat::Jpeg`]: 1 (smallest frame) to 100 (smallest error); 0 means 90.
+    pub jpeg_quality: u32,
 }
 
 impl Picture {
@@ -139,7 +143,7 @@ pub struct Frame {
     pub width: u32,
     pub height: u32,
     pub format: FrameFormat,
-    /// A PNG file, or 4 or 12 bytes per pixel, as `format` states.
+    /// A PNG or JPEG file, or 4 or 12 bytes per pixel, as `format` states.
     pub bytes: Bytes,
     /// Number of steps skipped since the previous step of the stream; 0 for all pictures of a step but the first.
     pub skipped: u64,
@@ -293,6 +297,7 @@ impl WireChunk for v1::FrameChunk {
     fn decode_reply(head: Self::Head, bytes: Bytes) -> Result<Frame> {
         let (format, pixel_bytes) = match head.format() {
             v1::Format::Png => (FrameFormat::Png, None),
+            v1::Format::Jpeg => (FrameFormat::Jpeg, None),
             v1::Format::Rgba => (FrameFormat::Rgba, Some(4)),
             v1::Format::F32 => (FrameFormat::F32, Some(4)),
             v1::Format::U32 => (FrameFormat::U32, Some(4)),
@@ -351,14 +356,22 @@ impl From<Picture> for v1::Picture {
         // server rejects the number formats for the other outputs.
         let format = match (picture.output, picture.format) {
             (Output::Depth | Output::Domains | Output::Normals, _) | (_, FrameFormat::Png) => v1::Format::Unspecified,
+            (_, FrameFormat::Jpeg) => v1::Format::Jpeg,
             (_, FrameFormat::Rgba) => v1::Format::Rgba,
             (_, FrameFormat::F32) => v1::Format::F32,
             (_, FrameFormat::U32) => v1::Format::U32,
             (_, FrameFormat::F32x3) => v1::Format::F32x3,
         };
-        let camera = picture.camera.map(Into::into);
-        let (width, height) = (picture.width, picture.height);
-        Self { width, height, format: format.into(), camera, output: output.into(), mode, largest: scale_max }
+        Self {
+            width: picture.width,
+            height: picture.height,
+            format: format.into(),
+            camera: picture.camera.map(Into::into),
+            output: output.into(),
+            mode,
+            largest: scale_max,
+            jpeg_quality: if format == v1::Format::Jpeg { picture.jpeg_quality } else { 0 },
+        }
     }
 }
 

@@ -352,6 +352,11 @@ async fn fetch_saves_files_and_exits_with_documented_codes() {
     let frame_path = path("one.rgba");
     let frame_arguments = [&["frame", "--out", &frame_path], &picture_arguments[..]].concat();
     assert_eq!(run_fetch(&url, &frame_arguments).await.exit_code, 0);
+    let several_outputs = [&frame_arguments[..], &["--output", "color,normals"]].concat();
+    assert_eq!(run_fetch(&url, &several_outputs).await.exit_code, 0);
+    // The fake server sends every picture as RGBA.
+    let sizes = ["one_color.rgba", "one_normals.rgba"].map(|name| std::fs::read(path(name)).expect("a frame").len());
+    assert_eq!(sizes, [800; 2]);
     assert_eq!(run_fetch(&url, &["info"]).await.exit_code, 0);
     assert!(run_fetch(&url, &["list", "--json"]).await.stdout.contains("\"scene\":\"toy\""));
     assert_eq!(run_fetch(&url, &["frame", "--scene", "none", "--out", &path("x.png")]).await.exit_code, 1);

@@ -1,4 +1,4 @@
-//! Encodes frames for the wire as PNG or raw pixels. All streams share one encoder, which uses at most one thread per
+//! Encodes frames for the wire as PNG, JPEG or raw pixels. All streams share one encoder, which uses at most one thread per
 //! core.
 
 use std::borrow::Cow;
@@ -156,6 +156,7 @@ fn encode_pixels(picture: &RenderedPicture, format: FrameFormat) -> Result<Vec<u
     };
     match format {
         FrameFormat::Png => frame::encode_png(width, height, &rgba),
+        FrameFormat::Jpeg(quality) => frame::encode_jpeg(width, height, &rgba, quality.get()),
         FrameFormat::Rgba => Ok(rgba.into_owned()),
         FrameFormat::F32 | FrameFormat::U32 | FrameFormat::F32x3 => {
             Err(fault("encode", "expected a format of colors, got a format of numbers"))
@@ -166,6 +167,7 @@ fn encode_pixels(picture: &RenderedPicture, format: FrameFormat) -> Result<Vec<u
 #[cfg(test)]
 pub(in crate::engine) mod tests {
     use super::*;
+    use crate::engine::output::frame_format::JpegQuality;
     use modalcast_render::FrameImage;
 
     /// A frame of noise, so that encoding its PNG takes time. `number` is the step number and the seed.
@@ -205,7 +207,8 @@ pub(in crate::engine) mod tests {
             let (first, second) = tokio::join!(first, second);
             (first.expect("expected an encoded frame").output, second.expect("expected an encoded frame").output)
         };
-        for format in [FrameFormat::Png, FrameFormat::Rgba] {
+        let jpeg = |quality| FrameFormat::Jpeg(JpegQuality::parse("quality", quality).expect("expected a quality"));
+        for format in [FrameFormat::Png, FrameFormat::Rgba, jpeg(50), jpeg(90)] {
             let (first, second) = encode_twice(format).await;
             assert_eq!(first.bytes.as_ptr(), second.bytes.as_ptr(), "{format:?}: expected shared bytes");
             assert_eq!(first.bytes.len(), second.bytes.len(), "{format:?}");
@@ -213,6 +216,9 @@ pub(in crate::engine) mod tests {
         }
         let other_frame = encoder.encode(first_picture(&noise_frame(1, 16)), FrameFormat::Png).await;
         let other_frame = other_frame.expect("expected a PNG").output;
+        let ((small, _), (large, _)) = (encode_twice(jpeg(50)).await, encode_twice(jpeg(90)).await);
+        assert!(small.bytes.len() < large.bytes.len(), "expected one encoding per quality");
+        assert_eq!(large.bytes, encode_twice(jpeg(0)).await.0.bytes, "expected the default quality of 90");
         let (shared, _) = encode_twice(FrameFormat::Png).await;
         assert_eq!(other_frame.bytes, shared.bytes);
         assert_ne!(

@@ -2,7 +2,7 @@
 
 use modalcast_proto::v1;
 
-use crate::engine::{FrameFormat, FrameOutput, validate_mode};
+use crate::engine::{FrameFormat, FrameOutput, JpegQuality, validate_mode};
 use modalcast_model::error::{Result, invalid};
 use modalcast_model::scene::Scene;
 
@@ -28,13 +28,16 @@ pub(super) fn parse_output(scene: &Scene, picture: &v1::Picture) -> Result<(Fram
         v1::Output::Displacement => FrameOutput::Displacement { scale_max },
         v1::Output::ModeShape => FrameOutput::ModeShape { mode: validate_mode(scene, picture.mode)?, scale_max },
     };
-    Ok((frame_output, parse_format(frame_output, picture.format)?))
+    Ok((frame_output, parse_format(frame_output, picture)?))
 }
 
 /// Parses a format. Unspecified is PNG for color frames and color maps, else the only format of the output.
-fn parse_format(frame_output: FrameOutput, number: i32) -> Result<FrameFormat> {
-    let requested_format =
-        v1::Format::try_from(number).map_err(|_| invalid("format", "a format of this version", number))?;
+fn parse_format(frame_output: FrameOutput, picture: &v1::Picture) -> Result<FrameFormat> {
+    let requested_format = v1::Format::try_from(picture.format)
+        .map_err(|_| invalid("format", "a format of this version", picture.format))?;
+    if picture.jpeg_quality != 0 && requested_format != v1::Format::Jpeg {
+        return Err(invalid("jpeg_quality", "0 unless the format is FORMAT_JPEG", picture.jpeg_quality));
+    }
     // The only format of the output, as wire and engine types; `None` for outputs with a choice.
     let required_format = match frame_output {
         FrameOutput::Color | FrameOutput::Displacement { .. } | FrameOutput::ModeShape { .. } => None,
@@ -44,8 +47,11 @@ fn parse_format(frame_output: FrameOutput, number: i32) -> Result<FrameFormat> {
     };
     match (required_format, requested_format) {
         (None, v1::Format::Unspecified | v1::Format::Png) => Ok(FrameFormat::Png),
+        (None, v1::Format::Jpeg) => JpegQuality::parse("jpeg_quality", picture.jpeg_quality).map(FrameFormat::Jpeg),
         (None, v1::Format::Rgba) => Ok(FrameFormat::Rgba),
-        (None, other) => Err(invalid("format", "FORMAT_PNG or FORMAT_RGBA for this output", other.as_str_name())),
+        (None, other) => {
+            Err(invalid("format", "FORMAT_PNG, FORMAT_JPEG or FORMAT_RGBA for this output", other.as_str_name()))
+        }
         (Some((_, format)), v1::Format::Unspecified) => Ok(format),
         (Some((wire_format, format)), _) if wire_format == requested_format => Ok(format),
         (Some((wire_format, _)), _) => {
@@ -71,6 +77,7 @@ pub(super) fn wire_output(output: FrameOutput) -> v1::Picture {
 pub(crate) const fn wire_format(format: FrameFormat) -> v1::Format {
     match format {
         FrameFormat::Png => v1::Format::Png,
+        FrameFormat::Jpeg(_) => v1::Format::Jpeg,
         FrameFormat::Rgba => v1::Format::Rgba,
         FrameFormat::F32 => v1::Format::F32,
         FrameFormat::U32 => v1::Format::U32,

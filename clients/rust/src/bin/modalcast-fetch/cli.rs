@@ -9,6 +9,8 @@ const EXAMPLES: &str = "\
 Examples:
   modalcast-fetch frames --scene tree --open tree --count 60 --size 1280x720 --out out
   modalcast-fetch frame --scene tree --min-step 10 --out frame.png
+  modalcast-fetch frame --scene tree --output color,depth,normals --out tree.png
+  modalcast-fetch frames --scene tree --format jpeg --quality 80 --delivery latest --max-hz 10 --out out
   modalcast-fetch vertices --scene tree --count 60 --out vertices.npy --json
   modalcast-fetch --server http://10.0.0.2:50051 info
 
@@ -76,19 +78,23 @@ pub(crate) struct PictureOptions {
     #[arg(long, default_value = "1280x720", value_name = "WxH", value_parser = parse_size)]
     size: (u32, u32),
     /// Content of the picture: color, depth (f32 meters), domains (u32), normals (3 f32), or a color map of
-    /// `displacement` or `mode-shape` with a legend.
-    #[arg(long, value_enum, default_value = "color")]
-    output: OutputOption,
+    /// `displacement` or `mode-shape` with a legend. Several, separated by commas, are saved as one file each, with the
+    /// name of the output at the end of the file name; all show the same step.
+    #[arg(long = "output", value_enum, default_value = "color", value_delimiter = ',')]
+    outputs: Vec<OutputOption>,
     /// Index of the column of U for `--output mode-shape`, from 0.
-    #[arg(long, requires = "output", default_value_t = 0)]
+    #[arg(long, requires = "outputs", default_value_t = 0)]
     mode: u32,
     /// Value at the bright end of the color map, in meters (`displacement`) or meters per unit of q (`mode-shape`); 0
     /// fits the color map to each frame.
-    #[arg(long = "largest", value_name = "VALUE", requires = "output", default_value_t = 0.0)]
+    #[arg(long = "largest", value_name = "VALUE", requires = "outputs", default_value_t = 0.0)]
     scale_max: f64,
-    /// Encoding of color pictures: PNG, or raw RGBA8 (top row first, sRGB).
+    /// Encoding of color pictures and color maps: PNG, JPEG, or raw RGBA8 (top row first, sRGB).
     #[arg(long, value_enum, default_value = "png")]
     pub(crate) format: FormatOption,
+    /// Quality of JPEG, 1 (smallest file) to 100 (smallest error). Default: 90. Ignored by other formats.
+    #[arg(long, value_parser = clap::value_parser!(u32).range(1..=100))]
+    quality: Option<u32>,
     /// Position of the camera in scene units. Default: a camera that shows the whole scene.
     #[arg(long, value_name = "X,Y,Z", value_parser = parse_vector, requires = "target", allow_hyphen_values = true)]
     eye: Option<[f64; 3]>,
@@ -106,11 +112,12 @@ pub(crate) struct PictureOptions {
 #[derive(Debug, Clone, Copy, ValueEnum)]
 pub(crate) enum FormatOption {
     Png,
+    Jpeg,
     Raw,
 }
 
 #[derive(Debug, Clone, Copy, ValueEnum)]
-enum OutputOption {
+pub(crate) enum OutputOption {
     Color,
     Depth,
     Domains,
@@ -120,16 +127,31 @@ enum OutputOption {
 }
 
 impl PictureOptions {
-    pub(crate) fn picture(&self) -> Picture {
+    /// One picture per output.
+    pub(crate) fn pictures(&self) -> Vec<Picture> {
+        self.outputs.iter().map(|output| self.picture(*output)).collect()
+    }
+
+    /// The end of the file name of each picture: empty for a single picture, else `_` and the name of its output.
+    pub(crate) fn file_suffixes(&self) -> Vec<String> {
+        let suffix = |output: &OutputOption| match (self.outputs.len(), output.to_possible_value()) {
+            (2.., Some(value)) => format!("_{}", value.get_name()),
+            _ => String::new(),
+        };
+        self.outputs.iter().map(suffix).collect()
+    }
+
+    fn picture(&self, output: OutputOption) -> Picture {
         let view = self.eye.zip(self.target).map(|(eye, target)| View::LookAt { eye, target, up: self.up });
         let camera =
             view.map(|view| Camera { view, lens: Lens::FieldOfView(self.field_of_view.unwrap_or(35.0)), clip: None });
         let format = match self.format {
             FormatOption::Png => FrameFormat::Png,
+            FormatOption::Jpeg => FrameFormat::Jpeg,
             FormatOption::Raw => FrameFormat::Rgba,
         };
         let (mode, scale_max) = (self.mode, self.scale_max);
-        let output = match self.output {
+        let output = match output {
             OutputOption::Color => Output::Color,
             OutputOption::Depth => Output::Depth,
             OutputOption::Domains => Output::Domains,
@@ -137,7 +159,8 @@ impl PictureOptions {
             OutputOption::Displacement => Output::Displacement { scale_max },
             OutputOption::ModeShape => Output::ModeShape { mode, scale_max },
         };
-        Picture { width: self.size.0, height: self.size.1, format, camera, output }
+        let jpeg_quality = self.quality.unwrap_or(0);
+        Picture { width: self.size.0, height: self.size.1, format, camera, output, jpeg_quality }
     }
 }
 
@@ -162,7 +185,7 @@ pub(crate) struct FrameStreamOptions {
     pub(crate) scene: SceneOptions,
     #[command(flatten)]
     pub(crate) picture: PictureOptions,
-    /// Number of frames.
+    /// Number of steps. Each has one frame per output.
     #[arg(long, default_value_t = 60, value_parser = clap::value_parser!(u64).range(1..))]
     pub(crate) count: u64,
     /// Folder for frame_00000.png and so on; created if it does not exist.
@@ -171,6 +194,9 @@ pub(crate) struct FrameStreamOptions {
     /// lossless: receive every step; latest: skip to the newest step.
     #[arg(long, value_enum, default_value = "lossless")]
     pub(crate) delivery: DeliveryOption,
+    /// Maximum number of steps per second, with `--delivery latest` only; 0 for no limit.
+    #[arg(long, default_value_t = 0.0)]
+    pub(crate) max_hz: f64,
     /// How long to wait for the next frame, in seconds.
     #[arg(long, default_value_t = 120.0, value_parser = parse_seconds)]
     pub(crate) timeout: f64,
@@ -248,6 +274,9 @@ pub(crate) struct VerticesOptions {
     /// lossless: receive every step; latest: skip to the newest step.
     #[arg(long, value_enum, default_value = "lossless")]
     pub(crate) delivery: DeliveryOption,
+    /// Maximum number of steps per second, with `--count` and `--delivery latest` only; 0 for no limit.
+    #[arg(long, default_value_t = 0.0)]
+    pub(crate) max_hz: f64,
     /// How long to wait for the next step, in seconds.
     #[arg(long, default_value_t = 120.0, value_parser = parse_seconds)]
     pub(crate) timeout: f64,
@@ -280,6 +309,27 @@ mod tests {
     fn command_line_is_valid() {
         use clap::CommandFactory as _;
         Cli::command().debug_assert();
+    }
+
+    /// The options of `frame` with these arguments.
+    fn picture_options(arguments: &[&str]) -> PictureOptions {
+        let command = [&["modalcast-fetch", "frame", "--scene", "tree", "--out", "x.png"], arguments].concat();
+        match Cli::try_parse_from(command).expect("expected valid arguments").command {
+            Command::Frame(options) => options.picture,
+            other => panic!("expected the command `frame`, got {other:?}"),
+        }
+    }
+
+    #[test]
+    fn outputs_are_pictures_with_their_own_files() {
+        let single = picture_options(&["--output", "depth"]);
+        assert_eq!((single.pictures()[0].output, single.file_suffixes()), (Output::Depth, vec![String::new()]));
+        let several = picture_options(&["--output", "color,mode-shape", "--mode", "2", "--format", "jpeg"]);
+        assert_eq!(several.file_suffixes(), ["_color", "_mode-shape"]);
+        let outputs = several.pictures().into_iter().map(|picture| (picture.format, picture.output));
+        let expected = [Output::Color, Output::ModeShape { mode: 2, scale_max: 0.0 }];
+        assert!(outputs.eq(expected.map(|output| (FrameFormat::Jpeg, output))));
+        assert_eq!(picture_options(&["--format", "jpeg", "--quality", "35"]).pictures()[0].jpeg_quality, 35);
     }
 
     #[test]

@@ -29,7 +29,7 @@ async fn fetch_single(client: &Client, options: &VerticesOptions, scene: &str) -
 async fn fetch_stream(client: &Client, scene: &str, count: u64, files: &mut OutputFiles<'_>) -> Result<()> {
     let options = files.options;
     let request = VertexStreamRequest::new(scene, vertex_selection(options));
-    let request = request.delivery(options.delivery.into()).max_steps(count);
+    let request = request.delivery(options.delivery.into()).max_steps(count).max_hz(options.max_hz);
     let mut vertex_stream = client.stream_vertices(&request).await?;
     println!("ready");
     let timeout = Duration::from_secs_f64(options.timeout);
