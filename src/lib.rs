@@ -29,7 +29,7 @@
 //! | `modalcast::cli` | the command line: one file per command | `config`, `service`, `engine`, `frame`, `telemetry` |
 //! | `modalcast::service` | gRPC services: convert between wire messages and engine types; the only module that uses the protobuf types | `config`, `engine`, `telemetry` |
 //! | `modalcast::engine` | the device thread, open scenes, step queues, subscriptions, forces, persistent state | `config`, `frame`, `telemetry` |
-//! | `modalcast::frame` | PNG encoding, color maps with legends; pure functions | |
+//! | `modalcast::frame` | PNG and JPEG encoding, color maps with legends; pure functions | |
 //! | `modalcast::telemetry` | stage names and times, logging | |
 //! | `modalcast::config` | all limits and paths, validated once | |
 //! | `modalcast-compute::gpu` | the CUDA deformer and rasterizer, in the three tiers below | `storage` |

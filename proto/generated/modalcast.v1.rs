@@ -39,7 +39,7 @@ pub mod step_selector {
 ///
 /// * parse: validation of the step; queue: its wait in the step queue; deform: computation of the vertices
 /// * upload: vertices to OpenGL; shadow: shadow map; draw: all other passes; read: readback of pixels
-/// * encode: PNG encoding or packing of vertices; copy: readback of vertices
+/// * encode: PNG or JPEG encoding, or packing of vertices; copy: readback of vertices
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct StageTime {
     #[prost(string, tag = "1")]
