@@ -317,6 +317,79 @@ pub struct UploadSceneResponse {
     #[prost(message, optional, tag = "1")]
     pub scene: ::core::option::Option<SceneInfo>,
 }
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct UploadArraysRequest {
+    #[prost(oneof = "upload_arrays_request::Part", tags = "1, 2, 3")]
+    pub part: ::core::option::Option<upload_arrays_request::Part>,
+}
+/// Nested message and enum types in `UploadArraysRequest`.
+pub mod upload_arrays_request {
+    #[derive(Clone, PartialEq, ::prost::Oneof)]
+    pub enum Part {
+        #[prost(message, tag = "1")]
+        Header(super::UploadArraysHeader),
+        #[prost(message, tag = "2")]
+        Domain(super::UploadedDomain),
+        /// The next bytes of the arrays of the current domain, little-endian and without gaps:
+        ///
+        /// * rest positions x0: 3 f32 per vertex, in scene units and in the domain's own frame
+        /// * faces: 3 u32 per triangle, the indices of its vertices, counterclockwise seen from the front
+        /// * U: row-major f32, `rank` entries in each of 3 * vertices rows, in scene units per unit of q; rows 3v, 3v + 1
+        ///   and 3v + 2 belong to vertex v
+        ///   A chunk may end anywhere. A message must not exceed Limits.message_bytes.
+        #[prost(bytes, tag = "3")]
+        Chunk(::prost::bytes::Bytes),
+    }
+}
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct UploadArraysHeader {
+    /// The name that the scene gets, as in OpenSceneRequest; must not be empty or in use.
+    #[prost(string, tag = "1")]
+    pub scene: ::prost::alloc::string::String,
+    /// Number of domains, 1 to 4096.
+    #[prost(uint32, tag = "2")]
+    pub domains: u32,
+    /// Sum of the sizes of all arrays in bytes, at most Limits.upload_bytes.
+    #[prost(uint64, tag = "3")]
+    pub total_bytes: u64,
+    /// Meters per scene unit; 0: 1.
+    #[prost(double, tag = "4")]
+    pub unit: f64,
+    /// The up axis: "x", "y" or "z"; empty: "y".
+    #[prost(string, tag = "5")]
+    pub up: ::prost::alloc::string::String,
+}
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct UploadedDomain {
+    /// 1 to 256 bytes without control characters; each name once.
+    #[prost(string, tag = "1")]
+    pub name: ::prost::alloc::string::String,
+    /// Number of vertices and triangles, at least 1 each, and of modes, 0 to 512.
+    #[prost(uint32, tag = "2")]
+    pub vertices: u32,
+    #[prost(uint32, tag = "3")]
+    pub triangles: u32,
+    #[prost(uint32, tag = "4")]
+    pub rank: u32,
+    /// Index in the stream of an earlier domain whose mesh and modes this domain has. `vertices`, `triangles` and `rank`
+    /// must then be 0, and no chunks follow.
+    #[prost(uint32, optional, tag = "5")]
+    pub shares_shape_with: ::core::option::Option<u32>,
+    /// world_from_domain at rest: 12 little-endian f32, row-major 3x4, translation in scene units; empty: the identity.
+    #[prost(bytes = "bytes", tag = "6")]
+    pub placement: ::prost::bytes::Bytes,
+    /// Diffuse color: linear red, green and blue, 0 to 1; empty: white.
+    #[prost(float, repeated, tag = "7")]
+    pub color: ::prost::alloc::vec::Vec<f32>,
+    /// Squared angular frequencies in (rad/s)^2, one per mode; empty if unknown.
+    #[prost(double, repeated, tag = "8")]
+    pub eigenvalues: ::prost::alloc::vec::Vec<f64>,
+}
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct UploadArraysResponse {
+    #[prost(message, optional, tag = "1")]
+    pub scene: ::core::option::Option<SceneInfo>,
+}
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct FindUploadedFilesRequest {
     /// 1 to 4096 SHA-256 hashes of file contents, 32 bytes each.
@@ -872,6 +945,35 @@ pub mod scene_service_client {
                 .insert(GrpcMethod::new("modalcast.v1.SceneService", "UploadScene"));
             self.inner.client_streaming(req, path, codec).await
         }
+        /// Uploads meshes and modes as arrays, without files, and opens them as a scene. The parts are one `header`, then for
+        /// each domain one `domain` and its `chunk`s. The time budget is that of UploadScene. The scene survives a restart of
+        /// the server like uploaded files. Errors name the domain by its index i in the stream: `domains[i].rank`.
+        pub async fn upload_arrays(
+            &mut self,
+            request: impl tonic::IntoStreamingRequest<
+                Message = super::UploadArraysRequest,
+            >,
+        ) -> std::result::Result<
+            tonic::Response<super::UploadArraysResponse>,
+            tonic::Status,
+        > {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = tonic_prost::ProstCodec::default();
+            let path = http::uri::PathAndQuery::from_static(
+                "/modalcast.v1.SceneService/UploadArrays",
+            );
+            let mut req = request.into_streaming_request();
+            req.extensions_mut()
+                .insert(GrpcMethod::new("modalcast.v1.SceneService", "UploadArrays"));
+            self.inner.client_streaming(req, path, codec).await
+        }
         /// Tells which file contents the server already has, so that a client need not send them (UploadFile.reuse).
         pub async fn find_uploaded_files(
             &mut self,
@@ -1056,6 +1158,16 @@ pub mod scene_service_server {
             request: tonic::Request<tonic::Streaming<super::UploadSceneRequest>>,
         ) -> std::result::Result<
             tonic::Response<super::UploadSceneResponse>,
+            tonic::Status,
+        >;
+        /// Uploads meshes and modes as arrays, without files, and opens them as a scene. The parts are one `header`, then for
+        /// each domain one `domain` and its `chunk`s. The time budget is that of UploadScene. The scene survives a restart of
+        /// the server like uploaded files. Errors name the domain by its index i in the stream: `domains[i].rank`.
+        async fn upload_arrays(
+            &self,
+            request: tonic::Request<tonic::Streaming<super::UploadArraysRequest>>,
+        ) -> std::result::Result<
+            tonic::Response<super::UploadArraysResponse>,
             tonic::Status,
         >;
         /// Tells which file contents the server already has, so that a client need not send them (UploadFile.reuse).
@@ -1285,6 +1397,53 @@ pub mod scene_service_server {
                     let inner = self.inner.clone();
                     let fut = async move {
                         let method = UploadSceneSvc(inner);
+                        let codec = tonic_prost::ProstCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.client_streaming(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                "/modalcast.v1.SceneService/UploadArrays" => {
+                    #[allow(non_camel_case_types)]
+                    struct UploadArraysSvc<T: SceneService>(pub Arc<T>);
+                    impl<
+                        T: SceneService,
+                    > tonic::server::ClientStreamingService<super::UploadArraysRequest>
+                    for UploadArraysSvc<T> {
+                        type Response = super::UploadArraysResponse;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::Response>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<
+                                tonic::Streaming<super::UploadArraysRequest>,
+                            >,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as SceneService>::upload_arrays(&inner, request).await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = UploadArraysSvc(inner);
                         let codec = tonic_prost::ProstCodec::default();
                         let mut grpc = tonic::server::Grpc::new(codec)
                             .apply_compression_config(
@@ -5003,6 +5162,8 @@ pub enum Feature {
     ContentHashes = 2,
     /// FindUploadedFiles answers, and uploads accept UploadFile.reuse.
     UploadReuse = 3,
+    /// UploadArrays accepts scenes without files.
+    UploadArrays = 4,
 }
 impl Feature {
     /// String value of the enum field names used in the ProtoBuf definition.
@@ -5015,6 +5176,7 @@ impl Feature {
             Self::Frames => "FEATURE_FRAMES",
             Self::ContentHashes => "FEATURE_CONTENT_HASHES",
             Self::UploadReuse => "FEATURE_UPLOAD_REUSE",
+            Self::UploadArrays => "FEATURE_UPLOAD_ARRAYS",
         }
     }
     /// Creates an enum from field names used in the ProtoBuf definition.
@@ -5024,6 +5186,7 @@ impl Feature {
             "FEATURE_FRAMES" => Some(Self::Frames),
             "FEATURE_CONTENT_HASHES" => Some(Self::ContentHashes),
             "FEATURE_UPLOAD_REUSE" => Some(Self::UploadReuse),
+            "FEATURE_UPLOAD_ARRAYS" => Some(Self::UploadArrays),
             _ => None,
         }
     }

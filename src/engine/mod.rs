@@ -43,6 +43,7 @@ pub use scene::message::StepSelector;
 pub use scene::step_queue::{Overflow, StepReport};
 pub use scene::subscriber::Subscription;
 pub use source::SceneSource;
+pub use storage::array_upload::{ArrayUpload, ArrayUploadHeader, UploadedDomain, UploadedShape};
 pub use storage::scene_catalog::{SceneProvenance, validate_scene_name};
 pub use storage::upload::{Upload, UploadHeader};
 
@@ -250,13 +251,31 @@ impl Engine {
         if header.files == 0 || header.files > config.upload_files {
             return Err(invalid("header.files", format!("1 to {} files", config.upload_files), header.files));
         }
-        if header.total_bytes > config.upload_bytes {
-            let expected = format!("at most {} bytes", config.upload_bytes);
-            return Err(invalid("header.total_bytes", expected, header.total_bytes));
-        }
+        self.check_upload_bytes(header.total_bytes)?;
         let permit = self.permit_upload(&header.scene)?;
         let (upload_folder, hash_lists) = (self.shared.scene_catalog.uploads(), self.shared.scene_catalog.hash_lists());
         run_blocking("upload", move || Upload::begin(&upload_folder, hash_lists, header, permit)).await
+    }
+
+    /// Begins an upload of arrays.
+    ///
+    /// # Errors
+    /// As for [`Self::begin_upload`].
+    pub async fn begin_array_upload(&self, header: ArrayUploadHeader) -> Result<ArrayUpload> {
+        self.check_running()?;
+        validate_scene_name(&header.scene)?;
+        self.check_upload_bytes(header.total_bytes)?;
+        let permit = self.permit_upload(&header.scene)?;
+        let upload_folder = self.shared.scene_catalog.uploads();
+        run_blocking("upload", move || ArrayUpload::begin(&upload_folder, header, permit)).await
+    }
+
+    fn check_upload_bytes(&self, total_bytes: u64) -> Result<()> {
+        let max_bytes = self.shared.config.upload_bytes;
+        match total_bytes <= max_bytes {
+            true => Ok(()),
+            false => Err(invalid("header.total_bytes", format!("at most {max_bytes} bytes"), total_bytes)),
+        }
     }
 
     /// Checks that a scene with this name may be uploaded, and counts the upload until the permit is dropped.
@@ -285,6 +304,14 @@ impl Engine {
     /// `Invalid` naming the missing or malformed file; `NameTaken` when another scene was opened under the name since
     /// [`Self::begin_upload`].
     pub async fn finish_upload(&self, upload: Upload) -> Result<Arc<SceneHandle>> {
+        self.open_upload(run_blocking("upload", move || upload.finish()).await?).await
+    }
+
+    /// Opens a complete upload of arrays as a scene. On failure the uploaded files are removed.
+    ///
+    /// # Errors
+    /// As for [`Self::finish_upload`].
+    pub async fn finish_array_upload(&self, upload: ArrayUpload) -> Result<Arc<SceneHandle>> {
         self.open_upload(run_blocking("upload", move || upload.finish()).await?).await
     }
 

@@ -6,11 +6,13 @@ use modalcast_proto::v1;
 
 use crate::engine::{
     self, ContentHash, Delivery, Engine, FrameFormat, InitialState, LeaseRequest, LeaseToken, OutputSpec, Overflow,
-    PictureSpec, RasterBackend, SceneHandle, StepId, StepSelector, StreamDelivery, WriterSession, parse_hash,
+    PictureSpec, RasterBackend, SceneHandle, StepId, StepSelector, StreamDelivery, UploadedShape, WriterSession,
+    parse_hash,
 };
 use crate::telemetry::StageTimes;
+use modalcast_model::domain::Transform;
 use modalcast_model::error::{Result, invalid};
-use modalcast_model::scene::{Camera, FrameSize, PixelRect, RawStepUpdate, Scene, TransformFormat};
+use modalcast_model::scene::{Camera, FrameSize, PixelRect, RawStepUpdate, Scene, TransformFormat, UpAxis};
 
 mod camera;
 mod output;
@@ -334,4 +336,44 @@ pub(super) fn parse_upload_header(header: v1::UploadHeader) -> engine::UploadHea
         files: header.files,
         total_bytes: header.total_bytes,
     }
+}
+
+pub(super) fn parse_array_upload_header(header: v1::UploadArraysHeader) -> Result<engine::ArrayUploadHeader> {
+    let up = match header.up.as_str() {
+        "x" => UpAxis::X,
+        "" | "y" => UpAxis::Y,
+        "z" => UpAxis::Z,
+        other => return Err(invalid("header.up", "x, y or z", other)),
+    };
+    Ok(engine::ArrayUploadHeader {
+        scene: header.scene,
+        domains: header.domains,
+        total_bytes: header.total_bytes,
+        unit: if header.unit == 0.0 { 1.0 } else { header.unit },
+        up,
+    })
+}
+
+pub(super) fn parse_uploaded_domain(domain: v1::UploadedDomain) -> Result<engine::UploadedDomain> {
+    let v1::UploadedDomain { vertices, triangles, rank, .. } = domain;
+    let shape = match domain.shares_shape_with {
+        None => UploadedShape::Arrays { vertices, triangles, rank },
+        Some(earlier) if (vertices, triangles, rank) == (0, 0, 0) => UploadedShape::OfDomain(earlier),
+        Some(_) => {
+            let given = format!("{vertices} vertices, {triangles} triangles, rank {rank}");
+            return Err(invalid("shares_shape_with", "no arrays of its own", given));
+        }
+    };
+    let placement = match domain.placement.len() {
+        0 => Transform::IDENTITY,
+        48 => Transform::new(bytemuck::pod_read_unaligned(&domain.placement))
+            .map_err(|error| error.in_message("placement"))?,
+        length => return Err(invalid("placement", "0 or 48 bytes", format!("{length} bytes"))),
+    };
+    let color = match domain.color[..] {
+        [] => [1.0; 3],
+        [red, green, blue] => [red, green, blue],
+        _ => return Err(invalid("color", "none or 3 numbers", domain.color.len())),
+    };
+    Ok(engine::UploadedDomain { name: domain.name, shape, placement, color, eigenvalues: domain.eigenvalues })
 }

@@ -45,7 +45,7 @@ impl v1::server_service_server::ServerService for ServerServiceImpl {
 
 /// The features of a server with these devices.
 fn list_features(info: &EngineInfo) -> Vec<v1::Feature> {
-    let mut features = vec![v1::Feature::ContentHashes, v1::Feature::UploadReuse];
+    let mut features = vec![v1::Feature::ContentHashes, v1::Feature::UploadReuse, v1::Feature::UploadArrays];
     if info.renderer.is_ok() {
         features.push(v1::Feature::Frames);
     }
@@ -69,7 +69,7 @@ mod tests {
             max_side: 1,
         };
         let info = |renderer| EngineInfo { backend: Backend::Cpu, device: "none".into(), renderer };
-        let always = [v1::Feature::ContentHashes, v1::Feature::UploadReuse];
+        let always = [v1::Feature::ContentHashes, v1::Feature::UploadReuse, v1::Feature::UploadArrays];
         assert_eq!(list_features(&info(Err(fault("renderer", "none")))), always);
         assert_eq!(list_features(&info(Ok(renderer))), [&always[..], &[v1::Feature::Frames]].concat());
     }

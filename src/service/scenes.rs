@@ -8,7 +8,7 @@ use super::describe;
 use super::status::to_status;
 use super::stream::{ReplyStream, catch_panic};
 use super::uploads::receive_upload;
-use crate::engine::{Engine, Upload};
+use crate::engine::{ArrayUpload, Engine, Upload};
 
 /// Limit in bytes on the source names in one list.
 const MAX_SOURCE_BYTES: usize = 512 << 10;
@@ -40,6 +40,19 @@ impl v1::scene_service_server::SceneService for SceneServiceImpl {
         catch_panic(async move {
             let scene_handle = engine.finish_upload(upload).await?;
             Ok(v1::UploadSceneResponse { scene: Some(wire_scene_info(&scene_handle)) })
+        })
+        .await
+    }
+
+    async fn upload_arrays(
+        &self,
+        request: Request<Streaming<v1::UploadArraysRequest>>,
+    ) -> Result<Response<v1::UploadArraysResponse>, Status> {
+        let upload: ArrayUpload = receive_upload(&self.0, request.into_inner()).await?;
+        let engine = self.0.clone();
+        catch_panic(async move {
+            let scene_handle = engine.finish_array_upload(upload).await?;
+            Ok(v1::UploadArraysResponse { scene: Some(wire_scene_info(&scene_handle)) })
         })
         .await
     }

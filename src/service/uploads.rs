@@ -1,14 +1,15 @@
-//! Receives the stream of `UploadScene`.
+//! Receives the streams of `UploadScene` and `UploadArrays`. Both begin with a header and share one time budget.
 
 use std::time::{Duration, Instant};
 
 use modalcast_proto::v1;
+use modalcast_proto::v1::upload_arrays_request::Part as ArraysPart;
 use modalcast_proto::v1::upload_scene_request::Part as FilesPart;
 use tonic::{Status, Streaming};
 
-use super::convert::parse_upload_header;
+use super::convert::{parse_array_upload_header, parse_upload_header, parse_uploaded_domain};
 use super::status::{to_status, transport_status};
-use crate::engine::{Engine, Upload};
+use crate::engine::{ArrayUpload, Engine, Upload};
 use modalcast_model::error::{Error, Result, fault_in};
 
 /// The lowest sustained upload rate that the server accepts, in bytes per second: 32 KiB/s.
@@ -61,6 +62,38 @@ impl StreamedUpload for Upload {
             FilesPart::File(file) => self.begin_file(&file.path, file.bytes, &file.sha256),
             FilesPart::Chunk(bytes) => self.write_chunk(&bytes),
             FilesPart::Header(_) => Err(second_header()),
+        }
+    }
+
+    fn discard(self) {
+        Self::discard(self);
+    }
+}
+
+impl StreamedUpload for ArrayUpload {
+    type Request = v1::UploadArraysRequest;
+    type Part = ArraysPart;
+
+    fn part_of(request: Self::Request) -> Option<ArraysPart> {
+        request.part
+    }
+
+    async fn begin(engine: &Engine, part: ArraysPart) -> Result<Self> {
+        match part {
+            ArraysPart::Header(header) => engine.begin_array_upload(parse_array_upload_header(header)?).await,
+            _ => Err(missing_header()),
+        }
+    }
+
+    fn add_part(&mut self, part: ArraysPart) -> Result<()> {
+        match part {
+            ArraysPart::Domain(domain) => {
+                let path = format!("domains[{}]", self.domain_count());
+                let domain = parse_uploaded_domain(domain).map_err(|error| error.in_message(&path))?;
+                self.begin_domain(&domain)
+            }
+            ArraysPart::Chunk(bytes) => self.write_chunk(&bytes),
+            ArraysPart::Header(_) => Err(second_header()),
         }
     }
 

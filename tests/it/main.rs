@@ -1,5 +1,6 @@
 //! Tests that need no GPU, in one binary. The tests that render need an EGL driver; a software driver is enough.
 
+mod array_uploads;
 mod attribute_streams;
 #[path = "../common/mod.rs"]
 mod common;

@@ -1,6 +1,7 @@
 #![doc = include_str!("../README.md")]
 #![cfg_attr(not(test), deny(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::print_stdout))]
 
+mod array_upload;
 mod assemble;
 mod client;
 mod content;
@@ -21,6 +22,7 @@ mod upload;
 mod vertex_encoding;
 mod vertices;
 
+pub use array_upload::{ArrayUpload, UploadDomain, UploadShape};
 pub use client::{Client, REPLY_LIMIT, SceneList, ServerInfo};
 pub use content::ContentHash;
 pub use error::{Error, Reason, Rejection, Result};

@@ -149,6 +149,13 @@ impl SceneService for FakeService {
         Ok(Response::new(v1::UploadSceneResponse { scene: Some(self.0.info()) }))
     }
 
+    async fn upload_arrays(
+        &self,
+        _: Request<Streaming<v1::UploadArraysRequest>>,
+    ) -> Result<Response<v1::UploadArraysResponse>, Status> {
+        Err(Status::unimplemented("upload_arrays"))
+    }
+
     async fn find_uploaded_files(
         &self,
         request: Request<v1::FindUploadedFilesRequest>,

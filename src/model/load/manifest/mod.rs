@@ -77,7 +77,7 @@ use crate::scene::UpAxis;
 /// The file name of a manifest. A folder that contains it is a scene.
 pub(super) const MANIFEST_FILE: &str = "scene.toml";
 /// The largest size of a `scene.toml` in bytes.
-const MAX_MANIFEST_BYTES: u64 = 1 << 20;
+const MAX_MANIFEST_BYTES: u64 = 64 << 20;
 
 /// A parsed `scene.toml`. The documentation of this module describes its keys.
 #[derive(Debug, serde::Deserialize)]

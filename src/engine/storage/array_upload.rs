@@ -1,0 +1,352 @@
+//! Receives meshes and modes as arrays and writes them as files that the loaders read: an OBJ file and a `.npy` file per
+//! mesh, and one `scene.toml`. The scene therefore survives a restart of the server like any other upload.
+//!
+//! Every number is written so that the loaders read the same bits.
+
+use std::collections::{BTreeMap, HashSet};
+use std::fmt::Write as _;
+use std::fs::{self, File};
+use std::io::{self, BufWriter, Write as _};
+use std::path::Path;
+
+use tokio::sync::OwnedSemaphorePermit;
+
+use super::upload::CompleteUpload;
+use super::upload_folder::UploadFolder;
+use modalcast_model::domain::{Corners, MAX_RANK, Mesh, Modes, Shape, Transform};
+use modalcast_model::error::{Result, fault_in, invalid};
+use modalcast_model::scene::UpAxis;
+
+/// Limit on the domains of one upload. Each domain can have two files.
+const MAX_DOMAINS: u32 = 4096;
+
+/// Limit on the size of a domain's name in bytes.
+const MAX_NAME_BYTES: usize = 256;
+
+/// The material library of all meshes. An entry of `scene.toml` overrides the color.
+const MATERIAL_LIBRARY: &str = "newmtl surface\nKd 1 1 1\n";
+
+/// The header of an upload of arrays.
+#[derive(Debug, Clone)]
+pub struct ArrayUploadHeader {
+    /// Name of the scene.
+    pub scene: String,
+    /// Number of domains.
+    pub domains: u32,
+    /// Sum of the sizes of all arrays.
+    pub total_bytes: u64,
+    /// Meters per scene unit.
+    pub unit: f64,
+    pub up: UpAxis,
+}
+
+/// The mesh and the modes of a domain.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum UploadedShape {
+    /// Arrays of these sizes follow.
+    Arrays { vertices: u32, triangles: u32, rank: u32 },
+    /// Those of an earlier domain.
+    OfDomain(u32),
+}
+
+/// A domain of an upload of arrays.
+#[derive(Debug, Clone)]
+pub struct UploadedDomain {
+    pub name: String,
+    pub shape: UploadedShape,
+    /// `world_from_domain` at rest.
+    pub placement: Transform,
+    /// Linear red, green and blue.
+    pub color: [f32; 3],
+    /// None, or one per mode.
+    pub eigenvalues: Vec<f64>,
+}
+
+/// An upload of arrays in progress. Its methods block on the disk.
+#[derive(Debug)]
+pub struct ArrayUpload {
+    header: ArrayUploadHeader,
+    folder: UploadFolder,
+    /// The text of `scene.toml` so far.
+    manifest: String,
+    /// Per domain so far, the number of the domain whose arrays it has.
+    shapes: Vec<u32>,
+    /// Per domain so far, its number of modes.
+    ranks: Vec<u32>,
+    names: HashSet<String>,
+    /// Sum of the sizes of the arrays of all domains so far, in bytes.
+    declared_bytes: u64,
+    open_arrays: Option<OpenArrays>,
+}
+
+/// The arrays that are being received.
+#[derive(Debug)]
+struct OpenArrays {
+    /// Number of the domain.
+    domain: u32,
+    vertices: usize,
+    rank: usize,
+    /// Sizes in bytes: positions, faces and modes.
+    sizes: [u64; 3],
+    /// Grows with the received chunks, so that a declared size alone takes no memory.
+    bytes: Vec<u8>,
+}
+
+impl OpenArrays {
+    /// Arrays with the given numbers of vertices, triangles and modes.
+    fn new(domain: u32, [vertices, triangles, rank]: [u32; 3]) -> Result<Self> {
+        if vertices == 0 || triangles == 0 {
+            let given = format!("{vertices} vertices, {triangles} triangles");
+            return Err(invalid("vertices", "at least one vertex and one triangle", given));
+        }
+        if rank as usize > MAX_RANK {
+            return Err(invalid("rank", format!("0 to {MAX_RANK}"), rank));
+        }
+        // At most 2^32 x 12 x 512 bytes, which fits in 64 bits.
+        let sizes = [u64::from(vertices), u64::from(triangles), u64::from(vertices) * u64::from(rank)].map(|n| 12 * n);
+        Ok(Self { domain, vertices: vertices as usize, rank: rank as usize, sizes, bytes: Vec::new() })
+    }
+
+    fn total(&self) -> u64 {
+        self.sizes.iter().sum()
+    }
+
+    fn remaining_bytes(&self) -> u64 {
+        self.total() - self.bytes.len() as u64
+    }
+}
+
+impl ArrayUpload {
+    /// Creates a temporary folder next to the finished uploads.
+    ///
+    /// # Errors
+    /// `Invalid` for a number of domains or a unit out of range, `Fault` of the disk.
+    pub(in crate::engine) fn begin(
+        uploads: &Path,
+        header: ArrayUploadHeader,
+        permit: OwnedSemaphorePermit,
+    ) -> Result<Self> {
+        if !(1..=MAX_DOMAINS).contains(&header.domains) {
+            return Err(invalid("header.domains", format!("1 to {MAX_DOMAINS} domains"), header.domains));
+        }
+        if !(header.unit.is_finite() && header.unit > 0.0) {
+            return Err(invalid("header.unit", "a positive number of meters", header.unit));
+        }
+        let folder = UploadFolder::create(uploads, &header.scene, permit)?;
+        fs::write(folder.path().join("surface.mtl"), MATERIAL_LIBRARY).map_err(fault_in("upload"))?;
+        let mut upload = Self {
+            header,
+            folder,
+            manifest: String::new(),
+            shapes: Vec::new(),
+            ranks: Vec::new(),
+            names: HashSet::new(),
+            declared_bytes: 0,
+            open_arrays: None,
+        };
+        let (name, up, unit) = (toml_string(&upload.header.scene), upload.up(), upload.header.unit);
+        upload.manifest = format!("name = {name}\nup = \"{up}\"\nunit = {unit:?}\n");
+        Ok(upload)
+    }
+
+    /// The up axis of the scene and of its meshes in `scene.toml`.
+    const fn up(&self) -> &'static str {
+        ["x", "y", "z"][self.header.up.index()]
+    }
+
+    /// Number of domains so far.
+    pub const fn domain_count(&self) -> usize {
+        self.shapes.len()
+    }
+
+    /// Begins the next domain.
+    ///
+    /// # Errors
+    /// `Invalid` with a path below `domains[i]` for counts, names and numbers out of range, with `header.domains` or
+    /// `header.total_bytes` for more than the header declares, and when the arrays of the previous domain are incomplete.
+    pub fn begin_domain(&mut self, domain: &UploadedDomain) -> Result<()> {
+        self.check_arrays_complete()?;
+        let index = self.shapes.len() as u32;
+        if index >= self.header.domains {
+            return Err(invalid("header.domains", self.header.domains.to_string(), index + 1));
+        }
+        let path = format!("domains[{index}]");
+        self.add_domain(index, domain).map_err(|error| error.in_message(&path))?;
+        let UploadedShape::Arrays { vertices, triangles, rank } = domain.shape else { return Ok(()) };
+        let arrays = OpenArrays::new(index, [vertices, triangles, rank]).map_err(|error| error.in_message(&path))?;
+        self.declared_bytes = self.declared_bytes.saturating_add(arrays.total());
+        if self.declared_bytes > self.header.total_bytes {
+            return Err(invalid("header.total_bytes", self.header.total_bytes.to_string(), self.declared_bytes));
+        }
+        self.open_arrays = Some(arrays);
+        Ok(())
+    }
+
+    /// Validates a domain and adds its entry to the manifest.
+    fn add_domain(&mut self, index: u32, domain: &UploadedDomain) -> Result<()> {
+        let is_plain_name = !domain.name.is_empty() && !domain.name.contains(char::is_control);
+        if !is_plain_name || domain.name.len() > MAX_NAME_BYTES {
+            let expected = format!("1 to {MAX_NAME_BYTES} bytes without control characters");
+            return Err(invalid("name", expected, format!("{:?}", domain.name)));
+        }
+        if !self.names.insert(domain.name.clone()) {
+            return Err(invalid("name", "a name that no earlier domain has", &domain.name));
+        }
+        let (shape, rank) = match domain.shape {
+            UploadedShape::Arrays { rank, .. } => (index, rank),
+            UploadedShape::OfDomain(earlier) if earlier < index => {
+                (self.shapes[earlier as usize], self.ranks[earlier as usize])
+            }
+            UploadedShape::OfDomain(earlier) => {
+                return Err(invalid("shares_shape_with", format!("an index below {index}"), earlier));
+            }
+        };
+        if !domain.color.iter().all(|channel| (0.0..=1.0).contains(channel)) {
+            return Err(invalid("color", "numbers from 0 to 1", format!("{:?}", domain.color)));
+        }
+        let has_valid_eigenvalues = domain.eigenvalues.iter().all(|value| value.is_finite());
+        let count = domain.eigenvalues.len();
+        if !has_valid_eigenvalues || (count > 0 && count != rank as usize) {
+            return Err(invalid("eigenvalues", format!("none or {rank} finite numbers"), format!("{count} numbers")));
+        }
+        self.shapes.push(shape);
+        self.ranks.push(rank);
+        self.write_entry(shape, rank, domain);
+        Ok(())
+    }
+
+    /// Appends the entry of a domain to the manifest. `{:?}` prints f64 with all digits that they need.
+    fn write_entry(&mut self, shape: u32, rank: u32, domain: &UploadedDomain) {
+        let modes = if rank > 0 { format!("{shape}.npy") } else { String::new() };
+        let up = self.up();
+        let text = format!(
+            "\n[[domain]]\nname = {}\nmodel = \"{shape}.obj\"\nmodes = \"{modes}\"\nup = \"{up}\"\nplacement.matrix = {:?}\n\
+             material.diffuse = {:?}\n",
+            toml_string(&domain.name),
+            domain.placement.0.map(f64::from),
+            domain.color.map(f64::from),
+        );
+        self.manifest.push_str(&text);
+        if !domain.eigenvalues.is_empty() {
+            writeln!(self.manifest, "eigenvalues = {:?}", domain.eigenvalues).ok(); // A `String` accepts all text.
+        }
+    }
+
+    /// Appends bytes to the arrays of the current domain. The last chunk of the domain validates and writes the arrays.
+    ///
+    /// # Errors
+    /// `Invalid` when the bytes exceed the declared size, or with a path below `domains[i]` for invalid arrays; `Fault`
+    /// of the disk.
+    pub fn write_chunk(&mut self, bytes: &[u8]) -> Result<()> {
+        let chunk_bytes = bytes.len() as u64;
+        let Some(arrays) = self.open_arrays.as_mut().filter(|arrays| chunk_bytes <= arrays.remaining_bytes()) else {
+            let remaining_bytes = self.open_arrays.as_ref().map_or(0, OpenArrays::remaining_bytes);
+            let expected = format!("at most {remaining_bytes} bytes (the rest of the arrays)");
+            return Err(invalid("chunk", expected, format!("{chunk_bytes} bytes")));
+        };
+        arrays.bytes.extend_from_slice(bytes);
+        match self.open_arrays.take_if(|arrays| arrays.remaining_bytes() == 0) {
+            None => Ok(()),
+            Some(arrays) => {
+                let path = format!("domains[{}]", arrays.domain);
+                self.write_arrays(&arrays).map_err(|error| error.in_message(&path))
+            }
+        }
+    }
+
+    /// Validates complete arrays and writes their files.
+    fn write_arrays(&self, arrays: &OpenArrays) -> Result<()> {
+        let (positions, remainder) = arrays.bytes.split_at(arrays.sizes[0] as usize);
+        let (faces, modes) = remainder.split_at(arrays.sizes[1] as usize);
+        let positions: Vec<[f32; 3]> = bytemuck::pod_collect_to_vec(positions);
+        let faces: Vec<[u32; 3]> = bytemuck::pod_collect_to_vec(faces);
+        let modes: Vec<f32> = bytemuck::pod_collect_to_vec(modes);
+        check_arrays(arrays, &positions, &faces, &modes)?;
+        let file = |ending: &str| File::create_new(self.folder.path().join(format!("{}.{ending}", arrays.domain)));
+        let write_files = || -> io::Result<()> {
+            write_obj(BufWriter::new(file("obj")?), &positions, &faces)?;
+            if arrays.rank > 0 { write_npy(BufWriter::new(file("npy")?), arrays, &modes) } else { Ok(()) }
+        };
+        write_files().map_err(fault_in("upload"))
+    }
+
+    /// Completes the upload. On failure, removes its files.
+    ///
+    /// # Errors
+    /// `Invalid` when domains or arrays are missing, `Fault` of the disk.
+    pub(in crate::engine) fn finish(self) -> Result<CompleteUpload> {
+        let write_manifest =
+            || fs::write(self.folder.path().join("scene.toml"), &self.manifest).map_err(fault_in("upload"));
+        if let Err(error) = self.check_complete().and_then(|()| write_manifest()) {
+            self.discard();
+            return Err(error);
+        }
+        let Self { header, folder, .. } = self;
+        Ok(CompleteUpload { scene: header.scene, entry: String::new(), folder, hashes: BTreeMap::new() })
+    }
+
+    fn check_complete(&self) -> Result<()> {
+        self.check_arrays_complete()?;
+        if self.shapes.len() != self.header.domains as usize {
+            return Err(invalid("header.domains", self.header.domains.to_string(), self.shapes.len()));
+        }
+        if self.declared_bytes != self.header.total_bytes {
+            return Err(invalid("header.total_bytes", self.header.total_bytes.to_string(), self.declared_bytes));
+        }
+        Ok(())
+    }
+
+    /// Fails if the arrays of the last domain are incomplete.
+    fn check_arrays_complete(&self) -> Result<()> {
+        match &self.open_arrays {
+            None => Ok(()),
+            Some(arrays) => {
+                let field = format!("domains[{}]", arrays.domain);
+                Err(invalid(field, format!("{} bytes", arrays.total()), format!("{} bytes", arrays.bytes.len())))
+            }
+        }
+    }
+
+    /// Removes the files. Blocks on the disk.
+    pub fn discard(self) {
+        self.folder.discard();
+    }
+}
+
+/// Validates arrays with the constructors that the loaders also use.
+fn check_arrays(arrays: &OpenArrays, positions: &[[f32; 3]], faces: &[[u32; 3]], modes: &[f32]) -> Result<()> {
+    let vertices = (0..arrays.vertices as u32).collect();
+    let corners = Corners { vertices, normals: vec![[0.0, 0.0, 1.0]; arrays.vertices], uvs: Vec::new() };
+    let mesh = Mesh::new(positions.to_vec(), corners, faces.to_vec())?;
+    let modes = Modes::from_rows(3 * arrays.vertices, arrays.rank, modes)?;
+    Shape::new(mesh, modes).map(drop)
+}
+
+/// Writes a triangle mesh. `{:?}` prints f32 with all digits that they need. Indices of OBJ files begin at 1.
+fn write_obj(mut file: BufWriter<File>, positions: &[[f32; 3]], faces: &[[u32; 3]]) -> io::Result<()> {
+    writeln!(file, "mtllib surface.mtl\nusemtl surface")?;
+    for [x, y, z] in positions {
+        writeln!(file, "v {x:?} {y:?} {z:?}")?;
+    }
+    for face in faces {
+        let [a, b, c] = face.map(|vertex| u64::from(vertex) + 1);
+        writeln!(file, "f {a} {b} {c}")?;
+    }
+    file.flush()
+}
+
+/// Writes U as a NumPy file of version 1: 3n x r f32, row-major.
+fn write_npy(mut file: BufWriter<File>, arrays: &OpenArrays, modes: &[f32]) -> io::Result<()> {
+    let (rows, columns) = (3 * arrays.vertices, arrays.rank);
+    let header = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({rows}, {columns}), }}");
+    // The magic and the length take 10 bytes. The header is padded so that the data begin at byte 128.
+    file.write_all(b"\x93NUMPY\x01\x00\x76\x00")?;
+    writeln!(file, "{header:<117}")?;
+    file.write_all(bytemuck::cast_slice(modes))?;
+    file.flush()
+}
+
+/// A text without control characters as a TOML string.
+fn toml_string(text: &str) -> String {
+    format!("\"{}\"", text.replace('\\', "\\\\").replace('"', "\\\""))
+}
