@@ -44,7 +44,8 @@ impl HashLists {
         fs::remove_file(self.path(scene)).ok(); // Without the scene's files, the list finds nothing.
     }
 
-    /// Reads all lists. Leaves out unreadable lists and files that no longer exist.
+    /// Reads all lists. Leaves out unreadable lists and files that no longer exist. Removes lists of scenes without a
+    /// folder, which a server leaves behind if it is killed while it deletes a scene.
     pub(in crate::engine) fn read(&self) -> UploadedFiles {
         let mut files = UploadedFiles::new();
         for entry in fs::read_dir(&self.folder).into_iter().flatten().flatten() {
@@ -53,6 +54,10 @@ impl HashLists {
             else {
                 continue;
             };
+            if !self.uploads.join(scene).is_dir() {
+                fs::remove_file(&list_path).ok(); // The next call tries again.
+                continue;
+            }
             let bytes = fs::read(&list_path).unwrap_or_default();
             let Ok(hex_by_path) = serde_json::from_slice::<BTreeMap<String, String>>(&bytes) else { continue };
             for (path, digits) in hex_by_path {
@@ -91,8 +96,13 @@ mod tests {
         fs::write(uploads.join("a.b/x"), b"content").expect("expected a written file");
         let hashes = [("x".to_owned(), [1; 32]), ("gone".to_owned(), [2; 32])].into();
         lists.write("a.b", &hashes).expect("expected a written list");
-        fs::write(folder.path().join("lists/damaged.json"), b"{").expect("expected a written file");
+        fs::create_dir_all(uploads.join("damaged")).expect("expected a new folder");
+        for list in ["lists/damaged.json", "lists/removed.json"] {
+            fs::write(folder.path().join(list), b"{").expect("expected a written file");
+        }
         assert_eq!(lists.read(), [([1; 32], vec![uploads.join("a.b/x")])].into());
+        let names = fs::read_dir(folder.path().join("lists")).expect("expected a folder").count();
+        assert_eq!(names, 2, "expected the list without a folder of files to be removed");
         lists.remove("a.b");
         assert!(lists.read().is_empty());
     }
