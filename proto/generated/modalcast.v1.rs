@@ -807,10 +807,10 @@ pub mod scene_service_client {
     /// Units of lengths, for all files of this package: a length is in scene units, of which each is SceneInfo.unit meters,
     /// unless the comment of its field says meters. Positions, translations, displacements u = U q, bounds, cameras and clip
     /// planes are in scene units. Three kinds of values are in meters: the positions of origins in the world
-    /// (SceneInfo.origin, ATTRIBUTE_ORIGINS), depths (OUTPUT_DEPTH, Hit.depth), and the values of color maps
-    /// (Picture.largest). Positions and transforms are relative to the scene's origin unless a comment names another one. A
-    /// transform is a row-major 3x4 matrix whose last column is the translation in scene units; `a_from_b` maps coordinates
-    /// in frame b to coordinates in frame a.
+    /// (SceneInfo.origin, ATTRIBUTE_ORIGINS, STATE_CONTENT_ORIGINS), depths (OUTPUT_DEPTH, Hit.depth), and the values of
+    /// color maps (Picture.largest). Positions and transforms are relative to the scene's origin unless a comment names
+    /// another one. A transform is a row-major 3x4 matrix whose last column is the translation in scene units; `a_from_b`
+    /// maps coordinates in frame b to coordinates in frame a.
     #[derive(Debug, Clone)]
     pub struct SceneServiceClient<T> {
         inner: tonic::client::Grpc<T>,
@@ -1240,10 +1240,10 @@ pub mod scene_service_server {
     /// Units of lengths, for all files of this package: a length is in scene units, of which each is SceneInfo.unit meters,
     /// unless the comment of its field says meters. Positions, translations, displacements u = U q, bounds, cameras and clip
     /// planes are in scene units. Three kinds of values are in meters: the positions of origins in the world
-    /// (SceneInfo.origin, ATTRIBUTE_ORIGINS), depths (OUTPUT_DEPTH, Hit.depth), and the values of color maps
-    /// (Picture.largest). Positions and transforms are relative to the scene's origin unless a comment names another one. A
-    /// transform is a row-major 3x4 matrix whose last column is the translation in scene units; `a_from_b` maps coordinates
-    /// in frame b to coordinates in frame a.
+    /// (SceneInfo.origin, ATTRIBUTE_ORIGINS, STATE_CONTENT_ORIGINS), depths (OUTPUT_DEPTH, Hit.depth), and the values of
+    /// color maps (Picture.largest). Positions and transforms are relative to the scene's origin unless a comment names
+    /// another one. A transform is a row-major 3x4 matrix whose last column is the translation in scene units; `a_from_b`
+    /// maps coordinates in frame b to coordinates in frame a.
     #[derive(Debug)]
     pub struct SceneServiceServer<T> {
         inner: Arc<T>,
@@ -1825,7 +1825,7 @@ pub struct Step {
     /// Domains whose coordinates are in `q`, each once. If empty and `q` is not empty: all domains in order.
     #[prost(uint32, repeated, tag = "3")]
     pub q_domains: ::prost::alloc::vec::Vec<u32>,
-    /// r finite little-endian f32 per domain, concatenated; r is DomainDescription.rank. U q is in scene units.
+    /// r finite little-endian f32 per domain, concatenated; r is ShapeDescription.rank. U q is in scene units.
     #[prost(bytes = "bytes", tag = "4")]
     pub q: ::prost::bytes::Bytes,
     /// Domains whose transforms are in `transforms`, each once. If empty and `transforms` is not empty: all domains in
@@ -4061,14 +4061,14 @@ pub mod stream_states_response {
     pub enum Part {
         /// The first message of the stream, and only that one.
         #[prost(message, tag = "1")]
-        Settings(super::StateSettings),
+        Settings(super::StateStreamSettings),
         #[prost(message, tag = "2")]
         Chunk(super::StateChunk),
     }
 }
-/// The settings in effect of a stream of states, as in the request.
+/// The settings of a stream. Sent once, as the first reply.
 #[derive(Clone, Copy, PartialEq, ::prost::Message)]
-pub struct StateSettings {
+pub struct StateStreamSettings {
     #[prost(enumeration = "Delivery", tag = "1")]
     pub delivery: i32,
     #[prost(double, tag = "2")]
@@ -4128,7 +4128,7 @@ pub enum StateContent {
     Unspecified = 0,
     /// u32: indices of the domains with coordinates in STATE_CONTENT_Q, ascending.
     QDomains = 1,
-    /// f32: q of each of these domains, r numbers each (DomainDescription.rank), concatenated.
+    /// f32: q of each of these domains, r numbers each (ShapeDescription.rank), concatenated.
     Q = 2,
     /// u32: indices of the domains with transforms in STATE_CONTENT_TRANSFORMS, ascending.
     TransformDomains = 3,
@@ -4654,7 +4654,7 @@ pub struct SurfaceForce {
 /// A force on the coordinates of a domain.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct ModalForce {
-    /// f_q: r finite little-endian f32; r is DomainDescription.rank.
+    /// f_q: r finite little-endian f32 in the unit of AppliedForce.f_q; r is ShapeDescription.rank.
     #[prost(bytes = "bytes", tag = "1")]
     pub f_q: ::prost::bytes::Bytes,
 }
@@ -4686,7 +4686,8 @@ pub struct AppliedForce {
     pub force: ::core::option::Option<Force>,
     /// The force on the domain's coordinates: r little-endian f32. For a surface force U^T A^T f, where U is interpolated
     /// at the point from the scene's untruncated modes, as in Hit.modes, and A is the linear part of the domain's
-    /// transform at `step`. Lengths in U are in scene units. A number that f32 cannot represent is infinite.
+    /// transform at `step`. In newtons times scene units per unit of q, because U is in scene units per unit of q. A number
+    /// that f32 cannot represent is infinite.
     #[prost(bytes = "bytes", tag = "3")]
     pub f_q: ::prost::bytes::Bytes,
 }

@@ -52,7 +52,8 @@ impl v1::state_service_server::StateService for StateServiceImpl {
         let delivery = parse_stream_delivery(request.delivery, request.max_hz).map_err(to_status)?;
         // Subscribe before the response headers are sent, so that a client can rely on receiving the next step.
         let subscription = scene_handle.subscribe(OutputSpec::State, delivery).await.map_err(to_status)?;
-        let settings = v1::StateSettings { delivery: request.delivery, max_hz: request.max_hz, steps: request.steps };
+        let settings =
+            v1::StateStreamSettings { delivery: request.delivery, max_hz: request.max_hz, steps: request.steps };
         let scene = Arc::clone(&scene_handle.scene);
         let state_stream = StateStream { scene, max_chunk_bytes: self.0.config().chunk_bytes, settings };
         Ok(respond(move |reply_sender| {
@@ -65,7 +66,7 @@ impl v1::state_service_server::StateService for StateServiceImpl {
 struct StateStream {
     scene: Arc<Scene>,
     max_chunk_bytes: usize,
-    settings: v1::StateSettings,
+    settings: v1::StateStreamSettings,
 }
 
 impl StateStream {

@@ -40,7 +40,7 @@ pub use scene::{
     Shape, ShapeArray, Texture,
 };
 pub use stages::{StageSamples, StageTimes};
-pub use states::{SceneState, StateLayout, StateStream, StateStreamRequest};
+pub use states::{SceneState, StateLayout, StateRequest, StateStream, StateStreamRequest};
 pub use step::{DomainTransform, Step};
 pub use step_stream::{Ack, DriveRequest, StepStream, StreamSummary};
 pub use tonic::Code;

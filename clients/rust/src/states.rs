@@ -14,7 +14,7 @@ use v1::state_service_client::StateServiceClient;
 use crate::assemble::{Assembler, Chunk, DecodedReplies, ReplyDecoder, decode};
 use crate::client::Client;
 use crate::error::{Error, Result, malformed_reply};
-use crate::request::{Delivery, StepRequest};
+use crate::request::{StepRequest, Subscription};
 use crate::scene::SceneDescription;
 use crate::stages::{self, StageTimes};
 
@@ -155,37 +155,11 @@ impl SceneState {
     }
 }
 
-/// A subscription to the states of a scene.
-#[derive(Debug, Clone, PartialEq)]
-pub struct StateStreamRequest {
-    pub scene: String,
-    pub delivery: Delivery,
-    /// Largest number of states per second; 0 for no limit. Only for [`Delivery::Latest`].
-    pub max_hz: f64,
-    /// Number of states after which the subscription ends; 0 for no limit.
-    pub max_states: u64,
-}
+/// A request for the state of one step.
+pub type StateRequest = StepRequest<()>;
 
-impl StateStreamRequest {
-    /// A subscription without limits.
-    pub fn new(scene: &str, delivery: Delivery) -> Self {
-        Self { scene: scene.to_owned(), delivery, max_hz: 0.0, max_states: 0 }
-    }
-
-    /// Sets [`Self::max_hz`].
-    #[must_use]
-    pub const fn max_hz(mut self, max_hz: f64) -> Self {
-        self.max_hz = max_hz;
-        self
-    }
-
-    /// Sets [`Self::max_states`].
-    #[must_use]
-    pub const fn max_states(mut self, max_states: u64) -> Self {
-        self.max_states = max_states;
-        self
-    }
-}
+/// A subscription to the states of every step.
+pub type StateStreamRequest = Subscription<()>;
 
 impl Client {
     /// Gets the state of one step.
@@ -193,7 +167,7 @@ impl Client {
     /// # Errors
     /// `Status` if the scene or the step does not exist or the deadline passed; `Malformed` if the reply contradicts
     /// itself or the layout; `Connect` if the connection is lost.
-    pub async fn get_state(&self, request: &StepRequest<()>, layout: &Arc<StateLayout>) -> Result<Arc<SceneState>> {
+    pub async fn get_state(&self, request: &StateRequest, layout: &Arc<StateLayout>) -> Result<Arc<SceneState>> {
         let wire = v1::GetStateRequest {
             scene: request.scene.clone(),
             step: request.step.to_wire(),
@@ -217,7 +191,7 @@ impl Client {
             scene: request.scene.clone(),
             delivery: v1::Delivery::from(request.delivery).into(),
             max_hz: request.max_hz,
-            steps: request.max_states,
+            steps: request.max_steps,
         };
         let mut messages = self.replies(StateServiceClient::new(self.channel.clone()).stream_states(wire).await)?;
         let first_message = messages.next().await?.and_then(|message| message.part);
@@ -237,7 +211,7 @@ impl Client {
 /// one when the next one arrives.
 pub struct StateStream {
     /// The settings in effect.
-    pub settings: v1::StateSettings,
+    pub settings: v1::StateStreamSettings,
     replies: DecodedReplies<v1::StreamStatesResponse, StateDecoder<v1::StreamStatesResponse>>,
 }
 
