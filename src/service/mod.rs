@@ -25,6 +25,7 @@ use tokio::time::Instant;
 use tonic::transport::Server;
 use tonic_health::server::HealthReporter;
 
+use self::connection::{CONNECTION_WINDOW, STREAM_WINDOW};
 use self::routes::Routes;
 use crate::config::Config;
 use crate::engine::Engine;
@@ -128,8 +129,8 @@ fn transport(config: &Config) -> Server {
         .http2_max_local_error_reset_streams(Some(1024))
         .http2_max_pending_accept_reset_streams(Some(100))
         .http2_max_header_list_size(16 << 10)
-        .initial_stream_window_size(64 << 10)
-        .initial_connection_window_size(16 << 20)
+        .initial_stream_window_size(STREAM_WINDOW)
+        .initial_connection_window_size(CONNECTION_WINDOW)
         .max_frame_size(64 << 10)
         .http2_keepalive_interval(Some(config.keepalive_interval))
         .http2_keepalive_timeout(Some(config.keepalive_timeout))

@@ -6,10 +6,7 @@ use nalgebra::Vector3;
 use rayon::prelude::*;
 
 use crate::affine::{AffineTransform, fit_rigid_transform};
-use crate::model::{DomainModel, Joint, Model};
-
-/// Minimum number of domains that one thread processes.
-pub const MIN_DOMAINS_PER_THREAD: usize = 64;
+use crate::model::{DomainModel, Joint, MIN_DOMAINS_PER_THREAD, Model};
 
 /// Computes `world_from_domain` of every domain at the coordinates `q` of the scene. `local_transforms` has an optional
 /// motion of each domain within its own frame, for example the rotation of a leaf about its stalk. The list may be

@@ -11,7 +11,6 @@ use rayon::prelude::*;
 
 use crate::affine::AffineTransform;
 use crate::error::{Result, invalid_input};
-use crate::hierarchy::MIN_DOMAINS_PER_THREAD;
 
 /// Maximum number of entries of U in the surface samples of all domains together: 64 MiB of f64.
 const MAX_MODE_ENTRIES: usize = 8 << 20;
@@ -19,6 +18,9 @@ const MAX_MODE_ENTRIES: usize = 8 << 20;
 /// Minimum number of surface samples per domain, even if `MAX_MODE_ENTRIES` is exceeded. A domain with fewer vertices
 /// has all of them as samples.
 const MIN_SURFACE_SAMPLES: usize = 8;
+
+/// Minimum number of domains that one thread processes.
+pub const MIN_DOMAINS_PER_THREAD: usize = 64;
 
 /// A vertex at which the dynamics measures displacements or applies loads.
 #[derive(Debug, Clone, PartialEq)]

@@ -14,10 +14,8 @@ use serde_json::json;
 
 use crate::affine::AffineTransform;
 use crate::error::{Result, invalid_input};
-use crate::hierarchy::{
-    JointGapMeter, MIN_DOMAINS_PER_THREAD, compose_transforms, compute_transforms, deformed_attachments,
-};
-use crate::model::{DomainModel, Model};
+use crate::hierarchy::{JointGapMeter, compose_transforms, compute_transforms, deformed_attachments};
+use crate::model::{DomainModel, MIN_DOMAINS_PER_THREAD, Model};
 use crate::oscillator::{ModeState, Oscillator};
 use crate::run::{Report, Scenario, StepValues};
 use crate::wind::{CROSSWIND_CHANNEL, Wind, WindPressure};

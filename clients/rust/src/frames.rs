@@ -214,7 +214,8 @@ impl Client {
             steps: request.max_steps,
             max_hz: request.max_hz,
         };
-        let mut messages = self.replies(FrameServiceClient::new(self.channel.clone()).stream_frames(wire).await)?;
+        let channel = self.channel_for(request.delivery);
+        let mut messages = self.replies(FrameServiceClient::new(channel).stream_frames(wire).await)?;
         let settings = match messages.next().await?.and_then(|message| message.part) {
             Some(StreamPart::Settings(settings)) => settings,
             part => return Err(malformed_reply("frame.part", "the settings of the stream", format!("{part:?}"))),

@@ -5,6 +5,7 @@ mod array_upload;
 mod assemble;
 mod client;
 mod content;
+mod describe;
 mod description;
 mod error;
 mod forces;
@@ -25,6 +26,7 @@ mod vertices;
 pub use array_upload::{ArrayUpload, UploadDomain, UploadShape};
 pub use client::{Client, REPLY_LIMIT, SceneList, ServerInfo};
 pub use content::ContentHash;
+pub use describe::{DescriptionRequest, ModeRows};
 pub use error::{Error, Reason, Rejection, Result};
 pub use forces::{AppliedForce, Force, ForceKind, ForceRequest, ForceSet, ForceStream, SurfaceForce};
 pub use frames::{
@@ -36,8 +38,7 @@ pub use modalcast_proto::v1::{Feature, PROTOCOL_VERSION, SceneInfo, StepId};
 pub use pick::{Hit, PickRectangle, PickRequest, PickResult};
 pub use request::{Delivery, StepRequest, StepSelector, Subscription};
 pub use scene::{
-    AlphaMode, Attachment, DescriptionRequest, Domain, Follow, Material, MaterialRange, ModeRows, SceneDescription,
-    Shape, ShapeArray, Texture,
+    AlphaMode, Attachment, Domain, Follow, Material, MaterialRange, SceneDescription, Shape, ShapeArray, Texture,
 };
 pub use stages::{StageSamples, StageTimes};
 pub use states::{SceneState, StateLayout, StateRequest, StateStream, StateStreamRequest};

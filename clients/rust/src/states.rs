@@ -193,7 +193,8 @@ impl Client {
             max_hz: request.max_hz,
             steps: request.max_steps,
         };
-        let mut messages = self.replies(StateServiceClient::new(self.channel.clone()).stream_states(wire).await)?;
+        let channel = self.channel_for(request.delivery);
+        let mut messages = self.replies(StateServiceClient::new(channel).stream_states(wire).await)?;
         let first_message = messages.next().await?.and_then(|message| message.part);
         let Some(Part::Settings(settings)) = first_message else {
             return Err(malformed_reply("states.settings", "settings as the first message", "another message"));

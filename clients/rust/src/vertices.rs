@@ -154,7 +154,8 @@ impl Client {
             steps: request.max_steps,
             max_hz: request.max_hz,
         };
-        let mut messages = self.replies(VertexServiceClient::new(self.channel.clone()).stream_vertices(wire).await)?;
+        let channel = self.channel_for(request.delivery);
+        let mut messages = self.replies(VertexServiceClient::new(channel).stream_vertices(wire).await)?;
         let settings = match messages.next().await?.and_then(|message| message.part) {
             Some(v1::stream_vertices_response::Part::Settings(settings)) => settings,
             part => return Err(malformed_reply("vertices.part", "the settings of the stream", format!("{part:?}"))),

@@ -12,8 +12,9 @@ use super::{Scene, TransformFormat};
 use crate::domain::Transform;
 use crate::error::{Error, Result, invalid};
 
-/// Number of transforms that one thread parses at least. Smaller steps are parsed on the calling thread.
-const MIN_TRANSFORMS_PER_THREAD: usize = 4096;
+/// Number of transforms from which they are parsed on all cores. Fewer are parsed in less time than it takes to wake
+/// another thread.
+const PARALLEL_TRANSFORMS: usize = 4096;
 
 /// A step as received, not yet validated.
 #[derive(Debug, Clone, Default)]
@@ -186,16 +187,35 @@ fn parse_transforms(scene: &Scene, raw: &RawStepUpdate) -> Result<ParsedTransfor
         TransformFormat::QuaternionXyzwF32 => transform_format::parse_quaternion_f32(bytes),
         TransformFormat::QuaternionXyzwF64 => transform_format::parse_quaternion_f64(bytes, origin),
     };
-    let encoded_transforms = raw.transforms.par_chunks_exact(transform_bytes).with_min_len(MIN_TRANSFORMS_PER_THREAD);
+    if domains.len() >= PARALLEL_TRANSFORMS {
+        return parse_transforms_in_parallel(raw, &domains, parse);
+    }
+    let (mut transforms, mut translations) = (Vec::with_capacity(domains.len()), Vec::new());
+    for (index, (domain, bytes)) in domains.into_iter().zip(raw.transforms.chunks_exact(transform_bytes)).enumerate() {
+        let (transform, translation) = parse(bytes).map_err(|error| in_transform(index, error))?;
+        transforms.push((domain, transform));
+        translations.extend(translation.map(|translation| (domain, translation)));
+    }
+    Ok((transforms, translations))
+}
+
+/// Parses the transforms of `domains` on all cores. The bytes have the right length.
+fn parse_transforms_in_parallel(
+    raw: &RawStepUpdate,
+    domains: &[u32],
+    parse: impl Fn(&[u8]) -> Result<ParsedTransform> + Sync,
+) -> Result<ParsedTransforms> {
+    let transform_bytes = raw.transform_format.bytes();
     let first_invalid = AtomicUsize::new(usize::MAX);
-    let parse_or_note = |(index, (domain, bytes)): (usize, (&u32, &[u8]))| {
+    let parse_or_note = |(index, (bytes, domain)): (usize, (&[u8], &u32))| {
         let (transform, translation) = parse(bytes).unwrap_or_else(|_| {
             first_invalid.fetch_min(index, Ordering::Relaxed);
             (Transform::IDENTITY, None)
         });
         ((*domain, transform), translation.map(|translation| (*domain, translation)))
     };
-    let parsed = encoded_transforms.zip(&domains).map(|(bytes, domain)| (domain, bytes)).enumerate().map(parse_or_note);
+    let encoded_transforms = raw.transforms.par_chunks_exact(transform_bytes);
+    let parsed = encoded_transforms.zip(domains).enumerate().map(parse_or_note);
     let (transforms, translations) = match raw.transform_format {
         TransformFormat::QuaternionXyzwF64 => {
             let (transforms, translations): (Vec<_>, Vec<_>) = parsed.unzip();
@@ -206,9 +226,14 @@ fn parse_transforms(scene: &Scene, raw: &RawStepUpdate) -> Result<ParsedTransfor
     // Parsing the first invalid transform again gives its error.
     let first_invalid = first_invalid.into_inner();
     if let Some(bytes) = raw.transforms.chunks_exact(transform_bytes).nth(first_invalid) {
-        parse(bytes).map_err(|error| error.in_message(&format!("step.transforms[{first_invalid}]")))?;
+        parse(bytes).map_err(|error| in_transform(first_invalid, error))?;
     }
     Ok((transforms, translations))
+}
+
+/// Names the transform in an error.
+fn in_transform(index: usize, error: Error) -> Error {
+    error.in_message(&format!("step.transforms[{index}]"))
 }
 
 /// Parses [`TransformFormat::Affine`], the only format that can contain shear or a non-uniform scale, and rejects both

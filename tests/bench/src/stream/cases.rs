@@ -2,9 +2,9 @@
 
 use super::StreamReportOptions;
 use super::delay::DelayedStream;
+use super::peers::viewer::Content;
 use super::rates::Viewers;
 use super::session::SceneSource;
-use super::viewer::Content;
 use crate::workloads::Size;
 
 /// The width and the height of the pictures of a quick report are divided by this number.

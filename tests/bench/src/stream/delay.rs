@@ -5,10 +5,10 @@ use serde::Serialize;
 
 use super::StreamReportOptions;
 use super::motion;
-use super::proxy::DelayProxy;
+use super::peers::proxy::DelayProxy;
+use super::peers::viewer::Content;
 use super::rates::{self, Viewers};
 use super::session::Session;
-use super::viewer::Content;
 use modalcast_model::error::{Result, fault_in};
 
 /// Delay of each direction in milliseconds.

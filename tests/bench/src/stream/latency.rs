@@ -6,9 +6,10 @@ use std::time::{Duration, Instant};
 use modalcast_client::FrameStreamRequest;
 use serde::Serialize;
 
+use super::SCENE;
 use super::motion::{self, Motion};
-use super::session::{SCENE, Session};
-use super::viewer::{self, Content};
+use super::peers::viewer::{self, Content};
+use super::session::Session;
 use crate::timing::quantile;
 use modalcast_client::Client;
 use modalcast_model::error::{Result, fault, fault_in};

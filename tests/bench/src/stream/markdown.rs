@@ -2,9 +2,9 @@
 
 use super::delay::DelayResult;
 use super::latency::LatencyResult;
+use super::peers::socket::SocketComparison;
 use super::picture_encodings::PictureEncodingRow;
 use super::rates::RateResult;
-use super::socket::SocketComparison;
 use super::vertex_encodings::VertexEncodingRow;
 use super::{CaseReport, CaseResult, StreamReport};
 use crate::markdown_table::{dash, table};

@@ -20,13 +20,10 @@ pub(crate) mod peers;
 pub mod picture_encodings;
 mod plot;
 mod processes;
-mod proxy;
 pub mod rates;
 mod session;
-pub mod socket;
 pub mod stages;
 pub mod vertex_encodings;
-mod viewer;
 
 use std::path::PathBuf;
 
@@ -40,12 +37,15 @@ use cases::{Case, Measurement};
 use delay::DelayResult;
 use latency::LatencyResult;
 use modalcast_model::error::{Result, invalid};
+use peers::socket::{SocketComparison, SocketJob};
 use picture_encodings::PictureEncodingRow;
 use rates::RateResult;
 pub use session::SceneLook;
 use session::Session;
-use socket::{SocketComparison, SocketJob};
 use vertex_encodings::VertexEncodingRow;
+
+/// The name of every scene on its server.
+const SCENE: &str = "scene";
 
 /// Maximum number of steps that are recorded to be sent from memory. Longer measurements repeat them.
 const RECORDED_STEPS: u64 = 120;
@@ -209,9 +209,9 @@ fn measure_case(
 fn compare_with_socket(session: &Session, options: &StreamReportOptions) -> Result<SocketComparison> {
     let motion = session.motion(options.steps.min(RECORDED_STEPS))?;
     let receive = |content, writes: bool| {
-        let job = viewer::ViewerJob {
+        let job = peers::viewer::ViewerJob {
             server: session.url(),
-            scene: session::SCENE.into(),
+            scene: SCENE.into(),
             replies: options.steps,
             content,
             view: 0,
@@ -221,12 +221,12 @@ fn compare_with_socket(session: &Session, options: &StreamReportOptions) -> Resu
         if writes {
             session.runtime.block_on(motion::measure_rate(&session.client, motion, options.steps))?;
         }
-        process.finish::<viewer::ViewerSummary>()
+        process.finish::<peers::viewer::ViewerSummary>()
     };
-    let stream = receive(viewer::Content::Positions, true)?;
-    let requests = receive(viewer::Content::RequestedPositions, false)?;
+    let stream = receive(peers::viewer::Content::Positions, true)?;
+    let requests = receive(peers::viewer::Content::RequestedPositions, false)?;
     let reply_bytes = 12 * session.scene_info.vertices as usize;
-    let socket = socket::measure(SocketJob::new(reply_bytes, options.steps))?;
+    let socket = peers::socket::measure(SocketJob::new(reply_bytes, options.steps))?;
     SocketComparison::new(&stream, &requests, &socket)
 }
 

@@ -5,7 +5,7 @@ use std::time::Instant;
 
 use modalcast_client::{Client, Delivery, DriveRequest, SceneDescription, Step, StepStream};
 
-use super::session::SCENE;
+use super::SCENE;
 use modalcast_model::error::{Result, fault_in, invalid};
 use modalcast_model::load::{NpyArray, parse_numpy};
 

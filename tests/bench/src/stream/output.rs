@@ -4,9 +4,9 @@ use std::path::Path;
 
 use super::delay::DelayResult;
 use super::latency::LatencyResult;
+use super::peers::socket::SocketComparison;
 use super::picture_encodings::PictureEncodingRow;
 use super::rates::RateResult;
-use super::socket::SocketComparison;
 use super::vertex_encodings::VertexEncodingRow;
 use super::{CaseReport, CaseResult, StreamReport, markdown, plot};
 use crate::output_files::write_files;

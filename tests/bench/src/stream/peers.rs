@@ -1,9 +1,12 @@
 //! The roles of `modalcast-report` as a child process of itself: `modalcast-report peer JOB`, where JOB is JSON.
 
+pub(super) mod proxy;
+pub(in crate::stream) mod socket;
+pub(super) mod viewer;
+
 use serde::{Deserialize, Serialize};
 
 use super::processes::{Process, Program, arguments};
-use super::{proxy, socket, viewer};
 use modalcast_model::error::{Result, fault_in};
 
 /// What a child process does.

@@ -5,9 +5,10 @@ use std::time::Instant;
 use modalcast_client::FrameRequest;
 use serde::Serialize;
 
+use super::SCENE;
 use super::StreamReportOptions;
-use super::session::{SCENE, Session};
-use super::viewer::{self, Content};
+use super::peers::viewer::{self, Content};
+use super::session::Session;
 use crate::timing::quantile;
 use crate::workloads::Size;
 use modalcast_model::error::{Result, fault, fault_in};

@@ -4,13 +4,14 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
+use super::SCENE;
 use super::StreamReportOptions;
 use super::peers::PeerJob;
+use super::peers::socket::{self, SocketJob};
+use super::peers::viewer::{Content, ViewerJob, ViewerSummary};
 use super::processes::{Process, arguments};
-use super::session::{SCENE, Session};
-use super::socket::{self, SocketJob};
+use super::session::Session;
 use super::stages::{StageInputs, StageRate};
-use super::viewer::{Content, ViewerJob, ViewerSummary};
 use crate::timing::quantile;
 use crate::workloads::Size;
 use modalcast_model::error::{Result, fault};

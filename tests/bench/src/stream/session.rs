@@ -15,13 +15,10 @@ use tokio::runtime::Runtime;
 use super::grid;
 use super::motion::Motion;
 use super::processes::{Process, Program, arguments};
-use super::{StreamReportOptions, peers};
+use super::{SCENE, StreamReportOptions, peers};
 use modalcast_model::backend_settings::LookTable;
 use modalcast_model::error::{Error, Result, fault_in};
 use modalcast_model::load::{self, OpenedScene};
-
-/// The name of every scene on its server.
-pub(super) const SCENE: &str = "scene";
 
 /// Longest time between the end of the server's connections and its own end.
 const SERVER_END: Duration = Duration::from_secs(1);

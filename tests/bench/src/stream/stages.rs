@@ -10,7 +10,7 @@ use std::collections::BTreeMap;
 use modalcast_client::ServerInfo;
 use serde::Serialize;
 
-use super::viewer::Content;
+use super::peers::viewer::Content;
 
 /// The stages that run one after the other on the GPU, or on the CPU if the machine has no GPU.
 const DEVICE_STAGES: [&str; 4] = ["deform", "upload", "shadow", "draw"];

@@ -10,9 +10,10 @@ use modalcast_client::{
 use serde::Serialize;
 use tokio_stream::Stream;
 
+use super::SCENE;
 use super::StreamReportOptions;
 use super::motion::{self, Motion};
-use super::session::{SCENE, Session};
+use super::session::Session;
 use crate::timing::quantile;
 use crate::workloads::Size;
 use modalcast_model::error::{Result, fault, fault_in};

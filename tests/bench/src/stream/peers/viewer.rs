@@ -16,18 +16,18 @@ use modalcast_model::error::{Result, fault, fault_in};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct ViewerJob {
     /// URL of the server.
-    pub(super) server: String,
-    pub(super) scene: String,
-    pub(super) replies: u64,
-    pub(super) content: Content,
+    pub(in crate::stream) server: String,
+    pub(in crate::stream) scene: String,
+    pub(in crate::stream) replies: u64,
+    pub(in crate::stream) content: Content,
     /// The direction to look from: view v is turned about the up axis by v quarters of a turn. View 0 is the camera
     /// that the server selects.
-    pub(super) view: u32,
+    pub(in crate::stream) view: u32,
 }
 
 /// Content and encoding of the replies.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-pub(super) enum Content {
+pub(in crate::stream) enum Content {
     Png {
         width: u32,
         height: u32,
@@ -46,7 +46,7 @@ pub(super) enum Content {
 
 impl Content {
     /// Name in tables.
-    pub(super) fn name(self) -> String {
+    pub(in crate::stream) fn name(self) -> String {
         match self {
             Self::Png { width, height } => format!("PNG {width}x{height}"),
             Self::Rgba { width, height } => format!("raw {width}x{height}"),
@@ -57,7 +57,7 @@ impl Content {
     }
 
     /// Whether the server draws pictures for this content.
-    pub(super) const fn is_picture(self) -> bool {
+    pub(in crate::stream) const fn is_picture(self) -> bool {
         matches!(self, Self::Png { .. } | Self::Rgba { .. })
     }
 
@@ -70,15 +70,15 @@ impl Content {
 /// The replies of one viewer.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct ViewerSummary {
-    pub(super) replies: u64,
+    pub(in crate::stream) replies: u64,
     /// (n - 1) / t for n replies, where t is the time from the first to the last reply. 0 for fewer than two replies.
-    pub(super) per_second: f64,
+    pub(in crate::stream) per_second: f64,
     /// Bytes of all replies.
-    pub(super) bytes: u64,
+    pub(in crate::stream) bytes: u64,
     /// Steps that the server skipped.
-    pub(super) skipped: u64,
+    pub(in crate::stream) skipped: u64,
     /// Median of each stage in milliseconds.
-    pub(super) stages_ms: BTreeMap<String, f32>,
+    pub(in crate::stream) stages_ms: BTreeMap<String, f32>,
 }
 
 /// Collects the replies of a viewer.
@@ -129,7 +129,7 @@ impl Collector {
 }
 
 /// (n - 1) / t for n replies and the time from the first to the last one; 0 without a time.
-pub(super) fn rate(replies: u64, seconds: f64) -> f64 {
+pub(in crate::stream) fn rate(replies: u64, seconds: f64) -> f64 {
     if seconds > 0.0 { replies.saturating_sub(1) as f64 / seconds } else { 0.0 }
 }
 
@@ -137,7 +137,7 @@ pub(super) fn rate(replies: u64, seconds: f64) -> f64 {
 ///
 /// # Errors
 /// `Fault` when the server rejects the request, a stream ends early, or a step is missing.
-pub(super) async fn run(job: &ViewerJob) -> Result<()> {
+pub(in crate::stream) async fn run(job: &ViewerJob) -> Result<()> {
     let client = Client::connect(&job.server).await.map_err(fault_in("viewer"))?;
     let mut collector = Collector::default();
     match job.content {
@@ -150,7 +150,12 @@ pub(super) async fn run(job: &ViewerJob) -> Result<()> {
 }
 
 /// The picture of a job; `None` for vertices.
-pub(super) async fn picture(client: &Client, scene: &str, content: Content, view: u32) -> Result<Option<Picture>> {
+pub(in crate::stream) async fn picture(
+    client: &Client,
+    scene: &str,
+    content: Content,
+    view: u32,
+) -> Result<Option<Picture>> {
     let (size, format) = match content {
         Content::Png { width, height } => ((width, height), FrameFormat::Png),
         Content::Rgba { width, height } => ((width, height), FrameFormat::Rgba),

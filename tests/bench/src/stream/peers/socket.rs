@@ -6,8 +6,8 @@ use std::time::Instant;
 
 use serde::{Deserialize, Serialize};
 
-use super::peers::PeerJob;
-use super::processes::PROCESS_TIMEOUT;
+use super::super::processes::PROCESS_TIMEOUT;
+use super::PeerJob;
 use super::viewer::{ViewerSummary, rate};
 use modalcast::cli::print_line;
 use modalcast::config::Config;
@@ -16,15 +16,15 @@ use modalcast_model::error::{Result, fault, fault_in};
 /// Replies to send over a plain TCP connection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) struct SocketJob {
-    pub(super) reply_bytes: usize,
+    pub(in crate::stream) reply_bytes: usize,
     /// Every write has this size, except the last one of a reply, which has the rest.
-    pub(super) chunk_bytes: usize,
-    pub(super) replies: u64,
+    pub(in crate::stream) chunk_bytes: usize,
+    pub(in crate::stream) replies: u64,
 }
 
 impl SocketJob {
     /// Replies in chunks of the same size as those of the server.
-    pub(super) fn new(reply_bytes: usize, replies: u64) -> Self {
+    pub(in crate::stream) fn new(reply_bytes: usize, replies: u64) -> Self {
         Self { reply_bytes, chunk_bytes: Config::default().chunk_bytes, replies }
     }
 }
@@ -34,14 +34,14 @@ const ORIGIN_BYTES: u64 = 24;
 
 /// Rate of a plain TCP connection.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct SocketRate {
-    pub(super) job: SocketJob,
-    pub(super) per_second: f64,
+pub(in crate::stream) struct SocketRate {
+    pub(in crate::stream) job: SocketJob,
+    pub(in crate::stream) per_second: f64,
 }
 
 impl SocketRate {
     /// Bytes per second.
-    pub(super) fn bandwidth(&self) -> f64 {
+    pub(in crate::stream) fn bandwidth(&self) -> f64 {
         self.per_second * self.job.reply_bytes as f64
     }
 }
@@ -50,7 +50,7 @@ impl SocketRate {
 ///
 /// # Errors
 /// `Fault` when the child process fails or other bytes arrive.
-pub(super) fn measure(job: SocketJob) -> Result<SocketRate> {
+pub(in crate::stream) fn measure(job: SocketJob) -> Result<SocketRate> {
     let mut source = PeerJob::SocketSource(job).start()?;
     let address = source.wait_for("listening on ")?;
     let address: SocketAddr = address.parse().map_err(fault_in("socket"))?;
@@ -61,7 +61,7 @@ pub(super) fn measure(job: SocketJob) -> Result<SocketRate> {
 ///
 /// # Errors
 /// `Fault` when the socket fails.
-pub(super) fn run_source(job: &SocketJob) -> Result<()> {
+pub(in crate::stream) fn run_source(job: &SocketJob) -> Result<()> {
     let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).map_err(fault_in("socket"))?;
     print_line(format!("listening on {}", listener.local_addr().map_err(fault_in("socket"))?));
     let (stream, _) = listener.accept().map_err(fault_in("socket"))?;
@@ -125,7 +125,11 @@ impl SocketComparison {
     ///
     /// # Errors
     /// `Fault` unless each has as many replies of as many bytes as the others, except for the origins.
-    pub(super) fn new(stream: &ViewerSummary, requests: &ViewerSummary, socket: &SocketRate) -> Result<Self> {
+    pub(in crate::stream) fn new(
+        stream: &ViewerSummary,
+        requests: &ViewerSummary,
+        socket: &SocketRate,
+    ) -> Result<Self> {
         let job = socket.job;
         let socket_bytes = job.replies * job.reply_bytes as u64;
         let expected_bytes = socket_bytes..=socket_bytes + job.replies * ORIGIN_BYTES;

@@ -10,8 +10,8 @@ use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::mpsc;
 use tokio::time::Instant;
 
-use super::peers::PeerJob;
-use super::processes::Process;
+use super::super::processes::Process;
+use super::PeerJob;
 use modalcast::cli::print_line;
 use modalcast_model::error::{Result, fault_in};
 
@@ -26,16 +26,16 @@ const CHUNKS_IN_FLIGHT: usize = 4096;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct ProxyJob {
     /// Host and port of the server.
-    pub(super) server: SocketAddr,
+    pub(in crate::stream) server: SocketAddr,
     /// Delay of each direction in milliseconds, rounded up to the timer's resolution of 1 ms.
-    pub(super) one_way_ms: u64,
+    pub(in crate::stream) one_way_ms: u64,
 }
 
 /// A proxy in a child process. Dropping it ends the process.
-pub(super) struct DelayProxy {
+pub(in crate::stream) struct DelayProxy {
     _process: Process,
     /// URL of the proxy.
-    pub(super) url: String,
+    pub(in crate::stream) url: String,
 }
 
 impl DelayProxy {
@@ -43,7 +43,7 @@ impl DelayProxy {
     ///
     /// # Errors
     /// `Fault` when the process fails.
-    pub(super) fn start(server: SocketAddr, one_way_ms: u64) -> Result<Self> {
+    pub(in crate::stream) fn start(server: SocketAddr, one_way_ms: u64) -> Result<Self> {
         let mut process = PeerJob::Proxy(ProxyJob { server, one_way_ms }).start()?;
         let address = process.wait_for("listening on ")?;
         Ok(Self { _process: process, url: format!("http://{address}") })
@@ -54,7 +54,7 @@ impl DelayProxy {
 ///
 /// # Errors
 /// `Fault` when no port is free.
-pub(super) async fn run(job: &ProxyJob) -> Result<()> {
+pub(in crate::stream) async fn run(job: &ProxyJob) -> Result<()> {
     let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).await.map_err(fault_in("proxy"))?;
     print_line(format!("listening on {}", listener.local_addr().map_err(fault_in("proxy"))?));
     forward_connections(&listener, job).await
