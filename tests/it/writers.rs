@@ -177,6 +177,26 @@ async fn runs_never_repeat_on_any_scene_or_after_a_crash() {
     assert_eq!(runs.len(), 9);
 }
 
+/// The device shows the restored state, and the step changes only one domain.
+#[tokio::test(flavor = "multi_thread")]
+async fn reset_after_a_restart_removes_the_restored_state() {
+    let folder = tempfile::tempdir().expect("expected a temporary folder");
+    let server = Server::start(config(folder.path())).await;
+    server.open("strips").await;
+    let (mut writer, _) = open_successfully(&server, lossless("strips")).await;
+    writer.send_step_and_wait(step(1, &[0], &[0.5, 0.25])).await;
+    writer.finish().await;
+    server.stop().await.expect("expected the server to stop without an error");
+    let server = Server::start(config(folder.path())).await;
+    let request = OpenDrive { initial_state: InitialState::Reset.into(), ..lossless("strips") };
+    let (mut writer, _) = open_successfully(&server, request).await;
+    let first_step = step(1, &[1], &[0.125, 1.0]);
+    writer.send_step_and_wait(first_step.clone()).await;
+    let request = v1::GetVerticesRequest { scene: "strips".into(), ..v1::GetVerticesRequest::default() };
+    let reply = get_vertices(&server, request).await.expect("expected vertices");
+    assert_eq!(reply.positions, reference_vertices(&strips(), &[first_step]).positions);
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn first_step_starts_from_the_current_or_the_rest_state() {
     let server = Server::start_default().await;

@@ -231,6 +231,11 @@ impl SceneActor {
         };
         state.run = self.run;
         state.apply(&self.scene, &update);
+        if self.starts_from_rest {
+            // The device shows the current state, which may differ from rest in every domain.
+            state.serial = self.current.state.serial;
+            state.mark_all_dirty();
+        }
         let state = Arc::new(state);
         let pending_summary = self.device.deform(self.id, &state);
         let step_queue = Arc::clone(&writer.step_queue);
