@@ -7,18 +7,14 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
 use modalcast_model::error::{Error, Result};
 
-/// HTTP/2 flow-control window of a stream, in bytes: what a client may send before the server has read it. At a round
-/// trip of 50 ms a step stream then carries up to 40 MB/s.
-pub(super) const STREAM_WINDOW: u32 = 2 << 20;
+/// Ratio of the HTTP/2 flow-control windows of a connection and a stream. It is far above the number of streams, because
+/// the window of the connection also limits small frames, see [`MAX_DRIVES`].
+pub(super) const STREAMS_PER_CONNECTION_WINDOW: u32 = 256;
 
-/// HTTP/2 flow-control window of a connection, in bytes. It is far above what the streams can fill, because it also
-/// limits small frames, see [`MAX_DRIVES`].
-pub(super) const CONNECTION_WINDOW: u32 = 512 << 20;
-
-/// Limit on the step streams of one connection. A stream that blocks is not read, and h2 buffers up to a stream window
-/// (2 MiB) of its frames. h2 charges 256 - f bytes for each buffered frame of f bytes, and closes the connection if the
-/// charges exceed half of the connection window (256 MiB). The smallest frame of a step has f = 9 bytes: 5 bytes of gRPC
-/// and a step with nothing but its number. One stream is then charged 2 MiB / 9 * (256 - 9) = 58 MB, so four are safe.
+/// Limit on the step streams of one connection. A stream that blocks is not read, and h2 buffers up to a stream window W
+/// of its frames. h2 charges 256 - f bytes for each buffered frame of f bytes, and closes the connection if the charges
+/// exceed half of the connection window, 128 W. The smallest frame of a step has f = 9 bytes: 5 bytes of gRPC and a step
+/// with nothing but its number. One stream is then charged W / 9 * (256 - 9) = 27.4 W, so four are safe.
 pub(super) const MAX_DRIVES: usize = 4;
 
 /// A connection, in the extensions of each of its calls.

@@ -25,7 +25,7 @@ use tokio::time::Instant;
 use tonic::transport::Server;
 use tonic_health::server::HealthReporter;
 
-use self::connection::{CONNECTION_WINDOW, STREAM_WINDOW};
+use self::connection::STREAMS_PER_CONNECTION_WINDOW;
 use self::routes::Routes;
 use crate::config::Config;
 use crate::engine::Engine;
@@ -129,8 +129,8 @@ fn transport(config: &Config) -> Server {
         .http2_max_local_error_reset_streams(Some(1024))
         .http2_max_pending_accept_reset_streams(Some(100))
         .http2_max_header_list_size(16 << 10)
-        .initial_stream_window_size(STREAM_WINDOW)
-        .initial_connection_window_size(CONNECTION_WINDOW)
+        .initial_stream_window_size(config.stream_window)
+        .initial_connection_window_size(STREAMS_PER_CONNECTION_WINDOW * config.stream_window)
         .max_frame_size(64 << 10)
         .http2_keepalive_interval(Some(config.keepalive_interval))
         .http2_keepalive_timeout(Some(config.keepalive_timeout))
