@@ -15,7 +15,8 @@ const PROGRAM: &str = "modalcast-report";
 const EXAMPLES: &str = "Examples:
   modalcast report --help
   modalcast report deform --out report --quick
-  modalcast report render --out report --quick";
+  modalcast report render --out report --quick
+  modalcast report stream --out report --quick";
 
 /// Measures error against run time on this machine and writes tables and plots.
 #[derive(Debug, clap::Args)]
