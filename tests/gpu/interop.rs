@@ -93,8 +93,6 @@ fn gpu_frames_of_filled_and_uploaded_buffers_are_equal() {
     let repeated_frame = renderer.draw(&filled_scene, &params).expect("expected a frame");
     assert_eq!(frame.rgba, repeated_frame.rgba, "expected the same image after reading the surface");
     filling_deformer.deform(&other_state).expect("expected the step to succeed");
-    let unfilled_frame = renderer.draw(&filled_scene, &params).expect("expected a frame");
-    assert_eq!(frame.rgba, unfilled_frame.rgba, "expected the vertices of the last fill");
     filling_deformer.fill_gl_buffers().expect("expected filled buffers");
     let moved_frame = renderer.draw(&filled_scene, &params).expect("expected a frame");
     assert_ne!(frame.rgba, moved_frame.rgba, "expected another image of another state");
