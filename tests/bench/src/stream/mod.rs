@@ -1,12 +1,12 @@
 //! What reaches a client: rates, latencies and encodings, with the server, the physics process and each viewer in its
 //! own process of this machine.
 //!
-//! - [`processes`] starts and ends child processes, and `peers` are the roles of this program as such a process:
+//! - `processes` starts and ends child processes, and `peers` are the roles of this program as such a process:
 //!   `viewer`, `socket` (a plain TCP connection) and `proxy` (a delaying connection).
 //! - `session` is a server with one scene. `motion` has steps that are sent without computing them, `grid` is a scene of
 //!   many vertices.
-//! - `cases` lists the cases. Each case makes one measurement: [`rates`] with [`stages`], [`latency`], [`socket`],
-//!   [`delay`], [`vertex_encodings`] or [`picture_encodings`].
+//! - `cases` lists the cases. Each case makes one measurement: `rates` with `stages`, `latency`, `socket`,
+//!   `delay`, `vertex_encodings` or `picture_encodings`.
 //! - `output`, `markdown` and `plot` write the report.
 
 mod cases;
