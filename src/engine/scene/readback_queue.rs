@@ -3,13 +3,21 @@
 //! the order in which they were started. In the diagrams, `k` is the number of a step, `read` is the transfer of the
 //! pixels to host-readable memory, and `upload` is the copy of the new vertices into OpenGL buffers.
 //!
-//! Deformers have their own vertex memory, so they compute concurrently with the frames in flight. `upload` is ordered
-//! after the readback of frame k. Frame k is copied out, encoded and sent while frame k+1 is drawn.
+//! A deformer whose vertices are uploaded computes concurrently with the frames in flight:
 //!
 //! ```text
 //! deformer  [deform k+1  ]          [deform k+2  ]
 //! OpenGL    [draw k][read k][upload][draw k+1][read k+1][upload]
-//! frame k                           [copy out, encode, send]
+//! ```
+//!
+//! A deformer that fills OpenGL's buffers on the device submits a step and the copy of its vertices together while every
+//! step is drawn. Both are ordered after all OpenGL commands issued before, including the readback of frame k, so only the
+//! host's work overlaps. Frame k is copied out, encoded and sent while frame k+1 is drawn.
+//!
+//! ```text
+//! device    [draw k][read k][deform k+1, copy] [draw k+1][read k+1][deform k+2, copy]
+//! host      [submit k+1]                       [submit k+2]
+//! frame k                                      [copy out, encode, send]
 //! ```
 
 use std::collections::VecDeque;
