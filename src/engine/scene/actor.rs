@@ -49,7 +49,7 @@ use crate::engine::storage::run_counter::RunCounter;
 use crate::telemetry::{Stage, StageTimes};
 use modalcast_model::deform::DeformSummary;
 use modalcast_model::error::{Error, Result, fault};
-use modalcast_model::scene::{Scene, SceneState};
+use modalcast_model::scene::{Scene, SceneState, StepUpdate};
 
 /// Services that all scenes share.
 #[derive(Debug, Clone)]
@@ -225,18 +225,8 @@ impl SceneActor {
         let Some(queued_step) = writer.step_queue.take() else { return false };
         let stages = queued_step.stages();
         let QueuedStep { update, merged, .. } = queued_step;
-        let mut state = match self.starts_from_rest {
-            true => SceneState::rest(&self.scene),
-            false => SceneState::clone(&self.current.state),
-        };
-        state.run = self.run;
-        state.apply(&self.scene, &update);
-        if self.starts_from_rest {
-            // The device shows the current state, which may differ from rest in every domain.
-            state.serial = self.current.state.serial;
-            state.mark_all_dirty();
-        }
-        let state = Arc::new(state);
+        let state = next_state(&self.scene, &self.current.state, self.starts_from_rest, &update);
+        let state = Arc::new(SceneState { run: self.run, ..state });
         let pending_summary = self.device.deform(self.id, &state);
         let step_queue = Arc::clone(&writer.step_queue);
         self.phase = StepPhase::Deforming(DeformingStep { step_queue, merged, stages, state, pending_summary });
@@ -365,9 +355,48 @@ impl SceneActor {
     }
 }
 
+/// The state after a step that changes the current state or, with `starts_from_rest`, the rest state.
+fn next_state(scene: &Scene, current: &SceneState, starts_from_rest: bool, update: &StepUpdate) -> SceneState {
+    if !starts_from_rest {
+        let mut state = current.clone();
+        state.apply(scene, update);
+        return state;
+    }
+    let mut state = SceneState { serial: current.serial, ..SceneState::rest(scene) };
+    state.apply(scene, update);
+    // The device shows the current state, which may differ from rest in every domain.
+    state.mark_all_dirty();
+    state
+}
+
 async fn sleep_until(deadline: Option<Instant>) {
     match deadline {
         Some(deadline) => tokio::time::sleep_until(deadline.into()).await,
         None => std::future::pending().await,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::engine::testing;
+    use modalcast_model::scene::{DirtyDomains, RawStepUpdate};
+
+    /// A restored state has the serial number of the rest state, so only the list of changes tells them apart.
+    #[test]
+    fn step_from_rest_changes_every_domain() {
+        let scene = testing::two_strips();
+        let mut restored_state = SceneState::rest(&scene);
+        restored_state.q[0] = 0.5;
+        let q = vec![0; 4 * scene.layout.domains[1].rank].into();
+        let raw = RawStepUpdate { number: 1, q_domains: vec![1], q, ..RawStepUpdate::default() };
+        let update = StepUpdate::parse(&scene, &raw).expect("expected a valid step");
+        for (starts_from_rest, first_q, dirty_domains) in
+            [(true, 0.0, DirtyDomains::All), (false, 0.5, DirtyDomains::Some(vec![1]))]
+        {
+            let state = next_state(&scene, &restored_state, starts_from_rest, &update);
+            assert_eq!((state.q[0], &state.dirty_domains), (first_q, &dirty_domains));
+            assert!(state.serial > restored_state.serial);
+        }
     }
 }
