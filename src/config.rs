@@ -58,8 +58,8 @@ pub struct Config {
     pub window: u32,
     /// Largest window that a client may request.
     pub max_window: u32,
-    /// HTTP/2 flow-control window of a stream, in bytes: what a client may send before the server has read it. At a
-    /// round trip of 50 ms, 2 MiB permit 40 MB of steps per second.
+    /// HTTP/2 flow-control window of a stream, in bytes: what a client may send before the server has read it. It
+    /// limits the steps to one window per round trip: 2 MiB to 42 MB/s at 50 ms.
     pub stream_window: u32,
     /// Limit on the total size of one upload, in bytes.
     pub upload_bytes: u64,

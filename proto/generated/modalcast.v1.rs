@@ -2488,8 +2488,8 @@ pub struct FrameStreamSettings {
     /// server fits them to the scene, and `largest` remains 0 if it is fitted to each frame.
     #[prost(message, repeated, tag = "4")]
     pub pictures: ::prost::alloc::vec::Vec<Picture>,
-    /// 16 random bytes that identify the stream in UpdateFrameStream. Everybody who knows them can move the cameras, and
-    /// the server tells them to nobody else.
+    /// 16 random bytes that identify the stream in UpdateFrameStream. They permit any client to move the cameras, and the
+    /// server sends them only in this reply.
     #[prost(bytes = "bytes", tag = "5")]
     pub stream: ::prost::bytes::Bytes,
 }
@@ -4595,7 +4595,7 @@ pub struct ApplyForcesRequest {
     #[prost(string, tag = "1")]
     pub scene: ::prost::alloc::string::String,
     /// A token of 16 to 64 random bytes that the client keeps. It identifies the owner of the forces across calls and
-    /// connections. The server does not show it to others, so that nobody else can change the forces.
+    /// connections. The server never sends it, so other clients cannot change the forces.
     #[prost(bytes = "bytes", tag = "2")]
     pub owner: ::prost::bytes::Bytes,
     /// All forces of the owner, at most 16.
@@ -4785,7 +4785,7 @@ pub mod force_service_client {
             self
         }
         /// Sets all forces of one owner in a scene. An empty list removes them. Each call starts the lifetime again; forces
-        /// that are not renewed expire, so that a viewer that disappears does not push forever.
+        /// that are not renewed expire, so the forces of a viewer that has disconnected end.
         ///
         /// REASON_LIMIT_REACHED: more than 16 forces, or forces of a further owner while 32 owners have forces in the scene.
         /// REASON_INVALID_FIELD: an invalid force; nothing changes.
@@ -4856,7 +4856,7 @@ pub mod force_service_server {
     #[async_trait]
     pub trait ForceService: std::marker::Send + std::marker::Sync + 'static {
         /// Sets all forces of one owner in a scene. An empty list removes them. Each call starts the lifetime again; forces
-        /// that are not renewed expire, so that a viewer that disappears does not push forever.
+        /// that are not renewed expire, so the forces of a viewer that has disconnected end.
         ///
         /// REASON_LIMIT_REACHED: more than 16 forces, or forces of a further owner while 32 owners have forces in the scene.
         /// REASON_INVALID_FIELD: an invalid force; nothing changes.

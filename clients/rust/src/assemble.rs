@@ -56,6 +56,17 @@ pub(crate) struct Chunk<H> {
     pub(crate) data: Bytes,
 }
 
+impl<H> Chunk<H> {
+    /// A chunk whose head, if it has one, states the total size.
+    pub(crate) fn new(head: Option<H>, total_bytes: fn(&H) -> u64, offset: u64, data: Bytes) -> Self {
+        let head = head.map(|head| {
+            let total = total_bytes(&head);
+            (head, total)
+        });
+        Self { head, offset, data }
+    }
+}
+
 /// A chunk in its wire format. The first chunk of a reply has a `Head`, and all its chunks together form a `Reply`.
 pub(crate) trait WireChunk: Sized {
     type Head;

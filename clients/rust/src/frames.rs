@@ -288,11 +288,7 @@ impl WireChunk for v1::FrameChunk {
     const NAME: &'static str = "frame";
 
     fn into_chunk(self) -> Chunk<Self::Head> {
-        let head = self.head.map(|head| {
-            let total = head.total;
-            (head, total)
-        });
-        Chunk { head, offset: self.offset, data: self.data }
+        Chunk::new(self.head, |head| head.total, self.offset, self.data)
     }
 
     fn decode_reply(head: Self::Head, bytes: Bytes) -> Result<Frame> {

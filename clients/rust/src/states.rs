@@ -270,11 +270,7 @@ impl<M> ReplyDecoder<M> for StateDecoder<M> {
 
     fn add_message(&mut self, message: M) -> Result<Option<Arc<SceneState>>> {
         let chunk = (self.chunk_of)(message).ok_or_else(|| malformed_reply("states.part", "a chunk", "none"))?;
-        let head = chunk.head.map(|head| {
-            let total = head.total;
-            (head, total)
-        });
-        match self.assembler.push(Chunk { head, offset: chunk.offset, data: chunk.data })? {
+        match self.assembler.push(Chunk::new(chunk.head, |head| head.total, chunk.offset, chunk.data))? {
             Some((head, bytes)) => self.decode_state(head, &bytes).map(Some),
             None => Ok(None),
         }

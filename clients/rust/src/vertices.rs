@@ -249,11 +249,7 @@ impl<M> ReplyDecoder<M> for VertexDecoder<M> {
             None => Err(malformed_reply("vertices.part", "a layout or a chunk", "none")),
             Some(Part::Layout(layout)) => self.layout.add(&layout, self.max_domains).map(|()| None),
             Some(Part::Chunk(chunk)) => {
-                let head = chunk.head.map(|head| {
-                    let total = head.total;
-                    (head, total)
-                });
-                match self.assembler.push(Chunk { head, offset: chunk.offset, data: chunk.data })? {
+                match self.assembler.push(Chunk::new(chunk.head, |head| head.total, chunk.offset, chunk.data))? {
                     Some((head, bytes)) => self.decode_set(head, &bytes).map(Some),
                     None => Ok(None),
                 }

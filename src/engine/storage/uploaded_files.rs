@@ -1,6 +1,6 @@
 //! The hashes of uploaded files: one list per uploaded scene, so that clients need not send files that the server
-//! already has. The lists are hints. Whoever reuses a file verifies its hash, so a missing or outdated list costs only an
-//! upload of the content. The lists have the lifetime of their scenes, and no content is stored besides that of scenes.
+//! already has. A list may be missing or outdated: the hash of a file is verified before it is reused, so a wrong list
+//! costs only an upload of the content. The lists have the lifetime of their scenes, and no content is stored besides that of scenes.
 
 use std::collections::{BTreeMap, HashMap};
 use std::fs;

@@ -100,11 +100,10 @@ fn rotation_matrix(quaternion: [f32; 4]) -> Result<Matrix3<f64>> {
 }
 
 fn check_finite(field: &str, list: &[f64]) -> Result<()> {
-    if list.iter().all(|number| number.is_finite()) {
-        return Ok(());
+    match list.iter().position(|number| !number.is_finite()) {
+        None => Ok(()),
+        Some(index) => Err(invalid(format!("{field}[{index}]"), "a finite number", list[index])),
     }
-    let index = list.iter().position(|number| !number.is_finite()).unwrap_or(0);
-    Err(invalid(format!("{field}[{index}]"), "a finite number", list[index]))
 }
 
 fn decode_f32_array<const N: usize>(bytes: &[u8]) -> [f32; N] {

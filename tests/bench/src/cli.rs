@@ -14,7 +14,7 @@ use modalcast::cli::options::with_spinner;
 use modalcast::cli::{EXIT_CODES, Outcome, finish, print_line};
 use modalcast_model::error::Result;
 
-/// Measures error against run time, and what reaches a client, on this machine. Writes tables and plots.
+/// Measures error against run time, and rates and latencies at the client, on this machine. Writes tables and plots.
 #[derive(Debug, Parser)]
 #[command(name = "modalcast report", version, after_help = format!("{EXAMPLES}\n\n{EXIT_CODES}"))]
 struct Cli {

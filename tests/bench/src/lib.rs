@@ -1,5 +1,5 @@
 //! Benchmarks of error against run time for every variant of the deformation, on synthetic scenes or on a scene of the
-//! user. [`render`] does the same for the renderer, and [`stream`] measures what reaches a client.
+//! user. [`render`] does the same for the renderer, and [`stream`] measures at the client.
 //!
 //! A workload (`load` in options and reports) is a scene to measure. A variant is one way to deform it: a backend, a
 //! storage type of U and further options. Validation comes before timing: a variant whose error exceeds its a-priori

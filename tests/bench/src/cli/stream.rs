@@ -15,7 +15,7 @@ const EXAMPLES: &str = "Examples:
   modalcast report stream --out report --scenes ../data
   modalcast report stream --out report --case tree-png-1080p --case 'tree-delay*' --repeat 5";
 
-/// What reaches a client: rates beside the rate of the slowest stage, latency, a comparison with a plain socket, rates
+/// Rates and latencies at the client: rates beside the rate of the slowest stage, latency, a comparison with a plain socket, rates
 /// over a long round trip, and encodings.
 ///
 /// Starts the server, the physics process and each viewer as processes of this machine. Writes report.json, report.csv,

@@ -24,7 +24,7 @@ that merges steps. The transfer alone is a plain TCP connection over loopback wi
 pub(super) fn markdown(report: &StreamReport) -> String {
     let commit = report.provenance.commit.as_deref().unwrap_or("unknown");
     let mut text = format!(
-        "# What reaches a client\n\n{}\n\nCommit {commit}, build {}. Command: `{}`\n",
+        "# Rates and latencies at the client\n\n{}\n\nCommit {commit}, build {}. Command: `{}`\n",
         report.provenance.line(),
         report.build,
         report.provenance.command.join(" ")

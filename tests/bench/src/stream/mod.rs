@@ -1,4 +1,4 @@
-//! What reaches a client: rates, latencies and encodings, with the server, the physics process and each viewer in its
+//! Rates, latencies and encodings at the client, with the server, the physics process and each viewer in its
 //! own process of this machine.
 //!
 //! - `processes` starts and ends child processes, and `peers` are the roles of this program as such a process:

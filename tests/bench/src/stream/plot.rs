@@ -30,7 +30,7 @@ pub(super) fn draw_svg(report: &StreamReport) -> String {
     let panels_top = bars_top + rates.len() as f64 * BAR_ROW_HEIGHT + MARGIN;
     let height = panels_top + encodings.len().div_ceil(2) as f64 * PANEL_SIZE.1 + MARGIN;
     let mut svg = begin_svg(width, height);
-    write_text(&mut svg, (MARGIN, MARGIN + 18.0), TITLE_STYLE, "What reaches a client");
+    write_text(&mut svg, (MARGIN, MARGIN + 18.0), TITLE_STYLE, "Rates at the client");
     write_text(&mut svg, (MARGIN, MARGIN + 38.0), TEXT_STYLE, &report.provenance.line());
     let explanation =
         "per second; filled: received by the slowest viewer (without viewers: steps), line: slowest stage alone";
