@@ -75,7 +75,7 @@ uint value_of(uint id, vec2 ndc, float scale) {
 
 void main() {
     ivec2 size = id_image_size();
-    ivec2 pixel = ivec2(gl_GlobalInvocationID.xy);
+    ivec2 pixel = image_pixel();
     if (pixel.x >= size.x) return;
     uint output_index = uint(size.y - 1 - pixel.y) * uint(size.x) + uint(pixel.x);
     float scale = intBitsToFloat(scale_bits);

@@ -13,7 +13,7 @@ layout(binding = 0) uniform sampler2D source;
 layout(rgba16f, binding = 0) uniform image2D destination;
 
 void main() {
-    ivec2 destination_texel = ivec2(gl_GlobalInvocationID.xy);
+    ivec2 destination_texel = image_pixel();
     ivec2 max_texel = textureSize(source, 0) - 1;
     if (any(greaterThanEqual(destination_texel, imageSize(destination)))) return;
     ivec2 near_texel = destination_texel >> 1;

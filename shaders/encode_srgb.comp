@@ -18,7 +18,7 @@ float bayer_threshold(ivec2 pixel) {
 
 void main() {
     ivec2 size = textureSize(scene_color, 0);
-    ivec2 pixel = ivec2(gl_GlobalInvocationID.xy);
+    ivec2 pixel = image_pixel();
     if (pixel.x >= size.x) return;
 #ifdef FXAA
     vec3 linear = fxaa_color(pixel);

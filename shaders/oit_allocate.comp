@@ -40,7 +40,7 @@ void main() {
     }
     memoryBarrierShared();
     barrier();
-    ivec2 pixel = ivec2(gl_GlobalInvocationID.xy);
+    ivec2 pixel = image_pixel();
     bool is_inside = all(lessThan(pixel, imageSize(fragment_counts)));
     uint fragment_count = is_inside ? imageLoad(fragment_counts, pixel).x : 0u;
     uint record_count = min(fragment_count, per_pixel_limit);

@@ -103,7 +103,7 @@ void main() {
     ivec2 size = id_image_size();
     uint sample_ids[SAMPLES];
 #ifdef BACKGROUND
-    ivec2 pixel = ivec2(gl_GlobalInvocationID.xy);
+    ivec2 pixel = image_pixel();
     bool is_inside = all(lessThan(pixel, size));
     bool sees_triangle = false;
     for (int sample_index = 0; sample_index < SAMPLES; sample_index++) {

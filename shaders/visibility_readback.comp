@@ -6,7 +6,7 @@ layout(std430, binding = 0) writeonly buffer Pixels { uint ids_out[]; };
 
 void main() {
     ivec2 size = id_image_size();
-    ivec2 pixel = ivec2(gl_GlobalInvocationID.xy);
+    ivec2 pixel = image_pixel();
     if (pixel.x >= size.x) return;
     ids_out[uint(size.y - 1 - pixel.y) * uint(size.x) + uint(pixel.x)] = load_id(pixel, 0);
 }

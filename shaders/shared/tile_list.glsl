@@ -6,13 +6,6 @@ layout(std430, binding = 1) buffer TileList {
     uint tiles[];              // column in the lower 16 bits, row in the upper
 } tile_list;
 
-// Appends the tile of this workgroup. Only one lane may call it.
-void append_tile() {
-    uint index = atomicAdd(tile_list.count, 1u);
-    if (index % TILES_PER_ROW == 0u) atomicAdd(tile_list.workgroup_counts[1], 1u);
-    tile_list.tiles[index] = gl_WorkGroupID.x | gl_WorkGroupID.y << 16;
-}
-
 uint listed_tile_index() { return gl_WorkGroupID.y * TILES_PER_ROW + gl_WorkGroupID.x; }
 
 // Whether the indirect dispatch has a tile for this workgroup. The last row of workgroups may be incomplete.

@@ -53,10 +53,10 @@ mod uniforms;
 pub use self::device::readback_ring::MAX_FRAMES_IN_FLIGHT;
 pub use self::device::{EglDevice, devices};
 pub use self::pass::{FrameTimes, Pass, RenderStage, TimeKey};
-pub use self::passes::aov::{Aov, AovImage};
+pub use self::passes::aov::{Aov, AovImage, PartialAov};
 pub use self::passes::picking::{PendingPick, PickHit};
 pub use self::plan::{Allocation, OmittedFeature, RenderPlan, plan};
-pub use self::renderer::{MappedPixels, PendingFrame, Renderer};
+pub use self::renderer::{MappedPixels, PartialFrame, PendingFrame, Renderer};
 pub use self::resources::scene_buffers::SceneBuffers;
 pub use self::types::{
     BlurMethod, CullStats, DevicePreference, FrameCullStats, FrameImage, FrameParams, FrameStats, OitStats,

@@ -19,6 +19,16 @@ pub(crate) struct Region {
     size: [u32; 2],
 }
 
+/// Consecutive rows of an image that are drawn or computed without a break; row 0 is the bottom row. A large frame is
+/// drawn band by band, so that the device can execute other commands in between.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Band {
+    pub(crate) first_row: u32,
+    pub(crate) rows: u32,
+    /// Rows of the image.
+    image_rows: u32,
+}
+
 /// Dirty region of an image: the pixels that may differ from the clear value. `None` stands for all pixels, which are
 /// dirty initially.
 #[derive(Debug, Default)]
@@ -36,6 +46,37 @@ const PROJECTION_MARGIN: f64 = 1.0;
 /// Margin of the dirty region in pixels, because draws may exceed the scissor: llvmpipe exceeds it by one pixel with
 /// multisampling.
 const DIRTY_MARGIN: u32 = 2;
+
+/// The first row of a band is a multiple of this number of rows. llvmpipe rasterizes squares of 64 x 64 pixels, so a draw
+/// that exceeds the scissor (see [`DIRTY_MARGIN`]) does not reach into another band. It is also a multiple of the
+/// workgroup sizes of all passes that work on bands.
+const BAND_ALIGNMENT: u32 = 64;
+
+impl Band {
+    /// All rows of an image.
+    pub(crate) const fn whole(image_rows: u32) -> Self {
+        Self { first_row: 0, rows: image_rows, image_rows }
+    }
+
+    /// Divides an image into bands of at most `max_pixels` pixels, but at least [`BAND_ALIGNMENT`] rows, from the bottom
+    /// to the top.
+    pub(crate) fn divide([width, height]: [u32; 2], max_pixels: u64) -> Vec<Self> {
+        let max_rows = u32::try_from(max_pixels / u64::from(width.max(1))).unwrap_or(u32::MAX);
+        if height <= max_rows {
+            return vec![Self::whole(height)];
+        }
+        let band_rows = (max_rows / BAND_ALIGNMENT).max(1) * BAND_ALIGNMENT;
+        let first_rows = (0..height).step_by(band_rows as usize);
+        first_rows
+            .map(|first_row| Self { first_row, rows: band_rows.min(height - first_row), image_rows: height })
+            .collect()
+    }
+
+    /// Whether this band ends with the top row.
+    const fn is_last(&self) -> bool {
+        self.first_row + self.rows == self.image_rows
+    }
+}
 
 impl Region {
     /// All pixels of a frame.
@@ -77,6 +118,13 @@ impl Region {
         Self { corner: low, size: [high[0] - low[0], high[1] - low[1]], ..self }
     }
 
+    /// The part of the region in a band.
+    pub(crate) fn within(self, band: Band) -> Self {
+        let low = self.corner[1].max(band.first_row);
+        let high = (self.corner[1] + self.size[1]).min(band.first_row + band.rows).max(low);
+        Self { corner: [self.corner[0], low], size: [self.size[0], high - low], ..self }
+    }
+
     /// Width and height of the frame.
     pub(crate) const fn frame_size(&self) -> [u32; 2] {
         self.frame_size
@@ -90,9 +138,14 @@ impl Region {
 }
 
 impl DirtyRegion {
-    /// Returns the dirty region, or none if all pixels are dirty, and replaces it by `region` with a margin.
-    pub(crate) fn replace(&self, region: Region) -> Option<Region> {
-        self.0.replace(Some(region.expanded(DIRTY_MARGIN)))
+    /// Returns the dirty region, or none if all pixels are dirty. With the last band of a frame, replaces it by `region`,
+    /// the region of all bands, with a margin.
+    pub(crate) fn replace(&self, region: Region, band: Band) -> Option<Region> {
+        let dirty_region = self.0.get();
+        if band.is_last() {
+            self.0.set(Some(region.expanded(DIRTY_MARGIN)));
+        }
+        dirty_region
     }
 
     /// Marks all pixels as dirty.
@@ -214,12 +267,41 @@ mod tests {
     fn image_is_dirty_at_first_and_after_mark_all() {
         let (dirty_region, region) =
             (DirtyRegion::default(), Region { frame_size: FRAME, corner: [3, 1], size: [5, 6] });
-        assert_eq!(dirty_region.replace(region), None);
+        let whole = Band::whole(FRAME[1]);
+        assert_eq!(dirty_region.replace(region, whole), None);
         // Two pixels more on each side, except at the bottom, where the frame has only one.
         let region_with_margin = Region { frame_size: FRAME, corner: [1, 0], size: [9, 9] };
-        assert_eq!(dirty_region.replace(Region::whole(FRAME)), Some(region_with_margin));
-        assert_eq!(dirty_region.replace(region), Some(Region::whole(FRAME)));
+        assert_eq!(dirty_region.replace(Region::whole(FRAME), whole), Some(region_with_margin));
+        assert_eq!(dirty_region.replace(region, whole), Some(Region::whole(FRAME)));
         dirty_region.mark_all();
-        assert_eq!(dirty_region.replace(region), None);
+        assert_eq!(dirty_region.replace(region, whole), None);
+    }
+
+    #[test]
+    fn dirty_region_changes_with_the_last_band() {
+        let (dirty_region, region) = (DirtyRegion::default(), Region::whole(FRAME));
+        let bands = Band::divide(FRAME, 640 * 150);
+        for band in &bands {
+            assert_eq!(dirty_region.replace(region, *band), None, "{band:?}");
+        }
+        assert_eq!(dirty_region.replace(region, bands[0]), Some(region));
+    }
+
+    #[test]
+    fn bands_cover_each_row_once() {
+        let rows = |max_pixels: u64| -> Vec<[u32; 2]> {
+            Band::divide(FRAME, max_pixels).iter().map(|band| [band.first_row, band.rows]).collect()
+        };
+        assert_eq!(rows(640 * 400), [[0, 400]]);
+        assert_eq!(rows(640 * 400 - 1), [[0, 384], [384, 16]]);
+        assert_eq!(rows(640 * 150), [[0, 128], [128, 128], [256, 128], [384, 16]]);
+        // A band has at least 64 rows.
+        assert_eq!(rows(1).len(), 7);
+        let region = Region { frame_size: FRAME, corner: [3, 100], size: [5, 60] };
+        let parts = Band::divide(FRAME, 640 * 128).into_iter().map(|band| region.within(band).rect());
+        assert_eq!(
+            parts.map(|[_, y, _, rows]| [y, rows]).collect::<Vec<_>>(),
+            [[100, 28], [128, 32], [256, 0], [384, 0]]
+        );
     }
 }

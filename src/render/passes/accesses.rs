@@ -212,7 +212,6 @@ const PASS_ACCESSES: [(Pass, &[Accesses]); Pass::ALL.len()] = [
             &[
                 (Resource::CullDraws, Access::Transfer),
                 (Resource::OitCounters, Access::Transfer),
-                (Resource::OitTileList, Access::Transfer),
                 (Resource::OitCounts, Access::Attachment),
                 (Resource::Depth, Access::Attachment),
                 (Resource::OitCounts, Access::ImageWrite),
@@ -226,6 +225,7 @@ const PASS_ACCESSES: [(Pass, &[Accesses]); Pass::ALL.len()] = [
             (Resource::OitCounters, Access::StorageWrite),
             (Resource::OitRecords, Access::StorageWrite),
             (Resource::OitCursors, Access::ImageWrite),
+            (Resource::OitTileList, Access::Transfer),
             (Resource::OitTileList, Access::StorageWrite),
         ]],
     ),
@@ -383,7 +383,8 @@ mod tests {
         assert_eq!(barrier_before(Pass::Encode), Kinds::TEXTURE_FETCH | Kinds::SHADER_STORAGE);
         assert_eq!(barrier_before(Pass::Read), Kinds::BUFFER_UPDATE);
         assert_eq!(barrier_within(Pass::Visibility), Kinds::NONE);
-        assert_eq!(barrier_within(Pass::OitAllocate), Kinds::SHADER_STORAGE | Kinds::SHADER_IMAGE);
+        let allocation = Kinds::SHADER_STORAGE | Kinds::SHADER_IMAGE | Kinds::BUFFER_UPDATE;
+        assert_eq!(barrier_within(Pass::OitAllocate), allocation);
         assert_eq!(barrier_within(Pass::Bloom), Kinds::TEXTURE_FETCH | Kinds::SHADER_IMAGE);
         assert_eq!(barrier_within(Pass::Pick), Kinds::SHADER_STORAGE | Kinds::BUFFER_UPDATE);
     }

@@ -1,6 +1,7 @@
 //! AOV (arbitrary output variable) readback: depth, domains, normals or vertex values for every pixel of a frame.
 //! The first readback compiles programs and allocates buffers. Readbacks do not change later frames.
 
+use std::collections::VecDeque;
 use std::rc::Rc;
 use std::time::{Duration, Instant};
 
@@ -11,10 +12,10 @@ use super::readback::{IdTarget, WordPass};
 use super::recorder::PassRecorder;
 use super::uniforms::upload_frame;
 use super::visibility::{IdDraw, draw_ground, draw_ids};
-use crate::device::gl::{self, Buffer, ClearOp, Gl, Program};
+use crate::device::gl::{self, Buffer, ClearOp, Fence, Gl, PassTimer, Program};
 use crate::layout::VALUE_UNIT;
 use crate::pass::{FrameTimes, Pass, RenderStage};
-use crate::region::Region;
+use crate::region::{Band, Region};
 use crate::resources::programs::ProgramCache;
 use crate::resources::scene_buffers::SceneBuffers;
 use crate::resources::target_desc::TargetDesc;
@@ -54,7 +55,7 @@ pub struct AovImage {
     pub times: FrameTimes,
 }
 
-/// Reads AOV fields. Caches the render target of the last readback.
+/// Reads AOV fields. Caches the render target of the last finished readback.
 #[derive(Debug)]
 pub(crate) struct AovReader {
     gl: Rc<Gl>,
@@ -84,26 +85,108 @@ impl Aov {
     }
 }
 
+/// A readback of which some bands are not submitted yet. Owns its render target.
+#[derive(Debug)]
+pub struct PartialAov {
+    field: Aov,
+    params: FrameParams,
+    uniforms: FrameUniforms,
+    /// Draws the ids of cut-outs; none without such triangles.
+    mask: Option<Rc<Program>>,
+    /// Converts ids to the field.
+    program: Rc<Program>,
+    target: AovTarget,
+    /// Bands that are not submitted yet.
+    bands: VecDeque<Band>,
+    is_divided: bool,
+    timers: Vec<PassTimer>,
+    /// Fence after the last submitted band of a divided readback.
+    fence: Option<Fence>,
+}
+
+impl PartialAov {
+    /// Whether all bands are submitted, so that the words can be read.
+    pub fn is_submitted(&self) -> bool {
+        self.bands.is_empty()
+    }
+
+    /// Whether commands of other scenes should be executed between the bands, because the readback is large.
+    pub const fn is_divided(&self) -> bool {
+        self.is_divided
+    }
+
+    /// Waits at most `limit` for the last submitted band. Returns whether it is complete. Submitting the next band only
+    /// then keeps the queue of the device short.
+    pub fn is_ready_within(&self, limit: Duration) -> bool {
+        self.fence.as_ref().is_none_or(|fence| fence.is_done_within(limit))
+    }
+
+    /// Bytes of the words.
+    const fn byte_count(&self) -> u64 {
+        4 * self.target.words_per_pixel * self.target.desc.width as u64 * self.target.desc.height as u64
+    }
+
+    /// Draws the ids of a band, and converts them to the field.
+    fn record(&self, recorder: &mut PassRecorder<'_>, buffers: &SceneBuffers, band: Band) -> Result<()> {
+        let AovTarget { desc, ids: id_target, .. } = &self.target;
+        let ids = IdDraw {
+            framebuffer: &id_target.framebuffer,
+            clear: ClearOp::DepthAndIds(None),
+            region: Region::whole([desc.width, desc.height]),
+            band,
+            triangles: TriangleSet::All,
+            mask: self.mask.as_deref(),
+            opaque_parts: None,
+        };
+        recorder.begin(Pass::Aov);
+        draw_ids(recorder, buffers, &ids)?;
+        if self.field == Aov::Depth {
+            draw_ground(recorder, buffers, &self.params)?;
+        }
+        let word_pass = self.word_pass(buffers, band);
+        id_target.convert(recorder, &word_pass);
+        if self.is_submitted() { id_target.copy(recorder, &word_pass) } else { recorder.check(Pass::Aov) }
+    }
+
+    fn word_pass(&self, buffers: &SceneBuffers, band: Band) -> WordPass<'_> {
+        let scale = match self.field {
+            // Meters per scene unit.
+            Aov::Depth => Some(buffers.scene.unit as f32),
+            Aov::Values { scale_max } => Some(scale_max.recip()),
+            Aov::Domains | Aov::Normals => None,
+        };
+        WordPass {
+            pass: Pass::Aov,
+            program: &self.program,
+            uniform: scale.map(f32::to_bits),
+            size: [self.target.desc.width, self.target.desc.height],
+            band: Some(band),
+            staging: &self.target.staging,
+            bytes: self.byte_count(),
+        }
+    }
+}
+
 impl AovReader {
     pub(crate) fn new(gl: &Rc<Gl>) -> Self {
         Self { gl: Rc::clone(gl), target: None }
     }
 
-    /// Reads a field for the current content of the scene's buffers; waits at most `timeout`.
+    /// Begins to read a field for the current content of the scene's buffers, in bands of at most `max_samples` samples.
     ///
     /// # Errors
-    /// `Invalid` for a camera whose matrices overflow; `Fault` if no values were uploaded, OpenGL reports an error or
-    /// the device does not finish in time.
-    pub(crate) fn render(
+    /// `Invalid` for a camera whose matrices overflow; `Fault` if no values were uploaded or OpenGL reports an error.
+    pub(crate) fn begin(
         &mut self,
         programs: &mut ProgramCache,
         buffers: &SceneBuffers,
         params: &FrameParams,
         field: Aov,
-        timeout: Duration,
-    ) -> Result<AovImage> {
+        max_samples: u64,
+    ) -> Result<PartialAov> {
         let samples = if matches!(field, Aov::Values { .. }) { buffers.scene.look.samples_per_pixel() } else { 1 };
-        let desc = TargetDesc::ids_and_depth(&self.gl, [params.width, params.height], samples);
+        let size = [params.width, params.height];
+        let desc = TargetDesc::ids_and_depth(&self.gl, size, samples);
         let words_per_pixel = if field == Aov::Normals { 3 } else { u64::from(desc.samples) };
         let uniforms = FrameUniforms::new(&buffers.scene, params, buffers.origin)?;
         let mask = buffers.mask_program(desc.samples, &mut |source| programs.program(source))?;
@@ -111,96 +194,67 @@ impl AovReader {
             Aov::Domains => programs.program(shaders::readback::visibility_readback(desc.samples))?,
             _ => buffers.aov_program(field.define(), desc.samples, &mut |source| programs.program(source))?,
         };
-        let gl = Rc::clone(&self.gl);
-        let target = self.ensure_target(desc, words_per_pixel)?;
-        let byte_count = 4 * words_per_pixel * u64::from(desc.width) * u64::from(desc.height);
-        upload_frame(buffers, &uniforms);
-        if let Aov::Values { .. } = field {
-            let values = buffers.values.as_ref().ok_or_else(|| fault("aov", "no values were uploaded"))?;
-            values.view.bind(VALUE_UNIT);
+        if matches!(field, Aov::Values { .. }) && buffers.values.is_none() {
+            return Err(fault("aov", "no values were uploaded"));
         }
-        let mut recorder = PassRecorder { gl: &gl, stats: &mut FrameStats::default() };
-        let readback = Readback { field, mask: mask.as_deref(), program: &program, bytes: byte_count };
-        let timer =
-            gl.time_pass(Pass::Aov.name(), timeout, || readback.record(&mut recorder, buffers, params, target))?;
-        gl.wait(Pass::Aov.name(), timeout)?;
-        let start = Instant::now();
-        let words = target.staging.read(byte_count as usize)?;
-        gl.check(Pass::Aov.name())?;
-        let bytes = if field == Aov::Domains { domain_indices(buffers, words) } else { words };
-        let read_ms = start.elapsed().as_secs_f64() * 1e3;
-        let times = FrameTimes::of_stages(&[(RenderStage::Draw, timer.ms()), (RenderStage::Read, read_ms)]);
-        Ok(AovImage { width: desc.width, height: desc.height, samples: desc.samples, bytes, times })
+        let target = self.take_target(desc, words_per_pixel)?;
+        let bands = VecDeque::from(Band::divide(size, max_samples / u64::from(desc.samples)));
+        let (is_divided, params) = (bands.len() > 1, *params);
+        let (timers, fence) = (Vec::new(), None);
+        Ok(PartialAov { field, params, uniforms, mask, program, target, bands, is_divided, timers, fence })
     }
 
-    /// Returns the cached render target if it fits, else replaces it.
-    fn ensure_target(&mut self, desc: TargetDesc, words_per_pixel: u64) -> Result<&AovTarget> {
+    /// Submits the next band. The scene's buffers must not change until all bands are submitted.
+    ///
+    /// # Errors
+    /// `Fault` if OpenGL reports an error or a software renderer does not finish in time.
+    pub(crate) fn submit_band(&self, aov: &mut PartialAov, buffers: &SceneBuffers, timeout: Duration) -> Result<()> {
+        let Some(band) = aov.bands.pop_front() else { return Ok(()) };
+        upload_frame(buffers, &aov.uniforms);
+        if let (Aov::Values { .. }, Some(values)) = (aov.field, &buffers.values) {
+            values.view.bind(VALUE_UNIT);
+        }
+        let mut recorder = PassRecorder { gl: &self.gl, stats: &mut FrameStats::default() };
+        let timer = self.gl.time_pass(Pass::Aov.name(), timeout, || aov.record(&mut recorder, buffers, band))?;
+        aov.timers.push(timer);
+        if aov.is_divided {
+            aov.fence = Some(self.gl.fence(Pass::Aov.name())?);
+        }
+        Ok(())
+    }
+
+    /// Waits at most `timeout` for the words of a readback whose bands are all submitted, and returns them.
+    ///
+    /// # Errors
+    /// `Fault` if OpenGL reports an error or the device does not finish in time.
+    pub(crate) fn finish(&mut self, aov: PartialAov, buffers: &SceneBuffers, timeout: Duration) -> Result<AovImage> {
+        let byte_count = aov.byte_count();
+        let PartialAov { field, target, timers, .. } = aov;
+        self.gl.wait(Pass::Aov.name(), timeout)?;
+        let start = Instant::now();
+        let words = target.staging.read(byte_count as usize)?;
+        self.gl.check(Pass::Aov.name())?;
+        let bytes = if field == Aov::Domains { domain_indices(buffers, words) } else { words };
+        let read_ms = start.elapsed().as_secs_f64() * 1e3;
+        let draw_ms = timers.iter().map(PassTimer::ms).sum();
+        let times = FrameTimes::of_stages(&[(RenderStage::Draw, draw_ms), (RenderStage::Read, read_ms)]);
+        let TargetDesc { width, height, samples, .. } = target.desc;
+        self.target = Some(target);
+        Ok(AovImage { width, height, samples, bytes, times })
+    }
+
+    /// Takes the cached render target if it fits, else creates one.
+    fn take_target(&mut self, desc: TargetDesc, words_per_pixel: u64) -> Result<AovTarget> {
         let cached_target = self
             .target
             .take()
             .filter(|cached_target| (cached_target.desc, cached_target.words_per_pixel) == (desc, words_per_pixel));
-        let target = match cached_target {
-            Some(cached_target) => cached_target,
-            None => {
-                let bytes = 4 * words_per_pixel * u64::from(desc.width) * u64::from(desc.height);
-                let ids = IdTarget::new(&self.gl, desc, bytes)?;
-                AovTarget { desc, words_per_pixel, ids, staging: self.gl.buffer(bytes, gl::STREAM_READ, None)? }
-            }
-        };
-        Ok(self.target.insert(target))
-    }
-}
-
-/// Programs and parameters of a readback.
-#[derive(Debug)]
-struct Readback<'a> {
-    field: Aov,
-    /// Draws the ids of cut-outs; none without such triangles.
-    mask: Option<&'a Program>,
-    /// Converts ids to the field.
-    program: &'a Program,
-    /// Bytes to copy to the staging buffer.
-    bytes: u64,
-}
-
-impl Readback<'_> {
-    /// Draws the ids, converts them to the field, and copies it to the staging buffer.
-    fn record(
-        &self,
-        recorder: &mut PassRecorder<'_>,
-        buffers: &SceneBuffers,
-        params: &FrameParams,
-        target: &AovTarget,
-    ) -> Result<()> {
-        let size = [target.desc.width, target.desc.height];
-        let ids = IdDraw {
-            framebuffer: &target.ids.framebuffer,
-            clear: ClearOp::DepthAndIds(None),
-            region: Region::whole(size),
-            triangles: TriangleSet::All,
-            mask: self.mask,
-            opaque_parts: None,
-        };
-        recorder.begin(Pass::Aov);
-        draw_ids(recorder, buffers, &ids)?;
-        if self.field == Aov::Depth {
-            draw_ground(recorder, buffers, params)?;
+        if let Some(cached_target) = cached_target {
+            return Ok(cached_target);
         }
-        let scale = match self.field {
-            // Meters per scene unit.
-            Aov::Depth => Some(buffers.scene.unit as f32),
-            Aov::Values { scale_max } => Some(scale_max.recip()),
-            Aov::Domains | Aov::Normals => None,
-        };
-        let word_pass = WordPass {
-            pass: Pass::Aov,
-            program: self.program,
-            uniform: scale.map(f32::to_bits),
-            size,
-            staging: &target.staging,
-            bytes: self.bytes,
-        };
-        target.ids.read(recorder, &word_pass)
+        let bytes = 4 * words_per_pixel * u64::from(desc.width) * u64::from(desc.height);
+        let ids = IdTarget::new(&self.gl, desc, bytes)?;
+        Ok(AovTarget { desc, words_per_pixel, ids, staging: self.gl.buffer(bytes, gl::STREAM_READ, None)? })
     }
 }
 

@@ -35,6 +35,7 @@ use crate::device::gl::{ClearOp, PipelineState, Program};
 use crate::layout::cull::MAX_LEVEL;
 use crate::layout::{DEPTH_UNIT, TRIANGLE_ID_UNIT, pack_size};
 use crate::pass::Pass;
+use crate::region::Band;
 use crate::resources::cull::CullResources;
 use crate::resources::depth_pyramid::DepthPyramid;
 use crate::resources::programs::OcclusionPrograms;
@@ -113,7 +114,8 @@ pub(crate) fn cull_for_camera(recorder: &mut PassRecorder<'_>, frame: &FrameCont
 fn draw_occluders(recorder: &mut PassRecorder<'_>, frame: &FrameContext<'_>, pyramid: &DepthPyramid) {
     let FrameContext { buffers, target, programs, .. } = *frame;
     let clear = ClearOp::Depth(Some(&target.dirty_regions.depth));
-    recorder.gl.begin_pass(&pyramid.occluder_fbo, target.draw_region.get(), clear);
+    let band = Band::whole(target.desc.height);
+    recorder.gl.begin_pass(&pyramid.occluder_fbo, target.draw_region.get(), band, clear);
     let programs_by_mode =
         [(BlendMode::Opaque, buffers.programs.opaque.as_deref()), (BlendMode::Mask, programs.mask.as_deref())];
     let state = PipelineState { depth_write: true, ..PipelineState::default() };
@@ -148,7 +150,7 @@ fn build_pyramid(
 }
 
 /// Records the visible triangles as the occluders of the next frame. Does nothing without occlusion culling.
-pub(super) fn record_visible(recorder: &PassRecorder<'_>, frame: &FrameContext<'_>) -> Result<()> {
+pub(crate) fn record_visible(recorder: &PassRecorder<'_>, frame: &FrameContext<'_>) -> Result<()> {
     let FrameContext { buffers, target, programs, .. } = *frame;
     let occlusion = programs.cull.as_ref().and_then(|programs| programs.occlusion.as_ref());
     let (Some(cull_resources), Some(programs)) = (&buffers.cull_resources, occlusion) else { return Ok(()) };

@@ -19,4 +19,5 @@ pub(crate) mod shadow;
 pub(crate) mod uniforms;
 pub(crate) mod visibility;
 
+pub(crate) use self::oit::OitFrame;
 pub(crate) use self::recorder::{FrameContext, PassRecorder};

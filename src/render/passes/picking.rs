@@ -19,7 +19,7 @@ use super::visibility::{IdDraw, draw_ids};
 use crate::device::gl::{self, Buffer, ClearOp, Fence, Gl};
 use crate::layout::pack_size;
 use crate::pass::Pass;
-use crate::region::Region;
+use crate::region::{Band, Region};
 use crate::resources::programs::ProgramCache;
 use crate::resources::scene_buffers::SceneBuffers;
 use crate::resources::target_desc::TargetDesc;
@@ -125,6 +125,7 @@ impl Picker {
             framebuffer: &target.framebuffer,
             clear: ClearOp::DepthAndIds(None),
             region: Region::whole(size),
+            band: Band::whole(height),
             triangles: TriangleSet::All,
             mask: mask.as_deref(),
             opaque_parts: None,
@@ -136,6 +137,7 @@ impl Picker {
             program: &program,
             uniform: Some(pack_size(size)),
             size,
+            band: None,
             staging: &staging,
             bytes: 4 * (WORDS_PER_PIXEL * width as usize * height as usize) as u64,
         };

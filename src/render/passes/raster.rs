@@ -38,7 +38,7 @@ pub(crate) fn draw(
     let frame_viewport = Viewport::new(&clip_from_positions(scene, params, origin), params.width, params.height)?;
     recorder.begin(passes.stats_pass());
     compute_rasterizer.draw(recorder.gl, shadow_viewport.as_ref(), passes.visibility.then_some(&frame_viewport))?;
-    recorder.stats.passes.push(passes.stats_pass());
+    recorder.add_to_stats(passes.stats_pass());
     recorder.stats.raster_backends.shadow = passes.shadow.then_some(RasterBackend::Cuda);
     recorder.stats.raster_backends.visibility = passes.visibility.then_some(RasterBackend::Cuda);
     Ok(())

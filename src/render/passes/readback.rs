@@ -8,6 +8,7 @@ use super::recorder::{FrameContext, PassRecorder};
 use crate::device::gl::{self, Buffer, BufferCopy, Framebuffer, Gl, Program, Texture};
 use crate::layout::{ID_UNIT, WORDS_BINDING, WORKGROUP_SIZE};
 use crate::pass::Pass;
+use crate::region::Band;
 use crate::resources::target::RenderTarget;
 use crate::resources::target_desc::{TargetDesc, create_image};
 use modalcast_model::error::Result;
@@ -21,7 +22,7 @@ pub(super) struct IdTarget {
 }
 
 /// Parameters of a compute pass that converts ids to 32-bit words, and of the copy of the words.
-#[derive(Debug)]
+#[derive(Debug, Clone, Copy)]
 pub(super) struct WordPass<'a> {
     pub(super) pass: Pass,
     pub(super) program: &'a Program,
@@ -29,6 +30,8 @@ pub(super) struct WordPass<'a> {
     pub(super) uniform: Option<u32>,
     /// Width and height of the id image in pixels; the program runs once per pixel.
     pub(super) size: [u32; 2],
+    /// The rows to convert; none for a program that converts all rows.
+    pub(super) band: Option<Band>,
     pub(super) staging: &'a Buffer,
     /// Bytes to copy to the staging buffer.
     pub(super) bytes: u64,
@@ -46,8 +49,19 @@ impl IdTarget {
 
     /// Converts the ids of this target, and copies the words to the staging buffer.
     pub(super) fn read(&self, recorder: &PassRecorder<'_>, word_pass: &WordPass<'_>) -> Result<()> {
+        self.convert(recorder, word_pass);
+        self.copy(recorder, word_pass)
+    }
+
+    /// Converts the ids of this target to words.
+    pub(super) fn convert(&self, recorder: &PassRecorder<'_>, word_pass: &WordPass<'_>) {
         self.ids.bind(ID_UNIT);
-        convert_ids(recorder, &self.readback_source, word_pass)
+        convert_ids(recorder, &self.readback_source, word_pass);
+    }
+
+    /// Copies the words to the staging buffer.
+    pub(super) fn copy(&self, recorder: &PassRecorder<'_>, word_pass: &WordPass<'_>) -> Result<()> {
+        copy_words(recorder, &self.readback_source, word_pass)
     }
 }
 
@@ -62,8 +76,10 @@ pub(crate) fn read_visibility(
     bind_visibility(target);
     let size = [target.desc.width, target.desc.height];
     let bytes = target.desc.frame_bytes();
-    let word_pass = WordPass { pass: Pass::VisibilityReadback, program, uniform: None, size, staging, bytes };
-    convert_ids(recorder, &target.readback_source, &word_pass)
+    let band = Some(Band::whole(target.desc.height));
+    let word_pass = WordPass { pass: Pass::VisibilityReadback, program, uniform: None, size, band, staging, bytes };
+    convert_ids(recorder, &target.readback_source, &word_pass);
+    copy_words(recorder, &target.readback_source, &word_pass)
 }
 
 /// Copies the pixels of a frame, then its fragment and culling counters, to a staging buffer.
@@ -84,11 +100,19 @@ pub(crate) fn copy_frame(recorder: &PassRecorder<'_>, frame: &FrameContext<'_>, 
     recorder.check(Pass::Read)
 }
 
-/// Converts the bound ids, and copies the words to the staging buffer.
-fn convert_ids(recorder: &PassRecorder<'_>, readback_source: &Buffer, word_pass: &WordPass<'_>) -> Result<()> {
+/// Converts the bound ids to words.
+fn convert_ids(recorder: &PassRecorder<'_>, readback_source: &Buffer, word_pass: &WordPass<'_>) {
     word_pass.program.bind(word_pass.uniform);
+    if let Some(band) = word_pass.band {
+        word_pass.program.set_first_row(band.first_row);
+    }
     readback_source.bind_storage(WORDS_BINDING);
-    recorder.gl.dispatch(word_pass.size[0].div_ceil(WORKGROUP_SIZE), word_pass.size[1]);
+    let rows = word_pass.band.map_or(word_pass.size[1], |band| band.rows);
+    recorder.gl.dispatch(word_pass.size[0].div_ceil(WORKGROUP_SIZE), rows);
+}
+
+/// Copies the words to the staging buffer.
+fn copy_words(recorder: &PassRecorder<'_>, readback_source: &Buffer, word_pass: &WordPass<'_>) -> Result<()> {
     recorder.barrier_within_pass(word_pass.pass);
     recorder.gl.copy(BufferCopy::first(word_pass.bytes, readback_source, word_pass.staging));
     recorder.check(word_pass.pass)

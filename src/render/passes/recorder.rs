@@ -43,8 +43,15 @@ impl PassRecorder<'_> {
     /// # Errors
     /// `Fault` of the pass if OpenGL reported an error.
     pub(super) fn finish(&mut self, pass: Pass) -> Result<()> {
-        self.stats.passes.push(pass);
+        self.add_to_stats(pass);
         self.check(pass)
+    }
+
+    /// Adds a pass to the statistics as executed. A pass that is recorded band by band is added once.
+    pub(super) fn add_to_stats(&mut self, pass: Pass) {
+        if !self.stats.passes.contains(&pass) {
+            self.stats.passes.push(pass);
+        }
     }
 
     /// Fails if OpenGL reported an error in a pass.

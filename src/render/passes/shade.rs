@@ -4,14 +4,15 @@ use super::draw::{bind_shadow, bind_visibility};
 use super::recorder::{FrameContext, PassRecorder};
 use crate::layout::{BLEND_LAYER_UNIT, EMPTY_TILE_LIST, FRAGMENT_COUNT_UNIT, TILE, TILES_BINDING};
 use crate::pass::Pass;
+use crate::region::Band;
 use modalcast_model::error::Result;
 
 /// Image units of the outputs.
 const COLOR_IMAGE: u32 = 0;
 const BLOOM_IMAGE: u32 = 1;
 
-/// Shades tiles in which no triangle is visible and lists the other tiles; then shades the listed tiles.
-pub(crate) fn draw(recorder: &mut PassRecorder<'_>, frame: &FrameContext<'_>) -> Result<()> {
+/// Shades a band: shades tiles in which no triangle is visible and lists the other tiles; then shades the listed tiles.
+pub(crate) fn draw(recorder: &mut PassRecorder<'_>, frame: &FrameContext<'_>, band: Band) -> Result<()> {
     let FrameContext { buffers, target, programs, .. } = *frame;
     recorder.begin(Pass::Background);
     bind_shadow(buffers);
@@ -30,7 +31,8 @@ pub(crate) fn draw(recorder: &mut PassRecorder<'_>, frame: &FrameContext<'_>) ->
     target.tile_list.write(bytemuck::cast_slice(&EMPTY_TILE_LIST));
     target.tile_list.bind_storage(TILES_BINDING);
     programs.background.bind(None);
-    recorder.gl.dispatch(target.desc.width.div_ceil(TILE), target.desc.height.div_ceil(TILE));
+    programs.background.set_first_row(band.first_row);
+    recorder.gl.dispatch(target.desc.width.div_ceil(TILE), band.rows.div_ceil(TILE));
     recorder.finish(Pass::Background)?;
     let Some(program) = &programs.shade else { return Ok(()) };
     recorder.begin(Pass::Shade);

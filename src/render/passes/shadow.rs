@@ -6,7 +6,7 @@ use super::recorder::PassRecorder;
 use crate::device::gl::{ClearOp, PipelineState, Program, Texture};
 use crate::layout::{SOURCE_UNIT, WORDS_BINDING, WORKGROUP_SIZE};
 use crate::pass::Pass;
-use crate::region::Region;
+use crate::region::{Band, Region};
 use crate::resources::compute_rasterizer::ComputeRasterizer;
 use crate::resources::scene_buffers::SceneBuffers;
 use crate::resources::shadow_map::ShadowMap;
@@ -26,7 +26,7 @@ pub(crate) fn draw_depth(recorder: &mut PassRecorder<'_>, buffers: &SceneBuffers
     for (layer, framebuffer) in (0..).zip(&map.framebuffers) {
         cull_shadow_casters(recorder, buffers, size, |program| set_layer(program, map, layer))?;
         recorder.begin(Pass::Shadow);
-        recorder.gl.begin_pass(framebuffer, Region::whole([size; 2]), ClearOp::Depth(None));
+        recorder.gl.begin_pass(framebuffer, Region::whole([size; 2]), Band::whole(size), ClearOp::Depth(None));
         recorder.gl.set_pipeline_state(PipelineState { depth_write: true, ..PipelineState::default() });
         for (blend_mode, program) in
             [BlendMode::Opaque, BlendMode::Mask, BlendMode::Blend].into_iter().zip(&buffers.programs.shadow)
@@ -38,7 +38,7 @@ pub(crate) fn draw_depth(recorder: &mut PassRecorder<'_>, buffers: &SceneBuffers
         }
     }
     if buffers.cull_resources.is_some() {
-        recorder.stats.passes.push(Pass::ShadowCull);
+        recorder.add_to_stats(Pass::ShadowCull);
     }
     recorder.finish(Pass::Shadow)
 }

@@ -3,6 +3,7 @@
 
 use super::draw::bind_scene;
 use super::recorder::PassRecorder;
+use crate::layout::TRIANGLE_ID_UNIT;
 use crate::layout::cull::CULL_COUNTER_BYTES;
 use crate::pass::Pass;
 use crate::resources::scene_buffers::SceneBuffers;
@@ -20,6 +21,14 @@ pub(crate) fn upload(recorder: &PassRecorder<'_>, buffers: &SceneBuffers, params
     if let Some(cascades) = &buffers.uniforms.cascades {
         let box_params = light_box_params(&buffers.scene, params, buffers.origin);
         cascades.write(bytemuck::bytes_of(&ShadowCascades::new(&buffers.scene, params, &box_params, buffers.origin)));
+    }
+}
+
+/// Binds the uniforms, buffers and textures of a scene for a further step of a frame, whose uniforms are written.
+pub(crate) fn bind(buffers: &SceneBuffers) {
+    bind_scene(buffers);
+    if let Some(cull_resources) = &buffers.cull_resources {
+        cull_resources.triangle_ids.bind(TRIANGLE_ID_UNIT);
     }
 }
 

@@ -4,7 +4,7 @@ use super::draw::{TriangleDraw, TriangleSet, draw_groups, triangle_set};
 use super::recorder::{FrameContext, PassRecorder};
 use crate::device::gl::{ClearOp, Framebuffer, PipelineState, Program};
 use crate::pass::Pass;
-use crate::region::Region;
+use crate::region::{Band, Region};
 use crate::resources::scene_buffers::SceneBuffers;
 use crate::scene_data::geometry::BlendMode;
 use crate::types::{FrameParams, RasterBackend};
@@ -17,6 +17,8 @@ pub(super) struct IdDraw<'a> {
     pub(super) framebuffer: &'a Framebuffer,
     pub(super) clear: ClearOp<'a>,
     pub(super) region: Region,
+    /// The rows of the frame that are drawn and cleared.
+    pub(super) band: Band,
     pub(super) triangles: TriangleSet,
     /// Draws cut-outs; none without such triangles.
     pub(super) mask: Option<&'a Program>,
@@ -24,9 +26,9 @@ pub(super) struct IdDraw<'a> {
     pub(super) opaque_parts: Option<&'a Program>,
 }
 
-/// Draws the id and depth of each sample. `draws_ground`: whether the ground must be rasterized.
-pub(crate) fn draw(recorder: &mut PassRecorder<'_>, frame: &FrameContext<'_>, draws_ground: bool) -> Result<()> {
-    let FrameContext { buffers, target, programs, params } = *frame;
+/// Draws the id and depth of each sample in a band, without the ground.
+pub(crate) fn draw(recorder: &mut PassRecorder<'_>, frame: &FrameContext<'_>, band: Band) -> Result<()> {
+    let FrameContext { buffers, target, programs, .. } = *frame;
     // Multisampled ids are not cleared, which saves time: shaders also read the depth, which tells which ids are valid.
     let clear = match target.desc.samples {
         1 => ClearOp::DepthAndIds(Some(&target.dirty_regions)),
@@ -37,18 +39,24 @@ pub(crate) fn draw(recorder: &mut PassRecorder<'_>, frame: &FrameContext<'_>, dr
         framebuffer: &target.visibility_fbo,
         clear,
         region: target.draw_region.get(),
+        band,
         triangles: triangle_set(buffers),
         mask: programs.mask.as_deref(),
         opaque_parts: programs.opaque_parts.as_deref(),
     };
-    draw_ids(recorder, buffers, &ids)?;
-    super::cull::record_visible(recorder, frame)?;
-    if draws_ground { draw_ground(recorder, buffers, params) } else { Ok(()) }
+    draw_ids(recorder, buffers, &ids)
+}
+
+/// Draws the ground into the ids and the depth of a band.
+pub(crate) fn draw_ground_band(recorder: &mut PassRecorder<'_>, frame: &FrameContext<'_>, band: Band) -> Result<()> {
+    let FrameContext { buffers, target, params, .. } = *frame;
+    recorder.gl.begin_pass(&target.visibility_fbo, target.draw_region.get(), band, ClearOp::Load);
+    draw_ground(recorder, buffers, params)
 }
 
 /// Draws ids and depth of the triangles of each blend mode that has a program.
 pub(super) fn draw_ids(recorder: &mut PassRecorder<'_>, buffers: &SceneBuffers, ids: &IdDraw<'_>) -> Result<()> {
-    recorder.gl.begin_pass(ids.framebuffer, ids.region, ids.clear);
+    recorder.gl.begin_pass(ids.framebuffer, ids.region, ids.band, ids.clear);
     // Cut-outs are drawn after opaque triangles, so that the depth test can save their texture lookups.
     let programs = [
         (BlendMode::Opaque, buffers.programs.opaque.as_deref()),
@@ -64,13 +72,13 @@ pub(super) fn draw_ids(recorder: &mut PassRecorder<'_>, buffers: &SceneBuffers, 
         }
     }
     if has_program {
-        recorder.stats.passes.push(Pass::Visibility);
+        recorder.add_to_stats(Pass::Visibility);
         recorder.stats.raster_backends.visibility = Some(RasterBackend::OpenGl);
     }
     recorder.check(Pass::Visibility)
 }
 
-/// Draws the ground into the ids and the depth of the bound framebuffer. A frame calls this only if a vertex may be
+/// Draws the ground into the ids and the depth of the bound framebuffer, in the scissor that `begin_pass` has set. A frame calls this only if a vertex may be
 /// below the ground; otherwise the shading adds the ground.
 pub(super) fn draw_ground(recorder: &mut PassRecorder<'_>, buffers: &SceneBuffers, params: &FrameParams) -> Result<()> {
     let Some(program) = buffers.programs.ground.as_ref().filter(|_| camera_is_above_ground(&buffers.scene, params))

@@ -2,8 +2,11 @@
 
 mod autotune;
 mod frame;
+mod partial_frame;
 mod pending_frame;
 
+#[cfg(test)]
+mod band_tests;
 #[cfg(test)]
 mod cull_tests;
 #[cfg(test)]
@@ -15,9 +18,10 @@ use std::rc::Rc;
 use std::sync::Arc;
 use std::time::Duration;
 
+pub use self::partial_frame::PartialFrame;
 pub use self::pending_frame::{MappedPixels, PendingFrame};
 use crate::device::{self, gl, gl::Gl};
-use crate::passes::aov::{Aov, AovImage, AovReader};
+use crate::passes::aov::{Aov, AovImage, AovReader, PartialAov};
 use crate::passes::picking::{PendingPick, PickHit, Picker};
 use crate::passes::{PassRecorder, readback};
 use crate::resources::programs::ProgramCache;
@@ -38,6 +42,11 @@ const MAX_SIDE: u32 = 8192;
 const MAX_TARGETS: usize = 4;
 /// Maximum time that dropping a renderer waits for each thread that still copies pixels.
 const READER_TIMEOUT: Duration = Duration::from_secs(1);
+/// Maximum number of samples (pixels times samples per pixel) that hardware draws without a break: a frame of 3840 x 2160
+/// pixels with four samples each.
+const MAX_BAND_SAMPLES: u64 = 1 << 25;
+/// The same for a software renderer: a frame of 1920 x 1080 pixels with four samples each.
+const MAX_SOFTWARE_BAND_SAMPLES: u64 = 1 << 23;
 /// Time limit for one frame.
 const FRAME_TIMEOUT: Duration = Duration::from_secs(60);
 
@@ -57,6 +66,7 @@ pub struct Renderer {
     /// The last frame that was submitted without an error.
     last_frame: Option<LastFrame>,
     frame_timeout: Duration,
+    max_band_samples: u64,
     picker: Picker,
     aov_reader: AovReader,
     /// The pass in which a test makes every frame panic.
@@ -98,6 +108,7 @@ impl Renderer {
             stats: FrameStats::default(),
             last_frame: None,
             frame_timeout: FRAME_TIMEOUT,
+            max_band_samples: if gl.limits.software { MAX_SOFTWARE_BAND_SAMPLES } else { MAX_BAND_SAMPLES },
             picker: Picker::new(&gl),
             aov_reader: AovReader::new(&gl),
             #[cfg(test)]
@@ -119,6 +130,24 @@ impl Renderer {
     /// Selects the implementation of the shadow blur for all scenes that are loaded after this call.
     pub fn set_blur_method(&mut self, method: BlurMethod) {
         self.blur_method = method;
+    }
+
+    /// Sets the maximum number of samples (pixels times samples per pixel) that are drawn without a break. Larger frames
+    /// and AOVs are divided into bands of rows. The pixels do not depend on the bands. The default depends only on
+    /// whether the renderer is a software renderer.
+    pub fn set_max_band_samples(&mut self, max_band_samples: u64) {
+        self.max_band_samples = max_band_samples;
+    }
+
+    /// The maximum number of samples that are drawn without a break.
+    pub(crate) const fn max_band_samples(&self) -> u64 {
+        self.max_band_samples
+    }
+
+    /// Whether an output of this size is divided into bands, if the device supports this number of samples per pixel.
+    pub fn is_divided(&self, [width, height]: [u32; 2], samples: u32) -> bool {
+        let samples = TargetDesc::ids_and_depth(&self.gl, [width, height], samples).samples;
+        u64::from(samples) * u64::from(width) * u64::from(height) > self.max_band_samples
     }
 
     /// Uploads the static data of a scene and allocates the buffers of the deformed data.
@@ -246,9 +275,40 @@ impl Renderer {
     /// `Invalid` for a size above the limit or a camera whose matrices overflow; `Fault` if no values were uploaded,
     /// OpenGL reports an error or the device does not finish in time.
     pub fn render_aov(&mut self, buffers: &SceneBuffers, params: &FrameParams, field: Aov) -> Result<AovImage> {
+        let mut partial_aov = self.begin_aov(buffers, params, field)?;
+        while !partial_aov.is_submitted() {
+            self.submit_aov_band(buffers, &mut partial_aov)?;
+        }
+        self.finish_aov(buffers, partial_aov)
+    }
+
+    /// Begins to read an AOV field in bands. The scene's buffers must not change until it is finished.
+    ///
+    /// # Errors
+    /// `Invalid` for a size above the limit or a camera whose matrices overflow; `Fault` if no values were uploaded or
+    /// OpenGL reports an error.
+    pub fn begin_aov(&mut self, buffers: &SceneBuffers, params: &FrameParams, field: Aov) -> Result<PartialAov> {
         let _current = self.gl.make_current()?;
         self.check_size(params)?;
-        self.aov_reader.render(&mut self.programs, buffers, params, field, self.frame_timeout)
+        self.aov_reader.begin(&mut self.programs, buffers, params, field, self.max_band_samples)
+    }
+
+    /// Submits the next band of an AOV field.
+    ///
+    /// # Errors
+    /// `Fault` if OpenGL reports an error or a software renderer does not finish in time.
+    pub fn submit_aov_band(&mut self, buffers: &SceneBuffers, partial_aov: &mut PartialAov) -> Result<()> {
+        let _current = self.gl.make_current()?;
+        self.aov_reader.submit_band(partial_aov, buffers, self.frame_timeout)
+    }
+
+    /// Waits for an AOV field whose bands are all submitted.
+    ///
+    /// # Errors
+    /// `Fault` if OpenGL reports an error or the device does not finish in time.
+    pub fn finish_aov(&mut self, buffers: &SceneBuffers, partial_aov: PartialAov) -> Result<AovImage> {
+        let _current = self.gl.make_current()?;
+        self.aov_reader.finish(partial_aov, buffers, self.frame_timeout)
     }
 
     /// Reads the id of the first sample of each pixel of the last frame, top row first. The last frame is the last one

@@ -80,6 +80,11 @@ impl PendingFrame {
 }
 
 impl MappedPixels {
+    /// Times of the passes, without the copy of the pixels.
+    pub const fn times(&self) -> &FrameTimes {
+        &self.times
+    }
+
     /// Adds the time of the vertex upload that preceded the frame, in milliseconds.
     #[must_use]
     pub fn with_upload_time(mut self, ms: f64) -> Self {

@@ -1,5 +1,6 @@
 //! Device resources of one scene: buffers, texture arrays, shadow map and programs, as listed in its plan.
 
+use std::cell::Cell;
 use std::rc::Rc;
 use std::sync::Arc;
 
@@ -70,6 +71,8 @@ pub struct SceneBuffers {
     pub(crate) rebased: Option<RebasedPositions>,
     /// A scalar per vertex for AOV readbacks; allocated by the first upload.
     pub(crate) values: Option<VertexValues>,
+    /// Bit mask of the numbers of samples per pixel (1, 4) of the frames that were drawn.
+    drawn_samples: Cell<u32>,
     plan: RenderPlan,
     /// Names and sizes of the plan's buffers as they were allocated, sorted by name.
     plan_allocations: Vec<Allocation>,
@@ -176,6 +179,7 @@ impl SceneBuffers {
             origin: [0.0; 3],
             rebased: None,
             values: None,
+            drawn_samples: Cell::new(0),
             plan,
             plan_allocations,
         })
@@ -210,6 +214,15 @@ impl SceneBuffers {
         compile: &mut ProgramCompiler<'_>,
     ) -> Result<Rc<Program>> {
         compile(self.options.aov(field, samples))
+    }
+
+    /// Whether a frame with this number of samples per pixel was drawn, so that the driver has compiled its programs.
+    pub(crate) fn is_drawn_with(&self, samples: u32) -> bool {
+        self.drawn_samples.get() & samples != 0
+    }
+
+    pub(crate) fn mark_drawn_with(&self, samples: u32) {
+        self.drawn_samples.set(self.drawn_samples.get() | samples);
     }
 
     /// First triangle and number of triangles with this blend mode; they are contiguous.

@@ -33,6 +33,8 @@ const BARYCENTRICS: &str = include_str!("../../../shaders/shared/barycentrics.gl
 const TRIANGLE_FETCH: &str = include_str!("../../../shaders/shared/triangle_fetch.glsl");
 const TRIANGLE_SHADING: &str = include_str!("../../../shaders/shared/triangle_shading.glsl");
 const TILE_LIST: &str = include_str!("../../../shaders/shared/tile_list.glsl");
+const TILE_APPEND: &str = include_str!("../../../shaders/shared/tile_append.glsl");
+pub(crate) const BAND: &str = include_str!("../../../shaders/shared/band.glsl");
 
 /// First line of every shader.
 pub(crate) const VERSION: &str = "#version 430 core\n";
@@ -170,6 +172,7 @@ impl ShaderOptions {
     /// Shades tiles in which no triangle is visible.
     pub(crate) fn background(&self, samples: u32) -> ProgramSource {
         let mut text = self.shading_head(samples, &["BACKGROUND"]);
+        text += &[BAND, TILE_APPEND].concat();
         text += include_str!("../../../shaders/shade.comp");
         ProgramSource::compute(format!("background, {samples} samples"), text)
     }

@@ -1,8 +1,8 @@
 //! Shader sources of exact transparency: gather, histogram, allocate and resolve.
 
 use super::{
-    CLIP, FRAGMENT_ALPHA, FRAME, OIT_LISTS, ProgramSource, ShaderOptions, TRIANGLE_ID, UvDerivatives, VERSION,
-    tile_list, vertex_and_fragment,
+    BAND, CLIP, FRAGMENT_ALPHA, FRAME, OIT_LISTS, ProgramSource, ShaderOptions, TILE_APPEND, TRIANGLE_ID,
+    UvDerivatives, VERSION, tile_list, vertex_and_fragment,
 };
 use crate::layout::oit::{BINS, HISTOGRAM_TILE};
 use crate::scene_data::geometry::BlendMode;
@@ -49,7 +49,7 @@ pub(crate) fn histogram() -> ProgramSource {
 
 /// Allocates the list of each pixel.
 pub(crate) fn allocate() -> ProgramSource {
-    let head = [VERSION, &tile_list(), &bins_define()].concat();
+    let head = [VERSION, BAND, &tile_list(), TILE_APPEND, &bins_define()].concat();
     let text = [&head, OIT_LISTS, include_str!("../../../shaders/oit_allocate.comp")].concat();
     ProgramSource::compute("oit allocate", text)
 }

@@ -3,7 +3,7 @@
 
 use std::fmt::Write as _;
 
-use super::{ProgramSource, VERSION};
+use super::{BAND, ProgramSource, VERSION};
 use crate::layout::{TILE, WORKGROUP_SIZE};
 use modalcast_model::scene::{Antialiasing, Bloom, RenderSettings, ToneMapping};
 
@@ -38,13 +38,13 @@ fn tone_curve(look: &RenderSettings) -> String {
 
 /// Computes the next level of the bloom pyramid.
 pub(crate) fn bloom_downsample() -> ProgramSource {
-    let head = format!("{VERSION}#define TILE {TILE}\n");
+    let head = format!("{VERSION}#define TILE {TILE}\n{BAND}");
     ProgramSource::compute("bloom downsample", head + include_str!("../../../shaders/bloom_downsample.comp"))
 }
 
 /// Adds a level of the bloom pyramid to the next finer one, or, as the composite program, to the scene color.
 pub(crate) fn bloom_upsample(look: &RenderSettings, bloom: Bloom, is_composite: bool) -> ProgramSource {
-    let mut text = format!("{VERSION}#define TILE {TILE}\n");
+    let mut text = format!("{VERSION}#define TILE {TILE}\n{BAND}");
     if is_composite {
         write!(text, "#define COMPOSITE\n#define BLOOM_STRENGTH {:?}\n", bloom.strength).ok();
         text += &tone_curve(look);
@@ -56,7 +56,7 @@ pub(crate) fn bloom_upsample(look: &RenderSettings, bloom: Bloom, is_composite: 
 /// Encodes the scene color to sRGB bytes.
 pub(crate) fn encode(look: &RenderSettings) -> ProgramSource {
     let mut text = format!(
-        "{VERSION}#define WORKGROUP_SIZE {WORKGROUP_SIZE}\nlayout(binding = 0) uniform sampler2D scene_color;\n"
+        "{VERSION}#define WORKGROUP_SIZE {WORKGROUP_SIZE}\n{BAND}layout(binding = 0) uniform sampler2D scene_color;\n"
     );
     if look.dither {
         text += "#define DITHER\n";

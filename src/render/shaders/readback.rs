@@ -1,7 +1,8 @@
 //! Shader sources of readbacks on request: picks, AOVs and visibility ids.
 
 use super::{
-    BARYCENTRICS, CLIP, FRAME, GROUND_PLANE, ProgramSource, ShaderOptions, TRIANGLE_FETCH, VERSION, VISIBILITY_IDS,
+    BAND, BARYCENTRICS, CLIP, FRAME, GROUND_PLANE, ProgramSource, ShaderOptions, TRIANGLE_FETCH, VERSION,
+    VISIBILITY_IDS,
 };
 use crate::layout::WORKGROUP_SIZE;
 
@@ -15,7 +16,7 @@ impl ShaderOptions {
         text += if has_ground { "#define HAS_GROUND\n" } else { "" };
         text += &self.sample_defines(samples);
         let body = include_str!("../../../shaders/aov.comp");
-        text += &[FRAME, CLIP, VISIBILITY_IDS, GROUND_PLANE, BARYCENTRICS, TRIANGLE_FETCH, body].concat();
+        text += &[BAND, FRAME, CLIP, VISIBILITY_IDS, GROUND_PLANE, BARYCENTRICS, TRIANGLE_FETCH, body].concat();
         ProgramSource::compute(format!("aov {field}, {samples} samples"), text)
     }
 }
@@ -30,6 +31,6 @@ pub(crate) fn pick() -> ProgramSource {
 /// Packs the ids of each pixel's first sample.
 pub(crate) fn visibility_readback(samples: u32) -> ProgramSource {
     let head = format!("{VERSION}#define WORKGROUP_SIZE {WORKGROUP_SIZE}\n#define SAMPLES {samples}\n");
-    let body = [&head, VISIBILITY_IDS, include_str!("../../../shaders/visibility_readback.comp")].concat();
+    let body = [&head, BAND, VISIBILITY_IDS, include_str!("../../../shaders/visibility_readback.comp")].concat();
     ProgramSource::compute(format!("visibility readback, {samples} samples"), body)
 }

@@ -3,7 +3,7 @@
 use glow::HasContext as _;
 
 use super::{Framebuffer, Gl};
-use crate::region::{DirtyRegion, Region};
+use crate::region::{Band, DirtyRegion, Region};
 
 /// Dirty regions of an id image and its depth image.
 #[derive(Debug, Default)]
@@ -39,8 +39,9 @@ enum ClearValue {
 }
 
 impl Gl {
-    /// Binds a framebuffer, clears it as `clear` states and sets the scissor, so that later draws affect only `region`.
-    pub(crate) fn begin_pass(&self, framebuffer: &Framebuffer, region: Region, clear: ClearOp<'_>) {
+    /// Binds a framebuffer, clears the band of it as `clear` states and sets the scissor, so that later draws affect only
+    /// the part of `region` in the band.
+    pub(crate) fn begin_pass(&self, framebuffer: &Framebuffer, region: Region, band: Band, clear: ClearOp<'_>) {
         let Some(gl) = self.functions_or_skip() else { return };
         let [width, height] = region.frame_size().map(|side| side as i32);
         // SAFETY: sets state with a complete framebuffer.
@@ -51,22 +52,22 @@ impl Gl {
             gl.depth_mask(true);
         }
         match clear {
-            ClearOp::Depth(dirty) => self.clear_region(region, dirty, ClearValue::FarDepth),
+            ClearOp::Depth(dirty) => self.clear_region(region, band, dirty, ClearValue::FarDepth),
             ClearOp::DepthAndIds(dirty) => {
-                self.clear_region(region, dirty.map(|regions| &regions.depth), ClearValue::FarDepth);
-                self.clear_region(region, dirty.map(|regions| &regions.ids), ClearValue::Zero);
+                self.clear_region(region, band, dirty.map(|regions| &regions.depth), ClearValue::FarDepth);
+                self.clear_region(region, band, dirty.map(|regions| &regions.ids), ClearValue::Zero);
             }
-            ClearOp::Uint(dirty) => self.clear_region(region, Some(dirty), ClearValue::Zero),
-            ClearOp::Color(color, dirty) => self.clear_region(region, Some(dirty), ClearValue::Color(color)),
+            ClearOp::Uint(dirty) => self.clear_region(region, band, Some(dirty), ClearValue::Zero),
+            ClearOp::Color(color, dirty) => self.clear_region(region, band, Some(dirty), ClearValue::Color(color)),
             ClearOp::Load => {}
         }
-        self.set_scissor(region);
+        self.set_scissor(region.within(band));
     }
 
-    /// Clears the dirty region of an attachment and marks `region` as dirty.
-    fn clear_region(&self, region: Region, dirty: Option<&DirtyRegion>, value: ClearValue) {
-        let previous_region = dirty.and_then(|dirty| dirty.replace(region));
-        self.set_scissor(previous_region.unwrap_or_else(|| Region::whole(region.frame_size())));
+    /// Clears the dirty region of an attachment in a band. `region` becomes the dirty region with the last band.
+    fn clear_region(&self, region: Region, band: Band, dirty: Option<&DirtyRegion>, value: ClearValue) {
+        let previous_region = dirty.and_then(|dirty| dirty.replace(region, band));
+        self.set_scissor(previous_region.unwrap_or_else(|| Region::whole(region.frame_size())).within(band));
         let Some(gl) = self.functions_or_skip() else { return };
         // SAFETY: a clear of a complete framebuffer.
         unsafe {

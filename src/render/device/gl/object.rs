@@ -327,6 +327,12 @@ impl Program {
         self.set_uniform(1, layer as i32);
     }
 
+    /// Sets the first row of the band of an image that the next dispatch processes (location 2). This must be the bound
+    /// program.
+    pub(crate) fn set_first_row(&self, first_row: u32) {
+        self.set_uniform(2, first_row as i32);
+    }
+
     fn set_uniform(&self, location: u32, value: i32) {
         let Some(gl) = self.gl.functions_or_skip() else { return };
         // SAFETY: OpenGL reports an error unless a bound program declares an integer at the location.

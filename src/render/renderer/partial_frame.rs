@@ -1,0 +1,383 @@
+//! Frames that are submitted in steps. Between two steps, the device can execute commands of other scenes.
+//!
+//! A frame of at most [`Renderer::max_band_samples`] samples has one step for each pass, and is meant to be submitted
+//! without a break, unless it is the first one of its scene: drivers finish the compilation of a program when it is used
+//! for the first time. A larger frame is divided into bands of rows. Its steps are the passes that work on the complete
+//! frame, and each band of the other passes. A pass ends with its last band before the next pass begins, so the inputs of
+//! a pass are complete, and the pixels do not depend on the bands.
+//!
+//! The target of the frame is not in the cache until the frame is submitted, so other frames cannot use it. The buffers
+//! of the scene must not change until then.
+
+use std::cell::Cell;
+use std::collections::VecDeque;
+use std::time::Duration;
+
+use super::pending_frame::PendingFrame;
+use super::{LastFrame, MAX_TARGETS, Renderer};
+use crate::device::gl::{Fence, PassTimer};
+use crate::device::readback_ring::ReadbackSlot;
+use crate::pass::Pass;
+use crate::passes::post::BloomStep;
+use crate::passes::{self, FrameContext, OitFrame, PassRecorder};
+use crate::region::{Band, Region};
+use crate::resources::compute_rasterizer::RasterPasses;
+use crate::resources::oit::blend_storage;
+use crate::resources::programs::SampleCountPrograms;
+use crate::resources::scene_buffers::SceneBuffers;
+use crate::resources::target::RenderTarget;
+use crate::resources::target_desc::TargetDesc;
+use crate::types::{FrameParams, FrameStats};
+use crate::uniforms::frame::{FrameUniforms, camera_is_above_ground, clip_from_positions, ground_is_behind_scene};
+use modalcast_model::error::{Error, Result, fault};
+
+/// A frame of which some steps are not submitted yet. Dropping it abandons the frame and frees its target.
+#[derive(Debug)]
+pub struct PartialFrame {
+    params: FrameParams,
+    uniforms: FrameUniforms,
+    target: RenderTarget,
+    programs: SampleCountPrograms,
+    /// The slot of the staging buffer; none for a frame whose pixels are not read back.
+    slot: Option<ReadbackSlot>,
+    stats: FrameStats,
+    /// Submitted passes in execution order. A pass in bands has one entry for each band.
+    timers: Vec<(Pass, PassTimer)>,
+    /// Steps that are not submitted yet.
+    steps: VecDeque<Step>,
+    is_divided: bool,
+    has_breaks: bool,
+    is_begun: bool,
+    /// Fence after the last submitted step of a frame with breaks.
+    fence: Option<Fence>,
+}
+
+/// Commands that are submitted without a break.
+#[derive(Debug)]
+enum Step {
+    /// The passes of the compute rasterizer, if there is one.
+    ComputeRaster,
+    /// Shadow map and its blur, unless the map of an earlier frame is valid.
+    Shadow,
+    /// Culling for the camera, if OpenGL draws the visibility.
+    Cull,
+    /// Passes that are timed together under one name.
+    Passes(Pass, Vec<BandPass>),
+}
+
+/// A pass, or a part of it.
+#[derive(Debug, Clone, Copy)]
+enum BandPass {
+    Visibility(Band),
+    RecordVisible,
+    Ground(Band),
+    Blended(Band),
+    OitCount(Band),
+    OitSumCounts,
+    OitBlend(Band),
+    Shade(Band),
+    Bloom(BloomStep, Band),
+    Encode(Band),
+    Read,
+}
+
+impl PartialFrame {
+    /// Whether all steps are submitted.
+    pub fn is_submitted(&self) -> bool {
+        self.steps.is_empty()
+    }
+
+    /// Whether the frame is large and therefore divided into bands.
+    pub const fn is_divided(&self) -> bool {
+        self.is_divided
+    }
+
+    /// Whether commands of other scenes should be executed between the steps, because the frame is large or the first one
+    /// of its scene.
+    pub const fn has_breaks(&self) -> bool {
+        self.has_breaks
+    }
+
+    /// Waits at most `limit` for the last submitted step of a frame with breaks. Returns whether it is complete. Submitting
+    /// the next step only then keeps the queue of the device short.
+    pub fn is_ready_within(&self, limit: Duration) -> bool {
+        self.fence.as_ref().is_none_or(|fence| fence.is_done_within(limit))
+    }
+}
+
+#[cfg(test)]
+impl PartialFrame {
+    pub(super) fn remaining_step_count(&self) -> usize {
+        self.steps.len()
+    }
+
+    pub(super) fn remove_step(&mut self, index: usize) {
+        self.steps.remove(index);
+    }
+}
+
+impl Renderer {
+    /// Begins a frame of the current buffers. `has_readback`: whether its pixels are read back.
+    ///
+    /// # Errors
+    /// `Busy` if too many frames are in flight; `Invalid` for a size above the limit or a camera whose matrices
+    /// overflow; `Fault` if OpenGL reports an error.
+    pub fn begin_frame(
+        &mut self,
+        buffers: &SceneBuffers,
+        params: &FrameParams,
+        has_readback: bool,
+    ) -> Result<PartialFrame> {
+        let _current = self.gl.make_current()?;
+        self.check_size(params)?;
+        let uniforms = FrameUniforms::new(&buffers.scene, params, buffers.origin)?;
+        let look = &buffers.scene.look;
+        let size = [params.width, params.height];
+        let desc = TargetDesc::new(&self.gl, size, look, blend_storage(&self.gl, &buffers.scene, size)?);
+        let desc = TargetDesc { culling: buffers.culling(), ..desc };
+        self.ensure_target(desc)?;
+        let programs = buffers.sample_programs(desc.samples, &mut |source| self.programs.program(source))?;
+        let Some(target) = self.targets.last() else { return Err(fault("draw", "no target")) };
+        let slot = if has_readback { Some(target.readback_ring.acquire(self.frame_timeout)?) } else { None };
+        // If a pass fails or panics, the images of the target are undefined. Therefore the target is not in the cache
+        // until all passes are recorded.
+        self.last_frame = None;
+        let Some(target) = self.targets.pop() else { return Err(fault("draw", "no target")) };
+        let draws_ground = must_draw_ground(buffers, params);
+        target.draw_region.set(draw_region(buffers, params, draws_ground));
+        let is_divided = self.is_divided(size, desc.samples);
+        let steps = plan_steps(&target, draws_ground, slot.is_some(), self.max_band_samples());
+        Ok(PartialFrame {
+            params: *params,
+            uniforms,
+            programs,
+            slot,
+            stats: FrameStats { samples: desc.samples, ..FrameStats::default() },
+            timers: Vec::new(),
+            is_divided,
+            has_breaks: is_divided || !buffers.is_drawn_with(desc.samples),
+            steps,
+            is_begun: false,
+            fence: None,
+            target,
+        })
+    }
+
+    /// Submits the next step of a frame. On hardware, submits all steps of a frame without breaks.
+    ///
+    /// # Errors
+    /// `Fault` with the pass if OpenGL reports an error. The frame must then be dropped.
+    pub fn submit_step(&mut self, buffers: &SceneBuffers, partial_frame: &mut PartialFrame) -> Result<()> {
+        let _current = self.gl.make_current()?;
+        let PartialFrame { params, uniforms, target, programs, slot, stats, timers, steps, .. } = partial_frame;
+        let mut recorder = PassRecorder { gl: &self.gl, stats };
+        if std::mem::replace(&mut partial_frame.is_begun, true) {
+            // Commands of other scenes may have changed the bindings.
+            passes::uniforms::bind(buffers);
+        } else {
+            passes::uniforms::upload(&recorder, buffers, params, uniforms);
+        }
+        let frame = FrameContext { buffers, target, programs, params };
+        let has_breaks = partial_frame.has_breaks;
+        while let Some(step) = steps.pop_front() {
+            match step {
+                Step::ComputeRaster => timers.extend(self.record_compute_raster(&mut recorder, &frame)?),
+                Step::Shadow => self.record_shadow(&mut recorder, &frame, timers)?,
+                Step::Cull if buffers.cull_resources.is_some() && buffers.visibility_rasterizer().is_none() => {
+                    timers.push(self.time_pass(Pass::Cull, || passes::cull::cull_for_camera(&mut recorder, &frame))?);
+                }
+                Step::Cull => {}
+                Step::Passes(pass, band_passes) => timers.push(self.time_pass(pass, || {
+                    let mut band_passes = band_passes.into_iter();
+                    band_passes.try_for_each(|band_pass| record(&mut recorder, &frame, slot.as_ref(), band_pass))
+                })?),
+            }
+            if has_breaks || self.gl.limits.software {
+                break;
+            }
+        }
+        if has_breaks {
+            partial_frame.fence = Some(self.gl.fence("draw")?);
+        }
+        if partial_frame.is_submitted() {
+            buffers.mark_drawn_with(partial_frame.target.desc.samples);
+        }
+        Ok(())
+    }
+
+    /// Returns a frame whose steps are all submitted. Its target returns to the cache.
+    ///
+    /// # Errors
+    /// `Fault` if steps are missing or OpenGL fails.
+    pub fn finish_frame(&mut self, partial_frame: PartialFrame) -> Result<PendingFrame> {
+        if !partial_frame.is_submitted() {
+            return Err(fault("draw", "expected a frame whose steps are all submitted"));
+        }
+        let _current = self.gl.make_current()?;
+        let PartialFrame { uniforms, target, slot, timers, stats, .. } = partial_frame;
+        let desc = target.desc;
+        // A frame with an equal description may have been drawn between the steps of this one.
+        self.targets.retain(|cached_target| cached_target.desc != desc);
+        if self.targets.len() >= MAX_TARGETS {
+            self.targets.remove(0);
+        }
+        self.targets.push(target);
+        self.last_frame = Some(LastFrame { desc, uniforms });
+        Ok(PendingFrame {
+            desc,
+            slot,
+            fence: self.gl.fence(Pass::Read.name())?,
+            passes: timers,
+            stats,
+            timeout: self.frame_timeout,
+            first_wait: Cell::new(None),
+        })
+    }
+
+    /// Draws the passes of the compute rasterizer. Returns no timer if there is none or it fails; OpenGL then draws these
+    /// passes in later steps.
+    fn record_compute_raster(
+        &self,
+        recorder: &mut PassRecorder<'_>,
+        frame: &FrameContext<'_>,
+    ) -> Result<Option<(Pass, PassTimer)>> {
+        let buffers = frame.buffers;
+        let Some((rasterizer, enabled)) = buffers.active_rasterizer() else { return Ok(None) };
+        let is_shadow_stale = buffers.shadow_cache.is_stale(buffers.shadow_key(frame.params));
+        let raster_passes = RasterPasses { shadow: enabled.shadow && is_shadow_stale, ..enabled };
+        if !raster_passes.has_any() {
+            return Ok(None);
+        }
+        let draw = || passes::raster::draw(recorder, frame, rasterizer, raster_passes);
+        match self.time_pass(raster_passes.stats_pass(), draw) {
+            Ok(timer) => Ok(Some(timer)),
+            // OpenGL cannot draw on a lost device either.
+            Err(error @ Error::DeviceLost { .. }) => Err(error),
+            Err(error) => {
+                rasterizer.disable(&error);
+                Ok(None)
+            }
+        }
+    }
+
+    /// Draws and blurs the shadow map unless the map of an earlier frame is valid.
+    fn record_shadow(
+        &self,
+        recorder: &mut PassRecorder<'_>,
+        frame: &FrameContext<'_>,
+        timers: &mut Vec<(Pass, PassTimer)>,
+    ) -> Result<()> {
+        let buffers = frame.buffers;
+        let draw = || {
+            timers.push(self.time_pass(Pass::Shadow, || passes::shadow::draw_depth(recorder, buffers))?);
+            timers.push(self.time_pass(Pass::Blur, || passes::shadow::blur(recorder, buffers))?);
+            Ok(())
+        };
+        buffers.shadow_cache.draw_if_stale(buffers.shadow_key(frame.params), draw).map(drop)
+    }
+
+    /// Times the passes that `commands` records, and reports the time under `pass`, which is one of these passes.
+    fn time_pass(&self, pass: Pass, commands: impl FnOnce() -> Result<()>) -> Result<(Pass, PassTimer)> {
+        let commands = || {
+            #[cfg(test)]
+            assert_ne!(self.injected_panic, Some(pass), "injected");
+            commands()
+        };
+        self.gl.time_pass(pass.name(), self.frame_timeout, commands).map(|timer| (pass, timer))
+    }
+}
+
+/// Records a pass, or a band of it.
+fn record(
+    recorder: &mut PassRecorder<'_>,
+    frame: &FrameContext<'_>,
+    slot: Option<&ReadbackSlot>,
+    band_pass: BandPass,
+) -> Result<()> {
+    let rasterizer = frame.buffers.visibility_rasterizer();
+    match (band_pass, OitFrame::of(frame)) {
+        (BandPass::Visibility(band), _) => match rasterizer {
+            // This pass only converts the output of the compute rasterizer, so the first band converts all rows.
+            Some(rasterizer) if band.first_row == 0 => passes::raster::unpack(recorder, frame, rasterizer),
+            Some(_) => Ok(()),
+            None => passes::visibility::draw(recorder, frame, band),
+        },
+        (BandPass::RecordVisible, _) if rasterizer.is_none() => passes::cull::record_visible(recorder, frame),
+        (BandPass::Ground(band), _) if rasterizer.is_none() => {
+            passes::visibility::draw_ground_band(recorder, frame, band)
+        }
+        (BandPass::Blended(band), _) => passes::blended::draw(recorder, frame, band),
+        (BandPass::OitCount(band), Some(oit)) => oit.count(recorder, band),
+        (BandPass::OitSumCounts, Some(oit)) => oit.sum_counts(recorder),
+        (BandPass::OitBlend(band), Some(oit)) => oit.blend(recorder, band),
+        (BandPass::Shade(band), _) => passes::shade::draw(recorder, frame, band),
+        (BandPass::Bloom(step, band), _) => passes::post::bloom(recorder, frame, step, band),
+        (BandPass::Encode(band), _) => passes::post::encode(recorder, frame, band),
+        (BandPass::Read, _) => {
+            let staging = slot.and_then(ReadbackSlot::staging);
+            staging.map_or(Ok(()), |staging| passes::readback::copy_frame(recorder, frame, &staging.buffer))
+        }
+        // Passes that OpenGL or a frame without fragment lists does not have.
+        (BandPass::RecordVisible | BandPass::Ground(_) | BandPass::OitCount(_), _)
+        | (BandPass::OitSumCounts | BandPass::OitBlend(_), _) => Ok(()),
+    }
+}
+
+/// The steps of a frame. Bands have at most `max_samples` samples.
+fn plan_steps(target: &RenderTarget, draws_ground: bool, has_readback: bool, max_samples: u64) -> VecDeque<Step> {
+    let TargetDesc { width, height, samples, .. } = target.desc;
+    let bands = Band::divide([width, height], max_samples / u64::from(samples));
+    let of_bands = |pass: fn(Band) -> BandPass| bands.iter().copied().map(pass);
+    let mut visibility: Vec<BandPass> = of_bands(BandPass::Visibility).collect();
+    visibility.push(BandPass::RecordVisible);
+    visibility.extend(of_bands(BandPass::Ground).filter(|_| draws_ground));
+    let blended = match (&target.blend_layer, &target.oit) {
+        (_, Some(_)) => {
+            of_bands(BandPass::OitCount).chain([BandPass::OitSumCounts]).chain(of_bands(BandPass::OitBlend)).collect()
+        }
+        (Some(_), None) => of_bands(BandPass::Blended).collect(),
+        (None, None) => Vec::new(),
+    };
+    let bloom = passes::post::bloom_steps(target).flat_map(|(step, image)| {
+        let bands = Band::divide([image.desc.width, image.desc.height], max_samples / u64::from(samples));
+        bands.into_iter().map(move |band| BandPass::Bloom(step, band))
+    });
+    let mut groups = vec![
+        (Pass::Visibility, visibility),
+        (Pass::Blended, blended),
+        (Pass::Shade, of_bands(BandPass::Shade).collect()),
+        (Pass::Bloom, bloom.collect()),
+        (Pass::Encode, of_bands(BandPass::Encode).collect()),
+    ];
+    if has_readback {
+        groups.push((Pass::Read, vec![BandPass::Read]));
+    }
+    let mut steps = VecDeque::from([Step::ComputeRaster, Step::Shadow, Step::Cull]);
+    for (pass, band_passes) in groups {
+        if bands.len() > 1 {
+            steps.extend(band_passes.into_iter().map(|band_pass| Step::Passes(pass, vec![band_pass])));
+        } else {
+            steps.push_back(Step::Passes(pass, band_passes));
+        }
+    }
+    steps
+}
+
+/// Whether the ground must be rasterized. Otherwise the shading adds visible ground to samples without an id.
+fn must_draw_ground(buffers: &SceneBuffers, params: &FrameParams) -> bool {
+    let scene = &buffers.scene;
+    // The bounds of a rebased scene (drawn with positions relative to one chosen origin) exclude distant domains, which
+    // may be below the ground.
+    let is_ground_behind_scene = buffers.rebased.is_none() && ground_is_behind_scene(scene, params, buffers.origin);
+    scene.look.ground.is_some() && camera_is_above_ground(scene, params) && !is_ground_behind_scene
+}
+
+/// Region of the frame that may show triangles or rasterized ground.
+fn draw_region(buffers: &SceneBuffers, params: &FrameParams, draws_ground: bool) -> Region {
+    let size = [params.width, params.height];
+    // The bounds of a rebased scene exclude distant domains, and the ground is larger than all bounds.
+    if buffers.rebased.is_some() || draws_ground {
+        return Region::whole(size);
+    }
+    Region::project(&clip_from_positions(&buffers.scene, params, buffers.origin), &params.bounds, size)
+}
