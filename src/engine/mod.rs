@@ -142,8 +142,7 @@ impl Engine {
             Ok((scene_catalog, Arc::new(checkpoints), run_counter))
         })
         .await?;
-        let DeviceThread { handle, info, thread: device_thread } =
-            DeviceThread::start(config.open_scenes, open_device).await?;
+        let DeviceThread { handle, info, thread: device_thread } = DeviceThread::start(open_device).await?;
         let shared = Shared {
             services: SceneServices { device: handle, checkpoints, run_counter, config: Arc::clone(&config) },
             registry: Registry::new(config.open_scenes),

@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use tokio::sync::oneshot;
 
+use super::fair_queue::CostClass;
 use crate::engine::output::step_output::FrameOutput;
 use crate::frame::Legend;
 use modalcast_model::backend_settings::BackendSettings;
@@ -72,11 +73,58 @@ pub(in crate::engine) enum Command {
         id: SceneId,
         reply: Reply<()>,
     },
-    /// Ends the thread.
-    Quit,
 }
 
 impl Command {
+    /// The scene that the command is for. Commands of a scene are executed in their order.
+    pub(super) const fn scene(&self) -> SceneId {
+        match self {
+            Self::LoadScene { id, .. }
+            | Self::Deform { id, .. }
+            | Self::Draw { id, .. }
+            | Self::RenderAov { id, .. }
+            | Self::Pick { id, .. }
+            | Self::ReadVertices { id, .. }
+            | Self::UnloadScene { id, .. } => *id,
+        }
+    }
+
+    /// Commands of one class and scene take a similar time.
+    pub(super) fn cost_class(&self) -> CostClass {
+        let of_kind = |kind: &'static str| CostClass { kind, size_class: 0 };
+        match self {
+            Self::LoadScene { .. } => of_kind("load"),
+            Self::Deform { .. } => of_kind("deform"),
+            Self::Draw { size, .. } => CostClass { kind: "draw", size_class: size_class(*size) },
+            Self::RenderAov { size, .. } => CostClass { kind: "aov", size_class: size_class(*size) },
+            Self::Pick { .. } => of_kind("pick"),
+            Self::ReadVertices { .. } => of_kind("vertices"),
+            Self::UnloadScene { .. } => of_kind("unload"),
+        }
+    }
+
+    /// Whether the command counts against the limit on queued commands. An unloading is always accepted, so that no scene
+    /// stays on the device.
+    pub(super) const fn is_bounded(&self) -> bool {
+        !matches!(self, Self::UnloadScene { .. })
+    }
+
+    /// Whether the command leaves the queue when its caller no longer waits. The other commands change the scene.
+    pub(super) const fn is_cancellable(&self) -> bool {
+        matches!(self, Self::Draw { .. } | Self::RenderAov { .. } | Self::Pick { .. } | Self::ReadVertices { .. })
+    }
+
+    /// Whether the caller of a command that does not change the scene no longer waits.
+    pub(super) fn is_cancelled(&self) -> bool {
+        match self {
+            Self::Draw { reply, .. } => reply.is_closed(),
+            Self::RenderAov { reply, .. } => reply.is_closed(),
+            Self::Pick { reply, .. } => reply.is_closed(),
+            Self::ReadVertices { reply, .. } => reply.is_closed(),
+            Self::LoadScene { .. } | Self::Deform { .. } | Self::UnloadScene { .. } => false,
+        }
+    }
+
     /// Answers the command with an error instead of executing it.
     pub(super) fn reply_error(self, error: Error) {
         // A failed send means that the caller no longer waits. `map_err(drop)` gives all arms the same type.
@@ -87,7 +135,11 @@ impl Command {
             Self::RenderAov { reply, .. } => reply.send(Err(error)).map_err(drop).ok(),
             Self::Pick { reply, .. } => reply.send(Err(error)).map_err(drop).ok(),
             Self::ReadVertices { reply, .. } => reply.send(Err(error)).map_err(drop).ok(),
-            Self::Quit => None,
         };
     }
+}
+
+/// Binary logarithm of the number of pixels, rounded down.
+fn size_class(size: FrameSize) -> u32 {
+    (u64::from(size.width) * u64::from(size.height)).checked_ilog2().unwrap_or(0)
 }

@@ -18,8 +18,8 @@ use modalcast_model::error::{Error, Result};
 use modalcast_model::raster::{RasterGeometry, Rasterizer};
 use modalcast_model::scene::{Camera, FrameSize, PixelRect, Scene};
 use modalcast_render::{
-    Aov, AovImage, DevicePreference, FrameImage, MappedPixels, PendingFrame, PendingPick, PickHit, Renderer,
-    SceneBuffers,
+    Aov, AovImage, DevicePreference, FrameImage, MappedPixels, PartialAov, PartialFrame, PendingFrame, PendingPick,
+    PickHit, Renderer, SceneBuffers,
 };
 
 /// Description of the deformation backend and the renderer in use.
@@ -38,6 +38,20 @@ pub struct PendingDraw {
     frame: PendingFrame,
     /// Milliseconds spent on uploading vertices to the renderer; `None` if no upload was needed.
     upload_ms: Option<f64>,
+}
+
+/// A frame of which some steps are not submitted yet.
+#[derive(Debug)]
+pub(in crate::engine) struct PartialDraw {
+    pub frame: PartialFrame,
+    upload_ms: Option<f64>,
+}
+
+/// An AOV of which some bands are not submitted yet.
+#[derive(Debug)]
+pub(in crate::engine) struct PartialAovDraw {
+    pub aov: PartialAov,
+    legend: Option<Legend>,
 }
 
 impl PendingDraw {
@@ -205,13 +219,64 @@ impl DeviceContext {
         camera: &Camera,
         size: FrameSize,
     ) -> Result<PendingDraw> {
+        let mut partial_draw = self.begin_partial_draw(loaded_scene, camera, size)?;
+        while !partial_draw.frame.is_submitted() {
+            self.submit_draw_step(loaded_scene, &mut partial_draw)?;
+        }
+        self.finish_partial_draw(partial_draw)
+    }
+
+    /// Begins a frame of the last deformation. The scene must not be used for anything else until all steps of the frame
+    /// are submitted.
+    ///
+    /// # Errors
+    /// As [`Self::begin_draw`].
+    pub(in crate::engine) fn begin_partial_draw(
+        &mut self,
+        loaded_scene: &mut LoadedScene,
+        camera: &Camera,
+        size: FrameSize,
+    ) -> Result<PartialDraw> {
         let camera = camera.validated()?;
         let renderer = self.renderer.as_mut().map_err(|error| error.clone())?;
         let upload_begin = Instant::now();
         let contents = loaded_scene.fill_buffers(renderer, &camera)?;
         let upload_ms = contents.is_uploaded.then(|| ms_since(upload_begin));
         let params = contents.frame_params(camera, size);
-        Ok(PendingDraw { frame: renderer.submit(loaded_scene.buffers()?, &params)?, upload_ms })
+        Ok(PartialDraw { frame: renderer.begin_frame(loaded_scene.buffers()?, &params, true)?, upload_ms })
+    }
+
+    /// Submits the next step of a frame.
+    ///
+    /// # Errors
+    /// `Fault` of OpenGL. The frame must then be dropped.
+    pub(in crate::engine) fn submit_draw_step(&mut self, scene: &LoadedScene, draw: &mut PartialDraw) -> Result<()> {
+        self.renderer.as_mut().map_err(|error| error.clone())?.submit_step(scene.buffers()?, &mut draw.frame)
+    }
+
+    /// Returns a frame whose steps are all submitted.
+    ///
+    /// # Errors
+    /// `Fault` of OpenGL.
+    pub(in crate::engine) fn finish_partial_draw(&mut self, draw: PartialDraw) -> Result<PendingDraw> {
+        let PartialDraw { frame, upload_ms } = draw;
+        let frame = self.renderer.as_mut().map_err(|error| error.clone())?.finish_frame(frame)?;
+        Ok(PendingDraw { frame, upload_ms })
+    }
+
+    /// Whether an output of this size is drawn in steps, between which other scenes are served.
+    pub(in crate::engine) fn is_divided(&self, loaded_scene: &LoadedScene, size: FrameSize) -> bool {
+        self.renderer.as_ref().is_ok_and(|renderer| {
+            renderer.is_divided([size.width, size.height], loaded_scene.scene().look.samples_per_pixel())
+        })
+    }
+
+    /// Sets the number of samples that the renderer draws without a break.
+    #[cfg(test)]
+    pub(in crate::engine) fn set_max_band_samples(&mut self, max_band_samples: u64) {
+        if let Ok(renderer) = &mut self.renderer {
+            renderer.set_max_band_samples(max_band_samples);
+        }
     }
 
     /// Waits for a frame. Any thread may then copy its pixels.
@@ -239,6 +304,24 @@ impl DeviceContext {
         size: FrameSize,
         frame_output: FrameOutput,
     ) -> Result<(AovImage, Option<Legend>)> {
+        let mut draw = self.begin_aov(loaded_scene, camera, size, frame_output)?;
+        while !draw.aov.is_submitted() {
+            self.submit_aov_band(loaded_scene, &mut draw)?;
+        }
+        self.finish_aov(loaded_scene, draw)
+    }
+
+    /// Begins an AOV. The scene must not be used for anything else until the AOV is finished.
+    ///
+    /// # Errors
+    /// As [`Self::draw`].
+    pub(in crate::engine) fn begin_aov(
+        &mut self,
+        loaded_scene: &mut LoadedScene,
+        camera: &Camera,
+        size: FrameSize,
+        frame_output: FrameOutput,
+    ) -> Result<PartialAovDraw> {
         let camera = camera.validated()?;
         let renderer = self.renderer.as_mut().map_err(|error| error.clone())?;
         let params = loaded_scene.fill_buffers(renderer, &camera)?.frame_params(camera, size);
@@ -249,8 +332,29 @@ impl DeviceContext {
             (FrameOutput::Normals, _) => Aov::Normals,
             _ => Aov::Domains,
         };
-        let image = renderer.render_aov(loaded_scene.buffers()?, &params, aov)?;
-        Ok((image, legend))
+        Ok(PartialAovDraw { aov: renderer.begin_aov(loaded_scene.buffers()?, &params, aov)?, legend })
+    }
+
+    /// Submits the next band of an AOV.
+    ///
+    /// # Errors
+    /// `Fault` of OpenGL. The AOV must then be dropped.
+    pub(in crate::engine) fn submit_aov_band(&mut self, scene: &LoadedScene, draw: &mut PartialAovDraw) -> Result<()> {
+        self.renderer.as_mut().map_err(|error| error.clone())?.submit_aov_band(scene.buffers()?, &mut draw.aov)
+    }
+
+    /// Waits for an AOV whose bands are all submitted.
+    ///
+    /// # Errors
+    /// `Fault` when the device does not finish.
+    pub(in crate::engine) fn finish_aov(
+        &mut self,
+        scene: &LoadedScene,
+        draw: PartialAovDraw,
+    ) -> Result<(AovImage, Option<Legend>)> {
+        let PartialAovDraw { aov, legend } = draw;
+        let renderer = self.renderer.as_mut().map_err(|error| error.clone())?;
+        Ok((renderer.finish_aov(scene.buffers()?, aov)?, legend))
     }
 
     /// Submits a pick without waiting for the device. `rectangle` is in pixels of a picture of size `size`.

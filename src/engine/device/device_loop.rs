@@ -1,10 +1,23 @@
 //! The command loop of the device thread: executes commands and decides in which order it answers them.
 //!
+//! Scenes are served by deficit round-robin ([`super::fair_queue`]). The commands of a scene are executed in their order,
+//! so a frame shows the step before it, and a step waits for the frames before it.
+//!
+//! A large frame or AOV (arbitrary output variable: depth, normals and others) is drawn in steps, and other scenes are
+//! served between the steps ([`PartialOutput`]). The commands of its scene wait until its last step is submitted. Each
+//! step is submitted when the device has finished the one before it, so the commands of other scenes never wait for more
+//! than one step. Only one large output is drawn at a time, because each needs its own images; another one waits. The
+//! renderer defines what is large by the number of samples ([`modalcast_render::Renderer::set_max_band_samples`]). On
+//! hardware a step takes about 10 ms. A software renderer draws a frame of 1920 x 1080 pixels with four samples each in
+//! one step, so others wait about as long as for such a frame. The first frame of a scene is drawn in steps, too, because
+//! drivers finish the compilation of a program when it is used for the first time.
+//!
+//! An output whose caller no longer waits ends after its present step; on a software renderer, each pass is a step.
+//!
 //! Frames, picks and vertex readbacks are answered asynchronously, each type from its own bounded queue
 //! ([`InFlightQueue`]). After each command the loop waits for the vertex readbacks that were started before this
 //! command and answers them. It also answers the picks and frames that are ready. Readbacks that the command starts
-//! overlap with the next command. AOVs (arbitrary output variables: depth, normals and others) are never in flight:
-//! the renderer has no asynchronous readback for them.
+//! overlap with the next command. AOVs are never in flight: the renderer has no asynchronous readback for them.
 //!
 //! Frames pass through the renderer's ring buffer. The loop submits a frame, executes the commands after it, and
 //! answers the frame once the device has drawn it, or before the next submission when every ring slot is in flight. Two
@@ -19,20 +32,22 @@
 
 use std::collections::HashMap;
 use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use rayon::{ThreadPool, ThreadPoolBuilder};
-use tokio::sync::mpsc;
 
 use super::command::{Command, CopiedVertices, Reply, SceneId};
+use super::command_queue::{CommandQueue, Work};
 use super::context::{DeviceContext, EngineInfo, PendingDraw};
 use super::device_loss::DeviceLossSender;
+use super::fair_queue::Taken;
 use super::in_flight::{InFlight, InFlightQueue, Pollable};
 use super::loaded_scene::LoadedScene;
+use super::partial_output::{Charge, PartialKind, PartialOutput};
 use crate::telemetry::ms_since;
 use modalcast_model::deform::{VertexAttributes, VertexReadback};
 use modalcast_model::error::{Result, fault, fault_in};
-use modalcast_model::scene::{Camera, FrameSize, PixelRect};
 use modalcast_render::{FrameImage, MAX_FRAMES_IN_FLIGHT, PendingPick, PickHit};
 
 /// How long the thread waits for a frame before it checks the command queue again.
@@ -49,12 +64,22 @@ pub(super) struct DeviceLoop {
     context: DeviceContext,
     /// Records the loss of the device.
     loss: DeviceLossSender,
+    queue: Arc<CommandQueue>,
     /// Threads that copy pixels of frames.
     copy_pool: ThreadPool,
     scenes: HashMap<SceneId, LoadedScene>,
+    /// Outputs that are drawn in steps. The queue of their scene begins with [`Work::Continue`].
+    partial_outputs: HashMap<SceneId, PartialOutput>,
     vertices: InFlightQueue<PendingVertices, CopiedVertices>,
     picks: InFlightQueue<PendingPick, Vec<PickHit>>,
-    frames: InFlightQueue<PendingDraw, FrameImage>,
+    frames: InFlightQueue<FrameInFlight, FrameImage>,
+}
+
+/// A frame in flight, and what its scene was charged.
+struct FrameInFlight {
+    id: SceneId,
+    charge: Charge,
+    draw: PendingDraw,
 }
 
 /// A vertex readback in flight.
@@ -71,9 +96,9 @@ impl Pollable for PendingPick {
     }
 }
 
-impl Pollable for PendingDraw {
+impl Pollable for FrameInFlight {
     fn is_ready_within(&self, limit: Duration) -> bool {
-        Self::is_ready_within(self, limit)
+        self.draw.is_ready_within(limit)
     }
 }
 
@@ -95,14 +120,16 @@ impl DeviceLoop {
     ///
     /// # Errors
     /// `Fault` when the threads cannot be started.
-    pub(super) fn new(context: DeviceContext, loss: DeviceLossSender) -> Result<Self> {
+    pub(super) fn new(context: DeviceContext, loss: DeviceLossSender, queue: Arc<CommandQueue>) -> Result<Self> {
         let copy_pool =
             ThreadPoolBuilder::new().num_threads(COPY_THREADS).thread_name(|index| format!("pixels {index}"));
         Ok(Self {
             context,
             loss,
+            queue,
             copy_pool: copy_pool.build().map_err(fault_in("threads that copy pixels"))?,
             scenes: HashMap::new(),
+            partial_outputs: HashMap::new(),
             vertices: InFlightQueue::new(MAX_VERTEX_READBACKS_IN_FLIGHT),
             picks: InFlightQueue::new(MAX_PICKS_IN_FLIGHT),
             frames: InFlightQueue::new(MAX_FRAMES_IN_FLIGHT),
@@ -114,41 +141,196 @@ impl DeviceLoop {
         self.context.info()
     }
 
-    /// Executes commands until `Quit` arrives or every sender is dropped, then unloads all scenes.
-    pub(super) fn run(mut self, mut inbox: mpsc::Receiver<Command>) {
-        while let Some(command) = self.next_command(&mut inbox) {
-            if matches!(command, Command::Quit) {
-                break;
-            }
-            let older_readback_count = self.vertices.len();
-            run_caught(|| self.execute(command));
-            for _ in 0..older_readback_count {
-                run_caught(|| self.finish_oldest_vertices());
-            }
-            while self.picks.is_oldest_ready(Duration::ZERO) {
-                run_caught(|| self.finish_oldest_pick());
-            }
-            while self.frames.is_oldest_ready(Duration::ZERO) {
-                run_caught(|| self.finish_oldest_frame());
-            }
+    /// Executes commands until the queue is closed and empty.
+    pub(super) fn run(mut self) {
+        while self.run_next() {}
+    }
+
+    /// Executes the next command, or the next step of an output, and answers readbacks. Returns false if the queue is
+    /// closed and empty.
+    pub(super) fn run_next(&mut self) -> bool {
+        let Some(taken) = self.next_work() else { return false };
+        self.free_in_flight_slot(&taken.work);
+        let older_readback_count = self.vertices.len();
+        run_caught(|| self.run_work(taken));
+        for _ in 0..older_readback_count {
+            run_caught(|| self.finish_oldest_vertices());
         }
-        self.vertices.clear();
-        self.picks.clear();
-        self.frames.clear();
-        for (_, scene) in self.scenes.drain() {
-            run_caught(|| self.context.unload_scene(scene));
+        while self.picks.is_oldest_ready(Duration::ZERO) {
+            run_caught(|| self.finish_oldest_pick());
+        }
+        while self.frames.is_oldest_ready(Duration::ZERO) {
+            run_caught(|| self.finish_oldest_frame());
+        }
+        true
+    }
+
+    /// Takes the next work. While no work can run, answers readbacks in flight.
+    fn next_work(&mut self) -> Option<Taken<Work>> {
+        loop {
+            // Polled before the queue is locked.
+            let can_continue = |output: &PartialOutput| output.is_cancelled() || output.is_ready_within(Duration::ZERO);
+            let outputs = self.partial_outputs.iter().filter(|(_, output)| can_continue(output));
+            let ready: Vec<SceneId> = outputs.map(|(id, _)| *id).collect();
+            let has_large_output = self.partial_outputs.values().any(PartialOutput::is_large);
+            let can_run = |id: SceneId, work: &Work| match work {
+                Work::Continue => ready.contains(&id),
+                Work::Command(command) => !(has_large_output && self.is_large_output(id, command)),
+            };
+            if let Some(taken) = self.queue.take(can_run) {
+                return Some(taken);
+            }
+            if !(self.vertices.is_empty() && self.picks.is_empty() && self.frames.is_empty()) {
+                run_caught(|| self.finish_one());
+            } else if let Some(output) = self.partial_outputs.values().next() {
+                output.is_ready_within(POLL_INTERVAL);
+            } else if !self.queue.wait() {
+                return None;
+            }
         }
     }
 
-    /// Returns the next command. While the command queue is empty, answers readbacks in flight.
-    fn next_command(&mut self, inbox: &mut mpsc::Receiver<Command>) -> Option<Command> {
-        while !(self.vertices.is_empty() && self.picks.is_empty() && self.frames.is_empty()) {
-            match inbox.try_recv() {
-                Ok(command) => return Some(command),
-                Err(_) => run_caught(|| self.finish_one()),
+    /// Whether a command draws an output in steps.
+    fn is_large_output(&self, id: SceneId, command: &Command) -> bool {
+        match command {
+            Command::Draw { size, .. } | Command::RenderAov { size, .. } => {
+                self.scenes.get(&id).is_some_and(|scene| self.context.is_divided(scene, *size))
+            }
+            _ => false,
+        }
+    }
+
+    /// Waits for a slot for the readback that the work may start. This wait is not part of the cost of the work.
+    fn free_in_flight_slot(&mut self, work: &Work) {
+        match work {
+            Work::Command(Command::Draw { .. }) | Work::Continue => {
+                while self.frames.is_full() {
+                    run_caught(|| self.finish_oldest_frame());
+                }
+            }
+            Work::Command(Command::Pick { .. }) => {
+                while self.picks.is_full() {
+                    run_caught(|| self.finish_oldest_pick());
+                }
+            }
+            Work::Command(Command::ReadVertices { .. }) => {
+                while self.vertices.is_full() {
+                    run_caught(|| self.finish_oldest_vertices());
+                }
+            }
+            Work::Command(_) => {}
+        }
+    }
+
+    /// Executes a command or the next step of an output, and charges its scene the time.
+    fn run_work(&mut self, taken: Taken<Work>) {
+        let Taken { scene: id, class, charged_ms, work } = taken;
+        let begin = Instant::now();
+        match work {
+            Work::Command(command) if command.is_cancelled() => {}
+            // The costs of outputs are recorded when they are finished.
+            Work::Command(command @ (Command::Draw { .. } | Command::RenderAov { .. })) => {
+                return self.begin_output(command, Charge { class, charged_ms, spent_ms: 0.0, is_recorded: false });
+            }
+            Work::Command(command) => self.execute(command),
+            Work::Continue => {
+                if let Some(output) = self.partial_outputs.remove(&id) {
+                    self.continue_output(id, output);
+                }
             }
         }
-        inbox.blocking_recv()
+        self.queue.record_cost(id, class, charged_ms, ms_since(begin));
+    }
+
+    /// Begins a frame or an AOV.
+    fn begin_output(&mut self, command: Command, charge: Charge) {
+        let begin = Instant::now();
+        if let Some(error) = self.loss.error() {
+            return command.reply_error(error);
+        }
+        let Self { context, scenes, loss, .. } = self;
+        let (id, kind) = match command {
+            Command::Draw { id, camera, size, reply } => {
+                let draw = find_scene(scenes, id).and_then(|scene| context.begin_partial_draw(scene, &camera, size));
+                match loss.record_loss(draw) {
+                    Ok(draw) => (id, PartialKind::Frame(draw, reply)),
+                    Err(error) => return answer(reply, Err(error)),
+                }
+            }
+            Command::RenderAov { id, camera, size, frame_output, reply } => {
+                let draw =
+                    find_scene(scenes, id).and_then(|scene| context.begin_aov(scene, &camera, size, frame_output));
+                match loss.record_loss(draw) {
+                    Ok(draw) => (id, PartialKind::Aov(draw, reply)),
+                    Err(error) => return answer(reply, Err(error)),
+                }
+            }
+            _ => return,
+        };
+        let charge = Charge { spent_ms: ms_since(begin), ..charge };
+        self.continue_output(id, PartialOutput { kind, charge });
+    }
+
+    /// Submits the next step of an output with breaks, or all steps of another output. Drops an output whose caller no longer
+    /// waits.
+    fn continue_output(&mut self, id: SceneId, mut output: PartialOutput) {
+        let begin = Instant::now();
+        while !output.is_submitted() {
+            if output.is_cancelled() {
+                return;
+            }
+            let Self { context, scenes, .. } = self;
+            let step = match self.loss.error() {
+                Some(error) => Err(error),
+                None => find_scene(scenes, id).and_then(|scene| output.submit_step(context, scene)),
+            };
+            if let Err(error) = self.loss.record_loss(step) {
+                return output.reply_error(error);
+            }
+            if output.has_breaks() && !output.is_submitted() {
+                output.charge.spent_ms += ms_since(begin);
+                if !output.charge.is_recorded {
+                    let Charge { class, charged_ms, spent_ms, .. } = output.charge;
+                    self.queue.record_cost(id, class, charged_ms, spent_ms);
+                    output.charge.is_recorded = true;
+                }
+                self.queue.push_continuation(id, output.step_class());
+                self.partial_outputs.insert(id, output);
+                return;
+            }
+        }
+        output.charge.spent_ms += ms_since(begin);
+        self.finish_output(id, output);
+    }
+
+    /// Charges a scene for a finished output, which took `total_ms` in all steps.
+    fn record_output_cost(&self, id: SceneId, charge: Charge, total_ms: f64) {
+        let Charge { class, charged_ms, spent_ms, is_recorded } = charge;
+        match is_recorded {
+            true => self.queue.charge(id, total_ms - spent_ms),
+            false => self.queue.record_cost(id, class, charged_ms, total_ms),
+        }
+    }
+
+    /// Waits for an AOV and answers it. A frame is answered later.
+    fn finish_output(&mut self, id: SceneId, output: PartialOutput) {
+        let PartialOutput { kind, charge } = output;
+        match kind {
+            PartialKind::Frame(draw, reply) => {
+                let pending_draw = self.context.finish_partial_draw(draw);
+                match self.loss.record_loss(pending_draw) {
+                    Ok(draw) => self.frames.push(FrameInFlight { id, charge, draw }, reply),
+                    Err(error) => answer(reply, Err(error)),
+                }
+            }
+            PartialKind::Aov(draw, reply) => {
+                let begin = Instant::now();
+                let Self { context, scenes, .. } = self;
+                let aov = find_scene(scenes, id).and_then(|scene| context.finish_aov(scene, draw));
+                answer(reply, self.loss.record_loss(aov));
+                self.record_output_cost(id, charge, charge.spent_ms + ms_since(begin));
+            }
+        }
     }
 
     fn execute(&mut self, command: Command) {
@@ -173,25 +355,9 @@ impl DeviceLoop {
                 self.unload(id);
                 answer(reply, Ok(()));
             }
-            Command::Draw { id, camera, size, reply } if !reply.is_closed() => self.draw(id, camera, size, reply),
-            Command::RenderAov { id, camera, size, frame_output, reply } if !reply.is_closed() => {
-                let Self { context, scenes, .. } = self;
-                let aov =
-                    find_scene(scenes, id).and_then(|scene| context.render_aov(scene, &camera, size, frame_output));
-                answer(reply, self.loss.record_loss(aov));
-            }
-            Command::Pick { id, camera, picture, rectangle, reply } if !reply.is_closed() => {
-                self.pick(id, camera, picture, rectangle, reply);
-            }
-            Command::ReadVertices { id, attributes, reply } if !reply.is_closed() => {
-                self.read_vertices(id, attributes, reply)
-            }
-            // The caller no longer waits, so the work is skipped.
-            Command::Draw { .. }
-            | Command::RenderAov { .. }
-            | Command::Pick { .. }
-            | Command::ReadVertices { .. }
-            | Command::Quit => {}
+            Command::Pick { .. } => self.pick(command),
+            Command::ReadVertices { id, attributes, reply } => self.read_vertices(id, attributes, reply),
+            Command::Draw { .. } | Command::RenderAov { .. } => {}
         }
     }
 
@@ -199,33 +365,12 @@ impl DeviceLoop {
         if let Some(scene) = self.scenes.remove(&id) {
             self.context.unload_scene(scene);
         }
+        self.queue.forget(id);
     }
 
-    /// Submits a frame. Waits for the oldest frame first if every slot of the ring buffer is in flight.
-    fn draw(&mut self, id: SceneId, camera: Camera, size: FrameSize, reply: Reply<FrameImage>) {
-        while self.frames.is_full() {
-            self.finish_oldest_frame();
-        }
-        let Self { context, scenes, .. } = self;
-        let pending_draw = find_scene(scenes, id).and_then(|scene| context.begin_draw(scene, &camera, size));
-        match self.loss.record_loss(pending_draw) {
-            Ok(pending_draw) => self.frames.push(pending_draw, reply),
-            Err(error) => answer(reply, Err(error)),
-        }
-    }
-
-    /// Submits a pick. Waits for the oldest pick first if the queue is full.
-    fn pick(
-        &mut self,
-        id: SceneId,
-        camera: Camera,
-        picture: FrameSize,
-        rectangle: PixelRect,
-        reply: Reply<Vec<PickHit>>,
-    ) {
-        while self.picks.is_full() {
-            self.finish_oldest_pick();
-        }
+    /// Submits a pick.
+    fn pick(&mut self, command: Command) {
+        let Command::Pick { id, camera, picture, rectangle, reply } = command else { return };
         let Self { context, scenes, .. } = self;
         let pending_pick =
             find_scene(scenes, id).and_then(|scene| context.begin_pick(scene, &camera, picture, rectangle));
@@ -237,9 +382,6 @@ impl DeviceLoop {
 
     /// Starts a vertex readback; answers immediately if the vertices are already in host memory.
     fn read_vertices(&mut self, id: SceneId, attributes: VertexAttributes, reply: Reply<CopiedVertices>) {
-        while self.vertices.is_full() {
-            self.finish_oldest_vertices();
-        }
         let start = Instant::now();
         let readback = self.scene(id).and_then(|scene| scene.readback(attributes));
         match self.loss.record_loss(readback) {
@@ -278,7 +420,12 @@ impl DeviceLoop {
         if reply.is_closed() {
             return; // The caller no longer waits.
         }
-        let pixels = self.context.finish_draw(pending);
+        let FrameInFlight { id, charge, draw } = pending;
+        let pixels = self.context.finish_draw(draw);
+        if let Ok(pixels) = &pixels {
+            // On hardware, the device takes longer than the submission.
+            self.record_output_cost(id, charge, charge.spent_ms.max(pixels.times().drawing_ms()));
+        }
         match self.loss.record_loss(pixels) {
             Ok(pixels) => self.copy_pool.spawn(move || run_caught(|| answer(reply, Ok(pixels.into_image())))),
             Err(error) => answer(reply, Err(error)),
@@ -301,6 +448,29 @@ impl DeviceLoop {
 
     fn scene(&mut self, id: SceneId) -> Result<&mut LoadedScene> {
         find_scene(&mut self.scenes, id)
+    }
+}
+
+#[cfg(test)]
+impl DeviceLoop {
+    /// The scene of the large output that is being drawn.
+    pub(super) fn partial_scene(&self) -> Option<SceneId> {
+        self.partial_outputs.iter().find(|(_, output)| output.is_large()).map(|(id, _)| *id)
+    }
+}
+
+impl Drop for DeviceLoop {
+    /// Drops all commands and outputs, so that their callers get an error, and unloads all scenes.
+    fn drop(&mut self) {
+        self.queue.clear();
+        self.partial_outputs.clear();
+        self.vertices.clear();
+        self.picks.clear();
+        self.frames.clear();
+        let scenes: Vec<LoadedScene> = self.scenes.drain().map(|(_, scene)| scene).collect();
+        for scene in scenes {
+            run_caught(|| self.context.unload_scene(scene));
+        }
     }
 }
 
@@ -327,7 +497,7 @@ mod tests {
     /// Starts a device thread whose deformer injects faults, and loads two scenes.
     async fn start_with_two_scenes() -> (DeviceHandle, Arc<Scene>) {
         let open_device = || DeviceContext::with_deformer(FaultyDeformer::boxed);
-        let handle = DeviceThread::start(2, open_device).await.expect("expected a device thread").handle;
+        let handle = DeviceThread::start(open_device).await.expect("expected a device thread").handle;
         let scene = testing::two_strips();
         for id in [FAULTY_SCENE, CONTROL_SCENE] {
             handle.load_scene(id, &scene, BackendSettings::default()).await.expect("expected a loaded scene");

@@ -1,13 +1,14 @@
-//! Handle to the device thread. The thread receives commands (`command`) from a bounded queue, owns the device context
-//! and every loaded scene (`device_loop`), and answers each command at most once. Vertices, picks and frames are
+//! Handle to the device thread. The thread takes commands (`command`) from a bounded queue of each scene
+//! (`command_queue`), owns the device context and every loaded scene (`device_loop`), and answers each command at most
+//! once. Vertices, picks and frames are
 //! answered asynchronously: their readback overlaps with the commands after them.
 
 use std::sync::Arc;
 
-use tokio::sync::mpsc::error::TrySendError;
-use tokio::sync::{mpsc, oneshot};
+use tokio::sync::oneshot;
 
 use super::command::{Command, CopiedVertices, Reply, SceneId};
+use super::command_queue::{CancelGuard, CommandQueue};
 use super::context::{DeviceContext, EngineInfo};
 use super::device_loop::DeviceLoop;
 use super::device_loss::{DeviceLoss, device_loss_channel};
@@ -17,15 +18,23 @@ use modalcast_model::backend_settings::BackendSettings;
 use modalcast_model::deform::{DeformSummary, VertexAttributes};
 use modalcast_model::error::{Error, Result, fault, fault_in};
 use modalcast_model::scene::{Camera, FrameSize, PixelRect, Scene, SceneState};
-use modalcast_render::{AovImage, FrameImage, MAX_FRAMES_IN_FLIGHT, PickHit};
+use modalcast_render::{AovImage, FrameImage, PickHit};
 
 /// Sends commands to the device thread. The thread ends when the last clone is dropped.
 #[derive(Debug, Clone)]
 pub(in crate::engine) struct DeviceHandle {
-    commands: mpsc::Sender<Command>,
-    /// Capacity of the command queue, for errors.
-    capacity: usize,
+    commands: Arc<CommandSender>,
     loss: DeviceLoss,
+}
+
+/// Closes the queue when the last handle is dropped.
+#[derive(Debug)]
+struct CommandSender(Arc<CommandQueue>);
+
+impl Drop for CommandSender {
+    fn drop(&mut self) {
+        self.0.close();
+    }
 }
 
 /// A running device thread.
@@ -36,28 +45,24 @@ pub(in crate::engine) struct DeviceThread {
 }
 
 impl DeviceThread {
-    /// Starts the thread for up to `open_scenes` scenes. Returns when `open_device` has opened the devices.
+    /// Starts the thread. Returns when `open_device` has opened the devices.
     ///
     /// # Errors
     /// The errors of `open_device`; `Fault` when a thread cannot be started.
     pub(in crate::engine) async fn start(
-        open_scenes: usize,
         open_device: impl FnOnce() -> Result<DeviceContext> + Send + 'static,
     ) -> Result<Self> {
-        // A scene queues at most MAX_FRAMES_IN_FLIGHT frames and 3 other commands: a vertex readback, the next step and
-        // the command that loads the scene. 8 further commands are a reserve. So the queue is full only if more than
-        // `open_scenes` scenes use the device.
-        let capacity = (3 + MAX_FRAMES_IN_FLIGHT) * open_scenes + 8;
-        let (commands, inbox) = mpsc::channel(capacity);
+        let queue = CommandQueue::new();
+        let commands = Arc::new(CommandSender(Arc::clone(&queue)));
         let (info_sender, info_receiver) = oneshot::channel();
         let (loss_sender, loss) = device_loss_channel();
         let thread = std::thread::Builder::new()
             .name("device".into())
-            .spawn(move || match open_device().and_then(|context| DeviceLoop::new(context, loss_sender)) {
+            .spawn(move || match open_device().and_then(|context| DeviceLoop::new(context, loss_sender, queue)) {
                 Ok(device_loop) => {
                     // Fails only if the caller no longer waits. The queue is then closed and `run` returns.
                     info_sender.send(Ok(device_loop.info().clone())).ok();
-                    device_loop.run(inbox);
+                    device_loop.run();
                 }
                 Err(error) => {
                     info_sender.send(Err(error)).ok(); // Fails only if the caller no longer waits.
@@ -65,16 +70,35 @@ impl DeviceThread {
             })
             .map_err(fault_in("device thread"))?;
         let info = info_receiver.await.map_err(|_| no_answer_error())??;
-        Ok(Self { handle: DeviceHandle { commands, capacity, loss }, info, thread })
+        Ok(Self { handle: DeviceHandle { commands, loss }, info, thread })
     }
 }
 
 impl DeviceHandle {
     /// A handle for tests that answer the commands themselves, and the receiver of the commands.
     #[cfg(test)]
-    pub(in crate::engine) fn mock() -> (Self, mpsc::Receiver<Command>) {
-        let (commands, inbox) = mpsc::channel(16);
-        (Self { commands, capacity: 16, loss: device_loss_channel().1 }, inbox)
+    pub(in crate::engine) fn mock() -> (Self, tokio::sync::mpsc::Receiver<Command>) {
+        use super::command_queue::Work;
+        let queue = CommandQueue::new();
+        let (sender, inbox) = tokio::sync::mpsc::channel(16);
+        let handle = Self { commands: Arc::new(CommandSender(Arc::clone(&queue))), loss: device_loss_channel().1 };
+        // Ends when the handle or the receiver is dropped.
+        std::thread::spawn(move || {
+            while queue.wait() {
+                let Some(taken) = queue.take(|_, _| true) else { continue };
+                let Work::Command(command) = taken.work else { continue };
+                if sender.blocking_send(command).is_err() {
+                    return queue.clear();
+                }
+            }
+        });
+        (handle, inbox)
+    }
+
+    /// A handle for tests that run the device loop themselves.
+    #[cfg(test)]
+    pub(super) fn of_queue(queue: &Arc<CommandQueue>, loss: DeviceLoss) -> Self {
+        Self { commands: Arc::new(CommandSender(Arc::clone(queue))), loss }
     }
 
     /// The observer of a device loss.
@@ -137,18 +161,14 @@ impl DeviceHandle {
         self.submit(|reply| Command::ReadVertices { id, attributes, reply })
     }
 
-    /// Unloads a scene. Waits for queue capacity, so that a full queue never leaves a scene on the device.
+    /// Unloads a scene. A full queue accepts this command, too.
     pub(in crate::engine) async fn unload_scene(&self, id: SceneId) -> Result<()> {
-        let (reply, answer) = oneshot::channel();
-        self.commands.send(Command::UnloadScene { id, reply }).await.map_err(|_| no_answer_error())?;
-        answer.await.map_err(|_| no_answer_error())?
+        self.call(|reply| Command::UnloadScene { id, reply }).await
     }
 
-    /// Ends the thread after the commands already queued. Blocks until the queue has capacity, so it must not be called
-    /// on a runtime thread.
+    /// Ends the thread after the commands already queued.
     pub(in crate::engine) fn quit(&self) {
-        // A closed queue means that the thread has ended.
-        self.commands.blocking_send(Command::Quit).ok();
+        self.commands.0.close();
     }
 
     async fn call<T>(&self, create_command: impl FnOnce(Reply<T>) -> Command) -> Result<T> {
@@ -158,17 +178,21 @@ impl DeviceHandle {
     /// Sends a command; the caller awaits the answer later.
     fn submit<T>(&self, create_command: impl FnOnce(Reply<T>) -> Command) -> PendingReply<T> {
         let (reply, answer) = oneshot::channel();
-        PendingReply(match self.commands.try_send(create_command(reply)) {
-            Ok(()) => Ok(answer),
-            Err(TrySendError::Full(_)) => Err(Error::Busy { queue: "device", limit: self.capacity }),
-            Err(TrySendError::Closed(_)) => Err(no_answer_error()),
-        })
+        match self.commands.0.push(create_command(reply)) {
+            Ok(cancel_guard) => PendingReply { answer: Ok(answer), _cancel_guard: cancel_guard },
+            Err(error) => PendingReply { answer: Err(error.unwrap_or_else(no_answer_error)), _cancel_guard: None },
+        }
     }
 }
 
-/// The pending answer to a command that was sent to the device thread.
+/// The pending answer to a command that was sent to the device thread. Dropping it cancels a command that does not change
+/// the scene: a queued command leaves the queue at once, and a frame that is being drawn ends after its present pass.
 #[derive(Debug)]
-pub(in crate::engine) struct PendingReply<T>(Result<oneshot::Receiver<Result<T>>>);
+pub(in crate::engine) struct PendingReply<T> {
+    // Dropped before the guard, so that the device thread sees the cancellation if it has just taken the command.
+    answer: Result<oneshot::Receiver<Result<T>>>,
+    _cancel_guard: Option<CancelGuard>,
+}
 
 impl<T> PendingReply<T> {
     pub(in crate::engine) async fn wait(mut self) -> Result<T> {
@@ -177,7 +201,7 @@ impl<T> PendingReply<T> {
 
     /// [`Self::wait`], but cancel-safe. Must not be called again after it has returned.
     pub(in crate::engine) async fn recv(&mut self) -> Result<T> {
-        match &mut self.0 {
+        match &mut self.answer {
             Ok(answer) => answer.await.map_err(|_| no_answer_error())?,
             Err(error) => Err(error.clone()),
         }

@@ -1,0 +1,269 @@
+//! Tests of the device loop with several scenes: large outputs in steps, cancelled commands and full queues. The loop
+//! runs on the thread of the test, one command or step at a time, so the order does not depend on times.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use super::command::SceneId;
+use super::command_queue::{CommandQueue, MAX_QUEUED_COMMANDS};
+use super::context::DeviceContext;
+use super::device_loop::DeviceLoop;
+use super::device_loss::device_loss_channel;
+use super::handle::{DeviceHandle, PendingReply};
+use crate::config::{BackendChoice, Config, RendererChoice};
+use crate::engine::output::step_output::FrameOutput;
+use crate::engine::testing;
+use modalcast_model::backend_settings::BackendSettings;
+use modalcast_model::error::{Error, Result};
+use modalcast_model::scene::{Camera, FrameSize, Scene, SceneState};
+use modalcast_render::FrameImage;
+
+const LARGE: FrameSize = FrameSize::new(192, 512);
+const SMALL: FrameSize = FrameSize::new(32, 32);
+/// Samples of a band of [`LARGE`] of 64 rows with four samples per pixel.
+const BAND_SAMPLES: u64 = 4 * 192 * 64;
+
+/// A device loop with loaded scenes.
+struct Fixture {
+    device_loop: DeviceLoop,
+    queue: Arc<CommandQueue>,
+    handle: DeviceHandle,
+    scene: Arc<Scene>,
+}
+
+impl Fixture {
+    /// Loads the scenes 1 and 2, and draws a frame of each. Outputs of more than `max_band_samples` samples are drawn in
+    /// steps.
+    async fn start(max_band_samples: u64) -> Self {
+        let mut fixture = Self::load(max_band_samples).await;
+        for id in [1, 2] {
+            let first_frame = fixture.draw(id, SMALL);
+            while fixture.queue.len(id) > 0 {
+                fixture.run(1);
+            }
+            first_frame.wait().await.expect("expected a frame");
+        }
+        // The scenes begin with equal shares.
+        fixture.queue.reset_costs();
+        fixture
+    }
+
+    /// Loads the scenes 1 and 2.
+    async fn load(max_band_samples: u64) -> Self {
+        let config = Config {
+            backend: BackendChoice::Reference,
+            renderer: RendererChoice::Auto,
+            allow_software: true,
+            ..Config::default()
+        };
+        let mut context = DeviceContext::open(&config).expect("expected a renderer");
+        context.set_max_band_samples(max_band_samples);
+        let queue = CommandQueue::new();
+        let (loss_sender, loss) = device_loss_channel();
+        let handle = DeviceHandle::of_queue(&queue, loss);
+        let device_loop = DeviceLoop::new(context, loss_sender, Arc::clone(&queue)).expect("expected a loop");
+        let mut fixture = Self { device_loop, queue, handle, scene: testing::two_strips() };
+        for id in [1, 2] {
+            let (handle, scene) = (fixture.handle.clone(), Arc::clone(&fixture.scene));
+            let loaded = tokio::spawn(async move { handle.load_scene(id, &scene, BackendSettings::default()).await });
+            while fixture.queue.len(id) == 0 {
+                tokio::task::yield_now().await;
+            }
+            fixture.run(1);
+            loaded.await.expect("expected no panic").expect("expected a loaded scene");
+        }
+        fixture
+    }
+
+    fn draw(&self, id: SceneId, size: FrameSize) -> PendingReply<FrameImage> {
+        self.handle.begin_draw(id, Camera::fit_to_scene(&self.scene, size.width, size.height), size)
+    }
+
+    /// Runs `count` commands or steps.
+    fn run(&mut self, count: usize) {
+        for _ in 0..count {
+            assert!(self.device_loop.run_next());
+        }
+    }
+
+    /// Runs commands and steps until none is queued. Returns their number.
+    fn run_all(&mut self) -> usize {
+        let mut count = 0;
+        while self.queue.len(1) + self.queue.len(2) > 0 {
+            self.run(1);
+            count += 1;
+        }
+        // Ends the loop, which answers the frames in flight.
+        self.queue.close();
+        while self.device_loop.run_next() {}
+        count
+    }
+}
+
+/// Whether a command is answered.
+async fn is_answered<T>(reply: &mut PendingReply<T>) -> bool {
+    tokio::time::timeout(Duration::ZERO, reply.recv()).await.is_ok()
+}
+
+/// A state whose first coordinate is `q`.
+fn state_with_q(scene: &Scene, q: f32) -> Arc<SceneState> {
+    let mut state = SceneState::rest(scene);
+    state.q[0] = q;
+    Arc::new(state)
+}
+
+#[tokio::test]
+async fn large_frame_does_not_delay_another_scene() {
+    // Negative control: without steps, the other scene waits for the complete frame.
+    for (max_band_samples, has_steps) in [(BAND_SAMPLES, true), (u64::MAX, false)] {
+        let mut fixture = Fixture::start(max_band_samples).await;
+        let large = fixture.draw(1, LARGE);
+        fixture.run(1);
+        let state = state_with_q(&fixture.scene, 0.5);
+        let mut deformed = fixture.handle.deform(2, &state);
+        let mut waited = 0;
+        while !is_answered(&mut deformed).await {
+            fixture.run(1);
+            waited += 1;
+        }
+        assert!((1..=2).contains(&waited), "the other scene waited for {waited} steps");
+        let step_count = fixture.run_all();
+        assert_eq!(step_count > 15, has_steps, "{step_count} steps after the answer");
+        assert_eq!(large.wait().await.expect("expected a frame").height, LARGE.height);
+    }
+}
+
+#[tokio::test]
+async fn commands_of_a_scene_wait_for_its_large_outputs() {
+    let mut fixture = Fixture::start(u64::MAX).await;
+    let [whole, deformed_whole] = [fixture.draw(1, LARGE), {
+        fixture.handle.deform(1, &state_with_q(&fixture.scene, 0.5));
+        fixture.draw(1, LARGE)
+    }];
+    fixture.run_all();
+    let whole = whole.wait().await.expect("expected a frame");
+    let deformed_whole = deformed_whole.wait().await.expect("expected a frame");
+    assert!(whole.rgba != deformed_whole.rgba, "expected different frames of different states");
+
+    let mut fixture = Fixture::start(BAND_SAMPLES).await;
+    let large = fixture.draw(1, LARGE);
+    let mut deformed = fixture.handle.deform(1, &state_with_q(&fixture.scene, 0.5));
+    let deformed_large = fixture.draw(1, LARGE);
+    while fixture.queue.len(1) > 2 {
+        assert!(!is_answered(&mut deformed).await, "expected the step to wait for the frame before it");
+        fixture.run(1);
+    }
+    fixture.run_all();
+    assert!(large.wait().await.expect("expected a frame").rgba == whole.rgba);
+    assert!(deformed_large.wait().await.expect("expected a frame").rgba == deformed_whole.rgba);
+}
+
+#[tokio::test]
+async fn one_large_output_is_drawn_at_a_time() {
+    let mut fixture = Fixture::start(BAND_SAMPLES).await;
+    let (first, second) = (fixture.draw(1, LARGE), fixture.draw(2, LARGE));
+    fixture.run(1);
+    let (partial_scene, other_scene) = (fixture.device_loop.partial_scene().expect("expected steps"), [2, 1]);
+    let other_scene = other_scene[partial_scene as usize - 1];
+    while fixture.queue.len(partial_scene) > 0 {
+        assert_eq!((fixture.queue.len(other_scene), fixture.device_loop.partial_scene()), (1, Some(partial_scene)));
+        fixture.run(1);
+    }
+    fixture.run_all();
+    let [first, second] = [first.wait().await, second.wait().await].map(|image| image.expect("expected a frame").rgba);
+    assert!(first == second);
+}
+
+#[tokio::test]
+async fn cancelled_command_leaves_a_full_queue_at_once() {
+    let mut fixture = Fixture::start(u64::MAX).await;
+    let mut draws: Vec<_> = (0..MAX_QUEUED_COMMANDS).map(|_| fixture.draw(1, SMALL)).collect();
+    let busy = Error::Busy { queue: "device commands of the scene", limit: MAX_QUEUED_COMMANDS };
+    assert_eq!(fixture.draw(1, SMALL).wait().await.expect_err("expected a full queue"), busy);
+    // Another scene has a queue of its own.
+    draws.push(fixture.draw(2, SMALL));
+    drop(draws.remove(7));
+    assert_eq!(fixture.queue.len(1), MAX_QUEUED_COMMANDS - 1);
+    draws.push(fixture.draw(1, SMALL));
+    assert_eq!(fixture.queue.len(1), MAX_QUEUED_COMMANDS);
+    // A step changes the scene, so it is not cancelled.
+    drop(draws.remove(0));
+    drop(fixture.handle.deform(1, &state_with_q(&fixture.scene, 0.5)));
+    assert_eq!(fixture.queue.len(1), MAX_QUEUED_COMMANDS);
+    let command_count = fixture.run_all();
+    assert_eq!(command_count, MAX_QUEUED_COMMANDS + 1);
+    for draw in draws {
+        draw.wait().await.expect("expected a frame");
+    }
+}
+
+#[tokio::test]
+async fn cancelled_large_outputs_end_after_their_present_step() {
+    let mut fixture = Fixture::start(BAND_SAMPLES).await;
+    let large = fixture.draw(1, LARGE);
+    fixture.run(3);
+    drop(large);
+    let (handle, camera) = (fixture.handle.clone(), Camera::fit_to_scene(&fixture.scene, LARGE.width, LARGE.height));
+    let aov = tokio::spawn(async move { handle.render_aov(1, camera, LARGE, FrameOutput::Depth).await });
+    while fixture.queue.len(1) < 2 {
+        tokio::task::yield_now().await;
+    }
+    // Ends the frame, and begins the AOV.
+    fixture.run(2);
+    assert_eq!((fixture.queue.len(1), fixture.device_loop.partial_scene()), (1, Some(1)));
+    aov.abort();
+    aov.await.expect_err("expected an aborted task");
+    let state = state_with_q(&fixture.scene, 0.5);
+    let mut deformed = fixture.handle.deform(1, &state);
+    fixture.run(2);
+    assert!(is_answered(&mut deformed).await && fixture.device_loop.partial_scene().is_none());
+}
+
+#[tokio::test]
+async fn large_aov_equals_the_aov_without_steps() {
+    let mut results = Vec::new();
+    for max_band_samples in [u64::MAX, 192 * 64] {
+        let mut fixture = Fixture::start(max_band_samples).await;
+        let camera = Camera::fit_to_scene(&fixture.scene, LARGE.width, LARGE.height);
+        let outputs = [FrameOutput::Depth, FrameOutput::Displacement { scale_max: 1.0 }];
+        let handle = fixture.handle.clone();
+        let aovs = tokio::spawn(async move {
+            let mut aovs = Vec::new();
+            for output in outputs {
+                aovs.push(handle.render_aov(1, camera, LARGE, output).await.map(|(image, _)| image.bytes));
+            }
+            aovs.into_iter().collect::<Result<Vec<_>>>()
+        });
+        let mut step_count = 0;
+        while !aovs.is_finished() {
+            if fixture.queue.len(1) > 0 {
+                fixture.run(1);
+                step_count += 1;
+            }
+            tokio::task::yield_now().await;
+        }
+        results.push((step_count, aovs.await.expect("expected no panic").expect("expected AOVs")));
+    }
+    assert!(results[0].0 == 2 && results[1].0 >= 16, "{} and {} steps", results[0].0, results[1].0);
+    assert!(results[0].1 == results[1].1);
+}
+
+/// Drivers compile programs at their first use, so the first frame takes long.
+#[tokio::test]
+async fn first_frame_of_a_scene_is_drawn_in_steps() {
+    let mut fixture = Fixture::load(u64::MAX).await;
+    for (frame, has_steps) in [("first", true), ("second", false)] {
+        let draw = fixture.draw(1, SMALL);
+        fixture.run(1);
+        assert_eq!(fixture.queue.len(1) > 0, has_steps, "{frame}");
+        let state = state_with_q(&fixture.scene, 0.5);
+        let mut deformed = fixture.handle.deform(2, &state);
+        while !is_answered(&mut deformed).await {
+            fixture.run(1);
+        }
+        while fixture.queue.len(1) > 0 {
+            fixture.run(1);
+        }
+        draw.wait().await.expect("expected a frame");
+    }
+}

@@ -1,0 +1,107 @@
+//! An output of which some steps are not submitted to the device yet. A large output, or the first frame of a scene, is
+//! drawn in steps, between which the device thread serves other scenes. The commands of its own scene wait until all steps are submitted, so the vertices
+//! and the buffers of the scene do not change between the steps.
+
+use std::time::Duration;
+
+use super::command::Reply;
+use super::context::{DeviceContext, PartialAovDraw, PartialDraw};
+use super::fair_queue::CostClass;
+use super::loaded_scene::LoadedScene;
+use crate::frame::Legend;
+use modalcast_model::error::{Error, Result};
+use modalcast_render::{AovImage, FrameImage};
+
+/// Device time of an output.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Charge {
+    /// Class of the command.
+    pub class: CostClass,
+    /// Milliseconds that the scene was charged for the command.
+    pub charged_ms: f64,
+    /// Milliseconds that the device thread has spent on all steps so far.
+    pub spent_ms: f64,
+    /// Whether the cost of the first step is recorded. The later steps are charged separately.
+    pub is_recorded: bool,
+}
+
+/// An output and the channel for it.
+pub(super) struct PartialOutput {
+    pub kind: PartialKind,
+    pub charge: Charge,
+}
+
+pub(super) enum PartialKind {
+    Frame(PartialDraw, Reply<FrameImage>),
+    Aov(PartialAovDraw, Reply<(AovImage, Option<Legend>)>),
+}
+
+impl PartialOutput {
+    /// Whether the caller no longer waits. The output is then dropped instead of continued.
+    pub(super) fn is_cancelled(&self) -> bool {
+        match &self.kind {
+            PartialKind::Frame(_, reply) => reply.is_closed(),
+            PartialKind::Aov(_, reply) => reply.is_closed(),
+        }
+    }
+
+    pub(super) fn is_submitted(&self) -> bool {
+        match &self.kind {
+            PartialKind::Frame(draw, _) => draw.frame.is_submitted(),
+            PartialKind::Aov(draw, _) => draw.aov.is_submitted(),
+        }
+    }
+
+    /// Whether the output is large, so that no other large output is drawn at the same time.
+    pub(super) const fn is_large(&self) -> bool {
+        match &self.kind {
+            PartialKind::Frame(draw, _) => draw.frame.is_divided(),
+            PartialKind::Aov(draw, _) => draw.aov.is_divided(),
+        }
+    }
+
+    /// Whether other scenes are served between the steps.
+    pub(super) const fn has_breaks(&self) -> bool {
+        match &self.kind {
+            PartialKind::Frame(draw, _) => draw.frame.has_breaks(),
+            PartialKind::Aov(draw, _) => draw.aov.is_divided(),
+        }
+    }
+
+    /// Waits at most `limit` for the last step. Returns whether the device has finished it.
+    pub(super) fn is_ready_within(&self, limit: Duration) -> bool {
+        match &self.kind {
+            PartialKind::Frame(draw, _) => draw.frame.is_ready_within(limit),
+            PartialKind::Aov(draw, _) => draw.aov.is_ready_within(limit),
+        }
+    }
+
+    /// Class of the steps after the first.
+    pub(super) fn step_class(&self) -> CostClass {
+        let kind = match self.kind {
+            PartialKind::Frame(..) => "draw step",
+            PartialKind::Aov(..) => "aov step",
+        };
+        CostClass { kind, ..self.charge.class }
+    }
+
+    /// Answers the output with an error instead of finishing it.
+    pub(super) fn reply_error(self, error: Error) {
+        // A failed send means that the caller no longer waits.
+        match self.kind {
+            PartialKind::Frame(_, reply) => reply.send(Err(error)).map_err(drop).ok(),
+            PartialKind::Aov(_, reply) => reply.send(Err(error)).map_err(drop).ok(),
+        };
+    }
+
+    /// Submits the next step.
+    ///
+    /// # Errors
+    /// `Fault` of OpenGL. The output must then be dropped.
+    pub(super) fn submit_step(&mut self, context: &mut DeviceContext, scene: &LoadedScene) -> Result<()> {
+        match &mut self.kind {
+            PartialKind::Frame(draw, _) => context.submit_draw_step(scene, draw),
+            PartialKind::Aov(draw, _) => context.submit_aov_band(scene, draw),
+        }
+    }
+}
