@@ -109,12 +109,17 @@ impl OutputDelivery {
     /// Answers every request whose step has been reached or passed. Drops requests whose caller no longer waits. `run`
     /// is the run of the latest writer.
     pub(super) async fn answer_requests(&mut self, current: &CurrentStep, run: u64) {
-        for request in mem::take(&mut self.requests) {
+        for mut request in mem::take(&mut self.requests) {
             if request.reply.is_closed() {
                 continue;
             }
             let answer = match self.producer.is_reached(request.selector, current, run) {
-                Ok(true) => self.producer.produce(&request.spec, current, VertexAttributes::default()).await,
+                Ok(true) => tokio::select! {
+                    biased;
+                    answer = self.producer.produce(&request.spec, current, VertexAttributes::default()) => answer,
+                    // The caller no longer waits. Dropping the production cancels its commands to the device.
+                    () = request.reply.closed() => continue,
+                },
                 Ok(false) => {
                     self.requests.push(request);
                     continue;
@@ -342,7 +347,12 @@ impl OutputProducer {
             round.started_pictures.push_back(PendingReadback::of_picture(round.current, *spec, reply, recipient));
             return;
         }
-        let picture = self.draw(spec).await.map(Arc::new);
+        let picture = tokio::select! {
+            biased;
+            picture = self.draw(spec) => picture.map(Arc::new),
+            // The subscriber no longer waits. Dropping the drawing cancels it on the device.
+            () = recipient.cancelled() => return,
+        };
         round.drawn_pictures.extend(picture.iter().map(|picture| (*spec, Arc::clone(picture))));
         recipient.receive(picture);
     }
@@ -353,7 +363,12 @@ impl OutputProducer {
         // Results arrive in the order of the steps, so deliver the subscriber's readbacks in flight first.
         self.readbacks.flush_for(subscriber).await;
         let skipped = subscriber.mark_delivered(round.current.step_count);
-        let output = self.produce(&subscriber.spec, round.current, round.attributes).await;
+        let output = tokio::select! {
+            biased;
+            output = self.produce(&subscriber.spec, round.current, round.attributes) => output,
+            // The subscriber no longer waits. Dropping the production cancels its commands to the device.
+            () = subscriber.closed() => return false,
+        };
         subscriber.take_permit().send(output.map(|output| StepOutput { skipped, ..output }))
     }
 
@@ -476,7 +491,7 @@ impl OutputProducer {
 
 #[cfg(test)]
 mod tests {
-    use tokio::sync::mpsc;
+    use tokio::sync::{mpsc, oneshot};
     use tokio::time::timeout;
 
     use super::super::subscriber::Subscription;
@@ -668,6 +683,44 @@ mod tests {
                 assert_eq!(received, (1, 0, camera_version), "{mode:?}");
             }
         }
+    }
+
+    #[tokio::test]
+    async fn cancelled_request_cancels_its_frame() {
+        let (mut delivery, mut device) = delivery_to(Vec::new());
+        let (subscriber, _subscription) = subscribe(Delivery::Lossless, 16);
+        let (reply, answer) = oneshot::channel();
+        delivery.add_request(StepRequest { selector: StepSelector::Current, spec: subscriber.spec, reply });
+        let step = current_step(1);
+        let cancel = async {
+            let mut request = next_draw_request(&mut device, 10_000).await.expect("expected a frame");
+            assert!(!request.reply.is_closed(), "expected a caller that waits");
+            drop(answer);
+            request.reply.closed().await;
+        };
+        let both = async { tokio::join!(delivery.answer_requests(&step, 1), cancel) };
+        timeout(Duration::from_secs(10), both).await.expect("expected the cancellation in time");
+    }
+
+    /// The frame of the second subscriber is cancelled while the first one is being drawn.
+    #[tokio::test]
+    async fn dropped_subscription_cancels_its_frame_at_once() {
+        let (first_subscriber, mut first_subscription) = subscribe(Delivery::Lossless, 16);
+        let (second_subscriber, second_subscription) = subscribe(Delivery::Lossless, 24);
+        let (mut delivery, mut device) = delivery_to(vec![first_subscriber, second_subscriber]);
+        delivery.serve_subscribers(&current_step(1), WITHOUT_NEXT_STEP).await;
+        let cancel = async {
+            let first_request = next_draw_request(&mut device, 10_000).await.expect("expected the first frame");
+            let mut second_request = next_draw_request(&mut device, 10_000).await.expect("expected the second frame");
+            assert!(!second_request.reply.is_closed(), "expected a subscriber that waits");
+            drop(second_subscription);
+            second_request.reply.closed().await;
+            answer(first_request);
+        };
+        let both = async { tokio::join!(delivery.flush(), cancel) };
+        timeout(Duration::from_secs(10), both).await.expect("expected the cancellation in time");
+        first_subscription.next().await.expect("expected the frame of the first subscriber");
+        assert_eq!(delivery.subscribers.len(), 1);
     }
 
     #[tokio::test]

@@ -21,7 +21,10 @@
 //! ```
 
 use std::collections::VecDeque;
+use std::future::poll_fn;
+use std::pin::Pin;
 use std::sync::{Arc, Mutex};
+use std::task::Poll;
 
 use super::current_step::CurrentStep;
 use super::frame_stream::CameraState;
@@ -132,6 +135,17 @@ impl PictureRecipient {
     fn is_for(&self, subscriber: &Subscriber) -> bool {
         lock(&self.frames.0).recipient.as_ref().is_some_and(|recipient| recipient.permit.belongs_to(subscriber))
     }
+
+    /// Waits until the subscriber no longer waits for the pictures.
+    pub(super) fn cancelled(&self) -> impl Future<Output = ()> + Send + use<> {
+        // Without a recipient, an error was sent instead of the pictures.
+        let closed = lock(&self.frames.0).recipient.as_ref().map(|recipient| recipient.permit.closed());
+        async {
+            if let Some(closed) = closed {
+                closed.await;
+            }
+        }
+    }
 }
 
 /// The answer of the device to a readback, and the recipients of the answer.
@@ -158,6 +172,8 @@ impl<T, R> InFlight<T, R> {
 enum Readback {
     Vertices(InFlight<CopiedVertices, Recipient>),
     Picture(PictureSpec, InFlight<FrameImage, PictureRecipient>),
+    /// No recipient waits any longer, so the command to the device is cancelled.
+    Cancelled,
 }
 
 /// A readback in flight.
@@ -207,11 +223,41 @@ impl PendingReadback {
         }
     }
 
-    /// Waits for the answer of the device. Cancel-safe.
+    /// Waits for the answer of the device, or until no recipient waits any longer. Cancel-safe.
     async fn wait(&mut self) {
+        let cancelled = self.cancelled();
+        tokio::select! {
+            biased;
+            () = self.wait_for_answer() => {}
+            () = cancelled => self.readback = Readback::Cancelled,
+        }
+    }
+
+    /// Waits for the answer of the device. Cancel-safe.
+    async fn wait_for_answer(&mut self) {
         match &mut self.readback {
             Readback::Vertices(in_flight) => in_flight.wait().await,
             Readback::Picture(_, in_flight) => in_flight.wait().await,
+            Readback::Cancelled => {}
+        }
+    }
+
+    /// Waits until no recipient waits any longer.
+    fn cancelled(&self) -> impl Future<Output = ()> + Send + use<> {
+        let mut cancellations: Vec<Cancellation> = Vec::new();
+        match &self.readback {
+            Readback::Vertices(in_flight) => {
+                cancellations.extend(in_flight.recipients.iter().map(|recipient| boxed(recipient.permit.closed())));
+            }
+            Readback::Picture(_, in_flight) => {
+                cancellations.extend(in_flight.recipients.iter().map(|recipient| boxed(recipient.cancelled())));
+            }
+            Readback::Cancelled => {}
+        }
+        async {
+            for cancellation in cancellations {
+                cancellation.await;
+            }
         }
     }
 
@@ -230,6 +276,7 @@ impl PendingReadback {
                 recipients.into_iter().for_each(|recipient| recipient.receive(picture.clone()));
                 picture.ok().map(|picture| (spec, picture))
             }
+            Readback::Cancelled => None,
         };
         if let Some(step) = self.step_to_acknowledge {
             step.acknowledge();
@@ -251,8 +298,16 @@ impl PendingReadback {
             Readback::Picture(_, in_flight) => {
                 in_flight.recipients.iter().any(|recipient| recipient.is_for(subscriber))
             }
+            Readback::Cancelled => false,
         }
     }
+}
+
+/// Completes when a recipient no longer waits.
+type Cancellation = Pin<Box<dyn Future<Output = ()> + Send>>;
+
+fn boxed(cancellation: impl Future<Output = ()> + Send + 'static) -> Cancellation {
+    Box::pin(cancellation)
 }
 
 /// Readbacks in flight, oldest first: those of the current step, and frames of the step before it.
@@ -286,12 +341,45 @@ impl ReadbackQueue {
         }
     }
 
-    /// Waits for the oldest readback and delivers it. Cancel-safe.
+    /// Waits for the oldest readback and delivers it. Meanwhile cancels later readbacks for which no recipient waits any
+    /// longer. Cancel-safe.
     pub(super) async fn deliver_oldest(&mut self) {
-        let Some(oldest) = self.pending.front_mut() else { return };
-        oldest.wait().await;
+        loop {
+            let later_cancelled = self.later_cancelled();
+            let Some(oldest) = self.pending.front_mut() else { return };
+            tokio::select! {
+                biased;
+                () = oldest.wait() => break,
+                index = later_cancelled => self.cancel(index),
+            }
+        }
         if let Some(oldest) = self.pending.pop_front() {
             oldest.send();
+        }
+    }
+
+    /// Waits until no recipient waits any longer for one of the readbacks after the oldest. Returns its index.
+    fn later_cancelled(&self) -> impl Future<Output = usize> + Send + use<> {
+        let is_active = |(_, pending): &(usize, &PendingReadback)| !matches!(pending.readback, Readback::Cancelled);
+        let later = self.pending.iter().enumerate().skip(1).filter(is_active);
+        let mut cancellations: Vec<(usize, Cancellation)> =
+            later.map(|(index, pending)| (index, boxed(pending.cancelled()))).collect();
+        poll_fn(move |context| {
+            let mut cancellations = cancellations.iter_mut();
+            let index = cancellations
+                .find_map(|(index, cancellation)| cancellation.as_mut().poll(context).is_ready().then_some(*index));
+            index.map_or(Poll::Pending, Poll::Ready)
+        })
+    }
+
+    /// Cancels a readback: drops its command to the device. A readback with an acknowledgement keeps its place in the
+    /// order of the acknowledgements.
+    fn cancel(&mut self, index: usize) {
+        match self.pending.get_mut(index) {
+            Some(pending) if pending.step_to_acknowledge.is_some() => pending.readback = Readback::Cancelled,
+            _ => {
+                self.pending.remove(index);
+            }
         }
     }
 

@@ -69,6 +69,12 @@ impl SendPermit {
         self.results.try_send(output).is_ok() && is_output
     }
 
+    /// Waits until the subscription is dropped.
+    pub(in crate::engine) fn closed(&self) -> impl Future<Output = ()> + Send + use<> {
+        let results = self.results.clone();
+        async move { results.closed().await }
+    }
+
     /// Whether the permit belongs to this subscriber.
     pub(in crate::engine) fn belongs_to(&self, subscriber: &Subscriber) -> bool {
         self.results.same_channel(&subscriber.results)
@@ -84,6 +90,11 @@ impl Subscriber {
     /// Whether the subscription was dropped or an error was sent.
     pub(in crate::engine) fn is_closed(&self) -> bool {
         self.results.is_closed() || self.is_error_sent.load(Ordering::Acquire)
+    }
+
+    /// Waits until the subscription is dropped. Cancel-safe.
+    pub(in crate::engine) async fn closed(&self) {
+        self.results.closed().await;
     }
 
     /// Whether a camera has moved since the last result.
