@@ -27,6 +27,9 @@
 //! Submitting a frame and reading its pixels are separate calls, so that several frames can be in flight
 //! ([`PendingFrame`]).
 //!
+//! A large frame, and the first frame of a scene, is submitted in steps, so that other scenes can be drawn in between
+//! ([`PartialFrame`]). For the same reason, the textures and programs of a scene can be prepared one by one ([`ScenePreparation`]).
+//!
 //! Two outputs are drawn only on request, with programs and buffers that are created on first use. Picking finds the
 //! triangles at a few pixels ([`PendingPick`]). AOV (arbitrary output variable) readbacks deliver numbers instead of
 //! colors ([`AovImage`]).
@@ -56,7 +59,7 @@ pub use self::pass::{FrameTimes, Pass, RenderStage, TimeKey};
 pub use self::passes::aov::{Aov, AovImage, PartialAov};
 pub use self::passes::picking::{PendingPick, PickHit};
 pub use self::plan::{Allocation, OmittedFeature, RenderPlan, plan};
-pub use self::renderer::{MappedPixels, PartialFrame, PendingFrame, Renderer};
+pub use self::renderer::{MappedPixels, PartialFrame, PendingFrame, Renderer, ScenePreparation};
 pub use self::resources::scene_buffers::SceneBuffers;
 pub use self::types::{
     BlurMethod, CullStats, DevicePreference, FrameCullStats, FrameImage, FrameParams, FrameStats, OitStats,

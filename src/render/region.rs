@@ -29,6 +29,21 @@ pub(crate) struct Band {
     image_rows: u32,
 }
 
+/// Maximum size of a band.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct BandLimit {
+    pub(crate) max_pixels: u64,
+    /// Pixels times samples per pixel.
+    pub(crate) max_samples: u64,
+}
+
+impl BandLimit {
+    /// Maximum number of pixels of a band with this number of samples per pixel.
+    pub(crate) fn max_pixels(self, samples: u32) -> u64 {
+        self.max_pixels.min(self.max_samples / u64::from(samples))
+    }
+}
+
 /// Dirty region of an image: the pixels that may differ from the clear value. `None` stands for all pixels, which are
 /// dirty initially.
 #[derive(Debug, Default)]

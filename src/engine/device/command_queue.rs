@@ -73,6 +73,11 @@ impl CommandQueue {
         lock(&self.state).work.push_front(scene, class, Work::Continue);
     }
 
+    /// Returns work that was taken to the head of the queue of its scene.
+    pub(super) fn return_taken(&self, taken: Taken<Work>) {
+        lock(&self.state).work.return_taken(taken);
+    }
+
     /// Takes the work whose turn it is and for which `can_run` returns true.
     pub(super) fn take(&self, can_run: impl Fn(SceneId, &Work) -> bool) -> Option<Taken<Work>> {
         lock(&self.state).work.take(can_run)

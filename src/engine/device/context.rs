@@ -19,7 +19,7 @@ use modalcast_model::raster::{RasterGeometry, Rasterizer};
 use modalcast_model::scene::{Camera, FrameSize, PixelRect, Scene};
 use modalcast_render::{
     Aov, AovImage, DevicePreference, FrameImage, MappedPixels, PartialAov, PartialFrame, PendingFrame, PendingPick,
-    PickHit, Renderer, SceneBuffers,
+    PickHit, Renderer, SceneBuffers, ScenePreparation,
 };
 
 /// Description of the deformation backend and the renderer in use.
@@ -262,6 +262,34 @@ impl DeviceContext {
         let PartialDraw { frame, upload_ms } = draw;
         let frame = self.renderer.as_mut().map_err(|error| error.clone())?.finish_frame(frame)?;
         Ok(PendingDraw { frame, upload_ms })
+    }
+
+    /// Begins to prepare the textures and programs of a scene, so that its buffers can then be created quickly. `None`
+    /// without a renderer, if nothing is to prepare, or if the scene is not valid; creating the buffers then returns the
+    /// error.
+    pub(in crate::engine) fn begin_preparation(&mut self, scene: &Arc<Scene>) -> Option<ScenePreparation> {
+        let preparation = self.renderer.as_mut().ok()?.begin_preparation(scene).ok()?;
+        (!preparation.is_finished()).then_some(preparation)
+    }
+
+    /// Uploads the next layer of a texture, or compiles the next program.
+    ///
+    /// # Errors
+    /// `Fault` with the compiler's log, or of OpenGL.
+    pub(in crate::engine) fn prepare_step(&mut self, preparation: &mut ScenePreparation) -> Result<()> {
+        self.renderer.as_mut().map_err(|error| error.clone())?.prepare_step(preparation)
+    }
+
+    /// Keeps a finished preparation until the scene's buffers are created.
+    pub(in crate::engine) fn finish_preparation(&mut self, preparation: ScenePreparation) {
+        if let Ok(renderer) = &mut self.renderer {
+            renderer.finish_preparation(preparation);
+        }
+    }
+
+    /// Whether loading a scene creates its OpenGL buffers; otherwise its first output does.
+    pub(in crate::engine) fn creates_buffers_at_load(&self) -> bool {
+        self.cuda_device.is_some() && self.renderer.as_ref().is_ok_and(|renderer| renderer.info().cuda_device.is_some())
     }
 
     /// Whether an output of this size is drawn in steps, between which other scenes are served.

@@ -12,6 +12,10 @@
 //! one step, so others wait about as long as for such a frame. The first frame of a scene is drawn in steps, too, because
 //! drivers finish the compilation of a program when it is used for the first time.
 //!
+//! The OpenGL buffers of a scene are created by its first output, or with CUDA when it is loaded. Before that, its textures
+//! are uploaded and its programs compiled in steps, between which other scenes are served. Other threads compute the
+//! mipmap levels, and if the driver can, compile the programs.
+//!
 //! An output whose caller no longer waits ends after its present step; on a software renderer, each pass is a step.
 //!
 //! Frames, picks and vertex readbacks are answered asynchronously, each type from its own bounded queue
@@ -30,7 +34,9 @@
 //! The loop continues. After the first `Error::DeviceLost` the loop answers every command with that error, except
 //! `UnloadScene`.
 
-use std::collections::HashMap;
+mod outputs;
+
+use std::collections::{HashMap, HashSet};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -44,7 +50,7 @@ use super::device_loss::DeviceLossSender;
 use super::fair_queue::Taken;
 use super::in_flight::{InFlight, InFlightQueue, Pollable};
 use super::loaded_scene::LoadedScene;
-use super::partial_output::{Charge, PartialKind, PartialOutput};
+use super::partial_output::{Charge, PartialOutput};
 use crate::telemetry::ms_since;
 use modalcast_model::deform::{VertexAttributes, VertexReadback};
 use modalcast_model::error::{Result, fault, fault_in};
@@ -70,6 +76,8 @@ pub(super) struct DeviceLoop {
     scenes: HashMap<SceneId, LoadedScene>,
     /// Outputs that are drawn in steps. The queue of their scene begins with [`Work::Continue`].
     partial_outputs: HashMap<SceneId, PartialOutput>,
+    /// Scenes whose textures and programs were prepared.
+    prepared_scenes: HashSet<SceneId>,
     vertices: InFlightQueue<PendingVertices, CopiedVertices>,
     picks: InFlightQueue<PendingPick, Vec<PickHit>>,
     frames: InFlightQueue<FrameInFlight, FrameImage>,
@@ -130,6 +138,7 @@ impl DeviceLoop {
             copy_pool: copy_pool.build().map_err(fault_in("threads that copy pixels"))?,
             scenes: HashMap::new(),
             partial_outputs: HashMap::new(),
+            prepared_scenes: HashSet::new(),
             vertices: InFlightQueue::new(MAX_VERTEX_READBACKS_IN_FLIGHT),
             picks: InFlightQueue::new(MAX_PICKS_IN_FLIGHT),
             frames: InFlightQueue::new(MAX_FRAMES_IN_FLIGHT),
@@ -224,8 +233,17 @@ impl DeviceLoop {
 
     /// Executes a command or the next step of an output, and charges its scene the time.
     fn run_work(&mut self, taken: Taken<Work>) {
-        let Taken { scene: id, class, charged_ms, work } = taken;
         let begin = Instant::now();
+        if let Work::Command(command) = &taken.work
+            && let Some(preparation) = self.begin_preparation(command)
+        {
+            let Taken { scene: id, class, .. } = taken;
+            // The command is executed when its scene is prepared.
+            self.queue.return_taken(taken);
+            let charge = Charge { class, charged_ms: 0.0, spent_ms: 0.0, is_recorded: true };
+            return self.continue_output(id, PartialOutput { kind: PartialKind::Preparation(preparation), charge });
+        }
+        let Taken { scene: id, class, charged_ms, work, .. } = taken;
         match work {
             Work::Command(command) if command.is_cancelled() => {}
             // The costs of outputs are recorded when they are finished.
@@ -240,97 +258,6 @@ impl DeviceLoop {
             }
         }
         self.queue.record_cost(id, class, charged_ms, ms_since(begin));
-    }
-
-    /// Begins a frame or an AOV.
-    fn begin_output(&mut self, command: Command, charge: Charge) {
-        let begin = Instant::now();
-        if let Some(error) = self.loss.error() {
-            return command.reply_error(error);
-        }
-        let Self { context, scenes, loss, .. } = self;
-        let (id, kind) = match command {
-            Command::Draw { id, camera, size, reply } => {
-                let draw = find_scene(scenes, id).and_then(|scene| context.begin_partial_draw(scene, &camera, size));
-                match loss.record_loss(draw) {
-                    Ok(draw) => (id, PartialKind::Frame(draw, reply)),
-                    Err(error) => return answer(reply, Err(error)),
-                }
-            }
-            Command::RenderAov { id, camera, size, frame_output, reply } => {
-                let draw =
-                    find_scene(scenes, id).and_then(|scene| context.begin_aov(scene, &camera, size, frame_output));
-                match loss.record_loss(draw) {
-                    Ok(draw) => (id, PartialKind::Aov(draw, reply)),
-                    Err(error) => return answer(reply, Err(error)),
-                }
-            }
-            _ => return,
-        };
-        let charge = Charge { spent_ms: ms_since(begin), ..charge };
-        self.continue_output(id, PartialOutput { kind, charge });
-    }
-
-    /// Submits the next step of an output with breaks, or all steps of another output. Drops an output whose caller no longer
-    /// waits.
-    fn continue_output(&mut self, id: SceneId, mut output: PartialOutput) {
-        let begin = Instant::now();
-        while !output.is_submitted() {
-            if output.is_cancelled() {
-                return;
-            }
-            let Self { context, scenes, .. } = self;
-            let step = match self.loss.error() {
-                Some(error) => Err(error),
-                None => find_scene(scenes, id).and_then(|scene| output.submit_step(context, scene)),
-            };
-            if let Err(error) = self.loss.record_loss(step) {
-                return output.reply_error(error);
-            }
-            if output.has_breaks() && !output.is_submitted() {
-                output.charge.spent_ms += ms_since(begin);
-                if !output.charge.is_recorded {
-                    let Charge { class, charged_ms, spent_ms, .. } = output.charge;
-                    self.queue.record_cost(id, class, charged_ms, spent_ms);
-                    output.charge.is_recorded = true;
-                }
-                self.queue.push_continuation(id, output.step_class());
-                self.partial_outputs.insert(id, output);
-                return;
-            }
-        }
-        output.charge.spent_ms += ms_since(begin);
-        self.finish_output(id, output);
-    }
-
-    /// Charges a scene for a finished output, which took `total_ms` in all steps.
-    fn record_output_cost(&self, id: SceneId, charge: Charge, total_ms: f64) {
-        let Charge { class, charged_ms, spent_ms, is_recorded } = charge;
-        match is_recorded {
-            true => self.queue.charge(id, total_ms - spent_ms),
-            false => self.queue.record_cost(id, class, charged_ms, total_ms),
-        }
-    }
-
-    /// Waits for an AOV and answers it. A frame is answered later.
-    fn finish_output(&mut self, id: SceneId, output: PartialOutput) {
-        let PartialOutput { kind, charge } = output;
-        match kind {
-            PartialKind::Frame(draw, reply) => {
-                let pending_draw = self.context.finish_partial_draw(draw);
-                match self.loss.record_loss(pending_draw) {
-                    Ok(draw) => self.frames.push(FrameInFlight { id, charge, draw }, reply),
-                    Err(error) => answer(reply, Err(error)),
-                }
-            }
-            PartialKind::Aov(draw, reply) => {
-                let begin = Instant::now();
-                let Self { context, scenes, .. } = self;
-                let aov = find_scene(scenes, id).and_then(|scene| context.finish_aov(scene, draw));
-                answer(reply, self.loss.record_loss(aov));
-                self.record_output_cost(id, charge, charge.spent_ms + ms_since(begin));
-            }
-        }
     }
 
     fn execute(&mut self, command: Command) {
@@ -365,6 +292,7 @@ impl DeviceLoop {
         if let Some(scene) = self.scenes.remove(&id) {
             self.context.unload_scene(scene);
         }
+        self.prepared_scenes.remove(&id);
         self.queue.forget(id);
     }
 

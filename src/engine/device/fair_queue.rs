@@ -72,6 +72,7 @@ pub(super) struct Taken<T> {
     pub class: CostClass,
     /// Milliseconds that the scene was charged.
     pub charged_ms: f64,
+    pub ticket: Ticket,
     pub work: T,
 }
 
@@ -106,6 +107,18 @@ impl<T> FairQueue<T> {
     /// Returns work that is not finished to the head of the queue of its scene.
     pub(super) fn push_front(&mut self, scene: SceneId, class: CostClass, work: T) {
         self.insert(scene, class, work, VecDeque::push_front);
+    }
+
+    /// Returns work that was taken to the head of the queue of its scene, and gives the scene its charge back.
+    pub(super) fn return_taken(&mut self, taken: Taken<T>) {
+        let Taken { scene, class, charged_ms, ticket, work } = taken;
+        self.push_front(scene, class, work);
+        if let Some(queue) = self.scenes.get_mut(&scene) {
+            queue.deficit_ms += charged_ms;
+            if let Some(head) = queue.entries.front_mut() {
+                head.ticket = ticket;
+            }
+        }
     }
 
     fn insert(
@@ -175,11 +188,11 @@ impl<T> FairQueue<T> {
 
     fn take_head(&mut self, scene: SceneId) -> Option<Taken<T>> {
         let queue = self.scenes.get_mut(&scene)?;
-        let Entry { class, work, .. } = queue.entries.pop_front()?;
+        let Entry { ticket, class, work } = queue.entries.pop_front()?;
         let charged_ms = queue.cost_ms(class);
         queue.deficit_ms -= charged_ms;
         self.leave_ring_if_empty(scene);
-        Some(Taken { scene, class, charged_ms, work })
+        Some(Taken { scene, class, charged_ms, ticket, work })
     }
 
     /// Charges a scene the measured time of work instead of `charged_ms`, and updates the estimate of its class.
@@ -283,7 +296,7 @@ mod tests {
             queue.push(2, SMALL, number);
         }
         let mut numbers = HashMap::<SceneId, Vec<u32>>::new();
-        while let Some(Taken { scene, class, charged_ms, work }) = queue.take(|_, _| true) {
+        while let Some(Taken { scene, class, charged_ms, work, .. }) = queue.take(|_, _| true) {
             queue.record_cost(scene, class, charged_ms, cost_ms(class));
             numbers.entry(scene).or_default().push(work);
             // Unfinished work continues before later work.

@@ -72,6 +72,8 @@ impl Fixture {
             fixture.run(1);
             loaded.await.expect("expected no panic").expect("expected a loaded scene");
         }
+        // The scenes begin with equal shares.
+        fixture.queue.reset_costs();
         fixture
     }
 
@@ -266,4 +268,34 @@ async fn first_frame_of_a_scene_is_drawn_in_steps() {
         }
         draw.wait().await.expect("expected a frame");
     }
+}
+
+#[tokio::test]
+async fn scene_is_prepared_in_steps() {
+    let mut fixture = Fixture::load(u64::MAX).await;
+    let (draw, cancelled_draw) = (fixture.draw(1, SMALL), fixture.draw(1, SMALL));
+    fixture.run(1);
+    // The preparation, and the frames that need it.
+    assert_eq!(fixture.queue.len(1), 3);
+    let mut deformed = fixture.handle.deform(2, &state_with_q(&fixture.scene, 0.5));
+    while !is_answered(&mut deformed).await {
+        fixture.run(1);
+    }
+    assert_eq!(fixture.queue.len(1), 3, "expected programs that are not compiled yet");
+    drop(cancelled_draw);
+    assert_eq!(fixture.queue.len(1), 2);
+    // The frame keeps its place, and can be cancelled.
+    drop(draw);
+    assert_eq!(fixture.queue.len(1), 1);
+    let draw = fixture.draw(1, SMALL);
+    while fixture.queue.len(1) > 0 {
+        fixture.run(1);
+    }
+    draw.wait().await.expect("expected a frame");
+    // The other scene uses the same programs, so its first step draws.
+    let draw = fixture.draw(2, SMALL);
+    fixture.run(1);
+    assert_eq!(fixture.queue.len(2), 1);
+    fixture.run_all();
+    draw.wait().await.expect("expected a frame");
 }

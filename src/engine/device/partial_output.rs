@@ -10,7 +10,7 @@ use super::fair_queue::CostClass;
 use super::loaded_scene::LoadedScene;
 use crate::frame::Legend;
 use modalcast_model::error::{Error, Result};
-use modalcast_render::{AovImage, FrameImage};
+use modalcast_render::{AovImage, FrameImage, ScenePreparation};
 
 /// Device time of an output.
 #[derive(Debug, Clone, Copy)]
@@ -34,6 +34,8 @@ pub(super) struct PartialOutput {
 pub(super) enum PartialKind {
     Frame(PartialDraw, Reply<FrameImage>),
     Aov(PartialAovDraw, Reply<(AovImage, Option<Legend>)>),
+    /// The textures and programs of the scene, which the next command of the scene needs.
+    Preparation(ScenePreparation),
 }
 
 impl PartialOutput {
@@ -42,6 +44,7 @@ impl PartialOutput {
         match &self.kind {
             PartialKind::Frame(_, reply) => reply.is_closed(),
             PartialKind::Aov(_, reply) => reply.is_closed(),
+            PartialKind::Preparation(_) => false,
         }
     }
 
@@ -49,6 +52,7 @@ impl PartialOutput {
         match &self.kind {
             PartialKind::Frame(draw, _) => draw.frame.is_submitted(),
             PartialKind::Aov(draw, _) => draw.aov.is_submitted(),
+            PartialKind::Preparation(preparation) => preparation.is_finished(),
         }
     }
 
@@ -57,6 +61,7 @@ impl PartialOutput {
         match &self.kind {
             PartialKind::Frame(draw, _) => draw.frame.is_divided(),
             PartialKind::Aov(draw, _) => draw.aov.is_divided(),
+            PartialKind::Preparation(_) => false,
         }
     }
 
@@ -65,6 +70,7 @@ impl PartialOutput {
         match &self.kind {
             PartialKind::Frame(draw, _) => draw.frame.has_breaks(),
             PartialKind::Aov(draw, _) => draw.aov.is_divided(),
+            PartialKind::Preparation(_) => true,
         }
     }
 
@@ -73,6 +79,14 @@ impl PartialOutput {
         match &self.kind {
             PartialKind::Frame(draw, _) => draw.frame.is_ready_within(limit),
             PartialKind::Aov(draw, _) => draw.aov.is_ready_within(limit),
+            // Can only be polled.
+            PartialKind::Preparation(preparation) => {
+                let is_ready = preparation.is_ready();
+                if !is_ready {
+                    std::thread::sleep(limit);
+                }
+                is_ready
+            }
         }
     }
 
@@ -81,6 +95,7 @@ impl PartialOutput {
         let kind = match self.kind {
             PartialKind::Frame(..) => "draw step",
             PartialKind::Aov(..) => "aov step",
+            PartialKind::Preparation(_) => "load step",
         };
         CostClass { kind, ..self.charge.class }
     }
@@ -91,17 +106,20 @@ impl PartialOutput {
         match self.kind {
             PartialKind::Frame(_, reply) => reply.send(Err(error)).map_err(drop).ok(),
             PartialKind::Aov(_, reply) => reply.send(Err(error)).map_err(drop).ok(),
+            // The next command of the scene prepares it again, and returns the error.
+            PartialKind::Preparation(_) => None,
         };
     }
 
-    /// Submits the next step.
+    /// Submits the next step. `scene` is the loaded scene, or the error if it is not loaded.
     ///
     /// # Errors
     /// `Fault` of OpenGL. The output must then be dropped.
-    pub(super) fn submit_step(&mut self, context: &mut DeviceContext, scene: &LoadedScene) -> Result<()> {
+    pub(super) fn submit_step(&mut self, context: &mut DeviceContext, scene: Result<&LoadedScene>) -> Result<()> {
         match &mut self.kind {
-            PartialKind::Frame(draw, _) => context.submit_draw_step(scene, draw),
-            PartialKind::Aov(draw, _) => context.submit_aov_band(scene, draw),
+            PartialKind::Frame(draw, _) => context.submit_draw_step(scene?, draw),
+            PartialKind::Aov(draw, _) => context.submit_aov_band(scene?, draw),
+            PartialKind::Preparation(preparation) => context.prepare_step(preparation),
         }
     }
 }

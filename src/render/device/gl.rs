@@ -18,6 +18,7 @@ mod fullscreen;
 mod indirect;
 mod limits;
 mod object;
+mod program;
 mod staging;
 mod timer;
 
@@ -34,6 +35,7 @@ pub(crate) use self::debug::is_enabled as is_debug_enabled;
 pub(crate) use self::fence::Fence;
 pub(crate) use self::limits::Limits;
 pub(crate) use self::object::{Buffer, Framebuffer, Program, Texture, TextureDesc, VertexArray};
+pub(crate) use self::program::PendingProgram;
 pub(crate) use self::staging::{ReadbackView, StagingBuffer};
 pub(crate) use self::timer::PassTimer;
 use super::egl::{Context, CurrentContext};
@@ -359,29 +361,6 @@ impl Gl {
             gl.tex_buffer(target, format, Some(buffer.name()));
         }
         self.check("texture").map(|()| texture)
-    }
-
-    /// Compiles and links a program from pairs of shader stage and source.
-    pub(crate) fn program(self: &Rc<Self>, label: &str, stages: &[(u32, &str)]) -> Result<Program> {
-        let gl = self.functions()?;
-        let to_fault = |log: String| fault("shader", format!("{label}: {log}"));
-        // SAFETY: new objects; the shaders are flagged for deletion and live until the program is deleted.
-        unsafe {
-            let name = gl.create_program().map_err(fault_in("shader"))?;
-            let program = Program { gl: Rc::clone(self), name };
-            for (stage, source) in stages {
-                let shader = gl.create_shader(*stage).map_err(fault_in("shader"))?;
-                gl.shader_source(shader, source);
-                gl.compile_shader(shader);
-                gl.attach_shader(name, shader);
-                gl.delete_shader(shader);
-                if !gl.get_shader_compile_status(shader) {
-                    return Err(to_fault(gl.get_shader_info_log(shader)));
-                }
-            }
-            gl.link_program(name);
-            if gl.get_program_link_status(name) { Ok(program) } else { Err(to_fault(gl.get_program_info_log(name))) }
-        }
     }
 
     /// Creates a framebuffer with a depth attachment and an optional color attachment. Each is a complete texture.

@@ -15,7 +15,7 @@ use super::visibility::{IdDraw, draw_ground, draw_ids};
 use crate::device::gl::{self, Buffer, ClearOp, Fence, Gl, PassTimer, Program};
 use crate::layout::VALUE_UNIT;
 use crate::pass::{FrameTimes, Pass, RenderStage};
-use crate::region::{Band, Region};
+use crate::region::{Band, BandLimit, Region};
 use crate::resources::programs::ProgramCache;
 use crate::resources::scene_buffers::SceneBuffers;
 use crate::resources::target_desc::TargetDesc;
@@ -172,7 +172,7 @@ impl AovReader {
         Self { gl: Rc::clone(gl), target: None }
     }
 
-    /// Begins to read a field for the current content of the scene's buffers, in bands of at most `max_samples` samples.
+    /// Begins to read a field for the current content of the scene's buffers, in bands within `band_limit`.
     ///
     /// # Errors
     /// `Invalid` for a camera whose matrices overflow; `Fault` if no values were uploaded or OpenGL reports an error.
@@ -182,7 +182,7 @@ impl AovReader {
         buffers: &SceneBuffers,
         params: &FrameParams,
         field: Aov,
-        max_samples: u64,
+        band_limit: BandLimit,
     ) -> Result<PartialAov> {
         let samples = if matches!(field, Aov::Values { .. }) { buffers.scene.look.samples_per_pixel() } else { 1 };
         let size = [params.width, params.height];
@@ -198,7 +198,7 @@ impl AovReader {
             return Err(fault("aov", "no values were uploaded"));
         }
         let target = self.take_target(desc, words_per_pixel)?;
-        let bands = VecDeque::from(Band::divide(size, max_samples / u64::from(desc.samples)));
+        let bands = VecDeque::from(Band::divide(size, band_limit.max_pixels(desc.samples)));
         let (is_divided, params) = (bands.len() > 1, *params);
         let (timers, fence) = (Vec::new(), None);
         Ok(PartialAov { field, params, uniforms, mask, program, target, bands, is_divided, timers, fence })

@@ -60,7 +60,8 @@ fn draw_second_frame(scene: &Arc<Scene>, (original, replacement): (&str, &str)) 
         }
         renderer.programs.program(source)
     };
-    let buffers = SceneBuffers::new(&gl, scene, &sample_positions, BlurMethod::Auto, compile).expect("loads");
+    let buffers = SceneBuffers::new(&gl, scene, &sample_positions, BlurMethod::Auto, [Vec::new(), Vec::new()], compile)
+        .expect("loads");
     assert!(has_original, "expected '{original}' in the shader");
     let corners = scene.shapes[0].mesh.corners();
     let (positions, normals) = (scene.shapes[0].mesh.rest_positions().as_flattened(), corners.normals.as_flattened());

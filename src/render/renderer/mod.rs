@@ -4,6 +4,7 @@ mod autotune;
 mod frame;
 mod partial_frame;
 mod pending_frame;
+mod preparation;
 
 #[cfg(test)]
 mod band_tests;
@@ -14,16 +15,21 @@ mod oit_tests;
 #[cfg(test)]
 mod tests;
 
+use std::num::NonZero;
 use std::rc::Rc;
 use std::sync::Arc;
 use std::time::Duration;
 
+use rayon::{ThreadPool, ThreadPoolBuilder};
+
 pub use self::partial_frame::PartialFrame;
 pub use self::pending_frame::{MappedPixels, PendingFrame};
+pub use self::preparation::ScenePreparation;
 use crate::device::{self, gl, gl::Gl};
 use crate::passes::aov::{Aov, AovImage, AovReader, PartialAov};
 use crate::passes::picking::{PendingPick, PickHit, Picker};
 use crate::passes::{PassRecorder, readback};
+use crate::region::BandLimit;
 use crate::resources::programs::ProgramCache;
 use crate::resources::scene_buffers::{RebasedPositions, SceneBuffers, VertexValues};
 use crate::resources::target::RenderTarget;
@@ -32,7 +38,7 @@ use crate::shaders;
 use crate::types::{BlurMethod, DevicePreference, FrameParams, FrameStats, RendererInfo, VisibilityId};
 use crate::uniforms::frame::FrameUniforms;
 use modalcast_model::deform::DeformedSurface;
-use modalcast_model::error::{Result, fault, invalid};
+use modalcast_model::error::{Result, fault, fault_in, invalid};
 use modalcast_model::raster::{RasterGeometry, Rasterizer};
 use modalcast_model::scene::{PixelRect, Scene};
 
@@ -42,11 +48,12 @@ const MAX_SIDE: u32 = 8192;
 const MAX_TARGETS: usize = 4;
 /// Maximum time that dropping a renderer waits for each thread that still copies pixels.
 const READER_TIMEOUT: Duration = Duration::from_secs(1);
-/// Maximum number of samples (pixels times samples per pixel) that hardware draws without a break: a frame of 3840 x 2160
-/// pixels with four samples each.
-const MAX_BAND_SAMPLES: u64 = 1 << 25;
-/// The same for a software renderer: a frame of 1920 x 1080 pixels with four samples each.
-const MAX_SOFTWARE_BAND_SAMPLES: u64 = 1 << 23;
+/// What hardware draws without a break: a frame of 3840 x 2160 pixels with four samples each. The cost of a large frame is
+/// that of its samples.
+const HARDWARE_BAND_LIMIT: BandLimit = BandLimit { max_pixels: u64::MAX, max_samples: 1 << 25 };
+/// What a software renderer draws without a break: a frame of 1920 x 1080 pixels. Most of the cost is that of shading each
+/// pixel once.
+const SOFTWARE_BAND_LIMIT: BandLimit = BandLimit { max_pixels: 1 << 21, max_samples: u64::MAX };
 /// Time limit for one frame.
 const FRAME_TIMEOUT: Duration = Duration::from_secs(60);
 
@@ -66,7 +73,12 @@ pub struct Renderer {
     /// The last frame that was submitted without an error.
     last_frame: Option<LastFrame>,
     frame_timeout: Duration,
-    max_band_samples: u64,
+    band_limit: BandLimit,
+    /// Threads that compute mipmap levels: few, because they compete with the threads of a software renderer and with
+    /// the deformer.
+    preparation_pool: ThreadPool,
+    /// Scenes that are prepared and not loaded yet.
+    prepared_scenes: Vec<preparation::PreparedScene>,
     picker: Picker,
     aov_reader: AovReader,
     /// The pass in which a test makes every frame panic.
@@ -99,7 +111,15 @@ impl Renderer {
             cuda_device,
             max_side: gl.limits.max_side.min(MAX_SIDE),
         };
+        let cores = std::thread::available_parallelism().map_or(1, NonZero::get);
+        let preparation_pool = ThreadPoolBuilder::new()
+            .num_threads((cores / 2).max(1))
+            .thread_name(|index| format!("textures {index}"))
+            .build()
+            .map_err(fault_in("threads that compute mipmap levels"))?;
         Ok(Self {
+            preparation_pool,
+            prepared_scenes: Vec::new(),
             info,
             programs: ProgramCache::new(&gl),
             sample_positions: sample_positions(&gl)?,
@@ -108,7 +128,7 @@ impl Renderer {
             stats: FrameStats::default(),
             last_frame: None,
             frame_timeout: FRAME_TIMEOUT,
-            max_band_samples: if gl.limits.software { MAX_SOFTWARE_BAND_SAMPLES } else { MAX_BAND_SAMPLES },
+            band_limit: if gl.limits.software { SOFTWARE_BAND_LIMIT } else { HARDWARE_BAND_LIMIT },
             picker: Picker::new(&gl),
             aov_reader: AovReader::new(&gl),
             #[cfg(test)]
@@ -133,21 +153,16 @@ impl Renderer {
     }
 
     /// Sets the maximum number of samples (pixels times samples per pixel) that are drawn without a break. Larger frames
-    /// and AOVs are divided into bands of rows. The pixels do not depend on the bands. The default depends only on
-    /// whether the renderer is a software renderer.
+    /// and AOVs are divided into bands of rows. The pixels do not depend on the bands. By default, hardware draws 2^25
+    /// samples without a break, and a software renderer 2^21 pixels.
     pub fn set_max_band_samples(&mut self, max_band_samples: u64) {
-        self.max_band_samples = max_band_samples;
-    }
-
-    /// The maximum number of samples that are drawn without a break.
-    pub(crate) const fn max_band_samples(&self) -> u64 {
-        self.max_band_samples
+        self.band_limit = BandLimit { max_pixels: u64::MAX, max_samples: max_band_samples };
     }
 
     /// Whether an output of this size is divided into bands, if the device supports this number of samples per pixel.
     pub fn is_divided(&self, [width, height]: [u32; 2], samples: u32) -> bool {
         let samples = TargetDesc::ids_and_depth(&self.gl, [width, height], samples).samples;
-        u64::from(samples) * u64::from(width) * u64::from(height) > self.max_band_samples
+        u64::from(width) * u64::from(height) > self.band_limit.max_pixels(samples)
     }
 
     /// Uploads the static data of a scene and allocates the buffers of the deformed data.
@@ -156,8 +171,9 @@ impl Renderer {
     /// `Invalid` if the scene exceeds a limit of the device; `Fault` if a shader or a buffer cannot be created.
     pub fn load(&mut self, scene: &Arc<Scene>) -> Result<SceneBuffers> {
         let _current = self.gl.make_current()?;
+        let textures = self.textures_of(scene)?;
         let compile = &mut |source| self.programs.program(source);
-        let buffers = SceneBuffers::new(&self.gl, scene, &self.sample_positions, self.blur_method, compile)?;
+        let buffers = SceneBuffers::new(&self.gl, scene, &self.sample_positions, self.blur_method, textures, compile)?;
         self.gl.check("load").map(|()| buffers)
     }
 
@@ -290,7 +306,7 @@ impl Renderer {
     pub fn begin_aov(&mut self, buffers: &SceneBuffers, params: &FrameParams, field: Aov) -> Result<PartialAov> {
         let _current = self.gl.make_current()?;
         self.check_size(params)?;
-        self.aov_reader.begin(&mut self.programs, buffers, params, field, self.max_band_samples)
+        self.aov_reader.begin(&mut self.programs, buffers, params, field, self.band_limit)
     }
 
     /// Submits the next band of an AOV field.

@@ -1,6 +1,6 @@
 //! Frames that are submitted in steps. Between two steps, the device can execute commands of other scenes.
 //!
-//! A frame of at most [`Renderer::max_band_samples`] samples has one step for each pass, and is meant to be submitted
+//! A frame within the limit of [`Renderer::set_max_band_samples`] has one step for each pass, and is meant to be submitted
 //! without a break, unless it is the first one of its scene: drivers finish the compilation of a program when it is used
 //! for the first time. A larger frame is divided into bands of rows. Its steps are the passes that work on the complete
 //! frame, and each band of the other passes. A pass ends with its last band before the next pass begins, so the inputs of
@@ -146,7 +146,7 @@ impl Renderer {
         let draws_ground = must_draw_ground(buffers, params);
         target.draw_region.set(draw_region(buffers, params, draws_ground));
         let is_divided = self.is_divided(size, desc.samples);
-        let steps = plan_steps(&target, draws_ground, slot.is_some(), self.max_band_samples());
+        let steps = plan_steps(&target, draws_ground, slot.is_some(), self.band_limit.max_pixels(desc.samples));
         Ok(PartialFrame {
             params: *params,
             uniforms,
@@ -323,10 +323,10 @@ fn record(
     }
 }
 
-/// The steps of a frame. Bands have at most `max_samples` samples.
-fn plan_steps(target: &RenderTarget, draws_ground: bool, has_readback: bool, max_samples: u64) -> VecDeque<Step> {
-    let TargetDesc { width, height, samples, .. } = target.desc;
-    let bands = Band::divide([width, height], max_samples / u64::from(samples));
+/// The steps of a frame. Bands have at most `max_pixels` pixels.
+fn plan_steps(target: &RenderTarget, draws_ground: bool, has_readback: bool, max_pixels: u64) -> VecDeque<Step> {
+    let TargetDesc { width, height, .. } = target.desc;
+    let bands = Band::divide([width, height], max_pixels);
     let of_bands = |pass: fn(Band) -> BandPass| bands.iter().copied().map(pass);
     let mut visibility: Vec<BandPass> = of_bands(BandPass::Visibility).collect();
     visibility.push(BandPass::RecordVisible);
@@ -339,7 +339,7 @@ fn plan_steps(target: &RenderTarget, draws_ground: bool, has_readback: bool, max
         (None, None) => Vec::new(),
     };
     let bloom = passes::post::bloom_steps(target).flat_map(|(step, image)| {
-        let bands = Band::divide([image.desc.width, image.desc.height], max_samples / u64::from(samples));
+        let bands = Band::divide([image.desc.width, image.desc.height], max_pixels);
         bands.into_iter().map(move |band| BandPass::Bloom(step, band))
     });
     let mut groups = vec![

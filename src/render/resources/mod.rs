@@ -11,4 +11,4 @@ pub(crate) mod shadow_cache;
 pub(crate) mod shadow_map;
 pub(crate) mod target;
 pub(crate) mod target_desc;
-mod texture_arrays;
+pub(crate) mod texture_arrays;

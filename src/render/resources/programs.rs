@@ -3,7 +3,7 @@
 use std::collections::HashMap;
 use std::rc::Rc;
 
-use crate::device::gl::{Gl, Program};
+use crate::device::gl::{Gl, PendingProgram, Program};
 use crate::scene_data::geometry::{BlendMode, DrawGroup};
 use crate::shaders::{self, ProgramSource, ShaderOptions};
 use modalcast_model::error::Result;
@@ -120,14 +120,36 @@ impl ProgramCache {
         if let Some(program) = self.programs.get(&source) {
             return Ok(Rc::clone(program));
         }
+        let pending = self.begin(&source)?;
+        self.finish(source, pending)
+    }
+
+    /// Whether the program of a source is cached.
+    pub(crate) fn contains(&self, source: &ProgramSource) -> bool {
+        self.programs.contains_key(source)
+    }
+
+    /// Begins to compile the program of a source that is not cached.
+    ///
+    /// # Errors
+    /// `Fault` of OpenGL.
+    pub(crate) fn begin(&self, source: &ProgramSource) -> Result<PendingProgram> {
+        let stages: Vec<(u32, &str)> = source.stages.iter().map(|(stage, text)| (*stage, text.as_str())).collect();
+        self.gl.begin_program(&source.label, &stages)
+    }
+
+    /// Waits for the program of a source and caches it.
+    ///
+    /// # Errors
+    /// `Fault` with the compiler's log.
+    pub(crate) fn finish(&mut self, source: ProgramSource, pending: PendingProgram) -> Result<Rc<Program>> {
+        let program = Rc::new(pending.finish()?);
         if self.programs.len() >= MAX_PROGRAMS {
             self.programs.retain(|_, program| Rc::strong_count(program) > 1);
         }
         if self.programs.len() >= MAX_PROGRAMS {
             self.programs.clear();
         }
-        let stages: Vec<(u32, &str)> = source.stages.iter().map(|(stage, text)| (*stage, text.as_str())).collect();
-        let program = Rc::new(self.gl.program(&source.label, &stages)?);
         self.programs.insert(source, Rc::clone(&program));
         Ok(program)
     }

@@ -10,7 +10,6 @@ use super::programs::{PostPrograms, ProgramCompiler, SampleCountPrograms, SceneP
 use super::raster_mesh;
 use super::shadow_cache::{ShadowCache, ShadowKey};
 use super::shadow_map::ShadowMap;
-use super::texture_arrays::upload_arrays;
 use crate::device::gl::{self, Buffer, Gl, Program, Texture, VertexArray, VertexAttribute};
 use crate::layout::material::{PackedMaterial, pack_materials};
 use crate::layout::{
@@ -18,12 +17,13 @@ use crate::layout::{
     TRIANGLE_VERTEX_UNIT, UV_UNIT,
 };
 use crate::plan::buffers::{BufferName, GeometryBuffers, MaterialBuffers, SceneBufferSet, UniformBuffers};
+use crate::plan::features::ShaderFeatures;
 use crate::plan::{Allocation, RenderPlan, ScenePlan};
 use crate::scene_data::geometry::{
-    BlendMode, DrawGroup, Geometry, TriangleSpan, blend_mode, locate_triangle, used_materials,
+    BlendMode, DrawGroup, Geometry, TriangleSpan, blend_mode, groups, locate_triangle, used_materials,
 };
 use crate::scene_data::textures::{TextureArray, TextureRole, arrays, check_texture_budget, find_layer};
-use crate::shaders::{MaterialUse, ShaderOptions, post};
+use crate::shaders::{MaterialUse, ProgramSource, ShaderOptions, post};
 use crate::types::{BlurMethod, FrameParams};
 use modalcast_model::error::Result;
 use modalcast_model::raster::{GlVertexBuffers, RasterGeometry, Rasterizer};
@@ -116,13 +116,62 @@ pub(crate) struct BufferTextures {
     pub(crate) unit_views: Vec<(u32, Texture)>,
 }
 
+/// Passes the sources of all programs of a scene to `collect`. `placeholder` stands for each program.
+///
+/// # Errors
+/// `Invalid` if the scene exceeds a limit of the device.
+pub(crate) fn collect_program_sources(
+    gl: &Gl,
+    scene: &Scene,
+    sample_positions: &[[f32; 2]],
+    blur_method: BlurMethod,
+    placeholder: &Rc<Program>,
+) -> Result<Vec<ProgramSource>> {
+    let features = ScenePlan::new(scene, &gl.limits, blur_method).features;
+    let texture_arrays = [arrays(scene, TextureRole::Color), arrays(scene, TextureRole::Normal)];
+    check_texture_limits(gl, scene, &texture_arrays)?;
+    let options = shader_options(gl, scene, features, &texture_arrays, sample_positions);
+    let (groups, _) = groups(scene);
+    let mut sources = Vec::new();
+    let collect = &mut |source| {
+        sources.push(source);
+        Ok(Rc::clone(placeholder))
+    };
+    ScenePrograms::compile(&options, &groups, collect)?;
+    PostPrograms::compile(&scene.look, collect)?;
+    SampleCountPrograms::compile(&options, &groups, samples_of(scene, sample_positions), collect)?;
+    Ok(sources)
+}
+
+fn shader_options(
+    gl: &Gl,
+    scene: &Scene,
+    features: ShaderFeatures,
+    texture_arrays: &[Vec<TextureArray>; 2],
+    sample_positions: &[[f32; 2]],
+) -> ShaderOptions {
+    ShaderOptions {
+        features,
+        used_materials: material_uses(scene, texture_arrays),
+        sample_positions: sample_positions.to_vec(),
+        sample_resolve: post::sample_resolve(&scene.look),
+        post_depth_coverage: gl.limits.post_depth_coverage,
+    }
+}
+
+/// Samples per pixel of the look. A device without 4x multisampling has no sample positions, and one sample per pixel.
+fn samples_of(scene: &Scene, sample_positions: &[[f32; 2]]) -> u32 {
+    if sample_positions.is_empty() { 1 } else { scene.look.samples_per_pixel() }
+}
+
 impl SceneBuffers {
-    /// Creates the resources that the scene's plan lists. `compile` may return programs that other scenes share.
+    /// Creates the resources that the scene's plan lists. `textures`: the texture arrays of colors and of normals. `compile` may return programs that other scenes share.
     pub(crate) fn new(
         gl: &Rc<Gl>,
         scene: &Arc<Scene>,
         sample_positions: &[[f32; 2]],
         blur_method: BlurMethod,
+        textures: [Vec<Texture>; 2],
         compile: &mut ProgramCompiler<'_>,
     ) -> Result<Self> {
         let ScenePlan { buffers: sizes, features, report: plan } = ScenePlan::new(scene, &gl.limits, blur_method);
@@ -135,15 +184,8 @@ impl SceneBuffers {
         let mut plan_allocations: Vec<Allocation> = buffers.named().map(allocation).collect();
         plan_allocations.sort_by(|a, b| a.name.cmp(&b.name));
         let SceneBufferSet { geometry, materials, uniforms, culling } = buffers;
-        let options = ShaderOptions {
-            features,
-            used_materials: material_uses(scene, &texture_arrays),
-            sample_positions: sample_positions.to_vec(),
-            sample_resolve: post::sample_resolve(&scene.look),
-            post_depth_coverage: gl.limits.post_depth_coverage,
-        };
-        // A device without 4x multisampling has no sample positions.
-        let samples = if sample_positions.is_empty() { 1 } else { scene.look.samples_per_pixel() };
+        let options = shader_options(gl, scene, features, &texture_arrays, sample_positions);
+        let samples = samples_of(scene, sample_positions);
         let cull_resources = match culling {
             Some(culling) => {
                 let arrays = CullVertexArrays {
@@ -154,7 +196,7 @@ impl SceneBuffers {
             }
             None => None,
         };
-        let [color_arrays, normal_arrays] = &texture_arrays;
+        let [color_arrays, normal_arrays] = textures;
         Ok(Self {
             compute_rasterizer: None,
             scene: Arc::clone(scene),
@@ -166,8 +208,8 @@ impl SceneBuffers {
             _materials: materials,
             uniforms,
             empty_vertex_array: gl.vertex_array(None, &[])?,
-            color_arrays: upload_arrays(gl, scene, color_arrays, TextureRole::Color)?,
-            normal_arrays: upload_arrays(gl, scene, normal_arrays, TextureRole::Normal)?,
+            color_arrays,
+            normal_arrays,
             shadow: features.shadow.map(|shadow| ShadowMap::new(gl, shadow, features.blur_method)).transpose()?,
             shadow_cache: ShadowCache::default(),
             programs: ScenePrograms::compile(&options, &mesh.groups, compile)?,

@@ -1,29 +1,124 @@
-//! Uploads texture arrays with their mipmap levels.
+//! Uploads texture arrays with their mipmap levels, layer by layer. Other threads compute the mipmap levels.
 
+use std::collections::VecDeque;
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::rc::Rc;
+use std::sync::{Arc, OnceLock};
 
-use rayon::prelude::*;
+use rayon::ThreadPool;
 
 use crate::device::gl::{self, Gl, Texture, TextureDesc};
-use crate::scene_data::textures::{TextureArray, TextureRole, cutoff, mip_levels};
-use modalcast_model::error::Result;
+use crate::scene_data::textures::{TextureArray, TextureRole, arrays, cutoff, mip_levels};
+use modalcast_model::error::{Result, fault};
 use modalcast_model::scene::Scene;
 
-/// Layers whose mipmap levels are computed at once. Few, because mipmap chains take much host memory.
-const LAYERS_PER_CHUNK: usize = 8;
+/// Layers whose mipmap levels are computed or wait for their upload. Few, because mipmap levels take much host memory.
+const MAX_LAYERS_IN_FLIGHT: usize = 8;
 
-/// Creates and fills the texture arrays of one role.
-pub(crate) fn upload_arrays(
-    gl: &Rc<Gl>,
-    scene: &Scene,
-    arrays: &[TextureArray],
-    role: TextureRole,
-) -> Result<Vec<Texture>> {
-    arrays.iter().map(|array| upload_array(gl, scene, array, role)).collect()
+/// RGBA8 pixels of the levels of a layer, level 0 first; none if the computation panicked.
+type MipLevels = Option<Vec<Vec<u8>>>;
+
+/// Texture arrays of both roles. The layers are filled one by one.
+#[derive(Debug)]
+pub(crate) struct TextureUpload {
+    scene: Arc<Scene>,
+    /// The arrays of colors, then those of normals.
+    arrays: [Vec<TextureArray>; 2],
+    textures: [Vec<Texture>; 2],
+    /// Layers whose mipmap levels are not computed yet.
+    remaining: VecDeque<Layer>,
+    /// Layers whose mipmap levels are computed or being computed, in the order of their upload.
+    in_flight: VecDeque<(Layer, Arc<OnceLock<MipLevels>>)>,
 }
 
-/// Creates a texture array and fills all mipmap levels of its layers.
-fn upload_array(gl: &Rc<Gl>, scene: &Scene, array: &TextureArray, role: TextureRole) -> Result<Texture> {
+/// A layer of a texture array.
+#[derive(Debug, Clone, Copy)]
+struct Layer {
+    role: TextureRole,
+    array: usize,
+    layer: usize,
+}
+
+impl TextureUpload {
+    /// Creates the texture arrays of a scene. The content of their layers is undefined.
+    ///
+    /// # Errors
+    /// `Invalid` if an array has too many layers for the device; `Fault` of OpenGL.
+    pub(crate) fn begin(gl: &Rc<Gl>, scene: &Arc<Scene>, pool: &ThreadPool) -> Result<Self> {
+        let roles = [TextureRole::Color, TextureRole::Normal];
+        let arrays = roles.map(|role| arrays(scene, role));
+        let create = |role: TextureRole| {
+            arrays[role as usize].iter().map(|array| create_array(gl, array, role)).collect::<Result<Vec<_>>>()
+        };
+        let textures = [create(TextureRole::Color)?, create(TextureRole::Normal)?];
+        let layers_of = |role: TextureRole| {
+            let arrays = arrays[role as usize].iter().enumerate();
+            arrays.flat_map(move |(array, desc)| (0..desc.layers.len()).map(move |layer| Layer { role, array, layer }))
+        };
+        let remaining = roles.into_iter().flat_map(layers_of).collect();
+        let mut upload = Self { scene: Arc::clone(scene), arrays, textures, remaining, in_flight: VecDeque::new() };
+        upload.compute_ahead(pool);
+        Ok(upload)
+    }
+
+    /// Whether all layers are filled.
+    pub(crate) fn is_finished(&self) -> bool {
+        self.in_flight.is_empty()
+    }
+
+    /// Whether the mipmap levels of the next layer are computed.
+    pub(crate) fn is_ready(&self) -> bool {
+        self.in_flight.front().is_none_or(|(_, levels)| levels.get().is_some())
+    }
+
+    /// Fills the next layer. Waits until its mipmap levels are computed.
+    ///
+    /// # Errors
+    /// `Fault` if the computation panicked or OpenGL fails.
+    pub(crate) fn upload_layer(&mut self, pool: &ThreadPool) -> Result<()> {
+        let Some((Layer { role, array, layer }, levels)) = self.in_flight.pop_front() else { return Ok(()) };
+        self.compute_ahead(pool);
+        let levels = levels.wait().as_ref().ok_or_else(|| fault("textures", "computing mipmap levels panicked"))?;
+        let (desc, texture) = (&self.arrays[role as usize][array], &self.textures[role as usize][array]);
+        for (level, rgba) in levels.iter().enumerate() {
+            let size = [(desc.width >> level).max(1), (desc.height >> level).max(1)];
+            texture.upload_pixels(level as u32, layer as u32, size, rgba)?;
+        }
+        Ok(())
+    }
+
+    /// The textures of colors and of normals, after all layers were filled.
+    pub(crate) fn into_textures(self) -> [Vec<Texture>; 2] {
+        self.textures
+    }
+
+    /// Begins to compute the mipmap levels of the next layers.
+    fn compute_ahead(&mut self, pool: &ThreadPool) {
+        while self.in_flight.len() < MAX_LAYERS_IN_FLIGHT {
+            let Some(layer) = self.remaining.pop_front() else { return };
+            let levels = Arc::new(OnceLock::new());
+            let (scene, result) = (Arc::clone(&self.scene), Arc::downgrade(&levels));
+            let array = self.arrays[layer.role as usize][layer.array].clone();
+            pool.spawn(move || {
+                // Nobody waits for the levels of a dropped upload.
+                if let Some(result) = result.upgrade() {
+                    let compute = || compute_levels(&scene, &array, layer);
+                    result.set(catch_unwind(AssertUnwindSafe(compute)).ok()).ok();
+                }
+            });
+            self.in_flight.push_back((layer, levels));
+        }
+    }
+}
+
+fn compute_levels(scene: &Scene, array: &TextureArray, layer: Layer) -> Vec<Vec<u8>> {
+    let index = array.layers[layer.layer];
+    let cutoff = if layer.role == TextureRole::Color { cutoff(scene, index) } else { None };
+    mip_levels(&scene.textures[index], array, layer.role, cutoff)
+}
+
+/// Creates a texture array without content.
+fn create_array(gl: &Rc<Gl>, array: &TextureArray, role: TextureRole) -> Result<Texture> {
     let layer_count = array.layers.len() as u32;
     if layer_count > gl.limits.max_layers {
         let field = format!("textures of {} x {}", array.width, array.height);
@@ -37,21 +132,6 @@ fn upload_array(gl: &Rc<Gl>, scene: &Scene, array: &TextureArray, role: TextureR
         depth: layer_count,
         levels: array.levels(),
     })?;
-    for (chunk_index, texture_indices) in array.layers.chunks(LAYERS_PER_CHUNK).enumerate() {
-        let build_chain = |index: &usize| {
-            let cutoff = if role == TextureRole::Color { cutoff(scene, *index) } else { None };
-            mip_levels(&scene.textures[*index], array, role, cutoff)
-        };
-        // RGBA8 pixels of each layer and level.
-        let chains: Vec<Vec<Vec<u8>>> = texture_indices.par_iter().map(build_chain).collect();
-        for (index_in_chunk, chain) in chains.iter().enumerate() {
-            let layer = (LAYERS_PER_CHUNK * chunk_index + index_in_chunk) as u32;
-            for (level, rgba) in chain.iter().enumerate() {
-                let size = [(array.width >> level).max(1), (array.height >> level).max(1)];
-                texture.upload_pixels(level as u32, layer, size, rgba)?;
-            }
-        }
-    }
     // With a software rasterizer, blending two mipmap levels takes a sixth of the frame time and is hardly visible.
     let min_filter = if gl.limits.software { gl::LINEAR_MIPMAP_NEAREST } else { gl::LINEAR_MIPMAP_LINEAR };
     let sampling = [

@@ -32,6 +32,8 @@ pub(crate) struct Limits {
     pub(crate) max_storage_bytes: u64,
     /// Whether fragment shaders can read their coverage after the depth test.
     pub(crate) post_depth_coverage: bool,
+    /// Whether threads of the driver compile programs (`GL_KHR_parallel_shader_compile`).
+    pub(crate) parallel_compile: bool,
     /// Whether buffers can stay mapped while the device writes them (OpenGL 4.4).
     pub(crate) persistent_mapping: bool,
     /// Number of fractional bits of a vertex position in pixels; OpenGL guarantees 4.
@@ -69,6 +71,9 @@ impl Limits {
                 max_layers: parameter(glow::MAX_ARRAY_TEXTURE_LAYERS),
                 max_texels: u64::from(parameter(glow::MAX_TEXTURE_BUFFER_SIZE)),
                 max_storage_bytes: u64::from(parameter(glow::MAX_SHADER_STORAGE_BLOCK_SIZE)),
+                parallel_compile: ["GL_KHR_parallel_shader_compile", "GL_ARB_parallel_shader_compile"]
+                    .iter()
+                    .any(|name| gl.supported_extensions().contains(*name)),
                 persistent_mapping: has_persistent_mapping(gl),
                 subpixel_bits: parameter(SUBPIXEL_BITS),
                 post_depth_coverage: gl.supported_extensions().contains("GL_ARB_post_depth_coverage"),

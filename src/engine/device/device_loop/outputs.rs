@@ -1,0 +1,120 @@
+//! Frames and AOVs (arbitrary output variables), and the preparation of their scenes, in steps.
+
+use std::sync::Arc;
+use std::time::Instant;
+
+use super::{DeviceLoop, FrameInFlight, answer, find_scene};
+use crate::engine::device::command::{Command, SceneId};
+use crate::engine::device::partial_output::{Charge, PartialKind, PartialOutput};
+use crate::telemetry::ms_since;
+use modalcast_render::ScenePreparation;
+
+impl DeviceLoop {
+    /// Begins to prepare the textures and programs that a command needs to create the OpenGL buffers of its scene. `None`
+    /// if nothing is to prepare. A scene is prepared only once, so that a failure is reported by the command.
+    pub(super) fn begin_preparation(&mut self, command: &Command) -> Option<ScenePreparation> {
+        let id = command.scene();
+        let scene = match command {
+            Command::LoadScene { scene, .. } if self.context.creates_buffers_at_load() => Arc::clone(scene),
+            Command::Draw { .. } | Command::RenderAov { .. } | Command::Pick { .. } if !command.is_cancelled() => {
+                let loaded_scene = self.scenes.get(&id).filter(|scene| scene.buffers().is_err())?;
+                Arc::clone(loaded_scene.scene())
+            }
+            _ => return None,
+        };
+        let is_first = self.loss.error().is_none() && self.prepared_scenes.insert(id);
+        if is_first { self.context.begin_preparation(&scene) } else { None }
+    }
+
+    /// Begins a frame or an AOV.
+    pub(super) fn begin_output(&mut self, command: Command, charge: Charge) {
+        let begin = Instant::now();
+        if let Some(error) = self.loss.error() {
+            return command.reply_error(error);
+        }
+        let Self { context, scenes, loss, .. } = self;
+        let (id, kind) = match command {
+            Command::Draw { id, camera, size, reply } => {
+                let draw = find_scene(scenes, id).and_then(|scene| context.begin_partial_draw(scene, &camera, size));
+                match loss.record_loss(draw) {
+                    Ok(draw) => (id, PartialKind::Frame(draw, reply)),
+                    Err(error) => return answer(reply, Err(error)),
+                }
+            }
+            Command::RenderAov { id, camera, size, frame_output, reply } => {
+                let draw =
+                    find_scene(scenes, id).and_then(|scene| context.begin_aov(scene, &camera, size, frame_output));
+                match loss.record_loss(draw) {
+                    Ok(draw) => (id, PartialKind::Aov(draw, reply)),
+                    Err(error) => return answer(reply, Err(error)),
+                }
+            }
+            _ => return,
+        };
+        let charge = Charge { spent_ms: ms_since(begin), ..charge };
+        self.continue_output(id, PartialOutput { kind, charge });
+    }
+
+    /// Submits the next step of an output with breaks, or all steps of another output. Drops an output whose caller no longer
+    /// waits.
+    pub(super) fn continue_output(&mut self, id: SceneId, mut output: PartialOutput) {
+        let begin = Instant::now();
+        while !output.is_submitted() {
+            if output.is_cancelled() {
+                return;
+            }
+            let Self { context, scenes, .. } = self;
+            let step = match self.loss.error() {
+                Some(error) => Err(error),
+                None => output.submit_step(context, find_scene(scenes, id).map(|scene| &*scene)),
+            };
+            if let Err(error) = self.loss.record_loss(step) {
+                return output.reply_error(error);
+            }
+            if output.has_breaks() && !output.is_submitted() {
+                output.charge.spent_ms += ms_since(begin);
+                if !output.charge.is_recorded {
+                    let Charge { class, charged_ms, spent_ms, .. } = output.charge;
+                    self.queue.record_cost(id, class, charged_ms, spent_ms);
+                    output.charge.is_recorded = true;
+                }
+                self.queue.push_continuation(id, output.step_class());
+                self.partial_outputs.insert(id, output);
+                return;
+            }
+        }
+        output.charge.spent_ms += ms_since(begin);
+        self.finish_output(id, output);
+    }
+
+    /// Charges a scene for a finished output, which took `total_ms` in all steps.
+    pub(super) fn record_output_cost(&self, id: SceneId, charge: Charge, total_ms: f64) {
+        let Charge { class, charged_ms, spent_ms, is_recorded } = charge;
+        match is_recorded {
+            true => self.queue.charge(id, total_ms - spent_ms),
+            false => self.queue.record_cost(id, class, charged_ms, total_ms),
+        }
+    }
+
+    /// Waits for an AOV and answers it. A frame is answered later.
+    fn finish_output(&mut self, id: SceneId, output: PartialOutput) {
+        let PartialOutput { kind, charge } = output;
+        match kind {
+            PartialKind::Preparation(preparation) => self.context.finish_preparation(preparation),
+            PartialKind::Frame(draw, reply) => {
+                let pending_draw = self.context.finish_partial_draw(draw);
+                match self.loss.record_loss(pending_draw) {
+                    Ok(draw) => self.frames.push(FrameInFlight { id, charge, draw }, reply),
+                    Err(error) => answer(reply, Err(error)),
+                }
+            }
+            PartialKind::Aov(draw, reply) => {
+                let begin = Instant::now();
+                let Self { context, scenes, .. } = self;
+                let aov = find_scene(scenes, id).and_then(|scene| context.finish_aov(scene, draw));
+                answer(reply, self.loss.record_loss(aov));
+                self.record_output_cost(id, charge, charge.spent_ms + ms_since(begin));
+            }
+        }
+    }
+}
