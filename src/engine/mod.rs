@@ -24,14 +24,16 @@ pub use device::loaded_scene::LoadedScene;
 pub use device::scalar_field::validate_mode;
 pub use output::frame_encoder::{EncodedFrame, EncodedOutput, FrameEncoder, StepPicture};
 pub use output::frame_format::{FrameFormat, JpegQuality};
-pub use output::pack::{Attribute, Origins, PackedVertices, Section, VertexSelection, pack_vertices, validate_domains};
+pub use output::pack::{Origins, PackedVertices, Section, VertexPacker};
 pub use output::pick_result::{PickResult, resolve_picks};
 pub use output::rendered_picture::{Pixels, RenderedPicture};
 pub use output::state_packing::{PackedState, StateContent, StateSection, pack_state};
 pub use output::step_output::{
     FrameOutput, ModalHit, OutputBody, OutputSpec, PictureSpec, StepFrames, StepId, StepOutput,
 };
+pub use output::step_vertices::StepVertices;
 pub use output::vertex_encoding::Encoding;
+pub use output::vertex_selection::{Attribute, VertexSelection, validate_domains};
 pub use scene::delivery::{Delivery, StreamDelivery};
 pub use scene::encoded_subscription::EncodedSubscription;
 pub use scene::force_subscription::{ForceReport, ForceSubscription};
@@ -91,6 +93,7 @@ struct Shared {
     source: Arc<dyn SceneSource>,
     info: EngineInfo,
     encoder: FrameEncoder,
+    vertex_packer: VertexPacker,
     services: SceneServices,
     registry: Registry,
     frame_streams: Arc<FrameStreamRegistry>,
@@ -151,6 +154,7 @@ impl Engine {
             source,
             info,
             encoder: FrameEncoder::per_core(),
+            vertex_packer: VertexPacker::start()?,
             load_permits: Semaphore::new(MAX_CONCURRENT_LOADS),
             upload_permits: Arc::new(Semaphore::new(MAX_CONCURRENT_UPLOADS)),
             next_scene_id: AtomicU64::new(1),
@@ -176,6 +180,11 @@ impl Engine {
     /// The frame encoder. All its clones share one limit on threads.
     pub fn encoder(&self) -> &FrameEncoder {
         &self.shared.encoder
+    }
+
+    /// Packs vertices. All clones share one pool of threads.
+    pub fn vertex_packer(&self) -> &VertexPacker {
+        &self.shared.vertex_packer
     }
 
     /// The largest image side in pixels that both the configuration and the renderer allow.

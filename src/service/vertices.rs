@@ -3,6 +3,7 @@
 
 use std::sync::Arc;
 
+use bytes::Bytes;
 use modalcast_proto::v1;
 use tonic::{Request, Response, Status};
 use v1::get_vertices_response::Part as SinglePart;
@@ -13,8 +14,8 @@ use super::convert::{
     wire_sections, wire_stages, wire_step_id,
 };
 use super::status::to_status;
-use super::stream::{Deadline, ReplySender, ReplyStream, chunks_with_head, respond};
-use crate::engine::{Engine, OutputSpec, PackedVertices, Subscription, VertexSelection, pack_vertices};
+use super::stream::{Deadline, ReplySender, ReplyStream, respond, split_into_chunks};
+use crate::engine::{Engine, OutputSpec, PackedVertices, Subscription, VertexPacker, VertexSelection};
 
 /// Number of domains in one part of a layout. A part then has at most 0.8 MiB.
 const LAYOUT_PART_DOMAINS: usize = 65_536;
@@ -36,13 +37,13 @@ impl v1::vertex_service_server::VertexService for VertexServiceImpl {
         let scene_handle = self.0.find(&request.scene).map_err(to_status)?;
         let selection = parse_vertex_selection(&scene_handle.scene, request.selection).map_err(to_status)?;
         let selector = parse_step_selector(request.step);
-        let max_chunk_bytes = config.chunk_bytes;
+        let (packer, max_chunk_bytes) = (self.0.vertex_packer().clone(), config.chunk_bytes);
         let to_response = |part| v1::GetVerticesResponse { part: Some(part) };
         Ok(respond(move |reply_sender| async move {
             let work = async {
                 let spec = OutputSpec::Vertices(selection.vertex_attributes());
                 let output = scene_handle.request_output(selector, spec).await.map_err(to_status)?;
-                let vertices = pack_vertices(output, &selection, None).await.map_err(to_status)?;
+                let vertices = packer.pack(output, &selection, None).await.map_err(to_status)?;
                 for layout in layout_parts(&selection) {
                     reply_sender.send(to_response(SinglePart::Layout(layout))).await?;
                 }
@@ -69,8 +70,12 @@ impl v1::vertex_service_server::VertexService for VertexServiceImpl {
         let spec = OutputSpec::Vertices(selection.vertex_attributes());
         // Subscribe before the response headers are sent, so that a client can rely on receiving the next step.
         let subscription = scene_handle.subscribe(spec, delivery).await.map_err(to_status)?;
-        let vertex_stream =
-            VertexStream { selection, max_chunk_bytes: self.0.config().chunk_bytes, max_steps: request.steps };
+        let vertex_stream = VertexStream {
+            selection,
+            packer: self.0.vertex_packer().clone(),
+            max_chunk_bytes: self.0.config().chunk_bytes,
+            max_steps: request.steps,
+        };
         Ok(respond(move |reply_sender| {
             deadline.enforce("the vertex stream", vertex_stream.run(subscription, reply_sender))
         }))
@@ -80,6 +85,7 @@ impl v1::vertex_service_server::VertexService for VertexServiceImpl {
 /// Parameters of a vertex stream.
 struct VertexStream {
     selection: Arc<VertexSelection>,
+    packer: VertexPacker,
     max_chunk_bytes: usize,
     /// Number of steps to send. 0 means no limit.
     max_steps: u64,
@@ -108,7 +114,7 @@ impl VertexStream {
                 output = subscription.next() => output.map_err(to_status)?,
                 () = reply_sender.closed() => return Ok(()),
             };
-            let vertices = pack_vertices(output, &self.selection, known_origins).await.map_err(to_status)?;
+            let vertices = self.packer.pack(output, &self.selection, known_origins).await.map_err(to_status)?;
             for chunk in vertex_chunks(&vertices, self.max_chunk_bytes) {
                 tokio::select! {
                     sent = reply_sender.send(to_response(StreamPart::Chunk(chunk))) => sent?,
@@ -136,19 +142,55 @@ fn layout_parts(selection: &VertexSelection) -> Vec<v1::VertexLayout> {
     parts
 }
 
-/// Splits the vertices of a step into chunks, of which the first has the head.
+/// Splits the vertices of a step into chunks, of which the first has the head. A chunk belongs to one part. Vertices
+/// without bytes are one empty chunk.
 fn vertex_chunks(packed: &PackedVertices, max_chunk_bytes: usize) -> impl Iterator<Item = v1::VertexChunk> + use<> {
-    let encoded = &packed.encoded;
     let head = v1::VertexHead {
-        step: Some(wire_step_id(encoded.step)),
+        step: Some(wire_step_id(packed.step)),
         sections: wire_sections(&packed.sections),
-        total: encoded.bytes.len() as u64,
-        skipped: encoded.skipped,
-        stages: wire_stages(&encoded.stages),
+        total: packed.total_bytes(),
+        skipped: packed.skipped,
+        stages: wire_stages(&packed.stages),
     };
-    chunks_with_head(head, encoded.bytes.clone(), max_chunk_bytes, |head, offset, data| v1::VertexChunk {
-        head,
-        offset,
-        data,
+    let parts = if packed.parts.is_empty() { vec![Bytes::new()] } else { packed.parts.clone() };
+    let (mut head, mut part_offset) = (Some(head), 0);
+    parts.into_iter().flat_map(move |part| {
+        let part_bytes = part.len() as u64;
+        let chunks: Vec<v1::VertexChunk> = split_into_chunks(part, max_chunk_bytes)
+            .map(|(offset, data)| v1::VertexChunk { head: head.take(), offset: part_offset + offset, data })
+            .collect();
+        part_offset += part_bytes;
+        chunks
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::engine::{Attribute, Encoding, Section, StepId};
+
+    fn packed(parts: Vec<Bytes>) -> PackedVertices {
+        let bytes = parts.iter().map(|part| part.len() as u64).sum();
+        let sections = vec![Section { attribute: Attribute::Positions, encoding: Encoding::F32, offset: 0, bytes }];
+        let step = StepId { run: 1, number: 2, time: 0.0 };
+        PackedVertices { step, skipped: 0, stages: vec![], sections, parts, origins: Arc::new([]) }
+    }
+
+    #[test]
+    fn chunks_refer_to_the_parts_and_only_the_first_has_a_head() {
+        let parts: Vec<Bytes> = [250, 100, 1].map(|length| Bytes::from(vec![length; length.into()])).to_vec();
+        let chunks: Vec<_> = vertex_chunks(&packed(parts.clone()), 100).collect();
+        let offsets_and_sizes: Vec<_> = chunks.iter().map(|chunk| (chunk.offset, chunk.data.len())).collect();
+        assert_eq!(offsets_and_sizes, [(0, 100), (100, 100), (200, 50), (250, 100), (350, 1)]);
+        assert_eq!(chunks[1].data.as_ptr(), parts[0][100..].as_ptr());
+        assert_eq!(chunks[0].head.as_ref().map(|head| head.total), Some(351));
+        assert!(chunks[1..].iter().all(|chunk| chunk.head.is_none()));
+    }
+
+    #[test]
+    fn vertices_without_bytes_are_one_chunk() {
+        let chunks: Vec<_> = vertex_chunks(&packed(vec![]), 100).collect();
+        assert_eq!(chunks.len(), 1);
+        assert!(chunks[0].head.is_some() && chunks[0].data.is_empty());
+    }
 }

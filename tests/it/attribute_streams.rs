@@ -216,8 +216,8 @@ async fn box_stream_delivers_every_step() {
 
 /// Step number and vertex data of an output.
 fn vertices_of_output(output: &modalcast::engine::StepOutput) -> (usize, &DeformedSurface) {
-    let modalcast::engine::OutputBody::Vertices(surface) = &output.body else { panic!("expected vertices") };
-    (output.step.number as usize, surface)
+    let modalcast::engine::OutputBody::Vertices(vertices) = &output.body else { panic!("expected vertices") };
+    (output.step.number as usize, &vertices.surface)
 }
 
 /// The corners of all boxes, rounded to f32 as on the wire.

@@ -100,7 +100,8 @@ async fn overlapped_steps_keep_their_order_and_vertices() {
         writer.send_step(step.clone()).await;
     }
     let check_output = |output: &modalcast::engine::StepOutput| {
-        let modalcast::engine::OutputBody::Vertices(surface) = &output.body else { panic!("expected vertices") };
+        let modalcast::engine::OutputBody::Vertices(vertices) = &output.body else { panic!("expected vertices") };
+        let surface = &vertices.surface;
         let index = output.step.number as usize;
         let stages: Vec<_> = output.stages.iter().map(|(stage, _)| stage.name()).collect();
         assert_eq!(stages, ["parse", "queue", "deform", "copy"]);

@@ -7,4 +7,6 @@ pub(super) mod pick_result;
 pub(super) mod rendered_picture;
 pub(super) mod state_packing;
 pub(super) mod step_output;
+pub(super) mod step_vertices;
 pub(super) mod vertex_encoding;
+pub(super) mod vertex_selection;

@@ -3,8 +3,9 @@
 use std::sync::Arc;
 
 use super::rendered_picture::RenderedPicture;
+use super::step_vertices::StepVertices;
 use crate::telemetry::StageTimes;
-use modalcast_model::deform::{DeformedSurface, VertexAttributes};
+use modalcast_model::deform::VertexAttributes;
 use modalcast_model::scene::{Camera, FloatingOrigins, FrameSize, PixelRect, SceneState};
 use modalcast_render::PickHit;
 
@@ -78,7 +79,7 @@ impl StepId {
 #[derive(Debug, Clone)]
 pub enum OutputBody {
     Frames(StepFrames),
-    Vertices(Arc<DeformedSurface>),
+    Vertices(Arc<StepVertices>),
     Pick(Vec<ModalHit>),
     State(Arc<SceneState>),
 }

@@ -1,7 +1,10 @@
 //! How vectors of vertex attributes are stored in bytes. The errors of the encodings are stated in `vertices.proto`.
 
+use bytemuck::NoUninit;
+use bytes::Bytes;
 use half::f16;
-use half::slice::HalfFloatSliceExt as _;
+use half::slice::{HalfBitsSliceExt as _, HalfFloatSliceExt as _};
+use rayon::prelude::*;
 
 /// How the vectors of an attribute are stored.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -21,54 +24,65 @@ pub enum Encoding {
 /// Number of consecutive vectors that share a box.
 const BOX_VECTORS: usize = 256;
 
-impl Encoding {
-    /// Size of vectors in bytes.
-    pub(super) const fn encoded_bytes(self, vector_count: usize) -> usize {
-        match self {
-            Self::F32 => 12 * vector_count,
-            Self::F16 => 6 * vector_count,
-            Self::U16Box => size_of::<[[f32; 3]; 2]>() * vector_count.div_ceil(BOX_VECTORS) + 6 * vector_count,
-            Self::OctahedralI16 => 4 * vector_count,
-            Self::F64 => 24 * vector_count,
-        }
+/// Number of consecutive vectors that one task encodes: 64 boxes.
+const TASK_VECTORS: usize = 64 * BOX_VECTORS;
+
+/// Numbers whose memory is sent as it is.
+struct NumberBytes<T>(Vec<T>);
+
+impl<T: NoUninit> AsRef<[u8]> for NumberBytes<T> {
+    fn as_ref(&self) -> &[u8] {
+        bytemuck::cast_slice(&self.0)
     }
 }
 
-/// Appends vectors, three numbers each, to `bytes`.
-pub(super) fn encode_vectors(encoding: Encoding, numbers: &[f32], bytes: &mut Vec<u8>) {
+/// The memory of a list as bytes.
+pub(super) fn into_bytes<T: NoUninit + Send>(numbers: Vec<T>) -> Bytes {
+    Bytes::from_owner(NumberBytes(numbers))
+}
+
+/// Encodes vectors, three numbers each, on all threads of the current rayon pool. Returns their bytes in parts.
+pub(super) fn encode_vectors(encoding: Encoding, numbers: &[f32]) -> Vec<Bytes> {
     match encoding {
-        Encoding::F32 => bytes.extend_from_slice(bytemuck::cast_slice(numbers)),
-        Encoding::F16 => encode_f16(numbers, bytes),
-        Encoding::U16Box => encode_u16_boxes(numbers, bytes),
-        Encoding::OctahedralI16 => encode_octahedral(numbers, bytes),
+        Encoding::F32 => vec![into_bytes(numbers.to_vec())],
+        Encoding::F16 => vec![encode_f16(numbers)],
+        Encoding::U16Box => encode_u16_boxes(numbers),
+        Encoding::OctahedralI16 => vec![encode_octahedral(numbers)],
         // A selection contains no f64 numbers.
-        Encoding::F64 => bytes.extend(numbers.iter().flat_map(|number| f64::from(*number).to_le_bytes())),
+        Encoding::F64 => vec![into_bytes(numbers.iter().map(|number| f64::from(*number)).collect())],
     }
 }
 
-fn encode_f16(numbers: &[f32], bytes: &mut Vec<u8>) {
-    let mut rounded = vec![f16::ZERO; numbers.len()];
-    rounded.convert_from_f32_slice(numbers);
-    bytes.extend_from_slice(bytemuck::cast_slice(rounded.reinterpret_cast()));
+fn encode_f16(numbers: &[f32]) -> Bytes {
+    let mut codes = vec![0_u16; numbers.len()];
+    let tasks = codes.par_chunks_mut(3 * TASK_VECTORS).zip(numbers.par_chunks(3 * TASK_VECTORS));
+    tasks.for_each(|(codes, numbers)| codes.reinterpret_cast_mut::<f16>().convert_from_f32_slice(numbers));
+    into_bytes(codes)
 }
 
-fn encode_u16_boxes(numbers: &[f32], bytes: &mut Vec<u8>) {
-    let blocks = numbers.chunks(3 * BOX_VECTORS);
-    let boxes: Vec<[[f32; 3]; 2]> = blocks.clone().map(bounds_of).collect();
-    bytes.extend_from_slice(bytemuck::cast_slice(&boxes));
-    let mut codes = Vec::with_capacity(numbers.len());
-    for (block, [min, max]) in blocks.zip(&boxes) {
-        // In f64, so that the error is only that of rounding to an integer.
-        let scale: [f64; 3] = std::array::from_fn(|axis| {
-            let extent = f64::from(max[axis]) - f64::from(min[axis]);
-            if extent > 0.0 { f64::from(u16::MAX) / extent } else { 0.0 }
-        });
-        codes.extend(block.iter().enumerate().map(|(index, number)| {
-            let axis = index % 3;
-            ((f64::from(*number) - f64::from(min[axis])) * scale[axis]).round() as u16
-        }));
+fn encode_u16_boxes(numbers: &[f32]) -> Vec<Bytes> {
+    let mut boxes = vec![[[0.0_f32; 3]; 2]; numbers.len().div_ceil(3 * BOX_VECTORS)];
+    let mut codes = vec![0_u16; numbers.len()];
+    let blocks = numbers.par_chunks(3 * BOX_VECTORS).zip(codes.par_chunks_mut(3 * BOX_VECTORS)).zip(&mut boxes);
+    blocks.with_min_len(TASK_VECTORS / BOX_VECTORS).for_each(|((numbers, codes), bounds)| {
+        *bounds = bounds_of(numbers);
+        encode_u16_block(numbers, bounds, codes);
+    });
+    vec![into_bytes(boxes), into_bytes(codes)]
+}
+
+/// Encodes the vectors of one box.
+fn encode_u16_block(numbers: &[f32], [min, max]: &[[f32; 3]; 2], codes: &mut [u16]) {
+    // In f64, so that the error is only that of rounding to an integer.
+    let min = min.map(f64::from);
+    let scale: [f64; 3] = std::array::from_fn(|axis| {
+        let extent = f64::from(max[axis]) - min[axis];
+        if extent > 0.0 { f64::from(u16::MAX) / extent } else { 0.0 }
+    });
+    for (code, vector) in codes.as_chunks_mut::<3>().0.iter_mut().zip(numbers.as_chunks::<3>().0) {
+        // Adding one half before the conversion, which truncates, rounds to nearest.
+        *code = std::array::from_fn(|axis| ((f64::from(vector[axis]) - min[axis]) * scale[axis] + 0.5) as u16);
     }
-    bytes.extend_from_slice(bytemuck::cast_slice(&codes));
 }
 
 /// Minimum and maximum of vectors, of which there is at least one.
@@ -85,15 +99,16 @@ fn bounds_of(numbers: &[f32]) -> [[f32; 3]; 2] {
 
 /// Octahedral projection (Cigolle et al., "A Survey of Efficient Representations for Independent Unit Vectors", JCGT
 /// 2014): onto the octahedron |x| + |y| + |z| = 1, whose lower half is folded over the diagonals of the square.
-fn encode_octahedral(numbers: &[f32], bytes: &mut Vec<u8>) {
+fn encode_octahedral(numbers: &[f32]) -> Bytes {
     let project = |[x, y, z]: &[f32; 3]| {
         let norm = x.abs() + y.abs() + z.abs();
         let [x, y, z] = if norm > 0.0 { [x / norm, y / norm, z / norm] } else { [0.0, 0.0, 1.0] };
         let folded = if z < 0.0 { [(1.0 - y.abs()).copysign(x), (1.0 - x.abs()).copysign(y)] } else { [x, y] };
-        folded.map(|number| (number * f32::from(i16::MAX)).round() as i16)
+        // The conversion truncates, so adding one half with the number's sign rounds to nearest.
+        folded.map(|number| (number * f32::from(i16::MAX) + 0.5_f32.copysign(number)) as i16)
     };
-    let codes: Vec<[i16; 2]> = numbers.as_chunks::<3>().0.iter().map(project).collect();
-    bytes.extend_from_slice(bytemuck::cast_slice(&codes));
+    let vectors = numbers.as_chunks::<3>().0.par_iter().with_min_len(TASK_VECTORS);
+    into_bytes(vectors.map(project).collect::<Vec<[i16; 2]>>())
 }
 
 #[cfg(test)]
@@ -107,10 +122,7 @@ mod tests {
     }
 
     fn encoded(encoding: Encoding, numbers: &[f32]) -> Vec<u8> {
-        let mut bytes = Vec::new();
-        encode_vectors(encoding, numbers, &mut bytes);
-        assert_eq!(bytes.len(), encoding.encoded_bytes(numbers.len() / 3));
-        bytes
+        encode_vectors(encoding, numbers).concat()
     }
 
     #[test]
@@ -129,11 +141,11 @@ mod tests {
 
     #[test]
     fn u16_error_is_within_half_a_step_of_its_box() {
-        // Two full boxes and one of a single vector; the second box is far from the first.
-        let mut numbers = random_vectors(2 * BOX_VECTORS + 1, 3.0);
+        // Boxes of more than one task, and one of a single vector; the second box is far from the first.
+        let mut numbers = random_vectors(TASK_VECTORS + BOX_VECTORS + 1, 3.0);
         numbers[3 * BOX_VECTORS..].iter_mut().for_each(|number| *number += 4096.0);
         let bytes = encoded(Encoding::U16Box, &numbers);
-        let (boxes, codes) = bytes.split_at(3 * 24);
+        let (boxes, codes) = bytes.split_at(24 * (TASK_VECTORS / BOX_VECTORS + 2));
         assert_eq!(codes.len(), 2 * numbers.len());
         let boxes: Vec<[[f32; 3]; 2]> = bytemuck::pod_collect_to_vec(boxes);
         let mut max_error_in_steps = 0.0_f64;

@@ -20,8 +20,9 @@ use crate::engine::device::handle::{DeviceHandle, PendingReply};
 use crate::engine::output::pick_result::with_transforms;
 use crate::engine::output::rendered_picture::RenderedPicture;
 use crate::engine::output::step_output::{FrameOutput, OutputBody, OutputSpec, PictureSpec, StepFrames, StepOutput};
+use crate::engine::output::step_vertices::StepVertices;
 use crate::telemetry::Stage;
-use modalcast_model::deform::{DeformedSurface, VertexAttributes};
+use modalcast_model::deform::VertexAttributes;
 use modalcast_model::error::{Error, Result};
 use modalcast_model::scene::Scene;
 use modalcast_render::MAX_FRAMES_IN_FLIGHT;
@@ -270,8 +271,8 @@ struct OutputProducer {
 /// Vertices in host memory.
 #[derive(Debug, Clone)]
 struct CachedVertices {
-    surface: Arc<DeformedSurface>,
-    /// The attributes that `surface` contains.
+    vertices: Arc<StepVertices>,
+    /// The attributes that `vertices` contains.
     attributes: VertexAttributes,
     /// Duration of the copy in milliseconds.
     copy_ms: f64,
@@ -407,9 +408,10 @@ impl OutputProducer {
                 OutputBody::Pick(with_transforms(&current.state, &self.scene_on_device.scene, hits))
             }
             OutputSpec::Vertices(attributes) => {
-                let CachedVertices { surface, copy_ms, .. } = self.copy_vertices(*attributes, other_attributes).await?;
+                let CachedVertices { vertices, copy_ms, .. } =
+                    self.copy_vertices(*attributes, other_attributes).await?;
                 stages.push((Stage::Copy, copy_ms));
-                OutputBody::Vertices(surface)
+                OutputBody::Vertices(vertices)
             }
             OutputSpec::State => OutputBody::State(Arc::clone(&current.state)),
         };
@@ -484,7 +486,8 @@ impl OutputProducer {
         let copied_attributes = self.cached_attributes().union(attributes).union(other_attributes);
         let CopiedVertices { surface, copy_ms } =
             self.device.read_vertices(self.scene_on_device.id, copied_attributes).wait().await?;
-        let copied = CachedVertices { surface, attributes: copied_attributes, copy_ms };
+        let vertices = Arc::new(StepVertices::new(surface));
+        let copied = CachedVertices { vertices, attributes: copied_attributes, copy_ms };
         Ok(self.cached_vertices.insert(copied).clone())
     }
 }

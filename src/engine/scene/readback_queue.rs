@@ -35,6 +35,7 @@ use crate::engine::device::handle::PendingReply;
 use crate::engine::lock::lock;
 use crate::engine::output::rendered_picture::RenderedPicture;
 use crate::engine::output::step_output::{OutputBody, PictureSpec, StepFrames, StepId, StepOutput};
+use crate::engine::output::step_vertices::StepVertices;
 use crate::telemetry::{Stage, StageTimes};
 use modalcast_model::error::Result;
 use modalcast_model::scene::FloatingOrigins;
@@ -266,7 +267,7 @@ impl PendingReadback {
         let picture = match self.readback {
             Readback::Vertices(InFlight { answer, recipients, .. }) => {
                 let vertices = answer?.map(|CopiedVertices { surface, copy_ms }| {
-                    (OutputBody::Vertices(surface), vec![(Stage::Copy, copy_ms)])
+                    (OutputBody::Vertices(Arc::new(StepVertices::new(surface))), vec![(Stage::Copy, copy_ms)])
                 });
                 recipients.into_iter().for_each(|recipient| recipient.send(vertices.clone()));
                 None
