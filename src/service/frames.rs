@@ -14,6 +14,7 @@ use super::convert::{
     parse_stream_delivery, wire_delivery, wire_format, wire_picture, wire_raster_backend, wire_stages, wire_step_id,
 };
 use super::picks;
+use super::reply_body::without_copies;
 use super::status::to_status;
 use super::stream::{Deadline, ReplySender, ReplyStream, chunks_with_head, respond};
 use crate::engine::{
@@ -40,7 +41,7 @@ impl v1::frame_service_server::FrameService for FrameServiceImpl {
         let pictures = parse_pictures(&self.0, &scene_handle.scene, request.pictures).map_err(to_status)?;
         let selector = parse_step_selector(request.step);
         let (max_chunk_bytes, encoder) = (config.chunk_bytes, self.0.encoder().clone());
-        Ok(respond(move |reply_sender| async move {
+        Ok(without_copies(respond(move |reply_sender| async move {
             let work = async {
                 let output = scene_handle.request_output(selector, output_spec(&pictures)).await.map_err(to_status)?;
                 for (step_picture, picture) in StepPicture::of_output(output).map_err(to_status)?.zip(&pictures) {
@@ -52,7 +53,7 @@ impl v1::frame_service_server::FrameService for FrameServiceImpl {
                 Ok(())
             };
             deadline.enforce(&describe_step_selector(selector, &scene_handle.name), work).await
-        }))
+        })))
     }
 
     type PickStream = ReplyStream<v1::PickResponse>;
@@ -100,7 +101,9 @@ impl v1::frame_service_server::FrameService for FrameServiceImpl {
             max_steps: request.steps,
             max_chunk_bytes: self.0.config().chunk_bytes,
         };
-        Ok(respond(move |reply_sender| deadline.enforce("the frame stream", frame_stream.run(frames, reply_sender))))
+        Ok(without_copies(respond(move |reply_sender| {
+            deadline.enforce("the frame stream", frame_stream.run(frames, reply_sender))
+        })))
     }
 }
 

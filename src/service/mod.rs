@@ -9,6 +9,7 @@ mod frames;
 mod info;
 mod listen;
 mod picks;
+mod reply_body;
 mod routes;
 mod scenes;
 mod states;

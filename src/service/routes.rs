@@ -11,6 +11,8 @@ use tonic::codegen::http::{Request, Response};
 use tonic::codegen::{BoxFuture, Service};
 use tonic::server::NamedService;
 
+use super::reply_body::replace_body;
+
 type Route = Arc<dyn Fn(Request<Body>) -> BoxFuture<Response<Body>, Infallible> + Send + Sync>;
 
 /// All services of the server.
@@ -28,7 +30,10 @@ impl Routes {
         S::Future: Send + 'static,
     {
         let mut by_name = Arc::unwrap_or_clone(self.by_name);
-        let route: Route = Arc::new(move |request| Box::pin(service.clone().call(request)));
+        let route: Route = Arc::new(move |request| {
+            let call = service.clone().call(request);
+            Box::pin(async move { call.await.map(replace_body) })
+        });
         by_name.insert(S::NAME, route);
         Self { by_name: Arc::new(by_name) }
     }

@@ -8,6 +8,7 @@ use tonic::{Request, Response, Status};
 use v1::stream_states_response::Part;
 
 use super::convert::{describe_step_selector, parse_step_selector, parse_stream_delivery, wire_stages, wire_step_id};
+use super::reply_body::without_copies;
 use super::status::to_status;
 use super::stream::{Deadline, ReplySender, ReplyStream, chunks_with_head, respond};
 use crate::engine::{Engine, OutputSpec, PackedState, StateContent, StateSection, Subscription, pack_state};
@@ -27,7 +28,7 @@ impl v1::state_service_server::StateService for StateServiceImpl {
         let scene_handle = self.0.find(&request.scene).map_err(to_status)?;
         let selector = parse_step_selector(request.step);
         let max_chunk_bytes = config.chunk_bytes;
-        Ok(respond(move |reply_sender| async move {
+        Ok(without_copies(respond(move |reply_sender| async move {
             let work = async {
                 let output = scene_handle.request_output(selector, OutputSpec::State).await.map_err(to_status)?;
                 let packed = pack_state(output, &scene_handle.scene, None).await.map_err(to_status)?;
@@ -37,7 +38,7 @@ impl v1::state_service_server::StateService for StateServiceImpl {
                 Ok(())
             };
             deadline.enforce(&describe_step_selector(selector, &scene_handle.name), work).await
-        }))
+        })))
     }
 
     type StreamStatesStream = ReplyStream<v1::StreamStatesResponse>;
@@ -56,9 +57,9 @@ impl v1::state_service_server::StateService for StateServiceImpl {
             v1::StateStreamSettings { delivery: request.delivery, max_hz: request.max_hz, steps: request.steps };
         let scene = Arc::clone(&scene_handle.scene);
         let state_stream = StateStream { scene, max_chunk_bytes: self.0.config().chunk_bytes, settings };
-        Ok(respond(move |reply_sender| {
+        Ok(without_copies(respond(move |reply_sender| {
             deadline.enforce("the stream of states", state_stream.run(subscription, reply_sender))
-        }))
+        })))
     }
 }
 
