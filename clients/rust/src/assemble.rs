@@ -1,15 +1,16 @@
 //! Assembles chunks into complete replies. The first chunk states the total size of the reply, and each chunk its
 //! offset. The total and the offsets are checked. A total above the limit is an error before any byte is stored.
 
-use std::pin::Pin;
+use std::future::poll_fn;
 use std::sync::Arc;
 use std::task::{Context, Poll, ready};
 
 use bytemuck::Pod;
 use bytes::Bytes;
-use tokio_stream::Stream;
+use prost::Message;
 
 use crate::error::{Error, Result, malformed_reply};
+use crate::message_stream::MessageStream;
 
 // Numbers are little-endian on the wire and are copied without conversion.
 const _: () = assert!(cfg!(target_endian = "little"), "the client supports little-endian hosts only");
@@ -28,22 +29,22 @@ pub(crate) fn decode<T: Pod>(field: &str, bytes: &[u8]) -> Result<Vec<T>> {
 
 /// The messages of a server stream. An error contains the server's URL.
 pub(crate) struct Replies<M> {
-    messages: tonic::Streaming<M>,
+    messages: MessageStream<M>,
     url: Arc<str>,
 }
 
-impl<M> Replies<M> {
-    pub(crate) const fn new(messages: tonic::Streaming<M>, url: Arc<str>) -> Self {
+impl<M: Message + Default> Replies<M> {
+    pub(crate) const fn new(messages: MessageStream<M>, url: Arc<str>) -> Self {
         Self { messages, url }
     }
 
     /// The next message, or `None` at the end of the stream.
     pub(crate) async fn next(&mut self) -> Result<Option<M>> {
-        self.messages.message().await.map_err(|status| Error::from_status(status, &self.url))
+        poll_fn(|context| self.poll(context)).await.transpose()
     }
 
     fn poll(&mut self, context: &mut Context<'_>) -> Poll<Option<Result<M>>> {
-        let message = ready!(Pin::new(&mut self.messages).poll_next(context));
+        let message = ready!(self.messages.poll_next(context));
         Poll::Ready(message.map(|message| message.map_err(|status| Error::from_status(status, &self.url))))
     }
 }
@@ -77,20 +78,34 @@ pub(crate) trait WireChunk: Sized {
     fn decode_reply(head: Self::Head, bytes: Bytes) -> Result<Self::Reply>;
 }
 
-/// Collects the chunks of consecutive replies.
-pub(crate) struct Assembler<H> {
+/// Checks that the chunks of consecutive replies follow each other without gaps.
+pub(crate) struct ChunkSequence<H> {
     /// Name of the reply in errors.
     name: &'static str,
     /// Maximum size of a reply in bytes.
     limit: u64,
-    /// Head and total size in bytes of the reply whose last chunk has not been added.
-    open_reply: Option<(H, u64)>,
-    bytes: Vec<u8>,
+    /// The reply whose last chunk has not been added.
+    open_reply: Option<OpenReply<H>>,
 }
 
-impl<H> Assembler<H> {
+/// A reply that has begun.
+pub(crate) struct OpenReply<H> {
+    pub(crate) head: H,
+    /// Size of the reply in bytes.
+    pub(crate) total: u64,
+    received: u64,
+}
+
+impl<H> OpenReply<H> {
+    /// Whether all bytes were received.
+    const fn is_complete(&self) -> bool {
+        self.received == self.total
+    }
+}
+
+impl<H> ChunkSequence<H> {
     pub(crate) const fn new(name: &'static str, limit: u64) -> Self {
-        Self { name, limit, open_reply: None, bytes: Vec::new() }
+        Self { name, limit, open_reply: None }
     }
 
     /// Whether a reply has begun and not ended.
@@ -98,54 +113,79 @@ impl<H> Assembler<H> {
         self.open_reply.is_some()
     }
 
-    /// Adds a chunk. Returns the complete reply after its last chunk.
-    pub(crate) fn push(&mut self, chunk: Chunk<H>) -> Result<Option<(H, Bytes)>> {
+    /// Adds a chunk, and returns its data. With a head it begins a reply, for which `begin` prepares.
+    pub(crate) fn add(&mut self, chunk: Chunk<H>, begin: impl FnOnce(&OpenReply<H>) -> Result<()>) -> Result<Bytes> {
         let field = |name: &str| format!("{}.{name}", self.name);
+        let begins = chunk.head.is_some();
         match (chunk.head, self.open_reply.is_some()) {
             (Some((_, total)), false) if total > self.limit => {
                 return Err(malformed_reply(field("total"), format!("at most {} bytes", self.limit), total));
             }
-            (Some(head), false) => self.open_reply = Some(head),
+            (Some((head, total)), false) => self.open_reply = Some(OpenReply { head, total, received: 0 }),
             (None, true) => {}
             (Some(_), true) => {
                 return Err(malformed_reply(field("head"), "the next chunk of the open reply", "a new head"));
             }
             (None, false) => return Err(malformed_reply(field("head"), "a head on the first chunk", "none")),
         }
-        let Some((_, total)) = &self.open_reply else { return Ok(None) };
-        let (total, received) = (*total, self.bytes.len() as u64);
-        if chunk.offset != received {
-            return Err(malformed_reply(field("offset"), received, chunk.offset));
+        let Some(reply) = &mut self.open_reply else { return Ok(Bytes::new()) };
+        if chunk.offset != reply.received {
+            return Err(malformed_reply(field("offset"), reply.received, chunk.offset));
         }
-        let end = received.saturating_add(chunk.data.len() as u64);
-        if end > total {
-            return Err(malformed_reply(field("data"), format!("at most {total} bytes"), end));
+        let end = reply.received.saturating_add(chunk.data.len() as u64);
+        if end > reply.total {
+            return Err(malformed_reply(field("data"), format!("at most {} bytes", reply.total), end));
         }
-        if end < total {
-            if self.bytes.capacity() == 0 {
-                self.reserve(total)?;
-            }
-            self.bytes.extend_from_slice(&chunk.data);
+        if begins {
+            begin(reply)?;
+        }
+        reply.received = end;
+        Ok(chunk.data)
+    }
+
+    /// Ends the open reply if it is complete, and returns its head.
+    pub(crate) fn end_reply(&mut self) -> Option<H> {
+        self.open_reply.take_if(|reply| reply.is_complete()).map(|reply| reply.head)
+    }
+}
+
+/// Collects the chunks of consecutive replies.
+pub(crate) struct Assembler<H> {
+    chunks: ChunkSequence<H>,
+    bytes: Vec<u8>,
+}
+
+impl<H> Assembler<H> {
+    pub(crate) const fn new(name: &'static str, limit: u64) -> Self {
+        Self { chunks: ChunkSequence::new(name, limit), bytes: Vec::new() }
+    }
+
+    /// Whether a reply has begun and not ended.
+    pub(crate) const fn is_open(&self) -> bool {
+        self.chunks.is_open()
+    }
+
+    /// Adds a chunk. Returns the complete reply after its last chunk. A reply of a single chunk is returned without a
+    /// copy.
+    pub(crate) fn push(&mut self, chunk: Chunk<H>) -> Result<Option<(H, Bytes)>> {
+        let (name, bytes, chunk_bytes) = (self.chunks.name, &mut self.bytes, chunk.data.len() as u64);
+        // Memory for the whole reply. A total that this machine cannot hold is an error, not an abort.
+        let reserve = |reply: &OpenReply<H>| {
+            let total = if chunk_bytes < reply.total { reply.total } else { 0 };
+            let reservation = usize::try_from(total).ok().and_then(|total| bytes.try_reserve_exact(total).ok());
+            reservation.ok_or_else(|| malformed_reply(format!("{name}.total"), "a size that fits in memory", total))
+        };
+        let data = self.chunks.add(chunk, reserve)?;
+        let Some(head) = self.chunks.end_reply() else {
+            self.bytes.extend_from_slice(&data);
             return Ok(None);
-        }
-        Ok(self.complete(chunk.data))
-    }
-
-    /// Reserves memory for the whole reply. A total that this machine cannot hold is an error, not an abort.
-    fn reserve(&mut self, total: u64) -> Result<()> {
-        let reservation = usize::try_from(total).ok().and_then(|total| self.bytes.try_reserve_exact(total).ok());
-        reservation.ok_or_else(|| malformed_reply(format!("{}.total", self.name), "a size that fits in memory", total))
-    }
-
-    /// Completes the reply. A reply of a single chunk is returned without a copy.
-    fn complete(&mut self, last_data: Bytes) -> Option<(H, Bytes)> {
-        let (head, _) = self.open_reply.take()?;
+        };
         if self.bytes.is_empty() {
-            return Some((head, last_data));
+            return Ok(Some((head, data)));
         }
         let mut bytes = std::mem::take(&mut self.bytes);
-        bytes.extend_from_slice(&last_data);
-        Some((head, bytes.into()))
+        bytes.extend_from_slice(&data);
+        Ok(Some((head, bytes.into())))
     }
 }
 
@@ -167,7 +207,7 @@ pub(crate) struct DecodedReplies<M, D> {
     has_ended: bool,
 }
 
-impl<M, D: ReplyDecoder<M>> DecodedReplies<M, D> {
+impl<M: Message + Default, D: ReplyDecoder<M>> DecodedReplies<M, D> {
     pub(crate) const fn new(messages: Replies<M>, decoder: D) -> Self {
         Self { messages, decoder, has_ended: false }
     }
@@ -195,7 +235,7 @@ impl<M, D: ReplyDecoder<M>> DecodedReplies<M, D> {
 
     /// The next complete reply.
     pub(crate) async fn next(&mut self) -> Option<Result<D::Reply>> {
-        std::future::poll_fn(|context| self.poll(context)).await
+        poll_fn(|context| self.poll(context)).await
     }
 }
 

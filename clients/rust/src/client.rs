@@ -5,11 +5,13 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use modalcast_proto::v1;
+use prost::Message;
 use tonic::transport::{Channel, Endpoint};
 use tonic::{Response, Status, Streaming};
 
 use crate::assemble::Replies;
 use crate::error::{Error, Result, describe_causes, malformed_reply};
+use crate::message_stream::{MessageStream, UndecodedChannel};
 use crate::request::Delivery;
 
 /// The default limit of one reply that is assembled from chunks, in bytes.
@@ -191,12 +193,22 @@ impl Client {
         self.reply(service.get_server_info(v1::GetServerInfoRequest {}).await)
     }
 
+    /// The connection for calls with a stream of replies, see [`Self::replies`].
+    pub(crate) fn undecoded_channel(&self) -> UndecodedChannel {
+        UndecodedChannel(self.channel.clone())
+    }
+
     /// The connection for a stream of steps.
-    pub(crate) fn channel_for(&self, delivery: Delivery) -> Channel {
+    pub(crate) fn channel_for(&self, delivery: Delivery) -> UndecodedChannel {
         match delivery {
-            Delivery::Lossless => self.lossless_channel.clone(),
-            Delivery::Latest => self.channel.clone(),
+            Delivery::Lossless => UndecodedChannel(self.lossless_channel.clone()),
+            Delivery::Latest => self.undecoded_channel(),
         }
+    }
+
+    /// The scene service for calls with a stream of replies.
+    pub(crate) fn scene_streams(&self) -> v1::scene_service_client::SceneServiceClient<UndecodedChannel> {
+        v1::scene_service_client::SceneServiceClient::new(self.undecoded_channel())
     }
 
     pub(crate) fn scenes(&self) -> v1::scene_service_client::SceneServiceClient<Channel> {
@@ -208,8 +220,14 @@ impl Client {
         response.map(Response::into_inner).map_err(|status| Error::from_status(status, &self.url))
     }
 
-    /// The reply messages of a call; errors contain the server's URL.
-    pub(crate) fn replies<M>(&self, response: Result<Response<Streaming<M>>, Status>) -> Result<Replies<M>> {
-        Ok(Replies::new(self.reply(response)?, Arc::clone(&self.url)))
+    /// The reply messages of a call on an [`UndecodedChannel`]; errors contain the server's URL.
+    pub(crate) fn replies<M: Message + Default>(
+        &self,
+        response: Result<Response<Streaming<M>>, Status>,
+    ) -> Result<Replies<M>> {
+        let response = response.map_err(|status| Error::from_status(status, &self.url))?;
+        let messages = MessageStream::of_response(response);
+        let messages = messages.ok_or_else(|| malformed_reply("reply", "a body that was not decoded", "none"))?;
+        Ok(Replies::new(messages, Arc::clone(&self.url)))
     }
 }

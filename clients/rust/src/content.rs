@@ -35,7 +35,7 @@ impl Client {
         for hashes in hashes.chunks(HASHES_PER_REQUEST) {
             let sha256 = hashes.iter().map(|hash| Bytes::copy_from_slice(hash)).collect();
             let request = v1::ReadContentRequest { scene: scene.to_owned(), sha256 };
-            let mut messages = self.replies(self.scenes().read_content(request).await)?;
+            let mut messages = self.replies(self.scene_streams().read_content(request).await)?;
             for (item, hash) in hashes.iter().enumerate() {
                 let mut assembler = Assembler::new("content", remaining_bytes);
                 let bytes = loop {

@@ -104,7 +104,7 @@ impl Client {
             arrays: arrays_in_reply.iter().map(|array| *array as i32).collect(),
             hashes: request.hashes || request.textures || request.cache.is_some(),
         };
-        let mut messages = self.replies(self.scenes().describe_scene(wire_request).await)?;
+        let mut messages = self.replies(self.scene_streams().describe_scene(wire_request).await)?;
         let mut builder = DescriptionBuilder::new(self.max_reply_bytes);
         while let Some(message) = messages.next().await? {
             builder.add_message(message)?;
@@ -156,7 +156,7 @@ impl Client {
         // No scene has a domain u32::MAX, so the server rejects this index.
         let domain = u32::try_from(domain).unwrap_or(u32::MAX);
         let request = v1::ReadModesRequest { scene: scene.to_owned(), domain, vertices: vertices.to_vec() };
-        let mut messages = self.replies(self.scenes().read_modes(request).await)?;
+        let mut messages = self.replies(self.scene_streams().read_modes(request).await)?;
         let mut assembler = Assembler::new("modes", self.max_reply_bytes);
         let mut complete_reply = None;
         while let Some(message) = messages.next().await? {

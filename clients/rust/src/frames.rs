@@ -187,7 +187,7 @@ impl Client {
             step: request.step.to_wire(),
             deadline_ms: request.deadline_ms,
         };
-        let messages = self.replies(FrameServiceClient::new(self.channel.clone()).render_frame(wire).await)?;
+        let messages = self.replies(FrameServiceClient::new(self.undecoded_channel()).render_frame(wire).await)?;
         let mut replies = DecodedReplies::new(messages, ChunkDecoder::new(single_chunk, self.max_reply_bytes));
         let mut frames = Vec::new();
         while let Some(frame) = replies.next().await {

@@ -10,6 +10,7 @@ mod description;
 mod error;
 mod forces;
 mod frames;
+mod message_stream;
 pub mod npy;
 mod pick;
 pub mod program;
@@ -21,6 +22,7 @@ mod step;
 mod step_stream;
 mod upload;
 mod vertex_encoding;
+mod vertex_sections;
 mod vertices;
 
 pub use array_upload::{ArrayUpload, UploadDomain, UploadShape};
@@ -45,9 +47,8 @@ pub use states::{SceneState, StateLayout, StateRequest, StateStream, StateStream
 pub use step::{DomainTransform, Step};
 pub use step_stream::{Ack, DriveRequest, StepStream, StreamSummary};
 pub use tonic::Code;
-pub use vertices::{
-    Attribute, Encoding, VertexRequest, VertexSelection, VertexSet, VertexSetDomain, VertexStream, VertexStreamRequest,
-};
+pub use vertex_sections::VertexSetDomain;
+pub use vertices::{Attribute, Encoding, VertexRequest, VertexSelection, VertexSet, VertexStream, VertexStreamRequest};
 
 /// Compiles the client code in the project's README as a doctest.
 #[cfg(doctest)]

@@ -115,7 +115,7 @@ impl Client {
             height,
             without_modes: omit_modes,
         };
-        let mut messages = self.replies(FrameServiceClient::new(self.channel.clone()).pick(wire).await)?;
+        let mut messages = self.replies(FrameServiceClient::new(self.undecoded_channel()).pick(wire).await)?;
         let mut head = None;
         let mut hits = Vec::new();
         while let Some(response) = messages.next().await? {

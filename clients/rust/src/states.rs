@@ -173,7 +173,7 @@ impl Client {
             step: request.step.to_wire(),
             deadline_ms: request.deadline_ms,
         };
-        let messages = self.replies(StateServiceClient::new(self.channel.clone()).get_state(wire).await)?;
+        let messages = self.replies(StateServiceClient::new(self.undecoded_channel()).get_state(wire).await)?;
         let chunk_of = |message: v1::GetStateResponse| message.chunk;
         let decoder = StateDecoder::new(chunk_of, layout, self.max_reply_bytes);
         let state = DecodedReplies::new(messages, decoder).next().await;

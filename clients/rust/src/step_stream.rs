@@ -162,7 +162,7 @@ impl Client {
             .send(open_request)
             .await
             .map_err(|_| Error::StreamEnded { awaited_reply: "the reply to the open request" })?;
-        let mut service = v1::step_service_client::StepServiceClient::new(self.channel.clone());
+        let mut service = v1::step_service_client::StepServiceClient::new(self.undecoded_channel());
         let mut replies = self.replies(service.drive_scene(ReceiverStream::new(queue)).await)?;
         let opened = match replies.next().await?.and_then(|reply| reply.kind) {
             Some(ResponseKind::Opened(opened)) => opened,

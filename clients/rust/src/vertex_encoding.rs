@@ -13,11 +13,11 @@ const BOX_VECTORS: usize = 256;
 /// Size of a box in bytes: 6 f32.
 const BOX_BYTES: usize = 24;
 
-/// Decodes `vector_count` vectors, three numbers each. `field` names the section in errors.
+/// Checks the size of a section with `vector_count` vectors. `field` names the section in errors.
 ///
 /// # Errors
-/// `Malformed` when the size does not fit the encoding and the number of vectors.
-pub(crate) fn decode_vectors(field: &str, encoding: Encoding, vector_count: usize, bytes: &[u8]) -> Result<Vec<f32>> {
+/// `Malformed` when the size does not fit the encoding and the number of vectors, or the encoding is not one of vectors.
+pub(crate) fn check_section_bytes(field: &str, encoding: Encoding, vector_count: usize, bytes: u64) -> Result<()> {
     let expected_bytes = match encoding {
         // Saturating, because the server may claim any number of vectors.
         Encoding::Unspecified | Encoding::F32 => vector_count.saturating_mul(12),
@@ -29,9 +29,18 @@ pub(crate) fn decode_vectors(field: &str, encoding: Encoding, vector_count: usiz
         Encoding::OctahedralI16 => vector_count.saturating_mul(4),
         Encoding::F64 => return Err(malformed_reply(field, "an encoding of vectors", "F64")),
     };
-    if bytes.len() != expected_bytes {
-        return Err(malformed_reply(format!("{field}.bytes"), expected_bytes, bytes.len()));
+    if bytes != expected_bytes as u64 {
+        return Err(malformed_reply(format!("{field}.bytes"), expected_bytes, bytes));
     }
+    Ok(())
+}
+
+/// Decodes `vector_count` vectors, three numbers each. `field` names the section in errors.
+///
+/// # Errors
+/// As for [`check_section_bytes`].
+pub(crate) fn decode_vectors(field: &str, encoding: Encoding, vector_count: usize, bytes: &[u8]) -> Result<Vec<f32>> {
+    check_section_bytes(field, encoding, vector_count, bytes.len() as u64)?;
     match encoding {
         Encoding::F16 => decode_f16(field, bytes),
         Encoding::U16Box => decode_u16_boxes(field, vector_count, bytes),

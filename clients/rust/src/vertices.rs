@@ -8,16 +8,15 @@ use std::task::{Context, Poll};
 
 pub use modalcast_proto::v1::{Attribute, Encoding};
 
-use bytes::Bytes;
 use modalcast_proto::v1;
 use v1::vertex_service_client::VertexServiceClient;
 
-use crate::assemble::{Assembler, Chunk, DecodedReplies, ReplyDecoder, decode};
+use crate::assemble::{Chunk, ChunkSequence, DecodedReplies, ReplyDecoder};
 use crate::client::Client;
 use crate::error::{Error, Result, malformed_reply};
 use crate::request::{StepRequest, Subscription};
 use crate::stages::{self, StageTimes};
-use crate::vertex_encoding::decode_vectors;
+use crate::vertex_sections::{SectionWriter, VertexArrays, VertexSetDomain};
 
 /// The domains and attributes to return. The default is positions and normals of all domains, as f32. The server rejects
 /// attributes that `deform` in scene.toml does not enable.
@@ -64,14 +63,6 @@ pub type VertexRequest = StepRequest<VertexSelection>;
 
 /// A subscription to the vertices of every step.
 pub type VertexStreamRequest = Subscription<VertexSelection>;
-
-/// A selected domain of a [`VertexSet`].
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct VertexSetDomain {
-    pub index: u32,
-    pub vertex_count: u32,
-    pub corner_count: u32,
-}
 
 /// The vertices of one step.
 #[derive(Debug, Clone, PartialEq)]
@@ -136,7 +127,7 @@ impl Client {
             step: request.step.to_wire(),
             deadline_ms: request.deadline_ms,
         };
-        let messages = self.replies(VertexServiceClient::new(self.channel.clone()).get_vertices(wire).await)?;
+        let messages = self.replies(VertexServiceClient::new(self.undecoded_channel()).get_vertices(wire).await)?;
         let set = DecodedReplies::new(messages, VertexDecoder::new(single_part, self.max_reply_bytes)).next().await;
         set.unwrap_or(Err(Error::StreamEnded { awaited_reply: "the vertices of the step" }))
     }
@@ -221,23 +212,45 @@ struct VertexDecoder<M> {
     /// Limit on the domains of the layout, so that its size in memory is at most that of a reply.
     max_domains: u64,
     origins: Option<Arc<[[f64; 3]]>>,
-    assembler: Assembler<v1::VertexHead>,
+    chunks: ChunkSequence<v1::VertexHead>,
+    /// The sections of the open set.
+    sections: Option<SectionWriter>,
 }
 
 impl<M> VertexDecoder<M> {
     fn new(part_of: fn(M) -> Option<Part>, max_reply_bytes: u64) -> Self {
-        let (layout, assembler) = (Layout::Incomplete(Vec::new()), Assembler::new("vertices", max_reply_bytes));
-        let max_domains = max_reply_bytes / size_of::<VertexSetDomain>() as u64;
-        Self { part_of, layout, max_domains, origins: None, assembler }
+        Self {
+            part_of,
+            layout: Layout::Incomplete(Vec::new()),
+            max_domains: max_reply_bytes / size_of::<VertexSetDomain>() as u64,
+            origins: None,
+            chunks: ChunkSequence::new("vertices", max_reply_bytes),
+            sections: None,
+        }
     }
 
-    fn decode_set(&mut self, head: v1::VertexHead, bytes: &Bytes) -> Result<VertexSet> {
+    /// Adds a chunk. Returns the set that it completes.
+    fn add_chunk(&mut self, chunk: v1::VertexChunk) -> Result<Option<VertexSet>> {
         let Layout::Complete(domains) = &self.layout else {
             return Err(malformed_reply("vertices.layout", "a complete layout before the first step", "none"));
         };
-        let set = decode_vertex_set(head, bytes, domains, self.origins.take())?;
-        self.origins = Some(Arc::clone(&set.origins));
-        Ok(set)
+        let chunk = Chunk::new(chunk.head, |head| head.total, chunk.offset, chunk.data);
+        let sections = &mut self.sections;
+        let data = self.chunks.add(chunk, |reply| {
+            *sections = Some(SectionWriter::new(&reply.head, domains)?);
+            Ok(())
+        })?;
+        if let Some(sections) = &mut self.sections {
+            sections.write(&data);
+        }
+        match (self.chunks.end_reply(), self.sections.take_if(|_| !self.chunks.is_open())) {
+            (Some(head), Some(sections)) => {
+                let set = vertex_set(head, sections.finish()?, Arc::clone(domains), self.origins.take())?;
+                self.origins = Some(Arc::clone(&set.origins));
+                Ok(Some(set))
+            }
+            _ => Ok(None),
+        }
     }
 }
 
@@ -248,18 +261,36 @@ impl<M> ReplyDecoder<M> for VertexDecoder<M> {
         match (self.part_of)(message) {
             None => Err(malformed_reply("vertices.part", "a layout or a chunk", "none")),
             Some(Part::Layout(layout)) => self.layout.add(&layout, self.max_domains).map(|()| None),
-            Some(Part::Chunk(chunk)) => {
-                match self.assembler.push(Chunk::new(chunk.head, |head| head.total, chunk.offset, chunk.data))? {
-                    Some((head, bytes)) => self.decode_set(head, &bytes).map(Some),
-                    None => Ok(None),
-                }
-            }
+            Some(Part::Chunk(chunk)) => self.add_chunk(chunk),
         }
     }
 
     fn is_open(&self) -> bool {
-        self.assembler.is_open()
+        self.chunks.is_open()
     }
+}
+
+/// A set of decoded arrays. `last_origins` are those of the previous step.
+fn vertex_set(
+    head: v1::VertexHead,
+    arrays: VertexArrays,
+    domains: Arc<[VertexSetDomain]>,
+    last_origins: Option<Arc<[[f64; 3]]>>,
+) -> Result<VertexSet> {
+    let VertexArrays { positions, normals, displacements, boxes, origins } = arrays;
+    let missing_origins = || malformed_reply("vertices.origins", "origins in the first step", "none");
+    Ok(VertexSet {
+        step: head.step.ok_or_else(|| malformed_reply("vertices.step", "a step", "none"))?,
+        origins: origins.or(last_origins).ok_or_else(missing_origins)?,
+        domains,
+        positions,
+        normals,
+        displacements,
+        boxes,
+        skipped: head.skipped,
+        encoded_bytes: head.total,
+        stages: stages::from_wire(head.stages),
+    })
 }
 
 /// The selected domains of a reply.
@@ -299,97 +330,25 @@ impl Layout {
     }
 }
 
-/// Decodes the sections of a step. `origins` are those of the previous step.
-fn decode_vertex_set(
-    head: v1::VertexHead,
-    bytes: &[u8],
-    domains: &Arc<[VertexSetDomain]>,
-    mut origins: Option<Arc<[[f64; 3]]>>,
-) -> Result<VertexSet> {
-    let sum = |count: fn(&VertexSetDomain) -> u32| domains.iter().map(|domain| count(domain) as usize).sum::<usize>();
-    let (vertex_count, corner_count) = (sum(|domain| domain.vertex_count), sum(|domain| domain.corner_count));
-    let (mut positions, mut normals, mut displacements, mut boxes) = (vec![], vec![], vec![], vec![]);
-    let mut offset = 0;
-    for (index, section) in head.sections.iter().enumerate() {
-        let field = format!("vertices.sections[{index}]");
-        let end = section.offset.checked_add(section.bytes).filter(|end| *end <= bytes.len() as u64);
-        let Some(end) = end.filter(|_| section.offset == offset) else {
-            let expected = format!("a section at {offset} within {} bytes", bytes.len());
-            return Err(malformed_reply(field, expected, format!("{} bytes at {}", section.bytes, section.offset)));
-        };
-        let section_bytes = &bytes[offset as usize..end as usize];
-        offset = end;
-        let vectors = |count: usize| decode_vectors(&field, section.encoding(), count, section_bytes);
-        match section.attribute() {
-            Attribute::Positions => positions = vectors(vertex_count)?,
-            Attribute::Normals => normals = vectors(corner_count)?,
-            Attribute::Displacements => displacements = vectors(vertex_count)?,
-            Attribute::Boxes => {
-                vectors(2 * domains.len())?;
-                boxes = decode(&field, section_bytes)?;
-            }
-            Attribute::Origins => {
-                let received_origins: Vec<[f64; 3]> = decode(&field, section_bytes)?;
-                if received_origins.len() != 1 && received_origins.len() != domains.len() {
-                    let expected = format!("1 or {} origins", domains.len());
-                    return Err(malformed_reply(field, expected, received_origins.len()));
-                }
-                origins = Some(received_origins.into());
-            }
-            // An attribute of a newer server.
-            Attribute::Unspecified => {}
-        }
-    }
-    if offset != bytes.len() as u64 {
-        return Err(malformed_reply("vertices.total", offset, bytes.len()));
-    }
-    Ok(VertexSet {
-        step: head.step.ok_or_else(|| malformed_reply("vertices.step", "a step", "none"))?,
-        origins: origins.ok_or_else(|| malformed_reply("vertices.origins", "origins in the first step", "none"))?,
-        domains: Arc::clone(domains),
-        positions,
-        normals,
-        displacements,
-        boxes,
-        skipped: head.skipped,
-        encoded_bytes: bytes.len() as u64,
-        stages: stages::from_wire(head.stages),
-    })
-}
-
 #[cfg(test)]
 mod tests {
+    use bytes::Bytes;
+
     use super::*;
+    use crate::vertex_sections::tests::{NORMALS, ORIGIN, POSITIONS, float_bytes, head, two_domains};
 
-    /// The first domain has one vertex and no corner. The second has no vertex and one corner.
-    fn two_domains() -> Arc<[VertexSetDomain]> {
-        let domain = |index, vertex_count, corner_count| VertexSetDomain { index, vertex_count, corner_count };
-        [domain(4, 1, 0), domain(7, 0, 1)].into()
+    /// Decodes sections that arrive in one chunk.
+    fn decode_vertex_set(
+        head: v1::VertexHead,
+        bytes: &[u8],
+        domains: &Arc<[VertexSetDomain]>,
+        last_origins: Option<Arc<[[f64; 3]]>>,
+    ) -> Result<VertexSet> {
+        let mut decoder = VertexDecoder::new(|chunk| Some(Part::Chunk(chunk)), 1 << 20);
+        (decoder.layout, decoder.origins) = (Layout::Complete(Arc::clone(domains)), last_origins);
+        let chunk = v1::VertexChunk { head: Some(head), offset: 0, data: Bytes::copy_from_slice(bytes) };
+        decoder.add_message(chunk).map(|set| set.expect("expected a complete set"))
     }
-
-    /// A head whose sections follow each other.
-    fn head(sections: &[(Attribute, Encoding, u64)]) -> v1::VertexHead {
-        let mut offset = 0;
-        let wire_section = |(attribute, encoding, bytes): &(Attribute, Encoding, u64)| {
-            let section = v1::VertexSection {
-                attribute: (*attribute).into(),
-                encoding: (*encoding).into(),
-                offset,
-                bytes: *bytes,
-            };
-            offset += bytes;
-            section
-        };
-        let sections = sections.iter().map(wire_section).collect();
-        v1::VertexHead { step: Some(v1::StepId::default()), sections, ..Default::default() }
-    }
-
-    fn float_bytes(first: u16, count: u16) -> Vec<u8> {
-        (first..first + count).flat_map(|x| f32::from(x).to_le_bytes()).collect()
-    }
-
-    const POSITIONS: (Attribute, Encoding, u64) = (Attribute::Positions, Encoding::F32, 12);
-    const NORMALS: (Attribute, Encoding, u64) = (Attribute::Normals, Encoding::F32, 12);
 
     #[test]
     fn origins_are_kept_until_they_are_sent_again() {
@@ -426,29 +385,34 @@ mod tests {
     }
 
     #[test]
-    fn malformed_sections_report_their_field() {
-        let origins = (Attribute::Origins, Encoding::F64, 24);
-        let overlapping = v1::VertexHead {
-            sections: vec![v1::VertexSection { attribute: 1, encoding: 1, offset: 4, bytes: 12 }],
-            ..head(&[])
+    fn chunks_of_a_set_arrive_one_after_the_other() {
+        let mut decoder = VertexDecoder::new(|chunk| Some(Part::Chunk(chunk)), 1 << 20);
+        let bytes = [float_bytes(1, 3), vec![0; 24]].concat();
+        let chunk = |head, range: std::ops::Range<usize>| v1::VertexChunk {
+            head,
+            offset: range.start as u64,
+            data: Bytes::copy_from_slice(&bytes[range]),
         };
-        let overflowing = v1::VertexHead {
-            sections: vec![v1::VertexSection { attribute: 1, encoding: 1, offset: 0, bytes: u64::MAX }],
-            ..head(&[])
-        };
-        for (head, length, field) in [
-            (head(&[(Attribute::Positions, Encoding::F32, 24), origins]), 48, "sections[0].bytes"),
-            (head(&[POSITIONS, (Attribute::Boxes, Encoding::F32, 24)]), 36, "sections[1].bytes"),
-            (head(&[POSITIONS, (Attribute::Origins, Encoding::F64, 72)]), 84, "sections[1]"),
-            (head(&[POSITIONS, origins]), 24, "sections[1]"),
-            (head(&[POSITIONS, origins]), 40, "total"),
-            (head(&[POSITIONS]), 12, "origins"),
-            (overlapping, 16, "sections[0]"),
-            (overflowing, 16, "sections[0]"),
-        ] {
-            let error = decode_vertex_set(head, &vec![0; length], &two_domains(), None).expect_err(field).to_string();
-            assert!(error.contains(field), "expected {field}, got {error}");
+        let (head, empty_head) = (head(&[POSITIONS, ORIGIN]), head(&[]));
+        let error = decoder.add_message(chunk(Some(head.clone()), 0..5)).expect_err("a chunk without a layout");
+        assert!(error.to_string().contains("vertices.layout"), "{error}");
+        decoder.layout = Layout::Complete(two_domains());
+        for _ in 0..2 {
+            assert_eq!(decoder.add_message(chunk(Some(head.clone()), 0..5)).expect("a valid chunk"), None);
+            assert!(decoder.is_open());
+            let set = decoder.add_message(chunk(None, 5..36)).expect("a valid chunk").expect("a complete set");
+            assert_eq!((set.positions, set.encoded_bytes), (vec![1.0, 2.0, 3.0], 36));
+            assert!(!decoder.is_open());
         }
+        let set = decoder.add_message(chunk(Some(empty_head), 0..0)).expect("a valid chunk").expect("a complete set");
+        assert!(set.positions.is_empty());
+    }
+
+    #[test]
+    fn missing_origins_and_steps_are_malformed() {
+        let error = |head| decode_vertex_set(head, &[0; 12], &two_domains(), None).expect_err("an error").to_string();
+        assert!(error(head(&[POSITIONS])).contains("vertices.origins"));
+        assert!(error(v1::VertexHead { step: None, ..head(&[POSITIONS]) }).contains("vertices.step"));
     }
 
     #[test]
