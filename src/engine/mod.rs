@@ -22,6 +22,7 @@ pub use content::{ContentHash, ContentHashes, SceneContent, ShapeArray, hex, par
 pub use device::context::{DeviceContext, EngineInfo};
 pub use device::loaded_scene::LoadedScene;
 pub use device::scalar_field::validate_mode;
+pub use output::encoding_task::EncodingTask;
 pub use output::frame_encoder::{EncodedFrame, EncodedOutput, FrameEncoder, StepPicture};
 pub use output::frame_format::{FrameFormat, JpegQuality};
 pub use output::pack::{Origins, PackedVertices, Section, VertexPacker};
@@ -153,7 +154,7 @@ impl Engine {
             config,
             source,
             info,
-            encoder: FrameEncoder::per_core(),
+            encoder: FrameEncoder::per_core()?,
             vertex_packer: VertexPacker::start()?,
             load_permits: Semaphore::new(MAX_CONCURRENT_LOADS),
             upload_permits: Arc::new(Semaphore::new(MAX_CONCURRENT_UPLOADS)),

@@ -1,20 +1,19 @@
 //! Encodes frames for the wire as PNG, JPEG or raw pixels. All streams share one encoder, which uses at most one thread per
-//! core.
+//! core. The strips of a PNG are encoded in parallel.
 
-use std::borrow::Cow;
 use std::num::NonZero;
 use std::sync::Arc;
-use std::time::Instant;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use bytes::Bytes;
-use tokio::sync::Semaphore;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
+use super::encoder_pool::EncoderPool;
 use super::frame_format::FrameFormat;
 use super::rendered_picture::{Pixels, RenderedPicture};
 use super::step_output::{OutputBody, StepFrames, StepId, StepOutput};
-use crate::engine::blocking::run_blocking;
-use crate::frame;
-use crate::telemetry::{Stage, StageTimes, ms_since};
+use crate::frame::{self, EncodedStrip, PngLayout, StripBuffers};
+use crate::telemetry::{Stage, StageTimes};
 use modalcast_model::error::{Result, fault, fault_in};
 use modalcast_render::RasterBackends;
 
@@ -30,11 +29,13 @@ pub struct EncodedOutput {
     pub bytes: Bytes,
 }
 
-/// Encodes frames off the device thread. Clones share one limit on threads.
+/// Encodes frames off the device thread. Clones share its threads.
 #[derive(Debug, Clone)]
 pub struct FrameEncoder {
-    /// One permit per thread that may encode.
-    thread_permits: Arc<Semaphore>,
+    pool: EncoderPool,
+    /// One permit per picture in the pool, and as many permits as threads. A further picture waits for a permit, in the
+    /// order of the requests.
+    picture_permits: Arc<Semaphore>,
     cores: usize,
 }
 
@@ -87,12 +88,15 @@ pub struct EncodedFrame {
 
 impl FrameEncoder {
     /// An encoder for this machine: one thread per core.
-    pub(in crate::engine) fn per_core() -> Self {
+    ///
+    /// # Errors
+    /// `Fault` when the threads cannot be started.
+    pub(in crate::engine) fn per_core() -> Result<Self> {
         Self::new(std::thread::available_parallelism().map_or(1, NonZero::get))
     }
 
-    fn new(cores: usize) -> Self {
-        Self { thread_permits: Arc::new(Semaphore::new(cores)), cores }
+    fn new(cores: usize) -> Result<Self> {
+        Ok(Self { pool: EncoderPool::new(cores)?, picture_permits: Arc::new(Semaphore::new(cores)), cores })
     }
 
     /// Maximum number of frames that are encoded concurrently.
@@ -123,45 +127,110 @@ impl FrameEncoder {
     /// Returns the encoding of a picture and the milliseconds that encoding took. The first caller encodes the picture.
     /// If this caller is cancelled, the next caller encodes the picture.
     async fn encode_once(&self, picture: &Arc<RenderedPicture>, format: FrameFormat) -> Result<(Bytes, f64)> {
-        let encode = || {
-            let picture = Arc::clone(picture);
-            self.run(move || encode_pixels(&picture, format))
-        };
-        picture.encoding(format).get_or_try_init(encode).await.cloned()
+        picture.encoding(format).get_or_try_init(|| self.encode_picture(picture, format)).await.cloned()
     }
 
-    /// Runs work on a blocking thread as soon as the thread limit permits. Returns the bytes and the run time in
-    /// milliseconds, without the wait.
-    async fn run(&self, work: impl FnOnce() -> Result<Vec<u8>> + Send + 'static) -> Result<(Bytes, f64)> {
-        let permit = Arc::clone(&self.thread_permits).acquire_owned().await.map_err(fault_in("encode"))?;
-        run_blocking("encode", move || {
+    /// Encodes a picture as soon as the limit on pictures permits. Returns the encoding and its time in milliseconds,
+    /// without the waits for a permit and for the first thread.
+    async fn encode_picture(&self, picture: &Arc<RenderedPicture>, format: FrameFormat) -> Result<(Bytes, f64)> {
+        let permit = Arc::clone(&self.picture_permits).acquire_owned().await.map_err(fault_in("encode"))?;
+        let permit = Arc::new(permit);
+        let (rgba, draw_ms) = self.pixels(picture, &permit).await?;
+        let (width, height) = (picture.width, picture.height);
+        let (bytes, encode_ms) = match format {
+            FrameFormat::Png => self.encode_png([width, height], rgba, &permit).await?,
+            FrameFormat::Jpeg(quality) => {
+                let encode = move || frame::encode_jpeg(width, height, &rgba, quality.get()).map(Bytes::from);
+                self.run(&permit, encode).await?
+            }
+            FrameFormat::Rgba => (rgba, 0.0),
+            FrameFormat::F32 | FrameFormat::U32 | FrameFormat::F32x3 => {
+                return Err(fault("encode", "expected a format of colors, got a format of numbers"));
+            }
+        };
+        Ok((bytes, draw_ms + encode_ms))
+    }
+
+    /// The colors of a picture. Draws a color map with its legend first.
+    async fn pixels(&self, picture: &Arc<RenderedPicture>, permit: &Arc<OwnedSemaphorePermit>) -> Result<(Bytes, f64)> {
+        match &picture.pixels {
+            Pixels::Color(rgba) => Ok((rgba.clone(), 0.0)),
+            Pixels::ColorMap(..) => {
+                let picture = Arc::clone(picture);
+                self.run(permit, move || draw_color_map(&picture)).await
+            }
+            Pixels::Values(_) => Err(fault("encode", "expected colors, got values")),
+        }
+    }
+
+    /// Encodes the strips of a picture in parallel: first without alpha, and again with alpha if a strip turns out to be
+    /// translucent. Frames are opaque, so reading all pixels in advance would only add latency.
+    async fn encode_png(
+        &self,
+        [width, height]: [u32; 2],
+        rgba: Bytes,
+        permit: &Arc<OwnedSemaphorePermit>,
+    ) -> Result<(Bytes, f64)> {
+        let opaque = PngLayout::opaque(width, height)?;
+        let (file, ms) = self.encode_strips(opaque, rgba.clone(), permit).await?;
+        if let Some(file) = file {
+            return Ok((file, ms));
+        }
+        let (file, translucent_ms) = self.encode_strips(opaque.translucent()?, rgba, permit).await?;
+        Ok((file.ok_or_else(|| fault("encode", "expected a PNG with alpha"))?, ms + translucent_ms))
+    }
+
+    /// Encodes the strips of a picture. Returns `None` if a pixel is not opaque and the layout has no alpha channel.
+    async fn encode_strips(
+        &self,
+        layout: PngLayout,
+        rgba: Bytes,
+        permit: &Arc<OwnedSemaphorePermit>,
+    ) -> Result<(Option<Bytes>, f64)> {
+        let is_translucent = AtomicBool::new(false);
+        let encode_strip = move |index: usize, buffers: &mut StripBuffers| {
+            // Once one strip is translucent, the others are not needed.
+            if is_translucent.load(Ordering::Relaxed) {
+                return Ok(None);
+            }
+            let strip = layout.encode_strip(&rgba, index, buffers);
+            is_translucent.fetch_or(matches!(strip, Ok(None)), Ordering::Relaxed);
+            strip
+        };
+        let permit = Arc::clone(permit);
+        let assemble = move |strips: Vec<Result<Option<EncodedStrip>>>| {
             let _permit = permit;
-            let begin = Instant::now();
-            work().map(|bytes| (bytes.into(), ms_since(begin)))
-        })
-        .await
+            let strips: Option<Vec<EncodedStrip>> = strips.into_iter().collect::<Result<_>>()?;
+            Ok(strips.map(|strips| Bytes::from(layout.assemble(&strips))))
+        };
+        let (file, ms) = self.pool.run(layout.strip_count(), encode_strip, assemble).await?;
+        Ok((file?, ms))
+    }
+
+    /// Runs work that has no parallel parts. The work holds the permit, also after its caller is cancelled.
+    async fn run(
+        &self,
+        permit: &Arc<OwnedSemaphorePermit>,
+        work: impl Fn() -> Result<Bytes> + Send + Sync + 'static,
+    ) -> Result<(Bytes, f64)> {
+        let permit = Arc::clone(permit);
+        let finish = move |results: Vec<Result<Bytes>>| {
+            let _permit = permit;
+            results.into_iter().next().unwrap_or_else(|| Err(fault("encode", "expected a result")))
+        };
+        let (bytes, ms) = self.pool.run(1, move |_, (): &mut ()| work(), finish).await?;
+        Ok((bytes?, ms))
     }
 }
 
-/// Encodes a picture; draws a color map with its legend first.
-fn encode_pixels(picture: &RenderedPicture, format: FrameFormat) -> Result<Vec<u8>> {
-    let (width, height) = (picture.width, picture.height);
-    let rgba = match &picture.pixels {
-        Pixels::Color(rgba) => Cow::Borrowed(&rgba[..]),
-        // `samples` is the number of samples per pixel.
-        Pixels::ColorMap(image, legend) => {
-            Cow::Owned(frame::draw_color_map(&image.bytes, image.samples, [width, height], legend)?)
-        }
-        Pixels::Values(_) => return Err(fault("encode", "expected colors, got values")),
+/// Draws a color map with its legend.
+fn draw_color_map(picture: &RenderedPicture) -> Result<Bytes> {
+    let Pixels::ColorMap(image, legend) = &picture.pixels else {
+        return Err(fault("encode", "expected values with a legend"));
     };
-    match format {
-        FrameFormat::Png => frame::encode_png(width, height, &rgba),
-        FrameFormat::Jpeg(quality) => frame::encode_jpeg(width, height, &rgba, quality.get()),
-        FrameFormat::Rgba => Ok(rgba.into_owned()),
-        FrameFormat::F32 | FrameFormat::U32 | FrameFormat::F32x3 => {
-            Err(fault("encode", "expected a format of colors, got a format of numbers"))
-        }
-    }
+    // `samples` is the number of samples per pixel.
+    let rgba = frame::draw_color_map(&image.bytes, image.samples, [picture.width, picture.height], legend)?;
+    Ok(rgba.into())
 }
 
 #[cfg(test)]
@@ -191,15 +260,19 @@ pub(in crate::engine) mod tests {
         StepPicture::of_output(output.clone()).expect("expected frames").next().expect("expected a picture")
     }
 
-    /// An encoder without thread permits. It encodes once the test adds permits to the semaphore.
+    fn encoder(cores: usize) -> FrameEncoder {
+        FrameEncoder::new(cores).expect("expected threads")
+    }
+
+    /// An encoder without permits. It encodes once the test adds permits to the semaphore.
     pub(in crate::engine) fn paused_encoder(cores: usize) -> (FrameEncoder, Arc<Semaphore>) {
-        let thread_permits = Arc::new(Semaphore::new(0));
-        (FrameEncoder { thread_permits: Arc::clone(&thread_permits), cores }, thread_permits)
+        let picture_permits = Arc::new(Semaphore::new(0));
+        (FrameEncoder { picture_permits: Arc::clone(&picture_permits), ..encoder(cores) }, picture_permits)
     }
 
     #[tokio::test]
     async fn subscribers_share_one_png_and_raw_pixels() {
-        let encoder = FrameEncoder::new(2);
+        let encoder = encoder(2);
         let output = noise_frame(1, 16);
         let encode_twice = async |format| {
             let first = encoder.encode(first_picture(&output), format);
@@ -230,12 +303,12 @@ pub(in crate::engine) mod tests {
 
     #[tokio::test]
     async fn next_subscriber_encodes_after_a_cancelled_one() {
-        let (encoder, thread_permits) = paused_encoder(1);
+        let (encoder, picture_permits) = paused_encoder(1);
         let output = noise_frame(2, 8);
         let first = encoder.encode(first_picture(&output), FrameFormat::Png);
         let timeout = std::time::Duration::from_millis(20);
         tokio::time::timeout(timeout, first).await.expect_err("expected no PNG without a thread");
-        thread_permits.add_permits(1);
+        picture_permits.add_permits(1);
         let second = encoder.encode(first_picture(&output), FrameFormat::Png).await.expect("expected a PNG");
         assert!(image::load_from_memory(&second.output.bytes).is_ok());
     }

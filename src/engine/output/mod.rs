@@ -1,5 +1,7 @@
 //! Outputs of steps: frames, AOVs, picks, vertices and states, and their encoding for the wire off the device thread.
 
+mod encoder_pool;
+pub(super) mod encoding_task;
 pub(super) mod frame_encoder;
 pub(super) mod frame_format;
 pub(super) mod pack;

@@ -3,14 +3,13 @@
 
 use std::collections::VecDeque;
 
-use tokio::task::JoinHandle;
-
 use super::delivery::Delivery;
 use super::subscriber::Subscription;
+use crate::engine::output::encoding_task::EncodingTask;
 use crate::engine::output::frame_encoder::{EncodedFrame, FrameEncoder, StepPicture};
 use crate::engine::output::frame_format::FrameFormat;
 use crate::engine::output::step_output::StepOutput;
-use modalcast_model::error::{Error, Result, fault_in};
+use modalcast_model::error::{Error, Result};
 
 /// A stream that holds at least this many bytes of pixels accepts no further step.
 const MAX_PIXEL_BYTES: usize = 128 << 20;
@@ -30,22 +29,9 @@ pub struct EncodedSubscription {
     /// Number of steps that will still be taken from the subscription.
     remaining_steps: u64,
     /// Oldest first.
-    encodings: VecDeque<Encoding>,
+    encodings: VecDeque<EncodingTask>,
     /// The error that ended the subscription. It is reported after the frames in `encodings`.
     end_error: Option<Error>,
-}
-
-/// A frame that is encoded in a task. Dropping it cancels the encoding unless a thread has already started it.
-#[derive(Debug)]
-struct Encoding {
-    task: JoinHandle<Result<EncodedFrame>>,
-    pixel_bytes: usize,
-}
-
-impl Drop for Encoding {
-    fn drop(&mut self) {
-        self.task.abort();
-    }
 }
 
 impl EncodedSubscription {
@@ -87,7 +73,7 @@ impl EncodedSubscription {
             Delivery::Lossless => self.encoder.cores(),
             Delivery::Latest => MAX_LATEST_STEPS,
         };
-        let pixel_bytes: usize = self.encodings.iter().map(|encoding| encoding.pixel_bytes).sum();
+        let pixel_bytes: usize = self.encodings.iter().map(EncodingTask::pixel_bytes).sum();
         let held_steps = self.encodings.len().div_ceil(self.formats.len().max(1));
         let is_within_limits = held_steps < max_steps && pixel_bytes < MAX_PIXEL_BYTES;
         is_within_limits && self.remaining_steps > 0 && self.end_error.is_none()
@@ -95,9 +81,7 @@ impl EncodedSubscription {
 
     fn start_encoding(&mut self, output: StepOutput) -> Result<()> {
         for (picture, format) in StepPicture::of_output(output)?.zip(&self.formats) {
-            let (encoder, format, pixel_bytes) = (self.encoder.clone(), *format, picture.picture.pixel_bytes());
-            let task = tokio::spawn(async move { encoder.encode(picture, format).await });
-            self.encodings.push_back(Encoding { task, pixel_bytes });
+            self.encodings.push_back(EncodingTask::start(&self.encoder, picture, *format));
         }
         self.remaining_steps -= 1;
         Ok(())
@@ -105,11 +89,11 @@ impl EncodedSubscription {
 }
 
 /// Waits for the oldest encoding and removes it. Cancel-safe.
-async fn finish_oldest(encodings: &mut VecDeque<Encoding>) -> Result<EncodedFrame> {
+async fn finish_oldest(encodings: &mut VecDeque<EncodingTask>) -> Result<EncodedFrame> {
     let Some(oldest) = encodings.front_mut() else { return std::future::pending().await };
-    let encoded = (&mut oldest.task).await;
+    let encoded = oldest.finish().await;
     encodings.pop_front();
-    encoded.map_err(fault_in("encode"))?
+    encoded
 }
 
 #[cfg(test)]

@@ -84,7 +84,7 @@ fn random_patterns_are_decoded() {
     for _ in 0..300 {
         let (width, height) = (random.u32(1..200), random.u32(1..60));
         // Runs of random length, of colors that differ in few or many bits.
-        let (max_run, mask, alpha) = (random.u32(1..2000), random.u32(..), random.u32(..2) * random.u32(..) << 24);
+        let (max_run, mask, alpha) = (random.u32(1..2000), random.u32(..), (random.u32(..2) * random.u32(..)) << 24);
         let (mut run, mut color) = (0, 0);
         let rgba = picture(width, height, |_, _| {
             if run == 0 {
