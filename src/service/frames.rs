@@ -18,8 +18,8 @@ use super::reply_body::without_copies;
 use super::status::to_status;
 use super::stream::{Deadline, ReplySender, ReplyStream, chunks_with_head, respond};
 use crate::engine::{
-    EncodedFrame, EncodedSubscription, Engine, FrameStreamEntry, FrameStreamRegistration, OutputSpec, StepPicture,
-    StreamDelivery, StreamId,
+    EncodedFrame, EncodedSubscription, EncodingTask, Engine, FrameStreamEntry, FrameStreamRegistration, OutputSpec,
+    StepPicture, StreamDelivery, StreamId,
 };
 use modalcast_model::error::fault;
 
@@ -44,8 +44,12 @@ impl v1::frame_service_server::FrameService for FrameServiceImpl {
         Ok(without_copies(respond(move |reply_sender| async move {
             let work = async {
                 let output = scene_handle.request_output(selector, output_spec(&pictures)).await.map_err(to_status)?;
-                for (step_picture, picture) in StepPicture::of_output(output).map_err(to_status)?.zip(&pictures) {
-                    let frame = encoder.encode(step_picture, picture.format).await.map_err(to_status)?;
+                let step_pictures = StepPicture::of_output(output).map_err(to_status)?.zip(&pictures);
+                // All pictures are encoded concurrently, and sent in order.
+                let mut tasks: Vec<EncodingTask> =
+                    step_pictures.map(|(step, picture)| EncodingTask::start(&encoder, step, picture.format)).collect();
+                for (task, picture) in tasks.iter_mut().zip(&pictures) {
+                    let frame = task.finish().await.map_err(to_status)?;
                     for chunk in frame_chunks(&frame, picture, max_chunk_bytes) {
                         reply_sender.send(v1::RenderFrameResponse { part: Some(SinglePart::Chunk(chunk)) }).await?;
                     }
