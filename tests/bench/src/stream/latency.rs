@@ -1,6 +1,7 @@
 //! Latency with one step in flight. The sender and the viewer are two connections of this process, so that one clock
 //! measures both ends. The server is another process.
 
+use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
 use modalcast_client::FrameStreamRequest;
@@ -11,7 +12,7 @@ use super::motion::{self, Motion};
 use super::peers::viewer::{self, Content};
 use super::session::Session;
 use crate::timing::quantile;
-use modalcast_client::Client;
+use modalcast_client::{Client, StageTimes};
 use modalcast_model::error::{Result, fault, fault_in};
 
 /// Time between two steps: 60 steps per second.
@@ -24,7 +25,7 @@ const WARM_UP_STEPS: u64 = 5;
 const MAX_TIMER_ERROR: Duration = Duration::from_millis(2);
 
 /// Quantiles of times.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct LatencyResult {
     /// The two ends of the time.
     pub from: &'static str,
@@ -41,9 +42,29 @@ pub struct LatencyResult {
     pub delayed_steps: usize,
     /// Steps per second if steps are sent from memory without a wait for acknowledgements. Only for acknowledgements.
     pub steps_per_second: Option<f64>,
+    /// The stages of the server, and everything between them. The largest p50 is first. Only for frames.
+    pub stages: Vec<StageLatency>,
 }
 
+/// Quantiles of the time of one stage.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct StageLatency {
+    pub stage: String,
+    pub p50_ms: f64,
+    pub p99_ms: f64,
+}
+
+/// The name of the time of a frame that is not in a stage of the server.
+const OTHER_STAGE: &str = "send, transfer and waits";
+
 impl LatencyResult {
+    /// The stage with the largest p50, in words.
+    pub fn bottleneck(&self) -> Option<String> {
+        let StageLatency { stage, p50_ms, p99_ms } = self.stages.first()?;
+        let (total, tail) = (self.p50_ms, self.p99_ms);
+        Some(format!("{stage}: {p50_ms:.3} of {total:.3} ms at p50, p99 {p99_ms:.3} of {tail:.3} ms"))
+    }
+
     /// The quantiles of times in milliseconds.
     fn new([from, to]: [&'static str; 2], mut times_ms: Vec<f64>) -> Result<Self> {
         let mut at = |fraction: f64| quantile(&mut times_ms, fraction);
@@ -53,7 +74,33 @@ impl LatencyResult {
         };
         let steps = times_ms.len();
         let (period_ms, delayed_steps, steps_per_second) = (None, 0, None);
-        Ok(Self { from, to, steps, p50_ms, p90_ms, p99_ms, max_ms, period_ms, delayed_steps, steps_per_second })
+        let stages = Vec::new();
+        Ok(Self { from, to, steps, p50_ms, p90_ms, p99_ms, max_ms, period_ms, delayed_steps, steps_per_second, stages })
+    }
+}
+
+/// The times of the stages of frames.
+#[derive(Debug, Default)]
+struct StageSamples(BTreeMap<String, Vec<f64>>);
+
+impl StageSamples {
+    /// Adds the stages of a frame that took `total_ms`.
+    fn add(&mut self, stages: &StageTimes, total_ms: f64) {
+        let stages_ms: f64 = stages.iter().map(|(_, ms)| f64::from(*ms)).sum();
+        let other = (OTHER_STAGE, (total_ms - stages_ms).max(0.0));
+        for (stage, ms) in stages.iter().map(|(stage, ms)| (stage.as_str(), f64::from(*ms))).chain([other]) {
+            self.0.entry(stage.to_owned()).or_default().push(ms);
+        }
+    }
+
+    fn latencies(self) -> Vec<StageLatency> {
+        let quantiles = |(stage, mut times_ms): (String, Vec<f64>)| {
+            let p50_ms = quantile(&mut times_ms, 0.5)?;
+            Some(StageLatency { stage, p50_ms, p99_ms: quantile(&mut times_ms, 0.99)? })
+        };
+        let mut stages: Vec<StageLatency> = self.0.into_iter().filter_map(quantiles).collect();
+        stages.sort_by(|a, b| b.p50_ms.total_cmp(&a.p50_ms));
+        stages
     }
 }
 
@@ -74,6 +121,7 @@ async fn time_frames(url: &str, motion: &Motion, content: Content, steps: u64) -
     let mut frames = viewer.stream_frames(&request).await.map_err(fault_in("report"))?;
     let mut writer = motion::open_writer(&sender, None).await?;
     let (mut times_ms, mut delayed_steps, mut start) = (Vec::new(), 0, Instant::now());
+    let mut stages = StageSamples::default();
     for number in 0..WARM_UP_STEPS + steps {
         if number == WARM_UP_STEPS {
             start = Instant::now();
@@ -92,12 +140,17 @@ async fn time_frames(url: &str, motion: &Motion, content: Content, steps: u64) -
         if frame.step.number != number {
             return Err(fault("report", format!("expected a frame of step {number}, got {}", frame.step.number)));
         }
-        times_ms.extend(timed_number.map(|_| sent.elapsed().as_secs_f64() * 1e3));
+        if timed_number.is_some() {
+            let total_ms = sent.elapsed().as_secs_f64() * 1e3;
+            times_ms.push(total_ms);
+            stages.add(&frame.stages, total_ms);
+        }
         writer.take_acks();
     }
     writer.finish().await.map_err(fault_in("report"))?;
     let period_ms = Some(PERIOD.as_secs_f64() * 1e3);
-    Ok(LatencyResult { period_ms, delayed_steps, ..LatencyResult::new(["step sent", "PNG received"], times_ms)? })
+    let latency = LatencyResult::new(["step sent", "PNG received"], times_ms)?;
+    Ok(LatencyResult { period_ms, delayed_steps, stages: stages.latencies(), ..latency })
 }
 
 /// Measures the time from sending a step until its acknowledgement, with one step in flight, and the rate of steps that
@@ -146,5 +199,22 @@ mod tests {
         assert_eq!((latency.p50_ms, latency.p90_ms, latency.p99_ms, latency.max_ms), (50.0, 90.0, 99.0, 100.0));
         assert_eq!(latency.steps, 101);
         assert!(LatencyResult::new(["a", "b"], vec![]).is_err());
+    }
+
+    #[test]
+    fn stages_and_the_rest_add_up_and_the_largest_is_named() {
+        let mut samples = StageSamples::default();
+        for number in 0..=100_u8 {
+            let stages = vec![("draw".to_owned(), 3.0), ("encode".to_owned(), f32::from(number))];
+            samples.add(&stages, 10.0 + f64::from(number));
+        }
+        let stages = samples.latencies();
+        let of = |index: usize| (stages[index].stage.as_str(), stages[index].p50_ms, stages[index].p99_ms);
+        assert_eq!([of(0), of(1), of(2)], [("encode", 50.0, 99.0), (OTHER_STAGE, 7.0, 7.0), ("draw", 3.0, 3.0)]);
+        let times_ms = (10..=110).map(f64::from).collect();
+        let latency = LatencyResult::new(["a", "b"], times_ms).expect("expected quantiles");
+        assert_eq!(latency.bottleneck(), None);
+        let bottleneck = LatencyResult { stages, ..latency }.bottleneck();
+        assert_eq!(bottleneck.as_deref(), Some("encode: 50.000 of 60.000 ms at p50, p99 99.000 of 109.000 ms"));
     }
 }

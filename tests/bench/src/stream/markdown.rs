@@ -129,7 +129,18 @@ fn latency_section(report: &StreamReport) -> String {
     ];
     let note = "One step is in flight. Sender and viewer are two connections of one process. A step is delayed if the \
                 previous one had not arrived when it was due.";
-    section("Latency", note, &head, latencies.iter().map(row).collect())
+    let text = section("Latency", note, &head, latencies.iter().map(row).collect());
+    let stage_rows = latencies.iter().flat_map(|(case, result)| {
+        result.stages.iter().map(|stage| {
+            let times = [stage.p50_ms, stage.p99_ms].map(|ms| format!("{ms:.3}"));
+            [case.name.to_owned(), stage.stage.clone()].into_iter().chain(times).collect()
+        })
+    });
+    let bottleneck =
+        |(case, result): &(&CaseReport, &LatencyResult)| Some(format!("{}: {}.", case.name, result.bottleneck()?));
+    let bottlenecks: Vec<String> = latencies.iter().filter_map(bottleneck).collect();
+    let note = format!("The longest part of each case: {}", bottlenecks.join(" "));
+    text + &section("Latency of the stages", &note, &["case", "stage", "p50 ms", "p99 ms"], stage_rows.collect())
 }
 
 fn socket_section(report: &StreamReport) -> String {
@@ -225,12 +236,13 @@ fn encoding_sections(report: &StreamReport) -> String {
     let picture_row = |case: &CaseReport, row: &PictureEncodingRow| {
         let name = if row.is_used_by_server { format!("**{}**", row.encoder) } else { row.encoder.clone() };
         let errors = [row.largest_error, row.rms_error].map(|error| format!("{error:.3}"));
-        let cells = [case.scene.to_owned(), name, row.bytes.to_string(), format!("{:.2}", row.ms)];
+        let all_threads_ms = row.all_threads_ms.map_or_else(dash, |ms| format!("{ms:.2}"));
+        let cells = [case.scene.to_owned(), name, row.bytes.to_string(), format!("{:.2}", row.ms), all_threads_ms];
         cells.into_iter().chain(errors).collect()
     };
     let picture_rows = pictures.iter().flat_map(|(case, rows)| rows.iter().map(|row| picture_row(case, row)));
-    let head = ["scene", "encoder", "bytes", "ms", "largest error", "rms error"];
-    let note = "One frame, one thread. Errors are in levels of 255.";
+    let head = ["scene", "encoder", "bytes", "one thread ms", "all threads ms", "largest error", "rms error"];
+    let note = "One frame. The server uses the encoders in bold. Errors are in levels of 255.";
     text + &section("Encodings of pictures", note, &head, picture_rows.collect())
 }
 

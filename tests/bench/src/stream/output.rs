@@ -150,6 +150,10 @@ fn latency_quantities(result: &LatencyResult) -> Vec<Quantity> {
     quantities.push(quantity("steps", result.steps as f64, "1"));
     quantities.extend(result.period_ms.map(|ms| quantity("period", ms, "ms")));
     quantities.extend(result.steps_per_second.map(|rate| quantity("rate of steps from memory", rate, "1/s")));
+    for stage in &result.stages {
+        let times = [quantity("p50", stage.p50_ms, "ms"), quantity("p99", stage.p99_ms, "ms")];
+        quantities.extend(of_variant(&stage.stage, times));
+    }
     quantities
 }
 
@@ -201,5 +205,6 @@ fn picture_quantities(row: &PictureEncodingRow) -> Vec<Quantity> {
         quantity("largest error", row.largest_error, "level"),
         quantity("rms error", row.rms_error, "level"),
     ];
-    of_variant(&row.encoder, numbers)
+    let parallel = row.all_threads_ms.map(|ms| quantity("time to encode on all threads", ms, "ms"));
+    of_variant(&row.encoder, numbers.into_iter().chain(parallel))
 }

@@ -1,8 +1,10 @@
-//! Encodings of pictures: time, bytes and error of the server's encoder and of alternatives, on one frame of a scene.
+//! Encodings of pictures: time, bytes and error of the server's encoders and of alternatives, on one frame of a scene.
 
 use std::time::Instant;
 
+use modalcast::frame::{self, EncodedStrip, PngLayout, StripBuffers};
 use modalcast_client::FrameRequest;
+use rayon::prelude::*;
 use serde::Serialize;
 
 use super::SCENE;
@@ -16,13 +18,15 @@ use modalcast_model::error::{Result, fault, fault_in};
 /// One encoder.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct PictureEncodingRow {
-    /// Filter and compression level of a PNG.
+    /// Filter and compression level of a PNG, or quality of a JPEG.
     pub encoder: String,
-    /// Whether the server uses this encoder. Its time includes the removal of the opaque alpha channel.
+    /// Whether the server uses this encoder. The time of its PNG includes the removal of the opaque alpha channel.
     pub is_used_by_server: bool,
     pub bytes: usize,
     /// Median time of one thread.
     pub ms: f64,
+    /// Median time of one picture on all threads. `None` if the encoder uses one thread per picture.
+    pub all_threads_ms: Option<f64>,
     /// Errors of a channel after decoding, in levels of 255; 0 for a lossless encoding.
     pub largest_error: f64,
     pub rms_error: f64,
@@ -36,27 +40,36 @@ struct Pixels {
     rgb: Vec<u8>,
 }
 
-/// An encoder to measure. A lossy format would be a further variant.
+/// An encoder to measure.
 #[derive(Debug, Clone, Copy)]
 enum Encoder {
-    /// The encoder that the server uses.
-    Server,
+    /// The PNG encoder that the server uses.
+    ServerPng,
+    /// The JPEG encoder that the server uses, with a quality.
+    ServerJpeg(u8),
+    /// The crate `png`.
     Png(png::Filter, png::Compression),
 }
 
 impl Encoder {
     fn name(self) -> String {
         match self {
-            Self::Server => "PNG of the server".into(),
+            Self::ServerPng => "PNG of the server".into(),
+            Self::ServerJpeg(quality) => format!("JPEG of quality {quality}"),
             Self::Png(filter, level) => format!("PNG {filter:?} {level:?}"),
         }
     }
 
     fn encode(self, pixels: &Pixels) -> Result<Vec<u8>> {
         match self {
-            Self::Server => modalcast::frame::encode_png(pixels.width, pixels.height, &pixels.rgba),
+            Self::ServerPng => frame::encode_png(pixels.width, pixels.height, &pixels.rgba),
+            Self::ServerJpeg(quality) => frame::encode_jpeg(pixels.width, pixels.height, &pixels.rgba, quality),
             Self::Png(filter, level) => encode_png(pixels, filter, level),
         }
+    }
+
+    const fn is_used_by_server(self) -> bool {
+        matches!(self, Self::ServerPng | Self::ServerJpeg(_))
     }
 }
 
@@ -85,7 +98,7 @@ async fn draw(session: &Session, content: Content) -> Result<Pixels> {
     Ok(Pixels { width: frame.width, height: frame.height, rgba: frame.bytes.to_vec(), rgb })
 }
 
-/// The server's encoder; then all filters at its compression level, and all levels with its filter.
+/// The server's encoders; then the crate `png` with all filters at one compression level, and all levels with one filter.
 fn encoders() -> Vec<Encoder> {
     use png::{Compression, Filter};
     let filters = [Filter::NoFilter, Filter::Sub, Filter::Up, Filter::Avg, Filter::Paeth, Filter::Adaptive];
@@ -93,7 +106,17 @@ fn encoders() -> Vec<Encoder> {
     let with_filters = filters.into_iter().map(|filter| (filter, Compression::Fast));
     let with_levels = levels.into_iter().map(|level| (Filter::Sub, level));
     let png = |(filter, level)| Encoder::Png(filter, level);
-    std::iter::once(Encoder::Server).chain(with_filters.chain(with_levels).map(png)).collect()
+    let jpegs = [50, 75, 90, 100].map(Encoder::ServerJpeg);
+    std::iter::once(Encoder::ServerPng).chain(jpegs).chain(with_filters.chain(with_levels).map(png)).collect()
+}
+
+/// The PNG of the server, whose strips are encoded on all threads.
+fn encode_on_all_threads(pixels: &Pixels) -> Result<Vec<u8>> {
+    let layout = PngLayout::opaque(pixels.width, pixels.height)?;
+    let encode_strip = |buffers: &mut StripBuffers, index| layout.encode_strip(&pixels.rgba, index, buffers);
+    let strips = (0..layout.strip_count()).into_par_iter().map_init(StripBuffers::default, encode_strip);
+    let strips: Option<Vec<EncodedStrip>> = strips.collect::<Result<Vec<_>>>()?.into_iter().collect();
+    Ok(layout.assemble(&strips.ok_or_else(|| fault("report", "expected an opaque picture"))?))
 }
 
 fn encode_png(pixels: &Pixels, filter: png::Filter, level: png::Compression) -> Result<Vec<u8>> {
@@ -112,23 +135,33 @@ fn encode_png(pixels: &Pixels, filter: png::Filter, level: png::Compression) -> 
 }
 
 fn measure_encoder(encoder: Encoder, pixels: &Pixels, repetitions: usize) -> Result<PictureEncodingRow> {
-    // The first run is not timed.
-    let bytes = encoder.encode(pixels)?;
-    let mut times_ms = Vec::new();
-    for _ in 0..repetitions {
-        let start = Instant::now();
-        encoder.encode(pixels)?;
-        times_ms.push(start.elapsed().as_secs_f64() * 1e3);
-    }
+    let (bytes, ms) = time_median(repetitions, || encoder.encode(pixels))?;
+    let all_threads_ms = match encoder {
+        Encoder::ServerPng => Some(time_median(repetitions, || encode_on_all_threads(pixels))?.1),
+        Encoder::ServerJpeg(_) | Encoder::Png(..) => None,
+    };
     let [largest_error, rms_error] = decoding_errors(&bytes, &pixels.rgb)?;
     Ok(PictureEncodingRow {
         encoder: encoder.name(),
-        is_used_by_server: matches!(encoder, Encoder::Server),
+        is_used_by_server: encoder.is_used_by_server(),
         bytes: bytes.len(),
-        ms: quantile(&mut times_ms, 0.5).unwrap_or(0.0),
+        ms,
+        all_threads_ms,
         largest_error,
         rms_error,
     })
+}
+
+/// The result of `encode` and its median time in milliseconds. The first run is not timed.
+fn time_median(repetitions: usize, encode: impl Fn() -> Result<Vec<u8>>) -> Result<(Vec<u8>, f64)> {
+    let bytes = encode()?;
+    let mut times_ms = Vec::new();
+    for _ in 0..repetitions {
+        let start = Instant::now();
+        encode()?;
+        times_ms.push(start.elapsed().as_secs_f64() * 1e3);
+    }
+    Ok((bytes, quantile(&mut times_ms, 0.5).unwrap_or(0.0)))
 }
 
 /// The largest and the RMS error of a channel of an encoded picture, in levels.
@@ -154,23 +187,30 @@ mod tests {
     }
 
     #[test]
-    fn every_png_is_lossless_and_one_is_used_by_the_server() {
+    fn every_png_is_lossless_and_jpeg_is_not() {
         let rows: Vec<PictureEncodingRow> = encoders()
             .into_iter()
-            .map(|encoder| measure_encoder(encoder, &pixels(), 2).expect("expected a PNG"))
+            .map(|encoder| measure_encoder(encoder, &pixels(), 2).expect("expected a picture"))
             .collect();
-        assert!(rows.iter().all(|row| (row.largest_error, row.rms_error) == (0.0, 0.0) && row.bytes > 100), "{rows:?}");
-        let used: Vec<usize> = rows.iter().filter(|row| row.is_used_by_server).map(|row| row.bytes).collect();
-        let same = rows.iter().find(|row| row.encoder == "PNG Sub Fast").map(|row| row.bytes);
-        // The server's PNG also has a chunk that states the color space.
-        assert!(used.len() == 1 && same.is_some_and(|bytes| (bytes..bytes + 100).contains(&used[0])), "{rows:?}");
+        let (pngs, jpegs): (Vec<_>, Vec<_>) = rows.iter().partition(|row| row.encoder.starts_with("PNG"));
+        assert!(pngs.iter().all(|row| (row.largest_error, row.rms_error) == (0.0, 0.0) && row.bytes > 100), "{rows:?}");
+        assert!(jpegs.len() > 2 && jpegs.iter().all(|row| row.is_used_by_server && row.rms_error > 0.0), "{rows:?}");
+        let used: Vec<&str> = pngs.iter().filter(|row| row.is_used_by_server).map(|row| row.encoder.as_str()).collect();
+        assert_eq!(used, ["PNG of the server"]);
+        assert_eq!(rows.iter().filter(|row| row.all_threads_ms.is_some()).count(), 1);
+    }
+
+    #[test]
+    fn all_threads_write_the_same_file() {
+        let file = Encoder::ServerPng.encode(&pixels()).expect("expected a PNG");
+        assert_eq!(encode_on_all_threads(&pixels()).expect("expected a PNG"), file);
     }
 
     #[test]
     fn error_of_a_changed_channel_is_measured() {
         let Pixels { width, height, mut rgba, rgb } = pixels();
         rgba[0] ^= 8;
-        let changed = modalcast::frame::encode_png(width, height, &rgba).expect("expected a PNG");
+        let changed = frame::encode_png(width, height, &rgba).expect("expected a PNG");
         let [largest, rms] = decoding_errors(&changed, &rgb).expect("expected pixels");
         assert_eq!(largest, 8.0);
         assert!((rms - 8.0 / 384.0_f64.sqrt()).abs() < 1e-12, "{rms}");

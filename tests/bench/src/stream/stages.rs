@@ -11,6 +11,7 @@ use modalcast_client::ServerInfo;
 use serde::Serialize;
 
 use super::peers::viewer::Content;
+use modalcast::frame::PngLayout;
 
 /// The stages that run one after the other on the GPU, or on the CPU if the machine has no GPU.
 const DEVICE_STAGES: [&str; 4] = ["deform", "upload", "shadow", "draw"];
@@ -100,13 +101,17 @@ impl StageInputs<'_> {
         (total_ms > 0.0).then(|| StageRate::new(join_words(&names), total_ms, resource, 1))
     }
 
-    /// Each distinct frame is encoded once, on one of the server's encoder threads, of which there is one per thread of
-    /// the machine. Vertices are packed for each viewer, one step at a time.
+    /// Each distinct frame is encoded once, on as many of the server's encoder threads as a picture has strips. There is
+    /// one such thread per thread of the machine. Vertices are packed for each viewer, one step at a time.
     fn encode_rate(&self, content: Content, viewers: usize) -> Option<StageRate> {
         let threads = self.threads;
         let is_png = matches!(content, Content::Png { .. });
         let (ms, resource, parallel) = match content.is_picture() {
-            true => (self.sum_over_views("encode")?, format!("one of {threads} encoder threads"), threads),
+            true => {
+                let strips = strip_count(content);
+                let resource = format!("{} of {threads} encoder threads", strips.min(threads));
+                (self.sum_over_views("encode")?, resource, (threads / strips).max(1))
+            }
             false => {
                 let waves = viewers.div_ceil(threads) as f64;
                 (waves * self.max_over_views("encode")?, "one thread per viewer".to_owned(), 1)
@@ -126,6 +131,14 @@ impl StageInputs<'_> {
 
     fn times(&self, stage: &str) -> impl Iterator<Item = f64> {
         self.views.iter().filter_map(move |view| view.get(stage)).map(|ms| f64::from(*ms))
+    }
+}
+
+/// Number of parts of a picture that are encoded in parallel.
+fn strip_count(content: Content) -> usize {
+    match content {
+        Content::Png { width, height } => PngLayout::opaque(width, height).map_or(1, |layout| layout.strip_count()),
+        _ => 1,
     }
 }
 
@@ -195,7 +208,20 @@ mod tests {
         let rates = inputs(&server, &views, Some((Content::Png { width: 8, height: 8 }, 4))).rates();
         let line_of = |stages: &str| rates.iter().find(|rate| rate.stages == stages).map(StageRate::line);
         assert_eq!(line_of("draw and deform"), Some("draw and deform: 8.000 ms of the CPU".into()));
-        assert_eq!(line_of("PNG encoding"), Some("PNG encoding: 32.000 ms of one of 16 encoder threads".into()));
+        assert_eq!(line_of("PNG encoding"), Some("PNG encoding: 32.000 ms of 1 of 16 encoder threads".into()));
+    }
+
+    #[test]
+    fn png_of_many_strips_occupies_all_threads() {
+        let views = [view(&[("encode", 2.0)])];
+        let server = server(false);
+        let png = Content::Png { width: 1920, height: 1080 };
+        let rates = inputs(&server, &views, Some((png, 1))).rates();
+        let encode = rates.iter().find(|rate| rate.stages == "PNG encoding").expect("expected the stage");
+        assert_eq!(
+            (encode.line(), encode.per_second),
+            ("PNG encoding: 2.000 ms of 16 of 16 encoder threads".into(), 500.0)
+        );
     }
 
     #[test]
