@@ -51,7 +51,7 @@
 //! | `modalcast-render::region` | rectangles of a frame that are drawn or cleared | |
 //! | `modalcast-render::types` | parameters and results of the renderer | `pass` |
 //! | `modalcast-render::pass` | names of the passes and stages, and their times | |
-//! | `modalcast-model::load` | scene loaders: OBJ, glTF, Vega, NumPy, safetensors, SOFA, plant scans with one object per organ, `scene.toml`; the scene repository (a folder of scene sources) | `tree`, `backend_settings`, `scene`, `domain`, `error` |
+//! | `modalcast-model::load` | scene loaders: OBJ, glTF, PLY, STL, Vega, NumPy, safetensors, SOFA, plant scans with one object per organ, `scene.toml`; the scene repository (a folder of scene sources) | `tree`, `backend_settings`, `scene`, `domain`, `error` |
 //! | `modalcast-model::tree` | the built-in scene: a tree of beams, the modes of the beams, and the surface mesh that they deform | `scene`, `domain`, `error` |
 //! | `modalcast-model::deform` | the trait of deformers | `scene`, `error` |
 //! | `modalcast-model::raster` | the trait of compute rasterizers, which replace OpenGL in selected passes | `scene`, `error` |

@@ -22,15 +22,22 @@ const MAX_LISTED_DOMAINS: usize = 24;
   modalcast inspect tree
   modalcast inspect path/to/model.glb --json")]
 pub(super) struct Args {
-    /// A built-in name, a folder with scene.toml, a .glb, .gltf or .obj file, or a folder with one model.
+    /// A built-in name, a folder with scene.toml, a .glb, .gltf, .obj, .ply, .stl or .npz file, or a folder with
+    /// one model.
     scene: String,
+    /// Treat missing material libraries, materials and images as errors instead of remarks.
+    #[arg(long)]
+    strict: bool,
     /// Print the description as JSON.
     #[arg(long)]
     json: bool,
 }
 
 pub(super) fn run(args: &Args) -> Outcome {
-    let opened_scene = with_spinner("loading", || load::open(&args.scene))?;
+    let opened_scene = with_spinner("loading", || match args.strict {
+        true => load::open_strict(&args.scene),
+        false => load::open(&args.scene),
+    })?;
     if args.json {
         let report = serde_json::to_value(SceneReport::new(&opened_scene)).map_err(fault_in("inspect"))?;
         print_line(serde_json::to_string_pretty(&report).map_err(fault_in("inspect"))?);
@@ -71,6 +78,8 @@ struct SceneReport<'a> {
     /// The settings in the `deform` table of `scene.toml`.
     deformation: DeformTable,
     remarks: &'a [String],
+    /// The files of the modes, as in the text output.
+    modes: Vec<String>,
     /// The plan of the deformer.
     deform: DeformPlan,
     /// The plan of the renderer.
@@ -108,6 +117,7 @@ impl<'a> SceneReport<'a> {
             look: LookTable { settings: scene.look, raster: backends.raster },
             deformation: DeformTable { settings: scene.deformation, batches: backends.batches },
             remarks: &scene.remarks,
+            modes: load::modes_files(scene),
             deform: deform_plan(scene, backends),
             render: modalcast_render::plan(scene),
             domains: (0..scene.domains.len()).map(|index| DomainReport::new(scene, index)).collect(),
@@ -174,6 +184,7 @@ fn text_lines(opened_scene: &OpenedScene) -> Vec<String> {
     lines.extend(entries.map(|(name, value)| format!("{:<28}{value:>16}", format!("total {name}"))));
     let diagonal = scene.rest_bounds.diagonal();
     lines.push(format!("up {:?}, unit {} m, diagonal {diagonal:.4}, origin {:?}", scene.up, scene.unit, scene.origin));
+    lines.extend(load::modes_files(scene).iter().map(|file| format!("modes: {file}")));
     lines.extend(scene.remarks.iter().map(|remark| format!("remark: {remark}")));
     let flags = scene.features.flags().into_iter();
     let needed_features: Vec<&str> = flags.filter_map(|(name, is_needed)| is_needed.then_some(name)).collect();
@@ -281,6 +292,19 @@ mod tests {
         fn visit_unit<E>(self) -> Result<Self, E> {
             Ok(self)
         }
+    }
+
+    #[test]
+    fn modes_are_named_with_their_rank() {
+        let folder = tempfile::tempdir().expect("expected a temporary folder");
+        let write = |name: &str, text: &str| std::fs::write(folder.path().join(name), text).expect("a written file");
+        write("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n");
+        write("a.modes.txt", "9 1\n0 0 0 0 0 0 0 0 1\n");
+        write("pressure.npy", "");
+        let opened_scene = load::open(&folder.path().to_string_lossy()).expect("expected a scene");
+        let lines = text_lines(&opened_scene);
+        assert!(lines.contains(&"modes: a.modes.txt (r = 1)".to_owned()), "{lines:?}");
+        assert!(lines.contains(&"remark: not used as modes: pressure.npy".to_owned()), "{lines:?}");
     }
 
     #[test]

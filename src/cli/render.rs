@@ -1,7 +1,7 @@
 //! `modalcast render`: renders one frame without a server.
 
 use std::fs;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use super::options::{parse_point, with_spinner};
@@ -13,7 +13,7 @@ use modalcast_model::error::{Error, Result, fault, invalid};
 use modalcast_model::load::{self, OpenedScene};
 use modalcast_model::scene::{Camera, FrameSize, Lens, Scene, SceneState, View};
 
-/// Renders one frame of a scene to a PNG file.
+/// Renders one frame of a scene to a PNG or JPEG file.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   modalcast render tree --out tree.png
@@ -21,13 +21,14 @@ use modalcast_model::scene::{Camera, FrameSize, Lens, Scene, SceneState, View};
   modalcast render model.glb --out side.png --eye 4,1,0 --target 0,1,0
   modalcast render tree --q bent.npy --output displacement --largest 0.5 --out moved.png")]
 pub(super) struct Args {
-    /// A built-in name, a folder with scene.toml, a .glb, .gltf or .obj file, or a folder with one model.
+    /// A built-in name, a folder with scene.toml, a .glb, .gltf, .obj, .ply, .stl or .npz file, or a folder with
+    /// one model.
     scene: String,
     /// Coordinates q of all domains in order, concatenated: a one-dimensional .npy file of f32 or f64. Default: at
     /// rest.
     #[arg(long)]
     q: Option<PathBuf>,
-    /// PNG file to write.
+    /// File to write. Its extension selects PNG (.png) or JPEG (.jpg, .jpeg; quality 90).
     #[arg(long)]
     out: PathBuf,
     /// Image size in pixels.
@@ -71,7 +72,44 @@ enum OutputOption {
     ModeShape,
 }
 
+/// The format of the written file.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum FileFormat {
+    Png,
+    Jpeg,
+}
+
+/// Quality of JPEG files, 1 to 100.
+const JPEG_QUALITY: u8 = 90;
+
+impl FileFormat {
+    /// The format of a file by its extension, in any letter case.
+    ///
+    /// # Errors
+    /// `Invalid` for an unknown extension.
+    fn of(path: &Path) -> Result<Self> {
+        let extension = path.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
+        match extension.as_str() {
+            "png" => Ok(Self::Png),
+            "jpg" | "jpeg" => Ok(Self::Jpeg),
+            _ => Err(invalid("--out", "a file ending in .png, .jpg or .jpeg", path.display())),
+        }
+    }
+
+    /// Encodes RGBA8 sRGB pixels, top row first.
+    ///
+    /// # Errors
+    /// `Fault` when the encoder fails.
+    fn encode(self, size: [u32; 2], rgba: &[u8]) -> Result<Vec<u8>> {
+        match self {
+            Self::Png => frame::encode_png(size[0], size[1], rgba),
+            Self::Jpeg => frame::encode_jpeg(size[0], size[1], rgba, JPEG_QUALITY),
+        }
+    }
+}
+
 pub(super) fn run(args: &Args) -> Outcome {
+    let format = FileFormat::of(&args.out)?;
     let OpenedScene { scene, backends } = with_spinner("loading", || load::open(&args.scene))?;
     let mut state = SceneState::rest(&scene);
     if let Some(path) = &args.q {
@@ -82,11 +120,8 @@ pub(super) fn run(args: &Args) -> Outcome {
     let mut loaded_scene = device.load_scene(&scene, backends)?;
     loaded_scene.deform(&Arc::new(state))?;
     let scale_max = args.largest;
-    let bytes = match args.output {
-        OutputOption::Color => {
-            let image = device.draw(&mut loaded_scene, &camera(args, &scene), args.size)?;
-            frame::encode_png(image.width, image.height, &image.rgba)?
-        }
+    let rgba = match args.output {
+        OutputOption::Color => device.draw(&mut loaded_scene, &camera(args, &scene), args.size)?.rgba,
         OutputOption::Displacement => {
             render_color_map(args, &mut device, &mut loaded_scene, FrameOutput::Displacement { scale_max })?
         }
@@ -95,6 +130,7 @@ pub(super) fn run(args: &Args) -> Outcome {
             render_color_map(args, &mut device, &mut loaded_scene, FrameOutput::ModeShape { mode, scale_max })?
         }
     };
+    let bytes = format.encode(args.size.to_array(), &rgba)?;
     let field = format!("--out {}", args.out.display());
     fs::write(&args.out, bytes).map_err(|error| invalid(field, "a file that can be written", error))?;
     device.unload_scene(loaded_scene);
@@ -102,7 +138,7 @@ pub(super) fn run(args: &Args) -> Outcome {
     Ok(true)
 }
 
-/// Renders a color map to PNG.
+/// Renders a color map with its legend, as RGBA8.
 fn render_color_map(
     args: &Args,
     device: &mut DeviceContext,
@@ -112,8 +148,7 @@ fn render_color_map(
     let scene = Arc::clone(loaded_scene.scene());
     let (aov, legend) = device.render_aov(loaded_scene, &camera(args, &scene), args.size, frame_output)?;
     let legend = legend.ok_or_else(|| fault("encode", "expected a legend of the color map"))?;
-    let rgba = frame::draw_color_map(&aov.bytes, aov.samples, args.size.to_array(), &legend)?;
-    frame::encode_png(args.size.width, args.size.height, &rgba)
+    frame::draw_color_map(&aov.bytes, aov.samples, args.size.to_array(), &legend)
 }
 
 /// The camera of the options. Its near and far planes, both 0, are fitted to the scene.
@@ -149,5 +184,29 @@ fn read_coordinates(scene: &Scene, path: &PathBuf) -> Result<Vec<f32>> {
     match array.entries.iter().position(|number| !number.is_finite()) {
         None => Ok(array.entries),
         Some(index) => Err(invalid(format!("{field}, entry {index}"), "a finite number", array.entries[index])),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn extension_selects_the_format_or_is_rejected() {
+        for (name, format, magic) in [
+            ("a.png", FileFormat::Png, &b"\x89PNG"[..]),
+            ("b.PNG", FileFormat::Png, b"\x89PNG"),
+            ("c.jpg", FileFormat::Jpeg, b"\xff\xd8\xff"),
+            ("d.x.JPEG", FileFormat::Jpeg, b"\xff\xd8\xff"),
+        ] {
+            let selected = FileFormat::of(Path::new(name)).expect(name);
+            assert_eq!(selected, format, "{name}");
+            let bytes = selected.encode([2, 1], &[9; 8]).expect("expected encoded pixels");
+            assert!(bytes.starts_with(magic), "{name}: {:02x?}", &bytes[..4]);
+        }
+        for name in ["a.webp", "a", "png", "a.jpg.exr"] {
+            let message = FileFormat::of(Path::new(name)).expect_err(name).to_string();
+            assert_eq!(message, format!("--out: expected a file ending in .png, .jpg or .jpeg, got {name}"));
+        }
     }
 }

@@ -75,10 +75,12 @@ use self::storage::scene_catalog::SceneCatalog;
 use self::storage::upload::CompleteUpload;
 use crate::config::{Config, ValidatedConfig};
 use modalcast_model::error::{Error, Result, invalid};
-use modalcast_model::load::OpenedScene;
+use modalcast_model::load::{OpenedScene, modes_files};
 
 /// Maximum number of scenes that are read from disk concurrently.
 const MAX_CONCURRENT_LOADS: usize = 2;
+/// The largest number of modes files, and of remarks, that are logged when a scene is opened.
+const MAX_LOGGED_LINES: usize = 16;
 
 /// Maximum number of uploads in progress at a time.
 const MAX_CONCURRENT_UPLOADS: usize = 8;
@@ -484,7 +486,12 @@ impl Engine {
             return Err(error);
         }
         let layout = &scene_handle.scene.layout;
-        tracing::info!(scene = name, domains = layout.domains.len(), vertices = layout.vertices, "opened");
+        let modes = modes_files(&scene_handle.scene);
+        let modes = modes.iter().take(MAX_LOGGED_LINES).map(String::as_str).collect::<Vec<_>>().join(", ");
+        tracing::info!(scene = name, domains = layout.domains.len(), vertices = layout.vertices, modes, "opened");
+        for remark in scene_handle.scene.remarks.iter().take(MAX_LOGGED_LINES) {
+            tracing::warn!(scene = name, remark, "remark of the loader");
+        }
         Ok(scene_handle)
     }
 

@@ -54,8 +54,8 @@ pub(crate) enum Command {
         #[arg(long = "share", value_name = "SHARE", default_value_t = 0.06, value_parser = parse_fraction)]
         displacement_fraction: f64,
     },
-    /// Selects the scenario: the bridge if cubic forces are available, else the tree if the scene has eigenvalues, else
-    /// the sweep.
+    /// Selects the scenario: the bridge if cubic forces are available, else the tree if the scene has eigenvalues and
+    /// attached domains, else the sweep.
     #[command(after_help = EXAMPLES)]
     Auto {
         #[command(flatten)]

@@ -128,7 +128,7 @@ async fn create_scenario(client: &Client, scene: &str, command: &Command) -> Res
             let model = Model::fetch(client, scene, MAX_TREE_SAMPLES).await?;
             let command = if find_force_file(&model, files).is_some() {
                 Command::Bridge { common: common.clone(), files: files.clone(), load: *load }
-            } else if model.domains.iter().any(|domain| !domain.eigenvalues.is_empty()) {
+            } else if is_tree(&model) {
                 Command::Tree { common: common.clone(), wind: *wind }
             } else {
                 Command::Sweep { common: common.clone(), displacement_fraction: *displacement_fraction }
@@ -137,6 +137,13 @@ async fn create_scenario(client: &Client, scene: &str, command: &Command) -> Res
             Box::pin(create_scenario(client, scene, &command)).await
         }
     }
+}
+
+/// Whether the wind scenario fits: some domain has eigenvalues, and some domain is attached to another one. A single beam
+/// with eigenvalues is stiffer than a tree, so that wind would hardly move it; the sweep shows its modes.
+fn is_tree(model: &Model) -> bool {
+    let has_eigenvalues = model.domains.iter().any(|domain| !domain.eigenvalues.is_empty());
+    has_eigenvalues && model.domains.iter().any(|domain| domain.joint.is_some())
 }
 
 fn create_bridge_scenario(model: Model, files: &ForceFileOptions, options: BridgeOptions) -> Result<Box<dyn Scenario>> {

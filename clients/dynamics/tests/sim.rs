@@ -179,8 +179,15 @@ async fn auto_selects_tree_or_sweep_by_scene() {
     server_without_eigenvalues.domains.iter_mut().for_each(|domain| domain.shape.eigenvalues.clear());
     let triangle = vec![-1.0, 0.0, -1.0, 1.0, 2.0, 1.0, 0.0, 1.0, 0.0];
     let rigid_server = FakeServer::new(vec![FakeDomain::new(0, triangle, 0, vec![])]);
-    for (server, scenario) in [(tree_server(), "tree"), (server_without_eigenvalues, "sweep"), (rigid_server, "sweep")]
-    {
+    // One beam with eigenvalues is no tree.
+    let mut beam_server = tree_server();
+    beam_server.domains.truncate(1);
+    for (server, scenario) in [
+        (tree_server(), "tree"),
+        (server_without_eigenvalues, "sweep"),
+        (beam_server, "sweep"),
+        (rigid_server, "sweep"),
+    ] {
         let server = Arc::new(server);
         let rest_positions = server.output().positions;
         let url = serve(Arc::clone(&server)).await;

@@ -23,6 +23,8 @@ pub(super) struct AssetDir {
     /// The folder to which paths are relative.
     base: PathBuf,
     root: Option<PathBuf>,
+    /// Whether a file that another file refers to must exist.
+    is_strict: bool,
 }
 
 /// The kind of an existing path.
@@ -35,12 +37,34 @@ pub(super) enum EntryKind {
 impl AssetDir {
     /// Allows any path: absolute or relative to `base`.
     pub(super) fn unrestricted(base: &Path) -> Self {
-        Self { base: base.to_path_buf(), root: None }
+        Self { base: base.to_path_buf(), root: None, is_strict: false }
     }
 
     /// Allows only paths relative to `root` that stay inside it. `root` must be canonical.
     pub(super) fn confined_to(root: &Path) -> Self {
-        Self { base: root.to_path_buf(), root: Some(root.to_path_buf()) }
+        Self { base: root.to_path_buf(), root: Some(root.to_path_buf()), is_strict: false }
+    }
+
+    /// The same folder. [`Self::has_referenced_file`] fails for files that do not exist.
+    pub(super) fn strict(&self) -> Self {
+        Self { is_strict: true, ..self.clone() }
+    }
+
+    /// Whether a missing file or definition is an error instead of a remark.
+    pub(super) const fn is_strict(&self) -> bool {
+        self.is_strict
+    }
+
+    /// Whether a file exists that another file refers to: a material library or an image. If it does not, the loader
+    /// uses a stand-in and adds a remark.
+    ///
+    /// # Errors
+    /// `Invalid` for a path that leaves the root and, in strict mode, for a file that does not exist.
+    pub(super) fn has_referenced_file(&self, relative: &str) -> Result<bool> {
+        match self.kind(relative)? {
+            None if self.is_strict => Err(invalid(field_of(relative), "an existing file", "none (strict mode)")),
+            kind => Ok(kind.is_some()),
+        }
     }
 
     /// The folder `relative`, with the same confinement.
@@ -48,7 +72,7 @@ impl AssetDir {
     /// # Errors
     /// As for [`Self::resolve`].
     pub(super) fn within(&self, relative: &str) -> Result<Self> {
-        Ok(Self { base: self.resolve(relative)?, root: self.root.clone() })
+        Ok(Self { base: self.resolve(relative)?, ..self.clone() })
     }
 
     /// The last component of the resolved path, or `scene` if it has none or does not resolve.
@@ -108,6 +132,11 @@ impl AssetDir {
         entries
     }
 
+    /// Names of the folder's files, sorted.
+    pub(super) fn file_names(&self) -> Vec<String> {
+        self.entries().into_iter().filter(|(_, kind)| *kind == EntryKind::File).map(|(name, _)| name).collect()
+    }
+
     /// The canonical path of `relative`.
     ///
     /// # Errors
@@ -159,6 +188,16 @@ pub(super) fn parent_of(path: &str) -> &str {
 /// The last component of a path.
 pub(super) fn file_name_of(path: &str) -> &str {
     path.rsplit_once('/').map_or(path, |(_, name)| name)
+}
+
+/// The name of a file without its extension.
+pub(super) fn stem_of(name: &str) -> &str {
+    name.rsplit_once('.').map_or(name, |(stem, _)| stem)
+}
+
+/// The extension of a file name in lower case; empty if the name has none.
+pub(super) fn extension_of(name: &str) -> String {
+    name.rsplit_once('.').map_or_else(String::new, |(_, extension)| extension.to_ascii_lowercase())
 }
 
 /// The field of an error about a file.

@@ -1,18 +1,21 @@
 //! Loaders: from files to scenes.
 //!
 //! # Scene names
-//! A scene is a built-in name (`tree`), a folder with `scene.toml` (its keys are documented in `manifest`), a `.glb`,
-//! `.gltf` or `.obj` file, or a folder with exactly one such file. A folder with several is rejected with an error that
-//! lists them.
+//! A scene is a built-in name (`tree`), a folder with `scene.toml`, a `.glb`, `.gltf`, `.obj`, `.ply`, `.stl` or `.npz`
+//! file, or a folder with one such file. A folder with several is rejected with an error that lists them.
 //!
-//! The modes of an OBJ file are found by their file names in the same folder (`modes::find_sidecar`). An OBJ file is
-//! loaded as a plant if its folder also contains the two files with the structure of the plant (module `plant`).
+//! `manifest/README.md` is the reference: keys of `scene.toml`, models, and the names of mode files beside a model. An
+//! OBJ file is loaded as a plant if its folder also contains the two files with the structure of the plant (module
+//! `plant`).
 //!
 //! # Conventions
 //! - Rows of U follow the `v` lines of an OBJ file, including unreferenced and coincident vertices.
 //! - Texture coordinates have (0, 0) at the top left of the image; OBJ's v is flipped.
 //! - Colors in files are linear factors. Color images are sRGB; normal maps are linear with +Y up.
-//! - OBJ and glTF have Y up, plants have Z up, and units are meters. `scene.toml` can override these defaults.
+//! - OBJ and glTF have Y up; plants, PLY, STL and NumPy archives have Z up; units are meters. `scene.toml` can override
+//!   these defaults.
+//! - A file that another file refers to and that does not exist has a stand-in and a remark, or is an error in strict
+//!   mode.
 
 mod asset_dir;
 #[cfg(test)]
@@ -20,15 +23,21 @@ mod dataset_tests;
 mod gltf;
 mod manifest;
 mod modes;
+mod npz_model;
 mod obj;
 mod plant;
+mod ply;
+mod polygons;
 mod repository;
 mod source;
+mod stl;
+mod surface;
 mod texture_cache;
 mod vega_config;
 
 pub use modes::{NpyArray, parse_numpy};
 pub use repository::SceneRepository;
+pub use source::is_built_in;
 
 use std::path::Path;
 use std::sync::Arc;
@@ -74,11 +83,35 @@ impl From<SceneParts> for SceneDescription {
     }
 }
 
-/// Opens `SCENE` of the command line: a built-in name, a folder with `scene.toml`, a `.glb`, `.gltf` or `.obj` file, or
-/// a folder with exactly one recognized model. Paths are not confined to a root.
+/// Opens `SCENE` of the command line: a built-in name, a folder with `scene.toml`, a model file, or a folder with one
+/// model. Paths are not confined to a root.
 ///
 /// # Errors
 /// `NotFound` if nothing has this name; otherwise `Invalid` with the file, the field, and the expected and given value.
 pub fn open(source: &str) -> Result<OpenedScene> {
     OpenedScene::new(source::read(&asset_dir::AssetDir::unrestricted(Path::new(".")), source)?)
+}
+
+/// As [`open`], but missing material libraries, materials and images are errors instead of remarks.
+///
+/// # Errors
+/// As for [`open`].
+pub fn open_strict(source: &str) -> Result<OpenedScene> {
+    OpenedScene::new(source::read(&asset_dir::AssetDir::unrestricted(Path::new(".")).strict(), source)?)
+}
+
+/// The files with the modes of a scene, each with its number of columns: `FILE (r = 20)`, without repetitions, in the
+/// order of the domains. Modes that are not in a file of their own, such as morph targets, are not listed.
+pub fn modes_files(scene: &Scene) -> Vec<String> {
+    let mut files = Vec::new();
+    for domain in &scene.domains {
+        let rank = scene.shapes[domain.shape].modes.rank();
+        let file = domain.metadata.notes.get(modes::FILE_NOTE);
+        if let Some(line) = file.map(|file| format!("{file} (r = {rank})"))
+            && !files.contains(&line)
+        {
+            files.push(line);
+        }
+    }
+    files
 }

@@ -44,7 +44,7 @@ impl SceneRepository {
     pub fn open(&self, source: &str) -> Result<OpenedScene> {
         match &self.root {
             Some(root) => OpenedScene::new(source::read(&AssetDir::confined_to(root), source)?),
-            None if source::BUILT_IN.contains(&source) => super::open(source),
+            None if source::is_built_in(source) => super::open(source),
             None => Err(Error::NotFound { what: "scene", given: source.into() }),
         }
     }
@@ -57,6 +57,10 @@ impl SceneRepository {
             let mut root_names = Vec::new();
             collect_names(&AssetDir::confined_to(root), "", MAX_LIST_DEPTH, &mut root_names);
             root_names.sort();
+            // A built-in scene hides a folder of the same name, unless its path begins with `./`.
+            for name in root_names.iter_mut().filter(|name| source::is_built_in(name)) {
+                name.insert_str(0, "./");
+            }
             names.append(&mut root_names);
         }
         names
@@ -68,7 +72,7 @@ impl SceneRepository {
 fn collect_names(folder: &AssetDir, prefix: &str, depth: usize, names: &mut Vec<String>) {
     let entries = folder.entries();
     let has_manifest = entries.contains(&(manifest::MANIFEST_FILE.to_owned(), EntryKind::File));
-    if has_manifest || source::find_models(folder).len() == 1 {
+    if has_manifest || matches!(&source::find_models(folder)[..], [model] if model.is_mesh()) {
         names.push(if prefix.is_empty() { ".".into() } else { prefix.trim_end_matches('/').into() });
     }
     for (name, kind) in entries {
@@ -78,7 +82,8 @@ fn collect_names(folder: &AssetDir, prefix: &str, depth: usize, names: &mut Vec<
         }
         let path = format!("{prefix}{name}");
         match kind {
-            EntryKind::File if source::recognize_model(&name).is_some() => names.push(path),
+            // Most NumPy archives are not models.
+            EntryKind::File if source::recognize_model(&name).is_some_and(|model| model.is_mesh()) => names.push(path),
             EntryKind::Directory if depth > 0 => {
                 if let Ok(subfolder) = folder.within(&name) {
                     collect_names(&subfolder, &format!("{path}/"), depth - 1, names);
@@ -118,10 +123,13 @@ mod tests {
             ("a/b/c/d/e/f/far.obj", TRIANGLE),
             (".hidden/x.obj", TRIANGLE),
             ("notes.txt", ""),
+            ("tree/d.obj", TRIANGLE),
+            ("data/results.npz", ""),
         ]);
         // The folder `two` has two models, so it is not a scene. `far.obj` is six folders deep; the listing ends at four.
         let names = repository.list();
-        assert_eq!(names, ["tree", "deep/er/scene", "one", "one/a.obj", "two/b.obj", "two/c.obj"]);
+        let expected = ["tree", "deep/er/scene", "one", "one/a.obj", "./tree", "tree/d.obj", "two/b.obj", "two/c.obj"];
+        assert_eq!(names, expected, "expected ./tree for the folder whose name is that of a built-in scene");
         // All names but that of the built-in tree.
         for name in &names[1..] {
             let opened = repository.open(name).unwrap_or_else(|error| panic!("{name}: {error}"));
@@ -169,7 +177,10 @@ mod tests {
         let absent = repository.open("absent").expect_err("a missing scene");
         assert_eq!(absent, Error::NotFound { what: "scene", given: "absent".into() });
         let ambiguous = repository.open("two").expect_err("two models").to_string();
-        assert_eq!(ambiguous, "folder 'two': expected scene.toml or one .glb, .gltf or .obj file, got 2: b.obj, c.obj");
+        assert_eq!(
+            ambiguous,
+            "folder 'two': expected scene.toml or one .glb, .gltf, .obj, .ply, .stl or .npz file, got 2: b.obj, c.obj"
+        );
         let empty = repository.open("none").expect_err("a folder without models").to_string();
         assert!(empty.ends_with("got no model among: x.txt"), "{empty}");
         assert!(matches!(SceneRepository::new(Some(&outer.path().join("no"))), Err(Error::Unavailable { .. })));

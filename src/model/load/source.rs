@@ -1,22 +1,64 @@
 //! Resolves a SCENE argument: a built-in name, a folder with `scene.toml`, a model file, or a folder with one model.
 
-use super::asset_dir::{AssetDir, EntryKind, file_name_of, parent_of};
-use super::obj::ModesSource;
-use super::{SceneDescription, gltf, manifest, obj, plant};
+use super::asset_dir::{AssetDir, EntryKind, extension_of, file_name_of, parent_of, stem_of};
+use super::surface::ModesSource;
+use super::{SceneDescription, gltf, manifest, npz_model, obj, plant, ply, stl};
 use crate::error::{Error, Result, invalid};
 use crate::scene::SceneParts;
 
 /// Names of procedural scenes. A folder with such a name can be opened as `./NAME`.
 pub(super) const BUILT_IN: [&str; 1] = ["tree"];
 
-/// A model in a folder: the name of its file or, for a plant, the common stem of its files.
+/// Whether a scene name denotes a built-in scene, even if a folder has the same name.
+pub fn is_built_in(source: &str) -> bool {
+    BUILT_IN.contains(&source)
+}
+
+/// A model in a folder: the name of its main file.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum ModelFile {
     Gltf(String),
     Obj(String),
-    /// `STEM.obj`, `STEM.structure.json` and `STEM_object_id.dat`.
+    /// `STEM.obj`, to which `STEM.structure.json` and `STEM_object_id.dat` belong.
     Plant(String),
+    Ply(String),
+    Stl(String),
+    /// A NumPy archive with the arrays `vertices` and `faces`.
+    Npz(String),
 }
+
+impl ModelFile {
+    /// The name of the main file.
+    pub(super) fn name(&self) -> &str {
+        match self {
+            Self::Gltf(name)
+            | Self::Obj(name)
+            | Self::Plant(name)
+            | Self::Ply(name)
+            | Self::Stl(name)
+            | Self::Npz(name) => name,
+        }
+    }
+
+    /// Whether the format always contains a mesh.
+    pub(super) const fn is_mesh(&self) -> bool {
+        !matches!(self, Self::Npz(_))
+    }
+
+    /// Models of a folder with a higher rank are used only if there is none with a lower rank, because exporters write
+    /// meshes of these formats beside a model with materials.
+    const fn format_rank(&self) -> usize {
+        match self {
+            Self::Gltf(_) | Self::Obj(_) | Self::Plant(_) => 0,
+            Self::Ply(_) => 1,
+            Self::Stl(_) => 2,
+            Self::Npz(_) => 3,
+        }
+    }
+}
+
+/// The formats in error messages.
+const FORMATS: &str = ".glb, .gltf, .obj, .ply, .stl or .npz";
 
 /// The largest number of names in an error message.
 const MAX_LISTED_NAMES: usize = 16;
@@ -26,7 +68,7 @@ const MAX_LISTED_NAMES: usize = 16;
 /// # Errors
 /// `NotFound` if nothing has this name; otherwise `Invalid` with the file, the field, and the expected and given value.
 pub(super) fn read(files: &AssetDir, source: &str) -> Result<SceneDescription> {
-    if BUILT_IN.contains(&source) {
+    if is_built_in(source) {
         return crate::tree::generate(&crate::tree::TreeParameters::default()).map(SceneDescription::from);
     }
     match files.kind(source)? {
@@ -39,10 +81,10 @@ pub(super) fn read(files: &AssetDir, source: &str) -> Result<SceneDescription> {
             let folder = files.within(source)?;
             match folder.kind(manifest::MANIFEST_FILE)? {
                 Some(EntryKind::File) => manifest::read(&folder, manifest::MANIFEST_FILE, &files.resolved_name(source)),
-                _ => read_model(files, source, ModesSource::Sidecar).map(SceneDescription::from),
+                _ => read_model(files, source, &ModesSource::Sidecar).map(SceneDescription::from),
             }
         }
-        Some(EntryKind::File) => read_model(files, source, ModesSource::Sidecar).map(SceneDescription::from),
+        Some(EntryKind::File) => read_model(files, source, &ModesSource::Sidecar).map(SceneDescription::from),
     }
 }
 
@@ -50,11 +92,12 @@ pub(super) fn read(files: &AssetDir, source: &str) -> Result<SceneDescription> {
 ///
 /// # Errors
 /// `Invalid` with the file, the field, and the expected and given value.
-pub(super) fn read_model(files: &AssetDir, path: &str, modes: ModesSource) -> Result<SceneParts> {
+pub(super) fn read_model(files: &AssetDir, path: &str, modes: &ModesSource) -> Result<SceneParts> {
     match files.kind(path)? {
         Some(EntryKind::Directory) => {
             let folder = files.within(path)?;
-            let mut parts = read_model_file(&folder, &choose_single_model(&folder, path)?, modes)?;
+            let model = choose_single_model(&folder, path)?;
+            let mut parts = read_model_file(&folder, &model, modes)?;
             parts.name = files.resolved_name(path);
             Ok(parts)
         }
@@ -62,73 +105,102 @@ pub(super) fn read_model(files: &AssetDir, path: &str, modes: ModesSource) -> Re
             let folder = files.within(parent_of(path))?;
             let file_name = file_name_of(path);
             let model = recognize_model(file_name)
-                .ok_or_else(|| invalid(format!("file '{path}'"), "a file ending in .glb, .gltf or .obj", file_name))?;
-            let model = detect_plant(model, &file_names(&folder));
+                .ok_or_else(|| invalid(format!("file '{path}'"), expected_format(), describe_format(file_name)))?;
+            let model = detect_plant(model, &folder.file_names());
             read_model_file(&folder, &model, modes)
         }
         None => Err(invalid(format!("file '{path}'"), "an existing model", "no file of this name")),
     }
 }
 
-fn read_model_file(folder: &AssetDir, model: &ModelFile, modes: ModesSource) -> Result<SceneParts> {
+fn read_model_file(folder: &AssetDir, model: &ModelFile, modes: &ModesSource) -> Result<SceneParts> {
     match model {
         ModelFile::Gltf(name) => gltf::read(folder, name),
         ModelFile::Obj(name) => obj::read(folder, name, modes),
-        ModelFile::Plant(stem) => plant::read(folder, stem),
+        ModelFile::Plant(name) => plant::read(folder, name),
+        ModelFile::Ply(name) => ply::read(folder, name, modes),
+        ModelFile::Stl(name) => stl::read(folder, name, modes),
+        ModelFile::Npz(name) => npz_model::read(folder, name, modes),
     }
 }
 
 /// Recognizes a model by the extension of its main file `name`.
 pub(super) fn recognize_model(name: &str) -> Option<ModelFile> {
-    match name.rsplit_once('.')?.1.to_ascii_lowercase().as_str() {
+    match extension_of(name).as_str() {
         "glb" | "gltf" => Some(ModelFile::Gltf(name.into())),
         "obj" => Some(ModelFile::Obj(name.into())),
+        "ply" => Some(ModelFile::Ply(name.into())),
+        "stl" => Some(ModelFile::Stl(name.into())),
+        "npz" => Some(ModelFile::Npz(name.into())),
         _ => None,
     }
 }
 
-/// All models in a folder.
+/// The models of a folder: its glTF and OBJ files; if there is none, its PLY files, else its STL files, else its NumPy
+/// archives.
 pub(super) fn find_models(folder: &AssetDir) -> Vec<ModelFile> {
-    let names = file_names(folder);
-    names.iter().filter_map(|name| recognize_model(name)).map(|model| detect_plant(model, &names)).collect()
+    let names = folder.file_names();
+    let mut models: Vec<ModelFile> = names.iter().filter_map(|name| recognize_model(name)).collect();
+    let rank = models.iter().map(ModelFile::format_rank).min();
+    models.retain(|model| Some(model.format_rank()) == rank);
+    models.into_iter().map(|model| detect_plant(model, &names)).collect()
 }
 
 /// Changes an OBJ file to a plant if both files of the plant's structure are among the `names` of its folder.
 fn detect_plant(model: ModelFile, names: &[String]) -> ModelFile {
-    let stem = match &model {
-        ModelFile::Obj(name) => name.strip_suffix(".obj"),
-        _ => None,
-    };
-    let is_plant = |stem: &&str| {
-        let structure_files = [format!("{stem}.structure.json"), format!("{stem}_object_id.dat")];
-        structure_files.iter().all(|name| names.contains(name))
-    };
-    stem.filter(is_plant).map(|stem| ModelFile::Plant(stem.into())).unwrap_or(model)
-}
-
-/// Names of the files in a folder.
-fn file_names(folder: &AssetDir) -> Vec<String> {
-    folder.entries().into_iter().filter(|(_, kind)| *kind == EntryKind::File).map(|(name, _)| name).collect()
+    let ModelFile::Obj(name) = &model else { return model };
+    let stem = stem_of(name);
+    let structure_files = [format!("{stem}.structure.json"), format!("{stem}_object_id.dat")];
+    match structure_files.iter().all(|name| names.contains(name)) {
+        true => ModelFile::Plant(name.clone()),
+        false => model,
+    }
 }
 
 fn choose_single_model(folder: &AssetDir, path: &str) -> Result<ModelFile> {
     let mut models = find_models(folder);
     let join_names = |names: Vec<String>| names.into_iter().take(MAX_LISTED_NAMES).collect::<Vec<_>>().join(", ");
     let field = format!("folder '{path}'");
-    let expected = "scene.toml or one .glb, .gltf or .obj file";
+    let expected = format!("scene.toml or one {FORMATS} file");
     match models.len() {
         1 => Ok(models.remove(0)),
         0 => {
-            let given = join_names(folder.entries().into_iter().map(|(name, _)| name).collect());
-            Err(invalid(field, expected, format!("no model among: {given}")))
+            let names: Vec<String> = folder.entries().into_iter().map(|(name, _)| name).collect();
+            let hint =
+                names.iter().find_map(|name| conversion(name)).map_or_else(String::new, |hint| format!(" ({hint})"));
+            Err(invalid(field, expected, format!("no model among: {}{hint}", join_names(names))))
         }
         model_count => {
-            let name = |model| match model {
-                ModelFile::Gltf(name) | ModelFile::Obj(name) => name,
-                ModelFile::Plant(stem) => format!("{stem} (a plant)"),
+            let name = |model: ModelFile| match model {
+                ModelFile::Plant(name) => format!("{name} (a plant)"),
+                other => other.name().to_owned(),
             };
             let given = join_names(models.into_iter().map(name).collect());
             Err(invalid(field, expected, format!("{model_count}: {given}")))
         }
+    }
+}
+
+fn expected_format() -> String {
+    format!("a file ending in {FORMATS}")
+}
+
+/// The name of a file of another format, with the command that converts it.
+fn describe_format(name: &str) -> String {
+    conversion(name).map_or_else(|| name.to_owned(), |conversion| format!("{name} ({conversion})"))
+}
+
+/// How a file of another format is converted; `None` for an unknown format.
+fn conversion(name: &str) -> Option<String> {
+    let stem = stem_of(name);
+    match extension_of(name).as_str() {
+        // Formats that meshio reads (5.3).
+        "vtk" | "vtu" | "msh" | "inp" | "bdf" | "nas" | "fem" | "e" | "ex2" | "exo" | "xdmf" | "xmf" | "med"
+        | "mesh" | "meshb" | "off" | "ugrid" | "su2" | "cgns" | "h5m" | "avs" | "mdpa" | "f3grid" | "wkt" | "tec" => {
+            Some(format!("convert it: meshio convert {name} {stem}.ply"))
+        }
+        "fbx" | "dae" | "3ds" | "blend" | "usd" | "usda" | "usdc" | "usdz" | "abc" | "x3d" | "3mf" | "step" | "stp"
+        | "iges" | "igs" => Some(format!("export it as {stem}.glb, for example with Blender")),
+        _ => None,
     }
 }

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use super::asset_dir::{AssetDir, EntryKind, MAX_TEXT_BYTES};
+use super::asset_dir::{AssetDir, EntryKind, MAX_TEXT_BYTES, stem_of};
 use crate::error::{Result, invalid};
 
 /// Numeric entries of a configuration that describe the dynamics.
@@ -15,7 +15,7 @@ const DYNAMICS_KEYS: [&str; 4] =
 /// # Errors
 /// `Invalid` with the file and the entry that is not a finite number.
 pub(super) fn read_notes(files: &AssetDir, name: &str) -> Result<BTreeMap<String, String>> {
-    let stem = name.strip_suffix(".obj").unwrap_or(name);
+    let stem = stem_of(name);
     let mut notes = BTreeMap::new();
     let cubic_file = format!("{stem}.cub");
     if files.kind(&cubic_file)? == Some(EntryKind::File) {

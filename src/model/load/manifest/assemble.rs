@@ -12,7 +12,7 @@ use crate::domain::{Attachment, Domain, FollowConstraint, Material, Modes, Shape
 use crate::error::{Result, invalid};
 use crate::load::SceneDescription;
 use crate::load::asset_dir::AssetDir;
-use crate::load::obj::ModesSource;
+use crate::load::surface::ModesSource;
 use crate::load::{modes, source, texture_cache};
 use crate::scene::{MAX_DOMAINS, SceneParts, UpAxis};
 
@@ -140,7 +140,7 @@ impl ManifestAssembler<'_> {
     /// (`entry_index` 0) also sets the scene's up axis, unit and render settings.
     fn load_model(&mut self, entry_index: usize, entry: &DomainEntry) -> Result<LoadedModel> {
         let modes_source = if entry.modes.is_some() { ModesSource::None } else { ModesSource::Sidecar };
-        let mut model = source::read_model(self.files, &entry.model, modes_source)?;
+        let mut model = source::read_model(self.files, &entry.model, &modes_source)?;
         if let Some(file) = &entry.modes {
             replace_modes(self.files, file, &mut model)?;
         }
@@ -149,8 +149,11 @@ impl ManifestAssembler<'_> {
         }
         let up = self.manifest.up.unwrap_or(self.parts.up);
         if entry.up.is_none() && model.up != up {
-            let remark =
-                format!("its up axis is {:?}, but that of the scene is {up:?}; set `up` in its entry", model.up);
+            let remark = format!(
+                "not rotated: {:?} is up by default in its format, and {up:?} in this scene. Set `up` in its entry to \
+                 the model's up axis",
+                model.up
+            );
             model.remarks.push(remark);
         }
         let (shape_offset, material_offset) = (self.parts.shapes.len(), self.parts.materials.len());
@@ -333,14 +336,22 @@ fn add_follow_constraints(entry: &DomainEntry, domains: &mut [Domain]) -> Result
     }
 }
 
-/// Replaces U of a model with one shape, and clears the rest coordinates, which belong to the old modes.
+/// Replaces U and the eigenvalues of a model with one shape, and clears the rest coordinates, which belong to the old
+/// modes.
 fn replace_modes(files: &AssetDir, file: &str, model: &mut SceneParts) -> Result<()> {
     let [shape] = &mut model.shapes[..] else {
         return Err(invalid("modes", "a model with one shape", format!("{} shapes", model.shapes.len())));
     };
-    let modes = if file.is_empty() { Modes::rigid() } else { modes::read(files, file)? };
-    *shape = Shape::new(shape.mesh.clone(), modes).map_err(|error| error.prefix_field(&format!("file '{file}'")))?;
-    model.domains.iter_mut().for_each(|domain| domain.rest_q.clear());
+    let loaded = if file.is_empty() { Modes::rigid().into() } else { modes::read(files, file)? };
+    let new_shape = Shape::new(shape.mesh.clone(), loaded.modes);
+    *shape = new_shape.map_err(|error| error.prefix_field(&format!("file '{file}'")))?;
+    for domain in &mut model.domains {
+        domain.rest_q.clear();
+        domain.metadata.eigenvalues.clone_from(&loaded.eigenvalues);
+        if !file.is_empty() {
+            domain.metadata.notes.insert(modes::FILE_NOTE.to_owned(), file.to_owned());
+        }
+    }
     Ok(())
 }
 

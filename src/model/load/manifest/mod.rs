@@ -1,62 +1,7 @@
 //! Loader of `scene.toml`: which models a scene consists of, where they are placed and attached, and how their
 //! materials and the scene's settings are overridden.
 //!
-//! ```toml
-//! name = "fern"              # default: the name of the folder
-//! up = "y"                   # x, y or z; default: up axis of the first model
-//! unit = 1.0                 # meters per scene unit; default: unit of the first model
-//! origin = [0.0, 0.0, 0.0]   # world position of the scene's origin, to which all transforms are relative; meters
-//! transforms = "rigid"       # declares that no step shears or scales non-uniformly; default: "affine"
-//! shadows = true             # false: no shadow map
-//! ground = true              # false: no ground plane; look.ground.colour is its color
-//! look.sunlight = [1.0, 0.9, 0.8]   # also sun (direction), skylight, zenith, horizon; linear colors
-//! look.samples = 4           # samples per pixel, 1 or 4
-//! look.antialias = "samples" # or "fxaa", "none", both with one sample per pixel
-//! look.transparency = "exact"   # order-independent, with up to look.fragments blended fragments per frame;
-//!                            # or "two-pass", with look.opaque_alpha
-//! look.culling = "depth"     # or "none", "triangles", "fitting" (default); does not change the image
-//! look.raster = "opengl"     # the rasterizer; or "cuda", "fastest"
-//! look.bloom = { threshold = 1.0, strength = 0.5, levels = 5 }
-//! look.tone = "aces"         # tone mapping; or "reinhard", "none"
-//! look.exposure = 1.2        # multiplies all light before bloom and tone mapping
-//! look.dither = true         # avoids banding in slow gradients
-//! look.shadow = { method = "variance", size = 2048, blur = 2.0, splits = 1 }
-//!                            # method: variance, standard, filtered; splits: number of cascades, 1 to 4;
-//!                            # also bleeding, least_variance, alpha_threshold, moments (f32, f16),
-//!                            # fit (vertices, corners)
-//! deform.storage = "f16"     # type of the entries of U: f32 (default), f16, bf16, int8
-//! deform.normals = "exact"   # or "rigid" (default)
-//! deform.truncation = 1e-4   # skip modes that together move no vertex by more than this many meters
-//! deform.compensated = true  # compensated summation of modes
-//! deform.batches = "never"   # or "always", "auto" (default): whether domains that share U are deformed together
-//! deform.boxes = true        # store a bounding box per domain for clients
-//! deform.displacements = true   # store u = U q of every vertex for clients
-//!
-//! model = "fern_02.glb"      # a scene of one model; or several [[domain]] entries
-//! modes = "fern.npy"         # U of a model with one shape; "" for none
-//! follows = "leaf"           # name prefix of domains that move rigidly with their parents, so that steps cannot set
-//!                            # their transforms; "" for all domains with a parent
-//! placement = { translation = [0, 0, 0], axis = [0, 1, 0], degrees = 90, scale = 2.0 }
-//!
-//! [material."*"]             # overrides by material name, or * for all; missing keys keep the model's values
-//! diffuse = [0.8, 0.1, 0.1]  # linear, 0 to 1; also sets ambient, unless ambient is given
-//! specular = [0.2, 0.2, 0.2] # also shininess, alpha
-//! colour_texture = "leaf.png"   # "" removes it; also normal_texture
-//! alpha_mode = "mask"        # opaque, mask or blend
-//! cutoff = 0.5
-//! double_sided = true
-//!
-//! [[domain]]                 # entries with the same model are instances: they share mesh and U
-//! name = "branch"
-//! model = "../branch.obj"    # also modes, follows and placement, as above
-//! up = "z"                   # up axis of the model; the model is rotated to the up axis of the scene
-//! parent = "trunk"           # a domain of an earlier entry
-//! frame = { translation = [0, 1, 0] }   # parent_from_model, instead of a placement
-//! parent_vertices = [3, 4, 5]   # the vertices that carry it; default: the nearest eight of a deformable parent
-//! material = { diffuse = [1, 0, 0] }    # overrides for this entry only
-//! eigenvalues = [39.5]       # (rad/s)^2, one per mode of a single domain; stored for clients
-//! notes = { source = "scan" }   # strings, stored for clients
-//! ```
+#![doc = include_str!("README.md")]
 
 mod assemble;
 mod patch;
@@ -79,7 +24,7 @@ pub(super) const MANIFEST_FILE: &str = "scene.toml";
 /// The largest size of a `scene.toml` in bytes.
 const MAX_MANIFEST_BYTES: u64 = 64 << 20;
 
-/// A parsed `scene.toml`. The documentation of this module describes its keys.
+/// A parsed `scene.toml`. `README.md` in the folder of this module describes its keys.
 #[derive(Debug, serde::Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Manifest {
@@ -101,6 +46,11 @@ struct Manifest {
     modes: Option<String>,
     follows: Option<String>,
     placement: Option<Placement>,
+    eigenvalues: Option<Vec<f64>>,
+    notes: Option<BTreeMap<String, String>>,
+    /// Whether missing material libraries, materials and images are errors instead of remarks.
+    #[serde(default)]
+    strict: bool,
     #[serde(default)]
     domain: Vec<DomainEntry>,
 }
@@ -148,6 +98,7 @@ pub(super) fn read(files: &AssetDir, file: &str, default_name: &str) -> Result<S
     let bytes = files.read(file, MAX_MANIFEST_BYTES)?;
     let mut manifest = parse(&bytes).map_err(|error| error.prefix_field(&location))?;
     let entries = take_entries(&mut manifest).map_err(|error| error.prefix_field(&location))?;
+    let files = if manifest.strict { &files.strict() } else { files };
     assemble::assemble(files, &manifest, &entries, default_name).map_err(|error| error.prefix_field(&location))
 }
 
@@ -162,20 +113,33 @@ fn parse(bytes: &[u8]) -> Result<Manifest> {
 /// Takes the entries out of the manifest. A manifest with a top-level `model` has one entry.
 fn take_entries(manifest: &mut Manifest) -> Result<Vec<DomainEntry>> {
     let entries = std::mem::take(&mut manifest.domain);
+    let entry_keys = [
+        ("modes", manifest.modes.is_some()),
+        ("follows", manifest.follows.is_some()),
+        ("placement", manifest.placement.is_some()),
+        ("eigenvalues", manifest.eigenvalues.is_some()),
+        ("notes", manifest.notes.is_some()),
+    ];
     match (manifest.model.take(), entries.is_empty()) {
-        (Some(model), true) => {
-            let (modes, placement) = (manifest.modes.take(), manifest.placement.take());
-            let follows = manifest.follows.take();
-            Ok(vec![DomainEntry { model, modes, placement, follows, ..DomainEntry::default() }])
-        }
+        (Some(model), true) => Ok(vec![DomainEntry {
+            model,
+            modes: manifest.modes.take(),
+            placement: manifest.placement.take(),
+            follows: manifest.follows.take(),
+            eigenvalues: manifest.eigenvalues.take(),
+            notes: manifest.notes.take().unwrap_or_default(),
+            ..DomainEntry::default()
+        }]),
         (Some(_), false) => Err(invalid("model", "either one model or [[domain]] entries", "both of them")),
         (None, true) => Err(invalid("model", "one model or [[domain]] entries", "neither")),
-        (None, false) if manifest.modes.is_some() || manifest.placement.is_some() || manifest.follows.is_some() => {
-            Err(invalid("modes, placement, follows", "these keys in the [[domain]] entries", "a top-level key"))
-        }
-        (None, false) => Ok(entries),
+        (None, false) => match entry_keys.into_iter().find(|(_, is_given)| *is_given) {
+            Some((key, _)) => Err(invalid(key, "this key in the [[domain]] entries", "a top-level key")),
+            None => Ok(entries),
+        },
     }
 }
 
+#[cfg(test)]
+mod reference_tests;
 #[cfg(test)]
 mod tests;

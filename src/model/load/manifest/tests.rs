@@ -168,16 +168,20 @@ fn up_axis_of_an_entry_is_rotated_to_that_of_the_scene() {
     let up = parts.domains[0].placement.linear() * nalgebra::Vector3::y();
     assert!((up - nalgebra::Vector3::z()).norm() < 1e-6, "{up}");
     assert_eq!(parts.domains[1].placement, Transform::IDENTITY);
-    let remark = "model 'b.obj': its up axis is Y, but that of the scene is Z; set `up` in its entry";
-    assert_eq!(parts.remarks, [remark]);
+    let remark = "model 'b.obj': not rotated: Y is up by default in its format, and Z in this scene. Set `up` in its \
+                  entry to the model's up axis";
+    assert_eq!(parts.remarks.last().map(String::as_str), Some(remark));
 }
 
 #[test]
 fn eigenvalues_and_notes_become_metadata() {
-    let text = "[[domain]]\nmodel = 'a.obj'\nmodes = 'u.txt'\neigenvalues = [1.5, 2.5]\nnotes = { who = 'me' }\n";
-    let parts = read_parts(text).expect("a valid manifest");
-    assert_eq!(parts.domains[0].metadata.eigenvalues, [1.5, 2.5]);
-    assert_eq!(parts.domains[0].metadata.notes["who"], "me");
+    let keys = "model = 'a.obj'\nmodes = 'u.txt'\neigenvalues = [1.5, 2.5]\nnotes = { who = 'me' }\n";
+    for text in [keys.to_owned(), format!("[[domain]]\n{keys}")] {
+        let parts = read_parts(&text).expect("a valid manifest");
+        assert_eq!(parts.domains[0].metadata.eigenvalues, [1.5, 2.5]);
+        assert_eq!(parts.domains[0].metadata.notes["who"], "me");
+        assert_eq!(parts.domains[0].metadata.notes["modes.file"], "u.txt");
+    }
 }
 
 #[test]
@@ -189,7 +193,7 @@ fn invalid_manifest_is_rejected_with_line_or_entry() {
         ("model = \n", "line 1: expected the keys and values of a scene"),
         ("model = 'a.obj'\n[look]\nsky = 1\n", "line 3: expected the keys and values of a scene, got unknown field"),
         ("model = 'a.obj'\n[[domain]]\nmodel = 'b.obj'\n", "model: expected either one model"),
-        ("modes = 'u.txt'\n[[domain]]\nmodel = 'b.obj'\n", "modes, placement, follows: expected these keys in"),
+        ("modes = 'u.txt'\n[[domain]]\nmodel = 'b.obj'\n", "modes: expected this key in the [[domain]] entries"),
         ("[[domain]]\nname = 'x'\n", "line 1: expected the keys and values of a scene, got missing field `model`"),
         ("model = 'c.obj'\n", "domain 0 ('c.obj'): file 'c.obj': expected an existing file"),
         ("model = 'a.mtl'\n", "domain 0 ('a.mtl'): file 'a.mtl': expected a file ending in .glb"),

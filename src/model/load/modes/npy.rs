@@ -17,35 +17,99 @@ pub struct NpyArray {
     pub entries: Vec<f32>,
 }
 
+/// The header of a file: what its data contain.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(in crate::load) struct NpyHeader {
+    dtype: String,
+    pub(in crate::load) shape: Vec<usize>,
+    pub(in crate::load) fortran_order: bool,
+    /// Bytes of the data, computed from type and shape.
+    pub(in crate::load) data_bytes: usize,
+}
+
+/// The largest length of a header with its magic, version and length.
+pub(in crate::load) const MAX_PREFIX_BYTES: usize = MAX_HEADER_BYTES + 12;
+
 /// Parses an array of f32 or f64 (rounded to f32) in either byte order.
 ///
 /// # Errors
 /// `Invalid` if the header or the type is not supported, or if the size of the data does not match the shape.
 pub fn parse(bytes: &[u8]) -> Result<NpyArray> {
+    let (header, body) = parse_header(bytes)?;
+    header.check_size(body)?;
+    let entries = match header.dtype.as_str() {
+        "<f4" => super::vega::read_f32_le(body),
+        "<f8" => super::vega::read_f64_le_as_f32(body),
+        ">f4" => body.as_chunks().0.iter().map(|entry| f32::from_be_bytes(*entry)).collect(),
+        ">f8" => body.as_chunks().0.iter().map(|entry| f64::from_be_bytes(*entry) as f32).collect(),
+        other => return Err(invalid("descr", "f4 or f8", other)),
+    };
+    Ok(NpyArray { shape: header.shape, fortran_order: header.fortran_order, entries })
+}
+
+/// Parses an array of f64, or of another type whose values f64 contains, in C order.
+///
+/// # Errors
+/// As for [`parse`].
+pub(in crate::load) fn parse_f64(bytes: &[u8]) -> Result<(Vec<usize>, Vec<f64>)> {
+    let (header, body) = parse_header(bytes)?;
+    header.check_size(body)?;
+    if header.fortran_order && header.shape.iter().filter(|extent| **extent > 1).count() > 1 {
+        return Err(invalid("fortran_order", "False", "True"));
+    }
+    let entries = match header.dtype.as_str() {
+        "|u1" | "|b1" => body.iter().map(|entry| f64::from(*entry)).collect(),
+        "<i2" => body.as_chunks().0.iter().map(|entry| f64::from(i16::from_le_bytes(*entry))).collect(),
+        "<u2" => body.as_chunks().0.iter().map(|entry| f64::from(u16::from_le_bytes(*entry))).collect(),
+        "<i4" => body.as_chunks().0.iter().map(|entry| f64::from(i32::from_le_bytes(*entry))).collect(),
+        "<u4" => body.as_chunks().0.iter().map(|entry| f64::from(u32::from_le_bytes(*entry))).collect(),
+        // Whole numbers above 2^53 are rounded. No valid index is as large.
+        "<i8" => body.as_chunks().0.iter().map(|entry| i64::from_le_bytes(*entry) as f64).collect(),
+        "<u8" => body.as_chunks().0.iter().map(|entry| u64::from_le_bytes(*entry) as f64).collect(),
+        "<f4" => body.as_chunks().0.iter().map(|entry| f64::from(f32::from_le_bytes(*entry))).collect(),
+        "<f8" => body.as_chunks().0.iter().map(|entry| f64::from_le_bytes(*entry)).collect(),
+        other => return Err(invalid("descr", "u1, or a little-endian i2, u2, i4, u4, i8, u8, f4 or f8", other)),
+    };
+    Ok((header.shape, entries))
+}
+
+/// Parses the header of a file. `bytes` contains at least the header. Returns the header and the bytes after it.
+///
+/// # Errors
+/// `Invalid` if the header is not supported, or its shape has more bytes than memory can address.
+pub(in crate::load) fn parse_header(bytes: &[u8]) -> Result<(NpyHeader, &[u8])> {
     let (header, body) = split_header(bytes)?;
-    let dtype = find_value(header, "descr")?.trim_matches(['\'', '"']);
+    let dtype = find_value(header, "descr")?.trim_matches(['\'', '"']).to_owned();
     let fortran_order = match find_value(header, "fortran_order")? {
         "True" => true,
         "False" => false,
         other => return Err(invalid("fortran_order", "True or False", other)),
     };
     let shape = parse_shape(find_value(header, "shape")?)?;
-    let entry_bytes = match dtype {
-        "<f4" | ">f4" => 4,
-        "<f8" | ">f8" => 8,
-        other => return Err(invalid("descr", "f4 or f8", other)),
+    let entry_bytes: usize = match dtype.get(1..) {
+        Some("u1" | "b1" | "i1") => 1,
+        Some("i2" | "u2" | "f2") => 2,
+        Some("f4" | "i4" | "u4") => 4,
+        Some("f8" | "i8" | "u8") => 8,
+        _ => return Err(invalid("descr", "f4 or f8", dtype)),
     };
-    let size = shape.iter().try_fold(entry_bytes, |size: usize, extent| size.checked_mul(*extent));
-    if size != Some(body.len()) {
-        return Err(invalid("data", format!("{entry_bytes} bytes for each entry of {shape:?}"), body.len()));
+    let data_bytes = shape.iter().try_fold(entry_bytes, |size: usize, extent| size.checked_mul(*extent));
+    let data_bytes = data_bytes
+        .ok_or_else(|| invalid("data", format!("{entry_bytes} bytes for each entry of {shape:?}"), body.len()))?;
+    Ok((NpyHeader { dtype, shape, fortran_order, data_bytes }, body))
+}
+
+impl NpyHeader {
+    fn check_size(&self, body: &[u8]) -> Result<()> {
+        match body.len() == self.data_bytes {
+            true => Ok(()),
+            false => {
+                let entries: usize = self.shape.iter().product();
+                let entry_bytes = self.data_bytes.checked_div(entries).unwrap_or(0);
+                Err(invalid("data", format!("{entry_bytes} bytes for each entry of {:?}", self.shape), body.len()))
+            }
+        }
     }
-    let entries = match dtype {
-        "<f4" => super::vega::read_f32_le(body),
-        "<f8" => super::vega::read_f64_le_as_f32(body),
-        ">f4" => body.as_chunks().0.iter().map(|entry| f32::from_be_bytes(*entry)).collect(),
-        _ => body.as_chunks().0.iter().map(|entry| f64::from_be_bytes(*entry) as f32).collect(),
-    };
-    Ok(NpyArray { shape, fortran_order, entries })
 }
 
 /// Splits the file into the text of the header and the data after it.
@@ -117,7 +181,7 @@ mod tests {
         let f64_array = row_major.mapv(f64::from);
         let modes: Vec<_> = [to_npy(&row_major), to_npy(&column_major), to_npy(&f64_array)]
             .iter()
-            .map(|bytes| super::super::parse_npy(bytes).expect("a valid .npy file"))
+            .map(|bytes| super::super::matrix(parse(bytes).expect("a valid .npy file")).expect("a matrix"))
             .collect();
         assert_eq!(modes[0].entry(0, 2, 1), 5.0);
         assert!(
@@ -144,7 +208,7 @@ mod tests {
             (b"\x93NUMPY\x02\x00\xff\xff\xff\xff".to_vec(), "header: expected at most 4096 bytes, got 4294967295"),
             (b"\x93NUMPY\x01\x00\x40\x00ab".to_vec(), "header: expected a complete"),
             (file_with_shape("(3, 2)"), "data: expected 4 bytes for each entry of [3, 2], got 12"),
-            (file_with_shape("(3, 0)"), "data: expected 4 bytes for each entry of [3, 0], got 12"),
+            (file_with_shape("(3, 0)"), "data: expected 0 bytes for each entry of [3, 0], got 12"),
             (file_with_shape("(4294967296, 4294967296)"), "data: expected"),
             (file_with_shape("(9223372036854775807, 3)"), "data: expected"),
             (file_with_shape("(3, -1)"), "shape: expected a tuple of whole numbers"),
@@ -159,7 +223,25 @@ mod tests {
             let message = parse(&bytes).expect_err(start).to_string();
             assert!(message.starts_with(start), "{message}");
         }
-        let message = super::super::parse_npy(&file_with_shape("(3,)")).expect_err("one dimension").to_string();
-        assert_eq!(message, "shape: expected two dimensions, 3n x r, got [3]");
+        let vector = parse(&file_with_shape("(3,)")).expect("a vector");
+        let message = super::super::matrix(vector).expect_err("one dimension").to_string();
+        assert_eq!(message, "shape: expected 3n x r or n x 3 x r, got [3]");
+    }
+
+    #[test]
+    fn arrays_of_n_3_r_are_the_same_matrix_in_both_orders() {
+        let entry = |(vertex, component, mode): (usize, usize, usize)| (100 * vertex + 10 * component + mode) as f32;
+        let row_major = ndarray::Array3::from_shape_fn((2, 3, 4), entry);
+        let column_major = ndarray::Array3::from_shape_fn((2, 3, 4).f(), entry);
+        let [a, b] = [row_major, column_major].map(|array| {
+            let mut bytes = Vec::new();
+            array.write_npy(&mut bytes).expect("an encoded array");
+            super::super::matrix(parse(&bytes).expect("a valid .npy file")).expect("a matrix")
+        });
+        assert_eq!((a.vertices(), a.rank(), a.entry(1, 2, 3)), (2, 4, 123.0));
+        assert_eq!(a, b);
+        let modes_first = NpyArray { shape: vec![4, 2, 3], fortran_order: false, entries: vec![0.0; 24] };
+        let message = super::super::matrix(modes_first).expect_err("modes on the first axis").to_string();
+        assert_eq!(message, "shape: expected 3n x r or n x 3 x r, got [4, 2, 3]");
     }
 }

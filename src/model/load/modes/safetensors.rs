@@ -1,19 +1,23 @@
 //! Parser of safetensors files. U is the tensor named `U` or the only tensor of the file, row-major, as f64, f32, f16
-//! or bf16.
+//! or bf16. The tensor `eigenvalues` (f64 or f32) is optional.
 
+use safetensors::tensor::TensorView;
 use safetensors::{Dtype, SafeTensors};
 
-use crate::domain::Modes;
+use super::{LoadedModes, NpyArray, matrix};
 use crate::error::{Result, invalid};
 
-/// Parses U.
+/// The name of the tensor with the eigenvalues.
+const EIGENVALUES: &str = "eigenvalues";
+
+/// Parses U and the eigenvalues.
 ///
 /// # Errors
-/// `Invalid` if the bytes are not a safetensors file, U is missing, or U has an unsupported type or shape.
-pub(super) fn parse(bytes: &[u8]) -> Result<Modes> {
+/// `Invalid` if the bytes are not a safetensors file, U is missing, or a tensor has an unsupported type or shape.
+pub(super) fn parse(bytes: &[u8]) -> Result<LoadedModes> {
     let safetensors =
         SafeTensors::deserialize(bytes).map_err(|error| invalid("header", "a safetensors file", error))?;
-    let names = safetensors.names();
+    let names: Vec<&str> = safetensors.names().into_iter().filter(|name| *name != EIGENVALUES).collect();
     let name = match names[..] {
         [name] => name,
         _ => "U",
@@ -23,11 +27,24 @@ pub(super) fn parse(bytes: &[u8]) -> Result<Modes> {
         invalid("tensor", "one tensor, or one named U", format!("{} tensors ({given})", names.len()))
     };
     let tensor = safetensors.tensor(name).map_err(missing)?;
-    let [rows, rank] = *tensor.shape() else {
-        return Err(invalid(format!("tensor '{name}': shape"), "3n x r", format!("{:?}", tensor.shape())));
+    let array =
+        NpyArray { shape: tensor.shape().to_vec(), fortran_order: false, entries: read_entries(&tensor, name)? };
+    let modes = match matrix(array) {
+        Err(crate::error::Error::Invalid { field, expected, given }) if field == "shape" => {
+            return Err(invalid(format!("tensor '{name}': shape"), expected, given));
+        }
+        modes => modes?,
     };
+    let eigenvalues = match safetensors.tensor(EIGENVALUES) {
+        Ok(tensor) => read_eigenvalues(&tensor)?,
+        Err(_) => Vec::new(),
+    };
+    LoadedModes::new(modes, eigenvalues)
+}
+
+fn read_entries(tensor: &TensorView<'_>, name: &str) -> Result<Vec<f32>> {
     let body = tensor.data();
-    let entries = match tensor.dtype() {
+    Ok(match tensor.dtype() {
         Dtype::F64 => super::vega::read_f64_le_as_f32(body),
         Dtype::F32 => super::vega::read_f32_le(body),
         Dtype::F16 => body.as_chunks().0.iter().map(|bits| f16_to_f32(u16::from_le_bytes(*bits))).collect(),
@@ -37,8 +54,17 @@ pub(super) fn parse(bytes: &[u8]) -> Result<Modes> {
             body.as_chunks().0.iter().map(bf16_to_f32).collect()
         }
         other => return Err(invalid(format!("tensor '{name}': type"), "F64, F32, F16 or BF16", format!("{other:?}"))),
-    };
-    Modes::from_rows(rows, rank, &entries)
+    })
+}
+
+fn read_eigenvalues(tensor: &TensorView<'_>) -> Result<Vec<f64>> {
+    match tensor.dtype() {
+        Dtype::F64 => Ok(tensor.data().as_chunks().0.iter().map(|entry| f64::from_le_bytes(*entry)).collect()),
+        Dtype::F32 => {
+            Ok(tensor.data().as_chunks().0.iter().map(|entry| f64::from(f32::from_le_bytes(*entry))).collect())
+        }
+        other => Err(invalid(format!("tensor '{EIGENVALUES}': type"), "F64 or F32", format!("{other:?}"))),
+    }
 }
 
 /// IEEE 754 binary16 to f32, exact. A binary16 has a sign bit, 5 exponent bits with bias 15, and 10 fraction bits. The
@@ -82,9 +108,24 @@ mod tests {
         let f16s: Vec<u8> = [0x3c00u16, 0xb800, 0x4000].iter().flat_map(|entry| entry.to_le_bytes()).collect();
         let bf16s: Vec<u8> = [0x3f80u16, 0xbf00, 0x4000].iter().flat_map(|entry| entry.to_le_bytes()).collect();
         for (dtype, body) in [(Dtype::F64, f64s), (Dtype::F32, f32s), (Dtype::F16, f16s), (Dtype::BF16, bf16s)] {
-            let modes = parse(&serialize_tensors(&[("anything", dtype, vec![3, 1], &body)])).expect("a valid file");
+            let modes =
+                parse(&serialize_tensors(&[("anything", dtype, vec![3, 1], &body)])).expect("a valid file").modes;
             assert_eq!(modes.column(0), [1.0, -0.5, 2.0], "{dtype:?}");
         }
+    }
+
+    #[test]
+    fn eigenvalues_and_n_3_r_arrays_are_read() {
+        let entries: Vec<u8> = (0..12u8).flat_map(|entry| f32::from(entry).to_le_bytes()).collect();
+        let values: Vec<u8> = [1.5f64, 2.5].iter().flat_map(|value| value.to_le_bytes()).collect();
+        let u = ("phi", Dtype::F32, vec![2, 3, 2], &entries[..]);
+        let file = |values: &[u8], count: usize| {
+            parse(&serialize_tensors(&[u.clone(), (EIGENVALUES, Dtype::F64, vec![count], values)]))
+        };
+        let loaded = file(&values, 2).expect("a valid file");
+        assert_eq!((loaded.modes.entry(1, 2, 1), &loaded.eigenvalues[..]), (11.0, &[1.5, 2.5][..]));
+        let message = file(&values[..8], 1).expect_err("one eigenvalue of two").to_string();
+        assert_eq!(message, "eigenvalues: expected one per mode (2), got 1");
     }
 
     #[test]

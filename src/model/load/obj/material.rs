@@ -25,6 +25,7 @@ pub(super) fn create_material(
 ) -> Result<Material> {
     let field_of = |statement: &str| format!("material '{name}': {statement}");
     let diffuse = statements.diffuse.unwrap_or([1.0; 3]);
+    let statements = &without_missing_images(statements, files, &field_of, remarks)?;
     let color_texture = load_color_texture(statements, files, texture_cache)
         .map_err(|error| error.prefix_field(&field_of("map_Kd, map_d")))?;
     let normal_texture = match &statements.normal_map {
@@ -59,6 +60,31 @@ pub(super) fn create_material(
         double_sided: true,
     };
     material.validated()
+}
+
+/// Removes the images that do not exist, with a remark for each.
+///
+/// # Errors
+/// In strict mode, `Invalid` with the statement and the file.
+fn without_missing_images(
+    statements: &MtlMaterial,
+    files: &AssetDir,
+    field_of: &impl Fn(&str) -> String,
+    remarks: &mut Vec<String>,
+) -> Result<MtlMaterial> {
+    let mut statements = statements.clone();
+    for (image, statement, stand_in) in [
+        (&mut statements.color_map, "map_Kd", "the color Kd is drawn"),
+        (&mut statements.alpha_map, "map_d", "the surface is opaque"),
+        (&mut statements.normal_map, "normal map", "the normals of the mesh are used"),
+    ] {
+        let Some(path) = image.as_deref() else { continue };
+        if !files.has_referenced_file(path).map_err(|error| error.prefix_field(&field_of(statement)))? {
+            remarks.push(format!("{} '{path}' does not exist: {stand_in}", field_of(statement)));
+            *image = None;
+        }
+    }
+    Ok(statements)
 }
 
 /// Loads the image of `map_Kd` with the alpha of `map_d`. A missing `map_Kd` is white. Returns `None` if both
@@ -135,7 +161,7 @@ mod tests {
     fn read(text: &str, folder: &std::path::Path) -> Result<(Material, TextureCache, Vec<String>)> {
         let statements = super::super::mtl::parse(text.as_bytes())?;
         let (mut texture_cache, mut remarks) = (TextureCache::default(), Vec::new());
-        let files = AssetDir::unrestricted(folder);
+        let files = AssetDir::unrestricted(folder).strict();
         let material = create_material("m", &statements["m"], &files, &mut texture_cache, &mut remarks)?;
         Ok((material, texture_cache, remarks))
     }
@@ -189,7 +215,7 @@ mod tests {
         let folder = tempfile::tempdir().expect("a temporary folder");
         std::fs::write(folder.path().join("broken.png"), b"\x89PNG\r\n").expect("a writable file");
         for (statement, start) in [
-            ("map_Kd no.png", "material 'm': map_Kd, map_d: file 'no.png': expected an existing file"),
+            ("map_Kd no.png", "material 'm': map_Kd: file 'no.png': expected an existing file, got none (strict mode)"),
             ("map_Kd broken.png", "material 'm': map_Kd, map_d: texture 'broken.png': expected a PNG or JPEG image"),
             ("norm no.png", "material 'm': normal map: file 'no.png': expected an existing file"),
             ("d 7", "material 'm': alpha: expected 0 to 1, got 7"),

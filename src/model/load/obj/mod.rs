@@ -1,21 +1,17 @@
 //! Loader of OBJ files, with their MTL libraries, images, modes and Vega configuration, as scenes of one domain.
 
-mod build;
 mod material;
 mod mtl;
 mod parse;
-mod triangulate;
 
 use std::collections::BTreeMap;
 
-pub(super) use build::build_faces;
 pub(super) use material::DEFAULT_ALPHA_CUTOFF;
-pub(super) use parse::ObjFile;
+use parse::ObjFile;
 
-use super::asset_dir::{AssetDir, MAX_MODEL_BYTES, MAX_TEXT_BYTES, parent_of};
-use super::modes;
+use super::asset_dir::{AssetDir, MAX_MODEL_BYTES, MAX_TEXT_BYTES, parent_of, stem_of};
+use super::surface::{self, ModesSource};
 use super::texture_cache::TextureCache;
-use crate::domain::{Domain, Material, Metadata, Modes, Shape};
 use crate::error::{Result, invalid};
 use crate::scene::SceneParts;
 
@@ -24,38 +20,15 @@ const MAX_LISTED_NAMES: usize = 16;
 /// The largest number of names of undefined materials in a remark.
 const MAX_LISTED_UNDEFINED: usize = 8;
 
-/// Where the modes of an OBJ file come from.
-#[derive(Debug, Clone, Copy)]
-pub(super) enum ModesSource {
-    /// A file in the same folder, if any (see [`modes::find_sidecar`]).
-    Sidecar,
-    /// No modes: the caller provides them.
-    None,
-}
-
 /// Reads the OBJ file `name` in the folder `files` as one domain. Each material becomes a range of triangles.
 ///
 /// # Errors
 /// `Invalid` with the file, the line or material, and the expected and given value.
-pub(super) fn read(files: &AssetDir, name: &str, source: ModesSource) -> Result<SceneParts> {
+pub(super) fn read(files: &AssetDir, name: &str, modes: &ModesSource) -> Result<SceneParts> {
     let obj = parse_file(files, name)?;
-    let mut parts = SceneParts::named(name.strip_suffix(".obj").unwrap_or(name));
+    let mut parts = SceneParts::named(stem_of(name));
     add_materials(&obj, files, &mut parts)?;
-    let obj_mesh = build::build_all_faces(&obj).map_err(|error| error.prefix_field(&format!("file '{name}'")))?;
-    let modes_file = match source {
-        ModesSource::Sidecar => modes::find_sidecar(files, name)?,
-        ModesSource::None => None,
-    };
-    let modes = modes_file.as_deref().map_or(Ok(Modes::rigid()), |file| modes::read(files, file))?;
-    let shape = Shape::new(obj_mesh.mesh, modes);
-    let location = || format!("file '{}'", modes_file.as_deref().unwrap_or(name));
-    parts.shapes.push(shape.map_err(|error| error.prefix_field(&location()))?);
-    parts.domains.push(Domain {
-        material: obj_mesh.material,
-        material_ranges: obj_mesh.material_ranges,
-        metadata: Metadata { eigenvalues: Vec::new(), notes: super::vega_config::read_notes(files, name)? },
-        ..Domain::new(parts.name.clone(), 0)
-    });
+    surface::add_domain(files, name, &obj.polygons, modes, None, &mut parts)?;
     Ok(parts)
 }
 
@@ -67,7 +40,16 @@ pub(super) fn parse_file(files: &AssetDir, name: &str) -> Result<ObjFile> {
     ObjFile::parse(&files.read(name, MAX_MODEL_BYTES)?).map_err(|error| error.prefix_field(&format!("file '{name}'")))
 }
 
-/// Adds the materials that the faces use, in the order of [`ObjFile::materials`], and their textures.
+/// Parses the text of a test, without materials.
+#[cfg(test)]
+pub(super) fn parse_obj(text: &str) -> super::polygons::PolygonMesh {
+    ObjFile::parse(text.as_bytes()).expect("a valid OBJ file").polygons
+}
+
+/// Adds the materials that the faces use, in the order of [`super::polygons::PolygonMesh::materials`], and their textures.
+///
+/// A material without definition is white, and a library or image that does not exist is left out. In strict mode, both
+/// are errors.
 ///
 /// # Errors
 /// `Invalid` with the material and the statement.
@@ -76,6 +58,10 @@ pub(super) fn add_materials(obj: &ObjFile, files: &AssetDir, parts: &mut ScenePa
     let mut statements_by_name = BTreeMap::new();
     for library in &obj.libraries {
         for path in library_paths(files, library)? {
+            if !files.has_referenced_file(&path)? {
+                parts.remarks.push(format!("material library '{path}' does not exist"));
+                continue;
+            }
             let library_statements = mtl::parse(&files.read(&path, MAX_TEXT_BYTES)?);
             let library_statements =
                 library_statements.map_err(|error| error.prefix_field(&format!("file '{path}'")))?;
@@ -87,14 +73,14 @@ pub(super) fn add_materials(obj: &ObjFile, files: &AssetDir, parts: &mut ScenePa
     }
     parts.remarks.extend(obj.remarks.iter().cloned());
     let mut undefined_names = Vec::new();
-    for name in &obj.materials {
+    for name in &obj.polygons.materials {
         let material = match statements_by_name.get(name) {
             Some((statements, folder)) => {
                 material::create_material(name, statements, folder, &mut texture_cache, &mut parts.remarks)?
             }
-            None if obj.libraries.is_empty() || name.is_empty() => {
+            None if !files.is_strict() || obj.libraries.is_empty() || name.is_empty() => {
                 undefined_names.push(format!("'{name}'"));
-                white_material(name)
+                surface::white_material(name)
             }
             None => {
                 let names = statements_by_name.keys().take(MAX_LISTED_NAMES).map(String::as_str);
@@ -113,10 +99,6 @@ pub(super) fn add_materials(obj: &ObjFile, files: &AssetDir, parts: &mut ScenePa
     }
     parts.textures.append(&mut texture_cache.into_textures());
     Ok(())
-}
-
-fn white_material(name: &str) -> Material {
-    Material { name: if name.is_empty() { "white" } else { name }.into(), double_sided: true, ..Material::default() }
 }
 
 /// The paths in an `mtllib` statement. The statement is one path if a file of this name exists, because file names may
@@ -152,13 +134,13 @@ mod tests {
             ("modes.txt", "9 1\n1 0 0 0 0 0 0 0 2\n"),
         ]);
         let parts =
-            read(&AssetDir::unrestricted(folder.path()), "a.obj", ModesSource::Sidecar).expect("a valid OBJ file");
+            read(&AssetDir::unrestricted(folder.path()), "a.obj", &ModesSource::Sidecar).expect("a valid OBJ file");
         assert_eq!(parts.materials.iter().map(|material| material.name.as_str()).collect::<Vec<_>>(), ["red", "blue"]);
         assert_eq!(parts.domains.len(), 1);
         assert_eq!(parts.domains[0].material_ranges.len(), 2);
         assert_eq!(parts.shapes[0].modes.entry(2, 2, 0), 2.0);
         let parts_without_modes =
-            read(&AssetDir::unrestricted(folder.path()), "a.obj", ModesSource::None).expect("a valid OBJ file");
+            read(&AssetDir::unrestricted(folder.path()), "a.obj", &ModesSource::None).expect("a valid OBJ file");
         assert_eq!(parts_without_modes.shapes[0].modes.rank(), 0);
     }
 
@@ -175,15 +157,69 @@ mod tests {
         std::fs::write(folder.path().join("rows.U.float"), modes).expect("a writable file");
         let files = AssetDir::unrestricted(folder.path());
         for (name, message) in [
-            ("lib.obj", "file 'no.mtl': expected an existing file, got entity not found"),
+            ("lib.obj", "file 'no.mtl': expected an existing file, got none (strict mode)"),
             ("use.obj", "usemtl: expected a material of the libraries (red), got green"),
             ("bad.obj", "file 'bad.obj': line 4: f: index of v: expected 1 to 3, got 9"),
             ("rows.obj", "file 'rows.U.float': modes.rows: expected 9 (3 x 3 vertices), got 6"),
         ] {
-            assert_eq!(read(&files, name, ModesSource::Sidecar).expect_err(name).to_string(), message);
+            assert_eq!(read(&files.strict(), name, &ModesSource::Sidecar).expect_err(name).to_string(), message);
         }
-        let parts = read(&files, "rows.obj", ModesSource::None).expect("a valid OBJ file");
+        let parts = read(&files, "rows.obj", &ModesSource::None).expect("a valid OBJ file");
         assert_eq!(parts.materials[0].diffuse, [1.0; 3]);
         assert_eq!(parts.remarks, ["undefined materials are white (1): ''"]);
+    }
+
+    #[test]
+    fn missing_libraries_and_images_are_remarks_with_their_stand_ins() {
+        let folder = create_folder(&[
+            ("lib.obj", &format!("mtllib no.mtl\n{TRIANGLE}usemtl bark\nf 1 2 3\n")),
+            ("use.obj", &format!("mtllib a.mtl\n{TRIANGLE}usemtl green\nf 1 2 3\n")),
+            ("map.obj", &format!("mtllib a.mtl\n{TRIANGLE}usemtl red\nf 1 2 3\n")),
+            ("a.mtl", "newmtl red\nKd 1 0 0\nmap_Kd no.png\nmap_d no.png\nnorm no.png\n"),
+        ]);
+        let files = AssetDir::unrestricted(folder.path());
+        let read = |name: &str| read(&files, name, &ModesSource::Sidecar).expect("a mesh with stand-ins");
+        let lib = read("lib.obj");
+        let undefined = "undefined materials are white (1): 'bark'";
+        assert_eq!(lib.remarks, ["material library 'no.mtl' does not exist", undefined]);
+        assert_eq!(lib.materials[0].diffuse, [1.0; 3]);
+        assert_eq!(read("use.obj").remarks, ["undefined materials are white (1): 'green'"]);
+        let map = read("map.obj");
+        assert_eq!((map.materials[0].diffuse, map.materials[0].color_texture), ([1.0, 0.0, 0.0], None));
+        assert_eq!(map.materials[0].alpha_mode, crate::domain::AlphaMode::Opaque);
+        let remark = |statement: &str, stand_in: &str| {
+            format!("material 'red': {statement} 'no.png' does not exist: {stand_in}")
+        };
+        let expected = [
+            remark("map_Kd", "the color Kd is drawn"),
+            remark("map_d", "the surface is opaque"),
+            remark("normal map", "the normals of the mesh are used"),
+        ];
+        assert_eq!(map.remarks, expected);
+    }
+
+    #[test]
+    fn colors_of_vertices_are_drawn_unless_there_is_an_image() {
+        let colored = "v 0 0 0 1 0 0\nv 1 0 0 0 1 0\nv 0 1 0\nusemtl red\nf 1 2 3\n";
+        let folder = create_folder(&[
+            ("a.obj", colored),
+            ("b.obj", &format!("mtllib b.mtl\n{colored}")),
+            ("c.obj", &colored.replace("0 1 0 0\n", "0 255 0 0\n").replace("0 1 0\nv 0 1", "0 255 0\nv 0 1")),
+            ("b.mtl", "newmtl red\nmap_Kd b.png\n"),
+        ]);
+        image::RgbaImage::new(1, 1).save(folder.path().join("b.png")).expect("a writable file");
+        let files = AssetDir::unrestricted(folder.path());
+        let read = |name: &str| read(&files, name, &ModesSource::Sidecar).expect("a valid file");
+        let parts = read("a.obj");
+        // One patch of 2 x 2 texels. A vertex without a color is white.
+        assert_eq!((parts.textures[0].width(), parts.materials[0].color_texture), (2, Some(0)));
+        let texels: Vec<&[u8]> = parts.textures[0].rgba().chunks_exact(4).collect();
+        for color in [[255, 0, 0, 255], [0, 255, 0, 255], [255; 4]] {
+            assert!(texels.contains(&&color[..]), "{color:?} is not among {texels:?}");
+        }
+        let masked = read("b.obj");
+        assert_eq!(masked.remarks, ["colors of vertices are not used, because a material has an image"]);
+        let bytes = read("c.obj");
+        assert_eq!(bytes.textures[0].rgba(), parts.textures[0].rgba(), "expected colors of 0 to 255 to be scaled");
     }
 }

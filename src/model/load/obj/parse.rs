@@ -1,4 +1,4 @@
-//! Parser of OBJ files. The indices of the parsed polygons count from 0 and are validated.
+//! Parser of OBJ files.
 //!
 //! The `tobj` crate is not used because it renumbers vertices by first use. The rows of U follow the `v` lines of the
 //! file. Renumbered vertices would get wrong rows, and no check would notice because the number of rows still matches.
@@ -6,41 +6,19 @@
 use std::collections::{BTreeMap, HashMap};
 
 use crate::error::{Error, Result, invalid};
-
-/// The index of a missing texture coordinate or normal of a corner.
-pub(in crate::load) const NO_INDEX: u32 = u32::MAX;
+use crate::load::polygons::{Corner, NO_INDEX, PolygonMesh};
 
 /// The largest number of remarks on unsupported statements, one per key.
 const MAX_REMARKS: usize = 16;
 
-/// One corner of a polygon, as indices into the lists of the file.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub(in crate::load) struct Corner {
-    pub(in crate::load) v: u32,
-    pub(in crate::load) vt: u32,
-    pub(in crate::load) vn: u32,
-}
+/// Marks a vertex without a color in a file that has colors. Such a vertex is white.
+const NO_COLOR: [f32; 3] = [-1.0; 3];
 
-/// One polygon: its corners, its material and its line in the file.
-#[derive(Debug, Clone, Copy)]
-pub(in crate::load) struct Face {
-    first_corner: usize,
-    corner_count: usize,
-    /// Index into [`ObjFile::materials`].
-    pub(in crate::load) material: usize,
-    line: usize,
-}
-
-/// The contents of an OBJ file. Texture coordinates have (0, 0) at the top left.
+/// The contents of an OBJ file.
 #[derive(Debug, Default)]
 pub(in crate::load) struct ObjFile {
-    pub(in crate::load) positions: Vec<[f32; 3]>,
-    pub(in crate::load) uvs: Vec<[f32; 2]>,
-    pub(in crate::load) normals: Vec<[f32; 3]>,
-    pub(in crate::load) faces: Vec<Face>,
-    corners: Vec<Corner>,
-    /// Material names of `usemtl` in order of first use. Faces before any `usemtl` have an empty name.
-    pub(in crate::load) materials: Vec<String>,
+    /// Faces before any `usemtl` have a material with an empty name.
+    pub(in crate::load) polygons: PolygonMesh,
     /// The arguments of each `mtllib`.
     pub(in crate::load) libraries: Vec<String>,
     /// Messages about statements that are not supported.
@@ -73,39 +51,6 @@ impl ObjFile {
         }
         parser.finish()
     }
-
-    /// The corners of a polygon.
-    pub(in crate::load) fn corners_of(&self, face: usize) -> &[Corner] {
-        let face = &self.faces[face];
-        &self.corners[face.first_corner..][..face.corner_count]
-    }
-
-    fn check_faces(&self) -> Result<()> {
-        if self.faces.is_empty() {
-            return Err(invalid("f", "at least one face", 0));
-        }
-        for (index, face) in self.faces.iter().enumerate() {
-            for corner in self.corners_of(index) {
-                check_index(face.line, "v", corner.v, self.positions.len())?;
-                if corner.vt != NO_INDEX {
-                    check_index(face.line, "vt", corner.vt, self.uvs.len())?;
-                }
-                if corner.vn != NO_INDEX {
-                    check_index(face.line, "vn", corner.vn, self.normals.len())?;
-                }
-            }
-        }
-        Ok(())
-    }
-}
-
-/// Checks that an index of a face is below the number of elements in its list.
-fn check_index(line: usize, list_name: &str, index: u32, count: usize) -> Result<()> {
-    if (index as usize) < count {
-        return Ok(());
-    }
-    let expected = if count == 0 { format!("no index in a file without {list_name}") } else { format!("1 to {count}") };
-    Err(invalid(format!("line {line}: f: index of {list_name}"), expected, u64::from(index) + 1))
 }
 
 #[derive(Default)]
@@ -113,10 +58,14 @@ struct Parser {
     obj: ObjFile,
     /// The name of the last `usemtl`.
     current_material: String,
-    /// The index of `current_material` in [`ObjFile::materials`]; `None` until a face uses it.
+    /// The index of `current_material` in [`PolygonMesh::materials`]; `None` until a face uses it.
     current_index: Option<usize>,
-    /// Indices in [`ObjFile::materials`] by name.
+    /// Indices in [`PolygonMesh::materials`] by name.
     material_indices: HashMap<String, usize>,
+    /// The corners of the current face. The allocation is reused.
+    corners: Vec<Corner>,
+    /// The largest channel of all colors of vertices.
+    max_color: f32,
     /// Number of statements per unsupported key.
     unsupported_counts: BTreeMap<String, usize>,
 }
@@ -126,12 +75,12 @@ impl Parser {
         let mut words = words(line);
         let Some(key) = words.next() else { return Ok(()) };
         match key {
-            b"v" => self.obj.positions.push(parse_vector(words, "v", line_number)?),
-            b"vn" => self.obj.normals.push(parse_vector(words, "vn", line_number)?),
+            b"v" => self.add_vertex(words, line_number)?,
+            b"vn" => self.obj.polygons.normals.push(parse_vector(words, "vn", line_number)?),
             b"vt" => {
                 let [u, v] = parse_texture_coordinates(words, line_number)?;
                 // In the file, v = 0 is the bottom of the image; in meshes, it is the top.
-                self.obj.uvs.push([u, 1.0 - v]);
+                self.obj.polygons.uvs.push([u, 1.0 - v]);
             }
             b"f" => self.add_face(words, line_number)?,
             b"usemtl" => (self.current_material, self.current_index) = (text_after_key(line), None),
@@ -148,7 +97,7 @@ impl Parser {
         if let Some(index) = self.current_index {
             return index;
         }
-        let materials = &mut self.obj.materials;
+        let materials = &mut self.obj.polygons.materials;
         let index = *self.material_indices.entry(self.current_material.clone()).or_insert_with(|| {
             materials.push(self.current_material.clone());
             materials.len() - 1
@@ -157,7 +106,8 @@ impl Parser {
     }
 
     fn add_face<'a>(&mut self, words: impl Iterator<Item = &'a [u8]>, line: usize) -> Result<()> {
-        let first_corner = self.obj.corners.len();
+        let mut corners = std::mem::take(&mut self.corners);
+        corners.clear();
         for word in words {
             let mut fields = word.split(|byte| *byte == b'/');
             let mut parse_index = |list: &str, count: usize| match fields.next() {
@@ -166,26 +116,57 @@ impl Parser {
                     resolve_index(digits, count).map_err(|error| error.prefix_field(&format!("line {line}: f: {list}")))
                 }
             };
-            let v = parse_index("v", self.obj.positions.len())?;
-            let vt = parse_index("vt", self.obj.uvs.len())?;
-            let vn = parse_index("vn", self.obj.normals.len())?;
+            let polygons = &self.obj.polygons;
+            let v = parse_index("v", polygons.positions.len())?;
+            let vt = parse_index("vt", polygons.uvs.len())?;
+            let vn = parse_index("vn", polygons.normals.len())?;
             if v == NO_INDEX || fields.next().is_some() {
                 let given = String::from_utf8_lossy(word).into_owned();
                 return Err(invalid(format!("line {line}: f"), "corners of the form v, v/vt, v//vn or v/vt/vn", given));
             }
-            self.obj.corners.push(Corner { v, vt, vn });
+            corners.push(Corner { v, vt, vn });
         }
-        let corner_count = self.obj.corners.len() - first_corner;
-        if corner_count < 3 {
-            return Err(invalid(format!("line {line}: f"), "at least 3 corners", corner_count));
+        if corners.len() < 3 {
+            return Err(invalid(format!("line {line}: f"), "at least 3 corners", corners.len()));
         }
         let material = self.current_material_index();
-        self.obj.faces.push(Face { first_corner, corner_count, material, line });
+        self.obj.polygons.add_face(corners.iter().copied(), material, line)?;
+        self.corners = corners;
+        Ok(())
+    }
+
+    /// Adds a vertex: its position and, if three or more numbers follow, its color.
+    fn add_vertex<'a>(&mut self, mut words: impl Iterator<Item = &'a [u8]>, line: usize) -> Result<()> {
+        let position = parse_vector(words.by_ref(), "v", line)?;
+        let polygons = &mut self.obj.polygons;
+        polygons.positions.push(position);
+        let color_words: Vec<&[u8]> = words.take(3).collect();
+        // A single number is the weight of a rational curve.
+        if let [_, _, _] = color_words[..] {
+            let color = parse_vector(color_words.into_iter(), "v: color", line)?;
+            if color.iter().any(|channel| !(0.0..=255.0).contains(channel)) {
+                return Err(invalid(format!("line {line}: v: color"), "0 to 1, or 0 to 255", format!("{color:?}")));
+            }
+            self.max_color = color.into_iter().fold(self.max_color, f32::max);
+            polygons.colors.resize(polygons.positions.len() - 1, NO_COLOR);
+            polygons.colors.push(color);
+        }
         Ok(())
     }
 
     fn finish(mut self) -> Result<ObjFile> {
-        self.obj.check_faces()?;
+        let polygons = &mut self.obj.polygons;
+        polygons.check(|line| format!("line {line}: f"), 1)?;
+        if !polygons.colors.is_empty() {
+            let scale = if self.max_color > 1.0 { 255.0 } else { 1.0 };
+            if scale > 1.0 {
+                self.obj.remarks.push("colors of vertices are divided by 255, because some exceed 1".into());
+            }
+            polygons.colors.resize(polygons.positions.len(), NO_COLOR);
+            for color in &mut polygons.colors {
+                *color = if *color == NO_COLOR { [1.0; 3] } else { color.map(|channel| channel / scale) };
+            }
+        }
         let remark = |(key, count): (&String, &usize)| format!("{count} statements '{key}' are not used");
         self.obj.remarks.extend(self.unsupported_counts.iter().take(MAX_REMARKS).map(remark));
         Ok(self.obj)
@@ -257,10 +238,11 @@ mod tests {
     fn negative_indices_count_back_from_the_last_element() {
         let text = format!("{TRIANGLE}vt 0.25 0.25\nvn 0 0 1\nf -3/-1/-1 -2/-1/-1 -1/-1/-1\nv 9 9 9\n");
         let obj = ObjFile::parse(text.as_bytes()).expect("a valid file");
-        let indices: Vec<_> = obj.corners_of(0).iter().map(|corner| (corner.v, corner.vt, corner.vn)).collect();
+        let indices: Vec<_> =
+            obj.polygons.corners_of(0).iter().map(|corner| (corner.v, corner.vt, corner.vn)).collect();
         assert_eq!(indices, [(0, 0, 0), (1, 0, 0), (2, 0, 0)]);
-        assert_eq!(obj.uvs, [[0.25, 0.75]], "expected a flipped v");
-        assert_eq!(obj.positions.len(), 4, "expected the unreferenced vertex");
+        assert_eq!(obj.polygons.uvs, [[0.25, 0.75]], "expected a flipped v");
+        assert_eq!(obj.polygons.positions.len(), 4, "expected the unreferenced vertex");
     }
 
     #[test]
@@ -270,9 +252,9 @@ mod tests {
                     usemtl dark bark\r\nf 1 2 \\\n 3\r\nl 1 2\r\nusemtl none\nusemtl light\nf 3 2 1 # back\n";
         let obj = ObjFile::parse(text.as_bytes()).expect("a valid file");
         assert_eq!(obj.libraries, ["my file.mtl"]);
-        assert_eq!(obj.materials, ["dark bark", "light"]);
-        assert_eq!(obj.positions, [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]);
-        assert_eq!((obj.faces[0].material, obj.faces[1].material), (0, 1));
+        assert_eq!(obj.polygons.materials, ["dark bark", "light"]);
+        assert_eq!(obj.polygons.positions, [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]);
+        assert_eq!((obj.polygons.faces[0].material, obj.polygons.faces[1].material), (0, 1));
         assert_eq!(obj.remarks, ["1 statements 'l' are not used"]);
     }
 

@@ -10,28 +10,30 @@ use std::collections::{BTreeMap, HashMap};
 use organs::{Organ, assign_organs};
 use structure::{PlantStructure, parse_object_ids};
 
-use super::asset_dir::{AssetDir, MAX_TEXT_BYTES};
-use super::obj::{self, ObjFile};
+use super::asset_dir::{AssetDir, MAX_TEXT_BYTES, stem_of};
+use super::obj;
+use super::polygons::{self, PolygonMesh};
 use crate::domain::{Attachment, Domain, Metadata, Modes, Shape, Transform};
 use crate::error::Result;
 use crate::scene::{SceneParts, UpAxis};
 
-/// Reads the plant `stem` in the folder `files`.
+/// Reads the plant whose OBJ file is `name` in the folder `files`.
 ///
 /// The frame of a domain has the axes of the scene. Its origin is the base of the organ: the first point of a shoot,
 /// the start of a leaf's petiole, or the base of a leaf whose petiole belongs to another leaf.
 ///
 /// # Errors
 /// `Invalid` with the file, and the expected and given value.
-pub(super) fn read(files: &AssetDir, stem: &str) -> Result<SceneParts> {
+pub(super) fn read(files: &AssetDir, name: &str) -> Result<SceneParts> {
+    let stem = stem_of(name);
     let (structure_file, ids_file) = (format!("{stem}.structure.json"), format!("{stem}_object_id.dat"));
     let file_field = |name: &str| format!("file '{name}'");
-    let obj = obj::parse_file(files, &format!("{stem}.obj"))?;
+    let obj = obj::parse_file(files, name)?;
     let structure = PlantStructure::parse(&files.read(&structure_file, MAX_TEXT_BYTES)?)
         .map_err(|error| error.prefix_field(&file_field(&structure_file)))?;
-    let object_ids = parse_object_ids(&files.read(&ids_file, MAX_TEXT_BYTES)?, obj.faces.len());
+    let object_ids = parse_object_ids(&files.read(&ids_file, MAX_TEXT_BYTES)?, obj.polygons.faces.len());
     let object_ids = object_ids.map_err(|error| error.prefix_field(&file_field(&ids_file)))?;
-    let organs = assign_organs(&structure, &positions_by_object(&obj, &object_ids))
+    let organs = assign_organs(&structure, &positions_by_object(&obj.polygons, &object_ids))
         .map_err(|error| error.prefix_field(&file_field(&structure_file)))?;
     let mut parts = SceneParts { up: UpAxis::Z, ..SceneParts::named(stem) };
     obj::add_materials(&obj, files, &mut parts)?;
@@ -42,21 +44,28 @@ pub(super) fn read(files: &AssetDir, stem: &str) -> Result<SceneParts> {
             faces_by_organ.entry(*organ).or_default().push(face);
         }
     }
-    PlantBuilder { obj: &obj, structure: &structure, faces_by_organ, organ_domains: HashMap::new(), parts }.build()
+    PlantBuilder {
+        polygons: &obj.polygons,
+        structure: &structure,
+        faces_by_organ,
+        organ_domains: HashMap::new(),
+        parts,
+    }
+    .build()
 }
 
 /// For each object id, the positions of the corners of its faces.
-fn positions_by_object(obj: &ObjFile, object_ids: &[u64]) -> BTreeMap<u64, Vec<[f32; 3]>> {
+fn positions_by_object(polygons: &PolygonMesh, object_ids: &[u64]) -> BTreeMap<u64, Vec<[f32; 3]>> {
     let mut positions: BTreeMap<u64, Vec<[f32; 3]>> = BTreeMap::new();
     for (face, object_id) in object_ids.iter().enumerate() {
-        let corners = obj.corners_of(face).iter().map(|corner| obj.positions[corner.v as usize]);
+        let corners = polygons.corners_of(face).iter().map(|corner| polygons.positions[corner.v as usize]);
         positions.entry(*object_id).or_default().extend(corners);
     }
     positions
 }
 
 struct PlantBuilder<'a> {
-    obj: &'a ObjFile,
+    polygons: &'a PolygonMesh,
     structure: &'a PlantStructure,
     faces_by_organ: HashMap<Organ, Vec<usize>>,
     /// Index and origin of the domain of each organ so far.
@@ -93,8 +102,9 @@ impl PlantBuilder<'_> {
 
     fn add_domain(&mut self, organ: Organ, name: String, origin: [f64; 3], parent: Option<Organ>) -> Result<()> {
         let faces = self.faces_by_organ.remove(&organ).unwrap_or_default();
-        let obj_mesh = obj::build_faces(self.obj, &faces, origin).map_err(|error| error.prefix_field(&name))?;
-        self.parts.shapes.push(Shape::new(obj_mesh.mesh, Modes::rigid())?);
+        let triangle_mesh =
+            polygons::build_faces(self.polygons, &faces, origin).map_err(|error| error.prefix_field(&name))?;
+        self.parts.shapes.push(Shape::new(triangle_mesh.mesh, Modes::rigid())?);
         let attachment =
             parent.and_then(|parent| self.organ_domains.get(&parent)).map(|(index, parent_origin)| Attachment {
                 parent: *index,
@@ -104,8 +114,8 @@ impl PlantBuilder<'_> {
         self.organ_domains.insert(organ, (self.parts.domains.len(), origin));
         let kind = if matches!(organ, Organ::Shoot(_)) { "shoot" } else { "leaf" };
         self.parts.domains.push(Domain {
-            material: obj_mesh.material,
-            material_ranges: obj_mesh.material_ranges,
+            material: triangle_mesh.material,
+            material_ranges: triangle_mesh.material_ranges,
             placement: translation_transform(origin),
             attachment,
             metadata: Metadata { eigenvalues: Vec::new(), notes: [("plant.kind".into(), kind.into())].into() },
@@ -144,7 +154,7 @@ mod tests {
         for (name, text) in [("p.obj", OBJ), ("p_object_id.dat", IDS), ("p.structure.json", JSON)].iter().chain(files) {
             std::fs::write(folder.path().join(name), text).expect("a writable file");
         }
-        read(&AssetDir::unrestricted(folder.path()), "p")
+        read(&AssetDir::unrestricted(folder.path()), "p.obj")
     }
 
     #[test]

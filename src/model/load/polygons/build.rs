@@ -1,15 +1,15 @@
-//! Builds a triangle mesh from the polygons of an OBJ file, with one range of triangles per material.
+//! Builds a triangle mesh from polygons, with one range of triangles per material.
 
 use std::collections::HashMap;
 
-use super::parse::{Corner, NO_INDEX, ObjFile};
 use super::triangulate::triangulate;
+use super::{Corner, NO_INDEX, PolygonMesh};
 use crate::domain::{Corners, MaterialRange, Mesh, smooth_normals};
 use crate::error::Result;
 
-/// A mesh and its materials, as indices into [`ObjFile::materials`].
+/// A triangle mesh and its materials, as indices into [`PolygonMesh::materials`].
 #[derive(Debug)]
-pub(in crate::load) struct ObjMesh {
+pub(in crate::load) struct TriangleMesh {
     pub(in crate::load) mesh: Mesh,
     /// The material of the first triangle.
     pub(in crate::load) material: usize,
@@ -21,9 +21,9 @@ pub(in crate::load) struct ObjMesh {
 ///
 /// # Errors
 /// `Invalid` as for [`Mesh::new`].
-pub(in crate::load) fn build_all_faces(obj: &ObjFile) -> Result<ObjMesh> {
-    let faces: Vec<usize> = (0..obj.faces.len()).collect();
-    let mut builder = ObjMeshBuilder { rest_positions: obj.positions.clone(), ..ObjMeshBuilder::new(obj) };
+pub(in crate::load) fn build_all_faces(polygons: &PolygonMesh) -> Result<TriangleMesh> {
+    let faces: Vec<usize> = (0..polygons.faces.len()).collect();
+    let mut builder = MeshBuilder { rest_positions: polygons.positions.clone(), ..MeshBuilder::new(polygons) };
     builder.add_faces(&faces);
     builder.finish()
 }
@@ -32,23 +32,23 @@ pub(in crate::load) fn build_all_faces(obj: &ObjFile) -> Result<ObjMesh> {
 ///
 /// # Errors
 /// `Invalid` as for [`Mesh::new`].
-pub(in crate::load) fn build_faces(obj: &ObjFile, faces: &[usize], origin: [f64; 3]) -> Result<ObjMesh> {
+pub(in crate::load) fn build_faces(polygons: &PolygonMesh, faces: &[usize], origin: [f64; 3]) -> Result<TriangleMesh> {
     let used_vertices = UsedVertices { new_indices: HashMap::new(), origin };
-    let mut builder = ObjMeshBuilder { used_vertices: Some(used_vertices), ..ObjMeshBuilder::new(obj) };
+    let mut builder = MeshBuilder { used_vertices: Some(used_vertices), ..MeshBuilder::new(polygons) };
     builder.add_faces(faces);
     builder.finish()
 }
 
 /// The vertices that [`build_faces`] uses.
 struct UsedVertices {
-    /// Index in the mesh by index in the file.
+    /// Index in the triangle mesh by index in the polygon mesh.
     new_indices: HashMap<u32, u32>,
     origin: [f64; 3],
 }
 
 /// Collects the corners and triangles of the faces of one mesh.
-struct ObjMeshBuilder<'a> {
-    obj: &'a ObjFile,
+struct MeshBuilder<'a> {
+    polygons: &'a PolygonMesh,
     /// `None` if the mesh has all vertices of the file.
     used_vertices: Option<UsedVertices>,
     rest_positions: Vec<[f32; 3]>,
@@ -61,10 +61,10 @@ struct ObjMeshBuilder<'a> {
     material_ranges: Vec<MaterialRange>,
 }
 
-impl<'a> ObjMeshBuilder<'a> {
-    fn new(obj: &'a ObjFile) -> Self {
+impl<'a> MeshBuilder<'a> {
+    fn new(polygons: &'a PolygonMesh) -> Self {
         Self {
-            obj,
+            polygons,
             used_vertices: None,
             rest_positions: Vec::new(),
             corner_indices: HashMap::new(),
@@ -78,9 +78,9 @@ impl<'a> ObjMeshBuilder<'a> {
     fn add_faces(&mut self, faces: &[usize]) {
         // Sort by material, so that each material has one range. The sort is stable, so a range is in file order.
         let mut faces = faces.to_vec();
-        faces.sort_by_key(|face| self.obj.faces[*face].material);
+        faces.sort_by_key(|face| self.polygons.faces[*face].material);
         for face in faces {
-            let material = self.obj.faces[face].material;
+            let material = self.polygons.faces[face].material;
             if self.material_ranges.last().is_none_or(|range| range.material != material) {
                 self.material_ranges.push(MaterialRange { first_triangle: self.triangles.len(), material });
             }
@@ -89,8 +89,8 @@ impl<'a> ObjMeshBuilder<'a> {
     }
 
     fn add_face(&mut self, face: usize) {
-        let corners = self.obj.corners_of(face);
-        let positions: Vec<_> = corners.iter().map(|corner| self.obj.positions[corner.v as usize]).collect();
+        let corners = self.polygons.corners_of(face);
+        let positions: Vec<_> = corners.iter().map(|corner| self.polygons.positions[corner.v as usize]).collect();
         let corner_indices: Vec<u32> = corners.iter().map(|corner| self.corner_index(*corner)).collect();
         self.triangles
             .extend(triangulate(&positions).into_iter().map(|triangle| triangle.map(|index| corner_indices[index])));
@@ -113,27 +113,27 @@ impl<'a> ObjMeshBuilder<'a> {
     fn vertex_index(&mut self, v: u32) -> u32 {
         let Some(UsedVertices { new_indices, origin }) = &mut self.used_vertices else { return v };
         *new_indices.entry(v).or_insert_with(|| {
-            let position = self.obj.positions[v as usize];
+            let position = self.polygons.positions[v as usize];
             self.rest_positions.push([0, 1, 2].map(|axis| (f64::from(position[axis]) - origin[axis]) as f32));
             self.rest_positions.len() as u32 - 1
         })
     }
 
-    fn finish(self) -> Result<ObjMesh> {
+    fn finish(self) -> Result<TriangleMesh> {
         let normals = self.normals();
         let uvs = if self.corners.iter().all(|corner| corner.vt == NO_INDEX) { Vec::new() } else { self.uvs() };
         let material = self.material_ranges.first().map_or(0, |range| range.material);
         let material_ranges = if self.material_ranges.len() > 1 { self.material_ranges } else { Vec::new() };
         let mesh =
             Mesh::new(self.rest_positions, Corners { vertices: self.corner_vertices, normals, uvs }, self.triangles)?;
-        Ok(ObjMesh { mesh, material, material_ranges })
+        Ok(TriangleMesh { mesh, material, material_ranges })
     }
 
     /// The normals of the corners. A corner whose normal is missing or zero in the file has the smooth normal of its
     /// vertex.
     fn normals(&self) -> Vec<[f32; 3]> {
         let file_normal =
-            |corner: &Corner| self.obj.normals.get(corner.vn as usize).filter(|normal| **normal != [0.0; 3]);
+            |corner: &Corner| self.polygons.normals.get(corner.vn as usize).filter(|normal| **normal != [0.0; 3]);
         if let Some(file_normals) = self.corners.iter().map(|corner| file_normal(corner).copied()).collect() {
             return file_normals;
         }
@@ -146,7 +146,7 @@ impl<'a> ObjMeshBuilder<'a> {
     }
 
     fn uvs(&self) -> Vec<[f32; 2]> {
-        let uv = |corner: &Corner| self.obj.uvs.get(corner.vt as usize).copied().unwrap_or_default();
+        let uv = |corner: &Corner| self.polygons.uvs.get(corner.vt as usize).copied().unwrap_or_default();
         self.corners.iter().map(uv).collect()
     }
 }
@@ -154,14 +154,15 @@ impl<'a> ObjMeshBuilder<'a> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::load::obj::parse_obj;
 
     /// Two squares in one plane, and a triangle on the first square. The squares have their own vertices on their
     /// common edge, vertex 0 is unused, and materials alternate.
     const SQUARES: &str = "v 9 9 9\nv 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nv 1 0 0\nv 2 0 0\nv 2 1 0\nv 1 1 0\n\
         vt 0 0\nvt 1 1\nusemtl b\nf 2/1 3/1 4/1 5/1\nusemtl a\nf 6 7 8 9\nusemtl b\nf 2/2 3/2 4/2\n";
 
-    fn parse_squares() -> ObjFile {
-        ObjFile::parse(SQUARES.as_bytes()).expect("a valid OBJ file")
+    fn parse_squares() -> PolygonMesh {
+        parse_obj(SQUARES)
     }
 
     #[test]
@@ -205,9 +206,7 @@ mod tests {
     #[test]
     fn missing_and_zero_normals_become_smooth_normals() {
         let text = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvn 1 0 0\nvn 0 0 0\nf 1//1 2//2 3\n";
-        let mesh = build_all_faces(&ObjFile::parse(text.as_bytes()).expect("a valid OBJ file"))
-            .expect("a valid OBJ file")
-            .mesh;
+        let mesh = build_all_faces(&parse_obj(text)).expect("a valid OBJ file").mesh;
         assert_eq!(mesh.corners().normals, [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 1.0]]);
     }
 }

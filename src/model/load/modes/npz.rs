@@ -1,0 +1,220 @@
+//! Reader of NumPy archives (`numpy.savez`, `numpy.savez_compressed`): arrays by name.
+
+use std::io::{Cursor, Read as _};
+
+use zip::ZipArchive;
+
+use super::npy::{self, NpyArray};
+use super::{LoadedModes, matrix};
+use crate::domain::MAX_RANK;
+use crate::error::{Error, Result, invalid};
+use crate::load::asset_dir::MAX_MODEL_BYTES;
+
+/// The largest number of arrays in an archive.
+const MAX_ARRAYS: usize = 1024;
+/// The largest number of names in an error message.
+const MAX_LISTED_NAMES: usize = 16;
+/// DEFLATE reduces data by a factor of at most 1032.
+const MAX_COMPRESSION: u64 = 1032;
+
+/// An archive of arrays.
+#[derive(Debug)]
+pub(in crate::load) struct NpzArchive<'a> {
+    archive: ZipArchive<Cursor<&'a [u8]>>,
+    /// Names of the arrays, without `.npy`.
+    names: Vec<String>,
+}
+
+impl<'a> NpzArchive<'a> {
+    /// Reads the directory of the archive.
+    ///
+    /// # Errors
+    /// `Invalid` if the bytes are not a ZIP archive, or the archive has too many members.
+    pub(in crate::load) fn open(bytes: &'a [u8]) -> Result<Self> {
+        let archive = ZipArchive::new(Cursor::new(bytes))
+            .map_err(|error| invalid("archive", "a NumPy archive (numpy.savez)", error))?;
+        if archive.len() > MAX_ARRAYS {
+            return Err(invalid("archive", format!("at most {MAX_ARRAYS} arrays"), archive.len()));
+        }
+        let members = archive.file_names().filter_map(Result::ok);
+        let mut names: Vec<String> = members.filter_map(|name| Some(name.strip_suffix(".npy")?.to_owned())).collect();
+        names.sort();
+        Ok(Self { archive, names })
+    }
+
+    /// Names of the arrays, sorted.
+    pub(in crate::load) fn names(&self) -> &[String] {
+        &self.names
+    }
+
+    /// The names for an error message.
+    pub(in crate::load) fn list_names(&self) -> String {
+        self.names.iter().take(MAX_LISTED_NAMES).map(String::as_str).collect::<Vec<_>>().join(", ")
+    }
+
+    /// The bytes of an array's `.npy` file; `None` if the archive has no array of this name. `check_shape` is called
+    /// with the shape in the header before the data are read.
+    ///
+    /// # Errors
+    /// `Invalid` with the name of the array, if the member cannot be read, the sizes in the headers contradict each
+    /// other, or the array is too large.
+    pub(in crate::load) fn read(
+        &mut self,
+        name: &str,
+        check_shape: impl Fn(&[usize]) -> Result<()>,
+    ) -> Result<Option<Vec<u8>>> {
+        if !self.names.iter().any(|other| other == name) {
+            return Ok(None);
+        }
+        self.read_member(name, check_shape).map(Some).map_err(|error| in_array(error, name))
+    }
+
+    fn read_member(&mut self, name: &str, check_shape: impl Fn(&[usize]) -> Result<()>) -> Result<Vec<u8>> {
+        let unreadable = |error: &dyn std::fmt::Display| invalid("data", "a readable member of the archive", error);
+        let mut member = self.archive.by_name(&format!("{name}.npy")).map_err(|error| unreadable(&error))?;
+        let (size, compressed) = (member.size(), member.compressed_size());
+        // Compare the sizes before the data are read, so that a small file cannot claim much memory.
+        if size > MAX_MODEL_BYTES || size > compressed.saturating_mul(MAX_COMPRESSION) {
+            let limit = MAX_MODEL_BYTES.min(compressed.saturating_mul(MAX_COMPRESSION));
+            return Err(invalid("size", format!("at most {limit} bytes"), size));
+        }
+        let mut bytes = Vec::new();
+        let prefix = member.by_ref().take(npy::MAX_PREFIX_BYTES as u64).read_to_end(&mut bytes);
+        prefix.map_err(|error| unreadable(&error))?;
+        let (header, body) = npy::parse_header(&bytes)?;
+        let header_bytes = bytes.len() - body.len();
+        if Some(size) != (header_bytes as u64).checked_add(header.data_bytes as u64) {
+            let expected = format!("{} bytes for the shape {:?}", header.data_bytes, header.shape);
+            return Err(invalid("data", expected, size.saturating_sub(header_bytes as u64)));
+        }
+        check_shape(&header.shape)?;
+        // One byte more than declared, so that a longer member is noticed.
+        let remaining = (size - bytes.len() as u64).saturating_add(1);
+        member.take(remaining).read_to_end(&mut bytes).map_err(|error| unreadable(&error))?;
+        if bytes.len() as u64 != size {
+            return Err(invalid("data", format!("{size} bytes"), bytes.len()));
+        }
+        Ok(bytes)
+    }
+}
+
+fn in_array(error: Error, name: &str) -> Error {
+    error.prefix_field(&format!("array '{name}'"))
+}
+
+/// Reads U from the array `U`, the array `modes` or the only array, and the array `eigenvalues` if there is one.
+///
+/// # Errors
+/// `Invalid` if U is missing, or an array is invalid.
+pub(in crate::load) fn read_modes(archive: &mut NpzArchive<'_>) -> Result<LoadedModes> {
+    let is_array = |name: &&str| archive.names().iter().any(|other| other == name);
+    let only_array = match archive.names() {
+        [name] => Some(name.as_str()),
+        _ => None,
+    };
+    let name = ["U", "modes"].into_iter().find(is_array).or(only_array);
+    let name = name.ok_or_else(|| invalid("archive", "an array named U", archive.list_names()))?.to_owned();
+    let check_rank = |shape: &[usize]| match shape {
+        [.., rank] if *rank > MAX_RANK => Err(invalid("shape", format!("at most {MAX_RANK} columns"), rank)),
+        _ => Ok(()),
+    };
+    let bytes = archive.read(&name, check_rank)?.unwrap_or_default();
+    let array: Result<NpyArray> = npy::parse(&bytes);
+    let modes = array.and_then(matrix).map_err(|error| in_array(error, &name))?;
+    LoadedModes::new(modes, read_vector(archive, "eigenvalues", MAX_RANK)?)
+}
+
+/// Reads a vector of at most `limit` entries. Returns an empty vector if the archive has no array of this name.
+fn read_vector(archive: &mut NpzArchive<'_>, name: &str, limit: usize) -> Result<Vec<f64>> {
+    let check_length = |shape: &[usize]| match shape.iter().try_fold(1_usize, |size, side| size.checked_mul(*side)) {
+        Some(length) if length <= limit => Ok(()),
+        _ => Err(invalid("shape", format!("at most {limit} entries"), format!("{shape:?}"))),
+    };
+    let Some(bytes) = archive.read(name, check_length)? else { return Ok(Vec::new()) };
+    npy::parse_f64(&bytes).map(|(_, entries)| entries).map_err(|error| in_array(error, name))
+}
+
+#[cfg(test)]
+pub(in crate::load) mod tests {
+    use std::io::Write as _;
+
+    use ndarray_npy::WriteNpyExt;
+    use zip::write::SimpleFileOptions;
+    use zip::{CompressionMethod, ZipWriter};
+
+    use super::*;
+
+    /// An archive of `.npy` files, stored or compressed.
+    pub(in crate::load) fn archive(arrays: &[(&str, Vec<u8>)], method: CompressionMethod) -> Vec<u8> {
+        let mut writer = ZipWriter::new(Cursor::new(Vec::new()));
+        for (name, bytes) in arrays {
+            let options = SimpleFileOptions::default().compression_method(method);
+            writer.start_file(format!("{name}.npy"), options).expect("a new member");
+            writer.write_all(bytes).expect("a written member");
+        }
+        writer.finish().expect("a complete archive").into_inner()
+    }
+
+    pub(in crate::load) fn npy<A, D>(array: &ndarray::Array<A, D>) -> Vec<u8>
+    where
+        A: ndarray_npy::WritableElement,
+        D: ndarray::Dimension,
+    {
+        let mut bytes = Vec::new();
+        array.write_npy(&mut bytes).expect("an encoded array");
+        bytes
+    }
+
+    fn read(bytes: &[u8]) -> Result<LoadedModes> {
+        read_modes(&mut NpzArchive::open(bytes)?)
+    }
+
+    #[test]
+    fn named_arrays_are_read_from_stored_and_compressed_archives() {
+        let u = npy(&ndarray::Array3::from_shape_fn((2, 3, 2), |(i, c, k)| (100 * i + 10 * c + k) as f64));
+        let eigenvalues = npy(&ndarray::arr1(&[1.5, 2.5]));
+        let stress = npy(&ndarray::arr1(&[1.0_f32; 7]));
+        for method in [CompressionMethod::Stored, CompressionMethod::Deflated] {
+            let arrays = [("stress", stress.clone()), ("U", u.clone()), ("eigenvalues", eigenvalues.clone())];
+            let loaded = read(&archive(&arrays, method)).expect("a valid archive");
+            assert_eq!((loaded.modes.entry(1, 2, 1), &loaded.eigenvalues[..]), (121.0, &[1.5, 2.5][..]));
+        }
+        let only = read(&archive(&[("arr_0", u.clone())], CompressionMethod::Stored)).expect("a single array");
+        assert!(only.eigenvalues.is_empty() && only.modes.rank() == 2);
+        let two = archive(&[("a", u.clone()), ("b", u)], CompressionMethod::Stored);
+        assert_eq!(read(&two).expect_err("no array U").to_string(), "archive: expected an array named U, got a, b");
+    }
+
+    #[test]
+    fn hostile_archives_are_rejected_before_their_data_are_read() {
+        let header = |shape: &str| {
+            let text = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}");
+            let length = u16::try_from(text.len()).expect("a short header").to_le_bytes();
+            [b"\x93NUMPY\x01\x00", &length[..], text.as_bytes()].concat()
+        };
+        let deflated = |bytes: Vec<u8>| archive(&[("U", bytes)], CompressionMethod::Deflated);
+        let valid = deflated(npy(&ndarray::arr2(&[[1.0_f32], [2.0], [3.0]])));
+        for length in 0..valid.len() {
+            assert!(read(&valid[..length]).is_err(), "expected an error for {length} of {} bytes", valid.len());
+        }
+        for (bytes, start) in [
+            (b"PK\x05\x06".to_vec(), "archive: expected a NumPy archive"),
+            (deflated(header("(1000000000, 1)")), "array 'U': data: expected 4000000000 bytes for the shape"),
+            (deflated(header("(9223372036854775807, 4)")), "array 'U': data: expected 4 bytes for each entry"),
+            (deflated(vec![0; 30]), "array 'U': header: expected the magic"),
+            (deflated([header("(3, 513)"), vec![0; 4 * 3 * 513]].concat()), "array 'U': shape: expected at most 512"),
+            (deflated([header("(4, 1)"), vec![0; 16]].concat()), "array 'U': modes.rows"),
+            (deflated(npy(&ndarray::arr2(&[[f32::NAN], [0.0], [0.0]]))), "array 'U': modes[0, 0]: expected a finite"),
+            (deflated(npy(&ndarray::arr2(&[[1_i32], [0], [0]]))), "array 'U': descr: expected f4 or f8, got <i4"),
+        ] {
+            let message = read(&bytes).expect_err(start).to_string();
+            assert!(message.starts_with(start), "{message}");
+        }
+        // A directory that declares 1 GiB for a member of a few bytes: offset 24 in the record after its signature.
+        let mut bomb = valid.clone();
+        let record = bomb.windows(4).position(|bytes| bytes == b"PK\x01\x02").expect("a central directory");
+        bomb[record + 24..record + 28].copy_from_slice(&(1_u32 << 30).to_le_bytes());
+        let message = read(&bomb).expect_err("a wrong size").to_string();
+        assert!(message.starts_with("array 'U': size: expected at most"), "{message}");
+    }
+}

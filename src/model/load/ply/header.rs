@@ -1,0 +1,146 @@
+//! The header of a PLY file, checked against the size of the file before any element is read.
+
+use ply_rs_bw::parser::{Parser, Reader};
+use ply_rs_bw::ply::{DefaultElement, ElementDef, Encoding, KeyMap, PropertyType, ScalarType};
+
+use crate::error::{Result, invalid};
+
+/// The largest length of a header in bytes.
+const MAX_HEADER_BYTES: usize = 64 << 10;
+/// The largest number of names in a remark.
+const MAX_LISTED_NAMES: usize = 8;
+
+/// The properties that are read, of vertices and faces.
+const VERTEX_PROPERTIES: [&str; 16] =
+    ["x", "y", "z", "nx", "ny", "nz", "s", "t", "u", "v", "texture_u", "texture_v", "red", "green", "blue", "alpha"];
+const FACE_PROPERTIES: [&str; 3] = ["vertex_indices", "vertex_index", "texcoord"];
+
+/// A valid header.
+#[derive(Debug)]
+pub(super) struct PlyHeader {
+    pub(super) encoding: Encoding,
+    pub(super) elements: KeyMap<ElementDef>,
+    comments: Vec<String>,
+}
+
+impl PlyHeader {
+    /// Parses the header. Returns it and the bytes after it.
+    ///
+    /// # Errors
+    /// `Invalid` if the header is malformed or too long, lacks the position or the faces, names a property twice, or
+    /// declares more elements than the file can contain.
+    pub(super) fn parse(bytes: &[u8]) -> Result<(Self, &[u8])> {
+        let start = &bytes[..bytes.len().min(MAX_HEADER_BYTES)];
+        let end = start.windows(10).position(|window| window == b"end_header");
+        if !start.starts_with(b"ply") || end.is_none() {
+            let expected = format!("ply, and end_header within {MAX_HEADER_BYTES} bytes");
+            return Err(invalid("header", expected, format!("{} bytes without them", bytes.len())));
+        }
+        let mut reader = Reader::new(bytes);
+        let header = Parser::<DefaultElement>::new().read_header(&mut reader).map_err(|error| {
+            let reason: String = error.to_string().chars().take(160).collect();
+            invalid("header", "a PLY header", reason.replace(['\n', '\t'], " "))
+        })?;
+        let body = reader.into_inner();
+        check_repetitions(&bytes[..bytes.len() - body.len()], &header.elements)?;
+        let header = Self { encoding: header.encoding, elements: header.elements, comments: header.comments };
+        header.check_elements(body.len())?;
+        Ok((header, body))
+    }
+
+    /// The image that the comment `TextureFile` names.
+    pub(super) fn texture_file(&self) -> Option<String> {
+        let names = self.comments.iter().filter_map(|comment| comment.trim().strip_prefix("TextureFile "));
+        names.map(|name| name.trim().replace('\\', "/")).find(|name| !name.is_empty())
+    }
+
+    /// Names the properties and elements that are not used.
+    pub(super) fn remarks(&self) -> Vec<String> {
+        let mut unused: Vec<String> = Vec::new();
+        for (element, definition) in &self.elements {
+            let used: &[&str] = match element.as_str() {
+                "vertex" => &VERTEX_PROPERTIES,
+                "face" => &FACE_PROPERTIES,
+                _ => {
+                    unused.push(format!("element {element}"));
+                    continue;
+                }
+            };
+            let names = definition.properties.keys().filter(|name| !used.contains(&name.as_str()));
+            unused.extend(names.map(|name| format!("{element}.{name}")));
+        }
+        match unused.len() {
+            0 => Vec::new(),
+            count => {
+                unused.truncate(MAX_LISTED_NAMES);
+                let more = if count > unused.len() { " and others" } else { "" };
+                vec![format!("properties that are not used: {}{more}", unused.join(", "))]
+            }
+        }
+    }
+
+    fn check_elements(&self, body_bytes: usize) -> Result<()> {
+        let properties_of = |name: &str| self.elements.get(name).map(|element| &element.properties);
+        let vertex = properties_of("vertex").ok_or_else(|| invalid("header", "the element vertex", "none"))?;
+        if let Some(axis) = ["x", "y", "z"].into_iter().find(|axis| !vertex.contains_key(*axis)) {
+            return Err(invalid("element vertex", "the properties x, y and z", format!("none named {axis}")));
+        }
+        if self.elements.contains_key("tristrips") {
+            return Err(invalid("element tristrips", "faces with vertex_indices", "triangle strips"));
+        }
+        let order: Vec<&str> = self.elements.keys().map(String::as_str).collect();
+        let place = |name: &str| order.iter().position(|other| *other == name);
+        if place("face").is_some_and(|face| place("vertex").is_none_or(|vertex| face < vertex)) {
+            return Err(invalid("header", "the element vertex before the element face", order.join(", ")));
+        }
+        let mut least_bytes: usize = 0;
+        for element in self.elements.values() {
+            let element_bytes = match self.encoding {
+                // A line has a digit and, except for the last one, a line break.
+                Encoding::Ascii => 1,
+                _ => element.properties.values().map(|property| least_size(&property.data_type)).sum(),
+            };
+            if element_bytes == 0 && element.count > 0 {
+                return Err(invalid(format!("element {}", element.name), "properties", "none"));
+            }
+            least_bytes = least_bytes.saturating_add(element_bytes.saturating_mul(element.count));
+            if least_bytes > body_bytes {
+                let given = format!("{} in {body_bytes} bytes", element.count);
+                let expected = format!("elements of at least {element_bytes} bytes that the file contains");
+                return Err(invalid(format!("element {}", element.name), expected, given));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Rejects elements and properties that are defined twice, because the parser keeps only the last definition, and a
+/// binary file would be read at wrong places.
+fn check_repetitions(header: &[u8], elements: &KeyMap<ElementDef>) -> Result<()> {
+    let count_lines = |key: &[u8]| header.split(|byte| *byte == b'\n').filter(|line| line.starts_with(key)).count();
+    let properties: usize = elements.values().map(|element| element.properties.len()).sum();
+    for (key, defined, kept) in
+        [("element", count_lines(b"element "), elements.len()), ("property", count_lines(b"property "), properties)]
+    {
+        if defined != kept {
+            return Err(invalid(
+                "header",
+                format!("different names in each {key}"),
+                format!("{defined}, {kept} of them different"),
+            ));
+        }
+    }
+    Ok(())
+}
+
+/// The smallest size of a property in a binary file.
+const fn least_size(data_type: &PropertyType) -> usize {
+    match data_type {
+        PropertyType::Scalar(scalar) | PropertyType::List(scalar, _) => match scalar {
+            ScalarType::Char | ScalarType::UChar => 1,
+            ScalarType::Short | ScalarType::UShort => 2,
+            ScalarType::Int | ScalarType::UInt | ScalarType::Float => 4,
+            ScalarType::Double => 8,
+        },
+    }
+}

@@ -1,0 +1,124 @@
+//! Polygon meshes, as the loaders of OBJ, PLY, STL and NumPy archives read them, and their conversion to triangles.
+
+mod build;
+mod triangulate;
+mod vertex_colors;
+
+pub(super) use build::{build_all_faces, build_faces};
+pub(super) use vertex_colors::{VertexColors, paint};
+
+use crate::error::{Result, invalid};
+
+/// The index of a missing texture coordinate or normal of a corner.
+pub(super) const NO_INDEX: u32 = u32::MAX;
+
+/// One corner of a polygon, as indices into the lists of the mesh.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub(super) struct Corner {
+    pub(super) v: u32,
+    pub(super) vt: u32,
+    pub(super) vn: u32,
+}
+
+impl Corner {
+    /// A corner of the vertex `v` without texture coordinates and normal.
+    pub(super) const fn of_vertex(v: u32) -> Self {
+        Self { v, vt: NO_INDEX, vn: NO_INDEX }
+    }
+}
+
+/// One polygon: its corners, its material and its place in the file.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Face {
+    first_corner: usize,
+    corner_count: usize,
+    /// Index into [`PolygonMesh::materials`].
+    pub(super) material: usize,
+    /// Line of a text file, or index of the face, for errors.
+    place: usize,
+}
+
+/// Polygons with shared vertices. The indices are validated by [`PolygonMesh::check`].
+#[derive(Debug, Default)]
+pub(super) struct PolygonMesh {
+    /// Rest positions, in the order of the file.
+    pub(super) positions: Vec<[f32; 3]>,
+    /// Texture coordinates with (0, 0) at the top left.
+    pub(super) uvs: Vec<[f32; 2]>,
+    pub(super) normals: Vec<[f32; 3]>,
+    /// One sRGB color per vertex, 0 to 1; empty if no vertex has a color.
+    pub(super) colors: Vec<[f32; 3]>,
+    pub(super) faces: Vec<Face>,
+    corners: Vec<Corner>,
+    /// Material names in order of first use.
+    pub(super) materials: Vec<String>,
+}
+
+impl PolygonMesh {
+    /// A mesh without faces, whose faces will have one material without a name.
+    pub(super) fn with_one_material(positions: Vec<[f32; 3]>) -> Self {
+        Self { positions, materials: vec![String::new()], ..Self::default() }
+    }
+
+    /// Adds a polygon.
+    ///
+    /// # Errors
+    /// `Invalid` for fewer than three corners.
+    pub(super) fn add_face(
+        &mut self,
+        corners: impl IntoIterator<Item = Corner>,
+        material: usize,
+        place: usize,
+    ) -> Result<()> {
+        let first_corner = self.corners.len();
+        self.corners.extend(corners);
+        let corner_count = self.corners.len() - first_corner;
+        if corner_count < 3 {
+            return Err(invalid("face", "at least 3 corners", corner_count));
+        }
+        self.faces.push(Face { first_corner, corner_count, material, place });
+        Ok(())
+    }
+
+    /// The corners of a polygon.
+    pub(super) fn corners_of(&self, face: usize) -> &[Corner] {
+        let face = &self.faces[face];
+        &self.corners[face.first_corner..][..face.corner_count]
+    }
+
+    /// Whether any corner has texture coordinates.
+    pub(super) fn has_uvs(&self) -> bool {
+        self.corners.iter().any(|corner| corner.vt != NO_INDEX)
+    }
+
+    /// Checks that the mesh has a face and that all indices are in range. `place` names a face of an error from its
+    /// place, `first_index` is the number of the first vertex in the file.
+    ///
+    /// # Errors
+    /// `Invalid` with the place of the face, and the range of valid indices.
+    pub(super) fn check(&self, place: impl Fn(usize) -> String, first_index: u64) -> Result<()> {
+        if self.faces.is_empty() {
+            return Err(invalid("f", "at least one face", 0));
+        }
+        for (index, face) in self.faces.iter().enumerate() {
+            for corner in self.corners_of(index) {
+                for (list, index, count) in [
+                    ("v", corner.v, self.positions.len()),
+                    ("vt", corner.vt, self.uvs.len()),
+                    ("vn", corner.vn, self.normals.len()),
+                ] {
+                    let is_missing = index == NO_INDEX && list != "v";
+                    if !is_missing && index as usize >= count {
+                        let expected = match count as u64 {
+                            0 => format!("no index in a file without {list}"),
+                            count => format!("{first_index} to {}", count - 1 + first_index),
+                        };
+                        let field = format!("{}: index of {list}", place(face.place));
+                        return Err(invalid(field, expected, u64::from(index) + first_index));
+                    }
+                }
+            }
+        }
+        Ok(())
+    }
+}

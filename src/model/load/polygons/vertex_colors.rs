@@ -1,0 +1,170 @@
+//! Colors of vertices, drawn through an image: the renderer has no colors per vertex. Each triangle has its own patch of
+//! 2 x 2 texels. The corners of the triangle are the centers of three texels, and the fourth texel is chosen so that the
+//! bilinear lookup is the linear interpolation of the three colors. Coarser levels of the image mix patches of triangles
+//! that are close in the file; they are used where a triangle is smaller than a pixel.
+
+use crate::domain::{Corners, Mesh, Texture};
+use crate::error::{Result, invalid};
+
+/// The largest number of patches in one row and in one column of an image of 8192 x 8192 texels.
+const MAX_PATCHES_PER_SIDE: usize = 4096;
+
+/// How the vertices of a mesh are colored.
+#[derive(Debug)]
+pub(in crate::load) enum VertexColors {
+    /// All vertices have this linear color.
+    Uniform([f32; 3]),
+    /// A mesh with separate corners for each triangle, and the image with the patches of all triangles.
+    Image(Box<(Mesh, Texture)>),
+}
+
+/// Colors a mesh. `colors` has one sRGB color, 0 to 1, per vertex.
+///
+/// # Errors
+/// `Invalid` if the mesh has more than 16,777,216 triangles.
+pub(in crate::load) fn paint(mesh: &Mesh, colors: &[[f32; 3]]) -> Result<VertexColors> {
+    let linear_colors: Vec<[f32; 3]> = colors.iter().map(|color| color.map(linear_from_srgb)).collect();
+    if let [first, others @ ..] = &linear_colors[..]
+        && others.iter().all(|color| color == first)
+    {
+        return Ok(VertexColors::Uniform(*first));
+    }
+    let triangle_count = mesh.triangles().len();
+    let columns = (triangle_count as f64).sqrt().ceil() as usize;
+    if columns > MAX_PATCHES_PER_SIDE {
+        let limit = MAX_PATCHES_PER_SIDE * MAX_PATCHES_PER_SIDE;
+        return Err(invalid("vertex colors", format!("at most {limit} triangles"), triangle_count));
+    }
+    let (width, height) = (2 * columns, 2 * triangle_count.div_ceil(columns));
+    let mut rgba = vec![u8::MAX; 4 * width * height];
+    let mut corners = Corners::default();
+    for (index, triangle) in mesh.triangles().iter().enumerate() {
+        let (x, y) = (2 * (index % columns), 2 * (index / columns));
+        let vertices = triangle.map(|corner| mesh.corners().vertices[corner as usize]);
+        let patch = Patch::new(vertices.map(|vertex| linear_colors[vertex as usize]));
+        for (texel, color) in patch.texels.iter().enumerate() {
+            let first_byte = 4 * ((y + texel / 2) * width + x + texel % 2);
+            rgba[first_byte..first_byte + 3].copy_from_slice(&color.map(srgb_byte));
+        }
+        for (corner, texel) in triangle.iter().zip(patch.texel_of_corner) {
+            let center = [(x + texel % 2) as f32 + 0.5, (y + texel / 2) as f32 + 0.5];
+            corners.vertices.push(mesh.corners().vertices[*corner as usize]);
+            corners.normals.push(mesh.corners().normals[*corner as usize]);
+            corners.uvs.push([center[0] / width as f32, center[1] / height as f32]);
+        }
+    }
+    let triangles = (0..triangle_count as u32).map(|index| [3 * index, 3 * index + 1, 3 * index + 2]).collect();
+    let texture = Texture::new("vertex colors", width as u32, height as u32, rgba)?;
+    let mesh = Mesh::new(mesh.rest_positions().to_vec(), corners, triangles)?;
+    Ok(VertexColors::Image(Box::new((mesh, texture))))
+}
+
+/// The four texels of a triangle, row by row, in linear color.
+struct Patch {
+    texels: [[f32; 3]; 4],
+    /// The texel of each corner of the triangle.
+    texel_of_corner: [usize; 3],
+}
+
+impl Patch {
+    /// The color is p + q - o in the fourth texel, where o is the color of the corner at the first texel. The corner is
+    /// chosen for which this leaves the range from 0 to 1 the least: for gray colors, the middle one leaves it never.
+    fn new(colors: [[f32; 3]; 3]) -> Self {
+        let fourth_of = |origin: usize| {
+            let [p, q, o] = [colors[(origin + 1) % 3], colors[(origin + 2) % 3], colors[origin]];
+            [0, 1, 2].map(|channel| p[channel] + q[channel] - o[channel])
+        };
+        let excess = |color: [f32; 3]| color.iter().map(|value| (value - value.clamp(0.0, 1.0)).abs()).sum::<f32>();
+        let origin = [0, 1, 2].into_iter().min_by(|a, b| excess(fourth_of(*a)).total_cmp(&excess(fourth_of(*b))));
+        let origin = origin.unwrap_or(0);
+        let mut texel_of_corner = [0; 3];
+        (texel_of_corner[(origin + 1) % 3], texel_of_corner[(origin + 2) % 3]) = (1, 2);
+        let fourth = fourth_of(origin).map(|value| value.clamp(0.0, 1.0));
+        let texels = [colors[origin], colors[(origin + 1) % 3], colors[(origin + 2) % 3], fourth];
+        Self { texels, texel_of_corner }
+    }
+}
+
+/// sRGB transfer function, IEC 61966-2-1.
+fn linear_from_srgb(encoded: f32) -> f32 {
+    if encoded <= 0.040_45 { encoded / 12.92 } else { ((encoded + 0.055) / 1.055).powf(2.4) }
+}
+
+fn srgb_byte(linear: f32) -> u8 {
+    let encoded = if linear <= 0.003_130_8 { linear * 12.92 } else { 1.055 * linear.powf(1.0 / 2.4) - 0.055 };
+    (encoded * 255.0).round() as u8
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn square() -> Mesh {
+        let positions = vec![[0.0; 3], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]];
+        Mesh::from_indexed(positions, vec![[0.0, 0.0, 1.0]; 4], vec![], vec![[0, 1, 2], [0, 2, 3]]).expect("a mesh")
+    }
+
+    /// The linear color of a texture at `uv`, interpolated as the sampler does.
+    fn sample(texture: &Texture, uv: [f32; 2]) -> [f32; 3] {
+        let [x, y] = [uv[0] * texture.width() as f32 - 0.5, uv[1] * texture.height() as f32 - 0.5];
+        let texel = |x: usize, y: usize| {
+            let first_byte = 4 * (y * texture.width() as usize + x);
+            [0, 1, 2].map(|channel| linear_from_srgb(f32::from(texture.rgba()[first_byte + channel]) / 255.0))
+        };
+        let (left, top) = (x.floor() as usize, y.floor() as usize);
+        let (u, v) = (x - x.floor(), y - y.floor());
+        let weighted = [
+            (texel(left, top), (1.0 - u) * (1.0 - v)),
+            (texel((left + 1).min(texture.width() as usize - 1), top), u * (1.0 - v)),
+            (texel(left, (top + 1).min(texture.height() as usize - 1)), (1.0 - u) * v),
+        ];
+        let last = texel((left + 1).min(texture.width() as usize - 1), (top + 1).min(texture.height() as usize - 1));
+        [0, 1, 2].map(|channel| {
+            weighted.iter().map(|(texel, weight)| texel[channel] * weight).sum::<f32>() + last[channel] * u * v
+        })
+    }
+
+    #[test]
+    fn image_interpolates_the_colors_of_the_corners_linearly() {
+        // Black, white and two grays: 0.5 and 0.735 encode the linear values 0.214 and 0.5.
+        let colors = [[0.0; 3], [1.0; 3], [0.5; 3], [0.735; 3]];
+        let VertexColors::Image(painted) = paint(&square(), &colors).expect("a painted mesh") else {
+            panic!("expected an image")
+        };
+        let (mesh, texture) = *painted;
+        assert_eq!(mesh.rest_positions(), square().rest_positions());
+        assert_eq!((mesh.corners().vertices.len(), mesh.corners().vertices[4]), (6, 2));
+        for triangle in mesh.triangles() {
+            for weights in [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.5, 0.5, 0.0], [0.2, 0.3, 0.5], [1.0 / 3.0; 3]] {
+                let mut uv = [0.0_f32; 2];
+                let mut expected = 0.0;
+                for (corner, weight) in triangle.iter().zip(weights) {
+                    let corner = *corner as usize;
+                    let corner_uv = mesh.corners().uvs[corner];
+                    uv = [uv[0] + weight * corner_uv[0], uv[1] + weight * corner_uv[1]];
+                    expected += weight * linear_from_srgb(colors[mesh.corners().vertices[corner] as usize][0]);
+                }
+                let color = sample(&texture, uv);
+                assert!((color[0] - expected).abs() < 0.005, "{weights:?}: expected {expected}, got {color:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn equal_colors_need_no_image() {
+        let VertexColors::Uniform(color) = paint(&square(), &[[0.5, 0.0, 1.0]; 4]).expect("colors") else {
+            panic!("expected one color")
+        };
+        assert!((color[0] - 0.214).abs() < 1e-3 && color[1..] == [0.0, 1.0], "{color:?}");
+    }
+
+    #[test]
+    fn saturated_colors_stay_in_range() {
+        // Red, green and blue: every choice of the fourth texel leaves the range.
+        let patch = Patch::new([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]);
+        assert!(patch.texels.iter().flatten().all(|value| (0.0..=1.0).contains(value)));
+        let mut corners = patch.texel_of_corner;
+        corners.sort_unstable();
+        assert_eq!(corners, [0, 1, 2]);
+    }
+}

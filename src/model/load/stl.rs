@@ -1,0 +1,206 @@
+//! Loader of STL files, binary and ASCII.
+//!
+//! An STL file repeats the coordinates of a vertex in each of its triangles. Equal coordinates become one vertex, and
+//! vertices are numbered by their first occurrence in the file. The rows of U follow this numbering. Normals of facets
+//! and attribute words are not used.
+//!
+//! The `stl_io` crate (0.11) is not used: it reads a binary file whose header begins with `solid ` as text, ends silently
+//! after the first of several solids, and rejects facets whose normal is not a number, although normals are redundant.
+
+use std::collections::HashMap;
+
+use super::asset_dir::{AssetDir, MAX_MODEL_BYTES, stem_of};
+use super::polygons::{Corner, PolygonMesh};
+use super::surface::{self, ModesSource};
+use crate::error::{Result, invalid};
+use crate::scene::{SceneParts, UpAxis};
+
+/// Bytes of a binary header: a comment, then the number of triangles.
+const HEADER_BYTES: usize = 84;
+/// Bytes of a binary triangle: normal, three vertices, attribute.
+const TRIANGLE_BYTES: usize = 50;
+
+/// Reads the STL file `name` in the folder `files` as one domain. Z is up.
+///
+/// # Errors
+/// `Invalid` with the file, the line or triangle, and the expected and given value.
+pub(super) fn read(files: &AssetDir, name: &str, modes: &ModesSource) -> Result<SceneParts> {
+    let mut parts = SceneParts { up: UpAxis::Z, ..SceneParts::named(stem_of(name)) };
+    let polygons = parse(&files.read(name, MAX_MODEL_BYTES)?, &mut parts.remarks)
+        .map_err(|error| error.prefix_field(&format!("file '{name}'")))?;
+    parts.materials.push(surface::white_material(""));
+    surface::add_domain(files, name, &polygons, modes, None, &mut parts)?;
+    Ok(parts)
+}
+
+fn parse(bytes: &[u8], remarks: &mut Vec<String>) -> Result<PolygonMesh> {
+    let declared_bytes = bytes.get(HEADER_BYTES - 4..).and_then(|rest| rest.first_chunk()).map(|count| {
+        let count = u32::from_le_bytes(*count) as usize;
+        HEADER_BYTES + TRIANGLE_BYTES * count
+    });
+    let mut merger = VertexMerger::default();
+    // A binary file may also begin with `solid`. Its size is certain.
+    let is_text = bytes.trim_ascii_start().get(..5).is_some_and(|word| word.eq_ignore_ascii_case(b"solid"));
+    match declared_bytes {
+        Some(size) if size == bytes.len() || (size < bytes.len() && !is_text) => {
+            if size < bytes.len() {
+                remarks.push(format!("{} bytes after the last triangle are not used", bytes.len() - size));
+            }
+            parse_binary(&bytes[HEADER_BYTES..size], &mut merger)?;
+        }
+        _ if is_text => parse_text(bytes, &mut merger)?,
+        Some(size) => return Err(invalid("size", format!("{size} bytes, as the header declares"), bytes.len())),
+        None => return Err(invalid("header", "84 bytes, or a text that begins with solid", bytes.len())),
+    }
+    let mut polygons = merger.polygons;
+    polygons.materials.push(String::new());
+    polygons.check(|triangle| format!("triangle {triangle}"), 0)?;
+    Ok(polygons)
+}
+
+fn parse_binary(triangles: &[u8], merger: &mut VertexMerger) -> Result<()> {
+    for (index, triangle) in triangles.as_chunks::<TRIANGLE_BYTES>().0.iter().enumerate() {
+        let coordinate = |number: usize| {
+            // The normal has 12 bytes.
+            let first_byte = 12 + 4 * number;
+            f32::from_le_bytes([
+                triangle[first_byte],
+                triangle[first_byte + 1],
+                triangle[first_byte + 2],
+                triangle[first_byte + 3],
+            ])
+        };
+        let vertices = [0, 3, 6].map(|first| [coordinate(first), coordinate(first + 1), coordinate(first + 2)]);
+        merger.add_triangle(vertices, index).map_err(|error| error.prefix_field(&format!("triangle {index}")))?;
+    }
+    Ok(())
+}
+
+/// Parses the `vertex` lines between each `outer loop` and `endloop`. The other words are not needed.
+fn parse_text(bytes: &[u8], merger: &mut VertexMerger) -> Result<()> {
+    let mut vertices: Vec<[f32; 3]> = Vec::new();
+    let mut is_in_loop = false;
+    for (index, line) in bytes.split(|byte| *byte == b'\n').enumerate() {
+        let location = format_args!("line {}", index + 1).to_string();
+        let mut words = line.split(u8::is_ascii_whitespace).filter(|word| !word.is_empty());
+        let key = words.next().unwrap_or_default().to_ascii_lowercase();
+        match key.as_slice() {
+            b"outer" => (vertices.clear(), is_in_loop = true).0,
+            b"vertex" if is_in_loop && vertices.len() < 3 => {
+                let number = |word: Option<&[u8]>| std::str::from_utf8(word?).ok()?.parse::<f32>().ok();
+                let [x, y, z] = [words.next(), words.next(), words.next()].map(number);
+                let (Some(x), Some(y), Some(z)) = (x, y, z) else {
+                    let given = String::from_utf8_lossy(line.trim_ascii()).chars().take(80).collect::<String>();
+                    return Err(invalid(location, "vertex and three numbers", given));
+                };
+                vertices.push([x, y, z]);
+            }
+            b"endloop" if is_in_loop => {
+                let [a, b, c] = vertices[..] else {
+                    return Err(invalid(location, "three vertices in a loop", vertices.len()));
+                };
+                merger.add_triangle([a, b, c], index + 1).map_err(|error| error.prefix_field(&location))?;
+                is_in_loop = false;
+            }
+            b"vertex" | b"endloop" => return Err(invalid(location, "a loop of three vertices", "another statement")),
+            b"" | b"solid" | b"facet" | b"endfacet" | b"endsolid" => {}
+            other => {
+                let given = String::from_utf8_lossy(other).chars().take(80).collect::<String>();
+                return Err(invalid(location, "a statement of STL", given));
+            }
+        }
+    }
+    match is_in_loop {
+        true => Err(invalid("end", "endloop", "the end of the file")),
+        false => Ok(()),
+    }
+}
+
+/// Numbers vertices by the first occurrence of their coordinates.
+#[derive(Default)]
+struct VertexMerger {
+    polygons: PolygonMesh,
+    index_of: HashMap<[u32; 3], u32>,
+}
+
+impl VertexMerger {
+    fn add_triangle(&mut self, vertices: [[f32; 3]; 3], place: usize) -> Result<()> {
+        if let Some(number) = vertices.as_flattened().iter().find(|number| !number.is_finite()) {
+            return Err(invalid("vertex", "finite numbers", number));
+        }
+        let corners = vertices.map(|position| {
+            // The sum with 0 changes -0 to 0, which is equal but has other bits.
+            let position = position.map(|number| number + 0.0);
+            let positions = &mut self.polygons.positions;
+            Corner::of_vertex(*self.index_of.entry(position.map(f32::to_bits)).or_insert_with(|| {
+                positions.push(position);
+                positions.len() as u32 - 1
+            }))
+        });
+        self.polygons.add_face(corners, 0, place)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const TEXT: &str = "solid \nfacet normal nan nan nan\n outer loop\n  vertex 0 0 0\n  vertex 1 0 0\n  vertex 0 1 0\n\
+         endloop\nendfacet\nendsolid\nsolid second\nfacet normal 0 0 1\nouter loop\nvertex 1 0 0\nVERTEX 1 1e0 -0.0\n\
+         vertex 0 1 0\nendloop\nendfacet\nendsolid second\n";
+
+    fn binary(header: &str, count: u32, triangles: &[[[f32; 3]; 3]]) -> Vec<u8> {
+        let mut bytes = vec![b' '; 80];
+        bytes[..header.len()].copy_from_slice(header.as_bytes());
+        bytes.extend(count.to_le_bytes());
+        for triangle in triangles {
+            bytes.extend([0; 12]);
+            bytes.extend(triangle.as_flattened().iter().flat_map(|number| number.to_le_bytes()));
+            bytes.extend([0; 2]);
+        }
+        bytes
+    }
+
+    const SQUARE: [[[f32; 3]; 3]; 2] =
+        [[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]]];
+
+    #[test]
+    fn text_and_binary_files_merge_equal_vertices_in_file_order() {
+        // A binary file may begin with the word that begins text files, and may have bytes after its triangles.
+        let mut remarks = Vec::new();
+        let padded = [binary("", 2, &SQUARE), vec![0; 3]].concat();
+        for bytes in [TEXT.as_bytes(), &binary("solid exported", 2, &SQUARE), &padded] {
+            let polygons = parse(bytes, &mut remarks).expect("a valid file");
+            assert_eq!(polygons.faces.len(), 2, "expected the triangles of both solids");
+            assert_eq!(polygons.positions, [[0.0; 3], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0, 1.0, 0.0]]);
+            let vertices: Vec<u32> = polygons.corners_of(1).iter().map(|corner| corner.v).collect();
+            assert_eq!(vertices, [1, 3, 2]);
+        }
+        assert_eq!(remarks, ["3 bytes after the last triangle are not used"]);
+    }
+
+    #[test]
+    fn hostile_files_are_rejected_before_allocation() {
+        let mut nan = SQUARE;
+        nan[1][2][1] = f32::NAN;
+        for (bytes, message) in [
+            (binary("", u32::MAX, &SQUARE), "size: expected 214748364834 bytes, as the header declares, got 184"),
+            (binary("", 3, &SQUARE), "size: expected 234 bytes, as the header declares, got 184"),
+            (binary("", 2, &nan), "triangle 1: vertex: expected finite numbers, got NaN"),
+            (binary("", 0, &[]), "f: expected at least one face, got 0"),
+            (vec![0; 83], "header: expected 84 bytes, or a text that begins with solid, got 83"),
+            (vec![], "header: expected 84 bytes, or a text that begins with solid, got 0"),
+            (TEXT.replace("1e0", "inf").into(), "line 16: vertex: expected finite numbers, got inf"),
+            (TEXT.replace("1e0", "x").into(), "line 14: expected vertex and three numbers, got VERTEX 1 x -0.0"),
+            (
+                TEXT.replace(" outer loop", "").into(),
+                "line 4: expected a loop of three vertices, got another statement",
+            ),
+            (TEXT.replacen("vertex 0 1 0", "", 1).into(), "line 7: expected three vertices in a loop, got 2"),
+            (TEXT[..60].into(), "end: expected endloop, got the end of the file"),
+            ("solid\nobject\n".into(), "line 2: expected a statement of STL, got object"),
+        ] {
+            assert_eq!(parse(&bytes, &mut Vec::new()).map(drop).expect_err(message).to_string(), message);
+        }
+    }
+}

@@ -1,0 +1,94 @@
+//! Builds a scene of one domain from a polygon mesh: triangles, colors of vertices, modes, and their remarks.
+
+use super::asset_dir::AssetDir;
+use super::modes::{self, LoadedModes};
+use super::polygons::{self, PolygonMesh, VertexColors};
+use crate::domain::{Domain, Material, Mesh, Metadata, Modes, Shape};
+use crate::error::{Error, Result};
+use crate::scene::SceneParts;
+
+/// Where the modes of a mesh come from.
+#[derive(Debug, Clone)]
+pub(super) enum ModesSource {
+    /// A file in the same folder, if any (see [`modes::find_sidecar`]).
+    Sidecar,
+    /// No modes: the caller provides them.
+    None,
+}
+
+/// Adds the mesh of the file `name` as the only domain. Its materials must be in `parts` in the order of
+/// [`PolygonMesh::materials`]. `own_modes` are modes in the file itself; they have precedence over files beside it.
+///
+/// # Errors
+/// `Invalid` with the file, and the expected and given value.
+pub(super) fn add_domain(
+    files: &AssetDir,
+    name: &str,
+    polygons: &PolygonMesh,
+    source: &ModesSource,
+    own_modes: Option<LoadedModes>,
+    parts: &mut SceneParts,
+) -> Result<()> {
+    let in_file = |file: &str| {
+        let location = format!("file '{file}'");
+        move |error: Error| error.prefix_field(&location)
+    };
+    let triangles = polygons::build_all_faces(polygons).map_err(in_file(name))?;
+    let mesh = color_vertices(polygons, triangles.mesh, parts).map_err(in_file(name))?;
+    let (loaded, modes_file) = match (source, own_modes) {
+        (ModesSource::None, _) => (Modes::rigid().into(), None),
+        (ModesSource::Sidecar, Some(own_modes)) => (own_modes, Some(name.to_owned())),
+        (ModesSource::Sidecar, None) => {
+            let sidecar = modes::find_sidecar(files, name)?;
+            parts.remarks.extend(sidecar.remark);
+            match sidecar.file {
+                Some(file) => (modes::read(files, &file)?, Some(file)),
+                None => (Modes::rigid().into(), None),
+            }
+        }
+    };
+    let shape = Shape::new(mesh, loaded.modes).map_err(in_file(modes_file.as_deref().unwrap_or(name)))?;
+    let mut notes = super::vega_config::read_notes(files, name)?;
+    notes.extend(modes_file.map(|file| (modes::FILE_NOTE.to_owned(), file)));
+    parts.shapes.push(shape);
+    parts.domains.push(Domain {
+        material: triangles.material,
+        material_ranges: triangles.material_ranges,
+        metadata: Metadata { eigenvalues: loaded.eigenvalues, notes },
+        ..Domain::new(parts.name.clone(), 0)
+    });
+    Ok(())
+}
+
+/// A white, double-sided material.
+pub(super) fn white_material(name: &str) -> Material {
+    Material { name: if name.is_empty() { "white" } else { name }.into(), double_sided: true, ..Material::default() }
+}
+
+/// Applies the colors of the vertices, unless a material has an image, whose texture coordinates they would replace.
+fn color_vertices(polygons: &PolygonMesh, mesh: Mesh, parts: &mut SceneParts) -> Result<Mesh> {
+    if polygons.colors.is_empty() {
+        return Ok(mesh);
+    }
+    let has_image = |material: &Material| material.color_texture.is_some() || material.normal_texture.is_some();
+    if parts.materials.iter().any(has_image) {
+        parts.remarks.push("colors of vertices are not used, because a material has an image".into());
+        return Ok(mesh);
+    }
+    match polygons::paint(&mesh, &polygons.colors)? {
+        VertexColors::Uniform(color) => {
+            let multiply = |factor: [f32; 3]| [0, 1, 2].map(|channel| factor[channel] * color[channel]);
+            for material in &mut parts.materials {
+                (material.ambient, material.diffuse) = (multiply(material.ambient), multiply(material.diffuse));
+            }
+            Ok(mesh)
+        }
+        VertexColors::Image(painted) => {
+            let (mesh, texture) = *painted;
+            parts.textures.push(texture);
+            let index = parts.textures.len() - 1;
+            parts.materials.iter_mut().for_each(|material| material.color_texture = Some(index));
+            Ok(mesh)
+        }
+    }
+}
