@@ -9,6 +9,7 @@ mod draw_region;
 mod far;
 mod ground;
 mod harness;
+mod image_sizes;
 mod limits;
 mod oit;
 mod picking;

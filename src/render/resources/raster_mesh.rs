@@ -65,13 +65,13 @@ fn alpha_material(scene: &Scene, material: &Material, image_textures: &mut Vec<u
 
 /// Alpha of all mipmap levels of an image, the same as in OpenGL; one opaque texel if the image has no texture array.
 fn alpha_image(scene: &Scene, arrays: &[TextureArray], texture: usize) -> AlphaImage {
-    let Some((array, _)) = find_layer(arrays, texture) else {
+    if find_layer(arrays, texture).is_none() {
         return AlphaImage { width: 1, height: 1, levels: vec![vec![u8::MAX]] };
-    };
-    let array = &arrays[array];
-    let levels = mip_levels(&scene.textures[texture], array, TextureRole::Color, cutoff(scene, texture));
+    }
+    let image = &scene.textures[texture];
+    let levels = mip_levels(image, TextureRole::Color, cutoff(scene, texture));
     let alpha_channel = |rgba: &Vec<u8>| rgba.iter().skip(3).step_by(4).copied().collect();
-    AlphaImage { width: array.width, height: array.height, levels: levels.iter().map(alpha_channel).collect() }
+    AlphaImage { width: image.width(), height: image.height(), levels: levels.iter().map(alpha_channel).collect() }
 }
 
 #[cfg(test)]

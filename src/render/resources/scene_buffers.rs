@@ -22,8 +22,8 @@ use crate::plan::{Allocation, RenderPlan, ScenePlan};
 use crate::scene_data::geometry::{
     BlendMode, DrawGroup, Geometry, TriangleSpan, blend_mode, groups, locate_triangle, used_materials,
 };
-use crate::scene_data::textures::{TextureArray, TextureRole, arrays, check_texture_budget, find_layer};
-use crate::shaders::{MaterialUse, ProgramSource, ShaderOptions, post};
+use crate::scene_data::textures::{ArrayUse, TextureArray, TextureRole, arrays, check_texture_budget, find_layer};
+use crate::shaders::{ImageFilter, MaterialUse, ProgramSource, ShaderOptions, post};
 use crate::types::{BlurMethod, FrameParams};
 use modalcast_model::error::Result;
 use modalcast_model::raster::{GlVertexBuffers, RasterGeometry, Rasterizer};
@@ -153,6 +153,7 @@ fn shader_options(
     ShaderOptions {
         features,
         used_materials: material_uses(scene, texture_arrays),
+        image_filter: ImageFilter { anisotropy: gl.limits.anisotropy, blends_levels: !gl.limits.software },
         sample_positions: sample_positions.to_vec(),
         sample_resolve: post::sample_resolve(&scene.look),
         post_depth_coverage: gl.limits.post_depth_coverage,
@@ -414,7 +415,10 @@ impl SceneBuffers {
 
 /// Properties of the used materials that the shader sources depend on.
 fn material_uses(scene: &Scene, texture_arrays: &[Vec<TextureArray>; 2]) -> Vec<MaterialUse> {
-    let array_of = |arrays: &[TextureArray], texture: Option<usize>| Some(find_layer(arrays, texture?)?.0);
+    let array_of = |arrays: &[TextureArray], texture: Option<usize>| {
+        let (index, _) = find_layer(arrays, texture?)?;
+        Some(ArrayUse { index, is_mixed: arrays[index].is_mixed })
+    };
     let material_use = |material: usize| {
         let material = &scene.materials[material];
         MaterialUse {

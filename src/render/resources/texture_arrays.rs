@@ -80,8 +80,10 @@ impl TextureUpload {
         self.compute_ahead(pool);
         let levels = levels.wait().as_ref().ok_or_else(|| fault("textures", "computing mipmap levels panicked"))?;
         let (desc, texture) = (&self.arrays[role as usize][array], &self.textures[role as usize][array]);
+        // In a mixed array, the image may be smaller than the layer.
+        let image = &self.scene.textures[desc.layers[layer]];
         for (level, rgba) in levels.iter().enumerate() {
-            let size = [(desc.width >> level).max(1), (desc.height >> level).max(1)];
+            let size = [(image.width() >> level).max(1), (image.height() >> level).max(1)];
             texture.upload_pixels(level as u32, layer as u32, size, rgba)?;
         }
         Ok(())
@@ -98,11 +100,11 @@ impl TextureUpload {
             let Some(layer) = self.remaining.pop_front() else { return };
             let levels = Arc::new(OnceLock::new());
             let (scene, result) = (Arc::clone(&self.scene), Arc::downgrade(&levels));
-            let array = self.arrays[layer.role as usize][layer.array].clone();
+            let index = self.arrays[layer.role as usize][layer.array].layers[layer.layer];
             pool.spawn(move || {
                 // Nobody waits for the levels of a dropped upload.
                 if let Some(result) = result.upgrade() {
-                    let compute = || compute_levels(&scene, &array, layer);
+                    let compute = || compute_levels(&scene, index, layer.role);
                     result.set(catch_unwind(AssertUnwindSafe(compute)).ok()).ok();
                 }
             });
@@ -111,10 +113,10 @@ impl TextureUpload {
     }
 }
 
-fn compute_levels(scene: &Scene, array: &TextureArray, layer: Layer) -> Vec<Vec<u8>> {
-    let index = array.layers[layer.layer];
-    let cutoff = if layer.role == TextureRole::Color { cutoff(scene, index) } else { None };
-    mip_levels(&scene.textures[index], array, layer.role, cutoff)
+/// The mipmap levels of the texture `index` of a scene.
+fn compute_levels(scene: &Scene, index: usize, role: TextureRole) -> Vec<Vec<u8>> {
+    let cutoff = if role == TextureRole::Color { cutoff(scene, index) } else { None };
+    mip_levels(&scene.textures[index], role, cutoff)
 }
 
 /// Creates a texture array without content.

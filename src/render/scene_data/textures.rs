@@ -1,8 +1,9 @@
 //! Packs the images of a scene into a bounded number of texture arrays, one layer per image and role (color or normal).
 //!
 //! Images of the same size share an array. If there are more sizes than [`MAX_ARRAYS`], the smallest array is merged
-//! into the array for which this wastes the fewest texels, and images are enlarged to the common size. Texture
-//! coordinates do not change, because they run from 0 to 1. Colors are stored as sRGB, normal maps as linear values.
+//! into the array for which this wastes the fewest texels. Images are never resampled: each level of an image is at the
+//! first texels of the same level of its layer, and shaders wrap and filter within the image
+//! (`shaders/shared/mixed_image.glsl`). Colors are stored as sRGB, normal maps as linear values.
 //! For cut-outs, the mipmap levels preserve the covered fraction of the image (`coverage`).
 
 mod coverage;
@@ -29,17 +30,28 @@ pub(crate) enum TextureRole {
     Normal,
 }
 
-/// A texture array whose layers have the same size.
+/// A texture array.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct TextureArray {
+    /// Size of the layers.
     pub(crate) width: u32,
     pub(crate) height: u32,
+    /// Whether the images of some layers are smaller than the layers.
+    pub(crate) is_mixed: bool,
     /// Index of the scene's texture in each layer.
     pub(crate) layers: Vec<usize>,
 }
 
 /// Location of an image: index of the array, index of the layer.
 pub(crate) type ArrayLayer = (usize, usize);
+
+/// A texture array of a role, as shaders use it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) struct ArrayUse {
+    pub(crate) index: usize,
+    /// As [`TextureArray::is_mixed`].
+    pub(crate) is_mixed: bool,
+}
 
 impl TextureArray {
     /// Number of levels of a full mipmap chain.
@@ -109,7 +121,7 @@ fn group_by_size(texture_sizes: impl Iterator<Item = (usize, u32, u32)>) -> Vec<
     for (texture, width, height) in texture_sizes {
         match arrays.iter_mut().find(|array| (array.width, array.height) == (width, height)) {
             Some(array) => array.layers.push(texture),
-            None => arrays.push(TextureArray { width, height, layers: vec![texture] }),
+            None => arrays.push(TextureArray { width, height, is_mixed: false, layers: vec![texture] }),
         }
     }
     arrays
@@ -130,6 +142,7 @@ fn merge_arrays(mut arrays: Vec<TextureArray>, limit: usize) -> Vec<TextureArray
         };
         if let Some(target) = arrays.iter_mut().min_by_key(|array| wasted_texels(array)) {
             (target.width, target.height) = merged_size(target);
+            target.is_mixed = true;
             target.layers.extend(smallest.layers);
         }
     }
@@ -150,19 +163,9 @@ pub(crate) fn cutoff(scene: &Scene, texture: usize) -> Option<f32> {
         .then_some(common_cutoff)
 }
 
-/// All mipmap levels of an image at the size of its array, RGBA8, level 0 first. With a cutoff, all levels have the
-/// same coverage.
-pub(crate) fn mip_levels(
-    texture: &Texture,
-    array: &TextureArray,
-    role: TextureRole,
-    cutoff: Option<f32>,
-) -> Vec<Vec<u8>> {
-    let mut image = LinearImage::new(texture, role);
-    if (texture.width(), texture.height()) != (array.width, array.height) {
-        image = image.enlarged(array.width, array.height);
-    }
-    let mut chain = vec![image];
+/// All mipmap levels of an image, RGBA8, level 0 first. With a cutoff, all levels have the same coverage.
+pub(crate) fn mip_levels(texture: &Texture, role: TextureRole, cutoff: Option<f32>) -> Vec<Vec<u8>> {
+    let mut chain = vec![LinearImage::new(texture, role)];
     while let Some(coarsest) = chain.last().filter(|coarsest| coarsest.width > 1 || coarsest.height > 1) {
         let next_level = coarsest.downsampled();
         chain.push(next_level);
@@ -215,34 +218,6 @@ impl LinearImage {
                     (self.texel_at((2 * x + dx) as u32, (2 * y + dy) as u32), column_weights[dx] * row_weights[dy])
                 });
                 texels.push(alpha_weighted_mean(&weighted_texels));
-            }
-        }
-        Self { width, height, texels }
-    }
-
-    /// Enlarges the image bilinearly, with repeat wrapping like the sampler.
-    fn enlarged(&self, width: u32, height: u32) -> Self {
-        // Along one axis: the two source texels around a destination texel, and the weight of the second.
-        let interpolate = |destination: u32, destination_count: u32, source_count: u32| {
-            let position = (destination as f32 + 0.5) * source_count as f32 / destination_count as f32 - 0.5;
-            let low = position.floor();
-            (
-                (low as i64).rem_euclid(i64::from(source_count)) as u32,
-                (low as i64 + 1).rem_euclid(i64::from(source_count)) as u32,
-                position - low,
-            )
-        };
-        let mut texels = Vec::with_capacity((width * height) as usize);
-        for y in 0..height {
-            let (top, bottom, v) = interpolate(y, height, self.height);
-            for x in 0..width {
-                let (left, right, u) = interpolate(x, width, self.width);
-                texels.push(alpha_weighted_mean(&[
-                    (self.texel_at(left, top), (1.0 - u) * (1.0 - v)),
-                    (self.texel_at(right, top), u * (1.0 - v)),
-                    (self.texel_at(left, bottom), (1.0 - u) * v),
-                    (self.texel_at(right, bottom), u * v),
-                ]));
             }
         }
         Self { width, height, texels }
@@ -330,13 +305,14 @@ mod tests {
     }
 
     #[test]
-    fn arrays_are_merged_without_shrinking_images() {
+    fn merged_arrays_contain_all_images_and_are_mixed() {
         let sizes: Vec<(usize, u32, u32)> = (0..40).map(|index| (index, 1 + index as u32 * 3, 50)).collect();
         let merged = merge_arrays(group_by_size(sizes.iter().copied()), MAX_ARRAYS);
         assert_eq!(merged.len(), MAX_ARRAYS);
         for (texture, width, height) in sizes {
             let (array, _) = find_layer(&merged, texture).expect("a layer");
             assert!(merged[array].width >= width && merged[array].height >= height);
+            assert!(merged[array].is_mixed || (merged[array].width, merged[array].height) == (width, height));
         }
         let arrays = group_by_size([(0, 4, 4), (1, 8, 8), (2, 4, 4)].into_iter());
         assert_eq!(merge_arrays(arrays.clone(), MAX_ARRAYS), arrays, "expected no merging of two arrays");
@@ -345,7 +321,8 @@ mod tests {
     #[test]
     fn images_above_the_budget_are_rejected_with_their_sizes() {
         // A full mipmap chain has about 4/3 times the texels of level 0, with 4 bytes each.
-        let array = |side, count| TextureArray { width: side, height: side, layers: (0..count).collect() };
+        let array =
+            |side, count| TextureArray { width: side, height: side, is_mixed: false, layers: (0..count).collect() };
         let error = check_texture_budget(&[vec![array(16, 1), array(4096, 512)], vec![]])
             .expect_err("46 GB exceed the budget")
             .to_string();
@@ -357,9 +334,9 @@ mod tests {
     #[test]
     fn level_zero_is_byte_identical_to_the_image() {
         let texture = image(16, 16, |x, y| [(16 * y + x) as u8, (255 - 16 * y) as u8, x as u8, 1 + 15 * y as u8]);
-        let array = TextureArray { width: 16, height: 16, layers: vec![0] };
+        let array = TextureArray { width: 16, height: 16, is_mixed: false, layers: vec![0] };
         for role in [TextureRole::Color, TextureRole::Normal] {
-            let chain = mip_levels(&texture, &array, role, None);
+            let chain = mip_levels(&texture, role, None);
             assert_eq!(chain[0], texture.rgba());
             assert_eq!(chain.iter().map(Vec::len).collect::<Vec<_>>(), [1024, 256, 64, 16, 4]);
             assert_eq!(chain.iter().map(Vec::len).sum::<usize>() as u64, array.bytes());
@@ -369,8 +346,7 @@ mod tests {
     #[test]
     fn transparent_texels_get_the_color_of_the_leaf() {
         let texture = image(4, 4, |x, _| if x == 0 { [0, 200, 0, 255] } else { [255, 0, 255, 0] });
-        let chain =
-            mip_levels(&texture, &TextureArray { width: 4, height: 4, layers: vec![0] }, TextureRole::Color, None);
+        let chain = mip_levels(&texture, TextureRole::Color, None);
         for (level, rgba) in chain.iter().enumerate() {
             assert!(rgba.chunks_exact(4).all(|texel| texel[..3] == [0, 200, 0]), "level {level}: {rgba:?}");
         }
@@ -412,15 +388,18 @@ mod tests {
     }
 
     #[test]
-    fn enlarged_images_have_a_full_mipmap_chain() {
-        let texture = image(2, 2, |x, y| [255 * x as u8, 255 * y as u8, 0, 255]);
-        let array = TextureArray { width: 7, height: 3, layers: vec![0] };
-        let chain = mip_levels(&texture, &array, TextureRole::Normal, None);
-        // Levels of 7 x 3, 3 x 1 and 1 x 1 texels, with 4 bytes each.
-        assert_eq!((chain[0].len(), chain.len(), chain[2].len()), (84, 3, 4));
-        assert_eq!(array.bytes(), 4 * (21 + 3 + 1));
-        let constant = image(1, 1, |_, _| [9, 99, 199, 255]);
-        let chain = mip_levels(&constant, &array, TextureRole::Color, None);
-        assert!(chain[0].chunks_exact(4).all(|texel| texel == [9, 99, 199, 255]));
+    fn levels_of_an_image_fit_into_those_of_a_larger_layer() {
+        for (width, height) in [(25, 15), (16, 16), (1, 3), (127, 2)] {
+            let texture = image(width, height, |x, y| [x as u8, y as u8, 0, 255]);
+            let layer = TextureArray { width: 127, height: 17, is_mixed: true, layers: vec![0] };
+            let chain = mip_levels(&texture, TextureRole::Normal, None);
+            assert_eq!(chain[0], texture.rgba(), "expected no resampling");
+            assert!(chain.len() <= layer.levels() as usize);
+            for (level, rgba) in chain.iter().enumerate() {
+                let side = |side: u32| (side >> level).max(1);
+                assert_eq!(rgba.len() as u32, 4 * side(width) * side(height));
+                assert!(side(width) <= side(layer.width) && side(height) <= side(layer.height));
+            }
+        }
     }
 }

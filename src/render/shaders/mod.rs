@@ -15,7 +15,7 @@ use crate::layout::material::MATERIAL_BYTES;
 use crate::layout::{COLOR_UNIT, NORMAL_UNIT, TILE, TILES_PER_ROW};
 use crate::plan::features::ShaderFeatures;
 use crate::scene_data::geometry::BlendMode;
-use crate::scene_data::textures::TextureRole;
+use crate::scene_data::textures::{ArrayUse, TextureRole};
 
 pub(crate) const FRAME: &str = include_str!("../../../shaders/shared/frame.glsl");
 const CLIP: &str = include_str!("../../../shaders/shared/clip.glsl");
@@ -24,6 +24,7 @@ pub(crate) const TRIANGLE_ID: &str = include_str!("../../../shaders/shared/trian
 pub(crate) const VISIBILITY_IDS: &str = include_str!("../../../shaders/shared/visibility_ids.glsl");
 const ALPHA_COVERAGE: &str = include_str!("../../../shaders/shared/alpha_coverage.glsl");
 pub(crate) const FRAGMENT_ALPHA: &str = include_str!("../../../shaders/shared/fragment_alpha.glsl");
+const MIXED_IMAGE: &str = include_str!("../../../shaders/shared/mixed_image.glsl");
 const OIT_LISTS: &str = include_str!("../../../shaders/shared/oit_lists.glsl");
 const SKY: &str = include_str!("../../../shaders/shared/sky.glsl");
 const GROUND: &str = include_str!("../../../shaders/shared/ground_shading.glsl");
@@ -45,6 +46,8 @@ pub(crate) struct ShaderOptions {
     pub(crate) features: ShaderFeatures,
     /// The materials that triangles use.
     pub(crate) used_materials: Vec<MaterialUse>,
+    /// The filter of images in mixed arrays, which shaders compute.
+    pub(crate) image_filter: ImageFilter,
     /// Sample positions within a pixel with four samples, 0 to 1.
     pub(crate) sample_positions: Vec<[f32; 2]>,
     /// GLSL that accumulates the samples of a pixel, see [`post::sample_resolve`].
@@ -53,12 +56,21 @@ pub(crate) struct ShaderOptions {
     pub(crate) post_depth_coverage: bool,
 }
 
-/// A material that triangles use: its blend mode, and the indices of the texture arrays with its images.
+/// The filter of images, as the samplers of texture arrays have it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct ImageFilter {
+    /// Maximum anisotropy.
+    pub(crate) anisotropy: f32,
+    /// Whether two mipmap levels are blended, instead of a lookup in the nearest one.
+    pub(crate) blends_levels: bool,
+}
+
+/// A material that triangles use: its blend mode, and the texture arrays with its images.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct MaterialUse {
     pub(crate) blend_mode: BlendMode,
-    pub(crate) color_array: Option<usize>,
-    pub(crate) normal_array: Option<usize>,
+    pub(crate) color_array: Option<ArrayUse>,
+    pub(crate) normal_array: Option<ArrayUse>,
 }
 
 /// Source text of a program's stages. Each stage is its OpenGL type, such as `COMPUTE_SHADER`, and its text.
@@ -111,13 +123,17 @@ impl ShaderOptions {
 
     /// Lookup functions for the materials with these blend modes, and for the images of these materials.
     pub(crate) fn material_lookups(&self, blend_modes: &[BlendMode], derivatives: UvDerivatives) -> String {
-        let colors = sampler("color", COLOR_UNIT, &self.arrays(blend_modes, TextureRole::Color), derivatives);
-        let normals = sampler("normal", NORMAL_UNIT, &self.arrays(blend_modes, TextureRole::Normal), derivatives);
-        [MATERIAL, &colors, &normals].concat()
+        let [color_arrays, normal_arrays] =
+            [TextureRole::Color, TextureRole::Normal].map(|role| self.arrays(blend_modes, role));
+        let has_mixed_array = color_arrays.iter().chain(&normal_arrays).any(|array| array.is_mixed);
+        let mixed_image = if has_mixed_array { self.image_filter.glsl() + MIXED_IMAGE } else { String::new() };
+        let colors = sampler("color", COLOR_UNIT, &color_arrays, derivatives);
+        let normals = sampler("normal", NORMAL_UNIT, &normal_arrays, derivatives);
+        [MATERIAL, &mixed_image, &colors, &normals].concat()
     }
 
-    /// Indices of the texture arrays whose images the materials with these blend modes use in a role.
-    fn arrays(&self, blend_modes: &[BlendMode], role: TextureRole) -> BTreeSet<usize> {
+    /// The texture arrays whose images the materials with these blend modes use in a role.
+    fn arrays(&self, blend_modes: &[BlendMode], role: TextureRole) -> BTreeSet<ArrayUse> {
         let array_of = |material: &MaterialUse| match role {
             TextureRole::Color => material.color_array,
             TextureRole::Normal => material.normal_array,
@@ -242,30 +258,44 @@ fn tile_list() -> String {
     format!("#define TILE {TILE}\n#define TILES_PER_ROW {TILES_PER_ROW}u\n{TILE_LIST}")
 }
 
+impl ImageFilter {
+    /// Constants of `mixed_image.glsl`.
+    fn glsl(self) -> String {
+        let level_blend = if self.blends_levels { "#define IMAGE_LEVEL_BLEND\n" } else { "" };
+        format!("{level_blend}const float image_anisotropy = {:?};\n", self.anisotropy.max(1.0))
+    }
+}
+
 /// Function `{name}_texel` that samples an image in one of several texture arrays. Implicit derivatives are undefined
-/// in divergent control flow, so with several arrays the derivatives are computed before the array is selected.
-fn sampler(name: &str, unit: u32, arrays: &BTreeSet<usize>, derivatives: UvDerivatives) -> String {
+/// in divergent control flow, so with several arrays the derivatives are computed before the array is selected. Images
+/// in mixed arrays are sampled by `mixed_image_texel`.
+fn sampler(name: &str, unit: u32, arrays: &BTreeSet<ArrayUse>, derivatives: UvDerivatives) -> String {
     let mut text = String::new();
     let Some(first) = arrays.first() else { return text };
-    for index in arrays {
+    for ArrayUse { index, .. } in arrays {
         let unit = unit as usize + index;
         writeln!(text, "layout(binding = {unit}) uniform sampler2DArray {name}_{index};").ok();
     }
     let parameters = if derivatives == UvDerivatives::Explicit { ", vec2 dx, vec2 dy" } else { "" };
     writeln!(text, "vec4 {name}_texel(ivec2 array_and_layer, vec2 uv{parameters}) {{").ok();
     writeln!(text, "    vec3 coordinates = vec3(uv, float(max(array_and_layer.y, 0)));").ok();
-    if derivatives == UvDerivatives::Implicit && arrays.len() == 1 {
-        writeln!(text, "    return texture({name}_{first}, coordinates);\n}}").ok();
+    if derivatives == UvDerivatives::Implicit && arrays.len() == 1 && !first.is_mixed {
+        writeln!(text, "    return texture({name}_{}, coordinates);\n}}", first.index).ok();
         return text;
     }
     if derivatives == UvDerivatives::Implicit {
         writeln!(text, "    vec2 dx = dFdx(uv), dy = dFdy(uv);").ok();
     }
-    for index in arrays.iter().skip(1) {
-        let condition = format!("array_and_layer.x == {index}");
-        writeln!(text, "    if ({condition}) return textureGrad({name}_{index}, coordinates, dx, dy);").ok();
+    let lookup = |ArrayUse { index, is_mixed }: &ArrayUse| match is_mixed {
+        true => format!("mixed_image_texel({name}_{index}, max(array_and_layer, ivec2(0)), uv, dx, dy)"),
+        false => format!("textureGrad({name}_{index}, coordinates, dx, dy)"),
+    };
+    // The upper bits of a location in a mixed array contain the size of the image.
+    let array = if arrays.iter().any(|array| array.is_mixed) { "(array_and_layer.x & 7)" } else { "array_and_layer.x" };
+    for array_use in arrays.iter().skip(1) {
+        writeln!(text, "    if ({array} == {}) return {};", array_use.index, lookup(array_use)).ok();
     }
-    writeln!(text, "    return textureGrad({name}_{first}, coordinates, dx, dy);\n}}").ok();
+    writeln!(text, "    return {};\n}}", lookup(first)).ok();
     text
 }
 
@@ -288,6 +318,11 @@ mod tests {
     use modalcast_model::domain::{AlphaMode, Material};
     use modalcast_model::scene::Scene;
 
+    /// An array of images of one size.
+    fn uniform(index: usize) -> ArrayUse {
+        ArrayUse { index, is_mixed: false }
+    }
+
     fn options(alpha_mode: AlphaMode) -> ShaderOptions {
         let scene = Scene::new(squares(vec![Material { alpha_mode, ..Material::default() }])).expect("a valid scene");
         let plan =
@@ -298,6 +333,7 @@ mod tests {
         ShaderOptions {
             features: plan.features,
             used_materials,
+            image_filter: ImageFilter { anisotropy: 1.0, blends_levels: false },
             sample_positions,
             sample_resolve,
             post_depth_coverage: false,
@@ -335,7 +371,7 @@ mod tests {
             assert!(!text.contains("vec3 shade_ground(") && !text.contains("textureGrad"));
         }
         let used_materials =
-            vec![MaterialUse { blend_mode: BlendMode::Opaque, color_array: Some(0), normal_array: None }];
+            vec![MaterialUse { blend_mode: BlendMode::Opaque, color_array: Some(uniform(0)), normal_array: None }];
         let features = ShaderFeatures { textures: true, ground: true, ..ShaderFeatures::NONE };
         let textured_options = ShaderOptions { features, used_materials, ..plain_options };
         let shading = text(textured_options.shade(1));
@@ -344,7 +380,11 @@ mod tests {
 
     #[test]
     fn lookups_use_only_materials_of_the_blend_modes() {
-        let material = |blend_mode, color_array, normal_array| MaterialUse { blend_mode, color_array, normal_array };
+        let material = |blend_mode, color_array: Option<usize>, normal_array: Option<usize>| MaterialUse {
+            blend_mode,
+            color_array: color_array.map(uniform),
+            normal_array: normal_array.map(uniform),
+        };
         let used_materials = vec![
             material(BlendMode::Opaque, Some(0), Some(0)),
             material(BlendMode::Mask, Some(1), None),
@@ -371,8 +411,27 @@ mod tests {
     }
 
     #[test]
+    fn only_images_in_mixed_arrays_are_filtered_by_the_shader() {
+        let mixed = ArrayUse { index: 5, is_mixed: true };
+        let material = MaterialUse { blend_mode: BlendMode::Opaque, color_array: Some(mixed), normal_array: None };
+        let filter = ImageFilter { anisotropy: 8.0, blends_levels: true };
+        let options =
+            |used_materials| ShaderOptions { used_materials, image_filter: filter, ..options(AlphaMode::Opaque) };
+        let lookups = |options: ShaderOptions| options.material_lookups(&[BlendMode::Opaque], UvDerivatives::Explicit);
+        let text = lookups(options(vec![material, MaterialUse { color_array: Some(uniform(0)), ..material }]));
+        assert!(text.contains("if ((array_and_layer.x & 7) == 5) return mixed_image_texel(color_5,"), "{text}");
+        assert!(text.contains("return textureGrad(color_0,") && text.contains("image_anisotropy = 8.0"), "{text}");
+        assert!(text.contains("#define IMAGE_LEVEL_BLEND"), "{text}");
+        let text = lookups(options(vec![MaterialUse { color_array: Some(uniform(5)), ..material }]));
+        assert!(!text.contains("mixed_image_texel") && text.contains("textureGrad(color_5"), "{text}");
+        // A single lookup with implicit derivatives computes them, because the shader selects the level.
+        let text = sampler("color", 1, &BTreeSet::from([mixed]), UvDerivatives::Implicit);
+        assert!(text.contains("vec2 dx = dFdx(uv)") && text.contains("mixed_image_texel(color_5"), "{text}");
+    }
+
+    #[test]
     fn derivatives_precede_the_selection_of_an_array() {
-        let text = sampler("color", 1, &BTreeSet::from([0, 2, 3]), UvDerivatives::Implicit);
+        let text = sampler("color", 1, &BTreeSet::from([0, 2, 3].map(uniform)), UvDerivatives::Implicit);
         let (derivatives_offset, selection_offset) = (text.find("dFdx"), text.find("array_and_layer.x == 2"));
         assert!(derivatives_offset.is_some() && derivatives_offset < selection_offset, "{text}");
         assert_eq!(sampler("color", 1, &BTreeSet::new(), UvDerivatives::Explicit), "");

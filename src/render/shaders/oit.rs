@@ -70,6 +70,7 @@ mod tests {
         ShaderOptions {
             features: ShaderFeatures { blend_layers: true, oit: true, ..ShaderFeatures::NONE },
             used_materials,
+            image_filter: crate::shaders::ImageFilter { anisotropy: 1.0, blends_levels: false },
             sample_positions: vec![[0.5; 2]; 4],
             sample_resolve: String::new(),
             post_depth_coverage,

@@ -281,6 +281,7 @@ mod tests {
             assert_eq!(features(shadow).defines(), ["SHADOWS", define]);
             let options = ShaderOptions {
                 features: features(shadow),
+                image_filter: crate::shaders::ImageFilter { anisotropy: 1.0, blends_levels: false },
                 used_materials: vec![],
                 sample_positions: vec![],
                 sample_resolve: String::new(),

@@ -67,19 +67,19 @@ fn sample_alpha(image: &LinearImage) -> Vec<f32> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::{TextureArray, TextureRole, mip_levels};
+    use super::super::{TextureRole, mip_levels};
     use super::*;
     use modalcast_model::domain::Texture;
     use modalcast_model::scene::SceneParts;
 
     /// Coverage of each mipmap level, computed from its bytes. `is_preserved`: whether the levels are scaled.
     fn level_coverages(texture: &Texture, cutoff: f32, is_preserved: bool) -> Vec<f32> {
-        let array = TextureArray { width: texture.width(), height: texture.height(), layers: vec![0] };
-        let chain = mip_levels(texture, &array, TextureRole::Color, is_preserved.then_some(cutoff));
+        let chain = mip_levels(texture, TextureRole::Color, is_preserved.then_some(cutoff));
         let coverage_of = |(level, rgba): (usize, &Vec<u8>)| {
             let level_side = |side: u32| (side >> level).max(1);
-            let level_texture = Texture::new("level", level_side(array.width), level_side(array.height), rgba.clone())
-                .expect("a valid texture");
+            let level_texture =
+                Texture::new("level", level_side(texture.width()), level_side(texture.height()), rgba.clone())
+                    .expect("a valid texture");
             coverage(&LinearImage::new(&level_texture, TextureRole::Color), cutoff)
         };
         chain.iter().enumerate().map(coverage_of).collect()

@@ -6,18 +6,16 @@
 //!
 //! w x h is the size of an image, w_t x h_t the size of the array.
 //!
-//! The renderer uses an array per size class (images of equal or similar size), without a scale. For the comparison, a
-//! scene is rebuilt so that the renderer reproduces the thesis's method: images are repeated to the size of the array,
-//! and the corners of every triangle have the coordinates of the equation. The equation wraps the coordinates of each
-//! fragment. Wrapping the coordinates of each triangle is equivalent if no triangle crosses the edge of its image.
+//! The renderer uses an array per size. If there are more sizes than arrays, images of several sizes share an array, and
+//! the shader wraps and filters within each image, so that no image is scaled. For the comparison, a scene is rebuilt so
+//! that the renderer reproduces the thesis's method: images are repeated to the size of the array, and the corners of
+//! every triangle have the coordinates of the equation. The equation wraps the coordinates of each fragment. Wrapping the
+//! coordinates of each triangle is equivalent if no triangle crosses the edge of its image.
 //!
 //! The scale of the equation does not reach the last column and row of an image. [`Packing::CorrectedRepetition`] uses
-//! s = (w / w_t, h / h_t) instead. On the `images` workload, which shows images on panels and on a floor, the error of
-//! the corrected repetition is 3.93 of 255, and the error of size classes is 4.24 (software rendering at 640 x 360).
-//! The workload has seven image sizes. The renderer has six arrays, because the two smallest images, 16 x 16 and
-//! 25 x 15, share an array of 25 x 16 and are stretched to this size. On the panels of these two images, where a texel
-//! covers several pixels, the error of size classes is larger than that of the corrected repetition, by up to 7 of 255.
-//! On the floor, the error of size classes is smaller, by up to 0.5 of 255.
+//! s = (w / w_t, h / h_t) instead. The `images` workload has seven image sizes and the renderer has six arrays, so two
+//! images, 16 x 16 and 25 x 15, share an array. The test `images_in_a_mixed_array_look_as_they_do_alone` compares both
+//! methods with the images alone.
 
 use std::sync::Arc;
 
@@ -30,7 +28,7 @@ use modalcast_model::scene::{Scene, SceneParts};
 /// Packing of images in arrays.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 pub enum Packing {
-    /// An array per size class, as in the renderer.
+    /// An array per size, or a shared one, as in the renderer.
     #[serde(rename = "classes")]
     SizeClasses,
     /// Equation 3.13 as printed: it does not reach the last column and row of an image.
