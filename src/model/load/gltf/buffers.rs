@@ -94,6 +94,16 @@ impl<'a> GltfBuffers<'a> {
         }
     }
 
+    /// The URI of an image, if it is a file that does not exist.
+    ///
+    /// # Errors
+    /// `Invalid` if the URI leaves the folder and, in strict mode, if the file does not exist.
+    pub(super) fn missing_image(&self, index: usize) -> Result<Option<&str>> {
+        let uri = self.document.images[index].uri.as_deref().filter(|uri| !uri.starts_with("data:"));
+        let Some(uri) = uri else { return Ok(None) };
+        Ok((!self.folder.has_referenced_file(&relative_path(uri)?)?).then_some(uri))
+    }
+
     /// Subtracts `bytes` from the budget; call it before allocating them.
     ///
     /// # Errors

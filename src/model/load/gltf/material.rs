@@ -135,10 +135,12 @@ impl<'a> MaterialConverter<'a> {
                 .add(format!("material '{name}': the color texture is ignored: a primitive lacks TEXCOORD_{uv_set}"));
             return Ok(None);
         }
-        self.texture_loader
-            .texture_index(texture, remarks)
-            .map(Some)
-            .map_err(prefix_with("pbrMetallicRoughness.baseColorTexture"))
+        let with_field = prefix_with("pbrMetallicRoughness.baseColorTexture");
+        let stand_in = "the color factor is drawn";
+        if self.texture_loader.is_missing(texture, stand_in, remarks).map_err(&with_field)? {
+            return Ok(None);
+        }
+        self.texture_loader.texture_index(texture, remarks).map(Some).map_err(with_field)
     }
 
     fn load_normal_map(
@@ -160,6 +162,10 @@ impl<'a> MaterialConverter<'a> {
         if let Some(scale) = texture.scale.filter(|scale| *scale != 1.0) {
             remarks.add(format!("material '{name}': the normal map's scale of {scale} is ignored"));
         }
+        let stand_in = "the normals of the mesh are used";
+        if self.texture_loader.is_missing(texture, stand_in, remarks).map_err(prefix_with("normalTexture"))? {
+            return Ok(None);
+        }
         self.texture_loader.texture_index(texture, remarks).map(Some).map_err(prefix_with("normalTexture"))
     }
 
@@ -172,10 +178,12 @@ impl<'a> MaterialConverter<'a> {
     ) -> Result<(f32, f32)> {
         let (metalness, roughness) = (pbr.metallic_factor, pbr.roughness_factor);
         let Some(texture) = &pbr.metallic_roughness_texture else { return Ok((metalness, roughness)) };
-        let channel_means = self
-            .texture_loader
-            .channel_means(texture, remarks)
-            .map_err(prefix_with("pbrMetallicRoughness.metallicRoughnessTexture"))?;
+        let with_field = prefix_with("pbrMetallicRoughness.metallicRoughnessTexture");
+        let stand_in = "the metallic and roughness factors are used";
+        if self.texture_loader.is_missing(texture, stand_in, remarks).map_err(&with_field)? {
+            return Ok((metalness, roughness));
+        }
+        let channel_means = self.texture_loader.channel_means(texture, remarks).map_err(with_field)?;
         remarks.add(format!("material '{name}': only the mean of the metallic-roughness texture is used"));
         let [_, green, blue, _] = channel_means;
         Ok((metalness * blue, roughness * green))

@@ -42,6 +42,25 @@ impl<'a> TextureLoader<'a> {
         Ok(self.textures.len() - 1)
     }
 
+    /// Whether the image of a texture is a file that does not exist. Adds a remark that ends with `stand_in`.
+    ///
+    /// # Errors
+    /// `Invalid` if the texture does not exist and, in strict mode, if its image does not.
+    pub(super) fn is_missing(
+        &self,
+        texture_info: &TextureInfo,
+        stand_in: &str,
+        remarks: &mut ImportRemarks,
+    ) -> Result<bool> {
+        let image = self.image_index_of(texture_info, remarks)?;
+        let missing_uri = self.buffers.missing_image(image);
+        let missing_uri = missing_uri.map_err(|error| error.prefix_field(&format!("images[{image}]")))?;
+        if let Some(uri) = missing_uri {
+            remarks.add(format!("image '{}' does not exist: {stand_in}", sanitize(uri, 120)));
+        }
+        Ok(missing_uri.is_some())
+    }
+
     /// The mean of each of the four channels, 0 to 1. The texture is not added to `textures`.
     ///
     /// # Errors

@@ -247,7 +247,7 @@ mod tests {
 
     #[test]
     fn comments_continuations_and_names_with_spaces_are_parsed() {
-        // The third vertex has a color, which is ignored. The material `none` has no face.
+        // The third vertex has a color. The material `none` has no face.
         let text = "# head\r\nmtllib my file.mtl\r\nv 0 0 0 # first\r\nv 1 \\\r\n 0 0\r\nv 0 1 0 1 0 0\r\n\
                     usemtl dark bark\r\nf 1 2 \\\n 3\r\nl 1 2\r\nusemtl none\nusemtl light\nf 3 2 1 # back\n";
         let obj = ObjFile::parse(text.as_bytes()).expect("a valid file");
@@ -275,6 +275,9 @@ mod tests {
             ("v 1 nan 2\nf 1 2 3", "line 4: v: expected three finite numbers, got nan"),
             ("v 1 1e39 2\nf 1 2 3", "line 4: v: expected three finite numbers, got 1e39"),
             ("v 1 2\nf 1 2 3", "line 4: v: expected three finite numbers, got the end of the line"),
+            ("v 1 2 3 0 nan 0\nf 1 2 3", "line 4: v: color: expected three finite numbers, got nan"),
+            ("v 1 2 3 0 0 300\nf 1 2 3", "line 4: v: color: expected 0 to 1, or 0 to 255, got [0.0, 0.0, 300.0]"),
+            ("v 1 2 3 0 -1 0\nf 1 2 3", "line 4: v: color: expected 0 to 1, or 0 to 255, got [0.0, -1.0, 0.0]"),
             ("vt\nf 1 2 3", "line 4: vt: expected one to three finite numbers, got the end of the line"),
             ("vn 0 0 x\nf 1 2 3", "line 4: vn: expected three finite numbers, got x"),
             ("", "f: expected at least one face, got 0"),

@@ -131,7 +131,6 @@ fn invalid_references_and_types_are_rejected_by_field() {
         ("/images/0/bufferView", json!(null), "images[0]: uri"),
         ("/images/0/uri", json!("../secret.png"), "images[0]: uri"),
         ("/images/0/uri", json!("file:///x"), "images[0]: uri"),
-        ("/images/0/uri", json!("absent-from-this-folder.png"), "images[0]: file 'absent-from-this-folder.png'"),
         ("/buffers/0/uri", json!("../secret.bin"), "buffers[0]: uri"),
         ("/buffers/0/uri", json!("/etc/hostname"), "buffers[0]: uri"),
         ("/buffers/0/uri", json!("data:text/plain,abc"), "buffers[0]: uri"),

@@ -37,6 +37,30 @@ fn read_material(source: Value) -> Material {
 }
 
 #[test]
+fn missing_images_are_remarks_and_errors_in_strict_mode() {
+    let texture = json!({"index": 0});
+    let pbr = json!({
+        "baseColorFactor": [0.5, 0.25, 0.125, 1.0], "baseColorTexture": texture, "metallicRoughnessTexture": texture,
+        "metallicFactor": 0.0
+    });
+    let mut model = textured_triangle(json!({"pbrMetallicRoughness": pbr, "normalTexture": texture}));
+    model.json["images"] = json!([{"uri": "absent.png"}]);
+    let parts = model.parts();
+    let material = &parts.materials[0];
+    assert_eq!((material.diffuse, material.color_texture, material.normal_texture), ([0.5, 0.25, 0.125], None, None));
+    for stand_in in ["the color factor is drawn", "the normals of the mesh are used", "factors are used"] {
+        let is_remark =
+            |remark: &String| remark.starts_with("image 'absent.png' does not exist: ") && remark.ends_with(stand_in);
+        assert!(parts.remarks.iter().any(is_remark), "expected {stand_in} in {:?}", parts.remarks);
+    }
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let files = crate::load::asset_dir::AssetDir::unrestricted(folder.path()).strict();
+    let message =
+        crate::load::gltf::parse(&files, "model", &model.to_glb()).map(drop).expect_err("strict mode").to_string();
+    assert!(message.ends_with("file 'absent.png': expected an existing file, got none (strict mode)"), "{message}");
+}
+
+#[test]
 fn metalness_and_roughness_become_phong_parameters() {
     let material_with_factors = |metalness: f32, roughness: f32| {
         let pbr = json!({
