@@ -1,6 +1,6 @@
 //! The command line of `modalcast-fetch`.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use modalcast_client::{Camera, Delivery, FrameFormat, Lens, Output, Picture, StepSelector, View};
@@ -89,9 +89,10 @@ pub(crate) struct PictureOptions {
     /// fits the color map to each frame.
     #[arg(long = "largest", value_name = "VALUE", requires = "outputs", default_value_t = 0.0)]
     scale_max: f64,
-    /// Encoding of color pictures and color maps: PNG, JPEG, or raw RGBA8 (top row first, sRGB).
-    #[arg(long, value_enum, default_value = "png")]
-    pub(crate) format: FormatOption,
+    /// Encoding of color pictures and color maps: PNG, JPEG, or raw RGBA8 (top row first, sRGB). Default: that of the
+    /// extension of a single file (.jpg, .jpeg or .rgba), else PNG.
+    #[arg(long, value_enum)]
+    pub(crate) format: Option<FormatOption>,
     /// Quality of JPEG, 1 (smallest file) to 100 (smallest error). Default: 90. Ignored by other formats.
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..=100))]
     quality: Option<u32>,
@@ -129,7 +130,21 @@ pub(crate) enum OutputOption {
 impl PictureOptions {
     /// One picture per output.
     pub(crate) fn pictures(&self) -> Vec<Picture> {
-        self.outputs.iter().map(|output| self.picture(*output)).collect()
+        self.pictures_in(self.format.unwrap_or(FormatOption::Png))
+    }
+
+    /// One picture per output, for a single file. Its extension selects the encoding unless `--format` does.
+    pub(crate) fn pictures_for_file(&self, path: &Path) -> Vec<Picture> {
+        let extension = path.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
+        self.pictures_in(self.format.unwrap_or(match extension.as_str() {
+            "jpg" | "jpeg" => FormatOption::Jpeg,
+            "rgba" => FormatOption::Raw,
+            _ => FormatOption::Png,
+        }))
+    }
+
+    fn pictures_in(&self, format: FormatOption) -> Vec<Picture> {
+        self.outputs.iter().map(|output| self.picture(*output, format)).collect()
     }
 
     /// The end of the file name of each picture: empty for a single picture, else `_` and the name of its output.
@@ -141,11 +156,11 @@ impl PictureOptions {
         self.outputs.iter().map(suffix).collect()
     }
 
-    fn picture(&self, output: OutputOption) -> Picture {
+    fn picture(&self, output: OutputOption, format: FormatOption) -> Picture {
         let view = self.eye.zip(self.target).map(|(eye, target)| View::LookAt { eye, target, up: self.up });
         let camera =
             view.map(|view| Camera { view, lens: Lens::FieldOfView(self.field_of_view.unwrap_or(35.0)), clip: None });
-        let format = match self.format {
+        let format = match format {
             FormatOption::Png => FrameFormat::Png,
             FormatOption::Jpeg => FrameFormat::Jpeg,
             FormatOption::Raw => FrameFormat::Rgba,
@@ -330,6 +345,15 @@ mod tests {
         let expected = [Output::Color, Output::ModeShape { mode: 2, scale_max: 0.0 }];
         assert!(outputs.eq(expected.map(|output| (FrameFormat::Jpeg, output))));
         assert_eq!(picture_options(&["--format", "jpeg", "--quality", "35"]).pictures()[0].jpeg_quality, 35);
+        for (arguments, file, format) in [
+            (&[][..], "x.jpg", FrameFormat::Jpeg),
+            (&[], "x.y.JPEG", FrameFormat::Jpeg),
+            (&[], "x.rgba", FrameFormat::Rgba),
+            (&[], "x", FrameFormat::Png),
+            (&["--format", "png"], "x.jpg", FrameFormat::Png),
+        ] {
+            assert_eq!(picture_options(arguments).pictures_for_file(Path::new(file))[0].format, format, "{file}");
+        }
     }
 
     #[test]

@@ -36,7 +36,7 @@ pub(crate) async fn fetch_stream(client: &Client, options: &FrameStreamOptions, 
 /// Saves one frame per output, all of the same step.
 pub(crate) async fn fetch_single(client: &Client, options: &SingleFrameOptions, as_json: bool) -> Result<()> {
     let scene = open_scene(client, &options.scene).await?;
-    let request = FramesRequest::new(&scene, options.picture.pictures());
+    let request = FramesRequest::new(&scene, options.picture.pictures_for_file(&options.out));
     let request = request.step(options.step.selector()).deadline_ms(options.step.deadline_ms);
     let mut summary = Summary::new();
     for (frame, suffix) in client.render_frames(&request).await?.iter().zip(options.picture.file_suffixes()) {
