@@ -89,7 +89,8 @@ pub struct Rejection {
     pub step: ::core::option::Option<u64>,
     #[prost(enumeration = "Reason", tag = "2")]
     pub reason: i32,
-    /// Path of the invalid field in the request, such as "step.q_domains\[1\]"; empty if no field is invalid.
+    /// Path of the invalid field in the message, such as "step.q_domains\[1\]" or "open.delivery"; empty if no field is
+    /// invalid.
     #[prost(string, tag = "3")]
     pub field: ::prost::alloc::string::String,
     /// The expected value, range or condition.
@@ -810,7 +811,8 @@ pub mod scene_service_client {
     /// (SceneInfo.origin, ATTRIBUTE_ORIGINS, STATE_CONTENT_ORIGINS), depths (OUTPUT_DEPTH, Hit.depth), and the values of
     /// color maps (Picture.largest). Positions and transforms are relative to the scene's origin unless a comment names
     /// another one. A transform is a row-major 3x4 matrix whose last column is the translation in scene units; `a_from_b`
-    /// maps coordinates in frame b to coordinates in frame a.
+    /// maps coordinates in frame b to coordinates in frame a. A vertex is at x = T (x0 + U q), where T is the transform
+    /// world_from_domain.
     #[derive(Debug, Clone)]
     pub struct SceneServiceClient<T> {
         inner: tonic::client::Grpc<T>,
@@ -918,7 +920,8 @@ pub mod scene_service_client {
         }
         /// Uploads files and opens them as a scene. The parts are one `header`, then for each file one `file` and its
         /// `chunk`s. Waiting for the client consumes a time budget of 30 s. Every 32 KiB that the client sends adds 1 s to the
-        /// budget, which never exceeds 30 s. The call fails with DEADLINE_EXCEEDED when the budget is used up.
+        /// budget, which never exceeds 30 s. The call fails with DEADLINE_EXCEEDED when the budget is used up. The scene opens
+        /// when the client has closed its side of the stream. If the call fails or breaks off before, nothing remains of it.
         pub async fn upload_scene(
             &mut self,
             request: impl tonic::IntoStreamingRequest<
@@ -946,8 +949,8 @@ pub mod scene_service_client {
             self.inner.client_streaming(req, path, codec).await
         }
         /// Uploads meshes and modes as arrays, without files, and opens them as a scene. The parts are one `header`, then for
-        /// each domain one `domain` and its `chunk`s. The time budget is that of UploadScene. The scene survives a restart of
-        /// the server like uploaded files. Errors name the domain by its index i in the stream: `domains[i].rank`.
+        /// each domain one `domain` and its `chunk`s. Time budget and end are those of UploadScene. The scene survives a
+        /// restart of the server like uploaded files. Errors name the domain by its index i in the stream: `domains[i].rank`.
         pub async fn upload_arrays(
             &mut self,
             request: impl tonic::IntoStreamingRequest<
@@ -1025,7 +1028,7 @@ pub mod scene_service_client {
                 .insert(GrpcMethod::new("modalcast.v1.SceneService", "ListScenes"));
             self.inner.unary(req, path, codec).await
         }
-        /// Closes a scene and ends its streams. Removes the files of an uploaded scene.
+        /// Closes a scene and ends its streams with REASON_SCENE_NOT_FOUND. Removes the files of an uploaded scene.
         pub async fn delete_scene(
             &mut self,
             request: impl tonic::IntoRequest<super::DeleteSceneRequest>,
@@ -1152,7 +1155,8 @@ pub mod scene_service_server {
         >;
         /// Uploads files and opens them as a scene. The parts are one `header`, then for each file one `file` and its
         /// `chunk`s. Waiting for the client consumes a time budget of 30 s. Every 32 KiB that the client sends adds 1 s to the
-        /// budget, which never exceeds 30 s. The call fails with DEADLINE_EXCEEDED when the budget is used up.
+        /// budget, which never exceeds 30 s. The call fails with DEADLINE_EXCEEDED when the budget is used up. The scene opens
+        /// when the client has closed its side of the stream. If the call fails or breaks off before, nothing remains of it.
         async fn upload_scene(
             &self,
             request: tonic::Request<tonic::Streaming<super::UploadSceneRequest>>,
@@ -1161,8 +1165,8 @@ pub mod scene_service_server {
             tonic::Status,
         >;
         /// Uploads meshes and modes as arrays, without files, and opens them as a scene. The parts are one `header`, then for
-        /// each domain one `domain` and its `chunk`s. The time budget is that of UploadScene. The scene survives a restart of
-        /// the server like uploaded files. Errors name the domain by its index i in the stream: `domains[i].rank`.
+        /// each domain one `domain` and its `chunk`s. Time budget and end are those of UploadScene. The scene survives a
+        /// restart of the server like uploaded files. Errors name the domain by its index i in the stream: `domains[i].rank`.
         async fn upload_arrays(
             &self,
             request: tonic::Request<tonic::Streaming<super::UploadArraysRequest>>,
@@ -1185,7 +1189,7 @@ pub mod scene_service_server {
             tonic::Response<super::ListScenesResponse>,
             tonic::Status,
         >;
-        /// Closes a scene and ends its streams. Removes the files of an uploaded scene.
+        /// Closes a scene and ends its streams with REASON_SCENE_NOT_FOUND. Removes the files of an uploaded scene.
         async fn delete_scene(
             &self,
             request: tonic::Request<super::DeleteSceneRequest>,
@@ -1243,7 +1247,8 @@ pub mod scene_service_server {
     /// (SceneInfo.origin, ATTRIBUTE_ORIGINS, STATE_CONTENT_ORIGINS), depths (OUTPUT_DEPTH, Hit.depth), and the values of
     /// color maps (Picture.largest). Positions and transforms are relative to the scene's origin unless a comment names
     /// another one. A transform is a row-major 3x4 matrix whose last column is the translation in scene units; `a_from_b`
-    /// maps coordinates in frame b to coordinates in frame a.
+    /// maps coordinates in frame b to coordinates in frame a. A vertex is at x = T (x0 + U q), where T is the transform
+    /// world_from_domain.
     #[derive(Debug)]
     pub struct SceneServiceServer<T> {
         inner: Arc<T>,
@@ -1800,14 +1805,17 @@ pub struct OpenDrive {
     /// What happens to a lossless step when the window is full; ignored with DELIVERY_LATEST.
     #[prost(enumeration = "Overflow", tag = "3")]
     pub overflow: i32,
-    /// Number of steps that may be unacknowledged, at most Limits.window; 0: the server's default.
+    /// Number of steps that may be unacknowledged; 0: the server's default. A number above Limits.window means
+    /// Limits.window.
     #[prost(uint32, tag = "4")]
     pub window: u32,
     /// A token of 16 to 64 bytes that the client keeps. A stream with the token of the present writer replaces that writer
-    /// at once, for example after a crash of the client or of its connection. Empty: the server creates a token.
+    /// at once, for example after a crash of the client or of its connection, and begins a new run. The replaced stream
+    /// ends with REASON_LEASE_LOST. Empty: the server creates a token (Opened.lease_token).
     #[prost(bytes = "bytes", tag = "5")]
     pub lease_token: ::prost::bytes::Bytes,
-    /// Replaces the present writer even if its token is another one. Its stream ends with REASON_LEASE_LOST.
+    /// Replaces the present writer even if its token is another one. Without this, such a writer keeps the lease
+    /// (REASON_WRITER_LEASE_TAKEN).
     #[prost(bool, tag = "6")]
     pub take_over: bool,
     #[prost(enumeration = "InitialState", tag = "7")]
@@ -1816,7 +1824,8 @@ pub struct OpenDrive {
 /// One step. It is applied completely or not at all. Values that are not sent remain unchanged.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct Step {
-    /// Step number; must increase within the stream.
+    /// Step number; must be larger than that of the last accepted step of the stream. The number of a rejected step may be
+    /// sent again. The first step of a stream may have any number.
     #[prost(uint64, tag = "1")]
     pub number: u64,
     /// Simulation time in seconds; finite.
@@ -1870,16 +1879,21 @@ pub struct Opened {
     pub overflow: i32,
     #[prost(uint32, tag = "4")]
     pub window: u32,
+    /// The token of the request, or the one that the server has created.
     #[prost(bytes = "bytes", tag = "5")]
     pub lease_token: ::prost::bytes::Bytes,
     #[prost(enumeration = "InitialState", tag = "6")]
     pub initial_state: i32,
+    /// SceneInfo.last_step is the last step before this run.
     #[prost(message, optional, tag = "7")]
     pub scene: ::core::option::Option<SceneInfo>,
 }
+/// The last accepted step is always acknowledged. Earlier steps may have no acknowledgment of their own.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct Acknowledgement {
-    /// All steps up to this one are completed or, with DELIVERY_LATEST, merged into a newer one.
+    /// All accepted steps up to this one are completed or, with DELIVERY_LATEST, merged into a newer one. The server
+    /// writes the newest state to disk in the background, about ten times per second. A crash of the server loses the
+    /// steps after the last write; SceneInfo.last_step then names an earlier step.
     #[prost(uint64, tag = "1")]
     pub step: u64,
     /// Number of steps that were merged into a newer one since the stream began.
@@ -1929,7 +1943,7 @@ pub enum InitialState {
     Unspecified = 0,
     /// The current state.
     Keep = 1,
-    /// The rest state.
+    /// The rest state. The current state remains the old one until the first step.
     Reset = 2,
 }
 impl InitialState {
@@ -2093,8 +2107,15 @@ pub mod step_service_client {
             self
         }
         /// The first message must be `open`, which acquires the writer lease of the scene. A scene has one writer at a time.
-        /// Invalid input is answered with a Rejection on the stream, and the stream remains open. An acknowledgment also
-        /// covers all earlier steps. A connection may have Limits.drives of these streams open.
+        /// The reply to `open` is `opened`, or a rejection, after which the client may send another `open`. Invalid input is
+        /// answered with a Rejection on the stream, and the stream remains open.
+        ///
+        /// The lease ends with the stream. A client that has no more steps closes its side of the stream. The server then
+        /// completes the accepted steps, sends the remaining replies and ends the stream with OK. If the stream is cancelled
+        /// or its connection breaks, accepted steps without an acknowledgment may be lost. A connection that does not answer
+        /// HTTP/2 pings is closed after 15 s; until then, a new writer needs the token of the lease or `take_over`.
+        ///
+        /// A connection may have Limits.drives of these streams open (REASON_LIMIT_REACHED).
         pub async fn drive_scene(
             &mut self,
             request: impl tonic::IntoStreamingRequest<Message = super::DriveSceneRequest>,
@@ -2141,8 +2162,15 @@ pub mod step_service_server {
             + std::marker::Send
             + 'static;
         /// The first message must be `open`, which acquires the writer lease of the scene. A scene has one writer at a time.
-        /// Invalid input is answered with a Rejection on the stream, and the stream remains open. An acknowledgment also
-        /// covers all earlier steps. A connection may have Limits.drives of these streams open.
+        /// The reply to `open` is `opened`, or a rejection, after which the client may send another `open`. Invalid input is
+        /// answered with a Rejection on the stream, and the stream remains open.
+        ///
+        /// The lease ends with the stream. A client that has no more steps closes its side of the stream. The server then
+        /// completes the accepted steps, sends the remaining replies and ends the stream with OK. If the stream is cancelled
+        /// or its connection breaks, accepted steps without an acknowledgment may be lost. A connection that does not answer
+        /// HTTP/2 pings is closed after 15 s; until then, a new writer needs the token of the lease or `take_over`.
+        ///
+        /// A connection may have Limits.drives of these streams open (REASON_LIMIT_REACHED).
         async fn drive_scene(
             &self,
             request: tonic::Request<tonic::Streaming<super::DriveSceneRequest>>,
@@ -2518,6 +2546,7 @@ pub struct UpdateFrameStreamResponse {
     #[prost(uint64, tag = "1")]
     pub camera_version: u64,
 }
+/// A part of an encoded frame, in the order of the offsets.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct FrameChunk {
     /// Set on the first chunk of a frame only.
@@ -2526,6 +2555,7 @@ pub struct FrameChunk {
     /// Offset of `data` in the frame, in bytes.
     #[prost(uint64, tag = "2")]
     pub offset: u64,
+    /// At most 1 MiB.
     #[prost(bytes = "bytes", tag = "3")]
     pub data: ::prost::bytes::Bytes,
 }
@@ -3472,6 +3502,7 @@ pub struct VertexLayout {
     #[prost(bool, tag = "4")]
     pub has_more: bool,
 }
+/// A part of the bytes of a step, in the order of the offsets.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct VertexChunk {
     /// Set on the first chunk of a step only.
@@ -3480,6 +3511,7 @@ pub struct VertexChunk {
     /// Offset of `data` in the bytes of this step.
     #[prost(uint64, tag = "2")]
     pub offset: u64,
+    /// At most 1 MiB.
     #[prost(bytes = "bytes", tag = "3")]
     pub data: ::prost::bytes::Bytes,
 }
@@ -3513,6 +3545,7 @@ pub struct VertexSection {
 }
 /// An attribute of the vertices. Its vectors are stored for all selected domains one after the other. A vertex v of a
 /// domain has rows 3v, 3v + 1 and 3v + 2 of U; a corner is a vertex with its normal and texture coordinates (see Array).
+/// A client ignores sections with attributes that it does not know.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
 #[repr(i32)]
 pub enum Attribute {
@@ -3531,7 +3564,7 @@ pub enum Attribute {
     Boxes = 4,
     /// 3 f64 in meters: the world position of the origin of all positions, or 3 f64 per selected domain if the origins
     /// differ. It is SceneInfo.origin until a step with f64 translations moves domains far from that origin; then it
-    /// follows the domains. Sent without being selected: in the first step of a reply and whenever it has changed.
+    /// follows the domains. Cannot be selected: it is sent in the first step of a reply and whenever it has changed.
     Origins = 5,
 }
 impl Attribute {
