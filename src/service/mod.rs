@@ -156,7 +156,7 @@ fn routes(engine: &Engine, config: &Config) -> Result<Routes> {
             .register_encoded_file_descriptor_set(v1::DESCRIPTORS)
             .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
     };
-    Ok(Routes::default()
+    Ok(Routes::new(config.message_bytes)
         .with(reflection().build_v1().map_err(fault_in("reflection"))?)
         .with(reflection().build_v1alpha().map_err(fault_in("reflection"))?)
         .with(with_limits!(ServerServiceServer::new(info::ServerServiceImpl(engine.clone()))))

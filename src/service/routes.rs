@@ -5,23 +5,31 @@ use std::convert::Infallible;
 use std::sync::Arc;
 use std::task::{Context, Poll};
 
-use tonic::Status;
 use tonic::body::Body;
 use tonic::codegen::http::{Request, Response};
 use tonic::codegen::{BoxFuture, Service};
 use tonic::server::NamedService;
+use tonic::{Code, Status};
+
+use super::status::transport_status;
 
 use super::reply_body::replace_body;
 
 type Route = Arc<dyn Fn(Request<Body>) -> BoxFuture<Response<Body>, Infallible> + Send + Sync>;
 
 /// All services of the server.
-#[derive(Clone, Default)]
+#[derive(Clone)]
 pub(super) struct Routes {
     by_name: Arc<BTreeMap<&'static str, Route>>,
+    max_message_bytes: usize,
 }
 
 impl Routes {
+    /// `max_message_bytes` is the limit on the messages that the services accept.
+    pub(super) fn new(max_message_bytes: usize) -> Self {
+        Self { by_name: Arc::default(), max_message_bytes }
+    }
+
     /// Adds a service.
     pub(super) fn with<S>(self, service: S) -> Self
     where
@@ -35,7 +43,15 @@ impl Routes {
             Box::pin(async move { call.await.map(replace_body) })
         });
         by_name.insert(S::NAME, route);
-        Self { by_name: Arc::new(by_name) }
+        Self { by_name: Arc::new(by_name), ..self }
+    }
+}
+
+/// Tonic answers a call whose only request message is too large by itself. The answer gets the details of other errors.
+fn with_transport_details(response: Response<Body>, max_message_bytes: usize) -> Response<Body> {
+    match Status::from_header_map(response.headers()) {
+        Some(status) if status.code() == Code::OutOfRange => transport_status(status, max_message_bytes).into_http(),
+        _ => response,
     }
 }
 
@@ -51,7 +67,10 @@ impl Service<Request<Body>> for Routes {
     fn call(&mut self, request: Request<Body>) -> Self::Future {
         let name = request.uri().path().split('/').nth(1).unwrap_or_default();
         match self.by_name.get(name) {
-            Some(route) => route(request),
+            Some(route) => {
+                let (response, max_message_bytes) = (route(request), self.max_message_bytes);
+                Box::pin(async move { Ok(with_transport_details(response.await?, max_message_bytes)) })
+            }
             None => Box::pin(async {
                 Ok(Status::unimplemented("expected the path of a service of this server").into_http())
             }),

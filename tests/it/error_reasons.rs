@@ -75,6 +75,8 @@ async fn errors_of_calls() -> Vec<(Code, Reason, Status)> {
     writer.send_step(step(6, &[0], &vec![0.0; 20_000])).await;
     let too_large = with_timeout(writer.replies.message()).await.expect_err("expected an error");
     errors.push((Code::ResourceExhausted, Reason::MessageTooLarge, too_large));
+    let too_large_request = vertex_error(&server, vertex_request(&"x".repeat(65 << 10))).await;
+    errors.push((Code::ResourceExhausted, Reason::MessageTooLarge, too_large_request));
     let channel = server.channel().await;
     server.engine.shutdown().await;
     let mut client = v1::vertex_service_client::VertexServiceClient::new(channel);
