@@ -304,6 +304,9 @@ async fn subscribers_of_different_attributes_get_every_step() {
 #[tokio::test(flavor = "multi_thread")]
 async fn disabled_and_repeated_attributes_are_rejected() {
     let server = Server::start_default().await;
+    let normals_in_boxes =
+        v1::SelectedAttribute { attribute: v1::Attribute::Normals.into(), encoding: v1::Encoding::U16Box.into() };
+    let normals_in_boxes = Some(v1::VertexSelection { domains: Vec::new(), attributes: vec![normals_in_boxes] });
     // This scene enables neither displacements nor boxes.
     server.open("strips").await;
     for (selection, field, expected) in [
@@ -315,6 +318,8 @@ async fn disabled_and_repeated_attributes_are_rejected() {
         ),
         (select(&[], &[v1::Attribute::Unspecified]), "attributes[0].attribute", "an attribute of this version"),
         (select(&[], &[v1::Attribute::Positions; 2]), "attributes[1]", "each attribute once"),
+        (select(&[], &[v1::Attribute::Origins]), "attributes[0].attribute", "an attribute that can be selected"),
+        (normals_in_boxes, "attributes[0].encoding", "ENCODING_OCTAHEDRAL_I16 for ATTRIBUTE_NORMALS"),
     ] {
         let selection = selection.expect("expected a selection");
         let error = get_vertices(&server, vertex_request("strips", selection.clone()))

@@ -21,7 +21,7 @@ pub enum Attribute {
 
 impl Attribute {
     /// The encodings that the attribute may have.
-    const fn encodings(self) -> &'static [Encoding] {
+    pub const fn encodings(self) -> &'static [Encoding] {
         match self {
             Self::Positions | Self::Displacements => &[Encoding::F32, Encoding::F16, Encoding::U16Box],
             Self::Normals => &[Encoding::F32, Encoding::F16, Encoding::OctahedralI16],

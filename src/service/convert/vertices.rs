@@ -18,15 +18,29 @@ pub(crate) fn parse_vertex_selection(
         .iter()
         .enumerate()
         .map(|(index, selected)| {
-            let field = |name: &str| format!("selection.attributes[{index}].{name}");
-            let attribute = parse_attribute(selected.attribute)
-                .ok_or_else(|| invalid(field("attribute"), "an attribute of this version", selected.attribute))?;
-            let encoding = parse_encoding(selected.encoding)
-                .ok_or_else(|| invalid(field("encoding"), "an encoding of this version", selected.encoding))?;
-            Ok((attribute, encoding))
+            parse_selected(*selected).map_err(|error| error.in_message(&format!("selection.attributes[{index}]")))
         })
         .collect::<Result<_>>()?;
     VertexSelection::new(scene, domains, attributes).map(Arc::new)
+}
+
+/// Parses a selected attribute. Errors name attributes and encodings as the contract does.
+fn parse_selected(selected: v1::SelectedAttribute) -> Result<(Attribute, Encoding)> {
+    let attribute = match parse_attribute(selected.attribute) {
+        Some(Attribute::Origins) => {
+            return Err(invalid("attribute", "an attribute that can be selected", selected.attribute().as_str_name()));
+        }
+        Some(attribute) => attribute,
+        None => return Err(invalid("attribute", "an attribute of this version", selected.attribute)),
+    };
+    let encoding = parse_encoding(selected.encoding)
+        .ok_or_else(|| invalid("encoding", "an encoding of this version", selected.encoding))?;
+    if attribute.encodings().contains(&encoding) {
+        return Ok((attribute, encoding));
+    }
+    let names: Vec<_> = attribute.encodings().iter().map(|encoding| wire_encoding(*encoding).as_str_name()).collect();
+    let expected = format!("{} for {}", names.join(", "), selected.attribute().as_str_name());
+    Err(invalid("encoding", expected, selected.encoding().as_str_name()))
 }
 
 fn parse_attribute(number: i32) -> Option<Attribute> {
@@ -61,19 +75,22 @@ pub(crate) fn wire_sections(sections: &[Section]) -> Vec<v1::VertexSection> {
             Attribute::Boxes => v1::Attribute::Boxes,
             Attribute::Origins => v1::Attribute::Origins,
         };
-        let encoding = match section.encoding {
-            Encoding::F32 => v1::Encoding::F32,
-            Encoding::F16 => v1::Encoding::F16,
-            Encoding::U16Box => v1::Encoding::U16Box,
-            Encoding::OctahedralI16 => v1::Encoding::OctahedralI16,
-            Encoding::F64 => v1::Encoding::F64,
-        };
         v1::VertexSection {
             attribute: attribute.into(),
-            encoding: encoding.into(),
+            encoding: wire_encoding(section.encoding).into(),
             offset: section.offset,
             bytes: section.bytes,
         }
     };
     sections.iter().map(wire_section).collect()
+}
+
+const fn wire_encoding(encoding: Encoding) -> v1::Encoding {
+    match encoding {
+        Encoding::F32 => v1::Encoding::F32,
+        Encoding::F16 => v1::Encoding::F16,
+        Encoding::U16Box => v1::Encoding::U16Box,
+        Encoding::OctahedralI16 => v1::Encoding::OctahedralI16,
+        Encoding::F64 => v1::Encoding::F64,
+    }
 }
