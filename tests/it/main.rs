@@ -2,6 +2,7 @@
 
 mod array_uploads;
 mod attribute_streams;
+mod broken_streams;
 #[path = "../common/mod.rs"]
 mod common;
 mod cpu_checks;
@@ -17,6 +18,7 @@ mod import_cycles;
 mod invalid_input;
 mod layering;
 mod light;
+mod message_streams;
 mod moved_cameras;
 mod normals;
 mod picks;
@@ -27,6 +29,7 @@ mod real;
 mod restart;
 #[path = "../gpu/scenes.rs"]
 mod scenes;
+mod server_process;
 mod service;
 mod service_faults;
 mod service_files;
