@@ -118,6 +118,15 @@ fn case_lines(case: &CaseReport) -> Vec<String> {
             .iter()
             .map(|row| line(format!("{:<26}{:>10} bytes, {:.2} ms", row.encoder, row.bytes, row.ms)))
             .collect(),
+        CaseResult::Afternoon(comparison) => comparison
+            .variants
+            .iter()
+            .map(|variant| {
+                let (name, fraction) = (&variant.name, variant.server_of_program);
+                let (server, program) = (variant.server_per_second, variant.per_second);
+                line(format!("{server:>9.1} /s  {fraction:.2} of {name} of the program, {program:.1} /s"))
+            })
+            .collect(),
     }
 }
 

@@ -34,6 +34,8 @@ pub(super) enum Measurement {
     Delay(DelayedStream),
     VertexEncodings,
     PictureEncodings(Content),
+    /// Rates beside those of a Python program, with pictures of this width and height.
+    Afternoon([u32; 2]),
 }
 
 /// The contents that several cases have.
@@ -42,6 +44,7 @@ struct Contents {
     png_720p: Content,
     png_360p: Content,
     raw_1080p: Content,
+    size_1080p: [u32; 2],
 }
 
 impl Contents {
@@ -56,6 +59,7 @@ impl Contents {
             png_720p: png(1280, 720),
             png_360p: png(640, 360),
             raw_1080p: Content::Rgba { width: 1920 / divisor, height: 1080 / divisor },
+            size_1080p: [1920 / divisor, 1080 / divisor],
         }
     }
 }
@@ -102,6 +106,7 @@ fn tree_cases(contents: &Contents, size: Size) -> Vec<Case> {
         ("tree-delay-png-1080p", delayed_replies(contents.png_1080p)),
         ("tree-vertex-encodings", Measurement::VertexEncodings),
         ("tree-picture-encodings", Measurement::PictureEncodings(contents.raw_1080p)),
+        ("tree-afternoon", Measurement::Afternoon(contents.size_1080p)),
     ];
     cases.map(|(name, measurement)| Case { name, scene: SceneSource::Tree, measurement }).into()
 }
@@ -119,6 +124,7 @@ fn repository_cases(contents: &Contents, size: Size) -> Vec<Case> {
         ("almond-latency", ALMOND, Measurement::FrameLatency(contents.png_1080p, frames)),
         ("almond-vertex-encodings", ALMOND, Measurement::VertexEncodings),
         ("almond-picture-encodings", ALMOND, Measurement::PictureEncodings(contents.raw_1080p)),
+        ("almond-afternoon", ALMOND, Measurement::Afternoon(contents.size_1080p)),
         ("bridge-png-720p", BRIDGE, rate(contents.png_720p)),
         ("bridge-vertices", BRIDGE, rate(Content::Positions)),
         ("bridge-steps", BRIDGE, Measurement::Rate(None)),
@@ -141,8 +147,12 @@ pub(crate) const CASE_HELP: &str = "Cases:
                  rates over a connection with a round trip of 50 ms
   tree-vertex-encodings, tree-picture-encodings
                  bytes, times and errors of encodings
+  tree-afternoon
+                 rates beside those of a Python program that draws the same scene (needs moderngl, pyzmq,
+                 opencv-python-headless and numpy in MODALCAST_PYTHON; uses cupy on a GPU)
   almond-*, bridge-*
-                 scenes of --scenes: png, vertices, steps, and of the almond also latency and encodings";
+                 scenes of --scenes: png, vertices, steps, and of the almond also latency, encodings
+                 and the Python program";
 
 #[cfg(test)]
 mod tests {

@@ -1,5 +1,6 @@
 //! Formats a report as Markdown (`report.md`): one table for each kind of measurement.
 
+use super::afternoon::AfternoonComparison;
 use super::delay::DelayResult;
 use super::latency::LatencyResult;
 use super::peers::socket::SocketComparison;
@@ -42,6 +43,7 @@ pub(super) fn markdown(report: &StreamReport) -> String {
     text.push_str(&latency_section(report));
     text.push_str(&socket_section(report));
     text.push_str(&delay_section(report));
+    text.push_str(&afternoon_section(report));
     text.push_str(&encoding_sections(report));
     text.push_str(&scene_section(report));
     text
@@ -197,6 +199,42 @@ fn delay_section(report: &StreamReport) -> String {
     let head = ["case", "content", "bytes", "direct /s", "proxy, 0 ms /s", "proxy, 50 ms /s", "50 ms / 0 ms"];
     let note = "A proxy in its own process delays each direction by 25 ms and does not limit the rate otherwise.";
     section("Round trip of 50 ms", note, &head, delays.iter().map(row).collect())
+}
+
+fn afternoon_section(report: &StreamReport) -> String {
+    let comparisons = select(report, |result| match result {
+        CaseResult::Afternoon(comparison) => Some(comparison),
+        _ => None,
+    });
+    let rows = comparisons.iter().flat_map(|(case, comparison): &(&CaseReport, &AfternoonComparison)| {
+        comparison.variants.iter().map(|variant| {
+            vec![
+                case.name.to_owned(),
+                variant.name.clone(),
+                format!("{:.1}", variant.per_second),
+                format!("{:.0}", variant.bytes),
+                variant.server_content.clone(),
+                format!("{:.1}", variant.server_per_second),
+                format!("{:.0}", variant.server_bytes),
+                format!("{:.2}", variant.server_of_program),
+                format!("{}, {}", comparison.arrays, comparison.renderer),
+            ]
+        })
+    });
+    let head = [
+        "case",
+        "program",
+        "per second",
+        "bytes",
+        "server",
+        "per second",
+        "bytes",
+        "server / program",
+        "the program's arrays and renderer",
+    ];
+    let note = "The program is `tests/bench/peers/afternoon.py`. Its receiver is a process of its own. It replays a \
+                recorded motion, while a physics process drives the server. It draws without normal maps.";
+    section("Beside a Python program", note, &head, rows.collect())
 }
 
 fn encoding_sections(report: &StreamReport) -> String {

@@ -6,9 +6,12 @@
 //! - `session` is a server with one scene. `motion` has steps that are sent without computing them, `grid` is a scene of
 //!   many vertices.
 //! - `cases` lists the cases. Each case makes one measurement: `rates` with `stages`, `latency`, `socket`,
-//!   `delay`, `vertex_encodings` or `picture_encodings`.
+//!   `delay`, `vertex_encodings`, `picture_encodings` or `afternoon`.
+//! - `afternoon_scene` writes a scene for the Python program of `afternoon`.
 //! - `output`, `markdown` and `plot` write the report.
 
+pub mod afternoon;
+mod afternoon_scene;
 mod cases;
 pub mod delay;
 mod grid;
@@ -32,6 +35,7 @@ use serde::Serialize;
 use crate::is_selected;
 use crate::provenance::{Provenance, utc_date};
 use crate::workloads::Size;
+use afternoon::AfternoonComparison;
 pub(crate) use cases::CASE_HELP;
 use cases::{Case, Measurement};
 use delay::DelayResult;
@@ -109,6 +113,7 @@ pub enum CaseResult {
     Delay(DelayResult),
     VertexEncodings(Vec<VertexEncodingRow>),
     PictureEncodings(Vec<PictureEncodingRow>),
+    Afternoon(AfternoonComparison),
 }
 
 /// Progress events of a running report.
@@ -190,6 +195,7 @@ fn measure_case(
         Measurement::PictureEncodings(content) => {
             picture_encodings::measure(session, content, options).map(CaseResult::PictureEncodings)
         }
+        Measurement::Afternoon(size) => afternoon::measure(session, size, options).map(CaseResult::Afternoon),
     }?;
     let server = &session.server_info;
     Ok(CaseReport {

@@ -91,7 +91,7 @@ impl Motion {
 }
 
 /// The coordinates of each domain that has its own, as a range of the coordinates of the scene.
-fn coordinate_ranges(description: &SceneDescription) -> Vec<(u32, std::ops::Range<usize>)> {
+pub(super) fn coordinate_ranges(description: &SceneDescription) -> Vec<(u32, std::ops::Range<usize>)> {
     let mut first = 0;
     let owners = description.domains.iter().filter(|domain| domain.rank > 0 && domain.shares_q_with.is_none());
     owners

@@ -2,6 +2,7 @@
 
 use std::path::Path;
 
+use super::afternoon::AfternoonComparison;
 use super::delay::DelayResult;
 use super::latency::LatencyResult;
 use super::peers::socket::SocketComparison;
@@ -109,6 +110,7 @@ impl CaseResult {
             Self::Delay(result) => delay_quantities(result),
             Self::VertexEncodings(rows) => rows.iter().flat_map(vertex_quantities).collect(),
             Self::PictureEncodings(rows) => rows.iter().flat_map(picture_quantities).collect(),
+            Self::Afternoon(comparison) => afternoon_quantities(comparison),
         }
     }
 }
@@ -182,6 +184,20 @@ fn delay_quantities(result: &DelayResult) -> Vec<Quantity> {
         quantity("rate with delay", result.delayed_per_second, "1/s"),
         quantity("rate with delay / without", result.of_undelayed, "1"),
     ]
+}
+
+fn afternoon_quantities(comparison: &AfternoonComparison) -> Vec<Quantity> {
+    let of_program = comparison.variants.iter().flat_map(|variant| {
+        let numbers = [
+            quantity("rate of the program", variant.per_second, "1/s"),
+            quantity("reply of the program", variant.bytes, "B"),
+            quantity("rate of the server", variant.server_per_second, "1/s"),
+            quantity("reply of the server", variant.server_bytes, "B"),
+            quantity("server / program", variant.server_of_program, "1"),
+        ];
+        of_variant(&variant.name, numbers)
+    });
+    of_program.chain([quantity("server / best PNG variant", comparison.of_best_png, "1")]).collect()
 }
 
 fn vertex_quantities(row: &VertexEncodingRow) -> Vec<Quantity> {

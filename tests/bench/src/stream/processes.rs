@@ -86,7 +86,12 @@ impl Process {
         Self::spawn(format!("{} {role}", program.file_name()), &mut command)
     }
 
-    fn spawn(name: String, command: &mut Command) -> Result<Self> {
+    /// Starts a command as a child process with this name. Must be called on the main thread of the report, as
+    /// [`Self::start`].
+    ///
+    /// # Errors
+    /// `Fault` when the command cannot be started.
+    pub(super) fn spawn(name: String, command: &mut Command) -> Result<Self> {
         command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
         // SAFETY: the closure runs in the child between fork and exec. It makes one system call, which is
         // async-signal-safe, and it does not allocate.

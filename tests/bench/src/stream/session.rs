@@ -149,6 +149,19 @@ impl Session {
         })
     }
 
+    /// The path or built-in name of the scene in this process.
+    pub(super) fn path(&self) -> String {
+        match self.source {
+            SceneSource::Tree => self.source.name().to_owned(),
+            SceneSource::Repository(_) | SceneSource::Grid => self.files.to_string_lossy().into_owned(),
+        }
+    }
+
+    /// The folder with the recording of [`Self::motion`].
+    pub(super) fn recording(&self) -> PathBuf {
+        self.work.path().join("record")
+    }
+
     /// The URL of the server.
     pub(super) fn url(&self) -> String {
         format!("http://{}", self.address)
@@ -183,7 +196,7 @@ impl Session {
         let motion = match self.source {
             SceneSource::Grid => Motion::oscillation(&description, steps),
             SceneSource::Tree | SceneSource::Repository(_) => {
-                let folder = self.work.path().join("record");
+                let folder = self.recording();
                 self.start_physics(steps, &arguments([&"--record", &folder]))?.finish::<Value>()?;
                 Motion::read(&folder, &description)?
             }
