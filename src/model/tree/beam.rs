@@ -1,18 +1,33 @@
 //! The lowest modes of a clamped chain of beam elements: K phi = lambda M phi, lambda in (rad/s)^2, phi^T M phi = 1.
 
-use nalgebra::{Cholesky, DMatrix, SymmetricEigen, Vector3};
+use nalgebra::{DMatrix, SymmetricEigen, Vector3};
 
-use super::element::{ElasticConstants, Section, element_matrices};
+use super::band::BandMatrix;
+use super::element::{ElasticConstants, Matrix12, Taper, element_matrices, point_mass_matrix};
+use super::random::SplitMix64;
 use super::skin_modes::Station;
 use crate::error::{Result, fault_in};
+
+/// Number of vectors that the iteration has in addition to the wanted modes. More vectors converge in fewer iterations.
+const SPARE_VECTORS: usize = 8;
+
+/// Maximum number of iterations.
+const MAX_ITERATIONS: usize = 200;
+
+/// Largest relative change of an eigenvalue in an iteration after convergence.
+const EIGENVALUE_TOLERANCE: f64 = 1e-12;
+
+/// Iterations after the eigenvalues have converged, because the error of a shape decreases with the square root of the
+/// error of its eigenvalue.
+const EXTRA_ITERATIONS: usize = 4;
 
 /// A cantilever along a polyline, clamped at its first node.
 #[derive(Debug, Clone)]
 pub(super) struct Beam {
     /// N + 1 node positions in meters.
     pub(super) nodes: Vec<Vector3<f64>>,
-    /// N sections, one per element.
-    pub(super) sections: Vec<Section>,
+    /// N tapers, one per element.
+    pub(super) tapers: Vec<Taper>,
     pub(super) elastic: ElasticConstants,
     /// Carried masses (kg) and their stations (element, and fraction of its length).
     pub(super) point_masses: Vec<(Station, f64)>,
@@ -31,70 +46,89 @@ impl Beam {
     /// Mass of the beam in kg, without carried masses.
     pub(super) fn wood_mass(&self) -> f64 {
         let lengths = self.nodes.windows(2).map(|ends| (ends[1] - ends[0]).norm());
-        lengths.zip(&self.sections).map(|(length, section)| self.elastic.density * section.area * length).sum()
+        lengths.zip(&self.tapers).map(|(length, taper)| self.elastic.density * taper.mean_area() * length).sum()
     }
 
     /// K and M of the 6 N free degrees of freedom.
-    pub(super) fn assemble(&self) -> (DMatrix<f64>, DMatrix<f64>) {
-        let free_dofs = 6 * self.sections.len();
-        let (mut stiffness, mut mass) = (DMatrix::zeros(free_dofs, free_dofs), DMatrix::zeros(free_dofs, free_dofs));
-        for (element, section) in self.sections.iter().enumerate() {
-            let (k, m) = element_matrices(&self.nodes[element], &self.nodes[element + 1], section, &self.elastic);
-            // The first node is clamped, so only the second node's block of the first element is free.
-            let (first_free, count) = if element == 0 { (6, 6) } else { (0, 12) };
-            let first_row = 6 * element + first_free - 6;
-            let mut block = stiffness.view_mut((first_row, first_row), (count, count));
-            block += k.view((first_free, first_free), (count, count));
-            let mut block = mass.view_mut((first_row, first_row), (count, count));
-            block += m.view((first_free, first_free), (count, count));
+    pub(super) fn assemble(&self) -> (BandMatrix, BandMatrix) {
+        let free_dofs = 6 * self.tapers.len();
+        let (mut stiffness, mut mass) = (BandMatrix::zeros(free_dofs), BandMatrix::zeros(free_dofs));
+        for (element, taper) in self.tapers.iter().enumerate() {
+            let (k, m) = element_matrices(&self.nodes[element], &self.nodes[element + 1], taper, &self.elastic);
+            add_element(&mut stiffness, element, &k);
+            add_element(&mut mass, element, &m);
         }
-        for (station, carried_mass) in &self.point_masses {
-            for (node, weight) in [(station.element, 1.0 - station.fraction), (station.element + 1, station.fraction)] {
-                // The mass resists the three translations of a node; the clamped node 0 has no free ones.
-                let free_translations = if node == 0 { 0 } else { 3 };
-                for axis in 0..free_translations {
-                    mass[(6 * (node - 1) + axis, 6 * (node - 1) + axis)] += weight * carried_mass;
-                }
-            }
+        for (Station { element, fraction }, carried_mass) in &self.point_masses {
+            let (from, to) = (&self.nodes[*element], &self.nodes[element + 1]);
+            add_element(&mut mass, *element, &point_mass_matrix(from, to, *fraction, *carried_mass));
         }
         (stiffness, mass)
     }
 
-    /// The `count` lowest modes.
+    /// The `count` lowest modes, by orthogonal iteration with Rayleigh-Ritz projection (Golub and Van Loan, "Matrix
+    /// Computations", section 8.2). It needs a few vectors more than modes. Its cost grows with
+    /// the number of elements, that of a dense solution with the cube.
     ///
     /// K is factored instead of M, because axial stiffness is up to 10^10 times the lowest bending stiffness. With
-    /// M = L L^T, the lowest eigenvalues of L^-1 K L^-T would be smaller than the rounding errors of the highest. With
-    /// K = L L^T, the lowest modes have the largest eigenvalues mu = 1 / lambda of L^-1 M L^-T, which are accurate to
-    /// full precision. For an eigenvector y of L^-1 M L^-T, phi = L^-T y / sqrt(mu).
+    /// K = L L^T, the lowest modes have the largest eigenvalues mu = 1 / lambda of A = L^-1 M L^-T, which are accurate
+    /// to full precision. For an eigenvector y of A, phi = L^-T y / sqrt(mu).
     ///
     /// # Errors
     /// `Fault` if K is not positive definite (the beam has no stiffness) or the iteration does not converge.
     pub(super) fn solve_modes(&self, count: usize) -> Result<BeamModes> {
         let fault = fault_in::<&str>("tree.beam");
         let (stiffness, mass) = self.assemble();
-        let factor = Cholesky::new(stiffness).ok_or_else(|| fault("the stiffness is not positive definite"))?.unpack();
-        let singular_factor = || fault("the factor of the stiffness is singular");
-        let half_transformed = factor.solve_lower_triangular(&mass).ok_or_else(singular_factor)?;
-        let transformed_mass =
-            factor.solve_lower_triangular(&half_transformed.transpose()).ok_or_else(singular_factor)?;
-        let transformed_mass = (&transformed_mass + transformed_mass.transpose()) * 0.5;
-        let eigen = SymmetricEigen::try_new(transformed_mass, f64::EPSILON, 10_000)
-            .ok_or_else(|| fault("the eigenvalue iteration did not converge"))?;
-        let mut sorted_indices: Vec<usize> = (0..eigen.eigenvalues.len()).collect();
-        sorted_indices.sort_by(|a, b| eigen.eigenvalues[*b].total_cmp(&eigen.eigenvalues[*a]));
-        sorted_indices.truncate(count);
-        let mut mode_shapes = DMatrix::zeros(6 * self.nodes.len(), sorted_indices.len());
-        let mut eigenvalues = Vec::with_capacity(sorted_indices.len());
-        for (column, index) in sorted_indices.into_iter().enumerate() {
-            let mu = eigen.eigenvalues[index];
-            let shape =
-                factor.tr_solve_lower_triangular(&eigen.eigenvectors.column(index)).ok_or_else(singular_factor)?;
+        let factor = stiffness.factor().ok_or_else(|| fault("the stiffness is not positive definite"))?;
+        let not_converged = || fault("the eigenvalue iteration did not converge");
+        let vector_count = (count + SPARE_VECTORS).min(mass.size());
+        let mut random = SplitMix64::new(0);
+        let mut vectors = DMatrix::from_fn(mass.size(), vector_count, |_, _| random.uniform_symmetric(1.0));
+        let mut inverse_eigenvalues = vec![f64::INFINITY; count.min(vector_count)];
+        let mut converged_iterations = 0;
+        for _ in 0..MAX_ITERATIONS {
+            let basis = vectors.qr().q();
+            let shapes = factor.solve_upper(basis.clone());
+            let mapped = factor.solve_lower(mass.multiply(&shapes));
+            let projected = basis.tr_mul(&mapped);
+            let eigen = SymmetricEigen::try_new((&projected + projected.transpose()) * 0.5, f64::EPSILON, 10_000)
+                .ok_or_else(not_converged)?;
+            let mut order: Vec<usize> = (0..vector_count).collect();
+            order.sort_by(|a, b| eigen.eigenvalues[*b].total_cmp(&eigen.eigenvalues[*a]));
+            let mut largest_change = 0.0_f64;
+            for (mu, index) in inverse_eigenvalues.iter_mut().zip(&order) {
+                largest_change = largest_change.max((*mu / eigen.eigenvalues[*index] - 1.0).abs());
+                *mu = eigen.eigenvalues[*index];
+            }
+            converged_iterations += usize::from(largest_change <= EIGENVALUE_TOLERANCE);
+            if converged_iterations > EXTRA_ITERATIONS {
+                let ritz_vectors = eigen.eigenvectors.select_columns(&order[..inverse_eigenvalues.len()]);
+                return Ok(self.create_modes(&inverse_eigenvalues, shapes * ritz_vectors));
+            }
+            vectors = mapped;
+        }
+        Err(not_converged())
+    }
+
+    /// Normalizes the shapes of the free degrees of freedom, one column per mode, and adds the rows of the clamped node.
+    fn create_modes(&self, inverse_eigenvalues: &[f64], shapes: DMatrix<f64>) -> BeamModes {
+        let mut mode_shapes = DMatrix::zeros(6 * self.nodes.len(), inverse_eigenvalues.len());
+        for (column, (shape, mu)) in shapes.column_iter().zip(inverse_eigenvalues).enumerate() {
             // Make the largest entry positive, so that the sign does not depend on the solver.
             let scale = shape[shape.icamax()].signum() / mu.sqrt();
             mode_shapes.view_mut((6, column), (shape.len(), 1)).copy_from(&(shape * scale));
-            eigenvalues.push(1.0 / mu);
         }
-        Ok(BeamModes { eigenvalues, mode_shapes })
+        BeamModes { eigenvalues: inverse_eigenvalues.iter().map(|mu| mu.recip()).collect(), mode_shapes }
+    }
+}
+
+/// Adds the lower triangle of an element's matrix to the matrix of all free degrees of freedom. Those of the first node,
+/// which is clamped, are not free.
+fn add_element(matrix: &mut BandMatrix, element: usize, block: &Matrix12) {
+    let first_free = if element == 0 { 6 } else { 0 };
+    for row in first_free..12 {
+        for column in first_free..=row {
+            matrix.add(6 * element + row - 6, 6 * element + column - 6, block[(row, column)]);
+        }
     }
 }
 
@@ -120,7 +154,7 @@ pub(super) mod tests {
         let radius = |index: usize| radii[0] + (radii[1] - radii[0]) * index as f64 / elements as f64;
         Beam {
             nodes: (0..=elements).map(node_position).collect(),
-            sections: (0..elements).map(|index| Section::of_cone(radius(index), radius(index + 1))).collect(),
+            tapers: (0..elements).map(|index| Taper { radii: [radius(index), radius(index + 1)] }).collect(),
             elastic: WOOD,
             point_masses: vec![],
         }
@@ -129,6 +163,7 @@ pub(super) mod tests {
     /// The largest ||K phi - lambda M phi|| / ||K phi||, and the largest deviation of phi^T M phi from the identity.
     pub(in super::super) fn eigen_residuals(beam: &Beam, modes: &BeamModes) -> (f64, f64) {
         let (stiffness, mass) = beam.assemble();
+        let (stiffness, mass) = (stiffness.to_dense(), mass.to_dense());
         let mode_shapes = modes.mode_shapes.rows(6, stiffness.nrows()).into_owned();
         let residual = |column: usize| {
             let force = &stiffness * mode_shapes.column(column);
@@ -178,7 +213,7 @@ pub(super) mod tests {
             let elastic = ElasticConstants { shear_modulus: 1e12, ..WOOD };
             let beam = Beam { elastic, ..curved_beam(14, [radius; 2], 0.0) };
             let modes = beam.solve_modes(6).expect("a converged solution");
-            let Section { area, moment } = beam.sections[0];
+            let (area, moment) = (beam.tapers[0].area(0.5), beam.tapers[0].moment(0.5));
             let base_frequency = (elastic.youngs_modulus * moment / (elastic.density * area)).sqrt();
             // Roots of cos x cosh x = -1. Each bending mode occurs twice, once per plane.
             let roots = [1.875_104, 1.875_104, 4.694_091, 4.694_091, 7.854_757, 7.854_757];
@@ -209,7 +244,7 @@ pub(super) mod tests {
         let tip_mass = 1000.0 * beam.wood_mass();
         beam.point_masses.push((Station { element: 11, fraction: 1.0 }, tip_mass));
         // The tip stiffness of a cantilever of length 1: 3 E I.
-        let expected_stiffness = 3.0 * WOOD.youngs_modulus * beam.sections[0].moment;
+        let expected_stiffness = 3.0 * WOOD.youngs_modulus * beam.tapers[0].moment(0.5);
         let eigenvalue = beam.solve_modes(1).expect("a converged solution").eigenvalues[0];
         assert!((eigenvalue * tip_mass / expected_stiffness - 1.0).abs() < 1e-3, "{eigenvalue}");
     }

@@ -12,12 +12,11 @@ const STEPS_PER_RING: usize = 8;
 #[derive(Debug, Clone)]
 pub(super) struct GrowthParameters {
     pub(super) length: f64,
-    /// Number of beam elements along the branch.
-    pub(super) elements: usize,
-    /// Number of skin rings per beam element.
-    pub(super) rings_per_element: usize,
-    /// Exponent of the node spacing: node i of N is at arc length `length (i / N)^grading`. Above 1, nodes are denser
-    /// near the root.
+    /// Number of segments along the branch. Rings are equidistant within a segment.
+    pub(super) segments: usize,
+    pub(super) rings_per_segment: usize,
+    /// Exponent of the segments' spacing: segment i of N begins at arc length `length (i / N)^grading`. Above 1,
+    /// segments are denser near the root.
     pub(super) grading: f64,
     /// Unit direction at the root.
     pub(super) start: Vector3<f64>,
@@ -31,8 +30,8 @@ pub(super) struct GrowthParameters {
     pub(super) wander: f64,
 }
 
-/// A sampled curve with one sample per ring of the skin. Every `rings_per_element`-th sample is a node of the beam.
-/// Points and arc lengths are in meters.
+/// A sampled curve with one sample per ring of the skin. The samples are also the nodes of the beam. Points and arc
+/// lengths are in meters.
 #[derive(Debug, Clone)]
 pub(super) struct Centerline {
     pub(super) points: Vec<Vector3<f64>>,
@@ -42,8 +41,6 @@ pub(super) struct Centerline {
     pub(super) side_vectors: Vec<Vector3<f64>>,
     /// Arc length from the root.
     pub(super) arc_lengths: Vec<f64>,
-    /// Samples per beam element.
-    pub(super) rings_per_element: usize,
 }
 
 impl Centerline {
@@ -52,13 +49,7 @@ impl Centerline {
         let random_bends = RandomBends::new(growth, random);
         let arc_lengths = ring_arc_lengths(growth);
         let (mut point, mut tangent) = (Vector3::zeros(), growth.start);
-        let mut centerline = Self {
-            points: vec![point],
-            tangents: vec![tangent],
-            side_vectors: vec![],
-            arc_lengths,
-            rings_per_element: growth.rings_per_element,
-        };
+        let mut centerline = Self { points: vec![point], tangents: vec![tangent], side_vectors: vec![], arc_lengths };
         for ring in 1..centerline.arc_lengths.len() {
             let step = (centerline.arc_lengths[ring] - centerline.arc_lengths[ring - 1]) / STEPS_PER_RING as f64;
             for substep in 0..STEPS_PER_RING {
@@ -100,11 +91,6 @@ impl Centerline {
         self.arc_lengths[ring] / self.length()
     }
 
-    /// The beam's nodes.
-    pub(super) fn nodes(&self) -> Vec<Vector3<f64>> {
-        self.points.iter().copied().step_by(self.rings_per_element).collect()
-    }
-
     /// The unit direction of a branch at ring `ring`: the tangent, rotated by `angle` towards the direction `side`.
     pub(super) fn branch_direction(&self, ring: usize, angle: f64, side: &Vector3<f64>) -> Vector3<f64> {
         let tangent = self.tangents[ring];
@@ -123,16 +109,17 @@ pub(super) fn part_orientation(y: &Vector3<f64>, up: &Vector3<f64>) -> Rotation3
     Rotation3::from_basis_unchecked(&[y.cross(&z), *y, z])
 }
 
-/// The arc length of each ring. Rings are equidistant within a beam element.
+/// The arc length of each ring.
 fn ring_arc_lengths(growth: &GrowthParameters) -> Vec<f64> {
-    let node_arc_length = |index: usize| growth.length * (index as f64 / growth.elements as f64).powf(growth.grading);
-    let ring_arc_length = |element: usize, ring: usize| {
-        let fraction = ring as f64 / growth.rings_per_element as f64;
-        node_arc_length(element) * (1.0 - fraction) + node_arc_length(element + 1) * fraction
+    let segment_arc_length =
+        |index: usize| growth.length * (index as f64 / growth.segments as f64).powf(growth.grading);
+    let ring_arc_length = |segment: usize, ring: usize| {
+        let fraction = ring as f64 / growth.rings_per_segment as f64;
+        segment_arc_length(segment) * (1.0 - fraction) + segment_arc_length(segment + 1) * fraction
     };
-    let mut arc_lengths: Vec<f64> = (0..growth.elements)
-        .flat_map(|element| (0..growth.rings_per_element).map(move |ring| (element, ring)))
-        .map(|(element, ring)| ring_arc_length(element, ring))
+    let mut arc_lengths: Vec<f64> = (0..growth.segments)
+        .flat_map(|segment| (0..growth.rings_per_segment).map(move |ring| (segment, ring)))
+        .map(|(segment, ring)| ring_arc_length(segment, ring))
         .collect();
     arc_lengths.push(growth.length);
     arc_lengths
@@ -202,14 +189,14 @@ pub(super) mod tests {
 
     pub(in super::super) fn straight_growth(
         length: f64,
-        elements: usize,
-        rings_per_element: usize,
+        segments: usize,
+        rings_per_segment: usize,
     ) -> GrowthParameters {
         let (start, up) = (Vector3::y(), Vector3::z());
         GrowthParameters {
             length,
-            elements,
-            rings_per_element,
+            segments,
+            rings_per_segment,
             grading: 1.0,
             start,
             up,
@@ -222,10 +209,9 @@ pub(super) mod tests {
     #[test]
     fn branch_without_bends_is_straight() {
         let centerline = Centerline::grow(&straight_growth(3.0, 6, 2), &mut SplitMix64::new(1));
-        // 6 elements x 2 rings, and the ring at the tip.
+        // 6 segments x 2 rings, and the ring at the tip.
         assert_eq!(centerline.points.len(), 13);
         assert!((centerline.points[12] - Vector3::new(0.0, 3.0, 0.0)).norm() < 1e-12);
-        assert_eq!(centerline.nodes().len(), 7);
         assert_eq!(centerline.ring_at(0.5), 6);
         assert_eq!((centerline.ring_at(0.0), centerline.ring_at(1.0)), (0, 12));
     }

@@ -61,8 +61,8 @@ fn grow_cluster(parameters: ClusterParameters, random: &mut SplitMix64) -> PartT
     let ClusterParameters { is_flexible, shoot_length, leaf_count, leaf_length } = parameters;
     let growth = GrowthParameters {
         length: shoot_length,
-        elements: 4,
-        rings_per_element: 1,
+        segments: 4,
+        rings_per_segment: 1,
         grading: 1.0,
         start: Vector3::y(),
         up: Vector3::z(),

@@ -1,13 +1,29 @@
-//! The 12 x 12 stiffness and consistent mass matrices of one Euler-Bernoulli frame element.
+//! The 12 x 12 stiffness and consistent mass matrices of one Euler-Bernoulli frame element with a tapered section.
 //!
 //! Degrees of freedom per node: displacement along x, y, z (m), rotation about x, y, z (rad). Local x points along the
 //! element. Within the element, bending is cubic, and stretch and twist are linear (Przemieniecki, "Theory of Matrix
 //! Structural Analysis", sections 5.6 and 11.3). The rotary inertia of bending is neglected, as in Euler-Bernoulli
 //! theory.
 
-use nalgebra::{Matrix3, Matrix4, SMatrix, Vector3};
+use nalgebra::{Matrix3, Matrix4, SMatrix, Vector3, Vector4};
 
 pub(super) type Matrix12 = SMatrix<f64, 12, 12>;
+
+/// The degrees of freedom of bending in local y and their signs: displacement and rotation about z of both nodes.
+const BENDING_Y: ([usize; 4], [f64; 4]) = ([1, 5, 7, 11], [1.0; 4]);
+
+/// The same in local z. A rotation about y decreases the slope dz/dx.
+const BENDING_Z: ([usize; 4], [f64; 4]) = ([2, 4, 8, 10], [1.0, -1.0, 1.0, -1.0]);
+
+/// Abscissas and weights of the five-point Gauss-Legendre rule on 0 to 1. It is exact for polynomials of degree 9. The
+/// integrands are at most of degree 8: a squared cubic shape function times the area of a cone.
+const GAUSS_POINTS: [(f64, f64); 5] = [
+    (0.046_910_077_030_668_0, 0.118_463_442_528_094_5),
+    (0.230_765_344_947_158_5, 0.239_314_335_249_683_2),
+    (0.5, 0.284_444_444_444_444_4),
+    (0.769_234_655_052_841_5, 0.239_314_335_249_683_2),
+    (0.953_089_922_969_332, 0.118_463_442_528_094_5),
+];
 
 /// Elastic constants (Pa) and density (kg/m^3) of wood or of a green shoot.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -17,26 +33,69 @@ pub(super) struct ElasticConstants {
     pub(super) density: f64,
 }
 
-/// A circular section: area (m^2) and second moment of area about a diameter (m^4).
+/// Circular sections of an element whose radius is linear along it: a truncated cone.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Section {
-    pub(super) area: f64,
-    pub(super) moment: f64,
+pub(super) struct Taper {
+    /// Radii at the start and at the end, meters.
+    pub(super) radii: [f64; 2],
 }
 
-impl Section {
-    /// Mean area and second moment of a truncated cone. Its radius is linear between the two radii, so that the means
-    /// of r^2 and r^4 have these closed forms.
-    pub(super) fn of_cone(radius_a: f64, radius_b: f64) -> Self {
-        use std::f64::consts::{FRAC_PI_4, PI};
-        let mean_square = (radius_a * radius_a + radius_a * radius_b + radius_b * radius_b) / 3.0;
-        let mean_fourth_power = (radius_a.powi(4)
-            + radius_a.powi(3) * radius_b
-            + (radius_a * radius_b).powi(2)
-            + radius_a * radius_b.powi(3)
-            + radius_b.powi(4))
-            / 5.0;
-        Self { area: PI * mean_square, moment: FRAC_PI_4 * mean_fourth_power }
+impl Taper {
+    /// Area in m^2 at a fraction of the length.
+    pub(super) fn area(&self, fraction: f64) -> f64 {
+        std::f64::consts::PI * self.radius(fraction).powi(2)
+    }
+
+    /// Second moment of area about a diameter, in m^4, at a fraction of the length.
+    pub(super) fn moment(&self, fraction: f64) -> f64 {
+        std::f64::consts::FRAC_PI_4 * self.radius(fraction).powi(4)
+    }
+
+    /// Mean area in m^2.
+    pub(super) fn mean_area(&self) -> f64 {
+        let [a, b] = self.radii;
+        std::f64::consts::PI * (a * a + a * b + b * b) / 3.0
+    }
+
+    fn radius(&self, fraction: f64) -> f64 {
+        self.radii[0] + (self.radii[1] - self.radii[0]) * fraction
+    }
+}
+
+/// Weights of the displacement and the rotation of the first node, then of the second, in one plane of bending: the
+/// cubic Hermite basis on an element.
+pub(super) struct BendingBasis {
+    /// Weights in the transverse displacement.
+    pub(super) values: Vector4<f64>,
+    /// Weights in its derivative along the element, per meter.
+    pub(super) slopes: Vector4<f64>,
+    /// Weights in its second derivative, per square meter.
+    curvatures: Vector4<f64>,
+}
+
+impl BendingBasis {
+    /// The basis at the fraction `x` of an element of length `l` meters.
+    pub(super) fn new(x: f64, l: f64) -> Self {
+        Self {
+            values: Vector4::new(
+                1.0 - 3.0 * x * x + 2.0 * x.powi(3),
+                l * x * (1.0 - x).powi(2),
+                x * x * (3.0 - 2.0 * x),
+                l * x * x * (x - 1.0),
+            ),
+            slopes: Vector4::new(
+                6.0 * x * (x - 1.0) / l,
+                (1.0 - x) * (1.0 - 3.0 * x),
+                6.0 * x * (1.0 - x) / l,
+                x * (3.0 * x - 2.0),
+            ),
+            curvatures: Vector4::new(
+                (12.0 * x - 6.0) / (l * l),
+                (6.0 * x - 4.0) / l,
+                (6.0 - 12.0 * x) / (l * l),
+                (6.0 * x - 2.0) / l,
+            ),
+        }
     }
 }
 
@@ -52,71 +111,75 @@ pub(super) fn element_axes(from: &Vector3<f64>, to: &Vector3<f64>) -> Matrix3<f6
 pub(super) fn element_matrices(
     from: &Vector3<f64>,
     to: &Vector3<f64>,
-    section: &Section,
+    taper: &Taper,
     material: &ElasticConstants,
 ) -> (Matrix12, Matrix12) {
-    let length = (to - from).norm();
-    let mut local_from_global = Matrix12::zeros();
-    for block in 0..4 {
-        local_from_global.fixed_view_mut::<3, 3>(3 * block, 3 * block).copy_from(&element_axes(from, to));
+    let (local_from_global, length) = (rotation_of_nodes(from, to), (to - from).norm());
+    let (mut stiffness, mut mass) = (Matrix12::zeros(), Matrix12::zeros());
+    for (x, weight) in GAUSS_POINTS {
+        let (area, moment) = (taper.area(x), taper.moment(x));
+        let ElasticConstants { youngs_modulus, shear_modulus, density } = *material;
+        let weight = weight * length;
+        let (linear_values, linear_slopes) = ([1.0 - x, x], [-1.0 / length, 1.0 / length]);
+        add_linear(&mut stiffness, 0, linear_slopes, weight * youngs_modulus * area);
+        // The polar moment of a circular section, which resists twist, is twice its second moment about a diameter.
+        add_linear(&mut stiffness, 3, linear_slopes, weight * shear_modulus * 2.0 * moment);
+        add_linear(&mut mass, 0, linear_values, weight * density * area);
+        add_linear(&mut mass, 3, linear_values, weight * density * 2.0 * moment);
+        let basis = BendingBasis::new(x, length);
+        add_bending(
+            &mut stiffness,
+            &(basis.curvatures * basis.curvatures.transpose()),
+            weight * youngs_modulus * moment,
+        );
+        add_bending(&mut mass, &(basis.values * basis.values.transpose()), weight * density * area);
     }
-    let (stiffness, mass) = (local_stiffness(length, section, material), local_mass(length, section, material));
     (
         local_from_global.transpose() * stiffness * local_from_global,
         local_from_global.transpose() * mass * local_from_global,
     )
 }
 
-/// Stiffness in local axes; `l` is the element's length. The polar moment of a circular section, which resists twist,
-/// is twice its second moment about a diameter.
-fn local_stiffness(l: f64, section: &Section, material: &ElasticConstants) -> Matrix12 {
-    let mut matrix = Matrix12::zeros();
-    let block = [1.0, -1.0, -1.0, 1.0];
-    add_linear(&mut matrix, 0, block.map(|entry| entry * material.youngs_modulus * section.area / l));
-    add_linear(&mut matrix, 3, block.map(|entry| entry * material.shear_modulus * 2.0 * section.moment / l));
-    #[rustfmt::skip]
-    let bending = Matrix4::new(
-        12.0,    6.0 * l,     -12.0,   6.0 * l,
-        6.0 * l, 4.0 * l * l, -6.0 * l, 2.0 * l * l,
-        -12.0,   -6.0 * l,    12.0,    -6.0 * l,
-        6.0 * l, 2.0 * l * l, -6.0 * l, 4.0 * l * l,
-    );
-    add_bending(&mut matrix, &(bending * (material.youngs_modulus * section.moment / l.powi(3))));
-    matrix
+/// The consistent mass matrix m N^T N of a point mass of `mass` kg on the centerline, at a fraction of the element. N
+/// is the 3 x 12 matrix of shape functions, which gives the displacement at the mass. Shares of the mass at the two
+/// nodes would overestimate its kinetic energy, because bending moves a point between them less than their mean.
+pub(super) fn point_mass_matrix(from: &Vector3<f64>, to: &Vector3<f64>, fraction: f64, mass: f64) -> Matrix12 {
+    let mut shape_functions = SMatrix::<f64, 3, 12>::zeros();
+    (shape_functions[(0, 0)], shape_functions[(0, 6)]) = (1.0 - fraction, fraction);
+    let basis = BendingBasis::new(fraction, (to - from).norm());
+    for (row, (dofs, signs)) in [(1, BENDING_Y), (2, BENDING_Z)] {
+        for index in 0..4 {
+            shape_functions[(row, dofs[index])] = signs[index] * basis.values[index];
+        }
+    }
+    let shape_functions = shape_functions * rotation_of_nodes(from, to);
+    shape_functions.transpose() * shape_functions * mass
 }
 
-/// Consistent mass in local axes, with the same symbols as [`local_stiffness`].
-fn local_mass(l: f64, section: &Section, material: &ElasticConstants) -> Matrix12 {
-    let mut matrix = Matrix12::zeros();
-    let block = [2.0, 1.0, 1.0, 2.0];
-    add_linear(&mut matrix, 0, block.map(|entry| entry * material.density * section.area * l / 6.0));
-    add_linear(&mut matrix, 3, block.map(|entry| entry * material.density * 2.0 * section.moment * l / 6.0));
-    #[rustfmt::skip]
-    let bending = Matrix4::new(
-        156.0,     22.0 * l,     54.0,      -13.0 * l,
-        22.0 * l,  4.0 * l * l,  13.0 * l,  -3.0 * l * l,
-        54.0,      13.0 * l,     156.0,     -22.0 * l,
-        -13.0 * l, -3.0 * l * l, -22.0 * l, 4.0 * l * l,
-    );
-    add_bending(&mut matrix, &(bending * (material.density * section.area * l / 420.0)));
-    matrix
+/// The local axes of an element for the four vectors of its degrees of freedom.
+fn rotation_of_nodes(from: &Vector3<f64>, to: &Vector3<f64>) -> Matrix12 {
+    let mut local_from_global = Matrix12::zeros();
+    for block in 0..4 {
+        local_from_global.fixed_view_mut::<3, 3>(3 * block, 3 * block).copy_from(&element_axes(from, to));
+    }
+    local_from_global
 }
 
-/// Adds a row-major 2 x 2 block that couples degree of freedom `dof` of both nodes.
-fn add_linear(matrix: &mut Matrix12, dof: usize, block: [f64; 4]) {
-    for (index, value) in block.into_iter().enumerate() {
-        matrix[(dof + 6 * (index / 2), dof + 6 * (index % 2))] += value;
+/// Adds the outer product of linear shape functions, for the degree of freedom `dof` of both nodes.
+fn add_linear(matrix: &mut Matrix12, dof: usize, shape_functions: [f64; 2], factor: f64) {
+    for (row, a) in shape_functions.iter().enumerate() {
+        for (column, b) in shape_functions.iter().enumerate() {
+            matrix[(dof + 6 * row, dof + 6 * column)] += factor * a * b;
+        }
     }
 }
 
-/// Adds bending in both planes: y with the rotation about z, and z with the rotation about y. Terms that couple z with
-/// the rotation change their sign, because a rotation about y decreases the slope dz/dx.
-fn add_bending(matrix: &mut Matrix12, block: &Matrix4<f64>) {
-    for (dofs, sign) in [([1, 5, 7, 11], 1.0), ([2, 4, 8, 10], -1.0)] {
+/// Adds bending in both planes.
+fn add_bending(matrix: &mut Matrix12, block: &Matrix4<f64>, factor: f64) {
+    for (dofs, signs) in [BENDING_Y, BENDING_Z] {
         for row in 0..4 {
             for column in 0..4 {
-                let factor = if (row + column) % 2 == 1 { sign } else { 1.0 };
-                matrix[(dofs[row], dofs[column])] += factor * block[(row, column)];
+                matrix[(dofs[row], dofs[column])] += factor * signs[row] * signs[column] * block[(row, column)];
             }
         }
     }
@@ -135,9 +198,9 @@ mod tests {
     #[test]
     fn rigid_motions_have_no_elastic_energy() {
         let (from, to) = oblique_nodes();
-        let section = Section::of_cone(0.03, 0.02);
-        let (stiffness, mass) = element_matrices(&from, &to, &section, &WOOD);
-        let element_mass = WOOD.density * section.area * (to - from).norm();
+        let taper = Taper { radii: [0.03, 0.02] };
+        let (stiffness, mass) = element_matrices(&from, &to, &taper, &WOOD);
+        let element_mass = WOOD.density * taper.mean_area() * (to - from).norm();
         for axis in 0..3 {
             let direction = Vector3::ith(axis, 1.0);
             let mut translation = nalgebra::SVector::<f64, 12>::zeros();
@@ -159,20 +222,64 @@ mod tests {
     #[test]
     fn matrices_are_symmetric_and_the_mass_is_positive() {
         let (from, to) = oblique_nodes();
-        let (stiffness, mass) = element_matrices(&from, &to, &Section::of_cone(0.01, 0.01), &WOOD);
+        let (stiffness, mass) = element_matrices(&from, &to, &Taper { radii: [0.01; 2] }, &WOOD);
         assert!((stiffness - stiffness.transpose()).norm() <= 1e-12 * stiffness.norm());
         assert!((mass - mass.transpose()).norm() <= 1e-12 * mass.norm());
         assert!(mass.cholesky().is_some());
     }
 
     #[test]
-    fn cone_section_is_between_those_of_its_ends() {
-        let (thick_section, thin_section, cone_section) =
-            (Section::of_cone(2.0, 2.0), Section::of_cone(1.0, 1.0), Section::of_cone(2.0, 1.0));
-        assert!((thin_section.area - std::f64::consts::PI).abs() < 1e-12);
-        assert!((thin_section.moment - std::f64::consts::FRAC_PI_4).abs() < 1e-12);
-        assert!(cone_section.area < thick_section.area && cone_section.area > thin_section.area);
+    fn uniform_element_has_the_textbook_matrices() {
+        let (from, to) = (Vector3::zeros(), Vector3::new(0.8, 0.0, 0.0));
+        let taper = Taper { radii: [0.02; 2] };
+        let (stiffness, mass) = element_matrices(&from, &to, &taper, &WOOD);
+        let (l, area, moment) = (0.8_f64, taper.area(0.5), taper.moment(0.5));
+        // Przemieniecki, equations 5.116 and 11.21: entries of bending in y, stretch and twist.
+        let bending = WOOD.youngs_modulus * moment;
+        let line_mass = WOOD.density * area;
+        for (matrix, row, column, expected) in [
+            (&stiffness, 1, 1, 12.0 * bending / l.powi(3)),
+            (&stiffness, 1, 5, 6.0 * bending / l.powi(2)),
+            (&stiffness, 5, 11, 2.0 * bending / l),
+            (&stiffness, 0, 6, -WOOD.youngs_modulus * area / l),
+            (&stiffness, 3, 3, WOOD.shear_modulus * 2.0 * moment / l),
+            (&mass, 1, 1, 156.0 / 420.0 * line_mass * l),
+            (&mass, 1, 11, -13.0 / 420.0 * line_mass * l * l),
+            (&mass, 5, 5, 4.0 / 420.0 * line_mass * l.powi(3)),
+            (&mass, 0, 6, line_mass * l / 6.0),
+            (&mass, 3, 3, WOOD.density * 2.0 * moment * l / 3.0),
+        ] {
+            let entry = matrix[(row, column)];
+            assert!((entry / expected - 1.0).abs() <= 1e-12, "({row}, {column}): expected {expected}, got {entry}");
+        }
+    }
+
+    #[test]
+    fn point_mass_has_its_kinetic_energy_anywhere() {
+        let (from, to) = oblique_nodes();
+        // An element of bent nodes: both rotate about z by different angles.
+        let dofs = nalgebra::SVector::<f64, 12>::from_fn(|row, _| (1.7 * row as f64).sin());
+        for fraction in [0.0, 0.3, 0.5, 1.0] {
+            let motion = super::super::skin_modes::section_motion(
+                &[from, to],
+                dofs.as_slice(),
+                super::super::skin_modes::Station { element: 0, fraction },
+            );
+            let twice_energy = (point_mass_matrix(&from, &to, fraction, 2.5) * dofs).dot(&dofs);
+            let expected = 2.5 * motion.translation.norm_squared();
+            assert!(
+                (twice_energy / expected - 1.0).abs() <= 1e-12,
+                "{fraction}: expected {expected}, got {twice_energy}"
+            );
+        }
+    }
+
+    #[test]
+    fn mean_area_of_a_cone_is_the_mean_over_its_length() {
+        let taper = Taper { radii: [2.0, 1.0] };
+        let integrated: f64 = GAUSS_POINTS.iter().map(|(x, weight)| weight * taper.area(*x)).sum();
+        assert!((taper.mean_area() / integrated - 1.0).abs() < 1e-12);
         // The mean of r^2 between the radii 2 and 1 is (2^2 + 2 x 1 + 1^2) / 3.
-        assert!((cone_section.area - std::f64::consts::PI * 7.0 / 3.0).abs() < 1e-12);
+        assert!((taper.mean_area() - std::f64::consts::PI * 7.0 / 3.0).abs() < 1e-12);
     }
 }

@@ -174,15 +174,12 @@ impl SkinBuilder {
     }
 }
 
-/// The beam station of a ring.
+/// The beam station of a ring: rings are the nodes of the beam.
 pub(super) fn station(centerline: &Centerline, ring: usize) -> Station {
     if ring + 1 == centerline.points.len() {
-        return Station { element: ring / centerline.rings_per_element - 1, fraction: 1.0 };
+        return Station { element: ring - 1, fraction: 1.0 };
     }
-    Station {
-        element: ring / centerline.rings_per_element,
-        fraction: (ring % centerline.rings_per_element) as f64 / centerline.rings_per_element as f64,
-    }
+    Station { element: ring, fraction: 0.0 }
 }
 
 /// The beam station, position and unit tangent at a fraction of the length.
@@ -194,8 +191,7 @@ pub(super) fn sample_at(centerline: &Centerline, fraction: f64) -> (Station, Vec
         .clamp(1, centerline.arc_lengths.len() - 1);
     let weight = (arc_length - centerline.arc_lengths[next_ring - 1])
         / (centerline.arc_lengths[next_ring] - centerline.arc_lengths[next_ring - 1]);
-    let mut station = station(centerline, next_ring - 1);
-    station.fraction += weight / centerline.rings_per_element as f64;
+    let station = Station { element: next_ring - 1, fraction: weight };
     let position = centerline.points[next_ring - 1].lerp(&centerline.points[next_ring], weight);
     (station, position, centerline.tangents[next_ring - 1].lerp(&centerline.tangents[next_ring], weight).normalize())
 }
@@ -275,13 +271,13 @@ mod tests {
     #[test]
     fn sample_at_a_fraction_is_on_the_centerline() {
         let centerline = winding_centerline();
-        // With two rings per element, ring 5 is in the middle of element 2.
-        let (station, position, _) = sample_at(&centerline, centerline.fraction(5));
-        assert!((position - centerline.points[5]).norm() < 1e-12);
-        assert!((station.element, station.fraction) == (2, 0.5));
+        let middle_fraction = 0.5 * (centerline.fraction(4) + centerline.fraction(5));
+        let (station, position, _) = sample_at(&centerline, middle_fraction);
+        assert!((position - 0.5 * (centerline.points[4] + centerline.points[5])).norm() < 1e-12);
+        assert!(station.element == 4 && (station.fraction - 0.5).abs() < 1e-12, "{station:?}");
         // The tip is ring 12, at the end of the last element.
         let (end_station, position, tangent) = sample_at(&centerline, 1.0);
-        assert!((end_station.element, end_station.fraction) == (5, 1.0));
+        assert!((end_station.element, end_station.fraction) == (11, 1.0));
         assert!((position - centerline.points[12]).norm() < 1e-12);
         assert!((tangent - centerline.tangents[12]).norm() < 1e-12);
     }

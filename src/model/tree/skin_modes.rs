@@ -1,9 +1,9 @@
 //! Lifts the modes of a beam to its skin: u = w(s) + theta(s) x d for a vertex at the offset d from the center of its
 //! section, where w and theta are the displacement and rotation of the section.
 
-use nalgebra::{DMatrix, Vector3};
+use nalgebra::{DMatrix, Vector3, Vector4};
 
-use super::element::element_axes;
+use super::element::{BendingBasis, element_axes};
 use crate::domain::Modes;
 use crate::error::Result;
 
@@ -12,6 +12,15 @@ use crate::error::Result;
 pub(super) struct Station {
     pub(super) element: usize,
     pub(super) fraction: f64,
+}
+
+impl Station {
+    /// The same position after every element is divided into `parts` equal elements.
+    pub(super) fn subdivide(self, parts: usize) -> Self {
+        let scaled_fraction = self.fraction * parts as f64;
+        let part = (scaled_fraction as usize).min(parts - 1);
+        Self { element: self.element * parts + part, fraction: scaled_fraction - part as f64 }
+    }
 }
 
 /// Rest position and infinitesimal motion of a section.
@@ -40,29 +49,22 @@ pub(super) fn section_motion(nodes: &[Vector3<f64>], dofs: &[f64], station: Stat
     };
     let (displacement_a, rotation_a) = (local_vector(element, 0), local_vector(element, 3));
     let (displacement_b, rotation_b) = (local_vector(element + 1, 0), local_vector(element + 1, 3));
-    // Cubic Hermite basis: the weights of the first value, first slope, second value and second slope, and the
-    // derivatives of the weights.
-    let value_basis =
-        [1.0 - 3.0 * x * x + 2.0 * x.powi(3), x * (1.0 - x).powi(2), x * x * (3.0 - 2.0 * x), x * x * (x - 1.0)];
-    let slope_basis = [6.0 * x * (x - 1.0), (1.0 - x) * (1.0 - 3.0 * x), 6.0 * x * (1.0 - x), x * (3.0 * x - 2.0)];
-    let interpolate = |basis: &[f64; 4], [value_a, slope_a, value_b, slope_b]: [f64; 4]| {
-        basis[0] * value_a + basis[1] * length * slope_a + basis[2] * value_b + basis[3] * length * slope_b
-    };
+    let basis = BendingBasis::new(x, length);
     // The slope of y is a rotation about z, and the slope of z is a rotation about -y.
     let (y_values, z_values) = (
-        [displacement_a.y, rotation_a.z, displacement_b.y, rotation_b.z],
-        [displacement_a.z, -rotation_a.y, displacement_b.z, -rotation_b.y],
+        Vector4::new(displacement_a.y, rotation_a.z, displacement_b.y, rotation_b.z),
+        Vector4::new(displacement_a.z, -rotation_a.y, displacement_b.z, -rotation_b.y),
     );
     let interpolate_linearly = |a: f64, b: f64| a * (1.0 - x) + b * x;
     let translation = Vector3::new(
         interpolate_linearly(displacement_a.x, displacement_b.x),
-        interpolate(&value_basis, y_values),
-        interpolate(&value_basis, z_values),
+        basis.values.dot(&y_values),
+        basis.values.dot(&z_values),
     );
     let rotation = Vector3::new(
         interpolate_linearly(rotation_a.x, rotation_b.x),
-        -interpolate(&slope_basis, z_values) / length,
-        interpolate(&slope_basis, y_values) / length,
+        -basis.slopes.dot(&z_values),
+        basis.slopes.dot(&y_values),
     );
     SectionMotion {
         center: from + (to - from) * x,

@@ -67,8 +67,8 @@ pub(super) fn grow_templates(random: &mut SplitMix64) -> Vec<PartTemplate> {
 fn grow_trunk(random: &mut SplitMix64) -> PartTemplate {
     let growth = GrowthParameters {
         length: 6.8,
-        elements: 16,
-        rings_per_element: 3,
+        segments: 16,
+        rings_per_segment: 3,
         grading: 1.25,
         start: Vector3::y(),
         up: Vector3::y(),
@@ -123,8 +123,8 @@ fn grow_bough(
 ) -> PartTemplate {
     let growth = GrowthParameters {
         length,
-        elements: 12,
-        rings_per_element: 2,
+        segments: 12,
+        rings_per_segment: 2,
         grading: 1.1,
         start: Vector3::y(),
         up: part_orientation(direction, &Vector3::y()).inverse() * Vector3::y(),
@@ -158,8 +158,8 @@ fn grow_bough(
 fn grow_twig(length: f64, leaves: &[PartTemplate], random: &mut SplitMix64) -> PartTemplate {
     let growth = GrowthParameters {
         length,
-        elements: 10,
-        rings_per_element: 1,
+        segments: 10,
+        rings_per_segment: 1,
         grading: 1.0,
         start: Vector3::y(),
         up: Vector3::new(0.0, 0.35, 0.94).normalize(),
