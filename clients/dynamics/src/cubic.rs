@@ -16,6 +16,10 @@ use crate::error::{Result, invalid_input};
 /// Size of the header of a file: four i32.
 const HEADER_BYTES: usize = 16;
 
+/// Largest difference of two coefficients that should be equal, as a fraction of the largest coefficient of their
+/// degree. Vega's files have differences below 1e-10.
+const GRADIENT_TOLERANCE: f64 = 1e-6;
+
 /// Coefficients of a polynomial force, which is the gradient of a quartic potential.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ReducedForce {
@@ -32,7 +36,8 @@ impl ReducedForce {
     /// Creates a force from its blocks, row-major matrices with one row per force component.
     ///
     /// # Errors
-    /// `Invalid` if r is not 1 to 512, a block has the wrong length, or an entry is not finite.
+    /// `Invalid` if r is not 1 to 512, a block has the wrong length, an entry is not finite, or the force is not the
+    /// gradient of a potential.
     pub fn new(rank: usize, linear: &[f64], quadratic: Vec<f64>, cubic: Vec<f64>) -> Result<Self> {
         let counts = monomial_counts(rank).ok_or_else(|| invalid_input("cub.r", "1 to 512", rank))?;
         for (field, length, count) in [
@@ -50,6 +55,9 @@ impl ReducedForce {
             }
         }
         let linear_block = DMatrix::from_row_slice(rank, rank, linear);
+        check_gradient("cub.linear", rank, 1, linear)?;
+        check_gradient("cub.quadratic", rank, 2, &quadratic)?;
+        check_gradient("cub.cubic", rank, 3, &cubic)?;
         Ok(Self { rank, linear_block, quadratic_block: quadratic, cubic_block: cubic })
     }
 
@@ -64,7 +72,7 @@ impl ReducedForce {
     /// Parses the bytes of a file.
     ///
     /// # Errors
-    /// `Invalid` if the counts do not match r, the size does not match the counts, or a number is not finite.
+    /// `Invalid` if the counts do not match r, the size does not match the counts, or as for [`Self::new`].
     pub fn parse(bytes: &[u8]) -> Result<Self> {
         let Some((header, body)) = bytes.split_at_checked(HEADER_BYTES) else {
             return Err(invalid_input("cub.size", "at least 16 bytes", bytes.len()));
@@ -162,6 +170,56 @@ impl ReducedForce {
         let cubic_term = multiply_block(&self.cubic_block, &cubic_monomials);
         [&self.linear_block * q, quadratic_term, cubic_term]
     }
+}
+
+/// Checks that a block of monomials of one degree is the gradient of a potential. Without a potential, the stiffness is
+/// asymmetric and the motion can gain energy without limit.
+///
+/// The coefficient v of a monomial M of the potential appears in the force component a of every coordinate q_a in M:
+/// there, M / q_a has the coefficient v times the exponent of q_a in M.
+fn check_gradient(field: &str, rank: usize, degree: usize, block: &[f64]) -> Result<()> {
+    let monomials = list_monomials(rank, degree);
+    let tolerance = GRADIENT_TOLERANCE * block.iter().fold(0.0, |largest: f64, entry| largest.max(entry.abs()));
+    // The coefficient of the potential according to the force component of the coordinate at `position` in M.
+    let potential_coefficient = |potential_monomial: &[usize], position: usize| {
+        let component = potential_monomial[position];
+        let mut monomial = potential_monomial.to_vec();
+        monomial.remove(position);
+        let exponent = potential_monomial.iter().filter(|index| **index == component).count() as f64;
+        let column = monomials.binary_search(&monomial).unwrap_or_default();
+        block[component * monomials.len() + column] / exponent
+    };
+    for monomial in &monomials {
+        for component in 0..rank {
+            let mut potential_monomial = monomial.clone();
+            let position = potential_monomial.partition_point(|index| *index < component);
+            potential_monomial.insert(position, component);
+            let (expected, given) =
+                (potential_coefficient(&potential_monomial, 0), potential_coefficient(&potential_monomial, position));
+            if (expected - given).abs() > tolerance {
+                let field = format!("{field}, component {component}, monomial {monomial:?}");
+                let expected = format!(
+                    "the gradient of a potential: {expected:e} as in component {}, both divided by the exponent",
+                    potential_monomial[0]
+                );
+                return Err(invalid_input(field, expected, format!("{given:e}")));
+            }
+        }
+    }
+    Ok(())
+}
+
+/// The monomials of a degree in lexicographic order, each as its ascending coordinates.
+fn list_monomials(rank: usize, degree: usize) -> Vec<Vec<usize>> {
+    let mut monomials = vec![vec![]];
+    for _ in 0..degree {
+        let extend = |monomial: Vec<usize>| {
+            let first = monomial.last().copied().unwrap_or(0);
+            (first..rank).map(move |index| [&monomial[..], &[index]].concat())
+        };
+        monomials = monomials.into_iter().flat_map(extend).collect();
+    }
+    monomials
 }
 
 /// The numbers of monomials of degree one, two and three in r coordinates; `None` unless r is 1 to 512.
@@ -267,12 +325,28 @@ pub(crate) mod tests {
             assert!((slope - q.dot(&force.force(&q))).abs() <= 1e-6 * slope.abs().max(1.0), "{slope}");
         }
         assert_eq!(force.force(&DVector::zeros(4)), DVector::zeros(4));
-        // In the gradient of a potential, the coefficient of q_0 q_0 q_1 in component 0 determines the coefficient of
-        // q_0 q_0 q_0 in component 1. Change only the first.
-        let mut non_gradient = force;
-        non_gradient.cubic_block[1] += 50.0;
-        let asymmetry = jacobian_errors(&non_gradient, &random_vector(1, 4)).asymmetry;
-        assert!(asymmetry > 1e-4, "expected an asymmetric Jacobian, got the asymmetry {asymmetry}");
+    }
+
+    /// Each change breaks one equality: of the linear block, of the quadratic block (q_0 q_1 in component 0 and q_0 q_0
+    /// in component 1), and of the cubic block (q_0 q_0 q_1 in component 0 and q_0 q_0 q_0 in component 1).
+    #[test]
+    fn forces_without_a_potential_are_rejected() {
+        let force = spring_chain(&[3.0, 5.0, 11.0, 400.0], 0.7, 0.4);
+        let parse = |force: &ReducedForce| ReducedForce::parse(&encode_file(force));
+        let (mut linear, mut quadratic, mut cubic) = (force.clone(), force.clone(), force.clone());
+        linear.linear_block[(0, 2)] += 1.0;
+        quadratic.quadratic_block[1] += 1.0;
+        cubic.cubic_block[1] += 1.0;
+        for (invalid_force, field) in [(linear, "cub.linear"), (quadratic, "cub.quadratic"), (cubic, "cub.cubic")] {
+            let asymmetry = jacobian_errors(&invalid_force, &random_vector(1, 4)).asymmetry;
+            assert!(asymmetry > 1e-5, "expected an asymmetric Jacobian, got the asymmetry {asymmetry}");
+            let error = parse(&invalid_force).expect_err("a force without potential").to_string();
+            assert!(error.starts_with(field) && error.contains("gradient of a potential"), "{error}");
+        }
+        // Rounding errors of an exporter.
+        let mut rounded = force;
+        rounded.cubic_block[1] += 1e-9;
+        parse(&rounded).expect("a valid file");
     }
 
     #[test]
