@@ -11,11 +11,14 @@ use serde_json::json;
 
 use crate::affine::AffineTransform;
 use crate::cubic::ReducedForce;
-use crate::error::{Result, invalid_input};
+use crate::error::{Result, check_option, invalid_input};
 use crate::model::{DomainModel, Model};
 use crate::newmark::{LoadChange, NewmarkState, ReducedSystem};
-use crate::run::{Report, Scenario, StepValues};
+use crate::run::{Report, Scenario, StepValues, aliasing_remark};
 use crate::vega::VegaSettings;
+
+/// Largest error of the deflection at equilibrium, as a fraction of the requested deflection.
+const DEFLECTION_TOLERANCE: f64 = 1e-3;
 
 /// Settings of the bridge scenario.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -72,9 +75,12 @@ impl BridgeScenario {
     /// Calibrates the load of the bridge.
     ///
     /// # Errors
-    /// `Invalid` if no domain has the rank of the forces, the stiffness is not positive definite, or the load cannot
-    /// deform the domain.
+    /// `Invalid` if an option is out of range, no domain has the rank of the forces, the stiffness is not positive definite, the load cannot
+    /// deform the domain, or the bridge has no stable equilibrium at the requested deflection.
     pub fn new(model: Model, force: ReducedForce, settings: &VegaSettings, options: BridgeOptions) -> Result<Self> {
+        check_option("dt", options.dt, f64::MIN_POSITIVE..=1e6)?;
+        check_option("deflection", options.deflection_fraction, 0.0..=0.5)?;
+        check_option("period", options.period, f64::MIN_POSITIVE..=1e6)?;
         let rank = force.rank();
         // The first domain with coordinates of its own and as many modes as the force.
         let domain = model.domains.iter().position(|domain| domain.owns_q && domain.rank == rank);
@@ -140,6 +146,10 @@ impl Scenario for BridgeScenario {
         let first_coordinate = self.model.domains[self.domain].first_coordinate;
         self.viewer_load.copy_from_slice(&forces[first_coordinate..][..self.system.rank()]);
         Ok(())
+    }
+
+    fn remarks(&self) -> Vec<String> {
+        aliasing_remark("the load", self.options.period, self.options.dt).into_iter().collect()
     }
 
     fn report(&self) -> Report {
@@ -216,6 +226,12 @@ fn max_sample_displacement(domain: &DomainModel, q: &DVector<f64>) -> f64 {
 
 /// Finds the strength of the load whose equilibrium has the target deflection (scene units). Increases the strength
 /// until the deflection reaches the target, then bisects. Each solve starts from the equilibrium of a smaller load.
+///
+/// A structure that softens has no equilibrium above some load: it would deflect without bound or snap to a distant
+/// state.
+///
+/// # Errors
+/// `Invalid` if no load deflects the bridge, or if no stable equilibrium has the target deflection.
 fn calibrate_load(
     system: &ReducedSystem,
     domain: &DomainModel,
@@ -253,13 +269,22 @@ fn calibrate_load(
             (low_strength, q_low) = (middle_strength, q);
         }
     }
-    Ok(LoadedEquilibrium { strength: high_strength, q: q_high })
+    let deflection = max_sample_displacement(domain, &q_high);
+    let is_equilibrium = system.is_equilibrium(&(unit_load * high_strength), &q_high);
+    if is_equilibrium && (deflection - target_deflection).abs() <= DEFLECTION_TOLERANCE * target_deflection {
+        return Ok(LoadedEquilibrium { strength: high_strength, q: q_high });
+    }
+    let stable_deflection = max_sample_displacement(domain, &q_low);
+    let expected = format!("a stable equilibrium at a deflection of {target_deflection} scene units (--deflection)");
+    let given = format!("a bridge that softens: the largest stable deflection is {stable_deflection}");
+    Err(invalid_input("load", expected, given))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::cubic::tests::spring_chain;
+    use crate::divergence::DivergenceCheck;
     use crate::hierarchy::tests::four_domain_model;
 
     const OPTIONS: BridgeOptions =
@@ -284,6 +309,50 @@ mod tests {
         (0..40).for_each(|_| bridge.compute_next_step(&mut last_values).expect("the next step"));
         assert!(first_values.q != last_values.q && first_values.transforms == last_values.transforms);
         assert!(bridge.peak_displacement / bridge.model.diagonal() < 0.2);
+    }
+
+    /// A bridge that softens: the potential a (q_0 - q_1)^4 with a < 0 has no minimum far from rest.
+    fn softening_bridge(deflection_fraction: f64) -> Result<BridgeScenario> {
+        let options = BridgeOptions { deflection_fraction, ..OPTIONS };
+        let force = spring_chain(&[40.0, 90.0], -30.0, 0.0);
+        BridgeScenario::new(four_domain_model(), force, &VegaSettings::default(), options)
+    }
+
+    #[test]
+    fn deflection_without_stable_equilibrium_is_rejected() {
+        let error = softening_bridge(0.5).err().expect("an error").to_string();
+        assert!(error.contains("stable equilibrium") && error.contains("softens"), "{error}");
+        // Negative control: the bridge withstands a small load.
+        let bridge = softening_bridge(0.03).expect("a valid scenario");
+        assert!((bridge.static_deflection_fraction - 0.03).abs() <= 1e-4);
+    }
+
+    /// A push beyond the potential barrier accelerates the softening bridge without bound.
+    #[test]
+    fn softening_bridge_stops_before_it_diverges() {
+        let mut bridge = softening_bridge(0.03).expect("a valid scenario");
+        let check = DivergenceCheck::new(&bridge.model);
+        bridge.set_viewer_forces(&[500.0, 0.0, 0.0, 0.0, 0.0, 0.0]).expect("a scenario with forces");
+        let mut values = StepValues::default();
+        let mut steps = (0..600).map(|step| {
+            bridge.compute_next_step(&mut values).expect("a step");
+            check.check(&bridge.model, step, 0.0, &values)
+        });
+        let error = steps.find_map(Result::err).expect("expected the bridge to diverge").to_string();
+        assert!(error.contains("of 'beam' diverged"), "{error}");
+    }
+
+    #[test]
+    fn load_that_steps_do_not_resolve_is_remarked() {
+        let remarks = |dt: f64, period: f64| {
+            let options = BridgeOptions { dt, period, ..OPTIONS };
+            let force = spring_chain(&[40.0, 90.0], 30.0, 4.0);
+            let bridge = BridgeScenario::new(four_domain_model(), force, &VegaSettings::default(), options);
+            bridge.expect("a valid scenario").remarks()
+        };
+        // With one step per period, the load is the same in all steps.
+        assert!(remarks(2.0, 2.0)[0].contains("the load has a period of 2 s"), "{:?}", remarks(2.0, 2.0));
+        assert_eq!(remarks(1.0 / 60.0, 2.0), [""; 0]);
     }
 
     #[test]

@@ -15,7 +15,7 @@ Examples:
 
 Exit codes: 0 done; 1 rejected by the server (unknown scene, or a scene with another writer); 2 invalid command line;
 3 connection failed or lost; 4 local file error; 5 invalid content of a file, a scene or a reply; 6 done, but the server
-rejected steps.";
+rejected steps; 7 stopped before a step that is not finite or far out of range.";
 
 /// Drives a scene of a modalcast server: wind on trees, a load on a bridge, or a sweep through all coordinates.
 #[derive(Debug, Parser)]
@@ -133,10 +133,12 @@ impl From<DeliveryOption> for Delivery {
 
 #[derive(Debug, Clone, Copy, Args)]
 pub(crate) struct WindOptions {
-    /// Strength of the wind. At 1, the crown sways by `--sway`.
+    /// Strength of the wind. At 1, the crown sways by `--sway`. The wind has the spectrum of turbulence 10 m above
+    /// suburbs or forest, and begins with its strongest gust.
     #[arg(long = "wind", value_name = "WIND", default_value_t = 1.0, value_parser = parse_non_negative)]
     pub(crate) strength: f64,
-    /// Peak displacement of the crown at wind 1, as a fraction of the scene's height.
+    /// Peak displacement of the crown in 30 s at wind 1, as a fraction of the scene's height. A shorter run may not reach
+    /// it.
     #[arg(long = "sway", value_name = "SWAY", default_value_t = 0.05, value_parser = parse_fraction)]
     pub(crate) sway_fraction: f64,
     /// Direction that the wind blows to, in degrees about the up axis from the first horizontal axis. At 25, the

@@ -1,4 +1,5 @@
-//! Errors of the physics process: errors of the gRPC client and of local files, and invalid input.
+//! Errors of the physics process: errors of the gRPC client and of local files, invalid input, and motion
+//! that diverges.
 
 /// The result type of this crate.
 pub type Result<T, E = Error> = std::result::Result<T, E>;
@@ -12,9 +13,26 @@ pub enum Error {
     /// A file, an option or a scene description has content that this process cannot use.
     #[error("{field}: expected {expected}, got {given}")]
     Invalid { field: String, expected: String, given: String },
+    /// The motion is not finite or far out of range. `subject` is a coordinate or a transform.
+    #[error(
+        "step {step} ({time} s): {subject} diverged: expected a displacement of at most {} diagonals of the scene, got {given}",
+        crate::divergence::MAX_DISPLACEMENT
+    )]
+    Diverged { step: u64, time: f64, subject: String, given: String },
 }
 
 /// Creates an `Invalid` error: `field` holds `given` instead of `expected`.
 pub fn invalid_input(field: impl Into<String>, expected: impl ToString, given: impl ToString) -> Error {
     Error::Invalid { field: field.into(), expected: expected.to_string(), given: given.to_string() }
+}
+
+/// Checks an option of a scenario.
+///
+/// # Errors
+/// `Invalid` unless `value` is in the range. NaN is in no range.
+pub(crate) fn check_option(field: &str, value: f64, range: std::ops::RangeInclusive<f64>) -> Result<()> {
+    if range.contains(&value) {
+        return Ok(());
+    }
+    Err(invalid_input(field, format!("a number from {:e} to {:e}", range.start(), range.end()), value))
 }

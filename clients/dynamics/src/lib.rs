@@ -6,8 +6,9 @@
 //! | `model` | converts a scene description into domain models: rank, joints, selected rows of U |
 //! | `affine` | affine transforms, and the rigid transform that best fits displaced points |
 //! | `hierarchy` | computes transforms that keep every joint closed, and measures the remaining gap |
+//! | `parameters` | reads and validates eigenvalues and damping ratios |
 //! | `oscillator` | integrates one linear mode over a step, exactly |
-//! | `wind` | wind pressure by time and position |
+//! | `wind` | wind pressure by time and position, from a spectrum of turbulence |
 //! | `tree` | a tree in the wind, by modal superposition |
 //! | `cubic` | reduced StVK forces from a `.cub` file, with Jacobian and potential |
 //! | `vega` | base frequency and damping from a `.config` file |
@@ -15,6 +16,7 @@
 //! | `bridge` | a bridge under a pulsating load |
 //! | `sweep` | motion for any scene: moves one coordinate after another, or rocks a rigid scene |
 //! | `viewer_forces` | reads the forces that viewers apply |
+//! | `divergence` | stops a run before it sends a step that is not finite or far out of range |
 //! | `run` | sends a scenario as a step stream, optionally records it, and reports the results |
 
 #![cfg_attr(not(test), deny(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::print_stdout))]
@@ -22,12 +24,16 @@
 pub mod affine;
 pub mod bridge;
 pub mod cubic;
+pub mod divergence;
 mod error;
 pub mod hierarchy;
 pub mod model;
 pub mod newmark;
 pub mod oscillator;
+pub mod parameters;
 pub mod run;
+#[cfg(test)]
+mod stability;
 pub mod sweep;
 pub mod tree;
 pub mod vega;
@@ -35,3 +41,8 @@ pub mod viewer_forces;
 pub mod wind;
 
 pub use error::{Error, Result, invalid_input};
+
+/// Compiles the client code in the project's README as a doctest.
+#[cfg(doctest)]
+#[doc = include_str!("../../../README.md")]
+struct ProjectReadme;

@@ -46,6 +46,7 @@ const fn exit_code(error: &Error) -> u8 {
     match error {
         Error::Client(error) => program::exit_code(error),
         Error::Invalid { .. } => 5,
+        Error::Diverged { .. } => 7,
     }
 }
 
@@ -57,6 +58,9 @@ async fn run_scenario(arguments: &Cli) -> Result<RunSummary> {
         None => common.scene.clone(),
     };
     let mut scenario = create_scenario(&client, &scene, &arguments.command).await?;
+    for remark in scenario.remarks() {
+        eprintln!("modalcast-sim: {scene}: {remark}");
+    }
     let (stop_sender, stop_receiver) = watch::channel(false);
     tokio::spawn(async move {
         wait_for_shutdown_signal().await;
@@ -100,7 +104,6 @@ async fn create_scenario(client: &Client, scene: &str, command: &Command) -> Res
             let model = Model::fetch(client, scene, MAX_TREE_SAMPLES).await?;
             let options = TreeOptions {
                 dt,
-                steps,
                 sway_fraction: wind.sway_fraction,
                 wind_strength: wind.strength,
                 direction_radians: wind.direction_degrees.to_radians(),

@@ -137,9 +137,10 @@ impl DomainModel {
         &self.samples[..self.surface_sample_count]
     }
 
-    /// The value of a note, if it is a finite number.
-    pub fn numeric_note(&self, name: &str) -> Option<f64> {
-        self.notes.get(name).and_then(|text| text.trim().parse().ok()).filter(|number: &f64| number.is_finite())
+    /// The largest displacement of a sample per unit of the coordinate of `mode`, at the rest placement, in scene units.
+    pub fn displacement_per_unit(&self, mode: usize) -> f64 {
+        let world_displacement = |sample: &Sample| (self.placement.linear * sample.column(mode, self.rank)).norm();
+        self.samples.iter().map(world_displacement).fold(0.0, f64::max)
     }
 }
 
@@ -148,7 +149,7 @@ impl Model {
     /// reduced, but not below 8, if the samples of all domains would have more than 8 Mi entries of U.
     ///
     /// # Errors
-    /// `Client` as for the calls; `Invalid` if the description contradicts itself.
+    /// `Client` as for the calls; `Invalid` if the description contradicts itself, or the scene is a single point.
     pub async fn fetch(client: &Client, scene: &str, max_surface_samples: usize) -> Result<Self> {
         let description_without_arrays = client.describe(scene, &[]).await?;
         let has_modes = description_without_arrays.domains.iter().any(|domain| domain.rank > 0);
@@ -223,17 +224,22 @@ impl Model {
         };
         let bounds_min = Vector3::from_column_slice(&bounds[..3]);
         let bounds_max = Vector3::from_column_slice(&bounds[3..]);
+        let diagonal = (bounds_max - bounds_min).norm();
+        if !(diagonal.is_finite() && diagonal > 0.0) {
+            return Err(invalid_input("scene.bounds", "finite bounds with a positive diagonal", diagonal));
+        }
         Ok(Self { scene: info.scene.clone(), domains, coordinate_count, up, bounds_min, bounds_max })
     }
 
     /// Diagonal of the bounds at rest, in scene units.
     pub fn diagonal(&self) -> f64 {
-        (self.bounds_max - self.bounds_min).norm().max(f64::MIN_POSITIVE)
+        (self.bounds_max - self.bounds_min).norm()
     }
 
-    /// Extent along the up axis at rest, in scene units.
+    /// Extent along the up axis at rest, in scene units. For a flat scene, which has no height, the diagonal.
     pub fn height(&self) -> f64 {
-        (self.bounds_max - self.bounds_min).dot(&self.up).max(f64::MIN_POSITIVE)
+        let extent = (self.bounds_max - self.bounds_min).dot(&self.up);
+        if extent > 1e-6 * self.diagonal() { extent } else { self.diagonal() }
     }
 
     /// The horizontal direction at an angle about the up axis, in radians, from the first horizontal axis (x, or y if x

@@ -141,6 +141,19 @@ impl ReducedSystem {
         self.minimize(&objective, initial_guess)
     }
 
+    /// Whether `q` is a stable equilibrium under a load: the forces balance up to 1e-6 of the load, and the stiffness is
+    /// positive semidefinite up to rounding.
+    pub fn is_equilibrium(&self, load: &DVector<f64>, q: &DVector<f64>) -> bool {
+        let residual = (self.force.force(q) * self.scale - load).norm();
+        let jacobian = self.force.jacobian(q);
+        let is_finite = q.iter().chain(jacobian.iter()).all(|number| number.is_finite());
+        if !is_finite || residual > 1e-6 * load.norm() + f64::MIN_POSITIVE {
+            return false;
+        }
+        let stiffness = (&jacobian + jacobian.transpose()) * 0.5;
+        stiffness.symmetric_eigenvalues().min() >= -1e-9 * jacobian.abs().max()
+    }
+
     /// Computes the state `dt` seconds later, under a changing load.
     #[must_use]
     pub fn advance(&self, state: &NewmarkState, dt: f64, load: LoadChange<'_>) -> NewmarkState {

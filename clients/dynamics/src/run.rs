@@ -6,11 +6,15 @@ use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
 use modalcast_client::npy::Writer as NpyWriter;
-use modalcast_client::{Client, Delivery, DriveRequest, Error as ClientError, StageSamples, Step, StepStream};
+use modalcast_client::{
+    Client, Delivery, DriveRequest, Error as ClientError, StageSamples, Step, StepStream, StreamSummary,
+};
 use serde_json::{Value, json};
 use tokio::sync::watch;
 
+use crate::divergence::DivergenceCheck;
 use crate::error::{Error, Result, invalid_input};
+use crate::hierarchy::compute_transforms;
 use crate::model::Model;
 use crate::viewer_forces::ViewerForces;
 
@@ -29,6 +33,22 @@ pub struct StepValues {
     pub transforms: Vec<[f32; 12]>,
 }
 
+impl StepValues {
+    /// The values at the given coordinates of the whole scene. The transforms keep all joints closed.
+    pub fn new(model: &Model, q: &[f64]) -> Self {
+        let transforms = compute_transforms(model, q, &[]);
+        Self {
+            q: q.iter().map(|coordinate| *coordinate as f32).collect(),
+            transforms: transforms.iter().map(|transform| transform.to_row_major()).collect(),
+        }
+    }
+
+    /// A step with all values, at `time` seconds.
+    pub fn to_step(&self, model: &Model, number: u64, time: f64) -> Step {
+        add_changes(model, Step::new(number, time), None, self)
+    }
+}
+
 /// Computes the values of all steps of a scene, one step after another.
 pub trait Scenario {
     /// The model of the scene.
@@ -36,8 +56,10 @@ pub trait Scenario {
 
     /// Overwrites `values` with the values of the next step. The first call computes step 0.
     ///
+    /// The values may be out of range: [`DivergenceCheck`] checks them before they are sent.
+    ///
     /// # Errors
-    /// `Invalid` if the values are not finite.
+    /// Those of the scenario.
     fn compute_next_step(&mut self, values: &mut StepValues) -> Result<()>;
 
     /// Sets the forces of viewers, which act in all later steps in addition to the load of the scenario: one number per
@@ -53,9 +75,26 @@ pub trait Scenario {
         ))
     }
 
+    /// Sentences about parts of the input that the motion does not show, such as modes that are held still. They hold for
+    /// the whole run.
+    fn remarks(&self) -> Vec<String> {
+        vec![]
+    }
+
     /// Results so far. The keys depend on the scenario; each scenario has the key `load`, which
     /// names the motion or the force.
     fn report(&self) -> Report;
+}
+
+/// A remark if steps of `dt` seconds do not resolve a periodic motion: with two steps per period or fewer, all steps may
+/// be equal. `subject` names the motion.
+pub fn aliasing_remark(subject: &str, period: f64, dt: f64) -> Option<String> {
+    (period <= 2.0 * dt).then(|| {
+        format!(
+            "{subject} has a period of {period} s, which steps of {dt} s do not resolve: choose steps below {} s",
+            0.5 * period
+        )
+    })
 }
 
 /// Settings of a run.
@@ -101,81 +140,126 @@ struct RunStats {
 /// Drives a scene until all steps are done or `stop_receiver` receives true.
 ///
 /// # Errors
-/// `Client` if the scene has another writer, the stream ends, or a record cannot be written. Errors of the scenario are
-/// returned unchanged.
+/// `Client` if the scene has another writer, the stream ends, or a record cannot be written. `Diverged` before a step
+/// that is not finite or far out of range would be sent. Errors of the scenario are returned unchanged. After an error
+/// of the scenario, the stream and the record end with the step before it.
 pub async fn drive_scene(
     client: &Client,
     scenario: &mut dyn Scenario,
     options: &RunOptions,
     stop_receiver: &watch::Receiver<bool>,
 ) -> Result<RunSummary> {
-    let scene = scenario.model().scene.clone();
-    let mut viewer_forces = match options.applies_viewer_forces {
-        true => Some(ViewerForces::subscribe(client, &scene).await?),
-        false => None,
-    };
-    let request = DriveRequest::new(&scene, options.delivery);
-    let request = options.window.into_iter().fold(request, DriveRequest::window);
-    let mut step_stream = client.drive(&request).await?;
-    let create_recorder = |folder| Recorder::create(folder, scenario.model());
-    let mut recorder = options.record_folder.as_deref().map(create_recorder).transpose()?;
-    let progress_bar = create_progress_bar(options.steps);
-    let start = Instant::now();
-    let mut stats = RunStats::default();
-    // The values of the last step sent. `None` before the first step and after a reported rejection.
-    let mut last_sent_values: Option<StepValues> = None;
-    let mut current_values = StepValues::default();
-    let mut step_number = 0;
-    while options.steps.is_none_or(|steps| step_number < steps) && !*stop_receiver.borrow() {
-        if let Some(viewer_forces) = &mut viewer_forces
-            && let Some(forces) = viewer_forces.take_changed(scenario.model()).await?
-        {
-            scenario.set_viewer_forces(&forces)?;
-        }
-        scenario.compute_next_step(&mut current_values)?;
-        let time = step_number as f64 * options.dt;
-        if options.realtime {
-            // Adding `Duration::MAX` itself would overflow.
-            let due_time = start + Duration::try_from_secs_f64(time).unwrap_or(Duration::MAX / 4);
-            tokio::time::sleep_until(due_time.into()).await;
-        }
-        let step =
-            add_changes(scenario.model(), Step::new(step_number, time), last_sent_values.as_ref(), &current_values);
-        // A rejection arrives late: it may concern this step or an earlier one.
-        let is_rejected = stats.record_rejection(step_stream.step(&step).await)?;
-        stats.payload_bytes += step.payload_bytes() as u64;
-        stats.record_acknowledgements(&step_stream);
-        if let Some(recorder) = &mut recorder {
-            recorder.write_row(&current_values)?;
-        }
-        // After a rejection the server lacks the values of some step, so the next step sends all values.
-        last_sent_values = if is_rejected { None } else { Some(std::mem::take(&mut current_values)) };
-        step_number += 1;
-        progress_bar.inc(1);
+    let mut driver = Driver::start(client, scenario, options).await?;
+    let outcome = driver.send_steps(options, stop_receiver).await;
+    if let Err(error @ Error::Client(_)) = outcome {
+        return Err(error);
     }
-    // Each flush reports at most one rejection. Repeat until no rejection is left.
-    while stats.record_rejection(step_stream.flush().await)? {}
-    stats.record_acknowledgements(&step_stream);
-    let (run_number, window) = (step_stream.run, step_stream.window);
-    let stream_summary = step_stream.finish().await?;
-    recorder.map(Recorder::finish).transpose()?;
-    progress_bar.finish_and_clear();
-    let elapsed = start.elapsed().as_secs_f64();
-    let mut report = scenario.report();
-    report.extend(stats.report());
+    let report = driver.finish().await;
+    outcome?;
+    let (stream_summary, mut report) = report?;
+    report.extend(scenario.report());
     report.extend(Report::from_iter([
-        ("scene".to_owned(), json!(scene)),
-        ("run".to_owned(), json!(run_number)),
-        ("window".to_owned(), json!(window)),
+        ("scene".to_owned(), json!(scenario.model().scene)),
         ("dt_s".to_owned(), json!(options.dt)),
-        ("steps_sent".to_owned(), json!(stream_summary.sent)),
-        ("last_acknowledged".to_owned(), json!(stream_summary.acknowledged)),
-        ("rejected".to_owned(), json!(stream_summary.rejected)),
-        ("skipped".to_owned(), json!(stream_summary.skipped)),
-        ("elapsed_s".to_owned(), json!(elapsed)),
-        ("steps_per_second".to_owned(), json!(stream_summary.sent as f64 / elapsed.max(1e-9))),
+        ("remarks".to_owned(), json!(scenario.remarks())),
     ]));
     Ok(RunSummary { sent_steps: stream_summary.sent, rejected_steps: stream_summary.rejected, report })
+}
+
+/// A run in progress.
+struct Driver<'a> {
+    scenario: &'a mut dyn Scenario,
+    check: DivergenceCheck,
+    viewer_forces: Option<ViewerForces>,
+    step_stream: StepStream,
+    recorder: Option<Recorder>,
+    progress_bar: ProgressBar,
+    start: Instant,
+    stats: RunStats,
+}
+
+impl<'a> Driver<'a> {
+    async fn start(client: &Client, scenario: &'a mut dyn Scenario, options: &RunOptions) -> Result<Self> {
+        let scene = &scenario.model().scene;
+        let viewer_forces = match options.applies_viewer_forces {
+            true => Some(ViewerForces::subscribe(client, scene).await?),
+            false => None,
+        };
+        let request = DriveRequest::new(scene, options.delivery);
+        let request = options.window.into_iter().fold(request, DriveRequest::window);
+        let step_stream = client.drive(&request).await?;
+        let create_recorder = |folder| Recorder::create(folder, scenario.model());
+        Ok(Self {
+            check: DivergenceCheck::new(scenario.model()),
+            viewer_forces,
+            step_stream,
+            recorder: options.record_folder.as_deref().map(create_recorder).transpose()?,
+            progress_bar: create_progress_bar(options.steps),
+            start: Instant::now(),
+            stats: RunStats::default(),
+            scenario,
+        })
+    }
+
+    async fn send_steps(&mut self, options: &RunOptions, stop_receiver: &watch::Receiver<bool>) -> Result<()> {
+        // The values of the last step sent. `None` before the first step and after a reported rejection.
+        let mut last_sent_values: Option<StepValues> = None;
+        let mut current_values = StepValues::default();
+        let mut step_number = 0;
+        while options.steps.is_none_or(|steps| step_number < steps) && !*stop_receiver.borrow() {
+            if let Some(viewer_forces) = &mut self.viewer_forces
+                && let Some(forces) = viewer_forces.take_changed(self.scenario.model()).await?
+            {
+                self.scenario.set_viewer_forces(&forces)?;
+            }
+            self.scenario.compute_next_step(&mut current_values)?;
+            let time = step_number as f64 * options.dt;
+            let model = self.scenario.model();
+            self.check.check(model, step_number, time, &current_values)?;
+            if options.realtime {
+                // Adding `Duration::MAX` itself would overflow.
+                let due_time = self.start + Duration::try_from_secs_f64(time).unwrap_or(Duration::MAX / 4);
+                tokio::time::sleep_until(due_time.into()).await;
+            }
+            let step = add_changes(model, Step::new(step_number, time), last_sent_values.as_ref(), &current_values);
+            // A rejection arrives late: it may concern this step or an earlier one.
+            let is_rejected = self.stats.record_rejection(self.step_stream.step(&step).await)?;
+            self.stats.payload_bytes += step.payload_bytes() as u64;
+            self.stats.record_acknowledgements(&self.step_stream);
+            if let Some(recorder) = &mut self.recorder {
+                recorder.write_row(&current_values)?;
+            }
+            // After a rejection the server lacks the values of some step, so the next step sends all values.
+            last_sent_values = if is_rejected { None } else { Some(std::mem::take(&mut current_values)) };
+            step_number += 1;
+            self.progress_bar.inc(1);
+        }
+        Ok(())
+    }
+
+    /// Waits for the acknowledgements of all steps and closes the stream and the record.
+    async fn finish(mut self) -> Result<(StreamSummary, Report)> {
+        // Each flush reports at most one rejection. Repeat until no rejection is left.
+        while self.stats.record_rejection(self.step_stream.flush().await)? {}
+        self.stats.record_acknowledgements(&self.step_stream);
+        let (run_number, window) = (self.step_stream.run, self.step_stream.window);
+        let stream_summary = self.step_stream.finish().await?;
+        self.recorder.map(Recorder::finish).transpose()?;
+        self.progress_bar.finish_and_clear();
+        let elapsed = self.start.elapsed().as_secs_f64();
+        let mut report = self.stats.report();
+        report.extend(Report::from_iter([
+            ("run".to_owned(), json!(run_number)),
+            ("window".to_owned(), json!(window)),
+            ("steps_sent".to_owned(), json!(stream_summary.sent)),
+            ("last_acknowledged".to_owned(), json!(stream_summary.acknowledged)),
+            ("rejected".to_owned(), json!(stream_summary.rejected)),
+            ("skipped".to_owned(), json!(stream_summary.skipped)),
+            ("elapsed_s".to_owned(), json!(elapsed)),
+            ("steps_per_second".to_owned(), json!(stream_summary.sent as f64 / elapsed.max(1e-9))),
+        ]));
+        Ok((stream_summary, report))
+    }
 }
 
 /// Adds to a step the values whose bits changed since the last step sent, or all values if there is none. A domain that

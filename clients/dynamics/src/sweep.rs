@@ -9,8 +9,8 @@ use serde_json::json;
 
 use crate::affine::AffineTransform;
 use crate::error::Result;
-use crate::model::{DomainModel, Model};
-use crate::run::{Report, Scenario, StepValues};
+use crate::model::Model;
+use crate::run::{Report, Scenario, StepValues, aliasing_remark};
 
 /// Amplitude of a rocking scene, in radians.
 const ROCKING_ANGLE: f64 = 0.05;
@@ -52,7 +52,7 @@ impl SweepScenario {
         for domain in &model.domains {
             let displacements = &mut displacements_per_unit[domain.first_coordinate..][..domain.rank];
             for (mode, displacement) in displacements.iter_mut().enumerate() {
-                *displacement = displacement.max(displacement_per_unit(domain, mode));
+                *displacement = displacement.max(domain.displacement_per_unit(mode));
             }
         }
         let amplitude = |displacement: f64| if displacement > 0.0 { target_displacement / displacement } else { 0.0 };
@@ -95,7 +95,8 @@ impl SweepScenario {
         }
         let model = &self.model;
         let center = 0.5 * (model.bounds_min + model.bounds_max);
-        let base: Vector3<f64> = center - model.up * (0.5 * model.height());
+        let extent = (model.bounds_max - model.bounds_min).dot(&model.up);
+        let base: Vector3<f64> = center - model.up * (0.5 * extent);
         let angle = ROCKING_ANGLE * (TAU * time / ROCKING_PERIOD).sin();
         AffineTransform::rotation_about(&model.ground_axes().short_axis, angle, &base)
     }
@@ -119,6 +120,11 @@ impl Scenario for SweepScenario {
         Ok(())
     }
 
+    fn remarks(&self) -> Vec<String> {
+        let rocks = self.model.coordinate_count == 0;
+        rocks.then(|| aliasing_remark("the rocking", ROCKING_PERIOD, self.options.dt)).flatten().into_iter().collect()
+    }
+
     fn report(&self) -> Report {
         let motion_description = match self.model.coordinate_count {
             0 => format!(
@@ -135,12 +141,6 @@ impl Scenario for SweepScenario {
             ("peak_of_diagonal".to_owned(), json!(peak_displacement_fraction)),
         ])
     }
-}
-
-/// The largest displacement of a sample of `domain` per unit of the coordinate of `mode`, in scene units.
-fn displacement_per_unit(domain: &DomainModel, mode: usize) -> f64 {
-    let world_displacement = |column: Vector3<f64>| (domain.placement.linear * column).norm();
-    domain.samples.iter().map(|sample| world_displacement(sample.column(mode, domain.rank))).fold(0.0, f64::max)
 }
 
 #[cfg(test)]

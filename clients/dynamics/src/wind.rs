@@ -1,86 +1,293 @@
-//! Wind pressure by time and position: a steady component, gusts that travel downwind, and turbulence per domain.
-//! Pressures are dimensionless: the tree scenario multiplies them by a calibrated strength. The same seed gives the
-//! same wind.
+//! Wind pressure by time and position: a mean wind with turbulence of von Karman's spectrum. The wind is a sum of
+//! cosines with random frequencies and phases (Shinozuka and Deodatis 1991), so that it is a function of time and of a
+//! seed.
+//!
+//! With the frequency n, the length scale L and the mean speed V, the spectra of the gust speeds along and across the
+//! wind are (von Karman 1948, in the form of ESDU 85020)
+//!
+//! ```text
+//! n S(n) / sigma^2 = 4 x / (1 + 70.8 x^2)^(5/6)                          along,  x = n L / V
+//! n S(n) / sigma^2 = 4 x (1 + 755.2 x^2) / (1 + 283.2 x^2)^(11/6)        across, with half the length scale
+//! ```
+//!
+//! Gusts travel with the mean wind. The gusts of two domains are less similar at higher frequencies: the magnitude of
+//! their normalized cross-spectrum is exp(-10 n d / V) (Davenport 1961), with one typical distance d for all pairs of
+//! domains. Slow gusts therefore move a tree as a whole, and fast ones each leaf on its own.
+//!
+//! The mean speed is that of a strong breeze. Turbulence intensity and length scale are those of EN 1991-1-4 (4.4 and
+//! annex B) 10 m above ground, between the terrain categories III and IV: suburbs or forest, and cities.
 
-use std::f64::consts::TAU;
+use std::f64::consts::{PI, TAU};
 
-use nalgebra::Vector3;
+use rayon::prelude::*;
 
-/// A periodic component of the downwind pressure.
-struct Gust {
-    /// Seconds.
-    period: f64,
-    /// Relative amplitude.
-    amplitude: f64,
-}
+use crate::model::MIN_DOMAINS_PER_THREAD;
 
-/// The gusts; their amplitudes add up to 1. Their periods have no simple ratios, so that the sum repeats only after a
-/// long time.
-const GUSTS: [Gust; 5] = [
-    Gust { period: 0.83, amplitude: 0.30 },
-    Gust { period: 1.31, amplitude: 0.30 },
-    Gust { period: 2.17, amplitude: 0.22 },
-    Gust { period: 3.71, amplitude: 0.12 },
-    Gust { period: 6.43, amplitude: 0.06 },
-];
+/// V, in m/s.
+const MEAN_SPEED: f64 = 12.0;
 
-/// The downwind channel of [`Wind::turbulence`].
-pub const DOWNWIND_CHANNEL: u64 = 0;
+/// L, in meters.
+const LENGTH_SCALE: f64 = 40.0;
 
-/// The crosswind channel of [`Wind::turbulence`].
-pub const CROSSWIND_CHANNEL: u64 = 1;
+/// Standard deviation of the gust speed along the wind, as a fraction of the mean speed.
+const TURBULENCE_INTENSITY: f64 = 0.35;
 
-/// Time at which all gusts peak together at the downwind position 0, in seconds.
-const PEAK_TIME: f64 = 0.55;
+/// Standard deviation of the gust speed across the wind, as a fraction of that along the wind.
+const CROSSWIND_RATIO: f64 = 0.75;
 
-/// Time in which the wind rises from 0 to its full pressure, in seconds.
+/// Factor in the exponent of the coherence.
+const COHERENCE_DECAY: f64 = 10.0;
+
+/// Distance between two domains in the coherence, in meters.
+const DOMAIN_DISTANCE: f64 = 2.0;
+
+/// Diagonal of a scene in meters, for the travel time of gusts. Scenes have any unit of length; this is the diagonal of
+/// a tree of 8 m.
+const SCENE_DIAGONAL: f64 = 10.0;
+
+/// Lowest and highest frequency in hertz. The range contains the first modes of trunks (about 0.5 Hz) and of leaves (3
+/// to 7 Hz).
+const FREQUENCY_RANGE: [f64; 2] = [0.05, 8.0];
+
+/// Number of cosines. The frequencies of neighbors differ by 8 % on average, less than the bandwidth of a mode with a
+/// damping ratio of 0.05 (10 %), so that no mode is between two frequencies.
+const COSINE_COUNT: usize = 64;
+
+/// Duration in which the start of the wind is selected, in seconds.
+const SEARCH_DURATION: f64 = 600.0;
+
+/// Duration over which a gust is averaged when the start of the wind is selected, in seconds.
+const GUST_DURATION: f64 = 1.0;
+
+/// Time of the strongest gust after the start of the wind, in seconds.
+const GUST_TIME: f64 = 0.6;
+
+/// Time in which the wind rises from 0, in seconds.
 const RISE_TIME: f64 = 0.35;
 
-/// A wind that blows in one horizontal direction.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Wind {
-    /// Seed of the turbulence.
-    pub seed: u64,
-    /// Unit vector of the direction that the wind blows to.
-    pub downwind: Vector3<f64>,
-    /// Horizontal unit vector at a right angle to `downwind`.
-    pub crosswind: Vector3<f64>,
-    /// Travel time of a gust, in seconds per scene unit.
-    pub delay_per_length: f64,
+/// Number of products that are summed separately, so that the compiler can vectorize the sums.
+const LANES: usize = 8;
+
+/// Direction of a gust speed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Component {
+    Downwind,
+    Crosswind,
 }
 
-/// Components of the dimensionless pressure along the two horizontal directions of a wind.
+/// Pressure relative to the pressure of the mean wind, along the two horizontal directions of a wind.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct WindPressure {
     pub downwind: f64,
     pub crosswind: f64,
 }
 
+/// Speeds of a gust, relative to the mean speed.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+struct GustSpeed {
+    downwind: f64,
+    crosswind: f64,
+}
+
+/// Settings of a wind.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct WindSettings {
+    /// Seed of all frequencies and phases.
+    pub seed: u64,
+    /// Diagonal of the scene's bounds, in scene units. It must be positive.
+    pub diagonal: f64,
+    /// Highest frequency of the wind in hertz. Frequencies that a run does not resolve are left out: they would appear
+    /// as slower gusts that the spectrum does not contain.
+    pub max_frequency: f64,
+}
+
+/// One frequency of the wind.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Cosine {
+    /// Hertz.
+    frequency: f64,
+    /// Amplitudes of the gust speeds along and across the wind, relative to the mean speed.
+    amplitudes: [f64; 2],
+}
+
+/// A wind that blows in one horizontal direction.
+#[derive(Debug, Clone)]
+pub struct Wind {
+    cosines: Vec<Cosine>,
+    /// Time of the sum of cosines at the start of the wind, in seconds.
+    start_time: f64,
+    /// Per domain: the factors of the gust speeds along and across the wind, in this order. Each has one factor per
+    /// cosine, then one per sine, padded to a multiple of `LANES`.
+    coefficients: Vec<f32>,
+    /// Number of factors of one gust speed of a domain.
+    coefficient_count: usize,
+    domain_count: usize,
+}
+
 impl Wind {
-    /// The pressure at `time` (seconds) on a domain. `downwind_position` is the domain's position along the wind, in
-    /// scene units. The pressure is 0 at time 0. Its downwind component consists of a steady part (0.55), gusts (at
-    /// most 0.45) and turbulence (at most 0.15).
-    pub fn pressure(&self, time: f64, domain: usize, downwind_position: f64) -> WindPressure {
-        let onset_factor = smoothstep(time / RISE_TIME);
-        let gust_time = time - PEAK_TIME - self.delay_per_length * downwind_position;
-        let gust_sum: f64 = GUSTS.iter().map(|gust| gust.amplitude * (TAU * gust_time / gust.period).cos()).sum();
-        WindPressure {
-            downwind: onset_factor * (0.55 + 0.45 * gust_sum + 0.15 * self.turbulence(time, domain, DOWNWIND_CHANNEL)),
-            crosswind: onset_factor * 0.25 * self.turbulence(time, domain, CROSSWIND_CHANNEL),
+    /// Creates a wind on domains at the given positions along the wind (scene units).
+    pub fn new(settings: &WindSettings, downwind_positions: &[f64]) -> Self {
+        let cosines: Vec<Cosine> = create_cosines(settings.seed)
+            .into_iter()
+            .filter(|cosine| cosine.frequency <= settings.max_frequency)
+            .collect();
+        let coefficient_count = (2 * cosines.len()).next_multiple_of(LANES);
+        let seconds_per_length = SCENE_DIAGONAL / MEAN_SPEED / settings.diagonal;
+        let coefficients = downwind_positions.par_iter().enumerate().flat_map_iter(|(domain, position)| {
+            let delay = seconds_per_length * position;
+            let downwind = coefficients(&cosines, settings.seed, Component::Downwind, domain, delay);
+            let crosswind = coefficients(&cosines, settings.seed, Component::Crosswind, domain, delay);
+            [downwind, crosswind].into_iter().flat_map(move |mut factors| {
+                factors.resize(coefficient_count, 0.0);
+                factors
+            })
+        });
+        Self {
+            start_time: find_start_time(&cosines, settings.seed),
+            coefficients: coefficients.collect(),
+            coefficient_count,
+            domain_count: downwind_positions.len(),
+            cosines,
         }
     }
 
-    /// Turbulence from -1 to 1: the mean of three sines. Their frequencies (0.3 to 2 Hz) and phases are random per
-    /// domain and channel ([`DOWNWIND_CHANNEL`] or [`CROSSWIND_CHANNEL`]).
-    pub fn turbulence(&self, time: f64, domain: usize, channel: u64) -> f64 {
-        let sine = |index: u64| {
-            // A different counter for each domain, channel and sine, and for its frequency and phase.
-            let counter = (domain as u64) * 16 + channel * 8 + 2 * index;
-            let hertz = 0.3 + 1.7 * hash_to_unit(self.seed, counter);
-            (TAU * (hertz * time + hash_to_unit(self.seed, counter + 1))).sin()
-        };
-        (0..3).map(sine).sum::<f64>() / 3.0
+    /// The highest frequency of all winds, in hertz.
+    pub const fn highest_frequency() -> f64 {
+        FREQUENCY_RANGE[1]
     }
+
+    /// The pressure on every domain `time` seconds after the start of the wind. It is 0 at time 0. The drag of a body is
+    /// proportional to the speed times the velocity of the wind.
+    pub fn pressures(&self, time: f64) -> Vec<WindPressure> {
+        let onset_factor = smoothstep(time / RISE_TIME);
+        let pressure = |gust: GustSpeed| {
+            let speed = (1.0 + gust.downwind).hypot(gust.crosswind);
+            WindPressure {
+                downwind: onset_factor * speed * (1.0 + gust.downwind),
+                crosswind: onset_factor * speed * gust.crosswind,
+            }
+        };
+        self.gust_speeds(time).map(pressure).collect()
+    }
+
+    /// The gust speed at every domain.
+    fn gust_speeds(&self, time: f64) -> impl IndexedParallelIterator<Item = GustSpeed> + '_ {
+        let angle = |cosine: &Cosine| TAU * (cosine.frequency * (self.start_time + time)).fract();
+        let cosines = self.cosines.iter().map(|cosine| angle(cosine).cos() as f32);
+        let sines = self.cosines.iter().map(|cosine| angle(cosine).sin() as f32);
+        let mut basis: Vec<f32> = cosines.chain(sines).collect();
+        basis.resize(self.coefficient_count, 0.0);
+        (0..self.domain_count).into_par_iter().with_min_len(MIN_DOMAINS_PER_THREAD).map(move |domain| {
+            let count = self.coefficient_count;
+            let (downwind, crosswind) = self.coefficients[2 * count * domain..][..2 * count].split_at(count);
+            GustSpeed { downwind: dot(downwind, &basis), crosswind: dot(crosswind, &basis) }
+        })
+    }
+}
+
+/// The frequencies of all winds of a seed, in bands of equal ratio. Each is random in its band, so that the sum does not
+/// repeat. The amplitudes have the energy of the spectrum in the band.
+fn create_cosines(seed: u64) -> Vec<Cosine> {
+    let cosine = |index: usize| {
+        let (low, high) = (band_edge(index), band_edge(index + 1));
+        let amplitude = |component| (2.0 * integrate_spectrum(component, low, high)).sqrt();
+        Cosine {
+            frequency: low * (high / low).powf(hash_to_unit(seed, u64::MAX - index as u64)),
+            amplitudes: [amplitude(Component::Downwind), amplitude(Component::Crosswind)],
+        }
+    };
+    (0..COSINE_COUNT).map(cosine).collect()
+}
+
+/// The lower edge of a frequency band, in hertz.
+fn band_edge(index: usize) -> f64 {
+    let [lowest, highest] = FREQUENCY_RANGE;
+    lowest * (highest / lowest).powf(index as f64 / COSINE_COUNT as f64)
+}
+
+/// The spectrum n S(n) of a gust speed relative to the mean speed, at `frequency` hertz: see the module documentation.
+fn spectrum(component: Component, frequency: f64) -> f64 {
+    match component {
+        Component::Downwind => {
+            let x = frequency * LENGTH_SCALE / MEAN_SPEED;
+            TURBULENCE_INTENSITY.powi(2) * 4.0 * x / (1.0 + 70.8 * x * x).powf(5.0 / 6.0)
+        }
+        Component::Crosswind => {
+            let x = frequency * 0.5 * LENGTH_SCALE / MEAN_SPEED;
+            (CROSSWIND_RATIO * TURBULENCE_INTENSITY).powi(2) * 4.0 * x * (1.0 + 755.2 * x * x)
+                / (1.0 + 283.2 * x * x).powf(11.0 / 6.0)
+        }
+    }
+}
+
+/// The variance of a gust speed between two frequencies: the integral of n S(n) over ln n, by Simpson's rule.
+fn integrate_spectrum(component: Component, low: f64, high: f64) -> f64 {
+    let middle = (low * high).sqrt();
+    let sum = spectrum(component, low) + 4.0 * spectrum(component, middle) + spectrum(component, high);
+    sum * (high / low).ln() / 6.0
+}
+
+/// Magnitude of the normalized cross-spectrum of two domains.
+fn coherence(frequency: f64) -> f64 {
+    (-COHERENCE_DECAY * frequency * DOMAIN_DISTANCE / MEAN_SPEED).exp()
+}
+
+/// The factors of the cosines, then of the sines, of a gust speed. A domain has its own gusts and those of the whole
+/// scene, which arrive `delay` seconds later than at the position 0. Their energies add up to that of the spectrum.
+fn coefficients(cosines: &[Cosine], seed: u64, component: Component, domain: usize, delay: f64) -> Vec<f32> {
+    let phasor = |(index, cosine): (usize, &Cosine)| {
+        let coherence = coherence(cosine.frequency);
+        let scene_angle = scene_phase(seed, component, index) - TAU * (cosine.frequency * delay).fract();
+        let counter = ((domain as u64 + 1) * 2 + component as u64) * COSINE_COUNT as u64 + index as u64;
+        let own_angle = TAU * hash_to_unit(seed, counter);
+        let (scene_amplitude, own_amplitude) = (coherence.sqrt(), (1.0 - coherence).sqrt());
+        // cos(a + b) = cos a cos b - sin a sin b.
+        let amplitude = cosine.amplitudes[component as usize];
+        [
+            (amplitude * (scene_amplitude * scene_angle.cos() + own_amplitude * own_angle.cos())) as f32,
+            (-amplitude * (scene_amplitude * scene_angle.sin() + own_amplitude * own_angle.sin())) as f32,
+        ]
+    };
+    let phasors: Vec<[f32; 2]> = cosines.iter().enumerate().map(phasor).collect();
+    (0..2).flat_map(|part| phasors.iter().map(move |phasor| phasor[part])).collect()
+}
+
+/// The phase of the gusts of the whole scene, in radians.
+fn scene_phase(seed: u64, component: Component, index: usize) -> f64 {
+    TAU * hash_to_unit(seed, (component as u64) * COSINE_COUNT as u64 + index as u64)
+}
+
+/// Finds the start of the wind such that its strongest gust comes after `GUST_TIME`. A short run then shows a gust, and
+/// the wind does not become much stronger later.
+fn find_start_time(cosines: &[Cosine], seed: u64) -> f64 {
+    let amplitude = |cosine: &Cosine| {
+        // The mean of a cosine over a duration d has the amplitude sin(pi n d) / (pi n d).
+        let angle = PI * cosine.frequency * GUST_DURATION;
+        cosine.amplitudes[Component::Downwind as usize] * coherence(cosine.frequency).sqrt() * angle.sin() / angle
+    };
+    let amplitudes: Vec<f64> = cosines.iter().map(amplitude).collect();
+    let phases: Vec<f64> = (0..cosines.len()).map(|index| scene_phase(seed, Component::Downwind, index)).collect();
+    let mean_gust = |time: f64| -> f64 {
+        let terms = cosines.iter().zip(&amplitudes).zip(&phases);
+        terms.map(|((cosine, amplitude), phase)| amplitude * (TAU * cosine.frequency * time + phase).cos()).sum()
+    };
+    let times = (0..(10.0 * SEARCH_DURATION) as u32).into_par_iter().map(|index| 0.1 * f64::from(index));
+    // Of equal gusts, the first one: the result does not depend on the number of threads.
+    let gusts = times.map(|time| (mean_gust(time), time));
+    let strongest = gusts
+        .max_by(|(a_gust, a_time), (b_gust, b_time)| a_gust.total_cmp(b_gust).then_with(|| b_time.total_cmp(a_time)));
+    strongest.map_or(0.0, |(_, time)| time) - GUST_TIME
+}
+
+/// The sum of products. Both slices have the same multiple of `LANES` entries.
+fn dot(a: &[f32], b: &[f32]) -> f64 {
+    let mut sums = [0.0_f32; LANES];
+    for (a_lanes, b_lanes) in a.as_chunks::<LANES>().0.iter().zip(b.as_chunks::<LANES>().0) {
+        for lane in 0..LANES {
+            sums[lane] += a_lanes[lane] * b_lanes[lane];
+        }
+    }
+    f64::from(sums.iter().sum::<f32>())
 }
 
 /// A smooth step: 0 if x is below 0, 1 if x is above 1, and a cubic polynomial in between.
@@ -98,39 +305,4 @@ fn hash_to_unit(seed: u64, counter: u64) -> f64 {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn wind_starts_at_zero_and_depends_on_seed_and_domain() {
-        let wind = Wind { seed: 1, downwind: Vector3::x(), crosswind: Vector3::z(), delay_per_length: 0.1 };
-        assert_eq!(wind.pressure(0.0, 3, 0.5), WindPressure { downwind: 0.0, crosswind: 0.0 });
-        let other_wind = Wind { seed: 2, ..wind };
-        let mut max_pressure = 0.0_f64;
-        for step in 1..2000 {
-            let time = f64::from(step) * 0.01;
-            let pressure = wind.pressure(time, 3, 0.5);
-            assert_eq!(pressure, wind.pressure(time, 3, 0.5));
-            assert_ne!(pressure, wind.pressure(time, 4, 0.5), "domains 3 and 4 at {time} s");
-            assert_ne!(pressure, other_wind.pressure(time, 3, 0.5), "seeds 1 and 2 at {time} s");
-            max_pressure = max_pressure.max(pressure.downwind.abs()).max(pressure.crosswind.abs());
-        }
-        // The largest possible pressure is 0.55 + 0.45 + 0.15 = 1.15.
-        assert!(max_pressure <= 1.2, "expected at most 1.2, got {max_pressure}");
-    }
-
-    #[test]
-    fn gust_arrives_later_downwind() {
-        let wind = Wind { seed: 1, downwind: Vector3::x(), crosswind: Vector3::z(), delay_per_length: 0.2 };
-        let peak_step = |downwind_position: f64| {
-            let gust_pressure = |step: &i32| {
-                let time = f64::from(*step) * 0.01;
-                wind.pressure(time, 0, downwind_position).downwind - 0.15 * wind.turbulence(time, 0, DOWNWIND_CHANNEL)
-            };
-            // Start after 0.4 s, when the wind has reached its full pressure.
-            (40..300).max_by(|a, b| gust_pressure(a).total_cmp(&gust_pressure(b))).unwrap_or(0)
-        };
-        // A delay of 0.2 s per scene unit over 2 units, in steps of 0.01 s.
-        assert_eq!(peak_step(2.0) - peak_step(0.0), 40);
-    }
-}
+mod tests;

@@ -221,6 +221,64 @@ async fn forces_of_viewers_act_on_request() {
     assert!(sim_output.exit_code == 5 && sim_output.stderr.contains("--forces"), "{}", sim_output.stderr);
 }
 
+/// Invalid parameters of modes stop the process before the first step.
+#[tokio::test(flavor = "multi_thread")]
+async fn invalid_parameters_stop_before_the_first_step() {
+    let set_damping = |server: &mut FakeServer, text: &str| {
+        server.domains[1].wire.notes.insert("damping_ratio".into(), text.into());
+    };
+    let cases: [(&dyn Fn(&mut FakeServer), &str); 4] = [
+        (&|server| set_damping(server, "nan"), "damping_ratio"),
+        (&|server| set_damping(server, "five"), "damping_ratio"),
+        (&|server| server.domains[1].shape.eigenvalues[1] = -40.0, "eigenvalues[1]"),
+        (&|server| server.domains[1].shape.eigenvalues = vec![40.0], "eigenvalues"),
+    ];
+    for (change, field) in cases {
+        let mut server = tree_server();
+        change(&mut server);
+        let server = Arc::new(server);
+        let url = serve(Arc::clone(&server)).await;
+        let sim_output = run_sim(&url, &["tree", "--scene", "toy", "--steps", "3"]).await;
+        assert!(sim_output.exit_code == 5 && sim_output.stderr.contains(field), "{}", sim_output.stderr);
+        assert!(server.steps.lock().expect("lock").is_empty(), "expected no step");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn held_modes_and_unresolved_gusts_are_said() {
+    let mut server = tree_server();
+    server.domains[1].shape.eigenvalues[0] = 0.0;
+    let url = serve(Arc::new(server)).await;
+    let sim_output = run_sim(&url, &["tree", "--scene", "toy", "--steps", "3", "--dt", "0.5", "--json"]).await;
+    assert_eq!(sim_output.exit_code, 0, "{}", sim_output.stderr);
+    let report = sim_output.report();
+    for (index, remark) in ["1 modes have no stiffness", "gusts above 1 Hz"].into_iter().enumerate() {
+        assert!(sim_output.stderr.contains(remark), "{}", sim_output.stderr);
+        assert!(report["remarks"][index].as_str().expect("a remark").contains(remark), "{report}");
+    }
+}
+
+/// The process names what has diverged, and sends only the steps before.
+#[tokio::test(flavor = "multi_thread")]
+async fn diverging_run_stops_before_the_step_is_sent() {
+    let mut server = tree_server();
+    let force = v1::Force { id: 1, domain: 1, kind: None };
+    server.forces = vec![v1::AppliedForce { owner: 1, force: Some(force), f_q: pack(&[0.0, 1e30_f32]).into() }];
+    let server = Arc::new(server);
+    let url = serve(Arc::clone(&server)).await;
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let record = folder.path().display().to_string();
+    let arguments = ["tree", "--scene", "toy", "--steps", "20", "--forces", "--record", &record];
+    let sim_output = run_sim(&url, &arguments).await;
+    assert_eq!(sim_output.exit_code, 7, "{}", sim_output.stderr);
+    assert!(sim_output.stderr.contains("q[1] of ") && sim_output.stderr.contains("diverged"), "{}", sim_output.stderr);
+    let steps = server.steps.lock().expect("lock");
+    // Step 0 is the rest state, on which the force has not acted yet.
+    assert!(!steps.is_empty() && steps.len() < 20, "{} steps", steps.len());
+    assert!(steps.iter().flat_map(|step| fake::decode_f32(&step.q)).all(|number| number.abs() < 1e3));
+    assert_eq!(read_npy(&folder.path().join("q.npy")).len(), 6 * steps.len());
+}
+
 /// The expected codes are those of `modalcast-sim --help`: 1 rejected by the server, 2 command line, 3 connection, 4
 /// local file, 5 invalid content.
 #[tokio::test(flavor = "multi_thread")]

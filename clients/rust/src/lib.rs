@@ -49,8 +49,3 @@ pub use step_stream::{Ack, DriveRequest, StepStream, StreamSummary};
 pub use tonic::Code;
 pub use vertex_sections::VertexSetDomain;
 pub use vertices::{Attribute, Encoding, VertexRequest, VertexSelection, VertexSet, VertexStream, VertexStreamRequest};
-
-/// Compiles the client code in the project's README as a doctest.
-#[cfg(doctest)]
-#[doc = include_str!("../../../README.md")]
-struct ProjectReadme;

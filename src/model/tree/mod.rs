@@ -1,10 +1,10 @@
 //! The built-in scene `tree`, generated from a seed.
 //!
 //! A trunk of 6.8 m carries boughs and twigs, boughs carry twigs, and boughs and twigs carry leaf clusters. Every
-//! wooden part is a clamped Euler-Bernoulli beam along its centerline, loaded with the masses of its children at their
-//! joints: point masses with the consistent mass matrix. The modes of the beam are lifted to the part's skin, its surface mesh. The skin consists of rings: each ring
-//! is the circle of vertices around one point of the centerline. Modes are mass-orthonormal: U^T M U = I with M in kg.
-//! U is in 1/sqrt(kg) and q in m sqrt(kg), so that the modal forces are U^T f with f in newtons.
+//! wooden part is a clamped Euler-Bernoulli beam along its centerline, loaded with the masses of its children as point
+//! masses at their joints. The modes of the beam are lifted to the part's skin, its surface mesh. The skin consists of
+//! rings: each ring is the circle of vertices around one point of the centerline. Modes are mass-orthonormal: U^T M U = I
+//! with M in kg. U is in 1/sqrt(kg) and q in m sqrt(kg), so that the modal forces are U^T f with f in newtons.
 //!
 //! The coordinate frame of a part has its origin at the center of the part's base, +Y along the start of the
 //! centerline, and +Z as close to the world's up direction as possible.
