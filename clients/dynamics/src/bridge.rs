@@ -75,8 +75,8 @@ impl BridgeScenario {
     /// Calibrates the load of the bridge.
     ///
     /// # Errors
-    /// `Invalid` if an option is out of range, no domain has the rank of the forces, the stiffness is not positive definite, the load cannot
-    /// deform the domain, or the bridge has no stable equilibrium at the requested deflection.
+    /// `Invalid` if an option is out of range, no domain has the rank of the forces, the stiffness is not positive
+    /// definite, the load cannot deform the domain, or the bridge has no stable equilibrium at the requested deflection.
     pub fn new(model: Model, force: ReducedForce, settings: &VegaSettings, options: BridgeOptions) -> Result<Self> {
         check_option("dt", options.dt, f64::MIN_POSITIVE..=1e6)?;
         check_option("deflection", options.deflection_fraction, 0.0..=0.5)?;

@@ -137,7 +137,7 @@ pub(crate) struct WindOptions {
     /// suburbs or forest, and begins with its strongest gust.
     #[arg(long = "wind", value_name = "WIND", default_value_t = 1.0, value_parser = parse_non_negative)]
     pub(crate) strength: f64,
-    /// Peak displacement of the crown in 30 s at wind 1, as a fraction of the scene's height. A shorter run may not reach
+    /// Peak displacement of the crown in 30 s at wind 1, as a fraction of the scene's height. Shorter runs may not reach
     /// it.
     #[arg(long = "sway", value_name = "SWAY", default_value_t = 0.05, value_parser = parse_fraction)]
     pub(crate) sway_fraction: f64,

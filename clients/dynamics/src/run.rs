@@ -75,8 +75,8 @@ pub trait Scenario {
         ))
     }
 
-    /// Sentences about parts of the input that the motion does not show, such as modes that are held still. They hold for
-    /// the whole run.
+    /// Sentences about parts of the input that the motion does not show, such as modes that are held still. They hold
+    /// for the whole run.
     fn remarks(&self) -> Vec<String> {
         vec![]
     }

@@ -227,7 +227,8 @@ async fn invalid_parameters_stop_before_the_first_step() {
     let set_damping = |server: &mut FakeServer, text: &str| {
         server.domains[1].wire.notes.insert("damping_ratio".into(), text.into());
     };
-    let cases: [(&dyn Fn(&mut FakeServer), &str); 4] = [
+    type Change<'a> = &'a dyn Fn(&mut FakeServer);
+    let cases: [(Change<'_>, &str); 4] = [
         (&|server| set_damping(server, "nan"), "damping_ratio"),
         (&|server| set_damping(server, "five"), "damping_ratio"),
         (&|server| server.domains[1].shape.eigenvalues[1] = -40.0, "eigenvalues[1]"),

@@ -123,8 +123,8 @@ impl TreeScenario {
     /// Calibrates the wind for the tree.
     ///
     /// # Errors
-    /// `Invalid` if the scene has no eigenvalues; if an option, an eigenvalue or a damping ratio is out of range; or if the
-    /// wind does not deform any domain.
+    /// `Invalid` if the scene has no eigenvalues; if an option, an eigenvalue or a damping ratio is out of range; or if
+    /// the wind does not deform any domain.
     pub fn new(model: Model, options: TreeOptions) -> Result<Self> {
         options.check()?;
         if model.domains.iter().all(|domain| domain.eigenvalues.is_empty()) {
