@@ -1,9 +1,10 @@
-// AOV (arbitrary output variable) readback of one field: DEPTH, NORMALS or VALUES. The macro of that name is defined.
-// SAMPLES is 1 with DEPTH and NORMALS.
+// AOV (arbitrary output variable) readback of one field: DEPTH, DEPTH_WITH_GROUND, NORMALS or VALUES. The macro of
+// that name is defined. SAMPLES is 1 except with VALUES.
 //   ids      (in)  [height][width][SAMPLES]  R32UI, bottom row first; NO_ID where no surface is visible
 //   values   (in)  [vertices]                a scalar per vertex, with VALUES
 //   words    (out) top row first, one of
-//     DEPTH    [height][width]           f32: depth along the view axis times `scale`, in meters; infinite with NO_ID
+//     DEPTH    [height][width]           f32: depth along the view axis times `scale`, in meters; infinite with NO_ID.
+//                                        With DEPTH_WITH_GROUND, NO_ID has the depth of visible ground.
 //     NORMALS  [height][width][3]        f32: unit normal of the visible side; zeros with NO_ID
 //     VALUES   [height][width][SAMPLES]  two 16-bit fixed-point numbers from 0 to 1. Low half: value times `scale`.
 //                                        High half: cosine between the normal and the direction to the eye, at least
@@ -44,12 +45,14 @@ vec3 normalize_or_zero(vec3 v) {
     return max_component > 0.0 && !isinf(max_component) ? normalize(v / max_component) : vec3(0.0);
 }
 
-#ifdef DEPTH
+#if defined(DEPTH) || defined(DEPTH_WITH_GROUND)
 float depth_of(uint id, vec2 ndc) {
-    if (id == NO_ID) return uintBitsToFloat(0x7F800000u); // infinity
 #ifdef HAS_GROUND
-    if (id == GROUND_ID) return ground_ray_depth(view_ray(ndc));
+    // `eye.w` is 1 if the camera is above the ground.
+    vec3 direction = view_ray(ndc);
+    if (id == NO_ID && frame.eye.w > 0.0 && ray_hits_ground(direction)) return ground_ray_depth(direction);
 #endif
+    if (id == NO_ID) return uintBitsToFloat(0x7F800000u); // infinity
     SurfacePoint surface = interpolate_surface(int(id - 1u), ndc);
     return dot(surface.depths, surface.weights);
 }
@@ -83,7 +86,7 @@ void main() {
         // Unlike `load_id`, this line reads no depth: the ids of this pass are cleared, so each id is valid.
         uint id = texelFetch(ids, pixel, sample_index).x;
         vec2 ndc = 2.0 * (vec2(pixel) + SAMPLE_POSITIONS[sample_index]) / vec2(size) - 1.0;
-#ifdef DEPTH
+#if defined(DEPTH) || defined(DEPTH_WITH_GROUND)
         words[output_index] = floatBitsToUint(scale * depth_of(id, ndc));
 #endif
 #ifdef NORMALS

@@ -19,7 +19,7 @@ void main() {
     uint previous_id = NO_ID;
     for (int sample_index = 0; sample_index < SAMPLES; sample_index++) {
         uint id = load_id(pixel, sample_index);
-        if (id != NO_ID && id != GROUND_ID && id != previous_id) record_triangle(id - 1u);
+        if (id != NO_ID && id != previous_id) record_triangle(id - 1u);
         previous_id = id;
     }
 }

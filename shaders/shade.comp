@@ -1,6 +1,6 @@
 // Deferred shading: converts ids to the color of each pixel, in linear light. A triangle is shaded once per pixel, at
 // the center of the samples that see it. The color of a pixel is the mean of its samples after the tone curve.
-//   ids           (in)   [height][width][SAMPLES]  R32UI; NO_ID for sky, and for ground that was not rasterized
+//   ids           (in)   [height][width][SAMPLES]  R32UI; NO_ID for sky and ground
 //   blend_layers  (in)   [height][width][SAMPLES]  RGBA16F: light of the blended surfaces, transmittance
 //   scene_color   (out)  [height][width]           RGBA16F
 //   bloom_source  (out)  [height][width]           RGBA16F: light above the bloom threshold
@@ -28,7 +28,7 @@ layout(rgba16f, binding = 1) uniform writeonly image2D bloom_source;
 shared uint tile_has_triangle;
 #endif
 
-// Id of a sample. Ground that was not rasterized is behind everything else.
+// Id of a sample. The ground is behind all triangles, also those below it, so that it never hides a deformed object.
 uint sample_id(ivec2 pixel, int sample_index, ivec2 size) {
     uint id = load_id(pixel, sample_index);
 #ifdef HAS_GROUND

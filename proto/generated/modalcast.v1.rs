@@ -2682,8 +2682,8 @@ pub struct Hit {
     pub modes: ::prost::bytes::Bytes,
 }
 /// The quantity that a picture shows. Color is the mean of a pixel's samples. Depth, domains and normals are sampled
-/// once, at the center of the pixel. They show the opaque surface behind blended surfaces. Only color and depth contain
-/// the ground. In all other outputs the ground occludes nothing.
+/// once, at the center of the pixel. They show the opaque surface behind blended surfaces. The ground hides no surface, not
+/// even one that lies below it. Only OUTPUT_COLOUR and OUTPUT_DEPTH_WITH_GROUND contain it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
 #[repr(i32)]
 pub enum Output {
@@ -2705,6 +2705,8 @@ pub enum Output {
     Displacement = 5,
     /// A color map of one column of U: the norm of its three entries at each point, in meters per unit of q.
     ModeShape = 6,
+    /// FORMAT_F32: as OUTPUT_DEPTH, with the depth of the ground where the ground is visible and no surface is.
+    DepthWithGround = 7,
 }
 impl Output {
     /// String value of the enum field names used in the ProtoBuf definition.
@@ -2720,6 +2722,7 @@ impl Output {
             Self::Normals => "OUTPUT_NORMALS",
             Self::Displacement => "OUTPUT_DISPLACEMENT",
             Self::ModeShape => "OUTPUT_MODE_SHAPE",
+            Self::DepthWithGround => "OUTPUT_DEPTH_WITH_GROUND",
         }
     }
     /// Creates an enum from field names used in the ProtoBuf definition.
@@ -2732,6 +2735,7 @@ impl Output {
             "OUTPUT_NORMALS" => Some(Self::Normals),
             "OUTPUT_DISPLACEMENT" => Some(Self::Displacement),
             "OUTPUT_MODE_SHAPE" => Some(Self::ModeShape),
+            "OUTPUT_DEPTH_WITH_GROUND" => Some(Self::DepthWithGround),
             _ => None,
         }
     }

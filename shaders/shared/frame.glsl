@@ -5,7 +5,7 @@ layout(std140, binding = 0) uniform FrameBlock {
     mat4 shadow_from_world;    // to x, y and depth in the shadow map, each from 0 to 1
     mat4 world_from_ndc;       // from (x, y, 1) in normalized device coordinates to the direction of a view ray
     vec4 eye;                  // w: 1 if the scene has a ground and the camera is above it, else 0
-    vec4 to_sun;               // w: 0 if the ground lies behind all surfaces, so that the shading adds it; else 1
+    vec4 to_sun;               // w: 0
     vec4 sunlight;
     vec4 skylight;
     vec4 zenith;

@@ -21,16 +21,3 @@ float ground_ray_depth(vec3 direction) {
     return (frame.up.w - dot(frame.eye.xyz, frame.up.xyz)) / ascent;
 }
 #endif
-
-// Depth of the ground plane in normalized device coordinates at an image point. It is linear in the image, also above
-// the horizon. `slope`: change of the depth per unit of x and y.
-float ground_plane_depth(vec2 ndc, out vec2 slope) {
-    float eye_height = dot(frame.eye.xyz, frame.up.xyz) - frame.up.w;
-    // The inverse of the ground's depth along a view ray is dot(descents, vec3(ndc, 1)).
-    vec3 descents = -frame.up.xyz * mat3(frame.world_from_ndc) / eye_height;
-    // z and w in clip space: of the eye, and of the ground point divided by its depth.
-    vec2 eye_zw = (frame.clip_from_world * vec4(frame.eye.xyz, 1.0)).zw;
-    vec2 plane_zw = (frame.clip_from_world * vec4(view_ray(ndc), 0.0)).zw + dot(descents, vec3(ndc, 1.0)) * eye_zw;
-    slope = eye_zw.x / plane_zw.y * descents.xy;
-    return plane_zw.x / plane_zw.y;
-}

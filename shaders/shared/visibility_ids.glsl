@@ -1,5 +1,5 @@
-// Id of a sample in the visibility image: NO_ID, GROUND_ID, or the index of a triangle in the draw order plus 1. Twin:
-// `VisibilityId` in src/render/types.rs.
+// Id of a sample in the visibility image: NO_ID, or the index of a triangle in the draw order plus 1. The shading
+// replaces NO_ID by GROUND_ID where a view ray hits the ground. Twin: `VisibilityId` in src/render/types.rs.
 const uint NO_ID = 0u;
 const uint GROUND_ID = 0xFFFFFFFFu;
 

@@ -14,8 +14,7 @@
 //! | cull | lists of the triangles that the camera may see (compute) | triangles are culled |
 //! | visibility | triangle id and depth of each sample, with holes of cut-outs | some triangle is not blended |
 //! | record visible | triangles that are visible, as the occluders of the next frame (compute) | occlusion culling |
-//! | unpack | ids, converted from the output of the compute rasterizer, with the ground (compute) | the compute rasterizer drew the visibility |
-//! | ground | id and depth of the ground | the look has a ground, the camera is above it, and a vertex may be below it |
+//! | unpack | ids, converted from the output of the compute rasterizer (compute) | the compute rasterizer drew the visibility |
 //! | blended | light of the blended triangles, blended in draw order without depth writes | two-pass transparency, some triangle is blended |
 //! | oit count, oit allocate, oit fill | a list of the blended fragments of each pixel | exact transparency, some triangle is blended |
 //! | oit resolve | lists sorted by depth, shaded and blended (compute) | exact transparency, some triangle is blended |

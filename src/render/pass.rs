@@ -31,8 +31,6 @@ pub enum Pass {
     RecordVisible,
     /// Converts the keys of the compute rasterizer (triangle and depth) to ids.
     Unpack,
-    /// Draws the id and the depth of the ground.
-    Ground,
     /// Blends translucent triangles in draw order.
     Blended,
     /// Counts the blended fragments of each pixel.
@@ -73,7 +71,7 @@ pub enum RenderStage {
 
 impl Pass {
     /// All passes, in execution order.
-    pub const ALL: [Self; 25] = [
+    pub const ALL: [Self; 24] = [
         Self::UniformUpload,
         Self::RasterShadow,
         Self::RasterVisibility,
@@ -85,7 +83,6 @@ impl Pass {
         Self::Visibility,
         Self::RecordVisible,
         Self::Unpack,
-        Self::Ground,
         Self::Blended,
         Self::OitCount,
         Self::OitAllocate,
@@ -115,7 +112,6 @@ impl Pass {
             Self::Visibility => "visibility",
             Self::RecordVisible => "record visible",
             Self::Unpack => "unpack",
-            Self::Ground => "ground",
             Self::Blended => "blended",
             Self::OitCount => "oit count",
             Self::OitAllocate => "oit allocate",
@@ -170,9 +166,9 @@ impl RenderStage {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum TimeKey {
     Stage(RenderStage),
-    /// Passes that are timed together have the name of one of them. "visibility" includes the ground and the conversion
-    /// of keys, "cull" the occluders, "blended" the fragment lists, "shade" the background, and "raster shadow" the
-    /// visibility if the compute rasterizer draws both.
+    /// Passes that are timed together have the name of one of them. "visibility" includes the conversion of keys,
+    /// "cull" the occluders, "blended" the fragment lists, "shade" the background, and "raster shadow" the visibility if
+    /// the compute rasterizer draws both.
     Pass(Pass),
 }
 

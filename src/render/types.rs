@@ -153,6 +153,7 @@ impl CullStats {
 pub enum VisibilityId {
     /// Neither triangle nor ground, that is, the sky.
     Background,
+    /// The ground, which is behind all triangles: the shading adds it to samples without a triangle.
     Ground,
     /// Index of a triangle in the renderer's draw order. [`crate::SceneBuffers::source_triangle`] maps it to its
     /// domain.
@@ -164,7 +165,6 @@ impl VisibilityId {
     pub(crate) const fn from_id(id: u32) -> Self {
         match id {
             0 => Self::Background,
-            u32::MAX => Self::Ground,
             id => Self::Triangle(id as usize - 1),
         }
     }
@@ -201,10 +201,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn background_ground_and_first_triangle_have_different_ids() {
+    fn triangle_ids_follow_the_background() {
         assert_eq!(
-            [0, 1, u32::MAX].map(VisibilityId::from_id),
-            [VisibilityId::Background, VisibilityId::Triangle(0), VisibilityId::Ground]
+            [0, 1, 2].map(VisibilityId::from_id),
+            [VisibilityId::Background, VisibilityId::Triangle(0), VisibilityId::Triangle(1)]
         );
     }
 }

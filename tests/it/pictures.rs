@@ -31,6 +31,7 @@ fn pictures() -> Vec<Picture> {
         raw_color,
         Picture { camera: camera(1.5), ..raw_color },
         output(Output::Depth),
+        output(Output::DepthWithGround),
         output(Output::Domains),
         output(Output::Normals).size(40, 40),
         output(Output::Displacement { scale_max: 0.0 }),

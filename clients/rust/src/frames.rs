@@ -31,7 +31,8 @@ pub enum FrameFormat {
     /// Without alpha; see [`Picture::jpeg_quality`].
     Jpeg,
     Rgba,
-    /// Little-endian f32, one per pixel: the only format of [`Output::Depth`].
+    /// Little-endian f32, one per pixel: the only format of [`Output::Depth`] and
+    /// [`Output::DepthWithGround`].
     F32,
     /// Little-endian u32, one per pixel: the only format of [`Output::Domains`].
     U32,
@@ -46,6 +47,8 @@ pub enum Output {
     Color,
     /// Meters along the view axis; infinity in the background.
     Depth,
+    /// As `Depth`, with the depth of the ground in the background.
+    DepthWithGround,
     /// Index of the domain; `u32::MAX` in the background.
     Domains,
     /// Unit normals; zeros in the background.
@@ -344,6 +347,7 @@ impl From<Picture> for v1::Picture {
         let (output, mode, scale_max) = match picture.output {
             Output::Color => (v1::Output::Colour, 0, 0.0),
             Output::Depth => (v1::Output::Depth, 0, 0.0),
+            Output::DepthWithGround => (v1::Output::DepthWithGround, 0, 0.0),
             Output::Domains => (v1::Output::Domains, 0, 0.0),
             Output::Normals => (v1::Output::Normals, 0, 0.0),
             Output::Displacement { scale_max } => (v1::Output::Displacement, 0, scale_max),
@@ -352,7 +356,8 @@ impl From<Picture> for v1::Picture {
         // `Unspecified` selects the only format of depth, domains and normals, and PNG for the other outputs. The
         // server rejects the number formats for the other outputs.
         let format = match (picture.output, picture.format) {
-            (Output::Depth | Output::Domains | Output::Normals, _) | (_, FrameFormat::Png) => v1::Format::Unspecified,
+            (Output::Depth | Output::DepthWithGround | Output::Domains | Output::Normals, _)
+            | (_, FrameFormat::Png) => v1::Format::Unspecified,
             (_, FrameFormat::Jpeg) => v1::Format::Jpeg,
             (_, FrameFormat::Rgba) => v1::Format::Rgba,
             (_, FrameFormat::F32) => v1::Format::F32,

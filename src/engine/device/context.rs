@@ -357,6 +357,7 @@ impl DeviceContext {
         let aov = match (frame_output, &legend) {
             (_, Some(legend)) => Aov::Values { scale_max: legend.scale_max as f32 },
             (FrameOutput::Depth, _) => Aov::Depth,
+            (FrameOutput::DepthWithGround, _) => Aov::DepthWithGround,
             (FrameOutput::Normals, _) => Aov::Normals,
             _ => Aov::Domains,
         };

@@ -202,7 +202,11 @@ impl LoadedScene {
                 &self.current_state,
                 self.deformer.surface_with(VertexAttributes::POSITIONS_AND_NORMALS)?,
             ),
-            FrameOutput::Color | FrameOutput::Depth | FrameOutput::Domains | FrameOutput::Normals => return Ok(None),
+            FrameOutput::Color
+            | FrameOutput::Depth
+            | FrameOutput::DepthWithGround
+            | FrameOutput::Domains
+            | FrameOutput::Normals => return Ok(None),
         };
         let legend = scalar_field::fit_legend(&self.scene, frame_output, &scalar_field);
         let Some(buffers) = &mut self.buffers else { return Err(no_buffers_error()) };

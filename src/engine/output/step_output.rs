@@ -41,6 +41,8 @@ pub enum FrameOutput {
     Color,
     /// [`modalcast_render::Aov::Depth`], in meters.
     Depth,
+    /// [`modalcast_render::Aov::DepthWithGround`], in meters.
+    DepthWithGround,
     /// [`modalcast_render::Aov::Domains`]: indices of domains.
     Domains,
     /// [`modalcast_render::Aov::Normals`].

@@ -157,10 +157,6 @@ struct Attachment<'a> {
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct PipelineState {
     pub(crate) depth_write: bool,
-    /// Depth outside near and far is clamped instead of clipped.
-    pub(crate) depth_clamp: bool,
-    /// Depth is offset away from the camera, so that surfaces in the same plane stay visible.
-    pub(crate) polygon_offset: bool,
     /// Only triangles whose corners appear counterclockwise are drawn.
     pub(crate) cull_back_faces: bool,
     /// Colors are blended over the existing colors. Alpha accumulates the transmittance: the fraction of the background
@@ -473,16 +469,11 @@ impl Gl {
             unsafe { if is_enabled { gl.enable(flag) } else { gl.disable(flag) } }
         };
         set_flag(glow::DEPTH_TEST, true);
-        set_flag(glow::DEPTH_CLAMP, state.depth_clamp);
-        set_flag(glow::POLYGON_OFFSET_FILL, state.polygon_offset);
         set_flag(glow::CULL_FACE, state.cull_back_faces);
         set_flag(glow::BLEND, state.blend);
         // SAFETY: sets state; no memory is accessed.
         unsafe {
             gl.depth_func(glow::LEQUAL);
-            // Depth offset: 1 x the change of depth over a pixel + 8 rounding steps of depth. Twin:
-            // `biased_ground_depth` in shaders/visibility_unpack.comp.
-            gl.polygon_offset(1.0, 8.0);
             gl.depth_mask(state.depth_write);
             let one_minus_alpha = glow::ONE_MINUS_SRC_ALPHA;
             gl.blend_func_separate(glow::SRC_ALPHA, one_minus_alpha, glow::ZERO, one_minus_alpha);

@@ -196,7 +196,6 @@ const PASS_ACCESSES: [(Pass, &[Accesses]); Pass::ALL.len()] = [
         ]],
     ),
     (Pass::Unpack, &[&[(Resource::RasterKeys, Access::StorageRead), (Resource::Ids, Access::ImageWrite)]]),
-    (Pass::Ground, &[DRAW_IDS]),
     (
         Pass::Blended,
         &[
@@ -379,7 +378,6 @@ mod tests {
         let lists = Kinds::COMMAND | Kinds::ELEMENT_ARRAY | Kinds::TEXTURE_FETCH;
         assert_eq!(barrier_before(Pass::Shadow), lists);
         assert_eq!(barrier_before(Pass::Visibility), lists | Kinds::FRAMEBUFFER);
-        assert_eq!(barrier_before(Pass::Ground), Kinds::FRAMEBUFFER);
         assert_eq!(barrier_before(Pass::Encode), Kinds::TEXTURE_FETCH | Kinds::SHADER_STORAGE);
         assert_eq!(barrier_before(Pass::Read), Kinds::BUFFER_UPDATE);
         assert_eq!(barrier_within(Pass::Visibility), Kinds::NONE);

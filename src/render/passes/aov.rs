@@ -11,7 +11,7 @@ use super::draw::TriangleSet;
 use super::readback::{IdTarget, WordPass};
 use super::recorder::PassRecorder;
 use super::uniforms::upload_frame;
-use super::visibility::{IdDraw, draw_ground, draw_ids};
+use super::visibility::{IdDraw, draw_ids};
 use crate::device::gl::{self, Buffer, ClearOp, Fence, Gl, PassTimer, Program};
 use crate::layout::VALUE_UNIT;
 use crate::pass::{FrameTimes, Pass, RenderStage};
@@ -28,11 +28,14 @@ use modalcast_model::error::{Result, fault};
 /// Words that one parallel task converts: enough to hide the cost of starting the task.
 const WORDS_PER_TASK: usize = 4096;
 
-/// Field to read back. All fields ignore blended triangles. Only the depth contains the ground.
+/// Field to read back. All fields ignore blended triangles. Only `DepthWithGround` contains the
+/// ground.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Aov {
-    /// f32: meters along the view axis, not along the ray; infinite where neither a triangle nor the ground is visible.
+    /// f32: meters along the view axis, not along the ray; infinite where no triangle is visible.
     Depth,
+    /// As `Depth`, with the depth of the ground where the ground is visible and no triangle is.
+    DepthWithGround,
     /// u32: index of the domain; `u32::MAX` where no triangle is visible.
     Domains,
     /// Three f32: unit normal that points to the visible side; zeros where no triangle is visible.
@@ -78,6 +81,7 @@ impl Aov {
     const fn define(self) -> &'static str {
         match self {
             Self::Depth => "DEPTH",
+            Self::DepthWithGround => "DEPTH_WITH_GROUND",
             Self::Domains => "",
             Self::Normals => "NORMALS",
             Self::Values { .. } => "VALUES",
@@ -89,7 +93,6 @@ impl Aov {
 #[derive(Debug)]
 pub struct PartialAov {
     field: Aov,
-    params: FrameParams,
     uniforms: FrameUniforms,
     /// Draws the ids of cut-outs; none without such triangles.
     mask: Option<Rc<Program>>,
@@ -140,9 +143,6 @@ impl PartialAov {
         };
         recorder.begin(Pass::Aov);
         draw_ids(recorder, buffers, &ids)?;
-        if self.field == Aov::Depth {
-            draw_ground(recorder, buffers, &self.params)?;
-        }
         let word_pass = self.word_pass(buffers, band);
         id_target.convert(recorder, &word_pass);
         if self.is_submitted() { id_target.copy(recorder, &word_pass) } else { recorder.check(Pass::Aov) }
@@ -151,7 +151,7 @@ impl PartialAov {
     fn word_pass(&self, buffers: &SceneBuffers, band: Band) -> WordPass<'_> {
         let scale = match self.field {
             // Meters per scene unit.
-            Aov::Depth => Some(buffers.scene.unit as f32),
+            Aov::Depth | Aov::DepthWithGround => Some(buffers.scene.unit as f32),
             Aov::Values { scale_max } => Some(scale_max.recip()),
             Aov::Domains | Aov::Normals => None,
         };
@@ -199,9 +199,9 @@ impl AovReader {
         }
         let target = self.take_target(desc, words_per_pixel)?;
         let bands = VecDeque::from(Band::divide(size, band_limit.max_pixels(desc.samples)));
-        let (is_divided, params) = (bands.len() > 1, *params);
+        let is_divided = bands.len() > 1;
         let (timers, fence) = (Vec::new(), None);
-        Ok(PartialAov { field, params, uniforms, mask, program, target, bands, is_divided, timers, fence })
+        Ok(PartialAov { field, uniforms, mask, program, target, bands, is_divided, timers, fence })
     }
 
     /// Submits the next band. The scene's buffers must not change until all bands are submitted.

@@ -44,7 +44,7 @@ pub(crate) fn draw(
     Ok(())
 }
 
-/// Converts the visibility keys to ids, and adds the ground.
+/// Converts the visibility keys to ids.
 pub(crate) fn unpack(
     recorder: &mut PassRecorder<'_>,
     frame: &FrameContext<'_>,

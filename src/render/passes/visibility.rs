@@ -7,8 +7,7 @@ use crate::pass::Pass;
 use crate::region::{Band, Region};
 use crate::resources::scene_buffers::SceneBuffers;
 use crate::scene_data::geometry::BlendMode;
-use crate::types::{FrameParams, RasterBackend};
-use crate::uniforms::frame::camera_is_above_ground;
+use crate::types::RasterBackend;
 use modalcast_model::error::Result;
 
 /// Parameters of a draw of ids and depth. The framebuffer must be at least as large as the frame of the region.
@@ -26,7 +25,7 @@ pub(super) struct IdDraw<'a> {
     pub(super) opaque_parts: Option<&'a Program>,
 }
 
-/// Draws the id and depth of each sample in a band, without the ground.
+/// Draws the id and depth of each sample in a band.
 pub(crate) fn draw(recorder: &mut PassRecorder<'_>, frame: &FrameContext<'_>, band: Band) -> Result<()> {
     let FrameContext { buffers, target, programs, .. } = *frame;
     // Multisampled ids are not cleared, which saves time: shaders also read the depth, which tells which ids are valid.
@@ -45,13 +44,6 @@ pub(crate) fn draw(recorder: &mut PassRecorder<'_>, frame: &FrameContext<'_>, ba
         opaque_parts: programs.opaque_parts.as_deref(),
     };
     draw_ids(recorder, buffers, &ids)
-}
-
-/// Draws the ground into the ids and the depth of a band.
-pub(crate) fn draw_ground_band(recorder: &mut PassRecorder<'_>, frame: &FrameContext<'_>, band: Band) -> Result<()> {
-    let FrameContext { buffers, target, params, .. } = *frame;
-    recorder.gl.begin_pass(&target.visibility_fbo, target.draw_region.get(), band, ClearOp::Load);
-    draw_ground(recorder, buffers, params)
 }
 
 /// Draws ids and depth of the triangles of each blend mode that has a program.
@@ -76,23 +68,4 @@ pub(super) fn draw_ids(recorder: &mut PassRecorder<'_>, buffers: &SceneBuffers, 
         recorder.stats.raster_backends.visibility = Some(RasterBackend::OpenGl);
     }
     recorder.check(Pass::Visibility)
-}
-
-/// Draws the ground into the ids and the depth of the bound framebuffer, in the scissor that `begin_pass` has set. A frame calls this only if a vertex may be
-/// below the ground; otherwise the shading adds the ground.
-pub(super) fn draw_ground(recorder: &mut PassRecorder<'_>, buffers: &SceneBuffers, params: &FrameParams) -> Result<()> {
-    let Some(program) = buffers.programs.ground.as_ref().filter(|_| camera_is_above_ground(&buffers.scene, params))
-    else {
-        return Ok(());
-    };
-    recorder.begin(Pass::Ground);
-    recorder.gl.set_pipeline_state(PipelineState {
-        depth_clamp: true,
-        depth_write: true,
-        polygon_offset: true,
-        ..PipelineState::default()
-    });
-    program.bind(None);
-    recorder.gl.draw_procedural(&buffers.empty_vertex_array, 3);
-    recorder.finish(Pass::Ground)
 }

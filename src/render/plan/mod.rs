@@ -124,7 +124,6 @@ fn passes(scene: &Scene, groups: &[DrawGroup], features: &ShaderFeatures) -> Vec
     let has_visibility = has_blend_mode(BlendMode::Opaque) || has_blend_mode(BlendMode::Mask) || features.opaque_parts;
     passes.extend(cull_passes(features.culling));
     passes.extend(has_visibility.then_some(Pass::Visibility));
-    passes.extend(features.ground.then_some(Pass::Ground));
     passes.extend(if features.blend_layers { blend_passes(scene) } else { &[] });
     passes.push(Pass::Background);
     passes.extend(has_visibility.then_some(Pass::Shade));
@@ -271,7 +270,7 @@ fn omitted_features(scene: &Scene, culling: Culling) -> Vec<OmittedFeature> {
             &[],
             "no lookup per triangle",
         ),
-        omit_unless(look.ground.is_some(), "ground", 0, &[Pass::Ground], "no ground program"),
+        omit_unless(look.ground.is_some(), "ground", 0, &[], "no ground in the shading"),
         omit_unless(
             look.bloom.is_some(),
             "bloom",
@@ -357,19 +356,16 @@ mod tests {
             plan(&Scene::new(parts).expect("a valid scene"))
         };
         let two_pass = plan_blended(Transparency::TwoPass, 0.5);
-        assert_eq!(pass_names(&two_pass), ["ground", "blended", "background", "encode"]);
+        assert_eq!(pass_names(&two_pass), ["blended", "background", "encode"]);
         assert_eq!((two_pass.draw_calls, two_pass.defines), (1, vec!["HAS_GROUND", "BLEND_LAYERS"]));
         assert_eq!(two_pass.buffers.last().map(|buffer| buffer.name.as_str()), Some("corner vertices"));
         let oit = plan_blended(Transparency::OrderIndependent, 1.0);
-        assert_eq!(
-            pass_names(&oit),
-            ["ground", "oit count", "oit allocate", "oit fill", "oit resolve", "background", "encode"]
-        );
+        assert_eq!(pass_names(&oit), ["oit count", "oit allocate", "oit fill", "oit resolve", "background", "encode"]);
         assert_eq!((oit.draw_calls, oit.defines), (3, vec!["HAS_GROUND", "BLEND_LAYERS", "OIT"]));
         let with_opaque_parts = plan_blended(Transparency::TwoPass, 1.0);
         assert_eq!(
             pass_names(&with_opaque_parts),
-            ["visibility", "ground", "blended", "background", "shade", "encode"],
+            ["visibility", "blended", "background", "shade", "encode"],
             "expected visibility and shade passes for opaque parts"
         );
         assert_eq!(
@@ -386,7 +382,7 @@ mod tests {
         assert_eq!(
             pass_names(&plan),
             [
-                &["shadow cull", "shadow", "blur", "occluders", "cull", "visibility", "ground", "blended"][..],
+                &["shadow cull", "shadow", "blur", "occluders", "cull", "visibility", "blended"][..],
                 &["background", "shade", "bloom", "encode"]
             ]
             .concat()

@@ -349,7 +349,7 @@ impl Renderer {
         let parse_id = |word: &[u8]| word.iter().rev().fold(0, |id, byte| id << 8 | u32::from(*byte));
         let sample_position = if frame.desc.samples > 1 { self.sample_positions[0] } else { [0.5; 2] };
         let size = [frame.desc.width, frame.desc.height];
-        // Ground that was not rasterized has no id. It is visible where the view ray of a sample without an id hits it.
+        // The ground has no id. It is visible where the view ray of a sample without an id hits it.
         let sees_ground = |pixel: u32| frame.uniforms.ray_hits_ground(ndc_from_pixel(pixel, size, sample_position));
         let ids = id_bytes.chunks_exact(4).zip(0..).map(|(word, pixel)| match VisibilityId::from_id(parse_id(word)) {
             VisibilityId::Background if sees_ground(pixel) => VisibilityId::Ground,

@@ -28,7 +28,7 @@ use crate::resources::scene_buffers::SceneBuffers;
 use crate::resources::target::RenderTarget;
 use crate::resources::target_desc::TargetDesc;
 use crate::types::{FrameParams, FrameStats};
-use crate::uniforms::frame::{FrameUniforms, camera_is_above_ground, clip_from_positions, ground_is_behind_scene};
+use crate::uniforms::frame::{FrameUniforms, clip_from_positions};
 use modalcast_model::error::{Error, Result, fault};
 
 /// A frame of which some steps are not submitted yet. Dropping it abandons the frame and frees its target.
@@ -70,7 +70,6 @@ enum Step {
 enum BandPass {
     Visibility(Band),
     RecordVisible,
-    Ground(Band),
     Blended(Band),
     OitCount(Band),
     OitSumCounts,
@@ -143,10 +142,9 @@ impl Renderer {
         // until all passes are recorded.
         self.last_frame = None;
         let Some(target) = self.targets.pop() else { return Err(fault("draw", "no target")) };
-        let draws_ground = must_draw_ground(buffers, params);
-        target.draw_region.set(draw_region(buffers, params, draws_ground));
+        target.draw_region.set(draw_region(buffers, params));
         let is_divided = self.is_divided(size, desc.samples);
-        let steps = plan_steps(&target, draws_ground, slot.is_some(), self.band_limit.max_pixels(desc.samples));
+        let steps = plan_steps(&target, slot.is_some(), self.band_limit.max_pixels(desc.samples));
         Ok(PartialFrame {
             params: *params,
             uniforms,
@@ -303,9 +301,6 @@ fn record(
             None => passes::visibility::draw(recorder, frame, band),
         },
         (BandPass::RecordVisible, _) if rasterizer.is_none() => passes::cull::record_visible(recorder, frame),
-        (BandPass::Ground(band), _) if rasterizer.is_none() => {
-            passes::visibility::draw_ground_band(recorder, frame, band)
-        }
         (BandPass::Blended(band), _) => passes::blended::draw(recorder, frame, band),
         (BandPass::OitCount(band), Some(oit)) => oit.count(recorder, band),
         (BandPass::OitSumCounts, Some(oit)) => oit.sum_counts(recorder),
@@ -318,19 +313,19 @@ fn record(
             staging.map_or(Ok(()), |staging| passes::readback::copy_frame(recorder, frame, &staging.buffer))
         }
         // Passes that OpenGL or a frame without fragment lists does not have.
-        (BandPass::RecordVisible | BandPass::Ground(_) | BandPass::OitCount(_), _)
-        | (BandPass::OitSumCounts | BandPass::OitBlend(_), _) => Ok(()),
+        (BandPass::RecordVisible | BandPass::OitCount(_), _) | (BandPass::OitSumCounts | BandPass::OitBlend(_), _) => {
+            Ok(())
+        }
     }
 }
 
 /// The steps of a frame. Bands have at most `max_pixels` pixels.
-fn plan_steps(target: &RenderTarget, draws_ground: bool, has_readback: bool, max_pixels: u64) -> VecDeque<Step> {
+fn plan_steps(target: &RenderTarget, has_readback: bool, max_pixels: u64) -> VecDeque<Step> {
     let TargetDesc { width, height, .. } = target.desc;
     let bands = Band::divide([width, height], max_pixels);
     let of_bands = |pass: fn(Band) -> BandPass| bands.iter().copied().map(pass);
     let mut visibility: Vec<BandPass> = of_bands(BandPass::Visibility).collect();
     visibility.push(BandPass::RecordVisible);
-    visibility.extend(of_bands(BandPass::Ground).filter(|_| draws_ground));
     let blended = match (&target.blend_layer, &target.oit) {
         (_, Some(_)) => {
             of_bands(BandPass::OitCount).chain([BandPass::OitSumCounts]).chain(of_bands(BandPass::OitBlend)).collect()
@@ -363,20 +358,11 @@ fn plan_steps(target: &RenderTarget, draws_ground: bool, has_readback: bool, max
     steps
 }
 
-/// Whether the ground must be rasterized. Otherwise the shading adds visible ground to samples without an id.
-fn must_draw_ground(buffers: &SceneBuffers, params: &FrameParams) -> bool {
-    let scene = &buffers.scene;
-    // The bounds of a rebased scene (drawn with positions relative to one chosen origin) exclude distant domains, which
-    // may be below the ground.
-    let is_ground_behind_scene = buffers.rebased.is_none() && ground_is_behind_scene(scene, params, buffers.origin);
-    scene.look.ground.is_some() && camera_is_above_ground(scene, params) && !is_ground_behind_scene
-}
-
-/// Region of the frame that may show triangles or rasterized ground.
-fn draw_region(buffers: &SceneBuffers, params: &FrameParams, draws_ground: bool) -> Region {
+/// Region of the frame that may show triangles.
+fn draw_region(buffers: &SceneBuffers, params: &FrameParams) -> Region {
     let size = [params.width, params.height];
-    // The bounds of a rebased scene exclude distant domains, and the ground is larger than all bounds.
-    if buffers.rebased.is_some() || draws_ground {
+    // A rebased scene is drawn with positions relative to one chosen origin. Its bounds exclude distant domains.
+    if buffers.rebased.is_some() {
         return Region::whole(size);
     }
     Region::project(&clip_from_positions(&buffers.scene, params, buffers.origin), &params.bounds, size)

@@ -31,7 +31,6 @@ pub(crate) struct ScenePrograms {
     pub(crate) shadow: [Option<Rc<Program>>; 3],
     /// Draws the ids of opaque triangles.
     pub(crate) opaque: Option<Rc<Program>>,
-    pub(crate) ground: Option<Rc<Program>>,
     /// Culls shadow casters.
     pub(crate) shadow_cull: Option<ShadowCullPrograms>,
 }
@@ -194,7 +193,6 @@ impl ScenePrograms {
             blur: options.blur().into_iter().map(&mut *compile).collect::<Result<_>>()?,
             shadow,
             opaque: compile_if(has_triangles(BlendMode::Opaque), compile, || options.visibility(BlendMode::Opaque, 1))?,
-            ground: compile_if(options.features.ground, compile, || options.ground())?,
             shadow_cull,
         })
     }

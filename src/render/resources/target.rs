@@ -22,7 +22,7 @@ pub(crate) struct RenderTarget {
     pub(crate) ids: Texture,
     pub(crate) visibility_fbo: Framebuffer,
     pub(crate) dirty_regions: VisibilityDirtyRegions,
-    /// Region of the current frame that may show triangles or rasterized ground.
+    /// Region of the current frame that may show triangles.
     pub(crate) draw_region: Cell<Region>,
     pub(crate) blend_layer: Option<BlendLayer>,
     pub(crate) oit: Option<OitTarget>,

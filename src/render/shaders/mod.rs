@@ -233,19 +233,8 @@ impl ShaderOptions {
     pub(crate) fn unpack(&self) -> ProgramSource {
         let mut head = self.head(&[]);
         writeln!(head, "#define TILE {TILE}").ok();
-        let text =
-            [&head, FRAME, VISIBILITY_IDS, GROUND_PLANE, include_str!("../../../shaders/visibility_unpack.comp")]
-                .concat();
+        let text = [&head, VISIBILITY_IDS, include_str!("../../../shaders/visibility_unpack.comp")].concat();
         ProgramSource::compute("unpack", text)
-    }
-
-    /// Draws id and depth of the ground.
-    pub(crate) fn ground(&self) -> ProgramSource {
-        let head = self.head(&[]);
-        let vertex = [&head, FRAME, GROUND_PLANE, include_str!("../../../shaders/ground.vert")].concat();
-        let fragment =
-            [&head, FRAME, VISIBILITY_IDS, GROUND_PLANE, include_str!("../../../shaders/ground.frag")].concat();
-        ProgramSource { label: "ground".into(), stages: vertex_and_fragment(vertex, fragment) }
     }
 }
 

@@ -7,12 +7,11 @@ use super::{
 use crate::layout::WORKGROUP_SIZE;
 
 impl ShaderOptions {
-    /// Computes an AOV field from the ids. `field`: `DEPTH` or `NORMALS` (one sample per pixel), or `VALUES` (all
-    /// samples).
+    /// Computes an AOV field from the ids. `field`: `DEPTH`, `DEPTH_WITH_GROUND` or `NORMALS` (one sample per pixel),
+    /// or `VALUES` (all samples).
     pub(crate) fn aov(&self, field: &'static str, samples: u32) -> ProgramSource {
         let mut text = format!("{VERSION}#define WORKGROUP_SIZE {WORKGROUP_SIZE}\n#define {field}\n");
-        // Only the depth field contains the ground.
-        let has_ground = field == "DEPTH" && self.features.ground;
+        let has_ground = field == "DEPTH_WITH_GROUND" && self.features.ground;
         text += if has_ground { "#define HAS_GROUND\n" } else { "" };
         text += &self.sample_defines(samples);
         let body = include_str!("../../../shaders/aov.comp");

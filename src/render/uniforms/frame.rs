@@ -17,7 +17,7 @@ pub(crate) struct FrameUniforms {
     world_from_ndc: [[f32; 4]; 4],
     /// xyz: position of the camera. w: 1 if the scene has a ground and the camera is above it, else 0.
     eye: [f32; 4],
-    /// xyz: direction to the sun. w: 0 if the ground lies behind all surfaces, so that the shading adds it; else 1.
+    /// xyz: direction to the sun. w: 0.
     to_sun: [f32; 4],
     sunlight: [f32; 4],
     skylight: [f32; 4],
@@ -40,11 +40,6 @@ const _: () = assert!(size_of::<FrameUniforms>() == 368, "FrameUniforms differs 
 /// Half the side of the ground's square, in multiples of the fade distance D. The ground's weight is exp(-(d / D)^2) at
 /// distance d. At the border it is exp(-36), so the rounded color is that of the horizon.
 const GROUND_EXTENT: f64 = 6.0;
-
-/// Vertices below the ground by at most this tolerance count as on the ground. The unit is f32::EPSILON times the
-/// largest coordinate, because positions are sums in f32. Rasterized ground has a polygon offset for the same reason
-/// (`PipelineState::polygon_offset`).
-const GROUND_TOLERANCE_EPSILONS: f64 = 4.0;
 
 impl FrameUniforms {
     /// Computes the uniforms of one frame. Positions are relative to `origin`, a point in scene units from the scene's
@@ -70,7 +65,7 @@ impl FrameUniforms {
             shadow_from_world: light_box.shadow_from_world.cast().into(),
             world_from_ndc: world_from_ndc(&clip_from_camera, &camera_from_world).cast().into(),
             eye: vec4_of(rebased_camera.eye(), flag(look.ground.is_some() && camera_is_above_ground(scene, params))),
-            to_sun: vec4_of(to_sun, flag(!ground_is_behind_scene(scene, params, origin))),
+            to_sun: vec4_of(to_sun, 0.0),
             sunlight: color(look.sunlight, 0.0),
             skylight: color(look.skylight, 0.0),
             zenith: color(look.zenith, 0.0),
@@ -94,7 +89,7 @@ impl FrameUniforms {
     }
 
     /// Whether the view ray through a point in normalized device coordinates hits the ground. Used for samples without
-    /// an id, if the ground was not rasterized. Twin of `ray_hits_ground` in `shaders/shared/ground_plane.glsl`.
+    /// an id. Twin of `ray_hits_ground` in `shaders/shared/ground_plane.glsl`.
     pub(crate) fn ray_hits_ground(&self, ndc: [f64; 2]) -> bool {
         let to_vector3 = |vector4: [f32; 4]| Vector3::new(vector4[0], vector4[1], vector4[2]).cast::<f64>();
         let [x, y, forward] = [0, 1, 2].map(|column| to_vector3(self.world_from_ndc[column]));
@@ -177,22 +172,9 @@ pub fn shadow_clip_from_world(scene: &Scene, params: &FrameParams) -> Option<Mat
 }
 
 /// Whether the camera is above the ground; the ground is not visible from below.
-pub(crate) fn camera_is_above_ground(scene: &Scene, params: &FrameParams) -> bool {
+fn camera_is_above_ground(scene: &Scene, params: &FrameParams) -> bool {
     let up = scene.up.index();
     params.camera.eye()[up] > scene.rest_bounds.min[up]
-}
-
-/// Whether the ground is behind everything else: the camera is above it and no vertex is below it. Then the ground need
-/// not be rasterized, because the shading adds it to samples without an id.
-pub(crate) fn ground_is_behind_scene(scene: &Scene, params: &FrameParams, origin: [f64; 3]) -> bool {
-    let (up, bounds) = (scene.up.index(), params.bounds);
-    let ground_height = rebased_rest_bounds(scene, bounds, origin).min[up];
-    let max_coordinate = [ground_height, bounds.min[up], bounds.max[up]].map(f64::abs).into_iter().fold(0.0, f64::max);
-    let min_height = bounds.min[up] + GROUND_TOLERANCE_EPSILONS * f64::from(f32::EPSILON) * max_coordinate;
-    scene.look.ground.is_some()
-        && camera_is_above_ground(scene, params)
-        && bounds.is_finite()
-        && min_height >= ground_height
 }
 
 /// Rest bounds relative to `origin`. An origin other than 0 means that the scene moved far away. Then the rest bounds
@@ -278,38 +260,6 @@ mod tests {
     }
 
     #[test]
-    fn ground_is_behind_scene_if_no_vertex_is_below_it() {
-        let scene = Scene::new(squares(vec![Material::default()])).expect("a valid scene");
-        let (rest_bounds, up) = (scene.rest_bounds, scene.up.index());
-        let max_coordinate = rest_bounds.min[up].abs().max(rest_bounds.max[up].abs());
-        // Lowers the lowest vertex by `lowering`. `camera_height` is above the ground, `origin_height` above the
-        // world's origin.
-        let is_behind = |lowering: f64, camera_height: f64, origin_height: f64| {
-            let camera = Camera::fit_to_scene(&scene, 64, 64);
-            let mut params = FrameParams { camera, width: 64, height: 64, bounds: rest_bounds, light_bounds: None };
-            params.bounds.min[up] -= lowering + origin_height;
-            params.bounds.max[up] -= origin_height;
-            let mut eye = [0.3, 0.4, 0.5];
-            eye[up] = rest_bounds.min[up] + camera_height;
-            params.camera.view = View::LookAt { eye, target: [0.1; 3], up: [0.6, 0.8, 0.0] };
-            let mut position_origin = [0.0; 3];
-            position_origin[up] = origin_height;
-            ground_is_behind_scene(&scene, &params, position_origin)
-        };
-        assert!(is_behind(0.0, 1.0, 0.0) && is_behind(-0.1, 1.0, 0.0) && is_behind(0.0, 1.0, 4096.0));
-        // The tolerance is 4 f32::EPSILON = 4.8e-7 of the largest coordinate.
-        assert!(is_behind(2e-7 * max_coordinate, 1.0, 0.0), "expected a tolerance for rounding");
-        assert!(
-            !is_behind(1e-6 * max_coordinate, 1.0, 0.0) && !is_behind(1e-2, 1.0, 4096.0),
-            "expected the ground not to be behind a vertex that is below it"
-        );
-        assert!(
-            !is_behind(0.0, 0.0, 0.0) && !is_behind(0.0, -1.0, 0.0),
-            "expected no ground behind the scene for a camera at the ground or below"
-        );
-    }
-
-    #[test]
     fn replaces_overflowed_bounds_and_rejects_overflowed_cameras() {
         let scene = Scene::new(squares(vec![Material::default()])).expect("a valid scene");
         let mut params = FrameParams {
@@ -320,16 +270,11 @@ mod tests {
             light_bounds: None,
         };
         let uniforms = FrameUniforms::new(&scene, &params, [0.0; 3]).expect("finite uniforms");
-        let [x, y, z, must_rasterize_ground] = uniforms.to_sun;
-        assert!(must_rasterize_ground == 0.0 && uniforms.eye[3] > 0.0, "expected the ground behind the scene");
+        assert!(uniforms.eye[3] > 0.0, "expected a camera above the ground");
         for bounds in [BoundingBox::EMPTY, BoundingBox { min: [f64::NAN; 3], max: [f64::INFINITY; 3] }] {
             let replaced_uniforms =
                 FrameUniforms::new(&scene, &FrameParams { bounds, ..params }, [0.0; 3]).expect("finite uniforms");
-            assert_eq!(
-                replaced_uniforms,
-                FrameUniforms { to_sun: [x, y, z, 1.0], ..uniforms },
-                "expected rasterized ground, because vertices may be below it"
-            );
+            assert_eq!(replaced_uniforms, uniforms, "expected the rest bounds in place of overflowed ones");
         }
         let light_bounds = OrientedBounds(BoundingBox { min: [-0.25; 3], max: [0.25; 3] });
         let uniforms_with = |light_bounds| {

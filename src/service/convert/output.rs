@@ -23,6 +23,7 @@ pub(super) fn parse_output(scene: &Scene, picture: &v1::Picture) -> Result<(Fram
     let frame_output = match output {
         v1::Output::Unspecified | v1::Output::Colour => FrameOutput::Color,
         v1::Output::Depth => FrameOutput::Depth,
+        v1::Output::DepthWithGround => FrameOutput::DepthWithGround,
         v1::Output::Domains => FrameOutput::Domains,
         v1::Output::Normals => FrameOutput::Normals,
         v1::Output::Displacement => FrameOutput::Displacement { scale_max },
@@ -41,7 +42,7 @@ fn parse_format(frame_output: FrameOutput, picture: &v1::Picture) -> Result<Fram
     // The only format of the output, as wire and engine types; `None` for outputs with a choice.
     let required_format = match frame_output {
         FrameOutput::Color | FrameOutput::Displacement { .. } | FrameOutput::ModeShape { .. } => None,
-        FrameOutput::Depth => Some((v1::Format::F32, FrameFormat::F32)),
+        FrameOutput::Depth | FrameOutput::DepthWithGround => Some((v1::Format::F32, FrameFormat::F32)),
         FrameOutput::Domains => Some((v1::Format::U32, FrameFormat::U32)),
         FrameOutput::Normals => Some((v1::Format::F32x3, FrameFormat::F32x3)),
     };
@@ -66,6 +67,7 @@ pub(super) fn wire_output(output: FrameOutput) -> v1::Picture {
     let (wire_output, mode, largest) = match output {
         FrameOutput::Color => (v1::Output::Colour, 0, 0.0),
         FrameOutput::Depth => (v1::Output::Depth, 0, 0.0),
+        FrameOutput::DepthWithGround => (v1::Output::DepthWithGround, 0, 0.0),
         FrameOutput::Domains => (v1::Output::Domains, 0, 0.0),
         FrameOutput::Normals => (v1::Output::Normals, 0, 0.0),
         FrameOutput::Displacement { scale_max } => (v1::Output::Displacement, 0, scale_max),

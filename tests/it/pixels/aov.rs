@@ -70,7 +70,7 @@ fn depth_is_in_meters_along_the_view_axis() {
             builder.add_domain(floor_mesh(half_side, 0.0), Material::default()),
             oblique_camera(),
             64,
-            Aov::Depth,
+            if has_ground { Aov::DepthWithGround } else { Aov::Depth },
         );
         assert_eq!((image.width, image.height, image.samples), (64, 64, 1));
         let (mut covered_pixels, mut max_relative_error) = (0, 0.0_f64);
@@ -187,7 +187,7 @@ fn aovs_allocate_on_demand_and_do_not_change_frames() {
         initial_allocations.len() + 1,
         "expected one new allocation for the values"
     );
-    for aov in [Aov::Depth, Aov::Domains, Aov::Normals, Aov::Values { scale_max: 3.0 }] {
+    for aov in [Aov::Depth, Aov::DepthWithGround, Aov::Domains, Aov::Normals, Aov::Values { scale_max: 3.0 }] {
         renderer.render_aov(&buffers, &params, aov).expect("expected AOVs");
         assert_eq!(renderer.draw(&buffers, &params).expect("expected a frame").rgba, expected_rgba);
         assert_eq!(renderer.stats(), &expected_stats);

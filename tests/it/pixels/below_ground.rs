@@ -1,5 +1,5 @@
-//! Geometry below the ground plane. Depth readbacks include the ground. All other AOV (arbitrary output variable)
-//! readbacks and picks ignore the ground.
+//! Geometry below the ground plane. AOV (arbitrary output variable) readbacks and picks ignore the ground, except depth
+//! with ground, where the ground is behind all geometry.
 
 use std::sync::Arc;
 
@@ -22,7 +22,7 @@ fn wall_scene(samples: u32, ground: Option<Ground>) -> Arc<Scene> {
     builder.add_domain(facing_rectangle(-2.0, 0.0, 2.0, 3.0, 0.0), Material::default()).build()
 }
 
-/// A camera 3 units above the ground. From there, the ground hides the geometry below it.
+/// A camera 3 units above the ground. From there, the geometry below the ground is behind the ground plane.
 fn camera_above_ground() -> Camera {
     Camera { view: View::LookAt { eye: [0.0, 3.0, 10.0], target: [0.0; 3], up: [0.0, 1.0, 0.0] }, ..front_camera(SIZE) }
 }
@@ -55,10 +55,14 @@ fn read_aov_and_picks(scene: &Arc<Scene>, aov: Aov) -> Readbacks {
 }
 
 #[test]
-fn picks_and_aovs_other_than_depth_ignore_the_ground() {
-    for (samples, aov) in
-        [(1, Aov::Domains), (1, Aov::Normals), (1, Aov::Values { scale_max: 1.0 }), (4, Aov::Values { scale_max: 1.0 })]
-    {
+fn picks_and_aovs_ignore_the_ground() {
+    for (samples, aov) in [
+        (1, Aov::Depth),
+        (1, Aov::Domains),
+        (1, Aov::Normals),
+        (1, Aov::Values { scale_max: 1.0 }),
+        (4, Aov::Values { scale_max: 1.0 }),
+    ] {
         let [with_ground, without_ground] =
             [Some(Ground::default()), None].map(|ground| read_aov_and_picks(&wall_scene(samples, ground), aov));
         assert_eq!(with_ground, without_ground, "{aov:?}, {samples} samples");
@@ -69,23 +73,18 @@ fn picks_and_aovs_other_than_depth_ignore_the_ground() {
 }
 
 #[test]
-fn depth_includes_the_ground() {
-    let [depths_with_ground, depths_without_ground] = [Some(Ground::default()), None].map(|ground| {
-        let aov_words = read_aov_and_picks(&wall_scene(1, ground), Aov::Depth).aov_words;
-        aov_words.into_iter().map(f32::from_bits).collect::<Vec<f32>>()
-    });
-    let count_infinite = |depths: &[f32]| depths.iter().filter(|depth| **depth == f32::INFINITY).count();
-    assert!(
-        count_infinite(&depths_without_ground) > count_infinite(&depths_with_ground) + 1000,
-        "expected the depth of the ground beside the wall"
-    );
-    // Without ground, a finite depth is the depth of the wall.
-    let pixels_of_hidden_wall = depths_with_ground
-        .iter()
-        .zip(&depths_without_ground)
-        .filter(|(depth, wall_depth)| wall_depth.is_finite() && depth < wall_depth);
-    assert!(
-        pixels_of_hidden_wall.count() > 400,
-        "expected the depth of the ground in front of the lower part of the wall"
-    );
+fn depth_with_ground_has_the_ground_behind_all_geometry() {
+    let scene = wall_scene(1, Some(Ground::default()));
+    let [depths_with_ground, depths] = [Aov::DepthWithGround, Aov::Depth]
+        .map(|aov| read_aov_and_picks(&scene, aov).aov_words.into_iter().map(f32::from_bits).collect::<Vec<f32>>());
+    let wall_pixels = depths.iter().filter(|depth| depth.is_finite()).count();
+    assert!(wall_pixels > 900, "{wall_pixels} pixels of the wall");
+    let differs_on_wall = |(with_ground, depth): (&f32, &f32)| depth.is_finite() && with_ground != depth;
+    assert!(!depths_with_ground.iter().zip(&depths).any(differs_on_wall), "expected the depth of the whole wall");
+    let finite_pixels = depths_with_ground.iter().filter(|depth| depth.is_finite()).count();
+    assert!(finite_pixels > wall_pixels + 1000, "expected the depth of the ground beside the wall");
+    // Without a ground, both depths are equal.
+    let scene = wall_scene(1, None);
+    let [left, right] = [Aov::DepthWithGround, Aov::Depth].map(|aov| read_aov_and_picks(&scene, aov).aov_words);
+    assert_eq!(left, right);
 }

@@ -1,5 +1,4 @@
-//! The ground is rasterized by a pass of its own only if geometry may be below it. Otherwise the shading intersects
-//! view rays with the ground plane, in samples without a triangle. Both ways give the same image.
+//! The ground is behind all triangles, also those below it, and only visible from above.
 
 use std::sync::Arc;
 
@@ -7,7 +6,7 @@ use modalcast_model::deform::DeformedSurface;
 use modalcast_model::scene::{
     Bloom, Camera, Culling, Ground, Lens, RenderSettings, Scene, ShadowSettings, Transparency, View,
 };
-use modalcast_render::{FrameParams, Pass, Renderer, VisibilityId};
+use modalcast_render::{FrameParams, Renderer, VisibilityId};
 
 use super::harness::{SceneBuilder, colored_material, facing_rectangle, floor_mesh, glass_material, open_renderer};
 
@@ -43,13 +42,11 @@ struct Frame {
     rgba: Vec<u8>,
     /// Id of the first sample of each pixel.
     ids: Vec<VisibilityId>,
-    passes: Vec<Pass>,
 }
 
 impl Frame {
-    /// Renders the scene at rest, lowered by `lowering`. `min_y` is the lower bound of y that the
-    /// renderer receives.
-    fn new(renderer: &mut Renderer, scene: &Arc<Scene>, camera: Camera, lowering: f32, min_y: f64) -> Self {
+    /// Renders the scene at rest, lowered by `lowering`.
+    fn new(renderer: &mut Renderer, scene: &Arc<Scene>, camera: Camera, lowering: f32) -> Self {
         let buffers = renderer.load(scene).expect("expected the scene to load");
         let collect_from_meshes = |attribute: fn(&modalcast_model::domain::Mesh) -> &[[f32; 3]]| -> Vec<f32> {
             scene
@@ -66,36 +63,22 @@ impl Frame {
             .upload(&buffers, &DeformedSurface { positions, normals, ..DeformedSurface::default() })
             .expect("expected the upload to succeed");
         let mut bounds = scene.rest_bounds;
-        bounds.min[1] = min_y;
+        bounds.min[1] -= f64::from(lowering);
         let params = FrameParams { camera, width: SIZE, height: SIZE, bounds, light_bounds: None };
         let rgba = renderer.draw(&buffers, &params).expect("expected a frame").rgba;
-        let passes = renderer.stats().passes.clone();
         let ids = renderer.read_visibility().expect("expected visibility ids");
         renderer.unload(buffers);
-        Self { rgba, ids, passes }
+        Self { rgba, ids }
     }
 
-    fn draws_ground(&self) -> bool {
-        self.passes.contains(&Pass::Ground)
-    }
-
-    /// Number of pixels whose colors differ by more than two levels, and number of pixels whose ids differ.
-    fn count_differences(&self, other: &Self) -> [usize; 2] {
-        let pixels = self.rgba.chunks_exact(4).zip(other.rgba.chunks_exact(4));
-        let is_different = |(left, right): &(&[u8], &[u8])| left.iter().zip(*right).any(|(a, b)| a.abs_diff(*b) > 2);
-        [
-            pixels.filter(is_different).count(),
-            self.ids.iter().zip(&other.ids).filter(|(left, right)| left != right).count(),
-        ]
+    fn count_ids(&self, predicate: impl Fn(VisibilityId) -> bool) -> usize {
+        self.ids.iter().filter(|id| predicate(**id)).count()
     }
 }
 
-/// Lower bound in y that requires the ground pass. It is farther below the ground than the renderer's tolerance for
-/// rounding, about 1e-6 for these scenes, and too close to the ground to affect the shadow map or the depth range.
-const BELOW_GROUND: f64 = -1e-5;
-
+/// Lowers the scene until half of it is below the ground.
 #[test]
-fn analytic_ground_equals_drawn_ground() {
+fn ground_never_hides_triangles() {
     let look_changes: [fn(&mut RenderSettings); 6] = [
         |_| {},
         |look| look.samples = 1,
@@ -106,53 +89,52 @@ fn analytic_ground_equals_drawn_ground() {
     ];
     let mut renderer = open_renderer();
     for (index, modify_look) in look_changes.into_iter().enumerate() {
-        let scene = test_scene(modify_look);
-        for eye in [[0.5, 1.0, 7.0], [3.0, 4.0, 5.0], [-4.0, 0.05, 1.0], [0.0, 0.8, 60.0]] {
-            let mut draw_frame = |min_y: f64| Frame::new(&mut renderer, &scene, camera_at(eye), 0.0, min_y);
-            let (analytic_frame, drawn_frame) = (draw_frame(0.0), draw_frame(BELOW_GROUND));
-            assert_eq!([analytic_frame.draws_ground(), drawn_frame.draws_ground()], [false, true]);
-            // Rounding may assign a sample at the horizon to the ground or to the sky, which have the same color there.
-            let [colors, ids] = analytic_frame.count_differences(&drawn_frame);
-            assert!(
-                colors == 0 && ids <= 2,
-                "look {index} from {eye:?}: {colors} colors and {ids} ids of {} pixels differ",
-                SIZE * SIZE
-            );
-            let ground_pixels = analytic_frame.ids.iter().filter(|id| **id == VisibilityId::Ground).count();
+        let [scene, scene_without_ground] = [true, false].map(|has_ground| {
+            test_scene(|look| {
+                modify_look(look);
+                look.ground = look.ground.filter(|_| has_ground);
+            })
+        });
+        for eye in [[3.0, 4.0, 5.0], [-4.0, 0.05, 1.0]] {
+            let mut draw_frame =
+                |scene: &Arc<Scene>, lowering: f32| Frame::new(&mut renderer, scene, camera_at(eye), lowering);
+            let (frame, frame_without_ground) = (draw_frame(&scene, 0.7), draw_frame(&scene_without_ground, 0.7));
+            let triangle_or_background = |id: &VisibilityId| match *id {
+                VisibilityId::Ground => VisibilityId::Background,
+                id => id,
+            };
+            let ids: Vec<_> = frame.ids.iter().map(triangle_or_background).collect();
+            assert_eq!(ids, frame_without_ground.ids, "look {index} from {eye:?}");
+            let ground_pixels = frame.count_ids(|id| id == VisibilityId::Ground);
             assert!(ground_pixels > 500, "look {index} from {eye:?}: {ground_pixels} pixels of ground");
+            // The ground itself stays where it is: a pixel without a triangle in both frames shows the same.
+            let frame_at_rest = draw_frame(&scene, 0.0);
+            let has_moved = |(at_rest, lowered): (&VisibilityId, &VisibilityId)| {
+                !matches!(at_rest, VisibilityId::Triangle(_))
+                    && !matches!(lowered, VisibilityId::Triangle(_))
+                    && at_rest != lowered
+            };
+            let moved_pixels = frame_at_rest.ids.iter().zip(&frame.ids).filter(|pair| has_moved(*pair)).count();
+            assert_eq!(moved_pixels, 0, "look {index} from {eye:?}");
+            assert_ne!(frame_at_rest.ids, frame.ids, "control: the triangles have moved");
         }
     }
 }
 
-/// Bounds that overflowed to NaN also require the ground pass.
 #[test]
-fn ground_hides_geometry_below_and_is_one_sided() {
+fn ground_is_one_sided() {
     let (scene, mut renderer) = (test_scene(|_| {}), open_renderer());
-    let camera = camera_at([0.5, 1.0, 7.0]);
-    let mut draw_frame =
-        |camera: Camera, lowering: f32, min_y: f64| Frame::new(&mut renderer, &scene, camera, lowering, min_y);
-    // Both frames lower the scene by 0.7. Only the bounds of the first frame extend below the ground.
-    let (frame_with_pass, frame_without_pass) = (draw_frame(camera, 0.7, -0.7), draw_frame(camera, 0.7, 0.0));
-    assert_eq!([frame_with_pass.draws_ground(), frame_without_pass.draws_ground()], [true, false]);
-    let [colors, ids] = frame_without_pass.count_differences(&frame_with_pass);
-    assert!(colors > 200 && ids > 100, "negative control: {colors} colors and {ids} ids differ");
-    // From below, the ground is not visible.
-    let frame_from_below = draw_frame(camera_at([0.5, -1.0, 7.0]), 0.0, 0.0);
-    assert!(!frame_from_below.draws_ground() && frame_from_below.ids.iter().all(|id| *id != VisibilityId::Ground));
-    let nan_bounds_frame = draw_frame(camera, 0.0, f64::NAN);
-    assert!(nan_bounds_frame.draws_ground(), "expected the ground pass for bounds that overflowed");
+    let mut draw_frame = |eye: [f64; 3]| Frame::new(&mut renderer, &scene, camera_at(eye), 0.0);
+    let [from_above, from_below] = [draw_frame([0.5, 1.0, 7.0]), draw_frame([0.5, -1.0, 7.0])]
+        .map(|frame| frame.count_ids(|id| id == VisibilityId::Ground));
+    assert!(from_above > 500 && from_below == 0, "{from_above} pixels from above, {from_below} from below");
 }
 
 #[test]
 fn geometry_on_the_ground_is_visible_despite_rounding() {
     let (scene, mut renderer) = (test_scene(|_| {}), open_renderer());
-    let camera = camera_at([1.0, 5.0, 4.0]);
-    // The scene and its bounds are lowered by 4e-7, an error that rounding can cause.
-    let frame = Frame::new(&mut renderer, &scene, camera, 4e-7, -4e-7);
-    assert!(!frame.draws_ground());
-    let frame_with_pass = Frame::new(&mut renderer, &scene, camera, 4e-7, BELOW_GROUND);
-    let [colors, ids] = frame.count_differences(&frame_with_pass);
-    assert!(frame_with_pass.draws_ground() && colors == 0 && ids <= 2, "{colors} colors and {ids} ids differ");
+    // Rounding can lower the scene by 4e-7.
+    let frame = Frame::new(&mut renderer, &scene, camera_at([1.0, 5.0, 4.0]), 4e-7);
     let red_pixels = frame.rgba.chunks_exact(4).filter(|pixel| pixel[0] > pixel[1].saturating_add(30)).count();
     assert!(red_pixels > 300, "{red_pixels} pixels of the red square");
 }

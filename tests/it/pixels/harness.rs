@@ -6,7 +6,7 @@ use modalcast_compute::reference::ReferenceDeformer;
 use modalcast_model::deform::{DeformSummary, Deformer as _};
 use modalcast_model::domain::{AlphaMode, Domain, Material, Mesh, Modes, Shape, Texture};
 use modalcast_model::scene::{Camera, Lens, Scene, SceneParts, SceneState, View};
-use modalcast_render::{Allocation, DevicePreference, FrameImage, FrameParams, FrameStats, Pass, Renderer, plan};
+use modalcast_render::{Allocation, DevicePreference, FrameImage, FrameParams, FrameStats, Renderer};
 
 /// Builder for a scene without shadow and ground, with a black sky, and with the sun in the direction +Z, behind
 /// [`front_camera`]. A white surface that faces +Z has the linear color 0.25 (skylight) + 0.5 (sunlight) = 0.75.
@@ -160,11 +160,6 @@ impl RenderedFrame {
             .filter(|(x, y)| predicate(self.pixel(*x, *y)))
             .count()
     }
-}
-
-/// The planned passes without the ground pass. A frame skips the ground pass if no geometry is below the ground.
-pub(super) fn planned_passes_without_ground(scene: &Scene) -> Vec<Pass> {
-    plan(scene).passes.into_iter().filter(|pass| *pass != Pass::Ground).collect()
 }
 
 /// The sRGB level of a linear value (IEC 61966-2-1), from 0 to 255 and not rounded.

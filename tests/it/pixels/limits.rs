@@ -7,10 +7,7 @@ use modalcast_model::domain::{AlphaMode, Material, Mesh, Transform};
 use modalcast_model::scene::{BoundingBox, Camera, RenderSettings, SceneState, View};
 use modalcast_render::{DevicePreference, FrameParams, Pass, Renderer, devices, plan};
 
-use super::harness::{
-    SceneBuilder, facing_rectangle, floor_mesh, front_camera, open_renderer, planned_passes_without_ground, render,
-    render_square,
-};
+use super::harness::{SceneBuilder, facing_rectangle, floor_mesh, front_camera, open_renderer, render, render_square};
 
 fn default_look_builder() -> SceneBuilder {
     let mut builder = SceneBuilder::new();
@@ -65,7 +62,7 @@ fn unused_features_allocate_and_run_nothing() {
     let mut planned_buffers = plan(&scene).buffers;
     planned_buffers.sort_by(|a, b| a.name.cmp(&b.name));
     assert_eq!(full_frame.allocations, planned_buffers, "expected the planned allocations");
-    assert_eq!(full_frame.stats.passes, planned_passes_without_ground(&scene), "expected the planned passes");
+    assert_eq!(full_frame.stats.passes, plan(&scene).passes, "expected the planned passes");
 }
 
 #[test]

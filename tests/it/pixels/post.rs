@@ -4,11 +4,11 @@ use modalcast_compute::reference::ReferenceDeformer;
 use modalcast_model::deform::{DeformedSurface, Deformer as _};
 use modalcast_model::domain::{AlphaMode, Material, Mesh};
 use modalcast_model::scene::{Antialiasing, Bloom, Camera, Lens, RenderSettings, SceneState, ToneMapping};
-use modalcast_render::{FrameParams, Pass};
+use modalcast_render::{FrameParams, Pass, plan};
 
 use super::harness::{
     RenderedFrame, SceneBuilder, decode_srgb, encode_srgb, facing_rectangle, front_camera, is_close, open_renderer,
-    planned_passes_without_ground, render, render_sized, render_square,
+    render, render_sized, render_square,
 };
 
 /// A builder with one sample per pixel. Surfaces of [`white_material`] have the linear color `light`. `modify_look`
@@ -328,7 +328,7 @@ fn post_processing_is_deterministic() {
     let all_effects = scene(with_all_effects(RenderSettings::default()));
     let mut renderer = open_renderer();
     let first_frame = render_square(&mut renderer, &all_effects, front_camera(96), 96);
-    assert_eq!(first_frame.stats.passes, planned_passes_without_ground(&all_effects));
+    assert_eq!(first_frame.stats.passes, plan(&all_effects).passes);
     assert!(first_frame.stats.passes.contains(&Pass::Bloom));
     let plain_frame = render_square(&mut renderer, &scene(RenderSettings::default()), front_camera(96), 96);
     assert!(!plain_frame.stats.passes.contains(&Pass::Bloom));

@@ -206,10 +206,7 @@ fn compute_rasterized_frame_equals_opengl() {
         );
         // `RasterShadow` draws the shadow depths and the visibility keys. `Unpack` converts the keys to visibility ids.
         assert_eq!(compute_frame.stats.passes[..3], [Pass::RasterShadow, Pass::Blur, Pass::Unpack]);
-        assert!(
-            !compute_frame.stats.passes.contains(&Pass::Ground)
-                && compute_frame.allocations.iter().any(|name| name == "raster shadow depths")
-        );
+        assert!(compute_frame.allocations.iter().any(|name| name == "raster shadow depths"));
         assert!(
             !opengl_frame
                 .allocations
@@ -287,7 +284,7 @@ fn opengl_and_compute_frames_share_a_target() {
 }
 
 #[test]
-fn ground_hides_geometry_below_but_not_in_its_plane() {
+fn ground_hides_no_geometry_with_any_rasterizer() {
     let scene = yard_builder(None, 1).build();
     // Domain of each pixel, with the wall and the floating square lowered by `lowering`.
     let visible_domains = |backend: Backend, lowering: f32| {
@@ -326,14 +323,13 @@ fn ground_hides_geometry_below_but_not_in_its_plane() {
         "expected at most 8 different samples on edges, got {}",
         count_differences(&compute_domains, &opengl_domains)
     );
-    assert!(
-        count(&opengl_domains, 0) > 100 && 2 * count(&compute_domains, 0) < count(&above_ground, 0),
-        "expected the ground to hide most of the wall"
-    );
-    assert!(
-        count(&above_ground, 1) > 100 && count(&compute_domains, 1) == 0,
-        "expected the ground to hide the floating square"
-    );
+    // A pixel below the ground plane still shows the wall or the floating square.
+    let counts = |domain: usize| [&above_ground, &opengl_domains, &compute_domains].map(|ids| count(ids, domain));
+    for domain in 0..2 {
+        let [above, opengl, compute] = counts(domain);
+        assert!(above > 100 && 2 * opengl.min(compute) > above, "domain {domain}: {:?} pixels", counts(domain));
+    }
+    assert!(count_differences(&above_ground, &opengl_domains) > 100, "control: the geometry has moved");
     let in_plane_counts = [count(&above_ground, 2), count(&opengl_domains, 2), count(&compute_domains, 2)];
     assert!(
         in_plane_counts[0] > 100 && in_plane_counts == [in_plane_counts[0]; 3],

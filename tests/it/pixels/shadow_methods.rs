@@ -5,9 +5,7 @@ use modalcast_model::domain::{AlphaMode, Material, Mesh};
 use modalcast_model::scene::{Camera, Lens, MomentFormat, Scene, ShadowMethod, ShadowSettings, View};
 use modalcast_render::{BlurMethod, Pass, plan};
 
-use super::harness::{
-    RenderedFrame, decode_srgb, floor_mesh, is_close, open_renderer, planned_passes_without_ground, render_square,
-};
+use super::harness::{RenderedFrame, decode_srgb, floor_mesh, is_close, open_renderer, render_square};
 use super::shadow::{create_builder, with_square};
 
 /// Pixels per unit of the ground in the image of the edge.
@@ -293,7 +291,7 @@ fn unused_shadow_resources_are_not_allocated() {
     let resources_of = |shadow: ShadowSettings| {
         let scene = square_scene(shadow);
         let (frame, plan) = (render_edge(shadow), plan(&scene));
-        assert_eq!(frame.stats.passes, planned_passes_without_ground(&scene), "expected the planned passes");
+        assert_eq!(frame.stats.passes, plan.passes, "expected the planned passes");
         let names = plan.textures.iter().map(|allocation| allocation.name.clone());
         ShadowResources {
             has_blur_pass: frame.stats.passes.contains(&Pass::Blur),

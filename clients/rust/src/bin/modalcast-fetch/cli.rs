@@ -121,6 +121,7 @@ pub(crate) enum FormatOption {
 pub(crate) enum OutputOption {
     Color,
     Depth,
+    DepthWithGround,
     Domains,
     Normals,
     Displacement,
@@ -169,6 +170,7 @@ impl PictureOptions {
         let output = match output {
             OutputOption::Color => Output::Color,
             OutputOption::Depth => Output::Depth,
+            OutputOption::DepthWithGround => Output::DepthWithGround,
             OutputOption::Domains => Output::Domains,
             OutputOption::Normals => Output::Normals,
             OutputOption::Displacement => Output::Displacement { scale_max },
