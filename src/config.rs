@@ -48,6 +48,20 @@ pub struct Config {
     pub allow_software: bool,
     /// The largest message that the server accepts, in bytes.
     pub message_bytes: usize,
+    /// Limits in bytes on the messages that are being received: on one connection, and in total. An incomplete message
+    /// counts with its whole length. A request above the limit of its connection is rejected. Above the total, the
+    /// connection that holds the most loses its incomplete messages.
+    pub connection_receive_bytes: usize,
+    pub receive_bytes: usize,
+    /// Longest time without progress of an incomplete message. Progress below 32 KiB/s extends it only in part.
+    pub message_timeout: Duration,
+    /// Limits in bytes on the replies that are produced and not yet sent: on one connection, and in total. Above a limit,
+    /// senders wait.
+    pub connection_reply_bytes: usize,
+    pub reply_bytes: usize,
+    /// A call whose client takes no bytes for this time ends when another reply waits for the same limit. After this time
+    /// again, its connection is closed.
+    pub reply_timeout: Duration,
     /// The largest chunk of data in one reply message, in bytes. The message also contains a head.
     pub chunk_bytes: usize,
     /// The largest image side in pixels.
@@ -99,6 +113,12 @@ impl Default for Config {
             renderer: RendererChoice::Auto,
             allow_software: true,
             message_bytes: 16 << 20,
+            connection_receive_bytes: 32 << 20,
+            receive_bytes: 128 << 20,
+            message_timeout: Duration::from_secs(10),
+            connection_reply_bytes: 64 << 20,
+            reply_bytes: 256 << 20,
+            reply_timeout: Duration::from_secs(10),
             chunk_bytes: 1 << 20,
             frame_side: 8192,
             open_scenes: 16,
@@ -142,6 +162,16 @@ impl Config {
         let ms = |duration: Duration| u64::try_from(duration.as_millis()).unwrap_or(u64::MAX);
         const HOUR_MS: u64 = 3_600_000;
         check_range("message_bytes", self.message_bytes as u64, 64 << 10, 1 << 30)?;
+        let max_budget = u64::from(u32::MAX);
+        let (message_bytes, receive_bytes) = (self.message_bytes as u64, self.connection_receive_bytes as u64);
+        check_range("connection_receive_bytes", receive_bytes, message_bytes, max_budget)?;
+        check_range("receive_bytes", self.receive_bytes as u64, receive_bytes, max_budget)?;
+        // The largest reply has 3 MiB. Two fit, so that one unread reply does not block all others.
+        let reply_bytes = self.connection_reply_bytes as u64;
+        check_range("connection_reply_bytes", reply_bytes, 6 << 20, max_budget)?;
+        check_range("reply_bytes", self.reply_bytes as u64, reply_bytes, max_budget)?;
+        check_range("message_timeout (ms)", ms(self.message_timeout), 1, HOUR_MS)?;
+        check_range("reply_timeout (ms)", ms(self.reply_timeout), 4, HOUR_MS)?;
         check_range("chunk_bytes", self.chunk_bytes as u64, 1 << 10, 1 << 20)?;
         check_range("frame_side", self.frame_side.into(), 1, 16384)?;
         check_range("open_scenes", self.open_scenes as u64, 1, 4096)?;

@@ -5186,6 +5186,23 @@ pub struct Limits {
     /// stream of the smallest steps uses a fifth of the connection's budget for small frames.
     #[prost(uint32, tag = "7")]
     pub drives: u32,
+    /// Limit in bytes on the messages that one connection is sending: each counts with its whole length from its first byte
+    /// until it is complete, and a request until it is answered. A message above the limit is rejected with
+    /// REASON_LIMIT_REACHED.
+    #[prost(uint64, tag = "8")]
+    pub connection_receive_bytes: u64,
+    /// Longest time in milliseconds without progress of a message that has begun. Bytes extend it by the time in which a
+    /// client with 32 KiB/s sends them. REASON_DEADLINE_EXPIRED.
+    #[prost(uint32, tag = "9")]
+    pub message_timeout_ms: u32,
+    /// Limit in bytes on the unread replies of one connection. Above it, the server produces no more replies for this
+    /// connection until the client reads.
+    #[prost(uint64, tag = "10")]
+    pub connection_reply_bytes: u64,
+    /// A call whose client takes no bytes for this time, in milliseconds, while other replies wait for capacity, ends with
+    /// REASON_SLOW_READER. If its bytes remain unread, the server closes the connection after this time again.
+    #[prost(uint32, tag = "11")]
+    pub reply_timeout_ms: u32,
 }
 /// A capability that not every server of the same protocol version has. A client tests for a feature before it depends
 /// on it, and ignores values that it does not know.

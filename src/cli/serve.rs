@@ -44,6 +44,25 @@ pub(super) struct Args {
     /// Largest accepted message, in bytes.
     #[arg(long, default_value_t = Config::default().message_bytes)]
     message_bytes: usize,
+    /// Limit on the messages that one connection is sending, in bytes. Default: 32 MiB, and at least the largest message.
+    #[arg(long)]
+    connection_receive_bytes: Option<usize>,
+    /// Limit on the messages that all connections are sending, in bytes. When it is exhausted, the connection that holds
+    /// the most loses its incomplete messages.
+    #[arg(long, default_value_t = Config::default().receive_bytes)]
+    receive_bytes: usize,
+    /// Longest time without progress of an incomplete message, in milliseconds.
+    #[arg(long, default_value_t = default_ms(Config::default().message_timeout))]
+    message_timeout_ms: u64,
+    /// Limit on the unsent replies of one connection, in bytes.
+    #[arg(long, default_value_t = Config::default().connection_reply_bytes)]
+    connection_reply_bytes: usize,
+    /// Limit on the unsent replies of all connections, in bytes.
+    #[arg(long, default_value_t = Config::default().reply_bytes)]
+    reply_bytes: usize,
+    /// Time in milliseconds after which a client that reads nothing is disconnected, if other replies wait.
+    #[arg(long, default_value_t = default_ms(Config::default().reply_timeout))]
+    reply_timeout_ms: u64,
     /// Largest side of a frame, in pixels.
     #[arg(long, default_value_t = Config::default().frame_side)]
     frame_side: u32,
@@ -61,6 +80,10 @@ pub(super) struct Args {
     deadline_ms: u64,
 }
 
+fn default_ms(duration: Duration) -> u64 {
+    duration.as_millis() as u64
+}
+
 impl Args {
     fn config(&self) -> Result<ValidatedConfig> {
         let defaults = Config::default();
@@ -73,6 +96,14 @@ impl Args {
             renderer: self.renderer,
             allow_software: !self.hardware_only,
             message_bytes: self.message_bytes,
+            connection_receive_bytes: self
+                .connection_receive_bytes
+                .unwrap_or_else(|| defaults.connection_receive_bytes.max(self.message_bytes)),
+            receive_bytes: self.receive_bytes,
+            message_timeout: Duration::from_millis(self.message_timeout_ms),
+            connection_reply_bytes: self.connection_reply_bytes,
+            reply_bytes: self.reply_bytes,
+            reply_timeout: Duration::from_millis(self.reply_timeout_ms),
             frame_side: self.frame_side,
             open_scenes: self.open_scenes,
             window: self.window,

@@ -2,6 +2,7 @@
 
 use std::collections::HashMap;
 use std::ops::Range;
+use std::sync::Arc;
 
 use bytes::Bytes;
 use sha2::{Digest as _, Sha256};
@@ -58,11 +59,12 @@ impl ShapeArray {
         }
     }
 
-    /// Copies a range of bytes of the array. The range must lie within the size of the array.
-    pub fn read(self, shape: &Shape, range: Range<usize>) -> Bytes {
+    /// A range of bytes of the array of a shape. It is shared with the scene, except for the modes, which are stored in
+    /// another order. The range must lie within the size of the array.
+    pub fn read(self, scene: &Arc<Scene>, shape: usize, range: Range<usize>) -> Bytes {
         match self {
-            Self::Modes => read_modes(shape, range),
-            _ => Bytes::copy_from_slice(&self.stored_bytes(shape)[range]),
+            Self::Modes => read_modes(&scene.shapes[shape], range),
+            _ => share(scene, SceneContent::Array { shape, array: self }, range),
         }
     }
 
@@ -78,6 +80,25 @@ impl ShapeArray {
             Self::Modes => &[],
         }
     }
+}
+
+/// Bytes that keep their scene in memory.
+struct SharedContent {
+    scene: Arc<Scene>,
+    content: SceneContent,
+}
+
+impl AsRef<[u8]> for SharedContent {
+    fn as_ref(&self) -> &[u8] {
+        match self.content {
+            SceneContent::Array { shape, array } => array.stored_bytes(&self.scene.shapes[shape]),
+            SceneContent::Texture(texture) => self.scene.textures[texture].rgba(),
+        }
+    }
+}
+
+fn share(scene: &Arc<Scene>, content: SceneContent, range: Range<usize>) -> Bytes {
+    Bytes::from_owner(SharedContent { scene: Arc::clone(scene), content }).slice(range)
 }
 
 /// Copies a range of bytes of U in row-major order.
@@ -109,15 +130,16 @@ impl SceneContent {
         }
     }
 
-    /// Copies a range of bytes of the content. The range must lie within the size of the content.
-    pub fn read(self, scene: &Scene, range: Range<usize>) -> Bytes {
+    /// A range of bytes of the content, as [`ShapeArray::read`] returns it. The range must lie within the size of the
+    /// content.
+    pub fn read(self, scene: &Arc<Scene>, range: Range<usize>) -> Bytes {
         match self {
-            Self::Array { shape, array } => array.read(&scene.shapes[shape], range),
-            Self::Texture(texture) => Bytes::copy_from_slice(&scene.textures[texture].rgba()[range]),
+            Self::Array { shape, array } => array.read(scene, shape, range),
+            Self::Texture(_) => share(scene, self, range),
         }
     }
 
-    fn hash(self, scene: &Scene) -> ContentHash {
+    fn hash(self, scene: &Arc<Scene>) -> ContentHash {
         let mut hasher = Sha256::new();
         let size = self.size(scene);
         for start in (0..size).step_by(HASH_CHUNK_BYTES) {
@@ -139,7 +161,7 @@ pub struct ContentHashes {
 
 impl ContentHashes {
     /// Hashes all content of a scene. Takes time in proportion to its size.
-    pub(super) fn of_scene(scene: &Scene) -> Self {
+    pub(super) fn of_scene(scene: &Arc<Scene>) -> Self {
         let mut content_by_hash = HashMap::new();
         let mut hash = |content: SceneContent| {
             let hash = content.hash(scene);
@@ -183,7 +205,7 @@ mod tests {
         let expected: Vec<u8> = rows.flat_map(f32::to_le_bytes).collect();
         assert_eq!(ShapeArray::Modes.size(shape), expected.len());
         for range in [0..96, 5..6, 3..90, 96..96] {
-            assert_eq!(ShapeArray::Modes.read(shape, range.clone()), expected[range.clone()], "{range:?}");
+            assert_eq!(ShapeArray::Modes.read(&scene, 0, range.clone()), expected[range.clone()], "{range:?}");
         }
     }
 
@@ -193,7 +215,7 @@ mod tests {
         let hashes = ContentHashes::of_scene(&scene);
         for (array, hash) in ShapeArray::ALL.into_iter().zip(hashes.of_shape(0)) {
             let content = hashes.find(hash).expect("expected known content");
-            let bytes = array.read(&scene.shapes[0], 0..array.size(&scene.shapes[0]));
+            let bytes = array.read(&scene, 0, 0..array.size(&scene.shapes[0]));
             assert_eq!(content.read(&scene, 0..content.size(&scene)), bytes, "{array:?}");
             assert_eq!(hash[..], Sha256::digest(&bytes)[..], "{array:?}");
         }

@@ -3,8 +3,11 @@
 use std::net::SocketAddr;
 use std::sync::Arc;
 
-use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+use tokio::sync::{Notify, OwnedSemaphorePermit, Semaphore};
 
+use super::receive_budget::{ConnectionReceiveBudget, ReceiveBudget};
+use super::reply_budget::{ConnectionReplyBudget, ReplyBudget};
+use crate::config::Config;
 use modalcast_model::error::{Error, Result};
 
 /// Ratio of the HTTP/2 flow-control windows of a connection and a stream. It is far above the number of streams, because
@@ -17,16 +20,37 @@ pub(super) const STREAMS_PER_CONNECTION_WINDOW: u32 = 256;
 /// with nothing but its number. One stream is then charged W / 9 * (256 - 9) = 27.4 W, so four are safe.
 pub(super) const MAX_DRIVES: usize = 4;
 
+/// The budgets that all connections share.
+#[derive(Debug, Clone)]
+pub(super) struct Budgets {
+    receive: Arc<ReceiveBudget>,
+    reply: Arc<ReplyBudget>,
+}
+
+impl Budgets {
+    pub(super) fn new(config: &Config) -> Self {
+        Self { receive: ReceiveBudget::new(config), reply: ReplyBudget::new(config) }
+    }
+}
+
 /// A connection, in the extensions of each of its calls.
 #[derive(Debug, Clone)]
 pub(super) struct ConnectionInfo {
     remote: SocketAddr,
     drive_permits: Arc<Semaphore>,
+    pub(super) receive: Arc<ConnectionReceiveBudget>,
+    pub(super) reply: Arc<ConnectionReplyBudget>,
 }
 
 impl ConnectionInfo {
-    pub(super) fn new(remote: SocketAddr) -> Self {
-        Self { remote, drive_permits: Arc::new(Semaphore::new(MAX_DRIVES)) }
+    /// `close` closes the connection.
+    pub(super) fn new(remote: SocketAddr, budgets: &Budgets, close: Arc<Notify>) -> Self {
+        Self {
+            remote,
+            drive_permits: Arc::new(Semaphore::new(MAX_DRIVES)),
+            receive: budgets.receive.new_connection(),
+            reply: budgets.reply.new_connection(close),
+        }
     }
 
     /// The address of the client, for the log. It is never sent to another client.

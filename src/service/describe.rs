@@ -16,6 +16,9 @@ use modalcast_model::domain::{AlphaMode, Domain, Material, MaterialRange, Transf
 use modalcast_model::error::{Error, Result, invalid};
 use modalcast_model::scene::Scene;
 
+/// Upper bound on the encoded size of a chunk without its data, in bytes.
+const CHUNK_HEAD_BYTES: usize = 64;
+
 /// Replies with the descriptions of the selected domains and of everything that they use, and with the requested
 /// arrays.
 pub(super) fn respond_with_description(
@@ -42,9 +45,9 @@ pub(super) fn respond_with_description(
     }))
 }
 
-/// Sends an array in chunks, and copies one chunk at a time. An empty array is one empty chunk.
+/// Sends an array in chunks. An empty array is one empty chunk.
 async fn send_array(
-    scene: &Scene,
+    scene: &Arc<Scene>,
     shape: usize,
     array: ShapeArray,
     max_chunk_bytes: usize,
@@ -52,14 +55,15 @@ async fn send_array(
 ) -> Result<(), Status> {
     let size = array.size(&scene.shapes[shape]);
     for start in (0..size.max(1)).step_by(max_chunk_bytes) {
+        let permit = reply_sender.reserve(max_chunk_bytes.min(size) + CHUNK_HEAD_BYTES).await?;
         let chunk = v1::ArrayChunk {
             shape: shape as u32,
             array: wire_array(array).into(),
             offset: start as u64,
             total: size as u64,
-            data: array.read(&scene.shapes[shape], start..size.min(start + max_chunk_bytes)),
+            data: array.read(scene, shape, start..size.min(start + max_chunk_bytes)),
         };
-        reply_sender.send(response_with(Part::Chunk(chunk))).await?;
+        permit.send(response_with(Part::Chunk(chunk)));
     }
     Ok(())
 }
@@ -84,9 +88,10 @@ pub(super) async fn respond_with_content(
         for (item, content) in items.into_iter().enumerate() {
             let size = content.size(&scene_handle.scene);
             for start in (0..size.max(1)).step_by(max_chunk_bytes) {
+                let permit = reply_sender.reserve(max_chunk_bytes.min(size) + CHUNK_HEAD_BYTES).await?;
                 let data = content.read(&scene_handle.scene, start..size.min(start + max_chunk_bytes));
                 let (item, offset, total) = (item as u32, start as u64, size as u64);
-                reply_sender.send(v1::ReadContentResponse { item, offset, total, data }).await?;
+                permit.send(v1::ReadContentResponse { item, offset, total, data });
             }
         }
         Ok(())
@@ -125,13 +130,14 @@ pub(super) fn respond_with_modes(
     Ok(respond(move |reply_sender: ReplySender<v1::ReadModesResponse>| async move {
         let modes = &scene_handle.scene.shape_of(request.domain as usize).modes;
         for (chunk_index, vertices_of_chunk) in vertices_to_read.chunks(vertices_per_chunk).enumerate() {
+            let permit = reply_sender.reserve(vertices_of_chunk.len() * bytes_per_vertex + CHUNK_HEAD_BYTES).await?;
             let entries_of_row = |row: usize| (0..rank).map(move |mode| modes.column(mode)[row]);
             let rows = vertices_of_chunk
                 .iter()
                 .flat_map(|vertex| (0..3).map(move |component| 3 * *vertex as usize + component));
             let data: Vec<u8> = rows.flat_map(entries_of_row).flat_map(f32::to_le_bytes).collect();
             let offset = (chunk_index * vertices_per_chunk * bytes_per_vertex) as u64;
-            reply_sender.send(v1::ReadModesResponse { rank: rank as u32, offset, total, data: data.into() }).await?;
+            permit.send(v1::ReadModesResponse { rank: rank as u32, offset, total, data: data.into() });
         }
         Ok(())
     }))

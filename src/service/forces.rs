@@ -55,12 +55,12 @@ async fn send_reports(
     reply_sender: ReplySender<v1::StreamForcesResponse>,
 ) -> Result<(), Status> {
     loop {
-        let permit = reply_sender.reserve().await?;
+        reply_sender.wait_for_capacity().await?;
         let report = tokio::select! {
             report = subscription.next() => report.map_err(to_status)?,
             () = reply_sender.closed() => return Ok(()),
         };
-        permit.send(Ok(wire_report(&report)));
+        reply_sender.send(wire_report(&report)).await?;
     }
 }
 

@@ -1,5 +1,7 @@
 //! `ServerService`: version, features, devices and limits of the server.
 
+use std::time::Duration;
+
 use modalcast_proto::v1;
 use tonic::{Request, Response, Status};
 
@@ -27,8 +29,12 @@ impl v1::server_service_server::ServerService for ServerServiceImpl {
             scenes: config.open_scenes as u32,
             window: config.max_window,
             upload_bytes: config.upload_bytes,
-            deadline_ms: u32::try_from(config.deadline.as_millis()).unwrap_or(u32::MAX),
+            deadline_ms: to_ms(config.deadline),
             drives: MAX_DRIVES as u32,
+            connection_receive_bytes: config.connection_receive_bytes as u64,
+            message_timeout_ms: to_ms(config.message_timeout),
+            connection_reply_bytes: config.connection_reply_bytes as u64,
+            reply_timeout_ms: to_ms(config.reply_timeout),
         };
         Ok(Response::new(v1::GetServerInfoResponse {
             version: env!("CARGO_PKG_VERSION").into(),
@@ -41,6 +47,10 @@ impl v1::server_service_server::ServerService for ServerServiceImpl {
             features: list_features(info).into_iter().map(Into::into).collect(),
         }))
     }
+}
+
+fn to_ms(duration: Duration) -> u32 {
+    u32::try_from(duration.as_millis()).unwrap_or(u32::MAX)
 }
 
 /// The features of a server with these devices.

@@ -10,11 +10,13 @@ use std::time::Duration;
 
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::net::{TcpListener, TcpStream};
-use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
+use tokio::sync::futures::OwnedNotified;
+use tokio::sync::{Notify, OwnedSemaphorePermit, Semaphore, mpsc};
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::transport::server::Connected;
 
-use super::connection::ConnectionInfo;
+use super::connection::{Budgets, ConnectionInfo};
+use crate::config::Config;
 
 /// Maximum number of connections that have sent their first byte and are queued for the server. Further connections
 /// wait until the queue has capacity.
@@ -28,23 +30,24 @@ const ACCEPT_RETRY_DELAY: Duration = Duration::from_millis(50);
 pub(super) struct Connection {
     stream: TcpStream,
     info: ConnectionInfo,
+    /// Completes when the server must close the connection.
+    closed: Pin<Box<OwnedNotified>>,
+    is_closed: bool,
     /// Counts against the limit on connections until the connection is dropped.
     _permit: OwnedSemaphorePermit,
 }
 
-/// Accepts connections until the returned stream is dropped. At most `max_connections` are open at a time. Each must
-/// send its first byte within `first_byte_timeout`.
-pub(super) fn accept_connections(
-    listener: TcpListener,
-    max_connections: usize,
-    first_byte_timeout: Duration,
-) -> ReceiverStream<io::Result<Connection>> {
+/// Accepts connections until the returned stream is dropped. At most `config.connections` are open at a time. Each must
+/// send its first byte within `config.first_byte_timeout`. All share the budgets of the configuration.
+pub(super) fn accept_connections(listener: TcpListener, config: &Config) -> ReceiverStream<io::Result<Connection>> {
+    let budgets = Budgets::new(config);
+    let (max_connections, first_byte_timeout) = (config.connections, config.first_byte_timeout);
     let (ready_sender, ready_receiver) = mpsc::channel(READY_QUEUE_CAPACITY);
     tokio::spawn(async move {
         let permits = Arc::new(Semaphore::new(max_connections));
         loop {
             let accept_result = tokio::select! {
-                accept_result = accept(&listener, &permits) => accept_result,
+                accept_result = accept(&listener, &permits, &budgets) => accept_result,
                 () = ready_sender.closed() => return,
             };
             match accept_result {
@@ -61,11 +64,19 @@ pub(super) fn accept_connections(
     ReceiverStream::new(ready_receiver)
 }
 
-async fn accept(listener: &TcpListener, permits: &Arc<Semaphore>) -> io::Result<Connection> {
+async fn accept(listener: &TcpListener, permits: &Arc<Semaphore>, budgets: &Budgets) -> io::Result<Connection> {
     let permit = Arc::clone(permits).acquire_owned().await.map_err(io::Error::other)?;
     let (stream, remote) = listener.accept().await?;
     stream.set_nodelay(true)?;
-    Ok(Connection { stream, info: ConnectionInfo::new(remote), _permit: permit })
+    let close = Arc::new(Notify::new());
+    let closed = Box::pin(Arc::clone(&close).notified_owned());
+    Ok(Connection {
+        stream,
+        info: ConnectionInfo::new(remote, budgets, close),
+        closed,
+        is_closed: false,
+        _permit: permit,
+    })
 }
 
 /// Forwards a connection once it has sent its first byte. Drops it if it sends nothing within `first_byte_timeout`.
@@ -89,14 +100,24 @@ impl Connected for Connection {
     }
 }
 
+impl Connection {
+    /// Fails when the server must close the connection.
+    fn check_open(&mut self, cx: &mut Context<'_>) -> io::Result<()> {
+        self.is_closed = self.is_closed || self.closed.as_mut().poll(cx).is_ready();
+        if self.is_closed { Err(io::ErrorKind::ConnectionAborted.into()) } else { Ok(()) }
+    }
+}
+
 impl AsyncRead for Connection {
     fn poll_read(mut self: Pin<&mut Self>, cx: &mut Context<'_>, buffer: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
+        self.check_open(cx)?;
         Pin::new(&mut self.stream).poll_read(cx, buffer)
     }
 }
 
 impl AsyncWrite for Connection {
     fn poll_write(mut self: Pin<&mut Self>, cx: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
+        self.check_open(cx)?;
         Pin::new(&mut self.stream).poll_write(cx, bytes)
     }
 
@@ -105,6 +126,7 @@ impl AsyncWrite for Connection {
         cx: &mut Context<'_>,
         slices: &[io::IoSlice<'_>],
     ) -> Poll<io::Result<usize>> {
+        self.check_open(cx)?;
         Pin::new(&mut self.stream).poll_write_vectored(cx, slices)
     }
 

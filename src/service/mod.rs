@@ -9,7 +9,10 @@ mod frames;
 mod info;
 mod listen;
 mod picks;
+mod receive_budget;
 mod reply_body;
+mod reply_budget;
+mod request_body;
 mod routes;
 mod scenes;
 mod states;
@@ -35,6 +38,9 @@ use modalcast_model::error::{Error, Result, fault_in};
 /// Largest message that the server sends, in bytes: a chunk of at most 1 MiB and its head, or the layout of 65,536
 /// domains.
 const MAX_REPLY_BYTES: usize = 3 << 20;
+
+/// Limit on the open calls of one connection.
+const MAX_CALLS: usize = 128;
 
 /// Binds the configured address.
 ///
@@ -63,7 +69,7 @@ pub async fn serve(
     let (health_reporter, health_server) = tonic_health::server::health_reporter();
     set_health(&health_reporter, true).await;
     let routes = routes(&engine, &config)?.with(health_server);
-    let connections = listen::accept_connections(listener, config.connections, config.first_byte_timeout);
+    let connections = listen::accept_connections(listener, &config);
     let (stop_sender, stop_receiver) = oneshot::channel();
     let stop_engine = async move {
         let mut shutdown = std::pin::pin!(shutdown);
@@ -123,9 +129,10 @@ async fn set_health(health: &HealthReporter, is_serving: bool) {
 /// bytes.
 fn transport(config: &Config) -> Server {
     Server::builder()
-        // A connection may have 128 open calls. The server handles 64 of them at a time.
-        .max_concurrent_streams(128)
-        .concurrency_limit_per_connection(64)
+        // All open calls of a connection are handled at a time. A call in a queue would not be read, and HTTP/2 would
+        // buffer a stream window of it outside the budgets.
+        .max_concurrent_streams(MAX_CALLS as u32)
+        .concurrency_limit_per_connection(MAX_CALLS)
         // A client that opens and resets more streams than this (a rapid-reset attack) is disconnected.
         .http2_max_local_error_reset_streams(Some(1024))
         .http2_max_pending_accept_reset_streams(Some(100))

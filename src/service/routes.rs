@@ -11,9 +11,11 @@ use tonic::codegen::{BoxFuture, Service};
 use tonic::server::NamedService;
 use tonic::{Code, Status};
 
-use super::status::transport_status;
-
+use super::connection::ConnectionInfo;
 use super::reply_body::replace_body;
+use super::reply_budget::{CountedReplyBody, ReplyContext};
+use super::request_body::{RequestBody, RequestMemory};
+use super::status::transport_status;
 
 type Route = Arc<dyn Fn(Request<Body>) -> BoxFuture<Response<Body>, Infallible> + Send + Sync>;
 
@@ -66,14 +68,31 @@ impl Service<Request<Body>> for Routes {
 
     fn call(&mut self, request: Request<Body>) -> Self::Future {
         let name = request.uri().path().split('/').nth(1).unwrap_or_default();
-        match self.by_name.get(name) {
-            Some(route) => {
-                let (response, max_message_bytes) = (route(request), self.max_message_bytes);
-                Box::pin(async move { Ok(with_transport_details(response.await?, max_message_bytes)) })
-            }
-            None => Box::pin(async {
+        let Some(route) = self.by_name.get(name).cloned() else {
+            return Box::pin(async {
                 Ok(Status::unimplemented("expected the path of a service of this server").into_http())
-            }),
-        }
+            });
+        };
+        let response: Self::Future = match request.extensions().get::<ConnectionInfo>().cloned() {
+            Some(connection) => Box::pin(call_within_budgets(route, request, connection)),
+            None => route(request),
+        };
+        let max_message_bytes = self.max_message_bytes;
+        Box::pin(async move { Ok(with_transport_details(response.await?, max_message_bytes)) })
     }
+}
+
+/// Calls a service. Request and response count against the budgets of the connection.
+async fn call_within_budgets(
+    route: Route,
+    request: Request<Body>,
+    connection: ConnectionInfo,
+) -> Result<Response<Body>, Infallible> {
+    let memory = RequestMemory::new(&connection.receive);
+    let request_memory = memory.clone();
+    let request = request.map(|body| Body::new(RequestBody::new(body, request_memory, connection.receive.limits())));
+    let context = ReplyContext::new(connection.reply.new_call());
+    let response = context.clone().scope(route(request)).await;
+    memory.release_complete();
+    response.map(|response| response.map(|inner| Body::new(CountedReplyBody { inner, context })))
 }

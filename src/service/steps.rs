@@ -76,6 +76,7 @@ impl DriveSession {
             }
             // Without capacity, reports wait in the step queue.
             let may_read = self.writer.as_ref().is_none_or(WriterSession::may_read_step);
+            let next_reply_bytes = self.replies.front().map_or(0, prost::Message::encoded_len);
             let has_reply_capacity = self.replies.len() < MAX_PENDING_REPLIES;
             tokio::select! {
                 message = self.inbound.message(), if is_receiving && may_read => match message {
@@ -87,10 +88,10 @@ impl DriveSession {
                     Ok(report) => self.push_report(report),
                     Err(error) => return self.close_with_error(&reply_sender, error).await,
                 },
-                permit = reply_sender.reserve(), if !self.replies.is_empty() => {
+                permit = reply_sender.reserve(next_reply_bytes), if !self.replies.is_empty() => {
                     let permit = permit?;
                     if let Some(reply) = self.replies.pop_front() {
-                        permit.send(Ok(reply));
+                        permit.send(reply);
                     }
                 }
                 () = reply_sender.closed() => return Ok(()),

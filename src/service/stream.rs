@@ -1,16 +1,19 @@
-//! Reply streams. A task sends messages through a bounded channel. Replies are split into chunks of at most 1 MiB. A
+//! Reply streams. A task sends messages through a bounded queue, within the reply budgets. Replies are split into chunks of at most 1 MiB. A
 //! deadline covers the whole reply up to its last chunk. A panic ends only its own call.
 
 use std::pin::Pin;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::task::{Context, Poll, ready};
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
-use tokio::sync::mpsc;
+use tokio::sync::{mpsc, oneshot};
+use tokio::task::JoinHandle;
 use tokio_stream::Stream;
-use tokio_stream::wrappers::ReceiverStream;
 use tonic::metadata::MetadataMap;
 use tonic::{Response, Status};
 
+use super::reply_budget::{CallReplies, ReplyContext, UnsentBytes};
 use super::status::to_status;
 use crate::config::Config;
 use modalcast_model::error::{Error, Result};
@@ -18,33 +21,67 @@ use modalcast_model::error::{Error, Result};
 /// A reply stream.
 pub(super) type ReplyStream<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
 
-/// Maximum number of messages of a reply that are buffered for the connection.
+/// Maximum number of messages of a reply that are queued for the connection.
 const REPLY_CAPACITY: usize = 2;
 
-/// Sender of a reply stream. Sending waits while the client reads slowly (back-pressure).
-#[derive(Debug)]
-pub(super) struct ReplySender<T>(mpsc::Sender<Result<T, Status>>);
+/// Bytes that gRPC adds to a message.
+const MESSAGE_HEADER_BYTES: usize = 5;
 
-impl<T> ReplySender<T> {
-    /// Sends one message. Waits until the channel has capacity.
+/// A message with its share of the reply budget.
+type QueuedMessage<T> = (T, UnsentBytes);
+
+/// Sender of a reply stream. Sending waits while the client reads slowly (back-pressure), and while the replies of its
+/// connection or of all connections exceed their budget.
+#[derive(Debug)]
+pub(super) struct ReplySender<T> {
+    messages: mpsc::Sender<QueuedMessage<T>>,
+    replies: Arc<CallReplies>,
+}
+
+/// Capacity for one message.
+pub(super) struct ReplyPermit<'a, T> {
+    slot: mpsc::Permit<'a, QueuedMessage<T>>,
+    unsent: UnsentBytes,
+}
+
+impl<T> ReplyPermit<'_, T> {
+    pub(super) fn send(self, message: T) {
+        self.slot.send((message, self.unsent));
+    }
+}
+
+impl<T: prost::Message> ReplySender<T> {
+    /// Sends one message. Waits until there is capacity.
     ///
     /// # Errors
     /// `CANCELLED` when the client has disconnected.
     pub(super) async fn send(&self, message: T) -> Result<(), Status> {
-        self.0.send(Ok(message)).await.map_err(|_| disconnected_status())
+        self.reserve(message.encoded_len()).await?.send(message);
+        Ok(())
     }
 
-    /// Waits until the channel has capacity for a message. Cancel-safe.
+    /// Waits until there is capacity for a message of `bytes` bytes. Reserve before a large message is built, so that no
+    /// message waits outside the budget. Cancel-safe.
     ///
     /// # Errors
     /// `CANCELLED` when the client has disconnected.
-    pub(super) async fn reserve(&self) -> Result<mpsc::Permit<'_, Result<T, Status>>, Status> {
-        self.0.reserve().await.map_err(|_| disconnected_status())
+    pub(super) async fn reserve(&self, bytes: usize) -> Result<ReplyPermit<'_, T>, Status> {
+        let slot = self.messages.reserve().await.map_err(|_| disconnected_status())?;
+        let unsent = self.replies.acquire(bytes + MESSAGE_HEADER_BYTES).await?;
+        Ok(ReplyPermit { slot, unsent })
+    }
+
+    /// Waits until the queue has capacity for a message of unknown size. Cancel-safe.
+    ///
+    /// # Errors
+    /// `CANCELLED` when the client has disconnected.
+    pub(super) async fn wait_for_capacity(&self) -> Result<(), Status> {
+        self.messages.reserve().await.map(drop).map_err(|_| disconnected_status())
     }
 
     /// Waits until the client has disconnected.
     pub(super) async fn closed(&self) {
-        self.0.closed().await;
+        self.messages.closed().await;
     }
 }
 
@@ -52,42 +89,122 @@ fn disconnected_status() -> Status {
     Status::cancelled("the client has disconnected")
 }
 
+/// The queue of a reply. The stream takes messages from it, and the task that supervises the call can empty it.
+#[derive(Debug)]
+struct ReplyQueue<T> {
+    messages: Mutex<mpsc::Receiver<QueuedMessage<T>>>,
+    /// The error after the last message.
+    error: Mutex<Option<Status>>,
+}
+
+impl<T> ReplyQueue<T> {
+    /// Drops all queued messages.
+    fn clear(&self) {
+        let mut messages = lock(&self.messages);
+        while messages.try_recv().is_ok() {}
+    }
+}
+
+/// A poisoned lock is valid, because no holder changes the value in several steps.
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// The stream of queued messages.
+struct QueuedReplies<T> {
+    queue: Arc<ReplyQueue<T>>,
+    context: ReplyContext,
+    /// Tells the supervising task when the stream is dropped.
+    _is_open: oneshot::Sender<()>,
+}
+
+impl<T> Stream for QueuedReplies<T> {
+    type Item = Result<T, Status>;
+
+    fn poll_next(self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Option<Self::Item>> {
+        let next = lock(&self.queue.messages).poll_recv(cx);
+        match ready!(next) {
+            Some((message, unsent)) => {
+                self.context.encode(unsent);
+                Poll::Ready(Some(Ok(message)))
+            }
+            None => Poll::Ready(lock(&self.queue.error).take().map(Err)),
+        }
+    }
+}
+
+impl<T> Drop for QueuedReplies<T> {
+    fn drop(&mut self) {
+        lock(&self.queue.messages).close();
+        self.queue.clear();
+    }
+}
+
 /// Creates a reply stream to which `work` sends messages. An error of `work` ends the stream. When the client
-/// disconnects, `work` is dropped at its next await, so that its resources are released.
+/// disconnects, `work` is dropped at its next await, so that its resources are released. If the client does not read
+/// while others wait for the reply budget, the call ends with `SlowReader`.
 pub(super) fn respond<T, W, F>(work: W) -> Response<ReplyStream<T>>
 where
     T: Send + 'static,
     W: FnOnce(ReplySender<T>) -> F,
     F: Future<Output = Result<(), Status>> + Send + 'static,
 {
-    let (sender, replies) = mpsc::channel(REPLY_CAPACITY + 1);
-    // Reserved for the error of `work`, so that it can be sent even if the channel is full.
-    let error_permit = sender.clone().try_reserve_owned();
-    let disconnect_watcher = sender.clone();
-    let work = work(ReplySender(sender));
-    let task = tokio::spawn(async move {
-        tokio::select! {
-            result = work => result,
-            () = disconnect_watcher.closed() => Err(disconnected_status()),
+    let context = ReplyContext::current();
+    let replies = Arc::clone(&context.replies);
+    let (messages, receiver) = mpsc::channel(REPLY_CAPACITY);
+    let queue = Arc::new(ReplyQueue { messages: Mutex::new(receiver), error: Mutex::default() });
+    let (_is_open, is_closed) = oneshot::channel();
+    let stream = QueuedReplies { queue: Arc::clone(&queue), context, _is_open };
+    // The stream must not end before the error of `work` is stored.
+    let keep_open = messages.clone();
+    let task = tokio::spawn(work(ReplySender { messages, replies: Arc::clone(&replies) }));
+    tokio::spawn(supervise(task, queue, replies, keep_open, is_closed));
+    Response::new(Box::pin(stream))
+}
+
+/// Stores the error of a call. Ends the call when the stream is dropped or its client does not read.
+async fn supervise<T>(
+    mut task: JoinHandle<Result<(), Status>>,
+    queue: Arc<ReplyQueue<T>>,
+    replies: Arc<CallReplies>,
+    keep_open: mpsc::Sender<QueuedMessage<T>>,
+    mut is_closed: oneshot::Receiver<()>,
+) {
+    let panicked = |_| Err(Status::internal("the call panicked in the server"));
+    let end_slow_reader = || {
+        *lock(&queue.error) = Some(to_status(replies.slow_reader()));
+        queue.clear();
+    };
+    tokio::select! {
+        result = &mut task => *lock(&queue.error) = result.unwrap_or_else(panicked).err(),
+        _ = &mut is_closed => return task.abort(),
+        () = replies.ended() => {
+            task.abort();
+            // Wait for the end of the task, because it may be sending a message.
+            (&mut task).await.ok();
+            end_slow_reader();
+            return;
         }
-    });
-    tokio::spawn(async move {
-        let result = task.await.unwrap_or_else(|_| Err(Status::internal("the call panicked in the server")));
-        if let (Err(status), Ok(error_permit)) = (result, error_permit) {
-            error_permit.send(Err(status));
-        }
-    });
-    Response::new(Box::pin(ReceiverStream::new(replies)))
+    }
+    drop(keep_open);
+    // The queue may still have messages.
+    tokio::select! {
+        _ = &mut is_closed => {}
+        () = replies.ended() => end_slow_reader(),
+    }
 }
 
 /// Runs the work of a unary call in a separate task, so that a panic becomes an `INTERNAL` status of that call.
-pub(super) async fn catch_panic<T: Send + 'static>(
+pub(super) async fn catch_panic<T: prost::Message + 'static>(
     work: impl Future<Output = Result<T>> + Send + 'static,
 ) -> Result<Response<T>, Status> {
-    match tokio::spawn(work).await {
-        Ok(result) => result.map(Response::new).map_err(to_status),
-        Err(_) => Err(Status::internal("the call panicked in the server")),
-    }
+    let message = match tokio::spawn(work).await {
+        Ok(result) => result.map_err(to_status)?,
+        Err(_) => return Err(Status::internal("the call panicked in the server")),
+    };
+    let context = ReplyContext::current();
+    context.encode(context.replies.acquire(message.encoded_len() + MESSAGE_HEADER_BYTES).await?);
+    Ok(Response::new(message))
 }
 
 /// Splits a reply into chunks of at most `max_chunk_bytes` bytes, each with its offset in bytes. An empty reply is one

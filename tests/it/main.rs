@@ -3,6 +3,7 @@
 mod array_uploads;
 mod attribute_streams;
 mod broken_streams;
+mod budgets;
 #[path = "../common/mod.rs"]
 mod common;
 mod cpu_checks;

@@ -1,0 +1,452 @@
+//! Budgets for the bytes of replies that are produced and not yet sent, per connection and in total.
+//!
+//! A message counts from the moment when it is queued until HTTP/2 has written its last byte to the socket. A sender
+//! without budget waits. Nobody waits forever: a call that holds bytes and takes none for the reply timeout ends as soon
+//! as another sender waits for the same budget, and its connection is closed if that does not free the bytes.
+
+use std::collections::{HashMap, VecDeque};
+use std::pin::Pin;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
+use std::task::{Context, Poll};
+use std::time::{Duration, Instant};
+
+use bytes::Bytes;
+use http_body::{Body as HttpBody, Frame, SizeHint};
+use tokio::sync::{Notify, OwnedSemaphorePermit, Semaphore};
+use tonic::Status;
+use tonic::body::Body;
+
+use crate::config::Config;
+use modalcast_model::error::Error;
+
+/// The budget of all connections.
+#[derive(Debug)]
+pub(super) struct ReplyBudget {
+    share: Share,
+    max_connection_bytes: usize,
+    /// Time without progress after which a call may be ended.
+    reply_timeout: Duration,
+    connections: Registry<ConnectionReplyBudget>,
+}
+
+/// A limited number of bytes.
+#[derive(Debug)]
+struct Share {
+    permits: Arc<Semaphore>,
+    max_bytes: usize,
+}
+
+/// The budget of one connection.
+#[derive(Debug)]
+pub(super) struct ConnectionReplyBudget {
+    total: Arc<ReplyBudget>,
+    /// Key in `ReplyBudget::connections`.
+    id: u64,
+    share: Share,
+    close: Arc<Notify>,
+    calls: Registry<CallReplies>,
+}
+
+/// The unsent replies of one call.
+#[derive(Debug)]
+pub(super) struct CallReplies {
+    connection: Arc<ConnectionReplyBudget>,
+    /// Key in `ConnectionReplyBudget::calls`.
+    id: u64,
+    progress: Mutex<Progress>,
+    ended: Notify,
+}
+
+#[derive(Debug)]
+struct Progress {
+    unsent_bytes: usize,
+    /// When bytes were last sent, or when the first unsent bytes were produced.
+    last_change: Instant,
+    /// Whether the call was ended because its client does not read.
+    is_ended: bool,
+}
+
+/// Bytes of a reply that count against the budgets until this is dropped.
+#[derive(Debug)]
+pub(super) struct UnsentBytes {
+    call: Arc<CallReplies>,
+    bytes: usize,
+    of_connection: OwnedSemaphorePermit,
+    of_total: OwnedSemaphorePermit,
+}
+
+/// All existing objects of a kind.
+#[derive(Debug)]
+struct Registry<T> {
+    objects: Mutex<HashMap<u64, Weak<T>>>,
+    next_id: AtomicU64,
+    last_search: Mutex<Instant>,
+}
+
+impl<T> Registry<T> {
+    fn new() -> Self {
+        Self { objects: Mutex::default(), next_id: AtomicU64::new(0), last_search: Mutex::new(Instant::now()) }
+    }
+
+    /// Adds an object, which `new` creates with its key.
+    fn insert(&self, new: impl FnOnce(u64) -> T) -> Arc<T> {
+        let id = self.next_id.fetch_add(1, Ordering::Relaxed);
+        let object = Arc::new(new(id));
+        lock(&self.objects).insert(id, Arc::downgrade(&object));
+        object
+    }
+
+    fn remove(&self, id: u64) {
+        lock(&self.objects).remove(&id);
+    }
+
+    /// All objects, or none if another search was less than `interval` ago: one search serves all that wait.
+    fn search(&self, interval: Duration) -> Vec<Arc<T>> {
+        let mut last_search = lock(&self.last_search);
+        if last_search.elapsed() < interval {
+            return Vec::new();
+        }
+        *last_search = Instant::now();
+        lock(&self.objects).values().filter_map(Weak::upgrade).collect()
+    }
+}
+
+impl Share {
+    fn new(bytes: usize) -> Self {
+        let max_bytes = bytes.min(u32::MAX as usize).min(Semaphore::MAX_PERMITS);
+        Self { permits: Arc::new(Semaphore::new(max_bytes)), max_bytes }
+    }
+
+    /// Acquires bytes, at most all of the share. Calls `search` repeatedly during a wait.
+    async fn acquire(
+        &self,
+        bytes: usize,
+        search_interval: Duration,
+        search: impl Fn(),
+    ) -> Result<OwnedSemaphorePermit, Status> {
+        let mut acquire =
+            std::pin::pin!(Arc::clone(&self.permits).acquire_many_owned(bytes.min(self.max_bytes) as u32));
+        loop {
+            tokio::select! {
+                biased;
+                permit = &mut acquire => return permit.map_err(|_| Status::internal("the reply budget is closed")),
+                () = tokio::time::sleep(search_interval) => search(),
+            }
+        }
+    }
+}
+
+impl ReplyBudget {
+    pub(super) fn new(config: &Config) -> Arc<Self> {
+        Arc::new(Self {
+            share: Share::new(config.reply_bytes),
+            max_connection_bytes: config.connection_reply_bytes,
+            reply_timeout: config.reply_timeout,
+            connections: Registry::new(),
+        })
+    }
+
+    /// The budget of a new connection, which `close` closes.
+    pub(super) fn new_connection(self: &Arc<Self>, close: Arc<Notify>) -> Arc<ConnectionReplyBudget> {
+        let (total, share) = (Arc::clone(self), Share::new(self.max_connection_bytes));
+        let calls = Registry::new();
+        self.connections.insert(|id| ConnectionReplyBudget { total, id, share, close, calls })
+    }
+
+    /// How often a waiting sender searches for stalled calls.
+    fn search_interval(&self) -> Duration {
+        self.reply_timeout / 4
+    }
+
+    /// Ends the stalled calls of all connections.
+    fn end_stalled_calls(&self) {
+        for connection in self.connections.search(self.search_interval() / 2) {
+            connection.end_stalled_calls(Duration::ZERO);
+        }
+    }
+}
+
+impl ConnectionReplyBudget {
+    /// The replies of a new call.
+    pub(super) fn new_call(self: &Arc<Self>) -> Arc<CallReplies> {
+        let connection = Arc::clone(self);
+        let progress = Progress { unsent_bytes: 0, last_change: Instant::now(), is_ended: false };
+        let (progress, ended) = (Mutex::new(progress), Notify::new());
+        self.calls.insert(|id| CallReplies { connection, id, progress, ended })
+    }
+
+    /// Ends the stalled calls of this connection, unless they were searched less than `interval` ago.
+    fn end_stalled_calls(&self, interval: Duration) {
+        for call in self.calls.search(interval) {
+            call.end_if_stalled(self.total.reply_timeout);
+        }
+    }
+}
+
+impl Drop for ConnectionReplyBudget {
+    fn drop(&mut self) {
+        self.total.connections.remove(self.id);
+    }
+}
+
+impl CallReplies {
+    /// Waits for budget for a reply. Cancel-safe.
+    ///
+    /// # Errors
+    /// `INTERNAL` when the budget no longer exists.
+    pub(super) async fn acquire(self: &Arc<Self>, bytes: usize) -> Result<UnsentBytes, Status> {
+        let connection = &self.connection;
+        let total = &connection.total;
+        // A larger message passes with all permits of its connection.
+        let permits = bytes.min(connection.share.max_bytes);
+        let interval = total.search_interval();
+        let end_own = || connection.end_stalled_calls(interval / 2);
+        let of_connection = connection.share.acquire(permits, interval, end_own).await?;
+        let of_total = total.share.acquire(permits, interval, || total.end_stalled_calls()).await?;
+        let mut progress = lock(&self.progress);
+        if progress.unsent_bytes == 0 {
+            progress.last_change = Instant::now();
+        }
+        progress.unsent_bytes += bytes;
+        Ok(UnsentBytes { call: Arc::clone(self), bytes, of_connection, of_total })
+    }
+
+    /// Waits until the call is ended because its client does not read. Cancel-safe.
+    pub(super) async fn ended(&self) {
+        self.ended.notified().await;
+    }
+
+    /// The error of a call that was ended.
+    pub(super) fn slow_reader(&self) -> Error {
+        Error::SlowReader { queue: "reply buffer (in bytes)", limit: self.connection.total.max_connection_bytes }
+    }
+
+    /// Ends the call if its client has taken nothing for `timeout`. If that was done before and bytes are still unsent,
+    /// closes the connection.
+    fn end_if_stalled(&self, timeout: Duration) {
+        let mut progress = lock(&self.progress);
+        if progress.unsent_bytes == 0 || progress.last_change.elapsed() < timeout {
+            return;
+        }
+        if progress.is_ended {
+            tracing::warn!(
+                unsent_bytes = progress.unsent_bytes,
+                "a connection that does not read its replies is closed"
+            );
+            self.connection.close.notify_one();
+            return;
+        }
+        progress.is_ended = true;
+        progress.last_change = Instant::now();
+        self.ended.notify_one();
+    }
+}
+
+impl Drop for CallReplies {
+    fn drop(&mut self) {
+        self.connection.calls.remove(self.id);
+    }
+}
+
+impl UnsentBytes {
+    /// Removes `bytes` from the front.
+    fn split(&mut self, bytes: usize) -> Option<Self> {
+        // A message above the share has fewer permits than bytes. The remainder keeps what is left of them.
+        let take = |permit: &mut OwnedSemaphorePermit| permit.split(bytes.min(permit.num_permits()));
+        let (of_connection, of_total) = (take(&mut self.of_connection)?, take(&mut self.of_total)?);
+        self.bytes -= bytes;
+        Some(Self { call: Arc::clone(&self.call), bytes, of_connection, of_total })
+    }
+}
+
+impl Drop for UnsentBytes {
+    fn drop(&mut self) {
+        let mut progress = lock(&self.call.progress);
+        progress.unsent_bytes -= self.bytes;
+        progress.last_change = Instant::now();
+    }
+}
+
+/// The call that a handler answers. [`super::routes`] sets it, so that handlers need not pass it on.
+#[derive(Debug, Clone)]
+pub(super) struct ReplyContext {
+    pub(super) replies: Arc<CallReplies>,
+    /// Bytes of messages that tonic has taken and not yet returned as a frame.
+    encoding: Arc<Mutex<VecDeque<UnsentBytes>>>,
+}
+
+tokio::task_local! {
+    static CONTEXT: ReplyContext;
+}
+
+impl ReplyContext {
+    pub(super) fn new(replies: Arc<CallReplies>) -> Self {
+        Self { replies, encoding: Arc::default() }
+    }
+
+    /// The context of the current call. A call without a connection, as in tests, has a budget of its own.
+    pub(super) fn current() -> Self {
+        let own_budget = |_| {
+            let connection = ReplyBudget::new(&Config::default()).new_connection(Arc::default());
+            Self::new(connection.new_call())
+        };
+        CONTEXT.try_with(Clone::clone).unwrap_or_else(own_budget)
+    }
+
+    /// Runs a handler in this context.
+    pub(super) async fn scope<F: Future>(self, handler: F) -> F::Output {
+        CONTEXT.scope(self, handler).await
+    }
+
+    /// Passes the bytes of a message on to the body, when tonic encodes the message.
+    pub(super) fn encode(&self, unsent: UnsentBytes) {
+        lock(&self.encoding).push_back(unsent);
+    }
+
+    /// Attaches the unsent bytes to a frame of the body.
+    fn attach(&self, frame: Bytes) -> Bytes {
+        let mut encoding = lock(&self.encoding);
+        let (mut unsent, mut missing_bytes) = (Vec::new(), frame.len());
+        while let Some(first) = encoding.front_mut().filter(|_| missing_bytes > 0) {
+            let part = if first.bytes <= missing_bytes { encoding.pop_front() } else { first.split(missing_bytes) };
+            let Some(part) = part else { break };
+            missing_bytes -= part.bytes;
+            unsent.push(part);
+        }
+        if unsent.is_empty() { frame } else { Bytes::from_owner(UnsentFrame { frame, _unsent: unsent }) }
+    }
+}
+
+/// A frame that counts until HTTP/2 drops it.
+struct UnsentFrame {
+    frame: Bytes,
+    _unsent: Vec<UnsentBytes>,
+}
+
+impl AsRef<[u8]> for UnsentFrame {
+    fn as_ref(&self) -> &[u8] {
+        &self.frame
+    }
+}
+
+/// The body of a response. Its frames count until they are sent.
+pub(super) struct CountedReplyBody {
+    pub(super) inner: Body,
+    pub(super) context: ReplyContext,
+}
+
+impl HttpBody for CountedReplyBody {
+    type Data = Bytes;
+    type Error = Status;
+
+    fn poll_frame(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
+        let frame = Pin::new(&mut self.inner).poll_frame(cx);
+        frame.map_ok(|frame| frame.map_data(|data| self.context.attach(data)))
+    }
+
+    fn is_end_stream(&self) -> bool {
+        self.inner.is_end_stream()
+    }
+
+    fn size_hint(&self) -> SizeHint {
+        self.inner.size_hint()
+    }
+}
+
+/// Locks also after a panic of another holder. No update in this module can panic halfway.
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A total of 100 bytes, of which one connection may hold 60.
+    fn small_budget() -> Arc<ReplyBudget> {
+        ReplyBudget::new(&Config {
+            reply_bytes: 100,
+            connection_reply_bytes: 60,
+            reply_timeout: Duration::from_millis(40),
+            ..Config::default()
+        })
+    }
+
+    async fn with_timeout<T>(work: impl Future<Output = T>) -> T {
+        tokio::time::timeout(Duration::from_secs(60), work).await.expect("expected completion within 60 s")
+    }
+
+    #[tokio::test]
+    async fn bytes_count_until_their_frame_is_dropped() {
+        let budget = small_budget();
+        let context = ReplyContext::new(budget.new_connection(Arc::default()).new_call());
+        // Two messages in one and a half frames.
+        for bytes in [20, 30] {
+            context.encode(context.replies.acquire(bytes).await.expect("expected capacity"));
+        }
+        let free_bytes = || budget.share.permits.available_permits();
+        assert_eq!(free_bytes(), 50);
+        let frames = [40, 10, 5].map(|bytes| context.attach(vec![0; bytes].into()));
+        let [first, second, uncounted] = frames;
+        assert_eq!((first.len(), second.len(), uncounted.len(), free_bytes()), (40, 10, 5, 50));
+        let slice = first.slice(3..4);
+        drop(first);
+        assert_eq!(free_bytes(), 50);
+        drop(slice);
+        assert_eq!(free_bytes(), 90);
+        drop(second);
+        assert_eq!((free_bytes(), lock(&context.replies.progress).unsent_bytes), (100, 0));
+    }
+
+    /// A message above the budget passes when nothing else is unsent.
+    #[tokio::test]
+    async fn message_above_the_budget_passes_alone() {
+        let budget = small_budget();
+        let call = budget.new_connection(Arc::default()).new_call();
+        let other_call = budget.new_connection(Arc::default()).new_call();
+        let large = with_timeout(call.acquire(1000)).await.expect("expected capacity");
+        let other = with_timeout(other_call.acquire(40)).await.expect("expected capacity");
+        drop((large, other));
+        assert_eq!(budget.share.permits.available_permits(), 100);
+    }
+
+    /// A call that takes nothing ends when another connection waits, and its connection is closed if that frees nothing.
+    #[tokio::test]
+    async fn stalled_call_ends_when_others_wait() {
+        let budget = small_budget();
+        let close = Arc::new(Notify::new());
+        let stalled_connection = budget.new_connection(Arc::clone(&close));
+        let stalled = stalled_connection.new_call();
+        let held = stalled.acquire(60).await.expect("expected capacity");
+        // Nobody waits, so the call does not end.
+        let end = tokio::time::timeout(Duration::from_millis(200), stalled.ended()).await;
+        assert!(end.is_err(), "expected no end while nobody waits");
+        let other = budget.new_connection(Arc::default()).new_call();
+        let waiting = tokio::spawn(async move { other.acquire(60).await.map(drop) });
+        with_timeout(stalled.ended()).await;
+        with_timeout(close.notified()).await;
+        assert!(!waiting.is_finished());
+        drop(held);
+        with_timeout(waiting).await.expect("expected no panic").expect("expected capacity");
+    }
+
+    #[tokio::test]
+    async fn only_a_call_without_progress_is_stalled() {
+        let call = small_budget().new_connection(Arc::default()).new_call();
+        let is_ended = || lock(&call.progress).is_ended;
+        call.end_if_stalled(Duration::ZERO);
+        assert!(!is_ended(), "expected a call without unsent bytes to continue");
+        let held = [10, 20].map(|bytes| call.acquire(bytes));
+        let [first, second] = held;
+        let (first, second) = (first.await.expect("expected capacity"), second.await.expect("expected capacity"));
+        let change_before = lock(&call.progress).last_change;
+        drop(first);
+        assert!(lock(&call.progress).last_change > change_before, "expected sent bytes to count as progress");
+        call.end_if_stalled(Duration::from_secs(1000));
+        assert!(!is_ended(), "expected a call with recent progress to continue");
+        call.end_if_stalled(Duration::ZERO);
+        assert!(is_ended());
+        drop(second);
+    }
+}

@@ -1,0 +1,364 @@
+//! The body of a request. Counts its messages against the receive budgets, and ends a message of which no more bytes
+//! arrive.
+
+use std::pin::Pin;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::task::{Context, Poll};
+use std::time::Duration;
+
+use bytes::Bytes;
+use http_body::{Body as HttpBody, Frame, SizeHint};
+use tokio::sync::futures::OwnedNotified;
+use tokio::time::{Instant, Sleep};
+use tonic::Status;
+use tonic::body::Body;
+
+use super::receive_budget::{ConnectionReceiveBudget, MessageLimits, ReceivedMemory};
+use super::status::to_status;
+use modalcast_model::error::{Error, Result};
+
+/// The lowest rate at which a message must arrive, in bytes per second: 32 KiB/s.
+const MIN_MESSAGE_RATE: f64 = 32768.0;
+
+/// Bytes before each message: a flag and the length.
+const HEADER_BYTES: usize = 5;
+
+/// Memory of the messages of a call.
+#[derive(Debug)]
+struct CallMemory {
+    /// The message that is being received.
+    incomplete: ReceivedMemory,
+    /// The last complete message. `None` after the response head: the handler has taken the request then.
+    complete: Option<ReceivedMemory>,
+}
+
+impl CallMemory {
+    fn is_in_use(&self) -> bool {
+        self.incomplete.is_in_use() || self.complete.as_ref().is_some_and(ReceivedMemory::is_in_use)
+    }
+
+    /// Fails if memory in use was evicted.
+    fn check(&self) -> Result<()> {
+        self.incomplete.check()?;
+        self.complete.as_ref().map_or(Ok(()), ReceivedMemory::check)
+    }
+}
+
+/// Handle of the memory of a call's messages. It outlives the body until the handler has answered.
+#[derive(Debug, Clone)]
+pub(super) struct RequestMemory(Arc<Mutex<CallMemory>>);
+
+impl RequestMemory {
+    pub(super) fn new(connection: &Arc<ConnectionReceiveBudget>) -> Self {
+        let (incomplete, complete) = (connection.new_memory(), Some(connection.new_memory()));
+        Self(Arc::new(Mutex::new(CallMemory { incomplete, complete })))
+    }
+
+    /// Releases the last complete message. Call this when the handler has answered.
+    pub(super) fn release_complete(&self) {
+        self.lock().complete = None;
+    }
+
+    /// A poisoned lock is valid, because no update of the memory can panic halfway.
+    fn lock(&self) -> MutexGuard<'_, CallMemory> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// The body of a request.
+pub(super) struct RequestBody {
+    inner: Body,
+    memory: RequestMemory,
+    position: MessagePosition,
+    limits: MessageLimits,
+    /// Remaining time of the message while the timer does not run.
+    remaining: Duration,
+    timer: Option<Pin<Box<Sleep>>>,
+    is_timer_running: bool,
+    eviction: Option<Pin<Box<OwnedNotified>>>,
+}
+
+impl RequestBody {
+    pub(super) fn new(inner: Body, memory: RequestMemory, limits: MessageLimits) -> Self {
+        Self {
+            inner,
+            memory,
+            position: MessagePosition::default(),
+            limits,
+            remaining: limits.timeout,
+            timer: None,
+            is_timer_running: false,
+            eviction: None,
+        }
+    }
+
+    /// Counts the messages of a frame.
+    fn receive(&mut self, data: &[u8]) -> Result<()> {
+        self.stop_timer(data.len());
+        let advance = self.position.advance(data);
+        let CallMemory { incomplete, complete } = &mut *self.memory.lock();
+        if !advance.has_boundary {
+            return incomplete.check();
+        }
+        self.remaining = self.limits.timeout;
+        incomplete.resize(0)?;
+        if let Some(complete) = complete {
+            complete.resize(advance.largest_complete.min(self.limits.max_bytes))?;
+        }
+        incomplete.resize(self.position.incomplete_bytes().min(self.limits.max_bytes))
+    }
+
+    /// Stops the timer after `received_bytes` have arrived, and adds the time in which a client with the rate
+    /// [`MIN_MESSAGE_RATE`] sends them.
+    fn stop_timer(&mut self, received_bytes: usize) {
+        if let Some(timer) = self.timer.as_ref().filter(|_| self.is_timer_running) {
+            self.remaining = timer.deadline().saturating_duration_since(Instant::now());
+        }
+        self.is_timer_running = false;
+        let refill = Duration::from_secs_f64(received_bytes as f64 / MIN_MESSAGE_RATE);
+        self.remaining = self.limits.timeout.min(self.remaining + refill);
+    }
+
+    /// Waits for more bytes. Ready when the messages of the call were evicted, or the rest of a message is overdue.
+    fn poll_wait(&mut self, cx: &mut Context<'_>) -> Poll<Error> {
+        if !self.memory.lock().is_in_use() && !self.position.is_incomplete() {
+            return Poll::Pending;
+        }
+        // Register before the check, so that an eviction between the two wakes this task.
+        loop {
+            let new_eviction = || Box::pin(self.memory.lock().incomplete.next_eviction());
+            if self.eviction.get_or_insert_with(new_eviction).as_mut().poll(cx).is_pending() {
+                break;
+            }
+            self.eviction = None;
+        }
+        if let Err(error) = self.memory.lock().check() {
+            return Poll::Ready(error);
+        }
+        if !self.position.is_incomplete() {
+            return Poll::Pending;
+        }
+        let deadline = Instant::now() + self.remaining;
+        let timer = self.timer.get_or_insert_with(|| Box::pin(tokio::time::sleep_until(deadline)));
+        if !std::mem::replace(&mut self.is_timer_running, true) {
+            timer.as_mut().reset(deadline);
+        }
+        let ms = self.limits.timeout.as_millis() as u64;
+        timer.as_mut().poll(cx).map(|()| Error::Deadline { what: "the rest of a message".into(), ms })
+    }
+}
+
+impl HttpBody for RequestBody {
+    type Data = Bytes;
+    type Error = Status;
+
+    fn poll_frame(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
+        let this = &mut *self;
+        match Pin::new(&mut this.inner).poll_frame(cx) {
+            Poll::Ready(Some(Ok(frame))) => {
+                let received = frame.data_ref().map_or(Ok(()), |data| this.receive(data));
+                Poll::Ready(Some(received.map(|()| frame).map_err(to_status)))
+            }
+            Poll::Ready(end) => Poll::Ready(end),
+            Poll::Pending => this.poll_wait(cx).map(|error| Some(Err(to_status(error)))),
+        }
+    }
+
+    fn is_end_stream(&self) -> bool {
+        self.inner.is_end_stream()
+    }
+
+    fn size_hint(&self) -> SizeHint {
+        self.inner.size_hint()
+    }
+}
+
+/// Position in a sequence of gRPC messages.
+#[derive(Debug, Default)]
+struct MessagePosition {
+    header: [u8; HEADER_BYTES],
+    /// Number of received bytes of the next header.
+    header_bytes: usize,
+    /// Length of the message that is being received, and how much of it is missing. 0 between messages.
+    message_bytes: usize,
+    missing_bytes: usize,
+}
+
+/// What a frame contains.
+#[derive(Debug, PartialEq, Eq)]
+struct Advance {
+    /// Whether a message begins or ends in the frame.
+    has_boundary: bool,
+    /// Size of the largest message that ends in the frame, in bytes.
+    largest_complete: usize,
+}
+
+impl MessagePosition {
+    fn advance(&mut self, mut data: &[u8]) -> Advance {
+        let mut advance = Advance { has_boundary: false, largest_complete: 0 };
+        while !data.is_empty() {
+            if self.missing_bytes > 0 {
+                let bytes = self.missing_bytes.min(data.len());
+                data = &data[bytes..];
+                self.missing_bytes -= bytes;
+                if self.missing_bytes == 0 {
+                    advance.has_boundary = true;
+                    advance.largest_complete = advance.largest_complete.max(self.message_bytes);
+                    self.message_bytes = 0;
+                }
+                continue;
+            }
+            let bytes = (HEADER_BYTES - self.header_bytes).min(data.len());
+            self.header[self.header_bytes..][..bytes].copy_from_slice(&data[..bytes]);
+            data = &data[bytes..];
+            self.header_bytes += bytes;
+            if self.header_bytes == HEADER_BYTES {
+                let [_, length @ ..] = self.header;
+                (self.message_bytes, self.header_bytes) = (u32::from_be_bytes(length) as usize, 0);
+                self.missing_bytes = self.message_bytes;
+                advance.has_boundary = true;
+            }
+        }
+        advance
+    }
+
+    const fn is_incomplete(&self) -> bool {
+        self.header_bytes > 0 || self.missing_bytes > 0
+    }
+
+    /// Length of the message that is being received, in bytes.
+    const fn incomplete_bytes(&self) -> usize {
+        self.message_bytes
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::Config;
+    use crate::service::receive_budget::ReceiveBudget;
+
+    /// The bytes of messages with these lengths.
+    fn encode(lengths: &[usize]) -> Vec<u8> {
+        let encode_one = |length: &usize| [&[0], &(*length as u32).to_be_bytes()[..], &vec![7; *length]].concat();
+        lengths.iter().flat_map(encode_one).collect()
+    }
+
+    #[test]
+    fn position_is_the_same_for_every_split_into_frames() {
+        let bytes = encode(&[3, 0, 300, 9]);
+        for frame_bytes in [1, 2, 4, 5, 7, 100, bytes.len()] {
+            let mut position = MessagePosition::default();
+            let advances: Vec<_> = bytes.chunks(frame_bytes).map(|frame| position.advance(frame)).collect();
+            assert!(!position.is_incomplete(), "{frame_bytes}");
+            assert_eq!(advances.iter().map(|advance| advance.largest_complete).max(), Some(300), "{frame_bytes}");
+            position.advance(&bytes[..20]);
+            assert!(position.is_incomplete());
+            assert_eq!(position.incomplete_bytes(), 300);
+        }
+    }
+
+    /// A body whose frames come from a channel.
+    struct ChannelBody(tokio::sync::mpsc::Receiver<Vec<u8>>);
+
+    impl HttpBody for ChannelBody {
+        type Data = Bytes;
+        type Error = Status;
+
+        fn poll_frame(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
+            self.0.poll_recv(cx).map(|data| data.map(|data| Ok(Frame::data(data.into()))))
+        }
+    }
+
+    async fn next_frame(body: &mut RequestBody) -> Option<Result<usize, Status>> {
+        let frame = std::future::poll_fn(|cx| Pin::new(&mut *body).poll_frame(cx)).await?;
+        Some(frame.map(|frame| frame.data_ref().map_or(0, Bytes::len)))
+    }
+
+    fn body_of(
+        connection: &Arc<ConnectionReceiveBudget>,
+        timeout: Duration,
+    ) -> (RequestBody, tokio::sync::mpsc::Sender<Vec<u8>>) {
+        let (sender, receiver) = tokio::sync::mpsc::channel(8);
+        let memory = RequestMemory::new(connection);
+        let limits = MessageLimits { max_bytes: 1 << 20, timeout };
+        (RequestBody::new(Body::new(ChannelBody(receiver)), memory, limits), sender)
+    }
+
+    fn connection() -> Arc<ConnectionReceiveBudget> {
+        let config = Config { receive_bytes: 1000, connection_receive_bytes: 600, ..Config::default() };
+        ReceiveBudget::new(&config).new_connection()
+    }
+
+    #[tokio::test]
+    async fn rest_of_a_message_has_a_deadline_and_a_pause_between_messages_has_none() {
+        let (mut body, frames) = body_of(&connection(), Duration::from_millis(30));
+        let message = encode(&[100]);
+        frames.send(message.clone()).await.expect("expected an open channel");
+        assert_eq!(next_frame(&mut body).await.expect("a frame").expect("no error"), 105);
+        let pause = tokio::time::timeout(Duration::from_millis(300), next_frame(&mut body)).await;
+        assert!(pause.is_err(), "expected no deadline between messages, got {pause:?}");
+        frames.send(message[..50].to_vec()).await.expect("expected an open channel");
+        assert_eq!(next_frame(&mut body).await.expect("a frame").expect("no error"), 50);
+        let status = next_frame(&mut body).await.expect("a result").expect_err("expected a deadline");
+        assert_eq!(status.code(), tonic::Code::DeadlineExceeded);
+    }
+
+    /// A message whose bytes arrive one by one with pauses does not arrive completely.
+    #[tokio::test]
+    async fn trickle_below_the_minimum_rate_does_not_extend_the_deadline() {
+        let (mut body, frames) = body_of(&connection(), Duration::from_millis(60));
+        let message = encode(&[100]);
+        tokio::spawn(async move {
+            for byte in message {
+                if frames.send(vec![byte]).await.is_err() {
+                    return;
+                }
+                tokio::time::sleep(Duration::from_millis(30)).await;
+            }
+        });
+        let status = loop {
+            if let Err(status) = next_frame(&mut body).await.expect("expected no end of the body") {
+                break status;
+            }
+        };
+        assert_eq!(status.code(), tonic::Code::DeadlineExceeded);
+    }
+
+    /// A complete request counts until the handler has answered, also while the client keeps its side open.
+    #[tokio::test]
+    async fn complete_message_counts_until_the_handler_answers() {
+        let connection = connection();
+        let (mut body, frames) = body_of(&connection, Duration::from_secs(10));
+        frames.send(encode(&[500])).await.expect("expected an open channel");
+        next_frame(&mut body).await.expect("a frame").expect("no error");
+        let mut other = connection.new_memory();
+        assert!(matches!(other.resize(200), Err(Error::LimitReached { .. })));
+        body.memory.release_complete();
+        other.resize(200).expect("expected capacity");
+    }
+
+    #[tokio::test]
+    async fn incomplete_message_over_the_budget_is_rejected_and_eviction_ends_a_wait() {
+        let budget =
+            ReceiveBudget::new(&Config { receive_bytes: 1000, connection_receive_bytes: 600, ..Config::default() });
+        let connection = budget.new_connection();
+        let (mut body, frames) = body_of(&connection, Duration::from_secs(1000));
+        frames.send(encode(&[590])[..100].to_vec()).await.expect("expected an open channel");
+        next_frame(&mut body).await.expect("a frame").expect("no error");
+        let (mut second_body, second_frames) = body_of(&connection, Duration::from_secs(1000));
+        second_frames.send(encode(&[11])[..6].to_vec()).await.expect("expected an open channel");
+        let status = next_frame(&mut second_body).await.expect("a result").expect_err("expected a rejection");
+        assert_eq!(status.code(), tonic::Code::ResourceExhausted);
+        let evict = async {
+            tokio::task::yield_now().await;
+            let other = budget.new_connection();
+            let mut memory = other.new_memory();
+            memory.resize(500).expect("expected the first connection to be evicted");
+            memory
+        };
+        let (end, _memory) = tokio::join!(next_frame(&mut body), evict);
+        let status = end.expect("a result").expect_err("expected an eviction");
+        assert_eq!(status.code(), tonic::Code::ResourceExhausted);
+    }
+}

@@ -1,0 +1,342 @@
+//! Byte budgets: half-sent messages and unread replies hold a bounded number of bytes, and clients that read and send
+//! are served meanwhile.
+
+use std::io::BufRead as _;
+use std::pin::Pin;
+use std::process::{Child, Command, Stdio};
+use std::task::{Context, Poll};
+use std::time::Duration;
+
+use bytes::Bytes;
+use http_body::Frame;
+use modalcast::config::Config;
+use modalcast_proto::v1;
+use tonic::codegen::{Service as _, http};
+use tonic::transport::{Channel, Endpoint};
+use tonic::{Code, Status, Streaming};
+use v1::scene_service_client::SceneServiceClient;
+use v1::{Delivery, Reason};
+
+use crate::service_harness::{Server, StepWriter, rejection_details, step, with_timeout};
+
+/// All arrays of a shape.
+const ARRAYS: [v1::Array; 6] = [
+    v1::Array::Indices,
+    v1::Array::CornerVertices,
+    v1::Array::RestPositions,
+    v1::Array::Uvs,
+    v1::Array::RestNormals,
+    v1::Array::Modes,
+];
+
+fn describe(scene: &str) -> v1::DescribeSceneRequest {
+    let arrays = ARRAYS.into_iter().map(Into::into).collect();
+    v1::DescribeSceneRequest { scene: scene.into(), arrays, ..Default::default() }
+}
+
+/// A connection whose streams take 64 KiB each while they are not read.
+async fn small_windows(address: &str) -> Channel {
+    let endpoint = Endpoint::from_shared(address.to_owned()).expect("expected a URL");
+    let endpoint = endpoint.initial_stream_window_size(1 << 16).initial_connection_window_size(1 << 26);
+    endpoint.connect().await.expect("expected a connection")
+}
+
+/// Opens calls and reads nothing.
+async fn open_unread_calls(channel: &Channel, scene: &str, count: usize) -> Vec<Streaming<v1::DescribeSceneResponse>> {
+    let mut client = SceneServiceClient::new(channel.clone());
+    let mut calls = Vec::new();
+    for _ in 0..count {
+        calls.push(with_timeout(client.describe_scene(describe(scene))).await.expect("expected a reply").into_inner());
+    }
+    calls
+}
+
+/// Reads a whole description and returns its number of bytes.
+async fn read_description(channel: Channel, scene: &str, pause: Duration) -> Result<usize, Status> {
+    use prost::Message as _;
+    let mut replies = SceneServiceClient::new(channel).describe_scene(describe(scene)).await?.into_inner();
+    let mut bytes = 0;
+    while let Some(reply) = replies.message().await? {
+        bytes += reply.encoded_len();
+        tokio::time::sleep(pause).await;
+    }
+    Ok(bytes)
+}
+
+/// A request body: the header of a message, all but one of its bytes, and no end.
+struct HalfSentMessage {
+    data: Option<Bytes>,
+}
+
+impl HalfSentMessage {
+    fn new(bytes: usize) -> Self {
+        let header = [&[0], &(bytes as u32).to_be_bytes()[..]].concat();
+        Self { data: Some([header, vec![1; bytes - 1]].concat().into()) }
+    }
+}
+
+impl http_body::Body for HalfSentMessage {
+    type Data = Bytes;
+    type Error = Status;
+
+    fn poll_frame(mut self: Pin<&mut Self>, _: &mut Context<'_>) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
+        match self.data.take() {
+            Some(data) => Poll::Ready(Some(Ok(Frame::data(data)))),
+            None => Poll::Pending,
+        }
+    }
+}
+
+/// Sends all but one byte of a request, and returns the status with which the server ends the call.
+async fn send_half(mut channel: Channel, bytes: usize) -> Status {
+    let request = http::Request::post("http://server/modalcast.v1.SceneService/OpenScene")
+        .header("content-type", "application/grpc")
+        .header("te", "trailers")
+        .body(tonic::body::Body::new(HalfSentMessage::new(bytes)))
+        .expect("expected a valid request");
+    std::future::poll_fn(|cx| channel.poll_ready(cx)).await.expect("expected an open connection");
+    let response = channel.call(request).await.expect("expected a response");
+    Status::from_header_map(response.headers()).expect("expected a status without messages")
+}
+
+/// Four of 40 half-sent messages fit into the budget of their connection. The others are rejected. Those that fit end
+/// when they make no progress.
+#[tokio::test(flavor = "multi_thread")]
+async fn half_sent_messages_are_rejected_or_time_out() {
+    const MESSAGE_BYTES: usize = 1 << 20;
+    let limits = |config| Config {
+        connection_receive_bytes: 4 * MESSAGE_BYTES + 100,
+        message_timeout: Duration::from_secs(2),
+        ..config
+    };
+    let server = Server::start_with(limits).await;
+    server.open("strips").await;
+    let channel = server.channel().await;
+    let mut calls = tokio::task::JoinSet::new();
+    for _ in 0..40 {
+        calls.spawn(send_half(channel.clone(), MESSAGE_BYTES));
+    }
+    let mut rejected = 0;
+    while let Some(status) = with_timeout(calls.join_next()).await {
+        let status = status.expect("expected no panic");
+        match (status.code(), rejection_details(&status).reason()) {
+            (Code::ResourceExhausted, Reason::LimitReached) => rejected += 1,
+            (Code::DeadlineExceeded, Reason::DeadlineExpired) => {}
+            other => panic!("{other:?}: {status:?}"),
+        }
+    }
+    // A call may begin after another one has timed out.
+    assert!(rejected >= 30, "expected at least 30 rejected calls, got {rejected}");
+    let mut writer = StepWriter::connect(channel).await;
+    writer.open("strips", Delivery::Lossless, 0).await;
+    writer.send_step_and_wait(step(1, &[0], &[0.1, 0.2])).await;
+}
+
+/// Two connections hold all bytes. A third one is served, and the one that holds the most loses its message.
+#[tokio::test(flavor = "multi_thread")]
+async fn half_sent_messages_do_not_lock_out_other_connections() {
+    let limits = |config| Config {
+        connection_receive_bytes: 1 << 20,
+        receive_bytes: 3 << 19,
+        message_timeout: Duration::from_secs(1000),
+        ..config
+    };
+    let server = Server::start_with(limits).await;
+    let mut large = tokio::spawn(send_half(server.channel().await, 1 << 20));
+    let medium = tokio::spawn(send_half(server.channel().await, 1 << 19));
+    // Names of 300 KB. The server rejects them after it has received them.
+    let open_scene = async || {
+        let request = v1::OpenSceneRequest { source: "x".repeat(300 << 10), scene: String::new() };
+        server.scenes().await.open_scene(request).await.expect_err("expected an unknown source").code()
+    };
+    let until_evicted = async {
+        loop {
+            assert_ne!(open_scene().await, Code::ResourceExhausted);
+            if large.is_finished() {
+                return (&mut large).await.expect("expected no panic");
+            }
+        }
+    };
+    let status = with_timeout(until_evicted).await;
+    assert_eq!((status.code(), rejection_details(&status).reason()), (Code::ResourceExhausted, Reason::QueueFull));
+    assert!(!medium.is_finished());
+    medium.abort();
+}
+
+/// Six connections read slowly and six read nothing, and all replies together exceed the budget many times.
+#[tokio::test(flavor = "multi_thread")]
+async fn slow_readers_share_the_reply_budget_without_deadlock() {
+    let limits = |config| Config {
+        reply_bytes: 6 << 20,
+        connection_reply_bytes: 6 << 20,
+        // Long enough for a busy machine: a slow reader takes a message of 1 MiB within this time.
+        reply_timeout: Duration::from_secs(4),
+        ..config
+    };
+    let server = Server::start_with(limits).await;
+    server.open("sheet").await;
+    let mut stalled_calls = Vec::new();
+    for _ in 0..6 {
+        stalled_calls.extend(open_unread_calls(&small_windows(&server.address).await, "sheet", 4).await);
+    }
+    let mut readers = tokio::task::JoinSet::new();
+    for _ in 0..6 {
+        let channel = small_windows(&server.address).await;
+        readers.spawn(async move { read_description(channel, "sheet", Duration::from_millis(1)).await });
+    }
+    let mut sizes = Vec::new();
+    while let Some(result) = with_timeout(readers.join_next()).await {
+        sizes.push(result.expect("expected no panic").expect("expected a complete description"));
+    }
+    assert!(sizes.iter().all(|size| *size == sizes[0] && *size > 6 << 20), "{sizes:?}");
+    // Some of the unread calls have ended to make room. A call whose connection is still open names the reason.
+    let mut ended = 0;
+    for mut call in stalled_calls {
+        let end = loop {
+            match with_timeout(call.message()).await {
+                Ok(Some(_)) => {}
+                Ok(None) => break None,
+                Err(status) => break Some(status),
+            }
+        };
+        if let Some(status) = end.filter(|status| status.code() == Code::ResourceExhausted) {
+            assert_eq!(rejection_details(&status).reason(), Reason::SlowReader);
+            ended += 1;
+        }
+    }
+    assert!(ended > 0, "expected an unread call to end with a reason");
+}
+
+/// A server in a process of its own.
+struct ServerProcess {
+    child: Child,
+    url: String,
+    /// Scenes and state.
+    _folder: tempfile::TempDir,
+}
+
+impl ServerProcess {
+    /// Starts a server that can open `grid.obj`.
+    fn start(flags: &[&str]) -> Self {
+        let folder = tempfile::tempdir().expect("expected a temporary folder");
+        std::fs::write(folder.path().join("grid.obj"), grid_obj(400)).expect("expected a writable folder");
+        let mut child = Command::new(env!("CARGO_BIN_EXE_modalcast"))
+            .args(["serve", "--listen", "127.0.0.1:0", "--backend", "cpu", "--renderer", "off", "--scenes"])
+            .arg(folder.path())
+            .arg("--state")
+            .arg(folder.path().join("state"))
+            .args(flags)
+            .stdout(Stdio::piped())
+            .spawn()
+            .expect("expected a server");
+        let mut line = String::new();
+        let stdout = child.stdout.take().expect("expected standard output");
+        std::io::BufReader::new(stdout).read_line(&mut line).expect("expected a line");
+        let url = line.trim().strip_prefix("listening on ").expect("expected the URL").to_owned();
+        Self { child, url, _folder: folder }
+    }
+
+    /// A number of `/proc/PID/status` in bytes.
+    fn memory(&self, key: &str) -> u64 {
+        let path = format!("/proc/{}/status", self.child.id());
+        let status = std::fs::read_to_string(path).expect("expected a running server");
+        let line = status.lines().find_map(|line| line.strip_prefix(key)).expect("expected the key");
+        let kib = line.trim_start_matches(':').split_whitespace().next().expect("expected a number");
+        1024 * kib.parse::<u64>().expect("expected a number")
+    }
+
+    async fn channel(&self) -> Channel {
+        small_windows(&self.url).await
+    }
+}
+
+impl Drop for ServerProcess {
+    fn drop(&mut self) {
+        self.child.kill().ok();
+        self.child.wait().ok();
+    }
+}
+
+/// A grid of `side` x `side` vertices.
+fn grid_obj(side: usize) -> String {
+    use std::fmt::Write as _;
+    let mut text = String::new();
+    for index in 0..side * side {
+        writeln!(text, "v {} {} 0", index % side, index / side).expect("expected a string");
+    }
+    for first in (0..(side - 1) * (side - 1)).map(|cell| cell / (side - 1) * side + cell % (side - 1) + 1) {
+        let quad = [first, first + 1, first + side + 1, first + side];
+        writeln!(text, "f {} {} {} {}", quad[0], quad[1], quad[2], quad[3]).expect("expected a string");
+    }
+    text
+}
+
+/// Memory growth of a server with 120 unread descriptions, in bytes: the peak.
+async fn growth_by_unread_replies(flags: &[&str]) -> u64 {
+    let server = ServerProcess::start(flags);
+    let open = v1::OpenSceneRequest { source: "grid.obj".into(), scene: "grid".into() };
+    let mut scenes = SceneServiceClient::new(server.channel().await);
+    scenes.open_scene(open).await.expect("expected the scene to open");
+    read_description(server.channel().await, "grid", Duration::ZERO).await.expect("expected a description");
+    let idle_bytes = server.memory("VmHWM");
+    let attacker = server.channel().await;
+    let unread_calls = open_unread_calls(&attacker, "grid", 120).await;
+    // Clients on other connections are served, and give the server the time to produce replies that nobody reads.
+    for _ in 0..10 {
+        with_timeout(read_description(server.channel().await, "grid", Duration::from_millis(10)))
+            .await
+            .expect("expected a description");
+    }
+    let growth = server.memory("VmHWM") - idle_bytes;
+    drop(unread_calls);
+    growth
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn unread_replies_use_bounded_memory() {
+    let (bounded, unbounded) = tokio::join!(
+        growth_by_unread_replies(&["--connection-reply-bytes", "16777216"]),
+        growth_by_unread_replies(&["--connection-reply-bytes", "4000000000", "--reply-bytes", "4000000000"]),
+    );
+    println!("unread replies: {bounded} bytes with a budget of 16 MiB, {unbounded} bytes without");
+    assert!(bounded < 64 << 20, "{bounded}");
+    assert!(unbounded > 100 << 20, "control: {unbounded}");
+}
+
+/// Memory growth of a server while a connection holds 40 half-sent messages of 8 MiB, in bytes.
+async fn growth_by_half_sent_messages(flags: &[&str], is_bounded: bool) -> u64 {
+    let server = ServerProcess::start(flags);
+    let idle_bytes = server.memory("VmRSS");
+    let attacker = server.channel().await;
+    let mut calls = tokio::task::JoinSet::new();
+    for _ in 0..40 {
+        calls.spawn(send_half(attacker.clone(), 8 << 20));
+    }
+    let mut scenes = SceneServiceClient::new(server.channel().await);
+    let attack = async {
+        loop {
+            scenes.list_scenes(v1::ListScenesRequest {}).await.expect("expected service during the attack");
+            let growth = server.memory("VmRSS").saturating_sub(idle_bytes);
+            match is_bounded {
+                // Four messages remain when all others are rejected.
+                true if calls.len() <= 4 => return,
+                true => drop(calls.try_join_next()),
+                false if growth > 200 << 20 => return,
+                false => {}
+            }
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+    };
+    with_timeout(attack).await;
+    server.memory("VmHWM") - idle_bytes
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn half_sent_messages_use_bounded_memory() {
+    let unlimited = ["--connection-receive-bytes", "4000000000", "--receive-bytes", "4000000000"];
+    let bounded = growth_by_half_sent_messages(&[], true).await;
+    // Returns only when the memory exceeds 200 MiB.
+    let unbounded = growth_by_half_sent_messages(&unlimited, false).await;
+    println!("half-sent messages: {bounded} bytes with a budget of 32 MiB, {unbounded} bytes without");
+    assert!(bounded < 100 << 20, "{bounded}");
+}
