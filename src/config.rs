@@ -31,11 +31,41 @@ pub enum RendererChoice {
     Off,
 }
 
+/// An address that the server listens on: `HOST:PORT` or `unix:PATH`.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum ListenAddress {
+    /// Port 0 selects a free port.
+    Tcp(SocketAddr),
+    /// The path of a Unix socket, which only the user of the server can connect to.
+    Unix(PathBuf),
+}
+
+impl std::str::FromStr for ListenAddress {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        match text.strip_prefix("unix:") {
+            Some("") => Err("expected a path after 'unix:'".into()),
+            Some(path) => Ok(Self::Unix(path.into())),
+            None => text.parse().map(Self::Tcp).map_err(|error| format!("expected IP:PORT or unix:PATH: {error}")),
+        }
+    }
+}
+
+impl std::fmt::Display for ListenAddress {
+    fn fmt(&self, out: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Tcp(address) => address.fmt(out),
+            Self::Unix(path) => write!(out, "unix:{}", path.display()),
+        }
+    }
+}
+
 /// The server's configuration. The name or the documentation of a field gives its unit.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Config {
-    /// The address to listen on. The default is loopback; port 0 selects a free port.
-    pub listen: SocketAddr,
+    /// The addresses to listen on, at least one. The default is loopback.
+    pub listen: Vec<ListenAddress>,
     /// The folder of scenes that clients may open. `None` allows only the built-in scenes.
     pub scenes: Option<PathBuf>,
     /// The folder for uploads, the list of open scenes and their last steps. Only one server at a time can use it.
@@ -59,8 +89,8 @@ pub struct Config {
     /// senders wait.
     pub connection_reply_bytes: usize,
     pub reply_bytes: usize,
-    /// A call whose client takes no bytes for this time ends when another reply waits for the same limit. After this time
-    /// again, its connection is closed.
+    /// A call whose client takes less than a message, of at most 1 MiB, within this time ends when another reply waits for
+    /// the same limit. After this time again, its connection is closed.
     pub reply_timeout: Duration,
     /// The largest chunk of data in one reply message, in bytes. The message also contains a head.
     pub chunk_bytes: usize,
@@ -105,7 +135,7 @@ pub struct Config {
 impl Default for Config {
     fn default() -> Self {
         Self {
-            listen: SocketAddr::from((Ipv4Addr::LOCALHOST, 50051)),
+            listen: vec![ListenAddress::Tcp((Ipv4Addr::LOCALHOST, 50051).into())],
             scenes: None,
             state: default_state(),
             backend: BackendChoice::Auto,
@@ -190,6 +220,9 @@ impl Config {
         check_range("first_byte_timeout (ms)", ms(self.first_byte_timeout), 1, HOUR_MS)?;
         check_range("keepalive_interval (ms)", ms(self.keepalive_interval), 100, HOUR_MS)?;
         check_range("keepalive_timeout (ms)", ms(self.keepalive_timeout), 100, HOUR_MS)?;
+        if self.listen.is_empty() {
+            return Err(invalid("config.listen", "at least one address", "none"));
+        }
         if self.state.as_os_str().is_empty() {
             return Err(invalid("config.state", "the path of a folder", "an empty path"));
         }
@@ -216,12 +249,15 @@ mod tests {
     #[test]
     fn default_configuration_is_valid_and_listens_on_loopback() {
         let config = Config::default().validated().expect("expected valid defaults");
-        assert!(config.listen.ip().is_loopback());
+        assert!(matches!(config.listen[..], [ListenAddress::Tcp(address)] if address.ip().is_loopback()));
     }
 
     #[test]
     fn value_out_of_range_is_rejected_with_its_field() {
-        let invalid_configs: [(&str, Config); 5] = [
+        let invalid_configs: [(&str, Config); 8] = [
+            ("config.listen", Config { listen: Vec::new(), ..Config::default() }),
+            ("config.receive_bytes", Config { receive_bytes: 1 << 20, ..Config::default() }),
+            ("config.connection_receive_bytes", Config { message_bytes: 64 << 20, ..Config::default() }),
             ("config.chunk_bytes", Config { chunk_bytes: 2 << 20, ..Config::default() }),
             ("config.window", Config { window: 300, ..Config::default() }),
             ("config.frame_side", Config { frame_side: 0, ..Config::default() }),
@@ -231,6 +267,18 @@ mod tests {
         for (field, config) in invalid_configs {
             let error = config.validated().expect_err(field).to_string();
             assert!(error.starts_with(field), "expected {field}, got {error}");
+        }
+    }
+
+    #[test]
+    fn listen_address_is_a_socket_address_or_a_path() {
+        for text in ["127.0.0.1:50051", "[::1]:0", "unix:/run/modalcast.sock"] {
+            let address: ListenAddress = text.parse().expect(text);
+            assert_eq!(address.to_string(), text);
+        }
+        assert_eq!("unix:a b".parse(), Ok(ListenAddress::Unix("a b".into())));
+        for text in ["unix:", "", "127.0.0.1", "/run/modalcast.sock"] {
+            assert!(text.parse::<ListenAddress>().is_err(), "{text}");
         }
     }
 }

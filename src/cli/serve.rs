@@ -1,12 +1,11 @@
 //! `modalcast serve`: runs the server until it receives SIGTERM or Ctrl-C.
 
-use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
 use super::{Outcome, print_line};
-use crate::config::{BackendChoice, Config, RendererChoice, ValidatedConfig};
+use crate::config::{BackendChoice, Config, ListenAddress, RendererChoice, ValidatedConfig};
 use crate::engine::{Engine, EngineInfo};
 use crate::service;
 use modalcast_model::error::{Result, fault_in};
@@ -18,11 +17,13 @@ use modalcast_model::load::SceneRepository;
   modalcast serve                                   built-in scenes, for clients on this machine
   modalcast serve --scenes ~/scenes                 also the scenes of a folder
   modalcast serve --listen 0.0.0.0:50051            also for clients on other machines
+  modalcast serve --listen unix:/run/user/1000/modalcast.sock
   modalcast serve --backend cpu --renderer software without a GPU")]
 pub(super) struct Args {
-    /// Address to listen on; port 0 selects a free port. The address is printed as 'listening on URL'.
-    #[arg(long, env = "MODALCAST_LISTEN", default_value_t = Config::default().listen)]
-    listen: SocketAddr,
+    /// Addresses to listen on: IP:PORT, where port 0 selects a free port, or unix:PATH for a socket that only this user
+    /// can connect to. The option can be repeated. Each address is printed as 'listening on URL'.
+    #[arg(long, env = "MODALCAST_LISTEN", value_delimiter = ',', default_values_t = Config::default().listen)]
+    listen: Vec<ListenAddress>,
     /// Folder of scenes that clients may open. Files outside it are never read.
     #[arg(long, env = "MODALCAST_SCENES")]
     scenes: Option<PathBuf>,
@@ -88,7 +89,7 @@ impl Args {
     fn config(&self) -> Result<ValidatedConfig> {
         let defaults = Config::default();
         Config {
-            listen: self.listen,
+            listen: self.listen.clone(),
             scenes: self.scenes.clone(),
             state: self.state.clone().unwrap_or(defaults.state),
             backend: self.backend,
@@ -129,12 +130,13 @@ async fn serve(config: ValidatedConfig) -> Result<()> {
     // Bind before scenes are loaded, so that a second server on the same address fails immediately.
     let listener = service::bind(&config).await?;
     let engine = Engine::start(config, repository).await?;
-    let address = listener.local_addr().map_err(fault_in("serve"))?;
-    if !address.ip().is_loopback() {
+    for address in listener.remote_addresses() {
         tracing::warn!("{address} accepts clients on other machines, without authentication");
     }
     log_devices(engine.info());
-    print_line(format!("listening on http://{address}"));
+    for url in listener.urls() {
+        print_line(format!("listening on {url}"));
+    }
     service::serve(engine, listener, shutdown_signal()).await
 }
 

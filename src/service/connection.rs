@@ -1,6 +1,5 @@
 //! What the server knows about the connection of a call.
 
-use std::net::SocketAddr;
 use std::sync::Arc;
 
 use tokio::sync::{Notify, OwnedSemaphorePermit, Semaphore};
@@ -36,7 +35,8 @@ impl Budgets {
 /// A connection, in the extensions of each of its calls.
 #[derive(Debug, Clone)]
 pub(super) struct ConnectionInfo {
-    remote: SocketAddr,
+    /// Never sent to another client.
+    peer: Arc<str>,
     drive_permits: Arc<Semaphore>,
     pub(super) receive: Arc<ConnectionReceiveBudget>,
     pub(super) reply: Arc<ConnectionReplyBudget>,
@@ -44,18 +44,18 @@ pub(super) struct ConnectionInfo {
 
 impl ConnectionInfo {
     /// `close` closes the connection.
-    pub(super) fn new(remote: SocketAddr, budgets: &Budgets, close: Arc<Notify>) -> Self {
+    pub(super) fn new(peer: String, budgets: &Budgets, close: Arc<Notify>) -> Self {
         Self {
-            remote,
+            peer: peer.into(),
             drive_permits: Arc::new(Semaphore::new(MAX_DRIVES)),
             receive: budgets.receive.new_connection(),
             reply: budgets.reply.new_connection(close),
         }
     }
 
-    /// The address of the client, for the log. It is never sent to another client.
-    pub(super) fn address(&self) -> String {
-        self.remote.to_string()
+    /// Name of the client, for the log: its address, or its process.
+    pub(super) fn peer(&self) -> String {
+        self.peer.to_string()
     }
 
     /// Counts a step stream until the permit is dropped.

@@ -1,144 +1,234 @@
-//! Accepts connections under a limit. A permit is acquired before a connection is accepted. A connection that sends
-//! nothing is closed. The listener pauses after a failed accept, so that it does not spin when file descriptors run
-//! out.
+//! The sockets that the server listens on: TCP and Unix sockets.
 
 use std::io;
+use std::net::SocketAddr;
+use std::os::unix::fs::{FileTypeExt as _, MetadataExt as _, PermissionsExt as _};
+use std::path::{Path, PathBuf};
 use std::pin::Pin;
-use std::sync::Arc;
 use std::task::{Context, Poll};
-use std::time::Duration;
 
-use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
-use tokio::net::{TcpListener, TcpStream};
-use tokio::sync::futures::OwnedNotified;
-use tokio::sync::{Notify, OwnedSemaphorePermit, Semaphore, mpsc};
-use tokio_stream::wrappers::ReceiverStream;
-use tonic::transport::server::Connected;
+use tokio::io::{AsyncRead, AsyncWrite};
+use tokio::net::{TcpListener, TcpStream, UnixListener, UnixStream};
 
-use super::connection::{Budgets, ConnectionInfo};
-use crate::config::Config;
+use crate::config::ListenAddress;
+use modalcast_model::error::{Error, Result};
 
-/// Maximum number of connections that have sent their first byte and are queued for the server. Further connections
-/// wait until the queue has capacity.
-const READY_QUEUE_CAPACITY: usize = 16;
-
-/// Pause of the listener after a failed accept.
-const ACCEPT_RETRY_DELAY: Duration = Duration::from_millis(50);
-
-/// An accepted connection with its permit.
+/// Bound sockets. Dropping it removes the files of the Unix sockets.
 #[derive(Debug)]
-pub(super) struct Connection {
-    stream: TcpStream,
-    info: ConnectionInfo,
-    /// Completes when the server must close the connection.
-    closed: Pin<Box<OwnedNotified>>,
-    is_closed: bool,
-    /// Counts against the limit on connections until the connection is dropped.
-    _permit: OwnedSemaphorePermit,
+pub struct Listener {
+    pub(super) sockets: ListeningSockets,
+    /// The files of the Unix sockets.
+    pub(super) files: Vec<SocketFile>,
+    urls: Vec<String>,
+    remote_addresses: Vec<SocketAddr>,
 }
 
-/// Accepts connections until the returned stream is dropped. At most `config.connections` are open at a time. Each must
-/// send its first byte within `config.first_byte_timeout`. All share the budgets of the configuration.
-pub(super) fn accept_connections(listener: TcpListener, config: &Config) -> ReceiverStream<io::Result<Connection>> {
-    let budgets = Budgets::new(config);
-    let (max_connections, first_byte_timeout) = (config.connections, config.first_byte_timeout);
-    let (ready_sender, ready_receiver) = mpsc::channel(READY_QUEUE_CAPACITY);
-    tokio::spawn(async move {
-        let permits = Arc::new(Semaphore::new(max_connections));
-        loop {
-            let accept_result = tokio::select! {
-                accept_result = accept(&listener, &permits, &budgets) => accept_result,
-                () = ready_sender.closed() => return,
-            };
-            match accept_result {
-                Ok(connection) => {
-                    tokio::spawn(await_first_byte(connection, first_byte_timeout, ready_sender.clone()));
-                }
-                Err(error) => {
-                    tracing::warn!(%error, "a connection could not be accepted");
-                    tokio::time::sleep(ACCEPT_RETRY_DELAY).await;
-                }
-            }
+/// The sockets of a listener.
+#[derive(Debug, Default)]
+pub(super) struct ListeningSockets(Vec<ListeningSocket>);
+
+#[derive(Debug)]
+enum ListeningSocket {
+    Tcp(TcpListener),
+    Unix(UnixListener),
+}
+
+/// The connection of a client.
+#[derive(Debug)]
+pub(super) enum Socket {
+    Tcp(TcpStream),
+    Unix(UnixStream),
+}
+
+impl Listener {
+    /// Binds all addresses. Replaces the socket file of a server that no longer runs.
+    ///
+    /// # Errors
+    /// `Unavailable` when an address is in use, does not belong to this machine, or cannot be created.
+    pub(super) async fn bind(addresses: &[ListenAddress]) -> Result<Self> {
+        let sockets = ListeningSockets::default();
+        let mut listener = Self { sockets, files: Vec::new(), urls: Vec::new(), remote_addresses: Vec::new() };
+        for address in addresses {
+            listener.add(address).await.map_err(|error| Error::Unavailable {
+                what: "listening address",
+                reason: format!("{address}: {error}"),
+                remedy: "Set another address with --listen".into(),
+            })?;
         }
-    });
-    ReceiverStream::new(ready_receiver)
-}
+        Ok(listener)
+    }
 
-async fn accept(listener: &TcpListener, permits: &Arc<Semaphore>, budgets: &Budgets) -> io::Result<Connection> {
-    let permit = Arc::clone(permits).acquire_owned().await.map_err(io::Error::other)?;
-    let (stream, remote) = listener.accept().await?;
-    stream.set_nodelay(true)?;
-    let close = Arc::new(Notify::new());
-    let closed = Box::pin(Arc::clone(&close).notified_owned());
-    Ok(Connection {
-        stream,
-        info: ConnectionInfo::new(remote, budgets, close),
-        closed,
-        is_closed: false,
-        _permit: permit,
-    })
-}
+    async fn add(&mut self, address: &ListenAddress) -> io::Result<()> {
+        let socket = match address {
+            ListenAddress::Tcp(address) => {
+                let socket = TcpListener::bind(address).await?;
+                let bound_address = socket.local_addr()?;
+                self.urls.push(format!("http://{bound_address}"));
+                self.remote_addresses.extend((!bound_address.ip().is_loopback()).then_some(bound_address));
+                ListeningSocket::Tcp(socket)
+            }
+            ListenAddress::Unix(path) => {
+                let (socket, file) = SocketFile::bind(path)?;
+                self.urls.push(address.to_string());
+                self.files.push(file);
+                ListeningSocket::Unix(socket)
+            }
+        };
+        self.sockets.0.push(socket);
+        Ok(())
+    }
 
-/// Forwards a connection once it has sent its first byte. Drops it if it sends nothing within `first_byte_timeout`.
-async fn await_first_byte(
-    connection: Connection,
-    first_byte_timeout: Duration,
-    ready_sender: mpsc::Sender<io::Result<Connection>>,
-) {
-    let mut first_byte = [0];
-    let peeked_bytes = tokio::time::timeout(first_byte_timeout, connection.stream.peek(&mut first_byte)).await;
-    if matches!(peeked_bytes, Ok(Ok(1))) {
-        ready_sender.send(Ok(connection)).await.ok(); // Fails only if the server has stopped.
+    /// The URLs for clients, in the order of the addresses: `http://IP:PORT` or `unix:PATH`.
+    pub fn urls(&self) -> &[String] {
+        &self.urls
+    }
+
+    /// The addresses that other machines can connect to.
+    pub fn remote_addresses(&self) -> &[SocketAddr] {
+        &self.remote_addresses
     }
 }
 
-impl Connected for Connection {
-    type ConnectInfo = ConnectionInfo;
-
-    fn connect_info(&self) -> ConnectionInfo {
-        self.info.clone()
+impl ListeningSockets {
+    /// Accepts a connection on any of the sockets, and returns it with the name of its client. Cancel-safe.
+    pub(super) async fn accept(&self) -> io::Result<(Socket, String)> {
+        let poll_accept = |cx: &mut Context<'_>| {
+            let ready = self.0.iter().find_map(|socket| match socket.poll_accept(cx) {
+                Poll::Ready(result) => Some(result),
+                Poll::Pending => None,
+            });
+            ready.map_or(Poll::Pending, Poll::Ready)
+        };
+        std::future::poll_fn(poll_accept).await
     }
 }
 
-impl Connection {
-    /// Fails when the server must close the connection.
-    fn check_open(&mut self, cx: &mut Context<'_>) -> io::Result<()> {
-        self.is_closed = self.is_closed || self.closed.as_mut().poll(cx).is_ready();
-        if self.is_closed { Err(io::ErrorKind::ConnectionAborted.into()) } else { Ok(()) }
+impl ListeningSocket {
+    fn poll_accept(&self, cx: &mut Context<'_>) -> Poll<io::Result<(Socket, String)>> {
+        match self {
+            Self::Tcp(listener) => listener.poll_accept(cx)?.map(|(stream, peer)| {
+                stream.set_nodelay(true)?;
+                Ok((Socket::Tcp(stream), peer.to_string()))
+            }),
+            Self::Unix(listener) => listener.poll_accept(cx)?.map(|(stream, _)| {
+                let pid = stream.peer_cred().ok().and_then(|credentials| credentials.pid());
+                let peer = pid.map_or_else(|| "unix socket".to_owned(), |pid| format!("process {pid}"));
+                Ok((Socket::Unix(stream), peer))
+            }),
+        }
     }
 }
 
-impl AsyncRead for Connection {
-    fn poll_read(mut self: Pin<&mut Self>, cx: &mut Context<'_>, buffer: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
-        self.check_open(cx)?;
-        Pin::new(&mut self.stream).poll_read(cx, buffer)
+/// The file of a Unix socket. Dropping it removes the file.
+#[derive(Debug)]
+pub(super) struct SocketFile {
+    path: PathBuf,
+    /// Device and inode, so that the file of another server at this path is not removed.
+    identity: (u64, u64),
+}
+
+impl SocketFile {
+    /// Binds a socket that only the user of this process can connect to.
+    fn bind(path: &Path) -> io::Result<(UnixListener, Self)> {
+        check_replaceable(path)?;
+        // The socket gets its permissions before its name, and the rename replaces a stale file.
+        let temporary_path = path.with_extension(format!("{}.new", std::process::id()));
+        let bind = || {
+            let listener = UnixListener::bind(&temporary_path)?;
+            std::fs::set_permissions(&temporary_path, std::fs::Permissions::from_mode(0o600))?;
+            let metadata = std::fs::metadata(&temporary_path)?;
+            std::fs::rename(&temporary_path, path)?;
+            Ok((listener, Self { path: path.to_owned(), identity: (metadata.dev(), metadata.ino()) }))
+        };
+        bind().inspect_err(|_| {
+            std::fs::remove_file(&temporary_path).ok();
+        })
     }
 }
 
-impl AsyncWrite for Connection {
-    fn poll_write(mut self: Pin<&mut Self>, cx: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
-        self.check_open(cx)?;
-        Pin::new(&mut self.stream).poll_write(cx, bytes)
+impl Drop for SocketFile {
+    fn drop(&mut self) {
+        let identity = std::fs::symlink_metadata(&self.path).map(|metadata| (metadata.dev(), metadata.ino()));
+        if identity.is_ok_and(|identity| identity == self.identity) {
+            std::fs::remove_file(&self.path).ok();
+        }
+    }
+}
+
+/// Fails unless `path` is free or is the socket of a server that no longer runs.
+fn check_replaceable(path: &Path) -> io::Result<()> {
+    let Ok(metadata) = std::fs::symlink_metadata(path) else { return Ok(()) };
+    if !metadata.file_type().is_socket() {
+        return Err(io::Error::new(io::ErrorKind::AlreadyExists, "expected a free path or a socket, got another file"));
+    }
+    match std::os::unix::net::UnixStream::connect(path) {
+        Ok(_) => Err(io::Error::new(io::ErrorKind::AddrInUse, "another server listens on this socket")),
+        Err(error) if error.kind() == io::ErrorKind::ConnectionRefused => Ok(()),
+        Err(error) => Err(error),
+    }
+}
+
+/// Both directions of a socket.
+pub(super) trait Io: AsyncRead + AsyncWrite + Send + Unpin {}
+
+impl<T: AsyncRead + AsyncWrite + Send + Unpin> Io for T {}
+
+impl Socket {
+    /// Returns whether the client has sent a byte; false if it has closed the connection.
+    pub(super) async fn wait_for_first_byte(&self) -> bool {
+        match self {
+            Self::Tcp(stream) => stream.peek(&mut [0]).await.is_ok_and(|bytes| bytes > 0),
+            // A Unix socket has no peek. It is also readable if the client has closed it, which the transport notices.
+            Self::Unix(stream) => stream.readable().await.is_ok(),
+        }
     }
 
-    fn poll_write_vectored(
-        mut self: Pin<&mut Self>,
-        cx: &mut Context<'_>,
-        slices: &[io::IoSlice<'_>],
-    ) -> Poll<io::Result<usize>> {
-        self.check_open(cx)?;
-        Pin::new(&mut self.stream).poll_write_vectored(cx, slices)
+    pub(super) fn io(&mut self) -> Pin<&mut dyn Io> {
+        match self {
+            Self::Tcp(stream) => Pin::new(stream),
+            Self::Unix(stream) => Pin::new(stream),
+        }
     }
 
-    fn is_write_vectored(&self) -> bool {
-        self.stream.is_write_vectored()
+    pub(super) fn is_write_vectored(&self) -> bool {
+        match self {
+            Self::Tcp(stream) => stream.is_write_vectored(),
+            Self::Unix(stream) => stream.is_write_vectored(),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn stale_socket_is_replaced_and_other_files_are_kept() {
+        let folder = tempfile::tempdir().expect("expected a temporary folder");
+        let path = folder.path().join("socket");
+        let address = [ListenAddress::Unix(path.clone())];
+        // A standard library listener leaves its file, as a killed server does.
+        drop(std::os::unix::net::UnixListener::bind(&path).expect("expected a socket"));
+        let listener = Listener::bind(&address).await.expect("expected the stale socket to be replaced");
+        assert_eq!(std::fs::metadata(&path).expect("expected a file").permissions().mode() & 0o777, 0o600);
+        let error = Listener::bind(&address).await.expect_err("expected a socket in use").to_string();
+        assert!(error.contains("another server"), "{error}");
+        drop(listener);
+        assert_eq!(std::fs::read_dir(folder.path()).expect("expected a folder").count(), 0);
+        std::fs::write(&path, "text").expect("expected a writable folder");
+        assert!(Listener::bind(&address).await.is_err());
+        assert_eq!(std::fs::read_to_string(&path).expect("expected the file"), "text");
     }
 
-    fn poll_flush(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
-        Pin::new(&mut self.stream).poll_flush(cx)
-    }
-
-    fn poll_shutdown(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
-        Pin::new(&mut self.stream).poll_shutdown(cx)
+    /// A server that was replaced does not remove the socket of its successor.
+    #[tokio::test]
+    async fn only_the_own_socket_file_is_removed() {
+        let folder = tempfile::tempdir().expect("expected a temporary folder");
+        let path = folder.path().join("socket");
+        let first = Listener::bind(&[ListenAddress::Unix(path.clone())]).await.expect("expected a socket");
+        std::fs::remove_file(&path).expect("expected the file");
+        let _second = Listener::bind(&[ListenAddress::Unix(path.clone())]).await.expect("expected a socket");
+        drop(first);
+        assert!(path.exists());
     }
 }

@@ -1,6 +1,7 @@
 //! The gRPC services, which translate between wire messages and engine types. This is the only module that uses the
 //! protobuf types.
 
+mod accept;
 mod connection;
 mod convert;
 mod describe;
@@ -23,17 +24,18 @@ mod uploads;
 mod vertices;
 
 use modalcast_proto::v1;
-use tokio::net::TcpListener;
 use tokio::sync::oneshot;
 use tokio::time::Instant;
 use tonic::transport::Server;
 use tonic_health::server::HealthReporter;
 
+pub use self::listen::Listener;
+
 use self::connection::STREAMS_PER_CONNECTION_WINDOW;
 use self::routes::Routes;
 use crate::config::Config;
 use crate::engine::Engine;
-use modalcast_model::error::{Error, Result, fault_in};
+use modalcast_model::error::{Result, fault_in};
 
 /// Largest message that the server sends, in bytes: a chunk of at most 1 MiB and its head, or the layout of 65,536
 /// domains.
@@ -42,16 +44,12 @@ const MAX_REPLY_BYTES: usize = 3 << 20;
 /// Limit on the open calls of one connection.
 const MAX_CALLS: usize = 128;
 
-/// Binds the configured address.
+/// Binds the configured addresses.
 ///
 /// # Errors
-/// `Unavailable` when the address is in use or does not belong to this machine.
-pub async fn bind(config: &Config) -> Result<TcpListener> {
-    TcpListener::bind(config.listen).await.map_err(|error| Error::Unavailable {
-        what: "listening address",
-        reason: format!("{}: {error}", config.listen),
-        remedy: "Set another address with --listen".into(),
-    })
+/// `Unavailable` when an address is in use or does not belong to this machine.
+pub async fn bind(config: &Config) -> Result<Listener> {
+    Listener::bind(&config.listen).await
 }
 
 /// Serves until `shutdown` completes. Then answers health checks with `NOT_SERVING`, ends every stream and returns
@@ -62,14 +60,16 @@ pub async fn bind(config: &Config) -> Result<TcpListener> {
 /// `Fault` when the transport fails.
 pub async fn serve(
     engine: Engine,
-    listener: TcpListener,
+    listener: Listener,
     shutdown: impl Future<Output = ()> + Send + 'static,
 ) -> Result<()> {
     let config = engine.config().clone();
     let (health_reporter, health_server) = tonic_health::server::health_reporter();
     set_health(&health_reporter, true).await;
     let routes = routes(&engine, &config)?.with(health_server);
-    let connections = listen::accept_connections(listener, &config);
+    // The files are removed when this function returns.
+    let Listener { sockets, files: _files, .. } = listener;
+    let connections = accept::accept_connections(sockets, &config);
     let (stop_sender, stop_receiver) = oneshot::channel();
     let stop_engine = async move {
         let mut shutdown = std::pin::pin!(shutdown);
@@ -195,11 +195,11 @@ mod tests {
     #[tokio::test]
     async fn lost_device_turns_health_to_not_serving() {
         let folder = tempfile::tempdir().expect("expected a temporary folder");
-        let config =
-            Config { listen: ([127, 0, 0, 1], 0).into(), state: folder.path().to_owned(), ..Config::default() };
+        let listen = crate::config::ListenAddress::Tcp(([127, 0, 0, 1], 0).into());
+        let config = Config { listen: vec![listen], state: folder.path().to_owned(), ..Config::default() };
         let config = config.validated().expect("expected a valid configuration");
         let listener = bind(&config).await.expect("expected a free port");
-        let address = format!("http://{}", listener.local_addr().expect("expected a bound address"));
+        let address = listener.urls()[0].clone();
         let (engine, step) = Engine::with_losable_device(config).await.expect("expected a running engine");
         let (stop_sender, stop_receiver) = oneshot::channel::<()>();
         let server = tokio::spawn(serve(engine.clone(), listener, async {

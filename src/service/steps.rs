@@ -41,7 +41,7 @@ impl v1::step_service_server::StepService for StepServiceImpl {
         let deadline = Deadline::of_stream(request.metadata());
         let session = DriveSession {
             engine: self.0.clone(),
-            peer: connection.address(),
+            peer: connection.peer(),
             _drive_permit: drive_permit,
             inbound: request.into_inner(),
             writer: None,
@@ -54,7 +54,7 @@ impl v1::step_service_server::StepService for StepServiceImpl {
 /// The state of one step stream.
 struct DriveSession {
     engine: Engine,
-    /// Address of the client, for the log.
+    /// Name of the client, for the log.
     peer: String,
     /// Counts this stream among those of its connection.
     _drive_permit: OwnedSemaphorePermit,

@@ -41,4 +41,5 @@ mod storages;
 mod stream_settings;
 mod streams;
 mod tolerance;
+mod unix_sockets;
 mod writers;

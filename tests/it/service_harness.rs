@@ -4,7 +4,7 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
-use modalcast::config::{BackendChoice, Config, RendererChoice};
+use modalcast::config::{BackendChoice, Config, ListenAddress, RendererChoice};
 use modalcast::engine::{Engine, SceneSource};
 use modalcast::service;
 use modalcast_compute::reference;
@@ -180,7 +180,7 @@ fn scene(name: &str, shape: Shape, domains: Vec<Domain>) -> Arc<Scene> {
 /// state.
 pub(crate) fn config(state: &Path) -> Config {
     Config {
-        listen: ([127, 0, 0, 1], 0).into(),
+        listen: vec![ListenAddress::Tcp(([127, 0, 0, 1], 0).into())],
         state: state.to_owned(),
         backend: BackendChoice::Reference,
         renderer: RendererChoice::Off,
@@ -223,7 +223,7 @@ impl Server {
     pub(crate) async fn start_from(config: Config, source: Arc<dyn SceneSource>) -> Self {
         let config = config.validated().expect("expected valid settings");
         let listener = service::bind(&config).await.expect("expected a free port");
-        let address = format!("http://{}", listener.local_addr().expect("expected a socket address"));
+        let address = listener.urls()[0].clone();
         let engine = Engine::start(config, source).await.expect("expected an engine");
         let (stop_sender, stop_receiver) = oneshot::channel();
         let shutdown = async {

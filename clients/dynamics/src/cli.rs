@@ -74,7 +74,7 @@ pub(crate) enum Command {
 
 #[derive(Debug, Clone, Args)]
 pub(crate) struct CommonOptions {
-    /// URL of the server.
+    /// URL of the server: http://HOST:PORT or unix:PATH.
     #[arg(long, env = "MODALCAST_SERVER", default_value = "http://127.0.0.1:50051")]
     pub(crate) server: String,
     /// Maximum time to retry until the server answers, in seconds.

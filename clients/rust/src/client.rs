@@ -85,7 +85,7 @@ impl ServerInfo {
 
 impl Client {
     /// Connects, with a timeout of five seconds, and checks that the server has the protocol version of this client.
-    /// `url` is `http://host:port` or `host:port`.
+    /// `url` is `http://host:port`, `host:port`, or `unix:path` for a Unix socket.
     ///
     /// # Errors
     /// `Connect` if the URL is invalid or no server answers; `ProtocolVersion` if the server has another version;
@@ -93,7 +93,8 @@ impl Client {
     pub async fn connect(url: &str) -> Result<Self> {
         let connect_error =
             |error: tonic::transport::Error| Error::Connect { url: url.to_owned(), reason: describe_causes(&error) };
-        let url_with_scheme = if url.contains("://") { url.to_owned() } else { format!("http://{url}") };
+        let has_scheme = url.contains("://") || url.starts_with("unix:");
+        let url_with_scheme = if has_scheme { url.to_owned() } else { format!("http://{url}") };
         let endpoint = Endpoint::from_shared(url_with_scheme)
             .map_err(connect_error)?
             .connect_timeout(CONNECT_TIMEOUT)

@@ -208,6 +208,30 @@ async fn forward(server_address: &str) -> (String, tokio::task::JoinSet<()>) {
     (url, tasks)
 }
 
+/// The library and the program connect to a Unix socket, which is forwarded to a server.
+#[tokio::test(flavor = "multi_thread")]
+async fn unix_socket_is_a_url() {
+    let server = serve(Arc::new(one_domain_server(4))).await;
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("socket");
+    let listener = tokio::net::UnixListener::bind(&path).expect("a socket");
+    let server_address = server.trim_start_matches("http://").to_owned();
+    tokio::spawn(async move {
+        while let Ok((mut client, _)) = listener.accept().await {
+            let mut server = tokio::net::TcpStream::connect(&server_address).await.expect("a connection");
+            tokio::spawn(async move { drop(tokio::io::copy_bidirectional(&mut client, &mut server).await) });
+        }
+    });
+    let url = format!("unix:{}", path.display());
+    let client = Client::connect(&url).await.expect("a connection");
+    let stream = client.drive(&DriveRequest::new("toy", Delivery::Lossless)).await.expect("a step stream");
+    stream.finish().await.expect("a clean end");
+    let output = run_fetch(&url, &["info"]).await;
+    assert_eq!(output.exit_code, 0, "{}", output.stderr);
+    let error = Client::connect("unix:/nonexistent/socket").await.expect_err("no server");
+    assert!(error.to_string().starts_with("unix:/nonexistent/socket: no connection"), "{error}");
+}
+
 #[tokio::test]
 async fn lost_connection_names_the_server_in_calls_and_streams() {
     let server = serve(Arc::new(one_domain_server(4))).await;
