@@ -1824,8 +1824,8 @@ pub struct OpenDrive {
 /// One step. It is applied completely or not at all. Values that are not sent remain unchanged.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct Step {
-    /// Step number; must be larger than that of the last accepted step of the stream. The number of a rejected step may be
-    /// sent again. The first step of a stream may have any number.
+    /// Step number; must increase within the stream. The first step may have any number. A client that corrects a rejected
+    /// step gives it a new number, because a step that is rejected during its computation has used its number.
     #[prost(uint64, tag = "1")]
     pub number: u64,
     /// Simulation time in seconds; finite.
@@ -1849,6 +1849,13 @@ pub struct Step {
     /// The format of all transforms of the step.
     #[prost(enumeration = "TransformFormat", tag = "7")]
     pub transform_format: i32,
+    /// Whether the next message is a further part of this step. A large step is sent in parts, so that no message is larger
+    /// than necessary: consecutive messages with the same number, of which all but the last set this field. The lists and
+    /// the bytes of the parts are concatenated in order; `time` and `transform_format` are those of the first part. A step
+    /// of one message leaves it unset. All parts of a step together have at most Limits.message_bytes bytes. If a part is
+    /// rejected, the other parts of the step are ignored.
+    #[prost(bool, tag = "8")]
+    pub has_more: bool,
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct DriveSceneResponse {
@@ -5163,7 +5170,7 @@ pub struct GetServerInfoResponse {
 /// Limits of the server. A request beyond a limit is rejected with an error that names the limit (errors.proto).
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct Limits {
-    /// The largest message that the server accepts, in bytes. The server never sends a message above 3 MiB; a chunk of
+    /// The largest message that the server accepts, in bytes, and the largest step with all its parts. The server never sends a message above 3 MiB; a chunk of
     /// data in it has at most 1 MiB.
     #[prost(uint64, tag = "1")]
     pub message_bytes: u64,

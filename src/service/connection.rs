@@ -16,7 +16,8 @@ pub(super) const STREAMS_PER_CONNECTION_WINDOW: u32 = 256;
 /// Limit on the step streams of one connection. A stream that blocks is not read, and h2 buffers up to a stream window W
 /// of its frames. h2 charges 256 - f bytes for each buffered frame of f bytes, and closes the connection if the charges
 /// exceed half of the connection window, 128 W. The smallest frame of a step has f = 9 bytes: 5 bytes of gRPC and a step
-/// with nothing but its number. One stream is then charged W / 9 * (256 - 9) = 27.4 W, so four are safe.
+/// with nothing but its number. One stream is then charged W / 9 * (256 - 9) = 27.4 W, so four are safe. The parts of a
+/// large step are not smaller: a part has a number and says that more follow.
 pub(super) const MAX_DRIVES: usize = 4;
 
 /// The budgets that all connections share.

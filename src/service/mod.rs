@@ -18,6 +18,7 @@ mod routes;
 mod scenes;
 mod states;
 mod status;
+mod step_parts;
 mod steps;
 mod stream;
 mod uploads;

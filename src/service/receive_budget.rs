@@ -210,6 +210,18 @@ impl ReceivedMemory {
     pub(super) fn next_eviction(&self) -> OwnedNotified {
         Arc::clone(&self.connection.evictions.changed).notified_owned()
     }
+
+    /// Waits until the memory is in use and was evicted. Cancel-safe.
+    pub(super) async fn evicted(&self) -> Error {
+        loop {
+            // Created before the check, so that it completes if the eviction comes between the two.
+            let eviction = self.next_eviction();
+            if let Err(error) = self.check() {
+                return error;
+            }
+            eviction.await;
+        }
+    }
 }
 
 impl Drop for ReceivedMemory {

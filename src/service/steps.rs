@@ -13,6 +13,7 @@ use tonic::{Request, Response, Status, Streaming};
 use super::connection::ConnectionInfo;
 use super::convert::{parse_lease_request, parse_step, wire_opened, wire_stages};
 use super::status::{to_rejection, to_status, transport_status};
+use super::step_parts::StepAssembler;
 use super::stream::{Deadline, ReplySender, ReplyStream, respond};
 use crate::engine::{Engine, StepReport, WriterSession};
 use modalcast_model::error::{Error, Result, fault};
@@ -42,6 +43,7 @@ impl v1::step_service_server::StepService for StepServiceImpl {
         let session = DriveSession {
             engine: self.0.clone(),
             peer: connection.peer(),
+            parts: StepAssembler::new(connection.receive.new_memory(), connection.receive.limits()),
             _drive_permit: drive_permit,
             inbound: request.into_inner(),
             writer: None,
@@ -59,6 +61,8 @@ struct DriveSession {
     /// Counts this stream among those of its connection.
     _drive_permit: OwnedSemaphorePermit,
     inbound: Streaming<v1::DriveSceneRequest>,
+    /// The step that is being received, if it has several parts.
+    parts: StepAssembler,
     /// The writer lease, once it is acquired.
     writer: Option<WriterSession>,
     /// Replies that are not sent yet, oldest first.
@@ -84,6 +88,7 @@ impl DriveSession {
                     Ok(None) => is_receiving = false,
                     Err(status) => return Err(transport_status(status, self.engine.config().message_bytes)),
                 },
+                error = self.parts.stalled(), if is_receiving && may_read => return Err(to_status(error)),
                 report = next_report(self.writer.as_ref()), if has_reply_capacity => match report {
                     Ok(report) => self.push_report(report),
                     Err(error) => return self.close_with_error(&reply_sender, error).await,
@@ -132,6 +137,7 @@ impl DriveSession {
     }
 
     fn push_step(&mut self, step: v1::Step) -> Result<()> {
+        let Some(step) = self.parts.push(step)? else { return Ok(()) };
         match &mut self.writer {
             Some(writer) => writer.push_step(&parse_step(step)?),
             None => Err(Error::UnexpectedMessage { expected: "open before the first step", given: "a step" }),

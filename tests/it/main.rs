@@ -4,6 +4,7 @@ mod array_uploads;
 mod attribute_streams;
 mod broken_streams;
 mod budgets;
+mod bulk_steps;
 #[path = "../common/mod.rs"]
 mod common;
 mod cpu_checks;

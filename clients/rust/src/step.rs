@@ -1,7 +1,8 @@
 //! One step of a physics process: r coordinates and a transform per domain, packed little-endian.
 
-use bytes::BytesMut;
+use bytes::{Bytes, BytesMut};
 use modalcast_proto::v1;
+use prost::Message as _;
 
 use crate::error::{Error, Result};
 
@@ -131,7 +132,12 @@ impl Step {
         self.q.len() + self.transforms.len()
     }
 
-    /// The step in its wire format.
+    /// The step in its wire format, in parts of about 512 KiB if it is larger than 1 MiB.
+    pub(crate) fn to_wire_parts(&self) -> Vec<v1::Step> {
+        split_step(self.to_wire())
+    }
+
+    /// The step in its wire format, as one message.
     pub fn to_wire(&self) -> v1::Step {
         v1::Step {
             number: self.number,
@@ -141,8 +147,42 @@ impl Step {
             transform_domains: self.transform_domains.clone(),
             transforms: self.transforms.clone().freeze(),
             transform_format: self.format.into(),
+            has_more: false,
         }
     }
+}
+
+/// A step up to this size is one message. In bytes.
+const MAX_SINGLE_BYTES: usize = 1 << 20;
+
+/// Size of a part of a larger step, in bytes.
+const PART_BYTES: usize = 512 << 10;
+
+/// Number of domains in one part. Each has at most 5 bytes.
+const PART_DOMAINS: usize = PART_BYTES / 5;
+
+/// Splits a step that is larger than [`MAX_SINGLE_BYTES`]. Each part has a piece of one list or of one array.
+fn split_step(step: v1::Step) -> Vec<v1::Step> {
+    if step.encoded_len() <= MAX_SINGLE_BYTES {
+        return vec![step];
+    }
+    let v1::Step { number, time, q_domains, q, transform_domains, transforms, transform_format, .. } = step;
+    // The first part has what applies to all parts.
+    let mut parts = vec![v1::Step { number, time, transform_format, ..v1::Step::default() }];
+    let empty = || v1::Step { number, ..v1::Step::default() };
+    parts.extend(q_domains.chunks(PART_DOMAINS).map(|piece| v1::Step { q_domains: piece.to_vec(), ..empty() }));
+    parts.extend(pieces(q).map(|q| v1::Step { q, ..empty() }));
+    let domain_pieces = transform_domains.chunks(PART_DOMAINS);
+    parts.extend(domain_pieces.map(|piece| v1::Step { transform_domains: piece.to_vec(), ..empty() }));
+    parts.extend(pieces(transforms).map(|transforms| v1::Step { transforms, ..empty() }));
+    let last_part = parts.len() - 1;
+    parts[..last_part].iter_mut().for_each(|part| part.has_more = true);
+    parts
+}
+
+/// Splits bytes into pieces of [`PART_BYTES`].
+fn pieces(bytes: Bytes) -> impl Iterator<Item = Bytes> {
+    (0..bytes.len()).step_by(PART_BYTES).map(move |start| bytes.slice(start..bytes.len().min(start + PART_BYTES)))
 }
 
 #[cfg(test)]
@@ -192,5 +232,26 @@ mod tests {
             let error = step.check_formats().expect_err("mixed formats").to_string();
             assert_eq!(error, "step 0 cannot be sent: expected transforms of one format, got several");
         }
+    }
+
+    #[test]
+    fn large_step_is_split_into_parts_without_loss() {
+        let mut step = Step::new(3, 0.5);
+        for domain in 0..60_000 {
+            step.set_q(domain, &[domain as f32]);
+            step.set_transform(domain, &[domain as f32; 12]);
+        }
+        let (whole, parts) = (step.to_wire(), step.to_wire_parts());
+        assert!(parts.len() > 5, "{}", parts.len());
+        assert!(parts.iter().all(|part| part.encoded_len() <= PART_BYTES + 100 && part.number == 3));
+        let more: Vec<bool> = parts.iter().map(|part| part.has_more).collect();
+        assert!(more[..more.len() - 1].iter().all(|has_more| *has_more) && !more[more.len() - 1]);
+        assert_eq!(parts[0].time, 0.5);
+        let q: Vec<u8> = parts.iter().flat_map(|part| part.q.to_vec()).collect();
+        let transforms: Vec<u8> = parts.iter().flat_map(|part| part.transforms.to_vec()).collect();
+        let transform_domains: Vec<u32> = parts.iter().flat_map(|part| part.transform_domains.clone()).collect();
+        assert!(q == whole.q && transforms == whole.transforms && transform_domains == whole.transform_domains);
+        let small = Step::new(4, 0.0).q(0, &[1.0]);
+        assert_eq!(small.to_wire_parts(), [small.to_wire()]);
     }
 }

@@ -200,11 +200,14 @@ impl StepStream {
         step.check_formats()?;
         self.wait_until(|progress, window| window.is_none_or(|window| progress.in_flight.len() < window)).await?;
         lock(&self.progress).in_flight.push_back(step.number());
-        let message = v1::DriveSceneRequest { kind: Some(RequestKind::Step(step.to_wire())) };
-        let requests = self.requests.as_ref().ok_or(Error::StreamEnded { awaited_reply: "the reply to this step" })?;
-        if requests.send(message).await.is_err() {
-            // The stream has ended; the reading task receives the reason.
-            self.wait_until(|_, _| false).await?;
+        for part in step.to_wire_parts() {
+            let message = v1::DriveSceneRequest { kind: Some(RequestKind::Step(part)) };
+            let requests =
+                self.requests.as_ref().ok_or(Error::StreamEnded { awaited_reply: "the reply to this step" })?;
+            if requests.send(message).await.is_err() {
+                // The stream has ended; the reading task receives the reason.
+                self.wait_until(|_, _| false).await?;
+            }
         }
         self.sent += 1;
         self.report_rejection()
