@@ -14,7 +14,8 @@ use crate::cubic::ReducedForce;
 use crate::error::{Result, check_option, invalid_input};
 use crate::model::{DomainModel, Model};
 use crate::newmark::{LoadChange, NewmarkState, ReducedSystem};
-use crate::run::{Report, Scenario, StepValues, aliasing_remark};
+use crate::run::{Report, Scenario, aliasing_remark};
+use crate::step_values::StepValues;
 use crate::vega::VegaSettings;
 
 /// Largest error of the deflection at equilibrium, as a fraction of the requested deflection.

@@ -5,11 +5,11 @@ use nalgebra::Vector3;
 use crate::affine::AffineTransform;
 use crate::error::{Error, Result};
 use crate::model::{DomainModel, Model};
-use crate::run::StepValues;
+use crate::step_values::StepValues;
 
 /// Largest displacement of a vertex, in diagonals of the scene's rest bounds. Linear modes are meaningless long before,
 /// and all scenarios stay below one diagonal unless viewers push hard.
-pub const MAX_DISPLACEMENT: f64 = 10.0;
+const MAX_DISPLACEMENT: f64 = 10.0;
 
 /// Checks the steps of a scene.
 pub struct DivergenceCheck {
@@ -46,7 +46,10 @@ impl DivergenceCheck {
     /// `Diverged` if a number is not finite, or a displacement exceeds `MAX_DISPLACEMENT`. The displacement of a domain
     /// is bounded by the sum over its modes.
     pub fn check(&self, model: &Model, step: u64, time: f64, values: &StepValues) -> Result<()> {
-        let diverged = |subject: String, given: String| Error::Diverged { step, time, subject, given };
+        let diverged = |subject: String, given: String| {
+            let expected = format!("a displacement of at most {MAX_DISPLACEMENT} diagonals of the scene");
+            Error::Diverged { step, time, subject, expected, given }
+        };
         for (domain, transform) in model.domains.iter().zip(&values.transforms) {
             let range = domain.first_coordinate..domain.first_coordinate + domain.rank;
             let q = &values.q[range.clone()];

@@ -14,11 +14,8 @@ pub enum Error {
     #[error("{field}: expected {expected}, got {given}")]
     Invalid { field: String, expected: String, given: String },
     /// The motion is not finite or far out of range. `subject` is a coordinate or a transform.
-    #[error(
-        "step {step} ({time} s): {subject} diverged: expected a displacement of at most {} diagonals of the scene, got {given}",
-        crate::divergence::MAX_DISPLACEMENT
-    )]
-    Diverged { step: u64, time: f64, subject: String, given: String },
+    #[error("step {step} ({time} s): {subject} diverged: expected {expected}, got {given}")]
+    Diverged { step: u64, time: f64, subject: String, expected: String, given: String },
 }
 
 /// Creates an `Invalid` error: `field` holds `given` instead of `expected`.

@@ -17,6 +17,7 @@
 //! | `sweep` | motion for any scene: moves one coordinate after another, or rocks a rigid scene |
 //! | `viewer_forces` | reads the forces that viewers apply |
 //! | `divergence` | stops a run before it sends a step that is not finite or far out of range |
+//! | `step_values` | coordinates and transforms of a step, and the message with those that have changed |
 //! | `run` | sends a scenario as a step stream, optionally records it, and reports the results |
 
 #![cfg_attr(not(test), deny(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::print_stdout))]
@@ -34,6 +35,7 @@ pub mod parameters;
 pub mod run;
 #[cfg(test)]
 mod stability;
+pub mod step_values;
 pub mod sweep;
 pub mod tree;
 pub mod vega;

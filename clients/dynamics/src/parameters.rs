@@ -106,7 +106,7 @@ fn describe_held_modes(held_modes: &[(&str, usize)]) -> Option<String> {
         names.push(format!("and those of {unnamed_count} other domains"));
     }
     (count > 0)
-        .then(|| format!("{count} modes have no stiffness (eigenvalue 0) and are held still: {}", names.join(", ")))
+        .then(|| format!("modes without stiffness (eigenvalue 0) are held still ({count}): {}", names.join(", ")))
 }
 
 #[cfg(test)]

@@ -12,7 +12,8 @@ use crate::error::Error;
 use crate::hierarchy::tests::four_domain_model;
 use crate::newmark::{LoadChange, ReducedSystem};
 use crate::oscillator::{ModeState, Oscillator};
-use crate::run::{Scenario as _, StepValues};
+use crate::run::Scenario as _;
+use crate::step_values::StepValues;
 use crate::tree::{TreeOptions, TreeScenario};
 use crate::vega::VegaSettings;
 

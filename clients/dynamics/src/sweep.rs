@@ -10,7 +10,8 @@ use serde_json::json;
 use crate::affine::AffineTransform;
 use crate::error::Result;
 use crate::model::Model;
-use crate::run::{Report, Scenario, StepValues, aliasing_remark};
+use crate::run::{Report, Scenario, aliasing_remark};
+use crate::step_values::StepValues;
 
 /// Amplitude of a rocking scene, in radians.
 const ROCKING_ANGLE: f64 = 0.05;
