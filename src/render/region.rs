@@ -88,7 +88,7 @@ impl Band {
     }
 
     /// Whether this band ends with the top row.
-    const fn is_last(&self) -> bool {
+    pub(crate) const fn is_last(&self) -> bool {
         self.first_row + self.rows == self.image_rows
     }
 }

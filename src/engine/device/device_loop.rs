@@ -50,7 +50,7 @@ use super::device_loss::DeviceLossSender;
 use super::fair_queue::Taken;
 use super::in_flight::{InFlight, InFlightQueue, Pollable};
 use super::loaded_scene::LoadedScene;
-use super::partial_output::{Charge, PartialOutput};
+use super::partial_output::{Charge, PartialKind, PartialOutput};
 use crate::telemetry::ms_since;
 use modalcast_model::deform::{VertexAttributes, VertexReadback};
 use modalcast_model::error::{Result, fault, fault_in};

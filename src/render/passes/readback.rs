@@ -82,11 +82,23 @@ pub(crate) fn read_visibility(
     copy_words(recorder, &target.readback_source, &word_pass)
 }
 
-/// Copies the pixels of a frame, then its fragment and culling counters, to a staging buffer.
-pub(crate) fn copy_frame(recorder: &PassRecorder<'_>, frame: &FrameContext<'_>, staging: &Buffer) -> Result<()> {
+/// Copies as many rows of a frame as a band has to a staging buffer; with the last band, also the fragment and culling
+/// counters.
+pub(crate) fn copy_frame(
+    recorder: &PassRecorder<'_>,
+    frame: &FrameContext<'_>,
+    staging: &Buffer,
+    band: Band,
+) -> Result<()> {
     let FrameContext { buffers, target, .. } = *frame;
     recorder.begin(Pass::Read);
-    recorder.gl.copy(BufferCopy::first(target.desc.frame_bytes(), &target.readback_source, staging));
+    let [source_offset, bytes] =
+        [band.first_row, band.rows].map(|rows| 4 * u64::from(target.desc.width) * u64::from(rows));
+    let source = &target.readback_source;
+    recorder.gl.copy(BufferCopy { source, source_offset, target: staging, target_offset: source_offset, bytes });
+    if !band.is_last() {
+        return recorder.check(Pass::Read);
+    }
     let counters = [
         target.oit.as_ref().map(|oit| &oit.counters),
         buffers.cull_resources.as_ref().map(|cull_resources| &cull_resources.buffers.counters),

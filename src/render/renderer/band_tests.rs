@@ -128,8 +128,8 @@ fn draw_in_steps(
 fn frame_in_bands_has_the_pixels_of_the_whole_frame() {
     for (name, look) in looks() {
         let mut renderer = open_renderer();
-        let random_scene = RandomScene::load(&mut renderer, 1, look.clone());
-        let other_scene = RandomScene::load(&mut renderer, 2, look.clone());
+        let random_scene = RandomScene::load(&mut renderer, 1, look);
+        let other_scene = RandomScene::load(&mut renderer, 2, look);
         let params = random_scene.params(SIZE);
         // The second frame has occluders.
         renderer.draw(&random_scene.buffers, &params).expect("draws");
@@ -154,7 +154,7 @@ fn frame_in_bands_has_the_pixels_of_the_whole_frame() {
 fn missing_band_changes_the_pixels() {
     let mut renderer = open_renderer();
     let look = RenderSettings { transparency: Transparency::TwoPass, ..look(4) };
-    let random_scene = RandomScene::load(&mut renderer, 1, look.clone());
+    let random_scene = RandomScene::load(&mut renderer, 1, look);
     let other_scene = RandomScene::load(&mut renderer, 2, look);
     let params = random_scene.params(SIZE);
     renderer.set_max_band_samples(u64::from(4 * SIZE[0] * 64));

@@ -77,7 +77,7 @@ enum BandPass {
     Shade(Band),
     Bloom(BloomStep, Band),
     Encode(Band),
-    Read,
+    Read(Band),
 }
 
 impl PartialFrame {
@@ -308,9 +308,9 @@ fn record(
         (BandPass::Shade(band), _) => passes::shade::draw(recorder, frame, band),
         (BandPass::Bloom(step, band), _) => passes::post::bloom(recorder, frame, step, band),
         (BandPass::Encode(band), _) => passes::post::encode(recorder, frame, band),
-        (BandPass::Read, _) => {
+        (BandPass::Read(band), _) => {
             let staging = slot.and_then(ReadbackSlot::staging);
-            staging.map_or(Ok(()), |staging| passes::readback::copy_frame(recorder, frame, &staging.buffer))
+            staging.map_or(Ok(()), |staging| passes::readback::copy_frame(recorder, frame, &staging.buffer, band))
         }
         // Passes that OpenGL or a frame without fragment lists does not have.
         (BandPass::RecordVisible | BandPass::OitCount(_), _) | (BandPass::OitSumCounts | BandPass::OitBlend(_), _) => {
@@ -345,7 +345,7 @@ fn plan_steps(target: &RenderTarget, has_readback: bool, max_pixels: u64) -> Vec
         (Pass::Encode, of_bands(BandPass::Encode).collect()),
     ];
     if has_readback {
-        groups.push((Pass::Read, vec![BandPass::Read]));
+        groups.push((Pass::Read, of_bands(BandPass::Read).collect()));
     }
     let mut steps = VecDeque::from([Step::ComputeRaster, Step::Shadow, Step::Cull]);
     for (pass, band_passes) in groups {

@@ -124,6 +124,21 @@ mod tests {
     use modalcast_model::domain::{AlphaMode, Material, Texture};
     use modalcast_model::scene::{Bloom, Camera, Culling, Transparency};
 
+    /// Prepares a scene. Returns the number of steps.
+    fn prepare(renderer: &mut Renderer, scene: &Arc<Scene>) -> usize {
+        let mut preparation = renderer.begin_preparation(scene).expect("begins");
+        let mut step_count = 0;
+        while !preparation.is_finished() {
+            while !preparation.is_ready() {
+                std::thread::yield_now();
+            }
+            renderer.prepare_step(&mut preparation).expect("prepares");
+            step_count += 1;
+        }
+        renderer.finish_preparation(preparation);
+        step_count
+    }
+
     #[test]
     fn load_compiles_no_program_after_the_preparation() {
         let materials = [AlphaMode::Opaque, AlphaMode::Mask { cutoff: 0.5 }, AlphaMode::Blend];
@@ -132,16 +147,7 @@ mod tests {
         parts.look.transparency = Transparency::OrderIndependent;
         let scene = Scene::new(parts).expect("a valid scene");
         let mut renderer = Renderer::open(DevicePreference::Any).expect("EGL and OpenGL 4.3");
-        let mut preparation = renderer.begin_preparation(&scene).expect("begins");
-        let mut step_count = 0;
-        while !preparation.is_finished() {
-            while !preparation.is_ready() {
-                std::thread::yield_now();
-            }
-            renderer.prepare_step(&mut preparation).expect("compiles");
-            step_count += 1;
-        }
-        renderer.finish_preparation(preparation);
+        let step_count = prepare(&mut renderer, &scene);
         let program_count = renderer.programs.labels().count();
         assert!(program_count >= 15 && step_count >= program_count, "{program_count} programs, {step_count} steps");
         let buffers = renderer.load(&scene).expect("loads");
@@ -160,7 +166,7 @@ mod tests {
             (0..10).map(|index| Material { color_texture: Some(index), double_sided: true, ..Material::default() });
         let mut parts = squares(materials.collect());
         let texture = |index: u32| {
-            let side = if index % 3 == 0 { 16 } else { 32 };
+            let side = if index.is_multiple_of(3) { 16 } else { 32 };
             let pixel = |position: u32| [(20 * index) as u8, (position * 37 % 251) as u8, 99, 255];
             Texture::new("test", side, side, (0..side * side).flat_map(pixel).collect()).expect("a valid texture")
         };
@@ -175,20 +181,10 @@ mod tests {
             let scene = textured_scene();
             let mut renderer = Renderer::open(DevicePreference::Any).expect("EGL and OpenGL 4.3");
             if is_prepared {
-                let mut preparation = renderer.begin_preparation(&scene).expect("begins");
-                let mut step_count = 0;
-                while !preparation.is_finished() {
-                    while !preparation.is_ready() {
-                        std::thread::yield_now();
-                    }
-                    renderer.prepare_step(&mut preparation).expect("prepares");
-                    step_count += 1;
-                }
+                let step_count = prepare(&mut renderer, &scene);
                 assert!(step_count >= 10, "expected a step for each texture, got {step_count} steps");
-                renderer.finish_preparation(preparation);
                 // A prepared scene that is dropped before it is loaded frees its textures.
-                let dropped = renderer.begin_preparation(&textured_scene()).expect("begins");
-                renderer.finish_preparation(dropped);
+                prepare(&mut renderer, &textured_scene());
                 assert_eq!(renderer.prepared_scenes.len(), 2);
             }
             let buffers = renderer.load(&scene).expect("loads");

@@ -105,7 +105,10 @@ impl TextureUpload {
                 // Nobody waits for the levels of a dropped upload.
                 if let Some(result) = result.upgrade() {
                     let compute = || compute_levels(&scene, index, layer.role);
-                    result.set(catch_unwind(AssertUnwindSafe(compute)).ok()).ok();
+                    let levels = catch_unwind(AssertUnwindSafe(compute)).ok();
+                    // Dropped first, so that a finished upload does not hold the scene.
+                    drop(scene);
+                    result.set(levels).ok();
                 }
             });
             self.in_flight.push_back((layer, levels));
