@@ -4,7 +4,6 @@ use std::sync::Arc;
 
 use tokio::sync::oneshot;
 
-use super::fair_queue::CostClass;
 use crate::engine::output::step_output::FrameOutput;
 use crate::frame::Legend;
 use modalcast_model::backend_settings::BackendSettings;
@@ -15,6 +14,14 @@ use modalcast_render::{AovImage, FrameImage, PickHit};
 
 /// Identifies a loaded scene on the device thread.
 pub(in crate::engine) type SceneId = u64;
+
+/// Work whose costs are similar: of one kind, with sizes that differ by less than a factor of two.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub(super) struct CostClass {
+    pub kind: &'static str,
+    /// Binary logarithm of the number of pixels, rounded down; 0 for work without pixels.
+    pub size_class: u32,
+}
 
 /// The channel that carries a command's answer.
 pub(in crate::engine) type Reply<T> = oneshot::Sender<Result<T>>;

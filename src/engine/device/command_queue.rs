@@ -7,8 +7,8 @@
 
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
 
-use super::command::{Command, SceneId};
-use super::fair_queue::{CostClass, FairQueue, Taken, Ticket};
+use super::command::{Command, CostClass, SceneId};
+use super::fair_queue::{FairQueue, Taken, Ticket};
 use crate::engine::lock::lock;
 use modalcast_model::error::{Error, Result};
 

@@ -11,7 +11,7 @@
 
 use std::collections::{HashMap, VecDeque};
 
-use super::command::SceneId;
+use super::command::{CostClass, SceneId};
 
 /// Milliseconds that a scene gains in each round: a few frames of hardware.
 const QUANTUM_MS: f64 = 5.0;
@@ -22,14 +22,6 @@ const COST_WEIGHT: f64 = 0.25;
 
 /// Identifies queued work, to remove it.
 pub(super) type Ticket = u64;
-
-/// Work whose costs are similar: of one kind, with sizes that differ by less than a factor of two.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub(super) struct CostClass {
-    pub kind: &'static str,
-    /// Binary logarithm of the number of pixels, rounded down; 0 for work without pixels.
-    pub size_class: u32,
-}
 
 /// Queued work of type `T`.
 #[derive(Debug)]

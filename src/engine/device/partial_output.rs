@@ -4,9 +4,8 @@
 
 use std::time::Duration;
 
-use super::command::Reply;
+use super::command::{CostClass, Reply};
 use super::context::{DeviceContext, PartialAovDraw, PartialDraw};
-use super::fair_queue::CostClass;
 use super::loaded_scene::LoadedScene;
 use crate::frame::Legend;
 use modalcast_model::error::{Error, Result};
