@@ -96,9 +96,12 @@ impl<T> FairQueue<T> {
         self.insert(scene, class, work, VecDeque::push_back)
     }
 
-    /// Returns work that is not finished to the head of the queue of its scene.
+    /// Returns work that is not finished to the head of the queue of its scene, and ends the turn of the scene.
     pub(super) fn push_front(&mut self, scene: SceneId, class: CostClass, work: T) {
         self.insert(scene, class, work, VecDeque::push_front);
+        if self.ring.front() == Some(&scene) {
+            self.ring.rotate_left(1);
+        }
     }
 
     /// Returns work that was taken to the head of the queue of its scene, and gives the scene its charge back.
