@@ -30,6 +30,7 @@ pub(super) struct PartialOutput {
     pub charge: Charge,
 }
 
+#[expect(clippy::large_enum_variant, reason = "there are only as many as scenes, and most are frames")]
 pub(super) enum PartialKind {
     Frame(PartialDraw, Reply<FrameImage>),
     Aov(PartialAovDraw, Reply<(AovImage, Option<Legend>)>),
