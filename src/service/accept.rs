@@ -80,7 +80,7 @@ async fn accept(sockets: &ListeningSockets, permits: &Arc<Semaphore>, budgets: &
 
 /// Forwards a connection once it has sent its first byte. Drops it if it sends nothing within `first_byte_timeout`.
 async fn await_first_byte(
-    connection: Connection,
+    mut connection: Connection,
     first_byte_timeout: Duration,
     ready_sender: mpsc::Sender<io::Result<Connection>>,
 ) {
@@ -109,6 +109,10 @@ impl Connection {
 impl AsyncRead for Connection {
     fn poll_read(mut self: Pin<&mut Self>, cx: &mut Context<'_>, buffer: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
         self.check_open(cx)?;
+        if let Some(byte) = self.socket.take_first_byte() {
+            buffer.put_slice(&[byte]);
+            return Poll::Ready(Ok(()));
+        }
         self.socket.io().poll_read(cx, buffer)
     }
 }

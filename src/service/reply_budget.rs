@@ -250,6 +250,14 @@ impl Drop for CallReplies {
 }
 
 impl UnsentBytes {
+    /// Returns all but `bytes`. Without this, a call that was sent completely would still hold bytes, as if its client did
+    /// not read.
+    pub(super) fn shrink_to(&mut self, bytes: usize) {
+        if let Some(excess) = self.bytes.checked_sub(bytes) {
+            drop(self.split(excess));
+        }
+    }
+
     /// Removes `bytes` from the front.
     fn split(&mut self, bytes: usize) -> Option<Self> {
         // A message above the share has fewer permits than bytes. The remainder keeps what is left of them.
@@ -381,9 +389,11 @@ mod tests {
     async fn bytes_count_until_their_frame_is_dropped() {
         let budget = small_budget();
         let context = ReplyContext::new(budget.new_connection(Arc::default()).new_call());
-        // Two messages in one and a half frames.
-        for bytes in [20, 30] {
-            context.encode(context.replies.acquire(bytes).await.expect("expected capacity"));
+        // Two messages, of which one needs less than was reserved, in frames of other sizes.
+        for (reserved_bytes, bytes) in [(20, 20), (40, 30)] {
+            let mut unsent = context.replies.acquire(reserved_bytes).await.expect("expected capacity");
+            unsent.shrink_to(bytes);
+            context.encode(unsent);
         }
         let free_bytes = || budget.share.permits.available_permits();
         assert_eq!(free_bytes(), 50);

@@ -19,7 +19,7 @@ pub(super) struct StepAssembler {
 enum State {
     /// No part has arrived.
     Empty,
-    Assembling(PartialStep),
+    Assembling(Box<PartialStep>),
     /// A part of this step was rejected. Its other parts are ignored.
     Discarding {
         number: u64,
@@ -99,7 +99,7 @@ impl StepAssembler {
         }
         let (q, transforms) = (std::mem::take(&mut part.q).into(), std::mem::take(&mut part.transforms).into());
         part.has_more = false;
-        self.state = State::Assembling(PartialStep { step: part, q, transforms, bytes, deadline });
+        self.state = State::Assembling(Box::new(PartialStep { step: part, q, transforms, bytes, deadline }));
         Ok(())
     }
 

@@ -44,8 +44,10 @@ pub(super) struct ReplyPermit<'a, T> {
     unsent: UnsentBytes,
 }
 
-impl<T> ReplyPermit<'_, T> {
-    pub(super) fn send(self, message: T) {
+impl<T: prost::Message> ReplyPermit<'_, T> {
+    /// Queues a message, and returns what it needs less than was reserved.
+    pub(super) fn send(mut self, message: T) {
+        self.unsent.shrink_to(message.encoded_len() + MESSAGE_HEADER_BYTES);
         self.slot.send((message, self.unsent));
     }
 }
