@@ -161,9 +161,9 @@ impl ReplyBudget {
 
     /// Ends the stalled calls of all connections.
     fn end_stalled_calls(&self) {
-        for connection in self.connections.search(self.search_interval() / 2) {
-            connection.end_stalled_calls(Duration::ZERO);
-        }
+        let connections = self.connections.search(self.search_interval() / 2);
+        let calls: Vec<_> = connections.iter().flat_map(|connection| connection.calls.search(Duration::ZERO)).collect();
+        end_stalled(&calls, self.reply_timeout);
     }
 }
 
@@ -178,9 +178,7 @@ impl ConnectionReplyBudget {
 
     /// Ends the stalled calls of this connection, unless they were searched less than `interval` ago.
     fn end_stalled_calls(&self, interval: Duration) {
-        for call in self.calls.search(interval) {
-            call.end_if_stalled(self.total.reply_timeout);
-        }
+        end_stalled(&self.calls.search(interval), self.total.reply_timeout);
     }
 }
 
@@ -221,25 +219,28 @@ impl CallReplies {
     pub(super) fn slow_reader(&self) -> Error {
         Error::SlowReader { queue: "reply buffer (in bytes)", limit: self.connection.total.max_connection_bytes }
     }
+}
 
-    /// Ends the call if its client has taken nothing for `timeout`. If that was done before and bytes are still unsent,
-    /// closes the connection.
-    fn end_if_stalled(&self, timeout: Duration) {
-        let mut progress = lock(&self.progress);
-        if progress.unsent_bytes == 0 || progress.last_change.elapsed() < timeout {
-            return;
+/// Ends the calls whose clients have taken nothing for `timeout`. If all of them were ended before, what they hold in
+/// HTTP/2 remains unsent, and their connections are closed.
+fn end_stalled(calls: &[Arc<CallReplies>], timeout: Duration) {
+    let is_stalled = |call: &&Arc<CallReplies>| {
+        let progress = lock(&call.progress);
+        progress.unsent_bytes > 0 && progress.last_change.elapsed() >= timeout
+    };
+    let stalled = calls.iter().filter(is_stalled);
+    let (ended, running): (Vec<_>, Vec<_>) = stalled.partition(|call| lock(&call.progress).is_ended);
+    for call in &running {
+        let mut progress = lock(&call.progress);
+        (progress.is_ended, progress.last_change) = (true, Instant::now());
+        call.ended.notify_one();
+    }
+    if running.is_empty() {
+        for call in ended {
+            let unsent_bytes = lock(&call.progress).unsent_bytes;
+            tracing::warn!(unsent_bytes, "a connection that does not read its replies is closed");
+            call.connection.close.notify_one();
         }
-        if progress.is_ended {
-            tracing::warn!(
-                unsent_bytes = progress.unsent_bytes,
-                "a connection that does not read its replies is closed"
-            );
-            self.connection.close.notify_one();
-            return;
-        }
-        progress.is_ended = true;
-        progress.last_change = Instant::now();
-        self.ended.notify_one();
     }
 }
 
@@ -444,8 +445,9 @@ mod tests {
     #[tokio::test]
     async fn only_a_call_without_progress_is_stalled() {
         let call = small_budget().new_connection(Arc::default()).new_call();
+        let calls = [Arc::clone(&call)];
         let is_ended = || lock(&call.progress).is_ended;
-        call.end_if_stalled(Duration::ZERO);
+        end_stalled(&calls, Duration::ZERO);
         assert!(!is_ended(), "expected a call without unsent bytes to continue");
         let held = [10, 20].map(|bytes| call.acquire(bytes));
         let [first, second] = held;
@@ -453,9 +455,9 @@ mod tests {
         let change_before = lock(&call.progress).last_change;
         drop(first);
         assert!(lock(&call.progress).last_change > change_before, "expected sent bytes to count as progress");
-        call.end_if_stalled(Duration::from_secs(1000));
+        end_stalled(&calls, Duration::from_secs(1000));
         assert!(!is_ended(), "expected a call with recent progress to continue");
-        call.end_if_stalled(Duration::ZERO);
+        end_stalled(&calls, Duration::ZERO);
         assert!(is_ended());
         drop(second);
     }

@@ -30,7 +30,11 @@ const ARRAYS: [v1::Array; 6] = [
 ];
 
 fn describe(scene: &str) -> v1::DescribeSceneRequest {
-    let arrays = ARRAYS.into_iter().map(Into::into).collect();
+    describe_arrays(scene, &ARRAYS)
+}
+
+fn describe_arrays(scene: &str, arrays: &[v1::Array]) -> v1::DescribeSceneRequest {
+    let arrays = arrays.iter().map(|array| (*array).into()).collect();
     v1::DescribeSceneRequest { scene: scene.into(), arrays, ..Default::default() }
 }
 
@@ -163,21 +167,30 @@ async fn half_sent_messages_do_not_lock_out_other_connections() {
     medium.abort();
 }
 
-/// Six connections read slowly and six read nothing, and all replies together exceed the budget many times.
+/// Reads the replies of a call up to its end, and returns its error.
+async fn end_of_call(mut call: Streaming<v1::DescribeSceneResponse>) -> Option<Status> {
+    loop {
+        match with_timeout(call.message()).await {
+            Ok(Some(_)) => {}
+            Ok(None) => return None,
+            Err(status) => return Some(status),
+        }
+    }
+}
+
+/// Long enough for a busy machine: a slow reader takes a message of 1 MiB within this time.
+const REPLY_TIMEOUT: Duration = Duration::from_secs(4);
+
+/// Six connections read slowly and two read nothing. All replies together exceed the budget many times.
 #[tokio::test(flavor = "multi_thread")]
 async fn slow_readers_share_the_reply_budget_without_deadlock() {
-    let limits = |config| Config {
-        reply_bytes: 6 << 20,
-        connection_reply_bytes: 6 << 20,
-        // Long enough for a busy machine: a slow reader takes a message of 1 MiB within this time.
-        reply_timeout: Duration::from_secs(4),
-        ..config
-    };
+    let (reply_bytes, reply_timeout) = (6 << 20, REPLY_TIMEOUT);
+    let limits = |config| Config { reply_bytes, connection_reply_bytes: reply_bytes, reply_timeout, ..config };
     let server = Server::start_with(limits).await;
     server.open("sheet").await;
     let mut stalled_calls = Vec::new();
-    for _ in 0..6 {
-        stalled_calls.extend(open_unread_calls(&small_windows(&server.address).await, "sheet", 4).await);
+    for _ in 0..2 {
+        stalled_calls.extend(open_unread_calls(&small_windows(&server.address).await, "sheet", 2).await);
     }
     let mut readers = tokio::task::JoinSet::new();
     for _ in 0..6 {
@@ -189,22 +202,35 @@ async fn slow_readers_share_the_reply_budget_without_deadlock() {
         sizes.push(result.expect("expected no panic").expect("expected a complete description"));
     }
     assert!(sizes.iter().all(|size| *size == sizes[0] && *size > 6 << 20), "{sizes:?}");
-    // Some of the unread calls have ended to make room. A call whose connection is still open names the reason.
+    // Some of the unread calls or their connections have ended to make room.
     let mut ended = 0;
-    for mut call in stalled_calls {
-        let end = loop {
-            match with_timeout(call.message()).await {
-                Ok(Some(_)) => {}
-                Ok(None) => break None,
-                Err(status) => break Some(status),
-            }
-        };
-        if let Some(status) = end.filter(|status| status.code() == Code::ResourceExhausted) {
-            assert_eq!(rejection_details(&status).reason(), Reason::SlowReader);
-            ended += 1;
-        }
+    for call in stalled_calls {
+        ended += usize::from(end_of_call(call).await.is_some());
     }
-    assert!(ended > 0, "expected an unread call to end with a reason");
+    assert!(ended > 0, "expected an unread call to end");
+}
+
+/// Three unread calls of 4.3 MB of modes use the budget of their connection: each holds two messages of 1 MiB in its queue
+/// and two in HTTP/2. When a fourth call waits, they end with a reason, and the fourth call gets the bytes of the queues.
+#[tokio::test(flavor = "multi_thread")]
+async fn unread_calls_end_with_a_reason_when_others_wait() {
+    let limits = |config| Config { connection_reply_bytes: 8 << 20, reply_timeout: REPLY_TIMEOUT, ..config };
+    let server = Server::start_with(limits).await;
+    server.open("sheet").await;
+    let channel = small_windows(&server.address).await;
+    let mut client = SceneServiceClient::new(channel.clone());
+    let mut unread_calls = Vec::new();
+    for _ in 0..3 {
+        let request = describe_arrays("sheet", &[v1::Array::Modes]);
+        unread_calls.push(with_timeout(client.describe_scene(request)).await.expect("expected a reply").into_inner());
+    }
+    with_timeout(read_description(channel, "sheet", Duration::ZERO)).await.expect("expected a description");
+    let mut reasons = Vec::new();
+    for call in unread_calls {
+        reasons.extend(end_of_call(call).await.map(|status| (status.code(), rejection_details(&status).reason())));
+    }
+    assert!(!reasons.is_empty(), "expected an unread call to end");
+    assert!(reasons.iter().all(|reason| *reason == (Code::ResourceExhausted, Reason::SlowReader)), "{reasons:?}");
 }
 
 /// A server in a process of its own.
