@@ -20,6 +20,10 @@ use tonic::body::Body;
 use crate::config::Config;
 use modalcast_model::error::Error;
 
+/// Multiple of the reply timeout after which a connection with unsent bytes of an ended call is closed when others wait,
+/// although another call of it makes progress.
+const MAX_STALL: u32 = 3;
+
 /// The budget of all connections.
 #[derive(Debug)]
 pub(super) struct ReplyBudget {
@@ -163,7 +167,7 @@ impl ReplyBudget {
     fn end_stalled_calls(&self) {
         let connections = self.connections.search(self.search_interval() / 2);
         let calls: Vec<_> = connections.iter().flat_map(|connection| connection.calls.search(Duration::ZERO)).collect();
-        end_stalled(&calls, self.reply_timeout);
+        end_stalled(&calls, self.reply_timeout, Some(MAX_STALL * self.reply_timeout));
     }
 }
 
@@ -178,7 +182,7 @@ impl ConnectionReplyBudget {
 
     /// Ends the stalled calls of this connection, unless they were searched less than `interval` ago.
     fn end_stalled_calls(&self, interval: Duration) {
-        end_stalled(&self.calls.search(interval), self.total.reply_timeout);
+        end_stalled(&self.calls.search(interval), self.total.reply_timeout, None);
     }
 }
 
@@ -222,8 +226,9 @@ impl CallReplies {
 }
 
 /// Ends the calls whose clients have taken nothing for `timeout`. If all of them were ended before, what they hold in
-/// HTTP/2 remains unsent, and their connections are closed.
-fn end_stalled(calls: &[Arc<CallReplies>], timeout: Duration) {
+/// HTTP/2 remains unsent, and their connections are closed. A connection is not closed while another of its calls holds
+/// bytes, which it may still send or lose by its own end; but with `max_stall`, it is closed after this time.
+fn end_stalled(calls: &[Arc<CallReplies>], timeout: Duration, max_stall: Option<Duration>) {
     let is_stalled = |call: &&Arc<CallReplies>| {
         let progress = lock(&call.progress);
         progress.unsent_bytes > 0 && progress.last_change.elapsed() >= timeout
@@ -237,11 +242,25 @@ fn end_stalled(calls: &[Arc<CallReplies>], timeout: Duration) {
     }
     if running.is_empty() {
         for call in ended {
-            let unsent_bytes = lock(&call.progress).unsent_bytes;
+            let (unsent_bytes, stall) = {
+                let progress = lock(&call.progress);
+                (progress.unsent_bytes, progress.last_change.elapsed())
+            };
+            if max_stall.is_none_or(|max_stall| stall < max_stall) && holds_sendable_bytes(calls, &call.connection) {
+                continue;
+            }
             tracing::warn!(unsent_bytes, "a connection that does not read its replies is closed");
             call.connection.close.notify_one();
         }
     }
+}
+
+/// Whether a call of the connection that was not ended has unsent bytes.
+fn holds_sendable_bytes(calls: &[Arc<CallReplies>], connection: &Arc<ConnectionReplyBudget>) -> bool {
+    calls.iter().filter(|call| Arc::ptr_eq(&call.connection, connection)).any(|call| {
+        let progress = lock(&call.progress);
+        progress.unsent_bytes > 0 && !progress.is_ended
+    })
 }
 
 impl Drop for CallReplies {
@@ -443,11 +462,32 @@ mod tests {
     }
 
     #[tokio::test]
+    async fn connection_with_a_running_call_is_closed_later() {
+        let budget = small_budget();
+        let close = Arc::new(Notify::new());
+        let connection = budget.new_connection(Arc::clone(&close));
+        let calls = [connection.new_call(), connection.new_call()];
+        let _stalled_bytes = calls[0].acquire(20).await.expect("expected capacity");
+        end_stalled(&calls, Duration::ZERO, None);
+        assert!(lock(&calls[0].progress).is_ended);
+        let running_bytes = calls[1].acquire(10).await.expect("expected capacity");
+        lock(&calls[0].progress).last_change -= Duration::from_secs(60);
+        let is_closed = async || tokio::time::timeout(Duration::ZERO, close.notified()).await.is_ok();
+        end_stalled(&calls, Duration::from_secs(50), None);
+        assert!(!is_closed().await, "expected no end of the running call");
+        end_stalled(&calls, Duration::from_secs(50), Some(Duration::from_secs(60)));
+        assert!(is_closed().await, "expected a limit for calls of other connections");
+        drop(running_bytes);
+        end_stalled(&calls, Duration::from_secs(50), None);
+        assert!(is_closed().await, "expected nothing that could free bytes");
+    }
+
+    #[tokio::test]
     async fn only_a_call_without_progress_is_stalled() {
         let call = small_budget().new_connection(Arc::default()).new_call();
         let calls = [Arc::clone(&call)];
         let is_ended = || lock(&call.progress).is_ended;
-        end_stalled(&calls, Duration::ZERO);
+        end_stalled(&calls, Duration::ZERO, None);
         assert!(!is_ended(), "expected a call without unsent bytes to continue");
         let held = [10, 20].map(|bytes| call.acquire(bytes));
         let [first, second] = held;
@@ -455,9 +495,9 @@ mod tests {
         let change_before = lock(&call.progress).last_change;
         drop(first);
         assert!(lock(&call.progress).last_change > change_before, "expected sent bytes to count as progress");
-        end_stalled(&calls, Duration::from_secs(1000));
+        end_stalled(&calls, Duration::from_secs(1000), None);
         assert!(!is_ended(), "expected a call with recent progress to continue");
-        end_stalled(&calls, Duration::ZERO);
+        end_stalled(&calls, Duration::ZERO, None);
         assert!(is_ended());
         drop(second);
     }
