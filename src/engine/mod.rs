@@ -64,7 +64,7 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use self::blocking::run_blocking;
 use self::device::command::SceneId;
 use self::device::handle::DeviceThread;
-use self::lock::lock;
+pub(crate) use self::lock::lock;
 use self::registry::Registry;
 use self::scene::actor::SceneServices;
 use self::scene::frame_stream::FrameStreamRegistry;

@@ -1,13 +1,13 @@
 //! Budgets for the bytes of replies that are produced and not yet sent, per connection and in total.
 //!
 //! A message counts from the moment when it is queued until HTTP/2 has written its last byte to the socket. A sender
-//! without budget waits. Nobody waits forever: a call that holds bytes and takes none for the reply timeout ends as soon
-//! as another sender waits for the same budget, and its connection is closed if that does not free the bytes.
+//! without budget waits. The wait is bounded: a call whose client takes no bytes for the reply timeout ends as soon as
+//! another sender waits for the same budget, and its connection is closed if that does not free the bytes.
 
 use std::collections::{HashMap, VecDeque};
 use std::pin::Pin;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
+use std::sync::{Arc, Mutex, Weak};
 use std::task::{Context, Poll};
 use std::time::{Duration, Instant};
 
@@ -18,6 +18,7 @@ use tonic::Status;
 use tonic::body::Body;
 
 use crate::config::Config;
+use crate::engine::lock;
 use modalcast_model::error::Error;
 
 /// Multiple of the reply timeout after which a connection with unsent bytes of an ended call is closed when others wait,
@@ -225,8 +226,8 @@ impl CallReplies {
     }
 }
 
-/// Ends the calls whose clients have taken nothing for `timeout`. If all of them were ended before, what they hold in
-/// HTTP/2 remains unsent, and their connections are closed. A connection is not closed while another of its calls holds
+/// Ends the calls whose clients have taken nothing for `timeout`. If all of them were ended before, their remaining bytes
+/// are buffers of HTTP/2, which only the end of the connection frees, so their connections are closed. A connection is not closed while another of its calls holds
 /// bytes, which it may still send or lose by its own end; but with `max_stall`, it is closed after this time.
 fn end_stalled(calls: &[Arc<CallReplies>], timeout: Duration, max_stall: Option<Duration>) {
     let is_stalled = |call: &&Arc<CallReplies>| {
@@ -380,11 +381,6 @@ impl HttpBody for CountedReplyBody {
     fn size_hint(&self) -> SizeHint {
         self.inner.size_hint()
     }
-}
-
-/// Locks also after a panic of another holder. No update in this module can panic halfway.
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 #[cfg(test)]

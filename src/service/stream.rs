@@ -2,7 +2,7 @@
 //! deadline covers the whole reply up to its last chunk. A panic ends only its own call.
 
 use std::pin::Pin;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::task::{Context, Poll, ready};
 use std::time::{Duration, Instant};
 
@@ -16,6 +16,7 @@ use tonic::{Response, Status};
 use super::reply_budget::{CallReplies, ReplyContext, UnsentBytes};
 use super::status::to_status;
 use crate::config::Config;
+use crate::engine::lock;
 use modalcast_model::error::{Error, Result};
 
 /// A reply stream.
@@ -105,11 +106,6 @@ impl<T> ReplyQueue<T> {
         let mut messages = lock(&self.messages);
         while messages.try_recv().is_ok() {}
     }
-}
-
-/// A poisoned lock is valid, because no holder changes the value in several steps.
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// The stream of queued messages.

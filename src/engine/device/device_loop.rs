@@ -7,8 +7,7 @@
 //! served between the steps ([`PartialOutput`]). The commands of its scene wait until its last step is submitted. Each
 //! step is submitted when the device has finished the one before it, so the commands of other scenes never wait for more
 //! than one step. Only one large output is drawn at a time, because each needs its own images; another one waits. The
-//! renderer defines what is large by the number of samples ([`modalcast_render::Renderer::set_max_band_samples`]). On
-//! hardware a step takes about 10 ms. A software renderer draws a frame of 1920 x 1080 pixels with four samples each in
+//! limit is a number of samples ([`modalcast_render::Renderer::set_max_band_samples`]). A software renderer draws a frame of 1920 x 1080 pixels with four samples each in
 //! one step, so others wait about as long as for such a frame. The first frame of a scene is drawn in steps, too, because
 //! drivers finish the compilation of a program when it is used for the first time.
 //!
@@ -83,7 +82,7 @@ pub(super) struct DeviceLoop {
     frames: InFlightQueue<FrameInFlight, FrameImage>,
 }
 
-/// A frame in flight, and what its scene was charged.
+/// A frame in flight, and the device time that its scene was charged.
 struct FrameInFlight {
     id: SceneId,
     charge: Charge,

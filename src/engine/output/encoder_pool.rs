@@ -23,7 +23,7 @@ pub(super) struct EncoderPool {
     pool: Arc<ThreadPool>,
 }
 
-/// A job: its parts, and what is done with their results.
+/// A job: its parts, and a function that combines their results.
 struct Job<T, R, P, F> {
     part_count: usize,
     /// Computes the result of a part.
@@ -88,7 +88,7 @@ impl EncoderPool {
 }
 
 impl<T, R, P, F: FnOnce(Vec<T>) -> R> Job<T, R, P, F> {
-    /// Runs parts until none is left or nobody waits for the result.
+    /// Runs parts until none is left or the caller has dropped the job.
     fn work<B: Default>(&self)
     where
         P: Fn(usize, &mut B) -> T,
@@ -195,7 +195,7 @@ mod tests {
         };
         let dropped = pool.run(2, part, |_| ());
         tokio::time::timeout(std::time::Duration::from_millis(20), dropped).await.expect_err("expected a blocked part");
-        // Nobody receives this if the thread has not started the part before the caller was dropped.
+        // Fails if the caller was dropped before the thread has started the part.
         release.send(()).ok();
         // The only thread serves this job after the dropped one.
         pool.run(1, |_, (): &mut ()| (), |_| ()).await.expect("expected a result");

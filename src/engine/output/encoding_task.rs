@@ -6,7 +6,7 @@ use super::frame_encoder::{EncodedFrame, FrameEncoder, StepPicture};
 use super::frame_format::FrameFormat;
 use modalcast_model::error::{Result, fault_in};
 
-/// A picture that is encoded in a task of its own, also while nobody waits for it. Dropping it cancels the encoding,
+/// A picture that is encoded in a task of its own, whether or not it is awaited. Dropping it cancels the encoding,
 /// except for the parts that threads have already started.
 #[derive(Debug)]
 pub struct EncodingTask {

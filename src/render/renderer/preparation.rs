@@ -101,7 +101,7 @@ impl Renderer {
     /// The texture arrays of a scene: those of its preparation, or new ones.
     pub(super) fn textures_of(&mut self, scene: &Arc<Scene>) -> Result<[Vec<gl::Texture>; 2]> {
         let prepared = self.prepared_scenes.iter().position(|prepared| Arc::ptr_eq(&prepared.scene, scene));
-        // Scenes that nobody else holds were dropped before they were loaded.
+        // A scene without other references was dropped before it was loaded.
         let prepared = prepared.map(|index| self.prepared_scenes.swap_remove(index));
         self.prepared_scenes.retain(|prepared| Arc::strong_count(&prepared.scene) > 1);
         if let Some(PreparedScene { textures, .. }) = prepared {

@@ -102,7 +102,7 @@ impl TextureUpload {
             let (scene, result) = (Arc::clone(&self.scene), Arc::downgrade(&levels));
             let index = self.arrays[layer.role as usize][layer.array].layers[layer.layer];
             pool.spawn(move || {
-                // Nobody waits for the levels of a dropped upload.
+                // The levels of a dropped upload are not needed.
                 if let Some(result) = result.upgrade() {
                     let compute = || compute_levels(&scene, index, layer.role);
                     let levels = catch_unwind(AssertUnwindSafe(compute)).ok();

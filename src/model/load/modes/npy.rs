@@ -17,7 +17,7 @@ pub struct NpyArray {
     pub entries: Vec<f32>,
 }
 
-/// The header of a file: what its data contain.
+/// The header of a file: type, shape and order of its numbers.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(in crate::load) struct NpyHeader {
     dtype: String,
