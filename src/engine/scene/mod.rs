@@ -12,6 +12,7 @@ pub(super) mod handle;
 pub(super) mod lease;
 pub(super) mod message;
 mod output_delivery;
+mod output_producer;
 mod readback_queue;
 pub(super) mod step_queue;
 pub(super) mod subscriber;

@@ -1,31 +1,21 @@
 //! Delivery of a scene's outputs: to single requests whose step has been reached, and to subscribers that have not
 //! received the current step yet. A subscriber receives one result per credit ([`super::subscriber`]).
 
-use std::cmp::Ordering;
 use std::collections::VecDeque;
 use std::mem;
-use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use super::current_step::CurrentStep;
 use super::delivery::Delivery;
-use super::frame_stream::CameraState;
-use super::message::{StepRequest, StepSelector};
-use super::readback_queue::{PendingFrames, PendingReadback, PictureRecipient, ReadbackQueue, Recipient};
+use super::message::StepRequest;
+use super::output_producer::{DeliveryMode, DeliveryRound, OutputProducer, SceneOnDevice, attributes_for};
+use super::readback_queue::PendingReadback;
 use super::step_queue::CompletedStep;
-use super::subscriber::{LOSSLESS_CREDITS, Subscriber};
+use super::subscriber::Subscriber;
 use crate::config::Config;
-use crate::engine::device::command::{CopiedVertices, SceneId};
 use crate::engine::device::handle::{DeviceHandle, PendingReply};
-use crate::engine::output::pick_result::with_transforms;
-use crate::engine::output::rendered_picture::RenderedPicture;
-use crate::engine::output::step_output::{FrameOutput, OutputBody, OutputSpec, PictureSpec, StepFrames, StepOutput};
-use crate::engine::output::step_vertices::StepVertices;
-use crate::telemetry::Stage;
 use modalcast_model::deform::VertexAttributes;
 use modalcast_model::error::{Error, Result};
-use modalcast_model::scene::Scene;
-use modalcast_render::MAX_FRAMES_IN_FLIGHT;
 
 /// Owns the subscribers and the single requests of one scene, and the readbacks in flight for them.
 pub(super) struct OutputDelivery {
@@ -36,16 +26,6 @@ pub(super) struct OutputDelivery {
     producer: OutputProducer,
 }
 
-/// How the current step is delivered to subscribers.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct DeliveryMode {
-    /// A lossless subscriber without a credit blocks the writer. It is disconnected after `Config::stall_timeout`.
-    pub applies_back_pressure: bool,
-    /// Another step is queued. Readbacks of vertices are only started now, and are delivered while the queued step is
-    /// computed. Readbacks of frames are always only started.
-    pub overlaps_next_step: bool,
-}
-
 impl OutputDelivery {
     pub(super) fn new(scene_on_device: SceneOnDevice, device: DeviceHandle, config: &Config) -> Self {
         Self {
@@ -53,13 +33,7 @@ impl OutputDelivery {
             requests: Vec::new(),
             max_subscribers: config.max_subscribers,
             max_pending_requests: config.max_pending_requests,
-            producer: OutputProducer {
-                scene_on_device,
-                device,
-                stall_timeout: config.stall_timeout,
-                readbacks: ReadbackQueue::default(),
-                cached_vertices: None,
-            },
+            producer: OutputProducer::new(scene_on_device, device, config.stall_timeout),
         }
     }
 
@@ -223,283 +197,19 @@ impl OutputDelivery {
     }
 }
 
-/// The vertex attributes that a subscriber requests of the current step. `None` if it has no credit or has received the
-/// step.
-fn attributes_for(subscriber: &Subscriber, current: &CurrentStep) -> Option<VertexAttributes> {
-    match subscriber.spec {
-        OutputSpec::Vertices(attributes)
-            if subscriber.delivered_step_count < current.step_count && subscriber.has_credit() =>
-        {
-            Some(attributes)
-        }
-        _ => None,
-    }
-}
-
-/// The state of one delivery of the current step to all subscribers.
-struct DeliveryRound<'a> {
-    current: &'a CurrentStep,
-    mode: DeliveryMode,
-    /// Union of the vertex attributes that all subscribers request.
-    attributes: VertexAttributes,
-    /// Whether the round ends by starting one copy of `attributes` for all `vertex_recipients`.
-    starts_shared_copy: bool,
-    vertex_recipients: Vec<Recipient>,
-    /// Pictures that this round started and that are in flight, oldest first; at most [`MAX_FRAMES_IN_FLIGHT`].
-    started_pictures: VecDeque<PendingReadback>,
-    /// Pictures that this round has drawn. Later subscribers with an equal picture receive the same pixels.
-    drawn_pictures: Vec<(PictureSpec, Arc<RenderedPicture>)>,
-}
-
-/// Identifies a scene that is loaded on the device.
-pub(super) struct SceneOnDevice {
-    pub name: String,
-    pub id: SceneId,
-    pub scene: Arc<Scene>,
-}
-
-/// Produces outputs of the current step: draws, picks and copies. Owns the readbacks in flight.
-struct OutputProducer {
-    scene_on_device: SceneOnDevice,
-    device: DeviceHandle,
-    stall_timeout: Duration,
-    readbacks: ReadbackQueue,
-    /// Vertices of the current step in host memory, cached for later requests and subscribers.
-    cached_vertices: Option<CachedVertices>,
-}
-
-/// Vertices in host memory.
-#[derive(Debug, Clone)]
-struct CachedVertices {
-    vertices: Arc<StepVertices>,
-    /// The attributes that `vertices` contains.
-    attributes: VertexAttributes,
-    /// Duration of the copy in milliseconds.
-    copy_ms: f64,
-}
-
-impl OutputProducer {
-    /// Delivers the current step to one subscriber, or starts the delivery. Returns false if the subscriber must be
-    /// dropped.
-    async fn serve(&mut self, subscriber: &mut Subscriber, round: &mut DeliveryRound<'_>) -> bool {
-        let is_new_step = subscriber.delivered_step_count < round.current.step_count;
-        // The frame of a queued step will show a moved camera, too.
-        let redraws = !round.mode.overlaps_next_step && subscriber.has_moved_camera();
-        if !is_new_step && !redraws {
-            return true;
-        }
-        if !subscriber.has_credit() {
-            return !is_new_step || self.check_stall(subscriber, round.mode);
-        }
-        // `round.attributes` lacks the attributes of a subscriber that received its credit after the round had begun.
-        let is_covered = |attributes: VertexAttributes| round.attributes.contains(attributes);
-        if round.starts_shared_copy && attributes_for(subscriber, round.current).is_some_and(is_covered) {
-            round.vertex_recipients.push(Recipient::take_credit_of(subscriber, round.current));
-            return true;
-        }
-        if let Some(cameras) = subscriber.take_pictures() {
-            self.start_frames(subscriber, &cameras, round).await;
-            return true;
-        }
-        self.serve_now(subscriber, round).await
-    }
-
-    /// Starts the pictures of the current step for one subscriber, which receives them when the last one is there. Color
-    /// pictures are delivered asynchronously; all others are there when this returns.
-    async fn start_frames(
-        &mut self,
-        subscriber: &mut Subscriber,
-        cameras: &CameraState,
-        round: &mut DeliveryRound<'_>,
-    ) {
-        if cameras.pictures.iter().all(|picture| picture.output != FrameOutput::Color) {
-            // Results arrive in the order of the steps, and the result of this step is not delivered asynchronously.
-            self.readbacks.flush_for(subscriber).await;
-        }
-        let frames = PendingFrames::new(Recipient::take_credit_of(subscriber, round.current), cameras);
-        for (index, picture) in cameras.pictures.iter().enumerate() {
-            self.start_picture(picture, frames.picture(index), round).await;
-        }
-    }
-
-    /// Draws a picture of the current step for a recipient. An equal picture of another recipient is shared. At most
-    /// [`MAX_FRAMES_IN_FLIGHT`] color pictures are in flight; a further one waits for the oldest.
-    async fn start_picture(&mut self, spec: &PictureSpec, recipient: PictureRecipient, round: &mut DeliveryRound<'_>) {
-        let step_count = round.current.step_count;
-        if let Some((_, picture)) = round.drawn_pictures.iter().find(|(drawn_spec, _)| drawn_spec == spec) {
-            return recipient.receive(Ok(Arc::clone(picture)));
-        }
-        let recipients_of_equal = self
-            .readbacks
-            .iter_mut()
-            .chain(&mut round.started_pictures)
-            .find_map(|pending| pending.recipients_of(step_count, spec));
-        if let Some(recipients) = recipients_of_equal {
-            return recipients.push(recipient);
-        }
-        if spec.output == FrameOutput::Color {
-            if round.started_pictures.len() >= MAX_FRAMES_IN_FLIGHT
-                && let Some(oldest) = round.started_pictures.pop_front()
-            {
-                self.readbacks.flush_before(step_count).await;
-                round.drawn_pictures.extend(oldest.deliver().await);
-            }
-            let reply = self.device.begin_draw(self.scene_on_device.id, spec.camera, spec.size);
-            round.started_pictures.push_back(PendingReadback::of_picture(round.current, *spec, reply, recipient));
-            return;
-        }
-        let picture = tokio::select! {
-            biased;
-            picture = self.draw(spec) => picture.map(Arc::new),
-            // The subscriber no longer waits. Dropping the drawing cancels it on the device.
-            () = recipient.cancelled() => return,
-        };
-        round.drawn_pictures.extend(picture.iter().map(|picture| (*spec, Arc::clone(picture))));
-        recipient.receive(picture);
-    }
-
-    /// Produces the current step for one subscriber with a credit and delivers it. Returns false if the subscriber must
-    /// be dropped.
-    async fn serve_now(&mut self, subscriber: &mut Subscriber, round: &DeliveryRound<'_>) -> bool {
-        // Results arrive in the order of the steps, so deliver the subscriber's readbacks in flight first.
-        self.readbacks.flush_for(subscriber).await;
-        let skipped = subscriber.mark_delivered(round.current.step_count);
-        let output = tokio::select! {
-            biased;
-            output = self.produce(&subscriber.spec, round.current, round.attributes) => output,
-            // The subscriber no longer waits. Dropping the production cancels its commands to the device.
-            () = subscriber.closed() => return false,
-        };
-        subscriber.take_permit().send(output.map(|output| StepOutput { skipped, ..output }))
-    }
-
-    /// Disconnects a subscriber without a credit that has blocked the writer for too long. Returns false in that case.
-    fn check_stall(&self, subscriber: &mut Subscriber, mode: DeliveryMode) -> bool {
-        if !(mode.applies_back_pressure && subscriber.delivery == Delivery::Lossless) {
-            subscriber.stalled_since = None;
-            return true;
-        }
-        let stalled_since = *subscriber.stalled_since.get_or_insert_with(Instant::now);
-        let is_within_timeout = stalled_since.elapsed() < self.stall_timeout;
-        if !is_within_timeout {
-            let (scene, seconds) = (&self.scene_on_device.name, self.stall_timeout.as_secs());
-            tracing::warn!(scene, seconds, "a lossless subscriber did not read and is disconnected");
-            let error = Error::SlowReader { queue: "queue of results of this subscriber", limit: LOSSLESS_CREDITS };
-            subscriber.disconnect(error);
-        }
-        is_within_timeout
-    }
-
-    /// Draws, picks, copies or shares the current step. A copy also includes `other_attributes`, which other subscribers
-    /// request.
-    async fn produce(
-        &mut self,
-        spec: &OutputSpec,
-        current: &CurrentStep,
-        other_attributes: VertexAttributes,
-    ) -> Result<StepOutput> {
-        let mut stages = current.stages.clone();
-        let body = match spec {
-            OutputSpec::Frames(pictures) => {
-                OutputBody::Frames(StepFrames { pictures: self.draw_all(pictures).await?, camera_version: 0 })
-            }
-            OutputSpec::Pick { camera, picture, rectangle } => {
-                let hits = self.device.pick(self.scene_on_device.id, *camera, *picture, *rectangle).await?;
-                OutputBody::Pick(with_transforms(&current.state, &self.scene_on_device.scene, hits))
-            }
-            OutputSpec::Vertices(attributes) => {
-                let CachedVertices { vertices, copy_ms, .. } =
-                    self.copy_vertices(*attributes, other_attributes).await?;
-                stages.push((Stage::Copy, copy_ms));
-                OutputBody::Vertices(vertices)
-            }
-            OutputSpec::State => OutputBody::State(Arc::clone(&current.state)),
-        };
-        Ok(StepOutput { step: current.id(), skipped: 0, stages, origins: current.state.origins.clone(), body })
-    }
-
-    /// Draws pictures of the current step. Equal pictures are drawn once.
-    async fn draw_all(&self, pictures: &[PictureSpec]) -> Result<Vec<Arc<RenderedPicture>>> {
-        let mut drawn = Vec::with_capacity(pictures.len());
-        for (index, picture) in pictures.iter().enumerate() {
-            drawn.push(match pictures[..index].iter().position(|earlier| earlier == picture) {
-                Some(equal) => Arc::clone(&drawn[equal]),
-                None => Arc::new(self.draw(picture).await?),
-            });
-        }
-        Ok(drawn)
-    }
-
-    /// Draws a picture of the current step.
-    async fn draw(&self, picture: &PictureSpec) -> Result<RenderedPicture> {
-        let (id, PictureSpec { camera, size, output }) = (self.scene_on_device.id, *picture);
-        if output == FrameOutput::Color {
-            return self.device.begin_draw(id, camera, size).wait().await.map(RenderedPicture::from);
-        }
-        let (image, legend) = self.device.render_aov(id, camera, size, output).await?;
-        Ok(RenderedPicture::from_aov(image, legend))
-    }
-
-    /// Whether a request can be answered now. `run` is the run of the latest writer.
-    ///
-    /// # Errors
-    /// `StepPassed` when the scene has passed the requested exact step.
-    fn is_reached(&self, selector: StepSelector, current: &CurrentStep, run: u64) -> Result<bool> {
-        let current_step = (current.state.run > 0).then_some((current.state.run, current.state.step));
-        let compare = |requested_run: u64, number: u64| {
-            let requested_run = if requested_run == 0 { run } else { requested_run };
-            // Before the first step every requested step is in the future.
-            current_step.map_or(Ordering::Less, |current_step| current_step.cmp(&(requested_run, number)))
-        };
-        match selector {
-            StepSelector::Current => Ok(true),
-            StepSelector::Minimum { run, number } => Ok(compare(run, number) != Ordering::Less),
-            StepSelector::Exact { run, number } => match compare(run, number) {
-                Ordering::Less => Ok(false),
-                Ordering::Equal => Ok(true),
-                Ordering::Greater => {
-                    let (name, state) = (&self.scene_on_device.name, &current.state);
-                    let expected =
-                        format!("run {}, step {} (the current one of scene '{name}') or later", state.run, state.step);
-                    Err(Error::StepPassed { field: "step.exact", expected, given: number.to_string() })
-                }
-            },
-        }
-    }
-
-    /// The attributes of the current vertices that are cached in host memory.
-    fn cached_attributes(&self) -> VertexAttributes {
-        self.cached_vertices.as_ref().map_or(VertexAttributes::default(), |cached| cached.attributes)
-    }
-
-    /// Returns the current vertices with at least the given attributes. They are copied from the device once per step
-    /// unless a later request needs further attributes. A copy also includes `other_attributes`.
-    async fn copy_vertices(
-        &mut self,
-        attributes: VertexAttributes,
-        other_attributes: VertexAttributes,
-    ) -> Result<CachedVertices> {
-        if let Some(cached) = self.cached_vertices.as_ref().filter(|cached| cached.attributes.contains(attributes)) {
-            return Ok(cached.clone());
-        }
-        // The cached attributes are copied again, so that alternating readers do not evict each other's attributes.
-        let copied_attributes = self.cached_attributes().union(attributes).union(other_attributes);
-        let CopiedVertices { surface, copy_ms } =
-            self.device.read_vertices(self.scene_on_device.id, copied_attributes).wait().await?;
-        let vertices = Arc::new(StepVertices::new(surface));
-        let copied = CachedVertices { vertices, attributes: copied_attributes, copy_ms };
-        Ok(self.cached_vertices.insert(copied).clone())
-    }
-}
-
 #[cfg(test)]
 mod tests {
+    use std::sync::Arc;
+    use std::time::Duration;
+
     use tokio::sync::{mpsc, oneshot};
     use tokio::time::timeout;
 
+    use super::super::message::StepSelector;
     use super::super::subscriber::Subscription;
     use super::*;
     use crate::engine::device::command::{Command, Reply};
+    use crate::engine::output::step_output::{FrameOutput, OutputBody, OutputSpec, PictureSpec, StepOutput};
     use crate::engine::testing;
     use modalcast_model::scene::{Camera, FrameSize, SceneState};
     use modalcast_render::{FrameImage, RasterBackends};
