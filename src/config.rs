@@ -98,7 +98,7 @@ pub struct Config {
     pub frame_side: u32,
     /// Limit on open scenes.
     pub open_scenes: usize,
-    /// Default window of a step stream: the maximum number of steps without acknowledgement.
+    /// Default window of a step stream: the maximum number of steps without acknowledgment.
     pub window: u32,
     /// Largest window that a client may request.
     pub max_window: u32,

@@ -1869,7 +1869,7 @@ pub mod drive_scene_response {
         #[prost(message, tag = "1")]
         Opened(super::Opened),
         #[prost(message, tag = "2")]
-        Ack(super::Acknowledgement),
+        Ack(super::Acknowledgment),
         #[prost(message, tag = "3")]
         Rejection(super::Rejection),
     }
@@ -1897,7 +1897,7 @@ pub struct Opened {
 }
 /// The last accepted step is always acknowledged. Earlier steps may have no acknowledgment of their own.
 #[derive(Clone, PartialEq, ::prost::Message)]
-pub struct Acknowledgement {
+pub struct Acknowledgment {
     /// All accepted steps up to this one are completed or, with DELIVERY_LATEST, merged into a newer one. The server
     /// writes the newest state to disk in the background, about ten times per second. A crash of the server loses the
     /// steps after the last write; SceneInfo.last_step then names an earlier step.
@@ -2690,14 +2690,14 @@ pub struct Hit {
 }
 /// The quantity that a picture shows. Color is the mean of a pixel's samples. Depth, domains and normals are sampled
 /// once, at the center of the pixel. They show the opaque surface behind blended surfaces. The ground hides no surface, not
-/// even one that lies below it. Only OUTPUT_COLOUR and OUTPUT_DEPTH_WITH_GROUND contain it.
+/// even one that lies below it. Only OUTPUT_COLOR and OUTPUT_DEPTH_WITH_GROUND contain it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
 #[repr(i32)]
 pub enum Output {
-    /// Means OUTPUT_COLOUR.
+    /// Means OUTPUT_COLOR.
     Unspecified = 0,
     /// Shaded color: lights, shadows, ground and post-processing as in the table `look` of the scene's scene.toml.
-    Colour = 1,
+    Color = 1,
     /// FORMAT_F32: distance along the view axis (not along the ray) in meters, relative error at most 1e-4; infinity where
     /// there is no surface.
     Depth = 2,
@@ -2723,7 +2723,7 @@ impl Output {
     pub fn as_str_name(&self) -> &'static str {
         match self {
             Self::Unspecified => "OUTPUT_UNSPECIFIED",
-            Self::Colour => "OUTPUT_COLOUR",
+            Self::Color => "OUTPUT_COLOR",
             Self::Depth => "OUTPUT_DEPTH",
             Self::Domains => "OUTPUT_DOMAINS",
             Self::Normals => "OUTPUT_NORMALS",
@@ -2736,7 +2736,7 @@ impl Output {
     pub fn from_str_name(value: &str) -> ::core::option::Option<Self> {
         match value {
             "OUTPUT_UNSPECIFIED" => Some(Self::Unspecified),
-            "OUTPUT_COLOUR" => Some(Self::Colour),
+            "OUTPUT_COLOR" => Some(Self::Color),
             "OUTPUT_DEPTH" => Some(Self::Depth),
             "OUTPUT_DOMAINS" => Some(Self::Domains),
             "OUTPUT_NORMALS" => Some(Self::Normals),

@@ -37,7 +37,7 @@ pub enum Error {
     #[error("{field}: expected {expected}, got {given}")]
     StepPassed { field: &'static str, expected: String, given: String },
     /// Too many steps of a step stream are unacknowledged.
-    #[error("the window is full: expected at most {limit} steps without acknowledgement, got {given}")]
+    #[error("the window is full: expected at most {limit} steps without acknowledgment, got {given}")]
     WindowFull { limit: usize, given: usize },
     /// A queue is full. A later attempt may succeed.
     #[error("{queue} is full ({limit})")]

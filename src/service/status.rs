@@ -97,7 +97,7 @@ impl ErrorReport {
                 Self::new(Code::FailedPrecondition, Reason::StepPassed, expected, given).with_field(field)
             }
             Error::WindowFull { limit, given } => {
-                let expected = format!("at most {limit} steps without acknowledgement");
+                let expected = format!("at most {limit} steps without acknowledgment");
                 Self::new(Code::ResourceExhausted, Reason::WindowFull, expected, given.to_string())
             }
             Error::Busy { queue, limit } => {

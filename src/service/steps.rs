@@ -22,7 +22,7 @@ use modalcast_model::error::{Error, Result, fault};
 /// error.
 const MAX_PENDING_REPLIES: usize = 256;
 
-/// Number of buffered replies above which acknowledgements are merged.
+/// Number of buffered replies above which acknowledgments are merged.
 const MAX_PENDING_ACKS: usize = 64;
 
 /// Implementation of `StepService`.
@@ -144,7 +144,7 @@ impl DriveSession {
         }
     }
 
-    /// Appends a report. An acknowledgement also covers all earlier steps. If many replies wait, it replaces one that is
+    /// Appends a report. An acknowledgment also covers all earlier steps. If many replies wait, it replaces one that is
     /// not sent yet, so that a client that reads nothing can continue to send steps.
     fn push_report(&mut self, report: StepReport) {
         let response = to_response(report);
@@ -193,7 +193,7 @@ async fn next_report(writer: Option<&WriterSession>) -> Result<StepReport> {
 fn to_response(report: StepReport) -> v1::DriveSceneResponse {
     let kind = match report {
         StepReport::Done { step, skipped, stages: times } => {
-            ResponseKind::Ack(v1::Acknowledgement { step, skipped, stages: wire_stages(&times) })
+            ResponseKind::Ack(v1::Acknowledgment { step, skipped, stages: wire_stages(&times) })
         }
         StepReport::Rejected { step, error } => ResponseKind::Rejection(to_rejection(Some(step), &error)),
     };

@@ -44,7 +44,7 @@ async fn large_step_arrives_as_it_was_sent() {
     for number in 1..=2 {
         steps.step(&translations(number)).await.expect("expected an accepted step");
     }
-    with_timeout(steps.flush()).await.expect("expected acknowledgements");
+    with_timeout(steps.flush()).await.expect("expected acknowledgments");
     let attributes = [v1::Attribute::Positions];
     let selection = select(&[0, 40_000, 69_999], &attributes);
     let request = v1::GetVerticesRequest { scene: "crowd".into(), selection, ..Default::default() };

@@ -217,14 +217,14 @@ async fn invalid_rectangles_outputs_and_steps_are_rejected() {
         ..v1::Picture::default()
     };
     let depth_as_png = wire_picture(v1::Output::Depth, v1::Format::Png);
-    let colour_as_floats = wire_picture(v1::Output::Colour, v1::Format::F32);
+    let color_as_floats = wire_picture(v1::Output::Color, v1::Format::F32);
     let missing_mode = v1::Picture { mode: 2, ..wire_picture(v1::Output::ModeShape, v1::Format::Png) };
     let scaled_depth = v1::Picture { largest: 1.0, ..wire_picture(v1::Output::Depth, v1::Format::F32) };
     let nan_scale = v1::Picture { largest: f64::NAN, ..wire_picture(v1::Output::Displacement, v1::Format::Png) };
     let unknown_output = v1::Picture { output: 99, ..v1::Picture::default() };
     for (picture, field) in [
         (depth_as_png, "pictures[0].format"),
-        (colour_as_floats, "pictures[0].format"),
+        (color_as_floats, "pictures[0].format"),
         (missing_mode, "pictures[0].mode"),
         (scaled_depth, "pictures[0].largest"),
         (nan_scale, "pictures[0].largest"),

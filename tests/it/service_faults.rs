@@ -18,7 +18,7 @@ use v1::upload_scene_request::Part;
 use crate::service_harness::{DEFAULT_WINDOW, Server, StepWriter, TIMEOUT, step, with_timeout};
 
 /// Under the policy `latest`, the server merges steps that it has no time to process. Another stream of the same
-/// connection still gets all its acknowledgements.
+/// connection still gets all its acknowledgments.
 #[tokio::test(flavor = "multi_thread")]
 async fn latest_policy_merges_excess_steps() {
     const STEP_COUNT: u64 = 20_000;
@@ -43,7 +43,7 @@ async fn latest_policy_merges_excess_steps() {
             match message.expect("expected a reply").kind {
                 Some(ResponseKind::Ack(ack)) if ack.step == STEP_COUNT => return ack.skipped,
                 Some(ResponseKind::Ack(_)) => {}
-                kind => panic!("expected an acknowledgement, got {kind:?}"),
+                kind => panic!("expected an acknowledgment, got {kind:?}"),
             }
         }
     };

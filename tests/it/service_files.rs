@@ -124,7 +124,7 @@ async fn invalid_files_are_rejected_and_leave_no_files() {
     let server = start_server(state_folder.path(), repository_folder.path()).await;
     let square = SQUARE.as_bytes();
     let truncated_modes = &lift_mode()[..150];
-    let missing_texture = b"model = \"a.obj\"\n[material.\"*\"]\ncolour_texture = \"nowhere.png\"\n";
+    let missing_texture = b"model = \"a.obj\"\n[material.\"*\"]\ncolor_texture = \"nowhere.png\"\n";
     let invalid_alpha = b"model = \"a.obj\"\n[material.\"*\"]\nalpha = 7\n";
     let escaping_path = b"model = \"../../../scenes.json\"\n";
     let index_out_of_range = b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n";

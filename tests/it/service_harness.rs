@@ -39,7 +39,7 @@ pub(crate) const TIMEOUT: Duration = Duration::from_secs(60);
 /// Size limit of one message of the server in bytes: a chunk of 1 MiB and the other fields.
 pub(crate) const MAX_MESSAGE_BYTES: usize = (1 << 20) + 4096;
 
-/// Selects the server's default window: the maximum number of steps without acknowledgement.
+/// Selects the server's default window: the maximum number of steps without acknowledgment.
 pub(crate) const DEFAULT_WINDOW: u32 = 0;
 
 /// Source of scenes built in code: `strips` (two small domains), `far` (`strips` far from the world origin), `twig`
@@ -272,7 +272,7 @@ impl Server {
         self.drive(scene, v1::Delivery::Lossless, DEFAULT_WINDOW).await
     }
 
-    /// Opens a step stream and expects success. `window` is the maximum number of steps without acknowledgement.
+    /// Opens a step stream and expects success. `window` is the maximum number of steps without acknowledgment.
     pub(crate) async fn drive(&self, scene: &str, delivery: v1::Delivery, window: u32) -> StepWriter {
         let mut writer = StepWriter::connect(self.channel().await).await;
         let opened = writer.open(scene, delivery, window).await;
@@ -310,7 +310,7 @@ impl StepWriter {
     }
 
     /// Requests to drive a scene and returns the reply. `window` is the maximum number of steps without
-    /// acknowledgement.
+    /// acknowledgment.
     pub(crate) async fn open(&mut self, scene: &str, delivery: v1::Delivery, window: u32) -> ResponseKind {
         let open = v1::OpenDrive { scene: scene.into(), delivery: delivery.into(), window, ..v1::OpenDrive::default() };
         self.send(RequestKind::Open(open)).await;
@@ -331,13 +331,13 @@ impl StepWriter {
         reply.kind.expect("expected a message kind")
     }
 
-    /// Sends a step, waits for the reply and expects its acknowledgement.
-    pub(crate) async fn send_step_and_wait(&mut self, step: v1::Step) -> v1::Acknowledgement {
+    /// Sends a step, waits for the reply and expects its acknowledgment.
+    pub(crate) async fn send_step_and_wait(&mut self, step: v1::Step) -> v1::Acknowledgment {
         let number = step.number;
         self.send_step(step).await;
         match self.receive_reply().await {
             ResponseKind::Ack(ack) if ack.step == number => ack,
-            other => panic!("expected an acknowledgement of step {number}, got {other:?}"),
+            other => panic!("expected an acknowledgment of step {number}, got {other:?}"),
         }
     }
 

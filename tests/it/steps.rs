@@ -149,7 +149,7 @@ async fn unread_lossless_subscription_applies_back_pressure() {
     }
     let rejection = writer.receive_rejection().await;
     assert_eq!((rejection.step, rejection.reason()), (Some(5), v1::Reason::WindowFull));
-    assert_eq!(rejection.expected, "at most 2 steps without acknowledgement");
+    assert_eq!(rejection.expected, "at most 2 steps without acknowledgment");
     // Reading releases the remaining steps. The rejected step was not applied.
     for number in 1..=4 {
         assert_eq!(with_timeout(subscription.next()).await.expect("expected another message").step.number, number);
@@ -198,10 +198,10 @@ async fn latest_policy_merges_steps_and_counts_skipped_ones() {
         match writer.receive_reply().await {
             ResponseKind::Ack(ack) if ack.step == 200 => break ack,
             ResponseKind::Ack(_) => earlier_acks += 1,
-            kind => panic!("expected an acknowledgement, got {kind:?}"),
+            kind => panic!("expected an acknowledgment, got {kind:?}"),
         }
     };
-    assert!(last_ack.skipped > 0, "expected skipped steps, got {earlier_acks} acknowledgements before the last");
+    assert!(last_ack.skipped > 0, "expected skipped steps, got {earlier_acks} acknowledgments before the last");
     assert!(last_ack.skipped + earlier_acks < 200);
     let reply = get_vertices(&server, vertex_request("sheet")).await.expect("expected vertices");
     let expected = reference_vertices(&sheet(), &steps);

@@ -119,7 +119,7 @@ async fn first_reply_has_the_settings_in_effect() {
         height: 720,
         format: v1::Format::Png.into(),
         camera: Some(v1::Camera { view: Some(view), lens: Some(lens), near: 0.0, far: 0.0 }),
-        output: v1::Output::Colour.into(),
+        output: v1::Output::Color.into(),
         ..v1::Picture::default()
     };
     assert_eq!(settings.pictures, [expected_picture]);

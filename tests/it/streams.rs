@@ -1,4 +1,4 @@
-//! Frame streams while later steps are computed. Each frame shows the step that it names. Frames and acknowledgements
+//! Frame streams while later steps are computed. Each frame shows the step that it names. Frames and acknowledgments
 //! keep the order of the steps.
 
 use std::sync::Arc;
@@ -126,7 +126,7 @@ async fn frames_of_many_cameras_show_their_own_step() {
             ResponseKind::Rejection(_) => {
                 assert_eq!(number, REJECTED_STEP, "expected a rejection of step {REJECTED_STEP} only")
             }
-            kind => panic!("expected an acknowledgement or a rejection, got {kind:?}"),
+            kind => panic!("expected an acknowledgment or a rejection, got {kind:?}"),
         }
     }
     assert!(

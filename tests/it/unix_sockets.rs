@@ -37,7 +37,7 @@ async fn clients_of_both_sockets_use_the_same_server() {
     for number in 1..=20 {
         steps.step(&Step::new(number, 0.0).q(0, &[0.1, 0.2])).await.expect("expected a sent step");
     }
-    with_timeout(steps.flush()).await.expect("expected acknowledgements");
+    with_timeout(steps.flush()).await.expect("expected acknowledgments");
     drop(steps);
     server.stop().await.expect("expected the server to stop");
     assert!(!path.exists(), "expected the server to remove its socket");

@@ -83,7 +83,7 @@ async fn blocking_writer_that_writes_on_loses_no_step() {
     while let Some(reply) = with_timeout(replies.message()).await.expect("expected no error") {
         match reply.kind {
             Some(ResponseKind::Ack(ack)) => last_ack = ack.step,
-            other => panic!("expected only acknowledgements, got {other:?}"),
+            other => panic!("expected only acknowledgments, got {other:?}"),
         }
     }
     assert_eq!(last_ack, STEPS);
@@ -245,9 +245,9 @@ async fn start_delaying_proxy(server_address: String, mut open: watch::Receiver<
 }
 
 /// On a connection with a long round trip, the steps in flight are bounded by flow control (64 KiB), not by the window
-/// of 8 steps: the server completes 500 steps before the client has received any acknowledgement of them.
+/// of 8 steps: the server completes 500 steps before the client has received any acknowledgment of them.
 #[tokio::test(flavor = "multi_thread")]
-async fn steps_do_not_wait_for_acknowledgements_of_a_distant_server() {
+async fn steps_do_not_wait_for_acknowledgments_of_a_distant_server() {
     const STEPS: u64 = 500;
     let server = Server::start_default().await;
     server.open("strips").await;
@@ -273,7 +273,7 @@ async fn steps_do_not_wait_for_acknowledgements_of_a_distant_server() {
     while last_ack < STEPS {
         match writer.receive_reply().await {
             ResponseKind::Ack(ack) => last_ack = ack.step,
-            other => panic!("expected an acknowledgement, got {other:?}"),
+            other => panic!("expected an acknowledgment, got {other:?}"),
         }
     }
 }

@@ -98,7 +98,7 @@ pub(crate) struct CommonOptions {
     /// lossless: process every step; latest: skip to the newest step.
     #[arg(long, value_enum, default_value = "lossless")]
     pub(crate) delivery: DeliveryOption,
-    /// Wait for acknowledgements, so that at most this many steps are in flight. 0 selects the server's default. Without
+    /// Wait for acknowledgments, so that at most this many steps are in flight. 0 selects the server's default. Without
     /// this option the server slows the process down by flow control.
     #[arg(long, value_name = "STEPS")]
     pub(crate) window: Option<u32>,

@@ -100,14 +100,14 @@ pub struct RunSummary {
     pub report: Report,
 }
 
-/// Statistics of a run: acknowledgements, rejections and sent bytes.
+/// Statistics of a run: acknowledgments, rejections and sent bytes.
 #[derive(Default)]
 struct RunStats {
-    /// Times of the server's processing stages, from the acknowledgements.
+    /// Times of the server's processing stages, from the acknowledgments.
     stage_samples: StageSamples,
     /// Texts of the first `MAX_REJECTIONS` rejections.
     rejections: Vec<String>,
-    acknowledgement_count: u64,
+    acknowledgment_count: u64,
     /// Bytes of coordinates and transforms in all sent steps.
     payload_bytes: u64,
 }
@@ -200,7 +200,7 @@ impl<'a> Driver<'a> {
             // A rejection arrives late: it may concern this step or an earlier one.
             let is_rejected = self.stats.record_rejection(self.step_stream.step(&step).await)?;
             self.stats.payload_bytes += step.payload_bytes() as u64;
-            self.stats.record_acknowledgements(&self.step_stream);
+            self.stats.record_acknowledgments(&self.step_stream);
             if let Some(recorder) = &mut self.recorder {
                 recorder.write_row(&current_values)?;
             }
@@ -212,11 +212,11 @@ impl<'a> Driver<'a> {
         Ok(())
     }
 
-    /// Waits for the acknowledgements of all steps and closes the stream and the record.
+    /// Waits for the acknowledgments of all steps and closes the stream and the record.
     async fn finish(mut self) -> Result<(StreamSummary, Report)> {
         // Each flush reports at most one rejection. Repeat until no rejection is left.
         while self.stats.record_rejection(self.step_stream.flush().await)? {}
-        self.stats.record_acknowledgements(&self.step_stream);
+        self.stats.record_acknowledgments(&self.step_stream);
         let (run_number, window) = (self.step_stream.run, self.step_stream.window);
         let stream_summary = self.step_stream.finish().await?;
         self.recorder.map(Recorder::finish).transpose()?;
@@ -255,18 +255,18 @@ impl RunStats {
         }
     }
 
-    /// Records the acknowledgements that have arrived since the last call.
-    fn record_acknowledgements(&mut self, step_stream: &StepStream) {
-        for acknowledgement in step_stream.take_acks() {
-            self.acknowledgement_count += 1;
-            self.stage_samples.add(&acknowledgement.stages);
+    /// Records the acknowledgments that have arrived since the last call.
+    fn record_acknowledgments(&mut self, step_stream: &StepStream) {
+        for acknowledgment in step_stream.take_acks() {
+            self.acknowledgment_count += 1;
+            self.stage_samples.add(&acknowledgment.stages);
         }
     }
 
     fn report(self) -> Report {
         Report::from_iter([
             ("stages_ms".to_owned(), json!(self.stage_samples.medians())),
-            ("acknowledgements".to_owned(), json!(self.acknowledgement_count)),
+            ("acknowledgments".to_owned(), json!(self.acknowledgment_count)),
             ("payload_bytes".to_owned(), json!(self.payload_bytes)),
             ("rejections".to_owned(), json!(self.rejections)),
         ])

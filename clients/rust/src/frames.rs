@@ -345,7 +345,7 @@ impl Pictures {
 impl From<Picture> for v1::Picture {
     fn from(picture: Picture) -> Self {
         let (output, mode, scale_max) = match picture.output {
-            Output::Color => (v1::Output::Colour, 0, 0.0),
+            Output::Color => (v1::Output::Color, 0, 0.0),
             Output::Depth => (v1::Output::Depth, 0, 0.0),
             Output::DepthWithGround => (v1::Output::DepthWithGround, 0, 0.0),
             Output::Domains => (v1::Output::Domains, 0, 0.0),

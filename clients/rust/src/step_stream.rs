@@ -1,4 +1,4 @@
-//! A step stream: sends steps, receives acknowledgements and rejections, and limits the steps in flight to the window.
+//! A step stream: sends steps, receives acknowledgments and rejections, and limits the steps in flight to the window.
 //!
 //! A separate task reads the replies all the time, because the server closes a connection on which many small messages
 //! stay unread.
@@ -20,7 +20,7 @@ use crate::request::Delivery;
 use crate::stages::{self, StageTimes};
 use crate::step::Step;
 
-/// Maximum number of acknowledgements, and of rejections, that are stored until the caller takes them. Older ones are
+/// Maximum number of acknowledgments, and of rejections, that are stored until the caller takes them. Older ones are
 /// dropped; [`StreamSummary::rejected`] counts all rejections.
 const MAX_STORED: usize = 1024;
 
@@ -46,7 +46,7 @@ impl DriveRequest {
         Self { scene: scene.to_owned(), delivery, window, lease_token, takes_over: false, resets: false }
     }
 
-    /// Limits the steps in flight (sent and not yet acknowledged): [`StepStream::step`] waits for acknowledgements.
+    /// Limits the steps in flight (sent and not yet acknowledged): [`StepStream::step`] waits for acknowledgments.
     /// 0 selects the server's default. The server may grant fewer.
     #[must_use]
     pub fn window(mut self, steps: u32) -> Self {
@@ -90,7 +90,7 @@ impl DriveRequest {
     }
 }
 
-/// One acknowledgement: the server has processed all steps up to `step`, or merged them into a newer step.
+/// One acknowledgment: the server has processed all steps up to `step`, or merged them into a newer step.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Ack {
     pub step: u64,
@@ -121,7 +121,7 @@ struct Progress {
     acknowledged: Option<u64>,
     skipped: u64,
     rejected: u64,
-    /// Acknowledgements that the caller has not taken.
+    /// Acknowledgments that the caller has not taken.
     acks: VecDeque<Ack>,
     /// Rejections that have not been reported to the caller.
     rejections: VecDeque<Rejection>,
@@ -168,7 +168,7 @@ impl Client {
             Some(ResponseKind::Opened(opened)) => opened,
             Some(ResponseKind::Rejection(rejection)) => return Err(Error::Rejected(Box::new(rejection.into()))),
             Some(ResponseKind::Ack(_)) => {
-                return Err(malformed_reply("drive.opened", "`opened` first", "an acknowledgement"));
+                return Err(malformed_reply("drive.opened", "`opened` first", "an acknowledgment"));
             }
             None => return Err(Error::StreamEnded { awaited_reply: "the reply to the open request" }),
         };
@@ -230,7 +230,7 @@ impl StepStream {
         }
     }
 
-    /// Takes the acknowledgements received since the last call, oldest first; at most 1024 are stored.
+    /// Takes the acknowledgments received since the last call, oldest first; at most 1024 are stored.
     pub fn take_acks(&self) -> Vec<Ack> {
         lock(&self.progress).acks.drain(..).collect()
     }
@@ -256,7 +256,7 @@ impl StepStream {
         }
     }
 
-    /// Waits for all acknowledgements, then ends the stream. Rejections are counted and are not errors.
+    /// Waits for all acknowledgments, then ends the stream. Rejections are counted and are not errors.
     ///
     /// # Errors
     /// The error that ended the stream. A stream that has already ended is an error even if all steps are acknowledged.
@@ -280,14 +280,14 @@ impl StepStream {
                 if let Some(end) = &progress.end {
                     return Err(end
                         .clone()
-                        .unwrap_or(Error::StreamEnded { awaited_reply: "the acknowledgement of a step" }));
+                        .unwrap_or(Error::StreamEnded { awaited_reply: "the acknowledgment of a step" }));
                 }
                 if condition(&progress, self.window) {
                     return Ok(());
                 }
             }
             if self.progress_changes.changed().await.is_err() && lock(&self.progress).end.is_none() {
-                return Err(Error::StreamEnded { awaited_reply: "the acknowledgement of a step" });
+                return Err(Error::StreamEnded { awaited_reply: "the acknowledgment of a step" });
             }
         }
     }
@@ -325,7 +325,7 @@ async fn read_replies(
 }
 
 impl Progress {
-    fn acknowledge(&mut self, ack: v1::Acknowledgement) {
+    fn acknowledge(&mut self, ack: v1::Acknowledgment) {
         self.in_flight.retain(|step| *step > ack.step);
         self.acknowledged = self.acknowledged.max(Some(ack.step));
         self.skipped = ack.skipped;
@@ -379,7 +379,7 @@ mod tests {
         let mut progress = Progress { in_flight: (0..6).collect(), ..Progress::default() };
         progress.reject(rejection(4));
         assert_eq!(progress.in_flight, [0, 1, 2, 3, 5]);
-        progress.acknowledge(v1::Acknowledgement { step: 3, skipped: 2, stages: vec![] });
+        progress.acknowledge(v1::Acknowledgment { step: 3, skipped: 2, stages: vec![] });
         assert_eq!((progress.in_flight.make_contiguous(), progress.skipped), (&mut [5][..], 2));
         progress.reject(rejection(9));
         assert_eq!((progress.in_flight.len(), progress.rejected), (1, 2));

@@ -98,7 +98,7 @@ async fn subscription_before_the_first_step_receives_every_step() {
 }
 
 #[tokio::test]
-async fn step_beyond_the_window_waits_for_an_acknowledgement() {
+async fn step_beyond_the_window_waits_for_an_acknowledgment() {
     let mut slow_server = one_domain_server(4);
     (slow_server.window, slow_server.ack_permits) = (2, Semaphore::new(0));
     let (server, client) = connect(slow_server).await;

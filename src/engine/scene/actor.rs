@@ -17,7 +17,7 @@
 //! |---|---|---|
 //! | `Idle` | no step is in progress | the writer has queued a step |
 //! | `Deforming` | the device computes the step, readbacks of the previous step are delivered, messages wait | the device answers |
-//! | `Delivering` | the step is the current one, its writer waits for the acknowledgement | every lossless subscriber has received the step, or the writer is not lossless or has disconnected |
+//! | `Delivering` | the step is the current one, its writer waits for the acknowledgment | every lossless subscriber has received the step, or the writer is not lossless or has disconnected |
 //!
 //! Single requests and subscribers are served in `Idle` and in `Delivering`. In every state the actor ends, and
 //! [`SceneActor::close`] consumes it, when
@@ -252,7 +252,7 @@ impl SceneActor {
                 self.phase = StepPhase::Delivering(CompletedStep::new(step_queue, self.current.stages.clone()));
             }
             Err(error) => {
-                // Reports are ordered, so the acknowledgements of earlier steps come first.
+                // Reports are ordered, so the acknowledgments of earlier steps come first.
                 self.delivery.flush().await;
                 step_queue.report(Err(error));
             }

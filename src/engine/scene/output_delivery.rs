@@ -165,7 +165,7 @@ impl OutputDelivery {
 
     /// Acknowledges the current step after its last readback in flight, or now if it has none.
     pub(super) async fn acknowledge(&mut self, current: &CurrentStep, step: CompletedStep) {
-        if let Some(step) = self.producer.readbacks.attach_acknowledgement(current.step_count, step) {
+        if let Some(step) = self.producer.readbacks.attach_acknowledgment(current.step_count, step) {
             self.flush().await;
             step.acknowledge();
         }

@@ -330,9 +330,9 @@ impl ReadbackQueue {
         self.pending.iter_mut()
     }
 
-    /// Attaches the acknowledgement of a step to its last readback in flight. Returns the step if it has no readback in
+    /// Attaches the acknowledgment of a step to its last readback in flight. Returns the step if it has no readback in
     /// flight.
-    pub(super) fn attach_acknowledgement(&mut self, step_count: u64, step: CompletedStep) -> Option<CompletedStep> {
+    pub(super) fn attach_acknowledgment(&mut self, step_count: u64, step: CompletedStep) -> Option<CompletedStep> {
         match self.pending.back_mut().filter(|newest| newest.step_count == step_count) {
             Some(newest) => {
                 newest.step_to_acknowledge = Some(step);
@@ -373,8 +373,8 @@ impl ReadbackQueue {
         })
     }
 
-    /// Cancels a readback: drops its command to the device. A readback with an acknowledgement keeps its place in the
-    /// order of the acknowledgements.
+    /// Cancels a readback: drops its command to the device. A readback with an acknowledgment keeps its place in the
+    /// order of the acknowledgments.
     fn cancel(&mut self, index: usize) {
         match self.pending.get_mut(index) {
             Some(pending) if pending.step_to_acknowledge.is_some() => pending.readback = Readback::Cancelled,

@@ -77,7 +77,7 @@ pub(in crate::engine) struct StepQueue {
     writer_wake: Notify,
 }
 
-/// A computed step whose acknowledgement is outstanding.
+/// A computed step whose acknowledgment is outstanding.
 #[derive(Debug)]
 pub(super) struct CompletedStep {
     step_queue: Arc<StepQueue>,

@@ -183,7 +183,7 @@ fn real_datasets_are_listed_if_their_folder_has_one_model() {
 fn real_fern_is_masked_by_an_override_of_its_texture() {
     let (model, texture) =
         (dataset_path("gltf/fern/fern_02.glb"), dataset_path("gltf/fern/fern_02_basecolor_alpha_1k.derived.png"));
-    let scene = open_manifest(&format!("model = '{model}'\nmaterial.'*'.colour_texture = '{texture}'\n"))
+    let scene = open_manifest(&format!("model = '{model}'\nmaterial.'*'.color_texture = '{texture}'\n"))
         .expect("a valid scene");
     assert_eq!(scene.domains.len(), 4);
     let color_texture = scene.materials[0].color_texture.expect("a color texture");

@@ -146,7 +146,7 @@ mod tests {
             ("out/scene.toml", "model = '../../secret.obj'\n"),
             ("far/scene.toml", "model = '/etc/hostname'\n"),
             ("map/a.obj", "mtllib ../../secret.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"),
-            ("patch/scene.toml", "model = '../one/a.obj'\nmaterial.'*'.colour_texture = '../../x.png'\n"),
+            ("patch/scene.toml", "model = '../one/a.obj'\nmaterial.'*'.color_texture = '../../x.png'\n"),
         ]);
         std::fs::write(outer.path().join("secret.obj"), TRIANGLE).expect("a writable file");
         std::os::unix::fs::symlink(outer.path(), outer.path().join("root/link")).expect("a symbolic link");

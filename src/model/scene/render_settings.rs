@@ -39,7 +39,6 @@ impl UpAxis {
 #[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Ground {
-    #[serde(rename = "colour")]
     pub color: [f32; 3],
 }
 

@@ -21,7 +21,7 @@ pub(super) fn parse_output(scene: &Scene, picture: &v1::Picture) -> Result<(Fram
         return Err(invalid("largest", expected, scale_max));
     }
     let frame_output = match output {
-        v1::Output::Unspecified | v1::Output::Colour => FrameOutput::Color,
+        v1::Output::Unspecified | v1::Output::Color => FrameOutput::Color,
         v1::Output::Depth => FrameOutput::Depth,
         v1::Output::DepthWithGround => FrameOutput::DepthWithGround,
         v1::Output::Domains => FrameOutput::Domains,
@@ -65,7 +65,7 @@ fn parse_format(frame_output: FrameOutput, picture: &v1::Picture) -> Result<Fram
 /// A picture with only the fields of its output.
 pub(super) fn wire_output(output: FrameOutput) -> v1::Picture {
     let (wire_output, mode, largest) = match output {
-        FrameOutput::Color => (v1::Output::Colour, 0, 0.0),
+        FrameOutput::Color => (v1::Output::Color, 0, 0.0),
         FrameOutput::Depth => (v1::Output::Depth, 0, 0.0),
         FrameOutput::DepthWithGround => (v1::Output::DepthWithGround, 0, 0.0),
         FrameOutput::Domains => (v1::Output::Domains, 0, 0.0),

@@ -260,7 +260,7 @@ class Viewer:
             "limits": (texel, max(self.shadow["least_variance"], 1e-6), self.shadow["bleeding"], 0.0),
             "image": 0, "map": 1, "world_from_ray": column_major(world_from_ray), "half_size": half_size,
             "image_size": self.size, "ground_center": center,
-            "ground": (0, 0, 0, 0) if ground is None else (*look["ground"]["colour"], fade),
+            "ground": (0, 0, 0, 0) if ground is None else (*look["ground"]["color"], fade),
         }
         for program in self.programs.values():
             for name, value in uniforms.items():

@@ -20,8 +20,8 @@ def read_png(path):
         length, kind = struct.unpack(">I4s", data[offset : offset + 8])
         chunk = data[offset + 8 : offset + 8 + length]
         if kind == b"IHDR":
-            width, height, depth, colour = struct.unpack(">IIBB", chunk[:10])
-            assert (depth, colour) == (8, 2), f"{path}: expected 8-bit RGB, got {depth} bits of color type {colour}"
+            width, height, depth, color = struct.unpack(">IIBB", chunk[:10])
+            assert (depth, color) == (8, 2), f"{path}: expected 8-bit RGB, got {depth} bits of color type {color}"
         elif kind == b"IDAT":
             compressed += chunk
         offset += 12 + length

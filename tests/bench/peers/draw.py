@@ -43,7 +43,7 @@ void main() { world = position; surface_normal = normal; texture_uv = uv; gl_Pos
 FRAGMENT = """#version 430
 uniform mat4 map_from_world; uniform vec3 eye, to_sun, sunlight, skylight; uniform vec4 limits;
 uniform sampler2D cloth;
-in vec3 world; in vec3 surface_normal; centroid in vec2 texture_uv; out vec4 colour;
+in vec3 world; in vec3 surface_normal; centroid in vec2 texture_uv; out vec4 color;
 %s
 float srgb(float c) { return c <= 0.0031308 ? 12.92 * c : 1.055 * pow(c, 1.0 / 2.4) - 0.055; }
 void main() {
@@ -57,7 +57,7 @@ void main() {
         light += sun_visibility(map_position, cosine) * sunlight * (cosine * tint + 0.2 * pow(specular, 24.0));
     }
     light = clamp(light, 0.0, 1.0);
-    colour = vec4(srgb(light.r), srgb(light.g), srgb(light.b), 1.0);
+    color = vec4(srgb(light.r), srgb(light.g), srgb(light.b), 1.0);
 }"""
 SUN_VISIBILITY = {
     # Nine comparisons, each filtered between four texels by the sampler. The bias against shadow acne has a constant and a
@@ -99,9 +99,9 @@ def light_box(points, to_sun, size):
     return matrix, (high - low)[:2].max() / size / (high - low)[2]
 
 
-def srgb(colour):
+def srgb(color):
     """The sRGB encoding of a linear color."""
-    return [12.92 * c if c <= 0.0031308 else 1.055 * c ** (1 / 2.4) - 0.055 for c in colour]
+    return [12.92 * c if c <= 0.0031308 else 1.055 * c ** (1 / 2.4) - 0.055 for c in color]
 
 
 class Peer:

@@ -83,8 +83,8 @@ def cloth_image():
     v, u = np.meshgrid((np.arange(IMAGE) + 0.5) / IMAGE, (np.arange(IMAGE) + 0.5) / IMAGE, indexing="ij")
     wave = lambda periods: 0.5 + 0.5 * np.sin(2 * np.pi * periods)
     light = 0.45 + 0.4 * wave(4 * u + wave(2 * v)) * wave(4 * v + wave(2 * u)) + 0.15 * wave(32 * u) * wave(32 * v)
-    colour = np.stack([0.86 - 0.2 * wave(v), 0.70 + 0.2 * wave(u + v), 0.52 + 0.2 * wave(2 * v - u)], axis=-1)
-    return (255 * np.clip(colour * light[..., None], 0, 1)).astype(np.uint8)
+    color = np.stack([0.86 - 0.2 * wave(v), 0.70 + 0.2 * wave(u + v), 0.52 + 0.2 * wave(2 * v - u)], axis=-1)
+    return (255 * np.clip(color * light[..., None], 0, 1)).astype(np.uint8)
 
 
 def write_png(path, rgb):

@@ -83,7 +83,7 @@ pub(crate) struct FakeServer {
     pub(crate) protocol_version: u32,
     /// The largest window of a step stream.
     pub(crate) window: u32,
-    /// Number of acknowledgements that may still be sent; unlimited unless a test restricts it.
+    /// Number of acknowledgments that may still be sent; unlimited unless a test restricts it.
     pub(crate) ack_permits: Semaphore,
     /// The accepted steps.
     pub(crate) steps: Mutex<Vec<v1::Step>>,

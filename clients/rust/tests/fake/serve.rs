@@ -300,7 +300,7 @@ impl FakeService {
                     Ok(()) => {
                         self.0.ack_permits.acquire().await.expect("an open semaphore").forget();
                         let stages = vec![v1::StageTime { stage: "deform".into(), milliseconds: 1.5 }];
-                        ResponseKind::Ack(v1::Acknowledgement { step: step.number, skipped: 0, stages })
+                        ResponseKind::Ack(v1::Acknowledgment { step: step.number, skipped: 0, stages })
                     }
                 },
                 None => continue,

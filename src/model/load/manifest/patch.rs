@@ -13,7 +13,6 @@ pub(super) struct MaterialPatch {
     specular: Option<[f32; 3]>,
     shininess: Option<f32>,
     alpha: Option<f32>,
-    #[serde(rename = "colour_texture")]
     color_texture: Option<String>,
     normal_texture: Option<String>,
     alpha_mode: Option<AlphaModeKey>,
@@ -51,7 +50,7 @@ impl MaterialPatch {
             path => lookup.load_texture(path).map(Some).map_err(|error| error.prefix_field(&field_of(key))),
         };
         let color_texture =
-            self.color_texture.as_deref().map(|path| load_texture(path, "colour_texture")).transpose()?;
+            self.color_texture.as_deref().map(|path| load_texture(path, "color_texture")).transpose()?;
         let normal_texture =
             self.normal_texture.as_deref().map(|path| load_texture(path, "normal_texture")).transpose()?;
         let new_texture_has_alpha =
@@ -115,7 +114,7 @@ mod tests {
         let base = || Material { color_texture: Some(9), specular: [0.5; 3], ..Material::default() };
         assert_eq!(patch_material("", base()).expect("a valid patch"), base());
         // The empty name removes the color texture. The alpha below 1 selects blending.
-        let text = "alpha = 0.5\ncolour_texture = ''\ndiffuse = [1, 0, 0]\nnormal_texture = 'solid'";
+        let text = "alpha = 0.5\ncolor_texture = ''\ndiffuse = [1, 0, 0]\nnormal_texture = 'solid'";
         let patched = patch_material(text, base()).expect("a valid patch");
         assert_eq!((patched.color_texture, patched.normal_texture), (None, Some(0)));
         assert_eq!((patched.diffuse, patched.specular), ([1.0, 0.0, 0.0], [0.5; 3]));
@@ -127,12 +126,12 @@ mod tests {
         let mask = |cutoff| AlphaMode::Mask { cutoff };
         let masked = || Material { alpha_mode: mask(0.3), ..Material::default() };
         for (text, base, alpha_mode) in [
-            ("colour_texture = 'leaf'", Material::default(), mask(0.5)),
-            ("colour_texture = 'solid'", Material::default(), AlphaMode::Opaque),
-            ("colour_texture = 'leaf'", masked(), mask(0.3)),
+            ("color_texture = 'leaf'", Material::default(), mask(0.5)),
+            ("color_texture = 'solid'", Material::default(), AlphaMode::Opaque),
+            ("color_texture = 'leaf'", masked(), mask(0.3)),
             ("alpha_mode = 'mask'", masked(), mask(0.3)),
             ("cutoff = 0.7", masked(), mask(0.7)),
-            ("colour_texture = 'leaf'\nalpha_mode = 'blend'", masked(), AlphaMode::Blend),
+            ("color_texture = 'leaf'\nalpha_mode = 'blend'", masked(), AlphaMode::Blend),
             ("alpha_mode = 'opaque'", masked(), AlphaMode::Opaque),
         ] {
             assert_eq!(patch_material(text, base).expect(text).alpha_mode, alpha_mode, "{text}");
@@ -142,7 +141,7 @@ mod tests {
     #[test]
     fn invalid_overrides_are_rejected_with_their_key() {
         for (text, start) in [
-            ("colour_texture = 'no'", "material 'white': colour_texture: file 'no': expected an existing file"),
+            ("color_texture = 'no'", "material 'white': color_texture: file 'no': expected an existing file"),
             ("cutoff = 0.5", "material 'white': cutoff: expected alpha_mode mask or no cutoff"),
             ("color_texture = 'leaf'", "toml: expected a patch, got unknown field `color_texture`"),
             ("alpha_mode = 'cut'", "toml: expected a patch, got unknown variant `cut`"),

@@ -148,7 +148,7 @@ fn follows_key_constrains_domains_by_name_prefix() {
 #[test]
 fn overrides_apply_per_material_and_per_entry() {
     let parts = read_parts(
-        "[material.red]\ncolour_texture = 'leaf.png'\n[material.'*']\nshininess = 9\n\
+        "[material.red]\ncolor_texture = 'leaf.png'\n[material.'*']\nshininess = 9\n\
          [[domain]]\nmodel = 'a.obj'\n[[domain]]\nmodel = 'a.obj'\nmaterial = { diffuse = [0, 1, 0] }\n",
     )
     .expect("a valid manifest");
@@ -188,7 +188,7 @@ fn eigenvalues_and_notes_become_metadata() {
 fn invalid_manifest_is_rejected_with_line_or_entry() {
     for (text, start) in [
         ("", "model: expected one model or [[domain]] entries, got neither"),
-        ("colour = 1\n", "line 1: expected the keys and values of a scene, got unknown field `colour`"),
+        ("color = 1\n", "line 1: expected the keys and values of a scene, got unknown field `color`"),
         ("model = 'a.obj'\nup = 'w'\n", "line 2: expected the keys and values of a scene, got unknown variant `w`"),
         ("model = \n", "line 1: expected the keys and values of a scene"),
         ("model = 'a.obj'\n[look]\nsky = 1\n", "line 3: expected the keys and values of a scene, got unknown field"),
@@ -202,8 +202,8 @@ fn invalid_manifest_is_rejected_with_line_or_entry() {
         ("model = 'a.obj'\nplacement.scale = inf\n", "domain 0 ('a.obj'): placement: transform[0]"),
         ("model = 'a.obj'\nmaterial.green.alpha = 1\n", "material: expected * or one of: red, got green"),
         (
-            "model = 'a.obj'\nmaterial.red.colour_texture = 'x.png'\n",
-            "domain 0 ('a.obj'): material 'red': colour_texture: file 'x.png'",
+            "model = 'a.obj'\nmaterial.red.color_texture = 'x.png'\n",
+            "domain 0 ('a.obj'): material 'red': color_texture: file 'x.png'",
         ),
         ("[[domain]]\nmodel = 'a.obj'\nparent = 'x'\n", "domain 0 ('a.obj'): parent: expected the name of a domain"),
         (

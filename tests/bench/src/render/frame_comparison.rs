@@ -39,7 +39,7 @@ pub struct FrameComparison {
     pub differing_ids: usize,
     pub pixels: usize,
     /// Color differences from OpenGL's image, 0 to 255.
-    #[serde(rename = "colours")]
+    #[serde(rename = "colors")]
     pub color_errors: ErrorDistribution,
     /// Times per pass of OpenGL with automatic culling; "frame" is the sum without readback.
     pub opengl: Vec<PassTime>,
@@ -204,7 +204,7 @@ pub(super) fn markdown(comparisons: &[FrameComparison]) -> String {
         "shade",
         "encode",
         "differing ids",
-        "colours: mean",
+        "colors: mean",
         "p99",
         "largest",
     ];

@@ -33,8 +33,8 @@ pub(super) fn markdown(report: &RenderReport) -> String {
 }
 
 /// Meaning of the columns of [`HEADER`].
-const EXPLANATION: &str = "Color errors are the largest difference of the three sRGB channels, 0 to 255. `colour` \
-columns compare with hard shadow rays, `intended colour` with the intended result of the variant: no shadow, a hard \
+const EXPLANATION: &str = "Color errors are the largest difference of the three sRGB channels, 0 to 255. `color` \
+columns compare with hard shadow rays, `intended color` with the intended result of the variant: no shadow, a hard \
 shadow, or the hard shadow filtered by the blur's footprint. `intended light`, `penumbra` and `bleeding` compare the \
 sun visibility with the intended result; `bleeding` is the mean sun visibility in the umbra. `flicker` is the change \
 of the color error from step to step. `frame` is the time of all passes except the readback. `encode` converts linear \
@@ -58,10 +58,10 @@ const HEADER: [&str; 25] = [
     "hidden",
     "MB",
     "shadow MB",
-    "colour mean",
+    "color mean",
     "p99",
     "largest",
-    "intended colour mean",
+    "intended color mean",
     "intended light mean",
     "penumbra",
     "bleeding",

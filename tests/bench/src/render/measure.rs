@@ -56,10 +56,10 @@ pub struct RenderRow {
     /// Messages about the bounds that the variant exceeds.
     pub faults: Vec<String>,
     /// Color errors against the reference with hard shadows, which is exact for a point light.
-    #[serde(rename = "colour")]
+    #[serde(rename = "color")]
     pub color_errors: ErrorDistribution,
     /// Color errors against the intended result.
-    #[serde(rename = "colour_of_aim")]
+    #[serde(rename = "color_of_aim")]
     pub intended_color_errors: ErrorDistribution,
     /// Errors of the sun visibility against the reference with hard shadows.
     #[serde(rename = "light")]

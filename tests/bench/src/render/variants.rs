@@ -40,7 +40,6 @@ pub enum ReferenceKind {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct ErrorLimits {
     /// Mean color error of a pixel, of 255.
-    #[serde(rename = "mean_colour")]
     pub mean_color: f64,
     /// Mean error of the sun visibility, of 1.
     pub mean_light: f64,

@@ -26,8 +26,8 @@ pub(super) enum Measurement {
     Rate(Option<Viewers>),
     /// Time from a step to its frame, over this number of steps.
     FrameLatency(Content, u64),
-    /// Time from a step to its acknowledgement, over this number of steps.
-    AcknowledgementLatency(u64),
+    /// Time from a step to its acknowledgment, over this number of steps.
+    AcknowledgmentLatency(u64),
     /// Vertices beside a plain TCP connection.
     Socket,
     /// Rate over a connection with a long round trip.
@@ -64,7 +64,7 @@ impl Contents {
     }
 }
 
-/// Steps of the latency of frames and of acknowledgements.
+/// Steps of the latency of frames and of acknowledgments.
 const fn latency_steps(size: Size) -> [u64; 2] {
     match size {
         Size::Full => [10_000, 2_000],
@@ -85,7 +85,7 @@ pub(super) fn all(options: &StreamReportOptions) -> Vec<Case> {
 
 fn tree_cases(contents: &Contents, size: Size) -> Vec<Case> {
     let rate = |content, count, views| Measurement::Rate(Some(Viewers { content, count, views }));
-    let [frames, acknowledgements] = latency_steps(size);
+    let [frames, acknowledgments] = latency_steps(size);
     let delayed_replies = |content| Measurement::Delay(DelayedStream::Replies(content));
     let cases = [
         ("tree-png-1080p", rate(contents.png_1080p, 1, 1)),
@@ -98,7 +98,7 @@ fn tree_cases(contents: &Contents, size: Size) -> Vec<Case> {
         ("tree-vertices", rate(Content::Positions, 1, 1)),
         ("tree-vertices-compact", rate(Content::CompactPositions, 1, 1)),
         ("tree-steps", Measurement::Rate(None)),
-        ("tree-acknowledgements", Measurement::AcknowledgementLatency(acknowledgements)),
+        ("tree-acknowledgments", Measurement::AcknowledgmentLatency(acknowledgments)),
         ("tree-latency", Measurement::FrameLatency(contents.png_1080p, frames)),
         ("tree-socket", Measurement::Socket),
         ("tree-delay-steps", Measurement::Delay(DelayedStream::Steps)),
@@ -138,8 +138,8 @@ pub(crate) const CASE_HELP: &str = "Cases:
                  frames or positions per second at one viewer
   tree-png-360p-8-viewers, -32-viewers, -32-viewers-4-views
                  frames per second at the slowest viewer
-  tree-steps, tree-acknowledgements
-                 steps per second without viewers, and the time from a step to its acknowledgement
+  tree-steps, tree-acknowledgments
+                 steps per second without viewers, and the time from a step to its acknowledgment
   tree-latency   time from a step to its PNG of 1920x1080, with a step every 16.7 ms
   tree-socket, grid-socket
                  positions beside a plain TCP connection; the grid has 1.5 M vertices

@@ -40,7 +40,7 @@ pub struct LatencyResult {
     pub period_ms: Option<f64>,
     /// Steps that were sent more than 2 ms too late, because the previous step had not arrived.
     pub delayed_steps: usize,
-    /// Steps per second if steps are sent from memory without a wait for acknowledgements. Only for acknowledgements.
+    /// Steps per second if steps are sent from memory without a wait for acknowledgments. Only for acknowledgments.
     pub steps_per_second: Option<f64>,
     /// The stages of the server, and everything between them. The largest p50 is first. Only for frames.
     pub stages: Vec<StageLatency>,
@@ -153,22 +153,22 @@ async fn time_frames(url: &str, motion: &Motion, content: Content, steps: u64) -
     Ok(LatencyResult { period_ms, delayed_steps, stages: stages.latencies(), ..latency })
 }
 
-/// Measures the time from sending a step until its acknowledgement, with one step in flight, and the rate of steps that
-/// do not wait for acknowledgements.
+/// Measures the time from sending a step until its acknowledgment, with one step in flight, and the rate of steps that
+/// do not wait for acknowledgments.
 ///
 /// # Errors
 /// `Fault` when the server rejects a step.
-pub(super) fn measure_acknowledgements(session: &Session, steps: u64) -> Result<LatencyResult> {
+pub(super) fn measure_acknowledgments(session: &Session, steps: u64) -> Result<LatencyResult> {
     let motion = session.motion(steps.min(super::RECORDED_STEPS))?;
     session.runtime.block_on(async {
-        let times_ms = time_acknowledgements(&session.client, motion, steps).await?;
+        let times_ms = time_acknowledgments(&session.client, motion, steps).await?;
         let steps_per_second = Some(motion::measure_rate(&session.client, motion, steps).await?);
-        let latency = LatencyResult::new(["step sent", "acknowledgement received"], times_ms)?;
+        let latency = LatencyResult::new(["step sent", "acknowledgment received"], times_ms)?;
         Ok(LatencyResult { steps_per_second, ..latency })
     })
 }
 
-async fn time_acknowledgements(client: &Client, motion: &Motion, steps: u64) -> Result<Vec<f64>> {
+async fn time_acknowledgments(client: &Client, motion: &Motion, steps: u64) -> Result<Vec<f64>> {
     let mut writer = motion::open_writer(client, Some(1)).await?;
     let mut times_ms = Vec::new();
     for number in 0..WARM_UP_STEPS + steps {

@@ -13,7 +13,7 @@ use crate::markdown_table::{dash, table};
 /// How a rate and the rates of the stages are defined.
 const RATE_NOTE: &str = "The server, the physics process and each viewer are separate processes of this machine. A viewer \
 that receives n replies in a time t, from the first to the last reply, has the rate (n - 1) / t. The rate of a run is that \
-of its slowest viewer, or without viewers that of the physics process, from its first step to its last acknowledgement. \
+of its slowest viewer, or without viewers that of the physics process, from its first step to its last acknowledgment. \
 The rate of a case is the median of its runs. Every step is lossless.
 
 The rate of a stage alone is the number of threads that run it in parallel, divided by its median time per step in the \

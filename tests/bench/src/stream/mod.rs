@@ -186,8 +186,8 @@ fn measure_case(
         Measurement::FrameLatency(content, steps) => {
             latency::measure_frames(session, content, steps).map(CaseResult::Latency)
         }
-        Measurement::AcknowledgementLatency(steps) => {
-            latency::measure_acknowledgements(session, steps).map(CaseResult::Latency)
+        Measurement::AcknowledgmentLatency(steps) => {
+            latency::measure_acknowledgments(session, steps).map(CaseResult::Latency)
         }
         Measurement::Socket => compare_with_socket(session, options).map(CaseResult::Socket),
         Measurement::Delay(stream) => delay::measure(session, stream, options).map(CaseResult::Delay),

@@ -118,8 +118,8 @@ pub(super) async fn open_writer(client: &Client, window: Option<u32>) -> Result<
     client.drive(&request).await.map_err(fault_in("report"))
 }
 
-/// Sends steps without a wait for acknowledgements. Returns the steps per second, from the first step to the last
-/// acknowledgement.
+/// Sends steps without a wait for acknowledgments. Returns the steps per second, from the first step to the last
+/// acknowledgment.
 pub(super) async fn measure_rate(client: &Client, motion: &Motion, steps: u64) -> Result<f64> {
     let mut writer = open_writer(client, None).await?;
     let start = Instant::now();

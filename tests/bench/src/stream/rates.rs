@@ -58,7 +58,7 @@ pub struct RateResult {
     /// are no clients.
     pub per_second: f64,
     /// The other results are those of the run with the median rate. Steps per second of the physics process, from its
-    /// first step to its last acknowledgement.
+    /// first step to its last acknowledgment.
     pub steps_per_second: f64,
     /// Bytes of a reply on average; `None` without viewers.
     pub reply_bytes: Option<f64>,
