@@ -36,6 +36,9 @@ pub(super) struct Args {
     /// Steps of each run [default: 300, 10 with --quick].
     #[arg(long, value_parser = clap::value_parser!(u64).range(2..=100_000))]
     steps: Option<u64>,
+    /// Steps of the cases that measure latency [default: 10000 frames and 2000 acknowledgments, 200 with --quick].
+    #[arg(long, value_parser = clap::value_parser!(u64).range(2..=100_000))]
+    latency_steps: Option<u64>,
     /// Runs of each rate, of which the median is reported [default: 3, 1 with --quick].
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..=1_000))]
     repeat: Option<u32>,
@@ -73,6 +76,7 @@ fn report_options(args: &Args) -> StreamReportOptions {
         scenes: args.scenes.clone(),
         cases: args.cases.clone(),
         steps: args.steps.unwrap_or(default_steps),
+        latency_steps: args.latency_steps,
         repeat: args.repeat.unwrap_or(default_repeat) as usize,
         size,
     }
@@ -136,7 +140,15 @@ mod tests {
 
     #[test]
     fn quick_reports_have_fewer_steps_and_runs() {
-        let args = Args { out: "out".into(), scenes: None, cases: vec![], steps: None, repeat: None, quick: false };
+        let args = Args {
+            out: "out".into(),
+            scenes: None,
+            cases: vec![],
+            steps: None,
+            latency_steps: None,
+            repeat: None,
+            quick: false,
+        };
         let options = report_options(&args);
         assert_eq!((options.steps, options.repeat, options.size), (300, 3, Size::Full));
         let options = report_options(&Args { quick: true, repeat: Some(2), ..args });

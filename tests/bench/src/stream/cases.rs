@@ -65,27 +65,27 @@ impl Contents {
 }
 
 /// Steps of the latency of frames and of acknowledgments.
-const fn latency_steps(size: Size) -> [u64; 2] {
-    match size {
+fn latency_steps(options: &StreamReportOptions) -> [u64; 2] {
+    let defaults = match options.size {
         Size::Full => [10_000, 2_000],
         Size::Quick => [200, 200],
-    }
+    };
+    options.latency_steps.map_or(defaults, |steps| [steps; 2])
 }
 
 /// All cases. Scenes of a folder are included if the options name the folder.
 pub(super) fn all(options: &StreamReportOptions) -> Vec<Case> {
     let contents = Contents::of(options.size);
-    let mut cases = tree_cases(&contents, options.size);
+    let mut cases = tree_cases(&contents, latency_steps(options));
     if options.scenes.is_some() {
-        cases.extend(repository_cases(&contents, options.size));
+        cases.extend(repository_cases(&contents, latency_steps(options)));
     }
     cases.push(Case { name: "grid-socket", scene: SceneSource::Grid, measurement: Measurement::Socket });
     cases
 }
 
-fn tree_cases(contents: &Contents, size: Size) -> Vec<Case> {
+fn tree_cases(contents: &Contents, [frames, acknowledgments]: [u64; 2]) -> Vec<Case> {
     let rate = |content, count, views| Measurement::Rate(Some(Viewers { content, count, views }));
-    let [frames, acknowledgments] = latency_steps(size);
     let delayed_replies = |content| Measurement::Delay(DelayedStream::Replies(content));
     let cases = [
         ("tree-png-1080p", rate(contents.png_1080p, 1, 1)),
@@ -111,11 +111,10 @@ fn tree_cases(contents: &Contents, size: Size) -> Vec<Case> {
     cases.map(|(name, measurement)| Case { name, scene: SceneSource::Tree, measurement }).into()
 }
 
-fn repository_cases(contents: &Contents, size: Size) -> Vec<Case> {
+fn repository_cases(contents: &Contents, [frames, _]: [u64; 2]) -> Vec<Case> {
     const ALMOND: SceneSource = SceneSource::Repository("plants/almond");
     const BRIDGE: SceneSource = SceneSource::Repository("vega/simpleBridge");
     let rate = |content| Measurement::Rate(Some(Viewers::one(content)));
-    let [frames, _] = latency_steps(size);
     let cases = [
         ("almond-png-1080p", ALMOND, rate(contents.png_1080p)),
         ("almond-vertices", ALMOND, rate(Content::Positions)),
@@ -160,8 +159,14 @@ mod tests {
 
     #[test]
     fn names_are_unique_and_cases_of_a_scene_follow_each_other() {
-        let options =
-            StreamReportOptions { scenes: Some("data".into()), cases: vec![], steps: 1, repeat: 1, size: Size::Full };
+        let options = StreamReportOptions {
+            scenes: Some("data".into()),
+            cases: vec![],
+            steps: 1,
+            latency_steps: None,
+            repeat: 1,
+            size: Size::Full,
+        };
         let cases = all(&options);
         for (index, case) in cases.iter().enumerate() {
             assert!(cases[..index].iter().all(|other| other.name != case.name), "{}", case.name);

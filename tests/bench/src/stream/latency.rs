@@ -1,5 +1,6 @@
 //! Latency with one step in flight. The sender and the viewer are two connections of this process, so that one clock
-//! measures both ends. The server is another process.
+//! measures both ends. All tasks of this process run on one thread, so that no time includes the change from one thread of
+//! the client to another. The server is another process.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -110,7 +111,12 @@ impl StageSamples {
 /// `Fault` when the server rejects a request or a frame shows another step.
 pub(super) fn measure_frames(session: &Session, content: Content, steps: u64) -> Result<LatencyResult> {
     let motion = session.motion(steps.min(super::RECORDED_STEPS))?;
-    session.runtime.block_on(time_frames(&session.url(), motion, content, steps))
+    runtime()?.block_on(time_frames(&session.url(), motion, content, steps))
+}
+
+/// A runtime with one thread.
+fn runtime() -> Result<tokio::runtime::Runtime> {
+    tokio::runtime::Builder::new_current_thread().enable_all().build().map_err(fault_in("report"))
 }
 
 async fn time_frames(url: &str, motion: &Motion, content: Content, steps: u64) -> Result<LatencyResult> {
@@ -160,12 +166,13 @@ async fn time_frames(url: &str, motion: &Motion, content: Content, steps: u64) -
 /// `Fault` when the server rejects a step.
 pub(super) fn measure_acknowledgments(session: &Session, steps: u64) -> Result<LatencyResult> {
     let motion = session.motion(steps.min(super::RECORDED_STEPS))?;
-    session.runtime.block_on(async {
-        let times_ms = time_acknowledgments(&session.client, motion, steps).await?;
-        let steps_per_second = Some(motion::measure_rate(&session.client, motion, steps).await?);
-        let latency = LatencyResult::new(["step sent", "acknowledgment received"], times_ms)?;
-        Ok(LatencyResult { steps_per_second, ..latency })
-    })
+    let times_ms = runtime()?.block_on(async {
+        let client = connect(&session.url()).await?;
+        time_acknowledgments(&client, motion, steps).await
+    })?;
+    let steps_per_second = session.runtime.block_on(motion::measure_rate(&session.client, motion, steps))?;
+    let latency = LatencyResult::new(["step sent", "acknowledgment received"], times_ms)?;
+    Ok(LatencyResult { steps_per_second: Some(steps_per_second), ..latency })
 }
 
 async fn time_acknowledgments(client: &Client, motion: &Motion, steps: u64) -> Result<Vec<f64>> {

@@ -63,6 +63,8 @@ pub struct StreamReportOptions {
     pub cases: Vec<String>,
     /// Steps of each run.
     pub steps: u64,
+    /// Steps of the latencies of frames and of acknowledgments; `None` for the defaults of the size.
+    pub latency_steps: Option<u64>,
     /// Runs of each rate, of which the median is reported.
     pub repeat: usize,
     /// A quick report has pictures of a quarter of the width and height, a smaller grid and fewer repetitions.

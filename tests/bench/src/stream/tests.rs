@@ -112,7 +112,14 @@ fn encoding_beyond_its_bound_is_a_failure() {
 
 #[test]
 fn unknown_case_is_rejected_with_all_names() {
-    let options = StreamReportOptions { scenes: None, cases: vec!["x".into()], steps: 2, repeat: 1, size: Size::Quick };
+    let options = StreamReportOptions {
+        scenes: None,
+        cases: vec!["x".into()],
+        steps: 2,
+        latency_steps: None,
+        repeat: 1,
+        size: Size::Quick,
+    };
     let error = measure(&options, |_| Ok(())).expect_err("expected an unknown case").to_string();
     assert!(error.contains("tree-png-1080p, ") && error.ends_with("got x"), "{error}");
 }
