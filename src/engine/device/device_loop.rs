@@ -7,9 +7,10 @@
 //! served between the steps ([`PartialOutput`]). The commands of its scene wait until its last step is submitted. Each
 //! step is submitted when the device has finished the one before it, so the commands of other scenes never wait for more
 //! than one step. Only one large output is drawn at a time, because each needs its own images; another one waits. The
-//! limit is a number of samples ([`modalcast_render::Renderer::set_max_band_samples`]). A software renderer draws a frame of 1920 x 1080 pixels with four samples each in
-//! one step, so others wait about as long as for such a frame. The first frame of a scene is drawn in steps, too, because
-//! drivers finish the compilation of a program when it is used for the first time.
+//! limit is a number of samples ([`modalcast_render::Renderer::set_max_band_samples`]). A software renderer draws a frame
+//! of 1920 x 1080 pixels with four samples each in one step, so others wait about as long as for such a frame. The first
+//! frame of a scene is drawn in steps, too, because drivers finish the compilation of a program when it is used for the
+//! first time.
 //!
 //! The OpenGL buffers of a scene are created by its first output, or with CUDA when it is loaded. Before that, its textures
 //! are uploaded and its programs compiled in steps, between which other scenes are served. Other threads compute the

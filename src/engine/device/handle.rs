@@ -1,7 +1,6 @@
 //! Handle to the device thread. The thread takes commands (`command`) from a bounded queue of each scene
 //! (`command_queue`), owns the device context and every loaded scene (`device_loop`), and answers each command at most
-//! once. Vertices, picks and frames are
-//! answered asynchronously: their readback overlaps with the commands after them.
+//! once. Vertices, picks and frames are answered asynchronously: their readback overlaps with the commands after them.
 
 use std::sync::Arc;
 
