@@ -52,7 +52,8 @@ impl AffineTransform {
 /// The proper rotation and translation that map `rest` to `current` with the least squared error (Kabsch 1976). Fewer
 /// than three points, or collinear points, do not determine the rotation. In this case, the result is the translation
 /// of the mean.
-pub fn fit_rigid_transform(rest: &[Vector3<f64>], current: &[Vector3<f64>]) -> AffineTransform {
+#[cfg(test)]
+pub(crate) fn fit_rigid_transform(rest: &[Vector3<f64>], current: &[Vector3<f64>]) -> AffineTransform {
     let count = rest.len().min(current.len());
     if count == 0 {
         return AffineTransform::identity();
@@ -65,8 +66,51 @@ pub fn fit_rigid_transform(rest: &[Vector3<f64>], current: &[Vector3<f64>]) -> A
     AffineTransform { linear: rotation, translation: current_mean - rotation * rest_mean }
 }
 
+/// The smallest product D of [`closed_form_rotation`] for which its result is used. Its rounding error is about 1e-16 / D^2.
+const MIN_PAIR_SUM_PRODUCT: f64 = 0.02;
+
 /// The proper rotation nearest to a 3x3 correlation matrix; the identity if two of its singular values vanish.
-fn nearest_rotation(correlation: &Matrix3<f64>) -> Matrix3<f64> {
+pub(crate) fn nearest_rotation(correlation: &Matrix3<f64>) -> Matrix3<f64> {
+    closed_form_rotation(correlation).unwrap_or_else(|| rotation_by_svd(correlation))
+}
+
+/// The proper rotation nearest to a matrix M, without a singular value decomposition. With the singular values s of
+/// M / |M|, of which the last has the sign of det M, the rotation is a polynomial of M (Hoger and Carlson 1984):
+///
+/// ```text
+/// R D = (t^2 + 1) / 2 M + t cof M - M M^T M,      t = s1 + s2 + s3,      D = (s1 + s2) (s2 + s3) (s3 + s1)
+/// ```
+///
+/// t is the largest root of t^4 - 2 t^2 - 8 t det M + 1 - 4 |cof M|^2 (Horn 1987). Newton's method finds it from above.
+/// `None` if D is so small that the rotation is badly determined, or if M is not finite.
+fn closed_form_rotation(correlation: &Matrix3<f64>) -> Option<Matrix3<f64>> {
+    let norm = correlation.norm();
+    if !norm.is_normal() {
+        return None;
+    }
+    let matrix = correlation / norm;
+    let [x, y, z] = [matrix.column(0), matrix.column(1), matrix.column(2)];
+    let cofactors = Matrix3::from_columns(&[y.cross(&z), z.cross(&x), x.cross(&y)]);
+    let (determinant, constant) = (x.dot(&cofactors.column(0)), 1.0 - 4.0 * cofactors.norm_squared());
+    // The largest sum of three numbers whose squares add up to 1.
+    let mut sum = 3.0_f64.sqrt();
+    for _ in 0..16 {
+        let value = ((sum * sum - 2.0) * sum - 8.0 * determinant) * sum + constant;
+        let slope = 4.0 * ((sum * sum - 1.0) * sum - 2.0 * determinant);
+        if slope < 8.0 * MIN_PAIR_SUM_PRODUCT {
+            return None;
+        }
+        sum -= value / slope;
+        if value.abs() <= 2.0 * f64::EPSILON * slope {
+            break;
+        }
+    }
+    let pair_sum_product = 0.5 * (sum * sum - 1.0) * sum - determinant;
+    let polynomial = matrix * (0.5 * (sum * sum + 1.0)) + cofactors * sum - matrix * (matrix.transpose() * matrix);
+    (pair_sum_product >= MIN_PAIR_SUM_PRODUCT).then(|| polynomial / pair_sum_product)
+}
+
+fn rotation_by_svd(correlation: &Matrix3<f64>) -> Matrix3<f64> {
     let (compute_u, compute_v) = (true, true);
     let svd = correlation.svd(compute_u, compute_v);
     let (Some(left), Some(right)) = (svd.u, svd.v_t) else { return Matrix3::identity() };
@@ -143,5 +187,40 @@ mod tests {
         // A half turn about (1, 0, 0) moves (2, 0, 0) to the origin.
         let rotated_twice = quarter_turn.compose(&quarter_turn).apply(&Vector3::new(2.0, 0.0, 0.0));
         assert!((rotated_twice - Vector3::zeros()).norm() <= 1e-15);
+    }
+
+    /// Rotations of scaled shapes: spheres, disks, rods and mirrored shapes. The closed form leaves thin rods to the
+    /// singular value decomposition.
+    #[test]
+    fn closed_form_rotation_equals_singular_value_decomposition() {
+        let mut closed_count = 0;
+        for singular_values in [
+            [1.0, 1.0, 1.0],
+            [1.0, 1.0, 0.0],
+            [1.0, 0.3, 0.0],
+            [1.0, 0.5, -0.2],
+            [3.0, 2.0, 1e-9],
+            [1.0, 0.1, 0.1],
+            [1.0, 1e-3, 0.0],
+            [1.0, 1e-6, 1e-7],
+        ] {
+            for (index, scale) in [1e-150, 1e-9, 1.0, 1e12, 1e150].into_iter().enumerate() {
+                let axis = Vector3::new(1.0 + index as f64, -2.0, 0.5);
+                let left = AffineTransform::rotation_about(&axis, 0.7 * index as f64, &Vector3::zeros()).linear;
+                let right = AffineTransform::rotation_about(&Vector3::y(), 2.5, &Vector3::zeros()).linear;
+                let matrix = left * Matrix3::from_diagonal(&(Vector3::from(singular_values) * scale)) * right;
+                let expected = left * right;
+                let rotation = nearest_rotation(&matrix);
+                let [a, b, c] = singular_values;
+                let condition = singular_values[0] / (b + c);
+                let error = (rotation - expected).abs().max();
+                assert!(error <= 1e-12 * condition, "{a} {b} {c} x {scale}: {error}");
+                closed_count += usize::from(closed_form_rotation(&matrix).is_some());
+            }
+        }
+        assert_eq!(closed_count, 6 * 5);
+        for matrix in [Matrix3::zeros(), Matrix3::repeat(f64::NAN), Matrix3::repeat(f64::INFINITY)] {
+            assert_eq!(closed_form_rotation(&matrix), None);
+        }
     }
 }

@@ -5,8 +5,9 @@
 use nalgebra::Vector3;
 use rayon::prelude::*;
 
-use crate::affine::{AffineTransform, fit_rigid_transform};
-use crate::model::{DomainModel, Joint, MIN_DOMAINS_PER_THREAD, Model};
+use crate::affine::AffineTransform;
+use crate::attachments::Attachments;
+use crate::model::{DomainModel, MIN_DOMAINS_PER_THREAD, Model};
 
 /// Computes `world_from_domain` of every domain at the coordinates `q` of the scene. `local_transforms` has an optional
 /// motion of each domain within its own frame, for example the rotation of a leaf about its stalk. The list may be
@@ -16,19 +17,10 @@ pub fn compute_transforms(
     q: &[f64],
     local_transforms: &[Option<AffineTransform>],
 ) -> Vec<AffineTransform> {
-    compose_transforms(model, &deformed_attachments(model, q), local_transforms)
+    compose_transforms(model, &Attachments::new(model).deform(model, q), local_transforms)
 }
 
-/// `parent_from_child` of every domain at q. For a domain without a parent this is its placement in the world.
-pub fn deformed_attachments(model: &Model, q: &[f64]) -> Vec<AffineTransform> {
-    let attachment = |domain: &DomainModel| match &domain.joint {
-        None => domain.placement,
-        Some(joint) => deformed_attachment(&model.domains[joint.parent], joint, q),
-    };
-    model.domains.par_iter().with_min_len(MIN_DOMAINS_PER_THREAD).map(attachment).collect()
-}
-
-/// [`compute_transforms`] from the result of [`deformed_attachments`].
+/// [`compute_transforms`] from the result of [`Attachments::deform`].
 pub fn compose_transforms(
     model: &Model,
     attachments: &[AffineTransform],
@@ -49,19 +41,6 @@ pub fn compose_transforms(
         world_from_domain.push(local_transform.map_or(world_from_attached, |local| world_from_attached.compose(local)));
     }
     world_from_domain
-}
-
-/// `parent_from_child` at q: its value at rest, moved by the rigid transform that fits the displacement of the parent's
-/// attachment vertices.
-fn deformed_attachment(parent: &DomainModel, joint: &Joint, q: &[f64]) -> AffineTransform {
-    if parent.rank == 0 || joint.attachment_samples.is_empty() {
-        return joint.parent_from_child;
-    }
-    let q = parent.q(q);
-    let samples = || joint.attachment_samples.iter().map(|index| &parent.samples[*index]);
-    let rest: Vec<_> = samples().map(|sample| sample.rest_position).collect();
-    let current: Vec<_> = samples().map(|sample| sample.deformed_position(q)).collect();
-    fit_rigid_transform(&rest, &current).compose(&joint.parent_from_child)
 }
 
 /// Measures how far joints open: by how much the distances between a child's base vertex and the attachment vertices of
@@ -116,7 +95,7 @@ fn joint_distances(model: &Model, q: &[f64], world_from_domain: &[AffineTransfor
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
-    use crate::model::Sample;
+    use crate::model::{Joint, Sample};
     use nalgebra::Matrix3;
     use std::collections::BTreeMap;
 

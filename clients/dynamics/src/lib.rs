@@ -4,7 +4,8 @@
 //! | module | what it does |
 //! |---|---|
 //! | `model` | converts a scene description into domain models: rank, joints, selected rows of U |
-//! | `affine` | affine transforms, and the rigid transform that best fits displaced points |
+//! | `affine` | affine transforms, and the rotation nearest to a matrix |
+//! | `attachments` | the rigid transforms of joints as functions of q, fitted to displaced vertices |
 //! | `hierarchy` | computes transforms that keep every joint closed, and measures the remaining gap |
 //! | `parameters` | reads and validates eigenvalues and damping ratios |
 //! | `oscillator` | integrates one linear mode over a step, exactly |
@@ -23,6 +24,7 @@
 #![cfg_attr(not(test), deny(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::print_stdout))]
 
 pub mod affine;
+pub mod attachments;
 pub mod bridge;
 pub mod cubic;
 pub mod divergence;

@@ -10,8 +10,9 @@ use rayon::prelude::*;
 use super::crown::Crown;
 use super::excitation::WindExcitation;
 use super::response::{Integrator, Response};
+use crate::attachments::Attachments;
 use crate::error::Result;
-use crate::hierarchy::compute_transforms;
+use crate::hierarchy::compose_transforms;
 use crate::model::{DomainModel, MIN_DOMAINS_PER_THREAD, Model};
 use crate::parameters::ModalParameters;
 
@@ -114,12 +115,13 @@ pub(super) fn calibrate(
     target: &SwayTarget,
 ) -> Result<Calibration> {
     let response = record_unit_response(model, excitation, parameters)?;
+    let attachments = Attachments::new(model);
     // A `strength` is the common factor of all gains, before the bending limits; it is not the wind strength.
     let evaluate = |strength: f64| {
         let gains = target.compute_gains(model, strength, &response.bending);
         let sway = |unit_q: &Vec<f64>| {
             let q = scale_response(model, unit_q, &gains);
-            crown.sway(model, &q, &compute_transforms(model, &q, &[]))
+            crown.sway(model, &q, &compose_transforms(model, &attachments.deform(model, &q), &[]))
         };
         let sway_fraction = response.coordinates.iter().map(sway).fold(0.0, f64::max);
         Calibration { gains, sway_fraction }

@@ -14,8 +14,9 @@ use nalgebra::Vector3;
 use serde_json::json;
 
 use crate::affine::AffineTransform;
+use crate::attachments::Attachments;
 use crate::error::{Result, check_option, invalid_input};
-use crate::hierarchy::{JointGapMeter, compose_transforms, deformed_attachments};
+use crate::hierarchy::{JointGapMeter, compose_transforms};
 use crate::model::{DomainModel, Model};
 use crate::parameters::ModalParameters;
 use crate::run::{Report, Scenario};
@@ -64,6 +65,7 @@ pub struct TreeScenario {
     /// The step that the next call of `compute_next_step` computes.
     next_step: u64,
     crown: Crown,
+    attachments: Attachments,
     gap_meter: JointGapMeter,
     calibration: Calibration,
     remarks: Vec<String>,
@@ -156,6 +158,7 @@ impl TreeScenario {
             viewer_response: None,
             next_step: 0,
             crown,
+            attachments: Attachments::new(&model),
             gap_meter: JointGapMeter::new(&model),
             remarks: create_remarks(&parameters, &options, &calibration),
             calibration,
@@ -215,7 +218,7 @@ impl Scenario for TreeScenario {
             viewer_response.add_to(&mut q);
         }
         // These depend only on the response of this step and on the last step, so they run concurrently.
-        let compute_attachments = || deformed_attachments(&self.model, &q);
+        let compute_attachments = || self.attachments.deform(&self.model, &q);
         let measure_last_step = || self.peaks();
         let ((attachments, earlier_peaks), (leaf_rotations, next_response)) = rayon::join(
             || rayon::join(compute_attachments, measure_last_step),
