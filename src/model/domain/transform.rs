@@ -27,10 +27,12 @@ impl Transform {
     /// # Errors
     /// `Invalid` with the entry that is not finite.
     pub fn new(entries: [f32; 12]) -> Result<Self> {
-        match entries.iter().position(|entry| !entry.is_finite()) {
-            None => Ok(Self(entries)),
-            Some(index) => Err(invalid(format!("transform[{index}]"), "a finite number", entries[index])),
+        // Without an early exit, the compiler vectorizes the check.
+        if entries.iter().fold(true, |are_finite, entry| are_finite & entry.is_finite()) {
+            return Ok(Self(entries));
         }
+        let index = entries.iter().position(|entry| !entry.is_finite()).unwrap_or_default();
+        Err(invalid(format!("transform[{index}]"), "a finite number", entries[index]))
     }
 
     /// A transform from its linear part and translation, rounded to f32.
@@ -84,12 +86,14 @@ impl Transform {
     /// Whether A is a rotation or reflection times a uniform scale s: A^T A deviates from s^2 I by at most 1e-4 s^2 per
     /// entry. Rounding A to f32 causes deviations of about 1e-7 s^2. Normals of such a domain transform like directions.
     pub fn is_similarity(self) -> bool {
-        let linear = self.linear();
-        let [a, b, c] = [0, 1, 2].map(|column| linear.column(column).into_owned());
-        let squared_scale = (a.dot(&a) + b.dot(&b) + c.dot(&c)) / 3.0;
+        let column = |index: usize| [0, 4, 8].map(|row| f64::from(self.0[row + index]));
+        let dot = |a: [f64; 3], b: [f64; 3]| a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+        let [a, b, c] = [column(0), column(1), column(2)];
+        let squared_lengths = [dot(a, a), dot(b, b), dot(c, c)];
+        let squared_scale = squared_lengths.iter().sum::<f64>() / 3.0;
         let limit = 1e-4 * squared_scale.max(f64::MIN_POSITIVE);
-        let has_equal_scales = [a, b, c].iter().all(|column| (column.dot(column) - squared_scale).abs() <= limit);
-        has_equal_scales && [a.dot(&b), a.dot(&c), b.dot(&c)].iter().all(|product| product.abs() <= limit)
+        let has_equal_scales = squared_lengths.iter().all(|length| (length - squared_scale).abs() <= limit);
+        has_equal_scales && [dot(a, b), dot(a, c), dot(b, c)].iter().all(|product| product.abs() <= limit)
     }
 }
 

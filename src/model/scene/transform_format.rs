@@ -111,12 +111,9 @@ fn decode_f32_array<const N: usize>(bytes: &[u8]) -> [f32; N] {
 }
 
 /// Decodes N little-endian numbers of S bytes each, at any alignment. `bytes` has at least N * S bytes.
-fn decode_array<T, const N: usize, const S: usize>(bytes: &[u8], read: fn([u8; S]) -> T) -> [T; N] {
-    std::array::from_fn(|index| {
-        let mut word = [0; S];
-        word.copy_from_slice(&bytes[S * index..][..S]);
-        read(word)
-    })
+fn decode_array<T, const N: usize, const S: usize>(bytes: &[u8], read: impl Fn([u8; S]) -> T) -> [T; N] {
+    let words = &bytes.as_chunks::<S>().0[..N];
+    std::array::from_fn(|index| read(words[index]))
 }
 
 #[cfg(test)]
