@@ -59,15 +59,17 @@ fn decode_f16(field: &str, bytes: &[u8]) -> Result<Vec<f32>> {
 fn decode_u16_boxes(field: &str, vector_count: usize, bytes: &[u8]) -> Result<Vec<f32>> {
     let (boxes, codes) = bytes.split_at(BOX_BYTES * vector_count.div_ceil(BOX_VECTORS));
     let boxes: Vec<[[f32; 3]; 2]> = decode(field, boxes)?;
-    let codes: Vec<u16> = decode(field, codes)?;
-    let mut numbers = Vec::with_capacity(codes.len());
-    for (block, [min, max]) in codes.chunks(3 * BOX_VECTORS).zip(&boxes) {
-        let step: [f64; 3] =
-            std::array::from_fn(|axis| (f64::from(max[axis]) - f64::from(min[axis])) / f64::from(u16::MAX));
-        numbers.extend(block.iter().enumerate().map(|(index, code)| {
-            let axis = index % 3;
-            (f64::from(min[axis]) + f64::from(*code) * step[axis]) as f32
-        }));
+    let mut numbers = vec![0.0; 3 * vector_count];
+    let (vectors, _) = numbers.as_chunks_mut::<3>();
+    let blocks = codes.chunks(6 * BOX_VECTORS).zip(vectors.chunks_mut(BOX_VECTORS));
+    for ((codes, vectors), [min, max]) in blocks.zip(&boxes) {
+        let min = min.map(f64::from);
+        let step: [f64; 3] = std::array::from_fn(|axis| (f64::from(max[axis]) - min[axis]) / f64::from(u16::MAX));
+        let (codes, _) = codes.as_chunks::<6>();
+        for (vector, [x0, x1, y0, y1, z0, z1]) in vectors.iter_mut().zip(codes) {
+            let code = [[*x0, *x1], [*y0, *y1], [*z0, *z1]].map(|bytes| f64::from(u16::from_le_bytes(bytes)));
+            *vector = std::array::from_fn(|axis| (min[axis] + code[axis] * step[axis]) as f32);
+        }
     }
     Ok(numbers)
 }
