@@ -127,6 +127,7 @@ fn repository_cases(contents: &Contents, [frames, _]: [u64; 2]) -> Vec<Case> {
         ("bridge-png-720p", BRIDGE, rate(contents.png_720p)),
         ("bridge-vertices", BRIDGE, rate(Content::Positions)),
         ("bridge-steps", BRIDGE, Measurement::Rate(None)),
+        ("bridge-delay-steps", BRIDGE, Measurement::Delay(DelayedStream::Steps)),
     ];
     cases.map(|(name, scene, measurement)| Case { name, scene, measurement }).into()
 }
@@ -150,8 +151,8 @@ pub(crate) const CASE_HELP: &str = "Cases:
                  rates beside those of a Python program that draws the same scene (needs moderngl, pyzmq,
                  opencv-python-headless and numpy in MODALCAST_PYTHON; uses cupy on a GPU)
   almond-*, bridge-*
-                 scenes of --scenes: png, vertices, steps, and of the almond also latency, encodings
-                 and the Python program";
+                 scenes of --scenes: png, vertices, steps, of the almond also latency, encodings and the
+                 Python program, and of the bridge also steps over a round trip of 50 ms";
 
 #[cfg(test)]
 mod tests {

@@ -55,7 +55,7 @@ pub(super) fn measure(session: &Session, stream: DelayedStream, options: &Stream
     let steps = match stream {
         // Steps are fast. Their number reduces the part of the time that the last round trip takes.
         DelayedStream::Steps => 10 * options.steps,
-        DelayedStream::Replies(_) => options.steps,
+        DelayedStream::Replies(content) => rates::steps_of_run(Some(content), options),
     };
     let measure_at = |url: &str| measure_stream(session, stream, steps, url);
     let direct = measure_at(&session.url())?;

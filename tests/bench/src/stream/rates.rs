@@ -103,9 +103,9 @@ pub(super) fn measure(
     viewers: Option<Viewers>,
     options: &StreamReportOptions,
 ) -> Result<RateResult> {
-    let url = session.url();
+    let (url, steps) = (session.url(), steps_of_run(viewers.map(|viewers| viewers.content), options));
     run(session, viewers, WARM_UP_STEPS, &url)?;
-    let runs = (0..options.repeat).map(|_| run(session, viewers, options.steps, &url));
+    let runs = (0..options.repeat).map(|_| run(session, viewers, steps, &url));
     let mut runs: Vec<Run> = runs.collect::<Result<_>>()?;
     let rates: Vec<f64> = runs.iter().map(Run::per_second).collect();
     runs.sort_by(|a, b| a.per_second().total_cmp(&b.per_second()));
@@ -122,7 +122,7 @@ pub(super) fn measure(
         threads: std::thread::available_parallelism().map_or(1, std::num::NonZero::get),
         viewers: viewers.map(|viewers| (viewers.content, viewers.count)),
         views: &views,
-        physics_per_second: measure_physics(session, options.steps)?,
+        physics_per_second: measure_physics(session, steps)?,
         socket_per_second: reply_bytes.map(|bytes| measure_socket(bytes, options.size)).transpose()?,
     }
     .rates();
@@ -131,7 +131,7 @@ pub(super) fn measure(
         content: viewers.map(|viewers| viewers.content.name()),
         viewers: viewers.map_or(0, |viewers| viewers.count),
         views: viewers.map_or(0, |viewers| viewers.views),
-        steps: options.steps,
+        steps,
         runs: rates,
         per_second,
         steps_per_second: median_run.physics.steps_per_second,
@@ -141,6 +141,12 @@ pub(super) fn measure(
         stage_rates,
         of_slowest_stage: per_second / slowest_rate,
     })
+}
+
+/// Steps of a run. Steps without pictures are fast, so such a run has more of them, and its start and its end are a small
+/// part of it.
+pub(super) fn steps_of_run(content: Option<Content>, options: &StreamReportOptions) -> u64 {
+    if content.is_some_and(Content::is_picture) { options.steps } else { 4 * options.steps }
 }
 
 /// Starts the viewers, runs the physics process, and collects the results. The viewers connect to `viewer_url`.
