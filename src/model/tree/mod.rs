@@ -268,7 +268,7 @@ mod tests {
         assert_eq!(ranks.into_iter().collect::<Vec<_>>(), [0, 2]);
         for domain in &parts.domains {
             assert_eq!(domain.metadata.eigenvalues.len(), rank(domain));
-            assert_eq!(note(domain, "mass_normalised") == "true", rank(domain) > 0);
+            assert_eq!(note(domain, "mass_normalized") == "true", rank(domain) > 0);
         }
     }
 

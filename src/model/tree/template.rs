@@ -157,7 +157,7 @@ impl PartTemplate {
         }
         if self.rank > 0 {
             // U^T M U = I with the own and the carried mass M. U is in 1/sqrt(kg).
-            notes.insert("mass_normalised".into(), "true".into());
+            notes.insert("mass_normalized".into(), "true".into());
             notes.insert("q_unit".into(), "m sqrt(kg)".into());
         }
         if self.kind == PartKind::Leaf {

@@ -46,7 +46,7 @@ impl Provenance {
     pub fn line(&self) -> String {
         let devices: Vec<&str> = self.cuda.devices.iter().map(|device| device.name.as_str()).collect();
         let devices = if devices.is_empty() { "no CUDA device".into() } else { devices.join(", ") };
-        let build_note = if self.release { "" } else { ", unoptimised build" };
+        let build_note = if self.release { "" } else { ", unoptimized build" };
         format!("{}, {} threads; {devices}{build_note}", self.cpu, self.threads)
     }
 }
