@@ -1,6 +1,6 @@
-// Compute rasterizer: one sample per pixel. For each sample it finds the minimum depth and the index of the triangle
-// with that depth, by an atomic minimum of `depth << 32 | triangle`. The result does not depend on the order of
-// execution. A tile is 64 x 64 samples of the window.
+// Compute rasterizer: one sample per pixel. For each sample it finds the nearest depth and the index of the triangle
+// with that depth, by an atomic minimum of `~depth << 32 | triangle`: depth is 1 at the near plane and 0 at the far
+// plane. The result does not depend on the order of execution. A tile is 64 x 64 samples of the window.
 //   raster           a thread per triangle of a range: culls the triangle, draws it if its rectangle has few samples,
 //                    or appends it to the medium or the large queue
 //   raster_cut_outs  the same for cut-out triangles

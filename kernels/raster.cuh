@@ -1,7 +1,7 @@
 // Triangle setup of the compute rasterizer: corners in clip space, clipping, snapping to 1/256 pixel, edge functions
 // and depth. Every float sum and product is rounded separately (no fused multiply-add), so that host and device give
 // the same bits. In window coordinates (pixels) y points down. Each pixel has one sample, at its center: the sample of
-// the first pixel is at (1/2, 1/2). raster.cu describes the macros DEPTH_ONLY and CUT_OUTS. Twin:
+// the first pixel is at (1/2, 1/2). Depth is reversed: 1 at the near plane, 0 at the far plane. raster.cu describes the macros DEPTH_ONLY and CUT_OUTS. Twin:
 // src/compute/reference/raster.rs.
 #pragma once
 
@@ -13,7 +13,7 @@ constexpr float MIN_W = 0x1p-100f;   // smallest accepted w; 1 / w overflows bel
 struct RasterArgs {
     unsigned long long positions;        // [vertices][3] f32
     unsigned long long triangles;        // [triangles][3] u32: indices of vertices
-    unsigned long long target;           // [height][width] u64: depth << 32 | triangle; with DEPTH_ONLY f32 depth (in, out)
+    unsigned long long target;           // [height][width] u64: ~depth << 32 | triangle; with DEPTH_ONLY f32 depth (in, out)
     unsigned long long medium_queue;     // [triangles] u32: triangles that `raster` leaves to `raster_warps`
     unsigned long long large_queue;      // [triangles] LargeTriangle: triangles that `raster` leaves to `raster_tiles`
     unsigned long long counters;         // RasterCounters: lengths of the queues
@@ -48,7 +48,7 @@ enum TriangleBin { SMALL, MEDIUM, LARGE, NOT_FINITE, OUTSIDE_FRUSTUM, DEGENERATE
 
 struct SnappedVertex {
     int x, y; // in 1/256 pixel
-    float z;  // window depth, 0 to 1
+    float z;  // window depth, 1 (near) to 0 (far)
 };
 
 struct ClippedPolygon {
@@ -104,20 +104,20 @@ __device__ inline bool is_outside(const float4 (&corners)[3]) {
            (corners[0].y > corners[0].w && corners[1].y > corners[1].w && corners[2].y > corners[2].w) ||
            (corners[0].y < -corners[0].w && corners[1].y < -corners[1].w && corners[2].y < -corners[2].w) ||
            (corners[0].z > corners[0].w && corners[1].z > corners[1].w && corners[2].z > corners[2].w) ||
-           (corners[0].z < -corners[0].w && corners[1].z < -corners[1].w && corners[2].z < -corners[2].w);
+           (corners[0].z < 0.0f && corners[1].z < 0.0f && corners[2].z < 0.0f);
 }
 
 // Signed distance of a corner from a clip plane; at least 0 on the inner side. Plane 0 is the near plane. Planes 1 to 4
 // are the sides of the guard band, the region around the window inside which snapped coordinates cannot overflow.
 __device__ inline float plane_distance(const RasterArgs& args, float4 corner, unsigned plane) {
     const float x = mul_rn(args.guard_x, corner.w), y = mul_rn(args.guard_y, corner.w);
-    return plane == 0 ? add_rn(corner.z, corner.w) : plane == 1 ? add_rn(x, -corner.x) : plane == 2 ? add_rn(x, corner.x)
+    return plane == 0 ? add_rn(corner.w, -corner.z) : plane == 1 ? add_rn(x, -corner.x) : plane == 2 ? add_rn(x, corner.x)
          : plane == 3 ? add_rn(y, -corner.y) : add_rn(y, corner.y);
 }
 
 __device__ inline bool is_inside_guard_band(const RasterArgs& args, float4 corner) {
     const float x = mul_rn(args.guard_x, corner.w), y = mul_rn(args.guard_y, corner.w);
-    return add_rn(corner.z, corner.w) >= 0.0f && add_rn(x, -corner.x) >= 0.0f && add_rn(x, corner.x) >= 0.0f &&
+    return add_rn(corner.w, -corner.z) >= 0.0f && add_rn(x, -corner.x) >= 0.0f && add_rn(x, corner.x) >= 0.0f &&
            add_rn(y, -corner.y) >= 0.0f && add_rn(y, corner.y) >= 0.0f && corner.w >= MIN_W;
 }
 
@@ -129,7 +129,7 @@ __device__ inline SnappedVertex snap(const RasterArgs& args, float4 corner) {
     SnappedVertex snapped;
     snapped.x = __float2int_rn(mul_rn(x, (float)SUBPIXEL_STEPS));
     snapped.y = __float2int_rn(mul_rn(y, (float)SUBPIXEL_STEPS));
-    snapped.z = add_rn(mul_rn(mul_rn(corner.z, inverse_w), 0.5f), 0.5f);
+    snapped.z = mul_rn(corner.z, inverse_w);
     return snapped;
 }
 
@@ -216,12 +216,12 @@ __device__ inline PixelRect pixel_rect(const RasterArgs& args, const ClippedPoly
     return pixel_rect(args, x0, y0, x1, y1);
 }
 
-// A triangle with its corners clockwise on the screen. EdgeInt is the type of edge functions; it must be wide enough
+// A triangle with its corners clockwise on the screen; a is the farthest corner. EdgeInt is the type of edge functions; it must be wide enough
 // for their values at all tested samples.
 template <typename EdgeInt>
 struct TriangleSetup {
     SnappedVertex a, b, c;
-    float inverse_area, depth_ab, depth_ac; // depth_ab and depth_ac: depth differences from a to b and from a to c
+    float slope_b, slope_c;                 // depth differences from a to b and from a to c, divided by the doubled area
     int min_edge_a, min_edge_b, min_edge_c; // `min_covered_edge` of the edge opposite to a, b and c
 
     // Minimum of the edge function at covered samples. It is 0 for a top or left edge, because such an edge covers the
@@ -233,12 +233,15 @@ struct TriangleSetup {
     // `doubled_area` is positive. `is_flipped` is true if v0, v1, v2 are counterclockwise on the screen.
     __device__ TriangleSetup(const SnappedVertex& v0, const SnappedVertex& v1, const SnappedVertex& v2, bool is_flipped,
                              EdgeInt doubled_area) {
-        a = v0;
-        b = is_flipped ? v2 : v1;
-        c = is_flipped ? v1 : v2;
-        inverse_area = __frcp_rn((float)doubled_area);
-        depth_ab = add_rn(b.z, -a.z);
-        depth_ac = add_rn(c.z, -a.z);
+        const SnappedVertex second = is_flipped ? v2 : v1, third = is_flipped ? v1 : v2;
+        const bool starts_at_second = second.z < v0.z && second.z <= third.z;
+        const bool starts_at_third = !starts_at_second && third.z < v0.z;
+        a = starts_at_second ? second : starts_at_third ? third : v0;
+        b = starts_at_second ? third : starts_at_third ? v0 : second;
+        c = starts_at_second ? v0 : starts_at_third ? second : third;
+        const float inverse_area = __frcp_rn((float)doubled_area);
+        slope_b = mul_rn(add_rn(b.z, -a.z), inverse_area);
+        slope_c = mul_rn(add_rn(c.z, -a.z), inverse_area);
         min_edge_a = min_covered_edge(b, c);
         min_edge_b = min_covered_edge(c, a);
         min_edge_c = min_covered_edge(a, b);
@@ -250,24 +253,24 @@ struct TriangleSetup {
         return (EdgeInt)(end.x - start.x) * (y - start.y) - (EdgeInt)(end.y - start.y) * (x - start.x);
     }
 
-    // Whether a pixel's sample lies inside the triangle and not behind the far plane. Sets `depth`, clamped to at least
-    // 0.
+    // Whether a pixel's sample lies inside the triangle and not behind the far plane. Sets `depth`, clamped to at most
+    // 1. a is the farthest corner, so no term of the sum is negative, and its relative error is a few roundings, also where depth is small.
     __device__ bool covers(int column, int row, float& depth) const {
         const int x = SUBPIXEL_STEPS * column + SUBPIXEL_STEPS / 2, y = SUBPIXEL_STEPS * row + SUBPIXEL_STEPS / 2;
         const EdgeInt edge_b = edge_function(c, a, x, y), edge_c = edge_function(a, b, x, y);
         if (edge_function(b, c, x, y) < min_edge_a || edge_b < min_edge_b || edge_c < min_edge_c) {
             return false;
         }
-        const float weight_b = mul_rn((float)edge_b, inverse_area), weight_c = mul_rn((float)edge_c, inverse_area);
-        const float z = add_rn(a.z, add_rn(mul_rn(weight_b, depth_ab), mul_rn(weight_c, depth_ac)));
-        depth = z > 0.0f ? z : 0.0f;
-        return z <= 1.0f;
+        const float z = add_rn(a.z, add_rn(mul_rn((float)edge_b, slope_b), mul_rn((float)edge_c, slope_c)));
+        depth = z < 1.0f ? z : 1.0f;
+        return z >= 0.0f;
     }
 };
 
 // Writes a sample if it is nearer than the target's. Depths are not negative, so their bits have the order of the
-// numbers. The plain read may be stale, but the target only decreases: if the comparison fails, the atomic would change
-// nothing. The alpha texture is read only for samples that pass the comparison.
+// numbers. A depth-only target takes the largest depth. Keys take the minimum of the inverted bits, so that at equal
+// depths the smallest triangle wins. The plain read may be stale, but the target only changes in one direction: if the
+// comparison fails, the atomic would change nothing. The alpha texture is read only for samples that pass the comparison.
 template <typename AlphaTestPolicy>
 __device__ inline void write_sample(const RasterArgs& args, const AlphaTestPolicy& alpha_test, int column, int row,
                                     float depth, unsigned triangle) {
@@ -275,11 +278,11 @@ __device__ inline void write_sample(const RasterArgs& args, const AlphaTestPolic
     const unsigned bits = __float_as_uint(depth);
 #ifdef DEPTH_ONLY
     unsigned* target = (unsigned*)args.target + sample;
-    if (bits < __ldcg(target) && alpha_test.passes_alpha_test(args, column, row)) {
-        atomicMin(target, bits);
+    if (bits > __ldcg(target) && alpha_test.passes_alpha_test(args, column, row)) {
+        atomicMax(target, bits);
     }
 #else
-    const unsigned long long key = (unsigned long long)bits << 32 | triangle;
+    const unsigned long long key = (unsigned long long)~bits << 32 | triangle;
     unsigned long long* target = (unsigned long long*)args.target + sample;
     if (key < __ldcg(target) && alpha_test.passes_alpha_test(args, column, row)) {
         atomicMin(target, key);

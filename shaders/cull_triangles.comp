@@ -57,7 +57,8 @@ ClipVertex project_vertex(vec3 world) {
     position.xy = to_cascade(position.xy, layer);
     magnitude.xy = magnitude.xy * abs(cascades.scale_offsets[layer].xy) + abs(cascades.scale_offsets[layer].zw);
 #endif
-    return ClipVertex(vec4(2.0 * position - 1.0, 1.0), vec4(ROUNDING * (2.0 * magnitude + 1.0), 0.0));
+    vec4 clip = vec4(2.0 * position.xy - 1.0, 1.0 - position.z, 1.0);
+    return ClipVertex(clip, vec4(ROUNDING * (vec3(2.0, 2.0, 1.0) * magnitude + 1.0), 0.0));
 }
 #else
 ClipVertex project_vertex(vec3 world) {
@@ -67,7 +68,7 @@ ClipVertex project_vertex(vec3 world) {
 }
 #endif
 
-// A vertex that is not finite is placed in front of the near plane, as `to_clip` does for the vertex shaders.
+// A vertex that is not finite is placed behind the far plane, as `to_clip` does for the vertex shaders.
 ClipVertex clip_vertex(vec3 world) {
     bool is_not_finite = any(isnan(world)) || any(isinf(world));
     if (is_not_finite) return ClipVertex(vec4(0.0, 0.0, -2.0, 1.0), vec4(0.0));
@@ -91,28 +92,29 @@ bool is_occluded(uvec2 min_pixel, uvec2 max_pixel, uvec2 size, float depth) {
     if (any(greaterThan(max_pixel - min_pixel, uvec2(3u)))) return false;
     for (uint y = min_pixel.y; y <= max_pixel.y; y++) {
         for (uint x = min_pixel.x; x <= max_pixel.x; x++) {
-            if (!(depths[level_offset + y * size.x + x] < depth)) return false;
+            if (!(depths[level_offset + y * size.x + x] > depth)) return false;
         }
     }
     return true;
 }
 #endif
 
-// Class of a triangle whose corners are all inside the clip planes. `position` is in pixels, `depth` from 0 to 1.
+// Class of a triangle whose corners are all inside the clip planes. `position` is in pixels, `depth` from 1 (near) to 0
+// (far).
 uint classify_unclipped(ClipVertex corners[3], bool is_single_sided) {
     vec2 size = vec2(size_packed & 0xFFFF, size_packed >> 16 & 0xFFFF), position[3];
-    float nearest = 1.0, depth[3], depth_error = 0.0, pixel_error = 0.0;
+    float nearest = 0.0, depth[3], depth_error = 0.0, pixel_error = 0.0;
     for (int corner = 0; corner < 3; corner++) {
         vec4 clip = corners[corner].clip, error_bound = corners[corner].error_bound;
         vec3 ndc = clip.xyz / clip.w;
         // Bound on the error of the quotient, plus its own rounding.
         vec3 ndc_error = (error_bound.xyz + abs(ndc) * error_bound.w) / (clip.w - error_bound.w) + FLOAT_ERROR * abs(ndc);
         position[corner] = (0.5 * ndc.xy + 0.5) * size;
-        depth[corner] = 0.5 * ndc.z + 0.5;
+        depth[corner] = ndc.z;
         vec2 corner_error = 0.5 * ndc_error.xy * size;
         pixel_error = max(pixel_error, max(corner_error.x, corner_error.y));
-        depth_error = max(depth_error, 0.5 * ndc_error.z);
-        nearest = min(nearest, depth[corner]);
+        depth_error = max(depth_error, ndc_error.z);
+        nearest = max(nearest, depth[corner]);
     }
     pixel_error += max(size.x, size.y) * FLOAT_ERROR + groups.subpixel_step.x;
     vec2 min_position = min(position[0], min(position[1], position[2])) - pixel_error;
@@ -139,15 +141,16 @@ uint classify_unclipped(ClipVertex corners[3], bool is_single_sided) {
     // `slope` is an upper bound of the depth slope per pixel, from Cramer's rule for the plane through the corners.
     // `margin` bounds the depth difference between the exact plane and the plane through the rounded corners, also at a
     // sample that is outside the triangle by the rounding error. `reach` bounds the distances, in pixels, that the
-    // rasterizer multiplies by the slope with rounding.
+    // rasterizer multiplies by the slope with rounding. All terms are relative to the depths of this triangle, so that
+    // the margin is also tight far from the camera, where depth is small.
     vec2 depth_change = abs(vec2(depth[1], depth[2]) - depth[0]) + 2.0 * depth_error;
     float slope = (depth_change.x * (abs(edge_ac.x) + abs(edge_ac.y)) + depth_change.y * (abs(edge_ab.x) + abs(edge_ab.y))) / min_area;
     vec2 extent = max_position - min_position;
     float reach = size.x + size.y + (extent.x + extent.y) * (1.0 + area_magnitude / min_area);
-    float margin = depth_error + 2.0 * pixel_error * slope + ROUNDING * (1.0 + slope * reach);
+    float margin = depth_error + 2.0 * pixel_error * slope + ROUNDING * (nearest + slope * reach);
     uvec2 min_pixel = uvec2(clamp(min_position, vec2(0.0), size)), max_pixel = uvec2(clamp(max_position, vec2(0.0), size));
     uvec2 last_pixel = uvec2(size) - 1u;
-    if (is_occluded(min(min_pixel, last_pixel), min(max_pixel, last_pixel), uvec2(size), nearest - margin)) return OCCLUDED;
+    if (is_occluded(min(min_pixel, last_pixel), min(max_pixel, last_pixel), uvec2(size), nearest + margin)) return OCCLUDED;
 #endif
     return VISIBLE;
 }
@@ -156,7 +159,7 @@ uint classify_triangle(uint triangle, bool is_single_sided) {
     uvec3 vertices = texelFetch(triangle_vertices, int(triangle)).xyz;
     ClipVertex corners[3];
     vec3 world[3];
-    // For x, y and z of clip space: whether all corners are certainly below -w, or above w.
+    // For x, y and z of clip space: whether all corners are certainly below the lower or above the upper clip plane.
     bvec3 is_below = bvec3(true), is_above = bvec3(true);
     bool is_inside = true;
     for (int corner = 0; corner < 3; corner++) {
@@ -164,12 +167,14 @@ uint classify_triangle(uint triangle, bool is_single_sided) {
         corners[corner] = clip_vertex(world[corner]);
         vec4 clip = corners[corner].clip, error_bound = corners[corner].error_bound;
         if (!all(lessThan(error_bound, vec4(LARGE)))) return VISIBLE;
-        vec3 margin = error_bound.xyz + error_bound.w, lower_distance = clip.xyz + clip.w, upper_distance = clip.w - clip.xyz;
+        // The planes are -w <= x <= w, -w <= y <= w and 0 <= z <= w.
+        vec3 lower_distance = vec3(clip.xy + clip.w, clip.z), upper_distance = clip.w - clip.xyz;
+        vec3 margin = error_bound.xyz + error_bound.w, lower_margin = vec3(margin.xy, error_bound.z);
         for (int axis = 0; axis < 3; axis++) {
-            is_below[axis] = is_below[axis] && lower_distance[axis] < -margin[axis];
+            is_below[axis] = is_below[axis] && lower_distance[axis] < -lower_margin[axis];
             is_above[axis] = is_above[axis] && upper_distance[axis] < -margin[axis];
         }
-        is_inside = is_inside && all(greaterThan(lower_distance, margin)) && all(greaterThan(upper_distance, margin))
+        is_inside = is_inside && all(greaterThan(lower_distance, lower_margin)) && all(greaterThan(upper_distance, margin))
             && clip.w > 2.0 * error_bound.w;
     }
     if (any(is_below) || any(is_above)) return OUTSIDE;

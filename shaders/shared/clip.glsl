@@ -1,6 +1,6 @@
-// Clip-space position of a vertex. If the position overflows, the vertex is placed in front of the near plane (z < -w),
-// and its world position is set to the origin. So no NaN reaches the rasterizer, and shading uses the same position as
-// rasterization.
+// Clip-space position of a vertex. Depth z / w is reversed: 1 at the near plane, 0 at the far plane. If the position
+// overflows, the vertex is placed behind the far plane (z < 0), and its world position is set to the origin. So no NaN
+// reaches the rasterizer, and shading uses the same position as rasterization.
 vec4 to_clip(inout vec3 world) {
     vec4 clip = frame.clip_from_world * vec4(world, 1.0);
     bool is_not_finite = any(isnan(clip)) || any(isinf(clip));

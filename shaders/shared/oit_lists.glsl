@@ -2,8 +2,9 @@
 //   fragment_counts  [height][width]  R32UI: blended fragments of the pixel
 //   cursors          [height][width]  R32UI: index of the first record of the pixel's list that is not filled yet
 //   records          [budget][2]      depth; triangle index plus 1 in the upper 28 bits, sample coverage in the lower 4
-// The depth is stored as the bits of a float from 0 to 1, which have the same order as the float. A sorted list begins
-// with the nearest record; at equal depth, with the latest triangle.
+// The depth is stored as the bits of 1 minus those of a float from 1 (near) to 0 (far). The bits have the same order as
+// the float, so the difference increases with the distance. A sorted list begins with the nearest record; at equal
+// depth, with the latest triangle.
 layout(r32ui, binding = 1) uniform uimage2D fragment_counts;
 layout(r32ui, binding = 2) uniform uimage2D cursors;
 layout(std430, binding = 3) buffer OitCounters {

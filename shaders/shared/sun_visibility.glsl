@@ -62,6 +62,10 @@ float depth_bias(int layer) {
     return frame.shadow_ground_plane.w / min(layer_scale.x, layer_scale.y) * length(light_depth_gradient) + 4e-7;
 }
 
+// The map stores 1 - depth, as all depth images. 0 is the value of a texel without a caster.
+float caster_depth(float stored) { return 1.0 - stored; }
+vec4 caster_depth(vec4 stored) { return 1.0 - stored; }
+
 // Depth of a texel without a caster.
 const float NO_CASTER_DEPTH = 1.0;
 #endif
@@ -70,7 +74,7 @@ const float NO_CASTER_DEPTH = 1.0;
 // Standard shadow map: 0 or 1, from the texel that contains the point.
 float shadow_visibility(vec3 position, int layer, vec3 normal) {
     vec2 texel = position.xy * frame.shadow.w;
-    float depth = texelFetch(shadow_map, ivec3(texel, layer), 0).x;
+    float depth = caster_depth(texelFetch(shadow_map, ivec3(texel, layer), 0).x);
     float receiver_depth = position.z - depth_bias(layer) + dot(receiver_plane_gradient(normal, layer), floor(texel) + 0.5 - texel);
     return depth >= NO_CASTER_DEPTH || receiver_depth <= depth ? 1.0 : 0.0;
 }
@@ -92,7 +96,7 @@ float shadow_visibility(vec3 position, int layer, vec3 normal) {
             vec2 column_weights = mix(vec2(TAPS[abs(x)], TAPS[abs(x + 1)]), vec2(TAPS[abs(x - 1)], TAPS[abs(x)]), fraction.x);
             vec2 corner = vec2(x, y);
             // The four texels around their common corner, in textureGather order (0, 1), (1, 1), (1, 0), (0, 0).
-            vec4 depth = textureGather(shadow_map, vec3((base_texel + corner + 1.0) / frame.shadow.w, float(layer)), 0);
+            vec4 depth = caster_depth(textureGather(shadow_map, vec3((base_texel + corner + 1.0) / frame.shadow.w, float(layer)), 0));
             float corner_depth = receiver_depth + dot(gradient, corner - fraction);
             vec4 receiver_depths = corner_depth + vec4(gradient.y, gradient.x + gradient.y, gradient.x, 0.0);
             vec4 is_lit = vec4(lessThanEqual(receiver_depths, depth));

@@ -7,11 +7,11 @@ const uint GROUND_ID = 0xFFFFFFFFu;
 #if SAMPLES > 1
 layout(binding = 21) uniform usampler2DMS ids;
 ivec2 id_image_size() { return textureSize(ids); }
-// Depth of the same samples. An id is valid only if its depth is less than 1. Multisampled ids are not cleared, because
+// Depth of the same samples. An id is valid only if its depth is above 0. Multisampled ids are not cleared, because
 // clearing four samples per pixel takes 0.59 ms at 1920 x 1080 on an H200, as long as clearing their depth.
 layout(binding = 26) uniform sampler2DMS visibility_depth;
 uint load_id(ivec2 pixel, int sample_index) {
-    bool is_valid = texelFetch(visibility_depth, pixel, sample_index).x < 1.0;
+    bool is_valid = texelFetch(visibility_depth, pixel, sample_index).x > 0.0;
     return is_valid ? texelFetch(ids, pixel, sample_index).x : NO_ID;
 }
 #else

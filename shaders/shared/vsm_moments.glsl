@@ -1,4 +1,5 @@
-// Inputs of the variance shadow map's blur: the moments m and m^2, with m = depth - 1/2.
+// Inputs of the variance shadow map's blur: the moments m and m^2, with m = depth - 1/2. Images and buffers store the
+// reversed depth 1 - depth.
 layout(binding = 0) uniform sampler2DArray source; // with FROM_DEPTH: depth; else: horizontally blurred moments
 #ifdef DEPTH_IN_BUFFER
 // Depth from the compute rasterizer, top row first.
@@ -24,13 +25,13 @@ float ground_moment(ivec2 texel, int side) {
 float centered_depth(ivec2 texel, int side) {
     ivec2 inside_texel = clamp(texel, ivec2(0), ivec2(side - 1));
 #ifdef DEPTH_IN_BUFFER
-    float depth = raster_depths[(side - 1 - inside_texel.y) * side + inside_texel.x];
+    float reversed_depth = raster_depths[(side - 1 - inside_texel.y) * side + inside_texel.x];
 #else
-    float depth = texelFetch(source, ivec3(inside_texel, layer), 0).x;
+    float reversed_depth = texelFetch(source, ivec3(inside_texel, layer), 0).x;
 #endif
     // An empty texel gets the depth of the ground instead of the far plane, although the ground casts no shadow. Then
     // Chebyshev's bound is exact on the ground: it equals the sum of the blur weights of the empty texels.
-    return depth >= 1.0 ? ground_moment(texel, side) : depth - 0.5;
+    return reversed_depth <= 0.0 ? ground_moment(texel, side) : 0.5 - reversed_depth;
 }
 
 vec2 load_moments(ivec2 texel, int side) {

@@ -151,7 +151,7 @@ fn render_color_map(
     frame::draw_color_map(&aov.bytes, aov.samples, args.size.to_array(), &legend)
 }
 
-/// The camera of the options. Its near and far planes, both 0, are fitted to the scene.
+/// The camera of the options. Its near and far planes are 0, so that nothing in front of it is clipped.
 fn camera(args: &Args, scene: &Scene) -> Camera {
     let (Some(eye), Some(target)) = (args.eye, args.target) else {
         return Camera::fit_to_scene(scene, args.size.width, args.size.height);

@@ -48,12 +48,12 @@ impl ExactTriangle {
             && distances.iter().any(|distance| distance.abs() <= SNAP_STEP)
     }
 
-    /// Depth at a sample, from 0 (near) to 1 (far).
+    /// Depth at a sample, from 1 (near) to 0 (far).
     pub(crate) fn depth(&self, sample: Vector3<f64>) -> f64 {
         // The edge values are the barycentric weights of the corners times a common factor, which the quotient removes.
-        // The quotient is z / w in clip space, from -1 to 1.
+        // The quotient is z / w in clip space.
         let edge_values = Vector3::from(self.edges.map(|edge| edge.dot(&sample)));
-        0.5 * edge_values.dot(&self.clip_z) / edge_values.dot(&self.clip_w) + 0.5
+        edge_values.dot(&self.clip_z) / edge_values.dot(&self.clip_w)
     }
 }
 

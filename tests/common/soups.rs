@@ -3,7 +3,7 @@
 
 use modalcast_compute::reference::raster::VisibilityBuffer;
 use modalcast_model::scene::{CullMode, DrawRange, Viewport};
-use nalgebra::{Matrix4, Point3, Vector3};
+use nalgebra::{Matrix4, Point3, Vector3, Vector4};
 
 use crate::scenes::Random;
 
@@ -52,13 +52,27 @@ impl Soup {
 /// A camera at the origin that looks along -z with a vertical field of view of 60 degrees.
 pub(crate) fn perspective_viewport(width: u32, height: u32, near: f64, far: f64) -> Viewport {
     let aspect = f64::from(width) / f64::from(height);
-    let clip = nalgebra::Perspective3::new(aspect, 60.0_f64.to_radians(), near, far);
-    Viewport::new(&clip.to_homogeneous(), width, height).expect("expected a valid viewport")
+    Viewport::new(&reversed_perspective(aspect, 60.0_f64.to_radians(), near, far), width, height)
+        .expect("expected a valid viewport")
 }
 
-/// A viewport that uses positions as clip-space coordinates.
+/// A perspective projection with the clip volume of [`Viewport`]: z / w is 1 at the near plane and 0 at the far plane.
+/// `far` may be infinite.
+fn reversed_perspective(aspect: f64, field_of_view: f64, near: f64, far: f64) -> Matrix4<f64> {
+    let focal = 1.0 / (0.5 * field_of_view).tan();
+    let mut clip = Matrix4::from_diagonal(&Vector4::new(focal / aspect, focal, 0.0, 0.0));
+    // near (far - w) / (far - near), for w = -z.
+    (clip[(2, 2)], clip[(2, 3)]) = (near / (far - near), near / (1.0 - near / far));
+    clip[(3, 2)] = -1.0;
+    clip
+}
+
+/// A viewport that uses x and y of positions as clip-space coordinates. z is from -1 (near) to 1 (far), and depth is
+/// 0.5 - 0.5 z.
 pub(crate) fn clip_space_viewport(width: u32, height: u32) -> Viewport {
-    Viewport::new(&Matrix4::identity(), width, height).expect("expected a valid viewport")
+    let mut clip = Matrix4::identity();
+    (clip[(2, 2)], clip[(2, 3)]) = (-0.5, 0.5);
+    Viewport::new(&clip, width, height).expect("expected a valid viewport")
 }
 
 /// Positions of triangles with random corners around random centers. Per axis, centers are within `extent` of the
@@ -113,7 +127,7 @@ pub(crate) fn all_soups() -> Vec<Soup> {
     let far_projection = {
         let eye = Point3::new(1e7, 1e7, 1e7 + 8.0);
         let view = Matrix4::look_at_rh(&eye, &Point3::new(1e7, 1e7, 1e7), &Vector3::y());
-        nalgebra::Perspective3::new(1.5, 0.9, 0.1, 100.0).to_homogeneous() * view
+        reversed_perspective(1.5, 0.9, 0.1, 100.0) * view
     };
     let far_positions: Vec<f32> =
         scattered_triangles(random, 300, 3.0, [2.0; 3]).into_iter().map(|coordinate| coordinate + 1e7).collect();
@@ -133,6 +147,13 @@ pub(crate) fn all_soups() -> Vec<Soup> {
         scattered_soup("huge", 60, 1.0, [1e4, 1e4, 0.9], clip_space_viewport(129, 65)),
         scattered_soup("through the near plane", 300, 1.0, [2.0; 3], perspective_viewport(160, 120, 0.1, 10.0)),
         scattered_soup("near 1e-6, far 1e9", 100, 1.0, [9.0; 3], perspective_viewport(160, 120, 1e-6, 1e9)),
+        scattered_soup(
+            "near 2^-64, no far plane",
+            300,
+            1.0,
+            [9.0; 3],
+            perspective_viewport(160, 120, 5e-20, f64::INFINITY),
+        ),
         Soup::with_separate_triangles("behind the eye", positions_behind, perspective_viewport(64, 64, 0.1, 10.0)),
         scattered_soup("beyond the far plane", 200, 6.0, [4.0; 3], perspective_viewport(90, 90, 0.1, 4.0)),
         Soup::with_separate_triangles("non-finite positions", non_finite, clip_space_viewport(97, 101)),

@@ -210,6 +210,55 @@ fn gpu_shading_of_equal_ids_equals_opengl() {
     );
 }
 
+/// T moves the scene by 4096 units in f32, so that the bounds of a frame span the distance to the rest state. The camera
+/// has no clip planes of its own. Both rasterizers draw the same visible surfaces.
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_scene_moved_by_4096_units_is_drawn_by_both_rasterizers() {
+    let scene = scenes::random_scene(
+        &[(3000, 12), (50, 0), (700, 3)],
+        scenes::RandomSceneOptions { instances: 5, normal_maps: false, rigid_transforms: false },
+    );
+    // Pixels without a surface are black.
+    let look = RenderSettings {
+        antialias: Antialiasing::None,
+        ground: None,
+        zenith: [0.0; 3],
+        horizon: [0.0; 3],
+        ..scene.look
+    };
+    let scene = Scene::new(SceneParts { look, ..scene.parts() }).expect("expected a valid scene");
+    let camera = Camera::fit_to_scene(&scene, SIZE[0], SIZE[1]);
+    let draw_moved = |raster: RasterPolicy, shift: f32| {
+        let mut context = open_device();
+        let settings = BackendSettings { raster, ..BackendSettings::default() };
+        let mut loaded_scene = context.load_scene(&scene, settings).expect("expected the scene to load");
+        let mut state = SceneState::rest(&scene);
+        state.transforms.iter_mut().for_each(|transform| transform.0[3] += shift);
+        loaded_scene.deform(&state).expect("expected the step to succeed");
+        let moved_camera = camera.relative_to([-f64::from(shift), 0.0, 0.0]);
+        let image =
+            context.draw(&mut loaded_scene, &moved_camera, FrameSize::new(SIZE[0], SIZE[1])).expect("expected a frame");
+        context.unload_scene(loaded_scene);
+        image
+    };
+    let count_different = |left: &FrameImage, right: &FrameImage| {
+        let pixels = left.rgba.chunks_exact(4).zip(right.rgba.chunks_exact(4));
+        let is_different =
+            |(left, right): &(&[u8], &[u8])| left.iter().zip(*right).any(|(a, b)| a.abs_diff(*b) > COLOR_TOLERANCE);
+        pixels.filter(is_different).count()
+    };
+    let [opengl, cuda] = [RasterPolicy::OpenGl, RasterPolicy::Cuda].map(|raster| draw_moved(raster, 4096.0));
+    assert_eq!((opengl.raster_backends, cuda.raster_backends), (OPENGL_BACKENDS, CUDA_BACKENDS));
+    // Edges of triangles, and intersections of triangles.
+    let (different, pixel_count) = (count_different(&opengl, &cuda), opengl.rgba.len() / 4);
+    assert!(different < pixel_count / 50, "{different} of {pixel_count} pixels differ");
+    let count_surface = |image: &FrameImage| image.rgba.chunks_exact(4).filter(|pixel| pixel[..3] != [0; 3]).count();
+    let (rest, moved) = (count_surface(&draw_moved(RasterPolicy::Cuda, 0.0)), count_surface(&cuda));
+    eprintln!("{different} pixels differ; surfaces cover {rest} pixels at rest and {moved} after the move");
+    assert!(rest > 1000 && moved.abs_diff(rest) < rest / 20, "{rest} pixels at rest, {moved} after the move");
+}
+
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_cuda_frames_report_their_rasterizer_and_repeat_bits() {

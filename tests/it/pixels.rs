@@ -5,6 +5,7 @@ mod aov;
 mod below_ground;
 mod culling;
 mod culling_real;
+mod depth_range;
 mod draw_region;
 mod far;
 mod ground;

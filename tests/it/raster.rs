@@ -4,7 +4,7 @@
 
 use modalcast_compute::reference::raster::{
     ClippedPolygon, CullReason, EMPTY_KEY, SnappedVertex, VisibilityBuffer, clipped_polygon, depth_at, edge,
-    fan_triangles,
+    fan_triangles, sample_key, with_farthest_first,
 };
 use modalcast_model::scene::{CullMode, DrawRange, Viewport};
 
@@ -63,10 +63,10 @@ struct TileEntry {
 }
 
 impl RasterTraversal<'_> {
-    /// Keeps the key with the smaller depth, and for equal depths the key with the lower triangle.
+    /// Keeps the key of the nearer sample, and for equal depths the key with the lower triangle.
     fn write_sample(&mut self, column: i32, row: i32, depth: f32, triangle: u32) {
         let index = row as usize * self.soup.viewport.size()[0] as usize + column as usize;
-        self.keys[index] = self.keys[index].min(u64::from(depth.to_bits()) << 32 | u64::from(triangle));
+        self.keys[index] = self.keys[index].min(sample_key(depth, triangle));
     }
 
     fn clipped_polygon(&self, triangle: u32, cull_mode: CullMode) -> Result<ClippedPolygon, CullReason> {
@@ -119,20 +119,18 @@ impl RasterTraversal<'_> {
         };
         // A fan divides a polygon into triangles that share its first corner. The polygon is not clipped, so its fan
         // is one triangle.
-        let [a, b, c] = fan_triangles(clipped_polygon)[0];
+        let [a, b, c] = with_farthest_first(&fan_triangles(clipped_polygon)[0]);
         let area = edge(&a, &b, c.x, c.y);
         let [x0, y0, x1, y1] = clipped_polygon.samples;
         for (row, column) in (y0..=y1).flat_map(|row| (x0..=x1).map(move |column| (row, column))) {
             let (x, y) = (sample_coordinate(column), sample_coordinate(row));
             // The edge function is positive inside of the edge and zero on it.
-            let is_inside = [(&b, &c), (&c, &a), (&a, &b)]
-                .iter()
-                .all(|(from, to)| edge(from, to, x, y) >= i32::from(!owns_edge(from, to)));
-            let [weight_b, weight_c] =
-                [edge(&c, &a, x, y), edge(&a, &b, x, y)].map(|edge_value| edge_value as f32 * (1.0 / area as f32));
-            let z = a.z + (weight_b * (b.z - a.z) + weight_c * (c.z - a.z));
-            if is_inside && z <= 1.0 {
-                self.write_sample(column, row, if z > 0.0 { z } else { 0.0 }, triangle);
+            let edges = [(&b, &c), (&c, &a), (&a, &b)];
+            let is_inside = edges.iter().all(|(from, to)| edge(from, to, x, y) >= i32::from(!owns_edge(from, to)));
+            let [slope_b, slope_c] = [b, c].map(|corner| (corner.z - a.z) * (1.0 / area as f32));
+            let z = a.z + (edge(&c, &a, x, y) as f32 * slope_b + edge(&a, &b, x, y) as f32 * slope_c);
+            if is_inside && z >= 0.0 {
+                self.write_sample(column, row, if z < 1.0 { z } else { 1.0 }, triangle);
             }
         }
     }
@@ -315,7 +313,7 @@ fn fan_clipped_by_near_plane_covers_every_sample_once() {
 }
 
 /// The id of a triangle is its index in the list that is drawn. A nearer triangle is visible regardless of its id. The
-/// depth of clip-space z is 0.5 z + 0.5.
+/// depth of a position is 0.5 - 0.5 z.
 #[test]
 fn depth_ties_go_to_the_lower_id() {
     // Triangles a to d fill the viewport. a and b are at z = 0.5, c and d at z = 0.25.
@@ -328,10 +326,10 @@ fn depth_ties_go_to_the_lower_id() {
         (raster.ids(), raster.depths())
     };
     let [a, b, c, d] = [[0, 1, 2], [3, 4, 5], [6, 7, 8], [9, 10, 11]];
-    assert_eq!(draw_ids_and_depths(&[a, b]), (vec![Some(0); 16], vec![0.75; 16]));
+    assert_eq!(draw_ids_and_depths(&[a, b]), (vec![Some(0); 16], vec![0.25; 16]));
     // c has the id 1 and d has the id 3.
-    assert_eq!(draw_ids_and_depths(&[a, c, b, d]), (vec![Some(1); 16], vec![0.625; 16]));
-    assert_eq!(draw_ids_and_depths(&[]), (vec![None; 16], vec![1.0; 16]));
+    assert_eq!(draw_ids_and_depths(&[a, c, b, d]), (vec![Some(1); 16], vec![0.375; 16]));
+    assert_eq!(draw_ids_and_depths(&[]), (vec![None; 16], vec![0.0; 16]));
 }
 
 #[test]
@@ -376,8 +374,8 @@ fn plane_depth_and_rectangle_coverage_are_exact() {
         let to_ndc = |pixel: usize| (pixel as f64 + 0.5) / 100.0 - 1.0;
         let ray = nalgebra::Vector3::new(to_ndc(index % 200) / focal, -to_ndc(index / 200) / focal, -1.0);
         let distance = normal.dot(&a) / normal.dot(&ray);
-        let z = (far + near) / (far - near) - 2.0 * far * near / ((far - near) * distance);
-        max_error = max_error.max((f64::from(depth) - (0.5 * z + 0.5)).abs());
+        let expected_depth = near * (far - distance) / ((far - near) * distance);
+        max_error = max_error.max((f64::from(depth) - expected_depth).abs());
         samples += 1;
     }
     // Corners move by up to 1/512 pixel per axis when they are snapped. The depth of this plane changes by less than

@@ -6,8 +6,9 @@
 //!
 //! Coverage is then computed exactly, in integers: a triangle covers the samples on the inner side of all its edges. A
 //! sample on an edge belongs to the triangle for which it is a top or left edge, so triangles that share an edge cover
-//! each sample exactly once. Depth is z/w, linear in the window, in f32 from the exact edge values. Cut-outs cover only
-//! samples whose alpha is large enough ([`cut_out`]).
+//! each sample exactly once. Depth is z/w, linear in the window, in f32 from the exact edge values. It is reversed: 1 at
+//! the near plane and 0 at the far plane, so the largest depth of a sample is visible. Cut-outs cover only samples whose
+//! alpha is large enough ([`cut_out`]).
 
 pub mod cut_out;
 
@@ -60,13 +61,11 @@ pub struct ClippedPolygon {
     pub is_clipped: bool,
 }
 
-/// Samples of a window: the smallest depth of each sample, and its triangle.
+/// Samples of a window: the nearest depth of each sample, and its triangle.
 #[derive(Debug, Clone, PartialEq)]
 pub struct VisibilityBuffer {
     window: Viewport,
-    /// Row by row from the top. The upper 32 bits are the bits of the depth, the lower 32 bits the triangle. The bits
-    /// of non-negative floats have the order of the floats, so the smallest key has the smallest depth. [`EMPTY_KEY`]
-    /// where no triangle covers the sample.
+    /// Row by row from the top, each from [`sample_key`]. [`EMPTY_KEY`] where no triangle covers the sample.
     pub keys: Vec<u64>,
 }
 
@@ -107,10 +106,10 @@ impl VisibilityBuffer {
         }
     }
 
-    /// Depths; 1 where nothing was drawn.
+    /// Depths; 0 where nothing was drawn.
     pub fn depths(&self) -> Vec<f32> {
-        let depth_of = |key: &u64| if *key == EMPTY_KEY { 1.0 } else { f32::from_bits((key >> 32) as u32) };
-        self.keys.iter().map(depth_of).collect()
+        // The inverted bits of an empty key are those of 0.
+        self.keys.iter().map(|key| f32::from_bits(!((key >> 32) as u32))).collect()
     }
 
     /// The triangle of each sample; `None` where nothing was drawn.
@@ -128,11 +127,18 @@ impl VisibilityBuffer {
                     depth_at(&triangle_corners, column, row).filter(|_| passes_alpha_test([column, row]))
                 {
                     let key = &mut self.keys[row as usize * width + column as usize];
-                    *key = (*key).min(u64::from(depth.to_bits()) << 32 | u64::from(triangle));
+                    *key = (*key).min(sample_key(depth, triangle));
                 }
             }
         }
     }
+}
+
+/// Key of a sample: the inverted bits of its depth in the upper 32 bits, the triangle in the lower 32 bits. The bits of
+/// non-negative floats have the order of the floats, so the smallest key is nearest. At equal depths, it has the
+/// smallest triangle.
+pub const fn sample_key(depth: f32, triangle: u32) -> u64 {
+    (!depth.to_bits() as u64) << 32 | triangle as u64
 }
 
 /// Clips and snaps a triangle.
@@ -194,16 +200,29 @@ pub fn fan_triangles(clipped_polygon: &ClippedPolygon) -> Vec<[SnappedVertex; 3]
 /// Depth of a triangle at a pixel's sample, if the sample lies inside and not behind the far plane.
 pub fn depth_at(triangle: &[SnappedVertex; 3], column: i32, row: i32) -> Option<f32> {
     let (x, y) = (SUBPIXEL_STEPS * column + SUBPIXEL_STEPS / 2, SUBPIXEL_STEPS * row + SUBPIXEL_STEPS / 2);
-    let [a, b, c] = triangle;
+    let [a, b, c] = &with_farthest_first(triangle);
     let edge_values =
         [(b, c), (c, a), (a, b)].map(|(start, end)| (edge(start, end, x, y), min_covered_edge(start, end)));
     if edge_values.iter().any(|(value, min_covered_edge)| value < min_covered_edge) {
         return None;
     }
     let inverse_area = 1.0 / doubled_area(triangle) as f32;
-    let [weight_b, weight_c] = [1, 2].map(|corner| edge_values[corner].0 as f32 * inverse_area);
-    let z = a.z + (weight_b * (b.z - a.z) + weight_c * (c.z - a.z));
-    (z <= 1.0).then_some(if z > 0.0 { z } else { 0.0 })
+    // No term of the sum is negative, so its relative error is a few roundings, also where depth is small.
+    let [slope_b, slope_c] = [b, c].map(|corner| (corner.z - a.z) * inverse_area);
+    let z = a.z + (edge_values[1].0 as f32 * slope_b + edge_values[2].0 as f32 * slope_c);
+    (z >= 0.0).then_some(if z < 1.0 { z } else { 1.0 })
+}
+
+/// The corners in the same cyclic order, beginning with the farthest one, the first of several.
+pub fn with_farthest_first(triangle: &[SnappedVertex; 3]) -> [SnappedVertex; 3] {
+    let [a, b, c] = *triangle;
+    if b.z < a.z && b.z <= c.z {
+        [b, c, a]
+    } else if c.z < a.z {
+        [c, a, b]
+    } else {
+        [a, b, c]
+    }
 }
 
 /// The edge function at a point: positive on the right of the edge, with y down.
@@ -233,14 +252,16 @@ fn transform_to_clip(window: &Viewport, position: &[f32]) -> [f32; 4] {
 /// Whether all corners are outside of the same plane of the view frustum.
 fn is_outside(corners: &[[f32; 4]; 3]) -> bool {
     let is_beyond = |axis: usize, sign: f32| corners.iter().all(|corner| sign * corner[axis] > corner[3]);
-    (0..3).any(|axis| is_beyond(axis, 1.0) || is_beyond(axis, -1.0))
+    (0..3).any(|axis| is_beyond(axis, 1.0))
+        || (0..2).any(|axis| is_beyond(axis, -1.0))
+        || corners.iter().all(|corner| corner[2] < 0.0)
 }
 
 /// Signed distance to a plane, not negative on the inner side. Plane 0 is the near plane; planes 1 to 4 are the sides
 /// of the guard band.
 fn plane_distance(window: &Viewport, [x, y, z, w]: &[f32; 4], plane: usize) -> f32 {
     let [guard_x, guard_y] = window.guard_band().map(|guard| guard * w);
-    [z + w, guard_x - x, guard_x + x, guard_y - y, guard_y + y][plane]
+    [w - z, guard_x - x, guard_x + x, guard_y - y, guard_y + y][plane]
 }
 
 /// Clips a triangle to a convex polygon by the near plane and the guard band.
@@ -284,7 +305,7 @@ fn snap(window: &Viewport, [x, y, z, w]: &[f32; 4]) -> SnappedVertex {
     let window_x = x * inverse_w * half_width + half_width;
     let window_y = -(y * inverse_w) * half_height + half_height;
     let to_subpixels = |pixels: f32| (pixels * SUBPIXEL_STEPS as f32).round_ties_even() as i32;
-    SnappedVertex { x: to_subpixels(window_x), y: to_subpixels(window_y), z: z * inverse_w * 0.5 + 0.5 }
+    SnappedVertex { x: to_subpixels(window_x), y: to_subpixels(window_y), z: z * inverse_w }
 }
 
 /// The samples in the bounding box of the corners, clipped to the window. In units of 1/256 pixel, the sample of column

@@ -90,7 +90,16 @@ pub enum Lens {
 /// The fraction of the image that the scene fills in [`Camera::fit_to_scene`], in the tighter of both directions.
 const IMAGE_FILL: f64 = 0.94;
 
-/// A camera. `near` and `far` are distances in scene units; if both are 0, they are fitted to the scene.
+/// The fitted near plane, relative to the distance of the farthest point of the scene along the view axis.
+///
+/// The value only keeps depth in the range of f32: near / w is at most 1, and it is a normal number up to 2^62 times the
+/// farthest distance. It does not limit how close the camera may come, because the positions themselves are f32, and
+/// their rounding errors of 2^-24 of their magnitude are larger. It costs no precision either: see
+/// [`Camera::clip_from_camera`].
+const FITTED_NEAR: f64 = 1.0 / (1_u64 << 63) as f64 / 2.0;
+
+/// A camera. `near` and `far` are distances in scene units along the view axis, and geometry outside of them is clipped.
+/// If both are 0, nothing in front of the camera is clipped, at any distance.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Camera {
     pub view: View,
@@ -121,7 +130,7 @@ impl Camera {
         let camera_distance = if max_distance > 0.0 { max_distance } else { 1.0 };
         let eye = bounds.center() + to_camera * camera_distance;
         let view = View::LookAt { eye: eye.coords.into(), target: bounds.center().coords.into(), up: up.into() };
-        // Near and far are fitted to the scene, because both are 0.
+        // Nothing in front of the camera is clipped, because near and far are 0.
         Self { view, lens: Lens::FieldOfView(vertical_degrees), near: 0.0, far: 0.0 }
     }
 
@@ -231,9 +240,19 @@ impl Camera {
         Self { lens: Lens::Intrinsics { fx, fy, cx, cy }, ..self }
     }
 
-    /// `clip_from_camera` for an image of `width` x `height` pixels. Fitted near and far planes enclose `bounds`.
+    /// `clip_from_camera` for an image of `width` x `height` pixels, with reversed depth: z / w is 1 at the near plane
+    /// and 0 at the far plane. Without `near` and `far`, the far plane is at infinity, and the near plane is fitted to
+    /// `bounds`, which are those of the scene.
+    ///
+    /// z / w is then near / w, where w is the distance along the view axis. The spacing of f32 is at most 2^-23 of the
+    /// number, so depth resolves 2^-23 of the distance, at every distance and for every near plane. (Depth that
+    /// increases from 0 to 1 resolves 2^-24 distance / near of the distance.) Interpolation across a triangle adds
+    /// rounding errors of 2^-24 of the largest depth of its corners. For a plane at the distance h from the eye, and a
+    /// rasterizer that clips to a rectangle of G image sizes, the corners have w of at least about h / G. The relative
+    /// error at the distance d is then 2^-24 G d / h, which moves the surface by 2^-24 G d along its normal.
+    /// (Reed, "Depth Precision Visualized", 2015; Upchurch and Desbrun, "Tightening the Precision of Perspective
+    /// Rendering", 2012.)
     pub fn clip_from_camera(&self, width: u32, height: u32, bounds: &BoundingBox) -> Matrix4<f64> {
-        let (near, far) = self.depth_range(bounds);
         let [fx, fy, cx, cy] = self.intrinsics([width, height]);
         let (width, height) = (f64::from(width), f64::from(height));
         let mut matrix = Matrix4::zeros();
@@ -241,27 +260,24 @@ impl Camera {
         matrix[(0, 2)] = 1.0 - 2.0 * cx / width;
         matrix[(1, 1)] = 2.0 * fy / height;
         matrix[(1, 2)] = 2.0 * cy / height - 1.0;
-        matrix[(2, 2)] = -(far + near) / (far - near);
-        matrix[(2, 3)] = -2.0 * far * near / (far - near);
+        if self.far > 0.0 {
+            let scale = self.near / (self.far - self.near);
+            (matrix[(2, 2)], matrix[(2, 3)]) = (scale, scale * self.far);
+        } else {
+            matrix[(2, 3)] = self.fitted_near(bounds);
+        }
         matrix[(3, 2)] = -1.0;
         matrix
     }
 
-    /// Near and far distances: as given, or fitted to `bounds` and the ground around them.
-    fn depth_range(&self, bounds: &BoundingBox) -> (f64, f64) {
-        if self.far > 0.0 {
-            return (self.near, self.far);
-        }
+    /// Distance of the fitted near plane: a power of two, so that a change of the bounds changes only the exponents of
+    /// depths, not their order.
+    fn fitted_near(&self, bounds: &BoundingBox) -> f64 {
         let camera_from_world = self.camera_from_world();
-        let depth = |corner: &Point3<f64>| -camera_from_world.transform_point(corner).z;
-        let depths = bounds.corners().map(|corner| depth(&corner));
-        let farthest = depths.iter().copied().fold(0.0, f64::max);
-        let nearest = depths.iter().copied().fold(f64::INFINITY, f64::min);
-        // `far` includes four diagonals of ground behind the bounds. `near` is at least far / 10,000 to keep the
-        // precision of depth.
-        let far = (farthest.max(0.0) + 4.0 * bounds.diagonal()).max(1e-6);
-        let near = (0.5 * nearest).clamp(far * 1e-4, far * 0.5);
-        (near, far)
+        let distances = bounds.corners().map(|corner| camera_from_world.transform_point(&corner).z.abs());
+        let farthest = distances.into_iter().filter(|distance| distance.is_finite()).fold(f64::MIN_POSITIVE, f64::max);
+        // The f32 matrix needs a normal number.
+        (FITTED_NEAR * farthest.log2().ceil().exp2()).max(f64::from(f32::MIN_POSITIVE))
     }
 }
 
@@ -302,6 +318,39 @@ mod tests {
             let max_extent = extents.into_iter().fold(0.0, f64::max);
             assert!((max_extent - IMAGE_FILL).abs() < 1e-6, "{size:?}: expected {IMAGE_FILL}, got {max_extent}");
         }
+    }
+
+    /// Depth in f32, as the shaders compute it, decreases with the distance, from far below to far above the size of the
+    /// scene.
+    #[test]
+    fn fitted_depth_resolves_two_millionths_of_every_distance() {
+        for size in [1e-11, 1.0, 1e9_f32] {
+            let scene = block([size; 3]);
+            let camera = Camera::fit_to_scene(&scene, 64, 64);
+            let clip_from_camera = camera.clip_from_camera(64, 64, &scene.rest_bounds).cast::<f32>();
+            let depth = |distance: f32| {
+                let clip = clip_from_camera * nalgebra::Vector4::new(0.0, 0.0, -distance, 1.0);
+                clip.z / clip.w
+            };
+            for exponent in -50..50 {
+                let distance = size * 2.0_f32.powi(exponent);
+                let (near_depth, far_depth) = (depth(distance), depth(distance * (1.0 + 2e-6)));
+                assert!(
+                    near_depth > far_depth && far_depth > f32::MIN_POSITIVE && near_depth <= 1.0,
+                    "size {size}, distance {distance}: expected 1 >= {near_depth:e} > {far_depth:e} > 0"
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn explicit_planes_have_the_depths_1_and_0() {
+        let camera = Camera { near: 0.5, far: 80.0, ..Camera::fit_to_scene(&block([1.0; 3]), 64, 64) };
+        let clip_from_camera = camera.clip_from_camera(64, 64, &BoundingBox::EMPTY);
+        let depth = |distance: f64| clip_from_camera.transform_point(&Point3::new(0.0, 0.0, -distance)).z;
+        assert!((depth(0.5) - 1.0).abs() < 1e-12 && depth(80.0).abs() < 1e-12, "{} {}", depth(0.5), depth(80.0));
+        // near (far - w) / (w (far - near)) at w = 2
+        assert!((depth(2.0) - 0.5 * 78.0 / (2.0 * 79.5)).abs() < 1e-12, "{}", depth(2.0));
     }
 
     #[test]

@@ -12,6 +12,7 @@
 
 mod barrier;
 mod clear;
+mod clip_control;
 mod debug;
 mod fence;
 mod fullscreen;
@@ -171,6 +172,7 @@ impl Gl {
         // SAFETY: the context is current on this thread, and EGL returned the addresses for this context.
         let mut functions = unsafe { glow::Context::from_loader_function_cstr(load_address) };
         let limits = Limits::of(&functions);
+        clip_control::set_depth_range_from_zero(&functions, &context)?;
         if context.is_debug {
             debug::install_debug_callback(&mut functions);
         }
@@ -473,7 +475,8 @@ impl Gl {
         set_flag(glow::BLEND, state.blend);
         // SAFETY: sets state; no memory is accessed.
         unsafe {
-            gl.depth_func(glow::LEQUAL);
+            // Nearer surfaces have a larger depth. At equal depths, the surface that is drawn last wins.
+            gl.depth_func(glow::GEQUAL);
             gl.depth_mask(state.depth_write);
             let one_minus_alpha = glow::ONE_MINUS_SRC_ALPHA;
             gl.blend_func_separate(glow::SRC_ALPHA, one_minus_alpha, glow::ZERO, one_minus_alpha);

@@ -5,6 +5,7 @@
 use bytemuck::{Pod, Zeroable};
 use nalgebra::{Point3, Vector3};
 
+use super::MIN_SIZE;
 use super::light_box::{LightBox, LightBoxParams, TexelSpan};
 use crate::types::FrameParams;
 use modalcast_model::scene::{Camera, Scene};
@@ -58,8 +59,8 @@ fn visible_depth_range(camera: &Camera, box_params: &LightBoxParams) -> (f64, f6
     let depths = box_params.bounds.corners().map(|corner| -view.transform_point(&corner).z);
     let mut near = depths.into_iter().fold(f64::INFINITY, f64::min);
     // Positive, as the logarithmic scheme needs it.
-    let mut far = depths.into_iter().fold(f64::NEG_INFINITY, f64::max).max(1e-6);
-    // A camera with far = 0 has planes that are fitted to the bounds.
+    let mut far = depths.into_iter().fold(f64::NEG_INFINITY, f64::max).max(MIN_SIZE);
+    // A camera with far = 0 has no far plane; the cascades cover the bounds.
     if camera.far > 0.0 {
         (near, far) = (near.max(camera.near), far.min(camera.far).max(camera.near));
     }

@@ -3,6 +3,7 @@
 use bytemuck::{Pod, Zeroable};
 use nalgebra::{Matrix4, Vector3};
 
+use super::MIN_SIZE;
 use super::light_box::{LightBox, LightBoxParams};
 use crate::types::FrameParams;
 use modalcast_model::error::{Result, invalid};
@@ -102,8 +103,8 @@ impl FrameUniforms {
     }
 }
 
-/// Projection matrix of the camera for positions relative to `origin`. The depth range covers both the deformed and the
-/// rest state, so that it changes little when the scene deforms.
+/// Projection matrix of the camera for positions relative to `origin`. The bounds are those of both the deformed and the
+/// rest state, so that the fitted near plane changes rarely when the scene deforms.
 fn clip_from_camera(scene: &Scene, params: &FrameParams, origin: [f64; 3]) -> Matrix4<f64> {
     let bounds = finite_bounds(scene, params);
     let rebased_camera = params.camera.relative_to(origin);
@@ -119,13 +120,15 @@ pub(crate) fn clip_from_positions(scene: &Scene, params: &FrameParams, origin: [
     clip_from_camera(scene, params, origin) * params.camera.relative_to(origin).camera_from_world()
 }
 
-/// Matrix from positions relative to `origin` to the clip space of the shadow map; z = -1 is nearest to the sun.
+/// Matrix from positions relative to `origin` to the clip space of the shadow map; z is 1 nearest to the sun and 0 at the
+/// far plane.
 pub(crate) fn shadow_clip_from_positions(scene: &Scene, params: &FrameParams, origin: [f64; 3]) -> Matrix4<f64> {
     let shadow_from_world = LightBox::fit(&light_box_params(scene, params, origin)).shadow_from_world;
-    Matrix4::new_translation(&Vector3::repeat(-1.0)) * Matrix4::new_scaling(2.0) * shadow_from_world
+    let clip_from_shadow = Matrix4::new_nonuniform_scaling(&Vector3::new(2.0, 2.0, -1.0));
+    Matrix4::new_translation(&Vector3::new(-1.0, -1.0, 1.0)) * clip_from_shadow * shadow_from_world
 }
 
-/// Bounds of a frame, or the rest bounds if they overflowed: shadow map and depth range need finite bounds.
+/// Bounds of a frame, or the rest bounds if they overflowed: shadow map and near plane need finite bounds.
 fn finite_bounds(scene: &Scene, params: &FrameParams) -> BoundingBox {
     let has_valid_bounds = params.bounds.is_finite() && params.bounds.min[0] <= params.bounds.max[0];
     if has_valid_bounds { params.bounds } else { scene.rest_bounds }
@@ -165,7 +168,7 @@ pub fn shadow_texel_axes(scene: &Scene, params: &FrameParams) -> Option<[Vector3
     Some([texel_axis(0), texel_axis(1)])
 }
 
-/// Matrix from world space to the clip space of the shadow map; z = -1 is nearest to the sun. None if the look has no
+/// Matrix from world space to the clip space of the shadow map; z is 1 nearest to the sun. None if the look has no
 /// shadow. Valid for positions relative to the scene's origin.
 pub fn shadow_clip_from_world(scene: &Scene, params: &FrameParams) -> Option<Matrix4<f64>> {
     scene.look.shadow.map(|_| shadow_clip_from_positions(scene, params, [0.0; 3]))
@@ -199,7 +202,7 @@ fn ground_center_and_fade(up: usize, rest_bounds: BoundingBox, eye: Vector3<f64>
     center[up] = rest_bounds.min[up];
     let mut offset = eye - center;
     offset[up] = 0.0;
-    (center, 3.5 * rest_bounds.diagonal().max(offset.norm()).max(1e-6))
+    (center, 3.5 * rest_bounds.diagonal().max(offset.norm()).max(MIN_SIZE))
 }
 
 /// Matrix from (x, y, 1) in normalized device coordinates to the direction of a view ray in world space.

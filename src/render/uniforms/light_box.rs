@@ -9,6 +9,7 @@
 
 use nalgebra::{Matrix4, Vector3};
 
+use super::MIN_SIZE;
 use modalcast_model::scene::{BoundingBox, OrientedBounds, UpAxis, light_axes};
 
 /// Maximum distance from the near plane to the ground at the corners of the map, in diagonals of the bounds. Without
@@ -119,7 +120,7 @@ impl LightBox {
 
 /// Diagonal of the bounds, at least a length that f32 can resolve at their position.
 fn diagonal(params: &LightBoxParams) -> f64 {
-    params.bounds.diagonal().max(1e-6).max(1e-6 * params.bounds.center().coords.amax())
+    params.bounds.diagonal().max(MIN_SIZE).max(1e-6 * params.bounds.center().coords.amax())
 }
 
 /// z of the near and the far plane in light space, quantized to a 64th of the largest power of two that is at most the

@@ -3,3 +3,7 @@
 pub(crate) mod cascades;
 pub(crate) mod frame;
 pub(crate) mod light_box;
+
+/// Smallest size, in scene units, that is used for a scene without extent. Shaders can still square it, and divide by
+/// the square, in f32.
+const MIN_SIZE: f64 = 1e-15;

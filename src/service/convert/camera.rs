@@ -23,7 +23,7 @@ pub(super) fn parse_camera(default_camera: Camera, camera: v1::Camera) -> Result
         Some(v1::camera::Lens::FieldOfView(degrees)) => Lens::FieldOfView(degrees),
         Some(v1::camera::Lens::Intrinsics(v1::Intrinsics { fx, fy, cx, cy })) => Lens::Intrinsics { fx, fy, cx, cy },
     };
-    // If `near` and `far` are 0, the renderer fits the clipping planes to the scene.
+    // If `near` and `far` are 0, the renderer clips nothing in front of the camera.
     Camera { view, lens, near: camera.near, far: camera.far }.validated()
 }
 

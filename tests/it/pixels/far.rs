@@ -128,6 +128,25 @@ fn far_scene_renders_like_the_scene_at_the_origin() {
     }
 }
 
+/// The rest bounds keep their height, so that the frame's bounds span the whole distance from the ground to the scene.
+#[test]
+fn scene_at_a_height_of_100_km_renders_like_the_scene_at_0() {
+    let mut context = open_context();
+    let scene = SceneBuilder::new().add_domain(floor_mesh(0.8, 0.5), Material::default()).build();
+    let origin_frame = draw_frame(&mut context, &scene, &SceneState::rest(&scene), &camera_at([0.0; 3]));
+    let surface_pixels = origin_frame.rgba.chunks_exact(4).filter(|pixel| pixel[0] > 50).count();
+    assert!(surface_pixels > 1000, "control: expected a visible surface, got {surface_pixels} pixels");
+    for height in [1e5, 98.0 * 1024.0, -1e5] {
+        let high_state = move_domains(&scene, &[0], [0.0, height, 0.0]);
+        let high_frame = draw_frame(&mut context, &scene, &high_state, &camera_at([0.0, height, 0.0]));
+        let ImageDifference { max_levels, different_pixels } = compare_images(&origin_frame, &high_frame);
+        assert!(
+            different_pixels <= 9,
+            "height {height}: {different_pixels} pixels differ, by up to {max_levels} levels"
+        );
+    }
+}
+
 /// A camera near one of two distant domains sees only that domain.
 #[test]
 fn distant_domains_are_seen_by_nearby_cameras() {

@@ -1,10 +1,10 @@
 //! The compute rasterizer: launches `kernels/raster.cu`. It computes the visible triangle and its depth, or depth
-//! alone, by atomic minima. A pixel has one sample, at its center.
+//! alone, by atomic minima and maxima. A pixel has one sample, at its center.
 //!
 //! A thread draws a small triangle, whose bounding box has at most 32 samples. A warp draws a medium triangle, of up to
 //! 64 x 64 pixels. A larger or clipped triangle is divided into tiles of 64 x 64 pixels, which warps draw. Medium and
 //! large triangles wait in two queues. Each queue has capacity for every triangle, so it cannot overflow, and its
-//! length stays on the device. Samples of cut-outs are tested for alpha before the atomic minimum. The kernels for
+//! length stays on the device. Samples of cut-outs are tested for alpha before the atomic operation. The kernels for
 //! meshes without cut-outs are compiled without this test.
 //!
 //! | file | content |
@@ -40,8 +40,10 @@ const BLOCK_THREADS: u32 = 128;
 /// can be resident.
 const BLOCKS_PER_SM: u32 = 16;
 
-/// Value of both 32-bit words (depth and triangle) of a sample of the id pass that no triangle covers.
+/// Value of both 32-bit words (inverted depth and triangle) of a sample of the id pass that no triangle covers.
 const EMPTY_SAMPLE: u32 = u32::MAX;
+/// Bits of the depth of the far plane, 0, which is the depth of a sample that no triangle covers.
+const FAR_DEPTH: u32 = 0;
 
 /// Arguments of all kernels; pointers are device addresses. `kernels/raster.cuh` documents the fields.
 #[repr(C)]
@@ -272,7 +274,7 @@ impl RasterPipeline {
     /// The target of the pass has the bytes of its window.
     unsafe fn clear(&self, device: &Device, pass: &RasterPass<'_>) -> Result<()> {
         let variant = pass.functions.variant;
-        let clear_word = if variant.depth_only { 1.0_f32.to_bits() } else { EMPTY_SAMPLE };
+        let clear_word = if variant.depth_only { FAR_DEPTH } else { EMPTY_SAMPLE };
         let words = variant.bytes(pass.window) / 4;
         let counter_words = size_of::<RasterCounters>() as u64 / 4;
         for (address, word, word_count) in

@@ -16,9 +16,9 @@ pub(crate) struct VisibilityDirtyRegions {
 /// the complete image.
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum ClearOp<'a> {
-    /// Depth to 1.
+    /// Depth to 0, the far plane.
     Depth(Option<&'a DirtyRegion>),
-    /// Depth to 1 and ids to 0.
+    /// Depth and ids to 0.
     DepthAndIds(Option<&'a VisibilityDirtyRegions>),
     /// Color to a value.
     Color([f32; 4], &'a DirtyRegion),
@@ -31,7 +31,7 @@ pub(crate) enum ClearOp<'a> {
 /// The value that pixels are cleared to.
 #[derive(Debug, Clone, Copy)]
 enum ClearValue {
-    /// Depth of 1.
+    /// Depth of 0.
     FarDepth,
     /// Words of 0.
     Zero,
@@ -72,7 +72,7 @@ impl Gl {
         // SAFETY: a clear of a complete framebuffer.
         unsafe {
             match value {
-                ClearValue::FarDepth => gl.clear_buffer_f32_slice(glow::DEPTH, 0, &[1.0]),
+                ClearValue::FarDepth => gl.clear_buffer_f32_slice(glow::DEPTH, 0, &[0.0]),
                 ClearValue::Zero => gl.clear_buffer_u32_slice(glow::COLOR, 0, &[0; 4]),
                 ClearValue::Color(color) => gl.clear_buffer_f32_slice(glow::COLOR, 0, &color),
             }

@@ -4,6 +4,7 @@
 use std::path::Path;
 use std::time::Instant;
 
+use nalgebra::Matrix4;
 use serde::Serialize;
 
 use super::harness::{PassTime, RenderHarness, Size};
@@ -13,7 +14,7 @@ use crate::timing::{MIN_REPETITIONS, Timing};
 use modalcast_model::backend_settings::LookTable;
 use modalcast_model::error::{Result, fault, fault_in};
 use modalcast_model::load::{self, OpenedScene};
-use modalcast_model::scene::{Camera, SceneState};
+use modalcast_model::scene::{BoundingBox, Camera, SceneState};
 use modalcast_render::{RasterBackends, RendererInfo};
 
 /// Settings of the timing.
@@ -39,7 +40,7 @@ pub struct SceneFrameTimes {
     /// Rasterizers that drew the passes.
     #[serde(rename = "paths")]
     pub raster_backends: RasterBackends,
-    /// Matrix from world to clip space, column-major. The camera frames the scene.
+    /// Matrix from world to OpenGL's default clip space, -w <= z <= w, column-major. The camera frames the scene.
     pub clip_from_world: Vec<f64>,
     pub eye: [f64; 3],
     /// Unit vector towards the sun.
@@ -102,8 +103,7 @@ fn time_scene(
     }
     let (image, frame_params) = (harness.draw(&loaded_scene, camera, size)?, loaded_scene.frame_params(camera, size));
     let file = image_files::encode_grid(&name, size, 1, &[image.rgba])?;
-    let clip_from_world =
-        camera.clip_from_camera(size.width, size.height, &frame_params.bounds) * camera.camera_from_world();
+    let clip_from_world = default_clip_from_world(camera, size, &frame_params.bounds);
     let scene_times = SceneFrameTimes {
         name: name.into_owned(),
         vertices: scene.layout.vertices,
@@ -120,6 +120,20 @@ fn time_scene(
     };
     harness.unload(loaded_scene);
     Ok((scene_times, file))
+}
+
+/// Matrix from world to OpenGL's default clip space, which other renderers use: z / w is -1 at the near plane and 1 at
+/// the far plane. The planes enclose `bounds`, which must be in front of the camera.
+fn default_clip_from_world(camera: Camera, size: Size, bounds: &BoundingBox) -> Matrix4<f64> {
+    let camera_from_world = camera.camera_from_world();
+    let depths = bounds.corners().map(|corner| -camera_from_world.transform_point(&corner).z);
+    let far = depths.iter().fold(0.0, |far: f64, depth| far.max(*depth)) + bounds.diagonal();
+    let near = 0.5 * depths.iter().fold(far, |near: f64, depth| near.min(*depth)).max(1e-4 * far);
+    let reversed = Camera { near, far, ..camera }.clip_from_camera(size.width, size.height, bounds);
+    // The depth of the camera is reversed, from 1 to 0: z of the default clip space is w - 2 z.
+    let mut default_from_reversed = Matrix4::identity();
+    (default_from_reversed[(2, 2)], default_from_reversed[(2, 3)]) = (-2.0, 1.0);
+    default_from_reversed * reversed * camera_from_world
 }
 
 impl FrameTimeReport {
@@ -151,6 +165,10 @@ mod tests {
         let clip_from_world = nalgebra::Matrix4::from_column_slice(&scene_times.clip_from_world);
         let center = clip_from_world.transform_point(&scene.rest_bounds.center());
         assert!(center.x.abs() < 1e-9 && center.y.abs() < 1e-9, "{center}");
+        assert!(center.z > -1.0 && center.z < 1.0, "expected a center inside of the clip volume, got {center}");
+        let nearer_point =
+            clip_from_world.transform_point(&scene.rest_bounds.center().lerp(&scene_times.eye.into(), 0.1));
+        assert!(nearer_point.z < center.z, "expected a depth that increases, got {nearer_point} before {center}");
         let folder = tempfile::tempdir().expect("a folder");
         report.write(folder.path()).expect("report files");
         assert!(folder.path().join("times.json").exists() && folder.path().join("tree.png").exists());

@@ -359,7 +359,8 @@ mod tests {
             (0..3).all(|row| {
                 let coordinate: f32 = (0..3).map(|axis| clip_from_world[4 * row + axis] * point[axis]).sum::<f32>()
                     + clip_from_world[4 * row + 3];
-                coordinate.abs() <= 1.0
+                // x and y are from -1 to 1, depth is from 0 to 1.
+                coordinate <= 1.0 && coordinate >= if row == 2 { 0.0 } else { -1.0 }
             })
         };
         assert!(positions.chunks_exact(3).all(is_inside), "expected all vertices inside the map");

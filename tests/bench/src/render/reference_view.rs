@@ -3,7 +3,7 @@
 use nalgebra::{Matrix3, Vector3};
 
 use super::ray_scene::Ray;
-use modalcast_model::scene::{Lens, Scene};
+use modalcast_model::scene::{Camera, Lens, Scene};
 use modalcast_render::FrameParams;
 
 /// Camera, ground, sky and light of a reference image, derived from the scene and its [`FrameParams`]. Colors are linear,
@@ -13,7 +13,7 @@ pub(super) struct ReferenceView {
     pub(super) width: u32,
     pub(super) height: u32,
     pub(super) eye: Vector3<f64>,
-    /// Depths of the near and of the far plane along the camera's axis.
+    /// Depths of the near and of the far plane along the camera's axis; 0 and infinity if the camera clips nothing.
     pub(super) depth_range: (f64, f64),
     pub(super) to_sun: Vector3<f64>,
     pub(super) sunlight: Vector3<f64>,
@@ -51,14 +51,7 @@ impl ReferenceView {
             Lens::Intrinsics { fx, fy, cx, cy } => [fx, fy, cx, cy],
         };
         let rotation = frame_params.camera.camera_from_world().fixed_view::<3, 3>(0, 0).into_owned();
-        let clip_from_camera = frame_params.camera.clip_from_camera(
-            frame_params.width,
-            frame_params.height,
-            &frame_params.bounds.union(scene.rest_bounds),
-        );
-        // In OpenGL's projection with planes n and f, the scale is (f + n) / (n - f) and the shift 2 f n / (n - f).
-        // Hence n = shift / (scale - 1) and f = shift / (scale + 1).
-        let (depth_scale, depth_shift) = (clip_from_camera[(2, 2)], clip_from_camera[(2, 3)]);
+        let Camera { near, far, .. } = frame_params.camera;
         let eye = frame_params.camera.eye();
         let up_axis = scene.up.index();
         let is_above_ground = eye[up_axis] > scene.rest_bounds.min[up_axis];
@@ -66,7 +59,7 @@ impl ReferenceView {
             width: frame_params.width,
             height: frame_params.height,
             eye,
-            depth_range: (depth_shift / (depth_scale - 1.0), depth_shift / (depth_scale + 1.0)),
+            depth_range: if far > 0.0 { (near, far) } else { (0.0, f64::INFINITY) },
             to_sun: settings.to_sun(scene.up),
             sunlight: to_f64(settings.sunlight),
             skylight: to_f64(settings.skylight),
@@ -132,7 +125,7 @@ impl GroundPlane {
         Self {
             height,
             center,
-            fade_distance: 3.5 * rest_bounds.diagonal().max(horizontal_offset.norm()).max(1e-6),
+            fade_distance: 3.5 * rest_bounds.diagonal().max(horizontal_offset.norm()).max(1e-15),
             color,
         }
     }

@@ -129,7 +129,7 @@ impl CudaRasterizer {
             }
             prepared.push((window, pass_state.prepare(device, interop, pipeline, target)?));
         }
-        // Targets are mapped as `ReadWrite`, not `WriteDiscard`, because the atomic minima also read samples.
+        // Targets are mapped as `ReadWrite`, not `WriteDiscard`, because the atomic operations also read samples.
         let mut mappings = vec![Mapping { buffer: positions, access: MapAccess::Read }];
         let mut passes = Vec::new();
         for (window, PreparedPass { functions, groups, target }) in prepared {
