@@ -198,7 +198,7 @@ fn has_moved(scene: &Scene, domain: u32, [previous, current]: [&StepResult; 2]) 
 
 /// A step that sets the transform of a domain to an f64 translation: the quaternion of the identity as four f32, then
 /// the translation as three f64.
-fn far_step(domain: u32, translation: [f64; 3]) -> RawStepUpdate {
+pub(super) fn far_step(domain: u32, translation: [f64; 3]) -> RawStepUpdate {
     let rotation = [0.0_f32, 0.0, 0.0, 1.0].into_iter().flat_map(f32::to_le_bytes);
     let bytes: Vec<u8> = rotation.chain(translation.into_iter().flat_map(f64::to_le_bytes)).collect();
     RawStepUpdate {

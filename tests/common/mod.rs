@@ -6,6 +6,7 @@
 pub(crate) mod attributes;
 #[allow(dead_code, reason = "each test binary uses a part")]
 pub(crate) mod cut_outs;
+pub(crate) mod distant_steps;
 mod error_bounds;
 pub(crate) mod exact_triangle;
 pub(crate) mod extreme_values;

@@ -6,7 +6,8 @@ use modalcast_model::domain::{Domain, FollowConstraint};
 use modalcast_model::scene::{DeformationSettings, Scene};
 
 use crate::common::{
-    self, attributes, extreme_values, followers, neighbors, overflow, partial_steps, surfaces, truncation,
+    self, attributes, distant_steps, extreme_values, followers, neighbors, overflow, partial_steps, surfaces,
+    truncation,
 };
 use crate::reference_comparison::{cuda_deformer, cuda_deformer_with_batches};
 use crate::scenes::{self, Random};
@@ -206,6 +207,12 @@ fn gpu_partial_steps_of_roots_move_their_followers() {
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_followers_10000_km_away_are_exact_to_1_mm() {
     followers::check_far_followers(cuda_deformer);
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_model_driven_far_away_keeps_its_relative_precision() {
+    distant_steps::check_driven_model(cuda_deformer);
 }
 
 #[test]

@@ -5,11 +5,13 @@ use std::sync::Arc;
 
 use modalcast::config::BackendChoice;
 use modalcast_compute::cpu::CpuDeformer;
+use modalcast_compute::reference::ReferenceDeformer;
 use modalcast_compute::storage::Truncation;
 use modalcast_model::scene::Scene;
 
 use crate::common::{
-    attributes, extreme_values, followers, light_bounds, neighbors, overflow, partial_steps, surfaces, truncation,
+    attributes, distant_steps, extreme_values, followers, light_bounds, neighbors, overflow, partial_steps, surfaces,
+    truncation,
 };
 
 /// A deformer that also computes light-space bounds if the scene has a shadow.
@@ -137,6 +139,16 @@ fn partial_steps_of_transform_roots_move_their_followers() {
 #[test]
 fn followers_10000_km_away_are_exact_to_1_mm() {
     followers::check_far_followers(cpu_deformer);
+}
+
+#[test]
+fn model_driven_far_away_keeps_its_relative_precision() {
+    distant_steps::check_driven_model(cpu_deformer);
+}
+
+#[test]
+fn reference_of_a_driven_model_keeps_its_relative_precision() {
+    distant_steps::check_driven_model(ReferenceDeformer::new);
 }
 
 #[test]

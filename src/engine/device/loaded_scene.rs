@@ -10,7 +10,7 @@ use crate::frame::Legend;
 use modalcast_model::deform::{DeformSummary, DeformedSurface, Deformer, VertexAttributes, VertexReadback};
 use modalcast_model::error::{Error, Result, fault, invalid};
 use modalcast_model::raster::{RasterGeometry, Rasterizer};
-use modalcast_model::scene::{BoundingBox, Camera, FrameSize, OrientedBounds, Scene, SceneState, snap_to_origin_grid};
+use modalcast_model::scene::{BoundingBox, Camera, FrameSize, OrientedBounds, Scene, SceneState};
 use modalcast_render::{FrameParams, Renderer, SceneBuffers};
 
 /// Positions beyond this bound (scene units) are rejected like infinite ones, because their squares overflow f32 in the
@@ -163,7 +163,7 @@ impl LoadedScene {
                 return Ok(BufferContents { bounds: self.bounds, light_bounds: self.light_bounds, is_uploaded });
             }
         };
-        let camera_origin = snap_to_origin_grid(camera.eye().into());
+        let camera_origin = self.scene.origin_grids.snap(camera.eye().into());
         let positions = &self.deformer.surface_with(VertexAttributes::POSITIONS_AND_NORMALS)?.positions;
         let (positions, bounds) = origins.rebase_positions(camera_origin, &self.scene, positions);
         renderer.upload_rebased(buffers, &positions, camera_origin)?;

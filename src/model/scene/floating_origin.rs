@@ -1,51 +1,135 @@
-//! Floating origins: f64 reference points that keep f32 coordinates accurate to a millimeter, ten thousand kilometers
-//! away from the scene's origin.
+//! Floating origins: f64 reference points that keep f32 coordinates accurate relative to the size of a domain, at any
+//! distance from the scene's origin.
 //!
 //! A domain's f32 transform, and every f32 position that a deformer computes with it, is relative to the domain's
-//! *floating origin*: a point at whole multiples of [`ORIGIN_GRID`] from the scene's origin. All domains within
-//! [`ORIGIN_REACH`] of the *shared origin* use it, so that one coordinate frame suffices to draw them. A domain outside
-//! (an *outlier*) has a floating origin of its own. When more than half of the domains are outliers, the shared origin
-//! moves to them, and all transforms are rebased from the stored f64 translations.
+//! *floating origin*. Its distance from the domain is measured in multiples of the domain's *spacing* g
+//! ([`OriginGrids`]), the power of two below the domain's size. Most domains use the *shared origin*, so that one
+//! coordinate frame suffices to draw them. When more than half of the domains are farther than [`HOME_REACH`] spacings
+//! from it, it moves to the majority, and all transforms are rebased from the stored f64 translations. So the shared
+//! origin of a single domain follows the domain, also back. A domain farther than [`SHARED_REACH`] spacings from the
+//! shared origin (an *outlier*) has a floating origin of its own.
 //!
-//! Error bound per axis: rounding a translation contributes at most 2^-13 units at `ORIGIN_REACH`. Each of the three
-//! fused multiply-adds of x = A p + t contributes at most 2^-12 units while the vertex is within 8192 units of its
-//! floating origin. The sum is 7 x 2^-13 units, which is 0.86 mm in a scene of meters. The translation of an outlier is
-//! at most 512 units per axis from its own floating origin, so that within 1024 units the sum is 7 x 2^-16 units or
-//! 0.11 mm. The f32 rounding of A and p adds to this bound, independent of the domain's position.
+//! Error bound per axis, for a translation t from the floating origin with |t| <= 4 g = `HOME_REACH` g: rounding t
+//! contributes at most 2^-23 g. Each of the three fused multiply-adds of x = A p + t contributes at most 2^-22 g while
+//! the vertex is within 8 g of its floating origin. The sum is 7 x 2^-23 g: less than 8.4e-7 of the domain's size, at any
+//! distance. A domain at the end of the shared origin's reach has 16 times this bound, 1.4e-5 of its size, and an outlier
+//! an eighth of it. The f32 rounding of A and p adds to the bound, independent of the domain's position.
 //!
-//! A follower has no translation of its own: it uses the floating origin of its transform root. Where this module says
-//! "domain", it means a transform root. Translations have the order of the roots' transforms.
+//! Without f64 translations, all transforms are relative to the scene's origin, and rounding t contributes up to 2^-24
+//! |t| in each of the four operations.
 //!
-//! Floating origins exist only after the first step with f64 translations. Until then, all transforms are relative to
-//! the scene's origin.
+//! A follower has no translation of its own: it uses the floating origin of its transform root, whose size includes its
+//! followers. Where this module says "domain", it means a transform root with its followers. Translations have the order
+//! of the roots' transforms.
 
-use super::{BoundingBox, Scene};
-use crate::domain::Transform;
+use std::sync::Arc;
+
+use super::{BoundingBox, Scene, TransformRoots};
+use crate::domain::{Domain, Shape, Transform};
 use crate::error::{Result, invalid};
 
-/// Spacing of floating origins in scene units. It is a power of two, so that their coordinates are exact in f64, and up
-/// to 2^34 units (2^24 times the spacing) also in f32.
-pub const ORIGIN_GRID: f64 = 1024.0;
+/// The distance of a domain from the shared origin, per axis and in multiples of the domain's spacing, beyond which the
+/// shared origin does not suit the domain.
+pub const HOME_REACH: f64 = 4.0;
 
-/// The largest distance, per axis and in scene units, between the shared origin and the translation of a domain that
-/// uses it.
-pub const ORIGIN_REACH: f64 = 4096.0;
+/// The largest distance, per axis and in multiples of the domain's spacing, between the shared origin and the translation
+/// of a domain that uses it. It is larger than [`HOME_REACH`], because frames with outliers need a pass over all vertices
+/// on the host.
+pub const SHARED_REACH: f64 = 64.0;
+
+/// Distance in multiples of the domain's spacing up to which [`FloatingOrigins::rebase_positions`] includes a domain in
+/// the bounds.
+const NEARBY_REACH: f64 = 1024.0;
+
+/// The spacing of the floating origins of each transform root, which is constant in a scene.
+#[derive(Debug, Clone, PartialEq)]
+pub struct OriginGrids {
+    /// Per root, a power of two in scene units. Powers of two make floating origins, and differences of them, exact.
+    spacings: Vec<f64>,
+    /// The smallest spacing.
+    finest: f64,
+}
+
+impl OriginGrids {
+    /// The spacing of a root is the largest power of two that is at most its size. The size is that of the rest
+    /// positions of the root and its followers in the frame of the root: the diagonal of their bounds or their largest
+    /// coordinate, because f32 rounds relative to the coordinate.
+    pub(super) fn new(shapes: &[Shape], domains: &[Domain], transform_roots: &TransformRoots) -> Self {
+        let shape_bounds: Vec<BoundingBox> = shapes
+            .iter()
+            .map(|shape| BoundingBox::from_positions(shape.mesh.rest_positions().as_flattened()))
+            .collect();
+        let mut bounds = vec![BoundingBox::EMPTY; transform_roots.count()];
+        for (index, domain) in domains.iter().enumerate() {
+            let root_bounds = &mut bounds[transform_roots.root_of(index)];
+            match transform_roots.root_from_domain(index).map(|frame| frame.to_matrix()) {
+                None => *root_bounds = root_bounds.union(shape_bounds[domain.shape]),
+                Some(frame) => shape_bounds[domain.shape]
+                    .corners()
+                    .iter()
+                    .for_each(|corner| root_bounds.include(frame.transform_point(corner).coords.into())),
+            }
+        }
+        Self::from_sizes(bounds.iter().map(|bounds| {
+            let coordinates = bounds.min.iter().chain(&bounds.max);
+            coordinates.fold(bounds.diagonal(), |size: f64, coordinate| size.max(coordinate.abs()))
+        }))
+    }
+
+    fn from_sizes(sizes: impl Iterator<Item = f64>) -> Self {
+        let spacings: Vec<f64> = sizes.map(power_of_two_at_most).collect();
+        let finest = spacings.iter().copied().fold(f64::INFINITY, f64::min);
+        Self { spacings, finest }
+    }
+
+    /// Spacing of the floating origins of a root in scene units.
+    pub fn spacing(&self, root: usize) -> f64 {
+        self.spacings[root]
+    }
+
+    /// The point nearest to `point` on the finest grid of all roots.
+    pub fn snap(&self, point: [f64; 3]) -> [f64; 3] {
+        snap_to_grid(point, self.finest)
+    }
+
+    /// Whether a root at `translation` is farther than `reach` spacings from `origin` along an axis.
+    fn is_beyond(&self, root: usize, translation: [f64; 3], origin: [f64; 3], reach: f64) -> bool {
+        let max_distance = reach * self.spacings[root];
+        subtract(translation, origin).iter().any(|coordinate| coordinate.abs() > max_distance)
+    }
+}
+
+/// The largest power of two that is at most `size`; 1 for a size that is not a positive normal number.
+fn power_of_two_at_most(size: f64) -> f64 {
+    // The exponent bits of a normal number, without its fraction.
+    let exponent_bits = 0x7FF0_0000_0000_0000;
+    if size.is_normal() && size > 0.0 { f64::from_bits(size.to_bits() & exponent_bits) } else { 1.0 }
+}
+
+/// Numbers of roots that are far from the shared origin. Fewer outliers are better, then fewer roots away.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default)]
+struct DistanceCounts {
+    /// Beyond [`SHARED_REACH`], with a floating origin of their own.
+    outliers: usize,
+    /// Beyond [`HOME_REACH`].
+    away: usize,
+}
 
 /// The floating origins of all transform roots of one state.
 #[derive(Debug, Clone)]
 pub struct FloatingOrigins {
+    grids: Arc<OriginGrids>,
     /// Translation of each root in scene units from the scene's origin.
     translations: Vec<[f64; 3]>,
     shared_origin: [f64; 3],
-    /// Number of roots that have a floating origin of their own.
-    outlier_count: usize,
+    counts: DistanceCounts,
     /// Number of translations set since the last search for a shared origin. A search is a pass over all domains. It is
     /// repeated only after as many translations as there are domains, so that its cost per translation is constant.
     translations_since_search: usize,
 }
 
-/// Equality ignores the counters: `outlier_count` follows from the other fields, and `translations_since_search` only
-/// schedules searches.
+/// Equality ignores the grids and counters: `grids` belong to the scene, `counts` follow from the other fields, and
+/// `translations_since_search` only schedules searches.
 impl PartialEq for FloatingOrigins {
     fn eq(&self, other: &Self) -> bool {
         self.shared_origin == other.shared_origin && self.translations == other.translations
@@ -55,27 +139,40 @@ impl PartialEq for FloatingOrigins {
 impl FloatingOrigins {
     /// Floating origins for transforms that are relative to the scene's origin. [`Self::rebase_transform`] makes the
     /// transforms relative to these floating origins.
-    pub(super) fn from_transforms(transforms: &[Transform]) -> Self {
-        Self::with_shared_origin([0.0; 3], transforms.iter().map(|transform| transform.translation().into()).collect())
+    pub(super) fn from_transforms(grids: &Arc<OriginGrids>, transforms: &[Transform]) -> Self {
+        let translations = transforms.iter().map(|transform| transform.translation().into()).collect();
+        Self::with_shared_origin(grids, [0.0; 3], translations)
     }
 
-    fn with_shared_origin(shared_origin: [f64; 3], translations: Vec<[f64; 3]>) -> Self {
-        let outlier_count =
-            translations.iter().filter(|translation| is_beyond_reach(shared_origin, **translation)).count();
-        Self { shared_origin, outlier_count, translations_since_search: translations.len(), translations }
+    fn with_shared_origin(grids: &Arc<OriginGrids>, shared_origin: [f64; 3], translations: Vec<[f64; 3]>) -> Self {
+        let mut origins = Self {
+            grids: Arc::clone(grids),
+            shared_origin,
+            counts: DistanceCounts::default(),
+            translations_since_search: translations.len(),
+            translations,
+        };
+        origins.counts = origins.count_distances(shared_origin);
+        origins
     }
 
-    /// Restores floating origins from the stored values of [`Self::shared_origin`] and [`Self::translations`].
+    /// Restores floating origins from the stored values of [`Self::shared_origin`] and [`Self::translations`]. The caller
+    /// must rebase the transforms ([`Self::rebase_transform`]), because the spacings may have changed since they were
+    /// stored.
     ///
     /// # Errors
-    /// `Invalid` if the shared origin is not on the grid or a translation is not finite.
-    pub fn restore(shared_origin: [f64; 3], translations: Vec<[f64; 3]>) -> Result<Self> {
-        if shared_origin != snap_to_origin_grid(shared_origin) || !shared_origin.iter().all(|number| number.is_finite())
-        {
-            return Err(invalid("origins.shared", format!("multiples of {ORIGIN_GRID}"), format!("{shared_origin:?}")));
+    /// `Invalid` if there is not one translation per root, or a number is not finite.
+    pub fn restore(scene: &Scene, shared_origin: [f64; 3], translations: Vec<[f64; 3]>) -> Result<Self> {
+        let is_finite = |point: &[f64; 3]| point.iter().all(|number| number.is_finite());
+        if translations.len() != scene.transform_roots.count() {
+            let root_count = scene.transform_roots.count();
+            return Err(invalid("origins.translations", format!("{root_count} points"), translations.len()));
         }
-        match translations.iter().position(|translation| !translation.iter().all(|number| number.is_finite())) {
-            None => Ok(Self::with_shared_origin(shared_origin, translations)),
+        if !is_finite(&shared_origin) {
+            return Err(invalid("origins.shared", "finite numbers", format!("{shared_origin:?}")));
+        }
+        match translations.iter().position(|translation| !is_finite(translation)) {
+            None => Ok(Self::with_shared_origin(&scene.origin_grids, shared_origin, translations)),
             Some(index) => Err(invalid(
                 format!("origins.translations[{index}]"),
                 "finite numbers",
@@ -96,14 +193,14 @@ impl FloatingOrigins {
 
     /// Whether all domains use the shared origin: there are no outliers.
     pub const fn has_no_outliers(&self) -> bool {
-        self.outlier_count == 0
+        self.counts.outliers == 0
     }
 
     /// The floating origin of a root and its followers, in scene units from the scene's origin.
     pub fn origin_of(&self, root: usize) -> [f64; 3] {
         let translation = self.translations[root];
-        if is_beyond_reach(self.shared_origin, translation) {
-            snap_to_origin_grid(translation)
+        if self.grids.is_beyond(root, translation, self.shared_origin, SHARED_REACH) {
+            snap_to_grid(translation, self.grids.spacings[root])
         } else {
             self.shared_origin
         }
@@ -111,7 +208,8 @@ impl FloatingOrigins {
 
     /// Replaces the translation of `transform` by the root's stored translation, relative to its floating origin and
     /// rounded once. The previous translation does not matter.
-    pub(super) fn rebase_transform(&self, root: usize, mut transform: Transform) -> Transform {
+    #[must_use]
+    pub fn rebase_transform(&self, root: usize, mut transform: Transform) -> Transform {
         let relative_translation = subtract(self.translations[root], self.origin_of(root));
         for (row, coordinate) in transform.0.chunks_exact_mut(4).zip(relative_translation) {
             row[3] = coordinate as f32;
@@ -121,20 +219,22 @@ impl FloatingOrigins {
 
     /// Sets the translation of a root, in scene units from the scene's origin.
     pub(super) fn set_translation(&mut self, root: usize, translation: [f64; 3]) {
-        let (shared_origin, stored_translation) = (self.shared_origin, &mut self.translations[root]);
-        self.outlier_count -= usize::from(is_beyond_reach(shared_origin, *stored_translation));
-        *stored_translation = translation;
-        self.outlier_count += usize::from(is_beyond_reach(shared_origin, translation));
+        let previous_translation = std::mem::replace(&mut self.translations[root], translation);
+        let previous_counts = self.count_distance(root, previous_translation, self.shared_origin);
+        let counts = self.count_distance(root, translation, self.shared_origin);
+        self.counts.away = self.counts.away - previous_counts.away + counts.away;
+        self.counts.outliers = self.counts.outliers - previous_counts.outliers + counts.outliers;
         self.translations_since_search = self.translations_since_search.saturating_add(1);
     }
 
-    /// Moves the shared origin under three conditions: more than half of the domains are outliers, at least as many
-    /// translations were set since the last search as there are domains, and the move reduces the number of outliers.
-    /// The new shared origin is the grid point nearest to the per-axis median, which is robust to a few very distant
-    /// domains. If this function returns true, the caller must call [`Self::rebase_transform`] for every transform.
+    /// Moves the shared origin under three conditions: more than half of the domains are beyond [`HOME_REACH`], at least
+    /// as many translations were set since the last search as there are domains, and the move leaves fewer outliers, or as
+    /// many outliers and fewer domains beyond this reach. The new shared origin is the grid point nearest to the per-axis median, which is robust to a few very
+    /// distant domains. If this function returns true, the caller must call [`Self::rebase_transform`] for every
+    /// transform.
     pub(super) fn update_shared_origin(&mut self) -> bool {
         let root_count = self.translations.len();
-        if 2 * self.outlier_count <= root_count || self.translations_since_search < root_count {
+        if 2 * self.counts.away <= root_count || self.translations_since_search < root_count {
             return false;
         }
         self.translations_since_search = 0;
@@ -142,14 +242,29 @@ impl FloatingOrigins {
             let mut coordinates: Vec<f64> = self.translations.iter().map(|translation| translation[axis]).collect();
             *coordinates.select_nth_unstable_by(root_count / 2, f64::total_cmp).1
         };
-        let shared_origin = snap_to_origin_grid([0, 1, 2].map(median_along));
-        let outlier_count =
-            self.translations.iter().filter(|translation| is_beyond_reach(shared_origin, **translation)).count();
-        let is_improvement = outlier_count < self.outlier_count;
+        let shared_origin = self.grids.snap([0, 1, 2].map(median_along));
+        let counts = self.count_distances(shared_origin);
+        let is_improvement = counts < self.counts;
         if is_improvement {
-            (self.shared_origin, self.outlier_count) = (shared_origin, outlier_count);
+            (self.shared_origin, self.counts) = (shared_origin, counts);
         }
         is_improvement
+    }
+
+    /// Counts the roots that are far from a shared origin.
+    fn count_distances(&self, shared_origin: [f64; 3]) -> DistanceCounts {
+        let mut sum = DistanceCounts::default();
+        for (root, translation) in self.translations.iter().enumerate() {
+            let counts = self.count_distance(root, *translation, shared_origin);
+            sum = DistanceCounts { away: sum.away + counts.away, outliers: sum.outliers + counts.outliers };
+        }
+        sum
+    }
+
+    /// The counts of one root: each is 0 or 1.
+    fn count_distance(&self, root: usize, translation: [f64; 3], shared_origin: [f64; 3]) -> DistanceCounts {
+        let is_beyond = |reach: f64| usize::from(self.grids.is_beyond(root, translation, shared_origin, reach));
+        DistanceCounts { away: is_beyond(HOME_REACH), outliers: is_beyond(SHARED_REACH) }
     }
 
     /// Rebases positions from the floating origins of their domains to `reference_point`, in scene units from the
@@ -157,8 +272,8 @@ impl FloatingOrigins {
     /// in layout order.
     ///
     /// Also returns the bounds of the near domains. With d as the distance from `reference_point` to the nearest
-    /// floating origin, a domain is near if the distance of its floating origin is at most [`ORIGIN_REACH`] + 4 d. More
-    /// distant domains would make the bounds too large to fit a camera or shadow map to.
+    /// floating origin, a domain is near if the distance of its floating origin is at most [`NEARBY_REACH`] spacings + 4 d.
+    /// More distant domains would make the bounds too large to fit a shadow map to.
     pub fn rebase_positions(
         &self,
         reference_point: [f64; 3],
@@ -166,15 +281,17 @@ impl FloatingOrigins {
         positions: &[f32],
     ) -> (Vec<f32>, BoundingBox) {
         let layouts = &scene.layout.domains;
-        let offset = |domain| subtract(self.origin_of(scene.transform_roots.root_of(domain)), reference_point);
+        let root_of = |domain| scene.transform_roots.root_of(domain);
+        let offset = |domain| subtract(self.origin_of(root_of(domain)), reference_point);
         let offsets: Vec<[f64; 3]> = (0..layouts.len()).map(offset).collect();
         let distance =
             |offset: &[f64; 3]| offset.iter().fold(0.0, |largest: f64, coordinate| largest.max(coordinate.abs()));
         let nearest_distance = offsets.iter().map(distance).fold(f64::INFINITY, f64::min);
         let mut rebased = Vec::with_capacity(positions.len());
         let mut bounds = BoundingBox::EMPTY;
-        for (layout, offset) in layouts.iter().zip(&offsets) {
-            let is_near = distance(offset) <= ORIGIN_REACH + 4.0 * nearest_distance;
+        for (domain, (layout, offset)) in layouts.iter().zip(&offsets).enumerate() {
+            let reach = NEARBY_REACH * self.grids.spacings[root_of(domain)];
+            let is_near = distance(offset) <= reach + 4.0 * nearest_distance;
             let domain_positions = &positions[3 * layout.first_vertex..][..3 * layout.vertices];
             for point in domain_positions.chunks_exact(3) {
                 let point: [f64; 3] = std::array::from_fn(|axis| f64::from(point[axis]) + offset[axis]);
@@ -188,15 +305,11 @@ impl FloatingOrigins {
     }
 }
 
-/// The grid point nearest to a point. It is the floating origin of an outlier whose translation is `point`.
-pub fn snap_to_origin_grid(point: [f64; 3]) -> [f64; 3] {
-    point.map(|coordinate| (coordinate / ORIGIN_GRID).round() * ORIGIN_GRID)
+/// The multiple of `spacing` nearest to a point, per axis.
+fn snap_to_grid(point: [f64; 3], spacing: f64) -> [f64; 3] {
+    point.map(|coordinate| (coordinate / spacing).round() * spacing)
 }
 
 fn subtract(minuend: [f64; 3], subtrahend: [f64; 3]) -> [f64; 3] {
     std::array::from_fn(|axis| minuend[axis] - subtrahend[axis])
-}
-
-fn is_beyond_reach(shared_origin: [f64; 3], translation: [f64; 3]) -> bool {
-    subtract(translation, shared_origin).iter().any(|coordinate| coordinate.abs() > ORIGIN_REACH)
 }

@@ -23,7 +23,7 @@ mod transform_roots;
 pub use camera::{BoundingBox, Camera, Lens, View};
 pub use deformation::{DeformationSettings, NormalMethod, StorageType};
 pub use features::SceneFeatures;
-pub use floating_origin::{FloatingOrigins, ORIGIN_GRID, ORIGIN_REACH, snap_to_origin_grid};
+pub use floating_origin::{FloatingOrigins, HOME_REACH, OriginGrids, SHARED_REACH};
 pub use frame_size::FrameSize;
 pub use layout::{DomainLayout, Layout};
 pub use light_space::{OrientedBounds, light_axes};
@@ -104,6 +104,8 @@ pub struct Scene {
     pub features: SceneFeatures,
     /// Bounds of the rest state in scene units.
     pub rest_bounds: BoundingBox,
+    /// Spacings of the floating origins of the transform roots.
+    pub origin_grids: Arc<OriginGrids>,
 }
 
 impl Scene {
@@ -153,6 +155,7 @@ impl Scene {
         add_tangents(&mut parts);
         let layout = Layout::new(&parts.shapes, &parts.domains)?;
         let features = SceneFeatures::from_parts(&parts);
+        let origin_grids = Arc::new(OriginGrids::new(&parts.shapes, &parts.domains, &transform_roots));
         if features.exact_normals {
             add_smoothing(&mut parts)?;
         }
@@ -173,6 +176,7 @@ impl Scene {
             transform_roots,
             features,
             rest_bounds: BoundingBox::EMPTY,
+            origin_grids,
         };
         scene.rest_bounds = scene.compute_rest_bounds();
         Ok(Arc::new(scene))

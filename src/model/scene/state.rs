@@ -4,7 +4,7 @@
 use std::borrow::Cow;
 use std::sync::Arc;
 
-use super::{FloatingOrigins, Scene, StepUpdate, TransformRoots};
+use super::{FloatingOrigins, Scene, StepUpdate};
 use crate::domain::{ComposedTransform, Transform};
 
 /// The domains that differ from the state with the previous serial number.
@@ -90,16 +90,17 @@ impl SceneState {
         // The list consists of a few ascending runs, which a stable sort merges in linear time.
         changed_domains.sort();
         changed_domains.dedup();
-        let is_rebased = self.apply_transforms(&scene.transform_roots, update);
+        let is_rebased = self.apply_transforms(scene, update);
         self.dirty_domains = if is_rebased { DirtyDomains::All } else { DirtyDomains::Some(changed_domains) };
     }
 
     /// Sets the transforms of a step. Returns true if transforms were rebased: converted to another floating origin,
     /// also for domains that the step does not contain.
-    fn apply_transforms(&mut self, transform_roots: &TransformRoots, update: &StepUpdate) -> bool {
+    fn apply_transforms(&mut self, scene: &Scene, update: &StepUpdate) -> bool {
+        let transform_roots = &scene.transform_roots;
         let is_first_f64_step = self.origins.is_none() && update.has_f64_translations();
         if is_first_f64_step {
-            self.origins = Some(Arc::new(FloatingOrigins::from_transforms(&self.transforms)));
+            self.origins = Some(Arc::new(FloatingOrigins::from_transforms(&scene.origin_grids, &self.transforms)));
         }
         if update.transforms.is_empty() {
             return false;

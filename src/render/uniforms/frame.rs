@@ -180,16 +180,20 @@ fn camera_is_above_ground(scene: &Scene, params: &FrameParams) -> bool {
     params.camera.eye()[up] > scene.rest_bounds.min[up]
 }
 
-/// Rest bounds relative to `origin`. An origin other than 0 means that the scene moved far away. Then the rest bounds
-/// are moved horizontally to the center of the current bounds. Their height above the world's origin does not change,
-/// because the ground is at their lower end.
+/// Distance of the origin from the scene's origin, in diagonals of the rest bounds, from which the ground is centered at
+/// the current bounds. It is large, because the fade of the ground changes there.
+const GROUND_FOLLOW_DISTANCE: f64 = 4096.0;
+
+/// Rest bounds relative to `origin`. If the scene moved far away ([`GROUND_FOLLOW_DISTANCE`]), the rest bounds are moved
+/// horizontally to the center of the current bounds. Their height above the world's origin does not change, because the
+/// ground is at their lower end.
 fn rebased_rest_bounds(scene: &Scene, bounds: BoundingBox, origin: [f64; 3]) -> BoundingBox {
     let rest_bounds = scene.rest_bounds;
-    if origin == [0.0; 3] {
-        return rest_bounds;
+    let mut shift = -Vector3::from(origin);
+    if shift.amax() > GROUND_FOLLOW_DISTANCE * rest_bounds.diagonal() {
+        shift = bounds.center() - rest_bounds.center();
+        shift[scene.up.index()] = -origin[scene.up.index()];
     }
-    let mut shift = bounds.center() - rest_bounds.center();
-    shift[scene.up.index()] = -origin[scene.up.index()];
     let shifted = |corner: [f64; 3]| std::array::from_fn(|axis| corner[axis] + shift[axis]);
     BoundingBox { min: shifted(rest_bounds.min), max: shifted(rest_bounds.max) }
 }
@@ -256,9 +260,12 @@ mod tests {
         let shifted = |corner: [f64; 3]| [corner[0] + 3.0, corner[1] + 5.0, corner[2] - 7.0];
         let bounds = BoundingBox { min: shifted(rest_bounds.min), max: shifted(rest_bounds.max) };
         assert_eq!(rebased_rest_bounds(&scene, bounds, [0.0; 3]), rest_bounds, "expected no shift without an origin");
-        let rebased_rest_bounds = rebased_rest_bounds(&scene, bounds, [1024.0, 2048.0, 0.0]);
+        let near_bounds = rebased_rest_bounds(&scene, bounds, [4.0, 8.0, -16.0]);
+        let expected = |corner: [f64; 3]| [corner[0] - 4.0, corner[1] - 8.0, corner[2] + 16.0];
+        assert_eq!(near_bounds, BoundingBox { min: expected(rest_bounds.min), max: expected(rest_bounds.max) });
+        let rebased_rest_bounds = rebased_rest_bounds(&scene, bounds, [1024.0, 1e6, 0.0]);
         // y is the up axis.
-        let expected = |corner: [f64; 3]| [corner[0] + 3.0, corner[1] - 2048.0, corner[2] - 7.0];
+        let expected = |corner: [f64; 3]| [corner[0] + 3.0, corner[1] - 1e6, corner[2] - 7.0];
         assert_eq!(rebased_rest_bounds, BoundingBox { min: expected(rest_bounds.min), max: expected(rest_bounds.max) });
     }
 

@@ -8,15 +8,14 @@ use modalcast::engine::DeviceContext;
 use modalcast_model::backend_settings::BackendSettings;
 use modalcast_model::domain::Material;
 use modalcast_model::scene::{
-    Camera, FrameSize, Lens, ORIGIN_GRID, RawStepUpdate, RenderSettings, Scene, SceneState, ShadowMethod,
-    ShadowSettings, StepUpdate, TransformFormat, View,
+    Camera, FrameSize, Lens, RawStepUpdate, RenderSettings, Scene, SceneState, ShadowMethod, ShadowSettings,
+    StepUpdate, TransformFormat, View,
 };
 use modalcast_render::FrameImage;
 
 use super::harness::{SceneBuilder, facing_rectangle, floor_mesh};
 
-/// A position that is not on the grid of floating origins and not representable in f32. [`ORIGIN_GRID`] is the spacing
-/// of this grid.
+/// A position that is not on the grid of floating origins and not representable in f32.
 const FAR_POSITION: [f64; 3] = [1e7 + 1.3, 0.0, -1e7 - 2.7];
 
 fn open_context() -> DeviceContext {
@@ -90,7 +89,7 @@ fn far_scene_renders_like_the_scene_at_the_origin() {
     let mut context = open_context();
     // About ten thousand kilometers along x and z. Texels of a shadow map are aligned to a grid that is fixed in the
     // world. So the edge of a shadow looks the same only after a move by multiples of the texel size.
-    let grid_position = [9766.0 * ORIGIN_GRID, 0.0, -9767.0 * ORIGIN_GRID];
+    let grid_position = [9766.0 * 1024.0, 0.0, -9767.0 * 1024.0];
     // Off the grid, rounding moves positions by up to 1/500 pixel. A sample that is closer to an edge may change sides,
     // which affects at most one pixel in a thousand: 9 of 96 x 96.
     let default_shadow = ShadowSettings::default();

@@ -1,10 +1,10 @@
 //! Tests of dirty domains, distant translations and merged steps.
 
 use super::*;
-use crate::domain::{Domain, Material, Mesh, Modes, Shape};
-use crate::scene::{ORIGIN_GRID, RawStepUpdate, SceneParts, TransformFormat};
+use crate::domain::{Domain, FollowConstraint, Material, Mesh, Modes, Shape, Transform};
+use crate::scene::{RawStepUpdate, SceneParts, TransformFormat};
 
-/// Domains of one vertex and two modes. Domains 2 and 4 share the coordinates of domain 1; domain 5 has no modes.
+/// Domains of one vertex and two modes. The largest coordinate is 1, and so is the spacing of floating origins. Domains 2 and 4 share the coordinates of domain 1; domain 5 has no modes.
 fn scene(count: usize) -> Arc<Scene> {
     let mesh =
         || Mesh::from_indexed(vec![[0.5, 0.25, 1.0]], vec![[0.0, 0.0, 1.0]], vec![], vec![[0, 0, 0]]).expect("a point");
@@ -144,7 +144,7 @@ fn near_translations_keep_the_scene_origin() {
     let scene = scene(3);
     let state = state_after(&scene, &[f32_step(1, [1e6, 0.0, 0.0])]);
     assert_eq!((state.origins.as_ref(), state.transforms[1].0[3]), (None, 1e6));
-    let state = state_after(&scene, &[f64_step(&[0, 1], &[[4096.0, -4096.0, 0.1], [1.0, 2.0, 3.0]])]);
+    let state = state_after(&scene, &[f64_step(&[0, 1], &[[4.0, -4.0, 0.1], [1.0, 2.0, 3.0]])]);
     assert_eq!((state.origin_of(0), state.transforms[0].0[11]), ([0.0; 3], 0.1));
     assert_eq!(state.dirty_domains, DirtyDomains::Some(vec![0, 1]));
     assert!(state.origins.is_some_and(|origins| origins.has_no_outliers()));
@@ -153,24 +153,18 @@ fn near_translations_keep_the_scene_origin() {
 #[test]
 fn distant_domain_has_its_own_floating_origin() {
     let scene = scene(3);
-    // The grid point nearest to 1e7 is 9766 * ORIGIN_GRID, and the one nearest to 1e6 is 977 * ORIGIN_GRID.
     let position = [1e7 + 0.001, -1e7 - 0.002, 3.0];
     let mut state = state_after(&scene, &[f64_step(&[2], &[position])]);
     assert_eq!(state.dirty_domains, DirtyDomains::Some(vec![2]));
-    assert_eq!(
-        (state.origin_of(0), state.origin_of(2)),
-        ([0.0; 3], [9766.0 * ORIGIN_GRID, -9766.0 * ORIGIN_GRID, 0.0])
-    );
-    // The translation is within 512 units of its floating origin, where rounding to f32 changes it by at most 2^-16.
+    assert_eq!((state.origin_of(0), state.origin_of(2)), ([0.0; 3], [1e7, -1e7, 3.0]));
+    // The translation is within half a unit of its floating origin, where rounding to f32 changes it by at most 2^-26.
+    // In f64, numbers near 1e7 have a spacing of 2^-29.
     let error = (0..3).map(|axis| (world_position(&state, 2)[axis] - position[axis]).abs()).fold(0.0, f64::max);
-    assert!(error <= 2e-5, "{error} units");
+    assert!(error <= 2.0_f64.powi(-25), "{error} units");
     assert!((f64::from(position[0] as f32) - position[0]).abs() > 5e-4, "expected f32 to lose a millimeter");
     // f32 translations also change the floating origin, and move the domain back to the scene's origin.
     state.apply(&scene, &parse_step(&scene, &f32_step(2, [1e6 + 1.0, 0.0, 0.0])));
-    assert_eq!(
-        (world_position(&state, 2), state.origin_of(2)),
-        ([1e6 + 1.0, 0.0, 0.0], [977.0 * ORIGIN_GRID, 0.0, 0.0])
-    );
+    assert_eq!((world_position(&state, 2), state.origin_of(2)), ([1e6 + 1.0, 0.0, 0.0], [1e6 + 1.0, 0.0, 0.0]));
     state.apply(&scene, &parse_step(&scene, &f32_step(2, [5.0, 6.0, 7.0])));
     assert_eq!((state.transforms[2].0[3], state.origin_of(2)), (5.0, [0.0; 3]));
 }
@@ -182,10 +176,7 @@ fn shared_origin_follows_the_majority_of_the_domains() {
     // Of five domains, two distant ones become outliers; four distant ones move the shared origin.
     let steps = [f64_step(&[0, 1], &distant_positions(1e7)[..2]), f64_step(&[2, 3], &distant_positions(1e7)[2..])];
     let state = state_after(&scene, &steps[..1]);
-    assert_eq!(
-        (state.origin_of(1), state.origin_of(4)),
-        ([9766.0 * ORIGIN_GRID, 0.0, -9766.0 * ORIGIN_GRID], [0.0; 3])
-    );
+    assert_eq!((state.origin_of(1), state.origin_of(4)), ([1e7 + 1.0, 0.0, -1e7], [0.0; 3]));
     assert_eq!(state.origins.as_ref().map(|origins| origins.shared_origin()), Some([0.0; 3]));
     let mut state = state_after(&scene, &steps);
     assert_eq!((state.serial, &state.dirty_domains), (2, &DirtyDomains::All), "expected all transforms to be rebased");
@@ -195,21 +186,65 @@ fn shared_origin_follows_the_majority_of_the_domains() {
     );
     assert_eq!((state.origin_of(4), world_position(&state, 4)), ([0.0; 3], [0.0; 3]));
     for (domain, expected) in distant_positions(1e7).iter().enumerate() {
-        assert_eq!(state.origin_of(domain), [9766.0 * ORIGIN_GRID, 0.0, -9766.0 * ORIGIN_GRID]);
+        assert_eq!(state.origin_of(domain), [1e7 + 1.0, 0.0, -1e7]);
         assert_eq!(world_position(&state, domain), *expected);
     }
     // The shared origin remains while the domains are within its reach, and moves when they are beyond it.
-    state.apply(&scene, &parse_step(&scene, &f64_step(&[0, 1, 2, 3], &distant_positions(1e7 + 4000.0))));
+    state.apply(&scene, &parse_step(&scene, &f64_step(&[0, 1, 2, 3], &distant_positions(1e7 + 2.0))));
     assert_eq!(
         (state.origin_of(0), &state.dirty_domains),
-        ([9766.0 * ORIGIN_GRID, 0.0, -9766.0 * ORIGIN_GRID], &DirtyDomains::Some(vec![0, 1, 2, 3]))
+        ([1e7 + 1.0, 0.0, -1e7], &DirtyDomains::Some(vec![0, 1, 2, 3]))
     );
     state.apply(&scene, &parse_step(&scene, &f64_step(&[0, 1, 2, 3], &distant_positions(1e7 + 9000.0))));
-    // (1e7 + 9000) / 1024 = 9774.4
-    assert_eq!(
-        (state.origin_of(0), &state.dirty_domains),
-        ([9774.0 * ORIGIN_GRID, 0.0, -9774.0 * ORIGIN_GRID], &DirtyDomains::All)
-    );
+    assert_eq!((state.origin_of(0), &state.dirty_domains), ([1e7 + 9001.0, 0.0, -1e7 - 9000.0], &DirtyDomains::All));
+}
+
+/// A domain beyond the home reach but within the shared reach uses the shared origin of the majority.
+#[test]
+fn minority_within_the_shared_reach_has_no_origin_of_its_own() {
+    let scene = scene(3);
+    let mut state = state_after(&scene, &[f64_step(&[2], &[[64.0, 0.0, -64.0]])]);
+    assert!(state.origins.as_ref().is_some_and(|origins| origins.has_no_outliers()));
+    state.apply(&scene, &parse_step(&scene, &f64_step(&[2], &[[64.5, 0.0, 0.0]])));
+    assert!(state.origins.as_ref().is_some_and(|origins| !origins.has_no_outliers()));
+    assert_eq!((state.origin_of(0), state.origin_of(2)), ([0.0; 3], [65.0, 0.0, 0.0]));
+    state.apply(&scene, &parse_step(&scene, &f64_step(&[2], &[[-3.0, 0.0, 0.0]])));
+    assert!(state.origins.as_ref().is_some_and(|origins| origins.has_no_outliers()));
+}
+
+/// The shared origin of one domain stays while the domain is within its home reach, and then jumps to the nearest grid
+/// point. So a domain that swings around a border of this reach does not move the origin back and forth.
+#[test]
+fn shared_origin_follows_one_domain_with_hysteresis_and_returns() {
+    let scene = scene(1);
+    let mut state = SceneState::rest(&scene);
+    let expected_origins =
+        [(4.0, 0.0), (4.25, 4.0), (3.75, 4.0), (0.0, 4.0), (-0.25, 0.0), (500.3, 500.0), (1e5, 1e5), (0.1, 0.0)];
+    for (x, expected_origin) in expected_origins {
+        state.apply(&scene, &parse_step(&scene, &f64_step(&[0], &[[x, 0.0, 0.0]])));
+        assert_eq!(state.origin_of(0), [expected_origin, 0.0, 0.0], "translation {x}");
+        let error = (world_position(&state, 0)[0] - x).abs();
+        assert!(error <= 2.0_f64.powi(-23), "translation {x}: error {error:e}");
+    }
+}
+
+/// The spacing is the power of two below the diagonal or the largest coordinate of a root with its followers.
+#[test]
+fn origin_spacing_follows_the_size_of_a_root() {
+    let spacing = |scale: f32, placement: Transform| {
+        let mut parts = scene(1).parts();
+        let corners = vec![[-scale, 0.0, 0.0], [scale, 0.0, 0.0], [0.0, scale, 0.0]];
+        let mesh = Mesh::from_indexed(corners, vec![[0.0, 0.0, 1.0]; 3], vec![], vec![[0, 1, 2]]).expect("a triangle");
+        parts.shapes = vec![Shape::new(mesh, Modes::rigid()).expect("rigid")];
+        let follower = FollowConstraint { parent: 0, frame: placement };
+        parts.domains = vec![Domain::new("root", 0), Domain { follows: Some(follower), ..Domain::new("follower", 0) }];
+        Scene::new(parts).expect("a scene").origin_grids.spacing(0)
+    };
+    let mut moved = Transform::IDENTITY;
+    moved.0[3] = 100.0;
+    // The diagonal is sqrt(5) times the scale: 2.2, 0.22 and 2.2e9.
+    assert_eq!([1.0, 0.1, 1e9].map(|scale| spacing(scale, Transform::IDENTITY)), [2.0, 0.125, 2_147_483_648.0]);
+    assert_eq!(spacing(1.0, moved), 64.0, "expected the largest coordinate of the follower, 101");
 }
 
 #[test]
@@ -217,7 +252,7 @@ fn first_f64_step_rebases_distant_f32_transforms() {
     let scene = scene(5);
     let mut state = state_after(&scene, &[f32_step(3, [1e6, 2.0, 0.0])]);
     state.apply(&scene, &parse_step(&scene, &f64_step(&[0], &[[1.0, 0.0, 0.0]])));
-    assert_eq!((state.origin_of(3), world_position(&state, 3)), ([977.0 * ORIGIN_GRID, 0.0, 0.0], [1e6, 2.0, 0.0]));
+    assert_eq!((state.origin_of(3), world_position(&state, 3)), ([1e6, 2.0, 0.0], [1e6, 2.0, 0.0]));
     assert_eq!(state.dirty_domains, DirtyDomains::All);
 }
 
@@ -242,10 +277,10 @@ fn scattered_scene_is_not_searched_in_every_step() {
 fn merged_step_gives_the_state_of_all_its_steps() {
     let scene = scene(4);
     let steps = [
-        f64_step(&[0, 1], &[[1e7, 0.0, 0.0], [5.0, 0.5, 0.0]]),
+        f64_step(&[0, 1], &[[1e7, 0.0, 0.0], [3.0, 0.5, 0.0]]),
         RawStepUpdate { q_domains: vec![1], q: vec![1; 8].into(), ..f32_step(0, [1.0, 2.0, 3.0]) },
         f64_step(&[3], &[[-1e7 - 0.125, 0.0, 0.0]]),
-        f32_step(2, [9.0, 9.0, 9.0]),
+        f32_step(2, [3.0, 3.0, 3.0]),
     ];
     let merged = steps
         .iter()
