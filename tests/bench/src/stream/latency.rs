@@ -43,7 +43,7 @@ pub struct LatencyResult {
     pub delayed_steps: usize,
     /// Steps per second if steps are sent from memory without a wait for acknowledgments. Only for acknowledgments.
     pub steps_per_second: Option<f64>,
-    /// The stages of the server, and everything between them. The largest p50 is first. Only for frames.
+    /// The stages of the server, and everything between them. The largest p50 is first.
     pub stages: Vec<StageLatency>,
 }
 
@@ -55,7 +55,7 @@ pub struct StageLatency {
     pub p99_ms: f64,
 }
 
-/// The name of the time of a frame that is not in a stage of the server.
+/// The name of the time that is not in a stage of the server.
 const OTHER_STAGE: &str = "send, transfer and waits";
 
 impl LatencyResult {
@@ -80,12 +80,12 @@ impl LatencyResult {
     }
 }
 
-/// The times of the stages of frames.
+/// The times of the stages of frames or steps.
 #[derive(Debug, Default)]
 struct StageSamples(BTreeMap<String, Vec<f64>>);
 
 impl StageSamples {
-    /// Adds the stages of a frame that took `total_ms`.
+    /// Adds the stages of a frame or a step that took `total_ms`.
     fn add(&mut self, stages: &StageTimes, total_ms: f64) {
         let stages_ms: f64 = stages.iter().map(|(_, ms)| f64::from(*ms)).sum();
         let other = (OTHER_STAGE, (total_ms - stages_ms).max(0.0));
@@ -166,29 +166,32 @@ async fn time_frames(url: &str, motion: &Motion, content: Content, steps: u64) -
 /// `Fault` when the server rejects a step.
 pub(super) fn measure_acknowledgments(session: &Session, steps: u64) -> Result<LatencyResult> {
     let motion = session.motion(steps.min(super::RECORDED_STEPS))?;
-    let times_ms = runtime()?.block_on(async {
+    let latency = runtime()?.block_on(async {
         let client = connect(&session.url()).await?;
         time_acknowledgments(&client, motion, steps).await
     })?;
     let steps_per_second = session.runtime.block_on(motion::measure_rate(&session.client, motion, steps))?;
-    let latency = LatencyResult::new(["step sent", "acknowledgment received"], times_ms)?;
     Ok(LatencyResult { steps_per_second: Some(steps_per_second), ..latency })
 }
 
-async fn time_acknowledgments(client: &Client, motion: &Motion, steps: u64) -> Result<Vec<f64>> {
+async fn time_acknowledgments(client: &Client, motion: &Motion, steps: u64) -> Result<LatencyResult> {
     let mut writer = motion::open_writer(client, Some(1)).await?;
-    let mut times_ms = Vec::new();
+    let (mut times_ms, mut stages) = (Vec::new(), StageSamples::default());
     for number in 0..WARM_UP_STEPS + steps {
         let step = motion.step(number);
         let sent = Instant::now();
         writer.step(&step).await.map_err(fault_in("report"))?;
         writer.flush().await.map_err(fault_in("report"))?;
+        let total_ms = sent.elapsed().as_secs_f64() * 1e3;
+        let acks = writer.take_acks();
         if number >= WARM_UP_STEPS {
-            times_ms.push(sent.elapsed().as_secs_f64() * 1e3);
+            times_ms.push(total_ms);
+            acks.iter().for_each(|ack| stages.add(&ack.stages, total_ms));
         }
     }
     writer.finish().await.map_err(fault_in("report"))?;
-    Ok(times_ms)
+    let latency = LatencyResult::new(["step sent", "acknowledgment received"], times_ms)?;
+    Ok(LatencyResult { stages: stages.latencies(), ..latency })
 }
 
 async fn connect(url: &str) -> Result<Client> {
