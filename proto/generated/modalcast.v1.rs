@@ -385,6 +385,10 @@ pub struct UploadedDomain {
     /// Squared angular frequencies in (rad/s)^2, one per mode; empty if unknown.
     #[prost(double, repeated, tag = "8")]
     pub eigenvalues: ::prost::alloc::vec::Vec<f64>,
+    /// Crease angle in degrees, 0 (flat) to 180 (smooth): an edge is shaded as hard if the normals of its two triangles
+    /// differ by more at rest. Unset: 40. Must be unset with `shares_shape_with`. Vertices keep their numbers.
+    #[prost(double, optional, tag = "9")]
+    pub crease_angle: ::core::option::Option<f64>,
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct UploadArraysResponse {

@@ -10,7 +10,7 @@ use crate::engine::{
     parse_hash,
 };
 use crate::telemetry::StageTimes;
-use modalcast_model::domain::Transform;
+use modalcast_model::domain::{CreaseAngle, Transform};
 use modalcast_model::error::{Result, invalid};
 use modalcast_model::scene::{Camera, FrameSize, PixelRect, RawStepUpdate, Scene, TransformFormat, UpAxis};
 
@@ -375,5 +375,13 @@ pub(super) fn parse_uploaded_domain(domain: v1::UploadedDomain) -> Result<engine
         [red, green, blue] => [red, green, blue],
         _ => return Err(invalid("color", "none or 3 numbers", domain.color.len())),
     };
-    Ok(engine::UploadedDomain { name: domain.name, shape, placement, color, eigenvalues: domain.eigenvalues })
+    let crease_angle = domain.crease_angle.map(CreaseAngle::from_degrees).transpose()?;
+    Ok(engine::UploadedDomain {
+        name: domain.name,
+        shape,
+        placement,
+        color,
+        eigenvalues: domain.eigenvalues,
+        crease_angle,
+    })
 }

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use modalcast_compute::gpu::{BufferRole, CudaDeformer};
 use modalcast_compute::reference::{exact_normals, exact_tangents, rigid_normals, rigid_tangents};
 use modalcast_model::deform::Deformer;
-use modalcast_model::domain::{Corners, Mesh, Modes, Shape, Transform};
+use modalcast_model::domain::{Corners, CreaseAngle, Mesh, Modes, Shape, Transform, split_at_creases};
 use modalcast_model::scene::{NormalMethod, Scene, SceneState};
 use nalgebra::Vector3;
 
@@ -45,6 +45,13 @@ fn tube(random: &mut Random, columns: u32, rows: u32, rank: usize) -> Shape {
         [[lower_corner, lower_corner + 1, upper_corner + 1], [lower_corner, upper_corner + 1, upper_corner]]
     };
     let triangles = (0..rows - 1).flat_map(|row| (0..columns).flat_map(move |column| triangle(row, column))).collect();
+    let modes = wave_modes(random, &rest, rank);
+    Shape::new(Mesh::new(rest, corners, triangles).expect("expected a valid mesh"), modes)
+        .expect("expected a valid shape")
+}
+
+/// `rank` smooth modes: plane waves of random directions and amplitudes.
+fn wave_modes(random: &mut Random, rest: &[[f32; 3]], rank: usize) -> Modes {
     let mut entries = Vec::with_capacity(3 * rest.len() * rank);
     for _ in 0..rank {
         let (wave_vector, amplitudes) = (random.next_triple(), random.next_triple());
@@ -54,9 +61,7 @@ fn tube(random: &mut Random, columns: u32, rows: u32, rank: usize) -> Shape {
             rest.iter().flat_map(|position| amplitudes.map(|amplitude| scale * amplitude * phase(position).sin())),
         );
     }
-    let modes = Modes::from_columns(3 * rest.len(), rank, entries).expect("expected valid modes");
-    Shape::new(Mesh::new(rest, corners, triangles).expect("expected a valid mesh"), modes)
-        .expect("expected a valid shape")
+    Modes::from_columns(3 * rest.len(), rank, entries).expect("expected valid modes")
 }
 
 /// A scene with exact normals. `normal_maps` of the options applies to all shapes.
@@ -161,6 +166,39 @@ fn gpu_exact_normals_equal_the_reference() {
         assert_equals_reference(&name, &scene, &scenes::random_state(&scene, 5), &mut deformer);
         assert_eq!(deformer.surface().expect("expected a surface").tangents.is_empty(), !normal_maps);
     }
+}
+
+/// A prism of `sides` sides without normals, whose corners are split at creases, with `rank` smooth modes. The vertices
+/// are not split: the prism has two rows of `sides` vertices.
+fn creased_prism(random: &mut Random, sides: u32, rank: usize) -> Shape {
+    let angle = |side: u32| side as f32 / sides as f32 * std::f32::consts::TAU;
+    let rest: Vec<[f32; 3]> =
+        (0..2 * sides).map(|index| [angle(index / 2).cos(), (index % 2) as f32, -angle(index / 2).sin()]).collect();
+    let side_triangles = |side: u32| {
+        let (a, b) = (2 * side, 2 * ((side + 1) % sides));
+        [[a, b, b + 1], [a, b + 1, a + 1]]
+    };
+    let triangles: Vec<[u32; 3]> = (0..sides).flat_map(side_triangles).collect();
+    let vertices: Vec<u32> = (0..2 * sides).collect();
+    let creased = split_at_creases(&rest, &vertices, &triangles, &[], CreaseAngle::default());
+    let corners = Corners { vertices: creased.source_corners, normals: creased.normals, uvs: vec![] };
+    let modes = wave_modes(random, &rest, rank);
+    Shape::new(Mesh::new(rest, corners, creased.triangles).expect("expected a valid mesh"), modes)
+        .expect("expected a valid shape")
+}
+
+/// The first prism has a hard edge between all sides, the second one has none.
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_exact_normals_of_creases_equal_the_reference() {
+    let mut random = Random(7);
+    let shapes = vec![creased_prism(&mut random, 6, 3), creased_prism(&mut random, 300, 4)];
+    let corners = shapes.iter().map(|shape| shape.mesh.corners().vertices.len()).collect::<Vec<_>>();
+    assert_eq!(corners, [24, 600], "expected two corners per vertex of the first prism");
+    let options = RandomSceneOptions { instances: 2, normal_maps: false, rigid_transforms: false };
+    let scene = scene_with_exact_normals(shapes, options);
+    let mut deformer = cuda_deformer(&scene);
+    assert_equals_reference("prisms", &scene, &scenes::random_state(&scene, 11), &mut deformer);
 }
 
 /// Checks a shape with modes at q = 0, and a shape without modes.

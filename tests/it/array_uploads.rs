@@ -119,6 +119,23 @@ async fn beam_from_arrays_has_the_vertices_of_the_beam_from_files() {
     assert_eq!(vertex_bits(&server, "arrays").await, driven_bits, "expected the scene after a restart");
 }
 
+/// Every vertex of the beam is on an edge of 90 degrees. The second domain has the shape of the first one.
+#[tokio::test(flavor = "multi_thread")]
+async fn crease_angle_of_arrays_splits_corners_but_no_vertices() {
+    let folder = tempfile::tempdir().expect("expected a temporary folder");
+    let (_server, client) = start_server(&folder.path().join("state"), folder.path()).await;
+    for (name, crease_angle, corners) in [("hard", None, 144), ("smooth", Some(180.0), 72), ("flat", Some(89.0), 144)] {
+        let first = UploadDomain::new("first", Beam::new().shape());
+        let first = crease_angle.map_or(first.clone(), |degrees| first.crease_angle(degrees));
+        let second = UploadDomain::new("second", UploadShape::OfDomain(0));
+        let upload = ArrayUpload::new(name).domain(first).domain(second);
+        let info = client.upload_arrays(upload).await.expect("expected the upload to succeed");
+        assert_eq!((info.vertices, info.corners), (72, corners), "{name}");
+        let description = client.describe(name, &[]).await.expect("expected a description");
+        assert_eq!(description.shapes.len(), 1, "{name}: expected one shape for both domains");
+    }
+}
+
 /// Sends parts and returns the rejection.
 async fn rejected_upload(server: &Server, parts: Vec<Part>) -> (Code, v1::Rejection) {
     let requests: Vec<_> = parts.into_iter().map(|part| v1::UploadArraysRequest { part: Some(part) }).collect();
@@ -157,12 +174,13 @@ async fn invalid_domains_are_rejected_with_their_path() {
     let folder = tempfile::tempdir().expect("expected a temporary folder");
     let (server, _) = start_server(&folder.path().join("state"), folder.path()).await;
     type Change = fn(&mut v1::UploadedDomain);
-    let cases: [(Change, [&str; 3]); 7] = [
+    let cases: [(Change, [&str; 3]); 8] = [
         (|it| it.rank = 513, ["rank", "0 to 512", "513"]),
         (|it| it.vertices = 0, ["vertices", "at least one vertex and one triangle", "0 vertices, 1 triangles"]),
         (|it| it.placement = vec![0; 47].into(), ["placement", "0 or 48 bytes", "47 bytes"]),
         (|it| it.color = vec![0.0, 2.0, 0.0], ["color", "numbers from 0 to 1", "[0.0, 2.0, 0.0]"]),
         (|it| it.eigenvalues = vec![1.0; 2], ["eigenvalues", "none or 1 finite numbers", "2 numbers"]),
+        (|it| it.crease_angle = Some(181.0), ["crease_angle", "0 to 180 degrees", "181"]),
         (|it| it.name = "a\nb".into(), ["name", "1 to 256 bytes without control characters", "\"a\\nb\""]),
         (
             |it| it.shares_shape_with = Some(0),
@@ -180,6 +198,14 @@ async fn invalid_domains_are_rejected_with_their_path() {
     let path = "domains[1].shares_shape_with";
     let parts = [arrays_of_first(), vec![Part::Domain(later)]].concat();
     assert_rejected(&server, parts, [path, "an index below 1", "1"]).await;
+    let creased = v1::UploadedDomain {
+        name: "b".into(),
+        shares_shape_with: Some(0),
+        crease_angle: Some(30.0),
+        ..Default::default()
+    };
+    let parts = [arrays_of_first(), vec![Part::Domain(creased)]].concat();
+    assert_rejected(&server, parts, ["domains[1].crease_angle", "none with shares_shape_with", "30"]).await;
     let parts = [arrays_of_first(), vec![Part::Domain(triangle())]].concat();
     assert_rejected(&server, parts, ["domains[1].name", "a name that no earlier domain has", "a"]).await;
 }

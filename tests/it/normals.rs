@@ -10,8 +10,8 @@ use modalcast_model::scene::NormalMethod;
 use nalgebra::{Matrix3, Rotation3, Vector3};
 
 use fixtures::{
-    angle_degrees, create_scene, create_state, cube, deform_on_cpu, max_angle_degrees, reference_normals_and_tangents,
-    scene_with_normals, shape_with_mode, sheet, sphere, tube, uniform_q_state,
+    angle_degrees, creased_box, create_scene, create_state, cube, deform_on_cpu, max_angle_degrees,
+    reference_normals_and_tangents, scene_with_normals, shape_with_mode, sheet, sphere, tube, uniform_q_state,
 };
 
 /// Maximum angle between CPU and reference normals or tangents, in degrees.
@@ -90,6 +90,47 @@ fn sheared_box_has_face_normals_and_hard_edges() {
         assert!(edge_angle > 30.0, "expected more than 30 degrees between adjacent faces, got {edge_angle}");
         assert!(max_angle_degrees(&deform_on_cpu(&scene, &state).normals, &normals) < MAX_ANGLE_DEGREES);
     }
+}
+
+/// A mesh file without normals: the exact normals of a deformed state are the area-weighted normals of the deformed
+/// triangles of each side of a crease. Negative control: with a crease angle of 180 degrees they are those of all
+/// triangles of a vertex.
+#[test]
+fn creases_of_a_file_stay_hard_while_it_deforms() {
+    let max_error = |degrees: f64| {
+        let scene = creased_box(degrees);
+        let mesh = &scene.shapes[0].mesh;
+        let state = create_state(&scene, 0.4, linear_parts()[0], [1.0, 2.0, 3.0]);
+        let positions = reference::deform(&scene, &state);
+        let (normals, _) = reference_normals_and_tangents(&scene, &state);
+        assert!(max_angle_degrees(&deform_on_cpu(&scene, &state).normals, &normals) < MAX_ANGLE_DEGREES);
+        let area_vector = |triangle: &[u32; 3]| {
+            let [a, b, c] =
+                triangle.map(|corner| Vector3::from(positions[mesh.corners().vertices[corner as usize] as usize]));
+            (b - a).cross(&(c - a))
+        };
+        // Triangles of one side have the same rest normal, because the sides of the box are flat.
+        let rest_normal = |triangle: &[u32; 3]| {
+            let [a, b, c] = triangle.map(|corner| mesh.corners().vertices[corner as usize] as usize);
+            let [a, b, c] = [a, b, c].map(|vertex| Vector3::from(mesh.rest_positions()[vertex]));
+            (b - a).cross(&(c - a)).normalize()
+        };
+        let mut max_error = 0.0_f64;
+        for triangle in mesh.triangles() {
+            for corner in triangle {
+                let vertex = |corner: u32| mesh.corners().vertices[corner as usize];
+                let is_on_side = |other: &&[u32; 3]| {
+                    other.iter().any(|other| vertex(*other) == vertex(*corner))
+                        && rest_normal(other).dot(&rest_normal(triangle)) > 0.99
+                };
+                let expected: Vector3<f64> = mesh.triangles().iter().filter(is_on_side).map(area_vector).sum();
+                max_error = max_error.max(angle_degrees(normals[*corner as usize], expected.into()));
+            }
+        }
+        max_error
+    };
+    assert!(max_error(40.0) < 1e-4, "{} degrees", max_error(40.0));
+    assert!(max_error(180.0) > 30.0, "negative control: {} degrees", max_error(180.0));
 }
 
 #[test]

@@ -43,12 +43,13 @@ pub struct UploadDomain {
     placement: Option<[f32; 12]>,
     color: Option<[f32; 3]>,
     eigenvalues: Vec<f64>,
+    crease_angle: Option<f64>,
 }
 
 impl UploadDomain {
     /// A white domain at the origin. Its name must be unique in the upload.
     pub fn new(name: &str, shape: UploadShape) -> Self {
-        Self { name: name.to_owned(), shape, placement: None, color: None, eigenvalues: vec![] }
+        Self { name: name.to_owned(), shape, placement: None, color: None, eigenvalues: vec![], crease_angle: None }
     }
 
     /// Sets `world_from_domain` at rest: row-major 3x4, translation in scene units.
@@ -71,12 +72,21 @@ impl UploadDomain {
         Self { eigenvalues: eigenvalues.to_vec(), ..self }
     }
 
+    /// Sets the crease angle in degrees: an edge is shaded as hard if the normals of its two triangles differ by more at
+    /// rest. 0 is flat, 180 is smooth, and the default is 40. For [`UploadShape::Arrays`] only.
+    #[must_use]
+    pub const fn crease_angle(mut self, degrees: f64) -> Self {
+        self.crease_angle = Some(degrees);
+        self
+    }
+
     fn to_wire(&self) -> v1::UploadedDomain {
         let mut wire = v1::UploadedDomain {
             name: self.name.clone(),
             placement: self.placement.map(|entries| pack(&entries)).unwrap_or_default(),
             color: self.color.map(|color| color.to_vec()).unwrap_or_default(),
             eigenvalues: self.eigenvalues.clone(),
+            crease_angle: self.crease_angle,
             ..Default::default()
         };
         match &self.shape {

@@ -13,7 +13,7 @@ use tokio::sync::OwnedSemaphorePermit;
 
 use super::upload::CompleteUpload;
 use super::upload_folder::UploadFolder;
-use modalcast_model::domain::{Corners, MAX_RANK, Mesh, Modes, Shape, Transform};
+use modalcast_model::domain::{Corners, CreaseAngle, MAX_RANK, Mesh, Modes, Shape, Transform};
 use modalcast_model::error::{Result, fault_in, invalid};
 use modalcast_model::scene::UpAxis;
 
@@ -60,6 +60,8 @@ pub struct UploadedDomain {
     pub color: [f32; 3],
     /// None, or one per mode.
     pub eigenvalues: Vec<f64>,
+    /// For arrays only: the crease angle, if it is not the default.
+    pub crease_angle: Option<CreaseAngle>,
 }
 
 /// An upload of arrays in progress. Its methods block on the disk.
@@ -73,6 +75,8 @@ pub struct ArrayUpload {
     shapes: Vec<u32>,
     /// Per domain so far, its number of modes.
     ranks: Vec<u32>,
+    /// Per domain so far, the crease angle of its mesh.
+    crease_angles: Vec<Option<CreaseAngle>>,
     names: HashSet<String>,
     /// Sum of the sizes of the arrays of all domains so far, in bytes.
     declared_bytes: u64,
@@ -140,6 +144,7 @@ impl ArrayUpload {
             manifest: String::new(),
             shapes: Vec::new(),
             ranks: Vec::new(),
+            crease_angles: Vec::new(),
             names: HashSet::new(),
             declared_bytes: 0,
             open_arrays: None,
@@ -192,10 +197,14 @@ impl ArrayUpload {
         if !self.names.insert(domain.name.clone()) {
             return Err(invalid("name", "a name that no earlier domain has", &domain.name));
         }
-        let (shape, rank) = match domain.shape {
-            UploadedShape::Arrays { rank, .. } => (index, rank),
+        let (shape, rank, crease_angle) = match domain.shape {
+            UploadedShape::Arrays { rank, .. } => (index, rank, domain.crease_angle),
             UploadedShape::OfDomain(earlier) if earlier < index => {
-                (self.shapes[earlier as usize], self.ranks[earlier as usize])
+                if let Some(given) = domain.crease_angle {
+                    return Err(invalid("crease_angle", "none with shares_shape_with", given.degrees()));
+                }
+                let earlier = earlier as usize;
+                (self.shapes[earlier], self.ranks[earlier], self.crease_angles[earlier])
             }
             UploadedShape::OfDomain(earlier) => {
                 return Err(invalid("shares_shape_with", format!("an index below {index}"), earlier));
@@ -211,12 +220,13 @@ impl ArrayUpload {
         }
         self.shapes.push(shape);
         self.ranks.push(rank);
-        self.write_entry(shape, rank, domain);
+        self.crease_angles.push(crease_angle);
+        self.write_entry(shape, rank, crease_angle, domain);
         Ok(())
     }
 
     /// Appends the entry of a domain to the manifest. `{:?}` prints f64 with all digits that they need.
-    fn write_entry(&mut self, shape: u32, rank: u32, domain: &UploadedDomain) {
+    fn write_entry(&mut self, shape: u32, rank: u32, crease_angle: Option<CreaseAngle>, domain: &UploadedDomain) {
         let modes = if rank > 0 { format!("{shape}.npy") } else { String::new() };
         let up = self.up();
         let text = format!(
@@ -227,6 +237,9 @@ impl ArrayUpload {
             domain.color.map(f64::from),
         );
         self.manifest.push_str(&text);
+        if let Some(angle) = crease_angle {
+            writeln!(self.manifest, "crease_angle = {:?}", angle.degrees()).ok(); // A `String` accepts all text.
+        }
         if !domain.eigenvalues.is_empty() {
             writeln!(self.manifest, "eigenvalues = {:?}", domain.eigenvalues).ok(); // A `String` accepts all text.
         }

@@ -4,6 +4,7 @@
 //! other code does not check them again. Positions are in scene units.
 
 mod composed_transform;
+mod creases;
 mod material;
 mod mesh;
 mod modes;
@@ -13,6 +14,7 @@ mod texture;
 mod transform;
 
 pub use composed_transform::ComposedTransform;
+pub use creases::{CreaseAngle, CreasedCorners, split_at_creases};
 pub use material::{AlphaMode, Material};
 pub use mesh::{Corners, Mesh, smooth_normals};
 pub use modes::{MAX_RANK, Modes};

@@ -14,6 +14,8 @@
 //! - Colors in files are linear factors. Color images are sRGB; normal maps are linear with +Y up.
 //! - OBJ and glTF have Y up; plants, PLY, STL and NumPy archives have Z up; units are meters. `scene.toml` can override
 //!   these defaults.
+//! - Normals of a file are kept. Missing ones are smooth except along creases, which split the corners of a vertex and
+//!   never the vertex itself (module `domain::creases`).
 //! - A file that another file refers to and that does not exist has a stand-in and a remark, or is an error in strict
 //!   mode.
 

@@ -5,7 +5,7 @@
 use super::asset_dir::{AssetDir, MAX_MODEL_BYTES, stem_of};
 use super::modes::{LoadedModes, NpzArchive, parse_f64, read_npz_modes};
 use super::polygons::{Corner, NO_INDEX, PolygonMesh};
-use super::surface::{self, ModesSource};
+use super::surface::{self, ModelOptions};
 use crate::error::{Result, invalid};
 use crate::scene::{SceneParts, UpAxis};
 
@@ -16,12 +16,12 @@ const NAMES: [&str; 8] = ["vertices", "faces", "U", "modes", "eigenvalues", "nor
 ///
 /// # Errors
 /// `Invalid` with the file, the array, and the expected and given value.
-pub(super) fn read(files: &AssetDir, name: &str, modes: &ModesSource) -> Result<SceneParts> {
+pub(super) fn read(files: &AssetDir, name: &str, options: ModelOptions) -> Result<SceneParts> {
     let mut parts = SceneParts { up: UpAxis::Z, ..SceneParts::named(stem_of(name)) };
     let (polygons, own_modes) = parse(&files.read(name, MAX_MODEL_BYTES)?, &mut parts.remarks)
         .map_err(|error| error.prefix_field(&format!("file '{name}'")))?;
     parts.materials.push(surface::white_material(""));
-    surface::add_domain(files, name, &polygons, modes, own_modes, &mut parts)?;
+    surface::add_domain(files, name, &polygons, options, own_modes, &mut parts)?;
     Ok(parts)
 }
 
@@ -125,7 +125,7 @@ mod tests {
         let folder = tempfile::tempdir().expect("a temporary folder");
         let bytes = archive(arrays, CompressionMethod::Deflated);
         std::fs::write(folder.path().join("a.npz"), bytes).expect("a writable file");
-        read(&AssetDir::unrestricted(folder.path()), "a.npz", &ModesSource::Sidecar)
+        read(&AssetDir::unrestricted(folder.path()), "a.npz", ModelOptions::default())
     }
 
     #[test]

@@ -1,7 +1,7 @@
 //! Resolves a SCENE argument: a built-in name, a folder with `scene.toml`, a model file, or a folder with one model.
 
 use super::asset_dir::{AssetDir, EntryKind, extension_of, file_name_of, parent_of, stem_of};
-use super::surface::ModesSource;
+use super::surface::ModelOptions;
 use super::{SceneDescription, gltf, manifest, npz_model, obj, plant, ply, stl};
 use crate::error::{Error, Result, invalid};
 use crate::scene::SceneParts;
@@ -81,10 +81,10 @@ pub(super) fn read(files: &AssetDir, source: &str) -> Result<SceneDescription> {
             let folder = files.within(source)?;
             match folder.kind(manifest::MANIFEST_FILE)? {
                 Some(EntryKind::File) => manifest::read(&folder, manifest::MANIFEST_FILE, &files.resolved_name(source)),
-                _ => read_model(files, source, &ModesSource::Sidecar).map(SceneDescription::from),
+                _ => read_model(files, source, ModelOptions::default()).map(SceneDescription::from),
             }
         }
-        Some(EntryKind::File) => read_model(files, source, &ModesSource::Sidecar).map(SceneDescription::from),
+        Some(EntryKind::File) => read_model(files, source, ModelOptions::default()).map(SceneDescription::from),
     }
 }
 
@@ -92,12 +92,12 @@ pub(super) fn read(files: &AssetDir, source: &str) -> Result<SceneDescription> {
 ///
 /// # Errors
 /// `Invalid` with the file, the field, and the expected and given value.
-pub(super) fn read_model(files: &AssetDir, path: &str, modes: &ModesSource) -> Result<SceneParts> {
+pub(super) fn read_model(files: &AssetDir, path: &str, options: ModelOptions) -> Result<SceneParts> {
     match files.kind(path)? {
         Some(EntryKind::Directory) => {
             let folder = files.within(path)?;
             let model = choose_single_model(&folder, path)?;
-            let mut parts = read_model_file(&folder, &model, modes)?;
+            let mut parts = read_model_file(&folder, &model, options)?;
             parts.name = files.resolved_name(path);
             Ok(parts)
         }
@@ -107,20 +107,20 @@ pub(super) fn read_model(files: &AssetDir, path: &str, modes: &ModesSource) -> R
             let model = recognize_model(file_name)
                 .ok_or_else(|| invalid(format!("file '{path}'"), expected_format(), describe_format(file_name)))?;
             let model = detect_plant(model, &folder.file_names());
-            read_model_file(&folder, &model, modes)
+            read_model_file(&folder, &model, options)
         }
         None => Err(invalid(format!("file '{path}'"), "an existing model", "no file of this name")),
     }
 }
 
-fn read_model_file(folder: &AssetDir, model: &ModelFile, modes: &ModesSource) -> Result<SceneParts> {
+fn read_model_file(folder: &AssetDir, model: &ModelFile, options: ModelOptions) -> Result<SceneParts> {
     match model {
-        ModelFile::Gltf(name) => gltf::read(folder, name),
-        ModelFile::Obj(name) => obj::read(folder, name, modes),
-        ModelFile::Plant(name) => plant::read(folder, name),
-        ModelFile::Ply(name) => ply::read(folder, name, modes),
-        ModelFile::Stl(name) => stl::read(folder, name, modes),
-        ModelFile::Npz(name) => npz_model::read(folder, name, modes),
+        ModelFile::Gltf(name) => gltf::read(folder, name, options.crease_angle),
+        ModelFile::Obj(name) => obj::read(folder, name, options),
+        ModelFile::Plant(name) => plant::read(folder, name, options.crease_angle),
+        ModelFile::Ply(name) => ply::read(folder, name, options),
+        ModelFile::Stl(name) => stl::read(folder, name, options),
+        ModelFile::Npz(name) => npz_model::read(folder, name, options),
     }
 }
 

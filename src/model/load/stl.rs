@@ -11,7 +11,7 @@ use std::collections::HashMap;
 
 use super::asset_dir::{AssetDir, MAX_MODEL_BYTES, stem_of};
 use super::polygons::{Corner, PolygonMesh};
-use super::surface::{self, ModesSource};
+use super::surface::{self, ModelOptions};
 use crate::error::{Result, invalid};
 use crate::scene::{SceneParts, UpAxis};
 
@@ -24,12 +24,12 @@ const TRIANGLE_BYTES: usize = 50;
 ///
 /// # Errors
 /// `Invalid` with the file, the line or triangle, and the expected and given value.
-pub(super) fn read(files: &AssetDir, name: &str, modes: &ModesSource) -> Result<SceneParts> {
+pub(super) fn read(files: &AssetDir, name: &str, options: ModelOptions) -> Result<SceneParts> {
     let mut parts = SceneParts { up: UpAxis::Z, ..SceneParts::named(stem_of(name)) };
     let polygons = parse(&files.read(name, MAX_MODEL_BYTES)?, &mut parts.remarks)
         .map_err(|error| error.prefix_field(&format!("file '{name}'")))?;
     parts.materials.push(surface::white_material(""));
-    surface::add_domain(files, name, &polygons, modes, None, &mut parts)?;
+    surface::add_domain(files, name, &polygons, options, None, &mut parts)?;
     Ok(parts)
 }
 

@@ -3,17 +3,34 @@
 use super::asset_dir::AssetDir;
 use super::modes::{self, LoadedModes};
 use super::polygons::{self, PolygonMesh, VertexColors};
-use crate::domain::{Domain, Material, Mesh, Metadata, Modes, Shape};
+use crate::domain::{CreaseAngle, Domain, Material, Mesh, Metadata, Modes, Shape};
 use crate::error::{Error, Result};
 use crate::scene::SceneParts;
 
 /// Where the modes of a mesh come from.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(super) enum ModesSource {
     /// A file in the same folder, if any (see [`modes::find_sidecar`]).
+    #[default]
     Sidecar,
     /// No modes: the caller provides them.
     None,
+}
+
+/// How a model is read.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct ModelOptions {
+    pub(super) modes: ModesSource,
+    /// For the normals that the file does not contain.
+    pub(super) crease_angle: CreaseAngle,
+}
+
+#[cfg(test)]
+impl ModelOptions {
+    /// Options that ignore files with modes.
+    pub(super) fn without_modes() -> Self {
+        Self { modes: ModesSource::None, ..Self::default() }
+    }
 }
 
 /// Adds the mesh of the file `name` as the only domain. Its materials must be in `parts` in the order of
@@ -25,7 +42,7 @@ pub(super) fn add_domain(
     files: &AssetDir,
     name: &str,
     polygons: &PolygonMesh,
-    source: &ModesSource,
+    options: ModelOptions,
     own_modes: Option<LoadedModes>,
     parts: &mut SceneParts,
 ) -> Result<()> {
@@ -33,9 +50,9 @@ pub(super) fn add_domain(
         let location = format!("file '{file}'");
         move |error: Error| error.prefix_field(&location)
     };
-    let triangles = polygons::build_all_faces(polygons).map_err(in_file(name))?;
+    let triangles = polygons::build_all_faces(polygons, options.crease_angle).map_err(in_file(name))?;
     let mesh = color_vertices(polygons, triangles.mesh, parts).map_err(in_file(name))?;
-    let (loaded, modes_file) = match (source, own_modes) {
+    let (loaded, modes_file) = match (options.modes, own_modes) {
         (ModesSource::None, _) => (Modes::rigid().into(), None),
         (ModesSource::Sidecar, Some(own_modes)) => (own_modes, Some(name.to_owned())),
         (ModesSource::Sidecar, None) => {

@@ -76,6 +76,44 @@ pub(crate) fn cube() -> Mesh {
     Mesh::new(rest_positions, corners, triangles).expect("expected a valid mesh")
 }
 
+/// A bar of 2 x 1 x 1, loaded from an OBJ file without normals with this crease angle. Its sides are grids of squares,
+/// and its mode bends and twists it. Normals are exact.
+pub(crate) fn creased_box(crease_angle: f64) -> Arc<Scene> {
+    // Vertices of a 5 x 3 x 3 lattice; those in the interior belong to no face.
+    let vertex = |[x, y, z]: [usize; 3]| 1 + x + 5 * (y + 3 * z);
+    let mut text = String::new();
+    for index in 0..45 {
+        let [x, y, z] = [index % 5, index / 5 % 3, index / 15].map(|coordinate| 0.5 * coordinate as f32);
+        text += &format!("v {x} {y} {z}\n");
+    }
+    let last = [4, 2, 2];
+    for (axis, is_far) in (0..3).flat_map(|axis| [(axis, false), (axis, true)]) {
+        let (u, v) = ((axis + 1) % 3, (axis + 2) % 3);
+        for (i, j) in (0..last[u]).flat_map(|i| (0..last[v]).map(move |j| (i, j))) {
+            let corner = |i: usize, j: usize| {
+                let mut lattice = [0; 3];
+                (lattice[axis], lattice[u], lattice[v]) = (if is_far { last[axis] } else { 0 }, i, j);
+                vertex(lattice)
+            };
+            let mut face = [corner(i, j), corner(i + 1, j), corner(i + 1, j + 1), corner(i, j + 1)];
+            if !is_far {
+                face.reverse();
+            }
+            text += &format!("f {} {} {} {}\n", face[0], face[1], face[2], face[3]);
+        }
+    }
+    let folder = tempfile::tempdir().expect("expected a temporary folder");
+    std::fs::write(folder.path().join("box.obj"), text).expect("expected a written file");
+    let manifest =
+        format!("model = 'box.obj'\nmodes = ''\ncrease_angle = {crease_angle:?}\ndeform.normals = 'exact'\n");
+    std::fs::write(folder.path().join("scene.toml"), manifest).expect("expected a written file");
+    let path = folder.path().to_str().expect("expected a UTF-8 path");
+    let scene = modalcast_model::load::open(path).expect("expected a valid scene").scene;
+    assert_eq!(scene.shapes[0].mesh.rest_positions().len(), 45, "expected the vertices of the file");
+    let bend = |[x, y, z]: [f32; 3]| [-0.4 * x * y, 0.5 * x * x + 0.3 * x * z, -0.3 * x * y];
+    create_scene(vec![shape_with_mode(scene.shapes[0].mesh.clone(), bend)])
+}
+
 /// A unit sphere of 8 x 4^level triangles with area-weighted normals: an octahedron whose triangles are split `level`
 /// times.
 pub(crate) fn sphere(level: u32) -> Mesh {

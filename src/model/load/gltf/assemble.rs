@@ -13,7 +13,7 @@ use super::material::MaterialConverter;
 use super::primitive;
 use super::remarks::{ImportRemarks, sanitize};
 use super::texture::TextureLoader;
-use crate::domain::{Attachment, Domain, Shape, Transform};
+use crate::domain::{Attachment, CreaseAngle, Domain, Shape, Transform};
 use crate::error::{Result, invalid};
 use crate::scene::{MAX_DOMAINS, SceneParts};
 
@@ -39,6 +39,7 @@ struct GltfAssembler<'a> {
     material_converter: MaterialConverter<'a>,
     /// Converted primitives by the indices of mesh and primitive; `None` for points and lines.
     primitives: HashMap<(usize, usize), Option<LoadedPrimitive>>,
+    crease_angle: CreaseAngle,
     /// Names of all nodes with a mesh so far.
     names: HashSet<String>,
     shapes: Vec<Shape>,
@@ -54,6 +55,7 @@ pub(super) fn assemble(
     name: &str,
     document: &Document,
     buffers: &GltfBuffers<'_>,
+    crease_angle: CreaseAngle,
     mut remarks: ImportRemarks,
 ) -> Result<SceneParts> {
     let nodes = hierarchy::flatten_hierarchy(document, &mut remarks)?;
@@ -61,6 +63,7 @@ pub(super) fn assemble(
         reader: AccessorReader { document, buffers },
         material_converter: MaterialConverter::new(document, TextureLoader::new(document, buffers)),
         primitives: HashMap::new(),
+        crease_angle,
         names: HashSet::new(),
         shapes: Vec::new(),
         domains: Vec::new(),
@@ -136,7 +139,8 @@ impl GltfAssembler<'_> {
         }
         let primitive = &self.reader.document.meshes[mesh_index].primitives[primitive_index];
         let uv_set = self.material_converter.uv_set(primitive.material)?;
-        let loaded = match primitive::convert_primitive(self.reader, primitive, uv_set, &mut self.remarks)? {
+        let shape = primitive::convert_primitive(self.reader, primitive, uv_set, self.crease_angle, &mut self.remarks)?;
+        let loaded = match shape {
             None => None,
             Some(shape) => {
                 let has_uvs = !shape.mesh.corners().uvs.is_empty();

@@ -20,6 +20,7 @@ mod texture;
 
 use std::path::Path;
 
+use crate::domain::CreaseAngle;
 use crate::error::{Result, invalid};
 use crate::scene::SceneParts;
 
@@ -39,18 +40,18 @@ const APPEARANCE_EXTENSION_PREFIXES: [&str; 4] =
 ///
 /// # Errors
 /// `Invalid` with the file, the field, and the expected and given value.
-pub(super) fn read(files: &AssetDir, path: &str) -> Result<SceneParts> {
+pub(super) fn read(files: &AssetDir, path: &str, crease_angle: CreaseAngle) -> Result<SceneParts> {
     let content = files.read(path, MAX_FILE_BYTES)?;
     let folder = match Path::new(path).parent().and_then(Path::to_str) {
         None | Some("") => files.clone(),
         Some(parent) => files.within(parent)?,
     };
     let name = Path::new(path).file_stem().map_or_else(String::new, |stem| stem.to_string_lossy().into_owned());
-    parse(&folder, &name, &content).map_err(|error| error.prefix_field(&format!("file '{path}'")))
+    parse(&folder, &name, &content, crease_angle).map_err(|error| error.prefix_field(&format!("file '{path}'")))
 }
 
 /// Parses the bytes of a file. Relative URIs start at `folder`.
-fn parse(folder: &AssetDir, name: &str, content: &[u8]) -> Result<SceneParts> {
+fn parse(folder: &AssetDir, name: &str, content: &[u8], crease_angle: CreaseAngle) -> Result<SceneParts> {
     let container = container::split_container(content)?;
     let document = container::parse_document(container.json)?;
     let mut remarks = ImportRemarks::default();
@@ -58,7 +59,7 @@ fn parse(folder: &AssetDir, name: &str, content: &[u8]) -> Result<SceneParts> {
     check_extensions(&document, &mut remarks)?;
     report_ignored_features(&document, &mut remarks);
     let buffers = GltfBuffers::load(&document, folder, container.bin)?;
-    assemble::assemble(name, &document, &buffers, remarks)
+    assemble::assemble(name, &document, &buffers, crease_angle, remarks)
 }
 
 fn check_version(document: &document::Document) -> Result<()> {

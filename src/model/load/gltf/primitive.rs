@@ -1,10 +1,10 @@
-//! Converts a primitive to a shape: one vertex and one corner per element of POSITION, triangles from its topology, and
-//! U (3n x r) from the POSITION targets.
+//! Converts a primitive to a shape: one vertex per element of POSITION, triangles from its topology, and U (3n x r) from
+//! the POSITION targets. A vertex has one corner, or one per normal if the primitive has no NORMAL and creases split it.
 
 use super::accessor::{AccessorReader, AttributeFormat};
 use super::document::Primitive;
 use super::remarks::ImportRemarks;
-use crate::domain::{MAX_RANK, Mesh, Modes, Shape, smooth_normals};
+use crate::domain::{Corners, CreaseAngle, MAX_RANK, Mesh, Modes, Shape, split_at_creases};
 use crate::error::{Result, invalid};
 
 /// Values of [`Primitive::mode`]; lower values are points and lines.
@@ -21,6 +21,7 @@ pub(super) fn convert_primitive(
     reader: AccessorReader<'_>,
     primitive: &Primitive,
     uv_set: u32,
+    crease_angle: CreaseAngle,
     remarks: &mut ImportRemarks,
 ) -> Result<Option<Shape>> {
     if primitive.mode > FAN {
@@ -37,7 +38,7 @@ pub(super) fn convert_primitive(
         .decode_vectors::<3>(position_accessor, format)
         .map_err(|error| error.prefix_field("attributes.POSITION"))?;
     let modes = read_modes(reader, primitive, rest_positions.len(), remarks)?;
-    let mesh = read_mesh(reader, primitive, rest_positions, uv_set)?;
+    let mesh = read_mesh(reader, primitive, rest_positions, uv_set, crease_angle)?;
     if primitive.attributes.contains_key("COLOR_0") {
         remarks.add("vertex colors are ignored".into());
     }
@@ -49,6 +50,7 @@ fn read_mesh(
     primitive: &Primitive,
     rest_positions: Vec<[f32; 3]>,
     uv_set: u32,
+    crease_angle: CreaseAngle,
 ) -> Result<Mesh> {
     let indices = match primitive.indices {
         Some(accessor) => {
@@ -60,22 +62,26 @@ fn read_mesh(
     let format = AttributeFormat { allows_integers: false, count: Some(rest_positions.len()) };
     let normals = match primitive.attributes.get("NORMAL") {
         Some(accessor) => {
-            reader.decode_vectors(*accessor, format).map_err(|error| error.prefix_field("attributes.NORMAL"))?
+            Some(reader.decode_vectors(*accessor, format).map_err(|error| error.prefix_field("attributes.NORMAL"))?)
         }
-        None => {
-            let vertices: Vec<u32> = (0..rest_positions.len() as u32).collect();
-            smooth_normals(&rest_positions, &vertices, &triangles)
-        }
+        None => None,
     };
     let attribute = format!("TEXCOORD_{uv_set}");
     let format = AttributeFormat { allows_integers: true, ..format };
-    let uvs = match primitive.attributes.get(&attribute) {
+    let uvs: Vec<[f32; 2]> = match primitive.attributes.get(&attribute) {
         Some(accessor) => reader
             .decode_vectors(*accessor, format)
             .map_err(|error| error.prefix_field(&format!("attributes.{attribute}")))?,
         None => Vec::new(),
     };
-    Mesh::from_indexed(rest_positions, normals, uvs, triangles)
+    if let Some(normals) = normals {
+        return Mesh::from_indexed(rest_positions, normals, uvs, triangles);
+    }
+    let vertices: Vec<u32> = (0..rest_positions.len() as u32).collect();
+    let creased = split_at_creases(&rest_positions, &vertices, &triangles, &[], crease_angle);
+    let uvs = creased.source_corners.iter().filter_map(|vertex| uvs.get(*vertex as usize).copied()).collect();
+    let corners = Corners { vertices: creased.source_corners, normals: creased.normals, uvs };
+    Mesh::new(rest_positions, corners, creased.triangles)
 }
 
 /// The triangles of a list, strip or fan. The degenerate triangles that connect strips are omitted.

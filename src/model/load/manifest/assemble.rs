@@ -8,11 +8,11 @@ use super::patch::{MaterialPatch, TextureLookup};
 use super::settings::LookKeys;
 use super::{DomainEntry, Manifest, TransformKind};
 use crate::backend_settings::{BackendSettings, RasterPolicy};
-use crate::domain::{Attachment, Domain, FollowConstraint, Material, Modes, Shape, Texture, Transform};
+use crate::domain::{Attachment, CreaseAngle, Domain, FollowConstraint, Material, Modes, Shape, Texture, Transform};
 use crate::error::{Result, invalid};
 use crate::load::SceneDescription;
 use crate::load::asset_dir::AssetDir;
-use crate::load::surface::ModesSource;
+use crate::load::surface::{ModelOptions, ModesSource};
 use crate::load::{modes, source, texture_cache};
 use crate::scene::{MAX_DOMAINS, SceneParts, UpAxis};
 
@@ -79,6 +79,10 @@ struct LoadedModel {
     domains: Vec<Domain>,
 }
 
+/// What entries that share a model have in common: the path of the model file, the name of the modes file, and the bits
+/// of the crease angle in degrees.
+type ModelKey = (PathBuf, Option<String>, u64);
+
 /// Adds the entries of a manifest to a scene, one after another.
 struct ManifestAssembler<'a> {
     files: &'a AssetDir,
@@ -86,8 +90,7 @@ struct ManifestAssembler<'a> {
     /// The scene with the entries so far.
     parts: SceneParts,
     texture_by_path: HashMap<String, usize>,
-    /// Models by the path of the model file and the name of the modes file.
-    models: HashMap<(PathBuf, Option<String>), LoadedModel>,
+    models: HashMap<ModelKey, LoadedModel>,
     domain_by_name: HashMap<String, usize>,
     /// Names of the materials of all models.
     material_names: HashSet<String>,
@@ -112,9 +115,10 @@ impl ManifestAssembler<'_> {
     /// Adds the domains of an entry. The first entry with a model loads it.
     fn add_entry(&mut self, entry_index: usize, entry: &DomainEntry) -> Result<()> {
         let path = self.files.resolve(&entry.model)?;
-        let model_key = (path, entry.modes.clone());
+        let crease_angle = self.crease_angle(entry)?;
+        let model_key = (path, entry.modes.clone(), crease_angle.degrees().to_bits());
         if !self.models.contains_key(&model_key) {
-            let model = self.load_model(entry_index, entry)?;
+            let model = self.load_model(entry_index, entry, crease_angle)?;
             self.models.insert(model_key.clone(), model);
         }
         let Some(model) = self.models.get(&model_key) else { return Ok(()) };
@@ -136,11 +140,22 @@ impl ManifestAssembler<'_> {
         Ok(())
     }
 
+    /// The crease angle of an entry: its own one, or else that of the scene.
+    fn crease_angle(&self, entry: &DomainEntry) -> Result<CreaseAngle> {
+        let degrees = entry.crease_angle.or(self.manifest.crease_angle);
+        degrees.map_or(Ok(CreaseAngle::default()), CreaseAngle::from_degrees)
+    }
+
     /// Reads a model and appends its shapes, materials and textures to those of the scene. The model of the first entry
     /// (`entry_index` 0) also sets the scene's up axis, unit and render settings.
-    fn load_model(&mut self, entry_index: usize, entry: &DomainEntry) -> Result<LoadedModel> {
-        let modes_source = if entry.modes.is_some() { ModesSource::None } else { ModesSource::Sidecar };
-        let mut model = source::read_model(self.files, &entry.model, &modes_source)?;
+    fn load_model(
+        &mut self,
+        entry_index: usize,
+        entry: &DomainEntry,
+        crease_angle: CreaseAngle,
+    ) -> Result<LoadedModel> {
+        let modes = if entry.modes.is_some() { ModesSource::None } else { ModesSource::Sidecar };
+        let mut model = source::read_model(self.files, &entry.model, ModelOptions { modes, crease_angle })?;
         if let Some(file) = &entry.modes {
             replace_modes(self.files, file, &mut model)?;
         }

@@ -42,6 +42,8 @@ struct Manifest {
     deform: DeformKeys,
     #[serde(default)]
     material: BTreeMap<String, MaterialPatch>,
+    /// In degrees, of all entries without a crease angle.
+    crease_angle: Option<f64>,
     model: Option<String>,
     modes: Option<String>,
     follows: Option<String>,
@@ -71,6 +73,8 @@ struct DomainEntry {
     model: String,
     name: Option<String>,
     modes: Option<String>,
+    /// In degrees.
+    crease_angle: Option<f64>,
     /// Up axis of the model. The model is rotated to the up axis of the scene.
     up: Option<UpAxis>,
     placement: Option<Placement>,

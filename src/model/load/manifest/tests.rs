@@ -10,14 +10,19 @@ use crate::scene::{
 
 const TRIANGLE: &str = "mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl red\nf 1 2 3\n";
 
+/// Vertices of two triangles at a right angle.
+const ROOF: &str = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n";
+
 /// Reads a manifest from a folder that also contains two equal models of one triangle with the material `red`, modes
-/// for them (`u.txt`, two modes), modes with a wrong number of entries (`wide.txt`), and an opaque and a transparent
-/// image.
+/// for them (`u.txt`, two modes), modes with a wrong number of entries (`wide.txt`), two triangles at a right
+/// angle without and with normals, and an opaque and a transparent image.
 fn read_manifest(toml: &str) -> Result<SceneDescription> {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let write = |name: &str, text: &str| std::fs::write(folder.path().join(name), text).expect("a writable file");
     write("a.obj", TRIANGLE);
     write("b.obj", TRIANGLE);
+    write("roof.obj", &format!("{ROOF}f 1 2 3\nf 2 1 4\n"));
+    write("smooth.obj", &format!("{ROOF}vn 0 1 1\nf 1//1 2//1 3//1\nf 2//1 1//1 4//1\n"));
     write("a.mtl", "newmtl red\nKd 1 0 0\nmap_Kd solid.png\n");
     write("u.txt", "9 2\n1 0 0 0 0 0 0 0 0\n0 1 0 0 0 0 0 0 0\n");
     write("wide.txt", "9 1\n1 1 1 1 1 1 1 1 1 1\n");
@@ -101,6 +106,28 @@ fn instances_share_mesh_and_modes_but_not_coordinates_or_names() {
     // Each of the two instances has two coordinates of its own.
     let scene = crate::scene::Scene::new(parts).expect("a valid scene");
     assert_eq!((scene.layout.coordinates, scene.layout.domains[1].first_q), (4, 2));
+}
+
+#[test]
+fn crease_angle_of_an_entry_overrides_that_of_the_scene() {
+    // Two triangles at a right angle: `roof.obj` has no normals, `smooth.obj` has the same normal at all vertices.
+    let corners = |toml: &str| {
+        let parts = read_parts(toml).unwrap_or_else(|error| panic!("{toml}: {error}"));
+        let corners = |domain: &crate::domain::Domain| parts.shapes[domain.shape].mesh.corners().vertices.len();
+        (parts.shapes.len(), parts.domains.iter().map(corners).collect::<Vec<_>>())
+    };
+    assert_eq!(corners("model = 'roof.obj'\n"), (1, vec![6]), "expected a hard edge by default");
+    assert_eq!(corners("model = 'roof.obj'\ncrease_angle = 91\n"), (1, vec![4]));
+    assert_eq!(corners("model = 'smooth.obj'\ncrease_angle = 0\n"), (1, vec![4]), "expected the normals of the file");
+    let entries = "crease_angle = 180\n[[domain]]\nmodel = 'roof.obj'\n[[domain]]\nmodel = 'roof.obj'\n\
+                   crease_angle = 89.5\n[[domain]]\nmodel = 'roof.obj'\n";
+    assert_eq!(corners(entries), (2, vec![4, 6, 4]), "expected two shapes for three entries");
+    for (angle, given) in [("-1", "-1"), ("181", "181"), ("nan", "NaN")] {
+        let message =
+            read_parts(&format!("model = 'roof.obj'\ncrease_angle = {angle}\n")).expect_err(angle).to_string();
+        let expected = format!("crease_angle: expected 0 to 180 degrees, got {given}");
+        assert!(message.ends_with(&expected), "{message}");
+    }
 }
 
 #[test]

@@ -10,7 +10,7 @@ pub(super) use material::DEFAULT_ALPHA_CUTOFF;
 use parse::ObjFile;
 
 use super::asset_dir::{AssetDir, MAX_MODEL_BYTES, MAX_TEXT_BYTES, parent_of, stem_of};
-use super::surface::{self, ModesSource};
+use super::surface::{self, ModelOptions};
 use super::texture_cache::TextureCache;
 use crate::error::{Result, invalid};
 use crate::scene::SceneParts;
@@ -24,11 +24,11 @@ const MAX_LISTED_UNDEFINED: usize = 8;
 ///
 /// # Errors
 /// `Invalid` with the file, the line or material, and the expected and given value.
-pub(super) fn read(files: &AssetDir, name: &str, modes: &ModesSource) -> Result<SceneParts> {
+pub(super) fn read(files: &AssetDir, name: &str, options: ModelOptions) -> Result<SceneParts> {
     let obj = parse_file(files, name)?;
     let mut parts = SceneParts::named(stem_of(name));
     add_materials(&obj, files, &mut parts)?;
-    surface::add_domain(files, name, &obj.polygons, modes, None, &mut parts)?;
+    surface::add_domain(files, name, &obj.polygons, options, None, &mut parts)?;
     Ok(parts)
 }
 
@@ -137,13 +137,13 @@ mod tests {
             ("modes.txt", "9 1\n1 0 0 0 0 0 0 0 2\n"),
         ]);
         let parts =
-            read(&AssetDir::unrestricted(folder.path()), "a.obj", &ModesSource::Sidecar).expect("a valid OBJ file");
+            read(&AssetDir::unrestricted(folder.path()), "a.obj", ModelOptions::default()).expect("a valid OBJ file");
         assert_eq!(parts.materials.iter().map(|material| material.name.as_str()).collect::<Vec<_>>(), ["red", "blue"]);
         assert_eq!(parts.domains.len(), 1);
         assert_eq!(parts.domains[0].material_ranges.len(), 2);
         assert_eq!(parts.shapes[0].modes.entry(2, 2, 0), 2.0);
-        let parts_without_modes =
-            read(&AssetDir::unrestricted(folder.path()), "a.obj", &ModesSource::None).expect("a valid OBJ file");
+        let parts_without_modes = read(&AssetDir::unrestricted(folder.path()), "a.obj", ModelOptions::without_modes())
+            .expect("a valid OBJ file");
         assert_eq!(parts_without_modes.shapes[0].modes.rank(), 0);
     }
 
@@ -165,9 +165,9 @@ mod tests {
             ("bad.obj", "file 'bad.obj': line 4: f: index of v: expected 1 to 3, got 9"),
             ("rows.obj", "file 'rows.U.float': modes.rows: expected 9 (3 x 3 vertices), got 6"),
         ] {
-            assert_eq!(read(&files.strict(), name, &ModesSource::Sidecar).expect_err(name).to_string(), message);
+            assert_eq!(read(&files.strict(), name, ModelOptions::default()).expect_err(name).to_string(), message);
         }
-        let parts = read(&files, "rows.obj", &ModesSource::None).expect("a valid OBJ file");
+        let parts = read(&files, "rows.obj", ModelOptions::without_modes()).expect("a valid OBJ file");
         assert_eq!(parts.materials[0].diffuse, [1.0; 3]);
         assert!(parts.remarks.is_empty(), "{:?}", parts.remarks);
     }
@@ -181,7 +181,7 @@ mod tests {
             ("a.mtl", "newmtl red\nKd 1 0 0\nmap_Kd no.png\nmap_d no.png\nnorm no.png\n"),
         ]);
         let files = AssetDir::unrestricted(folder.path());
-        let read = |name: &str| read(&files, name, &ModesSource::Sidecar).expect("a mesh with stand-ins");
+        let read = |name: &str| read(&files, name, ModelOptions::default()).expect("a mesh with stand-ins");
         let lib = read("lib.obj");
         let undefined = "undefined materials are white (1): 'bark'";
         assert_eq!(lib.remarks, ["material library 'no.mtl' does not exist", undefined]);
@@ -212,7 +212,7 @@ mod tests {
         ]);
         image::RgbaImage::new(1, 1).save(folder.path().join("b.png")).expect("a writable file");
         let files = AssetDir::unrestricted(folder.path());
-        let read = |name: &str| read(&files, name, &ModesSource::Sidecar).expect("a valid file");
+        let read = |name: &str| read(&files, name, ModelOptions::default()).expect("a valid file");
         let parts = read("a.obj");
         // One patch of 2 x 2 texels. A vertex without a color is white.
         assert_eq!((parts.textures[0].width(), parts.materials[0].color_texture), (2, Some(0)));

@@ -13,7 +13,7 @@ use structure::{PlantStructure, parse_object_ids};
 use super::asset_dir::{AssetDir, MAX_TEXT_BYTES, stem_of};
 use super::obj;
 use super::polygons::{self, PolygonMesh};
-use crate::domain::{Attachment, Domain, Metadata, Modes, Shape, Transform};
+use crate::domain::{Attachment, CreaseAngle, Domain, Metadata, Modes, Shape, Transform};
 use crate::error::Result;
 use crate::scene::{SceneParts, UpAxis};
 
@@ -24,7 +24,7 @@ use crate::scene::{SceneParts, UpAxis};
 ///
 /// # Errors
 /// `Invalid` with the file, and the expected and given value.
-pub(super) fn read(files: &AssetDir, name: &str) -> Result<SceneParts> {
+pub(super) fn read(files: &AssetDir, name: &str, crease_angle: CreaseAngle) -> Result<SceneParts> {
     let stem = stem_of(name);
     let (structure_file, ids_file) = (format!("{stem}.structure.json"), format!("{stem}_object_id.dat"));
     let file_field = |name: &str| format!("file '{name}'");
@@ -50,6 +50,7 @@ pub(super) fn read(files: &AssetDir, name: &str) -> Result<SceneParts> {
         faces_by_organ,
         organ_domains: HashMap::new(),
         parts,
+        crease_angle,
     }
     .build()
 }
@@ -71,6 +72,7 @@ struct PlantBuilder<'a> {
     /// Index and origin of the domain of each organ so far.
     organ_domains: HashMap<Organ, (usize, [f64; 3])>,
     parts: SceneParts,
+    crease_angle: CreaseAngle,
 }
 
 impl PlantBuilder<'_> {
@@ -102,8 +104,8 @@ impl PlantBuilder<'_> {
 
     fn add_domain(&mut self, organ: Organ, name: String, origin: [f64; 3], parent: Option<Organ>) -> Result<()> {
         let faces = self.faces_by_organ.remove(&organ).unwrap_or_default();
-        let triangle_mesh =
-            polygons::build_faces(self.polygons, &faces, origin).map_err(|error| error.prefix_field(&name))?;
+        let triangle_mesh = polygons::build_faces(self.polygons, &faces, origin, self.crease_angle)
+            .map_err(|error| error.prefix_field(&name))?;
         self.parts.shapes.push(Shape::new(triangle_mesh.mesh, Modes::rigid())?);
         let attachment =
             parent.and_then(|parent| self.organ_domains.get(&parent)).map(|(index, parent_origin)| Attachment {
@@ -154,7 +156,7 @@ mod tests {
         for (name, text) in [("p.obj", OBJ), ("p_object_id.dat", IDS), ("p.structure.json", JSON)].iter().chain(files) {
             std::fs::write(folder.path().join(name), text).expect("a writable file");
         }
-        read(&AssetDir::unrestricted(folder.path()), "p.obj")
+        read(&AssetDir::unrestricted(folder.path()), "p.obj", CreaseAngle::default())
     }
 
     #[test]

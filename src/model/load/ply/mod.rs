@@ -8,7 +8,7 @@ use ply_rs_bw::ply::{ElementDef, Encoding, PropertyAccess};
 
 use super::asset_dir::{AssetDir, MAX_MODEL_BYTES, stem_of};
 use super::polygons::{Corner, NO_INDEX, PolygonMesh};
-use super::surface::{self, ModesSource};
+use super::surface::{self, ModelOptions};
 use super::texture_cache;
 use crate::domain::AlphaMode;
 use crate::error::{Result, invalid};
@@ -24,7 +24,7 @@ const MAX_REASON_CHARACTERS: usize = 160;
 ///
 /// # Errors
 /// `Invalid` with the file, the element, and the expected and given value.
-pub(super) fn read(files: &AssetDir, name: &str, modes: &ModesSource) -> Result<SceneParts> {
+pub(super) fn read(files: &AssetDir, name: &str, options: ModelOptions) -> Result<SceneParts> {
     let in_file = |error: crate::error::Error| error.prefix_field(&format!("file '{name}'"));
     let mut parts = SceneParts { up: UpAxis::Z, ..SceneParts::named(stem_of(name)) };
     let mut ply = PlyReader::default();
@@ -43,7 +43,7 @@ pub(super) fn read(files: &AssetDir, name: &str, modes: &ModesSource) -> Result<
     }
     parts.remarks.append(&mut ply.remarks);
     parts.materials.push(material);
-    surface::add_domain(files, name, &ply.polygons, modes, None, &mut parts)?;
+    surface::add_domain(files, name, &ply.polygons, options, None, &mut parts)?;
     Ok(parts)
 }
 

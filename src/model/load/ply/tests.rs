@@ -73,9 +73,9 @@ fn missing_image_is_a_remark_and_an_error_in_strict_mode() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     std::fs::write(folder.path().join("a.ply"), text).expect("a writable file");
     let files = AssetDir::unrestricted(folder.path());
-    let parts = read(&files, "a.ply", &ModesSource::Sidecar).expect("a mesh without its image");
+    let parts = read(&files, "a.ply", ModelOptions::default()).expect("a mesh without its image");
     assert!(parts.remarks[0].starts_with("TextureFile 'absent.png' does not exist"), "{:?}", parts.remarks);
-    let message = read(&files.strict(), "a.ply", &ModesSource::Sidecar).expect_err("strict mode").to_string();
+    let message = read(&files.strict(), "a.ply", ModelOptions::default()).expect_err("strict mode").to_string();
     assert_eq!(message, "file 'a.ply': file 'absent.png': expected an existing file, got none (strict mode)");
 }
 

@@ -4,7 +4,7 @@ use std::collections::HashMap;
 
 use super::triangulate::triangulate;
 use super::{Corner, NO_INDEX, PolygonMesh};
-use crate::domain::{Corners, MaterialRange, Mesh, smooth_normals};
+use crate::domain::{Corners, CreaseAngle, MaterialRange, Mesh, split_at_creases};
 use crate::error::Result;
 
 /// A triangle mesh and its materials, as indices into [`PolygonMesh::materials`].
@@ -21,22 +21,27 @@ pub(in crate::load) struct TriangleMesh {
 ///
 /// # Errors
 /// `Invalid` as for [`Mesh::new`].
-pub(in crate::load) fn build_all_faces(polygons: &PolygonMesh) -> Result<TriangleMesh> {
+pub(in crate::load) fn build_all_faces(polygons: &PolygonMesh, crease_angle: CreaseAngle) -> Result<TriangleMesh> {
     let faces: Vec<usize> = (0..polygons.faces.len()).collect();
     let mut builder = MeshBuilder { rest_positions: polygons.positions.clone(), ..MeshBuilder::new(polygons) };
     builder.add_faces(&faces);
-    builder.finish()
+    builder.finish(crease_angle)
 }
 
 /// Builds a mesh from some faces and only the vertices that they use, with positions relative to `origin`.
 ///
 /// # Errors
 /// `Invalid` as for [`Mesh::new`].
-pub(in crate::load) fn build_faces(polygons: &PolygonMesh, faces: &[usize], origin: [f64; 3]) -> Result<TriangleMesh> {
+pub(in crate::load) fn build_faces(
+    polygons: &PolygonMesh,
+    faces: &[usize],
+    origin: [f64; 3],
+    crease_angle: CreaseAngle,
+) -> Result<TriangleMesh> {
     let used_vertices = UsedVertices { new_indices: HashMap::new(), origin };
     let mut builder = MeshBuilder { used_vertices: Some(used_vertices), ..MeshBuilder::new(polygons) };
     builder.add_faces(faces);
-    builder.finish()
+    builder.finish(crease_angle)
 }
 
 /// The vertices that [`build_faces`] uses.
@@ -119,8 +124,8 @@ impl<'a> MeshBuilder<'a> {
         })
     }
 
-    fn finish(self) -> Result<TriangleMesh> {
-        let normals = self.normals();
+    fn finish(mut self, crease_angle: CreaseAngle) -> Result<TriangleMesh> {
+        let normals = self.add_normals(crease_angle);
         let uvs = if self.corners.iter().all(|corner| corner.vt == NO_INDEX) { Vec::new() } else { self.uvs() };
         let material = self.material_ranges.first().map_or(0, |range| range.material);
         let material_ranges = if self.material_ranges.len() > 1 { self.material_ranges } else { Vec::new() };
@@ -129,20 +134,22 @@ impl<'a> MeshBuilder<'a> {
         Ok(TriangleMesh { mesh, material, material_ranges })
     }
 
-    /// The normals of the corners. A corner whose normal is missing or zero in the file has the smooth normal of its
-    /// vertex.
-    fn normals(&self) -> Vec<[f32; 3]> {
+    /// The normals of the corners. Corners whose normal is missing or zero in the file are split at creases.
+    fn add_normals(&mut self, crease_angle: CreaseAngle) -> Vec<[f32; 3]> {
         let file_normal =
             |corner: &Corner| self.polygons.normals.get(corner.vn as usize).filter(|normal| **normal != [0.0; 3]);
-        if let Some(file_normals) = self.corners.iter().map(|corner| file_normal(corner).copied()).collect() {
-            return file_normals;
+        let file_normals: Vec<Option<[f32; 3]>> =
+            self.corners.iter().map(|corner| file_normal(corner).copied()).collect();
+        if let Some(normals) = file_normals.iter().copied().collect() {
+            return normals;
         }
-        let corner_smooth_normals = smooth_normals(&self.rest_positions, &self.corner_vertices, &self.triangles);
-        self.corners
-            .iter()
-            .zip(corner_smooth_normals)
-            .map(|(corner, smooth_normal)| file_normal(corner).copied().unwrap_or(smooth_normal))
-            .collect()
+        let creased =
+            split_at_creases(&self.rest_positions, &self.corner_vertices, &self.triangles, &file_normals, crease_angle);
+        let sources = || creased.source_corners.iter().map(|corner| *corner as usize);
+        self.corners = sources().map(|corner| self.corners[corner]).collect();
+        self.corner_vertices = sources().map(|corner| self.corner_vertices[corner]).collect();
+        self.triangles = creased.triangles;
+        creased.normals
     }
 
     fn uvs(&self) -> Vec<[f32; 2]> {
@@ -168,7 +175,7 @@ mod tests {
     #[test]
     fn build_all_faces_keeps_all_v_lines_in_file_order() {
         let obj = parse_squares();
-        let mesh = build_all_faces(&obj).expect("a valid OBJ file").mesh;
+        let mesh = build_all_faces(&obj, CreaseAngle::default()).expect("a valid OBJ file").mesh;
         assert_eq!(mesh.rest_positions(), obj.positions);
         // First both faces of material b, then the face of material a.
         assert_eq!(
@@ -184,20 +191,21 @@ mod tests {
     #[test]
     fn faces_are_merged_into_one_range_per_material() {
         let obj = parse_squares();
-        let obj_mesh = build_all_faces(&obj).expect("a valid OBJ file");
+        let obj_mesh = build_all_faces(&obj, CreaseAngle::default()).expect("a valid OBJ file");
         assert_eq!(obj.materials, ["b", "a"]);
         assert_eq!(
             obj_mesh.material_ranges,
             [MaterialRange { first_triangle: 0, material: 0 }, MaterialRange { first_triangle: 3, material: 1 }]
         );
         assert_eq!(obj_mesh.mesh.triangles().len(), 5);
-        let single_face_mesh = build_faces(&obj, &[1], [0.0; 3]).expect("a valid OBJ file");
+        let single_face_mesh = build_faces(&obj, &[1], [0.0; 3], CreaseAngle::default()).expect("a valid OBJ file");
         assert_eq!((single_face_mesh.material, single_face_mesh.material_ranges.len()), (1, 0));
     }
 
     #[test]
     fn build_faces_keeps_used_vertices_relative_to_origin() {
-        let obj_mesh = build_faces(&parse_squares(), &[1], [1.0, 0.0, 0.5]).expect("a valid OBJ file");
+        let obj_mesh =
+            build_faces(&parse_squares(), &[1], [1.0, 0.0, 0.5], CreaseAngle::default()).expect("a valid OBJ file");
         let rest_positions = [[0.0, 0.0, -0.5], [1.0, 0.0, -0.5], [1.0, 1.0, -0.5], [0.0, 1.0, -0.5]];
         assert_eq!(obj_mesh.mesh.rest_positions(), rest_positions);
         assert!(obj_mesh.mesh.corners().uvs.is_empty());
@@ -206,7 +214,7 @@ mod tests {
     #[test]
     fn missing_and_zero_normals_become_smooth_normals() {
         let text = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvn 1 0 0\nvn 0 0 0\nf 1//1 2//2 3\n";
-        let mesh = build_all_faces(&parse_obj(text)).expect("a valid OBJ file").mesh;
+        let mesh = build_all_faces(&parse_obj(text), CreaseAngle::default()).expect("a valid OBJ file").mesh;
         assert_eq!(mesh.corners().normals, [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 1.0]]);
     }
 }

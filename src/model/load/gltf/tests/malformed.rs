@@ -4,6 +4,7 @@ use serde_json::json;
 
 use super::materials::{encode_png, textured_triangle};
 use super::{F32, Model, U8, U16, morphed_triangle, push};
+use crate::domain::CreaseAngle;
 use crate::load::asset_dir::AssetDir;
 use crate::load::gltf::buffers::{GltfBuffers, MEMORY_BUDGET};
 use crate::load::gltf::remarks::ImportRemarks;
@@ -181,7 +182,7 @@ fn mode_and_memory_limits_are_checked_before_allocation() {
     for (remaining_budget, is_enough) in [(100, false), (10_000, true)] {
         let buffers = GltfBuffers::load(&document, &folder, Some(&model.bin)).expect("valid buffers");
         buffers.charge_budget(MEMORY_BUDGET - remaining_budget).expect("within the budget");
-        let result = assemble::assemble("model", &document, &buffers, ImportRemarks::default());
+        let result = assemble::assemble("model", &document, &buffers, CreaseAngle::default(), ImportRemarks::default());
         assert_eq!(result.is_ok(), is_enough);
         assert!(is_enough || result.is_err_and(|error| error.to_string().contains("decoded size: expected at most")));
     }
@@ -191,7 +192,7 @@ fn mode_and_memory_limits_are_checked_before_allocation() {
 fn truncated_and_patched_glb_headers_are_rejected() {
     let folder = AssetDir::unrestricted(&std::env::temp_dir());
     let glb = complete_model().to_glb();
-    let parse = |bytes: &[u8]| super::super::parse(&folder, "cut", bytes);
+    let parse = |bytes: &[u8]| super::super::parse(&folder, "cut", bytes, CreaseAngle::default());
     for length in 0..glb.len() {
         let message = parse(&glb[..length]).expect_err("a truncated file").to_string();
         assert!(message.contains("expected"), "{message}");
@@ -228,8 +229,9 @@ fn deeply_nested_or_huge_json_is_rejected() {
     let objects = format!("{{\"nodes\": [{}{{}}]}}", "{},".repeat((1 << 21) + 1));
     let commas = format!("{{\"scenes\": [{{\"nodes\": [{}0]}}]}}", "0,".repeat((1 << 24) + 1));
     for text in [nested_lists, objects, commas, String::new(), "[]".into(), "null".into()] {
-        let message =
-            super::super::parse(&folder, "json", text.as_bytes()).expect_err("an invalid document").to_string();
+        let message = super::super::parse(&folder, "json", text.as_bytes(), CreaseAngle::default())
+            .expect_err("an invalid document")
+            .to_string();
         assert!(message.starts_with("json: expected") || message.starts_with("asset.version"), "{message}");
     }
 }
@@ -264,7 +266,7 @@ fn mutated_glb_never_causes_a_panic() {
                 _ => bytes[digit_offsets[random.next_below(digit_offsets.len())]] = b'0' + random.next_below(10) as u8,
             }
         }
-        match super::super::parse(&files, "mutant", &bytes) {
+        match super::super::parse(&files, "mutant", &bytes, CreaseAngle::default()) {
             Ok(parts) => {
                 accepted_count += 1;
                 // Validation must not panic either; its result does not matter.

@@ -5,7 +5,7 @@ use std::io::Cursor;
 use serde_json::{Value, json};
 
 use super::{Model, push};
-use crate::domain::{AlphaMode, Material};
+use crate::domain::{AlphaMode, CreaseAngle, Material};
 use crate::scene::Scene;
 
 /// A 2 x 2 PNG of one color.
@@ -55,8 +55,10 @@ fn missing_images_are_remarks_and_errors_in_strict_mode() {
     }
     let folder = tempfile::tempdir().expect("a temporary folder");
     let files = crate::load::asset_dir::AssetDir::unrestricted(folder.path()).strict();
-    let message =
-        crate::load::gltf::parse(&files, "model", &model.to_glb()).map(drop).expect_err("strict mode").to_string();
+    let message = crate::load::gltf::parse(&files, "model", &model.to_glb(), CreaseAngle::default())
+        .map(drop)
+        .expect_err("strict mode")
+        .to_string();
     assert!(message.ends_with("file 'absent.png': expected an existing file, got none (strict mode)"), "{message}");
 }
 

@@ -6,6 +6,7 @@ mod real;
 
 use serde_json::{Value, json};
 
+use crate::domain::CreaseAngle;
 use crate::error::Result;
 use crate::load::asset_dir::AssetDir;
 use crate::scene::{Scene, SceneParts};
@@ -93,7 +94,7 @@ impl Model {
     }
 
     fn read(&self) -> Result<SceneParts> {
-        super::parse(&AssetDir::unrestricted(&std::env::temp_dir()), "model", &self.to_glb())
+        super::parse(&AssetDir::unrestricted(&std::env::temp_dir()), "model", &self.to_glb(), CreaseAngle::default())
     }
 
     fn parts(&self) -> SceneParts {
@@ -237,9 +238,11 @@ fn all_index_types_and_topologies_give_correct_triangles() {
     ];
     let mut triangles = |mode: u64, accessor: usize| {
         *model.primitive() = json!({"attributes": {"POSITION": 0}, "indices": accessor, "mode": mode});
-        model.parts().shapes[0].mesh.triangles().to_vec()
+        let mesh = &model.parts().shapes[0].mesh;
+        let vertices_of = |triangle: &[u32; 3]| triangle.map(|corner| mesh.corners().vertices[corner as usize]);
+        mesh.triangles().iter().map(vertices_of).collect::<Vec<_>>()
     };
-    // Modes 4, 5 and 6: a list, a strip (without its degenerate triangles) and a fan.
+    // Triangles as vertices: the fan folds back, so that creases split its corners. Modes 4, 5 and 6: a list, a strip (without its degenerate triangles) and a fan.
     for accessor in accessors {
         assert_eq!(triangles(4, accessor), [[0, 1, 2], [3, 3, 4]]);
         assert_eq!(triangles(5, accessor), [[0, 1, 2], [1, 3, 2]]);
@@ -292,7 +295,7 @@ fn buffers_are_read_from_data_uris_and_the_model_folder_only() {
     let mut read_buffer_uri = |uri: String| {
         model.json["buffers"][0]["uri"] = uri.into();
         std::fs::write(folder.path().join("sub/model.gltf"), model.json.to_string()).expect("a writable file");
-        super::read(&files, "sub/model.gltf")
+        super::read(&files, "sub/model.gltf", CreaseAngle::default())
     };
     let data = base64::engine::general_purpose::STANDARD.encode(&Model::triangle().bin);
     let from_data_uri = read_buffer_uri(format!("data:application/octet-stream;base64,{data}")).expect("a valid model");

@@ -3,14 +3,14 @@
 
 use std::path::PathBuf;
 
-use crate::domain::{AlphaMode, Texture};
+use crate::domain::{AlphaMode, CreaseAngle, Texture};
 use crate::load::asset_dir::AssetDir;
 use crate::scene::{Scene, SceneParts};
 
 fn read_dataset(path: &str) -> SceneParts {
     let default_folder = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data");
     let folder = std::env::var_os("MODALCAST_DATA").map_or(default_folder, PathBuf::from);
-    super::super::read(&AssetDir::unrestricted(&folder), path).expect("a valid model")
+    super::super::read(&AssetDir::unrestricted(&folder), path, CreaseAngle::default()).expect("a valid model")
 }
 
 #[test]
