@@ -379,7 +379,7 @@ pub struct UploadedDomain {
     /// world_from_domain at rest: 12 little-endian f32, row-major 3x4, translation in scene units; empty: the identity.
     #[prost(bytes = "bytes", tag = "6")]
     pub placement: ::prost::bytes::Bytes,
-    /// Diffuse color: linear red, green and blue, 0 to 1; empty: white.
+    /// Diffuse color: linear red, green and blue, 0 to 1; empty: 0.65, 0.4, 0.22.
     #[prost(float, repeated, tag = "7")]
     pub color: ::prost::alloc::vec::Vec<f32>,
     /// Squared angular frequencies in (rad/s)^2, one per mode; empty if unknown.

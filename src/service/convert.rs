@@ -10,7 +10,7 @@ use crate::engine::{
     parse_hash,
 };
 use crate::telemetry::StageTimes;
-use modalcast_model::domain::{CreaseAngle, Transform};
+use modalcast_model::domain::{CreaseAngle, Material, Transform};
 use modalcast_model::error::{Result, invalid};
 use modalcast_model::scene::{Camera, FrameSize, PixelRect, RawStepUpdate, Scene, TransformFormat, UpAxis};
 
@@ -371,7 +371,7 @@ pub(super) fn parse_uploaded_domain(domain: v1::UploadedDomain) -> Result<engine
         length => return Err(invalid("placement", "0 or 48 bytes", format!("{length} bytes"))),
     };
     let color = match domain.color[..] {
-        [] => [1.0; 3],
+        [] => Material::UNSPECIFIED_COLOR,
         [red, green, blue] => [red, green, blue],
         _ => return Err(invalid("color", "none or 3 numbers", domain.color.len())),
     };

@@ -3,6 +3,7 @@
 
 mod aov;
 mod below_ground;
+mod contrast;
 mod culling;
 mod culling_real;
 mod depth_range;

@@ -47,7 +47,7 @@ pub struct UploadDomain {
 }
 
 impl UploadDomain {
-    /// A white domain at the origin. Its name must be unique in the upload.
+    /// A domain of the default color at the origin. Its name must be unique in the upload.
     pub fn new(name: &str, shape: UploadShape) -> Self {
         Self { name: name.to_owned(), shape, placement: None, color: None, eigenvalues: vec![], crease_angle: None }
     }

@@ -53,6 +53,22 @@ impl Default for Material {
 }
 
 impl Material {
+    /// The color of surfaces whose source has none, linear: a copper tone that differs clearly from the default sky, the
+    /// default ground and its shadows, in luminance or in hue.
+    pub const UNSPECIFIED_COLOR: [f32; 3] = [0.65, 0.40, 0.22];
+
+    /// The material of surfaces whose source has none: [`Self::UNSPECIFIED_COLOR`], double-sided. An empty name becomes
+    /// `default`.
+    pub fn unspecified(name: &str) -> Self {
+        Self {
+            name: if name.is_empty() { "default" } else { name }.into(),
+            ambient: Self::UNSPECIFIED_COLOR,
+            diffuse: Self::UNSPECIFIED_COLOR,
+            double_sided: true,
+            ..Self::default()
+        }
+    }
+
     /// Validates all numbers.
     ///
     /// # Errors

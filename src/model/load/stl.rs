@@ -12,6 +12,7 @@ use std::collections::HashMap;
 use super::asset_dir::{AssetDir, MAX_MODEL_BYTES, stem_of};
 use super::polygons::{Corner, PolygonMesh};
 use super::surface::{self, ModelOptions};
+use crate::domain::Material;
 use crate::error::{Result, invalid};
 use crate::scene::{SceneParts, UpAxis};
 
@@ -28,7 +29,7 @@ pub(super) fn read(files: &AssetDir, name: &str, options: ModelOptions) -> Resul
     let mut parts = SceneParts { up: UpAxis::Z, ..SceneParts::named(stem_of(name)) };
     let polygons = parse(&files.read(name, MAX_MODEL_BYTES)?, &mut parts.remarks)
         .map_err(|error| error.prefix_field(&format!("file '{name}'")))?;
-    parts.materials.push(surface::white_material(""));
+    parts.materials.push(Material::unspecified(""));
     surface::add_domain(files, name, &polygons, options, None, &mut parts)?;
     Ok(parts)
 }

@@ -77,11 +77,6 @@ pub(super) fn add_domain(
     Ok(())
 }
 
-/// A white, double-sided material.
-pub(super) fn white_material(name: &str) -> Material {
-    Material { name: if name.is_empty() { "white" } else { name }.into(), double_sided: true, ..Material::default() }
-}
-
 /// Applies the colors of the vertices, unless a material has an image, whose texture coordinates they would replace.
 fn color_vertices(polygons: &PolygonMesh, mesh: Mesh, parts: &mut SceneParts) -> Result<Mesh> {
     if polygons.colors.is_empty() {
@@ -91,6 +86,12 @@ fn color_vertices(polygons: &PolygonMesh, mesh: Mesh, parts: &mut SceneParts) ->
     if parts.materials.iter().any(has_image) {
         parts.remarks.push("colors of vertices are not used, because a material has an image".into());
         return Ok(mesh);
+    }
+    // The colors of the vertices are factors of a material, and the only colors of a material without a definition.
+    for material in &mut parts.materials {
+        if *material == Material::unspecified(&material.name) {
+            (material.ambient, material.diffuse) = ([1.0; 3], [1.0; 3]);
+        }
     }
     match polygons::paint(&mesh, &polygons.colors)? {
         VertexColors::Uniform(color) => {

@@ -134,8 +134,10 @@ impl Default for RenderSettings {
             // white.
             sunlight: [0.82, 0.77, 0.69],
             skylight: [0.25, 0.28, 0.33],
-            zenith: [0.16, 0.36, 0.72],
-            horizon: [0.72, 0.82, 0.90],
+            zenith: [0.10, 0.27, 0.58],
+            // Between the lit and the shaded side of white surfaces in luminance, and saturated enough to differ from
+            // both.
+            horizon: [0.34, 0.54, 0.79],
             shadow: Some(ShadowSettings::default()),
             ground: Some(Ground::default()),
             samples: 4,

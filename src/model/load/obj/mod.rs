@@ -12,6 +12,7 @@ use parse::ObjFile;
 use super::asset_dir::{AssetDir, MAX_MODEL_BYTES, MAX_TEXT_BYTES, parent_of, stem_of};
 use super::surface::{self, ModelOptions};
 use super::texture_cache::TextureCache;
+use crate::domain::Material;
 use crate::error::{Result, invalid};
 use crate::scene::SceneParts;
 
@@ -48,8 +49,8 @@ pub(super) fn parse_obj(text: &str) -> super::polygons::PolygonMesh {
 
 /// Adds the materials that the faces use, in the order of [`super::polygons::PolygonMesh::materials`], and their textures.
 ///
-/// A material without definition is white, and a library or image that does not exist is left out. In strict mode, both
-/// are errors.
+/// A material without definition is [`Material::unspecified`], and a library or image that does not exist is left out. In
+/// strict mode, both are errors.
 ///
 /// # Errors
 /// `Invalid` with the material and the statement.
@@ -83,7 +84,7 @@ pub(super) fn add_materials(obj: &ObjFile, files: &AssetDir, parts: &mut ScenePa
                 if !name.is_empty() {
                     undefined_names.push(format!("'{name}'"));
                 }
-                surface::white_material(name)
+                Material::unspecified(name)
             }
             None => {
                 let names = statements_by_name.keys().take(MAX_LISTED_NAMES).map(String::as_str);
@@ -96,9 +97,10 @@ pub(super) fn add_materials(obj: &ObjFile, files: &AssetDir, parts: &mut ScenePa
     if !undefined_names.is_empty() {
         let undefined_count = undefined_names.len();
         undefined_names.truncate(MAX_LISTED_UNDEFINED);
-        parts
-            .remarks
-            .push(format!("undefined materials are white ({undefined_count}): {}", undefined_names.join(", ")));
+        parts.remarks.push(format!(
+            "undefined materials have the default color ({undefined_count}): {}",
+            undefined_names.join(", ")
+        ));
     }
     parts.textures.append(&mut texture_cache.into_textures());
     Ok(())
@@ -168,7 +170,7 @@ mod tests {
             assert_eq!(read(&files.strict(), name, ModelOptions::default()).expect_err(name).to_string(), message);
         }
         let parts = read(&files, "rows.obj", ModelOptions::without_modes()).expect("a valid OBJ file");
-        assert_eq!(parts.materials[0].diffuse, [1.0; 3]);
+        assert_eq!(parts.materials[0], Material::unspecified(""));
         assert!(parts.remarks.is_empty(), "{:?}", parts.remarks);
     }
 
@@ -183,10 +185,10 @@ mod tests {
         let files = AssetDir::unrestricted(folder.path());
         let read = |name: &str| read(&files, name, ModelOptions::default()).expect("a mesh with stand-ins");
         let lib = read("lib.obj");
-        let undefined = "undefined materials are white (1): 'bark'";
+        let undefined = "undefined materials have the default color (1): 'bark'";
         assert_eq!(lib.remarks, ["material library 'no.mtl' does not exist", undefined]);
-        assert_eq!(lib.materials[0].diffuse, [1.0; 3]);
-        assert_eq!(read("use.obj").remarks, ["undefined materials are white (1): 'green'"]);
+        assert_eq!(lib.materials[0], Material::unspecified("bark"));
+        assert_eq!(read("use.obj").remarks, ["undefined materials have the default color (1): 'green'"]);
         let map = read("map.obj");
         assert_eq!((map.materials[0].diffuse, map.materials[0].color_texture), ([1.0, 0.0, 0.0], None));
         assert_eq!(map.materials[0].alpha_mode, crate::domain::AlphaMode::Opaque);
@@ -216,6 +218,7 @@ mod tests {
         let parts = read("a.obj");
         // One patch of 2 x 2 texels. A vertex without a color is white.
         assert_eq!((parts.textures[0].width(), parts.materials[0].color_texture), (2, Some(0)));
+        assert_eq!(parts.materials[0].diffuse, [1.0; 3], "expected no factor of the colors");
         let texels: Vec<&[u8]> = parts.textures[0].rgba().chunks_exact(4).collect();
         for color in [[255, 0, 0, 255], [0, 255, 0, 255], [255; 4]] {
             assert!(texels.contains(&&color[..]), "{color:?} is not among {texels:?}");

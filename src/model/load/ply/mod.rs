@@ -10,7 +10,7 @@ use super::asset_dir::{AssetDir, MAX_MODEL_BYTES, stem_of};
 use super::polygons::{Corner, NO_INDEX, PolygonMesh};
 use super::surface::{self, ModelOptions};
 use super::texture_cache;
-use crate::domain::AlphaMode;
+use crate::domain::{AlphaMode, Material};
 use crate::error::{Result, invalid};
 use crate::load::obj::DEFAULT_ALPHA_CUTOFF;
 use crate::scene::{SceneParts, UpAxis};
@@ -29,12 +29,13 @@ pub(super) fn read(files: &AssetDir, name: &str, options: ModelOptions) -> Resul
     let mut parts = SceneParts { up: UpAxis::Z, ..SceneParts::named(stem_of(name)) };
     let mut ply = PlyReader::default();
     ply.parse(&files.read(name, MAX_MODEL_BYTES)?).map_err(in_file)?;
-    let mut material = surface::white_material("");
+    let mut material = Material::unspecified("");
     if let Some(image) = ply.image.take().filter(|_| ply.polygons.has_uvs()) {
         if files.has_referenced_file(&image).map_err(in_file)? {
             let texture = texture_cache::decode(files, &image)?;
             let mask = AlphaMode::Mask { cutoff: DEFAULT_ALPHA_CUTOFF };
             material.alpha_mode = if texture.has_alpha() { mask } else { AlphaMode::Opaque };
+            (material.ambient, material.diffuse) = ([1.0; 3], [1.0; 3]);
             material.color_texture = Some(parts.textures.len());
             parts.textures.push(texture);
         } else {
