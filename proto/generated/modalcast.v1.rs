@@ -2380,6 +2380,11 @@ pub struct Picture {
     /// Quality of FORMAT_JPEG, 1 (smallest frame) to 100 (smallest error); 0 means 90. Must be 0 for other formats.
     #[prost(uint32, tag = "8")]
     pub jpeg_quality: u32,
+    /// Width in pixels of lines along the edges of the faces, above 0, to 32; 0: no lines. Unset: as look.edges in the
+    /// scene.toml, which also has their color. Hidden edges and edges of blended surfaces have no lines. Must be 0 or unset
+    /// for outputs other than OUTPUT_COLOR.
+    #[prost(float, optional, tag = "9")]
+    pub edge_width: ::core::option::Option<f32>,
 }
 /// An unset view or lens is taken from the camera that frames the scene's rest bounds. Positions are in scene units
 /// relative to the scene's origin (SceneInfo.origin). The server keeps the camera in f64 and subtracts the origin of the

@@ -16,4 +16,5 @@ layout(std140, binding = 0) uniform FrameBlock {
     vec4 shadow;               // minimum variance, light bleeding reduction, alpha threshold, side of the map in texels
     // xyz: (a, b, c), the ground's depth at (x, y) of the map is a x + b y + c; w: side of a texel, in scene units.
     vec4 shadow_ground_plane;
+    vec4 edges;                // color of the lines along mesh edges; w: their width in pixels
 } frame;

@@ -32,5 +32,8 @@ vec4 shade_triangle(int triangle_index, vec2 ndc, vec2 pixel_size) {
 #endif
     shading_normal = bary.is_front_facing ? shading_normal : -shading_normal;
     vec3 light = phong(material, tint.rgb, shading_normal, geometric_normal, triangle.world * bary.weights);
+#ifdef MESH_EDGES
+    light = mix(light, frame.edges.rgb, edge_coverage(triangle, triangle_index, pixel_size));
+#endif
     return vec4(light, material.ambient.a * tint.a);
 }

@@ -11,7 +11,7 @@ use crate::engine::{DeviceContext, FrameOutput, LoadedScene, validate_mode};
 use crate::frame;
 use modalcast_model::error::{Error, Result, fault, invalid};
 use modalcast_model::load::{self, OpenedScene};
-use modalcast_model::scene::{Camera, FrameSize, Lens, Scene, SceneState, View};
+use modalcast_model::scene::{Camera, FrameSize, Lens, MeshEdges, Scene, SceneState, View};
 
 /// Renders one frame of a scene to a PNG or JPEG file.
 #[derive(Debug, clap::Args)]
@@ -55,6 +55,9 @@ pub(super) struct Args {
     /// Value at the bright end of the color map; 0 fits the color map to the frame.
     #[arg(long, requires = "output", default_value_t = 0.0)]
     largest: f64,
+    /// Draws lines along the edges of the faces, of this width. Default: as `look.edges` of the scene. 0: no lines.
+    #[arg(long, value_name = "PIXELS", num_args = 0..=1, default_missing_value = "1.25", conflicts_with = "output")]
+    edges: Option<f32>,
     /// Deformation backend.
     #[arg(long, value_enum, default_value_t)]
     backend: BackendChoice,
@@ -108,6 +111,17 @@ impl FileFormat {
     }
 }
 
+/// The lines along mesh edges: those of the scene, unless the command line sets their width.
+fn mesh_edges(width: Option<f32>, scene: &Scene) -> Result<Option<MeshEdges>> {
+    let edges = match width {
+        None => scene.look.edges,
+        Some(0.0) => None,
+        Some(width) => Some(scene.look.edges.unwrap_or_default().with_width(width)),
+    };
+    edges.map_or(Ok(()), |edges| edges.check("--edges"))?;
+    Ok(edges)
+}
+
 pub(super) fn run(args: &Args) -> Outcome {
     let format = FileFormat::of(&args.out)?;
     let OpenedScene { scene, backends } = with_spinner("loading", || load::open(&args.scene))?;
@@ -121,7 +135,10 @@ pub(super) fn run(args: &Args) -> Outcome {
     loaded_scene.deform(&Arc::new(state))?;
     let scale_max = args.largest;
     let rgba = match args.output {
-        OutputOption::Color => device.draw(&mut loaded_scene, &camera(args, &scene), args.size)?.rgba,
+        OutputOption::Color => {
+            let edges = mesh_edges(args.edges, &scene)?;
+            device.draw_with_edges(&mut loaded_scene, &camera(args, &scene), args.size, edges)?.rgba
+        }
         OutputOption::Displacement => {
             render_color_map(args, &mut device, &mut loaded_scene, FrameOutput::Displacement { scale_max })?
         }

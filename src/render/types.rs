@@ -1,7 +1,7 @@
 //! Parameters and results of the renderer, without references to a device.
 
 use crate::pass::{FrameTimes, Pass};
-use modalcast_model::scene::{BoundingBox, Camera, OrientedBounds};
+use modalcast_model::scene::{BoundingBox, Camera, MeshEdges, OrientedBounds};
 
 /// Selects the EGL device.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -41,6 +41,8 @@ pub struct FrameParams {
     /// Bounds of the same vertices in light space, whose z axis points to the sun. The shadow map is fitted to these
     /// bounds, or without them to the corners of `bounds`.
     pub light_bounds: Option<OrientedBounds>,
+    /// Lines along the edges of the faces. AOVs and picks ignore them.
+    pub edges: Option<MeshEdges>,
 }
 
 /// RGBA8 sRGB pixels of a frame, top row first.

@@ -233,8 +233,9 @@ fn parse_picture(engine: &Engine, scene: &Scene, picture: v1::Picture) -> Result
         return Err(invalid("width", expected, format!("{width} x {height}")));
     }
     let size = FrameSize::new(width, height);
+    let edges = output::parse_edges(scene, output, picture.edge_width)?;
     let camera = parse_picture_camera(scene, size, picture.camera)?;
-    Ok(RequestedPicture { spec: PictureSpec { camera, size, output }, format })
+    Ok(RequestedPicture { spec: PictureSpec { camera, size, output, edges }, format })
 }
 
 /// Validates the camera of a picture. An unset camera is fitted to the scene.
@@ -295,6 +296,7 @@ pub(super) fn wire_picture(RequestedPicture { spec, format }: &RequestedPicture)
         format: wire_format(*format).into(),
         jpeg_quality,
         camera: Some(camera::wire_camera(&spec.camera)),
+        edge_width: (spec.output == engine::FrameOutput::Color).then(|| spec.edges.map_or(0.0, |edges| edges.width)),
         ..output::wire_output(spec.output)
     }
 }

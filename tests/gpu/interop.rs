@@ -83,6 +83,7 @@ fn gpu_frames_of_filled_and_uploaded_buffers_are_equal() {
         height: 240,
         bounds,
         light_bounds: None,
+        edges: None,
     };
     let frame = renderer.draw(&filled_scene, &params).expect("expected a frame");
     renderer
@@ -120,6 +121,7 @@ fn gpu_frames_in_flight_keep_the_vertices_of_their_step() {
         height: 1080,
         bounds,
         light_bounds: None,
+        edges: None,
     };
     let (mut frames, mut expected_images) = (std::collections::VecDeque::new(), Vec::new());
     let mut images = Vec::new();

@@ -11,7 +11,7 @@ use modalcast_model::backend_settings::{BackendSettings, RasterPolicy};
 use modalcast_model::deform::Deformer as _;
 use modalcast_model::raster::{RasterGeometry, Rasterizer};
 use modalcast_model::scene::{
-    Antialiasing, Camera, FrameSize, RenderSettings, Scene, SceneParts, SceneState, ShadowSettings,
+    Antialiasing, Camera, FrameSize, MeshEdges, RenderSettings, Scene, SceneParts, SceneState, ShadowSettings,
 };
 use modalcast_render::{
     DevicePreference, FrameImage, FrameParams, MAX_FRAMES_IN_FLIGHT, MappedPixels, RasterBackend, RasterBackends,
@@ -92,6 +92,7 @@ fn draw_still(scene: &Arc<Scene>, state: &SceneState, backend: RasterBackend) ->
         height: SIZE[1],
         bounds: summary.bounds,
         light_bounds: summary.oriented_bounds,
+        edges: scene.look.edges,
     };
     let image = renderer.draw(&buffers, &params).expect("expected a frame");
     let triangle_of =
@@ -125,6 +126,12 @@ fn scenes_and_states() -> [(&'static str, Arc<Scene>, SceneState); 2] {
 /// The same scene with this shadow, without ground and with one sample per pixel.
 fn with_shadow(scene: &Scene, shadow: Option<ShadowSettings>) -> Arc<Scene> {
     let look = RenderSettings { shadow, ground: None, antialias: Antialiasing::None, ..scene.look };
+    Scene::new(SceneParts { look, ..scene.parts() }).expect("expected a valid scene")
+}
+
+/// The same scene with these lines along mesh edges.
+fn with_edges(scene: &Scene, edges: Option<MeshEdges>) -> Arc<Scene> {
+    let look = RenderSettings { edges, ..scene.look };
     Scene::new(SceneParts { look, ..scene.parts() }).expect("expected a valid scene")
 }
 
@@ -170,8 +177,9 @@ fn gpu_ids_equal_opengl_except_on_edges_and_depth_ties() {
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_shading_of_equal_ids_equals_opengl() {
     for (name, scene, state) in scenes_and_states() {
-        for shadow in [None, Some(ShadowSettings::default())] {
-            let scene = with_shadow(&scene, shadow);
+        let edges = Some(MeshEdges::default());
+        for (shadow, edges) in [(None, None), (Some(ShadowSettings::default()), None), (None, edges)] {
+            let scene = with_edges(&with_shadow(&scene, shadow), edges);
             let [want, got] =
                 [RasterBackend::OpenGl, RasterBackend::Cuda].map(|backend| draw_still(&scene, &state, backend));
             let pixels = got.image.rgba.chunks_exact(4).zip(want.image.rgba.chunks_exact(4));
@@ -184,7 +192,7 @@ fn gpu_shading_of_equal_ids_equals_opengl() {
                 .filter(|(is_different, is_same_triangle)| *is_different && *is_same_triangle)
                 .count();
             eprintln!(
-                "{name}, {:?}: {different_count} pixels with equal ids have different colors",
+                "{name}, {:?}, {edges:?}: {different_count} pixels with equal ids have different colors",
                 shadow.map(|shadow| shadow.size)
             );
             // 0.2 % of the pixels.
@@ -307,7 +315,7 @@ fn gpu_cuda_frames_in_flight_keep_their_step() {
         }
         in_flight.push_back(
             context
-                .begin_draw(&mut loaded_scene, &camera, FrameSize::new(SIZE[0], SIZE[1]))
+                .begin_draw(&mut loaded_scene, &camera, FrameSize::new(SIZE[0], SIZE[1]), None)
                 .expect("expected the frame to start"),
         );
     }

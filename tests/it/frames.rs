@@ -147,6 +147,44 @@ async fn lossless_frames_are_complete_and_latest_frames_increase() {
     tokio::join!(send_steps, read_lossless, read_latest);
 }
 
+/// The look of the scene has no lines along mesh edges.
+#[tokio::test(flavor = "multi_thread")]
+async fn edge_width_of_a_picture_draws_lines_for_this_picture_only() {
+    let server = start_server().await;
+    let request = |edge_width: Option<f32>, output: v1::Output| {
+        let mut request = rgba_request();
+        request.pictures[0].edge_width = edge_width;
+        (request.pictures[0].output, request.pictures[0].format) = (output.into(), v1::Format::Unspecified.into());
+        request
+    };
+    let color = v1::Output::Color;
+    let plain = render(&server, request(None, color)).await.expect("expected a frame").bytes;
+    let lines = render(&server, request(Some(2.0), color)).await.expect("expected a frame").bytes;
+    assert!(lines != plain, "expected lines");
+    let mut request_of_both = request(Some(2.0), color);
+    request_of_both.pictures.push(request(Some(0.0), color).pictures.remove(0));
+    let mut stream = with_timeout(server.frames().await.render_frame(request_of_both)).await.expect("expected frames");
+    let mut received: Vec<Vec<u8>> = Vec::new();
+    while let Some(response) = with_timeout(stream.get_mut().message()).await.expect("expected a message") {
+        let Some(v1::render_frame_response::Part::Chunk(chunk)) = response.part else { panic!("expected a chunk") };
+        match chunk.head {
+            Some(_) => received.push(chunk.data.to_vec()),
+            None => received.last_mut().expect("expected a head").extend_from_slice(&chunk.data),
+        }
+    }
+    assert!(received == [lines, plain], "expected lines in the first picture only");
+    for (edge_width, output) in
+        [(-1.0, color), (32.5, color), (f32::NAN, color), (f32::INFINITY, color), (1.0, v1::Output::Depth)]
+    {
+        let status = render(&server, request(Some(edge_width), output)).await.err().expect("expected a rejection");
+        assert_eq!(
+            (status.code(), &rejection_details(&status).field[..]),
+            (Code::InvalidArgument, "pictures[0].edge_width")
+        );
+    }
+    render(&server, request(Some(0.0), v1::Output::Depth)).await.expect("expected depth");
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn invalid_pictures_and_missed_deadlines_are_errors() {
     let server = start_server().await;

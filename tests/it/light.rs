@@ -11,8 +11,14 @@ use modalcast_render::{FrameParams, shadow_texel_axes};
 /// Side lengths of a shadow map texel in scene units. The map is fitted to `light_bounds` (the bounds in light space),
 /// or without these to the corners of `bounds`.
 fn texel_size(scene: &Scene, bounds: BoundingBox, light_bounds: Option<OrientedBounds>) -> [f64; 2] {
-    let params =
-        FrameParams { camera: Camera::fit_to_scene(scene, 64, 64), width: 64, height: 64, bounds, light_bounds };
+    let params = FrameParams {
+        camera: Camera::fit_to_scene(scene, 64, 64),
+        width: 64,
+        height: 64,
+        bounds,
+        light_bounds,
+        edges: None,
+    };
     shadow_texel_axes(scene, &params).expect("expected a scene with a shadow").map(|side| side.norm())
 }
 

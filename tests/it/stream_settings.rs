@@ -120,6 +120,7 @@ async fn first_reply_has_the_settings_in_effect() {
         format: v1::Format::Png.into(),
         camera: Some(v1::Camera { view: Some(view), lens: Some(lens), near: 0.0, far: 0.0 }),
         output: v1::Output::Color.into(),
+        edge_width: Some(0.0),
         ..v1::Picture::default()
     };
     assert_eq!(settings.pictures, [expected_picture]);

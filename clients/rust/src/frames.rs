@@ -101,6 +101,9 @@ pub struct Picture {
     pub output: Output,
     /// For [`FrameFormat::Jpeg`]: 1 (smallest frame) to 100 (smallest error); 0 means 90.
     pub jpeg_quality: u32,
+    /// For [`Output::Color`]: width in pixels of lines along the edges of the faces, to 32; 0 for none. `None`: as the
+    /// scene's `look.edges`.
+    pub edge_width: Option<f32>,
 }
 
 impl Picture {
@@ -108,6 +111,13 @@ impl Picture {
     #[must_use]
     pub const fn size(mut self, width: u32, height: u32) -> Self {
         (self.width, self.height) = (width, height);
+        self
+    }
+
+    /// Sets the width in pixels of lines along the edges of the faces; 0 for none.
+    #[must_use]
+    pub const fn edge_width(mut self, pixels: f32) -> Self {
+        self.edge_width = Some(pixels);
         self
     }
 
@@ -374,6 +384,7 @@ impl From<Picture> for v1::Picture {
             mode,
             largest: scale_max,
             jpeg_quality: if format == v1::Format::Jpeg { picture.jpeg_quality } else { 0 },
+            edge_width: picture.edge_width,
         }
     }
 }

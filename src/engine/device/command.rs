@@ -9,7 +9,7 @@ use crate::frame::Legend;
 use modalcast_model::backend_settings::BackendSettings;
 use modalcast_model::deform::{DeformSummary, DeformedSurface, VertexAttributes};
 use modalcast_model::error::{Error, Result};
-use modalcast_model::scene::{Camera, FrameSize, PixelRect, Scene, SceneState};
+use modalcast_model::scene::{Camera, FrameSize, MeshEdges, PixelRect, Scene, SceneState};
 use modalcast_render::{AovImage, FrameImage, PickHit};
 
 /// Identifies a loaded scene on the device thread.
@@ -51,6 +51,7 @@ pub(in crate::engine) enum Command {
         id: SceneId,
         camera: Camera,
         size: FrameSize,
+        edges: Option<MeshEdges>,
         reply: Reply<FrameImage>,
     },
     /// Renders an AOV (arbitrary output variable): values instead of colors, with a legend if they form a color map.

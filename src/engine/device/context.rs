@@ -16,10 +16,10 @@ use modalcast_model::backend_settings::{BackendSettings, BatchPolicy, RasterPoli
 use modalcast_model::deform::{Backend, Deformer};
 use modalcast_model::error::{Error, Result};
 use modalcast_model::raster::{RasterGeometry, Rasterizer};
-use modalcast_model::scene::{Camera, FrameSize, PixelRect, Scene};
+use modalcast_model::scene::{Camera, FrameSize, MeshEdges, PixelRect, Scene};
 use modalcast_render::{
-    Aov, AovImage, DevicePreference, FrameImage, MappedPixels, PartialAov, PartialFrame, PendingFrame, PendingPick,
-    PickHit, Renderer, SceneBuffers, ScenePreparation,
+    Aov, AovImage, DevicePreference, FrameImage, FrameParams, MappedPixels, PartialAov, PartialFrame, PendingFrame,
+    PendingPick, PickHit, Renderer, SceneBuffers, ScenePreparation,
 };
 
 /// Description of the deformation backend and the renderer in use.
@@ -204,7 +204,22 @@ impl DeviceContext {
     /// # Errors
     /// `Unavailable` without a renderer, `Invalid` for an invalid camera or size, `Fault` of OpenGL.
     pub fn draw(&mut self, loaded_scene: &mut LoadedScene, camera: &Camera, size: FrameSize) -> Result<FrameImage> {
-        let pending_draw = self.begin_draw(loaded_scene, camera, size)?;
+        let pending_draw = self.begin_draw(loaded_scene, camera, size, loaded_scene.scene().look.edges)?;
+        self.finish_draw(pending_draw).map(MappedPixels::into_image)
+    }
+
+    /// As [`Self::draw`], with these lines along mesh edges instead of those of the look.
+    ///
+    /// # Errors
+    /// As [`Self::draw`].
+    pub fn draw_with_edges(
+        &mut self,
+        loaded_scene: &mut LoadedScene,
+        camera: &Camera,
+        size: FrameSize,
+        edges: Option<MeshEdges>,
+    ) -> Result<FrameImage> {
+        let pending_draw = self.begin_draw(loaded_scene, camera, size, edges)?;
         self.finish_draw(pending_draw).map(MappedPixels::into_image)
     }
 
@@ -218,8 +233,9 @@ impl DeviceContext {
         loaded_scene: &mut LoadedScene,
         camera: &Camera,
         size: FrameSize,
+        edges: Option<MeshEdges>,
     ) -> Result<PendingDraw> {
-        let mut partial_draw = self.begin_partial_draw(loaded_scene, camera, size)?;
+        let mut partial_draw = self.begin_partial_draw(loaded_scene, camera, size, edges)?;
         while !partial_draw.frame.is_submitted() {
             self.submit_draw_step(loaded_scene, &mut partial_draw)?;
         }
@@ -236,13 +252,14 @@ impl DeviceContext {
         loaded_scene: &mut LoadedScene,
         camera: &Camera,
         size: FrameSize,
+        edges: Option<MeshEdges>,
     ) -> Result<PartialDraw> {
         let camera = camera.validated()?;
         let renderer = self.renderer.as_mut().map_err(|error| error.clone())?;
         let upload_begin = Instant::now();
         let contents = loaded_scene.fill_buffers(renderer, &camera)?;
         let upload_ms = contents.is_uploaded.then(|| ms_since(upload_begin));
-        let params = contents.frame_params(camera, size);
+        let params = FrameParams { edges, ..contents.frame_params(camera, size) };
         Ok(PartialDraw { frame: renderer.begin_frame(loaded_scene.buffers()?, &params, true)?, upload_ms })
     }
 

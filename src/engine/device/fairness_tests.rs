@@ -78,7 +78,7 @@ impl Fixture {
     }
 
     fn draw(&self, id: SceneId, size: FrameSize) -> PendingReply<FrameImage> {
-        self.handle.begin_draw(id, Camera::fit_to_scene(&self.scene, size.width, size.height), size)
+        self.handle.begin_draw(id, Camera::fit_to_scene(&self.scene, size.width, size.height), size, None)
     }
 
     /// Runs `count` commands or steps.

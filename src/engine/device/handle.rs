@@ -16,7 +16,7 @@ use crate::frame::Legend;
 use modalcast_model::backend_settings::BackendSettings;
 use modalcast_model::deform::{DeformSummary, VertexAttributes};
 use modalcast_model::error::{Error, Result, fault, fault_in};
-use modalcast_model::scene::{Camera, FrameSize, PixelRect, Scene, SceneState};
+use modalcast_model::scene::{Camera, FrameSize, MeshEdges, PixelRect, Scene, SceneState};
 use modalcast_render::{AovImage, FrameImage, PickHit};
 
 /// Sends commands to the device thread. The thread ends when the last clone is dropped.
@@ -127,8 +127,9 @@ impl DeviceHandle {
         id: SceneId,
         camera: Camera,
         size: FrameSize,
+        edges: Option<MeshEdges>,
     ) -> PendingReply<FrameImage> {
-        self.submit(|reply| Command::Draw { id, camera, size, reply })
+        self.submit(|reply| Command::Draw { id, camera, size, edges, reply })
     }
 
     pub(in crate::engine) async fn render_aov(

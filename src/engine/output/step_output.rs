@@ -6,7 +6,7 @@ use super::rendered_picture::RenderedPicture;
 use super::step_vertices::StepVertices;
 use crate::telemetry::StageTimes;
 use modalcast_model::deform::VertexAttributes;
-use modalcast_model::scene::{Camera, FloatingOrigins, FrameSize, PixelRect, SceneState};
+use modalcast_model::scene::{Camera, FloatingOrigins, FrameSize, MeshEdges, PixelRect, SceneState};
 use modalcast_render::PickHit;
 
 /// The output that a client requests of a step.
@@ -32,6 +32,8 @@ pub struct PictureSpec {
     pub camera: Camera,
     pub size: FrameSize,
     pub output: FrameOutput,
+    /// Lines along mesh edges of [`FrameOutput::Color`]; ignored for other outputs.
+    pub edges: Option<MeshEdges>,
 }
 
 /// The quantity that a frame shows.

@@ -149,7 +149,7 @@ mod tests {
 
     fn camera_control() -> CameraControl {
         let camera = Camera::fit_to_scene(&testing::two_strips(), 8, 8);
-        let picture = PictureSpec { camera, size: FrameSize::new(8, 8), output: FrameOutput::Color };
+        let picture = PictureSpec { camera, size: FrameSize::new(8, 8), output: FrameOutput::Color, edges: None };
         CameraControl::new([picture; 2].into(), Arc::default())
     }
 

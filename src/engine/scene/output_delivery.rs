@@ -249,7 +249,8 @@ mod tests {
         let camera = Camera::fit_to_scene(&testing::two_strips(), width, 8);
         Subscription::new(
             OutputSpec::Frames(
-                [PictureSpec { camera, size: FrameSize::new(width, 8), output: FrameOutput::Color }].into(),
+                [PictureSpec { camera, size: FrameSize::new(width, 8), output: FrameOutput::Color, edges: None }]
+                    .into(),
             ),
             delivery.into(),
             Arc::default(),

@@ -158,7 +158,7 @@ impl OutputProducer {
                 self.readbacks.flush_before(step_count).await;
                 round.drawn_pictures.extend(oldest.deliver().await);
             }
-            let reply = self.device.begin_draw(self.scene_on_device.id, spec.camera, spec.size);
+            let reply = self.device.begin_draw(self.scene_on_device.id, spec.camera, spec.size, spec.edges);
             round.started_pictures.push_back(PendingReadback::of_picture(round.current, *spec, reply, recipient));
             return;
         }
@@ -246,9 +246,9 @@ impl OutputProducer {
 
     /// Draws a picture of the current step.
     async fn draw(&self, picture: &PictureSpec) -> Result<RenderedPicture> {
-        let (id, PictureSpec { camera, size, output }) = (self.scene_on_device.id, *picture);
+        let (id, PictureSpec { camera, size, output, edges }) = (self.scene_on_device.id, *picture);
         if output == FrameOutput::Color {
-            return self.device.begin_draw(id, camera, size).wait().await.map(RenderedPicture::from);
+            return self.device.begin_draw(id, camera, size, edges).wait().await.map(RenderedPicture::from);
         }
         let (image, legend) = self.device.render_aov(id, camera, size, output).await?;
         Ok(RenderedPicture::from_aov(image, legend))

@@ -172,7 +172,7 @@ impl<T, R> InFlight<T, R> {
 
 enum Readback {
     Vertices(InFlight<CopiedVertices, Recipient>),
-    Picture(PictureSpec, InFlight<FrameImage, PictureRecipient>),
+    Picture(Box<PictureSpec>, InFlight<FrameImage, PictureRecipient>),
     /// No recipient waits any longer, so the command to the device is cancelled.
     Cancelled,
 }
@@ -203,7 +203,7 @@ impl PendingReadback {
         reply: PendingReply<FrameImage>,
         recipient: PictureRecipient,
     ) -> Self {
-        Self::new(current, Readback::Picture(spec, InFlight::new(reply, vec![recipient])))
+        Self::new(current, Readback::Picture(Box::new(spec), InFlight::new(reply, vec![recipient])))
     }
 
     const fn new(current: &CurrentStep, readback: Readback) -> Self {
@@ -217,7 +217,7 @@ impl PendingReadback {
         picture: &PictureSpec,
     ) -> Option<&mut Vec<PictureRecipient>> {
         match &mut self.readback {
-            Readback::Picture(spec, in_flight) if self.step_count == step_count && spec == picture => {
+            Readback::Picture(spec, in_flight) if self.step_count == step_count && **spec == *picture => {
                 Some(&mut in_flight.recipients)
             }
             _ => None,
@@ -275,7 +275,7 @@ impl PendingReadback {
             Readback::Picture(spec, InFlight { answer, recipients, .. }) => {
                 let picture = answer?.map(|image| Arc::new(RenderedPicture::from(image)));
                 recipients.into_iter().for_each(|recipient| recipient.receive(picture.clone()));
-                picture.ok().map(|picture| (spec, picture))
+                picture.ok().map(|picture| (*spec, picture))
             }
             Readback::Cancelled => None,
         };

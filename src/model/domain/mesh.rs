@@ -20,6 +20,7 @@ pub struct Mesh {
     rest_positions: Vec<[f32; 3]>,
     corners: Corners,
     triangles: Vec<[u32; 3]>,
+    inner_edges: Vec<u8>,
 }
 
 impl Mesh {
@@ -55,7 +56,21 @@ impl Mesh {
         for normal in &mut corners.normals {
             *normal = normalize_or_z(*normal);
         }
-        Ok(Self { rest_positions, corners, triangles })
+        Ok(Self { rest_positions, corners, triangles, inner_edges: Vec::new() })
+    }
+
+    /// Marks the edges of triangles that are inside of the polygons from which the triangles were made, as
+    /// [`Self::inner_edges`] returns them. A list without marks is stored as an empty one.
+    ///
+    /// # Errors
+    /// `Invalid` unless there is one entry per triangle.
+    pub fn with_inner_edges(self, inner_edges: Vec<u8>) -> Result<Self> {
+        if inner_edges.len() != self.triangles.len() {
+            let expected = format!("one entry per triangle ({})", self.triangles.len());
+            return Err(invalid("mesh.inner_edges", expected, inner_edges.len()));
+        }
+        let has_marks = inner_edges.iter().any(|edges| *edges != 0);
+        Ok(Self { inner_edges: if has_marks { inner_edges } else { Vec::new() }, ..self })
     }
 
     /// A mesh with one corner per vertex.
@@ -85,6 +100,12 @@ impl Mesh {
     /// Triangles as corner indices.
     pub fn triangles(&self) -> &[[u32; 3]] {
         &self.triangles
+    }
+
+    /// For each triangle, bit i is 1 if the edge opposite to its corner i is inside of a polygon, such as the diagonal of
+    /// a quadrilateral. Empty if there is no such edge.
+    pub fn inner_edges(&self) -> &[u8] {
+        &self.inner_edges
     }
 }
 

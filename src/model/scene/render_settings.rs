@@ -4,7 +4,7 @@
 use nalgebra::Vector3;
 
 use super::shadow::ShadowSettings;
-use super::{Antialiasing, Bloom, ToneMapping};
+use super::{Antialiasing, Bloom, MeshEdges, ToneMapping};
 use crate::error::{Result, invalid};
 
 /// The axis that points up.
@@ -102,6 +102,8 @@ pub struct RenderSettings {
     pub horizon: [f32; 3],
     pub shadow: Option<ShadowSettings>,
     pub ground: Option<Ground>,
+    /// Lines along the edges of the faces, in frames that do not set them themselves.
+    pub edges: Option<MeshEdges>,
     /// Samples per pixel for multisampling, 1 or 4.
     pub samples: u32,
     /// The antialiasing method: multisampling with `samples`, or a method with one sample per pixel.
@@ -140,6 +142,7 @@ impl Default for RenderSettings {
             horizon: [0.34, 0.54, 0.79],
             shadow: Some(ShadowSettings::default()),
             ground: Some(Ground::default()),
+            edges: None,
             samples: 4,
             antialias: Antialiasing::Msaa,
             bloom: None,
@@ -176,6 +179,7 @@ impl RenderSettings {
             return Err(invalid("look.fragments", format!("1 to {MAX_FRAGMENTS}"), format!("{:?}", self.fragments)));
         }
         self.check_post()?;
+        self.edges.map_or(Ok(()), |edges| edges.check("look.edges"))?;
         self.shadow.map_or(Ok(()), |shadow| shadow.check())
     }
 }

@@ -49,6 +49,9 @@ pub(crate) const WORDS_BINDING: u32 = 0;
 /// Storage binding of tile lists.
 pub(crate) const TILES_BINDING: u32 = 1;
 
+/// Storage binding of the marks of inner edges in the shading.
+pub(crate) const INNER_EDGES_BINDING: u32 = 2;
+
 /// Invocations of a compute workgroup, along x.
 pub(crate) const WORKGROUP_SIZE: u32 = 64;
 /// Side of the square of pixels that a workgroup shades.

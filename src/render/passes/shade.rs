@@ -2,7 +2,7 @@
 
 use super::draw::{bind_shadow, bind_visibility};
 use super::recorder::{FrameContext, PassRecorder};
-use crate::layout::{BLEND_LAYER_UNIT, EMPTY_TILE_LIST, FRAGMENT_COUNT_UNIT, TILE, TILES_BINDING};
+use crate::layout::{BLEND_LAYER_UNIT, EMPTY_TILE_LIST, FRAGMENT_COUNT_UNIT, INNER_EDGES_BINDING, TILE, TILES_BINDING};
 use crate::pass::Pass;
 use crate::region::Band;
 use modalcast_model::error::Result;
@@ -36,6 +36,9 @@ pub(crate) fn draw(recorder: &mut PassRecorder<'_>, frame: &FrameContext<'_>, ba
     recorder.finish(Pass::Background)?;
     let Some(program) = &programs.shade else { return Ok(()) };
     recorder.begin(Pass::Shade);
+    if let Some(inner_edges) = buffers.inner_edges.get().filter(|_| programs.has_edges) {
+        inner_edges.bind_storage(INNER_EDGES_BINDING);
+    }
     program.bind(None);
     recorder.gl.dispatch_indirect(&target.tile_list);
     recorder.finish(Pass::Shade)

@@ -291,6 +291,7 @@ fn omitted_features(scene: &Scene, culling: Culling) -> Vec<OmittedFeature> {
             cull_passes(Culling::Triangles),
             "no triangle id lookup in fragments",
         ),
+        omit_unless(look.edges.is_some(), "mesh edges", 0, &[], "no distance to the edges of a triangle"),
         omit_unless(look.dither, "dither", 0, &[], "no dither pattern"),
     ];
     omitted.into_iter().flatten().collect()
@@ -301,7 +302,7 @@ mod tests {
     use super::*;
     use crate::scene_data::geometry::tests::squares;
     use modalcast_model::domain::{AlphaMode, Material, Texture};
-    use modalcast_model::scene::{Bloom, RenderSettings};
+    use modalcast_model::scene::{Bloom, MeshEdges, RenderSettings};
 
     fn names(allocations: &[Allocation]) -> Vec<&str> {
         allocations.iter().map(|allocation| allocation.name.as_str()).collect()
@@ -322,6 +323,7 @@ mod tests {
         parts.textures.push(Texture::new("one", 1, 1, vec![255; 4]).expect("a valid texture"));
         let look =
             RenderSettings { bloom: Some(Bloom::default()), tone: ToneMapping::Aces, dither: true, ..parts.look };
+        let look = RenderSettings { edges: Some(MeshEdges::default()), ..look };
         parts.look = RenderSettings { antialias: Antialiasing::Fxaa, culling: Culling::Occlusion, ..look };
         parts
     }
@@ -339,7 +341,10 @@ mod tests {
         assert!(plan.textures.is_empty() && plan.defines.is_empty());
         let omitted: Vec<&str> = plan.omitted.iter().map(|omitted| omitted.feature).collect();
         let scene_features = ["normal maps", "textures", "mask", "blend", "shadows", "many materials", "ground"];
-        assert_eq!(omitted, [&scene_features[..], &["bloom", "tone curve", "fxaa", "culling", "dither"]].concat());
+        assert_eq!(
+            omitted,
+            [&scene_features[..], &["bloom", "tone curve", "fxaa", "culling", "mesh edges", "dither"]].concat()
+        );
         assert_eq!(plan.omitted[0].bytes, 16 * 4, "expected the tangents of four corners");
         assert_eq!(
             plan.omitted[4].bytes,

@@ -63,7 +63,7 @@ impl RandomScene {
         let view = View::LookAt { eye: [1.5, 2.0, 8.0], target: [0.0; 3], up: [0.0, 1.0, 0.0] };
         // Near and far 0: the planes are fitted to the bounds.
         let camera = Camera { view, lens: Lens::FieldOfView(45.0), near: 0.0, far: 0.0 };
-        FrameParams { camera, width, height, bounds: self.bounds, light_bounds: None }
+        FrameParams { camera, width, height, bounds: self.bounds, light_bounds: None, edges: None }
     }
 }
 

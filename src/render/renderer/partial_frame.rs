@@ -135,7 +135,12 @@ impl Renderer {
         let desc = TargetDesc::new(&self.gl, size, look, blend_storage(&self.gl, &buffers.scene, size)?);
         let desc = TargetDesc { culling: buffers.culling(), ..desc };
         self.ensure_target(desc)?;
-        let programs = buffers.sample_programs(desc.samples, &mut |source| self.programs.program(source))?;
+        let has_edges = params.edges.is_some();
+        let compile = &mut |source| self.programs.program(source);
+        let programs = buffers.sample_programs(desc.samples, has_edges, compile)?;
+        if has_edges {
+            buffers.ensure_inner_edges(&self.gl)?;
+        }
         let Some(target) = self.targets.last() else { return Err(fault("draw", "no target")) };
         let slot = if has_readback { Some(target.readback_ring.acquire(self.frame_timeout)?) } else { None };
         // If a pass fails or panics, the images of the target are undefined. Therefore the target is not in the cache

@@ -202,7 +202,7 @@ mod tests {
             renderer.upload(&buffers, &surface).expect("uploads");
             let camera = Camera::fit_to_scene(&scene, 128, 128);
             let bounds = scene.rest_bounds;
-            let params = FrameParams { camera, width: 128, height: 128, bounds, light_bounds: None };
+            let params = FrameParams { camera, width: 128, height: 128, bounds, light_bounds: None, edges: None };
             images.push(renderer.draw(&buffers, &params).expect("draws").rgba);
         }
         let colors: HashSet<&[u8]> = images[0].chunks(4).collect();

@@ -45,7 +45,7 @@ fn surface(extra_width: f32) -> DeformedSurface {
 
 fn params(scene: &Scene, side: u32) -> FrameParams {
     let camera = Camera::fit_to_scene(scene, side, side);
-    FrameParams { camera, width: side, height: side, bounds: scene.rest_bounds, light_bounds: None }
+    FrameParams { camera, width: side, height: side, bounds: scene.rest_bounds, light_bounds: None, edges: None }
 }
 
 /// Pixels of a surface drawn by a new renderer, and its number of blended fragments.

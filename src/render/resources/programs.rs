@@ -49,6 +49,8 @@ pub(crate) struct SampleCountPrograms {
     pub(crate) oit: Option<OitPrograms>,
     pub(crate) background: Rc<Program>,
     pub(crate) shade: Option<Rc<Program>>,
+    /// Whether `shade` draws lines along mesh edges.
+    pub(crate) has_edges: bool,
     /// Programs of triangle culling.
     pub(crate) cull: Option<CullPrograms>,
 }
@@ -203,6 +205,7 @@ impl SampleCountPrograms {
         options: &ShaderOptions,
         groups: &[DrawGroup],
         samples: u32,
+        has_edges: bool,
         compile: &mut ProgramCompiler<'_>,
     ) -> Result<Self> {
         let has_triangles = |blend_mode: BlendMode| groups.iter().any(|group| group.blend_mode == blend_mode);
@@ -215,7 +218,8 @@ impl SampleCountPrograms {
             blended: compile_if(has_triangles(BlendMode::Blend) && !oit, compile, || options.blended(samples))?,
             oit: if oit { Some(OitPrograms::compile(options, samples, compile)?) } else { None },
             background: compile(options.background(samples))?,
-            shade: compile_if(has_visibility, compile, || options.shade(samples))?,
+            shade: compile_if(has_visibility, compile, || options.shade(samples, has_edges))?,
+            has_edges,
             cull: if options.features.has_culling() {
                 Some(CullPrograms::compile(options, samples, compile)?)
             } else {

@@ -1,6 +1,6 @@
 //! Device resources of one scene: buffers, texture arrays, shadow map and programs, as listed in its plan.
 
-use std::cell::Cell;
+use std::cell::{Cell, OnceCell};
 use std::rc::Rc;
 use std::sync::Arc;
 
@@ -22,6 +22,7 @@ use crate::plan::{Allocation, RenderPlan, ScenePlan};
 use crate::scene_data::geometry::{
     BlendMode, DrawGroup, Geometry, TriangleSpan, blend_mode, groups, locate_triangle, used_materials,
 };
+use crate::scene_data::inner_edges::{has_inner_edges, pack_inner_edges};
 use crate::scene_data::textures::{ArrayUse, TextureArray, TextureRole, arrays, check_texture_budget, find_layer};
 use crate::shaders::{ImageFilter, MaterialUse, ProgramSource, ShaderOptions, post};
 use crate::types::{BlurMethod, FrameParams};
@@ -71,6 +72,8 @@ pub struct SceneBuffers {
     pub(crate) rebased: Option<RebasedPositions>,
     /// A scalar per vertex for AOV readbacks; allocated by the first upload.
     pub(crate) values: Option<VertexValues>,
+    /// Marks of the edges inside of polygons; allocated by the first frame with lines along mesh edges.
+    pub(crate) inner_edges: OnceCell<Buffer>,
     /// Bit mask of the numbers of samples per pixel (1, 4) of the frames that were drawn.
     drawn_samples: Cell<u32>,
     plan: RenderPlan,
@@ -139,7 +142,8 @@ pub(crate) fn collect_program_sources(
     };
     ScenePrograms::compile(&options, &groups, collect)?;
     PostPrograms::compile(&scene.look, collect)?;
-    SampleCountPrograms::compile(&options, &groups, samples_of(scene, sample_positions), collect)?;
+    let has_edges = scene.look.edges.is_some();
+    SampleCountPrograms::compile(&options, &groups, samples_of(scene, sample_positions), has_edges, collect)?;
     Ok(sources)
 }
 
@@ -153,6 +157,7 @@ fn shader_options(
     ShaderOptions {
         features,
         used_materials: material_uses(scene, texture_arrays),
+        inner_edges: has_inner_edges(scene),
         image_filter: ImageFilter { anisotropy: gl.limits.anisotropy, blends_levels: !gl.limits.software },
         sample_positions: sample_positions.to_vec(),
         sample_resolve: post::sample_resolve(&scene.look),
@@ -215,29 +220,53 @@ impl SceneBuffers {
             shadow_cache: ShadowCache::default(),
             programs: ScenePrograms::compile(&options, &mesh.groups, compile)?,
             post: PostPrograms::compile(&scene.look, compile)?,
-            sample_programs: SampleCountPrograms::compile(&options, &mesh.groups, samples, compile)?,
+            sample_programs: {
+                let has_edges = scene.look.edges.is_some();
+                SampleCountPrograms::compile(&options, &mesh.groups, samples, has_edges, compile)?
+            },
             options,
             groups: mesh.groups,
             spans: mesh.spans.into(),
             origin: [0.0; 3],
             rebased: None,
             values: None,
+            inner_edges: OnceCell::new(),
             drawn_samples: Cell::new(0),
             plan,
             plan_allocations,
         })
     }
 
-    /// Programs for this number of samples per pixel, compiled unless it is the number of the look.
+    /// Programs for this number of samples per pixel, with or without lines along mesh edges. Programs that differ from
+    /// those of the look are compiled.
     pub(crate) fn sample_programs(
         &self,
         samples: u32,
+        has_edges: bool,
         compile: &mut ProgramCompiler<'_>,
     ) -> Result<SampleCountPrograms> {
-        match self.sample_programs.samples == samples {
-            true => Ok(self.sample_programs.clone()),
-            false => SampleCountPrograms::compile(&self.options, &self.groups, samples, compile),
+        if self.sample_programs.samples != samples {
+            return SampleCountPrograms::compile(&self.options, &self.groups, samples, has_edges, compile);
         }
+        let mut programs = self.sample_programs.clone();
+        if programs.has_edges != has_edges && programs.shade.is_some() {
+            programs.shade = Some(compile(self.options.shade(samples, has_edges))?);
+        }
+        Ok(SampleCountPrograms { has_edges, ..programs })
+    }
+
+    /// Allocates the marks of inner edges, which frames with lines along mesh edges read, unless they exist or the scene
+    /// has no inner edges.
+    pub(crate) fn ensure_inner_edges(&self, gl: &Rc<Gl>) -> Result<()> {
+        if !self.options.inner_edges || self.inner_edges.get().is_some() {
+            return Ok(());
+        }
+        let words = pack_inner_edges(&self.scene, &self.spans);
+        let bytes: &[u8] = bytemuck::cast_slice(&words);
+        let buffer = gl.buffer(bytes.len() as u64, gl::STATIC_DRAW, Some(bytes))?;
+        // The cell was empty above.
+        self.inner_edges.set(buffer).ok();
+        Ok(())
     }
 
     /// Program that draws ids of cut-out triangles with this number of samples per pixel; none without such triangles.
@@ -395,7 +424,9 @@ impl SceneBuffers {
             self.values.iter().map(|values| Allocation { name: "vertex values".into(), bytes: values.buffer.bytes });
         let outputs = self.compute_rasterizer.iter().flat_map(ComputeRasterizer::allocations);
         let outputs = outputs.map(|(name, bytes)| Allocation { name: name.into(), bytes });
-        self.plan_allocations.iter().cloned().chain(rebased).chain(values).chain(outputs).collect()
+        let inner_edges = self.inner_edges.get();
+        let inner_edges = inner_edges.map(|buffer| Allocation { name: "inner edges".into(), bytes: buffer.bytes });
+        self.plan_allocations.iter().cloned().chain(inner_edges).chain(rebased).chain(values).chain(outputs).collect()
     }
 
     /// Handles to the vertex buffers, which a deformer can write directly. The handles keep the buffers alive.

@@ -162,17 +162,15 @@ impl Geometry {
     fn add_triangles(&mut self, scene: &Scene, index: usize, material_indices: &[u32], next_triangles: &mut [usize]) {
         let (domain, layout) = (&scene.domains[index], &scene.layout.domains[index]);
         let mesh = &scene.shapes[domain.shape].mesh;
-        // A mirroring placement reverses the winding of all triangles.
         let is_mirrored = domain.placement.linear().determinant() < 0.0;
         for (material, range) in material_triangle_ranges(domain, layout) {
             let material_properties = &scene.materials[material];
             let draw_index = &mut next_triangles[self.group_of_material[material]];
             self.spans.push(TriangleSpan { first: *draw_index, domain: index, triangle: range.start });
             for triangle in &mesh.triangles()[range] {
-                let is_reversed = material_properties.double_sided && winding_disagrees(mesh, *triangle);
+                let is_reversed = is_drawn_reversed(mesh, *triangle, material_properties, is_mirrored);
                 let [a, b, c] = triangle.map(|corner| corner + layout.first_corner as u32);
-                // Two reversals cancel each other.
-                self.triangle_corners[*draw_index] = if is_mirrored == is_reversed { [a, b, c] } else { [a, c, b] };
+                self.triangle_corners[*draw_index] = if is_reversed { [a, c, b] } else { [a, b, c] };
                 if let Some(material_index) = self.triangle_materials.get_mut(*draw_index) {
                     *material_index = material_indices[material];
                 }
@@ -197,6 +195,17 @@ fn material_triangle_ranges<'a>(
         .zip(range_ends)
         .map(|(material_range, end)| (material_range.material, material_range.first_triangle..end));
     single_range.into_iter().chain(material_ranges)
+}
+
+/// Whether a triangle is drawn with its second and third corner exchanged. A mirroring placement reverses the winding of
+/// all triangles of its domain. Two reversals cancel each other.
+pub(super) fn is_drawn_reversed(
+    mesh: &modalcast_model::domain::Mesh,
+    triangle: [u32; 3],
+    material: &Material,
+    is_mirrored: bool,
+) -> bool {
+    is_mirrored != (material.double_sided && winding_disagrees(mesh, triangle))
 }
 
 /// Whether a triangle's winding contradicts its normals. The renderer finds the visible side of a double-sided triangle

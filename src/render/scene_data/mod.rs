@@ -2,4 +2,5 @@
 //! arrays with mipmap levels.
 
 pub(crate) mod geometry;
+pub(crate) mod inner_edges;
 pub(crate) mod textures;

@@ -33,6 +33,7 @@ const PHONG: &str = include_str!("../../../shaders/shared/phong.glsl");
 const BARYCENTRICS: &str = include_str!("../../../shaders/shared/barycentrics.glsl");
 const TRIANGLE_FETCH: &str = include_str!("../../../shaders/shared/triangle_fetch.glsl");
 const TRIANGLE_SHADING: &str = include_str!("../../../shaders/shared/triangle_shading.glsl");
+const MESH_EDGES: &str = include_str!("../../../shaders/shared/mesh_edges.glsl");
 const TILE_LIST: &str = include_str!("../../../shaders/shared/tile_list.glsl");
 const TILE_APPEND: &str = include_str!("../../../shaders/shared/tile_append.glsl");
 pub(crate) const BAND: &str = include_str!("../../../shaders/shared/band.glsl");
@@ -46,6 +47,8 @@ pub(crate) struct ShaderOptions {
     pub(crate) features: ShaderFeatures,
     /// The materials that triangles use.
     pub(crate) used_materials: Vec<MaterialUse>,
+    /// Whether some triangles have edges inside of polygons, which have no lines.
+    pub(crate) inner_edges: bool,
     /// The filter of images in mixed arrays, which shaders compute.
     pub(crate) image_filter: ImageFilter,
     /// Sample positions within a pixel with four samples, 0 to 1.
@@ -193,14 +196,20 @@ impl ShaderOptions {
         ProgramSource::compute(format!("background, {samples} samples"), text)
     }
 
-    /// Shades tiles in which a triangle is visible.
-    pub(crate) fn shade(&self, samples: u32) -> ProgramSource {
+    /// Shades tiles in which a triangle is visible. `edges`: whether lines along mesh edges are drawn.
+    pub(crate) fn shade(&self, samples: u32, edges: bool) -> ProgramSource {
         let all_modes = [BlendMode::Opaque, BlendMode::Mask, BlendMode::Blend];
         let blend_modes = if self.features.opaque_parts { &all_modes } else { &all_modes[..2] };
-        let mut text = self.shading_head(samples, &[]) + &self.material_defines(blend_modes);
-        text += &self.triangle_shading(blend_modes);
+        let defines: &[&str] = match (edges, self.inner_edges) {
+            (false, _) => &[],
+            (true, false) => &["MESH_EDGES"],
+            (true, true) => &["MESH_EDGES", "INNER_EDGES"],
+        };
+        let mut text = self.shading_head(samples, defines) + &self.material_defines(blend_modes);
+        text += &self.triangle_shading(blend_modes, if edges { MESH_EDGES } else { "" });
         text += include_str!("../../../shaders/shade.comp");
-        ProgramSource::compute(format!("shade, {samples} samples"), text)
+        let suffix = if edges { ", edges" } else { "" };
+        ProgramSource::compute(format!("shade, {samples} samples{suffix}"), text)
     }
 
     /// Common part of the shading programs, without the functions that shade triangles.
@@ -223,10 +232,11 @@ impl ShaderOptions {
         .concat()
     }
 
-    /// GLSL function `shade_triangle`, with the lookups for the materials of these blend modes.
-    fn triangle_shading(&self, blend_modes: &[BlendMode]) -> String {
+    /// GLSL function `shade_triangle`, with the lookups for the materials of these blend modes. `mesh_edges` is the source
+    /// of the lines along mesh edges, or empty.
+    fn triangle_shading(&self, blend_modes: &[BlendMode], mesh_edges: &str) -> String {
         let material_lookups = self.material_lookups(blend_modes, UvDerivatives::Explicit);
-        [&material_lookups, PHONG, BARYCENTRICS, TRIANGLE_FETCH, TRIANGLE_SHADING].concat()
+        [&material_lookups, PHONG, BARYCENTRICS, TRIANGLE_FETCH, mesh_edges, TRIANGLE_SHADING].concat()
     }
 
     /// Converts the keys of the compute rasterizer to ids.
@@ -322,6 +332,7 @@ mod tests {
         ShaderOptions {
             features: plan.features,
             used_materials,
+            inner_edges: false,
             image_filter: ImageFilter { anisotropy: 1.0, blends_levels: false },
             sample_positions,
             sample_resolve,
@@ -353,7 +364,7 @@ mod tests {
     #[test]
     fn shading_contains_only_features_of_the_scene() {
         let plain_options = ShaderOptions { features: ShaderFeatures::NONE, ..options(AlphaMode::Opaque) };
-        let [background, shading] = [plain_options.background(4), plain_options.shade(4)].map(text);
+        let [background, shading] = [plain_options.background(4), plain_options.shade(4, false)].map(text);
         assert!(!background.contains("vec4 shade_triangle("), "expected no triangle in the background");
         assert!(shading.contains("vec4 shade_triangle("));
         for text in [&background, &shading] {
@@ -363,8 +374,20 @@ mod tests {
             vec![MaterialUse { blend_mode: BlendMode::Opaque, color_array: Some(uniform(0)), normal_array: None }];
         let features = ShaderFeatures { textures: true, ground: true, ..ShaderFeatures::NONE };
         let textured_options = ShaderOptions { features, used_materials, ..plain_options };
-        let shading = text(textured_options.shade(1));
+        let shading = text(textured_options.shade(1, false));
         assert!(shading.contains("vec3 shade_ground(") && shading.contains("textureGrad(color_0"));
+    }
+
+    #[test]
+    fn only_frames_with_edges_compute_distances_to_edges() {
+        let options = options(AlphaMode::Opaque);
+        let [plain, edges] = [false, true].map(|edges| text(options.shade(4, edges)));
+        assert!(!plain.contains("edge_coverage(Triangle") && !plain.contains("#define MESH_EDGES"));
+        assert!(edges.contains("edge_coverage(Triangle") && !edges.contains("#define INNER_EDGES"));
+        let polygons = ShaderOptions { inner_edges: true, ..options };
+        assert!(text(polygons.shade(1, true)).contains("#define INNER_EDGES"));
+        assert_eq!(text(polygons.shade(4, false)), plain, "expected the same program without edges");
+        assert!(!text(polygons.background(4)).contains("#define MESH_EDGES"));
     }
 
     #[test]

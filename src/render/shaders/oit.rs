@@ -34,7 +34,7 @@ impl ShaderOptions {
     pub(crate) fn oit_resolve(&self, samples: u32) -> ProgramSource {
         let mut text = self.head(&[]) + &bins_define() + &tile_list() + &self.material_defines(&[BlendMode::Blend]);
         text += &[&self.sample_defines(samples), FRAME, CLIP, &self.sun_visibility(), OIT_LISTS].concat();
-        text += &self.triangle_shading(&[BlendMode::Blend]);
+        text += &self.triangle_shading(&[BlendMode::Blend], "");
         text += include_str!("../../../shaders/oit_resolve.comp");
         ProgramSource::compute(format!("oit resolve, {samples} samples"), text)
     }
@@ -70,6 +70,7 @@ mod tests {
         ShaderOptions {
             features: ShaderFeatures { blend_layers: true, oit: true, ..ShaderFeatures::NONE },
             used_materials,
+            inner_edges: false,
             image_filter: crate::shaders::ImageFilter { anisotropy: 1.0, blends_levels: false },
             sample_positions: vec![[0.5; 2]; 4],
             sample_resolve: String::new(),

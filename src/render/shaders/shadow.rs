@@ -282,6 +282,7 @@ mod tests {
             let options = ShaderOptions {
                 features: features(shadow),
                 image_filter: crate::shaders::ImageFilter { anisotropy: 1.0, blends_levels: false },
+                inner_edges: false,
                 used_materials: vec![],
                 sample_positions: vec![],
                 sample_resolve: String::new(),

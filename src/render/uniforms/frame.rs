@@ -34,9 +34,11 @@ pub(crate) struct FrameUniforms {
     shadow: [f32; 4],
     /// xyz: [`LightBox::ground`]. w: side of a shadow map texel in scene units.
     shadow_ground_plane: [f32; 4],
+    /// xyz: color of the lines along mesh edges. w: their width in pixels.
+    edges: [f32; 4],
 }
 
-const _: () = assert!(size_of::<FrameUniforms>() == 368, "FrameUniforms differs from shaders/shared/frame.glsl");
+const _: () = assert!(size_of::<FrameUniforms>() == 384, "FrameUniforms differs from shaders/shared/frame.glsl");
 
 /// Half the side of the ground's square, in multiples of the fade distance D. The ground's weight is exp(-(d / D)^2) at
 /// distance d. At the border it is exp(-36), so the rounded color is that of the horizon.
@@ -81,6 +83,7 @@ impl FrameUniforms {
                 shadow.size as f32,
             ],
             shadow_ground_plane: vec4_of(light_box.ground.into(), light_box.texel_side(f64::from(shadow.size))),
+            edges: params.edges.map_or([0.0; 4], |edges| color(edges.color, edges.width.into())),
         };
         let numbers: &[f32] = bytemuck::cast_slice(std::slice::from_ref(&frame));
         match numbers.iter().all(|number| number.is_finite()) {
@@ -278,6 +281,7 @@ mod tests {
             height: 64,
             bounds: scene.rest_bounds,
             light_bounds: None,
+            edges: None,
         };
         let uniforms = FrameUniforms::new(&scene, &params, [0.0; 3]).expect("finite uniforms");
         assert!(uniforms.eye[3] > 0.0, "expected a camera above the ground");

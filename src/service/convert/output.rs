@@ -4,7 +4,7 @@ use modalcast_proto::v1;
 
 use crate::engine::{FrameFormat, FrameOutput, JpegQuality, validate_mode};
 use modalcast_model::error::{Result, invalid};
-use modalcast_model::scene::Scene;
+use modalcast_model::scene::{MeshEdges, Scene};
 
 /// Upper limit of the value at the end of a color map's scale. The lower limit is 1 / `MAX_SCALE`.
 const MAX_SCALE: f64 = 1e30;
@@ -30,6 +30,24 @@ pub(super) fn parse_output(scene: &Scene, picture: &v1::Picture) -> Result<(Fram
         v1::Output::ModeShape => FrameOutput::ModeShape { mode: validate_mode(scene, picture.mode)?, scale_max },
     };
     Ok((frame_output, parse_format(frame_output, picture)?))
+}
+
+/// Parses the width of lines along mesh edges: 0 is none, and a missing width is that of the scene's look. The color is
+/// that of the look.
+pub(super) fn parse_edges(scene: &Scene, output: FrameOutput, width: Option<f32>) -> Result<Option<MeshEdges>> {
+    let look_edges = scene.look.edges.filter(|_| output == FrameOutput::Color);
+    let Some(width) = width else { return Ok(look_edges) };
+    if output != FrameOutput::Color && width != 0.0 {
+        return Err(invalid("edge_width", "0 or unset unless the output is OUTPUT_COLOR", width));
+    }
+    if width == 0.0 {
+        return Ok(None);
+    }
+    let edges = look_edges.unwrap_or_default().with_width(width);
+    match edges.has_valid_width() {
+        true => Ok(Some(edges)),
+        false => Err(invalid("edge_width", format!("0 to {} pixels", MeshEdges::MAX_WIDTH), width)),
+    }
 }
 
 /// Parses a format. Unspecified is PNG for color frames and color maps, else the only format of the output.

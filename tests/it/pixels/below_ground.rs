@@ -46,7 +46,14 @@ fn read_aov_and_picks(scene: &Arc<Scene>, aov: Aov) -> Readbacks {
     let mut buffers = renderer.load(scene).expect("expected the scene to load");
     renderer.upload(&buffers, deformer.surface().expect("expected a surface")).expect("expected the upload to succeed");
     renderer.upload_vertex_values(&mut buffers, &[0.25, 0.5, 0.75, 1.0]).expect("expected the upload to succeed");
-    let params = FrameParams { camera: camera_above_ground(), width: SIZE, height: SIZE, bounds, light_bounds: None };
+    let params = FrameParams {
+        camera: camera_above_ground(),
+        width: SIZE,
+        height: SIZE,
+        bounds,
+        light_bounds: None,
+        edges: None,
+    };
     let aov_words =
         bytemuck::pod_collect_to_vec(&renderer.render_aov(&buffers, &params, aov).expect("expected AOVs").bytes);
     let full_image = PixelRect::within([SIZE; 2], [0; 2], [SIZE; 2]).expect("expected a valid rectangle");

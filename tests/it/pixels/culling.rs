@@ -71,7 +71,7 @@ impl CullHarness {
     }
 
     fn draw(&mut self, camera: Camera, [width, height]: [u32; 2]) -> Frame {
-        let params = FrameParams { camera, width, height, bounds: self.bounds, light_bounds: None };
+        let params = FrameParams { camera, width, height, bounds: self.bounds, light_bounds: None, edges: None };
         let rgba = self.renderer.draw(&self.buffers, &params).expect("expected a frame").rgba;
         let stats = self.renderer.stats().clone();
         Frame { rgba, ids: self.renderer.read_visibility().expect("expected visibility ids"), stats }
@@ -430,8 +430,14 @@ fn picks_aovs_and_rebased_frames_do_not_depend_on_culling() {
     let [unculled, with_triangle_culling, with_occlusion] = CULLING_MODES.map(|culling| {
         let mut harness = CullHarness::new(mixed_builder(4, Transparency::OrderIndependent), culling);
         let camera = camera_at([0.0, 1.0, 9.0], [0.0; 3]);
-        let params =
-            FrameParams { camera, width: SIZE, height: SIZE, bounds: harness.scene.rest_bounds, light_bounds: None };
+        let params = FrameParams {
+            camera,
+            width: SIZE,
+            height: SIZE,
+            bounds: harness.scene.rest_bounds,
+            light_bounds: None,
+            edges: None,
+        };
         harness.draw(camera, [SIZE, SIZE]);
         let rectangle = PixelRect::within([SIZE; 2], [40; 2], [8; 2]).expect("expected a valid rectangle");
         let pick = harness.renderer.begin_pick(&harness.buffers, &params, rectangle).expect("expected a pick to start");

@@ -90,14 +90,26 @@ fn empty_and_oversized_frames_are_rejected() {
     let buffers = renderer.load(&scene).expect("expected the scene to load");
     let limit = renderer.info().max_side;
     for (width, height) in [(0, 0), (0, 5), (5, 0), (limit + 1, 1), (16384, 16384), (u32::MAX, u32::MAX)] {
-        let params =
-            FrameParams { camera: front_camera(64), width, height, bounds: scene.rest_bounds, light_bounds: None };
+        let params = FrameParams {
+            camera: front_camera(64),
+            width,
+            height,
+            bounds: scene.rest_bounds,
+            light_bounds: None,
+            edges: None,
+        };
         let error = renderer.draw(&buffers, &params).expect_err("expected an invalid-size error").to_string();
         let expected = format!("frame.size: expected 1 to {limit} pixels a side, got {width} x {height}");
         assert_eq!(error, expected);
     }
-    let params =
-        FrameParams { camera: front_camera(64), width: 1, height: 1, bounds: scene.rest_bounds, light_bounds: None };
+    let params = FrameParams {
+        camera: front_camera(64),
+        width: 1,
+        height: 1,
+        bounds: scene.rest_bounds,
+        light_bounds: None,
+        edges: None,
+    };
     assert_eq!(renderer.draw(&buffers, &params).expect("expected a frame of one pixel").rgba.len(), 4);
 }
 
@@ -182,7 +194,8 @@ fn overflowed_vertices_leave_no_black_pixels() {
         let surface = DeformedSurface { positions, normals: [0.0, 0.0, 1.0].repeat(4), ..DeformedSurface::default() };
         renderer.upload(&buffers, &surface).expect("expected the upload to succeed");
         let bounds = BoundingBox { min: [f64::NAN; 3], max: [f64::NAN; 3] };
-        let params = FrameParams { camera: front_camera(64), width: 64, height: 64, bounds, light_bounds: None };
+        let params =
+            FrameParams { camera: front_camera(64), width: 64, height: 64, bounds, light_bounds: None, edges: None };
         let image = renderer.draw(&buffers, &params).expect("expected a frame");
         assert!(image.rgba.chunks_exact(4).all(|pixel| pixel[..3] != [0; 3] && pixel[3] == 255), "{value}");
     }
@@ -233,8 +246,14 @@ fn renderers_work_on_separate_and_on_shared_threads() {
     first_renderer
         .upload(&buffers, deformer.surface().expect("expected a surface"))
         .expect("expected the upload to succeed");
-    let params =
-        FrameParams { camera: Camera::fit_to_scene(&scene, 64, 64), width: 32, height: 32, bounds, light_bounds: None };
+    let params = FrameParams {
+        camera: Camera::fit_to_scene(&scene, 64, 64),
+        width: 32,
+        height: 32,
+        bounds,
+        light_bounds: None,
+        edges: None,
+    };
     assert!(
         first_renderer.draw(&buffers, &params).expect("expected a frame").rgba == expected_rgba,
         "expected independent contexts on one thread"

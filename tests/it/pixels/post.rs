@@ -363,8 +363,14 @@ fn nan_and_infinite_light_affect_no_other_pixel() {
                 surface.normals[..12].copy_from_slice(&normal.repeat(4));
                 let buffers = renderer.load(&scene).expect("expected the scene to load");
                 renderer.upload(&buffers, &surface).expect("expected the upload to succeed");
-                let params =
-                    FrameParams { camera: front_camera(64), width: 64, height: 64, bounds, light_bounds: None };
+                let params = FrameParams {
+                    camera: front_camera(64),
+                    width: 64,
+                    height: 64,
+                    bounds,
+                    light_bounds: None,
+                    edges: None,
+                };
                 let image = renderer.draw(&buffers, &params).expect("expected a frame");
                 RenderedFrame { image, stats: renderer.stats().clone(), allocations: vec![] }
             };

@@ -293,8 +293,14 @@ fn render_with_normals(scene: &Arc<Scene>, normal: [f32; 3], tangent: [f32; 4], 
         ..DeformedSurface::default()
     };
     renderer.upload(&buffers, &surface).expect("expected the upload to succeed");
-    let params =
-        FrameParams { camera: front_camera(64), width: 64, height: 64, bounds: scene.rest_bounds, light_bounds: None };
+    let params = FrameParams {
+        camera: front_camera(64),
+        width: 64,
+        height: 64,
+        bounds: scene.rest_bounds,
+        light_bounds: None,
+        edges: None,
+    };
     renderer.draw(&buffers, &params).expect("expected a frame").rgba
 }
 

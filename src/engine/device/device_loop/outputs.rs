@@ -34,8 +34,9 @@ impl DeviceLoop {
         }
         let Self { context, scenes, loss, .. } = self;
         let (id, kind) = match command {
-            Command::Draw { id, camera, size, reply } => {
-                let draw = find_scene(scenes, id).and_then(|scene| context.begin_partial_draw(scene, &camera, size));
+            Command::Draw { id, camera, size, edges, reply } => {
+                let draw =
+                    find_scene(scenes, id).and_then(|scene| context.begin_partial_draw(scene, &camera, size, edges));
                 match loss.record_loss(draw) {
                     Ok(draw) => (id, PartialKind::Frame(draw, reply)),
                     Err(error) => return answer(reply, Err(error)),

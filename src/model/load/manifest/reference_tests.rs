@@ -68,8 +68,18 @@ fn table_path(heading: &str) -> &str {
 #[test]
 fn page_has_exactly_the_keys_of_the_parser() {
     let tables = page_tables();
-    let headings =
-        ["Scene", "domain", "placement", "material", "look", "look.shadow", "look.ground", "look.bloom", "deform"];
+    let headings = [
+        "Scene",
+        "domain",
+        "placement",
+        "material",
+        "look",
+        "look.shadow",
+        "look.ground",
+        "look.edges",
+        "look.bloom",
+        "deform",
+    ];
     for heading in headings {
         let rows = tables.get(heading).unwrap_or_else(|| panic!("expected a table of {heading}"));
         let documented: BTreeSet<String> = rows.iter().map(|[key, ..]| key.clone()).collect();
@@ -143,9 +153,9 @@ fn documented_defaults_are_those_of_the_parser() {
             }
             let path = if path.is_empty() { key.clone() } else { format!("{path}.{key}") };
             let text = format!("model = 'a.obj'\n{path} = {value}\n");
-            // A table without keys has all defaults; `look.bloom` is none by default.
+            // A table without keys has all defaults; `look.bloom` and `look.edges` are none by default.
             let expected = match heading.as_str() {
-                "look.bloom" => describe("model = 'a.obj'\nlook.bloom = {}\n"),
+                "look.bloom" | "look.edges" => describe(&format!("model = 'a.obj'\n{heading} = {{}}\n")),
                 _ => without_key.clone(),
             };
             assert_eq!(describe(&text), expected, "{path} = {value}");

@@ -2,7 +2,7 @@
 
 use crate::backend_settings::{BatchPolicy, RasterPolicy};
 use crate::scene::{
-    Antialiasing, Bloom, Culling, DeformationSettings, Ground, NormalMethod, RenderSettings, ShadowSettings,
+    Antialiasing, Bloom, Culling, DeformationSettings, Ground, MeshEdges, NormalMethod, RenderSettings, ShadowSettings,
     StorageType, ToneMapping, Transparency,
 };
 
@@ -17,6 +17,7 @@ pub(super) struct LookKeys {
     horizon: Option<[f32; 3]>,
     shadow: Option<ShadowSettings>,
     ground: Option<Ground>,
+    edges: Option<MeshEdges>,
     samples: Option<u32>,
     antialias: Option<Antialiasing>,
     bloom: Option<Bloom>,
@@ -44,6 +45,7 @@ impl LookKeys {
             horizon: self.horizon.unwrap_or(default.horizon),
             shadow: self.shadow.or(default.shadow),
             ground: self.ground.or(default.ground),
+            edges: self.edges.or(default.edges),
             samples: self.samples.unwrap_or(default.samples),
             antialias: self.antialias.unwrap_or(default.antialias),
             bloom: self.bloom.or(default.bloom),

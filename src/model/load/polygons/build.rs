@@ -63,6 +63,8 @@ struct MeshBuilder<'a> {
     /// The vertex of each corner in the mesh.
     corner_vertices: Vec<u32>,
     triangles: Vec<[u32; 3]>,
+    /// As [`Mesh::inner_edges`].
+    inner_edges: Vec<u8>,
     material_ranges: Vec<MaterialRange>,
 }
 
@@ -76,6 +78,7 @@ impl<'a> MeshBuilder<'a> {
             corners: Vec::new(),
             corner_vertices: Vec::new(),
             triangles: Vec::new(),
+            inner_edges: Vec::new(),
             material_ranges: Vec::new(),
         }
     }
@@ -97,8 +100,10 @@ impl<'a> MeshBuilder<'a> {
         let corners = self.polygons.corners_of(face);
         let positions: Vec<_> = corners.iter().map(|corner| self.polygons.positions[corner.v as usize]).collect();
         let corner_indices: Vec<u32> = corners.iter().map(|corner| self.corner_index(*corner)).collect();
-        self.triangles
-            .extend(triangulate(&positions).into_iter().map(|triangle| triangle.map(|index| corner_indices[index])));
+        for triangle in triangulate(&positions) {
+            self.triangles.push(triangle.map(|index| corner_indices[index]));
+            self.inner_edges.push(inner_edges(triangle, corners.len()));
+        }
     }
 
     /// Returns the index of a corner in the mesh. The first call for a corner adds it to the mesh.
@@ -130,7 +135,8 @@ impl<'a> MeshBuilder<'a> {
         let material = self.material_ranges.first().map_or(0, |range| range.material);
         let material_ranges = if self.material_ranges.len() > 1 { self.material_ranges } else { Vec::new() };
         let mesh =
-            Mesh::new(self.rest_positions, Corners { vertices: self.corner_vertices, normals, uvs }, self.triangles)?;
+            Mesh::new(self.rest_positions, Corners { vertices: self.corner_vertices, normals, uvs }, self.triangles)?
+                .with_inner_edges(self.inner_edges)?;
         Ok(TriangleMesh { mesh, material, material_ranges })
     }
 
@@ -156,6 +162,14 @@ impl<'a> MeshBuilder<'a> {
         let uv = |corner: &Corner| self.polygons.uvs.get(corner.vt as usize).copied().unwrap_or_default();
         self.corners.iter().map(uv).collect()
     }
+}
+
+/// The edges of a triangle of a polygon with `count` corners that are not edges of the polygon: bit i is 1 for the edge
+/// opposite to corner i.
+fn inner_edges(triangle: [usize; 3], count: usize) -> u8 {
+    let is_polygon_edge = |a: usize, b: usize| (a + 1) % count == b || (b + 1) % count == a;
+    let is_inner = |corner: usize| !is_polygon_edge(triangle[(corner + 1) % 3], triangle[(corner + 2) % 3]);
+    (0..3).map(|corner| u8::from(is_inner(corner)) << corner).sum()
 }
 
 #[cfg(test)]
@@ -186,6 +200,29 @@ mod tests {
         assert_eq!(mesh.corners().uvs[4], [1.0, 0.0]);
         assert_eq!(mesh.corners().uvs[7], [0.0, 0.0], "expected (0, 0) for a corner without vt");
         assert_eq!(mesh.corners().normals, [[0.0, 0.0, 1.0]; 11]);
+    }
+
+    /// The faces of a quadrilateral, a pentagon and two triangles, one of them sharing an edge with the other.
+    #[test]
+    fn edges_inside_of_polygons_are_marked() {
+        let vertices = "v 0 0 0\nv 1 0 0\nv 2 1 0\nv 1 2 0\nv 0 1 0\n";
+        let inner_edges = |faces: &str| {
+            let obj = parse_obj(&format!("{vertices}{faces}"));
+            let mesh = build_all_faces(&obj, CreaseAngle::default()).expect("a valid OBJ file").mesh;
+            let vertex = |corner: u32| mesh.corners().vertices[corner as usize];
+            let mut edges = Vec::new();
+            for (triangle, marks) in mesh.triangles().iter().zip(mesh.inner_edges()) {
+                for corner in (0..3).filter(|corner| marks >> corner & 1 == 1) {
+                    let ends = [1, 2].map(|offset| vertex(triangle[(corner + offset) % 3]));
+                    edges.push([ends[0].min(ends[1]), ends[0].max(ends[1])]);
+                }
+            }
+            edges.sort_unstable();
+            edges
+        };
+        assert_eq!(inner_edges("f 1 2 4 5\n"), [[0, 3], [0, 3]], "expected the diagonal, from both sides");
+        assert_eq!(inner_edges("f 1 2 3 4 5\n"), [[0, 2], [0, 2], [0, 3], [0, 3]]);
+        assert_eq!(inner_edges("f 1 2 3\nf 1 3 4\n"), <[[u32; 2]; 0]>::default());
     }
 
     #[test]

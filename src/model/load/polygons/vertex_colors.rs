@@ -55,7 +55,11 @@ pub(in crate::load) fn paint(mesh: &Mesh, colors: &[[f32; 3]]) -> Result<VertexC
     }
     let triangles = (0..triangle_count as u32).map(|index| [3 * index, 3 * index + 1, 3 * index + 2]).collect();
     let texture = Texture::new("vertex colors", width as u32, height as u32, rgba)?;
-    let mesh = Mesh::new(mesh.rest_positions().to_vec(), corners, triangles)?;
+    let painted = Mesh::new(mesh.rest_positions().to_vec(), corners, triangles)?;
+    let mesh = match mesh.inner_edges() {
+        [] => painted,
+        inner_edges => painted.with_inner_edges(inner_edges.to_vec())?,
+    };
     Ok(VertexColors::Image(Box::new((mesh, texture))))
 }
 

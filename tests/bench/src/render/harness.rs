@@ -162,6 +162,7 @@ impl LoadedScene {
             height: size.height,
             bounds: self.bounds,
             light_bounds: self.light_box,
+            edges: None,
         }
     }
 

@@ -207,7 +207,8 @@ fn time_frame(
             .upload(&setup.buffers, setup.deformer.surface_with(VertexAttributes::POSITIONS_AND_NORMALS)?)?;
         upload = elapsed_us(begin);
     }
-    let frame_params = FrameParams { camera, width: size.width, height: size.height, bounds, light_bounds };
+    let frame_params =
+        FrameParams { camera, width: size.width, height: size.height, bounds, light_bounds, edges: None };
     let image = harness.renderer.draw(&setup.buffers, &frame_params)?;
     let frame = elapsed_us(frame_begin);
     let render = 1e3 * image.times.drawing_ms();

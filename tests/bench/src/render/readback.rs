@@ -142,6 +142,7 @@ impl FrameSource {
         let frame_params = |camera: Camera| FrameParams {
             bounds: first_bounds.union(second_bounds),
             light_bounds,
+            edges: None,
             ..loaded_scene.frame_params(camera, size)
         };
         Ok(Self {

@@ -177,7 +177,7 @@ impl PictureOptions {
             OutputOption::ModeShape => Output::ModeShape { mode, scale_max },
         };
         let jpeg_quality = self.quality.unwrap_or(0);
-        Picture { width: self.size.0, height: self.size.1, format, camera, output, jpeg_quality }
+        Picture { width: self.size.0, height: self.size.1, format, camera, output, jpeg_quality, edge_width: None }
     }
 }
 
