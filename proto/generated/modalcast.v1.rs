@@ -2607,6 +2607,31 @@ pub struct FrameHead {
     /// Number of updates of the stream's cameras that the frame shows; 0 before the first one and in RenderFrame.
     #[prost(uint64, tag = "11")]
     pub camera_version: u64,
+    /// For color frames: the parts of the look that a preset can choose.
+    #[prost(message, optional, tag = "12")]
+    pub look: ::core::option::Option<FrameLook>,
+    /// For color frames: how far the lowest vertex lies below the ground, in meters. The ground hides no geometry, but a
+    /// viewer of the frame may take geometry below the ground for geometry in front of it. 0 if no vertex lies below the
+    /// ground by more than 1e-5 of the diagonal of the scene's rest bounds, or if the scene has no ground.
+    #[prost(double, tag = "13")]
+    pub below_ground: f64,
+}
+/// Antialiasing and shadow map of a frame. The scene's settings choose them, or the server by a rule that depends on the
+/// renderer, the pixels and the triangles; see `look` in the reference of scene.toml.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct FrameLook {
+    #[prost(enumeration = "LookPreset", tag = "1")]
+    pub preset: i32,
+    #[prost(enumeration = "Antialiasing", tag = "2")]
+    pub antialiasing: i32,
+    /// Samples per pixel, 1 or 4.
+    #[prost(uint32, tag = "3")]
+    pub samples: u32,
+    #[prost(enumeration = "ShadowMethod", tag = "4")]
+    pub shadow_method: i32,
+    /// Side of the shadow map in texels; 0 without a shadow map.
+    #[prost(uint32, tag = "5")]
+    pub shadow_size: u32,
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct PickRequest {
@@ -2803,6 +2828,107 @@ impl Format {
             "FORMAT_U32" => Some(Self::U32),
             "FORMAT_F32X3" => Some(Self::F32x3),
             "FORMAT_JPEG" => Some(Self::Jpeg),
+            _ => None,
+        }
+    }
+}
+/// The preset that a scene names.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
+#[repr(i32)]
+pub enum LookPreset {
+    /// The scene names no preset.
+    Unspecified = 0,
+    Preview = 1,
+    Standard = 2,
+    Best = 3,
+}
+impl LookPreset {
+    /// String value of the enum field names used in the ProtoBuf definition.
+    ///
+    /// The values are not transformed in any way and thus are considered stable
+    /// (if the ProtoBuf definition does not change) and safe for programmatic use.
+    pub fn as_str_name(&self) -> &'static str {
+        match self {
+            Self::Unspecified => "LOOK_PRESET_UNSPECIFIED",
+            Self::Preview => "LOOK_PRESET_PREVIEW",
+            Self::Standard => "LOOK_PRESET_STANDARD",
+            Self::Best => "LOOK_PRESET_BEST",
+        }
+    }
+    /// Creates an enum from field names used in the ProtoBuf definition.
+    pub fn from_str_name(value: &str) -> ::core::option::Option<Self> {
+        match value {
+            "LOOK_PRESET_UNSPECIFIED" => Some(Self::Unspecified),
+            "LOOK_PRESET_PREVIEW" => Some(Self::Preview),
+            "LOOK_PRESET_STANDARD" => Some(Self::Standard),
+            "LOOK_PRESET_BEST" => Some(Self::Best),
+            _ => None,
+        }
+    }
+}
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
+#[repr(i32)]
+pub enum Antialiasing {
+    /// Not known to this version.
+    Unspecified = 0,
+    /// One sample per pixel, not smoothed.
+    None = 1,
+    Fxaa = 2,
+    Samples = 3,
+}
+impl Antialiasing {
+    /// String value of the enum field names used in the ProtoBuf definition.
+    ///
+    /// The values are not transformed in any way and thus are considered stable
+    /// (if the ProtoBuf definition does not change) and safe for programmatic use.
+    pub fn as_str_name(&self) -> &'static str {
+        match self {
+            Self::Unspecified => "ANTIALIASING_UNSPECIFIED",
+            Self::None => "ANTIALIASING_NONE",
+            Self::Fxaa => "ANTIALIASING_FXAA",
+            Self::Samples => "ANTIALIASING_SAMPLES",
+        }
+    }
+    /// Creates an enum from field names used in the ProtoBuf definition.
+    pub fn from_str_name(value: &str) -> ::core::option::Option<Self> {
+        match value {
+            "ANTIALIASING_UNSPECIFIED" => Some(Self::Unspecified),
+            "ANTIALIASING_NONE" => Some(Self::None),
+            "ANTIALIASING_FXAA" => Some(Self::Fxaa),
+            "ANTIALIASING_SAMPLES" => Some(Self::Samples),
+            _ => None,
+        }
+    }
+}
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
+#[repr(i32)]
+pub enum ShadowMethod {
+    /// No shadow map.
+    Unspecified = 0,
+    Variance = 1,
+    Standard = 2,
+    Filtered = 3,
+}
+impl ShadowMethod {
+    /// String value of the enum field names used in the ProtoBuf definition.
+    ///
+    /// The values are not transformed in any way and thus are considered stable
+    /// (if the ProtoBuf definition does not change) and safe for programmatic use.
+    pub fn as_str_name(&self) -> &'static str {
+        match self {
+            Self::Unspecified => "SHADOW_METHOD_UNSPECIFIED",
+            Self::Variance => "SHADOW_METHOD_VARIANCE",
+            Self::Standard => "SHADOW_METHOD_STANDARD",
+            Self::Filtered => "SHADOW_METHOD_FILTERED",
+        }
+    }
+    /// Creates an enum from field names used in the ProtoBuf definition.
+    pub fn from_str_name(value: &str) -> ::core::option::Option<Self> {
+        match value {
+            "SHADOW_METHOD_UNSPECIFIED" => Some(Self::Unspecified),
+            "SHADOW_METHOD_VARIANCE" => Some(Self::Variance),
+            "SHADOW_METHOD_STANDARD" => Some(Self::Standard),
+            "SHADOW_METHOD_FILTERED" => Some(Self::Filtered),
             _ => None,
         }
     }

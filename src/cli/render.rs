@@ -7,18 +7,18 @@ use std::sync::Arc;
 use super::options::{parse_point, with_spinner};
 use super::{Outcome, print_line};
 use crate::config::{BackendChoice, Config, RendererChoice};
-use crate::engine::{DeviceContext, FrameOutput, LoadedScene, validate_mode};
+use crate::engine::{DeviceContext, FrameInfo, FrameOutput, LoadedScene, validate_mode};
 use crate::frame;
 use modalcast_model::error::{Error, Result, fault, invalid};
 use modalcast_model::load::{self, OpenedScene};
-use modalcast_model::scene::{Camera, FrameSize, Lens, MeshEdges, Scene, SceneState, View};
+use modalcast_model::scene::{Camera, FrameSize, Lens, LookPreset, MeshEdges, Scene, SceneState, View};
 
 /// Renders one frame of a scene to a PNG or JPEG file.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   modalcast render tree --out tree.png
   modalcast render path/to/simpleBridge --q bent.npy --out bridge.png --size 1920x1080
-  modalcast render model.glb --out side.png --eye 4,1,0 --target 0,1,0
+  modalcast render model.glb --out side.png --eye 4,1,0 --target 0,1,0 --look best
   modalcast render tree --q bent.npy --output displacement --largest 0.5 --out moved.png")]
 pub(super) struct Args {
     /// A built-in name, a folder with scene.toml, a .glb, .gltf, .obj, .ply, .stl or .npz file, or a folder with
@@ -58,6 +58,11 @@ pub(super) struct Args {
     /// Draws lines along the edges of the faces, of this width. Default: as `look.edges` of the scene. 0: no lines.
     #[arg(long, value_name = "PIXELS", num_args = 0..=1, default_missing_value = "1.25", conflicts_with = "output")]
     edges: Option<f32>,
+    /// Preset of the antialiasing and the shadow map: preview, standard or best. Replaces the preset of the scene. Keys
+    /// of the table `look` in scene.toml win over it. Default: that of the scene, else chosen by renderer, image size and
+    /// triangles.
+    #[arg(long, value_name = "PRESET")]
+    look: Option<LookPreset>,
     /// Deformation backend.
     #[arg(long, value_enum, default_value_t)]
     backend: BackendChoice,
@@ -124,7 +129,7 @@ fn mesh_edges(width: Option<f32>, scene: &Scene) -> Result<Option<MeshEdges>> {
 
 pub(super) fn run(args: &Args) -> Outcome {
     let format = FileFormat::of(&args.out)?;
-    let OpenedScene { scene, backends } = with_spinner("loading", || load::open(&args.scene))?;
+    let OpenedScene { scene, backends } = with_spinner("loading", || load::open_with_preset(&args.scene, args.look))?;
     let mut state = SceneState::rest(&scene);
     if let Some(path) = &args.q {
         state.q = read_coordinates(&scene, path)?;
@@ -134,10 +139,13 @@ pub(super) fn run(args: &Args) -> Outcome {
     let mut loaded_scene = device.load_scene(&scene, backends)?;
     loaded_scene.deform(&Arc::new(state))?;
     let scale_max = args.largest;
+    let mut info = FrameInfo::default();
     let rgba = match args.output {
         OutputOption::Color => {
             let edges = mesh_edges(args.edges, &scene)?;
-            device.draw_with_edges(&mut loaded_scene, &camera(args, &scene), args.size, edges)?.rgba
+            let image = device.draw_with_edges(&mut loaded_scene, &camera(args, &scene), args.size, edges)?;
+            info = image.info;
+            image.rgba
         }
         OutputOption::Displacement => {
             render_color_map(args, &mut device, &mut loaded_scene, FrameOutput::Displacement { scale_max })?
@@ -152,7 +160,17 @@ pub(super) fn run(args: &Args) -> Outcome {
     fs::write(&args.out, bytes).map_err(|error| invalid(field, "a file that can be written", error))?;
     device.unload_scene(loaded_scene);
     print_line(format!("{} ({}, {})", args.out.display(), args.size, device.backend().name()));
+    info_lines(&info).into_iter().for_each(print_line);
     Ok(true)
+}
+
+/// Lines about how a color picture was drawn; none for other pictures.
+fn info_lines(info: &FrameInfo) -> Vec<String> {
+    let look = info.look.map(|look| format!("look: {look}"));
+    let below_ground = (info.below_ground > 0.0).then(|| {
+        format!("remark: vertices lie up to {:.4} m below the ground, which hides no geometry", info.below_ground)
+    });
+    look.into_iter().chain(below_ground).collect()
 }
 
 /// Renders a color map with its legend, as RGBA8.

@@ -53,7 +53,7 @@ pub use storage::upload::{Upload, UploadHeader};
 #[cfg(test)]
 pub(crate) use testing::lossless_lease;
 
-pub use modalcast_render::{RasterBackend, RasterBackends};
+pub use modalcast_render::{FrameInfo, FrameLook, RasterBackend};
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};

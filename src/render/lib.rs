@@ -61,7 +61,7 @@ pub use self::plan::{Allocation, OmittedFeature, RenderPlan, plan};
 pub use self::renderer::{MappedPixels, PartialFrame, PendingFrame, Renderer, ScenePreparation};
 pub use self::resources::scene_buffers::SceneBuffers;
 pub use self::types::{
-    BlurMethod, CullStats, DevicePreference, FrameCullStats, FrameImage, FrameParams, FrameStats, OitStats,
-    RasterBackend, RasterBackends, RendererInfo, VisibilityId,
+    BlurMethod, CullStats, DevicePreference, FrameCullStats, FrameImage, FrameInfo, FrameLook, FrameParams, FrameStats,
+    OitStats, RasterBackend, RasterBackends, RendererInfo, VisibilityId,
 };
 pub use self::uniforms::frame::{shadow_clip_from_world, shadow_texel_axes};

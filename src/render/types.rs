@@ -1,7 +1,11 @@
 //! Parameters and results of the renderer, without references to a device.
 
+use std::fmt;
+
 use crate::pass::{FrameTimes, Pass};
-use modalcast_model::scene::{BoundingBox, Camera, MeshEdges, OrientedBounds};
+use modalcast_model::scene::{
+    Antialiasing, BoundingBox, Camera, LookPreset, MeshEdges, OrientedBounds, ShadowSettings,
+};
 
 /// Selects the EGL device.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -52,7 +56,43 @@ pub struct FrameImage {
     pub height: u32,
     pub rgba: Vec<u8>,
     pub times: FrameTimes,
+    pub info: FrameInfo,
+}
+
+/// How a frame was drawn, and what a viewer of it should know.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct FrameInfo {
+    /// The rasterizer that drew the shadow map and the visibility.
     pub raster_backends: RasterBackends,
+    /// The parts of the look that a preset can choose. `None` for outputs other than color.
+    pub look: Option<FrameLook>,
+    /// How far the lowest vertex lies below the ground, in meters. 0 if no vertex lies below the ground by more than 1e-5
+    /// of the diagonal of the scene's rest bounds, which bounds the error of the vertices, or if the scene has no ground.
+    /// Vertices outside of [`FrameParams::bounds`] are ignored.
+    pub below_ground: f64,
+}
+
+/// The parts of a look that a preset can choose, as the renderer chose them for a frame.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct FrameLook {
+    /// The preset that the scene names. `None`: the rule chose, or the settings were final.
+    pub preset: Option<LookPreset>,
+    pub antialias: Antialiasing,
+    /// Samples per pixel that were drawn: those of the look, or 1 if the device does not support them for the frame.
+    pub samples: u32,
+    pub shadow: Option<ShadowSettings>,
+}
+
+impl fmt::Display for FrameLook {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { preset, antialias, samples, shadow } = self;
+        write!(formatter, "{}, antialiasing {}", preset.map_or("no preset", LookPreset::name), antialias.name())?;
+        write!(formatter, ", {samples} per pixel, ")?;
+        match shadow {
+            Some(shadow) => write!(formatter, "{} shadow map {} x {}", shadow.method.name(), shadow.size, shadow.size),
+            None => formatter.write_str("no shadow map"),
+        }
+    }
 }
 
 /// Statistics of a frame: the passes that ran and how many triangles they processed.

@@ -6,8 +6,7 @@ use modalcast_proto::v1;
 
 use crate::engine::{
     self, ContentHash, Delivery, Engine, FrameFormat, InitialState, LeaseRequest, LeaseToken, OutputSpec, Overflow,
-    PictureSpec, RasterBackend, SceneHandle, StepId, StepSelector, StreamDelivery, UploadedShape, WriterSession,
-    parse_hash,
+    PictureSpec, SceneHandle, StepId, StepSelector, StreamDelivery, UploadedShape, WriterSession, parse_hash,
 };
 use crate::telemetry::StageTimes;
 use modalcast_model::domain::{CreaseAngle, Material, Transform};
@@ -15,9 +14,11 @@ use modalcast_model::error::{Result, invalid};
 use modalcast_model::scene::{Camera, FrameSize, PixelRect, RawStepUpdate, Scene, TransformFormat, UpAxis};
 
 mod camera;
+mod frame_info;
 mod output;
 mod vertices;
 
+pub(super) use frame_info::wire_frame_info;
 pub(super) use output::wire_format;
 pub(super) use vertices::{parse_vertex_selection, wire_sections};
 
@@ -87,14 +88,6 @@ pub(super) const fn wire_step_id(step: StepId) -> v1::StepId {
 
 pub(super) fn wire_stages(times: &StageTimes) -> Vec<v1::StageTime> {
     times.iter().map(|(stage, ms)| v1::StageTime { stage: stage.name().into(), milliseconds: *ms as f32 }).collect()
-}
-
-pub(super) const fn wire_raster_backend(backend: Option<RasterBackend>) -> v1::DrawnBy {
-    match backend {
-        None => v1::DrawnBy::Unspecified,
-        Some(RasterBackend::OpenGl) => v1::DrawnBy::Opengl,
-        Some(RasterBackend::Cuda) => v1::DrawnBy::Cuda,
-    }
 }
 
 pub(super) fn parse_step(step: v1::Step) -> Result<RawStepUpdate> {

@@ -11,7 +11,7 @@ use v1::stream_frames_response::Part as StreamPart;
 
 use super::convert::{
     RequestedPicture, describe_step_selector, parse_moved_cameras, parse_pictures, parse_step_selector,
-    parse_stream_delivery, wire_delivery, wire_format, wire_picture, wire_raster_backend, wire_stages, wire_step_id,
+    parse_stream_delivery, wire_delivery, wire_format, wire_frame_info, wire_picture, wire_stages, wire_step_id,
 };
 use super::picks;
 use super::reply_body::without_copies;
@@ -178,10 +178,9 @@ fn frame_chunks(
         total: frame.bytes.len() as u64,
         skipped: frame.skipped,
         stages: wire_stages(&frame.stages),
-        shadow_drawn_by: wire_raster_backend(frame.raster_backends.shadow).into(),
-        visibility_drawn_by: wire_raster_backend(frame.raster_backends.visibility).into(),
         picture: *picture_index,
         camera_version: *camera_version,
+        ..wire_frame_info(&frame.info)
     };
     chunks_with_head(head, frame.bytes.clone(), max_chunk_bytes, |head, offset, data| v1::FrameChunk {
         head,

@@ -11,6 +11,7 @@ mod device;
 #[expect(dead_code, reason = "shared with the benchmarks")]
 mod ensembles;
 mod extremes;
+mod frame_info;
 mod gl;
 mod interop;
 mod light;

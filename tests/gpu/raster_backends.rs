@@ -119,6 +119,9 @@ fn scenes_and_states() -> [(&'static str, Arc<Scene>, SceneState); 2] {
         scenes::RandomSceneOptions { instances: 5, normal_maps: true, rigid_transforms: false },
     );
     let tree = modalcast_model::load::open("tree").expect("expected the built-in scene").scene;
+    // The compute rasterizer draws the shadow of variance maps only.
+    let look = RenderSettings { preset: None, shadow: Some(ShadowSettings::default()), ..tree.look };
+    let tree = Scene::new(SceneParts { look, ..tree.parts() }).expect("expected a valid scene");
     let (random_state, rest_state) = (scenes::random_state(&soup, 1), SceneState::rest(&tree));
     [("soup", soup, random_state), ("tree", tree, rest_state)]
 }
@@ -257,7 +260,7 @@ fn gpu_scene_moved_by_4096_units_is_drawn_by_both_rasterizers() {
         pixels.filter(is_different).count()
     };
     let [opengl, cuda] = [RasterPolicy::OpenGl, RasterPolicy::Cuda].map(|raster| draw_moved(raster, 4096.0));
-    assert_eq!((opengl.raster_backends, cuda.raster_backends), (OPENGL_BACKENDS, CUDA_BACKENDS));
+    assert_eq!((opengl.info.raster_backends, cuda.info.raster_backends), (OPENGL_BACKENDS, CUDA_BACKENDS));
     // Edges of triangles, and intersections of triangles.
     let (different, pixel_count) = (count_different(&opengl, &cuda), opengl.rgba.len() / 4);
     assert!(different < pixel_count / 50, "{different} of {pixel_count} pixels differ");
@@ -279,7 +282,7 @@ fn gpu_cuda_frames_report_their_rasterizer_and_repeat_bits() {
         .map(|raster| draw_states(&scene, raster, &states));
     for frame in 0..states.len() {
         assert_eq!(
-            (got[frame].raster_backends, want[frame].raster_backends),
+            (got[frame].info.raster_backends, want[frame].info.raster_backends),
             (CUDA_BACKENDS, OPENGL_BACKENDS),
             "{frame}"
         );
@@ -358,7 +361,7 @@ fn gpu_resized_cuda_frames_equal_a_fresh_renderer() {
             let image = context
                 .draw(loaded_scene, &Camera::fit_to_scene(&scene, width, height), FrameSize::new(width, height))
                 .expect("expected a frame");
-            assert_eq!(image.raster_backends.visibility, Some(RasterBackend::Cuda));
+            assert_eq!(image.info.raster_backends.visibility, Some(RasterBackend::Cuda));
             image.rgba
         };
     let mut context = open_device();
@@ -392,8 +395,8 @@ fn gpu_fastest_rasterizer_draws_frames_of_every_size() {
     for [width, height] in [[64, 48], [1920, 1080], [1, 1], [333, 77]] {
         let camera = Camera::fit_to_scene(&scene, width, height);
         let image = context.draw(&mut loaded_scene, &camera, FrameSize::new(width, height)).expect("expected a frame");
-        eprintln!("{width} x {height}: {:?}", image.raster_backends);
-        assert!(image.raster_backends.visibility.is_some());
+        eprintln!("{width} x {height}: {:?}", image.info.raster_backends);
+        assert!(image.info.raster_backends.visibility.is_some());
         assert_eq!(image.rgba.len(), 4 * (width * height) as usize);
         loaded_scene.deform(&scenes::random_state(&scene, u64::from(width))).expect("expected the step to succeed");
     }

@@ -62,6 +62,32 @@ async fn next_head(stream: &mut Streaming<v1::StreamFramesResponse>) -> Option<v
     None
 }
 
+/// With q = -8, the fourth vertex of the left strip moves from y = 1 to 1 - 8 * 0.5 = -3. The ground is at y = 0.
+#[tokio::test(flavor = "multi_thread")]
+async fn color_frame_names_its_look_and_vertices_below_ground() {
+    let server = start_server().await;
+    let mut writer = server.drive_lossless("strips").await;
+    let rest_head = render(&server, rgba_request()).await.expect("expected a frame at rest").head;
+    // The settings of the scene, which leave nothing to a preset.
+    let look = v1::FrameLook {
+        preset: v1::LookPreset::Unspecified.into(),
+        antialiasing: v1::Antialiasing::Samples.into(),
+        samples: 4,
+        shadow_method: v1::ShadowMethod::Variance.into(),
+        shadow_size: 128,
+    };
+    assert_eq!((rest_head.look, rest_head.below_ground), (Some(look), 0.0));
+    writer.send_step_and_wait(step(1, &[], &[-8.0, 0.0, 0.0, 0.0])).await;
+    let head = render(&server, rgba_request()).await.expect("expected a frame").head;
+    assert!((head.below_ground - 3.0).abs() < 1e-6, "expected 3 m below the ground, got {} m", head.below_ground);
+    writer.send_step_and_wait(step(2, &[], &[0.0; 4])).await;
+    assert_eq!(render(&server, rgba_request()).await.expect("expected a frame").head.below_ground, 0.0);
+    let mut pictures = picture_of_size(64, 48, v1::Format::Unspecified);
+    pictures[0].output = v1::Output::Depth.into();
+    let depth_head = render(&server, v1::RenderFrameRequest { pictures, ..rgba_request() }).await;
+    assert_eq!(depth_head.expect("expected depth").head.look, None);
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn frame_names_its_step_and_png_equals_rgba() {
     let server = start_server().await;

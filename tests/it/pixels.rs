@@ -13,6 +13,7 @@ mod ground;
 mod harness;
 mod image_sizes;
 mod limits;
+mod look_presets;
 mod mesh_edges;
 mod oit;
 mod picking;

@@ -1,5 +1,6 @@
 //! Frame requests and streams: each reply is a complete frame with its step and stage times.
 
+use std::fmt;
 use std::pin::Pin;
 use std::task::{Context, Poll};
 
@@ -167,6 +168,37 @@ pub struct Frame {
     pub shadow_drawn_by: Option<DrawnBy>,
     /// The rasterizer of the visible triangles. `None` for other outputs than color.
     pub visibility_drawn_by: Option<DrawnBy>,
+    /// Antialiasing and shadow map. `None` for other outputs than color, and from servers that do not report them.
+    pub look: Option<FrameLook>,
+    /// How far the lowest vertex lies below the ground, in meters; 0 if none does, and for other outputs than color.
+    pub below_ground: f64,
+}
+
+/// Antialiasing and shadow map of a frame, chosen by the scene's settings or by the server.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct FrameLook {
+    /// The preset that the scene names: `preview`, `standard` or `best`; empty if it names none.
+    pub preset: &'static str,
+    /// `samples`, `fxaa` or `none`; empty if this client does not know the method.
+    pub antialiasing: &'static str,
+    /// Samples per pixel.
+    pub samples: u32,
+    /// `variance`, `standard` or `filtered`; empty without a shadow map.
+    pub shadow_method: &'static str,
+    /// Side of the shadow map in texels; 0 without a shadow map.
+    pub shadow_size: u32,
+}
+
+impl fmt::Display for FrameLook {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { preset, antialiasing, samples, shadow_method, shadow_size } = self;
+        let preset = if preset.is_empty() { "no preset" } else { preset };
+        write!(formatter, "{preset}, antialiasing {antialiasing}, {samples} per pixel, ")?;
+        match shadow_size {
+            0 => formatter.write_str("no shadow map"),
+            size => write!(formatter, "{shadow_method} shadow map {size} x {size}"),
+        }
+    }
 }
 
 /// The rasterizer of a pass.
@@ -334,6 +366,8 @@ impl WireChunk for v1::FrameChunk {
             skipped: head.skipped,
             shadow_drawn_by: decode_drawn_by(head.shadow_drawn_by()),
             visibility_drawn_by: decode_drawn_by(head.visibility_drawn_by()),
+            look: head.look.as_ref().map(decode_look),
+            below_ground: head.below_ground,
             stages: stages::from_wire(head.stages),
         })
     }
@@ -344,6 +378,31 @@ const fn decode_drawn_by(wire: v1::DrawnBy) -> Option<DrawnBy> {
         v1::DrawnBy::Unspecified => None,
         v1::DrawnBy::Opengl => Some(DrawnBy::OpenGl),
         v1::DrawnBy::Cuda => Some(DrawnBy::Cuda),
+    }
+}
+
+fn decode_look(wire: &v1::FrameLook) -> FrameLook {
+    FrameLook {
+        preset: match wire.preset() {
+            v1::LookPreset::Unspecified => "",
+            v1::LookPreset::Preview => "preview",
+            v1::LookPreset::Standard => "standard",
+            v1::LookPreset::Best => "best",
+        },
+        antialiasing: match wire.antialiasing() {
+            v1::Antialiasing::Unspecified => "",
+            v1::Antialiasing::None => "none",
+            v1::Antialiasing::Fxaa => "fxaa",
+            v1::Antialiasing::Samples => "samples",
+        },
+        samples: wire.samples,
+        shadow_method: match wire.shadow_method() {
+            v1::ShadowMethod::Unspecified => "",
+            v1::ShadowMethod::Variance => "variance",
+            v1::ShadowMethod::Standard => "standard",
+            v1::ShadowMethod::Filtered => "filtered",
+        },
+        shadow_size: wire.shadow_size,
     }
 }
 

@@ -32,8 +32,8 @@ pub use describe::{DescriptionRequest, ModeRows};
 pub use error::{Error, Reason, Rejection, Result};
 pub use forces::{AppliedForce, Force, ForceKind, ForceRequest, ForceSet, ForceStream, SurfaceForce};
 pub use frames::{
-    Camera, DrawnBy, Frame, FrameFormat, FrameRequest, FrameStream, FrameStreamRequest, FramesRequest, Lens, Output,
-    Picture, Pictures, View,
+    Camera, DrawnBy, Frame, FrameFormat, FrameLook, FrameRequest, FrameStream, FrameStreamRequest, FramesRequest, Lens,
+    Output, Picture, Pictures, View,
 };
 pub use modalcast_proto::v1;
 pub use modalcast_proto::v1::{Feature, PROTOCOL_VERSION, SceneInfo, StepId};

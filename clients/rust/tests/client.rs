@@ -64,10 +64,13 @@ async fn frame_above_4_mib_arrives_complete_and_names_its_step() {
     let request = FrameRequest::new("toy", picture(1920, 1080)).minimum_step(5);
     let frame = client.render_frame(&request).await.expect("a frame");
     assert_eq!((frame.step.number, frame.width, frame.bytes.len()), (5, 1920, 1920 * 1080 * 4));
-    // The fake server fills a frame with the step number and reports fixed stage times and rasterizers.
+    // The fake server fills a frame with the step number and reports a fixed look, stage times, rasterizers and distance below the ground.
     assert!(frame.bytes.iter().all(|byte| *byte == 5));
     assert_eq!(frame.stages, [("draw".to_owned(), 2.0)]);
     assert_eq!((frame.shadow_drawn_by, frame.visibility_drawn_by), (None, Some(DrawnBy::Cuda)));
+    let look = frame.look.expect("a look").to_string();
+    assert_eq!(look, "best, antialiasing fxaa, 1 per pixel, filtered shadow map 512 x 512");
+    assert_eq!(frame.below_ground, 0.25);
 }
 
 #[tokio::test]

@@ -260,7 +260,9 @@ impl DeviceContext {
         let contents = loaded_scene.fill_buffers(renderer, &camera)?;
         let upload_ms = contents.is_uploaded.then(|| ms_since(upload_begin));
         let params = FrameParams { edges, ..contents.frame_params(camera, size) };
-        Ok(PartialDraw { frame: renderer.begin_frame(loaded_scene.buffers()?, &params, true)?, upload_ms })
+        let frame = renderer.begin_frame(loaded_scene.buffers()?, &params, true)?;
+        loaded_scene.log_frame(frame.info());
+        Ok(PartialDraw { frame, upload_ms })
     }
 
     /// Submits the next step of a frame.
@@ -311,9 +313,8 @@ impl DeviceContext {
 
     /// Whether an output of this size is drawn in steps, between which other scenes are served.
     pub(in crate::engine) fn is_divided(&self, loaded_scene: &LoadedScene, size: FrameSize) -> bool {
-        self.renderer.as_ref().is_ok_and(|renderer| {
-            renderer.is_divided([size.width, size.height], loaded_scene.scene().look.samples_per_pixel())
-        })
+        let size = [size.width, size.height];
+        self.renderer.as_ref().is_ok_and(|renderer| renderer.is_divided(loaded_scene.scene(), size))
     }
 
     /// Sets the number of samples that the renderer draws without a break.

@@ -4,6 +4,7 @@
 use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::sync::Arc;
 
+use super::frame_log::FrameLog;
 use super::scalar_field;
 use crate::engine::output::step_output::FrameOutput;
 use crate::frame::Legend;
@@ -11,7 +12,7 @@ use modalcast_model::deform::{DeformSummary, DeformedSurface, Deformer, VertexAt
 use modalcast_model::error::{Error, Result, fault, invalid};
 use modalcast_model::raster::{RasterGeometry, Rasterizer};
 use modalcast_model::scene::{BoundingBox, Camera, FrameSize, OrientedBounds, Scene, SceneState};
-use modalcast_render::{FrameParams, Renderer, SceneBuffers};
+use modalcast_render::{FrameInfo, FrameParams, Renderer, SceneBuffers};
 
 /// Positions beyond this bound (scene units) are rejected like infinite ones, because their squares overflow f32 in the
 /// shaders.
@@ -56,6 +57,7 @@ pub struct LoadedScene {
     generation: u64,
     /// The color map whose values are in the buffers.
     cached_color_map: Option<(FrameOutput, Legend)>,
+    frame_log: FrameLog,
 }
 
 impl LoadedScene {
@@ -76,6 +78,7 @@ impl LoadedScene {
             current_state,
             generation: 0,
             cached_color_map: None,
+            frame_log: FrameLog::default(),
         }
     }
 
@@ -255,6 +258,11 @@ impl LoadedScene {
         let contents = self.fill_buffers(renderer, &camera)?;
         let Some(buffers) = &mut self.buffers else { return Err(no_buffers_error()) };
         renderer.select_raster_backends(buffers, &contents.frame_params(camera, BENCHMARK_SIZE)).map(drop)
+    }
+
+    /// Logs how a frame is drawn, unless a frame of the scene was drawn in the same way before.
+    pub(in crate::engine) fn log_frame(&mut self, info: &FrameInfo) {
+        self.frame_log.record(&self.scene.name, info);
     }
 
     pub(in crate::engine) fn buffers(&self) -> Result<&SceneBuffers> {

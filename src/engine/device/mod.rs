@@ -10,6 +10,7 @@ mod device_loss;
 mod fair_queue;
 #[cfg(test)]
 mod fairness_tests;
+mod frame_log;
 pub(super) mod handle;
 mod in_flight;
 pub(super) mod loaded_scene;

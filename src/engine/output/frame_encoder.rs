@@ -15,7 +15,7 @@ use super::step_output::{OutputBody, StepFrames, StepId, StepOutput};
 use crate::frame::{self, EncodedStrip, PngLayout, StripBuffers};
 use crate::telemetry::{Stage, StageTimes};
 use modalcast_model::error::{Result, fault, fault_in};
-use modalcast_render::RasterBackends;
+use modalcast_render::FrameInfo;
 
 /// An encoded result of one step.
 #[derive(Debug, Clone)]
@@ -24,8 +24,8 @@ pub struct EncodedOutput {
     /// Steps that the subscriber skipped since its last output.
     pub skipped: u64,
     pub stages: StageTimes,
-    /// The rasterizers that drew a color frame; default for other results.
-    pub raster_backends: RasterBackends,
+    /// How a color frame was drawn; default for other results.
+    pub info: FrameInfo,
     pub bytes: Bytes,
 }
 
@@ -120,7 +120,7 @@ impl FrameEncoder {
                 bytes
             }
         };
-        let output = EncodedOutput { step, skipped, stages, raster_backends: picture.raster_backends, bytes };
+        let output = EncodedOutput { step, skipped, stages, info: picture.info, bytes };
         Ok(EncodedFrame { picture: index, camera_version, output })
     }
 
@@ -248,7 +248,7 @@ pub(in crate::engine) mod tests {
             height: side,
             rgba,
             times: modalcast_render::FrameTimes::default(),
-            raster_backends: RasterBackends::default(),
+            info: FrameInfo::default(),
         };
         let step = StepId { run: 1, number, time: 0.0 };
         let body = OutputBody::Frames(StepFrames { pictures: vec![Arc::new(image.into())], camera_version: 0 });

@@ -9,7 +9,7 @@ use super::frame_format::FrameFormat;
 use crate::engine::lock::lock;
 use crate::frame::Legend;
 use crate::telemetry::{Stage, StageTimes};
-use modalcast_render::{AovImage, FrameImage, FrameTimes, RasterBackends, RenderStage, TimeKey};
+use modalcast_render::{AovImage, FrameImage, FrameInfo, FrameTimes, RenderStage, TimeKey};
 
 /// The pixels of one picture of a step. All readers of equal pictures share them, and share each encoding, which is
 /// computed once, on first use.
@@ -20,8 +20,8 @@ pub struct RenderedPicture {
     pub pixels: Pixels,
     /// Times of the stages from the upload to the readback.
     pub(super) stages: StageTimes,
-    /// The rasterizers that drew a color picture; default for others.
-    pub(super) raster_backends: RasterBackends,
+    /// How a color picture was drawn; default for others.
+    pub(super) info: FrameInfo,
     /// At most one entry per format.
     encodings: Mutex<Vec<(FrameFormat, SharedEncoding)>>,
 }
@@ -48,7 +48,7 @@ impl RenderedPicture {
             Some(legend) => Pixels::ColorMap(image, legend),
             None => Pixels::Values(image.bytes.into()),
         };
-        Self { width, height, pixels, stages, raster_backends: RasterBackends::default(), encodings: Mutex::default() }
+        Self { width, height, pixels, stages, info: FrameInfo::default(), encodings: Mutex::default() }
     }
 
     /// Size of the pixels in bytes.
@@ -73,9 +73,9 @@ impl RenderedPicture {
 
 impl From<FrameImage> for RenderedPicture {
     fn from(image: FrameImage) -> Self {
-        let FrameImage { width, height, rgba, times, raster_backends } = image;
+        let FrameImage { width, height, rgba, times, info } = image;
         let (pixels, stages) = (Pixels::Color(rgba.into()), stage_times(&times));
-        Self { width, height, pixels, stages, raster_backends, encodings: Mutex::default() }
+        Self { width, height, pixels, stages, info, encodings: Mutex::default() }
     }
 }
 

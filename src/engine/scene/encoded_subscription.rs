@@ -211,7 +211,7 @@ mod tests {
             height: 1,
             rgba: vec![0; MAX_PIXEL_BYTES],
             times: modalcast_render::FrameTimes::default(),
-            raster_backends: modalcast_render::RasterBackends::default(),
+            info: modalcast_render::FrameInfo::default(),
         };
         let body = OutputBody::Frames(StepFrames { pictures: vec![Arc::new(large_image.into())], camera_version: 0 });
         let large_frame = StepOutput { body, ..noise_frame(0, 1) };

@@ -212,7 +212,7 @@ mod tests {
     use crate::engine::output::step_output::{FrameOutput, OutputBody, OutputSpec, PictureSpec, StepOutput};
     use crate::engine::testing;
     use modalcast_model::scene::{Camera, FrameSize, SceneState};
-    use modalcast_render::{FrameImage, RasterBackends};
+    use modalcast_render::{FrameImage, FrameInfo};
 
     const WITHOUT_NEXT_STEP: DeliveryMode = DeliveryMode { applies_back_pressure: false, overlaps_next_step: false };
     const WITH_NEXT_STEP: DeliveryMode = DeliveryMode { overlaps_next_step: true, ..WITHOUT_NEXT_STEP };
@@ -272,7 +272,7 @@ mod tests {
                 height: 8,
                 rgba: vec![],
                 times: modalcast_render::FrameTimes::default(),
-                raster_backends: RasterBackends::default(),
+                info: FrameInfo::default(),
             }))
             .expect("expected a caller that waits");
     }

@@ -46,7 +46,7 @@ use std::sync::Arc;
 
 use crate::backend_settings::BackendSettings;
 use crate::error::Result;
-use crate::scene::{Scene, SceneParts};
+use crate::scene::{LookPreset, PresetRequest, Scene, SceneParts};
 
 /// A scene that was opened by name or path, with its backend settings.
 #[derive(Debug, Clone)]
@@ -79,8 +79,9 @@ struct SceneDescription {
 }
 
 impl From<SceneParts> for SceneDescription {
-    /// A scene with the default settings of the backends.
-    fn from(parts: SceneParts) -> Self {
+    /// A scene with the default settings of the backends, whose antialiasing and shadow map are left to the renderer.
+    fn from(mut parts: SceneParts) -> Self {
+        parts.look = parts.look.with_preset(PresetRequest::default());
         Self { parts, backends: BackendSettings::default() }
     }
 }
@@ -92,6 +93,20 @@ impl From<SceneParts> for SceneDescription {
 /// `NotFound` if nothing has this name; otherwise `Invalid` with the file, the field, and the expected and given value.
 pub fn open(source: &str) -> Result<OpenedScene> {
     OpenedScene::new(source::read(&asset_dir::AssetDir::unrestricted(Path::new(".")), source)?)
+}
+
+/// As [`open`], with a preset for the look instead of the scene's own preset. Settings of antialiasing and shadow map in
+/// `scene.toml` win over it. `None` keeps the scene's own preset.
+///
+/// # Errors
+/// As for [`open`].
+pub fn open_with_preset(source: &str, preset: Option<LookPreset>) -> Result<OpenedScene> {
+    let mut description = source::read(&asset_dir::AssetDir::unrestricted(Path::new(".")), source)?;
+    if preset.is_some() {
+        let look = &mut description.parts.look;
+        *look = look.with_preset(PresetRequest { preset, ..look.preset.unwrap_or_default() });
+    }
+    OpenedScene::new(description)
 }
 
 /// As [`open`], but missing material libraries, materials and images are errors instead of remarks.

@@ -10,6 +10,7 @@ mod floating_origin;
 mod frame_size;
 mod layout;
 mod light_space;
+mod look_preset;
 mod mesh_edges;
 mod pixel_rect;
 mod post_processing;
@@ -28,6 +29,7 @@ pub use floating_origin::{FloatingOrigins, HOME_REACH, OriginGrids, SHARED_REACH
 pub use frame_size::FrameSize;
 pub use layout::{DomainLayout, Layout};
 pub use light_space::{OrientedBounds, light_axes};
+pub use look_preset::{FrameAntialiasing, LookOverrides, LookPreset, PresetRequest, RendererKind};
 pub use mesh_edges::MeshEdges;
 pub use pixel_rect::PixelRect;
 pub use post_processing::{Antialiasing, Bloom, ToneMapping};

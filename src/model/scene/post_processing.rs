@@ -17,6 +17,17 @@ pub enum Antialiasing {
     None,
 }
 
+impl Antialiasing {
+    /// Name in scene files and results.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Msaa => "samples",
+            Self::Fxaa => "fxaa",
+            Self::None => "none",
+        }
+    }
+}
+
 /// The tone-mapping curve, applied to each color channel.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "lowercase")]

@@ -4,7 +4,7 @@
 use nalgebra::Vector3;
 
 use super::shadow::ShadowSettings;
-use super::{Antialiasing, Bloom, MeshEdges, ToneMapping};
+use super::{Antialiasing, Bloom, MeshEdges, PresetRequest, ToneMapping};
 use crate::error::{Result, invalid};
 
 /// The axis that points up.
@@ -91,6 +91,9 @@ pub enum Culling {
 /// Light, shadow, ground, sky and rasterization settings. Colors are linear.
 #[derive(Debug, Clone, Copy, PartialEq, serde::Serialize)]
 pub struct RenderSettings {
+    /// Leaves `antialias`, `samples`, and method, size and blur of `shadow` to the renderer. `None`: the values in these
+    /// fields are final. Set by [`Self::with_preset`]; scene files always set it.
+    pub preset: Option<PresetRequest>,
     /// Direction towards the sun in Y-up coordinates; rotated to the scene's up axis.
     pub sun: [f32; 3],
     /// Color times intensity of the sun.
@@ -131,6 +134,7 @@ pub struct RenderSettings {
 impl Default for RenderSettings {
     fn default() -> Self {
         Self {
+            preset: None,
             sun: [0.45, 0.80, 0.55],
             // Sunlight and skylight add up to about 1 per channel, so that white surfaces are not clipped to uniform
             // white.

@@ -22,6 +22,17 @@ pub enum ShadowMethod {
     PercentageCloser,
 }
 
+impl ShadowMethod {
+    /// Name in scene files and results.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Variance => "variance",
+            Self::Standard => "standard",
+            Self::PercentageCloser => "filtered",
+        }
+    }
+}
+
 /// The storage type of a variance map's moments.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -47,8 +58,7 @@ pub enum ShadowFit {
 }
 
 /// Settings of the shadow map.
-#[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
-#[serde(default, deny_unknown_fields)]
+#[derive(Debug, Clone, Copy, PartialEq, serde::Serialize)]
 pub struct ShadowSettings {
     pub method: ShadowMethod,
     /// Side of the square map in texels, 16 to 16384.

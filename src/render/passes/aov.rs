@@ -184,11 +184,11 @@ impl AovReader {
         field: Aov,
         band_limit: BandLimit,
     ) -> Result<PartialAov> {
-        let samples = if matches!(field, Aov::Values { .. }) { buffers.scene.look.samples_per_pixel() } else { 1 };
         let size = [params.width, params.height];
+        let samples = if matches!(field, Aov::Values { .. }) { buffers.antialiasing(size).samples } else { 1 };
         let desc = TargetDesc::ids_and_depth(&self.gl, size, samples);
         let words_per_pixel = if field == Aov::Normals { 3 } else { u64::from(desc.samples) };
-        let uniforms = FrameUniforms::new(&buffers.scene, params, buffers.origin)?;
+        let uniforms = FrameUniforms::new(&buffers.scene, &buffers.look, params, buffers.origin)?;
         let mask = buffers.mask_program(desc.samples, &mut |source| programs.program(source))?;
         let program = match field {
             Aov::Domains => programs.program(shaders::readback::visibility_readback(desc.samples))?,

@@ -104,7 +104,7 @@ impl Picker {
         let size @ [width, height] = rectangle.size();
         let camera = params.camera.cropped_to([params.width, params.height], rectangle);
         let params = FrameParams { camera, width, height, ..*params };
-        let uniforms = FrameUniforms::new(&buffers.scene, &params, buffers.origin)?;
+        let uniforms = FrameUniforms::new(&buffers.scene, &buffers.look, &params, buffers.origin)?;
         let mask = buffers.mask_program(1, &mut |source| programs.program(source))?;
         let program = programs.program(shaders::readback::pick())?;
         let target = match self.target.take() {

@@ -65,7 +65,7 @@ pub(crate) fn bloom(
 
 /// Encodes a band of the scene color to sRGB bytes in the readback source.
 pub(crate) fn encode(recorder: &mut PassRecorder<'_>, frame: &FrameContext<'_>, band: Band) -> Result<()> {
-    let (target, program) = (frame.target, &frame.buffers.post.encode);
+    let (target, program) = (frame.target, frame.encode);
     recorder.begin(Pass::Encode);
     program.bind(None);
     program.set_first_row(band.first_row);

@@ -28,11 +28,11 @@ pub(crate) fn draw(
     passes: RasterPasses,
 ) -> Result<()> {
     let FrameContext { buffers, params, .. } = *frame;
-    let (scene, origin) = (&buffers.scene, buffers.origin);
+    let (scene, look, origin) = (&buffers.scene, &buffers.look, buffers.origin);
     // Without a shadow map, the size is not used.
-    let map_size = scene.look.shadow.map_or(1, |shadow| shadow.size);
+    let map_size = look.shadow.map_or(1, |shadow| shadow.size);
     let shadow_viewport = match passes.shadow {
-        true => Some(Viewport::new(&shadow_clip_from_positions(scene, params, origin), map_size, map_size)?),
+        true => Some(Viewport::new(&shadow_clip_from_positions(scene, look, params, origin), map_size, map_size)?),
         false => None,
     };
     let frame_viewport = Viewport::new(&clip_from_positions(scene, params, origin), params.width, params.height)?;

@@ -3,7 +3,7 @@
 use std::rc::Rc;
 
 use super::accesses::{barrier_before, barrier_within};
-use crate::device::gl::Gl;
+use crate::device::gl::{Gl, Program};
 use crate::pass::Pass;
 use crate::resources::programs::SampleCountPrograms;
 use crate::resources::scene_buffers::SceneBuffers;
@@ -17,6 +17,8 @@ pub(crate) struct FrameContext<'a> {
     pub(crate) buffers: &'a SceneBuffers,
     pub(crate) target: &'a RenderTarget,
     pub(crate) programs: &'a SampleCountPrograms,
+    /// Encodes the frame, with its antialiasing.
+    pub(crate) encode: &'a Program,
     pub(crate) params: &'a FrameParams,
 }
 

@@ -19,7 +19,7 @@ pub(crate) fn upload(recorder: &PassRecorder<'_>, buffers: &SceneBuffers, params
         cull_resources.buffers.counters.write(&[0; CULL_COUNTER_BYTES]);
     }
     if let Some(cascades) = &buffers.uniforms.cascades {
-        let box_params = light_box_params(&buffers.scene, params, buffers.origin);
+        let box_params = light_box_params(&buffers.scene, &buffers.look, params, buffers.origin);
         cascades.write(bytemuck::bytes_of(&ShadowCascades::new(&buffers.scene, params, &box_params, buffers.origin)));
     }
 }

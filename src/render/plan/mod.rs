@@ -97,12 +97,13 @@ impl ScenePlan {
     pub(crate) fn new(scene: &Scene, limits: &Limits, blur_method: BlurMethod) -> Self {
         let (groups, _) = groups(scene);
         let culling = select_culling(scene, limits);
-        let features = features(scene, blur_method.resolve(limits.software), culling);
+        let shadow = scene.look.with_shadow_map_for(limits.renderer_kind()).shadow;
+        let features = features(scene, shadow, blur_method.resolve(limits.software), culling);
         let buffers = buffer_sizes(scene, culling);
         let allocations = buffers.named().map(|(name, bytes)| Allocation { name: name.to_string(), bytes: *bytes });
         let report = RenderPlan {
             buffers: allocations.collect(),
-            textures: textures(scene, features.blur_method),
+            textures: textures(scene, &features),
             passes: passes(scene, &groups, &features),
             draw_calls: draw_calls(scene, &groups) + occluder_draw_calls(&groups, culling),
             defines: features.defines(),
@@ -196,7 +197,7 @@ fn buffer_sizes(scene: &Scene, culling: Culling) -> SceneBufferSet<u64> {
 }
 
 /// The texture arrays of the materials, and the textures of the shadow map.
-fn textures(scene: &Scene, blur_method: BlurMethod) -> Vec<Allocation> {
+fn textures(scene: &Scene, features: &ShaderFeatures) -> Vec<Allocation> {
     let mut textures = Vec::new();
     for (role, label) in [(TextureRole::Color, "colors"), (TextureRole::Normal, "normals")] {
         for array in arrays(scene, role) {
@@ -204,8 +205,8 @@ fn textures(scene: &Scene, blur_method: BlurMethod) -> Vec<Allocation> {
             textures.push(Allocation { name, bytes: array.bytes() });
         }
     }
-    if let Some(shadow) = scene.look.shadow {
-        textures.extend(shadow_allocations(&shadow, blur_method));
+    if let Some(shadow) = &features.shadow {
+        textures.extend(shadow_allocations(shadow, features.blur_method));
     }
     textures
 }
@@ -218,7 +219,12 @@ fn shadow_allocations(shadow: &ShadowSettings, blur_method: BlurMethod) -> impl 
     })
 }
 
-fn features(scene: &Scene, blur_method: BlurMethod, culling: Culling) -> ShaderFeatures {
+fn features(
+    scene: &Scene,
+    shadow: Option<ShadowSettings>,
+    blur_method: BlurMethod,
+    culling: Culling,
+) -> ShaderFeatures {
     let (features, look) = (scene.features, &scene.look);
     ShaderFeatures {
         textures: features.textures,
@@ -228,7 +234,7 @@ fn features(scene: &Scene, blur_method: BlurMethod, culling: Culling) -> ShaderF
         blend_layers: features.blend,
         oit: features.blend && look.transparency == Transparency::OrderIndependent,
         opaque_parts: has_opaque_parts(scene),
-        shadow: look.shadow,
+        shadow,
         blur_method,
         culling,
     }

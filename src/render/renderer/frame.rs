@@ -12,7 +12,7 @@ use crate::device::readback_ring::ReadbackSlot;
 use crate::layout;
 use crate::pass::{FrameTimes, Pass};
 use crate::resources::scene_buffers::SceneBuffers;
-use crate::types::{FrameImage, FrameParams, FrameStats, RasterBackend};
+use crate::types::{FrameImage, FrameInfo, FrameParams, FrameStats, RasterBackend};
 use modalcast_model::error::Result;
 
 impl Renderer {
@@ -59,7 +59,7 @@ impl Renderer {
     pub fn map_pixels(&mut self, pending_frame: PendingFrame) -> Result<MappedPixels> {
         let _current = self.gl.make_current()?;
         pending_frame.wait()?;
-        let PendingFrame { desc, slot, passes, mut stats, .. } = pending_frame;
+        let PendingFrame { desc, slot, passes, mut stats, info, .. } = pending_frame;
         let staging = slot.as_ref().and_then(ReadbackSlot::staging);
         if let Some(staging) = staging {
             let [oit_range, cull_range] = desc.readback_ranges().map(|range| range.start as usize..range.end as usize);
@@ -79,7 +79,7 @@ impl Renderer {
         if let Some(culled) = &stats.culled {
             tracing::trace!(?culled, "culled triangles");
         }
-        let raster_backends = stats.raster_backends;
+        let info = FrameInfo { raster_backends: stats.raster_backends, ..info };
         self.stats = stats;
         let mut times: Vec<(Pass, f64)> = Vec::new();
         for (pass, timer) in &passes {
@@ -90,7 +90,7 @@ impl Renderer {
             }
         }
         let times = FrameTimes::of_passes(&times);
-        Ok(MappedPixels { width: desc.width, height: desc.height, view, times, raster_backends })
+        Ok(MappedPixels { width: desc.width, height: desc.height, view, times, info })
     }
 
     fn submit_frame(

@@ -31,7 +31,7 @@ use crate::passes::picking::{PendingPick, PickHit, Picker};
 use crate::passes::{PassRecorder, readback};
 use crate::region::BandLimit;
 use crate::resources::programs::ProgramCache;
-use crate::resources::scene_buffers::{RebasedPositions, SceneBuffers, VertexValues};
+use crate::resources::scene_buffers::{RebasedPositions, SceneBuffers, VertexValues, antialiasing};
 use crate::resources::target::RenderTarget;
 use crate::resources::target_desc::{TargetDesc, sample_positions};
 use crate::shaders;
@@ -159,9 +159,13 @@ impl Renderer {
         self.band_limit = BandLimit { max_pixels: u64::MAX, max_samples: max_band_samples };
     }
 
-    /// Whether an output of this size is divided into bands, if the device supports this number of samples per pixel.
-    pub fn is_divided(&self, [width, height]: [u32; 2], samples: u32) -> bool {
-        let samples = TargetDesc::ids_and_depth(&self.gl, [width, height], samples).samples;
+    /// Whether an output of this size is divided into bands.
+    pub fn is_divided(&self, scene: &Scene, size: [u32; 2]) -> bool {
+        let samples = antialiasing(scene, self.gl.limits.renderer_kind(), size).samples;
+        self.exceeds_band_limit(size, TargetDesc::ids_and_depth(&self.gl, size, samples).samples)
+    }
+
+    fn exceeds_band_limit(&self, [width, height]: [u32; 2], samples: u32) -> bool {
         u64::from(width) * u64::from(height) > self.band_limit.max_pixels(samples)
     }
 

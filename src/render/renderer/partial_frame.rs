@@ -11,11 +11,12 @@
 
 use std::cell::Cell;
 use std::collections::VecDeque;
+use std::rc::Rc;
 use std::time::Duration;
 
 use super::pending_frame::PendingFrame;
 use super::{LastFrame, MAX_TARGETS, Renderer};
-use crate::device::gl::{Fence, PassTimer};
+use crate::device::gl::{Fence, PassTimer, Program};
 use crate::device::readback_ring::ReadbackSlot;
 use crate::pass::Pass;
 use crate::passes::post::BloomStep;
@@ -27,9 +28,10 @@ use crate::resources::programs::SampleCountPrograms;
 use crate::resources::scene_buffers::SceneBuffers;
 use crate::resources::target::RenderTarget;
 use crate::resources::target_desc::TargetDesc;
-use crate::types::{FrameParams, FrameStats};
-use crate::uniforms::frame::{FrameUniforms, clip_from_positions};
+use crate::types::{FrameInfo, FrameLook, FrameParams, FrameStats, RasterBackends};
+use crate::uniforms::frame::{FrameUniforms, clip_from_positions, depth_below_ground};
 use modalcast_model::error::{Error, Result, fault};
+use modalcast_model::scene::FrameAntialiasing;
 
 /// A frame of which some steps are not submitted yet. Dropping it abandons the frame and frees its target.
 #[derive(Debug)]
@@ -38,9 +40,11 @@ pub struct PartialFrame {
     uniforms: FrameUniforms,
     target: RenderTarget,
     programs: SampleCountPrograms,
+    encode: Rc<Program>,
     /// The slot of the staging buffer; none for a frame whose pixels are not read back.
     slot: Option<ReadbackSlot>,
     stats: FrameStats,
+    info: FrameInfo,
     /// Submitted passes in execution order. A pass in bands has one entry for each band.
     timers: Vec<(Pass, PassTimer)>,
     /// Steps that are not submitted yet.
@@ -97,6 +101,11 @@ impl PartialFrame {
         self.has_breaks
     }
 
+    /// How the frame is drawn, without the rasterizers, which are known when it is finished.
+    pub const fn info(&self) -> &FrameInfo {
+        &self.info
+    }
+
     /// Waits at most `limit` for the last submitted step of a frame with breaks. Returns whether it is complete. Submitting
     /// the next step only then keeps the queue of the device short.
     pub fn is_ready_within(&self, limit: Duration) -> bool {
@@ -129,10 +138,11 @@ impl Renderer {
     ) -> Result<PartialFrame> {
         let _current = self.gl.make_current()?;
         self.check_size(params)?;
-        let uniforms = FrameUniforms::new(&buffers.scene, params, buffers.origin)?;
-        let look = &buffers.scene.look;
+        let uniforms = FrameUniforms::new(&buffers.scene, &buffers.look, params, buffers.origin)?;
         let size = [params.width, params.height];
-        let desc = TargetDesc::new(&self.gl, size, look, blend_storage(&self.gl, &buffers.scene, size)?);
+        let antialiasing = buffers.antialiasing(size);
+        let blend_storage = blend_storage(&self.gl, &buffers.scene, size)?;
+        let desc = TargetDesc::new(&self.gl, size, &buffers.look, antialiasing.samples, blend_storage);
         let desc = TargetDesc { culling: buffers.culling(), ..desc };
         self.ensure_target(desc)?;
         let has_edges = params.edges.is_some();
@@ -141,6 +151,7 @@ impl Renderer {
         if has_edges {
             buffers.ensure_inner_edges(&self.gl)?;
         }
+        let encode = buffers.encode_program(antialiasing.method, &mut |source| self.programs.program(source))?;
         let Some(target) = self.targets.last() else { return Err(fault("draw", "no target")) };
         let slot = if has_readback { Some(target.readback_ring.acquire(self.frame_timeout)?) } else { None };
         // If a pass fails or panics, the images of the target are undefined. Therefore the target is not in the cache
@@ -148,14 +159,16 @@ impl Renderer {
         self.last_frame = None;
         let Some(target) = self.targets.pop() else { return Err(fault("draw", "no target")) };
         target.draw_region.set(draw_region(buffers, params));
-        let is_divided = self.is_divided(size, desc.samples);
+        let is_divided = self.exceeds_band_limit(size, desc.samples);
         let steps = plan_steps(&target, slot.is_some(), self.band_limit.max_pixels(desc.samples));
         Ok(PartialFrame {
             params: *params,
             uniforms,
             programs,
+            encode,
             slot,
             stats: FrameStats { samples: desc.samples, ..FrameStats::default() },
+            info: frame_info(buffers, params, FrameAntialiasing { samples: desc.samples, ..antialiasing }),
             timers: Vec::new(),
             is_divided,
             has_breaks: is_divided || !buffers.is_drawn_with(desc.samples),
@@ -172,7 +185,7 @@ impl Renderer {
     /// `Fault` with the pass if OpenGL reports an error. The frame must then be dropped.
     pub fn submit_step(&mut self, buffers: &SceneBuffers, partial_frame: &mut PartialFrame) -> Result<()> {
         let _current = self.gl.make_current()?;
-        let PartialFrame { params, uniforms, target, programs, slot, stats, timers, steps, .. } = partial_frame;
+        let PartialFrame { params, uniforms, target, programs, encode, slot, stats, timers, steps, .. } = partial_frame;
         let mut recorder = PassRecorder { gl: &self.gl, stats };
         if std::mem::replace(&mut partial_frame.is_begun, true) {
             // Commands of other scenes may have changed the bindings.
@@ -180,7 +193,7 @@ impl Renderer {
         } else {
             passes::uniforms::upload(&recorder, buffers, params, uniforms);
         }
-        let frame = FrameContext { buffers, target, programs, params };
+        let frame = FrameContext { buffers, target, programs, encode, params };
         let has_breaks = partial_frame.has_breaks;
         while let Some(step) = steps.pop_front() {
             match step {
@@ -217,7 +230,7 @@ impl Renderer {
             return Err(fault("draw", "expected a frame whose steps are all submitted"));
         }
         let _current = self.gl.make_current()?;
-        let PartialFrame { uniforms, target, slot, timers, stats, .. } = partial_frame;
+        let PartialFrame { uniforms, target, slot, timers, stats, info, .. } = partial_frame;
         let desc = target.desc;
         // A frame with an equal description may have been drawn between the steps of this one.
         self.targets.retain(|cached_target| cached_target.desc != desc);
@@ -232,6 +245,7 @@ impl Renderer {
             fence: self.gl.fence(Pass::Read.name())?,
             passes: timers,
             stats,
+            info,
             timeout: self.frame_timeout,
             first_wait: Cell::new(None),
         })
@@ -361,6 +375,17 @@ fn plan_steps(target: &RenderTarget, has_readback: bool, max_pixels: u64) -> Vec
         }
     }
     steps
+}
+
+/// How a frame is drawn, without the rasterizers.
+fn frame_info(buffers: &SceneBuffers, params: &FrameParams, antialiasing: FrameAntialiasing) -> FrameInfo {
+    let FrameAntialiasing { method: antialias, samples } = antialiasing;
+    let preset = buffers.look.preset.and_then(|request| request.preset);
+    FrameInfo {
+        raster_backends: RasterBackends::default(),
+        look: Some(FrameLook { preset, antialias, samples, shadow: buffers.look.shadow }),
+        below_ground: depth_below_ground(&buffers.scene, params, buffers.origin),
+    }
 }
 
 /// Region of the frame that may show triangles.

@@ -9,7 +9,7 @@ use crate::device::gl::{Fence, PassTimer, ReadbackView};
 use crate::device::readback_ring::ReadbackSlot;
 use crate::pass::{FrameTimes, Pass, RenderStage};
 use crate::resources::target_desc::TargetDesc;
-use crate::types::{FrameImage, FrameStats, RasterBackends};
+use crate::types::{FrameImage, FrameInfo, FrameStats};
 use modalcast_model::error::{Error, Result};
 
 /// Bytes that one parallel task copies: enough to hide the cost of starting the task.
@@ -25,6 +25,8 @@ pub struct PendingFrame {
     /// Passes in execution order, each with its timer.
     pub(super) passes: Vec<(Pass, PassTimer)>,
     pub(super) stats: FrameStats,
+    /// Without the rasterizers, which `stats` contains.
+    pub(super) info: FrameInfo,
     /// Maximum time from `first_wait` until the frame is finished.
     pub(super) timeout: Duration,
     /// When the host first polled or waited for the frame.
@@ -39,7 +41,7 @@ pub struct MappedPixels {
     pub(super) height: u32,
     pub(super) view: Option<ReadbackView>,
     pub(super) times: FrameTimes,
-    pub(super) raster_backends: RasterBackends,
+    pub(super) info: FrameInfo,
 }
 
 impl PendingFrame {
@@ -95,13 +97,13 @@ impl MappedPixels {
     /// Copies the pixels, with several threads if there are many.
     pub fn into_image(self) -> FrameImage {
         let begin = Instant::now();
-        let Self { width, height, view, mut times, raster_backends } = self;
+        let Self { width, height, view, mut times, info } = self;
         let bytes = view.as_ref().map_or(&[][..], ReadbackView::bytes);
         let mut rgba = vec![0; bytes.len()];
         let chunks = rgba.par_chunks_mut(COPY_CHUNK_BYTES).zip(bytes.par_chunks(COPY_CHUNK_BYTES));
         chunks.for_each(|(destination, source)| destination.copy_from_slice(source));
         drop(view);
         times.add(RenderStage::Read, begin.elapsed().as_secs_f64() * 1e3);
-        FrameImage { width, height, rgba, times, raster_backends }
+        FrameImage { width, height, rgba, times, info }
     }
 }

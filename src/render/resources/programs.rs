@@ -7,7 +7,7 @@ use crate::device::gl::{Gl, PendingProgram, Program};
 use crate::scene_data::geometry::{BlendMode, DrawGroup};
 use crate::shaders::{self, ProgramSource, ShaderOptions};
 use modalcast_model::error::Result;
-use modalcast_model::scene::RenderSettings;
+use modalcast_model::scene::{Antialiasing, RenderSettings};
 
 /// Maximum number of programs in the cache.
 const MAX_PROGRAMS: usize = 128;
@@ -95,7 +95,9 @@ pub(crate) struct OitPrograms {
 /// Post-processing programs for the look (the render settings) of a scene.
 #[derive(Debug)]
 pub(crate) struct PostPrograms {
+    /// Encodes frames with the antialiasing `antialias`.
     pub(crate) encode: Rc<Program>,
+    pub(crate) antialias: Antialiasing,
     pub(crate) bloom: Option<BloomPrograms>,
 }
 
@@ -257,7 +259,12 @@ impl OitPrograms {
 }
 
 impl PostPrograms {
-    pub(crate) fn compile(look: &RenderSettings, compile: &mut ProgramCompiler<'_>) -> Result<Self> {
+    /// `antialias`: the antialiasing of most frames.
+    pub(crate) fn compile(
+        look: &RenderSettings,
+        antialias: Antialiasing,
+        compile: &mut ProgramCompiler<'_>,
+    ) -> Result<Self> {
         let bloom = match look.bloom {
             Some(bloom) => Some(BloomPrograms {
                 downsample: compile(shaders::post::bloom_downsample())?,
@@ -266,6 +273,6 @@ impl PostPrograms {
             }),
             None => None,
         };
-        Ok(Self { encode: compile(shaders::post::encode(look))?, bloom })
+        Ok(Self { encode: compile(shaders::post::encode(look, antialias))?, antialias, bloom })
     }
 }

@@ -28,7 +28,10 @@ use crate::shaders::{ImageFilter, MaterialUse, ProgramSource, ShaderOptions, pos
 use crate::types::{BlurMethod, FrameParams};
 use modalcast_model::error::Result;
 use modalcast_model::raster::{GlVertexBuffers, RasterGeometry, Rasterizer};
-use modalcast_model::scene::{Culling, Scene};
+use modalcast_model::scene::{Antialiasing, Culling, FrameAntialiasing, RenderSettings, RendererKind, Scene};
+
+/// Programs are compiled in advance for frames of this size: the default size of a picture.
+const TYPICAL_FRAME_SIZE: [u32; 2] = [1280, 720];
 
 /// A scene's buffers, textures and programs on the device; freed when dropped.
 #[derive(Debug)]
@@ -37,6 +40,9 @@ pub struct SceneBuffers {
     /// that it has registered.
     pub(crate) compute_rasterizer: Option<ComputeRasterizer>,
     pub(crate) scene: Arc<Scene>,
+    /// The scene's look, with the shadow map for this renderer.
+    pub(crate) look: RenderSettings,
+    renderer_kind: RendererKind,
     /// Its deformed positions are called shared positions, because a deformer may write their buffer directly
     /// ([`Self::vertex_buffers`]).
     pub(crate) geometry: GeometryBuffers<Buffer>,
@@ -60,7 +66,7 @@ pub struct SceneBuffers {
     pub(crate) shadow_cache: ShadowCache,
     pub(crate) programs: ScenePrograms,
     pub(crate) post: PostPrograms,
-    /// Programs for the look's number of samples per pixel.
+    /// Programs for the number of samples per pixel of a frame of [`TYPICAL_FRAME_SIZE`].
     sample_programs: SampleCountPrograms,
     /// Parameters of the shader sources, to compile further programs.
     options: ShaderOptions,
@@ -141,9 +147,10 @@ pub(crate) fn collect_program_sources(
         Ok(Rc::clone(placeholder))
     };
     ScenePrograms::compile(&options, &groups, collect)?;
-    PostPrograms::compile(&scene.look, collect)?;
-    let has_edges = scene.look.edges.is_some();
-    SampleCountPrograms::compile(&options, &groups, samples_of(scene, sample_positions), has_edges, collect)?;
+    let antialiasing = antialiasing(scene, gl.limits.renderer_kind(), TYPICAL_FRAME_SIZE);
+    PostPrograms::compile(&scene.look, antialiasing.method, collect)?;
+    let (samples, has_edges) = (supported_samples(antialiasing, sample_positions), scene.look.edges.is_some());
+    SampleCountPrograms::compile(&options, &groups, samples, has_edges, collect)?;
     Ok(sources)
 }
 
@@ -165,9 +172,15 @@ fn shader_options(
     }
 }
 
-/// Samples per pixel of the look. A device without 4x multisampling has no sample positions, and one sample per pixel.
-fn samples_of(scene: &Scene, sample_positions: &[[f32; 2]]) -> u32 {
-    if sample_positions.is_empty() { 1 } else { scene.look.samples_per_pixel() }
+/// The antialiasing that the look of a scene has for a frame.
+pub(crate) fn antialiasing(scene: &Scene, renderer_kind: RendererKind, [width, height]: [u32; 2]) -> FrameAntialiasing {
+    let pixels = u64::from(width) * u64::from(height);
+    scene.look.frame_antialiasing(renderer_kind, scene.layout.triangles, pixels)
+}
+
+/// Samples per pixel. A device without 4x multisampling has no sample positions, and one sample per pixel.
+fn supported_samples(antialiasing: FrameAntialiasing, sample_positions: &[[f32; 2]]) -> u32 {
+    if sample_positions.is_empty() { 1 } else { antialiasing.samples }
 }
 
 impl SceneBuffers {
@@ -191,7 +204,10 @@ impl SceneBuffers {
         plan_allocations.sort_by(|a, b| a.name.cmp(&b.name));
         let SceneBufferSet { geometry, materials, uniforms, culling } = buffers;
         let options = shader_options(gl, scene, features, &texture_arrays, sample_positions);
-        let samples = samples_of(scene, sample_positions);
+        let renderer_kind = gl.limits.renderer_kind();
+        let look = scene.look.with_shadow_map_for(renderer_kind);
+        let antialiasing = antialiasing(scene, renderer_kind, TYPICAL_FRAME_SIZE);
+        let samples = supported_samples(antialiasing, sample_positions);
         let cull_resources = match culling {
             Some(culling) => {
                 let arrays = CullVertexArrays {
@@ -206,6 +222,8 @@ impl SceneBuffers {
         Ok(Self {
             compute_rasterizer: None,
             scene: Arc::clone(scene),
+            look,
+            renderer_kind,
             buffer_textures: BufferTextures::new(gl, &geometry, &materials)?,
             position_array: position_array(gl, &geometry.positions, &geometry.triangle_vertices)?,
             corner_array: corner_array(gl, &geometry, &geometry.triangles)?,
@@ -219,7 +237,7 @@ impl SceneBuffers {
             shadow: features.shadow.map(|shadow| ShadowMap::new(gl, shadow, features.blur_method)).transpose()?,
             shadow_cache: ShadowCache::default(),
             programs: ScenePrograms::compile(&options, &mesh.groups, compile)?,
-            post: PostPrograms::compile(&scene.look, compile)?,
+            post: PostPrograms::compile(&look, antialiasing.method, compile)?,
             sample_programs: {
                 let has_edges = scene.look.edges.is_some();
                 SampleCountPrograms::compile(&options, &mesh.groups, samples, has_edges, compile)?
@@ -237,8 +255,25 @@ impl SceneBuffers {
         })
     }
 
+    /// The antialiasing that the look has for a frame of this size in pixels. The device may support fewer samples.
+    pub(crate) fn antialiasing(&self, size: [u32; 2]) -> FrameAntialiasing {
+        antialiasing(&self.scene, self.renderer_kind, size)
+    }
+
+    /// Program that encodes frames with this antialiasing, compiled unless most frames use it.
+    pub(crate) fn encode_program(
+        &self,
+        antialias: Antialiasing,
+        compile: &mut ProgramCompiler<'_>,
+    ) -> Result<Rc<Program>> {
+        match self.post.antialias == antialias {
+            true => Ok(Rc::clone(&self.post.encode)),
+            false => compile(post::encode(&self.look, antialias)),
+        }
+    }
+
     /// Programs for this number of samples per pixel, with or without lines along mesh edges. Programs that differ from
-    /// those of the look are compiled.
+    /// those of most frames are compiled.
     pub(crate) fn sample_programs(
         &self,
         samples: u32,

@@ -47,10 +47,16 @@ impl TargetDesc {
         culling: Culling::None,
     };
 
-    /// Target of a frame of a look.
-    pub(crate) fn new(gl: &Gl, [width, height]: [u32; 2], look: &RenderSettings, blend_storage: BlendStorage) -> Self {
+    /// Target of a frame of a look, with at most `samples` samples per pixel.
+    pub(crate) fn new(
+        gl: &Gl,
+        size: [u32; 2],
+        look: &RenderSettings,
+        samples: u32,
+        blend_storage: BlendStorage,
+    ) -> Self {
         let bloom_levels = look.bloom.map_or(0, |bloom| bloom.levels);
-        Self { blend_storage, bloom_levels, ..Self::ids_and_depth(gl, [width, height], look.samples_per_pixel()) }
+        Self { blend_storage, bloom_levels, ..Self::ids_and_depth(gl, size, samples) }
     }
 
     /// Target with ids and depth only. It has `samples` samples per pixel if the device and the frame size allow it,

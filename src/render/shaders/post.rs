@@ -54,14 +54,14 @@ pub(crate) fn bloom_upsample(look: &RenderSettings, bloom: Bloom, is_composite: 
 }
 
 /// Encodes the scene color to sRGB bytes.
-pub(crate) fn encode(look: &RenderSettings) -> ProgramSource {
+pub(crate) fn encode(look: &RenderSettings, antialias: Antialiasing) -> ProgramSource {
     let mut text = format!(
         "{VERSION}#define WORKGROUP_SIZE {WORKGROUP_SIZE}\n{BAND}layout(binding = 0) uniform sampler2D scene_color;\n"
     );
     if look.dither {
         text += "#define DITHER\n";
     }
-    if look.antialias == Antialiasing::Fxaa {
+    if antialias == Antialiasing::Fxaa {
         text += "#define FXAA\n";
         text += FXAA;
     }
@@ -80,7 +80,7 @@ mod tests {
     #[test]
     fn sources_contain_only_features_of_the_look() {
         let default_look = RenderSettings::default();
-        let encode_text = text(encode(&default_look));
+        let encode_text = text(encode(&default_look, default_look.antialias));
         assert!(!encode_text.contains("#define FXAA") && !encode_text.contains("fxaa_color(ivec2 pixel) {"));
         assert!(!encode_text.contains("#define DITHER"));
         let resolve_text = sample_resolve(&default_look);
@@ -94,7 +94,7 @@ mod tests {
             dither: true,
             ..default_look
         };
-        let (encode_text, resolve_text) = (text(encode(&full_look)), sample_resolve(&full_look));
+        let (encode_text, resolve_text) = (text(encode(&full_look, full_look.antialias)), sample_resolve(&full_look));
         assert!(encode_text.contains("#define FXAA") && encode_text.contains("fxaa_color(ivec2 pixel) {"));
         assert!(encode_text.contains("#define DITHER"));
         assert!(resolve_text.contains("#define EXPOSURE 1.5\n") && resolve_text.contains("#define ACES"));

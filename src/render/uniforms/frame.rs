@@ -7,7 +7,7 @@ use super::MIN_SIZE;
 use super::light_box::{LightBox, LightBoxParams};
 use crate::types::FrameParams;
 use modalcast_model::error::{Result, invalid};
-use modalcast_model::scene::{BoundingBox, OrientedBounds, Scene};
+use modalcast_model::scene::{BoundingBox, OrientedBounds, RenderSettings, Scene};
 
 /// Uniform block of a frame; matrices are column-major. Twin of `FrameBlock` in `shaders/shared/frame.glsl`.
 #[repr(C)]
@@ -44,20 +44,23 @@ const _: () = assert!(size_of::<FrameUniforms>() == 384, "FrameUniforms differs 
 /// distance d. At the border it is exp(-36), so the rounded color is that of the horizon.
 const GROUND_EXTENT: f64 = 6.0;
 
+/// Vertices that lie less than this fraction of the diagonal below the ground count as on the ground: the largest error of
+/// deformed vertices.
+const GROUND_TOLERANCE: f64 = 1e-5;
+
 impl FrameUniforms {
-    /// Computes the uniforms of one frame. Positions are relative to `origin`, a point in scene units from the scene's
-    /// origin; it is subtracted from the camera in f64.
+    /// Computes the uniforms of one frame. `look`: the scene's look with the shadow map for the renderer. Positions are
+    /// relative to `origin`, a point in scene units from the scene's origin; it is subtracted from the camera in f64.
     ///
     /// # Errors
     /// `Invalid` if the camera's matrices overflow.
-    pub(crate) fn new(scene: &Scene, params: &FrameParams, origin: [f64; 3]) -> Result<Self> {
+    pub(crate) fn new(scene: &Scene, look: &RenderSettings, params: &FrameParams, origin: [f64; 3]) -> Result<Self> {
         let bounds = finite_bounds(scene, params);
         let rest_bounds = rebased_rest_bounds(scene, bounds, origin);
-        let look = &scene.look;
         let to_sun = look.to_sun(scene.up);
         let ground_height = rest_bounds.min[scene.up.index()];
         let shadow = look.shadow.unwrap_or_default();
-        let light_box = LightBox::fit(&light_box_params(scene, params, origin));
+        let light_box = LightBox::fit(&light_box_params(scene, look, params, origin));
         let rebased_camera = params.camera.relative_to(origin);
         let camera_from_world = rebased_camera.camera_from_world();
         let clip_from_camera = clip_from_camera(scene, params, origin);
@@ -125,8 +128,13 @@ pub(crate) fn clip_from_positions(scene: &Scene, params: &FrameParams, origin: [
 
 /// Matrix from positions relative to `origin` to the clip space of the shadow map; z is 1 nearest to the sun and 0 at the
 /// far plane.
-pub(crate) fn shadow_clip_from_positions(scene: &Scene, params: &FrameParams, origin: [f64; 3]) -> Matrix4<f64> {
-    let shadow_from_world = LightBox::fit(&light_box_params(scene, params, origin)).shadow_from_world;
+pub(crate) fn shadow_clip_from_positions(
+    scene: &Scene,
+    look: &RenderSettings,
+    params: &FrameParams,
+    origin: [f64; 3],
+) -> Matrix4<f64> {
+    let shadow_from_world = LightBox::fit(&light_box_params(scene, look, params, origin)).shadow_from_world;
     let clip_from_shadow = Matrix4::new_nonuniform_scaling(&Vector3::new(2.0, 2.0, -1.0));
     Matrix4::new_translation(&Vector3::new(-1.0, -1.0, 1.0)) * clip_from_shadow * shadow_from_world
 }
@@ -142,27 +150,33 @@ fn finite_light_bounds(params: &FrameParams) -> Option<OrientedBounds> {
     params.light_bounds.filter(|light_bounds| light_bounds.is_valid() && params.bounds.is_finite())
 }
 
-/// Inputs of the light box, for positions relative to `origin`.
-pub(crate) fn light_box_params(scene: &Scene, params: &FrameParams, origin: [f64; 3]) -> LightBoxParams {
+/// Inputs of the light box, for positions relative to `origin`. `look`: as for [`FrameUniforms::new`].
+pub(crate) fn light_box_params(
+    scene: &Scene,
+    look: &RenderSettings,
+    params: &FrameParams,
+    origin: [f64; 3],
+) -> LightBoxParams {
     let bounds = finite_bounds(scene, params);
     let ground_height = rebased_rest_bounds(scene, bounds, origin).min[scene.up.index()];
-    let shadow = scene.look.shadow.unwrap_or_default();
+    let shadow = look.shadow.unwrap_or_default();
     LightBoxParams {
-        to_sun: scene.look.to_sun(scene.up),
+        to_sun: look.to_sun(scene.up),
         up: scene.up,
         bounds,
         light_bounds: finite_light_bounds(params),
-        ground: scene.look.ground.map(|_| ground_height),
+        ground: look.ground.map(|_| ground_height),
         size: f64::from(shadow.size),
         margin: f64::from(shadow.blur_radius()) + 1.0,
     }
 }
 
 /// Sides of a shadow map texel in world space: two vectors along x and y of the map, in scene units. None if the look
-/// has no shadow. Valid for positions relative to the scene's origin.
+/// has no shadow. Valid for positions relative to the scene's origin, and for the map of `scene.look`, which the renderer
+/// draws if the look leaves nothing to a preset.
 pub fn shadow_texel_axes(scene: &Scene, params: &FrameParams) -> Option<[Vector3<f64>; 2]> {
     let shadow = scene.look.shadow?;
-    let shadow_from_world = LightBox::fit(&light_box_params(scene, params, [0.0; 3])).shadow_from_world;
+    let shadow_from_world = LightBox::fit(&light_box_params(scene, &scene.look, params, [0.0; 3])).shadow_from_world;
     // One texel is a step of 1 / size in a map coordinate, which is the product of a matrix row and the position.
     let texel_axis = |row: usize| {
         let row_vector = shadow_from_world.fixed_view::<1, 3>(row, 0).transpose();
@@ -172,15 +186,26 @@ pub fn shadow_texel_axes(scene: &Scene, params: &FrameParams) -> Option<[Vector3
 }
 
 /// Matrix from world space to the clip space of the shadow map; z is 1 nearest to the sun. None if the look has no
-/// shadow. Valid for positions relative to the scene's origin.
+/// shadow. Valid as [`shadow_texel_axes`].
 pub fn shadow_clip_from_world(scene: &Scene, params: &FrameParams) -> Option<Matrix4<f64>> {
-    scene.look.shadow.map(|_| shadow_clip_from_positions(scene, params, [0.0; 3]))
+    scene.look.shadow.map(|_| shadow_clip_from_positions(scene, &scene.look, params, [0.0; 3]))
 }
 
 /// Whether the camera is above the ground; the ground is not visible from below.
 fn camera_is_above_ground(scene: &Scene, params: &FrameParams) -> bool {
     let up = scene.up.index();
     params.camera.eye()[up] > scene.rest_bounds.min[up]
+}
+
+/// How far the lowest vertex of a frame lies below the ground in meters; see [`crate::FrameInfo::below_ground`].
+/// `origin`: origin of the bounds, in scene units from the scene's origin. Bounds that are empty or not finite give 0.
+pub(crate) fn depth_below_ground(scene: &Scene, params: &FrameParams, origin: [f64; 3]) -> f64 {
+    let up = scene.up.index();
+    let depth = scene.rest_bounds.min[up] - (params.bounds.min[up] + origin[up]);
+    let is_below = scene.look.ground.is_some()
+        && params.bounds.is_finite()
+        && depth > GROUND_TOLERANCE * scene.rest_bounds.diagonal();
+    if is_below { depth * scene.unit } else { 0.0 }
 }
 
 /// Distance of the origin from the scene's origin, in diagonals of the rest bounds, from which the ground is centered at
@@ -273,6 +298,36 @@ mod tests {
     }
 
     #[test]
+    fn depth_below_ground_is_exact_above_the_vertex_error() {
+        let mut parts = squares(vec![Material::default()]);
+        parts.unit = 0.5;
+        let scene = Scene::new(parts.clone()).expect("a valid scene");
+        parts.look.ground = None;
+        let without_ground = Scene::new(parts).expect("a valid scene");
+        let (bounds, tolerance) = (scene.rest_bounds, 1e-5 * scene.rest_bounds.diagonal());
+        let params = |bounds| FrameParams {
+            camera: Camera::fit_to_scene(&scene, 64, 64),
+            width: 64,
+            height: 64,
+            bounds,
+            light_bounds: None,
+        };
+        // y is the up axis.
+        let lowered = |depth: f64| BoundingBox { min: [bounds.min[0], bounds.min[1] - depth, bounds.min[2]], ..bounds };
+        let depth = |bounds, origin| depth_below_ground(&scene, &params(bounds), origin);
+        for (lowered_by, expected) in [(0.0, 0.0), (-1.0, 0.0), (0.9 * tolerance, 0.0), (3.0, 1.5)] {
+            let got = depth(lowered(lowered_by), [0.0; 3]);
+            assert!((got - expected).abs() < 1e-12, "{lowered_by} scene units: expected {expected} m, got {got} m");
+        }
+        assert!(depth(lowered(1.1 * tolerance), [0.0; 3]) > 0.0);
+        // Bounds relative to an origin.
+        assert_eq!([2.0, -2.0].map(|height| depth(bounds, [7.0, height, 7.0])), [0.0, 1.0]);
+        assert_eq!(depth_below_ground(&without_ground, &params(lowered(3.0)), [0.0; 3]), 0.0);
+        let not_finite = BoundingBox { min: [f64::NEG_INFINITY; 3], max: [f64::NAN; 3] };
+        assert_eq!([depth(BoundingBox::EMPTY, [0.0; 3]), depth(not_finite, [0.0; 3])], [0.0; 2]);
+    }
+
+    #[test]
     fn replaces_overflowed_bounds_and_rejects_overflowed_cameras() {
         let scene = Scene::new(squares(vec![Material::default()])).expect("a valid scene");
         let mut params = FrameParams {
@@ -283,17 +338,23 @@ mod tests {
             light_bounds: None,
             edges: None,
         };
-        let uniforms = FrameUniforms::new(&scene, &params, [0.0; 3]).expect("finite uniforms");
+        let uniforms = FrameUniforms::new(&scene, &scene.look, &params, [0.0; 3]).expect("finite uniforms");
         assert!(uniforms.eye[3] > 0.0, "expected a camera above the ground");
         for bounds in [BoundingBox::EMPTY, BoundingBox { min: [f64::NAN; 3], max: [f64::INFINITY; 3] }] {
             let replaced_uniforms =
-                FrameUniforms::new(&scene, &FrameParams { bounds, ..params }, [0.0; 3]).expect("finite uniforms");
+                FrameUniforms::new(&scene, &scene.look, &FrameParams { bounds, ..params }, [0.0; 3])
+                    .expect("finite uniforms");
             assert_eq!(replaced_uniforms, uniforms, "expected the rest bounds in place of overflowed ones");
         }
         let light_bounds = OrientedBounds(BoundingBox { min: [-0.25; 3], max: [0.25; 3] });
         let uniforms_with = |light_bounds| {
-            FrameUniforms::new(&scene, &FrameParams { light_bounds: Some(light_bounds), ..params }, [0.0; 3])
-                .expect("finite uniforms")
+            FrameUniforms::new(
+                &scene,
+                &scene.look,
+                &FrameParams { light_bounds: Some(light_bounds), ..params },
+                [0.0; 3],
+            )
+            .expect("finite uniforms")
         };
         assert_ne!(uniforms_with(light_bounds), uniforms, "expected an effect of valid light bounds");
         for invalid_bounds in
@@ -302,7 +363,7 @@ mod tests {
             assert_eq!(uniforms_with(invalid_bounds), uniforms, "{invalid_bounds:?}");
         }
         params.camera.view = View::LookAt { eye: [1e300, 0.0, 0.0], target: [0.0; 3], up: [0.0, 1.0, 0.0] };
-        let error = FrameUniforms::new(&scene, &params, [0.0; 3]).expect_err("an overflow").to_string();
+        let error = FrameUniforms::new(&scene, &scene.look, &params, [0.0; 3]).expect_err("an overflow").to_string();
         assert!(error.starts_with("camera:"), "{error}");
     }
 }

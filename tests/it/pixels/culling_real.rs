@@ -16,8 +16,9 @@ use super::harness::open_renderer;
 const SIZE: [u32; 2] = [1920, 1080];
 const FRAME_COUNT: usize = 9;
 
-/// A copy of the scene with other render settings.
+/// A copy of the scene with other render settings, of which none is left to a preset.
 fn replace_look(scene: &Scene, look: RenderSettings) -> Arc<Scene> {
+    let look = RenderSettings { preset: None, ..look };
     Scene::new(SceneParts { look, ..scene.parts() }).expect("expected a valid scene")
 }
 

@@ -273,7 +273,7 @@ fn opengl_and_compute_frames_share_a_target() {
             camera_at(x),
             if frame_index % 2 == 0 { Backend::OpenGl } else { Backend::Compute(0.0) },
         );
-        assert_eq!(image.raster_backends, expected.stats.raster_backends);
+        assert_eq!(image.info.raster_backends, expected.stats.raster_backends);
         assert!(image.rgba == expected.image.rgba, "frame {frame_index}");
         let triangle_pixels = expected.ids.iter().filter(|id| matches!(id, VisibilityId::Triangle(_))).count();
         assert!(
@@ -404,13 +404,16 @@ fn cameras_share_the_shadow_and_rebased_scenes_use_opengl() {
     assert_eq!(draw(&mut renderer, &buffers, &first_params).1, [Pass::RasterShadow, Pass::Blur]);
     let (shared_image, passes) = draw(&mut renderer, &buffers, &second_params);
     assert_eq!(passes, [Pass::RasterVisibility, Pass::Unpack], "expected no second shadow pass");
-    assert_eq!(shared_image.raster_backends, RasterBackends { shadow: None, visibility: Some(RasterBackend::Cuda) });
+    assert_eq!(
+        shared_image.info.raster_backends,
+        RasterBackends { shadow: None, visibility: Some(RasterBackend::Cuda) }
+    );
     assert!(shared_image.rgba == unshared_image.rgba, "expected the same image with a shared shadow");
     let positions = deformer.surface().expect("expected a surface").positions.clone();
     renderer.upload_rebased(&mut buffers, &positions, [0.0; 3]).expect("expected the upload to succeed");
     let (rebased_image, passes) = draw(&mut renderer, &buffers, &second_params);
     assert_eq!(
-        (passes[0], rebased_image.raster_backends.visibility),
+        (passes[0], rebased_image.info.raster_backends.visibility),
         (Pass::Shadow, Some(RasterBackend::OpenGl)),
         "expected OpenGL for rebased positions"
     );
@@ -421,7 +424,7 @@ fn cameras_share_the_shadow_and_rebased_scenes_use_opengl() {
     );
     buffers.set_shared_origin([0.0; 3]);
     let (restored_image, _) = draw(&mut renderer, &buffers, &second_params);
-    assert_eq!(restored_image.raster_backends.visibility, Some(RasterBackend::Cuda));
+    assert_eq!(restored_image.info.raster_backends.visibility, Some(RasterBackend::Cuda));
     assert!(restored_image.rgba == unshared_image.rgba, "expected the same image as before `upload_rebased`");
 }
 
@@ -483,7 +486,7 @@ fn failing_rasterizer_falls_back_to_opengl() {
         assert_eq!(draw_calls, 1, "expected a disabled rasterizer after the first draw call");
         for frame in frames {
             let image = frame.expect("expected a frame");
-            assert_eq!(image.raster_backends, opengl_frame.stats.raster_backends);
+            assert_eq!(image.info.raster_backends, opengl_frame.stats.raster_backends);
             assert!(image.rgba == opengl_frame.image.rgba);
         }
     }
@@ -553,7 +556,7 @@ fn rasterizer_is_compiled_when_the_scene_is_loaded() {
             light_bounds: None,
             edges: None,
         };
-        let raster_backends = renderer.draw(&buffers, &params).expect("expected a frame").raster_backends;
+        let raster_backends = renderer.draw(&buffers, &params).expect("expected a frame").info.raster_backends;
         assert_eq!(raster_backends.visibility, Some(RasterBackend::OpenGl));
     }
 }

@@ -3,7 +3,7 @@
 //! `modalcast render tree --size 104x78 --eye 1.5,1.9,2.5 --target 0,1.8,0 --field-of-view 45`.
 
 use modalcast_model::load;
-use modalcast_model::scene::{Camera, Lens, View};
+use modalcast_model::scene::{Antialiasing, Camera, Lens, RenderSettings, Scene, SceneParts, ShadowSettings, View};
 use modalcast_render::FrameImage;
 
 use super::harness::{open_renderer, render_sized};
@@ -32,10 +32,13 @@ fn compare_images(image: &[u8], snapshot: &[u8]) -> DifferenceStats {
     DifferenceStats { mean, percentile_99: levels[levels.len() * 99 / 100], max: levels[levels.len() - 1] }
 }
 
-/// Renders the tree close to its trunk: normal map of the bark, cut-out leaves, shadow, ground and sky. Clip planes of
-/// 0 are fitted to the bounds of the scene.
+/// Renders the tree close to its trunk: normal map of the bark, cut-out leaves, variance shadow map, four samples per pixel,
+/// ground and sky. Clip planes of 0 are fitted to the bounds of the scene.
 fn render_tree(eye: [f64; 3]) -> FrameImage {
-    let scene = load::open("tree").expect("expected the built-in scene").scene;
+    let tree = load::open("tree").expect("expected the built-in scene").scene;
+    let shadow = Some(ShadowSettings::default());
+    let look = RenderSettings { preset: None, antialias: Antialiasing::Msaa, samples: 4, shadow, ..tree.look };
+    let scene = Scene::new(SceneParts { look, ..tree.parts() }).expect("expected a valid scene");
     let view = View::LookAt { eye, target: [0.0, 1.8, 0.0], up: [0.0, 1.0, 0.0] };
     let camera = Camera { view, lens: Lens::FieldOfView(45.0), near: 0.0, far: 0.0 };
     render_sized(&mut open_renderer(), &scene, camera, [104, 78]).image

@@ -477,6 +477,14 @@ fn encode_frame(output: &StepOutput, picture: &v1::Picture, index: u32) -> Vec<v
         visibility_drawn_by: v1::DrawnBy::Cuda.into(),
         picture: index,
         camera_version: 0,
+        look: Some(v1::FrameLook {
+            preset: v1::LookPreset::Best.into(),
+            antialiasing: v1::Antialiasing::Fxaa.into(),
+            samples: 1,
+            shadow_method: v1::ShadowMethod::Filtered.into(),
+            shadow_size: 512,
+        }),
+        below_ground: 0.25,
     });
     let chunk = |ByteChunk { offset, data, .. }| v1::FrameChunk { head: head.take(), offset, data };
     split_bytes(bytes).into_iter().map(chunk).collect()

@@ -5,7 +5,6 @@ use std::collections::{HashMap, HashSet};
 use std::path::PathBuf;
 
 use super::patch::{MaterialPatch, TextureLookup};
-use super::settings::LookKeys;
 use super::{DomainEntry, Manifest, TransformKind};
 use crate::backend_settings::{BackendSettings, RasterPolicy};
 use crate::domain::{Attachment, CreaseAngle, Domain, FollowConstraint, Material, Modes, Shape, Texture, Transform};
@@ -14,7 +13,7 @@ use crate::load::SceneDescription;
 use crate::load::asset_dir::AssetDir;
 use crate::load::surface::{ModelOptions, ModesSource};
 use crate::load::{modes, source, texture_cache};
-use crate::scene::{MAX_DOMAINS, SceneParts, UpAxis};
+use crate::scene::{MAX_DOMAINS, PresetRequest, SceneParts, UpAxis};
 
 /// Number of parent vertices that carry the domains of an entry without `parent_vertices`.
 const DEFAULT_ATTACHMENT_VERTICES: usize = 8;
@@ -52,7 +51,10 @@ pub(super) fn assemble(
     parts.up = manifest.up.unwrap_or(parts.up);
     parts.unit = manifest.unit.unwrap_or(parts.unit);
     parts.origin = manifest.origin;
-    parts.look = manifest.look.as_ref().map_or(parts.look, LookKeys::render_settings);
+    parts.look = match &manifest.look {
+        Some(keys) => keys.render_settings(),
+        None => parts.look.with_preset(PresetRequest::default()),
+    };
     parts.deformation = manifest.deform.deformation_settings();
     match manifest.shadows {
         Some(false) => parts.look.shadow = None,

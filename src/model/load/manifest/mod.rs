@@ -35,6 +35,7 @@ struct Manifest {
     origin: [f64; 3],
     #[serde(default)]
     transforms: TransformKind,
+    #[serde(default, deserialize_with = "settings::deserialize_look")]
     look: Option<LookKeys>,
     shadows: Option<bool>,
     ground: Option<bool>,

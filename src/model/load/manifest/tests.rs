@@ -4,8 +4,8 @@ use super::*;
 use crate::backend_settings::{BackendSettings, BatchPolicy, RasterPolicy};
 use crate::domain::{AlphaMode, Transform};
 use crate::scene::{
-    Antialiasing, Bloom, Culling, DeformationSettings, MomentFormat, NormalMethod, RenderSettings, SceneParts,
-    ShadowMethod, ShadowSettings, StorageType, ToneMapping,
+    Antialiasing, Bloom, Culling, DeformationSettings, LookOverrides, LookPreset, MomentFormat, NormalMethod,
+    PresetRequest, RenderSettings, SceneParts, ShadowMethod, ShadowSettings, StorageType, ToneMapping,
 };
 
 const TRIANGLE: &str = "mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl red\nf 1 2 3\n";
@@ -84,7 +84,8 @@ fn scene_keys_override_the_defaults() {
         assert!(message.contains("line 2"), "{message}");
     }
     let SceneDescription { parts, backends } = read_manifest("model = 'a.obj'\n").expect("a valid manifest");
-    assert_eq!((parts.look, backends), (RenderSettings::default(), BackendSettings::default()));
+    let default_look = RenderSettings::default().with_preset(PresetRequest::default());
+    assert_eq!((parts.look, backends), (default_look, BackendSettings::default()));
     assert_eq!((parts.name.as_str(), parts.up, parts.rigid_transforms), ("folder", UpAxis::Y, false));
     assert_eq!(parts.deformation, DeformationSettings::default());
     let message =
@@ -273,4 +274,39 @@ fn unrestricted_manifest_accepts_absolute_paths() {
     let parts = read_parts(&format!("model = '{}'\n", path.display())).expect("a valid manifest");
     assert_eq!(parts.domains[0].name, "x");
     assert!(path.is_absolute());
+}
+
+/// A preset by name, by key, and with overrides. Keys that are set win over the preset.
+#[test]
+fn look_is_a_preset_or_a_table_with_overrides() {
+    let request = |look: &str| {
+        let parts = read_parts(&format!("model = 'a.obj'\n{look}\n")).unwrap_or_else(|error| panic!("{look}: {error}"));
+        crate::scene::Scene::new(parts).expect("a valid scene").look.preset.expect("a preset request")
+    };
+    let preview = PresetRequest { preset: Some(LookPreset::Preview), ..PresetRequest::default() };
+    assert_eq!(request(""), PresetRequest::default());
+    assert_eq!((request("look = 'preview'"), request("look.preset = 'preview'")), (preview, preview));
+    let overrides = LookOverrides { samples: Some(4), shadow_size: Some(256), ..LookOverrides::default() };
+    let table = "look = { preset = 'preview', samples = 4, shadow = { size = 256 }, sunlight = [1, 2, 3] }";
+    assert_eq!(request(table), PresetRequest { overrides, ..preview });
+    assert_eq!(request("look.samples = 1").overrides.samples, Some(1));
+    // The compute rasterizer implies a variance map.
+    let method = |look| request(look).overrides.shadow_method;
+    let named = "look = { raster = 'cuda', shadow.method = 'filtered' }";
+    let methods = [method("look.raster = 'cuda'"), method(named), method("look.raster = 'opengl'")];
+    assert_eq!(methods, [Some(ShadowMethod::Variance), Some(ShadowMethod::PercentageCloser), None]);
+    for (look, expected) in [
+        ("look = 'fast'", "unknown variant `fast`, expected one of `preview`, `standard`, `best`"),
+        ("look = 3", "the name of a preset, or a table"),
+        ("look.preset = 'fast'", "unknown variant `fast`"),
+    ] {
+        let message = read_parts(&format!("model = 'a.obj'\n{look}\n")).expect_err(look).to_string();
+        assert!(message.contains("line 2") && message.contains(expected), "{look}: {message}");
+    }
+    for (look, expected) in [("samples = 3", "look.samples: expected 1 or 4"), ("shadow.size = 8", "look.shadow.size")]
+    {
+        let parts = read_parts(&format!("model = 'a.obj'\nlook.preset = 'preview'\nlook.{look}\n")).expect(look);
+        let message = crate::scene::Scene::new(parts).expect_err(look).to_string();
+        assert!(message.contains(expected), "{look}: {message}");
+    }
 }

@@ -1,6 +1,7 @@
 //! Limits and features of an OpenGL context.
 
 use glow::HasContext as _;
+use modalcast_model::scene::RendererKind;
 
 /// GL_SUBPIXEL_BITS, which glow does not define.
 const SUBPIXEL_BITS: u32 = 0x0D50;
@@ -44,6 +45,11 @@ pub(crate) struct Limits {
 }
 
 impl Limits {
+    /// The kind of renderer, on which the choice of a look's parts depends.
+    pub(crate) const fn renderer_kind(&self) -> RendererKind {
+        if self.software { RendererKind::Software } else { RendererKind::Hardware }
+    }
+
     pub(super) fn of(gl: &glow::Context) -> Self {
         // SAFETY: queries that every 4.3 core context answers.
         unsafe {

@@ -9,12 +9,12 @@ use modalcast_model::domain::{Material, Texture};
 use modalcast_model::error::Result;
 use modalcast_model::scene::{Ground, RenderSettings, Scene, SceneParts};
 
-/// The scene with other render settings.
+/// The scene with other render settings, of which none is left to a preset.
 ///
 /// # Errors
 /// `Invalid` when the settings contradict each other.
 pub(super) fn with_settings(scene: &Scene, look: RenderSettings) -> Result<Arc<Scene>> {
-    Scene::new(SceneParts { look, ..scene.parts() })
+    Scene::new(SceneParts { look: RenderSettings { preset: None, ..look }, ..scene.parts() })
 }
 
 /// The scene with white, matte surfaces. The alpha of blended surfaces and cut-outs remains. The sunlight is 1, the

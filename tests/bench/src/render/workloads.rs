@@ -17,6 +17,7 @@ use std::sync::Arc;
 use nalgebra::{Matrix4, Rotation3, Vector3};
 
 use super::harness::Size;
+use super::light_meter::with_settings;
 use super::rigid_domain::add_rigid_domain;
 use super::texture_panels;
 use crate::motion::WorkloadMotion;
@@ -24,7 +25,7 @@ use crate::workloads::Workload;
 use modalcast_model::domain::{AlphaMode, Material, Mesh, Transform, smooth_normals};
 use modalcast_model::error::{Result, invalid};
 use modalcast_model::load;
-use modalcast_model::scene::{Camera, Lens, RenderSettings, Scene, SceneParts, SceneState, View};
+use modalcast_model::scene::{Antialiasing, Camera, Lens, RenderSettings, Scene, SceneParts, SceneState, View};
 
 /// Identifies a scene of the benchmark.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -114,8 +115,8 @@ impl RenderWorkload {
             Self::Shelf => (Scene::new(build_shelf()?)?, None),
             Self::Panes => (Scene::new(build_panes()?)?, Some(1)),
             Self::Images => (Scene::new(texture_panels::build_panels()?)?, Some(0)),
-            Self::Tree => (load::open("tree")?.scene, None),
-            Self::Grove => (Scene::new(build_grove(load::open("tree")?.scene.as_ref()))?, None),
+            Self::Tree => (open_tree()?, None),
+            Self::Grove => (Scene::new(build_grove(open_tree()?.as_ref()))?, None),
             Self::Triangles(count) => (Scene::new(build_field(count)?)?, Some(1)),
         };
         Ok(AnimatedScene::new(self, scene, sliding_domain))
@@ -304,6 +305,12 @@ fn build_panes() -> Result<SceneParts> {
     )?;
     parts.look = RenderSettings { sun: [0.35, 0.6, 0.7], ..RenderSettings::default() };
     Ok(parts)
+}
+
+/// Opens the built-in tree. All variants draw it with four samples per pixel, on every renderer.
+fn open_tree() -> Result<Arc<Scene>> {
+    let tree = load::open("tree")?.scene;
+    with_settings(&tree, RenderSettings { samples: 4, antialias: Antialiasing::Msaa, ..tree.look })
 }
 
 /// Builds four copies of one tree, each rotated and translated. The copies share shapes, materials and textures.

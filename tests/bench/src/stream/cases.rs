@@ -1,14 +1,11 @@
 //! The cases of the report. Cases of one scene follow each other, because they share a server.
 
-use super::StreamReportOptions;
 use super::delay::DelayedStream;
 use super::peers::viewer::Content;
 use super::rates::Viewers;
 use super::session::SceneSource;
+use super::{QUICK_DIVISOR, StreamReportOptions};
 use crate::workloads::Size;
-
-/// The width and the height of the pictures of a quick report are divided by this number.
-const QUICK_DIVISOR: u32 = 4;
 
 /// One case.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

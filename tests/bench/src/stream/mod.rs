@@ -54,6 +54,9 @@ const SCENE: &str = "scene";
 /// Maximum number of steps that are recorded to be sent from memory. Longer measurements repeat them.
 const RECORDED_STEPS: u64 = 120;
 
+/// The width and the height of the pictures of a quick report are divided by this number.
+const QUICK_DIVISOR: u32 = 4;
+
 /// Settings of a report.
 #[derive(Debug, Clone)]
 pub struct StreamReportOptions {

@@ -15,10 +15,12 @@ use tokio::runtime::Runtime;
 use super::grid;
 use super::motion::Motion;
 use super::processes::{Process, Program, arguments};
-use super::{SCENE, StreamReportOptions, peers};
+use super::{QUICK_DIVISOR, SCENE, StreamReportOptions, peers};
+use crate::workloads::Size;
 use modalcast_model::backend_settings::LookTable;
 use modalcast_model::error::{Error, Result, fault_in};
 use modalcast_model::load::{self, OpenedScene};
+use modalcast_model::scene::{FrameAntialiasing, RenderSettings, RendererKind};
 
 /// Longest time between the end of the server's connections and its own end.
 const SERVER_END: Duration = Duration::from_secs(1);
@@ -57,12 +59,15 @@ pub struct SceneLook {
 }
 
 impl SceneLook {
-    fn of(source: &str) -> Result<Self> {
+    /// The look with which a server draws frames of `pixels` pixels.
+    fn of(source: &str, renderer: RendererKind, pixels: u64) -> Result<Self> {
         let OpenedScene { scene, backends } = load::open(source)?;
-        let settings = scene.look;
+        let antialiasing = scene.look.frame_antialiasing(renderer, scene.layout.triangles, pixels);
+        let FrameAntialiasing { method: antialias, samples } = antialiasing;
+        let settings = RenderSettings { antialias, samples, ..scene.look.with_shadow_map_for(renderer) };
         Ok(Self {
             look: serde_json::to_value(LookTable { settings, raster: backends.raster }).map_err(fault_in("report"))?,
-            samples: settings.samples,
+            samples,
             shadow_map: settings.shadow.map(|shadow| shadow.size),
         })
     }
@@ -109,19 +114,20 @@ impl Session {
     /// `Fault` when the server fails; errors of loading the scene.
     pub(super) fn open(source: SceneSource, options: &StreamReportOptions) -> Result<Self> {
         let work = create_work_folder()?;
-        let (repository, look) = match source {
-            SceneSource::Tree => (None, Some(SceneLook::of(source.name())?)),
+        // The path of a scene that is drawn.
+        let (repository, drawn_scene) = match source {
+            SceneSource::Tree => (None, Some(PathBuf::from(source.name()))),
             SceneSource::Repository(path) => {
                 let folder = options.scenes.clone().unwrap_or_default();
-                let look = SceneLook::of(&folder.join(path).to_string_lossy())?;
-                (Some(folder), Some(look))
+                let path = folder.join(path);
+                (Some(folder), Some(path))
             }
             SceneSource::Grid => {
                 grid::write(work.path(), grid::side(options.size))?;
                 (Some(work.path().to_owned()), None)
             }
         };
-        let mut server = start_server(work.path(), repository.as_deref(), look.is_some())?;
+        let mut server = start_server(work.path(), repository.as_deref(), drawn_scene.is_some())?;
         let url = server.wait_for("listening on ")?;
         let address = url.trim_start_matches("http://").parse().map_err(fault_in("report"))?;
         let runtime = peers::start_runtime()?;
@@ -133,6 +139,11 @@ impl Session {
         });
         let (client, server_info, scene_info) =
             opened.map_err(|error: modalcast_client::Error| server.failure(&error.to_string()))?;
+        let renderer = if server_info.is_software_renderer { RendererKind::Software } else { RendererKind::Hardware };
+        // The look of the largest pictures.
+        let divisor = if options.size == Size::Quick { QUICK_DIVISOR } else { 1 };
+        let pixels = u64::from(1920 / divisor) * u64::from(1080 / divisor);
+        let look = drawn_scene.map(|path| SceneLook::of(&path.to_string_lossy(), renderer, pixels)).transpose()?;
         Ok(Self {
             source,
             runtime,

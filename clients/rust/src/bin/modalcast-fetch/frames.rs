@@ -26,6 +26,7 @@ pub(crate) async fn fetch_stream(client: &Client, options: &FrameStreamOptions, 
         let frame = result.unwrap_or(Err(Error::StreamEnded { awaited_reply: "the last frame" }))?;
         write_file(&options.out.join(format!("frame_{index:05}{suffix}.{}", extension(frame.format))), &frame)?;
         summary.add(&received_reply(&frame));
+        summary.add_frame_info(&frame);
         progress_bar.set_position(index + 1);
     }
     progress_bar.finish_and_clear();
@@ -42,6 +43,7 @@ pub(crate) async fn fetch_single(client: &Client, options: &SingleFrameOptions, 
     for (frame, suffix) in client.render_frames(&request).await?.iter().zip(options.picture.file_suffixes()) {
         write_file(&output_path(&options.out, &suffix, frame.format), frame)?;
         summary.add(&received_reply(frame));
+        summary.add_frame_info(frame);
     }
     summary.print("frames", &options.out, None, as_json);
     Ok(())

@@ -1,9 +1,10 @@
 //! Output of the commands: summaries as text or as one line of JSON on standard output, and progress on standard error.
 
+use std::collections::BTreeSet;
 use std::time::Instant;
 
 use indicatif::{ProgressBar, ProgressStyle};
-use modalcast_client::{Client, Result, SceneInfo, SceneList, StageSamples, StageTimes, StepId, v1};
+use modalcast_client::{Client, Frame, FrameLook, Result, SceneInfo, SceneList, StageSamples, StageTimes, StepId, v1};
 use serde_json::{Value, json};
 
 use crate::cli::SceneOptions;
@@ -36,6 +37,10 @@ pub(crate) struct Summary {
     bytes: u64,
     skipped: u64,
     stages: StageSamples,
+    /// The different looks of color frames, as text.
+    looks: BTreeSet<String>,
+    /// The largest distance of a vertex below the ground in meters.
+    below_ground: f64,
 }
 
 impl Summary {
@@ -48,6 +53,8 @@ impl Summary {
             bytes: 0,
             skipped: 0,
             stages: StageSamples::default(),
+            looks: BTreeSet::new(),
+            below_ground: 0.0,
         }
     }
 
@@ -60,6 +67,12 @@ impl Summary {
         self.bytes += reply.bytes;
         self.skipped += reply.skipped;
         self.stages.add(reply.stages);
+    }
+
+    /// Adds the look of a frame, and how far its vertices lie below the ground.
+    pub(crate) fn add_frame_info(&mut self, frame: &Frame) {
+        self.looks.extend(frame.look.as_ref().map(FrameLook::to_string));
+        self.below_ground = self.below_ground.max(frame.below_ground);
     }
 
     /// Replies per second from the first to the last reply; 0 for fewer than two replies.
@@ -85,6 +98,9 @@ impl Summary {
             if let Some(origin) = origin {
                 summary["origin"] = json!(origin);
             }
+            if !self.looks.is_empty() {
+                (summary["looks"], summary["below_ground"]) = (json!(self.looks), json!(self.below_ground));
+            }
             println!("{summary}");
             return;
         }
@@ -95,6 +111,10 @@ impl Summary {
         );
         for (stage, milliseconds) in medians {
             println!("  {stage:8} {milliseconds:8.3} ms (median)");
+        }
+        self.looks.iter().for_each(|look| println!("  look     {look}"));
+        if self.below_ground > 0.0 {
+            println!("  remark   vertices lie up to {:.4} m below the ground", self.below_ground);
         }
     }
 }

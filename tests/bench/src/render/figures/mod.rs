@@ -127,7 +127,8 @@ fn bark_textures(tree: &SceneParts) -> Result<[&Texture; 2]> {
 
 /// Settings with a shadow map that resolves single leaves.
 fn with_large_shadow_map(settings: RenderSettings) -> RenderSettings {
-    RenderSettings { shadow: Some(ShadowSettings { size: 4096, ..ShadowSettings::default() }), ..settings }
+    let shadow = Some(ShadowSettings { size: 4096, ..ShadowSettings::default() });
+    RenderSettings { preset: None, shadow, ..settings }
 }
 
 /// One image to draw.
