@@ -245,6 +245,7 @@ fn report_lines(report: &RenderReport) -> Vec<String> {
     }
     lines.extend(report.raster.iter().map(render::RasterComparison::line));
     lines.extend(report.failed.iter().map(|failed| format!("failed: {failed}")));
+    lines.extend(report.default_shadow.iter().flat_map(render::DefaultShadow::lines));
     lines
 }
 

@@ -1,6 +1,6 @@
 //! Formats a report as Markdown tables (`report.md`).
 
-use super::{RenderReport, RenderRow, RenderWorkloadSummary, ShadowTexelSize, comparison_tables};
+use super::{DefaultShadow, RenderReport, RenderRow, RenderWorkloadSummary, ShadowTexelSize, comparison_tables};
 use crate::markdown_table::{dash, table};
 use modalcast_render::CullStats;
 
@@ -29,7 +29,10 @@ pub(super) fn markdown(report: &RenderReport) -> String {
         text.push_str(&workload_section(workload, rows));
     }
     text.push_str(&super::readback::readback_section(&report.readback));
-    text + &comparison_tables::markdown(report)
+    text.push_str(&comparison_tables::markdown(report));
+    let lines = report.default_shadow.iter().flat_map(DefaultShadow::lines);
+    let default_section = lines.map(|line| format!("    {line}\n")).collect::<String>();
+    if default_section.is_empty() { text } else { text + "\n## Default shadow map\n\n" + &default_section }
 }
 
 /// Meaning of the columns of [`HEADER`].

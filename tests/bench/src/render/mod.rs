@@ -18,6 +18,7 @@
 //! - `blur_comparison`: the blurred moments of variance shadow maps, by compute shaders and by fragment shaders.
 //! - `raster_comparison`: the minimal passes by the CUDA rasterizer and by OpenGL; `frame_comparison`: whole frames by
 //!   both.
+//! - `default_shadow`: the default shadow map by the measurements, and by the rule that its documentation states.
 //! - [`packing`]: all images in one texture array as in equation 3.13 of the thesis, or in arrays by size.
 //! - [`plants`]: the plants of table 4.5 of the thesis, deformed and drawn.
 //! - [`frame_times`]: frame times of user-supplied scenes, for comparison with other programs.
@@ -26,6 +27,7 @@
 
 mod blur_comparison;
 mod comparison_tables;
+mod default_shadow;
 pub mod figures;
 mod frame_comparison;
 pub mod frame_times;
@@ -61,6 +63,7 @@ pub mod workloads;
 use serde::Serialize;
 
 pub use self::blur_comparison::BlurComparison;
+pub use self::default_shadow::{DefaultCandidate, DefaultShadow};
 use self::harness::RenderHarness;
 pub use self::harness::{PassTime, Size};
 pub use self::image_files::ImageFile;
@@ -184,6 +187,9 @@ pub struct RenderReport {
     pub blurs: Vec<BlurComparison>,
     /// Plants of the thesis's table 4.5, deformed and drawn.
     pub plants: Vec<PlantResult>,
+    /// The default shadow map by these measurements; `None` if no variant of the shadow map was timed.
+    #[serde(rename = "default")]
+    pub default_shadow: Option<DefaultShadow>,
     /// Unexpected results, as `workload: variant: reason`: variants that failed unexpectedly or passed although they
     /// are expected to fail, and rasterizer comparisons with too many differing ids.
     pub failed: Vec<String>,
@@ -226,6 +232,7 @@ pub fn render(options: &RenderReportOptions, mut progress: impl FnMut(&str)) -> 
         (Provenance::collect(), harness.renderer.info().clone(), variants::ERROR_LIMITS);
     let blurs = BlurComparison::pair_rows(&rows);
     let size = options.size;
+    let default_shadow = DefaultShadow::choose(&rows, &renderer);
     Ok(RenderReport {
         provenance,
         renderer,
@@ -238,6 +245,7 @@ pub fn render(options: &RenderReportOptions, mut progress: impl FnMut(&str)) -> 
         raster,
         blurs,
         plants,
+        default_shadow,
         failed,
         pictures,
     })

@@ -82,7 +82,7 @@ const EXACT_BLEEDING_LIMIT: f64 = 0.01;
 const SHELF_MEAN_LIGHT_LIMIT: f64 = 0.4;
 
 /// Sides of shadow maps, texels.
-const MAP_SIZES: [u32; 4] = [512, 1024, 2048, 4096];
+const MAP_SIZES: [u32; 5] = [256, 512, 1024, 2048, 4096];
 /// Standard deviations of the blur, texels.
 const BLUR_DEVIATIONS: [f32; 3] = [0.0, 1.5, 4.0];
 
@@ -280,10 +280,14 @@ fn culling_variants() -> [RenderVariant; 3] {
 fn quick_variants() -> Vec<RenderVariant> {
     let mut variants = vec![
         RenderVariant::without_shadow(),
+        RenderVariant::with_variance_map(256, BLUR_DEVIATIONS[1]),
         RenderVariant::with_variance_map(512, BLUR_DEVIATIONS[1]),
         RenderVariant::with_variance_map(512, BLUR_DEVIATIONS[2]),
+        RenderVariant::with_variance_map(1024, BLUR_DEVIATIONS[1]),
         RenderVariant::with_variance_map(2048, BLUR_DEVIATIONS[1]),
+        RenderVariant::with_standard_map(512),
         RenderVariant::with_standard_map(1024),
+        RenderVariant::with_filtered_map(512, BLUR_DEVIATIONS[1]),
         RenderVariant::with_filtered_map(1024, BLUR_DEVIATIONS[1]),
         RenderVariant::with_f16_moments(2048),
         RenderVariant::with_cascades(1024, 3),
@@ -306,10 +310,10 @@ mod tests {
             let variants = all(quick);
             let names: std::collections::BTreeSet<&str> =
                 variants.iter().map(|variant| variant.name.as_str()).collect();
-            // Quick: 11 variants, 3 of packing and 3 of culling. All: 1 without shadow, 4 map sizes x 6, 2 f16, 2
+            // Quick: 15 variants, 3 of packing and 3 of culling. All: 1 without shadow, 5 map sizes x 6, 2 f16, 2
             // bleeding, 3 cascades, 1 corner fit, 3 maps x 3 blur methods, 2 transparency, 3 of packing and 3 of
             // culling.
-            assert_eq!((names.len(), variants.len()), if quick { (17, 17) } else { (50, 50) });
+            assert_eq!((names.len(), variants.len()), if quick { (21, 21) } else { (56, 56) });
             for variant in &variants {
                 let settings = variant.settings(RenderSettings::default());
                 let transparency = variant.transparency.unwrap_or_default();
