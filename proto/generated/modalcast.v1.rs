@@ -1990,13 +1990,16 @@ pub enum TransformFormat {
     /// Means TRANSFORM_FORMAT_AFFINE_F32.
     Unspecified = 0,
     /// 48 bytes: 12 f32, row-major 3x4. The translation, the last column, is in scene units from the scene's origin
-    /// (SceneInfo.origin).
+    /// (SceneInfo.origin). At a distance t from there, f32 rounds positions by up to 2^-22 t on each axis: 2.4 mm at 10 km.
+    /// Normals that follow the deformed triangles become rigid where this exceeds a few percent of the edges of a mesh. Use
+    /// f64 translations beyond a few thousand times the size of a domain.
     AffineF32 = 1,
     /// 28 bytes: a quaternion x y z w as 4 f32, then the translation as 3 f32 in scene units from the scene's origin.
     QuaternionXyzwF32 = 2,
     /// 40 bytes: a quaternion x y z w as 4 f32, then the translation as 3 f64 in scene units from the WORLD's origin: the
     /// client does not subtract the scene's origin. The server computes translation - SceneInfo.origin / SceneInfo.unit in
-    /// f64 and rounds to f32 once, relative to an origin near the domain, so that millimeters are resolved at 10^7 m. The
+    /// f64 and rounds to f32 once, relative to an origin near the domain. Positions are then within 10^-6 of the size of
+    /// a domain at any distance, if most domains are within 4 sizes of each other, and within 1.5 * 10^-5 otherwise. The
     /// translation and its difference from the scene's origin must both be at most 2^40 scene units in magnitude on each
     /// axis.
     QuaternionXyzwF64 = 3,
@@ -2391,7 +2394,8 @@ pub struct Picture {
 /// drawn vertices (VertexHead.origin) before it rounds to f32.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct Camera {
-    /// Near and far plane, distances in scene units with 0 \< near \< far; both 0 fits them to the scene.
+    /// Near and far plane, distances in scene units along the view axis with 0 \< near \< far. If both are 0, nothing in
+    /// front of the camera is clipped.
     #[prost(double, tag = "5")]
     pub near: f64,
     #[prost(double, tag = "6")]
@@ -2528,8 +2532,8 @@ pub struct FrameStreamSettings {
     /// Number of steps after which the stream ends; 0: no limit.
     #[prost(uint64, tag = "3")]
     pub steps: u64,
-    /// Size, format, output and complete camera of each picture: view and lens are set. `near` and `far` remain 0 if the
-    /// server fits them to the scene, and `largest` remains 0 if it is fitted to each frame.
+    /// Size, format, output and complete camera of each picture: view and lens are set. `near` and `far` remain 0 if
+    /// they clip nothing, and `largest` remains 0 if it is fitted to each frame.
     #[prost(message, repeated, tag = "4")]
     pub pictures: ::prost::alloc::vec::Vec<Picture>,
     /// 16 random bytes that identify the stream in UpdateFrameStream. They permit any client to move the cameras, and the

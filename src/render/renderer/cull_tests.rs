@@ -107,17 +107,20 @@ fn each_culling_test_that_removes_too_much_changes_the_image() {
     // Each replacement makes one culling test remove visible triangles.
     for replacement in [
         // Planes of the view volume.
-        ("is_below[axis] && lower_distance[axis] < -margin[axis]", "is_below[axis] && lower_distance[axis] < 2.0"),
+        (
+            "is_below[axis] && lower_distance[axis] < -lower_margin[axis]",
+            "is_below[axis] && lower_distance[axis] < 2.0",
+        ),
         ("is_above[axis] && upper_distance[axis] < -margin[axis]", "is_above[axis] && upper_distance[axis] < 2.0"),
         // Back faces.
         ("area < -area_error", "area < area_error + 20.0"),
         // Triangles without a sample.
         ("ceil(min_position - sample_position)", "ceil(min_position - sample_position + 8.0)"),
         // Occlusion: the margin of the depth, and the comparison with the depth pyramid.
-        ("nearest - margin))", "nearest + 0.5))"),
+        ("nearest + margin))", "nearest * 0.5))"),
         (
-            "if (!(depths[level_offset + y * size.x + x] < depth)) return false;",
-            "if (depths[level_offset + y * size.x + x] < depth) return true;",
+            "if (!(depths[level_offset + y * size.x + x] > depth)) return false;",
+            "if (depths[level_offset + y * size.x + x] > depth) return true;",
         ),
     ] {
         let image = draw_second_frame(&scene, replacement);

@@ -143,7 +143,7 @@ mod tests {
         for (text, start) in [
             ("color_texture = 'no'", "material 'white': color_texture: file 'no': expected an existing file"),
             ("cutoff = 0.5", "material 'white': cutoff: expected alpha_mode mask or no cutoff"),
-            ("color_texture = 'leaf'", "toml: expected a patch, got unknown field `color_texture`"),
+            ("colour_texture = 'leaf'", "toml: expected a patch, got unknown field `colour_texture`"),
             ("alpha_mode = 'cut'", "toml: expected a patch, got unknown variant `cut`"),
         ] {
             let message = patch_material(text, Material::default()).expect_err(text).to_string();
