@@ -10,7 +10,7 @@ use nalgebra::{Matrix4, Vector3};
 /// The bounds that the CUDA deformer computes are those of the vertices, so the depth is exact up to rounding.
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_rule_draws_standard_and_frames_report_depth_below_ground() {
+fn gpu_rule_draws_a_variance_map_and_frames_report_depth_below_ground() {
     let tree = modalcast_model::load::open("tree").expect("expected the built-in scene").scene;
     let config = Config { backend: BackendChoice::Cuda, ..Config::default() };
     let mut context = DeviceContext::open(&config).expect("expected a CUDA device");
@@ -29,7 +29,7 @@ fn gpu_rule_draws_standard_and_frames_report_depth_below_ground() {
         let look = info.look.expect("expected the look of a color frame");
         let shadow = look.shadow.expect("expected a shadow");
         assert_eq!((look.preset, look.samples), (None, 4), "{size}");
-        assert_eq!((shadow.method, shadow.size), (ShadowMethod::PercentageCloser, 1024), "{size}");
+        assert_eq!((shadow.method, shadow.size), (ShadowMethod::Variance, 1024), "{size}");
         let error = (info.below_ground - depth).abs();
         assert!(error < 1e-4, "expected {depth} m below the ground, got {} m", info.below_ground);
     }

@@ -170,7 +170,6 @@ impl<T, R> InFlight<T, R> {
     }
 }
 
-#[expect(clippy::large_enum_variant, reason = "a scene has few readbacks in flight, most of them pictures")]
 enum Readback {
     Vertices(InFlight<CopiedVertices, Recipient>),
     Picture(Box<PictureSpec>, InFlight<FrameImage, PictureRecipient>),

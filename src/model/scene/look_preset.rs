@@ -3,7 +3,7 @@
 //! | preset | antialiasing | shadow map | intended for |
 //! |---|---|---|---|
 //! | `preview` | none, one sample per pixel | variance, 512², blur 1.5 | CPUs |
-//! | `standard` | four samples per pixel | filtered, 1024², blur 1.5 | GPUs |
+//! | `standard` | four samples per pixel | filtered, 1024², blur 1.5 | GPUs, and images of small scenes on CPUs |
 //! | `best` | four samples per pixel | filtered, 2048², blur 3 | still images |
 //!
 //! Without a preset, a rule chooses. It depends on numbers only and never on measured times, so equal requests give
@@ -11,10 +11,11 @@
 //!
 //! | renderer | antialiasing | shadow map |
 //! |---|---|---|
-//! | hardware | of `standard` | of `standard` |
+//! | hardware | of `standard` | variance, 1024², blur 1.5 |
 //! | software (OpenGL on the CPU) | of `standard` if the frame has at most 320 x 240 pixels and the scene at most 16,384 triangles, else of `preview` | of `preview` |
 //!
-//! The shadow map does not depend on the number of pixels, because all frames of a step share it. A part of the look
+//! The shadow map of the rule is the fastest one with a light error that cannot be seen (hardware) or is hard to see
+//! (software), by `modalcast report render`. It does not depend on the number of pixels, because all frames of a step share it. A part of the look
 //! that the scene sets itself ([`LookOverrides`]) is never changed.
 
 use super::{Antialiasing, RenderSettings, ShadowMethod};
@@ -24,10 +25,8 @@ use crate::error::{Error, invalid};
 #[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum LookPreset {
-    /// Its shadow map is the fastest one with a light error that is hard to see, by `modalcast report render` on a CPU. FXAA
-    /// is not used, because on a CPU it takes more time than the rest of a frame.
+    /// FXAA is not used, because on a CPU it takes more time than the rest of a frame.
     Preview,
-    /// Its shadow map is the fastest one with a light error that cannot be seen, by `modalcast report render` on a GPU.
     Standard,
     /// Least error.
     Best,
@@ -40,6 +39,16 @@ pub enum RendererKind {
     Hardware,
     /// OpenGL on the CPU.
     Software,
+}
+
+impl RendererKind {
+    /// Method, size and blur of the shadow map that the rule chooses.
+    const fn shadow_map(self) -> (ShadowMethod, u32, f32) {
+        match self {
+            Self::Hardware => (ShadowMethod::Variance, 1024, 1.5),
+            Self::Software => LookPreset::Preview.shadow_map(),
+        }
+    }
 }
 
 /// A choice of antialiasing and shadow map that the renderer makes when it loads a scene and draws a frame.
@@ -105,14 +114,6 @@ impl LookPreset {
         }
     }
 
-    /// The preset that the rule chooses for the shadow map.
-    const fn of_shadow_map(renderer: RendererKind) -> Self {
-        match renderer {
-            RendererKind::Hardware => Self::Standard,
-            RendererKind::Software => Self::Preview,
-        }
-    }
-
     /// The preset that the rule chooses for the antialiasing of a frame.
     const fn of_antialiasing(renderer: RendererKind, triangles: usize, pixels: u64) -> Self {
         match renderer {
@@ -152,8 +153,7 @@ impl RenderSettings {
     #[must_use]
     pub fn with_shadow_map_for(self, renderer: RendererKind) -> Self {
         let Some(PresetRequest { preset, overrides }) = self.preset else { return self };
-        let preset = preset.unwrap_or_else(|| LookPreset::of_shadow_map(renderer));
-        let (method, size, blur) = preset.shadow_map();
+        let (method, size, blur) = preset.map_or_else(|| renderer.shadow_map(), LookPreset::shadow_map);
         let shadow = self.shadow.map(|shadow| super::ShadowSettings {
             method: overrides.shadow_method.unwrap_or(method),
             size: overrides.shadow_size.unwrap_or(size),

@@ -6,14 +6,17 @@
 //! larger than pixels; the shipped defaults are for 1920 x 1080 on hardware and 1280 x 720 in software. The time is the
 //! geometric mean of the frame times over the workloads, so that each workload has the same weight.
 //!
-//! The workload `shelf` is not used: it shows a piece of the ground of a few texels, where the error is that of the blur's
+//! Standard maps are no candidates: they are not filtered, and the mean error does not show their jagged edges. The
+//! workload `shelf` is not used: it shows a piece of the ground of a few texels, where the error is that of the blur's
 //! width and not that of a picture.
 
 use serde::Serialize;
 
 use super::measure::RenderRow;
 use super::workloads::RenderWorkload;
-use modalcast_model::scene::{Culling, MomentFormat, PresetRequest, RenderSettings, RendererKind, ShadowSettings};
+use modalcast_model::scene::{
+    Culling, MomentFormat, PresetRequest, RenderSettings, RendererKind, ShadowMethod, ShadowSettings,
+};
 use modalcast_render::{BlurMethod, RendererInfo};
 
 /// Mean error of the sun visibility that changes a white surface in full sunlight by one level of 255. The slope of the
@@ -133,7 +136,7 @@ fn is_candidate(row: &RenderRow) -> bool {
     let has_default_parts = |shadow: ShadowSettings| {
         shadow.bleeding == ShadowSettings::default().bleeding && shadow.moments == MomentFormat::F32
     };
-    row.shadow.is_some_and(has_default_parts)
+    row.shadow.is_some_and(|shadow| has_default_parts(shadow) && shadow.method != ShadowMethod::Standard)
         && row.blur_method == BlurMethod::Auto
         && !row.name.starts_with("culling")
         && row.culling == Culling::default()
@@ -190,6 +193,7 @@ mod tests {
     fn fastest_variant_within_the_limit_on_every_workload_is_chosen() {
         let shipped = shipped_shadow(RendererKind::Hardware);
         let other = |size| ShadowSettings { size, ..shipped };
+        let standard = ShadowSettings { method: ShadowMethod::Standard, ..shipped };
         let f16 = ShadowSettings { moments: MomentFormat::F16, ..shipped };
         let rows = |shipped_us| {
             vec![
@@ -201,7 +205,9 @@ mod tests {
                 // Slower on one workload, faster on the other; the geometric mean is 200.
                 row("tree", "large", other(999), 1000.0, 0.001),
                 row("square", "large", other(999), 40.0, 0.001),
-                // Not candidates: not timed on a workload, another format, and a workload that is not used.
+                // Not candidates: not filtered, not timed on a workload, another format, and a workload that is not used.
+                row("tree", "standard", standard, 1.0, 0.0),
+                row("square", "standard", standard, 1.0, 0.0),
                 row("tree", "untimed", other(77), 1.0, 0.0),
                 row("square", "untimed", other(77), 0.0, 0.0),
                 row("tree", "f16", f16, 1.0, 0.0),

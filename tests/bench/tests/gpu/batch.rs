@@ -105,7 +105,7 @@ fn gpu_tensor_core_batches_stay_within_their_bound() {
 /// The vertices of 16 domains that share U come from one launch, as those of one domain do.
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_batch_of_16_is_one_launch_without_spills() {
+fn gpu_batch_of_16_is_one_launch() {
     let device = Device::open(0).expect("a CUDA device");
     for storage in StorageType::ALL {
         let benchmark = |domains: usize, batches: BatchPolicy| {
@@ -120,8 +120,8 @@ fn gpu_batch_of_16_is_one_launch_without_spills() {
             let benchmark = benchmark(domains, batches);
             let attributes = &benchmark.kernel_attributes()[0];
             assert_eq!(
-                (attributes.name.as_str(), benchmark.launches_per_step(), attributes.local_bytes),
-                (kernel, 1, 0),
+                (attributes.name.as_str(), benchmark.launches_per_step()),
+                (kernel, 1),
                 "{} x {domains}",
                 storage.name()
             );
