@@ -272,7 +272,7 @@ impl FloatingOrigins {
     /// in layout order.
     ///
     /// Also returns the bounds of the near domains. With d as the distance from `reference_point` to the nearest
-    /// floating origin, a domain is near if the distance of its floating origin is at most [`NEARBY_REACH`] spacings + 4 d.
+    /// floating origin, a domain is near if the distance of its floating origin is at most 1024 of its spacings plus 4 d.
     /// More distant domains would make the bounds too large to fit a shadow map to.
     pub fn rebase_positions(
         &self,

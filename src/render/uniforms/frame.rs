@@ -311,6 +311,7 @@ mod tests {
             height: 64,
             bounds,
             light_bounds: None,
+            edges: None,
         };
         // y is the up axis.
         let lowered = |depth: f64| BoundingBox { min: [bounds.min[0], bounds.min[1] - depth, bounds.min[2]], ..bounds };
