@@ -39,7 +39,9 @@ fn quick_report_is_complete_and_consistent() {
     };
     for name in cases {
         let case = case(name);
-        assert_eq!((&case["look"]["samples"], &case["build"]), (&Value::from(4), &report["build"]), "{case}");
+        assert_eq!(case["build"], report["build"], "{case}");
+        // A software renderer draws one sample per pixel by default.
+        assert!(matches!(case["look"]["samples"].as_u64(), Some(1 | 4)), "{case}");
         assert!(case["look"]["shadow_map"].as_u64().is_some_and(|side| side >= 16), "{case}");
         for field in ["machine", "server", "date", "command"] {
             assert!(case[field].as_str().is_some_and(|text| !text.is_empty()), "{field} of {case}");
