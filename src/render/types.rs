@@ -59,7 +59,7 @@ pub struct FrameImage {
     pub info: FrameInfo,
 }
 
-/// How a frame was drawn, and what a viewer of it should know.
+/// How a frame was drawn, and remarks on its content.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct FrameInfo {
     /// The rasterizer that drew the shadow map and the visibility.

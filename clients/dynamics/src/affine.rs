@@ -66,7 +66,8 @@ pub(crate) fn fit_rigid_transform(rest: &[Vector3<f64>], current: &[Vector3<f64>
     AffineTransform { linear: rotation, translation: current_mean - rotation * rest_mean }
 }
 
-/// The smallest product D of [`closed_form_rotation`] for which its result is used. Its rounding error is about 1e-16 / D^2.
+/// The smallest product D of [`closed_form_rotation`] for which its result is used, because rounding errors grow as D
+/// becomes smaller. A test compares the results with a singular value decomposition.
 const MIN_PAIR_SUM_PRODUCT: f64 = 0.02;
 
 /// The proper rotation nearest to a 3x3 correlation matrix; the identity if two of its singular values vanish.

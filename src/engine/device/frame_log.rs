@@ -2,8 +2,8 @@
 
 use modalcast_render::{FrameInfo, FrameLook};
 
-/// What the log already contains about the frames of one scene. A line is logged once, because a stream has many equal
-/// frames, and a swinging object crosses the ground in every period.
+/// Logs the looks of a scene's frames and vertices below the ground, each once: a stream has many equal frames, and a
+/// swinging object crosses the ground in every period.
 #[derive(Debug, Default)]
 pub(super) struct FrameLog {
     /// At most as many looks as the rule has kinds of antialiasing, because the shadow map of a loaded scene is constant.
@@ -12,7 +12,8 @@ pub(super) struct FrameLog {
 }
 
 impl FrameLog {
-    /// Logs what is new about a frame. Returns whether it logged a look, and whether it logged vertices below the ground.
+    /// Logs the look of a frame, and that vertices lie below the ground, unless an earlier frame had the same look or such
+    /// vertices. Returns whether the look was logged, and whether the vertices were logged.
     pub(super) fn record(&mut self, scene: &str, info: &FrameInfo) -> [bool; 2] {
         let new_look = info.look.filter(|look| !self.looks.contains(look));
         if let Some(look) = new_look {
