@@ -106,6 +106,10 @@ fn case_lines(case: &CaseReport) -> Vec<String> {
             let fraction = result.stream_of_socket;
             vec![line(format!("{stream:>9.1} /s  {fraction:.2} of a plain socket, {socket:.1} /s"))]
         }
+        CaseResult::Contention(result) => {
+            let (p99, max, idle) = (result.added_p99_ms, result.added_max_ms, result.idle.p50_ms);
+            vec![line(format!("added p99 {p99:.2} ms, added max {max:.2} ms to a median of {idle:.2} ms"))]
+        }
         CaseResult::Delay(result) => {
             let (delayed, undelayed) = (result.delayed_per_second, result.undelayed_per_second);
             vec![line(format!("{delayed:>9.1} /s with a round trip of 50 ms, {undelayed:.1} /s without"))]

@@ -1,5 +1,6 @@
 //! The cases of the report. Cases of one scene follow each other, because they share a server.
 
+use super::contention::OtherWork;
 use super::delay::DelayedStream;
 use super::peers::viewer::Content;
 use super::rates::Viewers;
@@ -27,6 +28,8 @@ pub(super) enum Measurement {
     AcknowledgmentLatency(u64),
     /// Vertices beside a plain TCP connection.
     Socket,
+    /// Waits while the server works for another client.
+    Contention(OtherWork),
     /// Rate over a connection with a long round trip.
     Delay(DelayedStream),
     VertexEncodings,
@@ -98,6 +101,8 @@ fn tree_cases(contents: &Contents, [frames, acknowledgments]: [u64; 2]) -> Vec<C
         ("tree-acknowledgments", Measurement::AcknowledgmentLatency(acknowledgments)),
         ("tree-latency", Measurement::FrameLatency(contents.png_1080p, frames)),
         ("tree-socket", Measurement::Socket),
+        ("tree-waits-loads", Measurement::Contention(OtherWork::Loads)),
+        ("tree-waits-large-frames", Measurement::Contention(OtherWork::LargeFrames)),
         ("tree-delay-steps", Measurement::Delay(DelayedStream::Steps)),
         ("tree-delay-vertices", delayed_replies(Content::Positions)),
         ("tree-delay-png-1080p", delayed_replies(contents.png_1080p)),
@@ -109,8 +114,8 @@ fn tree_cases(contents: &Contents, [frames, acknowledgments]: [u64; 2]) -> Vec<C
 }
 
 fn repository_cases(contents: &Contents, [frames, _]: [u64; 2]) -> Vec<Case> {
-    const ALMOND: SceneSource = SceneSource::Repository("plants/almond");
-    const BRIDGE: SceneSource = SceneSource::Repository("vega/simpleBridge");
+    const ALMOND: SceneSource = SceneSource::ALMOND;
+    const BRIDGE: SceneSource = SceneSource::BRIDGE;
     let rate = |content| Measurement::Rate(Some(Viewers::one(content)));
     let cases = [
         ("almond-png-1080p", ALMOND, rate(contents.png_1080p)),
@@ -140,6 +145,9 @@ pub(crate) const CASE_HELP: &str = "Cases:
   tree-latency   time from a step to its PNG of 1920x1080, with a step every 16.7 ms
   tree-socket, grid-socket
                  positions beside a plain TCP connection; the grid has 1.5 M vertices
+  tree-waits-loads, tree-waits-large-frames
+                 time from a step to its frame while another client loads scenes (with --scenes also the almond
+                 and the bridge), or draws frames of 8192x8192
   tree-delay-steps, tree-delay-vertices, tree-delay-png-1080p
                  rates over a connection with a round trip of 50 ms
   tree-vertex-encodings, tree-picture-encodings

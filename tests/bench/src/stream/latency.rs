@@ -115,7 +115,7 @@ pub(super) fn measure_frames(session: &Session, content: Content, steps: u64) ->
 }
 
 /// A runtime with one thread.
-fn runtime() -> Result<tokio::runtime::Runtime> {
+pub(super) fn runtime() -> Result<tokio::runtime::Runtime> {
     tokio::runtime::Builder::new_current_thread().enable_all().build().map_err(fault_in("report"))
 }
 
@@ -194,7 +194,7 @@ async fn time_acknowledgments(client: &Client, motion: &Motion, steps: u64) -> R
     Ok(LatencyResult { stages: stages.latencies(), ..latency })
 }
 
-async fn connect(url: &str) -> Result<Client> {
+pub(super) async fn connect(url: &str) -> Result<Client> {
     Client::connect(url).await.map_err(fault_in("report"))
 }
 

@@ -1,6 +1,7 @@
 //! Formats a report as Markdown (`report.md`): one table for each kind of measurement.
 
 use super::afternoon::AfternoonComparison;
+use super::contention::{ContentionResult, Waits};
 use super::delay::DelayResult;
 use super::latency::LatencyResult;
 use super::peers::socket::SocketComparison;
@@ -42,6 +43,7 @@ pub(super) fn markdown(report: &StreamReport) -> String {
     text.push_str(&rate_section(report));
     text.push_str(&latency_section(report));
     text.push_str(&socket_section(report));
+    text.push_str(&contention_section(report));
     text.push_str(&delay_section(report));
     text.push_str(&afternoon_section(report));
     text.push_str(&encoding_sections(report));
@@ -178,6 +180,44 @@ fn socket_section(report: &StreamReport) -> String {
                 between two processes. The receiver of the plain connection reads into one buffer and does not decode. \
                 Steps are sent from memory. Single requests ask for the same step again and again.";
     section("Vertices and a plain socket", note, &head, comparisons.iter().map(row).collect())
+}
+
+fn contention_section(report: &StreamReport) -> String {
+    let contentions = select(report, |result| match result {
+        CaseResult::Contention(result) => Some(result),
+        _ => None,
+    });
+    let rows_of = |(case, result): &(&CaseReport, &ContentionResult)| {
+        let row = |job: &str, job_ms: Option<f64>, waits: &Waits| {
+            let mut cells =
+                vec![case.name.to_owned(), job.to_owned(), job_ms.map_or_else(dash, |ms| format!("{ms:.0}"))];
+            cells.push(waits.steps.to_string());
+            cells.extend([waits.p50_ms, waits.p99_ms, waits.max_ms].map(|ms| format!("{ms:.2}")));
+            cells.extend([waits.p99_ms, waits.max_ms].map(|ms| format!("{:.2}", ms - result.idle.p50_ms)));
+            let stages = waits.longest_stages.iter().take(2).map(|(stage, ms)| format!("{stage} {ms:.1}"));
+            cells.push(stages.collect::<Vec<_>>().join(", "));
+            cells
+        };
+        let mut rows = vec![row("none", None, &result.idle), row("all", None, &result.busy)];
+        rows.extend(result.jobs.iter().map(|job| row(&job.job, Some(job.job_ms), &job.waits)));
+        rows
+    };
+    let head = [
+        "case",
+        "job",
+        "its time ms",
+        "steps",
+        "p50 ms",
+        "p99 ms",
+        "max ms",
+        "added p99 ms",
+        "added max ms",
+        "longest stages of the max",
+    ];
+    let note = "A client sends a step of the tree each period and receives a frame of 320x180 of it, while the server \
+                does a job for another client. A wait counts from the time at which the step was due. The added wait is \
+                the difference to the median without a job. The first round of a load also compiles programs.";
+    section("Waits for another client", note, &head, contentions.iter().flat_map(rows_of).collect())
 }
 
 fn delay_section(report: &StreamReport) -> String {

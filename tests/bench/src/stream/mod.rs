@@ -6,13 +6,14 @@
 //! - `session` is a server with one scene. `motion` has steps that are sent without computing them, `grid` is a scene of
 //!   many vertices.
 //! - `cases` lists the cases. Each case makes one measurement: `rates` with `stages`, `latency`, `socket`,
-//!   `delay`, `vertex_encodings`, `picture_encodings` or `afternoon`.
+//!   `contention`, `delay`, `vertex_encodings`, `picture_encodings` or `afternoon`.
 //! - `afternoon_scene` writes a scene for the Python program of `afternoon`.
 //! - `output`, `markdown` and `plot` write the report.
 
 pub mod afternoon;
 mod afternoon_scene;
 mod cases;
+pub mod contention;
 pub mod delay;
 mod grid;
 pub mod latency;
@@ -38,6 +39,7 @@ use crate::workloads::Size;
 use afternoon::AfternoonComparison;
 pub(crate) use cases::CASE_HELP;
 use cases::{Case, Measurement};
+use contention::ContentionResult;
 use delay::DelayResult;
 use latency::LatencyResult;
 use modalcast_model::error::{Result, invalid};
@@ -115,6 +117,7 @@ pub enum CaseResult {
     Rate(RateResult),
     Latency(LatencyResult),
     Socket(SocketComparison),
+    Contention(ContentionResult),
     Delay(DelayResult),
     VertexEncodings(Vec<VertexEncodingRow>),
     PictureEncodings(Vec<PictureEncodingRow>),
@@ -195,6 +198,7 @@ fn measure_case(
             latency::measure_acknowledgments(session, steps).map(CaseResult::Latency)
         }
         Measurement::Socket => compare_with_socket(session, options).map(CaseResult::Socket),
+        Measurement::Contention(work) => contention::measure(session, work, options).map(CaseResult::Contention),
         Measurement::Delay(stream) => delay::measure(session, stream, options).map(CaseResult::Delay),
         Measurement::VertexEncodings => vertex_encodings::measure(session, options).map(CaseResult::VertexEncodings),
         Measurement::PictureEncodings(content) => {

@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use super::afternoon::AfternoonComparison;
+use super::contention::{ContentionResult, Waits};
 use super::delay::DelayResult;
 use super::latency::LatencyResult;
 use super::peers::socket::SocketComparison;
@@ -107,6 +108,7 @@ impl CaseResult {
             Self::Rate(result) => rate_quantities(result),
             Self::Latency(result) => latency_quantities(result),
             Self::Socket(result) => socket_quantities(result),
+            Self::Contention(result) => contention_quantities(result),
             Self::Delay(result) => delay_quantities(result),
             Self::VertexEncodings(rows) => rows.iter().flat_map(vertex_quantities).collect(),
             Self::PictureEncodings(rows) => rows.iter().flat_map(picture_quantities).collect(),
@@ -172,6 +174,30 @@ fn socket_quantities(result: &SocketComparison) -> Vec<Quantity> {
         quantity("bandwidth of the stream", result.stream_bytes_per_second, "B/s"),
         quantity("bandwidth of the socket", result.socket_bytes_per_second, "B/s"),
     ]
+}
+
+fn contention_quantities(result: &ContentionResult) -> Vec<Quantity> {
+    let of_waits = |variant: &str, waits: &Waits| {
+        let quantities = [
+            quantity("steps", waits.steps as f64, "1"),
+            quantity("p50", waits.p50_ms, "ms"),
+            quantity("p99", waits.p99_ms, "ms"),
+            quantity("max", waits.max_ms, "ms"),
+        ];
+        of_variant(variant, quantities)
+    };
+    let mut quantities = vec![
+        quantity("period", result.period_ms, "ms"),
+        quantity("added p99", result.added_p99_ms, "ms"),
+        quantity("added max", result.added_max_ms, "ms"),
+    ];
+    quantities.extend(of_waits("idle", &result.idle));
+    quantities.extend(of_waits("busy", &result.busy));
+    for job in &result.jobs {
+        quantities.extend(of_variant(&job.job, [quantity("time of the job", job.job_ms, "ms")]));
+        quantities.extend(of_waits(&job.job, &job.waits));
+    }
+    quantities
 }
 
 fn delay_quantities(result: &DelayResult) -> Vec<Quantity> {

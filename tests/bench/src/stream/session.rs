@@ -37,6 +37,9 @@ pub(super) enum SceneSource {
 }
 
 impl SceneSource {
+    pub(super) const ALMOND: Self = Self::Repository("plants/almond");
+    pub(super) const BRIDGE: Self = Self::Repository("vega/simpleBridge");
+
     /// The name that clients open.
     pub(super) const fn name(self) -> &'static str {
         match self {
@@ -116,7 +119,7 @@ impl Session {
         let work = create_work_folder()?;
         // The path of a scene that is drawn.
         let (repository, drawn_scene) = match source {
-            SceneSource::Tree => (None, Some(PathBuf::from(source.name()))),
+            SceneSource::Tree => (options.scenes.clone(), Some(PathBuf::from(source.name()))),
             SceneSource::Repository(path) => {
                 let folder = options.scenes.clone().unwrap_or_default();
                 let path = folder.join(path);
