@@ -7,13 +7,15 @@ use modalcast_model::domain::Transform;
 use modalcast_model::scene::{Camera, FrameSize, SceneState, ShadowMethod};
 use nalgebra::{Matrix4, Vector3};
 
+use crate::gl::Exclusive;
+
 /// The bounds that the CUDA deformer computes are those of the vertices, so the depth is exact up to rounding.
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_rule_draws_a_variance_map_and_frames_report_depth_below_ground() {
     let tree = modalcast_model::load::open("tree").expect("expected the built-in scene").scene;
     let config = Config { backend: BackendChoice::Cuda, ..Config::default() };
-    let mut context = DeviceContext::open(&config).expect("expected a CUDA device");
+    let mut context = Exclusive::open(|| DeviceContext::open(&config));
     let mut loaded_scene = context.load_scene(&tree, BackendSettings::default()).expect("expected a loaded scene");
     for (size, depth) in
         [(FrameSize::new(64, 48), 0.0), (FrameSize::new(1280, 720), 0.5), (FrameSize::new(96, 64), 0.0)]

@@ -2,16 +2,57 @@
 
 use std::any::Any;
 use std::num::NonZeroU32;
+use std::ops::{Deref, DerefMut};
 use std::rc::Rc;
+use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use glow::HasContext as _;
 use modalcast_model::error::Result;
 use modalcast_model::raster::{GlBuffer, GlBufferOwner};
 use modalcast_render::{DevicePreference, Renderer};
 
+/// An owner of an OpenGL context on the GPU. It exists only while no other test of this process has one: see
+/// [`Renderer::open`].
+pub(crate) struct Exclusive<T> {
+    // Dropped before the lock is released.
+    value: T,
+    _lock: MutexGuard<'static, ()>,
+}
+
+impl<T> Exclusive<T> {
+    /// Waits until no other test has a context, and opens one.
+    pub(crate) fn open(open: impl FnOnce() -> Result<T>) -> Self {
+        static LOCK: Mutex<()> = Mutex::new(());
+        // The lock protects no data, so a failed test leaves it usable.
+        let lock = LOCK.lock().unwrap_or_else(PoisonError::into_inner);
+        Self { value: open().expect("expected an OpenGL context on the CUDA device"), _lock: lock }
+    }
+}
+
+impl Exclusive<Renderer> {
+    /// A renderer on the CUDA device.
+    pub(crate) fn renderer() -> Self {
+        Self::open(|| Renderer::open(DevicePreference::Cuda(0)))
+    }
+}
+
+impl<T> Deref for Exclusive<T> {
+    type Target = T;
+
+    fn deref(&self) -> &T {
+        &self.value
+    }
+}
+
+impl<T> DerefMut for Exclusive<T> {
+    fn deref_mut(&mut self) -> &mut T {
+        &mut self.value
+    }
+}
+
 /// The context of a renderer, which stays current on this thread.
 pub(crate) struct GlContext {
-    pub(crate) renderer: Renderer,
+    pub(crate) renderer: Exclusive<Renderer>,
     api: Rc<glow::Context>,
 }
 
@@ -43,8 +84,7 @@ impl Drop for OwnedBuffer {
 
 impl GlContext {
     pub(crate) fn open() -> Self {
-        let renderer =
-            Renderer::open(DevicePreference::Cuda(0)).expect("expected an OpenGL context on the CUDA device");
+        let renderer = Exclusive::renderer();
         // SAFETY: loading runs the initializers of libEGL. They have already run, because the renderer loaded libEGL.
         let egl =
             unsafe { khronos_egl::DynamicInstance::<khronos_egl::EGL1_4>::load_required() }.expect("expected libEGL");

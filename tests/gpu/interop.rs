@@ -6,9 +6,10 @@ use modalcast_compute::gpu::{CudaDeformer, CudaDeformerOptions, Device};
 use modalcast_model::deform::{Deformer, VertexAttributes};
 use modalcast_model::raster::{GlBuffer, GlVertexBuffers};
 use modalcast_model::scene::{Camera, Scene};
-use modalcast_render::{DevicePreference, FrameParams, MAX_FRAMES_IN_FLIGHT, Renderer};
+use modalcast_render::{FrameParams, MAX_FRAMES_IN_FLIGHT, Renderer};
 
 use crate::accuracy::{assert_equals_reference, have_equal_bits};
+use crate::gl::Exclusive;
 use crate::scenes;
 
 /// Opens a deformer that can fill `buffers`. With `None` its vertices must be uploaded.
@@ -18,8 +19,8 @@ fn open_deformer(device: &Arc<Device>, scene: &Arc<Scene>, buffers: Option<GlVer
 }
 
 /// Opens a renderer and a CUDA device, and creates a scene with normal maps.
-fn open_renderer() -> (Renderer, Arc<Device>, Arc<Scene>) {
-    let renderer = Renderer::open(DevicePreference::Cuda(0)).expect("expected an OpenGL context on the CUDA device");
+fn open_renderer() -> (Exclusive<Renderer>, Arc<Device>, Arc<Scene>) {
+    let renderer = Exclusive::renderer();
     let scene = scenes::random_scene(
         &[(3000, 12), (50, 0), (7, 3)],
         scenes::RandomSceneOptions { instances: 5, normal_maps: true, rigid_transforms: false },

@@ -14,11 +14,11 @@ use modalcast_model::scene::{
     Antialiasing, Camera, FrameSize, MeshEdges, RenderSettings, Scene, SceneParts, SceneState, ShadowSettings,
 };
 use modalcast_render::{
-    DevicePreference, FrameImage, FrameParams, MAX_FRAMES_IN_FLIGHT, MappedPixels, RasterBackend, RasterBackends,
-    Renderer, VisibilityId,
+    FrameImage, FrameParams, MAX_FRAMES_IN_FLIGHT, MappedPixels, RasterBackend, RasterBackends, VisibilityId,
 };
 
 use crate::common::exact_triangle::{ExactTriangle, compare_ids};
+use crate::gl::Exclusive;
 use crate::scenes;
 
 /// Width and height of images.
@@ -33,8 +33,8 @@ const CUDA_BACKENDS: RasterBackends =
 const OPENGL_BACKENDS: RasterBackends =
     RasterBackends { shadow: Some(RasterBackend::OpenGl), visibility: Some(RasterBackend::OpenGl) };
 
-fn open_device() -> DeviceContext {
-    DeviceContext::open(&Config { backend: BackendChoice::Cuda, ..Config::default() }).expect("expected a CUDA device")
+fn open_device() -> Exclusive<DeviceContext> {
+    Exclusive::open(|| DeviceContext::open(&Config { backend: BackendChoice::Cuda, ..Config::default() }))
 }
 
 /// The same scene with one sample per pixel, which the CUDA rasterizer requires.
@@ -71,10 +71,8 @@ struct StillImage {
 /// Draws one state. The CPU deforms it, so that both backends get the same vertices.
 fn draw_still(scene: &Arc<Scene>, state: &SceneState, backend: RasterBackend) -> StillImage {
     let device = Device::open(0).expect("expected a CUDA device");
-    let (mut renderer, mut deformer) = (
-        Renderer::open(DevicePreference::Cuda(0)).expect("expected an OpenGL context"),
-        CpuDeformer::new(scene).with_bounding_axes(scene.light_axes()),
-    );
+    let (mut renderer, mut deformer) =
+        (Exclusive::renderer(), CpuDeformer::new(scene).with_bounding_axes(scene.light_axes()));
     let summary = deformer.deform(state).expect("expected the step to succeed");
     let mut buffers = renderer.load(scene).expect("expected the scene to load");
     renderer.upload(&buffers, deformer.surface().expect("expected a surface")).expect("expected the upload to succeed");
