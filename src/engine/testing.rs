@@ -68,7 +68,7 @@ pub(super) struct FaultyDeformer {
 }
 
 impl FaultyDeformer {
-    pub(super) fn boxed(scene: &Arc<Scene>) -> Box<dyn Deformer> {
+    pub(super) fn boxed(scene: &Arc<Scene>) -> Box<dyn Deformer + Send> {
         Box::new(Self { inner: ReferenceDeformer::new(scene), fault: None, readbacks: Vec::new() })
     }
 }

@@ -26,7 +26,7 @@ pub mod launch;
 mod tables;
 
 pub use executor::raster::{CudaRasterizer, RasterGranularity, RasterVariant};
-pub use executor::{CudaDeformer, MAX_STEPS_IN_FLIGHT, device_layout_values};
+pub use executor::{CudaDeformer, MAX_STEPS_IN_FLIGHT, PreparedDeformer, device_layout_values};
 #[cfg(any(test, feature = "testing"))]
 pub use launch::{CAPABILITIES, CompiledVariant, assert_compiles};
 pub use launch::{Device, DeviceInfo, KernelDescriptor, KernelKind, Probe, probe};

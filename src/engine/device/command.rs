@@ -4,9 +4,10 @@ use std::sync::Arc;
 
 use tokio::sync::oneshot;
 
+use super::context::PreparedDeformer;
 use crate::engine::output::step_output::FrameOutput;
 use crate::frame::Legend;
-use modalcast_model::backend_settings::BackendSettings;
+use modalcast_model::backend_settings::RasterPolicy;
 use modalcast_model::deform::{DeformSummary, DeformedSurface, VertexAttributes};
 use modalcast_model::error::{Error, Result};
 use modalcast_model::scene::{Camera, FrameSize, MeshEdges, PixelRect, Scene, SceneState};
@@ -39,7 +40,9 @@ pub(in crate::engine) enum Command {
     LoadScene {
         id: SceneId,
         scene: Arc<Scene>,
-        backends: BackendSettings,
+        /// The prepared deformer, or the error of its preparation.
+        deformer: Result<PreparedDeformer>,
+        raster: RasterPolicy,
         reply: Reply<()>,
     },
     Deform {

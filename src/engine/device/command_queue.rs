@@ -17,9 +17,10 @@ use modalcast_model::error::{Error, Result};
 pub(super) const MAX_QUEUED_COMMANDS: usize = 16;
 
 /// Queued work of a scene.
-#[expect(clippy::large_enum_variant, reason = "most work is a command, and queues are short")]
 pub(super) enum Work {
     Command(Command),
+    /// A command whose textures and programs were prepared.
+    Prepared(Command),
     /// The next step of the output that the device thread has begun for this scene.
     Continue,
 }

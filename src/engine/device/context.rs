@@ -63,7 +63,55 @@ impl PendingDraw {
 
 /// Creates the deformer of a scene in tests.
 #[cfg(test)]
-type CreateDeformer = fn(&Arc<Scene>) -> Box<dyn Deformer>;
+type CreateDeformer = fn(&Arc<Scene>) -> Box<dyn Deformer + Send>;
+
+/// A deformer, as far as any thread can create it.
+pub(in crate::engine) enum PreparedDeformer {
+    Complete(Box<dyn Deformer + Send>),
+    /// Lacks the output buffers, which the device thread creates, because OpenGL may own them.
+    Cuda(Box<gpu::PreparedDeformer>),
+}
+
+/// Prepares deformers on any thread, so that the device thread executes the commands of other scenes meanwhile.
+#[derive(Debug, Clone)]
+pub(in crate::engine) struct DeformerPreparer {
+    backend: Backend,
+    cuda_device: Option<Arc<gpu::Device>>,
+    #[cfg(test)]
+    create_test_deformer: Option<CreateDeformer>,
+}
+
+impl DeformerPreparer {
+    /// Prepares deformers of the reference backend.
+    #[cfg(test)]
+    pub(super) const fn reference() -> Self {
+        Self { backend: Backend::Reference, cuda_device: None, create_test_deformer: None }
+    }
+
+    /// Prepares the deformer of a scene: compiles its kernels, and packs and uploads its tables.
+    ///
+    /// # Errors
+    /// `Fault` of the device; `Unavailable` when its memory is too small.
+    pub(in crate::engine) fn prepare(&self, scene: &Arc<Scene>, batches: BatchPolicy) -> Result<PreparedDeformer> {
+        #[cfg(test)]
+        if let Some(create_test_deformer) = self.create_test_deformer {
+            return Ok(PreparedDeformer::Complete(create_test_deformer(scene)));
+        }
+        let bounding_axes = scene.light_axes();
+        match (&self.cuda_device, self.backend) {
+            (Some(device), Backend::Cuda) => {
+                let options = CudaDeformerOptions { batches, bounding_axes };
+                let prepared = gpu::PreparedDeformer::new(device, scene, options)?;
+                Ok(PreparedDeformer::Cuda(Box::new(prepared)))
+            }
+            (_, Backend::Reference) => {
+                let deformer = ReferenceDeformer::new(scene).with_bounding_axes(bounding_axes);
+                Ok(PreparedDeformer::Complete(Box::new(deformer)))
+            }
+            _ => Ok(PreparedDeformer::Complete(Box::new(CpuDeformer::new(scene).with_bounding_axes(bounding_axes)))),
+        }
+    }
+}
 
 /// Owns the CUDA device and the renderer. Must remain on the thread that created it: the device thread of the server,
 /// or the main thread of `modalcast render`.
@@ -121,16 +169,36 @@ impl DeviceContext {
         self.renderer.as_ref().ok().map(Renderer::stats)
     }
 
+    /// Prepares the deformers of this context's scenes on other threads.
+    pub(in crate::engine) fn deformer_preparer(&self) -> DeformerPreparer {
+        DeformerPreparer {
+            backend: self.info.backend,
+            cuda_device: self.cuda_device.clone(),
+            #[cfg(test)]
+            create_test_deformer: self.create_test_deformer,
+        }
+    }
+
     /// Loads a scene and deforms it to the rest state. Creates OpenGL buffers here only if the deformer or a CUDA
     /// rasterizer uses them; otherwise the first frame creates them.
     ///
     /// # Errors
     /// `Fault` of the device; `Invalid` when the rest state overflows.
     pub fn load_scene(&mut self, scene: &Arc<Scene>, backends: BackendSettings) -> Result<LoadedScene> {
-        let (deformer, buffers) = self.create_deformer(scene, backends.batches)?;
+        let deformer = self.deformer_preparer().prepare(scene, backends.batches)?;
+        self.load_prepared(scene, deformer, backends.raster)
+    }
+
+    /// [`Self::load_scene`] with a prepared deformer.
+    pub(in crate::engine) fn load_prepared(
+        &mut self,
+        scene: &Arc<Scene>,
+        deformer: PreparedDeformer,
+        raster: RasterPolicy,
+    ) -> Result<LoadedScene> {
+        let (deformer, buffers) = self.complete_deformer(scene, deformer)?;
         let mut loaded_scene = LoadedScene::new(scene, deformer, buffers);
-        let result =
-            loaded_scene.deform_rest().and_then(|()| self.attach_rasterizer(&mut loaded_scene, backends.raster));
+        let result = loaded_scene.deform_rest().and_then(|()| self.attach_rasterizer(&mut loaded_scene, raster));
         match result {
             Ok(()) => Ok(loaded_scene),
             Err(error) => {
@@ -140,26 +208,18 @@ impl DeviceContext {
         }
     }
 
-    /// Creates the deformer of a scene. If the deformer can fill OpenGL buffers, creates the buffers, too.
-    fn create_deformer(
+    /// Completes a prepared deformer. If it can fill OpenGL buffers, creates the buffers, too.
+    fn complete_deformer(
         &mut self,
         scene: &Arc<Scene>,
-        batches: BatchPolicy,
+        deformer: PreparedDeformer,
     ) -> Result<(Box<dyn Deformer>, Option<SceneBuffers>)> {
-        #[cfg(test)]
-        if let Some(create_test_deformer) = self.create_test_deformer {
-            return Ok((create_test_deformer(scene), None));
-        }
-        let device = match (self.cuda_device.clone(), self.info.backend) {
-            (Some(device), Backend::Cuda) => device,
-            (_, Backend::Reference) => {
-                return Ok((Box::new(ReferenceDeformer::new(scene).with_bounding_axes(scene.light_axes())), None));
-            }
-            _ => return Ok((Box::new(CpuDeformer::new(scene).with_bounding_axes(scene.light_axes())), None)),
+        let prepared = match deformer {
+            PreparedDeformer::Complete(deformer) => return Ok((deformer, None)),
+            PreparedDeformer::Cuda(prepared) => prepared,
         };
         let buffers = self.create_shareable_buffers(scene)?;
-        let options = CudaDeformerOptions { batches, bounding_axes: scene.light_axes() };
-        match CudaDeformer::new(&device, scene, buffers.as_ref().map(SceneBuffers::vertex_buffers), options) {
+        match CudaDeformer::from_prepared(*prepared, buffers.as_ref().map(SceneBuffers::vertex_buffers)) {
             Ok(deformer) => Ok((Box::new(deformer), buffers)),
             Err(error) => {
                 self.free_buffers(buffers);
@@ -192,10 +252,14 @@ impl DeviceContext {
         if policy == RasterPolicy::Fastest { loaded_scene.select_raster_backends(renderer) } else { Ok(()) }
     }
 
-    /// Frees a loaded scene.
+    /// Frees a loaded scene. Waits until CUDA has freed its memory, so that it is available to the next scene.
     pub fn unload_scene(&mut self, loaded_scene: LoadedScene) {
         let buffers = loaded_scene.into_buffers();
         self.free_buffers(buffers);
+        if let Some(device) = &self.cuda_device {
+            // A lost device reports its error at the next step.
+            device.synchronize("unload").ok();
+        }
     }
 
     /// Draws the vertices of the last deformation. The image's times include the stage `upload` if the vertices had to
@@ -288,6 +352,18 @@ impl DeviceContext {
     /// error.
     pub(in crate::engine) fn begin_preparation(&mut self, scene: &Arc<Scene>) -> Option<ScenePreparation> {
         let preparation = self.renderer.as_mut().ok()?.begin_preparation(scene).ok()?;
+        (!preparation.is_finished()).then_some(preparation)
+    }
+
+    /// Begins to compile the programs of a frame that are not compiled yet. `None` if all are compiled.
+    pub(in crate::engine) fn begin_frame_preparation(
+        &mut self,
+        buffers: &SceneBuffers,
+        size: FrameSize,
+        has_edges: bool,
+    ) -> Option<ScenePreparation> {
+        let renderer = self.renderer.as_mut().ok()?;
+        let preparation = renderer.begin_frame_preparation(buffers, [size.width, size.height], has_edges).ok()?;
         (!preparation.is_finished()).then_some(preparation)
     }
 

@@ -12,6 +12,7 @@
 //! frame of a scene is drawn in steps, too, because drivers finish the compilation of a program when it is used for the
 //! first time.
 //!
+//! Another thread prepares the deformer of a scene before the scene is loaded: it compiles the kernels and uploads the tables.
 //! The OpenGL buffers of a scene are created by its first output, or with CUDA when it is loaded. Before that, its textures
 //! are uploaded and its programs compiled in steps, between which other scenes are served. Other threads compute the
 //! mipmap levels, and if the driver can, compile the programs.
@@ -36,7 +37,7 @@
 
 mod outputs;
 
-use std::collections::{HashMap, HashSet};
+use std::collections::HashMap;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -45,12 +46,12 @@ use rayon::{ThreadPool, ThreadPoolBuilder};
 
 use super::command::{Command, CopiedVertices, Reply, SceneId};
 use super::command_queue::{CommandQueue, Work};
-use super::context::{DeviceContext, EngineInfo, PendingDraw};
+use super::context::{DeformerPreparer, DeviceContext, EngineInfo, PendingDraw};
 use super::device_loss::DeviceLossSender;
 use super::fair_queue::Taken;
 use super::in_flight::{InFlight, InFlightQueue, Pollable};
 use super::loaded_scene::LoadedScene;
-use super::partial_output::{Charge, PartialKind, PartialOutput};
+use super::partial_output::{Charge, PartialOutput};
 use crate::telemetry::ms_since;
 use modalcast_model::deform::{VertexAttributes, VertexReadback};
 use modalcast_model::error::{Result, fault, fault_in};
@@ -58,6 +59,8 @@ use modalcast_render::{FrameImage, MAX_FRAMES_IN_FLIGHT, PendingPick, PickHit};
 
 /// How long the thread waits for a frame before it checks the command queue again.
 const POLL_INTERVAL: Duration = Duration::from_micros(100);
+/// Work of at least this many milliseconds is logged, because the other scenes wait for it.
+const LONG_WORK_MS: f64 = 10.0;
 /// Number of threads that copy pixels.
 const COPY_THREADS: usize = 2;
 /// Maximum number of picks in flight. A further pick first waits for the oldest one.
@@ -76,8 +79,6 @@ pub(super) struct DeviceLoop {
     scenes: HashMap<SceneId, LoadedScene>,
     /// Outputs that are drawn in steps. The queue of their scene begins with [`Work::Continue`].
     partial_outputs: HashMap<SceneId, PartialOutput>,
-    /// Scenes whose textures and programs were prepared.
-    prepared_scenes: HashSet<SceneId>,
     vertices: InFlightQueue<PendingVertices, CopiedVertices>,
     picks: InFlightQueue<PendingPick, Vec<PickHit>>,
     frames: InFlightQueue<FrameInFlight, FrameImage>,
@@ -138,11 +139,15 @@ impl DeviceLoop {
             copy_pool: copy_pool.build().map_err(fault_in("threads that copy pixels"))?,
             scenes: HashMap::new(),
             partial_outputs: HashMap::new(),
-            prepared_scenes: HashSet::new(),
             vertices: InFlightQueue::new(MAX_VERTEX_READBACKS_IN_FLIGHT),
             picks: InFlightQueue::new(MAX_PICKS_IN_FLIGHT),
             frames: InFlightQueue::new(MAX_FRAMES_IN_FLIGHT),
         })
+    }
+
+    /// Prepares deformers for the context.
+    pub(super) fn deformer_preparer(&self) -> DeformerPreparer {
+        self.context.deformer_preparer()
     }
 
     /// The backend and the renderer in use.
@@ -161,7 +166,12 @@ impl DeviceLoop {
         let Some(taken) = self.next_work() else { return false };
         self.free_in_flight_slot(&taken.work);
         let older_readback_count = self.vertices.len();
+        let (begin, scene, class) = (Instant::now(), taken.scene, taken.class);
         run_caught(|| self.run_work(taken));
+        let ms = ms_since(begin);
+        if ms >= LONG_WORK_MS {
+            tracing::debug!(scene, work = class.kind, ms, "other scenes waited for the device thread");
+        }
         for _ in 0..older_readback_count {
             run_caught(|| self.finish_oldest_vertices());
         }
@@ -184,7 +194,9 @@ impl DeviceLoop {
             let has_large_output = self.partial_outputs.values().any(PartialOutput::is_large);
             let can_run = |id: SceneId, work: &Work| match work {
                 Work::Continue => ready.contains(&id),
-                Work::Command(command) => !(has_large_output && self.is_large_output(id, command)),
+                Work::Command(command) | Work::Prepared(command) => {
+                    !(has_large_output && self.is_large_output(id, command))
+                }
             };
             if let Some(taken) = self.queue.take(can_run) {
                 return Some(taken);
@@ -212,12 +224,12 @@ impl DeviceLoop {
     /// Waits for a slot for the readback that the work may start. This wait is not part of the cost of the work.
     fn free_in_flight_slot(&mut self, work: &Work) {
         match work {
-            Work::Command(Command::Draw { .. }) | Work::Continue => {
+            Work::Command(Command::Draw { .. }) | Work::Prepared(Command::Draw { .. }) | Work::Continue => {
                 while self.frames.is_full() {
                     run_caught(|| self.finish_oldest_frame());
                 }
             }
-            Work::Command(Command::Pick { .. }) => {
+            Work::Command(Command::Pick { .. }) | Work::Prepared(Command::Pick { .. }) => {
                 while self.picks.is_full() {
                     run_caught(|| self.finish_oldest_pick());
                 }
@@ -227,30 +239,26 @@ impl DeviceLoop {
                     run_caught(|| self.finish_oldest_vertices());
                 }
             }
-            Work::Command(_) => {}
+            Work::Command(_) | Work::Prepared(_) => {}
         }
     }
 
     /// Executes a command or the next step of an output, and charges its scene the time.
     fn run_work(&mut self, taken: Taken<Work>) {
         let begin = Instant::now();
-        if let Work::Command(command) = &taken.work
-            && let Some(preparation) = self.begin_preparation(command)
-        {
-            let Taken { scene: id, class, .. } = taken;
-            // The command is executed when its scene is prepared.
-            self.queue.return_taken(taken);
-            let charge = Charge { class, charged_ms: 0.0, spent_ms: 0.0, is_recorded: true };
-            return self.continue_output(id, PartialOutput { kind: PartialKind::Preparation(preparation), charge });
-        }
+        let taken = match self.prepare(taken) {
+            Some(taken) => taken,
+            None => return,
+        };
         let Taken { scene: id, class, charged_ms, work, .. } = taken;
         match work {
-            Work::Command(command) if command.is_cancelled() => {}
+            Work::Command(command) | Work::Prepared(command) if command.is_cancelled() => drop(command),
             // The costs of outputs are recorded when they are finished.
-            Work::Command(command @ (Command::Draw { .. } | Command::RenderAov { .. })) => {
+            Work::Command(command @ (Command::Draw { .. } | Command::RenderAov { .. }))
+            | Work::Prepared(command @ (Command::Draw { .. } | Command::RenderAov { .. })) => {
                 return self.begin_output(command, Charge { class, charged_ms, spent_ms: 0.0, is_recorded: false });
             }
-            Work::Command(command) => self.execute(command),
+            Work::Command(command) | Work::Prepared(command) => self.execute(command),
             Work::Continue => {
                 if let Some(output) = self.partial_outputs.remove(&id) {
                     self.continue_output(id, output);
@@ -265,8 +273,9 @@ impl DeviceLoop {
             return command.reply_error(error);
         }
         match command {
-            Command::LoadScene { id, scene, backends, reply } => {
-                let result = self.loss.record_loss(self.context.load_scene(&scene, backends)).map(|scene| {
+            Command::LoadScene { id, scene, deformer, raster, reply } => {
+                let loaded_scene = deformer.and_then(|deformer| self.context.load_prepared(&scene, deformer, raster));
+                let result = self.loss.record_loss(loaded_scene).map(|scene| {
                     self.scenes.insert(id, scene);
                 });
                 // If the caller no longer waits, no `UnloadScene` will follow.
@@ -292,7 +301,6 @@ impl DeviceLoop {
         if let Some(scene) = self.scenes.remove(&id) {
             self.context.unload_scene(scene);
         }
-        self.prepared_scenes.remove(&id);
         self.queue.forget(id);
     }
 

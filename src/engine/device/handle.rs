@@ -8,9 +8,10 @@ use tokio::sync::oneshot;
 
 use super::command::{Command, CopiedVertices, Reply, SceneId};
 use super::command_queue::{CancelGuard, CommandQueue};
-use super::context::{DeviceContext, EngineInfo};
+use super::context::{DeformerPreparer, DeviceContext, EngineInfo};
 use super::device_loop::DeviceLoop;
 use super::device_loss::{DeviceLoss, device_loss_channel};
+use crate::engine::blocking::run_blocking;
 use crate::engine::output::step_output::FrameOutput;
 use crate::frame::Legend;
 use modalcast_model::backend_settings::BackendSettings;
@@ -24,6 +25,7 @@ use modalcast_render::{AovImage, FrameImage, PickHit};
 pub(in crate::engine) struct DeviceHandle {
     commands: Arc<CommandSender>,
     loss: DeviceLoss,
+    preparer: DeformerPreparer,
 }
 
 /// Closes the queue when the last handle is dropped.
@@ -60,7 +62,7 @@ impl DeviceThread {
             .spawn(move || match open_device().and_then(|context| DeviceLoop::new(context, loss_sender, queue)) {
                 Ok(device_loop) => {
                     // Fails only if the caller no longer waits. The queue is then closed and `run` returns.
-                    info_sender.send(Ok(device_loop.info().clone())).ok();
+                    info_sender.send(Ok((device_loop.info().clone(), device_loop.deformer_preparer()))).ok();
                     device_loop.run();
                 }
                 Err(error) => {
@@ -68,8 +70,8 @@ impl DeviceThread {
                 }
             })
             .map_err(fault_in("device thread"))?;
-        let info = info_receiver.await.map_err(|_| no_answer_error())??;
-        Ok(Self { handle: DeviceHandle { commands, loss }, info, thread })
+        let (info, preparer) = info_receiver.await.map_err(|_| no_answer_error())??;
+        Ok(Self { handle: DeviceHandle { commands, loss, preparer }, info, thread })
     }
 }
 
@@ -80,12 +82,16 @@ impl DeviceHandle {
         use super::command_queue::Work;
         let queue = CommandQueue::new();
         let (sender, inbox) = tokio::sync::mpsc::channel(16);
-        let handle = Self { commands: Arc::new(CommandSender(Arc::clone(&queue))), loss: device_loss_channel().1 };
+        let handle = Self {
+            commands: Arc::new(CommandSender(Arc::clone(&queue))),
+            loss: device_loss_channel().1,
+            preparer: DeformerPreparer::reference(),
+        };
         // Ends when the handle or the receiver is dropped.
         std::thread::spawn(move || {
             while queue.wait() {
                 let Some(taken) = queue.take(|_, _| true) else { continue };
-                let Work::Command(command) = taken.work else { continue };
+                let (Work::Command(command) | Work::Prepared(command)) = taken.work else { continue };
                 if sender.blocking_send(command).is_err() {
                     return queue.clear();
                 }
@@ -97,7 +103,7 @@ impl DeviceHandle {
     /// A handle for tests that run the device loop themselves.
     #[cfg(test)]
     pub(super) fn of_queue(queue: &Arc<CommandQueue>, loss: DeviceLoss) -> Self {
-        Self { commands: Arc::new(CommandSender(Arc::clone(queue))), loss }
+        Self { commands: Arc::new(CommandSender(Arc::clone(queue))), loss, preparer: DeformerPreparer::reference() }
     }
 
     /// The observer of a device loss.
@@ -105,14 +111,18 @@ impl DeviceHandle {
         &self.loss
     }
 
+    /// Prepares the deformer of a scene on another thread, and then loads the scene on the device thread.
     pub(in crate::engine) async fn load_scene(
         &self,
         id: SceneId,
         scene: &Arc<Scene>,
         backends: BackendSettings,
     ) -> Result<()> {
-        let scene = Arc::clone(scene);
-        self.call(|reply| Command::LoadScene { id, scene, backends, reply }).await
+        let (preparer, prepared_scene) = (self.preparer.clone(), Arc::clone(scene));
+        let prepare = move || preparer.prepare(&prepared_scene, backends.batches);
+        let deformer = run_blocking("load", prepare).await;
+        let (scene, raster) = (Arc::clone(scene), backends.raster);
+        self.call(|reply| Command::LoadScene { id, scene, deformer, raster, reply }).await
     }
 
     /// Starts deforming a scene to a state.

@@ -80,6 +80,9 @@ pub(crate) struct CurrentGl {
     _context: CurrentContext,
 }
 
+/// Threads of the driver that compile programs. A scene has about ten programs.
+const MAX_COMPILER_THREADS: u32 = 8;
+
 /// The functions of a context that is current on this thread while this value exists.
 struct Functions<'a> {
     functions: &'a glow::Context,
@@ -173,6 +176,7 @@ impl Gl {
         let mut functions = unsafe { glow::Context::from_loader_function_cstr(load_address) };
         let limits = Limits::of(&functions);
         clip_control::set_depth_range_from_zero(&functions, &context)?;
+        program::set_compiler_threads(&context, MAX_COMPILER_THREADS);
         if context.is_debug {
             debug::install_debug_callback(&mut functions);
         }

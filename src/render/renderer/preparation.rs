@@ -7,20 +7,22 @@ use std::sync::Arc;
 
 use super::Renderer;
 use crate::device::gl::{self, PendingProgram, Program};
-use crate::resources::scene_buffers::collect_program_sources;
+use crate::resources::scene_buffers::{SceneBuffers, collect_program_sources};
+use crate::resources::target_desc::TargetDesc;
 use crate::resources::texture_arrays::TextureUpload;
 use crate::shaders::ProgramSource;
 use modalcast_model::error::Result;
-use modalcast_model::scene::Scene;
+use modalcast_model::scene::{FrameAntialiasing, Scene};
 
 /// Textures and programs of a scene that are not on the device yet. A step uploads a layer of a texture array, or
 /// compiles a program. If threads of the driver compile programs, a step only begins or ends a compilation.
 #[derive(Debug)]
 pub struct ScenePreparation {
     scene: Arc<Scene>,
-    textures: TextureUpload,
+    /// None for a frame, whose scene has its textures.
+    textures: Option<TextureUpload>,
     sources: VecDeque<ProgramSource>,
-    pending: VecDeque<(ProgramSource, PendingProgram)>,
+    pending: Vec<(ProgramSource, PendingProgram)>,
     /// Keeps the compiled programs in the cache.
     compiled: Vec<Rc<Program>>,
 }
@@ -37,15 +39,23 @@ pub(super) struct PreparedScene {
 impl ScenePreparation {
     /// Whether no step remains.
     pub fn is_finished(&self) -> bool {
-        self.textures.is_finished() && self.sources.is_empty() && self.pending.is_empty()
+        self.textures.as_ref().is_none_or(TextureUpload::is_finished)
+            && self.sources.is_empty()
+            && self.pending.is_empty()
     }
 
     /// Whether the next step does not wait for other threads.
     pub fn is_ready(&self) -> bool {
-        let is_texture_ready = !self.textures.is_finished() && self.textures.is_ready();
-        let is_program_ready = self.pending.front().is_some_and(|(_, program)| program.is_complete());
-        self.is_finished() || is_texture_ready || is_program_ready || !self.sources.is_empty()
+        let is_texture_ready =
+            self.textures.as_ref().is_some_and(|textures| !textures.is_finished() && textures.is_ready());
+        self.is_finished() || is_texture_ready || !self.sources.is_empty() || complete_program(&self.pending).is_some()
     }
+}
+
+/// Index of a program that is complete. Polls all programs, because polling lets the driver link them.
+fn complete_program(pending: &[(ProgramSource, PendingProgram)]) -> Option<usize> {
+    let complete = pending.iter().enumerate().filter(|(_, (_, program))| program.is_complete());
+    complete.map(|(index, _)| index).last()
 }
 
 impl Renderer {
@@ -57,16 +67,56 @@ impl Renderer {
         let _current = self.gl.make_current()?;
         let placeholder = Rc::new(self.gl.empty_program()?);
         let (positions, method) = (&self.sample_positions, self.blur_method);
-        let mut sources = collect_program_sources(&self.gl, scene, positions, method, &placeholder)?;
+        let sources = collect_program_sources(&self.gl, scene, positions, method, &placeholder)?;
+        let textures = TextureUpload::begin(&self.gl, scene, &self.preparation_pool)?;
+        Ok(self.preparation_of(scene, Some(textures), sources))
+    }
+
+    /// Begins to compile the programs of a frame of this size that are not compiled yet: those for another number of
+    /// samples per pixel than most frames have, or for lines along mesh edges.
+    ///
+    /// # Errors
+    /// `Fault` of OpenGL.
+    pub fn begin_frame_preparation(
+        &mut self,
+        buffers: &SceneBuffers,
+        size: [u32; 2],
+        has_edges: bool,
+    ) -> Result<ScenePreparation> {
+        let _current = self.gl.make_current()?;
+        let mut sources = Vec::new();
+        let FrameAntialiasing { method, samples } = buffers.antialiasing(size);
+        // Large frames may have fewer samples.
+        let antialiasing =
+            FrameAntialiasing { method, samples: TargetDesc::ids_and_depth(&self.gl, size, samples).samples };
+        if !buffers.has_frame_programs(antialiasing, has_edges) {
+            let placeholder = Rc::new(self.gl.empty_program()?);
+            let collect = &mut |source| {
+                sources.push(source);
+                Ok(Rc::clone(&placeholder))
+            };
+            buffers.sample_programs(antialiasing.samples, has_edges, collect)?;
+            buffers.encode_program(method, collect)?;
+        }
+        Ok(self.preparation_of(&buffers.scene, None, sources))
+    }
+
+    /// A preparation of textures and of those programs that are not in the cache.
+    fn preparation_of(
+        &self,
+        scene: &Arc<Scene>,
+        textures: Option<TextureUpload>,
+        mut sources: Vec<ProgramSource>,
+    ) -> ScenePreparation {
         let mut known = HashSet::new();
         sources.retain(|source| !self.programs.contains(source) && known.insert(source.clone()));
-        Ok(ScenePreparation {
+        ScenePreparation {
             scene: Arc::clone(scene),
-            textures: TextureUpload::begin(&self.gl, scene, &self.preparation_pool)?,
+            textures,
             sources: sources.into(),
-            pending: VecDeque::new(),
+            pending: Vec::new(),
             compiled: Vec::new(),
-        })
+        }
     }
 
     /// Executes the next step of a preparation.
@@ -76,25 +126,31 @@ impl Renderer {
     pub fn prepare_step(&mut self, preparation: &mut ScenePreparation) -> Result<()> {
         let _current = self.gl.make_current()?;
         let ScenePreparation { textures, sources, pending, compiled, .. } = preparation;
-        if !textures.is_finished() && (textures.is_ready() || (sources.is_empty() && pending.is_empty())) {
+        let must_upload = |textures: &TextureUpload| {
+            !textures.is_finished() && (textures.is_ready() || (sources.is_empty() && pending.is_empty()))
+        };
+        if let Some(textures) = textures.as_mut().filter(|textures| must_upload(textures)) {
             return textures.upload_layer(&self.preparation_pool);
         }
         if let Some(source) = sources.pop_front() {
             let program = self.programs.begin(&source)?;
-            pending.push_back((source, program));
+            pending.push((source, program));
             if self.gl.limits.parallel_compile {
                 return Ok(());
             }
         }
-        if let Some((source, program)) = pending.pop_front() {
+        if !pending.is_empty() {
+            let (source, program) = pending.swap_remove(complete_program(pending).unwrap_or(0));
             compiled.push(self.programs.finish(source, program)?);
         }
         Ok(())
     }
 
-    /// Keeps the textures and programs of a finished preparation until the scene is loaded or dropped.
+    /// Keeps the textures and programs of a finished preparation until the scene is loaded or dropped. The programs of a
+    /// frame stay in the cache.
     pub fn finish_preparation(&mut self, preparation: ScenePreparation) {
         let ScenePreparation { scene, textures, compiled, .. } = preparation;
+        let Some(textures) = textures else { return };
         self.prepared_scenes.push(PreparedScene { scene, textures: textures.into_textures(), _compiled: compiled });
     }
 

@@ -260,6 +260,13 @@ impl SceneBuffers {
         antialiasing(&self.scene, self.renderer_kind, size)
     }
 
+    /// Whether the programs of a frame with this antialiasing are those of most frames.
+    pub(crate) fn has_frame_programs(&self, antialiasing: FrameAntialiasing, has_edges: bool) -> bool {
+        let FrameAntialiasing { method, samples } = antialiasing;
+        let has_shade = self.sample_programs.has_edges == has_edges || self.sample_programs.shade.is_none();
+        self.sample_programs.samples == samples && self.post.antialias == method && has_shade
+    }
+
     /// Program that encodes frames with this antialiasing, compiled unless most frames use it.
     pub(crate) fn encode_program(
         &self,

@@ -75,51 +75,85 @@ pub struct CudaDeformer {
     is_drawn: bool,
 }
 
+/// The parts of a deformer that need neither OpenGL nor the thread of the deformer: compiled kernels and uploaded tables.
+/// Compiling takes hundreds of milliseconds and the upload of U can take longer, so another thread prepares a scene while
+/// the device thread executes the steps of other scenes.
+pub struct PreparedDeformer {
+    device: Arc<Device>,
+    plan: DeformPlan,
+    kernels: StepKernels,
+    inputs: StepInputs,
+    displacements: Option<DeviceBuffer>,
+    max_changed_domains: usize,
+}
+
+impl PreparedDeformer {
+    /// Compiles the kernels of a scene and uploads its tables. Any thread may call this. The work has a stream of its own,
+    /// and is complete when this returns.
+    ///
+    /// # Errors
+    /// `Fault` when the device fails; `Unavailable` when NVRTC is missing or the device's memory is too small.
+    pub fn new(device: &Arc<Device>, scene: &Arc<Scene>, options: CudaDeformerOptions) -> Result<Self> {
+        let tables = DeviceTables::new(scene, options);
+        let plan = plan_from_tables(scene, &tables);
+        let upload_device = device.with_own_stream()?;
+        let _current = upload_device.enter()?;
+        check_memory(&upload_device, &plan)?;
+        let normals = plan.kernel(KernelKind::Normals);
+        let normals = normals.map(|kernel| NormalsKernel::new(&upload_device, scene, &tables, kernel)).transpose()?;
+        let kernels =
+            PositionKernels { deform: plan.require_kernel(KernelKind::Deform)?, batch: plan.kernel(KernelKind::Batch) };
+        let deform = DeformKernel::new(&upload_device, scene, kernels, tables)?;
+        let apply = plan.kernel(KernelKind::Apply);
+        let bounds = plan.require_kernel(KernelKind::Bounds)?;
+        let kernels = StepKernels {
+            bounds: BoundsKernel::new(&upload_device, bounds, options.bounding_axes, &deform)?,
+            normals,
+            apply: apply.map(|apply| ApplyKernel::new(&upload_device, deform.packer(), apply)).transpose()?,
+            deform,
+        };
+        let inputs = StepInputs::new(&upload_device, kernels.deform.packer())?;
+        let displacements = match plan.bytes(BufferRole::Displacements) {
+            0 => None,
+            bytes => Some(DeviceBuffer::zeroed(&upload_device, bytes)?),
+        };
+        upload_device.synchronize("upload")?;
+        let max_changed_domains = max_changed_domains(scene);
+        Ok(Self { device: Arc::clone(device), plan, kernels, inputs, displacements, max_changed_domains })
+    }
+}
+
 impl CudaDeformer {
     /// Uploads a scene to the device. Drawn steps are copied to `gl_buffers` on the device if the driver can register
     /// them.
     ///
     /// # Errors
-    /// `Fault` when the device fails; `Unavailable` when NVRTC is missing or the device's memory is too small.
+    /// Those of [`PreparedDeformer::new`] and [`Self::from_prepared`].
     pub fn new(
         device: &Arc<Device>,
         scene: &Arc<Scene>,
         gl_buffers: Option<GlVertexBuffers>,
         options: CudaDeformerOptions,
     ) -> Result<Self> {
-        let tables = DeviceTables::new(scene, options);
-        let plan = plan_from_tables(scene, &tables);
+        Self::from_prepared(PreparedDeformer::new(device, scene, options)?, gl_buffers)
+    }
+
+    /// Completes a prepared deformer with its output buffers. Drawn steps are copied to `gl_buffers` on the device if the
+    /// driver can register them.
+    ///
+    /// # Errors
+    /// `Fault` when the device fails or its memory is too small.
+    pub fn from_prepared(prepared: PreparedDeformer, gl_buffers: Option<GlVertexBuffers>) -> Result<Self> {
+        let PreparedDeformer { device, plan, kernels, inputs, displacements, max_changed_domains } = prepared;
         let _current = device.enter()?;
-        check_memory(device, &plan)?;
-        let normals = plan.kernel(KernelKind::Normals);
-        let normals = normals.map(|kernel| NormalsKernel::new(device, scene, &tables, kernel)).transpose()?;
-        let kernels =
-            PositionKernels { deform: plan.require_kernel(KernelKind::Deform)?, batch: plan.kernel(KernelKind::Batch) };
-        let deform = DeformKernel::new(device, scene, kernels, tables)?;
-        let apply = plan.kernel(KernelKind::Apply);
-        let kernels = StepKernels {
-            bounds: BoundsKernel::new(
-                device,
-                plan.require_kernel(KernelKind::Bounds)?,
-                options.bounding_axes,
-                &deform,
-            )?,
-            normals,
-            apply: apply.map(|apply| ApplyKernel::new(device, deform.packer(), apply)).transpose()?,
-            deform,
-        };
-        let output = OutputBuffers::new(device, &plan, gl_buffers)?;
-        let inputs = StepInputs::new(device, kernels.deform.packer())?;
+        let output = OutputBuffers::new(&device, &plan, gl_buffers)?;
         Ok(Self {
-            step_slots: vec![StepSlot::new(device, &kernels, &inputs)?],
-            output_ring: OutputRing::new(OutputBuffers::MAX_SETS, max_changed_domains(scene)),
+            step_slots: vec![StepSlot::new(&device, &kernels, &inputs)?],
+            output_ring: OutputRing::new(OutputBuffers::MAX_SETS, max_changed_domains),
             inputs,
             kernels,
             output,
-            displacements: match plan.bytes(BufferRole::Displacements) {
-                0 => None,
-                bytes => Some(DeviceBuffer::zeroed(device, bytes)?),
-            },
+            displacements,
             in_flight: VecDeque::new(),
             last_slot: 0,
             readbacks: ReadbackPool::default(),
@@ -129,7 +163,7 @@ impl CudaDeformer {
             host_attributes: VertexAttributes::ALL,
             gl_buffers_are_current: false,
             is_drawn: false,
-            device: Arc::clone(device),
+            device,
             plan,
         })
     }
@@ -431,10 +465,9 @@ impl Drop for CudaDeformer {
     }
 }
 
-/// Rejects a scene that does not fit into the device's free memory.
+/// Rejects a scene that does not fit into the device's free memory. Does not wait for the device's stream, which another
+/// thread may be capturing.
 fn check_memory(device: &Device, plan: &DeformPlan) -> Result<()> {
-    // Frees are stream-ordered: synchronize, so that memory freed by other scenes counts as free.
-    device.synchronize("device")?;
     let (free, _) = device.memory()?;
     if plan.total_bytes() <= free as u64 {
         return Ok(());

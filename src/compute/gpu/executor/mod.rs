@@ -23,5 +23,5 @@ pub(crate) mod raster;
 mod readback;
 mod step_slot;
 
-pub use deformer::{CudaDeformer, MAX_STEPS_IN_FLIGHT};
+pub use deformer::{CudaDeformer, MAX_STEPS_IN_FLIGHT, PreparedDeformer};
 pub use layout_check::device_layout_values;

@@ -13,8 +13,9 @@ use modalcast_model::error::{Error, Result};
 /// Minimum CUDA version of the driver, 12.0, in the encoding of cuDriverGetVersion: 1000 major + 10 minor.
 const MIN_DRIVER_VERSION: i32 = 12_000;
 
-/// A CUDA device. One stream orders all work, except readbacks of vertices. They have a second stream, and events order
-/// the work of the two streams.
+/// A CUDA device. One stream orders all work, except readbacks of vertices and the preparation of deformers. Readbacks have
+/// a second stream, and events order the work of the two streams. Each preparation has a stream of its own, and waits for
+/// its end.
 #[derive(Debug)]
 pub struct Device {
     context: Arc<CudaContext>,
@@ -51,6 +52,17 @@ impl Device {
         let name = context.name()?;
         let capability = context.compute_capability()?;
         Ok(Arc::new(Self { context, stream, name, ordinal, capability }))
+    }
+
+    /// The same device with another stream. Its work runs concurrently with that of this device, so a thread can upload a
+    /// scene while another thread captures or launches the steps of other scenes.
+    ///
+    /// # Errors
+    /// `Fault` when the driver refuses a stream.
+    pub(crate) fn with_own_stream(&self) -> Result<Self> {
+        let stream = self.context.new_stream().map_err(cuda_error("device"))?;
+        let (context, name) = (Arc::clone(&self.context), self.name.clone());
+        Ok(Self { context, stream, name, ordinal: self.ordinal, capability: self.capability })
     }
 
     /// The device's name.

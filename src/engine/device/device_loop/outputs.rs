@@ -1,29 +1,60 @@
 //! Frames and AOVs (arbitrary output variables), and the preparation of their scenes, in steps.
 
-use std::sync::Arc;
 use std::time::Instant;
 
 use super::{DeviceLoop, FrameInFlight, answer, find_scene};
 use crate::engine::device::command::{Command, SceneId};
+use crate::engine::device::command_queue::Work;
+use crate::engine::device::fair_queue::Taken;
 use crate::engine::device::partial_output::{Charge, PartialKind, PartialOutput};
 use crate::telemetry::ms_since;
 use modalcast_render::ScenePreparation;
 
 impl DeviceLoop {
-    /// Begins to prepare the textures and programs that a command needs to create the OpenGL buffers of its scene. `None`
-    /// if nothing is to prepare. A scene is prepared only once, so that a failure is reported by the command.
-    pub(super) fn begin_preparation(&mut self, command: &Command) -> Option<ScenePreparation> {
-        let id = command.scene();
-        let scene = match command {
-            Command::LoadScene { scene, .. } if self.context.creates_buffers_at_load() => Arc::clone(scene),
-            Command::Draw { .. } | Command::RenderAov { .. } | Command::Pick { .. } if !command.is_cancelled() => {
-                let loaded_scene = self.scenes.get(&id).filter(|scene| scene.buffers().is_err())?;
-                Arc::clone(loaded_scene.scene())
-            }
-            _ => return None,
+    /// Returns work that can run. If a command needs textures or programs that are not on the device yet, begins to prepare
+    /// them in steps and returns `None`; the command runs after the last step. A command is prepared only once, so that it
+    /// reports a failure.
+    pub(super) fn prepare(&mut self, taken: Taken<Work>) -> Option<Taken<Work>> {
+        let preparation = match &taken.work {
+            Work::Command(command) if self.loss.error().is_none() => self.begin_preparation(command),
+            _ => None,
         };
-        let is_first = self.loss.error().is_none() && self.prepared_scenes.insert(id);
-        if is_first { self.context.begin_preparation(&scene) } else { None }
+        let Some(preparation) = preparation else { return Some(taken) };
+        let Taken { scene: id, class, .. } = taken;
+        self.queue.return_taken(Taken {
+            work: match taken.work {
+                Work::Command(command) => Work::Prepared(command),
+                work => work,
+            },
+            ..taken
+        });
+        let charge = Charge { class, charged_ms: 0.0, spent_ms: 0.0, is_recorded: true };
+        let output = PartialOutput { kind: PartialKind::Preparation(preparation), charge };
+        self.queue.push_continuation(id, output.step_class());
+        self.partial_outputs.insert(id, output);
+        None
+    }
+
+    /// Begins to prepare the textures and programs that a command needs: those of the OpenGL buffers that it creates, or
+    /// those of a frame that is drawn in another way than the earlier ones. `None` if nothing is to prepare.
+    fn begin_preparation(&mut self, command: &Command) -> Option<ScenePreparation> {
+        let Self { context, scenes, .. } = self;
+        match command {
+            Command::LoadScene { scene, .. } if context.creates_buffers_at_load() => context.begin_preparation(scene),
+            Command::Draw { id, .. } | Command::RenderAov { id, .. } | Command::Pick { id, .. }
+                if !command.is_cancelled() =>
+            {
+                let loaded_scene = scenes.get(id)?;
+                match (loaded_scene.buffers(), command) {
+                    (Ok(buffers), Command::Draw { size, edges, .. }) => {
+                        context.begin_frame_preparation(buffers, *size, edges.is_some())
+                    }
+                    (Ok(_), _) => None,
+                    (Err(_), _) => context.begin_preparation(loaded_scene.scene()),
+                }
+            }
+            _ => None,
+        }
     }
 
     /// Begins a frame or an AOV.
