@@ -417,11 +417,13 @@ fn find_scene(scenes: &mut HashMap<SceneId, LoadedScene>, id: SceneId) -> Result
 #[cfg(test)]
 mod tests {
     use std::sync::Arc;
+    use std::sync::atomic::{AtomicBool, Ordering};
 
     use super::super::handle::{DeviceHandle, DeviceThread};
     use super::*;
     use crate::engine::testing::{self, FaultyDeformer, InjectedFault};
     use modalcast_model::backend_settings::BackendSettings;
+    use modalcast_model::deform::Deformer;
     use modalcast_model::error::Error;
     use modalcast_model::scene::{Scene, SceneState};
 
@@ -474,6 +476,40 @@ mod tests {
             let positions = deform_and_read(&handle, FAULTY_SCENE, &valid_state).await;
             assert_eq!(positions.as_ref(), Ok(&expected), "{fault:?}: expected the faulty scene to continue");
         }
+    }
+
+    /// Whether deformers of `create_when_open` wait.
+    static IS_GATE_CLOSED: AtomicBool = AtomicBool::new(false);
+
+    /// Creates a deformer when the gate is open, at the latest after two minutes, so that a failed test ends.
+    fn create_when_open(scene: &Arc<Scene>) -> Box<dyn Deformer + Send> {
+        let limit = Instant::now() + Duration::from_secs(120);
+        while IS_GATE_CLOSED.load(Ordering::Relaxed) && Instant::now() < limit {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        FaultyDeformer::boxed(scene)
+    }
+
+    #[tokio::test]
+    async fn scenes_are_served_while_the_deformer_of_another_scene_is_prepared() {
+        let open_device = || DeviceContext::with_deformer(create_when_open);
+        let handle = DeviceThread::start(open_device).await.expect("expected a device thread").handle;
+        let scene = testing::two_strips();
+        handle.load_scene(CONTROL_SCENE, &scene, BackendSettings::default()).await.expect("expected a loaded scene");
+        IS_GATE_CLOSED.store(true, Ordering::Relaxed);
+        let (slow_handle, slow_scene) = (handle.clone(), Arc::clone(&scene));
+        let load =
+            tokio::spawn(async move { slow_handle.load_scene(3, &slow_scene, BackendSettings::default()).await });
+        let state = state_with_q(&scene, 0.5);
+        let served = deform_and_read(&handle, CONTROL_SCENE, &state);
+        tokio::time::timeout(Duration::from_secs(60), served)
+            .await
+            .expect("expected no wait")
+            .expect("expected positions");
+        assert!(!load.is_finished(), "control: expected a load that waits");
+        IS_GATE_CLOSED.store(false, Ordering::Relaxed);
+        load.await.expect("expected no panic").expect("expected a loaded scene");
+        deform_and_read(&handle, 3, &state).await.expect("expected positions of the loaded scene");
     }
 
     #[tokio::test]

@@ -178,7 +178,7 @@ mod tests {
     use crate::{DevicePreference, FrameParams};
     use modalcast_model::deform::DeformedSurface;
     use modalcast_model::domain::{AlphaMode, Material, Texture};
-    use modalcast_model::scene::{Bloom, Camera, Culling, Transparency};
+    use modalcast_model::scene::{Bloom, Camera, Culling, MeshEdges, Transparency};
 
     /// Prepares a scene. Returns the number of steps.
     fn prepare(renderer: &mut Renderer, scene: &Arc<Scene>) -> usize {
@@ -264,6 +264,33 @@ mod tests {
         let colors: HashSet<&[u8]> = images[0].chunks(4).collect();
         assert!(colors.len() > 100, "expected a detailed image, got {} colors", colors.len());
         assert!(images[0] == images[1]);
+    }
+
+    #[test]
+    fn frame_with_edges_compiles_no_program_after_its_preparation() {
+        let mut renderer = Renderer::open(DevicePreference::Any).expect("EGL and OpenGL 4.3");
+        let scene = Scene::new(squares(vec![Material::default()])).expect("a valid scene");
+        let buffers = renderer.load(&scene).expect("loads");
+        let size = [48, 32];
+        assert!(renderer.begin_frame_preparation(&buffers, size, false).expect("begins").is_finished(), "control");
+        let loaded_count = renderer.programs.labels().count();
+        let mut preparation = renderer.begin_frame_preparation(&buffers, size, true).expect("begins");
+        assert!(!preparation.is_finished(), "expected programs for edges");
+        while !preparation.is_finished() {
+            while !preparation.is_ready() {
+                std::thread::yield_now();
+            }
+            renderer.prepare_step(&mut preparation).expect("prepares");
+        }
+        renderer.finish_preparation(preparation);
+        let prepared_count = renderer.programs.labels().count();
+        assert!(prepared_count > loaded_count && renderer.prepared_scenes.is_empty());
+        let edges = Some(MeshEdges::default());
+        let (camera, bounds) = (Camera::fit_to_scene(&scene, size[0], size[1]), scene.rest_bounds);
+        let params = FrameParams { camera, width: size[0], height: size[1], bounds, light_bounds: None, edges };
+        renderer.draw(&buffers, &params).expect("draws");
+        assert_eq!(renderer.programs.labels().count(), prepared_count);
+        renderer.unload(buffers);
     }
 
     #[test]
