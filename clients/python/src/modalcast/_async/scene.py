@@ -1,0 +1,700 @@
+"""An open scene: pictures, vertices, states, picks and forces."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, TypeVar
+
+from modalcast._async.describe import read_attachments, read_description, read_modes
+from modalcast._async.drive import Drive, DriveOptions
+from modalcast._async.streams import FrameBatchStream, FrameStream, Stream, read_reply, with_reconnect
+from modalcast._async.transport import ReplyStream, Transport
+from modalcast._channel import deadline_ms
+from modalcast._chunks import malformed
+from modalcast._common import Delivery, StepId, delivery_message, step_id, step_selector
+from modalcast._decoders import (
+    ForceDecoder,
+    FrameDecoder,
+    ReplyDecoder,
+    SceneStateDecoder,
+    VertexSetDecoder,
+    parse,
+)
+from modalcast._methods import (
+    APPLY_FORCES,
+    GET_STATE,
+    GET_VERTICES,
+    PICK,
+    RENDER_FRAME,
+    STREAM_FORCES,
+    STREAM_FRAMES,
+    STREAM_STATES,
+    STREAM_VERTICES,
+)
+from modalcast._types import F32
+from modalcast.camera import Camera
+from modalcast.forces import Force, ForceSet, Hit, PickResult, force_messages, hit_from_message
+from modalcast.frame import ColorFormat, Frame, Output, OutputName, PictureOptions, picture_size
+from modalcast.kinematics import Kinematics
+from modalcast.scene_description import ArrayName, Domain, Domains, SceneDescription
+from modalcast.states import SceneState, StateLayout
+from modalcast.v1 import common_pb2, forces_pb2, frames_pb2, scenes_pb2, states_pb2, vertices_pb2
+from modalcast.vertices import Attributes, VertexSet, check_out, vertex_selection
+
+if TYPE_CHECKING:
+    from modalcast._async.client import Client
+
+T = TypeVar("T")
+
+
+class Scene:
+    """An open scene, from `Client.open`, `Client.scene` or `Client.upload`.
+
+    Calls without `step` show the current step; `step` waits for that step or a later one, and `exact` for exactly that
+    one. `timeout` is in seconds; None is that of the client.
+
+    Attributes:
+        client: The connection, which the scene keeps open.
+        info: Size, units, up axis, bounds and origin; `SceneInfo` in `scenes.proto` documents the fields.
+        domains: The domains, by index and by name.
+    """
+
+    def __init__(
+        self,
+        client: Client,
+        transport: Transport,
+        description: SceneDescription,
+        force_owner: bytes,
+        *,
+        timeout: float,
+        reconnect: float,
+    ) -> None:
+        """`Client` creates scenes."""
+        self.client = client
+        self.info: scenes_pb2.SceneInfo = description.info
+        self.domains: Domains = description.domains
+        self._transport = transport
+        self._force_owner = force_owner
+        self._timeout = timeout
+        self._reconnect = reconnect
+        self._layout = StateLayout(self.domains)
+        self._kinematics: Kinematics | None = None
+
+    @property
+    def name(self) -> str:
+        """The name of the scene on the server."""
+        return self.info.scene
+
+    @property
+    def vertex_count(self) -> int:
+        """Number of vertices of all domains."""
+        return self.info.vertices
+
+    @property
+    def coordinate_count(self) -> int:
+        """Number of coordinates q of all domains."""
+        return self.info.coordinates
+
+    def __repr__(self) -> str:
+        counts = f"{len(self.domains)} domains, {self.vertex_count} vertices, {self.coordinate_count} coordinates"
+        return f"<Scene '{self.name}': {counts}>"
+
+    async def describe(
+        self,
+        arrays: Sequence[ArrayName] = (),
+        *,
+        domains: Sequence[int | str | Domain] = (),
+        textures: bool = False,
+        hashes: bool = False,
+        cache: str | None = None,
+        timeout: float | None = None,
+    ) -> SceneDescription:
+        """Describes domains, and the shapes, materials and textures that they use.
+
+        Args:
+            arrays: Arrays of the shapes to read, see `Shape.arrays`.
+            domains: The domains; empty: all.
+            textures: Whether to read the pixels of textures.
+            hashes: Whether to return the hashes of arrays and textures.
+            cache: A folder for arrays and pixels by their SHA-256; a content that is in the folder is not received.
+            timeout: In seconds, for each call; None: that of the client.
+
+        Raises:
+            KeyError: No domain has a name.
+            OSError: The folder cannot be written.
+            Error: The call failed.
+        """
+        selected = [self.domains[domain].index for domain in domains]
+        time_limit = self._time_limit(timeout)
+
+        async def read() -> SceneDescription:
+            return await read_description(
+                self._transport,
+                self.name,
+                selected,
+                arrays,
+                textures=textures,
+                hashes=hashes,
+                cache=cache,
+                timeout=time_limit,
+            )
+
+        return await with_reconnect(self._reconnect, read)
+
+    async def modes(
+        self, domain: int | str | Domain, vertices: Sequence[int] = (), *, timeout: float | None = None
+    ) -> F32:
+        """U of a domain: 3k x r, three rows for each of the k vertices; empty: all n vertices.
+
+        Raises:
+            KeyError: No domain has the name.
+            Error: The call failed.
+        """
+        index, time_limit = self.domains[domain].index, self._time_limit(timeout)
+        return await with_reconnect(
+            self._reconnect, lambda: read_modes(self._transport, self.name, index, vertices, time_limit)
+        )
+
+    async def drive(
+        self,
+        *,
+        delivery: Delivery = "lossless",
+        joints: bool = True,
+        reset: bool = False,
+        take_over: bool = False,
+        window: int | None = None,
+        lease_token: bytes = b"",
+        dt: float = 1 / 60,
+        timeout: float | None = None,
+    ) -> Drive:
+        """Becomes the writer of the scene.
+
+        Args:
+            delivery: "lossless": every step is computed, in order, and a slow lossless reader slows the drive down.
+                "latest": steps that arrive while another one is computed are merged into one.
+            joints: Whether to compute the transforms of attached domains, so that they move with their parents.
+            reset: Whether the first step starts from the rest state.
+            take_over: Whether to replace the present writer.
+            window: Limits the steps without acknowledgment; None: the server limits them.
+            lease_token: Replaces the writer with this token (`Drive.lease_token`) at once.
+            dt: Seconds between steps that do not set their time.
+            timeout: Default time limit of the calls of the drive, in seconds.
+
+        Raises:
+            AlreadyExists: Another writer drives the scene, and `take_over` is false.
+            Error: The call failed.
+        """
+        time_limit = self._time_limit(timeout)
+        kinematics = await self._load_kinematics(time_limit) if joints else None
+        drive = Drive(
+            self._transport,
+            self.name,
+            self._layout,
+            kinematics,
+            DriveOptions(delivery, reset, take_over, window, lease_token, dt),
+            lambda: self.state(timeout=time_limit),
+            timeout=time_limit,
+            reconnect=self._reconnect,
+        )
+        await drive.start()
+        return drive
+
+    async def reset(self, *, take_over: bool = False, timeout: float | None = None) -> StepId:
+        """Returns to the rest state. A program that drives the scene calls `Drive.reset` instead.
+
+        Raises:
+            AlreadyExists: Another writer drives the scene, and `take_over` is false.
+            Error: The call failed.
+        """
+        async with await self.drive(joints=False, reset=True, take_over=take_over, timeout=timeout) as drive:
+            return await drive.reset(timeout=timeout)
+
+    async def frame(
+        self,
+        camera: Camera | None = None,
+        *,
+        outputs: Sequence[OutputName | Output] = ("color",),
+        width: int | None = None,
+        height: int | None = None,
+        format: ColorFormat = "raw",  # noqa: A002 # the word of the field
+        jpeg_quality: int = 90,
+        step: StepId | int | None = None,
+        exact: bool = False,
+        timeout: float | None = None,
+    ) -> Frame:
+        """Renders a frame.
+
+        Args:
+            camera: `look_at`, `at_pose` or `pinhole`; None shows the whole scene.
+            outputs: Names out of "color", "depth", "depth_with_ground", "domains", "normals", "displacement" and
+                "mode_shape", or `Output` for parameters. All are of the same step, one array each.
+            width: In pixels; None: that of the camera, or 1280.
+            height: In pixels; None: that of the camera, or 720.
+            format: Encoding of color: "raw" for arrays, "png", or "jpeg".
+            jpeg_quality: 1 to 100.
+            step, exact, timeout: As for the class.
+
+        Raises:
+            ValueError: An argument is invalid.
+            StepPassed: The scene has passed the exact step.
+            Error: The call failed.
+        """
+        frames = await self.frame_batch(
+            [camera],
+            outputs=outputs,
+            width=width,
+            height=height,
+            format=format,
+            jpeg_quality=jpeg_quality,
+            step=step,
+            exact=exact,
+            timeout=timeout,
+        )
+        return frames[0]
+
+    async def frame_batch(
+        self,
+        cameras: Sequence[Camera | None],
+        *,
+        outputs: Sequence[OutputName | Output] = ("color",),
+        width: int | None = None,
+        height: int | None = None,
+        format: ColorFormat = "raw",  # noqa: A002
+        jpeg_quality: int = 90,
+        step: StepId | int | None = None,
+        exact: bool = False,
+        timeout: float | None = None,
+    ) -> list[Frame]:
+        """Renders one frame per camera, all of the same step; at most 16 pictures (cameras times outputs).
+
+        Raises:
+            Error: As for `frame`, which documents the other arguments.
+        """
+        options = PictureOptions(cameras, outputs, width, height, format, jpeg_quality)
+        time_limit = self._time_limit(timeout)
+        request = frames_pb2.RenderFrameRequest(
+            scene=self.name,
+            pictures=options.to_messages(self.info.up),
+            step=step_selector(step, exact=exact),
+            deadline_ms=deadline_ms(time_limit),
+        )
+        return await self._read_one(
+            lambda: self._transport.stream(RENDER_FRAME, request, time_limit),
+            lambda: FrameDecoder(options.names(), len(cameras), chunk_field=1),
+        )
+
+    async def frames(
+        self,
+        camera: Camera | None = None,
+        *,
+        outputs: Sequence[OutputName | Output] = ("color",),
+        width: int | None = None,
+        height: int | None = None,
+        format: ColorFormat = "raw",  # noqa: A002
+        jpeg_quality: int = 90,
+        delivery: Delivery = "latest",
+        max_hz: float = 0.0,
+        count: int = 0,
+    ) -> FrameStream:
+        """Iterates over one frame per step. When this returns, the next step is delivered.
+
+        Args:
+            camera: As for `frame`; `FrameStream.move_camera` moves it.
+            outputs, width, height, format, jpeg_quality: As for `frame`.
+            delivery: "latest": the newest step, beginning with the current one. "lossless": every step from the next
+                one on; a slow reader slows the drive down.
+            max_hz: Limits the frames per second, with the delivery "latest"; 0: no limit.
+            count: Ends the stream after this number of frames; 0: no limit.
+
+        Raises:
+            ValueError: An argument is invalid.
+            Error: The call failed.
+        """
+        return FrameStream(
+            await self.frame_batches(
+                [camera],
+                outputs=outputs,
+                width=width,
+                height=height,
+                format=format,
+                jpeg_quality=jpeg_quality,
+                delivery=delivery,
+                max_hz=max_hz,
+                count=count,
+            )
+        )
+
+    async def frame_batches(
+        self,
+        cameras: Sequence[Camera | None],
+        *,
+        outputs: Sequence[OutputName | Output] = ("color",),
+        width: int | None = None,
+        height: int | None = None,
+        format: ColorFormat = "raw",  # noqa: A002
+        jpeg_quality: int = 90,
+        delivery: Delivery = "latest",
+        max_hz: float = 0.0,
+        count: int = 0,
+    ) -> FrameBatchStream:
+        """Iterates over one frame per camera and step, as lists.
+
+        Raises:
+            Error: As for `frames`, which documents the arguments.
+        """
+        options = PictureOptions(cameras, outputs, width, height, format, jpeg_quality)
+        pictures = options.to_messages(self.info.up)
+        wire_delivery = delivery_message(delivery)
+
+        def open_call(steps: int) -> ReplyStream:
+            request = frames_pb2.StreamFramesRequest(
+                scene=self.name, pictures=pictures, delivery=wire_delivery, max_hz=max_hz, steps=steps
+            )
+            return self._transport.stream(STREAM_FRAMES, request, None, is_lossless=delivery == "lossless")
+
+        stream = FrameBatchStream(
+            self._transport,
+            pictures,
+            len(outputs),
+            self.info.up,
+            self._timeout,
+            open_call,
+            lambda: FrameDecoder(options.names(), len(cameras), chunk_field=2),
+            count=count,
+            reconnect=self._stream_reconnect(delivery),
+        )
+        await stream.start()
+        return stream
+
+    async def vertices(
+        self,
+        out: F32 | None = None,
+        *,
+        step: StepId | int | None = None,
+        exact: bool = False,
+        timeout: float | None = None,
+    ) -> F32:
+        """Positions of all vertices: n x 3, domain by domain, in scene units relative to the scene's origin.
+
+        Args:
+            out: An n x 3 array of float32 that receives the positions, and is returned.
+            step, exact, timeout: As for the class.
+
+        Raises:
+            ValueError: `out` has another shape or type.
+            Error: The call failed.
+        """
+        target = None if out is None else check_out(out, self.vertex_count)
+        selection = vertex_selection(self.domains, (), ("positions",))
+        vertex_set = await self._vertex_set(
+            selection, lambda: VertexSetDecoder(1, 2, target), step, exact=exact, timeout=timeout
+        )
+        if vertex_set.positions is None:
+            raise malformed("vertices.sections", "positions", "none")
+        return vertex_set.positions if out is None else out
+
+    async def vertex_set(
+        self,
+        attributes: Attributes = ("positions", "normals"),
+        *,
+        domains: Sequence[int | str | Domain] = (),
+        step: StepId | int | None = None,
+        exact: bool = False,
+        timeout: float | None = None,
+    ) -> VertexSet:
+        """Reads attributes of the vertices of a step.
+
+        Args:
+            attributes: Names out of "positions", "normals", "displacements" and "boxes", or encodings by name: "f32",
+                "f16", "u16_box" (positions, displacements) and "octahedral_i16" (normals). The arrays are f32.
+            domains: The domains, in the order of the arrays; empty: all.
+            step, exact, timeout: As for the class.
+
+        Raises:
+            KeyError: No domain has a name.
+            ValueError: An attribute or an encoding is unknown.
+            Error: The call failed.
+        """
+        selection = vertex_selection(self.domains, domains, attributes)
+        return await self._vertex_set(selection, lambda: VertexSetDecoder(1, 2), step, exact=exact, timeout=timeout)
+
+    async def vertex_sets(
+        self,
+        attributes: Attributes = ("positions",),
+        *,
+        domains: Sequence[int | str | Domain] = (),
+        delivery: Delivery = "latest",
+        max_hz: float = 0.0,
+        count: int = 0,
+    ) -> Stream[VertexSet]:
+        """Iterates over the vertices of steps; `vertex_set` and `frames` document the arguments.
+
+        Raises:
+            KeyError: No domain has a name.
+            ValueError: An argument is invalid.
+            Error: The call failed.
+        """
+        selection = vertex_selection(self.domains, domains, attributes)
+        wire_delivery = delivery_message(delivery)
+
+        def open_call(steps: int) -> ReplyStream:
+            request = vertices_pb2.StreamVerticesRequest(
+                scene=self.name, selection=selection, delivery=wire_delivery, max_hz=max_hz, steps=steps
+            )
+            return self._transport.stream(STREAM_VERTICES, request, None, is_lossless=delivery == "lossless")
+
+        return await self._start(open_call, lambda: VertexSetDecoder(2, 3), count, delivery)
+
+    async def state(
+        self, *, step: StepId | int | None = None, exact: bool = False, timeout: float | None = None
+    ) -> SceneState:
+        """Reads the coordinates q and the transforms T of all domains.
+
+        Raises:
+            Error: The call failed.
+        """
+        time_limit = self._time_limit(timeout)
+        request = states_pb2.GetStateRequest(
+            scene=self.name, step=step_selector(step, exact=exact), deadline_ms=deadline_ms(time_limit)
+        )
+        return await self._read_one(
+            lambda: self._transport.stream(GET_STATE, request, time_limit),
+            lambda: SceneStateDecoder(self._layout, chunk_field=1),
+        )
+
+    async def steps(self, *, delivery: Delivery = "latest", max_hz: float = 0.0, count: int = 0) -> Stream[SceneState]:
+        """Iterates over the coordinates and transforms of steps. Only changes are sent, and complete states returned.
+
+        Raises:
+            ValueError: An argument is invalid; `frames` documents them.
+            Error: The call failed.
+        """
+        wire_delivery = delivery_message(delivery)
+
+        def open_call(steps: int) -> ReplyStream:
+            request = states_pb2.StreamStatesRequest(
+                scene=self.name, delivery=wire_delivery, max_hz=max_hz, steps=steps
+            )
+            return self._transport.stream(STREAM_STATES, request, None, is_lossless=delivery == "lossless")
+
+        return await self._start(open_call, lambda: SceneStateDecoder(self._layout, chunk_field=2), count, delivery)
+
+    async def pick(
+        self,
+        x: int,
+        y: int,
+        camera: Camera | None = None,
+        *,
+        width: int | None = None,
+        height: int | None = None,
+        step: StepId | int | None = None,
+        exact: bool = False,
+        timeout: float | None = None,
+    ) -> Hit | None:
+        """The surface at the center of a pixel; None where there is none.
+
+        Args:
+            x: Column of the pixel, from the left of the picture.
+            y: Row of the pixel, from the top.
+            camera: The camera of the picture; None: one that shows the whole scene.
+            width: Width of the picture; None: that of the camera, or 1280.
+            height: Height of the picture; None: that of the camera, or 720.
+            step, exact, timeout: As for the class.
+
+        Raises:
+            InvalidRequest: The pixel is outside the picture.
+            Error: The call failed.
+        """
+        picked = await self.pick_rectangle(
+            x, y, (1, 1), camera, width=width, height=height, step=step, exact=exact, timeout=timeout
+        )
+        return picked.hits[0] if picked.hits else None
+
+    async def pick_rectangle(
+        self,
+        x: int,
+        y: int,
+        size: tuple[int, int],
+        camera: Camera | None = None,
+        *,
+        modes: bool = True,
+        width: int | None = None,
+        height: int | None = None,
+        step: StepId | int | None = None,
+        exact: bool = False,
+        timeout: float | None = None,
+    ) -> PickResult:
+        """The surface at the centers of the pixels of a rectangle.
+
+        Args:
+            x: Column of the top left pixel.
+            y: Row of the top left pixel.
+            size: Width and height of the rectangle in pixels, 1 to 64 each.
+            camera: As for `pick`.
+            modes: Whether to read `Hit.modes`.
+            width, height, step, exact, timeout: As for `pick`.
+
+        Raises:
+            ValueError: A pixel or a size is negative.
+            InvalidRequest: The rectangle is outside the picture.
+            Error: The call failed.
+        """
+        if min(x, y, *size) < 0:
+            raise ValueError(f"expected pixels and sizes of at least 0, got pixel ({x}, {y}) and size {size}")
+        picture_width, picture_height = picture_size(camera, width, height)
+        picture = frames_pb2.Picture(width=picture_width, height=picture_height)
+        if camera is not None:
+            picture.camera.CopyFrom(camera.to_message(self.info.up))
+        time_limit = self._time_limit(timeout)
+        request = frames_pb2.PickRequest(
+            scene=self.name,
+            picture=picture,
+            step=step_selector(step, exact=exact),
+            deadline_ms=deadline_ms(time_limit),
+            x=x,
+            y=y,
+            width=size[0],
+            height=size[1],
+            without_modes=not modes,
+        )
+
+        async def read() -> PickResult:
+            stream = self._transport.stream(PICK, request, time_limit)
+            step_message: common_pb2.StepId | None = None
+            hits: list[Hit] = []
+            while (message := await stream.read()) is not None:
+                reply = parse("pick", frames_pb2.PickResponse, message)
+                step_message = reply.head.step if reply.HasField("head") else step_message
+                hits.extend(hit_from_message(hit) for hit in reply.hits)
+            if step_message is None:
+                raise malformed("pick.head", "a head", "none")
+            return PickResult(step_id(step_message), tuple(hits))
+
+        return await with_reconnect(self._reconnect, read)
+
+    async def apply_forces(
+        self, forces: Sequence[Force], *, lifetime: float = 0.5, timeout: float | None = None
+    ) -> int:
+        """Replaces all forces that this client applies to the scene. An empty list removes them.
+
+        Args:
+            forces: `Hit.force`, `surface_force` or `modal_force`; at most 16.
+            lifetime: Seconds after which the forces expire unless they are applied again, at most 10.
+            timeout: In seconds; None: that of the client.
+
+        Returns:
+            The number of this client in `ForceSet.forces`; 0 without forces.
+
+        Raises:
+            KeyError: No domain has a name.
+            ValueError: A modal force does not have one number per mode.
+            Error: The call failed.
+        """
+        request = forces_pb2.ApplyForcesRequest(
+            scene=self.name,
+            owner=self._force_owner,
+            forces=force_messages(self.domains, forces),
+            lifetime_ms=max(round(lifetime * 1000), 1),
+        )
+        reply = await self._transport.unary(APPLY_FORCES, request, self._time_limit(timeout))
+        return reply.owner
+
+    async def forces(self, *, max_hz: float = 0.0) -> Stream[ForceSet]:
+        """Iterates over the forces of all viewers: the present ones, then all forces after every change.
+
+        Args:
+            max_hz: Limits the replies per second; 0: no limit.
+
+        Raises:
+            Error: The call failed.
+        """
+        request = forces_pb2.StreamForcesRequest(scene=self.name, max_hz=max_hz)
+        return await self._start(
+            lambda _: self._transport.stream(STREAM_FORCES, request, None), ForceDecoder, 0, "latest"
+        )
+
+    async def delete(self, *, timeout: float | None = None) -> None:
+        """Closes the scene for all clients, and removes the files of an uploaded scene.
+
+        Raises:
+            Error: The call failed.
+        """
+        await self.client.delete(self.name, timeout=timeout)
+
+    def _time_limit(self, timeout: float | None) -> float:
+        if timeout is not None and timeout <= 0:
+            raise ValueError(f"timeout: expected a number of seconds above 0, got {timeout}")
+        return self._timeout if timeout is None else timeout
+
+    def _stream_reconnect(self, delivery: Delivery) -> float:
+        return self._reconnect if delivery == "latest" else 0.0
+
+    async def _start(
+        self,
+        open_call: Callable[[int], ReplyStream],
+        new_decoder: Callable[[], ReplyDecoder[T]],
+        count: int,
+        delivery: Delivery,
+    ) -> Stream[T]:
+        stream = Stream(open_call, new_decoder, count=count, reconnect=self._stream_reconnect(delivery))
+        await stream.start()
+        return stream
+
+    async def _read_one(self, open_call: Callable[[], ReplyStream], new_decoder: Callable[[], ReplyDecoder[T]]) -> T:
+        """The single reply of a call."""
+
+        async def read() -> T:
+            stream = open_call()
+            try:
+                reply = await read_reply(stream, new_decoder())
+                if reply is None:
+                    raise malformed("reply", "a complete reply", "the end of the stream")
+                # The status after the reply ends the call.
+                await stream.read()
+            except BaseException:
+                stream.cancel()
+                raise
+            return reply
+
+        return await with_reconnect(self._reconnect, read)
+
+    async def _vertex_set(
+        self,
+        selection: vertices_pb2.VertexSelection,
+        new_decoder: Callable[[], VertexSetDecoder],
+        step: StepId | int | None,
+        *,
+        exact: bool,
+        timeout: float | None,
+    ) -> VertexSet:
+        time_limit = self._time_limit(timeout)
+        request = vertices_pb2.GetVerticesRequest(
+            scene=self.name,
+            selection=selection,
+            step=step_selector(step, exact=exact),
+            deadline_ms=deadline_ms(time_limit),
+        )
+        return await self._read_one(lambda: self._transport.stream(GET_VERTICES, request, time_limit), new_decoder)
+
+    async def _load_kinematics(self, timeout: float) -> Kinematics | None:
+        """Reads the modes near the joints, once. None for a scene without attached domains."""
+        if self._kinematics is None and any(domain.parent is not None for domain in self.domains):
+            points = await read_attachments(self._transport, self.name, self._layout, timeout)
+            self._kinematics = Kinematics(self._layout, points)
+        return self._kinematics
+
+
+async def open_scene(
+    client: Client,
+    transport: Transport,
+    info: scenes_pb2.SceneInfo,
+    force_owner: bytes,
+    *,
+    timeout: float,
+    reconnect: float,
+) -> Scene:
+    """Describes an open scene."""
+    description = await read_description(
+        transport, info.scene, (), (), textures=False, hashes=False, cache=None, timeout=timeout
+    )
+    return Scene(client, transport, description, force_owner, timeout=timeout, reconnect=reconnect)

@@ -1,0 +1,206 @@
+"""Calls over grpc.aio. Errors of gRPC become errors of this package."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Iterator
+from typing import Any, TypeVar, cast
+
+import grpc
+import grpc.aio
+from google.protobuf.message import Message
+
+from modalcast._channel import CHANNEL_OPTIONS, target_of
+from modalcast._chunks import malformed
+from modalcast._methods import DRIVE_SCENE, Method
+from modalcast._step_progress import Progress
+from modalcast.errors import ConnectionLost, DeadlineExceeded, Error, from_rejection, from_rpc_error
+from modalcast.v1 import steps_pb2
+
+RequestT = TypeVar("RequestT", bound=Message)
+ReplyT = TypeVar("ReplyT", bound=Message)
+
+sleep = asyncio.sleep
+
+
+class ReplyStream:
+    """The messages of a call, as bytes."""
+
+    def __init__(self, call: grpc.aio.UnaryStreamCall[Any, bytes], address: str) -> None:
+        self._call = call
+        self._address = address
+
+    async def read(self) -> bytes | None:
+        """The next message; None at the end.
+
+        Raises:
+            Error: The call failed.
+        """
+        try:
+            message = await self._call.read()
+        except grpc.RpcError as error:
+            raise from_rpc_error(error, self._address) from None
+        except asyncio.InvalidStateError:  # cancelled by `cancel`
+            return None
+        return message if isinstance(message, bytes) else None
+
+    def cancel(self) -> None:
+        """Ends the call."""
+        self._call.cancel()
+
+
+class StepStream:
+    """A step stream. A task reads the replies, also while the caller does nothing."""
+
+    def __init__(self, call: grpc.aio.StreamStreamCall[Any, Any], address: str) -> None:
+        self._call = call
+        self._address = address
+        self._changed = asyncio.Event()
+        self._reader: asyncio.Task[None] | None = None
+        self.progress = Progress()
+
+    async def open(self, request: steps_pb2.OpenDrive, timeout: float) -> steps_pb2.Opened:
+        """Sends the first message, and begins to read replies.
+
+        Raises:
+            Error: The server rejects the request, or does not answer in time.
+        """
+        try:
+            async with asyncio.timeout(timeout):
+                await self._call.write(steps_pb2.DriveSceneRequest(open=request))
+                reply = await self._call.read()
+        except grpc.RpcError as error:
+            raise from_rpc_error(error, self._address) from None
+        except TimeoutError:
+            raise DeadlineExceeded(f"{self._address}: the drive did not open within {timeout:g} s") from None
+        if not isinstance(reply, steps_pb2.DriveSceneResponse):
+            raise malformed("drive.opened", "`opened` first", "the end of the stream")
+        if reply.HasField("rejection"):
+            raise from_rejection(reply.rejection)
+        self._reader = asyncio.create_task(self._read_replies())
+        return reply.opened
+
+    async def send(self, step: steps_pb2.Step) -> None:
+        """Sends a part of a step.
+
+        Raises:
+            Error: The stream has ended.
+        """
+        if self.progress.end is not None:
+            raise self.progress.end.with_traceback(None)
+        try:
+            await self._call.write(steps_pb2.DriveSceneRequest(step=step))
+        except (grpc.RpcError, asyncio.InvalidStateError):
+            # The reader receives the reason.
+            await self.wait_until(lambda: False, 5.0)
+
+    async def wait_until(self, condition: Callable[[], bool], timeout: float) -> None:
+        """Waits until the progress satisfies a condition.
+
+        Raises:
+            DeadlineExceeded: The time has passed; the stream remains open.
+            Error: The stream has ended.
+        """
+        try:
+            async with asyncio.timeout(timeout):
+                while not condition():
+                    if self.progress.end is not None:
+                        raise self.progress.end.with_traceback(None)
+                    self._changed.clear()
+                    await self._changed.wait()
+        except TimeoutError:
+            raise DeadlineExceeded(f"{self._address}: no acknowledgment of a step within {timeout:g} s") from None
+
+    async def finish(self, timeout: float) -> None:
+        """Ends the stream from this side, and waits until the server has released the scene."""
+        await self._call.done_writing()
+        if self._reader is not None:
+            await asyncio.wait([self._reader], timeout=timeout)
+        self.cancel()
+
+    def cancel(self) -> None:
+        """Ends the stream at once."""
+        self._call.cancel()
+        if self._reader is not None:
+            self._reader.cancel()
+
+    async def _read_replies(self) -> None:
+        end: Error = ConnectionLost(f"{self._address}: the server has ended the step stream")
+        try:
+            while isinstance(reply := await self._call.read(), steps_pb2.DriveSceneResponse):
+                self.progress.add(reply)
+                self._changed.set()
+        except grpc.RpcError as error:
+            end = from_rpc_error(error, self._address)
+        finally:
+            self.progress.end = end
+            self._changed.set()
+
+
+class Transport:
+    """Connections to a server: one for calls, and one for streams of every step, which opens with its first stream."""
+
+    def __init__(self, address: str) -> None:
+        """Connects with the first call.
+
+        Raises:
+            ValueError: The address is invalid.
+        """
+        self.address = address
+        self._target = target_of(address)
+        self._channel = self._new_channel()
+        self._lossless_channel: grpc.aio.Channel | None = None
+
+    async def unary(self, method: Method[RequestT, ReplyT], request: RequestT, timeout: float) -> ReplyT:
+        """Makes a call with one reply.
+
+        Raises:
+            Error: The call failed.
+        """
+        call = self._channel.unary_unary(method.path, method.request.SerializeToString, method.reply.FromString)
+        try:
+            return await call(request, timeout=timeout)
+        except grpc.RpcError as error:
+            raise from_rpc_error(error, self.address) from None
+
+    async def upload(
+        self, method: Method[RequestT, ReplyT], requests: Iterator[RequestT], timeout: float | None
+    ) -> ReplyT:
+        """Makes a call with a stream of requests. The requests are created as they are sent.
+
+        Raises:
+            Error: The call failed.
+        """
+        call = self._channel.stream_unary(method.path, method.request.SerializeToString, method.reply.FromString)
+        try:
+            return await call(requests, timeout=timeout)
+        except grpc.RpcError as error:
+            raise from_rpc_error(error, self.address) from None
+
+    def stream(
+        self, method: Method[RequestT, ReplyT], request: RequestT, timeout: float | None, *, is_lossless: bool = False
+    ) -> ReplyStream:
+        """Makes a call with a stream of replies."""
+        channel = self._lossless() if is_lossless else self._channel
+        call = cast(Any, channel.unary_stream(method.path, method.request.SerializeToString))
+        return ReplyStream(call(request, timeout=timeout), self.address)
+
+    def step_stream(self) -> StepStream:
+        """Makes a call that sends steps."""
+        method = DRIVE_SCENE
+        call = self._channel.stream_stream(method.path, method.request.SerializeToString, method.reply.FromString)
+        return StepStream(call(), self.address)
+
+    async def close(self) -> None:
+        """Closes the connections, and ends all calls."""
+        await self._channel.close()
+        if self._lossless_channel is not None:
+            await self._lossless_channel.close()
+
+    def _new_channel(self) -> grpc.aio.Channel:
+        return grpc.aio.insecure_channel(self._target, options=CHANNEL_OPTIONS)
+
+    def _lossless(self) -> grpc.aio.Channel:
+        if self._lossless_channel is None:
+            self._lossless_channel = self._new_channel()
+        return self._lossless_channel

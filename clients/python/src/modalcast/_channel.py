@@ -1,0 +1,40 @@
+"""Settings of connections."""
+
+from __future__ import annotations
+
+# Bytes. The server sends messages of at most 3 MiB.
+_MAX_MESSAGE_BYTES = 4 << 20
+
+CHANNEL_OPTIONS: list[tuple[str, int]] = [
+    ("grpc.max_receive_message_length", _MAX_MESSAGE_BYTES),
+    # The server limits the size of what it receives and rejects with an error that names the limit.
+    ("grpc.max_send_message_length", -1),
+    # Connections of clients in one process are separate, so that closing a client closes its connection.
+    ("grpc.use_local_subchannel_pool", 1),
+    # A connection that does not answer a ping for 20 s is closed.
+    ("grpc.keepalive_time_ms", 20_000),
+    ("grpc.keepalive_timeout_ms", 20_000),
+    # Times between two attempts to connect.
+    ("grpc.initial_reconnect_backoff_ms", 100),
+    ("grpc.min_reconnect_backoff_ms", 1_000),
+    ("grpc.max_reconnect_backoff_ms", 1_000),
+]
+
+
+def target_of(address: str) -> str:
+    """The target of a connection: HOST:PORT, http://HOST:PORT or unix:PATH.
+
+    Raises:
+        ValueError: The address has another scheme.
+    """
+    target = address.removeprefix("http://").rstrip("/")
+    if "://" in target:
+        raise ValueError(f"address: expected HOST:PORT, http://HOST:PORT or unix:PATH, got '{address}'")
+    if not target:
+        raise ValueError("address: expected HOST:PORT, http://HOST:PORT or unix:PATH, got an empty text")
+    return target
+
+
+def deadline_ms(timeout: float) -> int:
+    """The deadline of a request in milliseconds, at most ten minutes, the limit of the server."""
+    return min(max(int(timeout * 1000), 1), 600_000)

@@ -1,0 +1,86 @@
+"""Starts and ends a server as a child process."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import tempfile
+import weakref
+from collections.abc import Sequence
+from pathlib import Path
+
+from modalcast.errors import ServerStartError
+
+_ADDRESS_PREFIX = "listening on http://"
+_STOP_SECONDS = 5.0
+
+
+class ServerProcess:
+    """A server on a free port of this machine. It ends with `stop`, and at the latest when this process exits."""
+
+    def __init__(self, program: str | Path | None, arguments: Sequence[str]) -> None:
+        """Starts the server; `address` tells when it listens.
+
+        Raises:
+            ServerStartError: The program does not exist or cannot be started.
+        """
+        path = _find_program(program)
+        self._folder = tempfile.TemporaryDirectory(prefix="modalcast-", ignore_cleanup_errors=True)
+        folder = Path(self._folder.name)
+        self._output, self._log = folder / "output", folder / "log"
+        command = [path, "serve", "--listen", "127.0.0.1:0", "--state", str(folder / "state"), *arguments]
+        with self._output.open("wb") as output, self._log.open("wb") as log:
+            try:
+                self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=output, stderr=log)
+            except OSError as error:
+                self._folder.cleanup()
+                raise ServerStartError(f"{path}: {error}") from error
+        self._finalizer = weakref.finalize(self, _end, self._process, self._folder)
+
+    @property
+    def pid(self) -> int:
+        """The process id of the server."""
+        return self._process.pid
+
+    def address(self) -> str | None:
+        """HOST:PORT, or None until the server listens.
+
+        Raises:
+            ServerStartError: The server has ended; the message has the end of its log.
+        """
+        for line in self._output.read_text().splitlines():
+            if line.startswith(_ADDRESS_PREFIX):
+                return line.removeprefix(_ADDRESS_PREFIX)
+        if self._process.poll() is not None:
+            raise ServerStartError(f"the server ended with exit code {self._process.returncode}: {self.log()}")
+        return None
+
+    def log(self) -> str:
+        """The last 2000 characters that the server has logged."""
+        return self._log.read_text(errors="replace")[-2000:].strip() if self._log.exists() else ""
+
+    def stop(self) -> None:
+        """Ends the server and waits for it. Later calls have no effect."""
+        self._finalizer()
+
+
+def _find_program(program: str | Path | None) -> str:
+    name = str(program or os.environ.get("MODALCAST_PROGRAM") or "modalcast")
+    path = shutil.which(name)
+    if path is None:
+        raise ServerStartError(
+            f"found no program '{name}': install the server so that 'modalcast' is in PATH, "
+            "or set program= or the environment variable MODALCAST_PROGRAM"
+        )
+    return path
+
+
+def _end(process: subprocess.Popen[bytes], folder: tempfile.TemporaryDirectory[str]) -> None:
+    process.terminate()
+    try:
+        process.wait(_STOP_SECONDS)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+    folder.cleanup()

@@ -1,0 +1,53 @@
+"""Progress of a step stream: steps in flight, acknowledgments and rejections."""
+
+from __future__ import annotations
+
+from collections import deque
+
+from modalcast._common import stage_times
+from modalcast.errors import Error, ServerError, from_rejection
+from modalcast.v1 import steps_pb2
+
+_MAX_REJECTIONS = 1024
+
+
+class Progress:
+    """Progress of a step stream.
+
+    Attributes:
+        in_flight: Numbers of the sent steps without acknowledgment and rejection, oldest first.
+        acknowledged: Number of the last acknowledged step.
+        skipped: Number of steps that were merged into a newer one.
+        rejected: Number of rejected steps.
+        rejections: The newest 1024 rejections that were not raised.
+        stages: Milliseconds by stage of the last acknowledged step.
+        end: The error that ended the stream; None while it is open.
+    """
+
+    def __init__(self) -> None:
+        self.in_flight: deque[int] = deque()
+        self.acknowledged: int | None = None
+        self.skipped = 0
+        self.rejected = 0
+        self.rejections: deque[ServerError] = deque(maxlen=_MAX_REJECTIONS)
+        self.stages: dict[str, float] = {}
+        self.end: Error | None = None
+
+    def add(self, reply: steps_pb2.DriveSceneResponse) -> None:
+        """Applies a reply of the server."""
+        if reply.HasField("ack"):
+            while self.in_flight and self.in_flight[0] <= reply.ack.step:
+                self.in_flight.popleft()
+            self.acknowledged = reply.ack.step
+            self.skipped = reply.ack.skipped
+            self.stages = stage_times(reply.ack.stages)
+        elif reply.HasField("rejection"):
+            rejection = from_rejection(reply.rejection)
+            if rejection.step in self.in_flight:
+                self.in_flight.remove(rejection.step)
+            self.rejected += 1
+            self.rejections.append(rejection)
+
+    def fits(self, window: int | None) -> bool:
+        """Whether another step fits into the window."""
+        return window is None or len(self.in_flight) < window

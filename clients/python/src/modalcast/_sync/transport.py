@@ -1,0 +1,258 @@
+"""Calls over grpc. Errors of gRPC become errors of this package."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from typing import Any, Protocol, TypeVar, cast
+
+import grpc
+from google.protobuf.message import Message
+from grpc.experimental import ChannelOptions  # pyright: ignore[reportMissingTypeStubs]
+
+from modalcast._channel import CHANNEL_OPTIONS, target_of
+from modalcast._chunks import malformed
+from modalcast._methods import DRIVE_SCENE, Method
+from modalcast._step_progress import Progress
+from modalcast.errors import ConnectionLost, DeadlineExceeded, Error, from_rejection, from_rpc_error
+from modalcast.v1 import steps_pb2
+
+RequestT = TypeVar("RequestT", bound=Message)
+ReplyT = TypeVar("ReplyT", bound=Message)
+
+sleep = time.sleep
+
+# Replies are read by the thread that calls, without a thread per call.
+_OPTIONS = [*CHANNEL_OPTIONS, (ChannelOptions.SingleThreadedUnaryStream, 1)]
+
+# Steps that wait inside this process for the connection.
+_QUEUED_STEPS = 8
+
+
+class _Call(Protocol):
+    """An iterator over the replies of a call."""
+
+    def __iter__(self) -> Iterator[Any]: ...
+    def __next__(self) -> Any: ...
+    def cancel(self) -> object: ...
+
+
+class ReplyStream:
+    """The messages of a call, as bytes."""
+
+    def __init__(self, call: _Call, address: str) -> None:
+        self._call = call
+        self._address = address
+        self._is_cancelled = False
+
+    def read(self) -> bytes | None:
+        """The next message; None at the end.
+
+        Raises:
+            Error: The call failed.
+        """
+        try:
+            return next(self._call, None)
+        except grpc.RpcError as error:
+            if self._is_cancelled:
+                return None
+            raise from_rpc_error(error, self._address) from None
+
+    def cancel(self) -> None:
+        """Ends the call."""
+        self._is_cancelled = True
+        self._call.cancel()
+
+
+class _RequestQueue:
+    """The requests of a step stream. gRPC takes them in a thread of its own; a full queue blocks `put`."""
+
+    def __init__(self) -> None:
+        self._requests: deque[steps_pb2.DriveSceneRequest] = deque()
+        self._condition = threading.Condition()
+        self._is_closed = False
+
+    def put(self, request: steps_pb2.DriveSceneRequest) -> None:
+        """Adds a request, unless the queue is closed."""
+        with self._condition:
+            self._condition.wait_for(lambda: self._is_closed or len(self._requests) < _QUEUED_STEPS)
+            self._requests.append(request)
+            self._condition.notify_all()
+
+    def close(self) -> None:
+        """Ends the requests after those in the queue."""
+        with self._condition:
+            self._is_closed = True
+            self._condition.notify_all()
+
+    def __iter__(self) -> Iterator[steps_pb2.DriveSceneRequest]:
+        return self
+
+    def __next__(self) -> steps_pb2.DriveSceneRequest:
+        with self._condition:
+            self._condition.wait_for(lambda: self._is_closed or self._requests)
+            if not self._requests:
+                raise StopIteration
+            request = self._requests.popleft()
+            self._condition.notify_all()
+            return request
+
+
+class StepStream:
+    """A step stream. A thread reads the replies, also while the caller does nothing."""
+
+    def __init__(
+        self,
+        call: Callable[[_RequestQueue], _Call],
+        address: str,
+    ) -> None:
+        self._requests = _RequestQueue()
+        self._address = address
+        self._changed = threading.Condition()
+        self._opened: steps_pb2.DriveSceneResponse | None = None
+        self.progress = Progress()
+        self._call = call(self._requests)
+        self._reader = threading.Thread(target=self._read_replies, name="modalcast drive", daemon=True)
+        self._reader.start()
+
+    def open(self, request: steps_pb2.OpenDrive, timeout: float) -> steps_pb2.Opened:
+        """Sends the first message.
+
+        Raises:
+            Error: The server rejects the request, or does not answer in time.
+        """
+        self._requests.put(steps_pb2.DriveSceneRequest(open=request))
+        self._wait(lambda: self._opened is not None, timeout, "the drive did not open")
+        reply = self._opened or steps_pb2.DriveSceneResponse()
+        if reply.HasField("rejection"):
+            raise from_rejection(reply.rejection)
+        if not reply.HasField("opened"):
+            raise malformed("drive.opened", "`opened` first", "another message")
+        return reply.opened
+
+    def send(self, step: steps_pb2.Step) -> None:
+        """Sends a part of a step.
+
+        Raises:
+            Error: The stream has ended.
+        """
+        if self.progress.end is not None:
+            raise self.progress.end.with_traceback(None)
+        self._requests.put(steps_pb2.DriveSceneRequest(step=step))
+
+    def wait_until(self, condition: Callable[[], bool], timeout: float) -> None:
+        """Waits until the progress satisfies a condition.
+
+        Raises:
+            DeadlineExceeded: The time has passed; the stream remains open.
+            Error: The stream has ended.
+        """
+        self._wait(condition, timeout, "no acknowledgment of a step")
+
+    def finish(self, timeout: float) -> None:
+        """Ends the stream from this side, and waits until the server has released the scene."""
+        self._requests.close()
+        self._reader.join(timeout)
+        self.cancel()
+
+    def cancel(self) -> None:
+        """Ends the stream at once."""
+        self._requests.close()
+        self._call.cancel()
+
+    def _wait(self, condition: Callable[[], bool], timeout: float, complaint: str) -> None:
+        with self._changed:
+            in_time = self._changed.wait_for(lambda: condition() or self.progress.end is not None, timeout)
+            if condition():
+                return
+            if self.progress.end is not None:
+                raise self.progress.end.with_traceback(None)
+            if not in_time:
+                raise DeadlineExceeded(f"{self._address}: {complaint} within {timeout:g} s")
+
+    def _read_replies(self) -> None:
+        end: Error = ConnectionLost(f"{self._address}: the server has ended the step stream")
+        try:
+            for reply in self._call:
+                with self._changed:
+                    if self._opened is None:
+                        self._opened = reply
+                    else:
+                        self.progress.add(reply)
+                    self._changed.notify_all()
+        except grpc.RpcError as error:
+            end = from_rpc_error(error, self._address)
+        finally:
+            with self._changed:
+                self.progress.end = end
+                self._changed.notify_all()
+            self._requests.close()
+
+
+class Transport:
+    """Connections to a server: one for calls, and one for streams of every step, which opens with its first stream."""
+
+    def __init__(self, address: str) -> None:
+        """Connects with the first call.
+
+        Raises:
+            ValueError: The address is invalid.
+        """
+        self.address = address
+        self._target = target_of(address)
+        self._channel = self._new_channel()
+        self._lossless_channel: grpc.Channel | None = None
+
+    def unary(self, method: Method[RequestT, ReplyT], request: RequestT, timeout: float) -> ReplyT:
+        """Makes a call with one reply.
+
+        Raises:
+            Error: The call failed.
+        """
+        call = self._channel.unary_unary(method.path, method.request.SerializeToString, method.reply.FromString)
+        try:
+            return call(request, timeout=timeout)
+        except grpc.RpcError as error:
+            raise from_rpc_error(error, self.address) from None
+
+    def upload(self, method: Method[RequestT, ReplyT], requests: Iterator[RequestT], timeout: float | None) -> ReplyT:
+        """Makes a call with a stream of requests. The requests are created as they are sent.
+
+        Raises:
+            Error: The call failed.
+        """
+        call = self._channel.stream_unary(method.path, method.request.SerializeToString, method.reply.FromString)
+        try:
+            return call(requests, timeout=timeout)
+        except grpc.RpcError as error:
+            raise from_rpc_error(error, self.address) from None
+
+    def stream(
+        self, method: Method[RequestT, ReplyT], request: RequestT, timeout: float | None, *, is_lossless: bool = False
+    ) -> ReplyStream:
+        """Makes a call with a stream of replies."""
+        channel = self._lossless() if is_lossless else self._channel
+        call = cast(Any, channel.unary_stream(method.path, method.request.SerializeToString))
+        return ReplyStream(call(request, timeout=timeout), self.address)
+
+    def step_stream(self) -> StepStream:
+        """Makes a call that sends steps."""
+        method = DRIVE_SCENE
+        call = self._channel.stream_stream(method.path, method.request.SerializeToString, method.reply.FromString)
+        return StepStream(cast(Callable[[_RequestQueue], _Call], call), self.address)
+
+    def close(self) -> None:
+        """Closes the connections, and ends all calls."""
+        self._channel.close()
+        if self._lossless_channel is not None:
+            self._lossless_channel.close()
+
+    def _new_channel(self) -> grpc.Channel:
+        return grpc.insecure_channel(self._target, options=_OPTIONS)
+
+    def _lossless(self) -> grpc.Channel:
+        if self._lossless_channel is None:
+            self._lossless_channel = self._new_channel()
+        return self._lossless_channel

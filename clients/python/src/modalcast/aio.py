@@ -1,0 +1,8 @@
+"""The client for asyncio: the calls of `modalcast` as coroutines and asynchronous iterators."""
+
+from modalcast._async.client import Client, SceneList, connect, spawn
+from modalcast._async.drive import Drive
+from modalcast._async.scene import Scene
+from modalcast._async.streams import FrameBatchStream, FrameStream, Stream
+
+__all__ = ["Client", "Drive", "FrameBatchStream", "FrameStream", "Scene", "SceneList", "Stream", "connect", "spawn"]

@@ -1,0 +1,150 @@
+"""States of a scene: the coordinates q and the transforms T of its domains at a step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from modalcast._chunks import malformed
+from modalcast._common import StepId, stage_times, step_id
+from modalcast._types import F32, F64, Bytes
+from modalcast.scene_description import Domain, Domains
+from modalcast.v1 import states_pb2
+
+
+class StateLayout:
+    """Where the values of each domain are in a state.
+
+    Attributes:
+        domains: The domains of the scene.
+        first_coordinate: Index of the first coordinate of each domain. Domains that share coordinates have the same.
+        coordinate_count: Number of coordinates of all domains.
+        owns_q: Whether each domain has coordinates of its own.
+        root: Index of the domain whose transform determines that of each domain.
+        root_from_domain: 4x4 for each domain; the identity for a root.
+    """
+
+    def __init__(self, domains: Domains) -> None:
+        self.domains = domains
+        self.first_coordinate: list[int] = []
+        self.owns_q: list[bool] = []
+        self.root: list[int] = []
+        self.root_from_domain: F64 = np.tile(np.eye(4), (len(domains), 1, 1))
+        self.coordinate_count = 0
+        for domain in domains:
+            for name, other in (("shares_q_with", domain.shares_q_with), ("follows", domain.follows)):
+                if other is not None and other >= domain.index:
+                    raise malformed(f"domains[{domain.index}].{name}", f"below {domain.index}", str(other))
+            owner = domain.shares_q_with
+            self.owns_q.append(owner is None)
+            self.first_coordinate.append(self.coordinate_count if owner is None else self.first_coordinate[owner])
+            self.coordinate_count += domain.rank if owner is None else 0
+            if domain.follows is None or domain.follow_frame is None:
+                self.root.append(domain.index)
+                continue
+            self.root.append(self.root[domain.follows])
+            frame = self.root_from_domain[domain.follows] @ square(domain.follow_frame)
+            self.root_from_domain[domain.index] = frame
+
+    def q_slice(self, domain: Domain) -> slice:
+        """Place of the coordinates of a domain among those of the scene."""
+        first = self.first_coordinate[domain.index]
+        return slice(first, first + domain.rank)
+
+
+def square(matrix: F32 | F64) -> F64:
+    """A 3x4 matrix as 4x4 f64."""
+    result = np.eye(4)
+    result[:3] = matrix
+    return result
+
+
+@dataclass(frozen=True, eq=False)
+class SceneState:
+    """The state of a scene at a step.
+
+    Attributes:
+        step: The step.
+        q: All coordinates of the scene, domain by domain.
+        transforms: world_from_domain of every domain: domains x 3 x 4, in scene units relative to the origins.
+        origins: World position in meters of the origin of each domain's transform: domains x 3.
+        skipped: Number of steps skipped since the previous state of the stream.
+        stages: Milliseconds by stage.
+    """
+
+    step: StepId
+    q: F32
+    transforms: F32
+    origins: F64
+    skipped: int
+    stages: dict[str, float] = field(repr=False)
+    layout: StateLayout = field(repr=False)
+
+    def q_of(self, domain: int | str | Domain) -> F32:
+        """The coordinates of a domain, r numbers."""
+        return self.q[self.layout.q_slice(self.layout.domains[domain])]
+
+    def transform_of(self, domain: int | str | Domain) -> F32:
+        """world_from_domain of a domain, 3x4."""
+        return self.transforms[self.layout.domains[domain].index]
+
+
+class StateDecoder:
+    """Decodes the states of one call. Keeps the last state, to which changes are applied."""
+
+    def __init__(self, layout: StateLayout) -> None:
+        self._layout = layout
+        self._q: F32 = np.zeros(layout.coordinate_count, np.float32)
+        # Transforms of roots; those of followers are computed from them.
+        self._root_transforms: F32 = np.zeros((len(layout.domains), 3, 4), np.float32)
+        self._root = np.array(layout.root, np.intp)
+        self._is_root = self._root == np.arange(len(self._root))
+        self._origins: F64 = np.zeros((len(layout.domains), 3))
+
+    def decode(self, head: states_pb2.StateHead, data: Bytes) -> SceneState:
+        """Applies the bytes of a state."""
+        sections: dict[int, Bytes] = {}
+        for section in head.sections:
+            sections[section.content] = data[section.offset : section.offset + section.bytes]
+        try:
+            self._apply(sections)
+        except (ValueError, IndexError) as error:
+            raise malformed("states.sections", "the sizes that the scene has", str(error)) from error
+        transforms = self._root_transforms[self._root]
+        if not self._is_root.all():
+            followers = ~self._is_root
+            frames = self._layout.root_from_domain[followers]
+            of_roots = transforms[followers].astype(np.float64)
+            transforms[followers] = of_roots[:, :, :3] @ frames[:, :3]
+            transforms[followers, :, 3] += of_roots[:, :, 3]
+        return SceneState(
+            step=step_id(head.step),
+            q=self._q.copy(),
+            transforms=transforms,
+            origins=self._origins[self._root],
+            skipped=head.skipped,
+            stages=stage_times(head.stages),
+            layout=self._layout,
+        )
+
+    def _apply(self, sections: dict[int, Bytes]) -> None:
+        def numbers(content: int, dtype: str) -> NDArray[Any]:
+            return sections.get(content, np.empty(0, np.uint8)).view(dtype)
+
+        q, position = numbers(states_pb2.STATE_CONTENT_Q, "<f4"), 0
+        for index in numbers(states_pb2.STATE_CONTENT_Q_DOMAINS, "<u4"):
+            place = self._layout.q_slice(self._layout.domains[int(index)])
+            rank = place.stop - place.start
+            self._q[place] = q[position : position + rank]
+            position += rank
+        moved = numbers(states_pb2.STATE_CONTENT_TRANSFORM_DOMAINS, "<u4")
+        transforms = numbers(states_pb2.STATE_CONTENT_TRANSFORMS, "<f4")
+        self._root_transforms[moved.astype(np.intp)] = transforms.reshape(-1, 3, 4)
+        origins = numbers(states_pb2.STATE_CONTENT_ORIGINS, "<f8").reshape(-1, 3)
+        if len(origins) == 1:
+            self._origins[:] = origins
+        elif len(origins) > 1:
+            self._origins[self._is_root] = origins

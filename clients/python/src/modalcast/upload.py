@@ -1,0 +1,228 @@
+"""Scenes to upload: meshes and modes as arrays, or files."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from modalcast._types import F32, U32, Vector, affine, to_f32, to_f64, vector3
+from modalcast.v1 import scenes_pb2
+
+Progress: TypeAlias = Callable[[int, int], None]
+"""Called with the bytes that were sent and the bytes of the upload."""
+
+_CHUNK_BYTES = 512 << 10
+_MAX_FOLDER_DEPTH = 16
+_MAX_INDEX = 0xFFFFFFFF
+
+
+@dataclass(frozen=True)
+class _Domain:
+    message: scenes_pb2.UploadedDomain
+    arrays: tuple[F32 | U32, ...]
+
+
+class SceneBuilder:
+    """Collects domains for `Client.upload`."""
+
+    def __init__(self, name: str, *, unit: float = 1.0, up: str = "y") -> None:
+        """Begins a scene without domains.
+
+        Args:
+            name: The name that the scene gets: 1 to 64 of A-Z, a-z, 0-9, '.', '_' and '-'.
+            unit: Meters per scene unit.
+            up: The up axis: "x", "y" or "z".
+        """
+        self.name = name
+        self._unit = unit
+        self._up = up
+        self._domains: list[_Domain] = []
+        self._names: dict[str, int] = {}
+
+    def add(
+        self,
+        positions: ArrayLike,
+        faces: ArrayLike,
+        modes: ArrayLike | None = None,
+        *,
+        name: str = "",
+        eigenvalues: ArrayLike | None = None,
+        placement: ArrayLike | None = None,
+        color: Vector | None = None,
+        crease_angle: float | None = None,
+    ) -> SceneBuilder:
+        """Adds a domain and returns the builder.
+
+        Args:
+            positions: Rest positions x0, n x 3, in scene units and in the domain's own frame.
+            faces: Vertices of the triangles, m x 3, counterclockwise seen from the front.
+            modes: U, 3n x r (rows 3v, 3v + 1, 3v + 2 of vertex v) or n x 3 x r, in scene units per unit of q; None: a
+                rigid domain.
+            name: Unique in the scene; empty: "domain" and the number of earlier domains.
+            eigenvalues: Squared angular frequencies in (rad/s)^2, one per mode.
+            placement: world_from_domain at rest, 3x4 or 4x4; None: the identity.
+            color: Linear red, green and blue, 0 to 1.
+            crease_angle: In degrees, 0 (flat) to 180 (smooth): edges between triangles whose normals differ by more are
+                hard. None: 40.
+
+        Raises:
+            ValueError: An array has another shape, an index is out of range, or a name occurs twice.
+        """
+        positions = to_f32("positions", positions, (None, 3))
+        triangles = _faces(faces, len(positions))
+        U = _modes(modes, len(positions))
+        message = self._message(name, eigenvalues, placement, color)
+        message.vertices, message.triangles, message.rank = len(positions), len(triangles), U.shape[1]
+        if len(message.eigenvalues) not in (0, U.shape[1]):
+            raise ValueError(f"eigenvalues: expected shape ({U.shape[1]},), got ({len(message.eigenvalues)},)")
+        if crease_angle is not None:
+            message.crease_angle = crease_angle
+        return self._append(_Domain(message, (positions, triangles, U)))
+
+    def add_copy(
+        self, of: str, *, name: str = "", placement: ArrayLike | None = None, color: Vector | None = None
+    ) -> SceneBuilder:
+        """Adds a domain with the mesh and the modes of the domain named `of`, and returns the builder.
+
+        Raises:
+            KeyError: No earlier domain has the name `of`.
+            ValueError: An array has another shape, or a name occurs twice.
+        """
+        if of not in self._names:
+            raise KeyError(f"no earlier domain is named '{of}'; the scene has {list(self._names)}")
+        message = self._message(name, None, placement, color)
+        message.shares_shape_with = self._names[of]
+        return self._append(_Domain(message, ()))
+
+    def messages(self, progress: Progress | None) -> Iterator[scenes_pb2.UploadArraysRequest]:
+        """The messages of the upload."""
+        total = sum(array.nbytes for domain in self._domains for array in domain.arrays)
+        header = scenes_pb2.UploadArraysHeader(
+            scene=self.name, domains=len(self._domains), total_bytes=total, unit=self._unit, up=self._up
+        )
+        yield scenes_pb2.UploadArraysRequest(header=header)
+        sent = 0
+        for domain in self._domains:
+            yield scenes_pb2.UploadArraysRequest(domain=domain.message)
+            for array in domain.arrays:
+                data = array.reshape(-1).view(np.uint8)
+                for start in range(0, len(data), _CHUNK_BYTES):
+                    chunk = data[start : start + _CHUNK_BYTES].tobytes()
+                    yield scenes_pb2.UploadArraysRequest(chunk=chunk)
+                    sent += len(chunk)
+                    if progress is not None:
+                        progress(sent, total)
+
+    def _message(
+        self, name: str, eigenvalues: ArrayLike | None, placement: ArrayLike | None, color: Vector | None
+    ) -> scenes_pb2.UploadedDomain:
+        name = name or f"domain{len(self._domains)}"
+        if name in self._names:
+            raise ValueError(f"name: expected a name that no earlier domain has, got '{name}'")
+        message = scenes_pb2.UploadedDomain(name=name)
+        if eigenvalues is not None:
+            message.eigenvalues.extend(to_f64("eigenvalues", eigenvalues, (None,)).tolist())
+        if placement is not None:
+            message.placement = affine("placement", placement).tobytes()
+        if color is not None:
+            message.color.extend(vector3("color", color))
+        return message
+
+    def _append(self, domain: _Domain) -> SceneBuilder:
+        self._names[domain.message.name] = len(self._domains)
+        self._domains.append(domain)
+        return self
+
+
+def _faces(faces: ArrayLike, vertex_count: int) -> U32:
+    given: NDArray[np.generic] = np.asarray(faces)
+    if given.ndim != 2 or given.shape[1] != 3:
+        hint = ": split the quadrilaterals" if given.ndim == 2 and given.shape[1] == 4 else ""
+        raise ValueError(f"faces: expected triangles of shape (n, 3), got {given.shape}{hint}")
+    if given.dtype.kind not in "iu":
+        raise ValueError(f"faces: expected integers, got the type {given.dtype}")
+    if given.size > 0 and not 0 <= int(given.min()) <= int(given.max()) < min(vertex_count, _MAX_INDEX):
+        raise ValueError(f"faces: expected vertices of 0 to {vertex_count - 1}, got {given.min()} to {given.max()}")
+    return np.ascontiguousarray(given, "<u4")
+
+
+def _modes(modes: ArrayLike | None, vertex_count: int) -> F32:
+    if modes is None:
+        return np.empty((3 * vertex_count, 0), np.float32)
+    shape = np.shape(modes)
+    if len(shape) == 3:
+        return to_f32("modes", modes, (vertex_count, 3, None)).reshape(3 * vertex_count, shape[2])
+    if len(shape) != 2 or shape[0] != 3 * vertex_count:
+        expected = f"({3 * vertex_count}, r) or ({vertex_count}, 3, r)"
+        raise ValueError(f"modes: expected shape {expected} for {vertex_count} positions, got {shape}")
+    return to_f32("modes", modes, (3 * vertex_count, None))
+
+
+@dataclass(frozen=True)
+class LocalFile:
+    """A file to upload.
+
+    Attributes:
+        local_path: Where it is.
+        path: Path in the upload.
+        size: In bytes.
+        sha256: Hash of the content.
+    """
+
+    local_path: Path
+    path: str
+    size: int
+    sha256: bytes
+
+
+def local_files(root: Path) -> list[LocalFile]:
+    """All files of a folder in order of their paths, or the single file `root`.
+
+    Raises:
+        OSError: A file cannot be read.
+        ValueError: The folder has more than 16 levels.
+    """
+    if root.is_file():
+        return [_local_file(root, root.name)]
+    found = sorted(path for path in root.rglob("*") if path.is_file())
+    if not found:
+        root.stat()
+        raise ValueError(f"expected a folder with files, got no files in '{root}'")
+    relative = [path.relative_to(root) for path in found]
+    deepest = max(len(path.parts) for path in relative)
+    if deepest > _MAX_FOLDER_DEPTH:
+        raise ValueError(f"expected paths of at most {_MAX_FOLDER_DEPTH} parts in '{root}', got {deepest}")
+    return [_local_file(path, name.as_posix()) for path, name in zip(found, relative, strict=True)]
+
+
+def _local_file(local_path: Path, path: str) -> LocalFile:
+    with local_path.open("rb") as file:
+        sha256 = hashlib.file_digest(file, "sha256").digest()
+    return LocalFile(local_path, path, local_path.stat().st_size, sha256)
+
+
+def file_messages(
+    name: str, entry: str, files: Sequence[LocalFile], known: Mapping[bytes, bool], progress: Progress | None
+) -> Iterator[scenes_pb2.UploadSceneRequest]:
+    """The messages of an upload of files. The server has the contents whose hashes are true in `known`."""
+    total = sum(file.size for file in files)
+    header = scenes_pb2.UploadHeader(scene=name, entry=entry, files=len(files), total_bytes=total)
+    yield scenes_pb2.UploadSceneRequest(header=header)
+    sent = 0
+    for file in files:
+        reuse = known.get(file.sha256, False)
+        message = scenes_pb2.UploadFile(path=file.path, bytes=file.size, sha256=file.sha256, reuse=reuse)
+        yield scenes_pb2.UploadSceneRequest(file=message)
+        if not reuse:
+            with file.local_path.open("rb") as content:
+                while chunk := content.read(_CHUNK_BYTES):
+                    yield scenes_pb2.UploadSceneRequest(chunk=chunk)
+        sent += file.size
+        if progress is not None:
+            progress(sent, total)

@@ -1,0 +1,1 @@
+"""The generated messages of the contract in `proto/modalcast/v1`, one module per file."""

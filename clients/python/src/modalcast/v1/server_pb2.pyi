@@ -1,0 +1,71 @@
+from google.protobuf.internal import containers as _containers
+from google.protobuf.internal import enum_type_wrapper as _enum_type_wrapper
+from google.protobuf import descriptor as _descriptor
+from google.protobuf import message as _message
+from collections.abc import Iterable as _Iterable, Mapping as _Mapping
+from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
+
+DESCRIPTOR: _descriptor.FileDescriptor
+
+class Feature(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    FEATURE_UNSPECIFIED: _ClassVar[Feature]
+    FEATURE_FRAMES: _ClassVar[Feature]
+    FEATURE_CONTENT_HASHES: _ClassVar[Feature]
+    FEATURE_UPLOAD_REUSE: _ClassVar[Feature]
+    FEATURE_UPLOAD_ARRAYS: _ClassVar[Feature]
+FEATURE_UNSPECIFIED: Feature
+FEATURE_FRAMES: Feature
+FEATURE_CONTENT_HASHES: Feature
+FEATURE_UPLOAD_REUSE: Feature
+FEATURE_UPLOAD_ARRAYS: Feature
+
+class GetServerInfoRequest(_message.Message):
+    __slots__ = ()
+    def __init__(self) -> None: ...
+
+class GetServerInfoResponse(_message.Message):
+    __slots__ = ("version", "backend", "device", "renderer", "software", "limits", "protocol_version", "features")
+    VERSION_FIELD_NUMBER: _ClassVar[int]
+    BACKEND_FIELD_NUMBER: _ClassVar[int]
+    DEVICE_FIELD_NUMBER: _ClassVar[int]
+    RENDERER_FIELD_NUMBER: _ClassVar[int]
+    SOFTWARE_FIELD_NUMBER: _ClassVar[int]
+    LIMITS_FIELD_NUMBER: _ClassVar[int]
+    PROTOCOL_VERSION_FIELD_NUMBER: _ClassVar[int]
+    FEATURES_FIELD_NUMBER: _ClassVar[int]
+    version: str
+    backend: str
+    device: str
+    renderer: str
+    software: bool
+    limits: Limits
+    protocol_version: int
+    features: _containers.RepeatedScalarFieldContainer[Feature]
+    def __init__(self, version: _Optional[str] = ..., backend: _Optional[str] = ..., device: _Optional[str] = ..., renderer: _Optional[str] = ..., software: bool = ..., limits: _Optional[_Union[Limits, _Mapping]] = ..., protocol_version: _Optional[int] = ..., features: _Optional[_Iterable[_Union[Feature, str]]] = ...) -> None: ...
+
+class Limits(_message.Message):
+    __slots__ = ("message_bytes", "frame_side", "scenes", "window", "upload_bytes", "deadline_ms", "drives", "connection_receive_bytes", "message_timeout_ms", "connection_reply_bytes", "reply_timeout_ms")
+    MESSAGE_BYTES_FIELD_NUMBER: _ClassVar[int]
+    FRAME_SIDE_FIELD_NUMBER: _ClassVar[int]
+    SCENES_FIELD_NUMBER: _ClassVar[int]
+    WINDOW_FIELD_NUMBER: _ClassVar[int]
+    UPLOAD_BYTES_FIELD_NUMBER: _ClassVar[int]
+    DEADLINE_MS_FIELD_NUMBER: _ClassVar[int]
+    DRIVES_FIELD_NUMBER: _ClassVar[int]
+    CONNECTION_RECEIVE_BYTES_FIELD_NUMBER: _ClassVar[int]
+    MESSAGE_TIMEOUT_MS_FIELD_NUMBER: _ClassVar[int]
+    CONNECTION_REPLY_BYTES_FIELD_NUMBER: _ClassVar[int]
+    REPLY_TIMEOUT_MS_FIELD_NUMBER: _ClassVar[int]
+    message_bytes: int
+    frame_side: int
+    scenes: int
+    window: int
+    upload_bytes: int
+    deadline_ms: int
+    drives: int
+    connection_receive_bytes: int
+    message_timeout_ms: int
+    connection_reply_bytes: int
+    reply_timeout_ms: int
+    def __init__(self, message_bytes: _Optional[int] = ..., frame_side: _Optional[int] = ..., scenes: _Optional[int] = ..., window: _Optional[int] = ..., upload_bytes: _Optional[int] = ..., deadline_ms: _Optional[int] = ..., drives: _Optional[int] = ..., connection_receive_bytes: _Optional[int] = ..., message_timeout_ms: _Optional[int] = ..., connection_reply_bytes: _Optional[int] = ..., reply_timeout_ms: _Optional[int] = ...) -> None: ...

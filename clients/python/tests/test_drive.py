@@ -1,0 +1,181 @@
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+from scenes import RANK, beam
+
+import modalcast as mc
+
+
+def expected_beam(q: np.ndarray) -> np.ndarray:
+    positions, _, modes = beam()
+    return positions + modes @ q
+
+
+def test_step_moves_vertices_by_u_q(beams: mc.Scene):
+    q = np.array([0.25, -0.5, 0.125])
+    with beams.drive() as drive:
+        step = drive.step(q={"copy": q})
+        vertices = beams.vertices(step=step, exact=True)
+    n = len(vertices) // 2
+    np.testing.assert_allclose(vertices[:n], expected_beam(np.zeros(RANK)), atol=1e-6)
+    np.testing.assert_allclose(vertices[n:], expected_beam(q) + [0, 0, 1], atol=1e-6)
+    assert (step.number, step.time) == (0, 0.0)
+
+
+def test_all_coordinates_of_scene_are_one_array(beams: mc.Scene):
+    with beams.drive(dt=0.5) as drive:
+        drive.step(np.arange(2 * RANK))
+        step = drive.step(q={1: [7, 8, 9]})
+    state = beams.state()
+    assert state.step == step == mc.StepId(drive.run, 1, 0.5)
+    assert state.q.tolist() == [0, 1, 2, 7, 8, 9]
+    assert state.q_of("copy").tolist() == [7, 8, 9]
+
+
+def test_transforms_are_matrices(beams: mc.Scene):
+    moved = np.eye(4)
+    moved[:3, 3] = 1, 2, 3
+    with beams.drive() as drive:
+        drive.step(transforms={"beam": moved, "copy": moved[:3]})
+    np.testing.assert_array_equal(beams.state().transforms, [moved[:3], moved[:3]])
+    np.testing.assert_allclose(beams.vertices()[:4], beam()[0][:4] + [1, 2, 3], atol=1e-6)
+
+
+def test_world_pose_far_from_origin_keeps_precision(beams: mc.Scene):
+    far = 1e7
+    poses = {name: mc.WorldPose((0, 0, 0, 1), (far, index, 0)) for index, name in enumerate(("beam", "copy"))}
+    with beams.drive() as drive:
+        drive.step(transforms=poses)
+    vertex_set = beams.vertex_set(("positions",))
+    assert vertex_set.positions is not None
+    world = vertex_set.origins + vertex_set.positions.astype(np.float64)
+    np.testing.assert_allclose(world[0], beam()[0][0] + [far, 0, 0], atol=1e-4)
+
+
+def test_wrong_arguments_name_expected_and_given(beams: mc.Scene):
+    cases: list[tuple[dict[str, object], type[Exception], str]] = [
+        ({"q": {"beam": [1.0]}}, ValueError, r"q of domain 'beam': expected shape (3,), got (1,)"),
+        ({"q": {"beam": [[1.0, 2, 3]]}}, ValueError, r"expected shape (3,), got (1, 3)"),
+        ({"q": np.zeros(5)}, ValueError, r"q of the scene: expected shape (6,), got (5,)"),
+        ({"q": {"beam": ["a", "b", "c"]}}, ValueError, "expected an array of real numbers"),
+        ({"q": {"beam": [1e39, 0, 0]}}, ValueError, "3.4e38"),
+        ({"q": {"bean": [0, 0, 0]}}, KeyError, "near names: ['beam']"),
+        ({"q": {7: [0, 0, 0]}}, IndexError, "expected an index of a domain below 2, got 7"),
+        ({"transforms": {"beam": np.eye(3)}}, ValueError, "expected a matrix of shape (3, 4) or (4, 4), got (3, 3)"),
+        ({"time": float("nan")}, ValueError, "time: expected a finite number"),
+    ]
+    with beams.drive() as drive:
+        for arguments, error, message in cases:
+            with pytest.raises(error, match=re.escape(message)):
+                drive.step(**arguments)  # pyright: ignore[reportArgumentType]
+        drive.step(q={"beam": [1, 2, 3]})
+    assert beams.state().q.tolist() == [1, 2, 3, 0, 0, 0]
+
+
+def test_rejected_step_changes_nothing_and_drive_continues(beams: mc.Scene):
+    with beams.drive() as drive:
+        drive.step(q={"beam": [1, 2, 3]})
+        with pytest.raises(mc.InvalidRequest) as error:
+            drive.step(q={"beam": [float("nan"), 0, 0], "copy": [5, 5, 5]})
+        assert (error.value.reason, error.value.step, error.value.field) == ("INVALID_FIELD", 1, "step.q[0]")
+        drive.step(q={"copy": [4, 5, 6]})
+        assert drive.rejected == 1
+    assert beams.state().q.tolist() == [1, 2, 3, 4, 5, 6]
+
+
+def test_steps_without_wait_are_completed_by_flush(beams: mc.Scene):
+    with beams.drive(window=4) as drive:
+        for number in range(200):
+            drive.step(q={"beam": [number, 0, 0]}, wait=False)
+        drive.flush()
+        assert beams.state().q[0] == 199
+        drive.step(q={"beam": [float("inf"), 0, 0]}, wait=False)
+        with pytest.raises(mc.InvalidRequest):
+            drive.flush()
+
+
+def test_scene_has_one_writer(beams: mc.Scene):
+    with beams.drive() as first:
+        with pytest.raises(mc.AlreadyExists, match="writer") as error:
+            beams.drive()
+        assert error.value.reason == "WRITER_LEASE_TAKEN"
+        with beams.drive(take_over=True) as second:
+            second.step(q={"beam": [1, 1, 1]})
+            assert second.run > first.run
+        with pytest.raises(mc.LeaseLost):
+            first.step(q={"beam": [2, 2, 2]})
+        with pytest.raises(mc.LeaseLost):
+            first.flush()
+        first.close()
+
+
+def test_reset_returns_to_rest(beams: mc.Scene):
+    moved = np.eye(4)
+    moved[0, 3] = 3
+    with beams.drive() as drive:
+        drive.step(q={"beam": [1, 2, 3]}, transforms={"copy": moved})
+        drive.reset()
+        np.testing.assert_allclose(beams.vertices()[:4], beam()[0][:4], atol=1e-6)
+        drive.step(q={"beam": [1, 2, 3]})
+    beams.reset()
+    state = beams.state()
+    assert not state.q.any()
+    np.testing.assert_array_equal(state.transforms[1], beams.domains["copy"].placement)
+
+
+def test_delivery_latest_merges_steps(beams: mc.Scene):
+    with beams.drive(delivery="latest") as drive:
+        for number in range(100):
+            drive.step(q={"beam": [number, 0, 0]}, wait=False)
+        drive.flush()
+        assert beams.state().q[0] == 99
+
+
+def joint_gap(scene: mc.Scene, vertices: np.ndarray) -> float:
+    """Largest change of the distance between the base of a domain and its attachment vertices on the parent."""
+    description = scene.describe(["rest_positions"])
+    first = np.cumsum([0, *(domain.vertex_count for domain in scene.domains)])
+    rest = np.concatenate(
+        [
+            description.shape_of(domain).arrays["rest_positions"] @ domain.placement[:, :3].T + domain.placement[:, 3]
+            for domain in scene.domains
+        ]
+    )
+    gap = 0.0
+    for domain in scene.domains:
+        if domain.parent is None:
+            continue
+        base = np.linalg.norm(description.shape_of(domain).arrays["rest_positions"], axis=1).argmin()
+        base += first[domain.index]
+        attached = first[domain.parent] + domain.attachment_vertices
+        distances = [np.linalg.norm(points[attached] - points[base], axis=1) for points in (rest, vertices)]
+        gap = max(gap, float(np.abs(distances[1] - distances[0]).max()))
+    return gap
+
+
+def test_branches_move_with_their_parents(tree: mc.Scene):
+    trunk = tree.domains["trunk"]
+    q = np.zeros(trunk.rank)
+    q[0] = 4
+    diagonal = np.linalg.norm(np.subtract(tree.info.bounds[3:], tree.info.bounds[:3]))
+    gaps: dict[bool, float] = {}
+    for joints in (True, False):
+        with tree.drive(joints=joints, reset=True) as drive:
+            vertices = tree.vertices(step=drive.step(q={"trunk": q}))
+        gaps[joints] = joint_gap(tree, vertices)
+    assert gaps[True] < 1e-3 * diagonal
+    # Negative control: without joints, the branches stay where they are.
+    assert gaps[False] > 1e-2 * diagonal
+    tree.reset()
+
+
+def test_transform_of_attached_domain_needs_joints_false(tree: mc.Scene):
+    attached = next(domain for domain in tree.domains if domain.parent is not None and domain.follows is None)
+    with tree.drive() as drive, pytest.raises(ValueError, match="joints=False"):
+        drive.step(transforms={attached: np.eye(4)})
+    with tree.drive(joints=False) as drive:
+        drive.step(transforms={attached: np.eye(4)})
+        drive.reset()
