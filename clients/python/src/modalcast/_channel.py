@@ -5,7 +5,7 @@ from __future__ import annotations
 # Bytes. The server sends messages of at most 3 MiB.
 _MAX_MESSAGE_BYTES = 4 << 20
 
-CHANNEL_OPTIONS: list[tuple[str, int]] = [
+CHANNEL_OPTIONS: list[tuple[str, int | str]] = [
     ("grpc.max_receive_message_length", _MAX_MESSAGE_BYTES),
     # The server limits the size of what it receives and rejects with an error that names the limit.
     ("grpc.max_send_message_length", -1),
@@ -19,6 +19,15 @@ CHANNEL_OPTIONS: list[tuple[str, int]] = [
     ("grpc.min_reconnect_backoff_ms", 1_000),
     ("grpc.max_reconnect_backoff_ms", 1_000),
 ]
+
+
+# gRPC derives the host name of a Unix socket from its path, which servers in Rust reject.
+UNIX_OPTIONS: list[tuple[str, int | str]] = [("grpc.default_authority", "localhost")]
+
+
+def options_of(target: str) -> list[tuple[str, int | str]]:
+    """The settings of connections to a target."""
+    return CHANNEL_OPTIONS + (UNIX_OPTIONS if target.startswith("unix:") else [])
 
 
 def target_of(address: str) -> str:

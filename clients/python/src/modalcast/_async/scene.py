@@ -301,8 +301,8 @@ class Scene:
         Args:
             camera: As for `frame`; `FrameStream.move_camera` moves it.
             outputs, width, height, format, jpeg_quality: As for `frame`.
-            delivery: "latest": the newest step, beginning with the current one. "lossless": every step from the next
-                one on; a slow reader slows the drive down.
+            delivery: "latest": the newest step, beginning with the current one if the scene has had a step. "lossless":
+                every step from the next one on; a slow reader slows the drive down.
             max_hz: Limits the frames per second, with the delivery "latest"; 0: no limit.
             count: Ends the stream after this number of frames; 0: no limit.
 
@@ -350,7 +350,7 @@ class Scene:
             request = frames_pb2.StreamFramesRequest(
                 scene=self.name, pictures=pictures, delivery=wire_delivery, max_hz=max_hz, steps=steps
             )
-            return self._transport.stream(STREAM_FRAMES, request, None, is_lossless=delivery == "lossless")
+            return self._transport.subscribe(STREAM_FRAMES, request)
 
         stream = FrameBatchStream(
             self._transport,
@@ -441,7 +441,7 @@ class Scene:
             request = vertices_pb2.StreamVerticesRequest(
                 scene=self.name, selection=selection, delivery=wire_delivery, max_hz=max_hz, steps=steps
             )
-            return self._transport.stream(STREAM_VERTICES, request, None, is_lossless=delivery == "lossless")
+            return self._transport.subscribe(STREAM_VERTICES, request)
 
         return await self._start(open_call, lambda: VertexSetDecoder(2, 3), count, delivery)
 
@@ -475,7 +475,7 @@ class Scene:
             request = states_pb2.StreamStatesRequest(
                 scene=self.name, delivery=wire_delivery, max_hz=max_hz, steps=steps
             )
-            return self._transport.stream(STREAM_STATES, request, None, is_lossless=delivery == "lossless")
+            return self._transport.subscribe(STREAM_STATES, request)
 
         return await self._start(open_call, lambda: SceneStateDecoder(self._layout, chunk_field=2), count, delivery)
 
@@ -609,9 +609,7 @@ class Scene:
             Error: The call failed.
         """
         request = forces_pb2.StreamForcesRequest(scene=self.name, max_hz=max_hz)
-        return await self._start(
-            lambda _: self._transport.stream(STREAM_FORCES, request, None), ForceDecoder, 0, "latest"
-        )
+        return await self._start(lambda _: self._transport.subscribe(STREAM_FORCES, request), ForceDecoder, 0, "latest")
 
     async def delete(self, *, timeout: float | None = None) -> None:
         """Closes the scene for all clients, and removes the files of an uploaded scene.

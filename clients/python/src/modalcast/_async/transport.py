@@ -10,7 +10,7 @@ import grpc
 import grpc.aio
 from google.protobuf.message import Message
 
-from modalcast._channel import CHANNEL_OPTIONS, target_of
+from modalcast._channel import options_of, target_of
 from modalcast._chunks import malformed
 from modalcast._methods import DRIVE_SCENE, Method
 from modalcast._step_progress import Progress
@@ -138,7 +138,10 @@ class StepStream:
 
 
 class Transport:
-    """Connections to a server: one for calls, and one for streams of every step, which opens with its first stream."""
+    """Connections to a server: one for calls and steps, and one for subscriptions, which opens with the first of them.
+
+    Subscriptions without a reader fill the flow-control window of their connection, and block no call.
+    """
 
     def __init__(self, address: str) -> None:
         """Connects with the first call.
@@ -149,7 +152,7 @@ class Transport:
         self.address = address
         self._target = target_of(address)
         self._channel = self._new_channel()
-        self._lossless_channel: grpc.aio.Channel | None = None
+        self._subscriptions: grpc.aio.Channel | None = None
 
     async def unary(self, method: Method[RequestT, ReplyT], request: RequestT, timeout: float) -> ReplyT:
         """Makes a call with one reply.
@@ -177,13 +180,15 @@ class Transport:
         except grpc.RpcError as error:
             raise from_rpc_error(error, self.address) from None
 
-    def stream(
-        self, method: Method[RequestT, ReplyT], request: RequestT, timeout: float | None, *, is_lossless: bool = False
-    ) -> ReplyStream:
-        """Makes a call with a stream of replies."""
-        channel = self._lossless() if is_lossless else self._channel
-        call = cast(Any, channel.unary_stream(method.path, method.request.SerializeToString))
-        return ReplyStream(call(request, timeout=timeout), self.address)
+    def stream(self, method: Method[RequestT, ReplyT], request: RequestT, timeout: float) -> ReplyStream:
+        """Makes a call with a stream of replies, which the caller reads to its end."""
+        return self._stream(self._channel, method, request, timeout)
+
+    def subscribe(self, method: Method[RequestT, ReplyT], request: RequestT) -> ReplyStream:
+        """Makes a call with a stream of replies without end, which the caller cancels."""
+        if self._subscriptions is None:
+            self._subscriptions = self._new_subscription_channel()
+        return self._stream(self._subscriptions, method, request, None)
 
     def step_stream(self) -> StepStream:
         """Makes a call that sends steps."""
@@ -194,13 +199,17 @@ class Transport:
     async def close(self) -> None:
         """Closes the connections, and ends all calls."""
         await self._channel.close()
-        if self._lossless_channel is not None:
-            await self._lossless_channel.close()
+        if self._subscriptions is not None:
+            await self._subscriptions.close()
+
+    def _stream(
+        self, channel: grpc.aio.Channel, method: Method[RequestT, ReplyT], request: RequestT, timeout: float | None
+    ) -> ReplyStream:
+        call = cast(Any, channel.unary_stream(method.path, method.request.SerializeToString))
+        return ReplyStream(call(request, timeout=timeout), self.address)
 
     def _new_channel(self) -> grpc.aio.Channel:
-        return grpc.aio.insecure_channel(self._target, options=CHANNEL_OPTIONS)
+        return grpc.aio.insecure_channel(self._target, options=options_of(self._target))
 
-    def _lossless(self) -> grpc.aio.Channel:
-        if self._lossless_channel is None:
-            self._lossless_channel = self._new_channel()
-        return self._lossless_channel
+    def _new_subscription_channel(self) -> grpc.aio.Channel:
+        return self._new_channel()

@@ -12,7 +12,7 @@ import grpc
 from google.protobuf.message import Message
 from grpc.experimental import ChannelOptions  # pyright: ignore[reportMissingTypeStubs]
 
-from modalcast._channel import CHANNEL_OPTIONS, target_of
+from modalcast._channel import options_of, target_of
 from modalcast._chunks import malformed
 from modalcast._methods import DRIVE_SCENE, Method
 from modalcast._step_progress import Progress
@@ -23,9 +23,6 @@ RequestT = TypeVar("RequestT", bound=Message)
 ReplyT = TypeVar("ReplyT", bound=Message)
 
 sleep = time.sleep
-
-# Replies are read by the thread that calls, without a thread per call.
-_OPTIONS = [*CHANNEL_OPTIONS, (ChannelOptions.SingleThreadedUnaryStream, 1)]
 
 # Steps that wait inside this process for the connection.
 _QUEUED_STEPS = 8
@@ -192,7 +189,10 @@ class StepStream:
 
 
 class Transport:
-    """Connections to a server: one for calls, and one for streams of every step, which opens with its first stream."""
+    """Connections to a server: one for calls and steps, and one for subscriptions, which opens with the first of them.
+
+    Subscriptions without a reader fill the flow-control window of their connection, and block no call.
+    """
 
     def __init__(self, address: str) -> None:
         """Connects with the first call.
@@ -203,7 +203,7 @@ class Transport:
         self.address = address
         self._target = target_of(address)
         self._channel = self._new_channel()
-        self._lossless_channel: grpc.Channel | None = None
+        self._subscriptions: grpc.Channel | None = None
 
     def unary(self, method: Method[RequestT, ReplyT], request: RequestT, timeout: float) -> ReplyT:
         """Makes a call with one reply.
@@ -229,13 +229,15 @@ class Transport:
         except grpc.RpcError as error:
             raise from_rpc_error(error, self.address) from None
 
-    def stream(
-        self, method: Method[RequestT, ReplyT], request: RequestT, timeout: float | None, *, is_lossless: bool = False
-    ) -> ReplyStream:
-        """Makes a call with a stream of replies."""
-        channel = self._lossless() if is_lossless else self._channel
-        call = cast(Any, channel.unary_stream(method.path, method.request.SerializeToString))
-        return ReplyStream(call(request, timeout=timeout), self.address)
+    def stream(self, method: Method[RequestT, ReplyT], request: RequestT, timeout: float) -> ReplyStream:
+        """Makes a call with a stream of replies, which the caller reads to its end."""
+        return self._stream(self._channel, method, request, timeout)
+
+    def subscribe(self, method: Method[RequestT, ReplyT], request: RequestT) -> ReplyStream:
+        """Makes a call with a stream of replies without end, which the caller cancels."""
+        if self._subscriptions is None:
+            self._subscriptions = self._new_subscription_channel()
+        return self._stream(self._subscriptions, method, request, None)
 
     def step_stream(self) -> StepStream:
         """Makes a call that sends steps."""
@@ -246,13 +248,20 @@ class Transport:
     def close(self) -> None:
         """Closes the connections, and ends all calls."""
         self._channel.close()
-        if self._lossless_channel is not None:
-            self._lossless_channel.close()
+        if self._subscriptions is not None:
+            self._subscriptions.close()
+
+    def _stream(
+        self, channel: grpc.Channel, method: Method[RequestT, ReplyT], request: RequestT, timeout: float | None
+    ) -> ReplyStream:
+        call = cast(Any, channel.unary_stream(method.path, method.request.SerializeToString))
+        return ReplyStream(call(request, timeout=timeout), self.address)
 
     def _new_channel(self) -> grpc.Channel:
-        return grpc.insecure_channel(self._target, options=_OPTIONS)
+        # The calling thread reads the replies of a call, without a thread per call. Such a call keeps its connection
+        # open if it is cancelled, so subscriptions do without.
+        single_threaded = (ChannelOptions.SingleThreadedUnaryStream, 1)
+        return grpc.insecure_channel(self._target, options=[*options_of(self._target), single_threaded])
 
-    def _lossless(self) -> grpc.Channel:
-        if self._lossless_channel is None:
-            self._lossless_channel = self._new_channel()
-        return self._lossless_channel
+    def _new_subscription_channel(self) -> grpc.Channel:
+        return grpc.insecure_channel(self._target, options=options_of(self._target))
