@@ -1,0 +1,33 @@
+"""The examples run."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import modalcast as mc
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+
+
+def test_beam_has_the_frequencies_of_beam_theory(client: mc.Client, tmp_path: Path):
+    # One thread, because the server uses the other cores.
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    command = [sys.executable, EXAMPLES / "beam.py", client.address]
+    result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, env=environment)
+    assert result.returncode == 0, result.stderr
+    frequencies = [float(number) for number in re.findall(r"\d+\.\d", result.stdout)]
+    # The first bending mode of an Euler-Bernoulli beam that is clamped at one end.
+    expected = 1.8751**2 / (2 * np.pi) * np.sqrt(210e9 / 7850) * 0.2 / np.sqrt(12) / 4.0**2
+    assert frequencies[0] == pytest.approx(expected, rel=0.02)
+    pixels = np.asarray(Image.open(tmp_path / "beam.png")).astype(int)
+    # The beam with the first mode is red.
+    assert ((pixels[..., 0] - pixels[..., 2]) > 60).mean() > 0.02
+    client.delete("beams")
