@@ -59,6 +59,20 @@ require_nvrtc() {
         --target .tools/nvrtc 'nvidia-cuda-nvrtc==13.0.88'
 }
 
+# Installs the Python client and the tools that test it into a virtual environment in the git-ignored folder
+# .tools/python, again whenever its dependencies change.
+require_python_client() {
+    python3 -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || require_packages python3
+    python3 -c 'import sys; sys.exit(sys.version_info < (3, 11))' ||
+        fail "expected Python 3.11 or newer, got $(python3 --version)"
+    python3 -c 'import ensurepip' 2>/dev/null || require_packages python3-venv
+    cmp -s clients/python/pyproject.toml .tools/python/pyproject.toml && return
+    say "Installing the Python client and its tools into .tools/python"
+    python3 -m venv --clear .tools/python
+    .tools/python/bin/python -m pip install --quiet --disable-pip-version-check --editable 'clients/python[test]'
+    cp clients/python/pyproject.toml .tools/python/
+}
+
 # Installs NVRTC if the machine has an NVIDIA driver but no NVRTC.
 require_nvrtc_for_driver() {
     has_library 'libcuda.so.1' || return 0

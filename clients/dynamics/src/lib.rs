@@ -20,6 +20,37 @@
 //! | `divergence` | stops a run before it sends a step that is not finite or far out of range |
 //! | `step_values` | coordinates and transforms of a step, and the message with those that have changed |
 //! | `run` | sends a scenario as a step stream, optionally records it, and reports the results |
+//!
+//! # Example
+//! A client that moves the parts of the built-in tree and saves frames. `modalcast serve` runs in another process.
+//!
+//! ```rust,no_run
+//! use modalcast_client::{Client, Delivery, DriveRequest, FrameRequest, Picture};
+//! use modalcast_dynamics::{model::Model, step_values::StepValues};
+//!
+//! #[tokio::main]
+//! async fn main() -> Result<(), Box<dyn std::error::Error>> {
+//!     let client = Client::connect("http://127.0.0.1:50051").await?; // `modalcast serve`
+//!     let scene = client.open_scene("tree", "").await?.scene;
+//!     let model = Model::fetch(&client, &scene, 24).await?;
+//!     let mut drive = client.drive(&DriveRequest::new(&scene, Delivery::Lossless)).await?;
+//!     for number in 0..12 {
+//!         let time = number as f64 / 12.0;
+//!         let mut q = vec![0.0; model.coordinate_count];
+//!         for domain in model.domains.iter().filter(|domain| domain.rank > 0) {
+//!             // The first mode of each part moves its outermost point by up to 8 % of the part's size.
+//!             let amplitude = 0.08 * domain.diagonal / domain.displacement_per_unit(0);
+//!             q[domain.first_coordinate] = amplitude * (std::f64::consts::TAU * time).sin();
+//!         }
+//!         let step = StepValues::new(&model, &q).to_step(&model, number, time); // with the T that close all joints
+//!         drive.step(&step).await?; // x = T (x0 + U q)
+//!         drive.flush().await?;
+//!         let frame = client.render_frame(&FrameRequest::new(&scene, Picture::default())).await?;
+//!         std::fs::write(format!("frame-{number:02}.png"), &frame.bytes)?;
+//!     }
+//!     Ok(drive.finish().await.map(drop)?)
+//! }
+//! ```
 
 #![cfg_attr(not(test), deny(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::print_stdout))]
 
@@ -45,8 +76,3 @@ pub mod viewer_forces;
 pub mod wind;
 
 pub use error::{Error, Result, invalid_input};
-
-/// Compiles the client code in the project's README as a doctest.
-#[cfg(doctest)]
-#[doc = include_str!("../../../README.md")]
-struct ProjectReadme;
