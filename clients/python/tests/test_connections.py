@@ -78,15 +78,42 @@ def test_spawn_reports_why_a_server_does_not_start(tmp_path: Path):
         mc.spawn(arguments=["--no-such-option"])
 
 
-def test_spawned_server_ends_with_its_client_or_process():
+def refuses_connections(address: str) -> bool:
+    host, port = address.split(":")
+    with socket.socket() as probe:
+        return probe.connect_ex((host, int(port))) != 0
+
+
+def test_spawned_server_ends_with_its_client():
     client = mc.spawn(arguments=SERVER_ARGUMENTS)
-    assert client._server is not None
-    pid = client._server.pid
+    assert not refuses_connections(client.address)
     client.close()
-    assert not Path(f"/proc/{pid}").exists()
-    script = f"import modalcast as mc; client = mc.spawn(arguments={SERVER_ARGUMENTS}); print(client._server.pid)"
-    printed = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
-    assert not Path(f"/proc/{int(printed)}").exists()
+    assert refuses_connections(client.address)
+
+
+@pytest.mark.parametrize("end", ["", "import os; os.kill(os.getpid(), 9)"])
+def test_spawned_server_ends_with_its_process(end: str):
+    script = f"import modalcast as mc; c = mc.spawn(arguments={SERVER_ARGUMENTS}); print(c.address, flush=True); {end}"
+    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    deadline = time.monotonic() + 5
+    while not refuses_connections(result.stdout.strip()) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    assert refuses_connections(result.stdout.strip())
+
+
+def test_interrupt_of_the_process_group_does_not_end_a_spawned_server():
+    script = f"""
+import os, signal, time
+import modalcast as mc
+signal.signal(signal.SIGINT, signal.SIG_IGN)
+with mc.spawn(arguments={SERVER_ARGUMENTS}) as client:
+    os.killpg(os.getpgrp(), signal.SIGINT)
+    time.sleep(0.1)
+    print(client.scenes().sources)
+"""
+    command = [sys.executable, "-c", script]
+    result = subprocess.run(command, capture_output=True, text=True, check=False, start_new_session=True)
+    assert "tree" in result.stdout, result.stderr
 
 
 def test_lost_connection_is_an_error_without_reconnect(server: RestartableServer):

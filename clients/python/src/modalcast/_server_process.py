@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import subprocess
 import tempfile
 import weakref
@@ -16,8 +17,13 @@ _ADDRESS_PREFIX = "listening on http://"
 _STOP_SECONDS = 5.0
 
 
+# Runs the server until it ends or the standard input closes, which happens when this process ends in any way. The
+# server has a session of its own, so that Ctrl-C in the terminal or in a notebook does not end it.
+_SCRIPT = 'exec 3<&0; "$@" & server=$!; (cat <&3 >/dev/null; kill "$server" 2>/dev/null) & wait "$server"'
+
+
 class ServerProcess:
-    """A server on a free port of this machine. It ends with `stop`, and at the latest when this process exits."""
+    """A server on a free port of this machine. It ends with `stop`, and at the latest when this process ends."""
 
     def __init__(self, program: str | Path | None, arguments: Sequence[str]) -> None:
         """Starts the server; `address` tells when it listens.
@@ -29,19 +35,17 @@ class ServerProcess:
         self._folder = tempfile.TemporaryDirectory(prefix="modalcast-", ignore_cleanup_errors=True)
         folder = Path(self._folder.name)
         self._output, self._log = folder / "output", folder / "log"
-        command = [path, "serve", "--listen", "127.0.0.1:0", "--state", str(folder / "state"), *arguments]
+        command = ["sh", "-c", _SCRIPT, "sh", path, "serve", "--listen", "127.0.0.1:0"]
+        command += ["--state", str(folder / "state"), *arguments]
         with self._output.open("wb") as output, self._log.open("wb") as log:
             try:
-                self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=output, stderr=log)
+                self._process = subprocess.Popen(
+                    command, stdin=subprocess.PIPE, stdout=output, stderr=log, start_new_session=True
+                )
             except OSError as error:
                 self._folder.cleanup()
                 raise ServerStartError(f"{path}: {error}") from error
         self._finalizer = weakref.finalize(self, _end, self._process, self._folder)
-
-    @property
-    def pid(self) -> int:
-        """The process id of the server."""
-        return self._process.pid
 
     def address(self) -> str | None:
         """HOST:PORT, or None until the server listens.
@@ -77,10 +81,11 @@ def _find_program(program: str | Path | None) -> str:
 
 
 def _end(process: subprocess.Popen[bytes], folder: tempfile.TemporaryDirectory[str]) -> None:
-    process.terminate()
+    if process.stdin is not None:
+        process.stdin.close()
     try:
         process.wait(_STOP_SECONDS)
     except subprocess.TimeoutExpired:
-        process.kill()
+        os.killpg(process.pid, signal.SIGKILL)
         process.wait()
     folder.cleanup()

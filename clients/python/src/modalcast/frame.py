@@ -284,11 +284,12 @@ class Frame:
         """
         path = Path(path)
         image = self._colored() if output is None else self.image(output)
-        if path.suffix == ".npy":
+        suffix = path.suffix.lower()
+        if suffix == ".npy":
             np.save(path, image.array)
-        elif path.suffix in _SUFFIXES.get(image.head.format, ()):
+        elif suffix in _SUFFIXES.get(image.head.format, ()):
             path.write_bytes(image.data.tobytes())
-        elif path.suffix == ".png" and image.head.format == frames_pb2.FORMAT_RGBA:
+        elif suffix == ".png" and image.head.format == frames_pb2.FORMAT_RGBA:
             path.write_bytes(encode_png(image.data.reshape(image.head.height, image.head.width, 4)))
         else:
             name = frames_pb2.Format.Name(image.head.format).removeprefix("FORMAT_")

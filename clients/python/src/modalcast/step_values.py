@@ -119,7 +119,7 @@ class StepValues:
         for index, matrix in matrices.items():
             self._roots[index] = square(matrix)
         current = self._sent.copy()
-        if self._kinematics is not None:
+        if self._kinematics is not None and (step.q_domains or matrices):
             computed = self._kinematics.transforms(self._q.astype(np.float64), self._roots)[:, :3]
             current[self._is_attached] = computed[self._is_attached]
         for index, matrix in matrices.items():
