@@ -95,7 +95,9 @@ class Client:
         timeout = self._timeout if timeout is None else timeout
         request = scenes_pb2.OpenSceneRequest(source=source, scene=name)
         try:
-            reply = await with_reconnect(self._reconnect, lambda: self._transport.unary(OPEN_SCENE, request, timeout))
+            reply = await with_reconnect(
+                self._transport, self._reconnect, lambda: self._transport.unary(OPEN_SCENE, request, timeout)
+            )
         except NotFound as error:
             sources = (await self.scenes(timeout=timeout)).sources
             error.args = (f"{error}; the server has the sources {sources[:20]}",)
@@ -122,7 +124,9 @@ class Client:
         """
         timeout = self._timeout if timeout is None else timeout
         request = scenes_pb2.ListScenesRequest()
-        reply = await with_reconnect(self._reconnect, lambda: self._transport.unary(LIST_SCENES, request, timeout))
+        reply = await with_reconnect(
+            self._transport, self._reconnect, lambda: self._transport.unary(LIST_SCENES, request, timeout)
+        )
         return SceneList({scene.scene: scene for scene in reply.scenes}, list(reply.sources))
 
     async def add_scene(

@@ -139,7 +139,7 @@ class Scene:
                 timeout=time_limit,
             )
 
-        return await with_reconnect(self._reconnect, read)
+        return await with_reconnect(self._transport, self._reconnect, read)
 
     async def modes(
         self, domain: int | str | Domain, vertices: Sequence[int] = (), *, timeout: float | None = None
@@ -152,7 +152,9 @@ class Scene:
         """
         index, time_limit = self.domains[domain].index, self._time_limit(timeout)
         return await with_reconnect(
-            self._reconnect, lambda: read_modes(self._transport, self.name, index, vertices, time_limit)
+            self._transport,
+            self._reconnect,
+            lambda: read_modes(self._transport, self.name, index, vertices, time_limit),
         )
 
     async def drive(
@@ -346,11 +348,11 @@ class Scene:
         pictures = options.to_messages(self.info.up)
         wire_delivery = delivery_message(delivery)
 
-        def open_call(steps: int) -> ReplyStream:
+        def open_call(steps: int, wait: bool) -> ReplyStream:
             request = frames_pb2.StreamFramesRequest(
                 scene=self.name, pictures=pictures, delivery=wire_delivery, max_hz=max_hz, steps=steps
             )
-            return self._transport.subscribe(STREAM_FRAMES, request)
+            return self._transport.subscribe(STREAM_FRAMES, request, wait_for_ready=wait)
 
         stream = FrameBatchStream(
             self._transport,
@@ -437,11 +439,11 @@ class Scene:
         selection = vertex_selection(self.domains, domains, attributes)
         wire_delivery = delivery_message(delivery)
 
-        def open_call(steps: int) -> ReplyStream:
+        def open_call(steps: int, wait: bool) -> ReplyStream:
             request = vertices_pb2.StreamVerticesRequest(
                 scene=self.name, selection=selection, delivery=wire_delivery, max_hz=max_hz, steps=steps
             )
-            return self._transport.subscribe(STREAM_VERTICES, request)
+            return self._transport.subscribe(STREAM_VERTICES, request, wait_for_ready=wait)
 
         return await self._start(open_call, lambda: VertexSetDecoder(2, 3), count, delivery)
 
@@ -471,11 +473,11 @@ class Scene:
         """
         wire_delivery = delivery_message(delivery)
 
-        def open_call(steps: int) -> ReplyStream:
+        def open_call(steps: int, wait: bool) -> ReplyStream:
             request = states_pb2.StreamStatesRequest(
                 scene=self.name, delivery=wire_delivery, max_hz=max_hz, steps=steps
             )
-            return self._transport.subscribe(STREAM_STATES, request)
+            return self._transport.subscribe(STREAM_STATES, request, wait_for_ready=wait)
 
         return await self._start(open_call, lambda: SceneStateDecoder(self._layout, chunk_field=2), count, delivery)
 
@@ -570,7 +572,7 @@ class Scene:
                 raise malformed("pick.head", "a head", "none")
             return PickResult(step_id(step_message), tuple(hits))
 
-        return await with_reconnect(self._reconnect, read)
+        return await with_reconnect(self._transport, self._reconnect, read)
 
     async def apply_forces(
         self, forces: Sequence[Force], *, lifetime: float = 0.5, timeout: float | None = None
@@ -609,7 +611,12 @@ class Scene:
             Error: The call failed.
         """
         request = forces_pb2.StreamForcesRequest(scene=self.name, max_hz=max_hz)
-        return await self._start(lambda _: self._transport.subscribe(STREAM_FORCES, request), ForceDecoder, 0, "latest")
+        return await self._start(
+            lambda _, wait: self._transport.subscribe(STREAM_FORCES, request, wait_for_ready=wait),
+            ForceDecoder,
+            0,
+            "latest",
+        )
 
     async def delete(self, *, timeout: float | None = None) -> None:
         """Closes the scene for all clients, and removes the files of an uploaded scene.
@@ -629,12 +636,13 @@ class Scene:
 
     async def _start(
         self,
-        open_call: Callable[[int], ReplyStream],
+        open_call: Callable[[int, bool], ReplyStream],
         new_decoder: Callable[[], ReplyDecoder[T]],
         count: int,
         delivery: Delivery,
     ) -> Stream[T]:
-        stream = Stream(open_call, new_decoder, count=count, reconnect=self._stream_reconnect(delivery))
+        reconnect = self._stream_reconnect(delivery)
+        stream = Stream(open_call, new_decoder, transport=self._transport, count=count, reconnect=reconnect)
         await stream.start()
         return stream
 
@@ -654,7 +662,7 @@ class Scene:
                 raise
             return reply
 
-        return await with_reconnect(self._reconnect, read)
+        return await with_reconnect(self._transport, self._reconnect, read)
 
     async def _vertex_set(
         self,

@@ -256,7 +256,7 @@ class Drive:
                 # The server has not noticed yet that the old connection is lost.
                 raise ConnectionLost(str(error)) from error
 
-        with_reconnect(self._reconnect, reopen)
+        with_reconnect(self._transport, self._reconnect, reopen)
         self._send(self._values.complete_step(self._next_number, self._time), self._timeout)
         self._stream.wait_until(self._is_idle, self._timeout)
 

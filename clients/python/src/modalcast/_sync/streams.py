@@ -23,7 +23,7 @@ RETRY_SECONDS = 0.1
 """Pause between two attempts to reach a server."""
 
 
-def with_reconnect(reconnect: float, operation: Callable[[], T]) -> T:
+def with_reconnect(transport: Transport, reconnect: float, operation: Callable[[], T]) -> T:
     """Repeats an operation without side effects, for up to `reconnect` seconds, while no server answers.
 
     Raises:
@@ -34,9 +34,11 @@ def with_reconnect(reconnect: float, operation: Callable[[], T]) -> T:
         try:
             return operation()
         except ConnectionLost:
-            if time.monotonic() >= end:
+            remaining = end - time.monotonic()
+            if remaining <= 0:
                 raise
         sleep(RETRY_SECONDS)
+        transport.wait_for_server(remaining)
 
 
 def read_reply(stream: ReplyStream, decoder: ReplyDecoder[T]) -> T | None:
@@ -58,26 +60,31 @@ class Stream(Generic[T]):
     """An iterator over the replies of a subscription. Leave its `with` block or call `close` to unsubscribe.
 
     A stream of the latest steps continues by itself after a lost connection, for as long as the client's `reconnect`
-    allows. A stream of every step raises `ConnectionLost`, because steps may be missing.
+    allows. A stream of every step raises `ConnectionLost`, because steps may be missing. With asyncio, a cancelled
+    iteration ends the stream.
     """
 
     def __init__(
         self,
-        open_call: Callable[[int], ReplyStream],
+        open_call: Callable[[int, bool], ReplyStream],
         new_decoder: Callable[[], ReplyDecoder[T]],
         *,
+        transport: Transport,
         count: int,
         reconnect: float,
     ) -> None:
         """Prepares a subscription, which `start` opens.
 
         Args:
-            open_call: Subscribes to the given number of replies; 0 for no limit.
+            open_call: Subscribes to the given number of replies, 0 for no limit. The second argument is whether to
+                wait for the connection.
             new_decoder: Creates the decoder of a call.
+            transport: The connection.
             count: Number of replies after which the stream ends; 0 for no limit.
             reconnect: Seconds for which a lost connection is opened again.
         """
         self._open_call = open_call
+        self._transport = transport
         self._new_decoder = new_decoder
         self._remaining = count
         self._is_limited = count > 0
@@ -87,13 +94,13 @@ class Stream(Generic[T]):
         self._stream: ReplyStream | None = None
         self._decoder = new_decoder()
 
-    def start(self) -> None:
+    def start(self, *, wait_for_ready: bool = False) -> None:
         """Subscribes. The next step is delivered when this returns.
 
         Raises:
             Error: The server rejects the subscription, or no server answers.
         """
-        self._stream = self._open_call(self._remaining)
+        self._stream = self._open_call(self._remaining, wait_for_ready)
         self._decoder = self._new_decoder()
         # The settings, or the forces that exist already.
         self._first_message = self._stream.read()
@@ -126,7 +133,8 @@ class Stream(Generic[T]):
         except BaseException:
             self.close()
             raise
-        with_reconnect(self._reconnect, self.start)
+        self._transport.wait_for_server(self._reconnect)
+        with_reconnect(self._transport, self._reconnect, lambda: self.start(wait_for_ready=True))
         return self._read()
 
     def _read(self) -> T | None:
@@ -167,14 +175,13 @@ class FrameBatchStream(Stream[list[Frame]]):
         outputs_per_camera: int,
         scene_up: str,
         timeout: float,
-        open_call: Callable[[int], ReplyStream],
+        open_call: Callable[[int, bool], ReplyStream],
         new_decoder: Callable[[], ReplyDecoder[list[Frame]]],
         *,
         count: int,
         reconnect: float,
     ) -> None:
-        super().__init__(open_call, new_decoder, count=count, reconnect=reconnect)
-        self._transport = transport
+        super().__init__(open_call, new_decoder, transport=transport, count=count, reconnect=reconnect)
         self._pictures = pictures
         self._outputs_per_camera = outputs_per_camera
         self._scene_up = scene_up

@@ -14,7 +14,7 @@ from grpc.experimental import ChannelOptions  # pyright: ignore[reportMissingTyp
 
 from modalcast._channel import options_of, target_of
 from modalcast._chunks import malformed
-from modalcast._methods import DRIVE_SCENE, Method
+from modalcast._methods import DRIVE_SCENE, GET_SERVER_INFO, Method
 from modalcast._step_progress import Progress
 from modalcast.errors import ConnectionLost, DeadlineExceeded, Error, from_rejection, from_rpc_error
 from modalcast.v1 import steps_pb2
@@ -217,6 +217,20 @@ class Transport:
         except grpc.RpcError as error:
             raise from_rpc_error(error, self.address) from None
 
+    def wait_for_server(self, timeout: float) -> None:
+        """Waits until a server answers.
+
+        Raises:
+            ConnectionLost: No server has answered in time.
+        """
+        method = GET_SERVER_INFO
+        call = self._channel.unary_unary(method.path, method.request.SerializeToString, method.reply.FromString)
+        try:
+            # Without `wait_for_ready`, the call fails while the connection is still being established.
+            call(method.request(), timeout=timeout, wait_for_ready=True)
+        except grpc.RpcError:
+            raise ConnectionLost(f"{self.address}: no connection for {timeout:g} s") from None
+
     def upload(self, method: Method[RequestT, ReplyT], requests: Iterator[RequestT], timeout: float | None) -> ReplyT:
         """Makes a call with a stream of requests. The requests are created as they are sent.
 
@@ -233,11 +247,14 @@ class Transport:
         """Makes a call with a stream of replies, which the caller reads to its end."""
         return self._stream(self._channel, method, request, timeout)
 
-    def subscribe(self, method: Method[RequestT, ReplyT], request: RequestT) -> ReplyStream:
-        """Makes a call with a stream of replies without end, which the caller cancels."""
+    def subscribe(self, method: Method[RequestT, ReplyT], request: RequestT, *, wait_for_ready: bool) -> ReplyStream:
+        """Makes a call with a stream of replies without end, which the caller cancels.
+
+        With `wait_for_ready`, the call waits for the connection, without a time limit.
+        """
         if self._subscriptions is None:
             self._subscriptions = self._new_subscription_channel()
-        return self._stream(self._subscriptions, method, request, None)
+        return self._stream(self._subscriptions, method, request, None, wait_for_ready=wait_for_ready)
 
     def step_stream(self) -> StepStream:
         """Makes a call that sends steps."""
@@ -252,10 +269,16 @@ class Transport:
             self._subscriptions.close()
 
     def _stream(
-        self, channel: grpc.Channel, method: Method[RequestT, ReplyT], request: RequestT, timeout: float | None
+        self,
+        channel: grpc.Channel,
+        method: Method[RequestT, ReplyT],
+        request: RequestT,
+        timeout: float | None,
+        *,
+        wait_for_ready: bool = False,
     ) -> ReplyStream:
         call = cast(Any, channel.unary_stream(method.path, method.request.SerializeToString))
-        return ReplyStream(call(request, timeout=timeout), self.address)
+        return ReplyStream(call(request, timeout=timeout, wait_for_ready=wait_for_ready), self.address)
 
     def _new_channel(self) -> grpc.Channel:
         # The calling thread reads the replies of a call, without a thread per call. Such a call keeps its connection
