@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -79,9 +80,7 @@ class VertexSet:
 
     Attributes:
         step: The step.
-        domains: Indices of the selected domains.
-        vertex_counts: Number of vertices of each selected domain.
-        corner_counts: Number of corners of each selected domain.
+        layout: The selected domains, and their numbers of vertices and corners, as a message.
         positions: n x 3 in scene units: a vertex is at origin + unit * position in the world.
         normals: One unit vector per corner, in world axes.
         displacements: u = U q, n x 3 in scene units, in each domain's own frame.
@@ -92,9 +91,7 @@ class VertexSet:
     """
 
     step: StepId
-    domains: tuple[int, ...]
-    vertex_counts: tuple[int, ...]
-    corner_counts: tuple[int, ...]
+    layout: vertices_pb2.VertexLayout = field(repr=False)
     positions: F32 | None
     normals: F32 | None
     displacements: F32 | None
@@ -102,6 +99,21 @@ class VertexSet:
     origins: F64
     skipped: int
     stages: dict[str, float] = field(repr=False)
+
+    @cached_property
+    def domains(self) -> tuple[int, ...]:
+        """Indices of the selected domains."""
+        return tuple(self.layout.domains)
+
+    @cached_property
+    def vertex_counts(self) -> tuple[int, ...]:
+        """Number of vertices of each selected domain."""
+        return tuple(self.layout.vertices)
+
+    @cached_property
+    def corner_counts(self) -> tuple[int, ...]:
+        """Number of corners of each selected domain."""
+        return tuple(self.layout.corners)
 
     def positions_of(self, domain: int | Domain) -> F32:
         """The positions of one domain, a view.
@@ -122,21 +134,22 @@ class VertexDecoder:
 
     def __init__(self) -> None:
         self._layout = vertices_pb2.VertexLayout()
+        self._vectors: dict[int, int] = {}
         self._origins: F64 = np.zeros((1, 3))
 
     def add_layout(self, part: vertices_pb2.VertexLayout) -> None:
         """Adds a part of the layout."""
         self._layout.MergeFrom(part)
+        vertex_count, corner_count = sum(self._layout.vertices), sum(self._layout.corners)
+        self._vectors = {
+            vertices_pb2.ATTRIBUTE_POSITIONS: vertex_count,
+            vertices_pb2.ATTRIBUTE_NORMALS: corner_count,
+            vertices_pb2.ATTRIBUTE_DISPLACEMENTS: vertex_count,
+            vertices_pb2.ATTRIBUTE_BOXES: 2 * len(self._layout.domains),
+        }
 
     def decode(self, head: vertices_pb2.VertexHead, target: Bytes, data: Bytes) -> VertexSet:
         """Decodes the bytes of a step: those of `target`, then those of `data`."""
-        layout = self._layout
-        counts = {
-            vertices_pb2.ATTRIBUTE_POSITIONS: sum(layout.vertices),
-            vertices_pb2.ATTRIBUTE_NORMALS: sum(layout.corners),
-            vertices_pb2.ATTRIBUTE_DISPLACEMENTS: sum(layout.vertices),
-            vertices_pb2.ATTRIBUTE_BOXES: 2 * len(layout.domains),
-        }
         arrays: dict[int, F32] = {}
         for section in head.sections:
             start, end = section.offset, section.offset + section.bytes
@@ -146,14 +159,12 @@ class VertexDecoder:
                 raise malformed("vertices.sections", f"{section.bytes} bytes at {start}", f"{len(content)} bytes")
             if section.attribute == vertices_pb2.ATTRIBUTE_ORIGINS:
                 self._origins = content.view("<f8").reshape(-1, 3)
-            elif section.attribute in counts:
-                arrays[section.attribute] = decode_vectors(section.encoding, counts[section.attribute], content)
+            elif section.attribute in self._vectors:
+                arrays[section.attribute] = decode_vectors(section.encoding, self._vectors[section.attribute], content)
         boxes = arrays.get(vertices_pb2.ATTRIBUTE_BOXES)
         return VertexSet(
             step=step_id(head.step),
-            domains=tuple(layout.domains),
-            vertex_counts=tuple(layout.vertices),
-            corner_counts=tuple(layout.corners),
+            layout=self._layout,
             positions=arrays.get(vertices_pb2.ATTRIBUTE_POSITIONS),
             normals=arrays.get(vertices_pb2.ATTRIBUTE_NORMALS),
             displacements=arrays.get(vertices_pb2.ATTRIBUTE_DISPLACEMENTS),
