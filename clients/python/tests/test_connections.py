@@ -131,13 +131,14 @@ def test_lost_connection_is_an_error_without_reconnect(server: RestartableServer
             scene.vertices()
 
 
-def test_drive_stream_and_calls_continue_after_restart(server: RestartableServer):
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+def test_drive_stream_and_calls_continue_after_restart(server: RestartableServer, number: int):
     with mc.connect(server.address) as client:
         scene = client.upload(beam_builder("resumed"))
         with scene.drive() as drive, scene.steps() as steps:
             first = drive.step(q={"beam": [1, 2, 3]})
             assert next(steps).step == first
-            server.stop(signal.SIGKILL)
+            server.stop(number)
             restart = threading.Timer(0.5, server.start)
             restart.start()
             second = drive.step(q={"copy": [4, 5, 6]})

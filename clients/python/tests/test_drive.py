@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import re
+import time
 
 import numpy as np
 import pytest
@@ -124,6 +125,29 @@ def test_reset_returns_to_rest(beams: mc.Scene):
     state = beams.state()
     assert not state.q.any()
     np.testing.assert_array_equal(state.transforms[1], beams.domains["copy"].placement)
+
+
+def test_closed_drive_rejects_steps_and_releases_the_scene(beams: mc.Scene):
+    drive = beams.drive()
+    drive.step()
+    drive.finish()
+    drive.finish()
+    drive.close()
+    for use in (drive.step, drive.reset, drive.flush):
+        with pytest.raises(ValueError, match="the drive is closed"):
+            use()
+    assert drive.rejected == 0
+    forgotten = beams.drive()
+    del forgotten
+    deadline = time.monotonic() + 5
+    while time.monotonic() < deadline:
+        try:
+            beams.drive().finish()
+            break
+        except mc.AlreadyExists:
+            time.sleep(0.01)
+    else:
+        pytest.fail("expected the lease of a collected drive to be released")
 
 
 def test_delivery_latest_merges_steps(beams: mc.Scene):

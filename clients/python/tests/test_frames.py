@@ -36,7 +36,8 @@ def test_color_maps_have_parameters(beams: mc.Scene):
     frame = beams.frame(outputs=outputs, **SIZE)
     assert frame["displacement"].shape == frame["mode_shape"].shape == (90, 160, 4)
     assert np.array_equal(frame.rgba, frame["displacement"])
-    edges = beams.frame(outputs=[mc.Output("color", edge_width=2.0)], **SIZE)
+    assert beams.frame(outputs="depth", **SIZE).depth.shape == (90, 160)
+    edges = beams.frame(outputs=mc.Output("color", edge_width=2.0), **SIZE)
     assert not np.array_equal(edges.array, beams.frame(**SIZE).array)
 
 
@@ -54,7 +55,7 @@ def test_png_files_have_the_pixels_of_the_array(beams: mc.Scene, tmp_path: Path)
     np.testing.assert_array_equal(np.asarray(PillowImage.open(io.BytesIO(shown))), raw.array)
     with pytest.raises(ValueError, match="format='raw'"):
         _ = encoded.array
-    with pytest.raises(ValueError, match=re.escape("ends with .npy")):
+    with pytest.raises(ValueError, match=re.escape("ends with .png or .npy")):
         raw.save(tmp_path / "frame.jpg")
 
 
@@ -117,6 +118,8 @@ def test_invalid_pictures_name_expected_and_given(beams: mc.Scene):
         beams.frame(outputs=("color", "color"))
     with pytest.raises(ValueError, match="expected names out of"):
         beams.frame(outputs=("colour",))  # pyright: ignore[reportArgumentType]
+    with pytest.raises(TypeError, match="camera: expected a Camera or None, got str"):
+        beams.frame("front")  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="width: expected at least 1 pixel, got 0"):
         beams.frame(width=0)
     camera = mc.pinhole(np.eye(3), 100, 100, np.eye(4))

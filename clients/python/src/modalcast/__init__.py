@@ -25,6 +25,7 @@ from modalcast.errors import (
     ProtocolVersionError,
     ServerError,
     ServerStartError,
+    ShuttingDown,
     StepPassed,
     Unavailable,
 )
@@ -77,6 +78,7 @@ __all__ = [
     "ServerError",
     "ServerStartError",
     "Shape",
+    "ShuttingDown",
     "StepId",
     "StepPassed",
     "Stream",

@@ -31,7 +31,7 @@ def options_of(target: str) -> list[tuple[str, int | str]]:
 
 
 def target_of(address: str) -> str:
-    """The target of a connection: HOST:PORT, http://HOST:PORT or unix:PATH.
+    """The target of a connection: HOST, HOST:PORT, http://HOST:PORT or unix:PATH. The default port is 50051.
 
     Raises:
         ValueError: The address has another scheme.
@@ -41,7 +41,7 @@ def target_of(address: str) -> str:
         raise ValueError(f"address: expected HOST:PORT, http://HOST:PORT or unix:PATH, got '{address}'")
     if not target:
         raise ValueError("address: expected HOST:PORT, http://HOST:PORT or unix:PATH, got an empty text")
-    return target
+    return target if ":" in target else f"{target}:50051"
 
 
 def deadline_ms(timeout: float) -> int:

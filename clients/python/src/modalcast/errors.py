@@ -101,6 +101,10 @@ class Unavailable(ServerError):
     """The server lacks a program, a device or memory, or is shutting down."""
 
 
+class ShuttingDown(Unavailable, ConnectionLost):
+    """The server is shutting down. Calls and streams that reconnect treat this as a lost connection."""
+
+
 class LeaseLost(ServerError):
     """Another writer has taken over the scene."""
 
@@ -167,10 +171,11 @@ def from_rpc_error(error: grpc.RpcError, address: str) -> Error:
         return _CLASS_OF_CODE.get(code, ServerError)(f"{address}: {message} ({code})", code=code)
     info, field, retry_after = details
     metadata = dict(info.metadata)
-    return _CLASS_OF_CODE.get(code, ServerError)(
+    reason = info.reason.removeprefix("REASON_")
+    return _error_class(code, reason)(
         message,
         code=code,
-        reason=info.reason.removeprefix("REASON_"),
+        reason=reason,
         field=field,
         expected=metadata.pop("expected", ""),
         given=metadata.pop("given", ""),
@@ -188,8 +193,7 @@ def from_rejection(rejection: errors_pb2.Rejection) -> ServerError:
     step = rejection.step if rejection.HasField("step") else None
     prefix = "" if step is None else f"step {step}: "
     field = f"{rejection.field}: " if rejection.field else ""
-    code = _CODE_OF_REJECTION.get(reason, "")
-    return _CLASS_OF_CODE.get(code, ServerError)(
+    return _error_class(_CODE_OF_REJECTION.get(reason, ""), reason)(
         f"{prefix}{field}expected {rejection.expected}, got {rejection.given}",
         reason=reason,
         field=rejection.field,
@@ -197,6 +201,10 @@ def from_rejection(rejection: errors_pb2.Rejection) -> ServerError:
         given=rejection.given,
         step=step,
     )
+
+
+def _error_class(code: str, reason: str) -> type[ServerError]:
+    return ShuttingDown if reason == "SHUTTING_DOWN" else _CLASS_OF_CODE.get(code, ServerError)
 
 
 def _status_details(status: RpcStatus) -> tuple[error_details_pb2.ErrorInfo, str, float | None] | None:

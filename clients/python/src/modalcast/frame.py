@@ -73,13 +73,17 @@ class Output:
     edge_width: float | None = None
 
 
+Outputs: TypeAlias = OutputName | Output | Sequence[OutputName | Output]
+"""One or several outputs, by name or with parameters."""
+
+
 @dataclass(frozen=True)
 class PictureOptions:
     """What the frames of a request show.
 
     Attributes:
         cameras: One camera per frame; None shows the whole scene.
-        outputs: The outputs of each frame.
+        outputs: The outputs of each frame, or one output.
         width: Width in pixels; None: that of the camera, or 1280.
         height: Height in pixels; None: that of the camera, or 720.
         format: Encoding of color and color maps.
@@ -87,15 +91,23 @@ class PictureOptions:
     """
 
     cameras: Sequence[Camera | None]
-    outputs: Sequence[OutputName | Output]
+    outputs: Outputs
     width: int | None
     height: int | None
     format: ColorFormat
     jpeg_quality: int
 
+    def output_list(self) -> list[Output]:
+        """The outputs with their parameters."""
+        if isinstance(self.outputs, Output):
+            return [self.outputs]
+        if isinstance(self.outputs, str):
+            return [Output(self.outputs)]
+        return [output if isinstance(output, Output) else Output(output) for output in self.outputs]
+
     def names(self) -> list[str]:
         """The names of the outputs."""
-        return [output.name if isinstance(output, Output) else output for output in self.outputs]
+        return [output.name for output in self.output_list()]
 
     def to_messages(self, scene_up: str) -> list[frames_pb2.Picture]:
         """The pictures of the request: all outputs of the first camera, then those of the second.
@@ -113,10 +125,9 @@ class PictureOptions:
             )
         if self.format not in _COLOR_FORMATS:
             raise ValueError(f"format: expected one of {list(_COLOR_FORMATS)}, got '{self.format}'")
-        return [self._picture(camera, output, scene_up) for camera in self.cameras for output in self.outputs]
+        return [self._picture(camera, output, scene_up) for camera in self.cameras for output in self.output_list()]
 
-    def _picture(self, camera: Camera | None, output: OutputName | Output, scene_up: str) -> frames_pb2.Picture:
-        output = output if isinstance(output, Output) else Output(output)
+    def _picture(self, camera: Camera | None, output: Output, scene_up: str) -> frames_pb2.Picture:
         if output.name not in _OUTPUTS:
             raise ValueError(f"outputs: expected names out of {list(_OUTPUTS)}, got '{output.name}'")
         is_colored = output.name in _COLORED
@@ -141,8 +152,11 @@ def picture_size(camera: Camera | None, width: int | None, height: int | None) -
     """The size of a picture in pixels.
 
     Raises:
+        TypeError: `camera` is not a camera.
         ValueError: A size is not positive, or a pinhole camera has another size.
     """
+    if not isinstance(camera, Camera | None):  # pyright: ignore[reportUnnecessaryIsInstance] # of untyped callers
+        raise TypeError(f"camera: expected a Camera or None, got {type(camera).__name__}")
     camera_size = (None, None) if camera is None else (camera.width, camera.height)
     size: list[int] = []
     pairs = zip(("width", "height"), (width, height), camera_size, (1280, 720), strict=True)
@@ -293,7 +307,9 @@ class Frame:
             path.write_bytes(encode_png(image.data.reshape(image.head.height, image.head.width, 4)))
         else:
             name = frames_pb2.Format.Name(image.head.format).removeprefix("FORMAT_")
-            expected = ".npy" if image.head.format in _ARRAYS else _SUFFIXES[image.head.format][0]
+            is_rgba = image.head.format == frames_pb2.FORMAT_RGBA
+            arrays = ".png or .npy" if is_rgba else ".npy"
+            expected = arrays if image.head.format in _ARRAYS else _SUFFIXES[image.head.format][0]
             raise ValueError(f"expected a path that ends with {expected} for an image of format {name}, got '{path}'")
 
     def _repr_png_(self) -> bytes | None:

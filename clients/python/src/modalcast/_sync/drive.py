@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -107,13 +108,14 @@ class Drive:
 
         Raises:
             KeyError: No domain has a name; the message lists near names.
-            ValueError: An array has another shape, with the expected and the given one.
+            ValueError: An array has another shape, with the expected and the given one; or the drive is closed.
             InvalidRequest: The server rejected this step or, without `wait`, an earlier one. The drive remains open.
             LeaseLost: Another writer has taken over the scene.
             ConnectionLost: No server answers.
             DeadlineExceeded: The time has passed; the step may complete later.
         """
         timeout = self._timeout if timeout is None else timeout
+        self._check_open()
         new_time = self._time + self._options.dt if time is None else to_time(time)
         message = self._values.step(self._next_number, new_time, q, transforms)
         self._time = new_time
@@ -133,6 +135,7 @@ class Drive:
             Error: As for `step`.
         """
         timeout = self._timeout if timeout is None else timeout
+        self._check_open()
         self._values = StepValues(self._layout, self._kinematics, *rest_values(self._layout))
         self._time += self._options.dt
         try:
@@ -150,6 +153,7 @@ class Drive:
             InvalidRequest: The server rejected a step.
             Error: As for `step`.
         """
+        self._check_open()
         try:
             self._stream.wait_until(self._is_idle, self._timeout if timeout is None else timeout)
         except ConnectionLost:
@@ -162,10 +166,13 @@ class Drive:
         Raises:
             Error: As for `flush`.
         """
+        if self._is_closed:
+            return
         timeout = self._timeout if timeout is None else timeout
         try:
             self.flush(timeout=timeout)
         finally:
+            self._is_closed = True
             self._stream.finish(timeout)
 
     def close(self) -> None:
@@ -189,20 +196,30 @@ class Drive:
         """Milliseconds by stage of the last acknowledged step."""
         return dict(self._stream.progress.stages)
 
+    def __del__(self) -> None:
+        if not getattr(self, "_is_closed", True):
+            # An event loop may be closed already, and has then ended the stream.
+            with contextlib.suppress(RuntimeError):
+                self.close()
+
     def __enter__(self) -> Drive:
         return self
 
     def __exit__(self, error_type: object, *_: object) -> None:
-        if error_type is not None:
-            self.close()
-        elif not self._is_closed:
+        if error_type is None:
             self.finish()
+        else:
+            self.close()
 
     @property
     def _stream(self) -> StepStream:
         if self._opened_stream is None:
-            raise ConnectionLost(f"{self._transport.address}: the drive is not open")
+            raise ValueError("the drive was not started")
         return self._opened_stream
+
+    def _check_open(self) -> None:
+        if self._is_closed:
+            raise ValueError("the drive is closed: Scene.drive opens another one")
 
     def _is_idle(self) -> bool:
         return not self._stream.progress.in_flight

@@ -36,7 +36,7 @@ from modalcast._sync.transport import ReplyStream, Transport
 from modalcast._types import F32
 from modalcast.camera import Camera
 from modalcast.forces import Force, ForceSet, Hit, PickResult, force_messages, hit_from_message
-from modalcast.frame import ColorFormat, Frame, Output, OutputName, PictureOptions, picture_size
+from modalcast.frame import ColorFormat, Frame, Outputs, PictureOptions, picture_size
 from modalcast.kinematics import Kinematics
 from modalcast.scene_description import ArrayName, Domain, Domains, SceneDescription
 from modalcast.states import SceneState, StateLayout
@@ -215,7 +215,7 @@ class Scene:
         self,
         camera: Camera | None = None,
         *,
-        outputs: Sequence[OutputName | Output] = ("color",),
+        outputs: Outputs = "color",
         width: int | None = None,
         height: int | None = None,
         format: ColorFormat = "raw",  # noqa: A002 # the word of the field
@@ -229,7 +229,7 @@ class Scene:
         Args:
             camera: `look_at`, `at_pose` or `pinhole`; None shows the whole scene.
             outputs: Names out of "color", "depth", "depth_with_ground", "domains", "normals", "displacement" and
-                "mode_shape", or `Output` for parameters. All are of the same step, one array each.
+                "mode_shape", or `Output` for parameters: one or several, all of the same step, one array each.
             width: In pixels; None: that of the camera, or 1280.
             height: In pixels; None: that of the camera, or 720.
             format: Encoding of color: "raw" for arrays, "png", or "jpeg".
@@ -258,7 +258,7 @@ class Scene:
         self,
         cameras: Sequence[Camera | None],
         *,
-        outputs: Sequence[OutputName | Output] = ("color",),
+        outputs: Outputs = "color",
         width: int | None = None,
         height: int | None = None,
         format: ColorFormat = "raw",  # noqa: A002
@@ -289,7 +289,7 @@ class Scene:
         self,
         camera: Camera | None = None,
         *,
-        outputs: Sequence[OutputName | Output] = ("color",),
+        outputs: Outputs = "color",
         width: int | None = None,
         height: int | None = None,
         format: ColorFormat = "raw",  # noqa: A002
@@ -330,7 +330,7 @@ class Scene:
         self,
         cameras: Sequence[Camera | None],
         *,
-        outputs: Sequence[OutputName | Output] = ("color",),
+        outputs: Outputs = "color",
         width: int | None = None,
         height: int | None = None,
         format: ColorFormat = "raw",  # noqa: A002
@@ -357,7 +357,7 @@ class Scene:
         stream = FrameBatchStream(
             self._transport,
             pictures,
-            len(outputs),
+            len(options.names()),
             self.info.up,
             self._timeout,
             open_call,
