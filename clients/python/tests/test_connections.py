@@ -150,6 +150,21 @@ def test_drive_stream_and_calls_continue_after_restart(server: RestartableServer
         restart.join()
 
 
+def test_world_poses_are_sent_again_after_restart(server: RestartableServer):
+    with mc.connect(server.address) as client:
+        scene = client.upload(beam_builder("poses"))
+        with scene.drive() as drive:
+            drive.step(q={"beam": [1, 2, 3]}, transforms={"copy": mc.WorldPose((0, 0, 0, 1), (7, 8, 9))})
+            with pytest.raises(ValueError, match="expected world poses, as in earlier steps"):
+                drive.step(transforms={"copy": np.eye(4)})
+            server.stop(signal.SIGKILL)
+            server.start()
+            drive.step(q={"copy": [4, 5, 6]})
+        state = scene.state()
+        assert state.q.tolist() == [1, 2, 3, 4, 5, 6]
+        assert (state.transform_of("copy")[:, 3] + state.origins[1]).tolist() == [7, 8, 9]
+
+
 def test_lossless_stream_reports_a_lost_connection(server: RestartableServer):
     with mc.connect(server.address) as client:
         scene = client.upload(beam_builder("lossless"))
@@ -159,6 +174,16 @@ def test_lossless_stream_reports_a_lost_connection(server: RestartableServer):
             with pytest.raises(mc.ConnectionLost):
                 next(steps)
         assert scene.vertices().shape == (scene.vertex_count, 3)
+
+
+def send_until_full(drive: mc.Drive) -> int:
+    """Sends steps to a stopped server until its connection is full. Returns the number of sent steps."""
+    for number in range(100_000):
+        try:
+            drive.step(q={"beam": [number, 0, 0]}, wait=False, timeout=0.3)
+        except mc.DeadlineExceeded:
+            return number
+    pytest.fail("expected a full connection")
 
 
 def test_stopped_server_exceeds_the_deadline(server: RestartableServer):
@@ -171,9 +196,13 @@ def test_stopped_server_exceeds_the_deadline(server: RestartableServer):
                 scene.vertices(timeout=0.3)
             with pytest.raises(TimeoutError):
                 drive.step(timeout=0.3)
+            last = send_until_full(drive)
         finally:
             server.process.send_signal(signal.SIGCONT)
         drive.flush()
+        # The values that were not sent are part of the next step.
+        drive.step(q={"copy": [1, 0, 0]})
+        assert scene.state().q.tolist() == [last, 0, 0, 1, 0, 0]
         drive.close()
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections import deque
 
 from modalcast._common import stage_times
@@ -43,10 +44,14 @@ class Progress:
             self.stages = stage_times(reply.ack.stages)
         elif reply.HasField("rejection"):
             rejection = from_rejection(reply.rejection)
-            if rejection.step in self.in_flight:
-                self.in_flight.remove(rejection.step)
+            self.discard(rejection.step)
             self.rejected += 1
             self.rejections.append(rejection)
+
+    def discard(self, number: int | None) -> None:
+        """Removes a step from the steps in flight."""
+        with contextlib.suppress(ValueError):
+            self.in_flight.remove(number)  # pyright: ignore[reportArgumentType] # None is in no list
 
     def fits(self, window: int | None) -> bool:
         """Whether another step fits into the window."""

@@ -72,6 +72,8 @@ class StepValues:
         self._q = q.copy()
         self._roots: F64 = np.stack([square(transform) for transform in transforms])
         self._sent: F32 = transforms.copy()
+        # The last poses, while the caller sends poses.
+        self._poses: dict[int, WorldPose] = {}
         domains = layout.domains
         self._is_attached = np.array([domain.parent is not None and domain.follows is None for domain in domains])
 
@@ -95,21 +97,27 @@ class StepValues:
             step.q_domains.append(domain)
             self._q[self._layout.q_slice(self._layout.domains[domain])] = values
         step.q = b"".join(values.tobytes() for values in changed_q.values())
+        self._poses.update(poses)
         if poses:
-            step.transform_domains.extend(poses)
-            step.transforms = b"".join(pose.to_bytes() for pose in poses.values())
-            step.transform_format = steps_pb2.TRANSFORM_FORMAT_QUATERNION_XYZW_F64
-            return step
-        self._add_matrices(step, matrices)
+            _add_poses(step, poses)
+        else:
+            self._add_matrices(step, matrices)
         return step
 
     def complete_step(self, number: int, time: float) -> steps_pb2.Step:
-        """A step with all values, for a server that may have lost some of them."""
+        """A step with all values, for a server that may have lost some of them.
+
+        Transforms of a step have one format. After world poses, the step has the last pose of each domain, and the
+        transforms of domains without a pose remain those of the server.
+        """
         domains = self._layout.domains
         step = steps_pb2.Step(number=number, time=time)
         owners = [domain for domain in domains if self._layout.owns_q[domain.index] and domain.rank > 0]
         step.q_domains.extend(domain.index for domain in owners)
         step.q = b"".join(self._q[self._layout.q_slice(domain)].tobytes() for domain in owners)
+        if self._poses:
+            _add_poses(step, self._poses)
+            return step
         moved = [domain.index for domain in domains if domain.follows is None]
         step.transform_domains.extend(moved)
         step.transforms = self._sent[moved].tobytes()
@@ -164,7 +172,15 @@ class StepValues:
                 matrices[domain.index] = affine(name, transform)
         if poses and (matrices or self._kinematics is not None):
             raise ValueError("transforms: expected world poses only, in a drive with joints=False")
+        if matrices and self._poses:
+            raise ValueError("transforms: expected world poses, as in earlier steps of the drive, got matrices")
         return matrices, poses
+
+
+def _add_poses(step: steps_pb2.Step, poses: Mapping[int, WorldPose]) -> None:
+    step.transform_domains.extend(poses)
+    step.transforms = b"".join(pose.to_bytes() for pose in poses.values())
+    step.transform_format = steps_pb2.TRANSFORM_FORMAT_QUATERNION_XYZW_F64
 
 
 def step_parts(step: steps_pb2.Step) -> Iterator[steps_pb2.Step]:

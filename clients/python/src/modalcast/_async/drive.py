@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from modalcast._async.streams import with_reconnect
 from modalcast._async.transport import StepStream, Transport
 from modalcast._common import Delivery, StepId, delivery_message
-from modalcast.errors import AlreadyExists, ConnectionLost
+from modalcast.errors import ConnectionLost
 from modalcast.kinematics import Kinematics
 from modalcast.states import SceneState, StateLayout
 from modalcast.step_values import Coordinates, StepValues, Transforms, rest_values, step_parts, to_time
@@ -63,6 +63,8 @@ class Drive:
         self._values = StepValues(layout, kinematics, *rest_values(layout))
         self._opened_stream: StepStream | None = None
         self._is_closed = False
+        # Whether values of a step were not sent.
+        self._is_stale = False
         self._next_number = 0
         self._time = -options.dt
         self.run = 0
@@ -116,6 +118,8 @@ class Drive:
         self._check_open()
         new_time = self._time + self._options.dt if time is None else to_time(time)
         message = self._values.step(self._next_number, new_time, q, transforms)
+        if self._is_stale:
+            message = self._values.complete_step(self._next_number, new_time)
         self._time = new_time
         try:
             await self._send(message, timeout)
@@ -224,11 +228,18 @@ class Drive:
 
     async def _send(self, message: steps_pb2.Step, timeout: float) -> None:
         stream = self._stream
+        self._is_stale = True
         await stream.wait_until(lambda: stream.progress.fits(self._options.window), timeout)
         stream.progress.in_flight.append(message.number)
         self._next_number = message.number + 1
-        for part in step_parts(message):
-            await stream.send(part)
+        try:
+            for part in step_parts(message):
+                await stream.send(part, timeout)
+        except BaseException:
+            # No acknowledgment will arrive for this step.
+            stream.progress.discard(message.number)
+            raise
+        self._is_stale = False
 
     async def _open(self, options: DriveOptions) -> None:
         overflow = steps_pb2.OVERFLOW_BLOCK if options.window is None else steps_pb2.OVERFLOW_REJECT
@@ -264,14 +275,9 @@ class Drive:
         if self._reconnect <= 0:
             raise self._stream.progress.end or ConnectionLost(f"{self._transport.address}: no connection")
 
-        async def reopen() -> None:
-            try:
-                await self._open(self._options)
-            except AlreadyExists as error:
-                # The server has not noticed yet that the old connection is lost.
-                raise ConnectionLost(str(error)) from error
-
-        await with_reconnect(self._transport, self._reconnect, reopen)
+        # The token replaces the old stream, but not a writer that has taken over in the meantime.
+        options = replace(self._options, take_over=False)
+        await with_reconnect(self._transport, self._reconnect, lambda: self._open(options))
         await self._send(self._values.complete_step(self._next_number, self._time), self._timeout)
         await self._stream.wait_until(self._is_idle, self._timeout)
 

@@ -80,16 +80,21 @@ class StepStream:
         self._reader = asyncio.create_task(self._read_replies())
         return reply.opened
 
-    async def send(self, step: steps_pb2.Step) -> None:
-        """Sends a part of a step.
+    async def send(self, step: steps_pb2.Step, timeout: float) -> None:
+        """Sends a part of a step. gRPC ends the stream if this is cancelled.
 
         Raises:
+            DeadlineExceeded: The server had no capacity in time, and the stream has ended.
             Error: The stream has ended.
         """
         if self.progress.end is not None:
             raise self.progress.end.with_traceback(None)
         try:
-            await self._call.write(steps_pb2.DriveSceneRequest(step=step))
+            async with asyncio.timeout(timeout):
+                await self._call.write(steps_pb2.DriveSceneRequest(step=step))
+        except TimeoutError:
+            complaint = f"the server had no capacity for a step within {timeout:g} s, and the drive has ended"
+            raise DeadlineExceeded(f"{self._address}: {complaint}") from None
         except (grpc.RpcError, asyncio.InvalidStateError):
             # The reader receives the reason.
             await self.wait_until(lambda: False, 5.0)
@@ -101,6 +106,8 @@ class StepStream:
             DeadlineExceeded: The time has passed; the stream remains open.
             Error: The stream has ended.
         """
+        if self.progress.end is not None:
+            raise self.progress.end.with_traceback(None)
         try:
             async with asyncio.timeout(timeout):
                 while not condition():

@@ -71,12 +71,18 @@ class _RequestQueue:
         self._condition = threading.Condition()
         self._is_closed = False
 
-    def put(self, request: steps_pb2.DriveSceneRequest) -> None:
-        """Adds a request, unless the queue is closed."""
+    def put(self, request: steps_pb2.DriveSceneRequest, timeout: float) -> bool:
+        """Adds a request, unless the queue is closed. Returns whether the queue had capacity in time."""
+
+        def has_capacity() -> bool:
+            return self._is_closed or len(self._requests) < _QUEUED_STEPS
+
         with self._condition:
-            self._condition.wait_for(lambda: self._is_closed or len(self._requests) < _QUEUED_STEPS)
+            if not self._condition.wait_for(has_capacity, timeout):
+                return False
             self._requests.append(request)
             self._condition.notify_all()
+            return True
 
     def close(self) -> None:
         """Ends the requests after those in the queue."""
@@ -120,7 +126,7 @@ class StepStream:
         Raises:
             Error: The server rejects the request, or does not answer in time.
         """
-        self._requests.put(steps_pb2.DriveSceneRequest(open=request))
+        self._requests.put(steps_pb2.DriveSceneRequest(open=request), timeout)
         self._wait(lambda: self._opened is not None, timeout, "the drive did not open")
         reply = self._opened or steps_pb2.DriveSceneResponse()
         if reply.HasField("rejection"):
@@ -129,15 +135,17 @@ class StepStream:
             raise malformed("drive.opened", "`opened` first", "another message")
         return reply.opened
 
-    def send(self, step: steps_pb2.Step) -> None:
+    def send(self, step: steps_pb2.Step, timeout: float) -> None:
         """Sends a part of a step.
 
         Raises:
+            DeadlineExceeded: The server had no capacity in time; the stream remains open.
             Error: The stream has ended.
         """
         if self.progress.end is not None:
             raise self.progress.end.with_traceback(None)
-        self._requests.put(steps_pb2.DriveSceneRequest(step=step))
+        if not self._requests.put(steps_pb2.DriveSceneRequest(step=step), timeout):
+            raise DeadlineExceeded(f"{self._address}: the server had no capacity for a step within {timeout:g} s")
 
     def wait_until(self, condition: Callable[[], bool], timeout: float) -> None:
         """Waits until the progress satisfies a condition.
@@ -146,6 +154,8 @@ class StepStream:
             DeadlineExceeded: The time has passed; the stream remains open.
             Error: The stream has ended.
         """
+        if self.progress.end is not None:
+            raise self.progress.end.with_traceback(None)
         self._wait(condition, timeout, "no acknowledgment of a step")
 
     def finish(self, timeout: float) -> None:
