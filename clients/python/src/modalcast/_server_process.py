@@ -6,6 +6,7 @@ import os
 import shutil
 import signal
 import subprocess
+import sysconfig
 import tempfile
 import weakref
 from collections.abc import Sequence
@@ -71,7 +72,8 @@ class ServerProcess:
 
 def _find_program(program: str | Path | None) -> str:
     name = str(program or os.environ.get("MODALCAST_PROGRAM") or "modalcast")
-    path = shutil.which(name)
+    # A wheel with the programs installs them in the folder of scripts, which need not be in PATH.
+    path = shutil.which(name) or shutil.which(name, path=sysconfig.get_path("scripts"))
     if path is None:
         raise ServerStartError(
             f"found no program '{name}': install the server so that 'modalcast' is in PATH, "
