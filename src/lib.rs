@@ -18,7 +18,7 @@
 //! | `modalcast-model` (`src/model`) | scenes, their file formats, the traits of deformers and rasterizers | |
 //!
 //! Further crates: `proto` (the gRPC contract), `clients/rust` and `clients/dynamics` (they use none of the crates in
-//! the table), and `tests/bench` (all benchmarks, started by `modalcast report`).
+//! the table), and `tests/bench` (all benchmarks, started by `modalcast report`). `clients/python` is a client in Python.
 //!
 //! # Modules
 //! A test (`tests/it/layering.rs`) reads this table. It checks that a module uses only the modules in its row and that

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import SERVER_ARGUMENTS
-from scenes import SIZE, beam_builder
+from scenes import SIZE, beam, beam_builder
 
 import modalcast as mc
 from modalcast._server_process import _find_program
@@ -180,7 +180,7 @@ def send_until_full(drive: mc.Drive) -> int:
     """Sends steps to a stopped server until its connection is full. Returns the number of sent steps."""
     for number in range(100_000):
         try:
-            drive.step(q={"beam": [number, 0, 0]}, wait=False, timeout=0.3)
+            drive.step(q={"beam": np.full(512, number)}, wait=False, timeout=0.3)
         except mc.DeadlineExceeded:
             return number
     pytest.fail("expected a full connection")
@@ -188,7 +188,10 @@ def send_until_full(drive: mc.Drive) -> int:
 
 def test_stopped_server_exceeds_the_deadline(server: RestartableServer):
     with mc.connect(server.address, reconnect=0) as client:
-        scene = client.upload(beam_builder("stopped"))
+        positions, faces, _ = beam()
+        # Steps of 2 KiB fill the connection quickly.
+        builder = mc.SceneBuilder("stopped").add(positions, faces, np.zeros((3 * len(positions), 512)), name="beam")
+        scene = client.upload(builder.add(positions, faces, np.ones((3 * len(positions), 1)), name="copy"))
         drive = scene.drive()
         server.process.send_signal(signal.SIGSTOP)
         try:
@@ -201,8 +204,8 @@ def test_stopped_server_exceeds_the_deadline(server: RestartableServer):
             server.process.send_signal(signal.SIGCONT)
         drive.flush()
         # The values that were not sent are part of the next step.
-        drive.step(q={"copy": [1, 0, 0]})
-        assert scene.state().q.tolist() == [last, 0, 0, 1, 0, 0]
+        drive.step(q={"copy": [1]})
+        assert scene.state().q.tolist() == [last] * 512 + [1]
         drive.close()
 
 
