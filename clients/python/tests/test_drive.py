@@ -196,6 +196,17 @@ def test_branches_move_with_their_parents(tree: mc.Scene):
     tree.reset()
 
 
+def test_rejected_step_of_a_scene_with_joints_changes_nothing(tree: mc.Scene):
+    with tree.drive() as drive:
+        before = tree.vertices()
+        with pytest.raises(mc.InvalidRequest):
+            drive.step(q={"trunk": np.full(tree.domains["trunk"].rank, np.nan)})
+        with pytest.raises(mc.InvalidRequest):
+            drive.step(transforms={"trunk": np.full((3, 4), np.inf)})
+        drive.step(q={"trunk": np.zeros(tree.domains["trunk"].rank)})
+        np.testing.assert_allclose(tree.vertices(), before, atol=1e-5)
+
+
 def test_transform_of_attached_domain_needs_joints_false(tree: mc.Scene):
     attached = next(domain for domain in tree.domains if domain.parent is not None and domain.follows is None)
     with tree.drive() as drive, pytest.raises(ValueError, match="joints=False"):

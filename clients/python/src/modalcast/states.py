@@ -35,7 +35,8 @@ class StateLayout:
         self.root_from_domain: F64 = np.tile(np.eye(4), (len(domains), 1, 1))
         self.coordinate_count = 0
         for domain in domains:
-            for name, other in (("shares_q_with", domain.shares_q_with), ("follows", domain.follows)):
+            others = {"parent": domain.parent, "shares_q_with": domain.shares_q_with, "follows": domain.follows}
+            for name, other in others.items():
                 if other is not None and other >= domain.index:
                     raise malformed(f"domains[{domain.index}].{name}", f"below {domain.index}", str(other))
             owner = domain.shares_q_with

@@ -127,7 +127,9 @@ class StepValues:
         for index, matrix in matrices.items():
             self._roots[index] = square(matrix)
         current = self._sent.copy()
-        if self._kinematics is not None and (step.q_domains or matrices):
+        # The server rejects a step with other numbers than finite ones.
+        is_finite = bool(np.isfinite(self._q).all() and np.isfinite(self._roots).all())
+        if self._kinematics is not None and (step.q_domains or matrices) and is_finite:
             computed = self._kinematics.transforms(self._q.astype(np.float64), self._roots)[:, :3]
             current[self._is_attached] = computed[self._is_attached]
         for index, matrix in matrices.items():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
-from typing import Generic, TypeVar
+from typing import Generic, Self, TypeVar
 
 from modalcast._async.transport import ReplyStream, Transport, sleep
 from modalcast._decoders import ReplyDecoder, parse
@@ -15,7 +15,6 @@ from modalcast.frame import Frame
 from modalcast.v1 import frames_pb2
 
 T = TypeVar("T")
-U = TypeVar("U")
 
 RETRY_SECONDS = 0.1
 """Pause between two attempts to reach a server."""
@@ -112,14 +111,13 @@ class Stream(Generic[T]):
         return self
 
     async def __anext__(self) -> T:
-        while True:
-            reply = None if self._is_closed else await self._next_reply()
-            if reply is None:
-                self.close()
-                raise StopAsyncIteration
-            if self._is_limited:
-                self._remaining -= 1
-            return reply
+        reply = None if self._is_closed else await self._next_reply()
+        if reply is None:
+            self.close()
+            raise StopAsyncIteration
+        if self._is_limited:
+            self._remaining -= 1
+        return reply
 
     async def _next_reply(self) -> T | None:
         try:
@@ -151,7 +149,7 @@ class Stream(Generic[T]):
         if self._stream is not None:
             self._stream.cancel()
 
-    async def __aenter__(self: U) -> U:
+    async def __aenter__(self) -> Self:
         return self
 
     async def __aexit__(self, *_: object) -> None:

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import Generic, TypeVar
+from typing import Generic, Self, TypeVar
 
 from modalcast._decoders import ReplyDecoder, parse
 from modalcast._methods import UPDATE_FRAME_STREAM
@@ -17,7 +17,6 @@ from modalcast.frame import Frame
 from modalcast.v1 import frames_pb2
 
 T = TypeVar("T")
-U = TypeVar("U")
 
 RETRY_SECONDS = 0.1
 """Pause between two attempts to reach a server."""
@@ -114,14 +113,13 @@ class Stream(Generic[T]):
         return self
 
     def __next__(self) -> T:
-        while True:
-            reply = None if self._is_closed else self._next_reply()
-            if reply is None:
-                self.close()
-                raise StopIteration
-            if self._is_limited:
-                self._remaining -= 1
-            return reply
+        reply = None if self._is_closed else self._next_reply()
+        if reply is None:
+            self.close()
+            raise StopIteration
+        if self._is_limited:
+            self._remaining -= 1
+        return reply
 
     def _next_reply(self) -> T | None:
         try:
@@ -153,7 +151,7 @@ class Stream(Generic[T]):
         if self._stream is not None:
             self._stream.cancel()
 
-    def __enter__(self: U) -> U:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
