@@ -66,6 +66,9 @@ impl std::fmt::Display for ListenAddress {
 pub struct Config {
     /// The addresses to listen on, at least one. The default is loopback.
     pub listen: Vec<ListenAddress>,
+    /// The path of a Unix socket for clients of the same user on this machine, which can send steps and receive
+    /// vertices and frames in shared memory. `None` turns shared memory off.
+    pub shared_memory: Option<PathBuf>,
     /// The folder of scenes that clients may open. `None` allows only the built-in scenes.
     pub scenes: Option<PathBuf>,
     /// The folder for uploads, the list of open scenes and their last steps. Only one server at a time can use it.
@@ -136,6 +139,7 @@ impl Default for Config {
     fn default() -> Self {
         Self {
             listen: vec![ListenAddress::Tcp((Ipv4Addr::LOCALHOST, 50051).into())],
+            shared_memory: None,
             scenes: None,
             state: default_state(),
             backend: BackendChoice::Auto,

@@ -47,6 +47,47 @@ pub struct StageTime {
     #[prost(float, tag = "2")]
     pub milliseconds: f32,
 }
+/// Data in shared memory, in place of the field `data` of a chunk, or of `q` or `transforms` of a step. Only for a client
+/// on the server's machine, on request.
+///
+/// The server offers shared memory if it has FEATURE_SHARED_MEMORY. Its operator sets the path of a Unix socket for this
+/// purpose (`modalcast serve --shared-memory PATH`), to which only processes of the server's user can connect. All
+/// numbers on that socket are little-endian.
+///
+/// 1. The client connects to the socket. The server sends 32 bytes: u32 version of this handshake, 1; u32 size of a
+///    slot in bytes; u32 number of slots; u32 zero; 16 bytes of a random token. With them it sends the file
+///    descriptors (SCM_RIGHTS) of two memfds, the first for replies and the second for steps. Both are sealed against
+///    changes of the size (F_SEAL_GROW and F_SEAL_SHRINK), and the first against writes by others
+///    (F_SEAL_FUTURE_WRITE). If the server has as many such connections as it allows, it closes the connection
+///    instead.
+/// 1. The client maps the first memfd read-only and shared, and the second one, if it sends steps, writable and
+///    shared. Each has the same number of slots, and slot n begins at n times the size of a slot.
+/// 1. The client starts a call with the token as the metadata `modalcast-shared-memory-bin`, which is 16 binary bytes;
+///    gRPC encodes them. A token of no open connection is rejected with REASON_INVALID_FIELD.
+/// 1. Replies: the server puts data of 64 KiB or more into a free slot, and sends the chunk with `shared`. The client
+///    copies or uses the data, and then returns the slot: it sends the number of the slot as u32 on the socket. The
+///    server does not write to a slot between these messages.
+/// 1. Steps (DriveScene): the client puts values into a free slot of the second memfd, and sends the step with
+///    `shared_q` or `shared_transforms`. The server copies the values when it receives the message, and then returns
+///    the slot: it sends the number of the slot as u32 on the socket. It validates the copy. Values in shared memory
+///    count for Limits.message_bytes as those of a message do.
+///    Without a free slot for a reply, the server waits for one, as it waits for a client that does not read. So a client
+///    returns the slots of a message before it waits for the next one, and uses one connection per call. The slots of
+///    messages that a client does not read, for example after it has cancelled the call, are not returned, and it closes
+///    the connection. It can use the connection for another call after a call that has ended with OK and whose slots were
+///    all returned.
+///
+/// A slot that the client returns without having received it ends the connection. When the connection has ended, the
+/// server sends further data of its calls in `data`, and frees the memory when these calls have ended.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct SharedRange {
+    /// Index of the slot.
+    #[prost(uint32, tag = "1")]
+    pub slot: u32,
+    /// Number of bytes from the beginning of the slot.
+    #[prost(uint32, tag = "2")]
+    pub bytes: u32,
+}
 /// Which steps a stream carries. A stream must name one of them, because each costs something: a slow reader of every
 /// step slows down the simulation, and a stream of the latest steps skips some.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
@@ -1860,6 +1901,11 @@ pub struct Step {
     /// rejected, the other parts of the step are ignored.
     #[prost(bool, tag = "8")]
     pub has_more: bool,
+    /// `q` and `transforms` of this message, if they are in shared memory. The field itself is then empty.
+    #[prost(message, optional, tag = "9")]
+    pub shared_q: ::core::option::Option<SharedRange>,
+    #[prost(message, optional, tag = "10")]
+    pub shared_transforms: ::core::option::Option<SharedRange>,
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct DriveSceneResponse {
@@ -2578,6 +2624,9 @@ pub struct FrameChunk {
     /// At most 1 MiB.
     #[prost(bytes = "bytes", tag = "3")]
     pub data: ::prost::bytes::Bytes,
+    /// The data, if they are in shared memory. `data` is then empty.
+    #[prost(message, optional, tag = "4")]
+    pub shared: ::core::option::Option<SharedRange>,
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct FrameHead {
@@ -3664,6 +3713,9 @@ pub struct VertexChunk {
     /// At most 1 MiB.
     #[prost(bytes = "bytes", tag = "3")]
     pub data: ::prost::bytes::Bytes,
+    /// The data, if they are in shared memory. `data` is then empty.
+    #[prost(message, optional, tag = "4")]
+    pub shared: ::core::option::Option<SharedRange>,
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct VertexHead {
@@ -5365,6 +5417,9 @@ pub enum Feature {
     UploadReuse = 3,
     /// UploadArrays accepts scenes without files.
     UploadArrays = 4,
+    /// VertexService and FrameService send data in shared memory to clients on the same machine, and StepService receives
+    /// steps in it, see SharedRange.
+    SharedMemory = 5,
 }
 impl Feature {
     /// String value of the enum field names used in the ProtoBuf definition.
@@ -5378,6 +5433,7 @@ impl Feature {
             Self::ContentHashes => "FEATURE_CONTENT_HASHES",
             Self::UploadReuse => "FEATURE_UPLOAD_REUSE",
             Self::UploadArrays => "FEATURE_UPLOAD_ARRAYS",
+            Self::SharedMemory => "FEATURE_SHARED_MEMORY",
         }
     }
     /// Creates an enum from field names used in the ProtoBuf definition.
@@ -5388,6 +5444,7 @@ impl Feature {
             "FEATURE_CONTENT_HASHES" => Some(Self::ContentHashes),
             "FEATURE_UPLOAD_REUSE" => Some(Self::UploadReuse),
             "FEATURE_UPLOAD_ARRAYS" => Some(Self::UploadArrays),
+            "FEATURE_SHARED_MEMORY" => Some(Self::SharedMemory),
             _ => None,
         }
     }

@@ -24,6 +24,10 @@ pub(super) struct Args {
     /// can connect to. The option can be repeated. Each address is printed as 'listening on URL'.
     #[arg(long, env = "MODALCAST_LISTEN", value_delimiter = ',', default_values_t = Config::default().listen)]
     listen: Vec<ListenAddress>,
+    /// Path of a Unix socket at which programs of this user ask for shared memory, in which they send steps and receive
+    /// vertices and frames. Default: off.
+    #[arg(long, env = "MODALCAST_SHARED_MEMORY", value_name = "PATH")]
+    shared_memory: Option<PathBuf>,
     /// Folder of scenes that clients may open. Files outside it are never read.
     #[arg(long, env = "MODALCAST_SCENES")]
     scenes: Option<PathBuf>,
@@ -90,6 +94,7 @@ impl Args {
         let defaults = Config::default();
         Config {
             listen: self.listen.clone(),
+            shared_memory: self.shared_memory.clone(),
             scenes: self.scenes.clone(),
             state: self.state.clone().unwrap_or(defaults.state),
             backend: self.backend,

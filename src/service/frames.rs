@@ -15,6 +15,7 @@ use super::convert::{
 };
 use super::picks;
 use super::reply_body::without_copies;
+use super::shared_memory::{CallMemory, SharedMemory};
 use super::status::to_status;
 use super::stream::{Deadline, ReplySender, ReplyStream, chunks_with_head, respond};
 use crate::engine::{
@@ -24,7 +25,10 @@ use crate::engine::{
 use modalcast_model::error::fault;
 
 /// Implementation of `FrameService`.
-pub(super) struct FrameServiceImpl(pub(super) Engine);
+pub(super) struct FrameServiceImpl {
+    pub(super) engine: Engine,
+    pub(super) shared_memory: SharedMemory,
+}
 
 #[tonic::async_trait]
 impl v1::frame_service_server::FrameService for FrameServiceImpl {
@@ -34,13 +38,14 @@ impl v1::frame_service_server::FrameService for FrameServiceImpl {
         &self,
         request: Request<v1::RenderFrameRequest>,
     ) -> Result<Response<Self::RenderFrameStream>, Status> {
-        let config = self.0.config();
+        let config = self.engine.config();
         let deadline = Deadline::of_request(request.metadata(), request.get_ref().deadline_ms, config);
+        let memory = self.shared_memory.find(request.metadata()).map_err(to_status)?;
         let request = request.into_inner();
-        let scene_handle = self.0.find(&request.scene).map_err(to_status)?;
-        let pictures = parse_pictures(&self.0, &scene_handle.scene, request.pictures).map_err(to_status)?;
+        let scene_handle = self.engine.find(&request.scene).map_err(to_status)?;
+        let pictures = parse_pictures(&self.engine, &scene_handle.scene, request.pictures).map_err(to_status)?;
         let selector = parse_step_selector(request.step);
-        let (max_chunk_bytes, encoder) = (config.chunk_bytes, self.0.encoder().clone());
+        let (max_chunk_bytes, encoder) = (config.chunk_bytes, self.engine.encoder().clone());
         Ok(without_copies(respond(move |reply_sender| async move {
             let work = async {
                 let output = scene_handle.request_output(selector, output_spec(&pictures)).await.map_err(to_status)?;
@@ -50,7 +55,8 @@ impl v1::frame_service_server::FrameService for FrameServiceImpl {
                     step_pictures.map(|(step, picture)| EncodingTask::start(&encoder, step, picture.format)).collect();
                 for (task, picture) in tasks.iter_mut().zip(&pictures) {
                     let frame = task.finish().await.map_err(to_status)?;
-                    for chunk in frame_chunks(&frame, picture, max_chunk_bytes) {
+                    for mut chunk in frame_chunks(&frame, picture, max_chunk_bytes) {
+                        chunk.shared = memory.share(&mut chunk.data).await;
                         reply_sender.send(v1::RenderFrameResponse { part: Some(SinglePart::Chunk(chunk)) }).await?;
                     }
                 }
@@ -63,9 +69,9 @@ impl v1::frame_service_server::FrameService for FrameServiceImpl {
     type PickStream = ReplyStream<v1::PickResponse>;
 
     async fn pick(&self, request: Request<v1::PickRequest>) -> Result<Response<Self::PickStream>, Status> {
-        let config = self.0.config();
+        let config = self.engine.config();
         let deadline = Deadline::of_request(request.metadata(), request.get_ref().deadline_ms, config);
-        picks::respond_to_pick(&self.0, deadline, request.into_inner())
+        picks::respond_to_pick(&self.engine, deadline, request.into_inner())
     }
 
     async fn update_frame_stream(
@@ -74,7 +80,8 @@ impl v1::frame_service_server::FrameService for FrameServiceImpl {
     ) -> Result<Response<v1::UpdateFrameStreamResponse>, Status> {
         let v1::UpdateFrameStreamRequest { stream, cameras } = request.into_inner();
         let id = StreamId::parse("stream", &stream).map_err(to_status)?;
-        let FrameStreamEntry { scene, cameras: camera_control } = &*self.0.find_frame_stream(id).map_err(to_status)?;
+        let FrameStreamEntry { scene, cameras: camera_control } =
+            &*self.engine.find_frame_stream(id).map_err(to_status)?;
         let moved_cameras = parse_moved_cameras(scene, &camera_control.pictures(), cameras).map_err(to_status)?;
         let camera_version = camera_control.move_cameras(&moved_cameras);
         Ok(Response::new(v1::UpdateFrameStreamResponse { camera_version }))
@@ -87,23 +94,25 @@ impl v1::frame_service_server::FrameService for FrameServiceImpl {
         request: Request<v1::StreamFramesRequest>,
     ) -> Result<Response<Self::StreamFramesStream>, Status> {
         let deadline = Deadline::of_stream(request.metadata());
+        let memory = self.shared_memory.find(request.metadata()).map_err(to_status)?;
         let request = request.into_inner();
-        let scene_handle = self.0.find(&request.scene).map_err(to_status)?;
-        let pictures = parse_pictures(&self.0, &scene_handle.scene, request.pictures).map_err(to_status)?;
+        let scene_handle = self.engine.find(&request.scene).map_err(to_status)?;
+        let pictures = parse_pictures(&self.engine, &scene_handle.scene, request.pictures).map_err(to_status)?;
         let delivery = parse_stream_delivery(request.delivery, request.max_hz).map_err(to_status)?;
         // Subscribe before the response headers are sent, so that a client can rely on receiving the next step.
         let subscription = scene_handle.subscribe(output_spec(&pictures), delivery).await.map_err(to_status)?;
         let cameras = subscription.cameras().cloned().ok_or_else(|| to_status(fault("frames", "expected cameras")))?;
         let entry = FrameStreamEntry { scene: Arc::clone(&scene_handle.scene), cameras };
-        let registration = self.0.register_frame_stream(entry).map_err(to_status)?;
+        let registration = self.engine.register_frame_stream(entry).map_err(to_status)?;
         let formats = pictures.iter().map(|picture| picture.format).collect();
-        let frames = EncodedSubscription::new(subscription, self.0.encoder().clone(), formats, request.steps);
+        let frames = EncodedSubscription::new(subscription, self.engine.encoder().clone(), formats, request.steps);
         let frame_stream = FrameStream {
             registration,
             pictures,
             delivery,
             max_steps: request.steps,
-            max_chunk_bytes: self.0.config().chunk_bytes,
+            memory,
+            max_chunk_bytes: self.engine.config().chunk_bytes,
         };
         Ok(without_copies(respond(move |reply_sender| {
             deadline.enforce("the frame stream", frame_stream.run(frames, reply_sender))
@@ -119,6 +128,7 @@ struct FrameStream {
     delivery: StreamDelivery,
     /// Number of steps to send. 0 means no limit.
     max_steps: u64,
+    memory: CallMemory,
     max_chunk_bytes: usize,
 }
 
@@ -140,9 +150,13 @@ impl FrameStream {
             let Some(frame) = frame else { return Ok(()) };
             // The encoder numbers the frames by the same list of pictures.
             let Some(picture) = self.pictures.get(frame.picture as usize) else { continue };
-            for chunk in frame_chunks(&frame, picture, self.max_chunk_bytes) {
+            for mut chunk in frame_chunks(&frame, picture, self.max_chunk_bytes) {
+                let send = async {
+                    chunk.shared = self.memory.share(&mut chunk.data).await;
+                    reply_sender.send(to_response(StreamPart::Chunk(chunk))).await
+                };
                 tokio::select! {
-                    sent = reply_sender.send(to_response(StreamPart::Chunk(chunk))) => sent?,
+                    sent = send => sent?,
                     error = frames.disconnected() => return Err(to_status(error)),
                 }
             }
@@ -186,5 +200,6 @@ fn frame_chunks(
         head,
         offset,
         data,
+        shared: None,
     })
 }

@@ -44,7 +44,7 @@ impl v1::server_service_server::ServerService for ServerServiceImpl {
             software: is_software,
             limits: Some(limits),
             protocol_version: v1::PROTOCOL_VERSION,
-            features: list_features(info).into_iter().map(Into::into).collect(),
+            features: list_features(info, config.shared_memory.is_some()).into_iter().map(Into::into).collect(),
         }))
     }
 }
@@ -53,11 +53,14 @@ fn to_ms(duration: Duration) -> u32 {
     u32::try_from(duration.as_millis()).unwrap_or(u32::MAX)
 }
 
-/// The features of a server with these devices.
-fn list_features(info: &EngineInfo) -> Vec<v1::Feature> {
+/// The features of a server with these devices, with or without shared memory.
+fn list_features(info: &EngineInfo, has_shared_memory: bool) -> Vec<v1::Feature> {
     let mut features = vec![v1::Feature::ContentHashes, v1::Feature::UploadReuse, v1::Feature::UploadArrays];
     if info.renderer.is_ok() {
         features.push(v1::Feature::Frames);
+    }
+    if has_shared_memory {
+        features.push(v1::Feature::SharedMemory);
     }
     features
 }
@@ -70,7 +73,7 @@ mod tests {
     use modalcast_render::RendererInfo;
 
     #[test]
-    fn only_a_server_with_a_renderer_has_frames() {
+    fn frames_and_shared_memory_are_optional() {
         let renderer = RendererInfo {
             renderer: "test".into(),
             version: "4.6".into(),
@@ -80,7 +83,9 @@ mod tests {
         };
         let info = |renderer| EngineInfo { backend: Backend::Cpu, device: "none".into(), renderer };
         let always = [v1::Feature::ContentHashes, v1::Feature::UploadReuse, v1::Feature::UploadArrays];
-        assert_eq!(list_features(&info(Err(fault("renderer", "none")))), always);
-        assert_eq!(list_features(&info(Ok(renderer))), [&always[..], &[v1::Feature::Frames]].concat());
+        assert_eq!(list_features(&info(Err(fault("renderer", "none"))), false), always);
+        assert_eq!(list_features(&info(Ok(renderer.clone())), false), [&always[..], &[v1::Feature::Frames]].concat());
+        let features = list_features(&info(Ok(renderer)), true);
+        assert_eq!(features[always.len()..], [v1::Feature::Frames, v1::Feature::SharedMemory]);
     }
 }

@@ -10,13 +10,15 @@ use std::task::{Context, Poll};
 use tokio::io::{AsyncRead, AsyncReadExt as _, AsyncWrite};
 use tokio::net::{TcpListener, TcpStream, UnixListener, UnixStream};
 
-use crate::config::ListenAddress;
+use crate::config::{Config, ListenAddress};
 use modalcast_model::error::{Error, Result};
 
 /// Bound sockets. Dropping it removes the files of the Unix sockets.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub struct Listener {
     pub(super) sockets: ListeningSockets,
+    /// The socket for shared memory, if it is on.
+    pub(super) shared_memory: Option<UnixListener>,
     /// The files of the Unix sockets.
     pub(super) files: Vec<SocketFile>,
     urls: Vec<String>,
@@ -42,21 +44,34 @@ pub(super) enum Socket {
 }
 
 impl Listener {
-    /// Binds all addresses. Replaces the socket file of a server that no longer runs.
+    /// Binds all sockets of a configuration. Replaces the socket file of a server that no longer runs.
     ///
     /// # Errors
     /// `Unavailable` when an address is in use, does not belong to this machine, or cannot be created.
-    pub(super) async fn bind(addresses: &[ListenAddress]) -> Result<Self> {
-        let sockets = ListeningSockets::default();
-        let mut listener = Self { sockets, files: Vec::new(), urls: Vec::new(), remote_addresses: Vec::new() };
-        for address in addresses {
+    pub(super) async fn bind(config: &Config) -> Result<Self> {
+        let mut listener = Self::default();
+        for address in &config.listen {
             listener.add(address).await.map_err(|error| Error::Unavailable {
                 what: "listening address",
                 reason: format!("{address}: {error}"),
                 remedy: "Set another address with --listen".into(),
             })?;
         }
+        if let Some(path) = &config.shared_memory {
+            listener.add_shared_memory(path).map_err(|error| Error::Unavailable {
+                what: "socket for shared memory",
+                reason: format!("{}: {error}", path.display()),
+                remedy: "Set another path with --shared-memory".into(),
+            })?;
+        }
         Ok(listener)
+    }
+
+    fn add_shared_memory(&mut self, path: &Path) -> io::Result<()> {
+        let (socket, file) = SocketFile::bind(path)?;
+        self.shared_memory = Some(socket);
+        self.files.push(file);
+        Ok(())
     }
 
     async fn add(&mut self, address: &ListenAddress) -> io::Result<()> {
@@ -220,17 +235,17 @@ mod tests {
     async fn stale_socket_is_replaced_and_other_files_are_kept() {
         let folder = tempfile::tempdir().expect("expected a temporary folder");
         let path = folder.path().join("socket");
-        let address = [ListenAddress::Unix(path.clone())];
+        let config = Config { listen: vec![ListenAddress::Unix(path.clone())], ..Config::default() };
         // A standard library listener leaves its file, as a killed server does.
         drop(std::os::unix::net::UnixListener::bind(&path).expect("expected a socket"));
-        let listener = Listener::bind(&address).await.expect("expected the stale socket to be replaced");
+        let listener = Listener::bind(&config).await.expect("expected the stale socket to be replaced");
         assert_eq!(std::fs::metadata(&path).expect("expected a file").permissions().mode() & 0o777, 0o600);
-        let error = Listener::bind(&address).await.expect_err("expected a socket in use").to_string();
+        let error = Listener::bind(&config).await.expect_err("expected a socket in use").to_string();
         assert!(error.contains("another server"), "{error}");
         drop(listener);
         assert_eq!(std::fs::read_dir(folder.path()).expect("expected a folder").count(), 0);
         std::fs::write(&path, "text").expect("expected a writable folder");
-        assert!(Listener::bind(&address).await.is_err());
+        assert!(Listener::bind(&config).await.is_err());
         assert_eq!(std::fs::read_to_string(&path).expect("expected the file"), "text");
     }
 
@@ -239,9 +254,10 @@ mod tests {
     async fn only_the_own_socket_file_is_removed() {
         let folder = tempfile::tempdir().expect("expected a temporary folder");
         let path = folder.path().join("socket");
-        let first = Listener::bind(&[ListenAddress::Unix(path.clone())]).await.expect("expected a socket");
+        let config = Config { listen: vec![ListenAddress::Unix(path.clone())], ..Config::default() };
+        let first = Listener::bind(&config).await.expect("expected a socket");
         std::fs::remove_file(&path).expect("expected the file");
-        let _second = Listener::bind(&[ListenAddress::Unix(path.clone())]).await.expect("expected a socket");
+        let _second = Listener::bind(&config).await.expect("expected a socket");
         drop(first);
         assert!(path.exists());
     }

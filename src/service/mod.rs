@@ -16,6 +16,7 @@ mod reply_budget;
 mod request_body;
 mod routes;
 mod scenes;
+mod shared_memory;
 mod states;
 mod status;
 mod step_parts;
@@ -34,6 +35,7 @@ pub use self::listen::Listener;
 
 use self::connection::STREAMS_PER_CONNECTION_WINDOW;
 use self::routes::Routes;
+use self::shared_memory::SharedMemory;
 use crate::config::Config;
 use crate::engine::Engine;
 use modalcast_model::error::{Result, fault_in};
@@ -50,7 +52,7 @@ const MAX_CALLS: usize = 128;
 /// # Errors
 /// `Unavailable` when an address is in use or does not belong to this machine.
 pub async fn bind(config: &Config) -> Result<Listener> {
-    Listener::bind(&config.listen).await
+    Listener::bind(config).await
 }
 
 /// Serves until `shutdown` completes. Then answers health checks with `NOT_SERVING`, ends every stream and returns
@@ -67,9 +69,11 @@ pub async fn serve(
     let config = engine.config().clone();
     let (health_reporter, health_server) = tonic_health::server::health_reporter();
     set_health(&health_reporter, true).await;
-    let routes = routes(&engine, &config)?.with(health_server);
+    let shared_memory = SharedMemory::default();
+    let routes = routes(&engine, &config, &shared_memory)?.with(health_server);
     // The files are removed when this function returns.
-    let Listener { sockets, files: _files, .. } = listener;
+    let Listener { sockets, shared_memory: shared_memory_socket, files: _files, .. } = listener;
+    let _shared_memory_server = shared_memory_socket.map(|socket| shared_memory.serve(socket));
     let connections = accept::accept_connections(sockets, &config);
     let (stop_sender, stop_receiver) = oneshot::channel();
     let stop_engine = async move {
@@ -145,7 +149,7 @@ fn transport(config: &Config) -> Server {
         .http2_keepalive_timeout(Some(config.keepalive_timeout))
 }
 
-fn routes(engine: &Engine, config: &Config) -> Result<Routes> {
+fn routes(engine: &Engine, config: &Config, shared_memory: &SharedMemory) -> Result<Routes> {
     use v1::force_service_server::ForceServiceServer;
     use v1::frame_service_server::FrameServiceServer;
     use v1::scene_service_server::SceneServiceServer;
@@ -164,14 +168,17 @@ fn routes(engine: &Engine, config: &Config) -> Result<Routes> {
             .register_encoded_file_descriptor_set(v1::DESCRIPTORS)
             .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
     };
+    let frame_service = frames::FrameServiceImpl { engine: engine.clone(), shared_memory: shared_memory.clone() };
+    let vertex_service = vertices::VertexServiceImpl { engine: engine.clone(), shared_memory: shared_memory.clone() };
+    let step_service = steps::StepServiceImpl { engine: engine.clone(), shared_memory: shared_memory.clone() };
     Ok(Routes::new(config.message_bytes)
         .with(reflection().build_v1().map_err(fault_in("reflection"))?)
         .with(reflection().build_v1alpha().map_err(fault_in("reflection"))?)
         .with(with_limits!(ServerServiceServer::new(info::ServerServiceImpl(engine.clone()))))
         .with(with_limits!(SceneServiceServer::new(scenes::SceneServiceImpl(engine.clone()))))
-        .with(with_limits!(StepServiceServer::new(steps::StepServiceImpl(engine.clone()))))
-        .with(with_limits!(FrameServiceServer::new(frames::FrameServiceImpl(engine.clone()))))
-        .with(with_limits!(VertexServiceServer::new(vertices::VertexServiceImpl(engine.clone()))))
+        .with(with_limits!(StepServiceServer::new(step_service)))
+        .with(with_limits!(FrameServiceServer::new(frame_service)))
+        .with(with_limits!(VertexServiceServer::new(vertex_service)))
         .with(with_limits!(StateServiceServer::new(states::StateServiceImpl(engine.clone()))))
         .with(with_limits!(ForceServiceServer::new(forces::ForceServiceImpl(engine.clone())))))
 }

@@ -34,12 +34,12 @@ const BUFFER_CAPACITY: usize = 8 << 10;
 /// Size of the prefix of a message: a flag (0: not compressed) and the length of the message as u32.
 const PREFIX_BYTES: usize = 5;
 
-/// Key of the field `data` of a chunk: field 3 with a length. It is the last field of every chunk.
+/// Key of the field `data` of a chunk: field 3 with a length. It is the last field of every chunk with large data.
 const DATA_KEY: u8 = 3 << 3 | 2;
 
 /// A reply that may have a chunk. The chunk is then its only field.
 pub(super) trait ChunkReply: Message {
-    /// The field `data` of the chunk, which is the last field of the chunk and has the number 3.
+    /// The field `data` of the chunk. It has the number 3, and is the last field of the chunk if it is not empty.
     fn chunk_data(&mut self) -> Option<&mut Bytes>;
 }
 
@@ -239,7 +239,7 @@ mod tests {
     fn chunk(data: Bytes) -> v1::StreamVerticesResponse {
         let step = Some(v1::StepId { run: 1, number: 300, time: 0.5 });
         let head = Some(v1::VertexHead { step, total: 1 << 40, skipped: 7, ..Default::default() });
-        let chunk = v1::VertexChunk { head, offset: 1 << 33, data };
+        let chunk = v1::VertexChunk { head, offset: 1 << 33, data, shared: None };
         v1::StreamVerticesResponse { part: Some(v1::stream_vertices_response::Part::Chunk(chunk)) }
     }
 
@@ -291,8 +291,9 @@ mod tests {
             assert_eq!((frames.len(), frames.concat()), (2, encoded(&reply)), "{}", std::any::type_name::<T>());
         }
         let data = Bytes::from(vec![5; MIN_DATA_FRAME]);
-        let vertices = v1::VertexChunk { head: None, offset: 9, data: data.clone() };
-        let frame = v1::FrameChunk { head: Some(v1::FrameHead::default()), offset: 0, data: data.clone() };
+        let vertices = v1::VertexChunk { head: None, offset: 9, data: data.clone(), shared: None };
+        let frame =
+            v1::FrameChunk { offset: 0, data: data.clone(), head: Some(v1::FrameHead::default()), shared: None };
         let state = v1::StateChunk { head: Some(v1::StateHead::default()), offset: 1 << 20, data };
         let part = v1::get_vertices_response::Part::Chunk(vertices);
         assert_encoding(v1::GetVerticesResponse { part: Some(part) }).await;

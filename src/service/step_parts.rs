@@ -6,6 +6,7 @@ use prost::Message as _;
 use tokio::time::Instant;
 
 use super::receive_budget::{MessageLimits, ReceivedMemory};
+use super::shared_memory::CallMemory;
 use modalcast_model::error::{Error, Result, invalid};
 
 /// The parts of the step that is being received.
@@ -14,6 +15,8 @@ pub(super) struct StepAssembler {
     /// Memory of the received parts.
     memory: ReceivedMemory,
     limits: MessageLimits,
+    /// Has the values of parts that are not in their messages.
+    shared_memory: CallMemory,
 }
 
 enum State {
@@ -38,16 +41,20 @@ struct PartialStep {
 }
 
 impl StepAssembler {
-    pub(super) const fn new(memory: ReceivedMemory, limits: MessageLimits) -> Self {
-        Self { state: State::Empty, memory, limits }
+    pub(super) const fn new(memory: ReceivedMemory, limits: MessageLimits, shared_memory: CallMemory) -> Self {
+        Self { state: State::Empty, memory, limits, shared_memory }
     }
 
     /// Adds a message. Returns the step when it is complete. A step of one message is not copied.
     ///
     /// # Errors
-    /// `Invalid` for a part of another step or a step that is too large; `LimitReached` or `Busy` when the parts exceed a
-    /// budget. The parts of the step are dropped.
-    pub(super) fn push(&mut self, part: v1::Step) -> Result<Option<v1::Step>> {
+    /// `Invalid` for a part of another step, a step that is too large or a wrong range of shared memory; `LimitReached`
+    /// or `Busy` when the parts exceed a budget. The parts of the step are dropped.
+    pub(super) fn push(&mut self, mut part: v1::Step) -> Result<Option<v1::Step>> {
+        // The values in shared memory count like those of several messages.
+        let is_one_message = !part.has_more && part.shared_q.is_none() && part.shared_transforms.is_none();
+        // Also for a part that is ignored below, because the client waits for its slots.
+        let received = self.shared_memory.receive(&mut part);
         if let State::Discarding { number } = self.state {
             if number == part.number {
                 if !part.has_more {
@@ -57,11 +64,11 @@ impl StepAssembler {
             }
             self.state = State::Empty;
         }
-        if matches!(self.state, State::Empty) && !part.has_more {
+        let (number, has_more) = (part.number, part.has_more);
+        if is_one_message && matches!(self.state, State::Empty) {
             return Ok(Some(part));
         }
-        let (number, has_more) = (part.number, part.has_more);
-        match self.append(part) {
+        match received.and_then(|()| self.append(part)) {
             Ok(()) if has_more => Ok(None),
             Ok(()) => Ok(self.finish()),
             Err(error) => {
@@ -141,7 +148,21 @@ mod tests {
 
     fn assembler(config: &Config) -> StepAssembler {
         let connection = ReceiveBudget::new(config).new_connection();
-        StepAssembler::new(connection.new_memory(), connection.limits())
+        StepAssembler::new(connection.new_memory(), connection.limits(), CallMemory::default())
+    }
+
+    /// A part whose values are in shared memory that the call does not have.
+    #[test]
+    fn step_with_a_wrong_range_is_rejected_once() {
+        let mut assembler = assembler(&Config::default());
+        let wrong =
+            |number, has_more| v1::Step { shared_q: Some(v1::SharedRange::default()), ..part(number, 0, has_more) };
+        assert!(assembler.push(wrong(1, false)).is_err());
+        assert!(matches!(assembler.push(part(2, 0, true)), Ok(None)));
+        assert!(assembler.push(wrong(2, true)).is_err());
+        assert!(matches!(assembler.push(wrong(2, true)), Ok(None)));
+        assert!(matches!(assembler.push(part(2, 0, false)), Ok(None)), "expected the rest of the step to be ignored");
+        assert!(matches!(assembler.push(part(3, 0, false)), Ok(Some(_))));
     }
 
     /// A part with two transforms.

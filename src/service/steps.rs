@@ -12,6 +12,7 @@ use tonic::{Request, Response, Status, Streaming};
 
 use super::connection::ConnectionInfo;
 use super::convert::{parse_lease_request, parse_step, wire_opened, wire_stages};
+use super::shared_memory::SharedMemory;
 use super::status::{to_rejection, to_status, transport_status};
 use super::step_parts::StepAssembler;
 use super::stream::{Deadline, ReplySender, ReplyStream, respond};
@@ -26,7 +27,10 @@ const MAX_PENDING_REPLIES: usize = 256;
 const MAX_PENDING_ACKS: usize = 64;
 
 /// Implementation of `StepService`.
-pub(super) struct StepServiceImpl(pub(super) Engine);
+pub(super) struct StepServiceImpl {
+    pub(super) engine: Engine,
+    pub(super) shared_memory: SharedMemory,
+}
 
 #[tonic::async_trait]
 impl v1::step_service_server::StepService for StepServiceImpl {
@@ -40,10 +44,11 @@ impl v1::step_service_server::StepService for StepServiceImpl {
         let connection = connection.ok_or_else(|| to_status(fault("connection", "expected its address, got none")))?;
         let drive_permit = connection.acquire_drive().map_err(to_status)?;
         let deadline = Deadline::of_stream(request.metadata());
+        let memory = self.shared_memory.find(request.metadata()).map_err(to_status)?;
         let session = DriveSession {
-            engine: self.0.clone(),
+            engine: self.engine.clone(),
             peer: connection.peer(),
-            parts: StepAssembler::new(connection.receive.new_memory(), connection.receive.limits()),
+            parts: StepAssembler::new(connection.receive.new_memory(), connection.receive.limits(), memory),
             _drive_permit: drive_permit,
             inbound: request.into_inner(),
             writer: None,

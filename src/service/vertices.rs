@@ -14,6 +14,7 @@ use super::convert::{
     wire_sections, wire_stages, wire_step_id,
 };
 use super::reply_body::without_copies;
+use super::shared_memory::{CallMemory, SharedMemory};
 use super::status::to_status;
 use super::stream::{Deadline, ReplySender, ReplyStream, respond, split_into_chunks};
 use crate::engine::{Engine, OutputSpec, PackedVertices, Subscription, VertexPacker, VertexSelection};
@@ -22,7 +23,10 @@ use crate::engine::{Engine, OutputSpec, PackedVertices, Subscription, VertexPack
 const LAYOUT_PART_DOMAINS: usize = 65_536;
 
 /// Implementation of `VertexService`.
-pub(super) struct VertexServiceImpl(pub(super) Engine);
+pub(super) struct VertexServiceImpl {
+    pub(super) engine: Engine,
+    pub(super) shared_memory: SharedMemory,
+}
 
 #[tonic::async_trait]
 impl v1::vertex_service_server::VertexService for VertexServiceImpl {
@@ -32,13 +36,14 @@ impl v1::vertex_service_server::VertexService for VertexServiceImpl {
         &self,
         request: Request<v1::GetVerticesRequest>,
     ) -> Result<Response<Self::GetVerticesStream>, Status> {
-        let config = self.0.config();
+        let config = self.engine.config();
         let deadline = Deadline::of_request(request.metadata(), request.get_ref().deadline_ms, config);
+        let memory = self.shared_memory.find(request.metadata()).map_err(to_status)?;
         let request = request.into_inner();
-        let scene_handle = self.0.find(&request.scene).map_err(to_status)?;
+        let scene_handle = self.engine.find(&request.scene).map_err(to_status)?;
         let selection = parse_vertex_selection(&scene_handle.scene, request.selection).map_err(to_status)?;
         let selector = parse_step_selector(request.step);
-        let (packer, max_chunk_bytes) = (self.0.vertex_packer().clone(), config.chunk_bytes);
+        let (packer, max_chunk_bytes) = (self.engine.vertex_packer().clone(), config.chunk_bytes);
         let to_response = |part| v1::GetVerticesResponse { part: Some(part) };
         Ok(without_copies(respond(move |reply_sender| async move {
             let work = async {
@@ -48,7 +53,8 @@ impl v1::vertex_service_server::VertexService for VertexServiceImpl {
                 for layout in layout_parts(&selection) {
                     reply_sender.send(to_response(SinglePart::Layout(layout))).await?;
                 }
-                for chunk in vertex_chunks(&vertices, max_chunk_bytes) {
+                for mut chunk in vertex_chunks(&vertices, max_chunk_bytes) {
+                    chunk.shared = memory.share(&mut chunk.data).await;
                     reply_sender.send(to_response(SinglePart::Chunk(chunk))).await?;
                 }
                 Ok(())
@@ -64,8 +70,9 @@ impl v1::vertex_service_server::VertexService for VertexServiceImpl {
         request: Request<v1::StreamVerticesRequest>,
     ) -> Result<Response<Self::StreamVerticesStream>, Status> {
         let deadline = Deadline::of_stream(request.metadata());
+        let memory = self.shared_memory.find(request.metadata()).map_err(to_status)?;
         let request = request.into_inner();
-        let scene_handle = self.0.find(&request.scene).map_err(to_status)?;
+        let scene_handle = self.engine.find(&request.scene).map_err(to_status)?;
         let selection = parse_vertex_selection(&scene_handle.scene, request.selection).map_err(to_status)?;
         let delivery = parse_stream_delivery(request.delivery, request.max_hz).map_err(to_status)?;
         let spec = OutputSpec::Vertices(selection.vertex_attributes());
@@ -73,8 +80,9 @@ impl v1::vertex_service_server::VertexService for VertexServiceImpl {
         let subscription = scene_handle.subscribe(spec, delivery).await.map_err(to_status)?;
         let vertex_stream = VertexStream {
             selection,
-            packer: self.0.vertex_packer().clone(),
-            max_chunk_bytes: self.0.config().chunk_bytes,
+            packer: self.engine.vertex_packer().clone(),
+            memory,
+            max_chunk_bytes: self.engine.config().chunk_bytes,
             max_steps: request.steps,
         };
         Ok(without_copies(respond(move |reply_sender| {
@@ -87,6 +95,7 @@ impl v1::vertex_service_server::VertexService for VertexServiceImpl {
 struct VertexStream {
     selection: Arc<VertexSelection>,
     packer: VertexPacker,
+    memory: CallMemory,
     max_chunk_bytes: usize,
     /// Number of steps to send. 0 means no limit.
     max_steps: u64,
@@ -116,9 +125,13 @@ impl VertexStream {
                 () = reply_sender.closed() => return Ok(()),
             };
             let vertices = self.packer.pack(output, &self.selection, known_origins).await.map_err(to_status)?;
-            for chunk in vertex_chunks(&vertices, self.max_chunk_bytes) {
+            for mut chunk in vertex_chunks(&vertices, self.max_chunk_bytes) {
+                let send = async {
+                    chunk.shared = self.memory.share(&mut chunk.data).await;
+                    reply_sender.send(to_response(StreamPart::Chunk(chunk))).await
+                };
                 tokio::select! {
-                    sent = reply_sender.send(to_response(StreamPart::Chunk(chunk))) => sent?,
+                    sent = send => sent?,
                     error = subscription.disconnected() => return Err(to_status(error)),
                 }
             }
@@ -158,7 +171,12 @@ fn vertex_chunks(packed: &PackedVertices, max_chunk_bytes: usize) -> impl Iterat
     parts.into_iter().flat_map(move |part| {
         let part_bytes = part.len() as u64;
         let chunks: Vec<v1::VertexChunk> = split_into_chunks(part, max_chunk_bytes)
-            .map(|(offset, data)| v1::VertexChunk { head: head.take(), offset: part_offset + offset, data })
+            .map(|(offset, data)| v1::VertexChunk {
+                head: head.take(),
+                offset: part_offset + offset,
+                data,
+                shared: None,
+            })
             .collect();
         part_offset += part_bytes;
         chunks

@@ -36,6 +36,8 @@ mod service;
 mod service_faults;
 mod service_files;
 mod service_harness;
+mod shared_memory;
+mod shared_memory_faults;
 mod states;
 mod steps;
 mod storages;

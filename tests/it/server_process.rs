@@ -26,15 +26,20 @@ use crate::message_streams::{MessageSizes, StreamKind, message_sizes};
 use crate::service_harness::with_timeout;
 
 /// A server in a process of its own, which is killed when it is dropped.
-struct ServerProcess {
+pub(crate) struct ServerProcess {
     process: Child,
-    address: String,
+    pub(crate) address: String,
 }
 
 impl ServerProcess {
     /// Starts a server that deforms and draws on the CPU, and waits until it listens. `folder` has its state and its
     /// scenes.
     fn start(folder: &Path) -> Self {
+        Self::start_with(folder, &[])
+    }
+
+    /// As [`Self::start`], with further options.
+    pub(crate) fn start_with(folder: &Path, options: &[&str]) -> Self {
         let scenes = folder.join("scenes");
         std::fs::create_dir_all(&scenes).expect("expected a folder");
         let mut process = Command::new(env!("CARGO_BIN_EXE_modalcast"))
@@ -42,6 +47,7 @@ impl ServerProcess {
             .arg(folder.join("state"))
             .arg("--scenes")
             .arg(scenes)
+            .args(options)
             .stdout(Stdio::piped())
             .stderr(Stdio::null())
             .spawn()
@@ -57,12 +63,23 @@ impl ServerProcess {
         endpoint.connect().await.expect("expected a connection")
     }
 
-    async fn client(&self) -> Client {
+    pub(crate) async fn client(&self) -> Client {
         Client::connect(&self.address).await.expect("expected a connection")
     }
 
+    /// The number of mappings of a file whose path begins with `name`.
+    pub(crate) fn mappings(&self, name: &str) -> usize {
+        let maps = std::fs::read_to_string(format!("/proc/{}/maps", self.process.id())).expect("expected a process");
+        maps.lines().filter(|line| line.contains(name)).count()
+    }
+
+    /// The number of open files and sockets.
+    pub(crate) fn open_files(&self) -> usize {
+        std::fs::read_dir(format!("/proc/{}/fd", self.process.id())).expect("expected a process").count()
+    }
+
     /// The resident memory of the process in bytes.
-    fn resident_bytes(&self) -> u64 {
+    pub(crate) fn resident_bytes(&self) -> u64 {
         let status =
             std::fs::read_to_string(format!("/proc/{}/status", self.process.id())).expect("expected a process");
         let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:")).expect("expected its memory");
@@ -101,7 +118,7 @@ const DOMAINS: usize = 2000;
 
 /// A grid of 100 x 100 vertices with 16 modes, a triangle with 512 modes and many triangles without modes: vertices,
 /// states and forces are large enough that unbounded buffers would be seen.
-fn crowded_upload() -> ArrayUpload {
+pub(crate) fn crowded_upload() -> ArrayUpload {
     const SIDE: u32 = 100;
     let positions = (0..SIDE * SIDE).map(|index| [(index % SIDE) as f32, (index / SIDE) as f32, 0.0]).collect();
     let cells = (0..(SIDE - 1) * (SIDE - 1)).map(|cell| cell % (SIDE - 1) + cell / (SIDE - 1) * SIDE);
@@ -127,7 +144,7 @@ fn step_offset(number: u64) -> f32 {
 }
 
 /// A step that moves every domain of [`crowded_upload`]: about 100 KB.
-fn crowded_step(number: u64) -> Step {
+pub(crate) fn crowded_step(number: u64) -> Step {
     let transform = [1.0, 0.0, 0.0, step_offset(number), 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0];
     (0..DOMAINS as u32).fold(Step::new(number, 0.0), |step, domain| step.transform(domain, &transform))
 }
@@ -148,7 +165,7 @@ fn plate_step(number: u64) -> Step {
     Step::new(number, 0.0).transform(0, &transform)
 }
 
-async fn drive(client: &Client, scene: &str) -> StepStream {
+pub(crate) async fn drive(client: &Client, scene: &str) -> StepStream {
     let request = DriveRequest::new(scene, Delivery::Lossless).take_over();
     with_timeout(client.drive(&request)).await.expect("expected the writer lease")
 }

@@ -300,9 +300,19 @@ pub(crate) struct StepWriter {
 
 impl StepWriter {
     pub(crate) async fn connect(channel: Channel) -> Self {
+        Self::connect_with(channel, tonic::Request::new).await
+    }
+
+    /// As [`Self::connect`], with metadata that `to_request` adds.
+    pub(crate) async fn connect_with(
+        channel: Channel,
+        to_request: impl FnOnce(
+            ReceiverStream<v1::DriveSceneRequest>,
+        ) -> tonic::Request<ReceiverStream<v1::DriveSceneRequest>>,
+    ) -> Self {
         let (sender, requests) = mpsc::channel(1024);
         let mut client = StepServiceClient::new(channel);
-        let replies = with_timeout(client.drive_scene(ReceiverStream::new(requests)))
+        let replies = with_timeout(client.drive_scene(to_request(ReceiverStream::new(requests))))
             .await
             .expect("expected a stream")
             .into_inner();

@@ -11,6 +11,7 @@ use prost::Message;
 
 use crate::error::{Error, Result, malformed_reply};
 use crate::message_stream::MessageStream;
+use crate::shared_memory::CallMemory;
 
 // Numbers are little-endian on the wire and are copied without conversion.
 const _: () = assert!(cfg!(target_endian = "little"), "the client supports little-endian hosts only");
@@ -74,7 +75,8 @@ pub(crate) trait WireChunk: Sized {
     type Reply;
     /// Name of the reply in errors.
     const NAME: &'static str;
-    fn into_chunk(self) -> Chunk<Self::Head>;
+    /// `memory` has the data of a chunk in shared memory.
+    fn into_chunk(self, memory: &CallMemory) -> Result<Chunk<Self::Head>>;
     fn decode_reply(head: Self::Head, bytes: Bytes) -> Result<Self::Reply>;
 }
 
@@ -198,6 +200,9 @@ pub(crate) trait ReplyDecoder<M> {
 
     /// Whether a reply has begun and not ended.
     fn is_open(&self) -> bool;
+
+    /// The stream has ended with OK, and a complete reply was the last one.
+    fn end(&mut self) {}
 }
 
 /// Turns a server stream of messages `M` into a stream of complete replies. An error ends the stream.
@@ -222,6 +227,7 @@ impl<M: Message + Default, D: ReplyDecoder<M>> DecodedReplies<M, D> {
                 }
                 None => {
                     self.has_ended = true;
+                    self.decoder.end();
                     return Poll::Ready(None);
                 }
             };
@@ -237,6 +243,16 @@ impl<M: Message + Default, D: ReplyDecoder<M>> DecodedReplies<M, D> {
     pub(crate) async fn next(&mut self) -> Option<Result<D::Reply>> {
         poll_fn(|context| self.poll(context)).await
     }
+
+    /// The only reply of a call. `awaited_reply` names it in errors.
+    pub(crate) async fn single(mut self, awaited_reply: &'static str) -> Result<D::Reply> {
+        let reply = self.next().await.unwrap_or(Err(Error::StreamEnded { awaited_reply }))?;
+        match self.next().await {
+            None => Ok(reply),
+            Some(Err(error)) => Err(error),
+            Some(Ok(_)) => Err(malformed_reply("reply", "one reply", "another one")),
+        }
+    }
 }
 
 /// Decodes messages that contain one chunk `C` each.
@@ -244,12 +260,13 @@ pub(crate) struct ChunkDecoder<M, C: WireChunk> {
     /// Extracts the chunk of a message.
     chunk_of: fn(M) -> Option<C>,
     assembler: Assembler<C::Head>,
+    memory: CallMemory,
 }
 
 impl<M, C: WireChunk> ChunkDecoder<M, C> {
     /// A decoder of replies of at most `limit` bytes.
-    pub(crate) const fn new(chunk_of: fn(M) -> Option<C>, limit: u64) -> Self {
-        Self { chunk_of, assembler: Assembler::new(C::NAME, limit) }
+    pub(crate) const fn new(chunk_of: fn(M) -> Option<C>, limit: u64, memory: CallMemory) -> Self {
+        Self { chunk_of, assembler: Assembler::new(C::NAME, limit), memory }
     }
 }
 
@@ -259,7 +276,7 @@ impl<M, C: WireChunk> ReplyDecoder<M> for ChunkDecoder<M, C> {
     fn add_message(&mut self, message: M) -> Result<Option<C::Reply>> {
         let missing_chunk = || malformed_reply(format!("{}.chunk", C::NAME), "a chunk", "none");
         let chunk = (self.chunk_of)(message).ok_or_else(missing_chunk)?;
-        match self.assembler.push(chunk.into_chunk())? {
+        match self.assembler.push(chunk.into_chunk(&self.memory)?)? {
             Some((head, bytes)) => C::decode_reply(head, bytes).map(Some),
             None => Ok(None),
         }
@@ -267,6 +284,10 @@ impl<M, C: WireChunk> ReplyDecoder<M> for ChunkDecoder<M, C> {
 
     fn is_open(&self) -> bool {
         self.assembler.is_open()
+    }
+
+    fn end(&mut self) {
+        self.memory.release();
     }
 }
 

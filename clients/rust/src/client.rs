@@ -1,6 +1,7 @@
 //! The connection to a server. Unary calls return values, and streaming calls return handles of streams. Clones of a
 //! `Client` share the connection.
 
+use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -13,6 +14,7 @@ use crate::assemble::Replies;
 use crate::error::{Error, Result, describe_causes, malformed_reply};
 use crate::message_stream::{MessageStream, UndecodedChannel};
 use crate::request::Delivery;
+use crate::shared_memory::{CallMemory, SharedMemory};
 
 /// The default limit of one reply that is assembled from chunks, in bytes.
 pub const REPLY_LIMIT: u64 = 1 << 30;
@@ -47,6 +49,7 @@ pub struct Client {
     /// A connection with larger windows, which opens with its first stream.
     lossless_channel: Channel,
     pub(crate) max_reply_bytes: u64,
+    shared_memory: Option<Arc<SharedMemory>>,
     /// The URL of the server, as the caller passed it, for errors.
     url: Arc<str>,
 }
@@ -109,6 +112,7 @@ impl Client {
             channel: with_window(STREAM_WINDOW).connect().await.map_err(connect_error)?,
             lossless_channel: with_window(LOSSLESS_STREAM_WINDOW).connect_lazy(),
             max_reply_bytes: REPLY_LIMIT,
+            shared_memory: None,
             url: url.into(),
         };
         let no_answer = |_| Error::Connect { url: url.to_owned(), reason: "the server does not answer calls".into() };
@@ -141,6 +145,16 @@ impl Client {
     pub fn with_reply_limit(mut self, bytes: u64) -> Self {
         self.max_reply_bytes = bytes;
         self
+    }
+
+    /// Sends steps and receives vertices and frames in shared memory. The server runs on this machine as the same user, and `path` is the
+    /// Unix socket of its option `--shared-memory`. The calls themselves use the same connection as before.
+    ///
+    /// # Errors
+    /// `Connect` if the server does not offer shared memory at this path.
+    pub async fn with_shared_memory(mut self, path: impl AsRef<Path>) -> Result<Self> {
+        self.shared_memory = Some(SharedMemory::connect(path.as_ref()).await?);
+        Ok(self)
     }
 
     /// Gets features, backend, renderer and limits of the server.
@@ -192,6 +206,14 @@ impl Client {
     async fn get_server_info(&self) -> Result<v1::GetServerInfoResponse> {
         let mut service = v1::server_service_client::ServerServiceClient::new(self.channel.clone());
         self.reply(service.get_server_info(v1::GetServerInfoRequest {}).await)
+    }
+
+    /// The shared memory of a new call, if this client uses it.
+    pub(crate) async fn call_memory(&self) -> Result<CallMemory> {
+        match &self.shared_memory {
+            Some(shared_memory) => shared_memory.acquire().await,
+            None => Ok(CallMemory::default()),
+        }
     }
 
     /// The connection for calls with a stream of replies, see [`Self::replies`].

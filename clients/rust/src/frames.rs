@@ -13,6 +13,7 @@ use crate::assemble::{Chunk, ChunkDecoder, DecodedReplies, WireChunk};
 use crate::client::Client;
 use crate::error::{Error, Result, malformed_reply};
 use crate::request::{StepRequest, Subscription};
+use crate::shared_memory::CallMemory;
 use crate::stages::{self, StageTimes};
 
 /// A request for one frame.
@@ -233,8 +234,10 @@ impl Client {
             step: request.step.to_wire(),
             deadline_ms: request.deadline_ms,
         };
-        let messages = self.replies(FrameServiceClient::new(self.undecoded_channel()).render_frame(wire).await)?;
-        let mut replies = DecodedReplies::new(messages, ChunkDecoder::new(single_chunk, self.max_reply_bytes));
+        let memory = self.call_memory().await?;
+        let reply = FrameServiceClient::new(self.undecoded_channel()).render_frame(memory.request(wire)).await;
+        let decoder = ChunkDecoder::new(single_chunk, self.max_reply_bytes, memory);
+        let mut replies = DecodedReplies::new(self.replies(reply)?, decoder);
         let mut frames = Vec::new();
         while let Some(frame) = replies.next().await {
             frames.push(frame?);
@@ -261,12 +264,14 @@ impl Client {
             max_hz: request.max_hz,
         };
         let channel = self.channel_for(request.delivery);
-        let mut messages = self.replies(FrameServiceClient::new(channel).stream_frames(wire).await)?;
+        let memory = self.call_memory().await?;
+        let reply = FrameServiceClient::new(channel).stream_frames(memory.request(wire)).await;
+        let mut messages = self.replies(reply)?;
         let settings = match messages.next().await?.and_then(|message| message.part) {
             Some(StreamPart::Settings(settings)) => settings,
             part => return Err(malformed_reply("frame.part", "the settings of the stream", format!("{part:?}"))),
         };
-        let frames = DecodedReplies::new(messages, ChunkDecoder::new(stream_chunk, self.max_reply_bytes));
+        let frames = DecodedReplies::new(messages, ChunkDecoder::new(stream_chunk, self.max_reply_bytes, memory));
         Ok(FrameStream { settings, frames })
     }
 
@@ -333,8 +338,14 @@ impl WireChunk for v1::FrameChunk {
     type Reply = Frame;
     const NAME: &'static str = "frame";
 
-    fn into_chunk(self) -> Chunk<Self::Head> {
-        Chunk::new(self.head, |head| head.total, self.offset, self.data)
+    fn into_chunk(self, memory: &CallMemory) -> Result<Chunk<Self::Head>> {
+        let is_shared = self.shared.is_some();
+        let mut data = memory.data(self.data, self.shared)?;
+        // The data of a frame in one chunk become the frame, which the caller may hold for any time.
+        if is_shared && self.head.as_ref().is_some_and(|head| head.total == data.len() as u64) {
+            data = Bytes::copy_from_slice(&data);
+        }
+        Ok(Chunk::new(self.head, |head| head.total, self.offset, data))
     }
 
     fn decode_reply(head: Self::Head, bytes: Bytes) -> Result<Frame> {

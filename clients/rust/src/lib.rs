@@ -16,6 +16,7 @@ mod pick;
 pub mod program;
 mod request;
 mod scene;
+mod shared_memory;
 mod stages;
 mod states;
 mod step;

@@ -263,7 +263,7 @@ mod tests {
     }
 
     fn chunk(offset: u64, data: &[u8]) -> v1::VertexChunk {
-        v1::VertexChunk { head: None, offset, data: Bytes::copy_from_slice(data) }
+        v1::VertexChunk { head: None, offset, data: Bytes::copy_from_slice(data), shared: None }
     }
 
     /// All messages up to the end or the first error.

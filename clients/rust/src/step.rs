@@ -148,6 +148,8 @@ impl Step {
             transforms: self.transforms.clone().freeze(),
             transform_format: self.format.into(),
             has_more: false,
+            shared_q: None,
+            shared_transforms: None,
         }
     }
 }

@@ -17,6 +17,7 @@ use crate::assemble::Replies;
 use crate::client::Client;
 use crate::error::{Error, Rejection, Result, malformed_reply};
 use crate::request::Delivery;
+use crate::shared_memory::StepMemory;
 use crate::stages::{self, StageTimes};
 use crate::step::Step;
 
@@ -147,6 +148,8 @@ pub struct StepStream {
     progress_changes: watch::Receiver<()>,
     reader: tokio::task::JoinHandle<()>,
     sent: u64,
+    /// The memory for large values, if this client uses shared memory.
+    memory: Option<StepMemory>,
 }
 
 impl Client {
@@ -163,7 +166,8 @@ impl Client {
             .await
             .map_err(|_| Error::StreamEnded { awaited_reply: "the reply to the open request" })?;
         let mut service = v1::step_service_client::StepServiceClient::new(self.undecoded_channel());
-        let mut replies = self.replies(service.drive_scene(ReceiverStream::new(queue)).await)?;
+        let memory = self.call_memory().await?;
+        let mut replies = self.replies(service.drive_scene(memory.request(ReceiverStream::new(queue))).await)?;
         let opened = match replies.next().await?.and_then(|reply| reply.kind) {
             Some(ResponseKind::Opened(opened)) => opened,
             Some(ResponseKind::Rejection(rejection)) => return Err(Error::Rejected(Box::new(rejection.into()))),
@@ -185,6 +189,7 @@ impl Client {
             progress_changes,
             reader,
             sent: 0,
+            memory: memory.into_step_memory(),
         })
     }
 }
@@ -200,7 +205,14 @@ impl StepStream {
         step.check_formats()?;
         self.wait_until(|progress, window| window.is_none_or(|window| progress.in_flight.len() < window)).await?;
         lock(&self.progress).in_flight.push_back(step.number());
-        for part in step.to_wire_parts() {
+        for mut part in step.to_wire_parts() {
+            if let Some(memory) = &mut self.memory {
+                let end = wait_until(&self.progress, &mut self.progress_changes, |_| false);
+                tokio::select! {
+                    () = memory.share(&mut part) => {}
+                    end = end => end?,
+                }
+            }
             let message = v1::DriveSceneRequest { kind: Some(RequestKind::Step(part)) };
             let requests =
                 self.requests.as_ref().ok_or(Error::StreamEnded { awaited_reply: "the reply to this step" })?;
@@ -272,23 +284,33 @@ impl StepStream {
 
     /// Waits until `condition` holds for the progress and the window. Fails if the stream has ended.
     async fn wait_until(&mut self, condition: impl Fn(&Progress, Option<usize>) -> bool) -> Result<()> {
-        loop {
-            // Mark the last change as seen before `progress` is read, so that a later change ends the wait below.
-            self.progress_changes.borrow_and_update();
-            {
-                let progress = lock(&self.progress);
-                if let Some(end) = &progress.end {
-                    return Err(end
-                        .clone()
-                        .unwrap_or(Error::StreamEnded { awaited_reply: "the acknowledgment of a step" }));
-                }
-                if condition(&progress, self.window) {
-                    return Ok(());
-                }
+        let window = self.window;
+        wait_until(&self.progress, &mut self.progress_changes, |progress| condition(progress, window)).await
+    }
+}
+
+/// Waits until `condition` holds for the progress. Fails if the stream has ended.
+async fn wait_until(
+    progress: &Mutex<Progress>,
+    changes: &mut watch::Receiver<()>,
+    condition: impl Fn(&Progress) -> bool,
+) -> Result<()> {
+    loop {
+        // Mark the last change as seen before `progress` is read, so that a later change ends the wait below.
+        changes.borrow_and_update();
+        {
+            let progress = lock(progress);
+            if let Some(end) = &progress.end {
+                return Err(end
+                    .clone()
+                    .unwrap_or(Error::StreamEnded { awaited_reply: "the acknowledgment of a step" }));
             }
-            if self.progress_changes.changed().await.is_err() && lock(&self.progress).end.is_none() {
-                return Err(Error::StreamEnded { awaited_reply: "the acknowledgment of a step" });
+            if condition(&progress) {
+                return Ok(());
             }
+        }
+        if changes.changed().await.is_err() && lock(progress).end.is_none() {
+            return Err(Error::StreamEnded { awaited_reply: "the acknowledgment of a step" });
         }
     }
 }

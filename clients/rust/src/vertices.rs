@@ -13,8 +13,9 @@ use v1::vertex_service_client::VertexServiceClient;
 
 use crate::assemble::{Chunk, ChunkSequence, DecodedReplies, ReplyDecoder};
 use crate::client::Client;
-use crate::error::{Error, Result, malformed_reply};
+use crate::error::{Result, malformed_reply};
 use crate::request::{StepRequest, Subscription};
+use crate::shared_memory::CallMemory;
 use crate::stages::{self, StageTimes};
 use crate::vertex_sections::{SectionWriter, VertexArrays, VertexSetDomain};
 
@@ -127,9 +128,10 @@ impl Client {
             step: request.step.to_wire(),
             deadline_ms: request.deadline_ms,
         };
-        let messages = self.replies(VertexServiceClient::new(self.undecoded_channel()).get_vertices(wire).await)?;
-        let set = DecodedReplies::new(messages, VertexDecoder::new(single_part, self.max_reply_bytes)).next().await;
-        set.unwrap_or(Err(Error::StreamEnded { awaited_reply: "the vertices of the step" }))
+        let memory = self.call_memory().await?;
+        let reply = VertexServiceClient::new(self.undecoded_channel()).get_vertices(memory.request(wire)).await;
+        let decoder = VertexDecoder::new(single_part, self.max_reply_bytes, memory);
+        DecodedReplies::new(self.replies(reply)?, decoder).single("the vertices of the step").await
     }
 
     /// Subscribes to vertices. When this returns, the server has accepted the subscription.
@@ -146,12 +148,14 @@ impl Client {
             max_hz: request.max_hz,
         };
         let channel = self.channel_for(request.delivery);
-        let mut messages = self.replies(VertexServiceClient::new(channel).stream_vertices(wire).await)?;
+        let memory = self.call_memory().await?;
+        let reply = VertexServiceClient::new(channel).stream_vertices(memory.request(wire)).await;
+        let mut messages = self.replies(reply)?;
         let settings = match messages.next().await?.and_then(|message| message.part) {
             Some(v1::stream_vertices_response::Part::Settings(settings)) => settings,
             part => return Err(malformed_reply("vertices.part", "the settings of the stream", format!("{part:?}"))),
         };
-        let sets = DecodedReplies::new(messages, VertexDecoder::new(stream_part, self.max_reply_bytes));
+        let sets = DecodedReplies::new(messages, VertexDecoder::new(stream_part, self.max_reply_bytes, memory));
         Ok(VertexStream { settings, sets })
     }
 }
@@ -215,10 +219,11 @@ struct VertexDecoder<M> {
     chunks: ChunkSequence<v1::VertexHead>,
     /// The sections of the open set.
     sections: Option<SectionWriter>,
+    memory: CallMemory,
 }
 
 impl<M> VertexDecoder<M> {
-    fn new(part_of: fn(M) -> Option<Part>, max_reply_bytes: u64) -> Self {
+    fn new(part_of: fn(M) -> Option<Part>, max_reply_bytes: u64, memory: CallMemory) -> Self {
         Self {
             part_of,
             layout: Layout::Incomplete(Vec::new()),
@@ -226,6 +231,7 @@ impl<M> VertexDecoder<M> {
             origins: None,
             chunks: ChunkSequence::new("vertices", max_reply_bytes),
             sections: None,
+            memory,
         }
     }
 
@@ -234,7 +240,8 @@ impl<M> VertexDecoder<M> {
         let Layout::Complete(domains) = &self.layout else {
             return Err(malformed_reply("vertices.layout", "a complete layout before the first step", "none"));
         };
-        let chunk = Chunk::new(chunk.head, |head| head.total, chunk.offset, chunk.data);
+        let data = self.memory.data(chunk.data, chunk.shared)?;
+        let chunk = Chunk::new(chunk.head, |head| head.total, chunk.offset, data);
         let sections = &mut self.sections;
         let data = self.chunks.add(chunk, |reply| {
             *sections = Some(SectionWriter::new(&reply.head, domains)?);
@@ -267,6 +274,10 @@ impl<M> ReplyDecoder<M> for VertexDecoder<M> {
 
     fn is_open(&self) -> bool {
         self.chunks.is_open()
+    }
+
+    fn end(&mut self) {
+        self.memory.release();
     }
 }
 
@@ -344,9 +355,9 @@ mod tests {
         domains: &Arc<[VertexSetDomain]>,
         last_origins: Option<Arc<[[f64; 3]]>>,
     ) -> Result<VertexSet> {
-        let mut decoder = VertexDecoder::new(|chunk| Some(Part::Chunk(chunk)), 1 << 20);
+        let mut decoder = VertexDecoder::new(|chunk| Some(Part::Chunk(chunk)), 1 << 20, CallMemory::default());
         (decoder.layout, decoder.origins) = (Layout::Complete(Arc::clone(domains)), last_origins);
-        let chunk = v1::VertexChunk { head: Some(head), offset: 0, data: Bytes::copy_from_slice(bytes) };
+        let chunk = v1::VertexChunk { head: Some(head), offset: 0, data: Bytes::copy_from_slice(bytes), shared: None };
         decoder.add_message(chunk).map(|set| set.expect("expected a complete set"))
     }
 
@@ -386,12 +397,13 @@ mod tests {
 
     #[test]
     fn chunks_of_a_set_arrive_one_after_the_other() {
-        let mut decoder = VertexDecoder::new(|chunk| Some(Part::Chunk(chunk)), 1 << 20);
+        let mut decoder = VertexDecoder::new(|chunk| Some(Part::Chunk(chunk)), 1 << 20, CallMemory::default());
         let bytes = [float_bytes(1, 3), vec![0; 24]].concat();
         let chunk = |head, range: std::ops::Range<usize>| v1::VertexChunk {
             head,
             offset: range.start as u64,
             data: Bytes::copy_from_slice(&bytes[range]),
+            shared: None,
         };
         let (head, empty_head) = (head(&[POSITIONS, ORIGIN]), head(&[]));
         let error = decoder.add_message(chunk(Some(head.clone()), 0..5)).expect_err("a chunk without a layout");

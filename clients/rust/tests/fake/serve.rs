@@ -447,7 +447,7 @@ impl FakeService {
             total: bytes.len() as u64,
             ..Default::default()
         });
-        let chunk = |ByteChunk { offset, data, .. }| v1::VertexChunk { head: head.take(), offset, data };
+        let chunk = |ByteChunk { offset, data, .. }| v1::VertexChunk { head: head.take(), offset, data, shared: None };
         split_bytes(bytes).into_iter().map(chunk).collect()
     }
 }
@@ -486,7 +486,7 @@ fn encode_frame(output: &StepOutput, picture: &v1::Picture, index: u32) -> Vec<v
         }),
         below_ground: 0.25,
     });
-    let chunk = |ByteChunk { offset, data, .. }| v1::FrameChunk { head: head.take(), offset, data };
+    let chunk = |ByteChunk { offset, data, .. }| v1::FrameChunk { head: head.take(), offset, data, shared: None };
     split_bytes(bytes).into_iter().map(chunk).collect()
 }
 

@@ -24,19 +24,21 @@ _sym_db = _symbol_database.Default()
 
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x19modalcast/v1/common.proto\x12\x0cmodalcast.v1\"3\n\x06StepId\x12\x0b\n\x03run\x18\x01 \x01(\x04\x12\x0e\n\x06number\x18\x02 \x01(\x04\x12\x0c\n\x04time\x18\x03 \x01(\x01\"I\n\x0cStepSelector\x12\x0b\n\x03run\x18\x01 \x01(\x04\x12\x0f\n\x05\x65xact\x18\x02 \x01(\x04H\x00\x12\x11\n\x07minimum\x18\x03 \x01(\x04H\x00\x42\x08\n\x06number\"0\n\tStageTime\x12\r\n\x05stage\x18\x01 \x01(\t\x12\x14\n\x0cmilliseconds\x18\x02 \x01(\x02*P\n\x08\x44\x65livery\x12\x18\n\x14\x44\x45LIVERY_UNSPECIFIED\x10\x00\x12\x15\n\x11\x44\x45LIVERY_LOSSLESS\x10\x01\x12\x13\n\x0f\x44\x45LIVERY_LATEST\x10\x02\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x19modalcast/v1/common.proto\x12\x0cmodalcast.v1\"3\n\x06StepId\x12\x0b\n\x03run\x18\x01 \x01(\x04\x12\x0e\n\x06number\x18\x02 \x01(\x04\x12\x0c\n\x04time\x18\x03 \x01(\x01\"I\n\x0cStepSelector\x12\x0b\n\x03run\x18\x01 \x01(\x04\x12\x0f\n\x05\x65xact\x18\x02 \x01(\x04H\x00\x12\x11\n\x07minimum\x18\x03 \x01(\x04H\x00\x42\x08\n\x06number\"0\n\tStageTime\x12\r\n\x05stage\x18\x01 \x01(\t\x12\x14\n\x0cmilliseconds\x18\x02 \x01(\x02\"*\n\x0bSharedRange\x12\x0c\n\x04slot\x18\x01 \x01(\r\x12\r\n\x05\x62ytes\x18\x02 \x01(\r*P\n\x08\x44\x65livery\x12\x18\n\x14\x44\x45LIVERY_UNSPECIFIED\x10\x00\x12\x15\n\x11\x44\x45LIVERY_LOSSLESS\x10\x01\x12\x13\n\x0f\x44\x45LIVERY_LATEST\x10\x02\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'modalcast.v1.common_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_DELIVERY']._serialized_start=221
-  _globals['_DELIVERY']._serialized_end=301
+  _globals['_DELIVERY']._serialized_start=265
+  _globals['_DELIVERY']._serialized_end=345
   _globals['_STEPID']._serialized_start=43
   _globals['_STEPID']._serialized_end=94
   _globals['_STEPSELECTOR']._serialized_start=96
   _globals['_STEPSELECTOR']._serialized_end=169
   _globals['_STAGETIME']._serialized_start=171
   _globals['_STAGETIME']._serialized_end=219
+  _globals['_SHAREDRANGE']._serialized_start=221
+  _globals['_SHAREDRANGE']._serialized_end=263
 # @@protoc_insertion_point(module_scope)

@@ -41,3 +41,11 @@ class StageTime(_message.Message):
     stage: str
     milliseconds: float
     def __init__(self, stage: _Optional[str] = ..., milliseconds: _Optional[float] = ...) -> None: ...
+
+class SharedRange(_message.Message):
+    __slots__ = ("slot", "bytes")
+    SLOT_FIELD_NUMBER: _ClassVar[int]
+    BYTES_FIELD_NUMBER: _ClassVar[int]
+    slot: int
+    bytes: int
+    def __init__(self, slot: _Optional[int] = ..., bytes: _Optional[int] = ...) -> None: ...

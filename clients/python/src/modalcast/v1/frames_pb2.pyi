@@ -229,14 +229,16 @@ class UpdateFrameStreamResponse(_message.Message):
     def __init__(self, camera_version: _Optional[int] = ...) -> None: ...
 
 class FrameChunk(_message.Message):
-    __slots__ = ("head", "offset", "data")
+    __slots__ = ("head", "offset", "data", "shared")
     HEAD_FIELD_NUMBER: _ClassVar[int]
     OFFSET_FIELD_NUMBER: _ClassVar[int]
     DATA_FIELD_NUMBER: _ClassVar[int]
+    SHARED_FIELD_NUMBER: _ClassVar[int]
     head: FrameHead
     offset: int
     data: bytes
-    def __init__(self, head: _Optional[_Union[FrameHead, _Mapping]] = ..., offset: _Optional[int] = ..., data: _Optional[bytes] = ...) -> None: ...
+    shared: _common_pb2.SharedRange
+    def __init__(self, head: _Optional[_Union[FrameHead, _Mapping]] = ..., offset: _Optional[int] = ..., data: _Optional[bytes] = ..., shared: _Optional[_Union[_common_pb2.SharedRange, _Mapping]] = ...) -> None: ...
 
 class FrameHead(_message.Message):
     __slots__ = ("step", "width", "height", "format", "total", "skipped", "stages", "shadow_drawn_by", "visibility_drawn_by", "picture", "camera_version", "look", "below_ground")

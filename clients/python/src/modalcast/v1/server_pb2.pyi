@@ -14,11 +14,13 @@ class Feature(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     FEATURE_CONTENT_HASHES: _ClassVar[Feature]
     FEATURE_UPLOAD_REUSE: _ClassVar[Feature]
     FEATURE_UPLOAD_ARRAYS: _ClassVar[Feature]
+    FEATURE_SHARED_MEMORY: _ClassVar[Feature]
 FEATURE_UNSPECIFIED: Feature
 FEATURE_FRAMES: Feature
 FEATURE_CONTENT_HASHES: Feature
 FEATURE_UPLOAD_REUSE: Feature
 FEATURE_UPLOAD_ARRAYS: Feature
+FEATURE_SHARED_MEMORY: Feature
 
 class GetServerInfoRequest(_message.Message):
     __slots__ = ()

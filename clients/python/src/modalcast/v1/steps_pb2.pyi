@@ -66,7 +66,7 @@ class OpenDrive(_message.Message):
     def __init__(self, scene: _Optional[str] = ..., delivery: _Optional[_Union[_common_pb2.Delivery, str]] = ..., overflow: _Optional[_Union[Overflow, str]] = ..., window: _Optional[int] = ..., lease_token: _Optional[bytes] = ..., take_over: bool = ..., initial_state: _Optional[_Union[InitialState, str]] = ...) -> None: ...
 
 class Step(_message.Message):
-    __slots__ = ("number", "time", "q_domains", "q", "transform_domains", "transforms", "transform_format", "has_more")
+    __slots__ = ("number", "time", "q_domains", "q", "transform_domains", "transforms", "transform_format", "has_more", "shared_q", "shared_transforms")
     NUMBER_FIELD_NUMBER: _ClassVar[int]
     TIME_FIELD_NUMBER: _ClassVar[int]
     Q_DOMAINS_FIELD_NUMBER: _ClassVar[int]
@@ -75,6 +75,8 @@ class Step(_message.Message):
     TRANSFORMS_FIELD_NUMBER: _ClassVar[int]
     TRANSFORM_FORMAT_FIELD_NUMBER: _ClassVar[int]
     HAS_MORE_FIELD_NUMBER: _ClassVar[int]
+    SHARED_Q_FIELD_NUMBER: _ClassVar[int]
+    SHARED_TRANSFORMS_FIELD_NUMBER: _ClassVar[int]
     number: int
     time: float
     q_domains: _containers.RepeatedScalarFieldContainer[int]
@@ -83,7 +85,9 @@ class Step(_message.Message):
     transforms: bytes
     transform_format: TransformFormat
     has_more: bool
-    def __init__(self, number: _Optional[int] = ..., time: _Optional[float] = ..., q_domains: _Optional[_Iterable[int]] = ..., q: _Optional[bytes] = ..., transform_domains: _Optional[_Iterable[int]] = ..., transforms: _Optional[bytes] = ..., transform_format: _Optional[_Union[TransformFormat, str]] = ..., has_more: bool = ...) -> None: ...
+    shared_q: _common_pb2.SharedRange
+    shared_transforms: _common_pb2.SharedRange
+    def __init__(self, number: _Optional[int] = ..., time: _Optional[float] = ..., q_domains: _Optional[_Iterable[int]] = ..., q: _Optional[bytes] = ..., transform_domains: _Optional[_Iterable[int]] = ..., transforms: _Optional[bytes] = ..., transform_format: _Optional[_Union[TransformFormat, str]] = ..., has_more: bool = ..., shared_q: _Optional[_Union[_common_pb2.SharedRange, _Mapping]] = ..., shared_transforms: _Optional[_Union[_common_pb2.SharedRange, _Mapping]] = ...) -> None: ...
 
 class DriveSceneResponse(_message.Message):
     __slots__ = ("opened", "ack", "rejection")

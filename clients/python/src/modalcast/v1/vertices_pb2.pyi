@@ -121,14 +121,16 @@ class VertexLayout(_message.Message):
     def __init__(self, domains: _Optional[_Iterable[int]] = ..., vertices: _Optional[_Iterable[int]] = ..., corners: _Optional[_Iterable[int]] = ..., has_more: bool = ...) -> None: ...
 
 class VertexChunk(_message.Message):
-    __slots__ = ("head", "offset", "data")
+    __slots__ = ("head", "offset", "data", "shared")
     HEAD_FIELD_NUMBER: _ClassVar[int]
     OFFSET_FIELD_NUMBER: _ClassVar[int]
     DATA_FIELD_NUMBER: _ClassVar[int]
+    SHARED_FIELD_NUMBER: _ClassVar[int]
     head: VertexHead
     offset: int
     data: bytes
-    def __init__(self, head: _Optional[_Union[VertexHead, _Mapping]] = ..., offset: _Optional[int] = ..., data: _Optional[bytes] = ...) -> None: ...
+    shared: _common_pb2.SharedRange
+    def __init__(self, head: _Optional[_Union[VertexHead, _Mapping]] = ..., offset: _Optional[int] = ..., data: _Optional[bytes] = ..., shared: _Optional[_Union[_common_pb2.SharedRange, _Mapping]] = ...) -> None: ...
 
 class VertexHead(_message.Message):
     __slots__ = ("step", "sections", "total", "skipped", "stages")

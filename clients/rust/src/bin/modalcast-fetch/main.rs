@@ -20,7 +20,10 @@ fn main() -> ExitCode {
 }
 
 async fn run_command(arguments: &Cli) -> Result<()> {
-    let client = Client::connect_with_retry(&arguments.server, Duration::from_secs_f64(arguments.wait)).await?;
+    let mut client = Client::connect_with_retry(&arguments.server, Duration::from_secs_f64(arguments.wait)).await?;
+    if let Some(path) = &arguments.shared_memory {
+        client = client.with_shared_memory(path).await?;
+    }
     let as_json = arguments.json;
     match &arguments.command {
         Command::Frames(options) => frames::fetch_stream(&client, options, as_json).await,
