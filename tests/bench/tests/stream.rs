@@ -64,6 +64,9 @@ fn quick_report_is_complete_and_consistent() {
     assert!((0.5 * bytes..0.6 * bytes).contains(&compact_bytes), "{compact_bytes} of {bytes}");
     let quotient = number(&socket["stream_per_second"]) / number(&socket["socket_per_second"]);
     assert!((number(&socket["stream_of_socket"]) - quotient).abs() < 1e-9 * quotient, "{socket}");
+    for path in ["unix_stream_per_second", "shared_stream_per_second", "shared_request_per_second"] {
+        number(&socket[path]);
+    }
     let csv = String::from_utf8(read(folder.path(), "report.csv")).expect("expected text");
     let markdown = String::from_utf8(read(folder.path(), "report.md")).expect("expected text");
     for name in cases {

@@ -26,7 +26,7 @@ pub(super) enum Measurement {
     FrameLatency(Content, u64),
     /// Time from a step to its acknowledgment, over this number of steps.
     AcknowledgmentLatency(u64),
-    /// Vertices beside a plain TCP connection.
+    /// Vertices over the server's sockets and in shared memory, beside a plain TCP connection.
     Socket,
     /// Waits while the server works for another client.
     Contention(OtherWork),
@@ -144,7 +144,8 @@ pub(crate) const CASE_HELP: &str = "Cases:
                  steps per second without viewers, and the time from a step to its acknowledgment
   tree-latency   time from a step to its PNG of 1920x1080, with a step every 16.7 ms
   tree-socket, grid-socket
-                 positions beside a plain TCP connection; the grid has 1.5 M vertices
+                 positions over TCP, a Unix socket and in shared memory, beside a plain TCP connection; the grid has
+                 1.5 M vertices
   tree-waits-loads, tree-waits-large-frames
                  time from a step to its frame while another client loads scenes (with --scenes also the almond
                  and the bridge), or draws frames of 8192x8192

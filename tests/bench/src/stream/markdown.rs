@@ -159,6 +159,10 @@ fn socket_section(report: &StreamReport) -> String {
             result.replies.to_string(),
             format!("{:.1}", result.stream_per_second),
             format!("{:.1}", result.request_per_second),
+            format!("{:.1}", result.unix_stream_per_second),
+            format!("{:.1}", result.unix_request_per_second),
+            format!("{:.1}", result.shared_stream_per_second),
+            format!("{:.1}", result.shared_request_per_second),
             format!("{:.1}", result.socket_per_second),
             format!("{:.3}", result.stream_of_socket),
             format!("{:.3}", result.request_of_socket),
@@ -171,6 +175,10 @@ fn socket_section(report: &StreamReport) -> String {
         "replies",
         "stream /s",
         "requests /s",
+        "stream, Unix /s",
+        "requests, Unix /s",
+        "stream, shared /s",
+        "requests, shared /s",
         "socket /s",
         "stream / socket",
         "requests / socket",
@@ -178,7 +186,8 @@ fn socket_section(report: &StreamReport) -> String {
     ];
     let note = "Positions as f32 beside a plain TCP connection over loopback that carries as many bytes in chunks of 1 MiB \
                 between two processes. The receiver of the plain connection reads into one buffer and does not decode. \
-                Steps are sent from memory. Single requests ask for the same step again and again.";
+                Steps are sent from memory. Single requests ask for the same step again and again. `Unix` is a Unix \
+                socket in place of TCP, and `shared` is shared memory.";
     section("Vertices and a plain socket", note, &head, comparisons.iter().map(row).collect())
 }
 

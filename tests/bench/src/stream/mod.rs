@@ -43,7 +43,7 @@ use contention::ContentionResult;
 use delay::DelayResult;
 use latency::LatencyResult;
 use modalcast_model::error::{Result, invalid};
-use peers::socket::{SocketComparison, SocketJob};
+use peers::socket::{SocketComparison, SocketJob, VertexViewers};
 use picture_encodings::PictureEncodingRow;
 use rates::RateResult;
 pub use session::SceneLook;
@@ -223,9 +223,10 @@ fn measure_case(
 /// Compares vertex streams with a plain TCP connection.
 fn compare_with_socket(session: &Session, options: &StreamReportOptions) -> Result<SocketComparison> {
     let motion = session.motion(options.steps.min(RECORDED_STEPS))?;
-    let receive = |content, writes: bool| {
+    let receive = |server: String, shared_memory, content, writes: bool| {
         let job = peers::viewer::ViewerJob {
-            server: session.url(),
+            server,
+            shared_memory,
             scene: SCENE.into(),
             replies: options.steps,
             content,
@@ -238,11 +239,19 @@ fn compare_with_socket(session: &Session, options: &StreamReportOptions) -> Resu
         }
         process.finish::<peers::viewer::ViewerSummary>()
     };
-    let stream = receive(peers::viewer::Content::Positions, true)?;
-    let requests = receive(peers::viewer::Content::RequestedPositions, false)?;
+    let (streamed, requested) = (peers::viewer::Content::Positions, peers::viewer::Content::RequestedPositions);
+    let shared_memory = Some(session.shared_memory());
+    let viewers = VertexViewers {
+        stream: receive(session.url(), None, streamed, true)?,
+        requests: receive(session.url(), None, requested, false)?,
+        unix_stream: receive(session.unix_url(), None, streamed, true)?,
+        unix_requests: receive(session.unix_url(), None, requested, false)?,
+        shared_stream: receive(session.url(), shared_memory.clone(), streamed, true)?,
+        shared_requests: receive(session.url(), shared_memory, requested, false)?,
+    };
     let reply_bytes = 12 * session.scene_info.vertices as usize;
     let socket = peers::socket::measure(SocketJob::new(reply_bytes, options.steps))?;
-    SocketComparison::new(&stream, &requests, &socket)
+    SocketComparison::new(&viewers, &socket)
 }
 
 impl StreamReport {

@@ -156,6 +156,7 @@ pub(super) fn steps_of_run(content: Option<Content>, options: &StreamReportOptio
 pub(super) fn run(session: &Session, viewers: Option<Viewers>, steps: u64, viewer_url: &str) -> Result<Run> {
     let job = |viewers: &Viewers, viewer| ViewerJob {
         server: viewer_url.to_owned(),
+        shared_memory: None,
         scene: SCENE.into(),
         replies: steps,
         content: viewers.content,

@@ -181,6 +181,16 @@ impl Session {
         format!("http://{}", self.address)
     }
 
+    /// The URL of the server's Unix socket.
+    pub(super) fn unix_url(&self) -> String {
+        format!("unix:{}", unix_socket(self.work.path()).display())
+    }
+
+    /// The server's socket for shared memory.
+    pub(super) fn shared_memory(&self) -> PathBuf {
+        shared_memory_socket(self.work.path())
+    }
+
     /// Ends the session after an error of a case. If the server has ended, the error also contains its standard error.
     pub(super) fn explain(mut self, error: Error) -> Error {
         if self.server.ends_within(SERVER_END) { self.server.failure(&error.to_string()) } else { error }
@@ -226,9 +236,19 @@ fn create_work_folder() -> Result<TempDir> {
     in_memory.map_or_else(tempfile::tempdir, Ok).map_err(fault_in("report"))
 }
 
+fn unix_socket(work: &Path) -> PathBuf {
+    work.join("server.sock")
+}
+
+fn shared_memory_socket(work: &Path) -> PathBuf {
+    work.join("memory.sock")
+}
+
 fn start_server(work: &Path, repository: Option<&Path>, draws: bool) -> Result<Process> {
     let state = work.join("state");
-    let mut list = arguments([&"serve", &"--listen", &"127.0.0.1:0", &"--state", &state]);
+    let unix_address = format!("unix:{}", unix_socket(work).display());
+    let mut list = arguments([&"serve", &"--listen", &"127.0.0.1:0", &"--listen", &unix_address, &"--state", &state]);
+    list.extend(arguments([&"--shared-memory", &shared_memory_socket(work)]));
     if let Some(repository) = repository {
         list.extend(arguments([&"--scenes", &repository]));
     }

@@ -112,6 +112,12 @@ pub struct SocketComparison {
     pub stream_per_second: f64,
     /// Replies per second if the client requests the same step again and again.
     pub request_per_second: f64,
+    /// The same two rates over a Unix socket.
+    pub unix_stream_per_second: f64,
+    pub unix_request_per_second: f64,
+    /// The same two rates with the vertices in shared memory.
+    pub shared_stream_per_second: f64,
+    pub shared_request_per_second: f64,
     pub socket_per_second: f64,
     /// `stream_per_second` and `request_per_second` divided by `socket_per_second`.
     pub stream_of_socket: f64,
@@ -120,20 +126,35 @@ pub struct SocketComparison {
     pub socket_bytes_per_second: f64,
 }
 
+/// What viewers of vertices have received over the server's TCP socket, its Unix socket and in shared memory.
+#[derive(Debug, Clone, PartialEq)]
+pub(in crate::stream) struct VertexViewers {
+    pub(in crate::stream) stream: ViewerSummary,
+    pub(in crate::stream) requests: ViewerSummary,
+    pub(in crate::stream) unix_stream: ViewerSummary,
+    pub(in crate::stream) unix_requests: ViewerSummary,
+    pub(in crate::stream) shared_stream: ViewerSummary,
+    pub(in crate::stream) shared_requests: ViewerSummary,
+}
+
 impl SocketComparison {
-    /// Compares a stream and single requests with a plain connection.
+    /// Compares streams and single requests with a plain connection.
     ///
     /// # Errors
     /// `Fault` unless each has as many replies of as many bytes as the others, except for the origins.
-    pub(in crate::stream) fn new(
-        stream: &ViewerSummary,
-        requests: &ViewerSummary,
-        socket: &SocketRate,
-    ) -> Result<Self> {
+    pub(in crate::stream) fn new(viewers: &VertexViewers, socket: &SocketRate) -> Result<Self> {
+        let VertexViewers { stream, requests, unix_stream, unix_requests, shared_stream, shared_requests } = viewers;
         let job = socket.job;
         let socket_bytes = job.replies * job.reply_bytes as u64;
         let expected_bytes = socket_bytes..=socket_bytes + job.replies * ORIGIN_BYTES;
-        for (name, summary) in [("the stream", stream), ("the requests", requests)] {
+        for (name, summary) in [
+            ("the stream", stream),
+            ("the requests", requests),
+            ("the stream over a Unix socket", unix_stream),
+            ("the requests over a Unix socket", unix_requests),
+            ("the stream in shared memory", shared_stream),
+            ("the requests in shared memory", shared_requests),
+        ] {
             if summary.replies != job.replies || !expected_bytes.contains(&summary.bytes) {
                 let given = format!("{} replies, {} bytes", summary.replies, summary.bytes);
                 let expected = format!("{} replies, {socket_bytes} bytes", job.replies);
@@ -146,6 +167,10 @@ impl SocketComparison {
             replies: job.replies,
             stream_per_second: stream.per_second,
             request_per_second: requests.per_second,
+            unix_stream_per_second: unix_stream.per_second,
+            unix_request_per_second: unix_requests.per_second,
+            shared_stream_per_second: shared_stream.per_second,
+            shared_request_per_second: shared_requests.per_second,
             socket_per_second: socket.per_second,
             stream_of_socket: stream.per_second / socket.per_second,
             request_of_socket: requests.per_second / socket.per_second,
@@ -197,13 +222,28 @@ mod tests {
             stages_ms: Default::default(),
         };
         let equal = summary(5, 5000);
-        let comparison = SocketComparison::new(&equal, &equal, &socket_rate).expect("expected a comparison");
+        let viewers = VertexViewers {
+            stream: equal.clone(),
+            requests: equal.clone(),
+            unix_stream: equal.clone(),
+            unix_requests: equal.clone(),
+            shared_stream: equal.clone(),
+            shared_requests: equal,
+        };
+        let comparison = SocketComparison::new(&viewers, &socket_rate).expect("expected a comparison");
         assert_eq!((comparison.stream_of_socket, comparison.socket_bytes_per_second), (0.5, 1e5));
         let with_origins = summary(5, 5 * 1024);
-        assert!(SocketComparison::new(&equal, &with_origins, &socket_rate).is_ok());
+        let with_requests = |requests| VertexViewers { requests, ..viewers.clone() };
+        assert!(SocketComparison::new(&with_requests(with_origins), &socket_rate).is_ok());
         for unequal in [summary(4, 4000), summary(5, 4990), summary(5, 5 * 1024 + 1)] {
-            assert!(SocketComparison::new(&unequal, &equal, &socket_rate).is_err(), "{unequal:?}");
-            assert!(SocketComparison::new(&equal, &unequal, &socket_rate).is_err(), "{unequal:?}");
+            let shared_stream = unequal.clone();
+            for unequal_viewers in [
+                with_requests(unequal.clone()),
+                VertexViewers { stream: unequal.clone(), ..viewers.clone() },
+                VertexViewers { shared_stream, ..viewers.clone() },
+            ] {
+                assert!(SocketComparison::new(&unequal_viewers, &socket_rate).is_err(), "{unequal:?}");
+            }
         }
     }
 }

@@ -1,6 +1,7 @@
 //! A client in its own process that receives frames or vertices and measures their rate.
 
 use std::collections::BTreeMap;
+use std::path::PathBuf;
 use std::time::Instant;
 
 use modalcast_client::{
@@ -17,6 +18,8 @@ use modalcast_model::error::{Result, fault, fault_in};
 pub(crate) struct ViewerJob {
     /// URL of the server.
     pub(in crate::stream) server: String,
+    /// The server's socket for shared memory, if the viewer uses it.
+    pub(in crate::stream) shared_memory: Option<PathBuf>,
     pub(in crate::stream) scene: String,
     pub(in crate::stream) replies: u64,
     pub(in crate::stream) content: Content,
@@ -138,7 +141,10 @@ pub(in crate::stream) fn rate(replies: u64, seconds: f64) -> f64 {
 /// # Errors
 /// `Fault` when the server rejects the request, a stream ends early, or a step is missing.
 pub(in crate::stream) async fn run(job: &ViewerJob) -> Result<()> {
-    let client = Client::connect(&job.server).await.map_err(fault_in("viewer"))?;
+    let mut client = Client::connect(&job.server).await.map_err(fault_in("viewer"))?;
+    if let Some(path) = &job.shared_memory {
+        client = client.with_shared_memory(path).await.map_err(fault_in("viewer"))?;
+    }
     let mut collector = Collector::default();
     match job.content {
         Content::RequestedPositions => request_positions(&client, job, &mut collector).await?,
