@@ -196,6 +196,23 @@ def test_branches_move_with_their_parents(tree: mc.Scene):
     tree.reset()
 
 
+def test_step_above_1_mib_is_sent_in_parts(client: mc.Client):
+    positions, faces, _ = beam()
+    builder = mc.SceneBuilder("large")
+    builder.add(positions, faces, np.zeros((3 * len(positions), 512)), name="beam 0")
+    for index in range(1, 600):
+        builder.add_copy("beam 0", name=f"beam {index}")
+    scene = client.upload(builder)
+    q = np.random.default_rng(1).random(scene.coordinate_count, np.float32)
+    assert q.nbytes > 1 << 20
+    with scene.drive() as drive:
+        drive.step(q, transforms={domain: np.eye(4) for domain in scene.domains})
+        drive.step(q={"beam 7": np.zeros(512)})
+    q[7 * 512 : 8 * 512] = 0
+    np.testing.assert_array_equal(scene.state().q, q)
+    scene.delete()
+
+
 def test_rejected_step_of_a_scene_with_joints_changes_nothing(tree: mc.Scene):
     with tree.drive() as drive:
         before = tree.vertices()
