@@ -17,13 +17,19 @@ import modalcast as mc
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
 
-def test_beam_has_the_frequencies_of_beam_theory(client: mc.Client, tmp_path: Path):
+def run_example(name: str, client: mc.Client, folder: Path) -> str:
+    """Runs an example in a folder and returns its output."""
     # One thread, because the server uses the other cores.
     environment = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-    command = [sys.executable, EXAMPLES / "beam.py", client.address]
-    result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, env=environment)
+    command = [sys.executable, EXAMPLES / name, client.address]
+    result = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, env=environment)
     assert result.returncode == 0, result.stderr
-    frequencies = [float(number) for number in re.findall(r"\d+\.\d", result.stdout)]
+    return result.stdout
+
+
+def test_beam_has_the_frequencies_of_beam_theory(client: mc.Client, tmp_path: Path):
+    output = run_example("beam.py", client, tmp_path)
+    frequencies = [float(number) for number in re.findall(r"\d+\.\d", output)]
     # The first bending mode of an Euler-Bernoulli beam that is clamped at one end.
     expected = 1.8751**2 / (2 * np.pi) * np.sqrt(210e9 / 7850) * 0.2 / np.sqrt(12) / 4.0**2
     assert frequencies[0] == pytest.approx(expected, rel=0.02)
@@ -31,3 +37,12 @@ def test_beam_has_the_frequencies_of_beam_theory(client: mc.Client, tmp_path: Pa
     # The beam with the first mode is red.
     assert ((pixels[..., 0] - pixels[..., 2]) > 60).mean() > 0.02
     client.delete("beams")
+
+
+def test_pulled_tree_moves_and_returns(client: mc.Client, tmp_path: Path):
+    output = run_example("pull.py", client, tmp_path)
+    pulled, released = (float(number) for number in re.findall(r"(-?\d+\.\d+) m", output))
+    assert pulled > 0.5
+    assert abs(released) < pulled / 2
+    assert (tmp_path / "pulled.png").read_bytes() != (tmp_path / "released.png").read_bytes()
+    client.open("tree").reset()
