@@ -79,3 +79,19 @@ require_nvrtc_for_driver() {
     has_library 'libnvrtc.so.13' && return 0
     require_nvrtc
 }
+
+# Installs the Python packages of the attack programs and compiles the contract for them, into a git-ignored folder.
+require_siege() {
+    local tools=.tools/siege
+    if ! cmp -s tests/siege/requirements.txt "$tools/requirements.txt"; then
+        command -v python3 >/dev/null && python3 -c 'import venv, ensurepip' 2>/dev/null ||
+            require_packages python3 python3-venv
+        say "Installing the packages of tests/siege/requirements.txt (PyPI) into $tools"
+        python3 -m venv --clear "$tools/venv"
+        "$tools/venv/bin/pip" install --quiet --disable-pip-version-check -r tests/siege/requirements.txt
+        cp tests/siege/requirements.txt "$tools/requirements.txt"
+    fi
+    mkdir -p "$tools/proto"
+    "$tools/venv/bin/python" -m grpc_tools.protoc -I proto --python_out="$tools/proto" \
+        --grpc_python_out="$tools/proto" proto/modalcast/v1/*.proto
+}

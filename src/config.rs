@@ -125,10 +125,13 @@ pub struct Config {
     pub stall_timeout: Duration,
     /// Time for streams to end when the server shuts down.
     pub drain_timeout: Duration,
-    /// Limit on open connections.
+    /// Limit on open connections. Above it, connections without calls are closed: those that have sent no request,
+    /// and then those that were idle for the longest time.
     pub connections: usize,
-    /// Time within which a new connection must send its first byte.
-    pub first_byte_timeout: Duration,
+    /// Time within which a new connection must send the preface of HTTP/2, which is 24 bytes.
+    pub handshake_timeout: Duration,
+    /// Time after the preface within which a connection must send its first request.
+    pub first_request_timeout: Duration,
     /// Interval of HTTP/2 keepalive pings.
     pub keepalive_interval: Duration,
     /// Time within which the client must answer a keepalive ping.
@@ -168,7 +171,8 @@ impl Default for Config {
             stall_timeout: Duration::from_secs(30),
             drain_timeout: Duration::from_secs(10),
             connections: 1024,
-            first_byte_timeout: Duration::from_secs(5),
+            handshake_timeout: Duration::from_secs(5),
+            first_request_timeout: Duration::from_secs(30),
             keepalive_interval: Duration::from_secs(10),
             keepalive_timeout: Duration::from_secs(5),
         }
@@ -221,7 +225,8 @@ impl Config {
         check_range("deadline (ms)", ms(self.deadline), 1, ms(self.max_deadline))?;
         check_range("stall_timeout (ms)", ms(self.stall_timeout), 1, HOUR_MS)?;
         check_range("drain_timeout (ms)", ms(self.drain_timeout), 1, HOUR_MS)?;
-        check_range("first_byte_timeout (ms)", ms(self.first_byte_timeout), 1, HOUR_MS)?;
+        check_range("handshake_timeout (ms)", ms(self.handshake_timeout), 1, HOUR_MS)?;
+        check_range("first_request_timeout (ms)", ms(self.first_request_timeout), 1, HOUR_MS)?;
         check_range("keepalive_interval (ms)", ms(self.keepalive_interval), 100, HOUR_MS)?;
         check_range("keepalive_timeout (ms)", ms(self.keepalive_timeout), 100, HOUR_MS)?;
         if self.listen.is_empty() {

@@ -1,6 +1,8 @@
 //! Telemetry: stage names, stage times in milliseconds, and logging.
 
 use std::io::IsTerminal as _;
+use std::sync::{Mutex, PoisonError};
+use std::time::{Duration, Instant};
 
 /// A stage of processing a step. Its name is the same in logs, replies and reports.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -45,7 +47,7 @@ impl Stage {
 pub type StageTimes = Vec<(Stage, f64)>;
 
 /// Milliseconds since `start`.
-pub fn ms_since(start: std::time::Instant) -> f64 {
+pub fn ms_since(start: Instant) -> f64 {
     start.elapsed().as_secs_f64() * 1e3
 }
 
@@ -61,4 +63,44 @@ pub fn init_logging() {
         tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).with_ansi(has_colors);
     // Fails only if a logger is already installed. That logger remains.
     subscriber.try_init().ok();
+}
+
+/// Limits a kind of log record to one per second.
+#[derive(Debug, Default)]
+pub struct LogLimiter(Mutex<LogPeriod>);
+
+#[derive(Debug, Default)]
+struct LogPeriod {
+    /// When the last record was written.
+    start: Option<Instant>,
+    /// Events since then.
+    count: u64,
+}
+
+impl LogLimiter {
+    /// Counts an event. Returns the number of events since the last record if a record is due.
+    pub fn record(&self) -> Option<u64> {
+        // A poisoned lock is valid, because no update can panic.
+        let mut period = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        period.count += 1;
+        let is_due = period.start.is_none_or(|start| start.elapsed() >= Duration::from_secs(1));
+        is_due.then(|| {
+            period.start = Some(Instant::now());
+            std::mem::take(&mut period.count)
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn limiter_counts_the_events_without_a_record() {
+        let limiter = LogLimiter::default();
+        assert_eq!(limiter.record(), Some(1));
+        assert_eq!((limiter.record(), limiter.record()), (None, None));
+        limiter.0.lock().expect("expected no panic").start = None;
+        assert_eq!(limiter.record(), Some(3));
+    }
 }

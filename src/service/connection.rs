@@ -2,8 +2,9 @@
 
 use std::sync::Arc;
 
-use tokio::sync::{Notify, OwnedSemaphorePermit, Semaphore};
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
+use super::connection_table::{Activity, ConnectionSlot};
 use super::receive_budget::{ConnectionReceiveBudget, ReceiveBudget};
 use super::reply_budget::{ConnectionReplyBudget, ReplyBudget};
 use crate::config::Config;
@@ -41,16 +42,17 @@ pub(super) struct ConnectionInfo {
     drive_permits: Arc<Semaphore>,
     pub(super) receive: Arc<ConnectionReceiveBudget>,
     pub(super) reply: Arc<ConnectionReplyBudget>,
+    pub(super) activity: Arc<Activity>,
 }
 
 impl ConnectionInfo {
-    /// `close` closes the connection.
-    pub(super) fn new(peer: String, budgets: &Budgets, close: Arc<Notify>) -> Self {
+    pub(super) fn new(peer: String, budgets: &Budgets, slot: &ConnectionSlot) -> Self {
         Self {
             peer: peer.into(),
             drive_permits: Arc::new(Semaphore::new(MAX_DRIVES)),
             receive: budgets.receive.new_connection(),
-            reply: budgets.reply.new_connection(close),
+            reply: budgets.reply.new_connection(Arc::clone(&slot.signals.close)),
+            activity: Arc::clone(&slot.activity),
         }
     }
 

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::pin::Pin;
 use std::task::{Context, Poll};
 
-use tokio::io::{AsyncRead, AsyncReadExt as _, AsyncWrite};
+use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::{TcpListener, TcpStream, UnixListener, UnixStream};
 
 use crate::config::{Config, ListenAddress};
@@ -39,8 +39,7 @@ enum ListeningSocket {
 #[derive(Debug)]
 pub(super) enum Socket {
     Tcp(TcpStream),
-    /// With the first byte, until it is read from here.
-    Unix(UnixStream, Option<u8>),
+    Unix(UnixStream),
 }
 
 impl Listener {
@@ -129,7 +128,7 @@ impl ListeningSocket {
             Self::Unix(listener) => listener.poll_accept(cx)?.map(|(stream, _)| {
                 let pid = stream.peer_cred().ok().and_then(|credentials| credentials.pid());
                 let peer = pid.map_or_else(|| "unix socket".to_owned(), |pid| format!("process {pid}"));
-                Ok((Socket::Unix(stream, None), peer))
+                Ok((Socket::Unix(stream), peer))
             }),
         }
     }
@@ -190,39 +189,17 @@ pub(super) trait Io: AsyncRead + AsyncWrite + Send + Unpin {}
 impl<T: AsyncRead + AsyncWrite + Send + Unpin> Io for T {}
 
 impl Socket {
-    /// Returns whether the client has sent a byte; false if it has closed the connection.
-    pub(super) async fn wait_for_first_byte(&mut self) -> bool {
-        match self {
-            Self::Tcp(stream) => stream.peek(&mut [0]).await.is_ok_and(|bytes| bytes > 0),
-            // A Unix socket has no peek, so the byte is read and returned later.
-            Self::Unix(stream, first_byte) => {
-                let mut byte = [0];
-                let is_received = stream.read(&mut byte).await.is_ok_and(|bytes| bytes > 0);
-                *first_byte = is_received.then_some(byte[0]);
-                is_received
-            }
-        }
-    }
-
-    /// The first byte, if [`Self::wait_for_first_byte`] has read it and it was not taken before.
-    pub(super) const fn take_first_byte(&mut self) -> Option<u8> {
-        match self {
-            Self::Tcp(_) => None,
-            Self::Unix(_, first_byte) => first_byte.take(),
-        }
-    }
-
     pub(super) fn io(&mut self) -> Pin<&mut dyn Io> {
         match self {
             Self::Tcp(stream) => Pin::new(stream),
-            Self::Unix(stream, _) => Pin::new(stream),
+            Self::Unix(stream) => Pin::new(stream),
         }
     }
 
     pub(super) fn is_write_vectored(&self) -> bool {
         match self {
             Self::Tcp(stream) => stream.is_write_vectored(),
-            Self::Unix(stream, _) => stream.is_write_vectored(),
+            Self::Unix(stream) => stream.is_write_vectored(),
         }
     }
 }

@@ -3,6 +3,7 @@
 
 mod accept;
 mod connection;
+mod connection_table;
 mod convert;
 mod describe;
 mod forces;
@@ -26,14 +27,13 @@ mod uploads;
 mod vertices;
 
 use modalcast_proto::v1;
-use tokio::sync::oneshot;
 use tokio::time::Instant;
-use tonic::transport::Server;
 use tonic_health::server::HealthReporter;
 
 pub use self::listen::Listener;
 
-use self::connection::STREAMS_PER_CONNECTION_WINDOW;
+use self::accept::ConnectionServer;
+use self::connection_table::ConnectionTable;
 use self::routes::Routes;
 use self::shared_memory::SharedMemory;
 use crate::config::Config;
@@ -43,9 +43,6 @@ use modalcast_model::error::{Result, fault_in};
 /// Largest message that the server sends, in bytes: a chunk of at most 1 MiB and its head, or the layout of 65,536
 /// domains.
 const MAX_REPLY_BYTES: usize = 3 << 20;
-
-/// Limit on the open calls of one connection.
-const MAX_CALLS: usize = 128;
 
 /// Binds the configured addresses.
 ///
@@ -60,7 +57,7 @@ pub async fn bind(config: &Config) -> Result<Listener> {
 /// server, but health checks are answered with `NOT_SERVING` from then on, so that a supervisor can restart it.
 ///
 /// # Errors
-/// `Fault` when the transport fails.
+/// `Fault` when the description of the services for reflection is invalid.
 pub async fn serve(
     engine: Engine,
     listener: Listener,
@@ -74,8 +71,9 @@ pub async fn serve(
     // The files are removed when this function returns.
     let Listener { sockets, shared_memory: shared_memory_socket, files: _files, .. } = listener;
     let _shared_memory_server = shared_memory_socket.map(|socket| shared_memory.serve(socket));
-    let connections = accept::accept_connections(sockets, &config);
-    let (stop_sender, stop_receiver) = oneshot::channel();
+    let table = ConnectionTable::new(config.connections);
+    let accept_connections =
+        ConnectionServer::new(routes, &config).accept_connections(sockets, std::sync::Arc::clone(&table));
     let stop_engine = async move {
         let mut shutdown = std::pin::pin!(shutdown);
         tokio::select! {
@@ -91,25 +89,17 @@ pub async fn serve(
         if tokio::time::timeout_at(drain_deadline, engine.shutdown()).await.is_err() {
             tracing::warn!("the engine did not stop within the drain time");
         }
-        stop_sender.send(()).ok(); // Fails only if the transport has failed and dropped the receiver.
         drain_deadline
     };
-    let shutdown_signal = async {
-        stop_receiver.await.ok(); // A dropped sender is a stop signal, too.
-    };
-    let mut transport =
-        std::pin::pin!(transport(&config).serve_with_incoming_shutdown(routes, connections, shutdown_signal));
+    // The sockets are closed when the engine has stopped.
     let drain_deadline = tokio::select! {
-        result = &mut transport => return result.map_err(fault_in("transport")),
+        () = accept_connections => return Ok(()),
         drain_deadline = stop_engine => drain_deadline,
     };
-    match tokio::time::timeout_at(drain_deadline, transport).await {
-        Ok(result) => result.map_err(fault_in("transport")),
-        Err(_) => {
-            tracing::warn!("some clients did not close their connections within the drain time");
-            Ok(())
-        }
+    if tokio::time::timeout_at(drain_deadline, table.retire_all()).await.is_err() {
+        tracing::warn!("some clients did not close their connections within the drain time");
     }
+    Ok(())
 }
 
 async fn set_health(health: &HealthReporter, is_serving: bool) {
@@ -128,25 +118,6 @@ async fn set_health(health: &HealthReporter, is_serving: bool) {
     for name in services.map(|service| format!("modalcast.v1.{service}")).into_iter().chain([String::new()]) {
         health.set_service_status(name, status).await;
     }
-}
-
-/// The transport. Every limit is set explicitly, because the library's defaults disable some of them. Sizes are in
-/// bytes.
-fn transport(config: &Config) -> Server {
-    Server::builder()
-        // All open calls of a connection are handled at a time. A call in a queue would not be read, and HTTP/2 would
-        // buffer a stream window of it outside the budgets.
-        .max_concurrent_streams(MAX_CALLS as u32)
-        .concurrency_limit_per_connection(MAX_CALLS)
-        // A client that opens and resets more streams than this (a rapid-reset attack) is disconnected.
-        .http2_max_local_error_reset_streams(Some(1024))
-        .http2_max_pending_accept_reset_streams(Some(100))
-        .http2_max_header_list_size(16 << 10)
-        .initial_stream_window_size(config.stream_window)
-        .initial_connection_window_size(STREAMS_PER_CONNECTION_WINDOW * config.stream_window)
-        .max_frame_size(64 << 10)
-        .http2_keepalive_interval(Some(config.keepalive_interval))
-        .http2_keepalive_timeout(Some(config.keepalive_timeout))
 }
 
 fn routes(engine: &Engine, config: &Config, shared_memory: &SharedMemory) -> Result<Routes> {
@@ -187,6 +158,7 @@ fn routes(engine: &Engine, config: &Config, shared_memory: &SharedMemory) -> Res
 mod tests {
     use std::time::Duration;
 
+    use tokio::sync::oneshot;
     use tonic::transport::Channel;
     use tonic_health::ServingStatus;
     use tonic_health::pb::HealthCheckRequest;

@@ -17,6 +17,7 @@ use tokio::sync::{Notify, OwnedSemaphorePermit, Semaphore};
 use tonic::Status;
 use tonic::body::Body;
 
+use super::connection_table::CountedCall;
 use crate::config::Config;
 use crate::engine::lock;
 use modalcast_model::error::Error;
@@ -363,6 +364,7 @@ impl AsRef<[u8]> for UnsentFrame {
 pub(super) struct CountedReplyBody {
     pub(super) inner: Body,
     pub(super) context: ReplyContext,
+    pub(super) _call: Arc<CountedCall>,
 }
 
 impl HttpBody for CountedReplyBody {

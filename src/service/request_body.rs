@@ -13,6 +13,7 @@ use tokio::time::{Instant, Sleep};
 use tonic::Status;
 use tonic::body::Body;
 
+use super::connection_table::CountedCall;
 use super::receive_budget::{ConnectionReceiveBudget, MessageLimits, ReceivedMemory};
 use super::status::to_status;
 use modalcast_model::error::{Error, Result};
@@ -76,10 +77,11 @@ pub(super) struct RequestBody {
     timer: Option<Pin<Box<Sleep>>>,
     is_timer_running: bool,
     eviction: Option<Pin<Box<OwnedNotified>>>,
+    call: Arc<CountedCall>,
 }
 
 impl RequestBody {
-    pub(super) fn new(inner: Body, memory: RequestMemory, limits: MessageLimits) -> Self {
+    pub(super) fn new(inner: Body, memory: RequestMemory, limits: MessageLimits, call: Arc<CountedCall>) -> Self {
         Self {
             inner,
             memory,
@@ -89,6 +91,7 @@ impl RequestBody {
             timer: None,
             is_timer_running: false,
             eviction: None,
+            call,
         }
     }
 
@@ -102,8 +105,11 @@ impl RequestBody {
         }
         self.remaining = self.limits.timeout;
         incomplete.resize(0)?;
+        if advance.largest_complete.is_some() {
+            self.call.count();
+        }
         if let Some(complete) = complete {
-            complete.resize(advance.largest_complete.min(self.limits.max_bytes))?;
+            complete.resize(advance.largest_complete.unwrap_or(0).min(self.limits.max_bytes))?;
         }
         incomplete.resize(self.position.incomplete_bytes().min(self.limits.max_bytes))
     }
@@ -190,12 +196,12 @@ struct Advance {
     /// Whether a message begins or ends in the frame.
     has_boundary: bool,
     /// Size of the largest message that ends in the frame, in bytes.
-    largest_complete: usize,
+    largest_complete: Option<usize>,
 }
 
 impl MessagePosition {
     fn advance(&mut self, mut data: &[u8]) -> Advance {
-        let mut advance = Advance { has_boundary: false, largest_complete: 0 };
+        let mut advance = Advance { has_boundary: false, largest_complete: None };
         while !data.is_empty() {
             if self.missing_bytes > 0 {
                 let bytes = self.missing_bytes.min(data.len());
@@ -203,7 +209,7 @@ impl MessagePosition {
                 self.missing_bytes -= bytes;
                 if self.missing_bytes == 0 {
                     advance.has_boundary = true;
-                    advance.largest_complete = advance.largest_complete.max(self.message_bytes);
+                    advance.largest_complete = advance.largest_complete.max(Some(self.message_bytes));
                     self.message_bytes = 0;
                 }
                 continue;
@@ -217,6 +223,9 @@ impl MessagePosition {
                 (self.message_bytes, self.header_bytes) = (u32::from_be_bytes(length) as usize, 0);
                 self.missing_bytes = self.message_bytes;
                 advance.has_boundary = true;
+                if self.message_bytes == 0 {
+                    advance.largest_complete = advance.largest_complete.max(Some(0));
+                }
             }
         }
         advance
@@ -236,6 +245,7 @@ impl MessagePosition {
 mod tests {
     use super::*;
     use crate::config::Config;
+    use crate::service::connection_table::Activity;
     use crate::service::receive_budget::ReceiveBudget;
 
     /// The bytes of messages with these lengths.
@@ -251,7 +261,11 @@ mod tests {
             let mut position = MessagePosition::default();
             let advances: Vec<_> = bytes.chunks(frame_bytes).map(|frame| position.advance(frame)).collect();
             assert!(!position.is_incomplete(), "{frame_bytes}");
-            assert_eq!(advances.iter().map(|advance| advance.largest_complete).max(), Some(300), "{frame_bytes}");
+            assert_eq!(
+                advances.iter().filter_map(|advance| advance.largest_complete).max(),
+                Some(300),
+                "{frame_bytes}"
+            );
             position.advance(&bytes[..20]);
             assert!(position.is_incomplete());
             assert_eq!(position.incomplete_bytes(), 300);
@@ -282,7 +296,8 @@ mod tests {
         let (sender, receiver) = tokio::sync::mpsc::channel(8);
         let memory = RequestMemory::new(connection);
         let limits = MessageLimits { max_bytes: 1 << 20, timeout };
-        (RequestBody::new(Body::new(ChannelBody(receiver)), memory, limits), sender)
+        let call = Activity::new(&Arc::default()).new_call();
+        (RequestBody::new(Body::new(ChannelBody(receiver)), memory, limits, call), sender)
     }
 
     fn connection() -> Arc<ConnectionReceiveBudget> {

@@ -3,7 +3,6 @@
 use std::collections::BTreeMap;
 use std::convert::Infallible;
 use std::sync::Arc;
-use std::task::{Context, Poll};
 
 use tonic::body::Body;
 use tonic::codegen::http::{Request, Response};
@@ -57,23 +56,15 @@ fn with_transport_details(response: Response<Body>, max_message_bytes: usize) ->
     }
 }
 
-impl Service<Request<Body>> for Routes {
-    type Response = Response<Body>;
-    type Error = Infallible;
-    type Future = BoxFuture<Response<Body>, Infallible>;
-
-    fn poll_ready(&mut self, _: &mut Context<'_>) -> Poll<Result<(), Infallible>> {
-        Poll::Ready(Ok(()))
-    }
-
-    fn call(&mut self, request: Request<Body>) -> Self::Future {
+impl Routes {
+    pub(super) fn call(&self, request: Request<Body>) -> BoxFuture<Response<Body>, Infallible> {
         let name = request.uri().path().split('/').nth(1).unwrap_or_default();
         let Some(route) = self.by_name.get(name).cloned() else {
             return Box::pin(async {
                 Ok(Status::unimplemented("expected the path of a service of this server").into_http())
             });
         };
-        let response: Self::Future = match request.extensions().get::<ConnectionInfo>().cloned() {
+        let response: BoxFuture<_, _> = match request.extensions().get::<ConnectionInfo>().cloned() {
             Some(connection) => Box::pin(call_within_budgets(route, request, connection)),
             None => route(request),
         };
@@ -90,9 +81,12 @@ async fn call_within_budgets(
 ) -> Result<Response<Body>, Infallible> {
     let memory = RequestMemory::new(&connection.receive);
     let request_memory = memory.clone();
-    let request = request.map(|body| Body::new(RequestBody::new(body, request_memory, connection.receive.limits())));
+    let call = connection.activity.new_call();
+    let request_call = Arc::clone(&call);
+    let limits = connection.receive.limits();
+    let request = request.map(|body| Body::new(RequestBody::new(body, request_memory, limits, request_call)));
     let context = ReplyContext::new(connection.reply.new_call());
     let response = context.clone().scope(route(request)).await;
     memory.release_complete();
-    response.map(|response| response.map(|inner| Body::new(CountedReplyBody { inner, context })))
+    response.map(|response| response.map(|inner| Body::new(CountedReplyBody { inner, context, _call: call })))
 }

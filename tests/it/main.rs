@@ -7,6 +7,7 @@ mod budgets;
 mod bulk_steps;
 #[path = "../common/mod.rs"]
 mod common;
+mod connections;
 mod cpu_checks;
 mod cut_outs;
 mod deformers;

@@ -102,7 +102,7 @@ async fn stream_of_writer_that_reads_no_rejections_ends() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn silent_connection_is_closed_and_active_one_is_not() {
-    let server = Server::start_with(|config| Config { first_byte_timeout: Duration::from_millis(60), ..config }).await;
+    let server = Server::start_with(|config| Config { handshake_timeout: Duration::from_millis(60), ..config }).await;
     server.open("strips").await;
     let mut writer = server.drive_lossless("strips").await;
     let address = server.address.trim_start_matches("http://").to_owned();

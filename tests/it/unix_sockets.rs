@@ -46,8 +46,8 @@ async fn clients_of_both_sockets_use_the_same_server() {
 #[tokio::test(flavor = "multi_thread")]
 async fn silent_unix_connection_is_closed() {
     let folder = tempfile::tempdir().expect("expected a temporary folder");
-    let first_byte_timeout = Duration::from_millis(60);
-    let (_server, _) = start_on_both(folder.path(), |config| Config { first_byte_timeout, ..config }).await;
+    let handshake_timeout = Duration::from_millis(60);
+    let (_server, _) = start_on_both(folder.path(), |config| Config { handshake_timeout, ..config }).await;
     let mut silent = UnixStream::connect(folder.path().join("modalcast.sock")).await.expect("expected a connection");
     let result = with_timeout(silent.read(&mut [0; 1])).await;
     assert!(matches!(result, Ok(0) | Err(_)), "{result:?}");

@@ -1,0 +1,114 @@
+//! Connections that send no request: they are closed in time, and at once when a new client needs their place.
+
+use std::time::Duration;
+
+use modalcast::config::Config;
+use modalcast_proto::v1;
+use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+use tokio::net::TcpStream;
+use v1::Delivery;
+use v1::scene_service_client::SceneServiceClient;
+
+use crate::service_harness::{DEFAULT_WINDOW, Server, StepWriter, step, with_timeout};
+
+/// The preface of HTTP/2 and an empty SETTINGS frame.
+const HELLO: &[u8] = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n\x00\x00\x00\x04\x00\x00\x00\x00\x00";
+
+async fn connect(server: &Server, bytes: &[u8]) -> TcpStream {
+    let address = server.address.trim_start_matches("http://").to_owned();
+    let mut connection = TcpStream::connect(address).await.expect("expected a connection");
+    connection.write_all(bytes).await.expect("expected an open connection");
+    connection
+}
+
+/// Reads until the server closes the connection, and returns all bytes.
+async fn read_to_end(mut connection: TcpStream) -> Vec<u8> {
+    let mut bytes = Vec::new();
+    let mut buffer = [0; 4096];
+    // A reset is an end, too.
+    while let Ok(count @ 1..) = with_timeout(connection.read(&mut buffer)).await {
+        bytes.extend_from_slice(&buffer[..count]);
+    }
+    bytes
+}
+
+/// Whether the bytes contain a GOAWAY frame with NO_ERROR.
+fn contains_goaway(bytes: &[u8]) -> bool {
+    let mut rest = bytes;
+    while let [a, b, c, kind, _, _, _, _, _, payload @ ..] = rest {
+        let length = u32::from_be_bytes([0, *a, *b, *c]) as usize;
+        if *kind == 7 && payload.get(4..8) == Some(&[0; 4]) {
+            return true;
+        }
+        rest = payload.get(length..).unwrap_or_default();
+    }
+    false
+}
+
+/// Handshakes have no deadline here, so only the full server closes connections.
+async fn small_server(connections: usize) -> Server {
+    let patient = Duration::from_secs(1000);
+    let limits = |config| Config {
+        connections,
+        handshake_timeout: patient,
+        first_request_timeout: patient,
+        keepalive_interval: patient,
+        ..config
+    };
+    Server::start_with(limits).await
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn full_server_closes_connections_without_a_request() {
+    let server = small_server(4).await;
+    let mut occupants = Vec::new();
+    for bytes in [&b""[..], b"P", HELLO, HELLO] {
+        occupants.push(connect(&server, bytes).await);
+    }
+    let mut clients = Vec::new();
+    for _ in 0..4 {
+        let mut client = SceneServiceClient::new(server.channel().await);
+        with_timeout(client.list_scenes(v1::ListScenesRequest {})).await.expect("expected an answer");
+        clients.push(client);
+    }
+    for occupant in occupants {
+        read_to_end(occupant).await;
+    }
+    // The clients that have sent a request have remained.
+    for mut client in clients {
+        with_timeout(client.list_scenes(v1::ListScenesRequest {})).await.expect("expected an open connection");
+    }
+}
+
+/// A stream protects its connection. Idle connections get GOAWAY, and the writer continues.
+#[tokio::test(flavor = "multi_thread")]
+async fn full_server_keeps_connections_with_a_stream() {
+    let server = small_server(2).await;
+    let opener = SceneServiceClient::new(server.channel().await);
+    let open = v1::OpenSceneRequest { source: "strips".into(), scene: String::new() };
+    with_timeout(opener.clone().open_scene(open)).await.expect("expected the scene to open");
+    let mut writer = StepWriter::connect(server.channel().await).await;
+    writer.open("strips", Delivery::Lossless, DEFAULT_WINDOW).await;
+    writer.send_step_and_wait(step(0, &[0], &[0.1, 0.2])).await;
+    for number in 1..=8 {
+        let mut client = SceneServiceClient::new(server.channel().await);
+        with_timeout(client.list_scenes(v1::ListScenesRequest {})).await.expect("expected an answer");
+        writer.send_step_and_wait(step(number, &[0], &[0.1, 0.2])).await;
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn connection_without_a_request_gets_goaway_in_time() {
+    let first_request_timeout = Duration::from_millis(60);
+    let server = Server::start_with(|config| Config { first_request_timeout, ..config }).await;
+    server.open("strips").await;
+    let mut writer = server.drive_lossless("strips").await;
+    assert!(contains_goaway(&read_to_end(connect(&server, HELLO).await).await));
+    writer.send_step_and_wait(step(1, &[0], &[0.1, 0.2])).await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn other_protocols_are_closed_at_once() {
+    let server = small_server(4).await;
+    assert_eq!(read_to_end(connect(&server, b"GET / HTTP/1.1\r\n\r\n").await).await, b"");
+}

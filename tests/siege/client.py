@@ -1,0 +1,78 @@
+"""A well-behaved client, and the times that it sees."""
+
+import sys
+import time
+from pathlib import Path
+
+import grpc
+
+# The modules that `deploy/prove` generates from the contract.
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / ".tools/siege/proto"))
+
+from modalcast.v1 import (  # noqa: E402
+    common_pb2,
+    frames_pb2,
+    frames_pb2_grpc,
+    scenes_pb2,
+    scenes_pb2_grpc,
+    steps_pb2,
+    steps_pb2_grpc,
+    vertices_pb2,
+    vertices_pb2_grpc,
+)
+
+__all__ = ["common_pb2", "frames_pb2", "scenes_pb2", "steps_pb2", "vertices_pb2"]
+
+LIST_SCENES = "/modalcast.v1.SceneService/ListScenes"
+DESCRIBE_SCENE = "/modalcast.v1.SceneService/DescribeScene"
+OPEN_SCENE = "/modalcast.v1.SceneService/OpenScene"
+DRIVE_SCENE = "/modalcast.v1.StepService/DriveScene"
+RENDER_FRAME = "/modalcast.v1.FrameService/RenderFrame"
+GET_VERTICES = "/modalcast.v1.VertexService/GetVertices"
+HEALTH_WATCH = "/grpc.health.v1.Health/Watch"
+
+
+class Client:
+    """A connection of its own."""
+
+    def __init__(self, server):
+        options = [("grpc.use_local_subchannel_pool", 1), ("grpc.max_receive_message_length", 64 << 20)]
+        self.channel = grpc.insecure_channel(server.address, options)
+        self.scenes = scenes_pb2_grpc.SceneServiceStub(self.channel)
+        self.steps = steps_pb2_grpc.StepServiceStub(self.channel)
+        self.frames = frames_pb2_grpc.FrameServiceStub(self.channel)
+        self.vertices = vertices_pb2_grpc.VertexServiceStub(self.channel)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.channel.close()
+
+    def open_scene(self, source, name="", timeout=30):
+        request = scenes_pb2.OpenSceneRequest(source=source, scene=name)
+        return self.scenes.OpenScene(request, timeout=timeout).scene
+
+
+def time_to_serve(server, timeout):
+    """Seconds until a new client has connected and has the list of scenes. `timeout` if it takes longer."""
+    start = time.monotonic()
+    while (remaining := start + timeout - time.monotonic()) > 0:
+        with Client(server) as client:
+            try:
+                client.scenes.ListScenes(scenes_pb2.ListScenesRequest(), timeout=remaining, wait_for_ready=True)
+                return time.monotonic() - start
+            except grpc.RpcError:
+                # The connection was closed before its first request was received. A client tries again.
+                time.sleep(0.01)
+    return timeout
+
+
+def slowest_service(server, seconds, timeout, pause=0.2):
+    """The longest `time_to_serve` of clients that arrive one after another for a time."""
+    deadline = time.monotonic() + seconds
+    slowest = 0.0
+    while time.monotonic() < deadline:
+        slowest = max(slowest, time_to_serve(server, timeout))
+        time.sleep(pause)
+    return slowest

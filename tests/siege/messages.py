@@ -1,0 +1,85 @@
+"""Item 2: half-sent messages hold a bounded number of bytes, for a bounded time."""
+
+import threading
+
+import http2
+from client import LIST_SCENES, slowest_service, time_to_serve
+from report import Result, mb
+from server import Peak, Server
+
+ITEM = 2
+
+# Each of so many connections opens so many calls, which claim a message of so many bytes and send a part of it.
+CONNECTIONS = 4
+CALLS = 128
+CLAIMED_BYTES = 16 << 20
+SENT_BYTES = (2 << 20) - 4096
+
+# Limits on the growth in bytes: of the memory and of the address space during the attack, and of the memory after it.
+ASKED_PEAK = 256 << 20
+ASKED_ADDRESSES = 1 << 30
+ASKED_REST = 32 << 20
+
+# Seconds within which a new client must be served.
+ASKED_SERVICE = 1.0
+
+# Seconds after which the server ends a message without progress.
+MESSAGE_TIMEOUT = 10
+
+# Flags that raise the budgets to their largest values.
+UNLIMITED = ["--connection-receive-bytes", "4000000000", "--receive-bytes", "4000000000"]
+
+
+def send_half(connection):
+    """Opens calls and sends a part of a message on each, until the server closes the connection."""
+    part = http2.grpc_message(bytes(SENT_BYTES), CLAIMED_BYTES)
+    try:
+        for _ in range(CALLS):
+            connection.send_data(connection.open_call(LIST_SCENES), part)
+        # Read the errors, so that the server can send them.
+        connection.receive(MESSAGE_TIMEOUT + 5)
+    except OSError:
+        pass
+
+
+def attack(program, flags):
+    """Growth of memory and address space during the attack, growth of memory after it, and the slowest service."""
+    with Server(program, *flags) as server:
+        for _ in range(3):
+            time_to_serve(server, 10)
+        memory, addresses = Peak(server.memory), Peak(lambda: server.memory("VmSize"))
+        attackers = [http2.Connection(server.port) for _ in range(CONNECTIONS)]
+        threads = [threading.Thread(target=send_half, args=[attacker]) for attacker in attackers]
+        for thread in threads:
+            thread.start()
+        slowest = 0.0
+        while any(thread.is_alive() for thread in threads):
+            slowest = max(slowest, slowest_service(server, 0.1, 5, pause=0.02))
+            memory.sample()
+            addresses.sample()
+        peaks = memory.growth(), addresses.growth()
+        # The attackers are still connected. Their messages have ended.
+        rest = server.memory() - memory.first
+        for attacker in attackers:
+            attacker.close()
+        return *peaks, rest, slowest
+
+
+def run(program):
+    peak, addresses, rest, slowest = attack(program, [])
+    control, _, _, _ = attack(program, UNLIMITED)
+    return [
+        Result(
+            ITEM,
+            f"{CONNECTIONS * CALLS} half-sent messages of {mb(CLAIMED_BYTES)} use bounded memory, and it is given back",
+            f"memory +{mb(ASKED_PEAK)}, after {MESSAGE_TIMEOUT + 5} s +{mb(ASKED_REST)}, "
+            f"address space +{mb(ASKED_ADDRESSES)}, new client served within {ASKED_SERVICE:.0f} s",
+            f"+{mb(peak)}, then +{mb(rest)}, address space +{mb(addresses)}, served within {slowest:.2f} s",
+            peak <= ASKED_PEAK
+            and rest <= ASKED_REST
+            and addresses <= ASKED_ADDRESSES
+            and slowest <= ASKED_SERVICE,
+            f"with the largest budgets +{mb(control)}",
+            control > ASKED_PEAK,
+        )
+    ]

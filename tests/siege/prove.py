@@ -1,0 +1,53 @@
+"""Runs the attacks and prints one line per item."""
+
+import argparse
+import importlib
+import sys
+import time
+from pathlib import Path
+
+from report import Result
+
+# The checks of each item, and its subject. An item without checks is not claimed.
+ITEMS = {
+    1: ("connections", "connections without a request"),
+    2: ("messages", "half-sent messages"),
+    3: (None, "budgets of memory per scene and in total, reserved before decoding"),
+    4: (None, "replies that nobody reads"),
+    5: (None, "SIGTERM ends the server within 10 s"),
+    6: (None, "slow loads do not block other clients or the start"),
+    7: (None, "state on disk survives damage and power loss"),
+    8: (None, "a large frame does not delay other clients"),
+    9: (None, "the renderer gives memory back"),
+    10: (None, "unread replies to steps"),
+    11: (None, "quotas of scenes, uploads and disk"),
+    12: (None, "floods of control frames, log records, names in errors"),
+    13: (None, "panics, endless kernels and lost devices"),
+    14: (None, "HTTP/1, WebSocket and recordings"),
+    15: (None, "fuzzing"),
+    16: (None, "soak"),
+}
+
+
+def main():
+    parser = argparse.ArgumentParser(prog="deploy/prove", description="Attacks a server and checks what it promises.")
+    parser.add_argument("--program", type=Path, required=True, help="the server, `modalcast`")
+    parser.add_argument("--items", type=int, nargs="*", default=sorted(ITEMS), help="numbers of the items to check")
+    arguments = parser.parse_args()
+    is_good = True
+    for item in sorted(set(arguments.items) & set(ITEMS)):
+        module, subject = ITEMS[item]
+        if module is None:
+            print(f"{item:2}. not claimed: {subject}", flush=True)
+            continue
+        start = time.monotonic()
+        results: list[Result] = importlib.import_module(module).run(arguments.program.resolve())
+        for result in results:
+            is_good &= result.is_good()
+            print(result.line(), flush=True)
+        print(f"      took {time.monotonic() - start:.0f} s", flush=True)
+    sys.exit(0 if is_good else 1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,34 @@
+"""Results of the checks."""
+
+import dataclasses
+
+
+@dataclasses.dataclass
+class Result:
+    """One line of the report."""
+
+    item: int
+    promise: str
+    asked: str
+    reached: str
+    passed: bool
+    # What the same check found where it must fail.
+    control: str
+    control_failed: bool
+
+    def is_good(self):
+        return self.passed and self.control_failed
+
+    def line(self):
+        verdict = "pass" if self.passed else "FAIL"
+        control = "fails, as it must" if self.control_failed else "PASSES, so the check proves nothing"
+        return (
+            f"{self.item:2}. {verdict}  {self.promise}\n"
+            f"      asked: {self.asked}\n"
+            f"      reached: {self.reached}\n"
+            f"      control: {self.control}: {control}"
+        )
+
+
+def mb(count):
+    return f"{count / 1e6:.0f} MB"

@@ -1,0 +1,98 @@
+"""A server process under test, and its resources."""
+
+import os
+import resource
+import signal
+import subprocess
+import tempfile
+import time
+from pathlib import Path
+
+CLOCK_TICKS = os.sysconf("SC_CLK_TCK")
+
+# Enough for all sockets of the largest attack.
+resource.setrlimit(resource.RLIMIT_NOFILE, (resource.getrlimit(resource.RLIMIT_NOFILE)[1],) * 2)
+
+
+class Server:
+    """`modalcast serve` on a free port, with an empty state folder. It is killed when the `with` block ends."""
+
+    def __init__(self, program, *flags, scenes=None, renderer="off", prefix=()):
+        self.folder = tempfile.TemporaryDirectory(prefix="modalcast-siege-")
+        self.state = Path(self.folder.name) / "state"
+        self.log_path = Path(self.folder.name) / "log"
+        command = [*prefix, str(program), "serve", "--listen", "127.0.0.1:0", "--backend", "cpu"]
+        command += ["--renderer", renderer, "--state", str(self.state)]
+        command += ["--scenes", str(scenes)] if scenes else []
+        self.process = subprocess.Popen(
+            [*command, *flags], stdout=subprocess.PIPE, stderr=self.log_path.open("w"), text=True
+        )
+        line = self.process.stdout.readline()
+        if not line.startswith("listening on http://"):
+            raise RuntimeError(f"expected the address of the server, got {line!r}: {self.log()}")
+        self.address = line.strip().removeprefix("listening on http://")
+        self.port = int(self.address.rsplit(":", 1)[1])
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.process.kill()
+        self.process.wait()
+        self.folder.cleanup()
+
+    def log(self):
+        return self.log_path.read_text()
+
+    def is_running(self):
+        return self.process.poll() is None
+
+    def memory(self, key="VmRSS"):
+        """A number of /proc/PID/status, in bytes."""
+        for line in Path(f"/proc/{self.process.pid}/status").read_text().splitlines():
+            if line.startswith(key + ":"):
+                return 1024 * int(line.split()[1])
+        raise KeyError(key)
+
+    def cpu_seconds(self):
+        fields = Path(f"/proc/{self.process.pid}/stat").read_text().rsplit(")", 1)[1].split()
+        return (int(fields[11]) + int(fields[12])) / CLOCK_TICKS
+
+    def threads(self):
+        return len(os.listdir(f"/proc/{self.process.pid}/task"))
+
+    def sockets(self):
+        folder = f"/proc/{self.process.pid}/fd"
+        links = []
+        for name in os.listdir(folder):
+            try:
+                links.append(os.readlink(f"{folder}/{name}"))
+            except FileNotFoundError:
+                pass
+        return sum(link.startswith("socket:") for link in links)
+
+    def terminate(self, timeout):
+        """Sends SIGTERM. Returns the seconds until the end and the exit code, or None if it is still running."""
+        start = time.monotonic()
+        self.process.send_signal(signal.SIGTERM)
+        try:
+            code = self.process.wait(timeout)
+        except subprocess.TimeoutExpired:
+            return timeout, None
+        return time.monotonic() - start, code
+
+
+class Peak:
+    """The highest value of a function, sampled by `sample`."""
+
+    def __init__(self, function):
+        self.function = function
+        self.first = function()
+        self.highest = self.first
+
+    def sample(self):
+        self.highest = max(self.highest, self.function())
+        return self.highest
+
+    def growth(self):
+        return self.sample() - self.first
