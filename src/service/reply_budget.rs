@@ -2,7 +2,9 @@
 //!
 //! A message counts from the moment when it is queued until HTTP/2 has written its last byte to the socket. A sender
 //! without budget waits. The wait is bounded: a call whose client takes no bytes for the reply timeout ends as soon as
-//! another sender waits for the same budget, and its connection is closed if that does not free the bytes.
+//! another sender waits for the same budget, and its connection is closed if that does not free the bytes. If the total
+//! is exhausted, a connection that holds more than its share and takes nothing for a shorter time is closed, so that a
+//! few connections do not delay all others.
 
 use std::collections::{HashMap, VecDeque};
 use std::pin::Pin;
@@ -25,6 +27,16 @@ use modalcast_model::error::Error;
 /// Multiple of the reply timeout after which a connection with unsent bytes of an ended call is closed when others wait,
 /// although another call of it makes progress.
 const MAX_STALL: u32 = 3;
+
+/// How often a sender that waits for the total searches for connections to close.
+const EVICTION_INTERVAL: Duration = Duration::from_millis(200);
+
+/// Time without progress after which a connection above its share is closed when the total is exhausted.
+const EVICTION_STALL: Duration = Duration::from_millis(400);
+
+/// A connection that holds at most so many bytes is not above its share. One call never holds more: two messages of 1 MiB
+/// in its queue and two in HTTP/2.
+const MIN_SHARE: usize = 4 << 20;
 
 /// The budget of all connections.
 #[derive(Debug)]
@@ -50,6 +62,9 @@ pub(super) struct ConnectionReplyBudget {
     /// Key in `ReplyBudget::connections`.
     id: u64,
     share: Share,
+    /// Held by the sender that waits for the total. One sender per connection waits there, so that connections with many
+    /// calls do not delay the others.
+    turn: tokio::sync::Mutex<()>,
     close: Arc<Notify>,
     calls: Registry<CallReplies>,
 }
@@ -156,21 +171,75 @@ impl ReplyBudget {
     /// The budget of a new connection, which `close` closes.
     pub(super) fn new_connection(self: &Arc<Self>, close: Arc<Notify>) -> Arc<ConnectionReplyBudget> {
         let (total, share) = (Arc::clone(self), Share::new(self.max_connection_bytes));
-        let calls = Registry::new();
-        self.connections.insert(|id| ConnectionReplyBudget { total, id, share, close, calls })
+        let (turn, calls) = (tokio::sync::Mutex::default(), Registry::new());
+        self.connections.insert(|id| ConnectionReplyBudget { total, id, share, turn, close, calls })
     }
 
-    /// How often a waiting sender searches for stalled calls.
+    /// How often a sender that waits for its connection searches for stalled calls.
     fn search_interval(&self) -> Duration {
         self.reply_timeout / 4
     }
 
-    /// Ends the stalled calls of all connections.
-    fn end_stalled_calls(&self) {
-        let connections = self.connections.search(self.search_interval() / 2);
-        let calls: Vec<_> = connections.iter().flat_map(|connection| connection.calls.search(Duration::ZERO)).collect();
-        end_stalled(&calls, self.reply_timeout, Some(MAX_STALL * self.reply_timeout));
+    /// How often a sender that waits for the total searches for stalled calls and connections.
+    fn total_search_interval(&self) -> Duration {
+        EVICTION_INTERVAL.min(self.search_interval())
     }
+
+    /// Ends the stalled calls of all connections, and closes stalled connections above their share.
+    fn relieve(&self) {
+        let connections = self.connections.search(self.total_search_interval() / 2);
+        let calls_of = |connection: &Arc<ConnectionReplyBudget>| connection.calls.search(Duration::ZERO);
+        let calls: Vec<_> = connections.iter().map(calls_of).collect();
+        let loads: Vec<_> = calls.iter().map(|calls| Load::of(calls)).collect();
+        for index in find_connections_above_share(&loads, self.share.max_bytes, EVICTION_STALL) {
+            let unsent_bytes = loads[index].unsent_bytes;
+            tracing::warn!(
+                unsent_bytes,
+                "a connection that reads nothing is closed, because the reply budget is exhausted"
+            );
+            connections[index].close.notify_one();
+        }
+        end_stalled(&calls.concat(), self.reply_timeout, Some(MAX_STALL * self.reply_timeout));
+    }
+}
+
+/// The unsent bytes of a connection.
+#[derive(Debug, Clone, Copy)]
+struct Load {
+    unsent_bytes: usize,
+    /// Time since bytes of any call were last sent.
+    stall: Duration,
+}
+
+impl Load {
+    fn of(calls: &[Arc<CallReplies>]) -> Self {
+        let mut load = Self { unsent_bytes: 0, stall: Duration::MAX };
+        for call in calls {
+            let progress = lock(&call.progress);
+            if progress.unsent_bytes > 0 {
+                load.unsent_bytes += progress.unsent_bytes;
+                load.stall = load.stall.min(progress.last_change.elapsed());
+            }
+        }
+        load
+    }
+}
+
+/// The stalled connections that hold more than an equal share of the total, beginning with the largest, until they hold
+/// a quarter of the total together. The connection that waits counts for the shares, too.
+fn find_connections_above_share(loads: &[Load], max_bytes: usize, stall: Duration) -> Vec<usize> {
+    let holders = loads.iter().filter(|load| load.unsent_bytes > 0).count();
+    let share = MIN_SHARE.max(max_bytes / (holders + 1));
+    let is_above_share = |index: &usize| loads[*index].unsent_bytes > share && loads[*index].stall >= stall;
+    let mut found: Vec<usize> = (0..loads.len()).filter(is_above_share).collect();
+    found.sort_by_key(|index| std::cmp::Reverse(loads[*index].unsent_bytes));
+    let mut freed_bytes = 0;
+    found.retain(|index| {
+        let is_needed = freed_bytes < max_bytes / 4;
+        freed_bytes += loads[*index].unsent_bytes;
+        is_needed
+    });
+    found
 }
 
 impl ConnectionReplyBudget {
@@ -207,7 +276,9 @@ impl CallReplies {
         let interval = total.search_interval();
         let end_own = || connection.end_stalled_calls(interval / 2);
         let of_connection = connection.share.acquire(permits, interval, end_own).await?;
-        let of_total = total.share.acquire(permits, interval, || total.end_stalled_calls()).await?;
+        let turn = connection.turn.lock().await;
+        let of_total = total.share.acquire(permits, total.total_search_interval(), || total.relieve()).await?;
+        drop(turn);
         let mut progress = lock(&self.progress);
         if progress.unsent_bytes == 0 {
             progress.last_change = Instant::now();
@@ -437,6 +508,21 @@ mod tests {
         let other = with_timeout(other_call.acquire(40)).await.expect("expected capacity");
         drop((large, other));
         assert_eq!(budget.share.permits.available_permits(), 100);
+    }
+
+    #[test]
+    fn largest_stalled_connections_above_their_share_are_found() {
+        const MIB: usize = 1 << 20;
+        let load = |mib: usize, stall: u64| Load { unsent_bytes: mib * MIB, stall: Duration::from_secs(stall) };
+        let find = |loads: &[Load]| find_connections_above_share(loads, 256 * MIB, Duration::from_secs(1));
+        // The share is 64 MiB for three holders and the connection that waits. Idle connections do not count.
+        assert_eq!(find(&[load(70, 2), load(90, 0), load(80, 2), load(0, 9)]), [2]);
+        assert_eq!(find(&[load(64, 9), load(63, 9), load(90, 0), load(0, 9)]), [0; 0]);
+        assert_eq!(find(&[load(128, 9), load(128, 9)]), [0]);
+        // A connection with one call is never above its share.
+        assert_eq!(find(&vec![load(4, 9); 100]), [0; 0]);
+        let many = [vec![load(3, 9); 60], vec![load(40, 9); 3]].concat();
+        assert_eq!(find(&many), [60, 61]);
     }
 
     /// A call that takes nothing ends when another connection waits, and its connection is closed if that frees nothing.

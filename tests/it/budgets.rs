@@ -210,6 +210,24 @@ async fn slow_readers_share_the_reply_budget_without_deadlock() {
     assert!(ended > 0, "expected an unread call to end");
 }
 
+/// Two connections hold the whole budget and read nothing. The reply timeout is too long to help a third one, so one of the
+/// two is closed.
+#[tokio::test(flavor = "multi_thread")]
+async fn connection_above_its_share_is_closed_when_others_wait() {
+    let (connection_reply_bytes, reply_bytes) = (6 << 20, 12 << 20);
+    let reply_timeout = Duration::from_secs(1000);
+    let limits = |config| Config { reply_bytes, connection_reply_bytes, reply_timeout, ..config };
+    let server = Server::start_with(limits).await;
+    server.open("sheet").await;
+    let mut unread_calls = Vec::new();
+    for _ in 0..2 {
+        unread_calls.extend(open_unread_calls(&small_windows(&server.address).await, "sheet", 3).await);
+    }
+    let channel = small_windows(&server.address).await;
+    with_timeout(read_description(channel, "sheet", Duration::ZERO)).await.expect("expected a description");
+    drop(unread_calls);
+}
+
 /// Three unread calls of 4.3 MB of modes use the budget of their connection: each holds two messages of 1 MiB in its queue
 /// and two in HTTP/2. When a fourth call waits, they end with a reason, and the fourth call gets the bytes of the queues.
 #[tokio::test(flavor = "multi_thread")]

@@ -13,7 +13,7 @@ ITEMS = {
     1: ("connections", "connections without a request"),
     2: ("messages", "half-sent messages"),
     3: (None, "budgets of memory per scene and in total, reserved before decoding"),
-    4: (None, "replies that nobody reads"),
+    4: ("replies", "replies that nobody reads"),
     5: (None, "SIGTERM ends the server within 10 s"),
     6: (None, "slow loads do not block other clients or the start"),
     7: (None, "state on disk survives damage and power loss"),
