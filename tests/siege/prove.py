@@ -19,7 +19,7 @@ ITEMS = {
     7: (None, "state on disk survives damage and power loss"),
     8: (None, "a large frame does not delay other clients"),
     9: (None, "the renderer gives memory back"),
-    10: (None, "unread replies to steps"),
+    10: ("small_steps", "unread replies to steps"),
     11: (None, "quotas of scenes, uploads and disk"),
     12: (None, "floods of control frames, log records, names in errors"),
     13: (None, "panics, endless kernels and lost devices"),
