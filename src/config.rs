@@ -169,7 +169,7 @@ impl Default for Config {
             max_subscribers: 32,
             max_pending_requests: 64,
             stall_timeout: Duration::from_secs(30),
-            drain_timeout: Duration::from_secs(10),
+            drain_timeout: Duration::from_secs(8),
             connections: 1024,
             handshake_timeout: Duration::from_secs(5),
             first_request_timeout: Duration::from_secs(30),

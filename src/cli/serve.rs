@@ -4,10 +4,12 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
+use tokio::signal::unix::{Signal, SignalKind, signal};
+
 use super::{Outcome, print_line};
 use crate::config::{BackendChoice, Config, ListenAddress, RendererChoice, ValidatedConfig};
 use crate::engine::{Engine, EngineInfo};
-use crate::service;
+use crate::service::{self, Listener};
 use modalcast_model::error::{Result, fault_in};
 use modalcast_model::load::SceneRepository;
 
@@ -126,11 +128,23 @@ impl Args {
 pub(super) fn run(args: &Args) -> Outcome {
     let config = args.config()?;
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().map_err(fault_in("serve"))?;
-    runtime.block_on(serve(config))?;
-    Ok(true)
+    let result = runtime.block_on(serve(config));
+    // A scene that is being read or a frame that is being drawn must not delay the exit. The state is on disk.
+    runtime.shutdown_background();
+    result.map(|()| true)
 }
 
 async fn serve(config: ValidatedConfig) -> Result<()> {
+    let mut signals = TerminationSignals::install()?;
+    let (engine, listener) = tokio::select! {
+        started = start(config) => started?,
+        () = signals.received() => return Ok(()),
+    };
+    service::serve(engine, listener, async move { signals.received().await }).await
+}
+
+/// Opens the devices and the scenes, and prints the addresses.
+async fn start(config: ValidatedConfig) -> Result<(Engine, Listener)> {
     let repository = Arc::new(SceneRepository::new(config.scenes.as_deref())?);
     // Bind before scenes are loaded, so that a second server on the same address fails immediately.
     let listener = service::bind(&config).await?;
@@ -142,7 +156,7 @@ async fn serve(config: ValidatedConfig) -> Result<()> {
     for url in listener.urls() {
         print_line(format!("listening on {url}"));
     }
-    service::serve(engine, listener, shutdown_signal()).await
+    Ok((engine, listener))
 }
 
 /// Logs the backend and the renderer. Warns about a software renderer.
@@ -155,20 +169,23 @@ fn log_devices(info: &EngineInfo) {
     }
 }
 
-/// Waits for Ctrl-C or SIGTERM.
-async fn shutdown_signal() {
-    let interrupt = tokio::signal::ctrl_c();
-    match tokio::signal::unix::signal(tokio::signal::unix::SignalKind::terminate()) {
-        Ok(mut terminate) => {
-            tokio::select! {
-                _ = interrupt => {}
-                _ = terminate.recv() => {}
-            }
-        }
-        Err(error) => {
-            tracing::warn!("SIGTERM cannot be handled: {error}");
-            // If Ctrl-C cannot be handled either, this returns immediately and the server stops.
-            interrupt.await.ok();
+/// Ctrl-C and SIGTERM. Signals that arrive after the installation and before a call of [`Self::received`] are not lost.
+struct TerminationSignals {
+    interrupt: Signal,
+    terminate: Signal,
+}
+
+impl TerminationSignals {
+    fn install() -> Result<Self> {
+        let install = |kind| signal(kind).map_err(fault_in("signal handlers"));
+        Ok(Self { interrupt: install(SignalKind::interrupt())?, terminate: install(SignalKind::terminate())? })
+    }
+
+    /// Waits for one of the signals.
+    async fn received(&mut self) {
+        tokio::select! {
+            _ = self.interrupt.recv() => {}
+            _ = self.terminate.recv() => {}
         }
     }
 }

@@ -386,3 +386,16 @@ async fn killed_server_keeps_scenes_steps_and_runs() {
         }
     }
 }
+
+/// A signal that arrives as soon as the server has printed its address is not lost, and the exit code is 0.
+#[test]
+fn sigterm_after_the_start_is_a_clean_exit() {
+    let folder = tempfile::tempdir().expect("expected a temporary folder");
+    for _ in 0..3 {
+        let mut server = ServerProcess::start(folder.path());
+        let process = rustix::process::Pid::from_child(&server.process);
+        rustix::process::kill_process(process, rustix::process::Signal::TERM).expect("expected a process");
+        let status = server.process.wait().expect("expected an exit status");
+        assert!(status.success(), "{status}");
+    }
+}
