@@ -99,6 +99,9 @@ pub struct Config {
     pub chunk_bytes: usize,
     /// The largest image side in pixels.
     pub frame_side: u32,
+    /// Limit on the pixels of one connection in single frames that are not sent completely, and in its frame streams, which
+    /// count separately. A further single frame waits, and a further stream is rejected.
+    pub connection_pixels: u32,
     /// Limit on open scenes.
     pub open_scenes: usize,
     /// Default window of a step stream: the maximum number of steps without acknowledgment.
@@ -158,6 +161,7 @@ impl Default for Config {
             reply_timeout: Duration::from_secs(10),
             chunk_bytes: 1 << 20,
             frame_side: 8192,
+            connection_pixels: 8192 * 8192,
             open_scenes: 16,
             window: 8,
             max_window: 256,
@@ -212,6 +216,8 @@ impl Config {
         check_range("reply_timeout (ms)", ms(self.reply_timeout), 4, HOUR_MS)?;
         check_range("chunk_bytes", self.chunk_bytes as u64, 1 << 10, 1 << 20)?;
         check_range("frame_side", self.frame_side.into(), 1, 16384)?;
+        let frame_pixels = u64::from(self.frame_side).pow(2);
+        check_range("connection_pixels", self.connection_pixels.into(), frame_pixels, max_budget)?;
         check_range("open_scenes", self.open_scenes as u64, 1, 4096)?;
         check_range("max_window", self.max_window.into(), 1, 65536)?;
         check_range("window", self.window.into(), 1, self.max_window.into())?;

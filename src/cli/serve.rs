@@ -73,6 +73,10 @@ pub(super) struct Args {
     /// Largest side of a frame, in pixels.
     #[arg(long, default_value_t = Config::default().frame_side)]
     frame_side: u32,
+    /// Limit on the pixels of one connection in single frames that are drawn or sent, and in its frame streams. Default:
+    /// 8192 x 8192, and at least the largest frame.
+    #[arg(long)]
+    connection_pixels: Option<u32>,
     /// Limit on open scenes.
     #[arg(long, default_value_t = Config::default().open_scenes)]
     open_scenes: usize,
@@ -113,6 +117,9 @@ impl Args {
             reply_bytes: self.reply_bytes,
             reply_timeout: Duration::from_millis(self.reply_timeout_ms),
             frame_side: self.frame_side,
+            connection_pixels: self
+                .connection_pixels
+                .unwrap_or_else(|| defaults.connection_pixels.max(self.frame_side.saturating_pow(2))),
             open_scenes: self.open_scenes,
             window: self.window,
             // The default window must not exceed the largest window that a client may request.

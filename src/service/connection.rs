@@ -8,7 +8,7 @@ use super::connection_table::{Activity, ConnectionSlot};
 use super::receive_budget::{ConnectionReceiveBudget, ReceiveBudget};
 use super::reply_budget::{ConnectionReplyBudget, ReplyBudget};
 use crate::config::Config;
-use modalcast_model::error::{Error, Result};
+use modalcast_model::error::{Error, Result, fault, fault_in};
 
 /// Ratio of the HTTP/2 flow-control windows of a connection and a stream. It is far above the number of streams, because
 /// the window of the connection also limits small frames, see [`MAX_DRIVES`].
@@ -26,11 +26,16 @@ pub(super) const MAX_DRIVES: usize = 4;
 pub(super) struct Budgets {
     receive: Arc<ReceiveBudget>,
     reply: Arc<ReplyBudget>,
+    max_connection_pixels: u32,
 }
 
 impl Budgets {
     pub(super) fn new(config: &Config) -> Self {
-        Self { receive: ReceiveBudget::new(config), reply: ReplyBudget::new(config) }
+        Self {
+            receive: ReceiveBudget::new(config),
+            reply: ReplyBudget::new(config),
+            max_connection_pixels: config.connection_pixels,
+        }
     }
 }
 
@@ -40,16 +45,32 @@ pub(super) struct ConnectionInfo {
     /// Never sent to another client.
     peer: Arc<str>,
     drive_permits: Arc<Semaphore>,
+    /// One permit per pixel, of single frames and of frame streams.
+    frame_pixels: Arc<Semaphore>,
+    stream_pixels: Arc<Semaphore>,
+    max_pixels: u32,
     pub(super) receive: Arc<ConnectionReceiveBudget>,
     pub(super) reply: Arc<ConnectionReplyBudget>,
     pub(super) activity: Arc<Activity>,
 }
 
 impl ConnectionInfo {
+    /// The connection of a request.
+    ///
+    /// # Errors
+    /// `Fault` when the request did not arrive on a connection of this server.
+    pub(super) fn of<T>(request: &tonic::Request<T>) -> Result<Self> {
+        let connection = request.extensions().get::<Self>().cloned();
+        connection.ok_or_else(|| fault("connection", "expected a connection of this server, got none"))
+    }
+
     pub(super) fn new(peer: String, budgets: &Budgets, slot: &ConnectionSlot) -> Self {
         Self {
             peer: peer.into(),
             drive_permits: Arc::new(Semaphore::new(MAX_DRIVES)),
+            frame_pixels: Arc::new(Semaphore::new(budgets.max_connection_pixels as usize)),
+            stream_pixels: Arc::new(Semaphore::new(budgets.max_connection_pixels as usize)),
+            max_pixels: budgets.max_connection_pixels,
             receive: budgets.receive.new_connection(),
             reply: budgets.reply.new_connection(Arc::clone(&slot.signals.close)),
             activity: Arc::clone(&slot.activity),
@@ -68,5 +89,25 @@ impl ConnectionInfo {
     pub(super) fn acquire_drive(&self) -> Result<OwnedSemaphorePermit> {
         let too_many = |_| Error::LimitReached { objects: "step streams of one connection", limit: MAX_DRIVES };
         Arc::clone(&self.drive_permits).try_acquire_owned().map_err(too_many)
+    }
+
+    /// Waits until the connection may have `pixels` more in single frames, which count until the permit is dropped.
+    ///
+    /// # Errors
+    /// `Fault` when the connection no longer exists.
+    pub(super) async fn acquire_frame_pixels(&self, pixels: u64) -> Result<OwnedSemaphorePermit> {
+        let permits = u32::try_from(pixels).unwrap_or(u32::MAX).min(self.max_pixels);
+        Arc::clone(&self.frame_pixels).acquire_many_owned(permits).await.map_err(fault_in("pixel limit"))
+    }
+
+    /// Counts the pixels of a frame stream until the permit is dropped.
+    ///
+    /// # Errors
+    /// `LimitReached` when the frame streams of the connection have too many pixels.
+    pub(super) fn acquire_stream_pixels(&self, pixels: u64) -> Result<OwnedSemaphorePermit> {
+        let objects = "pixels in the frame streams of one connection";
+        let too_many = Error::LimitReached { objects, limit: self.max_pixels as usize };
+        let permits = u32::try_from(pixels).map_err(|_| too_many.clone())?;
+        Arc::clone(&self.stream_pixels).try_acquire_many_owned(permits).map_err(|_| too_many)
     }
 }

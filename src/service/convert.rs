@@ -202,15 +202,19 @@ pub(super) fn parse_pictures(
         parse_picture(engine, scene, picture).map_err(|error| error.in_message(&format!("pictures[{index}]")))
     };
     let pictures = pictures.into_iter().enumerate().map(parse).collect::<Result<Vec<_>>>()?;
-    let pixel_count =
-        |picture: &RequestedPicture| u64::from(picture.spec.size.width) * u64::from(picture.spec.size.height);
-    let total_pixels: u64 = pictures.iter().map(pixel_count).sum();
+    let total_pixels = count_pixels(&pictures);
     // As many as the largest single picture has, so that several pictures need no more memory than one may need.
     let max_pixels = u64::from(engine.frame_side()).pow(2);
     if total_pixels > max_pixels {
         return Err(invalid("pictures", format!("at most {max_pixels} pixels in total"), total_pixels));
     }
     Ok(pictures)
+}
+
+/// Number of pixels of all pictures together.
+pub(super) fn count_pixels(pictures: &[RequestedPicture]) -> u64 {
+    let of_one = |picture: &RequestedPicture| u64::from(picture.spec.size.width) * u64::from(picture.spec.size.height);
+    pictures.iter().map(of_one).sum()
 }
 
 /// Validates a picture. The field of an error is relative to the picture.

@@ -5,12 +5,14 @@ use std::sync::Arc;
 
 use bytes::Bytes;
 use modalcast_proto::v1;
+use tokio::sync::OwnedSemaphorePermit;
 use tonic::{Request, Response, Status};
 use v1::render_frame_response::Part as SinglePart;
 use v1::stream_frames_response::Part as StreamPart;
 
+use super::connection::ConnectionInfo;
 use super::convert::{
-    RequestedPicture, describe_step_selector, parse_moved_cameras, parse_pictures, parse_step_selector,
+    RequestedPicture, count_pixels, describe_step_selector, parse_moved_cameras, parse_pictures, parse_step_selector,
     parse_stream_delivery, wire_delivery, wire_format, wire_frame_info, wire_picture, wire_stages, wire_step_id,
 };
 use super::picks;
@@ -41,6 +43,7 @@ impl v1::frame_service_server::FrameService for FrameServiceImpl {
         let config = self.engine.config();
         let deadline = Deadline::of_request(request.metadata(), request.get_ref().deadline_ms, config);
         let memory = self.shared_memory.find(request.metadata()).map_err(to_status)?;
+        let connection = ConnectionInfo::of(&request).map_err(to_status)?;
         let request = request.into_inner();
         let scene_handle = self.engine.find(&request.scene).map_err(to_status)?;
         let pictures = parse_pictures(&self.engine, &scene_handle.scene, request.pictures).map_err(to_status)?;
@@ -48,6 +51,7 @@ impl v1::frame_service_server::FrameService for FrameServiceImpl {
         let (max_chunk_bytes, encoder) = (config.chunk_bytes, self.engine.encoder().clone());
         Ok(without_copies(respond(move |reply_sender| async move {
             let work = async {
+                let _pixels = connection.acquire_frame_pixels(count_pixels(&pictures)).await.map_err(to_status)?;
                 let output = scene_handle.request_output(selector, output_spec(&pictures)).await.map_err(to_status)?;
                 let step_pictures = StepPicture::of_output(output).map_err(to_status)?.zip(&pictures);
                 // All pictures are encoded concurrently, and sent in order.
@@ -95,10 +99,12 @@ impl v1::frame_service_server::FrameService for FrameServiceImpl {
     ) -> Result<Response<Self::StreamFramesStream>, Status> {
         let deadline = Deadline::of_stream(request.metadata());
         let memory = self.shared_memory.find(request.metadata()).map_err(to_status)?;
+        let connection = ConnectionInfo::of(&request).map_err(to_status)?;
         let request = request.into_inner();
         let scene_handle = self.engine.find(&request.scene).map_err(to_status)?;
         let pictures = parse_pictures(&self.engine, &scene_handle.scene, request.pictures).map_err(to_status)?;
         let delivery = parse_stream_delivery(request.delivery, request.max_hz).map_err(to_status)?;
+        let pixels = connection.acquire_stream_pixels(count_pixels(&pictures)).map_err(to_status)?;
         // Subscribe before the response headers are sent, so that a client can rely on receiving the next step.
         let subscription = scene_handle.subscribe(output_spec(&pictures), delivery).await.map_err(to_status)?;
         let cameras = subscription.cameras().cloned().ok_or_else(|| to_status(fault("frames", "expected cameras")))?;
@@ -113,6 +119,7 @@ impl v1::frame_service_server::FrameService for FrameServiceImpl {
             max_steps: request.steps,
             memory,
             max_chunk_bytes: self.engine.config().chunk_bytes,
+            _pixels: pixels,
         };
         Ok(without_copies(respond(move |reply_sender| {
             deadline.enforce("the frame stream", frame_stream.run(frames, reply_sender))
@@ -130,6 +137,7 @@ struct FrameStream {
     max_steps: u64,
     memory: CallMemory,
     max_chunk_bytes: usize,
+    _pixels: OwnedSemaphorePermit,
 }
 
 impl FrameStream {

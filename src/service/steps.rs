@@ -17,7 +17,7 @@ use super::status::{to_rejection, to_status, transport_status};
 use super::step_parts::StepAssembler;
 use super::stream::{Deadline, ReplySender, ReplyStream, respond};
 use crate::engine::{Engine, StepReport, WriterSession};
-use modalcast_model::error::{Error, Result, fault};
+use modalcast_model::error::{Error, Result};
 
 /// Maximum number of replies that are buffered for a client that does not read. A further reply ends the stream with an
 /// error.
@@ -40,8 +40,7 @@ impl v1::step_service_server::StepService for StepServiceImpl {
         &self,
         request: Request<Streaming<v1::DriveSceneRequest>>,
     ) -> Result<Response<Self::DriveSceneStream>, Status> {
-        let connection = request.extensions().get::<ConnectionInfo>().cloned();
-        let connection = connection.ok_or_else(|| to_status(fault("connection", "expected its address, got none")))?;
+        let connection = ConnectionInfo::of(&request).map_err(to_status)?;
         let drive_permit = connection.acquire_drive().map_err(to_status)?;
         let deadline = Deadline::of_stream(request.metadata());
         let memory = self.shared_memory.find(request.metadata()).map_err(to_status)?;

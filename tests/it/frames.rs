@@ -1,10 +1,13 @@
 //! Frames over the wire, as single frames and as streams: step, size, format, pixels and deadlines. These tests need an
 //! EGL driver that can render.
 
+use std::time::Duration;
+
 use modalcast::config::{Config, RendererChoice};
 use modalcast_proto::v1;
 use prost::Message as _;
 use tonic::{Code, Status, Streaming};
+use v1::Reason;
 
 use crate::service_harness::{
     MAX_MESSAGE_BYTES, Server, exact_step, minimum_step, rejection_details, step, with_timeout,
@@ -275,4 +278,44 @@ async fn invalid_pictures_and_missed_deadlines_are_errors() {
         stream.message().await
     };
     assert_eq!(with_timeout(result).await.err().map(|status| status.code()), Some(Code::DeadlineExceeded));
+}
+
+/// A connection has a limit on the pixels of its streams and of its single frames. Streams above it are rejected, and
+/// single frames wait.
+#[tokio::test(flavor = "multi_thread")]
+async fn pixels_of_a_connection_are_limited() {
+    let limits =
+        |config| Config { renderer: RendererChoice::Auto, frame_side: 64, connection_pixels: 64 * 64, ..config };
+    let server = Server::start_with(limits).await;
+    server.open("strips").await;
+    let client = server.frames().await;
+    let subscribe = async |width, height| {
+        let pictures = picture_of_size(width, height, v1::Format::Rgba);
+        let delivery = v1::Delivery::Latest.into();
+        let request = v1::StreamFramesRequest { scene: "strips".into(), pictures, delivery, ..Default::default() };
+        with_timeout(client.clone().stream_frames(request)).await.map(tonic::Response::into_inner)
+    };
+    let half = subscribe(64, 32).await.expect("expected a stream");
+    let status = subscribe(64, 33).await.expect_err("expected a rejection");
+    assert_eq!((status.code(), rejection_details(&status).reason()), (Code::ResourceExhausted, Reason::LimitReached));
+    assert!(status.message().contains("4096"), "{status:?}");
+    drop(half);
+    while let Err(status) = subscribe(64, 64).await {
+        assert_eq!(status.code(), Code::ResourceExhausted);
+        tokio::time::sleep(Duration::from_millis(5)).await;
+    }
+    let mut frames = tokio::task::JoinSet::new();
+    for _ in 0..10 {
+        let pictures = picture_of_size(64, 64, v1::Format::Rgba);
+        let mut client = client.clone();
+        frames.spawn(async move {
+            let mut reply =
+                client.render_frame(v1::RenderFrameRequest { pictures, ..rgba_request() }).await?.into_inner();
+            while reply.message().await?.is_some() {}
+            Ok::<_, Status>(())
+        });
+    }
+    while let Some(frame) = with_timeout(frames.join_next()).await {
+        frame.expect("expected no panic").expect("expected a frame");
+    }
 }
