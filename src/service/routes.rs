@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::convert::Infallible;
 use std::sync::Arc;
+use std::time::Duration;
 
 use tonic::body::Body;
 use tonic::codegen::http::{Request, Response};
@@ -14,7 +15,12 @@ use super::connection::ConnectionInfo;
 use super::reply_body::replace_body;
 use super::reply_budget::{CountedReplyBody, ReplyContext};
 use super::request_body::{RequestBody, RequestMemory};
-use super::status::transport_status;
+use super::status::{to_status, transport_status};
+use super::stream::parse_timeout;
+use modalcast_model::error::Error;
+
+/// Time by which a service may exceed the timeout of a call, so that its own error arrives first.
+const TIMEOUT_MARGIN: Duration = Duration::from_millis(20);
 
 type Route = Arc<dyn Fn(Request<Body>) -> BoxFuture<Response<Body>, Infallible> + Send + Sync>;
 
@@ -64,13 +70,31 @@ impl Routes {
                 Ok(Status::unimplemented("expected the path of a service of this server").into_http())
             });
         };
+        let timeout = request.headers().get("grpc-timeout");
+        let timeout = timeout.and_then(|timeout| parse_timeout(timeout.to_str().ok()?));
         let response: BoxFuture<_, _> = match request.extensions().get::<ConnectionInfo>().cloned() {
             Some(connection) => Box::pin(call_within_budgets(route, request, connection)),
             None => route(request),
         };
         let max_message_bytes = self.max_message_bytes;
-        Box::pin(async move { Ok(with_transport_details(response.await?, max_message_bytes)) })
+        Box::pin(async move {
+            let response = answer_in_time(timeout, response).await?;
+            Ok(with_transport_details(response, max_message_bytes))
+        })
     }
+}
+
+/// Awaits a response head for the time in the `grpc-timeout` header. Services that know more about their work enforce it
+/// themselves, with a better message.
+async fn answer_in_time(
+    timeout: Option<Duration>,
+    response: BoxFuture<Response<Body>, Infallible>,
+) -> Result<Response<Body>, Infallible> {
+    let Some(timeout) = timeout else { return response.await };
+    tokio::time::timeout(timeout + TIMEOUT_MARGIN, response).await.unwrap_or_else(|_| {
+        let error = Error::Deadline { what: "a reply".into(), ms: timeout.as_millis() as u64 };
+        Ok(to_status(error).into_http())
+    })
 }
 
 /// Calls a service. Request and response count against the budgets of the connection.
@@ -89,4 +113,43 @@ async fn call_within_budgets(
     let response = context.clone().scope(route(request)).await;
     memory.release_complete();
     response.map(|response| response.map(|inner| Body::new(CountedReplyBody { inner, context, _call: call })))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::task::{Context, Poll};
+
+    use super::*;
+
+    /// Never answers.
+    #[derive(Clone)]
+    struct Silent;
+
+    impl NamedService for Silent {
+        const NAME: &'static str = "silent";
+    }
+
+    impl Service<Request<Body>> for Silent {
+        type Response = Response<Body>;
+        type Error = Infallible;
+        type Future = std::future::Pending<Result<Response<Body>, Infallible>>;
+
+        fn poll_ready(&mut self, _: &mut Context<'_>) -> Poll<Result<(), Infallible>> {
+            Poll::Ready(Ok(()))
+        }
+
+        fn call(&mut self, _: Request<Body>) -> Self::Future {
+            std::future::pending()
+        }
+    }
+
+    #[tokio::test]
+    async fn call_ends_at_its_timeout_though_the_service_does_not_answer() {
+        let request = Request::builder().uri("/silent/Call").header("grpc-timeout", "10m");
+        let response = Routes::new(1).with(Silent).call(request.body(Body::empty()).expect("expected a request"));
+        let response = tokio::time::timeout(Duration::from_secs(60), response).await.expect("expected an answer");
+        let response = response.expect("expected a response");
+        let status = Status::from_header_map(response.headers()).expect("expected a status");
+        assert_eq!(status.code(), Code::DeadlineExceeded);
+    }
 }

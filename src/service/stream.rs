@@ -277,7 +277,7 @@ fn grpc_timeout(metadata: &MetadataMap) -> Option<Duration> {
 }
 
 /// Parses a `grpc-timeout` header: 1 to 8 digits and a unit.
-fn parse_timeout(text: &str) -> Option<Duration> {
+pub(super) fn parse_timeout(text: &str) -> Option<Duration> {
     let (digits, unit) = text.split_at_checked(text.len().checked_sub(1)?)?;
     if digits.is_empty() || digits.len() > 8 || !digits.bytes().all(|digit| digit.is_ascii_digit()) {
         return None;
