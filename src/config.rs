@@ -89,7 +89,8 @@ pub struct Config {
     /// Longest time without progress of an incomplete message. Progress below 32 KiB/s extends it only in part.
     pub message_timeout: Duration,
     /// Limits in bytes on the replies that are produced and not yet sent: on one connection, and in total. Above a limit,
-    /// senders wait.
+    /// senders wait. While the total is exhausted, a connection that holds more than an equal share and takes nothing for
+    /// 0.4 s is closed.
     pub connection_reply_bytes: usize,
     pub reply_bytes: usize,
     /// A call whose client takes less than a message, of at most 1 MiB, within this time ends when another reply waits for

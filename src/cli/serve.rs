@@ -77,6 +77,9 @@ pub(super) struct Args {
     /// 8192 x 8192, and at least the largest frame.
     #[arg(long)]
     connection_pixels: Option<u32>,
+    /// Limit on open connections. Above it, a connection without calls is closed for each new one.
+    #[arg(long, default_value_t = Config::default().connections)]
+    connections: usize,
     /// Limit on open scenes.
     #[arg(long, default_value_t = Config::default().open_scenes)]
     open_scenes: usize,
@@ -120,6 +123,7 @@ impl Args {
             connection_pixels: self
                 .connection_pixels
                 .unwrap_or_else(|| defaults.connection_pixels.max(self.frame_side.saturating_pow(2))),
+            connections: self.connections,
             open_scenes: self.open_scenes,
             window: self.window,
             // The default window must not exceed the largest window that a client may request.

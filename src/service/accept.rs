@@ -18,10 +18,10 @@ use tonic::codegen::http::{Request, Response};
 
 use super::connection::{Budgets, ConnectionInfo, STREAMS_PER_CONNECTION_WINDOW};
 use super::connection_table::{ConnectionSlot, ConnectionTable};
+use super::control_frames::ControlFrameLimit;
 use super::listen::{ListeningSockets, Socket};
 use super::routes::Routes;
 use crate::config::Config;
-use crate::telemetry::LogLimiter;
 
 /// Pause of the listener after a failed accept.
 const ACCEPT_RETRY_DELAY: Duration = Duration::from_millis(50);
@@ -58,7 +58,6 @@ impl ConnectionServer {
 
     /// Accepts connections until this future is dropped.
     pub(super) async fn accept_connections(self: Arc<Self>, sockets: ListeningSockets, table: Arc<ConnectionTable>) {
-        let error_log = LogLimiter::default();
         loop {
             match sockets.accept().await {
                 Ok((socket, peer)) => {
@@ -66,9 +65,7 @@ impl ConnectionServer {
                     tokio::spawn(Arc::clone(&self).serve(socket, peer, slot));
                 }
                 Err(error) => {
-                    if let Some(count) = error_log.record() {
-                        tracing::warn!(count, %error, "connections could not be accepted");
-                    }
+                    tracing::warn!(%error, "a connection could not be accepted");
                     // The file descriptor of another connection may be all that is missing.
                     table.evict();
                     tokio::time::sleep(ACCEPT_RETRY_DELAY).await;
@@ -92,7 +89,7 @@ impl ConnectionServer {
         }
         let info = ConnectionInfo::new(peer, &self.budgets, slot);
         let service = hyper::service::service_fn(|request| self.call(request, &info));
-        let io = TokioIo::new(PrefacedSocket { socket, preface: &PREFACE });
+        let io = TokioIo::new(LimitedSocket { socket, preface: &PREFACE, control_frames: ControlFrameLimit::new() });
         let mut connection = std::pin::pin!(self.http2.serve_connection(io, service));
         tokio::select! {
             result = &mut connection => return log_end(result),
@@ -166,14 +163,24 @@ async fn read_preface(socket: &mut Socket) -> io::Result<bool> {
     Ok(true)
 }
 
-/// A socket whose preface was read before.
-struct PrefacedSocket {
+/// A socket whose preface was read before. Reading fails when the client has sent too many control frames.
+struct LimitedSocket {
     socket: Socket,
     /// The part of the preface that HTTP/2 has not read.
     preface: &'static [u8],
+    control_frames: ControlFrameLimit,
 }
 
-impl AsyncRead for PrefacedSocket {
+impl LimitedSocket {
+    fn count_sent(&mut self, sent: Poll<io::Result<usize>>) -> Poll<io::Result<usize>> {
+        if let Poll::Ready(Ok(bytes)) = sent {
+            self.control_frames.send(bytes);
+        }
+        sent
+    }
+}
+
+impl AsyncRead for LimitedSocket {
     fn poll_read(mut self: Pin<&mut Self>, cx: &mut Context<'_>, buffer: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
         if !self.preface.is_empty() {
             let (now, later) = self.preface.split_at(self.preface.len().min(buffer.remaining()));
@@ -181,13 +188,19 @@ impl AsyncRead for PrefacedSocket {
             self.preface = later;
             return Poll::Ready(Ok(()));
         }
-        self.socket.io().poll_read(cx, buffer)
+        let filled = buffer.filled().len();
+        let result = self.socket.io().poll_read(cx, buffer);
+        match self.control_frames.receive(&buffer.filled()[filled..]) {
+            true => result,
+            false => Poll::Ready(Err(io::Error::other("the client has sent too many control frames"))),
+        }
     }
 }
 
-impl AsyncWrite for PrefacedSocket {
+impl AsyncWrite for LimitedSocket {
     fn poll_write(mut self: Pin<&mut Self>, cx: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
-        self.socket.io().poll_write(cx, bytes)
+        let sent = self.socket.io().poll_write(cx, bytes);
+        self.count_sent(sent)
     }
 
     fn poll_write_vectored(
@@ -195,7 +208,8 @@ impl AsyncWrite for PrefacedSocket {
         cx: &mut Context<'_>,
         slices: &[io::IoSlice<'_>],
     ) -> Poll<io::Result<usize>> {
-        self.socket.io().poll_write_vectored(cx, slices)
+        let sent = self.socket.io().poll_write_vectored(cx, slices);
+        self.count_sent(sent)
     }
 
     fn is_write_vectored(&self) -> bool {

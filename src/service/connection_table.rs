@@ -9,7 +9,6 @@ use std::time::Instant;
 use tokio::sync::Notify;
 
 use crate::engine::lock;
-use crate::telemetry::LogLimiter;
 
 /// Limit on the connections that are being closed and do not count against the limit on connections. Above it, a
 /// connection is closed without GOAWAY, and new connections wait until others have closed.
@@ -22,7 +21,6 @@ pub(super) struct ConnectionTable {
     state: Mutex<State>,
     /// Notified when a connection ends or has no call any more.
     changed: Arc<Notify>,
-    eviction_log: LogLimiter,
 }
 
 #[derive(Debug, Default)]
@@ -83,8 +81,7 @@ pub(super) struct CountedCall {
 
 impl ConnectionTable {
     pub(super) fn new(max_connections: usize) -> Arc<Self> {
-        let eviction_log = LogLimiter::default();
-        Arc::new(Self { max_connections, state: Mutex::default(), changed: Arc::default(), eviction_log })
+        Arc::new(Self { max_connections, state: Mutex::default(), changed: Arc::default() })
     }
 
     /// Adds a connection. If the table is full, closes another one: the oldest of those that have sent no request if they
@@ -102,13 +99,11 @@ impl ConnectionTable {
     fn try_insert(self: &Arc<Self>) -> Option<ConnectionSlot> {
         let mut state = lock(&self.state);
         let open = state.connections.values().filter(|entry| !entry.is_closing).count();
-        if open >= self.max_connections && !state.evict(self.max_new()) {
-            return None;
-        }
-        if open >= self.max_connections
-            && let Some(count) = self.eviction_log.record()
-        {
-            tracing::warn!(count, limit = self.max_connections, "connections without calls are closed for new ones");
+        if open >= self.max_connections {
+            if !state.evict(self.max_new()) {
+                return None;
+            }
+            tracing::warn!(limit = self.max_connections, "a connection without calls is closed for a new one");
         }
         if state.connections.len() >= self.max_connections + MAX_CLOSING {
             return None;

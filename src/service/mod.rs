@@ -4,6 +4,7 @@
 mod accept;
 mod connection;
 mod connection_table;
+mod control_frames;
 mod convert;
 mod describe;
 mod forces;

@@ -39,8 +39,7 @@ ATTACKS = [
 
 
 def attack(program, greeting, answers, total):
-    """The slowest service during an attack, the codes of the GOAWAY frames, and whether a stream survived that was opened
-    before."""
+    """The slowest service during an attack, the codes of the GOAWAY frames, and whether an older stream survived."""
     with Server(program) as server:
         watcher = http2.Connection(server.port)
         watcher.send(call(HEALTH_WATCH).removeprefix(HELLO))

@@ -3,7 +3,6 @@
 import time
 
 import grpc
-
 import http2
 from client import RENDER_FRAME, Client, common_pb2, frames_pb2
 from report import Result, mb

@@ -75,10 +75,7 @@ def run(program):
             f"memory +{mb(ASKED_PEAK)}, after {MESSAGE_TIMEOUT + 5} s +{mb(ASKED_REST)}, "
             f"address space +{mb(ASKED_ADDRESSES)}, new client served within {ASKED_SERVICE:.0f} s",
             f"+{mb(peak)}, then +{mb(rest)}, address space +{mb(addresses)}, served within {slowest:.2f} s",
-            peak <= ASKED_PEAK
-            and rest <= ASKED_REST
-            and addresses <= ASKED_ADDRESSES
-            and slowest <= ASKED_SERVICE,
+            peak <= ASKED_PEAK and rest <= ASKED_REST and addresses <= ASKED_ADDRESSES and slowest <= ASKED_SERVICE,
             f"with the largest budgets +{mb(control)}",
             control > ASKED_PEAK,
         )

@@ -13,7 +13,7 @@ ITEMS = {
     1: ("connections", "connections without a request"),
     2: ("messages", "half-sent messages"),
     3: (None, "budgets of memory per scene and in total, reserved before decoding"),
-    4: ("replies", "replies that nobody reads"),
+    4: ("replies", "unread replies"),
     5: ("shutdown", "SIGTERM ends the server within 10 s"),
     6: (None, "slow loads do not block other clients or the start"),
     7: (None, "state on disk survives damage and power loss"),
@@ -21,11 +21,17 @@ ITEMS = {
     9: (None, "the renderer gives memory back"),
     10: ("small_steps", "unread replies to steps"),
     11: (None, "quotas of scenes, uploads and disk"),
-    12: (None, "floods of control frames, log records, names in errors"),
+    12: ("floods", "floods of control frames, log records, names in errors"),
     13: (None, "panics, endless kernels and lost devices"),
     14: (None, "HTTP/1, WebSocket and recordings"),
     15: (None, "fuzzing"),
     16: (None, "soak"),
+}
+
+# Parts of items with checks that are not claimed.
+NOT_CLAIMED = {
+    4: "frames count against the budget of replies while they wait for their first byte to be sent",
+    12: "names in the errors of all loaders",
 }
 
 
@@ -45,6 +51,8 @@ def main():
         for result in results:
             is_good &= result.is_good()
             print(result.line(), flush=True)
+        if item in NOT_CLAIMED:
+            print(f"    not claimed: {NOT_CLAIMED[item]}", flush=True)
         print(f"      took {time.monotonic() - start:.0f} s", flush=True)
     sys.exit(0 if is_good else 1)
 

@@ -1,4 +1,4 @@
-"""Item 4: replies that nobody reads use bounded memory and end with a reason."""
+"""Item 4: unread replies use bounded memory and do not delay other clients."""
 
 import contextlib
 import tempfile
@@ -7,7 +7,6 @@ import time
 from pathlib import Path
 
 import grpc
-
 import http2
 from client import (
     DESCRIBE_SCENE,
@@ -80,9 +79,7 @@ def drive(server, is_stopped):
     """Sends a step every 50 ms."""
 
     def requests():
-        yield steps_pb2.DriveSceneRequest(
-            open=steps_pb2.OpenDrive(scene="grid", delivery=common_pb2.DELIVERY_LATEST)
-        )
+        yield steps_pb2.DriveSceneRequest(open=steps_pb2.OpenDrive(scene="grid", delivery=common_pb2.DELIVERY_LATEST))
         number = 0
         while not is_stopped.wait(0.05):
             number += 1

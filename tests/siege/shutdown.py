@@ -8,7 +8,6 @@ import tempfile
 import time
 from pathlib import Path
 
-
 import http2
 from client import HEALTH_WATCH, OPEN_SCENE, RENDER_FRAME, Client, frames_pb2, scenes_pb2
 from report import Result

@@ -10,17 +10,16 @@ import http2
 
 
 class Swarm(threading.Thread):
-    """Keeps `count` connections open, each of which sends `greeting` and then only answers, if `answers` is set. Opens a
-    new connection for each that the server closes. Opens at most `total` connections."""
+    """Keeps `count` connections open. Each sends `greeting`, and then only answers if `answers` is set. Opens a new
+    connection for each that the server closes, at most `total` in all."""
 
-    def __init__(self, port, count, greeting, answers=True, total=None, reconnects=True):
+    def __init__(self, port, count, greeting, answers=True, total=None):
         super().__init__(daemon=True)
         self.port = port
         self.count = count
         self.greeting = greeting
         self.answers = answers
         self.total = total
-        self.reconnects = reconnects
         self.selector = selectors.DefaultSelector()
         self.connecting = 0
         self.open = {}
@@ -55,8 +54,6 @@ class Swarm(threading.Thread):
 
     def wants_more(self):
         if self.total is not None and self.opened + self.connecting >= self.total:
-            return False
-        if not self.reconnects and self.closed:
             return False
         return len(self.open) < self.count and self.connecting < 64
 
