@@ -9,6 +9,7 @@ mod blocking;
 mod catch_unwind;
 mod content;
 mod device;
+mod load_permits;
 mod lock;
 mod output;
 mod registry;
@@ -64,6 +65,7 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use self::blocking::run_blocking;
 use self::device::command::SceneId;
 use self::device::handle::DeviceThread;
+use self::load_permits::LoadPermits;
 pub(crate) use self::lock::lock;
 use self::registry::Registry;
 use self::scene::actor::SceneServices;
@@ -77,8 +79,6 @@ use crate::config::{Config, ValidatedConfig};
 use modalcast_model::error::{Error, Result, invalid};
 use modalcast_model::load::{OpenedScene, modes_files};
 
-/// Maximum number of scenes that are read from disk concurrently.
-const MAX_CONCURRENT_LOADS: usize = 2;
 /// The largest number of modes files, and of remarks, that are logged when a scene is opened.
 const MAX_LOGGED_LINES: usize = 16;
 
@@ -100,7 +100,7 @@ struct Shared {
     services: SceneServices,
     registry: Registry,
     frame_streams: Arc<FrameStreamRegistry>,
-    load_permits: Semaphore,
+    load_permits: LoadPermits,
     upload_permits: Arc<Semaphore>,
     next_scene_id: AtomicU64,
     is_stopping: AtomicBool,
@@ -158,7 +158,7 @@ impl Engine {
             info,
             encoder: FrameEncoder::per_core()?,
             vertex_packer: VertexPacker::start()?,
-            load_permits: Semaphore::new(MAX_CONCURRENT_LOADS),
+            load_permits: LoadPermits::new(),
             upload_permits: Arc::new(Semaphore::new(MAX_CONCURRENT_UPLOADS)),
             next_scene_id: AtomicU64::new(1),
             is_stopping: AtomicBool::new(false),
@@ -514,9 +514,10 @@ impl Engine {
         provenance: &SceneProvenance,
         upload: Option<CompleteUpload>,
     ) -> Result<OpenedScene> {
-        let semaphore_closed = |_| Error::ShuttingDown;
-        let _permit = self.shared.load_permits.acquire().await.map_err(semaphore_closed)?;
         let source = Arc::clone(&self.shared.source);
+        let is_built_in =
+            matches!(provenance, SceneProvenance::Repository { source: path } if source.is_built_in(path));
+        let _permit = self.shared.load_permits.acquire(is_built_in).await?;
         let upload_folder = self.shared.scene_catalog.upload_folder(name);
         let (engine, scene_name, provenance) = (self.clone(), name.to_owned(), provenance.clone());
         let read = move || match provenance {

@@ -19,6 +19,11 @@ pub trait SceneSource: Send + Sync + 'static {
     /// As [`Self::open`].
     fn open_within(&self, folder: &Path, entry: &str) -> Result<OpenedScene>;
 
+    /// Whether [`Self::open`] reads no files for the source. Such a source does not wait for others that do.
+    fn is_built_in(&self, _source: &str) -> bool {
+        false
+    }
+
     /// The sources that [`Self::open`] accepts.
     fn list(&self) -> Vec<String>;
 }
@@ -31,6 +36,10 @@ impl SceneSource for SceneRepository {
     fn open_within(&self, folder: &Path, entry: &str) -> Result<OpenedScene> {
         // With the leading "./" a file name is never resolved as a built-in name.
         Self::new(Some(folder))?.open(&format!("./{entry}"))
+    }
+
+    fn is_built_in(&self, source: &str) -> bool {
+        Self::is_built_in(source)
     }
 
     fn list(&self) -> Vec<String> {

@@ -21,6 +21,7 @@ mod import_cycles;
 mod invalid_input;
 mod layering;
 mod light;
+mod loads;
 mod message_streams;
 mod moved_cameras;
 mod normals;

@@ -15,7 +15,7 @@ ITEMS = {
     3: (None, "budgets of memory per scene and in total, reserved before decoding"),
     4: ("replies", "unread replies"),
     5: ("shutdown", "SIGTERM ends the server within 10 s"),
-    6: (None, "slow loads do not block other clients or the start"),
+    6: ("loads", "slow loads do not block other clients or the start"),
     7: (None, "state on disk survives damage and power loss"),
     8: ("frames", "a large frame does not delay other clients"),
     9: (None, "the renderer gives memory back"),
@@ -31,6 +31,7 @@ ITEMS = {
 # Parts of items with checks that are not claimed.
 NOT_CLAIMED = {
     4: "frames count against the budget of replies while they wait for their first byte to be sent",
+    6: "the port answers before all scenes are open again; loads have a deadline and equal shares",
     12: "names in the errors of all loaders",
 }
 

@@ -49,6 +49,11 @@ impl SceneRepository {
         }
     }
 
+    /// Whether a source names a built-in scene.
+    pub fn is_built_in(source: &str) -> bool {
+        source::is_built_in(source)
+    }
+
     /// Names that [`Self::open`] accepts: built-in scenes, then folders and model files down to a limited depth,
     /// sorted.
     pub fn list(&self) -> Vec<String> {

@@ -2,9 +2,12 @@
 
 use nalgebra::{Vector2, Vector3};
 
-/// The largest polygon that is triangulated by ear clipping, which takes cubic time. A larger polygon is split into a
-/// fan.
+/// The largest polygon that is triangulated by ear clipping, which takes quadratic time. A larger polygon is split into a
+/// fan. So the time of a file is at most proportional to its number of corners.
 const MAX_EAR_CLIPPING_CORNERS: usize = 256;
+
+/// How often the ears of all corners are determined again. A simple polygon never needs it.
+const MAX_EAR_SEARCHES: usize = 4;
 
 /// Splits a polygon into triangles with the polygon's winding, as indices into `points`. There are always two fewer
 /// triangles than points.
@@ -49,27 +52,71 @@ fn project_to_plane(points: &[Vector3<f64>], normal: Vector3<f64>) -> Vec<Vector
     points.iter().map(|point| Vector2::new(point[first_axis], sign * point[second_axis])).collect()
 }
 
+/// Cuts the first ear until a triangle remains. Only reflex corners can lie in an ear, and a cut changes the angles and
+/// ears of no corners but its two neighbors (Eberly, Triangulation by Ear Clipping).
 fn ear_clip(points: &[Vector2<f64>]) -> Vec<[usize; 3]> {
-    let mut remaining: Vec<usize> = (0..points.len()).collect();
+    let mut outline = Outline { points, remaining: (0..points.len()).collect(), is_reflex: Vec::new() };
+    outline.is_reflex = (0..points.len()).map(|position| outline.is_reflex_at(position)).collect();
+    let mut is_ear: Vec<bool> = outline.find_ears();
+    let mut remaining_searches = MAX_EAR_SEARCHES;
     let mut triangles = Vec::with_capacity(points.len().saturating_sub(2));
-    while remaining.len() > 3 {
-        let count = remaining.len();
-        let triangle_at = |position: usize| {
-            [remaining[(position + count - 1) % count], remaining[position], remaining[(position + 1) % count]]
-        };
-        let is_ear = |position: &usize| {
-            let ear = triangle_at(*position);
-            let corners = ear.map(|index| points[index]);
-            signed_area2(corners) > 0.0
-                && !remaining.iter().any(|index| !ear.contains(index) && contains_point(points[*index], corners))
-        };
+    while outline.remaining.len() > 3 {
+        let mut position = is_ear.iter().position(|is_ear| *is_ear);
+        if position.is_none() && remaining_searches > 0 {
+            remaining_searches -= 1;
+            is_ear = outline.find_ears();
+            position = is_ear.iter().position(|is_ear| *is_ear);
+        }
         // A self-intersecting polygon may have no ear. In this case, cut any corner, so that no triangle is lost.
-        let position = (0..count).find(is_ear).unwrap_or(1);
-        triangles.push(triangle_at(position));
-        remaining.remove(position);
+        let position = position.unwrap_or(1);
+        triangles.push(outline.triangle_at(position));
+        outline.remaining.remove(position);
+        is_ear.remove(position);
+        let count = outline.remaining.len();
+        let neighbors = [(position + count - 1) % count, position % count];
+        for neighbor in neighbors {
+            outline.is_reflex[outline.remaining[neighbor]] = outline.is_reflex_at(neighbor);
+        }
+        for neighbor in neighbors {
+            is_ear[neighbor] = outline.is_ear_at(neighbor);
+        }
     }
-    triangles.push([remaining[0], remaining[1], remaining[2]]);
+    triangles.push([outline.remaining[0], outline.remaining[1], outline.remaining[2]]);
     triangles
+}
+
+/// A polygon of which corners are cut off.
+struct Outline<'a> {
+    points: &'a [Vector2<f64>],
+    /// Indices into `points` of the corners that are not cut off, in order.
+    remaining: Vec<usize>,
+    /// For each point, whether its corner is not convex.
+    is_reflex: Vec<bool>,
+}
+
+impl Outline<'_> {
+    /// The corner at a position of `remaining`, between its neighbors.
+    fn triangle_at(&self, position: usize) -> [usize; 3] {
+        let (corners, count) = (&self.remaining, self.remaining.len());
+        [corners[(position + count - 1) % count], corners[position], corners[(position + 1) % count]]
+    }
+
+    fn is_reflex_at(&self, position: usize) -> bool {
+        signed_area2(self.triangle_at(position).map(|index| self.points[index])) <= 0.0
+    }
+
+    fn is_ear_at(&self, position: usize) -> bool {
+        let ear = self.triangle_at(position);
+        let corners = ear.map(|index| self.points[index]);
+        let is_inside = |index: &usize| {
+            self.is_reflex[*index] && !ear.contains(index) && contains_point(self.points[*index], corners)
+        };
+        !self.is_reflex[ear[1]] && !self.remaining.iter().any(is_inside)
+    }
+
+    fn find_ears(&self) -> Vec<bool> {
+        (0..self.remaining.len()).map(|position| self.is_ear_at(position)).collect()
+    }
 }
 
 /// Twice the signed area of a triangle, positive if counterclockwise.
@@ -114,6 +161,23 @@ mod tests {
         // Control: a split along the wrong diagonal covers area outside of the arrow.
         let [_, absolute_area] = signed_and_absolute_area(&arrow, &[[1, 2, 3], [1, 3, 0]]);
         assert!(absolute_area > 1.5, "expected more than 1.5, got {absolute_area}");
+    }
+
+    /// A thin arc: almost every convex corner has a corner of the other side in its triangle.
+    #[test]
+    fn thin_arc_is_covered_once() {
+        let angles = (0..128).map(|index| f64::from(index) / 32.0);
+        let outer = angles.clone().map(|angle| (1.0, angle));
+        let inner = angles.rev().map(|angle| (0.9999, angle));
+        let point = |(radius, angle): (f64, f64)| [(radius * angle.cos()) as f32, (radius * angle.sin()) as f32, 0.0];
+        let arc: Vec<_> = outer.chain(inner).map(point).collect();
+        let triangles = triangulate(&arc);
+        assert_eq!(triangles.len(), 254);
+        let [signed, absolute] = signed_and_absolute_area(&arc, &triangles);
+        assert!((signed - absolute).abs() < 1e-9, "expected no overlap, got {signed} and {absolute}");
+        // The area of the ring sector of 127 / 32 rad.
+        let expected = 127.0 / 64.0 * (1.0 - 0.9999_f64.powi(2));
+        assert!((signed - expected).abs() < 0.01 * expected, "expected about {expected}, got {signed}");
     }
 
     #[test]

@@ -1,0 +1,66 @@
+"""Item 6: slow loads of one client do not delay other clients."""
+
+import contextlib
+import tempfile
+import threading
+import time
+from pathlib import Path
+
+import grpc
+from client import Client
+from report import Result
+from scenes import write_thin_arcs
+from server import Server
+
+ITEM = 6
+
+# The attacker opens so many files of so many polygons with 256 corners at a time.
+FILES = 4
+POLYGONS = 4000
+
+# Seconds within which another client has the built-in scene, and within which one file is loaded.
+ASKED = 2.0
+ASKED_LOAD = 10.0
+
+# Seconds after which the check gives up.
+GIVE_UP = 30.0
+
+
+def time_to_open(server, source, name):
+    """Seconds until a scene is open, at most GIVE_UP."""
+    start = time.monotonic()
+    with Client(server) as client, contextlib.suppress(grpc.RpcError):
+        client.open_scene(source, name, timeout=GIVE_UP)
+    return time.monotonic() - start
+
+
+def run(program):
+    with tempfile.TemporaryDirectory() as folder:
+        for number in range(FILES):
+            write_thin_arcs(Path(folder) / f"arcs-{number}.obj", POLYGONS)
+        with Server(program, scenes=folder) as server:
+            threads = [
+                threading.Thread(target=time_to_open, args=[server, f"arcs-{number}.obj", f"arcs-{number}"])
+                for number in range(FILES)
+            ]
+            start = time.monotonic()
+            for thread in threads:
+                thread.start()
+            time.sleep(0.3)
+            built_in = time_to_open(server, "tree", "tree")
+            for thread in threads:
+                thread.join()
+            all_files = time.monotonic() - start
+        with Server(program, scenes=folder) as server:
+            load = time_to_open(server, "arcs-0.obj", "arcs-0")
+    return [
+        Result(
+            ITEM,
+            f"loads of {FILES} files with {POLYGONS} concave polygons do not delay the built-in scene",
+            f"within {ASKED:.0f} s; one file within {ASKED_LOAD:.0f} s",
+            f"built-in scene {built_in:.2f} s, one file {load:.1f} s",
+            built_in <= ASKED and load <= ASKED_LOAD,
+            f"the {FILES} files themselves, {all_files:.1f} s",
+            all_files > ASKED,
+        )
+    ]
