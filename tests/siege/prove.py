@@ -18,7 +18,7 @@ ITEMS = {
     6: ("loads", "slow loads do not block other clients or the start"),
     7: (None, "state on disk survives damage and power loss"),
     8: ("frames", "a large frame does not delay other clients"),
-    9: (None, "the renderer gives memory back"),
+    9: ("renderer_memory", "the renderer gives memory back"),
     10: ("small_steps", "unread replies to steps"),
     11: (None, "quotas of scenes, uploads and disk"),
     12: ("floods", "floods of control frames, log records, names in errors"),
@@ -32,6 +32,7 @@ ITEMS = {
 NOT_CLAIMED = {
     4: "frames count against the budget of replies while they wait for their first byte to be sent",
     6: "the port answers before all scenes are open again; loads have a deadline and equal shares",
+    9: "while no other frame is drawn, Mesa keeps the memory of the last one",
     12: "names in the errors of all loaders",
 }
 

@@ -6,6 +6,7 @@
 //! queue at once.
 
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
+use std::time::Duration;
 
 use super::command::{Command, CostClass, SceneId};
 use super::fair_queue::{FairQueue, Taken, Ticket};
@@ -85,12 +86,18 @@ impl CommandQueue {
         lock(&self.state).work.take(can_run)
     }
 
-    /// Waits until the queue has work. Returns false if it is closed and empty.
-    pub(super) fn wait(&self) -> bool {
+    /// Waits until the queue has work, at most `limit`. Returns false if it is closed and empty.
+    pub(super) fn wait(&self, limit: Option<Duration>) -> bool {
         let state = lock(&self.state);
         let has_nothing = |state: &mut State| state.work.is_empty() && !state.is_closed;
-        let state = self.changed.wait_while(state, has_nothing).unwrap_or_else(PoisonError::into_inner);
-        !state.work.is_empty()
+        let state = match limit {
+            Some(limit) => {
+                let waited = self.changed.wait_timeout_while(state, limit, has_nothing);
+                waited.unwrap_or_else(PoisonError::into_inner).0
+            }
+            None => self.changed.wait_while(state, has_nothing).unwrap_or_else(PoisonError::into_inner),
+        };
+        !(state.is_closed && state.work.is_empty())
     }
 
     /// Rejects further commands. Queued commands remain.

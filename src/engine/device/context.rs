@@ -164,6 +164,20 @@ impl DeviceContext {
         &self.info
     }
 
+    /// Whether render targets are cached.
+    pub(super) fn has_targets(&self) -> bool {
+        self.renderer.as_ref().is_ok_and(Renderer::has_targets)
+    }
+
+    /// Frees the render targets that no frame has used for this time.
+    pub(super) fn free_unused_targets(&mut self, unused: Duration) {
+        if let Ok(renderer) = &mut self.renderer
+            && let Err(error) = renderer.free_unused_targets(unused)
+        {
+            tracing::warn!(%error, "the memory of unused render targets is not freed");
+        }
+    }
+
     /// Statistics of the passes that the last frame executed; `None` without a renderer.
     pub fn stats(&self) -> Option<&modalcast_render::FrameStats> {
         self.renderer.as_ref().ok().map(Renderer::stats)

@@ -61,6 +61,10 @@ use modalcast_render::{FrameImage, MAX_FRAMES_IN_FLIGHT, PendingPick, PickHit};
 const POLL_INTERVAL: Duration = Duration::from_micros(100);
 /// Work of at least this many milliseconds is logged, because the other scenes wait for it.
 const LONG_WORK_MS: f64 = 10.0;
+/// Time after which the memory of a render target that no frame uses is freed.
+const TARGET_LIFETIME: Duration = Duration::from_secs(10);
+/// How often unused render targets are searched.
+const TARGET_CHECK_INTERVAL: Duration = Duration::from_secs(1);
 /// Number of threads that copy pixels.
 const COPY_THREADS: usize = 2;
 /// Maximum number of picks in flight. A further pick first waits for the oldest one.
@@ -82,6 +86,8 @@ pub(super) struct DeviceLoop {
     vertices: InFlightQueue<PendingVertices, CopiedVertices>,
     picks: InFlightQueue<PendingPick, Vec<PickHit>>,
     frames: InFlightQueue<FrameInFlight, FrameImage>,
+    /// When the targets were last checked.
+    last_target_check: Instant,
 }
 
 /// A frame in flight, and the device time that its scene was charged.
@@ -142,6 +148,7 @@ impl DeviceLoop {
             vertices: InFlightQueue::new(MAX_VERTEX_READBACKS_IN_FLIGHT),
             picks: InFlightQueue::new(MAX_PICKS_IN_FLIGHT),
             frames: InFlightQueue::new(MAX_FRAMES_IN_FLIGHT),
+            last_target_check: Instant::now(),
         })
     }
 
@@ -181,7 +188,16 @@ impl DeviceLoop {
         while self.frames.is_oldest_ready(Duration::ZERO) {
             run_caught(|| self.finish_oldest_frame());
         }
+        self.free_unused_targets();
         true
+    }
+
+    /// Frees the memory of render targets that no frame has used for [`TARGET_LIFETIME`].
+    fn free_unused_targets(&mut self) {
+        if self.context.has_targets() && self.last_target_check.elapsed() >= TARGET_CHECK_INTERVAL {
+            self.last_target_check = Instant::now();
+            run_caught(|| self.context.free_unused_targets(TARGET_LIFETIME));
+        }
     }
 
     /// Takes the next work. While no work can run, answers readbacks in flight.
@@ -205,8 +221,11 @@ impl DeviceLoop {
                 run_caught(|| self.finish_one());
             } else if let Some(output) = self.partial_outputs.values().next() {
                 output.is_ready_within(POLL_INTERVAL);
-            } else if !self.queue.wait() {
-                return None;
+            } else {
+                self.free_unused_targets();
+                if !self.queue.wait(self.context.has_targets().then_some(TARGET_CHECK_INTERVAL)) {
+                    return None;
+                }
             }
         }
     }

@@ -89,7 +89,7 @@ impl DeviceHandle {
         };
         // Ends when the handle or the receiver is dropped.
         std::thread::spawn(move || {
-            while queue.wait() {
+            while queue.wait(None) {
                 let Some(taken) = queue.take(|_, _| true) else { continue };
                 let (Work::Command(command) | Work::Prepared(command)) = taken.work else { continue };
                 if sender.blocking_send(command).is_err() {

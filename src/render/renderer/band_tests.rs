@@ -240,3 +240,27 @@ fn dropped_frame_does_not_affect_later_frames() {
         assert!(renderer.draw(&random_scene.buffers, &params).expect("draws").rgba == expected);
     }
 }
+
+/// A target that is not in use is freed. The next frame creates it again and has the same pixels.
+#[test]
+fn unused_target_is_freed_and_created_again() {
+    let mut renderer = open_renderer();
+    let random_scene = RandomScene::load(&mut renderer, 1, look(4));
+    let params = random_scene.params(SIZE);
+    let expected = renderer.draw(&random_scene.buffers, &params).expect("draws").rgba;
+    renderer.free_unused_targets(Duration::from_secs(1000)).expect("frees");
+    assert!(renderer.has_targets());
+    renderer.read_visibility().expect("ids of the last frame");
+    renderer.free_unused_targets(Duration::ZERO).expect("frees");
+    assert!(!renderer.has_targets());
+    renderer.read_visibility().expect_err("the images of the last frame were freed");
+    // A frame that has begun keeps its target.
+    let mut partial_frame = renderer.begin_frame(&random_scene.buffers, &params, true).expect("begins");
+    renderer.free_unused_targets(Duration::ZERO).expect("frees");
+    while !partial_frame.is_submitted() {
+        renderer.submit_step(&random_scene.buffers, &mut partial_frame).expect("submits");
+    }
+    let pending_frame = renderer.finish_frame(partial_frame).expect("finishes");
+    renderer.free_unused_targets(Duration::ZERO).expect("frees");
+    assert!(renderer.read_image(pending_frame).expect("draws").rgba == expected);
+}

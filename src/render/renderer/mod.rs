@@ -18,7 +18,7 @@ mod tests;
 use std::num::NonZero;
 use std::rc::Rc;
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use rayon::{ThreadPool, ThreadPoolBuilder};
 
@@ -375,10 +375,32 @@ impl Renderer {
         Err(invalid("frame.size", format!("1 to {limit} pixels a side"), got))
     }
 
+    /// Frees the render targets that no frame has used for this time. Mesa keeps their memory until the next frame replaces
+    /// them in its state.
+    ///
+    /// # Errors
+    /// `Fault` if the context cannot be made current.
+    pub fn free_unused_targets(&mut self, unused: Duration) -> Result<()> {
+        let _current = self.gl.make_current()?;
+        self.targets.retain(|target| target.last_use.elapsed() < unused);
+        if let Some(last_frame) = &self.last_frame
+            && self.targets.iter().all(|target| target.desc != last_frame.desc)
+        {
+            self.last_frame = None;
+        }
+        Ok(())
+    }
+
+    /// Whether a render target is cached.
+    pub const fn has_targets(&self) -> bool {
+        !self.targets.is_empty()
+    }
+
     /// Moves the target with this description to the end of the cache. Creates it if it is not cached, after dropping
     /// the least recently used target of a full cache.
     fn ensure_target(&mut self, desc: TargetDesc) -> Result<()> {
         if let Some(index) = self.targets.iter().position(|target| target.desc == desc) {
+            self.targets[index].last_use = Instant::now();
             self.targets[index..].rotate_left(1);
             return Ok(());
         }

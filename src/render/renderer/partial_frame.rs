@@ -12,7 +12,7 @@
 use std::cell::Cell;
 use std::collections::VecDeque;
 use std::rc::Rc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use super::pending_frame::PendingFrame;
 use super::{LastFrame, MAX_TARGETS, Renderer};
@@ -230,8 +230,9 @@ impl Renderer {
             return Err(fault("draw", "expected a frame whose steps are all submitted"));
         }
         let _current = self.gl.make_current()?;
-        let PartialFrame { uniforms, target, slot, timers, stats, info, .. } = partial_frame;
+        let PartialFrame { uniforms, mut target, slot, timers, stats, info, .. } = partial_frame;
         let desc = target.desc;
+        target.last_use = Instant::now();
         // A frame with an equal description may have been drawn between the steps of this one.
         self.targets.retain(|cached_target| cached_target.desc != desc);
         if self.targets.len() >= MAX_TARGETS {

@@ -3,6 +3,7 @@
 
 use std::cell::Cell;
 use std::rc::Rc;
+use std::time::Instant;
 
 use super::depth_pyramid::DepthPyramid;
 use super::oit::OitTarget;
@@ -18,6 +19,7 @@ use modalcast_model::scene::Culling;
 #[derive(Debug)]
 pub(crate) struct RenderTarget {
     pub(crate) desc: TargetDesc,
+    pub(crate) last_use: Instant,
     /// Id of each sample; valid until the next frame, like `depth`.
     pub(crate) ids: Texture,
     pub(crate) visibility_fbo: Framebuffer,
@@ -72,6 +74,7 @@ impl RenderTarget {
         };
         Ok(Self {
             desc,
+            last_use: Instant::now(),
             visibility_fbo: gl.framebuffer(Some(&ids), &depth)?,
             dirty_regions: VisibilityDirtyRegions::default(),
             draw_region: Cell::new(Region::whole([width, height])),
