@@ -96,8 +96,9 @@ struct LastFrame {
 impl Renderer {
     /// Creates a surfaceless context and makes it current on this thread.
     ///
-    /// On a GPU, a process should have one renderer at a time: on an H200, frames in flight were wrong while other threads
-    /// of the process had contexts (25 of 30 frames, in every run), but right with one context in each of four processes.
+    /// On a GPU, a process should have one renderer at a time: on an H200 with driver 580.159, frames in flight were wrong
+    /// while other threads of the process had contexts (25 of 30 frames, in every run), but right with one context in each
+    /// of four processes.
     ///
     /// # Errors
     /// `Unavailable` with the name of the missing library or vendor file.
