@@ -46,3 +46,24 @@ def test_pulled_tree_moves_and_returns(client: mc.Client, tmp_path: Path):
     assert abs(released) < pulled / 2
     assert (tmp_path / "pulled.png").read_bytes() != (tmp_path / "released.png").read_bytes()
     client.open("tree").reset()
+
+
+def test_rigid_bodies_fall_onto_table_and_ground(client: mc.Client, tmp_path: Path):
+    pytest.importorskip("mujoco")
+    output = run_example("rigid_bodies.py", client, tmp_path)
+    on_table, bodies, lowest = (float(number) for number in re.findall(r"\d+(?:\.\d+)?", output))
+    # A body that was not moved would be above 0.8 m, and one without a table or a ground below would fall on.
+    assert 0 < on_table <= bodies == 16
+    assert 0.15 < lowest < 0.7
+    assert (tmp_path / "bodies.png").stat().st_size > 10_000
+    client.delete("bodies")
+
+
+def test_rerun_recording_has_the_vertices_of_each_step(client: mc.Client, tmp_path: Path):
+    pytest.importorskip("rerun")
+    run_example("log_to_rerun.py", client, tmp_path)
+    command = [sys.executable, "-m", "rerun", "rrd", "print", "tree.rrd"]
+    output = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True).stdout
+    rows = re.findall(r"with (\d+) rows .* - /scene/tree - data columns: .*vertex_normals.*vertex_positions", output)
+    assert sum(map(int, rows)) == 8
+    client.open("tree").reset()

@@ -272,6 +272,9 @@ fn candidates() -> Vec<PathBuf> {
     for folder in parent_folders {
         find_libraries(&folder.join(".tools/nvrtc"), MAX_WHEEL_DEPTH, &mut paths);
     }
+    // The environment into which a wheel has installed the program as `bin/modalcast`, and perhaps NVRTC.
+    let environment = executable.iter().flat_map(|path| path.ancestors().nth(2));
+    environment.for_each(|folder| find_in_python_environment(folder, &mut paths));
     for toolkit in entries(Path::new("/usr/local")) {
         if toolkit.file_name().is_some_and(|name| name.to_string_lossy().starts_with("cuda")) {
             let folder = toolkit.join("lib64");
@@ -280,6 +283,13 @@ fn candidates() -> Vec<PathBuf> {
     }
     paths.push("libnvrtc.so.12".into());
     paths
+}
+
+/// Adds the libraries of NVIDIA's wheels in a Python environment.
+fn find_in_python_environment(environment: &Path, paths: &mut Vec<PathBuf>) {
+    for python in entries(&environment.join("lib")) {
+        find_libraries(&python.join("site-packages/nvidia"), MAX_WHEEL_DEPTH, paths);
+    }
 }
 
 /// Adds every `libnvrtc.so.13` at most `depth` folders below `folder`.
@@ -318,5 +328,16 @@ mod tests {
         assert_eq!(paths, std::slice::from_ref(&broken));
         let error = Nvrtc::find(&paths).expect_err("a broken library").to_string();
         assert!(error.contains(&broken.display().to_string()), "{error}");
+    }
+
+    #[test]
+    fn finds_the_wheel_of_a_python_environment() {
+        let environment = tempfile::tempdir().expect("a folder");
+        let library = environment.path().join("lib/python3.11/site-packages/nvidia/cu13/lib/libnvrtc.so.13");
+        std::fs::create_dir_all(library.parent().expect("a parent")).expect("a folder");
+        std::fs::write(&library, b"").expect("a file");
+        let mut paths = Vec::new();
+        find_in_python_environment(environment.path(), &mut paths);
+        assert_eq!(paths, [library]);
     }
 }
