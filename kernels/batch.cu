@@ -8,7 +8,7 @@
 //   words           U, per tile of a shape [chunk][3 words of a quad][quad], 16 bytes per word               (in)
 //   rest_positions  x0, per tile of a shape [axis][quad][vertex in the quad] f32                             (in)
 //   scales          with STORE_INT8: one scale per tile of a shape and mode                                  (in)
-//   transforms, transform_links, frames, q  as described in deform.cu                                        (in)
+//   transforms, transform_links, follower_frames, q  as described in deform.cu                              (in)
 //   positions       [vertices][3] f32, address in the header                                                 (out)
 //   boxes           [tiles of `deform`][4 boxes][6 keys] u32: `float_to_ordered` keys of the maxima of -x, -y, -z,
 //                   x, y, z. Each of the two warps of a tile writes its box twice. A warp without vertices writes

@@ -17,7 +17,7 @@
 //                    f64 point that stays on the host)                                                           (in)
 //   transform_links  with FOLLOWERS, [domains]: the domain's transform root (the domain whose T it uses), and the
 //                    index of its frame, or NO_FRAME for a root. Without FOLLOWERS, every domain is a root       (in)
-//   frames           with FOLLOWERS: [followers][3] float4, the rows of each follower's frame, its constant
+//   follower_frames  with FOLLOWERS: [followers][3] float4, the rows of each follower's frame, its constant
 //                    transform relative to its root                                                              (in)
 //   q                the coordinates of all domains; with STORE_F16 and STORE_BF16 multiplied by the factor of
 //                    their mode                                                                                  (in)

@@ -43,7 +43,7 @@ __device__ inline Mat3d load_linear_part(const Transforms& transforms, unsigned 
     const TransformLink link = load_transform_link(transforms, domain);
     const Affine t = load_affine(transforms.rows, link.root);
     if (link.frame != NO_FRAME) {
-        const Affine f = load_affine(transforms.frames, link.frame);
+        const Affine f = load_affine(transforms.follower_frames, link.frame);
         return {multiply_linear_row(t.row0, f), multiply_linear_row(t.row1, f), multiply_linear_row(t.row2, f)};
     }
 #else

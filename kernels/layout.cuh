@@ -72,7 +72,7 @@ static_assert(sizeof(WarpTile) == 32, "WarpTile differs from src/compute/gpu/tab
 // A quad of a mixed tile.
 struct MixedQuad {
     unsigned first_item;    // packed index of the first item
-    unsigned rest_quad;     // index of the quad
+    unsigned rest_quad;     // index of the quad in `rest_positions`, `rest_normals` and `rest_tangents`
     unsigned packed_domain; // 4 * index of the domain + number of items of the quad - 1
     unsigned first_q;
 };
@@ -101,7 +101,7 @@ static_assert(sizeof(Change) == 16, "Change differs from src/compute/gpu/tables/
 // transform relative to its root. Used only with FOLLOWERS.
 struct TransformLink {
     unsigned root;  // index into `transforms`
-    unsigned frame; // index into `frames`, or NO_FRAME
+    unsigned frame; // index into `follower_frames`, or NO_FRAME for a root
 };
 static_assert(sizeof(TransformLink) == 8, "TransformLink differs from src/compute/gpu/tables/layout.rs");
 
@@ -118,7 +118,7 @@ struct DeformArgs {
     const unsigned* mixed_quad_scales; // per mixed quad, `first_scale`
     const float4* transforms;
     const TransformLink* transform_links;
-    const float4* frames;
+    const float4* follower_frames;
     const float* q;
     const unsigned* tile_list;
     const unsigned* retained_counts; // per domain, number of its retained chunks, which are not truncated
@@ -169,7 +169,7 @@ struct BatchArgs {
     const float* scales;
     const float4* transforms;
     const TransformLink* transform_links;
-    const float4* frames;
+    const float4* follower_frames;
     const float* q;
     unsigned* boxes;
 };
@@ -219,7 +219,7 @@ struct NormalsArgs {
     const float4* rest_tangents;
     const float4* transforms;
     const TransformLink* transform_links;
-    const float4* frames;
+    const float4* follower_frames;
     const unsigned* change_steps;
     const unsigned* corner_groups;
     const unsigned* ring_offsets;

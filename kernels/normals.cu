@@ -11,7 +11,7 @@
 //   rest_tangents  with NORMAL_MAPS: per corner of a shape with tangents a float4, unit tangent and sign of the
 //                  bitangent                                                                            (in)
 //   transforms     [roots][3] float4: the rows of T of each transform root                              (in)
-//   transform_links, frames  with FOLLOWERS, as for `deform`                                            (in)
+//   transform_links, follower_frames  with FOLLOWERS, as described in deform.cu                                   (in)
 //   change_steps   [domains] u32: number of the step that last changed the domain                       (in)
 //   corner_groups  per corner of a shape that has groups, the index of its smoothing group              (in)
 //   ring_offsets   [group_count + 1] u32: index of the first entry of each ring, then the end of the last one (in)

@@ -55,7 +55,7 @@ __device__ __forceinline__ Mat3f load_scaled_linear_part(const Transforms& trans
     if (link.frame == NO_FRAME) {
         return t;
     }
-    const Mat3f f = to_scaled_mat3f(load_affine(transforms.frames, link.frame));
+    const Mat3f f = to_scaled_mat3f(load_affine(transforms.follower_frames, link.frame));
     return to_scaled_mat3f(Affine{compose_linear_row(t.row0, f), compose_linear_row(t.row1, f), compose_linear_row(t.row2, f)});
 #else
     return to_scaled_mat3f(load_affine(transforms.rows, domain));

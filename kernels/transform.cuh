@@ -14,14 +14,14 @@ struct Transforms {
     const float4* rows; // [roots][3]: the three rows of T of each transform root
 #ifdef FOLLOWERS
     const TransformLink* transform_links;
-    const float4* frames; // [followers][3]: the three rows of F of each follower
+    const float4* follower_frames; // [followers][3]: the three rows of F of each follower
 #endif
 };
 
 template <typename Args>
 __device__ __forceinline__ Transforms transforms_of(const Args& args) {
 #ifdef FOLLOWERS
-    return {args.transforms, args.transform_links, args.frames};
+    return {args.transforms, args.transform_links, args.follower_frames};
 #else
     return {args.transforms};
 #endif
@@ -60,7 +60,7 @@ __device__ __forceinline__ Affine load_transform(const Transforms& transforms, u
     if (link.frame == NO_FRAME) {
         return t;
     }
-    const Affine f = load_affine(transforms.frames, link.frame);
+    const Affine f = load_affine(transforms.follower_frames, link.frame);
     return {compose_row(t.row0, f), compose_row(t.row1, f), compose_row(t.row2, f)};
 #else
     return load_affine(transforms.rows, domain);
@@ -88,7 +88,7 @@ __device__ __forceinline__ float3 transform_domain_point_f64(const Transforms& t
     // Apply both transforms in sequence: their product may overflow f32.
     const TransformLink link = load_transform_link(transforms, domain);
     if (link.frame != NO_FRAME) {
-        transform_point_f64(transforms.frames + 3 * (size_t)link.frame, point, world);
+        transform_point_f64(transforms.follower_frames + 3 * (size_t)link.frame, point, world);
         point[0] = world[0];
         point[1] = world[1];
         point[2] = world[2];

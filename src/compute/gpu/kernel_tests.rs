@@ -37,8 +37,8 @@ fn subsets(macros: &[&'static str]) -> Vec<Vec<&'static str>> {
 fn deform_variants(features: &[&'static str]) -> Vec<Variant> {
     let mut variants: Vec<Variant> =
         features.iter().chain(&LAUNCHER_DEFINES).map(|feature| (vec![*feature], SM_90)).collect();
-    // Most registers depend on three choices: how modes are summed, how many vertices or corners (items) a lane
-    // computes, and the kind of normals. With TILE_LIST, a lane always has one item.
+    // The number of registers depends mainly on three choices: how modes are summed, how many vertices or corners
+    // (items) a lane computes, and the kind of normals. With TILE_LIST, a lane always has one item.
     let lane_defines: [&[&str]; 3] = [&[], &["ONE_ITEM_PER_LANE"], &["ONE_ITEM_PER_LANE", "TILE_LIST"]];
     let normal_defines: [&[&str]; 4] = [
         &[],
@@ -66,8 +66,8 @@ fn deform_variants(features: &[&'static str]) -> Vec<Variant> {
         for options in &option_sets {
             add_variants(&sum(options), &normal_defines, &[]);
         }
-        // Registers that displacements or followers add to the largest sum. Entries 1 and 2 of `normal_defines` are
-        // rigid normals without and with normal maps.
+        // Displacements and followers need further registers, so they are combined with the sum that needs the most.
+        // Entries 1 and 2 of `normal_defines` are rigid normals without and with normal maps.
         add_variants(&sum(&all_options), &normal_defines[1..3], &["DISPLACEMENTS"]);
         add_variants(&sum(&all_options), &normal_defines[1..3], &["FOLLOWERS"]);
     }

@@ -28,7 +28,7 @@ const ROUND_UP: f64 = 1.0 + 1e-12;
 const UNIT_ROUNDOFF: f64 = 1.0 / (1 << 24) as f64;
 /// 2^-150, half of the smallest positive f32: the maximum error of a rounding that underflows.
 const UNDERFLOW: f64 = f64::from_bits((1023 - 150) << 52);
-/// Ratio of the norm of a vector to its largest component, at most.
+/// Maximum ratio of the norm of a vector to its largest component.
 const SQRT_3: f64 = 1.732_050_807_568_878;
 
 /// Bounds of the error of any vertex of one tile or domain, one per source of error, in scene units.

@@ -116,7 +116,7 @@ impl TransformRoots {
     }
 
     /// `root_from_domain` of every follower. Empty if the scene has no followers.
-    pub fn frames(&self) -> &[Transform] {
+    pub fn follower_frames(&self) -> &[Transform] {
         self.table.as_ref().map_or(&[], |table| &table.frames)
     }
 }

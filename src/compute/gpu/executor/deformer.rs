@@ -56,7 +56,8 @@ pub struct CudaDeformer {
     inputs: StepInputs,
     output: OutputBuffers,
     /// u, if displacements are an output of the scene. One buffer is sufficient for all output sets, because
-    /// displacements are read before the next step is submitted. The same holds for boxes.
+    /// displacements are read before the next step is submitted. The same holds for the boxes of domains
+    /// ([`BoundsKernel::boxes`]).
     displacements: Option<DeviceBuffer>,
     output_ring: OutputRing,
     /// Steps in flight, oldest first.
@@ -69,9 +70,10 @@ pub struct CudaDeformer {
     surface: PinnedSurface,
     /// Attributes of `surface` that show the last step.
     host_attributes: VertexAttributes,
-    /// Whether OpenGL's buffers hold the last step.
+    /// Whether OpenGL's buffers contain the vertices of the last step.
     gl_buffers_are_current: bool,
-    /// Whether [`Deformer::fill_gl_buffers`] was called after the last step. The next step then fills the buffers, too.
+    /// Whether [`Deformer::fill_gl_buffers`] was called after the last step. The next step then also fills OpenGL's
+    /// buffers.
     is_drawn: bool,
 }
 
@@ -252,8 +254,8 @@ impl CudaDeformer {
         let target = self.output_ring.begin_step(state);
         let Self { step_slots, kernels, inputs, .. } = self;
         let step_slot = &mut step_slots[slot_index];
-        // The lengths of the lists of a partial step, `None` for a full step. `changed` are the domains that the step
-        // changes. `outdated` are the domains that earlier steps changed in the other output only.
+        // The lengths of the lists of a partial step, `None` for a full step. `changed` are the domains that this step
+        // changes. `outdated` are the domains that earlier steps changed while they wrote the other output.
         let list_lengths =
             match (&target.dirty_domains, &state.dirty_domains, &mut step_slot.change_list, &mut kernels.apply) {
                 (Some(outdated), DirtyDomains::Some(changed), Some(list), Some(apply)) => {
@@ -325,7 +327,8 @@ impl CudaDeformer {
             tangents: 0,
             displacements: length(attributes.displacements, BufferRole::Displacements),
         };
-        // Displacements and boxes are not in the output set, so the next step may write it.
+        // A readback of displacements and boxes does not read the output set, so it need not delay a step that writes
+        // the set.
         let reads_output = lengths.positions + lengths.normals > 0;
         let read_id = reads_output.then(|| self.output_ring.begin_read());
         let request = ReadbackRequest { set, lengths, read_id, step_done: &self.step_slots[self.last_slot].done };
@@ -380,8 +383,8 @@ impl CudaDeformer {
     }
 }
 
-/// The header of a step, without the addresses of its outputs. A full step writes all outputs, so its `output_step`
-/// is 0.
+/// The header of a step, without the addresses of its outputs. The kernels compute the domains that changed after
+/// `output_step`. In a full step it is 0, which is before all changes.
 fn header(target: &StepTarget, list_lengths: Option<ChangeListLengths>, last_full_step: u32) -> StepHeader {
     let lengths = list_lengths.unwrap_or_default();
     StepHeader {

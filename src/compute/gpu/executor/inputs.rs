@@ -17,11 +17,11 @@ use modalcast_model::scene::SceneState;
 pub(crate) struct InputAddresses {
     pub header: u64,
     pub transforms: u64,
-    /// Per domain, its transform root (the domain whose transform it uses) and the index of its frame. Constant; only
-    /// in scenes with followers.
+    /// Per domain, its transform root (the domain whose transform it uses) and its index in `follower_frames`. Constant;
+    /// only in scenes with followers.
     pub transform_links: u64,
-    /// Per follower, its frame: its constant transform relative to its root.
-    pub frames: u64,
+    /// Per follower, its coordinate frame: its constant transform relative to its root.
+    pub follower_frames: u64,
     pub q: u64,
     /// Per domain, the step that last changed it.
     pub change_steps: u64,
@@ -39,7 +39,7 @@ pub struct StepInputs {
     values: DeviceBuffer,
     change_steps: DeviceBuffer,
     transform_links: DeviceBuffer,
-    frames: DeviceBuffer,
+    follower_frames: DeviceBuffer,
     sizes: InputSizes,
 }
 
@@ -49,7 +49,7 @@ pub type StagingBuffer = PinnedBuffer<f32>;
 /// The part of the staging buffer that a step copies to the device.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum InputPart {
-    /// Only the header, for a partial step: `apply` reads the other values from pinned memory.
+    /// Only the header, for a partial step: the kernel `apply` reads the other values from pinned memory.
     Header,
     /// All values.
     All,
@@ -67,7 +67,7 @@ impl StepInputs {
             values: DeviceBuffer::zeroed(device, sizes.total())?,
             change_steps: DeviceBuffer::zeroed(device, 4 * scene.domains.len() as u64)?,
             transform_links: DeviceBuffer::upload(device, &transform_links(scene))?,
-            frames: DeviceBuffer::upload(device, scene.transform_roots.frames())?,
+            follower_frames: DeviceBuffer::upload(device, scene.transform_roots.follower_frames())?,
             sizes,
         })
     }
@@ -89,7 +89,7 @@ impl StepInputs {
             header,
             transforms,
             transform_links: self.transform_links.address(),
-            frames: self.frames.address(),
+            follower_frames: self.follower_frames.address(),
             q,
             change_steps: self.change_steps.address(),
             retained_counts,

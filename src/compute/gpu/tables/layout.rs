@@ -114,7 +114,7 @@ pub(crate) struct DeformArgs {
     pub mixed_quad_scales: u64,
     pub transforms: u64,
     pub transform_links: u64,
-    pub frames: u64,
+    pub follower_frames: u64,
     pub q: u64,
     pub tile_list: u64,
     pub retained_counts: u64,
@@ -170,7 +170,7 @@ pub(crate) struct BatchArgs {
     pub scales: u64,
     pub transforms: u64,
     pub transform_links: u64,
-    pub frames: u64,
+    pub follower_frames: u64,
     pub q: u64,
     pub boxes: u64,
 }
@@ -238,7 +238,7 @@ pub(crate) struct NormalsArgs {
     pub rest_tangents: u64,
     pub transforms: u64,
     pub transform_links: u64,
-    pub frames: u64,
+    pub follower_frames: u64,
     pub change_steps: u64,
     pub corner_groups: u64,
     pub ring_offsets: u64,
@@ -300,21 +300,21 @@ pub fn layout_constants() -> Vec<LayoutConstant> {
         TransformLink { root, frame }
         DeformArgs {
             header, tiles, mixed_quads, words, rest_positions, rest_normals, rest_tangents, corner_offsets, scales,
-            mixed_quad_scales, transforms, transform_links, frames, q, tile_list, retained_counts, retained, boxes, tile_count,
+            mixed_quad_scales, transforms, transform_links, follower_frames, q, tile_list, retained_counts, retained, boxes, tile_count,
             reserved
         }
         BatchGroup { first_word, rest_quad, first_scale, vertex_count, first_member, chunk_count, member_count }
         BatchMember { first_vertex, first_q, domain, first_tile }
         BatchBlock { group, first_tile, end_tile, reserved }
         BatchArgs {
-            header, blocks, groups, members, words, rest_positions, scales, transforms, transform_links, frames, q, boxes
+            header, blocks, groups, members, words, rest_positions, scales, transforms, transform_links, follower_frames, q, boxes
         }
         BoxSegment { first_item, item_count, domain, is_vertex_range }
         BoundsArgs { header, boxes, segments, change_steps, segment_boxes, box_count, segment_count, bounding_axes, reserved }
         ApplyArgs { header, changes, new_transforms, new_q, dirty_tiles, transform_links, transforms, q, change_steps, tile_list }
         NormalSlot { first_corner, first_normal, first_tangent, first_vertex, first_corner_group }
         NormalsArgs {
-            header, slots, first_domains, rest_normals, rest_tangents, transforms, transform_links, frames, change_steps,
+            header, slots, first_domains, rest_normals, rest_tangents, transforms, transform_links, follower_frames, change_steps,
             corner_groups, ring_offsets, rings, group_normals, corner_count, rest_corner_count, group_count, reserved
         }
     };

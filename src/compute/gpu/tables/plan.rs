@@ -56,9 +56,9 @@ pub enum BufferRole {
     Positions,
     Normals,
     Tangents,
-    /// u; only if the scene keeps displacements.
+    /// u; only in scenes with the feature `displacements`.
     Displacements,
-    /// The segments of domains that `bounds` reduces to boxes; only if the scene keeps boxes.
+    /// The segments of domains that `bounds` reduces to boxes; only in scenes with the feature `boxes`.
     BoxSegments,
     /// The boxes of these segments.
     DomainBoxes,
@@ -78,7 +78,8 @@ pub struct OmittedFeature {
     pub feature: &'static str,
     /// Code and data that are not compiled, computed or stored.
     pub what: &'static str,
-    /// Device bytes saved. They do not include the rings of `normals`, whose length is unknown until they are built.
+    /// Device bytes saved. They do not include the rings of the kernel `normals` (the vertices around each vertex), whose
+    /// length is unknown until they are built.
     pub bytes: u64,
 }
 
@@ -169,7 +170,7 @@ fn plan_buffers(scene: &Scene, tables: &DeviceTables) -> Vec<BufferDescriptor> {
         buffers.push((BufferRole::GroupNormals, bytes_of(&rings.group_normals)));
     }
     if features.followers {
-        let frames = bytes_of(scene.transform_roots.frames()) + bytes_of(&tables.transform_links);
+        let frames = bytes_of(scene.transform_roots.follower_frames()) + bytes_of(&tables.transform_links);
         buffers.push((BufferRole::FollowerFrames, frames));
     }
     buffers.into_iter().map(|(role, bytes)| BufferDescriptor { role, bytes }).collect()

@@ -70,7 +70,7 @@ pub(crate) fn scene_with_exact_normals(shapes: &[(usize, usize)]) -> Arc<Scene> 
     Scene::new(parts).expect("a scene")
 }
 
-/// A scene that keeps displacements and domain boxes for readback.
+/// A scene with the features `displacements` and `boxes`, whose values can be read back.
 pub(crate) fn scene_with_readbacks(shapes: &[(usize, usize)]) -> Arc<Scene> {
     let mut parts = parts(shapes);
     (parts.deformation.displacements, parts.deformation.boxes) = (true, true);

@@ -1,5 +1,6 @@
-//! Launches `kernels/apply.cu`, the first kernel of a partial step (a step that changes few domains). The kernel reads
-//! the new transforms and coordinates of changed domains directly from pinned host memory.
+//! Launches `kernels/apply.cu`, the first kernel of a partial step (a step that changes few domains). It applies the
+//! changes to the inputs on the device: it reads the new transforms and coordinates of changed domains directly from
+//! pinned host memory. It also copies the list of dirty tiles, which `deform` computes next.
 
 use cudarc::driver::{CudaFunction, LaunchConfig};
 

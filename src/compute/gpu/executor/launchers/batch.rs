@@ -73,7 +73,7 @@ impl BatchKernel {
             scales: shared.scales.address(),
             transforms: values.transforms,
             transform_links: values.transform_links,
-            frames: values.frames,
+            follower_frames: values.follower_frames,
             q: values.q,
             boxes: shared.boxes.address(),
         };
@@ -104,10 +104,10 @@ mod tests {
 
     /// A scene of random shapes, one for each (vertices, rank) of `shapes`, and a random state. `instances` domains use
     /// each shape: domain i uses shape `i % shapes.len()`.
-    fn ensemble(storage: StorageType, shapes: &[(usize, usize)], instances: usize) -> (Arc<Scene>, SceneState) {
+    fn instanced_scene(storage: StorageType, shapes: &[(usize, usize)], instances: usize) -> (Arc<Scene>, SceneState) {
         let shapes_scene =
             scene_and_state(&shapes.iter().map(|(vertices, rank)| (*vertices, *rank, 1)).collect::<Vec<_>>()).0;
-        let mut parts = SceneParts::named("ensemble");
+        let mut parts = SceneParts::named("instances");
         (parts.shapes, parts.materials) = (shapes_scene.shapes.clone(), shapes_scene.materials.clone());
         parts.deformation = DeformationSettings { storage, ..DeformationSettings::default() };
         parts.domains =
@@ -154,7 +154,7 @@ mod tests {
 
     /// The scenes of the tests: (vertices, rank) of each shape, and the number of domains that use each shape. A warp
     /// computes 64 vertices, a tile has 128 vertices, and a group has at most 16 domains.
-    const ENSEMBLES: [(&[(usize, usize)], usize); 6] = [
+    const INSTANCED_SCENES: [(&[(usize, usize)], usize); 6] = [
         (&[(1, 3), (63, 13)], 2),
         (&[(64, 4), (300, 0)], 16),
         (&[(65, 16), (128, 32), (7, 1)], 3),
@@ -165,8 +165,8 @@ mod tests {
 
     #[test]
     fn batch_positions_are_bit_identical_to_plain_sums() {
-        for (shapes, instances) in ENSEMBLES {
-            let (scene, state) = ensemble(StorageType::F32, shapes, instances);
+        for (shapes, instances) in INSTANCED_SCENES {
+            let (scene, state) = instanced_scene(StorageType::F32, shapes, instances);
             let got = twin_of_batch(&Tables::of(&scene, &state));
             for (domain, layout) in scene.layout.domains.iter().enumerate() {
                 for vertex in 0..layout.vertices {
@@ -194,8 +194,8 @@ mod tests {
         // rounds an entry by at most 2^-12 (f16), 2^-9 (bf16) or 1/254 (int8), and the errors of up to 50 modes partly
         // cancel. A wrong entry would typically change x by some tenths.
         for (storage, tolerance) in StorageType::ALL.into_iter().zip([1e-5, 1e-2, 8e-2, 8e-2]) {
-            for (shapes, instances) in ENSEMBLES {
-                let (scene, state) = ensemble(storage, shapes, instances);
+            for (shapes, instances) in INSTANCED_SCENES {
+                let (scene, state) = instanced_scene(storage, shapes, instances);
                 let got = twin_of_batch(&Tables::of(&scene, &state));
                 for (domain, layout) in scene.layout.domains.iter().enumerate().filter(|(_, layout)| layout.rank > 0) {
                     for vertex in 0..layout.vertices {
@@ -213,7 +213,7 @@ mod tests {
     #[test]
     fn groups_have_similar_sizes_and_are_adjacent_within_a_tile() {
         // A shape of 261 vertices has three tiles. Its 40 domains need three groups of at most 16.
-        let (scene, _) = ensemble(StorageType::F32, &[(261, 12)], 40);
+        let (scene, _) = instanced_scene(StorageType::F32, &[(261, 12)], 40);
         let work = WorkList::new(&scene, &CoordinateLayout::new(&scene), BatchPolicy::Always);
         let sizes: Vec<u32> = work.batched.groups.iter().map(|group| group.member_count).collect();
         assert_eq!(sizes, [14, 14, 12]);
@@ -234,7 +234,7 @@ mod tests {
     #[test]
     fn blocks_of_large_scenes_cover_each_tile_once() {
         // 6001 + 3000 tiles of 128 vertices are more than twice `TARGET_BLOCKS`, but less than three times.
-        let (scene, _) = ensemble(StorageType::F32, &[(128 * 6001, 1), (128 * 3000, 1)], 2);
+        let (scene, _) = instanced_scene(StorageType::F32, &[(128 * 6001, 1), (128 * 3000, 1)], 2);
         let batched = WorkList::new(&scene, &CoordinateLayout::new(&scene), BatchPolicy::Always).batched;
         assert!(
             batched.blocks.iter().all(|block| (1..=2).contains(&(block.end_tile - block.first_tile))),
@@ -251,7 +251,7 @@ mod tests {
     fn batch_variant_fits_the_number_of_instances() {
         let defines = |instances: usize| {
             let options = CudaDeformerOptions { batches: BatchPolicy::Always, ..CudaDeformerOptions::default() };
-            let plan = plan(&ensemble(StorageType::F16, &[(261, 12)], instances).0, options);
+            let plan = plan(&instanced_scene(StorageType::F16, &[(261, 12)], instances).0, options);
             let kernel = plan.kernel(KernelKind::Batch).expect("a batch kernel").clone();
             (kernel.defines.join(" "), kernel.blocks)
         };

@@ -1,6 +1,7 @@
 //! Launches `kernels/bounds.cu`, which reduces the boxes that `deform` writes to the bounds of all positions. If the
-//! deformer has bounding axes, the kernel also computes the bounds along these axes. If the scene keeps boxes, the
-//! kernel also computes the box of each domain.
+//! deformer has bounding axes, the kernel also computes the bounds along these axes. If the scene has the feature
+//! `boxes`, the kernel also computes the box of each domain, from segments (parts of domains). Bounds and boxes are six
+//! keys: order-preserving integers of the sides (`tables::box_keys`).
 
 use cudarc::driver::{CudaFunction, LaunchConfig};
 
@@ -20,7 +21,7 @@ pub struct BoundsKernel {
     config: LaunchConfig,
     /// Axes of the second box of the result, in addition to the world's axes; `None` if the result has one box.
     axes: Option<BoundingAxes>,
-    /// The box of each domain; only in a scene that keeps boxes.
+    /// The box of each domain; only in a scene with the feature `boxes`.
     pub(crate) boxes: Option<DomainBoxes>,
 }
 
@@ -57,8 +58,8 @@ impl BoundsKernel {
     /// Starts the kernel on the boxes of `deform`. The kernel writes its result into the header in `inputs`.
     ///
     /// # Safety
-    /// `inputs` and `deform` belong to the scene of this launcher. If the scene keeps boxes, the header has the address
-    /// of its positions. `inputs`, `deform` and the positions exist until the kernel has ended.
+    /// `inputs` and `deform` belong to the scene of this launcher. With the feature `boxes`, the header has the
+    /// address of its positions. `inputs`, `deform` and the positions exist until the kernel has ended.
     ///
     /// # Errors
     /// `Fault` when the device fails.

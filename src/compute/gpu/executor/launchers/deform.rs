@@ -1,5 +1,9 @@
-//! Launches `kernels/deform.cu`: x = T (x0 + U q) of all domains at once, their rigid normals and tangents, and four
-//! bounding boxes per tile. A tile is the work of one warp of the kernel (`tables::work`).
+//! Launches `kernels/deform.cu`: x = T (x0 + U q) of all domains at once, their rigid normals and tangents (those at
+//! rest, transformed by T), and four bounding boxes per tile.
+//!
+//! A quad is four consecutive vertices or corners of a domain. A tile, the work of one warp, is up to 32 quads: of one
+//! domain, or of several small domains (a mixed tile). A step that changes few domains is a partial step: the kernel
+//! `apply` writes a list of tiles, and `deform` computes only these.
 
 use std::sync::Arc;
 
@@ -50,29 +54,35 @@ pub struct DeformKernel {
     config: LaunchConfig,
     /// The kernel for groups of domains that share U; only in a scene with batches.
     batch: Option<BatchKernel>,
-    /// The variant of the kernel that computes the tiles of a list; only in a scene that can have partial steps.
-    list_function: Option<CudaFunction>,
+    /// The variant of the kernel for partial steps; only in a scene that can have them.
+    tile_list_function: Option<CudaFunction>,
     tiles: DeviceBuffer,
+    /// The quads of mixed tiles.
     mixed_quads: DeviceBuffer,
+    /// With `Int8`, the index in `scales` of each of these quads.
     mixed_quad_scales: DeviceBuffer,
+    /// U in packed words of 16 bytes.
     words: DeviceBuffer,
     rest_positions: DeviceBuffer,
-    normals: DeviceBuffer,
-    tangents: DeviceBuffer,
+    rest_normals: DeviceBuffer,
+    rest_tangents: DeviceBuffer,
+    /// Per domain, the index of its first corner minus that of its first vertex, both counted over all domains.
     corner_offsets: DeviceBuffer,
+    /// With `Int8`, the scale of each tile and mode, by which the kernel multiplies q.
     scales: DeviceBuffer,
+    /// Indices of the tiles that a partial step computes.
     tile_list: DeviceBuffer,
-    /// Four boxes of six keys per tile.
+    /// Four boxes per tile, as six integer keys each (`tables::box_keys`).
     boxes: DeviceBuffer,
     /// Number of tiles.
     tile_count: u32,
-    /// Number of leading tiles that this kernel computes in a full step. `batch` computes the other tiles with
-    /// vertices.
+    /// Number of tiles that this kernel computes in a full step: the first ones of the list. The kernel `batch` computes
+    /// the other tiles with vertices.
     full_step_tiles: u32,
-    /// Index of the first quad that has normals.
+    /// Index of the first quad that has normals or tangents (directions).
     first_direction_quad: u64,
     packer: Arc<InputPacker>,
-    /// Segments of domains that `bounds` reduces to boxes; only if the scene keeps boxes.
+    /// Segments of domains that `bounds` reduces to boxes; only in scenes with the feature `boxes`.
     segments: Option<Vec<BoxSegment>>,
 }
 
@@ -101,7 +111,7 @@ impl DeformKernel {
         let mut uploader = ModeUploader::new(device, scene, &work)?;
         work.sources.iter().try_for_each(|source| uploader.add(source))?;
         let UploadedModes { words, scales, factors } = uploader.finish()?;
-        let has_lists = tile_list_capacity > 0;
+        let has_partial_steps = tile_list_capacity > 0;
         // Tiles that have only corners are needed only for rigid normals.
         let full_step_tiles =
             if kernel.defines.contains(&"RIGID_NORMALS") { work.full_step_tiles } else { work.vertex_tiles };
@@ -110,14 +120,14 @@ impl DeformKernel {
             function: compile_function(device, kernel)?,
             config,
             batch: kernels.batch.map(|kernel| BatchKernel::new(device, kernel, &work.batched)).transpose()?,
-            list_function: has_lists.then(|| compile_list_function(device, kernel)).transpose()?,
+            tile_list_function: has_partial_steps.then(|| compile_tile_list_function(device, kernel)).transpose()?,
             tiles: DeviceBuffer::upload(device, &work.tiles)?,
             mixed_quads: DeviceBuffer::upload(device, &work.mixed_quads)?,
             mixed_quad_scales: DeviceBuffer::upload(device, &work.mixed_quad_scales)?,
             words,
             rest_positions: DeviceBuffer::upload(device, &rest_positions)?,
-            normals: DeviceBuffer::upload(device, &rest_normals)?,
-            tangents: DeviceBuffer::upload(device, &rest_tangents)?,
+            rest_normals: DeviceBuffer::upload(device, &rest_normals)?,
+            rest_tangents: DeviceBuffer::upload(device, &rest_tangents)?,
             corner_offsets: DeviceBuffer::upload(device, &work.corner_offsets)?,
             scales,
             tile_list: DeviceBuffer::zeroed(device, 4 * tile_list_capacity as u64)?,
@@ -144,7 +154,7 @@ impl DeformKernel {
         &self.packer
     }
 
-    /// The segments of all domains, if the scene keeps boxes.
+    /// The segments of all domains, in scenes with the feature `boxes`.
     pub(super) fn segments(&self) -> Option<&[BoxSegment]> {
         self.segments.as_deref()
     }
@@ -154,7 +164,7 @@ impl DeformKernel {
         TileBoxes { address: self.boxes.address(), count: 4 * self.tile_count }
     }
 
-    /// Address of the tile list that `apply` writes.
+    /// Address of the tile list, which the kernel `apply` writes.
     pub(super) fn tile_list(&self) -> u64 {
         self.tile_list.address()
     }
@@ -170,7 +180,7 @@ impl DeformKernel {
     /// # Safety
     /// `inputs` has the layout of [`Self::packer`] and contains a full step when the kernels run. Its header has the
     /// addresses of the outputs that the kernels write, with the sizes of the scene: positions; normals and tangents if
-    /// they are rigid; displacements if the scene keeps them. `inputs` and the outputs exist until the kernels have
+    /// they are rigid; displacements with the feature `displacements`. `inputs` and the outputs exist until the kernels have
     /// ended.
     ///
     /// # Errors
@@ -189,11 +199,11 @@ impl DeformKernel {
         unsafe { self.launch_variant(device, inputs, &self.function, self.config) }
     }
 
-    /// Starts the kernel on the tiles of the tile list, whose length is in the header. In the variant for lists, a
-    /// block has one warp, and a tile has four warps.
+    /// Starts the kernel of a partial step, which computes the tiles of the tile list. The length of the list is in the
+    /// header. In this variant, a block has one warp, and four warps share a tile.
     ///
     /// # Safety
-    /// As [`Self::launch`]; in addition, `apply` has written the tile list of this step when the kernel runs.
+    /// As [`Self::launch`]; in addition, the kernel `apply` has written the tile list of this step when the kernel runs.
     ///
     /// # Errors
     /// `Fault` when the scene's steps are always full, or when the device fails.
@@ -202,7 +212,7 @@ impl DeformKernel {
         let config = LaunchConfig { grid_dim, block_dim: (WARP_THREADS, 1, 1), shared_mem_bytes: 0 };
         let missing_function =
             || Error::Fault { stage: "deform", reason: "expected a scene with partial steps".into() };
-        let function = self.list_function.as_ref().ok_or_else(missing_function)?;
+        let function = self.tile_list_function.as_ref().ok_or_else(missing_function)?;
         // SAFETY: the caller guarantees it.
         unsafe { self.launch_variant(device, inputs, function, config) }
     }
@@ -210,7 +220,7 @@ impl DeformKernel {
     /// Starts `function`, a variant of the kernel.
     ///
     /// # Safety
-    /// As [`Self::launch`], or as [`Self::launch_tile_list`] for the variant for lists.
+    /// As [`Self::launch`], or as [`Self::launch_tile_list`] if `function` is the variant of partial steps.
     unsafe fn launch_variant(
         &self,
         device: &Device,
@@ -227,14 +237,14 @@ impl DeformKernel {
             rest_positions: self.rest_positions.address(),
             // The tables begin with the first quad that has normals: 48 bytes of normals and 64 bytes of tangents per
             // quad. No tile with corners refers to an earlier quad.
-            rest_normals: self.normals.address().wrapping_sub(48 * self.first_direction_quad),
-            rest_tangents: self.tangents.address().wrapping_sub(64 * self.first_direction_quad),
+            rest_normals: self.rest_normals.address().wrapping_sub(48 * self.first_direction_quad),
+            rest_tangents: self.rest_tangents.address().wrapping_sub(64 * self.first_direction_quad),
             corner_offsets: self.corner_offsets.address(),
             scales: self.scales.address(),
             mixed_quad_scales: self.mixed_quad_scales.address(),
             transforms: values.transforms,
             transform_links: values.transform_links,
-            frames: values.frames,
+            follower_frames: values.follower_frames,
             q: values.q,
             tile_list: self.tile_list.address(),
             retained_counts: values.retained_counts,
@@ -272,19 +282,20 @@ fn compile_function(device: &Device, kernel: &KernelDescriptor) -> Result<CudaFu
     Err(Error::Fault { stage: "deform", reason })
 }
 
-/// Compiles the function that computes the tiles of a list.
-fn compile_list_function(device: &Device, kernel: &KernelDescriptor) -> Result<CudaFunction> {
-    // Lists are short: with more than one item per lane, most of the device would be idle.
+/// Compiles the function of partial steps.
+fn compile_tile_list_function(device: &Device, kernel: &KernelDescriptor) -> Result<CudaFunction> {
+    // Tile lists are short: with more than one item (vertex or corner) per lane, most of the device would be idle.
     let defines = kernel.defines.iter().copied().filter(|define| *define != "ONE_ITEM_PER_LANE");
-    let list_defines: Vec<&str> = defines.chain(["ONE_ITEM_PER_LANE", "TILE_LIST"]).collect();
-    compile(device, kernel, &list_defines)
+    let tile_list_defines: Vec<&str> = defines.chain(["ONE_ITEM_PER_LANE", "TILE_LIST"]).collect();
+    compile(device, kernel, &tile_list_defines)
 }
 
 /// Maximum number of blocks that loop over a tile list: 12 resident blocks on each of 132 multiprocessors, as many as
 /// an H200 has.
 const MAX_LIST_BLOCKS: u32 = 132 * 12;
 
-/// Uploads U source by source, and collects the scales and factors of all shapes.
+/// Uploads U source by source, and collects the scales (see [`DeformKernel`]) and the factors of all shapes. A factor is a
+/// power of two per mode, by which the host multiplies q because U is stored divided by it.
 struct ModeUploader<'a> {
     device: &'a Device,
     scene: &'a Scene,
@@ -355,6 +366,6 @@ impl<'a> ModeUploader<'a> {
 struct UploadedModes {
     words: DeviceBuffer,
     scales: DeviceBuffer,
-    /// Per shape, the factors of its modes; empty unless the storage has factors.
+    /// Per shape, the factors of its modes; empty unless U is stored in 16 bits.
     factors: Vec<Vec<f32>>,
 }

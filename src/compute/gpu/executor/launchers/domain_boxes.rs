@@ -19,7 +19,7 @@ pub(crate) struct DomainBoxes {
 }
 
 /// Addresses of the segments and of their boxes, and the number of segments. The default, zeros, is for a scene that
-/// keeps no boxes.
+/// without the feature `boxes`.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct DomainBoxAddresses {
     pub segments: u64,

@@ -9,7 +9,8 @@ use crate::gpu::tables::layout::NormalsArgs;
 use modalcast_model::error::{Error, Result};
 use modalcast_model::scene::Scene;
 
-/// The kernel and its constant tables. `NormalTables` and `RingTables` describe them.
+/// The kernel and its constant tables, which `NormalTables` and `RingTables` describe. A smoothing group is the corners
+/// of one vertex that share a normal. Its ring lists the vertices around it.
 #[derive(Debug)]
 pub struct NormalsKernel {
     function: CudaFunction,
@@ -83,7 +84,7 @@ impl NormalsKernel {
             rest_tangents: self.rest_tangents.as_ref().map_or(0, DeviceBuffer::address),
             transforms: values.transforms,
             transform_links: values.transform_links,
-            frames: values.frames,
+            follower_frames: values.follower_frames,
             change_steps: values.change_steps,
             corner_groups: self.corner_groups.address(),
             ring_offsets: self.ring_offsets.address(),

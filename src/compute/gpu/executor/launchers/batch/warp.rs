@@ -1,5 +1,6 @@
 //! Emulates a warp of `kernels/batch.cu` in lockstep, with its ring buffer for U and its coalesced stores. As in the
-//! kernel, a stage of the ring has a few chunks of modes, and the domains of a group are its members.
+//! kernel, a quad is four consecutive vertices, a chunk is a few consecutive modes, and the ring has stages of a few
+//! chunks. The members of a group are its domains.
 
 use crate::testing::transformed_axis;
 use std::sync::Arc;
@@ -14,11 +15,11 @@ use crate::storage::{PackedWord, TILE_QUADS, modes_per_chunk};
 use modalcast_model::backend_settings::BatchPolicy;
 use modalcast_model::scene::{Scene, SceneState, StorageType};
 
-/// Quads (four vertices each) of a warp.
+/// Quads of a warp.
 const WARP_QUADS: usize = TILE_QUADS / BATCH_WARPS;
 /// Vertices of a warp.
 const WARP_VERTICES: usize = 4 * WARP_QUADS;
-/// Chunks of modes of a stage.
+/// Chunks of a stage.
 const STAGE_CHUNKS: usize = 4;
 /// 16-byte words of a stage: three per chunk and quad.
 const STAGE_WORDS: usize = 3 * STAGE_CHUNKS * WARP_QUADS;
