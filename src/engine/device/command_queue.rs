@@ -22,7 +22,7 @@ pub(super) enum Work {
     Command(Command),
     /// A command whose textures and programs were prepared.
     Prepared(Command),
-    /// The next step of the output that the device thread has begun for this scene.
+    /// The next draw step of the output that the device thread has begun for this scene (`partial_output`).
     Continue,
 }
 
@@ -71,7 +71,7 @@ impl CommandQueue {
         Ok(is_cancellable.then(|| CancelGuard { queue: Arc::clone(self), scene, ticket }))
     }
 
-    /// Returns the output of a scene to the head of its queue, because steps of it remain.
+    /// Returns the output of a scene to the head of its queue, because draw steps of it remain.
     pub(super) fn push_continuation(&self, scene: SceneId, class: CostClass) {
         lock(&self.state).work.push_front(scene, class, Work::Continue);
     }

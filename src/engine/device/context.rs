@@ -40,7 +40,8 @@ pub struct PendingDraw {
     upload_ms: Option<f64>,
 }
 
-/// A frame of which some steps are not submitted yet.
+/// A frame of which some draw steps are not submitted yet (see `partial_output`). A draw step is a part of the drawing
+/// commands of one frame; it is no step of the simulation.
 #[derive(Debug)]
 pub(in crate::engine) struct PartialDraw {
     pub frame: PartialFrame,
@@ -65,10 +66,11 @@ impl PendingDraw {
 #[cfg(test)]
 type CreateDeformer = fn(&Arc<Scene>) -> Box<dyn Deformer + Send>;
 
-/// A deformer, as far as any thread can create it.
+/// A deformer that any thread can prepare, and that the device thread completes.
 pub(in crate::engine) enum PreparedDeformer {
+    /// Needs no completion.
     Complete(Box<dyn Deformer + Send>),
-    /// Lacks the output buffers, which the device thread creates, because OpenGL may own them.
+    /// Lacks the output buffers. The device thread creates them, because OpenGL may own them.
     Cuda(Box<gpu::PreparedDeformer>),
 }
 
@@ -320,8 +322,8 @@ impl DeviceContext {
         self.finish_partial_draw(partial_draw)
     }
 
-    /// Begins a frame of the last deformation. The scene must not be used for anything else until all steps of the frame
-    /// are submitted.
+    /// Begins a frame of the last deformation. The scene must not be used for anything else until all draw steps of the
+    /// frame are submitted.
     ///
     /// # Errors
     /// As [`Self::begin_draw`].
@@ -338,12 +340,13 @@ impl DeviceContext {
         let contents = loaded_scene.fill_buffers(renderer, &camera)?;
         let upload_ms = contents.is_uploaded.then(|| ms_since(upload_begin));
         let params = FrameParams { edges, ..contents.frame_params(camera, size) };
-        let frame = renderer.begin_frame(loaded_scene.buffers()?, &params, true)?;
+        let has_readback = true;
+        let frame = renderer.begin_frame(loaded_scene.buffers()?, &params, has_readback)?;
         loaded_scene.log_frame(frame.info());
         Ok(PartialDraw { frame, upload_ms })
     }
 
-    /// Submits the next step of a frame.
+    /// Submits the next draw step of a frame.
     ///
     /// # Errors
     /// `Fault` of OpenGL. The frame must then be dropped.
@@ -351,7 +354,7 @@ impl DeviceContext {
         self.renderer.as_mut().map_err(|error| error.clone())?.submit_step(scene.buffers()?, &mut draw.frame)
     }
 
-    /// Returns a frame whose steps are all submitted.
+    /// Returns a frame whose draw steps are all submitted.
     ///
     /// # Errors
     /// `Fault` of OpenGL.
@@ -381,7 +384,7 @@ impl DeviceContext {
         (!preparation.is_finished()).then_some(preparation)
     }
 
-    /// Uploads the next layer of a texture, or compiles the next program.
+    /// Executes the next step of a preparation: uploads a layer of a texture, or compiles a program.
     ///
     /// # Errors
     /// `Fault` with the compiler's log, or of OpenGL.
@@ -401,13 +404,13 @@ impl DeviceContext {
         self.cuda_device.is_some() && self.renderer.as_ref().is_ok_and(|renderer| renderer.info().cuda_device.is_some())
     }
 
-    /// Whether an output of this size is drawn in steps, between which other scenes are served.
+    /// Whether an output of this size is drawn in several draw steps, between which other scenes are served.
     pub(in crate::engine) fn is_divided(&self, loaded_scene: &LoadedScene, size: FrameSize) -> bool {
         let size = [size.width, size.height];
         self.renderer.as_ref().is_ok_and(|renderer| renderer.is_divided(loaded_scene.scene(), size))
     }
 
-    /// Sets the number of samples that the renderer draws without a break.
+    /// Sets the maximum number of samples of a band, the part of a picture that one draw step draws.
     #[cfg(test)]
     pub(in crate::engine) fn set_max_band_samples(&mut self, max_band_samples: u64) {
         if let Ok(renderer) = &mut self.renderer {

@@ -263,7 +263,7 @@ mod tests {
         }
         let scenes = take_scenes(&mut queue, 2000);
         let (large_ms, small_ms) = (200 * count_of(&scenes, 1), count_of(&scenes, 2));
-        // The scenes differ by at most the cost of one entry and the time that no cost was known.
+        // The scenes differ by at most the cost of one entry, and the work that was taken before any cost was measured.
         assert!(large_ms.abs_diff(small_ms) <= 600, "{large_ms} and {small_ms} ms");
         // Negative control: in the order of submission, the first scene would have used all the time.
         assert!(small_ms > 1000, "{small_ms} ms");
@@ -315,7 +315,7 @@ mod tests {
     }
 
     #[test]
-    fn removed_work_gives_back_its_place_at_once() {
+    fn removed_work_leaves_the_queue_at_once() {
         let mut queue = FairQueue::new();
         let tickets: Vec<Ticket> = (0..3).map(|number| queue.push(1, SMALL, number)).collect();
         assert_eq!(queue.remove(1, tickets[1]), Some(1));

@@ -1,5 +1,6 @@
-//! Tests of the device loop with several scenes: large outputs in steps, cancelled commands and full queues. The loop
-//! runs on the thread of the test, one command or step at a time, so the order does not depend on times.
+//! Tests of the device loop with several scenes: large outputs in draw steps (parts of a frame, `partial_output`),
+//! cancelled commands and full queues. The loop runs on the thread of the test, one command or draw step at a time, so the
+//! order does not depend on times.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -20,7 +21,7 @@ use modalcast_render::FrameImage;
 
 const LARGE: FrameSize = FrameSize::new(192, 512);
 const SMALL: FrameSize = FrameSize::new(32, 32);
-/// Samples of a band of [`LARGE`] of 64 rows with four samples per pixel.
+/// Samples of a band of 64 rows of [`LARGE`], with four samples per pixel. A draw step draws one band at most.
 const BAND_SAMPLES: u64 = 4 * 192 * 64;
 
 /// A device loop with loaded scenes.
@@ -33,7 +34,7 @@ struct Fixture {
 
 impl Fixture {
     /// Loads the scenes 1 and 2, and draws a frame of each. Outputs of more than `max_band_samples` samples are drawn in
-    /// steps.
+    /// several draw steps.
     async fn start(max_band_samples: u64) -> Self {
         let mut fixture = Self::load(max_band_samples).await;
         for id in [1, 2] {
@@ -81,14 +82,14 @@ impl Fixture {
         self.handle.begin_draw(id, Camera::fit_to_scene(&self.scene, size.width, size.height), size, None)
     }
 
-    /// Runs `count` commands or steps.
+    /// Runs `count` commands or draw steps.
     fn run(&mut self, count: usize) {
         for _ in 0..count {
             assert!(self.device_loop.run_next());
         }
     }
 
-    /// Runs commands and steps until none is queued. Returns their number.
+    /// Runs commands and draw steps until none is queued. Returns their number.
     fn run_all(&mut self) -> usize {
         let mut count = 0;
         while self.queue.len(1) + self.queue.len(2) > 0 {
@@ -116,8 +117,8 @@ fn state_with_q(scene: &Scene, q: f32) -> Arc<SceneState> {
 
 #[tokio::test]
 async fn large_frame_does_not_delay_another_scene() {
-    // Negative control: without steps, the other scene waits for the complete frame.
-    for (max_band_samples, has_steps) in [(BAND_SAMPLES, true), (u64::MAX, false)] {
+    // Negative control: without a limit on a band, the frame is one draw step, for which the other scene waits.
+    for (max_band_samples, is_divided) in [(BAND_SAMPLES, true), (u64::MAX, false)] {
         let mut fixture = Fixture::start(max_band_samples).await;
         let large = fixture.draw(1, LARGE);
         fixture.run(1);
@@ -128,9 +129,10 @@ async fn large_frame_does_not_delay_another_scene() {
             fixture.run(1);
             waited += 1;
         }
-        assert!((1..=2).contains(&waited), "the other scene waited for {waited} steps");
-        let step_count = fixture.run_all();
-        assert_eq!(step_count > 15, has_steps, "{step_count} steps after the answer");
+        assert!((1..=2).contains(&waited), "the other scene waited for {waited} commands and draw steps");
+        // Most of the divided frame is drawn after the answer to the other scene.
+        let remaining_count = fixture.run_all();
+        assert_eq!(remaining_count > 15, is_divided, "{remaining_count} draw steps after the answer");
         assert_eq!(large.wait().await.expect("expected a frame").height, LARGE.height);
     }
 }
@@ -152,7 +154,7 @@ async fn commands_of_a_scene_wait_for_its_large_outputs() {
     let mut deformed = fixture.handle.deform(1, &state_with_q(&fixture.scene, 0.5));
     let deformed_large = fixture.draw(1, LARGE);
     while fixture.queue.len(1) > 2 {
-        assert!(!is_answered(&mut deformed).await, "expected the step to wait for the frame before it");
+        assert!(!is_answered(&mut deformed).await, "expected the deformation to wait for the frame before it");
         fixture.run(1);
     }
     fixture.run_all();
@@ -165,7 +167,7 @@ async fn one_large_output_is_drawn_at_a_time() {
     let mut fixture = Fixture::start(BAND_SAMPLES).await;
     let (first, second) = (fixture.draw(1, LARGE), fixture.draw(2, LARGE));
     fixture.run(1);
-    let (partial_scene, other_scene) = (fixture.device_loop.partial_scene().expect("expected steps"), [2, 1]);
+    let (partial_scene, other_scene) = (fixture.device_loop.partial_scene().expect("expected a divided frame"), [2, 1]);
     let other_scene = other_scene[partial_scene as usize - 1];
     while fixture.queue.len(partial_scene) > 0 {
         assert_eq!((fixture.queue.len(other_scene), fixture.device_loop.partial_scene()), (1, Some(partial_scene)));
@@ -188,7 +190,7 @@ async fn cancelled_command_leaves_a_full_queue_at_once() {
     assert_eq!(fixture.queue.len(1), MAX_QUEUED_COMMANDS - 1);
     draws.push(fixture.draw(1, SMALL));
     assert_eq!(fixture.queue.len(1), MAX_QUEUED_COMMANDS);
-    // A step changes the scene, so it is not cancelled.
+    // A deformation changes the scene, so it is not cancelled.
     drop(draws.remove(0));
     drop(fixture.handle.deform(1, &state_with_q(&fixture.scene, 0.5)));
     assert_eq!(fixture.queue.len(1), MAX_QUEUED_COMMANDS);
@@ -200,7 +202,7 @@ async fn cancelled_command_leaves_a_full_queue_at_once() {
 }
 
 #[tokio::test]
-async fn cancelled_large_outputs_end_after_their_present_step() {
+async fn cancelled_large_output_ends_after_its_draw_step() {
     let mut fixture = Fixture::start(BAND_SAMPLES).await;
     let large = fixture.draw(1, LARGE);
     fixture.run(3);
@@ -222,7 +224,7 @@ async fn cancelled_large_outputs_end_after_their_present_step() {
 }
 
 #[tokio::test]
-async fn large_aov_equals_the_aov_without_steps() {
+async fn divided_aov_equals_the_undivided_aov() {
     let mut results = Vec::new();
     for max_band_samples in [u64::MAX, 192 * 64] {
         let mut fixture = Fixture::start(max_band_samples).await;
@@ -246,18 +248,18 @@ async fn large_aov_equals_the_aov_without_steps() {
         }
         results.push((step_count, aovs.await.expect("expected no panic").expect("expected AOVs")));
     }
-    assert!(results[0].0 == 2 && results[1].0 >= 16, "{} and {} steps", results[0].0, results[1].0);
+    assert!(results[0].0 == 2 && results[1].0 >= 16, "{} and {} commands and draw steps", results[0].0, results[1].0);
     assert!(results[0].1 == results[1].1);
 }
 
 /// Drivers compile programs at their first use, so the first frame takes long.
 #[tokio::test]
-async fn first_frame_of_a_scene_is_drawn_in_steps() {
+async fn first_frame_of_a_scene_has_several_draw_steps() {
     let mut fixture = Fixture::load(u64::MAX).await;
-    for (frame, has_steps) in [("first", true), ("second", false)] {
+    for (frame, is_divided) in [("first", true), ("second", false)] {
         let draw = fixture.draw(1, SMALL);
         fixture.run(1);
-        assert_eq!(fixture.queue.len(1) > 0, has_steps, "{frame}");
+        assert_eq!(fixture.queue.len(1) > 0, is_divided, "{frame} frame: expected draw steps to remain: {is_divided}");
         let state = state_with_q(&fixture.scene, 0.5);
         let mut deformed = fixture.handle.deform(2, &state);
         while !is_answered(&mut deformed).await {
@@ -275,16 +277,15 @@ async fn scene_is_prepared_in_steps() {
     let mut fixture = Fixture::load(u64::MAX).await;
     let (draw, cancelled_draw) = (fixture.draw(1, SMALL), fixture.draw(1, SMALL));
     fixture.run(1);
-    // The preparation, and the frames that need it.
-    assert_eq!(fixture.queue.len(1), 3);
+    assert_eq!(fixture.queue.len(1), 3, "expected the preparation of programs, and the two frames that need it");
     let mut deformed = fixture.handle.deform(2, &state_with_q(&fixture.scene, 0.5));
     while !is_answered(&mut deformed).await {
         fixture.run(1);
     }
-    assert_eq!(fixture.queue.len(1), 3, "expected programs that are not compiled yet");
+    assert_eq!(fixture.queue.len(1), 3, "expected an unfinished preparation");
     drop(cancelled_draw);
     assert_eq!(fixture.queue.len(1), 2);
-    // The frame keeps its place, and can be cancelled.
+    // Without the two frames, the preparation remains.
     drop(draw);
     assert_eq!(fixture.queue.len(1), 1);
     let draw = fixture.draw(1, SMALL);
@@ -292,7 +293,7 @@ async fn scene_is_prepared_in_steps() {
         fixture.run(1);
     }
     draw.wait().await.expect("expected a frame");
-    // The other scene uses the same programs, so its first step draws.
+    // The other scene uses the same programs, so it needs no preparation: only the frame itself remains queued.
     let draw = fixture.draw(2, SMALL);
     fixture.run(1);
     assert_eq!(fixture.queue.len(2), 1);

@@ -6,7 +6,8 @@ use modalcast_render::{FrameInfo, FrameLook};
 /// swinging object crosses the ground in every period.
 #[derive(Debug, Default)]
 pub(super) struct FrameLog {
-    /// At most as many looks as the rule has kinds of antialiasing, because the shadow map of a loaded scene is constant.
+    /// The looks of earlier frames. They differ only in their antialiasing, because the shadow map of a loaded scene is
+    /// constant.
     looks: Vec<FrameLook>,
     has_warned_of_ground: bool,
 }

@@ -55,7 +55,7 @@ pub struct LoadedScene {
     /// Number of deformations. Includes rejected states and the deformations that undo them, because each deformation
     /// changes the content of the buffers.
     generation: u64,
-    /// The color map whose values are in the buffers.
+    /// The color map whose values are in the buffers, and its legend.
     cached_color_map: Option<(FrameOutput, Legend)>,
     frame_log: FrameLog,
 }
@@ -82,7 +82,7 @@ impl LoadedScene {
         }
     }
 
-    /// Deforms the rest state.
+    /// Deforms the scene to the rest state.
     ///
     /// # Errors
     /// `Invalid` when the rest state overflows; `Fault` of the device.

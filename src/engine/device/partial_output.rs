@@ -1,6 +1,7 @@
-//! An output of which some steps are not submitted to the device yet. A large output, or the first frame of a scene, is
-//! drawn in steps, between which the device thread serves other scenes. The commands of its own scene wait until all steps are submitted, so the vertices
-//! and the buffers of the scene do not change between the steps.
+//! An output of which some draw steps are not submitted to the device yet. A large output, or the first frame of a scene,
+//! is drawn in several draw steps, between which the device thread serves other scenes. (Draw steps are unrelated to the
+//! steps of the simulation.) The commands of its own scene wait until all draw steps are submitted, so the vertices and the
+//! buffers of the scene do not change between them.
 
 use std::time::Duration;
 
@@ -18,19 +19,20 @@ pub(super) struct Charge {
     pub class: CostClass,
     /// Milliseconds that the scene was charged for the command.
     pub charged_ms: f64,
-    /// Milliseconds that the device thread has spent on all steps so far.
+    /// Milliseconds that the device thread has spent on all draw steps so far.
     pub spent_ms: f64,
-    /// Whether the cost of the first step is recorded. The later steps are charged separately.
+    /// Whether the queue has the measured cost of the command itself, which is that of its first draw step. Later draw
+    /// steps are charged to a class of their own.
     pub is_recorded: bool,
 }
 
-/// An output and the channel for it.
+/// An output, the channel for its answer, and its costs.
 pub(super) struct PartialOutput {
     pub kind: PartialKind,
     pub charge: Charge,
 }
 
-#[expect(clippy::large_enum_variant, reason = "there are only as many as scenes, and most are frames")]
+#[expect(clippy::large_enum_variant, reason = "there is at most one per scene, and most are frames")]
 pub(super) enum PartialKind {
     Frame(PartialDraw, Reply<FrameImage>),
     Aov(PartialAovDraw, Reply<(AovImage, Option<Legend>)>),
@@ -65,7 +67,7 @@ impl PartialOutput {
         }
     }
 
-    /// Whether other scenes are served between the steps.
+    /// Whether other scenes are served between the draw steps.
     pub(super) const fn has_breaks(&self) -> bool {
         match &self.kind {
             PartialKind::Frame(draw, _) => draw.frame.has_breaks(),
@@ -74,7 +76,7 @@ impl PartialOutput {
         }
     }
 
-    /// Waits at most `limit` for the last step. Returns whether the device has finished it.
+    /// Waits at most `limit` for the draw step that was submitted last. Returns whether the device has finished it.
     pub(super) fn is_ready_within(&self, limit: Duration) -> bool {
         match &self.kind {
             PartialKind::Frame(draw, _) => draw.frame.is_ready_within(limit),
@@ -90,7 +92,7 @@ impl PartialOutput {
         }
     }
 
-    /// Class of the steps after the first.
+    /// Class of the draw steps after the first.
     pub(super) fn step_class(&self) -> CostClass {
         let kind = match self.kind {
             PartialKind::Frame(..) => "draw step",
@@ -111,7 +113,7 @@ impl PartialOutput {
         };
     }
 
-    /// Submits the next step. `scene` is the loaded scene, or the error if it is not loaded.
+    /// Submits the next draw step. `scene` is the loaded scene, or the error if it is not loaded.
     ///
     /// # Errors
     /// `Fault` of OpenGL. The output must then be dropped.

@@ -120,7 +120,7 @@ impl<T, R, P, F: FnOnce(Vec<T>) -> R> Job<T, R, P, F> {
         drop(state);
         results.sort_unstable_by_key(|(index, _)| *index);
         let combination = finish(results.into_iter().map(|(_, result)| result).collect());
-        // The caller may be gone.
+        // Fails only if the caller no longer waits.
         sender.send((combination, ms_since(begin))).ok();
     }
 }

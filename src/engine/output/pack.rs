@@ -1,6 +1,6 @@
-//! Packs the selected vertex attributes into bytes for the wire. f32 attributes refer to the vertices themselves where
-//! the selected domains are large or consecutive. Other sections are packed once for all readers that select the same,
-//! on threads of their own.
+//! Packs the selected vertex attributes into bytes for the wire, one section per attribute. An f32 section is not copied if
+//! the selected domains are large or consecutive: its bytes are those of the vertices in memory. Any other section is packed
+//! once for all readers with the same selection, on a thread pool of its own.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
@@ -25,7 +25,7 @@ const _: () = assert!(cfg!(target_endian = "little"), "expected a little-endian 
 /// Maximum number of threads that pack.
 const MAX_THREADS: usize = 4;
 
-/// Minimum mean size of the ranges of vertices that are sent from where they are. Smaller ones are copied together.
+/// Minimum mean size of the ranges of vertices that are sent without a copy. Smaller ranges are copied into one part.
 const MIN_RANGE_BYTES: usize = 64 << 10;
 
 /// Size of a vector of an f32 attribute in numbers and in bytes.
@@ -53,8 +53,8 @@ pub struct PackedVertices {
     pub stages: StageTimes,
     /// In the order of their offsets, without gaps.
     pub sections: Vec<Section>,
-    /// The bytes of all sections, one part after the other; none of them is empty. A part may refer to the vertices that were read back, which
-    /// stay in memory until it is dropped.
+    /// The bytes of all sections, one part after the other; no part is empty. A part may refer to the vertices that were
+    /// read back, which then stay in memory until the part is dropped.
     pub parts: Vec<Bytes>,
     pub origins: Origins,
 }
@@ -229,8 +229,8 @@ fn checked_numbers<'a>(
     Ok(numbers)
 }
 
-/// The selected ranges of an f32 attribute, without a copy. `None` if they are too small for that, or if the attribute
-/// is not stored as f32.
+/// The selected ranges of an f32 attribute, without a copy. `None` if the ranges must be copied because they are too small,
+/// or if the attribute is not stored as f32.
 fn vertex_parts(
     surface: &Arc<DeformedSurface>,
     selection: &VertexSelection,

@@ -19,11 +19,11 @@ pub enum StateContent {
     QDomains,
     /// f32 coordinates of these domains.
     Q,
-    /// u32 indices of transform roots.
+    /// u32 indices of transform roots: domains that follow no other domain.
     TransformDomains,
     /// 12 f32 per transform root.
     Transforms,
-    /// 3 f64 in meters for all transform roots, or for each of them.
+    /// 3 f64 in meters: one origin for all transform roots, or one per root.
     Origins,
 }
 

@@ -211,7 +211,7 @@ pub fn check_force_count(count: usize) -> Result<()> {
 #[derive(Debug, Clone)]
 struct OwnedForces {
     owner: ForceOwner,
-    /// Stands for the owner where others see its forces.
+    /// Public number of the owner, which other clients see instead of its token.
     number: u64,
     forces: Arc<[Force]>,
     expires_at: Instant,
@@ -291,7 +291,7 @@ impl ForceSet {
 /// A force and its effect on the coordinates of its domain.
 #[derive(Debug, Clone, PartialEq)]
 pub struct AppliedForce {
-    /// Stands for the owner.
+    /// Public number of the owner.
     pub owner: u64,
     pub force: Force,
     /// r numbers.

@@ -174,7 +174,7 @@ impl SceneHandle {
         self.call(|reply| Message::Request(StepRequest { selector, spec, reply })).await
     }
 
-    /// Sets all forces of an owner. Returns the number that stands for the owner, or 0 if it has no forces now. The
+    /// Sets all forces of an owner. Returns the public number of the owner, or 0 if it has no forces now. The
     /// scene's task is not involved.
     ///
     /// # Errors
