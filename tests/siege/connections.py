@@ -1,4 +1,4 @@
-"""Item 1: connections without a request do not lock out new clients."""
+"""Item 1 of `prove.py`: connections without a request do not lock out new clients."""
 
 import http2
 import swarm
@@ -27,7 +27,8 @@ def call(path):
     return HELLO + http2.grpc_headers(path, 1) + data
 
 
-# Name, bytes that each connection sends, whether it answers PINGs, and the number of connections in all.
+# Name, bytes that each connection sends, whether it answers PINGs, and the maximum number of connections in all, None
+# without a maximum: a new connection replaces each one that the server closes.
 ATTACKS = [
     ("one byte", b"P", False, None),
     ("preface", HELLO, False, None),

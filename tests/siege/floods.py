@@ -1,4 +1,4 @@
-"""Item 12: floods of control frames end their connection, and errors and logs name no places and stay short."""
+"""Item 12 of `prove.py`: floods of control frames end their connection, errors name no file or address, and logs stay short."""
 
 import hashlib
 import re
@@ -15,7 +15,7 @@ from server import Peak, Server
 
 ITEM = 12
 
-# Frames of each flood. A connection of the control sends so few that it must stay open.
+# Frames of each flood, and of the negative control, whose connection must stay open.
 FLOOD = 100_000
 FEW = 1000
 
@@ -101,7 +101,7 @@ def collect_errors(server):
             ("modes.npy", b"\x93NUMPY"),
         ]:
             attempt(lambda name=name, content=content: upload(client, name, content) and None)
-        # The lease is taken by another client.
+        # Another client has the writer lease of the scene.
         with Client(server) as other:
             writer = other.steps.DriveScene(drive_requests("taken"))
             next(writer)
@@ -123,24 +123,24 @@ def upload(client, name, content):
     client.scenes.UploadScene(iter([scenes_pb2.UploadSceneRequest(**part) for part in parts]), timeout=20)
 
 
-def find_places(text, server):
-    """Names of the state folder and addresses of peers."""
-    places = [str(server.state), server.folder.name, "uploads/", "steps/", "scenes.json"]
-    return [place for place in places if place in text] + re.findall(r"127\.0\.0\.1:\d+", text)
+def find_private_names(text, server):
+    """The names of the state folder and its files, and the addresses of clients, that a text contains."""
+    names = [str(server.state), server.folder.name, "uploads/", "steps/", "scenes.json"]
+    return [name for name in names if name in text] + re.findall(r"127\.0\.0\.1:\d+", text)
 
 
 def error_texts(program):
     with Server(program) as server:
         texts = collect_errors(server)
-        found = sorted({place for text in texts for place in find_places(text, server)})
-        planted = find_places(f"{server.state}/uploads/1/a.obj of 127.0.0.1:4711", server)
+        found = sorted({name for text in texts for name in find_private_names(text, server)})
+        planted = find_private_names(f"{server.state}/uploads/1/a.obj of 127.0.0.1:4711", server)
     return Result(
         ITEM,
         "errors name no file of the state folder and no address of a client",
-        "no such name",
-        f"{len(texts)} errors, " + (f"names: {found}" if found else "no such name"),
+        "none of these names in any error",
+        f"{len(texts)} errors, " + (f"names: {found}" if found else "none of these names"),
         not found and len(texts) >= 12,
-        f"a planted text, {len(planted)} names",
+        f"a text with such names, {len(planted)} found",
         bool(planted),
     )
 
@@ -166,7 +166,7 @@ def log_records(program):
         f"at most {MAX_RECORDS} records",
         f"{records} records of {opened} connections",
         0 < records <= MAX_RECORDS < opened,
-        f"a planted log, {planted} records",
+        f"a log with one record per connection, {planted} records",
         planted > MAX_RECORDS,
     )
 

@@ -1,4 +1,4 @@
-"""Item 8: large frames of one client do not delay the frames of another one."""
+"""Item 8 of `prove.py`: large frames of one client do not delay the frames of another one."""
 
 import time
 

@@ -1,4 +1,4 @@
-"""Item 6: slow loads of one client do not delay other clients."""
+"""Item 6 of `prove.py`: slow loads of one client do not delay other clients."""
 
 import contextlib
 import tempfile

@@ -1,4 +1,4 @@
-"""Item 2: half-sent messages hold a bounded number of bytes, for a bounded time."""
+"""Item 2 of `prove.py`: half-sent messages hold a bounded number of bytes, for a bounded time."""
 
 import threading
 

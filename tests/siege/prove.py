@@ -1,4 +1,4 @@
-"""Runs the attacks and prints one line per item."""
+"""Runs the attacks, and prints for each check what was asked and what was reached."""
 
 import argparse
 import importlib
@@ -8,7 +8,7 @@ from pathlib import Path
 
 from report import Result
 
-# The checks of each item, and its subject. An item without checks is not claimed.
+# The items: numbered subjects of promises, each with the module of its checks. An item without checks is not claimed.
 ITEMS = {
     1: ("connections", "connections without a request"),
     2: ("messages", "half-sent messages"),
@@ -28,7 +28,7 @@ ITEMS = {
     16: (None, "soak"),
 }
 
-# Parts of items with checks that are not claimed.
+# For items with checks, the part of the subject that is not claimed.
 NOT_CLAIMED = {
     4: "frames count against the budget of replies while they wait for their first byte to be sent",
     6: "the port answers before all scenes are open again; loads have a deadline and equal shares",

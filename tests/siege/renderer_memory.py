@@ -1,4 +1,4 @@
-"""Item 9: the memory of a large frame is given back."""
+"""Item 9 of `prove.py`: the memory of a large frame is given back."""
 
 import time
 

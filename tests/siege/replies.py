@@ -1,4 +1,4 @@
-"""Item 4: unread replies use bounded memory and do not delay other clients."""
+"""Item 4 of `prove.py`: unread replies use bounded memory and do not delay other clients."""
 
 import contextlib
 import tempfile

@@ -5,14 +5,14 @@ import dataclasses
 
 @dataclasses.dataclass
 class Result:
-    """One line of the report."""
+    """One check in the report. `item` is its number in `prove.ITEMS`."""
 
     item: int
     promise: str
     asked: str
     reached: str
     passed: bool
-    # What the same check found where it must fail.
+    # The negative control: what the same check found where it must fail, and whether it failed there.
     control: str
     control_failed: bool
 

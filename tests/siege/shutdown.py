@@ -1,4 +1,4 @@
-"""Item 5: SIGTERM ends the server in time, whatever it is doing."""
+"""Item 5 of `prove.py`: SIGTERM ends the server in time, whatever it is doing."""
 
 import contextlib
 import signal
@@ -20,7 +20,7 @@ ITEM = 5
 ASKED = 10.0
 GIVE_UP = 40.0
 
-# A load takes longer than the limit.
+# So many polygons that loading them takes longer than the limit.
 POLYGONS = 20_000
 
 
@@ -81,8 +81,8 @@ def terminate(program, situation, renderer, scenes):
         return seconds, code
 
 
-def terminate_deaf_process():
-    """Seconds after which a process that ignores SIGTERM has ended. The check must notice that it has not."""
+def terminate_ignoring_process():
+    """Seconds for which a process that ignores SIGTERM runs after the signal, until the wait ends after ASKED + 1."""
     code = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print(flush=True); time.sleep(99)"
     process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE)
     process.stdout.readline()
@@ -103,7 +103,7 @@ def run(program):
             seconds, code = terminate(program, situation, renderer, folder)
             reached.append(f"{name} {seconds:.1f} s" + (f" (exit code {code})" if code else ""))
             passed &= seconds <= ASKED and code == 0
-    control = terminate_deaf_process()
+    control = terminate_ignoring_process()
     return [
         Result(
             ITEM,

@@ -1,4 +1,4 @@
-"""Item 10: a client that does not read the replies to its steps keeps its connection."""
+"""Item 10 of `prove.py`: a client that does not read the replies to its steps keeps its connection."""
 
 import struct
 import time
@@ -10,11 +10,12 @@ from server import Server
 
 ITEM = 10
 
-# Steps on each of so many streams of one connection. Replies to 39,000 steps once ended a connection.
+# Steps on each of so many streams of one connection. HTTP/2 libraries close a connection with too many unsent small
+# frames: in an earlier version of the server, replies to 39,000 steps ended the connection.
 STREAMS = 4
 STEPS = 50_000
 
-# Seconds without flow-control window after which a stream counts as blocked.
+# Seconds without progress on any stream after which the sender gives up.
 BLOCKED = 2.0
 
 
@@ -23,7 +24,7 @@ class StepSender:
 
     def __init__(self, server, deliveries):
         self.connection = http2.Connection(server.port)
-        # The streams stay without window. Other calls of the connection must not.
+        # The streams get no further window for their replies. The connection does, so that other calls are answered.
         self.connection.send(http2.window_update(0, 1 << 30))
         self.windows = {}
         self.is_open = True
@@ -62,7 +63,8 @@ class StepSender:
         return frames
 
     def send_all(self, steps):
-        """Sends steps until each stream has sent all, has ended, or is blocked. Returns the number of sent steps."""
+        """Sends steps until each stream has sent all or has ended, or until no stream makes progress. Returns the number
+        of sent steps."""
         numbers = dict.fromkeys(self.windows, 0)
         sent, last_progress = 0, time.monotonic()
         while self.is_open and time.monotonic() < last_progress + BLOCKED:

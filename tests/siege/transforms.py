@@ -1,4 +1,4 @@
-"""The part of item 12 on transforms: T may have a determinant of zero, and vertices are always finite."""
+"""Item 12 of `prove.py`, transforms: T may have a determinant of zero, and vertices are always finite."""
 
 import math
 import queue
@@ -70,10 +70,10 @@ def run(program):
     return Result(
         ITEM,
         "a transform may have a determinant of zero; one that moves a vertex out of range or is not finite is rejected",
-        f"the expected answer to {len(TRANSFORMS)} transforms, and finite vertices after each",
-        f"{len(TRANSFORMS) - len(wrong)} expected answers{': not ' + ', '.join(wrong) if wrong else ''}, "
-        f"{invalid} numbers that are not finite",
+        f"{len(TRANSFORMS)} transforms, each accepted or rejected as expected, and only finite vertices after each",
+        f"{len(TRANSFORMS) - len(wrong)} as expected{' (wrong: ' + ', '.join(wrong) + ')' if wrong else ''}, "
+        f"{invalid} vertex coordinates that are not finite",
         not wrong and invalid == 0,
-        f"a planted array, {planted} numbers that are not finite",
+        f"an array with a NaN and an infinity, {planted} numbers that are not finite",
         planted > 0,
     )
