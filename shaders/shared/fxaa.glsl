@@ -43,10 +43,11 @@ vec3 fxaa_color(ivec2 pixel) {
 
     float ne = luma(pixel + ivec2(1, 1)), nw = luma(pixel + ivec2(-1, 1));
     float se = luma(pixel + ivec2(1, -1)), sw = luma(pixel + ivec2(-1, -1));
-    // Second differences across rows and across columns. The edge is perpendicular to the direction of the larger one.
-    float row_curvature = abs(nw + sw - 2.0 * w) + 2.0 * abs(n + s - 2.0 * m) + abs(ne + se - 2.0 * e);
-    float column_curvature = abs(nw + ne - 2.0 * n) + 2.0 * abs(w + e - 2.0 * m) + abs(sw + se - 2.0 * s);
-    bool is_horizontal = row_curvature >= column_curvature;
+    // Absolute second differences of luma in the vertical and in the horizontal direction. A larger vertical difference
+    // means a horizontal edge.
+    float vertical_curvature = abs(nw + sw - 2.0 * w) + 2.0 * abs(n + s - 2.0 * m) + abs(ne + se - 2.0 * e);
+    float horizontal_curvature = abs(nw + ne - 2.0 * n) + 2.0 * abs(w + e - 2.0 * m) + abs(sw + se - 2.0 * s);
+    bool is_horizontal = vertical_curvature >= horizontal_curvature;
     ivec2 edge_direction = is_horizontal ? ivec2(1, 0) : ivec2(0, 1);
     ivec2 across_edge = is_horizontal ? ivec2(0, 1) : ivec2(1, 0);
     float across_luma = is_horizontal ? n : e, opposite_luma = is_horizontal ? s : w;
@@ -58,8 +59,9 @@ vec3 fxaa_color(ivec2 pixel) {
     vec2 forward_end = find_edge_end(pixel, edge_direction, across_edge, edge_mean, tolerance);
     vec2 backward_end = find_edge_end(pixel, -edge_direction, across_edge, edge_mean, tolerance);
     vec2 nearest_end = forward_end.x < backward_end.x ? forward_end : backward_end;
-    // The line crosses the boundary of the two rows halfway between the ends. It lies on this pixel's side only if, at the
-    // nearest end, the mean luma changes away from this pixel's luma.
+    // The smoothed edge is a straight line between the two ends of the pixel staircase. It enters this pixel only in the half
+    // next to the nearest end, and only if the luma of the pixel's side of the edge changes at that end, not the luma of
+    // the other side. The difference then has the opposite sign of this pixel's luma minus the mean.
     float blend_weight = 0.0;
     if ((nearest_end.y < 0.0) != (m < edge_mean)) blend_weight = 0.5 - nearest_end.x / (forward_end.x + backward_end.x);
     // A pixel that differs from all its neighbors, such as a thin line or a leaf smaller than a pixel.

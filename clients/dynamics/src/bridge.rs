@@ -155,7 +155,7 @@ impl Scenario for BridgeScenario {
 
     fn report(&self) -> Report {
         let load_description = format!(
-            "a force of {:.4} (reduced mass 1) on the middle tenth of the bridge, {}, pulsating every {} s; the run starts \
+            "a force of {:.4} (in units of mass-normalized modes) on the middle tenth of the bridge, {}, pulsating every {} s; the run starts \
              at the equilibrium, with a deflection of {:.4} of the diagonal",
             self.strength,
             self.options.load_direction.description(),
@@ -330,7 +330,7 @@ mod tests {
 
     /// A push beyond the potential barrier accelerates the softening bridge without bound.
     #[test]
-    fn softening_bridge_stops_before_it_diverges() {
+    fn diverging_softening_bridge_is_reported_as_error() {
         let mut bridge = softening_bridge(0.03).expect("a valid scenario");
         let check = DivergenceCheck::new(&bridge.model);
         bridge.set_viewer_forces(&[500.0, 0.0, 0.0, 0.0, 0.0, 0.0]).expect("a scenario with forces");
