@@ -234,7 +234,7 @@ fn exact_normals(scene: &Scene) -> Option<DeformationSettings> {
 
 /// Count of numbers in U and x0 of all domains: x0 and each mode have three numbers per vertex.
 fn count_rest_and_mode_numbers(scene: &Scene) -> usize {
-    scene.layout.domains.iter().map(|slot| 3 * slot.vertices * (1 + slot.rank)).sum()
+    scene.layout.domains.iter().map(|domain_layout| 3 * domain_layout.vertices * (1 + domain_layout.rank)).sum()
 }
 
 #[cfg(test)]

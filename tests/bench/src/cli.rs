@@ -180,7 +180,7 @@ fn format_lines(report: &DeformReport) -> Vec<String> {
             format_number(errors.map(|errors| errors.of_bound), 4),
             match (row.passed, row.is_skipped) {
                 (true, _) => "yes",
-                (false, true) => "left out",
+                (false, true) => "skipped",
                 (false, false) => "NO",
             }
         ));

@@ -177,7 +177,7 @@ fn batch_variants(
     let batched = |storage: StorageType| {
         positions_candidate(format!("cuda batch of {count} {}", storage.name()), storage, BatchPolicy::Always)
     };
-    let unbatched = positions_candidate(format!("cuda {count} apart f32"), StorageType::F32, BatchPolicy::Never);
+    let unbatched = positions_candidate(format!("cuda {count} unbatched f32"), StorageType::F32, BatchPolicy::Never);
     let tensor_core = |storage: StorageType| {
         let deformation = DeformationSettings { storage, ..scene.deformation };
         // "mma" marks tensor cores, whose summation order and rounding differ from the deformer's.
@@ -198,7 +198,8 @@ fn batch_variants(
     deformer_variants.chain([StorageType::F16, StorageType::Bf16].map(tensor_core)).collect()
 }
 
-/// The cuBLAS methods that support the scene, each alone and followed by a plain vertex update.
+/// Two variants of each cuBLAS method that supports the scene: u = U q only, and u = U q followed by a separate kernel for
+/// x = T (x0 + u).
 fn cublas_variants(device: &Arc<Device>, scene: &Arc<Scene>, is_selected: VariantFilter<'_>) -> Vec<VariantCandidate> {
     let is_instanced = scene.domains.len() > 1 && scene.shapes.len() == 1;
     let supports_scene = |method: &CublasMethod| match method {
@@ -261,14 +262,14 @@ fn refers_to_all_vertices(scene: &Scene) -> bool {
     })
 }
 
-/// Whether the scene has normals to compute. The shapes of workloads that measure only positions have three corners,
-/// the minimum of a mesh.
+/// Whether the scene has normals to compute. A mesh needs at least one triangle, so a workload that measures only positions
+/// has shapes with a placeholder triangle. A shape with more than its three corners has normals to compute.
 pub(super) fn has_normals(scene: &Scene) -> bool {
     scene.shapes.iter().any(|shape| shape.mesh.corners().vertices.len() > 3)
 }
 
-/// Formula of the memory traffic of an array in bytes, for the report. n is vertices, r modes, d domains. "As packed"
-/// means the bytes of the array on the device.
+/// Formula of the memory traffic of an array in bytes, for the report: n vertices and r modes of a domain, d domains. "As
+/// packed" means the bytes of the array on the device.
 fn traffic_formula(array: &str) -> &'static str {
     match array {
         "U" => "as packed: entries of all modes and vertices, filled up to tiles",

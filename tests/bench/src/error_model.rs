@@ -140,10 +140,13 @@ impl ErrorModel {
         if !self.uses_tensor_cores {
             return None;
         }
-        let split_domain = |domain: usize, slot: &DomainLayout| -> Vec<f64> {
+        let split_domain = |domain: usize, domain_layout: &DomainLayout| -> Vec<f64> {
             // U is stored divided by the factor of each mode, so tensor cores multiply it by q times the factor.
             let factors = self.stored[self.scene.domains[domain].shape].tiles.factors();
-            let scaled_q = q[slot.first_q..][..slot.rank].iter().zip(factors).map(|(q, factor)| *q as f32 * factor);
+            let scaled_q = q[domain_layout.first_q..][..domain_layout.rank]
+                .iter()
+                .zip(factors)
+                .map(|(q, factor)| *q as f32 * factor);
             let split = SplitCoordinates::new(&scaled_q.collect::<Vec<_>>(), self.scene.deformation.storage);
             factors
                 .iter()
@@ -152,8 +155,9 @@ impl ErrorModel {
                 .collect()
         };
         let mut rounded_q = q.to_vec();
-        for (domain, slot) in self.scene.layout.domains.iter().enumerate() {
-            rounded_q[slot.first_q..][..slot.rank].copy_from_slice(&split_domain(domain, slot));
+        for (domain, domain_layout) in self.scene.layout.domains.iter().enumerate() {
+            rounded_q[domain_layout.first_q..][..domain_layout.rank]
+                .copy_from_slice(&split_domain(domain, domain_layout));
         }
         Some(rounded_q)
     }

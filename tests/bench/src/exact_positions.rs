@@ -162,8 +162,8 @@ impl ModeEntries<'_> {
 
 /// Modal coordinates of a domain.
 fn coordinates_of<'a>(scene: &Scene, domain: usize, truth: &'a ExactState) -> &'a [f64] {
-    let slot = scene.layout.domains[domain];
-    &truth.q[slot.first_q..][..slot.rank]
+    let domain_layout = scene.layout.domains[domain];
+    &truth.q[domain_layout.first_q..][..domain_layout.rank]
 }
 
 /// u and sum |U q| of consecutive vertices. Rows that cancel are summed in double-double.
@@ -251,9 +251,9 @@ fn map_tiles<T: Copy + Send + Sync>(
 ) -> Vec<T> {
     let mut values: Vec<T> = rayon::iter::repeat_n(initial, scene.layout.vertices).collect();
     let (mut tiles, mut remaining): (Vec<Tile<'_, T>>, _) = (Vec::new(), values.as_mut_slice());
-    for (domain, slot) in scene.layout.domains.iter().enumerate() {
-        for first in (0..slot.vertices).step_by(TILE) {
-            let vertices = first..slot.vertices.min(first + TILE);
+    for (domain, domain_layout) in scene.layout.domains.iter().enumerate() {
+        for first in (0..domain_layout.vertices).step_by(TILE) {
+            let vertices = first..domain_layout.vertices.min(first + TILE);
             let (out, rest) = std::mem::take(&mut remaining).split_at_mut(vertices.len());
             tiles.push(Tile { domain, vertices, out });
             remaining = rest;

@@ -72,9 +72,9 @@ fn workload_section<'a>(workload: &WorkloadSummary, rows: impl Iterator<Item = &
 /// The times per step when the host reads every step back.
 fn overlap_paragraph(overlap: &Overlap) -> String {
     let Overlap { write_one_core_us, write_us, cores, graph_us, copy_out_us, step_us, .. } = overlap;
-    let Overlap { serial_us, fetched_us, overlapped_us, gain, ideal_us, differing, .. } = overlap;
+    let Overlap { serial_us, pipelined_us, overlapped_us, gain, ideal_us, differing, .. } = overlap;
     format!(
-        "\nThe host reads every step. Microseconds per step: {serial_us:.1} serially, {fetched_us:.1} with the readback during \
+        "\nThe host reads every step. Microseconds per step: {serial_us:.1} serially, {pipelined_us:.1} with the readback during \
          the next step, {overlapped_us:.1} with two steps in flight ({gain:.2} times as fast as serially). The lower \
          limit is {ideal_us:.1}, the longest part alone. Parts: host write {write_us:.1} on {cores} cores ({write_one_core_us:.1} on one), \
          upload and kernels {graph_us:.1}, readback {copy_out_us:.1}; a step without readback {step_us:.1}. Steps that \
@@ -102,7 +102,7 @@ fn row_cells(row: &DeformRow) -> [String; 13] {
         format_number(errors.map(|errors| errors.of_bound)),
         match (row.passed, row.is_skipped) {
             (true, _) => "yes".into(),
-            (false, true) => format!("left out: {}", row.faults.join("; ")),
+            (false, true) => format!("skipped: {}", row.faults.join("; ")),
             (false, false) => format!("no: {}", row.faults.join("; ")),
         },
     ]

@@ -56,8 +56,8 @@ impl WorkloadMotion {
         let mut spreads = vec![ModeSpread { deviation: 0.0, relative_frequency: 1.0 }; scene.layout.coordinates];
         let domain_spreads: Vec<_> =
             (0..scene.domains.len()).into_par_iter().map(|domain| mode_spreads(scene, domain)).collect();
-        for (slot, domain_spreads) in scene.layout.domains.iter().zip(domain_spreads) {
-            spreads[slot.first_q..][..domain_spreads.len()].copy_from_slice(&domain_spreads);
+        for (domain_layout, domain_spreads) in scene.layout.domains.iter().zip(domain_spreads) {
+            spreads[domain_layout.first_q..][..domain_spreads.len()].copy_from_slice(&domain_spreads);
         }
         Self { scene: Arc::clone(scene), is_paired: workload.is_paired, spreads, recorded_trajectory }
     }
@@ -123,20 +123,22 @@ impl WorkloadMotion {
 
     /// Changes coordinates so that the terms of U q nearly cancel, as described at [`Self::random_state`].
     fn cancel_displacements(&self, q: &mut [f64], rng: &mut Rng) {
-        for (domain, slot) in self.scene.layout.domains.iter().enumerate() {
-            let domain_q = &mut q[slot.first_q..][..slot.rank];
+        for (domain, domain_layout) in self.scene.layout.domains.iter().enumerate() {
+            let domain_q = &mut q[domain_layout.first_q..][..domain_layout.rank];
             if self.is_paired {
                 domain_q.chunks_exact_mut(2).for_each(|pair| pair[1] = -pair[0]);
-            } else if slot.rank > 1 {
+            } else if domain_layout.rank > 1 {
                 let modes = &self.scene.shape_of(domain).modes;
-                let row = rng.usize(0..3 * slot.vertices);
+                let row = rng.usize(0..3 * domain_layout.vertices);
                 let entry = |mode: usize| f64::from(modes.entry(row / 3, row % 3, mode));
-                let largest_mode = (0..slot.rank)
+                let largest_mode = (0..domain_layout.rank)
                     .max_by(|first, second| entry(*first).abs().total_cmp(&entry(*second).abs()))
                     .unwrap_or(0);
                 // The mode with the largest entry of the row cancels the sum of the other terms.
-                let remaining_displacement: f64 =
-                    (0..slot.rank).filter(|mode| *mode != largest_mode).map(|mode| entry(mode) * domain_q[mode]).sum();
+                let remaining_displacement: f64 = (0..domain_layout.rank)
+                    .filter(|mode| *mode != largest_mode)
+                    .map(|mode| entry(mode) * domain_q[mode])
+                    .sum();
                 // A row of zeros, as of a clamped vertex, cancels already.
                 if entry(largest_mode) != 0.0 {
                     domain_q[largest_mode] = -remaining_displacement / entry(largest_mode);

@@ -166,7 +166,7 @@ fn overlap_fails_report_only_when_vertices_differ() {
             let us = 12.5;
             let (cores, [bytes_in, bytes_out]) = (2, [1, 2]);
             let [write_one_core_us, write_us, graph_us, copy_out_us, step_us, ideal_us] = [us; 6];
-            let [serial_us, fetched_us, overlapped_us, gain] = [4.0 * us, 3.0 * us, 2.0 * us, 2.0];
+            let [serial_us, pipelined_us, overlapped_us, gain] = [4.0 * us, 3.0 * us, 2.0 * us, 2.0];
             let differing = self.differing;
             Some(Ok(Overlap {
                 steps,
@@ -179,7 +179,7 @@ fn overlap_fails_report_only_when_vertices_differ() {
                 copy_out_us,
                 step_us,
                 serial_us,
-                fetched_us,
+                pipelined_us,
                 overlapped_us,
                 gain,
                 ideal_us,
@@ -198,7 +198,7 @@ fn overlap_fails_report_only_when_vertices_differ() {
     assert_eq!(report_with(3, &[]).failed, ["c: cuda overlap: 3 steps differ"]);
     let passing = report_with(0, &["cuda overlap"]);
     assert!(passing.passed());
-    // serial_us = 4 x 12.5 and fetched_us = 3 x 12.5.
+    // serial_us = 4 x 12.5 and pipelined_us = 3 x 12.5.
     assert!(markdown::markdown(&passing).contains("50.0 serially, 37.5"));
     assert_eq!(report_with(3, &["cpu*"]).loads[0].overlap, None, "expected no overlap if it is not selected");
 }

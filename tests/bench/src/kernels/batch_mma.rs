@@ -266,16 +266,21 @@ fn pack_transforms_and_scales(state: &SceneState, split_q: &[SplitCoordinates], 
 
 /// The kernel arguments with null addresses.
 fn args_without_addresses(scene: &Scene, chunks: usize) -> BatchMmaArgs {
-    let slots = &scene.layout.domains;
+    let domain_layouts = &scene.layout.domains;
     let mut args = BatchMmaArgs {
-        domains: slots.len() as u32,
-        vertices: slots[0].vertices as u32,
+        domains: domain_layouts.len() as u32,
+        vertices: domain_layouts[0].vertices as u32,
         chunks: chunks as u32,
         // Positions of four vertices have 48 bytes, a multiple of 16.
-        is_aligned: u32::from(slots.iter().all(|slot| slot.first_vertex.is_multiple_of(QUAD))),
+        is_aligned: u32::from(
+            domain_layouts.iter().all(|domain_layout| domain_layout.first_vertex.is_multiple_of(QUAD)),
+        ),
         ..BatchMmaArgs::zeroed()
     };
-    args.first_vertices.iter_mut().zip(slots).for_each(|(first, slot)| *first = slot.first_vertex as u32);
+    args.first_vertices
+        .iter_mut()
+        .zip(domain_layouts)
+        .for_each(|(first, domain_layout)| *first = domain_layout.first_vertex as u32);
     args
 }
 

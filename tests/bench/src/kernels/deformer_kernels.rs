@@ -203,8 +203,10 @@ impl DeformerBenchmark {
     fn retained_mode_share(&self) -> Option<f64> {
         let per_chunk = modes_per_chunk(self.scene.deformation.storage);
         let weighted_sum = |chunk_count_of: &dyn Fn(usize) -> usize| -> f64 {
-            let slots = self.scene.layout.domains.iter().enumerate();
-            slots.map(|(domain, slot)| slot.vertices as f64 * chunk_count_of(domain) as f64).sum()
+            let domain_layouts = self.scene.layout.domains.iter().enumerate();
+            domain_layouts
+                .map(|(domain, domain_layout)| domain_layout.vertices as f64 * chunk_count_of(domain) as f64)
+                .sum()
         };
         let all_chunks = weighted_sum(&|domain| self.scene.rank_of(domain).div_ceil(per_chunk));
         let shares = self.step_inputs.iter().take(MAX_GRAPHS).map(|inputs| {
@@ -259,28 +261,30 @@ fn output_bytes(plan: &DeformPlan) -> [u64; 4] {
 
 /// The counts of a step that changes the domains `changed`; `None` means all domains.
 fn count_step(scene: &Scene, plan: &DeformPlan, changed: Option<&[u32]>) -> StepCounts {
-    let slots = &scene.layout.domains;
+    let domain_layouts = &scene.layout.domains;
     // A domain reads 48 bytes: its T, or its frame if it follows another domain. In scenes with followers, it also
     // reads its transform link, 8 bytes.
     let bytes_per_transform = if scene.features.followers { 56 } else { 48 };
     match changed {
         None => StepCounts {
             vertices: scene.layout.vertices as u64,
-            transform_bytes: bytes_per_transform * slots.len() as u64,
+            transform_bytes: bytes_per_transform * domain_layouts.len() as u64,
             coordinates: scene.layout.coordinates as u64,
             mode_bytes: plan.bytes(BufferRole::ModeWords),
             rest_bytes: plan.bytes(BufferRole::RestPositions),
         },
         Some(changed_domains) => {
-            let changed_slots = || changed_domains.iter().map(|domain| slots[*domain as usize]);
-            let mode_entries = |slot: modalcast_model::scene::DomainLayout| (slot.vertices * slot.rank) as u64;
-            let all_entries: u64 = slots.iter().map(|slot| mode_entries(*slot)).sum();
-            let changed_entries: u64 = changed_slots().map(mode_entries).sum();
-            let vertices: u64 = changed_slots().map(|slot| slot.vertices as u64).sum();
+            let changed_layouts = || changed_domains.iter().map(|domain| domain_layouts[*domain as usize]);
+            let mode_entries = |domain_layout: modalcast_model::scene::DomainLayout| {
+                (domain_layout.vertices * domain_layout.rank) as u64
+            };
+            let all_entries: u64 = domain_layouts.iter().map(|domain_layout| mode_entries(*domain_layout)).sum();
+            let changed_entries: u64 = changed_layouts().map(mode_entries).sum();
+            let vertices: u64 = changed_layouts().map(|domain_layout| domain_layout.vertices as u64).sum();
             StepCounts {
                 vertices,
                 transform_bytes: bytes_per_transform * changed_domains.len() as u64,
-                coordinates: changed_slots().map(|slot| slot.rank as u64).sum(),
+                coordinates: changed_layouts().map(|domain_layout| domain_layout.rank as u64).sum(),
                 mode_bytes: plan.bytes(BufferRole::ModeWords) * changed_entries / all_entries.max(1),
                 rest_bytes: 12 * vertices,
             }
@@ -324,9 +328,9 @@ impl KernelBenchmark for DeformerBenchmark {
         if self.step_outputs != StepOutputs::Uq {
             return Ok(numbers);
         }
-        let slots = &self.scene.layout.domains;
+        let domain_layouts = &self.scene.layout.domains;
         Ok(self.input_sets.compute_positions_on_host(|domain, vertex| {
-            let first_number = 3 * (slots[domain].first_vertex + vertex);
+            let first_number = 3 * (domain_layouts[domain].first_vertex + vertex);
             [numbers[first_number], numbers[first_number + 1], numbers[first_number + 2]]
         }))
     }

@@ -55,7 +55,8 @@ pub struct Overlap {
     pub serial_us: f64,
     /// Time per step if the host starts the next step before it waits for a readback, as the server does
     /// (`run_pipelined`).
-    pub fetched_us: f64,
+    #[serde(rename = "fetched_us")]
+    pub pipelined_us: f64,
     /// Time per step with two steps in flight, so that the host also writes inputs while the device computes
     /// (`run_overlapped`).
     pub overlapped_us: f64,
@@ -95,7 +96,7 @@ pub fn measure_overlap(
             times.push(elapsed_us(begin) / steps as f64);
         }
     }
-    let [serial_us, fetched_us, overlapped_us] = times.map(median);
+    let [serial_us, pipelined_us, overlapped_us] = times.map(median);
     let [step_us, copy_out_us] = time_step_and_readback(&mut deformer, states, steps)?;
     let (bytes_in, [write_one_core_us, write_us]) = time_input_writes(device, scene, states, steps)?;
     let graph_us = time_graph(device, &deformer, steps)?;
@@ -112,7 +113,7 @@ pub fn measure_overlap(
         copy_out_us,
         step_us,
         serial_us,
-        fetched_us,
+        pipelined_us,
         overlapped_us,
         gain: serial_us / overlapped_us,
         ideal_us: write_us.max(graph_us).max(copy_out_us),

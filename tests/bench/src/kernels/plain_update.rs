@@ -71,8 +71,13 @@ impl PlainUpdate {
     pub(super) fn new(device: &Device, scene: &Scene, first_u: &[Option<u64>]) -> Result<Self> {
         let (is_single, vertices) = (scene.domains.len() == 1, scene.layout.vertices);
         let defines: &[&str] = if is_single { &["SINGLE"] } else { &[] };
-        let u_bytes =
-            scene.layout.domains.iter().filter(|slot| slot.rank > 0).map(|slot| 12 * slot.vertices as u64).sum();
+        let u_bytes = scene
+            .layout
+            .domains
+            .iter()
+            .filter(|domain_layout| domain_layout.rank > 0)
+            .map(|domain_layout| 12 * domain_layout.vertices as u64)
+            .sum();
         Ok(Self {
             compiled: CompiledKernel::new(device, &SOURCE, defines)?,
             domains: DeviceBuffer::upload(device, &pack_domains(scene, first_u))?,
@@ -131,9 +136,9 @@ impl PlainUpdate {
 }
 
 fn pack_domains(scene: &Scene, first_u: &[Option<u64>]) -> Vec<PlainDomain> {
-    let pack_domain = |(slot, first_u): (&modalcast_model::scene::DomainLayout, &Option<u64>)| PlainDomain {
+    let pack_domain = |(domain_layout, first_u): (&modalcast_model::scene::DomainLayout, &Option<u64>)| PlainDomain {
         first_u: first_u.unwrap_or(RIGID),
-        first_vertex: slot.first_vertex as u32,
+        first_vertex: domain_layout.first_vertex as u32,
         reserved: 0,
     };
     scene.layout.domains.iter().zip(first_u).map(pack_domain).collect()
@@ -141,8 +146,10 @@ fn pack_domains(scene: &Scene, first_u: &[Option<u64>]) -> Vec<PlainDomain> {
 
 /// The domain of each vertex.
 fn domain_of_vertices(scene: &Scene) -> Vec<u32> {
-    let slots = scene.layout.domains.iter().enumerate();
-    slots.flat_map(|(domain, slot)| std::iter::repeat_n(domain as u32, slot.vertices)).collect()
+    let domain_layouts = scene.layout.domains.iter().enumerate();
+    domain_layouts
+        .flat_map(|(domain, domain_layout)| std::iter::repeat_n(domain as u32, domain_layout.vertices))
+        .collect()
 }
 
 /// Rest positions of all domains, one domain after the other.
@@ -198,9 +205,9 @@ mod tests {
             rest: packed_rest(&scene),
         };
         let transforms: &[f32] = bytemuck::cast_slice(&state.transforms);
-        for (domain, slot) in scene.layout.domains.iter().enumerate() {
-            for vertex in 0..slot.vertices {
-                let packed_vertex = slot.first_vertex + vertex;
+        for (domain, domain_layout) in scene.layout.domains.iter().enumerate() {
+            for vertex in 0..domain_layout.vertices {
+                let packed_vertex = domain_layout.first_vertex + vertex;
                 let got = twin_of_plain_update(&tables, transforms, &u, packed_vertex);
                 let want = position_of(&scene, &state, domain, vertex);
                 for (want, got) in want.iter().zip(got) {

@@ -94,8 +94,8 @@ impl RasterBenchmark {
     }
 
     /// The keys of the last launch, row by row from the top; empty for depth-only targets. The upper 32 bits of a key
-    /// are the bits of the depth, the lower 32 bits are the id of the triangle. A key is all ones where nothing was
-    /// drawn.
+    /// are the inverted bits of the depth, the lower 32 bits are the id of the triangle. A key is all ones where nothing
+    /// was drawn.
     ///
     /// # Errors
     /// `Fault` when the device fails.
@@ -105,8 +105,8 @@ impl RasterBenchmark {
         Ok(keys)
     }
 
-    /// The depths of the last launch, row by row from the top, for depth-only targets; otherwise empty. A depth is 1
-    /// where nothing was drawn.
+    /// The depths of the last launch, row by row from the top, for depth-only targets; otherwise empty. A depth is 1 at
+    /// the near plane, and 0 at the far plane and where nothing was drawn.
     ///
     /// # Errors
     /// `Fault` when the device fails.

@@ -36,7 +36,7 @@ pub struct AfternoonComparison {
     /// The OpenGL renderer of the program.
     pub renderer: String,
     pub variants: Vec<AfternoonVariant>,
-    /// The rate of the server's PNG frames divided by that of the program's faster variant.
+    /// The rate of the server's PNG frames divided by that of the faster PNG variant of the program.
     pub of_best_png: f64,
 }
 

@@ -2,8 +2,8 @@
 //!
 //! The first client drives the scene of the session: it sends a step each period and receives a small frame of it. Each
 //! wait counts from the time at which the step was due, so a stall of the server also counts for the steps that were due
-//! during it. After a stall the client
-//! continues with the current step, as one that follows real time. The second client runs on a thread of its own.
+//! during it. After a stall the client continues with the step that is due then, as a client that follows real time. The
+//! second client runs on a thread of its own.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -322,6 +322,9 @@ mod tests {
         assert_eq!(result.busy.longest_stages, [("queue".into(), 21.0), ("draw".into(), 1.0)]);
         let jobs: Vec<(usize, f64)> = result.jobs.iter().map(|job| (job.waits.steps, job.waits.max_ms)).collect();
         assert_eq!(jobs, [(3, 21.0), (1, 2.0)]);
-        assert!(ContentionResult::new(Duration::ZERO, &idle, &[], &[]).is_err(), "expected jobs");
+        assert!(
+            ContentionResult::new(Duration::ZERO, &idle, &[], &[]).is_err(),
+            "expected an error without waits during jobs"
+        );
     }
 }

@@ -53,7 +53,7 @@ struct Measured {
 /// `Fault` when a process fails.
 pub(super) fn measure(session: &Session, stream: DelayedStream, options: &StreamReportOptions) -> Result<DelayResult> {
     let steps = match stream {
-        // Steps are fast. Their number reduces the part of the time that the last round trip takes.
+        // Steps are fast, so many are sent: the wait for the last acknowledgment is then a small part of the time.
         DelayedStream::Steps => 10 * options.steps,
         DelayedStream::Replies(content) => rates::steps_of_run(Some(content), options),
     };

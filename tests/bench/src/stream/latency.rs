@@ -28,7 +28,7 @@ const MAX_TIMER_ERROR: Duration = Duration::from_millis(2);
 /// Quantiles of times.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct LatencyResult {
-    /// The two ends of the time.
+    /// The events at the start and at the end of the measured time.
     pub from: &'static str,
     pub to: &'static str,
     /// Number of steps.

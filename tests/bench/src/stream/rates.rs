@@ -57,8 +57,8 @@ pub struct RateResult {
     /// the rate (n - 1) / t. The rate of a run is that of its slowest client, or that of the physics process if there
     /// are no clients.
     pub per_second: f64,
-    /// The other results are those of the run with the median rate. Steps per second of the physics process, from its
-    /// first step to its last acknowledgment.
+    /// Steps per second of the physics process, from its first step to its last acknowledgment. This and the following
+    /// results are those of the run with the median rate.
     pub steps_per_second: f64,
     /// Bytes of a reply on average; `None` without viewers.
     pub reply_bytes: Option<f64>,

@@ -186,7 +186,7 @@ fn add_positions(sum: &mut ErrorSum, encoding: Encoding, unit: f64, positions: [
             let expected = f64::from(*expected);
             let bound = match encoding {
                 Encoding::F16 => (F16_RELATIVE_BOUND * expected.abs()).max(F16_SMALL_BOUND),
-                // The step of a code rounds to the nearest code, and the result to f32.
+                // Half of the step between two 16-bit codes, extent / 65,535, and the rounding of the result to f32.
                 Encoding::U16Box => {
                     extents[index % 3] / 131_070.0 + F32_ROUNDING * (expected.abs() + extents[index % 3])
                 }

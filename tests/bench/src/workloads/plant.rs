@@ -163,9 +163,9 @@ mod tests {
     /// Counts v, f, d, d', r and u of a scene.
     fn count_contents(workload: &Workload) -> [usize; 6] {
         let layout = &workload.scene.layout;
-        let deformable_slots: Vec<_> = layout.domains.iter().filter(|slot| slot.rank > 0).collect();
-        let rows = deformable_slots.iter().map(|slot| 3 * slot.vertices).sum();
-        [layout.corners, layout.triangles, layout.domains.len(), deformable_slots.len(), layout.coordinates, rows]
+        let deformable_layouts: Vec<_> = layout.domains.iter().filter(|domain_layout| domain_layout.rank > 0).collect();
+        let rows = deformable_layouts.iter().map(|domain_layout| 3 * domain_layout.vertices).sum();
+        [layout.corners, layout.triangles, layout.domains.len(), deformable_layouts.len(), layout.coordinates, rows]
     }
 
     #[test]

@@ -25,7 +25,7 @@ fn gpu_overlapped_steps_have_the_vertices_of_serial_steps() {
     );
     let times = [
         measurement.serial_us,
-        measurement.fetched_us,
+        measurement.pipelined_us,
         measurement.overlapped_us,
         measurement.graph_us,
         measurement.copy_out_us,

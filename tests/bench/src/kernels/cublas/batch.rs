@@ -109,8 +109,10 @@ impl GemmPlan {
     pub(super) fn new(scene: &Scene, method: CublasMethod) -> Result<Self> {
         check_scene(scene, method)?;
         let mut groups: BTreeMap<(usize, usize), Vec<usize>> = BTreeMap::new();
-        for (domain, slot) in scene.layout.domains.iter().enumerate().filter(|(_, slot)| slot.rank > 0) {
-            groups.entry(method.batch_key(3 * slot.vertices, slot.rank)).or_default().push(domain);
+        for (domain, domain_layout) in
+            scene.layout.domains.iter().enumerate().filter(|(_, domain_layout)| domain_layout.rank > 0)
+        {
+            groups.entry(method.batch_key(3 * domain_layout.vertices, domain_layout.rank)).or_default().push(domain);
         }
         let (mut batches, mut floats) = (Vec::with_capacity(groups.len()), [0_u64; 3]);
         for domains in groups.into_values() {
@@ -178,9 +180,9 @@ fn size_product(scene: &Scene, method: CublasMethod, domains: &[usize]) -> Resul
     let to_i32 = |number: usize| {
         i32::try_from(number).map_err(|_| invalid("scene.size", format!("at most {} for cuBLAS", i32::MAX), number))
     };
-    let slots = || domains.iter().map(|domain| scene.layout.domains[*domain]);
-    let rows = slots().map(|slot| 3 * slot.vertices).max().unwrap_or(0);
-    let rank = slots().map(|slot| slot.rank).max().unwrap_or(0);
+    let domain_layouts = || domains.iter().map(|domain| scene.layout.domains[*domain]);
+    let rows = domain_layouts().map(|domain_layout| 3 * domain_layout.vertices).max().unwrap_or(0);
+    let rank = domain_layouts().map(|domain_layout| domain_layout.rank).max().unwrap_or(0);
     // The leading dimension of U and u: floats per column. cuBLAS is fastest with columns aligned to 16 bytes.
     // Row-major storage has no padding.
     let lead = if method == CublasMethod::SgemvRows { rows } else { rows.next_multiple_of(4) };

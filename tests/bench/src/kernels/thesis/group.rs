@@ -94,13 +94,15 @@ pub struct LaneCounts {
     pub idle: u64,
 }
 
-/// The lane counts of each kernel of a split, computed without packing U. Kernels without domains are left out.
+/// The lane counts of each kernel of a split, computed without packing U. Kernels without domains are omitted.
 pub fn count_lanes(scene: &Scene, split: KernelSplit) -> Vec<LaneCounts> {
     let count_for_width = |width: &usize| {
         let (mut groups, mut busy_lanes) = (0, 0);
-        for slot in scene.layout.domains.iter().filter(|slot| belongs_to_width(split, *width, slot.rank)) {
-            groups += reshaped_rows(3 * slot.vertices, *width, vectors_per_row(slot.rank));
-            busy_lanes += (3 * slot.vertices * vectors_per_row(slot.rank)) as u64;
+        for domain_layout in
+            scene.layout.domains.iter().filter(|domain_layout| belongs_to_width(split, *width, domain_layout.rank))
+        {
+            groups += reshaped_rows(3 * domain_layout.vertices, *width, vectors_per_row(domain_layout.rank));
+            busy_lanes += (3 * domain_layout.vertices * vectors_per_row(domain_layout.rank)) as u64;
         }
         let all = (groups.div_ceil(groups_per_warp(*width)) * WARP).next_multiple_of(BLOCK) as u64;
         LaneCounts { width: *width, all, idle: all - busy_lanes }
@@ -124,10 +126,10 @@ pub(super) struct DisplacementLayout {
 impl DisplacementLayout {
     pub(super) fn of(scene: &Scene) -> Self {
         let mut vertex_count = 0;
-        let mut append_domain = |slot: &modalcast_model::scene::DomainLayout| {
+        let mut append_domain = |domain_layout: &modalcast_model::scene::DomainLayout| {
             let first = vertex_count;
-            vertex_count += if slot.rank > 0 { slot.vertices } else { 0 };
-            (slot.rank > 0).then_some(first as u32)
+            vertex_count += if domain_layout.rank > 0 { domain_layout.vertices } else { 0 };
+            (domain_layout.rank > 0).then_some(first as u32)
         };
         let first_vertices = scene.layout.domains.iter().map(&mut append_domain).collect();
         Self { first_vertices, vertex_count }
@@ -178,11 +180,12 @@ pub(super) fn pack_groups(scene: &Scene, split: KernelSplit, width: usize) -> Pa
     let mut packed = PackedGroups { width, entries: Vec::new(), meta: Vec::new() };
     // Index of the domain's first float4 of q.
     let mut first_q = 0;
-    for (domain, slot) in scene.layout.domains.iter().enumerate() {
-        let n_vr = vectors_per_row(slot.rank);
-        let first_u = displacements.first_vertices[domain].filter(|_| belongs_to_width(split, width, slot.rank));
+    for (domain, domain_layout) in scene.layout.domains.iter().enumerate() {
+        let n_vr = vectors_per_row(domain_layout.rank);
+        let first_u =
+            displacements.first_vertices[domain].filter(|_| belongs_to_width(split, width, domain_layout.rank));
         if let Some(first_u) = first_u {
-            let rows = 3 * slot.vertices;
+            let rows = 3 * domain_layout.vertices;
             let group_count = reshaped_rows(rows, width, n_vr);
             for group in 0..group_count {
                 packed.begin_group();

@@ -98,7 +98,12 @@ impl ThesisBenchmark {
                 [pack_q(scene, state), transform_matrices(scene, state)]
             })?,
             vertices: scene.layout.vertices,
-            q_bytes: scene.layout.domains.iter().map(|slot| 4 * slot.rank.next_multiple_of(4) as u64).sum(),
+            q_bytes: scene
+                .layout
+                .domains
+                .iter()
+                .map(|domain_layout| 4 * domain_layout.rank.next_multiple_of(4) as u64)
+                .sum(),
         })
     }
 }

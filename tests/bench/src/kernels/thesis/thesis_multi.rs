@@ -40,12 +40,16 @@ impl MultiDomainKernel {
     /// `Invalid` when a domain has more than 32 modes; `Unavailable` when NVRTC is missing; `Fault` when the device
     /// fails.
     pub(super) fn new(device: &Device, scene: &Scene, split: KernelSplit) -> Result<Self> {
-        let slots = &scene.layout.domains;
-        if let Some(domain) = slots.iter().position(|slot| slot.rank > MAX_RANK) {
+        let domain_layouts = &scene.layout.domains;
+        if let Some(domain) = domain_layouts.iter().position(|domain_layout| domain_layout.rank > MAX_RANK) {
             let field = format!("domain {domain}: modes");
-            return Err(invalid(field, format!("at most {MAX_RANK} for groups"), slots[domain].rank));
+            return Err(invalid(field, format!("at most {MAX_RANK} for groups"), domain_layouts[domain].rank));
         }
-        let rows = slots.iter().filter(|slot| slot.rank > 0).map(|slot| 3 * slot.vertices as u64).sum();
+        let rows = domain_layouts
+            .iter()
+            .filter(|domain_layout| domain_layout.rank > 0)
+            .map(|domain_layout| 3 * domain_layout.vertices as u64)
+            .sum();
         let mut kernels = Vec::new();
         for width in split.widths() {
             let packed = pack_groups(scene, split, *width);

@@ -63,13 +63,13 @@ impl SingleDomainKernel {
     /// # Errors
     /// `Invalid` when the scene is not one domain with modes.
     pub(super) fn new(device: &Device, scene: &Scene) -> Result<Self> {
-        let [slot] = scene.layout.domains[..] else {
+        let [domain_layout] = scene.layout.domains[..] else {
             return Err(invalid("scene.domains", "1 for the single-domain kernel", scene.domains.len()));
         };
-        if slot.rank == 0 {
+        if domain_layout.rank == 0 {
             return Err(invalid("modes", "at least 1 for the single-domain kernel", 0));
         }
-        let layout = RowLines::new(slot.vertices, slot.rank);
+        let layout = RowLines::new(domain_layout.vertices, domain_layout.rank);
         let compiled = CompiledKernel::new(device, &SOURCE, &[])?;
         Ok(Self { compiled, packed_lines: DeviceBuffer::upload(device, &layout.pack(scene))?, layout })
     }

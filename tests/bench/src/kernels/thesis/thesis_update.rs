@@ -73,7 +73,7 @@ impl UnfoldedTriangles {
         let displacements = DisplacementLayout::of(scene);
         let mut unfolded = Self::default();
         let mut domains = Vec::new();
-        for (domain, slot) in scene.layout.domains.iter().enumerate() {
+        for (domain, domain_layout) in scene.layout.domains.iter().enumerate() {
             let shape = scene.shape_of(domain);
             // A triangle lists corners. A corner is a vertex with one normal.
             let (corners, triangles) = (shape.mesh.corners(), shape.mesh.triangles());
@@ -82,7 +82,7 @@ impl UnfoldedTriangles {
             for corner in (0..3 * triangle_count).map(corner_of) {
                 let vertex = corners.vertices[corner];
                 unfolded.sources.push(displacements.first_vertices[domain].map_or(RIGID, |first| first + vertex));
-                unfolded.targets.push(slot.first_vertex as u32 + vertex);
+                unfolded.targets.push(domain_layout.first_vertex as u32 + vertex);
                 unfolded.positions.push(float4(shape.mesh.rest_positions()[vertex as usize], 1.0));
                 unfolded.normals.push(float4(corners.normals[corner], 0.0));
                 if scene.features.normal_maps {
@@ -277,9 +277,9 @@ mod tests {
         let positions = twin_of_thesis_update(&unfolded, &transform_matrices(&scene, &state), &u);
         let folded = fold(&positions, &unfolded.targets, scene.layout.vertices);
         let mut nan_count = 0;
-        for (domain, slot) in scene.layout.domains.iter().enumerate() {
-            for vertex in 0..slot.vertices {
-                let got = &folded[3 * (slot.first_vertex + vertex)..][..3];
+        for (domain, domain_layout) in scene.layout.domains.iter().enumerate() {
+            for vertex in 0..domain_layout.vertices {
+                let got = &folded[3 * (domain_layout.first_vertex + vertex)..][..3];
                 nan_count += usize::from(got[0].is_nan());
                 for (want, got) in position_of(&scene, &state, domain, vertex).iter().zip(got) {
                     // The triangles of the test scene refer to consecutive vertices. Other vertices are NaN, which
