@@ -24,8 +24,8 @@ vec2 receiver_plane_gradient(vec3 normal, int layer) {
 }
 
 #ifdef SHADOW_VARIANCE
-// Bias that compensates for ground depth leaking into the blurred mean near a contact line. The leak would pull the
-// mean towards the sun, although the ground casts no shadow. Let h be the height above the line in standard deviations
+// Bias that compensates for ground depth leaking into the blurred mean near a contact line, where a surface meets the
+// ground. The leak would pull the mean towards the sun, although the ground casts no shadow. Let h be the height above the line in standard deviations
 // of the blur, and k the depth difference of surface and ground per standard deviation. The ground shifts the mean by
 // k (phi(h) - h Q(h)), with the density phi and the upper tail Q of the normal distribution. The bias
 // 0.4 k (1 - h / 2)^2 is an upper bound of this shift up to h = 1.9.

@@ -109,11 +109,11 @@ pub trait Rasterizer: std::fmt::Debug {
     /// Draws depths, ids, or both. One call for both is cheaper, because the switch from OpenGL to CUDA and back takes
     /// longer than either pass.
     ///
-    /// Depths are one f32 per sample from 0 to 1. A sample without a triangle has depth 1. The depth pass draws both
-    /// faces of every triangle.
+    /// Depths are one f32 per sample: 1 at the near plane, 0 at the far plane and without a triangle. The depth pass
+    /// draws both faces of every triangle.
     ///
-    /// Ids are one u64 per sample. The upper half contains the bits of the nearest depth, the lower half the index of
-    /// the triangle. A sample without a triangle has all bits set. The cull mode of the triangle's group
+    /// Ids are one u64 per sample. The upper half contains the inverted bits of the nearest depth, the lower half the
+    /// index of the triangle. A sample without a triangle has all bits set. The cull mode of the triangle's group
     /// ([`RasterGeometry::groups`]) decides whether the id pass draws its back face.
     ///
     /// # Errors

@@ -17,17 +17,17 @@ pub(crate) struct PackedMaterial {
     diffuse_layer: [f32; 4],
     /// xyz: specular color. w: specular exponent.
     specular_exponent: [f32; 4],
-    /// Texture array and layer of the color texture ([`pack_location`]), each -1 without one; alpha; cutoff. The cutoff is the
-    /// alpha from which a cut-out is kept, or from which a blended triangle is drawn as opaque.
+    /// Texture array and layer of the color texture ([`pack_location`]), each -1 without one; alpha; cutoff. The cutoff
+    /// is the alpha from which a cut-out is kept, or from which a blended triangle is drawn as opaque.
     color_texture_alpha: [f32; 4],
 }
 
 pub(crate) const MATERIAL_BYTES: usize = size_of::<PackedMaterial>();
 const _: () = assert!(MATERIAL_BYTES == 64, "PackedMaterial differs from shaders/shared/material.glsl");
 
-/// Packs texture array and layer of an image and, in a mixed array, the size of the image: array + 8 (width - 1) and
-/// layer + 2048 (height - 1). f32 is exact, because the numbers are below 2^24: sides are at most 8192, a scene has at
-/// most 512 images.
+/// Packs texture array and layer of an image and, in a mixed array (with images of several sizes), the size of the
+/// image: array + 8 (width - 1) and layer + 2048 (height - 1). f32 is exact, because the numbers are below 2^24: sides
+/// are at most 8192, a scene has at most 512 images.
 fn pack_location(array: usize, layer: usize, size: Option<[u32; 2]>) -> [f32; 2] {
     let [width, height] = size.unwrap_or([1, 1]);
     [(array as u32 + 8 * (width - 1)) as f32, (layer as u32 + 2048 * (height - 1)) as f32]

@@ -1,6 +1,6 @@
 //! Triangle culling on the GPU. A compute pass tests each triangle of a draw group and lists those that may be visible;
 //! an indirect draw then draws the list. This is worthwhile because a data-center GPU rasterizes only about 0.4 G
-//! triangles/s, while its compute throughput is high.
+//! triangles/s (an H200 draws the depth of 3 M triangles in 7.3 ms), while its compute throughput is high.
 //!
 //! # Tests
 //! Culling removes triangles outside one plane of the view volume, back faces of single-sided materials, triangles so

@@ -24,7 +24,7 @@ pub(crate) fn upload(recorder: &PassRecorder<'_>, buffers: &SceneBuffers, params
     }
 }
 
-/// Binds the uniforms, buffers and textures of a scene for a further step of a frame, whose uniforms are written.
+/// Binds the uniforms, buffers and textures of a scene for a further draw step of a frame, whose uniforms are written.
 pub(crate) fn bind(buffers: &SceneBuffers) {
     bind_scene(buffers);
     if let Some(cull_resources) = &buffers.cull_resources {

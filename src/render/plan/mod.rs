@@ -51,8 +51,7 @@ pub struct RenderPlan {
     /// Textures of the scene, by name.
     pub textures: Vec<Allocation>,
     /// Passes of a frame, in execution order, without the passes of the compute rasterizer, `UniformUpload`,
-    /// `RecordVisible` and `Read`. The ground pass runs only when the camera is above the ground and a vertex may be
-    /// below the ground.
+    /// `RecordVisible` and `Read`.
     pub passes: Vec<Pass>,
     /// Draw calls of the occluder, visibility and blend passes, independent of the number of domains and materials. At
     /// most 4 + 4 + 2 x 3 = 14: four opaque and cut-out groups, once as occluders and once for the visibility, and two

@@ -1,4 +1,5 @@
-//! Frames that are submitted in steps. Between two steps, the device can execute commands of other scenes.
+//! Frames that are submitted in steps (draw steps, not steps of a simulation). Between two steps, the device can execute
+//! commands of other scenes.
 //!
 //! A frame within the limit of [`Renderer::set_max_band_samples`] has one step for each pass, and is meant to be submitted
 //! without a break, unless it is the first one of its scene: drivers finish the compilation of a program when it is used

@@ -210,7 +210,7 @@ mod tests {
         assert_eq!(renderer.programs.labels().count(), program_count);
         renderer.unload(buffers);
         assert!(renderer.begin_preparation(&scene).expect("begins").is_finished(), "expected cached programs");
-        // Negative control: without a compilation, the load compiles all programs.
+        // Negative control: without a preparation, the load compiles all programs.
         let mut renderer = Renderer::open(DevicePreference::Any).expect("EGL and OpenGL 4.3");
         renderer.load(&scene).expect("loads");
         assert_eq!(renderer.programs.labels().count(), program_count);

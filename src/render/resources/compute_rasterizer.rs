@@ -56,7 +56,7 @@ struct VisibilityKeys {
     unpack: Rc<Program>,
 }
 
-/// Bytes of a key: a word of the triangle's index, and a word of the depth's bits.
+/// Bytes of a key: a word of the triangle's index, and a word of the inverted bits of the depth.
 const KEY_BYTES: u64 = 8;
 
 impl RasterPasses {

@@ -184,7 +184,8 @@ fn supported_samples(antialiasing: FrameAntialiasing, sample_positions: &[[f32; 
 }
 
 impl SceneBuffers {
-    /// Creates the resources that the scene's plan lists. `textures`: the texture arrays of colors and of normals. `compile` may return programs that other scenes share.
+    /// Creates the resources that the scene's plan lists. `textures`: the texture arrays of colors and of normals.
+    /// `compile` may return programs that other scenes share.
     pub(crate) fn new(
         gl: &Rc<Gl>,
         scene: &Arc<Scene>,
