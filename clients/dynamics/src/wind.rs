@@ -53,7 +53,7 @@ const FREQUENCY_RANGE: [f64; 2] = [0.05, 8.0];
 /// damping ratio of 0.05 (10 %), so that no mode is between two frequencies.
 const COSINE_COUNT: usize = 64;
 
-/// Duration in which the start of the wind is selected, in seconds.
+/// Duration of the wind from which its start is selected, in seconds.
 const SEARCH_DURATION: f64 = 600.0;
 
 /// Duration over which a gust is averaged when the start of the wind is selected, in seconds.

@@ -1,9 +1,13 @@
-//! Calibrates the strength of the wind to a given sway.
+//! Calibrates the wind to a given sway.
 //!
-//! A calibration run applies the wind at unit strength for a physical duration, which depends neither on the steps of
-//! the run nor on their number. The modes are linear, so their response scales with the strength. The strength is then
-//! chosen so that the peak of the crown's mean displacement is the requested fraction of the height. The bending of each
-//! branch is limited to a fraction of its diagonal, because linear modes do not represent large bending.
+//! A calibration run applies the wind for a physical duration, which depends neither on the steps of the run nor on their
+//! number. The modes are linear, so their response can be scaled: the gain of a domain is the factor of the response of
+//! its modes, and the calibration run has gain 1. All domains have a common gain, at which the peak of the crown's mean
+//! displacement is the requested fraction of the height. Only branches may have a smaller gain: their bending is limited
+//! to a fraction of their diagonal, because linear modes do not represent large bending.
+//!
+//! Bending is the elastic displacement U q. The wind strength, an option of the scenario, scales the requested sway and
+//! the bending limits.
 
 use rayon::prelude::*;
 
@@ -51,12 +55,12 @@ pub(super) struct SwayTarget {
 
 /// The gain of each domain, and the sway at these gains as a fraction of the height.
 pub(super) struct Calibration {
-    /// Per domain: factor from the response at unit strength to the coordinates.
+    /// Per domain.
     pub(super) gains: Vec<f64>,
     pub(super) sway_fraction: f64,
 }
 
-/// The response to the wind at unit strength, recorded by the calibration run.
+/// The response to the wind in the calibration run.
 struct UnitResponse {
     /// Per domain: largest elastic displacement of its surface samples, in scene units.
     bending: Vec<f64>,
@@ -75,29 +79,31 @@ impl SwayTarget {
         limit * self.wind_strength.clamp(0.0, MAX_BENDING_SCALE)
     }
 
-    /// The gain of each domain: `strength`, reduced for branches that would exceed their bending limit.
-    fn compute_gains(&self, model: &Model, strength: f64, bending: &[f64]) -> Vec<f64> {
+    /// The gain of each domain: `common_gain`, reduced for branches that would exceed their bending limit.
+    fn compute_gains(&self, model: &Model, common_gain: f64, bending: &[f64]) -> Vec<f64> {
         let gain = |(domain, bending): (&DomainModel, &f64)| match (&domain.joint, *bending > 0.0) {
-            (Some(_), true) => strength.min(self.scale_bending_limit(MAX_BRANCH_BENDING) * domain.diagonal / bending),
-            _ => strength,
+            (Some(_), true) => {
+                common_gain.min(self.scale_bending_limit(MAX_BRANCH_BENDING) * domain.diagonal / bending)
+            }
+            _ => common_gain,
         };
         model.domains.iter().zip(bending).map(gain).collect()
     }
 
-    /// The strength at which the trunk reaches its bending limit. If no trunk deforms, the strength at which all
-    /// branches have reached their limits. 0 if nothing deforms.
-    fn max_strength(&self, model: &Model, bending: &[f64]) -> f64 {
+    /// The gain at which the trunk reaches its bending limit. If no trunk deforms, the gain at which all branches have
+    /// reached their limits. 0 if nothing deforms.
+    fn max_common_gain(&self, model: &Model, bending: &[f64]) -> f64 {
         let bending_domains = || model.domains.iter().zip(bending).filter(|(_, bending)| **bending > 0.0);
-        let strength_at = |limit: f64, domain: &DomainModel, bending: f64| {
+        let gain_at = |limit: f64, domain: &DomainModel, bending: f64| {
             self.scale_bending_limit(limit) * domain.diagonal / bending
         };
         let roots = bending_domains().filter(|(domain, _)| domain.joint.is_none());
-        let trunk_strength =
-            roots.map(|(domain, bending)| strength_at(MAX_TRUNK_BENDING, domain, *bending)).fold(f64::MAX, f64::min);
-        if trunk_strength < f64::MAX {
-            return trunk_strength;
+        let trunk_gain =
+            roots.map(|(domain, bending)| gain_at(MAX_TRUNK_BENDING, domain, *bending)).fold(f64::MAX, f64::min);
+        if trunk_gain < f64::MAX {
+            return trunk_gain;
         }
-        bending_domains().map(|(domain, bending)| strength_at(MAX_BRANCH_BENDING, domain, *bending)).fold(0.0, f64::max)
+        bending_domains().map(|(domain, bending)| gain_at(MAX_BRANCH_BENDING, domain, *bending)).fold(0.0, f64::max)
     }
 }
 
@@ -116,9 +122,8 @@ pub(super) fn calibrate(
 ) -> Result<Calibration> {
     let response = record_unit_response(model, excitation, parameters)?;
     let attachments = Attachments::new(model);
-    // A `strength` is the common factor of all gains, before the bending limits; it is not the wind strength.
-    let evaluate = |strength: f64| {
-        let gains = target.compute_gains(model, strength, &response.bending);
+    let evaluate = |common_gain: f64| {
+        let gains = target.compute_gains(model, common_gain, &response.bending);
         let sway = |unit_q: &Vec<f64>| {
             let q = scale_response(model, unit_q, &gains);
             crown.sway(model, &q, &compose_transforms(model, &attachments.deform(model, &q), &[]))
@@ -126,27 +131,27 @@ pub(super) fn calibrate(
         let sway_fraction = response.coordinates.iter().map(sway).fold(0.0, f64::max);
         Calibration { gains, sway_fraction }
     };
-    let mut high_strength = target.max_strength(model, &response.bending);
-    let can_sway = target.crown_sway() > 0.0 && high_strength > 0.0;
+    let mut high_gain = target.max_common_gain(model, &response.bending);
+    let can_sway = target.crown_sway() > 0.0 && high_gain > 0.0;
     if !can_sway {
         return Ok(Calibration { gains: vec![0.0; model.domains.len()], sway_fraction: 0.0 });
     }
-    if evaluate(high_strength).sway_fraction > target.crown_sway() {
-        let mut low_strength = 0.0;
+    if evaluate(high_gain).sway_fraction > target.crown_sway() {
+        let mut low_gain = 0.0;
         // 24 bisections reduce the interval by a factor of 1.7e7.
         for _ in 0..24 {
-            let middle_strength = 0.5 * (low_strength + high_strength);
-            if evaluate(middle_strength).sway_fraction > target.crown_sway() {
-                high_strength = middle_strength;
+            let middle_gain = 0.5 * (low_gain + high_gain);
+            if evaluate(middle_gain).sway_fraction > target.crown_sway() {
+                high_gain = middle_gain;
             } else {
-                low_strength = middle_strength;
+                low_gain = middle_gain;
             }
         }
     }
-    Ok(evaluate(high_strength))
+    Ok(evaluate(high_gain))
 }
 
-/// Runs at unit strength and records the response.
+/// Runs with gain 1 and records the response.
 fn record_unit_response(
     model: &Model,
     excitation: &WindExcitation,
@@ -179,7 +184,7 @@ fn record_unit_response(
     Ok(UnitResponse { bending, coordinates: recorded_states.into_iter().map(|(_, q)| q).collect() })
 }
 
-/// Scales the response at unit strength by the gain of each domain, and rounds it to f32.
+/// Multiplies the response at gain 1 by the gain of each domain, and rounds it to f32.
 pub(super) fn scale_response(model: &Model, unit_q: &[f64], gains: &[f64]) -> Vec<f64> {
     let mut q = vec![0.0; model.coordinate_count];
     for (domain, gain) in model.domains.iter().zip(gains) {

@@ -14,7 +14,7 @@ pub(super) struct Integrator {
     dt: f64,
 }
 
-/// The wind and the response to it at one time, at unit strength.
+/// The wind and the response to it at one time, with gain 1 (see `calibration`).
 pub(super) struct Response {
     /// Per coordinate.
     states: Vec<ModeState>,
