@@ -12,7 +12,7 @@ use modalcast_model::scene::{DeformationSettings, NormalMethod, Scene, ScenePart
 use crate::common::attributes::find_wrong_box;
 use crate::common::followers::follower_scene_parts;
 use crate::common::{assert_within_bound, run_step, scene_of_shapes, strip_shape};
-use crate::ensembles::{instanced_parts, random_states, with_storage};
+use crate::instanced_scenes::{instanced_parts, random_states, with_storage};
 use crate::reference_comparison::cuda_deformer_with_batches;
 use crate::scenes::{self, Random};
 

@@ -251,7 +251,7 @@ fn gpu_two_hundred_thousand_leaves_follow_their_branches() {
     let mut deformer = cuda_deformer(&scene);
     let plan = deformer.plan();
     eprintln!(
-        "201,000 domains: {} bytes per step, {} bytes of frames",
+        "201,000 domains: {} bytes per step, {} bytes of follower frames",
         plan.bytes_in,
         plan.bytes(BufferRole::FollowerFrames)
     );

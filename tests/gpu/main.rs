@@ -8,11 +8,11 @@ mod batch;
 mod common;
 mod cuda_checks;
 mod device;
-#[expect(dead_code, reason = "shared with the benchmarks")]
-mod ensembles;
 mod extremes;
 mod frame_info;
 mod gl;
+#[expect(dead_code, reason = "shared with the benchmarks")]
+mod instanced_scenes;
 mod interop;
 mod light;
 mod normals;

@@ -33,7 +33,8 @@ impl GpuContext {
         (CudaRasterizer::new(&self.device, geometry).expect("expected a rasterizer"), positions)
     }
 
-    /// The key of each sample: the bits of its depth in the upper half, the index of its triangle in the lower half.
+    /// The key of each sample: the inverted bits of its depth in the upper half, the index of its triangle in the lower
+    /// half.
     fn draw_ids(&self, rasterizer: &mut CudaRasterizer, viewport: &Viewport, target: &GlBuffer) -> Vec<u64> {
         rasterizer.draw(None, Some((viewport, target))).expect("expected a frame");
         self.gl.read(target, viewport.pixel_count())

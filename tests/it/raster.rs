@@ -40,7 +40,7 @@ fn owns_edge(from: &SnappedVertex, to: &SnappedVertex) -> bool {
 /// tile is a square of [`TILE_SIZE`] pixels. It may be divided into strips of rows.
 struct RasterTraversal<'a> {
     soup: &'a Soup,
-    /// Per sample, as in [`VisibilityBuffer::keys`]: the bits of the depth above the triangle index.
+    /// Per sample, as in [`VisibilityBuffer::keys`]: the inverted bits of the depth above the triangle index.
     keys: Vec<u64>,
     /// Triangles of the per-warp path, in any order.
     warp_queue: Vec<u32>,

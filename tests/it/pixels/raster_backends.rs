@@ -98,7 +98,7 @@ impl Rasterizer for ReferenceRasterizer {
             self.write(target, bytemuck::cast_slice(&self.rasterize(viewport, &[all_triangles]).depths()))?;
         }
         let Some((viewport, target)) = ids else { return Ok(()) };
-        // A sample has a 64-bit key: the bits of its depth above its triangle id.
+        // A sample has a 64-bit key: the inverted bits of its depth above its triangle id.
         self.write(target, bytemuck::cast_slice(&self.rasterize(viewport, &self.mesh.groups).keys))
     }
 }

@@ -212,7 +212,7 @@ impl RasterSetup {
         let map_raster = RasterBenchmark::new(device, mesh, map_viewport, map_variant)?;
         frame_raster.launch(device, 0)?;
         let keys = frame_raster.keys(device)?;
-        // A key has the depth in its upper and the triangle in its lower 32 bits.
+        // The lower 32 bits of a key are the triangle.
         let differing_ids = keys.iter().zip(&ids).filter(|(key, id)| **key as u32 != **id).count();
         let is_accepted = differing_ids as f64 <= MAX_DIFFERING_FRACTION * ids.len() as f64;
         let passes = if is_accepted {

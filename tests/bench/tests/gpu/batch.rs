@@ -11,7 +11,7 @@ use modalcast_model::backend_settings::BatchPolicy;
 use modalcast_model::scene::{Scene, SceneState, StorageType};
 
 use crate::accuracy::have_equal_bits;
-use crate::ensembles::{build_scene, instanced_parts, random_states, with_storage};
+use crate::instanced_scenes::{build_scene, instanced_parts, random_states, with_storage};
 use crate::scenes;
 
 /// Largest ratio of a vertex's error to the error bound of its tile. A tile of stored U has [`TILE_QUADS`] quads, and a

@@ -8,8 +8,8 @@ mod batch;
 mod benchmarks;
 #[path = "../../../common/cut_outs.rs"]
 mod cut_outs;
-#[path = "../../../gpu/ensembles.rs"]
-mod ensembles;
+#[path = "../../../gpu/instanced_scenes.rs"]
+mod instanced_scenes;
 mod light;
 mod overlap;
 mod raster;
