@@ -1,9 +1,10 @@
 //! A PNG encoder for rendered frames. It encodes strips of rows independently of each other, so that several threads can
-//! work on one picture. The file depends only on the pixels, not on the number of threads.
+//! work on one picture. The file depends only on the pixels, not on the number of threads. The kernels in `kernels/png.cu`
+//! write the same file.
 //!
 //! A strip is filtered with Sub (`filter`), split into literals and runs of zeros (`segments`), and written as one deflate
-//! block with a Huffman code of its own (`deflate`, `symbols`, `block_header`, `huffman`). The steps are those of a
-//! parallel implementation: each pixel, word and symbol depends on its neighbors and on the code of the strip only.
+//! block with a Huffman code of its own (`deflate`, `symbols`, `block_header`, `huffman`). Each pixel, word and symbol
+//! depends on its neighbors and on the code of the strip only, so the kernels compute them in parallel.
 //!
 //! # Format
 //! The strips are parts of one zlib stream. A strip ends on a byte boundary, with an empty stored block, and does not

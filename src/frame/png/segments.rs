@@ -1,23 +1,36 @@
 //! Splits filtered pixels into literals and runs of zeros. Filtered flat areas are zeros, and other matches are too rare
 //! in rendered frames to pay for the search.
+//!
+//! Runs do not cross the border of a tile, so that the tiles of a strip can be split independently of each other.
 
 /// Literals, followed by a run of zeros.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Segment {
     pub(super) literals: usize,
-    /// 0 only in the last segment.
+    /// 0 only in the last segment of a tile.
     pub(super) zeros: usize,
 }
+
+/// Number of bytes that are split independently of the others: what a block of the kernel processes in shared memory.
+pub(super) const TILE_BYTES: usize = 8192;
 
 /// Number of words whose zeros are found at once.
 const BLOCK_WORDS: usize = 64;
 
-/// Splits `bytes` into segments, which replace the content of `segments`. A run is a maximal sequence of zeros that
-/// contains an aligned word of eight zeros. So each word decides with its two neighbors alone, and a parallel
+/// Splits `bytes` into segments, which replace the content of `segments`. A run is a maximal sequence of zeros within a
+/// tile that contains an aligned word of eight zeros. So each word decides with its two neighbors alone, and a parallel
 /// implementation finds the same runs.
 #[inline(always)]
 pub(super) fn split(bytes: &[u8], segments: &mut Vec<Segment>) {
     segments.clear();
+    for tile in bytes.chunks(TILE_BYTES) {
+        split_tile(tile, segments);
+    }
+}
+
+/// Appends the segments of a tile.
+#[inline(always)]
+fn split_tile(bytes: &[u8], segments: &mut Vec<Segment>) {
     let mut splitter = Splitter { bytes, literals_begin: 0, zeros_begin: None };
     let (words, _) = bytes.as_chunks::<8>();
     let mut is_previous_zero = 0;
@@ -100,7 +113,7 @@ impl Splitter<'_> {
 mod tests {
     use super::*;
 
-    /// The segments by their definition, byte by byte.
+    /// The segments of a tile by their definition, byte by byte.
     fn split_by_bytes(bytes: &[u8]) -> Vec<Segment> {
         let (mut segments, mut literals, mut begin) = (Vec::new(), 0, 0);
         for run in bytes.chunk_by(|a, b| (*a == 0) == (*b == 0)) {
@@ -121,14 +134,15 @@ mod tests {
     fn segments_are_maximal_runs_with_an_aligned_word() {
         let mut random = fastrand::Rng::with_seed(2);
         let mut segments = vec![Segment { literals: 1, zeros: 1 }];
-        for length in (0..200).chain([1000, 5000]) {
+        for length in (0..200).chain([1000, 5000, 8191, 8192, 8193, 8200, 30_000]) {
             for zeros_in_16 in [0, 8, 14, 15, 16] {
                 let repeats = random.usize(1..=20);
                 let mut byte = || if random.u8(0..16) < zeros_in_16 { 0 } else { random.u8(..) };
                 let bytes: Vec<u8> =
                     (0..length).flat_map(|_| std::iter::repeat_n(byte(), repeats)).take(length).collect();
                 split(&bytes, &mut segments);
-                assert_eq!(segments, split_by_bytes(&bytes), "{bytes:?}");
+                let expected: Vec<Segment> = bytes.chunks(8192).flat_map(split_by_bytes).collect();
+                assert_eq!(segments, expected, "{bytes:?}");
             }
         }
     }

@@ -103,7 +103,7 @@ fn gradients_are_decoded_and_flat_pictures_are_small() {
     encode_and_check(700, 300, &gradient);
     let flat = picture(1920, 1080, |_, _| [77, 78, 79, 255]);
     let bytes = encode_and_check(1920, 1080, &flat).len();
-    assert!(bytes < 12_000, "expected a small file, got {bytes} bytes");
+    assert!(bytes < 14_000, "expected a small file, got {bytes} bytes");
 }
 
 #[test]
