@@ -32,9 +32,9 @@
 //! | `modalcast::frame` | PNG and JPEG encoding, color maps with legends; pure functions | |
 //! | `modalcast::telemetry` | stage names and times, logging | |
 //! | `modalcast::config` | all limits and paths, validated once | |
-//! | `modalcast-compute::gpu` | the CUDA deformer and rasterizer, in the three tiers below | `storage` |
-//! | `modalcast-compute::gpu::executor` | one launcher per kernel, with the kernel's name; steps in flight, outputs, readbacks, OpenGL interop | `tables`, `launch` |
-//! | `modalcast-compute::gpu::tables` | device arrays and launch plan of a scene, inputs of a step; pure functions | `launch` |
+//! | `modalcast-compute::gpu` | the CUDA deformer, rasterizer and PNG encoder, in the three tiers below | `storage` |
+//! | `modalcast-compute::gpu::executor` | one launcher per kernel, with the kernel's name; steps in flight, outputs, readbacks, OpenGL interop, PNG files | `tables`, `launch` |
+//! | `modalcast-compute::gpu::tables` | device arrays and launch plan of a scene, inputs of a step, strips of a PNG; pure functions | `launch` |
 //! | `modalcast-compute::gpu::launch` | access to a CUDA device: context, memory, compilation, launches, graphs | |
 //! | `modalcast-compute::cpu` | the f32 deformer for machines without a GPU | `storage` |
 //! | `modalcast-compute::reference` | the f64 reference deformer, which the others are tested against | |

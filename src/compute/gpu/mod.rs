@@ -25,6 +25,7 @@ mod kernel_tests;
 pub mod launch;
 mod tables;
 
+pub use executor::png::{DevicePicture, EncodedPng, PendingPng, PngEncoder};
 pub use executor::raster::{CudaRasterizer, RasterGranularity, RasterVariant};
 pub use executor::{CudaDeformer, MAX_STEPS_IN_FLIGHT, PreparedDeformer, device_layout_values};
 #[cfg(any(test, feature = "testing"))]
@@ -33,6 +34,7 @@ pub use launch::{Device, DeviceInfo, KernelDescriptor, KernelKind, Probe, probe}
 pub use tables::device_tables::CudaDeformerOptions;
 pub use tables::layout::{LayoutConstant, layout_constants};
 pub use tables::plan::{BufferDescriptor, BufferRole, DeformPlan, OmittedFeature, plan};
+pub use tables::png_plan::PngChannels;
 
 /// The launchers of the kernels, for programs that measure single kernels. The launch functions are unsafe, because the
 /// kernels write to the addresses in the step's [`StepHeader`](step_input::StepHeader), which nothing checks.

@@ -9,6 +9,7 @@
 //! | `output_ring` | double buffering of the outputs: the output that a step writes, and its outdated domains |
 //! | `readback`, `pinned_surface` | asynchronous readback of vertices, concurrent with the next step |
 //! | `raster` | compute rasterizer, which draws into OpenGL's buffers |
+//! | `png` | PNG encoder, from pixels in device memory to a file in pinned memory |
 //! | `layout_check` | check that host and device agree on struct layouts |
 
 mod deformer;
@@ -19,6 +20,7 @@ mod layout_check;
 mod output;
 mod output_ring;
 mod pinned_surface;
+pub(crate) mod png;
 pub(crate) mod raster;
 mod readback;
 mod step_slot;

@@ -12,6 +12,7 @@
 //! | `input_packing`, `staging` | the input values of a step |
 //! | `change_list` | the lists of a partial step |
 //! | `box_keys` | boxes as the kernels write them |
+//! | `png_plan` | strips, tiles and memory of a picture that is encoded as PNG |
 
 pub(crate) mod box_keys;
 pub(crate) mod box_segments;
@@ -23,6 +24,7 @@ pub(crate) mod layout;
 mod normal_tables;
 pub(crate) mod occupancy;
 pub(crate) mod plan;
+pub(crate) mod png_plan;
 mod rings;
 pub(crate) mod staging;
 #[cfg(test)]
