@@ -1,9 +1,12 @@
 //! Encodings of pictures: time, bytes and error of the server's encoders and of alternatives, on one frame of a scene.
 
+use std::num::NonZero;
 use std::time::Instant;
 
 use modalcast::frame::{self, EncodedStrip, PngLayout, StripBuffers};
 use modalcast_client::FrameRequest;
+use modalcast_compute::gpu::launch::DeviceBuffer;
+use modalcast_compute::gpu::{Device, DevicePicture, EncodedPng, PngChannels, PngEncoder};
 use rayon::prelude::*;
 use serde::Serialize;
 
@@ -23,7 +26,7 @@ pub struct PictureEncodingRow {
     /// Whether the server uses this encoder. The time of its PNG includes the removal of the opaque alpha channel.
     pub is_used_by_server: bool,
     pub bytes: usize,
-    /// Median time of one thread.
+    /// Median time of one thread, or of the device.
     pub ms: f64,
     /// Median time of one picture on all threads. `None` if the encoder uses one thread per picture.
     pub all_threads_ms: Option<f64>,
@@ -87,7 +90,10 @@ pub(super) fn measure(
         Size::Full => 7,
         Size::Quick => 3,
     };
-    encoders().into_iter().map(|encoder| measure_encoder(encoder, &pixels, repetitions)).collect()
+    let rows = encoders().into_iter().map(|encoder| measure_encoder(encoder, &pixels, repetitions));
+    let mut rows: Vec<PictureEncodingRow> = rows.collect::<Result<_>>()?;
+    rows.extend(measure_cuda(&pixels, repetitions)?);
+    Ok(rows)
 }
 
 async fn draw(session: &Session, content: Content) -> Result<Pixels> {
@@ -152,8 +158,37 @@ fn measure_encoder(encoder: Encoder, pixels: &Pixels, repetitions: usize) -> Res
     })
 }
 
+/// Measures the PNG encoder in CUDA, from pixels in device memory to a file in host memory. `None` on a machine without a
+/// CUDA device.
+fn measure_cuda(pixels: &Pixels, repetitions: usize) -> Result<Option<PictureEncodingRow>> {
+    let Ok(device) = Device::open(0) else { return Ok(None) };
+    let Pixels { width, height, .. } = *pixels;
+    // `time_median` holds one file while it encodes others.
+    let slot_count = NonZero::<usize>::MIN.saturating_add(1);
+    let encoder = PngEncoder::new(&device, [width, height], PngChannels::Rgb, slot_count)?;
+    let memory = DeviceBuffer::upload(&device, &pixels.rgba)?;
+    let picture = DevicePicture { address: memory.address(), pitch: 4 * i64::from(width), width, height };
+    let encode = || -> Result<EncodedPng> {
+        // SAFETY: the memory of the picture outlives the encoding, and nothing writes it.
+        let pending = unsafe { encoder.encode(&picture) }?;
+        let file = pending.ok_or_else(|| fault("report", "expected a free slot"))?.wait()?;
+        file.ok_or_else(|| fault("report", "expected an opaque picture"))
+    };
+    let (file, ms) = time_median(repetitions, encode)?;
+    let [largest_error, rms_error] = decoding_errors(file.as_ref(), &pixels.rgb)?;
+    Ok(Some(PictureEncodingRow {
+        encoder: "PNG in CUDA, of pixels on the device".into(),
+        is_used_by_server: false,
+        bytes: file.as_ref().len(),
+        ms,
+        all_threads_ms: None,
+        largest_error,
+        rms_error,
+    }))
+}
+
 /// The result of `encode` and its median time in milliseconds. The first run is not timed.
-fn time_median(repetitions: usize, encode: impl Fn() -> Result<Vec<u8>>) -> Result<(Vec<u8>, f64)> {
+fn time_median<T>(repetitions: usize, encode: impl Fn() -> Result<T>) -> Result<(T, f64)> {
     let bytes = encode()?;
     let mut times_ms = Vec::new();
     for _ in 0..repetitions {
@@ -198,6 +233,14 @@ mod tests {
         let used: Vec<&str> = pngs.iter().filter(|row| row.is_used_by_server).map(|row| row.encoder.as_str()).collect();
         assert_eq!(used, ["PNG of the server"]);
         assert_eq!(rows.iter().filter(|row| row.all_threads_ms.is_some()).count(), 1);
+    }
+
+    #[test]
+    #[ignore = "needs an NVIDIA GPU"]
+    fn gpu_png_has_the_bytes_of_the_server() {
+        let row = measure_cuda(&pixels(), 2).expect("expected a picture").expect("expected a CUDA device");
+        let file = Encoder::ServerPng.encode(&pixels()).expect("expected a PNG");
+        assert_eq!((row.bytes, row.largest_error), (file.len(), 0.0));
     }
 
     #[test]
