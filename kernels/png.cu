@@ -1,21 +1,28 @@
 // PNG encoder: filters RGBA8 pixels, compresses them and writes a whole file to pinned host memory. The file is the one
-// that the CPU twin writes: independent strips of rows, each one deflate block with a Huffman code of its own, or stored
-// blocks, in an IDAT chunk of its own (src/frame/png describes the format). It depends on the pixels only.
-//   png_filter  a block per tile: filter Sub, numbers of the symbols, sums for Adler-32; clears the memory of the content
+// that the CPU twin writes: independent strips of rows, each one deflate block with a Huffman code of its own, or
+// stored blocks, in an IDAT chunk of its own (src/frame/png describes the format). It depends on the pixels only.
+//   png_filter  a block per tile: filter Sub, numbers of the symbols, sums for Adler-32; clears the memory of the file
 //   png_code    a block per strip: Huffman code, header of the deflate block, sizes
 //   png_pack    a block per tile: writes the bits of the symbols at offsets from prefix sums
-//   png_finish  a block per strip: CRC-32; writes the chunk to the host. The first and the last block also write the start
-//               and the end of the file, with the Adler-32 of all strips
-// Macro: CHANNELS, 3 (RGB, the default) or 4 (RGBA). With 3, alpha is dropped, and the result says whether a pixel is not
-// opaque. The file is then incomplete: it has to be encoded with 4.
-// Launch: PngArgs. png_filter and png_pack: strips * tiles_per_strip blocks of BLOCK threads; png_code: strips blocks of
-// CODE_BLOCK threads; png_finish: strips blocks of BLOCK threads. CPU twin: PngLayout::encode_strip.
+//   png_finish  a block per strip: CRC-32; writes the chunk to the host. The first and the last block also write the
+//               start and the end of the file, with the Adler-32 of all strips
+// Macro: CHANNELS, 3 (RGB, the default) or 4 (RGBA). With 3, alpha is dropped, and the result says whether a pixel is
+// not opaque. Such a picture must be encoded with 4.
+// Launch: all kernels have the argument PngArgs. png_filter and png_pack: strips * tiles_per_strip blocks of BLOCK
+// threads; png_code: strips blocks of CODE_BLOCK threads; png_finish: strips blocks of BLOCK threads.
+// CPU twin: PngLayout::encode_strip.
 #include "png.cuh"
 #include "png_crc.cuh"
 #include "png_huffman.cuh"
 
 constexpr unsigned BLOCK = 256, WARPS = BLOCK / 32;
 constexpr unsigned WORDS_PER_THREAD = TILE_WORDS / BLOCK;
+// Blocks of png_pack per multiprocessor that the compiler limits the registers for, where that spills none.
+#if __CUDA_ARCH__ >= 800 && __CUDA_ARCH__ < 1000
+constexpr unsigned PACK_BLOCKS = 6;
+#else
+constexpr unsigned PACK_BLOCKS = 4;
+#endif
 constexpr unsigned FILTER_SUB = 1;
 constexpr unsigned HEAD_BYTES = 46;                  // signature and the chunks IHDR and sRGB
 constexpr unsigned CHUNK_PREFIX = 8, CHUNK_BYTES = 12; // length and type; with the checksum
@@ -46,9 +53,10 @@ struct FilteredPosition {
     }
 };
 
-// Four bytes of the filtered strip from `position` on. Bytes from `end` on are zeros. Clears bits of `alphas` if a pixel
-// is not opaque.
-__device__ inline unsigned filter_word(const PngArgs& args, unsigned strip, FilteredPosition position, unsigned end, unsigned& alphas) {
+// Four bytes of the filtered strip from `position` on. Bytes from `end` on are zeros. Clears bits of `alphas` if a
+// pixel is not opaque.
+__device__ inline unsigned filter_word(const PngArgs& args, unsigned strip, FilteredPosition position, unsigned end,
+                                       unsigned& alphas) {
     const unsigned first_row = strip * args.strip_rows;
     if (position.column > 0 && position.column + 3 < args.row_bytes && position.byte + 3 < end) {
         const unsigned pixel = (position.column - 1) / CHANNELS, shift = 8 * ((position.column - 1) % CHANNELS);
@@ -78,13 +86,14 @@ __device__ inline unsigned filter_word(const PngArgs& args, unsigned strip, Filt
     return word;
 }
 
-// Counts symbols: zeros in a register, because most literals are zeros, and other symbols in shared memory.
+// Counts symbols in shared memory. A counter of a padding symbol takes the bytes that are not literals, because a
+// branch for each byte would cost more than the addition.
 struct SymbolCounter {
     unsigned* counts;
-    unsigned zeros;
+    unsigned run_zeros; // literals of runs
 
     __device__ void add_zeros(unsigned count) {
-        zeros += count;
+        run_zeros += count;
     }
 
     __device__ void add_match(unsigned length) {
@@ -97,10 +106,7 @@ struct SymbolCounter {
         for (unsigned i = 0; i < WORD_BYTES; ++i) {
             const unsigned byte = (unsigned)(bytes >> 32 * (i / 4)) >> 8 * (i % 4) & 255;
             const bool is_literal = literals >> i & 1;
-            zeros += is_literal && byte == 0;
-            if (is_literal && byte != 0) {
-                atomicAdd(&counts[byte], 1);
-            }
+            atomicAdd(&counts[is_literal ? byte : PADDED_SYMBOLS - 1], 1);
         }
     }
 };
@@ -142,7 +148,7 @@ extern "C" __global__ void __launch_bounds__(BLOCK) png_filter(const __grid_cons
     for (unsigned word = threadIdx.x; word < TILE_WORDS; word += BLOCK) {
         add_word(tile, word, counter);
     }
-    atomicAdd(&counter.counts[0], counter.zeros);
+    atomicAdd(&counter.counts[0], counter.run_zeros);
     // The sums are at most 255 * 8192 and 65521 per thread, so 32 bits hold each.
     const unsigned long long sums = block_sum(
         (unsigned long long)(weighted_sum % ADLER_MODULUS) << 32 | sum, partial_sums);
@@ -150,7 +156,7 @@ extern "C" __global__ void __launch_bounds__(BLOCK) png_filter(const __grid_cons
     for (unsigned symbol = threadIdx.x; symbol < PADDED_SYMBOLS; symbol += BLOCK) {
         unsigned count = 0;
         for (unsigned warp = 0; warp < WARPS; ++warp) {
-            count += counts[warp][symbol];
+            count += symbol < SYMBOLS ? counts[warp][symbol] : 0;
         }
         target->counts[symbol] = count;
     }
@@ -274,7 +280,8 @@ __device__ inline unsigned write_header(CodeScratch& scratch, unsigned length, b
         atomicAdd(&scratch.field_frequencies[field.symbol], 1);
     }
     __syncthreads();
-    const unsigned field_length = code_length<LENGTH_SYMBOLS, 7>(scratch.huffman, index < 32 ? scratch.field_frequencies[index] : 0);
+    const unsigned frequency = index < 32 ? scratch.field_frequencies[index] : 0;
+    const unsigned field_length = code_length<LENGTH_SYMBOLS, 7>(scratch.huffman, frequency);
     const unsigned field_code = canonical_code(scratch.huffman, field_length);
     if (index < 32) {
         scratch.field_lengths[index] = field_length;
@@ -347,7 +354,8 @@ extern "C" __global__ void __launch_bounds__(CODE_BLOCK) png_code(const __grid_c
         target->header[symbol] = scratch.header[symbol];
     }
     if (symbol == 0) {
-        // Three bits and four bytes are an empty stored block, which fills the last byte of all strips but the last one.
+        // Three bits and four bytes are an empty stored block, which fills the last byte of all strips but the last
+        // one.
         const unsigned end_bits = is_last ? 0 : 3, end_bytes = is_last ? 0 : 4;
         const unsigned block_bytes = (unsigned)((header_bits + symbol_bits + end_bits + 7) / 8) + end_bytes;
         const unsigned strip_bytes = TileRange::strip_bytes(args, strip);
@@ -360,7 +368,8 @@ extern "C" __global__ void __launch_bounds__(CODE_BLOCK) png_code(const __grid_c
 }
 
 // Offset in the file of the content of a strip's chunk. All threads call it.
-__device__ inline unsigned content_offset(const PngArgs& args, unsigned strip, unsigned long long (&partial_sums)[WARPS]) {
+__device__ inline unsigned content_offset(const PngArgs& args, unsigned strip,
+                                          unsigned long long (&partial_sums)[WARPS]) {
     const PngStrip* strips = (const PngStrip*)args.strips;
     unsigned bytes = 0;
     for (unsigned other = threadIdx.x; other < strip; other += BLOCK) {
@@ -369,7 +378,8 @@ __device__ inline unsigned content_offset(const PngArgs& args, unsigned strip, u
     return HEAD_BYTES + CHUNK_PREFIX + (unsigned)block_sum(bytes, partial_sums);
 }
 
-// Collects the bits of the symbols of a word: at most 8 literals of 12 bits, or matches, which have fewer bits per byte.
+// Collects the bits of the symbols of a word: at most 8 literals of 12 bits, or matches, which have fewer bits per
+// byte.
 struct SymbolPacker {
     const unsigned* codes; // as PngStrip::codes
     unsigned long long low, high;
@@ -454,7 +464,7 @@ __device__ inline void store_tile(const PngArgs& args, const TileRange& range, u
     }
 }
 
-extern "C" __global__ void __launch_bounds__(BLOCK, 4) png_pack(const __grid_constant__ PngArgs args) {
+extern "C" __global__ void __launch_bounds__(BLOCK, PACK_BLOCKS) png_pack(const __grid_constant__ PngArgs args) {
     __shared__ SharedTile tile;
     __shared__ unsigned packed[PACKED_WORDS];
     __shared__ unsigned codes[PADDED_SYMBOLS];
@@ -522,7 +532,8 @@ extern "C" __global__ void __launch_bounds__(BLOCK, 4) png_pack(const __grid_con
     }
     __syncthreads();
     // `packed` begins at the word of the file that contains the first bit of the tile. The first tile has the header.
-    const bool is_first = tile_index == 0, is_last = range.first_byte + range.byte_count == TileRange::strip_bytes(args, range.strip);
+    const bool is_first = tile_index == 0;
+    const bool is_last = range.first_byte + range.byte_count == TileRange::strip_bytes(args, range.strip);
     const unsigned long long begin = 8ull * content + (is_first ? 0 : first_bit);
     const unsigned origin = (unsigned)(begin % 32), symbols_origin = origin + (is_first ? first_bit : 0);
 #pragma unroll
@@ -611,9 +622,9 @@ __device__ inline void write_head(const PngArgs& args, FinishScratch& scratch) {
     copy_bytes((unsigned char*)args.file, scratch.bytes, HEAD_BYTES);
 }
 
-// Adler-32 of the filtered bytes of all strips (RFC 1950). The low half is 1 + the sum of the bytes. The high half is the
-// sum of the low halves after each byte, in which each byte counts once for every byte from it to the end. All threads
-// call it.
+// Adler-32 of the filtered bytes of all strips (RFC 1950). The low half is 1 + the sum of the bytes. The high half is
+// the sum of the low halves after each byte, in which each byte counts once for every byte from it to the end. All
+// threads call it.
 __device__ inline unsigned adler_checksum(const PngArgs& args, FinishScratch& scratch) {
     const unsigned tile_count = args.strip_count * args.tiles_per_strip;
     const unsigned long long byte_count = (unsigned long long)args.row_bytes * args.height;
@@ -622,7 +633,8 @@ __device__ inline unsigned adler_checksum(const PngArgs& args, FinishScratch& sc
         const PngTile& source = ((const PngTile*)args.tiles)[tile];
         const TileRange range(args, tile);
         const unsigned long long strip_begin = (unsigned long long)args.strip_rows * args.row_bytes * range.strip;
-        const unsigned long long bytes_after = byte_count - min(byte_count, strip_begin + range.first_byte + range.byte_count);
+        const unsigned long long end = strip_begin + range.first_byte + range.byte_count;
+        const unsigned long long bytes_after = byte_count - min(byte_count, end);
         sum += source.sum;
         weighted_sum += source.weighted_sum + bytes_after % ADLER_MODULUS * source.sum;
     }
@@ -632,8 +644,8 @@ __device__ inline unsigned adler_checksum(const PngArgs& args, FinishScratch& sc
     return high << 16 | low;
 }
 
-// Writes the chunk with the Adler-32 checksum, the chunk IEND and the result. `end` is the end of the last strip's chunk.
-// All threads call it.
+// Writes the chunk with the Adler-32 checksum, the chunk IEND and the result. `end` is the end of the last strip's
+// chunk. All threads call it.
 __device__ inline void write_tail(const PngArgs& args, FinishScratch& scratch, unsigned end) {
     constexpr unsigned char START[CHUNK_PREFIX] = {0, 0, 0, 4, 'I', 'D', 'A', 'T'};
     constexpr unsigned char IEND[CHUNK_BYTES] = {0, 0, 0, 0, 'I', 'E', 'N', 'D', 0xae, 0x42, 0x60, 0x82};
@@ -651,8 +663,8 @@ __device__ inline void write_tail(const PngArgs& args, FinishScratch& scratch, u
     }
 }
 
-// CRC-32 of the type IDAT and the content at the bytes from `begin` to before `end` of `words`. All threads call it; the
-// result is valid in thread 0.
+// CRC-32 of the type IDAT and the content at the bytes from `begin` to before `end` of `words`. All threads call it;
+// the result is valid in thread 0.
 __device__ inline unsigned chunk_checksum(const unsigned* words, unsigned begin, unsigned end, FinishScratch& scratch) {
     // Each thread has as many words as the others, and the last ones end at the last whole word. Words before the first
     // one count as zeros, which do not change a checksum that starts from 0.

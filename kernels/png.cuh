@@ -1,4 +1,5 @@
-// Layout of the PNG encoder, and the symbols of its deflate blocks. png.cu describes the kernels and the macro CHANNELS.
+// Layout of the PNG encoder, and the symbols of its deflate blocks. png.cu describes the kernels and the macro
+// CHANNELS.
 //
 // A picture is divided into strips of rows. The filtered bytes of a strip are divided into tiles of TILE_BYTES, and a
 // tile into words of eight bytes. Runs of zeros do not cross the border of a tile, so a tile can be split into symbols
@@ -26,11 +27,11 @@ struct PngArgs {
     unsigned long long filtered;      // [strips][tiles_per_strip][TILE_BYTES] u8
     unsigned long long tiles;         // [strips][tiles_per_strip] PngTile
     unsigned long long strips;        // [strips] PngStrip
-    unsigned long long words;         // [words_per_tile * tiles] u32: the content of the file's IDAT chunks, at their offsets
-    unsigned long long is_translucent; // u32, 0 before the first encoding: 1 if a pixel is not opaque; png_finish resets it
+    unsigned long long words;         // [words_per_tile * tiles] u32: the file; only the content of its chunks is used
+    unsigned long long is_translucent; // u32: 1 if a pixel is not opaque; 0 at first, and reset by png_finish
     unsigned long long file;          // pinned host memory: the file, aligned to 16 bytes
     unsigned long long result;        // PngResult in pinned host memory
-    long long pitch;                  // bytes from a row to the next lower one, a multiple of 4; negative if rows ascend
+    long long pitch;                  // bytes from a row to the one below it, a multiple of 4; negative if rows ascend
     unsigned width, height;           // pixels
     unsigned row_bytes;               // bytes of a filtered row: 1 + CHANNELS * width
     unsigned strip_rows;              // rows of each strip but the last one, which may have fewer
@@ -45,7 +46,7 @@ static_assert(sizeof(PngArgs) == 104, "PngArgs differs from the host");
 struct PngTile {
     unsigned short counts[PADDED_SYMBOLS]; // number of each symbol
     unsigned sum;                          // sum of the bytes
-    unsigned weighted_sum;                 // sum of each byte times the number of bytes from it to the end; modulo 65521
+    unsigned weighted_sum;                 // sum of each byte times the bytes from it to the end, modulo 65521
     unsigned bit_count;                    // bits of all symbols
     unsigned reserved;
 };
@@ -95,7 +96,8 @@ __device__ inline unsigned warp_prefix_sum(unsigned value) {
 
 // Sum over all threads of the block, for every thread. `partial_sums` has a value per warp.
 template <unsigned WARP_COUNT>
-__device__ inline unsigned long long block_sum(unsigned long long value, unsigned long long (&partial_sums)[WARP_COUNT]) {
+__device__ inline unsigned long long block_sum(unsigned long long value,
+                                               unsigned long long (&partial_sums)[WARP_COUNT]) {
     for (unsigned offset = 16; offset > 0; offset /= 2) {
         value += __shfl_xor_sync(0xffffffffu, value, offset);
     }
@@ -203,9 +205,9 @@ struct SharedTile {
     }
 };
 
-// Passes the symbols of a run that begin at the bytes from `first` to before `end` to `sink`. The first zero of a run is
-// a literal. Matches of distance 1 follow, each of the maximum length but the last one. One or two remaining zeros are
-// literals.
+// Passes the symbols of a run that begin at the bytes from `first` to before `end` to `sink`. The first zero of a run
+// is a literal. Matches of distance 1 follow, each of the maximum length but the last one. One or two remaining zeros
+// are literals.
 template <typename Sink>
 __device__ inline void add_run(const ZeroRun& run, unsigned first, unsigned end, Sink& sink) {
     if (first == run.begin) {
@@ -229,8 +231,8 @@ __device__ inline void add_run(const ZeroRun& run, unsigned first, unsigned end,
     }
 }
 
-// Passes the symbols that begin in a word to `sink`: first those of a run that ends in it or covers it, then literals, then
-// those of a run that begins in it.
+// Passes the symbols that begin in a word to `sink`: first those of a run that ends in it or covers it, then literals,
+// then those of a run that begins in it.
 template <typename Sink>
 __device__ inline void add_word(const SharedTile& tile, unsigned word, Sink& sink) {
     const unsigned first = WORD_BYTES * word;

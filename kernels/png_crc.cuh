@@ -1,6 +1,6 @@
 // CRC-32 of PNG chunks (reflected, polynomial 0xedb88320), computed by one block. A checksum is a remainder of
-// polynomials over GF(2), so that of a concatenation is crc(first) * x^(8 bytes of second) + crc(second), where each crc
-// starts from 0.
+// polynomials over GF(2), so that of a concatenation is crc(first) * x^(8 bytes of second) + crc(second), where each
+// crc starts from 0.
 #pragma once
 
 constexpr unsigned CRC_POLYNOMIAL = 0xedb88320u;

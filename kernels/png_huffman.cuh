@@ -1,5 +1,5 @@
-// Length-limited Huffman codes, built by one block with CODE_BLOCK threads, one per symbol. All threads of the block call
-// these functions. Twin: src/frame/png/huffman.rs, which gives the same codes.
+// Length-limited Huffman codes, built by one block with CODE_BLOCK threads, one per symbol. All threads of the block
+// call these functions. Twin: src/frame/png/huffman.rs, which gives the same codes.
 #pragma once
 #include "png.cuh"
 
@@ -40,11 +40,10 @@ __device__ inline unsigned count_candidates(const unsigned* weights, unsigned we
     return total;
 }
 
-// Combines the two rarest nodes until one node is left, by one warp. Equal weights: leaves come first. Nodes that are at
-// most as heavy as the next new node precede all new nodes, so they are combined in pairs at once. A remaining one
-// waits for the next round. The smallest weight doubles with each round or two.
+// Combines the two rarest nodes until one node is left. Equal weights: leaves come first. Nodes that are at most as
+// heavy as the next new node precede all new nodes, so they are combined in pairs at once. A remaining one waits for
+// the next round. The smallest weight doubles with each round or two.
 __device__ inline void combine_nodes(HuffmanScratch& scratch, unsigned leaf_count) {
-    const unsigned lane = threadIdx.x % 32;
     unsigned leaf = 0, inner = 0, node = 0;
     while (node + 1 < leaf_count) {
         const unsigned* leaves = scratch.leaf_weights + leaf;
@@ -56,11 +55,12 @@ __device__ inline void combine_nodes(HuffmanScratch& scratch, unsigned leaf_coun
         const unsigned inner_candidates = count_candidates(inners, weight);
         const unsigned pair_count = (leaf_candidates + inner_candidates) / 2;
         // The rank of a node among all candidates is its index, plus the number of nodes of the other queue before it.
-        for (unsigned i = lane; i < leaf_candidates + inner_candidates; i += 32) {
+        for (unsigned i = threadIdx.x; i < leaf_candidates + inner_candidates; i += CODE_BLOCK) {
             const bool is_leaf = i < leaf_candidates;
-            const unsigned index = is_leaf ? i : i - leaf_candidates, node_weight = is_leaf ? leaves[index] : inners[index];
-            const unsigned rank = index + count_lighter(is_leaf ? inners : leaves, is_leaf ? inner_candidates : leaf_candidates,
-                                                        node_weight + !is_leaf);
+            const unsigned index = is_leaf ? i : i - leaf_candidates;
+            const unsigned node_weight = is_leaf ? leaves[index] : inners[index];
+            const unsigned other_count = is_leaf ? inner_candidates : leaf_candidates;
+            const unsigned rank = index + count_lighter(is_leaf ? inners : leaves, other_count, node_weight + !is_leaf);
             scratch.merged_weights[rank] = node_weight;
             if (rank < 2 * pair_count) {
                 unsigned short* parents = is_leaf ? scratch.leaf_parents + leaf : scratch.inner_parents + inner;
@@ -68,20 +68,21 @@ __device__ inline void combine_nodes(HuffmanScratch& scratch, unsigned leaf_coun
             }
         }
         const bool has_rest = (leaf_candidates + inner_candidates) % 2 == 1;
-        const bool rest_is_leaf = leaf_candidates > 0 && (inner_candidates == 0 || leaves[leaf_candidates - 1] > inners[inner_candidates - 1]);
+        const bool rest_is_leaf = leaf_candidates > 0 && (inner_candidates == 0 ||
+                                                          leaves[leaf_candidates - 1] > inners[inner_candidates - 1]);
         leaf += leaf_candidates - (has_rest && rest_is_leaf);
         inner += inner_candidates - (has_rest && !rest_is_leaf);
-        __syncwarp();
-        for (unsigned i = lane; i < pair_count; i += 32) {
+        __syncthreads();
+        for (unsigned i = threadIdx.x; i < pair_count; i += CODE_BLOCK) {
             scratch.inner_weights[node + i] = scratch.merged_weights[2 * i] + scratch.merged_weights[2 * i + 1];
         }
         node += pair_count;
-        __syncwarp();
+        __syncthreads();
     }
 }
 
-// Lengthens codes until the sum of 2^-length is 1 (Kraft's equality). `counts` has the number of codes of each length. All
-// lanes of a warp call it.
+// Lengthens codes until the sum of 2^-length is 1 (Kraft's equality). `counts` has the number of codes of each length.
+// All lanes of a warp call it.
 template <unsigned MAX_BITS>
 __device__ inline void complete_code(unsigned (&counts)[MAX_CODE_BITS + 1]) {
     const unsigned length = threadIdx.x % 32;
@@ -101,13 +102,15 @@ __device__ inline void complete_code(unsigned (&counts)[MAX_CODE_BITS + 1]) {
 }
 
 // Whether a symbol has a frequency and is before another one in the order of the leaves.
-__device__ inline unsigned precedes(unsigned frequency, unsigned symbol, unsigned other_frequency, unsigned other_symbol) {
+__device__ inline unsigned precedes(unsigned frequency, unsigned symbol, unsigned other_frequency,
+                                    unsigned other_symbol) {
     // 0 - 1 is larger than all frequencies.
     return frequency - 1 < other_frequency - (other_symbol <= symbol);
 }
 
-// The length of the code of this thread's symbol, at most MAX_BITS; 0 if its frequency is 0. Only the first SYMBOL_COUNT
-// symbols, a multiple of 4, can have a frequency. At least two symbols have one, and their sum is below 2^32 - 1.
+// The length of the code of this thread's symbol, at most MAX_BITS; 0 if its frequency is 0. Only the first
+// SYMBOL_COUNT symbols, a multiple of 4, can have a frequency. At least two symbols have one, and their sum is below
+// 2^32 - 1.
 template <unsigned SYMBOL_COUNT, unsigned MAX_BITS>
 __device__ inline unsigned code_length(HuffmanScratch& scratch, unsigned frequency) {
     const unsigned symbol = threadIdx.x;
@@ -134,10 +137,7 @@ __device__ inline unsigned code_length(HuffmanScratch& scratch, unsigned frequen
         scratch.inner_weights[PADDED_SYMBOLS + symbol] = NO_WEIGHT;
     }
     __syncthreads();
-    if (symbol < 32) {
-        combine_nodes(scratch, leaf_count);
-    }
-    __syncthreads();
+    combine_nodes(scratch, leaf_count);
     if (is_used) {
         unsigned depth = 1;
         // The last inner node is the root.
