@@ -302,6 +302,38 @@ pub struct SceneInfo {
     /// Warnings of the loader about unsupported content, at most about 64 KiB. Empty in ListScenes.
     #[prost(string, repeated, tag = "14")]
     pub remarks: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
+    /// Unset in ListScenes.
+    #[prost(message, optional, tag = "15")]
+    pub lighting: ::core::option::Option<Lighting>,
+}
+/// Light, sky and ground of the scene, for clients that draw the scene themselves: the table `look` of its scene.toml. Each
+/// vector has three numbers; colors are linear.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct Lighting {
+    /// Unit vector towards the sun in world axes.
+    #[prost(float, repeated, tag = "1")]
+    pub to_sun: ::prost::alloc::vec::Vec<f32>,
+    /// Color times intensity of the sun, and of the ambient light; see MaterialDescription.
+    #[prost(float, repeated, tag = "2")]
+    pub sunlight: ::prost::alloc::vec::Vec<f32>,
+    #[prost(float, repeated, tag = "3")]
+    pub skylight: ::prost::alloc::vec::Vec<f32>,
+    /// Colors of the sky.
+    #[prost(float, repeated, tag = "4")]
+    pub zenith: ::prost::alloc::vec::Vec<f32>,
+    #[prost(float, repeated, tag = "5")]
+    pub horizon: ::prost::alloc::vec::Vec<f32>,
+    /// Color of the plane at the lowest rest position along the up axis; empty if the scene has no ground.
+    #[prost(float, repeated, tag = "6")]
+    pub ground: ::prost::alloc::vec::Vec<f32>,
+    /// Whether the sun casts shadows.
+    #[prost(bool, tag = "7")]
+    pub shadows: bool,
+    /// Multiplies all light before tone mapping.
+    #[prost(float, tag = "8")]
+    pub exposure: f32,
+    #[prost(enumeration = "ToneMapping", tag = "9")]
+    pub tone_mapping: i32,
 }
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct UploadSceneRequest {
@@ -750,6 +782,42 @@ pub struct ReadModesResponse {
     /// contains whole vertices.
     #[prost(bytes = "bytes", tag = "4")]
     pub data: ::prost::bytes::Bytes,
+}
+/// Curve from linear light to displayed values.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
+#[repr(i32)]
+pub enum ToneMapping {
+    Unspecified = 0,
+    /// Light above 1 is displayed as 1.
+    None = 1,
+    /// x / (1 + x).
+    Reinhard = 2,
+    /// Narkowicz' approximation of the ACES curve: x (2.51 x + 0.03) / (x (2.43 x + 0.59) + 0.14).
+    Aces = 3,
+}
+impl ToneMapping {
+    /// String value of the enum field names used in the ProtoBuf definition.
+    ///
+    /// The values are not transformed in any way and thus are considered stable
+    /// (if the ProtoBuf definition does not change) and safe for programmatic use.
+    pub fn as_str_name(&self) -> &'static str {
+        match self {
+            Self::Unspecified => "TONE_MAPPING_UNSPECIFIED",
+            Self::None => "TONE_MAPPING_NONE",
+            Self::Reinhard => "TONE_MAPPING_REINHARD",
+            Self::Aces => "TONE_MAPPING_ACES",
+        }
+    }
+    /// Creates an enum from field names used in the ProtoBuf definition.
+    pub fn from_str_name(value: &str) -> ::core::option::Option<Self> {
+        match value {
+            "TONE_MAPPING_UNSPECIFIED" => Some(Self::Unspecified),
+            "TONE_MAPPING_NONE" => Some(Self::None),
+            "TONE_MAPPING_REINHARD" => Some(Self::Reinhard),
+            "TONE_MAPPING_ACES" => Some(Self::Aces),
+            _ => None,
+        }
+    }
 }
 /// Arrays of a shape, little-endian. A corner is a vertex with its normal and texture coordinates; a vertex may have
 /// several corners.
@@ -4849,6 +4917,10 @@ pub struct ApplyForcesResponse {
     /// The lifetime in effect in milliseconds.
     #[prost(uint32, tag = "2")]
     pub lifetime_ms: u32,
+    /// Number of readers of the scene's forces that are not passive (StreamForcesRequest.passive). If it is 0, no physics
+    /// process receives the forces, and they have no effect.
+    #[prost(uint32, tag = "3")]
+    pub receivers: u32,
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct Force {
@@ -4900,6 +4972,9 @@ pub struct StreamForcesRequest {
     /// Maximum number of replies per second, finite and above 0; 0: no limit. The forces that are sent are the newest ones.
     #[prost(double, tag = "2")]
     pub max_hz: f64,
+    /// Set by readers that show the forces and do not simulate: ApplyForcesResponse.receivers does not count them.
+    #[prost(bool, tag = "3")]
+    pub passive: bool,
 }
 /// All forces in a scene. The first reply has the present ones, which may be none.
 #[derive(Clone, PartialEq, ::prost::Message)]

@@ -39,7 +39,7 @@ pub use output::vertex_selection::{Attribute, VertexSelection, validate_domains}
 pub use scene::delivery::{Delivery, StreamDelivery};
 pub use scene::encoded_subscription::EncodedSubscription;
 pub use scene::force_subscription::{ForceReport, ForceSubscription};
-pub use scene::forces::{AppliedForce, Force, ForceKind, ForceOwner, ForceUpdate, check_force_count};
+pub use scene::forces::{AppliedForce, Force, ForceKind, ForceOwner, ForceReceipt, ForceUpdate, check_force_count};
 pub use scene::frame_stream::{CameraControl, FrameStreamEntry, FrameStreamRegistration, StreamId};
 pub use scene::handle::{SceneHandle, WriterSession};
 pub use scene::lease::{InitialState, LeaseRequest, LeaseToken};

@@ -11,7 +11,9 @@ use crate::engine::{
 use crate::telemetry::StageTimes;
 use modalcast_model::domain::{CreaseAngle, Material, Transform};
 use modalcast_model::error::{Result, invalid};
-use modalcast_model::scene::{Camera, FrameSize, PixelRect, RawStepUpdate, Scene, TransformFormat, UpAxis};
+use modalcast_model::scene::{
+    Camera, FrameSize, PixelRect, RawStepUpdate, Scene, ToneMapping, TransformFormat, UpAxis,
+};
 
 mod camera;
 mod frame_info;
@@ -27,10 +29,32 @@ const MAX_REMARK_BYTES: usize = 64 << 10;
 
 /// The public description of an open scene.
 pub(super) fn wire_scene_info(scene_handle: &SceneHandle) -> v1::SceneInfo {
-    v1::SceneInfo { remarks: list_remarks(&scene_handle.scene), ..wire_scene_summary(scene_handle) }
+    let scene = &scene_handle.scene;
+    let (remarks, lighting) = (list_remarks(scene), Some(wire_lighting(scene)));
+    v1::SceneInfo { remarks, lighting, ..wire_scene_summary(scene_handle) }
 }
 
-/// The public description of an open scene without its remarks.
+fn wire_lighting(scene: &Scene) -> v1::Lighting {
+    let look = &scene.look;
+    let tone_mapping = match look.tone {
+        ToneMapping::None => v1::ToneMapping::None,
+        ToneMapping::Reinhard => v1::ToneMapping::Reinhard,
+        ToneMapping::Aces => v1::ToneMapping::Aces,
+    };
+    v1::Lighting {
+        to_sun: look.to_sun(scene.up).iter().map(|component| *component as f32).collect(),
+        sunlight: look.sunlight.to_vec(),
+        skylight: look.skylight.to_vec(),
+        zenith: look.zenith.to_vec(),
+        horizon: look.horizon.to_vec(),
+        ground: look.ground.map(|ground| ground.color.to_vec()).unwrap_or_default(),
+        shadows: look.shadow.is_some(),
+        exposure: look.exposure,
+        tone_mapping: tone_mapping.into(),
+    }
+}
+
+/// The public description of an open scene without its remarks and lighting.
 pub(super) fn wire_scene_summary(scene_handle: &SceneHandle) -> v1::SceneInfo {
     let scene = &scene_handle.scene;
     let layout = &scene.layout;
@@ -50,6 +74,7 @@ pub(super) fn wire_scene_summary(scene_handle: &SceneHandle) -> v1::SceneInfo {
         affine: scene.features.shear,
         last_step: scene_handle.last_step().map(wire_step_id),
         remarks: Vec::new(),
+        lighting: None,
     }
 }
 

@@ -10,7 +10,8 @@ use super::convert::{parse_stream_delivery, wire_step_id};
 use super::status::to_status;
 use super::stream::{Deadline, ReplySender, ReplyStream, respond};
 use crate::engine::{
-    AppliedForce, Engine, Force, ForceKind, ForceOwner, ForceReport, ForceSubscription, ForceUpdate, check_force_count,
+    AppliedForce, Engine, Force, ForceKind, ForceOwner, ForceReceipt, ForceReport, ForceSubscription, ForceUpdate,
+    check_force_count,
 };
 use modalcast_model::error::{Result as ModelResult, invalid};
 use modalcast_model::scene::Scene;
@@ -27,9 +28,9 @@ impl v1::force_service_server::ForceService for ForceServiceImpl {
         let request = request.into_inner();
         let scene_handle = self.0.find(&request.scene).map_err(to_status)?;
         let update = parse_force_update(&scene_handle.scene, &request).map_err(to_status)?;
-        let owner = scene_handle.apply_forces(&update).map_err(to_status)?;
+        let ForceReceipt { owner, receivers } = scene_handle.apply_forces(&update).map_err(to_status)?;
         let lifetime_ms = update.lifetime.as_millis() as u32;
-        Ok(Response::new(v1::ApplyForcesResponse { owner, lifetime_ms }))
+        Ok(Response::new(v1::ApplyForcesResponse { owner, lifetime_ms, receivers: receivers as u32 }))
     }
 
     type StreamForcesStream = ReplyStream<v1::StreamForcesResponse>;
@@ -42,7 +43,7 @@ impl v1::force_service_server::ForceService for ForceServiceImpl {
         let request = request.into_inner();
         let scene_handle = self.0.find(&request.scene).map_err(to_status)?;
         let delivery = parse_stream_delivery(v1::Delivery::Latest.into(), request.max_hz).map_err(to_status)?;
-        let subscription = ForceSubscription::new(scene_handle, delivery).map_err(to_status)?;
+        let subscription = ForceSubscription::new(scene_handle, delivery, request.passive).map_err(to_status)?;
         Ok(respond(move |reply_sender| {
             deadline.enforce("the stream of forces", send_reports(subscription, reply_sender))
         }))

@@ -236,11 +236,12 @@ async fn limits_and_invalid_forces_are_rejected() {
         assert_eq!(apply_invalid(&client, &request).await.field, field);
     }
     // The invalid requests have changed nothing.
-    let set = next_set(&mut subscribe(&client).await).await;
+    let mut stream = subscribe(&client).await;
+    let set = next_set(&mut stream).await;
     assert_eq!(set.forces.last().map(|force| (force.owner, force.id)), Some((33, 0)));
     let defaults = ForceRequest::new("strips", &SECOND_OWNER).force(valid_force);
     let reply = with_timeout(client.apply_forces(&defaults)).await.expect("expected valid forces");
-    assert_eq!(reply.lifetime_ms, 500);
+    assert_eq!((reply.lifetime_ms, reply.receivers), (500, 1));
 }
 
 /// A stream with a limited rate skips sets and ends with the newest one.

@@ -54,7 +54,7 @@ impl StreamKind {
                 StateServiceClient::new(channel).stream_states(request).await.map(message_sizes)
             }
             Self::Forces => {
-                let request = v1::StreamForcesRequest { scene, max_hz: 0.0 };
+                let request = v1::StreamForcesRequest { scene, max_hz: 0.0, passive: false };
                 ForceServiceClient::new(channel).stream_forces(request).await.map(message_sizes)
             }
         }

@@ -145,7 +145,7 @@ impl Client {
     /// # Errors
     /// `Status` if the scene does not exist or `max_hz` is invalid; `Connect` if the connection is lost.
     pub async fn stream_forces(&self, scene: &str, max_hz: f64) -> Result<ForceStream> {
-        let wire = v1::StreamForcesRequest { scene: scene.to_owned(), max_hz };
+        let wire = v1::StreamForcesRequest { scene: scene.to_owned(), max_hz, passive: false };
         let messages = self.replies(ForceServiceClient::new(self.undecoded_channel()).stream_forces(wire).await)?;
         Ok(ForceStream(DecodedReplies::new(messages, ForceDecoder)))
     }

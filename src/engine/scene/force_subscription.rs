@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use tokio::sync::watch;
 
 use super::delivery::StreamDelivery;
-use super::forces::{AppliedForce, ForceChannel, ForceSet};
+use super::forces::{AppliedForce, ForceChannel, ForceReader, ForceSet};
 use super::handle::SceneHandle;
 use crate::engine::blocking::run_blocking;
 use crate::engine::output::step_output::StepId;
@@ -27,7 +27,7 @@ pub struct ForceReport {
 pub struct ForceSubscription {
     scene_handle: Arc<SceneHandle>,
     channel: Arc<ForceChannel>,
-    sets: watch::Receiver<ForceSet>,
+    reader: ForceReader,
     states: watch::Receiver<Arc<SceneState>>,
     /// Minimum time between two reports; `None` if there is no limit.
     min_interval: Option<Duration>,
@@ -38,15 +38,15 @@ pub struct ForceSubscription {
 }
 
 impl ForceSubscription {
-    /// Subscribes to the forces of a scene, at the rate of `delivery`.
+    /// Subscribes to the forces of a scene, at the rate of `delivery`. `passive`: the reader does not simulate.
     ///
     /// # Errors
     /// `LimitReached` when the scene has too many readers.
-    pub fn new(scene_handle: Arc<SceneHandle>, delivery: StreamDelivery) -> Result<Self> {
+    pub fn new(scene_handle: Arc<SceneHandle>, delivery: StreamDelivery, passive: bool) -> Result<Self> {
         let channel = Arc::clone(scene_handle.force_channel());
-        let (sets, states) = (channel.subscribe()?, scene_handle.watch_state());
+        let (reader, states) = (channel.subscribe(passive)?, scene_handle.watch_state());
         let min_interval = delivery.min_interval();
-        Ok(Self { scene_handle, channel, sets, states, min_interval, next_report_at: None, reported_forces: None })
+        Ok(Self { scene_handle, channel, reader, states, min_interval, next_report_at: None, reported_forces: None })
     }
 
     /// Returns the present forces, and then waits until the forces or their f_q differ from those of the last report.
@@ -63,7 +63,7 @@ impl ForceSubscription {
         }
         loop {
             self.channel.drop_expired();
-            let set = self.sets.borrow_and_update().clone();
+            let set = self.reader.sets.borrow_and_update().clone();
             let next_expiry = set.next_expiry();
             let depends_on_state = set.depends_on_state();
             let report = self.reduce(set, depends_on_state).await?;
@@ -99,7 +99,7 @@ impl ForceSubscription {
         };
         tokio::select! {
             // Neither sender is dropped before the scene ends: this subscription holds the channel.
-            _ = self.sets.changed() => Ok(()),
+            _ = self.reader.sets.changed() => Ok(()),
             Ok(()) = self.states.changed(), if depends_on_state => Ok(()),
             () = expiry => Ok(()),
             error = self.scene_handle.ended() => Err(error),

@@ -300,16 +300,36 @@ pub struct AppliedForce {
 
 /// The forces of a scene and the notification of their readers.
 #[derive(Debug, Default)]
-pub(super) struct ForceChannel(watch::Sender<ForceSet>);
+pub(super) struct ForceChannel {
+    sets: watch::Sender<ForceSet>,
+    /// Readers that are not passive hold a clone, so the count of references is one more than the number of them.
+    receivers: Arc<()>,
+}
+
+/// A reader of the forces of a scene, until it is dropped.
+#[derive(Debug)]
+pub(super) struct ForceReader {
+    pub(super) sets: watch::Receiver<ForceSet>,
+    _receiver: Option<Arc<()>>,
+}
+
+/// The effect of an update of forces.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ForceReceipt {
+    /// Stands for the owner where others see its forces; 0 if it has no forces now.
+    pub owner: u64,
+    /// Number of readers that are not passive.
+    pub receivers: usize,
+}
 
 impl ForceChannel {
-    /// Sets the forces of an owner; returns its number, or 0 if it has no forces now.
+    /// Sets the forces of an owner.
     ///
     /// # Errors
     /// `LimitReached` when too many owners have forces.
-    pub(super) fn apply(&self, update: &ForceUpdate) -> Result<u64> {
+    pub(super) fn apply(&self, update: &ForceUpdate) -> Result<ForceReceipt> {
         let mut number = Ok(0);
-        self.0.send_if_modified(|set| match set.apply(update, Instant::now()) {
+        self.sets.send_if_modified(|set| match set.apply(update, Instant::now()) {
             Ok((owner_number, is_changed)) => {
                 number = Ok(owner_number);
                 is_changed
@@ -319,24 +339,24 @@ impl ForceChannel {
                 false
             }
         });
-        number
+        Ok(ForceReceipt { owner: number?, receivers: Arc::strong_count(&self.receivers) - 1 })
     }
 
     /// Removes expired forces and notifies all readers if there were any.
     pub(super) fn drop_expired(&self) {
-        self.0.send_if_modified(|set| set.drop_expired(Instant::now()));
+        self.sets.send_if_modified(|set| set.drop_expired(Instant::now()));
     }
 
-    /// Adds a reader until the receiver is dropped.
+    /// Adds a reader. A passive one does not count as a receiver of the forces.
     ///
     /// # Errors
     /// `LimitReached` when there are too many readers.
-    pub(super) fn subscribe(&self) -> Result<watch::Receiver<ForceSet>> {
-        let receiver = self.0.subscribe();
-        if self.0.receiver_count() > MAX_READERS {
+    pub(super) fn subscribe(&self, passive: bool) -> Result<ForceReader> {
+        let sets = self.sets.subscribe();
+        if self.sets.receiver_count() > MAX_READERS {
             return Err(Error::LimitReached { objects: "readers of the forces of one scene", limit: MAX_READERS });
         }
-        Ok(receiver)
+        Ok(ForceReader { sets, _receiver: (!passive).then(|| Arc::clone(&self.receivers)) })
     }
 }
 
@@ -390,6 +410,18 @@ mod tests {
     }
 
     #[test]
+    fn passive_readers_are_not_counted_as_receivers() {
+        let channel = ForceChannel::default();
+        let receivers = || channel.apply(&update(1, &[0], 1000)).expect("expected a valid update").receivers;
+        let _passive_reader = channel.subscribe(true).expect("expected capacity");
+        assert_eq!(receivers(), 0);
+        let readers = [(), ()].map(|()| channel.subscribe(false).expect("expected capacity"));
+        assert_eq!(receivers(), 2);
+        drop(readers);
+        assert_eq!(receivers(), 0);
+    }
+
+    #[test]
     fn invalid_forces_are_rejected_with_their_field() {
         let scene = testing::two_strips();
         let surface = |domain: u32, triangle: u32, barycentrics: &[f64], newtons: &[f64]| {
@@ -434,27 +466,29 @@ mod tests {
     #[test]
     fn readers_are_limited_until_one_is_dropped() {
         let channel = ForceChannel::default();
-        let mut receivers: Vec<_> = (0..MAX_READERS).map(|_| channel.subscribe().expect("expected capacity")).collect();
-        assert!(matches!(channel.subscribe(), Err(Error::LimitReached { limit: MAX_READERS, .. })));
-        receivers.pop();
-        assert!(channel.subscribe().is_ok());
+        let subscribe = |index: usize| channel.subscribe(index.is_multiple_of(2));
+        let mut readers: Vec<_> = (0..MAX_READERS).map(|index| subscribe(index).expect("expected capacity")).collect();
+        assert!(matches!(subscribe(0), Err(Error::LimitReached { limit: MAX_READERS, .. })));
+        readers.pop();
+        assert!(subscribe(0).is_ok());
     }
 
     #[test]
     fn unchanged_forces_notify_no_reader() {
         let channel = ForceChannel::default();
-        let mut receiver = channel.subscribe().expect("expected capacity");
-        let has_changed = |receiver: &mut watch::Receiver<ForceSet>| {
-            let has_changed = receiver.has_changed().expect("expected an open channel");
-            receiver.mark_unchanged();
+        let mut reader = channel.subscribe(false).expect("expected capacity");
+        let has_changed = |reader: &mut ForceReader| {
+            let has_changed = reader.sets.has_changed().expect("expected an open channel");
+            reader.sets.mark_unchanged();
             has_changed
         };
-        assert_eq!(channel.apply(&update(1, &[0], 10_000)), Ok(1));
-        assert!(has_changed(&mut receiver));
-        assert_eq!(channel.apply(&update(1, &[0], 10_000)), Ok(1));
+        let receipt = |owner: u64| Ok(ForceReceipt { owner, receivers: 1 });
+        assert_eq!(channel.apply(&update(1, &[0], 10_000)), receipt(1));
+        assert!(has_changed(&mut reader));
+        assert_eq!(channel.apply(&update(1, &[0], 10_000)), receipt(1));
         channel.drop_expired();
-        assert!(!has_changed(&mut receiver));
-        assert_eq!(channel.apply(&update(1, &[], 10_000)), Ok(0));
-        assert!(has_changed(&mut receiver));
+        assert!(!has_changed(&mut reader));
+        assert_eq!(channel.apply(&update(1, &[], 10_000)), receipt(0));
+        assert!(has_changed(&mut reader));
     }
 }

@@ -8,7 +8,7 @@ use tokio::sync::{Notify, OnceCell, mpsc, oneshot, watch};
 
 use super::actor::{ActorParams, SceneActor, SceneServices};
 use super::delivery::StreamDelivery;
-use super::forces::{ForceChannel, ForceUpdate};
+use super::forces::{ForceChannel, ForceReceipt, ForceUpdate};
 use super::lease::{AcquiredLease, LeaseRequest, LeaseToken, WriterLease};
 use super::message::{Message, StepRequest, StepSelector};
 use super::step_queue::{QueuedStep, StepReport};
@@ -174,12 +174,11 @@ impl SceneHandle {
         self.call(|reply| Message::Request(StepRequest { selector, spec, reply })).await
     }
 
-    /// Sets all forces of an owner. Returns the public number of the owner, or 0 if it has no forces now. The
-    /// scene's task is not involved.
+    /// Sets all forces of an owner. The scene's task is not involved.
     ///
     /// # Errors
     /// `LimitReached` when too many owners have forces.
-    pub fn apply_forces(&self, update: &ForceUpdate) -> Result<u64> {
+    pub fn apply_forces(&self, update: &ForceUpdate) -> Result<ForceReceipt> {
         self.force_channel().apply(update)
     }
 

@@ -20,12 +20,14 @@ class ApplyForcesRequest(_message.Message):
     def __init__(self, scene: _Optional[str] = ..., owner: _Optional[bytes] = ..., forces: _Optional[_Iterable[_Union[Force, _Mapping]]] = ..., lifetime_ms: _Optional[int] = ...) -> None: ...
 
 class ApplyForcesResponse(_message.Message):
-    __slots__ = ("owner", "lifetime_ms")
+    __slots__ = ("owner", "lifetime_ms", "receivers")
     OWNER_FIELD_NUMBER: _ClassVar[int]
     LIFETIME_MS_FIELD_NUMBER: _ClassVar[int]
+    RECEIVERS_FIELD_NUMBER: _ClassVar[int]
     owner: int
     lifetime_ms: int
-    def __init__(self, owner: _Optional[int] = ..., lifetime_ms: _Optional[int] = ...) -> None: ...
+    receivers: int
+    def __init__(self, owner: _Optional[int] = ..., lifetime_ms: _Optional[int] = ..., receivers: _Optional[int] = ...) -> None: ...
 
 class Force(_message.Message):
     __slots__ = ("id", "domain", "surface", "modal")
@@ -56,12 +58,14 @@ class ModalForce(_message.Message):
     def __init__(self, f_q: _Optional[bytes] = ...) -> None: ...
 
 class StreamForcesRequest(_message.Message):
-    __slots__ = ("scene", "max_hz")
+    __slots__ = ("scene", "max_hz", "passive")
     SCENE_FIELD_NUMBER: _ClassVar[int]
     MAX_HZ_FIELD_NUMBER: _ClassVar[int]
+    PASSIVE_FIELD_NUMBER: _ClassVar[int]
     scene: str
     max_hz: float
-    def __init__(self, scene: _Optional[str] = ..., max_hz: _Optional[float] = ...) -> None: ...
+    passive: bool
+    def __init__(self, scene: _Optional[str] = ..., max_hz: _Optional[float] = ..., passive: bool = ...) -> None: ...
 
 class StreamForcesResponse(_message.Message):
     __slots__ = ("step", "forces")

@@ -8,6 +8,13 @@ from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
 
 DESCRIPTOR: _descriptor.FileDescriptor
 
+class ToneMapping(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    TONE_MAPPING_UNSPECIFIED: _ClassVar[ToneMapping]
+    TONE_MAPPING_NONE: _ClassVar[ToneMapping]
+    TONE_MAPPING_REINHARD: _ClassVar[ToneMapping]
+    TONE_MAPPING_ACES: _ClassVar[ToneMapping]
+
 class Array(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
     ARRAY_UNSPECIFIED: _ClassVar[Array]
@@ -24,6 +31,10 @@ class AlphaMode(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     ALPHA_MODE_OPAQUE: _ClassVar[AlphaMode]
     ALPHA_MODE_MASK: _ClassVar[AlphaMode]
     ALPHA_MODE_BLEND: _ClassVar[AlphaMode]
+TONE_MAPPING_UNSPECIFIED: ToneMapping
+TONE_MAPPING_NONE: ToneMapping
+TONE_MAPPING_REINHARD: ToneMapping
+TONE_MAPPING_ACES: ToneMapping
 ARRAY_UNSPECIFIED: Array
 ARRAY_INDICES: Array
 ARRAY_CORNER_VERTICES: Array
@@ -51,7 +62,7 @@ class OpenSceneResponse(_message.Message):
     def __init__(self, scene: _Optional[_Union[SceneInfo, _Mapping]] = ...) -> None: ...
 
 class SceneInfo(_message.Message):
-    __slots__ = ("scene", "source", "domains", "vertices", "corners", "triangles", "coordinates", "up", "unit", "origin", "bounds", "affine", "last_step", "remarks")
+    __slots__ = ("scene", "source", "domains", "vertices", "corners", "triangles", "coordinates", "up", "unit", "origin", "bounds", "affine", "last_step", "remarks", "lighting")
     SCENE_FIELD_NUMBER: _ClassVar[int]
     SOURCE_FIELD_NUMBER: _ClassVar[int]
     DOMAINS_FIELD_NUMBER: _ClassVar[int]
@@ -66,6 +77,7 @@ class SceneInfo(_message.Message):
     AFFINE_FIELD_NUMBER: _ClassVar[int]
     LAST_STEP_FIELD_NUMBER: _ClassVar[int]
     REMARKS_FIELD_NUMBER: _ClassVar[int]
+    LIGHTING_FIELD_NUMBER: _ClassVar[int]
     scene: str
     source: str
     domains: int
@@ -80,7 +92,30 @@ class SceneInfo(_message.Message):
     affine: bool
     last_step: _common_pb2.StepId
     remarks: _containers.RepeatedScalarFieldContainer[str]
-    def __init__(self, scene: _Optional[str] = ..., source: _Optional[str] = ..., domains: _Optional[int] = ..., vertices: _Optional[int] = ..., corners: _Optional[int] = ..., triangles: _Optional[int] = ..., coordinates: _Optional[int] = ..., up: _Optional[str] = ..., unit: _Optional[float] = ..., origin: _Optional[_Iterable[float]] = ..., bounds: _Optional[_Iterable[float]] = ..., affine: bool = ..., last_step: _Optional[_Union[_common_pb2.StepId, _Mapping]] = ..., remarks: _Optional[_Iterable[str]] = ...) -> None: ...
+    lighting: Lighting
+    def __init__(self, scene: _Optional[str] = ..., source: _Optional[str] = ..., domains: _Optional[int] = ..., vertices: _Optional[int] = ..., corners: _Optional[int] = ..., triangles: _Optional[int] = ..., coordinates: _Optional[int] = ..., up: _Optional[str] = ..., unit: _Optional[float] = ..., origin: _Optional[_Iterable[float]] = ..., bounds: _Optional[_Iterable[float]] = ..., affine: bool = ..., last_step: _Optional[_Union[_common_pb2.StepId, _Mapping]] = ..., remarks: _Optional[_Iterable[str]] = ..., lighting: _Optional[_Union[Lighting, _Mapping]] = ...) -> None: ...
+
+class Lighting(_message.Message):
+    __slots__ = ("to_sun", "sunlight", "skylight", "zenith", "horizon", "ground", "shadows", "exposure", "tone_mapping")
+    TO_SUN_FIELD_NUMBER: _ClassVar[int]
+    SUNLIGHT_FIELD_NUMBER: _ClassVar[int]
+    SKYLIGHT_FIELD_NUMBER: _ClassVar[int]
+    ZENITH_FIELD_NUMBER: _ClassVar[int]
+    HORIZON_FIELD_NUMBER: _ClassVar[int]
+    GROUND_FIELD_NUMBER: _ClassVar[int]
+    SHADOWS_FIELD_NUMBER: _ClassVar[int]
+    EXPOSURE_FIELD_NUMBER: _ClassVar[int]
+    TONE_MAPPING_FIELD_NUMBER: _ClassVar[int]
+    to_sun: _containers.RepeatedScalarFieldContainer[float]
+    sunlight: _containers.RepeatedScalarFieldContainer[float]
+    skylight: _containers.RepeatedScalarFieldContainer[float]
+    zenith: _containers.RepeatedScalarFieldContainer[float]
+    horizon: _containers.RepeatedScalarFieldContainer[float]
+    ground: _containers.RepeatedScalarFieldContainer[float]
+    shadows: bool
+    exposure: float
+    tone_mapping: ToneMapping
+    def __init__(self, to_sun: _Optional[_Iterable[float]] = ..., sunlight: _Optional[_Iterable[float]] = ..., skylight: _Optional[_Iterable[float]] = ..., zenith: _Optional[_Iterable[float]] = ..., horizon: _Optional[_Iterable[float]] = ..., ground: _Optional[_Iterable[float]] = ..., shadows: bool = ..., exposure: _Optional[float] = ..., tone_mapping: _Optional[_Union[ToneMapping, str]] = ...) -> None: ...
 
 class UploadSceneRequest(_message.Message):
     __slots__ = ("header", "file", "chunk")
