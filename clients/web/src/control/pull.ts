@@ -1,0 +1,209 @@
+/**
+ * Pulls on a point of the surface with a force that is proportional to the distance between the place where the pull began
+ * and the cursor. The stiffness is the inverse of the point's compliance, so that the point follows the cursor.
+ *
+ * The force does not depend on the moved point. Such a force would close a loop through the network, and its delay adds
+ * energy to modes with little damping: the vibration of a tree grew until the physics process stopped.
+ */
+
+import type { Hit } from "../proto/modalcast/v1/frames_pb";
+import type { OrbitCamera } from "../render/camera";
+import { norm, solveLinear, subtract, TRANSFORM_SIZE, type Vec3 } from "../scene/affine";
+import { linearNorm, restSphere } from "../scene/bounds";
+import { at, toF32 } from "../scene/numbers";
+import type { SceneModel } from "../scene/scene_model";
+import type { Server } from "../source/server";
+import { displacementAt, positionOf, type SurfacePoint, surfacePoint } from "./surface_point";
+
+/** Milliseconds between renewals of a force, and after which it expires if the viewer fails. */
+const RENEWAL_MS = 100;
+const LIFETIME_MS = 500;
+/** Milliseconds between forces while the scene moves. */
+const UPDATE_MS = 30;
+/** The force is limited to that at this distance, in sizes of the domain; without arrays, in diagonals of the scene. */
+const LONGEST_PULL = 0.6;
+const LONGEST_PULL_OF_SCENE = 0.1;
+/** Newtons at a distance of the scene's diagonal if the description has no eigenvalues. */
+const DEFAULT_FORCE = 1000;
+
+export interface PullView {
+    from: Vec3;
+    to: Vec3;
+    newtons: number;
+}
+
+export class PullTool {
+    private point: SurfacePoint | null = null;
+    private anchor: Vec3 = [0, 0, 0];
+    private cursor: [number, number] = [0, 0];
+    private stiffness = 0;
+    private longestPull = 0;
+    private isPressed = false;
+    private isSending = false;
+    private lastSent = 0;
+    private readonly owner = crypto.getRandomValues(new Uint8Array(32));
+    private timer: ReturnType<typeof setInterval> | null = null;
+    /** The number of this viewer's forces in StreamForces; 0 without forces. */
+    ownerNumber = 0n;
+    onChange: () => void = () => {};
+    /** A sentence for the user; empty to remove it. */
+    onMessage: (message: string) => void = () => {};
+
+    constructor(
+        private readonly server: Server,
+        private readonly model: SceneModel,
+        private readonly camera: OrbitCamera,
+        private readonly diagonal: number,
+    ) {}
+
+    /** The point that is pulled; null otherwise. */
+    get grabbed(): SurfacePoint | null {
+        return this.point;
+    }
+
+    /** What to draw while the user pulls; null otherwise. */
+    get view(): PullView | null {
+        if (!this.point || !this.isPressed) return null;
+        const from = positionOf(this.model, this.point);
+        const to = this.camera.unproject(...this.cursor, this.anchor);
+        return { from, to, newtons: norm(this.force(to)) };
+    }
+
+    /** The button went down on a pixel of the viewport, whose size is `size`. */
+    async begin(x: number, y: number, size: [number, number]): Promise<void> {
+        this.isPressed = true;
+        this.point = null;
+        this.cursor = [x, y];
+        try {
+            const pixel = [x, y].map((value, axis) => Math.min(Math.max(Math.floor(value), 0), at(size, axis) - 1));
+            const picked = await this.server.pick(
+                this.model.scene.info.scene,
+                size,
+                this.camera.toMessage(),
+                at(pixel, 0),
+                at(pixel, 1),
+            );
+            const hit = picked.hits[0];
+            if (!this.isPressed) return;
+            if (!hit) {
+                this.onMessage("There is no surface to pull at this point.");
+                return;
+            }
+            this.grab(hit);
+        } catch (error) {
+            this.onMessage(`The server could not pick a point: ${error instanceof Error ? error.message : error}`);
+        }
+    }
+
+    move(x: number, y: number): void {
+        this.cursor = [x, y];
+        if (this.isPressed) this.update();
+    }
+
+    /** Removes the force. */
+    end(): void {
+        if (!this.isPressed) return;
+        this.isPressed = false;
+        if (this.timer !== null) clearInterval(this.timer);
+        this.timer = null;
+        if (this.point) void this.send([]);
+        this.point = null;
+        this.onChange();
+    }
+
+    /** Call after each state: the force follows the point. */
+    update(): void {
+        if (!this.point || performance.now() - this.lastSent < UPDATE_MS) return;
+        void this.sendPull();
+    }
+
+    private grab(hit: Hit): void {
+        this.point = surfacePoint(this.model, hit.domain, hit.triangle, hit.barycentric) ?? this.pointOf(hit);
+        this.anchor = positionOf(this.model, this.point);
+        this.stiffness = this.stiffnessAt(this.point);
+        this.longestPull = this.longestPullOf(hit.domain);
+        this.timer = setInterval(() => this.update(), RENEWAL_MS);
+        this.update();
+        this.onChange();
+    }
+
+    /** The point of a hit if the viewer has no arrays: x0 follows from the position and the present state. */
+    private pointOf(hit: Hit): SurfacePoint {
+        const { domain, triangle, barycentric } = hit;
+        const modes = toF32(hit.modes, "hit.modes");
+        const point: SurfacePoint = { domain, triangle, barycentric, rest: [0, 0, 0], modes };
+        const transform = this.model.state.transforms.subarray(TRANSFORM_SIZE * domain, TRANSFORM_SIZE * (domain + 1));
+        const translation: Vec3 = [at(transform, 3), at(transform, 7), at(transform, 11)];
+        const local = solveLinear(transform, subtract(hit.position as Vec3, translation)) ?? [0, 0, 0];
+        point.rest = subtract(local, displacementAt(this.model, point));
+        return point;
+    }
+
+    /**
+     * Newtons per scene unit. The compliance of a point for forces in direction d is the sum of (U_k . d)^2 / w_k^2 over
+     * all modes. The sum over three axes is at least that of any direction, so the point does not pass the cursor.
+     */
+    private stiffnessAt({ domain, modes }: SurfacePoint): number {
+        const { scene, layout } = this.model;
+        const description = scene.domains[domain];
+        const eigenvalues =
+            description?.eigenvalues?.values ?? scene.shapes[description?.shape ?? 0]?.eigenvalues ?? [];
+        const rank = at(layout.ranks, domain);
+        let compliance = 0;
+        for (let mode = 0; mode < Math.min(rank, eigenvalues.length); mode++) {
+            const eigenvalue = at(eigenvalues, mode);
+            if (!(eigenvalue > 0)) continue;
+            for (let axis = 0; axis < 3; axis++) compliance += at(modes, axis * rank + mode) ** 2 / eigenvalue;
+        }
+        return compliance > 0 ? 1 / compliance : DEFAULT_FORCE / this.diagonal;
+    }
+
+    private longestPullOf(domain: number): number {
+        const shape = this.model.arrays?.shapes[this.model.scene.domains[domain]?.shape ?? -1];
+        if (!shape) return LONGEST_PULL_OF_SCENE * this.diagonal;
+        const scale = linearNorm(this.model.state.transforms, TRANSFORM_SIZE * domain);
+        return LONGEST_PULL * 2 * restSphere(shape).radius * scale;
+    }
+
+    private force(to: Vec3): Vec3 {
+        const offset = subtract(to, this.anchor);
+        const length = norm(offset);
+        const factor = this.stiffness * (length > this.longestPull ? this.longestPull / length : 1);
+        return offset.map((component) => factor * component) as Vec3;
+    }
+
+    private async sendPull(): Promise<void> {
+        const { point } = this;
+        if (!point || this.isSending) return;
+        const vector = this.force(this.camera.unproject(...this.cursor, this.anchor));
+        const { domain, triangle, barycentric } = point;
+        await this.send([{ id: 1n, domain, triangle, barycentric: [...barycentric], vector }]);
+    }
+
+    private async send(forces: Parameters<Server["applyForces"]>[2]): Promise<void> {
+        this.isSending = true;
+        this.lastSent = performance.now();
+        try {
+            const response = await this.server.applyForces(
+                this.model.scene.info.scene,
+                this.owner,
+                forces,
+                LIFETIME_MS,
+            );
+            this.ownerNumber = response.owner;
+            // The button went up while the force was on its way.
+            if (forces.length > 0 && !this.isPressed)
+                await this.server.applyForces(this.model.scene.info.scene, this.owner, [], LIFETIME_MS);
+            const isLost = forces.length > 0 && response.receivers === 0;
+            this.onMessage(
+                isLost
+                    ? "Nobody receives forces: no physics process reads them. For example, start `modalcast-sim auto --forces`."
+                    : "",
+            );
+        } catch (error) {
+            this.onMessage(`The server did not accept the force: ${error instanceof Error ? error.message : error}`);
+        } finally {
+            this.isSending = false;
+        }
+    }
+}

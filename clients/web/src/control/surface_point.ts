@@ -1,0 +1,59 @@
+/** A point of the surface that moves with the scene. */
+
+import { applyToPoint, TRANSFORM_SIZE, type Vec3 } from "../scene/affine";
+import { at } from "../scene/numbers";
+import type { SceneModel } from "../scene/scene_model";
+
+export interface SurfacePoint {
+    domain: number;
+    triangle: number;
+    barycentric: readonly number[];
+    /** x0 at the point, in the domain's frame. */
+    rest: Vec3;
+    /** U at the point: 3 x rank, row-major. */
+    modes: Float32Array;
+}
+
+/** The point of a triangle; null without the arrays of the scene, or if there is no such triangle. */
+export function surfacePoint(
+    model: SceneModel,
+    domain: number,
+    triangle: number,
+    barycentric: readonly number[],
+): SurfacePoint | null {
+    const shapeIndex = model.scene.domains[domain]?.shape ?? -1;
+    const shape = model.arrays?.shapes[shapeIndex];
+    if (!shape || 3 * triangle + 2 >= shape.indices.length || barycentric.length !== 3) return null;
+    const rank = at(model.layout.ranks, domain);
+    const rest: Vec3 = [0, 0, 0];
+    const modes = new Float32Array(3 * rank);
+    for (let corner = 0; corner < 3; corner++) {
+        const vertex = at(shape.cornerVertices, at(shape.indices, 3 * triangle + corner));
+        const weight = at(barycentric, corner);
+        for (let axis = 0; axis < 3; axis++) {
+            rest[axis] = at(rest, axis) + weight * at(shape.restPositions, 3 * vertex + axis);
+            for (let mode = 0; mode < rank; mode++) {
+                const place = axis * rank + mode;
+                modes[place] = at(modes, place) + weight * at(shape.modes ?? [], (3 * vertex + axis) * rank + mode);
+            }
+        }
+    }
+    return { domain, triangle, barycentric, rest, modes };
+}
+
+/** u = U q at the point, in the domain's frame. */
+export function displacementAt(model: SceneModel, { domain, modes }: SurfacePoint): Vec3 {
+    const q = model.state.qOf(domain);
+    return [0, 1, 2].map((axis) => {
+        let sum = 0;
+        for (let mode = 0; mode < q.length; mode++) sum += at(modes, axis * q.length + mode) * at(q, mode);
+        return sum;
+    }) as Vec3;
+}
+
+/** Position of the point at the present state, in scene units relative to the scene's origin. */
+export function positionOf(model: SceneModel, point: SurfacePoint): Vec3 {
+    const u = displacementAt(model, point);
+    const local = point.rest.map((value, axis) => value + at(u, axis));
+    return applyToPoint(model.state.transforms, TRANSFORM_SIZE * point.domain, local);
+}

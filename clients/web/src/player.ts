@@ -1,0 +1,80 @@
+/** Plays recordings without a server: from the page itself, or from a file that the user drops onto it. */
+
+import type { App } from "./app";
+import { norm, subtract, type Vec3 } from "./scene/affine";
+import { Playback } from "./source/playback";
+import { decodeBase64, type Recording, readRecording } from "./source/recording";
+import { Timeline } from "./ui/timeline";
+
+export class RecordingPlayer {
+    private timeline: Timeline | null = null;
+    private playback: Playback | null = null;
+
+    /** @param onOpen Called before a dropped file is shown. */
+    constructor(
+        private readonly app: App,
+        onOpen: () => void,
+    ) {
+        window.addEventListener("dragover", (event) => event.preventDefault());
+        window.addEventListener("drop", (event) => {
+            event.preventDefault();
+            const file = event.dataTransfer?.files[0];
+            if (!file) return;
+            onOpen();
+            void file.arrayBuffer().then((bytes) => this.open(file.name, new Uint8Array(bytes)));
+        });
+    }
+
+    /** Plays the recording that the page contains. False if it contains none. */
+    openEmbedded(): boolean {
+        const element = document.getElementById("recording");
+        if (!element?.textContent) return false;
+        const text = element.textContent;
+        element.remove();
+        this.open(document.title, () => decodeBase64(text));
+        return true;
+    }
+
+    private open(name: string, file: Uint8Array | (() => Uint8Array)): void {
+        const { app } = this;
+        this.close();
+        try {
+            this.play(name, readRecording(typeof file === "function" ? file() : file));
+        } catch (error) {
+            app.closeScene();
+            const text = error instanceof Error ? error.message : String(error);
+            app.cover.showMessage("The recording cannot be played", `${name}: ${text}`);
+        }
+    }
+
+    private play(name: string, recording: Recording): void {
+        const { app } = this;
+        const { scene, arrays, view, isCutOff } = recording;
+        const reason = app.checkBudget(scene);
+        if (reason) throw new Error(reason.replace("The server draws this scene.", ""));
+        app.bar.setScenes([], [], "");
+        app.bar.setConnection("idle", `recording of ${scene.info.scene}`);
+        const model = app.showScene(scene, arrays, "", null, { pictures: false, forces: false, drive: false });
+        document.title = `${scene.info.scene} - modalcast`;
+        if (view && norm(subtract(view.eye as Vec3, view.target as Vec3)) > 0)
+            app.viewport.camera.look(view.eye as Vec3, view.target as Vec3);
+        if (isCutOff) {
+            const text = `${name} was cut off. \`modalcast recover\` repairs it; the steps before the end can be played.`;
+            app.notices.show("recording", text, { severity: "warn" });
+        }
+        const playback = new Playback(recording, model);
+        this.playback = playback;
+        this.timeline = new Timeline(playback);
+        app.setPlayback(playback);
+        playback.seek(0);
+        playback.play();
+    }
+
+    private close(): void {
+        this.playback?.pause();
+        this.playback = null;
+        this.timeline?.remove();
+        this.timeline = null;
+        this.app.setPlayback(null);
+    }
+}

@@ -1,0 +1,127 @@
+/** The camera: framing, messages of the contract, and the expression that Python users paste. */
+
+import type { MessageInitShape } from "@bufbuild/protobuf";
+import * as THREE from "three";
+import { OrbitControls } from "three/addons/controls/OrbitControls.js";
+import type { CameraSchema } from "../proto/modalcast/v1/frames_pb";
+import { addScaled, cross, dot, subtract, type Vec3 } from "../scene/affine";
+import type { SceneDescription } from "../scene/description";
+import { at } from "../scene/numbers";
+import { fromYUp, normalized, unitVector, upAxis } from "./lighting";
+
+/** Vertical angle in degrees, and the part of the image that a framed scene fills, as those of the server. */
+const FIELD_OF_VIEW = 28;
+const IMAGE_FILL = 0.94;
+
+export type CameraMessage = MessageInitShape<typeof CameraSchema>;
+
+export class OrbitCamera {
+    readonly camera = new THREE.PerspectiveCamera(FIELD_OF_VIEW, 1, 0.1, 10);
+    private controls: OrbitControls | null = null;
+    private scene: SceneDescription | null = null;
+    onChange: () => void = () => {};
+
+    constructor(private readonly element: HTMLElement) {}
+
+    /** Frames a scene. The controls are created anew, because they read the up axis only once. */
+    setScene(scene: SceneDescription): void {
+        this.scene = scene;
+        this.controls?.dispose();
+        this.camera.up.set(...unitVector(upAxis(scene)));
+        const controls = new OrbitControls(this.camera, this.element);
+        controls.zoomToCursor = true;
+        controls.enableDamping = false;
+        controls.addEventListener("change", () => this.onChange());
+        this.controls = controls;
+        this.frame();
+    }
+
+    get target(): Vec3 {
+        return this.controls ? (this.controls.target.toArray() as Vec3) : [0, 0, 0];
+    }
+
+    get eye(): Vec3 {
+        return this.camera.position.toArray() as Vec3;
+    }
+
+    set enabled(isEnabled: boolean) {
+        if (this.controls) this.controls.enabled = isEnabled;
+    }
+
+    /** Views the rest bounds from the front, slightly from above and from the side, as the server's default camera. */
+    frame(): void {
+        if (!this.scene || !this.controls) return;
+        const axis = upAxis(this.scene);
+        const { bounds } = this.scene.info;
+        const toCamera = normalized(fromYUp([0.42, 0.14, 0.9], axis));
+        const center = [0, 1, 2].map((i) => (at(bounds, i) + at(bounds, 3 + i)) / 2) as Vec3;
+        const slope = IMAGE_FILL * Math.tan((FIELD_OF_VIEW / 2) * (Math.PI / 180));
+        const right = normalized(cross(unitVector(axis), toCamera));
+        const cameraUp = cross(toCamera, right);
+        let distance = 0;
+        for (let corner = 0; corner < 8; corner++) {
+            const point = [0, 1, 2].map((i) => at(bounds, i + ((corner >> i) & 1) * 3)) as Vec3;
+            const offset = subtract(point, center);
+            const width = Math.abs(dot(offset, right)) / (slope * this.camera.aspect);
+            distance = Math.max(
+                distance,
+                dot(offset, toCamera) + Math.max(width, Math.abs(dot(offset, cameraUp)) / slope),
+            );
+        }
+        this.look(addScaled(center, toCamera, distance > 0 ? distance : 1), center);
+    }
+
+    look(eye: Vec3, target: Vec3): void {
+        if (!this.controls) return;
+        this.camera.position.set(...eye);
+        this.controls.target.set(...target);
+        const distance = this.camera.position.distanceTo(this.controls.target);
+        this.controls.minDistance = 1e-4 * distance;
+        this.controls.maxDistance = 1e3 * distance;
+        this.controls.update();
+        this.onChange();
+    }
+
+    setAspect(aspect: number): void {
+        this.camera.aspect = aspect;
+        this.camera.updateProjectionMatrix();
+    }
+
+    toMessage(): CameraMessage {
+        const up = this.camera.up.toArray();
+        return {
+            view: { case: "lookAt", value: { eye: this.eye, target: this.target, up } },
+            lens: { case: "fieldOfView", value: this.camera.fov },
+        };
+    }
+
+    /** The expression that creates this camera in the Python package, for `import modalcast as mc`. */
+    toPython(): string {
+        const tuple = (vector: Vec3) =>
+            `(${vector.map((value) => Number(value.toPrecision(7)).toString()).join(", ")})`;
+        return `mc.look_at(eye=${tuple(this.eye)}, target=${tuple(this.target)}, field_of_view=${this.camera.fov})`;
+    }
+
+    /** A point in pixels of the element; null behind the camera. */
+    project(point: Vec3): [number, number] | null {
+        this.camera.updateMatrixWorld();
+        const place = new THREE.Vector3(...point).applyMatrix4(this.camera.matrixWorldInverse);
+        if (place.z >= 0) return null;
+        place.applyMatrix4(this.camera.projectionMatrix);
+        const { clientWidth, clientHeight } = this.element;
+        return [((place.x + 1) / 2) * clientWidth, ((1 - place.y) / 2) * clientHeight];
+    }
+
+    /** The point under a pixel in the plane through `point` that is parallel to the image. */
+    unproject(x: number, y: number, point: Vec3): Vec3 {
+        this.camera.updateMatrixWorld();
+        const { clientWidth, clientHeight } = this.element;
+        const ray = new THREE.Vector3((2 * x) / clientWidth - 1, 1 - (2 * y) / clientHeight, 0.5).unproject(
+            this.camera,
+        );
+        const direction = normalized(subtract(ray.toArray() as Vec3, this.eye));
+        const axis = this.camera.getWorldDirection(new THREE.Vector3()).toArray() as Vec3;
+        const depth = dot(subtract(point, this.eye), axis);
+        return addScaled(this.eye, direction, depth / dot(direction, axis));
+    }
+}

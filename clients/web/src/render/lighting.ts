@@ -1,0 +1,116 @@
+/** Light, sky and ground of a scene. */
+
+import { ToneMapping } from "../proto/modalcast/v1/scenes_pb";
+import { cross, dot, norm, type Vec3 } from "../scene/affine";
+import type { SceneDescription } from "../scene/description";
+
+export interface Lighting {
+    toSun: Vec3;
+    sunlight: Vec3;
+    skylight: Vec3;
+    zenith: Vec3;
+    horizon: Vec3;
+    ground: Vec3 | null;
+    shadows: boolean;
+    exposure: number;
+    /** 0: none, 1: Reinhard, 2: ACES. */
+    tone: number;
+}
+
+export type UpAxis = 0 | 1 | 2;
+
+export function upAxis(scene: SceneDescription): UpAxis {
+    const index = ["x", "y", "z"].indexOf(scene.info.up);
+    return index === 0 || index === 2 ? index : 1;
+}
+
+export function unitVector(axis: UpAxis): Vec3 {
+    return [0, 1, 2].map((index) => (index === axis ? 1 : 0)) as Vec3;
+}
+
+/** Rotates a vector from Y-up coordinates to the up axis of a scene, as the server does. */
+export function fromYUp([x, y, z]: Vec3, axis: UpAxis): Vec3 {
+    if (axis === 0) return [y, -x, z];
+    return axis === 2 ? [x, -z, y] : [x, y, z];
+}
+
+export function normalized(vector: Vec3): Vec3 {
+    const length = norm(vector);
+    return length > 0 ? (vector.map((component) => component / length) as Vec3) : [0, 1, 0];
+}
+
+/** Defaults of the table `look` of a scene.toml, for servers that do not send SceneInfo.lighting. */
+function defaultLighting(axis: UpAxis): Lighting {
+    return {
+        toSun: normalized(fromYUp([0.45, 0.8, 0.55], axis)),
+        sunlight: [0.82, 0.77, 0.69],
+        skylight: [0.25, 0.28, 0.33],
+        zenith: [0.1, 0.27, 0.58],
+        horizon: [0.34, 0.54, 0.79],
+        ground: [0.4, 0.41, 0.36],
+        shadows: true,
+        exposure: 1,
+        tone: 0,
+    };
+}
+
+export function lightingOf(scene: SceneDescription): Lighting {
+    const { lighting } = scene.info;
+    const defaults = defaultLighting(upAxis(scene));
+    if (!lighting) return defaults;
+    const vector = (value: number[], fallback: Vec3) => (value.length === 3 ? (value as Vec3) : fallback);
+    return {
+        toSun: normalized(vector(lighting.toSun, defaults.toSun)),
+        sunlight: vector(lighting.sunlight, defaults.sunlight),
+        skylight: vector(lighting.skylight, defaults.skylight),
+        zenith: vector(lighting.zenith, defaults.zenith),
+        horizon: vector(lighting.horizon, defaults.horizon),
+        ground: lighting.ground.length === 3 ? (lighting.ground as Vec3) : null,
+        shadows: lighting.shadows,
+        exposure: lighting.exposure,
+        tone: lighting.toneMapping === ToneMapping.REINHARD ? 1 : lighting.toneMapping === ToneMapping.ACES ? 2 : 0,
+    };
+}
+
+/** x, y and z axes of the sun's shadow map. z points to the sun. */
+export function lightAxes(toSun: Vec3, up: Vec3): [Vec3, Vec3, Vec3] {
+    let x = cross(up, toSun);
+    if (norm(x) < 1e-6) x = cross(Math.abs(toSun[0]) < 0.9 ? [1, 0, 0] : [0, 1, 0], toSun);
+    x = normalized(x);
+    return [x, cross(toSun, x), toSun];
+}
+
+/** A box along the axes of the shadow map. */
+export interface LightBox {
+    axes: [Vec3, Vec3, Vec3];
+    center: Vec3;
+    /** Side of the square that the map covers. */
+    side: number;
+    /** Extent towards the sun. */
+    depth: number;
+}
+
+/** The box that encloses the spheres, with a side and a center that change in steps, so that shadows do not flicker. */
+export function fitLightBox(
+    spheres: readonly { center: Vec3; radius: number }[],
+    axes: [Vec3, Vec3, Vec3],
+    texels: number,
+): LightBox {
+    const min: Vec3 = [Infinity, Infinity, Infinity];
+    const max: Vec3 = [-Infinity, -Infinity, -Infinity];
+    for (const { center, radius } of spheres) {
+        axes.forEach((direction, axis) => {
+            const value = dot(center, direction);
+            min[axis] = Math.min(min[axis] as number, value - radius);
+            max[axis] = Math.max(max[axis] as number, value + radius);
+        });
+    }
+    const widest = Math.max(max[0] - min[0], max[1] - min[1], 1e-6);
+    const side = 2 ** (Math.ceil(8 * Math.log2(1.02 * widest)) / 8);
+    const texel = side / texels;
+    const center = min.map((low, axis) => {
+        const middle = (low + (max[axis] as number)) / 2;
+        return axis < 2 ? Math.round(middle / texel) * texel : middle;
+    }) as Vec3;
+    return { axes, center, side, depth: 1.02 * Math.max(max[2] - min[2], 1e-6) };
+}

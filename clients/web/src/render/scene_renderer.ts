@@ -1,0 +1,368 @@
+/** Draws one scene with three.js: deformation, shadow map, surfaces, sky and ground. */
+
+import * as THREE from "three";
+import { norm, subtract, TRANSFORM_SIZE, type Vec3 } from "../scene/affine";
+import type { SceneArrays } from "../scene/arrays";
+import { type DomainSphere, domainSpheres, linearNorm, restSphere, type Sphere } from "../scene/bounds";
+import type { SceneDescription } from "../scene/description";
+import { at } from "../scene/numbers";
+import { errorBound } from "../scene/packed_modes";
+import type { SceneState } from "../scene/state";
+import { Deformer, type DomainDisplay } from "./deformer";
+import { FullscreenPass } from "./fullscreen_pass";
+import { fitLightBox, type Lighting, lightAxes, lightingOf, unitVector, upAxis } from "./lighting";
+import { BACKGROUND_FRAGMENT, PLAIN_FRAGMENT } from "./shaders";
+import { Surfaces, type Uniforms } from "./surfaces";
+
+/** Distance of the eye from the render origin, in diagonals of the scene, from which the origin follows the eye. */
+const ORIGIN_DISTANCE = 64;
+
+export type ColorChoice = { kind: "shaded" } | { kind: "displacement" } | { kind: "mode"; mode: number };
+
+export interface RenderOptions {
+    shadows: boolean;
+    edges: boolean;
+    color: ColorChoice;
+}
+
+/** Linear gray behind color maps, as the server's. */
+const PLAIN_GRAY = 0.87;
+
+export class SceneRenderer {
+    readonly deformer: Deformer;
+    readonly lighting: Lighting;
+    readonly diagonal: number;
+    private readonly surfaces: Surfaces;
+    private readonly background: FullscreenPass;
+    private readonly plain: FullscreenPass;
+    private readonly shadowTarget: THREE.WebGLRenderTarget;
+    private readonly light: Uniforms;
+    private readonly shadowUniforms: Uniforms = { clip_from_world: { value: new THREE.Matrix4() } };
+    private readonly restSpheres: Sphere[];
+    private spheres: DomainSphere[] = [];
+    private state: SceneState | null = null;
+    private origin: Vec3 = [0, 0, 0];
+    private options: RenderOptions = { shadows: true, edges: false, color: { kind: "shaded" } };
+    private display: DomainDisplay = { hidden: new Set(), highlighted: null };
+    private needsShadow = true;
+    private needsDeformation = true;
+    /** The value at the bright end of the color map, in meters, or in meters per unit of q. */
+    colorScale = 0;
+
+    constructor(
+        private readonly renderer: THREE.WebGLRenderer,
+        readonly scene: SceneDescription,
+        arrays: SceneArrays,
+        private readonly shadowSize: number,
+    ) {
+        this.lighting = lightingOf(scene);
+        const bounds = scene.info.bounds;
+        this.diagonal = norm([0, 1, 2].map((axis) => at(bounds, 3 + axis) - at(bounds, axis)) as Vec3) || 1;
+        this.restSpheres = arrays.shapes.map(restSphere);
+        this.deformer = new Deformer(renderer, scene, arrays);
+        this.shadowTarget = createShadowTarget(shadowSize);
+        this.light = this.createLight();
+        const anisotropy = renderer.capabilities.getMaxAnisotropy();
+        this.surfaces = new Surfaces(scene, arrays, this.deformer, this.light, this.shadowUniforms, anisotropy);
+        this.background = this.createBackground();
+        this.plain = new FullscreenPass(PLAIN_FRAGMENT, {
+            plain: new THREE.Vector3(PLAIN_GRAY, PLAIN_GRAY, PLAIN_GRAY),
+        });
+        this.plain.mesh.visible = false;
+        for (const pass of [this.background, this.plain]) {
+            pass.mesh.renderOrder = -1;
+            this.surfaces.colorScene.add(pass.mesh);
+        }
+        this.setOptions(this.options);
+    }
+
+    setOptions(options: RenderOptions): void {
+        this.options = { ...options, shadows: options.shadows && this.lighting.shadows };
+        const isMap = options.color.kind !== "shaded";
+        this.deformer.showMode(options.color.kind === "mode" ? options.color.mode : null);
+        this.surfaces.setShadows(this.options.shadows);
+        this.background.define("SHADOWS", this.options.shadows);
+        this.surfaces.setEdges(options.edges);
+        this.background.mesh.visible = !isMap;
+        this.plain.mesh.visible = isMap;
+        this.colorScale = 0;
+        if (this.state) this.update(this.state);
+    }
+
+    setDisplay(display: DomainDisplay): void {
+        this.display = display;
+        if (this.state) this.update(this.state);
+    }
+
+    /** Shows a state from the next frame on. States between two frames are not deformed. */
+    update(state: SceneState): void {
+        this.state = state;
+        this.needsDeformation = true;
+    }
+
+    private deform(state: SceneState): void {
+        this.needsDeformation = false;
+        this.deformer.deform(state, this.origin, this.display);
+        this.spheres = domainSpheres(state, this.restSpheres, this.deformer.packed);
+        this.needsShadow = true;
+        this.updateColorScale(state);
+    }
+
+    /** Near and far plane of a camera, so that they enclose all domains. */
+    depthRange(camera: THREE.PerspectiveCamera): { near: number; far: number } {
+        const view = camera.matrixWorldInverse.elements;
+        let near = Infinity;
+        let far = 0;
+        for (const { center, radius } of this.spheres) {
+            const depth = -(
+                at(view, 2) * center[0] +
+                at(view, 6) * center[1] +
+                at(view, 10) * center[2] +
+                at(view, 14)
+            );
+            near = Math.min(near, depth - radius);
+            far = Math.max(far, depth + radius);
+        }
+        if (!(far > 0)) return { near: 0.1, far: 10 };
+        return { near: Math.max(0.98 * near, 2e-4 * far), far: 1.02 * far };
+    }
+
+    render(camera: THREE.PerspectiveCamera): void {
+        this.prepare(camera);
+        if (this.options.shadows && this.needsShadow && this.options.color.kind === "shaded") this.renderShadow();
+        this.renderer.setRenderTarget(null);
+        this.renderer.render(this.surfaces.colorScene, camera);
+    }
+
+    /** Index of the domain at each pixel, top row first; 0xffffffff where there is no surface. It waits for the GPU. */
+    domainIds(camera: THREE.PerspectiveCamera, width: number, height: number): Uint32Array {
+        this.prepare(camera);
+        const target = new THREE.WebGLRenderTarget(width, height, {
+            format: THREE.RGBAIntegerFormat,
+            type: THREE.UnsignedIntType,
+            internalFormat: "RGBA32UI",
+            minFilter: THREE.NearestFilter,
+            magFilter: THREE.NearestFilter,
+        });
+        const clearColor = this.renderer.getClearColor(new THREE.Color());
+        const clearAlpha = this.renderer.getClearAlpha();
+        this.renderer.setRenderTarget(target);
+        this.renderer.setClearColor(0, 0);
+        this.renderer.clear();
+        this.renderer.render(this.surfaces.domainScene, camera);
+        const texels = new Uint32Array(4 * width * height);
+        this.renderer.readRenderTargetPixels(target, 0, 0, width, height, texels);
+        this.renderer.setRenderTarget(null);
+        this.renderer.setClearColor(clearColor, clearAlpha);
+        target.dispose();
+        const ids = new Uint32Array(width * height);
+        for (let y = 0; y < height; y++) {
+            for (let x = 0; x < width; x++) ids[y * width + x] = at(texels, 4 * ((height - 1 - y) * width + x)) - 1;
+        }
+        return ids;
+    }
+
+    /** World position of a deformed vertex as the GPU has computed it, in scene units. For tests. */
+    readVertices(): { positions: Float32Array; firstVertex: number[]; origin: Vec3 } {
+        return {
+            positions: this.deformer.readPositions(),
+            firstVertex: this.deformer.firstVertex,
+            origin: this.origin,
+        };
+    }
+
+    /** Upper bound in meters of the distance of any vertex from its position with full precision, due to the packed U. */
+    errorBound(): number {
+        const { state, scene } = this;
+        if (!state) return 0;
+        let largest = 0;
+        for (const domain of scene.domains) {
+            const packed = this.deformer.packed[domain.shape];
+            if (!packed) continue;
+            const error = errorBound(packed, state.qOf(domain.domain));
+            largest = Math.max(largest, error * linearNorm(state.transforms, TRANSFORM_SIZE * domain.domain));
+        }
+        return largest * scene.info.unit;
+    }
+
+    dispose(): void {
+        this.deformer.dispose();
+        this.surfaces.dispose();
+        this.background.dispose();
+        this.plain.dispose();
+        this.shadowTarget.depthTexture?.dispose();
+        this.shadowTarget.dispose();
+    }
+
+    private prepare(camera: THREE.PerspectiveCamera): void {
+        camera.updateMatrixWorld();
+        const eye = camera.position.toArray() as Vec3;
+        if (this.state && norm(subtract(eye, this.origin)) > ORIGIN_DISTANCE * this.diagonal) {
+            this.origin = eye.map(Math.round) as Vec3;
+            this.needsDeformation = true;
+        }
+        if (this.state && this.needsDeformation) this.deform(this.state);
+        const { near, far } = this.depthRange(camera);
+        camera.near = near;
+        camera.far = far;
+        camera.updateProjectionMatrix();
+        this.surfaces.moveTo(this.origin);
+        this.setLight("eye", new THREE.Vector3(...subtract(eye, this.origin)));
+        this.prepareBackground(camera);
+    }
+
+    private prepareBackground(camera: THREE.PerspectiveCamera): void {
+        const axis = upAxis(this.scene);
+        const bounds = this.scene.info.bounds;
+        const center = [0, 1, 2].map((i) => (at(bounds, i) + at(bounds, 3 + i)) / 2) as Vec3;
+        const offset = subtract(camera.position.toArray() as Vec3, center);
+        offset[axis] = 0;
+        const fade = 3.5 * Math.max(this.diagonal, norm(offset));
+        const relative = subtract(center, this.origin);
+        const uniforms = this.background.mesh.material.uniforms;
+        const color = this.lighting.ground ?? [0, 0, 0];
+        if (uniforms["ground"]) uniforms["ground"].value = new THREE.Vector4(...color, fade);
+        if (uniforms["ground_center"]) {
+            uniforms["ground_center"].value = new THREE.Vector4(...relative, at(bounds, axis) - at(this.origin, axis));
+        }
+        if (uniforms["world_from_ndc"]) uniforms["world_from_ndc"].value = worldFromNdc(camera);
+    }
+
+    private setLight(name: string, value: unknown): void {
+        const uniform = this.light[name];
+        if (uniform) uniform.value = value;
+    }
+
+    private createLight(): Uniforms {
+        const { lighting } = this;
+        const vector = (value: Vec3) => ({ value: new THREE.Vector3(...value) });
+        return {
+            eye: { value: new THREE.Vector3() },
+            to_sun: vector(lighting.toSun),
+            sunlight: vector(lighting.sunlight),
+            skylight: vector(lighting.skylight),
+            exposure: { value: lighting.exposure },
+            tone: { value: lighting.tone },
+            shadow_map: { value: this.shadowTarget.depthTexture },
+            shadow_from_world: { value: new THREE.Matrix4() },
+            shadow_texel: { value: 0 },
+            shadow_bias: { value: 0 },
+            map_scale: { value: 0 },
+        };
+    }
+
+    private createBackground(): FullscreenPass {
+        const vector = (value: Vec3) => new THREE.Vector3(...value);
+        const pass = new FullscreenPass(BACKGROUND_FRAGMENT, {
+            world_from_ndc: new THREE.Matrix4(),
+            up: vector(unitVector(upAxis(this.scene))),
+            zenith: vector(this.lighting.zenith),
+            horizon: vector(this.lighting.horizon),
+            ground: new THREE.Vector4(),
+            ground_center: new THREE.Vector4(),
+        });
+        Object.assign(pass.mesh.material.uniforms, this.light);
+        pass.define("GROUND", this.lighting.ground !== null);
+        return pass;
+    }
+
+    private renderShadow(): void {
+        this.needsShadow = false;
+        const axes = lightAxes(this.lighting.toSun, unitVector(upAxis(this.scene)));
+        const spheres = this.spheres
+            .filter((_, domain) => !this.display.hidden.has(domain))
+            .map(({ center, shadowRadius }) => ({ center: subtract(center, this.origin), radius: shadowRadius }));
+        if (spheres.length === 0) spheres.push({ center: [0, 0, 0], radius: this.diagonal });
+        const box = fitLightBox(spheres, axes, this.shadowSize);
+        const [x, y, z] = box.axes;
+        const row = (axis: Vec3, center: number, extent: number) =>
+            [...axis.map((component) => (2 * component) / extent), (-2 * center) / extent] as [
+                number,
+                number,
+                number,
+                number,
+            ];
+        const clip = new THREE.Matrix4().set(
+            ...row(x, box.center[0], box.side),
+            ...row(y, box.center[1], box.side),
+            // The depth increases away from the sun.
+            ...(row(z, box.center[2], box.depth).map((value) => -value) as [number, number, number, number]),
+            ...([0, 0, 0, 1] as const),
+        );
+        const half = new THREE.Matrix4().set(0.5, 0, 0, 0.5, 0, 0.5, 0, 0.5, 0, 0, 0.5, 0.5, 0, 0, 0, 1);
+        const texel = box.side / this.shadowSize;
+        if (this.shadowUniforms["clip_from_world"]) this.shadowUniforms["clip_from_world"].value = clip;
+        this.setLight("shadow_from_world", half.multiply(clip));
+        this.setLight("shadow_texel", texel);
+        this.setLight("shadow_bias", (0.75 * texel) / box.depth);
+        this.renderer.setRenderTarget(this.shadowTarget);
+        this.renderer.clear();
+        this.renderer.render(this.surfaces.shadowScene, new THREE.Camera());
+        this.renderer.setRenderTarget(null);
+    }
+
+    private updateColorScale(state: SceneState): void {
+        const { color } = this.options;
+        if (color.kind === "shaded") {
+            this.surfaces.setColorMode({ kind: "shaded" });
+            return;
+        }
+        let largest = 0;
+        for (const domain of this.scene.domains) {
+            const packed = this.deformer.packed[domain.shape];
+            if (!packed) continue;
+            if (color.kind === "mode") largest = Math.max(largest, packed.norms[color.mode] ?? 0);
+            else {
+                const q = state.qOf(domain.domain);
+                // The largest single mode: the sum over all modes is a bound that is rarely reached.
+                packed.norms.forEach((size, mode) => {
+                    largest = Math.max(largest, size * Math.abs(at(q, mode)));
+                });
+            }
+        }
+        largest *= this.scene.info.unit;
+        // The scale grows with the values, but does not shrink, so that colors keep their meaning while a stream runs.
+        this.colorScale = Math.max(this.colorScale, niceNumber(largest));
+        this.surfaces.setColorMode({ kind: "map", largest: this.colorScale / this.scene.info.unit });
+    }
+}
+
+/** The next of 1, 2, 2.5 and 5 times a power of ten. */
+export function niceNumber(value: number): number {
+    if (!(value > 0) || !Number.isFinite(value)) return 0;
+    const power = 10 ** Math.floor(Math.log10(value));
+    const factor = [1, 2, 2.5, 5, 10].find((step) => step * power >= value * (1 - 1e-9)) ?? 10;
+    return factor * power;
+}
+
+function createShadowTarget(size: number): THREE.WebGLRenderTarget {
+    const depthTexture = new THREE.DepthTexture(size, size, THREE.UnsignedIntType);
+    depthTexture.compareFunction = THREE.LessEqualCompare;
+    depthTexture.minFilter = THREE.LinearFilter;
+    depthTexture.magFilter = THREE.LinearFilter;
+    return new THREE.WebGLRenderTarget(size, size, { depthTexture, generateMipmaps: false });
+}
+
+/** From (x, y, 1) in normalized device coordinates to the direction of a view ray. */
+function worldFromNdc(camera: THREE.PerspectiveCamera): THREE.Matrix4 {
+    const projection = camera.projectionMatrix.elements;
+    const rays = new THREE.Matrix4().set(
+        1 / at(projection, 0),
+        0,
+        0,
+        0,
+        0,
+        1 / at(projection, 5),
+        0,
+        0,
+        0,
+        0,
+        -1,
+        0,
+        0,
+        0,
+        0,
+        1,
+    );
+    return new THREE.Matrix4().extractRotation(camera.matrixWorld).multiply(rays);
+}

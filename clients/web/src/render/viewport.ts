@@ -1,0 +1,132 @@
+/** The canvas of the viewer, and the loop that draws it when something has changed. */
+
+import * as THREE from "three";
+import { OrbitCamera } from "./camera";
+import type { SceneRenderer } from "./scene_renderer";
+
+/** Side of the shadow map in texels on a GPU, and on the CPU. */
+const SHADOW_SIZE = 2048;
+const SOFTWARE_SHADOW_SIZE = 512;
+
+const SOFTWARE_RENDERER = /swiftshader|llvmpipe|softpipe|software|basic render/i;
+
+export class Viewport {
+    readonly camera: OrbitCamera;
+    readonly gl: THREE.WebGLRenderer | null;
+    /** The name that WebGL reports, or the reason why there is no WebGL. */
+    readonly rendererName: string;
+    readonly isSoftware: boolean;
+    private sceneRenderer: SceneRenderer | null = null;
+    private needsFrame = true;
+    private frameTimes: number[] = [];
+    private contextLost = false;
+    /** Called before each frame that is drawn. */
+    onFrame: () => void = () => {};
+    /** Called when the size of the canvas in pixels has changed. */
+    onResize: () => void = () => {};
+    onContextRestored: () => void = () => {};
+
+    constructor(
+        private readonly container: HTMLElement,
+        readonly canvas: HTMLCanvasElement,
+    ) {
+        this.camera = new OrbitCamera(container);
+        const probe = probeWebGl();
+        this.rendererName = probe.name;
+        this.isSoftware = SOFTWARE_RENDERER.test(probe.name);
+        this.gl = probe.isUsable ? this.createRenderer() : null;
+        new ResizeObserver(() => this.resize()).observe(container);
+        this.resize();
+        requestAnimationFrame(() => this.loop());
+    }
+
+    get shadowSize(): number {
+        return this.isSoftware ? SOFTWARE_SHADOW_SIZE : SHADOW_SIZE;
+    }
+
+    /** Size of pictures in pixels. */
+    get pixelSize(): [number, number] {
+        const ratio = this.pixelRatio;
+        return [
+            Math.max(1, Math.round(this.container.clientWidth * ratio)),
+            Math.max(1, Math.round(this.container.clientHeight * ratio)),
+        ];
+    }
+
+    get pixelRatio(): number {
+        return this.isSoftware ? 1 : Math.min(window.devicePixelRatio, 2);
+    }
+
+    /** Frames drawn in the last second. */
+    get framesPerSecond(): number {
+        const now = performance.now();
+        this.frameTimes = this.frameTimes.filter((time) => now - time < 1000);
+        return this.frameTimes.length;
+    }
+
+    setScene(renderer: SceneRenderer | null): void {
+        this.sceneRenderer?.dispose();
+        this.sceneRenderer = renderer;
+        if (!renderer) this.gl?.clear();
+        this.invalidate();
+    }
+
+    /** Requests a frame. */
+    invalidate(): void {
+        this.needsFrame = true;
+    }
+
+    private createRenderer(): THREE.WebGLRenderer {
+        // Multisampling takes most of the time of a software renderer.
+        const gl = new THREE.WebGLRenderer({
+            canvas: this.canvas,
+            antialias: !this.isSoftware,
+            powerPreference: "high-performance",
+        });
+        gl.setPixelRatio(1);
+        gl.autoClear = true;
+        gl.setClearColor(0x8fb0d8, 1);
+        this.canvas.addEventListener("webglcontextlost", () => {
+            this.contextLost = true;
+        });
+        this.canvas.addEventListener("webglcontextrestored", () => {
+            this.contextLost = false;
+            this.onContextRestored();
+        });
+        return gl;
+    }
+
+    private resize(): void {
+        const [width, height] = this.pixelSize;
+        this.camera.setAspect(this.container.clientWidth / Math.max(1, this.container.clientHeight));
+        this.gl?.setSize(width, height, false);
+        this.onResize();
+        this.invalidate();
+    }
+
+    private loop(): void {
+        requestAnimationFrame(() => this.loop());
+        if (!this.needsFrame) return;
+        this.needsFrame = false;
+        this.onFrame();
+        if (!this.sceneRenderer || this.contextLost) return;
+        this.sceneRenderer.render(this.camera.camera);
+        this.frameTimes.push(performance.now());
+    }
+}
+
+interface WebGlProbe {
+    name: string;
+    isUsable: boolean;
+}
+
+/** Whether WebGL2 can render to f32 textures, and the name of the renderer. */
+function probeWebGl(): WebGlProbe {
+    const gl = document.createElement("canvas").getContext("webgl2");
+    if (!gl) return { name: "no WebGL2", isUsable: false };
+    const info = gl.getExtension("WEBGL_debug_renderer_info");
+    const name = String(gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER));
+    const isUsable = gl.getExtension("EXT_color_buffer_float") !== null;
+    gl.getExtension("WEBGL_lose_context")?.loseContext();
+    return { name: isUsable ? name : `${name}, without f32 render targets`, isUsable };
+}

@@ -1,0 +1,73 @@
+/** Bounds of the deformed scene from one sphere per domain, for the near plane and the shadow map. */
+
+import { applyToPoint, TRANSFORM_SIZE, type Vec3 } from "./affine";
+import type { ShapeArrays } from "./arrays";
+import { at } from "./numbers";
+import { displacementBound, type PackedModes } from "./packed_modes";
+import type { SceneState } from "./state";
+
+export interface Sphere {
+    center: Vec3;
+    radius: number;
+}
+
+/** A sphere around the rest positions of a shape. */
+export function restSphere({ restPositions }: ShapeArrays): Sphere {
+    const min: Vec3 = [Infinity, Infinity, Infinity];
+    const max: Vec3 = [-Infinity, -Infinity, -Infinity];
+    for (let i = 0; i < restPositions.length; i++) {
+        const axis = i % 3;
+        min[axis] = Math.min(at(min, axis), at(restPositions, i));
+        max[axis] = Math.max(at(max, axis), at(restPositions, i));
+    }
+    const center: Vec3 = [(min[0] + max[0]) / 2, (min[1] + max[1]) / 2, (min[2] + max[2]) / 2];
+    let squared = 0;
+    for (let vertex = 0; vertex < restPositions.length / 3; vertex++) {
+        const [x, y, z] = [0, 1, 2].map((axis) => at(restPositions, 3 * vertex + axis) - at(center, axis)) as Vec3;
+        squared = Math.max(squared, x * x + y * y + z * z);
+    }
+    return { center, radius: Math.sqrt(squared) };
+}
+
+/** A sphere around a deformed domain. */
+export interface DomainSphere extends Sphere {
+    /** A radius that a very large displacement may exceed, for the shadow map, whose resolution depends on it. */
+    shadowRadius: number;
+}
+
+/** Spheres that contain the vertices of each domain, relative to the scene's origin. */
+export function domainSpheres(
+    state: SceneState,
+    restSpheres: readonly Sphere[],
+    packed: readonly (Pick<PackedModes, "norms"> | null)[],
+): DomainSphere[] {
+    return state.layout.scene.domains.map((domain) => {
+        const rest = restSpheres[domain.shape] ?? { center: [0, 0, 0], radius: 0 };
+        const modes = packed[domain.shape];
+        const displacement = modes ? displacementBound(modes, state.qOf(domain.domain)) : 0;
+        const place = TRANSFORM_SIZE * domain.domain;
+        const scale = linearNorm(state.transforms, place);
+        return {
+            center: applyToPoint(state.transforms, place, rest.center),
+            radius: scale * (rest.radius + displacement),
+            // The bound of the displacement is loose for many modes.
+            shadowRadius: scale * (rest.radius + Math.min(displacement, 2 * rest.radius)),
+        };
+    });
+}
+
+/** Upper bound of the spectral norm of a linear part, exact for rotations with uniform scale. */
+export function linearNorm(transforms: ArrayLike<number>, place: number): number {
+    let largest = 0;
+    // The largest absolute row sum of A A^T bounds its spectral norm, which is the square of that of A.
+    for (let i = 0; i < 3; i++) {
+        let sum = 0;
+        for (let j = 0; j < 3; j++) {
+            let entry = 0;
+            for (let k = 0; k < 3; k++) entry += at(transforms, place + 4 * i + k) * at(transforms, place + 4 * j + k);
+            sum += Math.abs(entry);
+        }
+        largest = Math.max(largest, sum);
+    }
+    return Math.sqrt(largest);
+}

@@ -1,0 +1,200 @@
+/** The calls of the viewer to a server, over one channel. */
+
+import type { MessageInitShape } from "@bufbuild/protobuf";
+import { Delivery } from "../proto/modalcast/v1/common_pb";
+import { type ApplyForcesResponse, ForceService, type StreamForcesResponse } from "../proto/modalcast/v1/forces_pb";
+import {
+    Format,
+    FrameService,
+    type Hit,
+    Output,
+    type PickHead,
+    type StreamFramesResponse,
+} from "../proto/modalcast/v1/frames_pb";
+import { type ListScenesResponse, type SceneInfo, SceneService } from "../proto/modalcast/v1/scenes_pb";
+import { type GetServerInfoResponse, ServerService } from "../proto/modalcast/v1/server_pb";
+import { StateService, type StreamStatesResponse } from "../proto/modalcast/v1/states_pb";
+import { type DriveSceneRequestSchema, type DriveSceneResponse, StepService } from "../proto/modalcast/v1/steps_pb";
+import type { CameraMessage } from "../render/camera";
+import { contentHashes } from "../scene/arrays";
+import { DescriptionCollector, type SceneDescription } from "../scene/description";
+import { toHex } from "../scene/numbers";
+import type { Channel, DuplexStream, ReplyStream } from "../wire/channel";
+import { type ContentCache, hasHash } from "./content_cache";
+
+/** Version of the contract, see GetServerInfoResponse. */
+export const PROTOCOL_VERSION = 1;
+
+/** Largest number of hashes in a request. */
+const HASHES_PER_REQUEST = 256;
+
+/** Window of a picture stream in bytes: one frame at a time, so that a slow browser shows the newest step. */
+const PICTURE_WINDOW = 1;
+
+export interface PictureOptions {
+    width: number;
+    height: number;
+    jpeg: boolean;
+    camera: CameraMessage;
+    output: Output;
+    mode: number;
+    /** Scale of a color map; 0 fits it to each frame. */
+    largest: number;
+    edges: boolean;
+}
+
+export type SurfaceForceMessage = {
+    id: bigint;
+    domain: number;
+    triangle: number;
+    barycentric: number[];
+    vector: number[];
+};
+
+export interface PickResult {
+    head: PickHead | undefined;
+    hits: Hit[];
+}
+
+export type DriveStream = DuplexStream<MessageInitShape<typeof DriveSceneRequestSchema>, DriveSceneResponse>;
+
+export class Server {
+    constructor(
+        readonly channel: Channel,
+        private readonly cache: ContentCache,
+    ) {}
+
+    getInfo(): Promise<GetServerInfoResponse> {
+        return this.channel.unary(ServerService.method.getServerInfo, {}, { timeoutMs: 10_000 });
+    }
+
+    listScenes(): Promise<ListScenesResponse> {
+        return this.channel.unary(SceneService.method.listScenes, {}, { timeoutMs: 10_000 });
+    }
+
+    async openScene(source: string): Promise<SceneInfo> {
+        const { scene } = await this.channel.unary(SceneService.method.openScene, { source });
+        if (!scene) throw new Error("OpenScene: expected a scene, got none");
+        return scene;
+    }
+
+    async describe(scene: string): Promise<SceneDescription> {
+        const collector = new DescriptionCollector();
+        const stream = this.channel.serverStream(SceneService.method.describeScene, { scene, hashes: true });
+        for await (const response of stream) collector.add(response);
+        return collector.finish();
+    }
+
+    /** All arrays and textures of a scene, from the cache or the server. `progress`: received bytes. */
+    async readContents(scene: SceneDescription, progress: (bytes: number) => void): Promise<Map<string, Uint8Array>> {
+        const contents = new Map<string, Uint8Array>();
+        const missing: Uint8Array[] = [];
+        for (const hash of contentHashes(scene)) {
+            const cached = await this.cache.read(toHex(hash));
+            if (cached) {
+                contents.set(toHex(hash), cached);
+                progress(cached.length);
+            } else missing.push(hash);
+        }
+        for (let first = 0; first < missing.length; first += HASHES_PER_REQUEST) {
+            const received = await this.readMissing(scene, missing.slice(first, first + HASHES_PER_REQUEST), progress);
+            for (const [hash, bytes] of received) contents.set(hash, bytes);
+            await this.cache.write(received);
+        }
+        return contents;
+    }
+
+    streamStates(scene: string): ReplyStream<StreamStatesResponse> {
+        return this.channel.serverStream(StateService.method.streamStates, { scene, delivery: Delivery.LATEST });
+    }
+
+    streamForces(scene: string): ReplyStream<StreamForcesResponse> {
+        return this.channel.serverStream(ForceService.method.streamForces, { scene, maxHz: 30, passive: true });
+    }
+
+    streamFrames(scene: string, options: PictureOptions): ReplyStream<StreamFramesResponse> {
+        const { width, height, camera, output, mode, largest, jpeg } = options;
+        const isMap = output === Output.DISPLACEMENT || output === Output.MODE_SHAPE;
+        const picture = {
+            width,
+            height,
+            camera,
+            output,
+            mode: output === Output.MODE_SHAPE ? mode : 0,
+            largest: isMap ? largest : 0,
+            format: jpeg ? Format.JPEG : Format.PNG,
+            ...(output === Output.COLOR && options.edges ? { edgeWidth: 1.25 } : {}),
+        };
+        const request = { scene, delivery: Delivery.LATEST, pictures: [picture] };
+        return this.channel.serverStream(FrameService.method.streamFrames, request, { window: PICTURE_WINDOW });
+    }
+
+    async moveCamera(stream: Uint8Array, camera: CameraMessage): Promise<bigint> {
+        const request = { stream, cameras: [{ picture: 0, camera }] };
+        return (await this.channel.unary(FrameService.method.updateFrameStream, request)).cameraVersion;
+    }
+
+    /** The surface under a pixel. */
+    async pick(
+        scene: string,
+        size: [number, number],
+        camera: CameraMessage,
+        x: number,
+        y: number,
+    ): Promise<PickResult> {
+        const picture = { width: size[0], height: size[1], camera };
+        const result: PickResult = { head: undefined, hits: [] };
+        const request = { scene, picture, x, y, width: 1, height: 1 };
+        for await (const { head, hits } of this.channel.serverStream(FrameService.method.pick, request)) {
+            result.head ??= head;
+            result.hits.push(...hits);
+        }
+        return result;
+    }
+
+    applyForces(
+        scene: string,
+        owner: Uint8Array,
+        forces: SurfaceForceMessage[],
+        lifetimeMs: number,
+    ): Promise<ApplyForcesResponse> {
+        const messages = forces.map(({ id, domain, triangle, barycentric, vector }) => ({
+            id,
+            domain,
+            kind: { case: "surface" as const, value: { triangle, barycentric, vector } },
+        }));
+        const request = { scene, owner, forces: messages, lifetimeMs };
+        return this.channel.unary(ForceService.method.applyForces, request, { timeoutMs: 5_000 });
+    }
+
+    drive(): DriveStream {
+        return this.channel.duplexStream(StepService.method.driveScene);
+    }
+
+    private async readMissing(
+        scene: SceneDescription,
+        hashes: Uint8Array[],
+        progress: (bytes: number) => void,
+    ): Promise<Map<string, Uint8Array>> {
+        const received = new Map<string, Uint8Array>();
+        const request = { scene: scene.info.scene, sha256: hashes };
+        for await (const { item, offset, total, data } of this.channel.serverStream(
+            SceneService.method.readContent,
+            request,
+        )) {
+            const hash = toHex(hashes[item] ?? new Uint8Array());
+            let content = received.get(hash);
+            if (!content) {
+                content = new Uint8Array(Number(total));
+                received.set(hash, content);
+            }
+            content.set(data, Number(offset));
+            progress(data.length);
+        }
+        for (const [hash, bytes] of received) {
+            if (!(await hasHash(bytes, hash)))
+                throw new Error(`content ${hash}: the received bytes have another SHA-256`);
+        }
+        return received;
+    }
+}

@@ -1,0 +1,129 @@
+/** The panel section that selects who draws, and what. */
+
+import { h, setText } from "./dom";
+import type { Settings } from "./settings";
+
+export class ViewSection {
+    readonly element: HTMLElement;
+    private readonly local: HTMLButtonElement;
+    private readonly server: HTMLButtonElement;
+    private readonly hint = h("p", { className: "hint" });
+    private readonly color: HTMLSelectElement;
+    private readonly mode: HTMLInputElement;
+    private readonly modeRow: HTMLElement;
+    private readonly jpegRow: HTMLElement;
+    private readonly edges: HTMLInputElement;
+    private readonly shadows: HTMLInputElement;
+    private readonly jpeg: HTMLSelectElement;
+    private readonly switchRow: HTMLElement;
+    onChange: () => void = () => {};
+
+    constructor(private readonly settings: Settings) {
+        this.local = h("button", {
+            textContent: "Browser",
+            title: "Load the mesh and U once, then receive only q and T",
+        });
+        this.server = h("button", { textContent: "Server", title: "Show the pictures that the server draws" });
+        this.local.onclick = () => this.set(() => (settings.pictures = false));
+        this.server.onclick = () => this.set(() => (settings.pictures = true));
+        this.switchRow = h(
+            "div",
+            { className: "row" },
+            h("span", { className: "label", textContent: "Drawn by" }),
+            h("div", { className: "segments", aria: { role: "group", label: "Drawn by" } }, this.local, this.server),
+        );
+        this.color = h(
+            "select",
+            { id: "color" },
+            h("option", { value: "shaded", textContent: "Materials" }),
+            h("option", { value: "displacement", textContent: "Displacement" }),
+            h("option", { value: "mode", textContent: "One mode" }),
+        );
+        this.mode = h("input", { id: "mode", type: "number", min: "1", value: "1", step: "1" });
+        this.color.onchange = () => this.set(() => this.readColor());
+        this.mode.oninput = () => this.set(() => this.readColor());
+        this.modeRow = h("div", { className: "row" }, h("label", { htmlFor: "mode", textContent: "Mode" }), this.mode);
+        this.shadows = h("input", { type: "checkbox", checked: settings.shadows });
+        this.edges = h("input", { type: "checkbox", checked: settings.edges });
+        this.shadows.onchange = () => this.set(() => (settings.shadows = this.shadows.checked));
+        this.edges.onchange = () => this.set(() => (settings.edges = this.edges.checked));
+        this.jpeg = h(
+            "select",
+            { id: "format" },
+            h("option", { value: "jpeg", textContent: "JPEG, smaller" }),
+            h("option", { value: "png", textContent: "PNG, exact" }),
+        );
+        this.jpeg.onchange = () => this.set(() => (settings.jpeg = this.jpeg.value === "jpeg"));
+        this.jpegRow = h(
+            "div",
+            { className: "row" },
+            h("label", { htmlFor: "format", textContent: "Pictures" }),
+            this.jpeg,
+        );
+        const checks = h(
+            "div",
+            { className: "checks" },
+            h("label", {}, this.shadows, "Shadows"),
+            h("label", {}, this.edges, "Mesh edges"),
+        );
+        this.element = h(
+            "div",
+            { className: "body" },
+            this.switchRow,
+            this.hint,
+            h("div", { className: "row" }, h("label", { htmlFor: "color", textContent: "Color" }), this.color),
+            this.modeRow,
+            this.jpegRow,
+            checks,
+        );
+        this.refresh();
+    }
+
+    /** Allows only one of both ways to draw, and says why. */
+    restrict(canDrawLocally: boolean, canUseServer: boolean, hint: string): void {
+        this.local.disabled = !canDrawLocally;
+        this.server.disabled = !canUseServer;
+        this.switchRow.hidden = !canUseServer && canDrawLocally;
+        setText(this.hint, hint);
+        this.refresh();
+    }
+
+    setModes(largestRank: number): void {
+        this.mode.max = String(Math.max(1, largestRank));
+        for (const option of this.color.options) option.disabled = option.value !== "shaded" && largestRank === 0;
+        if (largestRank === 0 && this.settings.color.kind !== "shaded") {
+            this.settings.color = { kind: "shaded" };
+            this.color.value = "shaded";
+        }
+        this.refresh();
+    }
+
+    /** Shows a color map that was chosen elsewhere. */
+    showColor(): void {
+        this.color.value = this.settings.color.kind;
+    }
+
+    refresh(): void {
+        const { settings } = this;
+        this.local.setAttribute("aria-pressed", String(!settings.pictures));
+        this.server.setAttribute("aria-pressed", String(settings.pictures));
+        this.hint.hidden = !this.hint.textContent;
+        this.modeRow.hidden = settings.color.kind !== "mode";
+        this.jpegRow.hidden = !settings.pictures;
+        this.shadows.disabled = settings.pictures || settings.color.kind !== "shaded";
+        this.edges.checked = settings.edges;
+        this.shadows.checked = settings.shadows;
+    }
+
+    private set(change: () => void): void {
+        change();
+        this.refresh();
+        this.onChange();
+    }
+
+    private readColor(): void {
+        const mode = Math.max(0, Math.min(Number(this.mode.max), Math.round(Number(this.mode.value) || 1)) - 1);
+        const kind = this.color.value;
+        this.settings.color = kind === "mode" ? { kind, mode } : { kind: kind === "displacement" ? kind : "shaded" };
+    }
+}

@@ -1,0 +1,367 @@
+/** The viewer in headless Chromium against a server. */
+
+import assert from "node:assert/strict";
+import { after, before, test } from "node:test";
+import type { Browser, Page } from "playwright-core";
+import type { SurfacePoint } from "../../src/control/surface_point";
+import { Delivery } from "../../src/proto/modalcast/v1/common_pb";
+import { Format, FrameService, type Hit, Output } from "../../src/proto/modalcast/v1/frames_pb";
+import type { CameraMessage } from "../../src/render/camera";
+import { parseArrays } from "../../src/scene/arrays";
+import { Kinematics } from "../../src/scene/kinematics";
+import { SceneModel } from "../../src/scene/scene_model";
+import type { Server } from "../../src/source/server";
+import { end, launchBrowser, openPage, ServerProcess, startSimulation, waitForScene } from "./harness";
+
+const WIDTH = 480;
+const HEIGHT = 300;
+const NO_DOMAIN = 0xffffffff;
+
+declare global {
+    /** In the page: the point that a test has pulled. */
+    var watchedPoint: SurfacePoint | null;
+}
+
+let browser: Browser;
+const server = new ServerProcess();
+let client: Server;
+
+before(async () => {
+    await server.start();
+    client = await server.connect();
+    await client.openScene("tree");
+    browser = await launchBrowser();
+});
+
+after(async () => {
+    await browser?.close();
+    client?.channel.close();
+    await server.dispose();
+});
+
+/** Sends one step with coordinates of the trunk, and transforms that keep all joints closed. Returns the step's number. */
+async function bend(q0: number): Promise<bigint> {
+    const scene = await client.describe("tree");
+    const model = new SceneModel(scene, parseArrays(scene, await client.readContents(scene, () => {})));
+    const { state, layout, arrays } = model;
+    assert.ok(arrays);
+    const kinematics = new Kinematics(scene, arrays);
+    state.q.fill(0);
+    state.q[0] = q0;
+    const numbers = new Float32Array(kinematics.transforms(state, state.q).flatMap((transform) => [...transform]));
+    const stream = client.drive();
+    stream.send({ kind: { case: "open", value: { scene: "tree", delivery: Delivery.LOSSLESS, takeOver: true } } });
+    let number = 0n;
+    for await (const { kind } of stream) {
+        if (kind.case === "rejection") throw new Error(`rejected: ${kind.value.field} ${kind.value.given}`);
+        if (kind.case !== "opened") continue;
+        number = (kind.value.scene?.lastStep?.number ?? 0n) + 1n;
+        const step = {
+            number,
+            qDomains: [0],
+            q: new Uint8Array(state.q.slice(0, layout.ranks[0]).buffer),
+            transformDomains: kinematics.domains,
+            transforms: new Uint8Array(numbers.buffer),
+        };
+        stream.send({ kind: { case: "step", value: step } });
+        stream.end();
+    }
+    return number;
+}
+
+function waitForStep(page: Page, number: bigint): Promise<unknown> {
+    return page.waitForFunction((text) => String(modalcastViewer.model?.state.step?.number) === text, String(number));
+}
+
+function cameraOf(page: Page): Promise<CameraMessage> {
+    return page.evaluate(() => modalcastViewer.viewport.camera.toMessage());
+}
+
+/**
+ * Moves the camera towards its target, to a fraction of the distance. From far away, the holes of cut-out leaves are
+ * smaller than a pixel, and depend on how a renderer filters textures.
+ */
+function moveCloser(page: Page, fraction: number): Promise<void> {
+    return page.evaluate((weight) => {
+        const { camera } = modalcastViewer.viewport;
+        const { eye, target } = camera;
+        const closer = eye.map((value, axis) => (target[axis] ?? 0) + weight * (value - (target[axis] ?? 0)));
+        camera.look(closer as [number, number, number], target);
+    }, fraction);
+}
+
+/** The domain at each pixel, drawn by the browser. */
+async function drawnDomains(page: Page): Promise<number[]> {
+    return page.evaluate(
+        ([width, height]) => {
+            const { renderer, viewport } = modalcastViewer;
+            return Array.from(renderer?.domainIds(viewport.camera.camera, width as number, height as number) ?? []);
+        },
+        [WIDTH, HEIGHT],
+    );
+}
+
+/** The domain at each pixel, drawn by the server. */
+async function referenceDomains(camera: CameraMessage): Promise<Uint32Array> {
+    const request = { scene: "tree", pictures: [{ width: WIDTH, height: HEIGHT, camera, output: Output.DOMAINS }] };
+    const bytes = new Uint8Array(4 * WIDTH * HEIGHT);
+    for await (const { part } of client.channel.serverStream(FrameService.method.renderFrame, request)) {
+        if (part.case === "chunk") bytes.set(part.value.data, Number(part.value.offset));
+    }
+    return new Uint32Array(bytes.buffer);
+}
+
+/** Intersection over union: pixels with the same domain among those where either picture has a domain. */
+function iou(a: ArrayLike<number>, b: ArrayLike<number>): number {
+    let both = 0;
+    let either = 0;
+    for (let pixel = 0; pixel < a.length; pixel++) {
+        if (a[pixel] === NO_DOMAIN && b[pixel] === NO_DOMAIN) continue;
+        either++;
+        if (a[pixel] === b[pixel]) both++;
+    }
+    return both / either;
+}
+
+/** Hits at pixels that are spread over the picture. */
+async function pickMany(camera: CameraMessage, count: number): Promise<Hit[]> {
+    const hits: Hit[] = [];
+    const side = 60;
+    for (let y = 0; y + side <= HEIGHT; y += side) {
+        for (let x = 0; x + side <= WIDTH; x += side) {
+            const request = {
+                scene: "tree",
+                picture: { width: WIDTH, height: HEIGHT, camera },
+                x,
+                y,
+                width: side,
+                height: side,
+                withoutModes: true,
+            };
+            for await (const reply of client.channel.serverStream(FrameService.method.pick, request))
+                hits.push(...reply.hits);
+        }
+    }
+    const stride = Math.max(1, Math.floor(hits.length / count));
+    return hits.filter((_, index) => index % stride === 0).slice(0, count);
+}
+
+/** Where the browser draws the surface points of hits, in pixels. */
+async function projectHits(page: Page, hits: Hit[]): Promise<number[][]> {
+    const points = hits.map(({ domain, vertices, barycentric }) => ({ domain, vertices, barycentric }));
+    return page.evaluate((list) => {
+        const { renderer, viewport } = modalcastViewer;
+        if (!renderer) return [];
+        const { positions, firstVertex, origin } = renderer.readVertices();
+        return list.map(({ domain, vertices, barycentric }) => {
+            const point = [0, 1, 2].map((axis) =>
+                vertices.reduce(
+                    (sum, vertex, corner) =>
+                        sum +
+                        (barycentric[corner] ?? 0) *
+                            ((positions[4 * ((firstVertex[domain] ?? 0) + vertex) + axis] ?? 0) + (origin[axis] ?? 0)),
+                    0,
+                ),
+            );
+            return viewport.camera.project(point as [number, number, number]) ?? [-1, -1];
+        });
+    }, points);
+}
+
+test("q-relay draws the same domains and points as the server", { timeout: 120_000 }, async () => {
+    const number = await bend(2);
+    const { page, errors } = await openPage(browser, server.pageUrl("tree"), WIDTH, HEIGHT);
+    await waitForScene(page);
+    await waitForStep(page, number);
+    await moveCloser(page, 0.06);
+    const camera = await cameraOf(page);
+    const [drawn, reference] = [await drawnDomains(page), await referenceDomains(camera)];
+    const same = iou(drawn, reference);
+    assert.ok(
+        reference.some((domain) => domain !== NO_DOMAIN),
+        "expected a tree in the picture",
+    );
+    assert.ok(same >= 0.99, `expected an IoU of 0.99, got ${same}`);
+    const hits = await pickMany(camera, 200);
+    assert.equal(hits.length, 200);
+    const places = await projectHits(page, hits);
+    const distances = hits.map((hit, index) =>
+        Math.hypot((places[index]?.[0] ?? 0) - hit.x - 0.5, (places[index]?.[1] ?? 0) - hit.y - 0.5),
+    );
+    assert.ok(Math.max(...distances) <= 1, `expected points within 1 pixel, got ${Math.max(...distances)}`);
+    // Control: another q moves the masks.
+    const other = await bend(-2);
+    const moved = iou(drawn, await referenceDomains(camera));
+    assert.ok(moved < 0.9, `expected an IoU below 0.9 with another q, got ${moved}`);
+    await waitForStep(page, other);
+    assert.ok(iou(await drawnDomains(page), await referenceDomains(camera)) >= 0.99);
+    console.log(
+        `IoU ${same.toFixed(4)}, control ${moved.toFixed(4)}, largest distance ${Math.max(...distances).toFixed(3)} pixels`,
+    );
+    assert.deepEqual(errors, []);
+    await page.close();
+});
+
+test("the server's pictures follow the camera and the size of the window", { timeout: 120_000 }, async () => {
+    const { page, errors } = await openPage(browser, server.pageUrl("tree"), WIDTH, HEIGHT);
+    await waitForScene(page);
+    await page.keyboard.press("v");
+    await page.waitForFunction(() => modalcastViewer.pictures !== null && modalcastViewer.pictures.frames > 0);
+    // PNG, so that the shown pixels are those of RenderFrame.
+    await page.evaluate(() => modalcastViewer.change(() => (modalcastViewer.settings.jpeg = false)));
+    const shown = async () => {
+        const frames = await page.evaluate(() => modalcastViewer.pictures?.frames ?? 0);
+        await page.evaluate(() => {
+            const { camera } = modalcastViewer.viewport;
+            camera.look(camera.eye.map((value) => 1.1 * value) as [number, number, number], camera.target);
+        });
+        await page.waitForFunction((count) => (modalcastViewer.pictures?.frames ?? 0) > count, frames);
+        return waitForQuietPicture(page);
+    };
+    const first = await shown();
+    assert.deepEqual(first.size, [WIDTH, HEIGHT]);
+    assert.equal(await difference(first.pixels, await cameraOf(page), WIDTH, HEIGHT), 0);
+    const second = await shown();
+    assert.ok(meanDifference(first.pixels, second.pixels) > 1, "control: another camera shows another picture");
+    await page.setViewportSize({ width: 400, height: 360 });
+    await page.waitForFunction(() => (document.getElementById("picture") as HTMLCanvasElement).width === 400);
+    assert.deepEqual((await waitForQuietPicture(page)).size, [400, 360]);
+    await page.keyboard.press("v");
+    assert.ok(await page.locator("#surface").isVisible());
+    assert.deepEqual(errors, []);
+    await page.close();
+});
+
+interface ShownPicture {
+    size: number[];
+    pixels: number[];
+}
+
+/** The picture on the page, when no newer one has arrived for half a second. */
+async function waitForQuietPicture(page: Page): Promise<ShownPicture> {
+    return page.evaluate(async () => {
+        const frames = () => modalcastViewer.pictures?.frames ?? 0;
+        for (let before = -1; before !== frames(); ) {
+            before = frames();
+            await new Promise((done) => setTimeout(done, 500));
+        }
+        const canvas = document.getElementById("picture") as HTMLCanvasElement;
+        const pixels = canvas.getContext("2d")?.getImageData(0, 0, canvas.width, canvas.height).data ?? [];
+        return { size: [canvas.width, canvas.height], pixels: Array.from(pixels) };
+    });
+}
+
+/** Mean difference of RGBA values of 0 to 255 between a picture and the server's one. */
+async function difference(pixels: number[], camera: CameraMessage, width: number, height: number): Promise<number> {
+    const request = { scene: "tree", pictures: [{ width, height, camera, format: Format.RGBA }] };
+    const bytes = new Uint8Array(4 * width * height);
+    for await (const { part } of client.channel.serverStream(FrameService.method.renderFrame, request)) {
+        if (part.case === "chunk") bytes.set(part.value.data, Number(part.value.offset));
+    }
+    return meanDifference(pixels, bytes);
+}
+
+function meanDifference(a: ArrayLike<number>, b: ArrayLike<number>): number {
+    let sum = 0;
+    for (let index = 0; index < a.length; index++) sum += Math.abs((a[index] ?? 0) - (b[index] ?? 0));
+    return sum / a.length;
+}
+
+test("a pull bends a branch, and it comes back", { timeout: 180_000 }, async () => {
+    const { page, errors } = await openPage(browser, server.pageUrl("tree"), 640, 480);
+    await waitForScene(page);
+    // Nobody receives forces yet.
+    await page.keyboard.down("Shift");
+    await page.mouse.move(...(await leafPixel(page)));
+    await page.mouse.down();
+    await page.locator(".notice", { hasText: "Nobody receives forces" }).waitFor();
+    await page.mouse.up();
+    const simulation = startSimulation(server, ["--scene", "tree", "--wind", "0", "--forces"]);
+    try {
+        await page.waitForFunction(() => modalcastViewer.stateRate.perSecond() > 5);
+        const [x, y] = await leafPixel(page);
+        await page.mouse.move(x, y);
+        await page.mouse.down();
+        await page.waitForFunction(() => modalcastViewer.pull?.view != null);
+        const start = await pulledPoint(page);
+        await page.mouse.move(x + 90, y - 30, { steps: 5 });
+        await page.waitForFunction((from) => {
+            const now = modalcastViewer.pull?.view?.from ?? from;
+            return Math.hypot(...now.map((value, axis) => value - (from[axis] ?? 0))) > 0.05;
+        }, start);
+        assert.match(await page.locator("#overlay text").first().innerHTML(), /N$/);
+        await page.evaluate(() => {
+            globalThis.watchedPoint = modalcastViewer.pull?.grabbed ?? null;
+        });
+        const pulled = await watchedPosition(page);
+        await page.mouse.up();
+        await page.keyboard.up("Shift");
+        await page.waitForFunction(
+            ([from, far]) => {
+                const now = modalcastViewer.positionOf(globalThis.watchedPoint) ?? [0, 0, 0];
+                const away = (point: number[]) => Math.hypot(...now.map((value, axis) => value - (point[axis] ?? 0)));
+                return away(from as number[]) < 0.3 * away(far as number[]);
+            },
+            [start, pulled],
+        );
+        assert.equal(await page.evaluate(() => modalcastViewer.model?.forces.length), 0);
+    } finally {
+        await end(simulation);
+    }
+    assert.deepEqual(errors, []);
+    await page.close();
+});
+
+/** A pixel of the crown around which the browser has drawn domains with modes. */
+function leafPixel(page: Page): Promise<[number, number]> {
+    return page.evaluate(() => {
+        const { renderer, viewport, model } = modalcastViewer;
+        const stage = document.getElementById("stage") as HTMLElement;
+        const [width, height] = [stage.clientWidth, stage.clientHeight];
+        const ids = renderer?.domainIds(viewport.camera.camera, width, height) ?? [];
+        const bends = (x: number, y: number) => (model?.layout.ranks[ids[y * width + x] ?? -1] ?? 0) > 0;
+        for (let x = Math.floor(0.62 * width); x > 0; x--) {
+            for (let y = Math.floor(0.45 * height); y < 0.6 * height; y++) {
+                const around = [-2, -1, 0, 1, 2].flatMap((dx) => [-2, -1, 0, 1, 2].map((dy) => bends(x + dx, y + dy)));
+                if (around.every(Boolean)) return [x, y] as [number, number];
+            }
+        }
+        throw new Error("expected a domain with modes in the picture");
+    });
+}
+
+function pulledPoint(page: Page): Promise<number[]> {
+    return page.evaluate(() => modalcastViewer.pull?.view?.from ?? []);
+}
+
+function watchedPosition(page: Page): Promise<number[]> {
+    return page.evaluate(() => modalcastViewer.positionOf(globalThis.watchedPoint) ?? []);
+}
+
+test("the viewer connects again after a restart of the server", { timeout: 120_000 }, async () => {
+    const { page, errors } = await openPage(browser, server.pageUrl("tree"), 390, 844);
+    await waitForScene(page);
+    // Phone width: nothing is wider than the screen, and the panels open above the tools.
+    const overflow = await page.evaluate(() => document.documentElement.scrollWidth - window.innerWidth);
+    assert.ok(overflow <= 0, `expected no horizontal scrolling, got ${overflow} pixels`);
+    await page.getByRole("button", { name: "Panels" }).click();
+    const box = await page.locator("#panel").boundingBox();
+    assert.ok(box && box.x >= 0 && box.x + box.width <= 390 && box.height < 600, JSON.stringify(box));
+    await page.evaluate(() => {
+        modalcastViewer.model = null;
+    });
+    await server.stop();
+    await page.locator("#connection .dot.bad").waitFor({ state: "attached" });
+    await server.start();
+    await waitForScene(page);
+    await page.locator("#connection .dot.good").waitFor({ state: "attached" });
+    client = await server.connect();
+    const number = await bend(1);
+    await waitForStep(page, number);
+    // A browser logs each refused connection as an error.
+    const unexpected = errors.filter(
+        (error) => !/ERR_CONNECTION_REFUSED|ERR_CONNECTION_RESET|closed before|WebSocket/.test(error),
+    );
+    assert.deepEqual(unexpected, []);
+    await page.close();
+});
