@@ -83,7 +83,7 @@ fn encoder(device: &Arc<Device>, size: [u32; 2], channels: PngChannels, slot_cou
 }
 
 /// Encodes a picture whose memory outlives the call. `None` if the file would need an alpha channel.
-fn encode(encoder: &PngEncoder, picture: &DevicePicture) -> Option<EncodedPng> {
+fn encode(encoder: &mut PngEncoder, picture: &DevicePicture) -> Option<EncodedPng> {
     // SAFETY: the callers keep the picture's memory until this returns, and nothing writes it.
     let pending = unsafe { encoder.encode(picture) }.expect("expected the encoding to start");
     pending.expect("expected a free slot").wait().expect("expected the encoding to succeed")
@@ -94,9 +94,9 @@ fn check(device: &Arc<Device>, picture: &Picture, description: &str) {
     let size = [picture.width, picture.height];
     let (_memory, device_picture) = picture.upload(device);
     let is_opaque = picture.rgba.iter().skip(3).step_by(4).all(|alpha| *alpha == 255);
-    let rgb = encode(&encoder(device, size, PngChannels::Rgb, 1), &device_picture);
+    let rgb = encode(&mut encoder(device, size, PngChannels::Rgb, 1), &device_picture);
     assert_eq!(rgb.is_some(), is_opaque, "{description}");
-    let file = rgb.or_else(|| encode(&encoder(device, size, PngChannels::Rgba, 1), &device_picture));
+    let file = rgb.or_else(|| encode(&mut encoder(device, size, PngChannels::Rgba, 1), &device_picture));
     let file = file.unwrap_or_else(|| panic!("expected a file with alpha of {description}"));
     assert!(file.as_ref() == picture.encode_on_cpu(), "expected the file of the CPU: {description}");
 }
@@ -152,7 +152,7 @@ fn gpu_png_of_one_encoder_does_not_depend_on_earlier_pictures() {
     let device = Device::open(0).expect("expected a CUDA device");
     let mut random = fastrand::Rng::with_seed(3);
     let size = [1280, 720];
-    let encoder = encoder(&device, size, PngChannels::Rgb, 3);
+    let mut encoder = encoder(&device, size, PngChannels::Rgb, 3);
     let pictures = CONTENTS.map(|content| Picture::new(size, content, &mut random));
     let files = pictures.each_ref().map(Picture::encode_on_cpu);
     let uploads = pictures.each_ref().map(|picture| picture.upload(&device));
@@ -161,9 +161,9 @@ fn gpu_png_of_one_encoder_does_not_depend_on_earlier_pictures() {
     for _ in 0..40 {
         let index = random.usize(..pictures.len());
         if random.bool() {
-            assert!(encode(&encoder, &translucent).is_none(), "expected a refusal of the translucent picture");
+            assert!(encode(&mut encoder, &translucent).is_none(), "expected a refusal of the translucent picture");
         }
-        let file = encode(&encoder, &uploads[index].1).expect("expected an opaque picture");
+        let file = encode(&mut encoder, &uploads[index].1).expect("expected an opaque picture");
         assert!(file.as_ref() == files[index], "{:?}", CONTENTS[index]);
     }
     assert_ne!(files[2], files[4], "control: expected different files of different pictures");
@@ -181,12 +181,12 @@ fn gpu_png_reads_padded_and_ascending_rows() {
         padded.resize(padded.len() + padded_bytes - row_bytes, 99);
     }
     let ascending: Vec<u8> = picture.rgba.chunks_exact(row_bytes).rev().flatten().copied().collect();
-    let encoder = encoder(&device, [333, 222], PngChannels::Rgb, 1);
+    let mut encoder = encoder(&device, [333, 222], PngChannels::Rgb, 1);
     let layouts = [(padded, padded_bytes as i64, 0), (ascending, -(row_bytes as i64), 221 * row_bytes as u64)];
     for (bytes, pitch, offset) in layouts {
         let memory = DeviceBuffer::upload(&device, &bytes).expect("expected device memory");
         let address = memory.address() + offset;
-        let file = encode(&encoder, &DevicePicture { address, pitch, width: 333, height: 222 });
+        let file = encode(&mut encoder, &DevicePicture { address, pitch, width: 333, height: 222 });
         assert!(file.is_some_and(|file| file.as_ref() == picture.encode_on_cpu()), "pitch {pitch}");
     }
 }
@@ -197,8 +197,8 @@ fn gpu_png_slots_bound_the_files_in_flight() {
     let device = Device::open(0).expect("expected a CUDA device");
     let picture = Picture::new([640, 360], Content::Frame, &mut fastrand::Rng::with_seed(5));
     let (memory, device_picture) = picture.upload(&device);
-    let encoder = encoder(&device, [640, 360], PngChannels::Rgb, 2);
-    let start = || {
+    let mut encoder = encoder(&device, [640, 360], PngChannels::Rgb, 2);
+    let mut start = || {
         // SAFETY: the memory of the picture outlives all encodings, and nothing writes it.
         unsafe { encoder.encode(&device_picture) }.expect("expected no error")
     };
@@ -220,7 +220,7 @@ fn gpu_png_rejects_other_sizes_and_unaligned_pictures() {
     let device = Device::open(0).expect("expected a CUDA device");
     let picture = Picture::new([16, 9], Content::Flat, &mut fastrand::Rng::with_seed(6));
     let (_memory, valid) = picture.upload(&device);
-    let encoder = encoder(&device, [16, 9], PngChannels::Rgb, 1);
+    let mut encoder = encoder(&device, [16, 9], PngChannels::Rgb, 1);
     let invalid_pictures = [
         DevicePicture { width: 15, ..valid },
         DevicePicture { height: 10, ..valid },
@@ -234,5 +234,5 @@ fn gpu_png_rejects_other_sizes_and_unaligned_pictures() {
         let error = unsafe { encoder.encode(&picture) }.expect_err("expected an error");
         assert!(matches!(error, Error::Invalid { .. }), "{picture:?}: {error}");
     }
-    assert!(encode(&encoder, &valid).is_some());
+    assert!(encode(&mut encoder, &valid).is_some());
 }

@@ -152,10 +152,13 @@ impl PngEncoder {
     ///
     /// # Errors
     /// `Invalid` when the picture has another size or is not aligned; `Fault` when the device refuses the work.
-    pub unsafe fn encode(&self, picture: &DevicePicture) -> Result<Option<PendingPng>> {
+    pub unsafe fn encode(&mut self, picture: &DevicePicture) -> Result<Option<PendingPng>> {
         self.check(picture)?;
-        let Some(slot) = self.slots.iter().find(|slot| Arc::strong_count(slot) == 1) else { return Ok(None) };
-        let slot = Arc::clone(slot);
+        // Kernels of a dropped encoding may still write to a free slot. The stream orders them before those of this one.
+        let Some(slot) = self.slots.iter_mut().find_map(|slot| Arc::get_mut(slot).is_some().then(|| Arc::clone(slot)))
+        else {
+            return Ok(None);
+        };
         let [file, result] = slot.addresses();
         let args = PngArgs { pixels: picture.address, pitch: picture.pitch, file, result, ..self.args };
         let guard = WaitForStream::new(self.device.stream());
@@ -199,6 +202,13 @@ impl Drop for PngEncoder {
 mod tests {
     use super::*;
     use crate::testing::{CAPABILITIES, assert_compiles};
+
+    #[test]
+    fn any_thread_may_wait_for_a_file_and_read_it() {
+        fn assert_send_and_sync<T: Send + Sync>() {}
+        assert_send_and_sync::<PendingPng>();
+        assert_send_and_sync::<EncodedPng>();
+    }
 
     #[test]
     #[ignore = "needs NVRTC: deploy/check installs it"]

@@ -1,5 +1,6 @@
 //! Encodings of pictures: time, bytes and error of the server's encoders and of alternatives, on one frame of a scene.
 
+use std::cell::RefCell;
 use std::num::NonZero;
 use std::time::Instant;
 
@@ -165,12 +166,12 @@ fn measure_cuda(pixels: &Pixels, repetitions: usize) -> Result<Option<PictureEnc
     let Pixels { width, height, .. } = *pixels;
     // `time_median` holds one file while it encodes others.
     let slot_count = NonZero::<usize>::MIN.saturating_add(1);
-    let encoder = PngEncoder::new(&device, [width, height], PngChannels::Rgb, slot_count)?;
+    let encoder = RefCell::new(PngEncoder::new(&device, [width, height], PngChannels::Rgb, slot_count)?);
     let memory = DeviceBuffer::upload(&device, &pixels.rgba)?;
     let picture = DevicePicture { address: memory.address(), pitch: 4 * i64::from(width), width, height };
     let encode = || -> Result<EncodedPng> {
         // SAFETY: the memory of the picture outlives the encoding, and nothing writes it.
-        let pending = unsafe { encoder.encode(&picture) }?;
+        let pending = unsafe { encoder.borrow_mut().encode(&picture) }?;
         let file = pending.ok_or_else(|| fault("report", "expected a free slot"))?.wait()?;
         file.ok_or_else(|| fault("report", "expected an opaque picture"))
     };
