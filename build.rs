@@ -4,7 +4,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-const SOURCES: [&str; 6] = ["Cargo.lock", "Cargo.toml", "kernels", "proto", "shaders", "src"];
+const SOURCES: [&str; 7] = ["Cargo.lock", "Cargo.toml", "clients/web/dist", "kernels", "proto", "shaders", "src"];
 
 fn main() {
     let mut paths = Vec::new();

@@ -1,4 +1,5 @@
 //! The wire contract of modalcast, generated from `modalcast/v1/*.proto`. `tests/generated.rs` writes the code.
+//! `websocket.md` specifies the WebSocket that carries the same messages for browsers.
 
 #![allow(clippy::all, clippy::pedantic, reason = "generated code")]
 

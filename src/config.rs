@@ -5,7 +5,7 @@ use std::net::{Ipv4Addr, SocketAddr};
 use std::path::PathBuf;
 use std::time::Duration;
 
-use modalcast_model::error::{Result, invalid};
+use modalcast_model::error::{Result, fault_in, invalid};
 
 /// The deformation backend.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, clap::ValueEnum)]
@@ -61,6 +61,44 @@ impl std::fmt::Display for ListenAddress {
     }
 }
 
+/// The secret in the URL of the viewer. Its debug output does not show it.
+#[derive(Clone, PartialEq, Eq)]
+pub struct ViewerToken(String);
+
+impl ViewerToken {
+    /// A random token of 32 hexadecimal digits.
+    ///
+    /// # Errors
+    /// `Fault` when the system has no random numbers.
+    pub fn random() -> Result<Self> {
+        let mut bytes = [0; 16];
+        getrandom::fill(&mut bytes).map_err(fault_in("viewer token"))?;
+        Ok(Self(format!("{:032x}", u128::from_be_bytes(bytes))))
+    }
+
+    pub fn as_str(&self) -> &str {
+        &self.0
+    }
+}
+
+impl std::str::FromStr for ViewerToken {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let is_valid = |letter: char| letter.is_ascii_alphanumeric() || letter == '-' || letter == '_';
+        match (16..=128).contains(&text.len()) && text.chars().all(is_valid) {
+            true => Ok(Self(text.into())),
+            false => Err("expected 16 to 128 letters, digits, '-' or '_'".into()),
+        }
+    }
+}
+
+impl std::fmt::Debug for ViewerToken {
+    fn fmt(&self, out: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        out.write_str("ViewerToken(..)")
+    }
+}
+
 /// The server's configuration. The name or the documentation of a field gives its unit.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Config {
@@ -69,6 +107,10 @@ pub struct Config {
     /// The path of a Unix socket for clients of the same user on this machine, which can send steps and receive
     /// vertices and frames in shared memory. `None` turns shared memory off.
     pub shared_memory: Option<PathBuf>,
+    /// Whether browsers are served: the viewer and the WebSocket.
+    pub viewer: bool,
+    /// The secret in the URL of the viewer. `None` selects a random one.
+    pub viewer_token: Option<ViewerToken>,
     /// The folder of scenes that clients may open. `None` allows only the built-in scenes.
     pub scenes: Option<PathBuf>,
     /// The folder for uploads, the list of open scenes and their last steps. Only one server at a time can use it.
@@ -132,11 +174,12 @@ pub struct Config {
     /// Limit on open connections. Above it, connections without calls are closed: those that have sent no request,
     /// and then those that were idle for the longest time.
     pub connections: usize,
-    /// Time within which a new connection must send the preface of HTTP/2, which is 24 bytes.
+    /// Time within which a new connection must send the preface of HTTP/2, which is 24 bytes, or the head of a request in
+    /// HTTP/1.1.
     pub handshake_timeout: Duration,
-    /// Time after the preface within which a connection must send its first request.
+    /// Time after the preface or the handshake of a WebSocket within which a connection must send its first request.
     pub first_request_timeout: Duration,
-    /// Interval of HTTP/2 keepalive pings.
+    /// Interval of keepalive pings of HTTP/2 and WebSockets.
     pub keepalive_interval: Duration,
     /// Time within which the client must answer a keepalive ping.
     pub keepalive_timeout: Duration,
@@ -147,6 +190,8 @@ impl Default for Config {
         Self {
             listen: vec![ListenAddress::Tcp((Ipv4Addr::LOCALHOST, 50051).into())],
             shared_memory: None,
+            viewer: true,
+            viewer_token: None,
             scenes: None,
             state: default_state(),
             backend: BackendChoice::Auto,
@@ -283,6 +328,18 @@ mod tests {
         for (field, config) in invalid_configs {
             let error = config.validated().expect_err(field).to_string();
             assert!(error.starts_with(field), "expected {field}, got {error}");
+        }
+    }
+
+    #[test]
+    fn viewer_token_is_long_and_secret() {
+        let token = ViewerToken::random().expect("expected random numbers");
+        assert_eq!(token.as_str().len(), 32);
+        assert_ne!(token, ViewerToken::random().expect("expected random numbers"));
+        assert_eq!(token.as_str().parse(), Ok(token.clone()));
+        assert!(!format!("{token:?}").contains(token.as_str()));
+        for text in ["", "0123456789abcde", "0123456789abcdef&", &"x".repeat(129)] {
+            assert!(text.parse::<ViewerToken>().is_err(), "{text}");
         }
     }
 

@@ -27,7 +27,7 @@
 //! | module | contents | may use |
 //! |---|---|---|
 //! | `modalcast::cli` | the command line: one file per command | `config`, `service`, `engine`, `frame`, `telemetry` |
-//! | `modalcast::service` | gRPC services: convert between wire messages and engine types; the only module that uses the protobuf types | `config`, `engine`, `telemetry` |
+//! | `modalcast::service` | gRPC services, and the viewer's page and WebSocket on the same port: convert between wire messages and engine types; the only module that uses the protobuf types | `config`, `engine`, `telemetry` |
 //! | `modalcast::engine` | the device thread, open scenes, step queues, subscriptions, forces, persistent state | `config`, `frame`, `telemetry` |
 //! | `modalcast::frame` | PNG and JPEG encoding, color maps with legends; pure functions | |
 //! | `modalcast::telemetry` | stage names and times, logging | |

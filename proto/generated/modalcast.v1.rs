@@ -5432,6 +5432,11 @@ pub struct GetServerInfoResponse {
     /// What this server can do, each feature once.
     #[prost(enumeration = "Feature", repeated, tag = "8")]
     pub features: ::prost::alloc::vec::Vec<i32>,
+    /// The path and query of the viewer's URL, "/?token=" and the token. A client puts the host and port in front of it at
+    /// which it reaches this server. Empty if the viewer is off. Web pages cannot read it, because browsers cannot make gRPC
+    /// calls over plain HTTP/2.
+    #[prost(string, tag = "9")]
+    pub viewer_url_path: ::prost::alloc::string::String,
 }
 /// Limits of the server. A request beyond a limit is rejected with an error that names the limit (errors.proto).
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
@@ -5495,6 +5500,8 @@ pub enum Feature {
     /// VertexService and FrameService send data in shared memory to clients on the same machine, and StepService receives
     /// steps in it, see SharedRange.
     SharedMemory = 5,
+    /// The port also serves browsers: the viewer and a WebSocket that carries these calls (proto/websocket.md).
+    Viewer = 6,
 }
 impl Feature {
     /// String value of the enum field names used in the ProtoBuf definition.
@@ -5509,6 +5516,7 @@ impl Feature {
             Self::UploadReuse => "FEATURE_UPLOAD_REUSE",
             Self::UploadArrays => "FEATURE_UPLOAD_ARRAYS",
             Self::SharedMemory => "FEATURE_SHARED_MEMORY",
+            Self::Viewer => "FEATURE_VIEWER",
         }
     }
     /// Creates an enum from field names used in the ProtoBuf definition.
@@ -5520,6 +5528,7 @@ impl Feature {
             "FEATURE_UPLOAD_REUSE" => Some(Self::UploadReuse),
             "FEATURE_UPLOAD_ARRAYS" => Some(Self::UploadArrays),
             "FEATURE_SHARED_MEMORY" => Some(Self::SharedMemory),
+            "FEATURE_VIEWER" => Some(Self::Viewer),
             _ => None,
         }
     }

@@ -1,5 +1,6 @@
 //! `modalcast serve`: runs the server until it receives SIGTERM or Ctrl-C.
 
+use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
@@ -7,7 +8,7 @@ use std::time::Duration;
 use tokio::signal::unix::{Signal, SignalKind, signal};
 
 use super::{Outcome, print_line};
-use crate::config::{BackendChoice, Config, ListenAddress, RendererChoice, ValidatedConfig};
+use crate::config::{BackendChoice, Config, ListenAddress, RendererChoice, ValidatedConfig, ViewerToken};
 use crate::engine::{Engine, EngineInfo};
 use crate::service::{self, Listener};
 use modalcast_model::error::{Result, fault_in};
@@ -30,6 +31,12 @@ pub(super) struct Args {
     /// vertices and frames. Default: off.
     #[arg(long, env = "MODALCAST_SHARED_MEMORY", value_name = "PATH")]
     shared_memory: Option<PathBuf>,
+    /// Do not serve browsers: neither the viewer nor the WebSocket.
+    #[arg(long)]
+    no_viewer: bool,
+    /// Secret in the URL of the viewer: 16 to 128 letters, digits, '-' or '_'. Default: random, new at each start.
+    #[arg(long, env = "MODALCAST_VIEWER_TOKEN", hide_env_values = true, value_name = "TOKEN")]
+    viewer_token: Option<ViewerToken>,
     /// Folder of scenes that clients may open. Files outside it are never read.
     #[arg(long, env = "MODALCAST_SCENES")]
     scenes: Option<PathBuf>,
@@ -104,6 +111,8 @@ impl Args {
         Config {
             listen: self.listen.clone(),
             shared_memory: self.shared_memory.clone(),
+            viewer: !self.no_viewer,
+            viewer_token: self.viewer_token.clone(),
             scenes: self.scenes.clone(),
             state: self.state.clone().unwrap_or(defaults.state),
             backend: self.backend,
@@ -155,7 +164,7 @@ async fn serve(config: ValidatedConfig) -> Result<()> {
 }
 
 /// Opens the devices and the scenes, and prints the addresses.
-async fn start(config: ValidatedConfig) -> Result<(Engine, Listener)> {
+pub(super) async fn start(config: ValidatedConfig) -> Result<(Engine, Listener)> {
     let repository = Arc::new(SceneRepository::new(config.scenes.as_deref())?);
     // Bind before scenes are loaded, so that a second server on the same address fails immediately.
     let listener = service::bind(&config).await?;
@@ -167,7 +176,30 @@ async fn start(config: ValidatedConfig) -> Result<(Engine, Listener)> {
     for url in listener.urls() {
         print_line(format!("listening on {url}"));
     }
+    for url in listener.viewer_urls() {
+        print_line(format!("viewer at {url}"));
+    }
+    for command in tunnel_commands(&listener) {
+        print_line(format!("viewer from another machine: run '{command}' there, then open this URL"));
+    }
     Ok((engine, listener))
+}
+
+/// The commands that make the viewer available on another machine through SSH, if users probably are there: they have
+/// logged in through SSH, or the server accepts clients of other machines.
+fn tunnel_commands(listener: &Listener) -> Vec<String> {
+    let ssh_address = std::env::var("SSH_CONNECTION").ok().and_then(|text| server_of_ssh_connection(&text));
+    if ssh_address.is_none() && listener.remote_addresses().next().is_none() {
+        return Vec::new();
+    }
+    let host = ssh_address.or_else(service::host_name).unwrap_or_else(|| "HOST".into());
+    let command = |address: SocketAddr| format!("ssh -N -L {}:{address} {host}", address.port());
+    listener.viewer_addresses().map(command).collect()
+}
+
+/// The server's address in `SSH_CONNECTION`, which has the client's address and port and then the server's.
+fn server_of_ssh_connection(text: &str) -> Option<String> {
+    text.split(' ').nth(2).filter(|address| !address.is_empty()).map(str::to_owned)
 }
 
 /// Logs the backend and the renderer. Warns about a software renderer.
@@ -181,22 +213,34 @@ fn log_devices(info: &EngineInfo) {
 }
 
 /// Ctrl-C and SIGTERM. Signals that arrive after the installation and before a call of [`Self::received`] are not lost.
-struct TerminationSignals {
+pub(super) struct TerminationSignals {
     interrupt: Signal,
     terminate: Signal,
 }
 
 impl TerminationSignals {
-    fn install() -> Result<Self> {
+    pub(super) fn install() -> Result<Self> {
         let install = |kind| signal(kind).map_err(fault_in("signal handlers"));
         Ok(Self { interrupt: install(SignalKind::interrupt())?, terminate: install(SignalKind::terminate())? })
     }
 
     /// Waits for one of the signals.
-    async fn received(&mut self) {
+    pub(super) async fn received(&mut self) {
         tokio::select! {
             _ = self.interrupt.recv() => {}
             _ = self.terminate.recv() => {}
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn tunnel_leads_to_the_address_of_the_ssh_connection() {
+        let server = server_of_ssh_connection("192.0.2.1 50000 192.0.2.7 22");
+        assert_eq!(server.as_deref(), Some("192.0.2.7"));
+        assert_eq!(server_of_ssh_connection("192.0.2.1 50000"), None);
     }
 }

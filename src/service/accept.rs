@@ -1,33 +1,31 @@
-//! Accepts connections under a limit and serves HTTP/2 on them. A connection that does not send the preface of HTTP/2 or
-//! its first request in time is closed. The listener pauses after a failed accept, so that it does not spin when file
-//! descriptors run out.
+//! Accepts connections under a limit. Serves gRPC on those that begin with the preface of HTTP/2, and the browser viewer
+//! on the others. A connection that does not send its first bytes or its first request in time is closed. The listener
+//! pauses after a failed accept, so that it does not spin when file descriptors run out.
 
 use std::convert::Infallible;
 use std::io;
-use std::pin::Pin;
 use std::sync::Arc;
-use std::task::{Context, Poll};
 use std::time::Duration;
 
+use bytes::Bytes;
 use hyper::body::Incoming;
 use hyper::server::conn::http2;
 use hyper_util::rt::{TokioExecutor, TokioIo, TokioTimer};
-use tokio::io::{AsyncRead, AsyncReadExt as _, AsyncWrite, ReadBuf};
+use tokio::io::AsyncReadExt as _;
 use tonic::body::Body;
 use tonic::codegen::http::{Request, Response};
 
 use super::connection::{Budgets, ConnectionInfo, STREAMS_PER_CONNECTION_WINDOW};
-use super::connection_table::{ConnectionSlot, ConnectionTable};
+use super::connection_table::{ConnectionSlot, ConnectionTable, GOAWAY_TIMEOUT};
 use super::control_frames::ControlFrameLimit;
 use super::listen::{ListeningSockets, Socket};
+use super::metered_socket::MeteredSocket;
 use super::routes::Routes;
+use super::web::WebServer;
 use crate::config::Config;
 
 /// Pause of the listener after a failed accept.
 const ACCEPT_RETRY_DELAY: Duration = Duration::from_millis(50);
-
-/// Time within which the client must close a connection without calls after GOAWAY.
-const GOAWAY_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// Limit on the open calls of one connection. All of them are handled at a time. A call in a queue would not be read, and
 /// HTTP/2 would buffer a stream window of it outside the budgets.
@@ -36,9 +34,11 @@ const MAX_CALLS: u32 = 128;
 /// The bytes that every client sends first (RFC 9113, 3.4).
 const PREFACE: [u8; 24] = *b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n";
 
-/// Serves HTTP/2 on accepted connections.
+/// Serves accepted connections.
 pub(super) struct ConnectionServer {
     routes: Routes,
+    /// Serves HTTP/1.1. `None` if the viewer is off.
+    web: Option<WebServer>,
     http2: http2::Builder<TokioExecutor>,
     budgets: Budgets,
     handshake_timeout: Duration,
@@ -46,9 +46,10 @@ pub(super) struct ConnectionServer {
 }
 
 impl ConnectionServer {
-    pub(super) fn new(routes: Routes, config: &Config) -> Arc<Self> {
+    pub(super) fn new(routes: Routes, web: Option<WebServer>, config: &Config) -> Arc<Self> {
         Arc::new(Self {
             routes,
+            web,
             http2: http2_builder(config),
             budgets: Budgets::new(config),
             handshake_timeout: config.handshake_timeout,
@@ -83,18 +84,24 @@ impl ConnectionServer {
     }
 
     async fn serve_until_retired(&self, mut socket: Socket, peer: String, slot: &ConnectionSlot) {
-        let preface = read_preface(&mut socket);
-        if !matches!(tokio::time::timeout(self.handshake_timeout, preface).await, Ok(Ok(true))) {
-            return;
-        }
+        let protocol = tokio::time::timeout(self.handshake_timeout, detect_protocol(&mut socket));
+        let Ok(Ok(Some(protocol))) = protocol.await else { return };
         let info = ConnectionInfo::new(peer, &self.budgets, slot);
-        let service = hyper::service::service_fn(|request| self.call(request, &info));
-        let io = TokioIo::new(LimitedSocket { socket, preface: &PREFACE, control_frames: ControlFrameLimit::new() });
-        let mut connection = std::pin::pin!(self.http2.serve_connection(io, service));
+        match (protocol, &self.web) {
+            (Protocol::Http2, _) => self.serve_http2(socket, &info, slot).await,
+            (Protocol::Other(first_bytes), Some(web)) => web.serve(socket, first_bytes, info, slot).await,
+            (Protocol::Other(_), None) => {}
+        }
+    }
+
+    async fn serve_http2(&self, socket: Socket, info: &ConnectionInfo, slot: &ConnectionSlot) {
+        let service = hyper::service::service_fn(|request| self.call(request, info));
+        let io = MeteredSocket::new(socket, Bytes::from_static(&PREFACE), ControlFrameLimit::new());
+        let mut connection = std::pin::pin!(self.http2.serve_connection(TokioIo::new(io), service));
         tokio::select! {
             result = &mut connection => return log_end(result),
             () = slot.signals.retire.notified() => {}
-            () = self.first_request_overdue(slot) => {}
+            () = slot.first_request_overdue(self.first_request_timeout) => {}
         }
         connection.as_mut().graceful_shutdown();
         loop {
@@ -114,14 +121,6 @@ impl ConnectionServer {
         let mut request = request.map(Body::new);
         request.extensions_mut().insert(info.clone());
         self.routes.call(request)
-    }
-
-    /// Completes if no request has been received in time.
-    async fn first_request_overdue(&self, slot: &ConnectionSlot) {
-        tokio::time::sleep(self.first_request_timeout).await;
-        if slot.activity.has_received_request() {
-            std::future::pending().await
-        }
     }
 }
 
@@ -149,78 +148,27 @@ fn log_end(result: hyper::Result<()>) {
     }
 }
 
-/// Reads the preface. False if the client sends other bytes.
-async fn read_preface(socket: &mut Socket) -> io::Result<bool> {
+/// The protocol of a connection, by its first bytes.
+enum Protocol {
+    /// The preface has been read.
+    Http2,
+    /// These bytes have been read, and they do not begin the preface.
+    Other(Bytes),
+}
+
+/// Reads the preface, or the first bytes that differ from it. `None` if the client sends nothing more.
+async fn detect_protocol(socket: &mut Socket) -> io::Result<Option<Protocol>> {
     let mut bytes = [0; PREFACE.len()];
     let mut length = 0;
     while length < bytes.len() {
-        let received = socket.io().read(&mut bytes[length..]).await?;
+        let received = socket.read(&mut bytes[length..]).await?;
         length += received;
-        if received == 0 || bytes[..length] != PREFACE[..length] {
-            return Ok(false);
+        if received == 0 {
+            return Ok(None);
+        }
+        if bytes[..length] != PREFACE[..length] {
+            return Ok(Some(Protocol::Other(Bytes::copy_from_slice(&bytes[..length]))));
         }
     }
-    Ok(true)
-}
-
-/// A socket whose preface was read before. Reading fails when the client has sent too many control frames.
-struct LimitedSocket {
-    socket: Socket,
-    /// The part of the preface that HTTP/2 has not read.
-    preface: &'static [u8],
-    control_frames: ControlFrameLimit,
-}
-
-impl LimitedSocket {
-    fn count_sent(&mut self, sent: Poll<io::Result<usize>>) -> Poll<io::Result<usize>> {
-        if let Poll::Ready(Ok(bytes)) = sent {
-            self.control_frames.send(bytes);
-        }
-        sent
-    }
-}
-
-impl AsyncRead for LimitedSocket {
-    fn poll_read(mut self: Pin<&mut Self>, cx: &mut Context<'_>, buffer: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
-        if !self.preface.is_empty() {
-            let (now, later) = self.preface.split_at(self.preface.len().min(buffer.remaining()));
-            buffer.put_slice(now);
-            self.preface = later;
-            return Poll::Ready(Ok(()));
-        }
-        let filled = buffer.filled().len();
-        let result = self.socket.io().poll_read(cx, buffer);
-        match self.control_frames.receive(&buffer.filled()[filled..]) {
-            true => result,
-            false => Poll::Ready(Err(io::Error::other("the client has sent too many control frames"))),
-        }
-    }
-}
-
-impl AsyncWrite for LimitedSocket {
-    fn poll_write(mut self: Pin<&mut Self>, cx: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
-        let sent = self.socket.io().poll_write(cx, bytes);
-        self.count_sent(sent)
-    }
-
-    fn poll_write_vectored(
-        mut self: Pin<&mut Self>,
-        cx: &mut Context<'_>,
-        slices: &[io::IoSlice<'_>],
-    ) -> Poll<io::Result<usize>> {
-        let sent = self.socket.io().poll_write_vectored(cx, slices);
-        self.count_sent(sent)
-    }
-
-    fn is_write_vectored(&self) -> bool {
-        self.socket.is_write_vectored()
-    }
-
-    fn poll_flush(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
-        self.socket.io().poll_flush(cx)
-    }
-
-    fn poll_shutdown(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
-        self.socket.io().poll_shutdown(cx)
-    }
+    Ok(Some(Protocol::Http2))
 }

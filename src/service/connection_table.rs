@@ -4,7 +4,7 @@
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use tokio::sync::Notify;
 
@@ -13,6 +13,9 @@ use crate::engine::lock;
 /// Limit on the connections that are being closed and do not count against the limit on connections. Above it, a
 /// connection is closed without GOAWAY, and new connections wait until others have closed.
 const MAX_CLOSING: usize = 64;
+
+/// Time within which the client must close a connection without calls after GOAWAY.
+pub(super) const GOAWAY_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// All connections that were accepted and have not ended.
 #[derive(Debug)]
@@ -158,6 +161,16 @@ impl State {
         let signal = if is_retired { &entry.signals.retire } else { &entry.signals.close };
         signal.notify_one();
         true
+    }
+}
+
+impl ConnectionSlot {
+    /// Completes after this time if no request has been received until then.
+    pub(super) async fn first_request_overdue(&self, timeout: Duration) {
+        tokio::time::sleep(timeout).await;
+        if self.activity.has_received_request() {
+            std::future::pending().await
+        }
     }
 }
 

@@ -1,20 +1,10 @@
 //! Limits the HTTP/2 frames of a connection that carry no request: PING, SETTINGS, PRIORITY, WINDOW_UPDATE and frames of
 //! unknown types. Each costs a peer 9 to 17 bytes and the server some work, and h2 accepts any number of them.
-//!
-//! A connection has an allowance of [`BURST`] frames, which grows again with time and with the payload that is
-//! transferred. A client that receives much therefore may send many window updates and measure the round-trip time
-//! with many pings.
 
-use std::time::Instant;
+use std::io;
 
-/// Frames that a connection may send at once.
-const BURST: f64 = 10_000.0;
-
-/// Frames per second by which the allowance grows.
-const FRAMES_PER_SECOND: f64 = 100.0;
-
-/// Bytes of payload, in either direction, by which the allowance grows by one frame.
-const BYTES_PER_FRAME: f64 = 16.0;
+use super::frame_allowance::FrameAllowance;
+use super::metered_socket::Meter;
 
 /// Size of a frame's header in bytes: 3 bytes of length, the type, the flags and the stream.
 const HEADER_BYTES: usize = 9;
@@ -34,18 +24,17 @@ pub(super) struct ControlFrameLimit {
     header_bytes: usize,
     /// Number of missing bytes of the frame's payload.
     missing_bytes: usize,
-    allowance: f64,
-    last_growth: Instant,
+    allowance: FrameAllowance,
 }
 
 impl ControlFrameLimit {
     pub(super) fn new() -> Self {
         let (header, header_bytes, missing_bytes) = ([0; HEADER_BYTES], 0, 0);
-        Self { header, header_bytes, missing_bytes, allowance: BURST, last_growth: Instant::now() }
+        Self { header, header_bytes, missing_bytes, allowance: FrameAllowance::new() }
     }
 
     /// Counts received bytes. Returns false if the connection has sent too many control frames.
-    pub(super) fn receive(&mut self, mut bytes: &[u8]) -> bool {
+    fn receive_frames(&mut self, mut bytes: &[u8]) -> bool {
         while !bytes.is_empty() {
             if self.missing_bytes > 0 {
                 let payload = self.missing_bytes.min(bytes.len());
@@ -64,32 +53,28 @@ impl ControlFrameLimit {
                 self.count(kind);
             }
         }
-        self.allowance >= 0.0 || self.grow_with_time()
-    }
-
-    /// Counts bytes that the server has sent.
-    pub(super) fn send(&mut self, bytes: usize) {
-        self.grow(bytes as f64 / BYTES_PER_FRAME);
+        self.allowance.is_left()
     }
 
     fn count(&mut self, kind: u8) {
         match kind {
-            DATA | HEADERS | CONTINUATION => self.grow(self.missing_bytes as f64 / BYTES_PER_FRAME),
-            // The server answers with as many bytes, by which the allowance must not grow.
-            PING | SETTINGS => self.allowance -= 1.0 + (HEADER_BYTES + self.missing_bytes) as f64 / BYTES_PER_FRAME,
-            _ => self.allowance -= 1.0,
+            DATA | HEADERS | CONTINUATION => self.allowance.add_payload(self.missing_bytes),
+            PING | SETTINGS => self.allowance.take_answered_frame(HEADER_BYTES + self.missing_bytes),
+            _ => self.allowance.take_frame(),
+        }
+    }
+}
+
+impl Meter for ControlFrameLimit {
+    fn receive(&mut self, bytes: &[u8]) -> io::Result<()> {
+        match self.receive_frames(bytes) {
+            true => Ok(()),
+            false => Err(io::Error::other("the client has sent too many control frames")),
         }
     }
 
-    fn grow(&mut self, frames: f64) {
-        self.allowance = BURST.min(self.allowance + frames);
-    }
-
-    fn grow_with_time(&mut self) -> bool {
-        let seconds = self.last_growth.elapsed().as_secs_f64();
-        self.last_growth = Instant::now();
-        self.grow(FRAMES_PER_SECOND * seconds);
-        self.allowance >= 0.0
+    fn send(&mut self, bytes: usize) {
+        self.allowance.add_payload(bytes);
     }
 }
 
@@ -106,14 +91,13 @@ mod tests {
 
     /// A limit whose allowance does not grow with time.
     fn limit() -> ControlFrameLimit {
-        let future = Instant::now() + std::time::Duration::from_secs(1000);
-        ControlFrameLimit { last_growth: future, ..ControlFrameLimit::new() }
+        ControlFrameLimit { allowance: FrameAllowance::burst(), ..ControlFrameLimit::new() }
     }
 
     fn accepted_frames(kind: u8, payload: usize, answer: usize) -> Option<usize> {
         let mut limit = limit();
         (0..100_000).find(|_| {
-            let is_accepted = limit.receive(&frame(kind, payload));
+            let is_accepted = limit.receive_frames(&frame(kind, payload));
             limit.send(answer);
             !is_accepted
         })
@@ -138,10 +122,11 @@ mod tests {
     fn frames_are_found_in_any_split() {
         let bytes = [frame(DATA, 300), frame(PING, 8), frame(DATA, 0), frame(WINDOW_UPDATE, 4)].concat();
         for part in [1, 2, 8, 9, 10, 100, bytes.len()] {
-            let mut limit = ControlFrameLimit { allowance: 100.0, ..limit() };
-            assert!(bytes.chunks(part).all(|part| limit.receive(part)));
+            let mut limit = ControlFrameLimit { allowance: FrameAllowance::without_growth(100.0), ..limit() };
+            assert!(bytes.chunks(part).all(|part| limit.receive_frames(part)));
             let expected = 100.0 + 300.0 / 16.0 - 1.0 - 17.0 / 16.0 - 1.0;
-            assert!((limit.allowance - expected).abs() < 1e-9, "{part}: {}", limit.allowance);
+            let frames = limit.allowance.frames();
+            assert!((frames - expected).abs() < 1e-9, "{part}: {frames}");
         }
     }
 }

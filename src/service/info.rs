@@ -6,10 +6,15 @@ use modalcast_proto::v1;
 use tonic::{Request, Response, Status};
 
 use super::connection::MAX_DRIVES;
+use crate::config::Config;
 use crate::engine::{Engine, EngineInfo};
 
 /// Implementation of `ServerService`.
-pub(super) struct ServerServiceImpl(pub(super) Engine);
+pub(super) struct ServerServiceImpl {
+    pub(super) engine: Engine,
+    /// Empty if the viewer is off.
+    pub(super) viewer_url_path: String,
+}
 
 #[tonic::async_trait]
 impl v1::server_service_server::ServerService for ServerServiceImpl {
@@ -17,15 +22,15 @@ impl v1::server_service_server::ServerService for ServerServiceImpl {
         &self,
         _: Request<v1::GetServerInfoRequest>,
     ) -> Result<Response<v1::GetServerInfoResponse>, Status> {
-        let info = self.0.info();
-        let config = self.0.config();
+        let info = self.engine.info();
+        let config = self.engine.config();
         let (renderer, is_software) = match &info.renderer {
             Ok(renderer) => (renderer.renderer.clone(), renderer.software),
             Err(error) => (format!("none: {error}"), false),
         };
         let limits = v1::Limits {
             message_bytes: config.message_bytes as u64,
-            frame_side: self.0.frame_side(),
+            frame_side: self.engine.frame_side(),
             scenes: config.open_scenes as u32,
             window: config.max_window,
             upload_bytes: config.upload_bytes,
@@ -44,7 +49,8 @@ impl v1::server_service_server::ServerService for ServerServiceImpl {
             software: is_software,
             limits: Some(limits),
             protocol_version: v1::PROTOCOL_VERSION,
-            features: list_features(info, config.shared_memory.is_some()).into_iter().map(Into::into).collect(),
+            features: list_features(info, config).into_iter().map(Into::into).collect(),
+            viewer_url_path: self.viewer_url_path.clone(),
         }))
     }
 }
@@ -53,15 +59,12 @@ fn to_ms(duration: Duration) -> u32 {
     u32::try_from(duration.as_millis()).unwrap_or(u32::MAX)
 }
 
-/// The features of a server with these devices, with or without shared memory.
-fn list_features(info: &EngineInfo, has_shared_memory: bool) -> Vec<v1::Feature> {
+/// The features of a server with these devices and settings.
+fn list_features(info: &EngineInfo, config: &Config) -> Vec<v1::Feature> {
     let mut features = vec![v1::Feature::ContentHashes, v1::Feature::UploadReuse, v1::Feature::UploadArrays];
-    if info.renderer.is_ok() {
-        features.push(v1::Feature::Frames);
-    }
-    if has_shared_memory {
-        features.push(v1::Feature::SharedMemory);
-    }
+    features.extend(info.renderer.is_ok().then_some(v1::Feature::Frames));
+    features.extend(config.shared_memory.is_some().then_some(v1::Feature::SharedMemory));
+    features.extend(config.viewer.then_some(v1::Feature::Viewer));
     features
 }
 
@@ -73,7 +76,7 @@ mod tests {
     use modalcast_render::RendererInfo;
 
     #[test]
-    fn frames_and_shared_memory_are_optional() {
+    fn frames_shared_memory_and_viewer_are_optional() {
         let renderer = RendererInfo {
             renderer: "test".into(),
             version: "4.6".into(),
@@ -83,9 +86,10 @@ mod tests {
         };
         let info = |renderer| EngineInfo { backend: Backend::Cpu, device: "none".into(), renderer };
         let always = [v1::Feature::ContentHashes, v1::Feature::UploadReuse, v1::Feature::UploadArrays];
-        assert_eq!(list_features(&info(Err(fault("renderer", "none"))), false), always);
-        assert_eq!(list_features(&info(Ok(renderer.clone())), false), [&always[..], &[v1::Feature::Frames]].concat());
-        let features = list_features(&info(Ok(renderer)), true);
-        assert_eq!(features[always.len()..], [v1::Feature::Frames, v1::Feature::SharedMemory]);
+        let config = |shared_memory, viewer| Config { shared_memory, viewer, ..Config::default() };
+        let no_renderer = info(Err(fault("renderer", "none")));
+        assert_eq!(list_features(&no_renderer, &config(None, false)), always);
+        let features = list_features(&info(Ok(renderer)), &config(Some("socket".into()), true));
+        assert_eq!(features[always.len()..], [v1::Feature::Frames, v1::Feature::SharedMemory, v1::Feature::Viewer]);
     }
 }

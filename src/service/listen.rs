@@ -1,16 +1,16 @@
 //! The sockets that the server listens on: TCP and Unix sockets.
 
 use std::io;
-use std::net::SocketAddr;
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
 use std::os::unix::fs::{FileTypeExt as _, MetadataExt as _, PermissionsExt as _};
 use std::path::{Path, PathBuf};
 use std::pin::Pin;
 use std::task::{Context, Poll};
 
-use tokio::io::{AsyncRead, AsyncWrite};
+use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::net::{TcpListener, TcpStream, UnixListener, UnixStream};
 
-use crate::config::{Config, ListenAddress};
+use crate::config::{Config, ListenAddress, ViewerToken};
 use modalcast_model::error::{Error, Result};
 
 /// Bound sockets. Dropping it removes the files of the Unix sockets.
@@ -22,7 +22,10 @@ pub struct Listener {
     /// The files of the Unix sockets.
     pub(super) files: Vec<SocketFile>,
     urls: Vec<String>,
-    remote_addresses: Vec<SocketAddr>,
+    /// The addresses of TCP sockets.
+    addresses: Vec<SocketAddr>,
+    /// `None` if the viewer is off.
+    pub(super) viewer_token: Option<ViewerToken>,
 }
 
 /// The sockets of a listener.
@@ -46,9 +49,14 @@ impl Listener {
     /// Binds all sockets of a configuration. Replaces the socket file of a server that no longer runs.
     ///
     /// # Errors
-    /// `Unavailable` when an address is in use, does not belong to this machine, or cannot be created.
+    /// `Unavailable` when an address is in use, does not belong to this machine, or cannot be created; `Fault` when the
+    /// system has no random numbers.
     pub(super) async fn bind(config: &Config) -> Result<Self> {
         let mut listener = Self::default();
+        if config.viewer {
+            let token = config.viewer_token.clone();
+            listener.viewer_token = Some(token.map_or_else(ViewerToken::random, Ok)?);
+        }
         for address in &config.listen {
             listener.add(address).await.map_err(|error| Error::Unavailable {
                 what: "listening address",
@@ -79,7 +87,7 @@ impl Listener {
                 let socket = TcpListener::bind(address).await?;
                 let bound_address = socket.local_addr()?;
                 self.urls.push(format!("http://{bound_address}"));
-                self.remote_addresses.extend((!bound_address.ip().is_loopback()).then_some(bound_address));
+                self.addresses.push(bound_address);
                 ListeningSocket::Tcp(socket)
             }
             ListenAddress::Unix(path) => {
@@ -99,9 +107,45 @@ impl Listener {
     }
 
     /// The addresses that other machines can connect to.
-    pub fn remote_addresses(&self) -> &[SocketAddr] {
-        &self.remote_addresses
+    pub fn remote_addresses(&self) -> impl Iterator<Item = SocketAddr> {
+        self.addresses.iter().copied().filter(|address| !address.ip().is_loopback())
     }
+
+    /// The URLs of the viewer for browsers on this machine, in the order of the addresses. None if the viewer is off.
+    pub fn viewer_urls(&self) -> Vec<String> {
+        let Some(path) = self.viewer_url_path() else { return Vec::new() };
+        self.local_urls().into_iter().map(|url| url + &path).collect()
+    }
+
+    /// The URLs at which programs on this machine reach the TCP sockets, in the order of the addresses.
+    pub fn local_urls(&self) -> Vec<String> {
+        self.addresses.iter().map(|address| format!("http://{}", local_address(*address))).collect()
+    }
+
+    /// The addresses in the viewer's URLs.
+    pub fn viewer_addresses(&self) -> impl Iterator<Item = SocketAddr> {
+        self.addresses.iter().filter(|_| self.viewer_token.is_some()).map(|address| local_address(*address))
+    }
+
+    /// The path and query of the URLs of the viewer. `None` if the viewer is off.
+    pub(super) fn viewer_url_path(&self) -> Option<String> {
+        self.viewer_token.as_ref().map(|token| format!("/?token={}", token.as_str()))
+    }
+}
+
+/// The address at which a program on this machine reaches a socket.
+fn local_address(address: SocketAddr) -> SocketAddr {
+    let ip = match address.ip() {
+        IpAddr::V4(ip) if ip.is_unspecified() => Ipv4Addr::LOCALHOST.into(),
+        IpAddr::V6(ip) if ip.is_unspecified() => Ipv6Addr::LOCALHOST.into(),
+        ip => ip,
+    };
+    SocketAddr::new(ip, address.port())
+}
+
+/// The name of this machine.
+pub fn host_name() -> Option<String> {
+    rustix::system::uname().nodename().to_str().ok().filter(|name| !name.is_empty()).map(str::to_owned)
 }
 
 impl ListeningSockets {
@@ -184,23 +228,59 @@ fn check_replaceable(path: &Path) -> io::Result<()> {
 }
 
 /// Both directions of a socket.
-pub(super) trait Io: AsyncRead + AsyncWrite + Send + Unpin {}
+trait Io: AsyncRead + AsyncWrite + Send + Unpin {}
 
 impl<T: AsyncRead + AsyncWrite + Send + Unpin> Io for T {}
 
 impl Socket {
-    pub(super) fn io(&mut self) -> Pin<&mut dyn Io> {
+    fn io(&mut self) -> Pin<&mut dyn Io> {
         match self {
             Self::Tcp(stream) => Pin::new(stream),
             Self::Unix(stream) => Pin::new(stream),
         }
     }
 
-    pub(super) fn is_write_vectored(&self) -> bool {
+    /// The IP address at which the connection arrived. `None` for a Unix socket.
+    pub(super) fn local_ip(&self) -> Option<IpAddr> {
+        match self {
+            Self::Tcp(stream) => stream.local_addr().ok().map(|address| address.ip().to_canonical()),
+            Self::Unix(_) => None,
+        }
+    }
+}
+
+impl AsyncRead for Socket {
+    fn poll_read(mut self: Pin<&mut Self>, cx: &mut Context<'_>, buffer: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
+        self.io().poll_read(cx, buffer)
+    }
+}
+
+impl AsyncWrite for Socket {
+    fn poll_write(mut self: Pin<&mut Self>, cx: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
+        self.io().poll_write(cx, bytes)
+    }
+
+    fn poll_write_vectored(
+        mut self: Pin<&mut Self>,
+        cx: &mut Context<'_>,
+        slices: &[io::IoSlice<'_>],
+    ) -> Poll<io::Result<usize>> {
+        self.io().poll_write_vectored(cx, slices)
+    }
+
+    fn is_write_vectored(&self) -> bool {
         match self {
             Self::Tcp(stream) => stream.is_write_vectored(),
             Self::Unix(stream) => stream.is_write_vectored(),
         }
+    }
+
+    fn poll_flush(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
+        self.io().poll_flush(cx)
+    }
+
+    fn poll_shutdown(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
+        self.io().poll_shutdown(cx)
     }
 }
 

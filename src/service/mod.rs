@@ -8,10 +8,13 @@ mod control_frames;
 mod convert;
 mod describe;
 mod forces;
+mod frame_allowance;
 mod frames;
 mod info;
 mod listen;
+mod metered_socket;
 mod picks;
+mod progress_timer;
 mod receive_budget;
 mod reply_body;
 mod reply_budget;
@@ -26,17 +29,22 @@ mod steps;
 mod stream;
 mod uploads;
 mod vertices;
+mod web;
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use modalcast_proto::v1;
 use tokio::time::Instant;
 use tonic_health::server::HealthReporter;
 
-pub use self::listen::Listener;
+pub use self::listen::{Listener, host_name};
 
 use self::accept::ConnectionServer;
 use self::connection_table::ConnectionTable;
 use self::routes::Routes;
 use self::shared_memory::SharedMemory;
+use self::web::{Access, WebServer};
 use crate::config::Config;
 use crate::engine::Engine;
 use modalcast_model::error::{Result, fault_in};
@@ -66,27 +74,34 @@ pub async fn serve(
 ) -> Result<()> {
     let config = engine.config().clone();
     let (health_reporter, health_server) = tonic_health::server::health_reporter();
-    set_health(&health_reporter, true).await;
+    let health = Health { reporter: health_reporter, is_serving: Arc::default() };
+    health.set(true).await;
     let shared_memory = SharedMemory::default();
-    let routes = routes(&engine, &config, &shared_memory)?.with(health_server);
+    let viewer_url_path = listener.viewer_url_path().unwrap_or_default();
+    let routes = routes(&engine, &config, &shared_memory, viewer_url_path)?.with(health_server);
+    let accepts_machines = listener.remote_addresses().next().is_some();
+    let web = listener.viewer_token.clone().map(|token| {
+        let access = Access::new(token, host_name().filter(|_| accepts_machines));
+        WebServer::new(routes.clone(), access, Arc::clone(&health.is_serving), &config)
+    });
+    let connection_server = ConnectionServer::new(routes, web.transpose()?, &config);
     // The files are removed when this function returns.
     let Listener { sockets, shared_memory: shared_memory_socket, files: _files, .. } = listener;
     let _shared_memory_server = shared_memory_socket.map(|socket| shared_memory.serve(socket));
     let table = ConnectionTable::new(config.connections);
-    let accept_connections =
-        ConnectionServer::new(routes, &config).accept_connections(sockets, std::sync::Arc::clone(&table));
+    let accept_connections = connection_server.accept_connections(sockets, Arc::clone(&table));
     let stop_engine = async move {
         let mut shutdown = std::pin::pin!(shutdown);
         tokio::select! {
             () = &mut shutdown => {}
             _ = engine.device_lost() => {
-                set_health(&health_reporter, false).await;
+                health.set(false).await;
                 shutdown.await;
             }
         }
         tracing::info!("the server is shutting down");
         let drain_deadline = Instant::now() + engine.config().drain_timeout;
-        set_health(&health_reporter, false).await;
+        health.set(false).await;
         if tokio::time::timeout_at(drain_deadline, engine.shutdown()).await.is_err() {
             tracing::warn!("the engine did not stop within the drain time");
         }
@@ -103,25 +118,34 @@ pub async fn serve(
     Ok(())
 }
 
-async fn set_health(health: &HealthReporter, is_serving: bool) {
-    use tonic_health::ServingStatus::{NotServing, Serving};
-    let status = if is_serving { Serving } else { NotServing };
-    let services = [
-        "SceneService",
-        "StepService",
-        "FrameService",
-        "VertexService",
-        "StateService",
-        "ForceService",
-        "ServerService",
-    ];
-    // The empty name stands for the whole server.
-    for name in services.map(|service| format!("modalcast.v1.{service}")).into_iter().chain([String::new()]) {
-        health.set_service_status(name, status).await;
+/// The health of the server, for clients of gRPC and of HTTP/1.1.
+struct Health {
+    reporter: HealthReporter,
+    is_serving: Arc<AtomicBool>,
+}
+
+impl Health {
+    async fn set(&self, is_serving: bool) {
+        use tonic_health::ServingStatus::{NotServing, Serving};
+        self.is_serving.store(is_serving, Ordering::Relaxed);
+        let status = if is_serving { Serving } else { NotServing };
+        let services = [
+            "SceneService",
+            "StepService",
+            "FrameService",
+            "VertexService",
+            "StateService",
+            "ForceService",
+            "ServerService",
+        ];
+        // The empty name stands for the whole server.
+        for name in services.map(|service| format!("modalcast.v1.{service}")).into_iter().chain([String::new()]) {
+            self.reporter.set_service_status(name, status).await;
+        }
     }
 }
 
-fn routes(engine: &Engine, config: &Config, shared_memory: &SharedMemory) -> Result<Routes> {
+fn routes(engine: &Engine, config: &Config, shared_memory: &SharedMemory, viewer_url_path: String) -> Result<Routes> {
     use v1::force_service_server::ForceServiceServer;
     use v1::frame_service_server::FrameServiceServer;
     use v1::scene_service_server::SceneServiceServer;
@@ -146,7 +170,10 @@ fn routes(engine: &Engine, config: &Config, shared_memory: &SharedMemory) -> Res
     Ok(Routes::new(config.message_bytes)
         .with(reflection().build_v1().map_err(fault_in("reflection"))?)
         .with(reflection().build_v1alpha().map_err(fault_in("reflection"))?)
-        .with(with_limits!(ServerServiceServer::new(info::ServerServiceImpl(engine.clone()))))
+        .with(with_limits!(ServerServiceServer::new(info::ServerServiceImpl {
+            engine: engine.clone(),
+            viewer_url_path
+        })))
         .with(with_limits!(SceneServiceServer::new(scenes::SceneServiceImpl(engine.clone()))))
         .with(with_limits!(StepServiceServer::new(step_service)))
         .with(with_limits!(FrameServiceServer::new(frame_service)))

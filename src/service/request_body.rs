@@ -4,22 +4,18 @@
 use std::pin::Pin;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::task::{Context, Poll};
-use std::time::Duration;
 
 use bytes::Bytes;
 use http_body::{Body as HttpBody, Frame, SizeHint};
 use tokio::sync::futures::OwnedNotified;
-use tokio::time::{Instant, Sleep};
 use tonic::Status;
 use tonic::body::Body;
 
 use super::connection_table::CountedCall;
+use super::progress_timer::ProgressTimer;
 use super::receive_budget::{ConnectionReceiveBudget, MessageLimits, ReceivedMemory};
 use super::status::to_status;
 use modalcast_model::error::{Error, Result};
-
-/// The lowest rate at which a message must arrive, in bytes per second: 32 KiB/s.
-const MIN_MESSAGE_RATE: f64 = 32768.0;
 
 /// Bytes before each message: a flag and the length.
 const HEADER_BYTES: usize = 5;
@@ -72,10 +68,7 @@ pub(super) struct RequestBody {
     memory: RequestMemory,
     position: MessagePosition,
     limits: MessageLimits,
-    /// Remaining time of the message while the timer does not run.
-    remaining: Duration,
-    timer: Option<Pin<Box<Sleep>>>,
-    is_timer_running: bool,
+    timer: ProgressTimer,
     eviction: Option<Pin<Box<OwnedNotified>>>,
     call: Arc<CountedCall>,
 }
@@ -87,9 +80,7 @@ impl RequestBody {
             memory,
             position: MessagePosition::default(),
             limits,
-            remaining: limits.timeout,
-            timer: None,
-            is_timer_running: false,
+            timer: ProgressTimer::new(limits.timeout),
             eviction: None,
             call,
         }
@@ -97,13 +88,13 @@ impl RequestBody {
 
     /// Counts the messages of a frame.
     fn receive(&mut self, data: &[u8]) -> Result<()> {
-        self.stop_timer(data.len());
+        self.timer.stop(data.len());
         let advance = self.position.advance(data);
         let CallMemory { incomplete, complete } = &mut *self.memory.lock();
         if !advance.has_boundary {
             return incomplete.check();
         }
-        self.remaining = self.limits.timeout;
+        self.timer.reset();
         incomplete.resize(0)?;
         if advance.largest_complete.is_some() {
             self.call.count();
@@ -112,17 +103,6 @@ impl RequestBody {
             complete.resize(advance.largest_complete.unwrap_or(0).min(self.limits.max_bytes))?;
         }
         incomplete.resize(self.position.incomplete_bytes().min(self.limits.max_bytes))
-    }
-
-    /// Stops the timer after `received_bytes` have arrived, and adds the time in which a client with the rate
-    /// [`MIN_MESSAGE_RATE`] sends them.
-    fn stop_timer(&mut self, received_bytes: usize) {
-        if let Some(timer) = self.timer.as_ref().filter(|_| self.is_timer_running) {
-            self.remaining = timer.deadline().saturating_duration_since(Instant::now());
-        }
-        self.is_timer_running = false;
-        let refill = Duration::from_secs_f64(received_bytes as f64 / MIN_MESSAGE_RATE);
-        self.remaining = self.limits.timeout.min(self.remaining + refill);
     }
 
     /// Waits for more bytes. Ready when the messages of the call were evicted, or the rest of a message is overdue.
@@ -144,13 +124,7 @@ impl RequestBody {
         if !self.position.is_incomplete() {
             return Poll::Pending;
         }
-        let deadline = Instant::now() + self.remaining;
-        let timer = self.timer.get_or_insert_with(|| Box::pin(tokio::time::sleep_until(deadline)));
-        if !std::mem::replace(&mut self.is_timer_running, true) {
-            timer.as_mut().reset(deadline);
-        }
-        let ms = self.limits.timeout.as_millis() as u64;
-        timer.as_mut().poll(cx).map(|()| Error::Deadline { what: "the rest of a message".into(), ms })
+        self.timer.poll_overdue(cx)
     }
 }
 
@@ -243,6 +217,8 @@ impl MessagePosition {
 
 #[cfg(test)]
 mod tests {
+    use std::time::Duration;
+
     use super::*;
     use crate::config::Config;
     use crate::service::connection_table::Activity;

@@ -109,6 +109,12 @@ async fn connection_without_a_request_gets_goaway_in_time() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn other_protocols_are_closed_at_once() {
-    let server = small_server(4).await;
+    let server = Server::start_with(|config| Config { viewer: false, ..config }).await;
     assert_eq!(read_to_end(connect(&server, b"GET / HTTP/1.1\r\n\r\n").await).await, b"");
+    // With the viewer, HTTP/1.1 is answered and the rest is not.
+    let server = small_server(4).await;
+    let answer = read_to_end(connect(&server, b"GET / HTTP/1.1\r\n\r\n").await).await;
+    assert!(answer.starts_with(b"HTTP/1.1 403 "), "{answer:?}");
+    let answer = read_to_end(connect(&server, b"\x16\x03\x01\x00\x05\x01\x00\r\n").await).await;
+    assert!(!answer.starts_with(b"HTTP/1.1 200"), "{answer:?}");
 }

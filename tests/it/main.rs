@@ -47,4 +47,7 @@ mod stream_settings;
 mod streams;
 mod tolerance;
 mod unix_sockets;
+mod viewer_port;
+mod websocket;
+mod websocket_client;
 mod writers;

@@ -15,19 +15,21 @@ class Feature(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     FEATURE_UPLOAD_REUSE: _ClassVar[Feature]
     FEATURE_UPLOAD_ARRAYS: _ClassVar[Feature]
     FEATURE_SHARED_MEMORY: _ClassVar[Feature]
+    FEATURE_VIEWER: _ClassVar[Feature]
 FEATURE_UNSPECIFIED: Feature
 FEATURE_FRAMES: Feature
 FEATURE_CONTENT_HASHES: Feature
 FEATURE_UPLOAD_REUSE: Feature
 FEATURE_UPLOAD_ARRAYS: Feature
 FEATURE_SHARED_MEMORY: Feature
+FEATURE_VIEWER: Feature
 
 class GetServerInfoRequest(_message.Message):
     __slots__ = ()
     def __init__(self) -> None: ...
 
 class GetServerInfoResponse(_message.Message):
-    __slots__ = ("version", "backend", "device", "renderer", "software", "limits", "protocol_version", "features")
+    __slots__ = ("version", "backend", "device", "renderer", "software", "limits", "protocol_version", "features", "viewer_url_path")
     VERSION_FIELD_NUMBER: _ClassVar[int]
     BACKEND_FIELD_NUMBER: _ClassVar[int]
     DEVICE_FIELD_NUMBER: _ClassVar[int]
@@ -36,6 +38,7 @@ class GetServerInfoResponse(_message.Message):
     LIMITS_FIELD_NUMBER: _ClassVar[int]
     PROTOCOL_VERSION_FIELD_NUMBER: _ClassVar[int]
     FEATURES_FIELD_NUMBER: _ClassVar[int]
+    VIEWER_URL_PATH_FIELD_NUMBER: _ClassVar[int]
     version: str
     backend: str
     device: str
@@ -44,7 +47,8 @@ class GetServerInfoResponse(_message.Message):
     limits: Limits
     protocol_version: int
     features: _containers.RepeatedScalarFieldContainer[Feature]
-    def __init__(self, version: _Optional[str] = ..., backend: _Optional[str] = ..., device: _Optional[str] = ..., renderer: _Optional[str] = ..., software: bool = ..., limits: _Optional[_Union[Limits, _Mapping]] = ..., protocol_version: _Optional[int] = ..., features: _Optional[_Iterable[_Union[Feature, str]]] = ...) -> None: ...
+    viewer_url_path: str
+    def __init__(self, version: _Optional[str] = ..., backend: _Optional[str] = ..., device: _Optional[str] = ..., renderer: _Optional[str] = ..., software: bool = ..., limits: _Optional[_Union[Limits, _Mapping]] = ..., protocol_version: _Optional[int] = ..., features: _Optional[_Iterable[_Union[Feature, str]]] = ..., viewer_url_path: _Optional[str] = ...) -> None: ...
 
 class Limits(_message.Message):
     __slots__ = ("message_bytes", "frame_side", "scenes", "window", "upload_bytes", "deadline_ms", "drives", "connection_receive_bytes", "message_timeout_ms", "connection_reply_bytes", "reply_timeout_ms")

@@ -1,0 +1,231 @@
+//! HTTP/1.1 on the port of the server: the viewer's page, the health of the server, and the checks of token, Host and
+//! Origin.
+
+use std::time::Duration;
+
+use modalcast::config::{Config, ListenAddress};
+use modalcast_proto::v1;
+use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+use tokio::net::TcpStream;
+use tokio_tungstenite::tungstenite::Error as WebSocketError;
+use v1::scene_service_client::SceneServiceClient;
+use v1::server_service_client::ServerServiceClient;
+
+use crate::service_harness::{Server, with_timeout};
+use crate::websocket_client::{TOKEN, WebSocketClient, authority, handshake, start_server};
+
+/// An answer in HTTP/1.1.
+#[derive(Debug)]
+struct Answer {
+    status: u16,
+    /// Lower case.
+    head: String,
+    body: Vec<u8>,
+}
+
+impl Answer {
+    fn has_header(&self, text: &str) -> bool {
+        self.head.lines().any(|line| line == text)
+    }
+}
+
+async fn connect(server: &Server) -> TcpStream {
+    TcpStream::connect(authority(server)).await.expect("expected a connection")
+}
+
+/// Sends bytes and reads the answer up to the end of the connection. `None` if there is no answer.
+async fn exchange(server: &Server, request: &str) -> Option<Answer> {
+    let mut socket = connect(server).await;
+    socket.write_all(request.as_bytes()).await.ok();
+    let mut bytes = Vec::new();
+    with_timeout(socket.read_to_end(&mut bytes)).await.ok();
+    let end = bytes.windows(4).position(|window| window == b"\r\n\r\n")?;
+    let head = String::from_utf8_lossy(&bytes[..end]).to_ascii_lowercase();
+    let status = head.split(' ').nth(1)?.parse().ok()?;
+    Some(Answer { status, head, body: bytes[end + 4..].to_vec() })
+}
+
+/// A GET request with further header lines.
+async fn get(server: &Server, path: &str, host: &str, headers: &str) -> Answer {
+    let request = format!("GET {path} HTTP/1.1\r\nHost: {host}\r\n{headers}\r\n");
+    exchange(server, &request).await.expect("expected an answer")
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn page_needs_token_and_own_host() {
+    let server = start_server(|config| config).await;
+    let page_path = format!("/?token={TOKEN}");
+    let page = get(&server, &page_path, authority(&server), "").await;
+    assert_eq!(page.status, 200, "{page:?}");
+    assert!(page.body.starts_with(&[0x1f, 0x8b]), "expected gzip");
+    for header in ["content-encoding: gzip", "cache-control: no-store", "referrer-policy: no-referrer"] {
+        assert!(page.has_header(header), "{header}: {page:?}");
+    }
+    let connect_source = format!("connect-src 'self' ws://{};", authority(&server));
+    assert!(page.head.contains("content-security-policy: default-src 'none';"), "{}", page.head);
+    assert!(page.head.contains(&connect_source), "{}", page.head);
+    // A tunnel has another port.
+    assert_eq!(get(&server, &page_path, "localhost:7", "").await.status, 200);
+
+    let token_path = |token: &str| format!("/?token={token}");
+    let other_token = TOKEN.replace('0', "1");
+    for (path, host, headers, status) in [
+        ("/", "localhost", "", 403),
+        (&token_path(&other_token), "localhost", "", 403),
+        (&token_path(""), "localhost", "", 403),
+        (&page_path, "evil.example", "", 403),
+        (&page_path, "localhost", "Origin: http://evil.example\r\n", 403),
+        (&page_path, "localhost", "Host: localhost\r\n", 403),
+        (&format!("/websocket?token={TOKEN}"), "localhost", "", 400),
+        ("/favicon.ico", "localhost", "", 404),
+        ("/index.html", "localhost", "", 404),
+    ] {
+        let answer = get(&server, path, host, headers).await;
+        assert_eq!(answer.status, status, "{path} {host} {headers}");
+        assert!(answer.has_header("connection: close") && answer.has_header("x-content-type-options: nosniff"));
+        let text = String::from_utf8_lossy(&answer.body);
+        assert!(!text.contains(TOKEN));
+        assert_eq!(text.contains("modalcast serve"), status == 403, "{text}");
+    }
+    let post = format!("POST {page_path} HTTP/1.1\r\nHost: localhost\r\nContent-Length: 2\r\n\r\nab");
+    assert_eq!(exchange(&server, &post).await.expect("expected an answer").status, 405);
+    let no_host = format!("GET {page_path} HTTP/1.0\r\n\r\n");
+    assert_eq!(exchange(&server, &no_host).await.expect("expected an answer").status, 403);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn websocket_needs_token_origin_and_subprotocol() {
+    let server = start_server(|config| config).await;
+    let own_origin = format!("http://{}", authority(&server));
+    for (name, value, is_accepted) in [
+        ("origin", own_origin.as_str(), true),
+        ("x-other", "1", true),
+        ("origin", "http://evil.example", false),
+        ("origin", "null", false),
+        ("host", "evil.example", false),
+        ("sec-websocket-protocol", "modalcast.v2", false),
+        ("sec-websocket-version", "8", false),
+    ] {
+        let result = handshake(connect(&server).await, &server, &[(name, value)]).await;
+        assert_eq!(result.is_ok(), is_accepted, "{name}: {value}");
+        if let Err(error) = result {
+            let WebSocketError::Http(answer) = error else { panic!("expected an answer, got {error}") };
+            assert!([400, 403].contains(&answer.status().as_u16()));
+        }
+    }
+    // Without a token.
+    let request = "GET /websocket HTTP/1.1\r\nHost: localhost\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n\
+                   Sec-WebSocket-Version: 13\r\nSec-WebSocket-Protocol: modalcast.v1\r\n\
+                   Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n";
+    assert_eq!(exchange(&server, request).await.expect("expected an answer").status, 403);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn health_needs_no_token() {
+    let server = start_server(|config| config).await;
+    let answer = get(&server, "/healthz", authority(&server), "").await;
+    assert_eq!((answer.status, &answer.body[..]), (200, &b"serving\n"[..]));
+    assert_eq!(get(&server, "/healthz", "evil.example", "").await.status, 403);
+}
+
+/// Another server has another token, and clients of gRPC learn it.
+#[tokio::test(flavor = "multi_thread")]
+async fn token_is_random_and_known_to_grpc_clients() {
+    let mut paths = Vec::new();
+    for _ in 0..2 {
+        let server = Server::start_default().await;
+        let mut client = ServerServiceClient::new(server.channel().await);
+        let info = with_timeout(client.get_server_info(v1::GetServerInfoRequest {})).await.expect("expected an answer");
+        let info = info.into_inner();
+        assert!(info.features().any(|feature| feature == v1::Feature::Viewer));
+        assert_eq!(get(&server, &info.viewer_url_path, "localhost", "").await.status, 200);
+        paths.push(info.viewer_url_path);
+    }
+    assert_eq!(paths[0].len(), "/?token=".len() + 32, "{paths:?}");
+    assert_ne!(paths[0], paths[1]);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn viewer_can_be_turned_off() {
+    let server = start_server(|config| Config { viewer: false, ..config }).await;
+    let request = format!("GET /?token={TOKEN} HTTP/1.1\r\nHost: localhost\r\n\r\n");
+    assert!(exchange(&server, &request).await.is_none());
+    let mut client = ServerServiceClient::new(server.channel().await);
+    let info = with_timeout(client.get_server_info(v1::GetServerInfoRequest {})).await.expect("expected an answer");
+    assert_eq!(info.get_ref().viewer_url_path, "");
+    assert!(!info.get_ref().features().any(|feature| feature == v1::Feature::Viewer));
+}
+
+/// Slow heads, large heads and bodies that are not read end. Meanwhile, other clients are served.
+#[tokio::test(flavor = "multi_thread")]
+async fn slow_and_large_requests_are_closed() {
+    let server = start_server(|config| Config { handshake_timeout: Duration::from_millis(300), ..config }).await;
+    let trickle = async {
+        let mut socket = connect(&server).await;
+        let head = format!("GET /?token={TOKEN} HTTP/1.1\r\nHost: localhost\r\n");
+        socket.write_all(head.as_bytes()).await.expect("expected an open connection");
+        // A byte at a time does not extend the deadline.
+        while socket.write_all(b"X").await.is_ok() {
+            tokio::time::sleep(Duration::from_millis(50)).await;
+        }
+    };
+    with_timeout(trickle).await;
+    for bytes in [&b"G"[..], b"PRI * HTTP/1.1\r\n", b"\r\n", b"\x16\x03\x01"] {
+        let mut socket = connect(&server).await;
+        socket.write_all(bytes).await.expect("expected an open connection");
+        let mut answer = Vec::new();
+        with_timeout(socket.read_to_end(&mut answer)).await.ok();
+        assert!(!answer.starts_with(b"HTTP/1.1 200"), "{bytes:?}");
+    }
+    let large = format!("GET / HTTP/1.1\r\nHost: localhost\r\nX-Large: {}\r\n\r\n", "x".repeat(64 << 10));
+    let answer = exchange(&server, &large).await;
+    assert!(answer.is_none_or(|answer| answer.status == 431));
+    let many = format!("GET / HTTP/1.1\r\nHost: localhost\r\n{}\r\n", "X: 1\r\n".repeat(1000));
+    assert!(exchange(&server, &many).await.is_none_or(|answer| answer.status == 431));
+    assert_eq!(get(&server, "/healthz", "localhost", "").await.status, 200);
+}
+
+/// Connections of browsers without calls make room for new clients when the server is full.
+#[tokio::test(flavor = "multi_thread")]
+async fn full_server_closes_browsers_without_calls() {
+    let patient = Duration::from_secs(1000);
+    let limits = |config| Config {
+        connections: 4,
+        handshake_timeout: patient,
+        first_request_timeout: patient,
+        keepalive_interval: patient,
+        ..config
+    };
+    let server = start_server(limits).await;
+    let mut silent = connect(&server).await;
+    silent.write_all(b"GET /").await.expect("expected an open connection");
+    let mut websockets = Vec::new();
+    for _ in 0..3 {
+        websockets.push(WebSocketClient::connect(&server).await);
+    }
+    let mut clients = Vec::new();
+    for _ in 0..4 {
+        let mut client = SceneServiceClient::new(server.channel().await);
+        with_timeout(client.list_scenes(v1::ListScenesRequest {})).await.expect("expected an answer");
+        clients.push(client);
+    }
+    for mut websocket in websockets {
+        websocket.closed().await;
+    }
+    with_timeout(silent.read_to_end(&mut Vec::new())).await.ok();
+}
+
+/// The viewer is also served at a Unix socket, for tunnels.
+#[tokio::test(flavor = "multi_thread")]
+async fn unix_socket_serves_the_viewer() {
+    let folder = tempfile::tempdir().expect("expected a temporary folder");
+    let path = folder.path().join("socket");
+    let listen = ListenAddress::Unix(path.clone());
+    let _server = start_server(|config| Config { listen: [config.listen, vec![listen]].concat(), ..config }).await;
+    let mut socket = tokio::net::UnixStream::connect(&path).await.expect("expected a connection");
+    let request = format!("GET /?token={TOKEN} HTTP/1.1\r\nHost: localhost:8000\r\n\r\n");
+    socket.write_all(request.as_bytes()).await.expect("expected an open connection");
+    let mut answer = Vec::new();
+    with_timeout(socket.read_to_end(&mut answer)).await.expect("expected an answer");
+    assert!(answer.starts_with(b"HTTP/1.1 200"));
+}
