@@ -7,6 +7,7 @@ pub mod options;
 mod render;
 mod report;
 mod serve;
+mod view;
 
 use std::io::Write as _;
 
@@ -25,6 +26,7 @@ struct Cli {
 #[derive(Debug, Subcommand)]
 enum Command {
     Serve(serve::Args),
+    View(view::Args),
     Demo(demo::Args),
     Render(render::Args),
     Report(report::Args),
@@ -53,6 +55,7 @@ pub fn run() -> u8 {
     crate::telemetry::init_logging();
     let outcome = match cli.command {
         Command::Serve(args) => serve::run(&args),
+        Command::View(args) => view::run(&args),
         Command::Demo(args) => demo::run(&args),
         Command::Render(args) => render::run(&args),
         Command::Report(args) => report::run(&args),

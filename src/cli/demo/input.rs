@@ -9,16 +9,16 @@ use modalcast_model::load;
 use modalcast_model::scene::Scene;
 
 /// The scene that the demo runs, and the options with which the processes find its files.
-pub(super) struct DemoScene {
-    pub(super) scene: Arc<Scene>,
+pub(in crate::cli) struct DemoScene {
+    pub(in crate::cli) scene: Arc<Scene>,
     /// Name or path of the scene in the server's repository.
-    pub(super) source: String,
+    pub(in crate::cli) source: String,
     /// The server's repository. `None` for a built-in scene.
-    pub(super) repository: Option<PathBuf>,
+    pub(in crate::cli) repository: Option<PathBuf>,
     /// Vega's cubic polynomial of the internal forces (`.cub`), if a file with the model's name exists.
-    pub(super) cubic: Option<PathBuf>,
+    pub(in crate::cli) cubic: Option<PathBuf>,
     /// Vega's simulation settings (`.config`) beside `cubic`.
-    pub(super) vega_config: Option<PathBuf>,
+    pub(in crate::cli) vega_config: Option<PathBuf>,
 }
 
 impl DemoScene {
@@ -26,7 +26,7 @@ impl DemoScene {
     ///
     /// # Errors
     /// Those of loading the scene.
-    pub(super) fn find(source: &str) -> Result<Self> {
+    pub(in crate::cli) fn find(source: &str) -> Result<Self> {
         let scene = with_spinner("loading", || load::open(source))?.scene;
         Ok(Self::locate(scene, source, Path::new(".")))
     }

@@ -12,14 +12,15 @@ use std::time::{Duration, Instant};
 
 use clap::ValueEnum as _;
 
+pub(super) use self::input::DemoScene;
+pub(super) use self::processes::{Process, program_path};
+
 use super::options::with_spinner;
 use super::{Outcome, print_line};
 use crate::config::BackendChoice;
 use evaluation::Evaluation;
-use input::DemoScene;
 use modalcast_model::error::{Result, fault_in};
 use modalcast_model::scene::FrameSize;
-use processes::{Process, program_path};
 use step_records::StepRecords;
 
 /// Drives a scene with a physics process, receives its frames and vertices over the network, and checks them.

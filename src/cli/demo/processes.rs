@@ -18,7 +18,7 @@ const LINE_CAPACITY: usize = 1024;
 ///
 /// # Errors
 /// `Unavailable` when the program does not exist.
-pub(super) fn program_path(name: &str) -> Result<PathBuf> {
+pub(in crate::cli) fn program_path(name: &str) -> Result<PathBuf> {
     let executable = std::env::current_exe().map_err(fault_in("demo"))?;
     let path = executable.with_file_name(name);
     if path.exists() {
@@ -32,7 +32,7 @@ pub(super) fn program_path(name: &str) -> Result<PathBuf> {
 }
 
 /// A running child process. Dropping it kills the process.
-pub(super) struct Process {
+pub(in crate::cli) struct Process {
     name: &'static str,
     child: Child,
     lines: Receiver<String>,
@@ -41,7 +41,7 @@ pub(super) struct Process {
 
 impl Process {
     /// Starts a program, which inherits standard error. `name` is the name of the process in errors.
-    pub(super) fn start(
+    pub(in crate::cli) fn start(
         name: &'static str,
         program_path: &PathBuf,
         flags: &[impl AsRef<std::ffi::OsStr>],
@@ -65,7 +65,7 @@ impl Process {
     }
 
     /// Waits for a line that starts with `prefix`. Returns the rest of the line.
-    pub(super) fn wait_for(&mut self, prefix: &str, deadline: Instant) -> Result<String> {
+    pub(in crate::cli) fn wait_for(&mut self, prefix: &str, deadline: Instant) -> Result<String> {
         loop {
             let line = self.next_line(deadline, prefix)?;
             if let Some(rest) = line.strip_prefix(prefix) {
@@ -75,7 +75,7 @@ impl Process {
     }
 
     /// Waits until the process exits. Returns its last output line, which must be JSON.
-    pub(super) fn finish(mut self, deadline: Instant) -> Result<serde_json::Value> {
+    pub(in crate::cli) fn finish(mut self, deadline: Instant) -> Result<serde_json::Value> {
         let mut last_line = String::new();
         while let Some(line) = self.next_line_or_end(deadline, "the exit")? {
             last_line = line;
@@ -90,7 +90,7 @@ impl Process {
     }
 
     /// Sends SIGTERM and waits for at most 15 s. If the process is still running then, dropping it kills it.
-    pub(super) fn stop(&mut self) {
+    pub(in crate::cli) fn stop(&mut self) {
         if let Some(pid) = i32::try_from(self.child.id()).ok().and_then(Pid::from_raw) {
             kill_process(pid, Signal::TERM).ok(); // Fails only if the process has already exited.
         }

@@ -1,0 +1,143 @@
+//! `modalcast view`: runs a server with one scene and opens its viewer in the browser.
+
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+
+use super::demo::{DemoScene, Process, program_path};
+use super::serve::{TerminationSignals, start};
+use super::{Outcome, print_line};
+use crate::config::{BackendChoice, Config, ListenAddress, RendererChoice, ValidatedConfig};
+use crate::service::{self, Listener};
+use modalcast_model::error::{Result, fault, fault_in};
+
+/// The program that opens a URL in the user's browser (xdg-utils).
+const URL_OPENER: &str = "xdg-open";
+
+/// The physics process, in the folder of this program.
+const PHYSICS_PROGRAM: &str = "modalcast-sim";
+
+/// Shows a model in the browser. Runs a server with this scene until Ctrl-C.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:
+  modalcast view tree
+  modalcast view path/to/simpleBridge --no-sim
+  modalcast view model.glb --listen 0.0.0.0:50051   also for browsers on other machines")]
+pub(super) struct Args {
+    /// A built-in name, a folder with scene.toml, a .glb, .gltf, .obj, .ply, .stl or .npz file, or a folder with
+    /// one model.
+    model: String,
+    /// Address to listen on: IP:PORT, where port 0 selects a free port.
+    #[arg(long, env = "MODALCAST_LISTEN", default_value_t = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 0))]
+    listen: SocketAddr,
+    /// Print the URL and do not open a browser.
+    #[arg(long)]
+    no_open: bool,
+    /// Move the scene with the physics process `modalcast-sim auto`, which viewers can pull. Default: if the program is
+    /// beside this one.
+    #[arg(long, overrides_with = "no_sim")]
+    sim: bool,
+    /// Show the scene at rest, until another process drives it.
+    #[arg(long)]
+    no_sim: bool,
+    /// Deformation backend.
+    #[arg(long, value_enum, default_value_t)]
+    backend: BackendChoice,
+    /// OpenGL renderer.
+    #[arg(long, value_enum, default_value_t)]
+    renderer: RendererChoice,
+}
+
+impl Args {
+    fn config(&self, input: &DemoScene, state: &Path) -> Result<ValidatedConfig> {
+        Config {
+            listen: vec![ListenAddress::Tcp(self.listen)],
+            scenes: input.repository.clone(),
+            state: state.to_owned(),
+            backend: self.backend,
+            renderer: self.renderer,
+            ..Config::default()
+        }
+        .validated()
+    }
+
+    /// The physics program, if the scene is to be moved.
+    ///
+    /// # Errors
+    /// `Unavailable` when it is asked for and does not exist.
+    fn physics_program(&self) -> Result<Option<PathBuf>> {
+        match program_path(PHYSICS_PROGRAM) {
+            _ if self.no_sim => Ok(None),
+            Ok(path) => Ok(Some(path)),
+            Err(error) if self.sim => Err(error),
+            Err(_) => Ok(None),
+        }
+    }
+}
+
+pub(super) fn run(args: &Args) -> Outcome {
+    let input = DemoScene::find(&args.model)?;
+    // The server's state. The folder is removed when this value is dropped.
+    let state = tempfile::tempdir().map_err(fault_in("view"))?;
+    let config = args.config(&input, state.path())?;
+    let physics_program = args.physics_program()?;
+    let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().map_err(fault_in("view"))?;
+    let result = runtime.block_on(view(args, &input, config, physics_program));
+    // A frame that is being drawn must not delay the exit.
+    runtime.shutdown_background();
+    result.map(|()| true)
+}
+
+async fn view(args: &Args, input: &DemoScene, config: ValidatedConfig, physics_program: Option<PathBuf>) -> Result<()> {
+    let mut signals = TerminationSignals::install()?;
+    let open = async {
+        let (engine, listener) = start(config).await?;
+        let scene = engine.open(&input.source, "").await?;
+        Ok((engine, listener, scene.name.clone()))
+    };
+    let (engine, listener, scene) = tokio::select! {
+        opened = open => opened?,
+        () = signals.received() => return Ok(()),
+    };
+    // The server's sockets are open, so these programs wait until it serves them.
+    let url = viewer_url(&listener, &scene)?;
+    print_line(format!("open {url}"));
+    if !args.no_open && std::env::var_os("SSH_CONNECTION").is_none() {
+        open_browser(&url);
+    }
+    let mut physics = physics_program.map(|path| start_physics(&path, input, &listener, &scene)).transpose()?;
+    let result = service::serve(engine, listener, async move { signals.received().await }).await;
+    if let Some(physics) = &mut physics {
+        physics.stop();
+    }
+    result
+}
+
+/// The URL of the viewer that shows a scene. Names of scenes have only letters that are valid in a URL.
+fn viewer_url(listener: &Listener, scene: &str) -> Result<String> {
+    let url = listener.viewer_urls().into_iter().next();
+    url.map(|url| format!("{url}#scene={scene}")).ok_or_else(|| fault("view", "expected the URL of the viewer"))
+}
+
+fn start_physics(program: &PathBuf, input: &DemoScene, listener: &Listener, scene: &str) -> Result<Process> {
+    let server = listener.local_urls().into_iter().next().ok_or_else(|| fault("view", "expected an address"))?;
+    let mut flags = vec!["auto".to_owned(), "--server".into(), server, "--scene".into(), scene.into()];
+    flags.extend(["--wait", "30", "--seconds", "0", "--realtime", "--forces", "--delivery", "latest"].map(Into::into));
+    for (flag, path) in [("--cubic", &input.cubic), ("--config", &input.vega_config)] {
+        if let Some(path) = path {
+            flags.extend([flag.into(), path.to_string_lossy().into_owned()]);
+        }
+    }
+    Process::start("physics", program, &flags)
+}
+
+/// Opens a URL in the browser. A machine without a browser is not an error, because the URL is printed.
+fn open_browser(url: &str) {
+    let opener =
+        Command::new(URL_OPENER).arg(url).stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null()).spawn();
+    match opener {
+        // Waits for the end of the program, so that it does not remain as a zombie.
+        Ok(mut opener) => drop(std::thread::spawn(move || opener.wait())),
+        Err(error) => tracing::info!(%error, "no browser was opened"),
+    }
+}
