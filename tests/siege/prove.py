@@ -23,7 +23,7 @@ ITEMS = {
     11: (None, "quotas of scenes, uploads and disk"),
     12: ("floods", "floods of control frames, log records, names in errors"),
     13: (None, "panics, endless kernels and lost devices"),
-    14: (None, "HTTP/1, WebSocket and recordings"),
+    14: ("viewer_port", "HTTP/1.1 and WebSocket of the viewer"),
     15: (None, "fuzzing"),
     16: (None, "soak"),
 }
@@ -34,6 +34,7 @@ NOT_CLAIMED = {
     6: "the port answers before all scenes are open again; loads have a deadline and equal shares",
     9: "while no other frame is drawn, Mesa keeps the memory of the last one",
     12: "names in the errors of all loaders",
+    14: "hostile recordings, and enormous forces",
 }
 
 

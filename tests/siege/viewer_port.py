@@ -1,0 +1,283 @@
+"""Item 14: the viewer's port holds against other web pages, slow heads, hostile frames and viewers that never read."""
+
+import socket
+import tempfile
+import threading
+import time
+from pathlib import Path
+
+import websocket
+from client import DESCRIBE_SCENE, HEALTH_WATCH, Client, scenes_pb2, slowest_service, time_to_serve
+from replies import ALL_ARRAYS, SIDE, describe_whole
+from report import Result, mb
+from scenes import write_grid
+from server import Peak, Server
+from websocket import WebSocket
+
+ITEM = 14
+
+TOKEN = "0123456789abcdef"
+VIEWER = ["--viewer-token", TOKEN]
+
+# Seconds within which a new client must be served.
+ASKED_SERVICE = 1.0
+
+# The limit on connections of the server.
+CONNECTIONS = 1024
+
+# Each of so many connections sends a part of a message of so many bytes.
+HALF_SENT_CONNECTIONS = 48
+HALF_SENT_BYTES = 12 << 20
+ASKED_HALF_SENT = 256 << 20
+
+# Each of so many connections opens so many calls, and reads nothing.
+UNREAD_CONNECTIONS = 24
+UNREAD_CALLS = 32
+ASKED_UNREAD = 384 << 20
+DURATION = 12.0
+
+# Frames of each flood. A connection of the control sends so few that it must stay open.
+FLOOD = 100_000
+FEW = 1000
+ASKED_FLOOD = 32 << 20
+
+UNLIMITED = ["--connection-receive-bytes", "4000000000", "--receive-bytes", "4000000000"]
+UNLIMITED += ["--connection-reply-bytes", "4000000000", "--reply-bytes", "4000000000"]
+
+
+def other_pages(program):
+    """Requests that a page of another site can make, or that guess the token."""
+    with Server(program, *VIEWER) as server:
+        own = server.address
+        requests = []
+        for path, upgrade in [("/", False), ("/websocket", True)]:
+            for token in [None, "", "1123456789abcdef", TOKEN[:-1]]:
+                query = "" if token is None else f"?token={token}"
+                requests.append(websocket.request(server, path + query, upgrade=upgrade))
+            for host, origin in [
+                ("evil.example", None),
+                (f"evil.example:{server.port}", f"http://evil.example:{server.port}"),
+                (own, "http://evil.example"),
+                (own, "null"),
+                (own, f"https://{own}"),
+                (own, f"http://localhost:{server.port + 1}"),
+            ]:
+                requests.append(websocket.request(server, f"{path}?token={TOKEN}", host, origin, upgrade))
+        answers = [websocket.status_of(server, head) for head in requests]
+        control = [
+            websocket.status_of(server, websocket.request(server, f"/?token={TOKEN}")),
+            websocket.status_of(
+                server, websocket.request(server, f"/websocket?token={TOKEN}", own, f"http://{own}", True)
+            ),
+        ]
+    return Result(
+        ITEM,
+        "web pages of other sites and clients without the token get neither the viewer nor a WebSocket",
+        f"403 for {len(answers)} requests",
+        ", ".join(f"{answers.count(status)} x {status}" for status in sorted(set(answers))),
+        set(answers) == {403},
+        f"own page and WebSocket with the token: {control}",
+        control == [200, 101],
+    )
+
+
+def lockout(program, connect):
+    """The slowest service while many connections exist that `connect` opens, and how many of them the server closed."""
+    with Server(program, *VIEWER) as server:
+        connections = []
+        for _ in range(CONNECTIONS):
+            try:
+                connections.append(connect(server))
+            except OSError:
+                pass
+        slowest = slowest_service(server, 5, 4)
+        for connection in connections:
+            connection.close()
+        return slowest
+
+
+def slow_head(server):
+    connection = socket.create_connection(("127.0.0.1", server.port), timeout=10)
+    connection.sendall(f"GET /?token={TOKEN} HTTP/1.1\r\nHost: ".encode())
+    return connection
+
+
+def silent_websocket(server):
+    return WebSocket(server, TOKEN)
+
+
+def websocket_with_a_call(server):
+    connection = WebSocket(server, TOKEN)
+    connection.send(websocket.start_call(1, HEALTH_WATCH, b""))
+    connection.receive(0.02)
+    return connection
+
+
+def trickled_head(program):
+    """Seconds until a connection ends whose head arrives one byte at a time."""
+    with Server(program, *VIEWER) as server:
+        connection, start = slow_head(server), time.monotonic()
+        try:
+            while time.monotonic() - start < 60:
+                connection.sendall(b"x")
+                time.sleep(0.25)
+        except OSError:
+            pass
+        return time.monotonic() - start
+
+
+def slow_clients(program):
+    heads = lockout(program, slow_head)
+    silent = lockout(program, silent_websocket)
+    seconds = trickled_head(program)
+    control = lockout(program, websocket_with_a_call)
+    return Result(
+        ITEM,
+        f"{CONNECTIONS} slow HTTP heads or WebSockets without a call do not lock out a new client, and slow heads end",
+        f"served within {ASKED_SERVICE:.0f} s, a trickled head closed within 15 s",
+        f"slow heads {heads:.2f} s, silent WebSockets {silent:.2f} s, trickled head closed after {seconds:.1f} s",
+        max(heads, silent) <= ASKED_SERVICE and seconds <= 15,
+        f"{CONNECTIONS} WebSockets with an open call each, {control:.2f} s",
+        control > ASKED_SERVICE,
+    )
+
+
+def send_half(connection, is_fragmented):
+    part = bytes(HALF_SENT_BYTES // 12)
+    try:
+        for index in range(11):
+            if is_fragmented:
+                opcode = websocket.BINARY if index == 0 else websocket.CONTINUATION
+                connection.send(websocket.frame(opcode, part, is_last=False))
+            elif index == 0:
+                connection.send(websocket.frame(websocket.BINARY, part, claimed=HALF_SENT_BYTES))
+            else:
+                connection.send(part)
+    except OSError:
+        pass
+
+
+def half_sent(program, flags):
+    """Growth of the memory during half-sent messages, and the slowest service."""
+    with Server(program, *VIEWER, *flags) as server:
+        for _ in range(3):
+            time_to_serve(server, 10)
+        memory, slowest = Peak(server.memory), 0.0
+        connections = [WebSocket(server, TOKEN) for _ in range(HALF_SENT_CONNECTIONS)]
+        targets = [(connection, index % 2 == 0) for index, connection in enumerate(connections)]
+        threads = [threading.Thread(target=send_half, args=target) for target in targets]
+        for thread in threads:
+            thread.start()
+        while any(thread.is_alive() for thread in threads):
+            slowest = max(slowest, slowest_service(server, 0.1, 5, pause=0.02))
+            memory.sample()
+        memory.sample()
+        for connection in connections:
+            connection.close()
+        return memory.growth(), slowest
+
+
+def half_sent_messages(program):
+    growth, slowest = half_sent(program, [])
+    control, _ = half_sent(program, UNLIMITED)
+    return Result(
+        ITEM,
+        f"{HALF_SENT_CONNECTIONS} half-sent and fragmented WebSocket messages of {mb(HALF_SENT_BYTES)} use bounded memory",
+        f"memory +{mb(ASKED_HALF_SENT)}, new client served within {ASKED_SERVICE:.0f} s",
+        f"+{mb(growth)}, served within {slowest:.2f} s",
+        growth <= ASKED_HALF_SENT and slowest <= ASKED_SERVICE,
+        f"with the largest budgets +{mb(control)}",
+        control > ASKED_HALF_SENT,
+    )
+
+
+def unread(program, flags):
+    """Growth of the memory while viewers read nothing, and the slowest description for another client."""
+    request = scenes_pb2.DescribeSceneRequest(scene="grid", arrays=ALL_ARRAYS).SerializeToString()
+    with tempfile.TemporaryDirectory() as folder:
+        write_grid(Path(folder) / "grid.obj", SIDE)
+        with Server(program, *VIEWER, *flags, scenes=folder) as server:
+            with Client(server) as client:
+                client.open_scene("grid.obj", "grid")
+            describe_whole(server)
+            memory, slowest = Peak(server.memory), 0.0
+            connections = [WebSocket(server, TOKEN, receive_buffer=4096) for _ in range(UNREAD_CONNECTIONS)]
+            for connection in connections:
+                for call in range(UNREAD_CALLS):
+                    connection.send(websocket.start_call(call + 1, DESCRIBE_SCENE, request))
+            end = time.monotonic() + DURATION
+            while time.monotonic() < end:
+                slowest = max(slowest, describe_whole(server)[0])
+                memory.sample()
+                time.sleep(0.05)
+            for connection in connections:
+                connection.close()
+            return memory.growth(), slowest
+
+
+def unread_replies(program):
+    growth, slowest = unread(program, [])
+    control, _ = unread(program, UNLIMITED)
+    return Result(
+        ITEM,
+        f"{UNREAD_CONNECTIONS * UNREAD_CALLS} calls of viewers that never read use bounded memory, and another client is served",
+        f"memory +{mb(ASKED_UNREAD)}, a description within {ASKED_SERVICE:.0f} s",
+        f"+{mb(growth)}, {slowest:.2f} s",
+        growth <= ASKED_UNREAD and slowest <= ASKED_SERVICE,
+        f"with the largest budgets +{mb(control)}",
+        control > ASKED_UNREAD,
+    )
+
+
+FLOODS = [
+    ("PING", websocket.frame(websocket.PING, bytes(8))),
+    ("empty fragments", websocket.frame(websocket.CONTINUATION, b"", is_last=False)),
+    ("CREDIT", websocket.message(1, websocket.CREDIT, bytes(4))),
+]
+
+
+def flood(server, frame, count):
+    """Sends a frame many times and reads the answers. Returns whether the connection ends."""
+    connection = WebSocket(server, TOKEN)
+    try:
+        # A call that remains open, so that the connection has a message to continue and to give credit to.
+        connection.send(websocket.start_call(1, HEALTH_WATCH, b""))
+        if frame == FLOODS[1][1]:
+            connection.send(websocket.frame(websocket.BINARY, b"", is_last=False))
+        for _ in range(count // 500):
+            connection.send(frame * 500)
+            if not connection.receive(0.0005)[1]:
+                return True
+        return not connection.receive(0.5)[1]
+    except OSError:
+        return True
+    finally:
+        connection.close()
+
+
+def floods(program):
+    reached, passed = [], True
+    with Server(program, *VIEWER) as server:
+        time_to_serve(server, 10)
+        memory = Peak(server.memory)
+        for name, frame in FLOODS:
+            is_closed = flood(server, frame, FLOOD)
+            passed &= is_closed and time_to_serve(server, 5) <= ASKED_SERVICE
+            memory.sample()
+            reached.append(f"{name} {'closed' if is_closed else 'OPEN'}")
+        passed &= memory.growth() <= ASKED_FLOOD
+        is_control_closed = any([flood(server, frame, FEW) for _, frame in FLOODS])
+    return Result(
+        ITEM,
+        "floods of small WebSocket frames end their connection",
+        f"closed before {FLOOD} frames, memory +{mb(ASKED_FLOOD)}",
+        ", ".join(reached) + f"; +{mb(memory.growth())}",
+        passed,
+        f"{FEW} frames of each kind, {'closed' if is_control_closed else 'open'}",
+        not is_control_closed,
+    )
+
+
+def run(program):
+    checks = [other_pages, slow_clients, half_sent_messages, unread_replies, floods]
+    return [check(program) for check in checks]
