@@ -36,6 +36,7 @@ from modalcast.states import SceneState
 from modalcast.step_values import WorldPose
 from modalcast.upload import SceneBuilder
 from modalcast.vertices import VertexSet
+from modalcast.viewer import ViewerLink
 
 __version__ = "0.1.0"
 
@@ -85,6 +86,7 @@ __all__ = [
     "Texture",
     "Unavailable",
     "VertexSet",
+    "ViewerLink",
     "WorldPose",
     "at_pose",
     "connect",

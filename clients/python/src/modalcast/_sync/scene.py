@@ -42,6 +42,7 @@ from modalcast.scene_description import ArrayName, Domain, Domains, SceneDescrip
 from modalcast.states import SceneState, StateLayout
 from modalcast.v1 import common_pb2, forces_pb2, frames_pb2, scenes_pb2, states_pb2, vertices_pb2
 from modalcast.vertices import Attributes, VertexSet, check_out, vertex_selection
+from modalcast.viewer import ViewerLink, viewer_link
 
 if TYPE_CHECKING:
     from modalcast._sync.client import Client
@@ -100,6 +101,20 @@ class Scene:
     def __repr__(self) -> str:
         counts = f"{len(self.domains)} domains, {self.vertex_count} vertices, {self.coordinate_count} coordinates"
         return f"<Scene '{self.name}': {counts}>"
+
+    def view(self, *, height: int = 600) -> ViewerLink:
+        """The browser viewer of this scene, which a notebook shows. `ViewerLink.open` opens it in a browser.
+
+        The browser must reach the server at the address of this client. Through SSH, forward the port:
+        `ssh -L PORT:127.0.0.1:PORT HOST`.
+
+        Args:
+            height: Height in a notebook, in pixels.
+
+        Raises:
+            Unavailable: The viewer of the server is off, or the client uses a Unix socket.
+        """
+        return viewer_link(self.client.address, self.client.info.viewer_url_path, self.name, height)
 
     def describe(
         self,
