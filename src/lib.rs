@@ -55,6 +55,7 @@
 //! | `modalcast-model::tree` | the built-in scene: a tree of beams, the modes of the beams, and the surface mesh that they deform | `scene`, `domain`, `error` |
 //! | `modalcast-model::deform` | the trait of deformers | `scene`, `error` |
 //! | `modalcast-model::raster` | the trait of compute rasterizers, which replace OpenGL in selected passes | `scene`, `error` |
+//! | `modalcast-model::shared_memory` | the traits of device memory that OpenGL and CUDA share, and of its copies to the host | `error` |
 //! | `modalcast-model::backend_settings` | settings of deformers and rasterizers, which are not part of a scene | `scene` |
 //! | `modalcast-model::scene` | the set of domains, its memory layout and feature set; steps; cameras | `domain`, `error` |
 //! | `modalcast-model::domain` | mesh, modes U, material, texture; validated once, immutable | `error` |

@@ -4,9 +4,10 @@
 use serde_json::{Value, json};
 
 use super::{Outcome, print_line};
+use crate::engine::share_pictures;
 use modalcast_compute::gpu;
-use modalcast_model::error::fault_in;
-use modalcast_render::{DevicePreference, Renderer};
+use modalcast_model::error::{Result, fault_in};
+use modalcast_render::{DevicePreference, Renderer, RendererInfo};
 
 /// Checks the driver, CUDA devices, NVRTC, EGL devices and OpenGL; exit code 1 if no frame can be drawn.
 #[derive(Debug, clap::Args)]
@@ -31,7 +32,7 @@ pub(super) fn run(args: &Args) -> Outcome {
 
 /// Collects the report as JSON.
 pub(super) fn diagnose() -> Value {
-    let renderer = Renderer::open(DevicePreference::Any).map(|renderer| renderer.info().clone());
+    let renderer = open_renderer();
     let devices = modalcast_render::devices();
     let cuda = gpu::probe();
     json!({
@@ -41,9 +42,19 @@ pub(super) fn diagnose() -> Value {
         "cuda": cuda,
         "renderer": renderer.as_ref().ok(),
         "renderer_problem": renderer.as_ref().err().map(ToString::to_string),
+        "pixel_readback": renderer.as_ref().ok().map(|renderer| renderer.pixel_readback.to_string()),
         "egl_devices": devices.as_ref().ok(),
         "egl_problem": devices.as_ref().err().map(ToString::to_string),
     })
+}
+
+/// Opens a renderer as the server does, which also tests whether it can share memory with CUDA.
+fn open_renderer() -> Result<RendererInfo> {
+    let mut renderer = Renderer::open(DevicePreference::Any)?;
+    if let Ok(device) = gpu::Device::open(0) {
+        share_pictures(&mut renderer, &device)?;
+    }
+    Ok(renderer.info().clone())
 }
 
 /// Whether `--backend auto` would choose CUDA. It needs a CUDA device and an NVRTC version that supports it.
@@ -86,6 +97,7 @@ fn text_lines(report: &Value) -> Vec<String> {
         None => "none",
     };
     push_line("rendering", &rendering_mode.into(), "");
+    push_line("pixels leave", &report["pixel_readback"], "none");
     push_line("largest frame", &renderer["max_side"], "none");
     push_line("deforms on", &report["deforms_on"], "cpu");
     let verdict = if report["can_draw"] == true { "frames can be drawn" } else { "no frame can be drawn" };

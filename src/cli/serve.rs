@@ -207,7 +207,7 @@ fn log_devices(info: &EngineInfo) {
     tracing::info!("deforming on {} ({})", info.backend.name(), info.device);
     match &info.renderer {
         Ok(renderer) if renderer.software => tracing::warn!("drawing on the CPU: {}", renderer.renderer),
-        Ok(renderer) => tracing::info!("drawing on {}", renderer.renderer),
+        Ok(renderer) => tracing::info!("drawing on {}; pixels leave {}", renderer.renderer, renderer.pixel_readback),
         Err(error) => tracing::warn!("no frames can be drawn: {error}"),
     }
 }

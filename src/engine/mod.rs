@@ -20,7 +20,7 @@ mod storage;
 mod testing;
 
 pub use content::{ContentHash, ContentHashes, SceneContent, ShapeArray, hex, parse_hash};
-pub use device::context::{DeviceContext, EngineInfo};
+pub use device::context::{DeviceContext, EngineInfo, share_pictures};
 pub use device::loaded_scene::LoadedScene;
 pub use device::scalar_field::validate_mode;
 pub use output::encoding_task::EncodingTask;

@@ -11,4 +11,5 @@ pub mod error;
 pub mod load;
 pub mod raster;
 pub mod scene;
+pub mod shared_memory;
 pub mod tree;

@@ -58,10 +58,12 @@ pub use self::pass::{FrameTimes, Pass, RenderStage, TimeKey};
 pub use self::passes::aov::{Aov, AovImage, PartialAov};
 pub use self::passes::picking::{PendingPick, PickHit};
 pub use self::plan::{Allocation, OmittedFeature, RenderPlan, plan};
-pub use self::renderer::{MappedPixels, PartialFrame, PendingFrame, Renderer, ScenePreparation};
+pub use self::renderer::{
+    FramePixels, HeldPixels, MappedPixels, PartialFrame, PendingFrame, Renderer, ScenePreparation,
+};
 pub use self::resources::scene_buffers::SceneBuffers;
 pub use self::types::{
     BlurMethod, CullStats, DevicePreference, FrameCullStats, FrameImage, FrameInfo, FrameLook, FrameParams, FrameStats,
-    OitStats, RasterBackend, RasterBackends, RendererInfo, VisibilityId,
+    OitStats, PixelReadback, RasterBackend, RasterBackends, RendererInfo, VisibilityId,
 };
 pub use self::uniforms::frame::{shadow_clip_from_world, shadow_texel_axes};

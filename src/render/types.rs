@@ -31,6 +31,26 @@ pub struct RendererInfo {
     pub cuda_device: Option<i32>,
     /// Maximum width and height of a frame, in pixels.
     pub max_side: u32,
+    pub pixel_readback: PixelReadback,
+}
+
+/// How the pixels of a frame leave the device.
+#[derive(Debug, Clone, PartialEq, Eq, serde::Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum PixelReadback {
+    /// OpenGL draws into memory that it shares with CUDA, whose copy engine moves the pixels to the host.
+    CopyEngine,
+    /// OpenGL copies the pixels to a pixel buffer. The text is the reason why no memory is shared.
+    PixelBuffer(String),
+}
+
+impl fmt::Display for PixelReadback {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::CopyEngine => formatter.write_str("by CUDA's copy engine from memory shared with OpenGL"),
+            Self::PixelBuffer(reason) => write!(formatter, "by OpenGL: {reason}"),
+        }
+    }
 }
 
 /// Parameters of one frame. The geometry is the current content of the scene's buffers.
@@ -51,10 +71,10 @@ pub struct FrameParams {
 
 /// RGBA8 sRGB pixels of a frame, top row first.
 #[derive(Debug, Clone, PartialEq)]
-pub struct FrameImage {
+pub struct FrameImage<P = Vec<u8>> {
     pub width: u32,
     pub height: u32,
-    pub rgba: Vec<u8>,
+    pub rgba: P,
     pub times: FrameTimes,
     pub info: FrameInfo,
 }

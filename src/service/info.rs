@@ -83,6 +83,7 @@ mod tests {
             software: true,
             cuda_device: None,
             max_side: 1,
+            pixel_readback: modalcast_render::PixelReadback::CopyEngine,
         };
         let info = |renderer| EngineInfo { backend: Backend::Cpu, device: "none".into(), renderer };
         let always = [v1::Feature::ContentHashes, v1::Feature::UploadReuse, v1::Feature::UploadArrays];

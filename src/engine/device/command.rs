@@ -11,7 +11,7 @@ use modalcast_model::backend_settings::RasterPolicy;
 use modalcast_model::deform::{DeformSummary, DeformedSurface, VertexAttributes};
 use modalcast_model::error::{Error, Result};
 use modalcast_model::scene::{Camera, FrameSize, MeshEdges, PixelRect, Scene, SceneState};
-use modalcast_render::{AovImage, FrameImage, PickHit};
+use modalcast_render::{AovImage, FrameImage, FramePixels, PickHit};
 
 /// Identifies a loaded scene on the device thread.
 pub(in crate::engine) type SceneId = u64;
@@ -55,7 +55,7 @@ pub(in crate::engine) enum Command {
         camera: Camera,
         size: FrameSize,
         edges: Option<MeshEdges>,
-        reply: Reply<FrameImage>,
+        reply: Reply<FrameImage<FramePixels>>,
     },
     /// Renders an AOV (arbitrary output variable): values instead of colors, with a legend if they form a color map.
     RenderAov {

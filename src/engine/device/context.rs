@@ -1,6 +1,7 @@
 //! Device context: owns the deformation backend and the optional renderer, and loads scenes onto both
 //! ([`LoadedScene`]).
 
+use std::rc::Rc;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -10,7 +11,7 @@ use crate::engine::output::step_output::FrameOutput;
 use crate::frame::Legend;
 use crate::telemetry::ms_since;
 use modalcast_compute::cpu::CpuDeformer;
-use modalcast_compute::gpu::{self, CudaDeformer, CudaDeformerOptions, CudaRasterizer};
+use modalcast_compute::gpu::{self, CudaDeformer, CudaDeformerOptions, CudaPictureMemory, CudaRasterizer};
 use modalcast_compute::reference::ReferenceDeformer;
 use modalcast_model::backend_settings::{BackendSettings, BatchPolicy, RasterPolicy};
 use modalcast_model::deform::{Backend, Deformer};
@@ -134,7 +135,10 @@ impl DeviceContext {
     /// frame is requested.
     pub fn open(config: &Config) -> Result<Self> {
         let (backend, cuda_device, device_label) = open_backend(config)?;
-        let renderer = open_renderer(config, cuda_device.is_some());
+        let mut renderer = open_renderer(config, cuda_device.is_some());
+        if let (Ok(renderer), Some(device)) = (&mut renderer, &cuda_device) {
+            share_pictures(renderer, device)?;
+        }
         let info = EngineInfo {
             backend,
             device: device_label,
@@ -535,6 +539,18 @@ impl DeviceContext {
             renderer.unload(buffers);
         }
     }
+}
+
+/// Lets the renderer draw into memory that it shares with CUDA, if both use the same device and the memory passes the
+/// renderer's check.
+///
+/// # Errors
+/// `DeviceLost`; `Fault` when CUDA refuses a stream.
+pub fn share_pictures(renderer: &mut Renderer, device: &Arc<gpu::Device>) -> Result<()> {
+    if renderer.info().cuda_device.is_some() {
+        renderer.share_pictures(Rc::new(CudaPictureMemory::new(device)?))?;
+    }
+    Ok(())
 }
 
 /// Opens the configured backend. Returns it with its CUDA device, if any, and [`EngineInfo::device`].

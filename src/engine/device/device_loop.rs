@@ -55,7 +55,7 @@ use super::partial_output::{Charge, PartialOutput};
 use crate::telemetry::ms_since;
 use modalcast_model::deform::{VertexAttributes, VertexReadback};
 use modalcast_model::error::{Result, fault, fault_in};
-use modalcast_render::{FrameImage, MAX_FRAMES_IN_FLIGHT, PendingPick, PickHit};
+use modalcast_render::{FrameImage, FramePixels, MAX_FRAMES_IN_FLIGHT, PendingPick, PickHit};
 
 /// How long the thread waits for a frame before it checks the command queue again.
 const POLL_INTERVAL: Duration = Duration::from_micros(100);
@@ -85,7 +85,7 @@ pub(super) struct DeviceLoop {
     partial_outputs: HashMap<SceneId, PartialOutput>,
     vertices: InFlightQueue<PendingVertices, CopiedVertices>,
     picks: InFlightQueue<PendingPick, Vec<PickHit>>,
-    frames: InFlightQueue<FrameInFlight, FrameImage>,
+    frames: InFlightQueue<FrameInFlight, FrameImage<FramePixels>>,
     /// When the targets were last checked.
     last_target_check: Instant,
 }
@@ -369,7 +369,7 @@ impl DeviceLoop {
         answer(reply, self.loss.record_loss(hits));
     }
 
-    /// Waits for the oldest frame in flight; a copy thread then copies and sends its pixels.
+    /// Waits for the oldest frame in flight; a copy thread then copies its pixels if necessary, and sends them.
     fn finish_oldest_frame(&mut self) {
         let Some(InFlight { pending, reply }) = self.frames.pop_oldest() else { return };
         if reply.is_closed() {
@@ -382,7 +382,7 @@ impl DeviceLoop {
             self.record_output_cost(id, charge, charge.spent_ms.max(pixels.times().drawing_ms()));
         }
         match self.loss.record_loss(pixels) {
-            Ok(pixels) => self.copy_pool.spawn(move || run_caught(|| answer(reply, Ok(pixels.into_image())))),
+            Ok(pixels) => self.copy_pool.spawn(move || run_caught(|| answer(reply, Ok(pixels.into_shared_image())))),
             Err(error) => answer(reply, Err(error)),
         }
     }

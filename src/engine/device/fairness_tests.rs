@@ -17,7 +17,7 @@ use crate::engine::testing;
 use modalcast_model::backend_settings::BackendSettings;
 use modalcast_model::error::{Error, Result};
 use modalcast_model::scene::{Camera, FrameSize, Scene, SceneState};
-use modalcast_render::FrameImage;
+use modalcast_render::{FrameImage, FramePixels};
 
 const LARGE: FrameSize = FrameSize::new(192, 512);
 const SMALL: FrameSize = FrameSize::new(32, 32);
@@ -78,7 +78,7 @@ impl Fixture {
         fixture
     }
 
-    fn draw(&self, id: SceneId, size: FrameSize) -> PendingReply<FrameImage> {
+    fn draw(&self, id: SceneId, size: FrameSize) -> PendingReply<FrameImage<FramePixels>> {
         self.handle.begin_draw(id, Camera::fit_to_scene(&self.scene, size.width, size.height), size, None)
     }
 

@@ -18,7 +18,7 @@ use modalcast_model::backend_settings::BackendSettings;
 use modalcast_model::deform::{DeformSummary, VertexAttributes};
 use modalcast_model::error::{Error, Result, fault, fault_in};
 use modalcast_model::scene::{Camera, FrameSize, MeshEdges, PixelRect, Scene, SceneState};
-use modalcast_render::{AovImage, FrameImage, PickHit};
+use modalcast_render::{AovImage, FrameImage, FramePixels, PickHit};
 
 /// Sends commands to the device thread. The thread ends when the last clone is dropped.
 #[derive(Debug, Clone)]
@@ -138,7 +138,7 @@ impl DeviceHandle {
         camera: Camera,
         size: FrameSize,
         edges: Option<MeshEdges>,
-    ) -> PendingReply<FrameImage> {
+    ) -> PendingReply<FrameImage<FramePixels>> {
         self.submit(|reply| Command::Draw { id, camera, size, edges, reply })
     }
 

@@ -10,7 +10,7 @@ use super::context::{DeviceContext, PartialAovDraw, PartialDraw};
 use super::loaded_scene::LoadedScene;
 use crate::frame::Legend;
 use modalcast_model::error::{Error, Result};
-use modalcast_render::{AovImage, FrameImage, ScenePreparation};
+use modalcast_render::{AovImage, FrameImage, FramePixels, ScenePreparation};
 
 /// Device time of an output.
 #[derive(Debug, Clone, Copy)]
@@ -34,7 +34,7 @@ pub(super) struct PartialOutput {
 
 #[expect(clippy::large_enum_variant, reason = "there is at most one per scene, and most are frames")]
 pub(super) enum PartialKind {
-    Frame(PartialDraw, Reply<FrameImage>),
+    Frame(PartialDraw, Reply<FrameImage<FramePixels>>),
     Aov(PartialAovDraw, Reply<(AovImage, Option<Legend>)>),
     /// The textures and programs of the scene, which the next command of the scene needs.
     Preparation(ScenePreparation),

@@ -242,11 +242,11 @@ pub(in crate::engine) mod tests {
     /// A frame of noise, so that encoding its PNG takes time. `number` is the step number and the seed.
     pub(in crate::engine) fn noise_frame(number: u64, side: u32) -> StepOutput {
         let mut random = fastrand::Rng::with_seed(number);
-        let rgba = (0..side * side).flat_map(|_| [random.u8(..), random.u8(..), random.u8(..), 255]).collect();
+        let rgba: Vec<u8> = (0..side * side).flat_map(|_| [random.u8(..), random.u8(..), random.u8(..), 255]).collect();
         let image = FrameImage {
             width: side,
             height: side,
-            rgba,
+            rgba: rgba.into(),
             times: modalcast_render::FrameTimes::default(),
             info: FrameInfo::default(),
         };

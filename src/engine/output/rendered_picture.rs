@@ -9,7 +9,7 @@ use super::frame_format::FrameFormat;
 use crate::engine::lock::lock;
 use crate::frame::Legend;
 use crate::telemetry::{Stage, StageTimes};
-use modalcast_render::{AovImage, FrameImage, FrameInfo, FrameTimes, RenderStage, TimeKey};
+use modalcast_render::{AovImage, FrameImage, FrameInfo, FramePixels, FrameTimes, RenderStage, TimeKey};
 
 /// The pixels of one picture of a step. All readers of equal pictures share them, and share each encoding, which is
 /// computed once, on first use.
@@ -71,10 +71,14 @@ impl RenderedPicture {
     }
 }
 
-impl From<FrameImage> for RenderedPicture {
-    fn from(image: FrameImage) -> Self {
+impl From<FrameImage<FramePixels>> for RenderedPicture {
+    fn from(image: FrameImage<FramePixels>) -> Self {
         let FrameImage { width, height, rgba, times, info } = image;
-        let (pixels, stages) = (Pixels::Color(rgba.into()), stage_times(&times));
+        let bytes = match rgba {
+            FramePixels::Copied(bytes) => bytes.into(),
+            FramePixels::Held(pixels) => Bytes::from_owner(pixels),
+        };
+        let (pixels, stages) = (Pixels::Color(bytes), stage_times(&times));
         Self { width, height, pixels, stages, info, encodings: Mutex::default() }
     }
 }

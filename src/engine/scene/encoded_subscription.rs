@@ -209,7 +209,7 @@ mod tests {
         let large_image = modalcast_render::FrameImage {
             width: 1,
             height: 1,
-            rgba: vec![0; MAX_PIXEL_BYTES],
+            rgba: vec![0; MAX_PIXEL_BYTES].into(),
             times: modalcast_render::FrameTimes::default(),
             info: modalcast_render::FrameInfo::default(),
         };

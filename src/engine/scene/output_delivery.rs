@@ -212,7 +212,7 @@ mod tests {
     use crate::engine::output::step_output::{FrameOutput, OutputBody, OutputSpec, PictureSpec, StepOutput};
     use crate::engine::testing;
     use modalcast_model::scene::{Camera, FrameSize, SceneState};
-    use modalcast_render::{FrameImage, FrameInfo};
+    use modalcast_render::{FrameImage, FrameInfo, FramePixels};
 
     const WITHOUT_NEXT_STEP: DeliveryMode = DeliveryMode { applies_back_pressure: false, overlaps_next_step: false };
     const WITH_NEXT_STEP: DeliveryMode = DeliveryMode { overlaps_next_step: true, ..WITHOUT_NEXT_STEP };
@@ -227,7 +227,7 @@ mod tests {
     /// A frame that was requested from the device.
     struct DrawRequest {
         width: u32,
-        reply: Reply<FrameImage>,
+        reply: Reply<FrameImage<FramePixels>>,
     }
 
     /// Creates the delivery of a scene to some subscribers, and the receiver of its device commands.
@@ -270,7 +270,7 @@ mod tests {
             .send(Ok(FrameImage {
                 width,
                 height: 8,
-                rgba: vec![],
+                rgba: vec![].into(),
                 times: modalcast_render::FrameTimes::default(),
                 info: FrameInfo::default(),
             }))

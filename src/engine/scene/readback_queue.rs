@@ -39,7 +39,7 @@ use crate::engine::output::step_vertices::StepVertices;
 use crate::telemetry::{Stage, StageTimes};
 use modalcast_model::error::Result;
 use modalcast_model::scene::FloatingOrigins;
-use modalcast_render::FrameImage;
+use modalcast_render::{FrameImage, FramePixels};
 
 /// A subscriber that waits for one result of the current step.
 #[derive(Debug)]
@@ -172,7 +172,7 @@ impl<T, R> InFlight<T, R> {
 
 enum Readback {
     Vertices(InFlight<CopiedVertices, Recipient>),
-    Picture(Box<PictureSpec>, InFlight<FrameImage, PictureRecipient>),
+    Picture(Box<PictureSpec>, InFlight<FrameImage<FramePixels>, PictureRecipient>),
     /// No recipient waits any longer, so the command to the device is cancelled.
     Cancelled,
 }
@@ -200,7 +200,7 @@ impl PendingReadback {
     pub(super) fn of_picture(
         current: &CurrentStep,
         spec: PictureSpec,
-        reply: PendingReply<FrameImage>,
+        reply: PendingReply<FrameImage<FramePixels>>,
         recipient: PictureRecipient,
     ) -> Self {
         Self::new(current, Readback::Picture(Box::new(spec), InFlight::new(reply, vec![recipient])))

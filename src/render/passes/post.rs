@@ -63,14 +63,14 @@ pub(crate) fn bloom(
     recorder.finish(Pass::Bloom)
 }
 
-/// Encodes a band of the scene color to sRGB bytes in the readback source.
+/// Encodes a band of the scene color to sRGB bytes in the shared picture of the frame, or in the readback source.
 pub(crate) fn encode(recorder: &mut PassRecorder<'_>, frame: &FrameContext<'_>, band: Band) -> Result<()> {
     let (target, program) = (frame.target, frame.encode);
     recorder.begin(Pass::Encode);
     program.bind(None);
     program.set_first_row(band.first_row);
     target.scene_color.bind(SOURCE_UNIT);
-    target.readback_source.bind_storage(WORDS_BINDING);
+    frame.picture.unwrap_or(&target.readback_source).bind_storage(WORDS_BINDING);
     recorder.gl.dispatch(target.desc.width.div_ceil(WORKGROUP_SIZE), band.rows);
     recorder.finish(Pass::Encode)
 }

@@ -82,30 +82,32 @@ pub(crate) fn read_visibility(
     copy_words(recorder, &target.readback_source, &word_pass)
 }
 
-/// Copies as many rows of a frame as a band has to a staging buffer; with the last band, also the fragment and culling
-/// counters.
+/// Copies as many rows of a frame as a band has to a staging buffer, unless the frame has a shared picture. With the last
+/// band, also copies the fragment and culling counters behind the pixels.
 pub(crate) fn copy_frame(
     recorder: &PassRecorder<'_>,
     frame: &FrameContext<'_>,
-    staging: &Buffer,
+    staging: Option<&Buffer>,
     band: Band,
 ) -> Result<()> {
     let FrameContext { buffers, target, .. } = *frame;
     recorder.begin(Pass::Read);
-    let [source_offset, bytes] =
-        [band.first_row, band.rows].map(|rows| 4 * u64::from(target.desc.width) * u64::from(rows));
-    let source = &target.readback_source;
-    recorder.gl.copy(BufferCopy { source, source_offset, target: staging, target_offset: source_offset, bytes });
-    if !band.is_last() {
-        return recorder.check(Pass::Read);
+    if let Some(staging) = staging {
+        let [source_offset, bytes] =
+            [band.first_row, band.rows].map(|rows| 4 * u64::from(target.desc.width) * u64::from(rows));
+        let source = &target.readback_source;
+        recorder.gl.copy(BufferCopy { source, source_offset, target: staging, target_offset: source_offset, bytes });
     }
+    let Some(pixels) = staging.or(frame.picture).filter(|_| band.is_last()) else {
+        return recorder.check(Pass::Read);
+    };
     let counters = [
         target.oit.as_ref().map(|oit| &oit.counters),
         buffers.cull_resources.as_ref().map(|cull_resources| &cull_resources.buffers.counters),
     ];
     for (source, range) in counters.into_iter().zip(target.desc.readback_ranges()) {
         if let Some(source) = source.filter(|_| !range.is_empty()) {
-            let copy = BufferCopy::first(range.end - range.start, source, staging);
+            let copy = BufferCopy::first(range.end - range.start, source, pixels);
             recorder.gl.copy(BufferCopy { target_offset: range.start, ..copy });
         }
     }

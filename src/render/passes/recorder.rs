@@ -3,7 +3,7 @@
 use std::rc::Rc;
 
 use super::accesses::{barrier_before, barrier_within};
-use crate::device::gl::{Gl, Program};
+use crate::device::gl::{Buffer, Gl, Program};
 use crate::pass::Pass;
 use crate::resources::programs::SampleCountPrograms;
 use crate::resources::scene_buffers::SceneBuffers;
@@ -20,6 +20,8 @@ pub(crate) struct FrameContext<'a> {
     /// Encodes the frame, with its antialiasing.
     pub(crate) encode: &'a Program,
     pub(crate) params: &'a FrameParams,
+    /// The shared picture of the frame; `None` if the encode pass writes the readback source of the target.
+    pub(crate) picture: Option<&'a Buffer>,
 }
 
 /// Issues the barriers of passes, checks for errors, and collects statistics.

@@ -60,20 +60,19 @@ impl Renderer {
         let _current = self.gl.make_current()?;
         pending_frame.wait()?;
         let PendingFrame { desc, slot, passes, mut stats, info, .. } = pending_frame;
-        let staging = slot.as_ref().and_then(ReadbackSlot::staging);
-        if let Some(staging) = staging {
+        let mut view = slot.as_ref().map_or(Ok(None), ReadbackSlot::view)?;
+        if let Some(view) = &mut view {
             let [oit_range, cull_range] = desc.readback_ranges().map(|range| range.start as usize..range.end as usize);
-            let read_range =
-                |range: Range<usize>| if range.is_empty() { Ok(None) } else { staging.read(range).map(Some) };
+            let counters_in = |range: Range<usize>| view.bytes().get(range).filter(|counters| !counters.is_empty());
             (stats.oit, stats.culled) = (
-                read_range(oit_range)?.map(|counters| layout::oit::parse_counters(&counters)),
-                read_range(cull_range)?.map(|counts| layout::cull::parse_counters(&counts)),
+                counters_in(oit_range).map(layout::oit::parse_counters),
+                counters_in(cull_range).map(layout::cull::parse_counters),
             );
+            view.truncate(desc.frame_bytes() as usize);
         }
         // If the compute rasterizer drew the visibility, there are no camera counts. Then the shadow counts are
         // dropped, too.
         stats.culled = stats.culled.filter(|_| stats.raster_backends.visibility != Some(RasterBackend::Cuda));
-        let view = staging.map(|staging| staging.view(desc.frame_bytes() as usize)).transpose()?;
         self.gl.check(Pass::Read.name())?;
         warn_of_dropped_fragments(&self.stats, &stats);
         if let Some(culled) = &stats.culled {

@@ -23,7 +23,7 @@ use std::time::{Duration, Instant};
 use rayon::{ThreadPool, ThreadPoolBuilder};
 
 pub use self::partial_frame::PartialFrame;
-pub use self::pending_frame::{MappedPixels, PendingFrame};
+pub use self::pending_frame::{FramePixels, HeldPixels, MappedPixels, PendingFrame};
 pub use self::preparation::ScenePreparation;
 use crate::device::{self, gl, gl::Gl};
 use crate::passes::aov::{Aov, AovImage, AovReader, PartialAov};
@@ -35,12 +35,13 @@ use crate::resources::scene_buffers::{RebasedPositions, SceneBuffers, VertexValu
 use crate::resources::target::RenderTarget;
 use crate::resources::target_desc::{TargetDesc, sample_positions};
 use crate::shaders;
-use crate::types::{BlurMethod, DevicePreference, FrameParams, FrameStats, RendererInfo, VisibilityId};
+use crate::types::{BlurMethod, DevicePreference, FrameParams, FrameStats, PixelReadback, RendererInfo, VisibilityId};
 use crate::uniforms::frame::FrameUniforms;
 use modalcast_model::deform::DeformedSurface;
-use modalcast_model::error::{Result, fault, fault_in, invalid};
+use modalcast_model::error::{Error, Result, fault, fault_in, invalid};
 use modalcast_model::raster::{RasterGeometry, Rasterizer};
 use modalcast_model::scene::{PixelRect, Scene};
+use modalcast_model::shared_memory::PictureMemory;
 
 /// Maximum width and height of a frame in pixels, also on devices that support more.
 const MAX_SIDE: u32 = 8192;
@@ -67,6 +68,8 @@ pub struct Renderer {
     /// Sample positions within a pixel with four samples; empty on a device without 4x multisampling.
     sample_positions: Vec<[f32; 2]>,
     blur_method: BlurMethod,
+    /// Allocates the memory of pictures that OpenGL shares with CUDA, after it has passed the check.
+    picture_memory: Option<Rc<dyn PictureMemory>>,
     /// Cached render targets, least recently used first.
     targets: Vec<RenderTarget>,
     stats: FrameStats,
@@ -114,6 +117,7 @@ impl Renderer {
             software: gl.limits.software,
             cuda_device,
             max_side: gl.limits.max_side.min(MAX_SIDE),
+            pixel_readback: PixelReadback::PixelBuffer("CUDA is not used".into()),
         };
         let cores = std::thread::available_parallelism().map_or(1, NonZero::get);
         let preparation_pool = ThreadPoolBuilder::new()
@@ -128,6 +132,7 @@ impl Renderer {
             programs: ProgramCache::new(&gl),
             sample_positions: sample_positions(&gl)?,
             blur_method: BlurMethod::default(),
+            picture_memory: None,
             targets: Vec::new(),
             stats: FrameStats::default(),
             last_frame: None,
@@ -149,6 +154,37 @@ impl Renderer {
     /// Statistics of the last frame whose pixels were read or mapped.
     pub const fn stats(&self) -> &FrameStats {
         &self.stats
+    }
+
+    /// Draws later frames into memory of CUDA, whose copy engine moves the pixels to the host. Before that, checks that both
+    /// APIs see what the other one writes. If the check fails, logs the reason, and OpenGL copies the pixels.
+    /// [`RendererInfo::pixel_readback`] tells the result.
+    ///
+    /// # Errors
+    /// `DeviceLost`.
+    pub fn share_pictures(&mut self, picture_memory: Rc<dyn PictureMemory>) -> Result<()> {
+        self.info.pixel_readback = match self.check_picture_memory(picture_memory.as_ref()) {
+            Ok(()) => {
+                // Targets with staging buffers.
+                self.targets.clear();
+                self.picture_memory = Some(picture_memory);
+                PixelReadback::CopyEngine
+            }
+            Err(lost @ Error::DeviceLost { .. }) => return Err(lost),
+            Err(error) => {
+                tracing::warn!(%error, "OpenGL copies the pixels: no memory that CUDA and OpenGL share");
+                PixelReadback::PixelBuffer(error.to_string())
+            }
+        };
+        Ok(())
+    }
+
+    fn check_picture_memory(&self, picture_memory: &dyn PictureMemory) -> Result<()> {
+        if self.info.cuda_device.is_none() {
+            return Err(fault("shared memory", format!("{} is not a CUDA device", self.info.renderer)));
+        }
+        let _current = self.gl.make_current()?;
+        gl::check_sharing(&self.gl, picture_memory)
     }
 
     /// Selects the implementation of the shadow blur for all scenes that are loaded after this call.
@@ -408,7 +444,7 @@ impl Renderer {
         if self.targets.len() >= MAX_TARGETS {
             self.targets.remove(0);
         }
-        self.targets.push(RenderTarget::new(&self.gl, desc)?);
+        self.targets.push(RenderTarget::new(&self.gl, desc, self.picture_memory.clone())?);
         Ok(())
     }
 }

@@ -42,7 +42,7 @@ pub struct PartialFrame {
     target: RenderTarget,
     programs: SampleCountPrograms,
     encode: Rc<Program>,
-    /// The slot of the staging buffer; none for a frame whose pixels are not read back.
+    /// The slot of the readback; none for a frame whose pixels are not read back.
     slot: Option<ReadbackSlot>,
     stats: FrameStats,
     info: FrameInfo,
@@ -194,7 +194,8 @@ impl Renderer {
         } else {
             passes::uniforms::upload(&recorder, buffers, params, uniforms);
         }
-        let frame = FrameContext { buffers, target, programs, encode, params };
+        let picture = slot.as_ref().and_then(ReadbackSlot::picture);
+        let frame = FrameContext { buffers, target, programs, encode, params, picture };
         let has_breaks = partial_frame.has_breaks;
         while let Some(step) = steps.pop_front() {
             match step {
@@ -330,8 +331,7 @@ fn record(
         (BandPass::Bloom(step, band), _) => passes::post::bloom(recorder, frame, step, band),
         (BandPass::Encode(band), _) => passes::post::encode(recorder, frame, band),
         (BandPass::Read(band), _) => {
-            let staging = slot.and_then(ReadbackSlot::staging);
-            staging.map_or(Ok(()), |staging| passes::readback::copy_frame(recorder, frame, &staging.buffer, band))
+            passes::readback::copy_frame(recorder, frame, slot.and_then(ReadbackSlot::staging), band)
         }
         // Passes that OpenGL or a frame without fragment lists does not have.
         (BandPass::RecordVisible | BandPass::OitCount(_), _) | (BandPass::OitSumCounts | BandPass::OitBlend(_), _) => {

@@ -19,7 +19,7 @@ const COPY_CHUNK_BYTES: usize = 1 << 20;
 #[derive(Debug)]
 pub struct PendingFrame {
     pub(super) desc: TargetDesc,
-    /// The slot of the staging buffer; none for a frame whose pixels are not read back.
+    /// The slot of the readback; none for a frame whose pixels are not read back.
     pub(super) slot: Option<ReadbackSlot>,
     pub(super) fence: Fence,
     /// Passes in execution order, each with its timer.
@@ -33,8 +33,8 @@ pub struct PendingFrame {
     pub(super) first_wait: Cell<Option<Instant>>,
 }
 
-/// Pixels of a finished frame in a mapped staging buffer. Any thread may copy them. No other frame
-/// can use the staging buffer while this value exists, so copy the pixels soon.
+/// Pixels of a finished frame in host-readable memory. Any thread may read them. No other frame can use the memory while
+/// this value exists, so copy the pixels soon, or let [`MappedPixels::into_shared_image`] decide.
 #[derive(Debug)]
 pub struct MappedPixels {
     pub(super) width: u32,
@@ -42,6 +42,44 @@ pub struct MappedPixels {
     pub(super) view: Option<ReadbackView>,
     pub(super) times: FrameTimes,
     pub(super) info: FrameInfo,
+}
+
+/// The RGBA8 pixels of a frame, in memory of their own or in that of the readback.
+#[derive(Debug)]
+pub enum FramePixels {
+    Copied(Vec<u8>),
+    Held(HeldPixels),
+}
+
+/// Pixels in the memory of a readback. No other frame can use the memory while this value exists.
+#[derive(Debug)]
+pub struct HeldPixels(ReadbackView);
+
+impl AsRef<[u8]> for HeldPixels {
+    fn as_ref(&self) -> &[u8] {
+        self.0.bytes()
+    }
+}
+
+impl AsRef<[u8]> for FramePixels {
+    fn as_ref(&self) -> &[u8] {
+        match self {
+            Self::Copied(bytes) => bytes,
+            Self::Held(pixels) => pixels.as_ref(),
+        }
+    }
+}
+
+impl From<Vec<u8>> for FramePixels {
+    fn from(bytes: Vec<u8>) -> Self {
+        Self::Copied(bytes)
+    }
+}
+
+impl PartialEq for FramePixels {
+    fn eq(&self, other: &Self) -> bool {
+        self.as_ref() == other.as_ref()
+    }
 }
 
 impl PendingFrame {
@@ -53,7 +91,11 @@ impl PendingFrame {
     /// Waits at most `timeout` for the frame and returns whether it is ready. A frame that exceeds its own time limit
     /// counts as ready: retrieving it reports the timeout.
     pub fn is_ready_within(&self, timeout: Duration) -> bool {
-        self.time_left().is_zero() || self.fence.is_done_within(timeout)
+        self.time_left().is_zero()
+            || match &self.slot {
+                Some(slot) => slot.is_ready_within(&self.fence, timeout),
+                None => self.fence.is_done_within(timeout),
+            }
     }
 
     /// Remaining time until the frame's time limit. The clock starts at the first poll or wait.
@@ -92,6 +134,20 @@ impl MappedPixels {
     pub fn with_upload_time(mut self, ms: f64) -> Self {
         self.times.insert_first(RenderStage::Upload, ms);
         self
+    }
+
+    /// The pixels, held in the memory of the readback if enough of it is left for the next frames, else copied.
+    pub fn into_shared_image(self) -> FrameImage<FramePixels> {
+        let Self { width, height, view, times, info } = self;
+        match view {
+            Some(view) if view.can_be_held() => {
+                FrameImage { width, height, rgba: FramePixels::Held(HeldPixels(view)), times, info }
+            }
+            view => {
+                let FrameImage { rgba, times, .. } = Self { width, height, view, times, info }.into_image();
+                FrameImage { width, height, rgba: FramePixels::Copied(rgba), times, info }
+            }
+        }
     }
 
     /// Copies the pixels, with several threads if there are many.

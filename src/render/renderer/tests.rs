@@ -7,16 +7,18 @@ use std::sync::Arc;
 use std::thread;
 use std::time::Duration;
 
-use super::{MappedPixels, Renderer};
+use super::{FramePixels, MappedPixels, Renderer};
 use crate::device;
-use crate::device::readback_ring::MAX_FRAMES_IN_FLIGHT;
+use crate::device::gl::UnsharedMemory;
+use crate::device::readback_ring::{MAX_FRAMES_IN_FLIGHT, ReadbackRing};
 use crate::pass::Pass;
 use crate::scene_data::geometry::tests::squares;
-use crate::{DevicePreference, FrameImage, FrameParams, SceneBuffers};
+use crate::{DevicePreference, FrameImage, FrameParams, PixelReadback, SceneBuffers};
 use modalcast_model::deform::DeformedSurface;
 use modalcast_model::domain::{AlphaMode, Material};
 use modalcast_model::error::Error;
 use modalcast_model::scene::{Camera, Scene, Transparency};
+use modalcast_model::shared_memory::PictureMemory;
 
 /// A renderer that behaves as on hardware. A software renderer waits after every pass to time it; this one times passes
 /// with queries, so that submitted frames stay in flight.
@@ -121,6 +123,91 @@ fn frames_in_flight_are_limited_per_target() {
     }
     // A readback of ids does not use the ring of the frames.
     assert!(!renderer.read_visibility().expect("ids of the last frame").is_empty());
+}
+
+/// Draws a frame, so that the renderer has its target, and lets later frames of this target use emulated shared pictures.
+fn use_emulated_pictures(renderer: &mut Renderer, buffers: &SceneBuffers, params: &FrameParams) {
+    renderer.draw(buffers, params).expect("draws");
+    let target = renderer.targets.last_mut().expect("drawn");
+    let [_, cull_range] = target.desc.readback_ranges();
+    target.readback_ring = ReadbackRing::of_emulated_pictures(&renderer.gl, cull_range.end);
+}
+
+#[test]
+fn frames_in_shared_pictures_have_the_same_pixels_and_counts() {
+    let (mut renderer, scene, buffers) = load_renderer();
+    let params = params(&scene, 64);
+    for band_samples in [u64::MAX, 64 * 16 * 4] {
+        renderer.set_max_band_samples(band_samples);
+        use_emulated_pictures(&mut renderer, &buffers, &params);
+        let mut pending_frames = Vec::new();
+        for extra_width in [0.0, 0.2, 0.6] {
+            renderer.upload(&buffers, &surface(extra_width)).expect("uploads");
+            pending_frames.push(renderer.submit(&buffers, &params).expect("submits"));
+        }
+        let error = renderer.submit(&buffers, &params).expect_err("three frames in flight");
+        assert_eq!(error, Error::Busy { queue: "frames in flight", limit: 3 });
+        for (pending_frame, extra_width) in pending_frames.into_iter().zip([0.0, 0.2, 0.6]) {
+            while !pending_frame.is_ready() {
+                thread::yield_now();
+            }
+            let image = renderer.read_image(pending_frame).expect("draws");
+            let (rgba, fragments) = draw_frame(extra_width);
+            assert!(image.rgba == rgba, "{extra_width}");
+            assert_eq!(renderer.stats().oit.expect("list statistics").fragments, fragments);
+        }
+    }
+}
+
+#[test]
+fn held_pictures_are_bounded_and_keep_their_pixels() {
+    let (mut renderer, scene, buffers) = load_renderer();
+    let params = params(&scene, 64);
+    use_emulated_pictures(&mut renderer, &buffers, &params);
+    let draw = |renderer: &mut Renderer, extra_width: f32| {
+        renderer.upload(&buffers, &surface(extra_width)).expect("uploads");
+        let pending_frame = renderer.submit(&buffers, &params).expect("submits");
+        renderer.map_pixels(pending_frame).expect("draws").into_shared_image().rgba
+    };
+    let is_held = |pixels: &FramePixels| matches!(pixels, FramePixels::Held(_));
+    let widths: Vec<f32> = (0..8).map(|index| 0.1 * index as f32).collect();
+    let mut images: Vec<FramePixels> = widths.iter().map(|width| draw(&mut renderer, *width)).collect();
+    // Of eight pictures, three remain for frames in flight.
+    assert_eq!(images.iter().map(is_held).collect::<Vec<_>>(), [[true; 5].as_slice(), &[false; 3]].concat());
+    for (image, width) in images.iter().zip(&widths) {
+        assert!(image.as_ref() == draw_frame(*width).0, "{width}");
+    }
+    images.remove(0);
+    assert!(is_held(&draw(&mut renderer, 0.3)), "expected a picture that a reader has returned");
+}
+
+#[test]
+fn abandoned_frames_return_their_pictures() {
+    let (mut renderer, scene, buffers) = load_renderer();
+    let params = params(&scene, 64);
+    use_emulated_pictures(&mut renderer, &buffers, &params);
+    for round in 0..20 {
+        let pending_frame = renderer.submit(&buffers, &params).expect("submits");
+        if round % 2 == 0 {
+            // Starts the copy.
+            pending_frame.is_ready_within(Duration::from_secs(60));
+        }
+    }
+    assert!(renderer.draw(&buffers, &params).expect("draws").rgba == draw_frame(0.0).0);
+}
+
+#[test]
+fn software_renderer_refuses_shared_pictures() {
+    let (mut renderer, scene, buffers) = load_renderer();
+    if renderer.info().cuda_device.is_some() {
+        return;
+    }
+    let memory = Rc::new(UnsharedMemory::default());
+    renderer.share_pictures(Rc::clone(&memory) as Rc<dyn PictureMemory>).expect("no lost device");
+    let PixelReadback::PixelBuffer(reason) = &renderer.info().pixel_readback else { panic!("expected a refusal") };
+    assert!(reason.contains("is not a CUDA device"), "{reason}");
+    assert_eq!(memory.picture_count.get(), 0);
+    assert!(renderer.draw(&buffers, &params(&scene, 64)).expect("draws").rgba == draw_frame(0.0).0);
 }
 
 #[test]

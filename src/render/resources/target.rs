@@ -14,6 +14,7 @@ use crate::layout::tile_list_bytes;
 use crate::region::{DirtyRegion, Region};
 use modalcast_model::error::Result;
 use modalcast_model::scene::Culling;
+use modalcast_model::shared_memory::PictureMemory;
 
 /// Images and buffers of a frame. Consecutive frames with the same [`TargetDesc`] share them.
 #[derive(Debug)]
@@ -34,9 +35,9 @@ pub(crate) struct RenderTarget {
     pub(crate) scene_color: Texture,
     /// Bloom pyramid; empty without bloom. Level 0 has the size of the frame.
     pub(crate) bloom_mips: Vec<Texture>,
-    /// Output of the encode pass: RGBA8, top row first.
+    /// Output of the encode pass unless the frame has a shared picture: RGBA8, top row first.
     pub(crate) readback_source: Buffer,
-    /// Staging buffers for the readback of `readback_source`.
+    /// Memory in which the pixels leave the device: staging buffers for `readback_source`, or shared pictures.
     pub(crate) readback_ring: Rc<ReadbackRing>,
     /// Present with occlusion culling.
     pub(crate) depth_pyramid: Option<DepthPyramid>,
@@ -52,7 +53,8 @@ pub(crate) struct BlendLayer {
 }
 
 impl RenderTarget {
-    pub(crate) fn new(gl: &Rc<Gl>, desc: TargetDesc) -> Result<Self> {
+    /// `picture_memory`: the memory of shared pictures, if there are any.
+    pub(crate) fn new(gl: &Rc<Gl>, desc: TargetDesc, picture_memory: Option<Rc<dyn PictureMemory>>) -> Result<Self> {
         let TargetDesc { width, height, blend_storage, .. } = desc;
         let (ids, depth) = (create_image(gl, desc, gl::R32UI)?, create_image(gl, desc, gl::DEPTH_COMPONENT32F)?);
         let [_, cull_range] = desc.readback_ranges();
@@ -85,7 +87,7 @@ impl RenderTarget {
             scene_color: create_image(gl, TargetDesc { samples: 1, ..desc }, gl::RGBA16F)?,
             bloom_mips: create_bloom_mips(gl, desc)?,
             readback_source: gl.buffer(desc.frame_bytes(), gl::STREAM_COPY, None)?,
-            readback_ring: ReadbackRing::new(gl, cull_range.end),
+            readback_ring: ReadbackRing::new(gl, cull_range.end, picture_memory),
             depth_pyramid: if desc.culling == Culling::Occlusion {
                 Some(DepthPyramid::new(gl, desc, &depth)?)
             } else {

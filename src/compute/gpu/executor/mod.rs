@@ -8,6 +8,7 @@
 //! | `output`, `interop` | the output buffers |
 //! | `output_ring` | double buffering of the outputs: the output that a step writes, and its outdated domains |
 //! | `readback`, `pinned_surface` | asynchronous readback of vertices, concurrent with the next step |
+//! | `picture` | pictures that OpenGL draws and CUDA copies to the host |
 //! | `raster` | compute rasterizer, which draws into OpenGL's buffers |
 //! | `png` | PNG encoder, from pixels in device memory to a file in pinned memory |
 //! | `layout_check` | check that host and device agree on struct layouts |
@@ -19,6 +20,7 @@ pub(crate) mod launchers;
 mod layout_check;
 mod output;
 mod output_ring;
+mod picture;
 mod pinned_surface;
 pub(crate) mod png;
 pub(crate) mod raster;
@@ -27,3 +29,4 @@ mod step_slot;
 
 pub use deformer::{CudaDeformer, MAX_STEPS_IN_FLIGHT, PreparedDeformer};
 pub use layout_check::device_layout_values;
+pub use picture::CudaPictureMemory;

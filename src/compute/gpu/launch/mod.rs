@@ -5,6 +5,7 @@
 //! | `device` | the device and its stream |
 //! | `context` | a context that is current on a thread |
 //! | `memory` | device buffers and pinned host memory |
+//! | `exported_memory` | device memory that OpenGL can import |
 //! | `kernel` | descriptors of kernels, and their launch |
 //! | `capture` | CUDA graphs |
 //! | `compile` | machine code by NVRTC, and its cache |
@@ -18,6 +19,7 @@ pub(crate) mod compile;
 pub(crate) mod context;
 mod device;
 pub(crate) mod error;
+mod exported_memory;
 mod kernel;
 mod memory;
 mod probe;
@@ -26,6 +28,7 @@ pub use capture::capture;
 #[cfg(any(test, feature = "testing"))]
 pub use compile::{CAPABILITIES, CompiledVariant, assert_compiles};
 pub use device::Device;
+pub(crate) use exported_memory::ExportedMemory;
 pub use kernel::{KernelDescriptor, KernelKind, LaunchOrder, launch_kernel};
 pub(crate) use kernel::{KernelSource, KernelText};
 pub(crate) use memory::PageLock;

@@ -37,6 +37,8 @@ pub(crate) struct Limits {
     pub(crate) parallel_compile: bool,
     /// Whether buffers can stay mapped while the device writes them (OpenGL 4.4).
     pub(crate) persistent_mapping: bool,
+    /// Whether buffers can be in memory of another API (`GL_EXT_memory_object_fd`).
+    pub(crate) memory_object_fd: bool,
     /// Number of fractional bits of a vertex position in pixels; OpenGL guarantees 4.
     pub(crate) subpixel_bits: u32,
     /// Maximum anisotropy of texture lookups: [`HARDWARE_ANISOTROPY`], or 1 if the context does not support it or is a
@@ -81,6 +83,7 @@ impl Limits {
                     .iter()
                     .any(|name| gl.supported_extensions().contains(*name)),
                 persistent_mapping: has_persistent_mapping(gl),
+                memory_object_fd: gl.supported_extensions().contains("GL_EXT_memory_object_fd"),
                 subpixel_bits: parameter(SUBPIXEL_BITS),
                 post_depth_coverage: gl.supported_extensions().contains("GL_ARB_post_depth_coverage"),
                 anisotropy: if has_anisotropy && !software { HARDWARE_ANISOTROPY } else { 1.0 },

@@ -7,6 +7,7 @@ use std::rc::Rc;
 use glow::HasContext as _;
 
 use super::Gl;
+use super::external_memory::MemoryObject;
 use modalcast_model::error::{Result, fault};
 use modalcast_model::raster::{GlBuffer, GlBufferOwner};
 
@@ -22,6 +23,8 @@ pub(crate) struct Buffer {
 pub(super) struct BufferObject {
     pub(super) gl: Rc<Gl>,
     name: glow::Buffer,
+    /// The imported memory of the buffer. Fields are dropped after `drop` has deleted the buffer.
+    _memory: Option<MemoryObject>,
 }
 
 /// Storage parameters of a texture.
@@ -120,7 +123,12 @@ impl Drop for ReadMapping<'_> {
 impl Buffer {
     /// Takes ownership of a name whose storage has `bytes` bytes.
     pub(super) fn new(gl: &Rc<Gl>, name: glow::Buffer, bytes: u64) -> Self {
-        Self { object: Rc::new(BufferObject { gl: Rc::clone(gl), name }), bytes }
+        Self { object: Rc::new(BufferObject { gl: Rc::clone(gl), name, _memory: None }), bytes }
+    }
+
+    /// Takes ownership of a name whose storage is the first `bytes` bytes of imported memory.
+    pub(super) fn in_memory(gl: &Rc<Gl>, name: glow::Buffer, bytes: u64, memory: MemoryObject) -> Self {
+        Self { object: Rc::new(BufferObject { gl: Rc::clone(gl), name, _memory: Some(memory) }), bytes }
     }
 
     pub(super) fn name(&self) -> glow::Buffer {
@@ -129,6 +137,12 @@ impl Buffer {
 
     pub(super) const fn object(&self) -> &Rc<BufferObject> {
         &self.object
+    }
+
+    /// Another owner of the same buffer object.
+    #[cfg(test)]
+    pub(crate) fn alias(&self) -> Self {
+        Self { object: Rc::clone(&self.object), bytes: self.bytes }
     }
 
     /// A handle that other APIs need to register the buffer. It keeps the buffer alive.

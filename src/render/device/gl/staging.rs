@@ -4,6 +4,7 @@
 use std::cell::RefCell;
 use std::mem;
 use std::rc::Rc;
+use std::sync::Arc;
 use std::sync::mpsc::{self, Receiver, RecvTimeoutError, SyncSender, TryRecvError};
 use std::time::Duration;
 
@@ -12,6 +13,7 @@ use glow::HasContext as _;
 use super::object::BufferObject;
 use super::{Buffer, Gl};
 use modalcast_model::error::{Result, fault, fault_in};
+use modalcast_model::shared_memory::HostPixels;
 
 /// A buffer that the device writes and the host reads.
 #[derive(Debug)]
@@ -19,9 +21,12 @@ pub(crate) struct StagingBuffer {
     pub(crate) buffer: Buffer,
     /// Address of the persistent mapping; `None` if the context does not support it.
     mapping: Option<*const u8>,
-    /// Disconnects when the current reader (a [`ReadbackView`]) is dropped; `None` without a reader.
-    reader: RefCell<Option<Receiver<()>>>,
+    reader: ReaderSignal,
 }
+
+/// Disconnects when the current reader (a [`ReadbackView`]) is dropped; `None` without a reader.
+#[derive(Debug, Default)]
+pub(super) struct ReaderSignal(RefCell<Option<Receiver<()>>>);
 
 /// The buffer of a dropped staging buffer from which a reader still copies.
 pub(super) struct RetiredBuffer {
@@ -38,17 +43,28 @@ pub(crate) enum ReadbackView {
     Mapped { pointer: *const u8, bytes: usize, _done: SyncSender<()> },
     /// A copy of the bytes, if the buffer is not persistently mapped.
     Copied(Vec<u8>),
+    /// The first `bytes` bytes of pinned memory.
+    Pinned {
+        // Dropped before `_done`, so that the memory has no reader once the sender is disconnected.
+        pixels: Arc<dyn HostPixels>,
+        bytes: usize,
+        /// Whether a reader may keep the view for long, because enough slots are left for the next frames.
+        can_be_held: bool,
+        _done: SyncSender<()>,
+    },
 }
 
 // SAFETY: the memory is mapped for reading only. Nothing writes it before the staging buffer sees that this value was
 // dropped. It is unmapped after that, or never.
 unsafe impl Send for ReadbackView {}
+// SAFETY: as above; the bytes are only read.
+unsafe impl Sync for ReadbackView {}
 
 impl Gl {
     /// Creates a staging buffer of `bytes` bytes, persistently mapped if possible.
     pub(crate) fn staging(self: &Rc<Self>, bytes: u64) -> Result<StagingBuffer> {
         self.free_retired_buffers(Duration::ZERO);
-        let reader = RefCell::default();
+        let reader = ReaderSignal::default();
         if !self.limits.persistent_mapping {
             return Ok(StagingBuffer { buffer: self.buffer(bytes, glow::STREAM_READ, None)?, mapping: None, reader });
         }
@@ -92,40 +108,43 @@ impl StagingBuffer {
             return Err(fault("readback", format!("expected at most {} bytes, got {bytes}", self.buffer.bytes)));
         }
         let Some(pointer) = self.mapping else { return self.buffer.read(bytes).map(ReadbackView::Copied) };
-        // No message is sent. The disconnect signals that the reader is done.
-        let (sender, reader) = mpsc::sync_channel(1);
-        self.reader.replace(Some(reader));
-        Ok(ReadbackView::Mapped { pointer, bytes, _done: sender })
+        Ok(ReadbackView::Mapped { pointer, bytes, _done: self.reader.begin() })
     }
 
     /// Waits at most `limit` for the reader and returns whether it is done.
     pub(crate) fn is_read(&self, limit: Duration) -> bool {
-        let mut reader = self.reader.borrow_mut();
-        let is_read = reader.as_ref().is_none_or(|reader| is_done(reader, limit));
-        if is_read {
-            *reader = None;
-        }
-        is_read
-    }
-
-    /// Copies a range of bytes, under the same conditions as [`Self::view`].
-    pub(crate) fn read(&self, range: std::ops::Range<usize>) -> Result<Vec<u8>> {
-        let view = self.view(range.end)?;
-        view.bytes()
-            .get(range)
-            .map(<[u8]>::to_vec)
-            .ok_or_else(|| fault("readback", "expected a range that does not end before its start"))
+        self.reader.is_read(limit)
     }
 }
 
 impl Drop for StagingBuffer {
     /// Does not wait for the reader, which may run on this thread.
     fn drop(&mut self) {
-        if let Some(reader) = self.reader.take().filter(|reader| !is_done(reader, Duration::ZERO)) {
+        if let Some(reader) = self.reader.0.take().filter(|reader| !is_done(reader, Duration::ZERO)) {
             let object = self.buffer.object();
             let retired_buffer = RetiredBuffer { _object: Rc::clone(object), reader };
             object.gl.retired_buffers.borrow_mut().push(retired_buffer);
         }
+    }
+}
+
+impl ReaderSignal {
+    /// Begins to track a reader, which holds the returned sender.
+    fn begin(&self) -> SyncSender<()> {
+        // No message is sent. The disconnect signals that the reader is done.
+        let (sender, reader) = mpsc::sync_channel(1);
+        self.0.replace(Some(reader));
+        sender
+    }
+
+    /// Waits at most `limit` for the reader and returns whether it is done.
+    pub(super) fn is_read(&self, limit: Duration) -> bool {
+        let mut reader = self.0.borrow_mut();
+        let is_read = reader.as_ref().is_none_or(|reader| is_done(reader, limit));
+        if is_read {
+            *reader = None;
+        }
+        is_read
     }
 }
 
@@ -138,11 +157,30 @@ fn is_done(reader: &Receiver<()>, limit: Duration) -> bool {
 }
 
 impl ReadbackView {
+    /// A view of the first `bytes` bytes of pinned memory, which `reader` tracks.
+    pub(super) fn pinned(pixels: Arc<dyn HostPixels>, bytes: usize, can_be_held: bool, reader: &ReaderSignal) -> Self {
+        Self::Pinned { bytes: bytes.min(pixels.bytes().len()), pixels, can_be_held, _done: reader.begin() }
+    }
+
+    /// Whether a reader may keep the view for long instead of copying the bytes.
+    pub(crate) const fn can_be_held(&self) -> bool {
+        matches!(self, Self::Pinned { can_be_held: true, .. })
+    }
+
+    /// Shortens the view to its first `bytes` bytes.
+    pub(crate) fn truncate(&mut self, bytes: usize) {
+        match self {
+            Self::Mapped { bytes: length, .. } | Self::Pinned { bytes: length, .. } => *length = bytes.min(*length),
+            Self::Copied(copy) => copy.truncate(bytes),
+        }
+    }
+
     pub(crate) fn bytes(&self) -> &[u8] {
         match self {
             // SAFETY: the range is inside the mapping, which stays mapped and unwritten while this value exists.
             Self::Mapped { pointer, bytes, .. } => unsafe { std::slice::from_raw_parts(*pointer, *bytes) },
             Self::Copied(bytes) => bytes,
+            Self::Pinned { pixels, bytes, .. } => pixels.bytes().get(..*bytes).unwrap_or_default(),
         }
     }
 }

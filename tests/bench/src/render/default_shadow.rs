@@ -152,7 +152,14 @@ mod tests {
     use crate::timing::Timing;
 
     fn renderer(software: bool) -> RendererInfo {
-        RendererInfo { renderer: "test".into(), version: "test".into(), software, cuda_device: None, max_side: 8192 }
+        RendererInfo {
+            renderer: "test".into(),
+            version: "test".into(),
+            software,
+            cuda_device: None,
+            max_side: 8192,
+            pixel_readback: modalcast_render::PixelReadback::CopyEngine,
+        }
     }
 
     /// A row with this frame time; `us` 0 means that it was not timed.

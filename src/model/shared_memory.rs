@@ -1,0 +1,64 @@
+//! Traits of device memory that OpenGL and another API share for as long as it exists. The renderer draws into the
+//! memory; the module `gpu` of `modalcast-compute` allocates it in CUDA and copies pictures from it to the host.
+//!
+//! Each API holds its own reference to the memory, so neither can free it while the other uses it. Nothing orders the
+//! accesses of the two APIs on the device. The host does: it waits for a fence of OpenGL before it starts a copy, and
+//! for the end of the copy before OpenGL may write the memory again.
+
+use std::fmt::Debug;
+use std::os::fd::OwnedFd;
+use std::sync::Arc;
+
+use crate::error::Result;
+
+/// Allocates pictures in memory that OpenGL can import.
+pub trait PictureMemory: Debug {
+    /// Allocates a picture of `bytes` bytes.
+    ///
+    /// # Errors
+    /// `Fault` if the device has not enough memory or cannot export it.
+    fn create_picture(&self, bytes: usize) -> Result<NewPicture>;
+}
+
+/// A picture that OpenGL has not imported yet.
+#[derive(Debug)]
+pub struct NewPicture {
+    /// Names the memory. An import takes ownership of it.
+    pub descriptor: OwnedFd,
+    /// Size of the allocation, which an import must state: the bytes of the picture, rounded up by the device.
+    pub allocated_bytes: u64,
+    pub picture: Box<dyn SharedPicture>,
+}
+
+/// A picture in device memory, and the pinned host memory into which it is copied. At most one copy is in flight.
+/// Dropping the picture waits for the copy.
+pub trait SharedPicture: Debug {
+    /// Starts to copy the first `bytes` bytes to the host, without waiting. OpenGL has completed all commands that write
+    /// the picture, and writes it again only after [`Self::is_copied`] or [`Self::finish_copy`].
+    ///
+    /// # Errors
+    /// `Fault` if a copy is in flight, a reader has the pixels of the last copy, the picture has fewer bytes, or the
+    /// device fails.
+    fn start_copy(&mut self, bytes: usize) -> Result<()>;
+
+    /// Whether no copy is in flight. Also true if the device has failed; [`Self::finish_copy`] then returns the error.
+    fn is_copied(&self) -> bool;
+
+    /// Waits for the copy. Any thread may read the returned pixels.
+    ///
+    /// # Errors
+    /// `Fault` if no copy was started, or if the device fails.
+    fn finish_copy(&mut self) -> Result<Arc<dyn HostPixels>>;
+
+    /// Fills the picture with a word and waits, to test that OpenGL sees the word.
+    ///
+    /// # Errors
+    /// `Fault` if the device fails.
+    fn fill(&mut self, word: u32) -> Result<()>;
+}
+
+/// Pixels in pinned host memory. While a reference exists, no copy overwrites them.
+pub trait HostPixels: Debug + Send + Sync {
+    /// The bytes of the last copy.
+    fn bytes(&self) -> &[u8];
+}
