@@ -10,6 +10,7 @@ use std::rc::Rc;
 
 use crate::error::Result;
 use crate::scene::{DrawRange, Viewport};
+use crate::shared_memory::VertexImporter;
 
 /// The owner of an OpenGL buffer. The buffer is deleted once its owner is dropped.
 pub trait GlBufferOwner: std::fmt::Debug {
@@ -42,6 +43,8 @@ pub struct GlVertexBuffers {
     pub normals: GlBuffer,
     /// 4 f32 per corner; only if the scene has normal maps.
     pub tangents: Option<GlBuffer>,
+    /// Imports memory of the deformer instead, if the renderer can.
+    pub importer: Option<Rc<dyn VertexImporter>>,
 }
 
 impl PartialEq for GlBuffer {

@@ -1,11 +1,13 @@
-//! Traits of device memory that OpenGL and another API share for as long as it exists. The renderer draws into the
-//! memory; the module `gpu` of `modalcast-compute` allocates it in CUDA and copies pictures from it to the host.
+//! Traits of device memory that OpenGL and another API share for as long as it exists. The module `gpu` of
+//! `modalcast-compute` allocates it in CUDA. The renderer draws pictures into such memory, and CUDA copies them to the host.
+//! A deformer writes vertices into such memory, and OpenGL copies them to the vertex buffers of the scene.
 //!
 //! Each API holds its own reference to the memory, so neither can free it while the other uses it. Nothing orders the
-//! accesses of the two APIs on the device. The host does: it waits for a fence of OpenGL before it starts a copy, and
-//! for the end of the copy before OpenGL may write the memory again.
+//! accesses of the two APIs on the device. The host does: it waits for the end of the accesses of one API before it submits
+//! those of the other one.
 
 use std::fmt::Debug;
+use std::ops::Range;
 use std::os::fd::OwnedFd;
 use std::sync::Arc;
 
@@ -61,4 +63,44 @@ pub trait SharedPicture: Debug {
 pub trait HostPixels: Debug + Send + Sync {
     /// The bytes of the last copy.
     fn bytes(&self) -> &[u8];
+}
+
+/// Imports vertices of a scene, and copies them to the vertex buffers of the scene.
+pub trait VertexImporter: Debug {
+    /// Imports memory with the vertices of one step.
+    ///
+    /// # Errors
+    /// `Fault` if the ranges do not have the sizes of the scene's buffers, or OpenGL cannot import the memory.
+    fn import(&self, vertices: ExportedVertices) -> Result<Box<dyn ImportedVertices>>;
+}
+
+/// Memory with vertices that OpenGL has not imported yet.
+#[derive(Debug)]
+pub struct ExportedVertices {
+    /// Names the memory. An import takes ownership of it.
+    pub descriptor: OwnedFd,
+    /// Size of the allocation, which an import must state.
+    pub allocated_bytes: u64,
+    /// Byte ranges of positions, normals and, if the scene has them, tangents. Each begins at a multiple of 256.
+    pub ranges: Vec<Range<u64>>,
+}
+
+/// Imported memory with the vertices of one step.
+pub trait ImportedVertices: Debug {
+    /// Copies the vertices to the buffers of the scene with OpenGL commands, without waiting. Frames that were submitted
+    /// earlier show the old vertices, later ones the new vertices. The caller has waited for the writer of the memory.
+    ///
+    /// # Errors
+    /// `Fault` if OpenGL reports an error.
+    fn copy_to_scene(&self) -> Result<()>;
+
+    /// Whether the last copy is complete, so that the memory can be written. Also true if the wait fails;
+    /// [`Self::wait_for_copy`] then returns the error.
+    fn is_copied(&self) -> bool;
+
+    /// Waits for the last copy.
+    ///
+    /// # Errors
+    /// `Fault` if the device does not finish.
+    fn wait_for_copy(&self) -> Result<()>;
 }

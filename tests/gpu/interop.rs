@@ -181,6 +181,7 @@ fn gpu_unknown_or_small_buffers_are_not_filled() {
         positions: GlBuffer { name: 999_999, ..positions.clone() },
         normals: GlBuffer { name: 999_998, ..normals },
         tangents: Some(GlBuffer { name: 999_997, ..positions }),
+        importer: None,
     };
     let without_tangents = GlVertexBuffers { tangents: None, ..loaded_scene.vertex_buffers() };
     for buffers in [small_scene.vertex_buffers(), unknown_buffers, without_tangents] {

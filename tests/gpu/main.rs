@@ -23,3 +23,4 @@ mod raster_gl;
 mod real;
 mod reference_comparison;
 mod scenes;
+mod shared_memory;

@@ -10,9 +10,19 @@
 //! OpenGL    [draw k][read k][upload][draw k+1][read k+1][upload]
 //! ```
 //!
-//! A deformer that fills OpenGL's buffers on the device submits a step and the copy of its vertices together while every
-//! step is drawn. Both are ordered after all OpenGL commands issued before, including the readback of frame k, so only the
-//! host's work overlaps. Frame k is copied out, encoded and sent while frame k+1 is drawn.
+//! If OpenGL and CUDA share memory, CUDA deforms step k+1 while OpenGL draws frame k, and its copy engine reads frame k-1.
+//! The GPU changes between the contexts of OpenGL and CUDA once per step, within a frame. OpenGL copies the vertices of a
+//! step at the begin of its frame, so that two sets of vertices are sufficient.
+//!
+//! ```text
+//! OpenGL       [copy, draw k     ][copy, draw k+1   ][copy, draw k+2   ]
+//! CUDA               [deform k+1]       [deform k+2]
+//! copy engine  [read k-1]          [read k  ]          [read k+1]
+//! ```
+//!
+//! If CUDA maps OpenGL's buffers instead, a step and the copy of its vertices are submitted together while every step is
+//! drawn. Both are ordered after all OpenGL commands issued before, including the readback of frame k, so only the host's
+//! work overlaps. Frame k is copied out, encoded and sent while frame k+1 is drawn.
 //!
 //! ```text
 //! device    [draw k][read k][deform k+1, copy] [draw k+1][read k+1][deform k+2, copy]

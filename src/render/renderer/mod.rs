@@ -217,7 +217,11 @@ impl Renderer {
         let _current = self.gl.make_current()?;
         let textures = self.textures_of(scene)?;
         let compile = &mut |source| self.programs.program(source);
-        let buffers = SceneBuffers::new(&self.gl, scene, &self.sample_positions, self.blur_method, textures, compile)?;
+        let mut buffers =
+            SceneBuffers::new(&self.gl, scene, &self.sample_positions, self.blur_method, textures, compile)?;
+        if self.picture_memory.is_some() {
+            buffers.enable_vertex_import(&self.gl, self.programs.program(shaders::copy_words())?);
+        }
         self.gl.check("load").map(|()| buffers)
     }
 

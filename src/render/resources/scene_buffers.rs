@@ -10,6 +10,7 @@ use super::programs::{PostPrograms, ProgramCompiler, SampleCountPrograms, SceneP
 use super::raster_mesh;
 use super::shadow_cache::{ShadowCache, ShadowKey};
 use super::shadow_map::ShadowMap;
+use super::shared_vertices::SceneVertices;
 use crate::device::gl::{self, Buffer, Gl, Program, Texture, VertexArray, VertexAttribute};
 use crate::layout::material::{PackedMaterial, pack_materials};
 use crate::layout::{
@@ -29,6 +30,7 @@ use crate::types::{BlurMethod, FrameParams};
 use modalcast_model::error::Result;
 use modalcast_model::raster::{GlVertexBuffers, RasterGeometry, Rasterizer};
 use modalcast_model::scene::{Antialiasing, Culling, FrameAntialiasing, RenderSettings, RendererKind, Scene};
+use modalcast_model::shared_memory::VertexImporter;
 
 /// Programs are compiled in advance for frames of this size: the default size of a picture.
 const TYPICAL_FRAME_SIZE: [u32; 2] = [1280, 720];
@@ -46,6 +48,8 @@ pub struct SceneBuffers {
     /// Its deformed positions are called shared positions, because a deformer may write their buffer directly
     /// ([`Self::vertex_buffers`]).
     pub(crate) geometry: GeometryBuffers<Buffer>,
+    /// Imports memory of a deformer, if the renderer shares memory with CUDA.
+    pub(crate) vertex_importer: Option<Rc<SceneVertices>>,
     /// Keeps the buffers of the buffer textures alive.
     _materials: MaterialBuffers<Buffer>,
     pub(crate) uniforms: UniformBuffers<Buffer>,
@@ -230,6 +234,7 @@ impl SceneBuffers {
             corner_array: corner_array(gl, &geometry, &geometry.triangles)?,
             cull_resources,
             geometry,
+            vertex_importer: None,
             _materials: materials,
             uniforms,
             empty_vertex_array: gl.vertex_array(None, &[])?,
@@ -478,7 +483,16 @@ impl SceneBuffers {
             positions: self.geometry.positions.shared(),
             normals: self.geometry.normals.shared(),
             tangents: self.geometry.tangents.as_ref().map(Buffer::shared),
+            importer: self.vertex_importer.clone().map(|importer| importer as Rc<dyn VertexImporter>),
         }
+    }
+
+    /// Lets a deformer write vertices into memory of its own, which OpenGL imports. `copy_words` copies the vertices to the
+    /// vertex buffers.
+    pub(crate) fn enable_vertex_import(&mut self, gl: &Rc<Gl>, copy_words: Rc<Program>) {
+        let GeometryBuffers { positions, normals, tangents, .. } = &self.geometry;
+        let destinations = [positions, normals].into_iter().chain(tangents).map(Buffer::alias).collect();
+        self.vertex_importer = Some(Rc::new(SceneVertices::new(gl, copy_words, destinations)));
     }
 
     /// Number of textures that the device holds for this scene: texture arrays and shadow map textures.

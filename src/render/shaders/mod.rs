@@ -12,7 +12,7 @@ use std::fmt::Write as _;
 
 use crate::device::gl;
 use crate::layout::material::MATERIAL_BYTES;
-use crate::layout::{COLOR_UNIT, NORMAL_UNIT, TILE, TILES_PER_ROW};
+use crate::layout::{COLOR_UNIT, NORMAL_UNIT, TILE, TILES_PER_ROW, WORKGROUP_SIZE};
 use crate::plan::features::ShaderFeatures;
 use crate::scene_data::geometry::BlendMode;
 use crate::scene_data::textures::{ArrayUse, TextureRole};
@@ -246,6 +246,12 @@ impl ShaderOptions {
         let text = [&head, VISIBILITY_IDS, include_str!("../../../shaders/visibility_unpack.comp")].concat();
         ProgramSource::compute("unpack", text)
     }
+}
+
+/// Copies the first words of a buffer to another one.
+pub(crate) fn copy_words() -> ProgramSource {
+    let head = format!("{VERSION}#define WORKGROUP_SIZE {WORKGROUP_SIZE}\n");
+    ProgramSource::compute("copy words", head + include_str!("../../../shaders/copy_words.comp"))
 }
 
 pub(crate) fn vertex_and_fragment(vertex: String, fragment: String) -> Vec<(u32, String)> {

@@ -27,7 +27,7 @@ use crate::gpu::tables::device_tables::{CudaDeformerOptions, DeviceTables};
 use crate::gpu::tables::layout::StepHeader;
 use crate::gpu::tables::plan::{BufferRole, DeformPlan, plan_from_tables};
 use modalcast_model::deform::{Backend, DeformSummary, DeformedSurface, Deformer, VertexAttributes, VertexReadback};
-use modalcast_model::error::{Error, Result};
+use modalcast_model::error::{Error, Result, fault};
 use modalcast_model::raster::GlVertexBuffers;
 use modalcast_model::scene::{DirtyDomains, Scene, SceneState};
 
@@ -40,8 +40,9 @@ struct StepInFlight {
     /// Index in [`CudaDeformer::step_slots`].
     slot: usize,
     submitted: Instant,
-    /// Milliseconds of the host's work before it mapped OpenGL's buffers; `None` if the step did not map them.
-    ms_before_map: Option<f64>,
+    /// Milliseconds of the host's work before the step could begin on the device. `None` if the last step was not drawn, so
+    /// that the step does not wait for frames of OpenGL.
+    ms_before_begin: Option<f64>,
 }
 
 /// The CUDA deformer of one scene. It stays on the thread that created it, which owns the OpenGL context.
@@ -214,12 +215,12 @@ impl CudaDeformer {
     /// `Fault` when no step is in flight, or of the device. Afterwards no step is in flight.
     pub fn finish(&mut self) -> Result<DeformSummary> {
         let missing_step = || Error::Fault { stage: "deform", reason: "expected a step in flight, got none".into() };
-        let StepInFlight { slot, submitted, ms_before_map } = self.in_flight.pop_front().ok_or_else(missing_step)?;
+        let StepInFlight { slot, submitted, ms_before_begin } = self.in_flight.pop_front().ok_or_else(missing_step)?;
         let (bounds, oriented_bounds) = self.step_slots[slot].wait().inspect_err(|_| self.invalidate())?;
-        let ms = match ms_before_map {
+        let ms = match ms_before_begin {
             None => submitted.elapsed().as_secs_f64() * 1e3,
-            Some(ms_before_map) => {
-                ms_before_map + self.step_slots[slot].ms_since_mapped().inspect_err(|_| self.invalidate())?
+            Some(ms_before_begin) => {
+                ms_before_begin + self.step_slots[slot].ms_since_begin().inspect_err(|_| self.invalidate())?
             }
         };
         Ok(DeformSummary { bounds, oriented_bounds, ms })
@@ -238,9 +239,13 @@ impl CudaDeformer {
 
     /// Writes the values of a step and starts its graph. If the last step was drawn, also fills OpenGL's buffers.
     fn start(&mut self, state: &SceneState, submitted: Instant) -> Result<StepInFlight> {
-        let fills_gl_buffers = std::mem::take(&mut self.is_drawn);
+        let was_drawn = std::mem::take(&mut self.is_drawn);
+        let fills_gl_buffers = was_drawn && self.output.maps_gl_buffers();
         self.gl_buffers_are_current = false;
         let _current = self.device.enter()?;
+        for set in 0..self.output.count() {
+            self.output_ring.set_read_by_gl(set, self.output.is_read_by_gl(set));
+        }
         let set = self.output_ring.next_output();
         match self.output.ensure_set(&self.device, &self.plan, set) {
             Ok(()) => {}
@@ -268,6 +273,9 @@ impl CudaDeformer {
         if target.is_being_read {
             self.readbacks.wait_for_reads(&self.device, target.output)?;
         }
+        let wait_begin = Instant::now();
+        self.output.wait_for_gl(target.output)?;
+        let wait_for_gl = wait_begin.elapsed();
         let OutputAddresses { positions, normals, tangents } = self.output.addresses(target.output);
         let displacements = self.displacements.as_ref().map_or(0, DeviceBuffer::address);
         let header = StepHeader { positions, normals, tangents, displacements, ..header };
@@ -276,21 +284,24 @@ impl CudaDeformer {
             None => inputs.write(&mut step_slot.values, &header, state)?,
         }
         let step_kind = if list_lengths.is_some() { StepKind::Partial } else { StepKind::Full };
-        let ms_before_map = fills_gl_buffers.then(|| submitted.elapsed().as_secs_f64() * 1e3);
+        let ms_before_begin = was_drawn.then(|| submitted.elapsed().saturating_sub(wait_for_gl).as_secs_f64() * 1e3);
         if fills_gl_buffers {
             let (device, stream) = (&self.device, self.device.stream());
             self.output.copy_to_gl_after(device, target.output, || {
-                step_slot.record_mapped(device)?;
+                step_slot.record_begin(device)?;
                 step_slot.launch(step_kind)?;
                 step_slot.done.record(stream).map_err(cuda_error("deform"))
             })?;
         } else {
+            if was_drawn {
+                step_slot.record_begin(&self.device)?;
+            }
             step_slot.launch(step_kind)?;
             step_slot.done.record(self.device.stream()).map_err(cuda_error("deform"))?;
         }
         self.gl_buffers_are_current = fills_gl_buffers;
         self.output_ring.end_step(state);
-        Ok(StepInFlight { slot: slot_index, submitted, ms_before_map })
+        Ok(StepInFlight { slot: slot_index, submitted, ms_before_begin })
     }
 
     /// Returns a step slot whose step has ended; allocates one if all are in flight.
@@ -424,7 +435,15 @@ impl Deformer for CudaDeformer {
         let missing_step = || Error::Fault { stage: "interop", reason: "expected a deformed step, got none".into() };
         let set = self.output_ring.shown_output().ok_or_else(missing_step)?;
         if !self.gl_buffers_are_current {
-            self.output.copy_to_gl_after(&self.device, set, || Ok(()))?;
+            if self.output.maps_gl_buffers() {
+                self.output.copy_to_gl_after(&self.device, set, || Ok(()))?;
+            } else if self.output.has_gl_buffers() {
+                // OpenGL's commands are not ordered with those of CUDA.
+                self.step_slots[self.last_slot].done.synchronize().map_err(cuda_error("interop"))?;
+                self.output.copy_by_gl(set)?;
+            } else {
+                return Err(fault("interop", "expected OpenGL buffers that the device can fill, got none"));
+            }
         }
         (self.gl_buffers_are_current, self.is_drawn) = (true, true);
         Ok(())

@@ -1,19 +1,31 @@
-//! Output buffers: the sets that steps write, and the OpenGL buffers to which a drawn step is copied on the device. An
-//! output set is one buffer each of positions, normals and tangents.
+//! Output sets that steps write, and their way to the OpenGL buffers of a drawn step. An output set has positions, normals
+//! and tangents.
 //!
-//! Steps do not write OpenGL's buffers themselves, because mapping them makes the GPU change between the contexts of CUDA
-//! and OpenGL. That takes longer than the step of a small scene, so only steps that are drawn pay for it. While every
-//! step is drawn, the copy is submitted together with the step, so that the GPU changes its context once for both.
+//! If OpenGL can import memory of CUDA, the sets are in such memory, and OpenGL copies a set to its buffers at the begin of
+//! a frame. The host waits for the step before that copy is submitted, and for the copy before a later step writes the
+//! set. With two sets, the next step can run while frames of earlier steps are drawn.
+//!
+//! Otherwise CUDA maps OpenGL's buffers and copies a set into them. Steps do not write OpenGL's buffers themselves,
+//! because mapping them makes the GPU change between the contexts of CUDA and OpenGL. That takes longer than the step of a
+//! small scene, so only steps that are drawn pay for it. While every step is drawn, the copy is submitted together with the
+//! step, so that the GPU changes its context once for both.
 
-use cudarc::driver::result;
+use std::ops::Range;
+use std::rc::Rc;
+
+use cudarc::driver::{result, sys};
 
 use super::interop::{GlInterop, MapAccess, Mapping, RegisteredBuffer, with_mapped};
 use super::pinned_surface::SurfaceLists;
 use crate::gpu::launch::error::cuda_error;
-use crate::gpu::launch::{Device, DeviceBuffer};
+use crate::gpu::launch::{Device, DeviceBuffer, ExportedMemory, download};
 use crate::gpu::tables::plan::{BufferRole, DeformPlan};
 use modalcast_model::error::{Error, Result, fault};
 use modalcast_model::raster::{GlBuffer, GlVertexBuffers};
+use modalcast_model::shared_memory::{ExportedVertices, ImportedVertices, VertexImporter};
+
+/// Alignment of the attributes in shared memory in bytes: the largest that OpenGL may demand of a storage buffer.
+const ATTRIBUTE_ALIGNMENT: u64 = 256;
 
 /// Device addresses of an output set. `tangents` is 0 if the scene has no tangents.
 #[derive(Debug, Clone, Copy)]
@@ -28,16 +40,37 @@ pub(super) struct OutputAddresses {
 pub(super) struct OutputBuffers {
     /// One set. A second set is added when a step is submitted while the host reads the first.
     sets: Vec<OutputSet>,
-    /// `None` if CUDA cannot write OpenGL's buffers.
-    gl_buffers: Option<RegisteredOutputs>,
+    gl_outputs: GlOutputs,
 }
 
-/// Buffers that a step writes. Each has the bytes of the plan.
+/// How vertices get to OpenGL's buffers.
+#[derive(Debug)]
+enum GlOutputs {
+    /// They are uploaded, because CUDA and OpenGL share nothing.
+    None,
+    /// CUDA maps OpenGL's buffers.
+    Mapped(RegisteredOutputs),
+    /// OpenGL imports the output sets.
+    Imported(Rc<dyn VertexImporter>),
+}
+
+/// Memory that a step writes. Its attributes have the bytes of the plan.
 #[derive(Debug)]
 pub(super) struct OutputSet {
-    positions: DeviceBuffer,
-    normals: DeviceBuffer,
-    tangents: Option<DeviceBuffer>,
+    addresses: OutputAddresses,
+    /// Bytes of positions, normals and tangents.
+    sizes: [u64; 3],
+    memory: SetMemory,
+}
+
+#[derive(Debug)]
+enum SetMemory {
+    Own {
+        /// Positions, normals and, if the scene has them, tangents.
+        _buffers: Vec<DeviceBuffer>,
+    },
+    /// Shared with OpenGL, which releases its reference first.
+    Shared { vertices: Box<dyn ImportedVertices>, _memory: ExportedMemory },
 }
 
 /// Bytes of positions, normals and tangents.
@@ -47,21 +80,62 @@ pub(super) fn output_sizes(plan: &DeformPlan) -> [u64; 3] {
 
 impl OutputSet {
     fn new(device: &Device, plan: &DeformPlan) -> Result<Self> {
-        let [positions, normals, tangents] = output_sizes(plan);
-        Ok(Self {
-            positions: DeviceBuffer::zeroed(device, positions)?,
-            normals: DeviceBuffer::zeroed(device, normals)?,
-            tangents: (tangents > 0).then(|| DeviceBuffer::zeroed(device, tangents)).transpose()?,
-        })
+        let sizes = output_sizes(plan);
+        let used_sizes = sizes.into_iter().filter(|bytes| *bytes > 0);
+        let buffers = used_sizes.map(|bytes| DeviceBuffer::zeroed(device, bytes)).collect::<Result<Vec<_>>>()?;
+        let mut addresses = buffers.iter().map(DeviceBuffer::address);
+        let mut next_address = |bytes: u64| if bytes > 0 { addresses.next().unwrap_or(0) } else { 0 };
+        let [positions, normals, tangents] = sizes.map(&mut next_address);
+        let addresses = OutputAddresses { positions, normals, tangents };
+        Ok(Self { addresses, sizes, memory: SetMemory::Own { _buffers: buffers } })
     }
 
-    fn addresses(&self) -> OutputAddresses {
-        OutputAddresses {
-            positions: self.positions.address(),
-            normals: self.normals.address(),
-            tangents: self.tangents.as_ref().map_or(0, DeviceBuffer::address),
+    /// A set in memory that OpenGL imports.
+    ///
+    /// # Errors
+    /// `Fault` when the device has not enough memory or OpenGL refuses it.
+    fn shared(device: &Device, plan: &DeformPlan, importer: &dyn VertexImporter) -> Result<Self> {
+        let sizes = output_sizes(plan);
+        let ranges = attribute_ranges(sizes);
+        let bytes = ranges.iter().map(|range| range.end).max().unwrap_or(0) as usize;
+        let memory = ExportedMemory::new(device, bytes)?;
+        let stream = device.stream();
+        // SAFETY: the memory has at least these bytes, and the stream is synchronized before anything else uses it.
+        let clear_result = unsafe { sys::cuMemsetD8Async(memory.address(), 0, bytes, stream.cu_stream()) };
+        clear_result.result().and(stream.synchronize()).map_err(cuda_error("allocate"))?;
+        let address_of = |range: Option<&Range<u64>>| range.map_or(0, |range| memory.address() + range.start);
+        let [positions, normals, tangents] = [0, 1, 2].map(|index| address_of(ranges.get(index)));
+        let addresses = OutputAddresses { positions, normals, tangents };
+        let (descriptor, allocated_bytes) = (memory.export()?, memory.bytes() as u64);
+        let vertices = importer.import(ExportedVertices { descriptor, allocated_bytes, ranges })?;
+        Ok(Self { addresses, sizes, memory: SetMemory::Shared { vertices, _memory: memory } })
+    }
+
+    /// Address and bytes of each attribute that the scene has.
+    fn attributes(&self) -> impl Iterator<Item = (u64, u64)> {
+        let OutputAddresses { positions, normals, tangents } = self.addresses;
+        [positions, normals, tangents].into_iter().zip(self.sizes).filter(|(_, bytes)| *bytes > 0)
+    }
+
+    /// OpenGL's side of shared memory.
+    fn imported(&self) -> Option<&dyn ImportedVertices> {
+        match &self.memory {
+            SetMemory::Own { .. } => None,
+            SetMemory::Shared { vertices, .. } => Some(vertices.as_ref()),
         }
     }
+}
+
+/// Ranges of positions, normals and, if their size is not 0, tangents in shared memory.
+fn attribute_ranges([positions, normals, tangents]: [u64; 3]) -> Vec<Range<u64>> {
+    let mut begin = 0;
+    let mut next_range = |bytes: u64| {
+        let range = begin..begin + bytes;
+        begin = range.end.next_multiple_of(ATTRIBUTE_ALIGNMENT);
+        range
+    };
+    let vertices = [positions, normals].map(&mut next_range);
+    vertices.into_iter().chain((tangents > 0).then(|| next_range(tangents))).collect()
 }
 
 /// OpenGL buffers of positions, normals and optionally tangents, registered with CUDA.
@@ -112,19 +186,11 @@ impl RegisteredOutputs {
     fn copy_after(&mut self, device: &Device, set: &OutputSet, submit_step: impl FnOnce() -> Result<()>) -> Result<()> {
         self.with_addresses(device, MapAccess::WriteDiscard, |targets| {
             submit_step()?;
-            let sources = [Some(&set.positions), Some(&set.normals), set.tangents.as_ref()];
-            for (source, target) in sources.into_iter().flatten().zip(targets) {
+            for ((source, bytes), target) in set.attributes().zip(targets) {
                 // SAFETY: the mapping checks that the target has the bytes of the plan, which are those of the source.
                 // The deformer owns both, and waits for its stream before it drops them. The buffers do not overlap.
-                unsafe {
-                    result::memcpy_dtod_async(
-                        *target,
-                        source.address(),
-                        source.bytes() as usize,
-                        device.stream().cu_stream(),
-                    )
-                }
-                .map_err(cuda_error("interop"))?;
+                unsafe { result::memcpy_dtod_async(*target, source, bytes as usize, device.stream().cu_stream()) }
+                    .map_err(cuda_error("interop"))?;
             }
             Ok(())
         })
@@ -135,27 +201,40 @@ impl OutputBuffers {
     /// Maximum number of sets.
     pub(super) const MAX_SETS: usize = 2;
 
-    /// Allocates a set, and registers OpenGL's buffers if they are given. If that fails, logs the error.
+    /// Allocates a set. If OpenGL's buffers are given, lets OpenGL import the set, or else registers the buffers. If both
+    /// fail, logs the errors.
     ///
     /// # Errors
     /// `Fault` when the device has not enough memory; `DeviceLost`.
     pub(super) fn new(device: &Device, plan: &DeformPlan, gl_buffers: Option<GlVertexBuffers>) -> Result<Self> {
-        let gl_buffers =
+        if let Some(importer) = gl_buffers.as_ref().and_then(|buffers| buffers.importer.clone()) {
+            match OutputSet::shared(device, plan, importer.as_ref()) {
+                Ok(set) => return Ok(Self { sets: vec![set], gl_outputs: GlOutputs::Imported(importer) }),
+                Err(lost @ Error::DeviceLost { .. }) => return Err(lost),
+                Err(error) => tracing::warn!(%error, "CUDA maps OpenGL's buffers: OpenGL cannot import the vertices"),
+            }
+        }
+        let gl_outputs =
             match gl_buffers.map(|buffers| RegisteredOutputs::register(device, buffers, output_sizes(plan))) {
-                Some(Ok(registered)) => Some(registered),
+                Some(Ok(registered)) => GlOutputs::Mapped(registered),
                 Some(Err(lost @ Error::DeviceLost { .. })) => return Err(lost),
                 Some(Err(error)) => {
                     tracing::warn!(%error, "vertices are uploaded: CUDA cannot write OpenGL's buffers");
-                    None
+                    GlOutputs::None
                 }
-                None => None,
+                None => GlOutputs::None,
             };
-        Ok(Self { sets: vec![OutputSet::new(device, plan)?], gl_buffers })
+        Ok(Self { sets: vec![OutputSet::new(device, plan)?], gl_outputs })
     }
 
     /// Whether OpenGL's buffers can be filled on the device.
     pub(super) const fn has_gl_buffers(&self) -> bool {
-        self.gl_buffers.is_some()
+        !matches!(self.gl_outputs, GlOutputs::None)
+    }
+
+    /// Whether CUDA maps OpenGL's buffers, so that a copy into them is best submitted together with a step.
+    pub(super) const fn maps_gl_buffers(&self) -> bool {
+        matches!(self.gl_outputs, GlOutputs::Mapped(_))
     }
 
     /// Number of allocated sets.
@@ -169,7 +248,10 @@ impl OutputBuffers {
     /// `Fault` when the device has not enough memory; the existing sets remain unchanged.
     pub(super) fn ensure_set(&mut self, device: &Device, plan: &DeformPlan, set: usize) -> Result<()> {
         if self.sets.len() <= set {
-            self.sets.push(OutputSet::new(device, plan)?);
+            self.sets.push(match &self.gl_outputs {
+                GlOutputs::Imported(importer) => OutputSet::shared(device, plan, importer.as_ref())?,
+                GlOutputs::None | GlOutputs::Mapped(_) => OutputSet::new(device, plan)?,
+            });
         }
         Ok(())
     }
@@ -178,30 +260,71 @@ impl OutputBuffers {
     /// on the device's stream: after all OpenGL commands issued before, and before all OpenGL commands issued later.
     ///
     /// # Errors
-    /// The error of `submit_step`; `Fault` without OpenGL's buffers, or when the device fails.
+    /// The error of `submit_step`; `Fault` without mapped OpenGL buffers, or when the device fails.
     pub(super) fn copy_to_gl_after(
         &mut self,
         device: &Device,
         set: usize,
         submit_step: impl FnOnce() -> Result<()>,
     ) -> Result<()> {
-        let missing_buffers = || fault("interop", "expected OpenGL buffers that CUDA can write, got none");
-        let gl_buffers = self.gl_buffers.as_mut().ok_or_else(missing_buffers)?;
-        gl_buffers.copy_after(device, &self.sets[set], submit_step)
+        match &mut self.gl_outputs {
+            GlOutputs::Mapped(gl_buffers) => gl_buffers.copy_after(device, &self.sets[set], submit_step),
+            GlOutputs::None | GlOutputs::Imported(_) => {
+                Err(fault("interop", "expected OpenGL buffers that CUDA can write, got none"))
+            }
+        }
+    }
+
+    /// Lets OpenGL copy a set into its buffers. The caller has waited for the step that wrote the set.
+    ///
+    /// # Errors
+    /// `Fault` unless OpenGL has imported the set, or if OpenGL fails.
+    pub(super) fn copy_by_gl(&self, set: usize) -> Result<()> {
+        let missing_import = || fault("interop", "expected an output that OpenGL has imported, got none");
+        self.sets[set].imported().ok_or_else(missing_import)?.copy_to_scene()
+    }
+
+    /// Whether OpenGL still copies from a set.
+    pub(super) fn is_read_by_gl(&self, set: usize) -> bool {
+        self.sets[set].imported().is_some_and(|vertices| !vertices.is_copied())
+    }
+
+    /// Waits until OpenGL no longer copies from a set.
+    ///
+    /// # Errors
+    /// `Fault` if OpenGL does not finish.
+    pub(super) fn wait_for_gl(&self, set: usize) -> Result<()> {
+        self.sets[set].imported().map_or(Ok(()), ImportedVertices::wait_for_copy)
     }
 
     /// Copies a set into `surface_lists` and waits for the copies. Each list must have the length of the plan or be
     /// empty.
     pub(super) fn read(&self, device: &Device, set: usize, surface_lists: SurfaceLists<'_>) -> Result<()> {
         let SurfaceLists { positions, normals, tangents, .. } = surface_lists;
-        let buffers = &self.sets[set];
-        buffers.positions.read(device, 0, positions)?;
-        buffers.normals.read(device, 0, normals)?;
-        buffers.tangents.as_ref().map_or(Ok(()), |buffer| buffer.read(device, 0, tangents))
+        for ((address, bytes), list) in self.sets[set].attributes().zip([positions, normals, tangents]) {
+            if size_of_val(list) as u64 > bytes {
+                let got = size_of_val(list);
+                return Err(fault("download", format!("expected a list of at most {bytes} bytes, got {got}")));
+            }
+            // SAFETY: the attribute has at least the bytes of the list.
+            unsafe { download(device, address, list) }?;
+        }
+        Ok(())
     }
 
     /// The addresses of an existing set. They are valid while the set exists.
     pub(super) fn addresses(&self, set: usize) -> OutputAddresses {
-        self.sets[set].addresses()
+        self.sets[set].addresses
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn attributes_in_shared_memory_are_aligned_and_do_not_overlap() {
+        assert_eq!(attribute_ranges([12, 256, 0]), [0..12, 256..512]);
+        assert_eq!(attribute_ranges([300, 36, 48]), [0..300, 512..548, 768..816]);
     }
 }

@@ -39,6 +39,8 @@ struct OutputState {
     dirty_domains: Option<Vec<u32>>,
     /// The last readback of the output, until the host knows that it has ended.
     read_id: Option<u64>,
+    /// Whether OpenGL may still copy from the output.
+    is_read_by_gl: bool,
 }
 
 /// A step that begins.
@@ -74,7 +76,8 @@ impl OutputRing {
 
     /// The output that the next step writes: the current one, or the other one while the current one is being read.
     pub(super) fn next_output(&self) -> usize {
-        if self.outputs[self.current_output].read_id.is_some() {
+        let current = &self.outputs[self.current_output];
+        if current.read_id.is_some() || current.is_read_by_gl {
             (self.current_output + 1) % self.max_outputs
         } else {
             self.current_output
@@ -167,6 +170,13 @@ impl OutputRing {
             .for_each(|output| output.read_id = None);
     }
 
+    /// Records whether OpenGL may still copy from an output.
+    pub(super) fn set_read_by_gl(&mut self, output: usize, is_read: bool) {
+        if let Some(output) = self.outputs.get_mut(output) {
+            output.is_read_by_gl = is_read;
+        }
+    }
+
     /// Invalidates all outputs and the values on the device after a fault. Readbacks in flight continue.
     pub(super) fn invalidate(&mut self) {
         self.serial = None;
@@ -232,6 +242,23 @@ mod tests {
             assert!(target.is_being_read, "expected an unfinished copy");
             previous_changes = vec![serial as u32];
         }
+    }
+
+    #[test]
+    fn outputs_alternate_while_opengl_copies_them() {
+        let mut output_ring = OutputRing::new(2, 10);
+        step(&mut output_ring, &state(1, &[]));
+        output_ring.set_read_by_gl(0, true);
+        // A vertex readback of the same output begins and ends meanwhile.
+        let read_id = output_ring.begin_read();
+        output_ring.end_read(read_id);
+        assert_eq!(output_ring.next_output(), 1);
+        assert_eq!(step(&mut output_ring, &state(2, &[5])).output, 1);
+        output_ring.set_read_by_gl(0, false);
+        assert_eq!(output_ring.next_output(), 1, "expected the current output, which OpenGL does not copy");
+        output_ring.set_read_by_gl(1, true);
+        let third = step(&mut output_ring, &state(3, &[6]));
+        assert_eq!((third.output, third.is_being_read, third.dirty_domains), (0, false, Some(vec![5])));
     }
 
     #[test]

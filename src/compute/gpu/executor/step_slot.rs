@@ -42,9 +42,8 @@ pub(super) struct StepSlot {
     bounds_keys: PinnedBuffer<u32>,
     /// End of the last step.
     pub done: CudaEvent,
-    /// Begin of the last step on the device, if OpenGL's buffers were mapped before it. The map waits for frames in
-    /// flight.
-    mapped_event: Option<CudaEvent>,
+    /// Begin of the last step on the device, if it may have waited for frames of OpenGL.
+    begin_event: Option<CudaEvent>,
 }
 
 impl StepSlot {
@@ -60,29 +59,29 @@ impl StepSlot {
             .map(|change_list| capture(device, || submission.submit(device, Some(change_list))))
             .transpose()?;
         let done = new_timed_event(device)?;
-        Ok(Self { full_graph, partial_graph, values, change_list, bounds_keys, done, mapped_event: None })
+        Ok(Self { full_graph, partial_graph, values, change_list, bounds_keys, done, begin_event: None })
     }
 
-    /// Records on the stream that OpenGL's buffers are mapped, which the step begins with.
-    pub(super) fn record_mapped(&mut self, device: &Device) -> Result<()> {
-        let event = match self.mapped_event.take() {
+    /// Records on the stream that the device begins the step. It may first complete or interrupt frames of OpenGL.
+    pub(super) fn record_begin(&mut self, device: &Device) -> Result<()> {
+        let event = match self.begin_event.take() {
             Some(event) => event,
             None => new_timed_event(device)?,
         };
         event.record(device.stream()).map_err(cuda_error("deform"))?;
-        self.mapped_event = Some(event);
+        self.begin_event = Some(event);
         Ok(())
     }
 
-    /// Milliseconds from [`Self::record_mapped`] of the last step to the end of this step, which has ended. The host's
+    /// Milliseconds from [`Self::record_begin`] of the last step to the end of this step, which has ended. The host's
     /// work in between counts only as far as the device waits for it.
     ///
     /// # Errors
-    /// `Fault` without [`Self::record_mapped`], or when the device fails.
-    pub(super) fn ms_since_mapped(&self) -> Result<f64> {
-        let missing_event = || Error::Fault { stage: "deform", reason: "expected a mapped step, got none".into() };
-        let mapped_event = self.mapped_event.as_ref().ok_or_else(missing_event)?;
-        mapped_event.elapsed_ms(&self.done).map(f64::from).map_err(cuda_error("deform"))
+    /// `Fault` without [`Self::record_begin`], or when the device fails.
+    pub(super) fn ms_since_begin(&self) -> Result<f64> {
+        let missing_event = || Error::Fault { stage: "deform", reason: "expected a recorded begin, got none".into() };
+        let begin_event = self.begin_event.as_ref().ok_or_else(missing_event)?;
+        begin_event.elapsed_ms(&self.done).map(f64::from).map_err(cuda_error("deform"))
     }
 
     /// Starts the graph of a full or partial step on the device's stream. The caller has written the values.

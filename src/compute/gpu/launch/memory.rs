@@ -95,7 +95,7 @@ impl DeviceBuffer {
 ///
 /// # Safety
 /// `address` is that of at least as many bytes of device memory as `target` has.
-unsafe fn download<T: Pod>(device: &Device, address: u64, target: &mut [T]) -> Result<()> {
+pub(crate) unsafe fn download<T: Pod>(device: &Device, address: u64, target: &mut [T]) -> Result<()> {
     if target.is_empty() {
         return Ok(());
     }

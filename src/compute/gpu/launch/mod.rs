@@ -31,6 +31,6 @@ pub use device::Device;
 pub(crate) use exported_memory::ExportedMemory;
 pub use kernel::{KernelDescriptor, KernelKind, LaunchOrder, launch_kernel};
 pub(crate) use kernel::{KernelSource, KernelText};
-pub(crate) use memory::PageLock;
 pub use memory::{DeviceBuffer, PinnedBuffer, PinnedUse};
+pub(crate) use memory::{PageLock, download};
 pub use probe::{DeviceInfo, Probe, probe};

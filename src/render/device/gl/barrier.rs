@@ -12,6 +12,8 @@ pub(crate) struct MemoryBarriers(u32);
 
 impl MemoryBarriers {
     pub(crate) const NONE: Self = Self(0);
+    /// Vertex attributes.
+    pub(crate) const VERTEX_ATTRIBUTES: Self = Self(glow::VERTEX_ATTRIB_ARRAY_BARRIER_BIT);
     /// Index buffers.
     pub(crate) const ELEMENT_ARRAY: Self = Self(glow::ELEMENT_ARRAY_BARRIER_BIT);
     /// Texture lookups, including buffer textures.

@@ -140,7 +140,6 @@ impl Buffer {
     }
 
     /// Another owner of the same buffer object.
-    #[cfg(test)]
     pub(crate) fn alias(&self) -> Self {
         Self { object: Rc::clone(&self.object), bytes: self.bytes }
     }
@@ -184,6 +183,22 @@ impl Buffer {
         let Some(gl) = self.object.gl.functions_or_skip() else { return };
         // SAFETY: binding points below the eight that every context has.
         unsafe { gl.bind_buffer_base(glow::SHADER_STORAGE_BUFFER, binding, Some(self.object.name)) }
+    }
+
+    /// Binds a range of bytes as a storage buffer of shaders. `offset` is a multiple of 256, the largest alignment that a
+    /// context may demand.
+    pub(crate) fn bind_storage_range(&self, binding: u32, offset: u64, bytes: u64) {
+        let gl = &self.object.gl;
+        if offset.checked_add(bytes).is_none_or(|end| end > self.bytes) {
+            let reason = format!("expected a range within {} bytes, got {bytes} bytes at {offset}", self.bytes);
+            return gl.record_skipped(reason);
+        }
+        let Some(gl) = gl.functions_or_skip() else { return };
+        // SAFETY: binding points below the eight that every context has; the range is inside the buffer.
+        unsafe {
+            let (name, offset, bytes) = (Some(self.object.name), offset as i32, bytes as i32);
+            gl.bind_buffer_range(glow::SHADER_STORAGE_BUFFER, binding, name, offset, bytes);
+        }
     }
 
     /// Binds the first `bytes` bytes as a uniform block.

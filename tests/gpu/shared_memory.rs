@@ -1,0 +1,211 @@
+//! Memory that OpenGL and CUDA share: pictures that the copy engine moves to the host, and vertices that OpenGL imports.
+//! Frames equal those without shared memory, also with several steps and frames in flight.
+
+use std::collections::VecDeque;
+use std::rc::Rc;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use modalcast_compute::gpu::{CudaDeformer, CudaDeformerOptions, CudaPictureMemory, Device};
+use modalcast_model::deform::Deformer;
+use modalcast_model::error::Result;
+use modalcast_model::raster::GlVertexBuffers;
+use modalcast_model::scene::{BoundingBox, Camera, Scene, SceneState};
+use modalcast_model::shared_memory::{ExportedVertices, ImportedVertices, VertexImporter};
+use modalcast_render::{FrameParams, MAX_FRAMES_IN_FLIGHT, PendingFrame, PixelReadback, Renderer, SceneBuffers};
+
+use crate::gl::Exclusive;
+use crate::scenes;
+
+/// Number of different states.
+const STATES: u64 = 24;
+
+/// A renderer, a scene with normal maps, and the images of its states without shared memory.
+struct Fixture {
+    renderer: Exclusive<Renderer>,
+    device: Arc<Device>,
+    scene: Arc<Scene>,
+    states: Vec<SceneState>,
+    size: [u32; 2],
+    expected_images: Vec<Vec<u8>>,
+}
+
+impl Fixture {
+    /// Draws the images from uploaded vertices through pixel buffers. Then lets the renderer share memory with CUDA.
+    fn open(size: [u32; 2]) -> Self {
+        let mut renderer = Exclusive::renderer();
+        let device = Device::open(0).expect("expected a CUDA device");
+        let options = scenes::RandomSceneOptions { instances: 5, normal_maps: true, rigid_transforms: false };
+        let scene = scenes::random_scene(&[(3000, 12), (50, 0), (7, 3)], options);
+        let states: Vec<SceneState> = (0..STATES).map(|seed| scenes::random_state(&scene, seed)).collect();
+        let mut deformer = open_deformer(&device, &scene, None);
+        let buffers = renderer.load(&scene).expect("expected the scene to load");
+        assert!(matches!(renderer.info().pixel_readback, PixelReadback::PixelBuffer(_)));
+        assert!(buffers.vertex_buffers().importer.is_none());
+        let mut draw = |state: &SceneState| {
+            let bounds = deformer.deform(state).expect("expected the step to succeed").bounds;
+            renderer.upload(&buffers, deformer.surface().expect("expected a surface")).expect("expected an upload");
+            renderer.draw(&buffers, &frame_params(&scene, size, bounds)).expect("expected a frame").rgba
+        };
+        let expected_images: Vec<Vec<u8>> = states.iter().map(&mut draw).collect();
+        assert!(expected_images.windows(2).all(|pair| pair[0] != pair[1]), "expected different images");
+        renderer.unload(buffers);
+        let memory = CudaPictureMemory::new(&device).expect("expected a copy stream");
+        renderer.share_pictures(Rc::new(memory)).expect("expected no lost device");
+        assert_eq!(renderer.info().pixel_readback, PixelReadback::CopyEngine);
+        Self { renderer, device, scene, states, size, expected_images }
+    }
+
+    /// Deforms and draws steps with [`MAX_FRAMES_IN_FLIGHT`] frames in flight for at least `seconds` and two rounds of the
+    /// states. `change_buffers` changes the buffers that the deformer gets. Returns the numbers of frames and of frames that
+    /// show another image than that of their step.
+    fn draw_steps(
+        &mut self,
+        seconds: f64,
+        change_buffers: impl FnOnce(GlVertexBuffers) -> GlVertexBuffers,
+    ) -> FrameCounts {
+        let buffers = self.renderer.load(&self.scene).expect("expected the scene to load");
+        let vertex_buffers = buffers.vertex_buffers();
+        assert!(vertex_buffers.importer.is_some());
+        let mut deformer = open_deformer(&self.device, &self.scene, Some(change_buffers(vertex_buffers)));
+        let mut counts = FrameCounts::default();
+        let mut frames: VecDeque<(usize, PendingFrame)> = VecDeque::new();
+        let begin = Instant::now();
+        let mut step = 0;
+        while step < 2 * self.states.len() || begin.elapsed() < Duration::from_secs_f64(seconds) {
+            let index = step % self.states.len();
+            self.submit(&mut deformer, &buffers, index, &mut frames);
+            while frames.len() >= MAX_FRAMES_IN_FLIGHT {
+                self.finish_oldest(&mut frames, &mut counts);
+            }
+            step += 1;
+        }
+        while !frames.is_empty() {
+            self.finish_oldest(&mut frames, &mut counts);
+        }
+        drop(deformer);
+        self.renderer.unload(buffers);
+        counts
+    }
+
+    fn submit(
+        &mut self,
+        deformer: &mut CudaDeformer,
+        buffers: &SceneBuffers,
+        index: usize,
+        frames: &mut VecDeque<(usize, PendingFrame)>,
+    ) {
+        let bounds = deformer.deform(&self.states[index]).expect("expected the step to succeed").bounds;
+        deformer.fill_gl_buffers().expect("expected filled buffers");
+        let params = frame_params(&self.scene, self.size, bounds);
+        frames.push_back((index, self.renderer.submit(buffers, &params).expect("expected the frame to start")));
+    }
+
+    fn finish_oldest(&mut self, frames: &mut VecDeque<(usize, PendingFrame)>, counts: &mut FrameCounts) {
+        let Some((index, frame)) = frames.pop_front() else { return };
+        let pixels = self.renderer.map_pixels(frame).expect("expected a frame").into_shared_image().rgba;
+        counts.all += 1;
+        counts.stale += usize::from(pixels.as_ref() != self.expected_images[index]);
+    }
+}
+
+#[derive(Debug, Default, PartialEq, Eq)]
+struct FrameCounts {
+    all: usize,
+    stale: usize,
+}
+
+fn frame_params(scene: &Scene, [width, height]: [u32; 2], bounds: BoundingBox) -> FrameParams {
+    FrameParams { camera: Camera::fit_to_scene(scene, 64, 64), width, height, bounds, light_bounds: None, edges: None }
+}
+
+fn open_deformer(device: &Arc<Device>, scene: &Arc<Scene>, buffers: Option<GlVertexBuffers>) -> CudaDeformer {
+    let options = CudaDeformerOptions::with_bounding_axes(scene.light_axes());
+    CudaDeformer::new(device, scene, buffers, options).expect("expected a CUDA deformer")
+}
+
+/// Seconds of the long test; MODALCAST_PIPELINE_SECONDS overrides the default.
+fn pipeline_seconds() -> f64 {
+    std::env::var("MODALCAST_PIPELINE_SECONDS").ok().and_then(|text| text.parse().ok()).unwrap_or(5.0)
+}
+
+/// Steps and small frames without a pause, through shared vertices and shared pictures.
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_pipelined_steps_show_no_stale_frame() {
+    let mut fixture = Fixture::open([96, 64]);
+    let counts = fixture.draw_steps(pipeline_seconds(), |buffers| buffers);
+    eprintln!("{counts:?} small frames with shared vertices");
+    assert!(counts.all > 0 && counts.stale == 0, "{counts:?}");
+}
+
+/// Frames that take longer than a step, so that the deformer writes vertices while earlier frames are drawn.
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_large_frames_in_flight_keep_their_vertices_and_pixels() {
+    let mut fixture = Fixture::open([1920, 1080]);
+    let counts = fixture.draw_steps(0.0, |buffers| buffers);
+    assert_eq!(counts, FrameCounts { all: 2 * STATES as usize, stale: 0 });
+    // Without an importer, CUDA maps OpenGL's buffers.
+    let mapped_counts = fixture.draw_steps(0.0, |buffers| GlVertexBuffers { importer: None, ..buffers });
+    assert_eq!(mapped_counts, counts);
+}
+
+/// An importer that refuses all memory.
+#[derive(Debug)]
+struct RefusingImporter;
+
+impl VertexImporter for RefusingImporter {
+    fn import(&self, _: ExportedVertices) -> Result<Box<dyn ImportedVertices>> {
+        Err(modalcast_model::error::fault("test", "refused"))
+    }
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_buffers_are_mapped_if_the_import_is_refused() {
+    let mut fixture = Fixture::open([320, 240]);
+    let counts =
+        fixture.draw_steps(0.0, |buffers| GlVertexBuffers { importer: Some(Rc::new(RefusingImporter)), ..buffers });
+    assert_eq!(counts, FrameCounts { all: 2 * STATES as usize, stale: 0 });
+}
+
+/// An importer whose vertices claim that OpenGL has copied them at once.
+#[derive(Debug)]
+struct UnorderedImporter(Rc<dyn VertexImporter>);
+
+#[derive(Debug)]
+struct UnorderedVertices(Box<dyn ImportedVertices>);
+
+impl VertexImporter for UnorderedImporter {
+    fn import(&self, vertices: ExportedVertices) -> Result<Box<dyn ImportedVertices>> {
+        Ok(Box::new(UnorderedVertices(self.0.import(vertices)?)))
+    }
+}
+
+impl ImportedVertices for UnorderedVertices {
+    fn copy_to_scene(&self) -> Result<()> {
+        self.0.copy_to_scene()
+    }
+
+    fn is_copied(&self) -> bool {
+        true
+    }
+
+    fn wait_for_copy(&self) -> Result<()> {
+        Ok(())
+    }
+}
+
+/// Control of the tests above: without the wait for OpenGL's fence, frames show the vertices of later steps.
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_frames_are_stale_without_the_wait_for_opengl() {
+    let mut fixture = Fixture::open([1920, 1080]);
+    let counts = fixture.draw_steps(0.0, |buffers| {
+        let importer = buffers.importer.expect("expected an importer");
+        GlVertexBuffers { importer: Some(Rc::new(UnorderedImporter(importer))), ..buffers }
+    });
+    eprintln!("{counts:?} without the wait");
+    assert!(counts.stale > 0, "expected stale frames without the wait, got {counts:?}");
+}
