@@ -64,7 +64,8 @@
 //! # Invariants
 //! 1. No module or crate depends on a higher tier.
 //! 2. Only `service` uses protobuf types.
-//! 3. In the server, OpenGL and CUDA are called on the device thread only.
+//! 3. In the server, OpenGL and CUDA are called on the device thread only. Exceptions: another thread prepares a deformer,
+//!    and the last reader of a picture may free its pinned memory.
 //! 4. Every channel is bounded, and its documentation states what happens when it is full.
 //! 5. Every kernel has a launcher of the same name and a CPU twin. The twin has the same name unless the table in
 //!    `tests/it/layering.rs` names another one.

@@ -104,3 +104,31 @@ fn text_lines(report: &Value) -> Vec<String> {
     push_line("verdict", &verdict.into(), "");
     lines
 }
+
+#[cfg(test)]
+mod tests {
+    use modalcast_render::PixelReadback;
+
+    use super::*;
+
+    /// The text after the name of a line.
+    fn line_text(report: &Value, name: &str) -> String {
+        let lines = text_lines(report);
+        let line = lines.iter().find_map(|line| line.strip_prefix(name)).expect("expected the line");
+        line.trim().to_owned()
+    }
+
+    #[test]
+    fn report_says_how_pixels_leave_the_device() {
+        let mut report = diagnose();
+        assert_eq!(report["can_draw"], true, "expected a renderer, at least Mesa's");
+        let has_cuda = report["cuda"]["devices"].as_array().is_some_and(|devices| !devices.is_empty());
+        if !has_cuda {
+            assert_eq!(line_text(&report, "pixels leave"), "by OpenGL: CUDA is not used");
+        }
+        report["pixel_readback"] = PixelReadback::CopyEngine.to_string().into();
+        assert_eq!(line_text(&report, "pixels leave"), "by CUDA's copy engine from memory shared with OpenGL");
+        report["pixel_readback"] = Value::Null;
+        assert_eq!(line_text(&report, "pixels leave"), "none");
+    }
+}

@@ -8,9 +8,10 @@ use std::ops::Range;
 
 use super::Renderer;
 use super::pending_frame::{MappedPixels, PendingFrame};
+use crate::device::gl::ReadbackView;
 use crate::device::readback_ring::ReadbackSlot;
 use crate::layout;
-use crate::pass::{FrameTimes, Pass};
+use crate::pass::{FrameTimes, Pass, RenderStage};
 use crate::resources::scene_buffers::SceneBuffers;
 use crate::types::{FrameImage, FrameInfo, FrameParams, FrameStats, RasterBackend};
 use modalcast_model::error::Result;
@@ -88,7 +89,10 @@ impl Renderer {
                 None => times.push((*pass, timer.ms())),
             }
         }
-        let times = FrameTimes::of_passes(&times);
+        let mut times = FrameTimes::of_passes(&times);
+        if let Some(copy_ms) = view.as_ref().and_then(ReadbackView::copy_ms) {
+            times.add(RenderStage::Read, copy_ms);
+        }
         Ok(MappedPixels { width: desc.width, height: desc.height, view, times, info })
     }
 

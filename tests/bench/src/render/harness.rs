@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 use serde::Serialize;
 
 use crate::timing::{MIN_REPETITIONS, Timing};
+use modalcast::engine::share_pictures;
 use modalcast_compute::cpu::CpuDeformer;
 use modalcast_compute::gpu::{CudaRasterizer, Device};
 use modalcast_model::backend_settings::RasterPolicy;
@@ -55,8 +56,13 @@ pub(super) struct LoadedScene {
 }
 
 impl RenderHarness {
+    /// Opens a renderer that shares memory with CUDA if it can, as in the server.
     pub(super) fn open() -> Result<Self> {
-        Ok(Self { renderer: Renderer::open(DevicePreference::Any)? })
+        let mut renderer = Renderer::open(DevicePreference::Any)?;
+        if let Some(device) = cuda_device() {
+            share_pictures(&mut renderer, &device)?;
+        }
+        Ok(Self { renderer })
     }
 
     /// Loads a scene.
