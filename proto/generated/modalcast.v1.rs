@@ -1891,6 +1891,20 @@ pub mod scene_service_server {
         const NAME: &'static str = SERVICE_NAME;
     }
 }
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct ResetSceneRequest {
+    #[prost(string, tag = "1")]
+    pub scene: ::prost::alloc::string::String,
+    /// As OpenDrive.take_over. Without this, a scene that another client drives is not changed
+    /// (REASON_WRITER_LEASE_TAKEN).
+    #[prost(bool, tag = "2")]
+    pub take_over: bool,
+}
+#[derive(Clone, Copy, PartialEq, ::prost::Message)]
+pub struct ResetSceneResponse {
+    #[prost(message, optional, tag = "1")]
+    pub step: ::core::option::Option<StepId>,
+}
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct DriveSceneRequest {
     #[prost(oneof = "drive_scene_request::Kind", tags = "1, 2")]
@@ -1924,7 +1938,8 @@ pub struct OpenDrive {
     pub window: u32,
     /// A token of 16 to 64 bytes that the client keeps. A stream with the token of the present writer replaces that writer
     /// at once, for example after a crash of the client or of its connection, and begins a new run. The replaced stream
-    /// ends with REASON_LEASE_LOST. Empty: the server creates a token (Opened.lease_token).
+    /// ends with REASON_LEASE_LOST. The token also selects the default of `initial_state`. Empty: the server creates a
+    /// token (Opened.lease_token).
     #[prost(bytes = "bytes", tag = "5")]
     pub lease_token: ::prost::bytes::Bytes,
     /// Replaces the present writer even if its token is another one. Without this, such a writer keeps the lease
@@ -2064,7 +2079,10 @@ impl Overflow {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
 #[repr(i32)]
 pub enum InitialState {
-    /// Means INITIAL_STATE_KEEP.
+    /// A new writer begins at rest, and a writer that continues its own run keeps the state: means INITIAL_STATE_KEEP if
+    /// `lease_token` is that of the last writer of the scene since the server opened it, else INITIAL_STATE_RESET.
+    /// Opened.initial_state states which one is in effect. After INITIAL_STATE_RESET, a client that resumes after a restart
+    /// of the server sends all values again.
     Unspecified = 0,
     /// The current state.
     Keep = 1,
@@ -2268,6 +2286,33 @@ pub mod step_service_client {
                 .insert(GrpcMethod::new("modalcast.v1.StepService", "DriveScene"));
             self.inner.streaming(req, path, codec).await
         }
+        /// Returns a scene to its rest state: a writer of its own sends one step without values from INITIAL_STATE_RESET, with
+        /// number 0 and time 0, and releases the lease. The reply is sent when the step is completed. A program that drives
+        /// the scene sends the values at rest as a step instead.
+        pub async fn reset_scene(
+            &mut self,
+            request: impl tonic::IntoRequest<super::ResetSceneRequest>,
+        ) -> std::result::Result<
+            tonic::Response<super::ResetSceneResponse>,
+            tonic::Status,
+        > {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = tonic_prost::ProstCodec::default();
+            let path = http::uri::PathAndQuery::from_static(
+                "/modalcast.v1.StepService/ResetScene",
+            );
+            let mut req = request.into_request();
+            req.extensions_mut()
+                .insert(GrpcMethod::new("modalcast.v1.StepService", "ResetScene"));
+            self.inner.unary(req, path, codec).await
+        }
     }
 }
 /// Generated server implementations.
@@ -2303,6 +2348,16 @@ pub mod step_service_server {
             &self,
             request: tonic::Request<tonic::Streaming<super::DriveSceneRequest>>,
         ) -> std::result::Result<tonic::Response<Self::DriveSceneStream>, tonic::Status>;
+        /// Returns a scene to its rest state: a writer of its own sends one step without values from INITIAL_STATE_RESET, with
+        /// number 0 and time 0, and releases the lease. The reply is sent when the step is completed. A program that drives
+        /// the scene sends the values at rest as a step instead.
+        async fn reset_scene(
+            &self,
+            request: tonic::Request<super::ResetSceneRequest>,
+        ) -> std::result::Result<
+            tonic::Response<super::ResetSceneResponse>,
+            tonic::Status,
+        >;
     }
     /// Receives the steps of a simulation: one stream per physics process.
     #[derive(Debug)]
@@ -2429,6 +2484,51 @@ pub mod step_service_server {
                     };
                     Box::pin(fut)
                 }
+                "/modalcast.v1.StepService/ResetScene" => {
+                    #[allow(non_camel_case_types)]
+                    struct ResetSceneSvc<T: StepService>(pub Arc<T>);
+                    impl<
+                        T: StepService,
+                    > tonic::server::UnaryService<super::ResetSceneRequest>
+                    for ResetSceneSvc<T> {
+                        type Response = super::ResetSceneResponse;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::Response>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<super::ResetSceneRequest>,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as StepService>::reset_scene(&inner, request).await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = ResetSceneSvc(inner);
+                        let codec = tonic_prost::ProstCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.unary(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
                 _ => {
                     Box::pin(async move {
                         let mut response = http::Response::new(
@@ -2540,7 +2640,8 @@ pub mod camera {
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct LookAt {
     /// Three numbers each; `eye` and `target` are positions in scene units, and `up` is a direction of any length. `eye`
-    /// and `target` must differ, and `up` must not be parallel to the line between them.
+    /// and `target` must differ, and `up` must not be parallel to the line between them. Empty `up`: the up axis of the
+    /// scene.
     #[prost(double, repeated, tag = "1")]
     pub eye: ::prost::alloc::vec::Vec<f64>,
     #[prost(double, repeated, tag = "2")]

@@ -4,7 +4,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use super::scene::delivery::Delivery;
-use super::scene::lease::{InitialState, LeaseRequest};
+use super::scene::lease::LeaseRequest;
 use super::scene::step_queue::Overflow;
 use super::source::SceneSource;
 use modalcast_compute::reference::ReferenceDeformer;
@@ -140,6 +140,6 @@ pub(crate) const fn lossless_lease(window: u32) -> LeaseRequest {
         window,
         token: None,
         takes_over: false,
-        initial_state: InitialState::Keep,
+        initial_state: None,
     }
 }

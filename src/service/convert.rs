@@ -159,8 +159,9 @@ pub(super) fn parse_lease_request(open: &v1::OpenDrive, default_window: u32) -> 
         Err(_) => return Err(invalid("open.overflow", "an overflow of this version", open.overflow)),
     };
     let initial_state = match v1::InitialState::try_from(open.initial_state) {
-        Ok(v1::InitialState::Unspecified | v1::InitialState::Keep) => InitialState::Keep,
-        Ok(v1::InitialState::Reset) => InitialState::Reset,
+        Ok(v1::InitialState::Unspecified) => None,
+        Ok(v1::InitialState::Keep) => Some(InitialState::Keep),
+        Ok(v1::InitialState::Reset) => Some(InitialState::Reset),
         Err(_) => return Err(invalid("open.initial_state", "an initial state of this version", open.initial_state)),
     };
     let is_token_given = !open.lease_token.is_empty();
@@ -188,7 +189,7 @@ pub(super) fn wire_opened(writer: &WriterSession, request: &LeaseRequest, scene_
         Overflow::Block => v1::Overflow::Block,
         Overflow::Reject => v1::Overflow::Reject,
     };
-    let initial_state = match request.initial_state {
+    let initial_state = match writer.initial_state {
         InitialState::Keep => v1::InitialState::Keep,
         InitialState::Reset => v1::InitialState::Reset,
     };
@@ -263,7 +264,7 @@ fn parse_picture(engine: &Engine, scene: &Scene, picture: v1::Picture) -> Result
 /// Validates the camera of a picture. An unset camera is fitted to the scene.
 fn parse_picture_camera(scene: &Scene, size: FrameSize, camera: Option<v1::Camera>) -> Result<Camera> {
     let fit_to_scene = Camera::fit_to_scene(scene, size.width, size.height);
-    camera.map_or(Ok(fit_to_scene), |camera| camera::parse_camera(fit_to_scene, camera))
+    camera.map_or(Ok(fit_to_scene), |camera| camera::parse_camera(scene, fit_to_scene, camera))
 }
 
 /// Validates new cameras of a stream's pictures. Returns the index of each picture with its camera.

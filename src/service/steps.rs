@@ -11,7 +11,7 @@ use tokio::sync::OwnedSemaphorePermit;
 use tonic::{Request, Response, Status, Streaming};
 
 use super::connection::ConnectionInfo;
-use super::convert::{parse_lease_request, parse_step, wire_opened, wire_stages};
+use super::convert::{parse_lease_request, parse_step, wire_opened, wire_stages, wire_step_id};
 use super::shared_memory::SharedMemory;
 use super::status::{to_rejection, to_status, transport_status};
 use super::step_parts::StepAssembler;
@@ -54,6 +54,17 @@ impl v1::step_service_server::StepService for StepServiceImpl {
             replies: VecDeque::new(),
         };
         Ok(respond(move |reply_sender| deadline.enforce("the step stream", session.run(reply_sender))))
+    }
+
+    async fn reset_scene(
+        &self,
+        request: Request<v1::ResetSceneRequest>,
+    ) -> Result<Response<v1::ResetSceneResponse>, Status> {
+        let peer = ConnectionInfo::of(&request).map_err(to_status)?.peer();
+        let request = request.into_inner();
+        let scene_handle = self.engine.find(&request.scene).map_err(to_status)?;
+        let step = scene_handle.reset(&peer, request.take_over).await.map_err(to_status)?;
+        Ok(Response::new(v1::ResetSceneResponse { step: Some(wire_step_id(step)) }))
     }
 }
 

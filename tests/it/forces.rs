@@ -118,7 +118,7 @@ async fn forces_of_a_lost_viewer_expire() {
 
 /// A picture of the strips from the front.
 fn picture() -> Picture {
-    let view = View::LookAt { eye: [0.5, 0.5, 4.0], target: [0.5, 0.5, 0.0], up: [0.0, 1.0, 0.0] };
+    let view = View::LookAt { eye: [0.5, 0.5, 4.0], target: [0.5, 0.5, 0.0], up: Some([0.0, 1.0, 0.0]) };
     let lens = Lens::Intrinsics { fx: 160.0, fy: 160.0, cx: 48.0, cy: 40.0 };
     Picture { width: 96, height: 80, camera: Some(Camera { view, lens, clip: None }), ..Picture::default() }
 }

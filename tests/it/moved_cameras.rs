@@ -17,7 +17,7 @@ async fn start_server() -> (Server, Client) {
 
 /// A camera in front of the strips at a height.
 fn camera(height: f64) -> Camera {
-    let view = View::LookAt { eye: [0.5, height, 4.0], target: [0.5, 0.5, 0.0], up: [0.0, 1.0, 0.0] };
+    let view = View::LookAt { eye: [0.5, height, 4.0], target: [0.5, 0.5, 0.0], up: Some([0.0, 1.0, 0.0]) };
     Camera { view, lens: Lens::FieldOfView(40.0), clip: None }
 }
 
@@ -135,7 +135,7 @@ async fn invalid_updates_are_rejected() {
         error.rejection().expect("expected a rejection with details").clone()
     };
     let still = || Some(camera(0.5));
-    let eye_at_target = View::LookAt { eye: [0.0; 3], target: [0.0; 3], up: [0.0, 1.0, 0.0] };
+    let eye_at_target = View::LookAt { eye: [0.0; 3], target: [0.0; 3], up: Some([0.0, 1.0, 0.0]) };
     let invalid_camera = Some(Camera { view: eye_at_target, ..camera(0.5) });
     for (cameras, field) in [
         (vec![], "cameras"),

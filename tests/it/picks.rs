@@ -30,7 +30,7 @@ async fn start_server(source: &str) -> (Server, Client) {
 /// A picture of the strips by a camera 4 units in front of them. The focal length of 160 pixels gives 160 / 4 = 40
 /// pixels per unit at z = 0.
 fn picture() -> Picture {
-    let view = View::LookAt { eye: [0.5, 0.5, 4.0], target: [0.5, 0.5, 0.0], up: [0.0, 1.0, 0.0] };
+    let view = View::LookAt { eye: [0.5, 0.5, 4.0], target: [0.5, 0.5, 0.0], up: Some([0.0, 1.0, 0.0]) };
     let lens = Lens::Intrinsics { fx: 160.0, fy: 160.0, cx: 48.0, cy: 40.0 };
     let camera = Some(Camera { view, lens, clip: None });
     Picture { width: 96, height: 80, camera, ..Picture::default() }
@@ -135,7 +135,7 @@ async fn reduced_force_of_a_hit_matches_the_complete_modes() {
 #[tokio::test(flavor = "multi_thread")]
 async fn many_hits_are_chunked_and_far_picks_keep_precision() {
     let (_server, client) = start_server("sheet").await;
-    let view = View::LookAt { eye: [150.0, 150.0, 40.0], target: [150.0, 150.0, 0.0], up: [0.0, 1.0, 0.0] };
+    let view = View::LookAt { eye: [150.0, 150.0, 40.0], target: [150.0, 150.0, 0.0], up: Some([0.0, 1.0, 0.0]) };
     let camera = Some(Camera { view, lens: Lens::FieldOfView(20.0), clip: None });
     let picture = Picture { width: 640, height: 480, camera, ..Picture::default() };
     let picks = client
@@ -169,8 +169,11 @@ async fn many_hits_are_chunked_and_far_picks_keep_precision() {
     // Cameras and picked positions are in scene units from the scene origin.
     let translation: [f64; 3] = std::array::from_fn(|axis| domain_translation[axis] - scene.origin[axis] / scene.unit);
     let offset_point = |x: f64, y: f64, z: f64| [translation[0] + x, translation[1] + y, translation[2] + z];
-    let view =
-        View::LookAt { eye: offset_point(0.4, 0.45, 3.0), target: offset_point(0.4, 0.45, 0.0), up: [0.0, 1.0, 0.0] };
+    let view = View::LookAt {
+        eye: offset_point(0.4, 0.45, 3.0),
+        target: offset_point(0.4, 0.45, 0.0),
+        up: Some([0.0, 1.0, 0.0]),
+    };
     let camera = Some(Camera { view, lens: Lens::FieldOfView(40.0), clip: None });
     let picture = Picture { width: 65, height: 65, camera, ..Picture::default() };
     let hit = client
@@ -306,7 +309,7 @@ async fn distant_domains_are_picked_by_nearby_cameras() {
         let view = View::LookAt {
             eye: offset_point(0.4, 0.45, 3.0),
             target: offset_point(0.4, 0.45, 0.0),
-            up: [0.0, 1.0, 0.0],
+            up: Some([0.0, 1.0, 0.0]),
         };
         let camera = Some(Camera { view, lens: Lens::FieldOfView(40.0), clip: None });
         let picture = Picture { width: 65, height: 65, camera, ..Picture::default() };

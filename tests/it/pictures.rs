@@ -17,7 +17,7 @@ async fn start_server() -> (Server, Client) {
 
 /// A camera in front of the strips at a height.
 fn camera(height: f64) -> Option<Camera> {
-    let view = View::LookAt { eye: [0.5, height, 4.0], target: [0.5, 0.5, 0.0], up: [0.0, 1.0, 0.0] };
+    let view = View::LookAt { eye: [0.5, height, 4.0], target: [0.5, 0.5, 0.0], up: Some([0.0, 1.0, 0.0]) };
     Some(Camera { view, lens: Lens::FieldOfView(40.0), clip: None })
 }
 

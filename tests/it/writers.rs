@@ -4,6 +4,7 @@ use std::time::Duration;
 
 use modalcast::config::Config;
 use modalcast::engine::{Delivery as EngineDelivery, OutputSpec, Subscription};
+use modalcast_client::{Client, Delivery as ClientDelivery, DriveRequest, StateLayout, StateRequest, Step};
 use modalcast_model::deform::VertexAttributes;
 use modalcast_proto::v1;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
@@ -223,6 +224,105 @@ async fn first_step_starts_from_the_current_or_the_rest_state() {
         assert_eq!(reply.positions, reference_vertices(&strips(), &steps).positions, "{initial_state:?}");
         writer.finish().await;
     }
+}
+
+/// The vertices of the current step of "strips".
+async fn strips_positions(server: &Server) -> Vec<f32> {
+    let request = v1::GetVerticesRequest { scene: "strips".into(), ..v1::GetVerticesRequest::default() };
+    get_vertices(server, request).await.expect("expected vertices").positions
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn new_writer_starts_from_rest_and_a_resumed_one_from_its_state() {
+    let server = Server::start_default().await;
+    server.open("strips").await;
+    let (first_step, second_step) = (step(1, &[0], &[0.5, 0.25]), step(2, &[1], &[0.125, 1.0]));
+    let (mut writer, opened) = open_successfully(&server, lossless("strips")).await;
+    assert_eq!(opened.initial_state(), InitialState::Reset);
+    writer.send_step_and_wait(first_step.clone()).await;
+    writer.finish().await;
+    let own_token = OpenDrive { lease_token: opened.lease_token, ..lossless("strips") };
+    // The token of the last writer, after its stream has ended.
+    let (mut resumed, opened) = open_successfully(&server, own_token.clone()).await;
+    assert_eq!(opened.initial_state(), InitialState::Keep);
+    resumed.send_step_and_wait(second_step.clone()).await;
+    let both = reference_vertices(&strips(), &[first_step.clone(), second_step.clone()]).positions;
+    assert_eq!(strips_positions(&server).await, both);
+    resumed.finish().await;
+    // Another writer, which sends no step: the first writer continues the state of nobody else.
+    let (other, opened) = open_successfully(&server, lossless("strips")).await;
+    assert_eq!(opened.initial_state(), InitialState::Reset);
+    assert_eq!(strips_positions(&server).await, both, "expected no change before the first step");
+    other.finish().await;
+    let (mut writer, opened) = open_successfully(&server, own_token.clone()).await;
+    assert_eq!(opened.initial_state(), InitialState::Reset);
+    // Its connection breaks before the first step.
+    let (replacement, opened) = open_successfully(&server, own_token).await;
+    assert_eq!(opened.initial_state(), InitialState::Reset, "expected the rest state that the run has not left yet");
+    drop(std::mem::replace(&mut writer, replacement));
+    writer.send_step_and_wait(second_step.clone()).await;
+    assert_eq!(strips_positions(&server).await, reference_vertices(&strips(), &[second_step]).positions);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn reset_scene_shows_rest_and_respects_the_writer() {
+    let server = Server::start_default().await;
+    server.open("strips").await;
+    let (mut writer, _) = open_successfully(&server, lossless("strips")).await;
+    writer.send_step_and_wait(step(1, &[0], &[0.5, 0.25])).await;
+    let moved = strips_positions(&server).await;
+    let reset = async |take_over: bool| {
+        let request = v1::ResetSceneRequest { scene: "strips".into(), take_over };
+        let mut service = StepServiceClient::new(server.channel().await);
+        with_timeout(service.reset_scene(request)).await.map(tonic::Response::into_inner)
+    };
+    let status = reset(false).await.expect_err("expected the lease to be taken");
+    assert_eq!(rejection_details(&status).reason(), Reason::WriterLeaseTaken);
+    assert_eq!(strips_positions(&server).await, moved);
+    let step_of_reset = reset(true).await.expect("expected a reset").step.expect("expected a step");
+    let rest = reference_vertices(&strips(), &[step(0, &[], &[])]).positions;
+    assert_eq!(strips_positions(&server).await, rest);
+    // The lease is free again.
+    let repeated = reset(false).await.expect("expected a reset").step.expect("expected a step");
+    assert!(repeated.run > step_of_reset.run);
+    let request = v1::ResetSceneRequest { scene: "none".into(), take_over: false };
+    let status = StepServiceClient::new(server.channel().await).reset_scene(request).await;
+    assert_eq!(status.expect_err("expected no such scene").code(), Code::NotFound);
+}
+
+/// The defaults of the Rust client.
+#[tokio::test(flavor = "multi_thread")]
+async fn client_starts_from_rest_unless_it_resumes_or_keeps_the_state() {
+    let server = Server::start_default().await;
+    server.open("strips").await;
+    let client = Client::connect(&server.address).await.expect("expected a connection");
+    let request = || DriveRequest::new("strips", ClientDelivery::Lossless);
+    let description = client.describe("strips", &[]).await.expect("expected a description");
+    let layout = StateLayout::new(&description).expect("expected a layout");
+    let first_q = async || {
+        let state = client.get_state(&StateRequest::new("strips", ()), &layout).await.expect("expected a state");
+        state.q(0).expect("expected domain 0")[0]
+    };
+    let mut token = Vec::new();
+    let requests = [(request(), true), (request(), true), (request().keep_state(), false), (request().reset(), true)];
+    for (request, starts_from_rest) in requests {
+        let mut steps = client.drive(&request).await.expect("expected the lease");
+        assert_eq!(steps.starts_from_rest, starts_from_rest, "{request:?}");
+        let other_q = Step::new(1, 0.0).q(1, &[0.5, 0.5]);
+        steps.step(&other_q).await.expect("expected an open stream");
+        steps.flush().await.expect("expected an open stream");
+        let expected = if starts_from_rest { 0.0 } else { 2.0 };
+        assert_eq!(first_q().await, expected, "{request:?}");
+        steps.step(&Step::new(2, 0.0).q(0, &[2.0, 0.0])).await.expect("expected an open stream");
+        token = steps.lease_token.clone();
+        steps.finish().await.expect("expected an open stream");
+    }
+    let steps = client.drive(&request().lease_token(&token)).await.expect("expected the lease");
+    assert!(!steps.starts_from_rest);
+    assert!(client.reset_scene("strips", false).await.is_err(), "expected the lease to be taken");
+    steps.finish().await.expect("expected an open stream");
+    client.reset_scene("strips", false).await.expect("expected a reset");
+    assert_eq!(first_q().await, 0.0);
 }
 
 /// A proxy to a server that delays everything that the server sends until `open` is true.

@@ -203,6 +203,19 @@ impl Client {
         self.reply(self.scenes().delete_scene(request).await).map(drop)
     }
 
+    /// Returns a scene to its rest state. `take_over` replaces the writer that drives the scene. Returns the step that
+    /// shows the rest state.
+    ///
+    /// # Errors
+    /// `Status` if the scene does not exist or has a writer that is not replaced; `Connect` if the connection is lost;
+    /// `Malformed` if the reply has no step.
+    pub async fn reset_scene(&self, scene: &str, take_over: bool) -> Result<v1::StepId> {
+        let mut service = v1::step_service_client::StepServiceClient::new(self.channel.clone());
+        let request = v1::ResetSceneRequest { scene: scene.to_owned(), take_over };
+        let reply = self.reply(service.reset_scene(request).await)?;
+        reply.step.ok_or_else(|| malformed_reply("reset_scene.step", "a step", "none"))
+    }
+
     async fn get_server_info(&self) -> Result<v1::GetServerInfoResponse> {
         let mut service = v1::server_service_client::ServerServiceClient::new(self.channel.clone());
         self.reply(service.get_server_info(v1::GetServerInfoRequest {}).await)

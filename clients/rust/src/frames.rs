@@ -69,7 +69,8 @@ pub enum View {
     LookAt {
         eye: [f64; 3],
         target: [f64; 3],
-        up: [f64; 3],
+        /// `None`: the up axis of the scene.
+        up: Option<[f64; 3]>,
     },
     /// `world_from_camera`, row-major 3x4; x right, y up, looking along -z.
     Pose([f64; 12]),
@@ -464,7 +465,8 @@ impl From<Camera> for v1::Camera {
         use v1::camera::{Lens as WireLens, View as WireView};
         let view = match camera.view {
             View::LookAt { eye, target, up } => {
-                WireView::LookAt(v1::LookAt { eye: eye.into(), target: target.into(), up: up.into() })
+                let up = up.map_or_else(Vec::new, Vec::from);
+                WireView::LookAt(v1::LookAt { eye: eye.into(), target: target.into(), up })
             }
             View::Pose(pose) => WireView::Pose(v1::Pose { world_from_camera: pose.into() }),
         };

@@ -36,15 +36,16 @@ pub struct DriveRequest {
     window: Option<u32>,
     lease_token: Vec<u8>,
     takes_over: bool,
-    resets: bool,
+    initial_state: v1::InitialState,
 }
 
 impl DriveRequest {
-    /// A writer of the scene that starts from the current state. With [`Delivery::Lossless`], sending waits while the
-    /// server has no capacity.
+    /// A writer of the scene whose first step starts from the rest state. With [`Delivery::Lossless`], sending waits
+    /// while the server has no capacity.
     pub fn new(scene: &str, delivery: Delivery) -> Self {
         let (window, lease_token) = (None, Vec::new());
-        Self { scene: scene.to_owned(), delivery, window, lease_token, takes_over: false, resets: false }
+        let initial_state = v1::InitialState::Unspecified;
+        Self { scene: scene.to_owned(), delivery, window, lease_token, takes_over: false, initial_state }
     }
 
     /// Limits the steps in flight (sent and not yet acknowledged): [`StepStream::step`] waits for acknowledgments.
@@ -55,7 +56,8 @@ impl DriveRequest {
         self
     }
 
-    /// Replaces the writer that has this token, which is [`StepStream::lease_token`] of an earlier stream.
+    /// Replaces the writer that has this token, which is [`StepStream::lease_token`] of an earlier stream. If no other
+    /// writer has driven the scene since, the first step starts from the current state.
     #[must_use]
     pub fn lease_token(mut self, token: &[u8]) -> Self {
         self.lease_token = token.to_vec();
@@ -69,16 +71,22 @@ impl DriveRequest {
         self
     }
 
-    /// Lets the first step start from the rest state.
+    /// Lets the first step start from the rest state, also with the token of the last writer.
     #[must_use]
     pub fn reset(mut self) -> Self {
-        self.resets = true;
+        self.initial_state = v1::InitialState::Reset;
+        self
+    }
+
+    /// Lets the first step start from the current state, which may be that of another writer.
+    #[must_use]
+    pub fn keep_state(mut self) -> Self {
+        self.initial_state = v1::InitialState::Keep;
         self
     }
 
     fn to_wire(&self) -> v1::OpenDrive {
         let overflow = if self.window.is_some() { v1::Overflow::Reject } else { v1::Overflow::Block };
-        let initial_state = if self.resets { v1::InitialState::Reset } else { v1::InitialState::Keep };
         v1::OpenDrive {
             scene: self.scene.clone(),
             delivery: v1::Delivery::from(self.delivery).into(),
@@ -86,7 +94,7 @@ impl DriveRequest {
             window: self.window.unwrap_or_default(),
             lease_token: self.lease_token.clone().into(),
             take_over: self.takes_over,
-            initial_state: initial_state.into(),
+            initial_state: self.initial_state.into(),
         }
     }
 }
@@ -140,6 +148,8 @@ pub struct StepStream {
     pub window: Option<usize>,
     /// Identifies this writer: a later stream with this token replaces it at once, for example after a lost connection.
     pub lease_token: Vec<u8>,
+    /// Whether the first step starts from the rest state instead of the current one.
+    pub starts_from_rest: bool,
     /// The scene at the time the stream opened.
     pub scene: v1::SceneInfo,
     requests: Option<mpsc::Sender<v1::DriveSceneRequest>>,
@@ -182,6 +192,7 @@ impl Client {
         Ok(StepStream {
             run: opened.run,
             window: request.window.map(|_| (opened.window as usize).max(1)),
+            starts_from_rest: opened.initial_state() == v1::InitialState::Reset,
             lease_token: opened.lease_token.to_vec(),
             scene: opened.scene.unwrap_or_default(),
             requests: Some(requests),

@@ -384,6 +384,14 @@ async fn fetch_saves_files_and_exits_with_documented_codes() {
     // The fake server sends every picture as RGBA.
     let sizes = ["one_color.rgba", "one_normals.rgba"].map(|name| std::fs::read(path(name)).expect("a frame").len());
     assert_eq!(sizes, [800; 2]);
+    let reset = ["reset", "--scene", "toy"];
+    let mut resets = 0;
+    // The server notices the end of the aborted stream some time later.
+    while run_fetch(&url, &reset).await.exit_code == 1 && resets < 200 {
+        resets += 1;
+    }
+    assert_eq!(run_fetch(&url, &reset).await.exit_code, 0);
+    assert_eq!(server.output().positions, one_domain_server(4).output().positions);
     assert_eq!(run_fetch(&url, &["info"]).await.exit_code, 0);
     assert!(run_fetch(&url, &["list", "--json"]).await.stdout.contains("\"scene\":\"toy\""));
     assert_eq!(run_fetch(&url, &["frame", "--scene", "none", "--out", &path("x.png")]).await.exit_code, 1);

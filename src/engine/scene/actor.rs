@@ -126,6 +126,8 @@ pub(super) struct SceneActor {
     /// Whether the next step starts from the rest state instead of the current one.
     starts_from_rest: bool,
     writer: Option<Writer>,
+    /// The token of the latest writer, whether it is still connected or not.
+    last_token: Option<LeaseToken>,
     phase: StepPhase,
     current: CurrentStep,
     delivery: OutputDelivery,
@@ -153,6 +155,7 @@ impl SceneActor {
             run: state.run,
             starts_from_rest: false,
             writer: None,
+            last_token: None,
             phase: StepPhase::Idle,
             current: CurrentStep::of_opened_scene(state),
             current_state,
@@ -297,11 +300,18 @@ impl SceneActor {
             writer.step_queue.end(Error::LeaseLost { run });
         }
         self.run = run;
-        self.starts_from_rest = initial_state == InitialState::Reset;
+        let is_resumed = self.last_token.as_ref() == Some(&token);
+        self.starts_from_rest = match initial_state {
+            Some(initial_state) => initial_state == InitialState::Reset,
+            // A resumed run that has not sent a step yet begins as it would have without the interruption.
+            None => !is_resumed || self.starts_from_rest,
+        };
+        let initial_state = if self.starts_from_rest { InitialState::Reset } else { InitialState::Keep };
+        self.last_token = Some(token.clone());
         let step_queue = Arc::new(StepQueue::new(delivery, overflow, window, Arc::clone(&self.wake)));
         let (acquired_at, lease) = (Instant::now(), WriterLease { step_queue: Arc::clone(&step_queue) });
         self.writer = Some(Writer { step_queue, token: token.clone(), acquired_at });
-        Ok(AcquiredLease { lease, token, run })
+        Ok(AcquiredLease { lease, token, run, initial_state })
     }
 
     /// Whether another step is queued. If so, readbacks of the current step are only started and overlap with the

@@ -7,11 +7,11 @@ use tokio::sync::mpsc::error::TrySendError;
 use tokio::sync::{Notify, OnceCell, mpsc, oneshot, watch};
 
 use super::actor::{ActorParams, SceneActor, SceneServices};
-use super::delivery::StreamDelivery;
+use super::delivery::{Delivery, StreamDelivery};
 use super::forces::{ForceChannel, ForceReceipt, ForceUpdate};
-use super::lease::{AcquiredLease, LeaseRequest, LeaseToken, WriterLease};
+use super::lease::{AcquiredLease, InitialState, LeaseRequest, LeaseToken, WriterLease};
 use super::message::{Message, StepRequest, StepSelector};
-use super::step_queue::{QueuedStep, StepReport};
+use super::step_queue::{Overflow, QueuedStep, StepReport};
 use super::subscriber::Subscription;
 use crate::engine::blocking::run_blocking;
 use crate::engine::content::ContentHashes;
@@ -146,9 +146,34 @@ impl SceneHandle {
     pub async fn drive(&self, peer: &str, request: LeaseRequest) -> Result<WriterSession> {
         let request = LeaseRequest { window: request.window.clamp(1, self.max_window), ..request };
         let (delivery, window) = (request.delivery, request.window);
-        let AcquiredLease { lease, token, run } = self.call(|reply| Message::AcquireWriter { request, reply }).await?;
-        tracing::info!(scene = self.name, run, peer, ?delivery, "driven by a new writer");
-        Ok(WriterSession { lease, scene: Arc::clone(&self.scene), run, window, token, last_number: None })
+        let AcquiredLease { lease, token, run, initial_state } =
+            self.call(|reply| Message::AcquireWriter { request, reply }).await?;
+        tracing::info!(scene = self.name, run, peer, ?delivery, ?initial_state, "driven by a new writer");
+        let scene = Arc::clone(&self.scene);
+        Ok(WriterSession { lease, scene, run, window, token, initial_state, last_number: None })
+    }
+
+    /// Returns the scene to its rest state with a step of a new writer, which releases the lease again. `takes_over`
+    /// replaces the present writer. Returns the completed step.
+    ///
+    /// # Errors
+    /// Those of [`Self::drive`] and of the step.
+    pub async fn reset(&self, peer: &str, takes_over: bool) -> Result<StepId> {
+        let request = LeaseRequest {
+            // Does not wait for lossless readers, so that a stalled one cannot block the call.
+            delivery: Delivery::Latest,
+            overflow: Overflow::Block,
+            window: 1,
+            token: None,
+            takes_over,
+            initial_state: Some(InitialState::Reset),
+        };
+        let mut writer = self.drive(peer, request).await?;
+        writer.push_step(&RawStepUpdate::default())?;
+        match writer.next_report().await? {
+            StepReport::Done { step, .. } => Ok(StepId { run: writer.run, number: step, time: 0.0 }),
+            StepReport::Rejected { error, .. } => Err(error),
+        }
     }
 
     /// Subscribes to the scene's steps. The subscription is active when this returns.
@@ -268,6 +293,8 @@ pub struct WriterSession {
     /// Maximum number of unacknowledged steps.
     pub window: u32,
     pub token: LeaseToken,
+    /// The state that the first step changes.
+    pub initial_state: InitialState,
     /// Number of the last accepted step.
     last_number: Option<u64>,
 }

@@ -70,7 +70,8 @@ pub struct LeaseRequest {
     pub token: Option<LeaseToken>,
     /// Whether the writer replaces one with another token.
     pub takes_over: bool,
-    pub initial_state: InitialState,
+    /// `None` keeps the current state for the token of the last writer, and starts from rest for any other one.
+    pub initial_state: Option<InitialState>,
 }
 
 /// The writer's lease on a scene. Dropping it closes the queue and admits the next writer. A reply that carries the
@@ -92,6 +93,7 @@ pub(super) struct AcquiredLease {
     pub lease: WriterLease,
     pub token: LeaseToken,
     pub run: u64,
+    pub initial_state: InitialState,
 }
 
 #[cfg(test)]

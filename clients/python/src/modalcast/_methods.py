@@ -54,6 +54,7 @@ DESCRIBE_SCENE = _method(
 READ_CONTENT = _method("SceneService/ReadContent", scenes_pb2.ReadContentRequest, scenes_pb2.ReadContentResponse)
 READ_MODES = _method("SceneService/ReadModes", scenes_pb2.ReadModesRequest, scenes_pb2.ReadModesResponse)
 DRIVE_SCENE = _method("StepService/DriveScene", steps_pb2.DriveSceneRequest, steps_pb2.DriveSceneResponse)
+RESET_SCENE = _method("StepService/ResetScene", steps_pb2.ResetSceneRequest, steps_pb2.ResetSceneResponse)
 RENDER_FRAME = _method("FrameService/RenderFrame", frames_pb2.RenderFrameRequest, frames_pb2.RenderFrameResponse)
 STREAM_FRAMES = _method("FrameService/StreamFrames", frames_pb2.StreamFramesRequest, frames_pb2.StreamFramesResponse)
 UPDATE_FRAME_STREAM = _method(

@@ -220,6 +220,19 @@ impl FakeServer {
         Ok(())
     }
 
+    /// Returns to the rest state, unless a writer has the lease.
+    fn reset(&self) -> Result<v1::StepId, v1::Rejection> {
+        self.acquire_writer_lease()?;
+        let mut state = self.state.lock().unwrap();
+        state.q.iter_mut().for_each(|q| q.fill(0.0));
+        state.transforms = self.domains.iter().map(|domain| decode_f32(&domain.wire.placement)).collect();
+        let id = v1::StepId { run: state.run, number: 0, time: 0.0 };
+        state.last_step = Some(id);
+        drop(state);
+        self.release_writer_lease();
+        Ok(id)
+    }
+
     fn rank(&self, domain: u32) -> usize {
         self.domains[domain as usize].shape.rank as usize
     }

@@ -266,6 +266,15 @@ impl StepService for FakeService {
         tokio::spawn(async move { service.drive(request.into_inner(), &sender).await });
         Ok(Response::new(Box::pin(ReceiverStream::new(responses))))
     }
+
+    async fn reset_scene(
+        &self,
+        request: Request<v1::ResetSceneRequest>,
+    ) -> Result<Response<v1::ResetSceneResponse>, Status> {
+        self.check_scene(&request.get_ref().scene)?;
+        let step = self.0.reset().map_err(|rejection| rejection_status(tonic::Code::AlreadyExists, &rejection))?;
+        Ok(Response::new(v1::ResetSceneResponse { step: Some(step) }))
+    }
 }
 
 type ResponseSender = tokio::sync::mpsc::Sender<Result<v1::DriveSceneResponse, Status>>;

@@ -26,6 +26,7 @@ from modalcast._methods import (
     GET_VERTICES,
     PICK,
     RENDER_FRAME,
+    RESET_SCENE,
     STREAM_FORCES,
     STREAM_FRAMES,
     STREAM_STATES,
@@ -38,7 +39,7 @@ from modalcast.frame import ColorFormat, Frame, Outputs, PictureOptions, picture
 from modalcast.kinematics import Kinematics
 from modalcast.scene_description import ArrayName, Domain, Domains, SceneDescription
 from modalcast.states import SceneState, StateLayout
-from modalcast.v1 import common_pb2, forces_pb2, frames_pb2, scenes_pb2, states_pb2, vertices_pb2
+from modalcast.v1 import common_pb2, forces_pb2, frames_pb2, scenes_pb2, states_pb2, steps_pb2, vertices_pb2
 from modalcast.vertices import Attributes, VertexSet, check_out, vertex_selection
 from modalcast.viewer import ViewerLink, viewer_link
 
@@ -177,7 +178,7 @@ class Scene:
         *,
         delivery: Delivery = "lossless",
         joints: bool = True,
-        reset: bool = False,
+        reset: bool | None = None,
         take_over: bool = False,
         window: int | None = None,
         lease_token: bytes = b"",
@@ -190,10 +191,11 @@ class Scene:
             delivery: "lossless": every step is computed, in order, and a slow lossless reader slows the drive down.
                 "latest": steps that arrive while another one is computed are merged into one.
             joints: Whether to compute the transforms of attached domains, so that they move with their parents.
-            reset: Whether the first step starts from the rest state.
+            reset: Whether the first step starts from the rest state, or else from the present state. None: from the
+                rest state, unless `lease_token` is that of the last writer.
             take_over: Whether to replace the present writer.
             window: Limits the steps without acknowledgment; None: the server limits them.
-            lease_token: Replaces the writer with this token (`Drive.lease_token`) at once.
+            lease_token: Replaces the writer with this token (`Drive.lease_token`) at once and continues its state.
             dt: Seconds between steps that do not set their time.
             timeout: Default time limit of the calls of the drive, in seconds.
 
@@ -223,8 +225,8 @@ class Scene:
             AlreadyExists: Another writer drives the scene, and `take_over` is false.
             Error: The call failed.
         """
-        async with await self.drive(joints=False, reset=True, take_over=take_over, timeout=timeout) as drive:
-            return await drive.reset(timeout=timeout)
+        request = steps_pb2.ResetSceneRequest(scene=self.name, take_over=take_over)
+        return step_id((await self._transport.unary(RESET_SCENE, request, self._time_limit(timeout))).step)
 
     async def frame(
         self,

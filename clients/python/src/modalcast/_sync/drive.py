@@ -23,7 +23,7 @@ class DriveOptions:
     """How a drive is opened; `Scene.drive` documents the fields."""
 
     delivery: Delivery
-    reset: bool
+    reset: bool | None
     take_over: bool
     window: int | None
     lease_token: bytes
@@ -79,8 +79,8 @@ class Drive:
             AlreadyExists: Another writer drives the scene.
             Error: The call failed.
         """
-        self._open(self._options)
-        if not self._options.reset:
+        starts_from_rest = self._open(self._options)
+        if not starts_from_rest:
             self._load_state()
 
     def step(
@@ -243,9 +243,14 @@ class Drive:
             raise
         self._is_stale = False
 
-    def _open(self, options: DriveOptions) -> None:
+    def _open(self, options: DriveOptions) -> bool:
+        """Opens a stream. Returns whether its first step starts from the rest state."""
         overflow = steps_pb2.OVERFLOW_BLOCK if options.window is None else steps_pb2.OVERFLOW_REJECT
-        initial_state = steps_pb2.INITIAL_STATE_RESET if options.reset else steps_pb2.INITIAL_STATE_KEEP
+        initial_state = {
+            None: steps_pb2.INITIAL_STATE_UNSPECIFIED,
+            False: steps_pb2.INITIAL_STATE_KEEP,
+            True: steps_pb2.INITIAL_STATE_RESET,
+        }[options.reset]
         request = steps_pb2.OpenDrive(
             scene=self._scene,
             delivery=delivery_message(options.delivery),
@@ -266,6 +271,7 @@ class Drive:
         self._opened_stream = stream
         self.run = opened.run
         self.lease_token = opened.lease_token
+        return opened.initial_state == steps_pb2.INITIAL_STATE_RESET
 
     def _load_state(self) -> None:
         """Begins with the state of the server."""

@@ -39,6 +39,20 @@ TRANSFORM_FORMAT_AFFINE_F32: TransformFormat
 TRANSFORM_FORMAT_QUATERNION_XYZW_F32: TransformFormat
 TRANSFORM_FORMAT_QUATERNION_XYZW_F64: TransformFormat
 
+class ResetSceneRequest(_message.Message):
+    __slots__ = ("scene", "take_over")
+    SCENE_FIELD_NUMBER: _ClassVar[int]
+    TAKE_OVER_FIELD_NUMBER: _ClassVar[int]
+    scene: str
+    take_over: bool
+    def __init__(self, scene: _Optional[str] = ..., take_over: bool = ...) -> None: ...
+
+class ResetSceneResponse(_message.Message):
+    __slots__ = ("step",)
+    STEP_FIELD_NUMBER: _ClassVar[int]
+    step: _common_pb2.StepId
+    def __init__(self, step: _Optional[_Union[_common_pb2.StepId, _Mapping]] = ...) -> None: ...
+
 class DriveSceneRequest(_message.Message):
     __slots__ = ("open", "step")
     OPEN_FIELD_NUMBER: _ClassVar[int]

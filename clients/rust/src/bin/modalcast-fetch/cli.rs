@@ -20,7 +20,7 @@ subscription. The program then receives every step of a physics process that sta
 Exit codes: 0 done; 1 rejected by the server; 2 invalid command line; 3 connection failed or lost; 4 local file error;
 5 malformed, truncated or late reply.";
 
-/// Saves frames or vertices from a modalcast server, prints its scenes and settings, and closes scenes.
+/// Saves frames or vertices from a modalcast server, prints its scenes and settings, and resets or closes scenes.
 #[derive(Debug, Parser)]
 #[command(name = "modalcast-fetch", version, after_help = EXAMPLES)]
 pub(crate) struct Cli {
@@ -55,6 +55,15 @@ pub(crate) enum Command {
     Info,
     /// List the open scenes and the sources that can be opened.
     List,
+    /// Return a scene to its rest state.
+    Reset {
+        /// The scene's name on the server.
+        #[arg(long)]
+        scene: String,
+        /// Replace the physics process that drives the scene. Without this option, such a scene is not changed.
+        #[arg(long)]
+        take_over: bool,
+    },
     /// Close a scene; the server deletes the files of an uploaded scene.
     Close {
         /// The scene's name on the server.
@@ -105,9 +114,9 @@ pub(crate) struct PictureOptions {
     /// Point that the camera looks at, in scene units.
     #[arg(long, value_name = "X,Y,Z", value_parser = parse_vector, requires = "eye", allow_hyphen_values = true)]
     target: Option<[f64; 3]>,
-    /// Up direction of the camera.
-    #[arg(long, value_name = "X,Y,Z", value_parser = parse_vector, default_value = "0,1,0", allow_hyphen_values = true)]
-    up: [f64; 3],
+    /// Up direction of the camera. Default: the up axis of the scene.
+    #[arg(long, value_name = "X,Y,Z", value_parser = parse_vector, requires = "eye", allow_hyphen_values = true)]
+    up: Option<[f64; 3]>,
     /// Vertical field of view in degrees. Default: 35.
     #[arg(long, requires = "eye", value_name = "DEGREES")]
     field_of_view: Option<f64>,

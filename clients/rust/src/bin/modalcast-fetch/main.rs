@@ -31,6 +31,7 @@ async fn run_command(arguments: &Cli) -> Result<()> {
         Command::Vertices(options) => vertices::fetch(&client, options, as_json).await,
         Command::Info => output::print_info(&client, as_json).await,
         Command::List => output::print_list(&client, as_json).await,
+        Command::Reset { scene, take_over } => client.reset_scene(scene, *take_over).await.map(drop),
         Command::Close { scene } => client.delete_scene(scene).await,
     }
 }

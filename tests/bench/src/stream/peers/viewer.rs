@@ -192,7 +192,7 @@ async fn turned_camera(client: &Client, scene: &str, view: u32) -> Result<Camera
     eye[(up_axis + 1) % 3] += 1.6 * diagonal * cosine;
     eye[(up_axis + 2) % 3] += 1.6 * diagonal * sine;
     up[up_axis] = 1.0;
-    Ok(Camera { view: View::LookAt { eye, target, up }, lens: Lens::FieldOfView(35.0), clip: None })
+    Ok(Camera { view: View::LookAt { eye, target, up: Some(up) }, lens: Lens::FieldOfView(35.0), clip: None })
 }
 
 async fn receive_frames(client: &Client, job: &ViewerJob, collector: &mut Collector) -> Result<()> {
