@@ -50,6 +50,7 @@ pub struct BridgeScenario {
     options: BridgeOptions,
     /// Index of the deforming domain.
     domain: usize,
+    is_damped: bool,
     /// Reduced load U^T f of the force f at the peak of the pulse.
     peak_load: DVector<f64>,
     /// Reduced load of the viewers' forces.
@@ -96,6 +97,7 @@ impl BridgeScenario {
         Ok(Self {
             options,
             domain,
+            is_damped: settings.damping_mass > 0.0 || settings.damping_stiffness > 0.0,
             peak_load: unit_load * equilibrium.strength,
             viewer_load: DVector::zeros(rank),
             state: system.static_state(equilibrium.q),
@@ -150,7 +152,10 @@ impl Scenario for BridgeScenario {
     }
 
     fn remarks(&self) -> Vec<String> {
-        aliasing_remark("the load", self.options.period, self.options.dt).into_iter().collect()
+        let undamped = (!self.is_damped).then(|| {
+            "the bridge has no damping, so that vibrations do not decay: set it in the .config file".to_owned()
+        });
+        aliasing_remark("the load", self.options.period, self.options.dt).into_iter().chain(undamped).collect()
     }
 
     fn report(&self) -> Report {
@@ -344,16 +349,20 @@ mod tests {
     }
 
     #[test]
-    fn load_that_steps_do_not_resolve_is_remarked() {
-        let remarks = |dt: f64, period: f64| {
+    fn unresolved_load_and_missing_damping_are_remarked() {
+        let remarks = |dt: f64, period: f64, damping_stiffness: f64| {
             let options = BridgeOptions { dt, period, ..OPTIONS };
             let force = spring_chain(&[40.0, 90.0], 30.0, 4.0);
-            let bridge = BridgeScenario::new(four_domain_model(), force, &VegaSettings::default(), options);
+            let settings = VegaSettings { damping_stiffness, ..VegaSettings::default() };
+            let bridge = BridgeScenario::new(four_domain_model(), force, &settings, options);
             bridge.expect("a valid scenario").remarks()
         };
         // With one step per period, the load is the same in all steps.
-        assert!(remarks(2.0, 2.0)[0].contains("the load has a period of 2 s"), "{:?}", remarks(2.0, 2.0));
-        assert_eq!(remarks(1.0 / 60.0, 2.0), [""; 0]);
+        let unresolved = remarks(2.0, 2.0, 0.01);
+        assert!(unresolved.len() == 1 && unresolved[0].contains("the load has a period of 2 s"), "{unresolved:?}");
+        let undamped = remarks(1.0 / 60.0, 2.0, 0.0);
+        assert!(undamped.len() == 1 && undamped[0].starts_with("the bridge has no damping"), "{undamped:?}");
+        assert_eq!(remarks(1.0 / 60.0, 2.0, 0.01), [""; 0]);
     }
 
     #[test]

@@ -165,7 +165,8 @@ pub(crate) struct ForceFileOptions {
     /// exists.
     #[arg(long, value_name = "FILE.config")]
     pub(crate) config: Option<PathBuf>,
-    /// Folder to search for the file of cubic forces.
+    /// Folder with the file of cubic forces, which the note `vega.cubic` of the scene names. The server adds this note to
+    /// an OBJ model that has a .cub file of the same name.
     #[arg(long = "files", value_name = "DIR")]
     pub(crate) folder: Option<PathBuf>,
 }

@@ -28,6 +28,9 @@ const MAX_TREE_SAMPLES: usize = 24;
 /// Maximum number of surface samples per domain of other scenes, which usually have few domains.
 const MAX_SAMPLES: usize = 1 << 16;
 
+/// Maximum number of files that a remark names.
+const MAX_NAMED_FILES: usize = 8;
+
 /// The exit code of a complete run in which the server rejected steps.
 const EXIT_STEPS_REJECTED: u8 = 6;
 
@@ -129,6 +132,9 @@ async fn create_scenario(client: &Client, scene: &str, command: &Command) -> Res
         Command::Auto { files, load, wind, displacement_fraction, .. } => {
             // A model with few samples is enough to choose the scenario.
             let model = Model::fetch(client, scene, MAX_TREE_SAMPLES).await?;
+            if let Some(remark) = unused_force_files(&model, files) {
+                eprintln!("modalcast-sim: {scene}: {remark}");
+            }
             let command = if find_force_file(&model, files).is_some() {
                 Command::Bridge { common: common.clone(), files: files.clone(), load: *load }
             } else if is_tree(&model) {
@@ -151,8 +157,8 @@ fn is_tree(model: &Model) -> bool {
 
 fn create_bridge_scenario(model: Model, files: &ForceFileOptions, options: BridgeOptions) -> Result<Box<dyn Scenario>> {
     let force_path = find_force_file(&model, files).ok_or_else(|| {
-        let expected = "--cubic FILE.cub, or --files DIR with the file that the scene names";
-        invalid_input("cubic", expected, "no file, or several files in --files")
+        let expected = "--cubic FILE.cub, or --files DIR with the one file that a note vega.cubic of the scene names";
+        invalid_input("cubic", expected, "no such file, or several")
     })?;
     let default_config = force_path.with_extension("config");
     let config_path = files.config.clone().or_else(|| default_config.is_file().then_some(default_config));
@@ -161,8 +167,8 @@ fn create_bridge_scenario(model: Model, files: &ForceFileOptions, options: Bridg
 }
 
 /// Finds the file of reduced forces: the file of `--cubic`, else the file in `--files` that the note `vega.cubic` of a
-/// domain names (notes are metadata in the scene's description), else the only .cub file in `--files`. `None` if there
-/// is no file or the choice is not unique.
+/// domain names (notes are metadata in the scene's description). `None` if there is no such file or several ones. No other
+/// file is used, because the forces of another model would move this one in a wrong way.
 fn find_force_file(model: &Model, files: &ForceFileOptions) -> Option<PathBuf> {
     if let Some(path) = &files.cubic {
         return Some(path.clone());
@@ -174,11 +180,19 @@ fn find_force_file(model: &Model, files: &ForceFileOptions) -> Option<PathBuf> {
     // Several domains may name the same file.
     candidates.sort();
     candidates.dedup();
-    if candidates.is_empty() {
-        let paths = folder.read_dir().ok()?.filter_map(|entry| Some(entry.ok()?.path()));
-        candidates = paths.filter(|path| path.extension().is_some_and(|extension| extension == "cub")).collect();
-    }
     if candidates.len() == 1 { candidates.pop() } else { None }
+}
+
+/// Names the .cub files in `--files` if none of them is used.
+fn unused_force_files(model: &Model, files: &ForceFileOptions) -> Option<String> {
+    let folder = files.folder.as_deref().filter(|_| find_force_file(model, files).is_none())?;
+    let paths = folder.read_dir().ok()?.filter_map(|entry| Some(entry.ok()?.path()));
+    let is_cubic = |path: &PathBuf| path.extension().is_some_and(|extension| extension == "cub");
+    let mut names: Vec<String> = paths.filter(is_cubic).map(|path| path.display().to_string()).collect();
+    names.sort();
+    names.truncate(MAX_NAMED_FILES);
+    let hint = "no note vega.cubic of the scene names one of them; --cubic selects one";
+    (!names.is_empty()).then(|| format!("not used as cubic forces: {} ({hint})", names.join(", ")))
 }
 
 /// Prints the report as one line of JSON, or with one line per value.

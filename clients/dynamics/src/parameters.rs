@@ -31,8 +31,8 @@ pub struct ModalParameters {
     /// Per coordinate. `None` for a mode without stiffness: it would drift without bound in any wind, so it is held
     /// still.
     pub modes: Vec<Option<ModeParameters>>,
-    /// Names the modes that are held still, if there are any.
-    pub remark: Option<String>,
+    /// Names the modes that are held still, and those without damping.
+    pub remarks: Vec<String>,
 }
 
 impl ModalParameters {
@@ -43,7 +43,7 @@ impl ModalParameters {
     /// or if the note `damping_ratio` is not a number from 0 to 1000.
     pub fn read(model: &Model) -> Result<Self> {
         let mut modes = vec![None; model.coordinate_count];
-        let mut held_modes = vec![];
+        let (mut held_modes, mut undamped_modes) = (vec![], vec![]);
         for domain in model.domains.iter().filter(|domain| domain.owns_q) {
             let damping_ratio = read_damping_ratio(domain)?;
             let eigenvalues = read_eigenvalues(domain)?;
@@ -54,8 +54,14 @@ impl ModalParameters {
             if held > 0 {
                 held_modes.push((domain.name.as_str(), held));
             }
+            if damping_ratio == 0.0 && held < domain.rank {
+                undamped_modes.push((domain.name.as_str(), domain.rank - held));
+            }
         }
-        Ok(Self { modes, remark: describe_held_modes(&held_modes) })
+        let held = describe_modes("modes without stiffness (eigenvalue 0) are held still", &held_modes);
+        let undamped =
+            describe_modes("modes without damping (damping_ratio 0) keep the energy of all gusts", &undamped_modes);
+        Ok(Self { modes, remarks: held.into_iter().chain(undamped).collect() })
     }
 
     /// The lowest frequency in hertz; `None` if no mode can move.
@@ -96,17 +102,16 @@ fn read_damping_ratio(domain: &DomainModel) -> Result<f64> {
     })
 }
 
-/// Names the domains with modes that are held still, and the number of these modes.
-fn describe_held_modes(held_modes: &[(&str, usize)]) -> Option<String> {
-    let count: usize = held_modes.iter().map(|(_, held)| held).sum();
+/// A remark on some modes, with the names of their domains and the numbers of these modes. `None` without modes.
+fn describe_modes(subject: &str, modes: &[(&str, usize)]) -> Option<String> {
+    let count: usize = modes.iter().map(|(_, count)| count).sum();
     let mut names: Vec<String> =
-        held_modes.iter().take(MAX_NAMED_DOMAINS).map(|(name, held)| format!("{held} of '{name}'")).collect();
-    let unnamed_count = held_modes.len() - names.len();
+        modes.iter().take(MAX_NAMED_DOMAINS).map(|(name, count)| format!("{count} of '{name}'")).collect();
+    let unnamed_count = modes.len() - names.len();
     if unnamed_count > 0 {
         names.push(format!("and those of {unnamed_count} other domains"));
     }
-    (count > 0)
-        .then(|| format!("modes without stiffness (eigenvalue 0) are held still ({count}): {}", names.join(", ")))
+    (count > 0).then(|| format!("{subject} ({count}): {}", names.join(", ")))
 }
 
 #[cfg(test)]
@@ -154,10 +159,18 @@ mod tests {
         // A rounding error of a rigid motion, and a domain without eigenvalues.
         let parameters = read(&[-1e-12, 30.0], None).expect("valid parameters");
         assert!(parameters.modes[2].is_none() && parameters.modes[3].is_some());
-        let remark = parameters.remark.expect("a remark");
-        assert!(remark.contains("1 of 'branch'"), "{remark}");
-        let remark = read(&[], None).expect("valid parameters").remark.expect("a remark");
-        assert!(remark.contains("2 of 'branch'"), "{remark}");
-        assert_eq!(read(&[30.0, 35.0], None).expect("valid parameters").remark, None);
+        assert!(parameters.remarks[0].contains("1 of 'branch'"), "{:?}", parameters.remarks);
+        let remarks = read(&[], None).expect("valid parameters").remarks;
+        assert!(remarks[0].contains("2 of 'branch'"), "{remarks:?}");
+        assert_eq!(read(&[30.0, 35.0], None).expect("valid parameters").remarks, [""; 0]);
+    }
+
+    #[test]
+    fn modes_without_damping_are_named() {
+        let remarks = |damping_ratio| read(&[0.0, 30.0], Some(damping_ratio)).expect("valid parameters").remarks;
+        let undamped = remarks("0");
+        assert!(undamped.len() == 2 && undamped[1].starts_with("modes without damping"), "{undamped:?}");
+        assert!(undamped[1].ends_with("(1): 1 of 'branch'"), "expected no mode that is held still: {undamped:?}");
+        assert_eq!(remarks("1e-6").len(), 1);
     }
 }

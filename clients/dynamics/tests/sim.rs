@@ -293,6 +293,26 @@ async fn errors_exit_with_documented_codes() {
     assert!(sim_output.exit_code == 5 && sim_output.stderr.contains("--cubic"), "{}", sim_output.stderr);
 }
 
+/// A file of cubic forces that the scene does not name is named and not used, although it is the only one.
+#[tokio::test(flavor = "multi_thread")]
+async fn cubic_forces_of_another_model_are_not_used() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    std::fs::write(
+        folder.path().join("other.cub"),
+        "2
+",
+    )
+    .expect("a writable file");
+    let files = folder.path().display().to_string();
+    let url = serve(Arc::new(tree_server())).await;
+    let sim_output = run_sim(&url, &["auto", "--scene", "toy", "--files", &files, "--steps", "2"]).await;
+    assert_eq!(sim_output.exit_code, 0, "{}", sim_output.stderr);
+    assert!(sim_output.stderr.contains("scenario `tree`"), "{}", sim_output.stderr);
+    assert!(sim_output.stderr.contains("not used as cubic forces: ") && sim_output.stderr.contains("other.cub"));
+    let sim_output = run_sim(&url, &["bridge", "--scene", "toy", "--files", &files, "--steps", "2"]).await;
+    assert!(sim_output.exit_code == 5 && sim_output.stderr.contains("vega.cubic"), "{}", sim_output.stderr);
+}
+
 /// The folder of a Vega model.
 fn vega_folder(name: &str) -> PathBuf {
     let default_folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared/data");
@@ -328,7 +348,9 @@ async fn real_models_deflect_as_requested_and_stay_bounded() {
     // The lowest frequency of the .cub file (1 Hz and 37.68 Hz) times the base frequency of the .config file (0.25 and
     // 0.02).
     for (name, expected_hertz) in [("simpleBridge", 0.25), ("A", 37.68 * 0.02)] {
-        let url = serve(Arc::new(FakeServer::new(vec![vega_domain(name)]))).await;
+        let mut domain = vega_domain(name);
+        domain.wire.notes.insert("vega.cubic".into(), format!("{name}.cub"));
+        let url = serve(Arc::new(FakeServer::new(vec![domain]))).await;
         let files = vega_folder(name).display().to_string();
         for dt in ["0.0166667", "1"] {
             let arguments = ["auto", "--scene", "toy", "--files", &files, "--steps", "60", "--dt", dt, "--json"];

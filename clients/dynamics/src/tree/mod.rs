@@ -297,5 +297,5 @@ fn create_remarks(parameters: &ModalParameters, options: &TreeOptions, calibrati
             calibration.sway_fraction
         )
     });
-    parameters.remark.iter().cloned().chain(left_out_gusts).chain(limited_sway).collect()
+    parameters.remarks.iter().cloned().chain(left_out_gusts).chain(limited_sway).collect()
 }
