@@ -168,14 +168,15 @@ impl<'a> StateSample<'a> {
 /// takes at most 2^24 x 112 bytes = 1.9 GB.
 const MAX_GROUP_ITEMS: usize = 1 << 24;
 
-/// Validates the variants at `seeds` random states and at no more than `steps` states of the trajectory, at every
-/// vertex and corner. The reference values are computed once for all variants, in parallel over several states.
+/// Validates the variants at `seeds` random states, at least one, and at no more than `steps` states of the trajectory, at
+/// every vertex and corner. The reference values are computed once for all variants, in parallel over several states.
 pub fn validate(
     workload: &Workload,
     motion: &WorkloadMotion,
     variants: &mut [Box<dyn Variant>],
     (seeds, steps): (usize, usize),
 ) -> (Vec<ValidationResult>, ConditionNumbers) {
+    let seeds = seeds.max(1);
     let camera = Camera::fit_to_scene(&workload.scene, IMAGE_SIZE.0, IMAGE_SIZE.1);
     let error_scale = ErrorScale::new(&workload.scene, &camera);
     let exact_state =
@@ -473,6 +474,16 @@ mod tests {
             EmulatedVariant { label, scene: declared_scene, applied, declared, surface: DeformedSurface::default() };
         let mut variants: Vec<Box<dyn Variant>> = vec![Box::new(emulated)];
         validate(&workload, &WorkloadMotion::new(&workload, None), &mut variants, (3, usize::MAX)).0.remove(0)
+    }
+
+    #[test]
+    fn at_least_one_state_is_validated() {
+        let workload = WorkloadKind::OneDomain { has_normal_map: false }.build(Size::Quick).expect("expected a load");
+        let label = VariantLabel::new("cpu", Backend::Cpu, &workload.scene);
+        let cpu = DeformerVariant::new(label, &workload.scene, Box::new(CpuDeformer::new(&workload.scene)));
+        let mut variants: Vec<Box<dyn Variant>> = vec![Box::new(cpu)];
+        let (results, _) = validate(&workload, &WorkloadMotion::new(&workload, None), &mut variants, (0, 0));
+        assert!(results[0].errors.states == 1 && results[0].passed(), "{results:?}");
     }
 
     #[test]
