@@ -25,7 +25,8 @@ pub(super) struct Args {
     /// A built-in name, a folder with scene.toml, a .glb, .gltf, .obj, .ply, .stl or .npz file, or a folder with
     /// one model.
     scene: String,
-    /// Treat missing material libraries, materials and images as errors instead of remarks.
+    /// Treat missing material libraries, materials and images, and images of unsupported formats, as errors instead of
+    /// remarks.
     #[arg(long)]
     strict: bool,
     /// Print the description as JSON.

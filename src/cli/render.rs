@@ -59,8 +59,7 @@ pub(super) struct Args {
     #[arg(long, value_name = "PIXELS", num_args = 0..=1, default_missing_value = "1.25", conflicts_with = "output")]
     edges: Option<f32>,
     /// Preset of the antialiasing and the shadow map: preview, standard or best. Replaces the preset of the scene. Keys
-    /// of the table `look` in scene.toml win over it. Default: that of the scene, else chosen by renderer, image size and
-    /// triangles.
+    /// of the table `look` in scene.toml win over it. Default: that of the scene, else best.
     #[arg(long, value_name = "PRESET")]
     look: Option<LookPreset>,
     /// Deformation backend.
@@ -129,7 +128,7 @@ fn mesh_edges(width: Option<f32>, scene: &Scene) -> Result<Option<MeshEdges>> {
 
 pub(super) fn run(args: &Args) -> Outcome {
     let format = FileFormat::of(&args.out)?;
-    let OpenedScene { scene, backends } = with_spinner("loading", || load::open_with_preset(&args.scene, args.look))?;
+    let OpenedScene { scene, backends } = with_spinner("loading", || load::open_for_still(&args.scene, args.look))?;
     let mut state = SceneState::rest(&scene);
     if let Some(path) = &args.q {
         state.q = read_coordinates(&scene, path)?;

@@ -69,6 +69,13 @@ impl Material {
         }
     }
 
+    /// Multiplies the ambient and the diffuse color by a linear color.
+    pub fn multiply_color(&mut self, color: [f32; 3]) {
+        for factor in [&mut self.ambient, &mut self.diffuse] {
+            factor.iter_mut().zip(color).for_each(|(factor, channel)| *factor *= channel);
+        }
+    }
+
     /// Validates all numbers.
     ///
     /// # Errors

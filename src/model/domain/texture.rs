@@ -35,6 +35,14 @@ impl Texture {
         Ok(Self { name, width, height, rgba })
     }
 
+    /// Number of bytes at the start of a file that [`Self::is_supported`] needs.
+    pub const SIGNATURE_BYTES: usize = 16;
+
+    /// Whether a file that starts with these bytes is a PNG or JPEG image.
+    pub fn is_supported(start: &[u8]) -> bool {
+        matches!(image::guess_format(start), Ok(image::ImageFormat::Png | image::ImageFormat::Jpeg))
+    }
+
     /// Decodes PNG or JPEG bytes.
     ///
     /// # Errors

@@ -4,6 +4,7 @@ use std::fs::File;
 use std::io::Read;
 use std::path::{Component, Path, PathBuf};
 
+use crate::domain::Texture;
 use crate::error::{Result, invalid};
 
 /// The largest mesh or matrix file in bytes.
@@ -55,8 +56,7 @@ impl AssetDir {
         self.is_strict
     }
 
-    /// Whether a file exists that another file refers to: a material library or an image. If it does not, the loader
-    /// uses a stand-in and adds a remark.
+    /// Whether a file exists that another file refers to. If it does not, the loader uses a stand-in and adds a remark.
     ///
     /// # Errors
     /// `Invalid` for a path that leaves the root and, in strict mode, for a file that does not exist.
@@ -64,6 +64,30 @@ impl AssetDir {
         match self.kind(relative)? {
             None if self.is_strict => Err(invalid(field_of(relative), "an existing file", "none (strict mode)")),
             kind => Ok(kind.is_some()),
+        }
+    }
+
+    /// Why the image that another file refers to is not drawn, as the end of a remark. `None` for a PNG or JPEG image.
+    ///
+    /// # Errors
+    /// As for [`Self::has_referenced_file`] and [`Self::read_start`]; in strict mode, also for other formats.
+    pub(super) fn unusable_image(&self, relative: &str) -> Result<Option<&'static str>> {
+        if !self.has_referenced_file(relative)? {
+            return Ok(Some("does not exist"));
+        }
+        let start = self.read_start(relative, Texture::SIGNATURE_BYTES as u64)?;
+        self.unsupported_image(relative, &start)
+    }
+
+    /// As [`Self::unusable_image`], for an image that starts with the bytes `start`.
+    ///
+    /// # Errors
+    /// In strict mode, `Invalid` for other formats than PNG and JPEG.
+    pub(super) fn unsupported_image(&self, name: &str, start: &[u8]) -> Result<Option<&'static str>> {
+        match (Texture::is_supported(start), self.is_strict) {
+            (true, _) => Ok(None),
+            (false, false) => Ok(Some("is neither a PNG nor a JPEG image")),
+            (false, true) => Err(invalid(field_of(name), "a PNG or JPEG image", "another format (strict mode)")),
         }
     }
 
@@ -88,26 +112,41 @@ impl AssetDir {
     /// `Invalid` if the path is outside the root, does not exist, is not a regular file, is too large or unreadable.
     /// The error contains the unresolved path, so that it does not reveal the location of the root.
     pub(super) fn read(&self, relative: &str, limit: u64) -> Result<Vec<u8>> {
-        let path = self.resolve(relative)?;
-        let unreadable = |given: &dyn std::fmt::Display| invalid(field_of(relative), "a regular, readable file", given);
-        // Check the type before the file is opened, because opening a pipe or a device may block, and reading it may
-        // never end.
-        let metadata = path.metadata().map_err(|error| unreadable(&error.kind()))?;
-        if !metadata.is_file() {
-            return Err(unreadable(&"a folder or a special file"));
-        }
         let too_large = |size: u64| invalid(field_of(relative), format!("at most {limit} bytes"), size);
-        if metadata.len() > limit {
-            return Err(too_large(metadata.len()));
+        let file_bytes = self.regular_file(relative)?.1;
+        if file_bytes > limit {
+            return Err(too_large(file_bytes));
         }
-        let mut bytes = Vec::new();
-        let file = File::open(&path).map_err(|error| unreadable(&error.kind()))?;
-        file.take(limit.saturating_add(1)).read_to_end(&mut bytes).map_err(|error| unreadable(&error.kind()))?;
+        let bytes = self.read_start(relative, limit.saturating_add(1))?;
         // The file may have grown after its size was read.
         if bytes.len() as u64 > limit {
             return Err(too_large(bytes.len() as u64));
         }
         Ok(bytes)
+    }
+
+    /// Reads at most the first `count` bytes of a regular file.
+    ///
+    /// # Errors
+    /// As for [`Self::read`], except for the size.
+    pub(super) fn read_start(&self, relative: &str, count: u64) -> Result<Vec<u8>> {
+        let (path, _) = self.regular_file(relative)?;
+        let mut bytes = Vec::new();
+        let file = File::open(&path).map_err(|error| unreadable(relative, &error.kind()))?;
+        file.take(count).read_to_end(&mut bytes).map_err(|error| unreadable(relative, &error.kind()))?;
+        Ok(bytes)
+    }
+
+    /// The resolved path of a regular file, and its size in bytes.
+    fn regular_file(&self, relative: &str) -> Result<(PathBuf, u64)> {
+        let path = self.resolve(relative)?;
+        // Check the type before the file is opened, because opening a pipe or a device may block, and reading it may
+        // never end.
+        let metadata = path.metadata().map_err(|error| unreadable(relative, &error.kind()))?;
+        match metadata.is_file() {
+            true => Ok((path, metadata.len())),
+            false => Err(unreadable(relative, &"a folder or a special file")),
+        }
     }
 
     /// The kind of the path, or `None` if it does not exist.
@@ -203,6 +242,10 @@ pub(super) fn extension_of(name: &str) -> String {
 /// The field of an error about a file.
 fn field_of(relative: &str) -> String {
     format!("file '{relative}'")
+}
+
+fn unreadable(relative: &str, given: &dyn std::fmt::Display) -> crate::error::Error {
+    invalid(field_of(relative), "a regular, readable file", given)
 }
 
 fn outside_error(relative: &str) -> crate::error::Error {

@@ -16,8 +16,8 @@
 //!   these defaults.
 //! - Normals of a file are kept. Missing ones are smooth except along creases, which split the corners of a vertex and
 //!   never the vertex itself (module `domain::creases`).
-//! - A file that another file refers to and that does not exist has a stand-in and a remark, or is an error in strict
-//!   mode.
+//! - A file that another file refers to and that does not exist, and an image that is neither PNG nor JPEG, has a stand-in
+//!   and a remark, or is an error in strict mode.
 
 mod asset_dir;
 #[cfg(test)]
@@ -95,17 +95,17 @@ pub fn open(source: &str) -> Result<OpenedScene> {
     OpenedScene::new(source::read(&asset_dir::AssetDir::unrestricted(Path::new(".")), source)?)
 }
 
-/// As [`open`], with a preset for the look instead of the scene's own preset. Settings of antialiasing and shadow map in
-/// `scene.toml` win over it. `None` keeps the scene's own preset.
+/// As [`open`], for a still picture: `preset` replaces the scene's own preset, and [`LookPreset::STILL`] the choice by
+/// rule of a scene without a preset. Settings of antialiasing and shadow map in `scene.toml` win over both.
 ///
 /// # Errors
 /// As for [`open`].
-pub fn open_with_preset(source: &str, preset: Option<LookPreset>) -> Result<OpenedScene> {
+pub fn open_for_still(source: &str, preset: Option<LookPreset>) -> Result<OpenedScene> {
     let mut description = source::read(&asset_dir::AssetDir::unrestricted(Path::new(".")), source)?;
-    if preset.is_some() {
-        let look = &mut description.parts.look;
-        *look = look.with_preset(PresetRequest { preset, ..look.preset.unwrap_or_default() });
-    }
+    let look = &mut description.parts.look;
+    let request = look.preset.unwrap_or_default();
+    let preset = preset.or(request.preset).unwrap_or(LookPreset::STILL);
+    *look = look.with_preset(PresetRequest { preset: Some(preset), ..request });
     OpenedScene::new(description)
 }
 

@@ -93,12 +93,11 @@ fn color_vertices(polygons: &PolygonMesh, mesh: Mesh, parts: &mut SceneParts) ->
             (material.ambient, material.diffuse) = ([1.0; 3], [1.0; 3]);
         }
     }
-    match polygons::paint(&mesh, &polygons.colors)? {
+    let linear_colors: Vec<[f32; 3]> =
+        polygons.colors.iter().map(|color| color.map(polygons::linear_from_srgb)).collect();
+    match polygons::paint(&mesh, &linear_colors)? {
         VertexColors::Uniform(color) => {
-            let multiply = |factor: [f32; 3]| [0, 1, 2].map(|channel| factor[channel] * color[channel]);
-            for material in &mut parts.materials {
-                (material.ambient, material.diffuse) = (multiply(material.ambient), multiply(material.diffuse));
-            }
+            parts.materials.iter_mut().for_each(|material| material.multiply_color(color));
             Ok(mesh)
         }
         VertexColors::Image(painted) => {

@@ -47,6 +47,10 @@ use std::sync::Arc;
 use crate::domain::{AlphaMode, Domain, MAX_RING_TRIANGLES, Material, Shape, Texture};
 use crate::error::{Result, invalid};
 
+/// Largest magnitude of a negative eigenvalue that counts as a rounding error, as a fraction of the largest magnitude of
+/// its domain. Solvers return the eigenvalues of rigid motions as numbers near 0 of either sign.
+const EIGENVALUE_ROUNDING: f64 = 1e-9;
+
 /// The largest number of domains in a scene.
 pub const MAX_DOMAINS: usize = 1 << 20;
 
@@ -156,6 +160,7 @@ impl Scene {
         parts.look.check()?;
         parts.deformation.check()?;
         drop_textures_without_uvs(&mut parts);
+        parts.remarks.extend(negative_eigenvalues(&parts.domains));
         add_tangents(&mut parts);
         let layout = Layout::new(&parts.shapes, &parts.domains)?;
         let features = SceneFeatures::from_parts(&parts);
@@ -322,6 +327,23 @@ fn check_material_ranges(parts: &SceneParts, domain: &Domain) -> Result<()> {
     Ok(())
 }
 
+/// A remark on the domains with a negative eigenvalue, which a rounding error does not explain. They are accepted, because
+/// the server only stores eigenvalues.
+fn negative_eigenvalues(domains: &[Domain]) -> Option<String> {
+    let most_negative = |domain: &Domain| {
+        let eigenvalues = || domain.metadata.eigenvalues.iter().copied();
+        let tolerance = EIGENVALUE_ROUNDING * eigenvalues().fold(0.0, |largest: f64, value| largest.max(value.abs()));
+        eigenvalues().min_by(f64::total_cmp).filter(|value| *value < -tolerance)
+    };
+    let mut found = domains.iter().filter_map(|domain| Some((&domain.name, most_negative(domain)?)));
+    let (name, value) = found.next()?;
+    let others = found.count();
+    let more = if others > 0 { format!(", and in {others} other domains") } else { String::new() };
+    Some(format!(
+        "negative eigenvalue {value} (rad/s)^2 in '{name}'{more}: such a mode is unstable, and modalcast-sim refuses it"
+    ))
+}
+
 /// Replaces the materials of domains without texture coordinates by untextured copies, because a texture would show the
 /// same texel everywhere. Each replaced material adds a remark.
 fn drop_textures_without_uvs(parts: &mut SceneParts) {
@@ -435,6 +457,20 @@ mod tests {
         parts_with_uvs.shapes[0] = Shape::new(mesh.expect("a square"), Modes::rigid()).expect("rigid");
         let scene = Scene::new(parts_with_uvs).expect("a scene");
         assert!(scene.features.textures && scene.features.mask && scene.remarks.is_empty());
+    }
+
+    #[test]
+    fn negative_eigenvalues_are_remarked_and_rounding_errors_are_not() {
+        let remarks = |eigenvalues: &[f64]| {
+            let mut parts = square(vec![]);
+            parts.domains[0].metadata.eigenvalues = eigenvalues.to_vec();
+            Scene::new(parts).expect("a scene").remarks.clone()
+        };
+        let negative = remarks(&[-4.0, 100.0]);
+        assert!(negative.len() == 1 && negative[0].starts_with("negative eigenvalue -4 (rad/s)^2 in "), "{negative:?}");
+        for eigenvalues in [&[-1e-8, 100.0][..], &[0.0, 100.0], &[]] {
+            assert_eq!(remarks(eigenvalues), [""; 0], "{eigenvalues:?}");
+        }
     }
 
     fn material_range(first_triangle: usize, material: usize) -> MaterialRange {

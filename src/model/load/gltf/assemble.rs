@@ -10,7 +10,7 @@ use super::document::Document;
 use super::get_element;
 use super::hierarchy::{self, PlacedNode};
 use super::material::MaterialConverter;
-use super::primitive;
+use super::primitive::{self, ConvertedPrimitive, PrimitiveOptions};
 use super::remarks::{ImportRemarks, sanitize};
 use super::texture::TextureLoader;
 use crate::domain::{Attachment, CreaseAngle, Domain, Shape, Transform};
@@ -138,14 +138,17 @@ impl GltfAssembler<'_> {
             return Ok(*loaded);
         }
         let primitive = &self.reader.document.meshes[mesh_index].primitives[primitive_index];
-        let uv_set = self.material_converter.uv_set(primitive.material)?;
-        let shape = primitive::convert_primitive(self.reader, primitive, uv_set, self.crease_angle, &mut self.remarks)?;
-        let loaded = match shape {
+        let options = PrimitiveOptions {
+            uv_set: self.material_converter.uv_set(primitive.material)?,
+            has_image: self.material_converter.has_image(primitive.material)?,
+            crease_angle: self.crease_angle,
+        };
+        let loaded = match primitive::convert_primitive(self.reader, primitive, options, &mut self.remarks)? {
             None => None,
-            Some(shape) => {
-                let has_uvs = !shape.mesh.corners().uvs.is_empty();
+            Some(ConvertedPrimitive { shape, colors, has_uvs }) => {
                 let material =
                     self.material_converter.material_index(primitive.material, has_uvs, &mut self.remarks)?;
+                let material = self.material_converter.with_vertex_colors(material, colors);
                 self.shapes.push(shape);
                 Some(LoadedPrimitive { shape: self.shapes.len() - 1, material })
             }

@@ -9,6 +9,7 @@ use base64::engine::general_purpose::STANDARD_PAD_INDIFFERENT;
 use super::document::{BufferView, Document};
 use super::remarks::sanitize;
 use super::{MAX_FILE_BYTES, get_element};
+use crate::domain::Texture;
 use crate::error::{Result, invalid};
 use crate::load::asset_dir::AssetDir;
 
@@ -94,14 +95,26 @@ impl<'a> GltfBuffers<'a> {
         }
     }
 
-    /// The URI of an image, if it is a file that does not exist.
+    /// Why an image is not drawn, as the end of a remark. `None` for a PNG or JPEG image.
     ///
     /// # Errors
-    /// `Invalid` if the URI leaves the folder and, in strict mode, if the file does not exist.
-    pub(super) fn missing_image(&self, index: usize) -> Result<Option<&str>> {
-        let uri = self.document.images[index].uri.as_deref().filter(|uri| !uri.starts_with("data:"));
-        let Some(uri) = uri else { return Ok(None) };
-        Ok((!self.folder.has_referenced_file(&relative_path(uri)?)?).then_some(uri))
+    /// As for [`Self::image`] and [`AssetDir::unusable_image`].
+    pub(super) fn unusable_image(&self, index: usize) -> Result<Option<&'static str>> {
+        let image = &self.document.images[index];
+        let start = match (image.uri.as_deref(), image.buffer_view) {
+            (Some(uri), _) => match uri.strip_prefix("data:") {
+                Some(data) => Cow::Owned(decode_data_uri(signature_of_data_uri(data))?),
+                None => return self.folder.unusable_image(&relative_path(uri)?),
+            },
+            (None, Some(view)) => Cow::Borrowed(self.view(view)?.0),
+            (None, None) => return Err(invalid("uri", "a URI or a bufferView", "neither")),
+        };
+        self.folder.unsupported_image("in the model", &start[..start.len().min(Texture::SIGNATURE_BYTES)])
+    }
+
+    /// Whether an unusable image is an error instead of a remark.
+    pub(super) const fn is_strict(&self) -> bool {
+        self.folder.is_strict()
     }
 
     /// Subtracts `bytes` from the budget; call it before allocating them.
@@ -124,6 +137,14 @@ impl<'a> GltfBuffers<'a> {
         self.charge_budget(content.len() as u64)?;
         Ok(content)
     }
+}
+
+/// The start of a data URI, which has the signature of an image. `data` is the part after `data:`.
+fn signature_of_data_uri(data: &str) -> &str {
+    // Four characters encode three bytes.
+    const CHARACTERS: usize = 4 * Texture::SIGNATURE_BYTES.div_ceil(3);
+    let payload_start = data.find(',').map_or(0, |comma| comma + 1);
+    data.get(..payload_start + CHARACTERS).unwrap_or(data)
 }
 
 /// Decodes a data URI with Base64 content. `data` is the part after `data:`.

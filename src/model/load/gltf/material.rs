@@ -19,6 +19,7 @@ use std::collections::HashMap;
 
 use super::document::{self, Document};
 use super::get_element;
+use super::primitive::PrimitiveColors;
 use super::remarks::{ImportRemarks, sanitize};
 use super::texture::TextureLoader;
 use crate::domain::{AlphaMode, Material};
@@ -51,6 +52,31 @@ impl<'a> MaterialConverter<'a> {
         let material = get_element(&self.document.materials, index, "material")?;
         let base_color_texture = material.pbr_metallic_roughness.base_color_texture.as_ref();
         Ok(base_color_texture.or(material.normal_texture.as_ref()).map_or(0, |texture| texture.tex_coord))
+    }
+
+    /// Whether a material has an image that texture coordinates place on the surface.
+    ///
+    /// # Errors
+    /// `Invalid` if the material does not exist.
+    pub(super) fn has_image(&self, material: Option<usize>) -> Result<bool> {
+        let Some(index) = material else { return Ok(false) };
+        let material = get_element(&self.document.materials, index, "material")?;
+        Ok(material.pbr_metallic_roughness.base_color_texture.is_some() || material.normal_texture.is_some())
+    }
+
+    /// Returns the index of the converted material `index` with the colors of a primitive's vertices.
+    pub(super) fn with_vertex_colors(&mut self, index: usize, colors: PrimitiveColors) -> usize {
+        let mut material = self.materials[index].clone();
+        match colors {
+            PrimitiveColors::None => return index,
+            PrimitiveColors::Uniform(color) => material.multiply_color(color),
+            PrimitiveColors::Image(texture) => {
+                material.color_texture = Some(self.texture_loader.textures.len());
+                self.texture_loader.textures.push(texture);
+            }
+        }
+        self.materials.push(material);
+        self.materials.len() - 1
     }
 
     /// Returns the index of a converted material. The first call for a material converts it. `material` is its index in
@@ -137,7 +163,7 @@ impl<'a> MaterialConverter<'a> {
         }
         let with_field = prefix_with("pbrMetallicRoughness.baseColorTexture");
         let stand_in = "the color factor is drawn";
-        if self.texture_loader.is_missing(texture, stand_in, remarks).map_err(&with_field)? {
+        if self.texture_loader.is_unusable(texture, stand_in, remarks).map_err(&with_field)? {
             return Ok(None);
         }
         self.texture_loader.texture_index(texture, remarks).map(Some).map_err(with_field)
@@ -163,7 +189,7 @@ impl<'a> MaterialConverter<'a> {
             remarks.add(format!("material '{name}': the normal map's scale of {scale} is ignored"));
         }
         let stand_in = "the normals of the mesh are used";
-        if self.texture_loader.is_missing(texture, stand_in, remarks).map_err(prefix_with("normalTexture"))? {
+        if self.texture_loader.is_unusable(texture, stand_in, remarks).map_err(prefix_with("normalTexture"))? {
             return Ok(None);
         }
         self.texture_loader.texture_index(texture, remarks).map(Some).map_err(prefix_with("normalTexture"))
@@ -180,7 +206,7 @@ impl<'a> MaterialConverter<'a> {
         let Some(texture) = &pbr.metallic_roughness_texture else { return Ok((metalness, roughness)) };
         let with_field = prefix_with("pbrMetallicRoughness.metallicRoughnessTexture");
         let stand_in = "the metallic and roughness factors are used";
-        if self.texture_loader.is_missing(texture, stand_in, remarks).map_err(&with_field)? {
+        if self.texture_loader.is_unusable(texture, stand_in, remarks).map_err(&with_field)? {
             return Ok((metalness, roughness));
         }
         let channel_means = self.texture_loader.channel_means(texture, remarks).map_err(with_field)?;

@@ -4,15 +4,45 @@
 use super::accessor::{AccessorReader, AttributeFormat};
 use super::document::Primitive;
 use super::remarks::ImportRemarks;
-use crate::domain::{Corners, CreaseAngle, MAX_RANK, Mesh, Modes, Shape, split_at_creases};
+use crate::domain::{Corners, CreaseAngle, MAX_RANK, Mesh, Modes, Shape, Texture, split_at_creases};
 use crate::error::{Result, invalid};
+use crate::load::polygons::{VertexColors, paint};
 
 /// Values of [`Primitive::mode`]; lower values are points and lines.
 const TRIANGLES: u64 = 4;
 const STRIP: u64 = 5;
 const FAN: u64 = 6;
 
-/// Converts a primitive to a shape, with the texture coordinates of set `uv_set` if the primitive has them. Returns
+/// What the conversion of a primitive depends on besides the primitive.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct PrimitiveOptions {
+    /// The set of texture coordinates that the material uses.
+    pub(super) uv_set: u32,
+    /// Whether the material has an image.
+    pub(super) has_image: bool,
+    pub(super) crease_angle: CreaseAngle,
+}
+
+/// A primitive as a shape, and the colors of its vertices as factors of its material.
+#[derive(Debug)]
+pub(super) struct ConvertedPrimitive {
+    pub(super) shape: Shape,
+    pub(super) colors: PrimitiveColors,
+    /// Whether the primitive has texture coordinates for the images of its material.
+    pub(super) has_uvs: bool,
+}
+
+/// The colors of the vertices of a primitive.
+#[derive(Debug)]
+pub(super) enum PrimitiveColors {
+    None,
+    /// All vertices have this linear color.
+    Uniform([f32; 3]),
+    /// The texture coordinates of the shape refer to this image.
+    Image(Texture),
+}
+
+/// Converts a primitive to a shape, with the texture coordinates of its material if the primitive has them. Returns
 /// `None` for points and lines.
 ///
 /// # Errors
@@ -20,10 +50,9 @@ const FAN: u64 = 6;
 pub(super) fn convert_primitive(
     reader: AccessorReader<'_>,
     primitive: &Primitive,
-    uv_set: u32,
-    crease_angle: CreaseAngle,
+    options: PrimitiveOptions,
     remarks: &mut ImportRemarks,
-) -> Result<Option<Shape>> {
+) -> Result<Option<ConvertedPrimitive>> {
     if primitive.mode > FAN {
         return Err(invalid("mode", "0 to 6", primitive.mode));
     }
@@ -38,19 +67,66 @@ pub(super) fn convert_primitive(
         .decode_vectors::<3>(position_accessor, format)
         .map_err(|error| error.prefix_field("attributes.POSITION"))?;
     let modes = read_modes(reader, primitive, rest_positions.len(), remarks)?;
-    let mesh = read_mesh(reader, primitive, rest_positions, uv_set, crease_angle)?;
-    if primitive.attributes.contains_key("COLOR_0") {
-        remarks.add("vertex colors are ignored".into());
+    let mesh = read_mesh(reader, primitive, rest_positions, options)?;
+    let has_uvs = !mesh.corners().uvs.is_empty();
+    let (mesh, colors) = match primitive.attributes.get("COLOR_0") {
+        None => (mesh, PrimitiveColors::None),
+        // The colors are drawn through texture coordinates of their own.
+        Some(_) if options.has_image && has_uvs => {
+            remarks.add("vertex colors are not used where the material has an image".into());
+            (mesh, PrimitiveColors::None)
+        }
+        Some(accessor) => {
+            let colors = read_colors(reader, *accessor, mesh.rest_positions().len(), remarks);
+            let colors = colors.map_err(|error| error.prefix_field("attributes.COLOR_0"))?;
+            color_vertices(reader, mesh, &colors)?
+        }
+    };
+    Ok(Some(ConvertedPrimitive { shape: Shape::new(mesh, modes)?, colors, has_uvs }))
+}
+
+/// The linear colors of the vertices. Their alpha is ignored.
+fn read_colors(
+    reader: AccessorReader<'_>,
+    accessor: usize,
+    vertex_count: usize,
+    remarks: &mut ImportRemarks,
+) -> Result<Vec<[f32; 3]>> {
+    let format = AttributeFormat { allows_integers: true, count: Some(vertex_count) };
+    let clamp = |channel: f32| channel.clamp(0.0, 1.0);
+    if reader.document.accessors.get(accessor).is_none_or(|accessor| accessor.kind != "VEC4") {
+        let colors = reader.decode_vectors::<3>(accessor, format)?;
+        return Ok(colors.into_iter().map(|color| color.map(clamp)).collect());
     }
-    Shape::new(mesh, modes).map(Some)
+    let colors = reader.decode_vectors::<4>(accessor, format)?;
+    if colors.iter().any(|color| color[3] < 1.0) {
+        remarks.add("the alpha of vertex colors is ignored".into());
+    }
+    Ok(colors.into_iter().map(|[red, green, blue, _]| [red, green, blue].map(clamp)).collect())
+}
+
+/// Colors the vertices of a mesh.
+fn color_vertices(
+    reader: AccessorReader<'_>,
+    mesh: Mesh,
+    linear_colors: &[[f32; 3]],
+) -> Result<(Mesh, PrimitiveColors)> {
+    // Four texels per triangle.
+    reader.buffers.charge_budget(16 * mesh.triangles().len() as u64)?;
+    Ok(match paint(&mesh, linear_colors)? {
+        VertexColors::Uniform(color) => (mesh, PrimitiveColors::Uniform(color)),
+        VertexColors::Image(painted) => {
+            let (mesh, texture) = *painted;
+            (mesh, PrimitiveColors::Image(texture))
+        }
+    })
 }
 
 fn read_mesh(
     reader: AccessorReader<'_>,
     primitive: &Primitive,
     rest_positions: Vec<[f32; 3]>,
-    uv_set: u32,
-    crease_angle: CreaseAngle,
+    PrimitiveOptions { uv_set, crease_angle, .. }: PrimitiveOptions,
 ) -> Result<Mesh> {
     let indices = match primitive.indices {
         Some(accessor) => {

@@ -42,23 +42,29 @@ impl<'a> TextureLoader<'a> {
         Ok(self.textures.len() - 1)
     }
 
-    /// Whether the image of a texture is a file that does not exist. Adds a remark that ends with `stand_in`.
+    /// Whether a texture has no PNG or JPEG image: its image is a file that does not exist, has another format, or is
+    /// defined by an extension. Adds a remark that ends with `stand_in`.
     ///
     /// # Errors
-    /// `Invalid` if the texture does not exist and, in strict mode, if its image does not.
-    pub(super) fn is_missing(
+    /// `Invalid` if the texture does not exist and, in strict mode, if it has no PNG or JPEG image.
+    pub(super) fn is_unusable(
         &self,
         texture_info: &TextureInfo,
         stand_in: &str,
         remarks: &mut ImportRemarks,
     ) -> Result<bool> {
-        let image = self.image_index_of(texture_info, remarks)?;
-        let missing_uri = self.buffers.missing_image(image);
-        let missing_uri = missing_uri.map_err(|error| error.prefix_field(&format!("images[{image}]")))?;
-        if let Some(uri) = missing_uri {
-            remarks.add(format!("image '{}' does not exist: {stand_in}", sanitize(uri, 120)));
+        let texture = get_element(&self.document.textures, texture_info.index, "index")?;
+        if texture.source.is_none() && !self.buffers.is_strict() {
+            remarks.add(format!("texture {} has no PNG or JPEG image: {stand_in}", texture_info.index));
+            return Ok(true);
         }
-        Ok(missing_uri.is_some())
+        let image = self.image_index_of(texture_info, remarks)?;
+        let unusable = self.buffers.unusable_image(image);
+        let unusable = unusable.map_err(|error| error.prefix_field(&format!("images[{image}]")))?;
+        if let Some(reason) = unusable {
+            remarks.add(format!("image '{}' {reason}: {stand_in}", self.name(image)));
+        }
+        Ok(unusable.is_some())
     }
 
     /// The mean of each of the four channels, 0 to 1. The texture is not added to `textures`.

@@ -25,7 +25,7 @@ pub(super) fn create_material(
 ) -> Result<Material> {
     let field_of = |statement: &str| format!("material '{name}': {statement}");
     let diffuse = statements.diffuse.unwrap_or([1.0; 3]);
-    let statements = &without_missing_images(statements, files, &field_of, remarks)?;
+    let statements = &without_unusable_images(statements, files, &field_of, remarks)?;
     let color_texture = load_color_texture(statements, files, texture_cache)
         .map_err(|error| error.prefix_field(&field_of("map_Kd, map_d")))?;
     let normal_texture = match &statements.normal_map {
@@ -62,11 +62,11 @@ pub(super) fn create_material(
     material.validated()
 }
 
-/// Removes the images that do not exist, with a remark for each.
+/// Removes the images that do not exist or are neither PNG nor JPEG images, with a remark for each.
 ///
 /// # Errors
-/// In strict mode, `Invalid` with the statement and the file.
-fn without_missing_images(
+/// `Invalid` with the statement and the file: for an unreadable file and, in strict mode, for any such image.
+fn without_unusable_images(
     statements: &MtlMaterial,
     files: &AssetDir,
     field_of: &impl Fn(&str) -> String,
@@ -79,8 +79,9 @@ fn without_missing_images(
         (&mut statements.normal_map, "normal map", "the normals of the mesh are used"),
     ] {
         let Some(path) = image.as_deref() else { continue };
-        if !files.has_referenced_file(path).map_err(|error| error.prefix_field(&field_of(statement)))? {
-            remarks.push(format!("{} '{path}' does not exist: {stand_in}", field_of(statement)));
+        let unusable = files.unusable_image(path).map_err(|error| error.prefix_field(&field_of(statement)))?;
+        if let Some(reason) = unusable {
+            remarks.push(format!("{} '{path}' {reason}: {stand_in}", field_of(statement)));
             *image = None;
         }
     }
@@ -211,9 +212,32 @@ mod tests {
     }
 
     #[test]
+    fn other_image_formats_are_remarks_and_errors_in_strict_mode() {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        std::fs::write(folder.path().join("a.tga"), [0, 0, 2, 0, 0, 0]).expect("a writable file");
+        for (statement, field, stand_in) in [
+            ("map_Kd", "map_Kd", "the color Kd is drawn"),
+            ("map_d", "map_d", "the surface is opaque"),
+            ("norm", "normal map", "the normals of the mesh are used"),
+        ] {
+            let text = format!("newmtl m\n{statement} a.tga\n");
+            let statements = super::super::mtl::parse(text.as_bytes()).expect("an MTL library");
+            let (mut texture_cache, mut remarks) = (TextureCache::default(), Vec::new());
+            let files = AssetDir::unrestricted(folder.path());
+            let material = create_material("m", &statements["m"], &files, &mut texture_cache, &mut remarks);
+            let material = material.expect("a material without the image");
+            assert_eq!((material.color_texture, material.normal_texture), (None, None));
+            let expected = format!("material 'm': {field} 'a.tga' is neither a PNG nor a JPEG image: {stand_in}");
+            assert_eq!(remarks, [expected]);
+            let message = read(&text, folder.path()).expect_err(statement).to_string();
+            assert!(message.ends_with("expected a PNG or JPEG image, got another format (strict mode)"), "{message}");
+        }
+    }
+
+    #[test]
     fn invalid_images_and_numbers_are_rejected_with_material() {
         let folder = tempfile::tempdir().expect("a temporary folder");
-        std::fs::write(folder.path().join("broken.png"), b"\x89PNG\r\n").expect("a writable file");
+        std::fs::write(folder.path().join("broken.png"), b"\x89PNG\r\n\x1a\n").expect("a writable file");
         for (statement, start) in [
             ("map_Kd no.png", "material 'm': map_Kd: file 'no.png': expected an existing file, got none (strict mode)"),
             ("map_Kd broken.png", "material 'm': map_Kd, map_d: texture 'broken.png': expected a PNG or JPEG image"),

@@ -31,15 +31,15 @@ pub(super) fn read(files: &AssetDir, name: &str, options: ModelOptions) -> Resul
     ply.parse(&files.read(name, MAX_MODEL_BYTES)?).map_err(in_file)?;
     let mut material = Material::unspecified("");
     if let Some(image) = ply.image.take().filter(|_| ply.polygons.has_uvs()) {
-        if files.has_referenced_file(&image).map_err(in_file)? {
+        if let Some(reason) = files.unusable_image(&image).map_err(in_file)? {
+            parts.remarks.push(format!("TextureFile '{image}' {reason}: the surface is drawn without it"));
+        } else {
             let texture = texture_cache::decode(files, &image)?;
             let mask = AlphaMode::Mask { cutoff: DEFAULT_ALPHA_CUTOFF };
             material.alpha_mode = if texture.has_alpha() { mask } else { AlphaMode::Opaque };
             (material.ambient, material.diffuse) = ([1.0; 3], [1.0; 3]);
             material.color_texture = Some(parts.textures.len());
             parts.textures.push(texture);
-        } else {
-            parts.remarks.push(format!("TextureFile '{image}' does not exist: the surface is drawn without it"));
         }
     }
     parts.remarks.append(&mut ply.remarks);

@@ -5,7 +5,7 @@ mod triangulate;
 mod vertex_colors;
 
 pub(super) use build::{build_all_faces, build_faces};
-pub(super) use vertex_colors::{VertexColors, paint};
+pub(super) use vertex_colors::{VertexColors, linear_from_srgb, paint};
 
 use crate::error::{Result, invalid};
 

@@ -62,6 +62,118 @@ fn missing_images_are_remarks_and_errors_in_strict_mode() {
     assert!(message.ends_with("file 'absent.png': expected an existing file, got none (strict mode)"), "{message}");
 }
 
+/// The images of other formats than PNG and JPEG: embedded, as a data URI, and defined by an extension only.
+#[test]
+fn other_image_formats_are_remarks_and_errors_in_strict_mode() {
+    let pbr = json!({
+        "baseColorFactor": [0.5, 0.25, 0.125, 1.0], "baseColorTexture": {"index": 0}, "metallicFactor": 0.0
+    });
+    let model = || textured_triangle(json!({"pbrMetallicRoughness": pbr}));
+    let mut embedded = model();
+    let view = embedded.add_view(b"RIFF\x10\0\0\0WEBPVP8L");
+    embedded.json["images"] = json!([{"name": "swatch", "bufferView": view, "mimeType": "image/webp"}]);
+    let mut data_uri = model();
+    data_uri.json["images"] = json!([{"name": "swatch", "uri": "data:image/bmp;base64,Qk02AAAAAAAAADYAAAAoAAAA"}]);
+    let mut extension = model();
+    extension.json["textures"] = json!([{"extensions": {"EXT_texture_webp": {"source": 0}}}]);
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let files = crate::load::asset_dir::AssetDir::unrestricted(folder.path()).strict();
+    for (model, remark, error) in [
+        (
+            embedded,
+            "image 'swatch' is neither a PNG nor a JPEG image: the color factor is drawn",
+            "a PNG or JPEG image",
+        ),
+        (
+            data_uri,
+            "image 'swatch' is neither a PNG nor a JPEG image: the color factor is drawn",
+            "a PNG or JPEG image",
+        ),
+        (extension, "texture 0 has no PNG or JPEG image: the color factor is drawn", "textures[0].source"),
+    ] {
+        let parts = model.parts();
+        assert_eq!((parts.materials[0].diffuse, parts.materials[0].color_texture), ([0.5, 0.25, 0.125], None));
+        assert!(parts.remarks.iter().any(|given| given == remark), "expected {remark} in {:?}", parts.remarks);
+        let strict = crate::load::gltf::parse(&files, "model", &model.to_glb(), CreaseAngle::default());
+        let message = strict.map(drop).expect_err("strict mode").to_string();
+        assert!(message.contains(error), "{message}");
+    }
+}
+
+/// The texel at the corner `corner` of the first triangle of the first domain.
+fn texel_at_corner(parts: &crate::scene::SceneParts, corner: usize) -> [u8; 4] {
+    let material = &parts.materials[parts.domains[0].material];
+    let texture = &parts.textures[material.color_texture.expect("an image of the colors")];
+    let mesh = &parts.shapes[parts.domains[0].shape].mesh;
+    let [u, v] = mesh.corners().uvs[mesh.triangles()[0][corner] as usize];
+    let (x, y) = ((u * texture.width() as f32) as usize, (v * texture.height() as f32) as usize);
+    texture.rgba().as_chunks::<4>().0[y * texture.width() as usize + x]
+}
+
+#[test]
+fn vertex_colors_of_all_formats_are_drawn() {
+    let floats: Vec<u8> = bytemuck::cast_slice(&[1.0_f32, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 7.0]).to_vec();
+    let bytes = [255_u8, 0, 0, 255, 0, 255, 0, 255, 0, 0, 255, 128];
+    let shorts = bytes.map(|byte| u16::from(byte) * 257);
+    for (data, component, kind, has_alpha) in [
+        (&floats[..], super::F32, "VEC3", false),
+        (&bytes, super::U8, "VEC4", true),
+        (bytemuck::cast_slice(&shorts), super::U16, "VEC4", true),
+    ] {
+        let mut model = Model::triangle();
+        let colors = model.add_accessor(data, component, kind, 3);
+        model.json["accessors"][colors]["normalized"] = (component != super::F32).into();
+        model.primitive()["attributes"]["COLOR_0"] = colors.into();
+        model.primitive()["material"] = 0.into();
+        model.json["materials"] = json!([{"pbrMetallicRoughness": {"baseColorFactor": [0.5, 0.5, 0.5, 1.0]}}]);
+        let parts = model.parts();
+        let texels = [0, 1, 2].map(|corner| texel_at_corner(&parts, corner));
+        assert_eq!(texels, [[255, 0, 0, 255], [0, 255, 0, 255], [0, 0, 255, 255]], "{kind} of {component}");
+        let ambient = parts.materials[parts.domains[0].material].ambient;
+        assert_eq!(ambient, [0.5; 3], "expected the colors to multiply the color of the material");
+        let is_alpha_said = parts.remarks.iter().any(|remark| remark == "the alpha of vertex colors is ignored");
+        assert_eq!(is_alpha_said, has_alpha);
+        Scene::new(parts).expect("a valid scene");
+    }
+}
+
+/// One color for all vertices, and the colors of a primitive whose material has an image.
+#[test]
+fn equal_vertex_colors_are_factors_and_images_have_precedence() {
+    let with_colors = |mut model: Model, colors: &[f32]| {
+        let accessor = model.add_floats("VEC3", 3, colors);
+        model.primitive()["attributes"]["COLOR_0"] = accessor.into();
+        model
+    };
+    let pbr = json!({"baseColorFactor": [0.5, 0.5, 1.0, 1.0], "baseColorTexture": {"index": 0}, "metallicFactor": 0});
+    let mut uniform = Model::triangle();
+    uniform.primitive()["material"] = 0.into();
+    uniform.json["materials"] =
+        json!([{"pbrMetallicRoughness": {"baseColorFactor": [0.5, 0.5, 1.0, 1.0], "metallicFactor": 0}}]);
+    let parts = with_colors(uniform, &[0.5, 1.0, 0.25].repeat(3)).parts();
+    let material = &parts.materials[parts.domains[0].material];
+    assert_eq!((material.diffuse, material.color_texture), ([0.25, 0.5, 0.25], None));
+    let textured = textured_triangle(json!({"pbrMetallicRoughness": pbr}));
+    let parts = with_colors(textured, &[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]).parts();
+    assert_eq!((parts.textures.len(), parts.textures[0].name.as_str()), (1, "swatch"));
+    assert!(parts.remarks.iter().any(|remark| remark.starts_with("vertex colors are not used")), "{:?}", parts.remarks);
+}
+
+/// The primitives of one material have colors of their own, and the material itself is not changed.
+#[test]
+fn vertex_colors_belong_to_their_primitive() {
+    let mut model = Model::triangle();
+    let colors = model.add_floats("VEC3", 3, &[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]);
+    model.primitive()["material"] = 0.into();
+    model.primitive()["attributes"]["COLOR_0"] = colors.into();
+    model.json["materials"] = json!([{"name": "shared"}]);
+    push(&mut model.json["meshes"][0]["primitives"], json!({"attributes": {"POSITION": 0}, "material": 0}));
+    let parts = model.parts();
+    let textures = parts.domains.iter().map(|domain| parts.materials[domain.material].color_texture);
+    assert_eq!(textures.collect::<Vec<_>>(), [Some(0), None]);
+    assert!(parts.domains.iter().all(|domain| parts.materials[domain.material].name == "shared"));
+}
+
 #[test]
 fn metalness_and_roughness_become_phong_parameters() {
     let material_with_factors = |metalness: f32, roughness: f32| {
