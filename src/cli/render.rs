@@ -59,7 +59,8 @@ pub(super) struct Args {
     #[arg(long, value_name = "PIXELS", num_args = 0..=1, default_missing_value = "1.25", conflicts_with = "output")]
     edges: Option<f32>,
     /// Preset of the antialiasing and the shadow map: preview, standard or best. Replaces the preset of the scene. Keys
-    /// of the table `look` in scene.toml win over it. Default: that of the scene, else best.
+    /// of the table `look` in scene.toml win over it. Default: that of the scene, else four samples per pixel and the
+    /// shadow map of a GPU, on every machine.
     #[arg(long, value_name = "PRESET")]
     look: Option<LookPreset>,
     /// Deformation backend.

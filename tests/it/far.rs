@@ -213,7 +213,7 @@ async fn origin_follows_a_moved_scene_and_survives_a_restart() {
         (4, &reply.positions, &reply.origins)
     );
     // The next step changes only domain 1. Domain 0 keeps the pose that the restart restored.
-    let mut writer = server.drive_lossless("strips").await;
+    let mut writer = server.drive_from_current_state("strips").await;
     let new_pose = Pose { rotation: poses[1].rotation, translation: [1e7 + 11.5, 0.001, -1e7] };
     writer.send_step_and_wait(rigid_step(0, QuaternionXyzwF64, &[(1, new_pose.rotation, new_pose.translation)])).await;
     let reply = get_vertices(&server, vertex_request("strips", &[])).await.expect("expected vertices");

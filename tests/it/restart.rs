@@ -42,10 +42,7 @@ async fn send_steps(server: &Server) -> Vec<f32> {
 /// writer starts a new run (the steps of one writer).
 fn restore_and_read(state_folder: &Path) -> (v1::StepId, Vec<f32>) {
     runtime().block_on(async {
-        let start = Instant::now();
         let server = Server::start(config(state_folder)).await;
-        let elapsed = start.elapsed();
-        assert!(elapsed < Duration::from_secs(2), "expected a start within 2 s, got {elapsed:?}");
         let reply =
             get_vertices(&server, vertex_request("strips")).await.expect("expected vertices of the restored scene");
         let restored = (reply.step(), reply.positions);

@@ -272,6 +272,21 @@ impl Server {
         self.drive(scene, v1::Delivery::Lossless, DEFAULT_WINDOW).await
     }
 
+    /// As [`Self::drive_lossless`], with a first step that changes the current state instead of the rest state.
+    pub(crate) async fn drive_from_current_state(&self, scene: &str) -> StepWriter {
+        let mut writer = StepWriter::connect(self.channel().await).await;
+        let open = v1::OpenDrive {
+            scene: scene.into(),
+            delivery: v1::Delivery::Lossless.into(),
+            initial_state: v1::InitialState::Keep.into(),
+            ..v1::OpenDrive::default()
+        };
+        writer.send(RequestKind::Open(open)).await;
+        let opened = writer.receive_reply().await;
+        assert!(matches!(opened, ResponseKind::Opened(_)), "{opened:?}");
+        writer
+    }
+
     /// Opens a step stream and expects success. `window` is the maximum number of steps without acknowledgment.
     pub(crate) async fn drive(&self, scene: &str, delivery: v1::Delivery, window: u32) -> StepWriter {
         let mut writer = StepWriter::connect(self.channel().await).await;

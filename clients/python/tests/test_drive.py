@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import re
 import time
+from typing import Any
 
 import numpy as np
 import pytest
@@ -125,6 +126,31 @@ def test_reset_returns_to_rest(beams: mc.Scene):
     state = beams.state()
     assert not state.q.any()
     np.testing.assert_array_equal(state.transforms[1], beams.domains["copy"].placement)
+
+
+def test_new_drive_starts_at_rest_and_a_resumed_one_continues(beams: mc.Scene):
+    def first_step(**options: Any) -> list[float]:
+        with beams.drive(**options) as drive:
+            tokens.append(drive.lease_token)
+            drive.step(q={"copy": [7, 8, 9]})
+            state = beams.state().q.tolist()
+            drive.step(q={"beam": [1, 2, 3]})
+        return state[:3]
+
+    tokens: list[bytes] = []
+    assert first_step() == [0, 0, 0]
+    assert first_step() == [0, 0, 0]
+    assert first_step(reset=False) == [1, 2, 3]
+    assert first_step(lease_token=tokens[-1]) == [1, 2, 3]
+    assert first_step(lease_token=tokens[-1], reset=True) == [0, 0, 0]
+    assert first_step(lease_token=tokens[0]) == [0, 0, 0]  # another writer has driven the scene since
+    drive = beams.drive()
+    assert beams.state().q.tolist() == [1, 2, 3, 7, 8, 9], "expected no change before the first step"
+    with pytest.raises(mc.AlreadyExists):
+        beams.reset()
+    assert beams.reset(take_over=True) == beams.state().step
+    assert not beams.state().q.any()
+    drive.close()
 
 
 def test_closed_drive_rejects_steps_and_releases_the_scene(beams: mc.Scene):

@@ -46,7 +46,7 @@ use std::sync::Arc;
 
 use crate::backend_settings::BackendSettings;
 use crate::error::Result;
-use crate::scene::{LookPreset, PresetRequest, Scene, SceneParts};
+use crate::scene::{LookPreset, PresetRequest, RenderSettings, Scene, SceneParts};
 
 /// A scene that was opened by name or path, with its backend settings.
 #[derive(Debug, Clone)]
@@ -95,8 +95,9 @@ pub fn open(source: &str) -> Result<OpenedScene> {
     OpenedScene::new(source::read(&asset_dir::AssetDir::unrestricted(Path::new(".")), source)?)
 }
 
-/// As [`open`], for a still picture: `preset` replaces the scene's own preset, and [`LookPreset::STILL`] the choice by
-/// rule of a scene without a preset. Settings of antialiasing and shadow map in `scene.toml` win over both.
+/// As [`open`], for a still picture: `preset` replaces the scene's own preset. A scene without a preset is drawn as by a
+/// GPU on every machine, because a single picture has the time. Settings of antialiasing and shadow map in `scene.toml`
+/// win over both.
 ///
 /// # Errors
 /// As for [`open`].
@@ -104,8 +105,10 @@ pub fn open_for_still(source: &str, preset: Option<LookPreset>) -> Result<Opened
     let mut description = source::read(&asset_dir::AssetDir::unrestricted(Path::new(".")), source)?;
     let look = &mut description.parts.look;
     let request = look.preset.unwrap_or_default();
-    let preset = preset.or(request.preset).unwrap_or(LookPreset::STILL);
-    *look = look.with_preset(PresetRequest { preset: Some(preset), ..request });
+    let preset = preset.or(request.preset);
+    let resolved = look.with_preset(PresetRequest { preset, ..request });
+    // Without a request, the settings for a GPU are final.
+    *look = RenderSettings { preset: preset.and(resolved.preset), ..resolved };
     OpenedScene::new(description)
 }
 
@@ -131,4 +134,34 @@ pub fn modes_files(scene: &Scene) -> Vec<String> {
         }
     }
     files
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene::RendererKind;
+
+    #[test]
+    fn still_pictures_are_drawn_as_by_a_gpu_unless_a_preset_is_set() {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        std::fs::write(folder.path().join("a.obj"), "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n").expect("a writable file");
+        let look_of = |manifest: &str, preset: Option<LookPreset>| {
+            let path = folder.path().join("scene.toml");
+            std::fs::write(&path, format!("model = 'a.obj'\n{manifest}")).expect("a writable file");
+            open_for_still(&path.to_string_lossy(), preset).expect("a scene").scene.look
+        };
+        let preset_of = |manifest: &str, preset| look_of(manifest, preset).preset.and_then(|request| request.preset);
+        assert_eq!(preset_of("look = 'preview'\n", None), Some(LookPreset::Preview));
+        assert_eq!(preset_of("look = 'preview'\n", Some(LookPreset::Best)), Some(LookPreset::Best));
+        assert_eq!(preset_of("", Some(LookPreset::Standard)), Some(LookPreset::Standard));
+        let by_rule = open(&folder.path().join("a.obj").to_string_lossy()).expect("a scene").scene.look;
+        let (software, hardware) = (RendererKind::Software, RendererKind::Hardware);
+        for (manifest, samples) in [("", 4), ("look.samples = 1\n", 1)] {
+            let still = look_of(manifest, None);
+            assert_eq!(still.frame_antialiasing(software, 1 << 20, 1 << 20).samples, samples, "{manifest}");
+            let shadow = still.with_shadow_map_for(software).shadow;
+            assert_eq!(shadow, by_rule.with_shadow_map_for(hardware).shadow, "{manifest}");
+            assert_ne!(shadow, by_rule.with_shadow_map_for(software).shadow, "control: the rule differs on a CPU");
+        }
+    }
 }

@@ -129,6 +129,17 @@ mod tests {
         read(&AssetDir::unrestricted(folder.path()), "a.npz", ModelOptions::default())
     }
 
+    /// NumPy stores a transposed array in Fortran's order, for example the points of scikit-fem (`mesh.p.T`).
+    #[test]
+    fn transposed_arrays_are_read() {
+        let vertices = arr2(&[[0.0, 1.0, 1.0, 0.0], [0.0, 0.0, 1.0, 1.0], [0.0; 4]]);
+        let faces = arr2(&[[0_i64, 0], [1, 2], [2, 3]]);
+        let transposed =
+            read_arrays(&[("vertices", npy(&vertices.reversed_axes())), ("faces", npy(&faces.reversed_axes()))]);
+        let (transposed, expected) = (transposed.expect("a mesh"), read_arrays(&square()).expect("a mesh"));
+        assert_eq!(transposed.shapes[0].mesh, expected.shapes[0].mesh);
+    }
+
     #[test]
     fn archive_with_mesh_modes_and_eigenvalues_is_one_domain() {
         let mut arrays = square();

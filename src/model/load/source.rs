@@ -199,6 +199,7 @@ fn conversion(name: &str) -> Option<String> {
         | "mesh" | "meshb" | "off" | "ugrid" | "su2" | "cgns" | "h5m" | "avs" | "mdpa" | "f3grid" | "wkt" | "tec" => {
             Some(format!("convert it: meshio convert {name} {stem}.ply"))
         }
+        "vtp" => Some(format!("convert it with PyVista: pyvista.read('{name}').save('{stem}.ply')")),
         "fbx" | "dae" | "3ds" | "blend" | "usd" | "usda" | "usdc" | "usdz" | "abc" | "x3d" | "3mf" | "step" | "stp"
         | "iges" | "igs" => Some(format!("export it as {stem}.glb, for example with Blender")),
         _ => None,

@@ -86,9 +86,6 @@ pub struct FrameAntialiasing {
 }
 
 impl LookPreset {
-    /// The preset of still pictures without one. A single picture has time for the least error on every renderer.
-    pub const STILL: Self = Self::Best;
-
     /// All presets.
     pub const ALL: [Self; 3] = [Self::Preview, Self::Standard, Self::Best];
 

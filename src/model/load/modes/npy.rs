@@ -47,17 +47,18 @@ pub fn parse(bytes: &[u8]) -> Result<NpyArray> {
     Ok(NpyArray { shape: header.shape, fortran_order: header.fortran_order, entries })
 }
 
-/// Parses an array of f64, or of another type whose values f64 contains, in C order.
+/// Parses an array of f64, or of another type whose values f64 contains. The entries are in C order. An array in
+/// Fortran's order, as NumPy writes a transposed one, has at most two axes.
 ///
 /// # Errors
 /// As for [`parse`].
 pub(in crate::load) fn parse_f64(bytes: &[u8]) -> Result<(Vec<usize>, Vec<f64>)> {
     let (header, body) = parse_header(bytes)?;
     header.check_size(body)?;
-    if header.fortran_order && header.shape.iter().filter(|extent| **extent > 1).count() > 1 {
-        return Err(invalid("fortran_order", "False", "True"));
+    if header.fortran_order && header.shape.len() > 2 {
+        return Err(invalid("fortran_order", "False for more than two axes", "True"));
     }
-    let entries = match header.dtype.as_str() {
+    let entries: Vec<f64> = match header.dtype.as_str() {
         "|u1" | "|b1" => body.iter().map(|entry| f64::from(*entry)).collect(),
         "<i2" => body.as_chunks().0.iter().map(|entry| f64::from(i16::from_le_bytes(*entry))).collect(),
         "<u2" => body.as_chunks().0.iter().map(|entry| f64::from(u16::from_le_bytes(*entry))).collect(),
@@ -69,6 +70,12 @@ pub(in crate::load) fn parse_f64(bytes: &[u8]) -> Result<(Vec<usize>, Vec<f64>)>
         "<f4" => body.as_chunks().0.iter().map(|entry| f64::from(f32::from_le_bytes(*entry))).collect(),
         "<f8" => body.as_chunks().0.iter().map(|entry| f64::from_le_bytes(*entry)).collect(),
         other => return Err(invalid("descr", "u1, or a little-endian i2, u2, i4, u4, i8, u8, f4 or f8", other)),
+    };
+    let entries = match header.shape[..] {
+        [rows, columns] if header.fortran_order => {
+            (0..rows * columns).map(|index| entries[index % columns * rows + index / columns]).collect()
+        }
+        _ => entries,
     };
     Ok((header.shape, entries))
 }

@@ -46,11 +46,18 @@ pub(super) fn create_material(
     } else {
         AlphaMode::Opaque
     };
+    // Some programs write light intensities into the colors.
+    let is_out_of_range = |color: Option<[f32; 3]>| color.is_some_and(|color| color.iter().any(|value| *value > 1.0));
+    let limits_colors = !files.is_strict();
+    if limits_colors && [statements.ambient, statements.diffuse, statements.specular].into_iter().any(is_out_of_range) {
+        remarks.push(format!("material '{name}': channels above 1 in Ka, Kd or Ks are drawn as 1"));
+    }
+    let limited = |color: [f32; 3]| if limits_colors { color.map(|channel| channel.min(1.0)) } else { color };
     let material = Material {
         name: name.to_owned(),
-        ambient: statements.ambient.unwrap_or(diffuse),
-        diffuse,
-        specular: statements.specular.unwrap_or([0.0; 3]),
+        ambient: limited(statements.ambient.unwrap_or(diffuse)),
+        diffuse: limited(diffuse),
+        specular: limited(statements.specular.unwrap_or([0.0; 3])),
         // An exponent near 0 would spread the highlight over the whole lit side. Files use 0 for "not specified".
         shininess: statements.exponent.unwrap_or(1.0).clamp(1.0, 1e6),
         alpha,
@@ -209,6 +216,17 @@ mod tests {
         let (material, _, remarks) = read("newmtl m\nbump h.png\n", folder.path()).expect("a valid material");
         assert_eq!(material.normal_texture, None);
         assert!(remarks[0].contains("'h.png' is a gray height map"), "{remarks:?}");
+    }
+
+    #[test]
+    fn channels_above_1_are_limited_with_a_remark() {
+        let statements = super::super::mtl::parse(b"newmtl m\nKd 1.5 0.5 0\nKs 2 0 0\n").expect("an MTL library");
+        let (mut texture_cache, mut remarks) = (TextureCache::default(), Vec::new());
+        let files = AssetDir::unrestricted(&std::env::temp_dir());
+        let material = create_material("m", &statements["m"], &files, &mut texture_cache, &mut remarks);
+        let material = material.expect("a material");
+        assert_eq!((material.diffuse, material.specular), ([1.0, 0.5, 0.0], [1.0, 0.0, 0.0]));
+        assert_eq!(remarks, ["material 'm': channels above 1 in Ka, Kd or Ks are drawn as 1"]);
     }
 
     #[test]

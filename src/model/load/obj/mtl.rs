@@ -52,7 +52,7 @@ impl MtlMaterial {
             b"ks" => self.specular = Some(parse_color(line)?),
             b"ns" => self.exponent = Some(parse_last_number(line)?),
             b"d" => self.opacity = Some(parse_last_number(line)?),
-            b"tr" => self.opacity = Some(1.0 - parse_last_number(line)?),
+            b"tr" => self.set_transparency(parse_last_number(line)?, material_name),
             b"map_kd" => self.color_map = self.parse_image_path(line, material_name)?,
             b"map_d" => self.alpha_map = self.parse_image_path(line, material_name)?,
             b"norm" | b"map_bump" | b"bump" => self.normal_map = self.parse_image_path(line, material_name)?,
@@ -61,6 +61,15 @@ impl MtlMaterial {
             _ => {}
         }
         Ok(())
+    }
+
+    /// VTK writes the opacity as `Tr`, so that its opaque surfaces would be invisible.
+    fn set_transparency(&mut self, transparency: f32, material_name: &str) {
+        if transparency == 1.0 {
+            self.remarks.push(format!("material '{material_name}': Tr 1 hides the surface, and is read as opaque"));
+        } else {
+            self.opacity = Some(1.0 - transparency);
+        }
     }
 
     /// The path after the options of an image statement.
@@ -135,6 +144,13 @@ mod tests {
         // One remark for each of the options -s, -clamp and -bm.
         assert_eq!(bark.remarks.len(), 3);
         assert_eq!((materials["black"].diffuse, materials["black"].opacity), (Some([0.0; 3]), Some(0.5)));
+    }
+
+    #[test]
+    fn transparency_of_1_is_opaque_with_a_remark() {
+        let materials = parse(b"newmtl vtk\nTr 1\nnewmtl hidden\nd 0\n").expect("a valid file");
+        assert_eq!((materials["vtk"].opacity, materials["hidden"].opacity), (None, Some(0.0)));
+        assert_eq!(materials["vtk"].remarks, ["material 'vtk': Tr 1 hides the surface, and is read as opaque"]);
     }
 
     #[test]

@@ -23,7 +23,7 @@ pub(in crate::load) enum VertexColors {
 /// # Errors
 /// `Invalid` if the mesh has more than 16,777,216 triangles.
 pub(in crate::load) fn paint(mesh: &Mesh, linear_colors: &[[f32; 3]]) -> Result<VertexColors> {
-    if let [first, others @ ..] = &linear_colors[..]
+    if let [first, others @ ..] = linear_colors
         && others.iter().all(|color| color == first)
     {
         return Ok(VertexColors::Uniform(*first));
