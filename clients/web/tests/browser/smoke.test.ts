@@ -194,7 +194,8 @@ test("q-relay draws the same domains and points as the server", { timeout: 120_0
     const moved = iou(drawn, await referenceDomains(camera));
     assert.ok(moved < 0.9, `expected an IoU below 0.9 with another q, got ${moved}`);
     await waitForStep(page, other);
-    assert.ok(iou(await drawnDomains(page), await referenceDomains(camera)) >= 0.99);
+    const followed = iou(await drawnDomains(page), await referenceDomains(camera));
+    assert.ok(followed >= 0.99, `expected an IoU of 0.99 after the next step, got ${followed}`);
     console.log(
         `IoU ${same.toFixed(4)}, control ${moved.toFixed(4)}, largest distance ${Math.max(...distances).toFixed(3)} pixels`,
     );

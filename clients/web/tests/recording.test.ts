@@ -1,0 +1,162 @@
+import assert from "node:assert/strict";
+import { createHash } from "node:crypto";
+import { test } from "node:test";
+import { create, toBinary } from "@bufbuild/protobuf";
+import { StreamForcesResponseSchema } from "../src/proto/modalcast/v1/forces_pb";
+import { DescribeSceneResponseSchema, ReadContentResponseSchema } from "../src/proto/modalcast/v1/scenes_pb";
+import { StateContent, StreamStatesResponseSchema } from "../src/proto/modalcast/v1/states_pb";
+import { ArrayKind, type SceneDescription } from "../src/scene/description";
+import { toHex } from "../src/scene/numbers";
+import { SceneModel } from "../src/scene/scene_model";
+import { lastIndexAt, Playback } from "../src/source/playback";
+import { decodeBase64, readRecording } from "../src/source/recording";
+import { type RecordedMessage, writeRecording } from "./recording_file";
+import { floats, fourDomains } from "./scene";
+
+/** The scene with arrays of hashes, and the contents in the order of the hashes. */
+function sceneWithContents(): { scene: SceneDescription; contents: Uint8Array[] } {
+    const scene = fourDomains();
+    const contents: Uint8Array[] = [];
+    const add = (bytes: Uint8Array) => {
+        contents.push(bytes);
+        return createHash("sha256").update(bytes).digest();
+    };
+    for (const shape of scene.shapes) {
+        const numbers = new Uint8Array(new Uint32Array([0, 1, 2]).buffer);
+        const positions = floats(...Array.from({ length: 9 }, (_, i) => shape.shape + i));
+        const modes = floats(...Array.from({ length: 9 * shape.rank }, (_, i) => i / 10));
+        const arrays: [ArrayKind, Uint8Array][] = [
+            [ArrayKind.INDICES, numbers],
+            [ArrayKind.CORNER_VERTICES, numbers],
+            [ArrayKind.REST_POSITIONS, positions],
+            [ArrayKind.REST_NORMALS, positions],
+            [ArrayKind.MODES, modes],
+        ];
+        shape.arrays = arrays.map(([array, bytes]) => {
+            const sha256 = bytes.length > 0 ? add(bytes) : new Uint8Array();
+            return { $typeName: "modalcast.v1.ArrayDescription", array, bytes: BigInt(bytes.length), sha256 };
+        });
+    }
+    return { scene, contents };
+}
+
+/** A state with q of domain 0 or, if it is complete, of all domains. */
+function state(number: number, q: number[], complete: boolean): Uint8Array {
+    const sections: [StateContent, Uint8Array][] = complete
+        ? [
+              [StateContent.Q_DOMAINS, new Uint8Array(new Uint32Array([0, 1]).buffer)],
+              [StateContent.Q, floats(...q, number)],
+          ]
+        : [
+              [StateContent.Q_DOMAINS, new Uint8Array(new Uint32Array([0]).buffer)],
+              [StateContent.Q, floats(...q)],
+          ];
+    let offset = 0n;
+    const parts = sections.map(([content, bytes]) => {
+        const part = { content, offset, bytes: BigInt(bytes.length) };
+        offset += part.bytes;
+        return part;
+    });
+    const data = new Uint8Array(sections.flatMap(([, bytes]) => [...bytes]));
+    const head = { step: { run: 1n, number: BigInt(number), time: number }, complete, sections: parts, total: offset };
+    return toBinary(
+        StreamStatesResponseSchema,
+        create(StreamStatesResponseSchema, { part: { case: "chunk", value: { head, offset: 0n, data } } }),
+    );
+}
+
+/** Ten states, one every 0.5 s, of which every fourth is complete. q0 of domain 0 is the index of the state. */
+async function recording(contentsMode = "embedded"): Promise<Uint8Array> {
+    const { scene, contents } = sceneWithContents();
+    const messages: RecordedMessage[] = [];
+    const describe = (part: Parameters<typeof create<typeof DescribeSceneResponseSchema>>[1]) =>
+        messages.push({
+            topic: "scene",
+            time: 0,
+            data: toBinary(DescribeSceneResponseSchema, create(DescribeSceneResponseSchema, part)),
+        });
+    describe({ part: { case: "scene", value: scene.info } });
+    describe({ part: { case: "shapes", value: { shapes: scene.shapes } } });
+    describe({ part: { case: "materials", value: { materials: scene.materials } } });
+    describe({ part: { case: "domains", value: { domains: scene.domains } } });
+    contents.forEach((bytes, item) => {
+        const response = create(ReadContentResponseSchema, { item, total: BigInt(bytes.length), data: bytes });
+        messages.push({ topic: "content", time: 0, data: toBinary(ReadContentResponseSchema, response) });
+    });
+    for (let index = 0; index < 10; index++) {
+        messages.push({ topic: "states", time: index / 2, data: state(index, [index, -index], index % 4 === 0) });
+    }
+    const forces = create(StreamForcesResponseSchema, { forces: [{ owner: 3n }] });
+    messages.push({ topic: "forces", time: 3, data: toBinary(StreamForcesResponseSchema, forces) });
+    const sha256 = contents.map((bytes) => toHex(createHash("sha256").update(bytes).digest())).join(" ");
+    return writeRecording(messages, {
+        recording: { version: "1", contents: contentsMode },
+        content: { sha256 },
+        view: { eye: "1 2 3", target: "0 0 0.5" },
+    });
+}
+
+test("a recording has scene, arrays, states, forces and view", async () => {
+    const { scene, arrays, states, forces, view, isCutOff } = readRecording(await recording());
+    assert.equal(scene.domains.length, 4);
+    assert.deepEqual([...(arrays.shapes[1]?.restPositions ?? [])], [1, 2, 3, 4, 5, 6, 7, 8, 9]);
+    assert.equal(arrays.shapes[2]?.modes, null);
+    assert.deepEqual(
+        states.map(({ time }) => time),
+        [0, 0.5, 1, 1.5, 2, 2.5, 3, 3.5, 4, 4.5],
+    );
+    assert.deepEqual(states.map(({ isComplete }) => isComplete).slice(0, 5), [true, false, false, false, true]);
+    assert.deepEqual([forces.length, view, isCutOff], [1, { eye: [1, 2, 3], target: [0, 0, 0.5] }, false]);
+});
+
+test("a sought time shows the state that playing to this time shows", async () => {
+    const file = readRecording(await recording());
+    const model = new SceneModel(file.scene, file.arrays);
+    const playback = new Playback(file, model);
+    const shown = (time: number) => {
+        playback.seek(time);
+        return [model.state.step?.number, model.state.q[0], model.state.qOf(1)[0]];
+    };
+    assert.equal(playback.duration, 4.5);
+    // q of domain 1 is that of the last complete state.
+    assert.deepEqual(shown(0), [0n, 0, 0]);
+    assert.deepEqual(shown(3.4), [6n, 6, 4]);
+    assert.deepEqual(shown(0.7), [1n, 1, 0], "expected a state before the shown one");
+    assert.deepEqual(shown(99), [9n, 9, 8]);
+    assert.deepEqual(shown(-1), [0n, 0, 0]);
+});
+
+test("forces appear at their time, and disappear before it", async () => {
+    const file = readRecording(await recording());
+    const model = new SceneModel(file.scene, file.arrays);
+    const playback = new Playback(file, model);
+    playback.seek(2.5);
+    assert.equal(model.forces.length, 0);
+    playback.seek(3);
+    assert.equal(model.forces.length, 1);
+    playback.seek(1);
+    assert.equal(model.forces.length, 0);
+});
+
+test("a file that was cut off plays up to its end", async () => {
+    const file = await recording();
+    const { states, isCutOff } = readRecording(file.subarray(0, file.length - 700));
+    assert.ok(isCutOff && states.length > 0, `${states.length} states`);
+});
+
+test("other files are rejected with the reason", async () => {
+    assert.throws(() => readRecording(new TextEncoder().encode("no recording, but a text of some length")));
+    const byHash = await recording("by-hash");
+    assert.throws(() => readRecording(byHash), /by hash/);
+    const other = await writeRecording([], { recording: { version: "2" } });
+    assert.throws(() => readRecording(other), /expected format version 1, got 2/);
+});
+
+test("indices and base64", () => {
+    const entries = [{ time: 0 }, { time: 1 }, { time: 1 }, { time: 4 }];
+    assert.deepEqual(
+        [-1, 0, 0.9, 1, 3, 9].map((time) => lastIndexAt(entries, time)),
+        [0, 0, 0, 2, 2, 3],
+    );
+    assert.deepEqual(decodeBase64(" AP+A\n"), new Uint8Array([0, 255, 128]));
+});
