@@ -142,7 +142,7 @@ export class App {
         const model = new SceneModel(scene, arrays);
         this.model = model;
         if (arrays && viewport.gl) {
-            this.renderer = new SceneRenderer(viewport.gl, scene, arrays, viewport.shadowSize);
+            this.renderer = new SceneRenderer(viewport.gl, scene, arrays, viewport.isSoftware);
             this.renderer.setOptions(this.settings);
             this.renderer.update(model.state);
             viewport.setScene(this.renderer);

@@ -23,6 +23,8 @@ export class LiveViewer {
     private switchScene: () => void = () => {};
     private isConnected = false;
     private isStopped = false;
+    /** The choice of scenes that is shown; empty if a scene is shown. */
+    private offered = "";
 
     constructor(private readonly app: App) {
         window.addEventListener("hashchange", () => this.switchScene());
@@ -62,6 +64,7 @@ export class LiveViewer {
                     app.notices.show("connection", `${reason.title}. ${reason.text}`, { severity: "bad", duration: 0 });
             }
             this.server = null;
+            this.offered = "";
             app.bar.setConnection("bad", this.isConnected ? "reconnecting" : "not connected");
             await new Promise((resolve) => setTimeout(resolve, retry));
             retry = Math.min(2 * retry, LONGEST_RETRY_MS);
@@ -121,9 +124,11 @@ export class LiveViewer {
                 sources,
                 wanted,
             );
-            await changed;
+            // A server that has started again opens its scenes one after the other.
+            await Promise.race([changed, new Promise((resolve) => setTimeout(resolve, PING_MS))]);
             return;
         }
+        this.offered = "";
         try {
             await this.showScene(server, name, features, changed);
         } catch (error) {
@@ -181,6 +186,9 @@ export class LiveViewer {
 
     private offerScenes(open: [string, string][], sources: string[], wanted: string): void {
         const { app } = this;
+        const offer = JSON.stringify([open, sources, wanted]);
+        if (offer === this.offered) return;
+        this.offered = offer;
         app.closeScene();
         const title = open.length > 0 ? "Choose a scene" : "No scene is open";
         const problem = wanted ? `The server has no open scene "${wanted}". ` : "";

@@ -14,6 +14,10 @@ import { fitLightBox, type Lighting, lightAxes, lightingOf, unitVector, upAxis }
 import { BACKGROUND_FRAGMENT, PLAIN_FRAGMENT } from "./shaders";
 import { Surfaces, type Uniforms } from "./surfaces";
 
+/** Side of the shadow map in texels on a GPU, and on the CPU. */
+const SHADOW_SIZE = 2048;
+const SOFTWARE_SHADOW_SIZE = 512;
+
 /** Distance of the eye from the render origin, in diagonals of the scene, from which the origin follows the eye. */
 const ORIGIN_DISTANCE = 64;
 
@@ -32,6 +36,7 @@ export class SceneRenderer {
     readonly deformer: Deformer;
     readonly lighting: Lighting;
     readonly diagonal: number;
+    private readonly shadowSize: number;
     private readonly surfaces: Surfaces;
     private readonly background: FullscreenPass;
     private readonly plain: FullscreenPass;
@@ -53,17 +58,18 @@ export class SceneRenderer {
         private readonly renderer: THREE.WebGLRenderer,
         readonly scene: SceneDescription,
         arrays: SceneArrays,
-        private readonly shadowSize: number,
+        isSoftware: boolean,
     ) {
+        this.shadowSize = isSoftware ? SOFTWARE_SHADOW_SIZE : SHADOW_SIZE;
         this.lighting = lightingOf(scene);
         const bounds = scene.info.bounds;
         this.diagonal = norm([0, 1, 2].map((axis) => at(bounds, 3 + axis) - at(bounds, axis)) as Vec3) || 1;
         this.restSpheres = arrays.shapes.map(restSphere);
         this.deformer = new Deformer(renderer, scene, arrays);
-        this.shadowTarget = createShadowTarget(shadowSize);
+        this.shadowTarget = createShadowTarget(this.shadowSize);
         this.light = this.createLight();
-        const anisotropy = renderer.capabilities.getMaxAnisotropy();
-        this.surfaces = new Surfaces(scene, arrays, this.deformer, this.light, this.shadowUniforms, anisotropy);
+        const quality = { anisotropy: renderer.capabilities.getMaxAnisotropy(), blendsLevels: !isSoftware };
+        this.surfaces = new Surfaces(scene, arrays, this.deformer, this.light, this.shadowUniforms, quality);
         this.background = this.createBackground();
         this.plain = new FullscreenPass(PLAIN_FRAGMENT, {
             plain: new THREE.Vector3(PLAIN_GRAY, PLAIN_GRAY, PLAIN_GRAY),

@@ -24,6 +24,13 @@ export type Uniforms = Record<string, THREE.IUniform>;
 /** What the color of surfaces shows. */
 export type ColorMode = { kind: "shaded" } | { kind: "map"; largest: number };
 
+/** How textures are filtered. */
+export interface TextureQuality {
+    anisotropy: number;
+    /** Whether two mipmap levels are blended. */
+    blendsLevels: boolean;
+}
+
 /** Bytes of the merged mesh. */
 export function meshBytes(scene: SceneDescription): number {
     return scene.domains.reduce((sum, domain) => {
@@ -55,7 +62,7 @@ export class Surfaces {
         private readonly deformer: Deformer,
         private readonly light: Uniforms,
         private readonly shadow: Uniforms,
-        private readonly anisotropy: number,
+        private readonly quality: TextureQuality,
     ) {
         this.blank = new THREE.DataTexture(new Uint8Array([255, 255, 255, 255]), 1, 1);
         this.blank.needsUpdate = true;
@@ -204,11 +211,14 @@ export class Surfaces {
         texture.colorSpace = colorSpace;
         texture.wrapS = THREE.RepeatWrapping;
         texture.wrapT = THREE.RepeatWrapping;
-        texture.minFilter = THREE.LinearMipmapLinearFilter;
+        // The server blends two levels on a GPU only, too.
+        texture.minFilter = this.quality.blendsLevels
+            ? THREE.LinearMipmapLinearFilter
+            : THREE.LinearMipmapNearestFilter;
         texture.magFilter = THREE.LinearFilter;
         if (cutoff > 0) texture.mipmaps = mipChain(pixels, width, height, cutoff);
         texture.generateMipmaps = cutoff <= 0;
-        texture.anisotropy = this.anisotropy;
+        texture.anisotropy = this.quality.anisotropy;
         texture.needsUpdate = true;
         this.textures.set(key, texture);
         return texture;

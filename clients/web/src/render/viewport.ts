@@ -4,10 +4,6 @@ import * as THREE from "three";
 import { OrbitCamera } from "./camera";
 import type { SceneRenderer } from "./scene_renderer";
 
-/** Side of the shadow map in texels on a GPU, and on the CPU. */
-const SHADOW_SIZE = 2048;
-const SOFTWARE_SHADOW_SIZE = 512;
-
 const SOFTWARE_RENDERER = /swiftshader|llvmpipe|softpipe|software|basic render/i;
 
 export class Viewport {
@@ -38,10 +34,6 @@ export class Viewport {
         new ResizeObserver(() => this.resize()).observe(container);
         this.resize();
         requestAnimationFrame(() => this.loop());
-    }
-
-    get shadowSize(): number {
-        return this.isSoftware ? SOFTWARE_SHADOW_SIZE : SHADOW_SIZE;
     }
 
     /** Size of pictures in pixels. */

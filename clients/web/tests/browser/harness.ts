@@ -18,7 +18,7 @@ declare global {
     var modalcastViewer: App;
 }
 
-export const TIMEOUT_MS = 60_000;
+const TIMEOUT_MS = 120_000;
 const TOKEN = "smoke-test-token-0001";
 const programs = resolve(process.env["MODALCAST_PROGRAMS"] ?? join(process.cwd(), "../../target/debug"));
 

@@ -16,6 +16,8 @@ import { end, launchBrowser, openPage, ServerProcess, startSimulation, waitForSc
 const WIDTH = 480;
 const HEIGHT = 300;
 const NO_DOMAIN = 0xffffffff;
+/** A test that takes longer has failed. Alone on two cores, each takes less than a minute. */
+const LIMIT_MS = 300_000;
 
 declare global {
     /** In the page: the point that a test has pulled. */
@@ -168,12 +170,12 @@ async function projectHits(page: Page, hits: Hit[]): Promise<number[][]> {
     }, points);
 }
 
-test("q-relay draws the same domains and points as the server", { timeout: 120_000 }, async () => {
-    const number = await bend(2);
+test("q-relay draws the same domains and points as the server", { timeout: LIMIT_MS }, async () => {
+    const number = await bend(1);
     const { page, errors } = await openPage(browser, server.pageUrl("tree"), WIDTH, HEIGHT);
     await waitForScene(page);
     await waitForStep(page, number);
-    await moveCloser(page, 0.06);
+    await moveCloser(page, 0.08);
     const camera = await cameraOf(page);
     const [drawn, reference] = [await drawnDomains(page), await referenceDomains(camera)];
     const same = iou(drawn, reference);
@@ -190,7 +192,7 @@ test("q-relay draws the same domains and points as the server", { timeout: 120_0
     );
     assert.ok(Math.max(...distances) <= 1, `expected points within 1 pixel, got ${Math.max(...distances)}`);
     // Control: another q moves the masks.
-    const other = await bend(-2);
+    const other = await bend(-1);
     const moved = iou(drawn, await referenceDomains(camera));
     assert.ok(moved < 0.9, `expected an IoU below 0.9 with another q, got ${moved}`);
     await waitForStep(page, other);
@@ -203,7 +205,7 @@ test("q-relay draws the same domains and points as the server", { timeout: 120_0
     await page.close();
 });
 
-test("the server's pictures follow the camera and the size of the window", { timeout: 120_000 }, async () => {
+test("the server's pictures follow the camera and the size of the window", { timeout: LIMIT_MS }, async () => {
     const { page, errors } = await openPage(browser, server.pageUrl("tree"), WIDTH, HEIGHT);
     await waitForScene(page);
     await page.keyboard.press("v");
@@ -268,7 +270,7 @@ function meanDifference(a: ArrayLike<number>, b: ArrayLike<number>): number {
     return sum / a.length;
 }
 
-test("a pull bends a branch, and it comes back", { timeout: 180_000 }, async () => {
+test("a pull bends a branch, and it comes back", { timeout: LIMIT_MS }, async () => {
     const { page, errors } = await openPage(browser, server.pageUrl("tree"), 640, 480);
     await waitForScene(page);
     // Nobody receives forces yet.
@@ -339,7 +341,7 @@ function watchedPosition(page: Page): Promise<number[]> {
     return page.evaluate(() => modalcastViewer.positionOf(globalThis.watchedPoint) ?? []);
 }
 
-test("the viewer connects again after a restart of the server", { timeout: 120_000 }, async () => {
+test("the viewer connects again after a restart of the server", { timeout: LIMIT_MS }, async () => {
     const { page, errors } = await openPage(browser, server.pageUrl("tree"), 390, 844);
     await waitForScene(page);
     // Phone width: nothing is wider than the screen, and the panels open above the tools.
