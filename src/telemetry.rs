@@ -26,7 +26,7 @@ pub enum Stage {
     Shadow,
     /// All other passes of a frame.
     Draw,
-    /// Readback of pixels.
+    /// Readback of pixels by OpenGL and their copy on the host. A copy by CUDA's copy engine is not included.
     Read,
     /// PNG encoding, or packing of vertices.
     Encode,

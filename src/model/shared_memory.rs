@@ -50,21 +50,13 @@ pub trait SharedPicture: Debug {
     ///
     /// # Errors
     /// `Fault` if no copy was started, or if the device fails.
-    fn finish_copy(&mut self) -> Result<CopiedPixels>;
+    fn finish_copy(&mut self) -> Result<Arc<dyn HostPixels>>;
 
     /// Fills the picture with a word and waits, to test that OpenGL sees the word.
     ///
     /// # Errors
     /// `Fault` if the device fails.
     fn fill(&mut self, word: u32) -> Result<()>;
-}
-
-/// The result of a copy.
-#[derive(Debug, Clone)]
-pub struct CopiedPixels {
-    pub pixels: Arc<dyn HostPixels>,
-    /// Milliseconds that the device copied.
-    pub ms: f64,
 }
 
 /// Pixels in pinned host memory. While a reference exists, no copy overwrites them.

@@ -49,7 +49,7 @@ pub enum Pass {
     Bloom,
     /// Encodes linear light to sRGB bytes.
     Encode,
-    /// Copies the sRGB bytes and the statistics to the staging buffer.
+    /// Copies the sRGB bytes and the statistics to the staging buffer, or the statistics alone to a shared picture.
     Read,
     /// Reads back the id of the first sample of each pixel.
     VisibilityReadback,

@@ -8,10 +8,9 @@ use std::ops::Range;
 
 use super::Renderer;
 use super::pending_frame::{MappedPixels, PendingFrame};
-use crate::device::gl::ReadbackView;
 use crate::device::readback_ring::ReadbackSlot;
 use crate::layout;
-use crate::pass::{FrameTimes, Pass, RenderStage};
+use crate::pass::{FrameTimes, Pass};
 use crate::resources::scene_buffers::SceneBuffers;
 use crate::types::{FrameImage, FrameInfo, FrameParams, FrameStats, RasterBackend};
 use modalcast_model::error::Result;
@@ -89,10 +88,7 @@ impl Renderer {
                 None => times.push((*pass, timer.ms())),
             }
         }
-        let mut times = FrameTimes::of_passes(&times);
-        if let Some(copy_ms) = view.as_ref().and_then(ReadbackView::copy_ms) {
-            times.add(RenderStage::Read, copy_ms);
-        }
+        let times = FrameTimes::of_passes(&times);
         Ok(MappedPixels { width: desc.width, height: desc.height, view, times, info })
     }
 

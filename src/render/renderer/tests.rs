@@ -11,7 +11,7 @@ use super::{FramePixels, MappedPixels, Renderer};
 use crate::device;
 use crate::device::gl::UnsharedMemory;
 use crate::device::readback_ring::{MAX_FRAMES_IN_FLIGHT, ReadbackRing};
-use crate::pass::{Pass, RenderStage};
+use crate::pass::Pass;
 use crate::scene_data::geometry::tests::squares;
 use crate::{DevicePreference, FrameImage, FrameParams, PixelReadback, SceneBuffers};
 use modalcast_model::deform::DeformedSurface;
@@ -155,8 +155,6 @@ fn frames_in_shared_pictures_have_the_same_pixels_and_counts() {
             let (rgba, fragments) = draw_frame(extra_width);
             assert!(image.rgba == rgba, "{extra_width}");
             assert_eq!(renderer.stats().oit.expect("list statistics").fragments, fragments);
-            let read_ms = image.times.stage(RenderStage::Read).expect("the stage");
-            assert!(read_ms >= 0.25, "expected the time of the emulated copy, got {read_ms}");
         }
     }
 }

@@ -7,14 +7,13 @@
 use std::slice;
 use std::sync::Arc;
 
-use cudarc::driver::sys::{self, CUevent_flags};
-use cudarc::driver::{CudaEvent, CudaStream};
+use cudarc::driver::{CudaEvent, CudaStream, sys};
 
 use crate::gpu::launch::cleanup::WaitForStream;
 use crate::gpu::launch::error::cuda_error;
 use crate::gpu::launch::{Device, ExportedMemory, PinnedBuffer, PinnedUse};
 use modalcast_model::error::{Result, fault};
-use modalcast_model::shared_memory::{CopiedPixels, HostPixels, NewPicture, PictureMemory, SharedPicture};
+use modalcast_model::shared_memory::{HostPixels, NewPicture, PictureMemory, SharedPicture};
 
 const STAGE: &str = "read";
 
@@ -32,8 +31,6 @@ struct CudaPicture {
     /// Bytes of the picture; `memory` may be larger.
     bytes: usize,
     pixels: Arc<PinnedPixels>,
-    /// Begin of the last copy on the device.
-    begun: CudaEvent,
     /// End of the last copy.
     copied: CudaEvent,
     is_copying: bool,
@@ -76,8 +73,7 @@ impl PictureMemory for CudaPictureMemory {
             memory,
             bytes,
             pixels: Arc::new(PinnedPixels::new(device, bytes)?),
-            begun: new_timed_event(device)?,
-            copied: new_timed_event(device)?,
+            copied: device.context().new_event(None).map_err(cuda_error(STAGE))?,
             is_copying: false,
             copy_stream: Arc::clone(&self.copy_stream),
             device: Arc::clone(device),
@@ -110,7 +106,6 @@ impl SharedPicture for CudaPicture {
         }
         let _current = self.device.enter()?;
         let guard = WaitForStream::new(&self.copy_stream);
-        self.begun.record(&self.copy_stream).map_err(cuda_error(STAGE))?;
         let target = self.pixels.address.cast_mut().cast();
         // SAFETY: both memories have at least `bytes` bytes and belong to this value, which waits for the copy before it
         // is dropped. No reader has a reference to the pixels, and gets one only after the copy. If this fails before the
@@ -128,14 +123,13 @@ impl SharedPicture for CudaPicture {
         !self.is_copying || self.copied.try_is_complete() != Ok(false)
     }
 
-    fn finish_copy(&mut self) -> Result<CopiedPixels> {
+    fn finish_copy(&mut self) -> Result<Arc<dyn HostPixels>> {
         if !self.is_copying {
             return Err(fault(STAGE, "expected a copy in flight, got none"));
         }
         self.copied.synchronize().map_err(cuda_error(STAGE))?;
         self.is_copying = false;
-        let ms = self.begun.elapsed_ms(&self.copied).map_err(cuda_error(STAGE))?;
-        Ok(CopiedPixels { pixels: Arc::clone(&self.pixels) as Arc<dyn HostPixels>, ms: f64::from(ms) })
+        Ok(Arc::clone(&self.pixels) as Arc<dyn HostPixels>)
     }
 
     fn fill(&mut self, word: u32) -> Result<()> {
@@ -147,11 +141,6 @@ impl SharedPicture for CudaPicture {
         let wait_result = stream.synchronize();
         fill_result.result().and(wait_result).map_err(cuda_error(STAGE))
     }
-}
-
-/// An event that records when it is reached.
-fn new_timed_event(device: &Device) -> Result<CudaEvent> {
-    device.context().new_event(Some(CUevent_flags::CU_EVENT_DEFAULT)).map_err(cuda_error(STAGE))
 }
 
 impl Drop for CudaPicture {

@@ -150,7 +150,7 @@ pub(crate) mod testing {
 
     use super::*;
     use crate::device::gl::StagingBuffer;
-    use modalcast_model::shared_memory::{CopiedPixels, HostPixels, NewPicture};
+    use modalcast_model::shared_memory::{HostPixels, NewPicture};
 
     /// A mapped buffer of OpenGL instead of memory that OpenGL shares.
     #[derive(Debug)]
@@ -184,9 +184,9 @@ pub(crate) mod testing {
             !self.is_copying || self.is_polled.replace(true)
         }
 
-        fn finish_copy(&mut self) -> Result<CopiedPixels> {
+        fn finish_copy(&mut self) -> Result<Arc<dyn HostPixels>> {
             assert!(std::mem::take(&mut self.is_copying), "expected a copy in flight");
-            Ok(CopiedPixels { pixels: Arc::clone(&self.pixels) as Arc<dyn HostPixels>, ms: 0.25 })
+            Ok(Arc::clone(&self.pixels) as Arc<dyn HostPixels>)
         }
 
         fn fill(&mut self, _: u32) -> Result<()> {
@@ -234,8 +234,8 @@ pub(crate) mod testing {
             true
         }
 
-        fn finish_copy(&mut self) -> Result<CopiedPixels> {
-            Ok(CopiedPixels { pixels: Arc::new(EmulatedPixels(vec![0; self.0])), ms: 0.0 })
+        fn finish_copy(&mut self) -> Result<Arc<dyn HostPixels>> {
+            Ok(Arc::new(EmulatedPixels(vec![0; self.0])))
         }
 
         fn fill(&mut self, _: u32) -> Result<()> {

@@ -13,7 +13,7 @@ use glow::HasContext as _;
 use super::object::BufferObject;
 use super::{Buffer, Gl};
 use modalcast_model::error::{Result, fault, fault_in};
-use modalcast_model::shared_memory::{CopiedPixels, HostPixels};
+use modalcast_model::shared_memory::HostPixels;
 
 /// A buffer that the device writes and the host reads.
 #[derive(Debug)]
@@ -48,8 +48,6 @@ pub(crate) enum ReadbackView {
         // Dropped before `_done`, so that the memory has no reader once the sender is disconnected.
         pixels: Arc<dyn HostPixels>,
         bytes: usize,
-        /// Milliseconds that the device copied.
-        copy_ms: f64,
         /// Whether a reader may keep the view for long, because enough slots are left for the next frames.
         can_be_held: bool,
         _done: SyncSender<()>,
@@ -160,22 +158,13 @@ fn is_done(reader: &Receiver<()>, limit: Duration) -> bool {
 
 impl ReadbackView {
     /// A view of the first `bytes` bytes of pinned memory, which `reader` tracks.
-    pub(super) fn pinned(copied: CopiedPixels, bytes: usize, can_be_held: bool, reader: &ReaderSignal) -> Self {
-        let CopiedPixels { pixels, ms: copy_ms } = copied;
-        Self::Pinned { bytes: bytes.min(pixels.bytes().len()), pixels, copy_ms, can_be_held, _done: reader.begin() }
+    pub(super) fn pinned(pixels: Arc<dyn HostPixels>, bytes: usize, can_be_held: bool, reader: &ReaderSignal) -> Self {
+        Self::Pinned { bytes: bytes.min(pixels.bytes().len()), pixels, can_be_held, _done: reader.begin() }
     }
 
     /// Whether a reader may keep the view for long instead of copying the bytes.
     pub(crate) const fn can_be_held(&self) -> bool {
         matches!(self, Self::Pinned { can_be_held: true, .. })
-    }
-
-    /// Milliseconds of the copy that another API made, after OpenGL had completed the frame.
-    pub(crate) const fn copy_ms(&self) -> Option<f64> {
-        match self {
-            Self::Pinned { copy_ms, .. } => Some(*copy_ms),
-            Self::Mapped { .. } | Self::Copied(_) => None,
-        }
     }
 
     /// Shortens the view to its first `bytes` bytes.
