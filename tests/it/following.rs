@@ -90,7 +90,7 @@ async fn step_with_transform_of_a_follower_is_rejected() {
     );
     writer.finish().await;
     // A follower has its own coordinates: the step deforms only the leaf.
-    let mut writer = server.drive_lossless("twig").await;
+    let mut writer = server.drive_from_current_state("twig").await;
     writer.send_step_and_wait(step(2, &[LEAF], &[0.5, -0.25])).await;
     let deformed_positions = get_vertices(&server, vertex_request(&[])).await.expect("expected vertices").positions;
     let leaf = NUMBERS_PER_DOMAIN * LEAF as usize..NUMBERS_PER_DOMAIN * LEAFLET as usize;
