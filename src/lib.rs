@@ -17,8 +17,9 @@
 //! | `modalcast-render` (`src/render`) | the renderer: EGL and OpenGL buffers, passes and readback | `modalcast-model` |
 //! | `modalcast-model` (`src/model`) | scenes, their file formats, the traits of deformers and rasterizers | |
 //!
-//! Further crates: `proto` (the gRPC contract), `clients/rust` and `clients/dynamics` (they use none of the crates in
-//! the table), and `tests/bench` (all benchmarks, started by `modalcast report`). `clients/python` is a client in Python.
+//! Further crates: `proto` (the gRPC contract), `clients/rust`, `clients/dynamics` and `clients/recording` (they use none
+//! of the crates in the table; the last one is started by `modalcast record` and `replay`), and `tests/bench` (all
+//! benchmarks, started by `modalcast report`). `clients/python` is a client in Python.
 //!
 //! # Modules
 //! A test (`tests/it/layering.rs`) reads this table. It checks that a module uses only the modules in its row and that

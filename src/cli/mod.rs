@@ -5,8 +5,8 @@ mod doctor;
 mod inspect;
 pub mod options;
 mod render;
-mod report;
 mod serve;
+mod sibling;
 mod view;
 
 use std::io::Write as _;
@@ -29,10 +29,49 @@ enum Command {
     View(view::Args),
     Demo(demo::Args),
     Render(render::Args),
-    Report(report::Args),
+    /// Records the states of a scene of a server in an MCAP file.
+    #[command(after_help = RECORD_EXAMPLES, disable_help_flag = true)]
+    Record(sibling::Args),
+    /// Drives a scene of a server with a recording.
+    #[command(after_help = REPLAY_EXAMPLES, disable_help_flag = true)]
+    Replay(sibling::Args),
+    /// Repairs a recording that was cut off.
+    #[command(after_help = RECOVER_EXAMPLES, disable_help_flag = true)]
+    Recover(sibling::Args),
+    /// Converts a recording to a web page, glTF, NumPy arrays, pictures or a video.
+    #[command(after_help = EXPORT_EXAMPLES, disable_help_flag = true)]
+    Export(sibling::Args),
+    /// Measures error against run time on this machine and writes tables and plots.
+    #[command(after_help = REPORT_EXAMPLES, disable_help_flag = true)]
+    Report(sibling::Args),
     Inspect(inspect::Args),
     Doctor(doctor::Args),
 }
+
+const RECORD_EXAMPLES: &str = "Examples:
+  modalcast record --help
+  modalcast record tree --out tree.mcap
+  modalcast record tree --out tree.mcap --duration 10 --latest";
+
+const REPLAY_EXAMPLES: &str = "Examples:
+  modalcast replay --help
+  modalcast replay tree.mcap --speed 0.5 --loop
+  modalcast replay tree.mcap --fast --frames out";
+
+const EXPORT_EXAMPLES: &str = "Examples:
+  modalcast export --help
+  modalcast export tree.mcap --to html --out tree.html
+  modalcast export tree.mcap --to npz --out tree.npz";
+
+const RECOVER_EXAMPLES: &str = "Examples:
+  modalcast recover --help
+  modalcast recover cut.mcap --out tree.mcap";
+
+const REPORT_EXAMPLES: &str = "Examples:
+  modalcast report --help
+  modalcast report deform --out report --quick
+  modalcast report render --out report --quick
+  modalcast report stream --out report --quick";
 
 /// Help text on the exit codes of all commands.
 pub const EXIT_CODES: &str = "\
@@ -58,7 +97,11 @@ pub fn run() -> u8 {
         Command::View(args) => view::run(&args),
         Command::Demo(args) => demo::run(&args),
         Command::Render(args) => render::run(&args),
-        Command::Report(args) => report::run(&args),
+        Command::Record(args) => sibling::RECORD.execute(Some("record"), &args),
+        Command::Replay(args) => sibling::RECORD.execute(Some("replay"), &args),
+        Command::Export(args) => sibling::RECORD.execute(Some("export"), &args),
+        Command::Recover(args) => sibling::RECORD.execute(Some("recover"), &args),
+        Command::Report(args) => sibling::REPORT.execute(None, &args),
         Command::Inspect(args) => inspect::run(&args),
         Command::Doctor(args) => doctor::run(&args),
     };

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use syn::visit::Visit;
 
 /// Root files of the checked crates.
-const CRATE_ROOTS: [&str; 9] = [
+const CRATE_ROOTS: [&str; 11] = [
     "src/lib.rs",
     "src/model/lib.rs",
     "src/compute/lib.rs",
@@ -17,6 +17,8 @@ const CRATE_ROOTS: [&str; 9] = [
     "clients/rust/src/bin/modalcast-fetch/main.rs",
     "clients/dynamics/src/lib.rs",
     "clients/dynamics/src/main.rs",
+    "clients/recording/src/lib.rs",
+    "clients/recording/src/bin/modalcast-record/main.rs",
     "tests/bench/src/lib.rs",
 ];
 

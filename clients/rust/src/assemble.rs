@@ -28,8 +28,8 @@ pub(crate) fn decode<T: Pod>(field: &str, bytes: &[u8]) -> Result<Vec<T>> {
     Ok(bytemuck::pod_collect_to_vec(bytes))
 }
 
-/// The messages of a server stream. An error contains the server's URL.
-pub(crate) struct Replies<M> {
+/// The messages of a server stream; dropping it cancels the call. An error contains the server's URL.
+pub struct Replies<M> {
     messages: MessageStream<M>,
     url: Arc<str>,
 }
@@ -39,8 +39,11 @@ impl<M: Message + Default> Replies<M> {
         Self { messages, url }
     }
 
-    /// The next message, or `None` at the end of the stream.
-    pub(crate) async fn next(&mut self) -> Result<Option<M>> {
+    /// The next message, or `None` at the end of the stream. A call that is canceled before it returns loses no message.
+    ///
+    /// # Errors
+    /// `Status` with which the server has ended the stream; `Connect` if the connection is lost.
+    pub async fn next(&mut self) -> Result<Option<M>> {
         poll_fn(|context| self.poll(context)).await.transpose()
     }
 

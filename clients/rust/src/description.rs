@@ -222,7 +222,11 @@ impl Shape {
         self.hashes.iter().find(|(candidate, _)| *candidate == array).map(|(_, hash)| *hash)
     }
 
-    pub(crate) fn set_array(&mut self, array: ShapeArray, bytes: &[u8]) -> Result<()> {
+    /// Sets an array to the little-endian numbers in `bytes`. [`SceneDescription::check_arrays`] checks its length.
+    ///
+    /// # Errors
+    /// `Malformed` if the bytes are no whole numbers.
+    pub fn set_array(&mut self, array: ShapeArray, bytes: &[u8]) -> Result<()> {
         const FIELD: &str = "describe.chunk.data";
         match array {
             ShapeArray::Indices => self.indices = decode(FIELD, bytes)?,
@@ -266,8 +270,24 @@ impl Shape {
 }
 
 impl SceneDescription {
-    /// Checks the requested arrays of all shapes.
-    pub(crate) fn check_arrays(&self, arrays: &[ShapeArray]) -> Result<()> {
+    /// Decodes the messages of [`crate::Client::description_messages`]. Arrays have at most `max_bytes` bytes together.
+    ///
+    /// # Errors
+    /// `Malformed` if lengths and counts contradict each other; `StreamEnded` if an array is incomplete.
+    pub fn from_messages(
+        messages: impl IntoIterator<Item = v1::DescribeSceneResponse>,
+        max_bytes: u64,
+    ) -> Result<Self> {
+        let mut builder = DescriptionBuilder::new(max_bytes);
+        messages.into_iter().try_for_each(|message| builder.add_message(message))?;
+        builder.finish()
+    }
+
+    /// Checks that these arrays of all shapes have the lengths that the counts demand, and indices within range.
+    ///
+    /// # Errors
+    /// `Malformed` with the name of the array.
+    pub fn check_arrays(&self, arrays: &[ShapeArray]) -> Result<()> {
         self.shapes.iter().try_for_each(|shape| arrays.iter().try_for_each(|array| shape.check_array(*array)))
     }
 }

@@ -42,6 +42,20 @@ pub enum FrameFormat {
     F32x3,
 }
 
+impl FrameFormat {
+    /// The extension of a file with such a frame.
+    pub const fn extension(self) -> &'static str {
+        match self {
+            Self::Png => "png",
+            Self::Jpeg => "jpg",
+            Self::Rgba => "rgba",
+            Self::F32 => "f32",
+            Self::U32 => "u32",
+            Self::F32x3 => "f32x3",
+        }
+    }
+}
+
 /// The quantity that a picture shows; `frames.proto` defines each in detail.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub enum Output {

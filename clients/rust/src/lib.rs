@@ -11,6 +11,7 @@ mod error;
 mod forces;
 mod frames;
 mod message_stream;
+mod messages;
 pub mod npy;
 mod pick;
 pub mod program;
@@ -18,6 +19,7 @@ mod request;
 mod scene;
 mod shared_memory;
 mod stages;
+mod state_packing;
 mod states;
 mod step;
 mod step_stream;
@@ -27,6 +29,7 @@ mod vertex_sections;
 mod vertices;
 
 pub use array_upload::{ArrayUpload, UploadDomain, UploadShape};
+pub use assemble::Replies;
 pub use client::{Client, REPLY_LIMIT, SceneList, ServerInfo};
 pub use content::ContentHash;
 pub use describe::{DescriptionRequest, ModeRows};
@@ -44,7 +47,7 @@ pub use scene::{
     AlphaMode, Attachment, Domain, Follow, Material, MaterialRange, SceneDescription, Shape, ShapeArray, Texture,
 };
 pub use stages::{StageSamples, StageTimes};
-pub use states::{SceneState, StateLayout, StateRequest, StateStream, StateStreamRequest};
+pub use states::{SceneState, SentValues, StateDecoder, StateLayout, StateRequest, StateStream, StateStreamRequest};
 pub use step::{DomainTransform, Step};
 pub use step_stream::{Ack, DriveRequest, StepStream, StreamSummary};
 pub use tonic::Code;

@@ -1,9 +1,12 @@
-//! Entry point and exit codes that the programs `modalcast-fetch` and `modalcast-sim` share.
+//! Entry point, exit codes and options that the programs of the clients share.
+
+mod picture_options;
 
 use std::fmt::Display;
 use std::process::ExitCode;
 
 use crate::error::Error;
+pub use picture_options::PictureOptions;
 
 /// The exit code of a program that cannot use a local file or another local resource.
 const LOCAL_ERROR: u8 = 4;

@@ -27,7 +27,7 @@ pub struct StateLayout {
     domains: Vec<DomainSlot>,
     coordinate_count: usize,
     /// The domains with a transform of their own, in order.
-    roots: Vec<u32>,
+    pub(crate) roots: Vec<u32>,
     /// `root_from_domain` of the domains that follow another one.
     follow_frames: Vec<Matrix3x4>,
 }
@@ -92,7 +92,8 @@ impl StateLayout {
         self.domains.len()
     }
 
-    fn owns_coordinates(&self, domain: u32) -> bool {
+    /// Whether the domain has coordinates that it shares with no domain before it.
+    pub(crate) fn owns_coordinates(&self, domain: u32) -> bool {
         self.domains.get(domain as usize).is_some_and(|slot| slot.owns_q && slot.rank > 0)
     }
 
@@ -119,12 +120,13 @@ pub struct SceneState {
     /// Size of the sent part of the state on the wire in bytes, without messages and heads.
     pub encoded_bytes: u64,
     pub stages: StageTimes,
-    layout: Arc<StateLayout>,
-    q: Vec<f32>,
+    pub(crate) layout: Arc<StateLayout>,
+    /// Of the domains that own their coordinates, in order.
+    pub(crate) q: Vec<f32>,
     /// One per domain that follows no other.
-    transforms: Vec<Matrix3x4>,
+    pub(crate) transforms: Vec<Matrix3x4>,
     /// World position in meters of the origin of all transforms, or of the origin of each of them if they differ.
-    origins: Vec<[f64; 3]>,
+    pub(crate) origins: Vec<[f64; 3]>,
 }
 
 impl SceneState {
@@ -175,7 +177,7 @@ impl Client {
         };
         let messages = self.replies(StateServiceClient::new(self.undecoded_channel()).get_state(wire).await)?;
         let chunk_of = |message: v1::GetStateResponse| message.chunk;
-        let decoder = StateDecoder::new(chunk_of, layout, self.max_reply_bytes);
+        let decoder = StateMessageDecoder::new(chunk_of, layout, self.max_reply_bytes);
         let state = DecodedReplies::new(messages, decoder).next().await;
         state.unwrap_or(Err(Error::StreamEnded { awaited_reply: "the state of the step" }))
     }
@@ -203,7 +205,7 @@ impl Client {
             Some(Part::Chunk(chunk)) => Some(chunk),
             _ => None,
         };
-        let replies = DecodedReplies::new(messages, StateDecoder::new(chunk_of, layout, self.max_reply_bytes));
+        let replies = DecodedReplies::new(messages, StateMessageDecoder::new(chunk_of, layout, self.max_reply_bytes));
         Ok(StateStream { settings, replies })
     }
 }
@@ -213,7 +215,7 @@ impl Client {
 pub struct StateStream {
     /// The settings in effect.
     pub settings: v1::StateStreamSettings,
-    replies: DecodedReplies<v1::StreamStatesResponse, StateDecoder<v1::StreamStatesResponse>>,
+    replies: DecodedReplies<v1::StreamStatesResponse, StateMessageDecoder<v1::StreamStatesResponse>>,
 }
 
 impl StateStream {
@@ -231,18 +233,49 @@ impl tokio_stream::Stream for StateStream {
     }
 }
 
-/// Decodes messages `M` to states. Keeps the last state, to which changes are applied.
-struct StateDecoder<M> {
-    chunk_of: fn(M) -> Option<v1::StateChunk>,
+/// Decodes the chunks of consecutive states, of which the first is complete. Keeps the last state, to which changes are
+/// applied.
+pub struct StateDecoder {
     layout: Arc<StateLayout>,
     assembler: Assembler<v1::StateHead>,
     last_state: Option<Arc<SceneState>>,
+    sent_values: SentValues,
 }
 
-impl<M> StateDecoder<M> {
-    fn new(chunk_of: fn(M) -> Option<v1::StateChunk>, layout: &Arc<StateLayout>, max_reply_bytes: u64) -> Self {
-        let assembler = Assembler::new("states", max_reply_bytes);
-        Self { chunk_of, layout: Arc::clone(layout), assembler, last_state: None }
+/// The values that a state has on the wire. The other ones are those of the previous state.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct SentValues {
+    /// Whether the state has all values.
+    pub is_complete: bool,
+    /// Domains with coordinates, ascending.
+    pub q_domains: Vec<u32>,
+    /// Domains with transforms, ascending.
+    pub transform_domains: Vec<u32>,
+    /// Whether the state has the origins of the transforms.
+    pub origins: bool,
+}
+
+impl StateDecoder {
+    /// A decoder for states of at most `max_bytes` bytes.
+    pub fn new(layout: &Arc<StateLayout>, max_bytes: u64) -> Self {
+        let assembler = Assembler::new("states", max_bytes);
+        Self { layout: Arc::clone(layout), assembler, last_state: None, sent_values: SentValues::default() }
+    }
+
+    /// The values that the last state had on the wire.
+    pub const fn sent_values(&self) -> &SentValues {
+        &self.sent_values
+    }
+
+    /// Adds the next chunk. Returns the state that it completes.
+    ///
+    /// # Errors
+    /// `Malformed` if the chunk contradicts the previous ones or the layout, or the first state is not complete.
+    pub fn add_chunk(&mut self, chunk: v1::StateChunk) -> Result<Option<Arc<SceneState>>> {
+        match self.assembler.push(Chunk::new(chunk.head, |head| head.total, chunk.offset, chunk.data))? {
+            Some((head, bytes)) => self.decode_state(head, &bytes).map(Some),
+            None => Ok(None),
+        }
     }
 
     fn decode_state(&mut self, head: v1::StateHead, bytes: &Bytes) -> Result<Arc<SceneState>> {
@@ -255,7 +288,7 @@ impl<M> StateDecoder<M> {
             _ => Arc::new(changes.complete_state(&self.layout)?),
         };
         let changed_state = Arc::make_mut(&mut state);
-        changes.apply(changed_state);
+        self.sent_values = SentValues { is_complete: head.complete, ..changes.apply(changed_state) };
         changed_state.step = head.step.ok_or_else(|| malformed_reply("states.step", "a step", "none"))?;
         changed_state.skipped = head.skipped;
         changed_state.encoded_bytes = bytes.len() as u64;
@@ -265,19 +298,28 @@ impl<M> StateDecoder<M> {
     }
 }
 
-impl<M> ReplyDecoder<M> for StateDecoder<M> {
+/// Decodes messages `M` to states.
+struct StateMessageDecoder<M> {
+    chunk_of: fn(M) -> Option<v1::StateChunk>,
+    states: StateDecoder,
+}
+
+impl<M> StateMessageDecoder<M> {
+    fn new(chunk_of: fn(M) -> Option<v1::StateChunk>, layout: &Arc<StateLayout>, max_reply_bytes: u64) -> Self {
+        Self { chunk_of, states: StateDecoder::new(layout, max_reply_bytes) }
+    }
+}
+
+impl<M> ReplyDecoder<M> for StateMessageDecoder<M> {
     type Reply = Arc<SceneState>;
 
     fn add_message(&mut self, message: M) -> Result<Option<Arc<SceneState>>> {
         let chunk = (self.chunk_of)(message).ok_or_else(|| malformed_reply("states.part", "a chunk", "none"))?;
-        match self.assembler.push(Chunk::new(chunk.head, |head| head.total, chunk.offset, chunk.data))? {
-            Some((head, bytes)) => self.decode_state(head, &bytes).map(Some),
-            None => Ok(None),
-        }
+        self.states.add_chunk(chunk)
     }
 
     fn is_open(&self) -> bool {
-        self.assembler.is_open()
+        self.states.assembler.is_open()
     }
 }
 
@@ -362,21 +404,25 @@ impl StateChanges {
         })
     }
 
-    fn apply(self, state: &mut SceneState) {
+    /// Applies the changes. Returns what has changed.
+    fn apply(self, state: &mut SceneState) -> SentValues {
         let layout = Arc::clone(&state.layout);
         let mut values = self.q.as_slice();
-        for domain in self.q_domains {
-            let slot = layout.domains[domain as usize];
+        for domain in &self.q_domains {
+            let slot = layout.domains[*domain as usize];
             let (domain_q, remaining_values) = values.split_at(slot.rank);
             state.q[slot.first_coordinate..][..slot.rank].copy_from_slice(domain_q);
             values = remaining_values;
         }
-        for (domain, transform) in self.transform_domains.into_iter().zip(self.transforms) {
-            state.transforms[layout.domains[domain as usize].root] = transform;
+        for (domain, transform) in self.transform_domains.iter().zip(self.transforms) {
+            state.transforms[layout.domains[*domain as usize].root] = transform;
         }
-        if !self.origins.is_empty() {
-            state.origins = self.origins;
+        let Self { q_domains, transform_domains, origins, .. } = self;
+        let has_origins = !origins.is_empty();
+        if has_origins {
+            state.origins = origins;
         }
+        SentValues { is_complete: false, q_domains, transform_domains, origins: has_origins }
     }
 }
 
@@ -414,8 +460,8 @@ mod tests {
             .expect("a valid description")
     }
 
-    fn decoder() -> StateDecoder<v1::GetStateResponse> {
-        StateDecoder::new(|message| message.chunk, &layout(), 1 << 20)
+    fn decoder() -> StateMessageDecoder<v1::GetStateResponse> {
+        StateMessageDecoder::new(|message| message.chunk, &layout(), 1 << 20)
     }
 
     /// A state in one message, whose sections follow each other.

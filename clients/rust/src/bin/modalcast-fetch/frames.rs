@@ -24,7 +24,7 @@ pub(crate) async fn fetch_stream(client: &Client, options: &FrameStreamOptions, 
         let deadline_error = Error::Deadline { awaited_reply: "the next frame", ms: timeout.as_millis() as u64 };
         let result = tokio::time::timeout(timeout, frames.next()).await.map_err(|_| deadline_error)?;
         let frame = result.unwrap_or(Err(Error::StreamEnded { awaited_reply: "the last frame" }))?;
-        write_file(&options.out.join(format!("frame_{index:05}{suffix}.{}", extension(frame.format))), &frame)?;
+        write_file(&options.out.join(format!("frame_{index:05}{suffix}.{}", frame.format.extension())), &frame)?;
         summary.add(&received_reply(&frame));
         summary.add_frame_info(&frame);
         progress_bar.set_position(index + 1);
@@ -65,22 +65,11 @@ fn output_path(out: &Path, suffix: &str, format: FrameFormat) -> PathBuf {
         return out.to_owned();
     }
     let stem = out.file_stem().unwrap_or_default().to_string_lossy();
-    out.with_file_name(format!("{stem}{suffix}.{}", extension(format)))
+    out.with_file_name(format!("{stem}{suffix}.{}", format.extension()))
 }
 
 fn write_file(path: &Path, frame: &Frame) -> Result<()> {
     std::fs::write(path, &frame.bytes).map_err(|error| Error::file(path, error))
-}
-
-const fn extension(format: FrameFormat) -> &'static str {
-    match format {
-        FrameFormat::Png => "png",
-        FrameFormat::Jpeg => "jpg",
-        FrameFormat::Rgba => "rgba",
-        FrameFormat::F32 => "f32",
-        FrameFormat::U32 => "u32",
-        FrameFormat::F32x3 => "f32x3",
-    }
 }
 
 #[cfg(test)]
