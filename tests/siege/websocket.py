@@ -86,8 +86,11 @@ class WebSocket:
     def receive(self, seconds):
         """Reads for a time. Returns the bytes, and whether the connection is open."""
         data, end = b"", time.monotonic() + seconds
+        # Unlike `select`, it accepts file descriptors above 1023.
+        poll = select.poll()
+        poll.register(self.socket, select.POLLIN)
         while (remaining := end - time.monotonic()) > 0:
-            if not select.select([self.socket], [], [], remaining)[0]:
+            if not poll.poll(1000 * remaining):
                 break
             try:
                 part = self.socket.recv(1 << 16)
