@@ -28,7 +28,7 @@ pub(super) struct Args {
     /// one model.
     model: String,
     /// Address to listen on: IP:PORT, where port 0 selects a free port.
-    #[arg(long, env = "MODALCAST_LISTEN", default_value_t = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 0))]
+    #[arg(long, default_value_t = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 0))]
     listen: SocketAddr,
     /// Print the URL and do not open a browser.
     #[arg(long)]

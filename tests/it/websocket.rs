@@ -25,6 +25,7 @@ const LIST: &str = "/modalcast.v1.SceneService/ListScenes";
 const OPEN: &str = "/modalcast.v1.SceneService/OpenScene";
 const DESCRIBE: &str = "/modalcast.v1.SceneService/DescribeScene";
 const GET_VERTICES: &str = "/modalcast.v1.VertexService/GetVertices";
+const GET_STATE: &str = "/modalcast.v1.StateService/GetState";
 const STREAM_VERTICES: &str = "/modalcast.v1.VertexService/StreamVertices";
 
 /// Credit of a call for messages of the server and of the client, in bytes.
@@ -54,16 +55,22 @@ fn open_drive(scene: &str) -> Vec<u8> {
     drive_request(RequestKind::Open(v1::OpenDrive { scene: scene.into(), delivery, ..Default::default() }))
 }
 
-/// Removes the times from the heads of vertices, because they differ between two calls.
+/// Removes the times from the heads of vertices and states, because they differ between two calls.
 fn without_stage_times(path: &str, mut result: CallResult) -> CallResult {
     use v1::get_vertices_response::Part;
-    for message in result.messages.iter_mut().filter(|_| path == GET_VERTICES) {
-        let mut reply = v1::GetVerticesResponse::decode(&message[..]).expect("expected a reply");
-        if let Some(Part::Chunk(chunk)) = &mut reply.part
-            && let Some(head) = &mut chunk.head
-        {
-            head.stages.clear();
-            *message = reply.encode_to_vec();
+    for message in &mut result.messages {
+        if path == GET_VERTICES {
+            let mut reply = v1::GetVerticesResponse::decode(&message[..]).expect("expected a reply");
+            if let Some(Part::Chunk(v1::VertexChunk { head: Some(head), .. })) = &mut reply.part {
+                head.stages.clear();
+                *message = reply.encode_to_vec();
+            }
+        } else if path == GET_STATE {
+            let mut reply = v1::GetStateResponse::decode(&message[..]).expect("expected a reply");
+            if let Some(v1::StateChunk { head: Some(head), .. }) = &mut reply.chunk {
+                head.stages.clear();
+                *message = reply.encode_to_vec();
+            }
         }
     }
     result
@@ -104,7 +111,7 @@ async fn replies_and_errors_are_those_of_grpc() {
         both!(DESCRIBE, describe("sheet")),
         both!(GET_VERTICES, v1::GetVerticesRequest { scene: scene(), ..Default::default() }),
         both!(GET_VERTICES, v1::GetVerticesRequest { scene: "sheet".into(), ..Default::default() }),
-        both!("/modalcast.v1.StateService/GetState", v1::GetStateRequest { scene: scene(), ..Default::default() }),
+        both!(GET_STATE, v1::GetStateRequest { scene: scene(), ..Default::default() }),
         both!("/modalcast.v1.SceneService/ReadModes", v1::ReadModesRequest { scene: scene(), ..Default::default() }),
         both!("/grpc.health.v1.Health/Check", tonic_health::pb::HealthCheckRequest { service: String::new() }),
     ];

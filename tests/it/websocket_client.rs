@@ -50,10 +50,34 @@ impl ServerMessage {
 }
 
 /// The replies and the status of a call.
-#[derive(Debug, PartialEq)]
+#[derive(Debug)]
 pub(crate) struct CallResult {
     pub(crate) messages: Vec<Vec<u8>>,
     pub(crate) status: tonic_types::Status,
+}
+
+/// Details of an error. The entries of maps are encoded in any order.
+#[derive(Debug, PartialEq)]
+enum Detail {
+    Info(tonic_types::pb::ErrorInfo),
+    Other { type_url: String, value: Vec<u8> },
+}
+
+impl CallResult {
+    fn details(&self) -> Vec<Detail> {
+        let decode = |type_url: &str, value: &[u8]| match type_url.ends_with("google.rpc.ErrorInfo") {
+            true => Detail::Info(tonic_types::pb::ErrorInfo::decode(value).expect("expected an ErrorInfo")),
+            false => Detail::Other { type_url: type_url.into(), value: value.into() },
+        };
+        self.status.details.iter().map(|detail| decode(&detail.type_url, &detail.value)).collect()
+    }
+}
+
+impl PartialEq for CallResult {
+    fn eq(&self, other: &Self) -> bool {
+        let texts = |result: &Self| (result.status.code, result.status.message.clone());
+        self.messages == other.messages && texts(self) == texts(other) && self.details() == other.details()
+    }
 }
 
 /// A connection.
