@@ -71,6 +71,7 @@ export class SceneRenderer {
         const quality = { anisotropy: renderer.capabilities.getMaxAnisotropy(), blendsLevels: !isSoftware };
         this.surfaces = new Surfaces(scene, arrays, this.deformer, this.light, this.shadowUniforms, quality);
         this.background = this.createBackground();
+        this.background.define("SINGLE_LOOKUP", isSoftware);
         this.plain = new FullscreenPass(PLAIN_FRAGMENT, {
             plain: new THREE.Vector3(PLAIN_GRAY, PLAIN_GRAY, PLAIN_GRAY),
         });

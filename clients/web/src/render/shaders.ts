@@ -151,7 +151,7 @@ uniform mat4 shadow_from_world;
 uniform float shadow_texel;          // side of a texel in scene units
 uniform float shadow_bias;           // in units of the map's depth
 uniform vec3 to_sun;
-// Part of the sun that is visible: the mean of nine bilinear comparisons, at a point that is moved along the normal, so
+// Part of the sun that is visible: the mean of nine bilinear comparisons, or one on the CPU (SINGLE_LOOKUP), at a point that is moved along the normal, so
 // that a surface does not shadow itself.
 float sun_visibility(vec3 world, vec3 normal) {
     float cosine = clamp(dot(normal, to_sun), 0.0, 1.0);
@@ -160,11 +160,15 @@ float sun_visibility(vec3 world, vec3 normal) {
     if (any(lessThan(place.xy, vec2(0.0))) || any(greaterThan(place.xy, vec2(1.0)))) return 1.0;
     // The ground lies behind the far plane of the map.
     float depth = clamp(place.z - shadow_bias, 0.0, 1.0);
+#ifdef SINGLE_LOOKUP
+    return texture(shadow_map, vec3(place.xy, depth));
+#else
     float texel = 1.0 / float(textureSize(shadow_map, 0).x), sum = 0.0;
     for (int y = -1; y <= 1; y++) {
         for (int x = -1; x <= 1; x++) sum += texture(shadow_map, vec3(place.xy + texel * vec2(x, y), depth));
     }
     return sum / 9.0;
+#endif
 }
 #else
 uniform vec3 to_sun;

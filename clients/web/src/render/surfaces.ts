@@ -27,7 +27,7 @@ export type ColorMode = { kind: "shaded" } | { kind: "map"; largest: number };
 /** How textures are filtered. */
 export interface TextureQuality {
     anisotropy: number;
-    /** Whether two mipmap levels are blended. */
+    /** Whether two mipmap levels are blended, and shadows are smoothed by several lookups. */
     blendsLevels: boolean;
 }
 
@@ -156,6 +156,7 @@ export class Surfaces {
         if (material.normalTexture !== undefined) defines["NORMAL_TEXTURE"] = "";
         if (isMask) defines["MASK"] = "";
         if (blends) defines["BLEND"] = "";
+        if (!this.quality.blendsLevels) defines["SINGLE_LOOKUP"] = "";
         const phong = {
             ambient: { value: new THREE.Vector3(...material.ambient) },
             diffuse: { value: new THREE.Vector3(...material.diffuse) },

@@ -133,5 +133,5 @@ export async function openPage(browser: Browser, url: string, width = 480, heigh
 
 /** Waits until the page shows a scene. */
 export async function waitForScene(page: Page): Promise<void> {
-    await page.waitForFunction(() => (globalThis.modalcastViewer?.model?.counts.states ?? 0) > 0);
+    await page.waitForFunction(() => Boolean(globalThis.modalcastViewer?.model));
 }
