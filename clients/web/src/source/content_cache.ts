@@ -4,11 +4,13 @@ import { toHex } from "../scene/numbers";
 
 /** Largest sum of all stored contents in bytes. Above it, the contents that were not used for the longest time go. */
 const CACHE_BYTES = 512 << 20;
-const STORE = "contents";
+/** Bytes by hash, and sizes and times by hash, which are read without the bytes. */
+const CONTENTS = "contents";
+const USES = "uses";
 
-interface Entry {
+interface Use {
     hash: string;
-    bytes: Uint8Array<ArrayBuffer>;
+    bytes: number;
     /** Milliseconds since the epoch. */
     used: number;
 }
@@ -20,59 +22,56 @@ export class ContentCache {
     static async open(): Promise<ContentCache> {
         try {
             const request = indexedDB.open("modalcast", 1);
-            request.onupgradeneeded = () => request.result.createObjectStore(STORE, { keyPath: "hash" });
+            request.onupgradeneeded = () => {
+                request.result.createObjectStore(CONTENTS);
+                request.result.createObjectStore(USES, { keyPath: "hash" });
+            };
             return new ContentCache(await finished(request));
         } catch {
             return new ContentCache(null);
         }
     }
 
-    async read(hash: string): Promise<Uint8Array | null> {
-        if (!this.database) return null;
+    /** The stored contents among those with the given hashes. One transaction, because a plant has thousands. */
+    async read(hashes: readonly string[]): Promise<Map<string, Uint8Array>> {
+        const found = new Map<string, Uint8Array>();
+        if (!this.database) return found;
         try {
-            const store = this.database.transaction(STORE, "readwrite").objectStore(STORE);
-            const entry: Entry | undefined = await finished(store.get(hash));
-            if (!entry) return null;
-            store.put({ ...entry, used: Date.now() });
-            return entry.bytes;
+            const transaction = this.database.transaction([CONTENTS, USES], "readwrite");
+            const [contents, uses] = [transaction.objectStore(CONTENTS), transaction.objectStore(USES)];
+            const read = async (hash: string) => {
+                const bytes: Uint8Array | undefined = await finished(contents.get(hash));
+                if (!bytes) return;
+                found.set(hash, bytes);
+                uses.put({ hash, bytes: bytes.length, used: Date.now() } satisfies Use);
+            };
+            await Promise.all(hashes.map(read));
         } catch {
-            return null;
+            // The contents are then loaded again.
         }
+        return found;
     }
 
     /** Stores contents. A full disk is no error: the contents are then loaded again. */
-    async write(contents: ReadonlyMap<string, Uint8Array>): Promise<void> {
-        if (!this.database || contents.size === 0) return;
+    async write(received: ReadonlyMap<string, Uint8Array>): Promise<void> {
+        if (!this.database || received.size === 0) return;
         try {
-            const transaction = this.database.transaction(STORE, "readwrite");
-            const store = transaction.objectStore(STORE);
-            for (const [hash, bytes] of contents) {
-                store.put({ hash, bytes: bytes.slice(), used: Date.now() } satisfies Entry);
+            const transaction = this.database.transaction([CONTENTS, USES], "readwrite");
+            const [contents, uses] = [transaction.objectStore(CONTENTS), transaction.objectStore(USES)];
+            for (const [hash, bytes] of received) {
+                contents.put(bytes, hash);
+                uses.put({ hash, bytes: bytes.length, used: Date.now() } satisfies Use);
             }
-            await this.evict(store);
+            const all: Use[] = await finished(uses.getAll());
+            let total = all.reduce((sum, use) => sum + use.bytes, 0);
+            for (const use of all.sort((a, b) => a.used - b.used)) {
+                if (total <= CACHE_BYTES) break;
+                contents.delete(use.hash);
+                uses.delete(use.hash);
+                total -= use.bytes;
+            }
         } catch {
             // See above.
-        }
-    }
-
-    private async evict(store: IDBObjectStore): Promise<void> {
-        const entries: { hash: string; bytes: number; used: number }[] = [];
-        await new Promise<void>((resolve, reject) => {
-            const request = store.openCursor();
-            request.onerror = () => reject(request.error);
-            request.onsuccess = () => {
-                const cursor = request.result;
-                if (!cursor) return resolve();
-                const { hash, bytes, used } = cursor.value as Entry;
-                entries.push({ hash, bytes: bytes.length, used });
-                cursor.continue();
-            };
-        });
-        let total = entries.reduce((sum, entry) => sum + entry.bytes, 0);
-        for (const entry of entries.sort((a, b) => a.used - b.used)) {
-            if (total <= CACHE_BYTES) break;
-            store.delete(entry.hash);
-            total -= entry.bytes;
         }
     }
 }

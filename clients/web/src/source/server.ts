@@ -26,7 +26,7 @@ import { type ContentCache, hasHash } from "./content_cache";
 export const PROTOCOL_VERSION = 1;
 
 /** Largest number of hashes in a request. */
-const HASHES_PER_REQUEST = 256;
+const HASHES_PER_REQUEST = 4096;
 
 /** Window of a picture stream in bytes: one frame at a time, so that a slow browser shows the newest step. */
 const PICTURE_WINDOW = 1;
@@ -87,19 +87,15 @@ export class Server {
 
     /** All arrays and textures of a scene, from the cache or the server. `progress`: received bytes. */
     async readContents(scene: SceneDescription, progress: (bytes: number) => void): Promise<Map<string, Uint8Array>> {
-        const contents = new Map<string, Uint8Array>();
-        const missing: Uint8Array[] = [];
-        for (const hash of contentHashes(scene)) {
-            const cached = await this.cache.read(toHex(hash));
-            if (cached) {
-                contents.set(toHex(hash), cached);
-                progress(cached.length);
-            } else missing.push(hash);
-        }
+        const hashes = contentHashes(scene);
+        const contents = await this.cache.read(hashes.map(toHex));
+        for (const bytes of contents.values()) progress(bytes.length);
+        const missing = hashes.filter((hash) => !contents.has(toHex(hash)));
         for (let first = 0; first < missing.length; first += HASHES_PER_REQUEST) {
             const received = await this.readMissing(scene, missing.slice(first, first + HASHES_PER_REQUEST), progress);
             for (const [hash, bytes] of received) contents.set(hash, bytes);
-            await this.cache.write(received);
+            // Nobody waits for the cache.
+            void this.cache.write(received);
         }
         return contents;
     }
