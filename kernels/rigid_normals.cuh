@@ -38,7 +38,7 @@ __device__ __forceinline__ Mat3f to_scaled_mat3f(const Affine& t) {
 }
 
 #ifdef FOLLOWERS
-// A row of the linear part of T times that of the frame F.
+// One row of the product A F: `t` is a row of the linear part A of T, `f` is the linear part of the follower frame F.
 __device__ __forceinline__ float4 compose_linear_row(const float3& t, const Mat3f& f) {
     return make_float4(fmaf(t.x, f.row0.x, fmaf(t.y, f.row1.x, t.z * f.row2.x)),
                        fmaf(t.x, f.row0.y, fmaf(t.y, f.row1.y, t.z * f.row2.y)),
@@ -182,7 +182,8 @@ __device__ __forceinline__ void write_rigid_directions(const DeformArgs& args, O
                                                        const LaneSlice& slice, const RestNormals& rest_normals) {
     unsigned first_corner = slice.first_item;
 #ifdef CORNER_OFFSETS
-    // In a tile with vertices, `first_item` is the packed index of a vertex.
+    // In a tile with vertices, `first_item` is an index into the vertices of all domains. The offset of the domain
+    // converts it to the index of the same corner in the corners of all domains.
     if (slice.kind & TILE_VERTICES) {
         first_corner += __ldg(args.corner_offsets + slice.domain);
     }

@@ -3,7 +3,7 @@
 
 use serde_json::{Value, json};
 
-use super::{Outcome, print_line};
+use super::{Completion, Outcome, print_line};
 use crate::engine::share_pictures;
 use modalcast_compute::gpu;
 use modalcast_model::error::{Result, fault_in};
@@ -27,7 +27,7 @@ pub(super) fn run(args: &Args) -> Outcome {
     } else {
         text_lines(&report).into_iter().for_each(print_line);
     }
-    Ok(report["can_draw"] == true)
+    Ok(Completion::of_check(report["can_draw"] == true))
 }
 
 /// Collects the report as JSON.

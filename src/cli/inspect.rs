@@ -5,7 +5,7 @@ use serde::Serialize;
 use serde_json::{Value, json};
 
 use super::options::with_spinner;
-use super::{Outcome, print_line};
+use super::{Completion, Outcome, print_line};
 use modalcast_compute::gpu::{self, CudaDeformerOptions, DeformPlan};
 use modalcast_model::backend_settings::{BackendSettings, DeformTable, LookTable};
 use modalcast_model::error::fault_in;
@@ -45,7 +45,7 @@ pub(super) fn run(args: &Args) -> Outcome {
     } else {
         text_lines(&opened_scene).into_iter().for_each(print_line);
     }
-    Ok(true)
+    Ok(Completion::Success)
 }
 
 /// Bytes of a domain's shape in host memory: rest positions, corners, triangles, U, and the smoothing groups if the

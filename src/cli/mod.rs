@@ -85,8 +85,24 @@ Exit codes:
   5  a resource or a program is missing or in use; the message names it
   6  error of the server or the device";
 
-/// Result of a command: whether its check passed, or an error. Commands without a check return `true`.
-pub type Outcome = modalcast_model::error::Result<bool>;
+/// How a command without an error ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Completion {
+    /// The command is done. If it has a check, the check passed.
+    Success,
+    /// The command is done, and its check failed.
+    CheckFailed,
+}
+
+impl Completion {
+    /// The completion of a command with a check.
+    pub const fn of_check(passed: bool) -> Self {
+        if passed { Self::Success } else { Self::CheckFailed }
+    }
+}
+
+/// Result of a command.
+pub type Outcome = modalcast_model::error::Result<Completion>;
 
 /// Runs the command line and returns the process's exit code.
 pub fn run() -> u8 {
@@ -111,8 +127,8 @@ pub fn run() -> u8 {
 /// Converts an outcome to an exit code. Prints an error on standard error.
 pub fn finish(outcome: Outcome) -> u8 {
     match outcome {
-        Ok(true) => 0,
-        Ok(false) => 1,
+        Ok(Completion::Success) => 0,
+        Ok(Completion::CheckFailed) => 1,
         Err(error) => {
             eprintln!("modalcast: {error}");
             exit_code(&error)

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use super::options::{parse_point, with_spinner};
-use super::{Outcome, print_line};
+use super::{Completion, Outcome, print_line};
 use crate::config::{BackendChoice, Config, RendererChoice};
 use crate::engine::{DeviceContext, FrameInfo, FrameOutput, LoadedScene, validate_mode};
 use crate::frame;
@@ -161,7 +161,7 @@ pub(super) fn run(args: &Args) -> Outcome {
     device.unload_scene(loaded_scene);
     print_line(format!("{} ({}, {})", args.out.display(), args.size, device.backend().name()));
     info_lines(&info).into_iter().for_each(print_line);
-    Ok(true)
+    Ok(Completion::Success)
 }
 
 /// Lines about how a color picture was drawn; none for other pictures.

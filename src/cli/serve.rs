@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use tokio::signal::unix::{Signal, SignalKind, signal};
 
-use super::{Outcome, print_line};
+use super::{Completion, Outcome, print_line};
 use crate::config::{BackendChoice, Config, ListenAddress, RendererChoice, ValidatedConfig, ViewerToken};
 use crate::engine::{Engine, EngineInfo};
 use crate::service::{self, Listener};
@@ -151,7 +151,7 @@ pub(super) fn run(args: &Args) -> Outcome {
     let result = runtime.block_on(serve(config));
     // A scene that is being read or a frame that is being drawn must not delay the exit. The state is on disk.
     runtime.shutdown_background();
-    result.map(|()| true)
+    result.map(|()| Completion::Success)
 }
 
 async fn serve(config: ValidatedConfig) -> Result<()> {

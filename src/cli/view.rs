@@ -6,7 +6,7 @@ use std::process::{Command, Stdio};
 
 use super::demo::{DemoScene, Process, program_path};
 use super::serve::{TerminationSignals, start};
-use super::{Outcome, print_line};
+use super::{Completion, Outcome, print_line};
 use crate::config::{BackendChoice, Config, ListenAddress, RendererChoice, ValidatedConfig};
 use crate::service::{self, Listener};
 use modalcast_model::error::{Result, fault, fault_in};
@@ -85,7 +85,7 @@ pub(super) fn run(args: &Args) -> Outcome {
     let result = runtime.block_on(view(args, &input, config, physics_program));
     // A frame that is being drawn must not delay the exit.
     runtime.shutdown_background();
-    result.map(|()| true)
+    result.map(|()| Completion::Success)
 }
 
 async fn view(args: &Args, input: &DemoScene, config: ValidatedConfig, physics_program: Option<PathBuf>) -> Result<()> {

@@ -1,9 +1,9 @@
 //! Budgets for the bytes of messages that are being received, per connection and in total.
 //!
-//! tonic allocates a message when it has read the length in the message's header, and keeps it until the last byte has
-//! arrived. A message therefore counts with its whole length from its header on. A message that exceeds the budget of
-//! its connection is rejected. If the total is exhausted, the connection that holds the most loses its incomplete
-//! messages, so that a few connections with half-sent messages do not lock out the others.
+//! tonic allocates the memory of a whole message as soon as it has read the message's length, and holds it until the last
+//! byte has arrived. A message therefore counts with its whole length as soon as its header has arrived. A message that
+//! exceeds the budget of its connection is rejected. If the total is exhausted, the connection that holds the most bytes
+//! loses its incomplete messages, so that a few connections with half-sent messages do not block the others.
 
 use std::collections::HashMap;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -29,7 +29,7 @@ pub(super) struct ReceiveBudget {
 /// Limits of one message.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct MessageLimits {
-    /// Messages above this size are rejected by the decoder, so they count as this size.
+    /// Maximum size in bytes. The decoder rejects a larger message, so its remaining bytes do not count.
     pub(super) max_bytes: usize,
     /// Longest time without progress of an incomplete message.
     pub(super) timeout: Duration,
@@ -82,7 +82,7 @@ impl ReceiveBudget {
         Arc::new(ConnectionReceiveBudget { total: Arc::clone(self), id, evictions })
     }
 
-    /// Every update of the state is complete when it could panic, so a poisoned lock is valid.
+    /// A poisoned lock is valid, because no update of the state can panic halfway.
     fn lock(&self) -> MutexGuard<'_, State> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -110,8 +110,8 @@ impl State {
         Ok(())
     }
 
-    /// Writes off the bytes of the connection that holds the most, if it is not `id` and holds more than `bytes`. The
-    /// connection frees the memory as soon as its calls are polled.
+    /// Evicts the connection that holds the most bytes, if it is not `id` and holds more than `bytes`. The bytes no longer
+    /// count, and the calls of the connection free the memory when they are polled next.
     fn evict_other(&mut self, id: u64, bytes: usize) -> bool {
         let largest = self.connections.iter_mut().max_by_key(|(_, connection)| connection.held_bytes);
         let Some((largest_id, connection)) = largest else { return false };
@@ -141,7 +141,7 @@ impl ConnectionReceiveBudget {
         self.total.message_limits
     }
 
-    /// Memory of messages that is not allocated yet.
+    /// A new reservation of this connection, with 0 bytes.
     pub(super) fn new_memory(self: &Arc<Self>) -> ReceivedMemory {
         let eviction = self.evictions.count.load(Ordering::Acquire);
         ReceivedMemory { connection: Arc::clone(self), bytes: 0, eviction }
@@ -157,7 +157,7 @@ impl Drop for ConnectionReceiveBudget {
     }
 }
 
-/// Memory of received messages that counts against the budgets until it is dropped.
+/// A reservation of bytes for received messages. It counts against the budgets until it is dropped.
 #[derive(Debug)]
 pub(super) struct ReceivedMemory {
     connection: Arc<ConnectionReceiveBudget>,

@@ -100,7 +100,7 @@ async fn send_half(mut channel: Channel, bytes: usize) -> Status {
         .expect("expected a valid request");
     std::future::poll_fn(|cx| channel.poll_ready(cx)).await.expect("expected an open connection");
     let response = channel.call(request).await.expect("expected a response");
-    Status::from_header_map(response.headers()).expect("expected a status without messages")
+    Status::from_header_map(response.headers()).expect("expected a response with a status and no message")
 }
 
 /// Four of 40 half-sent messages fit into the budget of their connection. The others are rejected. Those that fit end
@@ -228,8 +228,9 @@ async fn connection_above_its_share_is_closed_when_others_wait() {
     drop(unread_calls);
 }
 
-/// Three unread calls of 4.3 MB of modes use the budget of their connection: each holds two messages of 1 MiB in its queue
-/// and two in HTTP/2. When a fourth call waits, they end with a reason, and the fourth call gets the bytes of the queues.
+/// Three unread calls, each with 4.3 MB of modes, exhaust the budget of their connection. Each can hold up to 4 MiB: two
+/// messages of 1 MiB in its queue and two in HTTP/2. When a fourth call waits, unread calls end with a reason, and the
+/// fourth call gets the bytes of their queues.
 #[tokio::test(flavor = "multi_thread")]
 async fn unread_calls_end_with_a_reason_when_others_wait() {
     let limits = |config| Config { connection_reply_bytes: 8 << 20, reply_timeout: REPLY_TIMEOUT, ..config };

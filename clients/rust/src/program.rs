@@ -32,9 +32,11 @@ pub fn run<E: Display>(
     ExitCode::from(code)
 }
 
-/// Maps an error of the client to the exit code that the help texts document: 1 rejected by the server or not
-/// encodable, 3 connection failed or lost, or a server of another protocol version, 4 local file error, 5 malformed,
-/// truncated or late reply.
+/// Maps an error of the client to an exit code:
+/// - 1: the server rejected the request, or a step is too large to be encoded as one message
+/// - 3: the connection failed or was lost, or the server has another protocol version
+/// - 4: a local file cannot be read or written
+/// - 5: a reply is malformed, truncated or late
 pub const fn exit_code(error: &Error) -> u8 {
     match error {
         Error::Connect { .. }

@@ -16,7 +16,7 @@ pub(super) use self::input::DemoScene;
 pub(super) use self::processes::{Process, program_path};
 
 use super::options::with_spinner;
-use super::{Outcome, print_line};
+use super::{Completion, Outcome, print_line};
 use crate::config::BackendChoice;
 use evaluation::Evaluation;
 use modalcast_model::error::{Result, fault_in};
@@ -71,7 +71,7 @@ pub(super) fn run(args: &Args) -> Outcome {
         fs::write(path, text + "\n").map_err(fault_in("demo"))?;
     }
     print_line(format!("frames in {}", args.out.display()));
-    Ok(evaluation.failed_checks().is_empty())
+    Ok(Completion::of_check(evaluation.failed_checks().is_empty()))
 }
 
 /// The results as JSON, with the command, version and machine for reproducibility.

@@ -1,5 +1,5 @@
-//! The numbers of runs. Every writer of the server gets a new one. It is on disk before the writer learns it, so that no
-//! number is used twice, also after a crash.
+//! Persistent counter of runs. A run is the sequence of steps from one writer; its number is `StepId.run`. Each new writer
+//! gets the next number, which is on disk before it is returned, so that no number is used twice, even after a crash.
 
 use std::fs;
 use std::io::ErrorKind;
@@ -10,10 +10,10 @@ use super::atomic_file::write_atomic;
 use crate::engine::lock::lock;
 use modalcast_model::error::{Error, Result, fault_in};
 
-/// Name of the file in the state folder: the last run as decimal digits.
+/// Name of the file in the state folder. It contains the number of the last run as decimal digits.
 const FILE_NAME: &str = "last_run";
 
-/// The last run of the server, in memory and on disk.
+/// The number of the server's last run, in memory and on disk.
 #[derive(Debug)]
 pub(in crate::engine) struct RunCounter {
     path: PathBuf,
@@ -21,7 +21,7 @@ pub(in crate::engine) struct RunCounter {
 }
 
 impl RunCounter {
-    /// Reads the counter of a state folder. A folder without one has had no run.
+    /// Reads the counter in a state folder. Without a counter file, it starts at 0.
     ///
     /// # Errors
     /// `Unavailable` when the file cannot be read or is damaged.
@@ -30,7 +30,7 @@ impl RunCounter {
         let unavailable = |reason: String| Error::Unavailable {
             what: "counter of runs",
             reason: format!("{}: {reason}", path.display()),
-            remedy: "Write a number into the file that is above every run that clients have seen".into(),
+            remedy: "Write into the file a number larger than every run that clients have seen".into(),
         };
         let last_run = match fs::read_to_string(&path) {
             Ok(text) => text.trim().parse().map_err(|_| unavailable(format!("expected a number, got {text:?}")))?,
@@ -40,10 +40,10 @@ impl RunCounter {
         Ok(Self { path, last_run: Mutex::new(last_run) })
     }
 
-    /// Returns a new run, larger than all before. Blocks on the disk.
+    /// Returns the number of a new run, which is larger than all numbers before. Waits until it is on disk.
     ///
     /// # Errors
-    /// `Fault` when the number cannot be written; no later run has it.
+    /// `Fault` when the number cannot be written. Later calls return larger numbers.
     pub(in crate::engine) fn next(&self) -> Result<u64> {
         let mut last_run = lock(&self.last_run);
         *last_run += 1;
@@ -51,7 +51,7 @@ impl RunCounter {
         Ok(*last_run)
     }
 
-    /// Continues after `run`, which a checkpoint contains, if the counter is behind it.
+    /// Raises the counter to `run`, which was read from a checkpoint, if the counter is lower.
     pub(in crate::engine) fn continue_after(&self, run: u64) {
         let mut last_run = lock(&self.last_run);
         *last_run = run.max(*last_run);

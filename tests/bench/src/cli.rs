@@ -11,7 +11,7 @@ use crate::bench::LocalMachine;
 use crate::workloads::{Size, WorkloadKind};
 use crate::{DeformReport, DeformReportOptions, Progress, WorkloadSource, deform};
 use modalcast::cli::options::with_spinner;
-use modalcast::cli::{EXIT_CODES, Outcome, finish, print_line};
+use modalcast::cli::{Completion, EXIT_CODES, Outcome, finish, print_line};
 use modalcast_model::error::Result;
 
 /// Measures error against run time, and rates and latencies at the client, on this machine. Writes tables and plots.
@@ -131,7 +131,7 @@ fn run_deform(args: &DeformArgs) -> Outcome {
     let report = with_spinner("measuring", || deform(&options, &LocalMachine::open(), on_progress))?;
     format_lines(&report).into_iter().for_each(print_line);
     print_line(format!("written to {}", args.out.display()));
-    Ok(report.passed())
+    Ok(Completion::of_check(report.passed()))
 }
 
 fn report_options(args: &DeformArgs) -> Result<DeformReportOptions> {

@@ -233,8 +233,9 @@ pub struct OrientationErrors {
     pub tangents_degrees: Option<ErrorNorms>,
     /// |n . t| of normal and tangent, which should be 0.
     pub normal_dot_tangent: Option<ErrorNorms>,
-    /// Directions that are not finite or have a length of at most 0.5, and bitangent signs that are wrong.
-    pub broken: u64,
+    /// Number of normals and tangents that are not finite, have a length of at most 0.5 or a wrong bitangent sign.
+    #[serde(rename = "broken")]
+    pub invalid_directions: u64,
 }
 
 /// Accumulator for [`OrientationErrors`].
@@ -245,7 +246,7 @@ pub struct OrientationErrorAccumulator {
     to_surface: NormAccumulator,
     tangents: NormAccumulator,
     dots: NormAccumulator,
-    broken: u64,
+    invalid_directions: u64,
 }
 
 impl OrientationErrorAccumulator {
@@ -255,7 +256,7 @@ impl OrientationErrorAccumulator {
         let add_corner = |corner: usize, sums: &mut Self| match angle_degrees(got[corner].map(f64::from), want[corner])
         {
             Some(angle) => sums.normals.add(angle),
-            None => sums.broken += 1,
+            None => sums.invalid_directions += 1,
         };
         *self = self.join(reduce_parallel(got.len().min(want.len()), add_corner, Self::join));
     }
@@ -286,7 +287,7 @@ impl OrientationErrorAccumulator {
     fn add_tangent(&mut self, [x, y, z, sign]: [f64; 4], want: [f64; 4], normal: Option<&[f32; 3]>) {
         match angle_degrees([x, y, z], [want[0], want[1], want[2]]) {
             Some(angle) if sign == want[3] => self.tangents.add(angle),
-            _ => self.broken += 1,
+            _ => self.invalid_directions += 1,
         }
         if let Some(normal) = normal {
             self.dots.add(Vector3::from(normal.map(f64::from)).dot(&Vector3::new(x, y, z)).abs());
@@ -299,7 +300,7 @@ impl OrientationErrorAccumulator {
             to_surface: self.to_surface.join(other.to_surface),
             tangents: self.tangents.join(other.tangents),
             dots: self.dots.join(other.dots),
-            broken: self.broken + other.broken,
+            invalid_directions: self.invalid_directions + other.invalid_directions,
         }
     }
 
@@ -310,7 +311,7 @@ impl OrientationErrorAccumulator {
             normals_to_surface_degrees: self.to_surface.norms(1.0),
             tangents_degrees: self.tangents.norms(1.0),
             normal_dot_tangent: self.dots.norms(1.0),
-            broken: self.broken,
+            invalid_directions: self.invalid_directions,
         }
     }
 }
@@ -386,9 +387,9 @@ mod tests {
         let want = [reference([0.0; 3], 1.0), reference([0.0; 3], 100.0)];
         accumulator.add(&error_scale, &[1.1, 0.0, 0.0, 0.0, 0.0, 0.0], &want);
         assert!(!accumulator.errors(&error_scale).passed());
-        let mut broken = PositionErrorAccumulator::default();
-        broken.add(&error_scale, &[f32::NAN, 0.0, 0.0, 0.0, f32::INFINITY, 0.0], &want);
-        assert_eq!((broken.errors(&error_scale).not_finite, broken.errors(&error_scale).passed()), (2, false));
+        let mut not_finite = PositionErrorAccumulator::default();
+        not_finite.add(&error_scale, &[f32::NAN, 0.0, 0.0, 0.0, f32::INFINITY, 0.0], &want);
+        assert_eq!((not_finite.errors(&error_scale).not_finite, not_finite.errors(&error_scale).passed()), (2, false));
     }
 
     #[test]
@@ -420,15 +421,15 @@ mod tests {
     }
 
     #[test]
-    fn counts_broken_directions_but_not_absent_tangents() {
+    fn counts_invalid_directions_but_not_absent_tangents() {
         let mut accumulator = OrientationErrorAccumulator::default();
         let want = [[1.0, 0.0, 0.0, 1.0], [1.0, 0.0, 0.0, -1.0], [0.0; 4]];
         let got = [1.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0];
         accumulator.add_tangents(&got, &want, &[0.6, 0.8, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]);
         accumulator.add_normals(&[f32::NAN, 0.0, 0.0], &[[1.0, 0.0, 0.0]]);
-        // Broken: the sign of the second tangent, and the normal. The third corner has no reference tangent.
+        // Invalid: the sign of the second tangent, and the normal. The third corner has no reference tangent.
         let found = accumulator.orientation();
-        assert_eq!((found.broken, found.tangents_degrees), (2, Some(ErrorNorms::default())));
+        assert_eq!((found.invalid_directions, found.tangents_degrees), (2, Some(ErrorNorms::default())));
         let dot = found.normal_dot_tangent.expect("expected dot products").largest;
         // The first normal and tangent: (0.6, 0.8, 0) . (1, 0, 0).
         assert!((dot - f64::from(0.6_f32)).abs() < 1e-12, "{dot}");

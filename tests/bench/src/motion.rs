@@ -32,8 +32,8 @@ const SLOWEST_MODE_HZ: f64 = 1.0;
 #[derive(Debug, Clone)]
 pub struct WorkloadMotion {
     scene: Arc<Scene>,
-    /// Whether modes 2k and 2k + 1 are nearly equal.
-    is_paired: bool,
+    /// As [`Workload::has_cancelling_mode_pairs`].
+    has_cancelling_mode_pairs: bool,
     /// One entry per packed coordinate.
     spreads: Vec<ModeSpread>,
     recorded_trajectory: Option<RecordedTrajectory>,
@@ -59,12 +59,17 @@ impl WorkloadMotion {
         for (domain_layout, domain_spreads) in scene.layout.domains.iter().zip(domain_spreads) {
             spreads[domain_layout.first_q..][..domain_spreads.len()].copy_from_slice(&domain_spreads);
         }
-        Self { scene: Arc::clone(scene), is_paired: workload.is_paired, spreads, recorded_trajectory }
+        Self {
+            scene: Arc::clone(scene),
+            has_cancelling_mode_pairs: workload.has_cancelling_mode_pairs,
+            spreads,
+            recorded_trajectory,
+        }
     }
 
     /// The random state of a seed: Gaussian coordinates and small rigid motions. With odd seeds, the terms of U q
-    /// nearly cancel, which amplifies rounding errors: in all rows of U if modes are paired, otherwise in one random
-    /// row per domain.
+    /// nearly cancel, which amplifies rounding errors: in all rows of U if the workload has cancelling mode pairs,
+    /// otherwise in one random row per domain.
     pub fn random_state(&self, seed: usize) -> ExactState {
         // The odd multiplier is 2^64 divided by the golden ratio. It turns consecutive seeds into distant ones.
         let mut rng = Rng::with_seed(0x5EED ^ (seed as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15));
@@ -125,7 +130,7 @@ impl WorkloadMotion {
     fn cancel_displacements(&self, q: &mut [f64], rng: &mut Rng) {
         for (domain, domain_layout) in self.scene.layout.domains.iter().enumerate() {
             let domain_q = &mut q[domain_layout.first_q..][..domain_layout.rank];
-            if self.is_paired {
+            if self.has_cancelling_mode_pairs {
                 domain_q.chunks_exact_mut(2).for_each(|pair| pair[1] = -pair[0]);
             } else if domain_layout.rank > 1 {
                 let modes = &self.scene.shape_of(domain).modes;

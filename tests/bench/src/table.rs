@@ -126,7 +126,9 @@ impl DeformRow {
 }
 
 /// Columns of `report.csv`: name, and JSON pointer of the value in a row of `report.json`. The pointer is empty for
-/// columns that `csv` computes.
+/// columns that `csv` computes. `of_copy` and `of_read` are fractions of peak bandwidths, `of_diagonal` and `of_bound`
+/// are fractions of the scene's diagonal and of the a-priori bound. `step_` columns are errors of the displacement
+/// between consecutive steps. `left_out` is true for a skipped variant.
 const COLUMNS: [(&str, &str); 56] = [
     ("load", "/load"),
     ("variant", "/name"),
@@ -313,7 +315,7 @@ pub(super) mod tests {
             normals_to_surface_degrees: norms,
             tangents_degrees: norms,
             normal_dot_tangent: norms,
-            broken: 0,
+            invalid_directions: 0,
         };
         let value = serde_json::to_value(&full).expect("JSON");
         for (name, pointer) in COLUMNS.iter().filter(|(_, pointer)| !pointer.is_empty()) {

@@ -153,7 +153,7 @@ mod tests {
     }
 
     #[test]
-    fn times_the_minimum_of_runs_after_one_warm_up() {
+    fn wall_clock_runs_one_warm_up_then_at_least_the_minimum() {
         for (cache, replays, expected) in
             [(CacheState::Warm, 2, MIN_REPETITIONS), (CacheState::Warm, 31, 31), (CacheState::Cold, 1, MIN_REPETITIONS)]
         {

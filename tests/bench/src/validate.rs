@@ -334,10 +334,10 @@ impl<'a> VariantCheck<'a> {
             faults
                 .push(format!("error of {of_bound:.3} times its a-priori bound, {not_finite} coordinates not finite"));
         }
-        if orientation.broken > 0 {
+        if orientation.invalid_directions > 0 {
             faults.push(format!(
                 "{} normals or tangents are not finite, too short or of the wrong sign",
-                orientation.broken
+                orientation.invalid_directions
             ));
         }
         ValidationResult {

@@ -1,4 +1,4 @@
-"""Decode the messages of a reply stream to frames, vertices, states and forces, one decoder per call."""
+"""Decoders of reply streams: frames, vertices, states and forces. Each call has its own decoder."""
 
 from __future__ import annotations
 
@@ -60,10 +60,10 @@ def parse(name: str, message: type[MessageT], content: bytes) -> MessageT:
 
 
 class FrameDecoder:
-    """Collects the frames of all pictures of a step."""
+    """Collects the pictures of a step (one per camera and output) and groups them into one frame per camera."""
 
     def __init__(self, names: Sequence[str], camera_count: int, chunk_field: int) -> None:
-        """Prepares for the outputs `names` of each camera. `chunk_field` is the field of the chunk in the message."""
+        """`names` are the outputs of each camera. `chunk_field` is the field of the chunk in the message."""
         self._names = names
         self._picture_count = len(names) * camera_count
         self._format = ChunkFormat("frame", frames_pb2.FrameChunk, chunk_field, data_field=3)
@@ -128,7 +128,7 @@ class VertexSetDecoder:
 
 
 class SceneStateDecoder:
-    """Decodes complete states from states and their changes."""
+    """Reconstructs the complete state of every step from a stream of complete states and changes."""
 
     def __init__(self, layout: StateLayout, chunk_field: int) -> None:
         self._format = ChunkFormat("states", states_pb2.StateChunk, chunk_field, data_field=3)
@@ -150,7 +150,7 @@ class SceneStateDecoder:
 
 
 class ForceDecoder:
-    """Decodes sets of forces, of which each is one message."""
+    """Decodes sets of forces. Each set is one message."""
 
     def add(self, message: bytes) -> ForceSet:
         """Returns the forces of the message."""

@@ -59,7 +59,7 @@ def force_messages(domains: Domains, forces: Sequence[Force]) -> list[forces_pb2
     """The messages of a list of forces; the id of a force is its index in the list.
 
     Raises:
-        KeyError: No domain has a name.
+        KeyError: A domain name is unknown.
         ValueError: A modal force does not have one number per mode.
     """
     messages: list[forces_pb2.Force] = []
@@ -96,7 +96,7 @@ class ForceSet:
     """All forces in a scene.
 
     Attributes:
-        step: The step with whose transforms `f_q` of surface forces was computed; None without surface forces.
+        step: The step whose transforms were used to compute `f_q` of surface forces; None without surface forces.
         forces: Ordered by owner.
     """
 

@@ -16,7 +16,7 @@ from modalcast.v1 import scenes_pb2
 
 ArrayName: TypeAlias = Literal["indices", "corner_vertices", "rest_positions", "uvs", "rest_normals", "modes"]
 
-# Number in the contract, type, and number of columns. The modes have `rank` columns.
+# Value of the enum `Array`, type, and number of columns. The modes have `rank` columns.
 _ARRAYS: dict[str, tuple[scenes_pb2.Array, str, int | None]] = {
     "indices": (scenes_pb2.ARRAY_INDICES, "<u4", 3),
     "corner_vertices": (scenes_pb2.ARRAY_CORNER_VERTICES, "<u4", 1),
@@ -213,8 +213,8 @@ class SceneDescription:
         return self.shapes[domain.shape]
 
 
-def array_numbers(names: Sequence[str]) -> list[scenes_pb2.Array]:
-    """The numbers of arrays in the contract.
+def array_enum_values(names: Sequence[str]) -> list[scenes_pb2.Array]:
+    """The values of the enum `Array` in the contract.
 
     Raises:
         ValueError: A name is unknown.

@@ -87,7 +87,7 @@ class StepValues:
         """The message with the given values and the transforms of attached domains that change.
 
         Raises:
-            KeyError: No domain has a name.
+            KeyError: A domain name is unknown.
             ValueError: An array has another shape, or a domain has no coordinates or no transform of its own.
         """
         step = steps_pb2.Step(number=number, time=time)

@@ -32,7 +32,8 @@ _ENCODINGS: dict[str, vertices_pb2.Encoding] = {
     "u16_box": vertices_pb2.ENCODING_U16_BOX,
     "octahedral_i16": vertices_pb2.ENCODING_OCTAHEDRAL_I16,
 }
-_BOX_VECTORS = 256
+# Number of consecutive vectors that share a box in ENCODING_U16_BOX.
+_VECTORS_PER_BOX = 256
 
 
 def vertex_selection(
@@ -41,7 +42,7 @@ def vertex_selection(
     """The message of a selection. An empty list selects all domains.
 
     Raises:
-        KeyError: No domain has a name.
+        KeyError: A domain name is unknown.
         ValueError: An attribute or an encoding is unknown, or no attribute is selected.
     """
     encodings = dict(attributes) if isinstance(attributes, Mapping) else dict.fromkeys(attributes, "f32")
@@ -61,8 +62,8 @@ def vertex_selection(
     )
 
 
-def check_out(out: F32, vertex_count: int) -> Bytes:
-    """The bytes of an array for positions.
+def output_bytes(out: F32, vertex_count: int) -> Bytes:
+    """The bytes of `out`, an array of the caller that receives positions.
 
     Raises:
         ValueError: The array has another shape or type, is not C-contiguous, or is read-only.
@@ -177,7 +178,7 @@ class VertexDecoder:
 
 def decode_vectors(encoding: int, count: int, data: Bytes) -> F32:
     """Decodes `count` vectors to count x 3. f32 vectors are a view of `data`."""
-    boxes = -(-count // _BOX_VECTORS)
+    boxes = -(-count // _VECTORS_PER_BOX)
     sizes: dict[int, int] = {
         vertices_pb2.ENCODING_UNSPECIFIED: 12 * count,
         vertices_pb2.ENCODING_F32: 12 * count,
@@ -191,7 +192,7 @@ def decode_vectors(encoding: int, count: int, data: Bytes) -> F32:
         return data.view("<f2").astype(np.float32).reshape(-1, 3)
     if encoding == vertices_pb2.ENCODING_U16_BOX:
         corners = data[: 24 * boxes].view("<f4").reshape(-1, 2, 3).astype(np.float64)
-        box_of_vector = np.arange(count) // _BOX_VECTORS
+        box_of_vector = np.arange(count) // _VECTORS_PER_BOX
         minimum, maximum = corners[box_of_vector, 0], corners[box_of_vector, 1]
         codes = data[24 * boxes :].view("<u2").reshape(-1, 3)
         return (minimum + codes * ((maximum - minimum) / 65535)).astype(np.float32)

@@ -349,7 +349,7 @@ fn add_follow_constraints(entry: &DomainEntry, domains: &mut [Domain]) -> Result
     }
     match has_followers {
         true => Ok(()),
-        false => Err(invalid("follows", "a name prefix of domains with a parent", prefix)),
+        false => Err(invalid("follows", "a prefix of the name of a domain that has a parent", prefix)),
     }
 }
 

@@ -84,7 +84,7 @@ struct DomainEntry {
     frame: Option<Placement>,
     /// Vertices of the parent that carry the model.
     parent_vertices: Option<Vec<u32>>,
-    /// Name prefix of the domains that move rigidly with their parent.
+    /// Prefix of names. The domains whose names start with it move rigidly with their parents.
     follows: Option<String>,
     material: Option<MaterialPatch>,
     /// Eigenvalues in (rad/s)^2, one per mode; stored for clients.

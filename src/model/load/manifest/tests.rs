@@ -151,8 +151,9 @@ fn child_attaches_by_frame_or_by_placement() {
     }
 }
 
+/// The value of `follows` is a prefix of domain names. The empty prefix matches all domains of the entry.
 #[test]
-fn follows_key_constrains_domains_by_name_prefix() {
+fn follows_constrains_the_domains_whose_names_have_its_prefix() {
     let read_child = |follows_line: &str| {
         read_parts(&format!(
             "[[domain]]\nname = 'trunk'\nmodel = 'a.obj'\nplacement = {{ translation = [10, 0, 0], axis = [0, 0, 1], degrees = 90 }}\n\
@@ -170,7 +171,7 @@ fn follows_key_constrains_domains_by_name_prefix() {
     let differences = scene.domains[1].placement.0.iter().zip(placement.0).map(|(a, b)| (a - b).abs());
     assert!(differences.fold(0.0, f32::max) < 1e-5, "expected an unchanged placement");
     let message = read_child("follows = 'nobody'\n").map(drop).expect_err("an unknown prefix").to_string();
-    assert!(message.contains("follows: expected a name prefix of domains with a parent"), "{message}");
+    assert!(message.contains("follows: expected a prefix of the name of a domain that has a parent"), "{message}");
 }
 
 #[test]

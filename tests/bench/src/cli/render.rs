@@ -6,7 +6,7 @@ use crate::render::workloads::RenderWorkload;
 use crate::render::{self, RenderReport, RenderReportOptions, variants};
 use crate::thesis::PLANTS;
 use modalcast::cli::options::with_spinner;
-use modalcast::cli::{Outcome, print_line};
+use modalcast::cli::{Completion, Outcome, print_line};
 use modalcast_model::error::{Result, invalid};
 use modalcast_model::scene::FrameSize;
 
@@ -92,7 +92,7 @@ pub(super) fn run(args: &Args) -> Outcome {
     report.write(&args.out)?;
     report_lines(&report).into_iter().for_each(print_line);
     print_line(format!("written to {}", args.out.display()));
-    Ok(report.passed())
+    Ok(Completion::of_check(report.passed()))
 }
 
 fn run_raster_comparison(args: &Args, options: &RenderReportOptions) -> Outcome {
@@ -102,7 +102,7 @@ fn run_raster_comparison(args: &Args, options: &RenderReportOptions) -> Outcome 
     comparisons.rows.iter().for_each(|row| print_line(row.line()));
     comparisons.frames.iter().for_each(|row| print_line(row.line()));
     print_line(format!("written to {}", args.out.display()));
-    Ok(comparisons.passed())
+    Ok(Completion::of_check(comparisons.passed()))
 }
 
 fn run_figures(args: &Args) -> Outcome {
@@ -115,7 +115,7 @@ fn run_figures(args: &Args) -> Outcome {
         print_line(format!("{:<6}{:<36}{}", figure.name, figure.file, figure.captions.join("; ")));
     }
     print_line(format!("written to {}", args.out.display()));
-    Ok(true)
+    Ok(Completion::Success)
 }
 
 fn run_frame_times(args: &Args) -> Outcome {
@@ -136,7 +136,7 @@ fn run_frame_times(args: &Args) -> Outcome {
         ));
     }
     print_line(format!("written to {}", args.out.display()));
-    Ok(true)
+    Ok(Completion::Success)
 }
 
 /// The requested or default size.

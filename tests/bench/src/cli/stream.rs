@@ -6,7 +6,7 @@ use crate::stream::peers::{self, PeerJob};
 use crate::stream::{self, CASE_HELP, CaseReport, CaseResult, StreamProgress, StreamReport, StreamReportOptions};
 use crate::workloads::Size;
 use modalcast::cli::options::with_spinner;
-use modalcast::cli::{Outcome, print_line};
+use modalcast::cli::{Completion, Outcome, print_line};
 use modalcast_model::error::invalid;
 
 const EXAMPLES: &str = "Examples:
@@ -60,14 +60,14 @@ pub(super) fn run(args: &Args) -> Outcome {
     let report = with_spinner("measuring", || stream::measure(&options, on_progress))?;
     report_lines(&report).into_iter().for_each(print_line);
     print_line(format!("written to {}", args.out.display()));
-    Ok(report.passed())
+    Ok(Completion::of_check(report.passed()))
 }
 
 /// Runs as a child process of a report.
 pub(super) fn run_peer(job: &str) -> Outcome {
     let job: PeerJob = serde_json::from_str(job).map_err(|error| invalid("job", "a job as JSON", error))?;
     peers::run(&job)?;
-    Ok(true)
+    Ok(Completion::Success)
 }
 
 fn report_options(args: &Args) -> StreamReportOptions {

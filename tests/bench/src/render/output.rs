@@ -12,8 +12,15 @@ use modalcast_model::error::{Result, fault_in};
 
 /// Columns of `report.csv`: the name, and the source of the value. The source is a JSON pointer into a row of
 /// `report.json`, or the name of a pass whose time the column contains. It is empty for `faults`, which [`cell_text`]
-/// joins. `of_aim` in a name means an error against the intended result; other errors are against the reference with
-/// hard shadows. `listed` triangles are passed to the rasterizer, `hidden` triangles are occluded.
+/// joins. Names that do not explain themselves:
+///
+/// - `color`, `light`: errors against the reference with hard shadows; `light` is the sun visibility
+/// - `of_aim`: errors against the intended result: no shadow, a hard shadow, or a hard shadow with the variant's blur
+/// - `bleeding`, `penumbra`, `lost`: of `light_of_aim`: mean sun visibility in the umbra, errors in the penumbra, and mean
+///   missing sun visibility where the reference has no shadow
+/// - `to_fail`: whether the variant is expected to exceed its bounds
+/// - `no_flicker`: why flicker was not measured
+/// - `listed`, `hidden`: triangles that are passed to the rasterizer, and triangles that are occluded
 const COLUMNS: [(&str, &str); 55] = [
     ("load", "/load"),
     ("variant", "/name"),
@@ -111,7 +118,8 @@ fn rows_csv(rows: &[RenderRow]) -> Result<Vec<u8>> {
 }
 
 /// The CSV of minimal passes, rasterizers and blurs. Each line has the time of a pass, `median_us`. The columns
-/// `beside` and `beside_us` are the name and the time of the frame or pass that it is compared with.
+/// `beside` and `beside_us` are the name and the time of the frame or pass that it is compared with. The minimal passes
+/// are named `bare` passes.
 fn passes_csv(report: &RenderReport) -> Result<Vec<u8>> {
     let header =
         ["load", "what", "size", "samples_or_taps", "median_us", "beside", "beside_us", "difference_us", "ratio"];
@@ -166,7 +174,8 @@ fn passes_csv(report: &RenderReport) -> Result<Vec<u8>> {
     encode_csv(header.map(String::from), lines)
 }
 
-/// The CSV of plants, one plant per line: our measurements, then the measurements of the thesis.
+/// The CSV of plants, one plant per line: our measurements, then the measurements of the thesis. `t_vbr` and `o_vbr` are
+/// defined in [`super::plants`].
 fn plants_csv(plants: &[PlantResult]) -> Result<Vec<u8>> {
     let header =
         ["load", "species", "full", "backend", "shared", "triangles", "domains", "map_size", "deform_ms", "upload_ms"];

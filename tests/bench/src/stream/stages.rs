@@ -1,8 +1,8 @@
 //! The rate of each stage between the physics process and the viewers, and the slowest stage.
 //!
 //! The rate of a stage is the number of steps per second that it could process if no other stage limited it. For a stage
-//! of the server, it is the number of threads that run the stage in parallel, divided by its median time per step. All
-//! views of a step count: the drawing time of a step is the sum over the distinct views. The time that a step waits in
+//! of the server, it is the number of threads that run the stage in parallel, divided by its median time per step. The
+//! drawing time of a step includes all its views: it is the sum over the distinct views. The time that a step waits in
 //! the step queue is not a stage.
 
 use std::collections::BTreeMap;
@@ -16,7 +16,8 @@ use modalcast::frame::PngLayout;
 /// The stages that run one after the other on the GPU, or on the CPU if the machine has no GPU.
 const DEVICE_STAGES: [&str; 4] = ["deform", "upload", "shadow", "draw"];
 
-/// Names of the stages whose part of a group's time is below this fraction are omitted.
+/// Stages that share a resource are reported as one group. A stage that takes less than this fraction of the group's time
+/// is not named.
 const MIN_NAMED_FRACTION: f64 = 0.05;
 
 /// One stage, or several that share a resource.
@@ -46,7 +47,7 @@ impl StageRate {
     }
 }
 
-/// What is measured of a case, from which the rates of its stages follow.
+/// Measurements of one benchmark case, from which [`Self::rates`] computes the rate of each stage.
 pub(super) struct StageInputs<'a> {
     pub(super) server: &'a ServerInfo,
     /// Threads of the machine.

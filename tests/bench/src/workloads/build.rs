@@ -19,7 +19,7 @@ pub(super) fn build(kind: WorkloadKind, size: Size) -> Result<Workload> {
         size: 1.0,
         seed: part_seed(&kind.name(), 0),
     };
-    // Workloads that measure positions only have no more corners than a mesh needs.
+    // A workload that measures only positions has one triangle, because a mesh needs at least one.
     let with_one_triangle =
         |patch: PatchSpec| PatchSpec { corners: 3, triangles: PatchTopology::SingleTriangle, ..patch };
     let (patches, has_normal_map) = match kind {
@@ -43,13 +43,15 @@ pub(super) fn build(kind: WorkloadKind, size: Size) -> Result<Workload> {
     };
     let mut remarks = Vec::new();
     if size == Size::Quick {
-        remarks.push(format!("quick: 1/{QUICK_DIVISOR} of the vertices of one domain, or of the domains"));
+        remarks
+            .push(format!("quick: 1/{QUICK_DIVISOR} of the vertices (one domain) or of the domains (several domains)"));
     }
-    let is_paired = kind == WorkloadKind::Cancelling;
-    let shapes = patches.par_iter().map(|patch| build_shape(patch, is_paired)).collect::<Result<Vec<_>>>()?;
+    let has_cancelling_mode_pairs = kind == WorkloadKind::Cancelling;
+    let shapes =
+        patches.par_iter().map(|patch| build_shape(patch, has_cancelling_mode_pairs)).collect::<Result<Vec<_>>>()?;
     let domains = if kind == WorkloadKind::Batch { 16 } else { shapes.len() };
     let scene = build_patch_scene(kind.name(), shapes, domains, has_normal_map)?;
-    Ok(Workload { is_paired, remarks, ..Workload::new(kind.name(), scene) })
+    Ok(Workload { has_cancelling_mode_pairs, remarks, ..Workload::new(kind.name(), scene) })
 }
 
 /// `count` patches. `random_size` returns the number of vertices and the rank of a patch.
@@ -99,7 +101,7 @@ mod tests {
     }
 
     #[test]
-    fn workload_a_has_tangents_unless_named_a_positions() {
+    fn workload_a_has_tangents_and_a_positions_has_none() {
         let build_scene = |kind: WorkloadKind| kind.build(Size::Quick).expect("a workload").scene;
         let scene = build_scene(WorkloadKind::OneDomain { has_normal_map: true });
         // 1.5 M vertices divided by QUICK_DIVISOR.

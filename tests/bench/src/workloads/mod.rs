@@ -63,7 +63,7 @@ pub struct Workload {
     /// Whether the CUDA deformer batches domains that share a U.
     pub batches: BatchPolicy,
     /// Whether modes 2k and 2k + 1 are nearly equal, so that opposite coordinates nearly cancel.
-    pub is_paired: bool,
+    pub has_cancelling_mode_pairs: bool,
     /// Index into [`PLANTS`], if the scene is one of the thesis's plants.
     pub thesis_plant: Option<usize>,
     /// Deviations from the size that the name states.
@@ -71,9 +71,16 @@ pub struct Workload {
 }
 
 impl Workload {
-    /// A workload with the default batching, without paired modes and remarks.
+    /// A workload with the default batching, without cancelling mode pairs and remarks.
     pub fn new(name: String, scene: Arc<Scene>) -> Self {
-        Self { name, scene, batches: BatchPolicy::default(), is_paired: false, thesis_plant: None, remarks: Vec::new() }
+        Self {
+            name,
+            scene,
+            batches: BatchPolicy::default(),
+            has_cancelling_mode_pairs: false,
+            thesis_plant: None,
+            remarks: Vec::new(),
+        }
     }
 }
 

@@ -45,8 +45,8 @@ pub(super) fn part_seed(name: &str, index: usize) -> u64 {
     Rng::with_seed(hash).u64(..)
 }
 
-/// Builds the mesh and the modes of a patch. `is_paired`: see [`random_modes`].
-pub(super) fn build_shape(patch: &PatchSpec, is_paired: bool) -> Result<Shape> {
+/// Builds the mesh and the modes of a patch. `has_cancelling_mode_pairs`: see [`random_modes`].
+pub(super) fn build_shape(patch: &PatchSpec, has_cancelling_mode_pairs: bool) -> Result<Shape> {
     let mut rng = Rng::with_seed(patch.seed);
     let grid_columns = (patch.vertices as f64).sqrt().ceil().max(1.0) as usize;
     let spacing = patch.size / grid_columns as f32;
@@ -71,7 +71,7 @@ pub(super) fn build_shape(patch: &PatchSpec, is_paired: bool) -> Result<Shape> {
         }
     };
     let mesh = Mesh::new(positions, Corners { vertices, normals, uvs }, triangles)?;
-    Shape::new(mesh, random_modes(patch, is_paired)?)
+    Shape::new(mesh, random_modes(patch, has_cancelling_mode_pairs)?)
 }
 
 /// Triangles as indices of corners. `grid_columns`: vertices per row of the grid.
@@ -108,9 +108,9 @@ fn patch_triangles(patch: &PatchSpec, grid_columns: usize) -> Vec<[u32; 3]> {
     }
 }
 
-/// Modes with entries uniform in [-1, 1); every column has its own seed. If `is_paired`, columns 2k and 2k + 1 are
-/// equal up to a relative difference of at most 5e-5.
-fn random_modes(patch: &PatchSpec, is_paired: bool) -> Result<Modes> {
+/// Modes with entries uniform in [-1, 1); every column has its own seed. If `has_cancelling_mode_pairs`, columns 2k and
+/// 2k + 1 are equal up to a relative difference of at most 5e-5.
+fn random_modes(patch: &PatchSpec, has_cancelling_mode_pairs: bool) -> Result<Modes> {
     let rows = 3 * patch.vertices;
     if patch.rank == 0 {
         return Ok(Modes::rigid());
@@ -120,7 +120,7 @@ fn random_modes(patch: &PatchSpec, is_paired: bool) -> Result<Modes> {
         let mut rng = Rng::with_seed(patch.seed ^ (1 + column as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15));
         entries.iter_mut().for_each(|entry| *entry = 2.0 * rng.f32() - 1.0);
     });
-    if is_paired {
+    if has_cancelling_mode_pairs {
         entries.par_chunks_mut(2 * rows).for_each(|pair| {
             let mut rng = Rng::with_seed(patch.seed);
             let (left, right) = pair.split_at_mut(rows);
@@ -173,8 +173,8 @@ mod tests {
     use super::*;
 
     #[test]
-    fn only_paired_modes_are_nearly_equal() {
-        let max_difference = |is_paired: bool| {
+    fn modes_are_nearly_equal_only_in_cancelling_pairs() {
+        let max_difference = |has_cancelling_mode_pairs: bool| {
             let modes = random_modes(
                 &PatchSpec {
                     vertices: 50,
@@ -184,7 +184,7 @@ mod tests {
                     size: 1.0,
                     seed: 5,
                 },
-                is_paired,
+                has_cancelling_mode_pairs,
             );
             let modes = modes.expect("modes");
             modes.column(0).iter().zip(modes.column(1)).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max)

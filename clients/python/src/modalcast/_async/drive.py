@@ -107,7 +107,7 @@ class Drive:
             The step, which `Scene.frame` and other calls accept.
 
         Raises:
-            KeyError: No domain has a name; the message lists near names.
+            KeyError: A domain name is unknown; the message lists near names.
             ValueError: An array has another shape, with the expected and the given one; or the drive is closed.
             InvalidRequest: The server rejected this step or, without `wait`, an earlier one. The drive remains open.
             LeaseLost: Another writer has taken over the scene.

@@ -40,7 +40,7 @@ from modalcast.kinematics import Kinematics
 from modalcast.scene_description import ArrayName, Domain, Domains, SceneDescription
 from modalcast.states import SceneState, StateLayout
 from modalcast.v1 import common_pb2, forces_pb2, frames_pb2, scenes_pb2, states_pb2, steps_pb2, vertices_pb2
-from modalcast.vertices import Attributes, VertexSet, check_out, vertex_selection
+from modalcast.vertices import Attributes, VertexSet, output_bytes, vertex_selection
 from modalcast.viewer import ViewerLink, viewer_link
 
 if TYPE_CHECKING:
@@ -136,7 +136,7 @@ class Scene:
             timeout: In seconds, for each call; None: that of the client.
 
         Raises:
-            KeyError: No domain has a name.
+            KeyError: A domain name is unknown.
             OSError: The folder cannot be written.
             Error: The call failed.
         """
@@ -403,7 +403,7 @@ class Scene:
             ValueError: `out` has another shape or type.
             Error: The call failed.
         """
-        target = None if out is None else check_out(out, self.vertex_count)
+        target = None if out is None else output_bytes(out, self.vertex_count)
         selection = vertex_selection(self.domains, (), ("positions",))
         vertex_set = await self._vertex_set(
             selection, lambda: VertexSetDecoder(1, 2, target), step, exact=exact, timeout=timeout
@@ -430,7 +430,7 @@ class Scene:
             step, exact, timeout: As for the class.
 
         Raises:
-            KeyError: No domain has a name.
+            KeyError: A domain name is unknown.
             ValueError: An attribute or an encoding is unknown.
             Error: The call failed.
         """
@@ -449,7 +449,7 @@ class Scene:
         """Iterates over the vertices of steps; `vertex_set` and `frames` document the arguments.
 
         Raises:
-            KeyError: No domain has a name.
+            KeyError: A domain name is unknown.
             ValueError: An argument is invalid.
             Error: The call failed.
         """
@@ -605,7 +605,7 @@ class Scene:
             The number of this client in `ForceSet.forces`; 0 without forces.
 
         Raises:
-            KeyError: No domain has a name.
+            KeyError: A domain name is unknown.
             ValueError: A modal force does not have one number per mode.
             Error: The call failed.
         """

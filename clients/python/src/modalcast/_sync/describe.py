@@ -25,7 +25,7 @@ from modalcast.scene_description import (
     SceneDescription,
     Shape,
     Texture,
-    array_numbers,
+    array_enum_values,
     decode_array,
     domain_from_message,
     material_from_message,
@@ -59,13 +59,13 @@ def read_description(
     request = scenes_pb2.DescribeSceneRequest(
         scene=scene,
         domains=domains,
-        arrays=[] if cache is not None else array_numbers(arrays),
+        arrays=[] if cache is not None else array_enum_values(arrays),
         hashes=hashes or by_hash,
     )
     description = _read_parts(transport.stream(DESCRIBE_SCENE, request, timeout))
     if not by_hash:
         return description
-    array_numbers(arrays)
+    array_enum_values(arrays)  # Raises if a name is unknown.
     wanted: dict[bytes, int] = {}
     if cache is not None:
         for shape in description.shapes.values():

@@ -238,7 +238,8 @@ impl<'a> NvrtcProgram<'a> {
 
 impl Drop for NvrtcProgram<'_> {
     fn drop(&mut self) {
-        // SAFETY: the handle came from `create` and is destroyed once. After a failure no cleanup remains.
+        // SAFETY: the handle came from `create` and is destroyed once.
+        // If destruction fails, nothing can be done, so the error is ignored.
         let _ = unsafe { (self.functions.destroy)(&mut self.handle) };
     }
 }
