@@ -1,6 +1,6 @@
 // AOV (arbitrary output variable) readback of one field: DEPTH, DEPTH_WITH_GROUND, NORMALS or VALUES. The macro of
-// that name is defined. SAMPLES is 1 except with VALUES. HAS_GROUND is defined with DEPTH_WITH_GROUND in scenes that have
-// a ground plane.
+// that name is defined. SAMPLES is 1 except with VALUES. HAS_GROUND is defined with DEPTH_WITH_GROUND in scenes that
+// have a ground plane.
 //   ids      (in)  [height][width][SAMPLES]  R32UI, bottom row first; NO_ID where no surface is visible
 //   values   (in)  [vertices]                a scalar per vertex, with VALUES
 //   words    (out) top row first, one of
@@ -84,8 +84,8 @@ void main() {
     uint output_index = uint(size.y - 1 - pixel.y) * uint(size.x) + uint(pixel.x);
     float scale = intBitsToFloat(scale_bits);
     for (int sample_index = 0; sample_index < SAMPLES; sample_index++) {
-        // `load_id` checks the depth because multisampled ids are normally not cleared and may be stale. The id image of
-        // this pass is cleared, so the check is not needed.
+        // `load_id` checks the depth because multisampled ids are normally not cleared and may be stale. The id image
+        // of this pass is cleared, so the check is not needed.
         uint id = texelFetch(ids, pixel, sample_index).x;
         vec2 ndc = 2.0 * (vec2(pixel) + SAMPLE_POSITIONS[sample_index]) / vec2(size) - 1.0;
 #if defined(DEPTH) || defined(DEPTH_WITH_GROUND)

@@ -1,7 +1,7 @@
 //! Budgets for the bytes of messages that are being received, per connection and in total.
 //!
-//! tonic allocates the memory of a whole message as soon as it has read the message's length, and holds it until the last
-//! byte has arrived. A message therefore counts with its whole length as soon as its header has arrived. A message that
+//! tonic allocates the memory of a whole message as soon as it has read the message's length, and holds it until the
+//! last byte has arrived. A message therefore counts with its whole length as soon as its header has arrived. A message that
 //! exceeds the budget of its connection is rejected. If the total is exhausted, the connection that holds the most bytes
 //! loses its incomplete messages, so that a few connections with half-sent messages do not block the others.
 

@@ -1,5 +1,6 @@
-//! Persistent counter of runs. A run is the sequence of steps from one writer; its number is `StepId.run`. Each new writer
-//! gets the next number, which is on disk before it is returned, so that no number is used twice, even after a crash.
+//! Persistent counter of runs. A run is the sequence of steps from one writer; its number is `StepId.run`. Each new
+//! writer gets the next number, which is on disk before it is returned, so that no number is used twice, even after a
+//! crash.
 
 use std::fs;
 use std::io::ErrorKind;

@@ -16,8 +16,8 @@ use modalcast::frame::PngLayout;
 /// The stages that run one after the other on the GPU, or on the CPU if the machine has no GPU.
 const DEVICE_STAGES: [&str; 4] = ["deform", "upload", "shadow", "draw"];
 
-/// Stages that share a resource are reported as one group. A stage that takes less than this fraction of the group's time
-/// is not named.
+/// Stages that share a resource are reported as one group. A stage that takes less than this fraction of the group's
+/// time is not named.
 const MIN_NAMED_FRACTION: f64 = 0.05;
 
 /// One stage, or several that share a resource.
