@@ -60,7 +60,7 @@ impl VertexImporter for SceneVertices {
         let bytes = ranges.iter().map(|range| range.end).max().unwrap_or(0);
         let _current = self.gl.make_current()?;
         Ok(Box::new(SharedVertices {
-            memory: self.gl.import_buffer(descriptor, allocated_bytes, bytes)?,
+            memory: Buffer::import(&self.gl, descriptor, allocated_bytes, bytes)?,
             gl: Rc::clone(&self.gl),
             copy_words: Rc::clone(&self.copy_words),
             destinations: Rc::clone(&self.destinations),

@@ -1,4 +1,4 @@
-//! Buffers in memory of another API, imported through a file descriptor (`GL_EXT_memory_object_fd`).
+//! Memory of another API, imported through a file descriptor (`GL_EXT_memory_object_fd`).
 
 use std::ffi::c_void;
 use std::os::fd::{AsRawFd as _, IntoRawFd as _, OwnedFd};
@@ -6,7 +6,7 @@ use std::rc::Rc;
 
 use glow::HasContext as _;
 
-use super::{Buffer, Gl};
+use super::Gl;
 use modalcast_model::error::{Result, fault, fault_in};
 
 /// GL_DEDICATED_MEMORY_OBJECT_EXT.
@@ -35,40 +35,11 @@ struct MemoryObjectFunctions {
 pub(super) struct MemoryObject {
     gl: Rc<Gl>,
     name: u32,
-    delete: DeleteMemoryObjects,
+    allocated_bytes: u64,
+    functions: MemoryObjectFunctions,
 }
 
 impl Gl {
-    /// Creates a buffer of `bytes` bytes at the start of another API's memory of `allocated_bytes` bytes. The memory lives
-    /// at least as long as the buffer. OpenGL does not order its commands with those of the other API.
-    ///
-    /// # Errors
-    /// `Fault` when the context cannot import memory, refuses this memory, or the memory is smaller than the buffer.
-    pub(crate) fn import_buffer(
-        self: &Rc<Self>,
-        descriptor: OwnedFd,
-        allocated_bytes: u64,
-        bytes: u64,
-    ) -> Result<Buffer> {
-        if bytes > allocated_bytes {
-            return Err(fault("import", format!("expected at least {bytes} bytes of memory, got {allocated_bytes}")));
-        }
-        let size = i32::try_from(bytes).map_err(fault_in("import"))?;
-        let functions = self.memory_object_functions()?;
-        let memory = MemoryObject::import(self, &functions, descriptor, allocated_bytes)?;
-        let gl = self.functions()?;
-        // SAFETY: a new name, which the buffer owns.
-        let name = unsafe { gl.create_buffer() }.map_err(fault_in("import"))?;
-        let memory_name = memory.name;
-        let buffer = Buffer::in_memory(self, name, bytes, memory);
-        // SAFETY: the function has the signature of the extension. The memory object has at least `size` bytes.
-        unsafe {
-            gl.bind_buffer(glow::COPY_WRITE_BUFFER, Some(name));
-            (functions.create_storage)(glow::COPY_WRITE_BUFFER, size as isize, memory_name, 0);
-        }
-        self.check("import").map(|()| buffer)
-    }
-
     /// # Errors
     /// `Fault` when the context lacks the extension.
     fn memory_object_functions(&self) -> Result<MemoryObjectFunctions> {
@@ -96,12 +67,11 @@ impl Gl {
 
 impl MemoryObject {
     /// Imports memory as a dedicated object. Without this flag, CUDA does not see what OpenGL writes on some drivers.
-    fn import(
-        gl: &Rc<Gl>,
-        functions: &MemoryObjectFunctions,
-        descriptor: OwnedFd,
-        allocated_bytes: u64,
-    ) -> Result<Self> {
+    ///
+    /// # Errors
+    /// `Fault` when the context cannot import memory or refuses this memory.
+    pub(super) fn import(gl: &Rc<Gl>, descriptor: OwnedFd, allocated_bytes: u64) -> Result<Self> {
+        let functions = gl.memory_object_functions()?;
         let _current = gl.make_current()?;
         let mut name = 0;
         // SAFETY: the functions have the signatures of the extension, and write or read one number.
@@ -109,7 +79,7 @@ impl MemoryObject {
             (functions.create)(1, &raw mut name);
             (functions.set_parameter)(name, DEDICATED_MEMORY_OBJECT, &1);
         }
-        let memory = Self { gl: Rc::clone(gl), name, delete: functions.delete };
+        let memory = Self { gl: Rc::clone(gl), name, allocated_bytes, functions };
         gl.check("import")?;
         // SAFETY: as above. The descriptor is open.
         unsafe { (functions.import)(name, allocated_bytes, HANDLE_TYPE_OPAQUE_FD, descriptor.as_raw_fd()) };
@@ -118,12 +88,34 @@ impl MemoryObject {
         let _ = descriptor.into_raw_fd();
         Ok(memory)
     }
+
+    /// Gives a buffer without storage its storage: the first `bytes` bytes of this memory, which must live as long as the
+    /// buffer.
+    ///
+    /// # Errors
+    /// `Fault` when the memory is smaller, or OpenGL reports an error.
+    pub(super) fn create_storage(&self, buffer: glow::Buffer, bytes: u64) -> Result<()> {
+        if bytes > self.allocated_bytes {
+            return Err(fault(
+                "import",
+                format!("expected at least {bytes} bytes of memory, got {}", self.allocated_bytes),
+            ));
+        }
+        let size = i32::try_from(bytes).map_err(fault_in("import"))?;
+        let gl = self.gl.functions()?;
+        // SAFETY: the function has the signature of the extension. The memory object has at least `size` bytes.
+        unsafe {
+            gl.bind_buffer(glow::COPY_WRITE_BUFFER, Some(buffer));
+            (self.functions.create_storage)(glow::COPY_WRITE_BUFFER, size as isize, self.name, 0);
+        }
+        self.gl.check("import")
+    }
 }
 
 impl Drop for MemoryObject {
     fn drop(&mut self) {
         // SAFETY: this value owns the name. The buffer in the memory is already deleted, and commands in flight keep the
         // memory until they are complete.
-        self.gl.delete(|_| unsafe { (self.delete)(1, &raw const self.name) });
+        self.gl.delete(|_| unsafe { (self.functions.delete)(1, &raw const self.name) });
     }
 }

@@ -2,13 +2,14 @@
 //! the object) and deletes the object when dropped. An object that refers to other objects shares their ownership, so
 //! that they are deleted later.
 
+use std::os::fd::OwnedFd;
 use std::rc::Rc;
 
 use glow::HasContext as _;
 
 use super::Gl;
 use super::external_memory::MemoryObject;
-use modalcast_model::error::{Result, fault};
+use modalcast_model::error::{Result, fault, fault_in};
 use modalcast_model::raster::{GlBuffer, GlBufferOwner};
 
 /// A buffer object of fixed size.
@@ -24,7 +25,7 @@ pub(super) struct BufferObject {
     pub(super) gl: Rc<Gl>,
     name: glow::Buffer,
     /// The imported memory of the buffer. Fields are dropped after `drop` has deleted the buffer.
-    _memory: Option<MemoryObject>,
+    memory: Option<MemoryObject>,
 }
 
 /// Storage parameters of a texture.
@@ -123,12 +124,23 @@ impl Drop for ReadMapping<'_> {
 impl Buffer {
     /// Takes ownership of a name whose storage has `bytes` bytes.
     pub(super) fn new(gl: &Rc<Gl>, name: glow::Buffer, bytes: u64) -> Self {
-        Self { object: Rc::new(BufferObject { gl: Rc::clone(gl), name, _memory: None }), bytes }
+        Self { object: Rc::new(BufferObject { gl: Rc::clone(gl), name, memory: None }), bytes }
     }
 
-    /// Takes ownership of a name whose storage is the first `bytes` bytes of imported memory.
-    pub(super) fn in_memory(gl: &Rc<Gl>, name: glow::Buffer, bytes: u64, memory: MemoryObject) -> Self {
-        Self { object: Rc::new(BufferObject { gl: Rc::clone(gl), name, _memory: Some(memory) }), bytes }
+    /// Creates a buffer of `bytes` bytes at the start of another API's memory of `allocated_bytes` bytes. The memory lives
+    /// at least as long as the buffer. OpenGL does not order its commands with those of the other API.
+    ///
+    /// # Errors
+    /// `Fault` when the context cannot import memory, refuses this memory, or the memory is smaller than the buffer.
+    pub(crate) fn import(gl: &Rc<Gl>, descriptor: OwnedFd, allocated_bytes: u64, bytes: u64) -> Result<Self> {
+        let memory = MemoryObject::import(gl, descriptor, allocated_bytes)?;
+        // SAFETY: a new name, which the buffer owns.
+        let name = unsafe { gl.functions()?.create_buffer() }.map_err(fault_in("import"))?;
+        let object = BufferObject { gl: Rc::clone(gl), name, memory: Some(memory) };
+        if let Some(memory) = &object.memory {
+            memory.create_storage(name, bytes)?;
+        }
+        Ok(Self { object: Rc::new(object), bytes })
     }
 
     pub(super) fn name(&self) -> glow::Buffer {

@@ -50,7 +50,7 @@ impl PictureBuffer {
     pub(crate) fn new(gl: &Rc<Gl>, memory: &dyn PictureMemory, bytes: u64) -> Result<Self> {
         let picture_bytes = usize::try_from(bytes).map_err(|_| fault("import", "expected a smaller picture"))?;
         let picture = memory.create_picture(picture_bytes)?;
-        let buffer = gl.import_buffer(picture.descriptor, picture.allocated_bytes, bytes)?;
+        let buffer = Buffer::import(gl, picture.descriptor, picture.allocated_bytes, bytes)?;
         let copy = RefCell::new(PictureCopy { picture: picture.picture, started: None });
         Ok(Self { buffer, copy, reader: ReaderSignal::default() })
     }
