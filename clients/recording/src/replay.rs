@@ -33,14 +33,14 @@ pub struct ReplayRequest {
     pub repeats: bool,
     /// Pictures of each step that are passed to the caller; at most 16.
     pub pictures: Vec<Picture>,
-    /// Plays only the states that are current at multiples of this interval in nanoseconds; `None`: every state.
-    pub frame_interval: Option<u64>,
+    /// Plays only the states that are current at the times of this number of frames per second; `None`: every state.
+    pub frame_rate: Option<f64>,
 }
 
 impl Default for ReplayRequest {
     /// The whole recording at its own speed, without pictures.
     fn default() -> Self {
-        Self { range: TimeRange::ALL, speed: Some(1.0), repeats: false, pictures: Vec::new(), frame_interval: None }
+        Self { range: TimeRange::ALL, speed: Some(1.0), repeats: false, pictures: Vec::new(), frame_rate: None }
     }
 }
 
@@ -57,7 +57,7 @@ pub struct ReplayedFrame {
     pub frame: Frame,
     /// Index of the step in the replay, from 0.
     pub step_index: u64,
-    /// Number of frames of a video that show it: 1, unless states are selected by [`ReplayRequest::frame_interval`].
+    /// Number of frames of a video that show it: 1, unless states are selected by [`ReplayRequest::frame_rate`].
     pub repeats: u64,
 }
 
@@ -177,6 +177,9 @@ pub async fn replay(
     if let Some(speed) = speed.filter(|speed| !(speed.is_finite() && *speed > 0.0)) {
         return Err(Error::invalid("speed", "a finite number above 0", speed));
     }
+    if let Some(rate) = request.frame_rate.filter(|rate| !(1e-3..=1e3).contains(rate)) {
+        return Err(Error::invalid("frame_rate", "0.001 to 1000 frames per second", rate));
+    }
     let name = &scene.info.scene;
     let frames = match request.pictures.as_slice() {
         [] => None,
@@ -186,7 +189,7 @@ pub async fn replay(
     let run = step_stream.run;
     let (sender, queue) = mpsc::channel(QUEUED_STEPS);
     let (sent_sender, sent_steps) = mpsc::channel(SENT_STEPS);
-    let source = StepSource::new(recording, scene.target, request.range, request.frame_interval)?;
+    let source = StepSource::new(recording, scene.target, request.range, request.frame_rate)?;
     let (recording, range, repeats) = (recording.clone(), request.range, request.repeats);
     let reader = tokio::task::spawn_blocking(move || read_steps(&recording, source, range, repeats, &sender));
 

@@ -39,19 +39,19 @@ pub(crate) struct StepSource {
 }
 
 impl StepSource {
-    /// Without `frame_interval`, every state is a step. With one, in nanoseconds, only the states that are current at
-    /// multiples of it are steps.
+    /// Without `frame_rate`, every state is a step. With one, in frames per second, only the states that are current at
+    /// the times of frames are steps.
     pub(crate) fn new(
         recording: &Recording,
         target: StepTarget,
         range: TimeRange,
-        frame_interval: Option<u64>,
+        frame_rate: Option<f64>,
     ) -> Result<Self> {
         Ok(Self {
             states: recording.states(range.from, range.to)?,
             converter: StepConverter::new(recording.description(), target),
             numbers: StepNumbers::default(),
-            sampler: frame_interval.map(Sampler::new),
+            sampler: frame_rate.map(Sampler::new),
             start: None,
         })
     }
@@ -103,17 +103,21 @@ struct SampledState {
     frames: u64,
 }
 
-/// Selects the states that are current at equidistant times, beginning with the time of the first state.
+/// Selects the states that are current at the times of frames, of which the first one is that of the first state.
 struct Sampler {
-    interval: u64,
+    /// Frames per second.
+    rate: f64,
     /// The state before the next one.
     current: Option<RecordedState>,
-    next_frame_time: Option<u64>,
+    /// Time of the first frame in nanoseconds.
+    start: Option<u64>,
+    /// Index of the next frame.
+    next_frame: u64,
 }
 
 impl Sampler {
-    const fn new(interval: u64) -> Self {
-        Self { interval, current: None, next_frame_time: None }
+    const fn new(rate: f64) -> Self {
+        Self { rate, current: None, start: None, next_frame: 0 }
     }
 
     fn next(&mut self, states: &mut RecordedStates) -> Result<Option<SampledState>> {
@@ -126,11 +130,12 @@ impl Sampler {
                 self.current = next;
                 continue;
             };
-            let frame_time = *self.next_frame_time.get_or_insert(current.time);
-            // Frames until the next state; the last state has the frame at its own time or the next frame.
+            let start = *self.start.get_or_insert(current.time);
+            // The last state is shown by the frame at its time.
             let end = next.as_ref().map_or(current.time + 1, |next| next.time);
-            let frames = end.saturating_sub(frame_time).div_ceil(self.interval);
-            self.next_frame_time = Some(frame_time.saturating_add(frames.saturating_mul(self.interval)));
+            let end_frame = frames_before(end - start, self.rate).max(self.next_frame);
+            let frames = end_frame - self.next_frame;
+            self.next_frame = end_frame;
             self.current = next;
             if frames > 0 {
                 return Ok(Some(SampledState { state: current, frames }));
@@ -143,9 +148,45 @@ impl Sampler {
     }
 }
 
+/// The number of frames before a time in nanoseconds. Frame k is at k / rate seconds, rounded to nanoseconds, so that
+/// frames at the rate of the states show one state each.
+fn frames_before(time: u64, rate: f64) -> u64 {
+    let frame_time = |frame: u64| (frame as f64 / rate * 1e9).round() as u64;
+    let mut frame = (time as f64 * 1e-9 * rate) as u64;
+    while frame > 0 && frame_time(frame - 1) >= time {
+        frame -= 1;
+    }
+    // At most one frame, because the estimate is too small by less than two.
+    while frame_time(frame) < time && frame_time(frame + 1) > frame_time(frame) {
+        frame += 1;
+    }
+    frame
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn frames_at_multiples_of_the_rate_are_counted_exactly() {
+        for (rate, states_per_second) in [(48.0, 24.0), (30.0, 30.0), (60.0, 60.0), (25.0, 100.0), (1e3, 60.0)] {
+            for state in 0..10_000_u64 {
+                let time = (state as f64 / states_per_second * 1e9).round() as u64;
+                let expected = (state as f64 * rate / states_per_second).ceil() as u64;
+                // An exact multiple can be one unit in the last place above an integer.
+                let is_exact = (state as f64 * rate) % states_per_second == 0.0;
+                let expected =
+                    if is_exact { (state as f64 * rate / states_per_second).round() as u64 } else { expected };
+                assert_eq!(frames_before(time, rate), expected, "state {state} at {rate} Hz");
+                if is_exact {
+                    assert_eq!(frames_before(time + 1, rate), expected + 1, "state {state} at {rate} Hz");
+                }
+            }
+        }
+        assert_eq!((frames_before(0, 24.0), frames_before(1, 24.0)), (0, 1));
+        // Times beyond the precision of f64 end.
+        frames_before(u64::MAX, 1e3);
+    }
 
     #[test]
     fn step_numbers_continue_after_a_new_run() {

@@ -227,15 +227,16 @@ async fn selected_frames_show_the_current_state() {
     record_steps(&server.client, "pair", &path, 10, None).await;
     let recording = Recording::open(&path).expect("a recording");
     let scene = open_recorded_scene(&server.client, &recording, "").await.expect("a scene");
-    // States at 24 Hz, frames at 10 Hz and at 50 Hz. Step n is current from n / 24 s on.
+    // States at 24 Hz, frames at 10, 48 and 50 Hz. Step n is current from n / 24 s on.
     for (rate, expected) in [
-        (10, vec![(0, 1), (2, 1), (4, 1), (7, 1)]),
-        (50, vec![(0, 3), (1, 2), (2, 2), (3, 2), (4, 2), (5, 2), (6, 2), (7, 2), (8, 2)]),
+        (10.0, vec![(0, 1), (2, 1), (4, 1), (7, 1)]),
+        (48.0, vec![(0, 2), (1, 2), (2, 2), (3, 2), (4, 2), (5, 2), (6, 2), (7, 2), (8, 2), (9, 1)]),
+        (50.0, vec![(0, 3), (1, 2), (2, 2), (3, 2), (4, 2), (5, 2), (6, 2), (7, 2), (8, 2)]),
     ] {
         let request = ReplayRequest {
             speed: None,
             pictures: vec![picture()],
-            frame_interval: Some(1_000_000_000 / rate),
+            frame_rate: Some(rate),
             ..ReplayRequest::default()
         };
         let mut shown = Vec::new();

@@ -137,14 +137,13 @@ impl ExportOptions {
         &self,
         recording: &Recording,
         pictures: Vec<Picture>,
-        frames_per_second: Option<f64>,
+        frame_rate: Option<f64>,
         on_frame: impl FnMut(ReplayedFrame) -> Result<()>,
     ) -> Result<()> {
         let client = self.server.connect().await?;
         let scene = open_recorded_scene(&client, recording, &self.scene).await?;
         print_difference(&scene);
-        let frame_interval = frames_per_second.map(|rate| (1e9 / rate).round() as u64);
-        let request = ReplayRequest { speed: None, pictures, frame_interval, ..ReplayRequest::default() };
+        let request = ReplayRequest { speed: None, pictures, frame_rate, ..ReplayRequest::default() };
         let replayed = replay(&client, recording, &scene, &request, on_frame, termination_signal()?).await;
         if scene.target == StepTarget::UploadedArrays {
             client.delete_scene(&scene.info.scene).await?;

@@ -63,7 +63,7 @@ impl ReplayOptions {
             speed: (!self.fast).then_some(self.speed),
             repeats: self.repeats,
             pictures: if self.frames.is_some() { self.picture.pictures() } else { Vec::new() },
-            frame_interval: None,
+            frame_rate: None,
         };
         let folder = self.frames.as_ref().map(|folder| FrameFolder::create(folder, &self.picture)).transpose()?;
         let on_frame =
