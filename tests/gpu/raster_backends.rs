@@ -362,20 +362,22 @@ fn gpu_resized_cuda_frames_equal_a_fresh_renderer() {
             assert_eq!(image.info.raster_backends.visibility, Some(RasterBackend::Cuda));
             image.rgba
         };
-    let mut context = open_device();
-    let mut loaded_scene = context
-        .load_scene(&scene, BackendSettings { raster: RasterPolicy::Cuda, ..BackendSettings::default() })
-        .expect("expected the scene to load");
-    for size in [[64, 48], [1920, 1080], [1, 1], [333, 77], [64, 48]] {
-        let got = draw(&mut context, &mut loaded_scene, size);
-        let mut new_context = open_device();
-        let mut new_scene = new_context
-            .load_scene(&scene, BackendSettings { raster: RasterPolicy::Cuda, ..BackendSettings::default() })
-            .expect("expected the scene to load");
-        assert!(got == draw(&mut new_context, &mut new_scene, size), "{size:?}");
-        new_context.unload_scene(new_scene);
+    let settings = || BackendSettings { raster: RasterPolicy::Cuda, ..BackendSettings::default() };
+    let sizes = [[64, 48], [1920, 1080], [1, 1], [333, 77], [64, 48]];
+    // Only one context may be open at a time.
+    let resized_frames = {
+        let mut context = open_device();
+        let mut loaded_scene = context.load_scene(&scene, settings()).expect("expected the scene to load");
+        let frames = sizes.map(|size| draw(&mut context, &mut loaded_scene, size));
+        context.unload_scene(loaded_scene);
+        frames
+    };
+    for (size, resized_frame) in sizes.into_iter().zip(resized_frames) {
+        let mut context = open_device();
+        let mut loaded_scene = context.load_scene(&scene, settings()).expect("expected the scene to load");
+        assert!(resized_frame == draw(&mut context, &mut loaded_scene, size), "{size:?}");
+        context.unload_scene(loaded_scene);
     }
-    context.unload_scene(loaded_scene);
 }
 
 /// `RasterPolicy::Fastest` measures both rasterizers and uses the faster one.
