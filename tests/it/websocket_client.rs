@@ -105,7 +105,7 @@ impl WebSocketClient {
     }
 
     pub(crate) async fn send(&mut self, id: u32, kind: u8, payload: &[u8]) {
-        self.send_bytes([&id.to_le_bytes()[..], &[kind], payload].concat()).await;
+        self.send_bytes(envelope(id, kind, payload)).await;
     }
 
     /// Begins a call without a timeout, and returns its id.
@@ -186,13 +186,19 @@ impl WebSocketClient {
         self.received.iter().any(|message| message.id == id && message.kind == STATUS)
     }
 
-    /// Waits for the end of any call, and returns its status. `None` at the end of the connection.
+    /// Waits for the end of any call, returns credit for every message until then, and returns the status. `None` at the
+    /// end of the connection.
     pub(crate) async fn next_end(&mut self) -> Option<tonic_types::Status> {
         loop {
-            match self.receive_any().await {
-                Ok(message) if message.kind == STATUS => return Some(message.status()),
-                Ok(_) => {}
-                Err(_) => return None,
+            let message = self.receive_any().await.ok()?;
+            match message.kind {
+                STATUS => return Some(message.status()),
+                MESSAGE => {
+                    let credit = (message.payload.len() as u32).to_le_bytes();
+                    let bytes = envelope(message.id, CREDIT, &credit);
+                    with_timeout(self.stream.send(Message::binary(bytes))).await.ok()?;
+                }
+                _ => {}
             }
         }
     }
@@ -205,6 +211,10 @@ impl WebSocketClient {
             }
         }
     }
+}
+
+fn envelope(id: u32, kind: u8, payload: &[u8]) -> Vec<u8> {
+    [&id.to_le_bytes()[..], &[kind], payload].concat()
 }
 
 /// Makes the handshake of a WebSocket with the token and further headers.
