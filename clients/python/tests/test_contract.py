@@ -157,6 +157,7 @@ def use_every_call(client: mc.Client, folder: Path) -> None:
     scene.describe(["modes"], cache=str(folder / "cache"))
     use_steps(scene)
     use_pictures(scene)
+    scene.reset()
     scene.delete()
 
 
