@@ -187,7 +187,7 @@ impl VertexImporter for OmittingImporter {
 impl ImportedVertices for OmittingVertices {
     fn copy_to_scene(&self) -> Result<()> {
         let step = self.steps.replace(self.steps.get() + 1);
-        if step % 2 == 0 { self.inner.copy_to_scene() } else { Ok(()) }
+        if step.is_multiple_of(2) { self.inner.copy_to_scene() } else { Ok(()) }
     }
 
     fn is_copied(&self) -> bool {
