@@ -249,7 +249,7 @@ async fn new_writer_starts_from_rest_and_a_resumed_one_from_its_state() {
     let both = reference_vertices(&strips(), &[first_step.clone(), second_step.clone()]).positions;
     assert_eq!(strips_positions(&server).await, both);
     resumed.finish().await;
-    // Another writer, which sends no step: the first writer continues the state of nobody else.
+    // Another writer, which sends no step. The token of the first writer is then no longer that of the last writer.
     let (other, opened) = open_successfully(&server, lossless("strips")).await;
     assert_eq!(opened.initial_state(), InitialState::Reset);
     assert_eq!(strips_positions(&server).await, both, "expected no change before the first step");

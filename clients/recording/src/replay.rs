@@ -267,7 +267,7 @@ async fn drive_steps(
         }
         step_stream.step(&step).await?;
         count += 1;
-        // Without pictures, nobody receives this.
+        // Without pictures, the channel has no receiver.
         sent.send(frames).await.ok();
     }
 }

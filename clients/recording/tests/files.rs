@@ -1,4 +1,4 @@
-//! Recordings as files: what was written is read, cut files are repaired, and damaged ones are errors.
+//! Recordings as files: all written messages are read, cut files are repaired, and damaged files are errors.
 
 mod synthetic;
 

@@ -22,7 +22,7 @@ const MIN_PIECE_FRAME: usize = 16 << 10;
 /// Messages are flushed together until they have this size.
 const MAX_BATCH_BYTES: usize = 64 << 10;
 
-/// What is sent to the client.
+/// Messages to the client.
 pub(super) enum Outgoing {
     Message(OutgoingMessage),
     Ping,

@@ -43,7 +43,7 @@ enum Command {
 ///
 /// Prints the line `ready` on standard output when the server has accepted the subscription: the steps of a physics
 /// process that starts after that line are recorded. The scene may also be driven already; the first state is complete.
-/// At least once per second, what was recorded is written: if this program is killed, `modalcast recover` repairs the
+/// Writes the recorded messages at least once per second: if this program is killed, `modalcast recover` repairs the
 /// file.
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:
