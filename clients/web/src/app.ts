@@ -33,11 +33,11 @@ import { defaultSettings } from "./ui/settings";
 import { Toolbar } from "./ui/toolbar";
 import { ViewSection } from "./ui/view_section";
 
-/** Limit in bytes on U in 16 bits in this browser, and on the merged meshes. Above, the server draws. */
+/** Limits in bytes: on U, stored in 16 bits per entry, and on the merged meshes. Above a limit, the server draws. */
 const MODE_BUDGET = 128e6;
 const MESH_BUDGET = 512e6;
 
-/** Milliseconds without a foreign step after which the sliders may drive the scene. */
+/** The sliders may drive the scene when another program has sent no step for this many milliseconds. */
 const FOREIGN_STEP_MS = 1000;
 
 /** What the source of the scene can do. */
@@ -114,7 +114,7 @@ export class App {
         for (const id of ["pause", "step", "pull", "pictures"]) this.toolbar.setVisible(id, playback === null);
     }
 
-    /** Whether a scene fits this browser, or the reason why not. */
+    /** Empty if this browser can draw the scene within its limits; otherwise the reason, for the user. */
     checkBudget(scene: SceneDescription): string {
         if (!this.viewport.gl) return `This browser cannot draw the scene: ${this.viewport.rendererName}.`;
         const modes = modeBytes(scene) / 2;
@@ -225,7 +225,7 @@ export class App {
         if (!model) return;
         this.stateRate.add(1);
         this.byteRate.add(model.lastStateBytes);
-        // The first state is the current one, and does not tell that a program drives the scene.
+        // The first state is sent at once, so it does not show that a program drives the scene.
         if (this.hasFirstState && model.state.step?.run !== driver?.run) this.lastForeignStep = performance.now();
         this.hasFirstState = true;
         this.pull?.update();
@@ -449,7 +449,7 @@ export class App {
         }
     }
 
-    /** Present position of a point of the surface, in scene units relative to the scene's origin. */
+    /** Current position of a point of the surface, in scene units relative to the scene's origin. */
     positionOf(point: SurfacePoint | null): Vec3 | null {
         return this.model && point ? positionOf(this.model, point) : null;
     }

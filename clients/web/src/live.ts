@@ -16,14 +16,14 @@ const FIRST_RETRY_MS = 250;
 const LONGEST_RETRY_MS = 4000;
 const PING_MS = 2000;
 
-/** An error that another attempt does not mend. */
+/** An error that would occur again at the next attempt to connect. */
 class FatalError extends Error {}
 
 export class LiveViewer {
     private switchScene: () => void = () => {};
     private isConnected = false;
     private isStopped = false;
-    /** The choice of scenes that is shown; empty if a scene is shown. */
+    /** The list of scenes that is offered, as JSON; empty while a scene is shown. */
     private offered = "";
 
     constructor(private readonly app: App) {
@@ -124,7 +124,7 @@ export class LiveViewer {
                 sources,
                 wanted,
             );
-            // A server that has started again opens its scenes one after the other.
+            // A restarted server opens its scenes one after the other, so list them again.
             await Promise.race([changed, new Promise((resolve) => setTimeout(resolve, PING_MS))]);
             return;
         }

@@ -25,7 +25,7 @@ function recordingCall(window?: number): { call: Call; sent: Sent[] } {
     return { call: new Call(send, () => {}, window), sent };
 }
 
-test("envelope has the bytes of the specification", () => {
+test("envelope has the layout of proto/websocket.md", () => {
     const bytes = encodeEnvelope(0x01020304, ClientKind.message, new Uint8Array([9, 8]));
     assert.deepEqual([...bytes], [4, 3, 2, 1, 1, 9, 8]);
     assert.deepEqual(decodeEnvelope(bytes), { call: 0x01020304, kind: 1, payload: new Uint8Array([9, 8]) });

@@ -30,7 +30,7 @@ test("the nearest rotation of a scaled rotation is this rotation", () => {
     }
 });
 
-test("the nearest matrix is never a reflection", () => {
+test("the nearest rotation of a reflection is not a reflection", () => {
     const m = nearestRotation([1, 0, 0, 0, 1, 0, 0, 0, -0.2]);
     const [a, b, c, d, e, f, g, h, i] = m as [number, number, number, number, number, number, number, number, number];
     assert.ok(Math.abs(a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) - 1) < 1e-12);

@@ -21,7 +21,7 @@ test("all levels cover the same fraction", () => {
     for (const { data, width } of chain.slice(0, 3)) {
         assert.ok(Math.abs(coverage(data, 0.5) - 0.25) <= 0.08, `${width}: ${coverage(data, 0.5)}`);
     }
-    // Control: means without the correction vanish.
+    // Control: the plain mean of the last level is below the cutoff, so the stripes would vanish.
     const last = chain[6]?.data ?? [];
     assert.ok((last[3] ?? 255) < 127, `expected a mean alpha below the cutoff, got ${last[3]}`);
 });

@@ -97,7 +97,7 @@ test("integers store U more precisely than f16", () => {
     assert.ok(integers < 2e-5 && halves > 1e-4 && halves < 5e-4, `got ${integers} and ${halves}`);
 });
 
-test("a column of zeros and a wrong size", () => {
+test("a column of zeros has scale 0, and a wrong size is rejected", () => {
     const packed = packModes(new Float32Array(3 * 2 * 1), 2, 1, "i16");
     assert.deepEqual([...packed.texels], new Array(24).fill(0));
     assert.equal(errorBound(packed, [5]), 0);

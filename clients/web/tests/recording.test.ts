@@ -152,7 +152,7 @@ test("other files are rejected with the reason", async () => {
     assert.throws(() => readRecording(other), /expected format version 1, got 2/);
 });
 
-test("indices and base64", () => {
+test("finds the last entry at a time, and decodes base64", () => {
     const entries = [{ time: 0 }, { time: 1 }, { time: 1 }, { time: 4 }];
     assert.deepEqual(
         [-1, 0, 0.9, 1, 3, 9].map((time) => lastIndexAt(entries, time)),

@@ -18,8 +18,8 @@ export function translation(x: number, y: number, z: number): number[] {
 }
 
 /**
- * Four domains. 0: two modes. 1: follows 0, one unit above, and has a mode. 2: has the q of 0, and follows 1, turned by 90
- * degrees about z. 3: rigid, and follows nobody.
+ * Four domains. 0: two modes. 1: follows 0, one unit above, and has a mode. 2: shares the q of 0, and follows 1,
+ * turned by 90 degrees about z. 3: rigid, and follows no domain.
  */
 export function fourDomains(): SceneDescription {
     const shape = (index: number, rank: number) =>

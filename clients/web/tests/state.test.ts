@@ -50,7 +50,7 @@ function at(state: SceneState, domain: number): number[] {
     return applyToPoint(state.transforms, 12 * domain, [1, 0, 0]);
 }
 
-test("the rest state has placements and rest_q", () => {
+test("the rest state has the placements and rest_q of the description", () => {
     const state = new SceneState(new StateLayout(fourDomains()));
     assert.deepEqual([...state.qOf(0)], [0.5, 0]);
     assert.deepEqual(

@@ -1,4 +1,4 @@
-/** Sends steps to the server when no other program drives the scene: sliders and animated modes. */
+/** Drives the scene with sliders and animated modes while no other program does. */
 
 import { Delivery } from "../proto/modalcast/v1/common_pb";
 import { Reason } from "../proto/modalcast/v1/errors_pb";
@@ -10,7 +10,10 @@ import type { SceneModel } from "../scene/scene_model";
 import type { DriveStream, Server } from "../source/server";
 import { RpcError, StatusCode } from "../wire/rpc_error";
 
-/** Milliseconds without a change after which the writer lease is released. */
+/**
+ * Milliseconds without a change after which this viewer releases the writer lease, the right to send steps that one
+ * program at a time has.
+ */
 const IDLE_MS = 3000;
 
 export type DriverStatus = { kind: "idle" } | { kind: "driving" } | { kind: "refused"; message: string };
@@ -25,7 +28,7 @@ export class Driver {
     private start = 0;
     private lastChange = 0;
     private readonly timer: ReturnType<typeof setInterval>;
-    /** The run of the steps that this viewer sends; 0 if it sends none. */
+    /** `StepId.run` of the steps that this viewer sends; 0 if it sends none. */
     run = 0n;
     onStatus: (status: DriverStatus) => void = () => {};
 

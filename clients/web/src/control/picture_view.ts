@@ -7,7 +7,7 @@ import type { PictureOptions, Server } from "../source/server";
 import type { ReplyStream } from "../wire/channel";
 import { RpcError, StatusCode } from "../wire/rpc_error";
 
-/** Milliseconds after a change of the options until the stream begins anew, so that a window can be resized. */
+/** Milliseconds from the last change of the options to a new stream. Resizing a window makes many changes. */
 const RESTART_MS = 150;
 
 export class PictureView {
@@ -49,7 +49,7 @@ export class PictureView {
         this.streamId = null;
     }
 
-    /** Moves the camera. Moves while an earlier one is on its way are merged. */
+    /** Moves the camera. While an earlier move is in flight, only the newest camera is kept. */
     moveCamera(camera: CameraMessage): void {
         if (this.options) this.options = { ...this.options, camera };
         this.pendingCamera = camera;

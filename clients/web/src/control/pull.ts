@@ -15,15 +15,18 @@ import type { SceneModel } from "../scene/scene_model";
 import type { Server } from "../source/server";
 import { displacementAt, positionOf, type SurfacePoint, surfacePoint } from "./surface_point";
 
-/** Milliseconds between renewals of a force, and after which it expires if the viewer fails. */
+/** Milliseconds between renewals of a force, and until the server removes a force that is not renewed. */
 const RENEWAL_MS = 100;
 const LIFETIME_MS = 500;
 /** Milliseconds between forces while the scene moves. */
 const UPDATE_MS = 30;
-/** The force is limited to that at this distance, in sizes of the domain; without arrays, in diagonals of the scene. */
+/**
+ * Distance of the cursor from the anchor at which the force stops growing: in diameters of the domain or, if the
+ * viewer has no arrays, in diagonals of the scene.
+ */
 const LONGEST_PULL = 0.6;
 const LONGEST_PULL_OF_SCENE = 0.1;
-/** Newtons at a distance of the scene's diagonal if the description has no eigenvalues. */
+/** Force in newtons at a distance of the scene's diagonal if the description has no eigenvalues. */
 const DEFAULT_FORCE = 1000;
 
 export interface PullView {
@@ -43,7 +46,7 @@ export class PullTool {
     private lastSent = 0;
     private readonly owner = crypto.getRandomValues(new Uint8Array(32));
     private timer: ReturnType<typeof setInterval> | null = null;
-    /** The number of this viewer's forces in StreamForces; 0 without forces. */
+    /** The owner number of this viewer's forces in StreamForces; 0 before it has sent any. */
     ownerNumber = 0n;
     onChange: () => void = () => {};
     /** A sentence for the user; empty to remove it. */
@@ -56,12 +59,12 @@ export class PullTool {
         private readonly diagonal: number,
     ) {}
 
-    /** The point that is pulled; null otherwise. */
+    /** The point that the user pulls, if any. */
     get grabbed(): SurfacePoint | null {
         return this.point;
     }
 
-    /** What to draw while the user pulls; null otherwise. */
+    /** The line to draw while the user pulls; null otherwise. */
     get view(): PullView | null {
         if (!this.point || !this.isPressed) return null;
         const from = positionOf(this.model, this.point);
@@ -69,7 +72,7 @@ export class PullTool {
         return { from, to, newtons: norm(this.force(to)) };
     }
 
-    /** The button went down on a pixel of the viewport, whose size is `size`. */
+    /** Starts a pull at a pixel of the viewport, which has `size` (width and height) pixels. */
     async begin(x: number, y: number, size: [number, number]): Promise<void> {
         this.isPressed = true;
         this.point = null;
@@ -127,7 +130,7 @@ export class PullTool {
         this.onChange();
     }
 
-    /** The point of a hit if the viewer has no arrays: x0 follows from the position and the present state. */
+    /** The point of a hit if the viewer has no arrays: x0 follows from the hit's position and the current state. */
     private pointOf(hit: Hit): SurfacePoint {
         const { domain, triangle, barycentric } = hit;
         const modes = toF32(hit.modes, "hit.modes");
@@ -140,8 +143,9 @@ export class PullTool {
     }
 
     /**
-     * Newtons per scene unit. The compliance of a point for forces in direction d is the sum of (U_k . d)^2 / w_k^2 over
-     * all modes. The sum over three axes is at least that of any direction, so the point does not pass the cursor.
+     * Newtons per scene unit. The compliance of a point in direction d is the sum of (U_k . d)^2 / eigenvalue_k over all
+     * modes k. Its sum over the three axes is at least the compliance in any direction, so the point does not pass the
+     * cursor.
      */
     private stiffnessAt({ domain, modes }: SurfacePoint): number {
         const { scene, layout } = this.model;
@@ -191,7 +195,7 @@ export class PullTool {
                 LIFETIME_MS,
             );
             this.ownerNumber = response.owner;
-            // The button went up while the force was on its way.
+            // The user released the button while the force was in flight.
             if (forces.length > 0 && !this.isPressed)
                 await this.server.applyForces(this.model.scene.info.scene, this.owner, [], LIFETIME_MS);
             const isLost = forces.length > 0 && response.receivers === 0;

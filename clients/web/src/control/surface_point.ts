@@ -51,7 +51,7 @@ export function displacementAt(model: SceneModel, { domain, modes }: SurfacePoin
     }) as Vec3;
 }
 
-/** Position of the point at the present state, in scene units relative to the scene's origin. */
+/** Position of the point in the current state, in scene units relative to the scene's origin. */
 export function positionOf(model: SceneModel, point: SurfacePoint): Vec3 {
     const u = displacementAt(model, point);
     const local = point.rest.map((value, axis) => value + at(u, axis));

@@ -9,7 +9,7 @@ import type { SceneDescription } from "../scene/description";
 import { at } from "../scene/numbers";
 import { fromYUp, normalized, unitVector, upAxis } from "./lighting";
 
-/** Vertical angle in degrees, and the part of the image that a framed scene fills, as those of the server. */
+/** Vertical field of view in degrees, and fraction of the image that a framed scene fills. The server uses the same. */
 const FIELD_OF_VIEW = 28;
 const IMAGE_FILL = 0.94;
 
@@ -102,7 +102,7 @@ export class OrbitCamera {
         return `mc.look_at(eye=${tuple(this.eye)}, target=${tuple(this.target)}, field_of_view=${this.camera.fov})`;
     }
 
-    /** A point in pixels of the element; null behind the camera. */
+    /** Projects a point to pixels of the element; null if the point is behind the camera. */
     project(point: Vec3): [number, number] | null {
         this.camera.updateMatrixWorld();
         const place = new THREE.Vector3(...point).applyMatrix4(this.camera.matrixWorldInverse);

@@ -11,7 +11,7 @@ import { FullscreenPass } from "./fullscreen_pass";
 import { DEFORM_FRAGMENT } from "./shaders";
 import { FORMATS, paddedEntries, TABLE_WIDTH, tableTexture, WIDTH } from "./texture_tables";
 
-/** Values per domain in the table of transforms: three rows of T, then visibility, highlight and two unused values. */
+/** Texels per domain in the table of transforms: three rows of T, then visibility, highlight and two unused values. */
 const TRANSFORM_TEXELS = 4;
 const NO_DOMAIN = 0xffffffff;
 
@@ -78,7 +78,7 @@ export class Deformer {
         this.pass.define("I16", modes.format === "i16");
     }
 
-    /** The deformed positions relative to the render origin, and the value of the color map. */
+    /** xyz: deformed positions in scene units relative to the origin of `deform`; w: the value of the color map. */
     get positions(): THREE.Texture {
         return this.target.texture;
     }
@@ -156,8 +156,9 @@ export class Deformer {
     }
 
     /**
-     * Numbers of each domain: offset of its vertices from those of its shape, texel of mode 0 of vertex 0 of the first
-     * shape if all had this rank, number of texels of four modes, and first texel of its coordinates.
+     * Four numbers for each domain: its first vertex minus the first vertex of its shape; the texel of U to which the
+     * shader adds 3 groups v for vertex v of the table of rest positions; the number of groups of four modes; the first
+     * texel of its coordinates.
      */
     private layOut(firstTexel: readonly number[]): Int32Array<ArrayBuffer> {
         const table = new Int32Array(4 * paddedEntries(this.scene.domains.length, TABLE_WIDTH));

@@ -1,6 +1,7 @@
 /**
  * Mipmap levels of cut-out images that preserve the covered fraction (Castano, "Computing alpha mipmaps", 2010), as the
- * server's. With plain averages, leaves of less than half of an image vanish in the distance, and others become squares.
+ * server does. With plain averages, leaves that cover less than half of their image vanish in the distance, and others
+ * become squares.
  */
 
 import { at } from "../scene/numbers";
@@ -68,7 +69,7 @@ function withCoverage(data: Uint8Array<ArrayBuffer>, cutoff: number, fraction: n
     const alphas = Uint8Array.from({ length: count }, (_, texel) => at(data, 4 * texel + 3)).sort();
     const covered = Math.round(fraction * count);
     if (covered === 0 || covered === count) return data;
-    // Between the lowest alpha that is to be covered and the highest one that is not.
+    // Halfway between the lowest alpha that must reach the cutoff and the highest one that must not.
     const threshold = (at(alphas, count - covered) + at(alphas, count - covered - 1)) / 2;
     if (threshold <= 0) return data;
     const scale = (255 * cutoff) / threshold;

@@ -18,7 +18,7 @@ import { Surfaces, type Uniforms } from "./surfaces";
 const SHADOW_SIZE = 2048;
 const SOFTWARE_SHADOW_SIZE = 512;
 
-/** Distance of the eye from the render origin, in diagonals of the scene, from which the origin follows the eye. */
+/** The render origin moves to the eye if it is this far away, in diagonals of the scene. This keeps f32 precise. */
 const ORIGIN_DISTANCE = 64;
 
 export type ColorChoice = { kind: "shaded" } | { kind: "displacement" } | { kind: "mode"; mode: number };
@@ -101,7 +101,7 @@ export class SceneRenderer {
         if (this.state) this.update(this.state);
     }
 
-    /** Shows a state from the next frame on. States between two frames are not deformed. */
+    /** Sets the state of the next frame. If several states arrive between two frames, only the last one is deformed. */
     update(state: SceneState): void {
         this.state = state;
         this.needsDeformation = true;
@@ -169,7 +169,7 @@ export class SceneRenderer {
         return ids;
     }
 
-    /** World position of a deformed vertex as the GPU has computed it, in scene units. For tests. */
+    /** Deformed vertices as the GPU has computed them, in scene units relative to `origin`. For tests. */
     readVertices(): { positions: Float32Array; firstVertex: number[]; origin: Vec3 } {
         return {
             positions: this.deformer.readPositions(),
@@ -178,7 +178,7 @@ export class SceneRenderer {
         };
     }
 
-    /** Upper bound in meters of the distance of any vertex from its position with full precision, due to the packed U. */
+    /** Upper bound in meters of the position error of any vertex that the storage of U in 16 bits causes. */
     errorBound(): number {
         const { state, scene } = this;
         if (!state) return 0;

@@ -39,7 +39,7 @@ export function meshBytes(scene: SceneDescription): number {
     }, 0);
 }
 
-/** Two u32, an octahedral normal in two i16, and texture coordinates in two f32. */
+/** Vertex and domain in two u32, an octahedral normal in two i16, and texture coordinates in two f32. */
 const CORNER_BYTES = 20;
 
 export class Surfaces {
@@ -186,7 +186,7 @@ export class Surfaces {
             polygonOffsetFactor: 1,
             polygonOffsetUnits: 2,
         });
-        // The server lets blended surfaces cast a shadow from this alpha on.
+        // As on the server, blended surfaces cast a shadow where alpha is at least 0.5.
         if (blends) shadow.uniforms["cutoff"] = { value: 0.5 };
         const domain = create(
             DOMAIN_VERTEX,
@@ -212,7 +212,7 @@ export class Surfaces {
         texture.colorSpace = colorSpace;
         texture.wrapS = THREE.RepeatWrapping;
         texture.wrapT = THREE.RepeatWrapping;
-        // The server blends two levels on a GPU only, too.
+        // As on the server, two levels are blended on a GPU only.
         texture.minFilter = this.quality.blendsLevels
             ? THREE.LinearMipmapLinearFilter
             : THREE.LinearMipmapNearestFilter;
@@ -300,7 +300,7 @@ export class Surfaces {
         return result;
     }
 
-    /** Lines along all triangle edges, each once. The contract does not tell the diagonals of polygons apart. */
+    /** Lines along all triangle edges, each once, with the diagonals of polygons: the description does not mark them. */
     private createEdges(): THREE.LineSegments {
         const index = this.geometry.getIndex()?.array ?? new Uint32Array();
         const vertices = this.geometry.getAttribute("vertex").array;

@@ -4,7 +4,7 @@ import { at } from "./numbers";
 
 export type Vec3 = [number, number, number];
 
-/** Numbers of one transform. */
+/** Number of entries of one transform. */
 export const TRANSFORM_SIZE = 12;
 
 export const IDENTITY: readonly number[] = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0];

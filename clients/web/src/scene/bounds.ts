@@ -31,7 +31,7 @@ export function restSphere({ restPositions }: ShapeArrays): Sphere {
 
 /** A sphere around a deformed domain. */
 export interface DomainSphere extends Sphere {
-    /** A radius that a very large displacement may exceed, for the shadow map, whose resolution depends on it. */
+    /** Radius for the shadow map: limited, because a larger one costs resolution. Large displacements can exceed it. */
     shadowRadius: number;
 }
 
@@ -50,13 +50,13 @@ export function domainSpheres(
         return {
             center: applyToPoint(state.transforms, place, rest.center),
             radius: scale * (rest.radius + displacement),
-            // The bound of the displacement is loose for many modes.
+            // With many modes, the bound is much larger than the displacement.
             shadowRadius: scale * (rest.radius + Math.min(displacement, 2 * rest.radius)),
         };
     });
 }
 
-/** Upper bound of the spectral norm of a linear part, exact for rotations with uniform scale. */
+/** Upper bound of the spectral norm of the linear part A of the transform at `place`; exact for uniform scales. */
 export function linearNorm(transforms: ArrayLike<number>, place: number): number {
     let largest = 0;
     // The largest absolute row sum of A A^T bounds its spectral norm, which is the square of that of A.

@@ -64,7 +64,7 @@ export function fromF16(half: number): number {
     return sign * (exponent === 0 ? fraction * 2 ** -24 : (1 + fraction / 1024) * 2 ** (exponent - 15));
 }
 
-/** Packs U, row-major 3 vertices x rank, in the format. */
+/** Packs U, row-major (3 vertices) x rank. */
 export function packModes(modes: Float32Array, vertices: number, rank: number, format: PackedFormat): PackedModes {
     if (modes.length !== 3 * vertices * rank) {
         throw new Error(`U: expected ${3 * vertices * rank} numbers, got ${modes.length}`);
@@ -106,7 +106,7 @@ export function packModes(modes: Float32Array, vertices: number, rank: number, f
     return { format, texels, scales, errors: squaredErrors.map(Math.sqrt), norms: squaredNorms.map(Math.sqrt) };
 }
 
-/** Largest error of a mode relative to the largest norm of the mode: the criterion by which a format is chosen. */
+/** Largest ratio of a mode's error to its norm. The format with the smaller one is chosen. */
 export function relativeError(packed: PackedModes): number {
     let largest = 0;
     packed.errors.forEach((error, mode) => {

@@ -13,9 +13,9 @@ export class StateLayout {
     readonly ranks: number[] = [];
     /** Index of the domain whose coordinates each domain has. */
     readonly owner: number[] = [];
-    /** Index of the domain whose transform determines that of each domain; its own index for a root. */
+    /** Index of the root of each domain: the last domain in the chain of domains that it follows, or the domain itself. */
     readonly root: number[] = [];
-    /** 12 numbers for each domain: `root_from_domain`. */
+    /** 12 numbers for each domain: the transform root_from_domain. */
     readonly rootFromDomain: Float64Array;
     readonly coordinates: number;
     readonly domains: number;
@@ -60,9 +60,9 @@ export class StateLayout {
 export class SceneState {
     /** All coordinates, see `StateLayout.firstCoordinate`. */
     readonly q: Float32Array;
-    /** 12 numbers for each root: world_from_domain, relative to the origin of the domain. */
+    /** 12 numbers for each root: world_from_domain, in scene units relative to its entry in `rootOrigins`. */
     readonly rootTransforms: Float32Array;
-    /** 3 numbers for each root, in scene units relative to the scene's origin: the origin of its transform. */
+    /** 3 numbers for each root: the origin of its transform, in scene units relative to the scene's origin. */
     readonly rootOrigins: Float64Array;
     /** 12 numbers for each domain: world_from_domain, in scene units relative to the scene's origin. */
     readonly transforms: Float64Array;

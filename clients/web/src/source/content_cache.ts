@@ -2,9 +2,9 @@
 
 import { toHex } from "../scene/numbers";
 
-/** Largest sum of all stored contents in bytes. Above it, the contents that were not used for the longest time go. */
+/** Limit on the stored contents in bytes. Above it, the least recently used contents are removed. */
 const CACHE_BYTES = 512 << 20;
-/** Bytes by hash, and sizes and times by hash, which are read without the bytes. */
+/** Object stores, by hash: the contents; their sizes and times of use, which are read without the contents. */
 const CONTENTS = "contents";
 const USES = "uses";
 
@@ -47,7 +47,7 @@ export class ContentCache {
             };
             await Promise.all(hashes.map(read));
         } catch {
-            // The contents are then loaded again.
+            // The contents are then loaded from the server.
         }
         return found;
     }
@@ -71,7 +71,7 @@ export class ContentCache {
                 total -= use.bytes;
             }
         } catch {
-            // See above.
+            // A full disk: the contents are then loaded again.
         }
     }
 }

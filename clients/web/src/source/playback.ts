@@ -1,4 +1,4 @@
-/** Plays a recording: delivers its messages to a scene, in time. */
+/** Plays a recording: delivers its messages to a scene at their times. */
 
 import type { SceneModel } from "../scene/scene_model";
 import type { RecordedState, Recording } from "./recording";
@@ -75,7 +75,7 @@ export class Playback {
     private show(index: number): void {
         const { states } = this.recording;
         if (index !== this.shown) {
-            // A state has what differs from the one before it, so begin at a complete one if the order is broken.
+            // A state has only what differs from the previous state, so begin at a complete one after a jump.
             let first = this.shown + 1;
             const complete = lastComplete(states, index);
             if (index < this.shown || complete > first) first = complete;

@@ -1,4 +1,4 @@
-/** A recording: an MCAP file with messages of the contract. Its format is described in clients/recording/README.md. */
+/** A recording: an MCAP file with messages of `proto/modalcast/v1`. Format: see clients/recording/README.md. */
 
 import { type DescMessage, fromBinary, type MessageShape } from "@bufbuild/protobuf";
 import { McapStreamReader } from "@mcap/core";
@@ -11,7 +11,7 @@ import { DescriptionCollector, type SceneDescription } from "../scene/descriptio
 
 /** Version of the format in the metadata record `recording`. */
 const FORMAT_VERSION = "1";
-/** Largest chunk in bytes, see the format. */
+/** Largest uncompressed chunk of the format in bytes. */
 const MAX_CHUNK = 64 << 20;
 
 /** A state of a recording. A large one has several messages. */
@@ -44,7 +44,7 @@ export interface Recording {
     isCutOff: boolean;
 }
 
-/** Reads a whole recording. Throws if the file is no recording, or is one without its contents. */
+/** Reads a whole recording. Throws if the file is not a recording, or does not contain its meshes. */
 export function readRecording(file: Uint8Array): Recording {
     const reader = new McapStreamReader({
         decompressHandlers: {

@@ -28,7 +28,7 @@ export const PROTOCOL_VERSION = 1;
 /** Largest number of hashes in a request. */
 const HASHES_PER_REQUEST = 4096;
 
-/** Window of a picture stream in bytes: one frame at a time, so that a slow browser shows the newest step. */
+/** Flow-control window of a picture stream in bytes. It admits one frame, so that a slow browser gets the newest. */
 const PICTURE_WINDOW = 1;
 
 export interface PictureOptions {
@@ -85,7 +85,7 @@ export class Server {
         return collector.finish();
     }
 
-    /** All arrays and textures of a scene, from the cache or the server. `progress`: received bytes. */
+    /** All arrays and textures of a scene, from the cache or the server. Calls `progress` with the received bytes. */
     async readContents(scene: SceneDescription, progress: (bytes: number) => void): Promise<Map<string, Uint8Array>> {
         const hashes = contentHashes(scene);
         const contents = await this.cache.read(hashes.map(toHex));
@@ -94,7 +94,7 @@ export class Server {
         for (let first = 0; first < missing.length; first += HASHES_PER_REQUEST) {
             const received = await this.readMissing(scene, missing.slice(first, first + HASHES_PER_REQUEST), progress);
             for (const [hash, bytes] of received) contents.set(hash, bytes);
-            // Nobody waits for the cache.
+            // Not awaited, so that the scene is shown at once.
             void this.cache.write(received);
         }
         return contents;

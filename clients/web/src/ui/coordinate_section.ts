@@ -112,7 +112,7 @@ export class CoordinateSection {
         this.update();
     }
 
-    /** Sliders or bars. */
+    /** Shows sliders if this viewer can drive the scene, otherwise bars. */
     setCanDrive(canDrive: boolean, hint = ""): void {
         this.canDrive = canDrive;
         for (const { slider, track, play } of this.rows) {

@@ -1,4 +1,4 @@
-/** The legend of color maps in the q-relay mode. The server's pictures have their own one. */
+/** The legend of color maps that the browser draws. The server draws its own legend into its pictures. */
 
 import { byId, h, setText } from "./dom";
 

@@ -17,7 +17,7 @@ export class Toolbar {
     private readonly buttons = new Map<string, HTMLButtonElement>();
     readonly element: HTMLElement;
 
-    /** @param groups Groups of actions, which separators divide. */
+    /** @param groups Groups of buttons, with a separator between two groups. */
     constructor(groups: ToolAction[][]) {
         this.element = h("div", { id: "tools", className: "card", aria: { role: "toolbar", label: "Tools" } });
         groups.forEach((group, index) => {

@@ -1,4 +1,4 @@
-/** The panel section that selects who draws, and what. */
+/** The panel section that selects whether the browser or the server draws, and what. */
 
 import { h, setText } from "./dom";
 import type { Settings } from "./settings";
@@ -79,7 +79,7 @@ export class ViewSection {
         this.refresh();
     }
 
-    /** Allows only one of both ways to draw, and says why. */
+    /** Disables drawing by the browser or by the server, and shows the reason. */
     restrict(canDrawLocally: boolean, canUseServer: boolean, hint: string): void {
         this.local.disabled = !canDrawLocally;
         this.server.disabled = !canUseServer;

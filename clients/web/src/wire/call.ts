@@ -3,7 +3,7 @@
 import { CLIENT_CREDIT, ClientKind, encodeCredit, SERVER_CREDIT } from "./envelope";
 import { RpcError, StatusCode } from "./rpc_error";
 
-/** Credit is returned in messages of at least this many bytes, or half of the call's window. */
+/** Credit is returned in batches of at least this many bytes, or of half the call's window if that is less. */
 const CREDIT_BATCH = 256 << 10;
 
 export type SendEnvelope = (kind: number, payload?: Uint8Array) => void;
@@ -21,7 +21,7 @@ export class Call {
     private inProcess = 0;
 
     /**
-     * @param window Bytes of unprocessed messages above which the server pauses. A message may exceed it, so that 1 is
+     * @param window Bytes of unprocessed messages at which the server pauses. One message may exceed it, so 1 admits
      *     one message at a time.
      */
     constructor(
@@ -29,7 +29,7 @@ export class Call {
         private readonly release: () => void,
         window: number = SERVER_CREDIT,
     ) {
-        // The server starts with SERVER_CREDIT. A smaller window withholds the difference once.
+        // The server starts with SERVER_CREDIT. A smaller window reduces the first returned credit by the difference.
         this.unreturned = Math.min(window, SERVER_CREDIT) - SERVER_CREDIT;
         this.creditBatch = Math.min(CREDIT_BATCH, Math.ceil(window / 2));
     }

@@ -24,7 +24,7 @@ export interface CallOptions {
     window?: number;
 }
 
-/** Replies of a stream, and its end from the side of the client. */
+/** Replies of a stream, which the client can cancel. */
 export interface ReplyStream<T> extends AsyncIterable<T> {
     cancel(): void;
 }
@@ -139,7 +139,7 @@ export class Channel {
         if (!(event.data instanceof ArrayBuffer)) return;
         this.bytesReceived += event.data.byteLength;
         const { call: id, kind, payload } = decodeEnvelope(new Uint8Array(event.data));
-        // Messages of calls that the client has cancelled are still on their way.
+        // Messages of a call can arrive after the client has cancelled it.
         const call = this.calls.get(id);
         if (!call) return;
         if (kind === ServerKind.message) call.onMessage(payload);

@@ -20,7 +20,7 @@ const NO_DOMAIN = 0xffffffff;
 const LIMIT_MS = 300_000;
 
 declare global {
-    /** In the page: the point that a test has pulled. */
+    /** A variable of the page: the point that a test pulls. */
     var watchedPoint: SurfacePoint | null;
 }
 
@@ -170,7 +170,7 @@ async function projectHits(page: Page, hits: Hit[]): Promise<number[][]> {
     }, points);
 }
 
-test("q-relay draws the same domains and points as the server", { timeout: LIMIT_MS }, async () => {
+test("the browser draws the same domains and points as the server", { timeout: LIMIT_MS }, async () => {
     const number = await bend(1);
     const { page, errors } = await openPage(browser, server.pageUrl("tree"), WIDTH, HEIGHT);
     await waitForScene(page);
@@ -270,7 +270,7 @@ function meanDifference(a: ArrayLike<number>, b: ArrayLike<number>): number {
     return sum / a.length;
 }
 
-test("a pull bends a branch, and it comes back", { timeout: LIMIT_MS }, async () => {
+test("a pull bends a branch, which returns afterwards", { timeout: LIMIT_MS }, async () => {
     const { page, errors } = await openPage(browser, server.pageUrl("tree"), 640, 480);
     await waitForScene(page);
     // Nobody receives forces yet.
