@@ -1,6 +1,6 @@
 """The modes of a clamped steel beam from scratch: mesh, stiffness, mass and modes by scikit-fem, then a picture.
 
-Usage: python beam.py [ADDRESS], without an address with a server of its own. Writes beam.png.
+Usage: python beam.py [ADDRESS]. Without ADDRESS, it starts a server. Writes beam.png.
 """
 
 import sys

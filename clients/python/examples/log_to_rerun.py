@@ -1,7 +1,7 @@
 """Logs the deforming tree to Rerun: positions and normals of each step, and the frame that the server draws.
 
-Usage: python log_to_rerun.py [ADDRESS], without an address with a server of its own. Writes tree.rrd, which
-`rerun tree.rrd` shows. Needs `pip install rerun-sdk`.
+Usage: python log_to_rerun.py [ADDRESS]. Without ADDRESS, it starts a server. Writes tree.rrd, which `rerun tree.rrd`
+shows. Needs `pip install rerun-sdk`.
 """
 
 import sys

@@ -1,6 +1,6 @@
 """A physics process in Python: a tree whose trunk a viewer pulls for two seconds and releases.
 
-Usage: python pull.py [ADDRESS], without an address with a server of its own. Writes pulled.png and released.png.
+Usage: python pull.py [ADDRESS]. Without ADDRESS, it starts a server. Writes pulled.png and released.png.
 Viewers on other machines can pull too: the forces of all of them arrive in `Scene.forces`.
 """
 

@@ -1,6 +1,6 @@
 """Rigid bodies of MuJoCo that fall onto a table: the poses of the bodies are the transforms T of domains without modes.
 
-Usage: python rigid_bodies.py [ADDRESS], without an address with a server of its own. Writes bodies.png.
+Usage: python rigid_bodies.py [ADDRESS]. Without ADDRESS, it starts a server. Writes bodies.png.
 Needs `pip install mujoco`.
 """
 

@@ -226,7 +226,7 @@ def test_waiting_for_a_step_ends_with_the_deadline_or_the_step(beams: mc.Scene):
 
 
 def test_unread_streams_do_not_block_calls(client: mc.Client, tree: mc.Scene):
-    """20 streams of 2.5 MB per step without a reader."""
+    """Opens 20 streams of 2.5 MB per step that nothing reads."""
     with tree.drive(joints=False) as drive:
         drive.step()
         streams = [tree.vertex_sets(("positions", "normals")) for _ in range(20)]

@@ -1,4 +1,4 @@
-"""The examples run."""
+"""The examples run, and their results are checked."""
 
 from __future__ import annotations
 

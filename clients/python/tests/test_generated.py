@@ -1,4 +1,4 @@
-"""The generated code in the package is that of the sources."""
+"""The generated code of the package is up to date."""
 
 from __future__ import annotations
 

@@ -16,11 +16,11 @@ class Progress:
     """Progress of a step stream.
 
     Attributes:
-        in_flight: Numbers of the sent steps without acknowledgment and rejection, oldest first.
+        in_flight: Numbers of the sent steps that were neither acknowledged nor rejected, oldest first.
         acknowledged: Number of the last acknowledged step.
         skipped: Number of steps that were merged into a newer one.
         rejected: Number of rejected steps.
-        rejections: The newest 1024 rejections that were not raised.
+        rejections: Rejections that were not raised as errors yet, at most the newest 1024.
         stages: Milliseconds by stage of the last acknowledged step.
         end: The error that ended the stream; None while it is open.
     """

@@ -20,7 +20,7 @@ class Force:
 
     Attributes:
         domain: Name or index of the domain.
-        message: The force without id and domain.
+        message: The protobuf message of the force, without id and domain.
     """
 
     domain: int | str | Domain
@@ -79,7 +79,7 @@ class AppliedForce:
     """A force that a viewer applies.
 
     Attributes:
-        owner: A number per viewer.
+        owner: Number of the viewer that applies the force.
         domain: Index of the domain.
         f_q: The force on the domain's coordinates, r numbers.
         vector: The force in newtons, in world axes; None for a modal force.

@@ -64,7 +64,7 @@ class Output:
             of one column of U as a color map).
         mode: Column of U for "mode_shape", from 0.
         largest: Value at the bright end of a color map, in meters or in meters per unit of q; 0 fits it to each frame.
-        edge_width: Width in pixels of lines along the edges of the faces for "color", to 32; None: as the scene.
+        edge_width: For "color": width in pixels of lines along the edges of the faces, at most 32; None: as the scene.
     """
 
     name: OutputName

@@ -17,8 +17,8 @@ from modalcast._types import F32, F64
 from modalcast.scene_description import Domain
 from modalcast.states import StateLayout, square
 
-# Singular values are sums of squared distances. Attachment vertices with a smaller ratio of the second to the first
-# one count as collinear, and do not determine a rotation.
+# Attachment vertices count as collinear, and do not determine a rotation, if the second singular value of their
+# correlation is below this fraction of the first one. Singular values are sums of squared distances.
 _COLLINEAR = 1e-9
 
 
@@ -55,7 +55,7 @@ class Kinematics:
         # Per joint: mean and correlation at rest (12 numbers), and their change per coordinate of the parent.
         self._rest_moments = np.zeros((len(points), 12))
         self._mode_moments = np.zeros((len(points), largest_rank, 12))
-        # Coordinates that a parent with fewer modes lacks refer to a zero after the last coordinate.
+        # For a parent with fewer modes, the remaining entries are the index of a zero after the last coordinate.
         self._coordinates = np.full((len(points), largest_rank), layout.coordinate_count, np.intp)
         for joint, (index, parent) in enumerate(zip(self._fitted.tolist(), parents, strict=True)):
             place = layout.q_slice(parent)

@@ -20,10 +20,10 @@ class StateLayout:
 
     Attributes:
         domains: The domains of the scene.
-        first_coordinate: Index of the first coordinate of each domain. Domains that share coordinates have the same.
+        first_coordinate: Index of the first coordinate of each domain; equal for domains that share coordinates.
         coordinate_count: Number of coordinates of all domains.
         owns_q: Whether each domain has coordinates of its own.
-        root: Index of the domain whose transform determines that of each domain.
+        root: Index of the root of each domain: the end of the chain of domains that it follows, or the domain itself.
         root_from_domain: 4x4 for each domain; the identity for a root.
     """
 
@@ -51,7 +51,7 @@ class StateLayout:
             self.root_from_domain[domain.index] = frame
 
     def q_slice(self, domain: Domain) -> slice:
-        """Place of the coordinates of a domain among those of the scene."""
+        """The slice of a domain's coordinates in those of the scene."""
         first = self.first_coordinate[domain.index]
         return slice(first, first + domain.rank)
 

@@ -16,10 +16,10 @@ from modalcast.scene_description import Domain
 from modalcast.states import StateLayout, square
 from modalcast.v1 import steps_pb2
 
-# A step up to the first size is one message; larger ones are sent in parts of the second size. In bytes.
+# In bytes: a step of at most _MAX_SINGLE_BYTES is one message, a larger one is sent in parts of _PART_BYTES.
 _MAX_SINGLE_BYTES = 1 << 20
 _PART_BYTES = 512 << 10
-# A domain has at most 5 bytes in a list.
+# The index of a domain is a varint of at most 5 bytes.
 _PART_DOMAINS = _PART_BYTES // 5
 
 
@@ -53,7 +53,7 @@ Transforms: TypeAlias = Mapping[Any, "ArrayLike | WorldPose"]
 
 
 class StepValues:
-    """The present coordinates and transforms of a scene, and what has changed since the last step.
+    """The current coordinates and transforms of a scene, and what has changed since the last step.
 
     The arguments of a step are converted and checked completely before any value changes.
     """
@@ -72,7 +72,7 @@ class StepValues:
         self._q = q.copy()
         self._roots: F64 = np.stack([square(transform) for transform in transforms])
         self._sent: F32 = transforms.copy()
-        # The last poses, while the caller sends poses.
+        # The last pose of each domain, if the caller sends poses instead of matrices.
         self._poses: dict[int, WorldPose] = {}
         domains = layout.domains
         self._is_attached = np.array([domain.parent is not None and domain.follows is None for domain in domains])
@@ -127,7 +127,7 @@ class StepValues:
         for index, matrix in matrices.items():
             self._roots[index] = square(matrix)
         current = self._sent.copy()
-        # The server rejects a step with other numbers than finite ones.
+        # The server rejects a step with infinite numbers or NaN.
         is_finite = bool(np.isfinite(self._q).all() and np.isfinite(self._roots).all())
         if self._kinematics is not None and (step.q_domains or matrices) and is_finite:
             computed = self._kinematics.transforms(self._q.astype(np.float64), self._roots)[:, :3]

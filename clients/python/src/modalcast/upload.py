@@ -15,7 +15,7 @@ from modalcast._types import F32, U32, Vector, affine, to_f32, to_f64, vector3
 from modalcast.v1 import scenes_pb2
 
 Progress: TypeAlias = Callable[[int, int], None]
-"""Called with the bytes that were sent and the bytes of the upload."""
+"""Called with the number of bytes that were sent, and with that of the whole upload."""
 
 _CHUNK_BYTES = 512 << 10
 _MAX_FOLDER_DEPTH = 16

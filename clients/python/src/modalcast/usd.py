@@ -72,7 +72,7 @@ class UsdWriter:
         if self._times and not vertex_set.step.time > self._times[-1]:
             raise ValueError(f"step.time: expected a time after {self._times[-1]} s, got {vertex_set.step.time} s")
         self._times.append(vertex_set.step.time)
-        # Positions are relative to origins that follow distant domains.
+        # The positions of distant domains are relative to origins of their own.
         offsets = (vertex_set.origins - self._origin) / self._unit
         offsets = np.broadcast_to(offsets, (len(vertex_set.domains), 3))
         for domain, offset in zip(vertex_set.domains, offsets, strict=True):

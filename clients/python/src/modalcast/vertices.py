@@ -77,7 +77,7 @@ def output_bytes(out: F32, vertex_count: int) -> Bytes:
 
 @dataclass(frozen=True, eq=False)
 class VertexSet:
-    """The vertices of a step, for the selected domains one after the other. Other attributes than requested are None.
+    """The vertices of a step, for one selected domain after the other. Attributes that were not requested are None.
 
     Attributes:
         step: The step.

@@ -143,9 +143,9 @@ export class PullTool {
     }
 
     /**
-     * Newtons per scene unit. The compliance of a point in direction d is the sum of (U_k . d)^2 / eigenvalue_k over all
-     * modes k. Its sum over the three axes is at least the compliance in any direction, so the point does not pass the
-     * cursor.
+     * Newtons per scene unit. The compliance of a point in direction d is the sum over all modes k of
+     * (U_k . d)^2 / eigenvalue_k. Its sum over the three axes is at least the compliance in any direction, so the point
+     * does not pass the cursor.
      */
     private stiffnessAt({ domain, modes }: SurfacePoint): number {
         const { scene, layout } = this.model;

@@ -300,7 +300,7 @@ export class Surfaces {
         return result;
     }
 
-    /** Lines along all triangle edges, each once, with the diagonals of polygons: the description does not mark them. */
+    /** Lines along all triangle edges, each once. The description does not mark the diagonals of polygons. */
     private createEdges(): THREE.LineSegments {
         const index = this.geometry.getIndex()?.array ?? new Uint32Array();
         const vertices = this.geometry.getAttribute("vertex").array;

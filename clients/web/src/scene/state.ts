@@ -13,7 +13,7 @@ export class StateLayout {
     readonly ranks: number[] = [];
     /** Index of the domain whose coordinates each domain has. */
     readonly owner: number[] = [];
-    /** Index of the root of each domain: the last domain in the chain of domains that it follows, or the domain itself. */
+    /** Index of the root of each domain: the end of the chain of domains that it follows, or the domain itself. */
     readonly root: number[] = [];
     /** 12 numbers for each domain: the transform root_from_domain. */
     readonly rootFromDomain: Float64Array;

@@ -218,7 +218,7 @@ class Client:
         except ServerError as error:
             if error.reason != "CONTENT_NOT_FOUND":
                 raise
-            # Another client has deleted a scene with one of these contents.
+            # Another client has deleted a scene with one of these contents in the meantime: send all.
             reply = await self._send_files(name, entry, files, {}, progress, timeout)
         return await self._scene(reply.scene)
 
@@ -279,7 +279,7 @@ class Client:
         try:
             return await self._transport.upload(UPLOAD_SCENE, requests, timeout)
         except (ServerError, ConnectionLost):
-            # A file that cannot be read breaks the upload off, and is the cause.
+            # A file that cannot be read aborts the upload: raise the error of the file.
             if requests.error is not None:
                 raise requests.error from None
             raise

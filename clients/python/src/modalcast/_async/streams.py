@@ -92,14 +92,14 @@ class Stream(Generic[T]):
         self._decoder = new_decoder()
 
     async def start(self, *, wait_for_ready: bool = False) -> None:
-        """Subscribes. The next step is delivered when this returns.
+        """Subscribes. When this returns, the server has accepted the subscription.
 
         Raises:
             Error: The server rejects the subscription, or no server answers.
         """
         self._stream = self._open_call(self._remaining, wait_for_ready)
         self._decoder = self._new_decoder()
-        # The settings, or the forces that exist already.
+        # The settings of the stream or, for a stream of forces, the current forces.
         self._first_message = await self._stream.read()
         if self._first_message is not None:
             self._started(self._first_message)
@@ -209,7 +209,7 @@ class FrameBatchStream(Stream[list[Frame]]):
             camera = cameras[index // self._outputs_per_camera]
             message = None if camera is None else camera.to_message(self._scene_up)
             updates.append(frames_pb2.PictureCamera(picture=index, camera=message))
-            # A call after a lost connection has the new cameras.
+            # If the connection is lost, the next call requests the new cameras.
             picture.ClearField("camera")
             if message is not None:
                 picture.camera.CopyFrom(message)

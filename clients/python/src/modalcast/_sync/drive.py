@@ -202,7 +202,7 @@ class Drive:
 
     def __del__(self) -> None:
         if not getattr(self, "_is_closed", True):
-            # An event loop may be closed already, and has then ended the stream.
+            # If the event loop is closed, it has ended the stream.
             with contextlib.suppress(RuntimeError):
                 self.close()
 
@@ -274,7 +274,7 @@ class Drive:
         return opened.initial_state == steps_pb2.INITIAL_STATE_RESET
 
     def _load_state(self) -> None:
-        """Begins with the state of the server."""
+        """Takes the first values from the current state of the server."""
         state = self._read_state()
         self._values = StepValues(self._layout, self._kinematics, state.q, state.transforms)
 

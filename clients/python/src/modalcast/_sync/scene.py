@@ -191,10 +191,10 @@ class Scene:
             delivery: "lossless": every step is computed, in order, and a slow lossless reader slows the drive down.
                 "latest": steps that arrive while another one is computed are merged into one.
             joints: Whether to compute the transforms of attached domains, so that they move with their parents.
-            reset: Whether the first step starts from the rest state, or else from the present state. None: from the
-                rest state, unless `lease_token` is that of the last writer.
-            take_over: Whether to replace the present writer.
-            window: Limits the steps without acknowledgment; None: the server limits them.
+            reset: True: the first step starts from the rest state. False: from the current state. None: from the rest
+                state, unless `lease_token` is that of the last writer.
+            take_over: Whether to replace the current writer.
+            window: Largest number of steps without acknowledgment; None: the server's limit.
             lease_token: Replaces the writer with this token (`Drive.lease_token`) at once and continues its state.
             dt: Seconds between steps that do not set their time.
             timeout: Default time limit of the calls of the drive, in seconds.
@@ -235,7 +235,7 @@ class Scene:
         outputs: Outputs = "color",
         width: int | None = None,
         height: int | None = None,
-        format: ColorFormat = "raw",  # noqa: A002 # the word of the field
+        format: ColorFormat = "raw",  # noqa: A002 # the usual name
         jpeg_quality: int = 90,
         step: StepId | int | None = None,
         exact: bool = False,
@@ -315,7 +315,7 @@ class Scene:
         max_hz: float = 0.0,
         count: int = 0,
     ) -> FrameStream:
-        """Iterates over one frame per step. When this returns, the next step is delivered.
+        """Iterates over one frame per step. The subscription begins before this returns.
 
         Args:
             camera: As for `frame`; `FrameStream.move_camera` moves it.
@@ -617,7 +617,7 @@ class Scene:
         return reply.owner
 
     def forces(self, *, max_hz: float = 0.0) -> Stream[ForceSet]:
-        """Iterates over the forces of all viewers: the present ones, then all forces after every change.
+        """Iterates over the forces of all viewers: the current ones, then all forces after every change.
 
         Args:
             max_hz: Limits the replies per second; 0: no limit.
