@@ -200,8 +200,8 @@ impl Engine {
     /// name is already open from the same source, returns the open scene.
     ///
     /// # Errors
-    /// `NameTaken` when the name belongs to another source, `LimitReached` when too many scenes are open, and the errors of
-    /// [`SceneSource::open`].
+    /// `NameTaken` when the name belongs to another source, `LimitReached` when too many scenes are open, and the
+    /// errors of [`SceneSource::open`].
     pub async fn open(&self, source: &str, name: &str) -> Result<Arc<SceneHandle>> {
         let name = if name.is_empty() {
             storage::scene_catalog::default_scene_name(source)?
@@ -377,6 +377,8 @@ impl Engine {
         self.shared.services.device.loss().wait().await
     }
 
+    /// Checks that scenes can be opened and used.
+    ///
     /// # Errors
     /// `ShuttingDown`, `DeviceLost`.
     fn check_running(&self) -> Result<()> {
@@ -547,7 +549,7 @@ impl Engine {
         let (engine, scene_name) = (self.clone(), name.to_owned());
         let catalog_change = run_blocking("close", move || {
             engine.shared.services.checkpoints.remove(&scene_name);
-            // Fails for a scene of the repository, which has no such folder.
+            // Fails for a scene of the repository, which has no upload folder.
             std::fs::remove_dir_all(engine.shared.scene_catalog.upload_folder(&scene_name)).ok();
             engine.shared.scene_catalog.hash_lists().remove(&scene_name);
             engine.shared.scene_catalog.remove(&scene_name)

@@ -89,6 +89,8 @@ impl Registry {
         Ok(entry)
     }
 
+    /// Checks that the name is free.
+    ///
     /// # Errors
     /// `NameTaken` when the name is reserved.
     pub(super) fn check_name_free(&self, name: &str) -> Result<()> {

@@ -114,8 +114,8 @@ impl Command {
         }
     }
 
-    /// Whether the command counts against the limit on queued commands. An unloading is always accepted, so that no scene
-    /// stays on the device.
+    /// Whether the command counts against the limit on queued commands. An unloading is always accepted, so that no
+    /// scene stays on the device.
     pub(super) const fn is_bounded(&self) -> bool {
         !matches!(self, Self::UnloadScene { .. })
     }

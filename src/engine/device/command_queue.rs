@@ -2,8 +2,8 @@
 //! round-robin ([`super::fair_queue`]).
 //!
 //! A scene may queue at most [`MAX_QUEUED_COMMANDS`] commands. A further command is rejected with `Busy`, except the
-//! command that unloads the scene, so that no scene stays on the device. A command whose caller no longer waits leaves the
-//! queue at once.
+//! command that unloads the scene, so that no scene stays on the device. A command whose caller no longer waits leaves
+//! the queue at once.
 
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::time::Duration;
@@ -13,8 +13,8 @@ use super::fair_queue::{FairQueue, Taken, Ticket};
 use crate::engine::lock::lock;
 use modalcast_model::error::{Error, Result};
 
-/// Maximum number of queued commands of a scene. The task of a scene queues at most the frames of two steps, each at most
-/// [`modalcast_render::MAX_FRAMES_IN_FLIGHT`], and a few other commands.
+/// Maximum number of queued commands of a scene. The task of a scene queues at most the frames of two steps, each at
+/// most [`modalcast_render::MAX_FRAMES_IN_FLIGHT`], and a few other commands.
 pub(super) const MAX_QUEUED_COMMANDS: usize = 16;
 
 /// Queued work of a scene.
@@ -71,12 +71,12 @@ impl CommandQueue {
         Ok(is_cancellable.then(|| CancelGuard { queue: Arc::clone(self), scene, ticket }))
     }
 
-    /// Returns the output of a scene to the head of its queue, because draw steps of it remain.
+    /// Puts the unfinished output of a scene at the head of the scene's queue, because draw steps remain.
     pub(super) fn push_continuation(&self, scene: SceneId, class: CostClass) {
         lock(&self.state).work.push_front(scene, class, Work::Continue);
     }
 
-    /// Returns work that was taken to the head of the queue of its scene.
+    /// Puts taken work back at the head of its scene's queue.
     pub(super) fn return_taken(&self, taken: Taken<Work>) {
         lock(&self.state).work.return_taken(taken);
     }
@@ -116,7 +116,7 @@ impl CommandQueue {
         drop(work);
     }
 
-    /// Charges a scene the measured time of work.
+    /// Charges a scene the measured time of work instead of the estimate `charged_ms`.
     pub(super) fn record_cost(&self, scene: SceneId, class: CostClass, charged_ms: f64, measured_ms: f64) {
         lock(&self.state).work.record_cost(scene, class, charged_ms, measured_ms);
     }

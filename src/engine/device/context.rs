@@ -292,7 +292,7 @@ impl DeviceContext {
         self.finish_draw(pending_draw).map(MappedPixels::into_image)
     }
 
-    /// As [`Self::draw`], with these lines along mesh edges instead of those of the look.
+    /// As [`Self::draw`], with lines along mesh edges as `edges` states, instead of those of the scene's settings.
     ///
     /// # Errors
     /// As [`Self::draw`].
@@ -368,9 +368,9 @@ impl DeviceContext {
         Ok(PendingDraw { frame, upload_ms })
     }
 
-    /// Begins to prepare the textures and programs of a scene, so that its buffers can then be created quickly. `None`
-    /// without a renderer, if nothing is to prepare, or if the scene is not valid; creating the buffers then returns the
-    /// error.
+    /// Begins to prepare the textures and programs of a scene, so that its buffers can then be created quickly. Returns
+    /// `None` without a renderer, if nothing is to prepare, or if the scene is not valid; in the last case, creating
+    /// the buffers returns the error.
     pub(in crate::engine) fn begin_preparation(&mut self, scene: &Arc<Scene>) -> Option<ScenePreparation> {
         let preparation = self.renderer.as_mut().ok()?.begin_preparation(scene).ok()?;
         (!preparation.is_finished()).then_some(preparation)

@@ -1,23 +1,25 @@
 //! The command loop of the device thread: executes commands and decides in which order it answers them.
 //!
-//! Scenes are served by deficit round-robin ([`super::fair_queue`]). The commands of a scene are executed in their order,
-//! so a frame shows the step before it, and a step waits for the frames before it.
+//! Scenes are served by deficit round-robin ([`super::fair_queue`]). The commands of a scene are executed in their
+//! order, so a frame shows the step before it, and a step waits for the frames before it.
 //!
-//! A large frame or AOV (arbitrary output variable: depth, normals and others) is drawn in steps, and other scenes are
-//! served between the steps ([`PartialOutput`]). The commands of its scene wait until its last step is submitted. Each
-//! step is submitted when the device has finished the one before it, so the commands of other scenes never wait for more
-//! than one step. Only one large output is drawn at a time, because each needs its own images; another one waits. The
-//! limit is a number of samples ([`modalcast_render::Renderer::set_max_band_samples`]). A software renderer draws a frame
-//! of 1920 x 1080 pixels with four samples each in one step, so others wait about as long as for such a frame. The first
+//! A large frame or AOV (arbitrary output variable: depth, normals and others) is drawn in steps, which are parts of
+//! its drawing commands and no steps of the simulation. Other scenes are served between the steps ([`PartialOutput`]).
+//! The commands of its scene wait until its last step is submitted. Each step is submitted when the device has finished
+//! the one before it, so the commands of other scenes never wait for more than one step. Only one large output is drawn
+//! at a time, because each needs its own images; another one waits. A step draws at most a fixed number of samples
+//! ([`modalcast_render::Renderer::set_max_band_samples`]). On a software renderer this limit is a whole frame of 1920x1080
+//! pixels with four samples per pixel, so other scenes wait at most about as long as such a frame takes. The first
 //! frame of a scene is drawn in steps, too, because drivers finish the compilation of a program when it is used for the
 //! first time.
 //!
-//! Another thread prepares the deformer of a scene before the scene is loaded: it compiles the kernels and uploads the tables.
-//! The OpenGL buffers of a scene are created by its first output, or with CUDA when it is loaded. Before that, its textures
-//! are uploaded and its programs compiled in steps, between which other scenes are served. Other threads compute the
-//! mipmap levels, and if the driver can, compile the programs.
+//! Another thread prepares the deformer of a scene before the scene is loaded: it compiles the kernels and uploads the
+//! tables. The OpenGL buffers of a scene are created by its first output, or with CUDA when it is loaded. Before that,
+//! its textures are uploaded and its programs compiled in steps, between which other scenes are served. Other threads
+//! compute the mipmap levels, and if the driver can, compile the programs.
 //!
-//! An output whose caller no longer waits ends after its present step; on a software renderer, each pass is a step.
+//! An output whose caller no longer waits ends after its present step. On a software renderer, each pass of such an
+//! output is a step.
 //!
 //! Frames, picks and vertex readbacks are answered asynchronously, each type from its own bounded queue
 //! ([`InFlightQueue`]). After each command the loop waits for the vertex readbacks that were started before this
@@ -63,7 +65,7 @@ const POLL_INTERVAL: Duration = Duration::from_micros(100);
 const LONG_WORK_MS: f64 = 10.0;
 /// Time after which the memory of a render target that no frame uses is freed.
 const TARGET_LIFETIME: Duration = Duration::from_secs(10);
-/// How often unused render targets are searched.
+/// Time between two searches for unused render targets.
 const TARGET_CHECK_INTERVAL: Duration = Duration::from_secs(1);
 /// Number of threads that copy pixels.
 const COPY_THREADS: usize = 2;
@@ -378,7 +380,7 @@ impl DeviceLoop {
         let FrameInFlight { id, charge, draw } = pending;
         let pixels = self.context.finish_draw(draw);
         if let Ok(pixels) = &pixels {
-            // On hardware, the device takes longer than the submission.
+            // A GPU takes longer to draw a frame than the device thread takes to submit it.
             self.record_output_cost(id, charge, charge.spent_ms.max(pixels.times().drawing_ms()));
         }
         match self.loss.record_loss(pixels) {

@@ -1,10 +1,11 @@
-//! Deficit round-robin (Shreedhar and Varghese 1996) over scenes, by the measured cost of their work on the device thread.
+//! Deficit round-robin (Shreedhar and Varghese 1996) over scenes, by the measured cost of their work on the device
+//! thread.
 //!
-//! Each scene has a bounded queue in the order of its submissions. The scenes with work form a ring. In each round, a scene
-//! gains [`QUANTUM_MS`] of device time, and spends it on the work at the head of its queue. The cost of work is an
-//! estimate: the running mean of the measured times of earlier work of the same kind and size in the same scene. Once work
-//! is measured, the scene is charged the measured time instead. So a scene with many or slow commands does not delay the
-//! others beyond its share, and a scene that is alone never waits.
+//! Each scene has a bounded queue in the order of its submissions. The scenes with work form a ring. In each round, a
+//! scene gains [`QUANTUM_MS`] of device time, and spends it on the work at the head of its queue. The cost of work is
+//! an estimate: the running mean of the measured times of earlier work of the same kind and size in the same scene.
+//! Once work is measured, the scene is charged the measured time instead. So a scene with many or slow commands does
+//! not delay the others beyond its share, and a scene that is alone never waits.
 //!
 //! A scene that runs out of work loses the time that it has saved, but not its debt, which is at most [`MAX_DEBT_MS`].
 //! Work that cannot run yet, for example because the device has not finished its last step, delays no other scene.
@@ -13,9 +14,10 @@ use std::collections::{HashMap, VecDeque};
 
 use super::command::{CostClass, SceneId};
 
-/// Milliseconds that a scene gains in each round: a few frames of hardware.
+/// Milliseconds that a scene gains in each round: about the time of a few frames on a GPU.
 const QUANTUM_MS: f64 = 5.0;
-/// Maximum debt of a scene in milliseconds, so that work that is slow only once, like loading, is forgiven soon.
+/// Maximum debt of a scene in milliseconds, so that a scene soon pays back work that is slow only once, such as
+/// loading.
 const MAX_DEBT_MS: f64 = 100.0;
 /// Weight of a new measurement in the running mean of costs.
 const COST_WEIGHT: f64 = 0.25;
@@ -62,7 +64,7 @@ impl<T> SceneQueue<T> {
 pub(super) struct Taken<T> {
     pub scene: SceneId,
     pub class: CostClass,
-    /// Milliseconds that the scene was charged.
+    /// Estimated cost in milliseconds that the scene was charged.
     pub charged_ms: f64,
     pub ticket: Ticket,
     pub work: T,
@@ -96,7 +98,7 @@ impl<T> FairQueue<T> {
         self.insert(scene, class, work, VecDeque::push_back)
     }
 
-    /// Returns work that is not finished to the head of the queue of its scene, and ends the turn of the scene.
+    /// Puts unfinished work back at the head of its scene's queue, and ends the turn of the scene.
     pub(super) fn push_front(&mut self, scene: SceneId, class: CostClass, work: T) {
         self.insert(scene, class, work, VecDeque::push_front);
         if self.ring.front() == Some(&scene) {
@@ -104,7 +106,7 @@ impl<T> FairQueue<T> {
         }
     }
 
-    /// Returns work that was taken to the head of the queue of its scene, and gives the scene its charge back.
+    /// Puts taken work back at the head of its scene's queue, and refunds the charge.
     pub(super) fn return_taken(&mut self, taken: Taken<T>) {
         let Taken { scene, class, charged_ms, ticket, work } = taken;
         self.push_front(scene, class, work);
@@ -156,7 +158,7 @@ impl<T> FairQueue<T> {
             queue.entries.front().is_some_and(|head| can_run(scene, &head.work))
         };
         let runnable: Vec<SceneId> = ring.iter().copied().filter(|scene| is_runnable(&scenes[scene], *scene)).collect();
-        // Completes at once all rounds in which no scene can afford its work.
+        // Skips all rounds in which no scene can afford its work: adds their quanta at once.
         let rounds = runnable.iter().map(|scene| scenes[scene].rounds_until_affordable());
         let rounds = rounds.min_by(f64::total_cmp)?;
         if rounds > 1.0 {

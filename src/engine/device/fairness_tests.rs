@@ -1,6 +1,6 @@
 //! Tests of the device loop with several scenes: large outputs in draw steps (parts of a frame, `partial_output`),
-//! cancelled commands and full queues. The loop runs on the thread of the test, one command or draw step at a time, so the
-//! order does not depend on times.
+//! cancelled commands and full queues. The loop runs on the thread of the test, one command or draw step at a time, so
+//! the order does not depend on times.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -33,8 +33,8 @@ struct Fixture {
 }
 
 impl Fixture {
-    /// Loads the scenes 1 and 2, and draws a frame of each. Outputs of more than `max_band_samples` samples are drawn in
-    /// several draw steps.
+    /// Loads the scenes 1 and 2, and draws a frame of each. Outputs of more than `max_band_samples` samples are drawn
+    /// in several draw steps.
     async fn start(max_band_samples: u64) -> Self {
         let mut fixture = Self::load(max_band_samples).await;
         for id in [1, 2] {

@@ -101,7 +101,8 @@ impl LoadedScene {
         &self.scene
     }
 
-    /// Bounds of the last deformation in scene units, each domain relative to its floating origin. Always finite.
+    /// Bounds of the last deformation in scene units, each domain relative to its floating origin (the f64 point that
+    /// the domain's f32 positions are relative to). Always finite.
     pub const fn bounds(&self) -> BoundingBox {
         self.bounds
     }

@@ -1,6 +1,6 @@
 //! The device thread. A [`handle::DeviceHandle`] sends commands ([`command`]) over a bounded queue of each scene
-//! ([`command_queue`]) to the loop ([`device_loop`]), which serves the scenes in turn ([`fair_queue`]). The loop owns the
-//! device context ([`context`]), the loaded scenes ([`loaded_scene`]) and the readbacks in flight.
+//! ([`command_queue`]) to the loop ([`device_loop`]), which serves the scenes in turn ([`fair_queue`]). The loop owns
+//! the device context ([`context`]), the loaded scenes ([`loaded_scene`]) and the readbacks in flight.
 
 pub(super) mod command;
 mod command_queue;

@@ -1,7 +1,7 @@
-//! An output of which some draw steps are not submitted to the device yet. A large output, or the first frame of a scene,
-//! is drawn in several draw steps, between which the device thread serves other scenes. (Draw steps are unrelated to the
-//! steps of the simulation.) The commands of its own scene wait until all draw steps are submitted, so the vertices and the
-//! buffers of the scene do not change between them.
+//! An output of which some draw steps are not submitted to the device yet. A large output, or the first frame of a
+//! scene, is drawn in several draw steps, between which the device thread serves other scenes. (Draw steps are
+//! unrelated to the steps of the simulation.) The commands of its own scene wait until all draw steps are submitted, so
+//! the vertices and the buffers of the scene do not change between them.
 
 use std::time::Duration;
 
@@ -21,8 +21,8 @@ pub(super) struct Charge {
     pub charged_ms: f64,
     /// Milliseconds that the device thread has spent on all draw steps so far.
     pub spent_ms: f64,
-    /// Whether the queue has the measured cost of the command itself, which is that of its first draw step. Later draw
-    /// steps are charged to a class of their own.
+    /// Whether the cost of the command itself, which is the cost of the first draw step, was recorded in the queue.
+    /// Later draw steps are charged to a class of their own.
     pub is_recorded: bool,
 }
 
@@ -81,7 +81,7 @@ impl PartialOutput {
         match &self.kind {
             PartialKind::Frame(draw, _) => draw.frame.is_ready_within(limit),
             PartialKind::Aov(draw, _) => draw.aov.is_ready_within(limit),
-            // Can only be polled.
+            // A preparation can only be polled.
             PartialKind::Preparation(preparation) => {
                 let is_ready = preparation.is_ready();
                 if !is_ready {

@@ -1,10 +1,10 @@
 //! The threads that encode pictures. A job consists of parts that run in parallel, such as the strips of a PNG.
 //!
-//! The threads serve jobs in the order of their start. A job queues one work item per thread that it can use, and a work
-//! item takes parts until none is left. So a single picture uses all idle threads, which shortens its latency. While
-//! several pictures wait, each thread first helps to finish the oldest one and then starts on the next one; no thread is
-//! idle while a part waits, so parallel parts do not reduce the throughput. The threads belong to no other pool, so
-//! encoding does not delay the copies and loops of the device thread, beyond sharing the cores with them.
+//! The threads serve jobs in the order of their start. A job queues one work item per thread that it can use, and a
+//! work item takes parts until none is left. So a single picture uses all idle threads, which shortens its latency.
+//! While several pictures wait, each thread first helps to finish the oldest one and then starts on the next one; no
+//! thread is idle while a part waits, so parallel parts do not reduce the throughput. The threads belong to no other
+//! pool, so encoding does not delay the copies and loops of the device thread, beyond sharing the cores with them.
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
@@ -38,7 +38,7 @@ struct JobState<T, R, F> {
     begin: Option<Instant>,
     /// Results with the indices of their parts, in the order of completion.
     results: Vec<(usize, T)>,
-    /// Combines the results and receives the combination. `None` once all results are there.
+    /// The function that combines the results, and the channel for the combination. `None` once all results are there.
     completion: Option<(F, oneshot::Sender<(R, f64)>)>,
 }
 
@@ -56,9 +56,10 @@ impl EncoderPool {
         Ok(Self { pool: Arc::new(pool.build().map_err(fault_in("threads that encode pictures"))?) })
     }
 
-    /// Runs `part` for each of `part_count` parts, at least one, with buffers that successive parts of a thread share, and
-    /// `finish` for their results, in the order of the parts. Returns what `finish` returns, and the milliseconds from the
-    /// start of the first part on. If the caller is dropped, parts that have not started are omitted.
+    /// Runs `part` for each of `part_count` parts (at least one), then `finish` with their results in the order of the
+    /// parts. The second argument of `part` is a buffer that successive parts on one thread share. Returns the result
+    /// of `finish`, and the milliseconds since the first part was started. If the caller is dropped, parts that have
+    /// not started are omitted.
     ///
     /// # Errors
     /// `Fault` when a part or `finish` panics.

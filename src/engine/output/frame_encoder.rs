@@ -1,5 +1,5 @@
-//! Encodes frames for the wire as PNG, JPEG or raw pixels. All streams share one encoder, which uses at most one thread per
-//! core. The strips of a PNG are encoded in parallel.
+//! Encodes frames for the wire as PNG, JPEG or raw pixels. All streams share one encoder, which uses at most one thread
+//! per core. The strips of a PNG are encoded in parallel.
 
 use std::num::NonZero;
 use std::sync::Arc;
@@ -49,7 +49,7 @@ pub struct StepPicture {
     pub stages: StageTimes,
     /// Index of the picture in the request.
     pub index: u32,
-    /// Number of updates of the cameras that the picture shows.
+    /// Number of camera updates that the picture includes.
     pub camera_version: u64,
     pub picture: Arc<RenderedPicture>,
 }
@@ -81,7 +81,7 @@ impl StepPicture {
 pub struct EncodedFrame {
     /// Index of the picture in the request.
     pub picture: u32,
-    /// Number of updates of the cameras that the frame shows.
+    /// Number of camera updates that the frame includes.
     pub camera_version: u64,
     pub output: EncodedOutput,
 }
@@ -163,8 +163,8 @@ impl FrameEncoder {
         }
     }
 
-    /// Encodes the strips of a picture in parallel: first without alpha, and again with alpha if a strip turns out to be
-    /// translucent. Frames are opaque, so reading all pixels in advance would only add latency.
+    /// Encodes the strips of a picture in parallel: first without alpha, and again with alpha if a strip turns out to
+    /// be translucent. Frames are opaque, so reading all pixels in advance would only add latency.
     async fn encode_png(
         &self,
         [width, height]: [u32; 2],

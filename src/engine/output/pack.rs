@@ -1,6 +1,6 @@
-//! Packs the selected vertex attributes into bytes for the wire, one section per attribute. An f32 section is not copied if
-//! the selected domains are large or consecutive: its bytes are those of the vertices in memory. Any other section is packed
-//! once for all readers with the same selection, on a thread pool of its own.
+//! Packs the selected vertex attributes into bytes for the wire, one section per attribute. An f32 section is not
+//! copied if the selected domains are large or consecutive: its bytes are those of the vertices in memory. Any other
+//! section is packed once for all readers with the same selection, on a thread pool of its own.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
@@ -28,7 +28,7 @@ const MAX_THREADS: usize = 4;
 /// Minimum mean size of the ranges of vertices that are sent without a copy. Smaller ranges are copied into one part.
 const MIN_RANGE_BYTES: usize = 64 << 10;
 
-/// Size of a vector of an f32 attribute in numbers and in bytes.
+/// Size of a vector of an f32 attribute: three numbers, 12 bytes.
 const VECTOR_NUMBERS: usize = 3;
 const VECTOR_BYTES: usize = VECTOR_NUMBERS * size_of::<f32>();
 
@@ -41,7 +41,8 @@ pub struct Section {
     pub bytes: u64,
 }
 
-/// The origin of all positions of a reply in the world, in meters, or the origin of each selected domain if they differ.
+/// Origins of the positions of a reply, in world coordinates in meters: one for all positions, or one per selected
+/// domain if their origins differ.
 pub type Origins = Arc<[[f64; 3]]>;
 
 /// The vertices of a step as bytes.
@@ -53,8 +54,8 @@ pub struct PackedVertices {
     pub stages: StageTimes,
     /// In the order of their offsets, without gaps.
     pub sections: Vec<Section>,
-    /// The bytes of all sections, one part after the other; no part is empty. A part may refer to the vertices that were
-    /// read back, which then stay in memory until the part is dropped.
+    /// The bytes of all sections, one part after the other; no part is empty. A part may refer to the vertices that
+    /// were read back, which then stay in memory until the part is dropped.
     pub parts: Vec<Bytes>,
     pub origins: Origins,
 }
@@ -91,8 +92,8 @@ impl VertexPacker {
         Ok(Self { pool: Arc::new(pool.build().map_err(fault_in("threads that pack vertices"))?) })
     }
 
-    /// Packs the selected attributes of the selected domains, then the origins unless they are `known_origins`, those
-    /// that the client has received before.
+    /// Packs the selected attributes of the selected domains, then the origins, unless they equal `known_origins`,
+    /// which the client has received before.
     ///
     /// # Errors
     /// `Fault` when `output` does not contain the selected attributes.
@@ -184,7 +185,7 @@ fn to_meters(scene: &Scene, origin: [f64; 3]) -> [f64; 3] {
 /// The common origin of the selected domains, or their origins if these differ.
 fn origins_of_domains(selection: &VertexSelection, floating_origins: &FloatingOrigins) -> Origins {
     let scene = &selection.scene;
-    // A domain that follows another one has the origin of its transform root.
+    // A domain that follows another one has the origin of its transform root, the domain that follows no other.
     let origin_of = |domain: &u32| floating_origins.origin_of(scene.transform_roots.root_of(*domain as usize));
     let shared_origin = floating_origins.shared_origin();
     if selection.domains.iter().all(|domain| origin_of(domain) == shared_origin) {
@@ -229,8 +230,8 @@ fn checked_numbers<'a>(
     Ok(numbers)
 }
 
-/// The selected ranges of an f32 attribute, without a copy. `None` if the ranges must be copied because they are too small,
-/// or if the attribute is not stored as f32.
+/// The selected ranges of an f32 attribute, without a copy. `None` if the ranges must be copied because they are too
+/// small, or if the attribute is not stored as f32.
 fn vertex_parts(
     surface: &Arc<DeformedSurface>,
     selection: &VertexSelection,
@@ -256,7 +257,7 @@ fn pack_section(
     encoding: Encoding,
 ) -> Result<Vec<Bytes>> {
     if attribute == Attribute::Boxes {
-        // The bounds are f32 values stored as f64, so the conversion is exact.
+        // `BoundingBox` stores these f32 values as f64, so the conversion back is exact.
         let corners = |domain: &u32| {
             let missing = || fault("copy", format!("expected the box of domain {domain}, got none"));
             let BoundingBox { min, max } = surface.boxes.get(*domain as usize).ok_or_else(missing)?;

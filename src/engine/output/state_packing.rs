@@ -42,7 +42,7 @@ pub struct PackedState {
     /// Steps that the subscriber skipped since its last output.
     pub skipped: u64,
     pub stages: StageTimes,
-    /// Whether the bytes have every domain.
+    /// Whether the bytes contain all domains.
     pub is_complete: bool,
     /// In the order of their offsets, without gaps. Empty sections are omitted.
     pub sections: Vec<StateSection>,

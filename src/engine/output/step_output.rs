@@ -93,7 +93,7 @@ pub enum OutputBody {
 pub struct StepFrames {
     /// One per picture of the [`OutputSpec`], in the same order.
     pub pictures: Vec<Arc<RenderedPicture>>,
-    /// Number of updates of the cameras that the pictures show; 0 for a single request.
+    /// Number of camera updates that the pictures include; 0 for a single request.
     pub camera_version: u64,
 }
 

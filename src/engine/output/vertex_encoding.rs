@@ -17,7 +17,7 @@ pub enum Encoding {
     U16Box,
     /// 2 i16: the octahedral projection of a unit vector.
     OctahedralI16,
-    /// Numbers of 8 bytes, of origins only.
+    /// f64 numbers; for origins only.
     F64,
 }
 
@@ -27,7 +27,7 @@ const BOX_VECTORS: usize = 256;
 /// Number of consecutive vectors that one task encodes: 64 boxes.
 const TASK_VECTORS: usize = 64 * BOX_VECTORS;
 
-/// Numbers whose memory is sent as it is.
+/// Numbers whose bytes in memory are sent unchanged.
 struct NumberBytes<T>(Vec<T>);
 
 impl<T: NoUninit> AsRef<[u8]> for NumberBytes<T> {
@@ -36,7 +36,7 @@ impl<T: NoUninit> AsRef<[u8]> for NumberBytes<T> {
     }
 }
 
-/// The memory of a list as bytes.
+/// The bytes of a list in memory, without a copy.
 pub(super) fn into_bytes<T: NoUninit + Send>(numbers: Vec<T>) -> Bytes {
     Bytes::from_owner(NumberBytes(numbers))
 }
@@ -136,7 +136,7 @@ mod tests {
             assert!(error <= (number.abs() * 2.0_f32.powi(-11)).max(2.0_f32.powi(-25)), "{number}: {error}");
             max_relative_error = max_relative_error.max(error / number.abs().max(1.0));
         }
-        assert!(max_relative_error > 2.0_f32.powi(-12), "the bound is not loose: {max_relative_error}");
+        assert!(max_relative_error > 2.0_f32.powi(-12), "expected an error near the bound, got {max_relative_error}");
     }
 
     #[test]
@@ -157,7 +157,7 @@ mod tests {
             assert!(error <= step * 0.500_001, "number {index}: {error}, step {step}");
             max_error_in_steps = max_error_in_steps.max(if step > 0.0 { error / step } else { 0.0 });
         }
-        assert!(max_error_in_steps > 0.49, "the bound is not loose: {max_error_in_steps}");
+        assert!(max_error_in_steps > 0.49, "expected an error near the bound, got {max_error_in_steps}");
     }
 
     #[test]

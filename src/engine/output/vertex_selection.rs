@@ -41,7 +41,7 @@ pub struct VertexSelection {
     pub(super) attributes: Vec<(Attribute, Encoding)>,
     /// The vertices of the domains as ranges of all vertices of the scene. Consecutive ranges are joined.
     vertex_ranges: Vec<Range<usize>>,
-    /// The corners of the domains, likewise.
+    /// The corners of the domains as ranges of all corners. A corner is a vertex with one of its normals.
     corner_ranges: Vec<Range<usize>>,
 }
 

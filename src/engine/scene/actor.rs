@@ -121,7 +121,7 @@ pub(super) struct SceneActor {
     scene: Arc<Scene>,
     device: DeviceHandle,
     run_counter: Arc<RunCounter>,
-    /// The run of the latest writer; 0 before the first writer.
+    /// The run of the latest writer: the number of its sequence of steps. 0 before the first writer.
     run: u64,
     /// Whether the next step starts from the rest state instead of the current one.
     starts_from_rest: bool,
@@ -255,7 +255,7 @@ impl SceneActor {
                 self.phase = StepPhase::Delivering(CompletedStep::new(step_queue, self.current.stages.clone()));
             }
             Err(error) => {
-                // Reports are ordered, so the acknowledgments of earlier steps come first.
+                // Reports have the order of the steps, so deliver the acknowledgments of earlier steps first.
                 self.delivery.flush().await;
                 step_queue.report(Err(error));
             }
@@ -279,8 +279,8 @@ impl SceneActor {
         }
     }
 
-    /// Admits one writer at a time. A writer replaces one whose queue is closed, one with the same token, and any writer
-    /// if it asks for that.
+    /// Admits one writer at a time. A new writer replaces the present one if the queue of the present one is closed, if
+    /// both have the same token, or if the new writer requests the takeover.
     ///
     /// # Errors
     /// `LeaseTaken`; `Fault` when the run or the token cannot be created. The present writer then keeps the lease.

@@ -13,13 +13,13 @@ use modalcast_model::error::{Error, Result};
 
 /// A stream that holds at least this many bytes of pixels accepts no further step.
 const MAX_PIXEL_BYTES: usize = 128 << 20;
-/// Maximum number of steps whose frames a [`Delivery::Latest`] stream holds. The next step is encoded while the previous
-/// one is sent. Further steps would only add latency.
+/// Maximum number of steps whose frames a [`Delivery::Latest`] stream holds. The next step is encoded while the
+/// previous one is sent. Further steps would only add latency.
 const MAX_LATEST_STEPS: usize = 2;
 
 /// The encoded frames of a [`Subscription`], in the same order. A lossless stream holds the frames of at most one step
-/// per core. While the client does not read frames, the subscription is not read either and applies back-pressure to the
-/// writer.
+/// per core. While the client does not read frames, the subscription is not read either and applies back-pressure to
+/// the writer.
 #[derive(Debug)]
 pub struct EncodedSubscription {
     subscription: Subscription,
@@ -35,14 +35,14 @@ pub struct EncodedSubscription {
 }
 
 impl EncodedSubscription {
-    /// Encodes the frames of the first `max_steps` steps of a subscription; 0 means all. `formats` has the format of each
-    /// picture of the subscription.
+    /// Encodes the frames of the first `max_steps` steps of a subscription; 0 means all. `formats` has the format of
+    /// each picture of the subscription.
     pub fn new(subscription: Subscription, encoder: FrameEncoder, formats: Vec<FrameFormat>, max_steps: u64) -> Self {
         let remaining_steps = if max_steps == 0 { u64::MAX } else { max_steps };
         Self { subscription, encoder, formats, remaining_steps, encodings: VecDeque::new(), end_error: None }
     }
 
-    /// Waits for the next frame: the pictures of a step in order, then those of the next one. Returns `None` after the
+    /// Waits for the next frame: the pictures of a step in order, then those of the next step. Returns `None` after the
     /// requested number of steps. Cancel-safe.
     ///
     /// # Errors
@@ -155,7 +155,7 @@ mod tests {
     #[tokio::test]
     async fn held_frames_are_bounded_and_arrive_in_order() {
         let cores = 3;
-        // A lossless subscription buffers two more frames, which the encoder has not taken.
+        // A lossless subscription itself buffers two more frames, which are not being encoded yet.
         for (delivery, max_encodings, buffered) in
             [(Delivery::Lossless, cores, 2), (Delivery::Latest, MAX_LATEST_STEPS, 0)]
         {

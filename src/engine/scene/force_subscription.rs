@@ -1,4 +1,5 @@
-//! A reader of the forces of a scene: the newest set of forces with their f_q, after every change.
+//! A reader of the forces of a scene. After every change it receives the newest set of forces with their f_q, the force
+//! on the coordinates q of the domain.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -38,7 +39,8 @@ pub struct ForceSubscription {
 }
 
 impl ForceSubscription {
-    /// Subscribes to the forces of a scene, at the rate of `delivery`. `passive`: the reader does not simulate.
+    /// Subscribes to the forces of a scene, at the rate of `delivery`. A `passive` reader does not simulate and is not
+    /// counted as a receiver of the forces.
     ///
     /// # Errors
     /// `LimitReached` when the scene has too many readers.

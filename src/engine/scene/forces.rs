@@ -1,6 +1,7 @@
-//! Forces that viewers apply to a scene. An owner, identified by a token, sets all its forces at once; they expire unless
-//! the owner renews them. The forces of a scene are independent of its task: they are stored behind a lock, and their
-//! readers remove expired ones. A scene without forces and without readers of forces has only an empty cell.
+//! Forces that viewers apply to a scene. An owner, identified by a token, sets all its forces at once; they expire
+//! unless the owner renews them. The forces of a scene are independent of its task: they are stored behind a lock, and
+//! their readers remove expired ones. Until forces are applied or read for the first time, a scene stores only an empty
+//! cell for them.
 //!
 //! A reader receives the newest set of forces, so nothing is queued.
 
@@ -54,7 +55,7 @@ pub enum ForceKind {
         /// In world axes.
         newtons: [f64; 3],
     },
-    /// On the r coordinates: f_q.
+    /// On the r coordinates of the domain: f_q.
     Modal(Vec<f32>),
 }
 
@@ -148,7 +149,7 @@ fn check_domain(scene: &Scene, domain: u32) -> Result<()> {
     Err(invalid("domain", format!("an index below {domain_count}"), domain))
 }
 
-/// A list of numbers for an error, at most four.
+/// Formats numbers for an error message: all of at most four numbers, otherwise only their count.
 fn describe_numbers(numbers: &[f64]) -> String {
     if numbers.len() > 4 { format!("{} numbers", numbers.len()) } else { format!("{numbers:?}") }
 }
@@ -220,9 +221,9 @@ struct OwnedForces {
 /// The forces of all owners. A clone shares the forces.
 #[derive(Debug, Clone, Default)]
 pub(super) struct ForceSet {
-    /// Ascending numbers.
+    /// In ascending order of `number`.
     owners: Vec<OwnedForces>,
-    /// Number of the last new owner.
+    /// `number` of the newest owner.
     last_number: u64,
 }
 
@@ -302,7 +303,7 @@ pub struct AppliedForce {
 #[derive(Debug, Default)]
 pub(super) struct ForceChannel {
     sets: watch::Sender<ForceSet>,
-    /// Readers that are not passive hold a clone, so the count of references is one more than the number of them.
+    /// Each reader that is not passive holds a clone, so the reference count is the number of these readers plus one.
     receivers: Arc<()>,
 }
 
@@ -316,7 +317,7 @@ pub(super) struct ForceReader {
 /// The effect of an update of forces.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ForceReceipt {
-    /// Stands for the owner where others see its forces; 0 if it has no forces now.
+    /// Public number of the owner, which other clients see; 0 if the owner has no forces now.
     pub owner: u64,
     /// Number of readers that are not passive.
     pub receivers: usize,

@@ -1,4 +1,4 @@
-//! Frame streams whose cameras can be moved while they run: the ids of the streams and their present cameras.
+//! Frame streams whose cameras can be moved while the streams run: the ids of the streams and their present cameras.
 
 use std::collections::HashMap;
 use std::fmt;
@@ -118,6 +118,8 @@ impl FrameStreamRegistry {
         Ok(FrameStreamRegistration { id, registry: Arc::downgrade(self) })
     }
 
+    /// The running stream with this id.
+    ///
     /// # Errors
     /// `StreamNotFound` when no running stream has this id.
     pub(in crate::engine) fn find(&self, id: StreamId) -> Result<Arc<FrameStreamEntry>> {

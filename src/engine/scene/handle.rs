@@ -137,8 +137,8 @@ impl SceneHandle {
         (state.run > 0).then(|| StepId::of(&state))
     }
 
-    /// Acquires the writer lease. `peer` is the address of the client, for the log. The window is clamped to the range
-    /// from 1 to the configured limit.
+    /// Acquires the writer lease. `peer` is the address of the client, for the log. The window (number of steps that
+    /// may be unacknowledged) is clamped to the range from 1 to the configured limit.
     ///
     /// # Errors
     /// `LeaseTaken` with the run of the current writer and how long it has held the lease; `NotFound` when the scene is
@@ -153,8 +153,8 @@ impl SceneHandle {
         Ok(WriterSession { lease, scene, run, window, token, initial_state, last_number: None })
     }
 
-    /// Returns the scene to its rest state with a step of a new writer, which releases the lease again. `takes_over`
-    /// replaces the present writer. Returns the completed step.
+    /// Returns the scene to its rest state: acquires the writer lease, completes one step and releases the lease. With
+    /// `takes_over` it replaces the present writer. Returns the completed step.
     ///
     /// # Errors
     /// Those of [`Self::drive`] and of the step.
@@ -288,7 +288,7 @@ impl SceneHandle {
 pub struct WriterSession {
     lease: WriterLease,
     scene: Arc<Scene>,
-    /// The run of this writer. Later writers of the server have larger runs.
+    /// The run of this writer: the number of its sequence of steps. Later writers of the server have larger runs.
     pub run: u64,
     /// Maximum number of unacknowledged steps.
     pub window: u32,
@@ -303,7 +303,8 @@ impl WriterSession {
     /// Validates and queues a step. A rejected step has no effect.
     ///
     /// # Errors
-    /// `Invalid` for a malformed step; `WindowFull` for a step beyond the window; the error with which the server ended the stream.
+    /// `Invalid` for a malformed step; `WindowFull` for a step beyond the window; the error with which the server ended
+    /// the stream.
     pub fn push_step(&mut self, raw: &RawStepUpdate) -> Result<()> {
         let begin = Instant::now();
         if let Some(last_number) = self.last_number.filter(|last_number| raw.number <= *last_number) {

@@ -68,9 +68,9 @@ pub struct LeaseRequest {
     pub window: u32,
     /// `None` asks for a new token.
     pub token: Option<LeaseToken>,
-    /// Whether the writer replaces one with another token.
+    /// Whether the writer replaces a present writer that has another token.
     pub takes_over: bool,
-    /// `None` keeps the current state for the token of the last writer, and starts from rest for any other one.
+    /// `None` means [`InitialState::Keep`] if the token is that of the last writer, otherwise [`InitialState::Reset`].
     pub initial_state: Option<InitialState>,
 }
 

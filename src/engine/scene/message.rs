@@ -7,8 +7,8 @@ use super::subscriber::Subscriber;
 use crate::engine::output::step_output::{OutputSpec, StepOutput};
 use modalcast_model::error::{Error, Result};
 
-/// The step that a single request asks for. A run of 0 is that of the latest writer. The steps of a later run come after
-/// those of an earlier one.
+/// The step that a single request asks for. A run is the sequence of steps from one writer; run 0 selects that of the
+/// latest writer. All steps of a later run come after those of an earlier one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum StepSelector {
     Current,

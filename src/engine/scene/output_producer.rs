@@ -1,4 +1,5 @@
-//! Produces the outputs of a scene's current step: draws, picks and copies, and delivers them to one subscriber at a time.
+//! Produces the outputs of a scene's current step: draws, picks and copies, and delivers them to one subscriber at a
+//! time.
 
 use std::cmp::Ordering;
 use std::collections::VecDeque;
@@ -118,8 +119,8 @@ impl OutputProducer {
         self.serve_now(subscriber, round).await
     }
 
-    /// Starts the pictures of the current step for one subscriber, which receives them when the last one is there. Color
-    /// pictures are delivered asynchronously; all others are there when this returns.
+    /// Starts the pictures of the current step for one subscriber, which receives them when the last one is there.
+    /// Color pictures are delivered asynchronously; all others are there when this returns.
     async fn start_frames(
         &mut self,
         subscriber: &mut Subscriber,
@@ -204,8 +205,8 @@ impl OutputProducer {
         is_within_timeout
     }
 
-    /// Draws, picks, copies or shares the current step. A copy also includes `other_attributes`, which other subscribers
-    /// request.
+    /// Draws, picks, copies or shares the current step. A copy also includes `other_attributes`, which other
+    /// subscribers request.
     pub(super) async fn produce(
         &mut self,
         spec: &OutputSpec,

@@ -10,9 +10,9 @@
 //! OpenGL    [draw k][read k][upload][draw k+1][read k+1][upload]
 //! ```
 //!
-//! If OpenGL and CUDA share memory, CUDA deforms step k+1 while OpenGL draws frame k, and its copy engine reads frame k-1.
-//! The GPU changes between the contexts of OpenGL and CUDA once per step, within a frame. OpenGL copies the vertices of a
-//! step at the begin of its frame, so that two sets of vertices are sufficient.
+//! If OpenGL and CUDA share memory, CUDA deforms step k+1 while OpenGL draws frame k, and its copy engine reads frame
+//! k-1. The GPU changes between the contexts of OpenGL and CUDA once per step, within a frame. OpenGL copies the
+//! vertices of a step at the begin of its frame, so that two sets of vertices are sufficient.
 //!
 //! ```text
 //! OpenGL       [copy, draw k     ][copy, draw k+1   ][copy, draw k+2   ]
@@ -20,9 +20,9 @@
 //! copy engine  [read k-1]          [read k  ]          [read k+1]
 //! ```
 //!
-//! If CUDA maps OpenGL's buffers instead, a step and the copy of its vertices are submitted together while every step is
-//! drawn. Both are ordered after all OpenGL commands issued before, including the readback of frame k, so only the host's
-//! work overlaps. Frame k is copied out, encoded and sent while frame k+1 is drawn.
+//! If CUDA maps OpenGL's buffers instead, a step and the copy of its vertices are submitted together while every step
+//! is drawn. Both are ordered after all OpenGL commands issued before, including the readback of frame k, so only the
+//! host's work overlaps. Frame k is copied out, encoded and sent while frame k+1 is drawn.
 //!
 //! ```text
 //! device    [draw k][read k][deform k+1, copy] [draw k+1][read k+1][deform k+2, copy]
@@ -352,8 +352,8 @@ impl ReadbackQueue {
         }
     }
 
-    /// Waits for the oldest readback and delivers it. Meanwhile cancels later readbacks for which no recipient waits any
-    /// longer. Cancel-safe.
+    /// Waits for the oldest readback and delivers it. Meanwhile cancels later readbacks for which no recipient waits
+    /// any longer. Cancel-safe.
     pub(super) async fn deliver_oldest(&mut self) {
         loop {
             let later_cancelled = self.later_cancelled();

@@ -220,7 +220,7 @@ impl Subscription {
             tokio::select! {
                 biased;
                 () = wait_for_credit(self.rate_limiter.as_ref()) => {}
-                // The subscription ends during the wait. Without a credit, no other result arrives.
+                // The subscription may end during the wait. Without a credit, no other result arrives.
                 end = self.results.recv() => return end,
             }
             self.has_granted_credit = true;
@@ -267,9 +267,9 @@ struct RateLimiter {
 }
 
 impl RateLimiter {
-    /// Schedules the next credit. The times of the credits form a grid, so that the time from a credit to its result
-    /// does not reduce the rate. The grid begins again with a result that arrives more than an interval after its
-    /// credit.
+    /// Schedules the next credit. Credits are granted at multiples of `interval` after a start time, so that the time
+    /// from a credit to its result does not reduce the rate. If a result arrives more than one interval after its
+    /// credit, its arrival is the new start time.
     fn record_result(&mut self, received_at: Instant) {
         let is_on_grid = received_at.saturating_duration_since(self.next_credit) <= self.interval;
         self.next_credit = if is_on_grid { self.next_credit } else { received_at } + self.interval;

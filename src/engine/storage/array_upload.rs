@@ -1,5 +1,5 @@
-//! Receives meshes and modes as arrays and writes them as files that the loaders read: an OBJ file and a `.npy` file per
-//! mesh, and one `scene.toml`. The scene therefore survives a restart of the server like any other upload.
+//! Receives meshes and modes as arrays and writes them as files that the loaders read: an OBJ file and a `.npy` file
+//! per mesh, and one `scene.toml`. The scene therefore survives a restart of the server like any other upload.
 //!
 //! Every number is written so that the loaders read the same bits.
 
@@ -45,7 +45,7 @@ pub struct ArrayUploadHeader {
 pub enum UploadedShape {
     /// Arrays of these sizes follow.
     Arrays { vertices: u32, triangles: u32, rank: u32 },
-    /// Those of an earlier domain.
+    /// The arrays of an earlier domain, given by its index.
     OfDomain(u32),
 }
 
@@ -58,7 +58,7 @@ pub struct UploadedDomain {
     pub placement: Transform,
     /// Linear red, green and blue.
     pub color: [f32; 3],
-    /// None, or one per mode.
+    /// Empty, or one eigenvalue (omega^2) per mode.
     pub eigenvalues: Vec<f64>,
     /// For arrays only: the crease angle, if it is not the default.
     pub crease_angle: Option<CreaseAngle>,
@@ -71,7 +71,7 @@ pub struct ArrayUpload {
     folder: UploadFolder,
     /// The text of `scene.toml` so far.
     manifest: String,
-    /// Per domain so far, the number of the domain whose arrays it has.
+    /// Per domain so far, the index of the domain whose arrays it uses.
     shapes: Vec<u32>,
     /// Per domain so far, its number of modes.
     ranks: Vec<u32>,
@@ -86,7 +86,7 @@ pub struct ArrayUpload {
 /// The arrays that are being received.
 #[derive(Debug)]
 struct OpenArrays {
-    /// Number of the domain.
+    /// Index of the domain.
     domain: u32,
     vertices: usize,
     rank: usize,
@@ -106,7 +106,7 @@ impl OpenArrays {
         if rank as usize > MAX_RANK {
             return Err(invalid("rank", format!("0 to {MAX_RANK}"), rank));
         }
-        // At most 2^32 x 12 x 512 bytes, which fits in 64 bits.
+        // At most 2^32 vertices x 3 x 4 bytes x 512 modes, which fits in 64 bits.
         let sizes = [u64::from(vertices), u64::from(triangles), u64::from(vertices) * u64::from(rank)].map(|n| 12 * n);
         Ok(Self { domain, vertices: vertices as usize, rank: rank as usize, sizes, bytes: Vec::new() })
     }
@@ -168,7 +168,8 @@ impl ArrayUpload {
     ///
     /// # Errors
     /// `Invalid` with a path below `domains[i]` for counts, names and numbers out of range, with `header.domains` or
-    /// `header.total_bytes` for more than the header declares, and when the arrays of the previous domain are incomplete.
+    /// `header.total_bytes` for more than the header declares, and when the arrays of the previous domain are
+    /// incomplete.
     pub fn begin_domain(&mut self, domain: &UploadedDomain) -> Result<()> {
         self.check_arrays_complete()?;
         let index = self.shapes.len() as u32;

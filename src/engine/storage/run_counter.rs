@@ -41,7 +41,7 @@ impl RunCounter {
         Ok(Self { path, last_run: Mutex::new(last_run) })
     }
 
-    /// Returns the number of a new run, which is larger than all numbers before. Waits until it is on disk.
+    /// Returns the number of a new run, which is larger than all earlier numbers. Waits until it is on disk.
     ///
     /// # Errors
     /// `Fault` when the number cannot be written. Later calls return larger numbers.

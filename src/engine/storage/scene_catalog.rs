@@ -50,7 +50,7 @@ impl SceneCatalog {
         let unavailable = |reason: String| Error::Unavailable {
             what: "state folder",
             reason,
-            remedy: "Name another one with --state".into(),
+            remedy: "Name another folder with --state".into(),
         };
         let unusable_folder = |error: std::io::Error| unavailable(format!("{}: {error}", folder.display()));
         fs::create_dir_all(folder.join("uploads")).map_err(unusable_folder)?;

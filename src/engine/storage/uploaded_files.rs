@@ -1,6 +1,7 @@
 //! The hashes of uploaded files: one list per uploaded scene, so that clients need not send files that the server
 //! already has. A list may be missing or outdated: the hash of a file is verified before it is reused, so a wrong list
-//! costs only an upload of the content. The lists have the lifetime of their scenes, and no content is stored besides that of scenes.
+//! costs only an upload of the content. A list is removed with its scene. The server stores no content other than that
+//! of open scenes.
 
 use std::collections::{BTreeMap, HashMap};
 use std::fs;

@@ -11,9 +11,9 @@ use crate::telemetry::ms_since;
 use modalcast_render::ScenePreparation;
 
 impl DeviceLoop {
-    /// Returns work that can run. If a command needs textures or programs that are not on the device yet, begins to prepare
-    /// them in steps and returns `None`; the command runs after the last step. A command is prepared only once, so that it
-    /// reports a failure.
+    /// Returns work that can run. If a command needs textures or programs that are not on the device yet, begins to
+    /// prepare them in steps and returns `None`; the command runs after the last step. A command is prepared only once:
+    /// if the preparation fails, the command runs and returns the error.
     pub(super) fn prepare(&mut self, taken: Taken<Work>) -> Option<Taken<Work>> {
         let preparation = match &taken.work {
             Work::Command(command) if self.loss.error().is_none() => self.begin_preparation(command),
@@ -35,8 +35,8 @@ impl DeviceLoop {
         None
     }
 
-    /// Begins to prepare the textures and programs that a command needs: those of the OpenGL buffers that it creates, or
-    /// those of a frame that is drawn in another way than the earlier ones. `None` if nothing is to prepare.
+    /// Begins to prepare the textures and programs that a command needs: those of the OpenGL buffers that it creates,
+    /// or those of a frame that is drawn in another way than the earlier ones. `None` if nothing is to prepare.
     fn begin_preparation(&mut self, command: &Command) -> Option<ScenePreparation> {
         let Self { context, scenes, .. } = self;
         match command {
@@ -87,8 +87,8 @@ impl DeviceLoop {
         self.continue_output(id, PartialOutput { kind, charge });
     }
 
-    /// Submits the next step of an output with breaks, or all steps of another output. Drops an output whose caller no longer
-    /// waits.
+    /// Submits the next step of an output, or all its steps if no other scene is served between them (`has_breaks`).
+    /// Drops an output whose caller no longer waits.
     pub(super) fn continue_output(&mut self, id: SceneId, mut output: PartialOutput) {
         let begin = Instant::now();
         while !output.is_submitted() {
