@@ -1,6 +1,6 @@
-//! Accepts connections under a limit. Serves gRPC on those that begin with the preface of HTTP/2, and the browser viewer
-//! on the others. A connection that does not send its first bytes or its first request in time is closed. The listener
-//! pauses after a failed accept, so that it does not spin when file descriptors run out.
+//! Accepts connections under a limit. Serves gRPC on those that begin with the preface of HTTP/2, and the browser
+//! viewer on the others. A connection that does not send its first bytes or its first request in time is closed. The
+//! listener pauses after a failed accept, so that it does not spin when file descriptors run out.
 
 use std::convert::Infallible;
 use std::io;
@@ -27,8 +27,8 @@ use crate::config::Config;
 /// Pause of the listener after a failed accept.
 const ACCEPT_RETRY_DELAY: Duration = Duration::from_millis(50);
 
-/// Limit on the open calls of one connection. All of them are handled at a time. A call in a queue would not be read, and
-/// HTTP/2 would buffer a stream window of it outside the budgets.
+/// Limit on the open calls of one connection. All of them are handled at a time. No call waits in a queue: HTTP/2 would
+/// buffer up to one stream window of a waiting call outside the budgets.
 const MAX_CALLS: u32 = 128;
 
 /// The bytes that every client sends first (RFC 9113, 3.4).
@@ -67,7 +67,7 @@ impl ConnectionServer {
                 }
                 Err(error) => {
                     tracing::warn!(%error, "a connection could not be accepted");
-                    // The file descriptor of another connection may be all that is missing.
+                    // The process may have too few file descriptors, and closing a connection frees one.
                     table.evict();
                     tokio::time::sleep(ACCEPT_RETRY_DELAY).await;
                 }

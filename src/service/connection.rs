@@ -10,15 +10,15 @@ use super::reply_budget::{ConnectionReplyBudget, ReplyBudget};
 use crate::config::Config;
 use modalcast_model::error::{Error, Result, fault, fault_in};
 
-/// Ratio of the HTTP/2 flow-control windows of a connection and a stream. It is far above the number of streams, because
-/// the window of the connection also limits small frames, see [`MAX_DRIVES`].
+/// Ratio of the HTTP/2 flow-control windows of a connection and a stream. It is far above the number of streams,
+/// because the window of the connection also limits small frames, see [`MAX_DRIVES`].
 pub(super) const STREAMS_PER_CONNECTION_WINDOW: u32 = 256;
 
-/// Limit on the step streams of one connection. A stream that blocks is not read, and h2 buffers up to a stream window W
-/// of its frames. h2 charges 256 - f bytes for each buffered frame of f bytes, and closes the connection if the charges
-/// exceed half of the connection window, 128 W. The smallest frame of a step has f = 9 bytes: 5 bytes of gRPC and a step
-/// with nothing but its number. One stream is then charged W / 9 * (256 - 9) = 27.4 W, so four are safe. The parts of a
-/// large step are not smaller: a part has a number and says that more follow.
+/// Limit on the step streams of one connection. A stream that blocks is not read, and h2 buffers up to a stream window
+/// W of its frames. h2 charges 256 - f bytes for each buffered frame of f bytes, and closes the connection if the
+/// charges exceed half of the connection window, 128 W. The smallest frame of a step has f = 9 bytes: 5 bytes of gRPC
+/// and a step with nothing but its number. One stream is then charged W / 9 * (256 - 9) = 27.4 W, so four are safe. The
+/// parts of a large step are not smaller: a part has a number and says that more follow.
 pub(super) const MAX_DRIVES: usize = 4;
 
 /// The budgets that all connections share.
@@ -45,7 +45,7 @@ pub(super) struct ConnectionInfo {
     /// Never sent to another client.
     peer: Arc<str>,
     drive_permits: Arc<Semaphore>,
-    /// One permit per pixel, of single frames and of frame streams.
+    /// One permit per pixel: this one for single frames, `stream_pixels` for frame streams.
     frame_pixels: Arc<Semaphore>,
     stream_pixels: Arc<Semaphore>,
     max_pixels: u32,
@@ -91,7 +91,8 @@ impl ConnectionInfo {
         Arc::clone(&self.drive_permits).try_acquire_owned().map_err(too_many)
     }
 
-    /// Waits until the connection may have `pixels` more in single frames, which count until the permit is dropped.
+    /// Waits until `pixels` more pixels of single frames are within the limit of the connection. They count until the
+    /// permit is dropped.
     ///
     /// # Errors
     /// `Fault` when the connection no longer exists.

@@ -87,9 +87,9 @@ impl ConnectionTable {
         Arc::new(Self { max_connections, state: Mutex::default(), changed: Arc::default() })
     }
 
-    /// Adds a connection. If the table is full, closes another one: the oldest of those that have sent no request if they
-    /// are more than an eighth of all, else the one that has been without calls for the longest time. Waits while every
-    /// connection has a call. Cancel-safe.
+    /// Adds a connection. If the table is full, closes another one: the oldest of those that have sent no request if
+    /// they are more than an eighth of all, else the one that has been without calls for the longest time. Waits while
+    /// every connection has a call. Cancel-safe.
     pub(super) async fn insert(self: &Arc<Self>) -> ConnectionSlot {
         loop {
             if let Some(slot) = self.try_insert() {
@@ -124,8 +124,9 @@ impl ConnectionTable {
         lock(&self.state).evict(self.max_new())
     }
 
-    /// Number of connections without a request that are not closed while others are idle. Without it, each connection of
-    /// a client that connects repeatedly would close a new one of another client before its first request arrives.
+    /// Number of connections without a request that are not closed while others are idle. Without this number, each
+    /// connection of a client that connects repeatedly would close a new one of another client before its first request
+    /// arrives.
     const fn max_new(&self) -> usize {
         self.max_connections / 8
     }

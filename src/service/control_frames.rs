@@ -1,5 +1,5 @@
-//! Limits the HTTP/2 frames of a connection that carry no request: PING, SETTINGS, PRIORITY, WINDOW_UPDATE and frames of
-//! unknown types. Each costs a peer 9 to 17 bytes and the server some work, and h2 accepts any number of them.
+//! Limits the HTTP/2 frames of a connection that carry no request: PING, SETTINGS, PRIORITY, WINDOW_UPDATE and frames
+//! of unknown types. Each costs a peer 9 to 17 bytes and the server some work, and h2 accepts any number of them.
 
 use std::io;
 

@@ -1,5 +1,5 @@
-//! Describes a scene for clients that do not have its files: shapes, materials, textures and domains, each once, and the
-//! arrays of the shapes. Replies are sent in messages of about 1 MiB.
+//! Describes a scene for clients that do not have its files: shapes, materials, textures and domains, each once, and
+//! the arrays of the shapes. Replies are sent in messages of about 1 MiB.
 
 use std::sync::Arc;
 

@@ -32,7 +32,7 @@ impl FrameAllowance {
         self.frames -= 1.0;
     }
 
-    /// Counts a frame that the server answers with as many bytes, by which the allowance must not grow.
+    /// Counts a frame that the server answers with `bytes` bytes. The allowance must not grow by this answer.
     pub(super) fn take_answered_frame(&mut self, bytes: usize) {
         self.frames -= 1.0 + bytes as f64 / BYTES_PER_FRAME;
     }

@@ -1,5 +1,5 @@
-//! `FrameService`: single frames with a deadline, frame streams with movable cameras, and picks. Every frame names its step and is sent in
-//! chunks.
+//! `FrameService`: single frames with a deadline, frame streams with movable cameras, and picks. Every frame names its
+//! step and is sent in chunks.
 
 use std::sync::Arc;
 

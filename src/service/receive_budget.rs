@@ -1,9 +1,9 @@
 //! Budgets for the bytes of messages that are being received, per connection and in total.
 //!
 //! tonic allocates the memory of a whole message as soon as it has read the message's length, and holds it until the
-//! last byte has arrived. A message therefore counts with its whole length as soon as its header has arrived. A message that
-//! exceeds the budget of its connection is rejected. If the total is exhausted, the connection that holds the most bytes
-//! loses its incomplete messages, so that a few connections with half-sent messages do not block the others.
+//! last byte has arrived. A message therefore counts with its whole length as soon as its header has arrived. A message
+//! that exceeds the budget of its connection is rejected. If the total is exhausted, the connection that holds the most
+//! bytes loses its incomplete messages, so that a few connections with half-sent messages do not block the others.
 
 use std::collections::HashMap;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -110,8 +110,8 @@ impl State {
         Ok(())
     }
 
-    /// Evicts the connection that holds the most bytes, if it is not `id` and holds more than `bytes`. The bytes no longer
-    /// count, and the calls of the connection free the memory when they are polled next.
+    /// Evicts the connection that holds the most bytes, if it is not `id` and holds more than `bytes`. The bytes no
+    /// longer count, and the calls of the connection free the memory when they are polled next.
     fn evict_other(&mut self, id: u64, bytes: usize) -> bool {
         let largest = self.connections.iter_mut().max_by_key(|(_, connection)| connection.held_bytes);
         let Some((largest_id, connection)) = largest else { return false };
@@ -170,7 +170,7 @@ impl ReceivedMemory {
     /// Sets the number of bytes.
     ///
     /// # Errors
-    /// As for [`State::add`]; the number then stays as it is. `Busy` if the memory was evicted; it is then 0.
+    /// As for [`State::add`]; the number is then unchanged. `Busy` if the memory was evicted; the number is then 0.
     pub(super) fn resize(&mut self, bytes: usize) -> Result<()> {
         let connection = Arc::clone(&self.connection);
         let mut state = connection.total.lock();

@@ -24,8 +24,8 @@ use crate::config::Config;
 use crate::engine::lock;
 use modalcast_model::error::Error;
 
-/// Multiple of the reply timeout after which a connection with unsent bytes of an ended call is closed when others wait,
-/// although another call of it makes progress.
+/// A connection with unsent bytes of an ended call is closed after this multiple of the reply timeout if others wait,
+/// even if another of its calls makes progress.
 const MAX_STALL: u32 = 3;
 
 /// How often a sender that waits for the total searches for connections to close.
@@ -34,8 +34,8 @@ const EVICTION_INTERVAL: Duration = Duration::from_millis(200);
 /// Time without progress after which a connection above its share is closed when the total is exhausted.
 const EVICTION_STALL: Duration = Duration::from_millis(400);
 
-/// A connection that holds at most so many bytes is not above its share. One call never holds more: two messages of 1 MiB
-/// in its queue and two in HTTP/2.
+/// A connection that holds at most this many bytes is not above its share. One call never holds more: two messages of 1
+/// MiB in its queue and two in HTTP/2.
 const MIN_SHARE: usize = 4 << 20;
 
 /// The budget of all connections.
@@ -62,8 +62,8 @@ pub(super) struct ConnectionReplyBudget {
     /// Key in `ReplyBudget::connections`.
     id: u64,
     share: Share,
-    /// Held by the sender that waits for the total. One sender per connection waits there, so that connections with many
-    /// calls do not delay the others.
+    /// Held by the sender that waits for the total. One sender per connection waits there, so that connections with
+    /// many calls do not delay the others.
     turn: tokio::sync::Mutex<()>,
     close: Arc<Notify>,
     calls: Registry<CallReplies>,
@@ -298,9 +298,10 @@ impl CallReplies {
     }
 }
 
-/// Ends the calls whose clients have taken nothing for `timeout`. If all of them were ended before, their remaining bytes
-/// are buffers of HTTP/2, which only the end of the connection frees, so their connections are closed. A connection is not closed while another of its calls holds
-/// bytes, which it may still send or lose by its own end; but with `max_stall`, it is closed after this time.
+/// Ends the calls whose clients have taken nothing for `timeout`. If all of them were ended before, their remaining
+/// bytes are buffers of HTTP/2, which only the end of the connection frees, so their connections are closed. While
+/// another call of the connection holds bytes, which it may still send or release, the connection is closed only after
+/// `max_stall`; `None` means never.
 fn end_stalled(calls: &[Arc<CallReplies>], timeout: Duration, max_stall: Option<Duration>) {
     let is_stalled = |call: &&Arc<CallReplies>| {
         let progress = lock(&call.progress);
@@ -343,8 +344,8 @@ impl Drop for CallReplies {
 }
 
 impl UnsentBytes {
-    /// Returns all but `bytes`. Without this, a call that was sent completely would still hold bytes, as if its client did
-    /// not read.
+    /// Releases all but `bytes`. Without this, a call that was sent completely would still hold bytes, as if its client
+    /// did not read.
     pub(super) fn shrink_to(&mut self, bytes: usize) {
         if let Some(excess) = self.bytes.checked_sub(bytes) {
             drop(self.split(excess));
@@ -525,7 +526,8 @@ mod tests {
         assert_eq!(find(&many), [60, 61]);
     }
 
-    /// A call that takes nothing ends when another connection waits, and its connection is closed if that frees nothing.
+    /// A call that takes nothing ends when another connection waits, and its connection is closed if that frees
+    /// nothing.
     #[tokio::test]
     async fn stalled_call_ends_when_others_wait() {
         let budget = small_budget();

@@ -25,7 +25,7 @@ const HEADER_BYTES: usize = 5;
 struct CallMemory {
     /// The message that is being received.
     incomplete: ReceivedMemory,
-    /// The last complete message. `None` after the response head: the handler has taken the request then.
+    /// The last complete message. `None` after the response head, because the handler has then taken the request.
     complete: Option<ReceivedMemory>,
 }
 

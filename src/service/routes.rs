@@ -54,7 +54,8 @@ impl Routes {
     }
 }
 
-/// Tonic answers a call whose only request message is too large by itself. The answer gets the details of other errors.
+/// tonic itself rejects a call whose only request message is too large. This function adds the details that all other
+/// errors have.
 fn with_transport_details(response: Response<Body>, max_message_bytes: usize) -> Response<Body> {
     match Status::from_header_map(response.headers()) {
         Some(status) if status.code() == Code::OutOfRange => transport_status(status, max_message_bytes).into_http(),
@@ -84,8 +85,8 @@ impl Routes {
     }
 }
 
-/// Awaits a response head for the time in the `grpc-timeout` header. Services that know more about their work enforce it
-/// themselves, with a better message.
+/// Awaits a response head for the time in the `grpc-timeout` header. Services that know more about their work enforce
+/// the timeout themselves, with a more specific message.
 async fn answer_in_time(
     timeout: Option<Duration>,
     response: BoxFuture<Response<Body>, Infallible>,

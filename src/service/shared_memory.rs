@@ -1,10 +1,10 @@
 //! Memory that clients of the same machine share with the server. `SharedRange` in `common.proto` documents the
-//! protocol. It is off unless the configuration names a Unix socket.
+//! protocol. Shared memory is off unless the configuration names a Unix socket.
 //!
 //! A connection to that socket owns slots for replies and slots for steps, whose memory is bounded: at most
-//! [`MAX_CONNECTIONS`] times `2 * SLOT_COUNT * SLOT_BYTES`. Data in slots do not count against the budget of replies. The
-//! copied values of a step count as those of a step in several messages. A call without a free slot for a reply waits
-//! until its client returns one or the connection ends.
+//! [`MAX_CONNECTIONS`] times `2 * SLOT_COUNT * SLOT_BYTES`. Data in slots do not count against the budget of replies.
+//! The copied values of a step count as those of a step in several messages. A call without a free slot for a reply
+//! waits until its client returns one or the connection ends.
 
 mod reply_memory;
 mod request_memory;

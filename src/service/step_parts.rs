@@ -15,7 +15,7 @@ pub(super) struct StepAssembler {
     /// Memory of the received parts.
     memory: ReceivedMemory,
     limits: MessageLimits,
-    /// Has the values of parts that are not in their messages.
+    /// Contains the values of parts whose messages only refer to them.
     shared_memory: CallMemory,
 }
 
@@ -53,7 +53,7 @@ impl StepAssembler {
     pub(super) fn push(&mut self, mut part: v1::Step) -> Result<Option<v1::Step>> {
         // The values in shared memory count like those of several messages.
         let is_one_message = !part.has_more && part.shared_q.is_none() && part.shared_transforms.is_none();
-        // Also for a part that is ignored below, because the client waits for its slots.
+        // Called also for a part that is ignored below, because the client waits for its slots.
         let received = self.shared_memory.receive(&mut part);
         if let State::Discarding { number } = self.state {
             if number == part.number {

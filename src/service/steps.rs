@@ -1,6 +1,6 @@
-//! `StepService`: one bidirectional stream per physics process. A stream that blocks is not read while its window is full,
-//! so that the flow control of HTTP/2 slows the client down. Every other stream is always read, and a step that cannot be
-//! accepted is answered with a rejection. The stream remains open.
+//! `StepService`: one bidirectional stream per physics process. A stream with the overflow `Block` is not read while
+//! its window is full, so that the flow control of HTTP/2 slows the client down. Every other stream is always read, and
+//! a step that cannot be accepted is answered with a rejection. The stream remains open.
 
 use std::collections::VecDeque;
 

@@ -1,5 +1,5 @@
-//! Reply streams. A task sends messages through a bounded queue, within the reply budgets. Replies are split into chunks of at most 1 MiB. A
-//! deadline covers the whole reply up to its last chunk. A panic ends only its own call.
+//! Reply streams. A task sends messages through a bounded queue, within the reply budgets. Replies are split into
+//! chunks of at most 1 MiB. A deadline covers the whole reply up to its last chunk. A panic ends only its own call.
 
 use std::pin::Pin;
 use std::sync::{Arc, Mutex};
@@ -46,7 +46,7 @@ pub(super) struct ReplyPermit<'a, T> {
 }
 
 impl<T: prost::Message> ReplyPermit<'_, T> {
-    /// Queues a message, and returns what it needs less than was reserved.
+    /// Queues a message, and releases the reserved bytes that it does not need.
     pub(super) fn send(mut self, message: T) {
         self.unsent.shrink_to(message.encoded_len() + MESSAGE_HEADER_BYTES);
         self.slot.send((message, self.unsent));
@@ -63,8 +63,8 @@ impl<T: prost::Message> ReplySender<T> {
         Ok(())
     }
 
-    /// Waits until there is capacity for a message of `bytes` bytes. Reserve before a large message is built, so that no
-    /// message waits outside the budget. Cancel-safe.
+    /// Waits until there is capacity for a message of `bytes` bytes. Reserve before a large message is built, so that
+    /// no message waits outside the budget. Cancel-safe.
     ///
     /// # Errors
     /// `CANCELLED` when the client has disconnected.

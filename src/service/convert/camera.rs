@@ -5,8 +5,8 @@ use modalcast_proto::v1;
 use modalcast_model::error::{Result, invalid};
 use modalcast_model::scene::{Camera, Lens, Scene, View};
 
-/// Parses and validates a camera. An unset view or lens is that of `default_camera`, and an unset up direction the up axis
-/// of the scene.
+/// Parses and validates a camera. An unset view or lens is that of `default_camera`, and an unset up direction the up
+/// axis of the scene.
 pub(super) fn parse_camera(scene: &Scene, default_camera: Camera, camera: v1::Camera) -> Result<Camera> {
     let view = match camera.view {
         None => default_camera.view,

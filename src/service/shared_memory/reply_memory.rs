@@ -15,11 +15,12 @@ use crate::engine::lock;
 /// Size of a slot in bytes: the largest chunk of a reply.
 pub(super) const SLOT_BYTES: usize = 1 << 20;
 
-/// Number of slots of a connection. The client copies a slot while the server fills the next ones. More slots than the
-/// client needs for that would only fill with steps that are out of date when a slow client reads them.
+/// Number of slots of a connection. The client copies a slot while the server fills the next ones. With more slots, a
+/// slow client would only read steps that are further out of date.
 pub(super) const SLOT_COUNT: usize = 8;
 
-/// Data of at least this size are put into a slot. The copy and the return of a slot cost more than to send fewer bytes.
+/// Data of at least this size are put into a slot. The copy and the return of a slot cost more than to send fewer
+/// bytes.
 const MIN_SHARED_BYTES: usize = 64 << 10;
 
 /// The slots of a connection. The memory is freed when this is dropped.
@@ -29,7 +30,7 @@ pub(in crate::service) struct ReplyMemory {
     slots: Mutex<Slots>,
     /// One permit for each free slot. Closed when the connection has ended.
     free_slots: Semaphore,
-    /// Counts the memory against the limit on all of it.
+    /// Counts the connection against the limit on connections.
     _permit: OwnedSemaphorePermit,
 }
 

@@ -40,9 +40,9 @@ impl RequestMemory {
             return Err(invalid(field, expected, format!("{bytes} bytes in slot {slot}")));
         }
         let mut data = Vec::with_capacity(bytes);
-        // SAFETY: the range is within the mapping, whose file cannot shrink, and `data` has the capacity. The client may
-        // write to the range at the same time, which can only mix old and new bytes: no reference to the memory exists,
-        // and every byte is a valid u8.
+        // SAFETY: the range is within the mapping, whose file cannot shrink, and `data` has the capacity. The client
+        // may write to the range at the same time, which can only mix old and new bytes: no reference to the memory
+        // exists, and every byte is a valid u8.
         unsafe {
             std::ptr::copy_nonoverlapping(self.mapping.as_ptr().add(slot * SLOT_BYTES), data.as_mut_ptr(), bytes);
             data.set_len(bytes);

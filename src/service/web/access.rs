@@ -1,5 +1,5 @@
-//! Checks which requests may use the viewer. Any web page can send requests to a port of its user's machine, so a request
-//! needs the token, and its `Host` and `Origin` must be those of this server.
+//! Checks which requests may use the viewer. Any web page can send requests to a port of its user's machine, so a
+//! request needs the token, and its `Host` and `Origin` must be those of this server.
 
 use std::hint::black_box;
 use std::net::IpAddr;
@@ -58,7 +58,7 @@ impl Access {
 
     /// Whether a `Host` header names this server. The port is not compared, because a tunnel may have another one.
     fn is_own_host(&self, host: &str, local_ip: Option<IpAddr>) -> bool {
-        // Not a name with a user.
+        // A host name that contains a user (`user@host`) is rejected.
         let Some(authority) = host.parse::<Authority>().ok().filter(|_| !host.contains('@')) else { return false };
         let name = authority.host();
         let address = name.trim_start_matches('[').trim_end_matches(']').parse::<IpAddr>();

@@ -18,7 +18,7 @@ use crate::engine::lock;
 /// Bytes of messages that a client may send before the service has taken any.
 const INITIAL_CREDIT: i64 = 1 << 20;
 
-/// Credit is returned when so many bytes have been processed.
+/// Credit is returned when at least this many bytes have been processed.
 const MIN_RETURNED_CREDIT: i64 = INITIAL_CREDIT / 4;
 
 /// Messages below this size are collected in one frame of the body.
@@ -46,7 +46,7 @@ struct State {
     memory_bytes: usize,
     /// Bytes that the client may send. Negative after a message that was larger than the credit.
     credit: i64,
-    /// Bytes that the service has taken and that are not returned to the client.
+    /// Bytes that the service has taken, and for which no credit was returned to the client yet.
     processed_bytes: i64,
     /// The client has sent END.
     is_complete: bool,
@@ -60,8 +60,9 @@ struct QueuedFrame {
     data: Bytes,
     /// Bytes of messages in the frame, without prefixes.
     payload_bytes: usize,
-    /// Bytes of the budget that are free once the service has the frame. The prefix of a large message has the bytes of
-    /// the message, because the body of the request counts them from the prefix on.
+    /// Bytes of the budget that are released when the service takes the frame. A frame that ends with the prefix of a
+    /// large message also releases the bytes of that message, because the body of the request counts them from the
+    /// prefix on.
     memory_bytes: usize,
 }
 
@@ -146,7 +147,8 @@ impl State {
         }
     }
 
-    /// Moves the collected messages to a frame. `announced_bytes` is the size of a message that follows the last prefix.
+    /// Moves the collected messages to a frame. `announced_bytes` is the size of a message that follows the last
+    /// prefix.
     fn end_frame(&mut self, announced_bytes: usize) {
         let data = self.collected.split().freeze();
         if !data.is_empty() {

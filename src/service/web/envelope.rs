@@ -37,7 +37,7 @@ pub(super) enum ClientContent {
     Credit(u32),
 }
 
-/// What a call begins with.
+/// The content of a START message.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) struct CallHead {
     pub(super) timeout: Option<Duration>,

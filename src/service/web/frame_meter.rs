@@ -1,8 +1,8 @@
 //! Limits on the WebSocket frames of a connection, which the library does not have: incomplete messages count against
 //! the receive budgets from their first header on and have a deadline, and frames without payload are counted.
 //!
-//! The library keeps the memory of its largest frame. Its reader is therefore replaced after a message with a large frame,
-//! and no byte after this message is read before ([`FrameMeter::take_boundary`]).
+//! The library keeps the memory of its largest frame. Its reader is therefore replaced after a message with a large
+//! frame, and no byte after this message is read before ([`FrameMeter::take_boundary`]).
 
 use std::io;
 use std::sync::Arc;
@@ -22,7 +22,7 @@ const MAX_HEADER_BYTES: usize = 14;
 /// Opcodes from here on are control frames.
 const FIRST_CONTROL_OPCODE: u8 = 8;
 
-/// Payload of a frame from which on it is large. More than the library reads at once.
+/// A frame with at least this many bytes of payload is large. The library reads fewer bytes at once.
 const MIN_LARGE_FRAME: usize = 64 << 10;
 
 /// Bytes of a connection.
@@ -78,8 +78,8 @@ impl FrameMeter {
         }
     }
 
-    /// Whether all received bytes belong to complete messages, the last of which has a large frame. The answer is true once
-    /// per message.
+    /// Whether all received bytes belong to complete messages, the last of which has a large frame. The answer is true
+    /// once per message.
     pub(super) fn take_boundary(&mut self) -> bool {
         std::mem::take(&mut self.is_at_boundary)
     }

@@ -70,6 +70,8 @@ type Answer = Response<Full<Bytes>>;
 type Upgrade = Mutex<Option<OnUpgrade>>;
 
 impl WebServer {
+    /// Unpacks the page of the viewer.
+    ///
     /// # Errors
     /// `Fault` when the page that the program contains is damaged.
     pub(super) fn new(routes: Routes, access: Access, is_serving: Arc<AtomicBool>, config: &Config) -> Result<Self> {

@@ -12,8 +12,8 @@ use tokio_tungstenite::tungstenite::protocol::frame::coding::{Data, OpCode};
 
 use super::envelope::{ENVELOPE_BYTES, ServerKind, server_envelope};
 
-/// Largest payload of a WebSocket frame. A message has as many frames as it needs. The library copies each frame into its
-/// buffer, which therefore remains small.
+/// Largest payload of a WebSocket frame. A message has as many frames as it needs. The library copies each frame into
+/// its buffer, which therefore remains small.
 const MAX_FRAME_BYTES: usize = 64 << 10;
 
 /// Pieces below this size are collected in one frame. Copying fewer bytes costs less than a further frame.
@@ -67,8 +67,8 @@ impl OutgoingMessage {
     }
 }
 
-/// Writes messages until the queue is closed, and adds the bytes of their payloads to `sent_bytes`. A message is dropped
-/// when it is written to the socket.
+/// Writes messages until the queue is closed, and adds the bytes of their payloads to `sent_bytes`. A message is
+/// dropped when it is written to the socket.
 pub(super) async fn write_messages<S>(
     sink: &mut S,
     queue: &mut mpsc::Receiver<Outgoing>,

@@ -37,8 +37,8 @@ impl Page {
         Ok(Self { body: Bytes::from_static(VIEWER), script_sources: script_sources(&html)? })
     }
 
-    /// The content security policy for a page that was loaded from `host`, which may have a port. Only the scripts of the
-    /// page may run, and only this server may be connected to. Pages that embed the viewer, such as notebooks, are
+    /// The content security policy for a page that was loaded from `host`, which may have a port. Only the scripts of
+    /// the page may run, and only this server may be connected to. Pages that embed the viewer, such as notebooks, are
     /// allowed, because they need the token.
     pub(super) fn policy(&self, host: &str) -> String {
         format!(

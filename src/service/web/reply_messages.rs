@@ -106,7 +106,7 @@ impl PieceQueue {
         Ok(Some(self.take(message_bytes)))
     }
 
-    /// Removes bytes from the front. There must be as many.
+    /// Removes `bytes` bytes from the front. The queue must contain at least as many.
     fn take(&mut self, bytes: usize) -> Vec<Bytes> {
         self.bytes -= bytes;
         let (mut taken, mut missing) = (Vec::new(), bytes);

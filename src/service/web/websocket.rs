@@ -72,8 +72,8 @@ impl WebSocketLimits {
     }
 }
 
-/// The socket from which a [`Reader`] reads. What the library answers by itself is dropped, because a [`Writer`] sends the
-/// answers.
+/// The socket from which a [`Reader`] reads. Answers that the library writes to it are dropped, because a [`Writer`]
+/// sends them.
 type ReadSocket = MeteredSocket<Join<ReadHalf<Socket>, Sink>, FrameMeter>;
 
 /// Sends messages. Separate from the reader, so that the reader can be replaced.
@@ -125,7 +125,7 @@ pub(super) async fn serve_websocket(
 ) {
     let traffic = Arc::<Traffic>::default();
     let mut meter = FrameMeter::new(&info.receive, Arc::clone(&traffic));
-    // The socket does not check its prefix.
+    // A `MeteredSocket` does not check its prefix, so these bytes are counted here.
     if meter.receive(&first_bytes).is_err() {
         return;
     }
@@ -158,8 +158,8 @@ pub(super) async fn serve_websocket(
     }
 }
 
-/// Sends a close frame and waits until the client has closed its side. Without the wait, unread bytes of the client could
-/// reset the connection before the client has read the frame.
+/// Sends a close frame and waits until the client has closed its side. Without the wait, unread bytes of the client
+/// could reset the connection before the client has read the frame.
 async fn close(mut writer: Writer, reader: Reader, reason: CloseReason) {
     writer.close(Some(reason.into_frame())).await.ok();
     let mut write_socket = writer.into_inner();
@@ -170,7 +170,8 @@ async fn close(mut writer: Writer, reader: Reader, reason: CloseReason) {
     while let Ok(1..) = socket.read(&mut buffer).await {}
 }
 
-/// Sends a ping when nothing has been received for the keepalive interval. Ends when nothing is received after it.
+/// Sends a ping when nothing has been received for the keepalive interval. Ends if nothing is received in time after
+/// the ping.
 async fn keep_alive(traffic: &Traffic, outgoing: mpsc::Sender<Outgoing>, limits: WebSocketLimits) {
     let is_unchanged = async |duration| {
         let before = traffic.received.load(Ordering::Relaxed);
