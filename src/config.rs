@@ -123,27 +123,29 @@ pub struct Config {
     pub allow_software: bool,
     /// The largest message that the server accepts, in bytes.
     pub message_bytes: usize,
-    /// Limits in bytes on the messages that are being received: on one connection, and in total. An incomplete message
-    /// counts with its whole length. A request above the limit of its connection is rejected. Above the total, the
-    /// connection that holds the most loses its incomplete messages.
+    /// Limit in bytes on the messages that one connection is sending; `receive_bytes` limits those of all connections.
+    /// An incomplete message counts with its whole length. A request above the limit of its connection is rejected.
+    /// Above the total, the connection that holds the most loses its incomplete messages.
     pub connection_receive_bytes: usize,
+    /// See `connection_receive_bytes`: the limit of all connections.
     pub receive_bytes: usize,
     /// Longest time without progress of an incomplete message. Progress below 32 KiB/s extends it only in part.
     pub message_timeout: Duration,
-    /// Limits in bytes on the replies that are produced and not yet sent: on one connection, and in total. Above a limit,
-    /// senders wait. While the total is exhausted, a connection that holds more than an equal share and takes nothing for
-    /// 0.4 s is closed.
+    /// Limit in bytes on the produced replies that are not sent yet, of one connection; `reply_bytes` limits those of
+    /// all connections. Above a limit, senders wait. While the total is exhausted, a connection that holds more than an
+    /// equal share and takes nothing for 0.4 s is closed.
     pub connection_reply_bytes: usize,
+    /// See `connection_reply_bytes`: the limit of all connections.
     pub reply_bytes: usize,
-    /// A call whose client takes less than a message, of at most 1 MiB, within this time ends when another reply waits for
-    /// the same limit. After this time again, its connection is closed.
+    /// A call ends if its client takes less than one message (at most 1 MiB) within this time while another reply waits
+    /// for the same limit. After the same time again, its connection is closed.
     pub reply_timeout: Duration,
     /// The largest chunk of data in one reply message, in bytes. The message also contains a head.
     pub chunk_bytes: usize,
     /// The largest image side in pixels.
     pub frame_side: u32,
-    /// Limit on the pixels of one connection in single frames that are not sent completely, and in its frame streams, which
-    /// count separately. A further single frame waits, and a further stream is rejected.
+    /// Limit on the pixels of one connection in single frames that are not sent completely, and in its frame streams,
+    /// which count separately. A further single frame waits, and a further stream is rejected.
     pub connection_pixels: u32,
     /// Limit on open scenes.
     pub open_scenes: usize,
@@ -152,7 +154,7 @@ pub struct Config {
     /// Largest window that a client may request.
     pub max_window: u32,
     /// HTTP/2 flow-control window of a stream, in bytes: what a client may send before the server has read it. It
-    /// limits the steps to one window per round trip: 2 MiB to 42 MB/s at 50 ms.
+    /// limits a stream to one window per round trip: with 2 MiB and a round trip of 50 ms, to 42 MB/s.
     pub stream_window: u32,
     /// Limit on the total size of one upload, in bytes.
     pub upload_bytes: u64,
@@ -174,10 +176,11 @@ pub struct Config {
     /// Limit on open connections. Above it, connections without calls are closed: those that have sent no request,
     /// and then those that were idle for the longest time.
     pub connections: usize,
-    /// Time within which a new connection must send the preface of HTTP/2, which is 24 bytes, or the head of a request in
-    /// HTTP/1.1.
+    /// Time within which a new connection must send the preface of HTTP/2, which is 24 bytes, or the head of a request
+    /// in HTTP/1.1.
     pub handshake_timeout: Duration,
-    /// Time after the preface or the handshake of a WebSocket within which a connection must send its first request.
+    /// Time within which a connection must send its first request, from the preface of HTTP/2 or the handshake of a
+    /// WebSocket on.
     pub first_request_timeout: Duration,
     /// Interval of keepalive pings of HTTP/2 and WebSockets.
     pub keepalive_interval: Duration,

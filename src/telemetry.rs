@@ -76,8 +76,8 @@ pub fn init_logging() {
     subscriber.try_init().ok();
 }
 
-/// Writes at most [`LOG_BURST`] records of a class at once, and then one per second. A class has all records of one place
-/// in the source. Clients cause many of the records, and must not fill the disk with them.
+/// Writes at most [`LOG_BURST`] records of a class at once, and then one per second. A class contains the records of
+/// one place in the source. Clients cause many of the records, and must not be able to fill the disk with them.
 struct LimitedFormat<F> {
     inner: F,
     classes: Mutex<HashMap<Identifier, LogBudget>>,
@@ -100,7 +100,7 @@ impl LogBudget {
         Self { allowance: LOG_BURST, last_record: now, suppressed: 0 }
     }
 
-    /// Counts a record. Returns the number of suppressed ones before it if it may be written.
+    /// Counts a record. If it may be written, returns the number of records that were suppressed before it.
     fn record(&mut self, now: Instant) -> Option<u64> {
         let seconds = now.saturating_duration_since(self.last_record).as_secs_f64();
         self.last_record = now;

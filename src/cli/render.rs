@@ -58,9 +58,9 @@ pub(super) struct Args {
     /// Draws lines along the edges of the faces, of this width. Default: as `look.edges` of the scene. 0: no lines.
     #[arg(long, value_name = "PIXELS", num_args = 0..=1, default_missing_value = "1.25", conflicts_with = "output")]
     edges: Option<f32>,
-    /// Preset of the antialiasing and the shadow map: preview, standard or best. Replaces the preset of the scene. Keys
-    /// of the table `look` in scene.toml win over it. Default: that of the scene, else four samples per pixel and the
-    /// shadow map of a GPU, on every machine.
+    /// Preset of the antialiasing and the shadow map: preview, standard or best. Replaces the preset of the scene, but
+    /// no other keys of the table `look` in scene.toml. Default: the preset of the scene; without one, the settings of
+    /// a GPU on every machine (four samples per pixel, and the shadow map of a GPU).
     #[arg(long, value_name = "PRESET")]
     look: Option<LookPreset>,
     /// Deformation backend.

@@ -58,11 +58,12 @@ pub(super) struct Args {
     /// Largest accepted message, in bytes.
     #[arg(long, default_value_t = Config::default().message_bytes)]
     message_bytes: usize,
-    /// Limit on the messages that one connection is sending, in bytes. Default: 32 MiB, and at least the largest message.
+    /// Limit on the messages that one connection is sending, in bytes. Default: 32 MiB, and at least the largest
+    /// message.
     #[arg(long)]
     connection_receive_bytes: Option<usize>,
-    /// Limit on the messages that all connections are sending, in bytes. When it is exhausted, the connection that holds
-    /// the most loses its incomplete messages.
+    /// Limit on the messages that all connections are sending, in bytes. When it is exhausted, the connection that
+    /// holds the most loses its incomplete messages.
     #[arg(long, default_value_t = Config::default().receive_bytes)]
     receive_bytes: usize,
     /// Longest time without progress of an incomplete message, in milliseconds.
@@ -80,8 +81,8 @@ pub(super) struct Args {
     /// Largest side of a frame, in pixels.
     #[arg(long, default_value_t = Config::default().frame_side)]
     frame_side: u32,
-    /// Limit on the pixels of one connection in single frames that are drawn or sent, and in its frame streams. Default:
-    /// 8192 x 8192, and at least the largest frame.
+    /// Limit on the pixels of one connection in single frames that are drawn or sent, and in its frame streams.
+    /// Default: 8192 x 8192, and at least the largest frame.
     #[arg(long)]
     connection_pixels: Option<u32>,
     /// Limit on open connections. Above it, a connection without calls is closed for each new one.

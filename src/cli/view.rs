@@ -33,8 +33,8 @@ pub(super) struct Args {
     /// Print the URL and do not open a browser.
     #[arg(long)]
     no_open: bool,
-    /// Move the scene with the physics process `modalcast-sim auto`, which viewers can pull. Default: if the program is
-    /// beside this one.
+    /// Move the scene with the physics process `modalcast-sim auto`, so that viewers can pull on the scene. Default: on
+    /// if the program is in the folder of this one.
     #[arg(long, overrides_with = "no_sim")]
     sim: bool,
     /// Show the scene at rest, until another process drives it.
@@ -64,7 +64,7 @@ impl Args {
     /// The physics program, if the scene is to be moved.
     ///
     /// # Errors
-    /// `Unavailable` when it is asked for and does not exist.
+    /// `Unavailable` when `--sim` is given and the program does not exist.
     fn physics_program(&self) -> Result<Option<PathBuf>> {
         match program_path(PHYSICS_PROGRAM) {
             _ if self.no_sim => Ok(None),
@@ -99,7 +99,7 @@ async fn view(args: &Args, input: &DemoScene, config: ValidatedConfig, physics_p
         opened = open => opened?,
         () = signals.received() => return Ok(()),
     };
-    // The server's sockets are open, so these programs wait until it serves them.
+    // The sockets are already open, so the browser and the physics process wait until the server answers.
     let url = viewer_url(&listener, &scene)?;
     print_line(format!("open {url}"));
     if !args.no_open && std::env::var_os("SSH_CONNECTION").is_none() {
