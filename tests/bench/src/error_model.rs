@@ -310,7 +310,6 @@ mod tests {
             assert!(!stored.is_exact() && stored.tiles(0).is_some());
             let mut bounds = [1e-6; 256];
             stored.bounds(0, &state).widen_bounds(0, bounds.iter_mut());
-            // Any vertex.
             bounds[200]
         };
         let [f16_bound, bf16_bound, int8_bound] =

@@ -15,8 +15,8 @@ pub const RANKS: [usize; 3] = [10, 20, 30];
 pub const CPU_OVER_GPU: [[f64; 5]; 3] =
     [[2.53, 0.68, 1.44, 1.6, 1.77], [6.47, 2.76, 5.01, 6.54, 7.04], [5.32, 3.67, 6.60, 8.02, 9.69]];
 
-/// One plant of tables 4.5 to 4.7. Times are in milliseconds. An occupation is the fraction of the frame time that a
-/// computation takes.
+/// One plant of tables 4.5 to 4.7. Times are in milliseconds; `t_uq` is the time of u = U q. An occupation is the
+/// fraction of the frame time that a computation takes.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct ThesisPlant {
     pub name: &'static str,
@@ -76,7 +76,8 @@ type SizeColumns = [usize; 7];
 /// `t_uq` of CPU and GPU, `t_vb` (table 4.6), `k_uq`, `O_uq` of CPU and GPU in per cent (table 4.7).
 type TimeColumns = [f64; 6];
 
-/// FPS and `t_vbr` of the CPU, FPS, `t_vbr` and s of the GPU (table 4.6), `O_vbr` of CPU and GPU in per cent (table 4.7).
+/// FPS and `t_vbr` of the CPU, FPS, `t_vbr` and s of the GPU (table 4.6), `O_vbr` of CPU and GPU in per cent (table
+/// 4.7).
 type RenderColumns = [f64; 7];
 
 /// A plant from its rows of the three tables. `kernels` is `n_uqk` of table 4.6.
@@ -150,8 +151,8 @@ mod tests {
 
     #[test]
     fn printed_speedups_and_occupations_follow_from_t_vbr() {
-        // Printed quotients of `t_vbr` of the CPU and of the GPU, with two digits after the point. Printed occupations are
-        // percentages with two digits after the point, so the fractions have four.
+        // Printed quotients of `t_vbr` of the CPU and of the GPU, with two digits after the point. Printed occupations
+        // are percentages with two digits after the point, so the fractions have four.
         let speedups = [1.16, 3.48, 40.40, 15.54, 11.41, 27.29, 16.23, 24.96, 19.34, 79.36, 47.58, 19.71];
         for (plant, speedup) in PLANTS.iter().zip(speedups) {
             let ThesisRenderTimes { cpu_vbr_ms, cpu_fps, cpu_vbr_occupation, .. } = plant.drawn;

@@ -76,13 +76,14 @@ mod tests {
     use super::super::kernel_benchmark::tests::compile_all;
     use super::*;
 
-    /// CPU twin of the addressing of `copy` and `read`: the indices of the vectors that they access.
+    /// CPU twin (the same algorithm in Rust) of the addressing of `copy` and `read`: the indices of the vectors that
+    /// they access.
     fn twin_of_copy(blocks: u64, loads: u64) -> Vec<u64> {
         let threads = (0..blocks).flat_map(|block| (0..BLOCK).map(move |thread| block * BLOCK * loads + thread));
         threads.flat_map(|first| (0..loads).map(move |index| first + index * BLOCK)).collect()
     }
 
-    /// CPU twin of `fill`, for one word.
+    /// CPU twin of `fill`: the same algorithm in Rust, for one word.
     fn twin_of_fill(index: u32) -> u32 {
         let mut key = index ^ index >> 16;
         key = key.wrapping_mul(0x85eb_ca6b);

@@ -342,8 +342,8 @@ mod tests {
         (33, 40, 17),
     ];
 
-    /// CPU twin of `batch_mma`, warp by warp. It uses the kernel's fragments, staging buffer and stores, but sums in
-    /// f64. Positions that no warp stores are NaN.
+    /// CPU twin of `batch_mma`: the same algorithm in Rust, warp by warp. It uses the kernel's fragments, staging
+    /// buffer and stores, but sums in f64. Positions that no warp stores are NaN.
     fn twin_of_batch_mma(inputs: &KernelInputs, coordinate_count: usize) -> Vec<f32> {
         let mut positions = vec![f32::NAN; coordinate_count];
         let vertices = inputs.args.vertices as usize;

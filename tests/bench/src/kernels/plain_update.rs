@@ -171,7 +171,7 @@ mod tests {
         rest: Vec<f32>,
     }
 
-    /// CPU twin of `plain_update`, for one vertex.
+    /// CPU twin of `plain_update`: the same algorithm in Rust, for one vertex.
     fn twin_of_plain_update(tables: &Tables, transforms: &[f32], u: &[f32], vertex: usize) -> [f32; 3] {
         let domain = tables.vertex_domains[vertex] as usize;
         let plain_domain = tables.domains[domain];

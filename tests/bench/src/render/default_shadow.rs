@@ -1,14 +1,15 @@
 //! Chooses the default shadow map from the measurements of a report, and compares it with the shipped default.
 //!
-//! The rule: of all variants of the shadow map whose mean light error is at most the limit on every workload, the default
-//! is the one with the least time. The error is that of the sun visibility against the reference with hard shadows, which
-//! is the same for all variants, so that blur counts as an error. It grows with the size of the image, as texels become
-//! larger than pixels; the shipped defaults are for 1920 x 1080 on hardware and 1280 x 720 in software. The time is the
-//! geometric mean of the frame times over the workloads, so that each workload has the same weight.
+//! The rule: of all variants of the shadow map whose mean light error is at most the limit on every workload, the
+//! default is the one with the least time. The light error is that of the sun visibility against the reference with
+//! hard shadows, which is the same for all variants, so that blur counts as an error. The light error grows with the
+//! size of the image, because texels become larger than pixels. The shipped defaults are for 1920 x 1080 on hardware
+//! and 1280 x 720 in software. The time is the geometric mean of the frame times over the workloads, so that all have
+//! the same weight.
 //!
-//! Standard maps are no candidates: they are not filtered, and the mean error does not show their jagged edges. The
-//! workload `shelf` is not used: it shows a piece of the ground of a few texels, where the error is that of the blur's
-//! width and not that of a picture.
+//! Standard maps are not candidates: they are not filtered, and the mean error does not show their jagged edges. The
+//! workload `shelf` is not used: its image shows only a few texels of the map, so its error depends on the width of the
+//! blur.
 
 use serde::Serialize;
 
@@ -30,7 +31,7 @@ const SOFTWARE_LEVELS: f64 = 2.0;
 /// The default shadow map by the measurements of a report.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct DefaultShadow {
-    /// The largest mean light error of a default.
+    /// The limit of the rule on the mean light error.
     pub max_light_error: f64,
     /// The workloads that every candidate was measured on.
     pub loads: Vec<String>,
@@ -212,7 +213,8 @@ mod tests {
                 // Slower on one workload, faster on the other; the geometric mean is 200.
                 row("tree", "large", other(999), 1000.0, 0.001),
                 row("square", "large", other(999), 40.0, 0.001),
-                // Not candidates: not filtered, not timed on a workload, another format, and a workload that is not used.
+                // Not candidates: not filtered, not timed on a workload, another format, and a workload that is not
+                // used.
                 row("tree", "standard", standard, 1.0, 0.0),
                 row("square", "standard", standard, 1.0, 0.0),
                 row("tree", "untimed", other(77), 1.0, 0.0),

@@ -16,8 +16,8 @@ use modalcast_model::error::{Result, fault_in};
 ///
 /// - `color`, `light`: errors against the reference with hard shadows; `light` is the sun visibility
 /// - `of_aim`: errors against the intended result: no shadow, a hard shadow, or a hard shadow with the variant's blur
-/// - `bleeding`, `penumbra`, `lost`: of `light_of_aim`: mean sun visibility in the umbra, errors in the penumbra, and
-///   mean missing sun visibility where the reference has no shadow
+/// - `bleeding`, `penumbra`, `lost`: mean sun visibility in the umbra, errors in the penumbra, and mean missing sun
+///   visibility where there is no shadow; all against the intended result
 /// - `to_fail`: whether the variant is expected to exceed its bounds
 /// - `no_flicker`: why flicker was not measured
 /// - `listed`, `hidden`: triangles that are passed to the rasterizer, and triangles that are occluded
@@ -174,8 +174,8 @@ fn passes_csv(report: &RenderReport) -> Result<Vec<u8>> {
     encode_csv(header.map(String::from), lines)
 }
 
-/// The CSV of plants, one plant per line: our measurements, then the measurements of the thesis. `t_vbr` and `o_vbr` are
-/// defined in [`super::plants`].
+/// The CSV of plants, one plant per line: our measurements, then the measurements of the thesis. `t_vbr` and `o_vbr`
+/// are defined in [`super::plants`].
 fn plants_csv(plants: &[PlantResult]) -> Result<Vec<u8>> {
     let header =
         ["load", "species", "full", "backend", "shared", "triangles", "domains", "map_size", "deform_ms", "upload_ms"];

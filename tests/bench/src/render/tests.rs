@@ -113,8 +113,8 @@ fn shades_one_pixel_by_equation_3_12() {
     add_rigid_domain(&mut parts, "square", upright_square([-3.0, -3.0, 3.0, 3.0], 0.0), material).expect("a domain");
     parts.look.sun = [3.0, 0.0, 4.0];
     let image = trace_images(parts, Viewpoint::Front, &[ShadowModel::Unshadowed], 41).remove(0);
-    // The center of the middle pixel is the origin, so the eye is straight ahead and v_e' is n. The unit vector to the
-    // sun is [0.6, 0, 0.8].
+    // The center of the middle pixel is the origin, so the eye is straight ahead and v_e', the reflected direction to
+    // the eye in the equation, is n. The unit vector to the sun is [0.6, 0, 0.8].
     let cosine: f64 = 0.8;
     let expected = [(0.2, 0.5, 0.3), (0.4, 0.25, 0.2), (0.6, 0.1, 0.1)]
         .map(|(ambient, diffuse, specular)| 0.25 * ambient + 0.5 * (cosine * diffuse + cosine.powi(3) * specular));

@@ -31,7 +31,7 @@ pub struct AfternoonComparison {
     /// Width and height of the pictures.
     pub size: [u32; 2],
     pub frames: u64,
-    /// `cupy` or `numpy`.
+    /// The array library of the program: `cupy` or `numpy`.
     pub arrays: String,
     /// The OpenGL renderer of the program.
     pub renderer: String,
@@ -40,7 +40,7 @@ pub struct AfternoonComparison {
     pub of_best_png: f64,
 }
 
-/// A variant of the program beside the same content of the server.
+/// A variant of the program, compared with the server.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct AfternoonVariant {
     /// `raw`, `png` (encoded on one thread), `png-pool` (on all cores) or `vertices`.
@@ -49,7 +49,8 @@ pub struct AfternoonVariant {
     pub per_second: f64,
     /// Bytes of a reply on average.
     pub bytes: f64,
-    /// The content that the server delivers: RGBA in place of RGB, and PNG of the whole default look.
+    /// The compared content of the server. It is RGBA where the program sends RGB, and its PNGs show the complete
+    /// default look, which the program simplifies.
     pub server_content: String,
     pub server_per_second: f64,
     pub server_bytes: f64,

@@ -1,9 +1,9 @@
 //! The waits of one client while the server works for another one: it loads scenes, or draws large frames.
 //!
 //! The first client drives the scene of the session: it sends a step each period and receives a small frame of it. Each
-//! wait counts from the time at which the step was due, so a stall of the server also counts for the steps that were due
-//! during it. After a stall the client continues with the step that is due then, as a client that follows real time. The
-//! second client runs on a thread of its own.
+//! wait counts from the time at which the step was due, so a stall of the server also counts for the steps that were
+//! due during it. After a stall the client continues with the step that is due then, as a client that follows real
+//! time. The second client runs on a thread of its own.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -198,7 +198,7 @@ impl<'a> Probe<'a> {
         Ok(Self { motion, steps, frames, number: 0, period: MIN_PERIOD, due: Instant::now() })
     }
 
-    /// A period in which the server can finish a step although its time varies.
+    /// Chooses a period in which the server can finish a step although its time varies.
     async fn choose_period(&mut self) -> Result<()> {
         let mut waits = Vec::new();
         for _ in 0..PERIOD_STEPS {
@@ -210,8 +210,8 @@ impl<'a> Probe<'a> {
         Ok(())
     }
 
-    /// Sends the next step when it is due. Also adds the waits of the steps that were due before its frame arrived, which
-    /// are not sent.
+    /// Sends the next step when it is due, and adds its wait. Steps that become due before its frame arrives are not
+    /// sent; their waits are added too.
     async fn next(&mut self, waits: &mut Vec<Wait>) -> Result<()> {
         self.due += self.period;
         tokio::time::sleep_until(self.due.into()).await;

@@ -1,6 +1,6 @@
 //! Latency with one step in flight. The sender and the viewer are two connections of this process, so that one clock
-//! measures both ends. All tasks of this process run on one thread, so that no time includes the change from one thread of
-//! the client to another. The server is another process.
+//! measures both ends. All tasks of this process run on one thread, so that no time includes a switch between threads
+//! of the client. The server is another process.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -41,7 +41,7 @@ pub struct LatencyResult {
     pub period_ms: Option<f64>,
     /// Steps that were sent more than 2 ms too late, because the previous step had not arrived.
     pub delayed_steps: usize,
-    /// Steps per second if steps are sent from memory without a wait for acknowledgments. Only for acknowledgments.
+    /// Steps per second if steps are sent from memory without waiting for acknowledgments; `None` for frames.
     pub steps_per_second: Option<f64>,
     /// The stages of the server, and everything between them. The largest p50 is first.
     pub stages: Vec<StageLatency>,

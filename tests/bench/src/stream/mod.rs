@@ -1,10 +1,10 @@
 //! Rates, latencies and encodings at the client, with the server, the physics process and each viewer in its
 //! own process of this machine.
 //!
-//! - `processes` starts and ends child processes, and `peers` are the roles of this program as such a process:
-//!   `viewer`, `socket` (a plain TCP connection) and `proxy` (a delaying connection).
-//! - `session` is a server with one scene. `motion` has steps that are sent without computing them, `grid` is a scene of
-//!   many vertices.
+//! - `processes` starts and ends child processes. `peers` are the jobs of this program as a child process: `viewer`,
+//!   `socket` (a plain TCP connection) and `proxy` (a delaying connection).
+//! - `session` is a server with one scene. `motion` has steps that are sent without computing them, `grid` is a scene
+//!   of many vertices.
 //! - `cases` lists the cases. Each case makes one measurement: `rates` with `stages`, `latency`, `socket`,
 //!   `contention`, `delay`, `vertex_encodings`, `picture_encodings` or `afternoon`.
 //! - `afternoon_scene` writes a scene for the Python program of `afternoon`.

@@ -36,7 +36,7 @@ const COLUMNS: [&str; 14] = [
 /// One number of a case.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Quantity {
-    /// What the number is about, for cases with several variants: an encoding or a stage. Empty for others.
+    /// The encoding, stage or other variant that the number belongs to; empty for a case without variants.
     pub(super) variant: String,
     pub(super) name: &'static str,
     pub(super) value: f64,
@@ -47,7 +47,7 @@ fn quantity(name: &'static str, value: f64, unit: &'static str) -> Quantity {
     Quantity { variant: String::new(), name, value, unit }
 }
 
-/// The same numbers for a variant.
+/// The quantities, labeled as those of a variant.
 fn of_variant(variant: &str, quantities: impl IntoIterator<Item = Quantity>) -> Vec<Quantity> {
     quantities.into_iter().map(|quantity| Quantity { variant: variant.to_owned(), ..quantity }).collect()
 }

@@ -19,8 +19,8 @@ use modalcast_model::error::{Result, fault};
 /// Steps of the untimed first run, which compiles kernels and shaders and fills the caches.
 const WARM_UP_STEPS: u64 = 3;
 
-/// Minimum number of steps from which the rate of the physics process alone is measured, because its first step sends all
-/// values.
+/// Minimum number of steps from which the rate of the physics process alone is measured, because its first step sends
+/// all values.
 const MIN_PHYSICS_STEPS: u64 = 60;
 
 /// The viewers of a case.
@@ -53,9 +53,9 @@ pub struct RateResult {
     pub steps: u64,
     /// Rate of each run.
     pub runs: Vec<f64>,
-    /// The median of `runs`. A client that receives n replies in a time t, counted from the first to the last reply, has
-    /// the rate (n - 1) / t. The rate of a run is that of its slowest client, or that of the physics process if there
-    /// are no clients.
+    /// The median of `runs`. A client that receives n replies in a time t, counted from the first to the last reply,
+    /// has the rate (n - 1) / t. The rate of a run is that of its slowest client, or that of the physics process if
+    /// there are no clients.
     pub per_second: f64,
     /// Steps per second of the physics process, from its first step to its last acknowledgment. This and the following
     /// results are those of the run with the median rate.
@@ -143,8 +143,8 @@ pub(super) fn measure(
     })
 }
 
-/// Steps of a run. Steps without pictures are fast, so such a run has more of them, and its start and its end are a small
-/// part of it.
+/// Steps of a run. Steps without pictures are fast, so such a run has more of them, and its start and its end are a
+/// small part of it.
 pub(super) fn steps_of_run(content: Option<Content>, options: &StreamReportOptions) -> u64 {
     if content.is_some_and(Content::is_picture) { options.steps } else { 4 * options.steps }
 }
@@ -212,7 +212,7 @@ mod tests {
     }
 
     #[test]
-    fn viewers_take_turns_with_the_views() {
+    fn viewers_are_assigned_to_the_views_in_turn() {
         let viewers = Viewers { content: Content::Positions, count: 8, views: 4 };
         assert_eq!((0..8).map(|viewer| viewers.view_of(viewer)).collect::<Vec<_>>(), [0, 1, 2, 3, 0, 1, 2, 3]);
     }

@@ -22,7 +22,7 @@ use modalcast_model::error::{Error, Result, fault_in};
 use modalcast_model::load::{self, OpenedScene};
 use modalcast_model::scene::{FrameAntialiasing, RenderSettings, RendererKind};
 
-/// Longest time between the end of the server's connections and its own end.
+/// Longest time in which a failed server exits after its connections have ended.
 const SERVER_END: Duration = Duration::from_secs(1);
 
 /// The scene of a case.
@@ -99,7 +99,7 @@ pub(super) struct Session {
     /// `None` for a scene that is not drawn.
     pub(super) look: Option<SceneLook>,
     pub(super) address: SocketAddr,
-    /// Folder in which `modalcast-sim` finds the force file of the scene.
+    /// The folder of the scene, for the option `--files` of `modalcast-sim`.
     files: PathBuf,
     /// Steps per second of the physics process, if the server does not slow it down.
     pub(super) physics_per_second: OnceCell<f64>,

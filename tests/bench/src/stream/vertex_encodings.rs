@@ -21,7 +21,7 @@ use modalcast_model::error::{Result, fault, fault_in};
 /// Number of vectors that share a box.
 const BOX_VECTORS: usize = 256;
 
-/// Bound of the relative error of f16, and the bound of the error of numbers that it stores with fewer digits.
+/// Bound of the relative error of f16, and bound of the absolute error of numbers below its normal range.
 const F16_RELATIVE_BOUND: f64 = 1.0 / 2048.0;
 const F16_SMALL_BOUND: f64 = 1.0 / 33_554_432.0;
 
@@ -50,8 +50,8 @@ pub struct VertexEncodingRow {
     pub bytes: u64,
     /// Median time of the server's stage `encode`.
     pub pack_ms: f64,
-    /// Median time that the client's stream works on a step: it assembles the chunks and decodes the numbers to f32. The
-    /// time in which it waits for bytes is not included.
+    /// Median time that the client's stream works on a step: it assembles the chunks and decodes the numbers to f32.
+    /// The time in which it waits for bytes is not included.
     pub decode_ms: f64,
     pub errors: EncodingErrors,
 }
@@ -86,7 +86,7 @@ impl ErrorSum {
     fn add(&mut self, error: f64, bound: f64) {
         let errors = &mut self.errors;
         (errors.largest, errors.bound) = (errors.largest.max(error), errors.bound.max(bound));
-        // Without an error, a bound of 0 is kept.
+        // An exact number is within a bound of 0.
         let of_bound = if error == 0.0 { 0.0 } else { error / bound };
         errors.of_bound = errors.of_bound.max(of_bound);
         self.sum_of_squares += error * error;

@@ -1,4 +1,5 @@
-//! CPU twin of one warp of `kernels/batch_mma.cu`: fragments, staging buffer and stores of all 32 lanes. Sums are f64.
+//! CPU twin (the same algorithm in Rust) of one warp of `kernels/batch_mma.cu`: fragments, staging buffer and stores of
+//! all 32 lanes. Sums are f64.
 //!
 //! A group is 8 domains, the columns of one product. Domain pair p of a group is its domains 2 p and 2 p + 1. The
 //! parity of a domain is its index modulo 2.

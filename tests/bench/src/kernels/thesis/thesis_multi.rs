@@ -111,7 +111,8 @@ mod tests {
     use super::*;
     use modalcast_compute::testing::{displacement_of, scene_and_state};
 
-    /// CPU twin of `thesis_multi`, thread by thread. It also counts the writes to each number of u.
+    /// CPU twin of `thesis_multi`: the same algorithm in Rust, thread by thread. It also counts the writes to each
+    /// number of u.
     fn twin_of_thesis_multi(packed: &PackedGroups, q: &[f32], u: &mut [f32], write_counts: &mut [usize]) {
         for first_lane in (0..packed.meta.len()).step_by(WARP) {
             let is_busy = |lane: &usize| packed.meta[first_lane + lane][0] != IDLE;

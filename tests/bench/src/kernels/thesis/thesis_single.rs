@@ -112,7 +112,7 @@ mod tests {
         i % 4 * 32 + i / 4
     }
 
-    /// CPU twin of `thesis_single`, thread by thread.
+    /// CPU twin of `thesis_single`: the same algorithm in Rust, thread by thread.
     fn twin_of_thesis_single(lines: &[[f32; 4]], q: &[f32], rows: usize) -> Vec<f32> {
         let (rank, width) = (q.len(), vectors_per_row(q.len()).min(WARP));
         let (rows_per_line, passes) = (WARP / width, vectors_per_row(rank).div_ceil(WARP));

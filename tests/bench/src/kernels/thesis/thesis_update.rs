@@ -235,7 +235,7 @@ mod tests {
     use super::*;
     use modalcast_compute::testing::{displacement_of, position_of, scene_and_state};
 
-    /// CPU twin of `thesis_update` for positions, thread by thread.
+    /// CPU twin of `thesis_update` for positions: the same algorithm in Rust, thread by thread.
     fn twin_of_thesis_update(unfolded: &UnfoldedTriangles, transforms: &[f32], u: &[[f32; 4]]) -> Vec<[f32; 4]> {
         let count = unfolded.targets.len();
         let mut positions = vec![[f32::NAN; 4]; count];
