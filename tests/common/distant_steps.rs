@@ -42,8 +42,8 @@ fn sheet_scene() -> Arc<Scene> {
     Scene::new(parts).expect("expected a valid scene")
 }
 
-/// Positions stay within 1e-6 of the diagonal of the model, and normals stay exact, at every distance. Back at its
-/// first place, the model has the first bits again.
+/// At every distance, position errors stay within 1e-6 of the diagonal of the model, and normals stay exact. Moved back
+/// to its first place, the model has the same bits as before.
 pub(crate) fn check_driven_model<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) {
     let scene = sheet_scene();
     let diagonal = scene.rest_bounds.diagonal();
@@ -63,7 +63,7 @@ pub(crate) fn check_driven_model<D: Deformer>(create_deformer: impl Fn(&Arc<Scen
         let (origin, surface) = (state.origin_of(0), run_step(&mut deformer, &state).surface);
         for (vertex, expected) in expected_positions.iter().enumerate() {
             for axis in 0..3 {
-                // The difference is exact, also where f64 would round the world position.
+                // The difference of the origins is exact even where f64 would round the world position.
                 let expected = expected[axis] + (translation[axis] - origin[axis]);
                 let error = (f64::from(surface.positions[3 * vertex + axis]) - expected).abs() / diagonal;
                 max_error = max_error.max(error);

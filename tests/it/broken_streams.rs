@@ -1,5 +1,5 @@
 //! Calls that break off in the middle: the client cancels them, or its connection is closed as by `kill -9` of the
-//! client. The server releases everything that they have held.
+//! client. The server releases everything that the calls held.
 
 use std::fmt::Debug;
 use std::path::Path;
@@ -28,7 +28,7 @@ use crate::service_harness::{
     step, strips, with_timeout,
 };
 
-/// A time that no test reaches. Only a release ends the waits that it limits.
+/// A timeout that no test reaches, so that a wait ends only when the server releases what it waits for.
 const NEVER: Duration = Duration::from_secs(3600);
 
 /// Pause between two attempts of a poll.
@@ -104,8 +104,8 @@ fn reason_of<T>(result: Result<T, Status>) -> Reason {
     rejection_details(&result.err().expect("expected an error")).reason()
 }
 
-/// The scene admits as many subscriptions as break off. They are lossless and nobody reads them, so they hold up the
-/// writer until they are released.
+/// The broken subscriptions use up the limit of the scene. They are lossless and unread, so they block the writer until
+/// the server releases them.
 #[tokio::test(flavor = "multi_thread")]
 async fn broken_streams_release_their_subscriptions() {
     let limits = |config| Config {
@@ -179,7 +179,7 @@ async fn broken_requests_stop_waiting() {
     drop(poll(async || try_wait(&direct_channel).await.ok()).await);
 }
 
-/// The replies of the arrays are not read. Their calls hold the scene.
+/// While the arrays of a description are unread, its call holds a reference to the scene.
 #[tokio::test(flavor = "multi_thread")]
 async fn broken_replies_of_arrays_release_the_scene() {
     let server = Server::start_default().await;
@@ -212,7 +212,7 @@ async fn broken_replies_of_arrays_release_the_scene() {
     }
 }
 
-/// The next writer needs no token. The state that it finds is that of a whole step.
+/// The next writer needs no lease token, and finds the state after a complete step.
 #[tokio::test(flavor = "multi_thread")]
 async fn broken_writer_releases_its_lease_after_a_whole_step() {
     const STEPS: u64 = 200;
@@ -311,7 +311,7 @@ async fn break_upload<T, F>(
         Ok(result) => assert!(result.is_err() && how == Break::Close, "expected a broken upload"),
         Err(error) => assert!(error.is_cancelled() && how == Break::Cancel, "{error}"),
     }
-    // Dropped only now, because the end of the messages would end the call without breaking it.
+    // Dropped only now, because dropping the sender ends the call regularly.
     drop(sender);
     poll(async || (folder_count(&uploads) == 0).then_some(())).await;
     assert!(server.engine.find("up").is_err(), "expected no part of the scene");

@@ -136,7 +136,7 @@ async fn half_sent_messages_are_rejected_or_time_out() {
     writer.send_step_and_wait(step(1, &[0], &[0.1, 0.2])).await;
 }
 
-/// Two connections hold all bytes. A third one is served, and the one that holds the most loses its message.
+/// Two connections hold the whole budget. For a third one, the connection that holds the most loses its message.
 #[tokio::test(flavor = "multi_thread")]
 async fn half_sent_messages_do_not_lock_out_other_connections() {
     let limits = |config| Config {
@@ -210,8 +210,8 @@ async fn slow_readers_share_the_reply_budget_without_deadlock() {
     assert!(ended > 0, "expected an unread call to end");
 }
 
-/// Two connections hold the whole budget and read nothing. The reply timeout is too long to help a third one, so one of the
-/// two is closed.
+/// Two connections hold the whole budget and read nothing. The reply timeout is too long to help a third one, so one of
+/// the two is closed.
 #[tokio::test(flavor = "multi_thread")]
 async fn connection_above_its_share_is_closed_when_others_wait() {
     let (connection_reply_bytes, reply_bytes) = (6 << 20, 12 << 20);
@@ -228,9 +228,9 @@ async fn connection_above_its_share_is_closed_when_others_wait() {
     drop(unread_calls);
 }
 
-/// Three unread calls, each with 4.3 MB of modes, exhaust the budget of their connection. Each can hold up to 4 MiB: two
-/// messages of 1 MiB in its queue and two in HTTP/2. When a fourth call waits, unread calls end with a reason, and the
-/// fourth call gets the bytes of their queues.
+/// Three unread calls, each with 4.3 MB of modes, exhaust the budget of their connection. Each can hold up to 4 MiB:
+/// two messages of 1 MiB in its queue and two in HTTP/2. When a fourth call waits, unread calls end with a reason, and
+/// the fourth call gets the bytes of their queues.
 #[tokio::test(flavor = "multi_thread")]
 async fn unread_calls_end_with_a_reason_when_others_wait() {
     let limits = |config| Config { connection_reply_bytes: 8 << 20, reply_timeout: REPLY_TIMEOUT, ..config };
@@ -316,7 +316,7 @@ fn grid_obj(side: usize) -> String {
     text
 }
 
-/// Memory growth of a server with 120 unread descriptions, in bytes: the peak.
+/// Peak growth of the memory of a server with 120 unread descriptions, in bytes.
 async fn growth_by_unread_replies(flags: &[&str]) -> u64 {
     let server = ServerProcess::start(flags);
     let open = v1::OpenSceneRequest { source: "grid.obj".into(), scene: "grid".into() };
@@ -326,7 +326,7 @@ async fn growth_by_unread_replies(flags: &[&str]) -> u64 {
     let idle_bytes = server.memory("VmHWM");
     let attacker = server.channel().await;
     let unread_calls = open_unread_calls(&attacker, "grid", 120).await;
-    // Clients on other connections are served, and give the server the time to produce replies that nobody reads.
+    // Clients on other connections are served. Meanwhile, the server has time to produce the unread replies.
     for _ in 0..10 {
         with_timeout(read_description(server.channel().await, "grid", Duration::from_millis(10)))
             .await

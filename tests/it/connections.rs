@@ -1,4 +1,4 @@
-//! Connections that send no request: they are closed in time, and at once when a new client needs their place.
+//! Connections that send no request are closed after a timeout, or at once if the server is full and a client connects.
 
 use std::time::Duration;
 
@@ -80,7 +80,7 @@ async fn full_server_closes_connections_without_a_request() {
     }
 }
 
-/// A stream protects its connection. Idle connections get GOAWAY, and the writer continues.
+/// A connection with a stream is not closed. Idle connections get GOAWAY, and the writer continues.
 #[tokio::test(flavor = "multi_thread")]
 async fn full_server_keeps_connections_with_a_stream() {
     let server = small_server(2).await;
@@ -98,7 +98,7 @@ async fn full_server_keeps_connections_with_a_stream() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn connection_without_a_request_gets_goaway_in_time() {
+async fn connection_without_a_request_times_out_with_goaway() {
     let first_request_timeout = Duration::from_millis(60);
     let server = Server::start_with(|config| Config { first_request_timeout, ..config }).await;
     server.open("strips").await;
@@ -111,7 +111,7 @@ async fn connection_without_a_request_gets_goaway_in_time() {
 async fn other_protocols_are_closed_at_once() {
     let server = Server::start_with(|config| Config { viewer: false, ..config }).await;
     assert_eq!(read_to_end(connect(&server, b"GET / HTTP/1.1\r\n\r\n").await).await, b"");
-    // With the viewer, HTTP/1.1 is answered and the rest is not.
+    // A server with the viewer answers HTTP/1.1, but no other protocol.
     let server = small_server(4).await;
     let answer = read_to_end(connect(&server, b"GET / HTTP/1.1\r\n\r\n").await).await;
     assert!(answer.starts_with(b"HTTP/1.1 403 "), "{answer:?}");

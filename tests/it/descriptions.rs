@@ -56,8 +56,8 @@ fn strip(vertex_count: usize, rank: usize, has_uvs: bool) -> Shape {
     Shape::new(mesh.expect("expected a valid mesh"), modes.expect("expected valid modes")).expect("expected a shape")
 }
 
-/// Plants of four domains: a shoot with six modes, and three rigid leaves that follow it. All shoots have one shape, and
-/// the leaves of a plant have three shapes. Two materials share a texture.
+/// Plants of four domains: a shoot with six modes, and three rigid leaves that follow it. All shoots have one shape,
+/// and the leaves of a plant have three shapes. Two materials share a texture.
 fn orchard(plant_count: usize) -> Arc<Scene> {
     let shapes = vec![strip(9000, 6, false), strip(12, 0, true), strip(13, 0, true), strip(14, 0, true)];
     let pixels = (0..4 * 8 * 4).map(|byte| byte as u8).collect();
@@ -158,7 +158,7 @@ fn assert_describes(description: &SceneDescription, scene: &Scene) {
     assert_eq!((texture.width, texture.height, &texture.pixels[..]), (8, 4, scene.textures[0].rgba()));
 }
 
-/// The sizes of a description depend on the number of domains only through the domains themselves.
+/// Only the messages of domains grow with the number of domains; those of shapes, materials and textures do not.
 #[tokio::test(flavor = "multi_thread")]
 async fn arrays_of_a_shape_are_sent_once_for_all_its_domains() {
     let scene = orchard(5000);
@@ -211,7 +211,7 @@ async fn client_describes_all_parts_directly_and_through_a_cache() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn selected_domains_come_with_what_they_use() {
+async fn selected_domains_come_with_shapes_and_materials() {
     let (_server, client, _folder) = start_orchard(&orchard(3)).await;
     let request = DescriptionRequest::new("orchard").domains(&[11, 7]);
     let description = client.describe_with(&request).await.expect("expected a description");

@@ -11,7 +11,7 @@ use modalcast_proto::v1;
 
 use crate::service_harness::{Server, config, strips, with_timeout};
 
-/// A source whose scene `built-in` opens at once. Every other one waits until the test sends it a message.
+/// A source whose scene `built-in` opens at once. Every other scene waits until the test sends a message.
 struct BlockedSource {
     started: SyncSender<()>,
     released: Mutex<Receiver<()>>,
@@ -20,7 +20,7 @@ struct BlockedSource {
 impl SceneSource for BlockedSource {
     fn open(&self, source: &str) -> Result<OpenedScene> {
         if !self.is_built_in(source) {
-            self.started.send(()).ok(); // The test waits for the first one only.
+            self.started.send(()).ok(); // The test waits for the first load only.
             self.released.lock().expect("expected no panic").recv().expect("expected a message of the test");
         }
         Ok(strips().into())

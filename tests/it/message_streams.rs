@@ -19,7 +19,7 @@ pub(crate) type MessageSizes = Pin<Box<dyn Stream<Item = Result<usize, Status>> 
 pub(crate) enum StreamKind {
     /// One picture per step.
     Frames,
-    /// Two pictures per step, of which one is a measurement.
+    /// Two pictures per step: color and normals.
     Pictures,
     Vertices,
     States,

@@ -34,7 +34,7 @@ async fn next_frame(frames: &mut FrameStream) -> Frame {
     with_timeout(frames.next()).await.expect("expected another frame").expect("expected a valid frame")
 }
 
-/// Moves the camera of the first picture to a height. Returns the version.
+/// Moves the camera of the first picture to a height. Returns the camera version.
 async fn move_camera(client: &Client, frames: &FrameStream, height: f64) -> u64 {
     let cameras = [(0, Some(camera(height)))];
     client.update_frame_stream(&frames.settings().stream, &cameras).await.expect("expected a moved camera")
@@ -44,7 +44,7 @@ async fn single_frame(client: &Client, height: f64) -> Frame {
     client.render_frame(&FrameRequest::new("strips", picture(height))).await.expect("expected a frame")
 }
 
-/// Step number, skipped steps and version of a frame.
+/// Step number, skipped steps and camera version of a frame.
 fn identity(frame: &Frame) -> (u64, u64, u64) {
     (frame.step.number, frame.skipped, frame.camera_version)
 }
@@ -74,7 +74,8 @@ async fn moved_camera_redraws_a_static_scene() {
     }
 }
 
-/// The stream gets the rest state, which is of run 0, although it waits for a first step.
+/// A stream that waits for the first step gets a frame of the rest state. Its run is 0, because no writer has sent a
+/// step.
 #[tokio::test(flavor = "multi_thread")]
 async fn moved_camera_shows_the_rest_state_before_the_first_step() {
     let (_server, client) = start_server().await;

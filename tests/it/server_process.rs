@@ -95,7 +95,7 @@ impl Drop for ServerProcess {
     }
 }
 
-/// Number of clients per kind of stream that never read.
+/// Number of clients that never read, for each kind of stream.
 const STALLED_READERS: u64 = 16;
 
 /// Limit on the growth of the server's memory in bytes.
@@ -282,7 +282,7 @@ async fn stalled_readers_take_bounded_memory() {
     drop(unread_calls(&channel).await);
     let before = server.resident_bytes();
     let calls = unread_calls(&channel).await;
-    // The vertices of a later call are packed after those of the earlier ones.
+    // The server packs the vertices of this call after those of the unread calls.
     client.get_vertices(&VertexRequest::new("crowded", VertexSelection::default())).await.expect("expected vertices");
     let growth = server.resident_bytes().saturating_sub(before);
     println!("{} unread calls: growth {} MB", calls.len(), growth >> 20);
@@ -296,7 +296,7 @@ fn checkpoint_step(state: &Path) -> Option<(u64, u64)> {
     run.zip(number)
 }
 
-/// Asserts that the scene shows a step of the run that is not older than `kept_step`, and all domains of that step.
+/// Asserts that the scene shows all domains of one step, which is not older than `kept_step` and of the same run.
 async fn assert_whole_step(client: &Client, description: &SceneDescription, kept_step: (u64, u64)) {
     let layout = StateLayout::new(description).expect("expected a layout");
     let state = client.get_state(&StateRequest::new("crowded", ()), &layout).await.expect("expected a state");
@@ -338,8 +338,8 @@ async fn begin_calls(server: &ServerProcess) -> Vec<JoinHandle<Result<(), Status
     calls
 }
 
-/// A server that is killed while all kinds of calls are in progress keeps its scenes, a whole step and the order of the
-/// runs. Nothing remains of the upload that was in progress, and every client gets an error.
+/// A server that is killed while all kinds of calls are in progress keeps its scenes and a complete step, and later
+/// runs have larger numbers. Nothing remains of the upload that was in progress, and every client gets an error.
 #[tokio::test(flavor = "multi_thread")]
 async fn killed_server_keeps_scenes_steps_and_runs() {
     let folder = tempfile::tempdir().expect("expected a temporary folder");

@@ -210,7 +210,7 @@ async fn frames_are_equal_in_shared_memory() {
     let mut local_stream = local.stream_frames(&request).await.expect("expected a subscription");
     let mut remote_stream = remote.stream_frames(&request).await.expect("expected a subscription");
     let mut writer = shared.server.drive_lossless("sheet").await;
-    // Frames that the caller holds do not hold their slots, so that more frames arrive than there are slots.
+    // A frame that the caller keeps does not occupy its slot, so more frames arrive than there are slots.
     let mut held = Vec::new();
     for number in 1..=3 {
         writer.send_step_and_wait(step(number, &[0], &[0.1 * number as f32, 0.0, 0.0, 0.0])).await;
@@ -272,7 +272,8 @@ async fn stream_waits_for_slots() {
     driving.await.expect("expected no panic");
 }
 
-/// Slots that the client does not have: one that was never sent, one that does not exist, and one that was returned.
+/// Returns slots that the client does not have: one that was never sent, one that does not exist, and one that was
+/// returned before.
 #[tokio::test(flavor = "multi_thread")]
 async fn forged_slot_ends_the_connection_but_not_the_call() {
     let shared = SharedMemoryServer::start(RendererChoice::Off).await;
@@ -373,7 +374,7 @@ async fn steps_are_equal_in_shared_memory() {
     assert!(sets[0].positions.iter().any(|number| *number > 100.0), "expected moved domains");
 }
 
-/// Values in a slot, and ranges that are not in a slot. The stream remains open.
+/// Steps with values in a slot are accepted. Ranges outside of a slot are rejected, and the stream remains open.
 #[tokio::test(flavor = "multi_thread")]
 async fn wrong_range_of_a_step_is_rejected() {
     let shared = SharedMemoryServer::start(RendererChoice::Off).await;
@@ -404,7 +405,7 @@ async fn wrong_range_of_a_step_is_rejected() {
     writer.finish().await;
 }
 
-/// The client writes to a slot while the server reads it. The server accepts or rejects each step, and remains.
+/// The client writes to a slot while the server reads it. The server accepts or rejects each step, and keeps running.
 #[tokio::test(flavor = "multi_thread")]
 async fn values_that_change_while_they_are_read_are_harmless() {
     let shared = SharedMemoryServer::start(RendererChoice::Off).await;

@@ -66,7 +66,7 @@ async fn read_steps(mut stream: VertexStream, count: u64) {
     assert!(numbers.iter().copied().eq(0..count), "{numbers:?}");
 }
 
-/// Readers of the newest steps that read nothing hold their slots and no more. A lossless reader gets every step.
+/// Stalled readers of the newest steps occupy their slots and no other memory. A lossless reader gets every step.
 #[tokio::test(flavor = "multi_thread")]
 async fn stalled_readers_hold_no_more_than_their_slots() {
     const READERS: usize = 12;
@@ -94,7 +94,7 @@ async fn stalled_readers_hold_no_more_than_their_slots() {
     wait_for_mappings(&server, 0).await;
 }
 
-/// A call that was read to its end leaves its memory to the next one.
+/// The next call reuses the memory of a call that was read to its end.
 #[tokio::test(flavor = "multi_thread")]
 async fn calls_reuse_memory() {
     let folder = tempfile::tempdir().expect("expected a temporary folder");
@@ -195,7 +195,7 @@ async fn killed_client_frees_its_memory() {
         child.wait().expect("expected the end of the process");
         with_timeout(sending).await.expect("expected all steps");
         with_timeout(reader).await.expect("expected every step");
-        // The reader has not read the end of its stream, so its connection is closed, too.
+        // The reader did not read its stream to the end, so its connection is closed instead of reused.
         wait_for_mappings(&server, 0).await;
         let until_closed = async {
             while open_files.first().is_some_and(|count| server.open_files() > *count) {

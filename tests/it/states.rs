@@ -13,8 +13,8 @@ use v1::state_service_client::StateServiceClient;
 
 use crate::service_harness::{MAX_MESSAGE_BYTES, Server, rigid_step, step, with_timeout};
 
-/// Maximum distance of a vertex from the server's vertex per axis, in scene units. Coordinates are below 8, where numbers
-/// in f32 are 5e-7 apart, and the transform of a follower is rounded three times.
+/// Maximum distance of a vertex from the server's vertex per axis, in scene units. Coordinates are below 8, where
+/// numbers in f32 are 5e-7 apart, and the transform of a follower is rounded three times.
 const TOLERANCE: f64 = 4e-6;
 
 /// A rotation by 90 degrees about z.
@@ -129,8 +129,8 @@ async fn client_deforms_by_itself() {
     }
 }
 
-/// A stream that skips steps ends in the state of a stream that has every step. The last step changes only domain 0, so
-/// that its own changes are not enough.
+/// A stream that skips steps ends in the same state as a stream of every step. The last step changes only domain 0, so
+/// the last state must also contain the changes of skipped steps.
 #[tokio::test(flavor = "multi_thread")]
 async fn skipped_steps_are_part_of_the_next_state() {
     let server = Server::start_default().await;

@@ -224,8 +224,8 @@ async fn latest_subscriber_gets_current_step_and_skip_count() {
     assert_eq!((second_output.step.number, second_output.skipped), (8, 4));
 }
 
-/// The rejection of the second writer names the address and the run of the first writer. After the first writer has
-/// ended its stream, the second writer can drive the scene.
+/// The rejection of the second writer names the run of the first writer, but not its address. After the first writer
+/// has ended its stream, the second writer can drive the scene.
 #[tokio::test(flavor = "multi_thread")]
 async fn second_writer_is_rejected_until_the_first_ends() {
     let server = Server::start_default().await;

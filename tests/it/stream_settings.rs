@@ -21,7 +21,7 @@ async fn next_step(stream: &mut tonic::Streaming<v1::StreamVerticesResponse>) ->
     (vertices.step().number, vertices.head.skipped)
 }
 
-/// A stream with a limit that the test never reaches carries one of ten steps, and a stream without a limit all of them.
+/// A stream limited to one result in 1000 s carries one of ten steps, and a stream without a limit all of them.
 #[tokio::test(flavor = "multi_thread")]
 async fn rate_limit_bounds_the_results_of_a_stream() {
     let server = Server::start_default().await;

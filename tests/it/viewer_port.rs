@@ -64,7 +64,7 @@ async fn page_needs_token_and_own_host() {
     let connect_source = format!("connect-src 'self' ws://{};", authority(&server));
     assert!(page.head.contains("content-security-policy: default-src 'none';"), "{}", page.head);
     assert!(page.head.contains(&connect_source), "{}", page.head);
-    // A tunnel has another port.
+    // Through a tunnel, the page is requested with another port.
     assert_eq!(get(&server, &page_path, "localhost:7", "").await.status, 200);
 
     let token_path = |token: &str| format!("/?token={token}");
@@ -128,7 +128,7 @@ async fn health_needs_no_token() {
     assert_eq!(get(&server, "/healthz", "evil.example", "").await.status, 403);
 }
 
-/// Another server has another token, and clients of gRPC learn it.
+/// Two servers have different tokens. A gRPC client receives the token of its server.
 #[tokio::test(flavor = "multi_thread")]
 async fn token_is_random_and_known_to_grpc_clients() {
     let mut paths = Vec::new();
@@ -156,7 +156,7 @@ async fn viewer_can_be_turned_off() {
     assert!(!info.get_ref().features().any(|feature| feature == v1::Feature::Viewer));
 }
 
-/// Slow heads, large heads and bodies that are not read end. Meanwhile, other clients are served.
+/// Connections with slow heads, large heads or unread bodies are closed. Meanwhile, other clients are served.
 #[tokio::test(flavor = "multi_thread")]
 async fn slow_and_large_requests_are_closed() {
     let server = start_server(|config| Config { handshake_timeout: Duration::from_millis(300), ..config }).await;

@@ -1,5 +1,5 @@
-//! gRPC calls over a WebSocket: replies and errors are those of gRPC, both directions have flow control, and clients that
-//! break the rules are disconnected with a code.
+//! gRPC calls over a WebSocket: replies and errors are those of gRPC, both directions have flow control, and clients
+//! that break the rules are disconnected with a code.
 
 use std::time::Duration;
 
@@ -187,7 +187,7 @@ async fn upload_above_the_credit_continues_when_credit_returns() {
     let server = default_server().await;
     let mut client = WebSocketClient::connect(&server).await;
     let drive = client.start(DRIVE).await;
-    // The server takes an invalid message and answers it, so messages of any size are processed.
+    // The server answers even an invalid message, so it processes messages of any content.
     let large = vec![0; 300 << 10];
     let step = v1::Step { number: 1, q: large.into(), ..Default::default() };
     let message = drive_request(RequestKind::Step(step));
@@ -290,7 +290,7 @@ async fn subscribe_without_credit(server: &Server) -> (WebSocketClient, u32) {
 /// Time without an acknowledgment after which a test assumes that a step is blocked.
 const BLOCKED: Duration = Duration::from_millis(1500);
 
-/// A server on which a lossless subscriber blocks the writer as long as it wants.
+/// A server without a time limit on a lossless subscriber that blocks the writer.
 async fn patient_server() -> Server {
     let server = start_server(|config| Config { stall_timeout: Duration::from_secs(3000), ..config }).await;
     server.open("sheet").await;
@@ -331,7 +331,7 @@ async fn cancel_and_close_end_streams() {
     }
 }
 
-/// The service does not take messages while its window is full, so credit does not return.
+/// While the step window is full, the service reads no messages, so the server returns no credit.
 #[tokio::test(flavor = "multi_thread")]
 async fn message_without_credit_closes_the_connection() {
     let server = patient_server().await;
@@ -461,7 +461,7 @@ async fn half_sent_messages_count_against_the_receive_budget() {
         client.stream.send(fragment(Data::Binary, &vec![0; bytes], false)).await.expect("expected an open connection");
         clients.push(client);
     }
-    // The third one has room when the one that holds the most has lost its message.
+    // The message of the third connection is accepted when the connection that holds the most has lost its message.
     let mut third = WebSocketClient::connect(&server).await;
     let until_evicted = async {
         loop {

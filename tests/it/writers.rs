@@ -53,9 +53,9 @@ async fn subscribe(server: &Server, scene: &str) -> Subscription {
     scene_handle.subscribe(spec, EngineDelivery::Lossless).await.expect("expected a subscription")
 }
 
-/// A plain client writes on and reads nothing in the meantime. It is slowed down, and no step is refused or lost.
+/// A client sends steps without reading replies. Back-pressure slows it down, and no step is rejected or lost.
 #[tokio::test(flavor = "multi_thread")]
-async fn blocking_writer_that_writes_on_loses_no_step() {
+async fn blocked_writer_that_keeps_sending_loses_no_step() {
     const STEPS: u64 = 400;
     let server = Server::start_default().await;
     server.open("strips").await;
@@ -91,7 +91,7 @@ async fn blocking_writer_that_writes_on_loses_no_step() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn rejecting_writer_learns_that_the_window_is_full() {
+async fn step_beyond_the_window_is_rejected_on_request() {
     let server = Server::start_default().await;
     server.open("strips").await;
     let _unread_subscription = subscribe(&server, "strips").await;
@@ -123,9 +123,9 @@ async fn stream_without_a_delivery_is_rejected_with_the_choices() {
     assert_eq!((status.code(), rejection_details(&status).field.as_str()), (Code::InvalidArgument, "delivery"));
 }
 
-/// The first writer's connection stays open, as after a crash that the server has not noticed.
+/// The connection of the first stream stays open, as after a crash of the client that the server has not noticed.
 #[tokio::test(flavor = "multi_thread")]
-async fn token_replaces_the_own_predecessor_at_once() {
+async fn lease_token_replaces_its_own_stream_at_once() {
     let server = Server::start_default().await;
     server.open("strips").await;
     let (mut first_writer, first_opened) = open_successfully(&server, lossless("strips")).await;
@@ -256,7 +256,7 @@ async fn new_writer_starts_from_rest_and_a_resumed_one_from_its_state() {
     other.finish().await;
     let (mut writer, opened) = open_successfully(&server, own_token.clone()).await;
     assert_eq!(opened.initial_state(), InitialState::Reset);
-    // Its connection breaks before the first step.
+    // The writer's connection breaks before its first step.
     let (replacement, opened) = open_successfully(&server, own_token).await;
     assert_eq!(opened.initial_state(), InitialState::Reset, "expected the rest state that the run has not left yet");
     drop(std::mem::replace(&mut writer, replacement));

@@ -291,7 +291,7 @@ fn culling_handles_far_scenes_and_extreme_clip_planes() {
 fn huge_triangles_and_a_lone_triangle_are_not_culled() {
     let huge_builder = || {
         let wall = |z: f32| [[-1e5, -1e5, z], [1e5, -1e5, z], [0.0, 1e5, z]];
-        // From behind the walls at z = -20 to behind the eye at z = 20.
+        // A triangle that extends from behind the walls at z = -20 to behind the eye at z = 20.
         let crossing_triangle = [[-3.0, -1.0, 20.0], [3.0, -1.0, 20.0], [0.0, -1.0, -20.0]];
         let mesh = separate_triangles(&[
             wall(-2.0),

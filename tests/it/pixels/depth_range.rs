@@ -74,8 +74,8 @@ fn observe(renderer: &mut Renderer, scene: &Arc<Scene>, state: &SceneState, came
     Observation { domains, depths: bytemuck::pod_collect_to_vec(&depth_image.bytes), hit }
 }
 
-/// A square of 2 s at the distance 10 s, 20 pixels wide, in front of a larger one. The depth of a pixel and of a pick is
-/// off by the rounding of the matrix to f32: less than 2^-20 of the distance.
+/// A square of 2 s at the distance 10 s, 20 pixels wide, in front of a larger one. The depth of a pixel and of a pick
+/// is off by the rounding of the matrix to f32: less than 2^-20 of the distance.
 #[test]
 fn models_of_all_sizes_are_drawn_picked_and_measured() {
     let mut renderer = open_renderer();
@@ -135,8 +135,8 @@ fn picture_does_not_depend_on_the_scale_of_the_scene() {
     }
 }
 
-/// One scene has pairs of squares at distances from a millimeter to ten thousand kilometers. The second square of a pair
-/// is behind the first one by 2^-18 of the distance. It must be hidden, whichever is drawn last.
+/// One scene has pairs of squares at distances from a millimeter to ten thousand kilometers. The second square of a
+/// pair is behind the first one by 2^-18 of the distance. It must be hidden, whichever is drawn last.
 #[test]
 fn depth_orders_surfaces_at_all_distances_of_one_scene() {
     let mut renderer = open_renderer();
@@ -164,8 +164,8 @@ fn depth_orders_surfaces_at_all_distances_of_one_scene() {
     }
 }
 
-/// T moves an object of half a meter away from its rest position. The camera is one meter away from it. The rest bounds and the deformed
-/// bounds are then 4 km apart.
+/// T moves an object of half a meter by 4 km or more, and the camera is one meter away from the moved object. The rest
+/// bounds and the deformed bounds are then far apart.
 #[test]
 fn object_beside_the_camera_is_drawn_after_a_long_move() {
     let mut renderer = open_renderer();

@@ -107,7 +107,7 @@ fn ground_never_hides_triangles() {
             assert_eq!(ids, frame_without_ground.ids, "look {index} from {eye:?}");
             let ground_pixels = frame.count_ids(|id| id == VisibilityId::Ground);
             assert!(ground_pixels > 500, "look {index} from {eye:?}: {ground_pixels} pixels of ground");
-            // The ground itself stays where it is: a pixel without a triangle in both frames shows the same.
+            // The ground does not move: a pixel without a triangle in both frames has the same color.
             let frame_at_rest = draw_frame(&scene, 0.0);
             let has_moved = |(at_rest, lowered): (&VisibilityId, &VisibilityId)| {
                 !matches!(at_rest, VisibilityId::Triangle(_))

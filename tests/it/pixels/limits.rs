@@ -113,7 +113,7 @@ fn empty_and_oversized_frames_are_rejected() {
     assert_eq!(renderer.draw(&buffers, &params).expect("expected a frame of one pixel").rgba.len(), 4);
 }
 
-/// Cut-outs remain transparent in such a frame.
+/// Cut-outs are drawn correctly in such a frame.
 #[test]
 fn frame_too_large_for_msaa_is_drawn_with_one_sample() {
     let mut builder = SceneBuilder::new();

@@ -1,4 +1,5 @@
-//! A look that leaves antialiasing and shadow map to a preset or to the rule is drawn as the look with these settings.
+//! A look may leave antialiasing and shadow map to a preset, or to the rule that chooses a preset by renderer and frame
+//! size. Its frame equals the frame of a look with the chosen settings.
 
 use std::sync::Arc;
 
@@ -60,7 +61,7 @@ fn rule_draws_the_settings_that_the_frame_names() {
     }
 }
 
-/// The rule needs one scene for frames of several sizes; a preset gives the same settings on every renderer.
+/// A preset gives the same settings on every renderer, and overrides replace single settings of it.
 #[test]
 fn preset_and_overrides_decide_on_every_renderer() {
     let mut renderer = open_renderer();
