@@ -23,8 +23,8 @@ pub enum UploadShape {
 }
 
 impl UploadShape {
-    /// Size of the arrays according to the numbers of vertices, triangles and modes. The server rejects arrays of another
-    /// size.
+    /// Size of the arrays according to the numbers of vertices, triangles and modes. The server rejects arrays of
+    /// another size.
     const fn declared_bytes(&self) -> u64 {
         match self {
             Self::Arrays { positions, triangles, rank, .. } => {
@@ -72,8 +72,8 @@ impl UploadDomain {
         Self { eigenvalues: eigenvalues.to_vec(), ..self }
     }
 
-    /// Sets the crease angle in degrees: an edge is shaded as hard if the normals of its two triangles differ by more at
-    /// rest. 0 is flat, 180 is smooth, and the default is 40. For [`UploadShape::Arrays`] only.
+    /// Sets the crease angle in degrees: an edge is shaded as hard if the normals of its two triangles differ by more
+    /// at rest. 0 is flat, 180 is smooth, and the default is 40. For [`UploadShape::Arrays`] only.
     #[must_use]
     pub const fn crease_angle(mut self, degrees: f64) -> Self {
         self.crease_angle = Some(degrees);
@@ -166,8 +166,8 @@ fn pack<T: bytemuck::NoUninit>(numbers: &[T]) -> Bytes {
 }
 
 impl Client {
-    /// Uploads meshes and modes and opens them as a scene. The server keeps them until the scene is deleted, also across
-    /// restarts.
+    /// Uploads meshes and modes and opens them as a scene. The server keeps them until the scene is deleted, also
+    /// across restarts.
     ///
     /// # Errors
     /// `Status` if the server rejects the upload, with the path of the invalid field, such as `domains[2].rank`.

@@ -39,7 +39,8 @@ impl<M: Message + Default> Replies<M> {
         Self { messages, url }
     }
 
-    /// The next message, or `None` at the end of the stream. A call that is canceled before it returns loses no message.
+    /// The next message, or `None` at the end of the stream. A call that is canceled before it returns loses no
+    /// message.
     ///
     /// # Errors
     /// `Status` with which the server has ended the stream; `Connect` if the connection is lost.
@@ -78,7 +79,7 @@ pub(crate) trait WireChunk: Sized {
     type Reply;
     /// Name of the reply in errors.
     const NAME: &'static str;
-    /// `memory` has the data of a chunk in shared memory.
+    /// `memory` contains the data of a chunk that was sent in shared memory.
     fn into_chunk(self, memory: &CallMemory) -> Result<Chunk<Self::Head>>;
     fn decode_reply(head: Self::Head, bytes: Bytes) -> Result<Self::Reply>;
 }
@@ -118,7 +119,7 @@ impl<H> ChunkSequence<H> {
         self.open_reply.is_some()
     }
 
-    /// Adds a chunk, and returns its data. With a head it begins a reply, for which `begin` prepares.
+    /// Adds a chunk, and returns its data. A chunk with a head begins a reply; `begin` is then called first.
     pub(crate) fn add(&mut self, chunk: Chunk<H>, begin: impl FnOnce(&OpenReply<H>) -> Result<()>) -> Result<Bytes> {
         let field = |name: &str| format!("{}.{name}", self.name);
         let begins = chunk.head.is_some();
@@ -204,7 +205,7 @@ pub(crate) trait ReplyDecoder<M> {
     /// Whether a reply has begun and not ended.
     fn is_open(&self) -> bool;
 
-    /// The stream has ended with OK, and a complete reply was the last one.
+    /// Called when the stream has ended with OK after a complete reply.
     fn end(&mut self) {}
 }
 

@@ -19,8 +19,8 @@ use crate::shared_memory::{CallMemory, SharedMemory};
 /// The default limit of one reply that is assembled from chunks, in bytes.
 pub const REPLY_LIMIT: u64 = 1 << 30;
 
-/// HTTP/2 flow-control window of a stream, in bytes. A stream that is not read fills its own window only. What it holds
-/// is out of date when a slow reader of the latest steps reads it, so the window is small.
+/// HTTP/2 flow-control window of a stream, in bytes. A stream that is not read fills its own window only. A full window
+/// delays a slow reader of the latest steps by what the window holds, so the window is small.
 const STREAM_WINDOW: u32 = 4 << 20;
 
 /// Window of a stream of every step, in bytes. At a round trip of 50 ms it permits 1.3 GB/s.
@@ -147,8 +147,9 @@ impl Client {
         self
     }
 
-    /// Sends steps and receives vertices and frames in shared memory. The server runs on this machine as the same user, and `path` is the
-    /// Unix socket of its option `--shared-memory`. The calls themselves use the same connection as before.
+    /// Sends steps and receives vertices and frames in shared memory. The server runs on this machine as the same user,
+    /// and `path` is the Unix socket of its option `--shared-memory`. The calls themselves use the same connection as
+    /// before.
     ///
     /// # Errors
     /// `Connect` if the server does not offer shared memory at this path.
@@ -178,7 +179,8 @@ impl Client {
     /// empty `name`, the name is the last path component of the source without extension.
     ///
     /// # Errors
-    /// `Status` if the source does not exist; `Connect` if the connection is lost; `Malformed` if the reply has no scene.
+    /// `Status` if the source does not exist; `Connect` if the connection is lost; `Malformed` if the reply has no
+    /// scene.
     pub async fn open_scene(&self, source: &str, name: &str) -> Result<v1::SceneInfo> {
         let request = v1::OpenSceneRequest { source: source.to_owned(), scene: name.to_owned() };
         let reply = self.reply(self.scenes().open_scene(request).await)?;

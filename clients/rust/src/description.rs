@@ -292,7 +292,7 @@ impl SceneDescription {
     }
 }
 
-/// The index in a list of the description of the object with this index in the scene.
+/// The index, in a list of the description, of the object that has the index `index` in the scene.
 fn find_ordinal(ordinals: &Ordinals, index: u32, field: String) -> Result<usize> {
     ordinals.get(&index).copied().ok_or_else(|| malformed_reply(field, "an index described before", index))
 }

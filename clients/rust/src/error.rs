@@ -120,9 +120,9 @@ impl Error {
     }
 }
 
-/// Whether the connection failed. tonic reports a broken connection as `Unknown` or `Unavailable` with a cause; a status
-/// sent by the server has no cause. The server adds details to every `Unavailable`. A status with this code but without
-/// details therefore comes from a proxy that cannot reach the server.
+/// Whether the connection failed. tonic reports a broken connection as `Unknown` or `Unavailable` with a cause; a
+/// status sent by the server has no cause. The server adds details to every `Unavailable`. A status with this code but
+/// without details therefore comes from a proxy that cannot reach the server.
 fn is_connection_lost(status: &tonic::Status) -> bool {
     let has_cause = std::error::Error::source(status).is_some();
     match status.code() {

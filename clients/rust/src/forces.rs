@@ -1,5 +1,5 @@
-//! Forces that a viewer applies to a scene, and the stream of all forces for a physics process. The server stores forces
-//! until they expire; it does not simulate.
+//! Forces that a viewer applies to a scene, and the stream of all forces for a physics process. The server stores
+//! forces until they expire; it does not simulate.
 
 use std::pin::Pin;
 use std::task::{Context, Poll};
@@ -28,14 +28,14 @@ pub struct SurfaceForce {
 #[derive(Debug, Clone, PartialEq)]
 pub enum ForceKind {
     Surface(SurfaceForce),
-    /// f_q: r numbers.
+    /// On the r coordinates of the domain: f_q.
     Modal(Vec<f32>),
 }
 
 /// A force on a domain.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Force {
-    /// Recognizes the force among those of its owner; each id once.
+    /// Identifies the force among those of its owner, which must have different ids.
     pub id: u64,
     pub domain: u32,
     pub kind: ForceKind,
@@ -102,7 +102,7 @@ impl ForceRequest {
 /// A force of any owner, and its effect.
 #[derive(Debug, Clone, PartialEq)]
 pub struct AppliedForce {
-    /// A number per owner.
+    /// Public number of the owner.
     pub owner: u64,
     /// As chosen by the owner.
     pub id: u64,

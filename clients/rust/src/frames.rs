@@ -118,8 +118,8 @@ pub struct Picture {
     pub output: Output,
     /// For [`FrameFormat::Jpeg`]: 1 (smallest frame) to 100 (smallest error); 0 means 90.
     pub jpeg_quality: u32,
-    /// For [`Output::Color`]: width in pixels of lines along the edges of the faces, to 32; 0 for none. `None`: as the
-    /// scene's `look.edges`.
+    /// For [`Output::Color`]: width in pixels of lines along the edges of the faces, at most 32; 0 for none. `None`: as
+    /// the scene's `look.edges`.
     pub edge_width: Option<f32>,
 }
 
@@ -169,7 +169,7 @@ pub struct Frame {
     pub step: v1::StepId,
     /// Index of the frame's picture in the request.
     pub picture: usize,
-    /// Number of updates of the stream's cameras that the frame shows; 0 for a single request.
+    /// Number of camera updates of the stream that the frame includes; 0 for a single request.
     pub camera_version: u64,
     pub width: u32,
     pub height: u32,
@@ -290,9 +290,9 @@ impl Client {
         Ok(FrameStream { settings, frames })
     }
 
-    /// Moves cameras of a running stream, each given by the index of its picture; `None` selects a camera that shows the
-    /// whole scene. `stream` is the id in [`FrameStream::settings`]. Returns the [`Frame::camera_version`] from which on
-    /// frames show the update. If the scene is static, the stream sends its current step again.
+    /// Moves cameras of a running stream, each given by the index of its picture; `None` selects a camera that shows
+    /// the whole scene. `stream` is the id in [`FrameStream::settings`]. Returns the [`Frame::camera_version`] from
+    /// which on frames show the update. If the scene is static, the stream sends its current step again.
     ///
     /// # Errors
     /// `Status` if the stream has ended or a camera is invalid; `Connect` if the connection is lost.

@@ -9,7 +9,8 @@ pub enum StepSelector {
     /// The newest state; the rest state before the first step.
     #[default]
     Current,
-    /// Exactly this step. The server rejects a step that it no longer has. A run of 0 is that of the latest writer.
+    /// Exactly this step. The server rejects a step that it no longer has. A run is the sequence of steps from one
+    /// writer; 0 selects the run of the latest writer.
     Exact { run: u64, number: u64 },
     /// This step or a later one. The steps of a later run come after those of an earlier one.
     Minimum { run: u64, number: u64 },

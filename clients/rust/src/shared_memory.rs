@@ -1,5 +1,6 @@
 //! Memory that a server on the same machine shares with this client. `SharedRange` in `common.proto` documents the
-//! protocol. Every call uses a connection of its own, and leaves it to a later call if all of its slots were returned.
+//! protocol. A connection has slots, which are pieces of memory of equal size. Every call uses a connection of its own,
+//! and leaves it to a later call if all of its slots were returned.
 
 mod steps;
 
@@ -54,11 +55,11 @@ pub(crate) struct SharedMemory {
 
 /// The shared memory of one call, if the client uses it.
 #[derive(Debug, Default)]
-pub(crate) struct CallMemory(Option<Lease>);
+pub(crate) struct CallMemory(Option<PooledConnection>);
 
-/// A connection and where to leave it.
+/// A connection, and the pool to which the call returns it.
 #[derive(Debug)]
-struct Lease {
+struct PooledConnection {
     connection: Arc<MemoryConnection>,
     pool: Arc<SharedMemory>,
 }
@@ -106,7 +107,7 @@ impl SharedMemory {
             Some(connection) => connection,
             None => Arc::new(MemoryConnection::connect(&self.path).await?),
         };
-        Ok(CallMemory(Some(Lease { connection, pool: Arc::clone(self) })))
+        Ok(CallMemory(Some(PooledConnection { connection, pool: Arc::clone(self) })))
     }
 
     fn idle(&self) -> std::sync::MutexGuard<'_, Vec<Arc<MemoryConnection>>> {
@@ -118,7 +119,7 @@ impl CallMemory {
     /// A request that tells the server to use this memory.
     pub(crate) fn request<T>(&self, message: T) -> Request<T> {
         let mut request = Request::new(message);
-        if let Some(Lease { connection, .. }) = &self.0 {
+        if let Some(PooledConnection { connection, .. }) = &self.0 {
             request.metadata_mut().insert_bin(TOKEN_KEY, MetadataValue::from_bytes(&connection.token));
         }
         request
@@ -153,7 +154,7 @@ impl CallMemory {
 
     /// Leaves the memory to a later call. The call has ended with OK, and all of its messages were read.
     pub(crate) fn release(&mut self) {
-        let Some(Lease { connection, pool }) = self.0.take() else { return };
+        let Some(PooledConnection { connection, pool }) = self.0.take() else { return };
         let mut idle = pool.idle();
         if connection.used_slots.load(Ordering::Acquire) == 0 && idle.len() < MAX_IDLE_CONNECTIONS {
             idle.push(connection);
@@ -189,7 +190,8 @@ impl MemoryConnection {
             if u64::try_from(file_bytes).map_or(true, |file_bytes| file_bytes < memory_bytes) {
                 return Err(invalid(format!("a file of {memory_bytes} bytes, got {file_bytes}")));
             }
-            // Without this seal, a smaller file would end this process when it uses the memory.
+            // Without this seal, the server could shrink the file, and an access to the memory would then end this
+            // process.
             if !fcntl_get_seals(file)?.contains(SealFlags::SHRINK) {
                 return Err(invalid("a file that is sealed against a smaller size, got another one".into()));
             }
@@ -227,7 +229,7 @@ fn receive_with_files(socket: BorrowedFd<'_>) -> io::Result<([u8; HANDSHAKE_BYTE
     match <[OwnedFd; 2]>::try_from(files.flatten().collect::<Vec<_>>()) {
         Ok(files) if received.bytes == HANDSHAKE_BYTES => Ok((message, files)),
         _ if received.bytes == 0 => {
-            let reason = "the server closed the connection, which it does when it has too many and for other users";
+            let reason = "the server closed the connection: it has too many connections, or it runs as another user";
             Err(io::Error::new(io::ErrorKind::ConnectionReset, reason))
         }
         _ => Err(io::Error::new(io::ErrorKind::InvalidData, "expected the handshake of a modalcast server")),
@@ -237,8 +239,8 @@ fn receive_with_files(socket: BorrowedFd<'_>) -> io::Result<([u8; HANDSHAKE_BYTE
 impl AsRef<[u8]> for SharedData {
     fn as_ref(&self) -> &[u8] {
         // SAFETY: `CallMemory::data` has checked that the range is within the slot and the slot within the mapping. The
-        // file cannot shrink, because it is sealed. The server, which runs as the same user and is the only process that
-        // can write to the memory, does not write to a slot until it is returned, which the drop of `self` does.
+        // file cannot shrink, because it is sealed. The server, which runs as the same user and is the only process
+        // that can write to the memory, does not write to a slot until it is returned, which the drop of `self` does.
         unsafe {
             let start = self.connection.replies.as_ptr().add(self.slot as usize * self.connection.slot_bytes);
             std::slice::from_raw_parts(start, self.bytes)
@@ -285,7 +287,7 @@ pub(crate) mod tests {
     pub(crate) struct FakeServer {
         folder: tempfile::TempDir,
         listener: UnixListener,
-        /// The memory for replies and that for steps.
+        /// The file for the slots of replies, and also for those of steps.
         pub(crate) file: OwnedFd,
         handshake: Handshake,
     }

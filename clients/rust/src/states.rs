@@ -40,7 +40,7 @@ struct DomainSlot {
     owns_q: bool,
     /// Index of the transform of the domain, or of the domain that it follows.
     root: usize,
-    /// Index of its frame; `None` for a domain that follows no other.
+    /// Index in `StateLayout::follow_frames`; `None` for a domain that follows no other.
     follow_frame: Option<usize>,
 }
 

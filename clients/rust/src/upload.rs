@@ -143,8 +143,8 @@ fn describe_file(base: &Path, local_path: PathBuf) -> Result<LocalFile> {
     Ok(LocalFile { local_path, header })
 }
 
-/// Sends the header, then each file and its chunks; a reused file has none. Stops without error if the server has closed
-/// the stream.
+/// Sends the header, then each file and its chunks; a reused file has none. Stops without error if the server has
+/// closed the stream.
 fn send_files(
     sender: &mpsc::Sender<v1::UploadSceneRequest>,
     header: v1::UploadHeader,

@@ -19,8 +19,8 @@ use crate::shared_memory::CallMemory;
 use crate::stages::{self, StageTimes};
 use crate::vertex_sections::{SectionWriter, VertexArrays, VertexSetDomain};
 
-/// The domains and attributes to return. The default is positions and normals of all domains, as f32. The server rejects
-/// attributes that `deform` in scene.toml does not enable.
+/// The domains and attributes to return. The default is positions and normals of all domains, as f32. The server
+/// rejects attributes that `deform` in scene.toml does not enable.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct VertexSelection {
     /// Domain indices in the order of the reply; empty for all domains.
@@ -108,8 +108,8 @@ impl VertexSet {
         }
     }
 
-    /// World position of the origin of a selected domain, in meters. `ordinal` is its index in `domains`. A vertex is at
-    /// `domain_origin(ordinal) + unit * position`, where `unit` is [`v1::SceneInfo::unit`].
+    /// World position of the origin of a selected domain, in meters. `ordinal` is its index in `domains`. A vertex is
+    /// at `domain_origin(ordinal) + unit * position`, where `unit` is [`v1::SceneInfo::unit`].
     pub fn domain_origin(&self, ordinal: usize) -> [f64; 3] {
         self.common_origin().or_else(|| self.origins.get(ordinal).copied()).unwrap_or_default()
     }

@@ -64,7 +64,8 @@ async fn frame_above_4_mib_arrives_complete_and_names_its_step() {
     let request = FrameRequest::new("toy", picture(1920, 1080)).minimum_step(5);
     let frame = client.render_frame(&request).await.expect("a frame");
     assert_eq!((frame.step.number, frame.width, frame.bytes.len()), (5, 1920, 1920 * 1080 * 4));
-    // The fake server fills a frame with the step number and reports a fixed look, stage times, rasterizers and distance below the ground.
+    // The fake server fills a frame with the step number and reports a fixed look, stage times, rasterizers and
+    // distance below the ground.
     assert!(frame.bytes.iter().all(|byte| *byte == 5));
     assert_eq!(frame.stages, [("draw".to_owned(), 2.0)]);
     assert_eq!((frame.shadow_drawn_by, frame.visibility_drawn_by), (None, Some(DrawnBy::Cuda)));
@@ -176,7 +177,7 @@ async fn rejected_calls_report_the_details_of_the_server() {
 }
 
 #[tokio::test]
-async fn server_of_another_protocol_version_is_an_error_with_both_numbers() {
+async fn other_protocol_version_is_an_error_with_both_numbers() {
     for version in [0, v1::PROTOCOL_VERSION + 1] {
         let mut server = one_domain_server(4);
         server.protocol_version = version;

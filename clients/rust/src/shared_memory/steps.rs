@@ -29,7 +29,7 @@ impl StepMemory {
     }
 
     /// Moves large values of a step to shared memory. Waits for free slots, which the server returns when it has copied
-    /// earlier values. Cancel-safe, except that slots in use may not be used again.
+    /// earlier values. Cancel-safe, except that slots which were filled before the cancellation may stay unused.
     pub(crate) async fn share(&mut self, step: &mut v1::Step) {
         step.shared_q = self.put(&mut step.q).await;
         step.shared_transforms = self.put(&mut step.transforms).await;

@@ -12,8 +12,8 @@ use tonic_types::{ErrorDetails, StatusExt as _};
 
 pub(crate) use serve::serve;
 
-/// One domain and its shape, which no other domain has: their descriptions, rest positions (3 per vertex) and U (3n x r,
-/// row-major).
+/// One domain and its shape, which no other domain has: their descriptions, rest positions (3 per vertex) and U (3n x
+/// r, row-major).
 #[derive(Debug, Clone, Default)]
 pub(crate) struct FakeDomain {
     pub(crate) wire: v1::DomainDescription,

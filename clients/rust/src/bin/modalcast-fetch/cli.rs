@@ -28,7 +28,8 @@ pub(crate) struct Cli {
     /// URL of the server: http://HOST:PORT or unix:PATH.
     #[arg(long, global = true, env = "MODALCAST_SERVER", default_value = "http://127.0.0.1:50051")]
     pub(crate) server: String,
-    /// Receive frames and vertices in shared memory. PATH is the Unix socket of `modalcast serve --shared-memory PATH` on this machine.
+    /// Receive frames and vertices in shared memory. PATH is the Unix socket of `modalcast serve --shared-memory PATH`
+    /// on this machine.
     #[arg(long, global = true, value_name = "PATH")]
     pub(crate) shared_memory: Option<PathBuf>,
     /// How long to retry until the server answers, in seconds.
