@@ -1,4 +1,5 @@
-//! A bridge under a pulsating load: reduced StVK forces, integrated by implicit Newmark.
+//! A bridge under a pulsating load: reduced forces of a Saint Venant-Kirchhoff (StVK) material, integrated by the
+//! implicit Newmark method.
 //!
 //! The load acts on the middle of the bridge, spread evenly over the sampled vertices there. Its strength is calibrated
 //! so that the deflection at equilibrium is a given fraction of the diagonal of the scene's rest bounds. The run starts
@@ -78,7 +79,8 @@ impl BridgeScenario {
     ///
     /// # Errors
     /// `Invalid` if an option is out of range, no domain has the rank of the forces, the stiffness is not positive
-    /// definite, the load cannot deform the domain, or the bridge has no stable equilibrium at the requested deflection.
+    /// definite, the load cannot deform the domain, or the bridge has no stable equilibrium at the requested
+    /// deflection.
     pub fn new(model: Model, force: ReducedForce, settings: &VegaSettings, options: BridgeOptions) -> Result<Self> {
         check_option("dt", options.dt, f64::MIN_POSITIVE..=1e6)?;
         check_option("deflection", options.deflection_fraction, 0.0..=0.5)?;
@@ -160,8 +162,8 @@ impl Scenario for BridgeScenario {
 
     fn report(&self) -> Report {
         let load_description = format!(
-            "a force of {:.4} (in units of mass-normalized modes) on the middle tenth of the bridge, {}, pulsating every {} s; the run starts \
-             at the equilibrium, with a deflection of {:.4} of the diagonal",
+            "a force of {:.4} (in units of mass-normalized modes) on the middle tenth of the bridge, {}, \
+             pulsating every {} s; the run starts at the equilibrium, with a deflection of {:.4} of the diagonal",
             self.strength,
             self.options.load_direction.description(),
             self.options.period,
@@ -349,7 +351,7 @@ mod tests {
     }
 
     #[test]
-    fn unresolved_load_and_missing_damping_are_remarked() {
+    fn remarks_name_unresolved_load_and_missing_damping() {
         let remarks = |dt: f64, period: f64, damping_stiffness: f64| {
             let options = BridgeOptions { dt, period, ..OPTIONS };
             let force = spring_chain(&[40.0, 90.0], 30.0, 4.0);

@@ -137,8 +137,8 @@ pub(crate) struct WindOptions {
     /// suburbs or forest, and begins with its strongest gust.
     #[arg(long = "wind", value_name = "WIND", default_value_t = 1.0, value_parser = parse_non_negative)]
     pub(crate) strength: f64,
-    /// Peak displacement of the crown in 30 s at wind 1, as a fraction of the scene's height. Shorter runs may not reach
-    /// it.
+    /// Peak displacement of the crown in 30 s at wind 1, as a fraction of the scene's height. Shorter runs may not
+    /// reach it.
     #[arg(long = "sway", value_name = "SWAY", default_value_t = 0.05, value_parser = parse_fraction)]
     pub(crate) sway_fraction: f64,
     /// Direction that the wind blows to, in degrees about the up axis from the first horizontal axis. At 25, the
@@ -165,8 +165,8 @@ pub(crate) struct ForceFileOptions {
     /// exists.
     #[arg(long, value_name = "FILE.config")]
     pub(crate) config: Option<PathBuf>,
-    /// Folder with the file of cubic forces, which the note `vega.cubic` of the scene names. The server adds this note to
-    /// an OBJ model that has a .cub file of the same name.
+    /// Folder with the file of cubic forces, which the note `vega.cubic` of the scene names. The server adds this note
+    /// to an OBJ model that has a .cub file of the same name.
     #[arg(long = "files", value_name = "DIR")]
     pub(crate) folder: Option<PathBuf>,
 }

@@ -148,8 +148,8 @@ async fn create_scenario(client: &Client, scene: &str, command: &Command) -> Res
     }
 }
 
-/// Whether the wind scenario fits: some domain has eigenvalues, and some domain is attached to another one. A single beam
-/// with eigenvalues is stiffer than a tree, so that wind would hardly move it; the sweep shows its modes.
+/// Whether the wind scenario fits: some domain has eigenvalues, and some domain is attached to another one. A single
+/// beam with eigenvalues is stiffer than a tree, so that wind would hardly move it; the sweep shows its modes.
 fn is_tree(model: &Model) -> bool {
     let has_eigenvalues = model.domains.iter().any(|domain| !domain.eigenvalues.is_empty());
     has_eigenvalues && model.domains.iter().any(|domain| domain.joint.is_some())
@@ -167,8 +167,8 @@ fn create_bridge_scenario(model: Model, files: &ForceFileOptions, options: Bridg
 }
 
 /// Finds the file of reduced forces: the file of `--cubic`, else the file in `--files` that the note `vega.cubic` of a
-/// domain names (notes are metadata in the scene's description). `None` if there is no such file or several ones. No other
-/// file is used, because the forces of another model would move this one in a wrong way.
+/// domain names (notes are metadata in the scene's description). `None` if there is no such file or several ones. No
+/// other file is used, because the forces of another model would move this one in a wrong way.
 fn find_force_file(model: &Model, files: &ForceFileOptions) -> Option<PathBuf> {
     if let Some(path) = &files.cubic {
         return Some(path.clone());

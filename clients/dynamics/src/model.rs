@@ -137,7 +137,8 @@ impl DomainModel {
         &self.samples[..self.surface_sample_count]
     }
 
-    /// The largest displacement of a sample per unit of the coordinate of `mode`, at the rest placement, in scene units.
+    /// The largest displacement of a sample per unit of the coordinate of `mode`, at the rest placement, in scene
+    /// units.
     pub fn displacement_per_unit(&self, mode: usize) -> f64 {
         let world_displacement = |sample: &Sample| (self.placement.linear * sample.column(mode, self.rank)).norm();
         self.samples.iter().map(world_displacement).fold(0.0, f64::max)

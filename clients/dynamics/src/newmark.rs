@@ -141,8 +141,8 @@ impl ReducedSystem {
         self.minimize(&objective, initial_guess)
     }
 
-    /// Whether `q` is a stable equilibrium under a load: the forces balance up to 1e-6 of the load, and the stiffness is
-    /// positive semidefinite up to rounding.
+    /// Whether `q` is a stable equilibrium under a load: the forces balance up to 1e-6 of the load, and the stiffness
+    /// is positive semidefinite up to rounding.
     pub fn is_equilibrium(&self, load: &DVector<f64>, q: &DVector<f64>) -> bool {
         let residual = (self.force.force(q) * self.scale - load).norm();
         let jacobian = self.force.jacobian(q);

@@ -61,8 +61,8 @@ pub trait Scenario {
     fn report(&self) -> Report;
 }
 
-/// A remark if steps of `dt` seconds do not resolve a periodic motion: with two steps per period or fewer, all steps may
-/// be equal. `subject` names the motion.
+/// A remark if steps of `dt` seconds do not resolve a periodic motion: with two steps per period or fewer, all steps
+/// may be equal. `subject` names the motion.
 pub fn aliasing_remark(subject: &str, period: f64, dt: f64) -> Option<String> {
     (period <= 2.0 * dt).then(|| {
         format!(

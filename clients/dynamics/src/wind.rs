@@ -156,8 +156,8 @@ impl Wind {
         FREQUENCY_RANGE[1]
     }
 
-    /// The pressure on every domain `time` seconds after the start of the wind. It is 0 at time 0. The drag of a body is
-    /// proportional to the speed times the velocity of the wind.
+    /// The pressure on every domain `time` seconds after the start of the wind. It is 0 at time 0. The drag of a body
+    /// is proportional to the speed times the velocity of the wind.
     pub fn pressures(&self, time: f64) -> Vec<WindPressure> {
         let onset_factor = smoothstep(time / RISE_TIME);
         let pressure = |gust: GustSpeed| {
@@ -185,8 +185,8 @@ impl Wind {
     }
 }
 
-/// The frequencies of all winds of a seed, in bands of equal ratio. Each is random in its band, so that the sum does not
-/// repeat. The amplitudes have the energy of the spectrum in the band.
+/// The frequencies of all winds of a seed, in bands of equal ratio. Each is random in its band, so that the sum does
+/// not repeat. The amplitudes have the energy of the spectrum in the band.
 fn create_cosines(seed: u64) -> Vec<Cosine> {
     let cosine = |index: usize| {
         let (low, high) = (band_edge(index), band_edge(index + 1));

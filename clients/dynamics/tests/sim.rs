@@ -246,7 +246,7 @@ async fn invalid_parameters_stop_before_the_first_step() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn held_modes_and_unresolved_gusts_are_said() {
+async fn held_modes_and_unresolved_gusts_are_reported() {
     let mut server = tree_server();
     server.domains[1].shape.eigenvalues[0] = 0.0;
     let url = serve(Arc::new(server)).await;

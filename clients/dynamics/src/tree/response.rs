@@ -34,6 +34,8 @@ pub(super) struct ViewerResponse {
 }
 
 impl Integrator {
+    /// Creates one oscillator per coordinate, for steps of `dt` seconds.
+    ///
     /// # Errors
     /// `Invalid` if the step is not positive.
     pub(super) fn new(parameters: &ModalParameters, dt: f64) -> Result<Self> {
@@ -84,7 +86,7 @@ impl ViewerResponse {
         Self { forces: vec![0.0; model.coordinate_count], states: vec![ModeState::default(); model.coordinate_count] }
     }
 
-    /// Adds the response to coordinates and rounds them to f32, as the server receives them.
+    /// Adds the response to the coordinates `q` and rounds them to f32, as the server receives them.
     pub(super) fn add_to(&self, q: &mut [f64]) {
         for (coordinate, state) in q.iter_mut().zip(&self.states) {
             *coordinate = f64::from((*coordinate + state.q) as f32);

@@ -139,7 +139,7 @@ fn invalid_parameters_are_rejected_before_the_first_step() {
 }
 
 #[test]
-fn held_modes_unresolved_gusts_and_limited_sway_are_remarked() {
+fn remarks_name_held_modes_left_out_gusts_and_limited_sway() {
     let remarks = |options: TreeOptions, change: &dyn Fn(&mut Model)| {
         create_tree(options, change).expect("a valid scenario").remarks()
     };

@@ -2,8 +2,8 @@ use super::*;
 
 const SETTINGS: WindSettings = WindSettings { seed: 7, diagonal: 10.0, max_frequency: f64::INFINITY };
 
-/// The sum of cosines that modelled gusts before: periods in seconds and amplitudes. It had no energy above 2 Hz, and
-/// two of its periods nearly excited the trunk of the built-in tree.
+/// A sum of five cosines for negative controls: periods in seconds and amplitudes. It has no energy above 2 Hz, and two
+/// of its periods nearly excite the trunk of the built-in tree.
 const FIVE_GUSTS: [(f64, f64); 5] = [(0.83, 0.30), (1.31, 0.30), (2.17, 0.22), (3.71, 0.12), (6.43, 0.06)];
 
 /// Number of samples of a signal, a power of two, and the seconds between them.
@@ -189,8 +189,8 @@ fn run_begins_with_a_strong_gust() {
 
 #[test]
 fn gust_arrives_later_downwind() {
-    // Below 0.1 Hz, the gusts of domains are nearly the same. They take 1.2 s to travel 14.4 units, because a diagonal
-    // of 10 units stands for 10 m, and the mean speed is 12 m/s.
+    // Below 0.1 Hz, the gusts of different domains are nearly the same. The gusts take 1.2 s to travel 14.4 units,
+    // because a diagonal of 10 units stands for 10 m, and the mean speed is 12 m/s.
     let wind = Wind::new(&WindSettings { max_frequency: 0.1, ..SETTINGS }, &[0.0, 14.4]);
     let difference = |delay: f64| {
         let square = |index: u32| {
