@@ -31,10 +31,11 @@ pub(crate) const MAX_CONTENT_BYTES: u64 = 8 << 30;
 /// Longest time between two complete states in nanoseconds.
 pub(crate) const COMPLETE_INTERVAL: u64 = 2_000_000_000;
 
-/// Largest distance between two complete states in states.
+/// Largest number of states from one complete state to the next.
 pub(crate) const COMPLETE_STATES: u64 = 1000;
 
-/// Size limit of a state of a scene in bytes: twice the size of a complete state, for contents of newer servers.
+/// Size limit of a state of a scene in bytes: twice the size of a complete state, so that sections which newer servers
+/// add fit, too.
 pub(crate) fn max_state_bytes(description: &SceneDescription) -> u64 {
     // q, two domain indices, a transform of 12 f32 and an origin of 3 f64.
     let domain_bytes = |domain: &Domain| 4 * domain.rank as u64 + 2 * 4 + 48 + 24;

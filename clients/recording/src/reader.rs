@@ -25,7 +25,7 @@ use crate::mcap_records::{
 /// Size limit of a chunk record: its records and its header.
 const MAX_CHUNK_RECORD_BYTES: u64 = MAX_CHUNK_BYTES + (64 << 10);
 
-/// A file of records at offsets.
+/// A file whose records are read by their offsets.
 pub(crate) struct RecordFile {
     path: PathBuf,
     file: File,

@@ -34,7 +34,7 @@ const HASHES_PER_REQUEST: usize = 4096;
 /// What to record.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RecordRequest {
-    /// An open scene, or a source that is opened under the name that it gives.
+    /// Name of an open scene, or a source, which the server opens under its default name.
     pub scene: String,
     pub delivery: Delivery,
     /// Time from the subscription on after which the recording ends.
@@ -108,7 +108,7 @@ pub async fn record(
     Ok(Recorded { summary, file_bytes, error: error.map(Into::into) })
 }
 
-/// The open scene of this name, or else the scene that opens from the source of this name.
+/// The open scene with this name, or else the scene that the server opens from the source `name`.
 async fn find_scene(client: &Client, name: &str) -> Result<SceneInfo> {
     let open_scenes = client.list_scenes().await?.scenes;
     match open_scenes.into_iter().find(|scene| scene.scene == name) {

@@ -39,7 +39,7 @@ pub fn recover(path: &Path, out: &Path) -> Result<Recovered> {
     if out.exists() && std::fs::canonicalize(out).ok() == std::fs::canonicalize(path).ok() {
         return Err(Error::invalid("--out", "another file than the recording", out.display()));
     }
-    let mut copy = Copy { source, channels: ChannelTable::default(), recovered: Recovered::default() };
+    let mut copy = ChunkCopier { source, channels: ChannelTable::default(), recovered: Recovered::default() };
     let (metadata, first_chunk) = copy.read_metadata()?;
     let file = File::create(out).map_err(|error| Error::open(out, &error))?;
     let mut writer = RecordingWriter::new(BufWriter::new(file), &metadata).map_err(|error| error.at(out))?;
@@ -55,7 +55,7 @@ pub fn recover(path: &Path, out: &Path) -> Result<Recovered> {
 }
 
 /// A recording that is read from its beginning.
-struct Copy {
+struct ChunkCopier {
     source: RecordFile,
     channels: ChannelTable,
     recovered: Recovered,
@@ -72,7 +72,7 @@ enum Next {
     Cut(Error),
 }
 
-impl Copy {
+impl ChunkCopier {
     fn next(&self, offset: u64) -> Next {
         match self.source.prefix(offset, self.source.length()) {
             Ok((prefix, next)) => Next::Record { opcode: prefix.opcode, offset, next },
@@ -80,7 +80,7 @@ impl Copy {
         }
     }
 
-    /// Reads the metadata records, which precede the first chunk. Returns its offset too.
+    /// Reads the metadata records, which precede the first chunk. Also returns the offset of the first chunk.
     fn read_metadata(&self) -> Result<(Vec<MetadataEntry>, u64)> {
         let mut entries = Vec::new();
         let mut position = mcap::MAGIC.len() as u64;
@@ -132,7 +132,7 @@ impl Copy {
         Ok(())
     }
 
-    /// Copies the messages of a chunk. The inner error is one of the chunk, the outer one of the new file. A chunk with
+    /// Copies the messages of a chunk. The inner error concerns the chunk, and the outer one the new file. A chunk with
     /// an error is not copied.
     fn copy_chunk<W: std::io::Write>(
         &mut self,

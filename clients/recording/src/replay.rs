@@ -27,7 +27,7 @@ const SENT_STEPS: usize = 1024;
 #[derive(Debug, Clone, PartialEq)]
 pub struct ReplayRequest {
     pub range: TimeRange,
-    /// Seconds of the recording per second; `None`: as fast as the server accepts steps.
+    /// Seconds of the recording per second of real time; `None`: as fast as the server accepts steps.
     pub speed: Option<f64>,
     /// Whether the replay begins again at its end.
     pub repeats: bool,
@@ -57,7 +57,7 @@ pub struct ReplayedFrame {
     pub frame: Frame,
     /// Index of the step in the replay, from 0.
     pub step_index: u64,
-    /// Number of frames of a video that show it: 1, unless states are selected by [`ReplayRequest::frame_rate`].
+    /// Number of frames of a video that show the step: 1, unless [`ReplayRequest::frame_rate`] selects states.
     pub repeats: u64,
 }
 
@@ -75,7 +75,7 @@ pub struct Replayed {
 /// Opens the recorded scene on a server.
 ///
 /// Uses an open scene with the name and the recorded contents. Otherwise opens the recorded source. If the server does
-/// not have it, or with other contents, uploads the recorded meshes and modes.
+/// not have the source, or has it with other contents, uploads the recorded meshes and modes.
 ///
 /// # Errors
 /// `Invalid` if an open scene with the name has other contents; `Unavailable` if contents are needed and the recording
@@ -159,8 +159,8 @@ fn upload_shape(shape: Shape) -> UploadShape {
     }
 }
 
-/// Replays a recording on a scene that [`open_recorded_scene`] has opened, until its end or `stop`. Passes the frames of
-/// all pictures to `on_frame`, in the order of the steps.
+/// Replays a recording on a scene that [`open_recorded_scene`] has opened, until its end or `stop`. Passes the frames
+/// of all pictures to `on_frame`, in the order of the steps.
 ///
 /// # Errors
 /// `Invalid` if a picture or the speed is invalid; `InvalidFile` if the recording is damaged; `Client` if the server

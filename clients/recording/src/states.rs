@@ -26,7 +26,7 @@ pub struct RecordedStates {
     decoder: StateDecoder,
     /// Whether changes before the first complete state are skipped.
     is_skipping: bool,
-    /// The last state at or before this time is the first one. `None` after it was found.
+    /// Start time: the last state at or before it is returned first. `None` after that state was found.
     from: Option<u64>,
     to: u64,
     /// The state after the first one, which was read to find the first one.
@@ -35,8 +35,8 @@ pub struct RecordedStates {
 }
 
 impl Recording {
-    /// The states from `from` to `to` in nanoseconds since the first state. The first one is the last state at or before
-    /// `from`, or the first of the recording if `from` is 0.
+    /// The states from `from` to `to` in nanoseconds since the first state. The first one is the last state at or
+    /// before `from`, or the first of the recording if `from` is 0.
     ///
     /// # Errors
     /// `InvalidFile` if a chunk is damaged; `File` if it cannot be read.

@@ -76,11 +76,12 @@ impl StepSource {
     }
 }
 
-/// Step numbers increase within a stream. Those of a recording may start again with a new run.
+/// The numbers of the sent steps. They increase within a stream, whereas recorded numbers may start again with a new
+/// run.
 #[derive(Debug, Default)]
 struct StepNumbers {
     last: Option<u64>,
-    /// Is added to recorded numbers.
+    /// Added to recorded numbers.
     offset: u64,
 }
 
@@ -103,7 +104,7 @@ struct SampledState {
     frames: u64,
 }
 
-/// Selects the states that are current at the times of frames, of which the first one is that of the first state.
+/// Selects the states that are current at the times of frames. The first frame is at the time of the first state.
 struct Sampler {
     /// Frames per second.
     rate: f64,
@@ -184,7 +185,7 @@ mod tests {
             }
         }
         assert_eq!((frames_before(0, 24.0), frames_before(1, 24.0)), (0, 1));
-        // Times beyond the precision of f64 end.
+        // The computation also ends for times beyond the precision of f64.
         frames_before(u64::MAX, 1e3);
     }
 

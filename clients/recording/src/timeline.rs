@@ -9,9 +9,12 @@ const MAX_TIME: u64 = i64::MAX as u64;
 #[derive(Debug, Default)]
 pub(crate) struct Timeline {
     last_step: Option<StepId>,
-    /// Time in seconds of the step at `base`.
+    /// Simulation time in seconds of the step at `base`.
     base_time: f64,
+    /// Time of this step in the recording, in nanoseconds. Later times are relative to it until a run begins or its
+    /// time decreases.
     base: u64,
+    /// Nanoseconds of the last step.
     last: u64,
 }
 

@@ -51,7 +51,7 @@ pub struct WriteSummary {
     pub last_time: u64,
 }
 
-/// Decides which states are complete, and keeps the current state for them.
+/// Decides which states are written as complete states, for which it keeps the current state.
 struct StateWriter {
     decoder: StateDecoder,
     timeline: Timeline,

@@ -52,7 +52,8 @@ fn states_are_read_as_written_from_any_time() {
     assert_eq!(count, RATE + 1);
 }
 
-/// The recorder replaces a change by a complete state every two seconds, and every 1,000 states if the time stands still.
+/// The recorder replaces a change by a complete state every two seconds, and every 1,000 states if the time stands
+/// still.
 #[test]
 fn complete_states_are_at_most_two_seconds_apart() {
     let complete_steps = |time_scale: f64, steps: u64| {

@@ -57,7 +57,7 @@ impl<'a> GlbBuilder<'a> {
         Ok(Self { out, data: BufWriter::new(data), data_bytes: 0, buffer_views: Vec::new(), accessors: Vec::new() })
     }
 
-    /// Adds bytes at a multiple of four. Returns the index of their view.
+    /// Adds bytes at an offset that is a multiple of four. Returns the index of their buffer view.
     pub(super) fn add_view(&mut self, bytes: &[u8]) -> Result<usize> {
         let padding = bytes.len().next_multiple_of(4) - bytes.len();
         let written = self.data.write_all(bytes).and_then(|()| self.data.write_all(&[0; 3][..padding]));
@@ -91,7 +91,7 @@ impl<'a> GlbBuilder<'a> {
         self.accessors.len() - 1
     }
 
-    /// Writes the file with the other parts of the JSON.
+    /// Writes the file. `document` has all parts of the JSON but the buffers, buffer views and accessors.
     pub(super) fn finish(self, mut document: Map<String, Value>) -> Result<()> {
         let Self { out, data, data_bytes, buffer_views, accessors } = self;
         document.insert("buffers".into(), json!([{ "byteLength": data_bytes }]));

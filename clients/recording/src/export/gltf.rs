@@ -1,4 +1,5 @@
-//! Writes recordings as binary glTF: modes are morph targets, and an animation sets their weights q and the transforms T.
+//! Writes recordings as binary glTF: modes are morph targets, and an animation sets their weights q and the transforms
+//! T.
 
 use std::collections::HashMap;
 use std::path::Path;
@@ -15,9 +16,10 @@ use crate::reader::Recording;
 /// Largest cosine of the angle between the axes of a transform without shear.
 const SHEAR_TOLERANCE: f64 = 1e-5;
 
-/// Writes a `.glb` file. Each domain is a node with a mesh, whose morph targets are the columns of U; domains of the same
-/// shape and materials share their mesh. The animation has a key per state, with linear interpolation; of several states
-/// at the same time, the last one. Normals are those of the rest shape. The Phong materials are approximated.
+/// Writes a `.glb` file. Each domain is a node with a mesh, whose morph targets are the columns of U; domains of the
+/// same shape and materials share their mesh. The animation has one key frame per state, with linear interpolation. Of
+/// several states at the same time, the last one is used. Normals are those of the rest shape. The Phong materials are
+/// approximated.
 ///
 /// # Errors
 /// `Invalid` if a transform has shear, which a node cannot express, or the file exceeds 4 GiB; `Unavailable` if the
@@ -208,7 +210,7 @@ fn add_shape(glb: &mut GlbBuilder<'_>, shape: &Shape) -> Result<ShapeAccessors> 
     Ok(ShapeAccessors { attributes, indices, targets })
 }
 
-/// A transform as a node of glTF has it.
+/// A transform in the form of a glTF node.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct NodeTransform {
     translation: [f32; 3],

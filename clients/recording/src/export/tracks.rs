@@ -27,12 +27,13 @@ pub(super) struct StateTimes {
     pub(super) times: Vec<f64>,
     pub(super) steps: Vec<u64>,
     pub(super) runs: Vec<u64>,
-    /// Of all states in the recording, which ones these are.
+    /// Per state of the recording: whether it is selected.
     pub(super) is_selected: Vec<bool>,
 }
 
 impl StateTimes {
-    /// All states, or only those before a change of their time rounded to f32, so that times increase.
+    /// Selects all states. With `with_increasing_times`, selects only the last one of consecutive states whose times
+    /// are equal as f32.
     pub(super) fn read(recording: &Recording, with_increasing_times: bool) -> Result<Self> {
         let mut selected = Self::default();
         let mut states = recording.states(0, u64::MAX)?;

@@ -74,12 +74,13 @@ struct RecordOptions {
     by_hash: bool,
 }
 
-/// Repairs a recording that was cut off, for example by a crash: copies everything up to the first incomplete or damaged
-/// chunk into a new file with an index.
+/// Repairs a recording that was cut off, for example by a crash: copies everything up to the first incomplete or
+/// damaged chunk into a new file with an index.
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:
   modalcast recover cut.mcap --out tree.mcap")]
 struct RecoverOptions {
+    /// Recording to repair.
     file: PathBuf,
     /// File to write; replaced if it exists.
     #[arg(long, value_name = "FILE")]

@@ -39,7 +39,9 @@ const MAX_PAGE_BYTES: u64 = 64 << 20;
   modalcast export tree.mcap --to png --out frames --size 640x360 --fps 24
   modalcast export tree.mcap --to video --out tree.mp4")]
 pub(crate) struct ExportOptions {
+    /// Recording to convert.
     file: PathBuf,
+    /// Format to convert to.
     #[arg(long, value_enum)]
     to: ExportFormat,
     /// File to write, or folder for `--to png`.

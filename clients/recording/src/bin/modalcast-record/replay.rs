@@ -23,13 +23,14 @@ use crate::options::{ServerOptions, parse_seconds, termination_signal};
   modalcast replay tree.mcap --speed 0.25 --loop --from 2 --to 5
   modalcast replay tree.mcap --fast --frames out --size 640x360")]
 pub(crate) struct ReplayOptions {
+    /// Recording to replay.
     file: PathBuf,
     #[command(flatten)]
     server: ServerOptions,
     /// Name of the scene on the server. Default: the recorded name.
     #[arg(long, default_value = "")]
     scene: String,
-    /// Seconds of the recording per second.
+    /// Speed: seconds of the recording per second of real time.
     #[arg(long, default_value_t = 1.0)]
     speed: f64,
     /// Send steps as fast as the server accepts them.
@@ -41,7 +42,7 @@ pub(crate) struct ReplayOptions {
     /// Time of the first state, in seconds since the beginning of the recording.
     #[arg(long, default_value_t = 0.0, value_parser = parse_seconds)]
     from: f64,
-    /// Time of the last state. Default: the end.
+    /// Time of the last state, in seconds since the beginning of the recording. Default: the end.
     #[arg(long, value_parser = parse_seconds)]
     to: Option<f64>,
     /// Save the frames of every step in this folder.
