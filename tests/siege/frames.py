@@ -10,14 +10,14 @@ from server import Peak, Server
 
 ITEM = 8
 
-# The attacker requests so many frames of so many pixels per side at a time.
+# The attacker requests FRAMES frames of SIDE x SIDE pixels at a time.
 FRAMES = 8
 SIDE = 8192
 
-# Seconds within which another client has a small frame, during the attack and after it was canceled, and the limit on
-# the growth of the memory in bytes.
-ASKED = 2.0
-ASKED_MEMORY = 2 << 30
+# Seconds within which another client receives a small frame, during the attack and after it was canceled. Then the
+# limit on the growth of the memory in bytes.
+MAX_SECONDS = 2.0
+MAX_MEMORY = 2 << 30
 
 # Seconds of the attack before it is canceled.
 DURATION = 15.0
@@ -102,12 +102,12 @@ def run(program):
         Result(
             ITEM,
             f"{FRAMES} frames of {SIDE} x {SIDE} pixels of one client do not delay the small frames of another one",
-            f"within {ASKED:.0f} s, also after the large ones were canceled; memory +{mb(ASKED_MEMORY)}; "
+            f"within {MAX_SECONDS:.0f} s, also after the large ones were canceled; memory +{mb(MAX_MEMORY)}; "
             f"one stream of such frames per connection",
             f"alone {alone:.2f} s, during the attack {during:.2f} s, after it {after:.2f} s, +{mb(memory)}; "
             f"{streams} of {FRAMES} streams accepted",
-            max(during, after) <= ASKED and memory <= ASKED_MEMORY and streams == 1,
+            max(during, after) <= MAX_SECONDS and memory <= MAX_MEMORY and streams == 1,
             f"a large frame itself, {large:.1f} s",
-            large > ASKED,
+            large > MAX_SECONDS,
         )
     ]

@@ -9,19 +9,20 @@ from server import Peak, Server
 
 ITEM = 2
 
-# Each of so many connections opens so many calls, which claim a message of so many bytes and send a part of it.
+# Each of CONNECTIONS connections opens CALLS calls. A call claims a message of CLAIMED_BYTES and sends SENT_BYTES of
+# it.
 CONNECTIONS = 4
 CALLS = 128
 CLAIMED_BYTES = 16 << 20
 SENT_BYTES = (2 << 20) - 4096
 
 # Limits on the growth in bytes: of the memory and of the address space during the attack, and of the memory after it.
-ASKED_PEAK = 256 << 20
-ASKED_ADDRESSES = 1 << 30
-ASKED_REST = 32 << 20
+MAX_PEAK = 256 << 20
+MAX_ADDRESS_SPACE = 1 << 30
+MAX_REST = 32 << 20
 
 # Seconds within which a new client must be served.
-ASKED_SERVICE = 1.0
+MAX_SERVICE_SECONDS = 1.0
 
 # Seconds after which the server ends a message without progress.
 MESSAGE_TIMEOUT = 10
@@ -72,11 +73,11 @@ def run(program):
         Result(
             ITEM,
             f"{CONNECTIONS * CALLS} half-sent messages of {mb(CLAIMED_BYTES)} use bounded memory, and it is given back",
-            f"memory +{mb(ASKED_PEAK)}, after {MESSAGE_TIMEOUT + 5} s +{mb(ASKED_REST)}, "
-            f"address space +{mb(ASKED_ADDRESSES)}, new client served within {ASKED_SERVICE:.0f} s",
+            f"memory +{mb(MAX_PEAK)}, after {MESSAGE_TIMEOUT + 5} s +{mb(MAX_REST)}, "
+            f"address space +{mb(MAX_ADDRESS_SPACE)}, new client served within {MAX_SERVICE_SECONDS:.0f} s",
             f"+{mb(peak)}, then +{mb(rest)}, address space +{mb(addresses)}, served within {slowest:.2f} s",
-            peak <= ASKED_PEAK and rest <= ASKED_REST and addresses <= ASKED_ADDRESSES and slowest <= ASKED_SERVICE,
+            peak <= MAX_PEAK and rest <= MAX_REST and addresses <= MAX_ADDRESS_SPACE and slowest <= MAX_SERVICE_SECONDS,
             f"with the largest budgets +{mb(control)}",
-            control > ASKED_PEAK,
+            control > MAX_PEAK,
         )
     ]

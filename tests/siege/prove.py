@@ -1,4 +1,4 @@
-"""Runs the attacks, and prints for each check what was asked and what was reached."""
+"""Runs the attacks, and prints for each check the requirement and the measured result."""
 
 import argparse
 import importlib

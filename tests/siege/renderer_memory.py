@@ -10,8 +10,8 @@ ITEM = 9
 
 SIDE = 8192
 
-# Limit on the growth of the memory in bytes after so many seconds in which only small frames are drawn.
-ASKED = 256 << 20
+# Limit on the growth of the memory in bytes, after WAIT seconds in which only small frames are drawn.
+MAX_GROWTH = 256 << 20
 WAIT = 14.0
 
 
@@ -43,10 +43,10 @@ def run(program):
         Result(
             ITEM,
             f"the memory of a frame of {SIDE} x {SIDE} pixels is given back",
-            f"+{mb(ASKED)} after {WAIT:.0f} s of small frames",
+            f"+{mb(MAX_GROWTH)} after {WAIT:.0f} s of small frames",
             f"+{mb(later)}",
-            later <= ASKED,
+            later <= MAX_GROWTH,
             f"right after the frame, +{mb(large)}",
-            large > ASKED,
+            large > MAX_GROWTH,
         )
     ]

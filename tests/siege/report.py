@@ -9,8 +9,8 @@ class Result:
 
     item: int
     promise: str
-    asked: str
-    reached: str
+    required: str
+    measured: str
     passed: bool
     # The negative control: what the same check found where it must fail, and whether it failed there.
     control: str
@@ -24,8 +24,8 @@ class Result:
         control = "fails, as it must" if self.control_failed else "PASSES, so the check proves nothing"
         return (
             f"{self.item:2}. {verdict}  {self.promise}\n"
-            f"      asked: {self.asked}\n"
-            f"      reached: {self.reached}\n"
+            f"      required: {self.required}\n"
+            f"      measured: {self.measured}\n"
             f"      control: {self.control}: {control}"
         )
 

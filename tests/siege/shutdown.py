@@ -17,7 +17,7 @@ from server import Server
 ITEM = 5
 
 # Limit in seconds, and time after which the check gives up.
-ASKED = 10.0
+MAX_SECONDS = 10.0
 GIVE_UP = 40.0
 
 # So many polygons that loading them takes longer than the limit.
@@ -82,36 +82,36 @@ def terminate(program, situation, renderer, scenes):
 
 
 def terminate_ignoring_process():
-    """Seconds for which a process that ignores SIGTERM runs after the signal, until the wait ends after ASKED + 1."""
+    """Seconds that a process which ignores SIGTERM runs after the signal. The wait ends after MAX_SECONDS + 1."""
     code = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print(flush=True); time.sleep(99)"
     process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE)
     process.stdout.readline()
     process.send_signal(signal.SIGTERM)
     start = time.monotonic()
     with contextlib.suppress(subprocess.TimeoutExpired):
-        process.wait(ASKED + 1)
+        process.wait(MAX_SECONDS + 1)
     process.kill()
     process.wait()
     return time.monotonic() - start
 
 
 def run(program):
-    reached, passed = [], True
+    measured, passed = [], True
     with tempfile.TemporaryDirectory() as folder:
         write_thin_arcs(Path(folder) / "concave.obj", POLYGONS)
         for name, situation, renderer in SITUATIONS:
             seconds, code = terminate(program, situation, renderer, folder)
-            reached.append(f"{name} {seconds:.1f} s" + (f" (exit code {code})" if code else ""))
-            passed &= seconds <= ASKED and code == 0
+            measured.append(f"{name} {seconds:.1f} s" + (f" (exit code {code})" if code else ""))
+            passed &= seconds <= MAX_SECONDS and code == 0
     control = terminate_ignoring_process()
     return [
         Result(
             ITEM,
             "SIGTERM ends the server, whatever it is doing",
-            f"within {ASKED:.0f} s, exit code 0",
-            ", ".join(reached),
+            f"within {MAX_SECONDS:.0f} s, exit code 0",
+            ", ".join(measured),
             passed,
             f"a process that ignores SIGTERM, {control:.1f} s",
-            control > ASKED,
+            control > MAX_SECONDS,
         )
     ]

@@ -10,8 +10,8 @@ from server import Server
 
 ITEM = 10
 
-# Steps on each of so many streams of one connection. HTTP/2 libraries close a connection with too many unsent small
-# frames: in an earlier version of the server, replies to 39,000 steps ended the connection.
+# Steps on each of STREAMS streams of one connection. HTTP/2 libraries close a connection with too many unsent small
+# frames. If the server does not merge its replies, the replies to 39,000 steps end the connection.
 STREAMS = 4
 STEPS = 50_000
 
@@ -63,8 +63,8 @@ class StepSender:
         return frames
 
     def send_all(self, steps):
-        """Sends steps until each stream has sent all or has ended, or until no stream makes progress. Returns the number
-        of sent steps."""
+        """Sends steps until each stream has sent all or has ended, or until no stream makes progress. Returns the
+        number of sent steps."""
         numbers = dict.fromkeys(self.windows, 0)
         sent, last_progress = 0, time.monotonic()
         while self.is_open and time.monotonic() < last_progress + BLOCKED:
@@ -109,10 +109,10 @@ def attack(program, deliveries, fault=b""):
 
 
 def run(program):
-    reached, passed = [], True
+    measured, passed = [], True
     for name, delivery in [("lossless", common_pb2.DELIVERY_LOSSLESS), ("latest", common_pb2.DELIVERY_LATEST)]:
         sent, is_served = attack(program, [delivery] * STREAMS)
-        reached.append(f"{name}: {sent} steps, connection {'open' if is_served else 'LOST'}")
+        measured.append(f"{name}: {sent} steps, connection {'open' if is_served else 'LOST'}")
         passed &= is_served
     # A PING of 7 bytes is a connection error.
     fault = http2.frame(http2.PING, payload=bytes(7))
@@ -122,7 +122,7 @@ def run(program):
             ITEM,
             "a client that does not read the replies to its steps keeps its connection",
             f"up to {STEPS} steps on each of {STREAMS} streams, then another call is answered",
-            ", ".join(reached),
+            ", ".join(measured),
             passed,
             f"with an invalid PING, connection {'open' if control else 'lost'}",
             not control,

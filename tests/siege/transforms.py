@@ -66,7 +66,7 @@ def run(program):
                 wrong.append(name)
             invalid += count_invalid(read_vertices(connection))
         writer.close()
-    planted = count_invalid(struct.pack("<3f", 1.0, math.nan, math.inf))
+    control_count = count_invalid(struct.pack("<3f", 1.0, math.nan, math.inf))
     return Result(
         ITEM,
         "a transform may have a determinant of zero; one that moves a vertex out of range or is not finite is rejected",
@@ -74,6 +74,6 @@ def run(program):
         f"{len(TRANSFORMS) - len(wrong)} as expected{' (wrong: ' + ', '.join(wrong) + ')' if wrong else ''}, "
         f"{invalid} vertex coordinates that are not finite",
         not wrong and invalid == 0,
-        f"an array with a NaN and an infinity, {planted} numbers that are not finite",
-        planted > 0,
+        f"an array with a NaN and an infinity, {control_count} numbers that are not finite",
+        control_count > 0,
     )

@@ -1,4 +1,4 @@
-"""Item 14: the viewer's port holds against other web pages, slow heads, hostile frames and viewers that never read."""
+"""Item 14: the viewer's port withstands other web pages, slow heads, hostile frames and viewers that never read."""
 
 import socket
 import tempfile
@@ -20,26 +20,29 @@ TOKEN = "0123456789abcdef"
 VIEWER = ["--viewer-token", TOKEN]
 
 # Seconds within which a new client must be served.
-ASKED_SERVICE = 1.0
+MAX_SERVICE_SECONDS = 1.0
 
 # The limit on connections of the server.
 CONNECTIONS = 1024
 
-# Each of so many connections sends a part of a message of so many bytes.
+# Each of HALF_SENT_CONNECTIONS connections sends a part of a message of HALF_SENT_BYTES. The memory may
+# grow by MAX_HALF_SENT_MEMORY bytes.
 HALF_SENT_CONNECTIONS = 48
 HALF_SENT_BYTES = 12 << 20
-ASKED_HALF_SENT = 256 << 20
+MAX_HALF_SENT_MEMORY = 256 << 20
 
-# Each of so many connections opens so many calls, and reads nothing.
+# Each of UNREAD_CONNECTIONS connections opens UNREAD_CALLS calls and reads nothing for DURATION seconds. The memory may
+# grow by MAX_UNREAD_MEMORY bytes.
 UNREAD_CONNECTIONS = 32
 UNREAD_CALLS = 32
-ASKED_UNREAD = 384 << 20
+MAX_UNREAD_MEMORY = 384 << 20
 DURATION = 12.0
 
-# Frames of each flood. A connection of the control sends so few that it must stay open.
+# Frames of each flood. A connection of the negative control sends FEW frames and must stay open. Then the limit on the
+# growth of the memory in bytes.
 FLOOD = 100_000
 FEW = 1000
-ASKED_FLOOD = 32 << 20
+MAX_FLOOD_MEMORY = 32 << 20
 
 UNLIMITED = ["--connection-receive-bytes", "4000000000", "--receive-bytes", "4000000000"]
 UNLIMITED += ["--connection-reply-bytes", "4000000000", "--reply-bytes", "4000000000"]
@@ -133,11 +136,11 @@ def slow_clients(program):
     return Result(
         ITEM,
         f"{CONNECTIONS} slow HTTP heads or WebSockets without a call do not lock out a new client, and slow heads end",
-        f"served within {ASKED_SERVICE:.0f} s, a trickled head closed within 15 s",
+        f"served within {MAX_SERVICE_SECONDS:.0f} s, a trickled head closed within 15 s",
         f"slow heads {heads:.2f} s, silent WebSockets {silent:.2f} s, trickled head closed after {seconds:.1f} s",
-        max(heads, silent) <= ASKED_SERVICE and seconds <= 15,
+        max(heads, silent) <= MAX_SERVICE_SECONDS and seconds <= 15,
         f"{CONNECTIONS} WebSockets with an open call each, {control:.2f} s",
-        control > ASKED_SERVICE,
+        control > MAX_SERVICE_SECONDS,
     )
 
 
@@ -181,12 +184,12 @@ def half_sent_messages(program):
     control, _ = half_sent(program, UNLIMITED)
     return Result(
         ITEM,
-        f"{HALF_SENT_CONNECTIONS} half-sent and fragmented WebSocket messages of {mb(HALF_SENT_BYTES)} use bounded memory",
-        f"memory +{mb(ASKED_HALF_SENT)}, new client served within {ASKED_SERVICE:.0f} s",
+        f"{HALF_SENT_CONNECTIONS} half-sent fragmented WebSocket messages of {mb(HALF_SENT_BYTES)} use bounded memory",
+        f"memory +{mb(MAX_HALF_SENT_MEMORY)}, new client served within {MAX_SERVICE_SECONDS:.0f} s",
         f"+{mb(growth)}, served within {slowest:.2f} s",
-        growth <= ASKED_HALF_SENT and slowest <= ASKED_SERVICE,
+        growth <= MAX_HALF_SENT_MEMORY and slowest <= MAX_SERVICE_SECONDS,
         f"with the largest budgets +{mb(control)}",
-        control > ASKED_HALF_SENT,
+        control > MAX_HALF_SENT_MEMORY,
     )
 
 
@@ -219,12 +222,12 @@ def unread_replies(program):
     control, _ = unread(program, UNLIMITED)
     return Result(
         ITEM,
-        f"{UNREAD_CONNECTIONS * UNREAD_CALLS} calls of viewers that never read use bounded memory, and another client is served",
-        f"memory +{mb(ASKED_UNREAD)}, a description within {ASKED_SERVICE:.0f} s",
+        f"{UNREAD_CONNECTIONS * UNREAD_CALLS} unread calls of viewers use bounded memory, and another client is served",
+        f"memory +{mb(MAX_UNREAD_MEMORY)}, a description within {MAX_SERVICE_SECONDS:.0f} s",
         f"+{mb(growth)}, {slowest:.2f} s",
-        growth <= ASKED_UNREAD and slowest <= ASKED_SERVICE,
+        growth <= MAX_UNREAD_MEMORY and slowest <= MAX_SERVICE_SECONDS,
         f"with the largest budgets +{mb(control)}",
-        control > ASKED_UNREAD,
+        control > MAX_UNREAD_MEMORY,
     )
 
 
@@ -255,23 +258,23 @@ def flood(server, frame, count):
 
 
 def floods(program):
-    reached, passed = [], True
+    measured, passed = [], True
     with Server(program, *VIEWER) as server:
         time_to_serve(server, 10)
         memory = Peak(server.memory)
         for name, frame in FLOODS:
             is_closed = flood(server, frame, FLOOD)
-            passed &= is_closed and time_to_serve(server, 5) <= ASKED_SERVICE
+            passed &= is_closed and time_to_serve(server, 5) <= MAX_SERVICE_SECONDS
             memory.sample()
-            reached.append(f"{name} {'closed' if is_closed else 'OPEN'}")
+            measured.append(f"{name} {'closed' if is_closed else 'OPEN'}")
         growth = memory.growth()
-        passed &= growth <= ASKED_FLOOD
+        passed &= growth <= MAX_FLOOD_MEMORY
         is_control_closed = any([flood(server, frame, FEW) for _, frame in FLOODS])
     return Result(
         ITEM,
         "floods of small WebSocket frames end their connection",
-        f"closed before {FLOOD} frames, memory +{mb(ASKED_FLOOD)}",
-        ", ".join(reached) + f"; +{mb(growth)}",
+        f"closed before {FLOOD} frames, memory +{mb(MAX_FLOOD_MEMORY)}",
+        ", ".join(measured) + f"; +{mb(growth)}",
         passed,
         f"{FEW} frames of each kind, {'closed' if is_control_closed else 'open'}",
         not is_control_closed,
