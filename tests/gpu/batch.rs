@@ -50,7 +50,7 @@ fn count_differing_states(name: &str, scene: &Arc<Scene>) -> usize {
     differing_states
 }
 
-/// Each case has one shape of so many vertices and modes, and so many domains of this shape.
+/// Each case is a scene with `domains` domains of one shape, which has `vertices` vertices and `rank` modes.
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_batches_have_the_bits_of_separate_domains() {

@@ -13,7 +13,7 @@ use crate::gl::Exclusive;
 /// The bounds that the CUDA deformer computes are those of the vertices, so the depth is exact up to rounding.
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_frames_without_preset_use_a_variance_map_and_report_depth_below_ground() {
+fn gpu_frames_report_variance_shadows_and_depth_below_ground() {
     let tree = modalcast_model::load::open("tree").expect("expected the built-in scene").scene;
     let config = Config { backend: BackendChoice::Cuda, ..Config::default() };
     let mut context = Exclusive::open(|| DeviceContext::open(&config));

@@ -1,6 +1,6 @@
-//! Tests of the CUDA deformer, the CUDA rasterizer and the CUDA PNG encoder. They are ignored by default because they need
-//! a GPU; run them with `--include-ignored --test-threads=1`. The test binary also runs on a machine without the source
-//! tree. It reads real inputs from the folder MODALCAST_DATA.
+//! Tests of the CUDA deformer, the CUDA rasterizer and the CUDA PNG encoder. They are ignored by default because they
+//! need a GPU; run them with `--include-ignored --test-threads=1`. The test binary also runs on a machine without the
+//! source tree. It reads real inputs from the folder MODALCAST_DATA.
 
 mod accuracy;
 mod batch;

@@ -1,4 +1,5 @@
-//! Exact normals and tangents of the CUDA deformer equal those of the f64 reference for the same positions.
+//! Exact normals follow the deformed surface, whereas rigid normals are rest normals rotated by T. Exact normals and
+//! tangents of the CUDA deformer equal those of the f64 reference for the same positions.
 
 use std::sync::Arc;
 

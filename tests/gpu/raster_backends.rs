@@ -219,8 +219,8 @@ fn gpu_shading_of_equal_ids_equals_opengl() {
     );
 }
 
-/// T moves the scene by 4096 units in f32, so that the bounds of a frame span the distance to the rest state. The camera
-/// has no clip planes of its own. Both rasterizers draw the same visible surfaces.
+/// T moves the scene by 4096 units in f32, so that the bounds of a frame span the distance to the rest state. The
+/// camera has no clip planes of its own. Both rasterizers draw the same visible surfaces.
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_scene_moved_by_4096_units_is_drawn_by_both_rasterizers() {

@@ -1,4 +1,4 @@
-//! Random scenes and states: shapes of n vertices and r modes, with rotated, mirrored and sheared domains.
+//! Random scenes and states: shapes of n vertices and r modes (their rank), with rotated, mirrored and sheared domains.
 
 use std::sync::Arc;
 

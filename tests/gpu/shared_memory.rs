@@ -1,5 +1,5 @@
-//! Memory that OpenGL and CUDA share: pictures that the copy engine moves to the host, and vertices that OpenGL imports.
-//! Frames equal those without shared memory, also with several steps and frames in flight.
+//! Memory that OpenGL and CUDA share: pictures that the copy engine moves to the host, and vertices that OpenGL
+//! imports. Frames equal those without shared memory, also with several steps and frames in flight.
 
 use std::cell::Cell;
 use std::collections::VecDeque;
@@ -54,9 +54,9 @@ impl Fixture {
         Self { renderer, device, scene, states, size, expected_images }
     }
 
-    /// Deforms and draws steps with [`MAX_FRAMES_IN_FLIGHT`] frames in flight for at least `seconds` and two rounds of the
-    /// states. `change_buffers` changes the buffers that the deformer gets. Returns the numbers of frames and of frames that
-    /// show another image than that of their step.
+    /// Deforms and draws steps with [`MAX_FRAMES_IN_FLIGHT`] frames in flight for at least `seconds` and two rounds of
+    /// the states. `change_buffers` changes the buffers that the deformer gets. Returns the numbers of frames and of
+    /// frames that show another image than that of their step.
     fn draw_steps(
         &mut self,
         seconds: f64,
