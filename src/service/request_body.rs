@@ -282,7 +282,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn rest_of_a_message_has_a_deadline_and_a_pause_between_messages_has_none() {
+    async fn only_an_incomplete_message_has_a_deadline() {
         let (mut body, frames) = body_of(&connection(), Duration::from_millis(30));
         let message = encode(&[100]);
         frames.send(message.clone()).await.expect("expected an open channel");
@@ -330,7 +330,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn incomplete_message_over_the_budget_is_rejected_and_eviction_ends_a_wait() {
+    async fn message_over_budget_is_rejected_and_eviction_ends_a_wait() {
         let budget =
             ReceiveBudget::new(&Config { receive_bytes: 1000, connection_receive_bytes: 600, ..Config::default() });
         let connection = budget.new_connection();

@@ -67,7 +67,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn files_belong_to_the_model_by_name_and_built_in_scenes_have_none() {
+    fn files_are_found_by_model_name_but_not_for_built_in_scenes() {
         let outer = tempfile::tempdir().expect("expected a temporary folder");
         for name in ["tree", "beam", "other"] {
             let folder = outer.path().join(name);

@@ -8,10 +8,10 @@
 //! The commands of its scene wait until its last step is submitted. Each step is submitted when the device has finished
 //! the one before it, so the commands of other scenes never wait for more than one step. Only one large output is drawn
 //! at a time, because each needs its own images; another one waits. A step draws at most a fixed number of samples
-//! ([`modalcast_render::Renderer::set_max_band_samples`]). On a software renderer this limit is a whole frame of 1920x1080
-//! pixels with four samples per pixel, so other scenes wait at most about as long as such a frame takes. The first
-//! frame of a scene is drawn in steps, too, because drivers finish the compilation of a program when it is used for the
-//! first time.
+//! ([`modalcast_render::Renderer::set_max_band_samples`]). On a software renderer this limit is a whole frame of
+//! 1920x1080 pixels with four samples per pixel, so other scenes wait at most about as long as such a frame takes. The
+//! first frame of a scene is drawn in steps, too, because drivers finish the compilation of a program when it is used
+//! for the first time.
 //!
 //! Another thread prepares the deformer of a scene before the scene is loaded: it compiles the kernels and uploads the
 //! tables. The OpenGL buffers of a scene are created by its first output, or with CUDA when it is loaded. Before that,
@@ -512,7 +512,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn scenes_are_served_while_the_deformer_of_another_scene_is_prepared() {
+    async fn scenes_are_served_while_another_deformer_is_prepared() {
         let open_device = || DeviceContext::with_deformer(create_when_open);
         let handle = DeviceThread::start(open_device).await.expect("expected a device thread").handle;
         let scene = testing::two_strips();
