@@ -259,7 +259,7 @@ async fn held_modes_and_unresolved_gusts_are_reported() {
     }
 }
 
-/// The process names what has diverged, and sends only the steps before.
+/// The process reports what has diverged, and sends only the steps before it.
 #[tokio::test(flavor = "multi_thread")]
 async fn diverging_run_stops_before_the_step_is_sent() {
     let mut server = tree_server();
@@ -293,7 +293,7 @@ async fn errors_exit_with_documented_codes() {
     assert!(sim_output.exit_code == 5 && sim_output.stderr.contains("--cubic"), "{}", sim_output.stderr);
 }
 
-/// A file of cubic forces that the scene does not name is named and not used, although it is the only one.
+/// The only file of cubic forces in the folder is reported but not used, because the scene does not name it.
 #[tokio::test(flavor = "multi_thread")]
 async fn cubic_forces_of_another_model_are_not_used() {
     let folder = tempfile::tempdir().expect("a temporary folder");

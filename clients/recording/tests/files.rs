@@ -196,7 +196,7 @@ fn read_everything(path: &Path) -> Result<()> {
     Ok(())
 }
 
-/// Changed bytes are errors or are not seen, but no panic and no endless loop.
+/// A changed byte gives an error or is not noticed, but causes no panic and no endless loop.
 #[test]
 fn damaged_files_are_errors() {
     let folder = tempfile::tempdir().expect("a folder");

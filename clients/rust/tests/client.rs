@@ -214,7 +214,7 @@ async fn forward(server_address: &str) -> (String, tokio::task::JoinSet<()>) {
 
 /// The library and the program connect to a Unix socket, which is forwarded to a server.
 #[tokio::test(flavor = "multi_thread")]
-async fn unix_socket_is_a_url() {
+async fn connects_to_a_unix_socket_by_url() {
     let server = serve(Arc::new(one_domain_server(4))).await;
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("socket");

@@ -196,7 +196,7 @@ async fn animation_of_gltf_gives_the_vertices_of_the_server() {
         let shape = loaded.shape_of(domain);
         let rank = domain.rank;
         assert_eq!(rank, recorded.domains[node].rank);
-        // The loader has merged the vertices of glTF, perhaps in another order: find them at rest.
+        // The loader may merge and reorder the vertices of glTF, so match them by rest position.
         let rest = &recorded.shapes[node].rest_positions;
         for (step, expected) in positions.iter().enumerate() {
             let (translation, rotation) = (glb.value(node, "translation", step), glb.value(node, "rotation", step));

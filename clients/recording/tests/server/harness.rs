@@ -82,7 +82,7 @@ impl Drop for Server {
     }
 }
 
-/// Row-major 3x4: a turn about y by an angle in radians, then a translation.
+/// Row-major 3x4: a rotation about y by an angle in radians, then a translation.
 pub(crate) fn turned(angle: f32, translation: [f32; 3]) -> [f32; 12] {
     let (sine, cosine) = angle.sin_cos();
     let [x, y, z] = translation;

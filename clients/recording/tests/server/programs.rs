@@ -1,4 +1,4 @@
-//! The program: signals, kill -9, and exit codes.
+//! The program `modalcast-record`: signals, kill -9, and exit codes.
 
 use std::io::{BufRead as _, BufReader};
 use std::path::{Path, PathBuf};
@@ -128,7 +128,7 @@ async fn errors_exit_with_the_documented_codes() {
     assert_eq!(String::from_utf8_lossy(&run(&["--build"]).stdout).trim().len(), 16);
 }
 
-/// A program that stands for ffmpeg: copies its standard input to the file that is its last argument.
+/// A substitute for ffmpeg: copies its standard input to the file that is its last argument.
 fn copying_encoder(folder: &Path) -> PathBuf {
     use std::os::unix::fs::PermissionsExt as _;
     let path = folder.join("encoder");

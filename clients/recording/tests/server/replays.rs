@@ -31,7 +31,7 @@ async fn replay_frames(client: &Client, recording: &Recording, request: &ReplayR
     (replayed.expect("a replay"), frames)
 }
 
-/// The states of a recording, with the same run.
+/// The states of a recording, with the run number set to 0, so that two recordings compare equal.
 fn states(recording: &Recording) -> Vec<SceneState> {
     let mut reader = recording.states(0, u64::MAX).expect("states");
     let mut list = Vec::new();

@@ -14,7 +14,7 @@ pub(crate) const IDENTITY: [f32; 12] = [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 
 /// Steps per second of the states.
 pub(crate) const RATE: u64 = 60;
 
-/// A content that has its hash.
+/// Bytes that are identified by their hash.
 pub(crate) struct Content {
     pub(crate) bytes: Vec<u8>,
 }

@@ -242,7 +242,8 @@ fn all_index_types_and_topologies_give_correct_triangles() {
         let vertices_of = |triangle: &[u32; 3]| triangle.map(|corner| mesh.corners().vertices[corner as usize]);
         mesh.triangles().iter().map(vertices_of).collect::<Vec<_>>()
     };
-    // Triangles as vertices: the fan folds back, so that creases split its corners. Modes 4, 5 and 6: a list, a strip (without its degenerate triangles) and a fan.
+    // Triangles as vertices: the fan folds back, so that creases split its corners. Modes 4, 5 and 6: a list, a strip
+    // (without its degenerate triangles) and a fan.
     for accessor in accessors {
         assert_eq!(triangles(4, accessor), [[0, 1, 2], [3, 3, 4]]);
         assert_eq!(triangles(5, accessor), [[0, 1, 2], [1, 3, 2]]);
