@@ -3,8 +3,8 @@
 //! potential.
 //!
 //! File format: four little-endian i32 (r, then the numbers of monomials of degree one, two and three: r, r(r+1)/2 and
-//! r(r+1)(r+2)/6), followed by one f64 matrix per degree, row-major, with one row per force component and one column
-//! per monomial. The monomials q_i q_j (i <= j) and q_i q_j q_k (i <= j <= k) are in lexicographic order.
+//! r(r+1)(r+2)/6), followed by one f64 matrix per degree. A matrix is row-major, with one row per force component and
+//! one column per monomial. The monomials q_i q_j (i <= j) and q_i q_j q_k (i <= j <= k) are in lexicographic order.
 
 use std::path::Path;
 

@@ -49,8 +49,8 @@ const SCENE_DIAGONAL: f64 = 10.0;
 /// to 7 Hz).
 const FREQUENCY_RANGE: [f64; 2] = [0.05, 8.0];
 
-/// Number of cosines. The frequencies of neighbors differ by 8 % on average, less than the bandwidth of a mode with a
-/// damping ratio of 0.05 (10 %), so that no mode is between two frequencies.
+/// Number of cosines. The frequencies of neighbors differ by 8 % on average. That is less than the bandwidth of a mode
+/// with a damping ratio of 0.05 (10 %), so that no mode is between two frequencies.
 const COSINE_COUNT: usize = 64;
 
 /// Duration of the wind from which its start is selected, in seconds.

@@ -1,5 +1,5 @@
-//! Arrays and textures by their SHA-256: fetched from a server, and optionally stored in a folder on this machine, so
-//! that equal content is received only once, also from different scenes and servers.
+//! Arrays and textures by their SHA-256, fetched from a server. A folder on this machine can store them, so that equal
+//! content is received only once, also from different scenes and servers.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};

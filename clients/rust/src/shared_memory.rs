@@ -239,8 +239,8 @@ fn receive_with_files(socket: BorrowedFd<'_>) -> io::Result<([u8; HANDSHAKE_BYTE
 impl AsRef<[u8]> for SharedData {
     fn as_ref(&self) -> &[u8] {
         // SAFETY: `CallMemory::data` has checked that the range is within the slot and the slot within the mapping. The
-        // file cannot shrink, because it is sealed. The server, which runs as the same user and is the only process
-        // that can write to the memory, does not write to a slot until it is returned, which the drop of `self` does.
+        // file cannot shrink, because it is sealed. Only the server, which runs as the same user, can write to the
+        // memory. It does not write to a slot until the slot is returned, which the drop of `self` does.
         unsafe {
             let start = self.connection.replies.as_ptr().add(self.slot as usize * self.connection.slot_bytes);
             std::slice::from_raw_parts(start, self.bytes)

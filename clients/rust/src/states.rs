@@ -1,4 +1,4 @@
-//! States of a scene: the coordinates q and the transforms T of its domains at a step, from which a client computes the
+//! States of a scene: the coordinates q and the transforms T of its domains at a step. From them a client computes the
 //! vertices x = T (x0 + U q) by itself. A stream sends only what changes; the client applies it and returns complete
 //! states.
 
