@@ -186,7 +186,7 @@ pub(super) async fn start(config: ValidatedConfig) -> Result<(Engine, Listener)>
     Ok((engine, listener))
 }
 
-/// The commands that make the viewer available on another machine through SSH, if users probably are there: they have
+/// The commands that make the viewer available on another machine through SSH. There are none unless the user has
 /// logged in through SSH, or the server accepts clients of other machines.
 fn tunnel_commands(listener: &Listener) -> Vec<String> {
     let ssh_address = std::env::var("SSH_CONNECTION").ok().and_then(|text| server_of_ssh_connection(&text));

@@ -87,9 +87,9 @@ impl ConnectionTable {
         Arc::new(Self { max_connections, state: Mutex::default(), changed: Arc::default() })
     }
 
-    /// Adds a connection. If the table is full, closes another one: the oldest of those that have sent no request if
-    /// they are more than an eighth of all, else the one that has been without calls for the longest time. Waits while
-    /// every connection has a call. Cancel-safe.
+    /// Adds a connection. If the table is full, closes another one. If more than an eighth of all connections have sent
+    /// no request, closes the oldest of these; otherwise the one that has been without calls for the longest time.
+    /// Waits while every connection has a call. Cancel-safe.
     pub(super) async fn insert(self: &Arc<Self>) -> ConnectionSlot {
         loop {
             if let Some(slot) = self.try_insert() {

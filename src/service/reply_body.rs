@@ -1,6 +1,6 @@
 //! Bodies of reply streams whose chunks are sent without a copy. tonic encodes every message into one buffer. A
-//! [`ReplyBody`] encodes only the head of a chunk: the data of the chunk follow as a frame of their own, which refers
-//! to the memory that the engine filled.
+//! [`ReplyBody`] encodes only the head of a chunk. The data of the chunk follow as a separate frame, which refers to
+//! the memory that the engine filled.
 //!
 //! tonic decodes the request and builds the head of the response as for every call. The response has an empty body,
 //! which [`replace_body`] replaces by the body in the extensions of the response.

@@ -2,9 +2,9 @@
 //!
 //! A message counts from the moment when it is queued until HTTP/2 has written its last byte to the socket. A sender
 //! without budget waits. The wait is bounded: a call whose client takes no bytes for the reply timeout ends as soon as
-//! another sender waits for the same budget, and its connection is closed if that does not free the bytes. If the total
-//! is exhausted, a connection that holds more than its share and takes nothing for a shorter time is closed, so that a
-//! few connections do not delay all others.
+//! another sender waits for the same budget. If that does not free the bytes, the connection is closed. If the total is
+//! exhausted, a connection that holds more than its share and takes nothing for a shorter time is closed, so that a few
+//! connections do not delay all others.
 
 use std::collections::{HashMap, VecDeque};
 use std::pin::Pin;

@@ -159,8 +159,8 @@ impl DriveSession {
         }
     }
 
-    /// Appends a report. An acknowledgment also covers all earlier steps. If many replies wait, it replaces one that is
-    /// not sent yet, so that a client that reads nothing can continue to send steps.
+    /// Appends a report. An acknowledgment also covers all earlier steps. If many replies wait, the acknowledgment
+    /// replaces one that is not sent yet. A client that reads nothing can therefore continue to send steps.
     fn push_report(&mut self, report: StepReport) {
         let response = to_response(report);
         let is_ack = |response: &v1::DriveSceneResponse| matches!(response.kind, Some(ResponseKind::Ack(_)));

@@ -195,9 +195,9 @@ impl DeviceHandle {
     }
 }
 
-/// The pending answer to a command that was sent to the device thread. Dropping it cancels a command that does not
-/// change the scene: a queued command leaves the queue at once, and a frame that is being drawn ends after its present
-/// pass.
+/// The pending answer to a command that was sent to the device thread. Dropping it cancels the command, unless the
+/// command changes the scene. A queued command then leaves the queue at once, and a frame that is being drawn ends
+/// after its present pass.
 #[derive(Debug)]
 pub(in crate::engine) struct PendingReply<T> {
     // Dropped before the guard, so that the device thread sees the cancellation if it has just taken the command.

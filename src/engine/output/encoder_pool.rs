@@ -2,7 +2,7 @@
 //!
 //! The threads serve jobs in the order of their start. A job queues one work item per thread that it can use, and a
 //! work item takes parts until none is left. So a single picture uses all idle threads, which shortens its latency.
-//! While several pictures wait, each thread first helps to finish the oldest one and then starts on the next one; no
+//! While several pictures wait, each thread first helps to finish the oldest one and then starts on the next one. No
 //! thread is idle while a part waits, so parallel parts do not reduce the throughput. The threads belong to no other
 //! pool, so encoding does not delay the copies and loops of the device thread, beyond sharing the cores with them.
 

@@ -1,5 +1,5 @@
-//! The result of a pick, with the data that a client needs to apply a force at a picked point: the 3 x r block of U at
-//! the point (r is the number of modes), and the linear part A of the transform.
+//! The result of a pick. It has the data that a client needs to apply a force at a picked point: the 3 x r block of U
+//! at the point, where r is the number of modes, and the linear part A of the transform.
 
 use std::sync::Arc;
 

@@ -285,8 +285,8 @@ mod tests {
         received: Vec<ReceivedFrame>,
     }
 
-    /// Delivers the second step to a slow subscriber (width 16), whose frame of the first step is in flight, and to a
-    /// fast subscriber (width 24), which has credits.
+    /// Delivers the second step to a slow subscriber (width 16) and to a fast one (width 24). The slow one waits for
+    /// its frame of the first step, and the fast one has credits.
     async fn serve_slow_and_fast(slow_delivery: Delivery) -> ServedFrames {
         let (slow_subscriber, mut slow_subscription) = subscribe(slow_delivery, 16);
         let (fast_subscriber, mut fast_subscription) = subscribe(Delivery::Lossless, 24);

@@ -1,6 +1,6 @@
-//! The bounded queue of steps from one writer to its scene, and the queue of reports back to the writer. The window
-//! bounds both: a lossless queue rejects a step beyond the window, or the writer waits for capacity before it reads the
-//! step; a `latest` queue merges a step into the one already queued.
+//! The bounded queue of steps from one writer to its scene, and the queue of reports back to the writer. The window, a
+//! number of steps, bounds both. A lossless queue rejects a step beyond the window, or the writer waits for capacity
+//! before it reads the step. A `latest` queue merges a step into the one already queued.
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, MutexGuard};

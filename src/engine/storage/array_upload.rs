@@ -167,9 +167,9 @@ impl ArrayUpload {
     /// Begins the next domain.
     ///
     /// # Errors
-    /// `Invalid` with a path below `domains[i]` for counts, names and numbers out of range, with `header.domains` or
-    /// `header.total_bytes` for more than the header declares, and when the arrays of the previous domain are
-    /// incomplete.
+    /// `Invalid` with a path below `domains[i]` for counts, names and numbers out of range; `Invalid` with
+    /// `header.domains` or `header.total_bytes` for more than the header declares; `Invalid` when the arrays of the
+    /// previous domain are incomplete.
     pub fn begin_domain(&mut self, domain: &UploadedDomain) -> Result<()> {
         self.check_arrays_complete()?;
         let index = self.shapes.len() as u32;

@@ -1,5 +1,5 @@
-//! Limits on the WebSocket frames of a connection, which the library does not have: incomplete messages count against
-//! the receive budgets from their first header on and have a deadline, and frames without payload are counted.
+//! Limits on the WebSocket frames of a connection that the library does not have. Incomplete messages have a deadline,
+//! and count against the receive budgets from their first header on. Frames without payload are counted.
 //!
 //! The library keeps the memory of its largest frame. Its reader is therefore replaced after a message with a large
 //! frame, and no byte after this message is read before ([`FrameMeter::take_boundary`]).

@@ -35,8 +35,9 @@ impl DeviceLoop {
         None
     }
 
-    /// Begins to prepare the textures and programs that a command needs: those of the OpenGL buffers that it creates,
-    /// or those of a frame that is drawn in another way than the earlier ones. `None` if nothing is to prepare.
+    /// Begins to prepare the textures and programs that a command needs. A command needs those of the OpenGL buffers
+    /// that it creates, and those of a frame that is drawn in another way than earlier frames. `None` if nothing is to
+    /// prepare.
     fn begin_preparation(&mut self, command: &Command) -> Option<ScenePreparation> {
         let Self { context, scenes, .. } = self;
         match command {
