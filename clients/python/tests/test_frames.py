@@ -116,7 +116,7 @@ def test_invalid_pictures_name_expected_and_given(beams: mc.Scene):
         beams.frame_batch([None] * 17)
     with pytest.raises(ValueError, match="each output once"):
         beams.frame(outputs=("color", "color"))
-    with pytest.raises(ValueError, match="expected names out of"):
+    with pytest.raises(ValueError, match="expected names from"):
         beams.frame(outputs=("colour",))  # pyright: ignore[reportArgumentType]
     with pytest.raises(TypeError, match="camera: expected a Camera or None, got str"):
         beams.frame("front")  # pyright: ignore[reportArgumentType]

@@ -41,7 +41,7 @@ def test_uploaded_arrays_are_described(beams: mc.Scene, tmp_path: Path):
     assert beams.modes("copy").shape == (3 * len(positions), RANK)
     assert beams.domains["copy"].placement[2, 3] == 1
     assert beams.domains["beam"].eigenvalues.tolist() == [30, 40, 900]
-    with pytest.raises(ValueError, match="arrays: expected names out of"):
+    with pytest.raises(ValueError, match="arrays: expected names from"):
         beams.describe(["normals"])  # pyright: ignore[reportArgumentType]
 
 

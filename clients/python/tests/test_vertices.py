@@ -57,7 +57,7 @@ def test_encodings_differ_by_their_error_bounds(tree: mc.Scene):
 
 
 def test_unknown_attributes_are_rejected(beams: mc.Scene):
-    with pytest.raises(ValueError, match="attributes: expected names out of"):
+    with pytest.raises(ValueError, match="attributes: expected names from"):
         beams.vertex_set(("position",))  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="encoding of positions: expected one of"):
         beams.vertex_set({"positions": "f64"})  # pyright: ignore[reportArgumentType]

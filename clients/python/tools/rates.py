@@ -36,7 +36,7 @@ def median_of(times: Iterator[float]) -> float:
 
 
 def frame_times(scene: mc.Scene, count: int) -> Iterator[float]:
-    """A step and a frame."""
+    """Times of a step, its acknowledgment and a frame, in seconds."""
     q = np.zeros(scene.domains[0].rank)
     with scene.drive(joints=False) as drive:
         for number in range(count):
@@ -49,7 +49,7 @@ def frame_times(scene: mc.Scene, count: int) -> Iterator[float]:
 
 
 def vertex_times(scene: mc.Scene, count: int) -> Iterator[float]:
-    """Positions on request."""
+    """Times of a call that returns all positions, in seconds."""
     for _ in range(count):
         start = time.perf_counter()
         assert len(scene.vertices()) == scene.vertex_count
@@ -57,7 +57,7 @@ def vertex_times(scene: mc.Scene, count: int) -> Iterator[float]:
 
 
 def stream_times(scene: mc.Scene, count: int) -> Iterator[float]:
-    """Positions in a stream."""
+    """The mean time per step of a stream of positions, in seconds."""
     with scene.vertex_sets(delivery="lossless") as vertex_sets:
         next(vertex_sets)
         start = time.perf_counter()
@@ -78,7 +78,7 @@ def send_steps(address: str, name: str) -> None:
 
 
 def chunk_times(count: int) -> dict[str, float]:
-    """Reading a frame of one chunk of 1 MiB, without a server."""
+    """Median times to read a frame of one chunk of 1 MiB, in milliseconds, without a server."""
     size = 1 << 20
     head = frames_pb2.FrameHead(width=512, height=512, format=frames_pb2.FORMAT_RGBA, total=size)
     chunk = frames_pb2.FrameChunk(head=head, data=bytes(size))

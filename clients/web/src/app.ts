@@ -40,7 +40,7 @@ const MESH_BUDGET = 512e6;
 /** The sliders may drive the scene when another program has sent no step for this many milliseconds. */
 const FOREIGN_STEP_MS = 1000;
 
-/** What the source of the scene can do. */
+/** Whether the source of the scene, a server or a recording, draws pictures, accepts forces, and accepts steps. */
 export interface SourceFeatures {
     pictures: boolean;
     forces: boolean;

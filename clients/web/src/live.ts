@@ -14,6 +14,7 @@ import { RpcError, StatusCode } from "./wire/rpc_error";
 /** Milliseconds until the next attempt to connect: doubled after each one, up to the limit. */
 const FIRST_RETRY_MS = 250;
 const LONGEST_RETRY_MS = 4000;
+/** Milliseconds between pings, which measure the round trip, and between lists of the scenes while none is shown. */
 const PING_MS = 2000;
 
 /** An error that would occur again at the next attempt to connect. */

@@ -153,7 +153,7 @@ class Assembler(Generic[HeadT]):
         self._assembly: Assembly | None = None
 
     def add(self, head: HeadT | None, offset: int, data: memoryview) -> tuple[HeadT, Bytes] | None:
-        """Adds a chunk. Returns the head and the bytes after those of the target, after the last chunk of a reply."""
+        """Adds a chunk. The last chunk of a reply returns the head and the bytes that `target` has not received."""
         if head is not None:
             if self._assembly is not None:
                 raise malformed(f"{self._name}.head", "the next chunk of the open reply", "a new head")

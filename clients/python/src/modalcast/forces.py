@@ -147,7 +147,7 @@ class Hit:
     modes: F32 = field(repr=False)
 
     def reduced_force(self, vector: Vector) -> F64:
-        """f_q = U^T A^T f of a force f at the point, in newtons and world axes: r numbers."""
+        """f_q = U^T A^T f, r numbers, of a force f in newtons and world axes at the point."""
         return self.modes.T.astype(np.float64) @ (self.linear.T @ np.array(vector3("vector", vector)))
 
     def force(self, vector: Vector) -> Force:

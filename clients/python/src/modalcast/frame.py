@@ -64,7 +64,7 @@ class Output:
             of one column of U as a color map).
         mode: Column of U for "mode_shape", from 0.
         largest: Value at the bright end of a color map, in meters or in meters per unit of q; 0 fits it to each frame.
-        edge_width: For "color": width in pixels of lines along the edges of the faces, at most 32; None: as the scene.
+        edge_width: For "color": width of lines along face edges in pixels, at most 32; None: as in the scene.
     """
 
     name: OutputName
@@ -129,7 +129,7 @@ class PictureOptions:
 
     def _picture(self, camera: Camera | None, output: Output, scene_up: str) -> frames_pb2.Picture:
         if output.name not in _OUTPUTS:
-            raise ValueError(f"outputs: expected names out of {list(_OUTPUTS)}, got '{output.name}'")
+            raise ValueError(f"outputs: expected names from {list(_OUTPUTS)}, got '{output.name}'")
         is_colored = output.name in _COLORED
         format_ = _COLOR_FORMATS[self.format] if is_colored else frames_pb2.FORMAT_UNSPECIFIED
         size = picture_size(camera, self.width, self.height)
@@ -265,7 +265,7 @@ class Frame:
 
     @property
     def camera_version(self) -> int:
-        """Number of updates of the stream's cameras that the frame shows."""
+        """Number of updates that the cameras of the stream had received when the frame was drawn."""
         return next(iter(self.images.values())).head.camera_version
 
     @property

@@ -1,4 +1,4 @@
-"""Transforms of attached domains that keep their joints closed.
+"""Transforms of attached domains that keep them on the surfaces of their parents.
 
 A domain that is attached to a parent moves with the parent's surface: its transform T is the parent's T, times the
 rigid transform that best fits the displacement U q of the parent's attachment vertices (Kabsch 1976), times
@@ -24,14 +24,14 @@ _COLLINEAR = 1e-9
 
 @dataclass(frozen=True)
 class AttachmentPoints:
-    """The attachment vertices of a joint on its parent: rest positions k x 3, and rows of U, 3k x r."""
+    """The k parent vertices to which a domain is attached: rest positions k x 3, and rows of U, 3k x r."""
 
     rest_positions: F32
     modes: F32
 
 
 def has_fit(domain: Domain, layout: StateLayout) -> bool:
-    """Whether the modes of the parent move the joint of the domain."""
+    """Whether the domain is attached to a parent whose modes move it."""
     if domain.parent is None or domain.follows is not None:
         return False
     return layout.domains[domain.parent].rank > 0 and len(domain.attachment_vertices) > 0
@@ -80,7 +80,7 @@ class Kinematics:
         return result
 
     def _fit(self, q: F64) -> F64:
-        """The rigid transforms of the joints, 4x4."""
+        """The fitted rigid transform of each joint (the attachment of a domain to its parent), 4x4."""
         values = np.append(q, 0.0)[self._coordinates]
         moments = self._rest_moments + (values[:, None] @ self._mode_moments)[:, 0]
         rotations = nearest_rotations(moments[:, 3:].reshape(-1, 3, 3))

@@ -113,7 +113,7 @@ class Domain:
         rest_q: q at rest, r numbers.
         parent: Index of the domain to which this one is attached; None if it is not attached.
         attachment_frame: parent_from_child at rest, 3x4; None without parent.
-        attachment_vertices: Vertices of the parent near the joint.
+        attachment_vertices: Vertices of the parent to which this domain is attached.
         follows: Index of the domain whose transform this domain follows; None if it has its own.
         follow_frame: followed_from_follower, 3x4; None if `follows` is None.
         shares_q_with: Index of the domain whose coordinates this domain has; None if it has its own.
@@ -221,7 +221,7 @@ def array_enum_values(names: Sequence[str]) -> list[scenes_pb2.Array]:
     """
     for name in names:
         if name not in _ARRAYS:
-            raise ValueError(f"arrays: expected names out of {list(_ARRAYS)}, got '{name}'")
+            raise ValueError(f"arrays: expected names from {list(_ARRAYS)}, got '{name}'")
     return [_ARRAYS[name][0] for name in names]
 
 

@@ -50,7 +50,7 @@ def vertex_selection(
         raise ValueError(f"attributes: expected at least one of {list(_ATTRIBUTES)}, got none")
     for attribute, encoding in encodings.items():
         if attribute not in _ATTRIBUTES:
-            raise ValueError(f"attributes: expected names out of {list(_ATTRIBUTES)}, got '{attribute}'")
+            raise ValueError(f"attributes: expected names from {list(_ATTRIBUTES)}, got '{attribute}'")
         if encoding not in _ENCODINGS:
             raise ValueError(f"encoding of {attribute}: expected one of {list(_ENCODINGS)}, got '{encoding}'")
     return vertices_pb2.VertexSelection(
@@ -82,9 +82,9 @@ class VertexSet:
     Attributes:
         step: The step.
         layout: The selected domains, and their numbers of vertices and corners, as a message.
-        positions: n x 3 in scene units: a vertex is at origin + unit * position in the world.
-        normals: One unit vector per corner, in world axes.
-        displacements: u = U q, n x 3 in scene units, in each domain's own frame.
+        positions: vertices x 3 in scene units: a vertex is at origin + unit * position in the world.
+        normals: corners x 3, unit vectors in world axes. A corner is a vertex with its normal and texture coordinates.
+        displacements: u = U q, vertices x 3 in scene units, in each domain's own frame.
         boxes: Minimum and maximum of the positions of each domain: domains x 2 x 3.
         origins: World position in meters of the origin of the positions: 1 x 3, or one row per selected domain.
         skipped: Number of steps skipped since the previous step of the stream.
@@ -117,7 +117,7 @@ class VertexSet:
         return tuple(self.layout.corners)
 
     def positions_of(self, domain: int | Domain) -> F32:
-        """The positions of one domain, a view.
+        """The positions of one domain, vertices x 3, as a view of `positions`.
 
         Raises:
             ValueError: The domain or the positions were not selected.
@@ -150,7 +150,7 @@ class VertexDecoder:
         }
 
     def decode(self, head: vertices_pb2.VertexHead, target: Bytes, data: Bytes) -> VertexSet:
-        """Decodes the bytes of a step: those of `target`, then those of `data`."""
+        """Decodes the sections of a step. Their offsets count the bytes of `target`, then those of `data`."""
         arrays: dict[int, F32] = {}
         for section in head.sections:
             start, end = section.offset, section.offset + section.bytes

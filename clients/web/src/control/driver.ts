@@ -22,6 +22,7 @@ export class Driver {
     private stream: DriveStream | null = null;
     private readonly kinematics: Kinematics | null;
     private q: Float32Array;
+    /** The domains whose coordinates have changed since the last sent step. */
     private readonly changed = new Set<number>();
     private animation: { domain: number; mode: number; amplitude: number; frequency: number } | null = null;
     private number = 0n;
@@ -56,7 +57,7 @@ export class Driver {
         for (let mode = 0; mode < at(this.model.layout.ranks, domain); mode++) this.set(domain, mode, 0);
     }
 
-    /** Moves one mode as a sine: q = amplitude sin(2 pi frequency t). */
+    /** Moves one mode as a sine of the time t in seconds: q = amplitude sin(2 pi frequency t). */
     animate(domain: number, mode: number, amplitude: number, frequency: number): void {
         this.stopAnimation();
         this.begin();
@@ -113,6 +114,7 @@ export class Driver {
         }
     }
 
+    /** Returns whether the stream continues. */
     private accept({ kind }: DriveSceneResponse): boolean {
         if (kind.case === "opened") {
             this.run = kind.value.run;

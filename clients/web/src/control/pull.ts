@@ -1,9 +1,10 @@
 /**
  * Pulls on a point of the surface with a force that is proportional to the distance between the place where the pull began
- * and the cursor. The stiffness is the inverse of the point's compliance, so that the point follows the cursor.
+ * and the cursor. The stiffness is the inverse of the point's compliance (displacement per newton), so that the point
+ * follows the cursor.
  *
- * The force does not depend on the moved point. Such a force would close a loop through the network, and its delay adds
- * energy to modes with little damping: the vibration of a tree grew until the physics process stopped.
+ * The force does not depend on where the point has moved. Otherwise it would close a loop through the network, whose
+ * delay adds energy to modes with little damping: the vibration of a tree grew until the physics process stopped.
  */
 
 import type { Hit } from "../proto/modalcast/v1/frames_pb";
@@ -21,8 +22,8 @@ const LIFETIME_MS = 500;
 /** Milliseconds between forces while the scene moves. */
 const UPDATE_MS = 30;
 /**
- * Distance of the cursor from the anchor at which the force stops growing: in diameters of the domain or, if the
- * viewer has no arrays, in diagonals of the scene.
+ * Distance of the cursor from the anchor, where the pull began, at which the force stops growing: in diameters of the
+ * domain or, if the viewer has no arrays, in diagonals of the scene.
  */
 const LONGEST_PULL = 0.6;
 const LONGEST_PULL_OF_SCENE = 0.1;

@@ -156,9 +156,9 @@ export class Deformer {
     }
 
     /**
-     * Four numbers for each domain: its first vertex minus the first vertex of its shape; the texel of U to which the
-     * shader adds 3 groups v for vertex v of the table of rest positions; the number of groups of four modes; the first
-     * texel of its coordinates.
+     * Four numbers for each domain: its first vertex minus the first vertex of its shape; a texel of U; the number of
+     * groups of four modes; the first texel of its coordinates. For vertex v of the table of rest positions, the shader
+     * adds 3 groups v to the texel of U.
      */
     private layOut(firstTexel: readonly number[]): Int32Array<ArrayBuffer> {
         const table = new Int32Array(4 * paddedEntries(this.scene.domains.length, TABLE_WIDTH));

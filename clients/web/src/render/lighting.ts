@@ -1,4 +1,4 @@
-/** Light, sky and ground of a scene. */
+/** Light, sky and ground of a scene. Colors are linear RGB, and vectors are in world axes. */
 
 import { ToneMapping } from "../proto/modalcast/v1/scenes_pb";
 import { cross, dot, norm, type Vec3 } from "../scene/affine";

@@ -310,6 +310,7 @@ export class Surfaces {
             const a = at(index, corner);
             const b = at(index, corner % 3 === 2 ? corner - 2 : corner + 1);
             const [u, v] = [at(vertices, 2 * a), at(vertices, 2 * b)];
+            // Numbers up to 2^53 are exact, so the key is unique below 2^26 vertices.
             const key = Math.min(u, v) * 2 ** 26 + Math.max(u, v);
             if (seen.has(key)) continue;
             seen.add(key);

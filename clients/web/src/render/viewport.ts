@@ -14,6 +14,7 @@ export class Viewport {
     readonly isSoftware: boolean;
     private sceneRenderer: SceneRenderer | null = null;
     private needsFrame = true;
+    /** When the frames of the last second were drawn, in milliseconds of `performance.now()`. */
     private frameTimes: number[] = [];
     private contextLost = false;
     /** Called before each frame that is drawn. */
@@ -36,7 +37,7 @@ export class Viewport {
         requestAnimationFrame(() => this.loop());
     }
 
-    /** Size of pictures in pixels. */
+    /** Width and height of pictures in pixels of the device. */
     get pixelSize(): [number, number] {
         const ratio = this.pixelRatio;
         return [

@@ -1,5 +1,5 @@
 /**
- * Transforms of attached domains that keep their joints closed, for the sliders of the viewer.
+ * Transforms of attached domains that keep them on the surfaces of their parents, for the sliders of the viewer.
  *
  * A domain that is attached to a parent moves with the parent's surface: its transform is the parent's, times the rigid
  * transform that best fits the displacement U q of the parent's attachment vertices, times parent_from_child at rest.
@@ -11,9 +11,11 @@ import { rankOf, type SceneDescription } from "./description";
 import { at, toF32 } from "./numbers";
 import type { SceneState, StateLayout } from "./state";
 
+/** The attachment of a domain to its parent. */
 interface Joint {
     domain: number;
     parent: number;
+    /** parent_from_child at rest: 12 numbers, row-major 3x4. */
     frame: ArrayLike<number>;
     /** Rest positions of the attachment vertices, and their rows of U: 3 x rank each. */
     rest: Vec3[];
@@ -44,12 +46,15 @@ export class Kinematics {
         }
     }
 
-    /** Domains whose transforms `transforms` returns. */
+    /** The attached domains, in the order in which `transforms` returns their transforms. */
     get domains(): number[] {
         return this.joints.map((joint) => joint.domain);
     }
 
-    /** Transforms of the attached domains at coordinates `q` of the whole scene, relative to the scene's origin. */
+    /**
+     * The transform of each attached domain relative to the scene's origin, a row-major 3x4 matrix. `q` are the
+     * coordinates of the whole scene.
+     */
     transforms(state: SceneState, q: Float32Array): Float64Array[] {
         const { layout } = state;
         const world = state.transforms.slice();
@@ -114,9 +119,8 @@ function fitRigid({ rest, modes }: Joint, q: Float32Array): number[] {
 }
 
 /**
- * The rotation nearest to a 3x3 matrix: the unit quaternion that is the eigenvector of the largest eigenvalue of Horn's
- * symmetric 4x4 matrix ("Closed-form solution of absolute orientation using unit quaternions", 1987), by Jacobi
- * rotations.
+ * The rotation nearest to a row-major 3x3 matrix. Its unit quaternion is the eigenvector of the largest eigenvalue of
+ * Horn's symmetric 4x4 matrix ("Closed-form solution of absolute orientation using unit quaternions", 1987).
  */
 export function nearestRotation(m: readonly number[]): number[] {
     const [xx, xy, xz, yx, yy, yz, zx, zy, zz] = m as [

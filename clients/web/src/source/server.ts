@@ -37,8 +37,9 @@ export interface PictureOptions {
     jpeg: boolean;
     camera: CameraMessage;
     output: Output;
+    /** Column of U for the output MODE_SHAPE, from 0. */
     mode: number;
-    /** Scale of a color map; 0 fits it to each frame. */
+    /** Value at the bright end of a color map, in meters or in meters per unit of q; 0 fits it to each frame. */
     largest: number;
     edges: boolean;
 }

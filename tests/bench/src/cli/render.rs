@@ -60,8 +60,8 @@ pub(super) struct Args {
     /// Draw the figures of the thesis's chapter 4.2 from our own scenes; nothing is measured.
     #[arg(long, conflicts_with_all = ["loads", "variants", "replays", "quick"])]
     figures: bool,
-    /// Measure only the CUDA rasterizer against OpenGL's minimal passes, on the loads, a room and two triangles that
-    /// fill the frame. Writes raster.json and raster.md. Needs an NVIDIA GPU.
+    /// Only compare the CUDA rasterizer with OpenGL, in passes that draw depth or ids, on the loads, a room and two
+    /// triangles that fill the frame. Writes raster.json and raster.md. Needs an NVIDIA GPU.
     #[arg(long, conflicts_with_all = ["variants", "figures", "scenes"])]
     raster: bool,
     /// A scene of your own, a path to a model or a scene folder; repeatable. With --figures, also draws a picture of
@@ -131,7 +131,7 @@ fn run_frame_times(args: &Args) -> Outcome {
     for scene in &frame_times.scenes {
         let frame_us = scene.passes.iter().find(|pass| pass.name == "frame").map_or(0.0, |pass| pass.timing.median_us);
         print_line(format!(
-            "{:<24}frame {frame_us:>12.1} us, with its pixels {:>12.1} us",
+            "{:<24}frame {frame_us:>12.1} us, with readback {:>12.1} us",
             scene.name, scene.wall_clock.median_us
         ));
     }

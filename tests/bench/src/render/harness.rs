@@ -51,7 +51,7 @@ pub(super) struct LoadedScene {
     deformer: CpuDeformer,
     /// Bounds of the last deformed vertices in world space.
     bounds: BoundingBox,
-    /// Bounds of the same vertices in light space.
+    /// Bounds of the same vertices in light space, whose z axis points to the sun.
     light_box: Option<OrientedBounds>,
 }
 
@@ -72,7 +72,7 @@ impl RenderHarness {
         Ok(LoadedScene { scene: Arc::clone(scene), buffers, deformer, bounds: BoundingBox::EMPTY, light_box: None })
     }
 
-    /// Lets the CUDA rasterizer draw the passes of a scene that it supports.
+    /// Lets the CUDA rasterizer draw those passes of a scene that it supports.
     ///
     /// # Errors
     /// Errors of the device.

@@ -196,7 +196,7 @@ async def read_modes(transport: Transport, scene: str, domain: int, vertices: Se
 async def read_attachments(
     transport: Transport, scene: str, layout: StateLayout, timeout: float
 ) -> dict[int, AttachmentPoints]:
-    """The attachment vertices of all joints that the modes of a parent move, by index of the attached domain."""
+    """The attachment vertices of all attached domains that the modes of their parents move, by index of the domain."""
     fitted = [domain for domain in layout.domains if has_fit(domain, layout)]
     parents = sorted({domain.parent for domain in fitted if domain.parent is not None})
     if not parents:

@@ -63,7 +63,7 @@ class Drive:
         self._values = StepValues(layout, kinematics, *rest_values(layout))
         self._opened_stream: StepStream | None = None
         self._is_closed = False
-        # Whether values of a step were not sent.
+        # Whether sending a step has failed, so that the server lacks its values.
         self._is_stale = False
         self._next_number = 0
         self._time = -options.dt
@@ -108,11 +108,11 @@ class Drive:
 
         Raises:
             KeyError: A domain name is unknown; the message lists near names.
-            ValueError: An array has another shape, with the expected and the given one; or the drive is closed.
+            ValueError: An array has another shape, or the drive is closed.
             InvalidRequest: The server rejected this step or, without `wait`, an earlier one. The drive remains open.
             LeaseLost: Another writer has taken over the scene.
             ConnectionLost: No server answers.
-            DeadlineExceeded: The time has passed; the step may complete later.
+            DeadlineExceeded: The timeout has passed; the step may complete later.
         """
         timeout = self._timeout if timeout is None else timeout
         self._check_open()

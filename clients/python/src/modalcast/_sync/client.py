@@ -149,7 +149,7 @@ class Client:
         """Opens a scene with one domain of the same name. `SceneBuilder.add` and `upload` document the arguments.
 
         Raises:
-            ValueError: An array has another shape, with the expected and the given one.
+            ValueError: An array has another shape; the message has the expected and the given one.
             AlreadyExists: A scene has the name, and `replace` is false.
             Error: The call failed.
         """
@@ -175,7 +175,7 @@ class Client:
 
         Raises:
             AlreadyExists: A scene has the name, and `replace` is false.
-            InvalidRequest: The server rejects an array, such as "domains[0].rank".
+            InvalidRequest: A field of the upload is invalid; `field` names it, such as "domains[0].rank".
             Error: The call failed.
         """
         if replace:

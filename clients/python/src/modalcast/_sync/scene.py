@@ -160,7 +160,7 @@ class Scene:
         return with_reconnect(self._transport, self._reconnect, read)
 
     def modes(self, domain: int | str | Domain, vertices: Sequence[int] = (), *, timeout: float | None = None) -> F32:
-        """U of a domain: 3k x r, three rows for each of the k vertices; empty: all n vertices.
+        """The rows of U of a domain for k vertices, 3k x r. Without `vertices`: for all n vertices.
 
         Raises:
             KeyError: No domain has the name.
@@ -245,8 +245,8 @@ class Scene:
 
         Args:
             camera: `look_at`, `at_pose` or `pinhole`; None shows the whole scene.
-            outputs: Names out of "color", "depth", "depth_with_ground", "domains", "normals", "displacement" and
-                "mode_shape", or `Output` for parameters: one or several, all of the same step, one array each.
+            outputs: One or several of "color", "depth", "depth_with_ground", "domains", "normals", "displacement" and
+                "mode_shape", or `Output` for parameters. All are of the same step, and each is one array.
             width: In pixels; None: that of the camera, or 1280.
             height: In pixels; None: that of the camera, or 720.
             format: Encoding of color: "raw" for arrays, "png", or "jpeg".
@@ -424,8 +424,9 @@ class Scene:
         """Reads attributes of the vertices of a step.
 
         Args:
-            attributes: Names out of "positions", "normals", "displacements" and "boxes", or encodings by name: "f32",
-                "f16", "u16_box" (positions, displacements) and "octahedral_i16" (normals). The arrays are f32.
+            attributes: One or several of "positions", "normals", "displacements" and "boxes", or a mapping from these
+                to encodings: "f32", "f16", "u16_box" (positions, displacements) or "octahedral_i16" (normals). The
+                returned arrays are f32.
             domains: The domains, in the order of the arrays; empty: all.
             step, exact, timeout: As for the class.
 

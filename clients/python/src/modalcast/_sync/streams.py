@@ -80,7 +80,7 @@ class Stream(Generic[T]):
             new_decoder: Creates the decoder of a call.
             transport: The connection.
             count: Number of replies after which the stream ends; 0 for no limit.
-            reconnect: Seconds for which a lost connection is opened again.
+            reconnect: Seconds for which the stream tries to connect again after a lost connection.
         """
         self._open_call = open_call
         self._transport = transport

@@ -151,7 +151,7 @@ class StepStream:
         """Waits until the progress satisfies a condition.
 
         Raises:
-            DeadlineExceeded: The time has passed; the stream remains open.
+            DeadlineExceeded: The timeout has passed; the stream remains open.
             Error: The stream has ended.
         """
         if self.progress.end is not None:
@@ -201,7 +201,7 @@ class StepStream:
 class Transport:
     """Connections to a server: one for calls and steps, and one for subscriptions, which opens with the first of them.
 
-    Subscriptions without a reader fill the flow-control window of their connection, and block no call.
+    Subscriptions that are not read fill the flow-control window of their connection, but not that of calls.
     """
 
     def __init__(self, address: str) -> None:
