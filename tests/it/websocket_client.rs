@@ -186,8 +186,8 @@ impl WebSocketClient {
         self.received.iter().any(|message| message.id == id && message.kind == STATUS)
     }
 
-    /// Waits for the end of any call, returns credit for every message until then, and returns the status. `None` at the
-    /// end of the connection.
+    /// Waits for the end of any call, returns credit for every message until then, and returns the status. `None` at
+    /// the end of the connection.
     pub(crate) async fn next_end(&mut self) -> Option<tonic_types::Status> {
         loop {
             let message = self.receive_any().await.ok()?;

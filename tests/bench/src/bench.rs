@@ -1,4 +1,5 @@
-//! The variants that this machine can run, and the memory bandwidths that they are compared with.
+//! The variants (ways to deform a scene) that this machine can run, and the memory bandwidths that they are compared
+//! with.
 
 use std::sync::Arc;
 

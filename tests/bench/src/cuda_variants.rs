@@ -198,8 +198,8 @@ fn batch_variants(
     deformer_variants.chain([StorageType::F16, StorageType::Bf16].map(tensor_core)).collect()
 }
 
-/// Two variants of each cuBLAS method that supports the scene: u = U q only, and u = U q followed by a separate kernel for
-/// x = T (x0 + u).
+/// Two variants of each cuBLAS method that supports the scene: u = U q only, and u = U q followed by a separate kernel
+/// for x = T (x0 + u).
 fn cublas_variants(device: &Arc<Device>, scene: &Arc<Scene>, is_selected: VariantFilter<'_>) -> Vec<VariantCandidate> {
     let is_instanced = scene.domains.len() > 1 && scene.shapes.len() == 1;
     let supports_scene = |method: &CublasMethod| match method {
@@ -262,14 +262,14 @@ fn refers_to_all_vertices(scene: &Scene) -> bool {
     })
 }
 
-/// Whether the scene has normals to compute. A mesh needs at least one triangle, so a workload that measures only positions
-/// has shapes with a placeholder triangle. A shape with more than its three corners has normals to compute.
+/// Whether the scene has normals to compute. A mesh needs at least one triangle, so a workload that measures only
+/// positions has shapes with a placeholder triangle. A shape with more than its three corners has normals to compute.
 pub(super) fn has_normals(scene: &Scene) -> bool {
     scene.shapes.iter().any(|shape| shape.mesh.corners().vertices.len() > 3)
 }
 
-/// Formula of the memory traffic of an array in bytes, for the report: n vertices and r modes of a domain, d domains. "As
-/// packed" means the bytes of the array on the device.
+/// Formula of the memory traffic of an array in bytes, for the report: n vertices and r modes of a domain, d domains.
+/// "As packed" means the bytes of the array on the device.
 fn traffic_formula(array: &str) -> &'static str {
     match array {
         "U" => "as packed: entries of all modes and vertices, filled up to tiles",

@@ -1,4 +1,5 @@
-//! Images of more sizes than there are texture arrays: images that share an array with larger ones look as they do alone.
+//! Images of more sizes than there are texture arrays: images that share an array with larger ones look as they do
+//! alone.
 
 use modalcast_model::domain::{Corners, Material, Mesh, Texture};
 use modalcast_render::Renderer;
@@ -22,8 +23,8 @@ fn texture(size: [u32; 2], texel: impl Fn(u32, u32) -> [u8; 4]) -> Texture {
     Texture::new("test", width, height, rgba).expect("expected a valid texture")
 }
 
-/// A square of 10 x 10 units in the plane z = 0, 100 x 100 pixels large, with `repeats` images along each side. Each image
-/// has its own triangles, with texture coordinates of 0 to `scale`.
+/// A square of 10 x 10 units in the plane z = 0, 100 x 100 pixels large, with `repeats` images along each side. Each
+/// image has its own triangles, with texture coordinates of 0 to `scale`.
 fn tiles(repeats: u32, scale: [f32; 2]) -> Mesh {
     let (mut positions, mut corners, mut triangles) = (Vec::new(), Corners::default(), Vec::new());
     let side = 10.0 / repeats as f32;
@@ -67,9 +68,9 @@ fn mean_difference(a: &[u8], b: &[u8]) -> f64 {
     differences.iter().sum::<f64>() / differences.len() as f64
 }
 
-/// The reference is the image alone, in its own array and with the filter of OpenGL. The thesis (B. Wang, "CUDA Deformers
-/// for Model Reduction", equation 3.13) repeats an image until it fills a layer of the largest size; its scale is
-/// corrected so that it covers the whole image. The control stretches the image to the layer of its array.
+/// The reference is the image alone, in its own array and with the filter of OpenGL. The thesis (B. Wang, "CUDA
+/// Deformers for Model Reduction", equation 3.13) repeats an image until it fills a layer of the largest size; its
+/// scale is corrected so that it covers the whole image. The control stretches the image to the layer of its array.
 #[test]
 fn images_in_a_mixed_array_look_as_they_do_alone() {
     let mut renderer = open_renderer();

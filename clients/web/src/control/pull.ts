@@ -1,7 +1,7 @@
 /**
- * Pulls on a point of the surface with a force that is proportional to the distance between the place where the pull began
- * and the cursor. The stiffness is the inverse of the point's compliance (displacement per newton), so that the point
- * follows the cursor.
+ * Pulls on a point of the surface with a force that is proportional to the distance of the cursor from where the pull
+ * began. The stiffness is the inverse of the point's compliance (displacement per newton), so that the point follows the
+ * cursor.
  *
  * The force does not depend on where the point has moved. Otherwise it would close a loop through the network, whose
  * delay adds energy to modes with little damping: the vibration of a tree grew until the physics process stopped.

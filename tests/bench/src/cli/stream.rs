@@ -15,12 +15,12 @@ const EXAMPLES: &str = "Examples:
   modalcast report stream --out report --scenes ../data
   modalcast report stream --out report --case tree-png-1080p --case 'tree-delay*' --repeat 5";
 
-/// Rates and latencies at the client: rates beside the rate of the slowest stage, latency, a comparison with a plain socket, rates
-/// over a long round trip, and encodings.
+/// Rates and latencies at the client: rates beside the rate of the slowest stage, latency, a comparison with a plain
+/// socket, rates over a long round trip, and encodings.
 ///
 /// Starts the server, the physics process and each viewer as processes of this machine. Writes report.json, report.csv,
-/// report.md, report.svg and report.png again after each case: an interrupted run keeps the finished cases and names the
-/// missing ones. Exit code 1 when a case fails or an encoding exceeds its error bound.
+/// report.md, report.svg and report.png again after each case: an interrupted run keeps the finished cases and names
+/// the missing ones. Exit code 1 when a case fails or an encoding exceeds its error bound.
 #[derive(Debug, clap::Args)]
 #[command(after_help = format!("{CASE_HELP}\n\n{EXAMPLES}"))]
 pub(super) struct Args {

@@ -94,8 +94,8 @@ impl RasterBenchmark {
     }
 
     /// The keys of the last launch, row by row from the top; empty for depth-only targets. The upper 32 bits of a key
-    /// are the inverted bits of the depth, the lower 32 bits are the id of the triangle. A key is all ones where nothing
-    /// was drawn.
+    /// are the inverted bits of the depth, the lower 32 bits are the id of the triangle. A key is all ones where
+    /// nothing was drawn.
     ///
     /// # Errors
     /// `Fault` when the device fails.

@@ -9,7 +9,7 @@ use modalcast_model::domain::{Material, Texture};
 use modalcast_model::error::Result;
 use modalcast_model::scene::{Ground, RenderSettings, Scene, SceneParts};
 
-/// The scene with other render settings, of which none is left to a preset.
+/// The scene with these render settings. No quality preset replaces any of them.
 ///
 /// # Errors
 /// `Invalid` when the settings contradict each other.

@@ -6,11 +6,11 @@
 //!
 //! w x h is the size of an image, w_t x h_t the size of the array.
 //!
-//! The renderer uses an array per size. If there are more sizes than arrays, images of several sizes share an array, and
-//! the shader wraps and filters within each image, so that no image is scaled. For the comparison, a scene is rebuilt so
-//! that the renderer reproduces the thesis's method: images are repeated to the size of the array, and the corners of
-//! every triangle have the coordinates of the equation. The equation wraps the coordinates of each fragment. Wrapping the
-//! coordinates of each triangle is equivalent if no triangle crosses the edge of its image.
+//! The renderer uses an array per size. If there are more sizes than arrays, images of several sizes share an array,
+//! and the shader wraps and filters within each image, so that no image is scaled. For the comparison, a scene is
+//! rebuilt so that the renderer reproduces the thesis's method: images are repeated to the size of the array, and the
+//! corners of every triangle have the coordinates of the equation. The equation wraps the coordinates of each fragment.
+//! Wrapping the coordinates of each triangle is equivalent if no triangle crosses the edge of its image.
 //!
 //! The scale of the equation does not reach the last column and row of an image. [`Packing::CorrectedRepetition`] uses
 //! s = (w / w_t, h / h_t) instead. The `images` workload has seven image sizes and the renderer has six arrays, so two

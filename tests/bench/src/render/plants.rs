@@ -4,10 +4,10 @@
 //! Definitions of the thesis: `t_vbr` is the time to update the vertices and render them. `O_vbr` is the fraction of
 //! the whole frame that is `t_vbr`. FPS are whole frames per second. s is device memory.
 //!
-//! Our `t_vbr` is the sum of three times: a step of the deformer (upload of the modal coordinates q and of the transforms
-//! T, and the product U q with the modes U), the upload of vertices if the deformer does not write the renderer's
-//! buffers, and all passes except the readback. Our frame also contains the readback of the pixels and the waits between
-//! all of these. The thesis's frame includes the simulation, ours does not.
+//! Our `t_vbr` is the sum of three times: a step of the deformer (upload of the modal coordinates q and of the
+//! transforms T, and the product U q with the modes U), the upload of vertices if the deformer does not write the
+//! renderer's buffers, and all passes except the readback. Our frame also contains the readback of the pixels and the
+//! waits between all of these. The thesis's frame includes the simulation, ours does not.
 
 use std::sync::Arc;
 use std::time::Instant;

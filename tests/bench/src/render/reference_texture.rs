@@ -58,8 +58,8 @@ impl ReferenceTexture {
         self.bilinear_footprint(uv).iter().map(|(texel, weight)| f64::from(texel[3]) * weight).sum()
     }
 
-    /// Samples all four channels. Fully transparent texels have no color, so the weights of the other texels' colors are
-    /// normalized to the sum 1.
+    /// Samples all four channels. Fully transparent texels have no color, so the weights of the other texels' colors
+    /// are normalized to the sum 1.
     pub(super) fn sample(&self, uv: [f64; 2]) -> [f64; 4] {
         let footprint = self.bilinear_footprint(uv);
         let has_color = |texel: &[f32; 4]| self.role == TextureRole::Normal || texel[3] > 0.0;

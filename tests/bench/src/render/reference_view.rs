@@ -6,8 +6,8 @@ use super::ray_scene::Ray;
 use modalcast_model::scene::{Camera, Lens, Scene};
 use modalcast_render::FrameParams;
 
-/// Camera, ground, sky and light of a reference image, derived from the scene and its [`FrameParams`]. Colors are linear,
-/// lengths are scene units.
+/// Camera, ground, sky and light of a reference image, derived from the scene and its [`FrameParams`]. Colors are
+/// linear, lengths are scene units.
 #[derive(Debug, Clone)]
 pub(super) struct ReferenceView {
     pub(super) width: u32,

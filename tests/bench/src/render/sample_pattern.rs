@@ -2,8 +2,8 @@
 
 use std::f64::consts::TAU;
 
-/// Samples of one pixel, one in each of `side` x `side` cells. The sample of cell (i, j) has x = (i + (j + 1/2) / side) /
-/// side, and y with i and j exchanged. All x are different, and so are all y.
+/// Samples of one pixel, one in each of `side` x `side` cells. The sample of cell (i, j) has
+/// x = (i + (j + 1/2) / side) / side, and y with i and j exchanged. All x are different, and so are all y.
 pub(super) fn pixel_samples(side: usize) -> Vec<[f64; 2]> {
     let count = side as f64;
     let coordinate = |cell: usize, other_cell: usize| (cell as f64 + (other_cell as f64 + 0.5) / count) / count;

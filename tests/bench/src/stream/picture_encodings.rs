@@ -105,7 +105,8 @@ async fn draw(session: &Session, content: Content) -> Result<Pixels> {
     Ok(Pixels { width: frame.width, height: frame.height, rgba: frame.bytes.to_vec(), rgb })
 }
 
-/// The server's encoders; then the crate `png` with all filters at one compression level, and all levels with one filter.
+/// The server's encoders; then the crate `png` with all filters at one compression level, and all levels with one
+/// filter.
 fn encoders() -> Vec<Encoder> {
     use png::{Compression, Filter};
     let filters = [Filter::NoFilter, Filter::Sub, Filter::Up, Filter::Avg, Filter::Paeth, Filter::Adaptive];
@@ -159,8 +160,8 @@ fn measure_encoder(encoder: Encoder, pixels: &Pixels, repetitions: usize) -> Res
     })
 }
 
-/// Measures the PNG encoder in CUDA, from pixels in device memory to a file in host memory. `None` on a machine without a
-/// CUDA device.
+/// Measures the PNG encoder in CUDA, from pixels in device memory to a file in host memory. `None` on a machine without
+/// a CUDA device.
 fn measure_cuda(pixels: &Pixels, repetitions: usize) -> Result<Option<PictureEncodingRow>> {
     let Ok(device) = Device::open(0) else { return Ok(None) };
     let Pixels { width, height, .. } = *pixels;

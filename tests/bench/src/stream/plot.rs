@@ -1,4 +1,5 @@
-//! Plots the rates of all cases beside the rates of their slowest stages, and the vertex encodings as error against time.
+//! Plots the rates of all cases beside the rates of their slowest stages, and the vertex encodings as error against
+//! time.
 
 use std::fmt::Write as _;
 

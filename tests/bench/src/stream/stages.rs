@@ -1,9 +1,9 @@
 //! The rate of each stage between the physics process and the viewers, and the slowest stage.
 //!
-//! The rate of a stage is the number of steps per second that it could process if no other stage limited it. For a stage
-//! of the server, it is the number of threads that run the stage in parallel, divided by its median time per step. The
-//! drawing time of a step includes all its views: it is the sum over the distinct views. The time that a step waits in
-//! the step queue is not a stage.
+//! The rate of a stage is the number of steps per second that it could process if no other stage limited it. For a
+//! stage of the server, it is the number of threads that run the stage in parallel, divided by its median time per
+//! step. The drawing time of a step includes all its views: it is the sum over the distinct views. The time that a step
+//! waits in the step queue is not a stage.
 
 use std::collections::BTreeMap;
 
@@ -102,8 +102,8 @@ impl StageInputs<'_> {
         (total_ms > 0.0).then(|| StageRate::new(join_words(&names), total_ms, resource, 1))
     }
 
-    /// Each distinct frame is encoded once, on as many of the server's encoder threads as a picture has strips. There is
-    /// one such thread per thread of the machine. Vertices are packed for each viewer, one step at a time.
+    /// Each distinct frame is encoded once, on as many of the server's encoder threads as a picture has strips. There
+    /// is one such thread per thread of the machine. Vertices are packed for each viewer, one step at a time.
     fn encode_rate(&self, content: Content, viewers: usize) -> Option<StageRate> {
         let threads = self.threads;
         let is_png = matches!(content, Content::Png { .. });
