@@ -1,4 +1,5 @@
-//! Vertices, frames and steps in shared memory: the same data as on the socket, and the rules of the protocol.
+//! Vertices, frames and steps in shared memory: the same data as on the socket, and the rules of the protocol. The
+//! memory is divided into slots, each for one chunk, which the receiver returns after reading.
 
 use std::io::IoSliceMut;
 use std::mem::MaybeUninit;
