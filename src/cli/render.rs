@@ -52,15 +52,16 @@ pub(super) struct Args {
     /// Index of the column of U for `--output mode-shape`, from 0.
     #[arg(long, requires = "output", default_value_t = 0)]
     mode: u32,
-    /// Value at the bright end of the color map; 0 fits the color map to the frame.
+    /// Value at the bright end of the color map, in meters (`displacement`) or meters per unit of q (`mode-shape`); 0
+    /// fits the color map to the frame.
     #[arg(long, requires = "output", default_value_t = 0.0)]
     largest: f64,
     /// Draws lines along the edges of the faces, of this width. Default: as `look.edges` of the scene. 0: no lines.
     #[arg(long, value_name = "PIXELS", num_args = 0..=1, default_missing_value = "1.25", conflicts_with = "output")]
     edges: Option<f32>,
     /// Preset of the antialiasing and the shadow map: preview, standard or best. Replaces the preset of the scene, but
-    /// no other keys of the table `look` in scene.toml. Default: the preset of the scene; without one, the settings of
-    /// a GPU on every machine (four samples per pixel, and the shadow map of a GPU).
+    /// no other keys of the table `look` in scene.toml. Default: the preset of the scene; without one, the settings for
+    /// a GPU (four samples per pixel and a large shadow map), also on a machine without a GPU.
     #[arg(long, value_name = "PRESET")]
     look: Option<LookPreset>,
     /// Deformation backend.
@@ -181,9 +182,9 @@ fn render_color_map(
     frame_output: FrameOutput,
 ) -> Result<Vec<u8>> {
     let scene = Arc::clone(loaded_scene.scene());
-    let (aov, legend) = device.render_aov(loaded_scene, &camera(args, &scene), args.size, frame_output)?;
+    let (values, legend) = device.render_aov(loaded_scene, &camera(args, &scene), args.size, frame_output)?;
     let legend = legend.ok_or_else(|| fault("encode", "expected a legend of the color map"))?;
-    frame::draw_color_map(&aov.bytes, aov.samples, args.size.to_array(), &legend)
+    frame::draw_color_map(&values.bytes, values.samples, args.size.to_array(), &legend)
 }
 
 /// The camera of the options. Its near and far planes are 0, so that nothing in front of it is clipped.

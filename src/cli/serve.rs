@@ -81,8 +81,8 @@ pub(super) struct Args {
     /// Largest side of a frame, in pixels.
     #[arg(long, default_value_t = Config::default().frame_side)]
     frame_side: u32,
-    /// Limit on the pixels of one connection in single frames that are drawn or sent, and in its frame streams.
-    /// Default: 8192 x 8192, and at least the largest frame.
+    /// Limit on the pixels that one connection requests at a time: in single frames until they are sent, and in its
+    /// open frame streams. Default: 8192 x 8192, and at least the largest frame.
     #[arg(long)]
     connection_pixels: Option<u32>,
     /// Limit on open connections. Above it, a connection without calls is closed for each new one.

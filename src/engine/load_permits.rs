@@ -10,7 +10,8 @@ const MAX_CONCURRENT_LOADS: usize = 2;
 /// Maximum number of built-in scenes that are created concurrently.
 const MAX_CONCURRENT_BUILT_IN: usize = 1;
 
-/// Permits to read or create a scene. Built-in scenes have their own, so that they do not wait for slow files.
+/// Permits to read or create a scene. Built-in scenes have permits of their own, so that they do not wait for slow
+/// files.
 #[derive(Debug)]
 pub(super) struct LoadPermits {
     files: Semaphore,

@@ -82,7 +82,9 @@ impl Meter for ControlFrameLimit {
 mod tests {
     use super::*;
 
+    const PRIORITY: u8 = 2;
     const WINDOW_UPDATE: u8 = 8;
+    const UNKNOWN: u8 = 99;
 
     fn frame(kind: u8, payload: usize) -> Vec<u8> {
         let [_, a, b, c] = (payload as u32).to_be_bytes();
@@ -94,6 +96,7 @@ mod tests {
         ControlFrameLimit { allowance: FrameAllowance::burst(), ..ControlFrameLimit::new() }
     }
 
+    /// Number of equal frames that are accepted, if the server sends `answer` bytes after each. `None`: all of 100,000.
     fn accepted_frames(kind: u8, payload: usize, answer: usize) -> Option<usize> {
         let mut limit = limit();
         (0..100_000).find(|_| {
@@ -105,7 +108,9 @@ mod tests {
 
     #[test]
     fn floods_of_all_kinds_end() {
-        for (kind, payload, answer) in [(PING, 8, 17), (SETTINGS, 0, 9), (2, 5, 0), (WINDOW_UPDATE, 4, 0), (99, 3, 0)] {
+        for (kind, payload, answer) in
+            [(PING, 8, 17), (SETTINGS, 0, 9), (PRIORITY, 5, 0), (WINDOW_UPDATE, 4, 0), (UNKNOWN, 3, 0)]
+        {
             let accepted = accepted_frames(kind, payload, answer).expect("expected an end");
             assert!((5000..=10_000).contains(&accepted), "{kind}: {accepted}");
         }

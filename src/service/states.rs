@@ -1,5 +1,5 @@
-//! `StateService`: q and transforms of one step with a deadline, or of the steps of a stream. A state has a head with
-//! its sections, and is sent in chunks.
+//! `StateService`: q and transforms of one step with a deadline, or of the steps of a stream. A state is sent in
+//! chunks, the first of which has a head that lists the sections of the state.
 
 use std::sync::Arc;
 

@@ -53,7 +53,8 @@ impl StepAssembler {
     pub(super) fn push(&mut self, mut part: v1::Step) -> Result<Option<v1::Step>> {
         // The values in shared memory count like those of several messages.
         let is_one_message = !part.has_more && part.shared_q.is_none() && part.shared_transforms.is_none();
-        // Called also for a part that is ignored below, because the client waits for its slots.
+        // Called also for a part that is ignored below, because the client waits until the server returns its slots of
+        // shared memory.
         let received = self.shared_memory.receive(&mut part);
         if let State::Discarding { number } = self.state {
             if number == part.number {

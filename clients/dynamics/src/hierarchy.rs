@@ -1,6 +1,6 @@
-//! Transforms of a hierarchy of domains that keep every joint closed. The transform T of a child is the product of
-//! three transforms: its parent's T, the rigid transform that best fits the displacement U q of the parent's attachment
-//! vertices, and `parent_from_child` at rest.
+//! Transforms of a hierarchy of domains. They keep every joint closed: a child stays attached to certain vertices of
+//! its parent, the attachment vertices. The transform T of a child is the product of three transforms: its parent's T,
+//! the rigid transform that best fits the displacement U q of the attachment vertices, and `parent_from_child` at rest.
 
 use nalgebra::Vector3;
 use rayon::prelude::*;

@@ -15,7 +15,7 @@ pub struct StepValues {
 }
 
 impl StepValues {
-    /// The values at the given coordinates of the whole scene. The transforms keep all joints closed.
+    /// The values at the given coordinates of the whole scene. The transforms keep every domain attached to its parent.
     pub fn new(model: &Model, q: &[f64]) -> Self {
         let transforms = compute_transforms(model, q, &[]);
         Self {

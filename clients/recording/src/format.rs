@@ -28,7 +28,7 @@ pub(crate) const MAX_SCENE_BYTES: u64 = 512 << 20;
 /// Size limit of all contents of a scene in bytes. Larger scenes are recorded by hash.
 pub(crate) const MAX_CONTENT_BYTES: u64 = 8 << 30;
 
-/// Longest time between two complete states in nanoseconds.
+/// Longest time in nanoseconds between two complete states, which have all values and not only changes.
 pub(crate) const COMPLETE_INTERVAL: u64 = 2_000_000_000;
 
 /// Largest number of states from one complete state to the next.

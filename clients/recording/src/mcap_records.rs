@@ -264,7 +264,7 @@ mod tests {
 
     #[test]
     fn lengths_beyond_the_record_are_errors() {
-        let body = |hex: &[u8]| Bytes::copy_from_slice(hex);
+        let body = |bytes: &[u8]| Bytes::copy_from_slice(bytes);
         // A channel whose topic claims 4 GiB, a chunk whose records claim 2^64 - 1 bytes, and empty records.
         let channel = [&[1, 0, 1, 0][..], &[0xff; 4]].concat();
         let chunk = [&[0; 16][..], &[1, 0, 0, 0, 0, 0, 0, 0], &[0; 4], &[0; 4], &[0xff; 8]].concat();

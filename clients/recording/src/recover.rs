@@ -21,10 +21,11 @@ pub struct Recovered {
     pub messages: u64,
     /// Number of messages of the topic `states`.
     pub state_messages: u64,
-    /// Size of the part of the file that was copied, and of the rest, in bytes.
+    /// Size of the part of the file that was copied, in bytes.
     pub copied_bytes: u64,
+    /// Size of the rest of the file, in bytes.
     pub lost_bytes: u64,
-    /// Why the rest was not copied; `None` if the file has its end.
+    /// Why the rest was not copied; `None` if the file is complete.
     pub reason: Option<String>,
 }
 
@@ -54,7 +55,7 @@ pub fn recover(path: &Path, out: &Path) -> Result<Recovered> {
     }
 }
 
-/// A recording that is read from its beginning.
+/// Copies the chunks of a recording that is read from its beginning.
 struct ChunkCopier {
     source: RecordFile,
     channels: ChannelTable,

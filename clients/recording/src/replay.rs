@@ -31,14 +31,14 @@ pub struct ReplayRequest {
     pub speed: Option<f64>,
     /// Whether the replay begins again at its end.
     pub repeats: bool,
-    /// Pictures of each step that are passed to the caller; at most 16.
+    /// Pictures of each step that are passed to the caller; at most 16, the server's limit.
     pub pictures: Vec<Picture>,
     /// Plays only the states that are current at the times of this number of frames per second; `None`: every state.
     pub frame_rate: Option<f64>,
 }
 
 impl Default for ReplayRequest {
-    /// The whole recording at its own speed, without pictures.
+    /// The whole recording at the recorded speed, without pictures.
     fn default() -> Self {
         Self { range: TimeRange::ALL, speed: Some(1.0), repeats: false, pictures: Vec::new(), frame_rate: None }
     }
@@ -272,7 +272,7 @@ async fn drive_steps(
     }
 }
 
-/// Receives the frames of all sent steps. Every item of `sent` is a step, and says how often its frames are shown.
+/// Receives the frames of all sent steps. `sent` has one number per step: how often its frames are shown.
 async fn receive_frames(
     frames: Option<FrameStream>,
     picture_count: usize,

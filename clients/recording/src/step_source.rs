@@ -7,7 +7,8 @@ use crate::reader::Recording;
 use crate::states::{RecordedState, RecordedStates};
 use crate::steps::{StepConverter, StepTarget};
 
-/// The part of a recording to play, in nanoseconds since the first state.
+/// The part of a recording to play, in nanoseconds since the first state. Begins with the state that is current at
+/// `from`, and ends with the last state at or before `to`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct TimeRange {
     pub from: u64,
@@ -108,7 +109,7 @@ struct SampledState {
 struct Sampler {
     /// Frames per second.
     rate: f64,
-    /// The state before the next one.
+    /// The last state that was read. Its frames are counted when the next one is read.
     current: Option<RecordedState>,
     /// Time of the first frame in nanoseconds.
     start: Option<u64>,

@@ -11,8 +11,8 @@ pub(crate) struct Timeline {
     last_step: Option<StepId>,
     /// Simulation time in seconds of the step at `base`.
     base_time: f64,
-    /// Time of this step in the recording, in nanoseconds. Later times are relative to it until a run begins or its
-    /// time decreases.
+    /// Time of this step in the recording, in nanoseconds. Later times are relative to it until a new run begins or the
+    /// simulation time decreases.
     base: u64,
     /// Nanoseconds of the last step.
     last: u64,

@@ -7,7 +7,11 @@ use std::path::Path;
 use modalcast_recording::{Error, Recording, Result, Topic, recover};
 use synthetic::{RATE, begin, q_at, recording, state, write};
 
+/// One second in nanoseconds.
 const SECOND: u64 = 1_000_000_000;
+
+/// Opcode of chunk records.
+const CHUNK: u8 = 6;
 
 /// The numbers of all states from `from` on.
 fn step_numbers(recording: &Recording, from: u64) -> Result<Vec<u64>> {
@@ -146,7 +150,7 @@ fn every_prefix_is_recovered_up_to_its_last_whole_chunk() {
     let folder = tempfile::tempdir().expect("a folder");
     let (steps, per_chunk) = (60, 20);
     let file = recording(steps, per_chunk);
-    let chunk_ends = record_ends(&file, 6);
+    let chunk_ends = record_ends(&file, CHUNK);
     // One chunk of the scene and the first states, and two of states.
     assert_eq!(chunk_ends.len(), 3);
     let all_ends: Vec<usize> = (0..=u8::MAX).flat_map(|opcode| record_ends(&file, opcode)).collect();
@@ -168,7 +172,8 @@ fn every_prefix_is_recovered_up_to_its_last_whole_chunk() {
     }
 }
 
-/// The ends of all records with this opcode outside of chunks.
+/// The ends of all records with this opcode outside of chunks. A file begins and ends with 8 magic bytes, and a record
+/// begins with its opcode and its length as u64.
 fn record_ends(file: &[u8], opcode: u8) -> Vec<usize> {
     let (mut ends, mut start) = (Vec::new(), 8);
     while start + 9 <= file.len() - 8 {

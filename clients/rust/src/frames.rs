@@ -69,8 +69,8 @@ pub enum Output {
     Domains,
     /// Unit normals; zeros in the background.
     Normals,
-    /// |u| as a color map with a legend. `scale_max` is the value at the bright end in meters; 0 fits the color map to
-    /// each frame.
+    /// The length of the displacement u = U q as a color map with a legend. `scale_max` is the value at the bright end
+    /// in meters; 0 fits the color map to each frame.
     Displacement { scale_max: f64 },
     /// The norm of each vertex's three entries in column `mode` of U, as a color map with a legend. `scale_max` is as
     /// for `Displacement`, but in meters per unit of q.

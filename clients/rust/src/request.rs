@@ -117,7 +117,7 @@ pub enum Delivery {
     /// Every step, in order. A slow reader slows the writer down.
     #[default]
     Lossless,
-    /// The newest step. A reader skips steps, and the steps of a writer are merged; both are counted.
+    /// The newest step. A slow reader skips steps, and queued steps of a writer are merged. Both are counted.
     Latest,
 }
 

@@ -29,7 +29,7 @@ pub(crate) use self::steps::StepMemory;
 /// Version of the handshake.
 const HANDSHAKE_VERSION: u32 = 1;
 
-/// Size of the first message of the server: four u32 and the token.
+/// Size of the first message of the server: version, size of a slot, number of slots and 0 as u32, and the token.
 const HANDSHAKE_BYTES: usize = 32;
 
 /// Metadata key of a call that uses shared memory. The value is the token of a connection.
@@ -127,7 +127,7 @@ impl CallMemory {
 
     /// The memory for the values of steps, if the client uses shared memory.
     pub(crate) fn into_step_memory(self) -> Option<StepMemory> {
-        self.0.map(|lease| StepMemory::new(lease.connection))
+        self.0.map(|pooled| StepMemory::new(pooled.connection))
     }
 
     /// The data of a chunk, which are in `data` or in a slot. A slot returns to the server when the last reference to
@@ -138,11 +138,11 @@ impl CallMemory {
     pub(crate) fn data(&self, data: Bytes, shared: Option<v1::SharedRange>) -> Result<Bytes> {
         let Some(v1::SharedRange { slot, bytes }) = shared else { return Ok(data) };
         let (slot_count, slot_bytes) =
-            self.0.as_ref().map_or((0, 0), |lease| (lease.connection.slot_count, lease.connection.slot_bytes));
+            self.0.as_ref().map_or((0, 0), |pooled| (pooled.connection.slot_count, pooled.connection.slot_bytes));
         match &self.0 {
-            Some(lease) if (slot as usize) < slot_count && bytes as usize <= slot_bytes => {
-                lease.connection.used_slots.fetch_add(1, Ordering::Relaxed);
-                let connection = Arc::clone(&lease.connection);
+            Some(pooled) if (slot as usize) < slot_count && bytes as usize <= slot_bytes => {
+                pooled.connection.used_slots.fetch_add(1, Ordering::Relaxed);
+                let connection = Arc::clone(&pooled.connection);
                 Ok(Bytes::from_owner(SharedData { connection, slot, bytes: bytes as usize }))
             }
             _ => {

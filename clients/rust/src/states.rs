@@ -55,7 +55,7 @@ impl StateLayout {
         if description.domains.len() != domain_count {
             return Err(malformed_reply("describe.domains", domain_count, description.domains.len()));
         }
-        // Unrounded frames, for followers of followers.
+        // In f64, so that a chain of followers is rounded only once.
         let mut unrounded_frames: Vec<[f64; 12]> = Vec::new();
         for (index, domain) in description.domains.iter().enumerate() {
             let earlier_domain = |other: usize| {
@@ -117,7 +117,7 @@ pub struct SceneState {
     pub step: v1::StepId,
     /// Number of steps skipped since the previous state of the stream.
     pub skipped: u64,
-    /// Size of the sent part of the state on the wire in bytes, without messages and heads.
+    /// Size of the sent values in bytes, without the heads and the encoding of messages.
     pub encoded_bytes: u64,
     pub stages: StageTimes,
     pub(crate) layout: Arc<StateLayout>,
@@ -382,7 +382,7 @@ impl StateChanges {
         Ok(())
     }
 
-    /// The state that these changes complete. Its values are those of [`Self::apply`].
+    /// A new state for a complete set of values. Its values are zeros until [`Self::apply`] sets them.
     fn complete_state(&self, layout: &Arc<StateLayout>) -> Result<SceneState> {
         let is_complete = self.q.len() == layout.coordinate_count
             && self.transforms.len() == layout.roots.len()

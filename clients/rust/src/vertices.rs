@@ -85,7 +85,7 @@ pub struct VertexSet {
     pub boxes: Vec<[[f32; 3]; 2]>,
     /// Number of steps skipped since the previous set of the stream.
     pub skipped: u64,
-    /// Size of the set on the wire in bytes, without messages and heads.
+    /// Size of the sent values in bytes, without the heads and the encoding of messages.
     pub encoded_bytes: u64,
     pub stages: StageTimes,
 }

@@ -23,11 +23,13 @@ pub(super) struct Evaluation {
     steps_per_second: f64,
     /// Names and median milliseconds of the stages.
     stages: Vec<(String, f64)>,
-    /// Largest distance of a received vertex from the reference, in scene units and as a fraction of the diagonal.
+    /// Largest distance of a received vertex from the reference, in scene units.
     error: f64,
+    /// `error` as a fraction of the scene's diagonal.
     relative_error: f64,
-    /// Largest distance of a received vertex from its rest position, in scene units and as a fraction of the diagonal.
+    /// Largest distance of a received vertex from its rest position, in scene units.
     displacement: f64,
+    /// `displacement` as a fraction of the scene's diagonal.
     relative_displacement: f64,
     /// The displacement of the top tenth of the scene alone, as a fraction of the scene's height.
     sway: f64,

@@ -1,4 +1,5 @@
-//! Input of the demo: the scene, the repository from which the server opens it, and the physics files next to it.
+//! Input of the demo: the scene, the repository from which the server opens it, and the files of the FEM library Vega
+//! next to it.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -53,8 +54,8 @@ impl DemoScene {
     }
 }
 
-/// The file of cubic polynomials that belongs to the model by its name, which the loader stores as a note. `None` if no
-/// domain or several domains have such a file, or it is not in the folder.
+/// The file of cubic polynomials that belongs to the model. The loader stores the file's name as a note of the domain.
+/// `None` if not exactly one domain has this note, or the file is not in the folder.
 fn cubic_file(scene: &Scene, folder: &Path) -> Option<PathBuf> {
     let mut names = scene.domains.iter().filter_map(|domain| domain.metadata.notes.get("vega.cubic"));
     let name = names.next()?;

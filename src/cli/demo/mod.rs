@@ -27,7 +27,7 @@ use step_records::StepRecords;
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   modalcast demo                                the built-in tree in the wind: 60 frames into out/
-  modalcast demo --scene path/to/simpleBridge   a Vega folder under its own cubic forces
+  modalcast demo --scene path/to/simpleBridge   a model of the FEM library Vega with its internal forces
   modalcast demo --frames 10 --size 640x360")]
 pub(super) struct Args {
     /// Scene: a built-in name, or a path to a model or a scene folder.

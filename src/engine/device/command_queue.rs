@@ -51,7 +51,8 @@ impl CommandQueue {
         Arc::new(Self { state: Mutex::new(state), changed: Condvar::new() })
     }
 
-    /// Queues a command. Returns the guard that removes it if its caller may cancel it.
+    /// Queues a command. If its caller may cancel it, returns a guard that removes the command from the queue when it
+    /// is dropped.
     ///
     /// # Errors
     /// `Busy` when the scene has too many queued commands; `None` when the queue is closed.

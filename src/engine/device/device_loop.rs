@@ -3,23 +3,24 @@
 //! Scenes are served by deficit round-robin ([`super::fair_queue`]). The commands of a scene are executed in their
 //! order, so a frame shows the step before it, and a step waits for the frames before it.
 //!
-//! A large frame or AOV (arbitrary output variable: depth, normals and others) is drawn in steps, which are parts of
-//! its drawing commands and no steps of the simulation. Other scenes are served between the steps ([`PartialOutput`]).
-//! The commands of its scene wait until its last step is submitted. Each step is submitted when the device has finished
-//! the one before it, so the commands of other scenes never wait for more than one step. Only one large output is drawn
-//! at a time, because each needs its own images; another one waits. A step draws at most a fixed number of samples
+//! A large frame or AOV (arbitrary output variable: depth, normals and others) is drawn in several draw steps, each of
+//! which submits a part of its drawing commands. (Draw steps are unrelated to the steps of the simulation.) Other
+//! scenes are served between the draw steps ([`PartialOutput`]). The commands of its own scene wait until the last draw
+//! step is submitted. Each draw step is submitted when the device has finished the one before it, so the commands of
+//! other scenes never wait for more than one draw step. Only one large output is drawn at a time, because each needs
+//! its own images; another one waits. A draw step draws at most a fixed number of samples
 //! ([`modalcast_render::Renderer::set_max_band_samples`]). On a software renderer this limit is a whole frame of
 //! 1920x1080 pixels with four samples per pixel, so other scenes wait at most about as long as such a frame takes. The
-//! first frame of a scene is drawn in steps, too, because drivers finish the compilation of a program when it is used
-//! for the first time.
+//! first frame of a scene has several draw steps, too, because drivers finish the compilation of a program when it is
+//! used for the first time.
 //!
 //! Another thread prepares the deformer of a scene before the scene is loaded: it compiles the kernels and uploads the
-//! tables. The OpenGL buffers of a scene are created by its first output, or with CUDA when it is loaded. Before that,
-//! its textures are uploaded and its programs compiled in steps, between which other scenes are served. Other threads
-//! compute the mipmap levels, and if the driver can, compile the programs.
+//! tables. The OpenGL buffers of a scene are created by its first output, or, with CUDA, when the scene is loaded.
+//! Before that, its textures are uploaded and its programs compiled in several parts, between which other scenes are
+//! served. Other threads compute the mipmap levels, and if the driver can, compile the programs.
 //!
-//! An output whose caller no longer waits ends after its present step. On a software renderer, each pass of such an
-//! output is a step.
+//! An output whose caller no longer waits ends after its present draw step. On a software renderer, each pass of an
+//! output is a draw step.
 //!
 //! Frames, picks and vertex readbacks are answered asynchronously, each type from its own bounded queue
 //! ([`InFlightQueue`]). After each command the loop waits for the vertex readbacks that were started before this
@@ -83,7 +84,7 @@ pub(super) struct DeviceLoop {
     /// Threads that copy pixels of frames.
     copy_pool: ThreadPool,
     scenes: HashMap<SceneId, LoadedScene>,
-    /// Outputs that are drawn in steps. The queue of their scene begins with [`Work::Continue`].
+    /// Outputs with further draw steps. The queue of their scene begins with [`Work::Continue`].
     partial_outputs: HashMap<SceneId, PartialOutput>,
     vertices: InFlightQueue<PendingVertices, CopiedVertices>,
     picks: InFlightQueue<PendingPick, Vec<PickHit>>,
@@ -169,8 +170,8 @@ impl DeviceLoop {
         while self.run_next() {}
     }
 
-    /// Executes the next command, or the next step of an output, and answers readbacks. Returns false if the queue is
-    /// closed and empty.
+    /// Executes the next command, or the next draw step of an output, and answers readbacks. Returns false if the queue
+    /// is closed and empty.
     pub(super) fn run_next(&mut self) -> bool {
         let Some(taken) = self.next_work() else { return false };
         self.free_in_flight_slot(&taken.work);
@@ -232,7 +233,7 @@ impl DeviceLoop {
         }
     }
 
-    /// Whether a command draws an output in steps.
+    /// Whether a command draws an output in several draw steps.
     fn is_large_output(&self, id: SceneId, command: &Command) -> bool {
         match command {
             Command::Draw { size, .. } | Command::RenderAov { size, .. } => {
@@ -264,7 +265,7 @@ impl DeviceLoop {
         }
     }
 
-    /// Executes a command or the next step of an output, and charges its scene the time.
+    /// Executes a command or the next draw step of an output, and charges its scene the time.
     fn run_work(&mut self, taken: Taken<Work>) {
         let begin = Instant::now();
         let taken = match self.prepare(taken) {

@@ -25,8 +25,9 @@ const BENCHMARK_SIZE: FrameSize = FrameSize::new(1920, 1080);
 #[derive(Debug, Clone, Copy)]
 pub(in crate::engine) struct BufferContents {
     bounds: BoundingBox,
-    /// Bounds of the vertices in light space. `None` in a camera-relative frame, because the deformer computed them
-    /// relative to the domains' floating origins.
+    /// Bounds of the vertices in light space. `None` if the positions were rebased to an origin near the camera,
+    /// because the deformer computes these bounds relative to the domains' floating origins (the f64 points that their
+    /// f32 positions are relative to).
     light_bounds: Option<OrientedBounds>,
     /// Whether vertices had to be uploaded to fill the buffers.
     pub(in crate::engine) is_uploaded: bool,
@@ -101,8 +102,7 @@ impl LoadedScene {
         &self.scene
     }
 
-    /// Bounds of the last deformation in scene units, each domain relative to its floating origin (the f64 point that
-    /// the domain's f32 positions are relative to). Always finite.
+    /// Bounds of the last deformation in scene units, each domain relative to its floating origin. Always finite.
     pub const fn bounds(&self) -> BoundingBox {
         self.bounds
     }

@@ -19,7 +19,8 @@ pub(super) struct CurrentStep {
 impl CurrentStep {
     /// The step of a scene that is opened with a restored state or the rest state.
     pub(super) fn of_opened_scene(state: Arc<SceneState>) -> Self {
-        // A restored state counts as one step. The rest state has the run 0 and is no step.
+        // A restored state counts as one step. The rest state is no step: its run, which counts the writers so far, is
+        // 0.
         let step_count = u64::from(state.run > 0);
         Self { state, step_count, stages: Vec::new() }
     }

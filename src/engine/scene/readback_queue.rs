@@ -10,9 +10,9 @@
 //! OpenGL    [draw k][read k][upload][draw k+1][read k+1][upload]
 //! ```
 //!
-//! If OpenGL and CUDA share memory, CUDA deforms step k+1 while OpenGL draws frame k, and its copy engine reads frame
-//! k-1. The GPU changes between the contexts of OpenGL and CUDA once per step, within a frame. OpenGL copies the
-//! vertices of a step at the begin of its frame, so that two sets of vertices are sufficient.
+//! If OpenGL and CUDA share memory, CUDA deforms step k+1 while OpenGL draws frame k, and the GPU's copy engine reads
+//! frame k-1. The GPU changes between the contexts of OpenGL and CUDA once per step, within a frame. OpenGL copies the
+//! vertices of a step at the beginning of its frame, so that two sets of vertices are sufficient.
 //!
 //! ```text
 //! OpenGL       [copy, draw k     ][copy, draw k+1   ][copy, draw k+2   ]
@@ -21,8 +21,8 @@
 //! ```
 //!
 //! If CUDA maps OpenGL's buffers instead, a step and the copy of its vertices are submitted together while every step
-//! is drawn. Both are ordered after all OpenGL commands issued before, including the readback of frame k, so only the
-//! host's work overlaps. Frame k is copied out, encoded and sent while frame k+1 is drawn.
+//! is drawn. Both wait for all earlier OpenGL commands, including the readback of frame k, so only the host's work
+//! overlaps. Frame k is copied out, encoded and sent while frame k+1 is drawn.
 //!
 //! ```text
 //! device    [draw k][read k][deform k+1, copy] [draw k+1][read k+1][deform k+2, copy]
@@ -64,7 +64,8 @@ pub(super) struct Recipient {
 }
 
 impl Recipient {
-    /// Takes one of the subscriber's credits, and marks the current step as delivered to it.
+    /// Takes one of the subscriber's credits, each of which permits one result, and marks the current step as delivered
+    /// to it.
     pub(super) fn take_credit_of(subscriber: &mut Subscriber, current: &CurrentStep) -> Self {
         Self {
             skipped: subscriber.mark_delivered(current.step_count),

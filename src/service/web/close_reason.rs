@@ -65,7 +65,7 @@ impl CloseReason {
         Self::new(code, error.to_string())
     }
 
-    /// The connection has lost its messages to another one.
+    /// The connection's messages were dropped to free memory for another connection.
     pub(super) fn evicted() -> Self {
         Self::new(1013, "the messages of all connections exceed their limit")
     }

@@ -2,7 +2,7 @@
 //! and count against the receive budgets from their first header on. Frames without payload are counted.
 //!
 //! The library keeps the memory of its largest frame. Its reader is therefore replaced after a message with a large
-//! frame, and no byte after this message is read before ([`FrameMeter::take_boundary`]).
+//! frame, and no byte after this message is read before the replacement ([`FrameMeter::take_boundary`]).
 
 use std::io;
 use std::sync::Arc;
@@ -22,7 +22,7 @@ const MAX_HEADER_BYTES: usize = 14;
 /// Opcodes from here on are control frames.
 const FIRST_CONTROL_OPCODE: u8 = 8;
 
-/// A frame with at least this many bytes of payload is large. The library reads fewer bytes at once.
+/// A frame with at least this many bytes of payload is large: it is larger than the library's read buffer.
 const MIN_LARGE_FRAME: usize = 64 << 10;
 
 /// Bytes of a connection.

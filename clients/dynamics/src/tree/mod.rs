@@ -131,7 +131,8 @@ impl TreeScenario {
     pub fn new(model: Model, options: TreeOptions) -> Result<Self> {
         options.check()?;
         if model.domains.iter().all(|domain| domain.eigenvalues.is_empty()) {
-            let given = format!("{} domains without eigenvalues (the sweep needs none)", model.domains.len());
+            let given =
+                format!("{} domains without eigenvalues (the scenario `sweep` needs none)", model.domains.len());
             return Err(invalid_input("scene.eigenvalues", "a domain whose modes have eigenvalues", given));
         }
         let parameters = ModalParameters::read(&model)?;

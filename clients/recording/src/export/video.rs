@@ -14,7 +14,7 @@ pub struct VideoSettings {
     pub frames_per_second: f64,
 }
 
-/// An ffmpeg process that receives RGBA frames. Its format follows from the extension of the file.
+/// An ffmpeg process that receives RGBA frames. The extension of the file selects the format of the video.
 pub struct VideoEncoder {
     process: Child,
     out: PathBuf,

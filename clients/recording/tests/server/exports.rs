@@ -79,6 +79,7 @@ impl Array {
         let mut entry = archive.by_name(&format!("{name}.npy")).unwrap_or_else(|error| panic!("{name}: {error}"));
         let mut bytes = Vec::new();
         entry.read_to_end(&mut bytes).expect("an entry");
+        // The length of the header is at byte 8. The header ends at a multiple of 64 bytes.
         let length = usize::from(u16::from_le_bytes([bytes[8], bytes[9]]));
         assert_eq!((10 + length) % 64, 0);
         let header = String::from_utf8(bytes[10..10 + length].to_vec()).expect("text");
@@ -132,6 +133,7 @@ struct Glb {
 impl Glb {
     fn read(path: &Path) -> Self {
         let bytes = std::fs::read(path).expect("a file");
+        // A file header of 12 bytes, and the chunks of JSON and binary data, each with a header of 8 bytes.
         let length = u32::from_le_bytes(bytes[12..16].try_into().expect("four bytes")) as usize;
         let document = serde_json::from_slice(&bytes[20..20 + length]).expect("JSON");
         Self { document, data: bytes[28 + length..].to_vec() }

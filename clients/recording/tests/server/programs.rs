@@ -123,7 +123,8 @@ async fn errors_exit_with_the_documented_codes() {
         ["export", &out, "--to", "video", "--out", &video, "--server", &server.url, "--ffmpeg", "./no-ffmpeg"];
     let output = run(&arguments);
     let message = String::from_utf8_lossy(&output.stderr).into_owned();
-    // A file without states, of a server without a renderer: ffmpeg is started first.
+    // The recording has no states and the server has no renderer, but ffmpeg is started first, so that its error is
+    // reported.
     assert!(output.status.code() == Some(5) && message.contains("no-ffmpeg"), "{message}");
     assert_eq!(String::from_utf8_lossy(&run(&["--build"]).stdout).trim().len(), 16);
 }
@@ -162,6 +163,7 @@ async fn pictures_and_videos_have_a_frame_per_interval() {
     let video = std::fs::read(video).expect("a file");
     assert_eq!(video.len(), 13 * 4 * 32 * 16);
     let frame = |index: usize| std::fs::read(raw.join(format!("frame_{index:05}.rgba"))).expect("a frame");
+    // A frame has 32x16 pixels of four bytes.
     for index in 0..13 {
         assert_eq!(video[2048 * index..][..2048], frame(index), "frame {index}");
     }

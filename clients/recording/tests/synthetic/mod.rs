@@ -29,7 +29,8 @@ fn bytes_of<T: bytemuck::NoUninit>(numbers: &[T]) -> Bytes {
     Bytes::copy_from_slice(bytemuck::cast_slice(numbers))
 }
 
-/// The scene: a triangle with two modes, and a second domain of the same shape. The description has no materials.
+/// The messages that describe the scene, and its contents. The scene is a triangle with two modes, and a second domain
+/// of the same shape.
 pub(crate) fn scene() -> (Vec<v1::DescribeSceneResponse>, Vec<Content>) {
     let positions = Content { bytes: bytes_of(&[0.0_f32, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0]).to_vec() };
     let modes: Vec<f32> = (0..18).map(|number| number as f32 / 16.0).collect();
@@ -126,7 +127,7 @@ pub(crate) fn metadata(contents: &[Content], embedded: bool) -> Vec<MetadataEntr
     ]
 }
 
-/// Begins a recording of the scene with its contents.
+/// Begins a recording of the scene, with its contents if `embedded`, else only with their hashes.
 pub(crate) fn begin<W: std::io::Write>(writer: W, embedded: bool) -> RecordingWriter<W> {
     let (messages, contents) = scene();
     let mut recording = RecordingWriter::new(writer, &metadata(&contents, embedded)).expect("a written header");

@@ -13,8 +13,8 @@ pub struct PictureOptions {
     #[arg(long, default_value = "1280x720", value_name = "WxH", value_parser = parse_size)]
     size: (u32, u32),
     /// Content of the picture: color, depth (f32 meters), domains (u32), normals (3 f32), or a color map of
-    /// `displacement` or `mode-shape` with a legend. Several, separated by commas, are saved as one file each, with the
-    /// name of the output at the end of the file name; all show the same step.
+    /// `displacement` or `mode-shape` with a legend. Several, separated by commas, are saved as one file each, whose
+    /// name ends with the name of the output. All files show the same step.
     #[arg(long = "output", value_enum, default_value = "color", value_delimiter = ',')]
     outputs: Vec<OutputOption>,
     /// Index of the column of U for `--output mode-shape`, from 0.

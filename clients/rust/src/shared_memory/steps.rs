@@ -1,4 +1,4 @@
-//! The values of steps in shared memory.
+//! The values of steps (q and transforms) in shared memory. Each array of a step takes one slot of the memory.
 
 use std::io;
 use std::sync::Arc;
@@ -8,8 +8,8 @@ use modalcast_proto::v1;
 
 use super::MemoryConnection;
 
-/// Values of at least this size are put into a slot. The copy and the return of a slot cost more than to send fewer
-/// bytes.
+/// Values of at least this size are put into a slot. For fewer bytes, sending them costs less than copying them to a
+/// slot and returning it.
 const MIN_SHARED_BYTES: usize = 64 << 10;
 
 /// The memory for the values of the steps of one stream.

@@ -91,7 +91,8 @@ pub(crate) struct FakeServer {
     pub(crate) forces: Vec<v1::AppliedForce>,
     /// Paths and bytes of the files of the last upload. Reused files have no bytes.
     pub(crate) uploaded_files: Mutex<Vec<(String, Vec<u8>)>>,
-    /// Hashes of the contents that the server claims to have. `None`: it does not know this call.
+    /// Hashes of the contents that the server claims to have. `None`: the server does not know the call
+    /// `find_uploaded_files`.
     pub(crate) known_hashes: Option<Vec<Vec<u8>>>,
     /// Whether the server no longer has these contents when the upload arrives.
     pub(crate) loses_contents: bool,
