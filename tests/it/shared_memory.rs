@@ -1,5 +1,5 @@
 //! Vertices, frames and steps in shared memory: the same data as on the socket, and the rules of the protocol. The
-//! memory is divided into slots, each for one chunk, which the receiver returns after reading.
+//! memory is divided into slots, each for the data of one message. The receiver returns a slot after reading it.
 
 use std::io::IoSliceMut;
 use std::mem::MaybeUninit;
