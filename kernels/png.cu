@@ -1,12 +1,12 @@
 // PNG encoder: filters RGBA8 pixels, compresses them and writes a whole file to pinned host memory. The file is the one
 // that the CPU twin writes: independent strips of rows, each one deflate block with a Huffman code of its own, or
-// stored blocks, in an IDAT chunk of its own (src/frame/png describes the format). It depends on the pixels only.
-//   png_filter  a block per tile: filter Sub, numbers of the symbols, sums for Adler-32; clears the memory of the file
+// stored blocks, in an IDAT chunk of its own (src/frame/png describes the format). The file depends only on the pixels.
+//   png_filter  a block per tile: filter Sub, counts of the symbols, sums for Adler-32; clears the memory of the file
 //   png_code    a block per strip: Huffman code, header of the deflate block, sizes
 //   png_pack    a block per tile: writes the bits of the symbols at offsets from prefix sums
 //   png_finish  a block per strip: CRC-32; writes the chunk to the host. The first and the last block also write the
 //               start and the end of the file, with the Adler-32 of all strips
-// Macro: CHANNELS, 3 (RGB, the default) or 4 (RGBA). With 3, alpha is dropped, and the result says whether a pixel is
+// Macro: CHANNELS, 3 (RGB, the default) or 4 (RGBA). With 3, alpha is dropped, and the result states whether a pixel is
 // not opaque. Such a picture must be encoded with 4.
 // Launch: all kernels have the argument PngArgs. png_filter and png_pack: strips * tiles_per_strip blocks of BLOCK
 // threads; png_code: strips blocks of CODE_BLOCK threads; png_finish: strips blocks of BLOCK threads.
@@ -17,7 +17,8 @@
 
 constexpr unsigned BLOCK = 256, WARPS = BLOCK / 32;
 constexpr unsigned WORDS_PER_THREAD = TILE_WORDS / BLOCK;
-// Blocks of png_pack per multiprocessor that the compiler limits the registers for, where that spills none.
+// Resident blocks of png_pack per multiprocessor for which the compiler limits the registers: chosen so that none
+// spill.
 #if __CUDA_ARCH__ >= 800 && __CUDA_ARCH__ < 1000
 constexpr unsigned PACK_BLOCKS = 6;
 #else
@@ -25,9 +26,9 @@ constexpr unsigned PACK_BLOCKS = 4;
 #endif
 constexpr unsigned FILTER_SUB = 1;
 constexpr unsigned HEAD_BYTES = 46;                  // signature and the chunks IHDR and sRGB
-constexpr unsigned CHUNK_PREFIX = 8, CHUNK_BYTES = 12; // length and type; with the checksum
+constexpr unsigned CHUNK_PREFIX = 8, CHUNK_BYTES = 12; // length and type; the same with the checksum
 constexpr unsigned ZLIB_HEADER_BYTES = 2;
-constexpr unsigned LENGTH_SYMBOLS = 20; // symbols of code lengths, 19, padded to a multiple of 4
+constexpr unsigned LENGTH_SYMBOLS = 20; // the 19 symbols that encode code lengths, padded to a multiple of 4
 
 __device__ inline const unsigned* row_pixels(const PngArgs& args, unsigned row) {
     return (const unsigned*)((const char*)args.pixels + (long long)row * args.pitch);
@@ -86,11 +87,11 @@ __device__ inline unsigned filter_word(const PngArgs& args, unsigned strip, Filt
     return word;
 }
 
-// Counts symbols in shared memory. A counter of a padding symbol takes the bytes that are not literals, because a
-// branch for each byte would cost more than the addition.
+// Counts symbols in shared memory. Bytes that are not literals increment the counter of an unused padding symbol,
+// because a branch per byte would cost more than the addition.
 struct SymbolCounter {
     unsigned* counts;
-    unsigned run_zeros; // literals of runs
+    unsigned run_zeros; // zeros of runs that are literals
 
     __device__ void add_zeros(unsigned count) {
         run_zeros += count;
@@ -135,7 +136,7 @@ extern "C" __global__ void __launch_bounds__(BLOCK) png_filter(const __grid_cons
         filtered[i] = word;
         const unsigned word_sum = __dp4a(word, 0x01010101u, 0u);
         sum += word_sum;
-        // Weights of the bytes: the number of bytes from each to the end. Bytes after the end are zeros.
+        // The weight of a byte is the number of bytes from it to the end of the tile. Bytes after the end are zeros.
         weighted_sum += word_sum * (range.byte_count - 4 * i) - __dp4a(word, 0x03020100u, 0u);
     }
     const bool is_opaque = alphas >> 24 == 255;
@@ -149,7 +150,8 @@ extern "C" __global__ void __launch_bounds__(BLOCK) png_filter(const __grid_cons
         add_word(tile, word, counter);
     }
     atomicAdd(&counter.counts[0], counter.run_zeros);
-    // The sums are at most 255 * 8192 and 65521 per thread, so 32 bits hold each.
+    // Over all threads of the block, the first sum is at most 255 * 8192, and each thread adds less than 65521 to the
+    // second, so each fits in 32 bits.
     const unsigned long long sums = block_sum(
         (unsigned long long)(weighted_sum % ADLER_MODULUS) << 32 | sum, partial_sums);
     PngTile* target = (PngTile*)args.tiles + blockIdx.x;
@@ -166,14 +168,15 @@ extern "C" __global__ void __launch_bounds__(BLOCK) png_filter(const __grid_cons
     }
 }
 
-// Shared memory of `png_code`.
+// Shared memory of `png_code`. A field is a symbol of the run-length code in which a deflate header lists the code
+// lengths of all symbols (RFC 1951, section 3.2.7). Fields have a Huffman code of their own.
 struct CodeScratch {
     HuffmanScratch huffman;
     unsigned header[HEADER_WORDS];
     unsigned symbol_bits[PADDED_SYMBOLS];       // bits of a symbol: code, extra bits and distance
     unsigned char lengths[PADDED_SYMBOLS];      // code lengths of literals and lengths, then of two distances
-    unsigned char field_lengths[32];            // code lengths of the code for code lengths
-    unsigned field_codes[32];                   // its codes: value | length << 16
+    unsigned char field_lengths[32];            // code lengths of the fields
+    unsigned field_codes[32];                   // codes of the fields: value | length << 16
     unsigned field_frequencies[32];
     unsigned run_starts[CODE_WARPS];
     unsigned warp_totals[CODE_WARPS];
@@ -181,17 +184,17 @@ struct CodeScratch {
     unsigned long long partial_sums[CODE_WARPS];
 };
 
-// A symbol of the run-length code of the code lengths, and its extra bits. `count` is 0 if the position has no symbol.
+// A field and its extra bits. `count` is 0 at a position that a repetition before it covers, else 1.
 struct LengthField {
     unsigned symbol, extra, extra_bits, count;
 };
 
-// The symbol that begins at a position of a run of `run_length` equal code lengths (RFC 1951, section 3.2.7).
+// The field that begins at a position of a run of `run_length` equal code lengths.
 __device__ inline LengthField length_field(unsigned value, unsigned position, unsigned run_length) {
     const LengthField single = {value, 0, 0, 1}, covered = {0, 0, 0, 0};
     const unsigned max_repeats = value == 0 ? 138 : 6;
     if (value != 0) {
-        // The first one of a run of other lengths is written as such.
+        // The first length of a run of nonzero lengths is written as it is.
         if (position == 0) {
             return single;
         }
@@ -212,7 +215,7 @@ __device__ inline LengthField length_field(unsigned value, unsigned position, un
     return repeats < 11 ? LengthField{17, repeats - 3, 3, 1} : LengthField{18, repeats - 11, 7, 1};
 }
 
-// Appends bits to words of shared or device memory that are zeros there.
+// Writes bits at a bit position of shared or device memory in which these bits are zero.
 __device__ inline void or_bits(unsigned* words, unsigned position, unsigned value, unsigned bit_count) {
     if (bit_count > 0) {
         atomicOr(&words[position / 32], value << position % 32);
@@ -222,7 +225,7 @@ __device__ inline void or_bits(unsigned* words, unsigned position, unsigned valu
     }
 }
 
-// The field for this thread's code length, from the lengths in `scratch`.
+// The field that begins at this thread's code length. The lengths are in `scratch`.
 __device__ inline LengthField field_of_thread(CodeScratch& scratch, unsigned length_count) {
     const unsigned index = threadIdx.x, lane = index % 32;
     const unsigned value = scratch.lengths[index];
@@ -249,7 +252,7 @@ __device__ inline LengthField field_of_thread(CodeScratch& scratch, unsigned len
     return length_field(value, index - begin, min(end, length_count) - begin);
 }
 
-// Sum of a value over the preceding threads of the block.
+// Sum of a value over the preceding threads of the block. All threads must call this.
 __device__ inline unsigned preceding_sum(unsigned value, unsigned (&warp_totals)[CODE_WARPS]) {
     const unsigned warp = threadIdx.x / 32;
     unsigned sum = warp_prefix_sum(value);
@@ -293,7 +296,7 @@ __device__ inline unsigned write_header(CodeScratch& scratch, unsigned length, b
         --order_count;
     }
     if (index == 0) {
-        // The type of a block with its own code is 2.
+        // Block type 2: a block with Huffman codes of its own.
         or_bits(scratch.header, 0, is_last | 2 << 1 | (symbol_count - 257) << 3 | 1 << 8 | (order_count - 4) << 13, 17);
     }
     if (index < order_count) {
@@ -354,8 +357,8 @@ extern "C" __global__ void __launch_bounds__(CODE_BLOCK) png_code(const __grid_c
         target->header[symbol] = scratch.header[symbol];
     }
     if (symbol == 0) {
-        // Three bits and four bytes are an empty stored block, which fills the last byte of all strips but the last
-        // one.
+        // Every strip but the last ends with an empty stored block, so that it ends at a byte boundary: three bits,
+        // padding to a byte, and four bytes.
         const unsigned end_bits = is_last ? 0 : 3, end_bytes = is_last ? 0 : 4;
         const unsigned block_bytes = (unsigned)((header_bits + symbol_bits + end_bits + 7) / 8) + end_bytes;
         const unsigned strip_bytes = TileRange::strip_bytes(args, strip);
@@ -367,7 +370,7 @@ extern "C" __global__ void __launch_bounds__(CODE_BLOCK) png_code(const __grid_c
     }
 }
 
-// Offset in the file of the content of a strip's chunk. All threads call it.
+// Offset in the file of the content of a strip's chunk. All threads of the block must call this.
 __device__ inline unsigned content_offset(const PngArgs& args, unsigned strip,
                                           unsigned long long (&partial_sums)[WARPS]) {
     const PngStrip* strips = (const PngStrip*)args.strips;
@@ -418,7 +421,8 @@ struct SymbolPacker {
                 const unsigned byte = (unsigned)(bytes >> 32 * half) >> 8 * i & 255;
                 literals[i] = is_literal >> (4 * half + i) & 1 ? codes[byte] : 0;
             }
-            // Sums of lengths in the high halves: values have at most 12 bits.
+            // The high halves of the sums are sums of code lengths, because sums of two 12-bit values do not carry into
+            // them.
             const unsigned first_sum = literals[0] + literals[1], second_sum = literals[2] + literals[3];
             const unsigned first = (literals[0] & 0xffff) | (literals[1] & 0xffff) << (literals[0] >> 16);
             const unsigned second = (literals[2] & 0xffff) | (literals[3] & 0xffff) << (literals[2] >> 16);
@@ -427,7 +431,7 @@ struct SymbolPacker {
     }
 };
 
-// The words of a tile's bits: at most 12 bits per byte, a header and the end of a strip.
+// Maximum number of words of a tile's bits: 12 bits per byte, the header of a block and the end of a strip.
 constexpr unsigned PACKED_WORDS = TILE_BYTES * MAX_CODE_BITS / 32 + HEADER_WORDS + 4;
 
 __device__ inline void pack_word(unsigned* packed, unsigned position, const SymbolPacker& packer) {
@@ -482,7 +486,7 @@ extern "C" __global__ void __launch_bounds__(BLOCK, PACK_BLOCKS) png_pack(const 
     unsigned content = content_offset(args, range.strip, partial_sums);
     if (range.strip == 0) {
         if (range.first_byte == 0 && threadIdx.x == 0) {
-            // A deflate stream with a window of 32 KiB, compressed by a fast algorithm: 0x78, 0x01.
+            // The zlib header 0x78, 0x01: deflate with a window of 32 KiB, fastest compression level.
             or_bits((unsigned*)args.words, 8 * content, 0x0178, 16);
         }
         content += ZLIB_HEADER_BYTES;
@@ -590,7 +594,7 @@ struct FinishScratch {
     unsigned char bytes[HEAD_BYTES];
 };
 
-// Appends the checksum of a chunk in shared memory, of its type and content. One thread calls it.
+// Appends the checksum of a chunk's type and content to the chunk, which is in shared memory. Called by one thread.
 __device__ inline void close_chunk(const FinishScratch& scratch, unsigned char* chunk, unsigned content_bytes) {
     unsigned crc = 0xffffffffu;
     for (unsigned i = 4; i < CHUNK_PREFIX + content_bytes; ++i) {
@@ -605,7 +609,7 @@ __device__ inline void copy_bytes(unsigned char* target, const unsigned char* so
     }
 }
 
-// Writes the signature and the chunks IHDR and sRGB. One thread calls it.
+// Writes the signature and the chunks IHDR and sRGB. Called by one thread.
 __device__ inline void write_head(const PngArgs& args, FinishScratch& scratch) {
     constexpr unsigned char START[16] = {0x89, 'P', 'N', 'G', '\r', '\n', 0x1a, '\n', 0, 0, 0, 13, 'I', 'H', 'D', 'R'};
     // 8 bits per channel; deflate, all filters, not interlaced.
@@ -624,7 +628,7 @@ __device__ inline void write_head(const PngArgs& args, FinishScratch& scratch) {
 
 // Adler-32 of the filtered bytes of all strips (RFC 1950). The low half is 1 + the sum of the bytes. The high half is
 // the sum of the low halves after each byte, in which each byte counts once for every byte from it to the end. All
-// threads call it.
+// threads of the block must call this.
 __device__ inline unsigned adler_checksum(const PngArgs& args, FinishScratch& scratch) {
     const unsigned tile_count = args.strip_count * args.tiles_per_strip;
     const unsigned long long byte_count = (unsigned long long)args.row_bytes * args.height;
@@ -645,7 +649,7 @@ __device__ inline unsigned adler_checksum(const PngArgs& args, FinishScratch& sc
 }
 
 // Writes the chunk with the Adler-32 checksum, the chunk IEND and the result. `end` is the end of the last strip's
-// chunk. All threads call it.
+// chunk. All threads of the block must call this.
 __device__ inline void write_tail(const PngArgs& args, FinishScratch& scratch, unsigned end) {
     constexpr unsigned char START[CHUNK_PREFIX] = {0, 0, 0, 4, 'I', 'D', 'A', 'T'};
     constexpr unsigned char IEND[CHUNK_BYTES] = {0, 0, 0, 0, 'I', 'E', 'N', 'D', 0xae, 0x42, 0x60, 0x82};
@@ -663,11 +667,11 @@ __device__ inline void write_tail(const PngArgs& args, FinishScratch& scratch, u
     }
 }
 
-// CRC-32 of the type IDAT and the content at the bytes from `begin` to before `end` of `words`. All threads call it;
+// CRC-32 of the type IDAT and of the bytes `begin` to `end` - 1 of `words`. All threads of the block must call this;
 // the result is valid in thread 0.
 __device__ inline unsigned chunk_checksum(const unsigned* words, unsigned begin, unsigned end, FinishScratch& scratch) {
-    // Each thread has as many words as the others, and the last ones end at the last whole word. Words before the first
-    // one count as zeros, which do not change a checksum that starts from 0.
+    // Each thread has the same number of words, and the words of the last thread end at the last whole word. Words
+    // before the first word count as zeros, which do not change a checksum that starts from 0.
     const unsigned first_word = begin / 4, end_word = max(first_word, end / 4);
     const unsigned words_per_thread = (end_word - first_word + BLOCK - 1) / BLOCK;
     const unsigned words_after = words_per_thread * (BLOCK - 1 - threadIdx.x);

@@ -46,7 +46,7 @@ static_assert(sizeof(PngArgs) == 104, "PngArgs differs from the host");
 struct PngTile {
     unsigned short counts[PADDED_SYMBOLS]; // number of each symbol
     unsigned sum;                          // sum of the bytes
-    unsigned weighted_sum;                 // sum of each byte times the bytes from it to the end, modulo 65521
+    unsigned weighted_sum;                 // sum of byte * (number of bytes from it to the end), modulo 65521
     unsigned bit_count;                    // bits of all symbols
     unsigned reserved;
 };
@@ -68,7 +68,7 @@ struct PngResult {
     unsigned is_translucent; // 1: a pixel is not opaque
 };
 
-// A range of bytes of a strip.
+// The bytes of a tile: a range of bytes of its strip.
 struct TileRange {
     unsigned strip, first_byte, byte_count;
 
@@ -113,7 +113,8 @@ __device__ inline unsigned long long block_sum(unsigned long long value,
     return value;
 }
 
-// Number of bits after the code of a symbol: extra bits of the length, and the distance (RFC 1951, section 3.2.5).
+// Number of bits after the code of a symbol: the extra bits of a match length, and the match distance (RFC 1951,
+// section 3.2.5).
 __device__ inline unsigned bits_after_code(unsigned symbol) {
     if (symbol <= END_OF_BLOCK) {
         return 0;
@@ -122,14 +123,14 @@ __device__ inline unsigned bits_after_code(unsigned symbol) {
     return DISTANCE_BITS + (index < 8 || symbol == SYMBOLS - 1 ? 0 : index / 4 - 1);
 }
 
-// The symbol of a match.
+// The symbol of a match of `length` bytes, and its extra bits.
 struct LengthSymbol {
     unsigned symbol, extra, extra_bits;
 
     __device__ explicit LengthSymbol(unsigned length) : symbol(SYMBOLS - 1), extra(0), extra_bits(0) {
         if (length < MAX_MATCH) {
             const unsigned offset = length - MIN_MATCH;
-            // From 8 on, four symbols share a number of extra bits.
+            // From offset 8 on, groups of four symbols have the same number of extra bits.
             extra_bits = offset < 8 ? 0 : 29 - __clz(offset);
             extra = offset & ((1u << extra_bits) - 1);
             symbol = END_OF_BLOCK + 1 + 4 * extra_bits + (offset >> extra_bits);
@@ -137,7 +138,7 @@ struct LengthSymbol {
     }
 };
 
-// Bytes of a tile that are zeros: from `begin` to before `end`.
+// Bytes of a tile that are zeros: `begin` to `end` - 1.
 struct ZeroRun {
     unsigned begin, end;
 };
@@ -148,8 +149,8 @@ struct SharedTile {
     unsigned long long words[TILE_WORDS]; // bytes after the end are zeros
     unsigned byte_count;
     unsigned zero_words[TILE_WORDS / 32]; // a bit per word: whether all its bytes exist and are zeros
-    int last_other[TILE_WORDS / 32];      // the last word before these 32 whose bit is not set, or -1
-    int first_other[TILE_WORDS / 32];     // the first word after these 32 whose bit is not set, or TILE_WORDS
+    int last_other[TILE_WORDS / 32];      // per 32 words: the last word before them whose bit is not set, or -1
+    int first_other[TILE_WORDS / 32];     // per 32 words: the first word after them whose bit is not set, or TILE_WORDS
 
     // Finds the words of zeros. The caller has synchronized the block after its writes to `words`, and `bytes` is the
     // same in all threads. BLOCK_THREADS is the size of the block.
@@ -205,9 +206,9 @@ struct SharedTile {
     }
 };
 
-// Passes the symbols of a run that begin at the bytes from `first` to before `end` to `sink`. The first zero of a run
-// is a literal. Matches of distance 1 follow, each of the maximum length but the last one. One or two remaining zeros
-// are literals.
+// Passes to `sink` those symbols of a run that begin at the bytes `first` to `end` - 1. The first zero of a run is a
+// literal. Matches of distance 1 follow, each of the maximum length but the last one. One or two remaining zeros are
+// literals.
 template <typename Sink>
 __device__ inline void add_run(const ZeroRun& run, unsigned first, unsigned end, Sink& sink) {
     if (first == run.begin) {
@@ -253,7 +254,7 @@ __device__ inline void add_word(const SharedTile& tile, unsigned word, Sink& sin
     const unsigned literals_end = byte_count - (is_before_zeros ? __clzll(bytes) / 8 : 0);
     sink.add_literals(bytes, literals_begin, literals_end);
     if (literals_end < byte_count) {
-        // The run has the next word too, so a match follows its first byte.
+        // The run includes the next word, so a match follows its first byte.
         sink.add_zeros(1);
         if (literals_end + 1 < byte_count) {
             sink.add_match(min(MAX_MATCH, tile.run_at(word + 1).end - (first + literals_end + 1)));

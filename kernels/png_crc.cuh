@@ -1,10 +1,10 @@
-// CRC-32 of PNG chunks (reflected, polynomial 0xedb88320), computed by one block. A checksum is a remainder of
-// polynomials over GF(2), so that of a concatenation is crc(first) * x^(8 bytes of second) + crc(second), where each
-// crc starts from 0.
+// CRC-32 of PNG chunks (reflected, polynomial 0xedb88320), computed by one block. A checksum is the remainder of a
+// polynomial over GF(2). The checksum of a concatenation is therefore crc(first) * x^(8 * bytes of second) +
+// crc(second), where each crc starts from 0.
 #pragma once
 
 constexpr unsigned CRC_POLYNOMIAL = 0xedb88320u;
-constexpr unsigned CRC_ONE = 0x80000000u; // the polynomial 1: the highest power comes last
+constexpr unsigned CRC_ONE = 0x80000000u; // the polynomial 1: bit 31 is the coefficient of x^0
 
 // The product of two polynomials modulo the polynomial of CRC-32.
 __device__ constexpr unsigned crc_multiply(unsigned a, unsigned b) {
@@ -39,7 +39,7 @@ __device__ const unsigned CRC_POWER_TABLE[CRC_DIGITS][16] = {CRC_POWERS(0), CRC_
                                                              CRC_POWERS(3), CRC_POWERS(4), CRC_POWERS(5)};
 #undef CRC_POWERS
 
-// A checksum after `byte_count` further zero bytes.
+// The checksum of the bytes of `crc` followed by `byte_count` zero bytes.
 __device__ inline unsigned crc_shift(unsigned crc, unsigned byte_count) {
     for (unsigned digit = 0; digit < CRC_DIGITS && byte_count > 0; ++digit, byte_count /= 16) {
         if (byte_count % 16 != 0) {
@@ -53,7 +53,7 @@ __device__ inline unsigned crc_shift(unsigned crc, unsigned byte_count) {
 struct CrcTables {
     unsigned table[4][256]; // table[i][byte]: the checksum of the byte and i zero bytes
 
-    // Fills the tables. All threads of a block of at least 256 threads call it.
+    // Fills the tables. All threads of a block of at least 256 threads must call this.
     __device__ void fill() {
         if (threadIdx.x < 256) {
             unsigned crc = threadIdx.x;

@@ -1,5 +1,5 @@
 // Length-limited Huffman codes, built by one block with CODE_BLOCK threads, one per symbol. All threads of the block
-// call these functions. Twin: src/frame/png/huffman.rs, which gives the same codes.
+// must call each of these functions. Twin: src/frame/png/huffman.rs, which gives the same codes.
 #pragma once
 #include "png.cuh"
 
@@ -10,9 +10,9 @@ constexpr unsigned NO_WEIGHT = 0xffffffffu; // larger than the sum of all freque
 // their creation, which is ascending too) are two queues, so the two rarest nodes are at their fronts.
 struct HuffmanScratch {
     alignas(16) unsigned frequencies[PADDED_SYMBOLS];
-    unsigned leaf_weights[PADDED_SYMBOLS + 32];  // NO_WEIGHT after the last one, for a whole warp
+    unsigned leaf_weights[PADDED_SYMBOLS + 32];  // then 32 times NO_WEIGHT, because a warp reads 32 at a time
     unsigned inner_weights[PADDED_SYMBOLS + 32]; // the same
-    unsigned merged_weights[PADDED_SYMBOLS];     // nodes that are combined at once, in ascending order
+    unsigned merged_weights[PADDED_SYMBOLS];     // weights of the nodes that a round combines, in ascending order
     unsigned short leaf_parents[PADDED_SYMBOLS], inner_parents[PADDED_SYMBOLS]; // indices of inner nodes
     unsigned counts[MAX_CODE_BITS + 1];          // number of codes of each length
     unsigned warp_counts[CODE_WARPS][MAX_CODE_BITS + 1];
@@ -30,7 +30,7 @@ __device__ inline unsigned count_lighter(const unsigned* weights, unsigned count
     return begin;
 }
 
-// Number of weights at the front of a queue that are at most `weight`. All lanes of a warp call it.
+// Number of weights at the front of a queue that are at most `weight`. All lanes of a warp must call this.
 __device__ inline unsigned count_candidates(const unsigned* weights, unsigned weight) {
     unsigned total = 0, count;
     do {
@@ -40,9 +40,10 @@ __device__ inline unsigned count_candidates(const unsigned* weights, unsigned we
     return total;
 }
 
-// Combines the two rarest nodes until one node is left. Equal weights: leaves come first. Nodes that are at most as
-// heavy as the next new node precede all new nodes, so they are combined in pairs at once. A remaining one waits for
-// the next round. The smallest weight doubles with each round or two.
+// Combines the two nodes with the smallest weights until one node is left. Of equal weights, leaves come first. All
+// nodes whose weight is at most that of the next new node come before all new nodes, so a round combines them in pairs
+// at once. If their number is odd, the last one waits for the next round. The smallest weight at least doubles in one
+// or two rounds, so few rounds are needed.
 __device__ inline void combine_nodes(HuffmanScratch& scratch, unsigned leaf_count) {
     unsigned leaf = 0, inner = 0, node = 0;
     while (node + 1 < leaf_count) {
@@ -82,7 +83,7 @@ __device__ inline void combine_nodes(HuffmanScratch& scratch, unsigned leaf_coun
 }
 
 // Lengthens codes until the sum of 2^-length is 1 (Kraft's equality). `counts` has the number of codes of each length.
-// All lanes of a warp call it.
+// All lanes of a warp must call this.
 template <unsigned MAX_BITS>
 __device__ inline void complete_code(unsigned (&counts)[MAX_CODE_BITS + 1]) {
     const unsigned length = threadIdx.x % 32;
@@ -92,7 +93,8 @@ __device__ inline void complete_code(unsigned (&counts)[MAX_CODE_BITS + 1]) {
         used += __shfl_xor_sync(0xffffffffu, used, offset);
     }
     for (; used > 1u << MAX_BITS; --used) {
-        // One code of the maximum length and a shorter one are replaced by two that are one bit longer than the latter.
+        // One code of the maximum length and a shorter code are replaced by two codes that are one bit longer than the
+        // shorter one.
         const unsigned shorter = 31 - __clz(__ballot_sync(0xffffffffu, length < MAX_BITS && count > 0));
         count += 2 * (length == shorter + 1) - (length == shorter) - (length == MAX_BITS);
     }
@@ -104,13 +106,13 @@ __device__ inline void complete_code(unsigned (&counts)[MAX_CODE_BITS + 1]) {
 // Whether a symbol has a frequency and is before another one in the order of the leaves.
 __device__ inline unsigned precedes(unsigned frequency, unsigned symbol, unsigned other_frequency,
                                     unsigned other_symbol) {
-    // 0 - 1 is larger than all frequencies.
+    // For frequency 0, the subtraction wraps around to a number above all frequencies.
     return frequency - 1 < other_frequency - (other_symbol <= symbol);
 }
 
 // The length of the code of this thread's symbol, at most MAX_BITS; 0 if its frequency is 0. Only the first
-// SYMBOL_COUNT symbols, a multiple of 4, can have a frequency. At least two symbols have one, and their sum is below
-// 2^32 - 1.
+// SYMBOL_COUNT symbols, a multiple of 4, can have a frequency. At least two symbols have one, and the sum of all
+// frequencies is below 2^32 - 1.
 template <unsigned SYMBOL_COUNT, unsigned MAX_BITS>
 __device__ inline unsigned code_length(HuffmanScratch& scratch, unsigned frequency) {
     const unsigned symbol = threadIdx.x;

@@ -1,8 +1,8 @@
 // Triangle setup of the compute rasterizer: corners in clip space, clipping, snapping to 1/256 pixel, edge functions
 // and depth. Every float sum and product is rounded separately (no fused multiply-add), so that host and device give
 // the same bits. In window coordinates (pixels) y points down. Each pixel has one sample, at its center: the sample of
-// the first pixel is at (1/2, 1/2). Depth is reversed: 1 at the near plane, 0 at the far plane. raster.cu describes the macros DEPTH_ONLY and CUT_OUTS. Twin:
-// src/compute/reference/raster.rs.
+// the first pixel is at (1/2, 1/2). Depth is reversed: 1 at the near plane, 0 at the far plane. raster.cu describes the
+// macros DEPTH_ONLY and CUT_OUTS. Twin: src/compute/reference/raster.rs.
 #pragma once
 
 constexpr int SUBPIXEL_STEPS = 256;  // per pixel
@@ -13,7 +13,7 @@ constexpr float MIN_W = 0x1p-100f;   // smallest accepted w; 1 / w overflows bel
 struct RasterArgs {
     unsigned long long positions;        // [vertices][3] f32
     unsigned long long triangles;        // [triangles][3] u32: indices of vertices
-    unsigned long long target;           // [height][width] u64: ~depth << 32 | triangle; with DEPTH_ONLY f32 depth (in, out)
+    unsigned long long target;           // (in, out) [height][width] u64: ~depth << 32 | triangle, or f32 depth
     unsigned long long medium_queue;     // [triangles] u32: triangles that `raster` leaves to `raster_warps`
     unsigned long long large_queue;      // [triangles] LargeTriangle: triangles that `raster` leaves to `raster_tiles`
     unsigned long long counters;         // RasterCounters: lengths of the queues
@@ -33,7 +33,7 @@ struct RasterArgs {
 struct LargeTriangle {
     unsigned long long first_tile; // number of tiles of all preceding entries
     unsigned triangle;
-    unsigned tile_rect;            // column and row of the first tile, and number of tile columns - 1; 8 bits each from bit 0
+    unsigned tile_rect;            // from bit 0, 8 bits each: column and row of the first tile, tile columns - 1
 };
 
 struct RasterCounters {
@@ -216,12 +216,12 @@ __device__ inline PixelRect pixel_rect(const RasterArgs& args, const ClippedPoly
     return pixel_rect(args, x0, y0, x1, y1);
 }
 
-// A triangle with its corners clockwise on the screen; a is the farthest corner. EdgeInt is the type of edge functions; it must be wide enough
-// for their values at all tested samples.
+// A triangle with its corners clockwise on the screen; a is the farthest corner. EdgeInt is the type of edge functions;
+// it must be wide enough for their values at all tested samples.
 template <typename EdgeInt>
 struct TriangleSetup {
     SnappedVertex a, b, c;
-    float slope_b, slope_c;                 // depth differences from a to b and from a to c, divided by the doubled area
+    float slope_b, slope_c;                 // depth differences from a to b and from a to c, over the doubled area
     int min_edge_a, min_edge_b, min_edge_c; // `min_covered_edge` of the edge opposite to a, b and c
 
     // Minimum of the edge function at covered samples. It is 0 for a top or left edge, because such an edge covers the
@@ -254,7 +254,8 @@ struct TriangleSetup {
     }
 
     // Whether a pixel's sample lies inside the triangle and not behind the far plane. Sets `depth`, clamped to at most
-    // 1. a is the farthest corner, so no term of the sum is negative, and its relative error is a few roundings, also where depth is small.
+    // 1. a is the farthest corner, so no term of the sum is negative, and its relative error is a few roundings, also
+    // where depth is small.
     __device__ bool covers(int column, int row, float& depth) const {
         const int x = SUBPIXEL_STEPS * column + SUBPIXEL_STEPS / 2, y = SUBPIXEL_STEPS * row + SUBPIXEL_STEPS / 2;
         const EdgeInt edge_b = edge_function(c, a, x, y), edge_c = edge_function(a, b, x, y);
@@ -267,10 +268,11 @@ struct TriangleSetup {
     }
 };
 
-// Writes a sample if it is nearer than the target's. Depths are not negative, so their bits have the order of the
-// numbers. A depth-only target takes the largest depth. Keys take the minimum of the inverted bits, so that at equal
-// depths the smallest triangle wins. The plain read may be stale, but the target only changes in one direction: if the
-// comparison fails, the atomic would change nothing. The alpha texture is read only for samples that pass the comparison.
+// Writes a sample if it is nearer than the one in the target. Depths are not negative, so their bits have the order of
+// the numbers. A depth-only target keeps the largest depth. A target of keys keeps the smallest key, which has inverted
+// depth bits, so that at equal depths the smallest triangle index wins. The plain read may be stale, but the target
+// only changes in one direction: if the comparison fails, the atomic would change nothing. The alpha texture is read
+// only for samples that pass the comparison.
 template <typename AlphaTestPolicy>
 __device__ inline void write_sample(const RasterArgs& args, const AlphaTestPolicy& alpha_test, int column, int row,
                                     float depth, unsigned triangle) {
