@@ -1,8 +1,8 @@
 // Blends a translucent surface over the surfaces drawn before it. The render target accumulates light in rgb and
 // transmittance in alpha. Shading is the same as for opaque surfaces.
 in vec3 world;
-// Centroid sampling: the center of a pixel at the edge of a triangle may lie outside of the triangle. Extrapolation to
-// this center could give wrong texture coordinates and normals.
+// Centroid sampling: the center of a pixel at the edge of a triangle may lie outside of the triangle. Attributes
+// extrapolated to this center could be wrong.
 centroid in vec3 normal_world;
 #ifdef UVS
 centroid in vec2 uv_image;

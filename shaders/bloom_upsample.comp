@@ -2,7 +2,7 @@
 // weights 3/4 and 1/4 (Chaikin 1974); repeated, this converges to a quadratic B-spline. All levels have the same
 // weight: `source` is the mean of `coarser_levels` levels, and `destination` becomes the mean of one more level. With
 // COMPOSITE, `destination` is the shaded image, from which shade.comp has subtracted the bloom light. This shader
-// inverts the tone curve, adds the glow, and applies the tone curve again.
+// inverts the tone curve, adds the blurred bloom light, and applies the tone curve again.
 //   source       (in)         [ceil height/2][ceil width/2]  RGBA16F
 //   destination  (in, out)    [height][width]                RGBA16F
 layout(local_size_x = TILE, local_size_y = TILE) in;

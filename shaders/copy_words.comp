@@ -1,5 +1,5 @@
-// Copies the first words of a buffer. A copy command of OpenGL would take longer, because it makes the GPU change between
-// its engines.
+// Copies the first words of a buffer. A copy command of OpenGL would take longer, because it makes the GPU switch from
+// its compute engine to its copy engine.
 //   source       (in)   [word_count]
 //   destination  (out)  [word_count]
 layout(local_size_x = WORKGROUP_SIZE) in;

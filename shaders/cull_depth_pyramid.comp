@@ -1,9 +1,9 @@
-// Builds the depth pyramid (Hi-Z): each texel is the farthest depth of 2 x 2 texels of the next finer level. The farthest
-// depth is the smallest, because depth is 1 at the near plane and 0 at the far plane. The levels are stored one after
-// another, finest first, each with half the width and height, rounded up. A workgroup reduces 16 x 16 texels to 8 x 8,
-// 4 x 4, 2 x 2 and 1, so a dispatch computes four further levels. The first dispatch (FROM_DEPTH) also writes level 0, the
-// minimum of each pixel's samples. The second dispatch reads level 4 and computes levels 5 to 8. Texels outside the image
-// count as 1, so that they do not change a minimum.
+// Builds the depth pyramid (Hi-Z): each texel is the farthest depth of 2 x 2 texels of the next finer level. The
+// farthest depth is the smallest, because depth is 1 at the near plane and 0 at the far plane. The levels are stored
+// one after another, finest first, each with half the width and height, rounded up. A workgroup reduces 16 x 16 texels
+// to 8 x 8, 4 x 4, 2 x 2 and 1, so a dispatch computes four further levels. The first dispatch (FROM_DEPTH) also writes
+// level 0, the minimum of each pixel's samples. The second dispatch reads level 4 and computes levels 5 to 8. Texels
+// outside the image count as 1, so that they do not change a minimum.
 layout(local_size_x = 16, local_size_y = 16) in;
 layout(location = 0) uniform int size_packed; // width in the lower 16 bits, height in the upper 16
 layout(std430, binding = 4) buffer DepthPyramid { float depths[]; };

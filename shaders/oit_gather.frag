@@ -49,8 +49,8 @@ void insert_id(uint first_record, uint depth, uint id_and_coverage) {
 void main() {
     float alpha = fragment_alpha(material_of(current_triangle()));
     ivec2 pixel = ivec2(gl_FragCoord.xy);
-    // Depths are compared as unsigned integers, so `abs` turns -0 (bits 0x80000000) into 0. gl_FragCoord.z decreases with
-    // the distance, the depth of a record increases.
+    // Depths are compared as unsigned integers, so `abs` turns -0 (bits 0x80000000) into 0. gl_FragCoord.z decreases
+    // with the distance, the depth of a record increases.
     uint depth = floatBitsToUint(1.0) - floatBitsToUint(abs(clamp(gl_FragCoord.z, 0.0, 1.0)));
     uint id_and_coverage = uint(current_triangle()) + 1u << 4 | sample_coverage();
     if (!(alpha > 0.0)) return;

@@ -24,8 +24,8 @@ void main() {
 #ifdef CASCADES
     map_position.xy = to_cascade(map_position.xy, layer);
 #endif
-    // Depth is reversed, as for the camera: 1 nearest to the sun. A vertex that is not finite is placed outside the view
-    // volume, as in `to_clip`.
+    // Depth is reversed, as for the camera: 1 nearest to the sun. A vertex that is not finite is placed outside the
+    // view volume, as in `to_clip`.
     bool is_not_finite = any(isnan(map_position)) || any(isinf(map_position));
     vec4 clip = vec4(2.0 * map_position.xy - 1.0, 1.0 - map_position.z, 1.0);
     gl_Position = is_not_finite ? vec4(0.0, 0.0, -2.0, 1.0) : clip;

@@ -1,5 +1,5 @@
 // Converts the visibility keys of the compute rasterizer to ids.
-//   keys     (in)   [height][width]  uvec2, top row first: triangle and inverted bits of its depth; all ones without a triangle
+//   keys     (in)   [height][width]  uvec2, top row first: triangle, inverted bits of its depth; all ones if empty
 //   ids_out  (out)  [height][width]  R32UI, bottom row first
 layout(local_size_x = TILE, local_size_y = TILE) in;
 layout(std430, binding = 0) readonly buffer Keys { uvec2 keys[]; };

@@ -1,7 +1,7 @@
-// Inputs and results of triangle culling. A group contains the triangles of one indirect draw. A workgroup tests a block:
-// WORKGROUP_SIZE triangles of one group. A superblock is SUPERBLOCK consecutive blocks of one group. Block indices are
-// padded, so that each group begins with a new superblock; no workgroup runs for the padding. Twins: `CullUniforms` and
-// `CullUniforms::empty_draws` in src/render/layout/cull.rs.
+// Inputs and results of triangle culling. A group contains the triangles of one indirect draw. A workgroup tests a
+// block: WORKGROUP_SIZE triangles of one group. A superblock is SUPERBLOCK consecutive blocks of one group. Block
+// indices are padded, so that each group begins with a new superblock; no workgroup runs for the padding. Twins:
+// `CullUniforms` and `CullUniforms::empty_draws` in src/render/layout/cull.rs.
 //   commands  [MAX_GROUPS][5]       indirect draws: index count, instances, first index, base vertex, base instance
 //   totals    [superblocks]         number of visible triangles of the superblock
 //   bits      [blocks][MASK_WORDS]  one bit per triangle: whether it is visible

@@ -1,7 +1,7 @@
 // Alpha of a fragment: alpha of the material times alpha of the texel.
 #ifdef TEXTURES
-// Centroid sampling: the center of a pixel at the edge of a triangle may lie outside of the triangle. Extrapolation to
-// this center could give wrong texture coordinates.
+// Centroid sampling: the center of a pixel at the edge of a triangle may lie outside of the triangle. Texture
+// coordinates extrapolated to this center could be wrong.
 centroid in vec2 uv_image;
 #endif
 

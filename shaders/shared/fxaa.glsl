@@ -1,7 +1,7 @@
-// Anti-aliasing of images with one sample per pixel, after Lottes 2009, "FXAA" (NVIDIA white paper). At an edge in luma,
-// the shader searches both ends of the edge along its row of pixels. It blends the pixel with its neighbor across the
-// edge by the area that a straight line between the ends covers. Edges are detected in perceptual luma but linear light
-// is blended, as in multisampling. Pixels without an edge do not change.
+// Anti-aliasing of images with one sample per pixel, after Lottes 2009, "FXAA" (NVIDIA white paper). At an edge in
+// luma, the shader searches both ends of the edge along its row of pixels. It blends the pixel with its neighbor across
+// the edge by the area that a straight line between the ends covers. Edges are detected in perceptual luma but linear
+// light is blended, as in multisampling. Pixels without an edge do not change.
 
 // Minimum contrast of an edge: a fraction of the maximum luma of the pixel and its neighbors, and an absolute luma.
 // Chosen for the least error of the tree scene's image against 8 x 8 samples per pixel.
@@ -17,9 +17,9 @@ ivec2 clamp_to_image(ivec2 pixel) { return clamp(pixel, ivec2(0), textureSize(sc
 // Perceptual luma, 0 to 1: the square root approximates the sRGB curve.
 float luma(ivec2 pixel) { return sqrt(dot(texelFetch(scene_color, clamp_to_image(pixel), 0).rgb, vec3(0.2126, 0.7152, 0.0722))); }
 
-// Searches the end of a pixel's edge in one direction: where the mean luma across the edge differs from `edge_mean` by
-// at least `tolerance`.
-// x of the result: distance from the pixel's center in pixels; y: the difference at the end.
+// Searches the end of a pixel's edge in one direction: the first pixel at which the mean luma across the edge differs
+// from `edge_mean` by at least `tolerance`. x of the result: distance from the pixel's center in pixels; y: the
+// difference at the end.
 vec2 find_edge_end(ivec2 pixel, ivec2 edge_direction, ivec2 across_edge, float edge_mean, float tolerance) {
     float difference = 0.0;
     int steps = 0;
@@ -59,9 +59,9 @@ vec3 fxaa_color(ivec2 pixel) {
     vec2 forward_end = find_edge_end(pixel, edge_direction, across_edge, edge_mean, tolerance);
     vec2 backward_end = find_edge_end(pixel, -edge_direction, across_edge, edge_mean, tolerance);
     vec2 nearest_end = forward_end.x < backward_end.x ? forward_end : backward_end;
-    // The smoothed edge is a straight line between the two ends of the pixel staircase. It enters this pixel only in the half
-    // next to the nearest end, and only if the luma of the pixel's side of the edge changes at that end, not the luma of
-    // the other side. The difference then has the opposite sign of this pixel's luma minus the mean.
+    // The smoothed edge is a straight line between the two ends of the pixel staircase. It enters only pixels in the
+    // half next to the nearest end, and only on the side of the edge whose luma changes at that end. That side is the
+    // pixel's own if the difference at the end and `m - edge_mean` have opposite signs.
     float blend_weight = 0.0;
     if ((nearest_end.y < 0.0) != (m < edge_mean)) blend_weight = 0.5 - nearest_end.x / (forward_end.x + backward_end.x);
     // A pixel that differs from all its neighbors, such as a thin line or a leaf smaller than a pixel.

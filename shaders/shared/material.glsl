@@ -6,7 +6,8 @@
 //                         specular color, exponent
 //                         texture array and layer of the color texture, alpha, cutoff
 //   triangle_materials  [triangles]                   R32UI; not read if all triangles of the draw have one material
-// Both are buffer textures, because a software rasterizer fetches eight texels at once, but storage words one by one.
+// Both are buffer textures, because a software rasterizer fetches eight texels at once, but reads storage buffers word
+// by word.
 struct Material {
     vec4 ambient;   // w: alpha
     vec4 diffuse;   // w: cutoff of a mask, or the alpha from which blended triangles are drawn as opaque

@@ -6,10 +6,9 @@ layout(std430, binding = 2) readonly buffer InnerEdgeBlock { uint inner_edges[];
 #endif
 
 // Part of a pixel that the lines of a triangle cover. For the corners b and c relative to the image point, (b x c).z is
-// zero where the image point is on the edge from b to c, and is linear in the image point: its quotient by the length
-// of its gradient is the distance to the edge. The same function at corner a gives the height of the triangle over the
-// edge. Lines fade out where a triangle is lower than four widths, because the lines of smaller triangles would cover
-// the surface.
+// linear in the image point, and zero on the edge from b to c. Divided by the length of its gradient, it is the
+// distance to that edge. At corner a, this distance is the height of the triangle over the edge. Lines fade out where a
+// triangle is lower than four widths, because the lines of smaller triangles would cover the surface.
 float edge_coverage(Triangle triangle, int triangle_index, vec2 pixel_size) {
     vec3 a = triangle.clip[0], b = triangle.clip[1], c = triangle.clip[2];
     float scale = 1.0 / max(max(abs(a.z), abs(b.z)), max(abs(c.z), 1e-30));

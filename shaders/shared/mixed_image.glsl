@@ -1,6 +1,6 @@
 // Lookup in an image of a mixed texture array: its images have several sizes and may be smaller than its layers. An
-// image and its mipmap levels begin at the first texel of the layer and of its levels. Repeats at the edges of the image
-// as GL_REPEAT does at those of a layer.
+// image and its mipmap levels begin at the first texel of the layer and of its levels. Repeats at the edges of the
+// image as GL_REPEAT does at those of a layer.
 //   image_anisotropy    largest number of lookups along the longer axis of a pixel's footprint
 //   IMAGE_LEVEL_BLEND   defined if two mipmap levels are blended
 vec4 bilinear_image_texel(sampler2DArray images, int layer, ivec2 size, vec2 uv, int level) {

@@ -1,8 +1,8 @@
 // Phong shading (equation 3.12) with clamped dot products and unshadowed ambient light:
 //   C = skylight Ca + s_f sunlight ((n . v_l) Cd + (v_e' . v_l)^k Cs),  v_e' = 2 (v_e . n) n - v_e,
-// with v_l to the sun, v_e to the eye, and s_f the sun visibility. In the thesis v_e points away from the eye, which
-// would put the highlight on the far side of the surface. If the material has a color image, its texel multiplies Ca
-// and Cd (equation 3.14, whose printed s_tex is inverted).
+// with v_l to the sun, v_e to the eye, s_f the sun visibility, and the ambient, diffuse and specular colors Ca, Cd and
+// Cs. In the thesis v_e points away from the eye, which would put the highlight on the far side of the surface. If the
+// material has a color image, its texel multiplies Ca and Cd (equation 3.14, whose printed s_tex is inverted).
 vec3 safe_normalize(vec3 v) { return v * inversesqrt(max(dot(v, v), 1e-30)); }
 
 #ifdef NORMAL_MAPS

@@ -25,10 +25,10 @@ vec2 receiver_plane_gradient(vec3 normal, int layer) {
 
 #ifdef SHADOW_VARIANCE
 // Bias that compensates for ground depth leaking into the blurred mean near a contact line, where a surface meets the
-// ground. The leak would pull the mean towards the sun, although the ground casts no shadow. Let h be the height above the line in standard deviations
-// of the blur, and k the depth difference of surface and ground per standard deviation. The ground shifts the mean by
-// k (phi(h) - h Q(h)), with the density phi and the upper tail Q of the normal distribution. The bias
-// 0.4 k (1 - h / 2)^2 is an upper bound of this shift up to h = 1.9.
+// ground. The leak would pull the mean towards the sun, although the ground casts no shadow. Let h be the height above
+// the line in standard deviations of the blur, and k the depth difference of surface and ground per standard deviation.
+// The ground shifts the mean by k (phi(h) - h Q(h)), with the density phi and the upper tail Q of the normal
+// distribution. The bias 0.4 k (1 - h / 2)^2 is an upper bound of this shift up to h = 1.9.
 float contact_bias(vec3 position, int layer, vec3 normal) {
     vec2 map_position = position.xy;
 #ifdef CASCADES
@@ -53,8 +53,9 @@ float shadow_visibility(vec3 position, int layer, vec3 normal) {
 }
 #else
 // Bias of the comparison. A texel's depth is compared with the depth of the surface plane at the texel's center, so a
-// slope does not shadow itself. A caster must be in front of that plane by at least the side of a texel. This covers
-// curved surfaces, whose triangles deviate from their normals. 4e-7 is for the rounding of depth.
+// slope does not shadow itself. A caster must be in front of that plane by at least the side of a texel, because on
+// curved surfaces the triangles deviate from the plane that the normal defines. The term 4e-7 covers the rounding of
+// depth.
 float depth_bias(int layer) {
     vec3 light_depth_gradient = vec3(frame.shadow_from_world[0].z, frame.shadow_from_world[1].z, frame.shadow_from_world[2].z);
     vec2 layer_scale = cascade_scale(layer);

@@ -1,5 +1,5 @@
-// List of pixel tiles, in any order, and the arguments of an indirect dispatch over them: one workgroup per tile, in rows
-// of TILES_PER_ROW workgroups.
+// List of pixel tiles, in any order, and the arguments of an indirect dispatch over them: one workgroup per tile, in
+// rows of TILES_PER_ROW workgroups.
 layout(std430, binding = 1) buffer TileList {
     uint workgroup_counts[3];  // x, y, z of the dispatch
     uint count;

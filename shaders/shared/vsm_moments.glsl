@@ -41,8 +41,8 @@ vec2 load_moments(ivec2 texel, int side) {
 #else
     ivec2 inside_texel = clamp(texel, ivec2(0), ivec2(side - 1));
     vec2 sums = texelFetch(source, ivec3(inside_texel, 0), 0).xy;
-    // A row outside the map has the moments of the nearest row, with the depth difference d of the ground added to m:
-    // (m + d)^2 = m^2 + d (2 m + d).
+    // A row outside the map has the moments of the nearest row, shifted by the depth difference d of the ground between
+    // the two rows: m + d, and (m + d)^2 = m^2 + d (2 m + d).
     float depth_change = ground_moment(texel, side) - ground_moment(inside_texel, side);
     return sums + depth_change * vec2(1.0, 2.0 * sums.x + depth_change);
 #endif
