@@ -27,15 +27,17 @@
 //! ([`PendingFrame`]).
 //!
 //! A large frame, and the first frame of a scene, is submitted in steps, so that other scenes can be drawn in between
-//! ([`PartialFrame`]). For the same reason, the textures and programs of a scene can be prepared one by one ([`ScenePreparation`]).
+//! ([`PartialFrame`]). For the same reason, the textures and programs of a scene can be prepared one by one
+//! ([`ScenePreparation`]).
 //!
 //! Two outputs are drawn only on request, with programs and buffers that are created on first use. Picking finds the
 //! triangles at a few pixels ([`PendingPick`]). AOV (arbitrary output variable) readbacks deliver numbers instead of
 //! colors ([`AovImage`]).
 //!
 //! Shading is deferred: the rasterizer writes only ids, and each visible triangle is shaded once per pixel.
-//! Multisampled id images are not cleared; an id is valid where the depth is less than 1. A frame draws only into the
-//! screen region that the bounds of the vertices can cover, and clears only the region that earlier frames wrote.
+//! Multisampled id images are not cleared; an id is valid where the depth is above 0, the value of the far plane. A
+//! frame draws only into the screen region that the bounds of the vertices can cover, and clears only the region that
+//! earlier frames wrote.
 
 #![cfg_attr(not(test), deny(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::print_stdout))]
 

@@ -167,8 +167,8 @@ impl RenderStage {
 pub enum TimeKey {
     Stage(RenderStage),
     /// Passes that are timed together have the name of one of them. "visibility" includes the conversion of keys,
-    /// "cull" the occluders, "blended" the fragment lists, "shade" the background, and "raster shadow" the visibility if
-    /// the compute rasterizer draws both.
+    /// "cull" the occluders, "blended" the fragment lists, "shade" the background, and "raster shadow" the visibility
+    /// if the compute rasterizer draws both.
     Pass(Pass),
 }
 

@@ -62,8 +62,8 @@ const PROJECTION_MARGIN: f64 = 1.0;
 /// multisampling.
 const DIRTY_MARGIN: u32 = 2;
 
-/// The first row of a band is a multiple of this number of rows. llvmpipe rasterizes squares of 64 x 64 pixels, so a draw
-/// that exceeds the scissor (see [`DIRTY_MARGIN`]) does not reach into another band. It is also a multiple of the
+/// The first row of a band is a multiple of this number of rows. llvmpipe rasterizes squares of 64 x 64 pixels, so a
+/// draw that exceeds the scissor (see [`DIRTY_MARGIN`]) does not reach into another band. It is also a multiple of the
 /// workgroup sizes of all passes that work on bands.
 const BAND_ALIGNMENT: u32 = 64;
 
@@ -73,8 +73,8 @@ impl Band {
         Self { first_row: 0, rows: image_rows, image_rows }
     }
 
-    /// Divides an image into bands of at most `max_pixels` pixels, but at least [`BAND_ALIGNMENT`] rows, from the bottom
-    /// to the top.
+    /// Divides an image into bands of at most `max_pixels` pixels, but at least [`BAND_ALIGNMENT`] rows, from the
+    /// bottom to the top.
     pub(crate) fn divide([width, height]: [u32; 2], max_pixels: u64) -> Vec<Self> {
         let max_rows = u32::try_from(max_pixels / u64::from(width.max(1))).unwrap_or(u32::MAX);
         if height <= max_rows {
@@ -153,8 +153,8 @@ impl Region {
 }
 
 impl DirtyRegion {
-    /// Returns the dirty region, or none if all pixels are dirty. With the last band of a frame, replaces it by `region`,
-    /// the region of all bands, with a margin.
+    /// Returns the dirty region, or none if all pixels are dirty. With the last band of a frame, replaces it by
+    /// `region`, the region of all bands, with a margin.
     pub(crate) fn replace(&self, region: Region, band: Band) -> Option<Region> {
         let dirty_region = self.0.get();
         if band.is_last() {

@@ -1,5 +1,5 @@
-//! EGL without a window: enumerates the devices of this machine and creates surfaceless OpenGL 4.3 core contexts. Drivers
-//! may create a later version; `gl/clip_control.rs` needs 4.5 or an extension.
+//! EGL without a window: enumerates the devices of this machine and creates surfaceless OpenGL 4.3 core contexts.
+//! Drivers may create a later version; `gl/clip_control.rs` needs 4.5 or an extension.
 //!
 //! Displays are initialized once and never terminated: EGL returns the same display of a device to all callers in a
 //! process, so terminating it would invalidate the other renderers' contexts.

@@ -1,5 +1,5 @@
-//! Ring of readback slots of one render target. A slot has the memory in which the pixels of a frame leave the device. It
-//! grows on demand.
+//! Ring of readback slots of one render target. A slot has the memory in which the pixels of a frame leave the device.
+//! It grows on demand.
 
 use std::cell::{Cell, RefCell};
 use std::collections::VecDeque;
@@ -62,8 +62,8 @@ impl ReadbackRing {
         })
     }
 
-    /// Takes a free slot for a frame, or allocates one. If all slots are in use, waits at most `limit` for the reader of
-    /// the oldest slot without a frame in flight. A reader is a thread that reads pixels.
+    /// Takes a free slot for a frame, or allocates one. If all slots are in use, waits at most `limit` for the reader
+    /// of the oldest slot without a frame in flight. A reader is a thread that reads pixels.
     ///
     /// # Errors
     /// `Busy` when [`MAX_FRAMES_IN_FLIGHT`] frames are in flight or the reader exceeds `limit`; `Fault` of OpenGL.

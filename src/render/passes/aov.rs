@@ -28,8 +28,7 @@ use modalcast_model::error::{Result, fault};
 /// Words that one parallel task converts: enough to hide the cost of starting the task.
 const WORDS_PER_TASK: usize = 4096;
 
-/// Field to read back. All fields ignore blended triangles. Only `DepthWithGround` contains the
-/// ground.
+/// Field to read back. All fields ignore blended triangles. Only `DepthWithGround` contains the ground.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Aov {
     /// f32: meters along the view axis, not along the ray; infinite where no triangle is visible.

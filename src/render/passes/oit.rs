@@ -122,8 +122,8 @@ impl<'a> OitFrame<'a> {
     }
 
     /// Draws all blended triangles in one phase. `PHASE_FILL_IDS` is needed only if the fragments exceed the budget.
-    /// Therefore it is drawn indirectly: the allocate program sets its number of instances to 1 if it is needed, else to
-    /// 0.
+    /// Therefore it is drawn indirectly: the allocate program sets its number of instances to 1 if it is needed, else
+    /// to 0.
     fn gather(&self, recorder: &mut PassRecorder<'_>, band: Band, phase: i32) {
         let Self { buffers, target, programs, region } = *self;
         let (gl, triangles) = (recorder.gl, triangle_set(buffers));

@@ -82,8 +82,8 @@ pub(crate) fn read_visibility(
     copy_words(recorder, &target.readback_source, &word_pass)
 }
 
-/// Copies as many rows of a frame as a band has to a staging buffer, unless the frame has a shared picture. With the last
-/// band, also copies the fragment and culling counters behind the pixels.
+/// Copies as many rows of a frame as a band has to a staging buffer, unless the frame has a shared picture. With the
+/// last band, also copies the fragment and culling counters behind the pixels.
 pub(crate) fn copy_frame(
     recorder: &PassRecorder<'_>,
     frame: &FrameContext<'_>,

@@ -1,5 +1,5 @@
-//! Tests of frames and AOVs that are drawn in bands: the pixels are those of a frame without bands, also if other scenes
-//! are drawn between the bands.
+//! Tests of frames and AOVs that are drawn in bands: the pixels are those of a frame without bands, also if other
+//! scenes are drawn between the bands.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -95,8 +95,8 @@ fn looks() -> Vec<(&'static str, RenderSettings)> {
     ]
 }
 
-/// Draws a frame step by step. Between the steps draws, picks and reads another scene. Returns the image, its statistics
-/// and the number of steps.
+/// Draws a frame step by step. Between the steps draws, picks and reads another scene. Returns the image, its
+/// statistics and the number of steps.
 fn draw_in_steps(
     renderer: &mut Renderer,
     random_scene: &RandomScene,
@@ -172,8 +172,8 @@ fn missing_band_changes_the_pixels() {
         let pending_frame = renderer.finish_frame(partial_frame).expect("finishes");
         changed_count += usize::from(renderer.read_image(pending_frame).expect("draws").rgba != expected);
     }
-    // At least three of the four bands of the visibility, the shading and the encoding, and the readback. Only the sky may
-    // be visible in the fourth.
+    // At least three of the four bands of the visibility, the shading and the encoding, and the readback. Only the sky
+    // may be visible in the fourth.
     assert!(changed_count >= 10, "{changed_count} of {step_count}");
 }
 

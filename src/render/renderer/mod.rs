@@ -49,11 +49,11 @@ const MAX_SIDE: u32 = 8192;
 const MAX_TARGETS: usize = 4;
 /// Maximum time that dropping a renderer waits for each thread that still copies pixels.
 const READER_TIMEOUT: Duration = Duration::from_secs(1);
-/// What hardware draws without a break: a frame of 3840 x 2160 pixels with four samples each. The cost of a large frame is
-/// that of its samples.
+/// The most that hardware draws without a break: a frame of 3840 x 2160 pixels with four samples each. The cost of a
+/// large frame is that of its samples.
 const HARDWARE_BAND_LIMIT: BandLimit = BandLimit { max_pixels: u64::MAX, max_samples: 1 << 25 };
-/// What a software renderer draws without a break: a frame of 1920 x 1080 pixels. Most of the cost is that of shading each
-/// pixel once.
+/// The most that a software renderer draws without a break: a frame of 1920 x 1080 pixels. Most of the cost is that of
+/// shading each pixel once.
 const SOFTWARE_BAND_LIMIT: BandLimit = BandLimit { max_pixels: 1 << 21, max_samples: u64::MAX };
 /// Time limit for one frame.
 const FRAME_TIMEOUT: Duration = Duration::from_secs(60);
@@ -99,9 +99,9 @@ struct LastFrame {
 impl Renderer {
     /// Creates a surfaceless context and makes it current on this thread.
     ///
-    /// On a GPU, a process should have one renderer at a time: on an H200 with driver 580.159, frames in flight were wrong
-    /// while other threads of the process had contexts (25 of 30 frames, in every run), but right with one context in each
-    /// of four processes.
+    /// On a GPU, a process should have one renderer at a time: on an H200 with driver 580.159, 25 of 30 frames in
+    /// flight had wrong pixels, in every run, while other threads of the process had contexts. With one context in each
+    /// of four processes, all frames were right.
     ///
     /// # Errors
     /// `Unavailable` with the name of the missing library or vendor file.
@@ -156,9 +156,9 @@ impl Renderer {
         &self.stats
     }
 
-    /// Draws later frames into memory of CUDA, whose copy engine moves the pixels to the host. Before that, checks that both
-    /// APIs see what the other one writes. If the check fails, logs the reason, and OpenGL copies the pixels.
-    /// [`RendererInfo::pixel_readback`] tells the result.
+    /// Draws later frames into memory of CUDA, whose copy engine moves the pixels to the host. Before that, checks that
+    /// both APIs see what the other one writes. If the check fails, logs the reason, and OpenGL copies the pixels.
+    /// [`RendererInfo::pixel_readback`] holds the result.
     ///
     /// # Errors
     /// `DeviceLost`.
@@ -192,9 +192,9 @@ impl Renderer {
         self.blur_method = method;
     }
 
-    /// Sets the maximum number of samples (pixels times samples per pixel) that are drawn without a break. Larger frames
-    /// and AOVs are divided into bands of rows. The pixels do not depend on the bands. By default, hardware draws 2^25
-    /// samples without a break, and a software renderer 2^21 pixels.
+    /// Sets the maximum number of samples (pixels times samples per pixel) that are drawn without a break. Larger
+    /// frames and AOVs are divided into bands of rows. The pixels do not depend on the bands. By default, hardware
+    /// draws 2^25 samples without a break, and a software renderer 2^21 pixels.
     pub fn set_max_band_samples(&mut self, max_band_samples: u64) {
         self.band_limit = BandLimit { max_pixels: u64::MAX, max_samples: max_band_samples };
     }
@@ -416,8 +416,8 @@ impl Renderer {
         Err(invalid("frame.size", format!("1 to {limit} pixels a side"), got))
     }
 
-    /// Frees the render targets that no frame has used for this time. Mesa keeps their memory until the next frame replaces
-    /// them in its state.
+    /// Frees the render targets that no frame has used for the time `unused`. Mesa frees their memory only when the
+    /// next frame binds other targets.
     ///
     /// # Errors
     /// `Fault` if the context cannot be made current.

@@ -1,11 +1,11 @@
-//! Frames that are submitted in steps (draw steps, not steps of a simulation). Between two steps, the device can execute
-//! commands of other scenes.
+//! Frames that are submitted in steps (draw steps, not steps of a simulation). Between two steps, the device can
+//! execute commands of other scenes.
 //!
-//! A frame within the limit of [`Renderer::set_max_band_samples`] has one step for each pass, and is meant to be submitted
-//! without a break, unless it is the first one of its scene: drivers finish the compilation of a program when it is used
-//! for the first time. A larger frame is divided into bands of rows. Its steps are the passes that work on the complete
-//! frame, and each band of the other passes. A pass ends with its last band before the next pass begins, so the inputs of
-//! a pass are complete, and the pixels do not depend on the bands.
+//! A frame within the limit of [`Renderer::set_max_band_samples`] has one step for each pass, and is meant to be
+//! submitted without a break, unless it is the first one of its scene: drivers finish the compilation of a program when
+//! it is used for the first time. A larger frame is divided into bands of rows. Its steps are the passes that work on
+//! the complete frame, and each band of the other passes. A pass ends with its last band before the next pass begins,
+//! so the inputs of a pass are complete, and the pixels do not depend on the bands.
 //!
 //! The target of the frame is not in the cache until the frame is submitted, so other frames cannot use it. The buffers
 //! of the scene must not change until then.
@@ -96,8 +96,8 @@ impl PartialFrame {
         self.is_divided
     }
 
-    /// Whether commands of other scenes should be executed between the steps, because the frame is large or the first one
-    /// of its scene.
+    /// Whether commands of other scenes should be executed between the steps, because the frame is large or the first
+    /// one of its scene.
     pub const fn has_breaks(&self) -> bool {
         self.has_breaks
     }
@@ -107,8 +107,8 @@ impl PartialFrame {
         &self.info
     }
 
-    /// Waits at most `limit` for the last submitted step of a frame with breaks. Returns whether it is complete. Submitting
-    /// the next step only then keeps the queue of the device short.
+    /// Waits at most `limit` for the last submitted step of a frame with breaks. Returns whether it is complete.
+    /// Submitting the next step only then keeps the queue of the device short.
     pub fn is_ready_within(&self, limit: Duration) -> bool {
         self.fence.as_ref().is_none_or(|fence| fence.is_done_within(limit))
     }
@@ -254,8 +254,8 @@ impl Renderer {
         })
     }
 
-    /// Draws the passes of the compute rasterizer. Returns no timer if there is none or it fails; OpenGL then draws these
-    /// passes in later steps.
+    /// Draws the passes of the compute rasterizer. Returns no timer if there is none or it fails; OpenGL then draws
+    /// these passes in later steps.
     fn record_compute_raster(
         &self,
         recorder: &mut PassRecorder<'_>,

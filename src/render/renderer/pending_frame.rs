@@ -33,8 +33,8 @@ pub struct PendingFrame {
     pub(super) first_wait: Cell<Option<Instant>>,
 }
 
-/// Pixels of a finished frame in host-readable memory. Any thread may read them. No other frame can use the memory while
-/// this value exists, so copy the pixels soon, or let [`MappedPixels::into_shared_image`] decide.
+/// Pixels of a finished frame in host-readable memory. Any thread may read them. No other frame can use the memory
+/// while this value exists, so copy the pixels soon, or let [`MappedPixels::into_shared_image`] decide.
 #[derive(Debug)]
 pub struct MappedPixels {
     pub(super) width: u32,

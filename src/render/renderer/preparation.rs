@@ -146,8 +146,8 @@ impl Renderer {
         Ok(())
     }
 
-    /// Keeps the textures and programs of a finished preparation until the scene is loaded or dropped. The programs of a
-    /// frame stay in the cache.
+    /// Keeps the textures and programs of a finished preparation until the scene is loaded or dropped. The programs of
+    /// a frame stay in the cache.
     pub fn finish_preparation(&mut self, preparation: ScenePreparation) {
         let ScenePreparation { scene, textures, compiled, .. } = preparation;
         let Some(textures) = textures else { return };

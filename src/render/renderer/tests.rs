@@ -125,7 +125,8 @@ fn frames_in_flight_are_limited_per_target() {
     assert!(!renderer.read_visibility().expect("ids of the last frame").is_empty());
 }
 
-/// Draws a frame, so that the renderer has its target, and lets later frames of this target use emulated shared pictures.
+/// Draws a frame, so that the renderer has its target, and lets later frames of this target use emulated shared
+/// pictures.
 fn use_emulated_pictures(renderer: &mut Renderer, buffers: &SceneBuffers, params: &FrameParams) {
     renderer.draw(buffers, params).expect("draws");
     let target = renderer.targets.last_mut().expect("drawn");

@@ -303,8 +303,8 @@ impl SceneBuffers {
         Ok(SampleCountPrograms { has_edges, ..programs })
     }
 
-    /// Allocates the marks of inner edges, which frames with lines along mesh edges read, unless they exist or the scene
-    /// has no inner edges.
+    /// Allocates the marks of inner edges, which frames with lines along mesh edges read, unless they exist or the
+    /// scene has no inner edges.
     pub(crate) fn ensure_inner_edges(&self, gl: &Rc<Gl>) -> Result<()> {
         if !self.options.inner_edges || self.inner_edges.get().is_some() {
             return Ok(());
@@ -487,8 +487,8 @@ impl SceneBuffers {
         }
     }
 
-    /// Lets a deformer write vertices into memory of its own, which OpenGL imports. `copy_words` copies the vertices to the
-    /// vertex buffers.
+    /// Lets a deformer write vertices into memory of its own, which OpenGL imports. `copy_words` copies the vertices to
+    /// the vertex buffers.
     pub(crate) fn enable_vertex_import(&mut self, gl: &Rc<Gl>, copy_words: Rc<Program>) {
         let GeometryBuffers { positions, normals, tangents, .. } = &self.geometry;
         let destinations = [positions, normals].into_iter().chain(tangents).map(Buffer::alias).collect();

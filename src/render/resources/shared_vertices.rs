@@ -1,4 +1,4 @@
-//! Vertices in memory that OpenGL shares with a deformer. At the begin of a frame, OpenGL copies them to the vertex
+//! Vertices in memory that OpenGL shares with a deformer. At the beginning of a frame, OpenGL copies them to the vertex
 //! buffers of the scene, so that the deformer can write the memory again while the frame is drawn.
 
 use std::cell::RefCell;

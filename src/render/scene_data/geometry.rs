@@ -197,8 +197,8 @@ fn material_triangle_ranges<'a>(
     single_range.into_iter().chain(material_ranges)
 }
 
-/// Whether a triangle is drawn with its second and third corner exchanged. A mirroring placement reverses the winding of
-/// all triangles of its domain. Two reversals cancel each other.
+/// Whether a triangle is drawn with its second and third corner exchanged. A mirroring placement reverses the winding
+/// of all triangles of its domain. Two reversals cancel each other.
 pub(super) fn is_drawn_reversed(
     mesh: &modalcast_model::domain::Mesh,
     triangle: [u32; 3],

@@ -44,8 +44,8 @@ mod tests {
     use crate::scene_data::geometry::tests::squares;
     use modalcast_model::domain::{Material, Transform};
 
-    /// Squares of two triangles, whose diagonal is their only inner edge. Mirrored domains and double-sided triangles with
-    /// opposite winding are drawn with exchanged corners.
+    /// Squares of two triangles, whose diagonal is their only inner edge. Mirrored domains and double-sided triangles
+    /// with opposite winding are drawn with exchanged corners.
     #[test]
     fn marks_follow_the_drawn_corners() {
         let mut parts =

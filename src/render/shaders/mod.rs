@@ -232,8 +232,8 @@ impl ShaderOptions {
         .concat()
     }
 
-    /// GLSL function `shade_triangle`, with the lookups for the materials of these blend modes. `mesh_edges` is the source
-    /// of the lines along mesh edges, or empty.
+    /// GLSL function `shade_triangle`, with the lookups for the materials of these blend modes. `mesh_edges` is the
+    /// source of the lines along mesh edges, or empty.
     fn triangle_shading(&self, blend_modes: &[BlendMode], mesh_edges: &str) -> String {
         let material_lookups = self.material_lookups(blend_modes, UvDerivatives::Explicit);
         [&material_lookups, PHONG, BARYCENTRICS, TRIANGLE_FETCH, mesh_edges, TRIANGLE_SHADING].concat()

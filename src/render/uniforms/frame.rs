@@ -44,8 +44,8 @@ const _: () = assert!(size_of::<FrameUniforms>() == 384, "FrameUniforms differs 
 /// distance d. At the border it is exp(-36), so the rounded color is that of the horizon.
 const GROUND_EXTENT: f64 = 6.0;
 
-/// Vertices that lie less than this fraction of the diagonal below the ground count as on the ground: the largest error of
-/// deformed vertices.
+/// Vertices that lie less than this fraction of the diagonal below the ground count as on the ground: the largest error
+/// of deformed vertices.
 const GROUND_TOLERANCE: f64 = 1e-5;
 
 impl FrameUniforms {
@@ -109,8 +109,8 @@ impl FrameUniforms {
     }
 }
 
-/// Projection matrix of the camera for positions relative to `origin`. The bounds are those of both the deformed and the
-/// rest state, so that the fitted near plane changes rarely when the scene deforms.
+/// Projection matrix of the camera for positions relative to `origin`. The bounds are those of both the deformed and
+/// the rest state, so that the fitted near plane changes rarely when the scene deforms.
 fn clip_from_camera(scene: &Scene, params: &FrameParams, origin: [f64; 3]) -> Matrix4<f64> {
     let bounds = finite_bounds(scene, params);
     let rebased_camera = params.camera.relative_to(origin);
@@ -126,8 +126,8 @@ pub(crate) fn clip_from_positions(scene: &Scene, params: &FrameParams, origin: [
     clip_from_camera(scene, params, origin) * params.camera.relative_to(origin).camera_from_world()
 }
 
-/// Matrix from positions relative to `origin` to the clip space of the shadow map; z is 1 nearest to the sun and 0 at the
-/// far plane.
+/// Matrix from positions relative to `origin` to the clip space of the shadow map; z is 1 nearest to the sun and 0 at
+/// the far plane.
 pub(crate) fn shadow_clip_from_positions(
     scene: &Scene,
     look: &RenderSettings,
@@ -172,8 +172,8 @@ pub(crate) fn light_box_params(
 }
 
 /// Sides of a shadow map texel in world space: two vectors along x and y of the map, in scene units. None if the look
-/// has no shadow. Valid for positions relative to the scene's origin, and for the map of `scene.look`, which the renderer
-/// draws if the look leaves nothing to a preset.
+/// has no shadow. Valid for positions relative to the scene's origin, and for the map of `scene.look`, which the
+/// renderer draws if the look leaves nothing to a preset.
 pub fn shadow_texel_axes(scene: &Scene, params: &FrameParams) -> Option<[Vector3<f64>; 2]> {
     let shadow = scene.look.shadow?;
     let shadow_from_world = LightBox::fit(&light_box_params(scene, &scene.look, params, [0.0; 3])).shadow_from_world;
@@ -208,13 +208,13 @@ pub(crate) fn depth_below_ground(scene: &Scene, params: &FrameParams, origin: [f
     if is_below { depth * scene.unit } else { 0.0 }
 }
 
-/// Distance of the origin from the scene's origin, in diagonals of the rest bounds, from which the ground is centered at
-/// the current bounds. It is large, because the fade of the ground changes there.
+/// Distance of the origin from the scene's origin, in diagonals of the rest bounds, from which the ground is centered
+/// at the current bounds. It is large, because the fade of the ground changes there.
 const GROUND_FOLLOW_DISTANCE: f64 = 4096.0;
 
-/// Rest bounds relative to `origin`. If the scene moved far away ([`GROUND_FOLLOW_DISTANCE`]), the rest bounds are moved
-/// horizontally to the center of the current bounds. Their height above the world's origin does not change, because the
-/// ground is at their lower end.
+/// Rest bounds relative to `origin`. If the scene moved far away ([`GROUND_FOLLOW_DISTANCE`]), the rest bounds are
+/// moved horizontally to the center of the current bounds. Their height above the world's origin does not change,
+/// because the ground is at their lower end.
 fn rebased_rest_bounds(scene: &Scene, bounds: BoundingBox, origin: [f64; 3]) -> BoundingBox {
     let rest_bounds = scene.rest_bounds;
     let mut shift = -Vector3::from(origin);

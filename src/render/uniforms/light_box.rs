@@ -13,7 +13,7 @@ use super::MIN_SIZE;
 use modalcast_model::scene::{BoundingBox, OrientedBounds, UpAxis, light_axes};
 
 /// Maximum distance from the near plane to the ground at the corners of the map, in diagonals of the bounds. Without
-/// this limit, a grazing sun would move the far plane to infinity. Receivers beyond the far plane are still shaded
+/// this limit, a grazing sun would move the far plane to infinity. Points beyond the far plane are still shaded
 /// correctly.
 const MAX_GROUND_DEPTH: f64 = 8.0;
 

@@ -39,8 +39,8 @@ enum ClearValue {
 }
 
 impl Gl {
-    /// Binds a framebuffer, clears the band of it as `clear` states and sets the scissor, so that later draws affect only
-    /// the part of `region` in the band.
+    /// Binds a framebuffer, clears the band of it as `clear` states and sets the scissor, so that later draws affect
+    /// only the part of `region` in the band.
     pub(crate) fn begin_pass(&self, framebuffer: &Framebuffer, region: Region, band: Band, clear: ClearOp<'_>) {
         let Some(gl) = self.functions_or_skip() else { return };
         let [width, height] = region.frame_size().map(|side| side as i32);

@@ -5,8 +5,8 @@ use glow::HasContext as _;
 use super::super::egl::Context;
 use modalcast_model::error::{Error, Result, fault};
 
-/// Sets the clip volume of a context to 0 <= z <= w, with y upwards. By default it is -w <= z <= w, and OpenGL maps z / w
-/// to depth with an addition that would round reversed depth to a multiple of 2^-24.
+/// Sets the clip volume of a context to 0 <= z <= w, with y upwards. By default it is -w <= z <= w, and OpenGL maps z /
+/// w to depth with an addition that would round reversed depth to a multiple of 2^-24.
 ///
 /// # Errors
 /// `Unavailable` if the context has neither OpenGL 4.5 nor `GL_ARB_clip_control`.

@@ -89,8 +89,8 @@ impl MemoryObject {
         Ok(memory)
     }
 
-    /// Gives a buffer without storage its storage: the first `bytes` bytes of this memory, which must live as long as the
-    /// buffer.
+    /// Gives a buffer without storage its storage: the first `bytes` bytes of this memory, which must live as long as
+    /// the buffer.
     ///
     /// # Errors
     /// `Fault` when the memory is smaller, or OpenGL reports an error.
@@ -114,8 +114,8 @@ impl MemoryObject {
 
 impl Drop for MemoryObject {
     fn drop(&mut self) {
-        // SAFETY: this value owns the name. The buffer in the memory is already deleted, and commands in flight keep the
-        // memory until they are complete.
+        // SAFETY: this value owns the name. The buffer in the memory is already deleted, and commands in flight keep
+        // the memory until they are complete.
         self.gl.delete(|_| unsafe { (self.functions.delete)(1, &raw const self.name) });
     }
 }

@@ -127,8 +127,8 @@ impl Buffer {
         Self { object: Rc::new(BufferObject { gl: Rc::clone(gl), name, memory: None }), bytes }
     }
 
-    /// Creates a buffer of `bytes` bytes at the start of another API's memory of `allocated_bytes` bytes. The memory lives
-    /// at least as long as the buffer. OpenGL does not order its commands with those of the other API.
+    /// Creates a buffer of `bytes` bytes at the start of another API's memory of `allocated_bytes` bytes. The memory
+    /// lives at least as long as the buffer. OpenGL does not order its commands with those of the other API.
     ///
     /// # Errors
     /// `Fault` when the context cannot import memory, refuses this memory, or the memory is smaller than the buffer.
@@ -197,8 +197,8 @@ impl Buffer {
         unsafe { gl.bind_buffer_base(glow::SHADER_STORAGE_BUFFER, binding, Some(self.object.name)) }
     }
 
-    /// Binds a range of bytes as a storage buffer of shaders. `offset` is a multiple of 256, the largest alignment that a
-    /// context may demand.
+    /// Binds a range of bytes as a storage buffer of shaders. `offset` is a multiple of 256, the largest alignment that
+    /// a context may demand.
     pub(crate) fn bind_storage_range(&self, binding: u32, offset: u64, bytes: u64) {
         let gl = &self.object.gl;
         if offset.checked_add(bytes).is_none_or(|end| end > self.bytes) {

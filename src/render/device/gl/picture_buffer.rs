@@ -1,5 +1,5 @@
-//! A picture in memory that OpenGL shares with another API, which copies the pixels to the host. Copies are started when
-//! the host has seen OpenGL's fence, and are polled.
+//! A picture in memory that OpenGL shares with another API, which copies the pixels to the host. Copies are started
+//! when the host has seen OpenGL's fence, and are polled.
 
 use std::cell::RefCell;
 use std::rc::Rc;
@@ -74,8 +74,8 @@ impl PictureBuffer {
         }
     }
 
-    /// Waits for the copy and returns its first `bytes` bytes. The caller has waited for the fence after the last command
-    /// that writes the picture. `can_be_held`: whether a reader may keep the view for long.
+    /// Waits for the copy and returns its first `bytes` bytes. The caller has waited for the fence after the last
+    /// command that writes the picture. `can_be_held`: whether a reader may keep the view for long.
     ///
     /// # Errors
     /// `Fault` when the device cannot copy the picture.

@@ -19,8 +19,8 @@ pub(crate) struct PendingProgram {
     is_linked: Cell<bool>,
 }
 
-/// Lets the driver compile on up to `count` threads. NVIDIA's driver compiles on the calling thread until this is called.
-/// Does nothing without `GL_KHR_parallel_shader_compile` or its ARB version.
+/// Lets the driver compile on up to `count` threads. NVIDIA's driver compiles on the calling thread until this is
+/// called. Does nothing without `GL_KHR_parallel_shader_compile` or its ARB version.
 pub(super) fn set_compiler_threads(context: &Context, count: u32) {
     type MaxShaderCompilerThreads = unsafe extern "system" fn(u32);
     let addresses =
@@ -72,8 +72,8 @@ impl Gl {
 }
 
 impl PendingProgram {
-    /// Links the program when its shaders are compiled, because the driver would link it earlier on this thread. Returns
-    /// whether [`Self::finish`] would return without waiting. Always true without the extension.
+    /// Links the program when its shaders are compiled, because the driver would link it earlier on this thread.
+    /// Returns whether [`Self::finish`] would return without waiting. Always true without the extension.
     pub(crate) fn is_complete(&self) -> bool {
         let gl = &self.program.gl;
         let Some(functions) = gl.functions_or_skip().filter(|_| gl.limits.parallel_compile) else { return true };
