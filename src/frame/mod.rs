@@ -1,5 +1,5 @@
-//! Converts AOVs of values to color maps and encodes pixels as PNG or JPEG. All functions are pure, so they run off the device
-//! thread.
+//! Converts AOVs of values to color maps and encodes pixels as PNG or JPEG. All functions are pure, so they run off the
+//! device thread.
 
 mod colormap;
 mod legend;
@@ -23,8 +23,8 @@ pub fn draw_color_map(word_bytes: &[u8], samples: u32, size: [u32; 2], legend: &
     Ok(rgba)
 }
 
-/// Encodes RGBA8 sRGB pixels, top row first, as PNG on the calling thread. The file has no alpha channel if every pixel is
-/// opaque. [`PngLayout`] divides the work for several threads, with the same result.
+/// Encodes RGBA8 sRGB pixels, top row first, as PNG on the calling thread. The file has no alpha channel if every pixel
+/// is opaque. [`PngLayout`] divides the work for several threads, with the same result.
 ///
 /// # Errors
 /// `Fault` when a side is 0, the picture is too large for PNG, or `rgba` has too few pixels.

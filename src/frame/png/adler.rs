@@ -8,8 +8,9 @@ pub(super) const EMPTY: u32 = 1;
 
 /// The checksum of bytes with the checksum `first`, followed by `second_bytes` bytes with the checksum `second`.
 ///
-/// The low half of a checksum is 1 + the sum of the bytes. The high half is the sum of the low halves after each byte, so
-/// the low half before a byte, less the 1 that the second checksum already contains, counts once per byte.
+/// The low half of a checksum is 1 + the sum of the bytes. The high half is the sum of the low halves after each byte.
+/// Preceding bytes with the sum s therefore add s to the low half of the second checksum, and s times the number of its
+/// bytes to the high half.
 pub(super) fn combine(first: u32, second: u32, second_bytes: usize) -> u32 {
     let halves = |checksum: u32| (u64::from(checksum & 0xffff), u64::from(checksum >> 16));
     let ((first_sum, first_sums), (second_sum, second_sums)) = (halves(first), halves(second));

@@ -3,8 +3,8 @@
 /// Bytes that a buffer needs beyond its content, because the writer stores whole words.
 pub(super) const SLACK_BYTES: usize = 8;
 
-/// Writes bits to a buffer. Bits that do not fit are dropped, so the buffer must have the exact size of the content plus
-/// [`SLACK_BYTES`].
+/// Writes bits to a buffer. Bits that do not fit are dropped, so the buffer must have the exact size of the content
+/// plus [`SLACK_BYTES`].
 pub(super) struct BitWriter<'a> {
     bytes: &'a mut [u8],
     /// Number of bytes that are complete.

@@ -4,9 +4,10 @@ use super::bit_writer::{BitWriter, Bits};
 use super::huffman::HuffmanCode;
 use super::symbols::SYMBOLS;
 
-/// The order in which the lengths of the code for code lengths are written.
+/// The code lengths of a block are written as run-length symbols (0 to 15: one length, 16 to 18: repetitions), which
+/// have a Huffman code of their own. The lengths of that code come first, in this order of symbols.
 const LENGTH_ORDER: [usize; 19] = [16, 17, 18, 0, 8, 7, 9, 6, 10, 5, 11, 4, 12, 3, 13, 2, 14, 1, 15];
-/// Codes for code lengths have at most this length.
+/// Maximum length of the codes of run-length symbols.
 const MAX_LENGTH_BITS: usize = 7;
 /// Two distances have a code, of one bit each.
 const DISTANCE_LENGTHS: [u8; 2] = [1, 1];
@@ -17,11 +18,11 @@ const REPEAT_ZERO: usize = 17;
 /// Repeats length 0, 11 to 138 times.
 const REPEAT_ZERO_LONG: usize = 18;
 
-/// The header of a block: the lengths of its codes, which are Huffman coded themselves.
+/// The header of a block with codes of its own.
 pub(super) struct BlockHeader {
     /// The fields before the code lengths, in order.
     fields: Vec<Bits>,
-    /// The code lengths: the codes of their symbols, followed by their extra bits.
+    /// The code lengths: for each run-length symbol, its code followed by its extra bits.
     lengths: Vec<Bits>,
 }
 
@@ -39,7 +40,7 @@ impl BlockHeader {
         let field = |value: usize, count| Bits { value: value as u64, count };
         let mut fields = vec![
             field(usize::from(is_last), 1),
-            // The type of a block with its own code.
+            // Block type 2: a block with codes of its own.
             field(2, 2),
             field(symbol_count - 257, 5),
             field(DISTANCE_LENGTHS.len() - 1, 5),
@@ -59,7 +60,7 @@ impl BlockHeader {
     }
 }
 
-/// The symbols of a sequence of code lengths and their extra bits.
+/// The run-length symbols of a sequence of code lengths, with their extra bits.
 fn run_length_encode(lengths: &[u8]) -> Vec<(usize, Bits)> {
     let mut symbols = Vec::with_capacity(lengths.len());
     let repeat = |symbol, times: usize, min: usize, count| (symbol, Bits { value: (times - min) as u64, count });

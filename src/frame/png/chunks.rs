@@ -52,7 +52,8 @@ pub(super) fn head(width: u32, height: u32, channels: Channels) -> Vec<u8> {
     [&SIGNATURE, &header.close()[..], &OpenChunk::new(b"sRGB").with(&[0]).close()].concat()
 }
 
-/// The bytes of a file after its compressed pixels: the checksum of the zlib stream, in a chunk of its own, and the end.
+/// The bytes of a file after its compressed pixels: the checksum of the zlib stream, in a chunk of its own, and the
+/// end.
 pub(super) fn tail(adler: u32) -> Vec<u8> {
     [OpenChunk::idat().with(&adler.to_be_bytes()).close(), OpenChunk::new(b"IEND").close()].concat()
 }

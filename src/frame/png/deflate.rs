@@ -17,11 +17,12 @@ const MATCH_DISTANCE: Bits = Bits { value: 0, count: 1 };
 const MAX_STORED_BYTES: usize = 65_535;
 /// Type and length fields of a stored block.
 const STORED_HEADER_BYTES: usize = 5;
-/// The empty stored block after a strip, which fills its last byte. Its first three bits, all 0, come before these bytes.
+/// The length fields of an empty stored block, which ends every strip but the last one, so that it ends at a byte
+/// boundary. Before them come the block's type, three bits that are 0, and zeros up to the next byte.
 const EMPTY_STORED_BLOCK: [u8; 4] = [0, 0, 0xff, 0xff];
 
-/// Appends the deflate blocks of a strip to `output`. They end on a byte boundary and do not refer to other strips. They
-/// have at most 5 bytes more than `bytes` per started 65,535 bytes. The content of `segments` is replaced.
+/// Appends the deflate blocks of a strip to `output`. They end on a byte boundary and do not refer to other strips.
+/// They have at most 5 bytes more than `bytes` per started 65,535 bytes. The content of `segments` is replaced.
 pub(super) fn compress(bytes: &[u8], is_last: bool, segments: &mut Vec<Segment>, output: &mut Vec<u8>) {
     let histogram = run_vectorized(SplitAndCount { bytes, segments });
     let code = HuffmanCode::of_frequencies(&histogram.frequencies(), MAX_CODE_BITS);
@@ -92,7 +93,7 @@ impl<'b> NullaryFnOnce for WriteSymbols<'_, 'b> {
 
 /// The codes of a block in compact form, to fit in the first-level cache.
 struct SymbolCodes {
-    /// The value in the low half, the number of bits in the high half.
+    /// Per literal: the value of the code in the low half, its number of bits in the high half.
     literals: [u32; 256],
     others: [Bits; OTHER_SYMBOLS],
 }

@@ -27,8 +27,8 @@ impl Channels {
     }
 }
 
-/// Filters rows of RGBA pixels into `target`, which has one byte and the channels of a row for each row. Returns `false`
-/// as soon as a row has a pixel that is not opaque and `channels` is [`Channels::Rgb`].
+/// Filters rows of RGBA pixels into `target`, which has one byte and the channels of a row for each row. Returns
+/// `false` as soon as a row has a pixel that is not opaque and `channels` is [`Channels::Rgb`].
 pub(super) fn filter_rows(rgba: &[u8], width: usize, channels: Channels, target: &mut [u8]) -> bool {
     let mut rows = rgba.chunks_exact(4 * width).zip(target.chunks_exact_mut(1 + channels.count() * width));
     rows.all(|(row, target)| {

@@ -12,8 +12,8 @@ pub(super) struct HuffmanCode<const N: usize> {
 }
 
 impl<const N: usize> HuffmanCode<N> {
-    /// The code of symbols with these frequencies, with codes of at most `max_length` bits. The code is complete: at least
-    /// two symbols have a code. The sum of the frequencies must be below 2^32, and N at most 2^`max_length`.
+    /// The code of symbols with these frequencies, with codes of at most `max_length` bits. The code is complete: at
+    /// least two symbols have a code. The sum of the frequencies must be below 2^32, and N at most 2^`max_length`.
     pub(super) fn of_frequencies(frequencies: &[u32; N], max_length: usize) -> Self {
         let lengths = code_lengths(frequencies, max_length);
         Self { codes: canonical_codes(&lengths), lengths }
@@ -52,8 +52,8 @@ fn pack((symbol, frequency): (u64, &u32)) -> u64 {
     u64::from(*frequency) << SYMBOL_BITS | symbol
 }
 
-/// Number of Huffman codes of each length, for at least two symbols in ascending order of frequency. Longer codes count as
-/// `max_length`.
+/// Number of Huffman codes of each length, for at least two symbols in ascending order of frequency. Longer codes count
+/// as `max_length`.
 fn length_counts(used: &[u64], max_length: usize) -> Vec<usize> {
     // The leaves come first, then the inner nodes in the order of their creation, which is ascending too. So the two
     // rarest nodes are always at the front of one of two queues.
@@ -90,7 +90,8 @@ fn complete_code(counts: &mut [usize]) {
     let max_length = counts.len() - 1;
     let used: usize = counts.iter().enumerate().map(|(length, count)| count << (max_length - length)).sum();
     for _ in 1_usize << max_length..used {
-        // One code of the longest length and a shorter one are replaced by two that are one bit longer than the latter.
+        // One code of the longest length and a shorter code are replaced by two codes that are one bit longer than the
+        // shorter one.
         let Some(shorter) = (1..max_length).rev().find(|length| counts[*length] > 0) else { return };
         counts[max_length] -= 1;
         counts[shorter] -= 1;

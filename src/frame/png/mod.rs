@@ -1,19 +1,19 @@
-//! A PNG encoder for rendered frames. It encodes strips of rows independently of each other, so that several threads can
-//! work on one picture. The file depends only on the pixels, not on the number of threads. The kernels in `kernels/png.cu`
-//! write the same file.
+//! A PNG encoder for rendered frames. It encodes strips of rows independently of each other, so that several threads
+//! can work on one picture. The file depends only on the pixels, not on the number of threads. The kernels in
+//! `kernels/png.cu` write the same file.
 //!
-//! A strip is filtered with Sub (`filter`), split into literals and runs of zeros (`segments`), and written as one deflate
-//! block with a Huffman code of its own (`deflate`, `symbols`, `block_header`, `huffman`). Each pixel, word and symbol
-//! depends on its neighbors and on the code of the strip only, so the kernels compute them in parallel.
+//! A strip is filtered with Sub (`filter`), split into literals and runs of zeros (`segments`), and written as one
+//! deflate block with a Huffman code of its own (`deflate`, `symbols`, `block_header`, `huffman`). Each pixel, word and
+//! symbol depends on its neighbors and on the code of the strip only, so the kernels compute them in parallel.
 //!
 //! # Format
 //! The strips are parts of one zlib stream. A strip ends on a byte boundary, with an empty stored block, and does not
 //! refer to other strips. Each strip is an IDAT chunk, which costs 12 bytes: the thread that encodes the strip also
-//! computes the checksum of the chunk, and checksums need not be combined. The Adler-32 checksum of the stream is combined
-//! from those of the strips and follows in a last IDAT chunk.
+//! computes the checksum of the chunk, and checksums need not be combined. The Adler-32 checksum of the stream is
+//! combined from those of the strips and follows in a last IDAT chunk.
 //!
-//! A strip that does not compress is stored. So a file has at most 76 bytes, 12 bytes per strip, and 5 bytes per started
-//! 65,535 bytes of a strip more than the filtered pixels, which are one byte per row and one per channel of a pixel.
+//! A strip that does not compress is stored. The filtered pixels have one byte per row and one per channel of a pixel.
+//! A file is larger by at most 76 bytes, plus 12 bytes per strip, plus 5 bytes per started 65,535 bytes of a strip.
 
 mod adler;
 mod bit_writer;
@@ -33,7 +33,7 @@ use segments::Segment;
 /// Size of the filtered rows of a strip, unless one row is larger. Smaller strips spend more time and bytes on their
 /// Huffman codes. Larger ones do not fit in the second-level cache, and keep fewer threads busy.
 const STRIP_BYTES: usize = 128 << 10;
-/// A deflate stream with a window of 32 KiB, compressed by a fast algorithm.
+/// Deflate with a window of 32 KiB, fastest compression level.
 const ZLIB_HEADER: [u8; 2] = [0x78, 0x01];
 /// Maximum size of the filtered rows of a strip, so that the content of a chunk has less than 2^31 bytes.
 const MAX_STRIP_BYTES: usize = 1 << 30;
@@ -96,8 +96,8 @@ impl PngLayout {
         (self.height as usize).div_ceil(self.strip_rows)
     }
 
-    /// Encodes the strip `index` of a picture, whose RGBA8 pixels are `rgba`, top row first. Returns `None` if a pixel is
-    /// not opaque and the file has no alpha channel.
+    /// Encodes the strip `index` of a picture, whose RGBA8 pixels are `rgba`, top row first. Returns `None` if a pixel
+    /// is not opaque and the file has no alpha channel.
     ///
     /// # Errors
     /// `Fault` when the picture has no such strip.

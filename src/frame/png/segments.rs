@@ -1,5 +1,5 @@
-//! Splits filtered pixels into literals and runs of zeros. Filtered flat areas are zeros, and other matches are too rare
-//! in rendered frames to pay for the search.
+//! Splits filtered pixels into literals and runs of zeros. Filtered flat areas are zeros, and other matches are too
+//! rare in rendered frames to pay for the search.
 //!
 //! Runs do not cross the border of a tile, so that the tiles of a strip can be split independently of each other.
 
@@ -18,8 +18,8 @@ pub(super) const TILE_BYTES: usize = 8192;
 const BLOCK_WORDS: usize = 64;
 
 /// Splits `bytes` into segments, which replace the content of `segments`. A run is a maximal sequence of zeros within a
-/// tile that contains an aligned word of eight zeros. So each word decides with its two neighbors alone, and a parallel
-/// implementation finds the same runs.
+/// tile that contains an aligned word of eight zeros. So which zeros of a word are in a run depends only on this word
+/// and its two neighbors, and a parallel implementation finds the same runs.
 #[inline(always)]
 pub(super) fn split(bytes: &[u8], segments: &mut Vec<Segment>) {
     segments.clear();
@@ -36,7 +36,7 @@ fn split_tile(bytes: &[u8], segments: &mut Vec<Segment>) {
     let mut is_previous_zero = 0;
     for (block, words) in words.chunks(BLOCK_WORDS).enumerate() {
         let zeros = zero_words(words);
-        // One bit for each word that is zero while the word before it is not, or the other way round.
+        // One bit for each zero word after a nonzero word, and for each nonzero word after a zero word.
         let mut changes = zeros ^ (zeros << 1 | is_previous_zero);
         if words.len() < BLOCK_WORDS {
             changes &= (1 << words.len()) - 1;
@@ -73,12 +73,12 @@ fn zero_words(words: &[[u8; 8]]) -> u64 {
 struct Splitter<'a> {
     bytes: &'a [u8],
     literals_begin: usize,
-    /// The begin of the current run, if there is one.
+    /// The first byte of the current run, if there is one.
     zeros_begin: Option<usize>,
 }
 
 impl Splitter<'_> {
-    /// A run begins before or in this word, or ends in it.
+    /// Begins a run with the zeros before this zero word, or ends the current run in this nonzero word.
     #[inline(always)]
     fn change(&mut self, word: usize, segments: &mut Vec<Segment>) {
         let word_at =

@@ -21,9 +21,9 @@ pub(super) trait SymbolSink {
     fn add_match(&mut self, length: usize);
 }
 
-/// Passes the symbols of segments to `sink`, which it returns, so that the sink stays in registers. Literals come in groups
-/// of four, of which the last one of a segment may be partial: a loop over one to three literals would end in a branch
-/// that the CPU cannot predict.
+/// Passes the symbols of segments to `sink`. Takes and returns the sink by value, so that it stays in registers.
+/// Literals come in groups of four; the last group of a segment may be partial. A loop over its one to three literals
+/// would end in a branch that the CPU cannot predict.
 #[inline(always)]
 pub(super) fn for_each_symbol<S: SymbolSink>(bytes: &[u8], segments: &[Segment], mut sink: S) -> S {
     let mut rest = bytes;
@@ -66,7 +66,7 @@ pub(super) const fn length_symbol(length: usize) -> (usize, Bits) {
         return (OTHER_SYMBOLS - 1, Bits { value: 0, count: 0 });
     }
     let offset = length - MIN_MATCH;
-    // From 8 on, four symbols share a number of extra bits.
+    // From offset 8 on, groups of four symbols have the same number of extra bits.
     let extra_bits = if offset < 8 { 0 } else { offset.ilog2() - 2 };
     let extra = Bits { value: (offset & ((1 << extra_bits) - 1)) as u64, count: extra_bits };
     (1 + 4 * extra_bits as usize + (offset >> extra_bits), extra)
@@ -83,7 +83,7 @@ pub(super) struct Histogram {
 }
 
 impl Histogram {
-    /// Without symbols but one end of the block.
+    /// Contains only one end of the block.
     #[inline(always)]
     pub(super) fn new() -> Self {
         let mut others = [0; OTHER_SYMBOLS];
