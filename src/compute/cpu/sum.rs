@@ -265,8 +265,9 @@ impl<const COMPENSATED: bool> Sums<'_, COMPENSATED> {
     }
 }
 
-/// Adds a product to a compensated sum. Returns the new sum and the new accumulated rounding error. A fused multiply-add
-/// gives the exact rounding error of the product (TwoProduct), and Knuth's TwoSum gives that of the addition.
+/// Adds a product to a compensated sum. Returns the new sum and the new accumulated rounding error. A fused
+/// multiply-add gives the exact rounding error of the product (TwoProduct), and Knuth's TwoSum gives that of the
+/// addition.
 #[inline(always)]
 fn add_exactly((sum, compensation): (f32, f32), entry: f32, coordinate: f32) -> (f32, f32) {
     let product = entry * coordinate;

@@ -5,8 +5,8 @@ use modalcast_model::domain::Shape;
 use modalcast_model::scene::{Scene, SceneState};
 
 /// Positions in world axes, three f64 per vertex, in the packed order of the scene's layout: one domain after the
-/// other. The positions of a domain are relative to its floating origin ([`SceneState::origin_of`]). That origin is near
-/// the domain, so that f32 deformers can be compared far from the world's origin.
+/// other. The positions of a domain are relative to its floating origin ([`SceneState::origin_of`]). That origin is
+/// near the domain, so that f32 deformers can be compared far from the world's origin.
 pub fn deform(scene: &Scene, state: &SceneState) -> Vec<[f64; 3]> {
     let mut positions = Vec::with_capacity(scene.layout.vertices);
     for domain in 0..scene.domains.len() {

@@ -6,9 +6,9 @@
 //!
 //! Coverage is then computed exactly, in integers: a triangle covers the samples on the inner side of all its edges. A
 //! sample on an edge belongs to the triangle for which it is a top or left edge, so triangles that share an edge cover
-//! each sample exactly once. Depth is z/w, linear in the window, in f32 from the exact edge values. It is reversed: 1 at
-//! the near plane and 0 at the far plane, so the largest depth of a sample is visible. Cut-outs cover only samples whose
-//! alpha is large enough ([`cut_out`]).
+//! each sample exactly once. Depth is z/w, linear in the window, in f32 from the exact edge values. It is reversed: 1
+//! at the near plane and 0 at the far plane, so the largest depth of a sample is visible. Cut-outs cover only samples
+//! whose alpha is large enough ([`cut_out`]).
 
 pub mod cut_out;
 

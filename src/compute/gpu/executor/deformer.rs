@@ -40,8 +40,8 @@ struct StepInFlight {
     /// Index in [`CudaDeformer::step_slots`].
     slot: usize,
     submitted: Instant,
-    /// Milliseconds of the host's work before the step could begin on the device. `None` if the last step was not drawn, so
-    /// that the step does not wait for frames of OpenGL.
+    /// Milliseconds of the host's work before the step could begin on the device. `None` if the last step was not
+    /// drawn, so that the step does not wait for frames of OpenGL.
     ms_before_begin: Option<f64>,
 }
 
@@ -78,9 +78,9 @@ pub struct CudaDeformer {
     is_drawn: bool,
 }
 
-/// The parts of a deformer that need neither OpenGL nor the thread of the deformer: compiled kernels and uploaded tables.
-/// Compiling takes hundreds of milliseconds and the upload of U can take longer, so another thread prepares a scene while
-/// the device thread executes the steps of other scenes.
+/// The parts of a deformer that need neither OpenGL nor the thread of the deformer: compiled kernels and uploaded
+/// tables. Compiling takes hundreds of milliseconds and the upload of U can take longer, so another thread prepares a
+/// scene while the device thread executes the steps of other scenes.
 pub struct PreparedDeformer {
     device: Arc<Device>,
     plan: DeformPlan,
@@ -91,8 +91,8 @@ pub struct PreparedDeformer {
 }
 
 impl PreparedDeformer {
-    /// Compiles the kernels of a scene and uploads its tables. Any thread may call this. The work has a stream of its own,
-    /// and is complete when this returns.
+    /// Compiles the kernels of a scene and uploads its tables. Any thread may call this. The work has a stream of its
+    /// own, and is complete when this returns.
     ///
     /// # Errors
     /// `Fault` when the device fails; `Unavailable` when NVRTC is missing or the device's memory is too small.
@@ -141,8 +141,8 @@ impl CudaDeformer {
         Self::from_prepared(PreparedDeformer::new(device, scene, options)?, gl_buffers)
     }
 
-    /// Completes a prepared deformer with its output buffers. Drawn steps are copied to `gl_buffers` on the device if the
-    /// driver can register them.
+    /// Completes a prepared deformer with its output buffers. Drawn steps are copied to `gl_buffers` on the device if
+    /// the driver can register them.
     ///
     /// # Errors
     /// `Fault` when the device fails or its memory is too small.
@@ -487,8 +487,8 @@ impl Drop for CudaDeformer {
     }
 }
 
-/// Rejects a scene that does not fit into the device's free memory. Does not wait for the device's stream, which another
-/// thread may be capturing.
+/// Rejects a scene that does not fit into the device's free memory. Does not wait for the device's stream, which
+/// another thread may be capturing.
 fn check_memory(device: &Device, plan: &DeformPlan) -> Result<()> {
     let (free, _) = device.memory()?;
     if plan.total_bytes() <= free as u64 {

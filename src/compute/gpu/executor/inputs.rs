@@ -17,8 +17,8 @@ use modalcast_model::scene::SceneState;
 pub(crate) struct InputAddresses {
     pub header: u64,
     pub transforms: u64,
-    /// Per domain, its transform root (the domain whose transform it uses) and its index in `follower_frames`. Constant;
-    /// only in scenes with followers.
+    /// Per domain, its transform root (the domain whose transform it uses) and its index in `follower_frames`.
+    /// Constant; only in scenes with followers.
     pub transform_links: u64,
     /// Per follower, its coordinate frame: its constant transform relative to its root.
     pub follower_frames: u64,

@@ -1,14 +1,14 @@
-//! Output sets that steps write, and their way to the OpenGL buffers of a drawn step. An output set has positions, normals
-//! and tangents.
+//! Output sets that steps write, and their way to the OpenGL buffers of a drawn step. An output set has positions,
+//! normals and tangents.
 //!
-//! If OpenGL can import memory of CUDA, the sets are in such memory, and OpenGL copies a set to its buffers at the begin of
-//! a frame. The host waits for the step before that copy is submitted, and for the copy before a later step writes the
-//! set. With two sets, the next step can run while frames of earlier steps are drawn.
+//! If OpenGL can import memory of CUDA, the sets are in such memory, and OpenGL copies a set to its buffers at the
+//! beginning of a frame. The host waits for the step before that copy is submitted, and for the copy before a later
+//! step writes the set. With two sets, the next step can run while frames of earlier steps are drawn.
 //!
 //! Otherwise CUDA maps OpenGL's buffers and copies a set into them. Steps do not write OpenGL's buffers themselves,
-//! because mapping them makes the GPU change between the contexts of CUDA and OpenGL. That takes longer than the step of a
-//! small scene, so only steps that are drawn pay for it. While every step is drawn, the copy is submitted together with the
-//! step, so that the GPU changes its context once for both.
+//! because mapping them makes the GPU change between the contexts of CUDA and OpenGL. That takes longer than the step
+//! of a small scene, so only steps that are drawn pay for it. While every step is drawn, the copy is submitted together
+//! with the step, so that the GPU changes its context once for both.
 
 use std::ops::Range;
 use std::rc::Rc;
@@ -201,8 +201,8 @@ impl OutputBuffers {
     /// Maximum number of sets.
     pub(super) const MAX_SETS: usize = 2;
 
-    /// Allocates a set. If OpenGL's buffers are given, lets OpenGL import the set, or else registers the buffers. If both
-    /// fail, logs the errors.
+    /// Allocates a set. If OpenGL's buffers are given, lets OpenGL import the set, or else registers the buffers. If
+    /// both fail, logs the errors.
     ///
     /// # Errors
     /// `Fault` when the device has not enough memory; `DeviceLost`.

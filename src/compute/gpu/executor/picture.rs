@@ -1,8 +1,8 @@
 //! Pictures in device memory that OpenGL and CUDA share, and their readback by CUDA's copy engine.
 //!
 //! OpenGL draws into the memory. The host waits for OpenGL's fence, then a copy on a stream of its own moves the pixels
-//! to pinned memory. Copies run concurrently with the next frame: they do not make the GPU change between the contexts of
-//! OpenGL and CUDA, as kernels do.
+//! to pinned memory. Copies run concurrently with the next frame: they do not make the GPU change between the contexts
+//! of OpenGL and CUDA, as kernels do.
 
 use std::slice;
 use std::sync::Arc;
@@ -107,9 +107,9 @@ impl SharedPicture for CudaPicture {
         let _current = self.device.enter()?;
         let guard = WaitForStream::new(&self.copy_stream);
         let target = self.pixels.address.cast_mut().cast();
-        // SAFETY: both memories have at least `bytes` bytes and belong to this value, which waits for the copy before it
-        // is dropped. No reader has a reference to the pixels, and gets one only after the copy. If this fails before the
-        // event is recorded, the guard waits for the copy.
+        // SAFETY: both memories have at least `bytes` bytes and belong to this value, which waits for the copy before
+        // it is dropped. No reader has a reference to the pixels, and gets one only after the copy. If this fails
+        // before the event is recorded, the guard waits for the copy.
         unsafe { sys::cuMemcpyDtoHAsync_v2(target, self.memory.address(), bytes, self.copy_stream.cu_stream()) }
             .result()
             .map_err(cuda_error(STAGE))?;

@@ -1,8 +1,9 @@
-//! The PNG encoder: launches `kernels/png.cu`. The pixels stay on the device, and the last kernel writes the file to pinned
-//! memory, so only compressed bytes cross the bus. The file is the one that the CPU encoder of the server writes.
+//! The PNG encoder: launches `kernels/png.cu`. The pixels stay on the device, and the last kernel writes the file to
+//! pinned memory, so only compressed bytes cross the bus. The file is the one that the CPU encoder of the server
+//! writes.
 //!
-//! An encoder has a size. Its memory is allocated once: work buffers on the device, which the stream's order protects from
-//! the next encoding, and pinned slots, one for each file that is in flight or that a reader holds.
+//! An encoder has a size. Its memory is allocated once: work buffers on the device, which the stream's order protects
+//! from the next encoding, and pinned slots, one for each file that is in flight or that a reader holds.
 //!
 //! | file | content |
 //! |---|---|
@@ -94,8 +95,8 @@ impl PngEncoder {
     /// flight or held by readers at a time. The work runs on the stream of `device`.
     ///
     /// # Errors
-    /// `Invalid` when the picture is empty or too large; `Unavailable` when NVRTC is missing; `Fault` when compiling fails
-    /// or the device has not enough memory.
+    /// `Invalid` when the picture is empty or too large; `Unavailable` when NVRTC is missing; `Fault` when compiling
+    /// fails or the device has not enough memory.
     pub fn new(
         device: &Arc<Device>,
         [width, height]: [u32; 2],
@@ -154,7 +155,8 @@ impl PngEncoder {
     /// `Invalid` when the picture has another size or is not aligned; `Fault` when the device refuses the work.
     pub unsafe fn encode(&mut self, picture: &DevicePicture) -> Result<Option<PendingPng>> {
         self.check(picture)?;
-        // Kernels of a dropped encoding may still write to a free slot. The stream orders them before those of this one.
+        // Kernels of a dropped encoding may still write to a free slot. The stream orders them before those of this
+        // one.
         let Some(slot) = self.slots.iter_mut().find_map(|slot| Arc::get_mut(slot).is_some().then(|| Arc::clone(slot)))
         else {
             return Ok(None);
@@ -167,9 +169,9 @@ impl PngEncoder {
         let launches = [tile_launch, (self.plan.strip_count, CODE_BLOCK_THREADS), tile_launch, strip_launch];
         for (function, (blocks, threads)) in self.functions.iter().zip(launches) {
             let config = LaunchConfig { grid_dim: (blocks, 1, 1), block_dim: (threads, 1, 1), shared_mem_bytes: 0 };
-            // SAFETY: the kernels' only argument is a `PngArgs`. Its buffers have the sizes of the plan and belong to this
-            // encoder, whose `drop` waits for the work. The slot is not read before the event below, and the caller
-            // guarantees the picture.
+            // SAFETY: the kernels' only argument is a `PngArgs`. Its buffers have the sizes of the plan and belong to
+            // this encoder, whose `drop` waits for the work. The slot is not read before the event below, and the
+            // caller guarantees the picture.
             unsafe { launch_kernel(&self.device, function, config, LaunchOrder::Serial, &args) }?;
         }
         slot.record(&self.device)?;

@@ -13,9 +13,9 @@ use modalcast_model::error::{Error, Result};
 /// Minimum CUDA version of the driver, 12.0, in the encoding of cuDriverGetVersion: 1000 major + 10 minor.
 const MIN_DRIVER_VERSION: i32 = 12_000;
 
-/// A CUDA device. One stream orders all work, except readbacks of vertices and the preparation of deformers. Readbacks have
-/// a second stream, and events order the work of the two streams. Each preparation has a stream of its own, and waits for
-/// its end.
+/// A CUDA device. One stream orders all work, except readbacks of vertices and the preparation of deformers. Readbacks
+/// have a second stream, and events order the work of the two streams. Each preparation has a stream of its own, and
+/// waits for its end.
 #[derive(Debug)]
 pub struct Device {
     context: Arc<CudaContext>,
@@ -54,8 +54,8 @@ impl Device {
         Ok(Arc::new(Self { context, stream, name, ordinal, capability }))
     }
 
-    /// The same device with another stream. Its work runs concurrently with that of this device, so a thread can upload a
-    /// scene while another thread captures or launches the steps of other scenes.
+    /// The same device with another stream. Its work runs concurrently with that of this device, so a thread can upload
+    /// a scene while another thread captures or launches the steps of other scenes.
     ///
     /// # Errors
     /// `Fault` when the driver refuses a stream.

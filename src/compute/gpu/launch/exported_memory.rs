@@ -13,7 +13,8 @@ use modalcast_model::error::{Result, fault, fault_in};
 
 const STAGE: &str = "shared memory";
 
-/// Exportable device memory. Its content is undefined at first. The importing API holds its own reference to the memory.
+/// Exportable device memory. Its content is undefined at first. The importing API holds its own reference to the
+/// memory.
 ///
 /// The owner waits for all CUDA work on the memory before it drops this value, because dropping it ends the mapping at
 /// once.

@@ -13,9 +13,9 @@ use super::device::Device;
 use super::error::cuda_error;
 use modalcast_model::error::{Error, Result, fault_in};
 
-/// Bytes in device memory. The stream of the device that allocated them orders the release of the memory on drop, so work
-/// that was submitted earlier to this stream can still use the memory. A user that submits work to another stream waits
-/// for that work before it drops the buffer.
+/// Bytes in device memory. The stream of the device that allocated them orders the release of the memory on drop, so
+/// work that was submitted earlier to this stream can still use the memory. A user that submits work to another stream
+/// waits for that work before it drops the buffer.
 #[derive(Debug)]
 pub struct DeviceBuffer {
     slice: CudaSlice<u8>,

@@ -78,8 +78,8 @@ pub struct OmittedFeature {
     pub feature: &'static str,
     /// Code and data that are not compiled, computed or stored.
     pub what: &'static str,
-    /// Device bytes saved. They do not include the rings of the kernel `normals` (the vertices around each vertex), whose
-    /// length is unknown until they are built.
+    /// Device bytes saved. They do not include the rings of the kernel `normals` (the vertices around each vertex),
+    /// whose length is unknown until they are built.
     pub bytes: u64,
 }
 

@@ -76,8 +76,8 @@ pub struct DeformKernel {
     boxes: DeviceBuffer,
     /// Number of tiles.
     tile_count: u32,
-    /// Number of tiles that this kernel computes in a full step: the first ones of the list. The kernel `batch` computes
-    /// the other tiles with vertices.
+    /// Number of tiles that this kernel computes in a full step: the first ones of the list. The kernel `batch`
+    /// computes the other tiles with vertices.
     full_step_tiles: u32,
     /// Index of the first quad that has normals or tangents (directions).
     first_direction_quad: u64,
@@ -180,8 +180,8 @@ impl DeformKernel {
     /// # Safety
     /// `inputs` has the layout of [`Self::packer`] and contains a full step when the kernels run. Its header has the
     /// addresses of the outputs that the kernels write, with the sizes of the scene: positions; normals and tangents if
-    /// they are rigid; displacements with the feature `displacements`. `inputs` and the outputs exist until the kernels have
-    /// ended.
+    /// they are rigid; displacements with the feature `displacements`. `inputs` and the outputs exist until the kernels
+    /// have ended.
     ///
     /// # Errors
     /// `Fault` when the device fails.
@@ -203,7 +203,8 @@ impl DeformKernel {
     /// header. In this variant, a block has one warp, and four warps share a tile.
     ///
     /// # Safety
-    /// As [`Self::launch`]; in addition, the kernel `apply` has written the tile list of this step when the kernel runs.
+    /// As [`Self::launch`]; in addition, the kernel `apply` has written the tile list of this step when the kernel
+    /// runs.
     ///
     /// # Errors
     /// `Fault` when the scene's steps are always full, or when the device fails.
@@ -294,8 +295,8 @@ fn compile_tile_list_function(device: &Device, kernel: &KernelDescriptor) -> Res
 /// an H200 has.
 const MAX_LIST_BLOCKS: u32 = 132 * 12;
 
-/// Uploads U source by source, and collects the scales (see [`DeformKernel`]) and the factors of all shapes. A factor is a
-/// power of two per mode, by which the host multiplies q because U is stored divided by it.
+/// Uploads U source by source, and collects the scales (see [`DeformKernel`]) and the factors of all shapes. A factor
+/// is a power of two per mode, by which the host multiplies q because U is stored divided by it.
 struct ModeUploader<'a> {
     device: &'a Device,
     scene: &'a Scene,

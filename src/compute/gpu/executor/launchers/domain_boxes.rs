@@ -18,7 +18,7 @@ pub(crate) struct DomainBoxes {
     keys: Option<PinnedBuffer<u32>>,
 }
 
-/// Addresses of the segments and of their boxes, and the number of segments. The default, zeros, is for a scene that
+/// Addresses of the segments and of their boxes, and the number of segments. The default, all zeros, is that of a scene
 /// without the feature `boxes`.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct DomainBoxAddresses {
