@@ -85,8 +85,8 @@ pub fn fault_in<E: std::fmt::Display>(stage: &'static str) -> impl Fn(E) -> Erro
 }
 
 impl Error {
-    /// Converts an [`Error::Invalid`] of a loader, whose field is a place in a file, to an [`Error::InvalidFile`]. Other
-    /// variants remain unchanged.
+    /// Converts an [`Error::Invalid`] of a loader, whose field is a place in a file, to an [`Error::InvalidFile`].
+    /// Other variants remain unchanged.
     pub fn into_file_error(self) -> Self {
         match self {
             Self::Invalid { field: location, expected, given } => Self::InvalidFile { location, expected, given },

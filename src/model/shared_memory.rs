@@ -1,10 +1,10 @@
 //! Traits of device memory that OpenGL and another API share for as long as it exists. The module `gpu` of
-//! `modalcast-compute` allocates it in CUDA. The renderer draws pictures into such memory, and CUDA copies them to the host.
-//! A deformer writes vertices into such memory, and OpenGL copies them to the vertex buffers of the scene.
+//! `modalcast-compute` allocates it in CUDA. The renderer draws pictures into such memory, and CUDA copies them to the
+//! host. A deformer writes vertices into such memory, and OpenGL copies them to the vertex buffers of the scene.
 //!
 //! Each API holds its own reference to the memory, so neither can free it while the other uses it. Nothing orders the
-//! accesses of the two APIs on the device. The host does: it waits for the end of the accesses of one API before it submits
-//! those of the other one.
+//! accesses of the two APIs on the device. The host does: it waits for the end of the accesses of one API before it
+//! submits those of the other one.
 
 use std::fmt::Debug;
 use std::ops::Range;
@@ -35,8 +35,8 @@ pub struct NewPicture {
 /// A picture in device memory, and the pinned host memory into which it is copied. At most one copy is in flight.
 /// Dropping the picture waits for the copy.
 pub trait SharedPicture: Debug {
-    /// Starts to copy the first `bytes` bytes to the host, without waiting. OpenGL has completed all commands that write
-    /// the picture, and writes it again only after [`Self::is_copied`] or [`Self::finish_copy`].
+    /// Starts to copy the first `bytes` bytes to the host, without waiting. OpenGL has completed all commands that
+    /// write the picture, and writes it again only after [`Self::is_copied`] or [`Self::finish_copy`].
     ///
     /// # Errors
     /// `Fault` if a copy is in flight, a reader has the pixels of the last copy, the picture has fewer bytes, or the
@@ -87,8 +87,9 @@ pub struct ExportedVertices {
 
 /// Imported memory with the vertices of one step.
 pub trait ImportedVertices: Debug {
-    /// Copies the vertices to the buffers of the scene with OpenGL commands, without waiting. Frames that were submitted
-    /// earlier show the old vertices, later ones the new vertices. The caller has waited for the writer of the memory.
+    /// Copies the vertices to the buffers of the scene with OpenGL commands, without waiting. Frames that were
+    /// submitted earlier show the old vertices, later ones the new vertices. The caller has waited for the writer of
+    /// the memory.
     ///
     /// # Errors
     /// `Fault` if OpenGL reports an error.

@@ -4,15 +4,15 @@
 //! An edge is a crease if the normals of its two triangles, which follow their winding, differ by more than the crease
 //! angle. The triangles around a vertex that are connected by edges that are not creases form a smooth fan. All corners
 //! of a fan have one normal: the direction of the sum of the fan's area vectors (b - a) x (c - a), that is, triangles
-//! are weighted by their areas. The angle is measured at rest. A vertex keeps its index and its rows of U: a crease only
-//! adds corners to it.
+//! are weighted by their areas. The angle is measured at rest. A vertex keeps its index and its rows of U: a crease
+//! only adds corners to it.
 //!
 //! # Special cases
-//! - 180 degrees: each vertex has one fan, whatever its triangles are connected by.
+//! - 180 degrees: each vertex has one fan, even if its triangles have no common edge.
 //! - 0 degrees: each flat region has its own normal. Triangles within [`SAME_PLANE_TOLERANCE`] are in one plane.
 //! - Neighbors of opposite winding have opposite normals, so their common edge is a crease.
-//! - An edge of three or more triangles connects each pair of them that is within the crease angle, and is a crease if
-//!   it has more than [`MAX_EDGE_TRIANGLES`] triangles.
+//! - An edge of three or more triangles connects those pairs of them that are within the crease angle. With more than
+//!   [`MAX_EDGE_TRIANGLES`] triangles, it is a crease.
 //! - A triangle without area (see [`MIN_AREA_RATIO`]) has no normal. It connects its neighbors as if its two edges at
 //!   the vertex were one edge, and is part of their fan.
 //! - Vertices with equal coordinates are different vertices, whose triangles are not connected: each has rows of U of
@@ -22,16 +22,17 @@ use nalgebra::Vector3;
 
 use crate::error::{Result, invalid};
 
-/// Two triangles are within an angle if the cosine between their normals is at most this below the cosine of the angle.
-/// The tolerance covers rounding: 1e-6 is 0.08 degrees between parallel normals and 1e-4 degrees at 40 degrees.
+/// Tolerance for rounding, subtracted from the cosine of the crease angle. It enlarges an angle of 0 by 0.08 degrees,
+/// and an angle of 40 degrees by 1e-4 degrees.
 const SAME_PLANE_TOLERANCE: f64 = 1e-6;
 
 /// The largest number of triangles of an edge for which all pairs are compared.
 const MAX_EDGE_TRIANGLES: usize = 8;
 
-/// A triangle has no area if its area vector is at most this fraction of the sum of l (l + w) over two of its edges,
-/// where l is the largest component of the edge and w the largest coordinate of its vertices. Rounding positions to f32
-/// changes an area vector by about 2^-23 of that sum, so that the direction of a smaller one is undetermined.
+/// A triangle counts as one without area if its area vector is not longer than this fraction of a scale: the sum of l
+/// (l + w) over two edges, where l is the largest component of the edge and w the largest coordinate of the vertices.
+/// Rounding positions to f32 changes an area vector by about 2^-23 of this scale, so a shorter vector has no reliable
+/// direction.
 const MIN_AREA_RATIO: f64 = 1.0 / 1_048_576.0;
 
 /// The largest angle in degrees between the normals of two adjacent triangles that are shaded as one smooth surface.
@@ -39,8 +40,8 @@ const MIN_AREA_RATIO: f64 = 1.0 / 1_048_576.0;
 pub struct CreaseAngle(f64);
 
 impl CreaseAngle {
-    /// The angle of meshes whose source has no setting: round parts of a dozen facets per turn are smooth, and the edges
-    /// of boxes and of eight-sided bars are hard.
+    /// The angle of meshes whose source has no setting: round parts of a dozen facets per turn are smooth, and the
+    /// edges of boxes and of eight-sided bars are hard.
     pub const DEFAULT: Self = Self(40.0);
 
     /// An angle in degrees: 0 is flat, 180 is smooth.
@@ -207,8 +208,8 @@ struct TriangleCorner {
     slot: u8,
 }
 
-/// The corners of all triangles, sorted by vertex and then by triangle, and the offset of the corners of each vertex. The
-/// offsets come first.
+/// The corners of all triangles, sorted by vertex and then by triangle, and the offset of the corners of each vertex.
+/// The offsets come first.
 fn corners_by_vertex(vertex_count: usize, triangles: &[[u32; 3]]) -> (Vec<usize>, Vec<TriangleCorner>) {
     let mut offsets = vec![0; vertex_count + 1];
     triangles.as_flattened().iter().for_each(|vertex| offsets[*vertex as usize + 1] += 1);

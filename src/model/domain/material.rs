@@ -53,8 +53,8 @@ impl Default for Material {
 }
 
 impl Material {
-    /// The color of surfaces whose source has none, linear: a copper tone that differs clearly from the default sky, the
-    /// default ground and its shadows, in luminance or in hue.
+    /// The color of surfaces whose source has none, linear: a copper tone that differs clearly from the default sky,
+    /// the default ground and its shadows, in luminance or in hue.
     pub const UNSPECIFIED_COLOR: [f32; 3] = [0.65, 0.40, 0.22];
 
     /// The material of surfaces whose source has none: [`Self::UNSPECIFIED_COLOR`], double-sided. An empty name becomes

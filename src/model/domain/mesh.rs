@@ -102,8 +102,8 @@ impl Mesh {
         &self.triangles
     }
 
-    /// For each triangle, bit i is 1 if the edge opposite to its corner i is inside of a polygon, such as the diagonal of
-    /// a quadrilateral. Empty if there is no such edge.
+    /// For each triangle, bit i is 1 if the edge opposite to its corner i is inside of a polygon, such as the diagonal
+    /// of a quadrilateral. Empty if there is no such edge.
     pub fn inner_edges(&self) -> &[u8] {
         &self.inner_edges
     }

@@ -84,7 +84,8 @@ impl Transform {
     }
 
     /// Whether A is a rotation or reflection times a uniform scale s: A^T A deviates from s^2 I by at most 1e-4 s^2 per
-    /// entry. Rounding A to f32 causes deviations of about 1e-7 s^2. Normals of such a domain transform like directions.
+    /// entry. Rounding A to f32 causes deviations of about 1e-7 s^2. Normals of such a domain transform like
+    /// directions.
     pub fn is_similarity(self) -> bool {
         let column = |index: usize| [0, 4, 8].map(|row| f64::from(self.0[row + index]));
         let dot = |a: [f64; 3], b: [f64; 3]| a[0] * b[0] + a[1] * b[1] + a[2] * b[2];

@@ -67,7 +67,8 @@ impl AssetDir {
         }
     }
 
-    /// Why the image that another file refers to is not drawn, as the end of a remark. `None` for a PNG or JPEG image.
+    /// The reason why the image that another file refers to is not drawn, worded as the end of a remark. `None` for a
+    /// PNG or JPEG image.
     ///
     /// # Errors
     /// As for [`Self::has_referenced_file`] and [`Self::read_start`]; in strict mode, also for other formats.

@@ -16,8 +16,8 @@
 //!   these defaults.
 //! - Normals of a file are kept. Missing ones are smooth except along creases, which split the corners of a vertex and
 //!   never the vertex itself (module `domain::creases`).
-//! - A file that another file refers to and that does not exist, and an image that is neither PNG nor JPEG, has a stand-in
-//!   and a remark, or is an error in strict mode.
+//! - A file that another file refers to and that does not exist, and an image that is neither PNG nor JPEG, has a
+//!   stand-in and a remark, or is an error in strict mode.
 
 mod asset_dir;
 #[cfg(test)]
@@ -95,9 +95,9 @@ pub fn open(source: &str) -> Result<OpenedScene> {
     OpenedScene::new(source::read(&asset_dir::AssetDir::unrestricted(Path::new(".")), source)?)
 }
 
-/// As [`open`], for a still picture: `preset` replaces the scene's own preset. A scene without a preset is drawn as by a
-/// GPU on every machine, because a single picture has the time. Settings of antialiasing and shadow map in `scene.toml`
-/// win over both.
+/// As [`open`], for a still picture: `preset` replaces the scene's own preset. A scene without a preset is drawn as by
+/// a GPU on every machine, because the time of a single picture does not matter. Settings of antialiasing and shadow
+/// map in `scene.toml` win over both.
 ///
 /// # Errors
 /// As for [`open`].

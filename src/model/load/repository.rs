@@ -131,7 +131,8 @@ mod tests {
             ("tree/d.obj", TRIANGLE),
             ("data/results.npz", ""),
         ]);
-        // The folder `two` has two models, so it is not a scene. `far.obj` is six folders deep; the listing ends at four.
+        // The folder `two` has two models, so it is not a scene. `far.obj` is six folders deep; the listing ends at
+        // four.
         let names = repository.list();
         let expected = ["tree", "deep/er/scene", "one", "one/a.obj", "./tree", "tree/d.obj", "two/b.obj", "two/c.obj"];
         assert_eq!(names, expected, "expected ./tree for the folder whose name is that of a built-in scene");

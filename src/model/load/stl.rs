@@ -4,8 +4,9 @@
 //! vertices are numbered by their first occurrence in the file. The rows of U follow this numbering. Normals of facets
 //! and attribute words are not used.
 //!
-//! The `stl_io` crate (0.11) is not used: it reads a binary file whose header begins with `solid ` as text, ends silently
-//! after the first of several solids, and rejects facets whose normal is not a number, although normals are redundant.
+//! The `stl_io` crate (0.11) is not used: it reads a binary file whose header begins with `solid ` as text, ends
+//! silently after the first of several solids, and rejects facets whose normal is not a number, although normals are
+//! redundant.
 
 use std::collections::HashMap;
 

@@ -92,14 +92,14 @@ const IMAGE_FILL: f64 = 0.94;
 
 /// The fitted near plane, relative to the distance of the farthest point of the scene along the view axis.
 ///
-/// The value only keeps depth in the range of f32: near / w is at most 1, and it is a normal number up to 2^62 times the
-/// farthest distance. It does not limit how close the camera may come, because the positions themselves are f32, and
-/// their rounding errors of 2^-24 of their magnitude are larger. It costs no precision either: see
+/// The value only keeps depth in the range of f32: near / w is at most 1, and it is a normal number up to 2^62 times
+/// the farthest distance. It does not limit how close the camera may come, because the positions themselves are f32,
+/// and their rounding errors of 2^-24 of their magnitude are larger. It costs no precision either: see
 /// [`Camera::clip_from_camera`].
 const FITTED_NEAR: f64 = 1.0 / (1_u64 << 63) as f64 / 2.0;
 
-/// A camera. `near` and `far` are distances in scene units along the view axis, and geometry outside of them is clipped.
-/// If both are 0, nothing in front of the camera is clipped, at any distance.
+/// A camera. `near` and `far` are distances in scene units along the view axis, and geometry outside of them is
+/// clipped. If both are 0, nothing in front of the camera is clipped, at any distance.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Camera {
     pub view: View,
@@ -320,8 +320,8 @@ mod tests {
         }
     }
 
-    /// Depth in f32, as the shaders compute it, decreases with the distance, from far below to far above the size of the
-    /// scene.
+    /// Depth in f32, as the shaders compute it, decreases with the distance, from far below to far above the size of
+    /// the scene.
     #[test]
     fn fitted_depth_resolves_two_millionths_of_every_distance() {
         for size in [1e-11, 1.0, 1e9_f32] {

@@ -11,16 +11,16 @@
 //!
 //! Error bound per axis, for a translation t from the floating origin with |t| <= 4 g = `HOME_REACH` g: rounding t
 //! contributes at most 2^-23 g. Each of the three fused multiply-adds of x = A p + t contributes at most 2^-22 g while
-//! the vertex is within 8 g of its floating origin. The sum is 7 x 2^-23 g: less than 8.4e-7 of the domain's size, at any
-//! distance. A domain at the end of the shared origin's reach has 16 times this bound, 1.4e-5 of its size, and an outlier
-//! an eighth of it. The f32 rounding of A and p adds to the bound, independent of the domain's position.
+//! the vertex is within 8 g of its floating origin. The sum is 7 x 2^-23 g: less than 8.4e-7 of the domain's size, at
+//! any distance. A domain at the end of the shared origin's reach has 16 times this bound, 1.4e-5 of its size, and an
+//! outlier an eighth of it. The f32 rounding of A and p adds to the bound, independent of the domain's position.
 //!
 //! Without f64 translations, all transforms are relative to the scene's origin, and rounding t contributes up to 2^-24
 //! |t| in each of the four operations.
 //!
 //! A follower has no translation of its own: it uses the floating origin of its transform root, whose size includes its
-//! followers. Where this module says "domain", it means a transform root with its followers. Translations have the order
-//! of the roots' transforms.
+//! followers. Where this module says "domain", it means a transform root with its followers. Translations have the
+//! order of the roots' transforms.
 
 use std::sync::Arc;
 
@@ -32,9 +32,9 @@ use crate::error::{Result, invalid};
 /// shared origin does not suit the domain.
 pub const HOME_REACH: f64 = 4.0;
 
-/// The largest distance, per axis and in multiples of the domain's spacing, between the shared origin and the translation
-/// of a domain that uses it. It is larger than [`HOME_REACH`], because frames with outliers need a pass over all vertices
-/// on the host.
+/// The largest distance, per axis and in multiples of the domain's spacing, between the shared origin and the
+/// translation of a domain that uses it. It is larger than [`HOME_REACH`], because frames with outliers need a pass
+/// over all vertices on the host.
 pub const SHARED_REACH: f64 = 64.0;
 
 /// Distance in multiples of the domain's spacing up to which [`FloatingOrigins::rebase_positions`] includes a domain in
@@ -106,13 +106,13 @@ fn power_of_two_at_most(size: f64) -> f64 {
     if size.is_normal() && size > 0.0 { f64::from_bits(size.to_bits() & exponent_bits) } else { 1.0 }
 }
 
-/// Numbers of roots that are far from the shared origin. Fewer outliers are better, then fewer roots away.
+/// Numbers of roots that are far from the shared origin. The order compares outliers first; fewer are better.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default)]
 struct DistanceCounts {
     /// Beyond [`SHARED_REACH`], with a floating origin of their own.
     outliers: usize,
     /// Beyond [`HOME_REACH`].
-    away: usize,
+    beyond_home: usize,
 }
 
 /// The floating origins of all transform roots of one state.
@@ -156,9 +156,9 @@ impl FloatingOrigins {
         origins
     }
 
-    /// Restores floating origins from the stored values of [`Self::shared_origin`] and [`Self::translations`]. The caller
-    /// must rebase the transforms ([`Self::rebase_transform`]), because the spacings may have changed since they were
-    /// stored.
+    /// Restores floating origins from the stored values of [`Self::shared_origin`] and [`Self::translations`]. The
+    /// caller must rebase the transforms ([`Self::rebase_transform`]), because the spacings may have changed since they
+    /// were stored.
     ///
     /// # Errors
     /// `Invalid` if there is not one translation per root, or a number is not finite.
@@ -222,19 +222,19 @@ impl FloatingOrigins {
         let previous_translation = std::mem::replace(&mut self.translations[root], translation);
         let previous_counts = self.count_distance(root, previous_translation, self.shared_origin);
         let counts = self.count_distance(root, translation, self.shared_origin);
-        self.counts.away = self.counts.away - previous_counts.away + counts.away;
+        self.counts.beyond_home = self.counts.beyond_home - previous_counts.beyond_home + counts.beyond_home;
         self.counts.outliers = self.counts.outliers - previous_counts.outliers + counts.outliers;
         self.translations_since_search = self.translations_since_search.saturating_add(1);
     }
 
-    /// Moves the shared origin under three conditions: more than half of the domains are beyond [`HOME_REACH`], at least
-    /// as many translations were set since the last search as there are domains, and the move leaves fewer outliers, or as
-    /// many outliers and fewer domains beyond this reach. The new shared origin is the grid point nearest to the per-axis median, which is robust to a few very
-    /// distant domains. If this function returns true, the caller must call [`Self::rebase_transform`] for every
-    /// transform.
+    /// Moves the shared origin under three conditions: more than half of the domains are beyond [`HOME_REACH`], at
+    /// least as many translations were set since the last search as there are domains, and the move leaves fewer
+    /// outliers, or as many outliers and fewer domains beyond this reach. The new shared origin is the grid point
+    /// nearest to the per-axis median, which is robust to a few very distant domains. If this function returns true,
+    /// the caller must call [`Self::rebase_transform`] for every transform.
     pub(super) fn update_shared_origin(&mut self) -> bool {
         let root_count = self.translations.len();
-        if 2 * self.counts.away <= root_count || self.translations_since_search < root_count {
+        if 2 * self.counts.beyond_home <= root_count || self.translations_since_search < root_count {
             return false;
         }
         self.translations_since_search = 0;
@@ -256,7 +256,10 @@ impl FloatingOrigins {
         let mut sum = DistanceCounts::default();
         for (root, translation) in self.translations.iter().enumerate() {
             let counts = self.count_distance(root, *translation, shared_origin);
-            sum = DistanceCounts { away: sum.away + counts.away, outliers: sum.outliers + counts.outliers };
+            sum = DistanceCounts {
+                beyond_home: sum.beyond_home + counts.beyond_home,
+                outliers: sum.outliers + counts.outliers,
+            };
         }
         sum
     }
@@ -264,7 +267,7 @@ impl FloatingOrigins {
     /// The counts of one root: each is 0 or 1.
     fn count_distance(&self, root: usize, translation: [f64; 3], shared_origin: [f64; 3]) -> DistanceCounts {
         let is_beyond = |reach: f64| usize::from(self.grids.is_beyond(root, translation, shared_origin, reach));
-        DistanceCounts { away: is_beyond(HOME_REACH), outliers: is_beyond(SHARED_REACH) }
+        DistanceCounts { beyond_home: is_beyond(HOME_REACH), outliers: is_beyond(SHARED_REACH) }
     }
 
     /// Rebases positions from the floating origins of their domains to `reference_point`, in scene units from the
@@ -272,8 +275,8 @@ impl FloatingOrigins {
     /// in layout order.
     ///
     /// Also returns the bounds of the near domains. With d as the distance from `reference_point` to the nearest
-    /// floating origin, a domain is near if the distance of its floating origin is at most 1024 of its spacings plus 4 d.
-    /// More distant domains would make the bounds too large to fit a shadow map to.
+    /// floating origin, a domain is near if the distance of its floating origin is at most 1024 of its spacings plus 4
+    /// d. More distant domains would make the bounds too large to fit a shadow map to.
     pub fn rebase_positions(
         &self,
         reference_point: [f64; 3],

@@ -47,8 +47,8 @@ use std::sync::Arc;
 use crate::domain::{AlphaMode, Domain, MAX_RING_TRIANGLES, Material, Shape, Texture};
 use crate::error::{Result, invalid};
 
-/// Largest magnitude of a negative eigenvalue that counts as a rounding error, as a fraction of the largest magnitude of
-/// its domain. Solvers return the eigenvalues of rigid motions as numbers near 0 of either sign.
+/// Largest magnitude of a negative eigenvalue that counts as a rounding error, as a fraction of the largest magnitude
+/// of its domain. Solvers return the eigenvalues of rigid motions as numbers near 0 of either sign.
 const EIGENVALUE_ROUNDING: f64 = 1e-9;
 
 /// The largest number of domains in a scene.
@@ -327,8 +327,8 @@ fn check_material_ranges(parts: &SceneParts, domain: &Domain) -> Result<()> {
     Ok(())
 }
 
-/// A remark on the domains with a negative eigenvalue, which a rounding error does not explain. They are accepted, because
-/// the server only stores eigenvalues.
+/// A remark on the domains with a negative eigenvalue, which a rounding error does not explain. They are accepted,
+/// because the server only stores eigenvalues.
 fn negative_eigenvalues(domains: &[Domain]) -> Option<String> {
     let most_negative = |domain: &Domain| {
         let eigenvalues = || domain.metadata.eigenvalues.iter().copied();

@@ -91,8 +91,8 @@ pub enum Culling {
 /// Light, shadow, ground, sky and rasterization settings. Colors are linear.
 #[derive(Debug, Clone, Copy, PartialEq, serde::Serialize)]
 pub struct RenderSettings {
-    /// Leaves `antialias`, `samples`, and method, size and blur of `shadow` to the renderer. `None`: the values in these
-    /// fields are final. Set by [`Self::with_preset`]; scene files always set it.
+    /// Leaves `antialias`, `samples`, and method, size and blur of `shadow` to the renderer. `None`: the values in
+    /// these fields are final. Set by [`Self::with_preset`]; scene files always set it.
     pub preset: Option<PresetRequest>,
     /// Direction towards the sun in Y-up coordinates; rotated to the scene's up axis.
     pub sun: [f32; 3],

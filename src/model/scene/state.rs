@@ -21,8 +21,8 @@ pub enum DirtyDomains {
 /// The complete state after a step.
 #[derive(Debug, Clone)]
 pub struct SceneState {
-    /// Number of the run. Each new writer (a simulation that sends steps) starts a run, and step numbers are unique only
-    /// within a run. 0 before the first step.
+    /// Number of the run. Each new writer (a simulation that sends steps) starts a run, and step numbers are unique
+    /// only within a run. 0 before the first step.
     pub run: u64,
     /// The step number that the writer assigned.
     pub step: u64,

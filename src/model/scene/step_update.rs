@@ -12,8 +12,8 @@ use super::{Scene, TransformFormat};
 use crate::domain::Transform;
 use crate::error::{Error, Result, invalid};
 
-/// Number of transforms from which they are parsed on all cores. Smaller steps are parsed on the calling thread: a step of
-/// 914 transforms took 65 us there, and 98 us on another thread that had to be woken.
+/// Number of transforms from which they are parsed on all cores. Smaller steps are parsed on the calling thread: a step
+/// of 914 transforms took 65 us there, and 98 us on another thread that had to be woken.
 const PARALLEL_TRANSFORMS: usize = 4096;
 
 /// A step as received, not yet validated.

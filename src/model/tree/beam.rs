@@ -109,7 +109,8 @@ impl Beam {
         Err(not_converged())
     }
 
-    /// Normalizes the shapes of the free degrees of freedom, one column per mode, and adds the rows of the clamped node.
+    /// Normalizes the shapes of the free degrees of freedom, one column per mode, and adds the rows of the clamped
+    /// node.
     fn create_modes(&self, inverse_eigenvalues: &[f64], shapes: DMatrix<f64>) -> BeamModes {
         let mut mode_shapes = DMatrix::zeros(6 * self.nodes.len(), inverse_eigenvalues.len());
         for (column, (shape, mu)) in shapes.column_iter().zip(inverse_eigenvalues).enumerate() {
@@ -121,8 +122,8 @@ impl Beam {
     }
 }
 
-/// Adds the lower triangle of an element's matrix to the matrix of all free degrees of freedom. Those of the first node,
-/// which is clamped, are not free.
+/// Adds the lower triangle of an element's matrix to the matrix of all free degrees of freedom. Those of the first
+/// node, which is clamped, are not free.
 fn add_element(matrix: &mut BandMatrix, element: usize, block: &Matrix12) {
     let first_free = if element == 0 { 6 } else { 0 };
     for row in first_free..12 {

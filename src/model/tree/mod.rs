@@ -3,8 +3,8 @@
 //! A trunk of 6.8 m carries boughs and twigs, boughs carry twigs, and boughs and twigs carry leaf clusters. Every
 //! wooden part is a clamped Euler-Bernoulli beam along its centerline, loaded with the masses of its children as point
 //! masses at their joints. The modes of the beam are lifted to the part's skin, its surface mesh. The skin consists of
-//! rings: each ring is the circle of vertices around one point of the centerline. Modes are mass-orthonormal: U^T M U = I
-//! with M in kg. U is in 1/sqrt(kg) and q in m sqrt(kg), so that the modal forces are U^T f with f in newtons.
+//! rings: each ring is the circle of vertices around one point of the centerline. Modes are mass-orthonormal: U^T M U =
+//! I with M in kg. U is in 1/sqrt(kg) and q in m sqrt(kg), so that the modal forces are U^T f with f in newtons.
 //!
 //! The coordinate frame of a part has its origin at the center of the part's base, +Y along the start of the
 //! centerline, and +Z as close to the world's up direction as possible.
@@ -291,7 +291,8 @@ mod tests {
                 domain.name,
                 joint_gap(&attachment.vertices)
             );
-            // Counterexample: the center of the ring below is elsewhere. Rings are consecutive in the vertices of a part.
+            // Counterexample: the center of the ring below is elsewhere. Rings are consecutive in the vertices of a
+            // part.
             let vertex_count = attachment.vertices.len() as u32;
             let lower_ring: Vec<u32> =
                 attachment.vertices.iter().map(|vertex| vertex.saturating_sub(vertex_count)).collect();

@@ -95,7 +95,7 @@ impl<'a> GltfBuffers<'a> {
         }
     }
 
-    /// Why an image is not drawn, as the end of a remark. `None` for a PNG or JPEG image.
+    /// The reason why an image is not drawn, worded as the end of a remark. `None` for a PNG or JPEG image.
     ///
     /// # Errors
     /// As for [`Self::image`] and [`AssetDir::unusable_image`].

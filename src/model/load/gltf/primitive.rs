@@ -1,5 +1,6 @@
-//! Converts a primitive to a shape: one vertex per element of POSITION, triangles from its topology, and U (3n x r) from
-//! the POSITION targets. A vertex has one corner, or one per normal if the primitive has no NORMAL and creases split it.
+//! Converts a primitive to a shape: one vertex per element of POSITION, triangles from its topology, and U (3n x r)
+//! from the POSITION targets. A vertex has one corner, or one per normal if the primitive has no NORMAL and creases
+//! split it.
 
 use super::accessor::{AccessorReader, AttributeFormat};
 use super::document::Primitive;

@@ -379,8 +379,8 @@ fn up_axis_rotation(model_up: Option<UpAxis>, scene_up: UpAxis) -> Transform {
     Transform::from_parts(rotation.matrix(), &nalgebra::Vector3::zeros())
 }
 
-/// The [`DEFAULT_ATTACHMENT_VERTICES`] vertices of a deformable shape nearest to the translation of `frame`, in ascending
-/// order of their indices. Empty for a rigid shape.
+/// The [`DEFAULT_ATTACHMENT_VERTICES`] vertices of a deformable shape nearest to the translation of `frame`, in
+/// ascending order of their indices. Empty for a rigid shape.
 fn nearest_vertices(shape: &Shape, frame: Transform) -> Vec<u32> {
     if shape.modes.rank() == 0 {
         return Vec::new();

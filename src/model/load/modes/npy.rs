@@ -1,6 +1,6 @@
 //! Parser of NumPy's `.npy` files to arrays of f32.
 //!
-//! The parser of the header only finds known keys. A general parser of Python literals would recurse as deep as
+//! The parser of the header only searches for known keys. A general parser of Python literals would recurse as deep as
 //! brackets nest, so that a header with many brackets could overflow the stack.
 
 use crate::error::{Error, Result, invalid};

@@ -1,4 +1,5 @@
-//! Finds the modes of a mesh by file name. [`NAMES`] states the rule. Other files of the folder are never read as modes.
+//! Finds the modes of a mesh by file name. [`NAMES`] states the rule. Other files of the folder are never read as
+//! modes.
 
 use crate::error::Result;
 use crate::load::asset_dir::{AssetDir, EntryKind, stem_of};
@@ -133,7 +134,7 @@ mod tests {
             (&["a.derived.obj", "a.U.float"], "a.derived.obj", Some("a.U.float")),
             (&["a.obj", "modes.txt", "q.npy", "a.q.npy"], "a.obj", Some("modes.txt")),
             (&["a.obj", "U.npy", "modes.txt"], "a.obj", Some("U.npy")),
-            // With several models, a generic name says not which one has the modes.
+            // With several models, a generic name does not say which model the modes belong to.
             (&["a.obj", "b.OBJ", "modes.txt"], "a.obj", None),
             (&["a.obj", "a.mtl"], "a.obj", None),
         ] {

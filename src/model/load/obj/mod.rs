@@ -47,10 +47,11 @@ pub(super) fn parse_obj(text: &str) -> super::polygons::PolygonMesh {
     ObjFile::parse(text.as_bytes()).expect("a valid OBJ file").polygons
 }
 
-/// Adds the materials that the faces use, in the order of [`super::polygons::PolygonMesh::materials`], and their textures.
+/// Adds the materials that the faces use, in the order of [`super::polygons::PolygonMesh::materials`], and their
+/// textures.
 ///
-/// A material without definition is [`Material::unspecified`], and a library or image that does not exist is left out. In
-/// strict mode, both are errors.
+/// A material without definition is [`Material::unspecified`], and a library or image that does not exist is left out.
+/// In strict mode, both are errors.
 ///
 /// # Errors
 /// `Invalid` with the material and the statement.

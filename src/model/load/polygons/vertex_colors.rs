@@ -1,7 +1,7 @@
-//! Colors of vertices, drawn through an image: the renderer has no colors per vertex. Each triangle has its own patch of
-//! 2 x 2 texels. The corners of the triangle are the centers of three texels, and the fourth texel is chosen so that the
-//! bilinear lookup is the linear interpolation of the three colors. Coarser levels of the image mix patches of triangles
-//! that are close in the file; they are used where a triangle is smaller than a pixel.
+//! Colors of vertices, drawn through an image: the renderer has no colors per vertex. Each triangle has its own patch
+//! of 2 x 2 texels. The corners of the triangle are the centers of three texels, and the fourth texel is chosen so that
+//! the bilinear lookup is the linear interpolation of the three colors. Coarser levels of the image mix patches of
+//! triangles that are close in the file; they are used where a triangle is smaller than a pixel.
 
 use crate::domain::{Corners, Mesh, Texture};
 use crate::error::{Result, invalid};
@@ -70,8 +70,9 @@ struct Patch {
 }
 
 impl Patch {
-    /// The color is p + q - o in the fourth texel, where o is the color of the corner at the first texel. The corner is
-    /// chosen for which this leaves the range from 0 to 1 the least: for gray colors, the middle one leaves it never.
+    /// The fourth texel has the color p + q - o, where o is the color of the corner at the first texel, and p and q are
+    /// the other two. That corner is chosen so that p + q - o is as little as possible outside of 0 to 1. For gray
+    /// colors, the corner with the middle value keeps it inside.
     fn new(colors: [[f32; 3]; 3]) -> Self {
         let fourth_of = |origin: usize| {
             let [p, q, o] = [colors[(origin + 1) % 3], colors[(origin + 2) % 3], colors[origin]];

@@ -4,7 +4,8 @@ use super::*;
 use crate::domain::{Domain, FollowConstraint, Material, Mesh, Modes, Shape, Transform};
 use crate::scene::{RawStepUpdate, SceneParts, TransformFormat};
 
-/// Domains of one vertex and two modes. The largest coordinate is 1, and so is the spacing of floating origins. Domains 2 and 4 share the coordinates of domain 1; domain 5 has no modes.
+/// Domains of one vertex and two modes. The largest coordinate is 1, and so is the spacing of floating origins. Domains
+/// 2 and 4 share the coordinates of domain 1; domain 5 has no modes.
 fn scene(count: usize) -> Arc<Scene> {
     let mesh =
         || Mesh::from_indexed(vec![[0.5, 0.25, 1.0]], vec![[0.0, 0.0, 1.0]], vec![], vec![[0, 0, 0]]).expect("a point");

@@ -131,8 +131,8 @@ fn vertex_colors_of_all_formats_are_drawn() {
         assert_eq!(texels, [[255, 0, 0, 255], [0, 255, 0, 255], [0, 0, 255, 255]], "{kind} of {component}");
         let ambient = parts.materials[parts.domains[0].material].ambient;
         assert_eq!(ambient, [0.5; 3], "expected the colors to multiply the color of the material");
-        let is_alpha_said = parts.remarks.iter().any(|remark| remark == "the alpha of vertex colors is ignored");
-        assert_eq!(is_alpha_said, has_alpha);
+        let has_alpha_remark = parts.remarks.iter().any(|remark| remark == "the alpha of vertex colors is ignored");
+        assert_eq!(has_alpha_remark, has_alpha);
         Scene::new(parts).expect("a valid scene");
     }
 }
