@@ -9,7 +9,8 @@ use modalcast_compute::gpu;
 use modalcast_model::error::{Result, fault_in};
 use modalcast_render::{DevicePreference, Renderer, RendererInfo};
 
-/// Checks the driver, CUDA devices, NVRTC, EGL devices and OpenGL; exit code 1 if no frame can be drawn.
+/// Checks the NVIDIA driver, the CUDA devices and compiler (NVRTC), and the OpenGL devices (EGL); exit code 1 if no
+/// frame can be drawn.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   modalcast doctor

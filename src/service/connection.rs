@@ -45,8 +45,9 @@ pub(super) struct ConnectionInfo {
     /// Never sent to another client.
     peer: Arc<str>,
     drive_permits: Arc<Semaphore>,
-    /// One permit per pixel: this one for single frames, `stream_pixels` for frame streams.
+    /// One permit per pixel of single frames.
     frame_pixels: Arc<Semaphore>,
+    /// One permit per pixel of frame streams.
     stream_pixels: Arc<Semaphore>,
     max_pixels: u32,
     pub(super) receive: Arc<ConnectionReceiveBudget>,

@@ -159,8 +159,9 @@ struct MessagePosition {
     header: [u8; HEADER_BYTES],
     /// Number of received bytes of the next header.
     header_bytes: usize,
-    /// Length of the message that is being received, and how much of it is missing. 0 between messages.
+    /// Length of the message that is being received. 0 between messages.
     message_bytes: usize,
+    /// Number of bytes of this message that were not received yet.
     missing_bytes: usize,
 }
 

@@ -95,7 +95,7 @@ fn gpu_partial_steps_have_the_bits_of_full_steps() {
     partial_steps::check_partial_steps(cuda_deformer_with_batches);
 }
 
-/// Negative control of the previous test: a step depends on its list of dirty domains.
+/// Negative control of the previous test: a step depends on its list of dirty domains, those that have changed.
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
 fn gpu_domain_missing_from_the_list_does_not_move() {

@@ -1,4 +1,5 @@
-//! Light-space bounds from the kernel `bounds`, compared with bounds computed from the positions of each tile.
+//! Bounds along the axes of the light from the kernel `bounds`, compared with bounds computed from the positions of
+//! each tile, a block of vertices.
 
 use modalcast_model::deform::Deformer;
 use modalcast_model::scene::{DeformationSettings, SceneState};

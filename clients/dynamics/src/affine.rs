@@ -95,6 +95,7 @@ fn closed_form_rotation(correlation: &Matrix3<f64>) -> Option<Matrix3<f64>> {
     let (determinant, constant) = (x.dot(&cofactors.column(0)), 1.0 - 4.0 * cofactors.norm_squared());
     // The largest sum of three numbers whose squares add up to 1.
     let mut sum = 3.0_f64.sqrt();
+    // The limit only bounds the loop. The convergence is quadratic, so fewer iterations are sufficient.
     for _ in 0..16 {
         let value = ((sum * sum - 2.0) * sum - 8.0 * determinant) * sum + constant;
         let slope = 4.0 * ((sum * sum - 1.0) * sum - 2.0 * determinant);

@@ -11,7 +11,7 @@
 //! | `oscillator` | integrates one linear mode over a step, exactly |
 //! | `wind` | wind pressure by time and position, from a spectrum of turbulence |
 //! | `tree` | a tree in the wind, by modal superposition |
-//! | `cubic` | reduced StVK forces from a `.cub` file, with Jacobian and potential |
+//! | `cubic` | reduced forces of a St. Venant-Kirchhoff material from a `.cub` file, with Jacobian and potential |
 //! | `vega` | base frequency and damping from a `.config` file |
 //! | `newmark` | implicit time integration of the reduced equations of motion |
 //! | `bridge` | a bridge under a pulsating load |

@@ -83,7 +83,7 @@ struct StepObjective<'a> {
 }
 
 impl ReducedSystem {
-    /// Creates a system with Vega's frequency scaling and Rayleigh damping.
+    /// Creates a system with the frequency scale and the Rayleigh damping of Vega's settings.
     ///
     /// # Errors
     /// `Invalid` if the stiffness at rest is not positive definite.

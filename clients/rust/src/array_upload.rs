@@ -23,8 +23,8 @@ pub enum UploadShape {
 }
 
 impl UploadShape {
-    /// Size of the arrays according to the numbers of vertices, triangles and modes. The server rejects arrays of
-    /// another size.
+    /// Size of the arrays according to the numbers of vertices, triangles and modes: three numbers of four bytes per
+    /// vertex, per vertex and mode, and per triangle. The server rejects arrays of another size.
     const fn declared_bytes(&self) -> u64 {
         match self {
             Self::Arrays { positions, triangles, rank, .. } => {

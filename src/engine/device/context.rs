@@ -49,7 +49,7 @@ pub(in crate::engine) struct PartialDraw {
     upload_ms: Option<f64>,
 }
 
-/// An AOV of which some bands are not submitted yet.
+/// An AOV (arbitrary output variable: values instead of colors) of which some bands of rows are not submitted yet.
 #[derive(Debug)]
 pub(in crate::engine) struct PartialAovDraw {
     pub aov: PartialAov,
@@ -563,7 +563,8 @@ fn open_backend(config: &Config) -> Result<(Backend, Option<Arc<gpu::Device>>, S
     }
 }
 
-/// Opens the CUDA device. Fails if no installed NVRTC supports it, because the kernels could not be compiled.
+/// Opens the CUDA device. Fails if no installed NVRTC (the run-time compiler of CUDA) supports it, because the kernels
+/// could not be compiled.
 fn open_cuda(config: &Config) -> Result<(Backend, Option<Arc<gpu::Device>>, String)> {
     let device = gpu::Device::open(config.cuda_device)?;
     device.check_compiler()?;

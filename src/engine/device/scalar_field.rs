@@ -26,11 +26,12 @@ pub fn validate_mode(scene: &Scene, mode: u32) -> Result<u32> {
     if (mode as usize) < max_rank { Ok(mode) } else { Err(invalid("mode", format!("an index below {max_rank}"), mode)) }
 }
 
-/// |u| of every vertex in meters: the distance of its deformed position from T x0, the position that it has if the
-/// domain is rigid.
+/// The length of u = U q for every vertex in meters: the distance of its deformed position from T x0, the position that
+/// it has if the domain is rigid.
 ///
 /// T x0 and the difference are computed in f64, so the error is the error of the deformer's positions. These positions
-/// are f32 relative to the domain's floating origin: one kilometer from the origin the error is up to 0.1 mm.
+/// are f32 relative to the domain's floating origin, an f64 point near the domain: one kilometer from this origin the
+/// error is up to 0.1 mm.
 pub(in crate::engine) fn displacement_magnitudes(
     scene: &Scene,
     state: &SceneState,

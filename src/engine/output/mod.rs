@@ -1,4 +1,5 @@
-//! Outputs of steps: frames, AOVs, picks, vertices and states, and their encoding for the wire off the device thread.
+//! Outputs of steps: frames, AOVs (arbitrary output variables, such as depth), picks, vertices and states, and their
+//! encoding for the wire off the device thread.
 
 mod encoder_pool;
 pub(super) mod encoding_task;

@@ -41,7 +41,8 @@ pub enum Pixels {
 }
 
 impl RenderedPicture {
-    /// A picture of an AOV. With a legend its values are drawn as a color map.
+    /// A picture of an AOV, which has values instead of colors. With a legend (the scale of a color map), the values
+    /// are drawn as colors.
     pub(in crate::engine) fn from_aov(image: AovImage, legend: Option<Legend>) -> Self {
         let (width, height, stages) = (image.width, image.height, stage_times(&image.times));
         let pixels = match legend {

@@ -104,7 +104,8 @@ pub struct StepOutput {
     /// Steps that this subscriber skipped since its last output.
     pub skipped: u64,
     pub stages: StageTimes,
-    /// The floating origins that the vertices are relative to. `None` if all are relative to the scene's origin.
+    /// The floating origins: per domain, the f64 point that its vertices are relative to. `None` if all are relative to
+    /// the scene's origin.
     pub origins: Option<Arc<FloatingOrigins>>,
     pub body: OutputBody,
 }

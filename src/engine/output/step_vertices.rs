@@ -1,4 +1,4 @@
-//! The vertices of a step and their packed sections.
+//! The vertices of a step and their packed sections. A section has the bytes of one attribute for the wire.
 
 use std::sync::{Arc, Mutex};
 

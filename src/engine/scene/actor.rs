@@ -393,7 +393,7 @@ mod tests {
     use crate::engine::testing;
     use modalcast_model::scene::{DirtyDomains, RawStepUpdate};
 
-    /// A restored state has the serial number of the rest state, so only the list of changes tells them apart.
+    /// A restored state has the serial number of the rest state. Only the list of changed domains tells the two apart.
     #[test]
     fn step_from_rest_changes_every_domain() {
         let scene = testing::two_strips();

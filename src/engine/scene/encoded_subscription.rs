@@ -139,8 +139,8 @@ mod tests {
         EncodedSubscription::new(subscription, encoder, vec![FrameFormat::Png], ALL_STEPS)
     }
 
-    /// Sends frames while the subscriber has credits. Returns how many were sent. The size of the frames decreases, so
-    /// that later frames could be encoded before earlier ones.
+    /// Sends frames while the subscriber has credits, each of which permits one frame. Returns how many were sent. The
+    /// size of the frames decreases, so that later frames could be encoded before earlier ones.
     async fn send_until_full(subscriber: &Subscriber, frames: &mut EncodedSubscription) -> usize {
         for number in 0..20 {
             poll_without_frame(frames).await;

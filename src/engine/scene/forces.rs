@@ -348,7 +348,7 @@ impl ForceChannel {
         self.sets.send_if_modified(|set| set.drop_expired(Instant::now()));
     }
 
-    /// Adds a reader. A passive one does not count as a receiver of the forces.
+    /// Adds a reader. A passive one, which does not simulate, does not count as a receiver of the forces.
     ///
     /// # Errors
     /// `LimitReached` when there are too many readers.

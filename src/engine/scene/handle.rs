@@ -42,7 +42,7 @@ pub struct SceneHandle {
     current_state: watch::Receiver<Arc<SceneState>>,
     /// Created when forces are applied or read for the first time.
     forces: OnceLock<Arc<ForceChannel>>,
-    /// Wakes the actor when a subscription grants a credit or is dropped.
+    /// Wakes the actor when a subscription grants a credit, which permits one more result, or is dropped.
     wake: Arc<Notify>,
     /// The error of [`Self::stop`], if it was called.
     stop_error: OnceLock<Error>,

@@ -1,4 +1,5 @@
-//! The writer lease of a scene: what a writer asks for, and the token that identifies it.
+//! The writer lease of a scene, which is the exclusive right to send steps: what a writer asks for, and the token that
+//! identifies the writer.
 
 use std::fmt;
 use std::sync::Arc;

@@ -27,10 +27,11 @@ use modalcast_render::MAX_FRAMES_IN_FLIGHT;
 /// How the current step is delivered to subscribers.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct DeliveryMode {
-    /// A lossless subscriber without a credit blocks the writer. It is disconnected after `Config::stall_timeout`.
+    /// A lossless subscriber without a credit, which permits one result, blocks the writer. It is disconnected after
+    /// `Config::stall_timeout`.
     pub applies_back_pressure: bool,
-    /// Another step is queued. Readbacks of vertices are only started now, and are delivered while the queued step is
-    /// computed. Readbacks of frames are always only started.
+    /// Whether another step is queued. If so, readbacks of vertices are only started now, and are delivered while the
+    /// queued step is computed. Readbacks of frames are only started in any case.
     pub overlaps_next_step: bool,
 }
 

@@ -25,8 +25,8 @@ const WRITE_INTERVAL: Duration = Duration::from_millis(100);
 /// counts of coordinates and of transforms (u64), q (f32), the transforms (12 f32 each), and the SHA-256 of all bytes
 /// before the hash. Little-endian.
 const MAGIC: &[u8; 8] = b"MCSTEP01";
-/// Magic number of a checkpoint with floating origins. Between the transforms and the hash, the file contains the
-/// shared origin (3 f64) and one translation (3 f64) per transform.
+/// Magic number of a checkpoint with floating origins, the points that transforms are relative to. Between the
+/// transforms and the hash, the file contains the shared origin (3 f64) and one translation (3 f64) per transform.
 const MAGIC_ORIGINS: &[u8; 8] = b"MCSTEP02";
 /// The magic number and five numbers of 8 bytes.
 const HEADER_BYTES: usize = 8 + 5 * 8;
@@ -109,7 +109,7 @@ impl CheckpointStore {
         fs::remove_file(checkpoint_path(&self.folder, name)).ok();
     }
 
-    /// Writes the dirty states and ends the thread. Waits for the disk.
+    /// Writes the states that are not written yet, and ends the thread. Waits for the disk.
     pub(in crate::engine) fn finish(&self) {
         lock(&self.shared.pending).is_stopping = true;
         self.shared.change_signal.notify_one();

@@ -32,8 +32,8 @@ pub(super) fn parse_output(scene: &Scene, picture: &v1::Picture) -> Result<(Fram
     Ok((frame_output, parse_format(frame_output, picture)?))
 }
 
-/// Parses the width in pixels of lines along mesh edges. 0 means no lines; an unset width is that of the scene's look.
-/// The color is that of the look.
+/// Parses the width in pixels of lines along mesh edges. 0 means no lines. The color, and an unset width, are those of
+/// `look.edges` in the scene's scene.toml.
 pub(super) fn parse_edges(scene: &Scene, output: FrameOutput, width: Option<f32>) -> Result<Option<MeshEdges>> {
     let look_edges = scene.look.edges.filter(|_| output == FrameOutput::Color);
     let Some(width) = width else { return Ok(look_edges) };

@@ -19,8 +19,8 @@ pub(super) const SLOT_BYTES: usize = 1 << 20;
 /// slow client would only read steps that are further out of date.
 pub(super) const SLOT_COUNT: usize = 8;
 
-/// Data of at least this size are put into a slot. The copy and the return of a slot cost more than to send fewer
-/// bytes.
+/// Data of at least this size are put into a slot. For fewer bytes, sending them costs less than copying them to a slot
+/// and returning it.
 const MIN_SHARED_BYTES: usize = 64 << 10;
 
 /// The slots of a connection. The memory is freed when this is dropped.

@@ -46,7 +46,7 @@ impl ReplyCredit {
         self.added.notify_one();
     }
 
-    /// Waits until the credit is positive. Cancel-safe.
+    /// Waits until the client accepts more bytes. Cancel-safe.
     async fn available(&self) {
         while self.bytes.load(Ordering::Acquire) <= 0 {
             self.added.notified().await;

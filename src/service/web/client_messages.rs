@@ -27,8 +27,8 @@ const MAX_COLLECTED_BYTES: usize = 16 << 10;
 /// Size of the prefix of a gRPC message: a flag (0: not compressed) and the length of the message as u32.
 const PREFIX_BYTES: usize = 5;
 
-/// The queue of messages. Its size is bounded by the credit of the call, and by the receive budget of the connection,
-/// which also counts the prefixes of empty messages.
+/// The queue of messages. Its size is bounded by the credit of the call, which is the number of bytes that the client
+/// may send, and by the receive budget of the connection, which also counts the prefixes of empty messages.
 #[derive(Debug)]
 pub(super) struct ClientMessages {
     state: Mutex<State>,

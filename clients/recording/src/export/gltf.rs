@@ -81,10 +81,11 @@ pub fn export_gltf(recording: &Recording, out: &Path) -> Result<()> {
 /// The node of the scene: scales to meters and turns the up axis to y.
 fn root_node(description: &SceneDescription, children: Vec<usize>) -> Value {
     let info = &description.info;
-    let half = std::f64::consts::FRAC_1_SQRT_2;
+    // The sine and the cosine of 45 degrees, half of a quarter turn.
+    let sine = std::f64::consts::FRAC_1_SQRT_2;
     let rotation = match info.up.as_str() {
-        "z" => [-half, 0.0, 0.0, half],
-        "x" => [0.0, 0.0, half, half],
+        "z" => [-sine, 0.0, 0.0, sine],
+        "x" => [0.0, 0.0, sine, sine],
         _ => [0.0, 0.0, 0.0, 1.0],
     };
     let scale = [info.unit; 3];

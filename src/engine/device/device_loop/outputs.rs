@@ -1,4 +1,5 @@
-//! Frames and AOVs (arbitrary output variables), and the preparation of their scenes, in steps.
+//! Frames and AOVs (arbitrary output variables, such as depth), and the preparation of their scenes, in draw steps:
+//! parts between which other scenes are served.
 
 use std::time::Instant;
 

@@ -132,7 +132,7 @@ pub(crate) struct StepOptions {
     /// Smallest accepted step number: the reply has this step or a later one.
     #[arg(long)]
     pub(crate) min_step: Option<u64>,
-    /// Run of the step; 0 selects the run of the latest writer.
+    /// Run of the step: the number of the writer that sends the step; 0 selects the latest writer.
     #[arg(long, default_value_t = 0)]
     pub(crate) run: u64,
     /// How long the server may wait for the step, in milliseconds; 0 selects the server's default.
