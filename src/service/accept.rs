@@ -130,8 +130,10 @@ fn http2_builder(config: &Config) -> http2::Builder<TokioExecutor> {
     builder
         .timer(TokioTimer::new())
         .max_concurrent_streams(MAX_CALLS)
-        // A client that opens and resets more streams than this (a rapid-reset attack) is disconnected.
+        // A connection ends when the server has reset this many of its streams because of errors.
         .max_local_error_reset_streams(1024)
+        // A connection ends when its client has reset this many streams that the server has not accepted yet (a
+        // rapid-reset attack).
         .max_pending_accept_reset_streams(100)
         .max_header_list_size(16 << 10)
         .initial_stream_window_size(config.stream_window)

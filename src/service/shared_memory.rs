@@ -181,7 +181,8 @@ async fn serve_memory(socket: UnixStream, memory: &SharedMemory, permit: OwnedSe
     }
 }
 
-/// Accepts the own user only. The permissions of the socket exclude other users, but not the system administrator.
+/// Accepts only the user of this process. The permissions of the socket exclude other users, but not the system
+/// administrator.
 fn check_user(uid: u32) -> io::Result<()> {
     let own_uid = rustix::process::geteuid().as_raw();
     if uid == own_uid {

@@ -14,9 +14,10 @@ ITEM = 8
 FRAMES = 8
 SIDE = 8192
 
-# Seconds within which another client receives a small frame, during the attack and after it was canceled. Then the
-# limit on the growth of the memory in bytes.
+# Seconds within which another client receives a small frame, during the attack and after it was canceled.
 MAX_SECONDS = 2.0
+
+# Limit on the growth of the memory in bytes.
 MAX_MEMORY = 2 << 30
 
 # Seconds of the attack before it is canceled.

@@ -10,8 +10,8 @@ import http2
 
 
 class Swarm(threading.Thread):
-    """Keeps `count` connections open. Each sends `greeting`, and then only answers if `answers` is set. Opens a new
-    connection for each that the server closes, at most `total` in all."""
+    """Keeps `count` connections open. Each sends `greeting`. If `answers` is set, it then answers PINGs and SETTINGS.
+    Opens a new connection for each that the server closes, at most `total` in all."""
 
     def __init__(self, port, count, greeting, answers=True, total=None):
         super().__init__(daemon=True)

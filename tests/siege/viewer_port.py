@@ -38,8 +38,8 @@ UNREAD_CALLS = 32
 MAX_UNREAD_MEMORY = 384 << 20
 DURATION = 12.0
 
-# Frames of each flood. A connection of the negative control sends FEW frames and must stay open. Then the limit on the
-# growth of the memory in bytes.
+# Each flood sends FLOOD frames. A connection of the negative control sends FEW frames and must stay open. The memory
+# may grow by MAX_FLOOD_MEMORY bytes.
 FLOOD = 100_000
 FEW = 1000
 MAX_FLOOD_MEMORY = 32 << 20

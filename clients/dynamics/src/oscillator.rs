@@ -2,10 +2,10 @@
 //! step.
 //!
 //! With time in units of the step h, p = h q' and y = (q, p), the mode is the 2 x 2 system y' = M y + h^2 e2 f. Here
-//! w = omega h, M = [[0, 1], [-w^2, -2 zeta w]] and e2 = (0, 1). All coefficients follow from the impulse response
-//! S(t): the free motion is exp(M) = [[C, S], [-w^2 S, S']], the step response is G1 = integral of S, and the ramp
-//! response is G2 = integral of G1. There are three formulas for S. `Response::compute` selects the accurate one by w
-//! and zeta.
+//! w = omega h, M = [[0, 1], [-w^2, -2 zeta w]] and e2 = (0, 1). All coefficients follow from the impulse response S(t)
+//! and its derivative S'. The free motion is exp(M) = [[C, S], [-w^2 S, S']] with C = S' + 2 zeta w S. The step
+//! response is G1 = integral of S, and the ramp response is G2 = integral of G1. There are three formulas for S.
+//! `Response::compute` selects the accurate one by w and zeta.
 
 use crate::error::{Result, invalid_input};
 

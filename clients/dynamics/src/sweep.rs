@@ -132,7 +132,7 @@ impl Scenario for SweepScenario {
                 "no coordinates: the scene rocks by {ROCKING_ANGLE} rad about its base every {ROCKING_PERIOD} s"
             ),
             _ => format!(
-                "in every domain one mode after another as a sine, {} of the diagonal at its crest",
+                "in every domain one mode after another as a sine, {} of the diagonal at its peak",
                 self.options.displacement_fraction
             ),
         };

@@ -369,8 +369,8 @@ impl DeviceContext {
     }
 
     /// Begins to prepare the textures and programs of a scene, so that its buffers can then be created quickly. Returns
-    /// `None` without a renderer, if nothing is to prepare, or if the scene is not valid; in the last case, creating
-    /// the buffers returns the error.
+    /// `None` if there is no renderer, if there is nothing to prepare, or if the scene is not valid. For an invalid
+    /// scene, creating the buffers then returns the error.
     pub(in crate::engine) fn begin_preparation(&mut self, scene: &Arc<Scene>) -> Option<ScenePreparation> {
         let preparation = self.renderer.as_mut().ok()?.begin_preparation(scene).ok()?;
         (!preparation.is_finished()).then_some(preparation)

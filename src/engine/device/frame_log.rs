@@ -1,4 +1,5 @@
-//! Log lines about the frames of a scene: the look that the renderer chose, and vertices below the ground.
+//! Log lines about the frames of a scene: the look that the renderer chose (preset, antialiasing and shadow map), and
+//! vertices below the ground.
 
 use modalcast_render::{FrameInfo, FrameLook};
 

@@ -17,9 +17,9 @@ const MAX_PIXEL_BYTES: usize = 128 << 20;
 /// previous one is sent. Further steps would only add latency.
 const MAX_LATEST_STEPS: usize = 2;
 
-/// The encoded frames of a [`Subscription`], in the same order. A lossless stream holds the frames of at most one step
-/// per core. While the client does not read frames, the subscription is not read either and applies back-pressure to
-/// the writer.
+/// The encoded frames of a [`Subscription`], in the same order. A lossless stream holds the frames of at most as many
+/// steps as there are cores. While the client does not read frames, the subscription is not read either and applies
+/// back-pressure to the writer.
 #[derive(Debug)]
 pub struct EncodedSubscription {
     subscription: Subscription,

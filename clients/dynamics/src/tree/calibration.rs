@@ -2,9 +2,9 @@
 //!
 //! A calibration run applies the wind for a physical duration, which depends neither on the steps of the run nor on
 //! their number. The modes are linear, so their response can be scaled: the gain of a domain is the factor of the
-//! response of its modes, and the calibration run has gain 1. All domains have a common gain, at which the peak of the
-//! crown's mean displacement is the requested fraction of the height. Only branches may have a smaller gain: their
-//! bending is limited to a fraction of their diagonal, because linear modes do not represent large bending.
+//! response of its modes, and the calibration run has gain 1. The calibration finds a common gain, at which the peak of
+//! the crown's mean displacement is the requested fraction of the height. A branch gets a smaller gain if it would bend
+//! by more than a fraction of its diagonal, because linear modes do not represent large bending.
 //!
 //! Bending is the elastic displacement U q. The wind strength, an option of the scenario, scales the requested sway and
 //! the bending limits.

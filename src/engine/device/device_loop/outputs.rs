@@ -36,9 +36,9 @@ impl DeviceLoop {
         None
     }
 
-    /// Begins to prepare the textures and programs that a command needs. A command needs those of the OpenGL buffers
-    /// that it creates, and those of a frame that is drawn in another way than earlier frames. `None` if nothing is to
-    /// prepare.
+    /// Begins to prepare the textures and programs that a command needs. A command that creates OpenGL buffers needs
+    /// the textures and programs of these buffers. A frame that is drawn in another way than earlier frames needs
+    /// further programs. `None` if there is nothing to prepare.
     fn begin_preparation(&mut self, command: &Command) -> Option<ScenePreparation> {
         let Self { context, scenes, .. } = self;
         match command {
