@@ -1,6 +1,7 @@
-// PNG encoder: filters RGBA8 pixels, compresses them and writes a whole file to pinned host memory. The file is the one
-// that the CPU twin writes: independent strips of rows, each one deflate block with a Huffman code of its own, or
-// stored blocks, in an IDAT chunk of its own (src/frame/png describes the format). The file depends only on the pixels.
+// PNG encoder: filters RGBA8 pixels, compresses them and writes a whole file to pinned host memory. The file equals
+// that of the CPU twin (src/frame/png describes the format). Strips of rows are encoded independently, each as an IDAT
+// chunk with one deflate block that has a Huffman code of its own, or with stored blocks. The file depends only on the
+// pixels.
 //   png_filter  a block per tile: filter Sub, counts of the symbols, sums for Adler-32; clears the memory of the file
 //   png_code    a block per strip: Huffman code, header of the deflate block, sizes
 //   png_pack    a block per tile: writes the bits of the symbols at offsets from prefix sums

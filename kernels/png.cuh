@@ -232,8 +232,8 @@ __device__ inline void add_run(const ZeroRun& run, unsigned first, unsigned end,
     }
 }
 
-// Passes the symbols that begin in a word to `sink`: first those of a run that ends in it or covers it, then literals,
-// then those of a run that begins in it.
+// Passes the symbols that begin in a word to `sink`: first those of a run that ends in the word or covers it, then
+// literals, then those of a run that begins in the word.
 template <typename Sink>
 __device__ inline void add_word(const SharedTile& tile, unsigned word, Sink& sink) {
     const unsigned first = WORD_BYTES * word;

@@ -1,6 +1,6 @@
-// Compute rasterizer: one sample per pixel. For each sample it finds the nearest depth and the index of the triangle
-// with that depth, by an atomic minimum of `~depth << 32 | triangle`: depth is 1 at the near plane and 0 at the far
-// plane. The result does not depend on the order of execution. A tile is 64 x 64 samples of the window.
+// Compute rasterizer: one sample per pixel. For each sample it finds the nearest depth and the index of its triangle,
+// by an atomic minimum of `~depth << 32 | triangle`. Depth is 1 at the near plane and 0 at the far plane. The result
+// does not depend on the order of execution. A tile is 64 x 64 samples of the window.
 //   raster           a thread per triangle of a range: culls the triangle, draws it if its rectangle has few samples,
 //                    or appends it to the medium or the large queue
 //   raster_cut_outs  the same for cut-out triangles
@@ -236,7 +236,7 @@ extern "C" __global__ void __launch_bounds__(BLOCK, 4) raster_warps(const __grid
 }
 
 // Finds the entry of the large queue that contains `tile`, the index of a tile among the tiles of all entries: the last
-// entry whose first tile is at or before `tile`. The warp tests 32 entries at a time.
+// entry whose first tile is at most `tile`. The warp tests 32 entries at a time.
 __device__ inline LargeTriangle find_large_triangle(const RasterArgs& args, unsigned entry_count, unsigned long long tile) {
     const LargeTriangle* queue = (const LargeTriangle*)args.large_queue;
     unsigned low = 0, high = entry_count;

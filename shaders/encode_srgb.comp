@@ -7,8 +7,8 @@ layout(std430, binding = 0) writeonly buffer Pixels { uint pixels[]; };
 #ifdef DITHER
 // Threshold of ordered dithering for a pixel, in output levels (Bayer 1973). Each of -63/128 to 63/128 in steps of 1/64
 // occurs once in every 8 x 8 pixels. `rank`, 0 to 63, interleaves the lower three bits of x ^ y and y: bit 0 of both
-// becomes the highest two bits of `rank`, then follow bit 1 and bit 2. The mean over 8 x 8 pixels is exact to 1/64
-// level, and a value exactly on a level does not change.
+// becomes the highest two bits of `rank`, bit 1 the next two, and bit 2 the lowest two. The mean over 8 x 8 pixels is
+// exact to 1/64 level, and a value exactly on a level does not change.
 float bayer_threshold(ivec2 pixel) {
     uint x = uint(pixel.x ^ pixel.y), y = uint(pixel.y);
     uint rank = (x & 1u) << 5 | (y & 1u) << 4 | (x & 2u) << 2 | (y & 2u) << 1 | (x & 4u) >> 1 | (y & 4u) >> 2;

@@ -86,9 +86,9 @@ pub struct FrameInfo {
     pub raster_backends: RasterBackends,
     /// The parts of the look that a preset can choose. `None` for outputs other than color.
     pub look: Option<FrameLook>,
-    /// How far the lowest vertex lies below the ground, in meters. 0 if no vertex lies below the ground by more than
-    /// 1e-5 of the diagonal of the scene's rest bounds, which bounds the error of the vertices, or if the scene has no
-    /// ground. Vertices outside of [`FrameParams::bounds`] are ignored.
+    /// How far the lowest vertex lies below the ground, in meters. 0 if the scene has no ground, or if the distance is
+    /// at most 1e-5 of the diagonal of the scene's rest bounds, which is an upper bound of the error of the vertices.
+    /// Vertices outside of [`FrameParams::bounds`] are ignored.
     pub below_ground: f64,
 }
 

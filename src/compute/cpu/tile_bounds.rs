@@ -48,7 +48,8 @@ impl TileBounds {
     /// The smallest bounds that contain both.
     #[inline(always)]
     pub(super) fn union(self, other: Self) -> Self {
-        // `add_zero_or_nan(number * 0.0)` would not do: empty bounds are infinite, and must not make the union NaN.
+        // `add_zero_or_nan(number * 0.0)` would be wrong for empty bounds, which are infinite: they must not make the
+        // union NaN.
         let zero_or_nan = if self.min[0].is_nan() || other.min[0].is_nan() { f32::NAN } else { 0.0 };
         Self {
             min: std::array::from_fn(|axis| self.min[axis].min(other.min[axis])),

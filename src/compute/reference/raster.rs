@@ -1,8 +1,8 @@
 //! The reference rasterizer: plain loops over samples that define the result of `kernels/raster.cu`.
 //!
 //! Corners are transformed to clip space in f32; each sum and product is rounded separately. Triangles are clipped by
-//! the near plane and a guard band (a rectangle around the window that keeps coordinates in range; Sutherland and
-//! Hodgman, "Reentrant polygon clipping", 1974), and their corners are snapped to 1/256 pixel.
+//! the near plane and a guard band, a rectangle around the window that keeps coordinates in range (Sutherland and
+//! Hodgman, "Reentrant polygon clipping", 1974). Their corners are snapped to 1/256 pixel.
 //!
 //! Coverage is then computed exactly, in integers: a triangle covers the samples on the inner side of all its edges. A
 //! sample on an edge belongs to the triangle for which it is a top or left edge, so triangles that share an edge cover

@@ -4,8 +4,8 @@
 //! the linear part of T, and U_ij is the block of three entries of vertex i and mode j. This follows from the triangle
 //! inequality.
 //!
-//! Hysteresis prevents popping of a mode whose q oscillates around a limit: a mode becomes truncated only if all
-//! truncated modes together stay within half the error budget, and is restored when they exceed the whole budget.
+//! Hysteresis prevents popping of a mode whose q oscillates around a limit. A mode becomes truncated only if all
+//! truncated modes together stay within half the error budget. It is restored when they exceed the whole budget.
 
 use modalcast_model::domain::Modes;
 

@@ -1,5 +1,5 @@
-//! The world transform of a domain as a product, T = T_root F: a follower moves with its root domain, and F, the
-//! follower's frame, is the constant transform from the follower's coordinates to those of the root.
+//! The world transform of a domain as a product, T = T_root F. A follower is a domain that moves with its root domain.
+//! F, its frame, is the constant transform from the follower's coordinates to those of the root.
 
 use nalgebra::Matrix3;
 

@@ -14,10 +14,10 @@
 //! - Colors in files are linear factors. Color images are sRGB; normal maps are linear with +Y up.
 //! - OBJ and glTF have Y up; plants, PLY, STL and NumPy archives have Z up; units are meters. `scene.toml` can override
 //!   these defaults.
-//! - Normals of a file are kept. Missing ones are smooth except along creases, which split the corners of a vertex and
-//!   never the vertex itself (module `domain::creases`).
-//! - A file that another file refers to and that does not exist, and an image that is neither PNG nor JPEG, has a
-//!   stand-in and a remark, or is an error in strict mode.
+//! - Normals of a file are kept. Missing normals are smooth except along creases, which split the corners of a vertex
+//!   but not the vertex itself (module `domain::creases`).
+//! - A file that does not exist although another file refers to it, and an image that is neither PNG nor JPEG, are
+//!   replaced by a default with a remark. In strict mode, they are errors.
 
 mod asset_dir;
 #[cfg(test)]

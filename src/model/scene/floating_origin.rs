@@ -51,9 +51,9 @@ pub struct OriginGrids {
 }
 
 impl OriginGrids {
-    /// The spacing of a root is the largest power of two that is at most its size. The size is that of the rest
-    /// positions of the root and its followers in the frame of the root: the diagonal of their bounds or their largest
-    /// coordinate, because f32 rounds relative to the coordinate.
+    /// The spacing of a root is the largest power of two that is at most its size. The size belongs to the rest
+    /// positions of the root and its followers in the frame of the root. It is the diagonal of their bounds or, if
+    /// larger, their largest coordinate, because f32 rounds relative to the coordinate.
     pub(super) fn new(shapes: &[Shape], domains: &[Domain], transform_roots: &TransformRoots) -> Self {
         let shape_bounds: Vec<BoundingBox> = shapes
             .iter()
@@ -227,11 +227,11 @@ impl FloatingOrigins {
         self.translations_since_search = self.translations_since_search.saturating_add(1);
     }
 
-    /// Moves the shared origin under three conditions: more than half of the domains are beyond [`HOME_REACH`], at
-    /// least as many translations were set since the last search as there are domains, and the move leaves fewer
-    /// outliers, or as many outliers and fewer domains beyond this reach. The new shared origin is the grid point
-    /// nearest to the per-axis median, which is robust to a few very distant domains. If this function returns true,
-    /// the caller must call [`Self::rebase_transform`] for every transform.
+    /// Moves the shared origin if more than half of the domains are beyond [`HOME_REACH`], and the move leaves fewer
+    /// outliers, or as many outliers and fewer domains beyond this reach. Searches at most once per as many set
+    /// translations as there are domains. The new shared origin is the grid point nearest to the per-axis median, which
+    /// is robust to a few very distant domains. If this function returns true, the caller must call
+    /// [`Self::rebase_transform`] for every transform.
     pub(super) fn update_shared_origin(&mut self) -> bool {
         let root_count = self.translations.len();
         if 2 * self.counts.beyond_home <= root_count || self.translations_since_search < root_count {

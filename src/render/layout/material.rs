@@ -26,8 +26,8 @@ pub(crate) const MATERIAL_BYTES: usize = size_of::<PackedMaterial>();
 const _: () = assert!(MATERIAL_BYTES == 64, "PackedMaterial differs from shaders/shared/material.glsl");
 
 /// Packs texture array and layer of an image and, in a mixed array (with images of several sizes), the size of the
-/// image: array + 8 (width - 1) and layer + 2048 (height - 1). f32 is exact, because the numbers are below 2^24: sides
-/// are at most 8192, a scene has at most 512 images.
+/// image: array + 8 (width - 1) and layer + 2048 (height - 1). f32 is exact, because both numbers are below 2^24: sides
+/// are at most 8192, and a scene has at most 512 images.
 fn pack_location(array: usize, layer: usize, size: Option<[u32; 2]>) -> [f32; 2] {
     let [width, height] = size.unwrap_or([1, 1]);
     [(array as u32 + 8 * (width - 1)) as f32, (layer as u32 + 2048 * (height - 1)) as f32]

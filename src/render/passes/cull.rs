@@ -3,10 +3,10 @@
 //! triangles/s (an H200 draws the depth of 3 M triangles in 7.3 ms), while its compute throughput is high.
 //!
 //! # Tests
-//! Culling removes triangles outside one plane of the view volume, back faces of single-sided materials, triangles so
-//! small that no sample lies in their bounding box and, with occlusion culling, triangles behind nearer ones. Each
-//! bound is widened by the rounding errors of the shaders and of the rasterizer, so that culling does not change the
-//! image. The counts are read back with the pixels.
+//! Culling removes triangles outside one plane of the view volume, back faces of single-sided materials, and triangles
+//! so small that no sample lies in their bounding box. Occlusion culling also removes triangles behind nearer ones.
+//! Each bound is widened by the rounding errors of the shaders and of the rasterizer, so that culling does not change
+//! the image. The counts are read back with the pixels.
 //!
 //! # Occlusion culling
 //! The occluders are the triangles that were visible in the last frame. Their depth is drawn at their current

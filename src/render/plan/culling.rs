@@ -24,7 +24,8 @@ const MIN_TRIANGLES: usize = 1 << 20;
 /// | almond tree | 37,560 | 1.57 | 1.59 | 2.09 |
 ///
 /// In software, culling is slower: on two cores, the visibility pass of the almond tree (1080p, four samples) takes 80
-/// ms with `None`, 83 ms with `Triangles`, which culls 3 % of the triangles, and four times as long with `Occlusion`.
+/// ms with `None` and 83 ms with `Triangles`, which culls 3 % of the triangles. With `Occlusion` it takes four times as
+/// long.
 pub(crate) fn select_culling(scene: &Scene, limits: &Limits) -> Culling {
     let software = limits.software;
     let selected = match scene.look.culling {

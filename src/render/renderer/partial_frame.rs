@@ -2,10 +2,10 @@
 //! execute commands of other scenes.
 //!
 //! A frame within the limit of [`Renderer::set_max_band_samples`] has one step for each pass, and is meant to be
-//! submitted without a break, unless it is the first one of its scene: drivers finish the compilation of a program when
-//! it is used for the first time. A larger frame is divided into bands of rows. Its steps are the passes that work on
-//! the complete frame, and each band of the other passes. A pass ends with its last band before the next pass begins,
-//! so the inputs of a pass are complete, and the pixels do not depend on the bands.
+//! submitted without a break. The first frame of a scene is an exception: drivers finish the compilation of a program
+//! when it is used for the first time. A larger frame is divided into bands of rows. Its steps are the passes that work
+//! on the complete frame, and each band of the other passes. A pass ends with its last band before the next pass
+//! begins, so the inputs of a pass are complete, and the pixels do not depend on the bands.
 //!
 //! The target of the frame is not in the cache until the frame is submitted, so other frames cannot use it. The buffers
 //! of the scene must not change until then.

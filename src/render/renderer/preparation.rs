@@ -72,8 +72,8 @@ impl Renderer {
         Ok(self.preparation_of(scene, Some(textures), sources))
     }
 
-    /// Begins to compile the programs of a frame of this size that are not compiled yet: those for another number of
-    /// samples per pixel than most frames have, or for lines along mesh edges.
+    /// Begins to compile the programs of a frame of this size that are not compiled yet. Those are programs for mesh
+    /// edges, or for another number of samples per pixel than most frames have.
     ///
     /// # Errors
     /// `Fault` of OpenGL.

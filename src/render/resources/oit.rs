@@ -1,8 +1,8 @@
 //! Fragment lists of exact order-independent transparency, in bounded memory.
 //!
 //! The memory budget is a number of fragments. When a frame has more, each pixel keeps only its nearest fragments, up
-//! to a limit that all pixels share: the largest limit for which all lists fit, at most 256 (the number of bins of the
-//! histogram over fragments per pixel). Dropped fragments are counted.
+//! to a limit that all pixels share. It is the largest limit for which all lists fit, at most 256 (the number of bins
+//! of the histogram over fragments per pixel). Dropped fragments are counted.
 
 use std::rc::Rc;
 

@@ -123,9 +123,9 @@ fn diagonal(params: &LightBoxParams) -> f64 {
     params.bounds.diagonal().max(MIN_SIZE).max(1e-6 * params.bounds.center().coords.amax())
 }
 
-/// z of the near and the far plane in light space, quantized to a 64th of the largest power of two that is at most the
-/// diagonal, with a margin of 1 % of the diagonal. The near plane is nearest to the sun. `far` and `nearest`: smallest
-/// and largest z of the bounds.
+/// z of the near and the far plane in light space, with a margin of 1 % of the diagonal. Both are quantized to a 64th
+/// of the largest power of two that is at most the diagonal. The near plane is nearest to the sun. `far` and `nearest`:
+/// smallest and largest z of the bounds.
 fn depth_range(
     params: &LightBoxParams,
     [mut far, nearest]: [f64; 2],

@@ -2,8 +2,8 @@
 //! pinned memory, so only compressed bytes cross the bus. The file is the one that the CPU encoder of the server
 //! writes.
 //!
-//! An encoder has a size. Its memory is allocated once: work buffers on the device, which the stream's order protects
-//! from the next encoding, and pinned slots, one for each file that is in flight or that a reader holds.
+//! An encoder has a size. Its memory is allocated once: work buffers on the device, and pinned slots, one for each file
+//! that is in flight or that a reader holds. The order of the stream protects the work buffers from the next encoding.
 //!
 //! | file | content |
 //! |---|---|

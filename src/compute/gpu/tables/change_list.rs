@@ -1,5 +1,6 @@
-//! The lists of a partial step (a step that changes few domains), which `apply` reads from pinned memory: changed
-//! domains with their new transforms and coordinates, and the dirty tiles, which `deform` then computes. Pure.
+//! The lists of a partial step (a step that changes few domains), which `apply` reads from pinned memory. They contain
+//! the changed domains with their new transforms and coordinates, and the dirty tiles, which `deform` then computes.
+//! Pure.
 //!
 //! ```text
 //! [changes][new transforms: 12 words each][new q][dirty tiles]
@@ -24,8 +25,8 @@ pub struct ChangeListLengths {
 const CHANGE_WORDS: usize = size_of::<Change>() / 4;
 const TRANSFORM_WORDS: usize = 12;
 
-/// Maximum number of changed domains in a partial step. 0 if all steps are full, because the scene has too few domains
-/// or truncates modes: the set of truncated modes depends on q, and only a full step uploads it.
+/// Maximum number of changed domains in a partial step. 0 if all steps are full: in a scene with too few domains, and
+/// in a scene that truncates modes, because only a full step uploads the set of truncated modes, which depends on q.
 pub(crate) const fn max_changed_domains(scene: &Scene) -> usize {
     if scene.features.truncation { 0 } else { scene.domains.len() / MAX_CHANGED_DIVISOR }
 }

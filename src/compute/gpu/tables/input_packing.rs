@@ -128,9 +128,9 @@ impl InputPacker {
         }
     }
 
-    /// Writes all coordinates in the layout of the device. If that is the order of the scene's state (U in f32, no
-    /// truncation, and therefore no factors), they are copied, and the padding at the end is zeroed. Otherwise each
-    /// domain is padded to whole chunks.
+    /// Writes all coordinates in the layout of the device. If this layout has the order of the scene's state (U in f32,
+    /// no truncation, and therefore no factors), the coordinates are copied, and the padding at the end is zeroed.
+    /// Otherwise each domain is padded to whole chunks.
     fn write_q(&self, state: &SceneState, device_q: &mut [f32]) {
         if self.coordinates.is_scene_order {
             let mut writer = SliceWriter::new(device_q);

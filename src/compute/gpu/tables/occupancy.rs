@@ -26,8 +26,8 @@ const fn row(macros: &'static [&'static str], before_sm_90: u32, sm_90: u32) -> 
 ///
 /// The numbers were chosen with the report of `ptxas -v`: variants with more accumulators or outputs have fewer blocks,
 /// and none spills. The test `nvrtc_compiles_every_kernel_without_spilling` repeats the measurement. One row differs by
-/// architecture. With MODES and RIGID_NORMALS, NVRTC 13.0 reports for 28 blocks (72 registers) no spills on sm_90 and
-/// 16 bytes on sm_80, and for 32 blocks (64 registers) 80 bytes on sm_90.
+/// architecture. With MODES and RIGID_NORMALS, NVRTC 13.0 reports no spills for 28 blocks (72 registers) on sm_90. It
+/// reports spills of 16 bytes for 28 blocks on sm_80, and of 80 bytes for 32 blocks (64 registers) on sm_90.
 const MIN_BLOCKS: [MinBlocks; 22] = [
     row(&["ONE_ITEM_PER_LANE", "MODES", "MODE_TRUNCATION", "TILE_LIST"], 8, 8),
     row(&["ONE_ITEM_PER_LANE", "MODES"], 10, 10),

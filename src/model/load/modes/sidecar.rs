@@ -9,8 +9,8 @@ use crate::load::source::{find_models, recognize_model};
 const NAMES: &str = "the modes of MODEL are in MODEL.U.npy, MODEL.npy, MODEL.U.float or another name of the reference \
                      of scene.toml, or in the file of the key `modes`";
 
-/// What follows the name of a model in the names of its mode files, in order of preference: Vega's files for the
-/// rendered mesh before its other files, binary files before text files, which have fewer digits.
+/// Endings of the names of mode files, after the name of the model, in order of preference. Vega's files for the
+/// rendered mesh come before its other files. Binary files come before text files, which have fewer digits.
 const ENDINGS: [&str; 13] = [
     ".URendering.float",
     ".U.float",
