@@ -45,8 +45,9 @@ fn parse(bytes: &[u8], remarks: &mut Vec<String>) -> Result<(PolygonMesh, Option
             return Err(invalid(format!("array 'faces': row {index}"), format!("0 to {}", count - 1), vertex));
         }
         let corner = |vertex: &f64| {
-            let v = *vertex as u32;
-            Corner { v, vt: if has_uvs { v } else { NO_INDEX }, vn: if has_normals { v } else { NO_INDEX } }
+            let vertex = *vertex as u32;
+            let index_if = |exists: bool| if exists { vertex } else { NO_INDEX };
+            Corner { vertex, uv: index_if(has_uvs), normal: index_if(has_normals) }
         };
         polygons.add_face(face.iter().map(corner), 0, index)?;
     }

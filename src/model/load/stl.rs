@@ -175,7 +175,7 @@ mod tests {
             let polygons = parse(bytes, &mut remarks).expect("a valid file");
             assert_eq!(polygons.faces.len(), 2, "expected the triangles of both solids");
             assert_eq!(polygons.positions, [[0.0; 3], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0, 1.0, 0.0]]);
-            let vertices: Vec<u32> = polygons.corners_of(1).iter().map(|corner| corner.v).collect();
+            let vertices: Vec<u32> = polygons.corners_of(1).iter().map(|corner| corner.vertex).collect();
             assert_eq!(vertices, [1, 3, 2]);
         }
         assert_eq!(remarks, ["3 bytes after the last triangle are not used"]);
@@ -189,7 +189,7 @@ mod tests {
             (binary("", u32::MAX, &SQUARE), "size: expected 214748364834 bytes, as the header declares, got 184"),
             (binary("", 3, &SQUARE), "size: expected 234 bytes, as the header declares, got 184"),
             (binary("", 2, &nan), "triangle 1: vertex: expected finite numbers, got NaN"),
-            (binary("", 0, &[]), "f: expected at least one face, got 0"),
+            (binary("", 0, &[]), "faces: expected at least one face, got 0"),
             (vec![0; 83], "header: expected 84 bytes, or a text that begins with solid, got 83"),
             (vec![], "header: expected 84 bytes, or a text that begins with solid, got 0"),
             (TEXT.replace("1e0", "inf").into(), "line 16: vertex: expected finite numbers, got inf"),

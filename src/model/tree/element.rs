@@ -74,26 +74,26 @@ pub(super) struct BendingBasis {
 }
 
 impl BendingBasis {
-    /// The basis at the fraction `x` of an element of length `l` meters.
-    pub(super) fn new(x: f64, l: f64) -> Self {
+    /// The basis at the fraction `x` of an element of `length` meters.
+    pub(super) fn new(x: f64, length: f64) -> Self {
         Self {
             values: Vector4::new(
                 1.0 - 3.0 * x * x + 2.0 * x.powi(3),
-                l * x * (1.0 - x).powi(2),
+                length * x * (1.0 - x).powi(2),
                 x * x * (3.0 - 2.0 * x),
-                l * x * x * (x - 1.0),
+                length * x * x * (x - 1.0),
             ),
             slopes: Vector4::new(
-                6.0 * x * (x - 1.0) / l,
+                6.0 * x * (x - 1.0) / length,
                 (1.0 - x) * (1.0 - 3.0 * x),
-                6.0 * x * (1.0 - x) / l,
+                6.0 * x * (1.0 - x) / length,
                 x * (3.0 * x - 2.0),
             ),
             curvatures: Vector4::new(
-                (12.0 * x - 6.0) / (l * l),
-                (6.0 * x - 4.0) / l,
-                (6.0 - 12.0 * x) / (l * l),
-                (6.0 * x - 2.0) / l,
+                (12.0 * x - 6.0) / (length * length),
+                (6.0 * x - 4.0) / length,
+                (6.0 - 12.0 * x) / (length * length),
+                (6.0 * x - 2.0) / length,
             ),
         }
     }

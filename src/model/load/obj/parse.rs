@@ -117,14 +117,14 @@ impl Parser {
                 }
             };
             let polygons = &self.obj.polygons;
-            let v = parse_index("v", polygons.positions.len())?;
-            let vt = parse_index("vt", polygons.uvs.len())?;
-            let vn = parse_index("vn", polygons.normals.len())?;
-            if v == NO_INDEX || fields.next().is_some() {
+            let vertex = parse_index("v", polygons.positions.len())?;
+            let uv = parse_index("vt", polygons.uvs.len())?;
+            let normal = parse_index("vn", polygons.normals.len())?;
+            if vertex == NO_INDEX || fields.next().is_some() {
                 let given = String::from_utf8_lossy(word).into_owned();
                 return Err(invalid(format!("line {line}: f"), "corners of the form v, v/vt, v//vn or v/vt/vn", given));
             }
-            corners.push(Corner { v, vt, vn });
+            corners.push(Corner { vertex, uv, normal });
         }
         if corners.len() < 3 {
             return Err(invalid(format!("line {line}: f"), "at least 3 corners", corners.len()));
@@ -239,7 +239,7 @@ mod tests {
         let text = format!("{TRIANGLE}vt 0.25 0.25\nvn 0 0 1\nf -3/-1/-1 -2/-1/-1 -1/-1/-1\nv 9 9 9\n");
         let obj = ObjFile::parse(text.as_bytes()).expect("a valid file");
         let indices: Vec<_> =
-            obj.polygons.corners_of(0).iter().map(|corner| (corner.v, corner.vt, corner.vn)).collect();
+            obj.polygons.corners_of(0).iter().map(|corner| (corner.vertex, corner.uv, corner.normal)).collect();
         assert_eq!(indices, [(0, 0, 0), (1, 0, 0), (2, 0, 0)]);
         assert_eq!(obj.polygons.uvs, [[0.25, 0.75]], "expected a flipped v");
         assert_eq!(obj.polygons.positions.len(), 4, "expected the unreferenced vertex");
@@ -280,7 +280,7 @@ mod tests {
             ("v 1 2 3 0 -1 0\nf 1 2 3", "line 4: v: color: expected 0 to 1, or 0 to 255, got [0.0, -1.0, 0.0]"),
             ("vt\nf 1 2 3", "line 4: vt: expected one to three finite numbers, got the end of the line"),
             ("vn 0 0 x\nf 1 2 3", "line 4: vn: expected three finite numbers, got x"),
-            ("", "f: expected at least one face, got 0"),
+            ("", "faces: expected at least one face, got 0"),
         ] {
             let text = format!("{TRIANGLE}{statement}\n");
             assert_eq!(ObjFile::parse(text.as_bytes()).expect_err(statement).to_string(), message);

@@ -59,7 +59,7 @@ pub(super) fn read(files: &AssetDir, name: &str, crease_angle: CreaseAngle) -> R
 fn positions_by_object(polygons: &PolygonMesh, object_ids: &[u64]) -> BTreeMap<u64, Vec<[f32; 3]>> {
     let mut positions: BTreeMap<u64, Vec<[f32; 3]>> = BTreeMap::new();
     for (face, object_id) in object_ids.iter().enumerate() {
-        let corners = polygons.corners_of(face).iter().map(|corner| polygons.positions[corner.v as usize]);
+        let corners = polygons.corners_of(face).iter().map(|corner| polygons.positions[corner.vertex as usize]);
         positions.entry(*object_id).or_default().extend(corners);
     }
     positions

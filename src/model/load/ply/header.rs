@@ -125,8 +125,8 @@ fn check_repetitions(header: &[u8], elements: &KeyMap<ElementDef>) -> Result<()>
         if defined != kept {
             return Err(invalid(
                 "header",
-                format!("different names in each {key}"),
-                format!("{defined}, {kept} of them different"),
+                format!("a different name in each {key} line"),
+                format!("{defined} lines with {kept} different names"),
             ));
         }
     }

@@ -121,13 +121,13 @@ impl PlyReader {
             polygons.uvs.extend(face.uvs.as_chunks::<2>().0.iter().map(|[u, v]| [*u, 1.0 - *v]));
         }
         let corner = |(corner, vertex): (usize, &i64)| {
-            let v = *vertex as u32;
-            let vt = match (face.uvs.is_empty(), has_uvs) {
+            let vertex = *vertex as u32;
+            let uv = match (face.uvs.is_empty(), has_uvs) {
                 (false, _) => first_wedge_uv + corner as u32,
-                (true, true) => v,
+                (true, true) => vertex,
                 (true, false) => NO_INDEX,
             };
-            Corner { v, vt, vn: if has_normals { v } else { NO_INDEX } }
+            Corner { vertex, uv, normal: if has_normals { vertex } else { NO_INDEX } }
         };
         polygons
             .add_face(face.vertices.iter().enumerate().map(corner), 0, index)

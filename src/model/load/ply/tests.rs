@@ -40,7 +40,7 @@ fn ascii_and_binary_files_give_the_same_mesh() {
         let PlyReader { polygons, remarks, .. } = parse(&bytes).expect("a valid file");
         assert_eq!(polygons.positions, POSITIONS);
         assert_eq!(polygons.colors[3], [1.0; 3]);
-        assert_eq!(polygons.corners_of(1).iter().map(|corner| corner.v).collect::<Vec<_>>(), [0, 2, 3]);
+        assert_eq!(polygons.corners_of(1).iter().map(|corner| corner.vertex).collect::<Vec<_>>(), [0, 2, 3]);
         assert!(remarks.is_empty(), "{remarks:?}");
     }
 }
@@ -59,7 +59,7 @@ fn normals_texture_coordinates_and_unused_properties_are_recognized() {
     // Texture coordinates of a face have precedence over those of its vertices.
     let corner = ply.polygons.corners_of(0)[2];
     assert_eq!(
-        (ply.polygons.uvs[corner.vt as usize], ply.polygons.normals[corner.vn as usize]),
+        (ply.polygons.uvs[corner.uv as usize], ply.polygons.normals[corner.normal as usize]),
         ([0.5, 0.25], [0.0, 0.0, 1.0])
     );
 }

@@ -98,7 +98,7 @@ impl<'a> MeshBuilder<'a> {
 
     fn add_face(&mut self, face: usize) {
         let corners = self.polygons.corners_of(face);
-        let positions: Vec<_> = corners.iter().map(|corner| self.polygons.positions[corner.v as usize]).collect();
+        let positions: Vec<_> = corners.iter().map(|corner| self.polygons.positions[corner.vertex as usize]).collect();
         let corner_indices: Vec<u32> = corners.iter().map(|corner| self.corner_index(*corner)).collect();
         for triangle in triangulate(&positions) {
             self.triangles.push(triangle.map(|index| corner_indices[index]));
@@ -112,7 +112,7 @@ impl<'a> MeshBuilder<'a> {
             return *index;
         }
         let index = self.corners.len() as u32;
-        let vertex = self.vertex_index(corner.v);
+        let vertex = self.vertex_index(corner.vertex);
         self.corner_vertices.push(vertex);
         self.corners.push(corner);
         self.corner_indices.insert(corner, index);
@@ -120,10 +120,10 @@ impl<'a> MeshBuilder<'a> {
     }
 
     /// Returns the index in the mesh of a vertex of the file. [`build_faces`] adds a vertex on the first call for it.
-    fn vertex_index(&mut self, v: u32) -> u32 {
-        let Some(UsedVertices { new_indices, origin }) = &mut self.used_vertices else { return v };
-        *new_indices.entry(v).or_insert_with(|| {
-            let position = self.polygons.positions[v as usize];
+    fn vertex_index(&mut self, file_vertex: u32) -> u32 {
+        let Some(UsedVertices { new_indices, origin }) = &mut self.used_vertices else { return file_vertex };
+        *new_indices.entry(file_vertex).or_insert_with(|| {
+            let position = self.polygons.positions[file_vertex as usize];
             self.rest_positions.push([0, 1, 2].map(|axis| (f64::from(position[axis]) - origin[axis]) as f32));
             self.rest_positions.len() as u32 - 1
         })
@@ -131,7 +131,7 @@ impl<'a> MeshBuilder<'a> {
 
     fn finish(mut self, crease_angle: CreaseAngle) -> Result<TriangleMesh> {
         let normals = self.add_normals(crease_angle);
-        let uvs = if self.corners.iter().all(|corner| corner.vt == NO_INDEX) { Vec::new() } else { self.uvs() };
+        let uvs = if self.corners.iter().all(|corner| corner.uv == NO_INDEX) { Vec::new() } else { self.uvs() };
         let material = self.material_ranges.first().map_or(0, |range| range.material);
         let material_ranges = if self.material_ranges.len() > 1 { self.material_ranges } else { Vec::new() };
         let mesh =
@@ -143,7 +143,7 @@ impl<'a> MeshBuilder<'a> {
     /// The normals of the corners. Corners whose normal is missing or zero in the file are split at creases.
     fn add_normals(&mut self, crease_angle: CreaseAngle) -> Vec<[f32; 3]> {
         let file_normal =
-            |corner: &Corner| self.polygons.normals.get(corner.vn as usize).filter(|normal| **normal != [0.0; 3]);
+            |corner: &Corner| self.polygons.normals.get(corner.normal as usize).filter(|normal| **normal != [0.0; 3]);
         let file_normals: Vec<Option<[f32; 3]>> =
             self.corners.iter().map(|corner| file_normal(corner).copied()).collect();
         if let Some(normals) = file_normals.iter().copied().collect() {
@@ -159,7 +159,7 @@ impl<'a> MeshBuilder<'a> {
     }
 
     fn uvs(&self) -> Vec<[f32; 2]> {
-        let uv = |corner: &Corner| self.polygons.uvs.get(corner.vt as usize).copied().unwrap_or_default();
+        let uv = |corner: &Corner| self.polygons.uvs.get(corner.uv as usize).copied().unwrap_or_default();
         self.corners.iter().map(uv).collect()
     }
 }

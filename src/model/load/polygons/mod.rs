@@ -12,18 +12,18 @@ use crate::error::{Result, invalid};
 /// The index of a missing texture coordinate or normal of a corner.
 pub(super) const NO_INDEX: u32 = u32::MAX;
 
-/// One corner of a polygon, as indices into the lists of the mesh.
+/// One corner of a polygon, as indices into the positions, texture coordinates and normals of the mesh.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub(super) struct Corner {
-    pub(super) v: u32,
-    pub(super) vt: u32,
-    pub(super) vn: u32,
+    pub(super) vertex: u32,
+    pub(super) uv: u32,
+    pub(super) normal: u32,
 }
 
 impl Corner {
-    /// A corner of the vertex `v` without texture coordinates and normal.
-    pub(super) const fn of_vertex(v: u32) -> Self {
-        Self { v, vt: NO_INDEX, vn: NO_INDEX }
+    /// A corner without texture coordinates and normal.
+    pub(super) const fn of_vertex(vertex: u32) -> Self {
+        Self { vertex, uv: NO_INDEX, normal: NO_INDEX }
     }
 }
 
@@ -88,24 +88,24 @@ impl PolygonMesh {
 
     /// Whether any corner has texture coordinates.
     pub(super) fn has_uvs(&self) -> bool {
-        self.corners.iter().any(|corner| corner.vt != NO_INDEX)
+        self.corners.iter().any(|corner| corner.uv != NO_INDEX)
     }
 
-    /// Checks that the mesh has a face and that all indices are in range. `place` names a face of an error from its
-    /// place, `first_index` is the number of the first vertex in the file.
+    /// Checks that the mesh has a face and that all indices are in range. For errors, `place` words the location of a
+    /// face from its line or index, and `first_index` is the index of the first vertex in the file format, 0 or 1.
     ///
     /// # Errors
     /// `Invalid` with the place of the face, and the range of valid indices.
     pub(super) fn check(&self, place: impl Fn(usize) -> String, first_index: u64) -> Result<()> {
         if self.faces.is_empty() {
-            return Err(invalid("f", "at least one face", 0));
+            return Err(invalid("faces", "at least one face", 0));
         }
         for (index, face) in self.faces.iter().enumerate() {
             for corner in self.corners_of(index) {
                 for (list, index, count) in [
-                    ("v", corner.v, self.positions.len()),
-                    ("vt", corner.vt, self.uvs.len()),
-                    ("vn", corner.vn, self.normals.len()),
+                    ("v", corner.vertex, self.positions.len()),
+                    ("vt", corner.uv, self.uvs.len()),
+                    ("vn", corner.normal, self.normals.len()),
                 ] {
                     let is_missing = index == NO_INDEX && list != "v";
                     if !is_missing && index as usize >= count {
