@@ -15,11 +15,11 @@ from server import Peak, Server
 
 ITEM = 12
 
-# Frames of each flood, and of the negative control, whose connection must stay open. Then limits during a flood: growth
-# of the memory in bytes, and seconds until a new client is served.
+# Each flood sends FLOOD frames. A connection of the negative control sends FEW frames and must stay open.
 FLOOD = 100_000
 FEW = 1000
 
+# Limits during a flood: growth of the memory in bytes, and seconds until a new client is served.
 MAX_MEMORY = 32 << 20
 MAX_SERVICE_SECONDS = 1.0
 
@@ -112,6 +112,7 @@ def collect_errors(server):
 
 
 def drive_requests(scene, keeps_open=True):
+    """Asks for the writer lease of a scene. Keeps the stream open for 3 s, or ends it immediately."""
     yield steps_pb2.DriveSceneRequest(open=steps_pb2.OpenDrive(scene=scene, delivery=common_pb2.DELIVERY_LOSSLESS))
     if keeps_open:
         time.sleep(3)
@@ -140,6 +141,7 @@ def error_texts(program):
         "errors name no file of the state folder and no address of a client",
         "none of these names in any error",
         f"{len(texts)} errors, " + (f"names: {found}" if found else "none of these names"),
+        # Fewer texts would mean that calls with invalid input succeed.
         not found and len(texts) >= 12,
         f"a text with such names, {len(control_result)} found",
         bool(control_result),

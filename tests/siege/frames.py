@@ -41,6 +41,7 @@ def render(client, scene, side):
 
 
 def slowest(client, seconds, memory):
+    """The longest `render` of small frames for a time. Samples `memory`."""
     deadline, result = time.monotonic() + seconds, 0.0
     while time.monotonic() < deadline:
         result = max(result, render(client, "viewed", 256))
@@ -82,8 +83,8 @@ def attack(program):
         memory = Peak(server.memory)
         alone = slowest(client, 2, memory)
         # The replies are received, but they are not read. The largest windows let the server send everything.
-        attacker = http2.Connection(server.port, initial_window=(1 << 31) - 1)
-        attacker.send(http2.window_update(0, (1 << 31) - 1 - 65535))
+        attacker = http2.Connection(server.port, initial_window=http2.MAX_WINDOW)
+        attacker.send(http2.window_update(0, http2.MAX_WINDOW - http2.FIRST_WINDOW))
         message = http2.grpc_message(request("attacked", SIDE).SerializeToString())
         for _ in range(FRAMES):
             attacker.send_data(attacker.open_call(RENDER_FRAME), message, http2.END_STREAM)

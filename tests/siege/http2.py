@@ -10,10 +10,17 @@ PREFACE = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n"
 DATA, HEADERS, PRIORITY, RST_STREAM, SETTINGS, PUSH_PROMISE, PING, GOAWAY, WINDOW_UPDATE = range(9)
 END_STREAM, ACK, END_HEADERS = 1, 1, 4
 INITIAL_WINDOW_SIZE = 4
-NO_ERROR, ENHANCE_YOUR_CALM = 0, 11
+NO_ERROR = 0
+
+# Size of a frame's header, and the largest payload of a frame by default, in bytes.
+HEADER_BYTES, MAX_PAYLOAD = 9, 16384
+
+# The largest flow-control window, and the window that a connection has at first, in bytes.
+MAX_WINDOW, FIRST_WINDOW = (1 << 31) - 1, 65535
 
 
 def frame(kind, flags=0, stream=0, payload=b""):
+    """A frame of the type `kind`. Stream 0 is the connection."""
     return struct.pack(">IBI", len(payload) << 8 | kind, flags, stream) + payload
 
 
@@ -23,18 +30,18 @@ def settings(**values):
     return frame(SETTINGS, payload=b"".join(struct.pack(">HI", ids[name], value) for name, value in values.items()))
 
 
-def grpc_headers(path, stream, authority="localhost", flags=END_HEADERS):
-    """The HEADERS frame of a gRPC call, without compression state."""
+def grpc_headers(path, stream):
+    """The HEADERS frame of a gRPC call."""
     fields = [
         (":method", "POST"),
         (":scheme", "http"),
         (":path", path),
-        (":authority", authority),
+        (":authority", "localhost"),
         ("content-type", "application/grpc"),
         ("te", "trailers"),
     ]
-    # A new encoder refers to no earlier headers, so the blocks of several calls can be sent in any order.
-    return frame(HEADERS, flags, stream, Encoder().encode(fields, huffman=False))
+    # A new encoder refers to no earlier headers, so the frames of several calls can be sent in any order.
+    return frame(HEADERS, END_HEADERS, stream, Encoder().encode(fields, huffman=False))
 
 
 def grpc_message(payload, length=None):
@@ -43,6 +50,7 @@ def grpc_message(payload, length=None):
 
 
 def window_update(stream, increment):
+    """Lets the server send `increment` bytes more. Stream 0 is the connection."""
     return frame(WINDOW_UPDATE, 0, stream, struct.pack(">I", increment))
 
 
@@ -53,17 +61,19 @@ class FrameReader:
         self.buffer = b""
 
     def feed(self, data):
+        """Adds received bytes. Returns the frames that are complete now, as (kind, flags, stream, payload)."""
         self.buffer += data
         frames = []
         position = 0
-        while len(self.buffer) - position >= 9:
+        while len(self.buffer) - position >= HEADER_BYTES:
             length = int.from_bytes(self.buffer[position : position + 3], "big")
-            if len(self.buffer) - position < 9 + length:
+            begin = position + HEADER_BYTES
+            if len(self.buffer) < begin + length:
                 break
             kind, flags = self.buffer[position + 3], self.buffer[position + 4]
             stream = int.from_bytes(self.buffer[position + 5 : position + 9], "big") & 0x7FFFFFFF
-            frames.append((kind, flags, stream, self.buffer[position + 9 : position + 9 + length]))
-            position += 9 + length
+            frames.append((kind, flags, stream, self.buffer[begin : begin + length]))
+            position = begin + length
         self.buffer = self.buffer[position:]
         return frames
 
@@ -95,6 +105,7 @@ class Connection:
         self.socket.close()
 
     def open_call(self, path):
+        """Sends the headers of a call. Returns its stream."""
         stream = self.next_stream
         self.next_stream += 2
         self.socket.sendall(grpc_headers(path, stream))
@@ -104,9 +115,10 @@ class Connection:
         self.socket.sendall(data)
 
     def send_data(self, stream, data, flags=0):
-        for first in range(0, len(data), 16384):
-            last = first + 16384 >= len(data)
-            self.socket.sendall(frame(DATA, flags if last else 0, stream, data[first : first + 16384]))
+        """Sends data in DATA frames. `flags` are those of the last frame."""
+        for first in range(0, len(data), MAX_PAYLOAD):
+            end = first + MAX_PAYLOAD
+            self.socket.sendall(frame(DATA, flags if end >= len(data) else 0, stream, data[first:end]))
 
     def receive(self, seconds, until=lambda frame: False):
         """Receives frames for a time, or until one fulfils a condition. Answers PINGs and SETTINGS. Returns the frames,

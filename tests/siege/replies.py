@@ -45,6 +45,7 @@ UNLIMITED = ["--connection-reply-bytes", "4000000000", "--reply-bytes", "4000000
 # Vertices along each side of the scene.
 SIDE = 400
 
+# All values of the enum `Array` but 0.
 ALL_ARRAYS = [1, 2, 3, 4, 5, 6]
 
 
@@ -65,9 +66,9 @@ def render():
 def unread_calls(server, path, request):
     """Calls with the largest flow-control windows, on connections from which nothing is read."""
     message = http2.grpc_message(request.SerializeToString())
-    connections = [http2.Connection(server.port, initial_window=(1 << 31) - 1) for _ in range(CONNECTIONS)]
+    connections = [http2.Connection(server.port, initial_window=http2.MAX_WINDOW) for _ in range(CONNECTIONS)]
     for connection in connections:
-        connection.send(http2.window_update(0, (1 << 31) - 1 - 65535))
+        connection.send(http2.window_update(0, http2.MAX_WINDOW - http2.FIRST_WINDOW))
         for _ in range(CALLS):
             connection.send_data(connection.open_call(path), message, http2.END_STREAM)
     yield connections

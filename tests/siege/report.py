@@ -31,4 +31,5 @@ class Result:
 
 
 def mb(count):
+    """A number of bytes as text."""
     return f"{count / 1e6:.0f} MB"

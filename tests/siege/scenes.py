@@ -13,8 +13,8 @@ def write_grid(path, side):
 
 
 def write_thin_arcs(path, polygons, corners=256):
-    """Polygons that are thin arcs: each triangle of three corners on the outer side contains corners of the inner side.
-    All polygons have the same vertices."""
+    """Polygons that are thin arcs of 4 radians. Each triangle of three corners on the outer side contains corners of
+    the inner side, so that triangulation is slow. All polygons have the same vertices."""
     side = corners // 2
     angles = [4 * index / side for index in range(side)]
     outline = [(1.0, angle) for angle in angles] + [(0.9999, angle) for angle in reversed(angles)]

@@ -8,8 +8,6 @@ import tempfile
 import time
 from pathlib import Path
 
-CLOCK_TICKS = os.sysconf("SC_CLK_TCK")
-
 # Enough for all sockets of the largest attack.
 resource.setrlimit(resource.RLIMIT_NOFILE, (resource.getrlimit(resource.RLIMIT_NOFILE)[1],) * 2)
 
@@ -17,11 +15,11 @@ resource.setrlimit(resource.RLIMIT_NOFILE, (resource.getrlimit(resource.RLIMIT_N
 class Server:
     """`modalcast serve` on a free port, with an empty state folder. It is killed when the `with` block ends."""
 
-    def __init__(self, program, *flags, scenes=None, renderer="off", prefix=()):
+    def __init__(self, program, *flags, scenes=None, renderer="off"):
         self.folder = tempfile.TemporaryDirectory(prefix="modalcast-siege-")
         self.state = Path(self.folder.name) / "state"
         self.log_path = Path(self.folder.name) / "log"
-        command = [*prefix, str(program), "serve", "--listen", "127.0.0.1:0", "--backend", "cpu"]
+        command = [str(program), "serve", "--listen", "127.0.0.1:0", "--backend", "cpu"]
         command += ["--renderer", renderer, "--state", str(self.state)]
         command += ["--scenes", str(scenes)] if scenes else []
         self.process = subprocess.Popen(
@@ -44,32 +42,15 @@ class Server:
     def log(self):
         return self.log_path.read_text()
 
-    def is_running(self):
-        return self.process.poll() is None
-
     def memory(self, key="VmRSS"):
-        """A number of /proc/PID/status, in bytes."""
+        """A number of /proc/PID/status, in bytes. VmRSS is the resident memory."""
         for line in Path(f"/proc/{self.process.pid}/status").read_text().splitlines():
             if line.startswith(key + ":"):
                 return 1024 * int(line.split()[1])
         raise KeyError(key)
 
-    def cpu_seconds(self):
-        fields = Path(f"/proc/{self.process.pid}/stat").read_text().rsplit(")", 1)[1].split()
-        return (int(fields[11]) + int(fields[12])) / CLOCK_TICKS
-
     def threads(self):
         return len(os.listdir(f"/proc/{self.process.pid}/task"))
-
-    def sockets(self):
-        folder = f"/proc/{self.process.pid}/fd"
-        links = []
-        for name in os.listdir(folder):
-            try:
-                links.append(os.readlink(f"{folder}/{name}"))
-            except FileNotFoundError:
-                pass
-        return sum(link.startswith("socket:") for link in links)
 
     def terminate(self, timeout):
         """Sends SIGTERM. Returns the seconds until the end and the exit code, or None if it is still running."""

@@ -33,14 +33,14 @@ def unread_call(server, path, request=None):
 
 
 def load(server):
-    """A load is running."""
+    """Begins to load a scene."""
     calls = [unread_call(server, OPEN_SCENE, scenes_pb2.OpenSceneRequest(source="concave.obj", scene="concave"))]
     time.sleep(1)
     return calls
 
 
 def draw(server):
-    """A large frame is being drawn."""
+    """Begins to draw a large frame."""
     with Client(server) as client:
         client.open_scene("tree", "tree")
     picture = frames_pb2.Picture(width=8192, height=8192)
@@ -51,18 +51,19 @@ def draw(server):
 
 
 def watch(server):
-    """64 streams are open and do not read."""
+    """Opens 64 streams and reads nothing."""
     return [unread_call(server, HEALTH_WATCH) for _ in range(64)]
 
 
 def send_half(server):
-    """A message is half sent on each of 64 connections."""
+    """Sends a part of a message on each of 64 connections."""
     connections = [http2.Connection(server.port) for _ in range(64)]
     for connection in connections:
         connection.send_data(connection.open_call(OPEN_SCENE), http2.grpc_message(b"half", 1 << 20))
     return connections
 
 
+# Name, function that creates the situation and returns the connections to close, and the renderer.
 SITUATIONS = [
     ("idle", lambda server: [], "off"),
     ("load", load, "off"),
@@ -73,6 +74,7 @@ SITUATIONS = [
 
 
 def terminate(program, situation, renderer, scenes):
+    """Seconds from SIGTERM to the end of the server, and its exit code."""
     with Server(program, scenes=scenes, renderer=renderer) as server:
         connections = situation(server)
         seconds, code = server.terminate(GIVE_UP)

@@ -22,9 +22,10 @@ class Swarm(threading.Thread):
         self.total = total
         self.selector = selectors.DefaultSelector()
         self.connecting = 0
+        # The frame reader of each connection. None while the connection is being established.
         self.open = {}
         self.opened = 0
-        self.closed = 0
+        # The error codes of all received GOAWAY frames.
         self.goaways = []
         self.is_stopped = False
 
@@ -40,7 +41,7 @@ class Swarm(threading.Thread):
         self.selector.close()
 
     def wait_until_open(self, count, timeout):
-        """Waits until `count` connections are open at a time or were open. Returns the number."""
+        """Waits until `count` connections have been opened in all. Returns the number of those that were."""
         deadline = time.monotonic() + timeout
         while self.opened < count and time.monotonic() < deadline:
             time.sleep(0.02)
@@ -53,6 +54,7 @@ class Swarm(threading.Thread):
                 self.handle(key.fileobj, events)
 
     def wants_more(self):
+        """Whether to open another connection. At most 64 are established at a time."""
         if self.total is not None and self.opened + self.connecting >= self.total:
             return False
         return len(self.open) < self.count and self.connecting < 64
@@ -95,7 +97,6 @@ class Swarm(threading.Thread):
     def drop(self, connection):
         if connection not in self.open:
             return
-        if self.open.pop(connection) is not None:
-            self.closed += 1
+        del self.open[connection]
         self.selector.unregister(connection)
         connection.close()

@@ -10,7 +10,9 @@ from server import Server
 
 ITEM = 12
 
+# Near the largest f32.
 LARGEST = 3e38
+
 # Name, the diagonal of the linear part, the translation along x, and whether the server must accept the transform.
 TRANSFORMS = [
     ("zero", 0.0, 0.0, True),
@@ -36,6 +38,7 @@ class Writer:
         self.number = 0
 
     def is_accepted(self, scale, x):
+        """Sends T with `scale` on the diagonal and the translation (x, 0, 0). Returns whether the server accepts it."""
         self.number += 1
         transform = struct.pack("<12f", scale, 0, 0, x, 0, scale, 0, 0, 0, 0, scale, 0)
         step = steps_pb2.Step(number=self.number, transform_domains=[0], transforms=transform)

@@ -22,6 +22,9 @@ VIEWER = ["--viewer-token", TOKEN]
 # Seconds within which a new client must be served.
 MAX_SERVICE_SECONDS = 1.0
 
+# Seconds within which a connection must end whose HTTP head arrives one byte at a time.
+MAX_HEAD_SECONDS = 15
+
 # The limit on connections of the server.
 CONNECTIONS = 1024
 
@@ -44,6 +47,7 @@ FLOOD = 100_000
 FEW = 1000
 MAX_FLOOD_MEMORY = 32 << 20
 
+# Flags that raise the budgets to their largest values.
 UNLIMITED = ["--connection-receive-bytes", "4000000000", "--receive-bytes", "4000000000"]
 UNLIMITED += ["--connection-reply-bytes", "4000000000", "--reply-bytes", "4000000000"]
 
@@ -51,7 +55,7 @@ UNLIMITED += ["--connection-reply-bytes", "4000000000", "--reply-bytes", "400000
 def other_pages(program):
     """Requests that a page of another site can make, or that guess the token."""
     with Server(program, *VIEWER) as server:
-        own = server.address
+        own = server.address  # The host that the viewer accepts.
         requests = []
         for path, upgrade in [("/", False), ("/websocket", True)]:
             for token in [None, "", "1123456789abcdef", TOKEN[:-1]]:
@@ -85,7 +89,7 @@ def other_pages(program):
 
 
 def lockout(program, connect):
-    """The slowest service while many connections exist that `connect` opens, and how many of them the server closed."""
+    """The slowest service while CONNECTIONS connections that `connect` opens exist."""
     with Server(program, *VIEWER) as server:
         connections = []
         for _ in range(CONNECTIONS):
@@ -100,6 +104,7 @@ def lockout(program, connect):
 
 
 def slow_head(server):
+    """Sends an incomplete HTTP head."""
     connection = socket.create_connection(("127.0.0.1", server.port), timeout=10)
     connection.sendall(f"GET /?token={TOKEN} HTTP/1.1\r\nHost: ".encode())
     return connection
@@ -116,7 +121,7 @@ def websocket_with_a_call(server):
 
 
 def trickled_head(program):
-    """Seconds until a connection ends whose head arrives one byte at a time."""
+    """Sends an HTTP head one byte at a time. Returns the seconds until the server ends the connection."""
     with Server(program, *VIEWER) as server:
         connection, start = slow_head(server), time.monotonic()
         try:
@@ -136,15 +141,16 @@ def slow_clients(program):
     return Result(
         ITEM,
         f"{CONNECTIONS} slow HTTP heads or WebSockets without a call do not lock out a new client, and slow heads end",
-        f"served within {MAX_SERVICE_SECONDS:.0f} s, a trickled head closed within 15 s",
+        f"served within {MAX_SERVICE_SECONDS:.0f} s, a trickled head closed within {MAX_HEAD_SECONDS} s",
         f"slow heads {heads:.2f} s, silent WebSockets {silent:.2f} s, trickled head closed after {seconds:.1f} s",
-        max(heads, silent) <= MAX_SERVICE_SECONDS and seconds <= 15,
+        max(heads, silent) <= MAX_SERVICE_SECONDS and seconds <= MAX_HEAD_SECONDS,
         f"{CONNECTIONS} WebSockets with an open call each, {control:.2f} s",
         control > MAX_SERVICE_SECONDS,
     )
 
 
 def send_half(connection, is_fragmented):
+    """Sends 11 of 12 parts of a message, each in a frame of its own or all in one frame."""
     part = bytes(HALF_SENT_BYTES // 12)
     try:
         for index in range(11):
@@ -231,9 +237,11 @@ def unread_replies(program):
     )
 
 
+EMPTY_FRAGMENT = websocket.frame(websocket.CONTINUATION, b"", is_last=False)
+
 FLOODS = [
     ("PING", websocket.frame(websocket.PING, bytes(8))),
-    ("empty fragments", websocket.frame(websocket.CONTINUATION, b"", is_last=False)),
+    ("empty fragments", EMPTY_FRAGMENT),
     ("CREDIT", websocket.message(1, websocket.CREDIT, bytes(4))),
 ]
 
@@ -244,7 +252,7 @@ def flood(server, frame, count):
     try:
         # A call that remains open, so that the connection has a message to continue and to give credit to.
         connection.send(websocket.start_call(1, HEALTH_WATCH, b""))
-        if frame == FLOODS[1][1]:
+        if frame == EMPTY_FRAGMENT:
             connection.send(websocket.frame(websocket.BINARY, b"", is_last=False))
         for _ in range(count // 500):
             connection.send(frame * 500)

@@ -9,7 +9,6 @@ import time
 # Opcodes of frames.
 CONTINUATION = 0
 BINARY = 2
-CLOSE = 8
 PING = 9
 
 # Kinds of messages.
@@ -51,11 +50,12 @@ def frame(opcode, payload, is_last=True, claimed=None):
 
 
 def message(call, kind, payload=b""):
+    """A message of the call with the id `call`, in one frame."""
     return frame(BINARY, struct.pack("<IB", call, kind) + payload)
 
 
 def start_call(call, path, content):
-    """The messages of a call with one request."""
+    """The messages of a call with one request and without a timeout."""
     head = message(call, START, struct.pack("<I", 0) + path.encode())
     return head + message(call, MESSAGE, content) + message(call, END)
 
