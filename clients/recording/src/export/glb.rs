@@ -8,7 +8,7 @@ use serde_json::{Map, Value, json};
 
 use crate::error::{Error, Result};
 
-/// `componentType` of an accessor.
+/// Values of `componentType` of an accessor.
 const FLOAT: u32 = 5126;
 const UNSIGNED_INT: u32 = 5125;
 
@@ -99,6 +99,7 @@ impl<'a> GlbBuilder<'a> {
         document.insert("accessors".into(), accessors.into());
         let mut text = serde_json::to_vec(&document).map_err(|error| Error::file(out, error))?;
         text.resize(text.len().next_multiple_of(4), b' ');
+        // The file has a header of 12 bytes, and each of its two chunks one of 8 bytes.
         let total = 12 + 8 + text.len() as u64 + 8 + data_bytes;
         if total > u64::from(u32::MAX) {
             return Err(Error::invalid(
@@ -112,6 +113,7 @@ impl<'a> GlbBuilder<'a> {
             data.seek(SeekFrom::Start(0))?;
             let mut file = BufWriter::new(File::create(out)?);
             file.write_all(b"glTF")?;
+            // The version of glTF, the size of the file, and the size of the JSON chunk.
             [2, total as u32, text.len() as u32].iter().try_for_each(|number| file.write_all(&number.to_le_bytes()))?;
             file.write_all(b"JSON")?;
             file.write_all(&text)?;
