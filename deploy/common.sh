@@ -1,5 +1,5 @@
-# Functions of deploy/demo and deploy/check that install missing dependencies or fail with their names. Source this file
-# from the root folder.
+# Functions of the scripts in this folder, which install missing dependencies or fail with their names. Source this file
+# from the root folder of the project.
 
 say() { printf '\033[1m== %s\033[0m\n' "$*" >&2; }
 fail() { printf 'modalcast: %s\n' "$*" >&2; exit 1; }

@@ -297,12 +297,7 @@ async fn errors_exit_with_documented_codes() {
 #[tokio::test(flavor = "multi_thread")]
 async fn cubic_forces_of_another_model_are_not_used() {
     let folder = tempfile::tempdir().expect("a temporary folder");
-    std::fs::write(
-        folder.path().join("other.cub"),
-        "2
-",
-    )
-    .expect("a writable file");
+    std::fs::write(folder.path().join("other.cub"), "2\n").expect("a writable file");
     let files = folder.path().display().to_string();
     let url = serve(Arc::new(tree_server())).await;
     let sim_output = run_sim(&url, &["auto", "--scene", "toy", "--files", &files, "--steps", "2"]).await;

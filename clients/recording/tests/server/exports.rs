@@ -29,6 +29,7 @@ async fn record_pair() -> Recorded {
     // Replays step by step, so that the vertices of each step can be requested.
     let mut positions = Vec::new();
     for step in 0..STEPS {
+        // A microsecond later, because the times in the file are rounded.
         let time = step * 1_000_000_000 / 24 + 1000;
         let range = modalcast_recording::TimeRange { from: time, to: time };
         let request = modalcast_recording::ReplayRequest { range, speed: None, ..Default::default() };
@@ -101,6 +102,7 @@ async fn arrays_of_npz_give_the_vertices_of_the_server() {
     assert_eq!(Array::read(&out, "step").numbers::<u64>(), (0..STEPS).collect::<Vec<_>>());
     assert!(Array::read(&out, "names").header.contains("'<U6'"));
     assert_eq!(Array::read(&out, "shapes").numbers::<u32>(), [0, 1]);
+    // The first shape is a grid of 4 x 4 vertices, which has 18 triangles.
     let faces = Array::read(&out, "shape_0/faces");
     assert!(faces.header.contains("(18, 3, )") && faces.numbers::<u32>()[..3] == [0, 1, 4], "{}", faces.header);
     for (domain, (name, rank)) in [("first", 2), ("second", 3)].into_iter().enumerate() {

@@ -87,7 +87,7 @@ async fn killed_recorder_loses_the_open_chunk_only() {
     upload_pair(&server.client, "pair", 1.0).await;
     let (folder, path) = new_file("pair.mcap");
     let mut recorder = Recorder::start(&server.url, &path);
-    // Until the file has a chunk with states.
+    // A recovery succeeds once the file has a chunk with states.
     let probe = folder.path().join("probe.mcap");
     let steps = drive_until(&server.client, |_| modalcast_recording::recover(&path, &probe).is_ok()).await;
     recorder.process.kill().expect("a running process");
@@ -126,6 +126,7 @@ async fn errors_exit_with_the_documented_codes() {
     // The recording has no states and the server has no renderer, but ffmpeg is started first, so that its error is
     // reported.
     assert!(output.status.code() == Some(5) && message.contains("no-ffmpeg"), "{message}");
+    // The hash of the build.
     assert_eq!(String::from_utf8_lossy(&run(&["--build"]).stdout).trim().len(), 16);
 }
 
