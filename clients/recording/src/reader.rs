@@ -236,6 +236,7 @@ impl Recording {
         &self.scene.description
     }
 
+    /// The layout of the states.
     pub fn layout(&self) -> &Arc<StateLayout> {
         &self.scene.layout
     }

@@ -40,18 +40,18 @@ pub fn recover(path: &Path, out: &Path) -> Result<Recovered> {
     if out.exists() && std::fs::canonicalize(out).ok() == std::fs::canonicalize(path).ok() {
         return Err(Error::invalid("--out", "another file than the recording", out.display()));
     }
-    let mut copy = ChunkCopier { source, channels: ChannelTable::default(), recovered: Recovered::default() };
-    let (metadata, first_chunk) = copy.read_metadata()?;
+    let mut copier = ChunkCopier { source, channels: ChannelTable::default(), recovered: Recovered::default() };
+    let (metadata, first_chunk) = copier.read_metadata()?;
     let file = File::create(out).map_err(|error| Error::open(out, &error))?;
     let mut writer = RecordingWriter::new(BufWriter::new(file), &metadata).map_err(|error| error.at(out))?;
-    copy.copy_chunks(first_chunk, &mut writer).map_err(|error| error.at(out))?;
+    copier.copy_chunks(first_chunk, &mut writer).map_err(|error| error.at(out))?;
     writer.finish().map_err(|error| error.at(out))?;
-    match copy.recovered.state_messages {
+    match copier.recovered.state_messages {
         0 => {
             std::fs::remove_file(out).map_err(|error| Error::file(out, error))?;
-            Err(copy.source.invalid("topic states", "a state before the cut", "none"))
+            Err(copier.source.invalid("topic states", "a state before the cut", "none"))
         }
-        _ => Ok(copy.recovered),
+        _ => Ok(copier.recovered),
     }
 }
 

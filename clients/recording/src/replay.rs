@@ -214,6 +214,7 @@ fn read_steps(
     repeats: bool,
     sender: &mpsc::Sender<TimedStep>,
 ) -> Result<()> {
+    // Nanoseconds at which the present repetition begins.
     let mut pass_start = 0;
     loop {
         let (mut last_time, mut interval) = (0, 0);

@@ -158,7 +158,8 @@ fn frames_before(time: u64, rate: f64) -> u64 {
     while frame > 0 && frame_time(frame - 1) >= time {
         frame -= 1;
     }
-    // At most one frame, because the estimate is too small by less than two.
+    // Adds at most one frame: the estimate is rounded down, and the count is rounded up. The second condition ends the
+    // loop where f64 cannot distinguish the times of two frames.
     while frame_time(frame) < time && frame_time(frame + 1) > frame_time(frame) {
         frame += 1;
     }

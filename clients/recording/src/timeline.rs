@@ -48,7 +48,7 @@ mod tests {
         let steps = [
             (1, 10.0, 0),
             (1, 10.5, 500_000_000),
-            // Time of the simulation was reset, then the writer changed, twice.
+            // The simulation time is reset, then run 2 begins.
             (1, 0.0, 500_000_000),
             (1, 0.25, 750_000_000),
             (2, 100.0, 750_000_000),

@@ -22,8 +22,9 @@ const SHEAR_TOLERANCE: f64 = 1e-5;
 /// approximated.
 ///
 /// # Errors
-/// `Invalid` if a transform has shear, which a node cannot express, or the file exceeds 4 GiB; `Unavailable` if the
-/// recording has only the hashes of its contents; `InvalidFile` if it is damaged; `File` if the file cannot be written.
+/// `Invalid` if a transform has shear or a scale of 0, which a node cannot express, or the file exceeds 4 GiB;
+/// `Unavailable` if the recording has only the hashes of its contents; `InvalidFile` if it is damaged; `File` if the
+/// file cannot be written.
 pub fn export_gltf(recording: &Recording, out: &Path) -> Result<()> {
     let arrays = [
         ShapeArray::Indices,
@@ -142,9 +143,10 @@ struct ShapeAccessors {
 
 #[derive(Default)]
 struct Meshes {
+    /// By the index of the shape.
     shapes: HashMap<usize, ShapeAccessors>,
-    /// By shape, and first triangle and material of each range.
-    indices: HashMap<(usize, Vec<(usize, usize)>), usize>,
+    /// Index of the mesh for a shape and its ranges of materials, each as first triangle and material.
+    mesh_indices: HashMap<(usize, Vec<(usize, usize)>), usize>,
     meshes: Vec<Value>,
 }
 
@@ -153,7 +155,7 @@ impl Meshes {
         let whole = [MaterialRange { first_triangle: 0, material: domain.material }];
         let ranges = if domain.material_ranges.is_empty() { &whole[..] } else { &domain.material_ranges };
         let key = (domain.shape, ranges.iter().map(|range| (range.first_triangle, range.material)).collect::<Vec<_>>());
-        if let Some(mesh) = self.indices.get(&key) {
+        if let Some(mesh) = self.mesh_indices.get(&key) {
             return Ok(*mesh);
         }
         let shape = &description.shapes[domain.shape];
@@ -183,7 +185,7 @@ impl Meshes {
             mesh["extras"] = json!({ "targetNames": names });
         }
         self.meshes.push(mesh);
-        self.indices.insert(key, self.meshes.len() - 1);
+        self.mesh_indices.insert(key, self.meshes.len() - 1);
         Ok(self.meshes.len() - 1)
     }
 }
@@ -269,7 +271,11 @@ impl Animation {
             let transform = NodeTransform::decompose(matrix, transforms.last());
             transforms.push(transform.ok_or_else(|| {
                 let field = format!("step {step}: transform of domain '{}'", domain.name);
-                Error::invalid(field, "translation, rotation and scale, the only transforms of glTF", "shear")
+                Error::invalid(
+                    field,
+                    "translation, rotation and scale, the only transforms of glTF",
+                    "shear or a scale of 0",
+                )
             })?);
         }
         let numbers = |vectors: Vec<Vec<f32>>| vectors.concat();
@@ -333,7 +339,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn transforms_are_decomposed_without_shear_only() {
+    fn transforms_without_shear_are_decomposed_and_others_rejected() {
         // A rotation by 90 degrees about z, with scales 2, 3 and -4.
         let matrix = [0.0, -3.0, 0.0, 5.0, 2.0, 0.0, 0.0, 6.0, 0.0, 0.0, -4.0, 7.0];
         let node = NodeTransform::decompose(&matrix, None).expect("no shear");
