@@ -26,8 +26,8 @@ pub fn validate_mode(scene: &Scene, mode: u32) -> Result<u32> {
     if (mode as usize) < max_rank { Ok(mode) } else { Err(invalid("mode", format!("an index below {max_rank}"), mode)) }
 }
 
-/// The length of u = U q for every vertex in meters: the distance of its deformed position from T x0, the position that
-/// it has if the domain is rigid.
+/// The displacement of every vertex in meters, after T: the distance of its deformed position T (x0 + U q) from T x0,
+/// the position that it has if the domain is rigid.
 ///
 /// T x0 and the difference are computed in f64, so the error is the error of the deformer's positions. These positions
 /// are f32 relative to the domain's floating origin, an f64 point near the domain: one kilometer from this origin the
@@ -112,13 +112,13 @@ mod tests {
         let mut max_displacement = 0.0_f32;
         for vertex in 0..4 {
             let mode_vector = Vector3::from_fn(|axis, _| modes.entry(vertex, axis, 0));
-            let vertex_of_second = 4 + vertex;
+            let second_strip_vertex = 4 + vertex;
             assert!((mode_shape[vertex] - mode_vector.norm()).abs() < 1e-6);
-            assert_eq!(mode_shape[vertex_of_second], mode_shape[vertex]);
+            assert_eq!(mode_shape[second_strip_vertex], mode_shape[vertex]);
             assert!(displacements[vertex] < 1e-6, "expected the first strip at rest, got {displacements:?}");
             // The scale of the transform times the coordinate.
             let expected = 2.0 * 0.75 * mode_vector.norm();
-            let displacement = displacements[vertex_of_second];
+            let displacement = displacements[second_strip_vertex];
             assert!((displacement - expected).abs() < 2e-6, "expected {expected}, got {displacement}");
             max_displacement = max_displacement.max(displacement);
         }

@@ -49,7 +49,7 @@ pub enum FrameOutput {
     Domains,
     /// [`modalcast_render::Aov::Normals`].
     Normals,
-    /// The length of the displacement u = U q as a color map.
+    /// The distance of each vertex from T x0 as a color map.
     Displacement {
         /// The value at the bright end of the scale in meters; 0 fits the scale to each frame.
         scale_max: f64,

@@ -13,7 +13,7 @@ pub enum Encoding {
     F32,
     /// 3 f16, rounded to nearest.
     F16,
-    /// 3 u16 relative to a box that 256 consecutive vectors share. All boxes come first.
+    /// 3 u16 relative to a box (minimum and maximum, 6 f32) that 256 consecutive vectors share. All boxes come first.
     U16Box,
     /// 2 i16: the octahedral projection of a unit vector.
     OctahedralI16,
@@ -127,6 +127,7 @@ mod tests {
 
     #[test]
     fn f16_error_is_within_its_bound() {
+        // Also the largest f16, and a number that is rounded to 0.
         let numbers = [random_vectors(1000, 1000.0), random_vectors(100, 1e-6), vec![0.0, 65504.0, -2e-8]].concat();
         let bytes = encoded(Encoding::F16, &numbers);
         assert_eq!(bytes.len(), 2 * numbers.len());
