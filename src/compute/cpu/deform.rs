@@ -112,7 +112,7 @@ fn deform_tile<const COMPENSATED: bool>(
     let tile_bounds = store_positions(&transform, &mut scratch.sums, QUAD * layout.quads, out.positions);
     let tile_bounds =
         if tile_bounds.is_finite() { tile_bounds } else { repair_non_finite(inputs, tile, out.positions) };
-    tile_bounds.poison_with(zero_or_nan)
+    tile_bounds.nan_unless_finite(zero_or_nan)
 }
 
 /// Copies the sums of a tile, `[axis][vertex]`, to the displacements of its vertices, and repairs displacements that

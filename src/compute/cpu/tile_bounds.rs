@@ -91,7 +91,7 @@ impl TileBounds {
 
     /// Makes the bounds NaN if `number` is not finite.
     #[inline(always)]
-    pub(super) fn poison_with(self, number: f32) -> Self {
+    pub(super) fn nan_unless_finite(self, number: f32) -> Self {
         self.add_zero_or_nan(number * 0.0)
     }
 

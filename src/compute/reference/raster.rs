@@ -213,7 +213,7 @@ pub fn depth_at(triangle: &[SnappedVertex; 3], column: i32, row: i32) -> Option<
     (z >= 0.0).then_some(if z < 1.0 { z } else { 1.0 })
 }
 
-/// The corners in the same cyclic order, beginning with the farthest one, the first of several.
+/// The corners in the same cyclic order, beginning with the farthest one. Of equally far corners, the first one begins.
 pub fn with_farthest_first(triangle: &[SnappedVertex; 3]) -> [SnappedVertex; 3] {
     let [a, b, c] = *triangle;
     if b.z < a.z && b.z <= c.z {

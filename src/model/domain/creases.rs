@@ -272,7 +272,7 @@ impl FanConnector<'_> {
         self.areas[corner.triangle as usize].direction
     }
 
-    /// Makes one edge of the two edges of each triangle without area.
+    /// Merges the two edges of each triangle without area into one.
     fn merge_edges_of_degenerate_triangles(&mut self, corners: &[TriangleCorner]) {
         let mut neighbors: Vec<u32> = self.edges.iter().map(|(neighbor, _)| *neighbor).collect();
         neighbors.dedup();
@@ -289,7 +289,8 @@ impl FanConnector<'_> {
         self.edges.dedup();
     }
 
-    /// Connects the corners of one edge: those within the crease angle with each other, those without area with any.
+    /// Connects corners at one edge if their triangles are within the crease angle. A corner of a triangle without area
+    /// is connected in any case.
     fn connect_edge(&mut self, corners: &[TriangleCorner], edge: &[(u32, usize)]) {
         let direction_of = |index: usize| self.areas[corners[index].triangle as usize].direction;
         let mut directed =

@@ -16,9 +16,9 @@ pub struct Viewport {
 }
 
 impl Viewport {
-    /// A viewport of `width` x `height` pixels. `clip_from_positions` maps positions to clip space,
-    /// in which visible points have |x| <= w, |y| <= w and 0 <= z <= w, with z / w = 1 nearest. It is rounded to f32.
-    /// Rasterizers drop triangles with a vertex that is not finite in clip space.
+    /// A viewport of `width` x `height` pixels. `clip_from_positions` maps positions to clip space, in which visible
+    /// points have |x| <= w, |y| <= w and 0 <= z <= w, with z / w = 1 nearest. It is rounded to f32. Rasterizers drop
+    /// triangles with a vertex that is not finite in clip space.
     ///
     /// # Errors
     /// `Invalid` if a side is not 1 to [`MAX_VIEWPORT_SIDE`] pixels.

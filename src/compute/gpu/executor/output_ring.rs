@@ -92,8 +92,8 @@ impl OutputRing {
     /// Begins a step of `state`, which writes [`Self::next_output`]. That output is not valid until [`Self::end_step`].
     pub(super) fn begin_step(&mut self, state: &SceneState) -> StepTarget {
         if self.last_step == u32::MAX {
-            // After the restart at 0, old step numbers on the device look new. The kernels then compute domains again
-            // that did not change, once, but no result is wrong.
+            // After the restart at 0, old step numbers on the device look new. The kernels then recompute unchanged
+            // domains once; no result is wrong.
             self.invalidate();
             (self.last_step, self.last_full_step) = (0, 0);
         }

@@ -1,9 +1,9 @@
 //! The PNG encoder: launches `kernels/png.cu`. The pixels stay on the device, and the last kernel writes the file to
-//! pinned memory, so only compressed bytes cross the bus. The file is the one that the CPU encoder of the server
-//! writes.
+//! pinned memory, so only compressed bytes cross the bus. The file equals that of the server's CPU encoder.
 //!
-//! An encoder has a size. Its memory is allocated once: work buffers on the device, and pinned slots, one for each file
-//! that is in flight or that a reader holds. The order of the stream protects the work buffers from the next encoding.
+//! An encoder is for pictures of one size. Its memory is allocated once: work buffers on the device, and pinned slots,
+//! one for each file that is in flight or that a reader holds. The order of the stream protects the work buffers from
+//! the next encoding.
 //!
 //! | file | content |
 //! |---|---|

@@ -62,7 +62,8 @@ impl StepSlot {
         Ok(Self { full_graph, partial_graph, values, change_list, bounds_keys, done, begin_event: None })
     }
 
-    /// Records on the stream that the device begins the step. It may first complete or interrupt frames of OpenGL.
+    /// Records on the stream that the device begins the step. The device may first complete or interrupt frames of
+    /// OpenGL.
     pub(super) fn record_begin(&mut self, device: &Device) -> Result<()> {
         let event = match self.begin_event.take() {
             Some(event) => event,

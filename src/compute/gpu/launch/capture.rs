@@ -27,6 +27,6 @@ pub fn capture(device: &Device, submit: impl FnOnce() -> Result<()>) -> Result<C
         stream.end_capture(CUgraphInstantiate_flags::CUDA_GRAPH_INSTANTIATE_FLAG_AUTO_FREE_ON_LAUNCH)
     });
     submitted?;
-    let nothing_submitted = || Error::Fault { stage, reason: "nothing was submitted".into() };
+    let nothing_submitted = || Error::Fault { stage, reason: "expected submitted work, got none".into() };
     graph.map_err(cuda_error(stage))?.ok_or_else(nothing_submitted)
 }

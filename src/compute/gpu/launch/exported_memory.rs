@@ -189,7 +189,9 @@ fn granularity(properties: &sys::CUmemAllocationProp) -> Result<usize> {
 /// The next multiple of `granularity`, at least one.
 fn round_up(bytes: usize, granularity: usize) -> Result<usize> {
     let units = bytes.max(1).div_ceil(granularity);
-    units.checked_mul(granularity).ok_or_else(|| fault_in(STAGE)(format!("expected fewer than {bytes} bytes")))
+    units
+        .checked_mul(granularity)
+        .ok_or_else(|| fault_in(STAGE)(format!("expected a size that fits in 64 bits when rounded up, got {bytes}")))
 }
 
 #[cfg(test)]

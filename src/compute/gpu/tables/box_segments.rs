@@ -1,4 +1,4 @@
-//! Bounding boxes per domain: the segments that `bounds` reduces to boxes, and their union per domain. Pure.
+//! Bounding boxes per domain: the segments that `bounds` reduces to boxes, and their union per domain.
 //!
 //! A domain with tiles of its own is split into segments of consecutive tiles, whose boxes `deform` computed. A domain
 //! that shares a tile with other domains is one segment, the range of its vertices. An item of a segment is therefore a

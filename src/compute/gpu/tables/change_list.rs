@@ -1,6 +1,5 @@
 //! The lists of a partial step (a step that changes few domains), which `apply` reads from pinned memory. They contain
 //! the changed domains with their new transforms and coordinates, and the dirty tiles, which `deform` then computes.
-//! Pure.
 //!
 //! ```text
 //! [changes][new transforms: 12 words each][new q][dirty tiles]

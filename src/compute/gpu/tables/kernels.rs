@@ -1,4 +1,4 @@
-//! The kernels of a step: their sources, and the macros and grid sizes for a scene. Pure.
+//! The kernels of a step: their sources, and the macros and grid sizes for a scene.
 //!
 //! A tile is the work of one warp of `deform`, up to 32 quads of four vertices. An item is a vertex or a corner.
 

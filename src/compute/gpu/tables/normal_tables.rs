@@ -1,5 +1,5 @@
 //! Tables of `normals`, derived from a scene: the offsets of each domain (its slot), the domains of each block of the
-//! kernel, rest normals and tangents. Pure.
+//! kernel, rest normals and tangents.
 
 use super::layout::{BLOCK, NO_TANGENTS};
 use modalcast_model::domain::Domain;

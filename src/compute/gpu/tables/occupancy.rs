@@ -1,4 +1,4 @@
-//! Tuning of `deform`: the number of resident blocks per multiprocessor that each variant is compiled for. Pure.
+//! Tuning of `deform`: the number of resident blocks per multiprocessor that each variant is compiled for.
 
 /// The macro of the number of blocks.
 const MIN_BLOCKS_DEFINE: &str = "MIN_BLOCKS_PER_SM";

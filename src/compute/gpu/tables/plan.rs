@@ -1,4 +1,4 @@
-//! The plan of a scene on the device: kernels with their macros, buffers in bytes, launches and copies. Pure. The
+//! The plan of a scene on the device: kernels with their macros, buffers in bytes, launches and copies. The
 //! module `work` describes tiles, quads and batches.
 
 use serde::Serialize;
@@ -193,7 +193,7 @@ fn list_omitted_features(scene: &Scene, tables: &DeviceTables) -> Vec<OmittedFea
             features.exact_normals,
             feature(
                 "exact_normals",
-                "`normals` behind `deform`, and its rings",
+                "`normals` after `deform`, and its rings",
                 possible_corner_group_bytes(scene) + slot_bytes,
             ),
         ),

@@ -1,4 +1,4 @@
-//! Strips and tiles of a picture that `png` encodes, and the memory that its encoding needs. Pure.
+//! Strips and tiles of a picture that `png` encodes, and the memory that its encoding needs.
 
 use modalcast_model::error::{Result, invalid};
 
@@ -41,7 +41,7 @@ pub(crate) struct PngPlan {
     pub tiles_per_strip: u32,
     /// Words of the file that each block of `png_filter` clears.
     pub words_per_tile: u32,
-    /// Bound of the file's size, which files of noise reach almost.
+    /// Upper bound of the file's size. Pictures of noise almost reach it.
     pub max_file_bytes: u64,
 }
 
@@ -55,6 +55,8 @@ impl PngChannels {
 }
 
 impl PngPlan {
+    /// The plan of a picture of `width` x `height` pixels.
+    ///
     /// # Errors
     /// `Invalid` when a side is 0 or the picture is too large.
     pub(crate) fn new(width: u32, height: u32, channels: PngChannels) -> Result<Self> {

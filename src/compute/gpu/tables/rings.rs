@@ -1,5 +1,5 @@
 //! Tables of `normals` for smoothing groups (the corners of one vertex that share a normal): the ring of vertices
-//! around each group. [`SmoothingGroups`] describes groups and rings. Pure.
+//! around each group. [`SmoothingGroups`] describes groups and rings.
 
 use super::layout::{NO_GROUPS, NormalSlot};
 use super::normal_tables::{self, CornerSlot};

@@ -1,4 +1,4 @@
-//! Groups of domains that share a shape, for which `batch` reads U once. Pure.
+//! Groups of domains that share a shape, for which `batch` reads U once.
 
 use super::super::layout::{BatchBlock, BatchGroup, BatchMember};
 use super::{CoordinateLayout, WorkList, chunk_count, count_users, quad_count};

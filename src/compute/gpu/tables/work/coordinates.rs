@@ -1,4 +1,4 @@
-//! Layout of modal coordinates on the device. Pure.
+//! Layout of modal coordinates on the device.
 
 use crate::storage::modes_per_chunk;
 use modalcast_model::scene::{DomainLayout, Scene, StorageType};

@@ -1,4 +1,4 @@
-//! The work list of `deform`, derived from a scene: a list of tiles, each of which is the work of one warp. Pure.
+//! The work list of `deform`, derived from a scene: a list of tiles, each of which is the work of one warp.
 //!
 //! A quad is four consecutive items, which are vertices or corners. A tile is up to `TILE_QUADS` quads. Where corner i
 //! of a shape is its vertex i, one tile computes both. A chunk is a few modes that are stored together.

@@ -1,5 +1,5 @@
 //! Layout of x0, normals and tangents at rest on the device, in quads (four vertices or corners) as `deform` reads
-//! them. Pure.
+//! them.
 
 use super::{QUAD, WorkList, has_own_tiles, has_rigid_normals, shapes_with_own_tiles};
 use crate::storage::TILE_QUADS;
