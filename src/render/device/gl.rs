@@ -458,7 +458,7 @@ impl Gl {
         let gl = self.functions()?;
         let address = self.context.address("glGetMultisamplefv");
         if address.is_null() {
-            return Err(fault("samples", "glGetMultisamplefv is missing"));
+            return Err(fault("samples", "expected the function glGetMultisamplefv, got none"));
         }
         // SAFETY: the address is that of glGetMultisamplefv, which has this signature and writes two floats.
         unsafe {

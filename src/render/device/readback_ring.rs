@@ -13,7 +13,7 @@ use modalcast_model::shared_memory::PictureMemory;
 /// Maximum number of frames of one render target in flight.
 pub const MAX_FRAMES_IN_FLIGHT: usize = 3;
 
-/// Maximum number of shared pictures of one render target. Readers hold those that are not in flight. If fewer than
+/// Maximum number of shared pictures of one render target. Readers may hold those that are not in flight. If fewer than
 /// [`MAX_FRAMES_IN_FLIGHT`] are left for the next frames, readers copy the pixels instead of holding them.
 const MAX_PICTURES: usize = 8;
 

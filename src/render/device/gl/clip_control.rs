@@ -19,7 +19,7 @@ pub(super) fn set_depth_range_from_zero(gl: &glow::Context, context: &Context) -
     if !is_supported || address.is_null() {
         let reason =
             format!("expected OpenGL 4.5 or GL_ARB_clip_control, got OpenGL {}.{}", version.major, version.minor);
-        let remedy = "install a driver with OpenGL 4.5".into();
+        let remedy = "Install a driver with OpenGL 4.5".into();
         return Err(Error::Unavailable { what: "OpenGL", reason, remedy });
     }
     // SAFETY: the address is that of glClipControl, which has this signature. It sets state of the current context.

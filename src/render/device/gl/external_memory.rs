@@ -40,6 +40,8 @@ pub(super) struct MemoryObject {
 }
 
 impl Gl {
+    /// The functions of the extension.
+    ///
     /// # Errors
     /// `Fault` when the context lacks the extension.
     fn memory_object_functions(&self) -> Result<MemoryObjectFunctions> {
