@@ -194,7 +194,7 @@ impl AovReader {
             _ => buffers.aov_program(field.define(), desc.samples, &mut |source| programs.program(source))?,
         };
         if matches!(field, Aov::Values { .. }) && buffers.values.is_none() {
-            return Err(fault("aov", "no values were uploaded"));
+            return Err(fault("aov", "expected uploaded vertex values, got none"));
         }
         let target = self.take_target(desc, words_per_pixel)?;
         let bands = VecDeque::from(Band::divide(size, band_limit.max_pixels(desc.samples)));

@@ -51,7 +51,7 @@ pub(crate) fn unpack(
     compute_rasterizer: &ComputeRasterizer,
 ) -> Result<()> {
     let target = frame.target;
-    let missing_keys = || fault_in(Pass::Unpack.name())("no keys were drawn");
+    let missing_keys = || fault_in(Pass::Unpack.name())("expected visibility keys, got none");
     let (keys, program) = compute_rasterizer.unpack_input().ok_or_else(missing_keys)?;
     recorder.begin(Pass::Unpack);
     program.bind(None);

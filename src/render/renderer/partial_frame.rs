@@ -153,12 +153,12 @@ impl Renderer {
             buffers.ensure_inner_edges(&self.gl)?;
         }
         let encode = buffers.encode_program(antialiasing.method, &mut |source| self.programs.program(source))?;
-        let Some(target) = self.targets.last() else { return Err(fault("draw", "no target")) };
+        let Some(target) = self.targets.last() else { return Err(fault("draw", "expected a render target, got none")) };
         let slot = if has_readback { Some(target.readback_ring.acquire(self.frame_timeout)?) } else { None };
         // If a pass fails or panics, the images of the target are undefined. Therefore the target is not in the cache
         // until all passes are recorded.
         self.last_frame = None;
-        let Some(target) = self.targets.pop() else { return Err(fault("draw", "no target")) };
+        let Some(target) = self.targets.pop() else { return Err(fault("draw", "expected a render target, got none")) };
         target.draw_region.set(draw_region(buffers, params));
         let is_divided = self.exceeds_band_limit(size, desc.samples);
         let steps = plan_steps(&target, slot.is_some(), self.band_limit.max_pixels(desc.samples));
