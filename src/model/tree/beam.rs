@@ -66,8 +66,8 @@ impl Beam {
     }
 
     /// The `count` lowest modes, by orthogonal iteration with Rayleigh-Ritz projection (Golub and Van Loan, "Matrix
-    /// Computations", section 8.2). It needs a few vectors more than modes. Its cost grows with
-    /// the number of elements, that of a dense solution with the cube.
+    /// Computations", section 8.2). It needs a few vectors more than modes. Its cost is proportional to the number of
+    /// elements; that of a dense solution is proportional to the cube of this number.
     ///
     /// K is factored instead of M, because axial stiffness is up to 10^10 times the lowest bending stiffness. With
     /// K = L L^T, the lowest modes have the largest eigenvalues mu = 1 / lambda of A = L^-1 M L^-T, which are accurate

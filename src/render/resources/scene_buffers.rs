@@ -45,7 +45,7 @@ pub struct SceneBuffers {
     /// The scene's look, with the shadow map for this renderer.
     pub(crate) look: RenderSettings,
     renderer_kind: RendererKind,
-    /// Its deformed positions are called shared positions, because a deformer may write their buffer directly
+    /// The deformed positions in it are called shared positions, because a deformer may write their buffer directly
     /// ([`Self::vertex_buffers`]).
     pub(crate) geometry: GeometryBuffers<Buffer>,
     /// Imports memory of a deformer, if the renderer shares memory with CUDA.

@@ -8,7 +8,7 @@ use std::fmt::Write as _;
 use modalcast_model::scene::ShadowSettings;
 
 /// Largest radius of the blur kernel for which the first of [`STRIP_SHAPES`] is used. Measured on an H200 with a map of
-/// 4096 x 4096 texels: a radius of 7 takes 135 us with the first shape and 154 us with the second, a radius of 12 takes
+/// 4096 x 4096 texels: a radius of 7 takes 135 us with the first shape and 154 us with the second; a radius of 12 takes
 /// 200 us and 166 us.
 const NARROW_RADIUS: u32 = 9;
 /// Lanes per workgroup and rows per iteration: first for narrow kernels, then for wide kernels.
