@@ -5,9 +5,9 @@
 //! *floating origin*. Its distance from the domain is measured in multiples of the domain's *spacing* g
 //! ([`OriginGrids`]), the power of two below the domain's size. Most domains use the *shared origin*, so that one
 //! coordinate frame suffices to draw them. When more than half of the domains are farther than [`HOME_REACH`] spacings
-//! from it, it moves to the majority, and all transforms are rebased from the stored f64 translations. So the shared
-//! origin of a single domain follows the domain, also back. A domain farther than [`SHARED_REACH`] spacings from the
-//! shared origin (an *outlier*) has a floating origin of its own.
+//! from it, it moves to the majority, and all transforms are rebased from the stored f64 translations. In a scene with
+//! a single domain, the shared origin therefore follows the domain, also when the domain returns. A domain farther than
+//! [`SHARED_REACH`] spacings from the shared origin (an *outlier*) has a floating origin of its own.
 //!
 //! Error bound per axis, for a translation t from the floating origin with |t| <= 4 g = `HOME_REACH` g: rounding t
 //! contributes at most 2^-23 g. Each of the three fused multiply-adds of x = A p + t contributes at most 2^-22 g while
@@ -228,10 +228,10 @@ impl FloatingOrigins {
     }
 
     /// Moves the shared origin if more than half of the domains are beyond [`HOME_REACH`], and the move leaves fewer
-    /// outliers, or as many outliers and fewer domains beyond this reach. Searches at most once per as many set
-    /// translations as there are domains. The new shared origin is the grid point nearest to the per-axis median, which
-    /// is robust to a few very distant domains. If this function returns true, the caller must call
-    /// [`Self::rebase_transform`] for every transform.
+    /// outliers, or as many outliers and fewer domains beyond this reach. Searches for a better origin only if at least
+    /// as many translations were set since the last search as there are domains. The new shared origin is the grid
+    /// point nearest to the per-axis median, which is robust to a few very distant domains. If this function returns
+    /// true, the caller must call [`Self::rebase_transform`] for every transform.
     pub(super) fn update_shared_origin(&mut self) -> bool {
         let root_count = self.translations.len();
         if 2 * self.counts.beyond_home <= root_count || self.translations_since_search < root_count {
