@@ -82,23 +82,32 @@ pub(crate) fn read_visibility(
     copy_words(recorder, &target.readback_source, &word_pass)
 }
 
+/// A buffer that receives a part of a frame and of the counters that follow it.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct ReadbackBuffer<'a> {
+    pub(crate) buffer: &'a Buffer,
+    /// The byte of the frame that the first byte of the buffer receives.
+    pub(crate) first_byte: u64,
+}
+
 /// Copies as many rows of a frame as a band has to a staging buffer, unless the frame has a shared picture. With the
 /// last band, also copies the fragment and culling counters behind the pixels.
 pub(crate) fn copy_frame(
     recorder: &PassRecorder<'_>,
     frame: &FrameContext<'_>,
-    staging: Option<&Buffer>,
+    staging: Option<ReadbackBuffer<'_>>,
     band: Band,
 ) -> Result<()> {
     let FrameContext { buffers, target, .. } = *frame;
     recorder.begin(Pass::Read);
-    if let Some(staging) = staging {
+    if let Some(ReadbackBuffer { buffer, first_byte }) = staging {
         let [source_offset, bytes] =
             [band.first_row, band.rows].map(|rows| 4 * u64::from(target.desc.width) * u64::from(rows));
-        let source = &target.readback_source;
-        recorder.gl.copy(BufferCopy { source, source_offset, target: staging, target_offset: source_offset, bytes });
+        let (source, target_offset) = (&target.readback_source, source_offset - first_byte);
+        recorder.gl.copy(BufferCopy { source, source_offset, target: buffer, target_offset, bytes });
     }
-    let Some(pixels) = staging.or(frame.picture).filter(|_| band.is_last()) else {
+    let picture = frame.picture.map(|buffer| ReadbackBuffer { buffer, first_byte: 0 });
+    let Some(ReadbackBuffer { buffer, first_byte }) = staging.or(picture).filter(|_| band.is_last()) else {
         return recorder.check(Pass::Read);
     };
     let counters = [
@@ -107,8 +116,8 @@ pub(crate) fn copy_frame(
     ];
     for (source, range) in counters.into_iter().zip(target.desc.readback_ranges()) {
         if let Some(source) = source.filter(|_| !range.is_empty()) {
-            let copy = BufferCopy::first(range.end - range.start, source, pixels);
-            recorder.gl.copy(BufferCopy { target_offset: range.start, ..copy });
+            let copy = BufferCopy::first(range.end - range.start, source, buffer);
+            recorder.gl.copy(BufferCopy { target_offset: range.start - first_byte, ..copy });
         }
     }
     recorder.check(Pass::Read)

@@ -8,7 +8,6 @@ use std::ops::Range;
 
 use super::Renderer;
 use super::pending_frame::{MappedPixels, PendingFrame};
-use crate::device::readback_ring::ReadbackSlot;
 use crate::layout;
 use crate::pass::{FrameTimes, Pass};
 use crate::resources::scene_buffers::SceneBuffers;
@@ -59,8 +58,9 @@ impl Renderer {
     pub fn map_pixels(&mut self, pending_frame: PendingFrame) -> Result<MappedPixels> {
         let _current = self.gl.make_current()?;
         pending_frame.wait()?;
-        let PendingFrame { desc, slot, passes, mut stats, info, .. } = pending_frame;
-        let mut view = slot.as_ref().map_or(Ok(None), ReadbackSlot::view)?;
+        let limit = pending_frame.time_left();
+        let PendingFrame { desc, readback, fence, passes, mut stats, info, .. } = pending_frame;
+        let mut view = readback.map_or(Ok(None), |readback| readback.into_view(&fence, limit))?;
         if let Some(view) = &mut view {
             let [oit_range, cull_range] = desc.readback_ranges().map(|range| range.start as usize..range.end as usize);
             let counters_in = |range: Range<usize>| view.bytes().get(range).filter(|counters| !counters.is_empty());

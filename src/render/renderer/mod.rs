@@ -2,6 +2,7 @@
 
 mod autotune;
 mod frame;
+mod frame_readback;
 mod partial_frame;
 mod pending_frame;
 mod preparation;
@@ -25,6 +26,7 @@ use rayon::{ThreadPool, ThreadPoolBuilder};
 pub use self::partial_frame::PartialFrame;
 pub use self::pending_frame::{FramePixels, HeldPixels, MappedPixels, PendingFrame};
 pub use self::preparation::ScenePreparation;
+use crate::device::readback_ring::ReadbackRing;
 use crate::device::{self, gl, gl::Gl};
 use crate::passes::aov::{Aov, AovImage, AovReader, PartialAov};
 use crate::passes::picking::{PendingPick, PickHit, Picker};
@@ -49,9 +51,9 @@ const MAX_SIDE: u32 = 8192;
 const MAX_TARGETS: usize = 4;
 /// Maximum time that dropping a renderer waits for each thread that still copies pixels.
 const READER_TIMEOUT: Duration = Duration::from_secs(1);
-/// The most that hardware draws without a break: a frame of 3840 x 2160 pixels with four samples each. The cost of a
-/// large frame is that of its samples.
-const HARDWARE_BAND_LIMIT: BandLimit = BandLimit { max_pixels: u64::MAX, max_samples: 1 << 25 };
+/// The most that hardware draws without a break: a frame of 3840 x 2160 pixels with four samples each. The cost of
+/// drawing is that of the samples, and the cost of page-locked memory for the readback that of the pixels.
+const HARDWARE_BAND_LIMIT: BandLimit = BandLimit { max_pixels: 1 << 23, max_samples: 1 << 25 };
 /// The most that a software renderer draws without a break: a frame of 1920 x 1080 pixels. Most of the cost is that of
 /// shading each pixel once.
 const SOFTWARE_BAND_LIMIT: BandLimit = BandLimit { max_pixels: 1 << 21, max_samples: u64::MAX };
@@ -77,6 +79,8 @@ pub struct Renderer {
     last_frame: Option<LastFrame>,
     frame_timeout: Duration,
     band_limit: BandLimit,
+    /// Staging buffers of frames that are copied to the host band by band.
+    band_ring: Rc<ReadbackRing>,
     /// Threads that compute mipmap levels: few, because they compete with the threads of a software renderer and with
     /// the deformer.
     preparation_pool: ThreadPool,
@@ -138,6 +142,7 @@ impl Renderer {
             last_frame: None,
             frame_timeout: FRAME_TIMEOUT,
             band_limit: if gl.limits.software { SOFTWARE_BAND_LIMIT } else { HARDWARE_BAND_LIMIT },
+            band_ring: ReadbackRing::new(&gl, frame_readback::BAND_STAGING_BYTES, None),
             picker: Picker::new(&gl),
             aov_reader: AovReader::new(&gl),
             #[cfg(test)]
@@ -194,7 +199,7 @@ impl Renderer {
 
     /// Sets the maximum number of samples (pixels times samples per pixel) that are drawn without a break. Larger
     /// frames and AOVs are divided into bands of rows. The pixels do not depend on the bands. By default, hardware
-    /// draws 2^25 samples without a break, and a software renderer 2^21 pixels.
+    /// draws 2^25 samples and 2^23 pixels without a break, and a software renderer 2^21 pixels.
     pub fn set_max_band_samples(&mut self, max_band_samples: u64) {
         self.band_limit = BandLimit { max_pixels: u64::MAX, max_samples: max_band_samples };
     }

@@ -15,10 +15,10 @@ use std::collections::VecDeque;
 use std::rc::Rc;
 use std::time::{Duration, Instant};
 
+use super::frame_readback::{BandReadback, FrameReadback, MAX_BAND_PIXELS};
 use super::pending_frame::PendingFrame;
 use super::{LastFrame, MAX_TARGETS, Renderer};
 use crate::device::gl::{Fence, PassTimer, Program};
-use crate::device::readback_ring::ReadbackSlot;
 use crate::pass::Pass;
 use crate::passes::post::BloomStep;
 use crate::passes::{self, FrameContext, OitFrame, PassRecorder};
@@ -42,8 +42,8 @@ pub struct PartialFrame {
     target: RenderTarget,
     programs: SampleCountPrograms,
     encode: Rc<Program>,
-    /// The slot of the readback; none for a frame whose pixels are not read back.
-    slot: Option<ReadbackSlot>,
+    /// None for a frame whose pixels are not read back.
+    readback: Option<FrameReadback>,
     stats: FrameStats,
     info: FrameInfo,
     /// Submitted passes in execution order. A pass in bands has one entry for each band.
@@ -154,20 +154,27 @@ impl Renderer {
         }
         let encode = buffers.encode_program(antialiasing.method, &mut |source| self.programs.program(source))?;
         let Some(target) = self.targets.last() else { return Err(fault("draw", "expected a render target, got none")) };
-        let slot = if has_readback { Some(target.readback_ring.acquire(self.frame_timeout)?) } else { None };
+        let is_divided = self.exceeds_band_limit(size, desc.samples);
+        let readback = match (has_readback, is_divided) {
+            (false, _) => None,
+            (true, false) => Some(FrameReadback::Whole(target.readback_ring.acquire(self.frame_timeout)?)),
+            (true, true) => {
+                let slot = self.band_ring.acquire(self.frame_timeout)?;
+                Some(FrameReadback::Bands(BandReadback::new(slot, desc)))
+            }
+        };
         // If a pass fails or panics, the images of the target are undefined. Therefore the target is not in the cache
         // until all passes are recorded.
         self.last_frame = None;
         let Some(target) = self.targets.pop() else { return Err(fault("draw", "expected a render target, got none")) };
         target.draw_region.set(draw_region(buffers, params));
-        let is_divided = self.exceeds_band_limit(size, desc.samples);
-        let steps = plan_steps(&target, slot.is_some(), self.band_limit.max_pixels(desc.samples));
+        let steps = plan_steps(&target, readback.is_some(), self.band_limit.max_pixels(desc.samples));
         Ok(PartialFrame {
             params: *params,
             uniforms,
             programs,
             encode,
-            slot,
+            readback,
             stats: FrameStats { samples: desc.samples, ..FrameStats::default() },
             info: frame_info(buffers, params, FrameAntialiasing { samples: desc.samples, ..antialiasing }),
             timers: Vec::new(),
@@ -186,7 +193,11 @@ impl Renderer {
     /// `Fault` with the pass if OpenGL reports an error. The frame must then be dropped.
     pub fn submit_step(&mut self, buffers: &SceneBuffers, partial_frame: &mut PartialFrame) -> Result<()> {
         let _current = self.gl.make_current()?;
-        let PartialFrame { params, uniforms, target, programs, encode, slot, stats, timers, steps, .. } = partial_frame;
+        let PartialFrame { params, uniforms, target, programs, encode, readback, stats, timers, steps, .. } =
+            partial_frame;
+        if let Some(readback) = readback {
+            readback.collect(partial_frame.fence.as_ref(), self.frame_timeout)?;
+        }
         let mut recorder = PassRecorder { gl: &self.gl, stats };
         if std::mem::replace(&mut partial_frame.is_begun, true) {
             // Commands of other scenes may have changed the bindings.
@@ -194,7 +205,8 @@ impl Renderer {
         } else {
             passes::uniforms::upload(&recorder, buffers, params, uniforms);
         }
-        let picture = slot.as_ref().and_then(ReadbackSlot::picture);
+        let readback = readback.as_ref();
+        let picture = readback.and_then(FrameReadback::picture);
         let frame = FrameContext { buffers, target, programs, encode, params, picture };
         let has_breaks = partial_frame.has_breaks;
         while let Some(step) = steps.pop_front() {
@@ -207,7 +219,7 @@ impl Renderer {
                 Step::Cull => {}
                 Step::Passes(pass, band_passes) => timers.push(self.time_pass(pass, || {
                     let mut band_passes = band_passes.into_iter();
-                    band_passes.try_for_each(|band_pass| record(&mut recorder, &frame, slot.as_ref(), band_pass))
+                    band_passes.try_for_each(|band_pass| record(&mut recorder, &frame, readback, band_pass))
                 })?),
             }
             if has_breaks || self.gl.limits.software {
@@ -232,7 +244,7 @@ impl Renderer {
             return Err(fault("draw", "expected a frame whose steps are all submitted"));
         }
         let _current = self.gl.make_current()?;
-        let PartialFrame { uniforms, mut target, slot, timers, stats, info, .. } = partial_frame;
+        let PartialFrame { uniforms, mut target, readback, timers, stats, info, .. } = partial_frame;
         let desc = target.desc;
         target.last_use = Instant::now();
         // A frame with an equal description may have been drawn between the steps of this one.
@@ -244,7 +256,7 @@ impl Renderer {
         self.last_frame = Some(LastFrame { desc, uniforms });
         Ok(PendingFrame {
             desc,
-            slot,
+            readback,
             fence: self.gl.fence(Pass::Read.name())?,
             passes: timers,
             stats,
@@ -311,7 +323,7 @@ impl Renderer {
 fn record(
     recorder: &mut PassRecorder<'_>,
     frame: &FrameContext<'_>,
-    slot: Option<&ReadbackSlot>,
+    readback: Option<&FrameReadback>,
     band_pass: BandPass,
 ) -> Result<()> {
     let rasterizer = frame.buffers.visibility_rasterizer();
@@ -331,7 +343,8 @@ fn record(
         (BandPass::Bloom(step, band), _) => passes::post::bloom(recorder, frame, step, band),
         (BandPass::Encode(band), _) => passes::post::encode(recorder, frame, band),
         (BandPass::Read(band), _) => {
-            passes::readback::copy_frame(recorder, frame, slot.and_then(ReadbackSlot::staging), band)
+            let staging = readback.and_then(|readback| readback.buffer(frame.target.desc, band));
+            passes::readback::copy_frame(recorder, frame, staging, band)
         }
         // Passes that OpenGL or a frame without fragment lists does not have.
         (BandPass::RecordVisible | BandPass::OitCount(_), _) | (BandPass::OitSumCounts | BandPass::OitBlend(_), _) => {
@@ -365,7 +378,10 @@ fn plan_steps(target: &RenderTarget, has_readback: bool, max_pixels: u64) -> Vec
         (Pass::Bloom, bloom.collect()),
         (Pass::Encode, of_bands(BandPass::Encode).collect()),
     ];
-    if has_readback {
+    if has_readback && bands.len() > 1 {
+        let bands = Band::divide([width, height], max_pixels.min(MAX_BAND_PIXELS));
+        groups.push((Pass::Read, bands.into_iter().map(BandPass::Read).collect()));
+    } else if has_readback {
         groups.push((Pass::Read, of_bands(BandPass::Read).collect()));
     }
     let mut steps = VecDeque::from([Step::ComputeRaster, Step::Shadow, Step::Cull]);

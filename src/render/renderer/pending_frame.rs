@@ -5,8 +5,8 @@ use std::time::{Duration, Instant};
 
 use rayon::prelude::*;
 
+use super::frame_readback::FrameReadback;
 use crate::device::gl::{Fence, PassTimer, ReadbackView};
-use crate::device::readback_ring::ReadbackSlot;
 use crate::pass::{FrameTimes, Pass, RenderStage};
 use crate::resources::target_desc::TargetDesc;
 use crate::types::{FrameImage, FrameInfo, FrameStats};
@@ -19,8 +19,8 @@ const COPY_CHUNK_BYTES: usize = 1 << 20;
 #[derive(Debug)]
 pub struct PendingFrame {
     pub(super) desc: TargetDesc,
-    /// The slot of the readback; none for a frame whose pixels are not read back.
-    pub(super) slot: Option<ReadbackSlot>,
+    /// None for a frame whose pixels are not read back.
+    pub(super) readback: Option<FrameReadback>,
     pub(super) fence: Fence,
     /// Passes in execution order, each with its timer.
     pub(super) passes: Vec<(Pass, PassTimer)>,
@@ -92,8 +92,8 @@ impl PendingFrame {
     /// counts as ready: retrieving it reports the timeout.
     pub fn is_ready_within(&self, timeout: Duration) -> bool {
         self.time_left().is_zero()
-            || match &self.slot {
-                Some(slot) => slot.is_ready_within(&self.fence, timeout),
+            || match &self.readback {
+                Some(readback) => readback.is_ready_within(&self.fence, timeout),
                 None => self.fence.is_done_within(timeout),
             }
     }
@@ -150,15 +150,20 @@ impl MappedPixels {
         }
     }
 
-    /// Copies the pixels, with several threads if there are many.
+    /// Copies the pixels, with several threads if there are many, unless they were copied band by band.
     pub fn into_image(self) -> FrameImage {
         let begin = Instant::now();
         let Self { width, height, view, mut times, info } = self;
-        let bytes = view.as_ref().map_or(&[][..], ReadbackView::bytes);
-        let mut rgba = vec![0; bytes.len()];
-        let chunks = rgba.par_chunks_mut(COPY_CHUNK_BYTES).zip(bytes.par_chunks(COPY_CHUNK_BYTES));
-        chunks.for_each(|(destination, source)| destination.copy_from_slice(source));
-        drop(view);
+        let rgba = match view {
+            Some(ReadbackView::Copied(bytes)) => bytes,
+            view => {
+                let bytes = view.as_ref().map_or(&[][..], ReadbackView::bytes);
+                let mut rgba = vec![0; bytes.len()];
+                let chunks = rgba.par_chunks_mut(COPY_CHUNK_BYTES).zip(bytes.par_chunks(COPY_CHUNK_BYTES));
+                chunks.for_each(|(destination, source)| destination.copy_from_slice(source));
+                rgba
+            }
+        };
         times.add(RenderStage::Read, begin.elapsed().as_secs_f64() * 1e3);
         FrameImage { width, height, rgba, times, info }
     }
