@@ -11,8 +11,8 @@ from typing import TypeVar
 from numpy.typing import ArrayLike
 
 from modalcast._async.scene import Scene, open_scene
-from modalcast._async.streams import RETRY_SECONDS, with_reconnect
-from modalcast._async.transport import Transport, sleep
+from modalcast._async.streams import with_reconnect
+from modalcast._async.transport import RETRY_SECONDS, Transport, sleep
 from modalcast._methods import (
     DELETE_SCENE,
     FIND_UPLOADED_FILES,

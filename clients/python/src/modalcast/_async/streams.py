@@ -6,7 +6,7 @@ import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from typing import Generic, Self, TypeVar
 
-from modalcast._async.transport import ReplyStream, Transport, sleep
+from modalcast._async.transport import RETRY_SECONDS, ReplyStream, Transport, sleep
 from modalcast._decoders import ReplyDecoder, parse
 from modalcast._methods import UPDATE_FRAME_STREAM
 from modalcast.camera import Camera
@@ -15,9 +15,6 @@ from modalcast.frame import Frame
 from modalcast.v1 import frames_pb2
 
 T = TypeVar("T")
-
-RETRY_SECONDS = 0.1
-"""Pause between two attempts to reach a server."""
 
 
 async def with_reconnect(transport: Transport, reconnect: float, operation: Callable[[], Awaitable[T]]) -> T:
@@ -121,17 +118,17 @@ class Stream(Generic[T]):
 
     async def _next_reply(self) -> T | None:
         try:
-            return await self._read()
-        except ConnectionLost:
-            if self._reconnect <= 0 or self._is_closed:
-                self.close()
-                raise
+            while True:
+                try:
+                    return await self._read()
+                except ConnectionLost:
+                    if self._reconnect <= 0 or self._is_closed:
+                        raise
+                await self._transport.wait_for_server(self._reconnect)
+                await with_reconnect(self._transport, self._reconnect, lambda: self.start(wait_for_ready=True))
         except BaseException:
             self.close()
             raise
-        await self._transport.wait_for_server(self._reconnect)
-        await with_reconnect(self._transport, self._reconnect, lambda: self.start(wait_for_ready=True))
-        return await self._read()
 
     async def _read(self) -> T | None:
         if self._stream is None or (self._is_limited and self._remaining == 0):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from collections.abc import Callable, Iterator
 from typing import Any, TypeVar, cast
 
@@ -21,6 +22,9 @@ RequestT = TypeVar("RequestT", bound=Message)
 ReplyT = TypeVar("ReplyT", bound=Message)
 
 sleep = asyncio.sleep
+
+RETRY_SECONDS = 0.1
+"""Pause between two attempts to reach a server."""
 
 
 class ReplyStream:
@@ -181,11 +185,19 @@ class Transport:
         """
         method = GET_SERVER_INFO
         call = self._channel.unary_unary(method.path, method.request.SerializeToString, method.reply.FromString)
-        try:
-            # Without `wait_for_ready`, the call fails while the connection is still being established.
-            await call(method.request(), timeout=timeout, wait_for_ready=True)
-        except grpc.RpcError:
-            raise ConnectionLost(f"{self.address}: no connection for {timeout:g} s") from None
+        end = time.monotonic() + timeout
+        while True:
+            # Without `wait_for_ready`, the call fails while the connection is being established. With it, it still
+            # fails if it was sent on a connection that is being lost.
+            remaining = max(end - time.monotonic(), RETRY_SECONDS)
+            try:
+                await call(method.request(), timeout=remaining, wait_for_ready=True)
+            except grpc.RpcError:
+                if time.monotonic() + RETRY_SECONDS >= end:
+                    raise ConnectionLost(f"{self.address}: no connection for {timeout:g} s") from None
+            else:
+                return
+            await sleep(RETRY_SECONDS)
 
     async def upload(
         self, method: Method[RequestT, ReplyT], requests: Iterator[RequestT], timeout: float | None

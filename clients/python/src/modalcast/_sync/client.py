@@ -24,8 +24,8 @@ from modalcast._methods import (
 )
 from modalcast._server_process import ServerProcess
 from modalcast._sync.scene import Scene, open_scene
-from modalcast._sync.streams import RETRY_SECONDS, with_reconnect
-from modalcast._sync.transport import Transport, sleep
+from modalcast._sync.streams import with_reconnect
+from modalcast._sync.transport import RETRY_SECONDS, Transport, sleep
 from modalcast._types import Vector
 from modalcast.errors import ConnectionLost, NotFound, ProtocolVersionError, ServerError, ServerStartError
 from modalcast.upload import LocalFile, Progress, SceneBuilder, file_messages, local_files

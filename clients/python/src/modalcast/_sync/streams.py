@@ -10,16 +10,13 @@ from typing import Generic, Self, TypeVar
 
 from modalcast._decoders import ReplyDecoder, parse
 from modalcast._methods import UPDATE_FRAME_STREAM
-from modalcast._sync.transport import ReplyStream, Transport, sleep
+from modalcast._sync.transport import RETRY_SECONDS, ReplyStream, Transport, sleep
 from modalcast.camera import Camera
 from modalcast.errors import ConnectionLost
 from modalcast.frame import Frame
 from modalcast.v1 import frames_pb2
 
 T = TypeVar("T")
-
-RETRY_SECONDS = 0.1
-"""Pause between two attempts to reach a server."""
 
 
 def with_reconnect(transport: Transport, reconnect: float, operation: Callable[[], T]) -> T:
@@ -123,17 +120,17 @@ class Stream(Generic[T]):
 
     def _next_reply(self) -> T | None:
         try:
-            return self._read()
-        except ConnectionLost:
-            if self._reconnect <= 0 or self._is_closed:
-                self.close()
-                raise
+            while True:
+                try:
+                    return self._read()
+                except ConnectionLost:
+                    if self._reconnect <= 0 or self._is_closed:
+                        raise
+                self._transport.wait_for_server(self._reconnect)
+                with_reconnect(self._transport, self._reconnect, lambda: self.start(wait_for_ready=True))
         except BaseException:
             self.close()
             raise
-        self._transport.wait_for_server(self._reconnect)
-        with_reconnect(self._transport, self._reconnect, lambda: self.start(wait_for_ready=True))
-        return self._read()
 
     def _read(self) -> T | None:
         if self._stream is None or (self._is_limited and self._remaining == 0):

@@ -24,6 +24,9 @@ ReplyT = TypeVar("ReplyT", bound=Message)
 
 sleep = time.sleep
 
+RETRY_SECONDS = 0.1
+"""Pause between two attempts to reach a server."""
+
 # Steps that wait inside this process for the connection.
 _QUEUED_STEPS = 8
 
@@ -235,11 +238,19 @@ class Transport:
         """
         method = GET_SERVER_INFO
         call = self._channel.unary_unary(method.path, method.request.SerializeToString, method.reply.FromString)
-        try:
-            # Without `wait_for_ready`, the call fails while the connection is still being established.
-            call(method.request(), timeout=timeout, wait_for_ready=True)
-        except grpc.RpcError:
-            raise ConnectionLost(f"{self.address}: no connection for {timeout:g} s") from None
+        end = time.monotonic() + timeout
+        while True:
+            # Without `wait_for_ready`, the call fails while the connection is being established. With it, it still
+            # fails if it was sent on a connection that is being lost.
+            remaining = max(end - time.monotonic(), RETRY_SECONDS)
+            try:
+                call(method.request(), timeout=remaining, wait_for_ready=True)
+            except grpc.RpcError:
+                if time.monotonic() + RETRY_SECONDS >= end:
+                    raise ConnectionLost(f"{self.address}: no connection for {timeout:g} s") from None
+            else:
+                return
+            sleep(RETRY_SECONDS)
 
     def upload(self, method: Method[RequestT, ReplyT], requests: Iterator[RequestT], timeout: float | None) -> ReplyT:
         """Makes a call with a stream of requests. The requests are created as they are sent.
