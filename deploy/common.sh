@@ -73,6 +73,27 @@ require_python_client() {
     cp clients/python/pyproject.toml .tools/python/
 }
 
+# The newest Python of this machine: in PATH, or an installed version of pyenv, whose commands in PATH work for the
+# selected versions only.
+newest_python() {
+    local candidate
+    for candidate in $(compgen -c python3. | grep -E '^python3\.[0-9]+$') "$HOME"/.pyenv/versions/3.*/bin/python3; do
+        "$candidate" -c 'import sys, ensurepip; print(*sys.version_info[:3], sys.executable)' 2>/dev/null || true
+    done | sort -k1,1n -k2,2n -k3,3n | tail -n 1 | cut -d ' ' -f 4-
+}
+
+# Installs the Python client with all optional packages into a virtual environment of the newest Python in the
+# git-ignored folder .tools/newest-python.
+require_newest_python_client() {
+    local python
+    python=$(newest_python)
+    cmp -s clients/python/pyproject.toml .tools/newest-python/pyproject.toml && return
+    say "Installing the Python client and all optional packages into .tools/newest-python ($("$python" --version))"
+    "$python" -m venv --clear .tools/newest-python
+    .tools/newest-python/bin/python -m pip install --quiet --disable-pip-version-check --editable 'clients/python[test,all]'
+    cp clients/python/pyproject.toml .tools/newest-python/
+}
+
 # Installs Node.js and the npm packages of the viewer, again whenever the lock file changes. Uses the system's Node.js if
 # it is new enough, else that of a PyPI wheel in the git-ignored folder .tools/node.
 require_viewer_tools() {

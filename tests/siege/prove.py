@@ -6,6 +6,7 @@ import sys
 import time
 from pathlib import Path
 
+import long_tests
 from report import Result
 
 # The items: numbered subjects of promises, each with the module of its checks. An item without checks is not claimed.
@@ -42,6 +43,9 @@ def main():
     parser = argparse.ArgumentParser(prog="deploy/prove", description="Attacks a server and checks what it promises.")
     parser.add_argument("--program", type=Path, required=True, help="the server, `modalcast`")
     parser.add_argument("--items", type=int, nargs="*", default=sorted(ITEMS), help="numbers of the items to check")
+    parser.add_argument(
+        "--full", nargs="*", choices=long_tests.NAMES, help="then run the long tests of the clients, all or by name"
+    )
     arguments = parser.parse_args()
     is_good = True
     for item in sorted(set(arguments.items) & set(ITEMS)):
@@ -57,6 +61,8 @@ def main():
         if item in NOT_CLAIMED:
             print(f"    not claimed: {NOT_CLAIMED[item]}", flush=True)
         print(f"      took {time.monotonic() - start:.0f} s", flush=True)
+    if arguments.full is not None:
+        is_good &= long_tests.run(arguments.program.resolve(), arguments.full or long_tests.NAMES)
     sys.exit(0 if is_good else 1)
 
 
