@@ -2,8 +2,8 @@
 /// Identifies a step.
 #[derive(Clone, Copy, PartialEq, ::prost::Message)]
 pub struct StepId {
-    /// The writer that sent the step. Every writer of the server gets a larger run than all writers before it, also after
-    /// a restart or a crash of the server. 0 before the first step.
+    /// Identifies the writer that sent the step. Each new writer gets a larger number than all writers before it, also
+    /// after a restart or a crash of the server. 0 before the first step.
     #[prost(uint64, tag = "1")]
     pub run: u64,
     /// Number of the step; increases within the run.
@@ -47,8 +47,8 @@ pub struct StageTime {
     #[prost(float, tag = "2")]
     pub milliseconds: f32,
 }
-/// Data in shared memory, in place of the field `data` of a chunk, or of `q` or `transforms` of a step. Only for a client
-/// on the server's machine, on request.
+/// Data in shared memory, in place of the field `data` of a chunk, or of `q` or `transforms` of a step. Only for a
+/// client on the server's machine, on request.
 ///
 /// The server offers shared memory if it has FEATURE_SHARED_MEMORY. Its operator sets the path of a Unix socket for this
 /// purpose (`modalcast serve --shared-memory PATH`), to which only processes of the server's user can connect. All
@@ -63,7 +63,7 @@ pub struct StageTime {
 /// 1. The client maps the first memfd read-only and shared, and the second one, if it sends steps, writable and
 ///    shared. Each has the same number of slots, and slot n begins at n times the size of a slot.
 /// 1. The client starts a call with the token as the metadata `modalcast-shared-memory-bin`, which is 16 binary bytes;
-///    gRPC encodes them. A token of no open connection is rejected with REASON_INVALID_FIELD.
+///    gRPC encodes them. A token that belongs to no open connection is rejected with REASON_INVALID_FIELD.
 /// 1. Replies: the server puts data of 64 KiB or more into a free slot, and sends the chunk with `shared`. The client
 ///    copies or uses the data, and then returns the slot: it sends the number of the slot as u32 on the socket. The
 ///    server does not write to a slot between these messages.
@@ -71,14 +71,13 @@ pub struct StageTime {
 ///    `shared_q` or `shared_transforms`. The server copies the values when it receives the message, and then returns
 ///    the slot: it sends the number of the slot as u32 on the socket. It validates the copy. Values in shared memory
 ///    count for Limits.message_bytes as those of a message do.
-///    Without a free slot for a reply, the server waits for one, as it waits for a client that does not read. So a client
-///    returns the slots of a message before it waits for the next one, and uses one connection per call. The slots of
-///    messages that a client does not read, for example after it has cancelled the call, are not returned, and it closes
-///    the connection. It can use the connection for another call after a call that has ended with OK and whose slots were
-///    all returned.
+///    If no slot is free for a reply, the server waits until one is returned. A client must therefore return the slots of a
+///    message before it waits for the next message, and use one connection per call. It can use the connection for another
+///    call if the call before has ended with OK and all of its slots were returned. Otherwise, for example after it has
+///    cancelled a call, it closes the connection.
 ///
-/// A slot that the client returns without having received it ends the connection. When the connection has ended, the
-/// server sends further data of its calls in `data`, and frees the memory when these calls have ended.
+/// If the client returns a slot that it has not received, the server closes the connection. After the connection has
+/// ended, the server sends further data of its calls in `data`, and frees the memory when these calls have ended.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct SharedRange {
     /// Index of the slot.
@@ -88,8 +87,8 @@ pub struct SharedRange {
     #[prost(uint32, tag = "2")]
     pub bytes: u32,
 }
-/// Which steps a stream carries. A stream must name one of them, because each costs something: a slow reader of every
-/// step slows down the simulation, and a stream of the latest steps skips some.
+/// Which steps a stream carries. A stream must choose, because both choices have a cost: a slow reader of every step
+/// slows down the simulation, and a stream of the newest steps skips some.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
 #[repr(i32)]
 pub enum Delivery {
@@ -293,7 +292,7 @@ pub struct SceneInfo {
     /// Rest bounds in scene units relative to `origin`: min x, y, z, max x, y, z.
     #[prost(double, repeated, tag = "11")]
     pub bounds: ::prost::alloc::vec::Vec<f64>,
-    /// Whether the transforms of steps may shear or scale non-uniformly.
+    /// Whether the transforms of steps may shear, or scale non-uniformly.
     #[prost(bool, tag = "12")]
     pub affine: bool,
     /// The last completed step; unset before the first one.
@@ -306,8 +305,8 @@ pub struct SceneInfo {
     #[prost(message, optional, tag = "15")]
     pub lighting: ::core::option::Option<Lighting>,
 }
-/// Light, sky and ground of the scene, for clients that draw the scene themselves: the table `look` of its scene.toml. Each
-/// vector has three numbers; colors are linear.
+/// Light, sky and ground of the scene, for clients that draw the scene themselves: the table `look` of its scene.toml.
+/// Each vector has three numbers; colors are linear.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct Lighting {
     /// Unit vector towards the sun in world axes.
@@ -509,8 +508,8 @@ pub struct DescribeSceneRequest {
     #[prost(enumeration = "Array", repeated, tag = "3")]
     pub arrays: ::prost::alloc::vec::Vec<i32>,
     /// Whether descriptions contain the hashes of arrays and textures. The server computes the hashes of the whole scene
-    /// at the first request that needs them, which takes time in proportion to the size of the scene, and keeps them while
-    /// the scene is open.
+    /// at the first request that needs them, and keeps them while the scene is open. The computation takes time in
+    /// proportion to the size of the scene.
     #[prost(bool, tag = "4")]
     pub hashes: bool,
 }
@@ -1977,11 +1976,11 @@ pub struct Step {
     /// The format of all transforms of the step.
     #[prost(enumeration = "TransformFormat", tag = "7")]
     pub transform_format: i32,
-    /// Whether the next message is a further part of this step. A large step is sent in parts, so that no message is larger
-    /// than necessary: consecutive messages with the same number, of which all but the last set this field. The lists and
-    /// the bytes of the parts are concatenated in order; `time` and `transform_format` are those of the first part. A step
-    /// of one message leaves it unset. All parts of a step together have at most Limits.message_bytes bytes. If a part is
-    /// rejected, the other parts of the step are ignored.
+    /// Whether the next message is a further part of this step. A large step is sent in parts, so that no message is
+    /// larger than necessary: consecutive messages with the same number, of which all but the last set this field. The
+    /// lists and the bytes of the parts are concatenated in order; `time` and `transform_format` are those of the first
+    /// part. A step of one message leaves it unset. All parts of a step together have at most Limits.message_bytes bytes.
+    /// If a part is rejected, the other parts of the step are ignored.
     #[prost(bool, tag = "8")]
     pub has_more: bool,
     /// `q` and `transforms` of this message, if they are in shared memory. The field itself is then empty.
@@ -2079,10 +2078,10 @@ impl Overflow {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
 #[repr(i32)]
 pub enum InitialState {
-    /// A new writer begins at rest, and a writer that continues its own run keeps the state: means INITIAL_STATE_KEEP if
-    /// `lease_token` is that of the last writer of the scene since the server opened it, else INITIAL_STATE_RESET.
-    /// Opened.initial_state states which one is in effect. After INITIAL_STATE_RESET, a client that resumes after a restart
-    /// of the server sends all values again.
+    /// A new writer begins at rest, and a writer that continues its own run keeps the state. Means INITIAL_STATE_KEEP if
+    /// `lease_token` is that of the last writer since the server opened the scene, else INITIAL_STATE_RESET.
+    /// Opened.initial_state states which one is in effect. After INITIAL_STATE_RESET, a client that resumes after a
+    /// restart of the server sends all values again.
     Unspecified = 0,
     /// The current state.
     Keep = 1,
@@ -2122,9 +2121,9 @@ pub enum TransformFormat {
     /// Means TRANSFORM_FORMAT_AFFINE_F32.
     Unspecified = 0,
     /// 48 bytes: 12 f32, row-major 3x4. The translation, the last column, is in scene units from the scene's origin
-    /// (SceneInfo.origin). At a distance t from there, f32 rounds positions by up to 2^-22 t on each axis: 2.4 mm at 10 km.
-    /// Normals that follow the deformed triangles become rigid where this exceeds a few percent of the edges of a mesh. Use
-    /// f64 translations beyond a few thousand times the size of a domain.
+    /// (SceneInfo.origin). At a distance t from there, f32 rounds positions by up to 2^-22 t on each axis: 2.4 mm at 10
+    /// km. Normals that follow the deformed triangles become rigid where this rounding exceeds a few percent of the edge
+    /// lengths of a mesh. Use f64 translations beyond a few thousand times the size of a domain.
     AffineF32 = 1,
     /// 28 bytes: a quaternion x y z w as 4 f32, then the translation as 3 f32 in scene units from the scene's origin.
     QuaternionXyzwF32 = 2,
@@ -2286,9 +2285,9 @@ pub mod step_service_client {
                 .insert(GrpcMethod::new("modalcast.v1.StepService", "DriveScene"));
             self.inner.streaming(req, path, codec).await
         }
-        /// Returns a scene to its rest state: a writer of its own sends one step without values from INITIAL_STATE_RESET, with
-        /// number 0 and time 0, and releases the lease. The reply is sent when the step is completed. A program that drives
-        /// the scene sends the values at rest as a step instead.
+        /// Returns a scene to its rest state. The server acquires the lease with INITIAL_STATE_RESET, applies a step without
+        /// values (number 0, time 0), and releases the lease. The reply is sent when the step is completed. A program that
+        /// drives the scene sends the values at rest as a step instead.
         pub async fn reset_scene(
             &mut self,
             request: impl tonic::IntoRequest<super::ResetSceneRequest>,
@@ -2348,9 +2347,9 @@ pub mod step_service_server {
             &self,
             request: tonic::Request<tonic::Streaming<super::DriveSceneRequest>>,
         ) -> std::result::Result<tonic::Response<Self::DriveSceneStream>, tonic::Status>;
-        /// Returns a scene to its rest state: a writer of its own sends one step without values from INITIAL_STATE_RESET, with
-        /// number 0 and time 0, and releases the lease. The reply is sent when the step is completed. A program that drives
-        /// the scene sends the values at rest as a step instead.
+        /// Returns a scene to its rest state. The server acquires the lease with INITIAL_STATE_RESET, applies a step without
+        /// values (number 0, time 0), and releases the lease. The reply is sent when the step is completed. A program that
+        /// drives the scene sends the values at rest as a step instead.
         async fn reset_scene(
             &self,
             request: tonic::Request<super::ResetSceneRequest>,
@@ -2597,15 +2596,15 @@ pub struct Picture {
     /// Quality of FORMAT_JPEG, 1 (smallest frame) to 100 (smallest error); 0 means 90. Must be 0 for other formats.
     #[prost(uint32, tag = "8")]
     pub jpeg_quality: u32,
-    /// Width in pixels of lines along the edges of the faces, above 0, to 32; 0: no lines. Unset: as look.edges in the
-    /// scene.toml, which also has their color. Hidden edges and edges of blended surfaces have no lines. Must be 0 or unset
-    /// for outputs other than OUTPUT_COLOR.
+    /// Width in pixels of lines along the edges of the faces, at most 32; 0: no lines. Unset: as look.edges in the
+    /// scene.toml, which also has their color. Hidden edges and edges of blended surfaces have no lines. Must be 0 or
+    /// unset for outputs other than OUTPUT_COLOR.
     #[prost(float, optional, tag = "9")]
     pub edge_width: ::core::option::Option<f32>,
 }
 /// An unset view or lens is taken from the camera that frames the scene's rest bounds. Positions are in scene units
 /// relative to the scene's origin (SceneInfo.origin). The server keeps the camera in f64 and subtracts the origin of the
-/// drawn vertices (VertexHead.origin) before it rounds to f32.
+/// drawn vertices (ATTRIBUTE_ORIGINS) before it rounds to f32.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct Camera {
     /// Near and far plane, distances in scene units along the view axis with 0 \< near \< far. If both are 0, nothing in
@@ -2716,8 +2715,8 @@ pub struct StreamFramesRequest {
     pub steps: u64,
     /// Maximum number of steps per second, finite and above 0; 0: no limit. The steps that are sent are the newest ones,
     /// and those in between are skipped and counted. Also limits the steps that are sent again because of a moved camera.
-    /// After a wait for a step, two steps may follow each other faster. Only with DELIVERY_LATEST: DELIVERY_LOSSLESS sends
-    /// every step, so a limit is rejected.
+    /// After a pause of the writer, two steps may follow each other at a shorter interval. Only with DELIVERY_LATEST:
+    /// DELIVERY_LOSSLESS sends every step, so a limit is rejected.
     #[prost(double, tag = "5")]
     pub max_hz: f64,
 }
@@ -2945,8 +2944,8 @@ pub struct Hit {
     pub modes: ::prost::bytes::Bytes,
 }
 /// The quantity that a picture shows. Color is the mean of a pixel's samples. Depth, domains and normals are sampled
-/// once, at the center of the pixel. They show the opaque surface behind blended surfaces. The ground hides no surface, not
-/// even one that lies below it. Only OUTPUT_COLOR and OUTPUT_DEPTH_WITH_GROUND contain it.
+/// once, at the center of the pixel. They show the opaque surface behind blended surfaces. A surface is visible even if
+/// it lies below the ground. Only OUTPUT_COLOR and OUTPUT_DEPTH_WITH_GROUND contain the ground.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
 #[repr(i32)]
 pub enum Output {
@@ -3333,9 +3332,9 @@ pub mod frame_service_client {
                 .insert(GrpcMethod::new("modalcast.v1.FrameService", "StreamFrames"));
             self.inner.server_streaming(req, path, codec).await
         }
-        /// Moves cameras of a running stream. The next frames show them. If no step arrives, the stream sends all pictures of
-        /// the current step again, also if its delivery is lossless; before the first step it sends the rest state.
-        /// Updates in quick succession are merged. Unary, so that browsers can call it over grpc-web.
+        /// Moves cameras of a running stream. The next frames use the new cameras. If no step arrives, the stream sends all
+        /// pictures of the current step again (before the first step, of the rest state), also with DELIVERY_LOSSLESS. Updates
+        /// in quick succession are merged. Unary, so that browsers can call it over grpc-web.
         pub async fn update_frame_stream(
             &mut self,
             request: impl tonic::IntoRequest<super::UpdateFrameStreamRequest>,
@@ -3436,9 +3435,9 @@ pub mod frame_service_server {
             tonic::Response<Self::StreamFramesStream>,
             tonic::Status,
         >;
-        /// Moves cameras of a running stream. The next frames show them. If no step arrives, the stream sends all pictures of
-        /// the current step again, also if its delivery is lossless; before the first step it sends the rest state.
-        /// Updates in quick succession are merged. Unary, so that browsers can call it over grpc-web.
+        /// Moves cameras of a running stream. The next frames use the new cameras. If no step arrives, the stream sends all
+        /// pictures of the current step again (before the first step, of the rest state), also with DELIVERY_LOSSLESS. Updates
+        /// in quick succession are merged. Unary, so that browsers can call it over grpc-web.
         async fn update_frame_stream(
             &self,
             request: tonic::Request<super::UpdateFrameStreamRequest>,
@@ -3821,8 +3820,8 @@ pub struct StreamVerticesRequest {
     #[prost(uint64, tag = "4")]
     pub steps: u64,
     /// Maximum number of steps per second, finite and above 0; 0: no limit. The steps that are sent are the newest ones,
-    /// and those in between are skipped and counted. After a wait for a step, two steps may follow each other faster. Only
-    /// with DELIVERY_LATEST: DELIVERY_LOSSLESS sends every step, so a limit is rejected.
+    /// and those in between are skipped and counted. After a pause of the writer, two steps may follow each other at a
+    /// shorter interval. Only with DELIVERY_LATEST: DELIVERY_LOSSLESS sends every step, so a limit is rejected.
     #[prost(double, tag = "5")]
     pub max_hz: f64,
 }
@@ -4029,8 +4028,8 @@ pub mod vertex_service_client {
     use tonic::codegen::*;
     use tonic::codegen::http::Uri;
     /// Deformed vertices, and attributes computed with them. A reply begins with the layout, which holds for all its steps.
-    /// The reply of a stream has the settings in effect before the layout. The bytes of each step follow in chunks of at most
-    /// 1 MiB, the first one with the head of the step.
+    /// The reply of a stream has the settings in effect before the layout. The bytes of each step follow in chunks of at
+    /// most 1 MiB, the first one with the head of the step.
     #[derive(Debug, Clone)]
     pub struct VertexServiceClient<T> {
         inner: tonic::client::Grpc<T>,
@@ -4208,8 +4207,8 @@ pub mod vertex_service_server {
         >;
     }
     /// Deformed vertices, and attributes computed with them. A reply begins with the layout, which holds for all its steps.
-    /// The reply of a stream has the settings in effect before the layout. The bytes of each step follow in chunks of at most
-    /// 1 MiB, the first one with the head of the step.
+    /// The reply of a stream has the settings in effect before the layout. The bytes of each step follow in chunks of at
+    /// most 1 MiB, the first one with the head of the step.
     #[derive(Debug)]
     pub struct VertexServiceServer<T> {
         inner: Arc<T>,
@@ -4446,8 +4445,8 @@ pub struct StreamStatesRequest {
     #[prost(enumeration = "Delivery", tag = "2")]
     pub delivery: i32,
     /// Maximum number of states per second, finite and above 0; 0: no limit. The states that are sent are the newest ones,
-    /// and the steps in between are skipped and counted. After a wait for a step, two states may follow each other faster.
-    /// Only with DELIVERY_LATEST: DELIVERY_LOSSLESS sends every step, so a limit is rejected.
+    /// and the steps in between are skipped and counted. After a pause of the writer, two states may follow each other at
+    /// a shorter interval. Only with DELIVERY_LATEST: DELIVERY_LOSSLESS sends every step, so a limit is rejected.
     #[prost(double, tag = "3")]
     pub max_hz: f64,
     /// Number of states after which the stream ends; 0: no limit.
@@ -4589,9 +4588,9 @@ pub mod state_service_client {
     /// (DescribeScene, ReadModes) computes the vertices x = T (x0 + U q) by itself. A state has a few numbers per domain, so
     /// it is much smaller than the vertices of the step.
     ///
-    /// A state has the vocabulary of Step, so that recorded states can be sent as steps again: while the origin of the
-    /// transforms is SceneInfo.origin, the sections of a state are the fields q_domains, q, transform_domains and transforms
-    /// of a Step with TRANSFORM_FORMAT_AFFINE_F32.
+    /// A state is encoded like a Step, so that recorded states can be sent as steps again. If the origin of the transforms
+    /// is SceneInfo.origin, the sections of a state are the fields q_domains, q, transform_domains and transforms of a Step
+    /// with TRANSFORM_FORMAT_AFFINE_F32.
     ///
     /// * Domains that share their coordinates (DomainDescription.shares_q_with) are not listed with q: they have the q of
     ///  the domain that they name, which may itself share them.
@@ -4778,9 +4777,9 @@ pub mod state_service_server {
     /// (DescribeScene, ReadModes) computes the vertices x = T (x0 + U q) by itself. A state has a few numbers per domain, so
     /// it is much smaller than the vertices of the step.
     ///
-    /// A state has the vocabulary of Step, so that recorded states can be sent as steps again: while the origin of the
-    /// transforms is SceneInfo.origin, the sections of a state are the fields q_domains, q, transform_domains and transforms
-    /// of a Step with TRANSFORM_FORMAT_AFFINE_F32.
+    /// A state is encoded like a Step, so that recorded states can be sent as steps again. If the origin of the transforms
+    /// is SceneInfo.origin, the sections of a state are the fields q_domains, q, transform_domains and transforms of a Step
+    /// with TRANSFORM_FORMAT_AFFINE_F32.
     ///
     /// * Domains that share their coordinates (DomainDescription.shares_q_with) are not listed with q: they have the q of
     ///  the domain that they name, which may itself share them.
@@ -5005,14 +5004,14 @@ pub struct ApplyForcesRequest {
     /// All forces of the owner, at most 16.
     #[prost(message, repeated, tag = "3")]
     pub forces: ::prost::alloc::vec::Vec<Force>,
-    /// Time in milliseconds after which the forces expire, at most 10000; 0: 500.
+    /// Time in milliseconds after which the forces expire, at most 10000; 0 means 500.
     #[prost(uint32, tag = "4")]
     pub lifetime_ms: u32,
 }
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct ApplyForcesResponse {
-    /// The number that stands for the owner in StreamForces; 0 if the owner has no forces. A client that had no forces
-    /// gets a new number.
+    /// The number that identifies the owner in StreamForces; 0 if the owner has no forces. An owner that had no forces
+    /// before gets a new number.
     #[prost(uint64, tag = "1")]
     pub owner: u64,
     /// The lifetime in effect in milliseconds.
@@ -5025,7 +5024,7 @@ pub struct ApplyForcesResponse {
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct Force {
-    /// Chosen by the owner, to recognize the force in StreamForces; each id once.
+    /// Chosen by the owner, to recognize the force in StreamForces; unique among its forces.
     #[prost(uint64, tag = "1")]
     pub id: u64,
     /// Index of the domain on which the force acts.
@@ -5070,7 +5069,8 @@ pub struct ModalForce {
 pub struct StreamForcesRequest {
     #[prost(string, tag = "1")]
     pub scene: ::prost::alloc::string::String,
-    /// Maximum number of replies per second, finite and above 0; 0: no limit. The forces that are sent are the newest ones.
+    /// Maximum number of replies per second, finite and above 0; 0: no limit. The forces that are sent are the newest
+    /// ones.
     #[prost(double, tag = "2")]
     pub max_hz: f64,
     /// Set by readers that show the forces and do not simulate: ApplyForcesResponse.receivers does not count them.
@@ -5080,7 +5080,7 @@ pub struct StreamForcesRequest {
 /// All forces in a scene. The first reply has the present ones, which may be none.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct StreamForcesResponse {
-    /// The step with whose transforms f_q of surface forces was computed. Unset if there are no surface forces.
+    /// The step whose transforms were used to compute f_q of the surface forces. Unset if there are no surface forces.
     #[prost(message, optional, tag = "1")]
     pub step: ::core::option::Option<StepId>,
     /// Ordered by owner; the forces of an owner have the order of ApplyForcesRequest.
@@ -5097,8 +5097,8 @@ pub struct AppliedForce {
     pub force: ::core::option::Option<Force>,
     /// The force on the domain's coordinates: r little-endian f32. For a surface force U^T A^T f, where U is interpolated
     /// at the point from the scene's untruncated modes, as in Hit.modes, and A is the linear part of the domain's
-    /// transform at `step`. In newtons times scene units per unit of q, because U is in scene units per unit of q. A number
-    /// that f32 cannot represent is infinite.
+    /// transform at `step`. In newtons times scene units per unit of q, because U is in scene units per unit of q. A
+    /// number beyond the range of f32 becomes infinite.
     #[prost(bytes = "bytes", tag = "3")]
     pub f_q: ::prost::bytes::Bytes,
 }
@@ -5225,8 +5225,8 @@ pub mod force_service_client {
             self.inner.unary(req, path, codec).await
         }
         /// Returns the present forces of all owners, and then all forces again after every change: forces were set, removed or
-        /// have expired, or a step has changed f_q. A reader that is slower skips sets and receives the newest one. A renewal
-        /// without a change is not reported. A scene may have 32 of these streams (REASON_LIMIT_REACHED).
+        /// have expired, or a step has changed AppliedForce.f_q. A slow reader skips replies and receives the newest one. A
+        /// renewal without a change is not reported. A scene may have 32 of these streams (REASON_LIMIT_REACHED).
         pub async fn stream_forces(
             &mut self,
             request: impl tonic::IntoRequest<super::StreamForcesRequest>,
@@ -5285,8 +5285,8 @@ pub mod force_service_server {
             + std::marker::Send
             + 'static;
         /// Returns the present forces of all owners, and then all forces again after every change: forces were set, removed or
-        /// have expired, or a step has changed f_q. A reader that is slower skips sets and receives the newest one. A renewal
-        /// without a change is not reported. A scene may have 32 of these streams (REASON_LIMIT_REACHED).
+        /// have expired, or a step has changed AppliedForce.f_q. A slow reader skips replies and receives the newest one. A
+        /// renewal without a change is not reported. A scene may have 32 of these streams (REASON_LIMIT_REACHED).
         async fn stream_forces(
             &self,
             request: tonic::Request<super::StreamForcesRequest>,
@@ -5533,17 +5533,17 @@ pub struct GetServerInfoResponse {
     /// What this server can do, each feature once.
     #[prost(enumeration = "Feature", repeated, tag = "8")]
     pub features: ::prost::alloc::vec::Vec<i32>,
-    /// The path and query of the viewer's URL, "/?token=" and the token. A client puts the host and port in front of it at
-    /// which it reaches this server. Empty if the viewer is off. Web pages cannot read it, because browsers cannot make gRPC
-    /// calls over plain HTTP/2.
+    /// The path and query of the viewer's URL, "/?token=" and the token. A client prepends the host and port at which it
+    /// reaches this server. Empty if the viewer is off. Web pages cannot read it, because browsers cannot make gRPC calls
+    /// over plain HTTP/2.
     #[prost(string, tag = "9")]
     pub viewer_url_path: ::prost::alloc::string::String,
 }
 /// Limits of the server. A request beyond a limit is rejected with an error that names the limit (errors.proto).
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct Limits {
-    /// The largest message that the server accepts, in bytes, and the largest step with all its parts. The server never sends a message above 3 MiB; a chunk of
-    /// data in it has at most 1 MiB.
+    /// Size in bytes of the largest message that the server accepts, and of the largest step with all its parts. The
+    /// server never sends a message above 3 MiB; a chunk of data in it has at most 1 MiB.
     #[prost(uint64, tag = "1")]
     pub message_bytes: u64,
     /// The largest image side in pixels.
@@ -5561,25 +5561,26 @@ pub struct Limits {
     /// Deadline in milliseconds of a request that sets none.
     #[prost(uint32, tag = "6")]
     pub deadline_ms: u32,
-    /// Number of DriveScene streams that one connection may have open. The limit keeps HTTP/2 flow control safe: a blocked
-    /// stream of the smallest steps uses a fifth of the connection's budget for small frames.
+    /// Number of DriveScene streams that one connection may have open. The HTTP/2 layer closes a connection that buffers
+    /// too many small frames; a blocked stream of the smallest steps uses up to a fifth of this budget.
     #[prost(uint32, tag = "7")]
     pub drives: u32,
-    /// Limit in bytes on the messages that one connection is sending: each counts with its whole length from its first byte
-    /// until it is complete, and a request until it is answered. A message above the limit is rejected with
+    /// Limit in bytes on the messages that one connection is sending. A message counts with its whole length from its
+    /// first byte until it is complete; a request, until it is answered. A message above the limit is rejected with
     /// REASON_LIMIT_REACHED.
     #[prost(uint64, tag = "8")]
     pub connection_receive_bytes: u64,
-    /// Longest time in milliseconds without progress of a message that has begun. Bytes extend it by the time in which a
-    /// client with 32 KiB/s sends them. REASON_DEADLINE_EXPIRED.
+    /// Time budget in milliseconds for the rest of a message that has begun. Waiting consumes it, and every received 32
+    /// KiB adds one second, up to this value. When it is used up, the call ends with REASON_DEADLINE_EXPIRED.
     #[prost(uint32, tag = "9")]
     pub message_timeout_ms: u32,
     /// Limit in bytes on the unread replies of one connection. Above it, the server produces no more replies for this
     /// connection until the client reads.
     #[prost(uint64, tag = "10")]
     pub connection_reply_bytes: u64,
-    /// A call whose client takes no bytes for this time, in milliseconds, while other replies wait for capacity, ends with
-    /// REASON_SLOW_READER. If its bytes remain unread, the server closes the connection after this time again.
+    /// Time in milliseconds. If a client reads no bytes of a call for this time while other replies wait for capacity, the
+    /// call ends with REASON_SLOW_READER. If the bytes remain unread for the same time again, the server closes the
+    /// connection.
     #[prost(uint32, tag = "11")]
     pub reply_timeout_ms: u32,
 }
