@@ -182,20 +182,21 @@ impl<'a> Driver<'a> {
         let mut current_values = StepValues::default();
         let mut step_number = 0;
         while options.steps.is_none_or(|steps| step_number < steps) && !*stop_receiver.borrow() {
+            let time = step_number as f64 * options.dt;
+            if options.realtime {
+                // Adding `Duration::MAX` itself would overflow.
+                let due_time = self.start + Duration::try_from_secs_f64(time).unwrap_or(Duration::MAX / 4);
+                tokio::time::sleep_until(due_time.into()).await;
+            }
+            // After the pause, so that a force that arrives during the pause acts in this step.
             if let Some(viewer_forces) = &mut self.viewer_forces
                 && let Some(forces) = viewer_forces.take_changed(self.scenario.model()).await?
             {
                 self.scenario.set_viewer_forces(&forces)?;
             }
             self.scenario.compute_next_step(&mut current_values)?;
-            let time = step_number as f64 * options.dt;
             let model = self.scenario.model();
             self.check.check(model, step_number, time, &current_values)?;
-            if options.realtime {
-                // Adding `Duration::MAX` itself would overflow.
-                let due_time = self.start + Duration::try_from_secs_f64(time).unwrap_or(Duration::MAX / 4);
-                tokio::time::sleep_until(due_time.into()).await;
-            }
             let step = add_changes(model, Step::new(step_number, time), last_sent_values.as_ref(), &current_values);
             // A rejection arrives late: it may concern this step or an earlier one.
             let is_rejected = self.stats.record_rejection(self.step_stream.step(&step).await)?;
