@@ -1,10 +1,11 @@
 /** Shows scenes of a server, and connects again after the connection has broken. */
 
-import type { App, SourceFeatures } from "./app";
+import type { App } from "./app";
 import { Feature } from "./proto/modalcast/v1/server_pb";
 import { contentBytes, parseArrays, type SceneArrays } from "./scene/arrays";
 import type { SceneDescription } from "./scene/description";
 import type { SceneModel } from "./scene/scene_model";
+import type { SourceFeatures } from "./session";
 import { ContentCache } from "./source/content_cache";
 import { PROTOCOL_VERSION, Server } from "./source/server";
 import * as format from "./ui/format";
@@ -151,11 +152,11 @@ export class LiveViewer {
         const isKnown = app.model?.scene.info.scene === name;
         if (!isKnown) app.cover.showProgress(`Loading ${name}`, 0, 0);
         const scene = await server.describe(name);
-        const reason = app.checkBudget(scene);
-        if (reason && !features.pictures)
-            throw new FatalError(`${reason.replace("The server draws this scene.", "")} The server has no renderer.`);
+        const reason = app.drawingProblem(scene);
+        if (reason && !features.pictures) throw new FatalError(`${reason} The server has no renderer.`);
         const arrays = reason ? null : await this.load(server, scene, isKnown);
-        const model = app.showScene(scene, arrays, reason, server, features);
+        const hint = reason && `${reason} The server draws this scene.`;
+        const model = app.showScene(scene, arrays, hint, { server, features });
         const states = server.streamStates(name);
         const forces = server.streamForces(name);
         try {
@@ -238,7 +239,7 @@ export class LiveViewer {
         const start = performance.now();
         try {
             await server.getInfo();
-            this.app.latency = performance.now() - start;
+            this.app.status.latency = performance.now() - start;
         } catch {
             // The end of the connection is handled elsewhere.
         }

@@ -50,11 +50,12 @@ export class RecordingPlayer {
     private play(name: string, recording: Recording): void {
         const { app } = this;
         const { scene, arrays, view, isCutOff } = recording;
-        const reason = app.checkBudget(scene);
-        if (reason) throw new Error(reason.replace("The server draws this scene.", ""));
+        const reason = app.drawingProblem(scene);
+        if (reason) throw new Error(reason);
         app.bar.setScenes([], [], "");
         app.bar.setConnection("idle", `recording of ${scene.info.scene}`);
-        const model = app.showScene(scene, arrays, "", null, { pictures: false, forces: false, drive: false });
+        const features = { pictures: false, forces: false, drive: false };
+        const model = app.showScene(scene, arrays, "", { server: null, features });
         document.title = `${scene.info.scene} - modalcast`;
         if (view && norm(subtract(view.eye as Vec3, view.target as Vec3)) > 0)
             app.viewport.camera.look(view.eye as Vec3, view.target as Vec3);

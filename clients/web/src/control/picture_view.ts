@@ -91,6 +91,8 @@ export class PictureView {
             if (this.stream !== stream) return;
             if (part.case === "settings") {
                 this.streamId = part.value.stream;
+                // The stream begins with the next step. After a moved camera it sends the current one.
+                this.pendingCamera ??= this.options?.camera ?? null;
                 void this.sendCamera();
             }
             if (part.case !== "chunk") continue;

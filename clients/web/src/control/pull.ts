@@ -13,14 +13,12 @@ import { norm, solveLinear, subtract, TRANSFORM_SIZE, type Vec3 } from "../scene
 import { linearNorm, restSphere } from "../scene/bounds";
 import { at, toF32 } from "../scene/numbers";
 import type { SceneModel } from "../scene/scene_model";
-import type { Server } from "../source/server";
+import type { Server, SurfaceForceMessage } from "../source/server";
 import { displacementAt, positionOf, type SurfacePoint, surfacePoint } from "./surface_point";
 
 /** Milliseconds between renewals of a force, and until the server removes a force that is not renewed. */
 const RENEWAL_MS = 100;
 const LIFETIME_MS = 500;
-/** Milliseconds between forces while the scene moves. */
-const UPDATE_MS = 30;
 /**
  * Distance of the cursor from the anchor, where the pull began, at which the force stops growing: in diameters of the
  * domain or, if the viewer has no arrays, in diagonals of the scene.
@@ -43,8 +41,11 @@ export class PullTool {
     private stiffness = 0;
     private longestPull = 0;
     private isPressed = false;
+    /** Number of presses, so that the pick of an earlier one is ignored. */
+    private presses = 0;
     private isSending = false;
-    private lastSent = 0;
+    /** Whether the force has changed while the previous one is on its way. */
+    private hasNewer = false;
     private readonly owner = crypto.getRandomValues(new Uint8Array(32));
     private timer: ReturnType<typeof setInterval> | null = null;
     /** The owner number of this viewer's forces in StreamForces; 0 before it has sent any. */
@@ -75,8 +76,9 @@ export class PullTool {
 
     /** Starts a pull at a pixel of the viewport, which has `size` (width and height) pixels. */
     async begin(x: number, y: number, size: [number, number]): Promise<void> {
+        this.end();
         this.isPressed = true;
-        this.point = null;
+        const press = ++this.presses;
         this.cursor = [x, y];
         try {
             const pixel = [x, y].map((value, axis) => Math.min(Math.max(Math.floor(value), 0), at(size, axis) - 1));
@@ -88,7 +90,7 @@ export class PullTool {
                 at(pixel, 1),
             );
             const hit = picked.hits[0];
-            if (!this.isPressed) return;
+            if (!this.isPressed || press !== this.presses) return;
             if (!hit) {
                 this.onMessage("There is no surface to pull at this point.");
                 return;
@@ -101,7 +103,7 @@ export class PullTool {
 
     move(x: number, y: number): void {
         this.cursor = [x, y];
-        if (this.isPressed) this.update();
+        if (this.point) void this.sendForces();
     }
 
     /** Removes the force. */
@@ -110,15 +112,10 @@ export class PullTool {
         this.isPressed = false;
         if (this.timer !== null) clearInterval(this.timer);
         this.timer = null;
-        if (this.point) void this.send([]);
+        const wasPulling = this.point !== null;
         this.point = null;
+        if (wasPulling) void this.sendForces();
         this.onChange();
-    }
-
-    /** Call after each state: the force follows the point. */
-    update(): void {
-        if (!this.point || performance.now() - this.lastSent < UPDATE_MS) return;
-        void this.sendPull();
     }
 
     private grab(hit: Hit): void {
@@ -126,8 +123,9 @@ export class PullTool {
         this.anchor = positionOf(this.model, this.point);
         this.stiffness = this.stiffnessAt(this.point);
         this.longestPull = this.longestPullOf(hit.domain);
-        this.timer = setInterval(() => this.update(), RENEWAL_MS);
-        this.update();
+        // The renewal follows a camera that has moved, too.
+        this.timer = setInterval(() => void this.sendForces(), RENEWAL_MS);
+        void this.sendForces();
         this.onChange();
     }
 
@@ -177,28 +175,28 @@ export class PullTool {
         return offset.map((component) => factor * component) as Vec3;
     }
 
-    private async sendPull(): Promise<void> {
-        const { point } = this;
-        if (!point || this.isSending) return;
-        const vector = this.force(this.camera.unproject(...this.cursor, this.anchor));
-        const { domain, triangle, barycentric } = point;
-        await this.send([{ id: 1n, domain, triangle, barycentric: [...barycentric], vector }]);
+    /** Sends the present force. One call at a time: while it is on its way, only the newest force waits. */
+    private async sendForces(): Promise<void> {
+        this.hasNewer = true;
+        if (this.isSending) return;
+        this.isSending = true;
+        while (this.hasNewer) {
+            this.hasNewer = false;
+            await this.send(this.point ? [this.message(this.point)] : []);
+        }
+        this.isSending = false;
     }
 
-    private async send(forces: Parameters<Server["applyForces"]>[2]): Promise<void> {
-        this.isSending = true;
-        this.lastSent = performance.now();
+    private message({ domain, triangle, barycentric }: SurfacePoint): SurfaceForceMessage {
+        const vector = this.force(this.camera.unproject(...this.cursor, this.anchor));
+        return { id: 1n, domain, triangle, barycentric: [...barycentric], vector };
+    }
+
+    private async send(forces: SurfaceForceMessage[]): Promise<void> {
+        const { scene } = this.model.scene.info;
         try {
-            const response = await this.server.applyForces(
-                this.model.scene.info.scene,
-                this.owner,
-                forces,
-                LIFETIME_MS,
-            );
+            const response = await this.server.applyForces(scene, this.owner, forces, LIFETIME_MS);
             this.ownerNumber = response.owner;
-            // The user released the button while the force was in flight.
-            if (forces.length > 0 && !this.isPressed)
-                await this.server.applyForces(this.model.scene.info.scene, this.owner, [], LIFETIME_MS);
             const isLost = forces.length > 0 && response.receivers === 0;
             this.onMessage(
                 isLost
@@ -207,8 +205,6 @@ export class PullTool {
             );
         } catch (error) {
             this.onMessage(`The server did not accept the force: ${error instanceof Error ? error.message : error}`);
-        } finally {
-            this.isSending = false;
         }
     }
 }

@@ -19,6 +19,8 @@ export class Viewport {
     private contextLost = false;
     /** Called before each frame that is drawn. */
     onFrame: () => void = () => {};
+    /** Called when a frame is drawn, while its pixels can be read. For tests. */
+    onDrawn: () => void = () => {};
     /** Called when the size of the canvas in pixels has changed. */
     onResize: () => void = () => {};
     onContextRestored: () => void = () => {};
@@ -105,6 +107,7 @@ export class Viewport {
         if (!this.sceneRenderer || this.contextLost) return;
         this.sceneRenderer.render(this.camera.camera);
         this.frameTimes.push(performance.now());
+        this.onDrawn();
     }
 }
 

@@ -23,6 +23,11 @@ export class Playback {
         return this.recording.states.at(-1)?.time ?? 0;
     }
 
+    /** Seconds of the first recorded force; null if there is none. */
+    get firstForce(): number | null {
+        return this.recording.forces.find(({ message }) => message.forces.length > 0)?.time ?? null;
+    }
+
     play(): void {
         if (this.time >= this.duration) this.seek(0);
         this.isPlaying = true;

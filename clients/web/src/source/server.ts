@@ -73,8 +73,9 @@ export class Server {
         return this.channel.unary(SceneService.method.listScenes, {}, { timeoutMs: 10_000 });
     }
 
-    async openScene(source: string): Promise<SceneInfo> {
-        const { scene } = await this.channel.unary(SceneService.method.openScene, { source });
+    /** @param name The name of the scene; empty: that of the source. */
+    async openScene(source: string, name = ""): Promise<SceneInfo> {
+        const { scene } = await this.channel.unary(SceneService.method.openScene, { source, scene: name });
         if (!scene) throw new Error("OpenScene: expected a scene, got none");
         return scene;
     }

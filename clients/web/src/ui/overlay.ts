@@ -1,4 +1,4 @@
-/** Lines and texts over the picture: the pull of this viewer, and the forces of others. */
+/** Arrows and texts over the picture: the pull of this viewer, and the forces of others. */
 
 import { byId } from "./dom";
 
@@ -10,6 +10,9 @@ export interface OverlayLine {
 }
 
 const SVG = "http://www.w3.org/2000/svg";
+
+/** Length and half width of an arrow's head in pixels. */
+const HEAD = [13, 6] as const;
 
 export class Overlay {
     private readonly svg = byId<SVGSVGElement>("overlay");
@@ -27,10 +30,22 @@ export class Overlay {
         };
         const [x1, y1] = from;
         const [x2, y2] = to;
-        const line = create("line", { x1, y1, x2, y2, class: isOwn ? "pull-line" : "other-line" });
-        const point = create("circle", { cx: x1, cy: y1, r: 5, class: isOwn ? "" : "other" });
+        const owner = isOwn ? "own" : "other";
+        const line = create("line", { x1, y1, x2, y2, class: owner });
+        const point = create("circle", { cx: x1, cy: y1, r: 5, class: owner });
+        const head = create("polygon", { points: arrowHead(from, to), class: owner });
         const label = create("text", { x: x2 + 12, y: y2 - 10 });
         label.textContent = text;
-        return [line, point, label];
+        return [line, point, head, label];
     }
+}
+
+/** The corners of an arrow's head; none if the arrow is too short for it. */
+function arrowHead([x1, y1]: [number, number], [x2, y2]: [number, number]): string {
+    const length = Math.hypot(x2 - x1, y2 - y1);
+    if (length < 2 * HEAD[0]) return "";
+    const [dx, dy] = [(x2 - x1) / length, (y2 - y1) / length];
+    const [x, y] = [x2 - HEAD[0] * dx, y2 - HEAD[0] * dy];
+    const side = (sign: number) => `${x - sign * HEAD[1] * dy},${y + sign * HEAD[1] * dx}`;
+    return `${x2},${y2} ${side(1)} ${side(-1)}`;
 }

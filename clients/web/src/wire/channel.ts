@@ -65,6 +65,10 @@ export class Channel {
         return new Promise((resolve) => this.socket.addEventListener("close", () => resolve(), { once: true }));
     }
 
+    get isOpen(): boolean {
+        return this.socket.readyState === WebSocket.OPEN;
+    }
+
     close(): void {
         this.socket.close();
     }
@@ -124,12 +128,12 @@ export class Channel {
         const call = new Call(send, () => this.calls.delete(id), options.window);
         this.calls.set(id, call);
         send(ClientKind.start, encodeStart(`/${method.parent.typeName}/${method.name}`, options.timeoutMs ?? 0));
-        if (this.socket.readyState !== WebSocket.OPEN) call.finish(unavailable());
+        if (!this.isOpen) call.finish(unavailable());
         return call;
     }
 
     private send(call: number, kind: number, payload?: Uint8Array): void {
-        if (this.socket.readyState !== WebSocket.OPEN) return;
+        if (!this.isOpen) return;
         const bytes = encodeEnvelope(call, kind, payload);
         this.bytesSent += bytes.length;
         this.socket.send(bytes as Uint8Array<ArrayBuffer>);

@@ -1,9 +1,10 @@
 /** Starts servers, physics processes and browsers for tests, and ends them. */
 
-import { type ChildProcess, spawn } from "node:child_process";
-import { mkdtempSync, rmSync } from "node:fs";
+import { type ChildProcess, type StdioOptions, spawn } from "node:child_process";
+import { mkdtempSync, readFileSync, rmSync } from "node:fs";
 import { tmpdir } from "node:os";
 import { join, resolve } from "node:path";
+import { gunzipSync } from "node:zlib";
 import { type Browser, type ConsoleMessage, chromium, type Page } from "playwright-core";
 import WebSocket from "ws";
 import type { App } from "../../src/app";
@@ -19,14 +20,29 @@ declare global {
 }
 
 const TIMEOUT_MS = 120_000;
+/** Whether servers show the page of dist instead of the one that they were built with. */
+const usesCommittedPage = Boolean(process.env["MODALCAST_COMMITTED_PAGE"]);
 const TOKEN = "smoke-test-token-0001";
 const programs = resolve(process.env["MODALCAST_PROGRAMS"] ?? join(process.cwd(), "../../target/debug"));
+
+/** The page of this folder. The programs have that of their build. */
+export function committedPage(): string {
+    return gunzipSync(readFileSync(join(process.cwd(), "dist/index.html.gz"))).toString();
+}
+
+/** A folder that the process removes when it ends. */
+export function temporaryFolder(): string {
+    const folder = mkdtempSync(join(tmpdir(), "modalcast-viewer-"));
+    process.once("exit", () => rmSync(folder, { recursive: true, force: true }));
+    return folder;
+}
 
 /** A running server. */
 export class ServerProcess {
     private process: ChildProcess | null = null;
-    private readonly state = mkdtempSync(join(tmpdir(), "modalcast-viewer-"));
+    private readonly state = temporaryFolder();
     private port = 0;
+    private connected: Server | null = null;
 
     /** @param scenes Folder of the scene repository; empty: built-in scenes only. */
     constructor(private readonly scenes = "") {}
@@ -47,13 +63,13 @@ export class ServerProcess {
             "cpu",
             ...scenes,
         ];
-        const server = spawn(join(programs, "modalcast"), options, { stdio: ["ignore", "pipe", "pipe"] });
+        const server = startProgram("modalcast", options, ["ignore", "pipe", "pipe"]);
         this.process = server;
         let log = "";
-        server.stderr.on("data", (text) => (log += text));
+        server.stderr?.on("data", (text) => (log += text));
         const line = await new Promise<string>((done, fail) => {
             let output = "";
-            server.stdout.on("data", (text) => {
+            server.stdout?.on("data", (text) => {
                 output += text;
                 const found = /viewer at (http:\S+)/.exec(output);
                 if (found?.[1]) done(found[1]);
@@ -74,40 +90,68 @@ export class ServerProcess {
         return `http://127.0.0.1:${this.port}`;
     }
 
-    /** A client in this process. */
+    /** A new client in this process. */
     async connect(): Promise<Server> {
         const channel = await Channel.open(`ws://127.0.0.1:${this.port}/websocket?token=${TOKEN}`);
         return new Server(channel, await ContentCache.open());
     }
 
-    /** Ends the server; its state remains. */
-    async stop(): Promise<void> {
-        await end(this.process);
-        this.process = null;
+    /**
+     * The client of the tests in this process. On a busy machine, a comparison of pictures may delay the answer to a
+     * ping for so long that the server closes the connection; the client then connects again.
+     */
+    async client(): Promise<Server> {
+        if (!this.connected?.channel.isOpen) this.connected = await this.connect();
+        return this.connected;
     }
 
-    async dispose(): Promise<void> {
-        await this.stop();
-        rmSync(this.state, { recursive: true, force: true });
+    get pid(): number {
+        return this.process?.pid ?? 0;
     }
+
+    /** Ends the server; its state remains. */
+    async stop(signal: NodeJS.Signals = "SIGTERM"): Promise<void> {
+        this.connected?.channel.close();
+        this.connected = null;
+        await end(this.process, signal);
+        this.process = null;
+    }
+}
+
+/** Starts a program of the project. It ends with this process at the latest. */
+export function startProgram(name: string, options: string[], stdio: StdioOptions = "ignore"): ChildProcess {
+    const program = spawn(join(programs, name), options, { stdio });
+    const kill = () => program.kill("SIGKILL");
+    process.once("exit", kill);
+    program.once("exit", () => process.removeListener("exit", kill));
+    return program;
+}
+
+/** Runs a program of the project to its end. Throws if it fails. */
+export async function runProgram(name: string, options: string[]): Promise<void> {
+    const program = startProgram(name, options, ["ignore", "ignore", "inherit"]);
+    const code = await new Promise((done) => program.once("exit", done));
+    if (code !== 0) throw new Error(`${name} ${options.join(" ")}: expected exit code 0, got ${code}`);
 }
 
 /** A physics process that receives the forces of viewers. */
 export function startSimulation(server: ServerProcess, options: string[]): ChildProcess {
     const all = ["auto", "--server", server.grpcUrl, "--seconds", "0", "--realtime", ...options];
-    return spawn(join(programs, "modalcast-sim"), all, { stdio: "ignore" });
+    return startProgram("modalcast-sim", all);
 }
 
-export async function end(process: ChildProcess | null): Promise<void> {
-    if (!process || process.exitCode !== null || process.signalCode !== null) return;
-    const ended = new Promise((done) => process.once("exit", done));
-    process.kill("SIGTERM");
+export async function end(program: ChildProcess | null, signal: NodeJS.Signals = "SIGTERM"): Promise<void> {
+    if (!program || program.exitCode !== null || program.signalCode !== null) return;
+    const ended = new Promise((done) => program.once("exit", done));
+    program.kill(signal);
     await ended;
 }
 
 export function launchBrowser(): Promise<Browser> {
     // WebGL on the CPU, because test machines have no GPU.
     const args = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"];
+    // Chromium does not count a replaced page as one of the loopback address.
+    if (usesCommittedPage) args.push("--disable-features=LocalNetworkAccessChecks");
     return chromium.launch({ executablePath: process.env["MODALCAST_CHROMIUM"] ?? "/usr/bin/chromium", args });
 }
 
@@ -127,8 +171,15 @@ export async function openPage(browser: Browser, url: string, width = 480, heigh
         if (message.text().includes("willReadFrequently")) return;
         if (message.type() === "error" || message.type() === "warning") errors.push(message.text());
     });
+    if (usesCommittedPage) await serveCommittedPage(page);
     await page.goto(url);
     return { page, errors };
+}
+
+/** Replaces the server's page by that of this folder, so that a new page can be tested without a build of the server. */
+async function serveCommittedPage(page: Page): Promise<void> {
+    const isPage = (url: URL) => url.protocol === "http:" && url.pathname === "/";
+    await page.route(isPage, (route) => route.fulfill({ body: committedPage(), contentType: "text/html" }));
 }
 
 /** Waits until the page shows a scene. */

@@ -10,7 +10,6 @@ import type { CameraMessage } from "../../src/render/camera";
 import { parseArrays } from "../../src/scene/arrays";
 import { Kinematics } from "../../src/scene/kinematics";
 import { SceneModel } from "../../src/scene/scene_model";
-import type { Server } from "../../src/source/server";
 import { end, launchBrowser, openPage, ServerProcess, startSimulation, waitForScene } from "./harness";
 
 const WIDTH = 480;
@@ -22,27 +21,27 @@ const LIMIT_MS = 300_000;
 declare global {
     /** A variable of the page: the point that a test pulls. */
     var watchedPoint: SurfacePoint | null;
+    /** In the page: the scene before the server ended. */
+    var shownModel: SceneModel | null;
 }
 
 let browser: Browser;
 const server = new ServerProcess();
-let client: Server;
 
 before(async () => {
     await server.start();
-    client = await server.connect();
-    await client.openScene("tree");
+    await (await server.client()).openScene("tree");
     browser = await launchBrowser();
 });
 
 after(async () => {
     await browser?.close();
-    client?.channel.close();
-    await server.dispose();
+    await server.stop();
 });
 
 /** Sends one step with coordinates of the trunk, and transforms that keep all joints closed. Returns the step's number. */
 async function bend(q0: number): Promise<bigint> {
+    const client = await server.client();
     const scene = await client.describe("tree");
     const model = new SceneModel(scene, parseArrays(scene, await client.readContents(scene, () => {})));
     const { state, layout, arrays } = model;
@@ -107,7 +106,8 @@ async function drawnDomains(page: Page): Promise<number[]> {
 async function referenceDomains(camera: CameraMessage): Promise<Uint32Array> {
     const request = { scene: "tree", pictures: [{ width: WIDTH, height: HEIGHT, camera, output: Output.DOMAINS }] };
     const bytes = new Uint8Array(4 * WIDTH * HEIGHT);
-    for await (const { part } of client.channel.serverStream(FrameService.method.renderFrame, request)) {
+    const { channel } = await server.client();
+    for await (const { part } of channel.serverStream(FrameService.method.renderFrame, request)) {
         if (part.case === "chunk") bytes.set(part.value.data, Number(part.value.offset));
     }
     return new Uint32Array(bytes.buffer);
@@ -129,6 +129,7 @@ function iou(a: ArrayLike<number>, b: ArrayLike<number>): number {
 async function pickMany(camera: CameraMessage, count: number): Promise<Hit[]> {
     const hits: Hit[] = [];
     const side = 60;
+    const { channel } = await server.client();
     for (let y = 0; y + side <= HEIGHT; y += side) {
         for (let x = 0; x + side <= WIDTH; x += side) {
             const request = {
@@ -140,8 +141,7 @@ async function pickMany(camera: CameraMessage, count: number): Promise<Hit[]> {
                 height: side,
                 withoutModes: true,
             };
-            for await (const reply of client.channel.serverStream(FrameService.method.pick, request))
-                hits.push(...reply.hits);
+            for await (const reply of channel.serverStream(FrameService.method.pick, request)) hits.push(...reply.hits);
         }
     }
     const stride = Math.max(1, Math.floor(hits.length / count));
@@ -258,7 +258,8 @@ async function waitForQuietPicture(page: Page): Promise<ShownPicture> {
 async function difference(pixels: number[], camera: CameraMessage, width: number, height: number): Promise<number> {
     const request = { scene: "tree", pictures: [{ width, height, camera, format: Format.RGBA }] };
     const bytes = new Uint8Array(4 * width * height);
-    for await (const { part } of client.channel.serverStream(FrameService.method.renderFrame, request)) {
+    const { channel } = await server.client();
+    for await (const { part } of channel.serverStream(FrameService.method.renderFrame, request)) {
         if (part.case === "chunk") bytes.set(part.value.data, Number(part.value.offset));
     }
     return meanDifference(pixels, bytes);
@@ -281,7 +282,7 @@ test("a pull bends a branch, which returns afterwards", { timeout: LIMIT_MS }, a
     await page.mouse.up();
     const simulation = startSimulation(server, ["--scene", "tree", "--wind", "0", "--forces"]);
     try {
-        await page.waitForFunction(() => modalcastViewer.stateRate.perSecond() > 5);
+        await page.waitForFunction(() => modalcastViewer.status.stateRate.perSecond() > 5);
         const [x, y] = await leafPixel(page);
         await page.mouse.move(x, y);
         await page.mouse.down();
@@ -351,14 +352,13 @@ test("the viewer connects again after a restart of the server", { timeout: LIMIT
     const box = await page.locator("#panel").boundingBox();
     assert.ok(box && box.x >= 0 && box.x + box.width <= 390 && box.height < 600, JSON.stringify(box));
     await page.evaluate(() => {
-        modalcastViewer.model = null;
+        globalThis.shownModel = modalcastViewer.model;
     });
     await server.stop();
     await page.locator("#connection .dot.bad").waitFor({ state: "attached" });
     await server.start();
-    await waitForScene(page);
+    await page.waitForFunction(() => modalcastViewer.model !== globalThis.shownModel);
     await page.locator("#connection .dot.good").waitFor({ state: "attached" });
-    client = await server.connect();
     const number = await bend(1);
     await waitForStep(page, number);
     // A browser logs each refused connection as an error.

@@ -1,0 +1,79 @@
+/** A scene that is shown, with the parts that live as long as it: drawing, pictures, pulls and steps of this viewer. */
+
+import { Driver } from "./control/driver";
+import { PictureView } from "./control/picture_view";
+import { PullTool } from "./control/pull";
+import { SceneRenderer } from "./render/scene_renderer";
+import type { Viewport } from "./render/viewport";
+import { norm, type Vec3 } from "./scene/affine";
+import { at } from "./scene/numbers";
+import type { SceneModel } from "./scene/scene_model";
+import type { Server } from "./source/server";
+
+/** The sliders may drive the scene when another program has sent no step for this many milliseconds. */
+const FOREIGN_STEP_MS = 1000;
+
+/** Whether the source of a scene, a server or a recording, draws pictures, accepts forces, and accepts steps. */
+export interface SourceFeatures {
+    pictures: boolean;
+    forces: boolean;
+    drive: boolean;
+}
+
+/** Where a scene comes from. */
+export interface SceneSource {
+    /** Null for a recording. */
+    server: Server | null;
+    features: SourceFeatures;
+}
+
+export class SceneSession {
+    /** Null if the server draws the scene. */
+    readonly renderer: SceneRenderer | null;
+    readonly pictures: PictureView | null;
+    readonly pull: PullTool | null;
+    readonly driver: Driver | null;
+    private hasFirstState = false;
+    private lastForeignStep = -Infinity;
+
+    /** @param canvas The element for the server's pictures. */
+    constructor(
+        readonly model: SceneModel,
+        readonly source: SceneSource,
+        viewport: Viewport,
+        canvas: HTMLCanvasElement,
+    ) {
+        const { scene, arrays } = model;
+        const { server, features } = source;
+        this.renderer =
+            arrays && viewport.gl ? new SceneRenderer(viewport.gl, scene, arrays, viewport.isSoftware) : null;
+        this.pictures = server && features.pictures ? new PictureView(server, scene.info.scene, canvas) : null;
+        this.pull = server && features.forces ? new PullTool(server, model, viewport.camera, diagonal(model)) : null;
+        this.driver = server && features.drive ? new Driver(server, model) : null;
+    }
+
+    /** Call after each state. */
+    receiveState(): void {
+        const { model, driver } = this;
+        // The first state is sent at once, so it does not show that a program drives the scene.
+        if (this.hasFirstState && model.state.step?.run !== driver?.run) this.lastForeignStep = performance.now();
+        this.hasFirstState = true;
+    }
+
+    /** Whether another program drives the scene. */
+    get isDriven(): boolean {
+        return performance.now() - this.lastForeignStep < FOREIGN_STEP_MS;
+    }
+
+    /** Ends all streams of this scene. The viewport owns and disposes of the renderer. */
+    close(): void {
+        this.pull?.end();
+        this.driver?.dispose();
+        this.pictures?.stop();
+    }
+}
+
+function diagonal({ scene }: SceneModel): number {
+    const { bounds } = scene.info;
+    return norm([0, 1, 2].map((axis) => at(bounds, 3 + axis) - at(bounds, axis)) as Vec3);
+}

@@ -1,0 +1,52 @@
+/** The pull of this viewer, and the forces of others or of a recording, as lines over the picture. */
+
+import { positionOf, surfacePoint } from "../control/surface_point";
+import type { OrbitCamera } from "../render/camera";
+import { addScaled, norm, subtract, type Vec3 } from "../scene/affine";
+import type { SceneSession } from "../session";
+import * as format from "./format";
+import { Overlay, type OverlayLine } from "./overlay";
+
+/** Length of the line of the largest force so far, as a part of its distance from the camera. */
+const LONGEST_LINE = 0.09;
+
+export class ForceLines {
+    private readonly overlay = new Overlay();
+    private session: SceneSession | null = null;
+    /** Newtons of the largest force so far, so that lengths can be compared. */
+    private largest = 0;
+
+    /** Shows the forces of another scene. */
+    setSession(session: SceneSession | null): void {
+        this.session = session;
+        this.largest = 0;
+        this.overlay.draw([]);
+    }
+
+    draw(camera: OrbitCamera): void {
+        if (!this.session) return;
+        const { model, pull, source } = this.session;
+        const lines: OverlayLine[] = [];
+        const add = (from: Vec3, to: Vec3, text: string, isOwn: boolean) => {
+            const [start, end] = [camera.project(from), camera.project(to)];
+            if (start && end) lines.push({ from: start, to: end, text, isOwn });
+        };
+        const view = pull?.view;
+        if (view) add(view.from, view.to, format.newtons(view.newtons), true);
+        for (const { owner, force } of model.forces) {
+            if (force?.kind.case !== "surface" || owner === pull?.ownerNumber) continue;
+            const { triangle, barycentric, vector } = force.kind.value;
+            const point = surfacePoint(model, force.domain, triangle, barycentric);
+            const newtons = norm(vector as Vec3);
+            if (!point || !(newtons > 0)) continue;
+            this.largest = Math.max(this.largest, newtons);
+            const from = positionOf(model, point);
+            const length = LONGEST_LINE * norm(subtract(camera.eye, from)) * (newtons / this.largest);
+            const isOnly = !source.server && model.forces.length === 1;
+            const text = isOnly ? format.newtons(newtons) : `viewer ${owner}: ${format.newtons(newtons)}`;
+            // Nobody pulls in a recording, so its forces have the look of a pull.
+            add(from, addScaled(from, vector as Vec3, length / newtons), text, !source.server);
+        }
+        this.overlay.draw(lines);
+    }
+}

@@ -1,0 +1,119 @@
+/** The panels that only show: legend, forces, performance, and facts about the scene. */
+
+import type { SceneInfo } from "../proto/modalcast/v1/scenes_pb";
+import { meshBytes } from "../render/surfaces";
+import type { Viewport } from "../render/viewport";
+import { norm, type Vec3 } from "../scene/affine";
+import { at } from "../scene/numbers";
+import type { SceneSession } from "../session";
+import { h, setText } from "./dom";
+import { FactsTable } from "./facts_table";
+import * as format from "./format";
+import { Legend } from "./legend";
+import type { Panel } from "./panel";
+import { RateMeter } from "./rate_meter";
+import type { Settings } from "./settings";
+
+export class StatusPanels {
+    readonly stateRate = new RateMeter();
+    readonly byteRate = new RateMeter();
+    readonly pictureRate = new RateMeter();
+    /** Round trip of the last call in milliseconds. */
+    latency = 0;
+    private readonly legend = new Legend();
+    private readonly scene = new FactsTable();
+    private readonly performance = new FactsTable();
+    private readonly forces = h("p", { className: "hint", textContent: "Nobody pulls." });
+
+    constructor(
+        private readonly panel: Panel,
+        private readonly settings: Settings,
+        private readonly viewport: Viewport,
+    ) {
+        const body = (element: HTMLElement) => h("div", { className: "body" }, element);
+        panel.add("Forces", body(this.forces), false);
+        panel.add("Performance", body(this.performance.element), true);
+        panel.add("Scene", body(this.scene.element), false);
+    }
+
+    showScene(info: SceneInfo): void {
+        const { bounds, unit } = info;
+        const size = [0, 1, 2]
+            .map((axis) => format.short((at(bounds, 3 + axis) - at(bounds, axis)) * unit))
+            .join(" x ");
+        this.scene.set({
+            Source: info.source,
+            Domains: format.count(info.domains),
+            Vertices: format.count(info.vertices),
+            Triangles: format.count(info.triangles),
+            Coordinates: format.count(info.coordinates),
+            Size: `${size} m`,
+            Unit: unit === 1 ? null : `${format.short(unit)} m`,
+            "Up axis": info.up,
+            Remarks: info.remarks.length > 0 ? info.remarks.join("; ") : null,
+        });
+    }
+
+    update(session: SceneSession): void {
+        this.updateLegend(session);
+        this.updateForces(session);
+        this.updatePerformance(session);
+    }
+
+    private updatePerformance({ model, renderer, pictures, source }: SceneSession): void {
+        const { settings, viewport } = this;
+        const rate = settings.pictures ? this.pictureRate.perSecond() : viewport.framesPerSecond;
+        const stages = settings.pictures ? (pictures?.stages ?? []) : model.stages;
+        const step = model.state.step;
+        const storage = renderer?.deformer.format === "i16" ? "16-bit integers" : "f16";
+        this.performance.set({
+            "Frames drawn": `${rate.toFixed(0)} /s`,
+            "Steps received": `${this.stateRate.perSecond().toFixed(0)} /s`,
+            "Steps skipped": format.count(settings.pictures ? (pictures?.skipped ?? 0n) : model.counts.skipped),
+            Received: `${format.bytes(this.byteRate.perSecond())}/s`,
+            "Bytes of the last step": format.bytes(
+                settings.pictures ? (pictures?.lastFrameBytes ?? 0) : model.lastStateBytes,
+            ),
+            "Round trip": source.server ? `${this.latency.toFixed(1)} ms` : null,
+            "Error of this view": this.errorText({ model, renderer }),
+            "Storage of U": renderer && model.layout.coordinates > 0 ? storage : null,
+            "Graphics memory": renderer ? format.bytes(renderer.deformer.bytes + meshBytes(model.scene)) : null,
+            Step: step ? `${step.number} at ${format.seconds(step.time)}` : "rest state",
+            Stages:
+                stages.length > 0
+                    ? `${stages.map(({ stage, milliseconds }) => `${stage} ${milliseconds.toFixed(2)}`).join(", ")} ms`
+                    : null,
+            "Drawn with": settings.pictures ? "pictures of the server" : viewport.rendererName,
+        });
+    }
+
+    private errorText({ model, renderer }: Pick<SceneSession, "model" | "renderer">): string | null {
+        const { settings } = this;
+        if (settings.pictures) return settings.jpeg ? "JPEG" : "none (PNG)";
+        if (!renderer || model.layout.coordinates === 0) return null;
+        return `at most ${format.meters(renderer.errorBound())}`;
+    }
+
+    private updateLegend({ renderer }: SceneSession): void {
+        const { color, pictures } = this.settings;
+        if (pictures || color.kind === "shaded" || !renderer) return this.legend.hide();
+        const title = color.kind === "mode" ? `Mode ${color.mode + 1}, per unit of q` : "Displacement";
+        const scale = renderer.colorScale;
+        this.legend.show(title, color.kind === "mode" ? `${format.short(scale)} m` : format.meters(scale));
+    }
+
+    private updateForces({ model, pull, source }: SceneSession): void {
+        this.panel.setCount("Forces", model.forces.length > 0 ? String(model.forces.length) : "");
+        if (model.forces.length === 0) {
+            setText(this.forces, source.features.forces ? "Nobody pulls. Drag with Shift to pull." : "Nobody pulls.");
+            return;
+        }
+        const text = model.forces.map(({ owner, force }) => {
+            const size =
+                force?.kind.case === "surface" ? format.newtons(norm(force.kind.value.vector as Vec3)) : "modal";
+            const who = owner === pull?.ownerNumber ? "you" : `viewer ${owner}`;
+            return `${who}: ${size} on ${model.scene.domains[force?.domain ?? 0]?.name ?? "?"}`;
+        });
+        setText(this.forces, text.join("\n"));
+    }
+}
