@@ -45,6 +45,12 @@ LONG_TESTS = (
         ("deploy/wheels", "--programs", "{programs}", "--out", "{out}"),
         10,
     ),
+    LongTest(
+        "viewer",
+        "browser viewer: ten minutes of use without growth of memory, 100 reconnects, a server that is killed",
+        ("deploy/web", "--programs", "{programs}", "--long"),
+        45,
+    ),
 )
 
 NAMES = [test.name for test in LONG_TESTS]

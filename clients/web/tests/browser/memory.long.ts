@@ -1,0 +1,155 @@
+/** Ten minutes in the browser, in which neither the page nor the server may grow, and connections that break. */
+
+import assert from "node:assert/strict";
+import { after, before, test } from "node:test";
+import type { Browser, Page } from "playwright-core";
+import type { Server } from "../../src/source/server";
+import { growing, growth, ResourceMeter, type Resources } from "./growth";
+import { end, launchBrowser, openPage, ServerProcess, startSimulation, waitForScene } from "./harness";
+
+const WIDTH = 480;
+const HEIGHT = 300;
+/** Seconds of the test, of each of its controls, and between samples. MODALCAST_SECONDS shortens the test. */
+const SECONDS = Number(process.env["MODALCAST_SECONDS"] ?? 600);
+const CONTROL_SECONDS = 60;
+const RECONNECTS = 100;
+
+declare global {
+    /** In the page: what a control has leaked. */
+    var leaked: unknown[];
+}
+
+let browser: Browser;
+const server = new ServerProcess();
+
+before(async () => {
+    await server.start();
+    await (await server.client()).openScene("tree");
+    browser = await launchBrowser();
+});
+
+after(async () => {
+    await browser?.close();
+    await server.stop();
+});
+
+/** What a user does: pulls, moves the camera, and switches all ways to draw. Ends in the state in which it began. */
+async function useViewer(page: Page): Promise<void> {
+    await page.keyboard.down("Shift");
+    await page.mouse.move(WIDTH / 2, HEIGHT / 2);
+    await page.mouse.down();
+    await page.mouse.move(WIDTH / 2 + 60, HEIGHT / 2, { steps: 10 });
+    await page.mouse.up();
+    await page.keyboard.up("Shift");
+    await page.mouse.down();
+    await page.mouse.move(WIDTH / 2, HEIGHT / 2, { steps: 10 });
+    await page.mouse.up();
+    for (const key of ["v", "v", "m", "m", "e", "e", "s", "s", "b", "b"]) {
+        await page.keyboard.press(key);
+        await page.waitForTimeout(150);
+    }
+    await page.keyboard.press("f");
+}
+
+/** Samples while the viewer is used. `afterEach` is called between the samples. */
+async function sample(page: Page, seconds: number, afterEach: () => Promise<unknown>): Promise<Resources[]> {
+    const meter = await ResourceMeter.create(page);
+    // Caches are full, and all shaders are compiled, after a few rounds.
+    for (let round = 0; round < 3; round++) await useViewer(page);
+    const samples = [await meter.read(server.pid)];
+    for (const start = performance.now(); performance.now() - start < 1000 * seconds; ) {
+        await useViewer(page);
+        await afterEach();
+        samples.push(await meter.read(server.pid));
+    }
+    return samples;
+}
+
+function describe(samples: readonly Resources[]): string {
+    const total = growth(samples);
+    const first = samples[0];
+    const texts = Object.entries(total).map(
+        ([name, value]) => `${name} ${first?.[name as keyof Resources]} + ${value.toFixed(0)}`,
+    );
+    return `${samples.length} samples: ${texts.join(", ")}`;
+}
+
+test("neither the page nor the server grows", { timeout: 1000 * (SECONDS + 600) }, async () => {
+    const simulation = startSimulation(server, ["--scene", "tree", "--forces", "--delivery", "latest"]);
+    const { page, errors } = await openPage(browser, server.pageUrl("tree"), WIDTH, HEIGHT);
+    await waitForScene(page);
+    const samples = await sample(page, SECONDS, async () => {});
+    console.log(`${SECONDS} s, ${describe(samples)}`);
+    assert.deepEqual(growing(samples), []);
+    assert.deepEqual(errors, []);
+
+    // Control: a page that keeps a state, a texture, a node and a listener of each round, and a server with more scenes.
+    let scenes = 0;
+    const leaking = await sample(page, CONTROL_SECONDS, async () => {
+        await (await server.client()).openScene("tree", `copy-${scenes++}`);
+        await page.evaluate(() => {
+            globalThis.leaked ??= [];
+            const { gl } = modalcastViewer.viewport;
+            const texture = modalcastViewer.renderer?.deformer.transforms.clone();
+            if (texture) gl?.initTexture(texture);
+            window.addEventListener("resize", () => texture);
+            document.body.append(document.createElement("i"));
+            globalThis.leaked.push(texture, new Uint8Array(1e6), Array.from({ length: 1e5 }, Math.random));
+        });
+    });
+    console.log(`control, ${describe(leaking)}`);
+    const found = growing(leaking);
+    for (const name of ["heap", "buffers", "textures", "serverMemory"] as const)
+        assert.ok(found.includes(name), `expected the control to find ${name}, got ${found.join(", ")}`);
+    await end(simulation);
+    await page.close();
+});
+
+test("100 reconnects leak nothing", { timeout: 900_000 }, async () => {
+    const { page } = await openPage(browser, server.pageUrl("tree"), WIDTH, HEIGHT);
+    await waitForScene(page);
+    const meter = await ResourceMeter.create(page);
+    const samples: Resources[] = [];
+    for (let count = 0; count <= RECONNECTS; count++) {
+        await reconnect(page);
+        // The first connections fill caches.
+        if (count % 10 === 0 && count > 0) samples.push(await meter.read(server.pid));
+    }
+    console.log(`${RECONNECTS} reconnects, ${describe(samples)}`);
+    assert.deepEqual(growing(samples), []);
+    // Control: connections that stay open.
+    const others: Server[] = [];
+    const leaking: Resources[] = [];
+    for (let count = 0; count < 3; count++) {
+        others.push(await server.connect());
+        leaking.push(await meter.read(server.pid));
+    }
+    assert.ok(growing(leaking).includes("serverDescriptors"), describe(leaking));
+    for (const other of others) other.channel.close();
+    await page.close();
+});
+
+/** Breaks the connection of a page, and waits until the page shows the scene again. */
+async function reconnect(page: Page): Promise<void> {
+    await page.evaluate(() => {
+        globalThis.leaked = [modalcastViewer.model];
+        modalcastViewer.disconnect();
+    });
+    await page.waitForFunction(() => modalcastViewer.model !== globalThis.leaked[0]);
+}
+
+test("the viewer goes on after a server that was killed", { timeout: 300_000 }, async () => {
+    const { page } = await openPage(browser, server.pageUrl("tree"), WIDTH, HEIGHT);
+    await waitForScene(page);
+    await page.evaluate(() => {
+        globalThis.leaked = [modalcastViewer.model];
+    });
+    await server.stop("SIGKILL");
+    await page.locator("#connection .dot.bad").waitFor({ state: "attached" });
+    await server.start();
+    await page.waitForFunction(() => modalcastViewer.model !== globalThis.leaked[0]);
+    const simulation = startSimulation(server, ["--scene", "tree"]);
+    await page.waitForFunction(() => modalcastViewer.status.stateRate.perSecond() > 1);
+    await end(simulation);
+    await page.close();
+});
