@@ -28,7 +28,7 @@ pub enum Error {
     #[error("the scene name '{name}' belongs to '{owner}'")]
     NameTaken { name: String, owner: String },
     /// Another writer holds the lease of the scene.
-    #[error("the writer lease is held by run {run} since {seconds} s")]
+    #[error("run {run} has held the writer lease for {seconds} s")]
     LeaseTaken { run: u64, seconds: u64 },
     /// The writer with this run has taken over the lease.
     #[error("the writer of run {run} has taken over the lease")]

@@ -90,8 +90,8 @@ pub struct CreasedCorners {
 
 /// Computes the normals of a mesh and splits its corners along creases. Triangles index corners, whose vertices are
 /// `corner_vertices`. A corner with a normal in `own_normals` (one entry per corner, or empty for none) keeps that
-/// normal and is not split. Fans of a corner whose normals are equal have one corner. The normal of a corner without
-/// triangles, or whose area vectors cancel, is +Z.
+/// normal and is not split. Fans of a corner with equal normals share one copy of the corner. The normal of a corner
+/// without triangles, or whose area vectors cancel, is +Z.
 ///
 /// Needs O(c log c) time for c corners.
 pub fn split_at_creases(

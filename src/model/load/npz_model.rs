@@ -11,7 +11,7 @@ use crate::error::{Result, invalid};
 use crate::scene::{SceneParts, UpAxis};
 
 /// The arrays that are read. Other arrays are named in a remark.
-const NAMES: [&str; 8] = ["vertices", "faces", "U", "modes", "eigenvalues", "normals", "uvs", "colors"];
+const ARRAY_NAMES: [&str; 8] = ["vertices", "faces", "U", "modes", "eigenvalues", "normals", "uvs", "colors"];
 
 /// Reads the archive `name` in the folder `files` as one domain. Z is up.
 ///
@@ -55,7 +55,7 @@ fn parse(bytes: &[u8], remarks: &mut Vec<String>) -> Result<(PolygonMesh, Option
     let has_modes = archive.names().iter().any(|name| name == "U" || name == "modes");
     let modes = if has_modes { Some(read_npz_modes(&mut archive)?) } else { None };
     let unused: Vec<&str> =
-        archive.names().iter().map(String::as_str).filter(|name| !NAMES.contains(name)).take(16).collect();
+        archive.names().iter().map(String::as_str).filter(|name| !ARRAY_NAMES.contains(name)).take(16).collect();
     if !unused.is_empty() {
         remarks.push(format!("arrays that are not used: {}", unused.join(", ")));
     }
@@ -99,12 +99,12 @@ fn read_vectors<const N: usize>(
     }
 }
 
-/// Reads the colors. Bytes are divided by 255. The fourth channel is not used.
+/// Reads the colors. Divides them by 255 if any is above 1. The fourth channel is not used.
 fn read_colors(archive: &mut NpzArchive<'_>, count: usize) -> Result<Vec<[f32; 3]>> {
     let Some((width, entries)) = read_rows(archive, "colors", &[3, 4], Some(count))? else { return Ok(Vec::new()) };
     let largest = entries.iter().copied().fold(0.0, f64::max);
-    if !entries.iter().all(|entry| (0.0..=255.0).contains(entry)) {
-        return Err(invalid("array 'colors'", "0 to 1, or 0 to 255", "another number"));
+    if let Some(entry) = entries.iter().find(|entry| !(0.0..=255.0).contains(*entry)) {
+        return Err(invalid("array 'colors'", "0 to 1, or 0 to 255", entry));
     }
     let scale = if largest > 1.0 { 255.0 } else { 1.0 };
     Ok(entries.chunks_exact(width).map(|row| [0, 1, 2].map(|channel| (row[channel] / scale) as f32)).collect())

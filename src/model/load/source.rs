@@ -45,8 +45,8 @@ impl ModelFile {
         !matches!(self, Self::Npz(_))
     }
 
-    /// Models of a folder with a higher rank are used only if there is none with a lower rank, because exporters write
-    /// meshes of these formats beside a model with materials.
+    /// Only the models of the smallest rank in a folder are used, because exporters write meshes of the other formats
+    /// beside a model with materials.
     const fn format_rank(&self) -> usize {
         match self {
             Self::Gltf(_) | Self::Obj(_) | Self::Plant(_) => 0,

@@ -37,7 +37,7 @@ const MAX_LISTED_NAMES: usize = 8;
 /// The result of a search for modes.
 #[derive(Debug, Default, PartialEq)]
 pub(in crate::load) struct Sidecar {
-    /// The name of the file; `None` if no file has a name of the rule.
+    /// The name of the file; `None` if no name follows the rule.
     pub(in crate::load) file: Option<String>,
     /// Names the files of the folder that look like modes but are not used.
     pub(in crate::load) remark: Option<String>,

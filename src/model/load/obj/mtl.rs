@@ -63,7 +63,8 @@ impl MtlMaterial {
         Ok(())
     }
 
-    /// VTK writes the opacity as `Tr`, so that its opaque surfaces would be invisible.
+    /// Sets the opacity to 1 - `Tr`, but ignores `Tr 1`: VTK writes the opacity as `Tr`, so its opaque surfaces would
+    /// be invisible.
     fn set_transparency(&mut self, transparency: f32, material_name: &str) {
         if transparency == 1.0 {
             self.remarks.push(format!("material '{material_name}': Tr 1 hides the surface, and is read as opaque"));

@@ -38,7 +38,7 @@ impl PlyHeader {
         }
         let mut reader = Reader::new(bytes);
         let header = Parser::<DefaultElement>::new().read_header(&mut reader).map_err(|error| {
-            let reason: String = error.to_string().chars().take(160).collect();
+            let reason: String = error.to_string().chars().take(super::MAX_REASON_CHARACTERS).collect();
             invalid("header", "a PLY header", reason.replace(['\n', '\t'], " "))
         })?;
         let body = reader.into_inner();
@@ -96,7 +96,7 @@ impl PlyHeader {
         let mut least_bytes: usize = 0;
         for element in self.elements.values() {
             let element_bytes = match self.encoding {
-                // A line has a digit and, except for the last one, a line break.
+                // A line has at least a digit. The line break of the last line may be missing.
                 Encoding::Ascii => 1,
                 _ => element.properties.values().map(|property| least_size(&property.data_type)).sum(),
             };
@@ -105,9 +105,8 @@ impl PlyHeader {
             }
             least_bytes = least_bytes.saturating_add(element_bytes.saturating_mul(element.count));
             if least_bytes > body_bytes {
-                let given = format!("{} in {body_bytes} bytes", element.count);
-                let expected = format!("elements of at least {element_bytes} bytes that the file contains");
-                return Err(invalid(format!("element {}", element.name), expected, given));
+                let expected = format!("elements of at least {element_bytes} bytes that fit in {body_bytes} bytes");
+                return Err(invalid(format!("element {}", element.name), expected, element.count));
             }
         }
         Ok(())

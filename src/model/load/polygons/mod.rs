@@ -91,8 +91,8 @@ impl PolygonMesh {
         self.corners.iter().any(|corner| corner.uv != NO_INDEX)
     }
 
-    /// Checks that the mesh has a face and that all indices are in range. For errors, `place` words the location of a
-    /// face from its line or index, and `first_index` is the index of the first vertex in the file format, 0 or 1.
+    /// Checks that the mesh has a face and that all indices are in range. `place` converts the line or index of a face
+    /// to its location in an error. `first_index` is the index of the first vertex in the file format, 0 or 1.
     ///
     /// # Errors
     /// `Invalid` with the place of the face, and the range of valid indices.

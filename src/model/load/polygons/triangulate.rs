@@ -3,7 +3,7 @@
 use nalgebra::{Vector2, Vector3};
 
 /// The largest polygon that is triangulated by ear clipping, which takes quadratic time. A larger polygon is split into
-/// a fan. So the time of a file is at most proportional to its number of corners.
+/// a fan. So the time for a file is at most proportional to its number of corners.
 const MAX_EAR_CLIPPING_CORNERS: usize = 256;
 
 /// How often the ears of all corners are determined again. A simple polygon never needs it.
