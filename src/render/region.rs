@@ -63,8 +63,8 @@ const PROJECTION_MARGIN: f64 = 1.0;
 const DIRTY_MARGIN: u32 = 2;
 
 /// The first row of a band is a multiple of this number of rows. llvmpipe rasterizes squares of 64 x 64 pixels, so a
-/// draw that exceeds the scissor (see [`DIRTY_MARGIN`]) does not reach into another band. It is also a multiple of the
-/// workgroup sizes of all passes that work on bands.
+/// draw that exceeds the scissor (see [`DIRTY_MARGIN`]) does not reach into another band. This number is also a
+/// multiple of the workgroup sizes of all passes that work on bands.
 const BAND_ALIGNMENT: u32 = 64;
 
 impl Band {

@@ -95,7 +95,7 @@ pub struct FrameInfo {
 /// The parts of a look that a preset can choose, as the renderer chose them for a frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FrameLook {
-    /// The preset that the scene names. `None`: the rule chose, or the settings were final.
+    /// The preset that the scene names. `None`: the kind of renderer decided, or the settings were final.
     pub preset: Option<LookPreset>,
     pub antialias: Antialiasing,
     /// Samples per pixel that were drawn: those of the look, or 1 if the device does not support them for the frame.

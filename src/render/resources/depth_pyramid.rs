@@ -1,5 +1,5 @@
-//! Hi-Z pyramid: each texel is the farthest depth of 2 x 2 texels of the next finer level, the smallest because depth
-//! is reversed. Level 0 has one texel per pixel.
+//! Hi-Z pyramid: each texel is the farthest depth of 2 x 2 texels of the next finer level, that is, the smallest,
+//! because depth is reversed. Level 0 has one texel per pixel.
 
 use std::rc::Rc;
 

@@ -273,7 +273,7 @@ impl SceneBuffers {
         self.sample_programs.samples == samples && self.post.antialias == method && has_shade
     }
 
-    /// Program that encodes frames with this antialiasing, compiled unless most frames use it.
+    /// Program that encodes frames with this antialiasing; compiled here if most frames use another one.
     pub(crate) fn encode_program(
         &self,
         antialias: Antialiasing,
@@ -303,8 +303,8 @@ impl SceneBuffers {
         Ok(SampleCountPrograms { has_edges, ..programs })
     }
 
-    /// Allocates the marks of inner edges, which frames with lines along mesh edges read, unless they exist or the
-    /// scene has no inner edges.
+    /// Allocates the marks of inner edges, which frames with lines along mesh edges read. Does nothing if they exist
+    /// already, or if the scene has no inner edges.
     pub(crate) fn ensure_inner_edges(&self, gl: &Rc<Gl>) -> Result<()> {
         if !self.options.inner_edges || self.inner_edges.get().is_some() {
             return Ok(());

@@ -11,13 +11,13 @@ use modalcast_model::error::{Result, fault};
 use modalcast_model::shared_memory::{ExportedVertices, ImportedVertices, VertexImporter};
 
 const STAGE: &str = "shared vertices";
-/// Time limit for the frames before a copy.
+/// Time limit of a wait for a copy, which the device executes after the frames before it.
 const COPY_TIMEOUT: Duration = Duration::from_secs(60);
 /// Maximum number of workgroups in x, which every context supports.
 const MAX_WORKGROUPS_X: u32 = 65_535;
-/// Storage buffer that [`SceneVertices`] copies from.
+/// Binding of the storage buffer that is copied.
 const SOURCE_BINDING: u32 = 0;
-/// Storage buffer that [`SceneVertices`] copies to.
+/// Binding of the storage buffer that receives the copy.
 const DESTINATION_BINDING: u32 = 1;
 
 /// The vertex buffers of a scene, as destinations of copies from shared memory.
@@ -123,7 +123,7 @@ mod tests {
     use crate::shaders;
     use crate::{DevicePreference, device};
 
-    /// As many words as need more than one row of workgroups, and a few.
+    /// The first attribute needs more than one row of workgroups, the second one has three words.
     #[test]
     fn words_of_each_attribute_are_copied_from_their_offsets() {
         let (gl, _) = device::open(DevicePreference::Any).expect("EGL");
@@ -135,7 +135,6 @@ mod tests {
         let offset = lengths[0].next_multiple_of(256);
         let memory = buffer(offset + lengths[1]);
         memory.write(&bytemuck::cast_slice(&source)[..(offset + lengths[1]) as usize]);
-        // One word more than is copied.
         let destinations: Vec<Buffer> = lengths.iter().map(|bytes| buffer(*bytes)).collect();
         let vertices = SharedVertices {
             gl: Rc::clone(&gl),

@@ -12,7 +12,8 @@ use crate::scene_data::textures::{TextureArray, TextureRole, arrays, cutoff, mip
 use modalcast_model::error::{Result, fault};
 use modalcast_model::scene::Scene;
 
-/// Layers whose mipmap levels are computed or wait for their upload. Few, because mipmap levels take much host memory.
+/// Largest number of layers whose mipmap levels are being computed or wait for their upload. Small, because mipmap
+/// levels take much host memory.
 const MAX_LAYERS_IN_FLIGHT: usize = 8;
 
 /// RGBA8 pixels of the levels of a layer, level 0 first; none if the computation panicked.
