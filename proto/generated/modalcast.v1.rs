@@ -2129,8 +2129,8 @@ pub enum TransformFormat {
     QuaternionXyzwF32 = 2,
     /// 40 bytes: a quaternion x y z w as 4 f32, then the translation as 3 f64 in scene units from the WORLD's origin: the
     /// client does not subtract the scene's origin. The server computes translation - SceneInfo.origin / SceneInfo.unit in
-    /// f64 and rounds to f32 once, relative to an origin near the domain. Positions are then within 10^-6 of the size of
-    /// a domain at any distance, if most domains are within 4 sizes of each other, and within 1.5 * 10^-5 otherwise. The
+    /// f64 and rounds to f32 once, relative to an origin near the domain. Positions then have an error of at most 10^-6
+    /// of the size of a domain at any distance if most domains are within 4 sizes of each other, else 1.5 * 10^-5. The
     /// translation and its difference from the scene's origin must both be at most 2^40 scene units in magnitude on each
     /// axis.
     QuaternionXyzwF64 = 3,
@@ -3094,7 +3094,9 @@ pub enum Antialiasing {
     Unspecified = 0,
     /// One sample per pixel, not smoothed.
     None = 1,
+    /// Fast approximate antialiasing: one sample per pixel; edges in the image are smoothed.
     Fxaa = 2,
+    /// Multisampling with FrameLook.samples samples per pixel.
     Samples = 3,
 }
 impl Antialiasing {
@@ -3126,8 +3128,11 @@ impl Antialiasing {
 pub enum ShadowMethod {
     /// No shadow map.
     Unspecified = 0,
+    /// Variance shadow map: soft edges from blurred moments of depth.
     Variance = 1,
+    /// One depth per texel: hard edges.
     Standard = 2,
+    /// Percentage-closer filtering: soft edges from the fraction of the surrounding depths that are in front.
     Filtered = 3,
 }
 impl ShadowMethod {
@@ -4500,8 +4505,8 @@ pub struct StateHead {
     /// Steps skipped since the previous state of this stream.
     #[prost(uint64, tag = "2")]
     pub skipped: u64,
-    /// Whether the state has every domain. If not, the values of the domains that it does not have are those of the
-    /// previous state of this stream.
+    /// Whether the state has every domain. If not, a domain that is left out keeps its values of the previous state of
+    /// this stream.
     #[prost(bool, tag = "3")]
     pub complete: bool,
     /// What the bytes of the state contain, in the order of their offsets and without gaps. Empty sections are left out.
