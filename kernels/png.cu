@@ -18,8 +18,8 @@
 
 constexpr unsigned BLOCK = 256, WARPS = BLOCK / 32;
 constexpr unsigned WORDS_PER_THREAD = TILE_WORDS / BLOCK;
-// Resident blocks of png_pack per multiprocessor for which the compiler limits the registers: chosen so that none
-// spill.
+// The compiler limits the registers of png_pack so that this many blocks fit on a multiprocessor. Chosen so that no
+// registers spill.
 #if __CUDA_ARCH__ >= 800 && __CUDA_ARCH__ < 1000
 constexpr unsigned PACK_BLOCKS = 6;
 #else
@@ -27,7 +27,7 @@ constexpr unsigned PACK_BLOCKS = 4;
 #endif
 constexpr unsigned FILTER_SUB = 1;
 constexpr unsigned HEAD_BYTES = 46;                  // signature and the chunks IHDR and sRGB
-constexpr unsigned CHUNK_PREFIX = 8, CHUNK_BYTES = 12; // length and type; the same with the checksum
+constexpr unsigned CHUNK_PREFIX = 8, CHUNK_BYTES = 12; // length and type; length, type and checksum
 constexpr unsigned ZLIB_HEADER_BYTES = 2;
 constexpr unsigned LENGTH_SYMBOLS = 20; // the 19 symbols that encode code lengths, padded to a multiple of 4
 
@@ -557,6 +557,8 @@ extern "C" __global__ void __launch_bounds__(BLOCK, PACK_BLOCKS) png_pack(const 
         const unsigned end_of_block = end;
         end += end_code >> 16;
         const bool has_empty_block = range.strip + 1 < args.strip_count;
+        // An empty stored block ends the strip at a whole byte: 3 bits of header, padding, the length 0 as u16, and its
+        // complement.
         if (has_empty_block) {
             end = (end + 3 + 7) / 8 * 8 + 32;
         }
