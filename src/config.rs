@@ -147,6 +147,16 @@ pub struct Config {
     /// Limit on the pixels of one connection in single frames that are not sent completely, and in its frame streams,
     /// which count separately. A further single frame waits, and a further stream is rejected.
     pub connection_pixels: u32,
+    /// Limits in bytes on the host memory of all scenes together, and of one scene. `None`: half of the memory of the
+    /// machine or its control group, and half of that.
+    pub scenes_host_bytes: Option<u64>,
+    pub scene_host_bytes: Option<u64>,
+    /// As for the host, on the memory of the GPU. Without one, the device memory of a scene counts as host memory.
+    pub scenes_device_bytes: Option<u64>,
+    pub scene_device_bytes: Option<u64>,
+    /// Limit in bytes on the render targets of all frames that are drawn. `None`: a quarter of the memory of the GPU or,
+    /// without one, of the host.
+    pub render_target_bytes: Option<u64>,
     /// Limit on open scenes.
     pub open_scenes: usize,
     /// Default window of a step stream: the maximum number of steps without acknowledgment.
@@ -211,6 +221,11 @@ impl Default for Config {
             chunk_bytes: 1 << 20,
             frame_side: 8192,
             connection_pixels: 8192 * 8192,
+            scenes_host_bytes: None,
+            scene_host_bytes: None,
+            scenes_device_bytes: None,
+            scene_device_bytes: None,
+            render_target_bytes: None,
             open_scenes: 16,
             window: 8,
             max_window: 256,
@@ -267,6 +282,16 @@ impl Config {
         check_range("frame_side", self.frame_side.into(), 1, 16384)?;
         let frame_pixels = u64::from(self.frame_side).pow(2);
         check_range("connection_pixels", self.connection_pixels.into(), frame_pixels, max_budget)?;
+        let memory_limits = [
+            ("scenes_host_bytes", self.scenes_host_bytes),
+            ("scene_host_bytes", self.scene_host_bytes),
+            ("scenes_device_bytes", self.scenes_device_bytes),
+            ("scene_device_bytes", self.scene_device_bytes),
+            ("render_target_bytes", self.render_target_bytes),
+        ];
+        for (field, bytes) in memory_limits {
+            bytes.map_or(Ok(()), |bytes| check_range(field, bytes, 1, 1 << 50))?;
+        }
         check_range("open_scenes", self.open_scenes as u64, 1, 4096)?;
         check_range("max_window", self.max_window.into(), 1, 65536)?;
         check_range("window", self.window.into(), 1, self.max_window.into())?;

@@ -185,6 +185,9 @@ pub enum Reason {
     StreamNotFound = 19,
     /// NOT_FOUND: no content has the requested SHA-256.
     ContentNotFound = 20,
+    /// RESOURCE_EXHAUSTED: a scene or a frame needs more memory than the server allows. It is rejected before the memory is
+    /// allocated. Metadata "object", "memory" (the limit), and in bytes "asked", "available" and "total".
+    OutOfMemory = 21,
 }
 impl Reason {
     /// String value of the enum field names used in the ProtoBuf definition.
@@ -214,6 +217,7 @@ impl Reason {
             Self::LeaseLost => "REASON_LEASE_LOST",
             Self::StreamNotFound => "REASON_STREAM_NOT_FOUND",
             Self::ContentNotFound => "REASON_CONTENT_NOT_FOUND",
+            Self::OutOfMemory => "REASON_OUT_OF_MEMORY",
         }
     }
     /// Creates an enum from field names used in the ProtoBuf definition.
@@ -240,6 +244,7 @@ impl Reason {
             "REASON_LEASE_LOST" => Some(Self::LeaseLost),
             "REASON_STREAM_NOT_FOUND" => Some(Self::StreamNotFound),
             "REASON_CONTENT_NOT_FOUND" => Some(Self::ContentNotFound),
+            "REASON_OUT_OF_MEMORY" => Some(Self::OutOfMemory),
             _ => None,
         }
     }
@@ -5588,6 +5593,17 @@ pub struct Limits {
     /// connection.
     #[prost(uint32, tag = "11")]
     pub reply_timeout_ms: u32,
+    /// The largest host and device memory of one scene in bytes (REASON_OUT_OF_MEMORY). They count what files decode to:
+    /// 4 bytes per pixel of a texture on the host, and with all levels 5.4 on the device. The device memory is 0 if the
+    /// server has no GPU; what a scene needs to be drawn then counts as host memory.
+    #[prost(uint64, tag = "12")]
+    pub scene_host_bytes: u64,
+    #[prost(uint64, tag = "13")]
+    pub scene_device_bytes: u64,
+    /// The largest memory of all frames that are being drawn, in bytes (REASON_OUT_OF_MEMORY). A frame takes 32 to 200 bytes
+    /// per pixel, depending on its samples and on transparency.
+    #[prost(uint64, tag = "14")]
+    pub render_target_bytes: u64,
 }
 /// A capability that not every server of the same protocol version has. A client tests for a feature before it depends
 /// on it, and ignores values that it does not know.

@@ -146,6 +146,7 @@ fn exit_code(error: &Error) -> u8 {
         | Error::WindowFull { .. }
         | Error::Busy { .. }
         | Error::LimitReached { .. }
+        | Error::OutOfMemory { .. }
         | Error::SlowReader { .. }
         | Error::Unavailable { .. }
         | Error::ShuttingDown => 5,

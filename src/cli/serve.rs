@@ -88,6 +88,23 @@ pub(super) struct Args {
     /// Limit on open connections. Above it, a connection without calls is closed for each new one.
     #[arg(long, default_value_t = Config::default().connections)]
     connections: usize,
+    /// Limit on the host memory of all scenes, in bytes. Default: half of the memory of the machine or its control group.
+    #[arg(long, value_name = "BYTES")]
+    scenes_host_bytes: Option<u64>,
+    /// Limit on the host memory of one scene, in bytes. Default: half of that of all scenes.
+    #[arg(long, value_name = "BYTES")]
+    scene_host_bytes: Option<u64>,
+    /// Limit on the GPU memory of all scenes, in bytes. Default: half of the memory. Without a GPU, scenes have only host
+    /// memory.
+    #[arg(long, value_name = "BYTES")]
+    scenes_device_bytes: Option<u64>,
+    /// Limit on the GPU memory of one scene, in bytes. Default: half of that of all scenes.
+    #[arg(long, value_name = "BYTES")]
+    scene_device_bytes: Option<u64>,
+    /// Limit on the render targets of all frames that are drawn, in bytes. Default: a quarter of the memory of the GPU or,
+    /// without one, of the host.
+    #[arg(long, value_name = "BYTES")]
+    render_target_bytes: Option<u64>,
     /// Limit on open scenes.
     #[arg(long, default_value_t = Config::default().open_scenes)]
     open_scenes: usize,
@@ -134,6 +151,11 @@ impl Args {
                 .connection_pixels
                 .unwrap_or_else(|| defaults.connection_pixels.max(self.frame_side.saturating_pow(2))),
             connections: self.connections,
+            scenes_host_bytes: self.scenes_host_bytes,
+            scene_host_bytes: self.scene_host_bytes,
+            scenes_device_bytes: self.scenes_device_bytes,
+            scene_device_bytes: self.scene_device_bytes,
+            render_target_bytes: self.render_target_bytes,
             open_scenes: self.open_scenes,
             window: self.window,
             // The default window must not exceed the largest window that a client may request.

@@ -11,9 +11,11 @@ mod content;
 mod device;
 mod load_permits;
 mod lock;
+mod memory_limits;
 mod output;
 mod registry;
 mod scene;
+mod scene_memory;
 mod source;
 mod storage;
 #[cfg(test)]
@@ -23,6 +25,7 @@ pub use content::{ContentHash, ContentHashes, SceneContent, ShapeArray, hex, par
 pub use device::context::{DeviceContext, EngineInfo, share_pictures};
 pub use device::loaded_scene::LoadedScene;
 pub use device::scalar_field::validate_mode;
+pub use memory_limits::MemoryLimits;
 pub use output::encoding_task::EncodingTask;
 pub use output::frame_encoder::{EncodedFrame, EncodedOutput, FrameEncoder, StepPicture};
 pub use output::frame_format::{FrameFormat, JpegQuality};
@@ -71,6 +74,7 @@ use self::registry::Registry;
 use self::scene::actor::SceneServices;
 use self::scene::frame_stream::FrameStreamRegistry;
 use self::scene::handle::OpenParams;
+use self::scene_memory::{MemoryBudgets, SceneMemory};
 use self::storage::checkpoint_store::CheckpointStore;
 use self::storage::run_counter::RunCounter;
 use self::storage::scene_catalog::SceneCatalog;
@@ -98,6 +102,7 @@ struct Shared {
     encoder: FrameEncoder,
     vertex_packer: VertexPacker,
     services: SceneServices,
+    memory: MemoryBudgets,
     registry: Registry,
     frame_streams: Arc<FrameStreamRegistry>,
     load_permits: LoadPermits,
@@ -151,6 +156,7 @@ impl Engine {
         let DeviceThread { handle, info, thread: device_thread } = DeviceThread::start(open_device).await?;
         let shared = Shared {
             services: SceneServices { device: handle, checkpoints, run_counter, config: Arc::clone(&config) },
+            memory: MemoryBudgets::new(info.memory, info.renderer.is_ok()),
             registry: Registry::new(config.open_scenes),
             frame_streams: Arc::default(),
             config,
@@ -456,7 +462,9 @@ impl Engine {
         provenance: &SceneProvenance,
         upload: Option<CompleteUpload>,
     ) -> Result<SceneHandle> {
-        let OpenedScene { scene, backends } = self.read_scene_files(name, provenance, upload).await?;
+        let memory = self.shared.memory.new_scene();
+        let OpenedScene { scene, backends } = self.read_scene_files(name, provenance, upload, &memory).await?;
+        memory.reserve_loaded(name, &scene)?;
         let (engine, scene_name, shared_scene) = (self.clone(), name.to_owned(), Arc::clone(&scene));
         let restored_state =
             run_blocking("checkpoint", move || Ok(engine.shared.services.checkpoints.load(&scene_name, &shared_scene)))
@@ -478,6 +486,7 @@ impl Engine {
             state: restored_state,
             on_failure: self.failure_callback(name, id),
             frames_unavailable: self.shared.info.renderer.as_ref().err().cloned(),
+            memory,
         };
         let scene_handle = SceneHandle::open(params, self.shared.services.clone()).await?;
         let (engine, scene_name, provenance) = (self.clone(), name.to_owned(), provenance.clone());
@@ -515,7 +524,9 @@ impl Engine {
         name: &str,
         provenance: &SceneProvenance,
         upload: Option<CompleteUpload>,
+        memory: &SceneMemory,
     ) -> Result<OpenedScene> {
+        let memory = Arc::clone(&memory.host);
         let source = Arc::clone(&self.shared.source);
         let is_built_in =
             matches!(provenance, SceneProvenance::Repository { source: path } if source.is_built_in(path));
@@ -523,14 +534,14 @@ impl Engine {
         let upload_folder = self.shared.scene_catalog.upload_folder(name);
         let (engine, scene_name, provenance) = (self.clone(), name.to_owned(), provenance.clone());
         let read = move || match provenance {
-            SceneProvenance::Repository { source: path } => source.open(&path),
+            SceneProvenance::Repository { source: path } => source.open(&path, &memory),
             SceneProvenance::Upload { entry } => {
                 if let Some(upload) = upload {
                     // A checkpoint of an older scene with this name does not apply to the new one.
                     engine.shared.services.checkpoints.remove(&scene_name);
                     upload.commit(&upload_folder, &engine.shared.scene_catalog.hash_lists())?;
                 }
-                source.open_within(&upload_folder, &entry)
+                source.open_within(&upload_folder, &entry, &memory)
             }
         };
         run_blocking("load", || read().map_err(Error::into_file_error)).await

@@ -13,6 +13,7 @@ use modalcast_model::deform::{Backend, DeformSummary, DeformedSurface, Deformer,
 use modalcast_model::domain::{Attachment, Domain, Material, Mesh, Modes, Shape, Transform};
 use modalcast_model::error::{Error, Result};
 use modalcast_model::load::OpenedScene;
+use modalcast_model::memory::MemoryReservation;
 use modalcast_model::scene::{DeformationSettings, Scene, SceneParts, SceneState};
 
 /// Two domains, `left` and `right`. Each is a square of two triangles with two modes. `right` is attached to `left`.
@@ -119,12 +120,12 @@ pub(super) fn device_lost_error() -> Error {
 pub(super) struct StripsSource;
 
 impl SceneSource for StripsSource {
-    fn open(&self, _source: &str) -> Result<OpenedScene> {
+    fn open(&self, _source: &str, _: &Arc<MemoryReservation>) -> Result<OpenedScene> {
         Ok(OpenedScene { scene: two_strips(), backends: BackendSettings::default() })
     }
 
-    fn open_within(&self, _folder: &Path, entry: &str) -> Result<OpenedScene> {
-        self.open(entry)
+    fn open_within(&self, _folder: &Path, entry: &str, memory: &Arc<MemoryReservation>) -> Result<OpenedScene> {
+        self.open(entry, memory)
     }
 
     fn list(&self) -> Vec<String> {

@@ -45,6 +45,9 @@ pub enum Error {
     /// As many objects exist as the configuration allows.
     #[error("at most {limit} {objects} are allowed")]
     LimitReached { objects: &'static str, limit: usize },
+    /// An object of a scene needs more memory than is left of a limit. `memory` names the limit. Nothing was allocated.
+    #[error("{object}: expected at most {available} bytes ({memory}, in total {total}), got {asked}")]
+    OutOfMemory { object: String, memory: &'static str, asked: u64, available: u64, total: u64 },
     /// The caller has not read its replies in time.
     #[error("{queue} is full ({limit}), because the client does not read it")]
     SlowReader { queue: &'static str, limit: usize },

@@ -9,6 +9,7 @@ pub mod deform;
 pub mod domain;
 pub mod error;
 pub mod load;
+pub mod memory;
 pub mod raster;
 pub mod scene;
 pub mod shared_memory;

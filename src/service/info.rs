@@ -40,6 +40,9 @@ impl v1::server_service_server::ServerService for ServerServiceImpl {
             message_timeout_ms: to_ms(config.message_timeout),
             connection_reply_bytes: config.connection_reply_bytes as u64,
             reply_timeout_ms: to_ms(config.reply_timeout),
+            scene_host_bytes: info.memory.scene_host,
+            scene_device_bytes: if info.memory.has_device { info.memory.scene_device } else { 0 },
+            render_target_bytes: info.memory.render_targets,
         };
         Ok(Response::new(v1::GetServerInfoResponse {
             version: env!("CARGO_PKG_VERSION").into(),
@@ -71,6 +74,7 @@ fn list_features(info: &EngineInfo, config: &Config) -> Vec<v1::Feature> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::engine::MemoryLimits;
     use modalcast_model::deform::Backend;
     use modalcast_model::error::fault;
     use modalcast_render::RendererInfo;
@@ -85,7 +89,9 @@ mod tests {
             max_side: 1,
             pixel_readback: modalcast_render::PixelReadback::CopyEngine,
         };
-        let info = |renderer| EngineInfo { backend: Backend::Cpu, device: "none".into(), renderer };
+        let memory =
+            MemoryLimits { host: 4, scene_host: 2, device: 0, scene_device: 0, render_targets: 1, has_device: false };
+        let info = |renderer| EngineInfo { backend: Backend::Cpu, device: "none".into(), renderer, memory };
         let always = [v1::Feature::ContentHashes, v1::Feature::UploadReuse, v1::Feature::UploadArrays];
         let config = |shared_memory, viewer| Config { shared_memory, viewer, ..Config::default() };
         let no_renderer = info(Err(fault("renderer", "none")));

@@ -96,25 +96,11 @@ impl ErrorReport {
             Error::StepPassed { field, expected, given } => {
                 Self::new(Code::FailedPrecondition, Reason::StepPassed, expected, given).with_field(field)
             }
-            Error::WindowFull { limit, given } => {
-                let expected = format!("at most {limit} steps without acknowledgment");
-                Self::new(Code::ResourceExhausted, Reason::WindowFull, expected, given.to_string())
-            }
-            Error::Busy { queue, limit } => {
-                Self::new(Code::ResourceExhausted, Reason::QueueFull, "capacity", "a full queue")
-                    .with_metadata([("queue", queue.into()), ("limit", limit.to_string())])
-                    .with_retry_delay(QUEUE_RETRY_DELAY)
-            }
-            Error::LimitReached { objects, limit } => {
-                let expected = format!("at most {limit} {objects}");
-                Self::new(Code::ResourceExhausted, Reason::LimitReached, expected, "one more")
-                    .with_metadata([("object", objects.into()), ("limit", limit.to_string())])
-            }
-            Error::SlowReader { queue, limit } => {
-                let expected = "a client that reads its replies";
-                Self::new(Code::ResourceExhausted, Reason::SlowReader, expected, "a full queue")
-                    .with_metadata([("queue", queue.into()), ("limit", limit.to_string())])
-            }
+            exhausted @ (Error::WindowFull { .. }
+            | Error::Busy { .. }
+            | Error::LimitReached { .. }
+            | Error::OutOfMemory { .. }
+            | Error::SlowReader { .. }) => Self::of_exhausted(exhausted),
             Error::Deadline { what, ms } => {
                 let expected = format!("{what} within {ms} ms");
                 Self::new(Code::DeadlineExceeded, Reason::DeadlineExpired, expected, "no reply in time")
@@ -131,6 +117,43 @@ impl ErrorReport {
             Error::Fault { stage, reason } => {
                 Self::new(Code::Internal, Reason::Internal, "no internal error", format!("{stage}: {reason}"))
             }
+        }
+    }
+
+    /// The report of an error with the code `RESOURCE_EXHAUSTED`.
+    fn of_exhausted(error: Error) -> Self {
+        match error {
+            Error::WindowFull { limit, given } => {
+                let expected = format!("at most {limit} steps without acknowledgment");
+                Self::new(Code::ResourceExhausted, Reason::WindowFull, expected, given.to_string())
+            }
+            Error::Busy { queue, limit } => {
+                Self::new(Code::ResourceExhausted, Reason::QueueFull, "capacity", "a full queue")
+                    .with_metadata([("queue", queue.into()), ("limit", limit.to_string())])
+                    .with_retry_delay(QUEUE_RETRY_DELAY)
+            }
+            Error::LimitReached { objects, limit } => {
+                let expected = format!("at most {limit} {objects}");
+                Self::new(Code::ResourceExhausted, Reason::LimitReached, expected, "one more")
+                    .with_metadata([("object", objects.into()), ("limit", limit.to_string())])
+            }
+            Error::OutOfMemory { object, memory, asked, available, total } => {
+                let expected = format!("at most {available} bytes of the {memory}");
+                let given = format!("{asked} bytes for {object}");
+                Self::new(Code::ResourceExhausted, Reason::OutOfMemory, expected, given).with_metadata([
+                    ("object", object),
+                    ("memory", memory.into()),
+                    ("asked", asked.to_string()),
+                    ("available", available.to_string()),
+                    ("total", total.to_string()),
+                ])
+            }
+            Error::SlowReader { queue, limit } => {
+                let expected = "a client that reads its replies";
+                Self::new(Code::ResourceExhausted, Reason::SlowReader, expected, "a full queue")
+                    .with_metadata([("queue", queue.into()), ("limit", limit.to_string())])
+            }
+            other => Self::new(Code::Internal, Reason::Internal, "an exhausted resource", other.to_string()),
         }
     }
 

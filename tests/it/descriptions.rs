@@ -11,6 +11,7 @@ use modalcast_model::domain::{
 };
 use modalcast_model::error::Result;
 use modalcast_model::load::OpenedScene;
+use modalcast_model::memory::MemoryReservation;
 use modalcast_model::scene::{Scene, SceneParts};
 use modalcast_proto::v1;
 use prost::Message as _;
@@ -32,12 +33,12 @@ const ALL_ARRAYS: [ShapeArray; 6] = [
 struct OneScene(Arc<Scene>);
 
 impl SceneSource for OneScene {
-    fn open(&self, _: &str) -> Result<OpenedScene> {
+    fn open(&self, _: &str, _: &Arc<MemoryReservation>) -> Result<OpenedScene> {
         Ok(Arc::clone(&self.0).into())
     }
 
-    fn open_within(&self, _: &Path, entry: &str) -> Result<OpenedScene> {
-        self.open(entry)
+    fn open_within(&self, _: &Path, entry: &str, memory: &Arc<MemoryReservation>) -> Result<OpenedScene> {
+        self.open(entry, memory)
     }
 
     fn list(&self) -> Vec<String> {

@@ -7,6 +7,7 @@ use std::sync::{Arc, Mutex};
 use modalcast::engine::SceneSource;
 use modalcast_model::error::Result;
 use modalcast_model::load::OpenedScene;
+use modalcast_model::memory::MemoryReservation;
 use modalcast_proto::v1;
 
 use crate::service_harness::{Server, config, strips, with_timeout};
@@ -18,7 +19,7 @@ struct BlockedSource {
 }
 
 impl SceneSource for BlockedSource {
-    fn open(&self, source: &str) -> Result<OpenedScene> {
+    fn open(&self, source: &str, _: &Arc<MemoryReservation>) -> Result<OpenedScene> {
         if !self.is_built_in(source) {
             self.started.send(()).ok(); // The test waits for the first load only.
             self.released.lock().expect("expected no panic").recv().expect("expected a message of the test");
@@ -26,8 +27,8 @@ impl SceneSource for BlockedSource {
         Ok(strips().into())
     }
 
-    fn open_within(&self, _: &Path, entry: &str) -> Result<OpenedScene> {
-        self.open(entry)
+    fn open_within(&self, _: &Path, entry: &str, memory: &Arc<MemoryReservation>) -> Result<OpenedScene> {
+        self.open(entry, memory)
     }
 
     fn is_built_in(&self, source: &str) -> bool {

@@ -22,6 +22,7 @@ mod invalid_input;
 mod layering;
 mod light;
 mod loads;
+mod memory_limits;
 mod message_streams;
 mod moved_cameras;
 mod normals;

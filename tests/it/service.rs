@@ -1,8 +1,11 @@
 //! Scenes over the wire: open, describe, list and delete; health, reflection and limits.
 
+use std::sync::Arc;
+
 use modalcast::engine::SceneSource;
 use modalcast_model::error::Result;
 use modalcast_model::load::OpenedScene;
+use modalcast_model::memory::MemoryReservation;
 use modalcast_proto::v1;
 use prost::Message as _;
 use tokio_stream::StreamExt as _;
@@ -21,7 +24,7 @@ struct FailingOnceSource {
 }
 
 impl SceneSource for FailingOnceSource {
-    fn open(&self, source: &str) -> Result<OpenedScene> {
+    fn open(&self, source: &str, _: &Arc<MemoryReservation>) -> Result<OpenedScene> {
         if self.open_count.fetch_add(1, std::sync::atomic::Ordering::SeqCst) == 0 {
             self.fail_signal.lock().expect("expected an unpoisoned mutex").recv().expect("expected a signal");
             return Err(modalcast_model::error::invalid("source", "a second try", source));
@@ -30,8 +33,8 @@ impl SceneSource for FailingOnceSource {
         Ok(strips().into())
     }
 
-    fn open_within(&self, _: &std::path::Path, entry: &str) -> Result<OpenedScene> {
-        self.open(entry)
+    fn open_within(&self, _: &std::path::Path, entry: &str, memory: &Arc<MemoryReservation>) -> Result<OpenedScene> {
+        self.open(entry, memory)
     }
 
     fn list(&self) -> Vec<String> {

@@ -91,12 +91,17 @@ async fn paths_within_the_repository_open_and_others_do_not() {
     assert_eq!((info.scene.as_str(), info.vertices, info.coordinates), ("square", 4, 1));
     assert_eq!(deform_last_vertex(&server, "square").await, [0.0, 1.0, 3.0]);
     let outside_path = parent_folder.path().join("secret.obj").to_string_lossy().into_owned();
-    for path in ["../secret.obj", "deep/../../secret.obj", outside_path.as_str(), "link.obj"] {
+    for path in ["../secret.obj", "deep/../../secret.obj", outside_path.as_str()] {
         let status = open(&server, path).await.expect_err(path);
         assert_eq!(status.code(), Code::InvalidArgument, "{path}: {status:?}");
         let rejection = rejection_details(&status);
         assert_eq!((rejection.reason(), rejection.field.as_str()), (v1::Reason::InvalidFile, ""), "{path}");
         assert!(!rejection.expected.is_empty() && !rejection.given.is_empty(), "{path}: {rejection:?}");
+    }
+    // A link to a file outside is not found, like a name that does not exist.
+    for path in ["link.obj", "none.obj"] {
+        let status = open(&server, path).await.expect_err(path);
+        assert_eq!((status.code(), rejection_details(&status).reason()), (Code::NotFound, v1::Reason::SceneNotFound));
     }
 }
 

@@ -13,6 +13,7 @@ use modalcast_model::domain::{
 };
 use modalcast_model::error::{Error, Result, invalid};
 use modalcast_model::load::OpenedScene;
+use modalcast_model::memory::MemoryReservation;
 use modalcast_model::scene::{
     DeformationSettings, RawStepUpdate, RenderSettings, Scene, SceneParts, SceneState, ShadowSettings, StepUpdate,
     TransformFormat,
@@ -48,7 +49,7 @@ pub(crate) const DEFAULT_WINDOW: u32 = 0;
 pub(crate) struct SyntheticScenes;
 
 impl SceneSource for SyntheticScenes {
-    fn open(&self, source: &str) -> Result<OpenedScene> {
+    fn open(&self, source: &str, _: &Arc<MemoryReservation>) -> Result<OpenedScene> {
         let scene = match source {
             "strips" => strips(),
             "far" => far_strips(),
@@ -63,10 +64,10 @@ impl SceneSource for SyntheticScenes {
     }
 
     /// Opens the source whose name is the text of a file; an empty `entry` means `scene.txt`.
-    fn open_within(&self, folder: &Path, entry: &str) -> Result<OpenedScene> {
+    fn open_within(&self, folder: &Path, entry: &str, memory: &Arc<MemoryReservation>) -> Result<OpenedScene> {
         let path = folder.join(if entry.is_empty() { "scene.txt" } else { entry });
         let text = std::fs::read_to_string(path).map_err(|error| invalid("entry", "a file", error))?;
-        self.open(text.trim())
+        self.open(text.trim(), memory)
     }
 
     fn list(&self) -> Vec<String> {

@@ -1,5 +1,6 @@
 """A well-behaved client, and the times that it sees."""
 
+import hashlib
 import sys
 import time
 from pathlib import Path
@@ -52,6 +53,26 @@ class Client:
     def open_scene(self, source, name="", timeout=30):
         request = scenes_pb2.OpenSceneRequest(source=source, scene=name)
         return self.scenes.OpenScene(request, timeout=timeout).scene
+
+    def list_scenes(self, timeout=30):
+        return self.scenes.ListScenes(scenes_pb2.ListScenesRequest(), timeout=timeout).scenes
+
+
+def upload_parts(name, files):
+    """The messages of an upload of files, by their paths."""
+    total = sum(map(len, files.values()))
+    header = scenes_pb2.UploadHeader(scene=name, files=len(files), total_bytes=total)
+    yield scenes_pb2.UploadSceneRequest(header=header)
+    for path, data in files.items():
+        sha256 = hashlib.sha256(data).digest()
+        yield scenes_pb2.UploadSceneRequest(file=scenes_pb2.UploadFile(path=path, bytes=len(data), sha256=sha256))
+        for start in range(0, len(data), 1 << 20):
+            yield scenes_pb2.UploadSceneRequest(chunk=data[start : start + (1 << 20)])
+
+
+def upload_files(client, name, files, timeout=60):
+    """Uploads files and opens them as a scene."""
+    return client.scenes.UploadScene(upload_parts(name, files), timeout=timeout).scene
 
 
 def time_to_serve(server, timeout):

@@ -13,7 +13,7 @@ from report import Result
 ITEMS = {
     1: ("connections", "connections without a request"),
     2: ("messages", "half-sent messages"),
-    3: (None, "budgets of memory per scene and in total, reserved before decoding"),
+    3: ("memory", "budgets of memory per scene and in total, reserved before decoding"),
     4: ("replies", "unread replies"),
     5: ("shutdown", "SIGTERM ends the server within 10 s"),
     6: ("loads", "slow loads do not block other clients or the start"),

@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 
 use super::loaded_scene::LoadedScene;
 use crate::config::{BackendChoice, Config, RendererChoice};
+use crate::engine::memory_limits::MemoryLimits;
 use crate::engine::output::step_output::FrameOutput;
 use crate::frame::Legend;
 use crate::telemetry::ms_since;
@@ -31,6 +32,7 @@ pub struct EngineInfo {
     pub device: String,
     /// The renderer, or the reason why there is none.
     pub renderer: Result<modalcast_render::RendererInfo>,
+    pub memory: MemoryLimits,
 }
 
 /// A frame in flight.
@@ -135,7 +137,13 @@ impl DeviceContext {
     /// frame is requested.
     pub fn open(config: &Config) -> Result<Self> {
         let (backend, cuda_device, device_label) = open_backend(config)?;
+        let device_bytes =
+            cuda_device.as_ref().map(|device| device.memory()).transpose()?.map(|(_, total)| total as u64);
+        let memory = MemoryLimits::new(config, device_bytes);
         let mut renderer = open_renderer(config, cuda_device.is_some());
+        if let Ok(renderer) = &mut renderer {
+            renderer.set_target_budget(memory.render_target_budget());
+        }
         if let (Ok(renderer), Some(device)) = (&mut renderer, &cuda_device) {
             share_pictures(renderer, device)?;
         }
@@ -143,6 +151,7 @@ impl DeviceContext {
             backend,
             device: device_label,
             renderer: renderer.as_ref().map(|renderer| renderer.info().clone()).map_err(Clone::clone),
+            memory,
         };
         Ok(Self {
             renderer,

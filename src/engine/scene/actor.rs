@@ -45,6 +45,7 @@ use crate::engine::blocking::run_blocking;
 use crate::engine::catch_unwind::catch_unwind_async;
 use crate::engine::device::command::SceneId;
 use crate::engine::device::handle::{DeviceHandle, PendingReply};
+use crate::engine::scene_memory::SceneMemory;
 use crate::engine::storage::checkpoint_store::{CheckpointStore, SceneCheckpoints};
 use crate::engine::storage::run_counter::RunCounter;
 use crate::telemetry::{Stage, StageTimes};
@@ -75,6 +76,8 @@ pub(super) struct ActorParams {
     pub failure: Arc<OnceLock<Error>>,
     /// Called when the scene has failed.
     pub on_failure: Box<dyn FnOnce() + Send>,
+    /// Reserved until the device has unloaded the scene.
+    pub memory: SceneMemory,
 }
 
 /// The current writer of a scene.
@@ -137,11 +140,12 @@ pub(super) struct SceneActor {
     wake: Arc<Notify>,
     failure: Arc<OnceLock<Error>>,
     on_failure: Box<dyn FnOnce() + Send>,
+    memory: SceneMemory,
 }
 
 impl SceneActor {
     pub(super) fn new(params: ActorParams, services: SceneServices) -> Self {
-        let ActorParams { name, id, scene, state, wake, current_state, failure, on_failure } = params;
+        let ActorParams { name, id, scene, state, wake, current_state, failure, on_failure, memory } = params;
         let SceneServices { device, checkpoints, run_counter, config } = services;
         let scene_on_device = SceneOnDevice { name: name.clone(), id, scene: Arc::clone(&scene) };
         Self {
@@ -162,6 +166,7 @@ impl SceneActor {
             wake,
             failure,
             on_failure,
+            memory,
         }
     }
 
@@ -343,7 +348,7 @@ impl SceneActor {
                 (error, None)
             }
         };
-        let Self { writer, phase, delivery, device, id, .. } = self;
+        let Self { writer, phase, delivery, device, id, memory, .. } = self;
         if let StepPhase::Delivering(step) = phase {
             step.acknowledge();
         }
@@ -353,6 +358,7 @@ impl SceneActor {
         delivery.end(&error);
         // Fails only if the device thread has ended, which frees the scene too.
         device.unload_scene(id).await.ok();
+        drop(memory);
         drop(mailbox);
         if let Some(done) = done {
             done.send(()).ok(); // Fails only if the caller no longer waits.

@@ -17,6 +17,7 @@ use crate::engine::blocking::run_blocking;
 use crate::engine::content::ContentHashes;
 use crate::engine::device::command::SceneId;
 use crate::engine::output::step_output::{OutputSpec, StepId, StepOutput};
+use crate::engine::scene_memory::SceneMemory;
 use crate::engine::storage::scene_catalog::SceneProvenance;
 use crate::telemetry::ms_since;
 use modalcast_model::backend_settings::BackendSettings;
@@ -64,6 +65,8 @@ pub(in crate::engine) struct OpenParams {
     /// The state restored from a checkpoint, if there is one.
     pub state: Option<SceneState>,
     pub frames_unavailable: Option<Error>,
+    /// Reserved until the device has unloaded the scene.
+    pub memory: SceneMemory,
 }
 
 impl SceneHandle {
@@ -73,7 +76,8 @@ impl SceneHandle {
     /// # Errors
     /// `Fault` of the device, `Invalid` when the rest state overflows, `Busy` when the command queue is full.
     pub(in crate::engine) async fn open(params: OpenParams, services: SceneServices) -> Result<Self> {
-        let OpenParams { name, provenance, scene, backends, id, on_failure, state, frames_unavailable } = params;
+        let OpenParams { name, provenance, scene, backends, id, on_failure, state, frames_unavailable, memory } =
+            params;
         services.device.load_scene(id, &scene, backends).await?;
         let state = match state.map(Arc::new) {
             Some(state) => match services.device.deform(id, &state).wait().await {
@@ -98,6 +102,7 @@ impl SceneHandle {
             current_state: state_sender,
             failure: Arc::clone(&failure),
             on_failure,
+            memory,
         };
         let (mailbox, inbox) = mpsc::channel(MAILBOX_CAPACITY);
         tokio::spawn(SceneActor::new(actor, services).run(inbox));

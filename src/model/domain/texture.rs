@@ -1,6 +1,12 @@
 //! Decoded images: RGBA8, top row first.
 
+use std::io::Cursor;
+use std::sync::Arc;
+
+use image::{ImageDecoder as _, ImageReader};
+
 use crate::error::{Result, invalid};
+use crate::memory::MemoryReservation;
 
 /// The largest width or height of a texture in pixels.
 pub(super) const MAX_TEXTURE_SIDE: u32 = 8192;
@@ -43,22 +49,27 @@ impl Texture {
         matches!(image::guess_format(start), Ok(image::ImageFormat::Png | image::ImageFormat::Jpeg))
     }
 
-    /// Decodes PNG or JPEG bytes.
+    /// Decodes PNG or JPEG bytes. Reserves the memory of the pixels in `memory` as soon as the header is read.
     ///
     /// # Errors
-    /// `Invalid` if the bytes are neither a PNG nor a JPEG image, or a side exceeds 8192 pixels.
-    pub fn decode(name: impl Into<String>, bytes: &[u8]) -> Result<Self> {
+    /// `Invalid` if the bytes are neither a PNG nor a JPEG image, or a side exceeds 8192 pixels. `OutOfMemory`.
+    pub fn decode(name: impl Into<String>, bytes: &[u8], memory: &Arc<MemoryReservation>) -> Result<Self> {
         let name = name.into();
         let decode_error =
             |error: &dyn std::fmt::Display| invalid(format!("texture '{name}'"), "a PNG or JPEG image", error);
-        let mut reader = image::ImageReader::new(std::io::Cursor::new(bytes));
+        let mut reader = ImageReader::new(Cursor::new(bytes));
         let mut limits = image::Limits::default();
         limits.max_image_width = Some(MAX_TEXTURE_SIDE);
         limits.max_image_height = Some(MAX_TEXTURE_SIDE);
         reader.limits(limits);
         let reader = reader.with_guessed_format().map_err(|error| decode_error(&error))?;
-        let image = reader.decode().map_err(|error| decode_error(&error))?.into_rgba8();
-        let (width, height) = image.dimensions();
+        let decoder = reader.into_decoder().map_err(|error| decode_error(&error))?;
+        let (width, height) = decoder.dimensions();
+        let object = format!("texture '{name}' of {width} x {height} pixels");
+        // The decoded image in the format of the file is freed after its conversion to RGBA8.
+        let _decoded = memory.reserve_temporary(&object, decoder.total_bytes())?;
+        memory.reserve(&object, 4 * u64::from(width) * u64::from(height))?;
+        let image = image::DynamicImage::from_decoder(decoder).map_err(|error| decode_error(&error))?.into_rgba8();
         Self::new(name, width, height, image.into_raw())
     }
 

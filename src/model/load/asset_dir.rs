@@ -1,11 +1,14 @@
-//! File access of the loaders: which paths they may read, and how many bytes.
+//! File access of the loaders: which paths they may read, how many bytes, and the memory that they reserve.
 
 use std::fs::File;
 use std::io::Read;
+use std::ops::Deref;
 use std::path::{Component, Path, PathBuf};
+use std::sync::Arc;
 
 use crate::domain::Texture;
 use crate::error::{Result, invalid};
+use crate::memory::{MemoryReservation, TemporaryReservation};
 
 /// The largest mesh or matrix file in bytes.
 pub(super) const MAX_MODEL_BYTES: u64 = 2 << 30;
@@ -26,6 +29,30 @@ pub(super) struct AssetDir {
     root: Option<PathBuf>,
     /// Whether a file that another file refers to must exist.
     is_strict: bool,
+    /// The memory of the scene that is loaded. Clones of the folder share it.
+    memory: Arc<MemoryReservation>,
+}
+
+/// The bytes of a file. Their memory is reserved until this is dropped.
+#[derive(Debug)]
+pub(super) struct FileContent {
+    bytes: Vec<u8>,
+    _memory: TemporaryReservation,
+}
+
+impl FileContent {
+    /// The bytes, whose memory is no longer reserved.
+    pub(super) fn into_bytes(self) -> Vec<u8> {
+        self.bytes
+    }
+}
+
+impl Deref for FileContent {
+    type Target = [u8];
+
+    fn deref(&self) -> &[u8] {
+        &self.bytes
+    }
 }
 
 /// The kind of an existing path.
@@ -36,14 +63,46 @@ pub(super) enum EntryKind {
 }
 
 impl AssetDir {
-    /// Allows any path: absolute or relative to `base`.
+    /// Allows any path, absolute or relative to `base`, and any amount of memory.
     pub(super) fn unrestricted(base: &Path) -> Self {
-        Self { base: base.to_path_buf(), root: None, is_strict: false }
+        Self { base: base.to_path_buf(), root: None, is_strict: false, memory: MemoryReservation::unlimited() }
     }
 
-    /// Allows only paths relative to `root` that stay inside it. `root` must be canonical.
-    pub(super) fn confined_to(root: &Path) -> Self {
-        Self { base: root.to_path_buf(), root: Some(root.to_path_buf()), is_strict: false }
+    /// Allows only paths relative to `root` that stay inside it. `root` must be canonical. The loaders reserve their memory
+    /// in `memory`.
+    pub(super) fn confined_to(root: &Path, memory: &Arc<MemoryReservation>) -> Self {
+        let memory = Arc::clone(memory);
+        Self { base: root.to_path_buf(), root: Some(root.to_path_buf()), is_strict: false, memory }
+    }
+
+    /// The memory of the scene that is loaded.
+    pub(super) const fn memory(&self) -> &Arc<MemoryReservation> {
+        &self.memory
+    }
+
+    /// Reserves memory for an object of the scene.
+    ///
+    /// # Errors
+    /// `OutOfMemory` with the name of the object.
+    pub(super) fn reserve(&self, object: &str, bytes: u64) -> Result<()> {
+        self.memory.reserve(object, bytes)
+    }
+
+    /// Reserves the memory of a mesh that is parsed from `file_bytes` bytes until the returned guard is dropped. Lists of
+    /// vertices have at most two bytes per byte of a text. Faces reserve more.
+    ///
+    /// # Errors
+    /// As for [`Self::reserve`].
+    pub(super) fn reserve_polygons(&self, relative: &str, file_bytes: usize) -> Result<Option<TemporaryReservation>> {
+        self.reserve_temporary(&field_of(relative), 2 * file_bytes as u64).map(Some)
+    }
+
+    /// Reserves memory until the returned guard is dropped.
+    ///
+    /// # Errors
+    /// As for [`Self::reserve`].
+    pub(super) fn reserve_temporary(&self, object: &str, bytes: u64) -> Result<TemporaryReservation> {
+        self.memory.reserve_temporary(object, bytes)
     }
 
     /// The same folder. [`Self::has_referenced_file`] fails for files that do not exist.
@@ -111,19 +170,21 @@ impl AssetDir {
     ///
     /// # Errors
     /// `Invalid` if the path is outside the root, does not exist, is not a regular file, is too large or unreadable.
-    /// The error contains the unresolved path, so that it does not reveal the location of the root.
-    pub(super) fn read(&self, relative: &str, limit: u64) -> Result<Vec<u8>> {
+    /// `OutOfMemory` if the memory of the scene is too small for it. The error contains the unresolved path, so that it
+    /// does not reveal the location of the root.
+    pub(super) fn read(&self, relative: &str, limit: u64) -> Result<FileContent> {
         let too_large = |size: u64| invalid(field_of(relative), format!("at most {limit} bytes"), size);
         let file_bytes = self.regular_file(relative)?.1;
         if file_bytes > limit {
             return Err(too_large(file_bytes));
         }
-        let bytes = self.read_start(relative, limit.saturating_add(1))?;
-        // The file may have grown after its size was read.
-        if bytes.len() as u64 > limit {
-            return Err(too_large(bytes.len() as u64));
+        let memory = self.reserve_temporary(&field_of(relative), file_bytes)?;
+        // One byte more than the size, to notice a file that has grown.
+        let bytes = self.read_start(relative, file_bytes + 1)?;
+        match bytes.len() as u64 <= file_bytes {
+            true => Ok(FileContent { bytes, _memory: memory }),
+            false => Err(unreadable(relative, &"a file that grows while it is read")),
         }
-        Ok(bytes)
     }
 
     /// Reads at most the first `count` bytes of a regular file.
@@ -150,15 +211,14 @@ impl AssetDir {
         }
     }
 
-    /// The kind of the path, or `None` if it does not exist.
+    /// The kind of the path, or `None` if it does not exist. A path whose symbolic links leave the root does not exist,
+    /// whether or not its target does, so that the answer reveals nothing about files outside the root.
     ///
     /// # Errors
-    /// `Invalid` for a path that leaves the root.
+    /// `Invalid` for a path whose own components leave the root.
     pub(super) fn kind(&self, relative: &str) -> Result<Option<EntryKind>> {
-        if !self.join(relative)?.exists() {
-            return Ok(None);
-        }
-        let path = self.resolve(relative)?;
+        self.join(relative)?;
+        let Ok(path) = self.resolve(relative) else { return Ok(None) };
         Ok(if path.is_dir() { Some(EntryKind::Directory) } else { path.is_file().then_some(EntryKind::File) })
     }
 
@@ -177,18 +237,18 @@ impl AssetDir {
         self.entries().into_iter().filter(|(_, kind)| *kind == EntryKind::File).map(|(name, _)| name).collect()
     }
 
-    /// The canonical path of `relative`.
+    /// The canonical path of `relative`. A symbolic link that leaves the root has the same error as a missing file, so
+    /// that the error does not reveal whether its target exists.
     ///
     /// # Errors
     /// `Invalid` if the path leaves the root or does not exist.
     pub(super) fn resolve(&self, relative: &str) -> Result<PathBuf> {
         let path = self.join(relative)?;
-        let missing_file = |error: std::io::Error| invalid(field_of(relative), "an existing file", error.kind());
-        let canonical = path.canonicalize().map_err(missing_file)?;
-        match &self.root {
-            Some(root) if !canonical.starts_with(root) => Err(outside_error(relative)),
-            _ => Ok(canonical),
-        }
+        let Some(root) = &self.root else {
+            return path.canonicalize().map_err(|error| invalid(field_of(relative), "an existing file", error.kind()));
+        };
+        let canonical = path.canonicalize().ok().filter(|canonical| canonical.starts_with(root));
+        canonical.ok_or_else(|| invalid(field_of(relative), "an existing file in the repository", "none of this name"))
     }
 
     /// Joins the path to `base` without access to the file system, so that an error reveals nothing about files outside
@@ -267,18 +327,45 @@ mod tests {
         std::os::unix::fs::symlink(outer.path().join("secret.txt"), root.join("link.txt")).expect("a symbolic link");
         std::os::unix::fs::symlink(outer.path(), root.join("folder")).expect("a symbolic link");
         let root = root.canonicalize().expect("an existing folder");
-        let files = AssetDir::confined_to(&root).within("sub").expect("an existing folder");
-        assert_eq!(files.read("../inside.txt", 6).expect("a file inside the root"), b"inside");
-        let secret = outer.path().join("secret.txt");
-        for path in ["../../secret.txt", "../link.txt", "../folder/secret.txt", secret.to_str().expect("a UTF-8 path")]
-        {
+        std::os::unix::fs::symlink(outer.path().join("absent.txt"), root.join("dangling.txt"))
+            .expect("a symbolic link");
+        let files = AssetDir::confined_to(&root, &MemoryReservation::unlimited());
+        let files = files.within("sub").expect("an existing folder");
+        assert_eq!(files.read("../inside.txt", 6).expect("a file inside the root")[..], b"inside"[..]);
+        assert_eq!(files.kind("../inside.txt"), Ok(Some(EntryKind::File)));
+        let [secret, absent] = ["secret.txt", "absent.txt"].map(|name| outer.path().join(name).display().to_string());
+        for path in ["../../secret.txt", "../../absent.txt", &secret, &absent] {
             let message = files.read(path, 100).expect_err(path).to_string();
             let expected = format!("file '{path}': expected a path inside the repository, got a path outside of it");
             assert_eq!(message, expected);
+            assert_eq!(files.kind(path).expect_err(path).to_string(), expected);
         }
-        let absent = files.read("../../absent.txt", 100).expect_err("a missing file outside").to_string();
-        assert!(absent.ends_with("expected a path inside the repository, got a path outside of it"), "{absent}");
-        assert_eq!(AssetDir::unrestricted(&root).read("../secret.txt", 100).expect("a readable file"), b"secret");
+        // Links out of the root, to files that exist and that do not, and a file that does not exist in the root.
+        let links = ["../link.txt", "../folder/secret.txt", "../dangling.txt", "../folder/absent.txt", "../none.txt"];
+        for path in links {
+            let message = files.read(path, 100).expect_err(path).to_string();
+            let expected = format!("file '{path}': expected an existing file in the repository, got none of this name");
+            assert_eq!(message, expected);
+            assert_eq!(files.kind(path), Ok(None), "{path}");
+        }
+        assert_eq!(AssetDir::unrestricted(&root).read("../secret.txt", 100).expect("a file")[..], b"secret"[..]);
+    }
+
+    #[test]
+    fn memory_of_a_file_is_reserved_until_it_is_dropped() {
+        use crate::memory::{MemoryBudget, MemoryKind};
+        let root = tempfile::tempdir().expect("a temporary folder");
+        std::fs::write(root.path().join("a.bin"), [0; 60]).expect("a writable file");
+        let root = root.path().canonicalize().expect("an existing folder");
+        let budget = MemoryBudget::new(MemoryKind::Host, 100, 100);
+        let files = AssetDir::confined_to(&root, &MemoryReservation::new(&budget));
+        let content = files.read("a.bin", 60).expect("a readable file");
+        let message = files.read("a.bin", 60).expect_err("too little memory").to_string();
+        let expected = "file 'a.bin': expected at most 40 bytes (host memory of one scene, in total 100), got 60";
+        assert_eq!((message.as_str(), budget.reserved()), (expected, 60));
+        drop(content);
+        assert_eq!(budget.reserved(), 0);
+        assert_eq!(files.read("a.bin", 60).expect("a readable file").into_bytes().len(), 60);
     }
 
     #[test]

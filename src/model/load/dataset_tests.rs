@@ -173,7 +173,14 @@ fn real_datasets_are_listed_if_their_folder_has_one_model() {
         assert!(names.iter().any(|listed| listed == name), "{name} is not among {names:?}");
     }
     assert!(!names.iter().any(|name| name == "vega/volumetric/beam3"));
-    assert_eq!(repository.open("vega/A").expect("a valid scene").scene.rank_of(0), 20);
+    assert_eq!(
+        repository
+            .open("vega/A", &crate::memory::MemoryReservation::unlimited())
+            .expect("a valid scene")
+            .scene
+            .rank_of(0),
+        20
+    );
     let message = super::open(&dataset_path("vega/volumetric/beam3")).expect_err("two models").to_string();
     assert!(message.ends_with("got 2: beam3.obj, beam3_tet.obj"), "{message}");
 }

@@ -19,15 +19,16 @@ const ARRAY_NAMES: [&str; 8] = ["vertices", "faces", "U", "modes", "eigenvalues"
 /// `Invalid` with the file, the array, and the expected and given value.
 pub(super) fn read(files: &AssetDir, name: &str, options: ModelOptions) -> Result<SceneParts> {
     let mut parts = SceneParts { up: UpAxis::Z, ..SceneParts::named(stem_of(name)) };
-    let (polygons, own_modes) = parse(&files.read(name, MAX_MODEL_BYTES)?, &mut parts.remarks)
-        .map_err(|error| error.prefix_field(&format!("file '{name}'")))?;
+    let content = files.read(name, MAX_MODEL_BYTES)?;
+    let (polygons, own_modes) =
+        parse(files, &content, &mut parts.remarks).map_err(|error| error.prefix_field(&format!("file '{name}'")))?;
     parts.materials.push(Material::unspecified(""));
     surface::add_domain(files, name, &polygons, options, own_modes, &mut parts)?;
     Ok(parts)
 }
 
-fn parse(bytes: &[u8], remarks: &mut Vec<String>) -> Result<(PolygonMesh, Option<LoadedModes>)> {
-    let mut archive = NpzArchive::open(bytes)?;
+fn parse(files: &AssetDir, bytes: &[u8], remarks: &mut Vec<String>) -> Result<(PolygonMesh, Option<LoadedModes>)> {
+    let mut archive = NpzArchive::open(bytes, files.memory())?;
     let missing = |archive: &NpzArchive<'_>| {
         invalid("archive", "the arrays vertices and faces, and optionally U", archive.list_names())
     };
@@ -35,6 +36,7 @@ fn parse(bytes: &[u8], remarks: &mut Vec<String>) -> Result<(PolygonMesh, Option
     let count = positions.len();
     let Some((sides, faces)) = read_rows(&mut archive, "faces", &[3, 4], None)? else { return Err(missing(&archive)) };
     let mut polygons = PolygonMesh::with_one_material(positions);
+    polygons.memory = files.reserve_polygons("faces", 0)?;
     polygons.normals = read_vectors::<3>(&mut archive, "normals", Some(count))?.unwrap_or_default();
     polygons.uvs = read_vectors::<2>(&mut archive, "uvs", Some(count))?.unwrap_or_default();
     polygons.colors = read_colors(&mut archive, count)?;

@@ -1,10 +1,12 @@
 //! The server's folder of scenes: opens scenes by name and lists their names.
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use super::asset_dir::{AssetDir, EntryKind};
 use super::{OpenedScene, manifest, source};
 use crate::error::{Error, Result};
+use crate::memory::MemoryReservation;
 
 /// The largest depth of listed folders below the root. Deeper scenes can still be opened by their path.
 const MAX_LIST_DEPTH: usize = 4;
@@ -37,13 +39,14 @@ impl SceneRepository {
         Ok(Self { root: Some(canonical) })
     }
 
-    /// Opens a built-in scene or a path inside the repository; `.` is the repository's root folder.
+    /// Opens a built-in scene or a path inside the repository; `.` is the repository's root folder. The loaders reserve in
+    /// `memory` what they read and decode, before they allocate it.
     ///
     /// # Errors
-    /// As for [`super::open`], and `Invalid` for a path that leaves the repository.
-    pub fn open(&self, source: &str) -> Result<OpenedScene> {
+    /// As for [`super::open`], `Invalid` for a path that leaves the repository, and `OutOfMemory`.
+    pub fn open(&self, source: &str, memory: &Arc<MemoryReservation>) -> Result<OpenedScene> {
         match &self.root {
-            Some(root) => OpenedScene::new(source::read(&AssetDir::confined_to(root), source)?),
+            Some(root) => OpenedScene::new(source::read(&AssetDir::confined_to(root, memory), source)?),
             None if source::is_built_in(source) => super::open(source),
             None => Err(Error::NotFound { what: "scene", given: source.into() }),
         }
@@ -60,7 +63,8 @@ impl SceneRepository {
         let mut names: Vec<String> = source::BUILT_IN.map(str::to_owned).to_vec();
         if let Some(root) = &self.root {
             let mut root_names = Vec::new();
-            collect_names(&AssetDir::confined_to(root), "", MAX_LIST_DEPTH, &mut root_names);
+            let files = AssetDir::confined_to(root, &MemoryReservation::unlimited());
+            collect_names(&files, "", MAX_LIST_DEPTH, &mut root_names);
             root_names.sort();
             // A built-in scene hides a folder of the same name, unless its path begins with `./`.
             for name in root_names.iter_mut().filter(|name| source::is_built_in(name)) {
@@ -138,11 +142,19 @@ mod tests {
         assert_eq!(names, expected, "expected ./tree for the folder whose name is that of a built-in scene");
         // All names but that of the built-in tree.
         for name in &names[1..] {
-            let opened = repository.open(name).unwrap_or_else(|error| panic!("{name}: {error}"));
+            let opened = repository
+                .open(name, &MemoryReservation::unlimited())
+                .unwrap_or_else(|error| panic!("{name}: {error}"));
             assert_eq!(opened.scene.domains.len(), 1);
         }
-        assert_eq!(repository.open("deep/er/scene").expect("a valid scene").scene.name, "scene");
-        assert!(repository.open("a/b/c/d/e/f/far.obj").is_ok(), "expected an unlisted path to open");
+        assert_eq!(
+            repository.open("deep/er/scene", &MemoryReservation::unlimited()).expect("a valid scene").scene.name,
+            "scene"
+        );
+        assert!(
+            repository.open("a/b/c/d/e/f/far.obj", &MemoryReservation::unlimited()).is_ok(),
+            "expected an unlisted path to open"
+        );
     }
 
     #[test]
@@ -162,17 +174,20 @@ mod tests {
             "/etc/passwd",
             "/absent",
             "one/../../secret.obj",
-            "link/secret.obj",
-            "link",
             "out",
             "far",
             "map",
             "patch",
         ] {
-            let message = repository.open(source).expect_err(source).to_string();
+            let message = repository.open(source, &MemoryReservation::unlimited()).expect_err(source).to_string();
             assert!(message.contains("expected a path inside the repository"), "{source}: {message}");
             let outside = outer.path().to_str().expect("a UTF-8 path");
             assert!(!message.contains(outside), "{source}: {message}");
+        }
+        // Links out of the repository are not found, whether or not their targets exist.
+        for source in ["link", "link/secret.obj", "link/absent.obj"] {
+            let error = repository.open(source, &MemoryReservation::unlimited()).expect_err(source);
+            assert_eq!(error, Error::NotFound { what: "scene", given: source.into() });
         }
         assert!(!repository.list().iter().any(|name| name.starts_with("link")));
     }
@@ -180,18 +195,19 @@ mod tests {
     #[test]
     fn missing_ambiguous_and_empty_folders_have_different_errors() {
         let (outer, repository) = repository(&[("two/b.obj", TRIANGLE), ("two/c.obj", TRIANGLE), ("none/x.txt", "")]);
-        let absent = repository.open("absent").expect_err("a missing scene");
+        let absent = repository.open("absent", &MemoryReservation::unlimited()).expect_err("a missing scene");
         assert_eq!(absent, Error::NotFound { what: "scene", given: "absent".into() });
-        let ambiguous = repository.open("two").expect_err("two models").to_string();
+        let ambiguous = repository.open("two", &MemoryReservation::unlimited()).expect_err("two models").to_string();
         assert_eq!(
             ambiguous,
             "folder 'two': expected scene.toml or one .glb, .gltf, .obj, .ply, .stl or .npz file, got 2: b.obj, c.obj"
         );
-        let empty = repository.open("none").expect_err("a folder without models").to_string();
+        let empty =
+            repository.open("none", &MemoryReservation::unlimited()).expect_err("a folder without models").to_string();
         assert!(empty.ends_with("got no model among: x.txt"), "{empty}");
         assert!(matches!(SceneRepository::new(Some(&outer.path().join("no"))), Err(Error::Unavailable { .. })));
         let built_in = SceneRepository::new(None).expect("built-in scenes only");
         assert_eq!(built_in.list(), ["tree"]);
-        assert!(matches!(built_in.open("two"), Err(Error::NotFound { .. })));
+        assert!(matches!(built_in.open("two", &MemoryReservation::unlimited()), Err(Error::NotFound { .. })));
     }
 }

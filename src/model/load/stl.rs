@@ -15,6 +15,7 @@ use super::polygons::{Corner, PolygonMesh};
 use super::surface::{self, ModelOptions};
 use crate::domain::Material;
 use crate::error::{Result, invalid};
+use crate::memory::TemporaryReservation;
 use crate::scene::{SceneParts, UpAxis};
 
 /// Bytes of a binary header: a comment, then the number of triangles.
@@ -28,19 +29,22 @@ const TRIANGLE_BYTES: usize = 50;
 /// `Invalid` with the file, the line or triangle, and the expected and given value.
 pub(super) fn read(files: &AssetDir, name: &str, options: ModelOptions) -> Result<SceneParts> {
     let mut parts = SceneParts { up: UpAxis::Z, ..SceneParts::named(stem_of(name)) };
-    let polygons = parse(&files.read(name, MAX_MODEL_BYTES)?, &mut parts.remarks)
-        .map_err(|error| error.prefix_field(&format!("file '{name}'")))?;
+    let content = files.read(name, MAX_MODEL_BYTES)?;
+    let memory = files.reserve_polygons(name, content.len())?;
+    let polygons =
+        parse(&content, memory, &mut parts.remarks).map_err(|error| error.prefix_field(&format!("file '{name}'")))?;
     parts.materials.push(Material::unspecified(""));
     surface::add_domain(files, name, &polygons, options, None, &mut parts)?;
     Ok(parts)
 }
 
-fn parse(bytes: &[u8], remarks: &mut Vec<String>) -> Result<PolygonMesh> {
+fn parse(bytes: &[u8], memory: Option<TemporaryReservation>, remarks: &mut Vec<String>) -> Result<PolygonMesh> {
     let declared_bytes = bytes.get(HEADER_BYTES - 4..).and_then(|rest| rest.first_chunk()).map(|count| {
         let count = u32::from_le_bytes(*count) as usize;
         HEADER_BYTES + TRIANGLE_BYTES * count
     });
     let mut merger = VertexMerger::default();
+    merger.polygons.memory = memory;
     // A binary file may also begin with `solid`. Its size is certain.
     let is_text = bytes.trim_ascii_start().get(..5).is_some_and(|word| word.eq_ignore_ascii_case(b"solid"));
     match declared_bytes {
@@ -172,7 +176,7 @@ mod tests {
         let mut remarks = Vec::new();
         let padded = [binary("", 2, &SQUARE), vec![0; 3]].concat();
         for bytes in [TEXT.as_bytes(), &binary("solid exported", 2, &SQUARE), &padded] {
-            let polygons = parse(bytes, &mut remarks).expect("a valid file");
+            let polygons = parse(bytes, None, &mut remarks).expect("a valid file");
             assert_eq!(polygons.faces.len(), 2, "expected the triangles of both solids");
             assert_eq!(polygons.positions, [[0.0; 3], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0, 1.0, 0.0]]);
             let vertices: Vec<u32> = polygons.corners_of(1).iter().map(|corner| corner.vertex).collect();
@@ -202,7 +206,7 @@ mod tests {
             (TEXT[..60].into(), "end: expected endloop, got the end of the file"),
             ("solid\nobject\n".into(), "line 2: expected a statement of STL, got object"),
         ] {
-            assert_eq!(parse(&bytes, &mut Vec::new()).map(drop).expect_err(message).to_string(), message);
+            assert_eq!(parse(&bytes, None, &mut Vec::new()).map(drop).expect_err(message).to_string(), message);
         }
     }
 }

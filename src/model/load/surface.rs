@@ -37,7 +37,7 @@ impl ModelOptions {
 /// [`PolygonMesh::materials`]. `own_modes` are modes in the file itself; they have precedence over files beside it.
 ///
 /// # Errors
-/// `Invalid` with the file, and the expected and given value.
+/// `Invalid` with the file, and the expected and given value; `OutOfMemory`.
 pub(super) fn add_domain(
     files: &AssetDir,
     name: &str,
@@ -50,6 +50,7 @@ pub(super) fn add_domain(
         let location = format!("file '{file}'");
         move |error: Error| error.prefix_field(&location)
     };
+    files.reserve(&format!("mesh of '{name}'"), polygons.build_bytes())?;
     let triangles = polygons::build_all_faces(polygons, options.crease_angle).map_err(in_file(name))?;
     let mesh = color_vertices(polygons, triangles.mesh, parts).map_err(in_file(name))?;
     let (loaded, modes_file) = match (options.modes, own_modes) {

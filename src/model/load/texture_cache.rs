@@ -51,5 +51,5 @@ impl TextureCache {
 /// # Errors
 /// As for [`TextureCache::load`].
 pub(super) fn decode(files: &AssetDir, path: &str) -> Result<Texture> {
-    Texture::decode(path, &files.read(path, MAX_IMAGE_BYTES)?)
+    Texture::decode(path, &files.read(path, MAX_IMAGE_BYTES)?, files.memory())
 }

@@ -3,6 +3,7 @@
 
 use std::collections::VecDeque;
 use std::rc::Rc;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use rayon::prelude::*;
@@ -24,6 +25,7 @@ use crate::shaders;
 use crate::types::{FrameParams, FrameStats, VisibilityId};
 use crate::uniforms::frame::FrameUniforms;
 use modalcast_model::error::{Result, fault};
+use modalcast_model::memory::MemoryReservation;
 
 /// Words that one parallel task converts: enough to hide the cost of starting the task.
 const WORDS_PER_TASK: usize = 4096;
@@ -72,6 +74,8 @@ struct AovTarget {
     words_per_pixel: u64,
     ids: IdTarget,
     staging: Buffer,
+    last_use: Instant,
+    _memory: Arc<MemoryReservation>,
 }
 
 impl Aov {
@@ -171,10 +175,27 @@ impl AovReader {
         Self { gl: Rc::clone(gl), target: None }
     }
 
-    /// Begins to read a field for the current content of the scene's buffers, in bands within `band_limit`.
+    /// Whether a render target is cached.
+    pub(crate) const fn has_target(&self) -> bool {
+        self.target.is_some()
+    }
+
+    /// Frees the cached render target.
+    pub(crate) fn free_target(&mut self) {
+        self.target = None;
+    }
+
+    /// Frees the cached render target if no readback has used it for this time.
+    pub(crate) fn free_unused_target(&mut self, unused: Duration) {
+        self.target.take_if(|target| target.last_use.elapsed() >= unused);
+    }
+
+    /// Begins to read a field for the current content of the scene's buffers, in bands within `band_limit`. `reserve`
+    /// reserves the memory of a new target.
     ///
     /// # Errors
-    /// `Invalid` for a camera whose matrices overflow; `Fault` if no values were uploaded or OpenGL reports an error.
+    /// `Invalid` for a camera whose matrices overflow; the errors of `reserve`; `Fault` if no values were uploaded or
+    /// OpenGL reports an error.
     pub(crate) fn begin(
         &mut self,
         programs: &mut ProgramCache,
@@ -182,6 +203,7 @@ impl AovReader {
         params: &FrameParams,
         field: Aov,
         band_limit: BandLimit,
+        reserve: impl FnOnce(TargetDesc, u64) -> Result<Arc<MemoryReservation>>,
     ) -> Result<PartialAov> {
         let size = [params.width, params.height];
         let samples = if matches!(field, Aov::Values { .. }) { buffers.antialiasing(size).samples } else { 1 };
@@ -196,7 +218,7 @@ impl AovReader {
         if matches!(field, Aov::Values { .. }) && buffers.values.is_none() {
             return Err(fault("aov", "expected uploaded vertex values, got none"));
         }
-        let target = self.take_target(desc, words_per_pixel)?;
+        let target = self.take_target(desc, words_per_pixel, reserve)?;
         let bands = VecDeque::from(Band::divide(size, band_limit.max_pixels(desc.samples)));
         let is_divided = bands.len() > 1;
         let (timers, fence) = (Vec::new(), None);
@@ -238,12 +260,17 @@ impl AovReader {
         let draw_ms = timers.iter().map(PassTimer::ms).sum();
         let times = FrameTimes::of_stages(&[(RenderStage::Draw, draw_ms), (RenderStage::Read, read_ms)]);
         let TargetDesc { width, height, samples, .. } = target.desc;
-        self.target = Some(target);
+        self.target = Some(AovTarget { last_use: Instant::now(), ..target });
         Ok(AovImage { width, height, samples, bytes, times })
     }
 
     /// Takes the cached render target if it fits, else creates one.
-    fn take_target(&mut self, desc: TargetDesc, words_per_pixel: u64) -> Result<AovTarget> {
+    fn take_target(
+        &mut self,
+        desc: TargetDesc,
+        words_per_pixel: u64,
+        reserve: impl FnOnce(TargetDesc, u64) -> Result<Arc<MemoryReservation>>,
+    ) -> Result<AovTarget> {
         let cached_target = self
             .target
             .take()
@@ -251,9 +278,13 @@ impl AovReader {
         if let Some(cached_target) = cached_target {
             return Ok(cached_target);
         }
-        let bytes = 4 * words_per_pixel * u64::from(desc.width) * u64::from(desc.height);
+        let pixels = u64::from(desc.width) * u64::from(desc.height);
+        let bytes = 4 * words_per_pixel * pixels;
+        // Ids and depth per sample, the words, and their staging buffer.
+        let memory = reserve(desc, 8 * u64::from(desc.samples) * pixels + 2 * bytes)?;
         let ids = IdTarget::new(&self.gl, desc, bytes)?;
-        Ok(AovTarget { desc, words_per_pixel, ids, staging: self.gl.buffer(bytes, gl::STREAM_READ, None)? })
+        let staging = self.gl.buffer(bytes, gl::STREAM_READ, None)?;
+        Ok(AovTarget { desc, words_per_pixel, ids, staging, last_use: Instant::now(), _memory: memory })
     }
 }
 

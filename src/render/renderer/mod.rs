@@ -41,6 +41,7 @@ use crate::types::{BlurMethod, DevicePreference, FrameParams, FrameStats, PixelR
 use crate::uniforms::frame::FrameUniforms;
 use modalcast_model::deform::DeformedSurface;
 use modalcast_model::error::{Error, Result, fault, fault_in, invalid};
+use modalcast_model::memory::{MemoryBudget, MemoryKind, MemoryReservation};
 use modalcast_model::raster::{RasterGeometry, Rasterizer};
 use modalcast_model::scene::{PixelRect, Scene};
 use modalcast_model::shared_memory::PictureMemory;
@@ -74,6 +75,8 @@ pub struct Renderer {
     picture_memory: Option<Rc<dyn PictureMemory>>,
     /// Cached render targets, least recently used first.
     targets: Vec<RenderTarget>,
+    /// Limit on the memory of all targets, also of those that frames and AOVs own.
+    target_budget: Arc<MemoryBudget>,
     stats: FrameStats,
     /// The last frame that was submitted without an error.
     last_frame: Option<LastFrame>,
@@ -138,6 +141,7 @@ impl Renderer {
             blur_method: BlurMethod::default(),
             picture_memory: None,
             targets: Vec::new(),
+            target_budget: MemoryBudget::new(MemoryKind::RenderTargets, u64::MAX, u64::MAX),
             stats: FrameStats::default(),
             last_frame: None,
             frame_timeout: FRAME_TIMEOUT,
@@ -195,6 +199,11 @@ impl Renderer {
     /// Selects the implementation of the shadow blur for all scenes that are loaded after this call.
     pub fn set_blur_method(&mut self, method: BlurMethod) {
         self.blur_method = method;
+    }
+
+    /// Limits the memory of render targets. Without this call, it is unlimited.
+    pub fn set_target_budget(&mut self, target_budget: Arc<MemoryBudget>) {
+        self.target_budget = target_budget;
     }
 
     /// Sets the maximum number of samples (pixels times samples per pixel) that are drawn without a break. Larger
@@ -354,12 +363,13 @@ impl Renderer {
     /// Begins to read an AOV field in bands. The scene's buffers must not change until it is finished.
     ///
     /// # Errors
-    /// `Invalid` for a size above the limit or a camera whose matrices overflow; `Fault` if no values were uploaded or
-    /// OpenGL reports an error.
+    /// `Invalid` for a size above the limit or a camera whose matrices overflow; `OutOfMemory`; `Fault` if no values were
+    /// uploaded or OpenGL reports an error.
     pub fn begin_aov(&mut self, buffers: &SceneBuffers, params: &FrameParams, field: Aov) -> Result<PartialAov> {
         let _current = self.gl.make_current()?;
         self.check_size(params)?;
-        self.aov_reader.begin(&mut self.programs, buffers, params, field, self.band_limit)
+        let reserve = |desc, bytes| reserve_target(&self.target_budget, &mut self.targets, desc, bytes);
+        self.aov_reader.begin(&mut self.programs, buffers, params, field, self.band_limit, reserve)
     }
 
     /// Submits the next band of an AOV field.
@@ -429,6 +439,7 @@ impl Renderer {
     pub fn free_unused_targets(&mut self, unused: Duration) -> Result<()> {
         let _current = self.gl.make_current()?;
         self.targets.retain(|target| target.last_use.elapsed() < unused);
+        self.aov_reader.free_unused_target(unused);
         if let Some(last_frame) = &self.last_frame
             && self.targets.iter().all(|target| target.desc != last_frame.desc)
         {
@@ -439,7 +450,7 @@ impl Renderer {
 
     /// Whether a render target is cached.
     pub const fn has_targets(&self) -> bool {
-        !self.targets.is_empty()
+        !self.targets.is_empty() || self.aov_reader.has_target()
     }
 
     /// Moves the target with this description to the end of the cache. Creates it if it is not cached, after dropping
@@ -453,8 +464,36 @@ impl Renderer {
         if self.targets.len() >= MAX_TARGETS {
             self.targets.remove(0);
         }
-        self.targets.push(RenderTarget::new(&self.gl, desc, self.picture_memory.clone())?);
+        let memory = match reserve_target(&self.target_budget, &mut self.targets, desc, desc.bytes()) {
+            Err(_) if self.aov_reader.has_target() => {
+                self.aov_reader.free_target();
+                reserve_target(&self.target_budget, &mut self.targets, desc, desc.bytes())
+            }
+            result => result,
+        }?;
+        self.targets.push(RenderTarget::new(&self.gl, desc, memory, self.picture_memory.clone())?);
         Ok(())
+    }
+}
+
+/// Reserves the memory of a target. Drops the least recently used targets of the cache until it is available.
+///
+/// # Errors
+/// `OutOfMemory` if the target is above the limit, or the targets of frames in progress leave too little.
+fn reserve_target(
+    budget: &Arc<MemoryBudget>,
+    cached_targets: &mut Vec<RenderTarget>,
+    desc: TargetDesc,
+    bytes: u64,
+) -> Result<Arc<MemoryReservation>> {
+    let object = format!("a frame of {} x {} pixels", desc.width, desc.height);
+    let memory = MemoryReservation::new(budget);
+    loop {
+        match memory.reserve(&object, bytes) {
+            Ok(()) => return Ok(memory),
+            Err(_) if bytes <= budget.per_scene() && !cached_targets.is_empty() => drop(cached_targets.remove(0)),
+            Err(error) => return Err(error),
+        }
     }
 }
 

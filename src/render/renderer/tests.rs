@@ -13,10 +13,11 @@ use crate::device::gl::UnsharedMemory;
 use crate::device::readback_ring::{MAX_FRAMES_IN_FLIGHT, ReadbackRing};
 use crate::pass::Pass;
 use crate::scene_data::geometry::tests::squares;
-use crate::{DevicePreference, FrameImage, FrameParams, PixelReadback, SceneBuffers};
+use crate::{Aov, DevicePreference, FrameImage, FrameParams, PixelReadback, SceneBuffers};
 use modalcast_model::deform::DeformedSurface;
 use modalcast_model::domain::{AlphaMode, Material};
 use modalcast_model::error::Error;
+use modalcast_model::memory::{MemoryBudget, MemoryKind};
 use modalcast_model::scene::{Camera, Scene, Transparency};
 use modalcast_model::shared_memory::PictureMemory;
 
@@ -381,4 +382,28 @@ fn calls_fail_while_the_context_is_occupied_and_work_afterwards() {
         renderer.draw(&buffers, &params(&scene, 64)).expect("draws").rgba == expected_rgba,
         "expected no effect of the failed upload"
     );
+}
+
+#[test]
+fn render_targets_stay_within_their_budget() {
+    let (mut renderer, scene, buffers) = load_renderer();
+    renderer.draw(&buffers, &params(&scene, 64)).expect("draws");
+    let bytes = renderer.targets[0].desc.bytes();
+    renderer.targets.clear();
+    let budget = MemoryBudget::new(MemoryKind::RenderTargets, bytes, bytes);
+    renderer.set_target_budget(Arc::clone(&budget));
+    // Each target replaces the one before.
+    for side in [64, 63, 64] {
+        renderer.draw(&buffers, &params(&scene, side)).expect("draws");
+        assert_eq!(renderer.targets.len(), 1);
+    }
+    assert_eq!(budget.reserved(), bytes);
+    let result = renderer.draw(&buffers, &params(&scene, 512)).map(drop);
+    assert!(matches!(result, Err(Error::OutOfMemory { asked, total, .. }) if asked > total), "{result:?}");
+    renderer.render_aov(&buffers, &params(&scene, 64), Aov::Depth).expect("replaces the target of the frame");
+    assert!(renderer.targets.is_empty() && renderer.has_targets() && budget.reserved() < bytes);
+    renderer.draw(&buffers, &params(&scene, 64)).expect("replaces the target of the AOV");
+    assert_eq!(budget.reserved(), bytes);
+    renderer.free_unused_targets(Duration::ZERO).expect("frees");
+    assert_eq!((renderer.has_targets(), budget.reserved()), (false, 0));
 }

@@ -3,6 +3,7 @@
 
 use std::cell::Cell;
 use std::rc::Rc;
+use std::sync::Arc;
 use std::time::Instant;
 
 use super::depth_pyramid::DepthPyramid;
@@ -13,6 +14,7 @@ use crate::device::readback_ring::ReadbackRing;
 use crate::layout::tile_list_bytes;
 use crate::region::{DirtyRegion, Region};
 use modalcast_model::error::Result;
+use modalcast_model::memory::MemoryReservation;
 use modalcast_model::scene::Culling;
 use modalcast_model::shared_memory::PictureMemory;
 
@@ -42,6 +44,7 @@ pub(crate) struct RenderTarget {
     /// Present with occlusion culling.
     pub(crate) depth_pyramid: Option<DepthPyramid>,
     pub(crate) depth: Texture,
+    _memory: Arc<MemoryReservation>,
 }
 
 /// Light of the blended triangles per sample, and their transmittance in alpha.
@@ -53,8 +56,14 @@ pub(crate) struct BlendLayer {
 }
 
 impl RenderTarget {
-    /// `picture_memory`: the memory of shared pictures, if there are any.
-    pub(crate) fn new(gl: &Rc<Gl>, desc: TargetDesc, picture_memory: Option<Rc<dyn PictureMemory>>) -> Result<Self> {
+    /// Creates the images and buffers in memory that is reserved for them. `picture_memory`: allocates shared pictures, if
+    /// there are any.
+    pub(crate) fn new(
+        gl: &Rc<Gl>,
+        desc: TargetDesc,
+        memory: Arc<MemoryReservation>,
+        picture_memory: Option<Rc<dyn PictureMemory>>,
+    ) -> Result<Self> {
         let TargetDesc { width, height, blend_storage, .. } = desc;
         let (ids, depth) = (create_image(gl, desc, gl::R32UI)?, create_image(gl, desc, gl::DEPTH_COMPONENT32F)?);
         let [_, cull_range] = desc.readback_ranges();
@@ -94,6 +103,7 @@ impl RenderTarget {
                 None
             },
             depth,
+            _memory: memory,
         })
     }
 }

@@ -4,8 +4,9 @@ use std::ops::Range;
 use std::rc::Rc;
 
 use crate::device::gl::{self, Gl, Texture, TextureDesc};
+use crate::device::readback_ring::MAX_FRAMES_IN_FLIGHT;
 use crate::layout::cull::CULL_COUNTER_BYTES;
-use crate::layout::oit::OIT_HEADER_BYTES;
+use crate::layout::oit::{OIT_HEADER_BYTES, RECORD_BYTES};
 use modalcast_model::error::Result;
 use modalcast_model::scene::{Culling, RenderSettings};
 
@@ -72,6 +73,26 @@ impl TargetDesc {
         4 * u64::from(self.width) * u64::from(self.height)
     }
 
+    /// Device memory in bytes of all images and buffers of a frame.
+    pub(crate) fn bytes(&self) -> u64 {
+        let pixels = u64::from(self.width) * u64::from(self.height);
+        let samples = pixels * u64::from(self.samples);
+        let blend_bytes = match self.blend_storage {
+            BlendStorage::None => 0,
+            // RGBA16F per sample.
+            BlendStorage::SingleLayer => 8 * samples,
+            // RGBA16F per sample, a counter and a cursor per pixel.
+            BlendStorage::FragmentLists(fragments) => 8 * samples + 8 * pixels + RECORD_BYTES * u64::from(fragments),
+        };
+        // RGBA16F, or f32 depth, of all levels, which together have 4/3 of the pixels.
+        let bloom_bytes = if self.bloom_levels > 0 { 32 * pixels / 3 } else { 0 };
+        let pyramid_bytes = if self.culling == Culling::Occlusion { 16 * pixels / 3 } else { 0 };
+        let [_, readback_range] = self.readback_ranges();
+        let staging_bytes = MAX_FRAMES_IN_FLIGHT as u64 * readback_range.end;
+        // Ids and depth per sample, and RGBA16F and the encoded color per pixel.
+        8 * samples + 8 * pixels + self.frame_bytes() + staging_bytes + blend_bytes + bloom_bytes + pyramid_bytes
+    }
+
     /// Byte ranges of the fragment counters and of the culling counters, which follow the encoded frame in the staging
     /// buffer. They are empty without fragment lists or culling.
     pub(crate) fn readback_ranges(&self) -> [Range<u64>; 2] {
@@ -107,4 +128,25 @@ pub(crate) fn create_nearest_texture(gl: &Rc<Gl>, desc: TextureDesc) -> Result<T
     let texture = gl.texture(desc)?;
     texture.set_sampling(&[(gl::TEXTURE_MIN_FILTER, gl::NEAREST), (gl::TEXTURE_MAG_FILTER, gl::NEAREST)], 1.0);
     Ok(texture)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn bytes_of_a_target_grow_with_its_features() {
+        let plain = TargetDesc { width: 100, height: 10, ..TargetDesc::EMPTY };
+        // Ids, depth, scene color, encoded color, and three staging buffers.
+        assert_eq!(plain.bytes(), (4 + 4 + 8 + 4 + 3 * 4) * 1000);
+        let multisampled = TargetDesc { samples: 4, ..plain };
+        assert_eq!(multisampled.bytes() - plain.bytes(), 3 * 8 * 1000);
+        let layered = TargetDesc { blend_storage: BlendStorage::SingleLayer, ..multisampled };
+        assert_eq!(layered.bytes() - multisampled.bytes(), 4 * 8 * 1000);
+        let lists = TargetDesc { blend_storage: BlendStorage::FragmentLists(1 << 20), ..plain };
+        assert!(lists.bytes() - plain.bytes() >= RECORD_BYTES << 20);
+        for larger in [TargetDesc { bloom_levels: 3, ..plain }, TargetDesc { culling: Culling::Occlusion, ..plain }] {
+            assert!(larger.bytes() > plain.bytes(), "{larger:?}");
+        }
+    }
 }

@@ -2,6 +2,7 @@
 
 use std::borrow::Cow;
 use std::cell::Cell;
+use std::sync::Arc;
 
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD_PAD_INDIFFERENT;
@@ -12,6 +13,7 @@ use super::{MAX_FILE_BYTES, get_element};
 use crate::domain::Texture;
 use crate::error::{Result, invalid};
 use crate::load::asset_dir::AssetDir;
+use crate::memory::MemoryReservation;
 
 /// The largest total size in bytes of a model's buffers, decoded accessors and pixels. Without this limit, a small file
 /// that refers to one large buffer or image many times could exhaust the memory.
@@ -120,8 +122,14 @@ impl<'a> GltfBuffers<'a> {
     /// Subtracts `bytes` from the budget; call it before allocating them.
     ///
     /// # Errors
-    /// `Invalid` if the budget of the model is exceeded.
+    /// `Invalid` if the budget of the model is exceeded, `OutOfMemory` if that of the scene is.
     pub(super) fn charge_budget(&self, bytes: u64) -> Result<()> {
+        self.count_budget(bytes)?;
+        self.folder.reserve("model", bytes)
+    }
+
+    /// As [`Self::charge_budget`], for bytes that are already reserved in the memory of the scene.
+    pub(super) fn count_budget(&self, bytes: u64) -> Result<()> {
         let remaining_budget = self.remaining_budget.get().checked_sub(bytes);
         let remaining_budget = remaining_budget
             .ok_or_else(|| invalid("decoded size", format!("at most {MEMORY_BUDGET} bytes in total"), "more"))?;
@@ -129,10 +137,17 @@ impl<'a> GltfBuffers<'a> {
         Ok(())
     }
 
+    /// The memory of the scene that is loaded.
+    pub(super) const fn memory(&self) -> &Arc<MemoryReservation> {
+        self.folder.memory()
+    }
+
     fn read_uri(&self, uri: &str) -> Result<Vec<u8>> {
         let content = match uri.strip_prefix("data:") {
             Some(data) => decode_data_uri(data)?,
-            None => self.folder.read(&relative_path(uri)?, MAX_FILE_BYTES.min(self.remaining_budget.get()))?,
+            None => {
+                self.folder.read(&relative_path(uri)?, MAX_FILE_BYTES.min(self.remaining_budget.get()))?.into_bytes()
+            }
         };
         self.charge_budget(content.len() as u64)?;
         Ok(content)

@@ -113,8 +113,8 @@ impl<'a> TextureLoader<'a> {
     fn decode(&self, image: usize) -> Result<Texture> {
         let add_image_location = |error: crate::error::Error| error.prefix_field(&format!("images[{image}]"));
         let encoded = self.buffers.image(image).map_err(add_image_location)?;
-        let texture = Texture::decode(self.name(image), &encoded).map_err(add_image_location)?;
-        self.buffers.charge_budget(texture.rgba().len() as u64).map_err(add_image_location)?;
+        let texture = Texture::decode(self.name(image), &encoded, self.buffers.memory()).map_err(add_image_location)?;
+        self.buffers.count_budget(texture.rgba().len() as u64).map_err(add_image_location)?;
         Ok(texture)
     }
 

@@ -19,6 +19,10 @@ use super::asset_dir::{AssetDir, MAX_MODEL_BYTES, extension_of, stem_of};
 use crate::domain::Modes;
 use crate::error::{Result, invalid};
 
+/// Bytes of parsed entries per byte of a file, at most: two bytes, an f16 number or a digit and a space, become f32 in two
+/// orders.
+const PARSED_BYTES_PER_BYTE: u64 = 4;
+
 /// The note of a domain that names the file of its modes.
 pub(super) const FILE_NOTE: &str = "modes.file";
 
@@ -66,15 +70,20 @@ pub(super) fn check_eigenvalues(eigenvalues: &[f64], rank: usize) -> Result<()> 
 /// # Errors
 /// `Invalid` with the file, and the expected and given value.
 pub(super) fn read(files: &AssetDir, name: &str) -> Result<LoadedModes> {
-    let parse: fn(&[u8]) -> Result<LoadedModes> = match extension_of(name).as_str() {
-        "float" | "double" | "u" => |bytes| vega::parse(bytes).map(LoadedModes::from),
-        "npy" => |bytes| matrix(npy::parse(bytes)?).map(LoadedModes::from),
-        "npz" => |bytes| npz::read_modes(&mut npz::NpzArchive::open(bytes)?),
-        "safetensors" => safetensors::parse,
-        "txt" => |bytes| sofa::parse(bytes).map(LoadedModes::from),
+    let location = format!("file '{name}'");
+    let parse: fn(&[u8], &AssetDir) -> Result<LoadedModes> = match extension_of(name).as_str() {
+        "float" | "double" | "u" => |bytes, _| vega::parse(bytes).map(LoadedModes::from),
+        "npy" => |bytes, _| matrix(npy::parse(bytes)?).map(LoadedModes::from),
+        "npz" => |bytes, files| npz::read_modes(&mut npz::NpzArchive::open(bytes, files.memory())?),
+        "safetensors" => |bytes, _| safetensors::parse(bytes),
+        "txt" => |bytes, _| sofa::parse(bytes).map(LoadedModes::from),
         _ => return Err(unknown_format(name)),
     };
-    parse(&files.read(name, MAX_MODEL_BYTES)?).map_err(|error| error.prefix_field(&format!("file '{name}'")))
+    let content = files.read(name, MAX_MODEL_BYTES)?;
+    let _parsed = files.reserve_temporary(&location, PARSED_BYTES_PER_BYTE * content.len() as u64)?;
+    let loaded = parse(&content, files).map_err(|error| error.prefix_field(&location))?;
+    files.reserve(&location, size_of_val(loaded.modes.columns()) as u64)?;
+    Ok(loaded)
 }
 
 fn unknown_format(name: &str) -> crate::error::Error {

@@ -1,6 +1,7 @@
 //! Reader of NumPy archives (`numpy.savez`, `numpy.savez_compressed`): arrays by name.
 
 use std::io::{Cursor, Read as _};
+use std::sync::Arc;
 
 use zip::ZipArchive;
 
@@ -9,11 +10,14 @@ use super::{LoadedModes, matrix};
 use crate::domain::MAX_RANK;
 use crate::error::{Error, Result, invalid};
 use crate::load::asset_dir::MAX_MODEL_BYTES;
+use crate::memory::{MemoryReservation, TemporaryReservation};
 
 /// The largest number of arrays in an archive.
 const MAX_ARRAYS: usize = 1024;
 /// The largest number of names in an error message.
 const MAX_LISTED_NAMES: usize = 16;
+/// Bytes of an entry while it is parsed: as f64, and as f32 in two orders.
+const PARSED_BYTES_PER_ENTRY: u64 = 16;
 /// DEFLATE reduces data by a factor of at most 1032.
 const MAX_COMPRESSION: u64 = 1032;
 
@@ -21,16 +25,19 @@ const MAX_COMPRESSION: u64 = 1032;
 #[derive(Debug)]
 pub(in crate::load) struct NpzArchive<'a> {
     archive: ZipArchive<Cursor<&'a [u8]>>,
+    memory: Arc<MemoryReservation>,
+    /// The memory of the arrays that were read.
+    reserved: Vec<TemporaryReservation>,
     /// Names of the arrays, without `.npy`.
     names: Vec<String>,
 }
 
 impl<'a> NpzArchive<'a> {
-    /// Reads the directory of the archive.
+    /// Reads the directory of the archive. Its arrays reserve their memory in `memory` until the archive is dropped.
     ///
     /// # Errors
     /// `Invalid` if the bytes are not a ZIP archive, or the archive has too many members.
-    pub(in crate::load) fn open(bytes: &'a [u8]) -> Result<Self> {
+    pub(in crate::load) fn open(bytes: &'a [u8], memory: &Arc<MemoryReservation>) -> Result<Self> {
         let archive = ZipArchive::new(Cursor::new(bytes))
             .map_err(|error| invalid("archive", "a NumPy archive (numpy.savez)", error))?;
         if archive.len() > MAX_ARRAYS {
@@ -39,7 +46,7 @@ impl<'a> NpzArchive<'a> {
         let members = archive.file_names().filter_map(Result::ok);
         let mut names: Vec<String> = members.filter_map(|name| Some(name.strip_suffix(".npy")?.to_owned())).collect();
         names.sort();
-        Ok(Self { archive, names })
+        Ok(Self { archive, memory: Arc::clone(memory), reserved: Vec::new(), names })
     }
 
     /// Names of the arrays, sorted.
@@ -57,7 +64,7 @@ impl<'a> NpzArchive<'a> {
     ///
     /// # Errors
     /// `Invalid` with the name of the array, if the member cannot be read, the sizes in the headers contradict each
-    /// other, or the array is too large.
+    /// other, or the array is too large; `OutOfMemory`.
     pub(in crate::load) fn read(
         &mut self,
         name: &str,
@@ -88,6 +95,9 @@ impl<'a> NpzArchive<'a> {
             return Err(invalid("data", expected, size.saturating_sub(header_bytes as u64)));
         }
         check_shape(&header.shape)?;
+        let entries = header.shape.iter().product::<usize>() as u64;
+        let object = format!("array '{name}' of {:?}", header.shape);
+        self.reserved.push(self.memory.reserve_temporary(&object, size + PARSED_BYTES_PER_ENTRY * entries)?);
         // One byte more than declared, so that a longer member is noticed.
         let remaining = (size - bytes.len() as u64).saturating_add(1);
         member.take(remaining).read_to_end(&mut bytes).map_err(|error| unreadable(&error))?;
@@ -166,7 +176,7 @@ pub(in crate::load) mod tests {
     }
 
     fn read(bytes: &[u8]) -> Result<LoadedModes> {
-        read_modes(&mut NpzArchive::open(bytes)?)
+        read_modes(&mut NpzArchive::open(bytes, &MemoryReservation::unlimited())?)
     }
 
     #[test]

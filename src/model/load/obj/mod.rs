@@ -38,13 +38,15 @@ pub(super) fn read(files: &AssetDir, name: &str, options: ModelOptions) -> Resul
 /// # Errors
 /// `Invalid` with the file, the line and the statement.
 pub(super) fn parse_file(files: &AssetDir, name: &str) -> Result<ObjFile> {
-    ObjFile::parse(&files.read(name, MAX_MODEL_BYTES)?).map_err(|error| error.prefix_field(&format!("file '{name}'")))
+    let content = files.read(name, MAX_MODEL_BYTES)?;
+    let memory = files.reserve_polygons(name, content.len())?;
+    ObjFile::parse(&content, memory).map_err(|error| error.prefix_field(&format!("file '{name}'")))
 }
 
 /// Parses the text of a test, without materials.
 #[cfg(test)]
 pub(super) fn parse_obj(text: &str) -> super::polygons::PolygonMesh {
-    ObjFile::parse(text.as_bytes()).expect("a valid OBJ file").polygons
+    ObjFile::parse(text.as_bytes(), None).expect("a valid OBJ file").polygons
 }
 
 /// Adds the materials that the faces use, in the order of [`super::polygons::PolygonMesh::materials`], and their

@@ -7,6 +7,7 @@ use std::collections::{BTreeMap, HashMap};
 
 use crate::error::{Error, Result, invalid};
 use crate::load::polygons::{Corner, NO_INDEX, PolygonMesh};
+use crate::memory::TemporaryReservation;
 
 /// The largest number of remarks on unsupported statements, one per key.
 const MAX_REMARKS: usize = 16;
@@ -26,12 +27,13 @@ pub(in crate::load) struct ObjFile {
 }
 
 impl ObjFile {
-    /// Parses a file.
+    /// Parses a file. The polygons grow in `memory`, if it is limited.
     ///
     /// # Errors
-    /// `Invalid` with the line and the statement.
-    pub(in crate::load) fn parse(bytes: &[u8]) -> Result<Self> {
+    /// `Invalid` with the line and the statement, `OutOfMemory`.
+    pub(in crate::load) fn parse(bytes: &[u8], memory: Option<TemporaryReservation>) -> Result<Self> {
         let mut parser = Parser::default();
+        parser.obj.polygons.memory = memory;
         let mut joined_line = Vec::new();
         for (index, line) in bytes.split(|byte| *byte == b'\n').enumerate() {
             let line = line.strip_suffix(b"\r").unwrap_or(line);
@@ -237,7 +239,7 @@ mod tests {
     #[test]
     fn negative_indices_count_back_from_the_last_element() {
         let text = format!("{TRIANGLE}vt 0.25 0.25\nvn 0 0 1\nf -3/-1/-1 -2/-1/-1 -1/-1/-1\nv 9 9 9\n");
-        let obj = ObjFile::parse(text.as_bytes()).expect("a valid file");
+        let obj = ObjFile::parse(text.as_bytes(), None).expect("a valid file");
         let indices: Vec<_> =
             obj.polygons.corners_of(0).iter().map(|corner| (corner.vertex, corner.uv, corner.normal)).collect();
         assert_eq!(indices, [(0, 0, 0), (1, 0, 0), (2, 0, 0)]);
@@ -250,7 +252,7 @@ mod tests {
         // The third vertex has a color. The material `none` has no face.
         let text = "# head\r\nmtllib my file.mtl\r\nv 0 0 0 # first\r\nv 1 \\\r\n 0 0\r\nv 0 1 0 1 0 0\r\n\
                     usemtl dark bark\r\nf 1 2 \\\n 3\r\nl 1 2\r\nusemtl none\nusemtl light\nf 3 2 1 # back\n";
-        let obj = ObjFile::parse(text.as_bytes()).expect("a valid file");
+        let obj = ObjFile::parse(text.as_bytes(), None).expect("a valid file");
         assert_eq!(obj.libraries, ["my file.mtl"]);
         assert_eq!(obj.polygons.materials, ["dark bark", "light"]);
         assert_eq!(obj.polygons.positions, [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]);
@@ -283,7 +285,7 @@ mod tests {
             ("", "faces: expected at least one face, got 0"),
         ] {
             let text = format!("{TRIANGLE}{statement}\n");
-            assert_eq!(ObjFile::parse(text.as_bytes()).expect_err(statement).to_string(), message);
+            assert_eq!(ObjFile::parse(text.as_bytes(), None).expect_err(statement).to_string(), message);
         }
     }
 
@@ -299,7 +301,7 @@ mod tests {
             b"mtllib",
             b"f -9223372036854775808 1 1",
         ] {
-            assert!(ObjFile::parse(text).is_err());
+            assert!(ObjFile::parse(text, None).is_err());
         }
     }
 }

@@ -29,6 +29,7 @@ pub(super) fn read(files: &AssetDir, name: &str, crease_angle: CreaseAngle) -> R
     let (structure_file, ids_file) = (format!("{stem}.structure.json"), format!("{stem}_object_id.dat"));
     let file_field = |name: &str| format!("file '{name}'");
     let obj = obj::parse_file(files, name)?;
+    files.reserve(&format!("mesh of '{name}'"), obj.polygons.build_bytes())?;
     let structure = PlantStructure::parse(&files.read(&structure_file, MAX_TEXT_BYTES)?)
         .map_err(|error| error.prefix_field(&file_field(&structure_file)))?;
     let object_ids = parse_object_ids(&files.read(&ids_file, MAX_TEXT_BYTES)?, obj.polygons.faces.len());

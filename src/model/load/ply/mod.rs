@@ -28,7 +28,9 @@ pub(super) fn read(files: &AssetDir, name: &str, options: ModelOptions) -> Resul
     let in_file = |error: crate::error::Error| error.prefix_field(&format!("file '{name}'"));
     let mut parts = SceneParts { up: UpAxis::Z, ..SceneParts::named(stem_of(name)) };
     let mut ply = PlyReader::default();
-    ply.parse(&files.read(name, MAX_MODEL_BYTES)?).map_err(in_file)?;
+    let content = files.read(name, MAX_MODEL_BYTES)?;
+    ply.polygons.memory = files.reserve_polygons(name, content.len())?;
+    ply.parse(&content).map_err(in_file)?;
     let mut material = Material::unspecified("");
     if let Some(image) = ply.image.take().filter(|_| ply.polygons.has_uvs()) {
         if let Some(reason) = files.unusable_image(&image).map_err(in_file)? {

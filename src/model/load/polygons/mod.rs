@@ -8,6 +8,7 @@ pub(super) use build::{build_all_faces, build_faces};
 pub(super) use vertex_colors::{VertexColors, linear_from_srgb, paint};
 
 use crate::error::{Result, invalid};
+use crate::memory::TemporaryReservation;
 
 /// The index of a missing texture coordinate or normal of a corner.
 pub(super) const NO_INDEX: u32 = u32::MAX;
@@ -52,7 +53,14 @@ pub(super) struct PolygonMesh {
     corners: Vec<Corner>,
     /// Material names in order of first use.
     pub(super) materials: Vec<String>,
+    /// The memory of the lists, which grows with them. `None`: unlimited.
+    pub(super) memory: Option<TemporaryReservation>,
 }
+
+/// Largest memory in bytes while triangles are built, per corner of a polygon and per vertex: the map of the corners, the
+/// triangles and their neighbors at creases, and the mesh itself.
+const BUILD_BYTES_PER_CORNER: u64 = 160;
+const BUILD_BYTES_PER_VERTEX: u64 = 64;
 
 impl PolygonMesh {
     /// A mesh without faces, whose faces will have one material without a name.
@@ -60,10 +68,24 @@ impl PolygonMesh {
         Self { positions, materials: vec![String::new()], ..Self::default() }
     }
 
+    /// Largest memory in bytes that building the triangles takes, from the numbers of vertices and corners.
+    pub(super) fn build_bytes(&self) -> u64 {
+        BUILD_BYTES_PER_CORNER * self.corners.len() as u64 + BUILD_BYTES_PER_VERTEX * self.positions.len() as u64
+    }
+
+    /// Reserves the memory of the lists, whose capacity is at most twice their length.
+    fn reserve_lists(&mut self) -> Result<()> {
+        let Some(memory) = &mut self.memory else { return Ok(()) };
+        let vectors = self.positions.len() + self.normals.len() + self.colors.len();
+        let faces = size_of_val(&self.faces[..]) + size_of_val(&self.corners[..]);
+        let bytes = (12 * vectors + size_of_val(&self.uvs[..]) + faces) as u64;
+        if bytes > memory.bytes() { memory.grow_to(2 * bytes) } else { Ok(()) }
+    }
+
     /// Adds a polygon.
     ///
     /// # Errors
-    /// `Invalid` for fewer than three corners.
+    /// `Invalid` for fewer than three corners, `OutOfMemory`.
     pub(super) fn add_face(
         &mut self,
         corners: impl IntoIterator<Item = Corner>,
@@ -77,7 +99,7 @@ impl PolygonMesh {
             return Err(invalid("face", "at least 3 corners", corner_count));
         }
         self.faces.push(Face { first_corner, corner_count, material, place });
-        Ok(())
+        self.reserve_lists()
     }
 
     /// The corners of a polygon.

@@ -1,0 +1,169 @@
+//! The memory that an open scene takes, and its reservation.
+
+use std::sync::Arc;
+
+use crate::engine::memory_limits::MemoryLimits;
+use modalcast_model::domain::Shape;
+use modalcast_model::error::Result;
+use modalcast_model::memory::{MemoryBudget, MemoryReservation};
+use modalcast_model::scene::Scene;
+
+/// Bytes of a domain on host and device, without its mesh: names, notes, transforms of several steps, tables.
+const DOMAIN_BYTES: u64 = 2048;
+
+/// Output sets of a deformer: one is written while another is copied.
+const OUTPUT_SETS: u64 = 2;
+
+/// The budgets that all scenes share.
+#[derive(Debug)]
+pub(super) struct MemoryBudgets {
+    host: Arc<MemoryBudget>,
+    device: Arc<MemoryBudget>,
+    has_device: bool,
+    has_renderer: bool,
+}
+
+/// The reserved memory of one scene, until this is dropped.
+#[derive(Debug)]
+pub(super) struct SceneMemory {
+    pub(super) host: Arc<MemoryReservation>,
+    device: Arc<MemoryReservation>,
+    has_device: bool,
+    has_renderer: bool,
+}
+
+impl MemoryBudgets {
+    /// Without a renderer, scenes need no memory to be drawn.
+    pub(super) fn new(limits: MemoryLimits, has_renderer: bool) -> Self {
+        let has_device = limits.has_device;
+        Self { host: limits.host_budget(), device: limits.device_budget(), has_device, has_renderer }
+    }
+
+    /// The memory of a scene that is to be loaded.
+    pub(super) fn new_scene(&self) -> SceneMemory {
+        SceneMemory {
+            host: MemoryReservation::new(&self.host),
+            device: MemoryReservation::new(&self.device),
+            has_device: self.has_device,
+            has_renderer: self.has_renderer,
+        }
+    }
+}
+
+impl SceneMemory {
+    /// Replaces what the loaders have reserved by the memory of the loaded scene on host and device.
+    ///
+    /// # Errors
+    /// `OutOfMemory`.
+    pub(super) fn reserve_loaded(&self, name: &str, scene: &Scene) -> Result<()> {
+        let object = format!("scene '{name}'");
+        let (mut host, mut device) = (host_bytes(scene), device_bytes(scene));
+        if self.has_renderer {
+            // The levels of textures are computed on the host before they are uploaded.
+            host += 4 * pixel_bytes(scene) / 3;
+            device += render_bytes(scene);
+        }
+        if self.has_device {
+            self.host.resize(&object, host)?;
+            self.device.resize(&object, device)
+        } else {
+            self.host.resize(&object, host.saturating_add(device))
+        }
+    }
+}
+
+/// Host memory of a scene: its arrays and pixels, and copies of the outputs of a deformer.
+fn host_bytes(scene: &Scene) -> u64 {
+    array_bytes(scene) + pixel_bytes(scene) + output_bytes(scene) + domain_bytes(scene)
+}
+
+/// Device memory of a deformer: U, the mesh, and the outputs.
+fn device_bytes(scene: &Scene) -> u64 {
+    array_bytes(scene) + output_bytes(scene) + domain_bytes(scene)
+}
+
+/// Device memory of a renderer: buffers, textures with their levels, and shadow maps.
+fn render_bytes(scene: &Scene) -> u64 {
+    // Rebased positions and the values of a color map are created by the first frame that needs them.
+    let on_demand = 16 * scene.layout.vertices as u64;
+    modalcast_render::plan(scene).bytes() + on_demand
+}
+
+fn array_bytes(scene: &Scene) -> u64 {
+    scene.shapes.iter().map(shape_bytes).sum()
+}
+
+fn pixel_bytes(scene: &Scene) -> u64 {
+    scene.textures.iter().map(|texture| texture.rgba().len() as u64).sum()
+}
+
+fn domain_bytes(scene: &Scene) -> u64 {
+    DOMAIN_BYTES * scene.domains.len() as u64
+}
+
+/// Bytes of the arrays of a shape: 3 f32 per vertex, its rank times 3 f32 of U, and per corner its vertex, its normal,
+/// its texture coordinates and its tangent.
+fn shape_bytes(shape: &Shape) -> u64 {
+    let mesh = &shape.mesh;
+    let corners = mesh.corners();
+    let lists = [
+        size_of_val(mesh.rest_positions()),
+        size_of_val(mesh.triangles()),
+        mesh.inner_edges().len(),
+        size_of_val(&corners.vertices[..]),
+        size_of_val(&corners.normals[..]),
+        size_of_val(&corners.uvs[..]),
+        size_of_val(shape.tangents()),
+        size_of_val(shape.modes.columns()),
+    ];
+    lists.iter().sum::<usize>() as u64
+}
+
+/// Bytes of the outputs of a deformer: positions and displacements per vertex, normals and tangents per corner.
+fn output_bytes(scene: &Scene) -> u64 {
+    let (vertices, corners) = (scene.layout.vertices as u64, scene.layout.corners as u64);
+    let tangent = if scene.features.normal_maps { 16 } else { 0 };
+    OUTPUT_SETS * (24 * vertices + (12 + tangent) * corners)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::Config;
+    use crate::engine::testing;
+    use modalcast_model::error::Error;
+
+    fn budgets(bytes: u64, has_device: bool) -> MemoryBudgets {
+        let config = Config {
+            scenes_host_bytes: Some(bytes),
+            scene_host_bytes: Some(bytes),
+            scenes_device_bytes: Some(bytes),
+            scene_device_bytes: Some(bytes),
+            ..Config::default()
+        };
+        MemoryBudgets::new(MemoryLimits::new(&config, has_device.then_some(1 << 30)), false)
+    }
+
+    #[test]
+    fn loaded_scene_replaces_the_reservation_of_its_files() {
+        let scene = testing::two_strips();
+        let budgets = budgets(1 << 30, true);
+        let memory = budgets.new_scene();
+        memory.host.reserve("file", 1 << 20).expect("expected enough memory");
+        memory.reserve_loaded("strips", &scene).expect("expected enough memory");
+        let expected = (host_bytes(&scene), device_bytes(&scene));
+        assert_eq!((budgets.host.reserved(), budgets.device.reserved()), expected);
+        drop(memory);
+        assert_eq!((budgets.host.reserved(), budgets.device.reserved()), (0, 0));
+    }
+
+    #[test]
+    fn scene_without_gpu_counts_its_device_memory_as_host_memory() {
+        let scene = testing::two_strips();
+        let bytes = host_bytes(&scene) + device_bytes(&scene);
+        let memory = budgets(bytes, false).new_scene();
+        memory.reserve_loaded("strips", &scene).expect("expected exactly enough memory");
+        let error = budgets(bytes - 1, false).new_scene().reserve_loaded("strips", &scene);
+        assert!(matches!(error, Err(Error::OutOfMemory { asked, .. }) if asked == bytes), "{error:?}");
+    }
+}
