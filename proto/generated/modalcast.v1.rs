@@ -309,6 +309,9 @@ pub struct SceneInfo {
     /// Unset in ListScenes.
     #[prost(message, optional, tag = "15")]
     pub lighting: ::core::option::Option<Lighting>,
+    /// The newest step that survives a crash of the server and a power loss; unset before the first one.
+    #[prost(message, optional, tag = "16")]
+    pub durable_step: ::core::option::Option<StepId>,
 }
 /// Light, sky and ground of the scene, for clients that draw the scene themselves: the table `look` of its scene.toml.
 /// Each vector has three numbers; colors are linear.
@@ -493,6 +496,25 @@ pub struct ListScenesResponse {
     /// Sources that OpenScene accepts, at most 512 KiB of names.
     #[prost(string, repeated, tag = "2")]
     pub sources: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
+    /// Names of the scenes that are being opened, for example after a restart. Calls for them fail with REASON_QUEUE_FULL and
+    /// a RetryInfo.
+    #[prost(string, repeated, tag = "3")]
+    pub opening: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
+    /// Scenes that have failed, or that could not be opened again after a restart. OpenScene tries again, and DeleteScene
+    /// removes them from this list.
+    #[prost(message, repeated, tag = "4")]
+    pub failed: ::prost::alloc::vec::Vec<FailedScene>,
+}
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct FailedScene {
+    #[prost(string, tag = "1")]
+    pub scene: ::prost::alloc::string::String,
+    /// As SceneInfo.source.
+    #[prost(string, tag = "2")]
+    pub source: ::prost::alloc::string::String,
+    /// Why the scene is not open. Has no step.
+    #[prost(message, optional, tag = "3")]
+    pub error: ::core::option::Option<Rejection>,
 }
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct DeleteSceneRequest {
@@ -921,6 +943,10 @@ pub mod scene_service_client {
     use tonic::codegen::*;
     use tonic::codegen::http::Uri;
     /// Opens, uploads, lists, closes and describes scenes.
+    ///
+    /// A new scene and its files count to a client (Limits.client_scenes, Limits.client_upload_bytes): to the lease token of 16
+    /// to 64 bytes (OpenDrive.lease_token) in the metadata key "modalcast-lease-token-bin" of the call or, without one, to the
+    /// connection.
     ///
     /// Units of lengths, for all files of this package: a length is in scene units, of which each is SceneInfo.unit meters,
     /// unless the comment of its field says meters. Positions, translations, displacements u = U q, bounds, cameras and clip
@@ -1357,6 +1383,10 @@ pub mod scene_service_server {
         ) -> std::result::Result<tonic::Response<Self::ReadModesStream>, tonic::Status>;
     }
     /// Opens, uploads, lists, closes and describes scenes.
+    ///
+    /// A new scene and its files count to a client (Limits.client_scenes, Limits.client_upload_bytes): to the lease token of 16
+    /// to 64 bytes (OpenDrive.lease_token) in the metadata key "modalcast-lease-token-bin" of the call or, without one, to the
+    /// connection.
     ///
     /// Units of lengths, for all files of this package: a length is in scene units, of which each is SceneInfo.unit meters,
     /// unless the comment of its field says meters. Positions, translations, displacements u = U q, bounds, cameras and clip
@@ -2035,9 +2065,7 @@ pub struct Opened {
 /// The last accepted step is always acknowledged. Earlier steps may have no acknowledgment of their own.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct Acknowledgment {
-    /// All accepted steps up to this one are completed or, with DELIVERY_LATEST, merged into a newer one. The server
-    /// writes the newest state to disk in the background, about ten times per second. A crash of the server loses the
-    /// steps after the last write; SceneInfo.last_step then names an earlier step.
+    /// All accepted steps up to this one are completed or, with DELIVERY_LATEST, merged into a newer one.
     #[prost(uint64, tag = "1")]
     pub step: u64,
     /// Number of steps that were merged into a newer one since the stream began.
@@ -2045,6 +2073,12 @@ pub struct Acknowledgment {
     pub skipped: u64,
     #[prost(message, repeated, tag = "3")]
     pub stages: ::prost::alloc::vec::Vec<StageTime>,
+    /// The newest step of this run that survives a crash of the server and a power loss; unset before the first one. The
+    /// server writes the newest state to disk in the background, at most twenty times per second, and no acknowledgment
+    /// waits for that: on a healthy disk, this step was acknowledged at most about 100 ms ago. It stands still while the disk
+    /// is full; the service "modalcast.v1.Storage" of grpc.health.v1.Health is then NOT_SERVING.
+    #[prost(uint64, optional, tag = "4")]
+    pub durable_step: ::core::option::Option<u64>,
 }
 /// What happens to a step for which the window has no capacity.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
@@ -5604,6 +5638,14 @@ pub struct Limits {
     /// per pixel, depending on its samples and on transparency.
     #[prost(uint64, tag = "14")]
     pub render_target_bytes: u64,
+    /// Number of scenes that one client may have open at a time, beside the first of each built-in scene, which has a place
+    /// of its own. SceneService tells what a client is.
+    #[prost(uint32, tag = "15")]
+    pub client_scenes: u32,
+    /// Limit in bytes on the uploads of one client: their declared size while they are in progress, and then the size of
+    /// their files until their scenes are deleted. A client may have four uploads in progress.
+    #[prost(uint64, tag = "16")]
+    pub client_upload_bytes: u64,
 }
 /// A capability that not every server of the same protocol version has. A client tests for a feature before it depends
 /// on it, and ignores values that it does not know.

@@ -108,12 +108,21 @@ pub(super) struct Args {
     /// Limit on open scenes.
     #[arg(long, default_value_t = Config::default().open_scenes)]
     open_scenes: usize,
+    /// Limit on open scenes of one client.
+    #[arg(long, default_value_t = Config::default().client_scenes)]
+    client_scenes: usize,
     /// Default window of a step stream: how many steps may be unacknowledged.
     #[arg(long, default_value_t = Config::default().window)]
     window: u32,
     /// Largest upload of one scene, in bytes.
     #[arg(long, default_value_t = Config::default().upload_bytes)]
     upload_bytes: u64,
+    /// Limit on the uploads of one client, in bytes.
+    #[arg(long, default_value_t = Config::default().client_upload_bytes)]
+    client_upload_bytes: u64,
+    /// Limit on all uploads on disk, in bytes.
+    #[arg(long, default_value_t = Config::default().stored_bytes)]
+    stored_bytes: u64,
     /// Deadline of a request that sets none, in milliseconds.
     #[arg(long, default_value_t = 30_000, value_parser = clap::value_parser!(u64).range(1..=600_000))]
     deadline_ms: u64,
@@ -157,10 +166,13 @@ impl Args {
             scene_device_bytes: self.scene_device_bytes,
             render_target_bytes: self.render_target_bytes,
             open_scenes: self.open_scenes,
+            client_scenes: self.client_scenes,
             window: self.window,
             // The default window must not exceed the largest window that a client may request.
             max_window: defaults.max_window.max(self.window),
             upload_bytes: self.upload_bytes,
+            client_upload_bytes: self.client_upload_bytes,
+            stored_bytes: self.stored_bytes,
             deadline: Duration::from_millis(self.deadline_ms),
             ..Config::default()
         }

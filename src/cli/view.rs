@@ -92,7 +92,7 @@ async fn view(args: &Args, input: &DemoScene, config: ValidatedConfig, physics_p
     let mut signals = TerminationSignals::install()?;
     let open = async {
         let (engine, listener) = start(config).await?;
-        let scene = engine.open(&input.source, "").await?;
+        let scene = engine.open(&input.source, "", None).await?;
         Ok((engine, listener, scene.name.clone()))
     };
     let (engine, listener, scene) = tokio::select! {

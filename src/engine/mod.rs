@@ -20,6 +20,7 @@ mod source;
 mod storage;
 #[cfg(test)]
 mod testing;
+mod upload_quota;
 
 pub use content::{ContentHash, ContentHashes, SceneContent, ShapeArray, hex, parse_hash};
 pub use device::context::{DeviceContext, EngineInfo, share_pictures};
@@ -39,6 +40,7 @@ pub use output::step_output::{
 pub use output::step_vertices::StepVertices;
 pub use output::vertex_encoding::Encoding;
 pub use output::vertex_selection::{Attribute, VertexSelection, validate_domains};
+pub use registry::FailedScene;
 pub use scene::delivery::{Delivery, StreamDelivery};
 pub use scene::encoded_subscription::EncodedSubscription;
 pub use scene::force_subscription::{ForceReport, ForceSubscription};
@@ -51,8 +53,9 @@ pub use scene::step_queue::{Overflow, StepReport};
 pub use scene::subscriber::Subscription;
 pub use source::SceneSource;
 pub use storage::array_upload::{ArrayUpload, ArrayUploadHeader, UploadedDomain, UploadedShape};
-pub use storage::scene_catalog::{SceneProvenance, validate_scene_name};
+pub use storage::provenance::{SceneProvenance, validate_scene_name};
 pub use storage::upload::{Upload, UploadHeader};
+pub use upload_quota::ClientId;
 
 #[cfg(test)]
 pub(crate) use testing::lossless_lease;
@@ -63,31 +66,31 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 
-use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+use tokio::sync::watch;
 
 use self::blocking::run_blocking;
 use self::device::command::SceneId;
 use self::device::handle::DeviceThread;
 use self::load_permits::LoadPermits;
 pub(crate) use self::lock::lock;
-use self::registry::Registry;
+use self::registry::{OpenRequest, Registry, RegistryEntry};
 use self::scene::actor::SceneServices;
 use self::scene::frame_stream::FrameStreamRegistry;
 use self::scene::handle::OpenParams;
 use self::scene_memory::{MemoryBudgets, SceneMemory};
 use self::storage::checkpoint_store::CheckpointStore;
+use self::storage::file_system::{DiskFileSystem, FileSystem};
 use self::storage::run_counter::RunCounter;
-use self::storage::scene_catalog::SceneCatalog;
+use self::storage::scene_catalog::{SceneCatalog, folder_bytes};
 use self::storage::upload::CompleteUpload;
+use self::storage::upload_record::find_uploaded_files;
+use self::upload_quota::{UploadPermit, UploadQuota};
 use crate::config::{Config, ValidatedConfig};
 use modalcast_model::error::{Error, Result, invalid};
 use modalcast_model::load::{OpenedScene, modes_files};
 
 /// The largest number of modes files, and of remarks, that are logged when a scene is opened.
 const MAX_LOGGED_LINES: usize = 16;
-
-/// Maximum number of uploads in progress at a time.
-const MAX_CONCURRENT_UPLOADS: usize = 8;
 
 /// Handle to the engine. A clone is shallow: all clones share one device thread and one set of scenes.
 #[derive(Clone)]
@@ -106,7 +109,9 @@ struct Shared {
     registry: Registry,
     frame_streams: Arc<FrameStreamRegistry>,
     load_permits: LoadPermits,
-    upload_permits: Arc<Semaphore>,
+    upload_quota: Arc<UploadQuota>,
+    /// Whether every scene of the last run is open or has failed.
+    are_scenes_reopened: watch::Sender<bool>,
     next_scene_id: AtomicU64,
     is_stopping: AtomicBool,
     device_thread: Mutex<Option<JoinHandle<()>>>,
@@ -116,7 +121,8 @@ struct Shared {
 }
 
 impl Engine {
-    /// Opens the state folder and the devices, then reopens every scene in the folder's list of open scenes.
+    /// Opens the state folder and the devices, and begins to reopen every scene in the folder's list of open scenes. Until
+    /// such a scene is open, [`Self::find`] returns `Busy` for its name.
     ///
     /// # Errors
     /// `Unavailable` when a backend requested by name cannot be opened, or another server uses the state folder.
@@ -133,7 +139,7 @@ impl Engine {
     ) -> Result<(Self, modalcast_model::scene::RawStepUpdate)> {
         let open = || DeviceContext::with_deformer(testing::FaultyDeformer::boxed);
         let engine = Self::start_with_device(Arc::new(config), Arc::new(testing::StripsSource), open).await?;
-        engine.open("strips", "strips").await?;
+        engine.open("strips", "strips", None).await?;
         let q = bytes::Bytes::copy_from_slice(bytemuck::cast_slice(&[testing::InjectedFault::DeviceLost.q(), 0.0]));
         let step = modalcast_model::scene::RawStepUpdate { number: 1, q_domains: vec![0], q, ..Default::default() };
         Ok((engine, step))
@@ -146,18 +152,21 @@ impl Engine {
         open_device: impl FnOnce() -> Result<DeviceContext> + Send + 'static,
     ) -> Result<Self> {
         let state = config.state.clone();
-        let (scene_catalog, checkpoints, run_counter) = run_blocking("state folder", move || {
-            let scene_catalog = SceneCatalog::open(&state)?;
-            let run_counter = Arc::new(RunCounter::open(&state)?);
-            let checkpoints = CheckpointStore::start(scene_catalog.checkpoint_folder())?;
-            Ok((scene_catalog, Arc::new(checkpoints), run_counter))
+        let quota_config = Arc::clone(&config);
+        let (scene_catalog, checkpoints, run_counter, upload_quota) = run_blocking("state folder", move || {
+            let file_system: Arc<dyn FileSystem> = Arc::new(DiskFileSystem);
+            let scene_catalog = SceneCatalog::open(&state, &file_system)?;
+            let run_counter = Arc::new(RunCounter::open(&state, &file_system)?);
+            let checkpoints = CheckpointStore::start(scene_catalog.checkpoint_folder(), &file_system)?;
+            let upload_quota = UploadQuota::new(&quota_config, scene_catalog.stored_uploads());
+            Ok((scene_catalog, Arc::new(checkpoints), run_counter, upload_quota))
         })
         .await?;
         let DeviceThread { handle, info, thread: device_thread } = DeviceThread::start(open_device).await?;
         let shared = Shared {
             services: SceneServices { device: handle, checkpoints, run_counter, config: Arc::clone(&config) },
             memory: MemoryBudgets::new(info.memory, info.renderer.is_ok()),
-            registry: Registry::new(config.open_scenes),
+            registry: Registry::new(config.open_scenes, config.client_scenes),
             frame_streams: Arc::default(),
             config,
             source,
@@ -165,14 +174,15 @@ impl Engine {
             encoder: FrameEncoder::per_core()?,
             vertex_packer: VertexPacker::start()?,
             load_permits: LoadPermits::new(),
-            upload_permits: Arc::new(Semaphore::new(MAX_CONCURRENT_UPLOADS)),
+            upload_quota,
+            are_scenes_reopened: watch::Sender::new(false),
             next_scene_id: AtomicU64::new(1),
             is_stopping: AtomicBool::new(false),
             device_thread: Mutex::new(Some(device_thread)),
             scene_catalog,
         };
         let engine = Self { shared: Arc::new(shared) };
-        engine.reopen_scenes().await;
+        engine.reopen_scenes();
         Ok(engine)
     }
 
@@ -202,25 +212,47 @@ impl Engine {
         self.shared.config.frame_side.min(max_renderer_side)
     }
 
+    /// Whether every scene of the last run is open or has failed.
+    pub fn watch_reopening(&self) -> watch::Receiver<bool> {
+        self.shared.are_scenes_reopened.subscribe()
+    }
+
+    /// Whether the last steps cannot be written to disk. The scenes continue.
+    pub fn watch_storage(&self) -> watch::Receiver<bool> {
+        self.shared.services.checkpoints.watch_degraded()
+    }
+
+    /// The names of the scenes that are being opened, sorted.
+    pub fn opening(&self) -> Vec<String> {
+        self.shared.registry.opening()
+    }
+
+    /// The scenes that have failed, or that could not be opened again, since this server was started, sorted by name. A
+    /// scene that is open again or deleted is not among them.
+    pub fn failed_scenes(&self) -> Vec<FailedScene> {
+        self.shared.registry.failed()
+    }
+
     /// Opens a source of the repository under a name; an empty name means the last path component of the source. If the
-    /// name is already open from the same source, returns the open scene.
+    /// name is already open from the same source, returns the open scene. A new scene counts to `client`, if there is one.
     ///
     /// # Errors
     /// `NameTaken` when the name belongs to another source, `LimitReached` when too many scenes are open, and the
     /// errors of [`SceneSource::open`].
-    pub async fn open(&self, source: &str, name: &str) -> Result<Arc<SceneHandle>> {
+    pub async fn open(&self, source: &str, name: &str, client: Option<ClientId>) -> Result<Arc<SceneHandle>> {
         let name = if name.is_empty() {
-            storage::scene_catalog::default_scene_name(source)?
+            storage::provenance::default_scene_name(source)?
         } else {
             validate_scene_name(name)?.to_owned()
         };
-        self.open_once(name, SceneProvenance::Repository { source: source.into() }, None).await
+        self.open_once(name, SceneProvenance::Repository { source: source.into() }, None, client).await
     }
 
     /// The open scene with this name.
     ///
     /// # Errors
-    /// `NotFound` when no open scene has this name, `ShuttingDown` when the server is shutting down, `DeviceLost`.
+    /// `NotFound` when no open scene has this name, `Busy` while it is being opened, `ShuttingDown` when the server is
+    /// shutting down, `DeviceLost`.
     pub fn find(&self, name: &str) -> Result<Arc<SceneHandle>> {
         self.check_running()?;
         self.shared.registry.find(name)
@@ -256,12 +288,13 @@ impl Engine {
         run_blocking("repository", move || Ok(source.list())).await
     }
 
-    /// Begins an upload.
+    /// Begins an upload, which counts to `client`.
     ///
     /// # Errors
     /// `Invalid` for a malformed name or entry path and for counts or sizes over the limits; `NameTaken` when the name
-    /// is in use; `Busy` when too many uploads are in progress; `Fault` of the disk.
-    pub async fn begin_upload(&self, header: UploadHeader) -> Result<Upload> {
+    /// is in use; `Busy` when too many uploads are in progress; `LimitReached` when the client has too many uploads, or
+    /// too many bytes would be stored; `Fault` of the disk.
+    pub async fn begin_upload(&self, header: UploadHeader, client: ClientId) -> Result<Upload> {
         self.check_running()?;
         validate_scene_name(&header.scene)?;
         let config = &self.shared.config;
@@ -269,22 +302,27 @@ impl Engine {
             return Err(invalid("header.files", format!("1 to {} files", config.upload_files), header.files));
         }
         self.check_upload_bytes(header.total_bytes)?;
-        let permit = self.permit_upload(&header.scene)?;
-        let (upload_folder, hash_lists) = (self.shared.scene_catalog.uploads(), self.shared.scene_catalog.hash_lists());
-        run_blocking("upload", move || Upload::begin(&upload_folder, hash_lists, header, permit)).await
+        let permit = self.permit_upload(&header.scene, client, header.total_bytes)?;
+        let (upload_folder, file_system) = (self.shared.scene_catalog.uploads(), self.file_system());
+        run_blocking("upload", move || Upload::begin(&upload_folder, &file_system, header, permit)).await
     }
 
     /// Begins an upload of arrays.
     ///
     /// # Errors
     /// As for [`Self::begin_upload`].
-    pub async fn begin_array_upload(&self, header: ArrayUploadHeader) -> Result<ArrayUpload> {
+    pub async fn begin_array_upload(&self, header: ArrayUploadHeader, client: ClientId) -> Result<ArrayUpload> {
         self.check_running()?;
         validate_scene_name(&header.scene)?;
         self.check_upload_bytes(header.total_bytes)?;
-        let permit = self.permit_upload(&header.scene)?;
-        let upload_folder = self.shared.scene_catalog.uploads();
-        run_blocking("upload", move || ArrayUpload::begin(&upload_folder, header, permit)).await
+        let permit = self.permit_upload(&header.scene, client, header.total_bytes)?;
+        let (upload_folder, file_system) = (self.shared.scene_catalog.uploads(), self.file_system());
+        let memory = self.shared.memory.new_scene().host;
+        run_blocking("upload", move || ArrayUpload::begin(&upload_folder, &file_system, header, permit, memory)).await
+    }
+
+    fn file_system(&self) -> Arc<dyn FileSystem> {
+        Arc::clone(self.shared.scene_catalog.file_system())
     }
 
     fn check_upload_bytes(&self, total_bytes: u64) -> Result<()> {
@@ -295,11 +333,10 @@ impl Engine {
         }
     }
 
-    /// Checks that a scene with this name may be uploaded, and counts the upload until the permit is dropped.
-    fn permit_upload(&self, scene: &str) -> Result<OwnedSemaphorePermit> {
-        self.shared.registry.check_name_free(scene)?;
-        let too_many_uploads = |_| Error::Busy { queue: "queue of uploads", limit: MAX_CONCURRENT_UPLOADS };
-        Arc::clone(&self.shared.upload_permits).try_acquire_owned().map_err(too_many_uploads)
+    /// Checks that a client may upload a scene with this name, and counts the upload until the permit is dropped.
+    fn permit_upload(&self, scene: &str, client: ClientId, bytes: u64) -> Result<UploadPermit> {
+        self.shared.registry.check_upload(scene, &client)?;
+        self.shared.upload_quota.admit(client, bytes)
     }
 
     /// For each hash, whether a file of an uploaded scene has this content.
@@ -307,9 +344,9 @@ impl Engine {
     /// # Errors
     /// `Fault` when the search panics.
     pub async fn find_uploaded_files(&self, hashes: Vec<ContentHash>) -> Result<Vec<bool>> {
-        let hash_lists = self.shared.scene_catalog.hash_lists();
+        let uploads = self.shared.scene_catalog.uploads();
         let find = move || {
-            let files = hash_lists.read();
+            let files = find_uploaded_files(&uploads);
             Ok(hashes.iter().map(|hash| files.contains_key(hash)).collect())
         };
         run_blocking("upload", find).await
@@ -333,8 +370,8 @@ impl Engine {
     }
 
     async fn open_upload(&self, upload: CompleteUpload) -> Result<Arc<SceneHandle>> {
-        let (name, entry) = (upload.scene.clone(), upload.entry.clone());
-        self.open_once(name, SceneProvenance::Upload { entry }, Some(upload)).await
+        let (name, entry, client) = (upload.scene.clone(), upload.entry.clone(), upload.client().cloned());
+        self.open_once(name, SceneProvenance::Upload { entry }, Some(upload), client).await
     }
 
     /// Closes a scene and ends its streams; removes its persisted step and, for an upload, its files.
@@ -394,19 +431,36 @@ impl Engine {
         self.shared.services.device.loss().error().map_or(Ok(()), Err)
     }
 
-    /// Reopens the scenes of the catalog. A scene that cannot be opened is logged.
-    async fn reopen_scenes(&self) {
+    /// Reserves the names of the scenes of the catalog, and reopens the scenes in the background. A scene that cannot be
+    /// opened is logged, and its entry remains in the catalog, because its files may be available again at the next start.
+    fn reopen_scenes(&self) {
         let mut openings = tokio::task::JoinSet::new();
         for (name, provenance) in self.shared.scene_catalog.entries() {
+            let request = self.open_request(&name, &provenance, None);
+            let reserved = self.shared.registry.reserve(&request, false);
             let engine = self.clone();
             openings.spawn(async move {
-                if let Err(error) = engine.open_once(name.clone(), provenance, None).await {
-                    // The entry remains in the list, because the files may be available again at the next start.
+                let opened = match engine.check_running().and(reserved) {
+                    Ok(entry) => engine.open_reserved(&entry, name.clone(), provenance.clone(), None).await,
+                    Err(error) => Err(error),
+                };
+                if let Err(error) = opened {
                     tracing::warn!(scene = name, %error, "a scene of the last run could not be reopened");
+                    engine.shared.registry.record_failure(&name, &provenance, error);
                 }
             });
         }
-        openings.join_all().await;
+        let engine = self.clone();
+        tokio::spawn(async move {
+            while openings.join_next().await.is_some() {}
+            engine.shared.are_scenes_reopened.send_replace(true);
+        });
+    }
+
+    fn open_request(&self, name: &str, provenance: &SceneProvenance, client: Option<ClientId>) -> OpenRequest {
+        let is_built_in =
+            matches!(provenance, SceneProvenance::Repository { source } if self.shared.source.is_built_in(source));
+        OpenRequest { name: name.to_owned(), provenance: provenance.clone(), client, is_built_in }
     }
 
     /// Opens a scene. Concurrent calls with the same name share one opening. The opening runs in a separate task, so
@@ -416,22 +470,35 @@ impl Engine {
         name: String,
         provenance: SceneProvenance,
         upload: Option<CompleteUpload>,
+        client: Option<ClientId>,
     ) -> Result<Arc<SceneHandle>> {
         self.check_running()?;
         let engine = self.clone();
         let work = async move {
             // A new upload must not join the opening of an earlier scene with the same name.
             let must_be_new = upload.is_some();
-            let entry = engine.shared.registry.reserve(&name, &provenance, must_be_new)?;
-            let opened = entry.get_or_open(|| engine.open_or_discard(name.clone(), provenance, upload)).await;
-            engine.shared.registry.release(&name, &entry);
-            // The scene may have failed before the registry had its handle.
-            if opened.as_ref().is_ok_and(|scene_handle| scene_handle.failure().is_some()) {
-                engine.shared.registry.remove(&name, &entry);
-            }
-            opened
+            let request = engine.open_request(&name, &provenance, client);
+            let entry = engine.shared.registry.reserve(&request, must_be_new)?;
+            engine.open_reserved(&entry, name, provenance, upload).await
         };
         tokio::spawn(work).await.map_err(modalcast_model::error::fault_in("open"))?
+    }
+
+    /// Opens a scene whose name is reserved for this call.
+    async fn open_reserved(
+        &self,
+        entry: &Arc<RegistryEntry>,
+        name: String,
+        provenance: SceneProvenance,
+        upload: Option<CompleteUpload>,
+    ) -> Result<Arc<SceneHandle>> {
+        let opened = entry.get_or_open(|| self.open_or_discard(name.clone(), provenance, upload)).await;
+        self.shared.registry.release(&name, entry);
+        // The scene may have failed before the registry had its handle.
+        if opened.as_ref().is_ok_and(|scene_handle| scene_handle.failure().is_some()) {
+            self.shared.registry.remove(&name, entry);
+        }
+        opened
     }
 
     /// Loads a scene. If that fails, removes the files of a new upload.
@@ -444,11 +511,11 @@ impl Engine {
         let is_new_upload = upload.is_some();
         let result = self.load_scene(&name, &provenance, upload).await;
         if result.is_err() && is_new_upload {
-            let upload_folder = self.shared.scene_catalog.upload_folder(&name);
-            let hash_lists = self.shared.scene_catalog.hash_lists();
+            let engine = self.clone();
             let remove = move || {
-                hash_lists.remove(&name);
-                Ok(std::fs::remove_dir_all(upload_folder).ok())
+                engine.shared.scene_catalog.remove_upload(&name);
+                engine.shared.upload_quota.remove(&name);
+                Ok(())
             };
             run_blocking("upload", remove).await?;
         }
@@ -512,7 +579,7 @@ impl Engine {
         let (shared, name) = (Arc::downgrade(&self.shared), name.to_owned());
         Box::new(move || {
             if let Some(shared) = shared.upgrade() {
-                shared.registry.remove_scene(&name, id);
+                shared.registry.remove_failed_scene(&name, id);
             }
         })
     }
@@ -539,7 +606,11 @@ impl Engine {
                 if let Some(upload) = upload {
                     // A checkpoint of an older scene with this name does not apply to the new one.
                     engine.shared.services.checkpoints.remove(&scene_name);
-                    upload.commit(&upload_folder, &engine.shared.scene_catalog.hash_lists())?;
+                    let client = upload.client().cloned();
+                    upload.commit(&upload_folder)?;
+                    if let Some(client) = client {
+                        engine.shared.upload_quota.store(&scene_name, client, folder_bytes(&upload_folder));
+                    }
                 }
                 source.open_within(&upload_folder, &entry, &memory)
             }
@@ -560,10 +631,9 @@ impl Engine {
         let (engine, scene_name) = (self.clone(), name.to_owned());
         let catalog_change = run_blocking("close", move || {
             engine.shared.services.checkpoints.remove(&scene_name);
-            // Fails for a scene of the repository, which has no upload folder.
-            std::fs::remove_dir_all(engine.shared.scene_catalog.upload_folder(&scene_name)).ok();
-            engine.shared.scene_catalog.hash_lists().remove(&scene_name);
-            engine.shared.scene_catalog.remove(&scene_name)
+            let is_removed = engine.shared.scene_catalog.remove(&scene_name);
+            engine.shared.upload_quota.remove(&scene_name);
+            is_removed
         })
         .await;
         // Release the name only after the files are removed, so that a new upload with this name does not lose its
@@ -571,6 +641,7 @@ impl Engine {
         if let Some(entry) = &entry {
             self.shared.registry.remove(name, entry);
         }
+        self.shared.registry.forget_failure(name);
         let was_listed = catalog_change?;
         if entry.is_some() || was_listed { Ok(()) } else { Err(scene_not_open(name)) }
     }
@@ -602,8 +673,8 @@ mod tests {
         let engine = Engine::start_with_device(Arc::new(config), Arc::new(StripsSource), open_device)
             .await
             .expect("expected a running engine");
-        let faulty_scene = engine.open("strips", "faulty").await.expect("expected an open scene");
-        let control_scene = engine.open("strips", "control").await.expect("expected an open scene");
+        let faulty_scene = engine.open("strips", "faulty", None).await.expect("expected an open scene");
+        let control_scene = engine.open("strips", "control", None).await.expect("expected an open scene");
         (engine, faulty_scene, control_scene)
     }
 
@@ -665,7 +736,7 @@ mod tests {
         assert!(error.contains("not loaded"), "expected 'not loaded', got {error}");
         assert!(is_done(&send_step(&mut control_writer, 2, 0.5).await), "expected the control scene to continue");
         let reopened_scene =
-            await_within_limit(engine.open("strips", "faulty")).await.expect("expected to reopen the scene");
+            await_within_limit(engine.open("strips", "faulty", None)).await.expect("expected to reopen the scene");
         let restored_step = reopened_scene.last_step().map(|step| step.number);
         assert_eq!(restored_step, Some(1), "expected the step of the checkpoint");
         engine.shutdown().await;
@@ -703,7 +774,7 @@ mod tests {
         assert_eq!(await_within_limit(subscription.next()).await.expect_err("expected the loss"), loss);
         assert_eq!(await_within_limit(engine.device_lost()).await, loss);
         assert_eq!(engine.find("control").expect_err("expected the loss"), loss);
-        assert_eq!(await_within_limit(engine.open("strips", "new")).await.expect_err("expected the loss"), loss);
+        assert_eq!(await_within_limit(engine.open("strips", "new", None)).await.expect_err("expected the loss"), loss);
         await_within_limit(engine.shutdown()).await;
     }
 }

@@ -9,14 +9,37 @@ use tokio::sync::OnceCell;
 
 use super::lock::lock;
 use super::scene_not_open;
+use super::upload_quota::ClientId;
 use crate::engine::device::command::SceneId;
 use crate::engine::scene::handle::SceneHandle;
-use crate::engine::storage::scene_catalog::SceneProvenance;
+use crate::engine::storage::provenance::SceneProvenance;
 use modalcast_model::error::{Error, Result};
+
+/// A scene that is to be opened.
+#[derive(Debug, Clone)]
+pub(super) struct OpenRequest {
+    pub(super) name: String,
+    pub(super) provenance: SceneProvenance,
+    /// The client that the scene counts to. `None` for a scene of the last run.
+    pub(super) client: Option<ClientId>,
+    pub(super) is_built_in: bool,
+}
+
+/// A scene that has failed, or that could not be opened again.
+#[derive(Debug, Clone, PartialEq)]
+pub struct FailedScene {
+    pub name: String,
+    /// Readable description of where the scene comes from.
+    pub source: String,
+    pub error: Error,
+}
 
 /// A reserved name, and its scene once the scene is loaded.
 pub(super) struct RegistryEntry {
     provenance: SceneProvenance,
+    client: Option<ClientId>,
+    /// Whether the scene has a place beyond the limit, which each built-in scene has once.
+    has_extra_place: bool,
     cell: OnceCell<Arc<SceneHandle>>,
     /// Number of concurrent openings; modified only under the registry's lock.
     open_calls: AtomicUsize,
@@ -48,25 +71,30 @@ impl RegistryEntry {
 /// All reserved names.
 pub(super) struct Registry {
     max_scenes: usize,
+    max_client_scenes: usize,
     entries: Mutex<BTreeMap<String, Arc<RegistryEntry>>>,
+    /// By name. At most one per name in the catalog.
+    failed: Mutex<BTreeMap<String, FailedScene>>,
 }
 
 impl Registry {
-    pub(super) const fn new(max_scenes: usize) -> Self {
-        Self { max_scenes, entries: Mutex::new(BTreeMap::new()) }
+    pub(super) const fn new(max_scenes: usize, max_client_scenes: usize) -> Self {
+        Self {
+            max_scenes,
+            max_client_scenes,
+            entries: Mutex::new(BTreeMap::new()),
+            failed: Mutex::new(BTreeMap::new()),
+        }
     }
 
     /// Reserves a name for a call that opens it, or joins an existing reservation with the same provenance. With
-    /// `must_be_new` an existing reservation is an error. The call ends with [`Self::release`].
+    /// `must_be_new` an existing reservation is an error. The call ends with [`Self::release`]. The first scene of each
+    /// built-in source does not count for the limits, so that other scenes cannot lock it out.
     ///
     /// # Errors
     /// `NameTaken` when the name is reserved for another provenance, `LimitReached` when too many scenes are open.
-    pub(super) fn reserve(
-        &self,
-        name: &str,
-        provenance: &SceneProvenance,
-        must_be_new: bool,
-    ) -> Result<Arc<RegistryEntry>> {
+    pub(super) fn reserve(&self, request: &OpenRequest, must_be_new: bool) -> Result<Arc<RegistryEntry>> {
+        let OpenRequest { name, provenance, client, is_built_in } = request;
         let mut entries = self.lock();
         if let Some(entry) = entries.get(name) {
             return match !must_be_new && entry.provenance == *provenance {
@@ -77,24 +105,48 @@ impl Registry {
                 false => Err(name_taken_error(name, entry)),
             };
         }
-        if entries.len() >= self.max_scenes {
-            return Err(Error::LimitReached { objects: "open scenes", limit: self.max_scenes });
+        let has_extra_place = *is_built_in && !entries.values().any(|entry| entry.provenance == *provenance);
+        if !has_extra_place {
+            self.check_limits(&entries, client.as_ref())?;
         }
         let entry = Arc::new(RegistryEntry {
             provenance: provenance.clone(),
+            client: client.clone(),
+            has_extra_place,
             cell: OnceCell::new(),
             open_calls: AtomicUsize::new(1),
         });
-        entries.insert(name.to_owned(), Arc::clone(&entry));
+        entries.insert(name.clone(), Arc::clone(&entry));
         Ok(entry)
     }
 
     /// Checks that the name is free.
     ///
     /// # Errors
-    /// `NameTaken` when the name is reserved.
-    pub(super) fn check_name_free(&self, name: &str) -> Result<()> {
-        self.lock().get(name).map_or(Ok(()), |entry| Err(name_taken_error(name, entry)))
+    /// `LimitReached` when the client or all clients have too many scenes.
+    fn check_limits(&self, entries: &BTreeMap<String, Arc<RegistryEntry>>, client: Option<&ClientId>) -> Result<()> {
+        let counted = || entries.values().filter(|entry| !entry.has_extra_place);
+        if counted().count() >= self.max_scenes {
+            return Err(Error::LimitReached { objects: "open scenes", limit: self.max_scenes });
+        }
+        if client.is_some()
+            && counted().filter(|entry| entry.client.as_ref() == client).count() >= self.max_client_scenes
+        {
+            return Err(Error::LimitReached { objects: "open scenes of one client", limit: self.max_client_scenes });
+        }
+        Ok(())
+    }
+
+    /// Checks that a client can upload a scene with this name.
+    ///
+    /// # Errors
+    /// `NameTaken` when the name is reserved, `LimitReached` when too many scenes are open.
+    pub(super) fn check_upload(&self, name: &str, client: &ClientId) -> Result<()> {
+        let entries = self.lock();
+        match entries.get(name) {
+            Some(entry) => Err(name_taken_error(name, entry)),
+            None => self.check_limits(&entries, Some(client)),
+        }
     }
 
     pub(super) fn find_entry(&self, name: &str) -> Option<Arc<RegistryEntry>> {
@@ -104,12 +156,38 @@ impl Registry {
     /// The open scene with this name.
     ///
     /// # Errors
-    /// `NotFound` when the scene is not loaded or is being closed.
+    /// `NotFound` when the name is not reserved or the scene is being closed, `Busy` while the scene is being opened.
     pub(super) fn find(&self, name: &str) -> Result<Arc<SceneHandle>> {
         let entries = self.lock();
-        let scene_handle =
-            entries.get(name).and_then(|entry| entry.scene_handle()).filter(|scene_handle| !scene_handle.is_closing());
-        scene_handle.cloned().ok_or_else(|| scene_not_open(name))
+        let entry = entries.get(name).ok_or_else(|| scene_not_open(name))?;
+        match entry.scene_handle() {
+            Some(scene_handle) if scene_handle.is_closing() => Err(scene_not_open(name)),
+            Some(scene_handle) => Ok(Arc::clone(scene_handle)),
+            None => Err(Error::Busy { queue: "queue for a scene that is being opened", limit: 1 }),
+        }
+    }
+
+    /// The names whose scene is not loaded yet, sorted.
+    pub(super) fn opening(&self) -> Vec<String> {
+        let entries = self.lock();
+        entries.iter().filter(|(_, entry)| entry.scene_handle().is_none()).map(|(name, _)| name.clone()).collect()
+    }
+
+    /// The failed scenes, sorted by name.
+    pub(super) fn failed(&self) -> Vec<FailedScene> {
+        let entries = self.lock();
+        lock(&self.failed).values().filter(|failed| !entries.contains_key(&failed.name)).cloned().collect()
+    }
+
+    /// Records that a scene could not be opened again.
+    pub(super) fn record_failure(&self, name: &str, provenance: &SceneProvenance, error: Error) {
+        let failed = FailedScene { name: name.to_owned(), source: provenance.label(), error };
+        lock(&self.failed).insert(name.to_owned(), failed);
+    }
+
+    /// A deleted scene is no longer a failed one.
+    pub(super) fn forget_failure(&self, name: &str) {
+        lock(&self.failed).remove(name);
     }
 
     /// The open scenes, sorted by name.
@@ -138,11 +216,15 @@ impl Registry {
         }
     }
 
-    /// Releases the name of a scene that has failed.
-    pub(super) fn remove_scene(&self, name: &str, id: SceneId) {
+    /// Releases the name of a scene that has failed, and records the failure.
+    pub(super) fn remove_failed_scene(&self, name: &str, id: SceneId) {
         let mut entries = self.lock();
-        if entries.get(name).and_then(|entry| entry.scene_handle()).is_some_and(|registered| registered.id() == id) {
-            entries.remove(name);
+        let is_registered = |entry: &&Arc<RegistryEntry>| entry.scene_handle().is_some_and(|scene| scene.id() == id);
+        let Some(entry) = entries.get(name).filter(is_registered).cloned() else { return };
+        entries.remove(name);
+        drop(entries);
+        if let Some(error) = entry.scene_handle().and_then(|scene_handle| scene_handle.failure()) {
+            self.record_failure(name, &entry.provenance, error.clone());
         }
     }
 
@@ -153,4 +235,55 @@ impl Registry {
 
 fn name_taken_error(name: &str, entry: &RegistryEntry) -> Error {
     Error::NameTaken { name: name.into(), owner: entry.provenance.label() }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn request(name: &str, client: u64, is_built_in: bool) -> OpenRequest {
+        let source = if is_built_in { "tree" } else { name }.to_owned();
+        let (provenance, client) = (SceneProvenance::Repository { source }, Some(ClientId::Connection(client)));
+        OpenRequest { name: name.to_owned(), provenance, client, is_built_in }
+    }
+
+    #[test]
+    fn clients_have_a_limit_and_the_built_in_scene_has_a_place() {
+        let registry = Registry::new(3, 2);
+        let reserve = |name: &str, client| registry.reserve(&request(name, client, false), false);
+        let limit = |result: Result<Arc<RegistryEntry>>| match result {
+            Err(Error::LimitReached { objects, limit }) => (objects, limit),
+            _ => panic!("expected LimitReached"),
+        };
+        let first = reserve("a", 1).expect("expected a place");
+        reserve("b", 1).expect("expected a place");
+        assert_eq!(limit(reserve("c", 1)), ("open scenes of one client", 2));
+        reserve("c", 2).expect("expected a place of another client");
+        assert_eq!(limit(reserve("d", 2)), ("open scenes", 3));
+        reserve("a", 2).expect("expected another client to join");
+        registry.release("a", &first);
+        registry.reserve(&request("tree", 1, true), false).expect("expected a place for the built-in scene");
+        let second_tree = registry.reserve(&request("tree 2", 3, true), false);
+        assert_eq!(limit(second_tree), ("open scenes", 3), "expected one extra place for each built-in scene");
+        assert!(
+            matches!(registry.find("tree"), Err(Error::Busy { .. })) && registry.opening().contains(&"tree".into())
+        );
+        registry.release("a", &first);
+        reserve("d", 2).expect("expected the place of the released name");
+    }
+
+    #[test]
+    fn failures_are_listed_until_the_scene_is_open_or_deleted() {
+        let registry = Registry::new(3, 3);
+        let OpenRequest { provenance, .. } = request("a", 1, false);
+        registry.record_failure("a", &provenance, Error::ShuttingDown);
+        let names = || registry.failed().into_iter().map(|failed| failed.name).collect::<Vec<_>>();
+        assert_eq!(names(), ["a"]);
+        let entry = registry.reserve(&request("a", 1, false), false).expect("expected a place");
+        assert!(names().is_empty());
+        registry.release("a", &entry);
+        assert_eq!(names(), ["a"]);
+        registry.forget_failure("a");
+        assert!(names().is_empty());
+    }
 }

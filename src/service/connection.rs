@@ -1,14 +1,17 @@
 //! What the server knows about the connection of a call.
 
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+use tonic::metadata::MetadataMap;
 
 use super::connection_table::{Activity, ConnectionSlot};
 use super::receive_budget::{ConnectionReceiveBudget, ReceiveBudget};
 use super::reply_budget::{ConnectionReplyBudget, ReplyBudget};
 use crate::config::Config;
-use modalcast_model::error::{Error, Result, fault, fault_in};
+use crate::engine::{ClientId, LeaseToken};
+use modalcast_model::error::{Error, Result, fault, fault_in, invalid};
 
 /// Ratio of the HTTP/2 flow-control windows of a connection and a stream. It is far above the number of streams,
 /// because the window of the connection also limits small frames, see [`MAX_DRIVES`].
@@ -20,6 +23,12 @@ pub(super) const STREAMS_PER_CONNECTION_WINDOW: u32 = 256;
 /// and a step with nothing but its number. One stream is then charged W / 9 * (256 - 9) = 27.4 W, so four are safe. The
 /// parts of a large step are not smaller: a part has a number and says that more follow.
 pub(super) const MAX_DRIVES: usize = 4;
+
+/// Metadata key of the lease token of a client that opens or uploads scenes.
+const LEASE_TOKEN_KEY: &str = "modalcast-lease-token-bin";
+
+/// Number of connections so far.
+static CONNECTION_COUNTER: AtomicU64 = AtomicU64::new(0);
 
 /// The budgets that all connections share.
 #[derive(Debug, Clone)]
@@ -42,6 +51,8 @@ impl Budgets {
 /// A connection, in the extensions of each of its calls.
 #[derive(Debug, Clone)]
 pub(super) struct ConnectionInfo {
+    /// Number of the connection, which no other connection of the server has.
+    id: u64,
     /// Never sent to another client.
     peer: Arc<str>,
     drive_permits: Arc<Semaphore>,
@@ -67,6 +78,7 @@ impl ConnectionInfo {
 
     pub(super) fn new(peer: String, budgets: &Budgets, slot: &ConnectionSlot) -> Self {
         Self {
+            id: CONNECTION_COUNTER.fetch_add(1, Ordering::Relaxed),
             peer: peer.into(),
             drive_permits: Arc::new(Semaphore::new(MAX_DRIVES)),
             frame_pixels: Arc::new(Semaphore::new(budgets.max_connection_pixels as usize)),
@@ -76,6 +88,17 @@ impl ConnectionInfo {
             reply: budgets.reply.new_connection(Arc::clone(&slot.signals.close)),
             activity: Arc::clone(&slot.activity),
         }
+    }
+
+    /// The client to which the scenes and uploads of a call count: the lease token in its metadata or, without one, this
+    /// connection.
+    ///
+    /// # Errors
+    /// `Invalid` for a token of a wrong length.
+    pub(super) fn client(&self, metadata: &MetadataMap) -> Result<ClientId> {
+        let Some(value) = metadata.get_bin(LEASE_TOKEN_KEY) else { return Ok(ClientId::Connection(self.id)) };
+        let bytes = value.to_bytes().map_err(|_| invalid(LEASE_TOKEN_KEY, "a binary value", "another value"))?;
+        LeaseToken::parse(LEASE_TOKEN_KEY, &bytes).map(|token| ClientId::of_token(token.as_bytes()))
     }
 
     /// Name of the client, for the log: its address, or its process.

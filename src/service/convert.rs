@@ -4,9 +4,10 @@
 use bytes::Bytes;
 use modalcast_proto::v1;
 
+use super::status::to_rejection;
 use crate::engine::{
-    self, ContentHash, Delivery, Engine, FrameFormat, InitialState, LeaseRequest, LeaseToken, OutputSpec, Overflow,
-    PictureSpec, SceneHandle, StepId, StepSelector, StreamDelivery, UploadedShape, WriterSession, parse_hash,
+    self, ContentHash, Delivery, Engine, FailedScene, FrameFormat, InitialState, LeaseRequest, LeaseToken, OutputSpec,
+    Overflow, PictureSpec, SceneHandle, StepId, StepSelector, StreamDelivery, UploadedShape, WriterSession, parse_hash,
 };
 use crate::telemetry::StageTimes;
 use modalcast_model::domain::{CreaseAngle, Material, Transform};
@@ -73,9 +74,16 @@ pub(super) fn wire_scene_summary(scene_handle: &SceneHandle) -> v1::SceneInfo {
         bounds: [bounds.min, bounds.max].concat(),
         affine: scene.features.shear,
         last_step: scene_handle.last_step().map(wire_step_id),
+        durable_step: scene_handle.durable_step().map(wire_step_id),
         remarks: Vec::new(),
         lighting: None,
     }
+}
+
+/// A scene that could not be opened, and why.
+pub(super) fn wire_failed_scene(failed: FailedScene) -> v1::FailedScene {
+    let FailedScene { name, source, error } = failed;
+    v1::FailedScene { scene: name, source, error: Some(to_rejection(None, &error)) }
 }
 
 /// Number of bytes that remain of a limit on the encoded size of a list of strings.

@@ -35,6 +35,8 @@ impl v1::server_service_server::ServerService for ServerServiceImpl {
             window: config.max_window,
             upload_bytes: config.upload_bytes,
             deadline_ms: to_ms(config.deadline),
+            client_scenes: config.client_scenes as u32,
+            client_upload_bytes: config.client_upload_bytes,
             drives: MAX_DRIVES as u32,
             connection_receive_bytes: config.connection_receive_bytes as u64,
             message_timeout_ms: to_ms(config.message_timeout),

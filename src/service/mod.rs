@@ -90,6 +90,7 @@ pub async fn serve(
     let _shared_memory_server = shared_memory_socket.map(|socket| shared_memory.serve(socket));
     let table = ConnectionTable::new(config.connections);
     let accept_connections = connection_server.accept_connections(sockets, Arc::clone(&table));
+    let report_state = report_state(engine.clone(), health.reporter.clone());
     let stop_engine = async move {
         let mut shutdown = std::pin::pin!(shutdown);
         tokio::select! {
@@ -110,12 +111,39 @@ pub async fn serve(
     // The sockets are closed when the engine has stopped.
     let drain_deadline = tokio::select! {
         () = accept_connections => return Ok(()),
+        () = report_state => return Ok(()),
         drain_deadline = stop_engine => drain_deadline,
     };
     if tokio::time::timeout_at(drain_deadline, table.retire_all()).await.is_err() {
         tracing::warn!("some clients did not close their connections within the drain time");
     }
     Ok(())
+}
+
+/// Service of health checks: `SERVING` while the last steps can be written to disk.
+const STORAGE_HEALTH: &str = "modalcast.v1.Storage";
+
+/// Service of health checks: `SERVING` when every scene of the last run is open or has failed.
+const SCENES_HEALTH: &str = "modalcast.v1.Scenes";
+
+/// Reports the state of the disk and of the scenes of the last run. Ends only with the engine.
+async fn report_state(engine: Engine, health: HealthReporter) {
+    use tonic_health::ServingStatus::{NotServing, Serving};
+    let (mut is_degraded, mut are_reopened) = (engine.watch_storage(), engine.watch_reopening());
+    loop {
+        let states =
+            [(STORAGE_HEALTH, !*is_degraded.borrow_and_update()), (SCENES_HEALTH, *are_reopened.borrow_and_update())];
+        for (service, is_serving) in states {
+            health.set_service_status(service, if is_serving { Serving } else { NotServing }).await;
+        }
+        let changed = tokio::select! {
+            changed = is_degraded.changed() => changed,
+            changed = are_reopened.changed() => changed,
+        };
+        if changed.is_err() {
+            return;
+        }
+    }
 }
 
 /// The health of the server, for clients of gRPC and of HTTP/1.1.

@@ -3,7 +3,8 @@
 use modalcast_proto::v1;
 use tonic::{Request, Response, Status, Streaming};
 
-use super::convert::{ByteBudget, parse_hashes, wire_scene_info, wire_scene_summary};
+use super::connection::ConnectionInfo;
+use super::convert::{ByteBudget, parse_hashes, wire_failed_scene, wire_scene_info, wire_scene_summary};
 use super::describe;
 use super::status::to_status;
 use super::stream::{ReplyStream, catch_panic};
@@ -23,9 +24,11 @@ impl v1::scene_service_server::SceneService for SceneServiceImpl {
         request: Request<v1::OpenSceneRequest>,
     ) -> Result<Response<v1::OpenSceneResponse>, Status> {
         let engine = self.0.clone();
+        let connection = ConnectionInfo::of(&request).map_err(to_status)?;
+        let client = connection.client(request.metadata()).map_err(to_status)?;
         let v1::OpenSceneRequest { source, scene } = request.into_inner();
         catch_panic(async move {
-            let scene_handle = engine.open(&source, &scene).await?;
+            let scene_handle = engine.open(&source, &scene, Some(client)).await?;
             Ok(v1::OpenSceneResponse { scene: Some(wire_scene_info(&scene_handle)) })
         })
         .await
@@ -35,7 +38,7 @@ impl v1::scene_service_server::SceneService for SceneServiceImpl {
         &self,
         request: Request<Streaming<v1::UploadSceneRequest>>,
     ) -> Result<Response<v1::UploadSceneResponse>, Status> {
-        let upload: Upload = receive_upload(&self.0, request.into_inner()).await?;
+        let upload: Upload = receive_upload(&self.0, request).await?;
         let engine = self.0.clone();
         catch_panic(async move {
             let scene_handle = engine.finish_upload(upload).await?;
@@ -48,7 +51,7 @@ impl v1::scene_service_server::SceneService for SceneServiceImpl {
         &self,
         request: Request<Streaming<v1::UploadArraysRequest>>,
     ) -> Result<Response<v1::UploadArraysResponse>, Status> {
-        let upload: ArrayUpload = receive_upload(&self.0, request.into_inner()).await?;
+        let upload: ArrayUpload = receive_upload(&self.0, request).await?;
         let engine = self.0.clone();
         catch_panic(async move {
             let scene_handle = engine.finish_array_upload(upload).await?;
@@ -76,7 +79,8 @@ impl v1::scene_service_server::SceneService for SceneServiceImpl {
             let scenes = engine.list().iter().map(|scene_handle| wire_scene_summary(scene_handle)).collect();
             let mut budget = ByteBudget::new(MAX_SOURCE_BYTES);
             let sources = engine.sources().await?.into_iter().take_while(|source| budget.take_string(source)).collect();
-            Ok(v1::ListScenesResponse { scenes, sources })
+            let failed = engine.failed_scenes().into_iter().map(wire_failed_scene).collect();
+            Ok(v1::ListScenesResponse { scenes, sources, opening: engine.opening(), failed })
         })
         .await
     }

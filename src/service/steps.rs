@@ -162,7 +162,8 @@ impl DriveSession {
     /// Appends a report. An acknowledgment also covers all earlier steps. If many replies wait, the acknowledgment
     /// replaces one that is not sent yet. A client that reads nothing can therefore continue to send steps.
     fn push_report(&mut self, report: StepReport) {
-        let response = to_response(report);
+        let durable_step = self.writer.as_ref().and_then(WriterSession::durable_step);
+        let response = to_response(report, durable_step);
         let is_ack = |response: &v1::DriveSceneResponse| matches!(response.kind, Some(ResponseKind::Ack(_)));
         if self.replies.len() >= MAX_PENDING_ACKS && is_ack(&response) && self.replies.back().is_some_and(is_ack) {
             self.replies.pop_back();
@@ -205,10 +206,10 @@ async fn next_report(writer: Option<&WriterSession>) -> Result<StepReport> {
     }
 }
 
-fn to_response(report: StepReport) -> v1::DriveSceneResponse {
+fn to_response(report: StepReport, durable_step: Option<u64>) -> v1::DriveSceneResponse {
     let kind = match report {
         StepReport::Done { step, skipped, stages: times } => {
-            ResponseKind::Ack(v1::Acknowledgment { step, skipped, stages: wire_stages(&times) })
+            ResponseKind::Ack(v1::Acknowledgment { step, skipped, stages: wire_stages(&times), durable_step })
         }
         StepReport::Rejected { step, error } => ResponseKind::Rejection(to_rejection(Some(step), &error)),
     };

@@ -226,6 +226,8 @@ impl Server {
         let listener = service::bind(&config).await.expect("expected a free port");
         let address = listener.urls()[0].clone();
         let engine = Engine::start(config, source).await.expect("expected an engine");
+        let mut are_reopened = engine.watch_reopening();
+        are_reopened.wait_for(|are_reopened| *are_reopened).await.expect("expected a running engine");
         let (stop_sender, stop_receiver) = oneshot::channel();
         let shutdown = async {
             stop_receiver.await.ok();

@@ -33,6 +33,11 @@ GET_VERTICES = "/modalcast.v1.VertexService/GetVertices"
 HEALTH_WATCH = "/grpc.health.v1.Health/Watch"
 
 
+# Statuses of the health service.
+SERVING = 1
+NOT_SERVING = 2
+
+
 class Client:
     """A connection of its own."""
 
@@ -54,8 +59,18 @@ class Client:
         request = scenes_pb2.OpenSceneRequest(source=source, scene=name)
         return self.scenes.OpenScene(request, timeout=timeout).scene
 
+    def list_reply(self, timeout=30):
+        return self.scenes.ListScenes(scenes_pb2.ListScenesRequest(), timeout=timeout)
+
     def list_scenes(self, timeout=30):
-        return self.scenes.ListScenes(scenes_pb2.ListScenesRequest(), timeout=timeout).scenes
+        return self.list_reply(timeout).scenes
+
+
+def health(client, service):
+    """The status of a service of the health service."""
+    request = b"\x0a" + bytes([len(service)]) + service.encode()
+    reply = client.channel.unary_unary("/grpc.health.v1.Health/Check")(request, timeout=10)
+    return reply[1] if len(reply) > 1 else 0
 
 
 def upload_parts(name, files):

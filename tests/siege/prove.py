@@ -17,11 +17,11 @@ ITEMS = {
     4: ("replies", "unread replies"),
     5: ("shutdown", "SIGTERM ends the server within 10 s"),
     6: ("loads", "slow loads do not block other clients or the start"),
-    7: (None, "state on disk survives damage and power loss"),
+    7: ("state", "the state on disk survives damage and full disks"),
     8: ("frames", "a large frame does not delay other clients"),
     9: ("renderer_memory", "the renderer gives memory back"),
     10: ("small_steps", "unread replies to steps"),
-    11: (None, "quotas of scenes, uploads and disk"),
+    11: ("quotas", "one client does not take all places"),
     12: ("floods", "floods of control frames, log records, names in errors"),
     13: (None, "panics, endless kernels and lost devices"),
     14: ("viewer_port", "HTTP/1.1 and WebSocket of the viewer"),
@@ -32,7 +32,7 @@ ITEMS = {
 # For items with checks, the part of the subject that is not claimed.
 NOT_CLAIMED = {
     4: "frames count against the budget of replies while they wait for their first byte to be sent",
-    6: "the port answers before all scenes are open again; loads have a deadline and equal shares",
+    6: "loads have a deadline and equal shares",
     9: "while no other frame is drawn, Mesa keeps the memory of the last one",
     12: "names in the errors of all loaders",
     14: "hostile recordings, and enormous forces",

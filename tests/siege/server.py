@@ -13,11 +13,12 @@ resource.setrlimit(resource.RLIMIT_NOFILE, (resource.getrlimit(resource.RLIMIT_N
 
 
 class Server:
-    """`modalcast serve` on a free port, with an empty state folder. It is killed when the `with` block ends."""
+    """`modalcast serve` on a free port, with a state folder in a new folder or in `state`. The end of the `with` block
+    kills it."""
 
-    def __init__(self, program, *flags, scenes=None, renderer="off"):
+    def __init__(self, program, *flags, scenes=None, renderer="off", state=None):
         self.folder = tempfile.TemporaryDirectory(prefix="modalcast-siege-")
-        self.state = Path(self.folder.name) / "state"
+        self.state = Path(state or self.folder.name) / "state"
         self.log_path = Path(self.folder.name) / "log"
         command = [str(program), "serve", "--listen", "127.0.0.1:0", "--backend", "cpu"]
         command += ["--renderer", renderer, "--state", str(self.state)]

@@ -106,6 +106,8 @@ pub struct Ack {
     /// Number of steps merged into a newer step since the stream began.
     pub skipped: u64,
     pub stages: StageTimes,
+    /// The newest step of this run that survives a crash of the server and a power loss.
+    pub durable_step: Option<u64>,
 }
 
 /// Totals of a stream.
@@ -364,7 +366,12 @@ impl Progress {
         self.skipped = ack.skipped;
         push_bounded(
             &mut self.acks,
-            Ack { step: ack.step, skipped: ack.skipped, stages: stages::from_wire(ack.stages) },
+            Ack {
+                step: ack.step,
+                skipped: ack.skipped,
+                stages: stages::from_wire(ack.stages),
+                durable_step: ack.durable_step,
+            },
         );
     }
 
@@ -412,7 +419,7 @@ mod tests {
         let mut progress = Progress { in_flight: (0..6).collect(), ..Progress::default() };
         progress.reject(rejection(4));
         assert_eq!(progress.in_flight, [0, 1, 2, 3, 5]);
-        progress.acknowledge(v1::Acknowledgment { step: 3, skipped: 2, stages: vec![] });
+        progress.acknowledge(v1::Acknowledgment { step: 3, skipped: 2, ..Default::default() });
         assert_eq!((progress.in_flight.make_contiguous(), progress.skipped), (&mut [5][..], 2));
         progress.reject(rejection(9));
         assert_eq!((progress.in_flight.len(), progress.rejected), (1, 2));

@@ -18,7 +18,8 @@ use crate::engine::content::ContentHashes;
 use crate::engine::device::command::SceneId;
 use crate::engine::output::step_output::{OutputSpec, StepId, StepOutput};
 use crate::engine::scene_memory::SceneMemory;
-use crate::engine::storage::scene_catalog::SceneProvenance;
+use crate::engine::storage::checkpoint_store::SceneCheckpoints;
+use crate::engine::storage::provenance::SceneProvenance;
 use crate::telemetry::ms_since;
 use modalcast_model::backend_settings::BackendSettings;
 use modalcast_model::error::{Error, Result, invalid};
@@ -51,6 +52,7 @@ pub struct SceneHandle {
     failure: Arc<OnceLock<Error>>,
     /// Computed when a client first asks for them.
     content_hashes: OnceCell<Arc<ContentHashes>>,
+    checkpoints: SceneCheckpoints,
 }
 
 /// Arguments of [`SceneHandle::open`].
@@ -92,6 +94,7 @@ impl SceneHandle {
         let wake = Arc::new(Notify::new());
         let max_window = services.config.max_window;
         let failure = Arc::new(OnceLock::new());
+        let checkpoints = SceneCheckpoints::new(Arc::clone(&services.checkpoints), name.clone());
         let (state_sender, current_state) = watch::channel(Arc::clone(&state));
         let actor = ActorParams {
             name: name.clone(),
@@ -120,6 +123,7 @@ impl SceneHandle {
             stop_error: OnceLock::new(),
             failure,
             content_hashes: OnceCell::new(),
+            checkpoints,
         })
     }
 
@@ -142,6 +146,12 @@ impl SceneHandle {
         (state.run > 0).then(|| StepId::of(&state))
     }
 
+    /// The newest step that survives a crash of the server and a power loss. `None` before the first one.
+    pub fn durable_step(&self) -> Option<StepId> {
+        let durable = self.checkpoints.durable_step().filter(|durable| durable.run > 0)?;
+        Some(StepId { run: durable.run, number: durable.number, time: durable.time })
+    }
+
     /// Acquires the writer lease. `peer` is the address of the client, for the log. The window (number of steps that
     /// may be unacknowledged) is clamped to the range from 1 to the configured limit.
     ///
@@ -154,8 +164,8 @@ impl SceneHandle {
         let AcquiredLease { lease, token, run, initial_state } =
             self.call(|reply| Message::AcquireWriter { request, reply }).await?;
         tracing::info!(scene = self.name, run, peer, ?delivery, ?initial_state, "driven by a new writer");
-        let scene = Arc::clone(&self.scene);
-        Ok(WriterSession { lease, scene, run, window, token, initial_state, last_number: None })
+        let (scene, checkpoints) = (Arc::clone(&self.scene), self.checkpoints.clone());
+        Ok(WriterSession { lease, scene, run, window, token, initial_state, last_number: None, checkpoints })
     }
 
     /// Returns the scene to its rest state: acquires the writer lease, completes one step and releases the lease. With
@@ -302,6 +312,7 @@ pub struct WriterSession {
     pub initial_state: InitialState,
     /// Number of the last accepted step.
     last_number: Option<u64>,
+    checkpoints: SceneCheckpoints,
 }
 
 impl WriterSession {
@@ -319,6 +330,12 @@ impl WriterSession {
         self.lease.step_queue.push(QueuedStep::new(update, ms_since(begin)))?;
         self.last_number = Some(raw.number);
         Ok(())
+    }
+
+    /// Number of the newest step of this run that survives a crash of the server and a power loss.
+    pub fn durable_step(&self) -> Option<u64> {
+        let durable = self.checkpoints.durable_step()?;
+        (durable.run == self.run).then_some(durable.number)
     }
 
     /// Whether the writer may read another step now. If not, it may after the next report.

@@ -5,16 +5,20 @@
 
 use std::collections::{BTreeMap, HashSet};
 use std::fmt::Write as _;
-use std::fs::{self, File};
-use std::io::{self, BufWriter, Write as _};
+use std::io::{self, BufWriter, Write};
 use std::path::Path;
+use std::sync::Arc;
 
-use tokio::sync::OwnedSemaphorePermit;
+use sha2::{Digest as _, Sha256};
 
+use super::file_system::{FileSystem, StateFile};
 use super::upload::CompleteUpload;
 use super::upload_folder::UploadFolder;
+use crate::engine::content::ContentHash;
+use crate::engine::upload_quota::UploadPermit;
 use modalcast_model::domain::{Corners, CreaseAngle, MAX_RANK, Mesh, Modes, Shape, Transform};
 use modalcast_model::error::{Result, fault_in, invalid};
+use modalcast_model::memory::MemoryReservation;
 use modalcast_model::scene::UpAxis;
 
 /// Limit on the domains of one upload. Each domain can have two files.
@@ -81,6 +85,33 @@ pub struct ArrayUpload {
     /// Sum of the sizes of the arrays of all domains so far, in bytes.
     declared_bytes: u64,
     open_arrays: Option<OpenArrays>,
+    /// The memory of the arrays that are being received.
+    memory: Arc<MemoryReservation>,
+    /// Hashes of the files so far, by their names.
+    hashes: BTreeMap<String, ContentHash>,
+}
+
+/// Copies of the arrays of a domain that are made when they are validated: as numbers, in a mesh, and in columns.
+const VALIDATED_COPIES: u64 = 3;
+
+/// A new file of the upload that is hashed while it is written.
+#[derive(Debug)]
+struct HashedFile {
+    name: String,
+    file: Box<dyn StateFile>,
+    hasher: Sha256,
+}
+
+impl Write for HashedFile {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        let length = self.file.write(bytes)?;
+        self.hasher.update(&bytes[..length]);
+        Ok(length)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.file.flush()
+    }
 }
 
 /// The arrays that are being received.
@@ -121,14 +152,17 @@ impl OpenArrays {
 }
 
 impl ArrayUpload {
-    /// Creates a temporary folder next to the finished uploads.
+    /// Creates a temporary folder next to the finished uploads. The arrays of a domain are in `memory` until they are on
+    /// disk.
     ///
     /// # Errors
     /// `Invalid` for a number of domains or a unit out of range, `Fault` of the disk.
     pub(in crate::engine) fn begin(
         uploads: &Path,
+        file_system: &Arc<dyn FileSystem>,
         header: ArrayUploadHeader,
-        permit: OwnedSemaphorePermit,
+        permit: UploadPermit,
+        memory: Arc<MemoryReservation>,
     ) -> Result<Self> {
         if !(1..=MAX_DOMAINS).contains(&header.domains) {
             return Err(invalid("header.domains", format!("1 to {MAX_DOMAINS} domains"), header.domains));
@@ -136,8 +170,7 @@ impl ArrayUpload {
         if !(header.unit.is_finite() && header.unit > 0.0) {
             return Err(invalid("header.unit", "a positive number of meters", header.unit));
         }
-        let folder = UploadFolder::create(uploads, &header.scene, permit)?;
-        fs::write(folder.path().join("surface.mtl"), MATERIAL_LIBRARY).map_err(fault_in("upload"))?;
+        let folder = UploadFolder::create(uploads, file_system, &header.scene, permit)?;
         let mut upload = Self {
             header,
             folder,
@@ -148,7 +181,10 @@ impl ArrayUpload {
             names: HashSet::new(),
             declared_bytes: 0,
             open_arrays: None,
+            memory,
+            hashes: BTreeMap::new(),
         };
+        upload.write_text("surface.mtl", MATERIAL_LIBRARY)?;
         let (name, up, unit) = (toml_string(&upload.header.scene), upload.up(), upload.header.unit);
         upload.manifest = format!("name = {name}\nup = \"{up}\"\nunit = {unit:?}\n");
         Ok(upload)
@@ -249,8 +285,8 @@ impl ArrayUpload {
     /// Appends bytes to the arrays of the current domain. The last chunk of the domain validates and writes the arrays.
     ///
     /// # Errors
-    /// `Invalid` when the bytes exceed the declared size, or with a path below `domains[i]` for invalid arrays; `Fault`
-    /// of the disk.
+    /// `Invalid` when the bytes exceed the declared size, or with a path below `domains[i]` for invalid arrays;
+    /// `OutOfMemory`; `Fault` of the disk.
     pub fn write_chunk(&mut self, bytes: &[u8]) -> Result<()> {
         let chunk_bytes = bytes.len() as u64;
         let Some(arrays) = self.open_arrays.as_mut().filter(|arrays| chunk_bytes <= arrays.remaining_bytes()) else {
@@ -258,28 +294,62 @@ impl ArrayUpload {
             let expected = format!("at most {remaining_bytes} bytes (the rest of the arrays)");
             return Err(invalid("chunk", expected, format!("{chunk_bytes} bytes")));
         };
+        let object = format!("arrays of domain {}", arrays.domain);
+        self.memory.reserve(&object, chunk_bytes)?;
         arrays.bytes.extend_from_slice(bytes);
         match self.open_arrays.take_if(|arrays| arrays.remaining_bytes() == 0) {
             None => Ok(()),
             Some(arrays) => {
+                let copies = self.memory.reserve_temporary(&object, VALIDATED_COPIES * arrays.total())?;
                 let path = format!("domains[{}]", arrays.domain);
-                self.write_arrays(&arrays).map_err(|error| error.in_message(&path))
+                self.write_arrays(&arrays).map_err(|error| error.in_message(&path))?;
+                drop((arrays, copies));
+                self.memory.resize(&object, 0)
             }
         }
     }
 
+    /// Creates a file of the upload.
+    fn create_file(&self, name: &str) -> io::Result<BufWriter<HashedFile>> {
+        let file = self.folder.file_system().create_file(&self.folder.path().join(name), true)?;
+        Ok(BufWriter::new(HashedFile { name: name.to_owned(), file, hasher: Sha256::new() }))
+    }
+
+    /// Syncs a file and records its hash.
+    fn finish_file(&mut self, file: BufWriter<HashedFile>) -> io::Result<()> {
+        let HashedFile { name, mut file, hasher } = file.into_inner().map_err(io::IntoInnerError::into_error)?;
+        file.sync()?;
+        self.hashes.insert(name, hasher.finalize().into());
+        Ok(())
+    }
+
+    fn write_text(&mut self, name: &str, text: &str) -> Result<()> {
+        let mut write = || -> io::Result<()> {
+            let mut file = self.create_file(name)?;
+            file.write_all(text.as_bytes())?;
+            self.finish_file(file)
+        };
+        write().map_err(fault_in("upload"))
+    }
+
     /// Validates complete arrays and writes their files.
-    fn write_arrays(&self, arrays: &OpenArrays) -> Result<()> {
+    fn write_arrays(&mut self, arrays: &OpenArrays) -> Result<()> {
         let (positions, remainder) = arrays.bytes.split_at(arrays.sizes[0] as usize);
         let (faces, modes) = remainder.split_at(arrays.sizes[1] as usize);
         let positions: Vec<[f32; 3]> = bytemuck::pod_collect_to_vec(positions);
         let faces: Vec<[u32; 3]> = bytemuck::pod_collect_to_vec(faces);
         let modes: Vec<f32> = bytemuck::pod_collect_to_vec(modes);
         check_arrays(arrays, &positions, &faces, &modes)?;
-        let file = |ending: &str| File::create_new(self.folder.path().join(format!("{}.{ending}", arrays.domain)));
-        let write_files = || -> io::Result<()> {
-            write_obj(BufWriter::new(file("obj")?), &positions, &faces)?;
-            if arrays.rank > 0 { write_npy(BufWriter::new(file("npy")?), arrays, &modes) } else { Ok(()) }
+        let mut write_files = || -> io::Result<()> {
+            let mut file = self.create_file(&format!("{}.obj", arrays.domain))?;
+            write_obj(&mut file, &positions, &faces)?;
+            self.finish_file(file)?;
+            if arrays.rank == 0 {
+                return Ok(());
+            }
+            let mut file = self.create_file(&format!("{}.npy", arrays.domain))?;
+            write_npy(&mut file, arrays, &modes)?;
+            self.finish_file(file)
         };
         write_files().map_err(fault_in("upload"))
     }
@@ -288,15 +358,14 @@ impl ArrayUpload {
     ///
     /// # Errors
     /// `Invalid` when domains or arrays are missing, `Fault` of the disk.
-    pub(in crate::engine) fn finish(self) -> Result<CompleteUpload> {
-        let write_manifest =
-            || fs::write(self.folder.path().join("scene.toml"), &self.manifest).map_err(fault_in("upload"));
-        if let Err(error) = self.check_complete().and_then(|()| write_manifest()) {
+    pub(in crate::engine) fn finish(mut self) -> Result<CompleteUpload> {
+        let manifest = std::mem::take(&mut self.manifest);
+        if let Err(error) = self.check_complete().and_then(|()| self.write_text("scene.toml", &manifest)) {
             self.discard();
             return Err(error);
         }
-        let Self { header, folder, .. } = self;
-        Ok(CompleteUpload { scene: header.scene, entry: String::new(), folder, hashes: BTreeMap::new() })
+        let Self { header, folder, hashes, .. } = self;
+        CompleteUpload::new(header.scene, String::new(), folder, &hashes)
     }
 
     fn check_complete(&self) -> Result<()> {
@@ -337,7 +406,7 @@ fn check_arrays(arrays: &OpenArrays, positions: &[[f32; 3]], faces: &[[u32; 3]],
 }
 
 /// Writes a triangle mesh. `{:?}` prints f32 with all digits that they need. Indices of OBJ files begin at 1.
-fn write_obj(mut file: BufWriter<File>, positions: &[[f32; 3]], faces: &[[u32; 3]]) -> io::Result<()> {
+fn write_obj(file: &mut impl Write, positions: &[[f32; 3]], faces: &[[u32; 3]]) -> io::Result<()> {
     writeln!(file, "mtllib surface.mtl\nusemtl surface")?;
     for [x, y, z] in positions {
         writeln!(file, "v {x:?} {y:?} {z:?}")?;
@@ -346,18 +415,17 @@ fn write_obj(mut file: BufWriter<File>, positions: &[[f32; 3]], faces: &[[u32; 3
         let [a, b, c] = face.map(|vertex| u64::from(vertex) + 1);
         writeln!(file, "f {a} {b} {c}")?;
     }
-    file.flush()
+    Ok(())
 }
 
 /// Writes U as a NumPy file of version 1: 3n x r f32, row-major.
-fn write_npy(mut file: BufWriter<File>, arrays: &OpenArrays, modes: &[f32]) -> io::Result<()> {
+fn write_npy(file: &mut impl Write, arrays: &OpenArrays, modes: &[f32]) -> io::Result<()> {
     let (rows, columns) = (3 * arrays.vertices, arrays.rank);
     let header = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({rows}, {columns}), }}");
     // The magic and the length take 10 bytes. The header is padded so that the data begin at byte 128.
     file.write_all(b"\x93NUMPY\x01\x00\x76\x00")?;
     writeln!(file, "{header:<117}")?;
-    file.write_all(bytemuck::cast_slice(modes))?;
-    file.flush()
+    file.write_all(bytemuck::cast_slice(modes))
 }
 
 /// A text without control characters as a TOML string.

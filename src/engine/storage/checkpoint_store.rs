@@ -1,6 +1,10 @@
 //! Checkpoint store: persists the last step of every scene, one file per scene. A background thread writes in rounds,
-//! at most ten per second. A round writes and syncs one file per changed scene. Files are replaced by an atomic rename,
-//! so a killed server never leaves a partial file. It loses the steps of the last 0.1 s plus the duration of one round.
+//! at most twenty per second. A round writes and syncs one file per changed scene. Files are replaced by an atomic rename,
+//! so neither a killed server nor a power loss leaves a partial file. What is lost are the steps of the last 0.05 s plus the
+//! duration of one round.
+//!
+//! A state that cannot be written, for example because the disk is full, is written again later. Until then the store is
+//! degraded, and the durable step of the scene stands still.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -11,15 +15,19 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 use sha2::{Digest as _, Sha256};
+use tokio::sync::watch;
 
-use super::atomic_file::write_atomic;
+use super::file_system::{FileSystem, write_atomic};
 use crate::engine::lock::lock;
 use modalcast_model::domain::Transform;
 use modalcast_model::error::{Result, fault, fault_in, invalid};
 use modalcast_model::scene::{FloatingOrigins, Scene, SceneState};
 
 /// Pause between two rounds of writes.
-const WRITE_INTERVAL: Duration = Duration::from_millis(100);
+const WRITE_INTERVAL: Duration = Duration::from_millis(50);
+
+/// Pause after a round in which a write failed.
+const RETRY_INTERVAL: Duration = Duration::from_millis(250);
 
 /// Magic number of a checkpoint file. The file continues with run and step number (u64), time (f64, seconds), the
 /// counts of coordinates and of transforms (u64), q (f32), the transforms (12 f32 each), and the SHA-256 of all bytes
@@ -36,21 +44,42 @@ const TRANSFORM_BYTES: usize = 48;
 /// Size of an origin or a translation: 3 f64.
 const POINT_BYTES: usize = 24;
 
+/// A step that survives a crash of the server and a power loss.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(in crate::engine) struct DurableStep {
+    pub(in crate::engine) run: u64,
+    pub(in crate::engine) number: u64,
+    /// Simulation time in seconds.
+    pub(in crate::engine) time: f64,
+}
+
+impl DurableStep {
+    const fn of(state: &SceneState) -> Self {
+        Self { run: state.run, number: state.step, time: state.time }
+    }
+}
+
 /// Writes checkpoints in the background.
 #[derive(Debug)]
 pub(in crate::engine) struct CheckpointStore {
-    folder: PathBuf,
-    shared: Arc<Shared>,
+    writer: Arc<CheckpointWriter>,
     thread: Mutex<Option<JoinHandle<()>>>,
 }
 
-#[derive(Debug, Default)]
-struct Shared {
+/// The part of the store that the background thread uses.
+#[derive(Debug)]
+struct CheckpointWriter {
+    file_system: Arc<dyn FileSystem>,
+    folder: PathBuf,
     pending: Mutex<PendingWrites>,
     /// Signaled when `pending` has changed.
     change_signal: Condvar,
-    /// Held while files are read, written or removed. Lock order: `file_lock` before `pending`.
+    /// Held while files are read, written or removed. Lock order: `file_lock` before `pending` and `durable`.
     file_lock: Mutex<()>,
+    /// The steps on disk, by scene name.
+    durable: Mutex<BTreeMap<String, DurableStep>>,
+    /// Whether the last round could not write a state.
+    is_degraded: watch::Sender<bool>,
 }
 
 #[derive(Debug, Default)]
@@ -61,25 +90,45 @@ struct PendingWrites {
 }
 
 impl CheckpointStore {
-    /// Starts the thread that writes into `folder`.
+    /// Starts the thread that writes into the existing folder `folder`.
     ///
     /// # Errors
-    /// `Fault` when the folder or the thread cannot be created.
-    pub(in crate::engine) fn start(folder: PathBuf) -> Result<Self> {
-        fs::create_dir_all(&folder).map_err(fault_in("state folder"))?;
-        let shared = Arc::new(Shared::default());
-        let (thread_shared, thread_folder) = (Arc::clone(&shared), folder.clone());
+    /// `Fault` when the thread cannot be created.
+    pub(in crate::engine) fn start(folder: PathBuf, file_system: &Arc<dyn FileSystem>) -> Result<Self> {
+        let writer = Arc::new(CheckpointWriter::new(folder, file_system));
+        let thread_writer = Arc::clone(&writer);
         let thread = std::thread::Builder::new()
             .name("checkpoints".into())
-            .spawn(move || write_loop(&thread_shared, &thread_folder))
+            .spawn(move || thread_writer.run())
             .map_err(fault_in("checkpoint thread"))?;
-        Ok(Self { folder, shared, thread: Mutex::new(Some(thread)) })
+        Ok(Self { writer, thread: Mutex::new(Some(thread)) })
+    }
+
+    /// A store whose test calls [`Self::write_round`].
+    #[cfg(test)]
+    pub(super) fn without_thread(folder: PathBuf, file_system: &Arc<dyn FileSystem>) -> Self {
+        Self { writer: Arc::new(CheckpointWriter::new(folder, file_system)), thread: Mutex::new(None) }
+    }
+
+    #[cfg(test)]
+    pub(super) fn write_round(&self) {
+        self.writer.write_round();
+    }
+
+    /// Whether the newest states cannot be written, for example because the disk is full.
+    pub(in crate::engine) fn watch_degraded(&self) -> watch::Receiver<bool> {
+        self.writer.is_degraded.subscribe()
+    }
+
+    /// The newest step of a scene that survives a crash of the server and a power loss.
+    pub(in crate::engine) fn durable_step(&self, name: &str) -> Option<DurableStep> {
+        lock(&self.writer.durable).get(name).copied()
     }
 
     /// Records the newest state of a scene. Never waits for the disk.
     pub(in crate::engine) fn enqueue(&self, name: &str, state: &Arc<SceneState>) {
-        lock(&self.shared.pending).dirty.insert(name.to_owned(), Arc::clone(state));
-        self.shared.change_signal.notify_one();
+        lock(&self.writer.pending).dirty.insert(name.to_owned(), Arc::clone(state));
+        self.writer.change_signal.notify_one();
     }
 
     /// Returns the newest recorded state of a scene, on disk or not. `None` if no state was recorded. Waits for the
@@ -88,14 +137,18 @@ impl CheckpointStore {
     /// # Errors
     /// `Invalid` when the file is damaged or its size does not match the scene; `Fault` of the disk.
     pub(in crate::engine) fn load(&self, name: &str, scene: &Scene) -> Result<Option<SceneState>> {
-        let _files = lock(&self.shared.file_lock);
+        let _files = lock(&self.writer.file_lock);
         // A scene that failed and is opened again may have a state that is not on disk yet.
-        if let Some(state) = lock(&self.shared.pending).dirty.get(name) {
+        if let Some(state) = lock(&self.writer.pending).dirty.get(name) {
             // Decoding checks that the state matches the scene.
             return decode(&encode(state), scene).map(Some);
         }
-        match fs::read(checkpoint_path(&self.folder, name)) {
-            Ok(bytes) => decode(&bytes, scene).map(Some),
+        match fs::read(checkpoint_path(&self.writer.folder, name)) {
+            Ok(bytes) => {
+                let state = decode(&bytes, scene)?;
+                lock(&self.writer.durable).insert(name.to_owned(), DurableStep::of(&state));
+                Ok(Some(state))
+            }
             Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
             Err(error) => Err(fault("reading a checkpoint", error)),
         }
@@ -103,16 +156,21 @@ impl CheckpointStore {
 
     /// Removes the checkpoint of a scene. Waits for the disk.
     pub(in crate::engine) fn remove(&self, name: &str) {
-        let _files = lock(&self.shared.file_lock);
-        lock(&self.shared.pending).dirty.remove(name);
+        let CheckpointWriter { file_system, folder, pending, durable, file_lock, .. } = &*self.writer;
+        let _files = lock(file_lock);
+        lock(pending).dirty.remove(name);
+        lock(durable).remove(name);
         // A scene without steps has no file.
-        fs::remove_file(checkpoint_path(&self.folder, name)).ok();
+        if file_system.remove_file(&checkpoint_path(folder, name)).is_ok() {
+            // Without this sync, a power loss could bring the step back for a later scene with this name.
+            file_system.sync_folder(folder).ok();
+        }
     }
 
     /// Writes the states that are not written yet, and ends the thread. Waits for the disk.
     pub(in crate::engine) fn finish(&self) {
-        lock(&self.shared.pending).is_stopping = true;
-        self.shared.change_signal.notify_one();
+        lock(&self.writer.pending).is_stopping = true;
+        self.writer.change_signal.notify_one();
         if let Some(thread) = lock(&self.thread).take() {
             thread.join().ok(); // If the thread has panicked, the panic hook has printed the panic.
         }
@@ -120,7 +178,7 @@ impl CheckpointStore {
 }
 
 /// The checkpoints of one scene.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub(in crate::engine) struct SceneCheckpoints {
     store: Arc<CheckpointStore>,
     name: String,
@@ -135,6 +193,11 @@ impl SceneCheckpoints {
     pub(in crate::engine) fn save(&self, state: &Arc<SceneState>) {
         self.store.enqueue(&self.name, state);
     }
+
+    /// The newest step of the scene that survives a crash of the server and a power loss.
+    pub(in crate::engine) fn durable_step(&self) -> Option<DurableStep> {
+        self.store.durable_step(&self.name)
+    }
 }
 
 impl Drop for CheckpointStore {
@@ -143,34 +206,61 @@ impl Drop for CheckpointStore {
     }
 }
 
-/// Writes dirty states until the store is finished and no state is dirty.
-fn write_loop(shared: &Shared, folder: &Path) {
-    loop {
-        let has_no_work = |pending: &mut PendingWrites| pending.dirty.is_empty() && !pending.is_stopping;
-        // Wait for work. Drop the lock before `file_lock` is acquired, because of the lock order.
-        drop(
-            shared.change_signal.wait_while(lock(&shared.pending), has_no_work).unwrap_or_else(PoisonError::into_inner),
-        );
-        {
-            let _files = lock(&shared.file_lock);
-            let dirty = std::mem::take(&mut lock(&shared.pending).dirty);
-            for (name, state) in dirty {
-                if let Err(error) = write_atomic(&checkpoint_path(folder, &name), &encode(&state)) {
-                    tracing::warn!(scene = name, %error, "the checkpoint could not be written");
+impl CheckpointWriter {
+    fn new(folder: PathBuf, file_system: &Arc<dyn FileSystem>) -> Self {
+        Self {
+            file_system: Arc::clone(file_system),
+            folder,
+            pending: Mutex::default(),
+            change_signal: Condvar::new(),
+            file_lock: Mutex::default(),
+            durable: Mutex::default(),
+            is_degraded: watch::Sender::new(false),
+        }
+    }
+
+    /// Writes dirty states until the store is finished and no state is dirty, or cannot be written.
+    fn run(&self) {
+        loop {
+            let has_no_work = |pending: &mut PendingWrites| pending.dirty.is_empty() && !pending.is_stopping;
+            // Wait for work. Drop the lock before `file_lock` is acquired, because of the lock order.
+            drop(
+                self.change_signal.wait_while(lock(&self.pending), has_no_work).unwrap_or_else(PoisonError::into_inner),
+            );
+            let is_written = self.write_round();
+            let pending = lock(&self.pending);
+            if pending.is_stopping && (pending.dirty.is_empty() || !is_written) {
+                return;
+            }
+            let is_running = |pending: &mut PendingWrites| !pending.is_stopping;
+            let pause = if is_written { WRITE_INTERVAL } else { RETRY_INTERVAL };
+            drop(
+                self.change_signal
+                    .wait_timeout_while(pending, pause, is_running)
+                    .unwrap_or_else(PoisonError::into_inner),
+            );
+        }
+    }
+
+    /// Writes the states that are dirty now. Returns whether all of them are on disk.
+    fn write_round(&self) -> bool {
+        let _files = lock(&self.file_lock);
+        let dirty = std::mem::take(&mut lock(&self.pending).dirty);
+        let mut is_written = true;
+        for (name, state) in dirty {
+            match write_atomic(&*self.file_system, &checkpoint_path(&self.folder, &name), &encode(&state)) {
+                Ok(()) => drop(lock(&self.durable).insert(name, DurableStep::of(&state))),
+                Err(error) => {
+                    is_written = false;
+                    // The log limits such records to one per second.
+                    tracing::warn!(scene = name, %error, "the last step could not be written; it is tried again");
+                    // Unless there is a newer state.
+                    lock(&self.pending).dirty.entry(name).or_insert(state);
                 }
             }
         }
-        let pending = lock(&shared.pending);
-        if pending.is_stopping && pending.dirty.is_empty() {
-            return;
-        }
-        let is_running = |pending: &mut PendingWrites| !pending.is_stopping;
-        drop(
-            shared
-                .change_signal
-                .wait_timeout_while(pending, WRITE_INTERVAL, is_running)
-                .unwrap_or_else(PoisonError::into_inner),
-        );
+        self.is_degraded.send_if_modified(|is_degraded| std::mem::replace(is_degraded, !is_written) == is_written);
+        is_written
     }
 }
 
@@ -266,8 +356,108 @@ fn decode_origins(bytes: &[u8], scene: &Scene) -> Result<FloatingOrigins> {
 
 #[cfg(test)]
 mod tests {
+    use std::io::Write;
+    use std::sync::atomic::{AtomicBool, Ordering};
+    use std::time::Instant;
+
+    use super::super::file_system::{DiskFileSystem, StateFile};
     use super::*;
     use crate::engine::testing;
+
+    /// A disk that is full while `is_full` is set: files can be created but not written.
+    #[derive(Debug, Default)]
+    struct FullDisk {
+        is_full: Arc<AtomicBool>,
+    }
+
+    #[derive(Debug)]
+    struct FullDiskFile {
+        is_full: Arc<AtomicBool>,
+        file: Box<dyn StateFile>,
+    }
+
+    impl FileSystem for FullDisk {
+        fn create_folder(&self, path: &Path) -> io::Result<()> {
+            DiskFileSystem.create_folder(path)
+        }
+
+        fn create_file(&self, path: &Path, is_new: bool) -> io::Result<Box<dyn StateFile>> {
+            let (is_full, file) = (Arc::clone(&self.is_full), DiskFileSystem.create_file(path, is_new)?);
+            Ok(Box::new(FullDiskFile { is_full, file }))
+        }
+
+        fn sync_folder(&self, path: &Path) -> io::Result<()> {
+            DiskFileSystem.sync_folder(path)
+        }
+
+        fn rename(&self, from: &Path, to: &Path) -> io::Result<()> {
+            DiskFileSystem.rename(from, to)
+        }
+
+        fn remove_file(&self, path: &Path) -> io::Result<()> {
+            DiskFileSystem.remove_file(path)
+        }
+
+        fn remove_folder(&self, path: &Path) -> io::Result<()> {
+            DiskFileSystem.remove_folder(path)
+        }
+    }
+
+    impl Write for FullDiskFile {
+        fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+            if self.is_full.load(Ordering::Relaxed) {
+                return Err(io::ErrorKind::StorageFull.into());
+            }
+            self.file.write(bytes)
+        }
+
+        fn flush(&mut self) -> io::Result<()> {
+            self.file.flush()
+        }
+    }
+
+    impl StateFile for FullDiskFile {
+        fn sync(&mut self) -> io::Result<()> {
+            self.file.sync()
+        }
+    }
+
+    fn wait_until(what: &str, mut condition: impl FnMut() -> bool) {
+        let start = Instant::now();
+        while !condition() {
+            assert!(start.elapsed() < Duration::from_secs(60), "expected within 60 s: {what}");
+            std::thread::sleep(Duration::from_millis(5));
+        }
+    }
+
+    #[test]
+    fn full_disk_stops_the_durable_step_until_it_has_room() {
+        let folder = tempfile::tempdir().expect("expected a temporary folder");
+        let disk = FullDisk::default();
+        let is_full = Arc::clone(&disk.is_full);
+        let file_system: Arc<dyn FileSystem> = Arc::new(disk);
+        let checkpoints =
+            CheckpointStore::start(folder.path().to_owned(), &file_system).expect("expected a checkpoint thread");
+        let is_degraded = checkpoints.watch_degraded();
+        let scene = testing::two_strips();
+        let save = |step| checkpoints.enqueue("strips", &Arc::new(SceneState { step, ..deformed_state(&scene) }));
+        let durable_number = || checkpoints.durable_step("strips").map(|durable| durable.number);
+        save(1);
+        wait_until("step 1 on disk", || durable_number() == Some(1));
+        is_full.store(true, Ordering::Relaxed);
+        save(2);
+        wait_until("a degraded store", || *is_degraded.borrow());
+        save(3);
+        assert_eq!(durable_number(), Some(1));
+        is_full.store(false, Ordering::Relaxed);
+        wait_until("step 3 on disk", || durable_number() == Some(3) && !*is_degraded.borrow());
+        is_full.store(true, Ordering::Relaxed);
+        save(4);
+        // Ends although the step cannot be written.
+        checkpoints.finish();
+        let state = CheckpointStore::without_thread(folder.path().to_owned(), &file_system).load("strips", &scene);
+        assert_eq!(state.expect("expected a valid checkpoint").map(|state| state.step), Some(3));
+    }
 
     fn deformed_state(scene: &Scene) -> SceneState {
         let mut state = SceneState { run: 3, step: 41, time: 0.25, ..SceneState::rest(scene) };
@@ -326,7 +516,10 @@ mod tests {
     fn finish_writes_the_newest_state_and_remove_deletes_it() {
         let folder = tempfile::tempdir().expect("expected a temporary folder");
         let scene = testing::two_strips();
-        let checkpoints = CheckpointStore::start(folder.path().to_owned()).expect("expected a checkpoint thread");
+        let checkpoints = {
+            let file_system: Arc<dyn FileSystem> = Arc::new(DiskFileSystem);
+            CheckpointStore::start(folder.path().to_owned(), &file_system).expect("expected a checkpoint thread")
+        };
         for step in 0..50 {
             checkpoints.enqueue("strips", &Arc::new(SceneState { step, ..deformed_state(&scene) }));
         }

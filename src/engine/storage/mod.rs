@@ -1,11 +1,15 @@
 //! The state folder: the catalog of open scenes, the checkpoints of their steps, the counter of runs, and uploaded
-//! files.
+//! files. A change is durable before it is acknowledged: files are synced, then renamed, then their folder is synced.
 
 pub(super) mod array_upload;
-mod atomic_file;
 pub(super) mod checkpoint_store;
+#[cfg(test)]
+mod crash_tests;
+pub(super) mod file_system;
+pub(super) mod provenance;
+mod recovery;
 pub(super) mod run_counter;
 pub(super) mod scene_catalog;
 pub(super) mod upload;
 mod upload_folder;
-pub(super) mod uploaded_files;
+pub(super) mod upload_record;

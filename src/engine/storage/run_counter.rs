@@ -5,9 +5,9 @@
 use std::fs;
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
-use std::sync::Mutex;
+use std::sync::{Arc, Mutex};
 
-use super::atomic_file::write_atomic;
+use super::file_system::{FileSystem, write_atomic};
 use crate::engine::lock::lock;
 use modalcast_model::error::{Error, Result, fault_in};
 
@@ -17,6 +17,7 @@ const FILE_NAME: &str = "last_run";
 /// The number of the server's last run, in memory and on disk.
 #[derive(Debug)]
 pub(in crate::engine) struct RunCounter {
+    file_system: Arc<dyn FileSystem>,
     path: PathBuf,
     last_run: Mutex<u64>,
 }
@@ -26,7 +27,7 @@ impl RunCounter {
     ///
     /// # Errors
     /// `Unavailable` when the file cannot be read or is damaged.
-    pub(in crate::engine) fn open(state_folder: &Path) -> Result<Self> {
+    pub(in crate::engine) fn open(state_folder: &Path, file_system: &Arc<dyn FileSystem>) -> Result<Self> {
         let path = state_folder.join(FILE_NAME);
         let unavailable = |reason: String| Error::Unavailable {
             what: "counter of runs",
@@ -38,7 +39,7 @@ impl RunCounter {
             Err(error) if error.kind() == ErrorKind::NotFound => 0,
             Err(error) => return Err(unavailable(error.to_string())),
         };
-        Ok(Self { path, last_run: Mutex::new(last_run) })
+        Ok(Self { file_system: Arc::clone(file_system), path, last_run: Mutex::new(last_run) })
     }
 
     /// Returns the number of a new run, which is larger than all earlier numbers. Waits until it is on disk.
@@ -48,7 +49,8 @@ impl RunCounter {
     pub(in crate::engine) fn next(&self) -> Result<u64> {
         let mut last_run = lock(&self.last_run);
         *last_run += 1;
-        write_atomic(&self.path, last_run.to_string().as_bytes()).map_err(fault_in("counter of runs"))?;
+        let digits = last_run.to_string();
+        write_atomic(&*self.file_system, &self.path, digits.as_bytes()).map_err(fault_in("counter of runs"))?;
         Ok(*last_run)
     }
 
@@ -61,10 +63,15 @@ impl RunCounter {
 
 #[cfg(test)]
 mod tests {
+    use super::super::file_system::DiskFileSystem;
     use super::*;
 
+    fn disk() -> Arc<dyn FileSystem> {
+        Arc::new(DiskFileSystem)
+    }
+
     fn open(folder: &Path) -> RunCounter {
-        RunCounter::open(folder).expect("expected a counter")
+        RunCounter::open(folder, &disk()).expect("expected a counter")
     }
 
     #[test]
@@ -85,7 +92,7 @@ mod tests {
     fn damaged_counter_is_not_replaced_by_zero() {
         let folder = tempfile::tempdir().expect("expected a temporary folder");
         fs::write(folder.path().join(FILE_NAME), "12x").expect("expected a written file");
-        assert!(matches!(RunCounter::open(folder.path()), Err(Error::Unavailable { .. })));
+        assert!(matches!(RunCounter::open(folder.path(), &disk()), Err(Error::Unavailable { .. })));
     }
 
     #[test]

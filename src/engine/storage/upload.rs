@@ -3,16 +3,18 @@
 //! uploads of other scenes.
 
 use std::collections::BTreeMap;
-use std::fs::{self, File};
-use std::io::{self, ErrorKind, Read as _, Write as _};
-use std::path::Path;
+use std::fs::File;
+use std::io::{self, ErrorKind, Read as _};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use sha2::{Digest as _, Sha256};
-use tokio::sync::OwnedSemaphorePermit;
 
+use super::file_system::{FileSystem, StateFile};
 use super::upload_folder::UploadFolder;
-use super::uploaded_files::{HashLists, UploadedFiles};
+use super::upload_record::{RECORD_NAME, UploadRecord, UploadedFiles, find_uploaded_files};
 use crate::engine::content::{ContentHash, hex, parse_hash};
+use crate::engine::upload_quota::{ClientId, UploadPermit};
 use modalcast_model::error::{Error, Result, fault, fault_in, invalid};
 
 /// Limit on the length of a path in bytes.
@@ -46,7 +48,8 @@ pub struct Upload {
     /// Sum of the declared sizes of the files so far, in bytes.
     declared_bytes: u64,
     open_file: Option<OpenFile>,
-    hash_lists: HashLists,
+    /// The folder of all uploads.
+    uploads: PathBuf,
     /// The files of other uploads. Read when the client first reuses a file.
     uploaded_files: Option<UploadedFiles>,
 }
@@ -57,23 +60,40 @@ pub(in crate::engine) struct CompleteUpload {
     pub(in crate::engine) scene: String,
     /// The path to open. An empty path means the folder.
     pub(in crate::engine) entry: String,
-    pub(super) folder: UploadFolder,
-    /// Hashes of the files that later uploads may reuse, by their paths.
-    pub(super) hashes: BTreeMap<String, ContentHash>,
+    folder: UploadFolder,
 }
 
 impl CompleteUpload {
-    /// Moves the folder to `target_folder`. Replaces the earlier upload in that folder and its list of hashes.
-    pub(in crate::engine) fn commit(self, target_folder: &Path, hash_lists: &HashLists) -> Result<()> {
-        hash_lists.remove(&self.scene);
-        self.folder.move_to(target_folder)?;
-        if self.hashes.is_empty() {
-            return Ok(());
+    /// Completes the upload of a folder: adds the record, whose `hashes` are those of all files by their paths, and makes
+    /// the folder durable.
+    ///
+    /// # Errors
+    /// `Fault` of the disk; the folder is then removed.
+    pub(super) fn new(
+        scene: String,
+        entry: String,
+        folder: UploadFolder,
+        hashes: &BTreeMap<String, ContentHash>,
+    ) -> Result<Self> {
+        let record = UploadRecord::new(&entry, hashes);
+        let written = record.write(folder.file_system(), folder.path()).map_err(fault_in("upload"));
+        match written.and_then(|()| folder.sync()) {
+            Ok(()) => Ok(Self { scene, entry, folder }),
+            Err(error) => {
+                folder.discard();
+                Err(error)
+            }
         }
-        if let Err(error) = hash_lists.write(&self.scene, &self.hashes) {
-            tracing::warn!(scene = self.scene, %error, "the files of the upload cannot be reused");
-        }
-        Ok(())
+    }
+
+    /// The client that has uploaded the files.
+    pub(in crate::engine) fn client(&self) -> Option<&ClientId> {
+        self.folder.client()
+    }
+
+    /// Moves the folder to `target_folder`. Replaces the earlier upload in that folder.
+    pub(in crate::engine) fn commit(self, target_folder: &Path) -> Result<()> {
+        self.folder.move_to(target_folder)
     }
 }
 
@@ -81,7 +101,7 @@ impl CompleteUpload {
 #[derive(Debug)]
 struct OpenFile {
     path: String,
-    file: File,
+    file: Box<dyn StateFile>,
     /// Size that the client declared.
     declared_bytes: u64,
     remaining_bytes: u64,
@@ -97,21 +117,21 @@ impl Upload {
     /// `Invalid` for a malformed entry path, `Fault` of the disk.
     pub(in crate::engine) fn begin(
         uploads: &Path,
-        hash_lists: HashLists,
+        file_system: &Arc<dyn FileSystem>,
         header: UploadHeader,
-        permit: OwnedSemaphorePermit,
+        permit: UploadPermit,
     ) -> Result<Self> {
         if !header.entry.is_empty() {
             validate_path("header.entry", &header.entry)?;
         }
-        let folder = UploadFolder::create(uploads, &header.scene, permit)?;
+        let folder = UploadFolder::create(uploads, file_system, &header.scene, permit)?;
         Ok(Self {
             header,
             folder,
             hashes: BTreeMap::new(),
             declared_bytes: 0,
             open_file: None,
-            hash_lists,
+            uploads: uploads.to_owned(),
             uploaded_files: None,
         })
     }
@@ -143,9 +163,9 @@ impl Upload {
             _ => fault("upload", error),
         };
         if let Some(parent) = file_path.parent() {
-            fs::create_dir_all(parent).map_err(path_conflict)?;
+            self.folder.file_system().create_folder(parent).map_err(path_conflict)?;
         }
-        let file = File::create_new(&file_path).map_err(path_conflict)?;
+        let file = self.folder.file_system().create_file(&file_path, true).map_err(path_conflict)?;
         self.open_file = Some(OpenFile {
             path: path.into(),
             file,
@@ -168,7 +188,7 @@ impl Upload {
             let field = "file.sha256".into();
             Error::ContentNotFound { field, what: "uploaded file", sha256: hex(&hash) }
         };
-        let files = self.uploaded_files.get_or_insert_with(|| self.hash_lists.read());
+        let files = self.uploaded_files.get_or_insert_with(|| find_uploaded_files(&self.uploads));
         let mut source =
             files.get(&hash).into_iter().flatten().find_map(|path| File::open(path).ok()).ok_or_else(not_found)?;
         self.begin_file(path, bytes, sha256)?;
@@ -221,7 +241,7 @@ impl Upload {
             return Err(error);
         }
         let Self { header: UploadHeader { scene, entry, .. }, folder, hashes, .. } = self;
-        Ok(CompleteUpload { scene, entry, folder, hashes })
+        CompleteUpload::new(scene, entry, folder, &hashes)
     }
 
     /// Checks that all declared files and bytes have arrived.
@@ -241,9 +261,11 @@ impl Upload {
         self.folder.discard();
     }
 
-    /// Checks the hash of the open file and closes it once all of its bytes have arrived.
+    /// Checks the hash of the open file, syncs and closes it once all of its bytes have arrived.
     fn finish_file_if_complete(&mut self) -> Result<()> {
-        let Some(open_file) = self.open_file.take_if(|open_file| open_file.remaining_bytes == 0) else { return Ok(()) };
+        let Some(mut open_file) = self.open_file.take_if(|open_file| open_file.remaining_bytes == 0) else {
+            return Ok(());
+        };
         let given: [u8; 32] = open_file.hasher.finalize().into();
         if given != open_file.declared_sha256 {
             return Err(invalid(
@@ -252,7 +274,7 @@ impl Upload {
                 format!("{} for '{}'", hex(&given), open_file.path),
             ));
         }
-        Ok(())
+        open_file.file.sync().map_err(fault_in("upload"))
     }
 
     /// Fails if the last file is incomplete.
@@ -273,6 +295,9 @@ fn validate_path(field: &str, path: &str) -> Result<()> {
     let is_plain_name =
         |part: &str| !part.is_empty() && part != "." && part != ".." && !part.contains(['\\', '\0', ':']);
     let depth = path.split('/').count();
+    if path == RECORD_NAME {
+        return Err(invalid(field, "a name that the server does not use", path));
+    }
     if path.len() > MAX_PATH_BYTES || depth > MAX_PATH_DEPTH || !path.split('/').all(is_plain_name) {
         let expected =
             format!("a relative path of plain names, at most {MAX_PATH_BYTES} bytes and {MAX_PATH_DEPTH} parts");
@@ -283,18 +308,19 @@ fn validate_path(field: &str, path: &str) -> Result<()> {
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
+    use super::super::file_system::DiskFileSystem;
     use super::*;
+    use crate::config::Config;
+    use crate::engine::upload_quota::UploadQuota;
 
     fn begin_upload(folder: &Path, files: u32, total_bytes: u64) -> Upload {
         let header = UploadHeader { scene: "s".into(), entry: String::new(), files, total_bytes };
-        let permits = std::sync::Arc::new(tokio::sync::Semaphore::new(1));
-        let permit = permits.try_acquire_owned().expect("expected a free permit");
-        Upload::begin(folder, lists(folder), header, permit).expect("expected a temporary folder")
-    }
-
-    /// The lists are in the folder `.lists`.
-    fn lists(folder: &Path) -> HashLists {
-        HashLists::new(folder.join(".lists"), folder.to_owned())
+        let quota = UploadQuota::new(&Config::default(), BTreeMap::new());
+        let permit = quota.admit(ClientId::Connection(1), total_bytes).expect("expected a free permit");
+        let disk: Arc<dyn FileSystem> = Arc::new(DiskFileSystem);
+        Upload::begin(folder, &disk, header, permit).expect("expected a temporary folder")
     }
 
     fn sha256_of(bytes: &[u8]) -> Vec<u8> {
@@ -310,22 +336,20 @@ mod tests {
         upload.write_chunk(b"llo").expect("expected an accepted chunk");
         upload.begin_file("empty", 0, &sha256_of(b"")).expect("expected a new file");
         let upload = upload.finish().expect("expected a complete upload");
-        upload.commit(&folder.path().join("target"), &lists(folder.path())).expect("expected to move the folder");
+        upload.commit(&folder.path().join("target")).expect("expected to move the folder");
         assert_eq!(fs::read(folder.path().join("target/a/b.txt")).expect("expected the file"), b"hello");
-        // The target and the folder of lists.
-        assert_eq!(fs::read_dir(folder.path()).expect("expected a folder").count(), 2);
+        assert_eq!(fs::read_dir(folder.path()).expect("expected a folder").count(), 1);
     }
 
     #[test]
     fn reused_file_is_copied_and_verified() {
         let folder = tempfile::tempdir().expect("expected a temporary folder");
-        let lists = lists(folder.path());
         let mut upload = begin_upload(folder.path(), 1, 5);
         upload.begin_file("b.txt", 5, &sha256_of(b"hello")).expect("expected a new file");
         upload.write_chunk(b"hello").expect("expected an accepted chunk");
         // The folder of a scene has the name of the scene.
         let target = folder.path().join("s");
-        upload.finish().and_then(|upload| upload.commit(&target, &lists)).expect("expected a complete upload");
+        upload.finish().and_then(|upload| upload.commit(&target)).expect("expected a complete upload");
         let reuse = |bytes: u64, content: &[u8]| {
             let mut upload = begin_upload(folder.path(), 1, bytes);
             upload.reuse_file("copy", bytes, &sha256_of(content)).map(|()| {
@@ -351,7 +375,7 @@ mod tests {
         let mut upload = begin_upload(folder.path(), 99, 0);
         let long_path = "x".repeat(300);
         let deep_path = ["d"; 20].join("/");
-        let unsafe_paths = ["", "/etc/x", "../x", "a/../x", "a//b", "./a", "a/", "a\\b", "a\0b", "C:x"];
+        let unsafe_paths = [RECORD_NAME, "", "/etc/x", "../x", "a/../x", "a//b", "./a", "a/", "a\\b", "a\0b", "C:x"];
         for path in unsafe_paths.into_iter().chain([long_path.as_str(), &deep_path]) {
             let error = upload.begin_file(path, 0, &sha256_of(b"")).expect_err(path).to_string();
             assert!(error.starts_with("file.path"), "expected file.path for {path:?}, got {error}");

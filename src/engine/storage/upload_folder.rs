@@ -1,14 +1,14 @@
 //! The temporary folder of an upload in progress. It moves to its final place when the upload is complete. Dropping it
 //! earlier removes it in the background; [`UploadFolder::discard`] removes it before it returns.
 
-use std::fs;
 use std::mem;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use tokio::sync::OwnedSemaphorePermit;
-
-use modalcast_model::error::{Result, fault_in};
+use super::file_system::{FileSystem, sync_folders};
+use crate::engine::upload_quota::{ClientId, UploadPermit};
+use modalcast_model::error::{Result, fault, fault_in};
 
 /// Number of uploads so far. Makes the names of temporary folders unique.
 static UPLOAD_COUNTER: AtomicU64 = AtomicU64::new(0);
@@ -16,10 +16,11 @@ static UPLOAD_COUNTER: AtomicU64 = AtomicU64::new(0);
 /// A temporary folder next to the finished uploads.
 #[derive(Debug)]
 pub(super) struct UploadFolder {
+    file_system: Arc<dyn FileSystem>,
     /// Empty after the folder was moved or removed.
     path: PathBuf,
-    /// Counts against the limit on concurrent uploads until the folder is moved or removed.
-    permit: Option<OwnedSemaphorePermit>,
+    /// Counts against the limits on uploads until the folder is moved or removed.
+    permit: Option<UploadPermit>,
 }
 
 impl UploadFolder {
@@ -27,33 +28,57 @@ impl UploadFolder {
     ///
     /// # Errors
     /// `Fault` of the disk.
-    pub(super) fn create(uploads: &Path, scene: &str, permit: OwnedSemaphorePermit) -> Result<Self> {
+    pub(super) fn create(
+        uploads: &Path,
+        file_system: &Arc<dyn FileSystem>,
+        scene: &str,
+        permit: UploadPermit,
+    ) -> Result<Self> {
         let count = UPLOAD_COUNTER.fetch_add(1, Ordering::Relaxed);
         let path = uploads.join(format!(".{scene}-{count}"));
-        fs::create_dir_all(&path).map_err(fault_in("upload"))?;
-        Ok(Self { path, permit: Some(permit) })
+        file_system.create_folder(&path).map_err(fault_in("upload"))?;
+        Ok(Self { file_system: Arc::clone(file_system), path, permit: Some(permit) })
+    }
+
+    pub(super) fn file_system(&self) -> &dyn FileSystem {
+        &*self.file_system
+    }
+
+    /// The client that uploads.
+    pub(super) fn client(&self) -> Option<&ClientId> {
+        self.permit.as_ref().map(|permit| &permit.client)
     }
 
     pub(super) fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Moves the folder to `target_folder`. Replaces the earlier upload in that folder.
+    /// Makes the names of all files durable. Their content must be synced before.
+    ///
+    /// # Errors
+    /// `Fault` of the disk.
+    pub(super) fn sync(&self) -> Result<()> {
+        sync_folders(&*self.file_system, &self.path).map_err(fault_in("upload"))
+    }
+
+    /// Moves the folder to `target_folder`, also beyond a power loss. Replaces the earlier upload in that folder.
     ///
     /// # Errors
     /// `Fault` of the disk.
     pub(super) fn move_to(mut self, target_folder: &Path) -> Result<()> {
+        let uploads =
+            target_folder.parent().ok_or_else(|| fault("upload", "expected a folder of uploads, got none"))?;
         if target_folder.exists() {
-            fs::remove_dir_all(target_folder).map_err(fault_in("upload"))?;
+            self.file_system.remove_folder(target_folder).map_err(fault_in("upload"))?;
         }
-        fs::rename(&self.path, target_folder).map_err(fault_in("upload"))?;
+        self.file_system.rename(&self.path, target_folder).map_err(fault_in("upload"))?;
         self.path = PathBuf::new();
-        Ok(())
+        self.file_system.sync_folder(uploads).map_err(fault_in("upload"))
     }
 
     /// Removes the folder. Blocks on the disk.
     pub(super) fn discard(mut self) {
-        fs::remove_dir_all(mem::take(&mut self.path)).ok(); // The next start removes leftovers.
+        self.file_system.remove_folder(&mem::take(&mut self.path)).ok(); // The next start removes leftovers.
     }
 }
 
@@ -64,9 +89,9 @@ impl Drop for UploadFolder {
         if folder.as_os_str().is_empty() {
             return;
         }
-        let permit = self.permit.take();
+        let (file_system, permit) = (Arc::clone(&self.file_system), self.permit.take());
         let remove = move || {
-            fs::remove_dir_all(folder).ok(); // The next start removes leftovers.
+            file_system.remove_folder(&folder).ok(); // The next start removes leftovers.
             drop(permit);
         };
         match tokio::runtime::Handle::try_current() {

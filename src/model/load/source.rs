@@ -165,7 +165,9 @@ fn choose_single_model(folder: &AssetDir, path: &str) -> Result<ModelFile> {
     match models.len() {
         1 => Ok(models.remove(0)),
         0 => {
-            let names: Vec<String> = folder.entries().into_iter().map(|(name, _)| name).collect();
+            // The record of an upload is a hidden file.
+            let entries = folder.entries().into_iter().filter(|(name, _)| !name.starts_with('.'));
+            let names: Vec<String> = entries.map(|(name, _)| name).collect();
             let hint =
                 names.iter().find_map(|name| conversion(name)).map_or_else(String::new, |hint| format!(" ({hint})"));
             Err(invalid(field, expected, format!("no model among: {}{hint}", join_names(names))))

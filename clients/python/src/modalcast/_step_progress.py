@@ -18,6 +18,7 @@ class Progress:
     Attributes:
         in_flight: Numbers of the sent steps that were neither acknowledged nor rejected, oldest first.
         acknowledged: Number of the last acknowledged step.
+        durable: Number of the newest step that survives a crash of the server and a power loss.
         skipped: Number of steps that were merged into a newer one.
         rejected: Number of rejected steps.
         rejections: Rejections that were not raised as errors yet, at most the newest 1024.
@@ -28,6 +29,7 @@ class Progress:
     def __init__(self) -> None:
         self.in_flight: deque[int] = deque()
         self.acknowledged: int | None = None
+        self.durable: int | None = None
         self.skipped = 0
         self.rejected = 0
         self.rejections: deque[ServerError] = deque(maxlen=_MAX_REJECTIONS)
@@ -40,6 +42,8 @@ class Progress:
             while self.in_flight and self.in_flight[0] <= reply.ack.step:
                 self.in_flight.popleft()
             self.acknowledged = reply.ack.step
+            if reply.ack.HasField("durable_step"):
+                self.durable = reply.ack.durable_step
             self.skipped = reply.ack.skipped
             self.stages = stage_times(reply.ack.stages)
         elif reply.HasField("rejection"):

@@ -167,7 +167,8 @@ impl SceneService for FakeService {
     }
 
     async fn list_scenes(&self, _: Request<v1::ListScenesRequest>) -> Result<Response<v1::ListScenesResponse>, Status> {
-        let reply = v1::ListScenesResponse { scenes: vec![self.0.info()], sources: vec!["toy".into()] };
+        let reply =
+            v1::ListScenesResponse { scenes: vec![self.0.info()], sources: vec!["toy".into()], ..Default::default() };
         Ok(Response::new(reply))
     }
 
@@ -309,7 +310,12 @@ impl FakeService {
                     Ok(()) => {
                         self.0.ack_permits.acquire().await.expect("an open semaphore").forget();
                         let stages = vec![v1::StageTime { stage: "deform".into(), milliseconds: 1.5 }];
-                        ResponseKind::Ack(v1::Acknowledgment { step: step.number, skipped: 0, stages })
+                        ResponseKind::Ack(v1::Acknowledgment {
+                            step: step.number,
+                            stages,
+                            durable_step: Some(step.number),
+                            ..Default::default()
+                        })
                     }
                 },
                 None => continue,

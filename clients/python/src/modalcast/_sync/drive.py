@@ -186,6 +186,14 @@ class Drive:
             self._opened_stream.cancel()
 
     @property
+    def durable_step(self) -> int | None:
+        """Number of the newest step that survives a crash of the server and a power loss; None before the first one.
+
+        The server writes the newest step in the background, and no acknowledgment waits for that.
+        """
+        return self._stream.progress.durable
+
+    @property
     def skipped(self) -> int:
         """Number of steps that were merged into a newer one, with the delivery "latest"."""
         return self._stream.progress.skipped

@@ -28,6 +28,7 @@ class Reason(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     REASON_LEASE_LOST: _ClassVar[Reason]
     REASON_STREAM_NOT_FOUND: _ClassVar[Reason]
     REASON_CONTENT_NOT_FOUND: _ClassVar[Reason]
+    REASON_OUT_OF_MEMORY: _ClassVar[Reason]
 REASON_UNSPECIFIED: Reason
 REASON_INVALID_FIELD: Reason
 REASON_UNEXPECTED_MESSAGE: Reason
@@ -49,6 +50,7 @@ REASON_INTERNAL: Reason
 REASON_LEASE_LOST: Reason
 REASON_STREAM_NOT_FOUND: Reason
 REASON_CONTENT_NOT_FOUND: Reason
+REASON_OUT_OF_MEMORY: Reason
 
 class Rejection(_message.Message):
     __slots__ = ("step", "reason", "field", "expected", "given")

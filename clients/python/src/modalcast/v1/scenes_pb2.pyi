@@ -1,4 +1,5 @@
 from modalcast.v1 import common_pb2 as _common_pb2
+from modalcast.v1 import errors_pb2 as _errors_pb2
 from google.protobuf.internal import containers as _containers
 from google.protobuf.internal import enum_type_wrapper as _enum_type_wrapper
 from google.protobuf import descriptor as _descriptor
@@ -62,7 +63,7 @@ class OpenSceneResponse(_message.Message):
     def __init__(self, scene: _Optional[_Union[SceneInfo, _Mapping]] = ...) -> None: ...
 
 class SceneInfo(_message.Message):
-    __slots__ = ("scene", "source", "domains", "vertices", "corners", "triangles", "coordinates", "up", "unit", "origin", "bounds", "affine", "last_step", "remarks", "lighting")
+    __slots__ = ("scene", "source", "domains", "vertices", "corners", "triangles", "coordinates", "up", "unit", "origin", "bounds", "affine", "last_step", "remarks", "lighting", "durable_step")
     SCENE_FIELD_NUMBER: _ClassVar[int]
     SOURCE_FIELD_NUMBER: _ClassVar[int]
     DOMAINS_FIELD_NUMBER: _ClassVar[int]
@@ -78,6 +79,7 @@ class SceneInfo(_message.Message):
     LAST_STEP_FIELD_NUMBER: _ClassVar[int]
     REMARKS_FIELD_NUMBER: _ClassVar[int]
     LIGHTING_FIELD_NUMBER: _ClassVar[int]
+    DURABLE_STEP_FIELD_NUMBER: _ClassVar[int]
     scene: str
     source: str
     domains: int
@@ -93,7 +95,8 @@ class SceneInfo(_message.Message):
     last_step: _common_pb2.StepId
     remarks: _containers.RepeatedScalarFieldContainer[str]
     lighting: Lighting
-    def __init__(self, scene: _Optional[str] = ..., source: _Optional[str] = ..., domains: _Optional[int] = ..., vertices: _Optional[int] = ..., corners: _Optional[int] = ..., triangles: _Optional[int] = ..., coordinates: _Optional[int] = ..., up: _Optional[str] = ..., unit: _Optional[float] = ..., origin: _Optional[_Iterable[float]] = ..., bounds: _Optional[_Iterable[float]] = ..., affine: bool = ..., last_step: _Optional[_Union[_common_pb2.StepId, _Mapping]] = ..., remarks: _Optional[_Iterable[str]] = ..., lighting: _Optional[_Union[Lighting, _Mapping]] = ...) -> None: ...
+    durable_step: _common_pb2.StepId
+    def __init__(self, scene: _Optional[str] = ..., source: _Optional[str] = ..., domains: _Optional[int] = ..., vertices: _Optional[int] = ..., corners: _Optional[int] = ..., triangles: _Optional[int] = ..., coordinates: _Optional[int] = ..., up: _Optional[str] = ..., unit: _Optional[float] = ..., origin: _Optional[_Iterable[float]] = ..., bounds: _Optional[_Iterable[float]] = ..., affine: bool = ..., last_step: _Optional[_Union[_common_pb2.StepId, _Mapping]] = ..., remarks: _Optional[_Iterable[str]] = ..., lighting: _Optional[_Union[Lighting, _Mapping]] = ..., durable_step: _Optional[_Union[_common_pb2.StepId, _Mapping]] = ...) -> None: ...
 
 class Lighting(_message.Message):
     __slots__ = ("to_sun", "sunlight", "skylight", "zenith", "horizon", "ground", "shadows", "exposure", "tone_mapping")
@@ -226,12 +229,26 @@ class ListScenesRequest(_message.Message):
     def __init__(self) -> None: ...
 
 class ListScenesResponse(_message.Message):
-    __slots__ = ("scenes", "sources")
+    __slots__ = ("scenes", "sources", "opening", "failed")
     SCENES_FIELD_NUMBER: _ClassVar[int]
     SOURCES_FIELD_NUMBER: _ClassVar[int]
+    OPENING_FIELD_NUMBER: _ClassVar[int]
+    FAILED_FIELD_NUMBER: _ClassVar[int]
     scenes: _containers.RepeatedCompositeFieldContainer[SceneInfo]
     sources: _containers.RepeatedScalarFieldContainer[str]
-    def __init__(self, scenes: _Optional[_Iterable[_Union[SceneInfo, _Mapping]]] = ..., sources: _Optional[_Iterable[str]] = ...) -> None: ...
+    opening: _containers.RepeatedScalarFieldContainer[str]
+    failed: _containers.RepeatedCompositeFieldContainer[FailedScene]
+    def __init__(self, scenes: _Optional[_Iterable[_Union[SceneInfo, _Mapping]]] = ..., sources: _Optional[_Iterable[str]] = ..., opening: _Optional[_Iterable[str]] = ..., failed: _Optional[_Iterable[_Union[FailedScene, _Mapping]]] = ...) -> None: ...
+
+class FailedScene(_message.Message):
+    __slots__ = ("scene", "source", "error")
+    SCENE_FIELD_NUMBER: _ClassVar[int]
+    SOURCE_FIELD_NUMBER: _ClassVar[int]
+    ERROR_FIELD_NUMBER: _ClassVar[int]
+    scene: str
+    source: str
+    error: _errors_pb2.Rejection
+    def __init__(self, scene: _Optional[str] = ..., source: _Optional[str] = ..., error: _Optional[_Union[_errors_pb2.Rejection, _Mapping]] = ...) -> None: ...
 
 class DeleteSceneRequest(_message.Message):
     __slots__ = ("scene",)

@@ -132,11 +132,13 @@ class Opened(_message.Message):
     def __init__(self, run: _Optional[int] = ..., delivery: _Optional[_Union[_common_pb2.Delivery, str]] = ..., overflow: _Optional[_Union[Overflow, str]] = ..., window: _Optional[int] = ..., lease_token: _Optional[bytes] = ..., initial_state: _Optional[_Union[InitialState, str]] = ..., scene: _Optional[_Union[_scenes_pb2.SceneInfo, _Mapping]] = ...) -> None: ...
 
 class Acknowledgment(_message.Message):
-    __slots__ = ("step", "skipped", "stages")
+    __slots__ = ("step", "skipped", "stages", "durable_step")
     STEP_FIELD_NUMBER: _ClassVar[int]
     SKIPPED_FIELD_NUMBER: _ClassVar[int]
     STAGES_FIELD_NUMBER: _ClassVar[int]
+    DURABLE_STEP_FIELD_NUMBER: _ClassVar[int]
     step: int
     skipped: int
     stages: _containers.RepeatedCompositeFieldContainer[_common_pb2.StageTime]
-    def __init__(self, step: _Optional[int] = ..., skipped: _Optional[int] = ..., stages: _Optional[_Iterable[_Union[_common_pb2.StageTime, _Mapping]]] = ...) -> None: ...
+    durable_step: int
+    def __init__(self, step: _Optional[int] = ..., skipped: _Optional[int] = ..., stages: _Optional[_Iterable[_Union[_common_pb2.StageTime, _Mapping]]] = ..., durable_step: _Optional[int] = ...) -> None: ...

@@ -1,0 +1,94 @@
+//! The operations that change the state folder, as a trait: a test records them and restarts from every prefix, and another
+//! one lets them fail as on a full disk. Files are read with `std::fs`.
+
+use std::fmt::Debug;
+use std::fs::{self, File};
+use std::io::{self, Write};
+use std::path::Path;
+
+/// Changes files and folders.
+pub(in crate::engine) trait FileSystem: Debug + Send + Sync {
+    /// Creates a folder and those above it, unless they exist.
+    fn create_folder(&self, path: &Path) -> io::Result<()>;
+
+    /// Creates an empty file. Replaces an existing one unless `is_new`, which makes it an error.
+    fn create_file(&self, path: &Path, is_new: bool) -> io::Result<Box<dyn StateFile>>;
+
+    /// Makes the names in a folder durable: what was created, renamed or removed in it.
+    fn sync_folder(&self, path: &Path) -> io::Result<()>;
+
+    /// Renames a file, replacing the file `to`, or a folder.
+    fn rename(&self, from: &Path, to: &Path) -> io::Result<()>;
+
+    fn remove_file(&self, path: &Path) -> io::Result<()>;
+
+    /// Removes a folder with its content.
+    fn remove_folder(&self, path: &Path) -> io::Result<()>;
+}
+
+/// A file that is written.
+pub(in crate::engine) trait StateFile: Write + Debug + Send {
+    /// Makes the content durable.
+    fn sync(&mut self) -> io::Result<()>;
+}
+
+/// The file system of the machine.
+#[derive(Debug)]
+pub(in crate::engine) struct DiskFileSystem;
+
+impl FileSystem for DiskFileSystem {
+    fn create_folder(&self, path: &Path) -> io::Result<()> {
+        fs::create_dir_all(path)
+    }
+
+    fn create_file(&self, path: &Path, is_new: bool) -> io::Result<Box<dyn StateFile>> {
+        let file = if is_new { File::create_new(path)? } else { File::create(path)? };
+        Ok(Box::new(file))
+    }
+
+    fn sync_folder(&self, path: &Path) -> io::Result<()> {
+        File::open(path)?.sync_all()
+    }
+
+    fn rename(&self, from: &Path, to: &Path) -> io::Result<()> {
+        fs::rename(from, to)
+    }
+
+    fn remove_file(&self, path: &Path) -> io::Result<()> {
+        fs::remove_file(path)
+    }
+
+    fn remove_folder(&self, path: &Path) -> io::Result<()> {
+        fs::remove_dir_all(path)
+    }
+}
+
+impl StateFile for File {
+    fn sync(&mut self) -> io::Result<()> {
+        self.sync_all()
+    }
+}
+
+/// Replaces a file atomically: writes a temporary file in the same folder, syncs it, renames it, and syncs the folder.
+/// Readers see either the old or the new content, also after a power failure.
+pub(super) fn write_atomic(file_system: &dyn FileSystem, path: &Path, bytes: &[u8]) -> io::Result<()> {
+    let temporary = path.with_extension("new");
+    let mut file = file_system.create_file(&temporary, false)?;
+    file.write_all(bytes)?;
+    // Without this sync, a power failure after the rename could leave an empty file at `path`.
+    file.sync()?;
+    drop(file);
+    file_system.rename(&temporary, path)?;
+    path.parent().map_or(Ok(()), |folder| file_system.sync_folder(folder))
+}
+
+/// Makes the names in a folder and in all folders below it durable.
+pub(super) fn sync_folders(file_system: &dyn FileSystem, folder: &Path) -> io::Result<()> {
+    for entry in fs::read_dir(folder)? {
+        let entry = entry?;
+        if entry.file_type()?.is_dir() {
+            sync_folders(file_system, &entry.path())?;
+        }
+    }
+    file_system.sync_folder(folder)
+}
