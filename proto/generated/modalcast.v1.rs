@@ -496,8 +496,7 @@ pub struct ListScenesResponse {
     /// Sources that OpenScene accepts, at most 512 KiB of names.
     #[prost(string, repeated, tag = "2")]
     pub sources: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
-    /// Names of the scenes that are being opened, for example after a restart. Calls for them fail with REASON_QUEUE_FULL and
-    /// a RetryInfo.
+    /// Names of the scenes that are being opened, for example after a restart. Calls for them wait.
     #[prost(string, repeated, tag = "3")]
     pub opening: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
     /// Scenes that have failed, or that could not be opened again after a restart. OpenScene tries again, and DeleteScene

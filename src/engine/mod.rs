@@ -122,7 +122,7 @@ struct Shared {
 
 impl Engine {
     /// Opens the state folder and the devices, and begins to reopen every scene in the folder's list of open scenes. Until
-    /// such a scene is open, [`Self::find`] returns `Busy` for its name.
+    /// such a scene is open, [`Self::find_opened`] waits for it.
     ///
     /// # Errors
     /// `Unavailable` when a backend requested by name cannot be opened, or another server uses the state folder.
@@ -256,6 +256,16 @@ impl Engine {
     pub fn find(&self, name: &str) -> Result<Arc<SceneHandle>> {
         self.check_running()?;
         self.shared.registry.find(name)
+    }
+
+    /// As [`Self::find`], but waits for a scene that is being opened.
+    ///
+    /// # Errors
+    /// As for [`Self::find`], and `NotFound` when the opening fails.
+    pub async fn find_opened(&self, name: &str) -> Result<Arc<SceneHandle>> {
+        self.check_running()?;
+        self.shared.registry.wait_until_opened(name).await;
+        self.find(name)
     }
 
     /// Registers a frame stream, so that its cameras can be moved until the registration is dropped.

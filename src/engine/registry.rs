@@ -167,6 +167,14 @@ impl Registry {
         }
     }
 
+    /// Waits while a scene with this name is being opened.
+    pub(super) async fn wait_until_opened(&self, name: &str) {
+        if let Some(entry) = self.find_entry(name) {
+            // Fails if the opening fails, or has not begun.
+            entry.cell.get_or_try_init(async || Err(scene_not_open(name))).await.ok();
+        }
+    }
+
     /// The names whose scene is not loaded yet, sorted.
     pub(super) fn opening(&self) -> Vec<String> {
         let entries = self.lock();

@@ -26,7 +26,7 @@ impl v1::force_service_server::ForceService for ForceServiceImpl {
         request: Request<v1::ApplyForcesRequest>,
     ) -> Result<Response<v1::ApplyForcesResponse>, Status> {
         let request = request.into_inner();
-        let scene_handle = self.0.find(&request.scene).map_err(to_status)?;
+        let scene_handle = self.0.find_opened(&request.scene).await.map_err(to_status)?;
         let update = parse_force_update(&scene_handle.scene, &request).map_err(to_status)?;
         let ForceReceipt { owner, receivers } = scene_handle.apply_forces(&update).map_err(to_status)?;
         let lifetime_ms = update.lifetime.as_millis() as u32;
@@ -41,7 +41,7 @@ impl v1::force_service_server::ForceService for ForceServiceImpl {
     ) -> Result<Response<Self::StreamForcesStream>, Status> {
         let deadline = Deadline::of_stream(request.metadata());
         let request = request.into_inner();
-        let scene_handle = self.0.find(&request.scene).map_err(to_status)?;
+        let scene_handle = self.0.find_opened(&request.scene).await.map_err(to_status)?;
         let delivery = parse_stream_delivery(v1::Delivery::Latest.into(), request.max_hz).map_err(to_status)?;
         let subscription = ForceSubscription::new(scene_handle, delivery, request.passive).map_err(to_status)?;
         Ok(respond(move |reply_sender| {

@@ -45,7 +45,7 @@ impl v1::frame_service_server::FrameService for FrameServiceImpl {
         let memory = self.shared_memory.find(request.metadata()).map_err(to_status)?;
         let connection = ConnectionInfo::of(&request).map_err(to_status)?;
         let request = request.into_inner();
-        let scene_handle = self.engine.find(&request.scene).map_err(to_status)?;
+        let scene_handle = self.engine.find_opened(&request.scene).await.map_err(to_status)?;
         let pictures = parse_pictures(&self.engine, &scene_handle.scene, request.pictures).map_err(to_status)?;
         let selector = parse_step_selector(request.step);
         let (max_chunk_bytes, encoder) = (config.chunk_bytes, self.engine.encoder().clone());
@@ -75,7 +75,7 @@ impl v1::frame_service_server::FrameService for FrameServiceImpl {
     async fn pick(&self, request: Request<v1::PickRequest>) -> Result<Response<Self::PickStream>, Status> {
         let config = self.engine.config();
         let deadline = Deadline::of_request(request.metadata(), request.get_ref().deadline_ms, config);
-        picks::respond_to_pick(&self.engine, deadline, request.into_inner())
+        picks::respond_to_pick(&self.engine, deadline, request.into_inner()).await
     }
 
     async fn update_frame_stream(
@@ -101,7 +101,7 @@ impl v1::frame_service_server::FrameService for FrameServiceImpl {
         let memory = self.shared_memory.find(request.metadata()).map_err(to_status)?;
         let connection = ConnectionInfo::of(&request).map_err(to_status)?;
         let request = request.into_inner();
-        let scene_handle = self.engine.find(&request.scene).map_err(to_status)?;
+        let scene_handle = self.engine.find_opened(&request.scene).await.map_err(to_status)?;
         let pictures = parse_pictures(&self.engine, &scene_handle.scene, request.pictures).map_err(to_status)?;
         let delivery = parse_stream_delivery(request.delivery, request.max_hz).map_err(to_status)?;
         let pixels = connection.acquire_stream_pixels(count_pixels(&pictures)).map_err(to_status)?;

@@ -14,12 +14,12 @@ use modalcast_model::scene::Scene;
 const MAX_HIT_BYTES: usize = 256;
 
 /// Answers one pick request.
-pub(super) fn respond_to_pick(
+pub(super) async fn respond_to_pick(
     engine: &Engine,
     deadline: Deadline,
     request: v1::PickRequest,
 ) -> Result<tonic::Response<ReplyStream<v1::PickResponse>>, Status> {
-    let scene_handle = engine.find(&request.scene).map_err(to_status)?;
+    let scene_handle = engine.find_opened(&request.scene).await.map_err(to_status)?;
     let output_spec = parse_pick(engine, &scene_handle.scene, &request).map_err(to_status)?;
     let selector = parse_step_selector(request.step);
     let max_chunk_bytes = engine.config().chunk_bytes;

@@ -101,7 +101,7 @@ impl v1::scene_service_server::SceneService for SceneServiceImpl {
         request: Request<v1::DescribeSceneRequest>,
     ) -> Result<Response<Self::DescribeSceneStream>, Status> {
         let request = request.into_inner();
-        let scene_handle = self.0.find(&request.scene).map_err(to_status)?;
+        let scene_handle = self.0.find_opened(&request.scene).await.map_err(to_status)?;
         describe::respond_with_description(scene_handle, request, self.0.config().chunk_bytes).map_err(to_status)
     }
 
@@ -112,7 +112,7 @@ impl v1::scene_service_server::SceneService for SceneServiceImpl {
         request: Request<v1::ReadContentRequest>,
     ) -> Result<Response<Self::ReadContentStream>, Status> {
         let request = request.into_inner();
-        let scene_handle = self.0.find(&request.scene).map_err(to_status)?;
+        let scene_handle = self.0.find_opened(&request.scene).await.map_err(to_status)?;
         describe::respond_with_content(scene_handle, request, self.0.config().chunk_bytes).await.map_err(to_status)
     }
 
@@ -123,7 +123,7 @@ impl v1::scene_service_server::SceneService for SceneServiceImpl {
         request: Request<v1::ReadModesRequest>,
     ) -> Result<Response<Self::ReadModesStream>, Status> {
         let request = request.into_inner();
-        let scene_handle = self.0.find(&request.scene).map_err(to_status)?;
+        let scene_handle = self.0.find_opened(&request.scene).await.map_err(to_status)?;
         describe::respond_with_modes(scene_handle, request, self.0.config().chunk_bytes).map_err(to_status)
     }
 }

@@ -25,7 +25,7 @@ impl v1::state_service_server::StateService for StateServiceImpl {
         let config = self.0.config();
         let deadline = Deadline::of_request(request.metadata(), request.get_ref().deadline_ms, config);
         let request = request.into_inner();
-        let scene_handle = self.0.find(&request.scene).map_err(to_status)?;
+        let scene_handle = self.0.find_opened(&request.scene).await.map_err(to_status)?;
         let selector = parse_step_selector(request.step);
         let max_chunk_bytes = config.chunk_bytes;
         Ok(without_copies(respond(move |reply_sender| async move {
@@ -49,7 +49,7 @@ impl v1::state_service_server::StateService for StateServiceImpl {
     ) -> Result<Response<Self::StreamStatesStream>, Status> {
         let deadline = Deadline::of_stream(request.metadata());
         let request = request.into_inner();
-        let scene_handle = self.0.find(&request.scene).map_err(to_status)?;
+        let scene_handle = self.0.find_opened(&request.scene).await.map_err(to_status)?;
         let delivery = parse_stream_delivery(request.delivery, request.max_hz).map_err(to_status)?;
         // Subscribe before the response headers are sent, so that a client can rely on receiving the next step.
         let subscription = scene_handle.subscribe(OutputSpec::State, delivery).await.map_err(to_status)?;

@@ -62,7 +62,7 @@ impl v1::step_service_server::StepService for StepServiceImpl {
     ) -> Result<Response<v1::ResetSceneResponse>, Status> {
         let peer = ConnectionInfo::of(&request).map_err(to_status)?.peer();
         let request = request.into_inner();
-        let scene_handle = self.engine.find(&request.scene).map_err(to_status)?;
+        let scene_handle = self.engine.find_opened(&request.scene).await.map_err(to_status)?;
         let step = scene_handle.reset(&peer, request.take_over).await.map_err(to_status)?;
         Ok(Response::new(v1::ResetSceneResponse { step: Some(wire_step_id(step)) }))
     }
@@ -142,7 +142,7 @@ impl DriveSession {
         if self.writer.is_some() {
             return Err(Error::UnexpectedMessage { expected: "one open per stream", given: "a second open" });
         }
-        let scene_handle = self.engine.find(&open.scene)?;
+        let scene_handle = self.engine.find_opened(&open.scene).await?;
         let request = parse_lease_request(&open, self.engine.config().window)?;
         let writer = scene_handle.drive(&self.peer, request.clone()).await?;
         let opened = wire_opened(&writer, &request, &scene_handle);

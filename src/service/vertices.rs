@@ -40,7 +40,7 @@ impl v1::vertex_service_server::VertexService for VertexServiceImpl {
         let deadline = Deadline::of_request(request.metadata(), request.get_ref().deadline_ms, config);
         let memory = self.shared_memory.find(request.metadata()).map_err(to_status)?;
         let request = request.into_inner();
-        let scene_handle = self.engine.find(&request.scene).map_err(to_status)?;
+        let scene_handle = self.engine.find_opened(&request.scene).await.map_err(to_status)?;
         let selection = parse_vertex_selection(&scene_handle.scene, request.selection).map_err(to_status)?;
         let selector = parse_step_selector(request.step);
         let (packer, max_chunk_bytes) = (self.engine.vertex_packer().clone(), config.chunk_bytes);
@@ -72,7 +72,7 @@ impl v1::vertex_service_server::VertexService for VertexServiceImpl {
         let deadline = Deadline::of_stream(request.metadata());
         let memory = self.shared_memory.find(request.metadata()).map_err(to_status)?;
         let request = request.into_inner();
-        let scene_handle = self.engine.find(&request.scene).map_err(to_status)?;
+        let scene_handle = self.engine.find_opened(&request.scene).await.map_err(to_status)?;
         let selection = parse_vertex_selection(&scene_handle.scene, request.selection).map_err(to_status)?;
         let delivery = parse_stream_delivery(request.delivery, request.max_hz).map_err(to_status)?;
         let spec = OutputSpec::Vertices(selection.vertex_attributes());

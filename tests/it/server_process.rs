@@ -354,6 +354,8 @@ async fn killed_server_keeps_scenes_steps_and_runs() {
     for _ in 0..3 {
         let server = ServerProcess::start(folder.path());
         let client = server.client().await;
+        let described_again = client.describe("crowded", &ALL_ARRAYS).await.expect("expected to wait for the scene");
+        assert_eq!(described_again.domains, described.domains);
         let scenes = client.list_scenes().await.expect("expected a list").scenes;
         assert_eq!(scenes.iter().map(|scene| scene.scene.as_str()).collect::<Vec<_>>(), ["crowded"]);
         let uploads = std::fs::read_dir(state.join("uploads")).expect("expected an uploads folder").count();
