@@ -75,8 +75,9 @@ pub(crate) fn nearest_rotation(correlation: &Matrix3<f64>) -> Matrix3<f64> {
     closed_form_rotation(correlation).unwrap_or_else(|| rotation_by_svd(correlation))
 }
 
-/// The proper rotation nearest to a matrix M, without a singular value decomposition. With the singular values s of
-/// M / |M|, of which the last has the sign of det M, the rotation is a polynomial of M (Hoger and Carlson 1984):
+/// The proper rotation R nearest to a matrix M, without a singular value decomposition. R does not change if M is
+/// divided by its Frobenius norm, so let |M| = 1. Let s1, s2 and s3 be the singular values, and let s3 have the sign of
+/// det M. Then R is a polynomial of M (Hoger and Carlson 1984):
 ///
 /// ```text
 /// R D = (t^2 + 1) / 2 M + t cof M - M M^T M,      t = s1 + s2 + s3,      D = (s1 + s2) (s2 + s3) (s3 + s1)
@@ -93,12 +94,13 @@ fn closed_form_rotation(correlation: &Matrix3<f64>) -> Option<Matrix3<f64>> {
     let [x, y, z] = [matrix.column(0), matrix.column(1), matrix.column(2)];
     let cofactors = Matrix3::from_columns(&[y.cross(&z), z.cross(&x), x.cross(&y)]);
     let (determinant, constant) = (x.dot(&cofactors.column(0)), 1.0 - 4.0 * cofactors.norm_squared());
-    // The largest sum of three numbers whose squares add up to 1.
+    // Start at the upper bound of t: the largest sum of three numbers whose squares add up to 1.
     let mut sum = 3.0_f64.sqrt();
     // The limit only bounds the loop. The convergence is quadratic, so fewer iterations are sufficient.
     for _ in 0..16 {
         let value = ((sum * sum - 2.0) * sum - 8.0 * determinant) * sum + constant;
         let slope = 4.0 * ((sum * sum - 1.0) * sum - 2.0 * determinant);
+        // At the root, the slope is 8 D, because s1 s2 + s2 s3 + s3 s1 = (t^2 - 1) / 2.
         if slope < 8.0 * MIN_PAIR_SUM_PRODUCT {
             return None;
         }
@@ -117,8 +119,9 @@ fn rotation_by_svd(correlation: &Matrix3<f64>) -> Matrix3<f64> {
     let svd = correlation.svd(compute_u, compute_v);
     let (Some(left), Some(right)) = (svd.u, svd.v_t) else { return Matrix3::identity() };
     let singular_values = svd.singular_values;
-    // Singular values are sums of squared distances, so 1e-9 is the square of a ratio of lengths. Points count as
-    // collinear if their extent in one direction is more than sqrt(1e9) = 3e4 times the extent in any other direction.
+    // Singular values are sums of squared distances, so the limit of their ratio is the square of a ratio of lengths.
+    // Points count as collinear if their extent in one direction is more than sqrt(1e9) = 3e4 times the extent in any
+    // other direction.
     let has_rank_two = singular_values[0].is_normal() && singular_values[1] > 1e-9 * singular_values[0];
     if !has_rank_two {
         return Matrix3::identity();
@@ -191,8 +194,8 @@ mod tests {
         assert!((rotated_twice - Vector3::zeros()).norm() <= 1e-15);
     }
 
-    /// Rotations of scaled shapes: spheres, disks, rods and mirrored shapes. The closed form leaves thin rods to the
-    /// singular value decomposition.
+    /// Rotations of scaled shapes: spheres, disks, rods and mirrored shapes. The closed form gives no result for the
+    /// last two shapes, which are thin rods.
     #[test]
     fn closed_form_rotation_equals_singular_value_decomposition() {
         let mut closed_count = 0;
@@ -220,6 +223,7 @@ mod tests {
                 closed_count += usize::from(closed_form_rotation(&matrix).is_some());
             }
         }
+        // Six shapes at five scales.
         assert_eq!(closed_count, 6 * 5);
         for matrix in [Matrix3::zeros(), Matrix3::repeat(f64::NAN), Matrix3::repeat(f64::INFINITY)] {
             assert_eq!(closed_form_rotation(&matrix), None);

@@ -1,7 +1,7 @@
 //! `parent_from_child` of every domain as a function of q. The correlation of deformed and rest positions, from which
 //! Kabsch's method fits a rigid transform, is linear in the deformed positions and therefore in q. It is precomputed
-//! per mode, so that a step costs 12 r multiplications and one `nearest_rotation` for a joint, however many attachment
-//! vertices the joint has.
+//! per mode. A step then costs 12 r multiplications per joint (for each of the r modes, 3 for the mean and 9 for the
+//! correlation) and one `nearest_rotation`, however many attachment vertices the joint has.
 
 use nalgebra::{Matrix3, Vector3};
 use rayon::prelude::*;
@@ -15,8 +15,8 @@ pub struct Attachments {
     fits: Vec<Option<AttachmentFit>>,
 }
 
-/// The rigid transform that best fits the deformed attachment vertices of a joint to their rest positions, as a
-/// function of the parent's q.
+/// The rigid transform that best maps the rest positions of a joint's attachment vertices to their deformed positions,
+/// as a function of the parent's q.
 struct AttachmentFit {
     rest_mean: Vector3<f64>,
     /// At rest.

@@ -90,7 +90,9 @@ impl BridgeScenario {
         let domain = model.domains.iter().position(|domain| domain.owns_q && domain.rank == rank);
         let ranks =
             || format!("domains of ranks {:?}", model.domains.iter().map(|domain| domain.rank).collect::<Vec<_>>());
-        let domain = domain.ok_or_else(|| invalid_input("scene", format!("a domain of rank {rank}"), ranks()))?;
+        let domain = domain.ok_or_else(|| {
+            invalid_input("scene", format!("a domain of rank {rank} (the rank of the cubic forces)"), ranks())
+        })?;
         let system = ReducedSystem::new(force, settings)?;
         let unit_load = compute_unit_load(&model, &model.domains[domain], options.load_direction)?;
         let target_deflection = options.deflection_fraction * model.diagonal();

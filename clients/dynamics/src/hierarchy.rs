@@ -134,8 +134,8 @@ pub(crate) mod tests {
         }
     }
 
-    /// A trunk, a branch, a twig and a rigid leaf. Each is tilted and attached to the top section of the previous one.
-    /// The first three have two coordinates each.
+    /// A trunk, a branch, a twig and a rigid leaf. Branch, twig and leaf are each tilted and attached to the top
+    /// section of the previous domain. Trunk, branch and twig have two coordinates each.
     pub(crate) fn four_domain_model() -> Model {
         let tilt = AffineTransform::rotation_about(&Vector3::z(), -0.9, &Vector3::zeros());
         let parent_from_child = AffineTransform { translation: Vector3::y(), ..tilt };

@@ -74,8 +74,8 @@ pub struct DomainModel {
     pub area: f64,
     /// Diagonal of the bounds at rest; 0 if the positions were not requested.
     pub diagonal: f64,
-    /// The first `surface_sample_count` samples are spread evenly over the vertices. The other vertices that joints
-    /// need follow.
+    /// The first `surface_sample_count` samples are spread evenly over the vertices. The remaining samples are further
+    /// vertices that joints need.
     pub samples: Vec<Sample>,
     pub surface_sample_count: usize,
     /// Index of the sample nearest to the domain's origin, where the domain is attached to its parent.
@@ -150,7 +150,8 @@ impl Model {
     /// reduced, but not below 8, if the samples of all domains would have more than 8 Mi entries of U.
     ///
     /// # Errors
-    /// `Client` as for the calls; `Invalid` if the description contradicts itself, or the scene is a single point.
+    /// `Client` if a request to the server fails; `Invalid` if the description contradicts itself, or if the scene's
+    /// bounds have no extent or are not finite.
     pub async fn fetch(client: &Client, scene: &str, max_surface_samples: usize) -> Result<Self> {
         let description_without_arrays = client.describe(scene, &[]).await?;
         let has_modes = description_without_arrays.domains.iter().any(|domain| domain.rank > 0);

@@ -28,7 +28,7 @@ impl VegaSettings {
     /// Reads a file.
     ///
     /// # Errors
-    /// `Client` if it cannot be read; `Invalid` as for [`Self::parse`].
+    /// `Client` if the file cannot be read; `Invalid` as for [`Self::parse`].
     pub fn read(path: &Path) -> Result<Self> {
         Self::parse(&std::fs::read_to_string(path).map_err(|error| ClientError::file(path, error))?)
     }

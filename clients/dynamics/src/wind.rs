@@ -2,12 +2,12 @@
 //! cosines with random frequencies and phases (Shinozuka and Deodatis 1991), so that it is a function of time and of a
 //! seed.
 //!
-//! With the frequency n, the length scale L and the mean speed V, the spectra of the gust speeds along and across the
-//! wind are (von Karman 1948, in the form of ESDU 85020)
+//! With the frequency n, the length scale L, the mean speed V and the standard deviation sigma of a gust speed, the
+//! spectra S of the gust speeds along and across the wind are (von Karman 1948, in the form of ESDU 85020)
 //!
 //! ```text
 //! n S(n) / sigma^2 = 4 x / (1 + 70.8 x^2)^(5/6)                          along,  x = n L / V
-//! n S(n) / sigma^2 = 4 x (1 + 755.2 x^2) / (1 + 283.2 x^2)^(11/6)        across, with half the length scale
+//! n S(n) / sigma^2 = 4 x (1 + 755.2 x^2) / (1 + 283.2 x^2)^(11/6)        across, x = n L / (2 V)
 //! ```
 //!
 //! Gusts travel with the mean wind. The gusts of two domains are less similar at higher frequencies: the magnitude of
@@ -38,7 +38,7 @@ const CROSSWIND_RATIO: f64 = 0.75;
 /// Factor in the exponent of the coherence.
 const COHERENCE_DECAY: f64 = 10.0;
 
-/// Distance between two domains in the coherence, in meters.
+/// d, the distance that the coherence assumes between any two domains, in meters.
 const DOMAIN_DISTANCE: f64 = 2.0;
 
 /// Diagonal of a scene in meters, for the travel time of gusts. Scenes have any unit of length; this is the diagonal of
@@ -116,8 +116,8 @@ pub struct Wind {
     cosines: Vec<Cosine>,
     /// Time of the sum of cosines at the start of the wind, in seconds.
     start_time: f64,
-    /// Per domain: the factors of the gust speeds along and across the wind, in this order. Each has one factor per
-    /// cosine, then one per sine, padded to a multiple of `LANES`.
+    /// Per domain: the factors of the gust speeds along and across the wind, in this order. A gust speed has one factor
+    /// per cosine, then one factor per sine, then zeros up to a multiple of `LANES`.
     coefficients: Vec<f32>,
     /// Number of factors of one gust speed of a domain.
     coefficient_count: usize,
@@ -257,8 +257,8 @@ fn scene_phase(seed: u64, component: Component, index: usize) -> f64 {
     TAU * hash_to_unit(seed, (component as u64) * COSINE_COUNT as u64 + index as u64)
 }
 
-/// Finds the start of the wind such that its strongest gust comes after `GUST_TIME`. A short run then shows a gust, and
-/// the wind does not become much stronger later.
+/// Finds the start of the wind, `GUST_TIME` before its strongest gust. A short run then shows a gust, and the wind does
+/// not become much stronger later.
 fn find_start_time(cosines: &[Cosine], seed: u64) -> f64 {
     let amplitude = |cosine: &Cosine| {
         // The mean of a cosine over a duration d has the amplitude sin(pi n d) / (pi n d).
@@ -272,7 +272,7 @@ fn find_start_time(cosines: &[Cosine], seed: u64) -> f64 {
         terms.map(|((cosine, amplitude), phase)| amplitude * (TAU * cosine.frequency * time + phase).cos()).sum()
     };
     let times = (0..(10.0 * SEARCH_DURATION) as u32).into_par_iter().map(|index| 0.1 * f64::from(index));
-    // Of equal gusts, the first one: the result does not depend on the number of threads.
+    // Of equal gusts, the earliest one is selected, so that the result does not depend on the number of threads.
     let gusts = times.map(|time| (mean_gust(time), time));
     let strongest = gusts
         .max_by(|(a_gust, a_time), (b_gust, b_time)| a_gust.total_cmp(b_gust).then_with(|| b_time.total_cmp(a_time)));

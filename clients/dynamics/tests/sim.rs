@@ -26,8 +26,8 @@ fn beam(index: u32, radius: f32) -> FakeDomain {
     FakeDomain::new(index, rest_positions, 2, modes)
 }
 
-/// A server with a trunk, two generations of branches and a rigid leaf. Each is tilted and attached to the last section
-/// of the previous one.
+/// A server with a trunk, a branch, a branch of this branch, and a rigid leaf. Each domain but the trunk is tilted and
+/// attached to the last section of the previous domain.
 fn tree_server() -> FakeServer {
     // A rotation about z by -atan(0.6 / 0.8), and a translation to the end of the parent, (0, 1, 0).
     let (sine, cosine) = (0.6_f32, 0.8_f32);
@@ -199,7 +199,7 @@ async fn auto_selects_tree_or_sweep_by_scene() {
     }
 }
 
-/// Without wind, only the force of a viewer moves the tree. The sweep has no forces.
+/// Without wind, only the force of a viewer moves the tree. The sweep rejects --forces.
 #[tokio::test(flavor = "multi_thread")]
 async fn forces_of_viewers_act_on_request() {
     let mut server = tree_server();
@@ -246,7 +246,7 @@ async fn invalid_parameters_stop_before_the_first_step() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn held_modes_and_unresolved_gusts_are_reported() {
+async fn fixed_modes_and_unresolved_gusts_are_reported() {
     let mut server = tree_server();
     server.domains[1].shape.eigenvalues[0] = 0.0;
     let url = serve(Arc::new(server)).await;
@@ -340,8 +340,8 @@ fn vega_domain(name: &str) -> FakeDomain {
 #[tokio::test(flavor = "multi_thread")]
 #[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
 async fn real_models_deflect_as_requested_and_stay_bounded() {
-    // The lowest frequency of the .cub file (1 Hz and 37.68 Hz) times the base frequency of the .config file (0.25 and
-    // 0.02).
+    // The lowest frequency of the .cub file (1 Hz and 37.68 Hz) times the factor `baseFrequency` of the .config file
+    // (0.25 and 0.02).
     for (name, expected_hertz) in [("simpleBridge", 0.25), ("A", 37.68 * 0.02)] {
         let mut domain = vega_domain(name);
         domain.wire.notes.insert("vega.cubic".into(), format!("{name}.cub"));

@@ -1,10 +1,11 @@
 //! Calibrates the wind to a given sway.
 //!
-//! A calibration run applies the wind for a physical duration, which depends neither on the steps of the run nor on
-//! their number. The modes are linear, so their response can be scaled: the gain of a domain is the factor of the
-//! response of its modes, and the calibration run has gain 1. The calibration finds a common gain, at which the peak of
-//! the crown's mean displacement is the requested fraction of the height. A branch gets a smaller gain if it would bend
-//! by more than a fraction of its diagonal, because linear modes do not represent large bending.
+//! A calibration run, which sends no steps, applies the wind for a duration of its own. So the result does not depend
+//! on the step size or the number of steps that are sent later. The modes are linear, so their response can be scaled:
+//! the gain of a domain is the factor of the response of its modes, and the calibration run has gain 1. The calibration
+//! finds a common gain, at which the peak of the crown's mean displacement is the requested fraction of the height. A
+//! branch gets a smaller gain if it would bend by more than a fraction of its diagonal, because linear modes do not
+//! represent large bending.
 //!
 //! Bending is the elastic displacement U q. The wind strength, an option of the scenario, scales the requested sway and
 //! the bending limits.
@@ -29,13 +30,14 @@ const MAX_TRUNK_BENDING: f64 = 0.2;
 /// Maximum factor by which the wind strength scales the bending limits.
 const MAX_BENDING_SCALE: f64 = 2.5;
 
-/// Duration of the calibration run in seconds. It is longer for modes whose period is long.
-const DURATION: f64 = 30.0;
+/// Minimum duration of the calibration run in seconds.
+const MIN_DURATION: f64 = 30.0;
 
 /// Minimum duration of the calibration run in periods of the slowest mode.
 const MIN_PERIODS: f64 = 6.0;
 
-/// Number of steps of the calibration run. A step of 0.05 s resolves all frequencies of the wind.
+/// Number of steps of the calibration run. At the minimum duration, a step takes 0.05 s and resolves all frequencies of
+/// the wind.
 const STEP_COUNT: u64 = 600;
 
 /// Number of recorded states at which the calibration evaluates the sway: the states with the largest trunk
@@ -158,8 +160,8 @@ fn record_unit_response(
     parameters: &ModalParameters,
 ) -> Result<UnitResponse> {
     let longest_period = parameters.lowest_frequency().map_or(0.0, f64::recip);
-    let integrator = Integrator::new(parameters, DURATION.max(MIN_PERIODS * longest_period) / STEP_COUNT as f64)?;
-    // Record every `stride`-th step, because a state takes 8 bytes per coordinate.
+    let integrator = Integrator::new(parameters, MIN_DURATION.max(MIN_PERIODS * longest_period) / STEP_COUNT as f64)?;
+    // Record every `stride`-th state, so that all of them fit in `MAX_STATE_BYTES`. A state has 8 bytes per coordinate.
     let stride = (STEP_COUNT * model.coordinate_count as u64 * 8).div_ceil(MAX_STATE_BYTES).max(1);
     let mut bending = vec![0.0_f64; model.domains.len()];
     let mut recorded_states = vec![];

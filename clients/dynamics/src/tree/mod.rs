@@ -1,7 +1,7 @@
 //! A tree that sways in the wind. Each mode is integrated exactly. The force of a mode is U^T times the wind pressure
 //! on the surface samples, plus the forces of child domains at their joints. `hierarchy` computes the transforms. A
-//! trunk is a domain without a parent, and a branch is a domain with a parent. A leaf is a branch without modes and
-//! children.
+//! trunk is a domain without a parent, and a branch is a domain with a parent. A leaf is a branch with neither modes
+//! nor children.
 
 mod calibration;
 mod crown;
@@ -33,7 +33,7 @@ const LEAF_ANGLE: f64 = 0.1;
 /// Maximum rotation of a rigid leaf, in radians.
 const MAX_LEAF_ANGLE: f64 = 0.6;
 
-/// Maximum wind strength that increases the rotation of rigid leaves.
+/// Wind strength above which the rotation of rigid leaves no longer increases.
 const MAX_LEAF_STRENGTH: f64 = 2.0;
 
 /// Settings of the tree scenario.
@@ -218,7 +218,7 @@ impl Scenario for TreeScenario {
         if let Some(viewer_response) = &self.viewer_response {
             viewer_response.add_to(&mut q);
         }
-        // These depend only on the response of this step and on the last step, so they run concurrently.
+        // The four computations below do not depend on each other, so they run concurrently.
         let compute_attachments = || self.attachments.deform(&self.model, &q);
         let measure_last_step = || self.peaks();
         let ((attachments, earlier_peaks), (leaf_rotations, next_response)) = rayon::join(
@@ -270,7 +270,7 @@ impl Scenario for TreeScenario {
     }
 }
 
-/// Per domain: whether it is a branch without modes and children.
+/// Per domain: whether it is a branch with neither modes nor children.
 fn find_rigid_leaves(model: &Model) -> Vec<bool> {
     let mut rigid_leaves: Vec<bool> =
         model.domains.iter().map(|domain| domain.rank == 0 && domain.joint.is_some()).collect();

@@ -24,8 +24,8 @@ pub(super) struct Response {
     pub(super) pressures: Vec<WindPressure>,
 }
 
-/// The response of every mode to the forces of viewers. The modes are linear, so it adds to the response to the wind,
-/// and the gains do not scale it. A force acts on its own domain only: joints do not transmit it to the parent.
+/// The response of every mode to the forces of viewers. The modes are linear, so this response is added to the response
+/// to the wind. The gains do not scale it. A force acts on one domain only: joints do not transmit it to the parent.
 pub(super) struct ViewerResponse {
     /// Per coordinate.
     pub(super) forces: Vec<f64>,

@@ -3,7 +3,7 @@ use super::*;
 const SETTINGS: WindSettings = WindSettings { seed: 7, diagonal: 10.0, max_frequency: f64::INFINITY };
 
 /// A sum of five cosines for negative controls: periods in seconds and amplitudes. It has no energy above 2 Hz, and two
-/// of its periods nearly excite the trunk of the built-in tree.
+/// of its frequencies are close to those of modes of the built-in tree's trunk.
 const FIVE_GUSTS: [(f64, f64); 5] = [(0.83, 0.30), (1.31, 0.30), (2.17, 0.22), (3.71, 0.12), (6.43, 0.06)];
 
 /// Number of samples of a signal, a power of two, and the seconds between them.
@@ -117,8 +117,8 @@ fn response_variance(cosines: &[(f64, f64)], hertz: f64, damping_ratio: f64) -> 
     cosines.iter().map(variance).sum()
 }
 
-/// The response should not depend on whether a cosine meets a mode. The trunk of the built-in tree has a damping ratio
-/// of 0.05; its lowest modes are between 0.4 and 1.5 Hz.
+/// The response should hardly depend on whether a cosine has the frequency of a mode. The trunk of the built-in tree
+/// has a damping ratio of 0.05; its lowest modes are between 0.4 and 1.5 Hz.
 #[test]
 fn response_changes_smoothly_with_the_frequency_of_a_mode() {
     let largest_change = |cosines: &[(f64, f64)]| {
@@ -126,7 +126,7 @@ fn response_changes_smoothly_with_the_frequency_of_a_mode() {
             .map(|index| 0.4 * (1.5_f64 / 0.4).powf(f64::from(index) / 60.0))
             .map(|hertz| response_variance(cosines, hertz, 0.05).sqrt())
             .collect();
-        // A mode whose frequency differs by 20 % or less.
+        // The frequencies of a window differ by 20 % or less.
         let windows = responses.windows(9);
         let ratio = |window: &[f64]| {
             window.iter().fold(0.0, |a: f64, b| a.max(*b)) / window.iter().fold(f64::MAX, |a, b| a.min(*b))
@@ -143,7 +143,7 @@ fn response_changes_smoothly_with_the_frequency_of_a_mode() {
 }
 
 #[test]
-fn slow_gusts_are_common_and_fast_gusts_are_not() {
+fn domains_share_slow_gusts_but_not_fast_ones() {
     let signals = record_gusts(&Wind::new(&SETTINGS, &[0.0; 12]));
     let difference = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a - b).collect::<Vec<f64>>();
     for (low, high, range) in [(0.06, 0.12, 0.0..0.4), (4.0, 8.0, 0.7..1.3)] {
