@@ -25,7 +25,7 @@ pub(crate) const MAX_METADATA_BYTES: u64 = 64 << 20;
 /// Size limit of the description of a scene, without arrays, in bytes.
 pub(crate) const MAX_SCENE_BYTES: u64 = 512 << 20;
 
-/// Size limit of all contents of a scene in bytes. Larger scenes are recorded by hash.
+/// Size limit of all contents of a scene in bytes. Larger scenes can be recorded only by hash.
 pub(crate) const MAX_CONTENT_BYTES: u64 = 8 << 30;
 
 /// Longest time in nanoseconds between two complete states, which have all values and not only changes.

@@ -24,14 +24,14 @@ use crate::writer::{MetadataEntry, RecordingWriter, WriteSummary};
 /// Longest time after which the open chunk is written.
 const FLUSH_INTERVAL: Duration = Duration::from_secs(1);
 
-/// Messages that wait for the file, of at most about 1 MiB each. When the queue is full, the server waits
-/// ([`Delivery::Lossless`]) or skips steps ([`Delivery::Latest`]).
+/// Maximum number of messages that wait to be written, of at most about 1 MiB each. When the queue is full, the server
+/// waits ([`Delivery::Lossless`]) or skips steps ([`Delivery::Latest`]).
 const QUEUED_MESSAGES: usize = 8;
 
 /// Number of hashes in one request: the limit of the server.
 const HASHES_PER_REQUEST: usize = 4096;
 
-/// What to record.
+/// A scene to record, and the limits of the recording.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RecordRequest {
     /// Name of an open scene, or a source, which the server opens under its default name.
@@ -325,7 +325,8 @@ impl Subscriptions {
         Ok(Self { states: client.state_messages(state_request).await?, forces })
     }
 
-    /// Sends messages to the file until a limit or the end of the stream of states. Returns the error that ended it.
+    /// Sends messages to the task that writes, until a limit or the end of the stream of states. Returns the error that
+    /// ended the stream.
     async fn forward(
         mut self,
         duration: Option<Duration>,

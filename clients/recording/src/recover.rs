@@ -12,7 +12,7 @@ use crate::mcap_records::{MetadataRecord, Record};
 use crate::reader::{ChannelTable, RecordFile};
 use crate::writer::{MetadataEntry, RecordingWriter};
 
-/// What [`recover`] has copied.
+/// The result of [`recover`].
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Recovered {
     /// Number of whole chunks.

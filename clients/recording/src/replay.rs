@@ -17,10 +17,10 @@ use crate::reader::Recording;
 use crate::step_source::{StepSource, TimeRange, TimedStep};
 use crate::steps::StepTarget;
 
-/// Steps that are read ahead of their time. When the queue is full, the reader waits.
+/// Maximum number of steps that are read ahead of their time. When the queue is full, the reader waits.
 const QUEUED_STEPS: usize = 16;
 
-/// Sent steps whose frames were not received yet. When the queue is full, no step is sent.
+/// Maximum number of sent steps whose frames were not received yet. When the queue is full, no step is sent.
 const SENT_STEPS: usize = 1024;
 
 /// How to replay a recording.
@@ -228,7 +228,7 @@ fn read_steps(
         if !repeats {
             return Ok(());
         }
-        // The first state follows the last one after the last interval.
+        // The next repetition begins one interval after the last state: the time between the last two states.
         pass_start += last_time + interval;
         source.rewind(recording, range)?;
     }

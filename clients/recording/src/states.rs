@@ -26,7 +26,8 @@ pub struct RecordedStates {
     decoder: StateDecoder,
     /// Whether changes before the first complete state are skipped.
     is_skipping: bool,
-    /// Start time: the last state at or before it is returned first. `None` after that state was found.
+    /// Start time: the last state at or before it is returned first. `None` if no state has to be found: the start time
+    /// is 0, or the state was found.
     from: Option<u64>,
     to: u64,
     /// The state after the first one, which was read to find the first one.

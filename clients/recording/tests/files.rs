@@ -107,7 +107,7 @@ fn state_messages_do_not_depend_on_chunks_and_stages() {
     assert_eq!(state_messages(&first), state_messages(&second));
     let other_run = begin_with_run(2);
     let third = write(folder.path(), "third.mcap", &other_run);
-    assert_ne!(state_messages(&first), state_messages(&third), "control: another run differs");
+    assert_ne!(state_messages(&first), state_messages(&third), "control: expected another run to differ");
 }
 
 fn begin_with_run(run: u64) -> Vec<u8> {

@@ -60,7 +60,7 @@ pub fn export_npz(recording: &Recording, out: &Path) -> Result<()> {
     archive.finish()
 }
 
-/// The names of the domains, each once.
+/// The names of the domains. A name that an earlier domain has gets the index of the domain, as in `NAME#INDEX`.
 fn unique_names(description: &SceneDescription) -> Vec<String> {
     let mut known = HashSet::new();
     let name = |domain: &modalcast_client::Domain| {

@@ -5,7 +5,8 @@ use std::ops::Range;
 use crate::error::Result;
 use crate::reader::Recording;
 
-/// Limit on the gathered values of a group of domains, in bytes. A domain with more is a group of its own.
+/// Size of the gathered values of a group of domains, in bytes. A group ends with the domain at which its values exceed
+/// this size.
 const GROUP_BYTES: u64 = 256 << 20;
 
 /// A row-major 3x4 matrix.

@@ -74,7 +74,7 @@ impl VideoEncoder {
 
 impl Drop for VideoEncoder {
     fn drop(&mut self) {
-        // Both fail if the process has ended, as after `finish`.
+        // Both calls fail if the process has ended, as after `finish`.
         self.process.kill().ok();
         self.process.wait().ok();
     }

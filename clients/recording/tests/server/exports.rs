@@ -123,7 +123,7 @@ async fn arrays_of_npz_give_the_vertices_of_the_server() {
             }
         }
     }
-    assert_ne!(positions[3][0], positions[4][0], "control: steps differ");
+    assert_ne!(positions[3][0], positions[4][0], "control: expected steps to differ");
 }
 
 /// The JSON and the binary data of a `.glb` file.
@@ -224,9 +224,9 @@ async fn animation_of_gltf_gives_the_vertices_of_the_server() {
         assert!(difference.fold(0.0, f64::max) < 1e-6, "{:?} {placement:?}", domain.placement);
     }
     assert!(largest < 1e-5, "{largest}");
-    assert_ne!(glb.value(0, "weights", 3), glb.value(0, "weights", 4), "control: weights are animated");
-    assert_ne!(glb.value(1, "translation", 3), glb.value(1, "translation", 4), "control: transforms are animated");
-    assert_ne!(glb.value(1, "rotation", 3), glb.value(1, "rotation", 4), "control: transforms are animated");
+    assert_ne!(glb.value(0, "weights", 3), glb.value(0, "weights", 4), "control: expected animated weights");
+    assert_ne!(glb.value(1, "translation", 3), glb.value(1, "translation", 4), "control: expected motion");
+    assert_ne!(glb.value(1, "rotation", 3), glb.value(1, "rotation", 4), "control: expected motion");
 }
 
 #[tokio::test(flavor = "multi_thread")]

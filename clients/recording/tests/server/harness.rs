@@ -76,7 +76,7 @@ impl Server {
 
 impl Drop for Server {
     fn drop(&mut self) {
-        // Both fail if the process has ended.
+        // Both calls fail if the process has already ended.
         self.process.kill().ok();
         self.process.wait().ok();
     }

@@ -70,7 +70,7 @@ async fn interrupt_ends_a_recording_without_loss() {
     let (_folder, path) = new_file("pair.mcap");
     let mut recorder = Recorder::start(&server.url, &path);
     let steps = drive_until(&server.client, |number| number == 20).await;
-    // The recorder reads what the server has sent to it before it ends.
+    // Time for the recorder to receive the last states before the signal.
     let pid = rustix::process::Pid::from_child(&recorder.process);
     tokio::time::sleep(std::time::Duration::from_millis(500)).await;
     rustix::process::kill_process(pid, rustix::process::Signal::INT).expect("a running process");
@@ -168,6 +168,6 @@ async fn pictures_and_videos_have_a_frame_per_interval() {
     for index in 0..13 {
         assert_eq!(video[2048 * index..][..2048], frame(index), "frame {index}");
     }
-    assert_ne!(frame(0), frame(2), "control: frames of different states differ");
-    assert_eq!(frame(0), frame(1), "two frames of one state");
+    assert_ne!(frame(0), frame(2), "control: expected frames of different states to differ");
+    assert_eq!(frame(0), frame(1), "expected equal frames of one state");
 }

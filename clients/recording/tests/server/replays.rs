@@ -65,7 +65,7 @@ async fn frames_of_a_replay_equal_those_of_the_run_bit_for_bit() {
         assert_eq!(live.step.number, replayed.step.number);
         assert_eq!(live.bytes, replayed.bytes, "step {}", live.step.number);
     }
-    assert_ne!(live_frames[2].bytes, frames[3].bytes, "control: another step has another frame");
+    assert_ne!(live_frames[2].bytes, frames[3].bytes, "control: expected another frame of another step");
 
     // A part of the recording begins with the complete state at its start.
     let range = TimeRange { from: 4_000_000_000 / 24 + 1, to: 6_500_000_000 / 24 };
@@ -216,7 +216,7 @@ async fn loops_repeat_the_states_until_they_are_stopped() {
     for (index, frame) in frames.iter().enumerate().take(10) {
         assert_eq!((frame.step.number, &frame.bytes), (index as u64, &frames[index % 4].bytes));
     }
-    assert_ne!(frames[0].bytes, frames[1].bytes, "control: another state has another frame");
+    assert_ne!(frames[0].bytes, frames[1].bytes, "control: expected another frame of another state");
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -157,8 +157,11 @@ impl ExportOptions {
 /// Numbers frames. A state may be shown by several frames.
 #[derive(Default)]
 struct FrameIndices {
+    /// Index of the last step.
     step_index: u64,
+    /// Index of the first frame of the last step.
     first: u64,
+    /// Index of the first frame of the next step.
     next: u64,
 }
 
