@@ -23,7 +23,7 @@ pub enum UploadShape {
 }
 
 impl UploadShape {
-    /// Size of the arrays according to the numbers of vertices, triangles and modes: three numbers of four bytes per
+    /// Size of the arrays according to the counts of vertices, triangles and modes: three numbers of four bytes per
     /// vertex, per vertex and mode, and per triangle. The server rejects arrays of another size.
     const fn declared_bytes(&self) -> u64 {
         match self {
@@ -73,7 +73,7 @@ impl UploadDomain {
     }
 
     /// Sets the crease angle in degrees: an edge is shaded as hard if the normals of its two triangles differ by more
-    /// at rest. 0 is flat, 180 is smooth, and the default is 40. For [`UploadShape::Arrays`] only.
+    /// than this angle at rest. 0 is flat, 180 is smooth, and the default is 40. For [`UploadShape::Arrays`] only.
     #[must_use]
     pub const fn crease_angle(mut self, degrees: f64) -> Self {
         self.crease_angle = Some(degrees);

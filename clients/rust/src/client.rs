@@ -20,7 +20,7 @@ use crate::shared_memory::{CallMemory, SharedMemory};
 pub const REPLY_LIMIT: u64 = 1 << 30;
 
 /// HTTP/2 flow-control window of a stream, in bytes. A stream that is not read fills its own window only. A full window
-/// delays a slow reader of the latest steps by what the window holds, so the window is small.
+/// delays a slow reader of the latest steps by the steps in the window, so the window is small.
 const STREAM_WINDOW: u32 = 4 << 20;
 
 /// Window of a stream of every step, in bytes. At a round trip of 50 ms it permits 1.3 GB/s.
@@ -58,7 +58,7 @@ pub struct Client {
 #[derive(Debug, Clone, PartialEq)]
 pub struct ServerInfo {
     pub version: String,
-    /// What the server can do. Features that this client does not know are left out.
+    /// The features of the server. Features that this client does not know are left out.
     pub features: Vec<v1::Feature>,
     /// The deformer in use: `cpu`, `cuda` or `reference`.
     pub backend: String,
@@ -236,7 +236,7 @@ impl Client {
         UndecodedChannel(self.channel.clone())
     }
 
-    /// The connection for a stream of steps.
+    /// The connection for a stream of replies, one per step, with this delivery.
     pub(crate) fn channel_for(&self, delivery: Delivery) -> UndecodedChannel {
         match delivery {
             Delivery::Lossless => UndecodedChannel(self.lossless_channel.clone()),

@@ -13,7 +13,7 @@ use crate::description::DescriptionBuilder;
 use crate::error::{Error, Result, malformed_reply};
 use crate::scene::{SceneDescription, ShapeArray};
 
-/// What [`Client::describe_with`] fetches.
+/// Selects the parts of a description that [`Client::describe_with`] fetches.
 #[derive(Debug, Clone, PartialEq)]
 pub struct DescriptionRequest {
     scene: String,
@@ -96,7 +96,8 @@ impl Client {
     /// # Errors
     /// As [`Self::describe`]; `File` if the cache cannot be written.
     pub async fn describe_with(&self, request: &DescriptionRequest) -> Result<SceneDescription> {
-        // With a cache, arrays are fetched by their hashes. Pixels always are.
+        // With a cache, arrays are fetched by their hashes instead of in the reply. Pixels are always fetched by their
+        // hashes.
         let arrays_in_reply = if request.cache.is_some() { &[][..] } else { &request.arrays };
         let wire_request = v1::DescribeSceneRequest {
             scene: request.scene.clone(),

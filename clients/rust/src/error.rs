@@ -62,7 +62,7 @@ pub enum Error {
     /// The connection failed or was lost.
     #[error("{url}: no connection: {reason}")]
     Connect { url: String, reason: String },
-    /// The server has another version of the wire contract than this client. Neither understands the other.
+    /// The server has another version of the wire contract than this client, so they cannot communicate.
     #[error("{url}: expected a server of protocol version {client}, got version {server}")]
     ProtocolVersion { url: String, client: u32, server: u32 },
     /// The server rejected a call with a gRPC status. `rejection` is present if the server sent details.

@@ -109,15 +109,16 @@ pub struct AppliedForce {
     pub domain: u32,
     /// `None` for a force on the coordinates.
     pub surface: Option<SurfaceForce>,
-    /// The force on the coordinates of the domain: r numbers. For a force on the surface U^T A^T f, where A is the
-    /// linear part of the domain's transform at [`ForceSet::step`].
+    /// The force on the coordinates of the domain: r numbers. For a force f on the surface, it is U^T A^T f, where A is
+    /// the linear part of the domain's transform at [`ForceSet::step`].
     pub f_q: Vec<f32>,
 }
 
 /// All forces in a scene.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct ForceSet {
-    /// The step with whose transforms the forces on the surface were converted to `f_q`; `None` if there are none.
+    /// The step with whose transforms the forces on the surface were converted to `f_q`; `None` if there are no forces
+    /// on the surface.
     pub step: Option<v1::StepId>,
     /// Ordered by owner.
     pub forces: Vec<AppliedForce>,

@@ -99,8 +99,8 @@ pub enum Lens {
     Intrinsics { fx: f64, fy: f64, cx: f64, cy: f64 },
 }
 
-/// A camera. `clip` is the pair of near and far distance in scene units; `None` clips nothing in
-/// front of the camera.
+/// A camera. `clip` is the pair of near and far distance in scene units. With `None`, the server chooses distances that
+/// clip nothing in front of the camera.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Camera {
     pub view: View,

@@ -111,7 +111,7 @@ impl<Q> Subscription<Q> {
     }
 }
 
-/// Which steps a stream carries.
+/// The steps that a stream carries.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub enum Delivery {
     /// Every step, in order. A slow reader slows the writer down.

@@ -283,7 +283,7 @@ pub(crate) mod tests {
         }
     }
 
-    /// A server that has sent its handshake to each client, and the slots that the clients return.
+    /// A server that sends its handshake to each client, and collects the slots that the clients return.
     pub(crate) struct FakeServer {
         folder: tempfile::TempDir,
         listener: UnixListener,

@@ -125,7 +125,8 @@ pub struct SceneState {
     pub(crate) q: Vec<f32>,
     /// One per domain that follows no other.
     pub(crate) transforms: Vec<Matrix3x4>,
-    /// World position in meters of the origin of all transforms, or of the origin of each of them if they differ.
+    /// World positions in meters of the origins of the transforms: one origin for all, or one per transform if they
+    /// differ.
     pub(crate) origins: Vec<[f64; 3]>,
 }
 
@@ -136,8 +137,8 @@ impl SceneState {
         self.q.get(slot.first_coordinate..)?.get(..slot.rank)
     }
 
-    /// `world_from_domain` of a domain, row-major 3x4, in scene units relative to [`Self::origin`]. That of a domain
-    /// that follows another one is a product, rounded to f32. `None` if the scene has no such domain.
+    /// `world_from_domain` of a domain, row-major 3x4, in scene units relative to [`Self::origin`]. The transform of a
+    /// domain that follows another one is a product, rounded to f32. `None` if the scene has no such domain.
     pub fn transform(&self, domain: usize) -> Option<[f32; 12]> {
         let slot = self.layout.domains.get(domain)?;
         let root = self.transforms.get(slot.root)?;
@@ -210,8 +211,8 @@ impl Client {
     }
 }
 
-/// A stream of complete states; dropping it unsubscribes. A state is copied only if the caller still holds the previous
-/// one when the next one arrives.
+/// A stream of complete states; dropping it unsubscribes. When changes arrive, the stream copies the previous state
+/// only if the caller still holds it.
 pub struct StateStream {
     /// The settings in effect.
     pub settings: v1::StateStreamSettings,
@@ -242,7 +243,7 @@ pub struct StateDecoder {
     sent_values: SentValues,
 }
 
-/// The values that a state has on the wire. The other ones are those of the previous state.
+/// The values that a state has on the wire. All other values are equal to those of the previous state.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct SentValues {
     /// Whether the state has all values.
@@ -382,7 +383,7 @@ impl StateChanges {
         Ok(())
     }
 
-    /// A new state for a complete set of values. Its values are zeros until [`Self::apply`] sets them.
+    /// A new state, if the changes have all values. The values of the state are zeros until [`Self::apply`] sets them.
     fn complete_state(&self, layout: &Arc<StateLayout>) -> Result<SceneState> {
         let is_complete = self.q.len() == layout.coordinate_count
             && self.transforms.len() == layout.roots.len()

@@ -160,7 +160,7 @@ const MAX_SINGLE_BYTES: usize = 1 << 20;
 /// Size of a part of a larger step, in bytes.
 const PART_BYTES: usize = 512 << 10;
 
-/// Number of domains in one part. Each has at most 5 bytes.
+/// Maximum number of domain indices in one part. An index takes at most 5 bytes on the wire.
 const PART_DOMAINS: usize = PART_BYTES / 5;
 
 /// Splits a step that is larger than [`MAX_SINGLE_BYTES`]. Each part has a piece of one list or of one array.

@@ -25,7 +25,7 @@ use crate::step::Step;
 /// dropped; [`StreamSummary::rejected`] counts all rejections.
 const MAX_STORED: usize = 1024;
 
-/// Steps that wait inside this process for the connection.
+/// Maximum number of steps that wait inside this process for the connection.
 const QUEUED_STEPS: usize = 8;
 
 /// Describes a step stream before it is opened.
@@ -40,8 +40,8 @@ pub struct DriveRequest {
 }
 
 impl DriveRequest {
-    /// A writer of the scene whose first step starts from the rest state. With [`Delivery::Lossless`], sending waits
-    /// while the server has no capacity.
+    /// A writer of the scene. The first step of the writer starts from the rest state. With [`Delivery::Lossless`],
+    /// sending waits while the server has no capacity.
     pub fn new(scene: &str, delivery: Delivery) -> Self {
         let (window, lease_token) = (None, Vec::new());
         let initial_state = v1::InitialState::Unspecified;
@@ -49,7 +49,8 @@ impl DriveRequest {
     }
 
     /// Limits the steps in flight (sent and not yet acknowledged): [`StepStream::step`] waits for acknowledgments.
-    /// 0 selects the server's default. The server may grant fewer.
+    /// 0 selects the server's default. The server may grant fewer. Without this call there is no window, and the server
+    /// slows this client down by flow control instead.
     #[must_use]
     pub fn window(mut self, steps: u32) -> Self {
         self.window = Some(steps);

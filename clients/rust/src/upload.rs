@@ -143,7 +143,7 @@ fn describe_file(base: &Path, local_path: PathBuf) -> Result<LocalFile> {
     Ok(LocalFile { local_path, header })
 }
 
-/// Sends the header, then each file and its chunks; a reused file has none. Stops without error if the server has
+/// Sends the header, then each file and its chunks; a reused file has no chunks. Stops without error if the server has
 /// closed the stream.
 fn send_files(
     sender: &mpsc::Sender<v1::UploadSceneRequest>,

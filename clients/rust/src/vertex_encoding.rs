@@ -16,8 +16,7 @@ const BOX_BYTES: usize = 24;
 /// Checks the size of a section with `vector_count` vectors. `field` names the section in errors.
 ///
 /// # Errors
-/// `Malformed` when the size does not fit the encoding and the number of vectors, or the encoding is not one of
-/// vectors.
+/// `Malformed` when the size does not fit the encoding and the number of vectors, or the encoding is not for vectors.
 pub(crate) fn check_section_bytes(field: &str, encoding: Encoding, vector_count: usize, bytes: u64) -> Result<()> {
     let expected_bytes = match encoding {
         // Saturating, because the server may claim any number of vectors.

@@ -105,7 +105,7 @@ impl SectionWriter {
         }
     }
 
-    /// Decodes the sections that have not arrived as f32. All bytes were written.
+    /// Decodes the sections that have not arrived as f32. Requires that all bytes of the step were written.
     ///
     /// # Errors
     /// `Malformed` if a section has a wrong number of origins or cannot be decoded.

@@ -43,7 +43,7 @@ impl VertexSelection {
         self.encoded_attribute(attribute, Encoding::F32)
     }
 
-    /// Adds an attribute with an encoding that may take fewer bytes; its documentation states the error.
+    /// Adds an attribute with an encoding that may take fewer bytes. [`Encoding`] states the error of each encoding.
     #[must_use]
     pub fn encoded_attribute(mut self, attribute: Attribute, encoding: Encoding) -> Self {
         self.attributes.push((attribute, encoding));
@@ -186,7 +186,7 @@ impl tokio_stream::Stream for VertexStream {
     }
 }
 
-/// A message of a vertex reply. Both calls have messages of this form.
+/// A message of a reply to `get_vertices` or `stream_vertices`.
 enum Part {
     Layout(v1::VertexLayout),
     Chunk(v1::VertexChunk),
@@ -209,7 +209,7 @@ fn stream_part(message: v1::StreamVerticesResponse) -> Option<Part> {
     }
 }
 
-/// Decodes messages `M` to vertex sets. Keeps what holds for all sets of a reply: the layout, and the last origins.
+/// Decodes messages `M` to vertex sets. Keeps the layout and the last origins, which hold for the following sets.
 struct VertexDecoder<M> {
     part_of: fn(M) -> Option<Part>,
     layout: Layout,
