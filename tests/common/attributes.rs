@@ -221,7 +221,7 @@ fn attributes_of_bits(bits: usize) -> VertexAttributes {
     VertexAttributes { positions: bit(0), normals: bit(1), displacements: bit(2), boxes: bit(3) }
 }
 
-/// A scene with u = (q0 + q1, q0 + q1, q2) at each of five vertices.
+/// A scene with the displacement u = U q = (q0 + q1, q0 + q1, q2) at each of five vertices.
 fn scene_of_ones(deformation: DeformationSettings) -> Arc<Scene> {
     let column = |row: [f32; 3]| row.repeat(5);
     let columns = [column([1.0, 1.0, 0.0]), column([1.0, 1.0, 0.0]), column([0.0, 0.0, 1.0])].concat();

@@ -24,7 +24,7 @@ const MAX_RELATIVE_ERROR: f64 = 8.0 / (1 << 23) as f64;
 /// Largest accepted error of a component of a unit normal: about 0.006 degrees.
 const MAX_NORMAL_ERROR: f64 = 1e-4;
 
-/// A square sheet of 0.1 with one mode, a parabola along x. Its normals follow the deformed triangles.
+/// A square sheet with sides of 0.1 and one mode, a parabola along x. Normals follow the deformed triangles.
 fn sheet_scene() -> Arc<Scene> {
     let coordinate = |index: usize| SIZE * (index as f32 / (SIDE - 1) as f32 - 0.5);
     let positions: Vec<[f32; 3]> =
@@ -50,7 +50,7 @@ pub(crate) fn check_driven_model<D: Deformer>(create_deformer: impl Fn(&Arc<Scen
     let mut state = SceneState::rest(&scene);
     state.q = vec![1.0];
     state.mark_all_dirty();
-    // In f64, and at the scene's origin.
+    // The reference computes in f64, here with the sheet at the scene's origin.
     let expected_positions = reference::deform(&scene, &state);
     let expected_normals = reference::exact_normals(&scene, &state, &expected_positions);
     let rigid_normals = reference::rigid_normals(&scene, &state);
@@ -72,9 +72,9 @@ pub(crate) fn check_driven_model<D: Deformer>(create_deformer: impl Fn(&Arc<Scen
         }
         let normal_error = max_abs_error(&surface.normals, expected_normals.as_flattened());
         max_normal_error = max_normal_error.max(normal_error);
-        assert!(normal_error <= MAX_NORMAL_ERROR, "at {distance}: error of a normal of {normal_error:e}");
+        assert!(normal_error <= MAX_NORMAL_ERROR, "at {distance}: normal error {normal_error:e}");
         if distance == 0.0 {
-            assert_eq!(origin, [0.0; 3], "expected the shared origin to return");
+            assert_eq!(origin, [0.0; 3], "expected the shared origin to follow the domain back");
             surfaces_at_zero.push(surface);
         }
     }
@@ -83,5 +83,8 @@ pub(crate) fn check_driven_model<D: Deformer>(create_deformer: impl Fn(&Arc<Scen
     assert_eq!(surfaces_at_zero[0].normals, surfaces_at_zero[1].normals);
     let rigid_normals: Vec<f32> = rigid_normals.as_flattened().iter().map(|number| *number as f32).collect();
     let rigid_error = max_abs_error(&rigid_normals, expected_normals.as_flattened());
-    assert!(rigid_error > 0.1, "negative control: expected other rigid normals, got a difference of {rigid_error}");
+    assert!(
+        rigid_error > 0.1,
+        "negative control: expected rigid normals to differ by more than 0.1, got {rigid_error}"
+    );
 }

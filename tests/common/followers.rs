@@ -25,8 +25,8 @@ const MAX_DIRECTION_ERROR: f64 = 1e-4;
 const SIZES: [(usize, usize); 9] =
     [(1, 0), (1, 3), (7, 0), (31, 1), (33, 4), (130, 31), (257, 0), (300, 33), (2000, 2)];
 
-/// A similarity transform for the follower with this index. It is mirrored if the index is divisible by 3. Unless
-/// `is_rigid`, it is sheared if the index is even.
+/// A random frame for the follower with this index. The frame is mirrored if the index is divisible by 3. With
+/// `is_rigid`, no frame is sheared; otherwise, the frame is sheared if the index is even.
 fn random_frame(random: &mut Random, index: usize, is_rigid: bool) -> Transform {
     let is_mirrored = index.is_multiple_of(3);
     let mut frame = random.next_similarity(is_mirrored);
@@ -38,9 +38,9 @@ fn random_frame(random: &mut Random, index: usize, is_rigid: bool) -> Transform 
     frame
 }
 
-/// Parts of a scene with `count` domains. The indices divisible by 3 are transform roots. Each other domain follows a
-/// random earlier domain, which is a root or a follower. With `is_rigid`, transforms may have no shear, but a uniform
-/// scale and a reflection.
+/// Parts of a scene with `count` domains. Domains with an index divisible by 3 are transform roots. Each other domain
+/// follows a random earlier domain, which is a root or a follower. With `is_rigid`, transforms have no shear. They may
+/// have a uniform scale and a reflection.
 pub(crate) fn follower_scene_parts(count: usize, deformation: DeformationSettings, is_rigid: bool) -> SceneParts {
     let mut random = Random(count as u64);
     let mut shapes: Vec<Shape> =
@@ -254,7 +254,7 @@ pub(crate) fn check_overflowing_frame_products<D: Deformer>(create_deformer: imp
     let normals = (0..37).map(|_| random.next_triple()).collect();
     let triangles = (0..35).map(|index| [index, index + 1, index + 2]).collect();
     let mesh = Mesh::from_indexed(rest_positions, normals, vec![], triangles).expect("expected a valid mesh");
-    // The translation is zero.
+    // The scaled linear part of a transform, with a translation of zero.
     let scaled_linear_part = |transform: Transform, scale: f32| {
         let mut entries = transform.0.map(|entry| entry * scale);
         [3, 7, 11].into_iter().for_each(|index| entries[index] = 0.0);

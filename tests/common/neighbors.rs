@@ -1,5 +1,5 @@
-//! The bits of a domain do not depend on the other domains of its scene, even if the other domains change the kernel
-//! variant.
+//! The vertices of a domain have the same bits whatever other domains its scene has, even if the other domains change
+//! the kernel variant.
 
 use std::sync::Arc;
 
@@ -58,8 +58,8 @@ fn embedded_scene(deformation: DeformationSettings, neighbors: Neighbors) -> Arc
     Scene::new(parts).expect("expected a valid scene")
 }
 
-/// A state with the q and transforms of `tested_state` for the domains from `first_domain` on, and random values for
-/// the other domains.
+/// A state with the q and transforms of `tested_state` for the domains under test, and random values for the other
+/// domains. `first_domain` is the index of the first domain under test.
 fn state_of(scene: &Scene, first_domain: usize, tested_state: &SceneState) -> SceneState {
     let mut state = scenes::random_state(scene, 63);
     let mut q = tested_state.q.iter();

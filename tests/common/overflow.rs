@@ -49,8 +49,8 @@ pub(crate) fn check_overflow_affects_one_step<D: Deformer>(create_deformer: impl
                 "{}: {coordinate:e}",
                 storage.name()
             );
-            // `overflowing_state` was a copy, so `valid_state` does not contain the overflowing step. Its next change
-            // is q of domain 2.
+            // `overflowing_state` was a copy, so `valid_state` does not contain the overflowing step. The next step of
+            // `valid_state` sets q of domain 2.
             partial_steps::randomize_q_and_transforms(&scene, &mut valid_state, &mut random, &[2], &[]);
             let result = run_step(&mut deformer, &valid_state);
             assert!(result.bounds.is_finite() && result.difference(&previous_result).is_some());

@@ -14,7 +14,8 @@ use super::{StepResult, run_step, strip_shape};
 use crate::scenes::{self, NORMAL_MAPPED_MATERIAL, Random};
 
 /// A step that sets the coordinates of `q_domains` and the transforms of `transform_domains` to random values.
-/// Transforms are mirrored, sheared (if the scene permits shear) and rotated, in turn.
+/// The index of a domain modulo 3 selects the kind of its transform: 0 mirrored, 1 sheared (rotated if the scene does
+/// not permit shear), 2 rotated.
 fn random_step(scene: &Scene, random: &mut Random, q_domains: &[u32], transform_domains: &[u32]) -> StepUpdate {
     let coordinates: usize = q_domains.iter().map(|domain| scene.rank_of(*domain as usize)).sum();
     let q: Vec<f32> = (0..coordinates).map(|_| random.next_number()).collect();

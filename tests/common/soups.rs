@@ -119,7 +119,8 @@ fn degenerate_soup() -> Soup {
 pub(crate) fn all_soups() -> Vec<Soup> {
     let random = &mut Random(5);
     let mut non_finite = scattered_triangles(random, 600, 1.0, [0.3; 3]);
-    // Each value replaces one of 61 to 64 coordinates. `f32::MAX` is finite, but its clip-space position may overflow.
+    // The four values replace every 61st, 62nd, 63rd and 64th coordinate. `f32::MAX` is finite, but the clip-space
+    // position of its vertex may overflow.
     for (index, value) in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, f32::MAX].into_iter().enumerate() {
         (index..non_finite.len()).step_by(61 + index).for_each(|coordinate| non_finite[coordinate] = value);
     }

@@ -100,8 +100,8 @@ fn are_unit_vectors(components: &[f32], width: usize) -> bool {
     components.chunks_exact(width).all(|vector| (length(vector) - 1.0).abs() < 1e-5)
 }
 
-/// Triangles without area have unit normals. Their tangents have length 1 too, also if the texture coordinates have no
-/// area. Without texture coordinates, tangents are zero.
+/// Triangles without area have unit normals. Their tangents have length 1 too, even if the triangles have no area in
+/// texture coordinates. Without texture coordinates, tangents are zero.
 pub(crate) fn check_zero_area_and_missing_uvs<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) {
     assert!(are_unit_vectors(&[0.6, 0.8, 0.0], 3));
     assert!(!are_unit_vectors(&[0.0; 3], 3) && !are_unit_vectors(&[f32::NAN; 3], 3));

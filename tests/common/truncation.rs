@@ -72,8 +72,8 @@ fn count_mode_toggles(storage: StorageType, mut deform: impl FnMut(&Arc<Scene>, 
     let mut columns = vec![0.0; 3 * vertices * rank];
     for vertex in 0..vertices {
         // Mode 0 moves every vertex along y, the oscillating mode moves it along x. A chunk is up to four consecutive
-        // modes. If one mode of a chunk is retained, all its modes are summed, so mode 4 must be in another chunk than
-        // mode 0.
+        // modes. If one mode of a chunk is retained, all modes of the chunk are summed. So the oscillating mode must be
+        // in another chunk than mode 0.
         columns[3 * vertex + 1] = 1.0;
         columns[3 * vertices * oscillating_mode + 3 * vertex] = 1.0;
     }
@@ -99,7 +99,8 @@ fn count_mode_toggles(storage: StorageType, mut deform: impl FnMut(&Arc<Scene>, 
 }
 
 /// Hysteresis: modes are truncated below half of the budget and restored above the whole budget, so an oscillation
-/// around one half truncates a mode at most once. Negative control: a new deformer per step has no hysteresis.
+/// around half of the budget truncates a mode at most once. Negative control: a new deformer per step has no
+/// hysteresis.
 pub(crate) fn check_hysteresis<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) {
     for storage in StorageType::ALL {
         let mut deformer: Option<D> = None;

@@ -92,7 +92,7 @@ async fn displacements_and_boxes_come_with_or_without_vertices() {
                 .await
                 .expect("expected vertices");
             assert!(attributes.positions.is_empty() && attributes.normals.is_empty());
-            // Eight displacements of 12 bytes, two boxes and an origin of 24 bytes.
+            // Eight displacements of 12 bytes, two boxes of 24 bytes, and one origin of 24 bytes.
             let section_bytes: Vec<u64> = attributes.head.sections.iter().map(|section| section.bytes).collect();
             assert_eq!((section_bytes, attributes.head.total), (vec![96, 48, 24], 168));
             assert_attributes(&attributes, 0..2);
@@ -144,7 +144,7 @@ async fn compact_encodings_stay_within_their_bounds() {
         for axis in 0..3 {
             let coordinates = || block.iter().skip(axis).step_by(3).copied();
             let (min, max) = (coordinates().fold(f32::MAX, f32::min), coordinates().fold(f32::MIN, f32::max));
-            // Plus the rounding of the decoded number to f32.
+            // Half a step of the 65,535 steps between min and max, plus the rounding of the decoded number to f32.
             let bound = (max - min) / 131_070.0 + max.abs().max(min.abs()) * f32::EPSILON;
             let compact_coordinates = compact_block.iter().skip(axis).step_by(3);
             let errors = coordinates().zip(compact_coordinates).map(|(exact, compact)| (exact - compact).abs());
@@ -152,6 +152,7 @@ async fn compact_encodings_stay_within_their_bounds() {
         }
     }
     for (number, half_number) in exact.positions.iter().zip(&half.positions) {
+        // f16 has a relative error of 2^-11, or an absolute error of 2^-25 for subnormal numbers.
         assert!((number - half_number).abs() <= (number.abs() / 2048.0).max(2.0_f32.powi(-25)));
     }
     let max_angle = |normals: &[f32]| {
@@ -161,8 +162,9 @@ async fn compact_encodings_stay_within_their_bounds() {
     };
     assert!(max_angle(&compact.normals) <= 0.004 && max_angle(&half.normals) <= 0.05);
     let ratio = compact.encoded_bytes as f64 / exact.encoded_bytes as f64;
-    assert!(ratio < 0.43, "10 bytes a vertex and the boxes instead of 24 bytes, got {ratio}");
-    assert_ne!(compact.positions, exact.positions, "control: the encoding is not exact");
+    // 10 bytes per vertex and the boxes of the blocks, instead of 24 bytes per vertex.
+    assert!(ratio < 0.43, "expected less than 0.43 of the bytes, got {ratio}");
+    assert_ne!(compact.positions, exact.positions, "control: expected an encoding that is not exact");
 }
 
 /// The layout of many domains arrives in several parts, before the first step.
@@ -182,7 +184,7 @@ async fn stream_of_70000_domains_has_one_layout() {
         assert_eq!((set.step.number, set.domains.len(), set.domains[69_999].index), (number, 70_000, 69_999));
         assert_eq!(set.positions.len(), 70_000 * NUMBERS_PER_DOMAIN);
         let (first_domain, last_domain) = (&set.positions[..12], &set.positions[69_999 * 12..]);
-        assert_ne!(first_domain, last_domain, "the step moves only the last domain");
+        assert_ne!(first_domain, last_domain, "expected the step to move the last domain only");
     }
 }
 

@@ -124,6 +124,7 @@ async fn broken_streams_release_their_subscriptions() {
         let subscribe = async |channel: &Channel| kind.subscribe(channel, "sheet", Delivery::Lossless).await;
         let proxy = Proxy::start(&server).await;
         let channel = proxy.channel().await;
+        // A scene admits 32 force streams. The limit of other streams is `max_subscribers`.
         let limit = if kind == StreamKind::Forces { 32 } else { 1 };
         let mut streams: Vec<MessageSizes> = Vec::new();
         while streams.len() < limit {
@@ -159,7 +160,7 @@ async fn broken_requests_stop_waiting() {
         deadline_ms: 600_000,
         ..Default::default()
     };
-    // A request that the scene admits has no reply within a poll interval.
+    // A request without a reply after 20 poll intervals counts as admitted.
     let try_wait = async |channel: &Channel| {
         let mut client = VertexServiceClient::new(channel.clone());
         let mut reply = client.get_vertices(request()).await.map(message_sizes)?;
@@ -235,7 +236,7 @@ async fn broken_writer_releases_its_lease_after_a_whole_step() {
         let request = v1::GetVerticesRequest { scene: "strips".into(), ..Default::default() };
         let vertices = get_vertices(&server, request).await.expect("expected vertices");
         let last_step = opened.scene.and_then(|scene| scene.last_step).expect("expected a last step");
-        assert_eq!(vertices.step(), last_step, "expected no step of the broken writer after the next one has opened");
+        assert_eq!(vertices.step(), last_step, "expected no step of the broken writer after the next writer opened");
         assert!(
             last_step.run < opened.run && last_step.run > last_run && last_step.number >= STEPS / 2,
             "{last_step:?}"

@@ -38,7 +38,7 @@ fn describe_arrays(scene: &str, arrays: &[v1::Array]) -> v1::DescribeSceneReques
     v1::DescribeSceneRequest { scene: scene.into(), arrays, ..Default::default() }
 }
 
-/// A connection whose streams take 64 KiB each while they are not read.
+/// A connection that receives at most 64 KiB of each stream while the stream is not read.
 async fn small_windows(address: &str) -> Channel {
     let endpoint = Endpoint::from_shared(address.to_owned()).expect("expected a URL");
     let endpoint = endpoint.initial_stream_window_size(1 << 16).initial_connection_window_size(1 << 26);
@@ -129,7 +129,7 @@ async fn half_sent_messages_are_rejected_or_time_out() {
             other => panic!("{other:?}: {status:?}"),
         }
     }
-    // A call may begin after another one has timed out.
+    // Fewer than 36 calls are rejected if some of them begin only after admitted calls have timed out.
     assert!(rejected >= 30, "expected at least 30 rejected calls, got {rejected}");
     let mut writer = StepWriter::connect(channel).await;
     writer.open("strips", Delivery::Lossless, 0).await;
@@ -181,7 +181,7 @@ async fn end_of_call(mut call: Streaming<v1::DescribeSceneResponse>) -> Option<S
 /// Long enough for a busy machine: a slow reader takes a message of 1 MiB within this time.
 const REPLY_TIMEOUT: Duration = Duration::from_secs(4);
 
-/// Six connections read slowly and two read nothing. All replies together exceed the budget many times.
+/// Six connections read slowly and two read nothing. All replies together have many times the bytes of the budget.
 #[tokio::test(flavor = "multi_thread")]
 async fn slow_readers_share_the_reply_budget_without_deadlock() {
     let (reply_bytes, reply_timeout) = (6 << 20, REPLY_TIMEOUT);
@@ -281,7 +281,7 @@ impl ServerProcess {
         Self { child, url, _folder: folder }
     }
 
-    /// A number of `/proc/PID/status` in bytes.
+    /// A memory size from `/proc/PID/status`, in bytes.
     fn memory(&self, key: &str) -> u64 {
         let path = format!("/proc/{}/status", self.child.id());
         let status = std::fs::read_to_string(path).expect("expected a running server");
@@ -348,7 +348,9 @@ async fn unread_replies_use_bounded_memory() {
     assert!(unbounded > 100 << 20, "control: {unbounded}");
 }
 
-/// Memory growth of a server while a connection holds 40 half-sent messages of 8 MiB, in bytes.
+/// Memory growth in bytes of a server to which a connection sends half of each of 40 messages of 8 MiB. With
+/// `is_bounded`, the attack ends when the server has rejected all but four messages; otherwise when the memory has
+/// grown by 200 MiB.
 async fn growth_by_half_sent_messages(flags: &[&str], is_bounded: bool) -> u64 {
     let server = ServerProcess::start(flags);
     let idle_bytes = server.memory("VmRSS");
@@ -380,7 +382,7 @@ async fn growth_by_half_sent_messages(flags: &[&str], is_bounded: bool) -> u64 {
 async fn half_sent_messages_use_bounded_memory() {
     let unlimited = ["--connection-receive-bytes", "4000000000", "--receive-bytes", "4000000000"];
     let bounded = growth_by_half_sent_messages(&[], true).await;
-    // Returns only when the memory exceeds 200 MiB.
+    // This call is the negative control: it returns only after a growth of more than 200 MiB.
     let unbounded = growth_by_half_sent_messages(&unlimited, false).await;
     println!("half-sent messages: {bounded} bytes with a budget of 32 MiB, {unbounded} bytes without");
     assert!(bounded < 100 << 20, "{bounded}");

@@ -1,4 +1,5 @@
-//! Connections that send no request are closed after a timeout, or at once if the server is full and a client connects.
+//! Connections that send no request are closed after a timeout, or at once if the server is full and another client
+//! connects.
 
 use std::time::Duration;
 
@@ -61,9 +62,9 @@ async fn small_server(connections: usize) -> Server {
 #[tokio::test(flavor = "multi_thread")]
 async fn full_server_closes_connections_without_a_request() {
     let server = small_server(4).await;
-    let mut occupants = Vec::new();
+    let mut idle_connections = Vec::new();
     for bytes in [&b""[..], b"P", HELLO, HELLO] {
-        occupants.push(connect(&server, bytes).await);
+        idle_connections.push(connect(&server, bytes).await);
     }
     let mut clients = Vec::new();
     for _ in 0..4 {
@@ -71,10 +72,10 @@ async fn full_server_closes_connections_without_a_request() {
         with_timeout(client.list_scenes(v1::ListScenesRequest {})).await.expect("expected an answer");
         clients.push(client);
     }
-    for occupant in occupants {
-        read_to_end(occupant).await;
+    for connection in idle_connections {
+        read_to_end(connection).await;
     }
-    // The clients that have sent a request have remained.
+    // The connections of clients that have sent a request stay open.
     for mut client in clients {
         with_timeout(client.list_scenes(v1::ListScenesRequest {})).await.expect("expected an open connection");
     }

@@ -192,8 +192,8 @@ fn alpha_images_repeat_and_filter_trilinearly() {
     assert_close(alpha_at(0.375, f32::MIN_POSITIVE), 0.2);
 }
 
-/// A sheet that is drawn with one sample per texel covers the samples of its opaque texels. At half the size, these are
-/// the texels of mip level 1.
+/// A sheet that is drawn with one sample per texel covers the samples of its opaque texels. At half the size, it covers
+/// the samples of the opaque texels of mip level 1.
 #[test]
 fn sheet_reproduces_its_image_at_levels_0_and_1() {
     let mut random = crate::scenes::Random(3);

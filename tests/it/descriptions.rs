@@ -103,7 +103,7 @@ async fn start_orchard(scene: &Arc<Scene>) -> (Server, Client, tempfile::TempDir
     (server, client, folder)
 }
 
-/// The arrays of the scene's shape, in the order of [`ALL_ARRAYS`].
+/// The arrays of a shape as bytes, in the order of [`ALL_ARRAYS`].
 fn array_bytes(shape: &Shape) -> [Vec<u8>; 6] {
     let (mesh, modes) = (&shape.mesh, &shape.modes);
     let rows = (0..3 * modes.vertices()).flat_map(|row| (0..modes.rank()).map(move |mode| modes.column(mode)[row]));
@@ -135,7 +135,7 @@ fn assert_describes(description: &SceneDescription, scene: &Scene) {
     assert_eq!(description.domains.len(), scene.domains.len());
     for (described, shape) in description.shapes.iter().zip(&scene.shapes) {
         let arrays = ALL_ARRAYS.map(|array| described_array(described, array));
-        assert!(arrays == array_bytes(shape), "expected other arrays of shape {}", described.index);
+        assert!(arrays == array_bytes(shape), "expected equal arrays of shape {}", described.index);
     }
     for (described, domain) in description.domains.iter().zip(&scene.domains) {
         assert_eq!(
@@ -223,7 +223,7 @@ async fn selected_domains_come_with_shapes_and_materials() {
     assert_eq!(domains, [(11, 0), (7, 0)]);
     let materials: Vec<_> = description.materials.iter().map(|material| (material.index, &material.name[..])).collect();
     assert_eq!(materials, [(1, "leaf"), (2, "edge")]);
-    assert_eq!(description.domains[0].material_ranges[1].material, 1, "expected the index in the description");
+    assert_eq!(description.domains[0].material_ranges[1].material, 1, "expected an index in `materials`");
 }
 
 #[tokio::test(flavor = "multi_thread")]

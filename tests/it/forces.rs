@@ -73,7 +73,7 @@ fn summarize(set: &ForceSet) -> Vec<(u64, u64, Vec<f32>)> {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn stream_reports_set_changed_and_cleared_forces_of_all_owners() {
+async fn stream_reports_new_changed_and_cleared_forces() {
     let (server, client) = start_server().await;
     let mut stream = subscribe(&client).await;
     assert_eq!(next_set(&mut stream).await, ForceSet::default());
@@ -152,7 +152,7 @@ async fn reduced_force_equals_that_of_a_pick() {
     assert!(difference > 0.01, "control: expected the rotation to change f_q");
 }
 
-/// f_q at the point with the barycentric coordinates of [`surface_force`], for the force f in the frame of the domain.
+/// f_q of a force at the point of [`surface_force`]. `local_force` is the force in the frame of the domain.
 fn expected_f_q(local_force: [f64; 3]) -> Vec<f32> {
     let scene = strips();
     let shape = scene.shape_of(0);
@@ -189,7 +189,7 @@ async fn rotation_of_the_domain_changes_f_q() {
     // The domain's y axis points along -x of the world, so that the force is -y in the frame of the domain.
     let (f_q, expected) = (&rotated_set.forces[0].f_q, expected_f_q([0.0, -2.0, 0.0]));
     assert!(f_q.iter().zip(&expected).all(|(a, b)| (a - b).abs() < 1e-6), "expected {expected:?}, got {f_q:?}");
-    assert_ne!(f_q, &rest_set.forces[0].f_q, "control");
+    assert_ne!(f_q, &rest_set.forces[0].f_q, "control: expected the rotation to change f_q");
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -249,7 +249,9 @@ async fn limits_and_invalid_forces_are_rejected() {
 async fn limited_rate_skips_to_the_newest_forces() {
     const CHANGES: u64 = 20;
     let (_server, client) = start_server().await;
-    let mut stream = with_timeout(client.stream_forces("strips", 0.5)).await.expect("expected a subscription");
+    // At most one set every two seconds.
+    let max_hz = 0.5;
+    let mut stream = with_timeout(client.stream_forces("strips", max_hz)).await.expect("expected a subscription");
     next_set(&mut stream).await;
     for id in 1..=CHANGES {
         apply(&client, &FIRST_OWNER, &[modal_force(id, 0, [1.0, 0.0])]).await;

@@ -29,7 +29,7 @@ pub(crate) enum StreamKind {
 impl StreamKind {
     pub(crate) const ALL: [Self; 5] = [Self::Frames, Self::Pictures, Self::Vertices, Self::States, Self::Forces];
 
-    /// Subscribes to a scene. Forces have no delivery. A frame of 640 x 360 pixels has 0.9 MB.
+    /// Subscribes to a scene. Streams of forces ignore `delivery`. A frame of 640 x 360 pixels has 0.9 MB.
     pub(crate) async fn subscribe(
         self,
         channel: &Channel,

@@ -119,7 +119,7 @@ async fn reduced_force_of_a_hit_matches_the_complete_modes() {
     let rotated_hit = picks.hits.iter().find(|hit| hit.domain == 1).expect("expected a hit of domain 1");
     let unrotated_force = project_force(&scene, rotated_hit, Matrix3::identity(), force);
     let reduced_force = DVector::from_vec(rotated_hit.reduced_force(force.into()));
-    assert!((reduced_force - unrotated_force).norm() > 0.1, "negative control: the force without the rotation differs");
+    assert!((reduced_force - unrotated_force).norm() > 0.1, "negative control: expected another without rotation");
     let current_picks = client
         .pick(&PickRequest::new("strips", PickRectangle::pixel(picture(), 44, 37)))
         .await
@@ -303,7 +303,7 @@ async fn distant_domains_are_picked_by_nearby_cameras() {
     let translation = [1e7 + 1.25, 0.0, -1e7];
     let far_step = rigid_step(1, v1::TransformFormat::QuaternionXyzwF64, &[(1, IDENTITY_QUATERNION, translation)]);
     server.drive_lossless("strips").await.send_step_and_wait(far_step).await;
-    // The third pick is like the first, after a camera far away from it.
+    // The third pick repeats the first one after a pick by a distant camera.
     for (domain, center) in [(1, translation), (0, [0.0; 3]), (1, translation)] {
         let offset_point = |x: f64, y: f64, z: f64| [center[0] + x, center[1] + y, center[2] + z];
         let view = View::LookAt {

@@ -80,7 +80,7 @@ async fn pictures_of_a_step_arrive_in_order_and_match_requests() {
             last_frames.push(frame);
         }
         assert_eq!((single_frame.step.number, &single_frame.bytes), (number, &last_frames[2].bytes));
-        assert_ne!(single_frame.bytes, last_frames[1].bytes, "control: another camera");
+        assert_ne!(single_frame.bytes, last_frames[1].bytes, "control: expected another image of another camera");
     }
     assert!(with_timeout(frames.next()).await.is_none(), "expected the end of the stream");
     let current_frames = client.render_frames(&FramesRequest::new("strips", pictures)).await.expect("expected frames");
@@ -133,7 +133,7 @@ async fn jpeg_error_is_small_and_decreases_with_quality() {
         let request = FramesRequest::new("strips", vec![png, jpeg(100), jpeg(0), jpeg(90), jpeg(5)]);
         let frames = client.render_frames(&request).await.expect("expected frames");
         assert!(frames[1..].iter().all(|frame| frame.format == FrameFormat::Jpeg));
-        assert_eq!(frames[2].bytes, frames[3].bytes, "expected 90 as the default");
+        assert_eq!(frames[2].bytes, frames[3].bytes, "expected quality 0 to select the default, 90");
         let errors = [1, 3, 4].map(|index: usize| mean_error(&frames[index].bytes, &frames[0].bytes));
         assert!(errors[1] < 2.0, "{output:?}: {errors:?}");
         assert!(errors.is_sorted_by(|a, b| a < b), "expected larger errors at lower quality: {output:?}, {errors:?}");

@@ -67,7 +67,7 @@ impl ServerProcess {
         Client::connect(&self.address).await.expect("expected a connection")
     }
 
-    /// The number of mappings of a file whose path begins with `name`.
+    /// The number of mappings of files whose path contains `name`.
     pub(crate) fn mappings(&self, name: &str) -> usize {
         let maps = std::fs::read_to_string(format!("/proc/{}/maps", self.process.id())).expect("expected a process");
         maps.lines().filter(|line| line.contains(name)).count()
@@ -273,7 +273,7 @@ async fn stalled_readers_take_bounded_memory() {
         let bytes = send_data(&client, kind).await;
         let growth = server.resident_bytes().saturating_sub(before);
         println!("{kind:?}: {} MB for each reader, growth {} MB", bytes >> 20, growth >> 20);
-        assert!(bytes * STALLED_READERS > 2 * MAX_GROWTH, "control: {kind:?}: the data exceed the limit");
+        assert!(bytes * STALLED_READERS > 2 * MAX_GROWTH, "control: {kind:?}: expected data above the limit");
         assert!(growth < MAX_GROWTH, "{kind:?}: {STALLED_READERS} stalled readers took {growth} bytes");
         reader.abort();
     }
@@ -296,7 +296,8 @@ fn checkpoint_step(state: &Path) -> Option<(u64, u64)> {
     run.zip(number)
 }
 
-/// Asserts that the scene shows all domains of one step, which is not older than `kept_step` and of the same run.
+/// Asserts that the scene shows all domains of one step. `kept_step` is the run and the number of a step of the same
+/// run that is not newer.
 async fn assert_whole_step(client: &Client, description: &SceneDescription, kept_step: (u64, u64)) {
     let layout = StateLayout::new(description).expect("expected a layout");
     let state = client.get_state(&StateRequest::new("crowded", ()), &layout).await.expect("expected a state");
@@ -320,7 +321,7 @@ async fn begin_upload(server: &ServerProcess) -> JoinHandle<Result<(), Status>> 
     tokio::spawn(async move { SceneServiceClient::new(channel).upload_arrays(requests).await.map(drop) })
 }
 
-/// Every kind of call is in progress.
+/// Begins an upload and every kind of stream, and leaves them in progress.
 async fn begin_calls(server: &ServerProcess) -> Vec<JoinHandle<Result<(), Status>>> {
     let mut calls = vec![begin_upload(server).await];
     for kind in StreamKind::ALL {

@@ -69,6 +69,7 @@ struct RawMemory {
     mapping: MmapRaw,
     /// The memory for steps.
     requests: OwnedFd,
+    /// The numbers of the handshake: version, bytes per slot, number of slots, and 0.
     numbers: [u32; 4],
     token: Vec<u8>,
 }
@@ -116,8 +117,8 @@ impl RawMemory {
         self.socket.write_u32_le(slot).await.expect("expected an open connection");
     }
 
-    /// Waits until the server has closed the connection.
-    async fn closed(&mut self) {
+    /// Waits until the server closes the connection.
+    async fn wait_until_closed(&mut self) {
         let result = with_timeout(self.socket.read(&mut [0; 1])).await;
         assert!(matches!(result, Ok(0) | Err(_)), "{result:?}");
     }
@@ -253,7 +254,7 @@ async fn stream_waits_for_slots() {
     }
     slots.sort_unstable();
     assert!(slots.iter().copied().eq(0..memory.slot_count() as u32), "expected each slot once, got {slots:?}");
-    // The message after the last slot may have small data.
+    // Further messages may have data that are too small for a slot.
     let no_slot = async { while next_chunk(&mut stream).await.shared.is_none() {} };
     assert!(tokio::time::timeout(Duration::from_millis(300), no_slot).await.is_err(), "expected no further slot");
     let other = shared.client().await;
@@ -290,7 +291,7 @@ async fn forged_slot_ends_the_connection_but_not_the_call() {
         };
         memory.return_slot(range.slot).await;
         memory.return_slot(forged_slot.unwrap_or(range.slot)).await;
-        memory.closed().await;
+        memory.wait_until_closed().await;
         // The call continues on the socket.
         while next_chunk(&mut stream).await.data.len() < 1 << 20 {}
         let request = v1::GetVerticesRequest { scene: "sheet".into(), ..Default::default() };
@@ -353,7 +354,7 @@ fn crowd_step(number: u64) -> Step {
     })
 }
 
-/// More parts of steps than there are slots.
+/// The steps have more parts than there are slots.
 #[tokio::test(flavor = "multi_thread")]
 async fn steps_are_equal_in_shared_memory() {
     let shared = SharedMemoryServer::start(RendererChoice::Off).await;

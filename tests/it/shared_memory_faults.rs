@@ -47,7 +47,7 @@ async fn wait_for_mappings(server: &ServerProcess, count: usize) {
     assert!(result.is_ok(), "expected {count} mappings, got {}", server.mappings(MEMORY_NAME));
 }
 
-/// Sends steps with consecutive numbers from `first` on.
+/// Sends `count` steps with the numbers from 0 on.
 async fn send_steps(client: &Client, count: u64) {
     let mut writer = drive(client, "crowded").await;
     for number in 0..count {
@@ -56,7 +56,7 @@ async fn send_steps(client: &Client, count: u64) {
     with_timeout(writer.finish()).await.expect("expected all steps to complete");
 }
 
-/// Reads `count` consecutive steps.
+/// Reads `count` steps and asserts that their numbers count from 0.
 async fn read_steps(mut stream: VertexStream, count: u64) {
     let mut numbers = Vec::new();
     for _ in 0..count {
@@ -218,8 +218,8 @@ async fn writer_process() {
     }
 }
 
-/// A writer that is killed while it sends leaves nothing behind. Its reader gets complete steps, also those of the next
-/// writer.
+/// A writer that is killed while it sends leaves nothing behind. A reader gets complete steps, including those of the
+/// next writer.
 #[tokio::test(flavor = "multi_thread")]
 async fn killed_writer_frees_its_memory() {
     let folder = tempfile::tempdir().expect("expected a temporary folder");

@@ -34,7 +34,7 @@ async fn next_state(states: &mut StateStream) -> Arc<SceneState> {
     with_timeout(states.next()).await.expect("expected another state").expect("expected a valid state")
 }
 
-/// What a client needs to deform a scene by itself: x0 and U of every domain.
+/// The data with which a client deforms a scene by itself: x0 and U of every domain.
 struct Deformer {
     description: SceneDescription,
     /// U of each domain, row-major.
@@ -87,7 +87,8 @@ async fn client_deforms_by_itself() {
     };
     let rotated = rigid_step(2, v1::TransformFormat::QuaternionXyzwF32, &[(1, QUARTER_TURN, [1.0, 0.25, -0.5])]);
     let first_step = step(1, &[0, 1], &[0.25, -0.5, 0.75, 0.125]);
-    // 4 of the last scene's units of half a meter from its origin, then 5,000 km further.
+    // In units of half a meter, the unit of `far`: first 4 units from the scene's origin, then 1e7 units (5,000 km)
+    // farther away.
     let far_steps = vec![
         first_step.clone(),
         translated(2, [2e7 + 4.0, -2e7, 2e7]),
@@ -162,13 +163,13 @@ async fn skipped_steps_are_part_of_the_next_state() {
         skipped += last_latest_state.skipped;
     }
     assert_eq!(received + skipped, last_step);
-    assert!(skipped > 0, "expected fewer than 2 steps per second to be delivered");
+    assert!(skipped > 0, "expected skipped steps with a limit of 2 per second");
     for domain in 0..4 {
         assert_eq!(last_latest_state.q(domain), last_lossless_state.q(domain), "domain {domain}");
         assert_eq!(last_latest_state.transform(domain), last_lossless_state.transform(domain), "domain {domain}");
     }
     for domain in 0..3 {
-        assert_ne!(last_latest_state.q(domain), first_state.q(domain), "control: domain {domain} has changed");
+        assert_ne!(last_latest_state.q(domain), first_state.q(domain), "control: expected domain {domain} to change");
     }
 }
 

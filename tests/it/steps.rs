@@ -109,7 +109,7 @@ async fn overlapped_steps_keep_their_order_and_vertices() {
         assert_ne!(
             surface.positions,
             reference_vertices(&strips(), &steps[..=(index + 1) % 40]).positions,
-            "negative control: the next step has other positions"
+            "negative control: expected other positions in the next step"
         );
         index
     };
@@ -239,7 +239,7 @@ async fn second_writer_is_rejected_until_the_first_ends() {
     };
     assert_eq!(rejection.reason(), v1::Reason::WriterLeaseTaken);
     assert!(rejection.given.contains("run 1"), "{rejection:?}");
-    assert!(!format!("{rejection:?}").contains("127.0.0.1"), "the address of a client is private: {rejection:?}");
+    assert!(!format!("{rejection:?}").contains("127.0.0.1"), "expected no client address: {rejection:?}");
     first_writer.send_step_and_wait(step(101, &[0], &[0.2, 0.0])).await;
     first_writer.finish().await;
     // A new run may start at any step number. The server limits the window to 256 steps.

@@ -132,7 +132,7 @@ async fn frames_of_many_cameras_show_their_own_step() {
     assert!(
         expected_images[0].images[0] != expected_images[1].images[0]
             && expected_images[0].images[0] != expected_images[0].images[1],
-        "negative control: steps and cameras differ"
+        "negative control: expected other images of other steps and cameras"
     );
     writer.finish().await;
 }
@@ -167,7 +167,7 @@ async fn pictures_of_one_subscription_show_the_same_step() {
         let output = with_timeout(last_camera.next()).await.expect("expected another output");
         let OutputBody::Frames(single) = output.body else { panic!("expected frames") };
         assert!(Arc::ptr_eq(&single.pictures[0], &pictures[4]), "expected one drawing of step {number}");
-        assert!(!Arc::ptr_eq(&single.pictures[0], &pictures[3]), "control: another camera");
+        assert!(!Arc::ptr_eq(&single.pictures[0], &pictures[3]), "control: expected others");
     }
     for _ in 0..STEPS {
         writer.receive_reply().await;

@@ -349,12 +349,12 @@ async fn message_without_credit_closes_the_connection() {
         }
     };
     with_timeout(until_blocked).await;
-    // The window has room for some more steps, which the server takes.
+    // The window has room for some more steps, which the server accepts.
     for number in 1000..1020 {
         client.send(drive, MESSAGE, &drive_request(RequestKind::Step(sheet_step(number)))).await;
     }
     for _ in 0..3 {
-        // The last one is sent without credit.
+        // The last of these three messages is sent without credit.
         client.send(drive, MESSAGE, &vec![0; CLIENT_CREDIT * 3 / 4]).await;
     }
     assert_eq!(client.closed().await, Some(4002));
@@ -386,6 +386,7 @@ fn fragment(opcode: Data, payload: &[u8], is_last: bool) -> Message {
 async fn clients_that_break_the_rules_are_disconnected() {
     let server = default_server().await;
     let fragmented_text = [fragment(Data::Text, b"a", false), fragment(Data::Continue, b"b", true)];
+    // Messages, and the close code that `proto/websocket.md` states for them.
     let attacks: [(&[Message], u16); 13] = [
         (&[Message::text("text")], 1003),
         (&fragmented_text, 1003),
@@ -507,7 +508,7 @@ async fn client_that_never_reads_is_cut_off() {
     for _ in 0..3 {
         assert_eq!(reader.call(DESCRIBE, &describe("sheet")).await, expected);
     }
-    // Those that were cut off have lost their connection or have a call with an error. The others finish now.
+    // Clients that were cut off have lost their connection or have a call with an error. The other clients finish now.
     let mut cut_off = 0;
     for client in &mut stalled {
         let mut statuses = Vec::new();

@@ -28,7 +28,7 @@ pub(crate) const CREDIT: u8 = 4;
 /// The kind of the server's last message of a call.
 pub(crate) const STATUS: u8 = 5;
 
-/// The port of a server, as text.
+/// Host and port of a server, as text.
 pub(crate) fn authority(server: &Server) -> &str {
     server.address.trim_start_matches("http://")
 }
@@ -56,7 +56,7 @@ pub(crate) struct CallResult {
     pub(crate) status: tonic_types::Status,
 }
 
-/// Details of an error. The entries of maps are encoded in any order.
+/// A detail of an error. An ErrorInfo is decoded, because the entries of its map are encoded in any order.
 #[derive(Debug, PartialEq)]
 enum Detail {
     Info(tonic_types::pb::ErrorInfo),
@@ -124,7 +124,8 @@ impl WebSocketClient {
         id
     }
 
-    /// The next message of any call. `None` if the server has closed the connection.
+    /// The next message of any call. An error means that the connection is closed; it has the close frame, if the
+    /// server has sent one.
     async fn receive_any(&mut self) -> Result<ServerMessage, Option<CloseFrame>> {
         loop {
             match with_timeout(self.stream.next()).await {

@@ -158,9 +158,9 @@ async fn malformed_lease_tokens_are_rejected() {
     }
 }
 
-/// Every server is stopped without a shutdown, as by `kill -9`, and the next one uses the same state folder.
+/// Three servers use the same state folder, one after another.
 #[tokio::test(flavor = "multi_thread")]
-async fn runs_never_repeat_on_any_scene_or_after_a_crash() {
+async fn runs_never_repeat_on_any_scene_or_after_a_restart() {
     let state = tempfile::tempdir().expect("expected a temporary folder");
     let mut runs = Vec::new();
     for _ in 0..3 {
@@ -178,7 +178,7 @@ async fn runs_never_repeat_on_any_scene_or_after_a_crash() {
     assert_eq!(runs.len(), 9);
 }
 
-/// The device shows the restored state, and the step changes only one domain.
+/// The device shows the restored state until the first step, which changes only one domain.
 #[tokio::test(flavor = "multi_thread")]
 async fn reset_after_a_restart_removes_the_restored_state() {
     let folder = tempfile::tempdir().expect("expected a temporary folder");

@@ -270,7 +270,7 @@ fn culling_handles_non_finite_and_huge_positions() {
 #[test]
 fn culling_handles_far_scenes_and_extreme_clip_planes() {
     // Clip planes of 0 are fitted to the bounds. The last planes lie on both sides of the scene's center at distance 9.
-    // From 1e6 the numbers of f32 are 0.06 and more apart, so that the triangles may lose their area.
+    // From 1e6 on, neighboring f32 numbers are 0.06 or more apart, so that triangles may lose their area.
     for (shift, near, far) in [(1e4, 0.0, 0.0), (1e6, 0.0, 0.0), (1e7, 0.0, 0.0), (0.0, 1e-6, 1e9), (0.0, 8.9, 9.1)] {
         let frames = assert_same_frames(&|| mixed_builder(4, Transparency::OrderIndependent), &|harness| {
             harness.move_vertices(|[x, y, z]| [x + shift as f32, y, z]);

@@ -138,7 +138,7 @@ fn geometry_outside_the_bounds_leaves_no_stale_pixels() {
             |shift: [f64; 2]| draw_frame(&mut renderer, &buffers, shifted_camera(shift), small_bounds);
         for shift in [[0.0; 2], [1.0; 2]] {
             let first_frame = draw_shifted(shift);
-            assert!(draw_shifted([30.0, 20.0]) != first_frame, "negative control: a shifted camera");
+            assert!(draw_shifted([30.0, 20.0]) != first_frame, "negative control: expected another frame");
             assert!(
                 draw_shifted(shift) == first_frame && draw_shifted(shift) == first_frame,
                 "expected the same frame again at {shift:?}"

@@ -123,7 +123,7 @@ fn far_scene_renders_like_the_scene_at_the_origin() {
     for (position, change) in [(rounded_position, "rounded to f32"), (moved_position, "moved by 0.1")] {
         let frame = draw_frame(&mut context, &scene, &far_state, &camera_at(position));
         let difference = compare_images(&origin_frame, &frame);
-        assert!(difference.max_levels > 8, "negative control: expected another image of a camera position {change}");
+        assert!(difference.max_levels > 8, "negative control: expected another image from a position {change}");
     }
 }
 

@@ -107,7 +107,7 @@ fn ground_never_hides_triangles() {
             assert_eq!(ids, frame_without_ground.ids, "look {index} from {eye:?}");
             let ground_pixels = frame.count_ids(|id| id == VisibilityId::Ground);
             assert!(ground_pixels > 500, "look {index} from {eye:?}: {ground_pixels} pixels of ground");
-            // The ground does not move: a pixel without a triangle in both frames has the same color.
+            // The ground does not move: a pixel without a triangle in both frames has the same id.
             let frame_at_rest = draw_frame(&scene, 0.0);
             let has_moved = |(at_rest, lowered): (&VisibilityId, &VisibilityId)| {
                 !matches!(at_rest, VisibilityId::Triangle(_))
@@ -116,7 +116,7 @@ fn ground_never_hides_triangles() {
             };
             let moved_pixels = frame_at_rest.ids.iter().zip(&frame.ids).filter(|pair| has_moved(*pair)).count();
             assert_eq!(moved_pixels, 0, "look {index} from {eye:?}");
-            assert_ne!(frame_at_rest.ids, frame.ids, "control: the triangles have moved");
+            assert_ne!(frame_at_rest.ids, frame.ids, "control: expected the triangles to move");
         }
     }
 }

@@ -78,7 +78,7 @@ fn images_in_a_mixed_array_look_as_they_do_alone() {
         let [width, height] = size;
         let others: Vec<[u32; 2]> = SIZES.into_iter().filter(|other| *other != size).collect();
         let image = || texture(size, |x, y| texel(size, x, y));
-        // Magnified, one texel per pixel or two, and minified.
+        // From magnified images (6 pixels per texel) to minified ones (3 or 5 texels per pixel).
         for repeats in [1, 4, 8, 20] {
             let alone = draw(&mut renderer, tiles(repeats, [1.0; 2]), image(), &[]);
             let mixed = draw(&mut renderer, tiles(repeats, [1.0; 2]), image(), &others);

@@ -155,7 +155,7 @@ fn frames_are_deterministic() {
     other_camera.lens = modalcast_model::scene::Lens::FieldOfView(33.0);
     assert!(
         first_frame.image.rgba != render_square(&mut renderer, &scene, other_camera, 96).image.rgba,
-        "negative control: another camera"
+        "negative control: expected another image of another camera"
     );
 }
 

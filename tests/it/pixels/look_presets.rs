@@ -13,11 +13,12 @@ use super::harness::{
     RenderedFrame, SceneBuilder, colored_material, facing_rectangle, floor_mesh, open_renderer, render_sized,
 };
 
-/// A frame that the rule draws as a preview in software, and one that it draws as standard.
+/// Sizes of frames. If the renderer is a software renderer, the rule draws large frames with one sample per pixel and
+/// small ones with four.
 const LARGE: [u32; 2] = [400, 240];
 const SMALL: [u32; 2] = [96, 64];
 
-/// A slanted pillar that casts a shadow on a floor.
+/// A narrow wall that casts a shadow on a floor.
 fn scene(look: impl FnOnce(RenderSettings) -> RenderSettings) -> Arc<Scene> {
     let mut builder = SceneBuilder::new();
     let settings = RenderSettings { sun: [2.0, 3.0, 1.0], ..builder.parts.look };

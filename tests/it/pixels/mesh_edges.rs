@@ -37,7 +37,7 @@ impl Harness {
         Self { scene, renderer, buffers }
     }
 
-    /// A frame of `focal_length` pixels; 100 is that of [`front_camera`].
+    /// A frame with a focal length of `focal_length` pixels. [`front_camera`] has 100 pixels.
     fn frame(&mut self, focal_length: f64, edges: Option<MeshEdges>) -> FrameImage {
         let center = f64::from(SIZE) / 2.0;
         let lens = Lens::Intrinsics { fx: focal_length, fy: focal_length, cx: center, cy: center };
@@ -104,7 +104,7 @@ fn edges_inside_of_polygons_have_no_line() {
     assert_eq!(row_coverage(&image, 38, 26..70), 0.0, "expected no diagonal");
     assert!(row_coverage(&image, 38, 10..26) > 0.7, "expected the left border");
     let mut harness = Harness::new(green_rectangle(square()));
-    assert!(row_coverage(&harness.frame(100.0, red_edges(2.0)), 38, 26..70) > 2.0, "negative control: a diagonal");
+    assert!(row_coverage(&harness.frame(100.0, red_edges(2.0)), 38, 26..70) > 2.0, "negative control: expected a line");
 }
 
 /// The diagonal of the rear square is behind the front square, whose own diagonal is an inner edge.
@@ -115,10 +115,10 @@ fn hidden_edges_have_no_line() {
     let image = harness.frame(100.0, red_edges(1.0));
     // The front square covers the columns and rows 37 to 58.
     assert_eq!((42..54).map(|row| row_coverage(&image, row, 42..54)).sum::<f64>(), 0.0);
-    assert!(row_coverage(&image, 28, 62..74) > 1.0, "negative control: the diagonal beside the front square");
+    assert!(row_coverage(&image, 28, 62..74) > 1.0, "negative control: expected a line beside it");
 }
 
-/// A grid of 64 x 64 cells of less than a pixel.
+/// Compares a grid with cells of 10 pixels and a grid with cells of a quarter pixel.
 #[test]
 fn lines_of_tiny_triangles_fade_out() {
     let grid = |cells: u32| {

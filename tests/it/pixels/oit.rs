@@ -114,9 +114,9 @@ fn crossing_layers_do_not_depend_on_the_order() {
     let two_pass_image = render_crossing_planes(Transparency::TwoPass, orders[0]);
     assert!(
         two_pass_image != render_crossing_planes(Transparency::TwoPass, orders[5]),
-        "negative control: two passes depend on the order"
+        "negative control: expected the image of two passes to depend on the order"
     );
-    assert!(two_pass_image != expected_image, "negative control: two passes differ");
+    assert!(two_pass_image != expected_image, "negative control: expected another image with two passes");
 }
 
 #[test]

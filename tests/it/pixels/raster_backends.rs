@@ -332,7 +332,7 @@ fn ground_hides_no_geometry_with_any_rasterizer() {
         let [above, opengl, compute] = counts(domain);
         assert!(above > 100 && 2 * opengl.min(compute) > above, "domain {domain}: {:?} pixels", counts(domain));
     }
-    assert!(count_differences(&above_ground, &opengl_domains) > 100, "control: the geometry has moved");
+    assert!(count_differences(&above_ground, &opengl_domains) > 100, "control: expected the geometry to move");
     let in_plane_counts = [count(&above_ground, 2), count(&opengl_domains, 2), count(&compute_domains, 2)];
     assert!(
         in_plane_counts[0] > 100 && in_plane_counts == [in_plane_counts[0]; 3],

@@ -96,14 +96,14 @@ fn shadow_of_a_floating_square_has_only_ambient_light() {
     let unshadowed_frame = render_square_shadow(builder_without_shadow, AlphaMode::Opaque, 1.0);
     assert!(
         is_close(unshadowed_frame.pixel(32, 32), ground_color(1.0, 0.8), 2.0),
-        "negative control: without a shadow map"
+        "negative control: expected sunlight without a shadow map"
     );
     assert!(!unshadowed_frame.stats.passes.contains(&Pass::Shadow) && frame.stats.passes.contains(&Pass::Shadow));
     let mut builder_without_caster = create_builder();
     builder_without_caster.parts.look.sun = [3.0, 4.0, 0.0];
     assert!(
         is_close(render_from_above(builder_without_caster).pixel(32, 32), ground_color(1.0, 0.8), 2.0),
-        "negative control: without a caster"
+        "negative control: expected sunlight without a caster"
     );
 }
 
@@ -230,7 +230,7 @@ fn unblurred_texel_gives_the_chebyshev_bound() {
             is_close(pixel, ground_color(visibility, 1.0), 2.0),
             "least_variance {least_variance}, bleeding {bleeding}: expected a visibility of {visibility}, got {pixel:?}"
         );
-        assert!(!is_close(pixel, ground_color(visibility + 0.05, 1.0), 2.0), "negative control: visibility + 0.05");
+        assert!(!is_close(pixel, ground_color(visibility + 0.05, 1.0), 2.0), "negative control: expected others");
     }
 }
 

@@ -120,7 +120,7 @@ fn view_dependent_shadows_are_drawn_for_each_frame() {
 }
 
 #[test]
-fn upload_bounds_or_origin_invalidate_the_shadow() {
+fn new_bounds_origin_or_surface_invalidate_the_shadow() {
     let scene = create_scene(1);
     let mut renderer = open_renderer();
     let mut buffers = renderer.load(&scene).expect("expected the scene to load");

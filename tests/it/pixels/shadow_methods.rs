@@ -11,7 +11,7 @@ use super::shadow::{create_builder, with_square};
 /// Pixels per unit of the ground in the image of the edge.
 const PIXELS_PER_UNIT: f64 = 100.0;
 /// Half the extent of the light box along z, across the edge. The bounds extend to z = 5. Half extents from 4 to 8 are
-/// quantized to multiples of 4 / 16 = 0.25, and 5 becomes the next larger multiple.
+/// quantized to multiples of 4 / 16 = 0.25. The value 5, which is a multiple itself, becomes the next one, 5.25.
 const LIGHT_BOX_HALF_EXTENT: f64 = 5.25;
 
 /// A variance shadow map with a blur of 2 texels.
@@ -106,7 +106,8 @@ fn filtered_and_variance_maps_give_the_blurred_edge() {
             "{method:?}, {shadow:?}: expected a maximum error below 0.012, got {}",
             max_error(0.0)
         );
-        assert!(max_error(0.5 * texel_size(&shadow)) > 0.02, "negative control: edge shifted by half a texel");
+        let control = max_error(0.5 * texel_size(&shadow));
+        assert!(control > 0.02, "negative control, edge shifted by half a texel: expected an error, got {control}");
     }
 }
 
@@ -185,7 +186,7 @@ fn only_standard_maps_have_hard_edges() {
     for method in [ShadowMethod::PercentageCloser, ShadowMethod::Variance] {
         assert!(
             count_penumbra_pixels(ShadowSettings { method, ..variance_settings() }) > 500,
-            "negative control: {method:?} has a soft edge"
+            "negative control: expected a soft edge with {method:?}"
         );
     }
 }
