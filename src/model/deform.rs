@@ -17,7 +17,7 @@ use crate::scene::{BoundingBox, OrientedBounds, SceneState};
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct DeformedSurface {
     /// World positions, three numbers per vertex, relative to the floating origin of their domain
-    /// ([`SceneState::origin_of`]). Before the first step with f64 translations, this is the scene's origin.
+    /// ([`SceneState::origin_of`]), which is the scene's origin before the first step with f64 translations.
     pub positions: Vec<f32>,
     /// World-space unit normals, three numbers per corner.
     pub normals: Vec<f32>,

@@ -43,7 +43,8 @@ pub struct GlVertexBuffers {
     pub normals: GlBuffer,
     /// 4 f32 per corner; only if the scene has normal maps.
     pub tangents: Option<GlBuffer>,
-    /// Imports memory of the deformer instead, if the renderer can.
+    /// Present if the renderer can import memory of the deformer. OpenGL then copies the vertices from this memory to
+    /// the buffers, and the deformer does not write the buffers.
     pub importer: Option<Rc<dyn VertexImporter>>,
 }
 

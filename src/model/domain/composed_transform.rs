@@ -79,7 +79,7 @@ mod tests {
     #[test]
     fn f64_product_keeps_the_range_and_cancels_to_zero() {
         let scaling = |scale: f32| Transform(Transform::IDENTITY.0.map(|entry| entry * scale));
-        // 1e30^2 overflows f32, and 1e-30^2 underflows it.
+        // In f32, 1e30^2 overflows and 1e-30^2 underflows.
         let overflowing = ComposedTransform { root: scaling(1e30), frame: Some(scaling(1e30)) };
         assert_eq!(overflowing.to_f32().0[0], f32::INFINITY);
         assert!((overflowing.to_f64()[0] / 1e60 - 1.0).abs() < 1e-6);

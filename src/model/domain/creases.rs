@@ -1,10 +1,10 @@
 //! Normals of meshes without normals: smooth across shallow edges, and hard along creases.
 //!
 //! # Definition
-//! An edge is a crease if the normals of its two triangles, which follow their winding, differ by more than the crease
-//! angle. The triangles around a vertex that are connected by edges that are not creases form a smooth fan. All corners
-//! of a fan have one normal: the direction of the sum of the fan's area vectors (b - a) x (c - a), that is, triangles
-//! are weighted by their areas. The angle is measured at rest. A vertex keeps its index and its rows of U: a crease
+//! An edge is a crease if the normals of its two triangles differ by more than the crease angle at rest. The normal of
+//! a triangle follows its winding. Triangles around a vertex form a smooth fan if they are connected by edges other
+//! than creases. All corners of a fan have one normal: the direction of the sum of the fan's area vectors
+//! (b - a) x (c - a). Triangles are thus weighted by their areas. A vertex keeps its index and its rows of U: a crease
 //! only adds corners to it.
 //!
 //! # Special cases
@@ -29,10 +29,10 @@ const SAME_PLANE_TOLERANCE: f64 = 1e-6;
 /// The largest number of triangles of an edge for which all pairs are compared.
 const MAX_EDGE_TRIANGLES: usize = 8;
 
-/// A triangle counts as one without area if its area vector is not longer than this fraction of a scale: the sum of l
-/// (l + w) over two edges, where l is the largest component of the edge and w the largest coordinate of the vertices.
-/// Rounding positions to f32 changes an area vector by about 2^-23 of this scale, so a shorter vector has no reliable
-/// direction.
+/// A triangle counts as one without area if its area vector is not longer than this fraction of a scale. The scale is
+/// the sum of `l (l + w)` over two edges of the triangle, where l is the largest component of the edge and w the
+/// largest coordinate of the vertices. Rounding positions to f32 changes an area vector by about 2^-23 of the scale, so
+/// the direction of a vector near this size is not reliable.
 const MIN_AREA_RATIO: f64 = 1.0 / 1_048_576.0;
 
 /// The largest angle in degrees between the normals of two adjacent triangles that are shaded as one smooth surface.
@@ -208,8 +208,8 @@ struct TriangleCorner {
     slot: u8,
 }
 
-/// The corners of all triangles, sorted by vertex and then by triangle, and the offset of the corners of each vertex.
-/// The offsets come first.
+/// Returns the offset of each vertex's corners, and the corners of all triangles, sorted by vertex and then by
+/// triangle.
 fn corners_by_vertex(vertex_count: usize, triangles: &[[u32; 3]]) -> (Vec<usize>, Vec<TriangleCorner>) {
     let mut offsets = vec![0; vertex_count + 1];
     triangles.as_flattened().iter().for_each(|vertex| offsets[*vertex as usize + 1] += 1);
@@ -234,7 +234,7 @@ struct FanConnector<'a> {
     crease_angle: CreaseAngle,
     /// The fans, as sets of indices into the corners of the vertex.
     connections: DisjointSets,
-    /// For each corner, its two edges at the vertex: the neighbor at the other end, and the index of the corner.
+    /// The two edges of each corner at the vertex. An edge is the vertex at its other end and the index of the corner.
     edges: Vec<(u32, usize)>,
 }
 

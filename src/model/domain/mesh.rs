@@ -59,8 +59,8 @@ impl Mesh {
         Ok(Self { rest_positions, corners, triangles, inner_edges: Vec::new() })
     }
 
-    /// Marks the edges of triangles that are inside of a polygon, in the format of [`Self::inner_edges`]. A list
-    /// without marks is stored as an empty one.
+    /// Marks the triangle edges that lie inside a polygon, in the format of [`Self::inner_edges`]. A list without marks
+    /// is stored as an empty one.
     ///
     /// # Errors
     /// `Invalid` unless there is one entry per triangle.

@@ -156,8 +156,8 @@ fn number_groups(representative_of_corner: &[u32]) -> Vec<u32> {
     representative_of_corner.iter().map(group_of).collect()
 }
 
-/// The opposite edges of all groups, sorted by group, and the offset of each group's edges. The offsets come first. A
-/// triangle that contains a vertex twice has no area in any state and is omitted.
+/// Returns the offset of each group's edges, and the opposite edges of all groups, sorted by group. A triangle that
+/// contains a vertex twice has no area in any state and is omitted.
 fn opposite_edges_of_groups(mesh: &Mesh, corner_groups: &[u32], group_count: usize) -> (Vec<usize>, Vec<OppositeEdge>) {
     // For each corner of each triangle: its group, and the edge opposite to it.
     let group_edges = || {

@@ -1,6 +1,6 @@
 //! Loader of NumPy archives with a mesh: the arrays `vertices` (n x 3) and `faces` (m x 3 or m x 4), and optionally
 //! `U`, `eigenvalues`, `normals` (n x 3), `uvs` (n x 2, with (0, 0) at the top left) and `colors` (n x 3 or n x 4,
-//! sRGB, 0 to 1, or 0 to 255 if any is above 1).
+//! sRGB, 0 to 1, or 0 to 255 if any value is above 1).
 
 use super::asset_dir::{AssetDir, MAX_MODEL_BYTES, stem_of};
 use super::modes::{LoadedModes, NpzArchive, parse_f64, read_npz_modes};
@@ -101,7 +101,7 @@ fn read_vectors<const N: usize>(
     }
 }
 
-/// Reads the colors. Divides them by 255 if any is above 1. The fourth channel is not used.
+/// Reads the colors. Divides them by 255 if any value is above 1. The fourth channel is not used.
 fn read_colors(archive: &mut NpzArchive<'_>, count: usize) -> Result<Vec<[f32; 3]>> {
     let Some((width, entries)) = read_rows(archive, "colors", &[3, 4], Some(count))? else { return Ok(Vec::new()) };
     let largest = entries.iter().copied().fold(0.0, f64::max);

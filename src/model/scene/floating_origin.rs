@@ -12,8 +12,9 @@
 //! Error bound per axis, for a translation t from the floating origin with |t| <= 4 g = `HOME_REACH` g: rounding t
 //! contributes at most 2^-23 g. Each of the three fused multiply-adds of x = A p + t contributes at most 2^-22 g while
 //! the vertex is within 8 g of its floating origin. The sum is 7 x 2^-23 g: less than 8.4e-7 of the domain's size, at
-//! any distance. A domain at the end of the shared origin's reach has 16 times this bound, 1.4e-5 of its size, and an
-//! outlier an eighth of it. The f32 rounding of A and p adds to the bound, independent of the domain's position.
+//! any distance. A domain at the end of the shared origin's reach (64 g) has 16 times this bound, 1.4e-5 of its size.
+//! An outlier, with |t| <= g / 2 and its vertices within 4 g, has less than half of this bound. The f32 rounding of A
+//! and p adds to the bound, independent of the domain's position.
 //!
 //! Without f64 translations, all transforms are relative to the scene's origin, and rounding t contributes up to 2^-24
 //! |t| in each of the four operations.
@@ -274,9 +275,9 @@ impl FloatingOrigins {
     /// scene's origin. The result is computed in f64 and rounded to f32 once. `positions` has three numbers per vertex
     /// in layout order.
     ///
-    /// Also returns the bounds of the near domains. With d as the distance from `reference_point` to the nearest
-    /// floating origin, a domain is near if the distance of its floating origin is at most 1024 of its spacings plus 4
-    /// d. More distant domains would make the bounds too large to fit a shadow map to.
+    /// Also returns the bounds of the near domains. Let d be the distance from `reference_point` to the nearest
+    /// floating origin. A domain of spacing g is near if the distance to its floating origin is at most 1024 g + 4 d.
+    /// More distant domains would make the bounds too large to fit a shadow map to.
     pub fn rebase_positions(
         &self,
         reference_point: [f64; 3],

@@ -15,8 +15,8 @@
 //! | software (OpenGL on the CPU) | of `standard` if the frame has at most 320 x 240 pixels and the scene at most 16,384 triangles, else of `preview` | of `preview` |
 //!
 //! The shadow map of the rule is the fastest one with a light error that cannot be seen (hardware) or is hard to see
-//! (software), by `modalcast report render`. It does not depend on the number of pixels, because all frames of a step
-//! share it. A part of the look that the scene sets itself ([`LookOverrides`]) is never changed.
+//! (software), as measured by `modalcast report render`. It does not depend on the number of pixels, because all frames
+//! of a step share it. A part of the look that the scene sets itself ([`LookOverrides`]) is never changed.
 
 use super::{Antialiasing, RenderSettings, ShadowMethod};
 use crate::error::{Error, invalid};
@@ -59,7 +59,7 @@ pub struct PresetRequest {
     pub overrides: LookOverrides,
 }
 
-/// The parts of a look that a scene sets itself. Parts that are `None` are those of a preset.
+/// The parts of a look that a scene sets itself. A preset or the rule chooses the parts that are `None`.
 #[derive(Debug, Clone, Copy, Default, PartialEq, serde::Serialize)]
 pub struct LookOverrides {
     pub antialias: Option<Antialiasing>,

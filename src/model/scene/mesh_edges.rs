@@ -9,7 +9,7 @@ use crate::error::{Result, invalid};
 #[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct MeshEdges {
-    /// Width in pixels, above 0, to 32.
+    /// Width in pixels, above 0 and at most 32.
     pub width: f32,
     /// Linear color, 0 to 1. It is not lit.
     pub color: [f32; 3],

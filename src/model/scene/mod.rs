@@ -135,8 +135,7 @@ impl Scene {
         }
     }
 
-    /// Builds a scene: validates the parts and the references between them, and computes everything that follows from
-    /// them.
+    /// Builds a scene: validates the parts and the references between them, and computes the derived fields.
     ///
     /// # Errors
     /// `Invalid` with the field and, for a field of a domain, the index of the domain.
@@ -327,8 +326,8 @@ fn check_material_ranges(parts: &SceneParts, domain: &Domain) -> Result<()> {
     Ok(())
 }
 
-/// A remark on the domains with a negative eigenvalue, which a rounding error does not explain. They are accepted,
-/// because the server only stores eigenvalues.
+/// A remark on the domains with a negative eigenvalue that is not a rounding error. These domains are accepted, because
+/// the server only stores eigenvalues.
 fn negative_eigenvalues(domains: &[Domain]) -> Option<String> {
     let most_negative = |domain: &Domain| {
         let eigenvalues = || domain.metadata.eigenvalues.iter().copied();

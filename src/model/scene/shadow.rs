@@ -124,9 +124,9 @@ impl ShadowSettings {
     /// Upper bound of the variance M2 - M1^2 that f32 rounding produces from equal depths m, |m| <= 1/2. M1 and M2 are
     /// the means of m and m^2, blurred by N taps in x and in y.
     ///
-    /// With the unit roundoff u = 2^-24, the products, sums and weights of two passes and the bilinear lookup cause
-    /// these errors: at most (2 N + 6) u / 4 in M2, which is at most 1/4, and at most (2 N + 5) u / 2 in M1, hence
-    /// (N + 3) u in M1^2. The sum is below (1.5 N + 5) u.
+    /// Let u = 2^-24 be the unit roundoff. The products, sums and weights of two passes and the bilinear lookup cause
+    /// an error of at most (2 N + 6) u / 4 in M2, because M2 <= 1/4, and of at most (2 N + 5) u / 2 in M1. As
+    /// |M1| <= 1/2, the error of M1^2 is at most (N + 3) u. The sum of both errors is below (1.5 N + 5) u.
     pub fn variance_floor(&self) -> f32 {
         let taps = 2 * self.blur_radius() + 1;
         let unit_roundoff = 0.5 * f32::EPSILON;

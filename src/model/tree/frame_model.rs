@@ -1,6 +1,6 @@
 //! An independent model of the parts of the tree, against which their modes are tested: a fine frame of uniform
 //! Euler-Bernoulli elements with point masses at nodes, assembled densely. It shares only the geometry and the masses
-//! with `beam` and `element`: its matrices are in closed form and in vectors instead of local axes.
+//! with `beam` and `element`: its matrices are in closed form and use vectors instead of local axes.
 
 use nalgebra::{Cholesky, DMatrix, Matrix3, Matrix3xX, Matrix4, Vector3};
 
@@ -173,7 +173,7 @@ mod tests {
     /// U^T M U: the integral of the products of velocities over all sections by the midpoint rule with many points per
     /// element, and the carried masses.
     fn gram_matrix(template: &PartTemplate, mode_shapes: &DMatrix<f64>) -> DMatrix<f64> {
-        // A multiple of every number of elements between two rings that occurs.
+        // A multiple of every number of elements between two rings in the tested templates.
         const POINTS: usize = 168;
         let (beam, parts) = (template.beam(), template.elements_per_ring());
         let points = &template.centerline.points;

@@ -124,8 +124,8 @@ impl PartTemplate {
     }
 
     /// Number of beam elements between two rings, so that the radii of an element differ by at most
-    /// [`MAX_RADIUS_RATIO`]. Bending is cubic within an element, and a strong taper, as in a branch collar, bends
-    /// otherwise: twigs with one element per ring are up to 0.6 % too stiff.
+    /// [`MAX_RADIUS_RATIO`]. An element bends as a cubic. A strongly tapered section, such as a branch collar, does
+    /// not, so twigs with one element between two rings are up to 0.6 % too stiff.
     pub(super) fn elements_per_ring(&self) -> usize {
         let ratio = |ends: &[f64]| (ends[1] / ends[0]).max(ends[0] / ends[1]);
         let largest_ratio = self.radii.windows(2).map(ratio).fold(1.0, f64::max);

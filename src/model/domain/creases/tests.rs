@@ -83,7 +83,7 @@ fn cube_has_hard_edges_by_default() {
         let sources = creased.triangles[index].map(|corner| creased.source_corners[corner as usize]);
         assert_eq!(sources, *vertices, "expected corners of the same vertices");
     }
-    // The diagonals of the sides weight the three sides of a vertex differently.
+    // A vertex has one or two triangles on each of its three sides, so the sides have different weights.
     let smooth = split(&CUBE, &CUBE_TRIANGLES, 180.0);
     assert_eq!((smooth.source_corners.len(), &smooth.triangles[..]), (8, &CUBE_TRIANGLES[..]));
 }
@@ -215,7 +215,7 @@ fn opposite_windings_have_opposite_normals() {
 
 #[test]
 fn triangles_without_area_connect_their_neighbors() {
-    // The edge of the hinge as a triangle without area: vertex 6 has the position of vertex 2, or is within the edge.
+    // A triangle without area replaces the edge of the hinge: vertex 6 is at the position of vertex 2 or on the edge.
     for (position, bend, corners_at_vertex_1) in [
         ([0.0, 1.0, 0.0], 30.0, 1),
         ([0.0, 1.0, 0.0], 60.0, 2),
@@ -229,9 +229,9 @@ fn triangles_without_area_connect_their_neighbors() {
         let creased = split(&positions, &with_sliver, 40.0);
         let count = creased.source_corners.iter().filter(|source| **source == 1).count();
         assert_eq!(count, corners_at_vertex_1, "{position:?} at {bend} degrees");
-        // Without it, vertices 2 and 6 are not connected.
-        let apart = split(&positions, &triangles, 40.0);
-        assert_eq!(apart.source_corners.iter().filter(|source| **source == 1).count(), 2);
+        // Without this triangle, vertices 2 and 6 are not connected.
+        let disconnected = split(&positions, &triangles, 40.0);
+        assert_eq!(disconnected.source_corners.iter().filter(|source| **source == 1).count(), 2);
     }
 }
 
@@ -253,7 +253,7 @@ fn extreme_coordinates_have_the_same_creases() {
         assert_eq!(creased.source_corners.len(), 24, "scale {scale}");
         assert_eq!(normals_of(&creased, 2), [[0.0, 0.0, 1.0]; 3], "scale {scale}");
     }
-    // Far from the origin, rounding decides the normals of small triangles, and they are smooth.
+    // Far from the origin, the normals of small triangles consist of rounding errors, so their edges are not creases.
     let (positions, triangles) = hinge(90.0);
     let far = positions.map(|position| position.map(|coordinate| coordinate * 1e-3 + 4096.0));
     assert_eq!(split(&far, &triangles, 40.0).source_corners.len(), 6);

@@ -19,9 +19,9 @@ const F32: u64 = 5126;
 pub(super) struct AttributeFormat {
     /// Whether normalized unsigned integers are accepted in addition to floats.
     pub(super) allows_integers: bool,
-    /// The required number of elements. `None`: any number, for the positions, which determine the number of the other
-    /// attributes. An accessor without a buffer view, whose elements are zero or sparse, is accepted only for a
-    /// required number. Otherwise, a large count without data could exhaust the memory.
+    /// The required number of elements. `None` allows any number. This is for the positions, which determine the number
+    /// for the other attributes. With `None`, an accessor without a buffer view (its elements are zero or sparse) is
+    /// rejected, because a large count without data could exhaust the memory.
     pub(super) count: Option<usize>,
 }
 

@@ -142,7 +142,7 @@ impl ManifestAssembler<'_> {
         Ok(())
     }
 
-    /// The crease angle of an entry: its own one, or else that of the scene.
+    /// The crease angle of an entry, or that of the scene if the entry has none.
     fn crease_angle(&self, entry: &DomainEntry) -> Result<CreaseAngle> {
         let degrees = entry.crease_angle.or(self.manifest.crease_angle);
         degrees.map_or(Ok(CreaseAngle::default()), CreaseAngle::from_degrees)

@@ -153,7 +153,7 @@ fn documented_defaults_are_those_of_the_parser() {
             }
             let path = if path.is_empty() { key.clone() } else { format!("{path}.{key}") };
             let text = format!("model = 'a.obj'\n{path} = {value}\n");
-            // A table without keys has all defaults; `look.bloom` and `look.edges` are none by default.
+            // `look.bloom` and `look.edges` are absent by default, so their defaults are those of a table without keys.
             let expected = match heading.as_str() {
                 "look.bloom" | "look.edges" => describe(&format!("model = 'a.obj'\n{heading} = {{}}\n")),
                 _ => without_key.clone(),

@@ -40,7 +40,7 @@ impl<'de> Visitor<'de> for LookVisitor {
     }
 }
 
-/// The table `look.shadow`. Missing keys are those of a preset, or have the default of [`ShadowSettings`].
+/// The table `look.shadow`. A missing key has the value of a preset or the default of [`ShadowSettings`].
 #[derive(Debug, Clone, Copy, serde::Deserialize)]
 #[serde(deny_unknown_fields)]
 struct ShadowKeys {
@@ -73,7 +73,7 @@ impl ShadowKeys {
     }
 }
 
-/// The table `look`. Missing keys are those of a preset, or have the default of [`RenderSettings`].
+/// The table `look`. A missing key has the value of a preset or the default of [`RenderSettings`].
 #[derive(Debug, Default, serde::Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct LookKeys {
@@ -143,7 +143,7 @@ impl LookKeys {
     }
 }
 
-/// The table `deform`. Missing keys have the default of [`DeformationSettings`].
+/// The table `deform`. A missing key has the default of [`DeformationSettings`].
 #[derive(Debug, Default, serde::Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub(super) struct DeformKeys {

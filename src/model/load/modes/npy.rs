@@ -47,8 +47,8 @@ pub fn parse(bytes: &[u8]) -> Result<NpyArray> {
     Ok(NpyArray { shape: header.shape, fortran_order: header.fortran_order, entries })
 }
 
-/// Parses an array of f64, or of another type whose values f64 contains. The entries are in C order. An array in
-/// Fortran's order, as NumPy writes a transposed one, has at most two axes.
+/// Parses an array of numbers to f64. The returned entries are in C order. An array in Fortran order, in which NumPy
+/// writes a transposed array, must have at most two axes.
 ///
 /// # Errors
 /// As for [`parse`].

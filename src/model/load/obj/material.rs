@@ -230,7 +230,7 @@ mod tests {
     }
 
     #[test]
-    fn other_image_formats_are_remarks_and_errors_in_strict_mode() {
+    fn other_image_formats_are_remarks_but_errors_in_strict_mode() {
         let folder = tempfile::tempdir().expect("a temporary folder");
         std::fs::write(folder.path().join("a.tga"), [0, 0, 2, 0, 0, 0]).expect("a writable file");
         for (statement, field, stand_in) in [

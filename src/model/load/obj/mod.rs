@@ -53,7 +53,7 @@ pub(super) fn parse_obj(text: &str) -> super::polygons::PolygonMesh {
 /// textures.
 ///
 /// A material without definition is [`Material::unspecified`], and a library or image that does not exist is left out.
-/// In strict mode, both are errors.
+/// In strict mode, each of these cases is an error.
 ///
 /// # Errors
 /// `Invalid` with the material and the statement.

@@ -59,8 +59,8 @@ pub(super) fn assign_organs(
     Ok(organs)
 }
 
-/// Indices of leaves with the centers of their petiole polylines. If no leaf has a polyline, indices and bases of all
-/// leaves.
+/// Returns the index of each leaf that has a petiole polyline, and the center of the polyline. If no leaf has one,
+/// returns the index and the base of every leaf.
 fn petiole_centers(structure: &PlantStructure) -> Vec<(usize, Vector3<f64>)> {
     let centers: Vec<_> = structure
         .leaves

@@ -65,7 +65,7 @@ fn normals_texture_coordinates_and_unused_properties_are_recognized() {
 }
 
 #[test]
-fn missing_image_is_a_remark_and_an_error_in_strict_mode() {
+fn missing_image_is_a_remark_but_an_error_in_strict_mode() {
     let text = ascii()
         .replace("comment made by hand", "comment TextureFile absent.png")
         .replace("uchar red", "float s")

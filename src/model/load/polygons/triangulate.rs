@@ -6,7 +6,7 @@ use nalgebra::{Vector2, Vector3};
 /// a fan. So the time for a file is at most proportional to its number of corners.
 const MAX_EAR_CLIPPING_CORNERS: usize = 256;
 
-/// How often the ears of all corners are determined again. A simple polygon never needs it.
+/// The largest number of repeated searches for the ears of all corners. A simple polygon needs none.
 const MAX_EAR_SEARCHES: usize = 4;
 
 /// Splits a polygon into triangles with the polygon's winding, as indices into `points`. There are always two fewer

@@ -72,7 +72,7 @@ struct Patch {
 impl Patch {
     /// The fourth texel has the color p + q - o, where o is the color of the corner at the first texel, and p and q are
     /// the other two. That corner is chosen so that p + q - o is as little as possible outside of 0 to 1. For gray
-    /// colors, the corner with the middle value keeps the fourth color inside.
+    /// colors, the corner with the middle value keeps p + q - o in this range.
     fn new(colors: [[f32; 3]; 3]) -> Self {
         let fourth_of = |origin: usize| {
             let [p, q, o] = [colors[(origin + 1) % 3], colors[(origin + 2) % 3], colors[origin]];

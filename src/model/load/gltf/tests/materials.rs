@@ -37,7 +37,7 @@ fn read_material(source: Value) -> Material {
 }
 
 #[test]
-fn missing_images_are_remarks_and_errors_in_strict_mode() {
+fn missing_images_are_remarks_but_errors_in_strict_mode() {
     let texture = json!({"index": 0});
     let pbr = json!({
         "baseColorFactor": [0.5, 0.25, 0.125, 1.0], "baseColorTexture": texture, "metallicRoughnessTexture": texture,
@@ -62,9 +62,9 @@ fn missing_images_are_remarks_and_errors_in_strict_mode() {
     assert!(message.ends_with("file 'absent.png': expected an existing file, got none (strict mode)"), "{message}");
 }
 
-/// The images of other formats than PNG and JPEG: embedded, as a data URI, and defined by an extension only.
+/// Covers images of other formats than PNG and JPEG: embedded, as a data URI, and defined by an extension only.
 #[test]
-fn other_image_formats_are_remarks_and_errors_in_strict_mode() {
+fn other_image_formats_are_remarks_but_errors_in_strict_mode() {
     let pbr = json!({
         "baseColorFactor": [0.5, 0.25, 0.125, 1.0], "baseColorTexture": {"index": 0}, "metallicFactor": 0.0
     });
@@ -137,7 +137,7 @@ fn vertex_colors_of_all_formats_are_drawn() {
     }
 }
 
-/// One color for all vertices, and the colors of a primitive whose material has an image.
+/// Covers one color for all vertices, and vertex colors in a primitive whose material has an image.
 #[test]
 fn equal_vertex_colors_are_factors_and_images_have_precedence() {
     let with_colors = |mut model: Model, colors: &[f32]| {
@@ -184,12 +184,13 @@ fn metalness_and_roughness_become_phong_parameters() {
     };
     let plastic = material_with_factors(0.0, 0.5);
     assert_eq!((plastic.diffuse, plastic.ambient, plastic.alpha), ([0.8, 0.4, 0.2], [0.8, 0.4, 0.2], 0.5));
-    // alpha^2 = 0.5^4 = 1/16: a peak of 0.04 x 16 / 4 and an exponent of (32 - 2) / 4.
+    // The GGX parameter a = roughness^2 is 1/4, so 1 / a^2 is 16. The peak is 0.04 / (4 a^2) = 0.16, and the exponent
+    // is (2 / a^2 - 2) / 4 = 7.5.
     for channel in plastic.specular {
         assert!((channel - 0.16).abs() <= 1e-6, "{channel}");
     }
     assert!((plastic.shininess - 7.5).abs() <= 1e-5, "{}", plastic.shininess);
-    // alpha^2 = 1: a peak of f / 4 with f = the base color, and an exponent of 0 that is clamped to 1.
+    // With a = 1, the peak is a quarter of the base color, and the exponent is 0, which is clamped to 1.
     let metal = material_with_factors(1.0, 1.0);
     assert_eq!(metal.diffuse, [0.4, 0.2, 0.1]);
     assert_eq!(metal.specular, [0.2, 0.1, 0.05]);
