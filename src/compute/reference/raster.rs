@@ -135,8 +135,8 @@ impl VisibilityBuffer {
 }
 
 /// Key of a sample: the inverted bits of its depth in the upper 32 bits, the triangle in the lower 32 bits. The bits of
-/// non-negative floats have the order of the floats, so the smallest key is nearest. At equal depths, it has the
-/// smallest triangle.
+/// non-negative floats compare as the floats do, so the smallest key has the largest depth, which is the nearest. At
+/// equal depths, the smallest key has the smallest triangle index.
 pub const fn sample_key(depth: f32, triangle: u32) -> u64 {
     (!depth.to_bits() as u64) << 32 | triangle as u64
 }

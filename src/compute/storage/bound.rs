@@ -8,10 +8,10 @@
 //! that underflows. The error of a compensated sum s of k terms is at most e |s| + gamma_k^2 sum|terms| (Ogita, Rump,
 //! Oishi, Accurate Sum and Dot Product, 2005, proposition 5.5), plus 5 k 2^-149.
 //!
-//! A follower is a domain that moves with another domain, its root. Its T is the product T_m F of the root's transform
-//! T_m and the follower's constant frame F. [`ComposedTransform::to_f32`] rounds each entry of T three times. The error
-//! of an entry of the linear part is at most gamma_3 |T_m| |F|. The error of the translation is at most
-//! gamma_3 (|T_m| |f| + |t_m|), where f and t_m are the translations of F and T_m.
+//! A follower is a domain that moves with another domain, its root. Its T is the product T_root F of the root's
+//! transform T_root and the follower's constant frame F. [`ComposedTransform::to_f32`] rounds each entry of T three
+//! times. The error of an entry of the linear part is at most gamma_3 |T_root| |F|. The error of the translation is at
+//! most gamma_3 (|T_root| |f| + |t_root|), where f and t_root are the translations of F and T_root.
 //!
 //! A bound is a length, the maximum error of a vertex position in scene units. It holds for sums without overflow, and
 //! is infinite where q times a factor overflows f32.

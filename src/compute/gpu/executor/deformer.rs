@@ -395,7 +395,7 @@ impl CudaDeformer {
 }
 
 /// The header of a step, without the addresses of its outputs. The kernels compute the domains that changed after
-/// `output_step`. In a full step it is 0, which is before all changes.
+/// `output_step`. In a full step, `output_step` is 0, which is before all changes.
 fn header(target: &StepTarget, list_lengths: Option<ChangeListLengths>, last_full_step: u32) -> StepHeader {
     let lengths = list_lengths.unwrap_or_default();
     StepHeader {

@@ -35,7 +35,7 @@ pub(crate) struct InputAddresses {
 #[derive(Debug)]
 pub struct StepInputs {
     writer: InputWriter,
-    /// Header, transforms, q, and with truncation the numbers and indices of the retained chunks.
+    /// Header, transforms, q, and with truncation the counts and indices of the retained chunks.
     values: DeviceBuffer,
     change_steps: DeviceBuffer,
     transform_links: DeviceBuffer,

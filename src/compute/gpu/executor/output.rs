@@ -1,5 +1,5 @@
-//! Output sets that steps write, and their way to the OpenGL buffers of a drawn step. An output set has positions,
-//! normals and tangents.
+//! Output sets that steps write, and the copy of a drawn step to OpenGL's buffers. An output set has positions, normals
+//! and tangents.
 //!
 //! If OpenGL can import memory of CUDA, the sets are in such memory, and OpenGL copies a set to its buffers at the
 //! beginning of a frame. The host waits for the step before that copy is submitted, and for the copy before a later
@@ -54,7 +54,7 @@ enum GlOutputs {
     Imported(Rc<dyn VertexImporter>),
 }
 
-/// Memory that a step writes. Its attributes have the bytes of the plan.
+/// Memory that a step writes. The plan determines the sizes of its attributes.
 #[derive(Debug)]
 pub(super) struct OutputSet {
     addresses: OutputAddresses,

@@ -72,8 +72,8 @@ pub(super) struct SynchronousLists<'a> {
 }
 
 impl ReadbackPool {
-    /// Starts the copy of the requested positions and normals. Meanwhile `copy_other_lists` fills the other lists. If
-    /// it fails or panics, the copy has ended before this returns.
+    /// Starts the copy of the requested positions and normals. Meanwhile `copy_other_lists` fills the other lists. The
+    /// copy has ended after an error or a panic, also of `copy_other_lists`.
     pub(super) fn start(
         &mut self,
         device: &Device,

@@ -1,5 +1,5 @@
-//! Boxes as the kernels write them: the maxima of -x, -y, -z, x, y, z as integer keys, which have the order of the
-//! numbers.
+//! Boxes as the kernels write them: the maxima of -x, -y, -z, x, y, z as integer keys. Keys compare as the numbers that
+//! they encode.
 
 use nalgebra::Vector3;
 

@@ -6,7 +6,7 @@
 //! ```
 //! A transform root is a domain that follows no other domain; a follower has the transform of its root times a constant
 //! frame. A chunk is a few modes that are stored together. With modal truncation, a domain sums only its retained
-//! chunks; their numbers and indices are uploaded. Without truncation, the last two parts are empty. The pinned memory
+//! chunks; their counts and indices are uploaded. Without truncation, the last two parts are empty. The pinned memory
 //! is write-combined: the host writes it from front to back and never reads it.
 
 use std::sync::Arc;

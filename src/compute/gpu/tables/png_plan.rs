@@ -9,12 +9,12 @@ pub(crate) const TILE_BYTES: u64 = 8192;
 /// Largest content of a stored block, and the bytes before it.
 const MAX_STORED_BYTES: u64 = 65_535;
 const STORED_HEADER_BYTES: u64 = 5;
-/// Bytes of a chunk beside its content.
+/// Bytes of a PNG chunk in addition to its content.
 const CHUNK_BYTES: u64 = 12;
-/// Bytes of a file beside the chunks of its strips: signature, IHDR, sRGB, the header of the zlib stream, its checksum
+/// Bytes of a file outside the chunks of its strips: signature, IHDR, sRGB, the header of the zlib stream, its checksum
 /// in a chunk of its own, and IEND.
 const FRAME_BYTES: u64 = 76;
-/// The checksum of a chunk supports contents below 2^24 bytes. A row of this width has at most 2^22 + 1.
+/// The checksum of a chunk supports contents below 2^24 bytes. A row of this width has at most 2^22 + 1 bytes.
 const MAX_WIDTH: u32 = 1 << 20;
 /// The kernels address the bytes of a file with 32 bits.
 const MAX_FILE_BYTES: u64 = 1 << 30;

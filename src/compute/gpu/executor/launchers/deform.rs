@@ -195,7 +195,7 @@ impl DeformKernel {
         if self.full_step_tiles == 0 {
             return Ok(());
         }
-        // SAFETY: the caller guarantees it.
+        // SAFETY: this function has the same safety conditions.
         unsafe { self.launch_variant(device, inputs, &self.function, self.config) }
     }
 
@@ -214,7 +214,7 @@ impl DeformKernel {
         let missing_function =
             || Error::Fault { stage: "deform", reason: "expected a scene with partial steps".into() };
         let function = self.tile_list_function.as_ref().ok_or_else(missing_function)?;
-        // SAFETY: the caller guarantees it.
+        // SAFETY: this function has the same safety conditions.
         unsafe { self.launch_variant(device, inputs, function, config) }
     }
 
