@@ -16,8 +16,8 @@
 //!
 //! Another thread prepares the deformer of a scene before the scene is loaded: it compiles the kernels and uploads the
 //! tables. The OpenGL buffers of a scene are created by its first output, or, with CUDA, when the scene is loaded.
-//! Before that, its textures are uploaded and its programs compiled in several parts, between which other scenes are
-//! served. Other threads compute the mipmap levels, and if the driver can, compile the programs.
+//! Before the buffers, its textures are uploaded and its programs compiled in several parts, between which other scenes
+//! are served. Other threads compute the mipmap levels, and if the driver can, compile the programs.
 //!
 //! An output whose caller no longer waits ends after its present draw step. On a software renderer, each pass of an
 //! output is a draw step.

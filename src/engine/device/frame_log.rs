@@ -14,8 +14,8 @@ pub(super) struct FrameLog {
 }
 
 impl FrameLog {
-    /// Logs the look of a frame, and that vertices lie below the ground, unless an earlier frame had the same look or
-    /// such vertices. Returns whether the look was logged, and whether the vertices were logged.
+    /// Logs the look of a frame, unless an earlier frame had the same look. Logs that vertices lie below the ground,
+    /// unless this was logged before. Returns whether the look and whether the vertices were logged.
     pub(super) fn record(&mut self, scene: &str, info: &FrameInfo) -> [bool; 2] {
         let new_look = info.look.filter(|look| !self.looks.contains(look));
         if let Some(look) = new_look {

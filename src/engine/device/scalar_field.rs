@@ -128,7 +128,7 @@ mod tests {
         };
         let fitted_max = legend_max(0.0, &displacements);
         // The scale ends at 1, 2, 2.5 or 5 times a power of ten. These ends differ by at most a factor of 2, so the end
-        // is at most 2 times the largest value; 2.5 leaves a margin.
+        // is at most 2 times the largest value. The limit of 2.5 times leaves a margin.
         assert!(fitted_max >= f64::from(max_displacement) && fitted_max <= 2.5 * f64::from(max_displacement));
         assert_eq!(legend_max(3.0, &displacements), 3.0);
         let max_of_rounding_errors = legend_max(0.0, &[1e-9]);

@@ -143,7 +143,7 @@ mod tests {
         }
     }
 
-    /// Two parts that each wait for the other end only on two threads.
+    /// Two parts that wait for each other finish only if each runs on its own thread.
     #[tokio::test]
     async fn parts_of_one_job_run_in_parallel() {
         let pool = EncoderPool::new(2).expect("expected threads");

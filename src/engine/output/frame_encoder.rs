@@ -33,8 +33,8 @@ pub struct EncodedOutput {
 #[derive(Debug, Clone)]
 pub struct FrameEncoder {
     pool: EncoderPool,
-    /// One permit per picture in the pool, and as many permits as threads. A further picture waits for a permit, in the
-    /// order of the requests.
+    /// Each picture in the pool holds a permit, and there are as many permits as threads. A further picture waits for a
+    /// permit, in the order of the requests.
     picture_permits: Arc<Semaphore>,
     cores: usize,
 }

@@ -60,7 +60,7 @@ impl RenderedPicture {
         }
     }
 
-    /// The encoding in a format, which the caller computes if it is empty.
+    /// The cell for the encoding in a format. The caller encodes the picture if the cell is empty.
     pub(super) fn encoding(&self, format: FrameFormat) -> SharedEncoding {
         let mut encodings = lock(&self.encodings);
         if let Some((_, encoding)) = encodings.iter().find(|(encoded_format, _)| *encoded_format == format) {

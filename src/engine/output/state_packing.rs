@@ -52,7 +52,7 @@ pub struct PackedState {
 }
 
 /// Packs the domains whose coordinates or transforms differ in any bit from `previous`, the state that the client has.
-/// Packs all domains if there is none.
+/// Packs all domains if there is no previous state.
 ///
 /// # Errors
 /// `Fault` when `output` is not a state.

@@ -44,7 +44,7 @@ impl StepVertices {
         Self { surface, packed_sections: Mutex::default() }
     }
 
-    /// A section, which the caller packs if it is empty.
+    /// The cell for a packed section. The caller packs the section if the cell is empty.
     pub(super) fn packed_section(&self, key: SectionKey) -> SharedSection {
         let mut packed_sections = lock(&self.packed_sections);
         if let Some((_, section)) = packed_sections.iter().find(|(packed_key, _)| *packed_key == key) {

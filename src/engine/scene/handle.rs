@@ -226,7 +226,7 @@ impl SceneHandle {
         self.forces.get_or_init(Arc::default)
     }
 
-    /// A receiver of the state of every completed step, and before the first one of the present state.
+    /// A receiver of the state of every completed step. Its initial value is the present state.
     pub(super) fn watch_state(&self) -> watch::Receiver<Arc<SceneState>> {
         self.current_state.clone()
     }

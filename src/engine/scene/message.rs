@@ -17,7 +17,7 @@ pub enum StepSelector {
         run: u64,
         number: u64,
     },
-    /// The current step, as soon as it is this one or a later one.
+    /// The first current step that has at least this run and number.
     Minimum {
         run: u64,
         number: u64,

@@ -30,8 +30,8 @@ pub(super) struct DeliveryMode {
     /// A lossless subscriber without a credit, which permits one result, blocks the writer. It is disconnected after
     /// `Config::stall_timeout`.
     pub applies_back_pressure: bool,
-    /// Whether another step is queued. If so, readbacks of vertices are only started now, and are delivered while the
-    /// queued step is computed. Readbacks of frames are only started in any case.
+    /// Whether another step is queued. If so, readbacks of vertices are started without waiting for them, and are
+    /// delivered while the queued step is computed. Readbacks of frames are started in this way in any case.
     pub overlaps_next_step: bool,
 }
 
