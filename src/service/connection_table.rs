@@ -124,9 +124,9 @@ impl ConnectionTable {
         lock(&self.state).evict(self.max_new())
     }
 
-    /// Number of connections without a request that are not closed while others are idle. Without this number, each
-    /// connection of a client that connects repeatedly would close a new one of another client before its first request
-    /// arrives.
+    /// Number of connections without a request that are not closed while others are idle. Without this number, a client
+    /// that connects repeatedly would cause each new connection of other clients to be closed before the first request
+    /// of that connection arrives.
     const fn max_new(&self) -> usize {
         self.max_connections / 8
     }

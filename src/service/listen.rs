@@ -111,7 +111,7 @@ impl Listener {
         self.addresses.iter().copied().filter(|address| !address.ip().is_loopback())
     }
 
-    /// The URLs of the viewer for browsers on this machine, in the order of the addresses. None if the viewer is off.
+    /// The URLs of the viewer for browsers on this machine, in the order of the addresses. Empty if the viewer is off.
     pub fn viewer_urls(&self) -> Vec<String> {
         let Some(path) = self.viewer_url_path() else { return Vec::new() };
         self.local_urls().into_iter().map(|url| url + &path).collect()

@@ -65,7 +65,7 @@ impl ReplyMemory {
         self.free_slots.acquire().await.ok()?.forget();
         let slot = lock(&self.slots).free.pop()?;
         self.write(slot as usize, data);
-        // Not earlier, because a client could guess the slot and return it during the copy.
+        // Mark the slot after the copy, because a client could otherwise guess the slot and return it during the copy.
         *lock(&self.slots).is_lent.get_mut(slot as usize)? = true;
         Some(v1::SharedRange { slot, bytes: std::mem::take(data).len() as u32 })
     }

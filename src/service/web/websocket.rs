@@ -147,7 +147,7 @@ pub(super) async fn serve_websocket(
             () = evicted => Some(CloseReason::evicted()),
         };
         if reason == Some(CloseReason::going_away()) {
-            // The last messages of the calls.
+            // Write the last messages of the calls.
             tokio::time::timeout(GOAWAY_TIMEOUT, write).await.ok();
         }
         reason
@@ -202,7 +202,7 @@ struct Calls {
     routes: Routes,
     info: ConnectionInfo,
     outgoing: mpsc::Sender<Outgoing>,
-    /// Calls whose status is not queued, and some that have ended.
+    /// Calls whose status is not queued yet, and ended calls that are not removed yet.
     open: HashMap<u32, OpenCall>,
     tasks: JoinSet<()>,
     permits: Arc<Semaphore>,
