@@ -9,7 +9,7 @@ use modalcast_model::scene::{Scene, StorageType};
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Operand {
     pub name: &'static str,
-    /// Formula of the bytes. The letters are numbers: n of vertices, f of triangles, c of corners, r of modes, d of
+    /// Formula of the bytes. The letters are counts: n of vertices, f of triangles, c of corners, r of modes, d of
     /// domains, Q of quads (four consecutive vertices), C of chunks of stored U, K of modes per chunk (as many as fit
     /// in 4 bytes per row of U) and `tiles` of tiles of stored U (up to 32 quads each).
     pub formula: &'static str,

@@ -68,8 +68,8 @@ impl WorkloadMotion {
     }
 
     /// The random state of a seed: Gaussian coordinates and small rigid motions. With odd seeds, the terms of U q
-    /// nearly cancel, which amplifies rounding errors: in all rows of U if the workload has cancelling mode pairs,
-    /// otherwise in one random row per domain.
+    /// nearly cancel in all rows of U if the workload has cancelling mode pairs, otherwise in one random row per
+    /// domain. Cancellation amplifies rounding errors.
     pub fn random_state(&self, seed: usize) -> ExactState {
         // The odd multiplier is 2^64 divided by the golden ratio. It turns consecutive seeds into distant ones.
         let mut rng = Rng::with_seed(0x5EED ^ (seed as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15));

@@ -168,9 +168,8 @@ impl<'a> StateSample<'a> {
 /// takes at most 2^24 x 112 bytes = 1.9 GB.
 const MAX_GROUP_ITEMS: usize = 1 << 24;
 
-/// Validates the variants at `seeds` random states, at least one, and at no more than `steps` states of the trajectory,
-/// at every vertex and corner. The reference values are computed once for all variants, in parallel over several
-/// states.
+/// Validates the variants at every vertex and corner of `seeds` random states (at least one) and of at most `steps`
+/// states of the trajectory. The reference values are computed once for all variants, in parallel over several states.
 pub fn validate(
     workload: &Workload,
     motion: &WorkloadMotion,

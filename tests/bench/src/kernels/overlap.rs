@@ -193,7 +193,7 @@ fn run_overlapped(
     Ok(())
 }
 
-/// [`Overlap::differing`].
+/// Computes [`Overlap::differing`].
 fn count_differing_steps(deformer: &mut CudaDeformer, states: &[SceneState], steps: usize) -> Result<usize> {
     let mut want = Vec::new();
     run_serial(deformer, states, states.len(), &mut |_, surface| want.push(surface.clone()))?;
@@ -285,8 +285,8 @@ pub struct HostWrite {
     pub on_all_cores: bool,
 }
 
-/// Times host writes of 64 KiB to 64 MiB, in powers of two. The times show from which size on all cores are faster than
-/// one.
+/// Times host writes of 64 KiB to 64 MiB, in powers of two, on one core and on all cores. The times show the smallest
+/// size for which all cores are faster than one core.
 ///
 /// # Errors
 /// `Invalid` when `replays` is 0; `Fault` when the driver cannot allocate memory.

@@ -32,7 +32,7 @@ use modalcast_render::{FrameParams, SceneBuffers};
 pub struct PlantResult {
     pub load: String,
     pub thesis: ThesisPlant,
-    /// Whether the plant has the size of its row in table 4.5. The results are comparable only if it has.
+    /// Whether the plant has the size of its row in table 4.5. Only then are the results comparable.
     #[serde(rename = "full")]
     pub is_full_size: bool,
     /// How the plant differs from its row in table 4.5.

@@ -208,7 +208,7 @@ mod tests {
         for (index, plant) in PLANTS.iter().enumerate() {
             let workload = build_plant(index, Size::Quick).expect("a plant");
             assert!(count_contents(&workload).iter().all(|count| *count > 0), "{}", workload.name);
-            // Less than a sixth of the rows / 3 vertices that the branches of a full plant have.
+            // The branches of a full plant have rows / 3 vertices. The limit is less than a sixth of this number.
             assert!(workload.scene.layout.vertices <= plant.rows / 20, "{}", workload.name);
             assert!(workload.remarks.iter().any(|remark| remark.contains("quick")), "{:?}", workload.remarks);
         }

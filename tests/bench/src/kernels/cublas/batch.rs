@@ -32,7 +32,7 @@ pub enum CublasMethod {
 }
 
 impl CublasMethod {
-    /// All variants.
+    /// All methods.
     pub const ALL: [Self; 8] = [
         Self::SgemvColumns,
         Self::SgemvRows,

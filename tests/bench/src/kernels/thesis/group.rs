@@ -36,7 +36,7 @@ pub enum KernelSplit {
 }
 
 impl KernelSplit {
-    /// All variants.
+    /// All splits.
     pub const ALL: [Self; 3] = [Self::One, Self::Two, Self::Four];
 
     /// The group widths w_g, one per kernel.
