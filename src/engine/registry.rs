@@ -40,6 +40,7 @@ pub(super) struct RegistryEntry {
     client: Option<ClientId>,
     /// Whether the scene has a place beyond the limit, which each built-in scene has once.
     has_extra_place: bool,
+    /// Empty until the scene is loaded.
     cell: OnceCell<Arc<SceneHandle>>,
     /// Number of concurrent openings; modified only under the registry's lock.
     open_calls: AtomicUsize,

@@ -52,6 +52,7 @@ struct ConnectionState {
 #[derive(Debug, Default)]
 struct Evictions {
     count: AtomicU64,
+    /// Wakes those that wait for an eviction.
     changed: Arc<Notify>,
 }
 

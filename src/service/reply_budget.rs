@@ -93,7 +93,9 @@ struct Progress {
 pub(super) struct UnsentBytes {
     call: Arc<CallReplies>,
     bytes: usize,
+    /// What these bytes take from the budget of the connection.
     of_connection: OwnedSemaphorePermit,
+    /// What these bytes take from the budget of all connections.
     of_total: OwnedSemaphorePermit,
 }
 
@@ -102,6 +104,7 @@ pub(super) struct UnsentBytes {
 struct Registry<T> {
     objects: Mutex<HashMap<u64, Weak<T>>>,
     next_id: AtomicU64,
+    /// When [`Self::search`] last returned the objects.
     last_search: Mutex<Instant>,
 }
 

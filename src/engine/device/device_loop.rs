@@ -104,6 +104,7 @@ struct FrameInFlight {
 struct PendingVertices {
     id: SceneId,
     readback: VertexReadback,
+    /// When the readback was started.
     start: Instant,
 }
 

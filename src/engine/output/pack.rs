@@ -37,7 +37,9 @@ const VECTOR_BYTES: usize = VECTOR_NUMBERS * size_of::<f32>();
 pub struct Section {
     pub attribute: Attribute,
     pub encoding: Encoding,
+    /// Position of the first byte among the bytes of the step.
     pub offset: u64,
+    /// Number of bytes.
     pub bytes: u64,
 }
 

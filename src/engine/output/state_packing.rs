@@ -31,7 +31,9 @@ pub enum StateContent {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct StateSection {
     pub content: StateContent,
+    /// Position of the first byte in `PackedState::bytes`.
     pub offset: u64,
+    /// Number of bytes.
     pub bytes: u64,
 }
 

@@ -56,6 +56,7 @@ pub(super) struct DeliveryRound<'a> {
     pub(super) attributes: VertexAttributes,
     /// Whether the round ends by starting one copy of `attributes` for all `vertex_recipients`.
     pub(super) starts_shared_copy: bool,
+    /// The subscribers that wait for that copy.
     pub(super) vertex_recipients: Vec<Recipient>,
     /// Pictures that this round started and that are in flight, oldest first; at most [`MAX_FRAMES_IN_FLIGHT`].
     pub(super) started_pictures: VecDeque<PendingReadback>,

@@ -37,7 +37,9 @@ pub struct RawStepUpdate {
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct CoordinateSpan {
     domain: u32,
+    /// Index in `StepUpdate::values` of the first coordinate.
     first: usize,
+    /// Number of coordinates, one per mode of the domain.
     rank: usize,
 }
 

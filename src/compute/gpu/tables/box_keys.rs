@@ -88,7 +88,7 @@ mod tests {
     }
 
     #[test]
-    fn keys_have_the_order_of_numbers() {
+    fn keys_compare_as_their_numbers() {
         let ascending = [f32::NEG_INFINITY, -1e30, -1.0, -1e-45, -0.0, 0.0, 1e-45, 2.5, f32::MAX, f32::INFINITY];
         for pair in ascending.windows(2) {
             assert!(float_to_ordered(pair[0]) < float_to_ordered(pair[1]), "{pair:?}");

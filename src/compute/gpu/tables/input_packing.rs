@@ -49,6 +49,7 @@ pub(crate) struct InputSizes {
     pub transforms: u64,
     pub q: u64,
     pub retained_counts: u64,
+    /// The indices of the retained chunks.
     pub retained: u64,
 }
 

@@ -24,6 +24,7 @@ pub(super) struct Leaf {
     pub(super) node: i64,
     /// Number of the petiole at the node.
     pub(super) petiole: i64,
+    /// Point where the leaf or leaflet begins, in scene units.
     pub(super) base: [f64; 3],
     #[serde(default)]
     pub(super) petiole_vertices: Option<Vec<[f64; 3]>>,
