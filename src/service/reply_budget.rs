@@ -24,8 +24,8 @@ use crate::config::Config;
 use crate::engine::lock;
 use modalcast_model::error::Error;
 
-/// A connection with unsent bytes of an ended call is closed after this multiple of the reply timeout if others wait,
-/// even if another of its calls makes progress.
+/// After this multiple of the reply timeout, a connection with unsent bytes of an ended call is closed if other senders
+/// wait, even if another call of the connection makes progress.
 const MAX_STALL: u32 = 3;
 
 /// How often a sender that waits for the total searches for connections to close.
@@ -301,10 +301,10 @@ impl CallReplies {
     }
 }
 
-/// Ends the calls whose clients have taken nothing for `timeout`. If all of them were ended before, their remaining
-/// bytes are buffers of HTTP/2, which only the end of the connection frees, so their connections are closed. While
-/// another call of the connection holds bytes, which it may still send or release, the connection is closed only after
-/// `max_stall`; `None` means never.
+/// Ends the calls whose clients have taken nothing for `timeout`. If all these calls were ended earlier, the bytes that
+/// they still hold are buffers of HTTP/2, which only the end of the connection frees, so their connections are closed.
+/// While another call of the connection holds bytes, which it may still send or release, the connection is closed only
+/// after `max_stall`; `None` means never.
 fn end_stalled(calls: &[Arc<CallReplies>], timeout: Duration, max_stall: Option<Duration>) {
     let is_stalled = |call: &&Arc<CallReplies>| {
         let progress = lock(&call.progress);

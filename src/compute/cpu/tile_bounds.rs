@@ -69,8 +69,8 @@ impl TileBounds {
         tile_bounds.par_iter().with_min_len(4096).copied().reduce(|| Self::EMPTY, Self::union).to_bounds()
     }
 
-    /// Bounds of a scene along these axes. They enclose the boxes of its tiles, so they may exceed those of the
-    /// positions.
+    /// Bounds of a scene along `axes`. They enclose the boxes of the tiles, so they may be larger than the bounds of
+    /// the positions.
     pub(super) fn of_scene_along(tile_bounds: &[Self], axes: &[Vector3<f64>; 3]) -> OrientedBounds {
         let bounds_of_tile = |tile_bounds: &Self| OrientedBounds::enclosing(axes, &tile_bounds.to_bounds());
         tile_bounds

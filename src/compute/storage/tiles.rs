@@ -48,9 +48,9 @@ pub struct TiledModes {
 impl TiledModes {
     /// Rounds a shape's U to the storage type.
     ///
-    /// Before the rounding, `F16` and `Bf16` divide each mode by a power of two (its factor), so that its largest entry
-    /// lies in [2^14, 2^15) or in [1, 2). `Int8` divides each mode of each tile by its scale, which is 1/127 of the
-    /// largest entry, rounded up.
+    /// Before the rounding, `F16` and `Bf16` divide each mode by a power of two (its factor), so that the largest entry
+    /// of the mode lies in [2^14, 2^15) for `F16` and in [1, 2) for `Bf16`. `Int8` divides each mode of each tile by a
+    /// scale, which is 1/127 of the largest entry of this mode in the tile, rounded up.
     pub fn new(shape: &Shape, storage: StorageType) -> Self {
         let rest = shape.mesh.rest_positions();
         let rank = shape.modes.rank();

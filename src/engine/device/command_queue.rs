@@ -51,8 +51,7 @@ impl CommandQueue {
         Arc::new(Self { state: Mutex::new(state), changed: Condvar::new() })
     }
 
-    /// Queues a command. If its caller may cancel it, returns a guard that removes the command from the queue when it
-    /// is dropped.
+    /// Queues a command. If the command can be canceled, returns a guard, whose drop removes it from the queue.
     ///
     /// # Errors
     /// `Busy` when the scene has too many queued commands; `None` when the queue is closed.

@@ -34,9 +34,9 @@ impl TransformRoots {
     /// Frame index of a domain that follows no other.
     pub const NO_FRAME: u32 = u32::MAX;
 
-    /// Flattens chains of followers to their roots, and sets the placement of each follower to its root's placement
-    /// times its frame. The caller has checked that every parent precedes its children. Products of frames are computed
-    /// in f64 and rounded once.
+    /// Flattens chains of followers to their roots, and sets each follower's placement to the root's placement times
+    /// the follower's frame. The caller has checked that every parent precedes its children. Products of frames are
+    /// computed in f64 and rounded once.
     ///
     /// # Errors
     /// `Invalid` with the domain whose frame or placement exceeds the range of f32.

@@ -142,7 +142,7 @@ pub(super) fn element_matrices(
 
 /// The consistent mass matrix m N^T N of a point mass of `mass` kg on the centerline, at a fraction of the element. N
 /// is the 3 x 12 matrix of shape functions, which gives the displacement at the mass. Shares of the mass at the two
-/// nodes would overestimate its kinetic energy, because bending moves a point between them less than their mean.
+/// nodes would overestimate the kinetic energy, because bending moves a point between the nodes less than their mean.
 pub(super) fn point_mass_matrix(from: &Vector3<f64>, to: &Vector3<f64>, fraction: f64, mass: f64) -> Matrix12 {
     let mut shape_functions = SMatrix::<f64, 3, 12>::zeros();
     (shape_functions[(0, 0)], shape_functions[(0, 6)]) = (1.0 - fraction, fraction);

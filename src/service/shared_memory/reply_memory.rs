@@ -19,8 +19,8 @@ pub(super) const SLOT_BYTES: usize = 1 << 20;
 /// slow client would only read steps that are further out of date.
 pub(super) const SLOT_COUNT: usize = 8;
 
-/// Data of at least this size are put into a slot. For fewer bytes, sending them costs less than copying them to a slot
-/// and returning it.
+/// Data of at least this size are put into a slot. Sending fewer bytes costs less than copying them to a slot and
+/// returning the slot.
 const MIN_SHARED_BYTES: usize = 64 << 10;
 
 /// The slots of a connection. The memory is freed when this is dropped.
@@ -75,8 +75,8 @@ impl ReplyMemory {
         let bytes = data.len().min(SLOT_BYTES);
         // SAFETY: `slot` comes from the list of free slots, so it is below SLOT_COUNT and its SLOT_BYTES are within the
         // mapping, which lives as long as `self`. No other thread writes to the slot: it is in no list, and `take_back`
-        // does not accept it before this copy has ended. This process never reads the mapping and never refers to it by
-        // a reference, and `data` is no part of it.
+        // does not accept it before this copy has ended. This process never reads the mapping, and has no reference to
+        // the mapping's bytes: `data` is other memory.
         unsafe {
             let target = self.mapping.as_mut_ptr().add(slot * SLOT_BYTES);
             std::ptr::copy_nonoverlapping(data.as_ptr(), target, bytes);

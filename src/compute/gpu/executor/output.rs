@@ -188,7 +188,7 @@ impl RegisteredOutputs {
             submit_step()?;
             for ((source, bytes), target) in set.attributes().zip(targets) {
                 // SAFETY: the mapping checks that the target has the bytes of the plan, which are those of the source.
-                // The deformer owns both, and waits for its stream before it drops them. The buffers do not overlap.
+                // The deformer owns both, which do not overlap, and waits for the device's stream before it drops them.
                 unsafe { result::memcpy_dtod_async(*target, source, bytes as usize, device.stream().cu_stream()) }
                     .map_err(cuda_error("interop"))?;
             }

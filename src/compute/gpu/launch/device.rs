@@ -54,8 +54,8 @@ impl Device {
         Ok(Arc::new(Self { context, stream, name, ordinal, capability }))
     }
 
-    /// The same device with another stream. Its work runs concurrently with that of this device, so a thread can upload
-    /// a scene while another thread captures or launches the steps of other scenes.
+    /// The same device with another stream. Work on the two streams runs concurrently, so a thread can upload a scene
+    /// while another thread captures or launches the steps of other scenes.
     ///
     /// # Errors
     /// `Fault` when the driver refuses a stream.

@@ -329,7 +329,7 @@ impl ManifestAssembler<'_> {
             self.domain_by_name.insert(domain.name.clone(), index);
         }
         if let (Some(name), false) = (&entry.name, has_one_domain) {
-            // If a later entry has this name as its `parent`, the name denotes the first domain of this entry.
+            // As the `parent` of a later entry, the name of this entry denotes its first domain.
             self.domain_by_name.entry(name.clone()).or_insert(self.parts.domains.len());
         }
         Ok(())

@@ -1,6 +1,6 @@
 //! Compares the server with a program that a user could write in an afternoon: `tests/bench/peers/afternoon.py`, which
-//! deforms with cupy or numpy, draws with moderngl, encodes with OpenCV and sends through ZeroMQ. It gets the arrays of
-//! the same scene and a recorded motion, so unlike the server it has no physics process beside it.
+//! deforms with cupy or numpy, draws with moderngl, encodes with OpenCV and sends through ZeroMQ. The program gets the
+//! arrays of the same scene and a recorded motion, so unlike the server it has no physics process beside it.
 
 use std::ffi::OsString;
 use std::path::Path;

@@ -143,8 +143,8 @@ pub(super) fn measure(
     })
 }
 
-/// Steps of a run. Steps without pictures are fast, so such a run has more of them, and its start and its end are a
-/// small part of it.
+/// Steps of a run. Steps without pictures are fast, so a run without pictures has more steps. Otherwise its start and
+/// its end would be a large part of its time.
 pub(super) fn steps_of_run(content: Option<Content>, options: &StreamReportOptions) -> u64 {
     if content.is_some_and(Content::is_picture) { options.steps } else { 4 * options.steps }
 }

@@ -97,8 +97,8 @@ impl PendingPng {
 
 impl AsRef<[u8]> for EncodedPng {
     fn as_ref(&self) -> &[u8] {
-        // SAFETY: the slot has `bytes` initialized bytes at its address. The encoder writes to a slot only while it has
-        // the only reference to it, and the encoding of this file is complete.
+        // SAFETY: the slot has `bytes` initialized bytes at its address, because the encoding of this file is complete.
+        // The encoder writes to a slot only while nobody else has a reference to the slot, and `self` has one.
         unsafe { std::slice::from_raw_parts(self.slot.address as *const u8, self.bytes) }
     }
 }

@@ -10,12 +10,12 @@ use modalcast_model::scene::Scene;
 /// Maximum number of domains of a group.
 pub(crate) const MAX_BATCH_SIZE: usize = 16;
 
-/// With `BatchPolicy::Auto`, the domains of a shape are deformed in batches when its U has at least this many bytes,
-/// about a third of the L2 cache of a large device. On an H200, `batch` and `deform` took the same time for two domains
-/// with a U of 20 MB.
+/// With `BatchPolicy::Auto`, the domains of a shape are deformed in batches when the shape's U has at least this many
+/// bytes, about a third of the L2 cache of a large device. On an H200, `batch` and `deform` took the same time for two
+/// domains with a U of 20 MB.
 const MIN_SHAPE_BYTES: u64 = 16 << 20;
 /// With `BatchPolicy::Auto`, the domains of a shape are also deformed in batches when `deform` would read at least this
-/// many bytes of U for all of them. Below both limits, `deform` is faster: it reads U from the L2 cache for each
+/// many bytes of U for all these domains. Below both limits, `deform` is faster: it reads U from the L2 cache for each
 /// further domain, whereas a batch uses few warps for a long time. On an H200, `batch` and `deform` took the same time
 /// at about 100 MB for shapes of 16,000 vertices.
 const MIN_READ_BYTES: u64 = 128 << 20;

@@ -99,7 +99,7 @@ impl CublasLibrary {
 
     /// Whether cudarc resolves its functions in this library. cudarc tries a list of library names. The system's loader
     /// identifies a loaded library by its `SONAME`, so cudarc gets this library, unless the search path has a library
-    /// with a name that is earlier in the list.
+    /// whose name is earlier in cudarc's list.
     fn is_used_by_cudarc(&self) -> bool {
         // SAFETY: as in `open`.
         if !unsafe { sys::is_culib_present() } {

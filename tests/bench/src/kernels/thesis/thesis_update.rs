@@ -55,8 +55,8 @@ unsafe impl DeviceRepr for UpdateArgs {}
 /// The vertices of unfolded triangles: three per triangle, without sharing.
 #[derive(Debug, Default)]
 struct UnfoldedTriangles {
-    /// Per warp: its first domain, its second domain, the index from 0 to 7 of its first vertex in the second domain (8
-    /// if there is none), and 0.
+    /// Per warp: its first domain, its second domain, the index (0 to 7) of the warp's first vertex that is one of the
+    /// second domain (8 if there is none), and 0.
     warps: Vec<[u32; 4]>,
     /// Index into u of each vertex, or [`RIGID`].
     sources: Vec<u32>,
