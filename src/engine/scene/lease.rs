@@ -69,13 +69,13 @@ pub struct LeaseRequest {
     pub window: u32,
     /// `None` asks for a new token.
     pub token: Option<LeaseToken>,
-    /// Whether the writer replaces a present writer that has another token.
+    /// Whether the writer replaces a connected writer that has another token.
     pub takes_over: bool,
     /// `None` means [`InitialState::Keep`] if the token is that of the last writer, otherwise [`InitialState::Reset`].
     pub initial_state: Option<InitialState>,
 }
 
-/// The writer's lease on a scene. Dropping it closes the queue and admits the next writer. A reply that carries the
+/// The writer's lease on a scene. Dropping it closes `step_queue` and admits the next writer. A reply that carries the
 /// lease is dropped if the client has disconnected, which also releases the lease.
 #[derive(Debug)]
 pub(in crate::engine) struct WriterLease {
@@ -88,7 +88,7 @@ impl Drop for WriterLease {
     }
 }
 
-/// The writer lease, its token, and the run that it begins.
+/// The writer lease, its token, and the run of steps that begins with it.
 #[derive(Debug)]
 pub(super) struct AcquiredLease {
     pub lease: WriterLease,

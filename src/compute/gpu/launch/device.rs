@@ -15,7 +15,7 @@ const MIN_DRIVER_VERSION: i32 = 12_000;
 
 /// A CUDA device. One stream orders all work, except readbacks of vertices and the preparation of deformers. Readbacks
 /// have a second stream, and events order the work of the two streams. Each preparation has a stream of its own, and
-/// waits for its end.
+/// waits for the end of the work of that stream.
 #[derive(Debug)]
 pub struct Device {
     context: Arc<CudaContext>,

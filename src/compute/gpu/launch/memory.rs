@@ -45,7 +45,7 @@ impl DeviceBuffer {
     }
 
     /// Copies `list` to the buffer at `byte_offset` and waits for the copy, because the driver may read pageable memory
-    /// after it returns. The caller may then free or change the list.
+    /// after its own call has returned. The caller may free or change the list when this method returns.
     ///
     /// # Errors
     /// `Fault` when the range exceeds the buffer, or when the device fails.

@@ -10,7 +10,7 @@ use super::layout::Change;
 use modalcast_model::scene::{Scene, SceneState};
 
 /// A partial step changes at most 1 / `MAX_CHANGED_DIVISOR` of the domains. With more changes, a full step is faster,
-/// which copies the values of all domains.
+/// although it copies the values of all domains.
 const MAX_CHANGED_DIVISOR: usize = 4;
 
 /// Lengths of the lists of a step.
