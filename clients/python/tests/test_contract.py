@@ -183,5 +183,5 @@ def test_every_call_and_message_of_the_contract_is_used(
         return {message.full_name for message in messages.values()}
 
     expected_messages = set[str]().union(*(names(dict(file.message_types_by_name)) for file in FILES))
-    # This client does not use shared memory.
-    assert expected_messages - recorder.messages == {"modalcast.v1.SharedRange"}
+    # This client does not use shared memory, and no scene of the server fails.
+    assert expected_messages - recorder.messages == {"modalcast.v1.SharedRange", "modalcast.v1.FailedScene"}
