@@ -1,5 +1,5 @@
-//! Computes the hash of all sources for the build scripts of `modalcast` and of the programs that it starts, so that it
-//! can check that they were built from the same sources.
+//! Computes the hash of all sources. The build scripts of `modalcast` and of the programs that it starts store this
+//! hash in their programs, and `modalcast` starts only programs with its own hash.
 
 use std::fs;
 use std::path::{Path, PathBuf};

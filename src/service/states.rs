@@ -1,5 +1,5 @@
-//! `StateService`: q and transforms of one step with a deadline, or of the steps of a stream. A state is sent in
-//! chunks, the first of which has a head that lists the sections of the state.
+//! `StateService`: sends q and transforms, either of one step or of every step of a stream. A state is sent in chunks,
+//! the first of which has a head that lists the sections of the state.
 
 use std::sync::Arc;
 
@@ -78,21 +78,22 @@ impl StateStream {
     ) -> Result<(), Status> {
         let to_response = |part| v1::StreamStatesResponse { part: Some(part) };
         reply_sender.send(to_response(Part::Settings(self.settings))).await?;
-        let (mut sent_states, mut sent_state) = (0, None);
-        while self.settings.steps == 0 || sent_states < self.settings.steps {
+        let mut sent_count = 0;
+        let mut previous_state = None;
+        while self.settings.steps == 0 || sent_count < self.settings.steps {
             let output = tokio::select! {
                 output = subscription.next() => output.map_err(to_status)?,
                 () = reply_sender.closed() => return Ok(()),
             };
-            let packed = pack_state(output, &self.scene, sent_state).await.map_err(to_status)?;
+            let packed = pack_state(output, &self.scene, previous_state).await.map_err(to_status)?;
             for chunk in state_chunks(&packed, self.max_chunk_bytes) {
                 tokio::select! {
                     sent = reply_sender.send(to_response(Part::Chunk(chunk))) => sent?,
                     error = subscription.disconnected() => return Err(to_status(error)),
                 }
             }
-            sent_state = Some(packed.state);
-            sent_states += 1;
+            previous_state = Some(packed.state);
+            sent_count += 1;
         }
         Ok(())
     }

@@ -156,7 +156,7 @@ async fn viewer_can_be_turned_off() {
     assert!(!info.get_ref().features().any(|feature| feature == v1::Feature::Viewer));
 }
 
-/// Connections with slow heads, large heads or unread bodies are closed. Meanwhile, other clients are served.
+/// Connections with slow, unfinished or large heads are closed. Afterwards, another client is served.
 #[tokio::test(flavor = "multi_thread")]
 async fn slow_and_large_requests_are_closed() {
     let server = start_server(|config| Config { handshake_timeout: Duration::from_millis(300), ..config }).await;

@@ -175,8 +175,9 @@ impl ReducedForce {
 /// Checks that a block of monomials of one degree is the gradient of a potential. Without a potential, the stiffness is
 /// asymmetric and the motion can gain energy without limit.
 ///
-/// The coefficient v of a monomial M of the potential appears in the force component a of every coordinate q_a in M:
-/// there, M / q_a has the coefficient v times the exponent of q_a in M.
+/// A monomial v M of the potential appears in the force component of each coordinate q_a that M contains: the component
+/// has the monomial M / q_a with the coefficient v times the exponent of q_a in M. For example, v q_0^2 q_1 gives
+/// 2 v q_0 q_1 in component 0 and v q_0^2 in component 1.
 fn check_gradient(field: &str, rank: usize, degree: usize, block: &[f64]) -> Result<()> {
     let monomials = list_monomials(rank, degree);
     let tolerance = GRADIENT_TOLERANCE * block.iter().fold(0.0, |largest: f64, entry| largest.max(entry.abs()));
@@ -199,7 +200,7 @@ fn check_gradient(field: &str, rank: usize, degree: usize, block: &[f64]) -> Res
             if (expected - given).abs() > tolerance {
                 let field = format!("{field}, component {component}, monomial {monomial:?}");
                 let expected = format!(
-                    "the gradient of a potential: {expected:e} as in component {}, both divided by the exponent",
+                    "forces of a potential (its coefficient is {expected:e} by component {})",
                     potential_monomial[0]
                 );
                 return Err(invalid_input(field, expected, format!("{given:e}")));
@@ -341,7 +342,7 @@ pub(crate) mod tests {
             let asymmetry = jacobian_errors(&invalid_force, &random_vector(1, 4)).asymmetry;
             assert!(asymmetry > 1e-5, "expected an asymmetric Jacobian, got the asymmetry {asymmetry}");
             let error = parse(&invalid_force).expect_err("a force without potential").to_string();
-            assert!(error.starts_with(field) && error.contains("gradient of a potential"), "{error}");
+            assert!(error.starts_with(field) && error.contains("forces of a potential"), "{error}");
         }
         // Rounding errors of an exporter.
         let mut rounded = force;

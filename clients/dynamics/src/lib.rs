@@ -32,7 +32,8 @@
 //! async fn main() -> Result<(), Box<dyn std::error::Error>> {
 //!     let client = Client::connect("http://127.0.0.1:50051").await?; // `modalcast serve`
 //!     let scene = client.open_scene("tree", "").await?.scene;
-//!     let model = Model::fetch(&client, &scene, 24).await?;
+//!     let surface_samples = 24; // per domain, at most
+//!     let model = Model::fetch(&client, &scene, surface_samples).await?;
 //!     let mut drive = client.drive(&DriveRequest::new(&scene, Delivery::Lossless)).await?;
 //!     for number in 0..12 {
 //!         let time = number as f64 / 12.0;

@@ -6,7 +6,7 @@ use crate::model::{DomainModel, Model};
 /// Damping ratio of domains without a note `damping_ratio`.
 const DEFAULT_DAMPING_RATIO: f64 = 0.03;
 
-/// Largest damping ratio. It is 1 for critical damping.
+/// Largest accepted damping ratio. A ratio of 1 is critical damping.
 const MAX_DAMPING_RATIO: f64 = 1000.0;
 
 /// Largest magnitude of an eigenvalue that counts as 0, as a fraction of the largest eigenvalue of its domain. Solvers
@@ -102,7 +102,7 @@ fn read_damping_ratio(domain: &DomainModel) -> Result<f64> {
     })
 }
 
-/// A remark on some modes, with the names of their domains and the numbers of these modes. `None` without modes.
+/// A remark on some modes, with the name of each domain and the number of its modes. `None` without modes.
 fn describe_modes(subject: &str, modes: &[(&str, usize)]) -> Option<String> {
     let count: usize = modes.iter().map(|(_, count)| count).sum();
     let mut names: Vec<String> =

@@ -80,7 +80,7 @@ pub struct RunOptions {
     /// Seconds per step.
     pub dt: f64,
     pub delivery: Delivery,
-    /// Maximum number of steps in flight. 0 selects the server's default.
+    /// Maximum number of steps in flight. `None` and 0 select the server's default.
     pub window: Option<u32>,
     /// Whether to run in real time.
     pub realtime: bool,
@@ -218,6 +218,7 @@ impl<'a> Driver<'a> {
         // Each flush reports at most one rejection. Repeat until no rejection is left.
         while self.stats.record_rejection(self.step_stream.flush().await)? {}
         self.stats.record_acknowledgments(&self.step_stream);
+        // The number that the server has given to this writer.
         let (run_number, window) = (self.step_stream.run, self.step_stream.window);
         let stream_summary = self.step_stream.finish().await?;
         self.recorder.map(Recorder::finish).transpose()?;

@@ -19,9 +19,10 @@ impl ViewerForces {
     /// Subscribes to the forces on a scene. When this returns, the present forces have arrived.
     ///
     /// # Errors
-    /// `Client` as for the calls.
+    /// `Client` if the server rejects the subscription or the connection fails.
     pub async fn subscribe(client: &Client, scene: &str) -> Result<Self> {
-        let mut stream = client.stream_forces(scene, 0.0).await?;
+        let unlimited_hz = 0.0;
+        let mut stream = client.stream_forces(scene, unlimited_hz).await?;
         let ended = || ClientError::StreamEnded { awaited_reply: "the next forces" };
         let present_forces = stream.next().await.unwrap_or_else(|| Err(ended()))?;
         let (sender, mut newest) = watch::channel(present_forces);

@@ -39,7 +39,8 @@ use retained_modes::RetainedModes;
 use tile::{PackedOutput, PerTileOutput, WorkList};
 use tile_bounds::TileBounds;
 
-/// Maximum number of corners of a tile of corners.
+/// Maximum number of corners that one work item processes. A corner is a vertex with one of its normals and texture
+/// coordinates.
 const MAX_TILE_CORNERS: usize = 256;
 
 /// The deformer of the `cpu` backend for one scene.

@@ -97,7 +97,7 @@ fn real_sofa_binary_modes_equal_the_text_modes() {
 #[test]
 #[ignore = "needs the real inputs: MODALCAST_DATA or ../../../shared/data (from this crate)"]
 fn real_ball_is_rejected_with_declared_and_actual_size() {
-    // The only mesh of the folder is an STL file, so its modes are in `modes.txt`.
+    // The only mesh of the folder is an STL file. The modes of such a folder are read from `modes.txt`.
     let folder_error = super::open(&dataset_path("sofa/ball")).expect_err("mismatching modes").to_string();
     assert!(folder_error.starts_with("file 'modes.txt': values: expected 684 x 32 values"), "{folder_error}");
     let (model, modes) = (dataset_path("sofa/finger/finger.derived.obj"), dataset_path("sofa/ball/modes.txt"));

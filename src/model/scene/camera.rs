@@ -92,10 +92,10 @@ const IMAGE_FILL: f64 = 0.94;
 
 /// The fitted near plane, relative to the distance of the farthest point of the scene along the view axis.
 ///
-/// The value only keeps depth in the range of f32: near / w is at most 1, and it is a normal number up to 2^62 times
-/// the farthest distance. It does not limit how close the camera may come, because the positions themselves are f32,
-/// and their rounding errors of 2^-24 of their magnitude are larger. It costs no precision either: see
-/// [`Camera::clip_from_camera`].
+/// The only purpose of this value is that depth stays in the range of f32. Depth is near / w, where w is the distance
+/// along the view axis: at most 1, and a normal number (at least 2^-126) up to 2^62 times the farthest distance. The
+/// value does not limit how close the camera may come, because the positions are f32, and their rounding errors of
+/// 2^-24 of their magnitude are larger. It costs no precision: see [`Camera::clip_from_camera`].
 const FITTED_NEAR: f64 = 1.0 / (1_u64 << 63) as f64 / 2.0;
 
 /// A camera. `near` and `far` are distances in scene units along the view axis, and geometry outside of them is
@@ -246,10 +246,11 @@ impl Camera {
     ///
     /// z / w is then near / w, where w is the distance along the view axis. The spacing of f32 is at most 2^-23 of the
     /// number, so depth resolves 2^-23 of the distance, at every distance and for every near plane. (Depth that
-    /// increases from 0 to 1 resolves 2^-24 distance / near of the distance.) Interpolation across a triangle adds
-    /// rounding errors of 2^-24 of the largest depth of its corners. For a plane at the distance h from the eye, and a
-    /// rasterizer that clips to a rectangle of G image sizes, the corners have w of at least about h / G. The relative
-    /// error at the distance d is then 2^-24 G d / h, which moves the surface by 2^-24 G d along its normal.
+    /// increases from 0 to 1 has the relative resolution 2^-24 distance / near.) Interpolation across a triangle adds
+    /// rounding errors of 2^-24 of the largest depth of its corners. Consider a flat surface at the distance h from the
+    /// eye, and a rasterizer whose guard band is G times as large as the image. The corners of the clipped triangle have
+    /// w of at least about h / G. At the distance d, the relative error of depth is then 2^-24 G d / h: the point moves
+    /// by d times this error along the view ray, and by h / d of that along the normal, which is 2^-24 G d.
     /// (Reed, "Depth Precision Visualized", 2015; Upchurch and Desbrun, "Tightening the Precision of Perspective
     /// Rendering", 2012.)
     pub fn clip_from_camera(&self, width: u32, height: u32, bounds: &BoundingBox) -> Matrix4<f64> {

@@ -74,7 +74,7 @@ def knot():
     points = (curve(t)[:, None] + 0.16 * circle).reshape(-1, 3)
     u, v = np.meshgrid(np.linspace(0, 30, segments + 1), np.linspace(0, 2, sides + 1), indexing="ij")
     triangles, _ = grid(points, segments, sides)
-    # The two ends of the tube coincide, so its normals are those of the circle, not those of the triangles.
+    # Normals of the circle: averages of triangles would show a seam, because the vertices of the seam exist twice.
     return points, circle.reshape(-1, 3), np.stack([u, v], axis=-1).reshape(-1, 2), triangles
 
 

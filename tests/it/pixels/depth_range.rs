@@ -16,9 +16,9 @@ const SIZE: u32 = 64;
 /// Focal length of the cameras in pixels: a square of side s at the distance d is 100 s / d pixels wide.
 const FOCAL_LENGTH: f64 = 100.0;
 
-/// A camera that looks along -z. `eye` is the center of the image.
+/// A camera at `eye` that looks along -z.
 fn camera_at(eye: [f64; 3]) -> Camera {
-    // The distance of the target has no effect, as long as it is representable beside `eye`.
+    // Only the direction of the target matters. It is so far away that `eye - target` does not round to 0.
     let target = [eye[0], eye[1], eye[2] - eye[2].abs().max(1.0)];
     let center = f64::from(SIZE) / 2.0;
     Camera {
@@ -65,7 +65,7 @@ fn observe(renderer: &mut Renderer, scene: &Arc<Scene>, state: &SceneState, came
     };
     let ids = renderer.read_visibility().expect("expected visibility ids");
     let domains = ids.iter().step_by(ids.len() / (SIZE * SIZE) as usize).map(domain_of).collect();
-    assert!(samples > 1, "expected multisampled ids, which are valid only where depth is above 0");
+    assert!(samples > 1, "expected several visibility ids per pixel, got {samples}");
     let depth_image = renderer.render_aov(&buffers, &params, Aov::Depth).expect("expected depths");
     let rectangle = PixelRect::within([SIZE; 2], [SIZE / 2; 2], [1, 1]).expect("expected a valid rectangle");
     let pick = renderer.begin_pick(&buffers, &params, rectangle).expect("expected a pick to start");
@@ -74,8 +74,8 @@ fn observe(renderer: &mut Renderer, scene: &Arc<Scene>, state: &SceneState, came
     Observation { domains, depths: bytemuck::pod_collect_to_vec(&depth_image.bytes), hit }
 }
 
-/// A square of 2 s at the distance 10 s, 20 pixels wide, in front of a larger one. The depth of a pixel and of a pick
-/// is off by the rounding of the matrix to f32: less than 2^-20 of the distance.
+/// A square in front of a larger one: its distance is five times its side, so that it is 20 pixels wide. The depth of a
+/// pixel and of a pick is off by the rounding of the matrix to f32: less than 2^-20 of the distance.
 #[test]
 fn models_of_all_sizes_are_drawn_picked_and_measured() {
     let mut renderer = open_renderer();

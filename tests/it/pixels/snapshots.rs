@@ -33,7 +33,7 @@ fn compare_images(image: &[u8], snapshot: &[u8]) -> DifferenceStats {
 }
 
 /// Renders the tree close to its trunk: normal map of the bark, cut-out leaves, variance shadow map, four samples per
-/// pixel, ground and sky. Clip planes of 0 are fitted to the bounds of the scene.
+/// pixel, ground and sky. The clip planes are fitted to the scene.
 fn render_tree(eye: [f64; 3]) -> FrameImage {
     let tree = load::open("tree").expect("expected the built-in scene").scene;
     let shadow = Some(ShadowSettings::default());

@@ -23,8 +23,8 @@ pub(super) struct WindExcitation {
     loads: Vec<WindLoad>,
 }
 
-/// Factors from the wind pressure to the loads of a domain's modes, and from the force at the domain's joint to the
-/// loads of its parent's modes.
+/// Factors for the generalized forces of one domain: those of the wind pressure on the domain's own modes, and those of
+/// the force at the domain's joint on the modes of its parent.
 struct WindLoad {
     /// Per mode: U^T times a unit pressure downwind.
     downwind: Vec<f64>,

@@ -25,7 +25,8 @@ fn crown_sways_as_calibrated_and_joints_stay_closed() {
         (0.5, 60, 0.01..=0.06),
     ] {
         let (tree, values) = run_tree(TreeOptions { dt, ..OPTIONS }, steps);
-        // The calibration aims at 0.05 in 30 s, in steps of 0.05 s. Shorter runs and other steps can differ.
+        // The wind is calibrated so that the sway, a fraction of the height, reaches 0.05 within 30 s that are simulated
+        // with dt = 0.05 s. Shorter runs and other values of dt can differ.
         let peaks = tree.peaks();
         assert!(expected.contains(&peaks.sway), "dt {dt}, {steps} steps: {peaks:?}");
         assert!(peaks.gap <= 1e-3 * tree.model.diagonal(), "{peaks:?}");
@@ -37,12 +38,12 @@ fn crown_sways_as_calibrated_and_joints_stay_closed() {
 /// The motion follows from the simulated time, whatever the steps are.
 #[test]
 fn motion_does_not_depend_on_the_step_size() {
-    let tip_coordinate =
+    let first_coordinate =
         |dt: f64, steps: u64| f64::from(run_tree(TreeOptions { dt, ..OPTIONS }, steps).1.pop().expect("a step").q[0]);
     // After 60 steps of 1 ns, the tree has barely begun to move.
-    let (instant, second) = (tip_coordinate(1e-9, 61), tip_coordinate(1.0 / 60.0, 61));
+    let (instant, second) = (first_coordinate(1e-9, 61), first_coordinate(1.0 / 60.0, 61));
     assert!(instant.abs() <= 1e-12 * second.abs(), "{instant} after 60 ns, {second} after 1 s");
-    let (fine, coarse) = (tip_coordinate(1.0 / 480.0, 481), tip_coordinate(1.0 / 60.0, 61));
+    let (fine, coarse) = (first_coordinate(1.0 / 480.0, 481), first_coordinate(1.0 / 60.0, 61));
     assert!((fine / coarse - 1.0).abs() <= 1e-2, "{fine} and {coarse} after 1 s");
 }
 
@@ -140,7 +141,7 @@ fn invalid_parameters_are_rejected_before_the_first_step() {
 }
 
 #[test]
-fn remarks_name_held_modes_left_out_gusts_and_limited_sway() {
+fn remarks_report_held_modes_omitted_gusts_and_limited_sway() {
     let remarks = |options: TreeOptions, change: &dyn Fn(&mut Model)| {
         create_tree(options, change).expect("a valid scenario").remarks()
     };
@@ -176,7 +177,7 @@ fn rigid_leaf_flutters() {
     };
     let angles: Vec<f64> = values.iter().map(angle).collect();
     assert!(angles.iter().all(|angle| *angle <= MAX_LEAF_ANGLE + 1e-3));
-    // Local extrema per second: about twice the frequency of the flutter.
+    // Local extrema in 10 s. Each oscillation has two.
     let extrema = angles.windows(3).filter(|angles| (angles[1] - angles[0]) * (angles[2] - angles[1]) < 0.0).count();
     assert!((30..300).contains(&extrema), "{extrema} extrema in 10 s");
 }

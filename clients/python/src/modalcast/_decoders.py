@@ -100,7 +100,7 @@ class VertexSetDecoder:
     """Decodes the layout, then the vertices of each step."""
 
     def __init__(self, layout_field: int, chunk_field: int, target: Bytes | None = None) -> None:
-        """`target` receives the first bytes of a step."""
+        """`target` receives the data of a step, as far as they fit. The remaining bytes get memory of their own."""
         self._layout_field = layout_field
         self._target: Bytes = np.empty(0, np.uint8) if target is None else target
         self._format = ChunkFormat("vertices", vertices_pb2.VertexChunk, chunk_field, data_field=3)

@@ -27,7 +27,7 @@ class ServerProcess:
     """A server on a free port of this machine. It ends with `stop`, and at the latest when this process ends."""
 
     def __init__(self, program: str | Path | None, arguments: Sequence[str]) -> None:
-        """Starts the server, which listens when `address` is not None.
+        """Starts the server. As soon as it listens, `address` returns its address; until then, None.
 
         Raises:
             ServerStartError: The program does not exist or cannot be started.

@@ -108,8 +108,8 @@ impl SharedPicture for CudaPicture {
         let guard = WaitForStream::new(&self.copy_stream);
         let target = self.pixels.address.cast_mut().cast();
         // SAFETY: both memories have at least `bytes` bytes and belong to this value, which waits for the copy before
-        // it is dropped. No reader has a reference to the pixels, and gets one only after the copy. If this fails
-        // before the event is recorded, the guard waits for the copy.
+        // it is dropped. No reader has a reference to the pixels: readers get them after the copy. If this
+        // function fails before the event is recorded, the guard waits for the copy.
         unsafe { sys::cuMemcpyDtoHAsync_v2(target, self.memory.address(), bytes, self.copy_stream.cu_stream()) }
             .result()
             .map_err(cuda_error(STAGE))?;

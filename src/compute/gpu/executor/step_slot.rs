@@ -38,11 +38,12 @@ pub(super) struct StepSlot {
     pub values: StagingBuffer,
     /// Only in a scene that can have partial steps.
     pub change_list: Option<ChangeListBuffer>,
-    /// The bounds that the step reads back, as unsigned integers in the order of the floats (`box_keys`).
+    /// The bounds that the step reads back, as unsigned integers that compare like the floats (`box_keys`).
     bounds_keys: PinnedBuffer<u32>,
     /// End of the last step.
     pub done: CudaEvent,
-    /// Begin of the last step on the device, if it may have waited for frames of OpenGL.
+    /// Begin of the last step on the device. Recorded by [`Self::record_begin`] only for steps that may wait for frames
+    /// of OpenGL.
     begin_event: Option<CudaEvent>,
 }
 
@@ -129,8 +130,8 @@ impl StepSubmission<'_> {
         let Self { kernels, inputs, values, bounds_keys } = self;
         let input_part = if change_list.is_some() { InputPart::Header } else { InputPart::All };
         // SAFETY: the work is captured in a graph. The deformer owns the graph, the kernels, the inputs and the pinned
-        // memory, all for one scene. It writes a header with the addresses of outputs of the plan's sizes, and valid
-        // lists, before each launch, and waits for the launch before it writes or drops the memory.
+        // memory, all for one scene. Before each launch it writes valid lists and a header, whose addresses are those of
+        // outputs as large as the plan requires. It waits for the launch before it writes or drops the memory.
         unsafe {
             inputs.send(device, values, input_part)?;
             match (change_list, &kernels.apply) {

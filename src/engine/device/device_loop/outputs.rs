@@ -1,5 +1,5 @@
-//! Frames and AOVs (arbitrary output variables, such as depth), and the preparation of their scenes, in draw steps:
-//! parts between which other scenes are served.
+//! Draws frames and AOVs (arbitrary output variables, such as depth), and prepares their scenes before. Long work is
+//! split into draw steps, and other scenes are served between them.
 
 use std::time::Instant;
 
@@ -36,9 +36,9 @@ impl DeviceLoop {
         None
     }
 
-    /// Begins to prepare the textures and programs that a command needs. A command that creates OpenGL buffers needs
-    /// the textures and programs of these buffers. A frame that is drawn in another way than earlier frames needs
-    /// further programs. `None` if there is nothing to prepare.
+    /// Begins to prepare the textures and programs that a command needs. A command that loads a
+    /// scene into OpenGL needs the textures and programs of the scene. A frame that is drawn in another way than earlier
+    /// frames needs further programs. `None` if there is nothing to prepare.
     fn begin_preparation(&mut self, command: &Command) -> Option<ScenePreparation> {
         let Self { context, scenes, .. } = self;
         match command {
@@ -89,8 +89,8 @@ impl DeviceLoop {
         self.continue_output(id, PartialOutput { kind, charge });
     }
 
-    /// Submits the next step of an output, or all its steps if no other scene is served between them (`has_breaks`).
-    /// Drops an output whose caller no longer waits.
+    /// Submits the next draw step of an output, after which other scenes are served. An output without breaks is
+    /// submitted whole (`has_breaks`). Drops an output whose caller no longer waits.
     pub(super) fn continue_output(&mut self, id: SceneId, mut output: PartialOutput) {
         let begin = Instant::now();
         while !output.is_submitted() {

@@ -8,12 +8,12 @@
 //! diffuse   = c (1 - m / 2)            half remains for metals, because reflections of surroundings are not rendered
 //! ambient   = c
 //! specular  = min(1, f / (4 alpha^2))  the peak of a GGX lobe relative to a white diffuse surface
-//! shininess = (2 / alpha^2 - 2) / 4    exponent of a half-vector lobe; that of a reflected vector is a quarter of it
+//! shininess = (2 / alpha^2 - 2) / 4    2 / alpha^2 - 2 is the exponent of a half-vector lobe; Phong has a quarter of it
 //! ```
 //!
-//! `shininess` is clamped to 1 to 10,000. The base color texture multiplies diffuse, ambient and alpha. Normal textures
-//! have +Y up, as in [`Material`]. A material with alpha mode "mask" keeps this mode even if its base color texture has
-//! no alpha, because a scene file may replace the texture.
+//! `shininess` is clamped to 1 to 10,000. The base color texture multiplies diffuse, ambient and opacity. Normal
+//! textures have +Y up, as in [`Material`]. A material with alpha mode "mask" keeps this mode even if its base color
+//! texture has no alpha, because a scene file may replace the texture.
 
 use std::collections::HashMap;
 
@@ -64,7 +64,8 @@ impl<'a> MaterialConverter<'a> {
         Ok(material.pbr_metallic_roughness.base_color_texture.is_some() || material.normal_texture.is_some())
     }
 
-    /// Returns the index of the converted material `index` with the colors of a primitive's vertices.
+    /// Adds a copy of a converted material that has the colors of a primitive's vertices, and returns its index. Returns
+    /// `index`, the index of the original, if the vertices have no colors.
     pub(super) fn with_vertex_colors(&mut self, index: usize, colors: PrimitiveColors) -> usize {
         let mut material = self.materials[index].clone();
         match colors {

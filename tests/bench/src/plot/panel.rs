@@ -117,7 +117,7 @@ impl<'a> Panel<'a> {
         self.draw_point_labels(svg, &positions, &front, &marker_style);
         if self.points.is_empty() {
             let center = (self.corner.0 + PANEL_SIZE.0 / 2.0, self.corner.1 + PANEL_SIZE.1 / 2.0);
-            write_text(svg, center, "font-size=\"13\" fill=\"#b2182b\" text-anchor=\"middle\"", "no variant passed");
+            write_text(svg, center, "font-size=\"13\" fill=\"#b2182b\" text-anchor=\"middle\"", "no points to show");
         }
     }
 

@@ -4,8 +4,8 @@
 
 use serde::Serialize;
 
-/// A reference pixel is in the penumbra when its sun visibility is between this value and 1 minus this value. A single
-/// one of 64 samples changes the sun visibility by less, 1/64 = 0.016.
+/// A reference pixel is in the penumbra when its sun visibility is between this value and 1 minus this value. The value
+/// is above 1/64 = 0.016, so that a single shadowed sample of 64 does not make a penumbra.
 const MIN_PENUMBRA_VISIBILITY: f32 = 0.02;
 /// A reference pixel is in the umbra when its sun visibility is at most this value, which allows for rounding. It is
 /// outside of shadows when its sun visibility is at least 1 minus this value.
