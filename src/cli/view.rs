@@ -4,7 +4,7 @@ use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
-use super::demo::{DemoScene, Process, program_path};
+use super::demo::{ForceFiles, Process, SceneLocation, program_path};
 use super::serve::{TerminationSignals, start};
 use super::{Completion, Outcome, print_line};
 use crate::config::{BackendChoice, Config, ListenAddress, RendererChoice, ValidatedConfig};
@@ -49,10 +49,10 @@ pub(super) struct Args {
 }
 
 impl Args {
-    fn config(&self, input: &DemoScene, state: &Path) -> Result<ValidatedConfig> {
+    fn config(&self, location: &SceneLocation, state: &Path) -> Result<ValidatedConfig> {
         Config {
             listen: vec![ListenAddress::Tcp(self.listen)],
-            scenes: input.repository.clone(),
+            scenes: location.repository.clone(),
             state: state.to_owned(),
             backend: self.backend,
             renderer: self.renderer,
@@ -76,26 +76,31 @@ impl Args {
 }
 
 pub(super) fn run(args: &Args) -> Outcome {
-    let input = DemoScene::find(&args.model)?;
+    let location = SceneLocation::find(&args.model)?;
     // The server's state. The folder is removed when this value is dropped.
     let state = tempfile::tempdir().map_err(fault_in("view"))?;
-    let config = args.config(&input, state.path())?;
+    let config = args.config(&location, state.path())?;
     let physics_program = args.physics_program()?;
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().map_err(fault_in("view"))?;
-    let result = runtime.block_on(view(args, &input, config, physics_program));
+    let result = runtime.block_on(view(args, &location, config, physics_program));
     // A frame that is being drawn must not delay the exit.
     runtime.shutdown_background();
     result.map(|()| Completion::Success)
 }
 
-async fn view(args: &Args, input: &DemoScene, config: ValidatedConfig, physics_program: Option<PathBuf>) -> Result<()> {
+async fn view(
+    args: &Args,
+    location: &SceneLocation,
+    config: ValidatedConfig,
+    physics_program: Option<PathBuf>,
+) -> Result<()> {
     let mut signals = TerminationSignals::install()?;
     let open = async {
         let (engine, listener) = start(config).await?;
-        let scene = engine.open(&input.source, "", None).await?;
-        Ok((engine, listener, scene.name.clone()))
+        let scene = engine.open(&location.source, "", None).await?;
+        Ok((engine, listener, scene.name.clone(), location.force_files(&scene.scene)))
     };
-    let (engine, listener, scene) = tokio::select! {
+    let (engine, listener, scene, force_files) = tokio::select! {
         opened = open => opened?,
         () = signals.received() => return Ok(()),
     };
@@ -105,7 +110,7 @@ async fn view(args: &Args, input: &DemoScene, config: ValidatedConfig, physics_p
     if !args.no_open && std::env::var_os("SSH_CONNECTION").is_none() {
         open_browser(&url);
     }
-    let mut physics = physics_program.map(|path| start_physics(&path, input, &listener, &scene)).transpose()?;
+    let mut physics = physics_program.map(|path| start_physics(&path, &force_files, &listener, &scene)).transpose()?;
     let result = service::serve(engine, listener, async move { signals.received().await }).await;
     if let Some(physics) = &mut physics {
         physics.stop();
@@ -119,11 +124,11 @@ fn viewer_url(listener: &Listener, scene: &str) -> Result<String> {
     url.map(|url| format!("{url}#scene={scene}")).ok_or_else(|| fault("view", "expected the URL of the viewer"))
 }
 
-fn start_physics(program: &PathBuf, input: &DemoScene, listener: &Listener, scene: &str) -> Result<Process> {
+fn start_physics(program: &PathBuf, force_files: &ForceFiles, listener: &Listener, scene: &str) -> Result<Process> {
     let server = listener.local_urls().into_iter().next().ok_or_else(|| fault("view", "expected an address"))?;
     let mut flags = vec!["auto".to_owned(), "--server".into(), server, "--scene".into(), scene.into()];
     flags.extend(["--wait", "30", "--seconds", "0", "--realtime", "--forces", "--delivery", "latest"].map(Into::into));
-    for (flag, path) in [("--cubic", &input.cubic), ("--config", &input.vega_config)] {
+    for (flag, path) in [("--cubic", &force_files.cubic), ("--config", &force_files.config)] {
         if let Some(path) = path {
             flags.extend([flag.into(), path.to_string_lossy().into_owned()]);
         }

@@ -9,17 +9,62 @@ use modalcast_model::error::Result;
 use modalcast_model::load;
 use modalcast_model::scene::Scene;
 
-/// The scene that the demo runs, and the options with which the processes find its files.
-pub(in crate::cli) struct DemoScene {
-    pub(in crate::cli) scene: Arc<Scene>,
+/// Where a scene is, without its content.
+pub(in crate::cli) struct SceneLocation {
     /// Name or path of the scene in the server's repository.
     pub(in crate::cli) source: String,
     /// The server's repository. `None` for a built-in scene.
     pub(in crate::cli) repository: Option<PathBuf>,
-    /// Vega's cubic polynomial of the internal forces (`.cub`), if a file with the model's name exists.
+    /// The folder of the scene's files. `None` for a built-in scene.
+    folder: Option<PathBuf>,
+}
+
+/// Files of the FEM library Vega that belong to a scene.
+pub(in crate::cli) struct ForceFiles {
+    /// Cubic polynomial of the internal forces (`.cub`), if a file with the model's name exists.
     pub(in crate::cli) cubic: Option<PathBuf>,
-    /// Vega's simulation settings (`.config`) beside `cubic`.
-    pub(in crate::cli) vega_config: Option<PathBuf>,
+    /// Simulation settings (`.config`) beside `cubic`.
+    pub(in crate::cli) config: Option<PathBuf>,
+}
+
+impl SceneLocation {
+    /// Finds a scene by built-in name or path.
+    ///
+    /// # Errors
+    /// That of loading the scene if nothing has this name.
+    pub(in crate::cli) fn find(source: &str) -> Result<Self> {
+        if !load::is_built_in(source) && !Path::new(source).exists() {
+            load::open(source)?;
+        }
+        Ok(Self::locate(source, Path::new(".")))
+    }
+
+    /// As [`Self::find`], for a path that is relative to `base`.
+    fn locate(source: &str, base: &Path) -> Self {
+        let path = base.join(source).canonicalize().ok();
+        // `load::open` prefers the built-in scene, even if a folder has its name.
+        let Some(path) = path.filter(|_| !load::is_built_in(source)) else {
+            return Self { source: source.into(), repository: None, folder: None };
+        };
+        let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let folder = if path.is_dir() { path.clone() } else { path.parent().unwrap_or(&path).to_path_buf() };
+        // With the leading "./" the name is never resolved as a built-in scene.
+        Self { source: format!("./{name}"), repository: path.parent().map(Path::to_path_buf), folder: Some(folder) }
+    }
+
+    /// The force files in the folder of the scene that is here.
+    pub(in crate::cli) fn force_files(&self, scene: &Scene) -> ForceFiles {
+        let cubic = self.folder.as_ref().and_then(|folder| cubic_file(scene, folder));
+        let config = cubic.as_ref().map(|path| path.with_extension("config")).filter(|path| path.is_file());
+        ForceFiles { cubic, config }
+    }
+}
+
+/// The scene that the demo runs, and the options with which the processes find its files.
+pub(in crate::cli) struct DemoScene {
+    pub(in crate::cli) scene: Arc<Scene>,
+    pub(in crate::cli) location: SceneLocation,
+    pub(in crate::cli) force_files: ForceFiles,
 }
 
 impl DemoScene {
@@ -27,30 +72,11 @@ impl DemoScene {
     ///
     /// # Errors
     /// Those of loading the scene.
-    pub(in crate::cli) fn find(source: &str) -> Result<Self> {
+    pub(in crate::cli) fn load(source: &str) -> Result<Self> {
         let scene = with_spinner("loading", || load::open(source))?.scene;
-        Ok(Self::locate(scene, source, Path::new(".")))
-    }
-
-    /// Finds the files of a scene that was opened as `source`, which is relative to `base`.
-    fn locate(scene: Arc<Scene>, source: &str, base: &Path) -> Self {
-        let path = base.join(source).canonicalize().ok();
-        // `load::open` prefers the built-in scene, even if a folder has its name.
-        let Some(path) = path.filter(|_| !load::is_built_in(source)) else {
-            return Self { scene, source: source.into(), repository: None, cubic: None, vega_config: None };
-        };
-        let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        let folder = if path.is_dir() { path.clone() } else { path.parent().unwrap_or(&path).to_path_buf() };
-        let cubic = cubic_file(&scene, &folder);
-        let vega_config = cubic.as_ref().map(|path| path.with_extension("config")).filter(|path| path.is_file());
-        Self {
-            scene,
-            // With the leading "./" the name is never resolved as a built-in scene.
-            source: format!("./{name}"),
-            repository: path.parent().map(Path::to_path_buf),
-            cubic,
-            vega_config,
-        }
+        let location = SceneLocation::find(source)?;
+        let force_files = location.force_files(&scene);
+        Ok(Self { scene, location, force_files })
     }
 }
 
@@ -82,20 +108,25 @@ mod tests {
         let locate = |source: &str| {
             let path = outer.path().join(source);
             let scene = load::open(&path.to_string_lossy()).expect("expected a scene").scene;
-            DemoScene::locate(scene, source, outer.path())
+            let location = SceneLocation::locate(source, outer.path());
+            let force_files = location.force_files(&scene);
+            (location, force_files)
         };
-        let beam = locate("beam");
-        assert_eq!(beam.source, "./beam");
+        let (location, beam) = locate("beam");
+        assert_eq!(location.source, "./beam");
         let file_name = |path: &Option<PathBuf>| path.as_ref().and_then(|path| path.file_name()).map(ToOwned::to_owned);
-        assert_eq!(
-            (file_name(&beam.cubic), file_name(&beam.vega_config)),
-            (Some("a.cub".into()), Some("a.config".into()))
-        );
-        let other = locate("other");
-        assert_eq!((other.cubic, other.vega_config), (None, None), "expected no guess");
+        assert_eq!((file_name(&beam.cubic), file_name(&beam.config)), (Some("a.cub".into()), Some("a.config".into())));
+        let (_, other) = locate("other");
+        assert_eq!((other.cubic, other.config), (None, None), "expected no guess");
         // `tree` is the built-in scene, although a folder has this name. `./tree` is the folder.
-        let built_in = locate("tree");
-        assert_eq!((built_in.source.as_str(), built_in.repository, built_in.cubic), ("tree", None, None));
-        assert!(locate("./tree").repository.is_some());
+        let (built_in, files) = locate("tree");
+        assert_eq!((built_in.source.as_str(), built_in.repository, files.cubic), ("tree", None, None));
+        assert!(locate("./tree").0.repository.is_some());
+    }
+
+    #[test]
+    fn missing_scene_is_an_error() {
+        let error = SceneLocation::find("no/such/scene.obj").err().expect("expected an error").to_string();
+        assert!(error.contains("no/such/scene.obj"), "{error}");
     }
 }

@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 
 use clap::ValueEnum as _;
 
-pub(super) use self::input::DemoScene;
+pub(super) use self::input::{DemoScene, ForceFiles, SceneLocation};
 pub(super) use self::processes::{Process, program_path};
 
 use super::options::with_spinner;
@@ -57,7 +57,7 @@ pub(super) struct Args {
 }
 
 pub(super) fn run(args: &Args) -> Outcome {
-    let input = DemoScene::find(&args.scene)?;
+    let input = DemoScene::load(&args.scene)?;
     // For the temporary files of the processes. The folder is removed when this value is dropped.
     let temporary_folder = tempfile::tempdir().map_err(fault_in("demo"))?;
     let demo_run = run_processes(args, &input, temporary_folder.path())?;
@@ -116,7 +116,8 @@ fn run_processes(args: &Args, input: &DemoScene, temporary_folder: &std::path::P
 
     let out = args.out.to_string_lossy();
     let size = args.size.to_string();
-    let mut flags = vec!["frames", "--open", input.source.as_str(), "--count", &frame_count, "--size", &size, "--json"];
+    let mut flags =
+        vec!["frames", "--open", input.location.source.as_str(), "--count", &frame_count, "--size", &size, "--json"];
     flags.extend(["--delivery", "lossless", "--out", &out]);
     let mut frame_client =
         Process::start("fetch", &program_path("modalcast-fetch")?, &[&flags[..], &common_flags].concat())?;
@@ -141,8 +142,8 @@ fn run_processes(args: &Args, input: &DemoScene, temporary_folder: &std::path::P
         &record_folder,
         "--json",
     ];
-    let cubic = input.cubic.as_ref().map(|path| path.to_string_lossy().into_owned());
-    let config = input.vega_config.as_ref().map(|path| path.to_string_lossy().into_owned());
+    let cubic = input.force_files.cubic.as_ref().map(|path| path.to_string_lossy().into_owned());
+    let config = input.force_files.config.as_ref().map(|path| path.to_string_lossy().into_owned());
     if let Some(path) = &cubic {
         flags.extend(["--cubic", path.as_str()]);
     }
@@ -175,7 +176,7 @@ fn server_flags<'a>(args: &'a Args, input: &'a DemoScene, temporary_folder: &'a 
     flags.push(temporary_folder.join("state").to_string_lossy().into_owned());
     let backend = args.backend.to_possible_value().map_or_else(String::new, |value| value.get_name().to_owned());
     flags.extend(["--backend".into(), backend]);
-    if let Some(repository) = &input.repository {
+    if let Some(repository) = &input.location.repository {
         flags.extend(["--scenes".into(), repository.to_string_lossy().into_owned()]);
     }
     flags
