@@ -1,7 +1,7 @@
 /**
  * Records a pull on the tree and saves the frames of its replay in the viewer as PNG files: animation.ts FOLDER.
- * The pull is made with the mouse in a viewer, which draws as fast as this machine can. Each frame then shows the
- * recording at its time, so that the animation is smooth on every machine.
+ * This program applies the force with the calls of a viewer, in simulated time, and a browser draws the recording later,
+ * frame by frame. The animation is thus smooth on every machine.
  */
 
 import { mkdirSync } from "node:fs";
@@ -9,6 +9,8 @@ import { writeFile } from "node:fs/promises";
 import { join } from "node:path";
 import { pathToFileURL } from "node:url";
 import type { Browser, Page } from "playwright-core";
+import { FrameService } from "../src/proto/modalcast/v1/frames_pb";
+import type { Server } from "../src/source/server";
 import {
     committedPage,
     end,
@@ -22,19 +24,22 @@ import {
     waitForScene,
 } from "../tests/browser/harness";
 
-const WIDTH = 640;
+const WIDTH = 600;
 const HEIGHT = 400;
 const FRAMES_PER_SECOND = 16;
 /** Seconds of the animation before the pull begins, and in total. */
-const LEAD = 0.15;
-const DURATION = 3;
-/** Simulated seconds during which the cursor moves, and until the button goes up. */
-const MOVE = 0.5;
+const LEAD = 0.2;
+const DURATION = 3.2;
+/** Simulated seconds until the pull begins, during which it grows, and after which it ends. */
+const START = 4;
+const GROWTH = 0.5;
 const HOLD = 0.85;
-/** Pixels from the pulled point to the cursor. */
-const OFFSET = [170, 15] as const;
-/** The height in the picture of the pulled point on the trunk. */
-const PULLED_HEIGHT = 0.45;
+/** The largest force: 2 kN to the right of the default camera, which looks along -(0.42, 0.14, 0.9). */
+const FORCE = [0.906 * 2000, 0, -0.423 * 2000] as const;
+/** Height of the pulled point on the trunk, as a part of the picture from its upper edge. */
+const PULLED_HEIGHT = 0.42;
+/** Distance of the camera, relative to that which frames the whole scene. */
+const CAMERA_DISTANCE = 0.8;
 
 const folder = process.argv[2];
 if (!folder) throw new Error("expected: animation.ts FOLDER");
@@ -42,9 +47,9 @@ mkdirSync(folder, { recursive: true });
 const work = temporaryFolder();
 const recording = join(work, "tree.mcap");
 const page = join(work, "tree.html");
+await recordPull();
 const browser = await launchBrowser();
 try {
-    await recordPull(browser);
     await writeFile(join(work, "viewer.html"), committedPage());
     await runProgram("modalcast-record", [
         "export",
@@ -61,42 +66,55 @@ try {
     await browser.close();
 }
 
-/** Records the tree while a viewer pulls on its trunk. */
-async function recordPull(browser: Browser): Promise<void> {
+/** Records the tree while a force acts on its trunk. */
+async function recordPull(): Promise<void> {
     const server = new ServerProcess();
     await server.start();
-    await (await server.client()).openScene("tree");
+    const client = await server.client();
+    await client.openScene("tree");
+    const point = await trunkPoint(client);
     const simulation = startSimulation(server, ["--scene", "tree", "--wind", "0", "--forces"]);
-    const { page } = await openPage(browser, server.pageUrl("tree"), WIDTH, HEIGHT);
-    await prepare(page);
-    await page.waitForFunction(() => modalcastViewer.status.stateRate.perSecond() > 5);
-    const recorder = startProgram("modalcast-record", [
-        "record",
-        "tree",
-        "--out",
-        recording,
-        "--server",
-        server.grpcUrl,
-    ]);
-    const [x, y] = await trunkPixel(page);
-    await waitSeconds(page, 2);
-    await page.keyboard.down("Shift");
-    await page.mouse.move(x, y);
-    await page.mouse.down();
-    await page.waitForFunction(() => modalcastViewer.pull?.view != null);
-    const start = await simulatedTime(page);
-    for (let part = 0; part < 1; ) {
-        part = Math.min(1, ((await simulatedTime(page)) - start) / MOVE);
-        const eased = part * part * (3 - 2 * part);
-        await page.mouse.move(x + OFFSET[0] * eased, y + OFFSET[1] * eased);
+    const options = ["record", "tree", "--out", recording, "--server", server.grpcUrl];
+    const recorder = startProgram("modalcast-record", options);
+    const owner = crypto.getRandomValues(new Uint8Array(32));
+    let isSending = false;
+    const apply = async (share: number) => {
+        isSending = true;
+        const vector = FORCE.map((component) => share * component);
+        await client.applyForces("tree", owner, share > 0 ? [{ id: 1n, ...point, vector }] : [], 1000);
+        isSending = false;
+    };
+    for await (const { part } of client.streamStates("tree")) {
+        const time = (part.case === "chunk" ? (part.value.head?.step?.time ?? 0) : 0) - START;
+        const growth = Math.min(Math.max(time / GROWTH, 0), 1);
+        if (!isSending) void apply(time > HOLD ? 0 : growth * growth * (3 - 2 * growth));
+        if (time > DURATION) break;
     }
-    await waitSeconds(page, HOLD - MOVE);
-    await page.mouse.up();
-    await waitSeconds(page, DURATION);
     await end(recorder, "SIGINT");
     await end(simulation);
-    await page.close();
     await server.stop();
+}
+
+/** A visible point of the trunk. */
+async function trunkPoint(client: Server): Promise<{ domain: number; triangle: number; barycentric: number[] }> {
+    const scene = await client.describe("tree");
+    const trunk = scene.domains.findIndex(({ name }) => name === "trunk");
+    const picture = { width: WIDTH, height: HEIGHT };
+    const middle = Math.round(PULLED_HEIGHT * HEIGHT);
+    const request = {
+        scene: "tree",
+        picture,
+        x: WIDTH / 2 - 32,
+        y: middle - 20,
+        width: 64,
+        height: 40,
+        withoutModes: true,
+    };
+    for await (const { hits } of client.channel.serverStream(FrameService.method.pick, request)) {
+        const hit = hits.find(({ domain }) => domain === trunk);
+        if (hit) return { domain: hit.domain, triangle: hit.triangle, barycentric: [...hit.barycentric] };
+    }
+    throw new Error("expected the trunk in the middle of the picture");
 }
 
 /** Saves what the viewer shows from shortly before the first force on. */
@@ -116,10 +134,11 @@ async function saveFrames(browser: Browser, folder: string): Promise<void> {
         }, time);
         await viewer.screenshot({ path: join(folder, `${String(frame).padStart(3, "0")}.png`) });
     }
+    await writeFile(join(folder, "rate"), String(FRAMES_PER_SECOND));
     await viewer.close();
 }
 
-/** Hides panels and tools, and moves the camera closer to the crown. */
+/** Hides panels and tools, and moves the camera closer. */
 async function prepare(page: Page): Promise<void> {
     await waitForScene(page);
     await page.addStyleTag({ content: "#bar, #dock, #panel { display: none !important }" });
@@ -127,36 +146,11 @@ async function prepare(page: Page): Promise<void> {
         if (!document.body.classList.contains("wide")) modalcastViewer.togglePanel();
     });
     await page.waitForFunction((width) => document.getElementById("stage")?.clientWidth === width, WIDTH);
-    await page.evaluate(() => modalcastViewer.frameScene());
-}
-
-/** The visible pixel of the trunk that is closest to a height in the picture. */
-async function trunkPixel(page: Page): Promise<[number, number]> {
-    return page.evaluate(
-        ([width, height, share]) => {
-            const { renderer, viewport, model } = modalcastViewer;
-            const ids = renderer?.domainIds(viewport.camera.camera, width, height) ?? [];
-            const trunk = model?.scene.domains.findIndex(({ name }) => name === "trunk") ?? -1;
-            let best: [number, number] | null = null;
-            for (let y = 1; y < height - 1; y++) {
-                for (let x = 1; x < width - 1; x++) {
-                    const isInside = [-1, 0, 1].every((dx) => ids[y * width + x + dx] === trunk);
-                    if (isInside && (!best || Math.abs(y - share * height) < Math.abs(best[1] - share * height)))
-                        best = [x, y];
-                }
-            }
-            if (!best) throw new Error("expected the trunk in the picture");
-            return best;
-        },
-        [WIDTH, HEIGHT, PULLED_HEIGHT] as const,
-    );
-}
-
-function simulatedTime(page: Page): Promise<number> {
-    return page.evaluate(() => modalcastViewer.model?.state.step?.time ?? 0);
-}
-
-async function waitSeconds(page: Page, seconds: number): Promise<void> {
-    const until = (await simulatedTime(page)) + seconds;
-    await page.waitForFunction((time) => (modalcastViewer.model?.state.step?.time ?? 0) >= time, until);
+    await page.evaluate((distance) => {
+        modalcastViewer.frameScene();
+        const { camera } = modalcastViewer.viewport;
+        const { eye, target } = camera;
+        const closer = eye.map((value, axis) => distance * value + (1 - distance) * (target[axis] ?? 0));
+        camera.look(closer as [number, number, number], target);
+    }, CAMERA_DISTANCE);
 }
