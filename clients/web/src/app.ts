@@ -98,6 +98,7 @@ export class App implements CommandHandlers {
     /** Lets the keys control a recording, whose time line replaces the buttons for live steps. */
     setPlayback(playback: Playback | null): void {
         this.playback = playback;
+        this.forceLines.largest = playback?.largestForce ?? 0;
         for (const id of ["pause", "step", "pull", "pictures"]) this.toolbar.setVisible(id, playback === null);
     }
 

@@ -14,7 +14,7 @@ import { linearNorm, restSphere } from "../scene/bounds";
 import { at, toF32 } from "../scene/numbers";
 import type { SceneModel } from "../scene/scene_model";
 import type { Server, SurfaceForceMessage } from "../source/server";
-import { displacementAt, positionOf, type SurfacePoint, surfacePoint } from "./surface_point";
+import { displacementAt, jointPoint, positionOf, type SurfacePoint, surfacePoint } from "./surface_point";
 
 /** Milliseconds between renewals of a force, and until the server removes a force that is not renewed. */
 const RENEWAL_MS = 100;
@@ -119,10 +119,14 @@ export class PullTool {
     }
 
     private grab(hit: Hit): void {
-        this.point = surfacePoint(this.model, hit.domain, hit.triangle, hit.barycentric) ?? this.pointOf(hit);
+        const { model } = this;
+        this.point =
+            jointPoint(model, hit.domain) ??
+            surfacePoint(model, hit.domain, hit.triangle, hit.barycentric) ??
+            this.pointOf(hit);
         this.anchor = positionOf(this.model, this.point);
         this.stiffness = this.stiffnessAt(this.point);
-        this.longestPull = this.longestPullOf(hit.domain);
+        this.longestPull = this.longestPullOf(this.point.domain);
         // The renewal follows a camera that has moved, too.
         this.timer = setInterval(() => void this.sendForces(), RENEWAL_MS);
         void this.sendForces();

@@ -1,7 +1,7 @@
 /** A point of the surface that moves with the scene. */
 
 import { applyToPoint, TRANSFORM_SIZE, type Vec3 } from "../scene/affine";
-import { at } from "../scene/numbers";
+import { at, toF32 } from "../scene/numbers";
 import type { SceneModel } from "../scene/scene_model";
 
 export interface SurfacePoint {
@@ -39,6 +39,40 @@ export function surfacePoint(
         }
     }
     return { domain, triangle, barycentric, rest, modes };
+}
+
+/**
+ * The point where a force on a rigid domain acts: on the closest ancestor that bends, at the vertex that is nearest to the
+ * joint. Null if the domain bends itself, if no ancestor does, or without the arrays of the scene.
+ */
+export function jointPoint(model: SceneModel, domain: number): SurfacePoint | null {
+    const { scene, layout, arrays } = model;
+    let child = scene.domains[domain];
+    while (child && at(layout.ranks, child.domain) === 0 && child.parent !== undefined) {
+        const parent = child.parent;
+        const indices = arrays?.shapes[scene.domains[parent]?.shape ?? -1]?.indices;
+        if (at(layout.ranks, parent) > 0 && indices) {
+            const corner = nearestCorner(model, parent, toF32(child.attachmentFrame, "attachment_frame"));
+            const barycentric = [0, 1, 2].map((place) => (place === corner % 3 ? 1 : 0));
+            return surfacePoint(model, parent, Math.floor(corner / 3), barycentric);
+        }
+        child = scene.domains[parent];
+    }
+    return null;
+}
+
+/** The entry of `indices` whose vertex is nearest to the origin of a frame (row-major 3x4) in the domain. */
+function nearestCorner(model: SceneModel, domain: number, frame: Float32Array): number {
+    const shape = model.arrays?.shapes[model.scene.domains[domain]?.shape ?? -1];
+    let nearest = 0;
+    let smallest = Infinity;
+    shape?.indices.forEach((corner, place) => {
+        const vertex = at(shape.cornerVertices, corner);
+        const offset = [0, 1, 2].map((axis) => at(shape.restPositions, 3 * vertex + axis) - at(frame, 4 * axis + 3));
+        const distance = Math.hypot(...offset);
+        if (distance < smallest) [nearest, smallest] = [place, distance];
+    });
+    return nearest;
 }
 
 /** u = U q at the point, in the domain's frame. */

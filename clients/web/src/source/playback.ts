@@ -1,5 +1,6 @@
 /** Plays a recording: delivers its messages to a scene at their times. */
 
+import { norm, type Vec3 } from "../scene/affine";
 import type { SceneModel } from "../scene/scene_model";
 import type { RecordedState, Recording } from "./recording";
 
@@ -26,6 +27,15 @@ export class Playback {
     /** Seconds of the first recorded force; null if there is none. */
     get firstForce(): number | null {
         return this.recording.forces.find(({ message }) => message.forces.length > 0)?.time ?? null;
+    }
+
+    /** Newtons of the largest recorded force on the surface. */
+    get largestForce(): number {
+        const forces = this.recording.forces.flatMap(({ message }) => message.forces);
+        return forces.reduce((largest, { force }) => {
+            const newtons = force?.kind.case === "surface" ? norm(force.kind.value.vector as Vec3) : 0;
+            return Math.max(largest, newtons);
+        }, 0);
     }
 
     play(): void {

@@ -8,13 +8,13 @@ import * as format from "./format";
 import { Overlay, type OverlayLine } from "./overlay";
 
 /** Length of the line of the largest force so far, as a part of its distance from the camera. */
-const LONGEST_LINE = 0.09;
+const LONGEST_LINE = 0.15;
 
 export class ForceLines {
     private readonly overlay = new Overlay();
     private session: SceneSession | null = null;
-    /** Newtons of the largest force so far, so that lengths can be compared. */
-    private largest = 0;
+    /** Newtons of the largest force so far or, in a recording, of all: the lengths of all lines are proportional. */
+    largest = 0;
 
     /** Shows the forces of another scene. */
     setSession(session: SceneSession | null): void {

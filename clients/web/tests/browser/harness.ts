@@ -17,6 +17,8 @@ globalThis.WebSocket ??= WebSocket as unknown as typeof globalThis.WebSocket;
 
 declare global {
     var modalcastViewer: App;
+    /** In the page: see `rememberPixels`. */
+    var rememberedPixels: Uint8Array;
 }
 
 const TIMEOUT_MS = 120_000;
@@ -172,7 +174,8 @@ export async function openPage(browser: Browser, url: string, width = 480, heigh
         if (message.type() === "error" || message.type() === "warning") errors.push(message.text());
     });
     if (usesCommittedPage) await serveCommittedPage(page);
-    await page.goto(url);
+    // Until the first bytes: a page with a recording loads for as long as it decodes the recording.
+    await page.goto(url, { waitUntil: "commit" });
     return { page, errors };
 }
 
@@ -185,4 +188,35 @@ async function serveCommittedPage(page: Page): Promise<void> {
 /** Waits until the page shows a scene. */
 export async function waitForScene(page: Page): Promise<void> {
     await page.waitForFunction(() => Boolean(globalThis.modalcastViewer?.model));
+}
+
+/** Draws the current state, and remembers its pixels in the page. */
+export async function rememberPixels(page: Page): Promise<void> {
+    await comparePixels(page, true);
+}
+
+/** Draws the current state. Returns the number of values (RGBA) that differ from the remembered pixels. */
+export function changedValues(page: Page): Promise<number> {
+    return comparePixels(page, false);
+}
+
+/** The pixels stay in the page, because a picture has more than a million values. */
+function comparePixels(page: Page, remembers: boolean): Promise<number> {
+    return page.evaluate(
+        (isNew) =>
+            new Promise<number>((done) => {
+                const { viewport } = modalcastViewer;
+                const gl = viewport.gl?.getContext() as WebGL2RenderingContext;
+                const [width, height] = viewport.pixelSize;
+                viewport.onDrawn = () => {
+                    viewport.onDrawn = () => {};
+                    const pixels = new Uint8Array(4 * width * height);
+                    gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
+                    if (isNew) globalThis.rememberedPixels = pixels;
+                    done(pixels.reduce((sum, value, i) => sum + Number(value !== globalThis.rememberedPixels[i]), 0));
+                };
+                viewport.invalidate();
+            }),
+        remembers,
+    );
 }

@@ -1,0 +1,184 @@
+/** Recordings in headless Chromium, without a server: dropped onto the page, and inside of an exported page. */
+
+import assert from "node:assert/strict";
+import { readFileSync, writeFileSync } from "node:fs";
+import { join } from "node:path";
+import { after, before, test } from "node:test";
+import { pathToFileURL } from "node:url";
+import type { Browser, Page } from "playwright-core";
+import { SceneModel } from "../../src/scene/scene_model";
+import { Playback } from "../../src/source/playback";
+import { type Recording, readRecording } from "../../src/source/recording";
+import {
+    changedValues,
+    committedPage,
+    end,
+    launchBrowser,
+    openPage,
+    rememberPixels,
+    runProgram,
+    ServerProcess,
+    startSimulation,
+    temporaryFolder,
+    waitForScene,
+} from "./harness";
+
+const LIMIT_MS = 300_000;
+const WIDTH = 480;
+const HEIGHT = 300;
+const folder = temporaryFolder();
+const file = join(folder, "tree.mcap");
+const viewerPage = join(folder, "viewer.html");
+const exportedPage = join(folder, "tree.html");
+
+let browser: Browser;
+let recording: Recording;
+
+before(async () => {
+    writeFileSync(viewerPage, committedPage());
+    await record();
+    recording = readRecording(readFileSync(file));
+    await runProgram("modalcast-record", [
+        ...["export", file, "--to", "html", "--out", exportedPage],
+        ...["--page", viewerPage],
+    ]);
+    browser = await launchBrowser();
+});
+
+after(async () => browser?.close());
+
+/** Records a moving tree. A force acts from the middle on. The server ends before the recording is played. */
+async function record(): Promise<void> {
+    const server = new ServerProcess();
+    await server.start();
+    const client = await server.client();
+    await client.openScene("tree");
+    const simulation = startSimulation(server, ["--scene", "tree", "--wind", "1", "--forces"]);
+    const options = ["record", "tree", "--out", file, "--server", server.grpcUrl, "--steps", "120"];
+    const recorder = runProgram("modalcast-record", options);
+    let states = 0;
+    for await (const { part } of client.streamStates("tree")) if (part.case === "chunk" && ++states === 60) break;
+    const force = { id: 1n, domain: 0, triangle: 100, barycentric: [1, 0, 0], vector: [500, 0, 0] };
+    await client.applyForces("tree", new Uint8Array(32).fill(7), [force], 10_000);
+    await recorder;
+    await end(simulation);
+    await server.stop();
+}
+
+/** q of the trunk that the recording has at a time in seconds. */
+function expectedQ(time: number): number[] {
+    const model = new SceneModel(recording.scene, recording.arrays);
+    new Playback(recording, model).seek(time);
+    return [...model.state.qOf(0)];
+}
+
+function shownQ(page: Page): Promise<number[]> {
+    return page.evaluate(() => [...(modalcastViewer.model?.state.qOf(0) ?? [])]);
+}
+
+/** Seeks with the slider of the time line, as a user does. */
+async function seek(page: Page, time: number): Promise<void> {
+    await page.getByRole("slider", { name: "Time in seconds" }).evaluate((slider, value) => {
+        (slider as HTMLInputElement).value = String(value);
+        slider.dispatchEvent(new Event("input"));
+    }, time);
+}
+
+/** Plays, seeks and loops. The page shows the first scene of a recording. */
+async function checkPlayback(page: Page): Promise<void> {
+    const duration = recording.states.at(-1)?.time ?? 0;
+    assert.ok(duration > 1, `expected a recording of more than a second, got ${duration}`);
+    await waitForScene(page);
+    // It plays by itself.
+    await page.waitForFunction(() => modalcastViewer.playback?.isPlaying && modalcastViewer.playback.time > 0.2);
+    await page.getByRole("button", { name: "Pause" }).click();
+    const paused = await page.evaluate(() => modalcastViewer.playback?.time ?? -1);
+    assert.deepEqual(await shownQ(page), expectedQ(paused));
+    await seek(page, 0);
+    assert.deepEqual(await shownQ(page), expectedQ(0));
+    await rememberPixels(page);
+    assert.equal(await changedValues(page), 0, "expected equal pictures of one state");
+    await seek(page, 0.8 * duration);
+    assert.deepEqual(await shownQ(page), expectedQ(0.8 * duration));
+    // Control: another time has other coordinates and another picture.
+    assert.notDeepEqual(await shownQ(page), expectedQ(0));
+    const changed = await changedValues(page);
+    assert.ok(changed > 100, `expected another picture, got ${changed} other values`);
+    // The force of the recording is shown at its time only.
+    await page.locator("#overlay text", { hasText: "500 N" }).waitFor({ state: "attached" });
+    await seek(page, 0);
+    await page.locator("#overlay text").waitFor({ state: "detached" });
+    await checkLoop(page, duration);
+}
+
+async function checkLoop(page: Page, duration: number): Promise<void> {
+    await seek(page, 0.9 * duration);
+    await page.getByRole("button", { name: "Play" }).click();
+    await page.waitForFunction((limit) => (modalcastViewer.playback?.time ?? limit) < limit, 0.5 * duration);
+    assert.ok(await page.evaluate(() => modalcastViewer.playback?.isPlaying));
+    // Control: without the loop, it stops at the end.
+    await page.getByRole("button", { name: "Loop" }).click();
+    await seek(page, 0.9 * duration);
+    await page.waitForFunction(() => modalcastViewer.playback?.isPlaying === false);
+    assert.deepEqual(await shownQ(page), expectedQ(duration));
+    // Keys step through the recording.
+    await page.locator("#stage").focus();
+    await page.keyboard.press("ArrowLeft");
+    assert.deepEqual(await shownQ(page), expectedQ(recording.states.at(-2)?.time ?? 0));
+    await page.keyboard.press("ArrowRight");
+    assert.deepEqual(await shownQ(page), expectedQ(duration));
+}
+
+test("an exported page plays its recording without a server", { timeout: LIMIT_MS }, async () => {
+    const { page, errors } = await openPage(browser, "about:blank", WIDTH, HEIGHT);
+    const requests: string[] = [];
+    page.on("request", (request) => requests.push(new URL(request.url()).protocol));
+    await page.goto(pathToFileURL(exportedPage).href, { waitUntil: "commit" });
+    await checkPlayback(page);
+    const others = requests.filter((protocol) => protocol !== "file:" && protocol !== "data:");
+    assert.deepEqual(others, [], "expected no requests to a server");
+    assert.deepEqual(errors, []);
+    await page.close();
+});
+
+test("a recording that is dropped onto the page plays", { timeout: LIMIT_MS }, async () => {
+    const { page, errors } = await openPage(browser, pathToFileURL(viewerPage).href, WIDTH, HEIGHT);
+    // Control: without a recording there is nothing to play.
+    await page.getByRole("heading", { name: "No recording" }).waitFor();
+    await drop(page, "cut.mcap", readFileSync(file).subarray(0, 3000));
+    await page.getByRole("heading", { name: "The recording cannot be played" }).waitFor();
+    await drop(page, "tree.mcap", readFileSync(file));
+    await checkPlayback(page);
+    // A pull says that a recording does not react.
+    await page.keyboard.down("Shift");
+    await page.mouse.click(WIDTH / 2, HEIGHT / 2);
+    await page.keyboard.up("Shift");
+    await page.locator(".notice", { hasText: "does not react to forces" }).waitFor();
+    assert.deepEqual(errors, []);
+    await page.close();
+});
+
+/** Drops a file onto the page. */
+async function drop(page: Page, name: string, bytes: Buffer): Promise<void> {
+    await page.evaluate(
+        ([fileName, base64]) => {
+            const content = Uint8Array.from(atob(base64), (character) => character.charCodeAt(0));
+            const dataTransfer = new DataTransfer();
+            dataTransfer.items.add(new File([content], fileName));
+            window.dispatchEvent(new DragEvent("drop", { dataTransfer, cancelable: true }));
+        },
+        [name, bytes.toString("base64")] as const,
+    );
+}
+
+test("a page with a damaged recording says so", { timeout: LIMIT_MS }, async () => {
+    const damaged = readFileSync(exportedPage, "utf8");
+    const start = damaged.indexOf('<script id="recording"');
+    const middle = start + Math.floor((damaged.length - start) / 2);
+    const path = join(folder, "damaged.html");
+    writeFileSync(path, `${damaged.slice(0, middle)}${"A".repeat(4000)}${damaged.slice(middle + 4000)}`);
+    const { page } = await openPage(browser, pathToFileURL(path).href, WIDTH, HEIGHT);
+    await page.getByRole("heading", { name: "The recording cannot be played" }).waitFor();
+    assert.equal(await page.evaluate(() => modalcastViewer.model), null);
+    await page.close();
+});
