@@ -33,7 +33,10 @@ pub(super) fn run(args: &Args) -> Outcome {
 
 /// Collects the report as JSON.
 pub(super) fn diagnose() -> Value {
-    let renderer = open_renderer();
+    let (renderer, encoder) = match open_renderer() {
+        Ok(opened) => (Ok(opened.info), opened.png_encoder),
+        Err(error) => (Err(error), "no renderer".into()),
+    };
     let devices = modalcast_render::devices();
     let cuda = gpu::probe();
     json!({
@@ -44,18 +47,31 @@ pub(super) fn diagnose() -> Value {
         "renderer": renderer.as_ref().ok(),
         "renderer_problem": renderer.as_ref().err().map(ToString::to_string),
         "pixel_readback": renderer.as_ref().ok().map(|renderer| renderer.pixel_readback.to_string()),
+        "cuda_png_encoder": encoder,
         "egl_devices": devices.as_ref().ok(),
         "egl_problem": devices.as_ref().err().map(ToString::to_string),
     })
 }
 
+struct OpenedRenderer {
+    info: RendererInfo,
+    /// Whether `--encode cuda` encodes on CUDA, or the reason why the CPU would.
+    png_encoder: String,
+}
+
 /// Opens a renderer as the server does, which also tests whether it can share memory with CUDA.
-fn open_renderer() -> Result<RendererInfo> {
+fn open_renderer() -> Result<OpenedRenderer> {
     let mut renderer = Renderer::open(DevicePreference::Any)?;
-    if let Ok(device) = gpu::Device::open(0) {
-        share_pictures(&mut renderer, &device)?;
-    }
-    Ok(renderer.info().clone())
+    let picture_memory = match gpu::Device::open(0) {
+        Ok(device) => share_pictures(&mut renderer, &device)?,
+        Err(_) => None,
+    };
+    let png_encoder = match picture_memory.map(|memory| memory.prepare_encoder()) {
+        Some(Ok(())) => "available with --encode cuda".into(),
+        Some(Err(error)) => format!("not available: {error}"),
+        None => "not available: CUDA and OpenGL share no pictures".into(),
+    };
+    Ok(OpenedRenderer { info: renderer.info().clone(), png_encoder })
 }
 
 /// Whether `--backend auto` would choose CUDA. It needs a CUDA device and an NVRTC version that supports it.
@@ -99,6 +115,7 @@ fn text_lines(report: &Value) -> Vec<String> {
     };
     push_line("rendering", &rendering_mode.into(), "");
     push_line("pixels leave", &report["pixel_readback"], "none");
+    push_line("PNG on CUDA", &report["cuda_png_encoder"], "not available");
     push_line("largest frame", &renderer["max_side"], "none");
     push_line("deforms on", &report["deforms_on"], "cpu");
     let verdict = if report["can_draw"] == true { "frames can be drawn" } else { "no frame can be drawn" };
@@ -126,6 +143,7 @@ mod tests {
         let has_cuda = report["cuda"]["devices"].as_array().is_some_and(|devices| !devices.is_empty());
         if !has_cuda {
             assert_eq!(line_text(&report, "pixels leave"), "by OpenGL: CUDA is not used");
+            assert_eq!(line_text(&report, "PNG on CUDA"), "not available: CUDA and OpenGL share no pictures");
         }
         report["pixel_readback"] = PixelReadback::CopyEngine.to_string().into();
         assert_eq!(line_text(&report, "pixels leave"), "by CUDA's copy engine from memory shared with OpenGL");

@@ -8,7 +8,7 @@ use std::time::Duration;
 use tokio::signal::unix::{Signal, SignalKind, signal};
 
 use super::{Completion, Outcome, print_line};
-use crate::config::{BackendChoice, Config, ListenAddress, RendererChoice, ValidatedConfig, ViewerToken};
+use crate::config::{BackendChoice, Config, EncodeChoice, ListenAddress, RendererChoice, ValidatedConfig, ViewerToken};
 use crate::engine::{Engine, EngineInfo};
 use crate::service::{self, Listener};
 use modalcast_model::error::{Result, fault_in};
@@ -52,6 +52,9 @@ pub(super) struct Args {
     /// OpenGL renderer.
     #[arg(long, value_enum, default_value_t)]
     renderer: RendererChoice,
+    /// Device that encodes PNG frames of streams. CUDA encodes only if it shares pictures with OpenGL.
+    #[arg(long, env = "MODALCAST_ENCODE", value_enum, default_value_t)]
+    encode: EncodeChoice,
     /// Do not draw frames with a software renderer.
     #[arg(long)]
     hardware_only: bool,
@@ -145,6 +148,7 @@ impl Args {
             backend: self.backend,
             cuda_device: self.cuda_device,
             renderer: self.renderer,
+            encode: self.encode,
             allow_software: !self.hardware_only,
             message_bytes: self.message_bytes,
             connection_receive_bytes: self

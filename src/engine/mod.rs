@@ -765,6 +765,24 @@ mod tests {
         engine.shutdown().await;
     }
 
+    /// The third step is taken from the queue while the second one is computed. Its state must not contain the q of the
+    /// second step, which is rejected; with it, the third step would be rejected, too.
+    #[tokio::test]
+    async fn step_after_a_rejected_one_starts_from_the_last_valid_state() {
+        let folder = tempfile::tempdir().expect("expected a temporary folder");
+        let (engine, faulty_scene, _) = start_faulty_engine(folder.path()).await;
+        let mut writer = acquire_writer(&faulty_scene).await;
+        writer.push_step(&step(1, 0.25)).expect("expected capacity");
+        writer.push_step(&step(2, InjectedFault::PanicInDeform.q())).expect("expected capacity");
+        writer.push_step(&RawStepUpdate { q_domains: vec![1], ..step(3, 0.5) }).expect("expected capacity");
+        assert!(is_done(&await_within_limit(writer.next_report()).await));
+        let report = await_within_limit(writer.next_report()).await;
+        assert!(matches!(report, Ok(StepReport::Rejected { step: 2, .. })), "{report:?}");
+        let report = await_within_limit(writer.next_report()).await;
+        assert!(matches!(report, Ok(StepReport::Done { step: 3, .. })), "{report:?}");
+        engine.shutdown().await;
+    }
+
     #[tokio::test]
     async fn lost_device_fails_every_scene_and_rejects_new_ones() {
         let folder = tempfile::tempdir().expect("expected a temporary folder");

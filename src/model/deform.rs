@@ -177,6 +177,15 @@ pub trait Deformer {
     /// `Fault` if the device fails.
     fn deform(&mut self, state: &SceneState) -> Result<DeformSummary>;
 
+    /// As [`Self::deform`]. Can also compute `next`, which is probably the state of the next call, so that a device computes
+    /// both at once. The output shows `state` until `next` itself is passed to this method, which then need not compute it.
+    ///
+    /// # Errors
+    /// As for [`Self::deform`].
+    fn deform_with_next(&mut self, state: &Arc<SceneState>, _next: Option<&Arc<SceneState>>) -> Result<DeformSummary> {
+        self.deform(state)
+    }
+
     /// Whether [`Self::fill_gl_buffers`] can fill the renderer's buffers, so that no upload is needed.
     fn fills_gl_buffers(&self) -> bool {
         false

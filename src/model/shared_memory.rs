@@ -35,13 +35,13 @@ pub struct NewPicture {
 /// A picture in device memory, and the pinned host memory into which it is copied. At most one copy is in flight.
 /// Dropping the picture waits for the copy.
 pub trait SharedPicture: Debug {
-    /// Starts to copy the first `bytes` bytes to the host, without waiting. OpenGL has completed all commands that
-    /// write the picture, and writes it again only after [`Self::is_copied`] or [`Self::finish_copy`].
+    /// Starts to copy the picture to the host, without waiting. OpenGL has completed all commands that write the picture,
+    /// and writes it again only after [`Self::is_copied`] or [`Self::finish_copy`].
     ///
     /// # Errors
     /// `Fault` if a copy is in flight, a reader has the pixels of the last copy, the picture has fewer bytes, or the
     /// device fails.
-    fn start_copy(&mut self, bytes: usize) -> Result<()>;
+    fn start_copy(&mut self, request: CopyRequest) -> Result<()>;
 
     /// Whether no copy is in flight. Also true if the device has failed; [`Self::finish_copy`] then returns the error.
     fn is_copied(&self) -> bool;
@@ -50,7 +50,7 @@ pub trait SharedPicture: Debug {
     ///
     /// # Errors
     /// `Fault` if no copy was started, or if the device fails.
-    fn finish_copy(&mut self) -> Result<Arc<dyn HostPixels>>;
+    fn finish_copy(&mut self) -> Result<CopiedPixels>;
 
     /// Fills the picture with a word and waits, to test that OpenGL sees the word.
     ///
@@ -59,7 +59,45 @@ pub trait SharedPicture: Debug {
     fn fill(&mut self, word: u32) -> Result<()>;
 }
 
-/// Pixels in pinned host memory. While a reference exists, no copy overwrites them.
+/// What a copy moves to the host.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct CopyRequest {
+    /// Bytes of the pixels and of the content behind them.
+    pub bytes: usize,
+    /// The PNG file of the pixels. `None`: pixels only.
+    pub png: Option<PngRequest>,
+}
+
+/// The PNG file of a picture: RGBA8 sRGB pixels without gaps between the rows, top row first.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct PngRequest {
+    /// Width and height in pixels.
+    pub size: [u32; 2],
+    /// Whether the pixels are copied, too. The content behind them always is.
+    pub copies_pixels: bool,
+}
+
+/// The result of a copy.
+#[derive(Debug, Clone)]
+pub struct CopiedPixels {
+    /// Without pixels if `png` is there and the request did not ask for pixels.
+    pub pixels: Arc<dyn HostPixels>,
+    /// The PNG file. `None` if none was requested, or if the picture has no file: it is not opaque, too many files are in
+    /// use, or the implementation has no encoder. The pixels are then there.
+    pub png: Option<CopiedPng>,
+}
+
+/// A PNG file that the device has encoded.
+#[derive(Debug, Clone)]
+pub struct CopiedPng {
+    pub file: Arc<dyn HostPixels>,
+    /// Whether the pixels were copied, too.
+    pub has_pixels: bool,
+    /// Milliseconds that the device encoded.
+    pub ms: f64,
+}
+
+/// Pixels or a file in pinned host memory. While a reference exists, no copy overwrites them.
 pub trait HostPixels: Debug + Send + Sync {
     /// The bytes of the last copy.
     fn bytes(&self) -> &[u8];

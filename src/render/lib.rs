@@ -61,7 +61,7 @@ pub use self::passes::aov::{Aov, AovImage, PartialAov};
 pub use self::passes::picking::{PendingPick, PickHit};
 pub use self::plan::{Allocation, OmittedFeature, RenderPlan, plan};
 pub use self::renderer::{
-    FramePixels, HeldPixels, MappedPixels, PartialFrame, PendingFrame, Renderer, ScenePreparation,
+    EncodedFrame, FramePixels, HeldPixels, MappedPixels, PartialFrame, PendingFrame, Renderer, ScenePreparation,
 };
 pub use self::resources::scene_buffers::SceneBuffers;
 pub use self::types::{

@@ -5,8 +5,9 @@ use std::sync::Arc;
 
 use modalcast::frame::encode_png;
 use modalcast_compute::gpu::launch::DeviceBuffer;
-use modalcast_compute::gpu::{Device, DevicePicture, EncodedPng, PngChannels, PngEncoder};
+use modalcast_compute::gpu::{CudaPictureMemory, Device, DevicePicture, EncodedPng, PngChannels, PngEncoder};
 use modalcast_model::error::Error;
+use modalcast_model::shared_memory::{CopiedPixels, CopyRequest, PictureMemory, PngRequest};
 
 /// A picture on the host.
 struct Picture {
@@ -235,4 +236,70 @@ fn gpu_png_rejects_other_sizes_and_unaligned_pictures() {
         assert!(matches!(error, Error::Invalid { .. }), "{picture:?}: {error}");
     }
     assert!(encode(&mut encoder, &valid).is_some());
+}
+
+/// Fills a shared picture with a pixel, and copies it with its PNG file. 16 further bytes follow the pixels.
+fn copy_filled(memory: &CudaPictureMemory, size: [u32; 2], pixel: [u8; 4], copies_pixels: bool) -> CopiedPixels {
+    let bytes = 4 * size[0] as usize * size[1] as usize + 16;
+    let mut picture = memory.create_picture(bytes).expect("expected device memory").picture;
+    picture.fill(u32::from_le_bytes(pixel)).expect("expected a filled picture");
+    let request = CopyRequest { bytes, png: Some(PngRequest { size, copies_pixels }) };
+    picture.start_copy(request).expect("expected the copy to start");
+    picture.finish_copy().expect("expected the copy to succeed")
+}
+
+/// Also with more sizes than encoders, so that encoders are replaced.
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_shared_pictures_have_the_png_of_the_cpu() {
+    let device = Device::open(0).expect("expected a CUDA device");
+    let memory = CudaPictureMemory::new(&device).expect("expected streams");
+    memory.prepare_encoder().expect("expected an encoder");
+    for round in 0..2 {
+        for side in 1..9_u32 {
+            let (size, pixel) = ([40 * side, 7 * side], [round, side as u8, 9, 255]);
+            let rgba = pixel.repeat((size[0] * size[1]) as usize);
+            let expected = encode_png(size[0], size[1], &rgba).expect("expected a PNG");
+            for copies_pixels in [false, true] {
+                let copied = copy_filled(&memory, size, pixel, copies_pixels);
+                let png = copied.png.expect("expected a file");
+                assert!(png.file.bytes() == expected, "expected the file of the CPU for {size:?}");
+                assert_eq!(png.has_pixels, copies_pixels);
+                let (pixels, rest) = copied.pixels.bytes().split_at(rgba.len());
+                assert_eq!(pixels == rgba, copies_pixels, "expected pixels only on request");
+                assert_eq!(rest, pixel.repeat(4), "expected the bytes behind the pixels");
+            }
+        }
+    }
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_translucent_shared_pictures_are_copied_without_a_file() {
+    let device = Device::open(0).expect("expected a CUDA device");
+    let memory = CudaPictureMemory::new(&device).expect("expected streams");
+    for copies_pixels in [false, true] {
+        let copied = copy_filled(&memory, [50, 30], [1, 2, 3, 254], copies_pixels);
+        assert!(copied.png.is_none());
+        assert_eq!(copied.pixels.bytes(), [1, 2, 3, 254].repeat(50 * 30 + 4));
+    }
+}
+
+/// Readers that keep all files of a size get pixels instead, and files again once they have dropped them.
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_shared_picture_without_a_free_file_is_copied() {
+    let device = Device::open(0).expect("expected a CUDA device");
+    let memory = CudaPictureMemory::new(&device).expect("expected streams");
+    let copy = || copy_filled(&memory, [50, 30], [1, 2, 3, 255], false);
+    let mut files = Vec::new();
+    let copied = loop {
+        let copied = copy();
+        let Some(png) = copied.png else { break copied };
+        files.push(png);
+        assert!(files.len() < 100, "expected a limit");
+    };
+    assert_eq!(copied.pixels.bytes(), [1, 2, 3, 255].repeat(50 * 30 + 4));
+    files.pop();
+    assert!(copy().png.is_some());
 }

@@ -7,13 +7,17 @@ use std::rc::Rc;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use modalcast::frame::encode_png;
 use modalcast_compute::gpu::{CudaDeformer, CudaDeformerOptions, CudaPictureMemory, Device};
+use modalcast_compute::reference::ReferenceDeformer;
 use modalcast_model::deform::Deformer;
 use modalcast_model::error::Result;
 use modalcast_model::raster::GlVertexBuffers;
 use modalcast_model::scene::{BoundingBox, Camera, Scene, SceneState};
 use modalcast_model::shared_memory::{ExportedVertices, ImportedVertices, VertexImporter};
-use modalcast_render::{FrameParams, MAX_FRAMES_IN_FLIGHT, PendingFrame, PixelReadback, Renderer, SceneBuffers};
+use modalcast_render::{
+    FrameParams, FramePixels, MAX_FRAMES_IN_FLIGHT, PendingFrame, PixelReadback, Renderer, SceneBuffers,
+};
 
 use crate::gl::Exclusive;
 use crate::scenes;
@@ -23,7 +27,7 @@ struct Fixture {
     renderer: Exclusive<Renderer>,
     device: Arc<Device>,
     scene: Arc<Scene>,
-    states: Vec<SceneState>,
+    states: Vec<Arc<SceneState>>,
     size: [u32; 2],
     expected_images: Vec<Vec<u8>>,
 }
@@ -35,12 +39,13 @@ impl Fixture {
         let device = Device::open(0).expect("expected a CUDA device");
         let options = scenes::RandomSceneOptions { instances: 5, normal_maps: true, rigid_transforms: false };
         let scene = scenes::random_scene(&[(3000, 12), (50, 0), (7, 3)], options);
-        let states: Vec<SceneState> = (0..states).map(|seed| scenes::random_state(&scene, seed)).collect();
+        let states: Vec<Arc<SceneState>> =
+            (0..states).map(|seed| Arc::new(scenes::random_state(&scene, seed))).collect();
         let mut deformer = open_deformer(&device, &scene, None);
         let buffers = renderer.load(&scene).expect("expected the scene to load");
         assert!(matches!(renderer.info().pixel_readback, PixelReadback::PixelBuffer(_)));
         assert!(buffers.vertex_buffers().importer.is_none());
-        let mut draw = |state: &SceneState| {
+        let mut draw = |state: &Arc<SceneState>| {
             let bounds = deformer.deform(state).expect("expected the step to succeed").bounds;
             renderer.upload(&buffers, deformer.surface().expect("expected a surface")).expect("expected an upload");
             renderer.draw(&buffers, &frame_params(&scene, size, bounds)).expect("expected a frame").rgba
@@ -54,13 +59,23 @@ impl Fixture {
         Self { renderer, device, scene, states, size, expected_images }
     }
 
-    /// Deforms and draws steps with [`MAX_FRAMES_IN_FLIGHT`] frames in flight for at least `seconds` and two rounds of
-    /// the states. `change_buffers` changes the buffers that the deformer gets. Returns the numbers of frames and of
-    /// frames that show another image than that of their step.
+    /// [`Self::draw_steps_with_next`] without steps ahead.
     fn draw_steps(
         &mut self,
         seconds: f64,
         change_buffers: impl FnOnce(GlVertexBuffers) -> GlVertexBuffers,
+    ) -> FrameCounts {
+        self.draw_steps_with_next(seconds, change_buffers, |_| None)
+    }
+
+    /// Deforms and draws steps with [`MAX_FRAMES_IN_FLIGHT`] frames in flight for at least `seconds` and two rounds of
+    /// the states. `next` returns the index of the state that the deformer may compute with that of a step. `change_buffers` changes the buffers that the deformer gets. Returns the numbers of frames and of
+    /// frames that show another image than that of their step.
+    fn draw_steps_with_next(
+        &mut self,
+        seconds: f64,
+        change_buffers: impl FnOnce(GlVertexBuffers) -> GlVertexBuffers,
+        next: impl Fn(usize) -> Option<usize>,
     ) -> FrameCounts {
         let buffers = self.renderer.load(&self.scene).expect("expected the scene to load");
         let vertex_buffers = buffers.vertex_buffers();
@@ -72,7 +87,18 @@ impl Fixture {
         let mut step = 0;
         while step < 2 * self.states.len() || begin.elapsed() < Duration::from_secs_f64(seconds) {
             let index = step % self.states.len();
-            self.submit(&mut deformer, &buffers, index, &mut frames);
+            let next_state = next(step).map(|next| Arc::clone(&self.states[next % self.states.len()]));
+            self.submit(&mut deformer, &buffers, (index, next_state), &mut frames);
+            if next(step).is_some() && step % 16 == 5 {
+                // A readback shows the same step, also if the next one is already computed.
+                let mut reference = ReferenceDeformer::new(&self.scene);
+                reference.deform(&self.states[index]).expect("expected a reference");
+                let (expected, got) = (reference.surface(), deformer.surface());
+                let expected = &expected.expect("expected positions").positions;
+                let got = &got.expect("expected positions").positions;
+                let is_close = |(a, b): (&f32, &f32)| (a - b).abs() < 1e-3;
+                assert!(expected.len() == got.len() && expected.iter().zip(got).all(is_close), "step {step}");
+            }
             while frames.len() >= MAX_FRAMES_IN_FLIGHT {
                 self.finish_oldest(&mut frames, &mut counts);
             }
@@ -86,14 +112,38 @@ impl Fixture {
         counts
     }
 
+    /// Draws each state once with the PNG file. Returns the numbers of files and of files that differ from those of the CPU.
+    fn encode_steps(&mut self, copies_pixels: bool) -> FrameCounts {
+        let buffers = self.renderer.load(&self.scene).expect("expected the scene to load");
+        let mut deformer = open_deformer(&self.device, &self.scene, Some(buffers.vertex_buffers()));
+        let mut counts = FrameCounts::default();
+        let mut frames: VecDeque<(usize, PendingFrame)> = VecDeque::new();
+        for index in 0..self.states.len() {
+            self.submit(&mut deformer, &buffers, (index, None), &mut frames);
+            frames[0].1.request_png(copies_pixels);
+            let (_, frame) = frames.pop_front().expect("expected a frame");
+            let pixels = self.renderer.map_pixels(frame).expect("expected a frame").into_shared_image().rgba;
+            let FramePixels::Encoded(encoded) = &pixels else { panic!("expected a file") };
+            let rgba = &self.expected_images[index];
+            let expected_file = encode_png(self.size[0], self.size[1], rgba).expect("expected a PNG");
+            assert_eq!(pixels.as_ref(), if copies_pixels { &rgba[..] } else { &[] });
+            counts.all += 1;
+            counts.stale += usize::from(encoded.png != expected_file);
+        }
+        drop(deformer);
+        self.renderer.unload(buffers);
+        counts
+    }
+
     fn submit(
         &mut self,
         deformer: &mut CudaDeformer,
         buffers: &SceneBuffers,
-        index: usize,
+        (index, next): (usize, Option<Arc<SceneState>>),
         frames: &mut VecDeque<(usize, PendingFrame)>,
     ) {
-        let bounds = deformer.deform(&self.states[index]).expect("expected the step to succeed").bounds;
+        let deformed = deformer.deform_with_next(&self.states[index], next.as_ref());
+        let bounds = deformed.expect("expected the step to succeed").bounds;
         deformer.fill_gl_buffers().expect("expected filled buffers");
         let params = frame_params(&self.scene, self.size, bounds);
         frames.push_back((index, self.renderer.submit(buffers, &params).expect("expected the frame to start")));
@@ -209,4 +259,30 @@ fn gpu_frames_of_steps_that_are_not_copied_are_found_stale() {
         GlVertexBuffers { importer: Some(Rc::new(OmittingImporter(importer))), ..buffers }
     });
     assert!(counts.stale > 0 && counts.stale < counts.all, "{counts:?}");
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_frames_have_the_png_of_the_cpu() {
+    for size in [[640, 360], [333, 111]] {
+        let mut fixture = Fixture::open(size, 5);
+        for copies_pixels in [false, true] {
+            assert_eq!(fixture.encode_steps(copies_pixels), FrameCounts { all: 5, stale: 0 }, "{size:?}");
+        }
+        // Frames without the request are not affected by earlier requests.
+        assert_eq!(fixture.draw_steps(0.1, |buffers| buffers).stale, 0);
+    }
+}
+
+/// Two steps are computed at once. The frames show the step that was deformed last, also if the next step is not the
+/// announced one.
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_frames_of_steps_ahead_are_not_stale() {
+    let mut fixture = Fixture::open([640, 360], 7);
+    let always = fixture.draw_steps_with_next(3.0, |buffers| buffers, |step| Some(step + 1));
+    assert!(always.stale == 0 && always.all > 100, "{always:?}");
+    let wrong_sometimes = |step: usize| Some(if step % 5 == 3 { step + 2 } else { step + 1 });
+    let mixed = fixture.draw_steps_with_next(3.0, |buffers| buffers, wrong_sometimes);
+    assert!(mixed.stale == 0 && mixed.all > 100, "{mixed:?}");
 }

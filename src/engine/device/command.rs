@@ -5,7 +5,7 @@ use std::sync::Arc;
 use tokio::sync::oneshot;
 
 use super::context::PreparedDeformer;
-use crate::engine::output::step_output::FrameOutput;
+use crate::engine::output::step_output::{FrameOutput, PictureContent};
 use crate::frame::Legend;
 use modalcast_model::backend_settings::RasterPolicy;
 use modalcast_model::deform::{DeformSummary, DeformedSurface, VertexAttributes};
@@ -48,6 +48,8 @@ pub(in crate::engine) enum Command {
     Deform {
         id: SceneId,
         state: Arc<SceneState>,
+        /// The state that will probably be deformed next.
+        next: Option<Arc<SceneState>>,
         reply: Reply<DeformSummary>,
     },
     Draw {
@@ -55,6 +57,7 @@ pub(in crate::engine) enum Command {
         camera: Camera,
         size: FrameSize,
         edges: Option<MeshEdges>,
+        content: PictureContent,
         reply: Reply<FrameImage<FramePixels>>,
     },
     /// Renders an AOV (arbitrary output variable): values instead of colors, with a legend if they form a color map.

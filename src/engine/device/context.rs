@@ -6,9 +6,9 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use super::loaded_scene::LoadedScene;
-use crate::config::{BackendChoice, Config, RendererChoice};
+use crate::config::{BackendChoice, Config, EncodeChoice, RendererChoice};
 use crate::engine::memory_limits::MemoryLimits;
-use crate::engine::output::step_output::FrameOutput;
+use crate::engine::output::step_output::{FrameOutput, PictureContent};
 use crate::frame::Legend;
 use crate::telemetry::ms_since;
 use modalcast_compute::cpu::CpuDeformer;
@@ -16,12 +16,13 @@ use modalcast_compute::gpu::{self, CudaDeformer, CudaDeformerOptions, CudaPictur
 use modalcast_compute::reference::ReferenceDeformer;
 use modalcast_model::backend_settings::{BackendSettings, BatchPolicy, RasterPolicy};
 use modalcast_model::deform::{Backend, Deformer};
-use modalcast_model::error::{Error, Result};
+use modalcast_model::error::{Error, Result, fault};
 use modalcast_model::raster::{RasterGeometry, Rasterizer};
 use modalcast_model::scene::{Camera, FrameSize, MeshEdges, PixelRect, Scene};
+use modalcast_model::shared_memory::PictureMemory;
 use modalcast_render::{
     Aov, AovImage, DevicePreference, FrameImage, FrameParams, MappedPixels, PartialAov, PartialFrame, PendingFrame,
-    PendingPick, PickHit, Renderer, SceneBuffers, ScenePreparation,
+    PendingPick, PickHit, PixelReadback, Renderer, SceneBuffers, ScenePreparation,
 };
 
 /// Description of the deformation backend and the renderer in use.
@@ -49,6 +50,17 @@ pub struct PendingDraw {
 pub(in crate::engine) struct PartialDraw {
     pub frame: PartialFrame,
     upload_ms: Option<f64>,
+    /// What the readers of the frame need.
+    content: PictureContent,
+    /// Whether CUDA encodes frames of the scene.
+    encodes_on_cuda: bool,
+}
+
+impl PartialDraw {
+    /// The same frame for readers of this content.
+    pub(super) fn with_content(self, content: PictureContent) -> Self {
+        Self { content, ..self }
+    }
 }
 
 /// An AOV (arbitrary output variable: values instead of colors) of which some bands of rows are not submitted yet.
@@ -59,6 +71,11 @@ pub(in crate::engine) struct PartialAovDraw {
 }
 
 impl PendingDraw {
+    /// Whether OpenGL has drawn the frame. It may still have to be copied or encoded.
+    pub(super) fn is_drawn(&self) -> bool {
+        self.frame.is_drawn()
+    }
+
     /// Waits for at most `limit`. Returns whether [`DeviceContext::finish_draw`] would now return immediately.
     pub fn is_ready_within(&self, limit: Duration) -> bool {
         self.frame.is_ready_within(limit)
@@ -124,6 +141,9 @@ impl DeformerPreparer {
 pub struct DeviceContext {
     renderer: Result<Renderer>,
     cuda_device: Option<Arc<gpu::Device>>,
+    encode: EncodeChoice,
+    /// Encodes frames as PNG on request. `None` if the CPU encodes all frames.
+    picture_encoder: Option<Rc<CudaPictureMemory>>,
     info: EngineInfo,
     #[cfg(test)]
     create_test_deformer: Option<CreateDeformer>,
@@ -144,9 +164,14 @@ impl DeviceContext {
         if let Ok(renderer) = &mut renderer {
             renderer.set_target_budget(memory.render_target_budget());
         }
-        if let (Ok(renderer), Some(device)) = (&mut renderer, &cuda_device) {
-            share_pictures(renderer, device)?;
-        }
+        let picture_memory = match (&mut renderer, &cuda_device) {
+            (Ok(renderer), Some(device)) => share_pictures(renderer, device)?,
+            _ => None,
+        };
+        let picture_encoder = match config.encode {
+            EncodeChoice::Cpu => None,
+            EncodeChoice::Cuda | EncodeChoice::Fastest => prepare_encoder(picture_memory)?,
+        };
         let info = EngineInfo {
             backend,
             device: device_label,
@@ -156,6 +181,8 @@ impl DeviceContext {
         Ok(Self {
             renderer,
             cuda_device,
+            encode: config.encode,
+            picture_encoder,
             info,
             #[cfg(test)]
             create_test_deformer: None,
@@ -227,7 +254,10 @@ impl DeviceContext {
     ) -> Result<LoadedScene> {
         let (deformer, buffers) = self.complete_deformer(scene, deformer)?;
         let mut loaded_scene = LoadedScene::new(scene, deformer, buffers);
-        let result = loaded_scene.deform_rest().and_then(|()| self.attach_rasterizer(&mut loaded_scene, raster));
+        let result = loaded_scene
+            .deform_rest()
+            .and_then(|()| self.attach_rasterizer(&mut loaded_scene, raster))
+            .and_then(|()| self.select_png_encoder(&mut loaded_scene));
         match result {
             Ok(()) => Ok(loaded_scene),
             Err(error) => {
@@ -279,6 +309,35 @@ impl DeviceContext {
             }
         }
         if policy == RasterPolicy::Fastest { loaded_scene.select_raster_backends(renderer) } else { Ok(()) }
+    }
+
+    /// Selects the device that encodes the frames of a scene as PNG.
+    ///
+    /// # Errors
+    /// The errors of drawing the measured frames.
+    fn select_png_encoder(&mut self, loaded_scene: &mut LoadedScene) -> Result<()> {
+        let (Some(_), Ok(renderer)) = (&self.picture_encoder, &mut self.renderer) else { return Ok(()) };
+        match self.encode {
+            EncodeChoice::Cpu => Ok(()),
+            EncodeChoice::Cuda => {
+                loaded_scene.set_encodes_on_cuda(true);
+                Ok(())
+            }
+            EncodeChoice::Fastest => loaded_scene.select_png_encoder(renderer),
+        }
+    }
+
+    /// Starts to encode the frames that wait for it. The caller calls this before a deformation, and when OpenGL has nothing
+    /// to draw ([`CudaPictureMemory::start_encodings`]).
+    pub(super) fn start_encodings(&self) {
+        if let Some(picture_encoder) = &self.picture_encoder {
+            picture_encoder.start_encodings();
+        }
+    }
+
+    /// Whether CUDA may encode frames.
+    pub(super) const fn encodes_on_cuda(&self) -> bool {
+        self.picture_encoder.is_some()
     }
 
     /// Frees a loaded scene. Waits until CUDA has freed its memory, so that it is available to the next scene.
@@ -356,7 +415,8 @@ impl DeviceContext {
         let has_readback = true;
         let frame = renderer.begin_frame(loaded_scene.buffers()?, &params, has_readback)?;
         loaded_scene.log_frame(frame.info());
-        Ok(PartialDraw { frame, upload_ms })
+        let encodes_on_cuda = loaded_scene.encodes_on_cuda();
+        Ok(PartialDraw { frame, upload_ms, content: PictureContent::PIXELS, encodes_on_cuda })
     }
 
     /// Submits the next draw step of a frame.
@@ -372,8 +432,11 @@ impl DeviceContext {
     /// # Errors
     /// `Fault` of OpenGL.
     pub(in crate::engine) fn finish_partial_draw(&mut self, draw: PartialDraw) -> Result<PendingDraw> {
-        let PartialDraw { frame, upload_ms } = draw;
+        let PartialDraw { frame, upload_ms, content, encodes_on_cuda } = draw;
         let frame = self.renderer.as_mut().map_err(|error| error.clone())?.finish_frame(frame)?;
+        if encodes_on_cuda && content.png {
+            frame.request_png(content.pixels);
+        }
         Ok(PendingDraw { frame, upload_ms })
     }
 
@@ -551,15 +614,33 @@ impl DeviceContext {
 }
 
 /// Lets the renderer draw into memory that it shares with CUDA, if both use the same device and the memory passes the
-/// renderer's check.
+/// renderer's check. Returns the memory if it is shared.
 ///
 /// # Errors
 /// `DeviceLost`; `Fault` when CUDA refuses a stream.
-pub fn share_pictures(renderer: &mut Renderer, device: &Arc<gpu::Device>) -> Result<()> {
-    if renderer.info().cuda_device.is_some() {
-        renderer.share_pictures(Rc::new(CudaPictureMemory::new(device)?))?;
+pub fn share_pictures(renderer: &mut Renderer, device: &Arc<gpu::Device>) -> Result<Option<Rc<CudaPictureMemory>>> {
+    if renderer.info().cuda_device.is_none() {
+        return Ok(None);
     }
-    Ok(())
+    let memory = Rc::new(CudaPictureMemory::new(device)?);
+    renderer.share_pictures(Rc::clone(&memory) as Rc<dyn PictureMemory>)?;
+    Ok((renderer.info().pixel_readback == PixelReadback::CopyEngine).then_some(memory))
+}
+
+/// The memory of pictures that CUDA can encode as PNG. If it cannot, logs the reason.
+///
+/// # Errors
+/// `DeviceLost`.
+fn prepare_encoder(picture_memory: Option<Rc<CudaPictureMemory>>) -> Result<Option<Rc<CudaPictureMemory>>> {
+    let no_memory = || fault("encode", "CUDA and OpenGL share no pictures");
+    match picture_memory.ok_or_else(no_memory).and_then(|memory| memory.prepare_encoder().map(|()| memory)) {
+        Ok(memory) => Ok(Some(memory)),
+        Err(lost @ Error::DeviceLost { .. }) => Err(lost),
+        Err(error) => {
+            tracing::warn!(%error, "the CPU encodes PNG files: CUDA cannot");
+            Ok(None)
+        }
+    }
 }
 
 /// Opens the configured backend. Returns it with its CUDA device, if any, and [`EngineInfo::device`].

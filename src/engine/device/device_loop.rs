@@ -33,6 +33,9 @@
 //! rayon's global thread pool because a long job in that pool, such as building a scene, would delay the copies. A
 //! delayed copy occupies its ring slot and so delays the frames of all scenes.
 //!
+//! If CUDA encodes frames as PNG, a frame that is drawn waits for the next deformation, or until no frame is being drawn:
+//! each change of the GPU between the contexts of OpenGL and CUDA takes 0.2 ms.
+//!
 //! # Failures
 //! A panic in a command, in a poll or in a copy drops the reply channel of that command, so its caller gets an error.
 //! The loop continues. After the first `Error::DeviceLost` the loop answers every command with that error, except
@@ -60,8 +63,10 @@ use modalcast_model::deform::{VertexAttributes, VertexReadback};
 use modalcast_model::error::{Result, fault, fault_in};
 use modalcast_render::{FrameImage, FramePixels, MAX_FRAMES_IN_FLIGHT, PendingPick, PickHit};
 
-/// How long the thread waits for a frame before it checks the command queue again.
-const POLL_INTERVAL: Duration = Duration::from_micros(100);
+/// How long the thread waits for a frame of a software renderer before it checks the command queue again.
+const SOFTWARE_POLL_INTERVAL: Duration = Duration::from_micros(100);
+/// [`SOFTWARE_POLL_INTERVAL`] of hardware, which is idle while a command waits.
+const HARDWARE_POLL_INTERVAL: Duration = Duration::from_micros(20);
 /// Work of at least this many milliseconds is logged, because the other scenes wait for it.
 const LONG_WORK_MS: f64 = 10.0;
 /// Time after which the memory of a render target that no frame uses is freed.
@@ -89,6 +94,7 @@ pub(super) struct DeviceLoop {
     vertices: InFlightQueue<PendingVertices, CopiedVertices>,
     picks: InFlightQueue<PendingPick, Vec<PickHit>>,
     frames: InFlightQueue<FrameInFlight, FrameImage<FramePixels>>,
+    poll_interval: Duration,
     /// When the targets were last checked.
     last_target_check: Instant,
 }
@@ -142,6 +148,7 @@ impl DeviceLoop {
     pub(super) fn new(context: DeviceContext, loss: DeviceLossSender, queue: Arc<CommandQueue>) -> Result<Self> {
         let copy_pool =
             ThreadPoolBuilder::new().num_threads(COPY_THREADS).thread_name(|index| format!("pixels {index}"));
+        let is_hardware = context.info().renderer.as_ref().is_ok_and(|renderer| !renderer.software);
         Ok(Self {
             context,
             loss,
@@ -152,6 +159,7 @@ impl DeviceLoop {
             vertices: InFlightQueue::new(MAX_VERTEX_READBACKS_IN_FLIGHT),
             picks: InFlightQueue::new(MAX_PICKS_IN_FLIGHT),
             frames: InFlightQueue::new(MAX_FRAMES_IN_FLIGHT),
+            poll_interval: if is_hardware { HARDWARE_POLL_INTERVAL } else { SOFTWARE_POLL_INTERVAL },
             last_target_check: Instant::now(),
         })
     }
@@ -222,9 +230,10 @@ impl DeviceLoop {
                 return Some(taken);
             }
             if !(self.vertices.is_empty() && self.picks.is_empty() && self.frames.is_empty()) {
+                self.start_encodings_if_idle();
                 run_caught(|| self.finish_one());
             } else if let Some(output) = self.partial_outputs.values().next() {
-                output.is_ready_within(POLL_INTERVAL);
+                output.is_ready_within(self.poll_interval);
             } else {
                 self.free_unused_targets();
                 if !self.queue.wait(self.context.has_targets().then_some(TARGET_CHECK_INTERVAL)) {
@@ -306,8 +315,10 @@ impl DeviceLoop {
                     self.unload(id);
                 }
             }
-            Command::Deform { id, state, reply } => {
-                let deformed = self.scene(id).and_then(|scene| scene.deform_shared(&state));
+            Command::Deform { id, state, next, reply } => {
+                // The GPU changes to the context of CUDA once for both.
+                self.context.start_encodings();
+                let deformed = self.scene(id).and_then(|scene| scene.deform_shared(&state, next.as_ref()));
                 answer(reply, self.loss.record_loss(deformed));
             }
             Command::UnloadScene { id, reply } => {
@@ -353,16 +364,27 @@ impl DeviceLoop {
     }
 
     /// Answers one readback in flight. Waits for vertices, or for a pick if no frame is in flight. Waits for a frame
-    /// for at most [`POLL_INTERVAL`], and answers nothing if the frame is not ready by then.
+    /// for at most the poll interval, and answers nothing if the frame is not ready by then.
     fn finish_one(&mut self) {
         if !self.vertices.is_empty() {
             self.finish_oldest_vertices();
         } else if self.picks.is_oldest_ready(Duration::ZERO) {
             self.finish_oldest_pick();
-        } else if self.frames.is_oldest_ready(POLL_INTERVAL) {
+        } else if self.frames.is_oldest_ready(self.poll_interval) {
             self.finish_oldest_frame();
         } else if self.frames.is_empty() {
             self.finish_oldest_pick();
+        }
+    }
+
+    /// Starts to encode frames if OpenGL draws no other frame, because the next deformation may be far away.
+    fn start_encodings_if_idle(&self) {
+        let is_drawn = |frame: &FrameInFlight| frame.draw.is_drawn();
+        if self.context.encodes_on_cuda()
+            && self.partial_outputs.is_empty()
+            && self.frames.newest().is_none_or(is_drawn)
+        {
+            self.context.start_encodings();
         }
     }
 

@@ -12,7 +12,7 @@ use super::device_loop::DeviceLoop;
 use super::device_loss::device_loss_channel;
 use super::handle::{DeviceHandle, PendingReply};
 use crate::config::{BackendChoice, Config, RendererChoice};
-use crate::engine::output::step_output::FrameOutput;
+use crate::engine::output::step_output::{FrameOutput, PictureContent};
 use crate::engine::testing;
 use modalcast_model::backend_settings::BackendSettings;
 use modalcast_model::error::{Error, Result};
@@ -79,7 +79,8 @@ impl Fixture {
     }
 
     fn draw(&self, id: SceneId, size: FrameSize) -> PendingReply<FrameImage<FramePixels>> {
-        self.handle.begin_draw(id, Camera::fit_to_scene(&self.scene, size.width, size.height), size, None)
+        let camera = Camera::fit_to_scene(&self.scene, size.width, size.height);
+        self.handle.begin_draw(id, camera, size, None, PictureContent::PIXELS)
     }
 
     /// Runs `count` commands or draw steps.

@@ -12,7 +12,7 @@ use super::context::{DeformerPreparer, DeviceContext, EngineInfo};
 use super::device_loop::DeviceLoop;
 use super::device_loss::{DeviceLoss, device_loss_channel};
 use crate::engine::blocking::run_blocking;
-use crate::engine::output::step_output::FrameOutput;
+use crate::engine::output::step_output::{FrameOutput, PictureContent};
 use crate::frame::Legend;
 use modalcast_model::backend_settings::BackendSettings;
 use modalcast_model::deform::{DeformSummary, VertexAttributes};
@@ -127,8 +127,18 @@ impl DeviceHandle {
 
     /// Starts deforming a scene to a state.
     pub(in crate::engine) fn deform(&self, id: SceneId, state: &Arc<SceneState>) -> PendingReply<DeformSummary> {
+        self.deform_with_next(id, state, None)
+    }
+
+    /// Starts deforming a scene to a state. `next` is the state that will probably follow.
+    pub(in crate::engine) fn deform_with_next(
+        &self,
+        id: SceneId,
+        state: &Arc<SceneState>,
+        next: Option<Arc<SceneState>>,
+    ) -> PendingReply<DeformSummary> {
         let state = Arc::clone(state);
-        self.submit(|reply| Command::Deform { id, state, reply })
+        self.submit(|reply| Command::Deform { id, state, next, reply })
     }
 
     /// Starts drawing the last deformation. Later commands do not affect the frame.
@@ -138,8 +148,9 @@ impl DeviceHandle {
         camera: Camera,
         size: FrameSize,
         edges: Option<MeshEdges>,
+        content: PictureContent,
     ) -> PendingReply<FrameImage<FramePixels>> {
-        self.submit(|reply| Command::Draw { id, camera, size, edges, reply })
+        self.submit(|reply| Command::Draw { id, camera, size, edges, content, reply })
     }
 
     pub(in crate::engine) async fn render_aov(

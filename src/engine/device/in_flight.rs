@@ -37,6 +37,11 @@ impl<P, T> InFlightQueue<P, T> {
         self.entries.is_empty()
     }
 
+    /// The newest readback.
+    pub(super) fn newest(&self) -> Option<&P> {
+        self.entries.back().map(|entry| &entry.pending)
+    }
+
     pub(super) fn is_full(&self) -> bool {
         self.entries.len() >= self.capacity
     }

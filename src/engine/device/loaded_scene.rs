@@ -1,18 +1,21 @@
 //! A scene loaded on the device thread: its deformer, its OpenGL buffers (created on first use), and the last valid
 //! state.
 
+use std::num::NonZero;
 use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::sync::Arc;
+use std::time::Instant;
 
 use super::frame_log::FrameLog;
 use super::scalar_field;
 use crate::engine::output::step_output::FrameOutput;
-use crate::frame::Legend;
+use crate::frame::{Legend, encode_png};
+use crate::telemetry::ms_since;
 use modalcast_model::deform::{DeformSummary, DeformedSurface, Deformer, VertexAttributes, VertexReadback};
 use modalcast_model::error::{Error, Result, fault, invalid};
 use modalcast_model::raster::{RasterGeometry, Rasterizer};
 use modalcast_model::scene::{BoundingBox, Camera, FrameSize, OrientedBounds, Scene, SceneState};
-use modalcast_render::{FrameInfo, FrameParams, Renderer, SceneBuffers};
+use modalcast_render::{FrameInfo, FrameParams, FramePixels, Renderer, SceneBuffers};
 
 /// Positions beyond this bound (scene units) are rejected like infinite ones, because their squares overflow f32 in the
 /// shaders.
@@ -59,6 +62,8 @@ pub struct LoadedScene {
     /// The color map whose values are in the buffers, and its legend.
     cached_color_map: Option<(FrameOutput, Legend)>,
     frame_log: FrameLog,
+    /// Whether CUDA encodes frames of the scene as PNG on request.
+    encodes_on_cuda: bool,
 }
 
 impl LoadedScene {
@@ -80,6 +85,7 @@ impl LoadedScene {
             generation: 0,
             cached_color_map: None,
             frame_log: FrameLog::default(),
+            encodes_on_cuda: false,
         }
     }
 
@@ -88,7 +94,7 @@ impl LoadedScene {
     /// # Errors
     /// `Invalid` when the rest state overflows; `Fault` of the device.
     pub(in crate::engine) fn deform_rest(&mut self) -> Result<()> {
-        let deformed = self.run_deformer(&Arc::clone(&self.current_state))?;
+        let deformed = self.run_deformer(&Arc::clone(&self.current_state), None)?;
         if !is_in_range(&deformed.bounds) {
             let expected = format!("vertices within {MAX_COORDINATE:e}");
             return Err(invalid("scene.rest", expected, format!("{:?}", deformed.bounds)));
@@ -113,16 +119,21 @@ impl LoadedScene {
     /// # Errors
     /// `Invalid` naming the domain whose vertices overflow; `Fault` of the device.
     pub fn deform(&mut self, state: &SceneState) -> Result<DeformSummary> {
-        self.deform_shared(&Arc::new(state.clone()))
+        self.deform_shared(&Arc::new(state.clone()), None)
     }
 
-    /// [`Self::deform`] of a shared state, without a copy.
-    pub(in crate::engine) fn deform_shared(&mut self, state: &Arc<SceneState>) -> Result<DeformSummary> {
+    /// [`Self::deform`] of a shared state, without a copy. `next` is the state that will probably follow
+    /// ([`Deformer::deform_with_next`]).
+    pub(in crate::engine) fn deform_shared(
+        &mut self,
+        state: &Arc<SceneState>,
+        next: Option<&Arc<SceneState>>,
+    ) -> Result<DeformSummary> {
         self.buffers_are_current = false;
-        let result = catch_unwind(AssertUnwindSafe(|| self.run_deformer(state)));
+        let result = catch_unwind(AssertUnwindSafe(|| self.run_deformer(state, next)));
         if !matches!(result, Ok(Ok(_) | Err(Error::DeviceLost { .. }))) {
             // The output may be partially written, so restore it. If that fails too, the first error is more specific.
-            self.run_deformer(&Arc::clone(&self.current_state)).ok();
+            self.run_deformer(&Arc::clone(&self.current_state), None).ok();
         }
         let deformed = result.unwrap_or_else(|panic| resume_unwind(panic))?;
         if is_in_range(&deformed.bounds) {
@@ -131,13 +142,13 @@ impl LoadedScene {
             return Ok(deformed);
         }
         let overflow_error = self.overflow_error(state);
-        self.run_deformer(&Arc::clone(&self.current_state))?;
+        self.run_deformer(&Arc::clone(&self.current_state), None)?;
         Err(overflow_error.unwrap_or_else(|error| error))
     }
 
-    fn run_deformer(&mut self, state: &SceneState) -> Result<DeformSummary> {
+    fn run_deformer(&mut self, state: &Arc<SceneState>, next: Option<&Arc<SceneState>>) -> Result<DeformSummary> {
         self.generation += 1;
-        self.deformer.deform(state)
+        self.deformer.deform_with_next(state, next)
     }
 
     /// The vertices of the last deformation, in host memory.
@@ -259,6 +270,43 @@ impl LoadedScene {
         let contents = self.fill_buffers(renderer, &camera)?;
         let Some(buffers) = &mut self.buffers else { return Err(no_buffers_error()) };
         renderer.select_raster_backends(buffers, &contents.frame_params(camera, BENCHMARK_SIZE)).map(drop)
+    }
+
+    pub(in crate::engine) const fn encodes_on_cuda(&self) -> bool {
+        self.encodes_on_cuda
+    }
+
+    pub(in crate::engine) const fn set_encodes_on_cuda(&mut self, encodes_on_cuda: bool) {
+        self.encodes_on_cuda = encodes_on_cuda;
+    }
+
+    /// Measures both PNG encoders with a frame of [`BENCHMARK_SIZE`] of the current state and selects the faster one: the time
+    /// of CUDA's kernels is compared with that of one thread of the CPU, divided by the number of threads.
+    pub(in crate::engine) fn select_png_encoder(&mut self, renderer: &mut Renderer) -> Result<()> {
+        let FrameSize { width, height } = BENCHMARK_SIZE;
+        let camera = Camera::fit_to_scene(&self.scene, width, height);
+        let params = self.fill_buffers(renderer, &camera)?.frame_params(camera, BENCHMARK_SIZE);
+        let mut encoded = None;
+        // The first encoding allocates memory.
+        for _ in 0..2 {
+            let frame = renderer.submit(self.buffers()?, &params)?;
+            let copies_pixels = true;
+            frame.request_png(copies_pixels);
+            encoded = match renderer.map_pixels(frame)?.into_shared_image().rgba {
+                FramePixels::Encoded(encoded) => encoded.rgba.map(|rgba| (encoded.ms, rgba)),
+                FramePixels::Copied(_) | FramePixels::Held(_) => None,
+            };
+        }
+        // Without a file, for example because the frame is translucent, the CPU encodes.
+        let Some((cuda_ms, rgba)) = encoded else { return Ok(()) };
+        let begin = Instant::now();
+        encode_png(width, height, (*rgba).as_ref())?;
+        let threads = std::thread::available_parallelism().map_or(1, NonZero::get);
+        let cpu_ms = ms_since(begin) / threads as f64;
+        self.encodes_on_cuda = cuda_ms < cpu_ms;
+        let (scene, encodes_on_cuda) = (&self.scene.name, self.encodes_on_cuda);
+        tracing::info!(scene, cuda_ms, cpu_ms, encodes_on_cuda, "measured the PNG encoders");
+        Ok(())
     }
 
     /// Logs how a frame is drawn, unless a frame of the scene was drawn in the same way before.

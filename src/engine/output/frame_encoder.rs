@@ -114,7 +114,7 @@ impl FrameEncoder {
         let bytes = match (&picture.pixels, format) {
             (Pixels::Color(rgba), FrameFormat::Rgba) => rgba.clone(),
             (Pixels::Values(bytes), _) => bytes.clone(),
-            (Pixels::Color(_) | Pixels::ColorMap(..), _) => {
+            (Pixels::Color(_) | Pixels::PngOnly(_) | Pixels::ColorMap(..), _) => {
                 let (bytes, ms) = self.encode_once(&picture, format).await?;
                 stages.push((Stage::Encode, ms));
                 bytes
@@ -159,6 +159,7 @@ impl FrameEncoder {
                 let picture = Arc::clone(picture);
                 self.run(permit, move || draw_color_map(&picture)).await
             }
+            Pixels::PngOnly(_) => Err(fault("encode", "expected colors, got a PNG file")),
             Pixels::Values(_) => Err(fault("encode", "expected colors, got values")),
         }
     }
@@ -311,5 +312,37 @@ pub(in crate::engine) mod tests {
         picture_permits.add_permits(1);
         let second = encoder.encode(first_picture(&output), FrameFormat::Png).await.expect("expected a PNG");
         assert!(image::load_from_memory(&second.output.bytes).is_ok());
+    }
+
+    /// Readers of PNG share the file that the device has encoded. Readers of pixels get them if they are there.
+    #[tokio::test]
+    async fn file_of_the_device_is_not_encoded_again() {
+        let (encoder, _picture_permits) = paused_encoder(1);
+        let rgba = vec![9_u8; 4 * 2 * 2];
+        let output = |has_pixels: bool| {
+            let encoded = modalcast_render::EncodedFrame {
+                png: vec![1, 2, 3],
+                ms: 0.5,
+                rgba: has_pixels.then(|| Box::new(rgba.clone().into())),
+            };
+            let image = FrameImage {
+                width: 2,
+                height: 2,
+                rgba: modalcast_render::FramePixels::Encoded(encoded),
+                times: modalcast_render::FrameTimes::default(),
+                info: FrameInfo::default(),
+            };
+            let body = OutputBody::Frames(StepFrames { pictures: vec![Arc::new(image.into())], camera_version: 0 });
+            StepOutput { body, ..noise_frame(1, 2) }
+        };
+        for has_pixels in [false, true] {
+            let picture = first_picture(&output(has_pixels));
+            let png = encoder.encode(picture, FrameFormat::Png).await.expect("expected the file").output;
+            assert_eq!((&png.bytes[..], png.stages), (&[1, 2, 3][..], vec![(Stage::Encode, 0.5)]));
+            // Without pixels this fails only after a permit for the CPU, which the paused encoder does not give.
+            let pixels = encoder.encode(first_picture(&output(has_pixels)), FrameFormat::Rgba);
+            let pixels = tokio::time::timeout(std::time::Duration::from_millis(20), pixels).await;
+            assert_eq!(pixels.is_ok_and(|frame| frame.is_ok_and(|frame| frame.output.bytes == rgba)), has_pixels);
+        }
     }
 }

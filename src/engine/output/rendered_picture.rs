@@ -9,7 +9,7 @@ use super::frame_format::FrameFormat;
 use crate::engine::lock::lock;
 use crate::frame::Legend;
 use crate::telemetry::{Stage, StageTimes};
-use modalcast_render::{AovImage, FrameImage, FrameInfo, FramePixels, FrameTimes, RenderStage, TimeKey};
+use modalcast_render::{AovImage, EncodedFrame, FrameImage, FrameInfo, FramePixels, FrameTimes, RenderStage, TimeKey};
 
 /// The pixels of one picture of a step. All readers of equal pictures share them, and share each encoding, which is
 /// computed once, on first use.
@@ -34,6 +34,8 @@ pub(super) type SharedEncoding = Arc<OnceCell<(Bytes, f64)>>;
 pub enum Pixels {
     /// RGBA8 sRGB, top row first.
     Color(Bytes),
+    /// Only the PNG file of a color picture, of this size in bytes, because no reader wanted the pixels.
+    PngOnly(usize),
     /// Little-endian numbers, top row first.
     Values(Bytes),
     /// Values that are drawn as a color map.
@@ -57,6 +59,7 @@ impl RenderedPicture {
         match &self.pixels {
             Pixels::Color(bytes) | Pixels::Values(bytes) => bytes.len(),
             Pixels::ColorMap(image, _) => image.bytes.len(),
+            Pixels::PngOnly(bytes) => *bytes,
         }
     }
 
@@ -75,12 +78,26 @@ impl RenderedPicture {
 impl From<FrameImage<FramePixels>> for RenderedPicture {
     fn from(image: FrameImage<FramePixels>) -> Self {
         let FrameImage { width, height, rgba, times, info } = image;
-        let bytes = match rgba {
-            FramePixels::Copied(bytes) => bytes.into(),
-            FramePixels::Held(pixels) => Bytes::from_owner(pixels),
+        let mut encodings = Vec::new();
+        let pixels = match rgba {
+            FramePixels::Encoded(EncodedFrame { png, ms, rgba }) => {
+                let file = Bytes::from(png);
+                let pixels = rgba.map_or(Pixels::PngOnly(file.len()), |rgba| Pixels::Color(shared_bytes(*rgba)));
+                encodings.push((FrameFormat::Png, Arc::new(OnceCell::new_with(Some((file, ms))))));
+                pixels
+            }
+            rgba => Pixels::Color(shared_bytes(rgba)),
         };
-        let (pixels, stages) = (Pixels::Color(bytes), stage_times(&times));
-        Self { width, height, pixels, stages, info, encodings: Mutex::default() }
+        Self { width, height, pixels, stages: stage_times(&times), info, encodings: Mutex::new(encodings) }
+    }
+}
+
+/// The pixels of a frame, without a copy.
+fn shared_bytes(rgba: FramePixels) -> Bytes {
+    match rgba {
+        FramePixels::Copied(bytes) => bytes.into(),
+        FramePixels::Held(pixels) => Bytes::from_owner(pixels),
+        FramePixels::Encoded(encoded) => encoded.rgba.map(|rgba| shared_bytes(*rgba)).unwrap_or_default(),
     }
 }
 

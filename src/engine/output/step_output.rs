@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use super::frame_format::FrameFormat;
 use super::rendered_picture::RenderedPicture;
 use super::step_vertices::StepVertices;
 use crate::telemetry::StageTimes;
@@ -34,6 +35,33 @@ pub struct PictureSpec {
     pub output: FrameOutput,
     /// Lines along mesh edges of [`FrameOutput::Color`]; ignored for other outputs.
     pub edges: Option<MeshEdges>,
+}
+
+/// The forms in which the readers of a color picture want it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(in crate::engine) struct PictureContent {
+    pub pixels: bool,
+    /// The PNG file. If the device does not encode it, the pixels are delivered instead.
+    pub png: bool,
+}
+
+impl PictureContent {
+    pub(in crate::engine) const PIXELS: Self = Self { pixels: true, png: false };
+
+    /// The content for readers of these formats.
+    pub(in crate::engine) fn of_formats(formats: &[FrameFormat]) -> Self {
+        let is_png = |format: &FrameFormat| *format == FrameFormat::Png;
+        Self { pixels: !formats.iter().all(is_png), png: formats.iter().any(is_png) }
+    }
+
+    pub(in crate::engine) const fn union(self, other: Self) -> Self {
+        Self { pixels: self.pixels || other.pixels, png: self.png || other.png }
+    }
+
+    /// Whether readers of another content can use this one. A file can be encoded from pixels.
+    pub(in crate::engine) const fn can_serve(self, other: Self) -> bool {
+        self.pixels || !other.pixels
+    }
 }
 
 /// The quantity that a frame shows.

@@ -97,6 +97,15 @@ struct DeformingStep {
     pending_summary: PendingReply<DeformSummary>,
 }
 
+/// The step after the one that the device is computing. Its state is known, so the device can compute both at once.
+struct NextStep {
+    step_queue: Arc<StepQueue>,
+    queued_step: QueuedStep,
+    /// The state before the step.
+    base: Arc<SceneState>,
+    state: Arc<SceneState>,
+}
+
 /// Progress of the step that the actor works on; see the module's documentation.
 #[derive(Default)]
 enum StepPhase {
@@ -132,6 +141,8 @@ pub(super) struct SceneActor {
     /// The token of the latest writer, whether it is still connected or not.
     last_token: Option<LeaseToken>,
     phase: StepPhase,
+    /// A step that was taken from the queue of the writer early.
+    next_step: Option<NextStep>,
     current: CurrentStep,
     delivery: OutputDelivery,
     checkpoints: SceneCheckpoints,
@@ -161,6 +172,7 @@ impl SceneActor {
             writer: None,
             last_token: None,
             phase: StepPhase::Idle,
+            next_step: None,
             current: CurrentStep::of_opened_scene(state),
             current_state,
             wake,
@@ -230,16 +242,48 @@ impl SceneActor {
 
     /// `Idle` to `Deforming`, if the writer has queued a step. Returns whether a step was started.
     fn begin_step(&mut self) -> bool {
-        let Some(writer) = &self.writer else { return false };
-        let Some(queued_step) = writer.step_queue.take() else { return false };
-        let stages = queued_step.stages();
-        let QueuedStep { update, merged, .. } = queued_step;
-        let state = next_state(&self.scene, &self.current.state, self.starts_from_rest, &update);
-        let state = Arc::new(SceneState { run: self.run, ..state });
-        let pending_summary = self.device.deform(self.id, &state);
+        let Some(writer) = &self.writer else {
+            self.next_step = None;
+            return false;
+        };
         let step_queue = Arc::clone(&writer.step_queue);
+        // The steps of an earlier writer are dropped.
+        let next_step = self.next_step.take().filter(|next_step| Arc::ptr_eq(&next_step.step_queue, &step_queue));
+        let (queued_step, state) = match next_step {
+            Some(NextStep { queued_step, base, state, .. })
+                if Arc::ptr_eq(&base, &self.current.state) && !self.starts_from_rest =>
+            {
+                (queued_step, state)
+            }
+            // The step before it was rejected.
+            Some(NextStep { queued_step, .. }) => {
+                let state = self.state_after(&self.current.state, self.starts_from_rest, &queued_step);
+                (queued_step, state)
+            }
+            None => {
+                let Some(queued_step) = step_queue.take() else { return false };
+                let state = self.state_after(&self.current.state, self.starts_from_rest, &queued_step);
+                (queued_step, state)
+            }
+        };
+        self.next_step = step_queue.take_early().map(|next| NextStep {
+            step_queue: Arc::clone(&step_queue),
+            base: Arc::clone(&state),
+            state: self.state_after(&state, false, &next),
+            queued_step: next,
+        });
+        let next_state = self.next_step.as_ref().map(|next_step| Arc::clone(&next_step.state));
+        let stages = queued_step.stages();
+        let merged = queued_step.merged;
+        let pending_summary = self.device.deform_with_next(self.id, &state, next_state);
         self.phase = StepPhase::Deforming(DeformingStep { step_queue, merged, stages, state, pending_summary });
         true
+    }
+
+    /// The state after a step of the present run.
+    fn state_after(&self, base: &SceneState, starts_from_rest: bool, step: &QueuedStep) -> Arc<SceneState> {
+        let state = next_state(&self.scene, base, starts_from_rest, &step.update);
+        Arc::new(SceneState { run: self.run, ..state })
     }
 
     /// `Deforming` to `Delivering`, or to `Idle` if the device rejects the step. Delivers readbacks in flight while the
@@ -322,7 +366,11 @@ impl SceneActor {
     /// Whether another step is queued. If so, readbacks of the current step are only started and overlap with the
     /// computation of the next step.
     fn has_queued_step(&self) -> bool {
-        self.writer.as_ref().is_some_and(|writer| !writer.step_queue.is_closed() && writer.step_queue.has_queued())
+        let has_next = |step_queue: &Arc<StepQueue>| {
+            step_queue.has_queued()
+                || self.next_step.as_ref().is_some_and(|next_step| Arc::ptr_eq(&next_step.step_queue, step_queue))
+        };
+        self.writer.as_ref().is_some_and(|writer| !writer.step_queue.is_closed() && has_next(&writer.step_queue))
     }
 
     /// Whether lossless subscribers may block the writer: only if the writer of the completed step is lossless and

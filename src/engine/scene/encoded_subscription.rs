@@ -8,7 +8,7 @@ use super::subscriber::Subscription;
 use crate::engine::output::encoding_task::EncodingTask;
 use crate::engine::output::frame_encoder::{EncodedFrame, FrameEncoder, StepPicture};
 use crate::engine::output::frame_format::FrameFormat;
-use crate::engine::output::step_output::StepOutput;
+use crate::engine::output::step_output::{PictureContent, StepOutput};
 use modalcast_model::error::{Error, Result};
 
 /// A stream that holds at least this many bytes of pixels accepts no further step.
@@ -38,6 +38,7 @@ impl EncodedSubscription {
     /// Encodes the frames of the first `max_steps` steps of a subscription; 0 means all. `formats` has the format of
     /// each picture of the subscription.
     pub fn new(subscription: Subscription, encoder: FrameEncoder, formats: Vec<FrameFormat>, max_steps: u64) -> Self {
+        subscription.set_content(PictureContent::of_formats(&formats));
         let remaining_steps = if max_steps == 0 { u64::MAX } else { max_steps };
         Self { subscription, encoder, formats, remaining_steps, encodings: VecDeque::new(), end_error: None }
     }

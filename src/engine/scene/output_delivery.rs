@@ -14,6 +14,7 @@ use super::step_queue::CompletedStep;
 use super::subscriber::Subscriber;
 use crate::config::Config;
 use crate::engine::device::handle::{DeviceHandle, PendingReply};
+use crate::engine::output::step_output::PictureContent;
 use modalcast_model::deform::VertexAttributes;
 use modalcast_model::error::{Error, Result};
 
@@ -115,6 +116,7 @@ impl OutputDelivery {
             mode,
             attributes,
             starts_shared_copy,
+            content: self.combined_content(),
             vertex_recipients: Vec::new(),
             started_pictures: VecDeque::new(),
             drawn_pictures: Vec::new(),
@@ -190,6 +192,13 @@ impl OutputDelivery {
         open_subscribers
             .filter_map(|subscriber| attributes_for(subscriber, current))
             .fold(VertexAttributes::default(), VertexAttributes::union)
+    }
+
+    /// The union of the forms in which all subscribers read color pictures, so that equal pictures are drawn once.
+    fn combined_content(&self) -> PictureContent {
+        let open_subscribers = self.subscribers.iter().filter(|subscriber| !subscriber.is_closed());
+        let contents = open_subscribers.filter_map(Subscriber::content);
+        contents.reduce(PictureContent::union).unwrap_or(PictureContent::PIXELS)
     }
 
     fn drop_closed_subscribers(&mut self) {

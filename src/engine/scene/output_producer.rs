@@ -16,7 +16,9 @@ use crate::engine::device::command::{CopiedVertices, SceneId};
 use crate::engine::device::handle::DeviceHandle;
 use crate::engine::output::pick_result::with_transforms;
 use crate::engine::output::rendered_picture::RenderedPicture;
-use crate::engine::output::step_output::{FrameOutput, OutputBody, OutputSpec, PictureSpec, StepFrames, StepOutput};
+use crate::engine::output::step_output::{
+    FrameOutput, OutputBody, OutputSpec, PictureContent, PictureSpec, StepFrames, StepOutput,
+};
 use crate::engine::output::step_vertices::StepVertices;
 use crate::telemetry::Stage;
 use modalcast_model::deform::VertexAttributes;
@@ -56,6 +58,8 @@ pub(super) struct DeliveryRound<'a> {
     pub(super) attributes: VertexAttributes,
     /// Whether the round ends by starting one copy of `attributes` for all `vertex_recipients`.
     pub(super) starts_shared_copy: bool,
+    /// The forms in which all subscribers together read color pictures.
+    pub(super) content: PictureContent,
     /// The subscribers that wait for that copy.
     pub(super) vertex_recipients: Vec<Recipient>,
     /// Pictures that this round started and that are in flight, oldest first; at most [`MAX_FRAMES_IN_FLIGHT`].
@@ -150,7 +154,7 @@ impl OutputProducer {
             .readbacks
             .iter_mut()
             .chain(&mut round.started_pictures)
-            .find_map(|pending| pending.recipients_of(step_count, spec));
+            .find_map(|pending| pending.recipients_of(step_count, spec, round.content));
         if let Some(recipients) = recipients_of_equal {
             return recipients.push(recipient);
         }
@@ -161,8 +165,10 @@ impl OutputProducer {
                 self.readbacks.flush_before(step_count).await;
                 round.drawn_pictures.extend(oldest.deliver().await);
             }
-            let reply = self.device.begin_draw(self.scene_on_device.id, spec.camera, spec.size, spec.edges);
-            round.started_pictures.push_back(PendingReadback::of_picture(round.current, *spec, reply, recipient));
+            let content = round.content;
+            let reply = self.device.begin_draw(self.scene_on_device.id, spec.camera, spec.size, spec.edges, content);
+            let pending = PendingReadback::of_picture(round.current, *spec, content, reply, recipient);
+            round.started_pictures.push_back(pending);
             return;
         }
         let picture = tokio::select! {
@@ -251,7 +257,8 @@ impl OutputProducer {
     async fn draw(&self, picture: &PictureSpec) -> Result<RenderedPicture> {
         let (id, PictureSpec { camera, size, output, edges }) = (self.scene_on_device.id, *picture);
         if output == FrameOutput::Color {
-            return self.device.begin_draw(id, camera, size, edges).wait().await.map(RenderedPicture::from);
+            let content = PictureContent::PIXELS;
+            return self.device.begin_draw(id, camera, size, edges, content).wait().await.map(RenderedPicture::from);
         }
         let (image, legend) = self.device.render_aov(id, camera, size, output).await?;
         Ok(RenderedPicture::from_aov(image, legend))

@@ -10,14 +10,15 @@
 //! OpenGL    [draw k][read k][upload][draw k+1][read k+1][upload]
 //! ```
 //!
-//! If OpenGL and CUDA share memory, CUDA deforms step k+1 while OpenGL draws frame k, and the GPU's copy engine reads
-//! frame k-1. The GPU changes between the contexts of OpenGL and CUDA once per step, within a frame. OpenGL copies the
-//! vertices of a step at the beginning of its frame, so that two sets of vertices are sufficient.
+//! If OpenGL and CUDA share memory, CUDA deforms steps while OpenGL draws earlier frames, and its copy engine reads the
+//! frames before them. CUDA deforms two steps at once if the second one is queued, because the GPU needs 0.2 ms for each
+//! change between the contexts of OpenGL and CUDA. OpenGL copies the vertices of a step at the beginning of its frame, so
+//! that four sets of vertices are sufficient.
 //!
 //! ```text
-//! OpenGL       [copy, draw k     ][copy, draw k+1   ][copy, draw k+2   ]
-//! CUDA               [deform k+1]       [deform k+2]
-//! copy engine  [read k-1]          [read k  ]          [read k+1]
+//! OpenGL       [draw k][draw k+1]                [draw k+2][draw k+3]
+//! CUDA                           [deform k+2, k+3]                   [deform k+4, k+5]
+//! copy engine          [read k]  [read k+1]                [read k+2][read k+3]
 //! ```
 //!
 //! If CUDA maps OpenGL's buffers instead, a step and the copy of its vertices are submitted together while every step
@@ -44,7 +45,7 @@ use crate::engine::device::command::CopiedVertices;
 use crate::engine::device::handle::PendingReply;
 use crate::engine::lock::lock;
 use crate::engine::output::rendered_picture::RenderedPicture;
-use crate::engine::output::step_output::{OutputBody, PictureSpec, StepFrames, StepId, StepOutput};
+use crate::engine::output::step_output::{OutputBody, PictureContent, PictureSpec, StepFrames, StepId, StepOutput};
 use crate::engine::output::step_vertices::StepVertices;
 use crate::telemetry::{Stage, StageTimes};
 use modalcast_model::error::Result;
@@ -191,6 +192,8 @@ enum Readback {
 /// A readback in flight.
 pub(super) struct PendingReadback {
     readback: Readback,
+    /// The forms in which a color picture is read.
+    content: PictureContent,
     /// The scene's step count when the readback was started.
     step_count: u64,
     /// The step that is acknowledged after this readback, if this is the last readback of the step.
@@ -211,24 +214,32 @@ impl PendingReadback {
     pub(super) fn of_picture(
         current: &CurrentStep,
         spec: PictureSpec,
+        content: PictureContent,
         reply: PendingReply<FrameImage<FramePixels>>,
         recipient: PictureRecipient,
     ) -> Self {
-        Self::new(current, Readback::Picture(Box::new(spec), InFlight::new(reply, vec![recipient])))
+        let readback = Readback::Picture(Box::new(spec), InFlight::new(reply, vec![recipient]));
+        Self { content, ..Self::new(current, readback) }
     }
 
     const fn new(current: &CurrentStep, readback: Readback) -> Self {
-        Self { readback, step_count: current.step_count, step_to_acknowledge: None }
+        let content = PictureContent::PIXELS;
+        Self { readback, content, step_count: current.step_count, step_to_acknowledge: None }
     }
 
-    /// The recipients of this picture of the scene's `step_count`-th step; `None` if this is another readback.
+    /// The recipients of this picture of the scene's `step_count`-th step; `None` if this is another readback, or if it
+    /// lacks content.
     pub(super) fn recipients_of(
         &mut self,
         step_count: u64,
         picture: &PictureSpec,
+        content: PictureContent,
     ) -> Option<&mut Vec<PictureRecipient>> {
+        let has_content = self.content.can_serve(content);
         match &mut self.readback {
-            Readback::Picture(spec, in_flight) if self.step_count == step_count && **spec == *picture => {
+            Readback::Picture(spec, in_flight)
+                if has_content && self.step_count == step_count && **spec == *picture =>
+            {
                 Some(&mut in_flight.recipients)
             }
             _ => None,

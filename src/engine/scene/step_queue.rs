@@ -183,6 +183,12 @@ impl StepQueue {
         Some(step)
     }
 
+    /// Takes the step after the one that is being computed, so that both can be computed at once. `None` if the queue is not
+    /// lossless: a later step may then replace the queued one.
+    pub(super) fn take_early(&self) -> Option<QueuedStep> {
+        if self.delivery == Delivery::Lossless { self.take() } else { None }
+    }
+
     /// Whether a step is queued.
     pub(in crate::engine) fn has_queued(&self) -> bool {
         !self.lock().queued.is_empty()
@@ -300,6 +306,19 @@ mod tests {
         assert!(step_queue.push(step(3, 0, [0.0; 2])).is_err(), "expected a full window until the report is taken");
         step_queue.state.lock().expect("expected an unpoisoned lock").reports.clear();
         step_queue.push(step(3, 0, [0.0; 2])).expect("expected capacity after the report was taken");
+    }
+
+    #[test]
+    fn only_a_lossless_queue_gives_a_step_early() {
+        for (delivery, expected) in [(Delivery::Lossless, Some(2)), (Delivery::Latest, None)] {
+            let step_queue = StepQueue::new(delivery, Overflow::Reject, 4, Arc::default());
+            step_queue.push(step(1, 0, [0.0; 2])).expect("expected capacity");
+            assert_eq!(step_queue.take().map(|step| step.update.number), Some(1));
+            step_queue.push(step(2, 0, [0.0; 2])).expect("expected capacity");
+            assert_eq!(step_queue.take_early().map(|step| step.update.number), expected);
+            assert_eq!(step_queue.has_queued(), expected.is_none());
+            assert!(!step_queue.is_drained());
+        }
     }
 
     #[test]

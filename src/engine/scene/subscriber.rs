@@ -7,15 +7,16 @@
 //! If the future of `next` is dropped, the next call returns the result that the dropped future has requested, even if
 //! the scene has completed a later step since.
 
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use tokio::sync::{Notify, mpsc, watch};
 
 use super::delivery::{Delivery, StreamDelivery};
 use super::frame_stream::{CameraControl, CameraState};
-use crate::engine::output::step_output::{OutputSpec, StepOutput};
+use crate::engine::lock::lock;
+use crate::engine::output::step_output::{OutputSpec, PictureContent, StepOutput};
 use modalcast_model::error::{Error, Result, fault};
 
 /// Number of results that a lossless subscriber may leave unread before it blocks the writer. Also the capacity of the
@@ -43,6 +44,8 @@ pub(in crate::engine) struct Subscriber {
     cameras: Option<watch::Receiver<CameraState>>,
     /// The version of the cameras in this subscriber's last result.
     delivered_camera_version: u64,
+    /// The forms in which the subscription reads color pictures.
+    content: Arc<Mutex<PictureContent>>,
     /// Number of results that may be sent now. The subscription grants credits.
     credits: Arc<AtomicUsize>,
     results: mpsc::Sender<Result<StepOutput>>,
@@ -85,6 +88,11 @@ impl Subscriber {
     /// Whether the subscriber has a credit for a further result.
     pub(in crate::engine) fn has_credit(&self) -> bool {
         self.credits.load(Ordering::Acquire) > 0
+    }
+
+    /// The forms in which color pictures are read; `None` for other outputs than frames.
+    pub(in crate::engine) fn content(&self) -> Option<PictureContent> {
+        self.cameras.as_ref().map(|_| *lock(&self.content))
     }
 
     /// Whether the subscription was dropped or an error was sent.
@@ -146,6 +154,7 @@ pub struct Subscription {
     /// Whether a `Latest` subscription has granted a credit whose result was not received yet.
     has_granted_credit: bool,
     rate_limiter: Option<RateLimiter>,
+    content: Arc<Mutex<PictureContent>>,
     credits: Arc<AtomicUsize>,
     results: mpsc::Receiver<Result<StepOutput>>,
     end: watch::Receiver<Option<EndReason>>,
@@ -162,6 +171,7 @@ impl Subscription {
     ) -> (Subscriber, Self) {
         let initial_credits = if delivery.delivery() == Delivery::Lossless { LOSSLESS_CREDITS } else { 0 };
         let credits = Arc::new(AtomicUsize::new(initial_credits));
+        let content = Arc::new(Mutex::new(PictureContent::PIXELS));
         let (result_sender, results) = mpsc::channel(LOSSLESS_CREDITS);
         let (end_sender, end) = watch::channel(None);
         let cameras = match &spec {
@@ -175,6 +185,7 @@ impl Subscription {
             stalled_since: None,
             cameras: cameras.as_ref().map(CameraControl::receiver),
             delivered_camera_version: 0,
+            content: Arc::clone(&content),
             credits: Arc::clone(&credits),
             results: result_sender,
             is_error_sent: Arc::default(),
@@ -182,9 +193,16 @@ impl Subscription {
         };
         let rate_limiter =
             delivery.min_interval().map(|interval| RateLimiter { interval, next_credit: Instant::now() });
+        let has_granted_credit = false;
         let subscription =
-            Self { delivery, cameras, has_granted_credit: false, rate_limiter, credits, results, end, scene_wake };
+            Self { delivery, cameras, has_granted_credit, rate_limiter, content, credits, results, end, scene_wake };
         (subscriber, subscription)
+    }
+
+    /// Tells the scene in which forms color pictures are read: pixels until the first call. A picture that was started
+    /// before has the former content.
+    pub(in crate::engine) fn set_content(&self, content: PictureContent) {
+        *lock(&self.content) = content;
     }
 
     /// Which steps the subscription receives, and the limit on their rate.

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use super::gl::{Buffer, Fence, Gl, PictureBuffer, ReadbackView, StagingBuffer};
 use modalcast_model::error::{Error, Result};
-use modalcast_model::shared_memory::PictureMemory;
+use modalcast_model::shared_memory::{PictureMemory, PngRequest};
 
 /// Maximum number of frames of one render target in flight.
 pub const MAX_FRAMES_IN_FLIGHT: usize = 3;
@@ -158,6 +158,13 @@ impl ReadbackSlot {
         match self.memory.as_ref()? {
             SlotMemory::Staging(_) => None,
             SlotMemory::Picture(picture) => Some(&picture.buffer),
+        }
+    }
+
+    /// Requests the PNG file of the frame in addition to or instead of its pixels. Without effect on a staging buffer.
+    pub(crate) fn request_png(&self, request: PngRequest) {
+        if let Some(SlotMemory::Picture(picture)) = &self.memory {
+            picture.request_png(request);
         }
     }
 

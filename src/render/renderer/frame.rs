@@ -8,6 +8,7 @@ use std::ops::Range;
 
 use super::Renderer;
 use super::pending_frame::{MappedPixels, PendingFrame};
+use crate::device::gl::ReadbackView;
 use crate::layout;
 use crate::pass::{FrameTimes, Pass};
 use crate::resources::scene_buffers::SceneBuffers;
@@ -61,6 +62,7 @@ impl Renderer {
         let limit = pending_frame.time_left();
         let PendingFrame { desc, readback, fence, passes, mut stats, info, .. } = pending_frame;
         let mut view = readback.map_or(Ok(None), |readback| readback.into_view(&fence, limit))?;
+        let png = view.as_mut().and_then(ReadbackView::take_png);
         if let Some(view) = &mut view {
             let [oit_range, cull_range] = desc.readback_ranges().map(|range| range.start as usize..range.end as usize);
             let counters_in = |range: Range<usize>| view.bytes().get(range).filter(|counters| !counters.is_empty());
@@ -89,7 +91,7 @@ impl Renderer {
             }
         }
         let times = FrameTimes::of_passes(&times);
-        Ok(MappedPixels { width: desc.width, height: desc.height, view, times, info })
+        Ok(MappedPixels { width: desc.width, height: desc.height, view, png, times, info })
     }
 
     fn submit_frame(

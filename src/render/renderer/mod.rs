@@ -24,7 +24,7 @@ use std::time::{Duration, Instant};
 use rayon::{ThreadPool, ThreadPoolBuilder};
 
 pub use self::partial_frame::PartialFrame;
-pub use self::pending_frame::{FramePixels, HeldPixels, MappedPixels, PendingFrame};
+pub use self::pending_frame::{EncodedFrame, FramePixels, HeldPixels, MappedPixels, PendingFrame};
 pub use self::preparation::ScenePreparation;
 use crate::device::readback_ring::ReadbackRing;
 use crate::device::{self, gl, gl::Gl};

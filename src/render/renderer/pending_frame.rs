@@ -11,6 +11,7 @@ use crate::pass::{FrameTimes, Pass, RenderStage};
 use crate::resources::target_desc::TargetDesc;
 use crate::types::{FrameImage, FrameInfo, FrameStats};
 use modalcast_model::error::{Error, Result};
+use modalcast_model::shared_memory::{CopiedPng, PngRequest};
 
 /// Bytes that one parallel task copies: enough to hide the cost of starting the task.
 const COPY_CHUNK_BYTES: usize = 1 << 20;
@@ -40,6 +41,8 @@ pub struct MappedPixels {
     pub(super) width: u32,
     pub(super) height: u32,
     pub(super) view: Option<ReadbackView>,
+    /// The PNG file, if [`PendingFrame::request_png`] has requested it and the device has encoded it.
+    pub(super) png: Option<CopiedPng>,
     pub(super) times: FrameTimes,
     pub(super) info: FrameInfo,
 }
@@ -49,6 +52,19 @@ pub struct MappedPixels {
 pub enum FramePixels {
     Copied(Vec<u8>),
     Held(HeldPixels),
+    /// The PNG file, which the device has encoded.
+    Encoded(EncodedFrame),
+}
+
+/// The PNG file of a frame.
+#[derive(Debug)]
+pub struct EncodedFrame {
+    /// A copy, so that the device's memory for files is free for the next frames.
+    pub png: Vec<u8>,
+    /// Milliseconds that the device encoded.
+    pub ms: f64,
+    /// The pixels, if they were requested, too.
+    pub rgba: Option<Box<FramePixels>>,
 }
 
 /// Pixels in the memory of a readback. No other frame can use the memory while this value exists.
@@ -66,6 +82,7 @@ impl AsRef<[u8]> for FramePixels {
         match self {
             Self::Copied(bytes) => bytes,
             Self::Held(pixels) => pixels.as_ref(),
+            Self::Encoded(encoded) => encoded.rgba.as_deref().map_or(&[], Self::as_ref),
         }
     }
 }
@@ -83,6 +100,19 @@ impl PartialEq for FramePixels {
 }
 
 impl PendingFrame {
+    /// Requests that the device encodes the frame as PNG. The pixels are copied, too, if `copies_pixels`, or if the device
+    /// cannot encode the frame ([`crate::PixelReadback`]).
+    pub fn request_png(&self, copies_pixels: bool) {
+        if let Some(FrameReadback::Whole(slot)) = &self.readback {
+            slot.request_png(PngRequest { size: [self.desc.width, self.desc.height], copies_pixels });
+        }
+    }
+
+    /// Whether OpenGL has drawn the frame. It may still have to be copied or encoded.
+    pub fn is_drawn(&self) -> bool {
+        self.fence.is_done_within(Duration::ZERO)
+    }
+
     /// Whether [`super::Renderer::map_pixels`] would return without waiting.
     pub fn is_ready(&self) -> bool {
         self.is_ready_within(Duration::ZERO)
@@ -136,15 +166,30 @@ impl MappedPixels {
         self
     }
 
-    /// The pixels, held in the memory of the readback if enough of it is left for the next frames, else copied.
-    pub fn into_shared_image(self) -> FrameImage<FramePixels> {
-        let Self { width, height, view, times, info } = self;
+    /// The pixels, held in the memory of the readback if enough of it is left for the next frames, else copied. With the
+    /// PNG file, if it was requested and the device has encoded it.
+    pub fn into_shared_image(mut self) -> FrameImage<FramePixels> {
+        let Some(CopiedPng { file, has_pixels, ms }) = self.png.take() else { return self.into_shared_pixels() };
+        let (width, height, info) = (self.width, self.height, self.info);
+        let png = file.bytes().to_vec();
+        drop(file);
+        let (times, rgba) = if has_pixels {
+            let image = self.into_shared_pixels();
+            (image.times, Some(Box::new(image.rgba)))
+        } else {
+            (self.times, None)
+        };
+        FrameImage { width, height, rgba: FramePixels::Encoded(EncodedFrame { png, ms, rgba }), times, info }
+    }
+
+    fn into_shared_pixels(self) -> FrameImage<FramePixels> {
+        let Self { width, height, view, png, times, info } = self;
         match view {
             Some(view) if view.can_be_held() => {
                 FrameImage { width, height, rgba: FramePixels::Held(HeldPixels(view)), times, info }
             }
             view => {
-                let FrameImage { rgba, times, .. } = Self { width, height, view, times, info }.into_image();
+                let FrameImage { rgba, times, .. } = Self { width, height, view, png, times, info }.into_image();
                 FrameImage { width, height, rgba: FramePixels::Copied(rgba), times, info }
             }
         }
@@ -153,7 +198,7 @@ impl MappedPixels {
     /// Copies the pixels, with several threads if there are many, unless they were copied band by band.
     pub fn into_image(self) -> FrameImage {
         let begin = Instant::now();
-        let Self { width, height, view, mut times, info } = self;
+        let Self { width, height, view, mut times, info, .. } = self;
         let rgba = match view {
             Some(ReadbackView::Copied(bytes)) => bytes,
             view => {

@@ -4,6 +4,9 @@
 //! Steps are double-buffered. A step can be submitted while the previous step is in flight: the host writes the values
 //! of the new step while the previous step runs. The host can also fetch the vertices of a step while the next step
 //! runs. The next step then writes another output set (buffers of positions, normals and tangents).
+//!
+//! If OpenGL draws every step and the next state is known, two steps are submitted at once, because each change of the GPU
+//! between the contexts of OpenGL and CUDA takes 0.2 ms. The second one, the step ahead, is shown when its state is deformed.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -63,8 +66,10 @@ pub struct CudaDeformer {
     output_ring: OutputRing,
     /// Steps in flight, oldest first.
     in_flight: VecDeque<StepInFlight>,
-    /// Index in `step_slots` of the last step.
-    last_slot: usize,
+    /// Index in `step_slots` of the step that is shown.
+    shown_slot: usize,
+    /// The state of the newest step in flight, if that is a step ahead.
+    ahead: Option<Arc<SceneState>>,
     readbacks: ReadbackPool,
     /// The readback of the last step and the attributes it copies; `None` after the next step is submitted.
     readback: Option<(VertexAttributes, VertexReadback)>,
@@ -152,13 +157,14 @@ impl CudaDeformer {
         let output = OutputBuffers::new(&device, &plan, gl_buffers)?;
         Ok(Self {
             step_slots: vec![StepSlot::new(&device, &kernels, &inputs)?],
-            output_ring: OutputRing::new(OutputBuffers::MAX_SETS, max_changed_domains),
+            output_ring: OutputRing::new(output.max_sets(), max_changed_domains),
             inputs,
             kernels,
             output,
             displacements,
             in_flight: VecDeque::new(),
-            last_slot: 0,
+            shown_slot: 0,
+            ahead: None,
             readbacks: ReadbackPool::default(),
             readback: None,
             surface: PinnedSurface::empty(),
@@ -197,16 +203,43 @@ impl CudaDeformer {
         if self.in_flight.len() == MAX_STEPS_IN_FLIGHT {
             return Err(Error::Busy { queue: "steps in flight", limit: MAX_STEPS_IN_FLIGHT });
         }
+        if self.ahead.is_some() {
+            // The state of the step ahead is not the one that is deformed.
+            self.invalidate();
+        }
         self.host_attributes = VertexAttributes::default();
         self.readback = None;
         let submitted = Instant::now();
         // If a panic unwinds from `start`, the step may run although it is not in `in_flight`: wait for it.
         let guard = WaitForStream::new(self.device.stream());
-        let step = self.start(state, submitted).inspect_err(|_| self.invalidate())?;
-        self.last_slot = step.slot;
-        self.in_flight.push_back(step);
+        let was_drawn = std::mem::take(&mut self.is_drawn);
+        let step = self.start(state, submitted, was_drawn, false).inspect_err(|_| self.invalidate())?;
+        if let Some(step) = step {
+            self.shown_slot = step.slot;
+            self.in_flight.push_back(step);
+        }
         guard.disarm();
         Ok(())
+    }
+
+    /// Starts a step ahead, which follows the step that [`Self::submit`] has started. Does nothing if no output is free.
+    fn submit_ahead(&mut self, state: &Arc<SceneState>) -> Result<()> {
+        let guard = WaitForStream::new(self.device.stream());
+        if let Some(step) = self.start(state, Instant::now(), true, true).inspect_err(|_| self.invalidate())? {
+            self.in_flight.push_back(step);
+            self.ahead = Some(Arc::clone(state));
+        }
+        guard.disarm();
+        Ok(())
+    }
+
+    /// Whether a step ahead leaves everything that readers of the shown step read: the device has one buffer each for
+    /// displacements and boxes, and the host one truncation bound.
+    fn supports_steps_ahead(&self) -> bool {
+        !self.output.maps_gl_buffers()
+            && self.displacements.is_none()
+            && self.kernels.bounds.boxes.is_none()
+            && self.inputs.retained_chunk_counts().is_none()
     }
 
     /// Waits for the oldest step in flight.
@@ -226,6 +259,16 @@ impl CudaDeformer {
         Ok(DeformSummary { bounds, oriented_bounds, ms })
     }
 
+    /// Waits for all steps in flight up to the one that is shown.
+    fn finish_shown(&mut self) -> Result<DeformSummary> {
+        loop {
+            let summary = self.finish()?;
+            if self.in_flight.len() == usize::from(self.ahead.is_some()) {
+                return Ok(summary);
+            }
+        }
+    }
+
     /// Starts the graph of the last full step again, to measure its time.
     ///
     /// # Errors
@@ -234,19 +277,26 @@ impl CudaDeformer {
         if self.output_ring.shown_output().is_none() {
             return Err(Error::Fault { stage: "replay", reason: "expected a deformed step, got none".into() });
         }
-        self.step_slots[self.last_slot].launch(StepKind::Full)
+        self.step_slots[self.shown_slot].launch(StepKind::Full)
     }
 
-    /// Writes the values of a step and starts its graph. If the last step was drawn, also fills OpenGL's buffers.
-    fn start(&mut self, state: &SceneState, submitted: Instant) -> Result<StepInFlight> {
-        let was_drawn = std::mem::take(&mut self.is_drawn);
+    /// Writes the values of a step and starts its graph. If the last step was drawn, also fills OpenGL's mapped buffers.
+    /// `None` for a step ahead if no output is free.
+    fn start(
+        &mut self,
+        state: &SceneState,
+        submitted: Instant,
+        was_drawn: bool,
+        is_ahead: bool,
+    ) -> Result<Option<StepInFlight>> {
         let fills_gl_buffers = was_drawn && self.output.maps_gl_buffers();
         self.gl_buffers_are_current = false;
         let _current = self.device.enter()?;
         for set in 0..self.output.count() {
             self.output_ring.set_read_by_gl(set, self.output.is_read_by_gl(set));
         }
-        let set = self.output_ring.next_output();
+        let next_output = if is_ahead { self.output_ring.ahead_output() } else { Some(self.output_ring.next_output()) };
+        let Some(set) = next_output else { return Ok(None) };
         match self.output.ensure_set(&self.device, &self.plan, set) {
             Ok(()) => {}
             Err(lost @ Error::DeviceLost { .. }) => return Err(lost),
@@ -256,7 +306,11 @@ impl CudaDeformer {
             }
         }
         let slot_index = self.acquire_step_slot()?;
-        let target = self.output_ring.begin_step(state);
+        let target = match is_ahead {
+            true => self.output_ring.begin_step_ahead(state),
+            false => Some(self.output_ring.begin_step(state)),
+        };
+        let Some(target) = target else { return Ok(None) };
         let Self { step_slots, kernels, inputs, .. } = self;
         let step_slot = &mut step_slots[slot_index];
         // The lengths of the lists of a partial step, `None` for a full step. `changed` are the domains that this step
@@ -301,7 +355,7 @@ impl CudaDeformer {
         }
         self.gl_buffers_are_current = fills_gl_buffers;
         self.output_ring.end_step(state);
-        Ok(StepInFlight { slot: slot_index, submitted, ms_before_begin })
+        Ok(Some(StepInFlight { slot: slot_index, submitted, ms_before_begin }))
     }
 
     /// Returns a step slot whose step has ended; allocates one if all are in flight.
@@ -321,6 +375,7 @@ impl CudaDeformer {
         self.device.stream().synchronize().ok();
         self.readbacks.synchronize();
         self.in_flight.clear();
+        self.ahead = None;
         self.gl_buffers_are_current = false;
         self.readback = None;
         self.output_ring.invalidate();
@@ -342,7 +397,7 @@ impl CudaDeformer {
         // the set.
         let reads_output = lengths.positions + lengths.normals > 0;
         let read_id = reads_output.then(|| self.output_ring.begin_read());
-        let request = ReadbackRequest { set, lengths, read_id, step_done: &self.step_slots[self.last_slot].done };
+        let request = ReadbackRequest { set, lengths, read_id, step_done: &self.step_slots[self.shown_slot].done };
         let Self { device, kernels, displacements, readbacks, output, .. } = self;
         readbacks.start(device, output, request, |lists: SynchronousLists<'_>| {
             if let Some(buffer) = displacements.as_ref() {
@@ -419,12 +474,28 @@ impl Deformer for CudaDeformer {
             self.finish()?;
         }
         self.submit(state)?;
-        loop {
-            let summary = self.finish()?;
-            if self.in_flight.is_empty() {
-                return Ok(summary);
-            }
+        self.finish_shown()
+    }
+
+    /// Computes the next state at once, too, if the last step was drawn, so that the device computes both in one turn.
+    fn deform_with_next(&mut self, state: &Arc<SceneState>, next: Option<&Arc<SceneState>>) -> Result<DeformSummary> {
+        if self.ahead.take_if(|ahead| Arc::ptr_eq(ahead, state)).is_some() {
+            self.output_ring.show_step_ahead();
+            self.host_attributes = VertexAttributes::default();
+            self.readback = None;
+            (self.gl_buffers_are_current, self.is_drawn) = (false, false);
+            self.shown_slot = self.in_flight.back().map_or(self.shown_slot, |step| step.slot);
+            return self.finish_shown();
         }
+        while self.in_flight.len() == MAX_STEPS_IN_FLIGHT {
+            self.finish()?;
+        }
+        let is_drawn = self.is_drawn;
+        self.submit(state)?;
+        if let Some(next) = next.filter(|_| is_drawn && self.in_flight.len() == 1 && self.supports_steps_ahead()) {
+            self.submit_ahead(next)?;
+        }
+        self.finish_shown()
     }
 
     fn fills_gl_buffers(&self) -> bool {
@@ -439,7 +510,7 @@ impl Deformer for CudaDeformer {
                 self.output.copy_to_gl_after(&self.device, set, || Ok(()))?;
             } else if self.output.has_gl_buffers() {
                 // OpenGL's commands are not ordered with those of CUDA.
-                self.step_slots[self.last_slot].done.synchronize().map_err(cuda_error("interop"))?;
+                self.step_slots[self.shown_slot].done.synchronize().map_err(cuda_error("interop"))?;
                 self.output.copy_by_gl(set)?;
             } else {
                 return Err(fault("interop", "expected OpenGL buffers that the device can fill, got none"));

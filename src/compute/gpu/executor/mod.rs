@@ -21,6 +21,7 @@ mod layout_check;
 mod output;
 mod output_ring;
 mod picture;
+mod picture_encoder;
 mod pinned_surface;
 pub(crate) mod png;
 pub(crate) mod raster;

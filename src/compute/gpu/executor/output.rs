@@ -1,9 +1,9 @@
 //! Output sets that steps write, and the copy of a drawn step to OpenGL's buffers. An output set has positions, normals
 //! and tangents.
 //!
-//! If OpenGL can import memory of CUDA, the sets are in such memory, and OpenGL copies a set to its buffers at the
-//! beginning of a frame. The host waits for the step before that copy is submitted, and for the copy before a later
-//! step writes the set. With two sets, the next step can run while frames of earlier steps are drawn.
+//! If OpenGL can import memory of CUDA, the sets are in such memory, and OpenGL copies a set to its buffers at the beginning of
+//! a frame. The host waits for the step before that copy is submitted, and for the copy before a later step writes the
+//! set. With four sets, the next two steps can run while the frames of two steps are drawn.
 //!
 //! Otherwise CUDA maps OpenGL's buffers and copies a set into them. Steps do not write OpenGL's buffers themselves,
 //! because mapping them makes the GPU change between the contexts of CUDA and OpenGL. That takes longer than the step
@@ -38,7 +38,7 @@ pub(super) struct OutputAddresses {
 /// The output sets and the buffers that OpenGL draws from.
 #[derive(Debug)]
 pub(super) struct OutputBuffers {
-    /// One set. A second set is added when a step is submitted while the host reads the first.
+    /// One set. Another set is added when a step is submitted while the others are read.
     sets: Vec<OutputSet>,
     gl_outputs: GlOutputs,
 }
@@ -198,8 +198,11 @@ impl RegisteredOutputs {
 }
 
 impl OutputBuffers {
-    /// Maximum number of sets.
-    pub(super) const MAX_SETS: usize = 2;
+    /// Maximum number of sets: one that is read while a step writes the other. OpenGL copies imported sets at the beginning of a
+    /// frame, so two frames in flight may still read theirs while two steps are computed.
+    pub(super) const fn max_sets(&self) -> usize {
+        if matches!(self.gl_outputs, GlOutputs::Imported(_)) { 4 } else { 2 }
+    }
 
     /// Allocates a set. If OpenGL's buffers are given, lets OpenGL import the set, or else registers the buffers. If
     /// both fail, logs the errors.

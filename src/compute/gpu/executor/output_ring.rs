@@ -1,9 +1,12 @@
-//! Double buffering of the outputs: chooses the output that a step writes, and records which domains of an output are
+//! Multiple buffering of the outputs: chooses the output that a step writes, and records which domains of an output are
 //! outdated. An output is one output set of `output`. This module does not access the device.
 //!
 //! While the host copies one output, the next step writes another, so neither waits. The other output shows an older
 //! step. The ring records which domains have changed since then, and the step computes them again together with its own
 //! changes. The second output is first used when a step begins while a readback is in flight.
+//!
+//! A step ahead is computed together with the step before it, and shown later. Until then, its output is not the one that is
+//! shown.
 
 use modalcast_model::scene::{DirtyDomains, SceneState};
 
@@ -21,6 +24,8 @@ pub(super) struct OutputRing {
     is_consecutive: bool,
     /// Index of the output of the last step that began.
     current_output: usize,
+    /// Index of the output whose step is shown: the current one, unless a step ahead has begun.
+    shown_index: usize,
     outputs: Vec<OutputState>,
     /// Maximum number of outputs.
     max_outputs: usize,
@@ -41,6 +46,12 @@ struct OutputState {
     read_id: Option<u64>,
     /// Whether OpenGL may still copy from the output.
     is_read_by_gl: bool,
+}
+
+impl OutputState {
+    const fn is_being_read(&self) -> bool {
+        self.read_id.is_some() || self.is_read_by_gl
+    }
 }
 
 /// A step that begins.
@@ -67,6 +78,7 @@ impl OutputRing {
             serial: None,
             is_consecutive: false,
             current_output: 0,
+            shown_index: 0,
             outputs: vec![OutputState::default()],
             max_outputs,
             max_changes,
@@ -74,22 +86,31 @@ impl OutputRing {
         }
     }
 
-    /// The output that the next step writes: the current one, or the other one while the current one is being read.
+    /// The output that the next step writes: the current one, or another one while the current one is being read. If all
+    /// are being read, the one that was written first.
     pub(super) fn next_output(&self) -> usize {
-        let current = &self.outputs[self.current_output];
-        if current.read_id.is_some() || current.is_read_by_gl {
-            (self.current_output + 1) % self.max_outputs
+        if self.outputs[self.current_output].is_being_read() {
+            self.ahead_output().unwrap_or((self.current_output + 1) % self.max_outputs)
         } else {
             self.current_output
         }
     }
 
-    /// Disables outputs beyond the current one, because the device has no memory for them.
-    pub(super) fn forbid_more_outputs(&mut self) {
-        self.max_outputs = self.current_output + 1;
+    /// The output that a step ahead can write: one that is neither shown nor being read. `None` if there is no such output.
+    pub(super) fn ahead_output(&self) -> Option<usize> {
+        let count = self.outputs.len();
+        let mut others = (1..count).map(|offset| (self.current_output + offset) % count);
+        let free = others.find(|index| !self.outputs[*index].is_being_read());
+        free.or_else(|| (count < self.max_outputs).then_some(count))
     }
 
-    /// Begins a step of `state`, which writes [`Self::next_output`]. That output is not valid until [`Self::end_step`].
+    /// Disables outputs beyond the present ones, because the device has no memory for them.
+    pub(super) fn forbid_more_outputs(&mut self) {
+        self.max_outputs = self.outputs.len();
+    }
+
+    /// Begins a step of `state`, which writes [`Self::next_output`]. That output is shown, but is not valid until
+    /// [`Self::end_step`].
     pub(super) fn begin_step(&mut self, state: &SceneState) -> StepTarget {
         if self.last_step == u32::MAX {
             // After the restart at 0, old step numbers on the device look new. The kernels then recompute unchanged
@@ -97,8 +118,25 @@ impl OutputRing {
             self.invalidate();
             (self.last_step, self.last_full_step) = (0, 0);
         }
+        let target = self.begin_step_in(self.next_output(), state);
+        self.shown_index = target.output;
+        target
+    }
+
+    /// Begins a step ahead, which writes [`Self::ahead_output`]. `None` if there is no such output.
+    pub(super) fn begin_step_ahead(&mut self, state: &SceneState) -> Option<StepTarget> {
+        let output = self.ahead_output().filter(|_| self.last_step < u32::MAX)?;
+        Some(self.begin_step_in(output, state))
+    }
+
+    /// Shows the step ahead.
+    pub(super) const fn show_step_ahead(&mut self) {
+        self.shown_index = self.current_output;
+    }
+
+    fn begin_step_in(&mut self, output: usize, state: &SceneState) -> StepTarget {
         self.last_step += 1;
-        self.current_output = self.next_output();
+        self.current_output = output;
         if self.outputs.len() <= self.current_output {
             self.outputs.resize_with(self.current_output + 1, OutputState::default);
         }
@@ -150,15 +188,15 @@ impl OutputRing {
         }
     }
 
-    /// The output that shows the last step; `None` if that step failed.
+    /// The output of the step that is shown; `None` if that step failed.
     pub(super) fn shown_output(&self) -> Option<usize> {
-        (self.outputs[self.current_output].shown_step > 0).then_some(self.current_output)
+        (self.outputs[self.shown_index].shown_step > 0).then_some(self.shown_index)
     }
 
-    /// Begins a readback of the last output. Returns its number.
+    /// Begins a readback of the output that is shown. Returns its number.
     pub(super) fn begin_read(&mut self) -> u64 {
         self.read_count += 1;
-        self.outputs[self.current_output].read_id = Some(self.read_count);
+        self.outputs[self.shown_index].read_id = Some(self.read_count);
         self.read_count
     }
 
@@ -334,6 +372,42 @@ mod tests {
         output_ring.last_step = u32::MAX;
         let target = step(&mut output_ring, &state(5, &[]));
         assert_eq!((target.step, target.dirty_domains), (1, None));
+    }
+
+    #[test]
+    fn step_ahead_is_shown_later_and_does_not_overwrite_what_is_read() {
+        let mut output_ring = OutputRing::new(4, 10);
+        step(&mut output_ring, &state(1, &[]));
+        let mut shown = 0;
+        for serial in (2..20).step_by(2) {
+            // OpenGL still copies the two outputs of the last round.
+            for output in 0..output_ring.outputs.len() {
+                output_ring.set_read_by_gl(output, output == shown || output == output_ring.current_output);
+            }
+            let read = [shown, output_ring.current_output];
+            let first = output_ring.begin_step(&state(serial, &[3]));
+            output_ring.end_step(&state(serial, &[3]));
+            let ahead = output_ring.begin_step_ahead(&state(serial + 1, &[4])).expect("expected a free output");
+            output_ring.end_step(&state(serial + 1, &[4]));
+            assert!(first.output != ahead.output && !read.contains(&first.output) && !read.contains(&ahead.output));
+            assert_eq!(output_ring.shown_output(), Some(first.output), "step {serial}");
+            let read_id = output_ring.begin_read();
+            assert_eq!(output_ring.outputs[first.output].read_id, Some(read_id));
+            output_ring.end_read(read_id);
+            shown = first.output;
+            output_ring.show_step_ahead();
+            assert_eq!(output_ring.shown_output(), Some(ahead.output), "step {serial}");
+            // The first step in a new output is full. Later ones add the changes since the output was written.
+            assert_eq!(first.dirty_domains.is_some(), serial > 2, "step {serial}: {first:?}");
+        }
+        assert_eq!(output_ring.outputs.len(), 4);
+        // Without a free output, there is no step ahead, and the next step waits for the output that was written first.
+        (0..4).for_each(|output| output_ring.set_read_by_gl(output, true));
+        assert_eq!(output_ring.begin_step_ahead(&state(20, &[])), None);
+        assert_eq!(output_ring.next_output(), (output_ring.current_output + 1) % 4);
+        let mut single = OutputRing::new(1, 10);
+        step(&mut single, &state(1, &[]));
+        assert_eq!(single.begin_step_ahead(&state(2, &[])), None);
     }
 
     #[test]

@@ -87,7 +87,9 @@ pub struct PngEncoder {
     /// The addresses of the buffers below, and the sizes of the plan.
     args: PngArgs,
     _buffers: [DeviceBuffer; 5],
+    /// Grows on demand.
     slots: Vec<Arc<FileSlot>>,
+    max_slots: usize,
 }
 
 impl PngEncoder {
@@ -135,9 +137,8 @@ impl PngEncoder {
             words_per_tile: plan.words_per_tile,
             ..PngArgs::zeroed()
         };
-        let new_slot = |_| FileSlot::new(device, plan.max_file_bytes).map(Arc::new);
-        let slots = (0..slot_count.get()).map(new_slot).collect::<Result<_>>()?;
-        Ok(Self { device: Arc::clone(device), plan, channels, functions, args, _buffers: buffers, slots })
+        let (slots, max_slots) = (Vec::new(), slot_count.get());
+        Ok(Self { device: Arc::clone(device), plan, channels, functions, args, _buffers: buffers, slots, max_slots })
     }
 
     /// Width and height of the pictures in pixels.
@@ -155,15 +156,12 @@ impl PngEncoder {
     /// `Invalid` when the picture has another size or is not aligned; `Fault` when the device refuses the work.
     pub unsafe fn encode(&mut self, picture: &DevicePicture) -> Result<Option<PendingPng>> {
         self.check(picture)?;
-        // Kernels of a dropped encoding may still write to a free slot. The stream orders them before those of this
-        // one.
-        let Some(slot) = self.slots.iter_mut().find_map(|slot| Arc::get_mut(slot).is_some().then(|| Arc::clone(slot)))
-        else {
-            return Ok(None);
-        };
+        // Kernels of a dropped encoding may still write to a free slot. The stream orders them before those of this one.
+        let Some(slot) = self.free_slot()? else { return Ok(None) };
         let [file, result] = slot.addresses();
         let args = PngArgs { pixels: picture.address, pitch: picture.pitch, file, result, ..self.args };
         let guard = WaitForStream::new(self.device.stream());
+        slot.record_begin(&self.device)?;
         let tile_launch = (self.plan.tile_count(), BLOCK_THREADS);
         let strip_launch = (self.plan.strip_count, BLOCK_THREADS);
         let launches = [tile_launch, (self.plan.strip_count, CODE_BLOCK_THREADS), tile_launch, strip_launch];
@@ -177,6 +175,17 @@ impl PngEncoder {
         slot.record(&self.device)?;
         guard.disarm();
         Ok(Some(PendingPng::new(slot, self.channels == PngChannels::Rgb)))
+    }
+
+    /// A slot that no file uses. Allocates one if there is none; `None` if there are as many as allowed.
+    fn free_slot(&mut self) -> Result<Option<Arc<FileSlot>>> {
+        let free_slot = self.slots.iter_mut().find_map(|slot| Arc::get_mut(slot).is_some().then(|| Arc::clone(slot)));
+        if free_slot.is_some() || self.slots.len() >= self.max_slots {
+            return Ok(free_slot);
+        }
+        let slot = Arc::new(FileSlot::new(&self.device, self.plan.max_file_bytes)?);
+        self.slots.push(Arc::clone(&slot));
+        Ok(Some(slot))
     }
 
     fn check(&self, picture: &DevicePicture) -> Result<()> {

@@ -67,11 +67,11 @@ impl DeviceLoop {
         }
         let Self { context, scenes, loss, .. } = self;
         let (id, kind) = match command {
-            Command::Draw { id, camera, size, edges, reply } => {
+            Command::Draw { id, camera, size, edges, content, reply } => {
                 let draw =
                     find_scene(scenes, id).and_then(|scene| context.begin_partial_draw(scene, &camera, size, edges));
                 match loss.record_loss(draw) {
-                    Ok(draw) => (id, PartialKind::Frame(draw, reply)),
+                    Ok(draw) => (id, PartialKind::Frame(draw.with_content(content), reply)),
                     Err(error) => return answer(reply, Err(error)),
                 }
             }

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use super::staging::{ReadbackView, ReaderSignal};
 use super::{Buffer, BufferCopy, Gl};
 use modalcast_model::error::{Result, fault};
-use modalcast_model::shared_memory::{PictureMemory, SharedPicture};
+use modalcast_model::shared_memory::{CopyRequest, PictureMemory, PngRequest, SharedPicture};
 
 /// Time limit of the commands of [`check_sharing`].
 const CHECK_TIMEOUT: Duration = Duration::from_secs(10);
@@ -30,6 +30,8 @@ pub(crate) struct PictureBuffer {
 #[derive(Debug)]
 struct PictureCopy {
     picture: Box<dyn SharedPicture>,
+    /// The PNG file of the present frame; `None`: pixels only.
+    png: Option<PngRequest>,
     /// Whether a copy of the present frame was started, or the error of the start.
     started: Option<Result<()>>,
 }
@@ -37,8 +39,8 @@ struct PictureCopy {
 impl PictureCopy {
     /// Starts the copy of the first `bytes` bytes unless it is started.
     fn start(&mut self, bytes: usize) -> Result<()> {
-        let picture = &mut self.picture;
-        self.started.get_or_insert_with(|| picture.start_copy(bytes)).clone()
+        let Self { picture, png, started } = self;
+        started.get_or_insert_with(|| picture.start_copy(CopyRequest { bytes, png: *png })).clone()
     }
 }
 
@@ -51,8 +53,13 @@ impl PictureBuffer {
         let picture_bytes = usize::try_from(bytes).map_err(|_| fault("import", "expected a smaller picture"))?;
         let picture = memory.create_picture(picture_bytes)?;
         let buffer = Buffer::import(gl, picture.descriptor, picture.allocated_bytes, bytes)?;
-        let copy = RefCell::new(PictureCopy { picture: picture.picture, started: None });
+        let copy = RefCell::new(PictureCopy { picture: picture.picture, png: None, started: None });
         Ok(Self { buffer, copy, reader: ReaderSignal::default() })
+    }
+
+    /// Requests the PNG file of the present frame, whose copy is not started yet.
+    pub(crate) fn request_png(&self, request: PngRequest) {
+        self.copy.borrow_mut().png = Some(request);
     }
 
     /// Starts the copy unless it is started. Waits at most `limit`. Returns whether [`Self::view`] would return without
@@ -82,7 +89,7 @@ impl PictureBuffer {
     pub(crate) fn view(&self, bytes: usize, can_be_held: bool) -> Result<ReadbackView> {
         let mut copy = self.copy.borrow_mut();
         let result = copy.start(self.buffer.bytes as usize).and_then(|()| copy.picture.finish_copy());
-        copy.started = None;
+        (copy.started, copy.png) = (None, None);
         Ok(ReadbackView::pinned(result?, bytes, can_be_held, &self.reader))
     }
 
@@ -95,6 +102,7 @@ impl PictureBuffer {
     /// Ends a copy whose frame was abandoned.
     fn abandon_copy(&self) {
         let mut copy = self.copy.borrow_mut();
+        copy.png = None;
         if copy.started.take().is_some_and(|result| result.is_ok()) {
             // The error of an abandoned copy concerns no frame. A failed device reports its error again.
             copy.picture.finish_copy().ok();
@@ -150,7 +158,7 @@ pub(crate) mod testing {
 
     use super::*;
     use crate::device::gl::StagingBuffer;
-    use modalcast_model::shared_memory::{HostPixels, NewPicture};
+    use modalcast_model::shared_memory::{CopiedPixels, HostPixels, NewPicture};
 
     /// A mapped buffer of OpenGL instead of memory that OpenGL shares.
     #[derive(Debug)]
@@ -172,7 +180,7 @@ pub(crate) mod testing {
     }
 
     impl SharedPicture for EmulatedPicture {
-        fn start_copy(&mut self, bytes: usize) -> Result<()> {
+        fn start_copy(&mut self, CopyRequest { bytes, .. }: CopyRequest) -> Result<()> {
             let in_use = || fault("emulated picture", "expected no copy in flight and no reader");
             let pixels = Arc::get_mut(&mut self.pixels).filter(|_| !self.is_copying).ok_or_else(in_use)?;
             pixels.0 = self.memory.view(bytes)?.bytes().to_vec();
@@ -184,9 +192,9 @@ pub(crate) mod testing {
             !self.is_copying || self.is_polled.replace(true)
         }
 
-        fn finish_copy(&mut self) -> Result<Arc<dyn HostPixels>> {
+        fn finish_copy(&mut self) -> Result<CopiedPixels> {
             assert!(std::mem::take(&mut self.is_copying), "expected a copy in flight");
-            Ok(Arc::clone(&self.pixels) as Arc<dyn HostPixels>)
+            Ok(CopiedPixels { pixels: Arc::clone(&self.pixels) as Arc<dyn HostPixels>, png: None })
         }
 
         fn fill(&mut self, _: u32) -> Result<()> {
@@ -201,7 +209,7 @@ pub(crate) mod testing {
             let buffer = memory.buffer.alias();
             let pixels = Arc::new(EmulatedPixels(Vec::new()));
             let picture = EmulatedPicture { memory, pixels, is_copying: false, is_polled: Cell::default() };
-            let copy = RefCell::new(PictureCopy { picture: Box::new(picture), started: None });
+            let copy = RefCell::new(PictureCopy { picture: Box::new(picture), png: None, started: None });
             Self { buffer, copy, reader: ReaderSignal::default() }
         }
     }
@@ -226,7 +234,7 @@ pub(crate) mod testing {
     }
 
     impl SharedPicture for UnsharedPicture {
-        fn start_copy(&mut self, _: usize) -> Result<()> {
+        fn start_copy(&mut self, _: CopyRequest) -> Result<()> {
             Ok(())
         }
 
@@ -234,8 +242,8 @@ pub(crate) mod testing {
             true
         }
 
-        fn finish_copy(&mut self) -> Result<Arc<dyn HostPixels>> {
-            Ok(Arc::new(EmulatedPixels(vec![0; self.0])))
+        fn finish_copy(&mut self) -> Result<CopiedPixels> {
+            Ok(CopiedPixels { pixels: Arc::new(EmulatedPixels(vec![0; self.0])), png: None })
         }
 
         fn fill(&mut self, _: u32) -> Result<()> {

@@ -13,7 +13,7 @@ use glow::HasContext as _;
 use super::object::BufferObject;
 use super::{Buffer, Gl};
 use modalcast_model::error::{Result, fault, fault_in};
-use modalcast_model::shared_memory::HostPixels;
+use modalcast_model::shared_memory::{CopiedPixels, CopiedPng, HostPixels};
 
 /// A buffer that the device writes and the host reads.
 #[derive(Debug)]
@@ -47,6 +47,8 @@ pub(crate) enum ReadbackView {
     Pinned {
         // Dropped before `_done`, so that the memory has no reader once the sender is disconnected.
         pixels: Arc<dyn HostPixels>,
+        /// The PNG file, if it was requested.
+        png: Option<CopiedPng>,
         bytes: usize,
         /// Whether a reader may keep the view for long, because enough slots are left for the next frames.
         can_be_held: bool,
@@ -158,13 +160,23 @@ fn is_done(reader: &Receiver<()>, limit: Duration) -> bool {
 
 impl ReadbackView {
     /// A view of the first `bytes` bytes of pinned memory, which `reader` tracks.
-    pub(super) fn pinned(pixels: Arc<dyn HostPixels>, bytes: usize, can_be_held: bool, reader: &ReaderSignal) -> Self {
-        Self::Pinned { bytes: bytes.min(pixels.bytes().len()), pixels, can_be_held, _done: reader.begin() }
+    pub(super) fn pinned(copied: CopiedPixels, bytes: usize, can_be_held: bool, reader: &ReaderSignal) -> Self {
+        let CopiedPixels { pixels, png } = copied;
+        let bytes = bytes.min(pixels.bytes().len());
+        Self::Pinned { pixels, png, bytes, can_be_held, _done: reader.begin() }
     }
 
     /// Whether a reader may keep the view for long instead of copying the bytes.
     pub(crate) const fn can_be_held(&self) -> bool {
         matches!(self, Self::Pinned { can_be_held: true, .. })
+    }
+
+    /// Takes the PNG file out of the view.
+    pub(crate) const fn take_png(&mut self) -> Option<CopiedPng> {
+        match self {
+            Self::Pinned { png, .. } => png.take(),
+            Self::Mapped { .. } | Self::Copied(_) => None,
+        }
     }
 
     /// Shortens the view to its first `bytes` bytes.

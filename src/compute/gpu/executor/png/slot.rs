@@ -3,11 +3,13 @@
 use std::sync::Arc;
 
 use cudarc::driver::CudaEvent;
+use cudarc::driver::sys::CUevent_flags;
 
 use super::STAGE;
 use crate::gpu::launch::error::cuda_error;
 use crate::gpu::launch::{Device, PinnedBuffer, PinnedUse};
 use modalcast_model::error::{Result, fault};
+use modalcast_model::shared_memory::HostPixels;
 
 /// The kernel copies vectors of this size to the file.
 const ALIGNMENT: u64 = 16;
@@ -22,6 +24,8 @@ pub(super) struct FileSlot {
     /// Address of `memory`, because the buffer calls the driver for each access.
     address: u64,
     result_offset: usize,
+    /// Begin of the last encoding into this slot.
+    begun: CudaEvent,
     /// End of the last encoding into this slot.
     done: CudaEvent,
 }
@@ -39,6 +43,8 @@ pub struct PendingPng {
 pub struct EncodedPng {
     slot: Arc<FileSlot>,
     bytes: usize,
+    /// Milliseconds that the device encoded.
+    ms: f64,
 }
 
 impl FileSlot {
@@ -49,13 +55,18 @@ impl FileSlot {
     pub(super) fn new(device: &Device, max_file_bytes: u64) -> Result<Self> {
         let result_offset = max_file_bytes.next_multiple_of(ALIGNMENT) as usize;
         let memory = PinnedBuffer::zeroed(device, result_offset + RESULT_BYTES, PinnedUse::FromDevice)?;
-        let done = device.context().new_event(None).map_err(cuda_error(STAGE))?;
-        Ok(Self { address: memory.address()?, memory, result_offset, done })
+        let new_event = || device.context().new_event(Some(CUevent_flags::CU_EVENT_DEFAULT)).map_err(cuda_error(STAGE));
+        Ok(Self { address: memory.address()?, memory, result_offset, begun: new_event()?, done: new_event()? })
     }
 
     /// Device addresses of the file and of its result.
     pub(super) const fn addresses(&self) -> [u64; 2] {
         [self.address, self.address + self.result_offset as u64]
+    }
+
+    /// Marks the begin of an encoding.
+    pub(super) fn record_begin(&self, device: &Device) -> Result<()> {
+        self.begun.record(device.stream()).map_err(cuda_error(STAGE))
     }
 
     /// Marks the end of the work that the device's stream has received.
@@ -91,7 +102,21 @@ impl PendingPng {
         if bytes == 0 || bytes > max_bytes {
             return Err(fault(STAGE, format!("expected a file of 1 to {max_bytes} bytes, got {bytes}")));
         }
-        Ok(Some(EncodedPng { slot: self.slot, bytes }))
+        let ms = f64::from(self.slot.begun.elapsed_ms(&self.slot.done).map_err(cuda_error(STAGE))?);
+        Ok(Some(EncodedPng { slot: self.slot, bytes, ms }))
+    }
+}
+
+impl EncodedPng {
+    /// Milliseconds that the device encoded.
+    pub const fn ms(&self) -> f64 {
+        self.ms
+    }
+}
+
+impl HostPixels for EncodedPng {
+    fn bytes(&self) -> &[u8] {
+        self.as_ref()
     }
 }
 
