@@ -5,7 +5,7 @@ in vec3 world;
 // extrapolated to this center could be wrong.
 centroid in vec3 normal_world;
 #ifdef UVS
-centroid in vec2 uv_image;
+centroid in vec2 image_uv;
 #endif
 #ifdef NORMAL_MAPS
 centroid in vec4 tangent_world;
@@ -16,12 +16,12 @@ void main() {
     Material material = material_of(current_triangle());
     vec4 tint = vec4(1.0);
 #ifdef TEXTURES
-    vec4 texel = color_texel(material.images.xy, uv_image);
+    vec4 texel = color_texel(material.images.xy, image_uv);
     if (material.images.x >= 0) tint = texel;
 #endif
     vec3 geometric_normal = safe_normalize(normal_world), normal = geometric_normal;
 #ifdef NORMAL_MAPS
-    vec3 normal_map_texel = normal_texel(material.images.zw, uv_image).xyz;
+    vec3 normal_map_texel = normal_texel(material.images.zw, image_uv).xyz;
     if (material.images.z >= 0) normal = apply_normal_map(normal, tangent_world, normal_map_texel);
 #endif
     normal = gl_FrontFacing ? normal : -normal;

@@ -8,7 +8,7 @@ out vec3 world;
 centroid out vec3 normal_world;
 #ifdef UVS
 layout(location = 2) in vec2 uv;
-centroid out vec2 uv_image;
+centroid out vec2 image_uv;
 #endif
 #ifdef NORMAL_MAPS
 layout(location = 3) in vec4 tangent;
@@ -19,7 +19,7 @@ void main() {
     world = texelFetch(positions, int(vertex)).xyz;
     normal_world = normal;
 #ifdef UVS
-    uv_image = uv;
+    image_uv = uv;
 #endif
 #ifdef NORMAL_MAPS
     tangent_world = tangent;

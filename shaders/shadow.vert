@@ -8,7 +8,7 @@ layout(binding = 13) uniform samplerBuffer positions;
 #endif
 #if defined(TEXTURES) && !defined(POSITION_ONLY)
 layout(location = 2) in vec2 uv;
-centroid out vec2 uv_image;
+centroid out vec2 image_uv;
 #endif
 #ifdef CASCADES
 layout(location = 1) uniform int layer;
@@ -30,6 +30,6 @@ void main() {
     vec4 clip = vec4(2.0 * map_position.xy - 1.0, 1.0 - map_position.z, 1.0);
     gl_Position = is_not_finite ? vec4(0.0, 0.0, -2.0, 1.0) : clip;
 #if defined(TEXTURES) && !defined(POSITION_ONLY)
-    uv_image = uv;
+    image_uv = uv;
 #endif
 }

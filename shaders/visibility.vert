@@ -9,7 +9,7 @@ layout(location = 0) in vec3 position;
 #endif
 #if defined(MASK) && defined(TEXTURES)
 layout(location = 2) in vec2 uv;
-centroid out vec2 uv_image;
+centroid out vec2 image_uv;
 #endif
 
 void main() {
@@ -20,6 +20,6 @@ void main() {
 #endif
     gl_Position = to_clip(world);
 #if defined(MASK) && defined(TEXTURES)
-    uv_image = uv;
+    image_uv = uv;
 #endif
 }

@@ -1,5 +1,6 @@
 // One direction of the Gaussian blur (equation 3.11 of the thesis) with one fragment per texel, as in the thesis: the
-// baseline of measurements. `blur_separable` in src/render/shaders/shadow.rs generates the function `blur`.
+// baseline of measurements. The first pass (FROM_DEPTH) reads depth and blurs along x. The second pass reads the moments
+// of the first and blurs along y. `blur_separable` in src/render/shaders/shadow.rs generates the function `blur`.
 layout(location = 0) out vec4 blurred;
 
 void main() {

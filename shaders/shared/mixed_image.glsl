@@ -17,7 +17,8 @@ vec4 bilinear_image_texel(sampler2DArray images, int layer, ivec2 size, vec2 uv,
     return mix(top, bottom, weight.y);
 }
 
-// `location`: the texture array plus 8 (width - 1), and the layer plus 2048 (height - 1). dx, dy: derivatives of uv.
+// location.x: bits 0 to 2 are the index of the texture array, the others width - 1. location.y: bits 0 to 10 are the
+// layer, the others height - 1. dx, dy: derivatives of uv.
 vec4 mixed_image_texel(sampler2DArray images, ivec2 location, vec2 uv, vec2 dx, vec2 dy) {
     int layer = location.y & 2047;
     ivec2 size = ivec2(location.x >> 3, location.y >> 11) + 1;

@@ -27,7 +27,7 @@ pub enum Error {
     /// Another scene has the name. `owner` is the source of that scene.
     #[error("the scene name '{name}' belongs to '{owner}'")]
     NameTaken { name: String, owner: String },
-    /// Another writer holds the lease of the scene.
+    /// Another writer holds the lease of the scene. A run is the number of a writer.
     #[error("run {run} has held the writer lease for {seconds} s")]
     LeaseTaken { run: u64, seconds: u64 },
     /// The writer with this run has taken over the lease.

@@ -52,7 +52,7 @@ pub(crate) fn check_error_budget<D: Deformer>(
             states_beyond_rounding += usize::from(!domains_beyond_bound(&scene, &state, &positions, 0.0).is_empty());
         }
         eprintln!(
-            "{}: truncation bound at most {max_bound:.2e} of {BUDGET}, beyond the rounding bound in \
+            "{}: truncation bound at most {max_bound:.2e} of {BUDGET}; the error exceeds the rounding bound in \
              {states_beyond_rounding} of 20 states",
             storage.name()
         );

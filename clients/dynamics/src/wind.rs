@@ -41,8 +41,8 @@ const COHERENCE_DECAY: f64 = 10.0;
 /// d, the distance that the coherence assumes between any two domains, in meters.
 const DOMAIN_DISTANCE: f64 = 2.0;
 
-/// Diagonal of a scene in meters, for the travel time of gusts. Scenes have any unit of length; this is the diagonal of
-/// a tree of 8 m.
+/// Diagonal in meters that every scene is assumed to have, for the travel time of gusts, because scenes have any unit of
+/// length. It is the diagonal of a tree of 8 m.
 const SCENE_DIAGONAL: f64 = 10.0;
 
 /// Lowest and highest frequency in hertz. The range contains the first modes of trunks (about 0.5 Hz) and of leaves (3
@@ -114,7 +114,7 @@ struct Cosine {
 #[derive(Debug, Clone)]
 pub struct Wind {
     cosines: Vec<Cosine>,
-    /// Time of the sum of cosines at the start of the wind, in seconds.
+    /// The argument of the cosines when the wind starts, in seconds.
     start_time: f64,
     /// Per domain: the factors of the gust speeds along and across the wind, in this order. A gust speed has one factor
     /// per cosine, then one factor per sine, then zeros up to a multiple of `LANES`.

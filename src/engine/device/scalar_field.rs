@@ -9,8 +9,8 @@ use modalcast_model::deform::DeformedSurface;
 use modalcast_model::error::{Result, invalid};
 use modalcast_model::scene::{Scene, SceneState};
 
-/// Lower bound of a fitted displacement scale, as a fraction of the scene's diagonal. Smaller displacements may be
-/// rounding errors.
+/// Lower bound of the value at the end of a fitted color scale of displacements, as a fraction of the scene's diagonal.
+/// Smaller displacements may be rounding errors.
 const MIN_SCALE_FRACTION: f64 = 1e-5;
 
 /// Limits of the value at the end of a scale. The values that clients may request have the same limits.

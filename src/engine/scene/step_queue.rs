@@ -1,6 +1,6 @@
 //! The bounded queue of steps from one writer to its scene, and the queue of reports back to the writer. The window, a
-//! number of steps, bounds both. A lossless queue rejects a step beyond the window, or the writer waits for capacity
-//! before it reads the step. A `latest` queue merges a step into the one already queued.
+//! number of steps, bounds both. A lossless queue rejects a step beyond the window, or lets the stream wait: then the
+//! server reads the next step only when there is capacity. A `latest` queue merges a step into the one already queued.
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, MutexGuard};
@@ -138,7 +138,7 @@ impl StepQueue {
         Self { delivery, overflow, window, state: Mutex::default(), scene_wake, writer_wake: Notify::new() }
     }
 
-    /// Whether the writer may read another step: always, unless it must wait for capacity.
+    /// Whether the server may read another step from the stream: always, unless it must wait for capacity.
     pub(in crate::engine) fn may_read_step(&self) -> bool {
         let must_wait = self.delivery == Delivery::Lossless && self.overflow == Overflow::Block;
         !must_wait || self.has_capacity(&self.lock())
@@ -204,9 +204,10 @@ impl StepQueue {
             Ok(stages) => StepReport::Done { step, skipped, stages },
             Err(error) => StepReport::Rejected { step, error },
         };
-        // Under `latest`, a writer may read its reports slowly. A `Done` also covers all older steps. Once `window`
-        // reports wait, it therefore replaces the newest report if that is a `Done`. A `Rejected` is never replaced. If
-        // more than `window` reports wait, the further report is dropped and the queue ends with an error.
+        // Under `latest`, a writer may read its reports slowly. A `Done` also covers all older steps. If at least
+        // `window` reports wait, a new `Done` therefore replaces the newest report, if that is a `Done` too. A
+        // `Rejected` is never replaced. If `window` + 1 reports wait, the new report is dropped, and the queue ends with
+        // an error.
         let replaces_newest =
             matches!((state.reports.back(), &report), (Some(StepReport::Done { .. }), StepReport::Done { .. }));
         if state.reports.len() >= self.window && replaces_newest {

@@ -91,8 +91,8 @@ pub enum Culling {
 /// Light, shadow, ground, sky and rasterization settings. Colors are linear.
 #[derive(Debug, Clone, Copy, PartialEq, serde::Serialize)]
 pub struct RenderSettings {
-    /// Leaves `antialias`, `samples`, and method, size and blur of `shadow` to the renderer. `None`: the values in
-    /// these fields are final. Set by [`Self::with_preset`]; scene files always set it.
+    /// If set, the renderer chooses `antialias`, `samples`, and the method, size and blur of `shadow`. If `None`, the
+    /// values in these fields are used. Set by [`Self::with_preset`]; scene files always set it.
     pub preset: Option<PresetRequest>,
     /// Direction towards the sun in Y-up coordinates; rotated to the scene's up axis.
     pub sun: [f32; 3],
@@ -105,7 +105,7 @@ pub struct RenderSettings {
     pub horizon: [f32; 3],
     pub shadow: Option<ShadowSettings>,
     pub ground: Option<Ground>,
-    /// Lines along the edges of the faces, in frames that do not set them themselves.
+    /// Lines along the edges of the faces. A frame request can override them.
     pub edges: Option<MeshEdges>,
     /// Samples per pixel for multisampling, 1 or 4.
     pub samples: u32,

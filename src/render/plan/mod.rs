@@ -157,8 +157,9 @@ fn occluder_draw_calls(groups: &[DrawGroup], culling: Culling) -> usize {
     if culling == Culling::Occlusion { occluder_groups } else { 0 }
 }
 
-/// Number of draw calls without the occluder pass. Order-independent transparency draws blended triangles in three
-/// phases, the third only on demand. Two-pass transparency draws their opaque parts in a second phase.
+/// Number of draw calls without the occluder pass. Order-independent transparency draws blended triangles once
+/// each in `OitCount`, `OitFill` and `OitResolve`; the last is skipped in frames without overflow. Two-pass transparency
+/// draws their opaque parts too.
 fn draw_calls(scene: &Scene, groups: &[DrawGroup]) -> usize {
     let blended_groups = groups.iter().filter(|group| group.blend_mode == BlendMode::Blend).count();
     let phases = match scene.look.transparency {
@@ -168,7 +169,8 @@ fn draw_calls(scene: &Scene, groups: &[DrawGroup]) -> usize {
     groups.len() + (phases - 1) * blended_groups
 }
 
-/// Sizes of the scene's buffers in bytes. An f32 or a u32 has 4 bytes; [`GeometryBuffers`] states their numbers.
+/// Sizes of the scene's buffers in bytes. [`GeometryBuffers`] states how many f32 and u32 of 4 bytes a
+/// vertex, a corner and a triangle have.
 fn buffer_sizes(scene: &Scene, culling: Culling) -> SceneBufferSet<u64> {
     let (layout, features) = (&scene.layout, scene.features);
     let [vertices, corners, triangles] = [layout.vertices, layout.corners, layout.triangles].map(|count| count as u64);
@@ -239,8 +241,8 @@ fn features(
     }
 }
 
-/// The features that the scene does not need. Their descriptions count 8 bytes per RGBA16F texel. All levels of the
-/// bloom pyramid together have 4/3 texels per pixel, hence 10.7 bytes.
+/// The features that the scene does not need. The texts "8 bytes per sample" and "10.7 bytes per pixel" refer to
+/// RGBA16F images with 8 bytes per texel; all levels of the bloom pyramid together have 4/3 texels per pixel.
 fn omitted_features(scene: &Scene, culling: Culling) -> Vec<OmittedFeature> {
     let (features, layout, look) = (scene.features, &scene.layout, &scene.look);
     let shadow_bytes: u64 =

@@ -144,7 +144,7 @@ impl TreeScenario {
         let needs_motion = options.target().crown_sway() > 0.0;
         if needs_motion && calibration.gains.iter().all(|gain| *gain == 0.0) {
             let area: f64 = model.domains.iter().map(|domain| domain.area).sum();
-            let given = format!("no motion in the wind (surface area {area}); --wind 0 is calm");
+            let given = format!("no motion in the wind (surface area {area}); use --wind 0 for a scene without wind");
             return Err(invalid_input(
                 "scene",
                 "a domain with a surface and with modes that the wind can excite",
@@ -196,7 +196,8 @@ impl TreeScenario {
         let angle_per_pressure = LEAF_ANGLE * self.options.wind_strength.clamp(0.0, MAX_LEAF_STRENGTH);
         let axes = &self.excitation.axes;
         let leaf_rotation = |((domain, is_rigid_leaf), pressure): ((&DomainModel, &bool), &WindPressure)| {
-            // About these axes, the upper end of a leaf turns downwind and crosswind.
+            // A rotation about the crosswind axis turns the upper end of a leaf downwind, and one about the negative
+            // downwind axis turns it crosswind.
             let axis = axes.crosswind * pressure.downwind - axes.downwind * pressure.crosswind;
             let angle = (angle_per_pressure * axis.norm()).min(MAX_LEAF_ANGLE);
             (*is_rigid_leaf && angle > 0.0).then(|| {
@@ -280,7 +281,7 @@ fn find_rigid_leaves(model: &Model) -> Vec<bool> {
     rigid_leaves
 }
 
-/// Remarks on modes, gusts and sway that the run does not show.
+/// Remarks on held modes, omitted gusts and limited sway.
 fn create_remarks(parameters: &ModalParameters, options: &TreeOptions, calibration: &Calibration) -> Vec<String> {
     let left_out_gusts = (options.nyquist_frequency() < Wind::highest_frequency()).then(|| {
         format!(

@@ -15,7 +15,10 @@ _DETAILS_KEY = "grpc-status-details-bin"
 
 
 class Error(Exception):
-    """Base class of all errors of this package that are not caused by the arguments of the call."""
+    """Base class of the errors of this package.
+
+    Arguments that the client itself rejects raise ValueError or TypeError.
+    """
 
 
 class ConnectionLost(Error, ConnectionError):

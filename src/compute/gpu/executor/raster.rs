@@ -40,7 +40,8 @@ const BLOCK_THREADS: u32 = 128;
 /// can be resident.
 const BLOCKS_PER_SM: u32 = 16;
 
-/// Value of both 32-bit words (inverted depth and triangle) of a sample of the id pass that no triangle covers.
+/// A sample has two 32-bit words: the depth with inverted bits, and the triangle. Both have this value where no triangle
+/// covers the sample.
 const EMPTY_SAMPLE: u32 = u32::MAX;
 /// Bits of the depth of the far plane, 0, which is the depth of a sample that no triangle covers.
 const FAR_DEPTH: u32 = 0;
@@ -271,7 +272,7 @@ impl RasterPipeline {
     /// Empties the queues and clears the samples.
     ///
     /// # Safety
-    /// The target of the pass has the bytes of its window.
+    /// The target of the pass has at least as many bytes as all samples of its window ([`RasterVariant::bytes`]).
     unsafe fn clear(&self, device: &Device, pass: &RasterPass<'_>) -> Result<()> {
         let variant = pass.functions.variant;
         let clear_word = if variant.depth_only { FAR_DEPTH } else { EMPTY_SAMPLE };

@@ -10,7 +10,7 @@ use crate::storage::TILE_QUADS;
 use modalcast_model::domain::RING_START;
 use modalcast_model::scene::TransformRoots;
 
-/// Threads per block of `apply`, `bounds` and `normals`, and packed corners per block of `normals`.
+/// Threads per block of `apply`, `bounds` and `normals`, and corners per block of `normals`.
 pub(crate) const BLOCK: u32 = 256;
 
 /// Threads per warp.
@@ -40,7 +40,8 @@ pub struct StepHeader {
     pub normals: u64,
     pub tangents: u64,
     pub displacements: u64,
-    /// The step that the outputs show before the launch; 0 for a full step, which writes all outputs.
+    /// Number of the last step that the output buffers contain before the launch; 0 for a full step, which writes all
+    /// outputs.
     pub output_step: u32,
     /// Number of the last step that computed all domains.
     pub last_full_step: u32,
@@ -49,7 +50,8 @@ pub struct StepHeader {
     pub change_count: u32,
     pub dirty_tile_count: u32,
     pub reserved: [u32; 3],
-    /// Output of `bounds`: two boxes of six keys (`box_keys`).
+    /// Output of `bounds`: the box along the coordinate axes, and one along `bounding_axes` if they are used. A box has
+    /// six keys, which compare like its floats (`box_keys`).
     pub bounds: [u32; 12],
 }
 
@@ -124,7 +126,7 @@ pub(crate) struct DeformArgs {
     pub reserved: u32,
 }
 
-/// A group of domains of one shape, its members, for which `batch` reads U once.
+/// A group of domains of one shape, for which `batch` reads U once. The domains are the members of the group.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
 pub(crate) struct BatchGroup {

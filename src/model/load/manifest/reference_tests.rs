@@ -56,7 +56,7 @@ fn page_tables() -> BTreeMap<String, Vec<[String; 3]>> {
     tables
 }
 
-/// The path of a key in the parser, for the headings of the page.
+/// The path of the TOML table that a heading of the page describes.
 fn table_path(heading: &str) -> &str {
     match heading {
         "Scene" => "",
@@ -86,7 +86,7 @@ fn page_has_exactly_the_keys_of_the_parser() {
         assert_eq!(documented.len(), rows.len(), "{heading}: expected each key once");
         assert_eq!(documented, parser_keys(table_path(heading)), "keys of {heading}: the page, then the parser");
     }
-    // Tables of the parser that this test does not list would accept any key.
+    // The comparison above covers only the tables in `headings`, so no other table may exist.
     for heading in headings {
         for key in parser_keys(table_path(heading)) {
             let path = if heading == "Scene" { key.clone() } else { format!("{}.{key}", table_path(heading)) };
@@ -147,8 +147,10 @@ fn documented_defaults_are_those_of_the_parser() {
         for [key, _, default] in rows.iter().filter(|[.., default]| default.starts_with('`') && default.ends_with('`'))
         {
             let (value, path) = (default.trim_matches('`'), table_path(&heading));
-            let is_key = key != value && !value.starts_with(char::is_alphabetic) || ["true", "false"].contains(&value);
-            if !is_key {
+            // Other cells name a key or a rule instead of a value.
+            let is_literal =
+                key != value && !value.starts_with(char::is_alphabetic) || ["true", "false"].contains(&value);
+            if !is_literal {
                 continue;
             }
             let path = if path.is_empty() { key.clone() } else { format!("{path}.{key}") };

@@ -13,9 +13,9 @@ use crate::markdown_table::{dash, table};
 
 /// How a rate and the rates of the stages are defined.
 const RATE_NOTE: &str = "The server, the physics process and each viewer are separate processes of this machine. A viewer \
-that receives n replies in a time t, from the first to the last reply, has the rate (n - 1) / t. The rate of a run is that \
-of its slowest viewer, or without viewers that of the physics process, from its first step to its last acknowledgment. \
-The rate of a case is the median of its runs. Every step is lossless.
+that receives n replies in a time t, from the first to the last reply, has the rate (n - 1) / t. The rate of a run is the \
+rate of its slowest viewer. In a run without viewers, it is the rate of the physics process from the first step sent to \
+the last acknowledgment. The rate of a case is the median of its runs. All streams are lossless.
 
 The rate of a stage alone is the number of threads that run it in parallel, divided by its median time per step in the \
 same run. Drawing and encoding times are summed over the distinct views. `deform`, `upload`, `shadow` and `draw` run one \
@@ -92,8 +92,8 @@ fn rate_section(report: &StreamReport) -> String {
         "runs",
         "bytes",
         "slowest stage",
-        "its rate alone",
-        "rate / its rate",
+        "rate of this stage alone",
+        "rate / rate of this stage",
     ];
     let text = section("Rates", RATE_NOTE, &head, rates.iter().map(row).collect());
     let stage_rows = rates.iter().flat_map(|(case, result)| {
@@ -101,7 +101,7 @@ fn rate_section(report: &StreamReport) -> String {
             vec![case.name.to_owned(), rate.line(), rate.parallel.to_string(), format!("{:.1}", rate.per_second)]
         })
     });
-    let stage_head = ["case", "stage: time of resource", "in parallel", "per second alone"];
+    let stage_head = ["case", "stage: time per step", "in parallel", "per second alone"];
     text + &section("Rates of the stages", "The slowest stage of a case is first.", &stage_head, stage_rows.collect())
 }
 
@@ -132,7 +132,8 @@ fn latency_section(report: &StreamReport) -> String {
         "steps/s from memory",
     ];
     let note = "One step is in flight. Sender and viewer are two connections of one process. A step is delayed if the \
-                previous one had not arrived when it was due.";
+                previous one had not arrived when it was due. Steps from memory were recorded before, so that their \
+                rate includes no physics.";
     let text = section("Latency", note, &head, latencies.iter().map(row).collect());
     let stage_rows = latencies.iter().flat_map(|(case, result)| {
         result.stages.iter().map(|stage| {
@@ -221,7 +222,7 @@ fn contention_section(report: &StreamReport) -> String {
         "max ms",
         "added p99 ms",
         "added max ms",
-        "longest stages of the max",
+        "longest stages of the step with the max",
     ];
     let note = "A client sends a step of the tree each period and receives a frame of 320x180 of it, while the server \
                 does a job for another client. A wait counts from the time at which the step was due. The added wait is \
@@ -281,8 +282,9 @@ fn afternoon_section(report: &StreamReport) -> String {
         "server / program",
         "the program's arrays and renderer",
     ];
-    let note = "The program is `tests/bench/peers/afternoon.py`. Its receiver is a process of its own. It replays a \
-                recorded motion, while a physics process drives the server. It draws without normal maps.";
+    let note = "The program is `tests/bench/peers/afternoon.py`. The pictures of the program are received by another \
+                process. The program replays a recorded motion and draws without normal maps; the server is driven by a \
+                physics process.";
     section("Beside a Python program", note, &head, rows.collect())
 }
 

@@ -1,13 +1,14 @@
 //! Rates, latencies and encodings at the client, with the server, the physics process and each viewer in its
 //! own process of this machine.
 //!
-//! - `processes` starts and ends child processes. `peers` are the jobs of this program as a child process: `viewer`,
-//!   `socket` (a plain TCP connection) and `proxy` (a delaying connection).
-//! - `session` is a server with one scene. `motion` has steps that are sent without computing them, `grid` is a scene
-//!   of many vertices.
+//! - `processes` starts and ends child processes. The benchmark also starts its own program as a child, which then has
+//!   one of the roles in `peers`: `viewer`, `socket` (a plain TCP connection) and `proxy` (a delaying connection).
+//! - `session` is a server with one scene. `motion` records steps, so that they can be sent from memory. `grid` is a
+//!   scene of many vertices.
 //! - `cases` lists the cases. Each case makes one measurement: `rates` with `stages`, `latency`, `socket`,
 //!   `contention`, `delay`, `vertex_encodings`, `picture_encodings` or `afternoon`.
-//! - `afternoon_scene` writes a scene for the Python program of `afternoon`.
+//! - `afternoon` compares the server with a Python program that a user could write in an afternoon
+//!   (`tests/bench/peers/afternoon.py`). `afternoon_scene` writes a scene for this program.
 //! - `output`, `markdown` and `plot` write the report.
 
 pub mod afternoon;
@@ -68,7 +69,7 @@ pub struct StreamReportOptions {
     pub cases: Vec<String>,
     /// Steps of each run.
     pub steps: u64,
-    /// Steps of the latencies of frames and of acknowledgments; `None` for the defaults of the size.
+    /// Number of steps of each latency measurement. `None` selects the default of a full or quick report (`size`).
     pub latency_steps: Option<u64>,
     /// Runs of each rate, of which the median is reported.
     pub repeat: usize,

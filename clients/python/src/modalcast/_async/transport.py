@@ -100,7 +100,7 @@ class StepStream:
             complaint = f"the server had no capacity for a step within {timeout:g} s, and the drive has ended"
             raise DeadlineExceeded(f"{self._address}: {complaint}") from None
         except (grpc.RpcError, asyncio.InvalidStateError):
-            # The reader receives the reason.
+            # The task that reads the replies receives the reason. `wait_until` raises it.
             await self.wait_until(lambda: False, 5.0)
 
     async def wait_until(self, condition: Callable[[], bool], timeout: float) -> None:
@@ -254,4 +254,5 @@ class Transport:
         return grpc.aio.insecure_channel(self._target, options=options_of(self._target))
 
     def _new_subscription_channel(self) -> grpc.aio.Channel:
+        # As the channel for calls; the synchronous client needs other options here.
         return self._new_channel()

@@ -37,7 +37,7 @@ class Drive:
     allows, and sends all coordinates and transforms. Steps without acknowledgment may be lost, but not their values.
 
     Attributes:
-        run: The run of this writer, see `StepId`.
+        run: The number of this writer. Later writers of the scene have larger numbers.
         lease_token: Identifies this writer, see `Scene.drive`.
     """
 

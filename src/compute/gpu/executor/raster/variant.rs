@@ -5,7 +5,8 @@ use modalcast_model::scene::Viewport;
 pub(super) const SOURCE: &str = include_str!("../../../../../kernels/raster.cu");
 
 /// The functions of the source with [`CUT_OUTS_DEFINE`]. `raster` draws the opaque triangles of a group,
-/// `raster_cut_outs` draws its cut-outs, and the others process the queues.
+/// `raster_cut_outs` draws its cut-outs, and
+/// the others draw the medium and large triangles, which these two functions put into queues.
 pub(super) const FUNCTIONS: [&str; 4] = ["raster", "raster_cut_outs", "raster_warps", "raster_tiles"];
 /// The functions of the source without [`CUT_OUTS_DEFINE`].
 pub(super) const OPAQUE_FUNCTIONS: [&str; 3] = [FUNCTIONS[0], FUNCTIONS[2], FUNCTIONS[3]];

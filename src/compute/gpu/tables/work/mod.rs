@@ -9,7 +9,8 @@
 //!
 //! Tiles with the most chunks come first, because a long tile that begins last would delay the end of the step. Tiles
 //! with vertices of batched domains come after all other tiles: in a full step, `batch` computes their vertices instead
-//! of `deform`. In a partial step, `deform` computes them, because the tile list can refer to them.
+//! of `deform`. In a partial step, `deform` computes them, because only the tiles of changed domains
+//! are computed, and the list of these tiles (`tile_list`) is an input of `deform`.
 
 pub(crate) mod batches;
 mod coordinates;
@@ -208,7 +209,8 @@ impl WorkList {
         })
     }
 
-    /// Device bytes of the bounding boxes of all tiles: four boxes per tile, six keys of four bytes each.
+    /// Device bytes of the bounding boxes of all tiles: four boxes per tile (boxes.cuh). A box has six u32 keys, which
+    /// compare like its floats.
     pub(crate) const fn box_bytes(&self) -> u64 {
         96 * self.tiles.len() as u64
     }
@@ -386,7 +388,8 @@ fn chunk_count(scene: &Scene, shape: &Shape) -> usize {
     shape.modes.rank().div_ceil(modes_per_chunk(scene.deformation.storage))
 }
 
-/// U of a mixed tile: packed words `[chunk][plane][quad]` with the quads of all of `shapes`. Each shape has one tile
+/// U of a mixed tile: packed words `[chunk][plane][quad]` with the quads of all of `shapes`. A plane has the rows of U
+/// for one of x, y and z. Each shape has one tile
 /// `[chunk][plane][quad]` of three planes, and all shapes have the same number of chunks.
 pub(crate) fn mix_tiles(shapes: &[TiledModes]) -> Vec<PackedWord> {
     let row_count = 3 * shapes.first().map_or(0, TiledModes::chunks);

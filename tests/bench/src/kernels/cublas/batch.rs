@@ -78,9 +78,12 @@ impl CublasMethod {
 /// The operands of u = U q. They index arrays with one entry per operand.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Operand {
+    /// The matrix U.
     Matrix,
+    /// The coordinates q.
     Q,
-    U,
+    /// The displacements u.
+    Displacements,
 }
 
 /// Products of one size and their domains.
@@ -134,7 +137,7 @@ impl GemmPlan {
         let mut offsets = vec![None; domains];
         for batch in &self.batches {
             for (index, domain) in batch.domains.iter().enumerate() {
-                offsets[*domain] = Some(batch.offset(index, Operand::U));
+                offsets[*domain] = Some(batch.offset(index, Operand::Displacements));
             }
         }
         offsets
@@ -253,7 +256,8 @@ mod tests {
                 matrices[batch.offset(index, Operand::Matrix) as usize..][..matrix.len()].copy_from_slice(&matrix);
             }
         }
-        let (q, mut u) = (plan.pack_q(scene, state), vec![f32::NAN; plan.floats[Operand::U as usize] as usize]);
+        let (q, mut u) =
+            (plan.pack_q(scene, state), vec![f32::NAN; plan.floats[Operand::Displacements as usize] as usize]);
         for batch in &plan.batches {
             multiply(batch, by_rows, [&matrices, &q], &mut u);
         }

@@ -69,7 +69,7 @@ impl CublasBenchmark {
         check_functions(is_grouped, method.uses_strided_gemv())?;
         let u_offsets = plan.u_offsets(scene.domains.len());
         let matrices = upload_matrices(device, scene, &plan, method)?;
-        let u = DeviceBuffer::zeroed(device, 4 * plan.floats[Operand::U as usize])?;
+        let u = DeviceBuffer::zeroed(device, 4 * plan.floats[Operand::Displacements as usize])?;
         let transforms = |state: &SceneState| bytemuck::cast_slice(&state.world_transforms(scene)).to_vec();
         let input_sets = InputSets::new(device, scene, states, |state| [plan.pack_q(scene, state), transforms(state)])?;
         let pointers = is_grouped.then(|| PointerArrays::new(device, &plan, [&matrices, &u], &input_sets));
@@ -131,7 +131,7 @@ impl KernelBenchmark for CublasBenchmark {
         if let Some(update) = &self.update {
             return update.positions(device);
         }
-        let mut u = vec![0.0_f32; self.plan.floats[Operand::U as usize] as usize];
+        let mut u = vec![0.0_f32; self.plan.floats[Operand::Displacements as usize] as usize];
         self.cublas.buffers.u.read(device, 0, &mut u)?;
         let u_offsets = &self.u_offsets;
         Ok(self.cublas.buffers.input_sets.compute_positions_on_host(|domain, vertex| {
@@ -185,7 +185,7 @@ impl PointerArrays {
         let matrices: Vec<u64> = pointers(matrices.address(), Operand::Matrix).collect();
         Ok(Self {
             matrices: DeviceBuffer::upload(device, &matrices)?,
-            u: DeviceBuffer::upload(device, &pointers(u.address(), Operand::U).collect::<Vec<u64>>())?,
+            u: DeviceBuffer::upload(device, &pointers(u.address(), Operand::Displacements).collect::<Vec<u64>>())?,
             q: DeviceBuffer::upload(device, &q)?,
             product_count: products().count() as u64,
         })
