@@ -10,6 +10,9 @@ import { icon } from "./icons";
 /** Modes shown at a time. */
 const MAX_MODES = 40;
 
+/** Milliseconds after the last key press in which a slider keeps its value: the state that shows it may arrive later. */
+const INPUT_MS = 1000;
+
 interface ModeRow {
     value: HTMLElement;
     bar: HTMLElement;
@@ -34,6 +37,7 @@ export class CoordinateSection {
     private ranges: number[] = [];
     private animated: number | null = null;
     private canDrive = false;
+    private lastInput = -Infinity;
     private readonly select: HTMLSelectElement;
     private readonly list = h("div", { className: "modes" });
     private readonly hint = h("p", { className: "hint" });
@@ -145,7 +149,8 @@ export class CoordinateSection {
             this.ranges[mode] = range;
             setText(value, short(current));
             bar.style.transform = `scaleX(${current / range})`;
-            if (document.activeElement !== slider || !slider.matches(":active")) {
+            const isEdited = slider.matches(":active") || performance.now() - this.lastInput < INPUT_MS;
+            if (document.activeElement !== slider || !isEdited) {
                 slider.max = String(range);
                 slider.min = String(-range);
                 slider.step = String(range / 200);
@@ -167,6 +172,7 @@ export class CoordinateSection {
         const track = h("div", { className: "track" }, bar);
         const slider = h("input", { type: "range", aria: { label: `Coordinate ${mode + 1}` } });
         slider.oninput = () => {
+            this.lastInput = performance.now();
             if (this.animated !== null) this.handlers.stop();
             this.animated = null;
             this.handlers.set(this.domain, mode, Number(slider.value));
