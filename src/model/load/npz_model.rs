@@ -143,6 +143,23 @@ mod tests {
         assert_eq!(transposed.shapes[0].mesh, expected.shapes[0].mesh);
     }
 
+    /// Solvers on other machines write big-endian numbers.
+    #[test]
+    fn big_endian_arrays_are_read() {
+        let to_big_endian = |bytes: Vec<u8>, little: &str, big: &str| {
+            let end = bytes.iter().position(|byte| *byte == b'\n').expect("the end of the header") + 1;
+            let header = String::from_utf8_lossy(&bytes[10..end]).replace(little, big);
+            assert!(header.contains(big), "control: {header}");
+            let entries = bytes[end..].chunks_exact(8).flat_map(|entry| entry.iter().rev().copied());
+            [&bytes[..10], header.as_bytes(), &entries.collect::<Vec<u8>>()[..]].concat()
+        };
+        let [(vertices, positions), (faces, triangles)]: [_; 2] = square().try_into().expect("two arrays");
+        let big_endian =
+            [(vertices, to_big_endian(positions, "<f8", ">f8")), (faces, to_big_endian(triangles, "<i8", ">i8"))];
+        let (read, expected) = (read_arrays(&big_endian), read_arrays(&square()));
+        assert_eq!(read.expect("a mesh").shapes[0].mesh, expected.expect("a mesh").shapes[0].mesh);
+    }
+
     #[test]
     fn archive_with_mesh_modes_and_eigenvalues_is_one_domain() {
         let mut arrays = square();

@@ -192,14 +192,24 @@ fn describe_format(name: &str) -> String {
     conversion(name).map_or_else(|| name.to_owned(), |conversion| format!("{name} ({conversion})"))
 }
 
+/// The command that converts a mesh of surfaces.
+fn meshio_conversion(name: &str, converted: &str) -> String {
+    format!(
+        "convert it: meshio convert {name} {converted}; of a volume mesh, write the surface as the section Models in the \
+         reference of scene.toml shows"
+    )
+}
+
 /// How a file of another format is converted; `None` for an unknown format.
 fn conversion(name: &str) -> Option<String> {
     let stem = stem_of(name);
     match extension_of(name).as_str() {
-        // Formats that meshio reads (5.3).
-        "vtk" | "vtu" | "msh" | "inp" | "bdf" | "nas" | "fem" | "e" | "ex2" | "exo" | "xdmf" | "xmf" | "med"
-        | "mesh" | "meshb" | "off" | "ugrid" | "su2" | "cgns" | "h5m" | "avs" | "mdpa" | "f3grid" | "wkt" | "tec" => {
-            Some(format!("convert it: meshio convert {name} {stem}.ply"))
+        // Formats that meshio reads (5.3). It writes only triangles and quadrilaterals to these formats. Binary VTK
+        // files are big-endian, which it cannot write as PLY.
+        "vtk" => Some(meshio_conversion(name, &format!("{stem}.obj"))),
+        "vtu" | "msh" | "inp" | "bdf" | "nas" | "fem" | "e" | "ex2" | "exo" | "xdmf" | "xmf" | "med" | "mesh"
+        | "meshb" | "off" | "ugrid" | "su2" | "cgns" | "h5m" | "avs" | "mdpa" | "f3grid" | "wkt" | "tec" => {
+            Some(meshio_conversion(name, &format!("{stem}.ply")))
         }
         "vtp" => Some(format!("convert it with PyVista: pyvista.read('{name}').save('{stem}.ply')")),
         "fbx" | "dae" | "3ds" | "blend" | "usd" | "usda" | "usdc" | "usdz" | "abc" | "x3d" | "3mf" | "step" | "stp"

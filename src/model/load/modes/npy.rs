@@ -3,6 +3,8 @@
 //! The parser of the header only searches for known keys. A general parser of Python literals would recurse as deep as
 //! brackets nest, so that a header with many brackets could overflow the stack.
 
+use std::borrow::Cow;
+
 use crate::error::{Error, Result, invalid};
 
 /// The longest accepted header in bytes.
@@ -58,18 +60,21 @@ pub(in crate::load) fn parse_f64(bytes: &[u8]) -> Result<(Vec<usize>, Vec<f64>)>
     if header.fortran_order && header.shape.len() > 2 {
         return Err(invalid("fortran_order", "False for more than two axes", "True"));
     }
-    let entries: Vec<f64> = match header.dtype.as_str() {
-        "|u1" | "|b1" => body.iter().map(|entry| f64::from(*entry)).collect(),
-        "<i2" => body.as_chunks().0.iter().map(|entry| f64::from(i16::from_le_bytes(*entry))).collect(),
-        "<u2" => body.as_chunks().0.iter().map(|entry| f64::from(u16::from_le_bytes(*entry))).collect(),
-        "<i4" => body.as_chunks().0.iter().map(|entry| f64::from(i32::from_le_bytes(*entry))).collect(),
-        "<u4" => body.as_chunks().0.iter().map(|entry| f64::from(u32::from_le_bytes(*entry))).collect(),
+    let (kind, body) = in_little_endian(&header.dtype, body);
+    let body = &*body;
+    let entries: Vec<f64> = match kind {
+        "u1" | "b1" => body.iter().map(|entry| f64::from(*entry)).collect(),
+        "i1" => body.iter().map(|entry| f64::from(i8::from_le_bytes([*entry]))).collect(),
+        "i2" => body.as_chunks().0.iter().map(|entry| f64::from(i16::from_le_bytes(*entry))).collect(),
+        "u2" => body.as_chunks().0.iter().map(|entry| f64::from(u16::from_le_bytes(*entry))).collect(),
+        "i4" => body.as_chunks().0.iter().map(|entry| f64::from(i32::from_le_bytes(*entry))).collect(),
+        "u4" => body.as_chunks().0.iter().map(|entry| f64::from(u32::from_le_bytes(*entry))).collect(),
         // Whole numbers above 2^53 are rounded. No valid index is as large.
-        "<i8" => body.as_chunks().0.iter().map(|entry| i64::from_le_bytes(*entry) as f64).collect(),
-        "<u8" => body.as_chunks().0.iter().map(|entry| u64::from_le_bytes(*entry) as f64).collect(),
-        "<f4" => body.as_chunks().0.iter().map(|entry| f64::from(f32::from_le_bytes(*entry))).collect(),
-        "<f8" => body.as_chunks().0.iter().map(|entry| f64::from_le_bytes(*entry)).collect(),
-        other => return Err(invalid("descr", "u1, or a little-endian i2, u2, i4, u4, i8, u8, f4 or f8", other)),
+        "i8" => body.as_chunks().0.iter().map(|entry| i64::from_le_bytes(*entry) as f64).collect(),
+        "u8" => body.as_chunks().0.iter().map(|entry| u64::from_le_bytes(*entry) as f64).collect(),
+        "f4" => body.as_chunks().0.iter().map(|entry| f64::from(f32::from_le_bytes(*entry))).collect(),
+        "f8" => body.as_chunks().0.iter().map(|entry| f64::from_le_bytes(*entry)).collect(),
+        _ => return Err(invalid("descr", "i1, u1, i2, u2, i4, u4, i8, u8, f4 or f8", header.dtype)),
     };
     let entries = match header.shape[..] {
         [rows, columns] if header.fortran_order => {
@@ -78,6 +83,16 @@ pub(in crate::load) fn parse_f64(bytes: &[u8]) -> Result<(Vec<usize>, Vec<f64>)>
         _ => entries,
     };
     Ok((header.shape, entries))
+}
+
+/// The type of the entries without its byte order, and the entries in little-endian order.
+fn in_little_endian<'a, 'b>(dtype: &'a str, body: &'b [u8]) -> (&'a str, Cow<'b, [u8]>) {
+    let kind = dtype.get(1..).unwrap_or_default();
+    let entry_bytes = kind.get(1..).and_then(|digits| digits.parse().ok()).unwrap_or(1).max(1);
+    match dtype.starts_with('>') {
+        true => (kind, body.chunks_exact(entry_bytes).flat_map(|entry| entry.iter().rev().copied()).collect()),
+        false => (kind, Cow::Borrowed(body)),
+    }
 }
 
 /// Parses the header of a file. `bytes` contains at least the header. Returns the header and the bytes after it.

@@ -4,7 +4,7 @@
 
 use std::collections::BTreeMap;
 
-use super::parse::{parse_number, text_after_key, words};
+use super::parse::{parse_number, text_after_key, without_byte_order_mark, words};
 use crate::error::{Result, invalid};
 
 /// The statements of one `newmtl`. A missing statement is `None`.
@@ -31,7 +31,7 @@ pub(super) struct MtlMaterial {
 pub(super) fn parse(bytes: &[u8]) -> Result<BTreeMap<String, MtlMaterial>> {
     let mut materials = BTreeMap::new();
     let mut current: Option<(String, MtlMaterial)> = None;
-    for (index, line) in bytes.split(|byte| *byte == b'\n').enumerate() {
+    for (index, line) in without_byte_order_mark(bytes)?.split(|byte| *byte == b'\n').enumerate() {
         let Some(key) = words(line).next() else { continue };
         if key == b"newmtl" {
             materials.extend(current.replace((text_after_key(line), MtlMaterial::default())));

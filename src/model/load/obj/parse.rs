@@ -35,7 +35,7 @@ impl ObjFile {
         let mut parser = Parser::default();
         parser.obj.polygons.memory = memory;
         let mut joined_line = Vec::new();
-        for (index, line) in bytes.split(|byte| *byte == b'\n').enumerate() {
+        for (index, line) in without_byte_order_mark(bytes)?.split(|byte| *byte == b'\n').enumerate() {
             let line = line.strip_suffix(b"\r").unwrap_or(line);
             // A backslash at the end of a line continues it on the next one.
             if let Some(line_start) = line.strip_suffix(b"\\") {
@@ -52,6 +52,18 @@ impl ObjFile {
             }
         }
         parser.finish()
+    }
+}
+
+/// A text without the byte-order mark that some programs write at its start.
+///
+/// # Errors
+/// `Invalid` for the mark of UTF-16.
+pub(super) fn without_byte_order_mark(text: &[u8]) -> Result<&[u8]> {
+    match text {
+        [0xef, 0xbb, 0xbf, rest @ ..] => Ok(rest),
+        [0xff, 0xfe, ..] | [0xfe, 0xff, ..] => Err(invalid("text", "UTF-8", "UTF-16")),
+        _ => Ok(text),
     }
 }
 
@@ -258,6 +270,20 @@ mod tests {
         assert_eq!(obj.polygons.positions, [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]);
         assert_eq!((obj.polygons.faces[0].material, obj.polygons.faces[1].material), (0, 1));
         assert_eq!(obj.remarks, ["1 statements 'l' are not used"]);
+    }
+
+    #[test]
+    fn byte_order_mark_is_no_part_of_the_first_statement() {
+        let text = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n";
+        let marked = ObjFile::parse(format!("\u{feff}{text}").as_bytes(), None).expect("a valid file");
+        assert_eq!(
+            marked.polygons.positions,
+            ObjFile::parse(text.as_bytes(), None).expect("a valid file").polygons.positions
+        );
+        assert!(marked.remarks.is_empty(), "{:?}", marked.remarks);
+        let utf16: Vec<u8> = format!("\u{feff}{text}").encode_utf16().flat_map(u16::to_le_bytes).collect();
+        let message = ObjFile::parse(&utf16, None).expect_err("UTF-16").to_string();
+        assert_eq!(message, "text: expected UTF-8, got UTF-16");
     }
 
     #[test]

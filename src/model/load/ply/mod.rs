@@ -57,6 +57,8 @@ struct PlyReader {
     /// The file in the comment `TextureFile`.
     image: Option<String>,
     remarks: Vec<String>,
+    /// Number of faces with one or two corners: the points and lines of a finite-element mesh.
+    small_face_count: usize,
 }
 
 impl PlyReader {
@@ -77,6 +79,14 @@ impl PlyReader {
         let vertex_count = self.polygons.positions.len() as u32;
         if header.elements.get("face").is_none_or(|face| face.count == 0) {
             return Err(invalid("element face", "at least one face", format!("{vertex_count} vertices, no face")));
+        }
+        let count = self.small_face_count;
+        if header.elements.get("face").is_some_and(|face| face.count == count) {
+            return Err(invalid("element face", "at least one face", format!("{count} points and lines")));
+        }
+        if count > 0 {
+            self.remarks
+                .push(format!("{count} faces are points or lines, with fewer than 3 corners: they are not drawn"));
         }
         self.polygons.check(|face| format!("face {face}"), 0)
     }
@@ -109,6 +119,10 @@ impl PlyReader {
     fn add_face(&mut self, face: &PlyFace, index: usize) -> Result<()> {
         let polygons = &mut self.polygons;
         let field = || format!("face {index}");
+        if face.vertices.len() < 3 {
+            self.small_face_count += 1;
+            return Ok(());
+        }
         let count = polygons.positions.len();
         if let Some(vertex) = face.vertices.iter().find(|vertex| !(0..count as i64).contains(*vertex)) {
             return Err(invalid(format!("{}: index", field()), format!("0 to {}", count.saturating_sub(1)), vertex));

@@ -64,6 +64,15 @@ fn normals_texture_coordinates_and_unused_properties_are_recognized() {
     );
 }
 
+/// meshio writes the points and lines of a mesh of Gmsh as faces with one and two corners.
+#[test]
+fn points_and_lines_are_a_remark() {
+    let text = ascii().replace("element face 2", "element face 4").replace("3 0 1 2\n", "1 0\n2 0 1\n3 0 1 2\n");
+    let ply = parse(text.as_bytes()).expect("a valid file");
+    assert_eq!(ply.remarks, ["2 faces are points or lines, with fewer than 3 corners: they are not drawn"]);
+    assert_eq!(ply.polygons.corners_of(1).iter().map(|corner| corner.vertex).collect::<Vec<_>>(), [0, 2, 3]);
+}
+
 #[test]
 fn missing_image_is_a_remark_but_an_error_in_strict_mode() {
     let text = ascii()
@@ -113,9 +122,12 @@ fn hostile_headers_and_elements_are_rejected_before_allocation() {
         (replaced("property float z\n", "property float w\n"), "element vertex: expected the properties x, y and z"),
         (replaced("element face 2", "element tristrips 2"), "element tristrips: expected faces"),
         (replaced("element face 2", "element polygon 2"), "element face: expected at least one face, got 4 vertices"),
+        (
+            replaced("3 0 1 2\n3 0 2 3", "1 0\n2 0 2"),
+            "element face: expected at least one face, got 2 points and lines",
+        ),
         (replaced("int vertex_indices", "float vertex_indices"), "face 0: expected a complete element"),
         (replaced("3 0 2 3", "3 0 2 4"), "face 1: index: expected 0 to 3, got 4"),
-        (replaced("3 0 2 3", "2 0 2"), "face 1: face: expected at least 3 corners, got 2"),
         (replaced("3 0 2 3", "4000000000 0 2 3"), "face 1: expected a complete element"),
         (replaced("1 1 0", "1 nan 0"), "vertex 2: expected a complete element"),
         (replaced("1 1 0", "1 1e40 0"), "vertex 2: expected finite numbers, got inf"),
