@@ -119,7 +119,8 @@ async fn beam_from_arrays_has_the_vertices_of_the_beam_from_files() {
     assert_eq!(vertex_bits(&server, "arrays").await, driven_bits, "expected the scene after a restart");
 }
 
-/// Every vertex of the beam is on an edge of 90 degrees. The second domain has the shape of the first one.
+/// Every vertex of the beam is on an edge of 90 degrees. The second domain has the shape of the first one. The angle is
+/// stored also if it is the default, so that a later default does not change the scene after a restart.
 #[tokio::test(flavor = "multi_thread")]
 async fn crease_angle_of_arrays_splits_corners_but_no_vertices() {
     let folder = tempfile::tempdir().expect("expected a temporary folder");
@@ -134,6 +135,15 @@ async fn crease_angle_of_arrays_splits_corners_but_no_vertices() {
         let description = client.describe(name, &[]).await.expect("expected a description");
         assert_eq!(description.shapes.len(), 1, "{name}: expected one shape for both domains");
     }
+    let uploads = std::fs::read_dir(folder.path().join("state/uploads")).expect("expected uploads");
+    let manifests = uploads.map(|entry| entry.expect("expected a folder").path().join("scene.toml"));
+    let angles_of = |path: std::path::PathBuf| -> Vec<String> {
+        let text = std::fs::read_to_string(path).expect("expected a manifest");
+        text.lines().filter_map(|line| line.strip_prefix("crease_angle = ").map(str::to_owned)).collect()
+    };
+    let mut angles: Vec<Vec<String>> = manifests.map(angles_of).collect();
+    angles.sort_unstable();
+    assert_eq!(angles, [["180.0"; 2], ["40.0"; 2], ["89.0"; 2]]);
 }
 
 /// Sends parts and returns the rejection.

@@ -64,7 +64,7 @@ pub struct UploadedDomain {
     pub color: [f32; 3],
     /// Empty, or one eigenvalue (omega^2) per mode.
     pub eigenvalues: Vec<f64>,
-    /// For arrays only: the crease angle, if it is not the default.
+    /// For arrays only: the crease angle. `None` is the default.
     pub crease_angle: Option<CreaseAngle>,
 }
 
@@ -80,8 +80,7 @@ pub struct ArrayUpload {
     /// Per domain so far, its number of modes.
     ranks: Vec<u32>,
     /// Per domain so far, the crease angle of its mesh.
-    crease_angles: Vec<Option<CreaseAngle>>,
-    /// Names of the domains so far.
+    crease_angles: Vec<CreaseAngle>,
     names: HashSet<String>,
     /// Sum of the sizes of the arrays of all domains so far, in bytes.
     declared_bytes: u64,
@@ -236,7 +235,7 @@ impl ArrayUpload {
             return Err(invalid("name", "a name that no earlier domain has", &domain.name));
         }
         let (shape, rank, crease_angle) = match domain.shape {
-            UploadedShape::Arrays { rank, .. } => (index, rank, domain.crease_angle),
+            UploadedShape::Arrays { rank, .. } => (index, rank, domain.crease_angle.unwrap_or_default()),
             UploadedShape::OfDomain(earlier) if earlier < index => {
                 if let Some(given) = domain.crease_angle {
                     return Err(invalid("crease_angle", "none with shares_shape_with", given.degrees()));
@@ -263,21 +262,20 @@ impl ArrayUpload {
         Ok(())
     }
 
-    /// Appends the entry of a domain to the manifest. `{:?}` prints f64 with all digits that they need.
-    fn write_entry(&mut self, shape: u32, rank: u32, crease_angle: Option<CreaseAngle>, domain: &UploadedDomain) {
+    /// Appends the entry of a domain to the manifest. `{:?}` prints f64 with all digits that they need. The crease
+    /// angle is written also if it is the default, so that the scene keeps it when a later version has another default.
+    fn write_entry(&mut self, shape: u32, rank: u32, crease_angle: CreaseAngle, domain: &UploadedDomain) {
         let modes = if rank > 0 { format!("{shape}.npy") } else { String::new() };
         let up = self.up();
         let text = format!(
             "\n[[domain]]\nname = {}\nmodel = \"{shape}.obj\"\nmodes = \"{modes}\"\nup = \"{up}\"\nplacement.matrix = {:?}\n\
-             material.diffuse = {:?}\n",
+             material.diffuse = {:?}\ncrease_angle = {:?}\n",
             toml_string(&domain.name),
             domain.placement.0.map(f64::from),
             domain.color.map(f64::from),
+            crease_angle.degrees(),
         );
         self.manifest.push_str(&text);
-        if let Some(angle) = crease_angle {
-            writeln!(self.manifest, "crease_angle = {:?}", angle.degrees()).ok(); // A `String` accepts all text.
-        }
         if !domain.eigenvalues.is_empty() {
             writeln!(self.manifest, "eigenvalues = {:?}", domain.eigenvalues).ok(); // A `String` accepts all text.
         }
