@@ -17,8 +17,13 @@ vec3 apply_normal_map(vec3 normal, vec4 raw_tangent, vec3 texel) {
 }
 #endif
 
-// `geometric_normal` is the normal before normal mapping, which the shadow lookup uses.
-vec3 phong(Material material, vec3 tint, vec3 normal, vec3 geometric_normal, vec3 world) {
+// Point and plane of a surface whose sun visibility is looked up. Normal maps do not change them.
+struct ShadowReceiver {
+    vec3 point;
+    vec3 normal;
+};
+
+vec3 phong(Material material, vec3 tint, vec3 normal, vec3 world, ShadowReceiver receiver) {
     vec3 to_sun = frame.to_sun.xyz;
     vec3 light = frame.skylight.rgb * material.ambient.rgb * tint;
     float cosine = dot(normal, to_sun);
@@ -28,7 +33,7 @@ vec3 phong(Material material, vec3 tint, vec3 normal, vec3 geometric_normal, vec
         float highlight_cosine = dot(reflected, to_sun);
         float highlight = highlight_cosine > 0.0 ? pow(highlight_cosine, material.specular.a) : 0.0;
         vec3 reflectance = cosine * material.diffuse.rgb * tint + highlight * material.specular.rgb;
-        light += sun_visibility(world, geometric_normal) * frame.sunlight.rgb * reflectance;
+        light += sun_visibility(receiver.point, receiver.normal) * frame.sunlight.rgb * reflectance;
     }
     return light;
 }

@@ -8,6 +8,36 @@ layout(binding = 20) uniform samplerBuffer tangents;
 
 vec2 finite_or_zero(vec2 slope) { return any(isnan(slope)) || any(isinf(slope)) ? vec2(0.0) : slope; }
 
+// The receiver of shadows at a point of a triangle. `normal` is the interpolated normal. `facing` is 1 if the front
+// side is visible, else -1.
+//
+// On a triangle that faces the sun, it is the triangle itself: no part of it is in front of its plane. The interpolated
+// normals of a coarse mesh have other planes, in which the triangle would shade itself.
+//
+// The interpolated normals describe a smooth surface. The sun lights a part of it that lies on triangles which face
+// away from the sun. These triangles are in their own shadow, so that dark triangles would show where the light ends
+// (the shadow terminator). Their receiver is therefore the smooth surface: the point is moved out of the tangent planes
+// of the corners (J. Hanika, "Hacking the Shadow Terminator", Ray Tracing Gems II, 2021). The offset is 0 where all
+// corners have the normal of the triangle.
+ShadowReceiver shadow_receiver(Triangle triangle, vec3 weights, vec3 world, vec3 normal, float facing) {
+#ifdef SHADOWS
+    // Cosine of the angle between the sun and the triangle's normal above which the triangle faces the sun.
+    const float FACING_COSINE = 0.25;
+    vec3 edge = safe_normalize(triangle.world[1] - triangle.world[0]);
+    vec3 face = safe_normalize(cross(edge, safe_normalize(triangle.world[2] - triangle.world[0])));
+    face *= dot(face, normal) < 0.0 ? -1.0 : 1.0;
+    float smoothness = clamp(1.0 - facing * dot(face, frame.to_sun.xyz) / FACING_COSINE, 0.0, 1.0);
+    vec3 offset = vec3(0.0);
+    for (int corner = 0; corner < 3; corner++) {
+        vec3 outside = facing * safe_normalize(triangle.normal[corner]);
+        offset -= weights[corner] * min(dot(world - triangle.world[corner], outside), 0.0) * outside;
+    }
+    return ShadowReceiver(world + smoothness * offset, mix(face, normal, smoothness));
+#else
+    return ShadowReceiver(world, normal);
+#endif
+}
+
 vec4 shade_triangle(int triangle_index, vec2 ndc, vec2 pixel_size) {
     Triangle triangle = fetch_triangle(triangle_index, ndc);
     Barycentrics bary = compute_barycentrics(triangle.clip[0], triangle.clip[1], triangle.clip[2], pixel_size);
@@ -30,8 +60,11 @@ vec4 shade_triangle(int triangle_index, vec2 ndc, vec2 pixel_size) {
     vec3 normal_map_texel = normal_texel(material.images.zw, uv, uv_ddx, uv_ddy).xyz;
     if (material.images.z >= 0) shading_normal = apply_normal_map(shading_normal, corner_tangents * bary.weights, normal_map_texel);
 #endif
-    shading_normal = bary.is_front_facing ? shading_normal : -shading_normal;
-    vec3 light = phong(material, tint.rgb, shading_normal, geometric_normal, triangle.world * bary.weights);
+    float facing = bary.is_front_facing ? 1.0 : -1.0;
+    shading_normal *= facing;
+    vec3 world = triangle.world * bary.weights;
+    ShadowReceiver receiver = shadow_receiver(triangle, bary.weights, world, geometric_normal, facing);
+    vec3 light = phong(material, tint.rgb, shading_normal, world, receiver);
 #ifdef MESH_EDGES
     light = mix(light, frame.edges.rgb, edge_coverage(triangle, triangle_index, pixel_size));
 #endif

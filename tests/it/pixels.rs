@@ -26,5 +26,6 @@ mod shadow_cache;
 mod shadow_extremes;
 mod shadow_ground;
 mod shadow_methods;
+mod shadow_terminator;
 mod snapshots;
 mod visibility;
