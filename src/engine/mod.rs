@@ -663,20 +663,19 @@ fn scene_not_open(name: &str) -> Error {
 
 #[cfg(test)]
 mod tests {
-    use std::time::Duration;
-
     use modalcast_model::deform::VertexAttributes;
     use modalcast_model::scene::RawStepUpdate;
 
     use super::testing::{FaultyDeformer, InjectedFault, StripsSource};
     use super::*;
+    use crate::hang_guard::HANG_GUARD;
 
     const POSITIONS: OutputSpec =
         OutputSpec::Vertices(VertexAttributes { positions: true, normals: false, displacements: false, boxes: false });
 
     /// Starts an engine whose deformer injects faults, and opens the scenes "faulty" and "control".
     async fn start_faulty_engine(state_folder: &std::path::Path) -> (Engine, Arc<SceneHandle>, Arc<SceneHandle>) {
-        let config = Config { state: state_folder.to_owned(), ..Config::default() }
+        let config = Config { state: state_folder.to_owned(), stall_timeout: HANG_GUARD, ..Config::default() }
             .validated()
             .expect("expected a valid configuration");
         let open_device = || DeviceContext::with_deformer(FaultyDeformer::boxed);
@@ -701,7 +700,7 @@ mod tests {
     }
 
     async fn await_within_limit<T>(work: impl Future<Output = T>) -> T {
-        tokio::time::timeout(Duration::from_secs(60), work).await.expect("expected an answer within 60 s")
+        tokio::time::timeout(HANG_GUARD, work).await.expect("expected an answer")
     }
 
     async fn acquire_writer(scene_handle: &SceneHandle) -> WriterSession {

@@ -41,6 +41,10 @@
 
 #![cfg_attr(not(test), deny(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::print_stdout))]
 
+#[cfg(test)]
+#[path = "../../tests/common/hang_guard.rs"]
+mod hang_guard;
+
 mod device;
 mod layout;
 mod pass;

@@ -222,6 +222,7 @@ mod tests {
 
     use super::*;
     use crate::engine::lossless_lease;
+    use crate::hang_guard::HANG_GUARD;
 
     async fn check_health(client: &mut HealthClient<Channel>) -> i32 {
         let request = HealthCheckRequest { service: String::new() };
@@ -252,8 +253,7 @@ mod tests {
                 tokio::time::sleep(Duration::from_millis(5)).await;
             }
         };
-        let timeout = Duration::from_secs(60);
-        tokio::time::timeout(timeout, wait_for_not_serving).await.expect("expected NOT_SERVING within 60 s");
+        tokio::time::timeout(HANG_GUARD, wait_for_not_serving).await.expect("expected NOT_SERVING");
         stop_sender.send(()).expect("expected the server to run until it is stopped");
         server.await.expect("expected no panic").expect("expected a clean stop");
     }

@@ -287,6 +287,6 @@ mod tests {
         held.resize(60).expect("expected capacity");
         let eviction = held.next_eviction();
         requested.resize(50).expect("expected the other connection to be evicted");
-        tokio::time::timeout(std::time::Duration::from_secs(10), eviction).await.expect("expected a notification");
+        tokio::time::timeout(crate::hang_guard::HANG_GUARD, eviction).await.expect("expected a notification");
     }
 }

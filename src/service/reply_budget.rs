@@ -475,7 +475,7 @@ mod tests {
     }
 
     async fn with_timeout<T>(work: impl Future<Output = T>) -> T {
-        tokio::time::timeout(Duration::from_secs(60), work).await.expect("expected completion within 60 s")
+        tokio::time::timeout(crate::hang_guard::HANG_GUARD, work).await.expect("expected completion")
     }
 
     #[tokio::test]

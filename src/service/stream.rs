@@ -355,7 +355,8 @@ mod tests {
             Ok(())
         });
         drop(replies);
-        let result = tokio::time::timeout(Duration::from_secs(10), work_dropped).await.expect("expected dropped work");
+        let result =
+            tokio::time::timeout(crate::hang_guard::HANG_GUARD, work_dropped).await.expect("expected dropped work");
         assert!(result.is_err());
     }
 

@@ -11,6 +11,8 @@ mod error_bounds;
 pub(crate) mod exact_triangle;
 pub(crate) mod extreme_values;
 pub(crate) mod followers;
+#[allow(dead_code, reason = "each test binary uses a part")]
+pub(crate) mod hang_guard;
 pub(crate) mod light_bounds;
 pub(crate) mod neighbors;
 pub(crate) mod overflow;

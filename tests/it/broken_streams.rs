@@ -28,9 +28,6 @@ use crate::service_harness::{
     step, strips, with_timeout,
 };
 
-/// A timeout that no test reaches, so that a wait ends only when the server releases what it waits for.
-const NEVER: Duration = Duration::from_secs(3600);
-
 /// Pause between two attempts of a poll.
 const POLL_INTERVAL: Duration = Duration::from_millis(5);
 
@@ -108,13 +105,8 @@ fn reason_of<T>(result: Result<T, Status>) -> Reason {
 /// the server releases them.
 #[tokio::test(flavor = "multi_thread")]
 async fn broken_streams_release_their_subscriptions() {
-    let limits = |config| Config {
-        backend: BackendChoice::Cpu,
-        renderer: RendererChoice::Auto,
-        max_subscribers: 1,
-        stall_timeout: NEVER,
-        ..config
-    };
+    let limits =
+        |config| Config { backend: BackendChoice::Cpu, renderer: RendererChoice::Auto, max_subscribers: 1, ..config };
     let server = Server::start_with(limits).await;
     server.open("sheet").await;
     let direct_channel = server.channel().await;
@@ -154,12 +146,7 @@ async fn broken_streams_release_their_subscriptions() {
 async fn broken_requests_stop_waiting() {
     let server = Server::start_with(|config| Config { max_pending_requests: 1, ..config }).await;
     server.open("strips").await;
-    let request = || v1::GetVerticesRequest {
-        scene: "strips".into(),
-        step: minimum_step(99),
-        deadline_ms: 600_000,
-        ..Default::default()
-    };
+    let request = || v1::GetVerticesRequest { scene: "strips".into(), step: minimum_step(99), ..Default::default() };
     // A request without a reply after 20 poll intervals counts as admitted.
     let try_wait = async |channel: &Channel| {
         let mut client = VertexServiceClient::new(channel.clone());
@@ -330,7 +317,7 @@ async fn break_upload<T, F>(
 async fn broken_uploads_leave_no_files_and_no_scene() {
     let folder = tempfile::tempdir().expect("expected a temporary folder");
     let repository = SceneRepository::new(None).expect("expected a repository");
-    let config = Config { stall_timeout: NEVER, ..config(folder.path()) };
+    let config = config(folder.path());
     let server = Server::start_from(config, Arc::new(repository)).await;
     for how in BREAKS {
         break_upload(&server, how, file_upload(), |channel, requests| async {

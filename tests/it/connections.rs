@@ -1,8 +1,6 @@
 //! Connections that send no request are closed after a timeout, or at once if the server is full and another client
 //! connects.
 
-use std::time::Duration;
-
 use modalcast::config::Config;
 use modalcast_proto::v1;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
@@ -10,7 +8,7 @@ use tokio::net::TcpStream;
 use v1::Delivery;
 use v1::scene_service_client::SceneServiceClient;
 
-use crate::service_harness::{DEFAULT_WINDOW, Server, StepWriter, step, with_timeout};
+use crate::service_harness::{DEFAULT_WINDOW, SILENCE_LIMIT, Server, StepWriter, step, with_timeout};
 
 /// The preface of HTTP/2 and an empty SETTINGS frame.
 const HELLO: &[u8] = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n\x00\x00\x00\x04\x00\x00\x00\x00\x00";
@@ -48,14 +46,7 @@ fn contains_goaway(bytes: &[u8]) -> bool {
 
 /// Handshakes have no deadline here, so only the full server closes connections.
 async fn small_server(connections: usize) -> Server {
-    let patient = Duration::from_secs(1000);
-    let limits = |config| Config {
-        connections,
-        handshake_timeout: patient,
-        first_request_timeout: patient,
-        keepalive_interval: patient,
-        ..config
-    };
+    let limits = |config| Config { connections, ..config };
     Server::start_with(limits).await
 }
 
@@ -99,9 +90,8 @@ async fn full_server_keeps_connections_with_a_stream() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn connection_without_a_request_times_out_with_goaway() {
-    let first_request_timeout = Duration::from_millis(60);
-    let server = Server::start_with(|config| Config { first_request_timeout, ..config }).await;
+async fn connection_without_a_request_gets_goaway_in_time() {
+    let server = Server::start_with(|config| Config { first_request_timeout: SILENCE_LIMIT, ..config }).await;
     server.open("strips").await;
     let mut writer = server.drive_lossless("strips").await;
     assert!(contains_goaway(&read_to_end(connect(&server, HELLO).await).await));

@@ -9,7 +9,7 @@ use modalcast_client::{
 };
 use modalcast_proto::v1;
 
-use crate::service_harness::{Server, rigid_step, step, strips, with_timeout};
+use crate::service_harness::{SILENCE_LIMIT, Server, rigid_step, step, strips, with_timeout};
 
 const FIRST_OWNER: [u8; 16] = [1; 16];
 const SECOND_OWNER: [u8; 64] = [2; 64];
@@ -99,7 +99,8 @@ async fn stream_reports_new_changed_and_cleared_forces() {
 /// The forces of a viewer whose connection is lost expire; those of another viewer that renews them remain.
 #[tokio::test(flavor = "multi_thread")]
 async fn forces_of_a_lost_viewer_expire() {
-    const LIFETIME: Duration = Duration::from_secs(2);
+    // The reader must receive the forces before they expire.
+    const LIFETIME: Duration = SILENCE_LIMIT;
     let (server, client) = start_server().await;
     let mut stream = subscribe(&client).await;
     next_set(&mut stream).await;

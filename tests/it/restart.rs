@@ -8,7 +8,8 @@ use modalcast_proto::v1;
 use sha2::{Digest as _, Sha256};
 use v1::upload_scene_request::Part;
 
-use crate::service_harness::{Server, TIMEOUT, config, get_vertices, reference_vertices, step, strips};
+use crate::common::hang_guard::HANG_GUARD;
+use crate::service_harness::{Server, config, get_vertices, reference_vertices, step, strips};
 
 /// Byte range of the step number in a checkpoint file.
 const CHECKPOINT_STEP_NUMBER: Range<usize> = 16..24;
@@ -83,7 +84,7 @@ fn killed_server_restores_the_last_checkpoint() {
         let start = Instant::now();
         let has_last_step = |bytes: Vec<u8>| bytes.get(CHECKPOINT_STEP_NUMBER) == Some(9_u64.to_le_bytes().as_slice());
         while !std::fs::read(folder.path().join("steps/strips.step")).is_ok_and(has_last_step) {
-            assert!(start.elapsed() < TIMEOUT, "expected a checkpoint of the last step");
+            assert!(start.elapsed() < HANG_GUARD, "expected a checkpoint of the last step");
             tokio::time::sleep(Duration::from_millis(5)).await;
         }
         std::fs::create_dir(copied_folder.path().join("steps")).expect("expected to create a folder");

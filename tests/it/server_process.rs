@@ -23,7 +23,7 @@ use v1::step_service_client::StepServiceClient;
 use v1::vertex_service_client::VertexServiceClient;
 
 use crate::message_streams::{MessageSizes, StreamKind, message_sizes};
-use crate::service_harness::with_timeout;
+use crate::service_harness::{LONG_LIMITS, with_timeout};
 
 /// A server in a process of its own, which is killed when it is dropped.
 pub(crate) struct ServerProcess {
@@ -47,6 +47,7 @@ impl ServerProcess {
             .arg(folder.join("state"))
             .arg("--scenes")
             .arg(scenes)
+            .args(LONG_LIMITS)
             .args(options)
             .stdout(Stdio::piped())
             .stderr(Stdio::null())

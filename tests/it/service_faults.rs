@@ -2,7 +2,7 @@
 //! clients that do not read. The server disconnects only the faulty client.
 
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use modalcast::config::Config;
 use modalcast_proto::v1;
@@ -15,7 +15,8 @@ use v1::Delivery;
 use v1::drive_scene_response::Kind as ResponseKind;
 use v1::upload_scene_request::Part;
 
-use crate::service_harness::{DEFAULT_WINDOW, Server, StepWriter, TIMEOUT, step, with_timeout};
+use crate::common::hang_guard::HANG_GUARD;
+use crate::service_harness::{DEFAULT_WINDOW, SILENCE_LIMIT, Server, StepWriter, step, with_timeout};
 
 /// Under the policy `latest`, the server merges steps that it has no time to process. Another stream of the same
 /// connection still gets all its acknowledgments.
@@ -102,7 +103,7 @@ async fn stream_of_writer_that_reads_no_rejections_ends() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn silent_connection_is_closed_and_active_one_is_not() {
-    let server = Server::start_with(|config| Config { handshake_timeout: Duration::from_millis(60), ..config }).await;
+    let server = Server::start_with(|config| Config { handshake_timeout: SILENCE_LIMIT, ..config }).await;
     server.open("strips").await;
     let mut writer = server.drive_lossless("strips").await;
     let address = server.address.trim_start_matches("http://").to_owned();
@@ -114,8 +115,8 @@ async fn silent_connection_is_closed_and_active_one_is_not() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn frozen_writer_loses_its_lease() {
-    // The server pings a connection every 100 ms and closes it after 100 ms without an answer.
-    let (keepalive_interval, keepalive_timeout) = (Duration::from_millis(100), Duration::from_millis(100));
+    // The server pings a connection every 100 ms and closes it if it does not answer.
+    let (keepalive_interval, keepalive_timeout) = (Duration::from_millis(100), SILENCE_LIMIT);
     let server = Server::start_with(|config| Config { keepalive_interval, keepalive_timeout, ..config }).await;
     server.open("strips").await;
     let proxy = FreezableProxy::start(server.address.trim_start_matches("http://").to_owned()).await;
@@ -123,7 +124,6 @@ async fn frozen_writer_loses_its_lease() {
     assert!(matches!(frozen_writer.open("strips", Delivery::Lossless, DEFAULT_WINDOW).await, ResponseKind::Opened(_)));
     frozen_writer.send_step_and_wait(step(1, &[0], &[0.1, 0.2])).await;
     proxy.freeze();
-    let start = Instant::now();
     let acquire_lease = async {
         loop {
             let mut candidate = StepWriter::connect(server.channel().await).await;
@@ -133,8 +133,6 @@ async fn frozen_writer_loses_its_lease() {
         }
     };
     with_timeout(acquire_lease).await;
-    let elapsed = start.elapsed();
-    assert!(elapsed < Duration::from_secs(10), "expected a new writer within 10 s, got {elapsed:?}");
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -154,10 +152,7 @@ async fn server_stops_in_time_despite_unread_streams() {
     for number in 1..=8 {
         unread_writer.send_step(step(number, &[], &[])).await;
     }
-    let start = Instant::now();
     server.stop().await.expect("expected the server to stop without an error");
-    let elapsed = start.elapsed();
-    assert!(elapsed < Duration::from_secs(5), "expected the server to stop within 5 s, got {elapsed:?}");
     drop((unread_stream, unread_writer));
 }
 
@@ -213,7 +208,7 @@ impl FreezableProxy {
                         async { freeze_receiver.wait_for(|is_frozen| *is_frozen).await.map(drop).unwrap_or_default() };
                     tokio::select! {
                         _ = tokio::io::copy_bidirectional(&mut client, &mut upstream) => {}
-                        () = until_frozen => tokio::time::sleep(TIMEOUT).await,
+                        () = until_frozen => tokio::time::sleep(HANG_GUARD).await,
                     }
                 });
             }

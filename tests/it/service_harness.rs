@@ -34,8 +34,14 @@ use v1::scene_service_client::SceneServiceClient;
 use v1::step_service_client::StepServiceClient;
 use v1::vertex_service_client::VertexServiceClient;
 
-/// Maximum time that a test waits for one reply.
-pub(crate) const TIMEOUT: Duration = Duration::from_secs(60);
+use crate::common::hang_guard::HANG_GUARD;
+
+/// A time that no test reaches: a server with this limit never ends anything because it was slow.
+pub(crate) const NEVER: Duration = Duration::from_secs(3600);
+
+/// A time limit of a server that ends silent clients, in tests that also have active ones: short enough to wait for,
+/// and longer than a busy machine delays an active client.
+pub(crate) const SILENCE_LIMIT: Duration = Duration::from_secs(4);
 
 /// Size limit of one message of the server in bytes: a chunk of 1 MiB and the other fields.
 pub(crate) const MAX_MESSAGE_BYTES: usize = (1 << 20) + 4096;
@@ -177,8 +183,8 @@ fn scene(name: &str, shape: Shape, domains: Vec<Domain>) -> Arc<Scene> {
     Scene::new(parts).expect("expected a valid scene")
 }
 
-/// Settings of a test server: reference deformer, no renderer, any free port. `state` is the folder of persistent
-/// state.
+/// Settings of a test server: reference deformer, no renderer, any free port, and no limit on the time that a client
+/// takes, because a busy machine may delay any client. `state` is the folder of persistent state.
 pub(crate) fn config(state: &Path) -> Config {
     Config {
         listen: vec![ListenAddress::Tcp(([127, 0, 0, 1], 0).into())],
@@ -186,9 +192,21 @@ pub(crate) fn config(state: &Path) -> Config {
         backend: BackendChoice::Reference,
         renderer: RendererChoice::Off,
         message_bytes: 1 << 20,
+        message_timeout: NEVER,
+        reply_timeout: NEVER,
+        deadline: NEVER,
+        max_deadline: NEVER,
+        stall_timeout: NEVER,
+        handshake_timeout: NEVER,
+        first_request_timeout: NEVER,
+        keepalive_interval: NEVER,
+        keepalive_timeout: NEVER,
         ..Config::default()
     }
 }
+
+/// Options of a server in a process of its own that raise the limits on the time that a client takes.
+pub(crate) const LONG_LIMITS: [&str; 4] = ["--deadline-ms", "600000", "--message-timeout-ms", "600000"];
 
 /// A running server.
 pub(crate) struct Server {
@@ -305,9 +323,9 @@ impl Server {
     }
 }
 
-/// Awaits a future and panics after [`TIMEOUT`].
+/// Awaits a future and panics after [`HANG_GUARD`].
 pub(crate) async fn with_timeout<T>(work: impl Future<Output = T>) -> T {
-    tokio::time::timeout(TIMEOUT, work).await.expect("expected completion within the timeout")
+    tokio::time::timeout(HANG_GUARD, work).await.expect("expected completion")
 }
 
 /// Client end of a step stream, as a physics process uses it.

@@ -8,6 +8,7 @@ use std::time::Duration;
 
 use modalcast_client::{Client, Delivery, VertexRequest, VertexSelection, VertexStream, VertexStreamRequest};
 
+use crate::common::hang_guard::HANG_GUARD;
 use crate::server_process::{ServerProcess, crowded_step, crowded_upload, drive};
 use crate::service_harness::with_timeout;
 
@@ -43,7 +44,7 @@ async fn wait_for_mappings(server: &ServerProcess, count: usize) {
             tokio::time::sleep(Duration::from_millis(5)).await;
         }
     };
-    let result = tokio::time::timeout(Duration::from_secs(30), waiting).await;
+    let result = tokio::time::timeout(HANG_GUARD, waiting).await;
     assert!(result.is_ok(), "expected {count} mappings, got {}", server.mappings(MEMORY_NAME));
 }
 

@@ -334,10 +334,7 @@ async fn requests_wait_for_exact_and_minimum_steps() {
     assert_eq!(status.code(), tonic::Code::FailedPrecondition);
     let rejection = crate::service_harness::rejection_details(&status);
     assert!(rejection.given == "4" && rejection.expected.starts_with("run 1, step 5"), "{rejection:?}");
-    let start = std::time::Instant::now();
     let unanswered_request = v1::GetVerticesRequest { deadline_ms: 80, ..request_step(minimum_step(99)) };
     let status = get_vertices(&server, unanswered_request).await.expect_err("expected a timeout");
     assert_eq!(status.code(), tonic::Code::DeadlineExceeded);
-    let elapsed = start.elapsed();
-    assert!(elapsed < std::time::Duration::from_secs(5), "expected a timeout after 80 ms, got {elapsed:?}");
 }

@@ -1,14 +1,13 @@
 //! Unix sockets: the same service and limits as on TCP, for the user of the server only.
 
 use std::os::unix::fs::PermissionsExt as _;
-use std::time::Duration;
 
 use modalcast::config::{Config, ListenAddress};
 use modalcast_client::{Client, Delivery, DriveRequest, Step};
 use tokio::io::AsyncReadExt as _;
 use tokio::net::UnixStream;
 
-use crate::service_harness::{Server, with_timeout};
+use crate::service_harness::{SILENCE_LIMIT, Server, with_timeout};
 
 /// Starts a server that listens on a free port and on a socket in `folder`.
 async fn start_on_both(folder: &std::path::Path, change: impl FnOnce(Config) -> Config) -> (Server, String) {
@@ -46,8 +45,8 @@ async fn clients_of_both_sockets_use_the_same_server() {
 #[tokio::test(flavor = "multi_thread")]
 async fn silent_unix_connection_is_closed() {
     let folder = tempfile::tempdir().expect("expected a temporary folder");
-    let handshake_timeout = Duration::from_millis(60);
-    let (_server, _) = start_on_both(folder.path(), |config| Config { handshake_timeout, ..config }).await;
+    let limits = |config| Config { handshake_timeout: SILENCE_LIMIT, ..config };
+    let (_server, _) = start_on_both(folder.path(), limits).await;
     let mut silent = UnixStream::connect(folder.path().join("modalcast.sock")).await.expect("expected a connection");
     let result = with_timeout(silent.read(&mut [0; 1])).await;
     assert!(matches!(result, Ok(0) | Err(_)), "{result:?}");

@@ -11,7 +11,7 @@ use tokio_tungstenite::tungstenite::Error as WebSocketError;
 use v1::scene_service_client::SceneServiceClient;
 use v1::server_service_client::ServerServiceClient;
 
-use crate::service_harness::{Server, with_timeout};
+use crate::service_harness::{SILENCE_LIMIT, Server, with_timeout};
 use crate::websocket_client::{TOKEN, WebSocketClient, authority, handshake, start_server};
 
 /// An answer in HTTP/1.1.
@@ -159,7 +159,7 @@ async fn viewer_can_be_turned_off() {
 /// Connections with slow, unfinished or large heads are closed. Afterwards, another client is served.
 #[tokio::test(flavor = "multi_thread")]
 async fn slow_and_large_requests_are_closed() {
-    let server = start_server(|config| Config { handshake_timeout: Duration::from_millis(300), ..config }).await;
+    let server = start_server(|config| Config { handshake_timeout: SILENCE_LIMIT, ..config }).await;
     let trickle = async {
         let mut socket = connect(&server).await;
         let head = format!("GET /?token={TOKEN} HTTP/1.1\r\nHost: localhost\r\n");
@@ -169,14 +169,20 @@ async fn slow_and_large_requests_are_closed() {
             tokio::time::sleep(Duration::from_millis(50)).await;
         }
     };
-    with_timeout(trickle).await;
-    for bytes in [&b"G"[..], b"PRI * HTTP/1.1\r\n", b"\r\n", b"\x16\x03\x01"] {
+    let send_start = async |bytes: &'static [u8]| {
         let mut socket = connect(&server).await;
         socket.write_all(bytes).await.expect("expected an open connection");
         let mut answer = Vec::new();
         with_timeout(socket.read_to_end(&mut answer)).await.ok();
         assert!(!answer.starts_with(b"HTTP/1.1 200"), "{bytes:?}");
-    }
+    };
+    tokio::join!(
+        with_timeout(trickle),
+        send_start(b"G"),
+        send_start(b"PRI * HTTP/1.1\r\n"),
+        send_start(b"\r\n"),
+        send_start(b"\x16\x03\x01"),
+    );
     let large = format!("GET / HTTP/1.1\r\nHost: localhost\r\nX-Large: {}\r\n\r\n", "x".repeat(64 << 10));
     let answer = exchange(&server, &large).await;
     assert!(answer.is_none_or(|answer| answer.status == 431));
@@ -188,14 +194,7 @@ async fn slow_and_large_requests_are_closed() {
 /// Connections of browsers without calls make room for new clients when the server is full.
 #[tokio::test(flavor = "multi_thread")]
 async fn full_server_closes_browsers_without_calls() {
-    let patient = Duration::from_secs(1000);
-    let limits = |config| Config {
-        connections: 4,
-        handshake_timeout: patient,
-        first_request_timeout: patient,
-        keepalive_interval: patient,
-        ..config
-    };
+    let limits = |config| Config { connections: 4, ..config };
     let server = start_server(limits).await;
     let mut silent = connect(&server).await;
     silent.write_all(b"GET /").await.expect("expected an open connection");

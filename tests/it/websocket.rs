@@ -15,7 +15,7 @@ use tonic::Code;
 use v1::drive_scene_request::Kind as RequestKind;
 use v1::drive_scene_response::Kind as ResponseKind;
 
-use crate::service_harness::{Server, minimum_step, step, with_timeout};
+use crate::service_harness::{SILENCE_LIMIT, Server, minimum_step, step, with_timeout};
 use crate::websocket_client::{
     CANCEL, CREDIT, CallResult, END, MESSAGE, START, WebSocketClient, authority, call_grpc, start_server,
 };
@@ -288,11 +288,11 @@ async fn subscribe_without_credit(server: &Server) -> (WebSocketClient, u32) {
 }
 
 /// Time without an acknowledgment after which a test assumes that a step is blocked.
-const BLOCKED: Duration = Duration::from_millis(1500);
+const BLOCKED: Duration = SILENCE_LIMIT;
 
 /// A server without a time limit on a lossless subscriber that blocks the writer.
 async fn patient_server() -> Server {
-    let server = start_server(|config| Config { stall_timeout: Duration::from_secs(3000), ..config }).await;
+    let server = default_server().await;
     server.open("sheet").await;
     server
 }
@@ -449,12 +449,7 @@ async fn incomplete_messages_and_silent_clients_are_disconnected() {
 /// Half-sent messages of many connections are bounded by the budget of all connections.
 #[tokio::test(flavor = "multi_thread")]
 async fn half_sent_messages_count_against_the_receive_budget() {
-    let limits = |config| Config {
-        connection_receive_bytes: 1 << 20,
-        receive_bytes: 3 << 19,
-        message_timeout: Duration::from_secs(1000),
-        ..config
-    };
+    let limits = |config| Config { connection_receive_bytes: 1 << 20, receive_bytes: 3 << 19, ..config };
     let server = start_server(limits).await;
     let mut clients = Vec::new();
     for bytes in [1000 << 10, 500 << 10] {
@@ -479,15 +474,8 @@ async fn half_sent_messages_count_against_the_receive_budget() {
 /// A viewer that never reads from its socket is bounded by the reply budget and disconnected when others wait.
 #[tokio::test(flavor = "multi_thread")]
 async fn client_that_never_reads_is_cut_off() {
-    let (reply_bytes, reply_timeout) = (6 << 20, Duration::from_millis(500));
-    let patient = Duration::from_secs(1000);
-    let limits = |config| Config {
-        reply_bytes,
-        connection_reply_bytes: reply_bytes,
-        reply_timeout,
-        keepalive_interval: patient,
-        ..config
-    };
+    let (reply_bytes, reply_timeout) = (6 << 20, SILENCE_LIMIT);
+    let limits = |config| Config { reply_bytes, connection_reply_bytes: reply_bytes, reply_timeout, ..config };
     let server = start_server(limits).await;
     server.open("sheet").await;
     let mut stalled = Vec::new();

@@ -71,8 +71,15 @@ async fn blocked_writer_that_keeps_sending_loses_no_step() {
         sender
     });
     // The subscriber has two credits, and the step after them blocks.
+    let scene_handle = server.engine.find("strips").expect("expected an open scene");
+    let until_first_step = async {
+        while scene_handle.last_step().is_none() {
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+    };
+    with_timeout(until_first_step).await;
     tokio::time::sleep(Duration::from_millis(200)).await;
-    let last_step = server.engine.find("strips").expect("expected an open scene").last_step();
+    let last_step = scene_handle.last_step();
     assert!(last_step.is_some_and(|step| step.number <= 3), "expected a blocked writer, got {last_step:?}");
     for number in 1..=STEPS {
         let output = with_timeout(subscription.next()).await.expect("expected another step");

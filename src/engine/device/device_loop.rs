@@ -467,6 +467,7 @@ mod tests {
     use super::super::handle::{DeviceHandle, DeviceThread};
     use super::*;
     use crate::engine::testing::{self, FaultyDeformer, InjectedFault};
+    use crate::hang_guard::HANG_GUARD;
     use modalcast_model::backend_settings::BackendSettings;
     use modalcast_model::deform::Deformer;
     use modalcast_model::error::Error;
@@ -526,9 +527,9 @@ mod tests {
     /// Whether deformers of `create_when_open` wait.
     static IS_GATE_CLOSED: AtomicBool = AtomicBool::new(false);
 
-    /// Creates a deformer when the gate is open, at the latest after two minutes, so that a failed test ends.
+    /// Creates a deformer when the gate is open, at the latest after [`HANG_GUARD`], so that a failed test ends.
     fn create_when_open(scene: &Arc<Scene>) -> Box<dyn Deformer + Send> {
-        let limit = Instant::now() + Duration::from_secs(120);
+        let limit = Instant::now() + HANG_GUARD;
         while IS_GATE_CLOSED.load(Ordering::Relaxed) && Instant::now() < limit {
             std::thread::sleep(Duration::from_millis(1));
         }
@@ -547,9 +548,9 @@ mod tests {
             tokio::spawn(async move { slow_handle.load_scene(3, &slow_scene, BackendSettings::default()).await });
         let state = state_with_q(&scene, 0.5);
         let served = deform_and_read(&handle, CONTROL_SCENE, &state);
-        tokio::time::timeout(Duration::from_secs(60), served)
+        tokio::time::timeout(HANG_GUARD, served)
             .await
-            .expect("expected no wait")
+            .expect("expected no wait for the other scene")
             .expect("expected positions");
         assert!(!load.is_finished(), "control: expected a load that waits");
         IS_GATE_CLOSED.store(false, Ordering::Relaxed);

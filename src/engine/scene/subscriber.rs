@@ -376,7 +376,7 @@ mod tests {
         let error = Error::NotFound { what: "scene", given: "'closed'".into() };
         subscriber.end(error.clone());
         drop(subscriber);
-        let end = tokio::time::timeout(Duration::from_secs(60), subscription.next()).await;
+        let end = tokio::time::timeout(crate::hang_guard::HANG_GUARD, subscription.next()).await;
         assert_eq!(end.expect("expected the end before the next credit").expect_err("expected the end"), error);
     }
 

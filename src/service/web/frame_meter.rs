@@ -327,7 +327,7 @@ mod tests {
         };
         assert!(overdue(&mut meter, Duration::from_millis(200)).await.is_err(), "expected no deadline");
         meter.receive(&frame(BINARY, false, 3)).expect("expected a frame within the limits");
-        let error = overdue(&mut meter, Duration::from_secs(60)).await.expect("expected a deadline");
+        let error = overdue(&mut meter, crate::hang_guard::HANG_GUARD).await.expect("expected a deadline");
         assert_eq!(error.downcast::<CloseReason>().expect("expected a reason").code(), 1008);
     }
 }

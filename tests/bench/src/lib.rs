@@ -22,6 +22,9 @@ pub mod error_sources;
 pub mod errors;
 pub mod exact_positions;
 mod exact_state;
+#[cfg(test)]
+#[path = "../../common/hang_guard.rs"]
+mod hang_guard;
 pub mod kernels;
 mod markdown;
 mod markdown_table;

@@ -1,10 +1,10 @@
 //! Tests of the OpenGL layer: current contexts, ranges of buffers, ownership of names, timer queries and errors.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::time::Duration;
 
 use super::*;
 use crate::device;
+use crate::hang_guard::HANG_GUARD;
 use crate::types::DevicePreference;
 
 fn open() -> Rc<Gl> {
@@ -129,11 +129,11 @@ fn timer_queries_end_when_their_commands_fail_or_panic() {
     let mut gl = open();
     // On hardware, passes are timed with queries.
     Rc::get_mut(&mut gl).expect("not shared").limits.software = false;
-    let time_commands = |commands: &dyn Fn() -> Result<()>| gl.time_pass("test", Duration::from_secs(60), commands);
+    let time_commands = |commands: &dyn Fn() -> Result<()>| gl.time_pass("test", HANG_GUARD, commands);
     time_commands(&|| Err(fault("test", "injected"))).expect_err("the error of the commands");
     assert!(catch_unwind(AssertUnwindSafe(|| time_commands(&|| panic!("injected")))).is_err());
     let timer = time_commands(&|| Ok(())).expect("a timer");
-    gl.wait("test", Duration::from_secs(60)).expect("completed commands");
+    gl.wait("test", HANG_GUARD).expect("completed commands");
     assert!(timer.is_done());
     gl.check("test").expect("at most one active query at a time");
     drop(timer);

@@ -209,6 +209,7 @@ pub(super) fn arguments<const N: usize>(list: [&dyn AsRef<std::ffi::OsStr>; N]) 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::hang_guard::HANG_GUARD;
 
     fn shell(script: &str) -> Process {
         Process::spawn("shell".into(), Command::new("sh").args(["-c", script])).expect("expected a shell")
@@ -239,7 +240,7 @@ mod tests {
     fn process_ends_with_the_thread_that_started_it() {
         assert!(!shell("sleep 1000").ends_within(Duration::from_millis(50)), "control: this thread goes on");
         let mut process = std::thread::spawn(|| shell("sleep 1000")).join().expect("expected no panic");
-        assert!(process.ends_within(Duration::from_secs(60)), "expected the end of the process");
+        assert!(process.ends_within(HANG_GUARD), "expected the end of the process");
     }
 
     #[test]
