@@ -72,9 +72,9 @@ pub struct StageTime {
 ///    the slot: it sends the number of the slot as u32 on the socket. It validates the copy. Values in shared memory
 ///    count for Limits.message_bytes as those of a message do.
 ///    If no slot is free for a reply, the server waits until one is returned. A client must therefore return the slots of a
-///    message before it waits for the next message, and use one connection per call. It can use the connection for another
-///    call if the call before has ended with OK and all of its slots were returned. Otherwise, for example after it has
-///    cancelled a call, it closes the connection.
+///    message before it waits for the next message, and a connection serves one call at a time. After a call has ended with
+///    OK and all of its slots were returned, the client can use the connection for another call. Otherwise, for example
+///    after it has cancelled a call, it closes the connection.
 ///
 /// If the client returns a slot that it has not received, the server closes the connection. After the connection has
 /// ended, the server sends further data of its calls in `data`, and frees the memory when these calls have ended.
@@ -466,7 +466,8 @@ pub struct UploadedDomain {
     #[prost(double, repeated, tag = "8")]
     pub eigenvalues: ::prost::alloc::vec::Vec<f64>,
     /// Crease angle in degrees, 0 (flat) to 180 (smooth): an edge is shaded as hard if the normals of its two triangles
-    /// differ by more at rest. Unset: 40. Must be unset with `shares_shape_with`. Vertices keep their numbers.
+    /// differ by more at rest. Unset: 40, which is stored with the upload, so that a later version draws the same creases.
+    /// Must be unset with `shares_shape_with`. Vertices keep their numbers.
     #[prost(double, optional, tag = "9")]
     pub crease_angle: ::core::option::Option<f64>,
 }
