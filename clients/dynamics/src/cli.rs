@@ -83,7 +83,7 @@ pub(crate) struct CommonOptions {
     /// The scene's name on the server.
     #[arg(long, default_value = "tree")]
     pub(crate) scene: String,
-    /// Source of a scene to open first, in the server's scene repository. The scene gets the name of --scene.
+    /// First opens a scene from this source in the server's scene repository, and names it as --scene says.
     #[arg(long, value_name = "SOURCE")]
     pub(crate) open: Option<String>,
     /// Simulated time in seconds; 0 runs until interrupted.
@@ -141,7 +141,7 @@ pub(crate) struct WindOptions {
     /// reach it.
     #[arg(long = "sway", value_name = "SWAY", default_value_t = 0.05, value_parser = parse_fraction)]
     pub(crate) sway_fraction: f64,
-    /// Direction that the wind blows to, in degrees about the up axis from the first horizontal axis. At 25, the
+    /// Direction that the wind blows to, in degrees about the up axis from x (from y if x is up). At 25, the
     /// default camera sees the sway from the side.
     #[arg(
         long = "direction",
@@ -165,8 +165,8 @@ pub(crate) struct ForceFileOptions {
     /// exists.
     #[arg(long, value_name = "FILE.config")]
     pub(crate) config: Option<PathBuf>,
-    /// Folder with the file of cubic forces, which the note `vega.cubic` of the scene names. The server adds this note
-    /// to an OBJ model that has a .cub file of the same name.
+    /// Folder with the file of cubic forces. The note `vega.cubic` of the scene has the name of this file. The server
+    /// adds the note to an OBJ model that has a .cub file of the same name.
     #[arg(long = "files", value_name = "DIR")]
     pub(crate) folder: Option<PathBuf>,
 }

@@ -43,8 +43,9 @@ impl DivergenceCheck {
     /// Checks the values of a step at `time` seconds.
     ///
     /// # Errors
-    /// `Diverged` if a number is not finite, or a displacement exceeds `MAX_DISPLACEMENT`. The displacement of a domain
-    /// is bounded by the sum over its modes.
+    /// `Diverged` if a number is not finite, or a displacement exceeds `MAX_DISPLACEMENT`. Two
+    /// displacements are compared with it: per domain, the sum of the largest displacements of its modes, and the
+    /// distance between the center of the scene and its image under the transform of the domain.
     pub fn check(&self, model: &Model, step: u64, time: f64, values: &StepValues) -> Result<()> {
         let diverged = |subject: String, given: String| {
             let expected = format!("a displacement of at most {MAX_DISPLACEMENT} diagonals of the scene");
@@ -64,7 +65,8 @@ impl DivergenceCheck {
             if displacements.iter().sum::<f64>() > MAX_DISPLACEMENT {
                 let largest = (0..domain.rank).max_by(|a, b| displacements[*a].total_cmp(&displacements[*b]));
                 let mode = largest.unwrap_or(0);
-                let given = format!("{} ({:.3e} diagonals)", q[mode], displacements[mode]);
+                let sum: f64 = displacements.iter().sum();
+                let given = format!("{sum:.3e} for all modes, {:.3e} for this one, q {}", displacements[mode], q[mode]);
                 return Err(diverged(format!("q[{mode}] of '{}'", domain.name), given));
             }
             if let Some(entry) = transform.iter().find(|entry| !entry.is_finite()) {

@@ -20,7 +20,8 @@ pub fn compute_transforms(
     compose_transforms(model, &Attachments::new(model).deform(model, q), local_transforms)
 }
 
-/// [`compute_transforms`] from the result of [`Attachments::deform`].
+/// As [`compute_transforms`]. `attachments` is the result of [`Attachments::deform`]: per domain, its transform relative
+/// to its deformed parent, or its placement in the world if it has no parent.
 pub fn compose_transforms(
     model: &Model,
     attachments: &[AffineTransform],

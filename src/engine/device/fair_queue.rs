@@ -150,8 +150,8 @@ impl<T> FairQueue<T> {
         Some(entry.work)
     }
 
-    /// Takes the work whose turn it is and charges its scene the estimated cost. Only work for which `can_run` returns
-    /// true is taken; other scenes do not wait for it. `None` if no work can run.
+    /// Takes the work whose turn it is and charges its scene the estimated cost. Work for
+    /// which `can_run` returns false is passed over. `None` if no work can run.
     pub(super) fn take(&mut self, can_run: impl Fn(SceneId, &T) -> bool) -> Option<Taken<T>> {
         let Self { scenes, ring, .. } = self;
         let is_runnable = |queue: &SceneQueue<T>, scene: SceneId| {
@@ -168,7 +168,7 @@ impl<T> FairQueue<T> {
                 }
             }
         }
-        // At most one further round is necessary.
+        // One round adds the last quantum, and the next one takes the work.
         for _ in 0..2 * ring.len() {
             let scene = *ring.front()?;
             let queue = scenes.get_mut(&scene)?;

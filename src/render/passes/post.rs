@@ -16,7 +16,8 @@ const DESTINATION_IMAGE: u32 = 0;
 pub(crate) enum BloomStep {
     /// Computes a level of the pyramid from the next finer one.
     Downsample { level: usize },
-    /// Adds to a level the next coarser one, which is the mean of `coarser_levels` levels.
+    /// Replaces a level by the mean of itself and all `coarser_levels` coarser levels. The next coarser level already
+    /// has the mean of these.
     Upsample { level: usize, coarser_levels: u32 },
     /// Adds level 1 to the scene color, in place: inverts the tone curve, adds the blurred light and applies the curve
     /// again.
@@ -63,7 +64,8 @@ pub(crate) fn bloom(
     recorder.finish(Pass::Bloom)
 }
 
-/// Encodes a band of the scene color to sRGB bytes in the shared picture of the frame, or in the readback source.
+/// Encodes a band of the scene color to sRGB bytes in the picture that CUDA reads too, or without one in the source of
+/// the readback.
 pub(crate) fn encode(recorder: &mut PassRecorder<'_>, frame: &FrameContext<'_>, band: Band) -> Result<()> {
     let (target, program) = (frame.target, frame.encode);
     recorder.begin(Pass::Encode);

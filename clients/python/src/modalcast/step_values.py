@@ -70,6 +70,7 @@ class StepValues:
         self._layout = layout
         self._kinematics = kinematics
         self._q = q.copy()
+        # world_from_domain as 4 x 4 per domain. `kinematics` ignores those of attached domains and followers.
         self._roots: F64 = np.stack([square(transform) for transform in transforms])
         self._sent: F32 = transforms.copy()
         # The last pose of each domain, if the caller sends poses instead of matrices.
@@ -107,8 +108,8 @@ class StepValues:
     def complete_step(self, number: int, time: float) -> steps_pb2.Step:
         """A step with all values, for a server that may have lost some of them.
 
-        Transforms of a step have one format. After world poses, the step has the last pose of each domain, and the
-        transforms of domains without a pose remain those of the server.
+        Transforms of a step have one format. If earlier steps have sent world poses, this step has the last pose of
+        each domain, and domains without a pose keep the transforms that the server has.
         """
         domains = self._layout.domains
         step = steps_pb2.Step(number=number, time=time)

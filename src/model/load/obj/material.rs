@@ -15,7 +15,8 @@ pub(in crate::load) const DEFAULT_ALPHA_CUTOFF: f32 = 0.5;
 /// MTL cannot express this property and leaves are usually single sheets.
 ///
 /// # Errors
-/// `Invalid` with the material and the statement: a missing or unreadable image, or a number out of range.
+/// `Invalid` with the material and the statement: an unreadable file or a number out of range. In strict mode, also a
+/// missing image, an image that is neither PNG nor JPEG, and a color above 1, which are remarks otherwise.
 pub(super) fn create_material(
     name: &str,
     statements: &MtlMaterial,

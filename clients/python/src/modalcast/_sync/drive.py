@@ -210,7 +210,7 @@ class Drive:
 
     def __del__(self) -> None:
         if not getattr(self, "_is_closed", True):
-            # If the event loop is closed, it has ended the stream.
+            # An asyncio client whose event loop is closed raises: the loop has ended the stream.
             with contextlib.suppress(RuntimeError):
                 self.close()
 

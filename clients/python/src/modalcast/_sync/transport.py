@@ -75,7 +75,7 @@ class _RequestQueue:
         self._is_closed = False
 
     def put(self, request: steps_pb2.DriveSceneRequest, timeout: float) -> bool:
-        """Adds a request, unless the queue is closed. Returns whether the queue had capacity in time."""
+        """Adds a request. Returns False if the queue had no capacity in time. A closed queue drops the request."""
 
         def has_capacity() -> bool:
             return self._is_closed or len(self._requests) < _QUEUED_STEPS
@@ -83,12 +83,13 @@ class _RequestQueue:
         with self._condition:
             if not self._condition.wait_for(has_capacity, timeout):
                 return False
-            self._requests.append(request)
-            self._condition.notify_all()
+            if not self._is_closed:
+                self._requests.append(request)
+                self._condition.notify_all()
             return True
 
     def close(self) -> None:
-        """Ends the requests after those in the queue."""
+        """Accepts no more requests. Those in the queue are still sent."""
         with self._condition:
             self._is_closed = True
             self._condition.notify_all()
@@ -302,8 +303,8 @@ class Transport:
         return ReplyStream(call(request, timeout=timeout, wait_for_ready=wait_for_ready), self.address)
 
     def _new_channel(self) -> grpc.Channel:
-        # The calling thread reads the replies of a call, without a thread per call. Such a call keeps its connection
-        # open if it is cancelled, so subscriptions do without.
+        # With this option, the calling thread reads the replies of a call, without a thread per call. A cancelled call
+        # then keeps its connection open. Subscriptions are cancelled often, so their channel has no such option.
         single_threaded = (ChannelOptions.SingleThreadedUnaryStream, 1)
         return grpc.insecure_channel(self._target, options=[*options_of(self._target), single_threaded])
 

@@ -60,9 +60,9 @@ impl ApplyKernel {
     /// `deform`. The header in `inputs` has the lengths of the lists.
     ///
     /// # Safety
-    /// `list` is from [`Self::allocate_list`]. [`Self::write`] wrote it for the packer of `inputs` and `deform`, or the
-    /// header has lengths of 0. `list`, `inputs` and `deform` exist, and `list` is not written, until the kernel has
-    /// ended.
+    /// `list` is from [`Self::allocate_list`]. [`Self::write`] wrote it with the packer of the scene of `inputs` and
+    /// `deform`, or the header has lengths of 0. `list`, `inputs` and `deform` exist, and `list` is not written, until
+    /// the kernel has ended.
     ///
     /// # Errors
     /// `Fault` when the device fails.
