@@ -49,7 +49,7 @@ LONG_TESTS = (
         "viewer",
         "browser viewer: ten minutes of use without growth of memory, 100 reconnects, a server that is killed",
         ("deploy/web", "--programs", "{programs}", "--long"),
-        45,
+        60,
     ),
 )
 
