@@ -250,22 +250,17 @@ impl SceneActor {
         // The steps of an earlier writer are dropped.
         let next_step = self.next_step.take().filter(|next_step| Arc::ptr_eq(&next_step.step_queue, &step_queue));
         let (queued_step, state) = match next_step {
-            Some(NextStep { queued_step, base, state, .. })
-                if Arc::ptr_eq(&base, &self.current.state) && !self.starts_from_rest =>
-            {
-                (queued_step, state)
+            Some(NextStep { queued_step, base, state, .. }) => {
+                // The step before it may have been rejected.
+                let is_base_current = Arc::ptr_eq(&base, &self.current.state) && !self.starts_from_rest;
+                (Some(queued_step), is_base_current.then_some(state))
             }
-            // The step before it was rejected.
-            Some(NextStep { queued_step, .. }) => {
-                let state = self.state_after(&self.current.state, self.starts_from_rest, &queued_step);
-                (queued_step, state)
-            }
-            None => {
-                let Some(queued_step) = step_queue.take() else { return false };
-                let state = self.state_after(&self.current.state, self.starts_from_rest, &queued_step);
-                (queued_step, state)
-            }
+            None => (step_queue.take(), None),
         };
+        let Some(queued_step) = queued_step else { return false };
+        // Ends the time in the queue, so before the states are computed.
+        let stages = queued_step.stages();
+        let state = state.unwrap_or_else(|| self.state_after(&self.current.state, self.starts_from_rest, &queued_step));
         self.next_step = step_queue.take_early().map(|next| NextStep {
             step_queue: Arc::clone(&step_queue),
             base: Arc::clone(&state),
@@ -273,7 +268,6 @@ impl SceneActor {
             queued_step: next,
         });
         let next_state = self.next_step.as_ref().map(|next_step| Arc::clone(&next_step.state));
-        let stages = queued_step.stages();
         let merged = queued_step.merged;
         let pending_summary = self.device.deform_with_next(self.id, &state, next_state);
         self.phase = StepPhase::Deforming(DeformingStep { step_queue, merged, stages, state, pending_summary });
