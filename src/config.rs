@@ -193,6 +193,8 @@ pub struct Config {
     pub upload_files: u32,
     /// Deadline of a single request that sets none.
     pub deadline: Duration,
+    /// Limit on the time that one piece of work may occupy the device thread. The device is then lost.
+    pub device_work_limit: Duration,
     /// Largest deadline of a single request.
     pub max_deadline: Duration,
     /// Limit on the frame, vertex and state streams of one scene.
@@ -258,6 +260,7 @@ impl Default for Config {
             stored_bytes: 64 << 30,
             upload_files: 4096,
             deadline: Duration::from_secs(30),
+            device_work_limit: Duration::from_secs(120),
             max_deadline: Duration::from_secs(600),
             max_subscribers: 32,
             max_pending_requests: 64,

@@ -61,6 +61,7 @@
 //! | `modalcast-model::scene` | the set of domains, its memory layout and feature set; steps; cameras | `domain`, `error` |
 //! | `modalcast-model::domain` | mesh, modes U, material, texture; validated once, immutable | `memory`, `error` |
 //! | `modalcast-model::memory` | budgets of memory, which scenes reserve before they allocate | `error` |
+//! | `modalcast-model::fault_injection` | planned faults of devices, for tests of the recovery; empty without the feature `fault-injection` | `error` |
 //! | `modalcast-model::error` | the error type, with variants for errors of the caller, of the operator and of the server | |
 //!
 //! # Invariants

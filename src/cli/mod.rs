@@ -83,7 +83,8 @@ Exit codes:
   3  invalid input; the message names the field, the expected and the given value
   4  not found
   5  a resource or a program is missing or in use; the message names it
-  6  error of the server or the device";
+  6  error of the server or the device
+  7  the device is lost, or does not answer; the state is on disk, and a new process can go on";
 
 /// How a command without an error ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -150,7 +151,8 @@ fn exit_code(error: &Error) -> u8 {
         | Error::SlowReader { .. }
         | Error::Unavailable { .. }
         | Error::ShuttingDown => 5,
-        Error::Deadline { .. } | Error::Fault { .. } | Error::DeviceLost { .. } => 6,
+        Error::Deadline { .. } | Error::Fault { .. } | Error::RendererLost { .. } => 6,
+        Error::DeviceLost { .. } => 7,
     }
 }
 

@@ -129,6 +129,9 @@ pub(super) struct Args {
     /// Deadline of a request that sets none, in milliseconds.
     #[arg(long, default_value_t = 30_000, value_parser = clap::value_parser!(u64).range(1..=600_000))]
     deadline_ms: u64,
+    /// Time in milliseconds after which a device that does not answer is lost, and the server ends with exit code 7.
+    #[arg(long, default_value_t = default_ms(Config::default().device_work_limit), value_parser = clap::value_parser!(u64).range(100..=3_600_000))]
+    device_work_limit_ms: u64,
 }
 
 fn default_ms(duration: Duration) -> u64 {
@@ -178,6 +181,7 @@ impl Args {
             client_upload_bytes: self.client_upload_bytes,
             stored_bytes: self.stored_bytes,
             deadline: Duration::from_millis(self.deadline_ms),
+            device_work_limit: Duration::from_millis(self.device_work_limit_ms),
             ..Config::default()
         }
         .validated()

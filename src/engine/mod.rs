@@ -24,6 +24,7 @@ mod upload_quota;
 
 pub use content::{ContentHash, ContentHashes, SceneContent, ShapeArray, hex, parse_hash};
 pub use device::context::{DeviceContext, EngineInfo, share_pictures};
+pub use device::device_loss::DeviceLoss;
 pub use device::loaded_scene::LoadedScene;
 pub use device::scalar_field::validate_mode;
 pub use memory_limits::MemoryLimits;
@@ -162,7 +163,8 @@ impl Engine {
             Ok((scene_catalog, Arc::new(checkpoints), run_counter, upload_quota))
         })
         .await?;
-        let DeviceThread { handle, info, thread: device_thread } = DeviceThread::start(open_device).await?;
+        let DeviceThread { handle, info, thread: device_thread } =
+            DeviceThread::start(open_device, config.device_work_limit).await?;
         let shared = Shared {
             services: SceneServices { device: handle, checkpoints, run_counter, config: Arc::clone(&config) },
             memory: MemoryBudgets::new(info.memory, info.renderer.is_ok()),
@@ -410,7 +412,10 @@ impl Engine {
             engine.shared.services.checkpoints.finish();
             let device_thread = lock(&engine.shared.device_thread).take();
             engine.shared.services.device.quit();
-            device_thread.map(JoinHandle::join);
+            // The thread of a lost device may be in a call that does not return.
+            if engine.shared.services.device.loss().error().is_none() {
+                device_thread.map(JoinHandle::join);
+            }
             engine.shared.scene_catalog.release();
             Ok(())
         };
@@ -428,6 +433,11 @@ impl Engine {
     /// scene returns it. Cancel-safe.
     pub async fn device_lost(&self) -> Error {
         self.shared.services.device.loss().wait().await
+    }
+
+    /// The observer of the device, which tells whether it and the renderer work.
+    pub fn observe_device(&self) -> DeviceLoss {
+        self.shared.services.device.loss().clone()
     }
 
     /// Checks that scenes can be opened and used.

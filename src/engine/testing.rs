@@ -48,11 +48,20 @@ pub(super) enum InjectedFault {
     PanicInDeform,
     PanicInReadback,
     PanicInWait,
+    RendererLost,
     DeviceLost,
+    Endless,
 }
 
 impl InjectedFault {
-    const ALL: [Self; 4] = [Self::PanicInDeform, Self::PanicInReadback, Self::PanicInWait, Self::DeviceLost];
+    const ALL: [Self; 6] = [
+        Self::PanicInDeform,
+        Self::PanicInReadback,
+        Self::PanicInWait,
+        Self::RendererLost,
+        Self::DeviceLost,
+        Self::Endless,
+    ];
 
     /// The first coordinate of a state that triggers the fault, far above that of any valid test state.
     pub(super) fn q(self) -> f32 {
@@ -84,7 +93,11 @@ impl Deformer for FaultyDeformer {
         self.fault = InjectedFault::ALL.into_iter().find(|fault| state.q[0] == fault.q());
         match self.fault {
             Some(InjectedFault::PanicInDeform) => panic!("injected into deform"),
+            Some(InjectedFault::RendererLost) => Err(renderer_lost_error()),
             Some(InjectedFault::DeviceLost) => Err(device_lost_error()),
+            Some(InjectedFault::Endless) => loop {
+                std::thread::park();
+            },
             _ => self.inner.deform(state),
         }
     }
@@ -109,6 +122,11 @@ impl Deformer for FaultyDeformer {
             .expect("expected a readback of this deformer");
         Ok(self.readbacks.swap_remove(index))
     }
+}
+
+/// The error of an injected loss of the renderer.
+pub(super) fn renderer_lost_error() -> Error {
+    Error::RendererLost { stage: "deform", reason: "injected".into() }
 }
 
 /// The error of an injected device loss.

@@ -63,8 +63,12 @@ pub enum Error {
     /// An internal error, or a failure of the device or a library.
     #[error("{stage} failed: {reason}")]
     Fault { stage: &'static str, reason: String },
-    /// The device context and its memory are lost, for example after an illegal access by a kernel. All later calls to
-    /// the device fail, so the operator must restart the server.
+    /// The OpenGL context and its objects are lost, for example after a reset of the GPU. The server opens the renderer
+    /// again, so that a later attempt may succeed.
+    #[error("{stage} failed: the renderer is lost ({reason}) and is opened again. Try again")]
+    RendererLost { stage: &'static str, reason: String },
+    /// The device context and its memory are lost, for example after an illegal access by a kernel, or the device does not
+    /// answer. All later calls to the device fail, so the server ends, and its supervisor must start it again.
     #[error("{stage} failed: the device is lost ({reason}). Restart the server")]
     DeviceLost { stage: &'static str, reason: String },
 }
@@ -88,6 +92,11 @@ pub fn fault_in<E: std::fmt::Display>(stage: &'static str) -> impl Fn(E) -> Erro
 }
 
 impl Error {
+    /// Whether the renderer or the device is lost, so that a second attempt on the same context fails, too.
+    pub const fn is_loss(&self) -> bool {
+        matches!(self, Self::RendererLost { .. } | Self::DeviceLost { .. })
+    }
+
     /// Converts an [`Error::Invalid`] of a loader, whose field is a place in a file, to an [`Error::InvalidFile`].
     /// Other variants remain unchanged.
     pub fn into_file_error(self) -> Self {

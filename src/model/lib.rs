@@ -8,6 +8,7 @@ pub mod backend_settings;
 pub mod deform;
 pub mod domain;
 pub mod error;
+pub mod fault_injection;
 pub mod load;
 pub mod memory;
 pub mod raster;

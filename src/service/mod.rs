@@ -33,6 +33,7 @@ mod web;
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
 
 use modalcast_proto::v1;
 use tokio::time::Instant;
@@ -47,7 +48,7 @@ use self::shared_memory::SharedMemory;
 use self::web::{Access, WebServer};
 use crate::config::Config;
 use crate::engine::Engine;
-use modalcast_model::error::{Result, fault_in};
+use modalcast_model::error::{Error, Result, fault_in};
 
 /// Largest message that the server sends, in bytes: a chunk of at most 1 MiB and its head, or the layout of 65,536
 /// domains.
@@ -62,11 +63,11 @@ pub async fn bind(config: &Config) -> Result<Listener> {
 }
 
 /// Serves until `shutdown` completes. Then answers health checks with `NOT_SERVING`, ends every stream and returns
-/// within the configured drain time, whether or not clients close their connections. A lost device does not end the
-/// server, but health checks are answered with `NOT_SERVING` from then on, so that a supervisor can restart it.
+/// within the configured drain time, whether or not clients close their connections. A lost device ends the server, too.
+/// Health checks are also answered with `NOT_SERVING` while a lost renderer is opened again.
 ///
 /// # Errors
-/// `Fault` when the description of the services for reflection is invalid.
+/// `Fault` when the description of the services for reflection is invalid; `DeviceLost`.
 pub async fn serve(
     engine: Engine,
     listener: Listener,
@@ -92,32 +93,46 @@ pub async fn serve(
     let accept_connections = connection_server.accept_connections(sockets, Arc::clone(&table));
     let report_state = report_state(engine.clone(), health.reporter.clone());
     let stop_engine = async move {
-        let mut shutdown = std::pin::pin!(shutdown);
-        tokio::select! {
-            () = &mut shutdown => {}
-            _ = engine.device_lost() => {
-                health.set(false).await;
-                shutdown.await;
-            }
-        }
+        let loss = tokio::select! {
+            () = shutdown => None,
+            error = report_device(&engine, &health) => Some(error),
+        };
         tracing::info!("the server is shutting down");
         let drain_deadline = Instant::now() + engine.config().drain_timeout;
         health.set(false).await;
         if tokio::time::timeout_at(drain_deadline, engine.shutdown()).await.is_err() {
             tracing::warn!("the engine did not stop within the drain time");
         }
-        drain_deadline
+        (drain_deadline, loss)
     };
     // The sockets are closed when the engine has stopped.
-    let drain_deadline = tokio::select! {
+    let (drain_deadline, loss) = tokio::select! {
         () = accept_connections => return Ok(()),
         () = report_state => return Ok(()),
-        drain_deadline = stop_engine => drain_deadline,
+        stopped = stop_engine => stopped,
     };
     if tokio::time::timeout_at(drain_deadline, table.retire_all()).await.is_err() {
         tracing::warn!("some clients did not close their connections within the drain time");
     }
-    Ok(())
+    loss.map_or(Ok(()), Err)
+}
+
+/// Time between the loss of the device and the end of the server, in which health checks report the loss.
+const LOSS_NOTICE: Duration = Duration::from_secs(1);
+
+/// Reports the health of the device. Returns when the device is lost, after [`LOSS_NOTICE`].
+async fn report_device(engine: &Engine, health: &Health) -> Error {
+    let mut device = engine.observe_device();
+    loop {
+        tokio::select! {
+            error = engine.device_lost() => {
+                health.set(false).await;
+                tokio::time::sleep(LOSS_NOTICE).await;
+                return error;
+            }
+            () = device.changed() => health.set(device.is_working()).await,
+        }
+    }
 }
 
 /// Service of health checks: `SERVING` while the last steps can be written to disk.
@@ -212,25 +227,24 @@ fn routes(engine: &Engine, config: &Config, shared_memory: &SharedMemory, viewer
 
 #[cfg(test)]
 mod tests {
-    use std::time::Duration;
-
     use tokio::sync::oneshot;
     use tonic::transport::Channel;
     use tonic_health::ServingStatus;
-    use tonic_health::pb::HealthCheckRequest;
     use tonic_health::pb::health_client::HealthClient;
+    use tonic_health::pb::{HealthCheckRequest, HealthCheckResponse};
 
     use super::*;
     use crate::engine::lossless_lease;
     use crate::hang_guard::HANG_GUARD;
 
-    async fn check_health(client: &mut HealthClient<Channel>) -> i32 {
-        let request = HealthCheckRequest { service: String::new() };
-        client.check(request).await.expect("expected an answer").into_inner().status
+    /// The next status of the whole server in a watch of its health.
+    async fn next_status(watch: &mut tonic::Streaming<HealthCheckResponse>) -> i32 {
+        let message = tokio::time::timeout(HANG_GUARD, watch.message()).await.expect("expected a status");
+        message.expect("expected no error").expect("expected a status").status
     }
 
     #[tokio::test]
-    async fn lost_device_turns_health_to_not_serving() {
+    async fn lost_device_turns_health_to_not_serving_and_ends_the_server() {
         let folder = tempfile::tempdir().expect("expected a temporary folder");
         let listen = crate::config::ListenAddress::Tcp(([127, 0, 0, 1], 0).into());
         let config = Config { listen: vec![listen], state: folder.path().to_owned(), ..Config::default() };
@@ -238,23 +252,20 @@ mod tests {
         let listener = bind(&config).await.expect("expected a free port");
         let address = listener.urls()[0].clone();
         let (engine, step) = Engine::with_losable_device(config).await.expect("expected a running engine");
-        let (stop_sender, stop_receiver) = oneshot::channel::<()>();
+        let (_stop_sender, stop_receiver) = oneshot::channel::<()>();
         let server = tokio::spawn(serve(engine.clone(), listener, async {
             stop_receiver.await.ok();
         }));
         let endpoint = Channel::from_shared(address).expect("expected a valid URL");
         let mut client = HealthClient::new(endpoint.connect().await.expect("expected a connection"));
-        assert_eq!(check_health(&mut client).await, ServingStatus::Serving as i32);
+        let request = HealthCheckRequest { service: String::new() };
+        let mut watch = client.watch(request).await.expect("expected a watch").into_inner();
+        assert_eq!(next_status(&mut watch).await, ServingStatus::Serving as i32);
         let scene_handle = engine.find("strips").expect("expected an open scene");
         let mut writer = scene_handle.drive("test", lossless_lease(4)).await.expect("expected the writer lease");
         writer.push_step(&step).expect("expected an accepted step");
-        let wait_for_not_serving = async {
-            while check_health(&mut client).await != ServingStatus::NotServing as i32 {
-                tokio::time::sleep(Duration::from_millis(5)).await;
-            }
-        };
-        tokio::time::timeout(HANG_GUARD, wait_for_not_serving).await.expect("expected NOT_SERVING");
-        stop_sender.send(()).expect("expected the server to run until it is stopped");
-        server.await.expect("expected no panic").expect("expected a clean stop");
+        assert_eq!(next_status(&mut watch).await, ServingStatus::NotServing as i32);
+        let error = server.await.expect("expected no panic").expect_err("expected the end of the server");
+        assert!(matches!(error, Error::DeviceLost { .. }), "{error}");
     }
 }

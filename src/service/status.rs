@@ -23,6 +23,9 @@ const QUEUE_RETRY_DELAY: Duration = Duration::from_millis(100);
 /// `RetryInfo` while the server shuts down, which includes the time of a restart.
 const RESTART_RETRY_DELAY: Duration = Duration::from_secs(5);
 
+/// `RetryInfo` while the renderer is opened again.
+const RENDERER_RETRY_DELAY: Duration = Duration::from_secs(1);
+
 fn truncate_text(text: String) -> String {
     match text.char_indices().nth(MAX_TEXT_CHARS) {
         None => text,
@@ -110,6 +113,11 @@ impl ErrorReport {
             }
             Error::ShuttingDown => Self::new(Code::Unavailable, Reason::ShuttingDown, "a running server", "a shutdown")
                 .with_retry_delay(RESTART_RETRY_DELAY),
+            Error::RendererLost { stage, reason } => {
+                let given = format!("{stage}: {reason}");
+                Self::new(Code::Unavailable, Reason::DeviceLost, "a renderer that is open again", given)
+                    .with_retry_delay(RENDERER_RETRY_DELAY)
+            }
             Error::DeviceLost { stage, reason } => {
                 let given = format!("{stage}: {reason}");
                 Self::new(Code::Unavailable, Reason::DeviceLost, "a restart of the server", given)

@@ -7,7 +7,7 @@ use tokio::sync::oneshot;
 use super::context::PreparedDeformer;
 use crate::engine::output::step_output::{FrameOutput, PictureContent};
 use crate::frame::Legend;
-use modalcast_model::backend_settings::RasterPolicy;
+use modalcast_model::backend_settings::BackendSettings;
 use modalcast_model::deform::{DeformSummary, DeformedSurface, VertexAttributes};
 use modalcast_model::error::{Error, Result};
 use modalcast_model::scene::{Camera, FrameSize, MeshEdges, PixelRect, Scene, SceneState};
@@ -42,7 +42,7 @@ pub(in crate::engine) enum Command {
         scene: Arc<Scene>,
         /// The prepared deformer, or the error of its preparation.
         deformer: Result<PreparedDeformer>,
-        raster: RasterPolicy,
+        backends: BackendSettings,
         reply: Reply<()>,
     },
     Deform {

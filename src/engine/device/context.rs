@@ -17,6 +17,7 @@ use modalcast_compute::reference::ReferenceDeformer;
 use modalcast_model::backend_settings::{BackendSettings, BatchPolicy, RasterPolicy};
 use modalcast_model::deform::{Backend, Deformer};
 use modalcast_model::error::{Error, Result, fault};
+use modalcast_model::fault_injection;
 use modalcast_model::raster::{RasterGeometry, Rasterizer};
 use modalcast_model::scene::{Camera, FrameSize, MeshEdges, PixelRect, Scene};
 use modalcast_model::shared_memory::PictureMemory;
@@ -145,6 +146,8 @@ pub struct DeviceContext {
     /// Encodes frames as PNG on request. `None` if the CPU encodes all frames.
     picture_encoder: Option<Rc<CudaPictureMemory>>,
     info: EngineInfo,
+    /// With which the renderer is opened again.
+    config: Config,
     #[cfg(test)]
     create_test_deformer: Option<CreateDeformer>,
 }
@@ -160,18 +163,7 @@ impl DeviceContext {
         let device_bytes =
             cuda_device.as_ref().map(|device| device.memory()).transpose()?.map(|(_, total)| total as u64);
         let memory = MemoryLimits::new(config, device_bytes);
-        let mut renderer = open_renderer(config, cuda_device.is_some());
-        if let Ok(renderer) = &mut renderer {
-            renderer.set_target_budget(memory.render_target_budget());
-        }
-        let picture_memory = match (&mut renderer, &cuda_device) {
-            (Ok(renderer), Some(device)) => share_pictures(renderer, device)?,
-            _ => None,
-        };
-        let picture_encoder = match config.encode {
-            EncodeChoice::Cpu => None,
-            EncodeChoice::Cuda | EncodeChoice::Fastest => prepare_encoder(picture_memory)?,
-        };
+        let OpenedRenderer { renderer, picture_encoder } = open_renderer(config, &memory, cuda_device.as_ref())?;
         let info = EngineInfo {
             backend,
             device: device_label,
@@ -184,9 +176,27 @@ impl DeviceContext {
             encode: config.encode,
             picture_encoder,
             info,
+            config: config.clone(),
             #[cfg(test)]
             create_test_deformer: None,
         })
+    }
+
+    /// Opens the renderer again after its loss. All buffers of the old one must be freed before.
+    ///
+    /// # Errors
+    /// Those of the renderer, for example `Unavailable`; `DeviceLost`.
+    pub(super) fn reopen_renderer(&mut self) -> Result<()> {
+        if matches!(self.config.renderer, RendererChoice::Off) {
+            return Ok(());
+        }
+        // Destroys the old context before the new one is created.
+        self.renderer = Err(fault("renderer", "the renderer is being opened"));
+        fault_injection::reopen_renderer();
+        self.picture_encoder = None;
+        let opened = open_renderer(&self.config, &self.info.memory, self.cuda_device.as_ref())?;
+        (self.renderer, self.picture_encoder) = (opened.renderer, opened.picture_encoder);
+        self.renderer.as_ref().map(drop).map_err(Clone::clone)
     }
 
     /// A context without renderer whose scenes use the given deformer.
@@ -302,7 +312,7 @@ impl DeviceContext {
             |geometry: RasterGeometry| Ok(Box::new(CudaRasterizer::new(device, geometry)?) as Box<dyn Rasterizer>);
         match loaded_scene.attach_rasterizer(renderer, create_rasterizer) {
             Ok(()) => {}
-            Err(error @ Error::DeviceLost { .. }) => return Err(error),
+            Err(error) if error.is_loss() => return Err(error),
             Err(error) => {
                 tracing::warn!(%error, "the compute rasterizer could not be created; OpenGL draws");
                 return Ok(());
@@ -662,7 +672,37 @@ fn open_cuda(config: &Config) -> Result<(Backend, Option<Arc<gpu::Device>>, Stri
     Ok((Backend::Cuda, Some(device), name))
 }
 
-fn open_renderer(config: &Config, uses_cuda: bool) -> Result<Renderer> {
+/// A renderer, and what CUDA does for it.
+struct OpenedRenderer {
+    renderer: Result<Renderer>,
+    picture_encoder: Option<Rc<CudaPictureMemory>>,
+}
+
+/// Opens the configured renderer.
+///
+/// # Errors
+/// `DeviceLost`; `Fault` when CUDA refuses a stream. A missing renderer is no error.
+fn open_renderer(
+    config: &Config,
+    memory: &MemoryLimits,
+    cuda_device: Option<&Arc<gpu::Device>>,
+) -> Result<OpenedRenderer> {
+    let mut renderer = open_any_renderer(config, cuda_device.is_some());
+    if let Ok(renderer) = &mut renderer {
+        renderer.set_target_budget(memory.render_target_budget());
+    }
+    let picture_memory = match (&mut renderer, cuda_device) {
+        (Ok(renderer), Some(device)) => share_pictures(renderer, device)?,
+        _ => None,
+    };
+    let picture_encoder = match config.encode {
+        EncodeChoice::Cpu => None,
+        EncodeChoice::Cuda | EncodeChoice::Fastest => prepare_encoder(picture_memory)?,
+    };
+    Ok(OpenedRenderer { renderer, picture_encoder })
+}
+
+fn open_any_renderer(config: &Config, uses_cuda: bool) -> Result<Renderer> {
     let renderer_unavailable = |reason: &str, remedy: &str| Error::Unavailable {
         what: "renderer",
         reason: reason.into(),

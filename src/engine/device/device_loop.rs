@@ -38,8 +38,9 @@
 //!
 //! # Failures
 //! A panic in a command, in a poll or in a copy drops the reply channel of that command, so its caller gets an error.
-//! The loop continues. After the first `Error::DeviceLost` the loop answers every command with that error, except
-//! `UnloadScene`.
+//! The loop continues. A lost renderer is opened again ([`super::recovery`]). After the first `Error::DeviceLost` the loop
+//! answers every command with that error, except `UnloadScene`. A call that does not return is noticed by the watchdog
+//! ([`super::watchdog`]).
 
 mod outputs;
 
@@ -58,9 +59,12 @@ use super::fair_queue::Taken;
 use super::in_flight::{InFlight, InFlightQueue, Pollable};
 use super::loaded_scene::LoadedScene;
 use super::partial_output::{Charge, PartialOutput};
+use super::recovery::{RecoveryLimit, SceneToRestore};
+use super::watchdog::WorkClock;
 use crate::telemetry::ms_since;
+use modalcast_model::backend_settings::BackendSettings;
 use modalcast_model::deform::{VertexAttributes, VertexReadback};
-use modalcast_model::error::{Result, fault, fault_in};
+use modalcast_model::error::{Error, Result, fault, fault_in};
 use modalcast_render::{FrameImage, FramePixels, MAX_FRAMES_IN_FLIGHT, PendingPick, PickHit};
 
 /// How long the thread waits for a frame of a software renderer before it checks the command queue again.
@@ -82,13 +86,17 @@ const MAX_VERTEX_READBACKS_IN_FLIGHT: usize = 2;
 
 /// State owned by the device thread: the device context, the loaded scenes and the readbacks in flight.
 pub(super) struct DeviceLoop {
-    context: DeviceContext,
+    pub(super) context: DeviceContext,
     /// Records the loss of the device.
-    loss: DeviceLossSender,
+    pub(super) loss: DeviceLossSender,
     queue: Arc<CommandQueue>,
     /// Threads that copy pixels of frames.
     copy_pool: ThreadPool,
+    clock: Arc<WorkClock>,
+    pub(super) recoveries: RecoveryLimit,
     scenes: HashMap<SceneId, LoadedScene>,
+    /// The settings of the loaded scenes, to load them again.
+    backends: HashMap<SceneId, BackendSettings>,
     /// Outputs with further draw steps. The queue of their scene begins with [`Work::Continue`].
     partial_outputs: HashMap<SceneId, PartialOutput>,
     vertices: InFlightQueue<PendingVertices, CopiedVertices>,
@@ -145,7 +153,12 @@ impl DeviceLoop {
     ///
     /// # Errors
     /// `Fault` when the threads cannot be started.
-    pub(super) fn new(context: DeviceContext, loss: DeviceLossSender, queue: Arc<CommandQueue>) -> Result<Self> {
+    pub(super) fn new(
+        context: DeviceContext,
+        loss: DeviceLossSender,
+        queue: Arc<CommandQueue>,
+        clock: Arc<WorkClock>,
+    ) -> Result<Self> {
         let copy_pool =
             ThreadPoolBuilder::new().num_threads(COPY_THREADS).thread_name(|index| format!("pixels {index}"));
         let is_hardware = context.info().renderer.as_ref().is_ok_and(|renderer| !renderer.software);
@@ -154,7 +167,10 @@ impl DeviceLoop {
             loss,
             queue,
             copy_pool: copy_pool.build().map_err(fault_in("threads that copy pixels"))?,
+            clock,
+            recoveries: RecoveryLimit::default(),
             scenes: HashMap::new(),
+            backends: HashMap::new(),
             partial_outputs: HashMap::new(),
             vertices: InFlightQueue::new(MAX_VERTEX_READBACKS_IN_FLIGHT),
             picks: InFlightQueue::new(MAX_PICKS_IN_FLIGHT),
@@ -183,6 +199,13 @@ impl DeviceLoop {
     /// is closed and empty.
     pub(super) fn run_next(&mut self) -> bool {
         let Some(taken) = self.next_work() else { return false };
+        let clock = Arc::clone(&self.clock);
+        clock.measure(|| self.run_taken(taken));
+        true
+    }
+
+    /// Executes the work, answers readbacks, and opens a lost renderer again.
+    fn run_taken(&mut self, taken: Taken<Work>) {
         self.free_in_flight_slot(&taken.work);
         let older_readback_count = self.vertices.len();
         let (begin, scene, class) = (Instant::now(), taken.scene, taken.class);
@@ -201,7 +224,7 @@ impl DeviceLoop {
             run_caught(|| self.finish_oldest_frame());
         }
         self.free_unused_targets();
-        true
+        self.recover_renderer();
     }
 
     /// Frees the memory of render targets that no frame has used for [`TARGET_LIFETIME`].
@@ -221,7 +244,8 @@ impl DeviceLoop {
             let ready: Vec<SceneId> = outputs.map(|(id, _)| *id).collect();
             let has_large_output = self.partial_outputs.values().any(PartialOutput::is_large);
             let can_run = |id: SceneId, work: &Work| match work {
-                Work::Continue => ready.contains(&id),
+                // An output that has failed between its steps has nothing to continue.
+                Work::Continue => ready.contains(&id) || !self.partial_outputs.contains_key(&id),
                 Work::Command(command) | Work::Prepared(command) => {
                     !(has_large_output && self.is_large_output(id, command))
                 }
@@ -230,8 +254,12 @@ impl DeviceLoop {
                 return Some(taken);
             }
             if !(self.vertices.is_empty() && self.picks.is_empty() && self.frames.is_empty()) {
-                self.start_encodings_if_idle();
-                run_caught(|| self.finish_one());
+                let clock = Arc::clone(&self.clock);
+                clock.measure(|| {
+                    self.start_encodings_if_idle();
+                    run_caught(|| self.finish_one());
+                    self.recover_renderer();
+                });
             } else if let Some(output) = self.partial_outputs.values().next() {
                 output.is_ready_within(self.poll_interval);
             } else {
@@ -305,11 +333,10 @@ impl DeviceLoop {
             return command.reply_error(error);
         }
         match command {
-            Command::LoadScene { id, scene, deformer, raster, reply } => {
-                let loaded_scene = deformer.and_then(|deformer| self.context.load_prepared(&scene, deformer, raster));
-                let result = self.loss.record_loss(loaded_scene).map(|scene| {
-                    self.scenes.insert(id, scene);
-                });
+            Command::LoadScene { id, scene, deformer, backends, reply } => {
+                let loaded_scene =
+                    deformer.and_then(|deformer| self.context.load_prepared(&scene, deformer, backends.raster));
+                let result = self.loss.record_loss(loaded_scene).map(|scene| self.insert_scene(id, scene, backends));
                 // If the caller no longer waits, no `UnloadScene` will follow.
                 if reply.send(result).is_err() {
                     self.unload(id);
@@ -331,7 +358,41 @@ impl DeviceLoop {
         }
     }
 
+    pub(super) fn insert_scene(&mut self, id: SceneId, scene: LoadedScene, backends: BackendSettings) {
+        self.scenes.insert(id, scene);
+        self.backends.insert(id, backends);
+    }
+
+    /// Answers all outputs in flight with an error. Vertices do not depend on the renderer, so these are answered.
+    pub(super) fn fail_outputs(&mut self, error: &Error) {
+        while !self.vertices.is_empty() {
+            run_caught(|| self.finish_oldest_vertices());
+        }
+        while let Some(InFlight { reply, .. }) = self.picks.pop_oldest() {
+            answer(reply, Err(error.clone()));
+        }
+        while let Some(InFlight { reply, .. }) = self.frames.pop_oldest() {
+            answer(reply, Err(error.clone()));
+        }
+        for (_, output) in std::mem::take(&mut self.partial_outputs) {
+            output.reply_error(error.clone());
+        }
+    }
+
+    /// Unloads all scenes. Returns what is needed to load them again.
+    pub(super) fn unload_all(&mut self) -> Vec<SceneToRestore> {
+        let mut scenes = Vec::new();
+        for (id, loaded_scene) in std::mem::take(&mut self.scenes) {
+            let (scene, state) = (Arc::clone(loaded_scene.scene()), Arc::clone(loaded_scene.current_state()));
+            let backends = self.backends.remove(&id).unwrap_or_default();
+            scenes.push(SceneToRestore { id, scene, state, backends });
+            run_caught(|| self.context.unload_scene(loaded_scene));
+        }
+        scenes
+    }
+
     fn unload(&mut self, id: SceneId) {
+        self.backends.remove(&id);
         if let Some(scene) = self.scenes.remove(&id) {
             self.context.unload_scene(scene);
         }
@@ -468,20 +529,20 @@ mod tests {
     use super::*;
     use crate::engine::testing::{self, FaultyDeformer, InjectedFault};
     use crate::hang_guard::HANG_GUARD;
-    use modalcast_model::backend_settings::BackendSettings;
     use modalcast_model::deform::Deformer;
-    use modalcast_model::error::Error;
     use modalcast_model::scene::{Scene, SceneState};
 
     const FAULTY_SCENE: SceneId = 1;
     const CONTROL_SCENE: SceneId = 2;
+    /// Longer than any work of these tests on a busy machine.
+    const WORK_LIMIT: Duration = Duration::from_secs(600);
     const POSITIONS: VertexAttributes =
         VertexAttributes { positions: true, normals: false, displacements: false, boxes: false };
 
     /// Starts a device thread whose deformer injects faults, and loads two scenes.
     async fn start_with_two_scenes() -> (DeviceHandle, Arc<Scene>) {
         let open_device = || DeviceContext::with_deformer(FaultyDeformer::boxed);
-        let handle = DeviceThread::start(open_device).await.expect("expected a device thread").handle;
+        let handle = DeviceThread::start(open_device, WORK_LIMIT).await.expect("expected a device thread").handle;
         let scene = testing::two_strips();
         for id in [FAULTY_SCENE, CONTROL_SCENE] {
             handle.load_scene(id, &scene, BackendSettings::default()).await.expect("expected a loaded scene");
@@ -539,7 +600,7 @@ mod tests {
     #[tokio::test]
     async fn scenes_are_served_while_another_deformer_is_prepared() {
         let open_device = || DeviceContext::with_deformer(create_when_open);
-        let handle = DeviceThread::start(open_device).await.expect("expected a device thread").handle;
+        let handle = DeviceThread::start(open_device, WORK_LIMIT).await.expect("expected a device thread").handle;
         let scene = testing::two_strips();
         handle.load_scene(CONTROL_SCENE, &scene, BackendSettings::default()).await.expect("expected a loaded scene");
         IS_GATE_CLOSED.store(true, Ordering::Relaxed);
@@ -556,6 +617,55 @@ mod tests {
         IS_GATE_CLOSED.store(false, Ordering::Relaxed);
         load.await.expect("expected no panic").expect("expected a loaded scene");
         deform_and_read(&handle, 3, &state).await.expect("expected positions of the loaded scene");
+    }
+
+    #[tokio::test]
+    async fn lost_renderer_is_opened_again_and_scenes_keep_their_states() {
+        let (handle, scene) = start_with_two_scenes().await;
+        let [state, other_state] = [0.5, 0.25].map(|q| state_with_q(&scene, q));
+        let expected = deform_and_read(&handle, FAULTY_SCENE, &state).await.expect("expected positions");
+        let other_expected = deform_and_read(&handle, CONTROL_SCENE, &other_state).await.expect("expected positions");
+        assert_ne!(expected, other_expected, "control: expected states with different positions");
+        let mut loss = handle.loss().clone();
+        let faulty_state = state_with_q(&scene, InjectedFault::RendererLost.q());
+        let error = deform_and_read(&handle, FAULTY_SCENE, &faulty_state).await;
+        assert_eq!(error, Err(testing::renderer_lost_error()));
+        loss.changed().await;
+        for (id, expected) in [(FAULTY_SCENE, &expected), (CONTROL_SCENE, &other_expected)] {
+            let vertices = handle.read_vertices(id, POSITIONS).wait().await.expect("expected vertices");
+            assert_eq!(&vertices.surface.positions, expected, "scene {id}: expected the state before the loss");
+        }
+        assert!(loss.is_working());
+        assert_eq!(handle.loss().error(), None);
+        assert_eq!(deform_and_read(&handle, FAULTY_SCENE, &other_state).await, Ok(other_expected));
+    }
+
+    #[tokio::test]
+    async fn renderer_that_is_lost_again_and_again_is_a_lost_device() {
+        let (handle, scene) = start_with_two_scenes().await;
+        let faulty_state = state_with_q(&scene, InjectedFault::RendererLost.q());
+        let mut losses = 0;
+        while handle.loss().error().is_none() {
+            deform_and_read(&handle, FAULTY_SCENE, &faulty_state).await.expect_err("expected the loss");
+            losses += 1;
+            assert!(losses < 10, "expected a limit on the number of recoveries");
+        }
+        assert!(losses > 1, "expected the first loss to be recovered from");
+    }
+
+    #[tokio::test]
+    async fn device_that_does_not_answer_is_lost() {
+        let open_device = || DeviceContext::with_deformer(FaultyDeformer::boxed);
+        let limit = Duration::from_secs(5);
+        let handle = DeviceThread::start(open_device, limit).await.expect("expected a device thread").handle;
+        let scene = testing::two_strips();
+        handle.load_scene(FAULTY_SCENE, &scene, BackendSettings::default()).await.expect("expected a loaded scene");
+        let faulty_state = state_with_q(&scene, InjectedFault::Endless.q());
+        let error = deform_and_read(&handle, FAULTY_SCENE, &faulty_state).await.expect_err("expected the loss");
+        assert!(matches!(error, Error::DeviceLost { stage: "device", .. }), "{error}");
+        // The thread never answers this command.
+        let error = handle.read_vertices(FAULTY_SCENE, POSITIONS).wait().await.expect_err("expected the loss");
+        assert!(matches!(error, Error::DeviceLost { .. }), "{error}");
     }
 
     #[tokio::test]

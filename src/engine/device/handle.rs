@@ -3,6 +3,7 @@
 //! once. Vertices, picks and frames are answered asynchronously: their readback overlaps with the commands after them.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use tokio::sync::oneshot;
 
@@ -11,6 +12,7 @@ use super::command_queue::{CancelGuard, CommandQueue};
 use super::context::{DeformerPreparer, DeviceContext, EngineInfo};
 use super::device_loop::DeviceLoop;
 use super::device_loss::{DeviceLoss, device_loss_channel};
+use super::watchdog::{self, WorkClock};
 use crate::engine::blocking::run_blocking;
 use crate::engine::output::step_output::{FrameOutput, PictureContent};
 use crate::frame::Legend;
@@ -46,27 +48,33 @@ pub(in crate::engine) struct DeviceThread {
 }
 
 impl DeviceThread {
-    /// Starts the thread. Returns when `open_device` has opened the devices.
+    /// Starts the thread. Returns when `open_device` has opened the devices. The device is lost when one piece of work
+    /// takes longer than `work_limit`.
     ///
     /// # Errors
     /// The errors of `open_device`; `Fault` when a thread cannot be started.
     pub(in crate::engine) async fn start(
         open_device: impl FnOnce() -> Result<DeviceContext> + Send + 'static,
+        work_limit: Duration,
     ) -> Result<Self> {
         let queue = CommandQueue::new();
         let commands = Arc::new(CommandSender(Arc::clone(&queue)));
         let (info_sender, info_receiver) = oneshot::channel();
         let (loss_sender, loss) = device_loss_channel();
+        let clock = WorkClock::new();
+        watchdog::start(&clock, work_limit, loss_sender.clone())?;
         let thread = std::thread::Builder::new()
             .name("device".into())
-            .spawn(move || match open_device().and_then(|context| DeviceLoop::new(context, loss_sender, queue)) {
-                Ok(device_loop) => {
-                    // Fails only if the caller no longer waits. The queue is then closed and `run` returns.
-                    info_sender.send(Ok((device_loop.info().clone(), device_loop.deformer_preparer()))).ok();
-                    device_loop.run();
-                }
-                Err(error) => {
-                    info_sender.send(Err(error)).ok(); // Fails only if the caller no longer waits.
+            .spawn(move || {
+                match open_device().and_then(|context| DeviceLoop::new(context, loss_sender, queue, clock)) {
+                    Ok(device_loop) => {
+                        // Fails only if the caller no longer waits. The queue is then closed and `run` returns.
+                        info_sender.send(Ok((device_loop.info().clone(), device_loop.deformer_preparer()))).ok();
+                        device_loop.run();
+                    }
+                    Err(error) => {
+                        info_sender.send(Err(error)).ok(); // Fails only if the caller no longer waits.
+                    }
                 }
             })
             .map_err(fault_in("device thread"))?;
@@ -121,8 +129,8 @@ impl DeviceHandle {
         let (preparer, prepared_scene) = (self.preparer.clone(), Arc::clone(scene));
         let prepare = move || preparer.prepare(&prepared_scene, backends.batches);
         let deformer = run_blocking("load", prepare).await;
-        let (scene, raster) = (Arc::clone(scene), backends.raster);
-        self.call(|reply| Command::LoadScene { id, scene, deformer, raster, reply }).await
+        let scene = Arc::clone(scene);
+        self.call(|reply| Command::LoadScene { id, scene, deformer, backends, reply }).await
     }
 
     /// Starts deforming a scene to a state.
@@ -184,7 +192,11 @@ impl DeviceHandle {
 
     /// Unloads a scene. A full queue accepts this command, too.
     pub(in crate::engine) async fn unload_scene(&self, id: SceneId) -> Result<()> {
-        self.call(|reply| Command::UnloadScene { id, reply }).await
+        match self.call(|reply| Command::UnloadScene { id, reply }).await {
+            // The end of the process frees the memory of a lost device.
+            Err(Error::DeviceLost { .. }) => Ok(()),
+            result => result,
+        }
     }
 
     /// Ends the thread after the commands already queued.
@@ -199,9 +211,12 @@ impl DeviceHandle {
     /// Sends a command; the caller awaits the answer later.
     fn submit<T>(&self, create_command: impl FnOnce(Reply<T>) -> Command) -> PendingReply<T> {
         let (reply, answer) = oneshot::channel();
+        let loss = self.loss.clone();
         match self.commands.0.push(create_command(reply)) {
-            Ok(cancel_guard) => PendingReply { answer: Ok(answer), _cancel_guard: cancel_guard },
-            Err(error) => PendingReply { answer: Err(error.unwrap_or_else(no_answer_error)), _cancel_guard: None },
+            Ok(cancel_guard) => PendingReply { answer: Ok(answer), loss, _cancel_guard: cancel_guard },
+            Err(error) => {
+                PendingReply { answer: Err(error.unwrap_or_else(no_answer_error)), loss, _cancel_guard: None }
+            }
         }
     }
 }
@@ -213,6 +228,7 @@ impl DeviceHandle {
 pub(in crate::engine) struct PendingReply<T> {
     // Dropped before the guard, so that the device thread sees the cancellation if it has just taken the command.
     answer: Result<oneshot::Receiver<Result<T>>>,
+    loss: DeviceLoss,
     _cancel_guard: Option<CancelGuard>,
 }
 
@@ -224,7 +240,12 @@ impl<T> PendingReply<T> {
     /// [`Self::wait`], but cancel-safe. Must not be called again after it has returned.
     pub(in crate::engine) async fn recv(&mut self) -> Result<T> {
         match &mut self.answer {
-            Ok(answer) => answer.await.map_err(|_| no_answer_error())?,
+            Ok(answer) => tokio::select! {
+                biased;
+                answer = answer => answer.map_err(|_| no_answer_error())?,
+                // A device thread in a call that does not return answers no command.
+                error = self.loss.wait() => Err(error),
+            },
             Err(error) => Err(error.clone()),
         }
     }

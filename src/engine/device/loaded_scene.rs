@@ -13,6 +13,7 @@ use crate::frame::{Legend, encode_png};
 use crate::telemetry::ms_since;
 use modalcast_model::deform::{DeformSummary, DeformedSurface, Deformer, VertexAttributes, VertexReadback};
 use modalcast_model::error::{Error, Result, fault, invalid};
+use modalcast_model::fault_injection::{self, InjectionPoint};
 use modalcast_model::raster::{RasterGeometry, Rasterizer};
 use modalcast_model::scene::{BoundingBox, Camera, FrameSize, OrientedBounds, Scene, SceneState};
 use modalcast_render::{FrameInfo, FrameParams, FramePixels, Renderer, SceneBuffers};
@@ -113,6 +114,11 @@ impl LoadedScene {
         self.bounds
     }
 
+    /// The state of the last deformation.
+    pub(in crate::engine) const fn current_state(&self) -> &Arc<SceneState> {
+        &self.current_state
+    }
+
     /// Deforms the scene to a state. Rejects the state if a vertex is not finite or beyond 1e18 units. The previous
     /// state is then deformed again, so that no reader sees the rejected one.
     ///
@@ -131,7 +137,12 @@ impl LoadedScene {
     ) -> Result<DeformSummary> {
         self.buffers_are_current = false;
         let result = catch_unwind(AssertUnwindSafe(|| self.run_deformer(state, next)));
-        if !matches!(result, Ok(Ok(_) | Err(Error::DeviceLost { .. }))) {
+        let is_restorable = match &result {
+            Ok(Ok(_)) => false,
+            Ok(Err(error)) => !error.is_loss(),
+            Err(_panic) => true,
+        };
+        if is_restorable {
             // The output may be partially written, so restore it. If that fails too, the first error is more specific.
             self.run_deformer(&Arc::clone(&self.current_state), None).ok();
         }
@@ -148,6 +159,7 @@ impl LoadedScene {
 
     fn run_deformer(&mut self, state: &Arc<SceneState>, next: Option<&Arc<SceneState>>) -> Result<DeformSummary> {
         self.generation += 1;
+        fault_injection::check(InjectionPoint::Deform)?;
         self.deformer.deform_with_next(state, next)
     }
 

@@ -6,7 +6,7 @@ pub(super) mod command;
 mod command_queue;
 pub(super) mod context;
 mod device_loop;
-mod device_loss;
+pub(super) mod device_loss;
 mod fair_queue;
 #[cfg(test)]
 mod fairness_tests;
@@ -15,4 +15,6 @@ pub(super) mod handle;
 mod in_flight;
 pub(super) mod loaded_scene;
 mod partial_output;
+mod recovery;
 pub(super) mod scalar_field;
+mod watchdog;

@@ -255,7 +255,7 @@ impl Gl {
     ///
     /// # Errors
     /// `Fault` of `stage` with the first error of a command that was not issued, or with an error of OpenGL;
-    /// `DeviceLost` when the context is lost.
+    /// `RendererLost` when the context is lost.
     pub(crate) fn check(&self, stage: &'static str) -> Result<()> {
         if let Some(reason) = self.skipped_error.take() {
             return Err(fault(stage, reason));
@@ -265,16 +265,16 @@ impl Gl {
         match unsafe { gl.get_error() } {
             glow::NO_ERROR => Ok(()),
             glow::OUT_OF_MEMORY => Err(fault(stage, "OpenGL is out of memory")),
-            glow::CONTEXT_LOST => Err(self.device_lost_error(stage).unwrap_or_else(|| {
+            glow::CONTEXT_LOST => Err(self.renderer_lost_error(stage).unwrap_or_else(|| {
                 let reason = "OpenGL reports a lost context".into();
-                Error::DeviceLost { stage, reason }
+                Error::RendererLost { stage, reason }
             })),
             error => Err(fault(stage, format!("OpenGL error 0x{error:04X}"))),
         }
     }
 
-    /// `DeviceLost` with the reason if the context is lost: the device was reset, and all objects are gone.
-    fn device_lost_error(&self, stage: &'static str) -> Option<Error> {
+    /// `RendererLost` with the reason if the context is lost: the device was reset, and all objects are gone.
+    fn renderer_lost_error(&self, stage: &'static str) -> Option<Error> {
         let (status, _current) = (self.reset_status?, self.functions().ok()?);
         // SAFETY: the address is that of glGetGraphicsResetStatus of the current context; a query without side effects.
         let reason = match unsafe { status() } {
@@ -283,7 +283,7 @@ impl Gl {
             glow::INNOCENT_CONTEXT_RESET => "a command of another OpenGL context reset the device",
             _ => "OpenGL reports a reset of the device",
         };
-        Some(Error::DeviceLost { stage, reason: reason.into() })
+        Some(Error::RendererLost { stage, reason: reason.into() })
     }
 
     /// Discards the errors since the last check.

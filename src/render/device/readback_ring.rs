@@ -97,7 +97,7 @@ impl ReadbackRing {
         if let Some(picture_memory) = picture_memory {
             match PictureBuffer::new(&self.gl, picture_memory.as_ref(), self.bytes) {
                 Ok(picture) => return Ok(SlotMemory::Picture(picture)),
-                Err(lost @ Error::DeviceLost { .. }) => return Err(lost),
+                Err(lost) if lost.is_loss() => return Err(lost),
                 Err(error) => {
                     tracing::warn!(%error, "OpenGL copies the pixels: no memory that CUDA and OpenGL share");
                     self.picture_memory.replace(None);

@@ -14,6 +14,7 @@ use crate::pass::{FrameTimes, Pass};
 use crate::resources::scene_buffers::SceneBuffers;
 use crate::types::{FrameImage, FrameInfo, FrameParams, FrameStats, RasterBackend};
 use modalcast_model::error::Result;
+use modalcast_model::fault_injection::{self, InjectionPoint};
 
 impl Renderer {
     /// Draws one frame of the current buffers and waits for its pixels.
@@ -58,6 +59,7 @@ impl Renderer {
     /// `Fault` with the pass that did not finish within the time limit, or with the OpenGL error.
     pub fn map_pixels(&mut self, pending_frame: PendingFrame) -> Result<MappedPixels> {
         let _current = self.gl.make_current()?;
+        fault_injection::check(InjectionPoint::Pixels)?;
         pending_frame.wait()?;
         let limit = pending_frame.time_left();
         let PendingFrame { desc, readback, fence, passes, mut stats, info, .. } = pending_frame;

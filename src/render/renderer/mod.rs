@@ -40,7 +40,8 @@ use crate::shaders;
 use crate::types::{BlurMethod, DevicePreference, FrameParams, FrameStats, PixelReadback, RendererInfo, VisibilityId};
 use crate::uniforms::frame::FrameUniforms;
 use modalcast_model::deform::DeformedSurface;
-use modalcast_model::error::{Error, Result, fault, fault_in, invalid};
+use modalcast_model::error::{Result, fault, fault_in, invalid};
+use modalcast_model::fault_injection::{self, InjectionPoint};
 use modalcast_model::memory::{MemoryBudget, MemoryKind, MemoryReservation};
 use modalcast_model::raster::{RasterGeometry, Rasterizer};
 use modalcast_model::scene::{PixelRect, Scene};
@@ -170,7 +171,7 @@ impl Renderer {
     /// [`RendererInfo::pixel_readback`] holds the result.
     ///
     /// # Errors
-    /// `DeviceLost`.
+    /// `RendererLost`, `DeviceLost`.
     pub fn share_pictures(&mut self, picture_memory: Rc<dyn PictureMemory>) -> Result<()> {
         self.info.pixel_readback = match self.check_picture_memory(picture_memory.as_ref()) {
             Ok(()) => {
@@ -179,7 +180,7 @@ impl Renderer {
                 self.picture_memory = Some(picture_memory);
                 PixelReadback::CopyEngine
             }
-            Err(lost @ Error::DeviceLost { .. }) => return Err(lost),
+            Err(lost) if lost.is_loss() => return Err(lost),
             Err(error) => {
                 tracing::warn!(%error, "OpenGL copies the pixels: no memory that CUDA and OpenGL share");
                 PixelReadback::PixelBuffer(error.to_string())
@@ -461,6 +462,7 @@ impl Renderer {
             self.targets[index..].rotate_left(1);
             return Ok(());
         }
+        fault_injection::check(InjectionPoint::Target)?;
         if self.targets.len() >= MAX_TARGETS {
             self.targets.remove(0);
         }

@@ -31,7 +31,8 @@ use crate::resources::target::RenderTarget;
 use crate::resources::target_desc::TargetDesc;
 use crate::types::{FrameInfo, FrameLook, FrameParams, FrameStats, RasterBackends};
 use crate::uniforms::frame::{FrameUniforms, clip_from_positions, depth_below_ground};
-use modalcast_model::error::{Error, Result, fault};
+use modalcast_model::error::{Result, fault};
+use modalcast_model::fault_injection::{self, InjectionPoint};
 use modalcast_model::scene::FrameAntialiasing;
 
 /// A frame of which some steps are not submitted yet. Dropping it abandons the frame and frees its target.
@@ -138,6 +139,7 @@ impl Renderer {
         has_readback: bool,
     ) -> Result<PartialFrame> {
         let _current = self.gl.make_current()?;
+        fault_injection::check(InjectionPoint::Frame)?;
         self.check_size(params)?;
         let uniforms = FrameUniforms::new(&buffers.scene, &buffers.look, params, buffers.origin)?;
         let size = [params.width, params.height];
@@ -284,7 +286,7 @@ impl Renderer {
         match self.time_pass(raster_passes.stats_pass(), draw) {
             Ok(timer) => Ok(Some(timer)),
             // OpenGL cannot draw on a lost device either.
-            Err(error @ Error::DeviceLost { .. }) => Err(error),
+            Err(error) if error.is_loss() => Err(error),
             Err(error) => {
                 rasterizer.disable(&error);
                 Ok(None)

@@ -19,6 +19,7 @@ use crate::gpu::launch::cleanup::with_cleanup;
 use crate::gpu::launch::context::CurrentContext;
 use crate::gpu::launch::error::cuda_error;
 use modalcast_model::error::{Error, Result, fault, fault_in};
+use modalcast_model::fault_injection::{self, InjectionPoint};
 use modalcast_model::raster::GlBuffer;
 
 const STAGE: &str = "interop";
@@ -172,6 +173,7 @@ pub(super) fn with_mapped(
     work: impl FnOnce(&[u64]) -> Result<()>,
 ) -> Result<()> {
     let _current = device.enter()?;
+    fault_injection::check(InjectionPoint::Interop)?;
     mappings.iter_mut().try_for_each(|Mapping { buffer, access }| buffer.set_map_flags(*access))?;
     let _gl = mappings.first().map(|mapping| mapping.buffer.buffer.owner.make_current()).transpose()?;
     let mut resources: Vec<CUgraphicsResource> = mappings.iter().map(|mapping| mapping.buffer.resource).collect();

@@ -9,6 +9,7 @@ use serde::Serialize;
 use super::device::Device;
 use super::error::cuda_error;
 use modalcast_model::error::Result;
+use modalcast_model::fault_injection::{self, InjectionPoint};
 
 /// First compute capability with programmatic dependent launch (PDL).
 const MIN_PDL_CAPABILITY: (i32, i32) = (9, 0);
@@ -105,6 +106,7 @@ pub unsafe fn launch_kernel<T: Pod>(
     args: &T,
 ) -> Result<()> {
     let _current = device.enter()?;
+    fault_injection::check(InjectionPoint::Launch)?;
     let id = sys::CUlaunchAttributeID::CU_LAUNCH_ATTRIBUTE_PROGRAMMATIC_STREAM_SERIALIZATION;
     let value = sys::CUlaunchAttributeValue { programmaticStreamSerializationAllowed: 1 };
     let mut attribute = sys::CUlaunchAttribute { id, pad: [0; 4], value };

@@ -74,9 +74,10 @@ impl Fence {
         match status {
             glow::ALREADY_SIGNALED | glow::CONDITION_SATISFIED => Ok(true),
             glow::TIMEOUT_EXPIRED => Ok(false),
-            _ => {
-                Err(self.gl.device_lost_error(stage).unwrap_or_else(|| fault(stage, "the wait for the device failed")))
-            }
+            _ => Err(self
+                .gl
+                .renderer_lost_error(stage)
+                .unwrap_or_else(|| fault(stage, "the wait for the device failed"))),
         }
     }
 }
