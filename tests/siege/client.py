@@ -66,6 +66,34 @@ class Client:
         return self.list_reply(timeout).scenes
 
 
+class Writer:
+    """A step stream of a scene."""
+
+    def __init__(self, client, scene):
+        self.number = 0
+        self.requests = []
+        self.replies = client.steps.DriveScene(self.send(scene))
+        next(self.replies)
+
+    def send(self, scene):
+        drive = steps_pb2.OpenDrive(scene=scene, delivery=common_pb2.DELIVERY_LOSSLESS)
+        yield steps_pb2.DriveSceneRequest(open=drive)
+        while True:
+            while not self.requests:
+                time.sleep(0.001)
+            yield self.requests.pop()
+
+    def send_step(self, **fields):
+        """Sends a step and returns the reply."""
+        self.number += 1
+        self.requests.append(steps_pb2.DriveSceneRequest(step=steps_pb2.Step(number=self.number, **fields)))
+        return next(self.replies)
+
+    def step(self):
+        """Sends a step. Returns the durable step of the acknowledgment, 0 if there is none."""
+        return self.send_step().ack.durable_step
+
+
 def health(client, service):
     """The status of a service of the health service."""
     request = b"\x0a" + bytes([len(service)]) + service.encode()

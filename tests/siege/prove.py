@@ -23,7 +23,7 @@ ITEMS = {
     10: ("small_steps", "unread replies to steps"),
     11: ("quotas", "one client does not take all places"),
     12: ("floods", "floods of control frames, log records, names in errors"),
-    13: (None, "panics, endless kernels and lost devices"),
+    13: ("faults", "panics, endless kernels and lost devices"),
     14: ("viewer_port", "HTTP/1.1 and WebSocket of the viewer"),
     15: (None, "fuzzing"),
     16: (None, "soak"),
@@ -35,6 +35,7 @@ NOT_CLAIMED = {
     6: "loads have a deadline and equal shares",
     9: "while no other frame is drawn, Mesa keeps the memory of the last one",
     12: "names in the errors of all loaders",
+    13: "faults of CUDA in `deploy/prove`, which runs without a GPU",
     14: "hostile recordings, and enormous forces",
 }
 
@@ -42,6 +43,7 @@ NOT_CLAIMED = {
 def main():
     parser = argparse.ArgumentParser(prog="deploy/prove", description="Attacks a server and checks what it promises.")
     parser.add_argument("--program", type=Path, required=True, help="the server, `modalcast`")
+    parser.add_argument("--fault-program", type=Path, help="the server, built with the feature fault-injection")
     parser.add_argument("--items", type=int, nargs="*", default=sorted(ITEMS), help="numbers of the items to check")
     parser.add_argument(
         "--full", nargs="*", choices=long_tests.NAMES, help="then run the long tests of the clients, all or by name"
@@ -53,8 +55,14 @@ def main():
         if module is None:
             print(f"{item:2}. not claimed: {subject}", flush=True)
             continue
+        programs = [arguments.program.resolve()]
+        if module == "faults":
+            if arguments.fault_program is None:
+                print(f"{item:2}. not checked: {subject} (--fault-program)", flush=True)
+                continue
+            programs.append(arguments.fault_program.resolve())
         start = time.monotonic()
-        results: list[Result] = importlib.import_module(module).run(arguments.program.resolve())
+        results: list[Result] = importlib.import_module(module).run(*programs)
         for result in results:
             is_good &= result.is_good()
             print(result.line(), flush=True)

@@ -13,10 +13,10 @@ resource.setrlimit(resource.RLIMIT_NOFILE, (resource.getrlimit(resource.RLIMIT_N
 
 
 class Server:
-    """`modalcast serve` on a free port, with a state folder in a new folder or in `state`. The end of the `with` block
-    kills it."""
+    """`modalcast serve` on a free port, with a state folder in a new folder or in `state`, and with additional variables
+    in its environment. The end of the `with` block kills it."""
 
-    def __init__(self, program, *flags, scenes=None, renderer="off", state=None):
+    def __init__(self, program, *flags, scenes=None, renderer="off", state=None, environment=None):
         self.folder = tempfile.TemporaryDirectory(prefix="modalcast-siege-")
         self.state = Path(state or self.folder.name) / "state"
         self.log_path = Path(self.folder.name) / "log"
@@ -24,7 +24,11 @@ class Server:
         command += ["--renderer", renderer, "--state", str(self.state)]
         command += ["--scenes", str(scenes)] if scenes else []
         self.process = subprocess.Popen(
-            [*command, *flags], stdout=subprocess.PIPE, stderr=self.log_path.open("w"), text=True
+            [*command, *flags],
+            stdout=subprocess.PIPE,
+            stderr=self.log_path.open("w"),
+            text=True,
+            env=os.environ | (environment or {}),
         )
         line = self.process.stdout.readline()
         if not line.startswith("listening on http://"):

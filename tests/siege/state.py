@@ -6,7 +6,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from client import NOT_SERVING, SERVING, Client, common_pb2, health, steps_pb2, upload_files
+from client import NOT_SERVING, SERVING, Client, Writer, health, upload_files
 from report import Result
 from server import Server
 
@@ -19,30 +19,6 @@ MAX_SECONDS = 0.1
 
 # Size of the file system that is filled.
 DISK = 8 << 20
-
-
-class Writer:
-    """A step stream of a scene."""
-
-    def __init__(self, client, scene):
-        self.number = 0
-        self.requests = []
-        self.replies = client.steps.DriveScene(self.send(scene))
-        next(self.replies)
-
-    def send(self, scene):
-        drive = steps_pb2.OpenDrive(scene=scene, delivery=common_pb2.DELIVERY_LOSSLESS)
-        yield steps_pb2.DriveSceneRequest(open=drive)
-        while True:
-            while not self.requests:
-                time.sleep(0.001)
-            yield self.requests.pop()
-
-    def step(self):
-        """Sends a step. Returns the durable step of the acknowledgment, 0 if there is none."""
-        self.number += 1
-        self.requests.append(steps_pb2.DriveSceneRequest(step=steps_pb2.Step(number=self.number)))
-        return next(self.replies).ack.durable_step
 
 
 def lag(writer, seconds):
