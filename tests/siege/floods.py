@@ -32,9 +32,8 @@ FRAMES = [
 ]
 
 
-def flood(server, frame, count):
+def flood(connection, frame, count):
     """Sends a frame many times and reads the answers. Returns whether the connection ends."""
-    connection = http2.Connection(server.port)
     try:
         batch = frame * 500
         for _ in range(count // 500):
@@ -49,29 +48,35 @@ def flood(server, frame, count):
         connection.close()
 
 
-def control_frames(program):
+def check_floods(item, promise, server, frames, connect):
+    """Floods a server with each of the named frames, on connections that `connect` opens for a frame."""
     measured, passed = [], True
-    with Server(program) as server:
-        time_to_serve(server, 10)
-        memory = Peak(server.memory)
-        for name, frame in FRAMES:
-            is_closed = flood(server, frame, FLOOD)
-            seconds = time_to_serve(server, 5)
-            memory.sample()
-            passed &= is_closed and seconds <= MAX_SERVICE_SECONDS
-            measured.append(f"{name} {'closed' if is_closed else 'OPEN'}")
-        growth = memory.growth()
-        passed &= growth <= MAX_MEMORY
-        is_control_closed = any([flood(server, frame, FEW) for _, frame in FRAMES])
+    time_to_serve(server, 10)
+    memory = Peak(server.memory)
+    for name, frame in frames:
+        is_closed = flood(connect(frame), frame, FLOOD)
+        seconds = time_to_serve(server, 5)
+        memory.sample()
+        passed &= is_closed and seconds <= MAX_SERVICE_SECONDS
+        measured.append(f"{name} {'closed' if is_closed else 'OPEN'}")
+    growth = memory.growth()
+    passed &= growth <= MAX_MEMORY
+    is_control_closed = any([flood(connect(frame), frame, FEW) for _, frame in frames])
     return Result(
-        ITEM,
-        "floods of control frames end their connection",
+        item,
+        promise,
         f"closed before {FLOOD} frames, memory +{mb(MAX_MEMORY)}",
         ", ".join(measured) + f"; +{mb(growth)}",
         passed,
         f"{FEW} frames of each kind, {'closed' if is_control_closed else 'open'}",
         not is_control_closed,
     )
+
+
+def control_frames(program):
+    promise = "floods of control frames end their connection"
+    with Server(program) as server:
+        return check_floods(ITEM, promise, server, FRAMES, lambda _: http2.Connection(server.port))
 
 
 def collect_errors(server):

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import websocket
 from client import DESCRIBE_SCENE, HEALTH_WATCH, Client, scenes_pb2, slowest_service, time_to_serve
+from floods import check_floods
 from replies import ALL_ARRAYS, SIDE, describe_whole
 from report import Result, mb
 from scenes import write_grid
@@ -40,12 +41,6 @@ UNREAD_CONNECTIONS = 32
 UNREAD_CALLS = 32
 MAX_UNREAD_MEMORY = 384 << 20
 DURATION = 12.0
-
-# Each flood sends FLOOD frames. A connection of the negative control sends FEW frames and must stay open. The memory
-# may grow by MAX_FLOOD_MEMORY bytes.
-FLOOD = 100_000
-FEW = 1000
-MAX_FLOOD_MEMORY = 32 << 20
 
 # Flags that raise the budgets to their largest values.
 UNLIMITED = ["--connection-receive-bytes", "4000000000", "--receive-bytes", "4000000000"]
@@ -246,49 +241,21 @@ FLOODS = [
 ]
 
 
-def flood(server, frame, count):
-    """Sends a frame many times and reads the answers. Returns whether the connection ends."""
+def connect_for_flood(server, frame):
+    """A WebSocket with an open call, so that it has a message to continue and to give credit to."""
     connection = WebSocket(server, TOKEN)
-    try:
-        # A call that remains open, so that the connection has a message to continue and to give credit to.
-        connection.send(websocket.start_call(1, HEALTH_WATCH, b""))
-        if frame == EMPTY_FRAGMENT:
-            connection.send(websocket.frame(websocket.BINARY, b"", is_last=False))
-        for _ in range(count // 500):
-            connection.send(frame * 500)
-            if not connection.receive(0.0005)[1]:
-                return True
-        return not connection.receive(0.5)[1]
-    except OSError:
-        return True
-    finally:
-        connection.close()
+    connection.send(websocket.start_call(1, HEALTH_WATCH, b""))
+    if frame == EMPTY_FRAGMENT:
+        connection.send(websocket.frame(websocket.BINARY, b"", is_last=False))
+    return connection
 
 
-def floods(program):
-    measured, passed = [], True
+def small_frames(program):
+    promise = "floods of small WebSocket frames end their connection"
     with Server(program, *VIEWER) as server:
-        time_to_serve(server, 10)
-        memory = Peak(server.memory)
-        for name, frame in FLOODS:
-            is_closed = flood(server, frame, FLOOD)
-            passed &= is_closed and time_to_serve(server, 5) <= MAX_SERVICE_SECONDS
-            memory.sample()
-            measured.append(f"{name} {'closed' if is_closed else 'OPEN'}")
-        growth = memory.growth()
-        passed &= growth <= MAX_FLOOD_MEMORY
-        is_control_closed = any([flood(server, frame, FEW) for _, frame in FLOODS])
-    return Result(
-        ITEM,
-        "floods of small WebSocket frames end their connection",
-        f"closed before {FLOOD} frames, memory +{mb(MAX_FLOOD_MEMORY)}",
-        ", ".join(measured) + f"; +{mb(growth)}",
-        passed,
-        f"{FEW} frames of each kind, {'closed' if is_control_closed else 'open'}",
-        not is_control_closed,
-    )
+        return check_floods(ITEM, promise, server, FLOODS, lambda frame: connect_for_flood(server, frame))
 
 
 def run(program):
-    checks = [other_pages, slow_clients, half_sent_messages, unread_replies, floods]
+    checks = [other_pages, slow_clients, half_sent_messages, unread_replies, small_frames]
     return [check(program) for check in checks]
