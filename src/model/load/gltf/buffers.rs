@@ -13,6 +13,7 @@ use super::{MAX_FILE_BYTES, get_element};
 use crate::domain::Texture;
 use crate::error::{Result, invalid};
 use crate::load::asset_dir::AssetDir;
+use crate::load::polygons::build_bytes;
 use crate::memory::MemoryReservation;
 
 /// The largest total size in bytes of a model's buffers, decoded accessors and pixels. Without this limit, a small file
@@ -137,18 +138,28 @@ impl<'a> GltfBuffers<'a> {
         Ok(())
     }
 
+    /// Reserves memory for a mesh that is built from vertices and triangles.
+    ///
+    /// # Errors
+    /// `OutOfMemory`.
+    pub(super) fn reserve_mesh(&self, vertices: usize, triangles: usize) -> Result<()> {
+        self.folder.reserve("mesh of the model", build_bytes(vertices, 3 * triangles))
+    }
+
     /// The memory of the scene that is loaded.
     pub(super) const fn memory(&self) -> &Arc<MemoryReservation> {
         self.folder.memory()
     }
 
     fn read_uri(&self, uri: &str) -> Result<Vec<u8>> {
-        let content = match uri.strip_prefix("data:") {
-            Some(data) => decode_data_uri(data)?,
-            None => {
-                self.folder.read(&relative_path(uri)?, MAX_FILE_BYTES.min(self.remaining_budget.get()))?.into_bytes()
-            }
+        let Some(data) = uri.strip_prefix("data:") else {
+            let limit = MAX_FILE_BYTES.min(self.remaining_budget.get());
+            let content = self.folder.read(&relative_path(uri)?, limit)?;
+            // The reservation of the file ends with the conversion.
+            self.charge_budget(content.len() as u64)?;
+            return Ok(content.into_bytes());
         };
+        let content = decode_data_uri(data)?;
         self.charge_budget(content.len() as u64)?;
         Ok(content)
     }

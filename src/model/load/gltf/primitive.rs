@@ -135,6 +135,9 @@ fn read_mesh(
         }
         None => (0..rest_positions.len() as u32).collect(),
     };
+    // A strip has at most as many triangles as indices.
+    let max_triangles = if primitive.mode == TRIANGLES { indices.len() / 3 } else { indices.len() };
+    reader.buffers.reserve_mesh(rest_positions.len(), max_triangles)?;
     let triangles = build_triangles(&indices, primitive.mode)?;
     let format = AttributeFormat { allows_integers: false, count: Some(rest_positions.len()) };
     let normals = match primitive.attributes.get("NORMAL") {
