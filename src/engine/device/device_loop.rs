@@ -38,11 +38,12 @@
 //!
 //! # Failures
 //! A panic in a command, in a poll or in a copy drops the reply channel of that command, so its caller gets an error.
-//! The loop continues. A lost renderer is opened again ([`super::recovery`]). After the first `Error::DeviceLost` the loop
+//! The loop continues. A lost renderer is opened again ([`recovery`]). After the first `Error::DeviceLost` the loop
 //! answers every command with that error, except `UnloadScene`. A call that does not return is noticed by the watchdog
 //! ([`super::watchdog`]).
 
 mod outputs;
+mod recovery;
 
 use std::collections::HashMap;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -59,12 +60,12 @@ use super::fair_queue::Taken;
 use super::in_flight::{InFlight, InFlightQueue, Pollable};
 use super::loaded_scene::LoadedScene;
 use super::partial_output::{Charge, PartialOutput};
-use super::recovery::{RecoveryLimit, SceneToRestore};
+use super::recovery_limit::RecoveryLimit;
 use super::watchdog::WorkClock;
 use crate::telemetry::ms_since;
 use modalcast_model::backend_settings::BackendSettings;
 use modalcast_model::deform::{VertexAttributes, VertexReadback};
-use modalcast_model::error::{Error, Result, fault, fault_in};
+use modalcast_model::error::{Result, fault, fault_in};
 use modalcast_render::{FrameImage, FramePixels, MAX_FRAMES_IN_FLIGHT, PendingPick, PickHit};
 
 /// How long the thread waits for a frame of a software renderer before it checks the command queue again.
@@ -86,14 +87,14 @@ const MAX_VERTEX_READBACKS_IN_FLIGHT: usize = 2;
 
 /// State owned by the device thread: the device context, the loaded scenes and the readbacks in flight.
 pub(super) struct DeviceLoop {
-    pub(super) context: DeviceContext,
+    context: DeviceContext,
     /// Records the loss of the device.
-    pub(super) loss: DeviceLossSender,
+    loss: DeviceLossSender,
     queue: Arc<CommandQueue>,
     /// Threads that copy pixels of frames.
     copy_pool: ThreadPool,
     clock: Arc<WorkClock>,
-    pub(super) recoveries: RecoveryLimit,
+    recoveries: RecoveryLimit,
     scenes: HashMap<SceneId, LoadedScene>,
     /// The settings of the loaded scenes, to load them again.
     backends: HashMap<SceneId, BackendSettings>,
@@ -358,37 +359,9 @@ impl DeviceLoop {
         }
     }
 
-    pub(super) fn insert_scene(&mut self, id: SceneId, scene: LoadedScene, backends: BackendSettings) {
+    fn insert_scene(&mut self, id: SceneId, scene: LoadedScene, backends: BackendSettings) {
         self.scenes.insert(id, scene);
         self.backends.insert(id, backends);
-    }
-
-    /// Answers all outputs in flight with an error. Vertices do not depend on the renderer, so these are answered.
-    pub(super) fn fail_outputs(&mut self, error: &Error) {
-        while !self.vertices.is_empty() {
-            run_caught(|| self.finish_oldest_vertices());
-        }
-        while let Some(InFlight { reply, .. }) = self.picks.pop_oldest() {
-            answer(reply, Err(error.clone()));
-        }
-        while let Some(InFlight { reply, .. }) = self.frames.pop_oldest() {
-            answer(reply, Err(error.clone()));
-        }
-        for (_, output) in std::mem::take(&mut self.partial_outputs) {
-            output.reply_error(error.clone());
-        }
-    }
-
-    /// Unloads all scenes. Returns what is needed to load them again.
-    pub(super) fn unload_all(&mut self) -> Vec<SceneToRestore> {
-        let mut scenes = Vec::new();
-        for (id, loaded_scene) in std::mem::take(&mut self.scenes) {
-            let (scene, state) = (Arc::clone(loaded_scene.scene()), Arc::clone(loaded_scene.current_state()));
-            let backends = self.backends.remove(&id).unwrap_or_default();
-            scenes.push(SceneToRestore { id, scene, state, backends });
-            run_caught(|| self.context.unload_scene(loaded_scene));
-        }
-        scenes
     }
 
     fn unload(&mut self, id: SceneId) {
@@ -530,6 +503,7 @@ mod tests {
     use crate::engine::testing::{self, FaultyDeformer, InjectedFault};
     use crate::hang_guard::HANG_GUARD;
     use modalcast_model::deform::Deformer;
+    use modalcast_model::error::Error;
     use modalcast_model::scene::{Scene, SceneState};
 
     const FAULTY_SCENE: SceneId = 1;

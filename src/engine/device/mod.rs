@@ -15,6 +15,6 @@ pub(super) mod handle;
 mod in_flight;
 pub(super) mod loaded_scene;
 mod partial_output;
-mod recovery;
+mod recovery_limit;
 pub(super) mod scalar_field;
 mod watchdog;

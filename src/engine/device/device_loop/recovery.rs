@@ -1,43 +1,21 @@
 //! Recovery from the loss of the renderer: the device thread opens the renderer again, loads all scenes again and deforms
 //! them to their last states. Commands that are queued meanwhile are executed afterwards.
 
-use std::collections::VecDeque;
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
-use super::command::SceneId;
-use super::device_loop::DeviceLoop;
+use super::{DeviceLoop, InFlight, SceneId, answer, run_caught};
+use crate::engine::device::recovery_limit::{MAX_RECOVERIES, RECOVERY_PERIOD};
 use modalcast_model::backend_settings::BackendSettings;
 use modalcast_model::error::{Error, Result};
 use modalcast_model::scene::{Scene, SceneState};
 
-/// Maximum number of recoveries within [`RECOVERY_PERIOD`]. A renderer that is lost more often is a lost device, so that a
-/// frame that always loses it does not occupy the server for ever.
-const MAX_RECOVERIES: usize = 3;
-const RECOVERY_PERIOD: Duration = Duration::from_secs(60);
-
-/// Limits how often the renderer is opened again.
-#[derive(Debug, Default)]
-pub(super) struct RecoveryLimit {
-    /// When the renderer was lost, oldest first.
-    losses: VecDeque<Instant>,
-}
-
-impl RecoveryLimit {
-    /// Counts a loss. Returns whether the renderer may be opened again.
-    fn admits(&mut self, now: Instant) -> bool {
-        self.losses.retain(|loss| now.duration_since(*loss) < RECOVERY_PERIOD);
-        self.losses.push_back(now);
-        self.losses.len() <= MAX_RECOVERIES
-    }
-}
-
 /// A scene that is loaded again.
-pub(super) struct SceneToRestore {
-    pub(super) id: SceneId,
-    pub(super) scene: Arc<Scene>,
-    pub(super) state: Arc<SceneState>,
-    pub(super) backends: BackendSettings,
+struct SceneToRestore {
+    id: SceneId,
+    scene: Arc<Scene>,
+    state: Arc<SceneState>,
+    backends: BackendSettings,
 }
 
 impl DeviceLoop {
@@ -75,17 +53,32 @@ impl DeviceLoop {
         }
         Ok(count)
     }
-}
 
-#[cfg(test)]
-mod tests {
-    use super::*;
+    /// Answers all outputs in flight with an error. Vertices do not depend on the renderer, so these are answered.
+    fn fail_outputs(&mut self, error: &Error) {
+        while !self.vertices.is_empty() {
+            run_caught(|| self.finish_oldest_vertices());
+        }
+        while let Some(InFlight { reply, .. }) = self.picks.pop_oldest() {
+            answer(reply, Err(error.clone()));
+        }
+        while let Some(InFlight { reply, .. }) = self.frames.pop_oldest() {
+            answer(reply, Err(error.clone()));
+        }
+        for (_, output) in std::mem::take(&mut self.partial_outputs) {
+            output.reply_error(error.clone());
+        }
+    }
 
-    #[test]
-    fn recoveries_are_limited_within_the_period() {
-        let (mut limit, start) = (RecoveryLimit::default(), Instant::now());
-        let admitted: Vec<bool> = (0..5).map(|second| limit.admits(start + Duration::from_secs(second))).collect();
-        assert_eq!(admitted, [true, true, true, false, false]);
-        assert!(limit.admits(start + 2 * RECOVERY_PERIOD), "expected older losses to be forgotten");
+    /// Unloads all scenes. Returns what is needed to load them again.
+    fn unload_all(&mut self) -> Vec<SceneToRestore> {
+        let mut scenes = Vec::new();
+        for (id, loaded_scene) in std::mem::take(&mut self.scenes) {
+            let (scene, state) = (Arc::clone(loaded_scene.scene()), Arc::clone(loaded_scene.current_state()));
+            let backends = self.backends.remove(&id).unwrap_or_default();
+            scenes.push(SceneToRestore { id, scene, state, backends });
+            run_caught(|| self.context.unload_scene(loaded_scene));
+        }
+        scenes
     }
 }
