@@ -120,6 +120,13 @@ pub(crate) struct ChunkIndex {
     pub(crate) channels: Vec<u16>,
 }
 
+impl ChunkIndex {
+    /// The offset after the chunk.
+    pub(crate) const fn end(&self) -> u64 {
+        self.offset.saturating_add(self.length)
+    }
+}
+
 /// A record that recordings contain. Others are skipped.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum Record {

@@ -97,9 +97,9 @@ impl RecordFile {
         self.invalid(format!("record at {offset}: {}", error.field), &error.expected, &error.given)
     }
 
-    /// Reads the records of a chunk.
-    pub(crate) fn chunk(&self, offset: u64) -> Result<Bytes> {
-        match self.record(offset, self.length, MAX_CHUNK_RECORD_BYTES)? {
+    /// Reads the records of a chunk that lies before `end`.
+    pub(crate) fn chunk(&self, offset: u64, end: u64) -> Result<Bytes> {
+        match self.record(offset, end, MAX_CHUNK_RECORD_BYTES)? {
             Record::Chunk(records) => Ok(records),
             _ => Err(self.invalid(format!("offset {offset}"), "a chunk", "another record")),
         }
@@ -206,8 +206,10 @@ impl Recording {
     pub fn open(path: impl AsRef<Path>) -> Result<Self> {
         let file = Arc::new(RecordingFile::open(path.as_ref())?);
         let messages = file.read_scene()?;
-        let description = SceneDescription::from_messages(messages.clone(), MAX_SCENE_BYTES)?;
-        let (layout, contents) = (StateLayout::new(&description)?, file.read_content_items()?);
+        let invalid_scene = |error| file.records.invalid("topic scene", "the description of a scene", error);
+        let description = SceneDescription::from_messages(messages.clone(), MAX_SCENE_BYTES).map_err(invalid_scene)?;
+        let layout = StateLayout::new(&description).map_err(invalid_scene)?;
+        let contents = file.read_content_items()?;
         Ok(Self { file, scene: Arc::new(RecordedScene { messages, description, layout, contents }) })
     }
 
@@ -368,6 +370,7 @@ impl RecordingFile {
         let records = RecordFile::open(path)?;
         let Index { channels, mut chunks, metadata } = read_index(&records)?;
         chunks.sort_by_key(|chunk| chunk.offset);
+        check_disjoint(&records, &chunks)?;
         let metadata = read_metadata(&records, &metadata)?;
         let file = Self { records, channels, chunks, metadata };
         file.check_version()?;
@@ -458,13 +461,33 @@ fn read_index(records: &RecordFile) -> Result<Index> {
     Ok(index)
 }
 
+/// Checks that the chunks lie inside the file, and that no byte belongs to two chunks. Otherwise a small file could
+/// contain any number of messages.
+fn check_disjoint(records: &RecordFile, chunks: &[ChunkIndex]) -> Result<()> {
+    let next_offsets = chunks.iter().skip(1).map(|chunk| chunk.offset).chain([records.length]);
+    for (chunk, next_offset) in chunks.iter().zip(next_offsets) {
+        if chunk.end() > next_offset {
+            let location = format!("index of the chunk at {}", chunk.offset);
+            let expected = format!("an end before {next_offset}, where the next chunk or the end of the file is");
+            return Err(records.invalid(location, expected, chunk.end()));
+        }
+    }
+    Ok(())
+}
+
 fn read_metadata(records: &RecordFile, index: &[MetadataIndex]) -> Result<BTreeMap<String, BTreeMap<String, String>>> {
     let mut metadata = BTreeMap::new();
     for entry in index.iter().filter(|entry| metadata::ALL.contains(&entry.name.as_str())) {
+        if metadata.contains_key(&entry.name) {
+            return Err(records.invalid("index of the metadata", format!("'{}' once", entry.name), "it again"));
+        }
         let end = entry.offset.saturating_add(entry.length);
         match records.record(entry.offset, end, MAX_METADATA_BYTES)? {
-            Record::Metadata(MetadataRecord { name, values }) => metadata.insert(name, values),
-            _ => return Err(records.invalid(format!("offset {}", entry.offset), "metadata", "another record")),
+            Record::Metadata(MetadataRecord { name, values }) if name == entry.name => metadata.insert(name, values),
+            _ => {
+                let expected = format!("metadata with the name '{}'", entry.name);
+                return Err(records.invalid(format!("offset {}", entry.offset), expected, "another record"));
+            }
         };
     }
     Ok(metadata)
@@ -505,7 +528,8 @@ impl Messages {
             let Some(chunk) = self.chunks.next().and_then(|chunk| self.file.chunks.get(chunk)) else { return Ok(None) };
             let is_wanted = |channel: &u16| self.wanted_topic(*channel).is_some();
             if chunk.channels.is_empty() || chunk.channels.iter().any(is_wanted) {
-                (self.chunk_offset, self.records) = (chunk.offset, self.file.records.chunk(chunk.offset)?);
+                let records = self.file.records.chunk(chunk.offset, chunk.end())?;
+                (self.chunk_offset, self.records) = (chunk.offset, records);
             }
         }
     }

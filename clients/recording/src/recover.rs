@@ -117,7 +117,7 @@ impl ChunkCopier {
                 break (self.source.length(), None);
             }
             if opcode == op::CHUNK {
-                let copied = match self.source.chunk(offset) {
+                let copied = match self.source.chunk(offset, next) {
                     Ok(records) => self.copy_chunk(offset, records, writer)?,
                     Err(error) => Err(error),
                 };
