@@ -386,6 +386,18 @@ pub(crate) mod tests {
         std::env::var_os("MODALCAST_DATA").map_or_else(|| default_folder.into(), Into::into)
     }
 
+    /// Inputs that the fuzzer keeps: its corpus, and inputs that once caused a crash.
+    #[test]
+    fn kept_inputs_of_the_fuzzer_do_not_panic() {
+        let fuzz = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../deploy/fuzz");
+        let list = |kind: &str| std::fs::read_dir(fuzz.join(kind).join("cub")).into_iter().flatten();
+        for file in list("corpus").chain(list("crashes")) {
+            let path = file.expect("a readable folder").path();
+            eprintln!("{}", path.display());
+            ReducedForce::parse(&std::fs::read(path).expect("a readable file")).ok();
+        }
+    }
+
     #[test]
     #[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
     fn real_forces_are_gradients_and_vanish_at_rest() {

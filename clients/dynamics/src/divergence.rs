@@ -24,19 +24,13 @@ pub struct DivergenceCheck {
 impl DivergenceCheck {
     /// Creates the check of a scene.
     pub fn new(model: &Model) -> Self {
-        let mut displacements_per_unit = vec![0.0_f64; model.coordinate_count];
-        for domain in &model.domains {
-            for mode in 0..domain.rank {
-                let displacement = &mut displacements_per_unit[domain.first_coordinate + mode];
-                *displacement = displacement.max(domain.displacement_per_unit(mode) / model.diagonal());
-            }
-        }
         let center = 0.5 * (model.bounds_min + model.bounds_max);
         let local_center = |domain: &DomainModel| {
             let AffineTransform { linear, translation } = &domain.placement;
             linear.try_inverse().map(|inverse| inverse * (center - translation))
         };
         let local_centers = model.domains.iter().map(local_center).collect();
+        let displacements_per_unit = model.displacements_per_unit();
         Self { displacements_per_unit, local_centers, center, diagonal: model.diagonal() }
     }
 

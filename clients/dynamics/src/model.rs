@@ -146,6 +146,19 @@ impl DomainModel {
 }
 
 impl Model {
+    /// Per coordinate: the largest displacement of a sample per unit of the coordinate, in diagonals of the scene's rest
+    /// bounds. Domains may share coordinates.
+    pub fn displacements_per_unit(&self) -> Vec<f64> {
+        let mut displacements_per_unit = vec![0.0_f64; self.coordinate_count];
+        for domain in &self.domains {
+            for mode in 0..domain.rank {
+                let displacement = &mut displacements_per_unit[domain.first_coordinate + mode];
+                *displacement = displacement.max(domain.displacement_per_unit(mode) / self.diagonal());
+            }
+        }
+        displacements_per_unit
+    }
+
     /// Reads a scene from its server. `max_surface_samples` limits the surface samples per domain. The limit is
     /// reduced, but not below 8, if the samples of all domains would have more than 8 Mi entries of U.
     ///

@@ -114,6 +114,13 @@ impl ReducedSystem {
         hertz
     }
 
+    /// The coordinates at rest under a load, with the stiffness of the shape at rest.
+    pub fn linear_equilibrium(&self, load: &DVector<f64>) -> DVector<f64> {
+        let stiffness = self.force.rest_stiffness() * self.scale;
+        // A positive definite matrix, which always has a solution.
+        stiffness.lu().solve(load).unwrap_or_else(|| DVector::zeros(self.rank()))
+    }
+
     /// The state at rest, without load.
     pub fn rest_state(&self) -> NewmarkState {
         self.static_state(DVector::zeros(self.rank()))

@@ -67,6 +67,11 @@ impl Oscillator {
         Self { step: 1.0, response: Response::default(), w_squared: 0.0 }
     }
 
+    /// The displacement at rest per unit of force, 1 / omega^2; 0 for a mode that never moves.
+    pub fn compliance(&self) -> f64 {
+        if self.w_squared > 0.0 { self.step * self.step / self.w_squared } else { 0.0 }
+    }
+
     /// The state one step later, under a force that changes linearly from `start_force` to `end_force`.
     #[must_use]
     pub fn advance(&self, state: ModeState, start_force: f64, end_force: f64) -> ModeState {

@@ -112,7 +112,7 @@ fn energy_of_reduced_forces_is_bounded() {
     }
 }
 
-/// The scenario itself: it sends only finite steps in range, and stops if a viewer pushes too hard.
+/// The scenario itself: it sends only finite steps in range, also if a viewer pushes hard.
 #[test]
 fn tree_sends_only_steps_in_range() {
     for case in &CASES {
@@ -136,11 +136,7 @@ fn tree_sends_only_steps_in_range() {
                 Ok(())
             };
             let outcome: Result<(), Error> = (0..300).try_for_each(&mut send_step);
-            match (viewer_force > 0.0, outcome) {
-                (false, Ok(())) => {}
-                (true, Err(Error::Diverged { subject, .. })) => assert!(subject.contains("'beam'"), "{subject}"),
-                (_, outcome) => panic!("{}, force {viewer_force}: {outcome:?}", case.name),
-            }
+            assert!(outcome.is_ok(), "{}, force {viewer_force}: {outcome:?}", case.name);
         }
     }
 }

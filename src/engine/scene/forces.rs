@@ -118,7 +118,8 @@ impl Force {
         matches!(self.kind, ForceKind::Surface { .. })
     }
 
-    /// The force on the coordinates of the domain: U^T A^T f at a point of the surface.
+    /// The force on the coordinates of the domain: U^T A^T f at a point of the surface. A component beyond the range of
+    /// f32 is the largest number, so that no reader receives infinity.
     fn reduced(&self, scene: &Scene, state: &SceneState) -> Vec<f32> {
         let (triangle, barycentrics, newtons) = match &self.kind {
             ForceKind::Modal(f_q) => return f_q.clone(),
@@ -135,7 +136,7 @@ impl Force {
             std::array::from_fn(|column| (0..3).map(|row| f64::from(linear[4 * row + column]) * newtons[row]).sum());
         let component = |mode: usize| {
             let terms = (0..3).map(|row| f64::from(modes[row * rank + mode]) * local_force[row]);
-            terms.sum::<f64>() as f32
+            terms.sum::<f64>().clamp(f32::MIN.into(), f32::MAX.into()) as f32
         };
         (0..rank).map(component).collect()
     }
@@ -378,6 +379,20 @@ mod tests {
         let forces = domains.iter().enumerate().map(force).collect::<Result<_>>().expect("expected valid forces");
         ForceUpdate::new(owner(owner_byte), forces, Duration::from_millis(lifetime_ms))
             .expect("expected a valid update")
+    }
+
+    #[test]
+    fn largest_forces_stay_finite() {
+        let scene = testing::two_strips();
+        let state = SceneState::rest(&scene);
+        let newtons = [MAX_NEWTONS, -MAX_NEWTONS, MAX_NEWTONS];
+        let force = Force::on_surface(&scene, 1, 0, 0, &[0.5, 0.25, 0.25], &newtons).expect("expected a valid force");
+        assert!(force.reduced(&scene, &state).iter().all(|component| component.is_finite()));
+        let mut enlarged = state;
+        enlarged.transforms[0].0.iter_mut().for_each(|entry| *entry *= 1e20);
+        let f_q = force.reduced(&scene, &enlarged);
+        assert!(f_q.iter().all(|component| component.is_finite()), "{f_q:?}");
+        assert!(f_q.iter().any(|component| component.abs() == f32::MAX), "expected the largest number: {f_q:?}");
     }
 
     #[test]

@@ -242,8 +242,9 @@ impl Scenario for TreeScenario {
         if self.viewer_response.is_none() && forces.iter().all(|force| *force == 0.0) {
             return Ok(());
         }
-        let viewer_response = self.viewer_response.get_or_insert_with(|| ViewerResponse::at_rest(&self.model));
-        viewer_response.forces = forces.to_vec();
+        let viewer_response =
+            self.viewer_response.get_or_insert_with(|| ViewerResponse::at_rest(&self.model, &self.integrator));
+        viewer_response.set_forces(forces);
         Ok(())
     }
 

@@ -5,6 +5,7 @@ use crate::error::Result;
 use crate::model::Model;
 use crate::oscillator::{ModeState, Oscillator};
 use crate::parameters::{ModalParameters, ModeParameters};
+use crate::viewer_forces::force_scale;
 use crate::wind::WindPressure;
 
 /// One oscillator per coordinate, for one step size.
@@ -31,6 +32,10 @@ pub(super) struct ViewerResponse {
     pub(super) forces: Vec<f64>,
     /// Per coordinate.
     states: Vec<ModeState>,
+    /// Per coordinate: [`Model::displacements_per_unit`].
+    displacements_per_unit: Vec<f64>,
+    /// Per coordinate: 1 / omega^2; 0 for a mode that is held still.
+    compliances: Vec<f64>,
 }
 
 impl Integrator {
@@ -82,8 +87,21 @@ impl Response {
 
 impl ViewerResponse {
     /// The rest state without forces.
-    pub(super) fn at_rest(model: &Model) -> Self {
-        Self { forces: vec![0.0; model.coordinate_count], states: vec![ModeState::default(); model.coordinate_count] }
+    pub(super) fn at_rest(model: &Model, integrator: &Integrator) -> Self {
+        Self {
+            forces: vec![0.0; model.coordinate_count],
+            states: vec![ModeState::default(); model.coordinate_count],
+            displacements_per_unit: model.displacements_per_unit(),
+            compliances: integrator.oscillators.iter().map(Oscillator::compliance).collect(),
+        }
+    }
+
+    /// Sets the forces, one number per coordinate. Forces that displace the tree by more than
+    /// [`MAX_STATIC_DISPLACEMENT`](crate::viewer_forces::MAX_STATIC_DISPLACEMENT) are scaled down.
+    pub(super) fn set_forces(&mut self, forces: &[f64]) {
+        let q: Vec<f64> = forces.iter().zip(&self.compliances).map(|(force, compliance)| force * compliance).collect();
+        let scale = force_scale(&q, &self.displacements_per_unit);
+        self.forces = forces.iter().map(|force| scale * force).collect();
     }
 
     /// Adds the response to the coordinates `q` and rounds them to f32, as the server receives them.

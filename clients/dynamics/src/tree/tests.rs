@@ -100,6 +100,24 @@ fn viewer_force_deflects_its_domain_in_addition_to_the_wind() {
     }
 }
 
+/// The largest forces that the server passes on, for 20 s, in the direction of the motion of each coordinate, which
+/// adds most energy.
+#[test]
+fn enormous_viewer_forces_do_not_end_the_run() {
+    let mut tree = TreeScenario::new(four_domain_model(), OPTIONS).expect("a valid scenario");
+    let check = crate::divergence::DivergenceCheck::new(tree.model());
+    let (mut values, mut last_q) = (StepValues::default(), vec![0.0; 6]);
+    for step in 0..1200 {
+        tree.compute_next_step(&mut values).expect("finite coordinates");
+        check.check(tree.model(), step, 0.0, &values).expect("a bounded motion");
+        let force = |(now, last): (&f32, &f32)| 32.0 * f64::from(f32::MAX).copysign(f64::from(now - last));
+        let forces: Vec<f64> = values.q.iter().zip(&last_q).map(force).collect();
+        tree.set_viewer_forces(&forces).expect("a scenario with forces");
+        last_q.clone_from(&values.q);
+    }
+    assert!(values.q.iter().any(|q| q.abs() > 1e-3), "expected an effect: {:?}", values.q);
+}
+
 #[test]
 fn same_seed_gives_the_same_values() {
     let (first_run, second_run) = (run_tree(OPTIONS, 60).1, run_tree(OPTIONS, 60).1);
