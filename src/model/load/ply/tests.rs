@@ -118,7 +118,7 @@ fn hostile_headers_and_elements_are_rejected_before_allocation() {
         (replaced("vertex 4", "vertex 99999999999999999999999"), "header: expected a PLY header"),
         (text_of(binary(true), "vertex 4", "vertex 400"), "element vertex: expected elements of at least 15 bytes"),
         (text_of(binary(true), "face 2", "face 18446744073709551615"), "element face: expected elements of at least"),
-        (text_of(binary(true), "property float z", "property float y"), "header: expected different names"),
+        (text_of(binary(true), "property float z", "property float y"), "header: expected a different name"),
         (replaced("property float z\n", "property float w\n"), "element vertex: expected the properties x, y and z"),
         (replaced("element face 2", "element tristrips 2"), "element tristrips: expected faces"),
         (replaced("element face 2", "element polygon 2"), "element face: expected at least one face, got 4 vertices"),
