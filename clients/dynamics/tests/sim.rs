@@ -259,9 +259,10 @@ async fn fixed_modes_and_unresolved_gusts_are_reported() {
     }
 }
 
-/// The process reports what has diverged, and sends only the steps before it.
+/// A viewer cannot end the process by an enormous force: the forces of all viewers together bend the scene by a limited
+/// fraction of its diagonal.
 #[tokio::test(flavor = "multi_thread")]
-async fn diverging_run_stops_before_the_step_is_sent() {
+async fn enormous_forces_bend_the_scene_by_a_limited_amount() {
     let mut server = tree_server();
     let force = v1::Force { id: 1, domain: 1, kind: None };
     server.forces = vec![v1::AppliedForce { owner: 1, force: Some(force), f_q: pack(&[0.0, 1e30_f32]).into() }];
@@ -271,12 +272,12 @@ async fn diverging_run_stops_before_the_step_is_sent() {
     let record = folder.path().display().to_string();
     let arguments = ["tree", "--scene", "toy", "--steps", "20", "--forces", "--record", &record];
     let sim_output = run_sim(&url, &arguments).await;
-    assert_eq!(sim_output.exit_code, 7, "{}", sim_output.stderr);
-    assert!(sim_output.stderr.contains("q[1] of ") && sim_output.stderr.contains("diverged"), "{}", sim_output.stderr);
+    assert_eq!(sim_output.exit_code, 0, "{}", sim_output.stderr);
     let steps = server.steps.lock().expect("lock");
-    // Step 0 is the rest state, on which the force has not acted yet.
-    assert!(!steps.is_empty() && steps.len() < 20, "{} steps", steps.len());
-    assert!(steps.iter().flat_map(|step| fake::decode_f32(&step.q)).all(|number| number.abs() < 1e3));
+    assert_eq!(steps.len(), 20);
+    let coordinates: Vec<f32> = steps.iter().flat_map(|step| fake::decode_f32(&step.q)).collect();
+    assert!(coordinates.iter().all(|number| number.abs() < 1e3), "{coordinates:?}");
+    assert!(coordinates.iter().any(|number| number.abs() > 1e-3), "control: expected motion, got {coordinates:?}");
     assert_eq!(read_npy(&folder.path().join("q.npy")).len(), 6 * steps.len());
 }
 

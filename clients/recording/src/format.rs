@@ -99,10 +99,15 @@ impl Topic {
     /// If the descriptors of the contract cannot be decoded.
     pub(crate) fn schema(self) -> Result<Vec<u8>, prost::DecodeError> {
         let mut set = FileDescriptorSet::decode(v1::DESCRIPTORS)?;
-        set.file.retain(|file| {
-            // All of these files import `common.proto` only.
-            file.name() == self.proto_file() || file.name() == "modalcast/v1/common.proto"
-        });
+        let mut names = vec![self.proto_file().to_owned()];
+        let mut index = 0;
+        while let Some(name) = names.get(index) {
+            let imports = set.file.iter().filter(|file| file.name() == name).flat_map(|file| file.dependency.clone());
+            let new_imports: Vec<String> = imports.filter(|import| !names.contains(import)).collect();
+            names.extend(new_imports);
+            index += 1;
+        }
+        set.file.retain(|file| names.iter().any(|name| name == file.name()));
         set.file.iter_mut().for_each(|file| file.source_code_info = None);
         Ok(set.encode_to_vec())
     }

@@ -116,8 +116,8 @@ async fn has_recorded_contents(client: &Client, recording: &Recording, name: &st
     let mut description = client.describe_with(&DescriptionRequest::new(name).hashes()).await?;
     let recorded = recording.description();
     // Name, source and progress of the scene do not matter.
-    let SceneInfo { scene, source, last_step, remarks, .. } = recorded.info.clone();
-    description.info = SceneInfo { scene, source, last_step, remarks, ..description.info };
+    let SceneInfo { scene, source, last_step, durable_step, remarks, .. } = recorded.info.clone();
+    description.info = SceneInfo { scene, source, last_step, durable_step, remarks, ..description.info };
     Ok(description == *recorded)
 }
 
