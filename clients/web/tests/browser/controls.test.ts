@@ -11,6 +11,7 @@ import {
     launchBrowser,
     openPage,
     rememberPixels,
+    rememberSettledPixels,
     ServerProcess,
     startSimulation,
     waitForScene,
@@ -100,7 +101,7 @@ test("sliders and animated modes drive a scene that nobody else drives", { timeo
 test("keys switch edges, shadows, colors, panels, the pull tool and help", { timeout: LIMIT_MS }, async () => {
     const { page, errors } = await openPage(browser, server.pageUrl("tree"), WIDTH, HEIGHT);
     await waitForScene(page);
-    await rememberPixels(page);
+    await rememberSettledPixels(page);
     for (const [key, name] of [
         ["e", "edges"],
         ["s", "shadows"],

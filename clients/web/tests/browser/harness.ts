@@ -195,6 +195,14 @@ export async function rememberPixels(page: Page): Promise<void> {
     await comparePixels(page, true);
 }
 
+/** Remembers the pixels of a picture that has not changed for 500 ms: the first state arrives after the model. */
+export async function rememberSettledPixels(page: Page): Promise<void> {
+    do {
+        await rememberPixels(page);
+        await page.waitForTimeout(500);
+    } while ((await changedValues(page)) !== 0);
+}
+
 /** Draws the current state. Returns the number of values (RGBA) that differ from the remembered pixels. */
 export function changedValues(page: Page): Promise<number> {
     return comparePixels(page, false);
