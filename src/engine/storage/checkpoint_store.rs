@@ -1,7 +1,7 @@
 //! Checkpoint store: persists the last step of every scene, one file per scene. A background thread writes in rounds,
 //! at most twenty per second. A round writes and syncs one file per changed scene. Files are replaced by an atomic rename,
-//! so neither a killed server nor a power loss leaves a partial file. What is lost are the steps of the last 0.05 s plus the
-//! duration of one round.
+//! so neither a killed server nor a power loss leaves a partial file. The steps of the last 0.05 s, and of the duration
+//! of one round, can be lost.
 //!
 //! A state that cannot be written, for example because the disk is full, is written again later. Until then the store is
 //! degraded, and the durable step of the scene stands still.

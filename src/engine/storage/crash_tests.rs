@@ -1,5 +1,5 @@
-//! Power loss: the operations on the state folder are recorded, and a server starts from every prefix of them. What was not
-//! synced is lost or damaged.
+//! Power loss: the operations on the state folder are recorded, and a server starts from every prefix of them. Data
+//! that were not synced are lost or damaged.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -129,7 +129,7 @@ enum Node {
     Folder { names: BTreeMap<PathBuf, usize>, synced: BTreeMap<PathBuf, usize> },
 }
 
-/// A disk that tells apart what is synced. Node 0 is the root.
+/// A disk that distinguishes synced data from other data. Node 0 is the root.
 #[derive(Debug)]
 struct CrashDisk {
     nodes: Vec<Node>,
@@ -210,7 +210,7 @@ impl CrashDisk {
         }
     }
 
-    /// Writes what is left after a crash to a folder.
+    /// Writes the files and folders that remain after a crash to a folder.
     fn write_to(&self, folder: &Path, crash: Crash, node: usize) {
         match &self.nodes[node] {
             Node::Folder { names, synced } => {

@@ -14,7 +14,7 @@ pub(in crate::engine) trait FileSystem: Debug + Send + Sync {
     /// Creates an empty file. Replaces an existing one unless `is_new`, which makes it an error.
     fn create_file(&self, path: &Path, is_new: bool) -> io::Result<Box<dyn StateFile>>;
 
-    /// Makes the names in a folder durable: what was created, renamed or removed in it.
+    /// Makes the names in a folder durable: all files and folders that were created, renamed or removed in it.
     fn sync_folder(&self, path: &Path) -> io::Result<()>;
 
     /// Renames a file, replacing the file `to`, or a folder.

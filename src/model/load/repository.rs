@@ -39,8 +39,8 @@ impl SceneRepository {
         Ok(Self { root: Some(canonical) })
     }
 
-    /// Opens a built-in scene or a path inside the repository; `.` is the repository's root folder. The loaders reserve in
-    /// `memory` what they read and decode, before they allocate it.
+    /// Opens a built-in scene or a path inside the repository; `.` is the repository's root folder. The loaders reserve
+    /// memory for contents in `memory` before they read or decode them.
     ///
     /// # Errors
     /// As for [`super::open`], `Invalid` for a path that leaves the repository, and `OutOfMemory`.

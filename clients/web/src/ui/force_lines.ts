@@ -44,7 +44,7 @@ export class ForceLines {
             const length = LONGEST_LINE * norm(subtract(camera.eye, from)) * (newtons / this.largest);
             const isOnly = !source.server && model.forces.length === 1;
             const text = isOnly ? format.newtons(newtons) : `viewer ${owner}: ${format.newtons(newtons)}`;
-            // Nobody pulls in a recording, so its forces have the look of a pull.
+            // A recording is not pulled, so its forces are drawn like a pull.
             add(from, addScaled(from, vector as Vec3, length / newtons), text, !source.server);
         }
         this.overlay.draw(lines);

@@ -70,7 +70,7 @@ impl DeviceLoop {
         }
     }
 
-    /// Unloads all scenes. Returns what is needed to load them again.
+    /// Unloads all scenes. Returns their contents and states, with which they are loaded again.
     fn unload_all(&mut self) -> Vec<SceneToRestore> {
         let mut scenes = Vec::new();
         for (id, loaded_scene) in std::mem::take(&mut self.scenes) {

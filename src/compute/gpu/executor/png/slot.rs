@@ -123,7 +123,7 @@ impl HostPixels for EncodedPng {
 impl AsRef<[u8]> for EncodedPng {
     fn as_ref(&self) -> &[u8] {
         // SAFETY: the slot has `bytes` initialized bytes at its address, because the encoding of this file is complete.
-        // The encoder writes to a slot only while nobody else has a reference to the slot, and `self` has one.
+        // The encoder writes only to slots that have no other reference, and `self` has a reference to this slot.
         unsafe { std::slice::from_raw_parts(self.slot.address as *const u8, self.bytes) }
     }
 }
