@@ -12,6 +12,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2] / ".tools/siege/proto
 
 from modalcast.v1 import (  # noqa: E402
     common_pb2,
+    forces_pb2,
+    forces_pb2_grpc,
     frames_pb2,
     frames_pb2_grpc,
     scenes_pb2,
@@ -22,7 +24,7 @@ from modalcast.v1 import (  # noqa: E402
     vertices_pb2_grpc,
 )
 
-__all__ = ["common_pb2", "frames_pb2", "scenes_pb2", "steps_pb2", "vertices_pb2"]
+__all__ = ["common_pb2", "forces_pb2", "forces_pb2_grpc", "frames_pb2", "scenes_pb2", "steps_pb2", "vertices_pb2"]
 
 LIST_SCENES = "/modalcast.v1.SceneService/ListScenes"
 DESCRIBE_SCENE = "/modalcast.v1.SceneService/DescribeScene"

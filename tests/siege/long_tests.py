@@ -46,6 +46,12 @@ LONG_TESTS = (
         10,
     ),
     LongTest(
+        "soak",
+        "16 clients that come, go and are killed for 30 minutes leave nothing behind; a planted leak is found",
+        (".tools/siege/venv/bin/python", "tests/siege/soak.py", "--program", "{programs}/modalcast", "--prove"),
+        45,
+    ),
+    LongTest(
         "viewer",
         "browser viewer: ten minutes of use without growth of memory, 100 reconnects, a server that is killed",
         ("deploy/web", "--programs", "{programs}", "--long"),

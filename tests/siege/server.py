@@ -16,11 +16,11 @@ class Server:
     """`modalcast serve` on a free port, with a state folder in a new folder or in `state`, and with additional variables
     in its environment. The end of the `with` block kills it."""
 
-    def __init__(self, program, *flags, scenes=None, renderer="off", state=None, environment=None):
+    def __init__(self, program, *flags, scenes=None, backend="cpu", renderer="off", state=None, environment=None):
         self.folder = tempfile.TemporaryDirectory(prefix="modalcast-siege-")
         self.state = Path(state or self.folder.name) / "state"
         self.log_path = Path(self.folder.name) / "log"
-        command = [str(program), "serve", "--listen", "127.0.0.1:0", "--backend", "cpu"]
+        command = [str(program), "serve", "--listen", "127.0.0.1:0", "--backend", backend]
         command += ["--renderer", renderer, "--state", str(self.state)]
         command += ["--scenes", str(scenes)] if scenes else []
         self.process = subprocess.Popen(
