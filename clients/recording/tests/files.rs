@@ -1,5 +1,9 @@
 //! Recordings as files: all written messages are read, cut files are repaired, and damaged files are errors.
 
+#[path = "../../../deploy/fuzz/replay.rs"]
+mod fuzz_replay;
+#[path = "../../../deploy/fuzz/recordings/target.rs"]
+mod fuzz_target;
 mod synthetic;
 
 use std::path::Path;
@@ -246,4 +250,31 @@ fn huge_lengths_cause_no_panic_and_other_files_are_errors() {
     assert_eq!(missing.exit_code(), 4);
     let other = write(folder.path(), "other.mcap", b"not a recording");
     assert!(Recording::open(other).err().expect("another file").to_string().contains("MCAP"));
+}
+
+/// Otherwise a small file would contain any number of messages.
+#[test]
+fn index_names_chunks_and_metadata_once() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let file = recording(60, 20);
+    let ends: Vec<usize> = (0..=u8::MAX).flat_map(|opcode| record_ends(&file, opcode)).collect();
+    // Opcodes of indexes of chunks and of metadata.
+    for (opcode, location) in [(8, "index of the chunk at"), (13, "index of the metadata")] {
+        let end = record_ends(&file, opcode)[0];
+        let start = *ends.iter().filter(|other| **other < end).max().expect("records before the index");
+        let repeated = [&file[..end], &file[start..]].concat();
+        let path = write(folder.path(), "repeated.mcap", &repeated);
+        let error = Recording::open(path).err().expect("a repeated entry").to_string();
+        assert!(error.contains(location), "{error}");
+    }
+}
+
+#[test]
+fn kept_recordings_of_the_fuzzer_neither_panic_nor_use_much_memory() {
+    let fuzz = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../deploy/fuzz");
+    fuzz_replay::replay("kept_recordings_of_the_fuzzer_neither_panic_nor_use_much_memory", || {
+        let target = fuzz_target::RecordingTarget::new();
+        let inputs = [vec![recording(10, 4)], fuzz_replay::kept_inputs(&fuzz, "recording")].concat();
+        inputs.iter().for_each(|input| target.run(input));
+    });
 }
