@@ -52,6 +52,12 @@ LONG_TESTS = (
         45,
     ),
     LongTest(
+        "stall",
+        "R7: a device that stalls for 30 s ends no connection and no stream in 1,000,000 messages",
+        (".tools/siege/venv/bin/python", "tests/siege/stalls.py", "--program", "{programs}/modalcast"),
+        10,
+    ),
+    LongTest(
         "viewer",
         "browser viewer: ten minutes of use without growth of memory, 100 reconnects, a server that is killed",
         ("deploy/web", "--programs", "{programs}", "--long"),

@@ -9,7 +9,7 @@ from pathlib import Path
 import long_tests
 from report import Result
 
-# The items: numbered subjects of promises, each with the modules of its checks. An item without checks is not claimed.
+# The items: numbered subjects of promises, each with the modules of its checks. `None`: a long test checks it.
 ITEMS = {
     1: ("connections", "connections without a request"),
     2: ("messages", "half-sent messages"),
@@ -26,7 +26,7 @@ ITEMS = {
     13: ("faults", "panics, endless kernels and lost devices"),
     14: ("viewer_port recordings forces", "the viewer's port, recordings and forces"),
     15: ("kept_inputs", "fuzzing"),
-    16: (None, "soak: 16 clients that come and go (`--full soak`)"),
+    16: (None, "soak: 16 clients that come and go"),
 }
 
 # For items with checks, the part of the subject that is not claimed.
@@ -40,8 +40,8 @@ NOT_CLAIMED = {
     15: "steps, uploads and messages of WebSockets; 10^8 executions, and coverage of 90 % of the lines of the loaders",
 }
 
-# The rows R of the promises of a robust server: what each promises, and the item that checks it or a part of it. Rows
-# without an item, or whose item has no checks, are not claimed.
+# The rows R of the promises of a robust server: what each promises, and the item that checks it or a part of it, or the
+# name of the long test that checks it. Rows with neither are not claimed.
 ROWS = {
     1: ("messages above the size limit are refused at the exact boundary", None),
     2: ("a compressed message that expands to 512 MiB is refused", None),
@@ -49,7 +49,7 @@ ROWS = {
     4: ("limits on connections and streams; others are served meanwhile", 1),
     5: ("floods of resets and control frames end their connection", 12),
     6: ("slow handshakes do not lock out others", 1),
-    7: ("a stall of 30 s ends no connection in 1,000,000 small messages", None),
+    7: ("a stall of 30 s ends no connection in 1,000,000 small messages", "stall"),
     8: ("an unread stream delays no other stream of its connection", None),
     9: ("a slow viewer is isolated, bounded and never stale", None),
     10: ("frames never mix the values of two steps in 1,000,000 steps", None),
@@ -61,7 +61,7 @@ ROWS = {
     16: ("a panic costs one call", 13),
     17: ("a fault of the GPU is contained", 13),
     18: ("budget of GPU memory", 3),
-    19: ("no growth in long runs", 16),
+    19: ("no growth in long runs", "soak"),
     20: ("loaders never crash", 15),
     21: ("paths are confined, and errors name no private path", 12),
     22: ("numbers that are not finite are refused", 12),
@@ -90,7 +90,7 @@ def main():
     for item in sorted(set(arguments.items) & set(ITEMS)):
         modules, subject = ITEMS[item]
         if modules is None:
-            print(f"{item:2}. not claimed: {subject}", flush=True)
+            print(f"{item:2}. {'not checked' if arguments.full is None else 'below'}: {subject} (--full)", flush=True)
             continue
         programs = [arguments.program.resolve()]
         if modules == "faults":
@@ -114,9 +114,13 @@ def main():
 
 
 def print_rows():
-    for row, (promise, item) in ROWS.items():
-        is_claimed = item is not None and ITEMS[item][0] is not None
-        claim = f"in part by item {item}" if is_claimed else "not claimed"
+    for row, (promise, check) in ROWS.items():
+        if check is None:
+            claim = "not claimed"
+        elif isinstance(check, int):
+            claim = f"in part by item {check}"
+        else:
+            claim = f"by --full {check}"
         print(f"R{row:<2} {claim}: {promise}", flush=True)
 
 
