@@ -43,7 +43,7 @@ PERIOD = 900
 RESOLUTION = {"heap": 1 << 20, "rss": 8 << 20, "fds": 4, "threads": 4, "gpu": 1 << 20}
 
 # Samples that the record keeps.
-CURVE = 40
+CURVE = 20
 
 # The planted leak of the negative control, and the largest leak that the measured run may contain by its confidence
 # interval: otherwise the noise could hide a leak of this size.
