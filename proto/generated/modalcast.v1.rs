@@ -467,7 +467,9 @@ pub struct UploadedDomain {
     pub eigenvalues: ::prost::alloc::vec::Vec<f64>,
     /// Crease angle in degrees, 0 (flat) to 180 (smooth): an edge is shaded as hard if the normals of its two triangles
     /// differ by more at rest. Unset: 40, which is stored with the upload, so that a later version draws the same creases.
-    /// Must be unset with `shares_shape_with`. Vertices keep their numbers.
+    /// Uploads that were stored before this field existed have no stored angle: each time they are loaded, they get the
+    /// default of the running version, 40, also if the version that stored them smoothed all edges. Must be unset with
+    /// `shares_shape_with`. Vertices keep their numbers.
     #[prost(double, optional, tag = "9")]
     pub crease_angle: ::core::option::Option<f64>,
 }
@@ -2640,6 +2642,13 @@ pub struct Picture {
     /// unset for outputs other than OUTPUT_COLOR.
     #[prost(float, optional, tag = "9")]
     pub edge_width: ::core::option::Option<f32>,
+    /// Samples per pixel: 1, or 4 for antialiased edges. 0: as in the scene.toml of the scene (its `look.preset`,
+    /// `look.samples` or `look.antialias`). If it has none of these, RenderFrame draws 4 on every machine, because a single
+    /// picture has the time, and StreamFrames draws 4 on a GPU. On a CPU, it draws 4 in frames of at most 76,800 pixels of
+    /// scenes of at most 16,384 triangles, else 1. FrameLook.samples has the number that was drawn. Must be 0 for outputs
+    /// other than OUTPUT_COLOR.
+    #[prost(uint32, tag = "10")]
+    pub samples: u32,
 }
 /// An unset view or lens is taken from the camera that frames the scene's rest bounds. Positions are in scene units
 /// relative to the scene's origin (SceneInfo.origin). The server keeps the camera in f64 and subtracts the origin of the

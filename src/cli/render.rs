@@ -11,7 +11,7 @@ use crate::engine::{DeviceContext, FrameInfo, FrameOutput, LoadedScene, validate
 use crate::frame;
 use modalcast_model::error::{Error, Result, fault, invalid};
 use modalcast_model::load::{self, OpenedScene};
-use modalcast_model::scene::{Camera, FrameSize, Lens, LookPreset, MeshEdges, Scene, SceneState, View};
+use modalcast_model::scene::{Camera, FrameSize, FrameStyle, Lens, LookPreset, MeshEdges, Scene, SceneState, View};
 
 /// Renders one frame of a scene to a PNG or JPEG file.
 #[derive(Debug, clap::Args)]
@@ -143,8 +143,8 @@ pub(super) fn run(args: &Args) -> Outcome {
     let mut info = FrameInfo::default();
     let rgba = match args.output {
         OutputOption::Color => {
-            let edges = mesh_edges(args.edges, &scene)?;
-            let image = device.draw_with_edges(&mut loaded_scene, &camera(args, &scene), args.size, edges)?;
+            let style = FrameStyle { edges: mesh_edges(args.edges, &scene)?, samples: None };
+            let image = device.draw_with_style(&mut loaded_scene, &camera(args, &scene), args.size, style)?;
             info = image.info;
             image.rgba
         }

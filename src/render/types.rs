@@ -67,6 +67,9 @@ pub struct FrameParams {
     pub light_bounds: Option<OrientedBounds>,
     /// Lines along the edges of the faces. AOVs and picks ignore them.
     pub edges: Option<MeshEdges>,
+    /// Samples per pixel, 1 or 4. `None`: as the look, or the rule without a preset, chooses for the size of the frame.
+    /// AOVs and picks ignore it.
+    pub samples: Option<u32>,
 }
 
 /// RGBA8 sRGB pixels of a frame, top row first.

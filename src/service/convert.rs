@@ -22,7 +22,7 @@ mod output;
 mod vertices;
 
 pub(super) use frame_info::wire_frame_info;
-pub(super) use output::wire_format;
+pub(super) use output::{FrameUse, wire_format};
 pub(super) use vertices::{parse_vertex_selection, wire_sections};
 
 /// Limit in bytes on the remarks in one scene description.
@@ -227,13 +227,15 @@ pub(super) fn parse_pictures(
     engine: &Engine,
     scene: &Scene,
     pictures: Vec<v1::Picture>,
+    frame_use: FrameUse,
 ) -> Result<Vec<RequestedPicture>> {
     if pictures.len() > MAX_PICTURES {
         return Err(invalid("pictures", format!("at most {MAX_PICTURES} pictures"), pictures.len()));
     }
     let pictures = if pictures.is_empty() { vec![v1::Picture::default()] } else { pictures };
     let parse = |(index, picture)| {
-        parse_picture(engine, scene, picture).map_err(|error| error.in_message(&format!("pictures[{index}]")))
+        parse_picture(engine, scene, picture, frame_use)
+            .map_err(|error| error.in_message(&format!("pictures[{index}]")))
     };
     let pictures = pictures.into_iter().enumerate().map(parse).collect::<Result<Vec<_>>>()?;
     let total_pixels = count_pixels(&pictures);
@@ -252,7 +254,12 @@ pub(super) fn count_pixels(pictures: &[RequestedPicture]) -> u64 {
 }
 
 /// Validates a picture. The field of an error is relative to the picture.
-fn parse_picture(engine: &Engine, scene: &Scene, picture: v1::Picture) -> Result<RequestedPicture> {
+fn parse_picture(
+    engine: &Engine,
+    scene: &Scene,
+    picture: v1::Picture,
+    frame_use: FrameUse,
+) -> Result<RequestedPicture> {
     let (output, format) = output::parse_output(scene, &picture)?;
     let (width, height) = match (picture.width, picture.height) {
         (0, 0) => (1280, 720),
@@ -264,9 +271,9 @@ fn parse_picture(engine: &Engine, scene: &Scene, picture: v1::Picture) -> Result
         return Err(invalid("width", expected, format!("{width} x {height}")));
     }
     let size = FrameSize::new(width, height);
-    let edges = output::parse_edges(scene, output, picture.edge_width)?;
+    let style = output::parse_style(scene, output, &picture, frame_use)?;
     let camera = parse_picture_camera(scene, size, picture.camera)?;
-    Ok(RequestedPicture { spec: PictureSpec { camera, size, output, edges }, format })
+    Ok(RequestedPicture { spec: PictureSpec { camera, size, output, style }, format })
 }
 
 /// Validates the camera of a picture. An unset camera is fitted to the scene.
@@ -305,7 +312,8 @@ pub(super) fn parse_pick(engine: &Engine, scene: &Scene, request: &v1::PickReque
     let picture = request.picture.clone().unwrap_or_default();
     let size_and_camera =
         v1::Picture { width: picture.width, height: picture.height, camera: picture.camera, ..v1::Picture::default() };
-    let picture = parse_picture(engine, scene, size_and_camera).map_err(|error| error.in_message("picture"))?;
+    let picture =
+        parse_picture(engine, scene, size_and_camera, FrameUse::Still).map_err(|error| error.in_message("picture"))?;
     let PictureSpec { camera, size: picture, .. } = picture.spec;
     let size = match (request.width, request.height) {
         (0, 0) => [1, 1],
@@ -327,7 +335,9 @@ pub(super) fn wire_picture(RequestedPicture { spec, format }: &RequestedPicture)
         format: wire_format(*format).into(),
         jpeg_quality,
         camera: Some(camera::wire_camera(&spec.camera)),
-        edge_width: (spec.output == engine::FrameOutput::Color).then(|| spec.edges.map_or(0.0, |edges| edges.width)),
+        edge_width: (spec.output == engine::FrameOutput::Color)
+            .then(|| spec.style.edges.map_or(0.0, |edges| edges.width)),
+        samples: spec.style.samples.unwrap_or_default(),
         ..output::wire_output(spec.output)
     }
 }

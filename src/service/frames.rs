@@ -12,8 +12,9 @@ use v1::stream_frames_response::Part as StreamPart;
 
 use super::connection::ConnectionInfo;
 use super::convert::{
-    RequestedPicture, count_pixels, describe_step_selector, parse_moved_cameras, parse_pictures, parse_step_selector,
-    parse_stream_delivery, wire_delivery, wire_format, wire_frame_info, wire_picture, wire_stages, wire_step_id,
+    FrameUse, RequestedPicture, count_pixels, describe_step_selector, parse_moved_cameras, parse_pictures,
+    parse_step_selector, parse_stream_delivery, wire_delivery, wire_format, wire_frame_info, wire_picture, wire_stages,
+    wire_step_id,
 };
 use super::picks;
 use super::reply_body::without_copies;
@@ -46,7 +47,8 @@ impl v1::frame_service_server::FrameService for FrameServiceImpl {
         let connection = ConnectionInfo::of(&request).map_err(to_status)?;
         let request = request.into_inner();
         let scene_handle = self.engine.find_opened(&request.scene).await.map_err(to_status)?;
-        let pictures = parse_pictures(&self.engine, &scene_handle.scene, request.pictures).map_err(to_status)?;
+        let pictures =
+            parse_pictures(&self.engine, &scene_handle.scene, request.pictures, FrameUse::Still).map_err(to_status)?;
         let selector = parse_step_selector(request.step);
         let (max_chunk_bytes, encoder) = (config.chunk_bytes, self.engine.encoder().clone());
         Ok(without_copies(respond(move |reply_sender| async move {
@@ -102,7 +104,8 @@ impl v1::frame_service_server::FrameService for FrameServiceImpl {
         let connection = ConnectionInfo::of(&request).map_err(to_status)?;
         let request = request.into_inner();
         let scene_handle = self.engine.find_opened(&request.scene).await.map_err(to_status)?;
-        let pictures = parse_pictures(&self.engine, &scene_handle.scene, request.pictures).map_err(to_status)?;
+        let pictures =
+            parse_pictures(&self.engine, &scene_handle.scene, request.pictures, FrameUse::Stream).map_err(to_status)?;
         let delivery = parse_stream_delivery(request.delivery, request.max_hz).map_err(to_status)?;
         let pixels = connection.acquire_stream_pixels(count_pixels(&pictures)).map_err(to_status)?;
         // Subscribe before the response headers are sent, so that a client can rely on receiving the next step.

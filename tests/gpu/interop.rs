@@ -85,6 +85,7 @@ fn gpu_frames_of_filled_and_uploaded_buffers_are_equal() {
         bounds,
         light_bounds: None,
         edges: None,
+        samples: None,
     };
     let frame = renderer.draw(&filled_scene, &params).expect("expected a frame");
     renderer
@@ -123,6 +124,7 @@ fn gpu_frames_in_flight_keep_the_vertices_of_their_step() {
         bounds,
         light_bounds: None,
         edges: None,
+        samples: None,
     };
     let (mut frames, mut expected_images) = (std::collections::VecDeque::new(), Vec::new());
     let mut images = Vec::new();

@@ -11,7 +11,8 @@ use modalcast_model::backend_settings::{BackendSettings, RasterPolicy};
 use modalcast_model::deform::Deformer as _;
 use modalcast_model::raster::{RasterGeometry, Rasterizer};
 use modalcast_model::scene::{
-    Antialiasing, Camera, FrameSize, MeshEdges, RenderSettings, Scene, SceneParts, SceneState, ShadowSettings,
+    Antialiasing, Camera, FrameSize, FrameStyle, MeshEdges, RenderSettings, Scene, SceneParts, SceneState,
+    ShadowSettings,
 };
 use modalcast_render::{
     FrameImage, FrameParams, MAX_FRAMES_IN_FLIGHT, MappedPixels, RasterBackend, RasterBackends, VisibilityId,
@@ -91,6 +92,7 @@ fn draw_still(scene: &Arc<Scene>, state: &SceneState, backend: RasterBackend) ->
         bounds: summary.bounds,
         light_bounds: summary.oriented_bounds,
         edges: scene.look.edges,
+        samples: None,
     };
     let image = renderer.draw(&buffers, &params).expect("expected a frame");
     let triangle_of =
@@ -316,7 +318,7 @@ fn gpu_cuda_frames_in_flight_keep_their_step() {
         }
         in_flight.push_back(
             context
-                .begin_draw(&mut loaded_scene, &camera, FrameSize::new(SIZE[0], SIZE[1]), None)
+                .begin_draw(&mut loaded_scene, &camera, FrameSize::new(SIZE[0], SIZE[1]), FrameStyle::default())
                 .expect("expected the frame to start"),
         );
     }

@@ -164,7 +164,15 @@ struct FrameCounts {
 }
 
 fn frame_params(scene: &Scene, [width, height]: [u32; 2], bounds: BoundingBox) -> FrameParams {
-    FrameParams { camera: Camera::fit_to_scene(scene, 64, 64), width, height, bounds, light_bounds: None, edges: None }
+    FrameParams {
+        camera: Camera::fit_to_scene(scene, 64, 64),
+        width,
+        height,
+        bounds,
+        light_bounds: None,
+        edges: None,
+        samples: None,
+    }
 }
 
 fn open_deformer(device: &Arc<Device>, scene: &Arc<Scene>, buffers: Option<GlVertexBuffers>) -> CudaDeformer {

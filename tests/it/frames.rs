@@ -4,6 +4,7 @@
 use std::time::Duration;
 
 use modalcast::config::{Config, RendererChoice};
+use modalcast_model::load::SceneRepository;
 use modalcast_proto::v1;
 use prost::Message as _;
 use tonic::{Code, Status, Streaming};
@@ -89,6 +90,54 @@ async fn color_frame_names_its_look_and_vertices_below_ground() {
     pictures[0].output = v1::Output::Depth.into();
     let depth_head = render(&server, v1::RenderFrameRequest { pictures, ..rgba_request() }).await;
     assert_eq!(depth_head.expect("expected depth").head.look, None);
+}
+
+/// A stream of one picture, which sends its first frame after the next step.
+async fn stream_picture(server: &Server, scene: &str, picture: v1::Picture) -> Streaming<v1::StreamFramesResponse> {
+    let (scene, pictures, delivery) = (scene.into(), vec![picture], v1::Delivery::Latest.into());
+    let request = v1::StreamFramesRequest { scene, pictures, delivery, ..Default::default() };
+    with_timeout(server.frames().await.stream_frames(request)).await.expect("expected a subscription").into_inner()
+}
+
+/// Above 320 x 240 pixels, the rule draws one sample per pixel on a CPU. Single frames have four, unless the scene
+/// names a preset or the request sets the samples.
+#[tokio::test(flavor = "multi_thread")]
+async fn single_frames_are_antialiased_by_default() {
+    let folder = tempfile::tempdir().expect("expected a temporary folder");
+    let write = |name: &str, text: &str| std::fs::write(folder.path().join(name), text).expect("expected a file");
+    write("plain.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n");
+    std::fs::create_dir(folder.path().join("preview")).expect("expected a folder");
+    write("preview/plain.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n");
+    write("preview/scene.toml", "model = 'plain.obj'\nlook = 'preview'\n");
+    let state = tempfile::tempdir().expect("expected a temporary folder");
+    let config = Config { renderer: RendererChoice::Software, ..crate::service_harness::config(state.path()) };
+    let repository = SceneRepository::new(Some(folder.path())).expect("expected a repository");
+    let server = Server::start_from(config, std::sync::Arc::new(repository)).await;
+    let picture = |samples| v1::Picture { samples, ..picture_of_size(400, 300, v1::Format::Rgba).remove(0) };
+    let samples = |head: v1::FrameHead| head.look.expect("expected a look").samples;
+    for (source, single_samples) in [("plain.obj", 4), ("preview", 1)] {
+        let scene = &server.open(source).await.scene;
+        let mut writer = server.drive_lossless(scene).await;
+        let cases = [(0, single_samples, 1), (1, 1, 1), (4, 4, 4)];
+        for (number, (requested, single, streamed)) in (1..).zip(cases) {
+            let request =
+                |picture| v1::RenderFrameRequest { scene: scene.into(), pictures: vec![picture], ..Default::default() };
+            let frame = render(&server, request(picture(requested))).await.expect("expected a frame");
+            assert_eq!(samples(frame.head), single, "{scene}, {requested} requested");
+            let repeated = render(&server, request(picture(requested))).await.expect("expected a frame");
+            assert!(repeated.bytes == frame.bytes, "expected equal pictures of {scene}");
+            let mut stream = stream_picture(&server, scene, picture(requested)).await;
+            writer.send_step_and_wait(step(number, &[], &[])).await;
+            let head = next_head(&mut stream).await.expect("expected a frame");
+            assert_eq!(samples(head), streamed, "stream of {scene}, {requested} requested");
+        }
+    }
+    for (samples, output) in [(2, v1::Output::Color), (8, v1::Output::Color), (4, v1::Output::Depth)] {
+        let picture = v1::Picture { output: output.into(), format: 0, ..picture(samples) };
+        let request = v1::RenderFrameRequest { scene: "preview".into(), pictures: vec![picture], ..Default::default() };
+        let status = render(&server, request).await.err().expect("expected a rejection");
+        assert_eq!(rejection_details(&status).field, "pictures[0].samples");
+    }
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -18,6 +18,7 @@ fn texel_size(scene: &Scene, bounds: BoundingBox, light_bounds: Option<OrientedB
         bounds,
         light_bounds,
         edges: None,
+        samples: None,
     };
     shadow_texel_axes(scene, &params).expect("expected a scene with a shadow").map(|side| side.norm())
 }

@@ -8,7 +8,7 @@ use modalcast::engine::{
     Delivery, DeviceContext, FrameOutput, OutputBody, OutputSpec, PictureSpec, Pixels, StepFrames, StepOutput,
 };
 use modalcast_model::backend_settings::BackendSettings;
-use modalcast_model::scene::{Camera, FrameSize, Lens};
+use modalcast_model::scene::{Camera, FrameSize, FrameStyle, Lens};
 use modalcast_proto::v1;
 use v1::drive_scene_response::Kind as ResponseKind;
 
@@ -27,7 +27,9 @@ fn cameras(count: usize) -> Vec<Camera> {
 }
 
 fn frame_output(camera: Camera) -> OutputSpec {
-    OutputSpec::Frames([PictureSpec { camera, size: SIZE, output: FrameOutput::Color, edges: None }].into())
+    OutputSpec::Frames(
+        [PictureSpec { camera, size: SIZE, output: FrameOutput::Color, style: FrameStyle::default() }].into(),
+    )
 }
 
 /// Every step sets both coordinates of domain 1; the value of the first coordinate differs per step.
@@ -143,7 +145,12 @@ async fn frames_of_many_cameras_show_their_own_step() {
 async fn pictures_of_one_subscription_show_the_same_step() {
     let (server, cameras) = (start_server().await, cameras(5));
     let scene_handle = server.engine.find("attributes").expect("expected an open scene");
-    let color = |camera: &Camera| PictureSpec { camera: *camera, size: SIZE, output: FrameOutput::Color, edges: None };
+    let color = |camera: &Camera| PictureSpec {
+        camera: *camera,
+        size: SIZE,
+        output: FrameOutput::Color,
+        style: FrameStyle::default(),
+    };
     let depth = PictureSpec { output: FrameOutput::Depth, ..color(&cameras[0]) };
     let pictures = cameras.iter().map(color).chain([depth]).collect();
     let subscribe =

@@ -39,6 +39,8 @@ def test_color_maps_have_parameters(beams: mc.Scene):
     assert beams.frame(outputs="depth", **SIZE).depth.shape == (90, 160)
     edges = beams.frame(outputs=mc.Output("color", edge_width=2.0), **SIZE)
     assert not np.array_equal(edges.array, beams.frame(**SIZE).array)
+    jagged = beams.frame(outputs=mc.Output("color", samples=1), **SIZE)
+    assert [frame.images["color"].head.look.samples for frame in (jagged, beams.frame(**SIZE))] == [1, 4]
 
 
 def test_png_files_have_the_pixels_of_the_array(beams: mc.Scene, tmp_path: Path):

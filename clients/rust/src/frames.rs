@@ -121,6 +121,9 @@ pub struct Picture {
     /// For [`Output::Color`]: width in pixels of lines along the edges of the faces, at most 32; 0 for none. `None`: as
     /// the scene's `look.edges`.
     pub edge_width: Option<f32>,
+    /// For [`Output::Color`]: samples per pixel, 1 or 4. 0: as the scene sets them; without a setting, a single frame
+    /// has 4, and the server chooses for a stream ([`FrameLook::samples`]).
+    pub samples: u32,
 }
 
 impl Picture {
@@ -135,6 +138,13 @@ impl Picture {
     #[must_use]
     pub const fn edge_width(mut self, pixels: f32) -> Self {
         self.edge_width = Some(pixels);
+        self
+    }
+
+    /// Sets the samples per pixel, 1 or 4; 0 for the default.
+    #[must_use]
+    pub const fn samples(mut self, samples: u32) -> Self {
+        self.samples = samples;
         self
     }
 
@@ -470,6 +480,7 @@ impl From<Picture> for v1::Picture {
             largest: scale_max,
             jpeg_quality: if format == v1::Format::Jpeg { picture.jpeg_quality } else { 0 },
             edge_width: picture.edge_width,
+            samples: picture.samples,
         }
     }
 }

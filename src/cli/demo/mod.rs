@@ -119,6 +119,11 @@ fn run_processes(args: &Args, input: &DemoScene, temporary_folder: &std::path::P
     let mut flags =
         vec!["frames", "--open", input.location.source.as_str(), "--count", &frame_count, "--size", &size, "--json"];
     flags.extend(["--delivery", "lossless", "--out", &out]);
+    // The frames are saved and looked at as still pictures.
+    let samples = input.scene.look.still_samples().map(|samples| samples.to_string());
+    if let Some(samples) = &samples {
+        flags.extend(["--samples", samples]);
+    }
     let mut frame_client =
         Process::start("fetch", &program_path("modalcast-fetch")?, &[&flags[..], &common_flags].concat())?;
     frame_client.wait_for("ready", deadline)?;

@@ -10,7 +10,7 @@ use crate::frame::Legend;
 use modalcast_model::backend_settings::BackendSettings;
 use modalcast_model::deform::{DeformSummary, DeformedSurface, VertexAttributes};
 use modalcast_model::error::{Error, Result};
-use modalcast_model::scene::{Camera, FrameSize, MeshEdges, PixelRect, Scene, SceneState};
+use modalcast_model::scene::{Camera, FrameSize, FrameStyle, PixelRect, Scene, SceneState};
 use modalcast_render::{AovImage, FrameImage, FramePixels, PickHit};
 
 /// Identifies a loaded scene on the device thread.
@@ -56,7 +56,7 @@ pub(in crate::engine) enum Command {
         id: SceneId,
         camera: Camera,
         size: FrameSize,
-        edges: Option<MeshEdges>,
+        style: FrameStyle,
         content: PictureContent,
         reply: Reply<FrameImage<FramePixels>>,
     },

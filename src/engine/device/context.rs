@@ -19,7 +19,7 @@ use modalcast_model::deform::{Backend, Deformer};
 use modalcast_model::error::{Error, Result, fault};
 use modalcast_model::fault_injection;
 use modalcast_model::raster::{RasterGeometry, Rasterizer};
-use modalcast_model::scene::{Camera, FrameSize, MeshEdges, PixelRect, Scene};
+use modalcast_model::scene::{Camera, FrameSize, FrameStyle, PixelRect, Scene};
 use modalcast_model::shared_memory::PictureMemory;
 use modalcast_render::{
     Aov, AovImage, DevicePreference, FrameImage, FrameParams, MappedPixels, PartialAov, PartialFrame, PendingFrame,
@@ -366,22 +366,23 @@ impl DeviceContext {
     /// # Errors
     /// `Unavailable` without a renderer, `Invalid` for an invalid camera or size, `Fault` of OpenGL.
     pub fn draw(&mut self, loaded_scene: &mut LoadedScene, camera: &Camera, size: FrameSize) -> Result<FrameImage> {
-        let pending_draw = self.begin_draw(loaded_scene, camera, size, loaded_scene.scene().look.edges)?;
+        let style = FrameStyle { edges: loaded_scene.scene().look.edges, samples: None };
+        let pending_draw = self.begin_draw(loaded_scene, camera, size, style)?;
         self.finish_draw(pending_draw).map(MappedPixels::into_image)
     }
 
-    /// As [`Self::draw`], with lines along mesh edges as `edges` states, instead of those of the scene's settings.
+    /// As [`Self::draw`], with this style instead of that of the scene's settings.
     ///
     /// # Errors
     /// As [`Self::draw`].
-    pub fn draw_with_edges(
+    pub fn draw_with_style(
         &mut self,
         loaded_scene: &mut LoadedScene,
         camera: &Camera,
         size: FrameSize,
-        edges: Option<MeshEdges>,
+        style: FrameStyle,
     ) -> Result<FrameImage> {
-        let pending_draw = self.begin_draw(loaded_scene, camera, size, edges)?;
+        let pending_draw = self.begin_draw(loaded_scene, camera, size, style)?;
         self.finish_draw(pending_draw).map(MappedPixels::into_image)
     }
 
@@ -395,9 +396,9 @@ impl DeviceContext {
         loaded_scene: &mut LoadedScene,
         camera: &Camera,
         size: FrameSize,
-        edges: Option<MeshEdges>,
+        style: FrameStyle,
     ) -> Result<PendingDraw> {
-        let mut partial_draw = self.begin_partial_draw(loaded_scene, camera, size, edges)?;
+        let mut partial_draw = self.begin_partial_draw(loaded_scene, camera, size, style)?;
         while !partial_draw.frame.is_submitted() {
             self.submit_draw_step(loaded_scene, &mut partial_draw)?;
         }
@@ -414,14 +415,14 @@ impl DeviceContext {
         loaded_scene: &mut LoadedScene,
         camera: &Camera,
         size: FrameSize,
-        edges: Option<MeshEdges>,
+        style: FrameStyle,
     ) -> Result<PartialDraw> {
         let camera = camera.validated()?;
         let renderer = self.renderer.as_mut().map_err(|error| error.clone())?;
         let upload_begin = Instant::now();
         let contents = loaded_scene.fill_buffers(renderer, &camera)?;
         let upload_ms = contents.is_uploaded.then(|| ms_since(upload_begin));
-        let params = FrameParams { edges, ..contents.frame_params(camera, size) };
+        let params = FrameParams { edges: style.edges, samples: style.samples, ..contents.frame_params(camera, size) };
         let has_readback = true;
         let frame = renderer.begin_frame(loaded_scene.buffers()?, &params, has_readback)?;
         loaded_scene.log_frame(frame.info());
@@ -463,10 +464,10 @@ impl DeviceContext {
         &mut self,
         buffers: &SceneBuffers,
         size: FrameSize,
-        has_edges: bool,
+        style: FrameStyle,
     ) -> Option<ScenePreparation> {
         let renderer = self.renderer.as_mut().ok()?;
-        let preparation = renderer.begin_frame_preparation(buffers, [size.width, size.height], has_edges).ok()?;
+        let preparation = renderer.begin_frame_preparation(buffers, [size.width, size.height], style).ok()?;
         (!preparation.is_finished()).then_some(preparation)
     }
 

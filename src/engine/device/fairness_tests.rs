@@ -17,7 +17,7 @@ use crate::engine::output::step_output::{FrameOutput, PictureContent};
 use crate::engine::testing;
 use modalcast_model::backend_settings::BackendSettings;
 use modalcast_model::error::{Error, Result};
-use modalcast_model::scene::{Camera, FrameSize, Scene, SceneState};
+use modalcast_model::scene::{Camera, FrameSize, FrameStyle, Scene, SceneState};
 use modalcast_render::{FrameImage, FramePixels};
 
 const LARGE: FrameSize = FrameSize::new(192, 512);
@@ -82,7 +82,7 @@ impl Fixture {
 
     fn draw(&self, id: SceneId, size: FrameSize) -> PendingReply<FrameImage<FramePixels>> {
         let camera = Camera::fit_to_scene(&self.scene, size.width, size.height);
-        self.handle.begin_draw(id, camera, size, None, PictureContent::PIXELS)
+        self.handle.begin_draw(id, camera, size, FrameStyle::default(), PictureContent::PIXELS)
     }
 
     /// Runs `count` commands or draw steps.

@@ -19,7 +19,7 @@ use crate::frame::Legend;
 use modalcast_model::backend_settings::BackendSettings;
 use modalcast_model::deform::{DeformSummary, VertexAttributes};
 use modalcast_model::error::{Error, Result, fault, fault_in};
-use modalcast_model::scene::{Camera, FrameSize, MeshEdges, PixelRect, Scene, SceneState};
+use modalcast_model::scene::{Camera, FrameSize, FrameStyle, PixelRect, Scene, SceneState};
 use modalcast_render::{AovImage, FrameImage, FramePixels, PickHit};
 
 /// Sends commands to the device thread. The thread ends when the last clone is dropped.
@@ -155,10 +155,10 @@ impl DeviceHandle {
         id: SceneId,
         camera: Camera,
         size: FrameSize,
-        edges: Option<MeshEdges>,
+        style: FrameStyle,
         content: PictureContent,
     ) -> PendingReply<FrameImage<FramePixels>> {
-        self.submit(|reply| Command::Draw { id, camera, size, edges, content, reply })
+        self.submit(|reply| Command::Draw { id, camera, size, style, content, reply })
     }
 
     pub(in crate::engine) async fn render_aov(

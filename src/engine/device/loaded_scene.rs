@@ -41,7 +41,15 @@ impl BufferContents {
     /// The parameters of a frame of these buffers.
     pub(in crate::engine) const fn frame_params(&self, camera: Camera, size: FrameSize) -> FrameParams {
         let FrameSize { width, height } = size;
-        FrameParams { camera, width, height, bounds: self.bounds, light_bounds: self.light_bounds, edges: None }
+        FrameParams {
+            camera,
+            width,
+            height,
+            bounds: self.bounds,
+            light_bounds: self.light_bounds,
+            edges: None,
+            samples: None,
+        }
     }
 }
 

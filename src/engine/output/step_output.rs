@@ -7,7 +7,7 @@ use super::rendered_picture::RenderedPicture;
 use super::step_vertices::StepVertices;
 use crate::telemetry::StageTimes;
 use modalcast_model::deform::VertexAttributes;
-use modalcast_model::scene::{Camera, FloatingOrigins, FrameSize, MeshEdges, PixelRect, SceneState};
+use modalcast_model::scene::{Camera, FloatingOrigins, FrameSize, FrameStyle, PixelRect, SceneState};
 use modalcast_render::PickHit;
 
 /// The output that a client requests of a step.
@@ -33,8 +33,8 @@ pub struct PictureSpec {
     pub camera: Camera,
     pub size: FrameSize,
     pub output: FrameOutput,
-    /// Lines along mesh edges of [`FrameOutput::Color`]; ignored for other outputs.
-    pub edges: Option<MeshEdges>,
+    /// Ignored for outputs other than [`FrameOutput::Color`].
+    pub style: FrameStyle,
 }
 
 /// The forms in which the readers of a color picture want it.

@@ -147,11 +147,16 @@ mod tests {
     use super::*;
     use crate::engine::output::step_output::FrameOutput;
     use crate::engine::testing;
-    use modalcast_model::scene::FrameSize;
+    use modalcast_model::scene::{FrameSize, FrameStyle};
 
     fn camera_control() -> CameraControl {
         let camera = Camera::fit_to_scene(&testing::two_strips(), 8, 8);
-        let picture = PictureSpec { camera, size: FrameSize::new(8, 8), output: FrameOutput::Color, edges: None };
+        let picture = PictureSpec {
+            camera,
+            size: FrameSize::new(8, 8),
+            output: FrameOutput::Color,
+            style: FrameStyle::default(),
+        };
         CameraControl::new([picture; 2].into(), Arc::default())
     }
 

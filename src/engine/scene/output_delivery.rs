@@ -220,7 +220,8 @@ mod tests {
     use crate::engine::device::command::{Command, Reply};
     use crate::engine::output::step_output::{FrameOutput, OutputBody, OutputSpec, PictureSpec, StepOutput};
     use crate::engine::testing;
-    use modalcast_model::scene::{Camera, FrameSize, SceneState};
+    use crate::hang_guard::HANG_GUARD;
+    use modalcast_model::scene::{Camera, FrameSize, FrameStyle, SceneState};
     use modalcast_render::{FrameImage, FrameInfo, FramePixels};
 
     const WITHOUT_NEXT_STEP: DeliveryMode = DeliveryMode { applies_back_pressure: false, overlaps_next_step: false };
@@ -258,17 +259,25 @@ mod tests {
         let camera = Camera::fit_to_scene(&testing::two_strips(), width, 8);
         Subscription::new(
             OutputSpec::Frames(
-                [PictureSpec { camera, size: FrameSize::new(width, 8), output: FrameOutput::Color, edges: None }]
-                    .into(),
+                [PictureSpec {
+                    camera,
+                    size: FrameSize::new(width, 8),
+                    output: FrameOutput::Color,
+                    style: FrameStyle::default(),
+                }]
+                .into(),
             ),
             delivery.into(),
             Arc::default(),
         )
     }
 
-    /// Returns the next frame that is requested from the device within `ms` milliseconds.
-    async fn next_draw_request(device: &mut mpsc::Receiver<Command>, ms: u64) -> Option<DrawRequest> {
-        match timeout(Duration::from_millis(ms), device.recv()).await.ok()?? {
+    /// Wait for a request that must not arrive.
+    const SHORT_WAIT: Duration = Duration::from_millis(500);
+
+    /// Returns the next frame that is requested from the device within `limit`.
+    async fn next_draw_request(device: &mut mpsc::Receiver<Command>, limit: Duration) -> Option<DrawRequest> {
+        match timeout(limit, device.recv()).await.ok()?? {
             Command::Draw { size, reply, .. } => Some(DrawRequest { width: size.width, reply }),
             _ => None,
         }
@@ -303,25 +312,27 @@ mod tests {
         timeout(Duration::ZERO, slow_subscription.next()).await.expect_err("expected no frame yet");
         let (mut delivery, mut device) = delivery_to(vec![slow_subscriber]);
         delivery.serve_subscribers(&current_step(1), WITH_NEXT_STEP).await;
-        // The request must arrive, so the timeout is long. The timeouts below are short, because no request may arrive.
-        let first_request = next_draw_request(&mut device, 10_000).await.expect("expected the first frame");
+        let first_request = next_draw_request(&mut device, HANG_GUARD).await.expect("expected the first frame");
         delivery.subscribers.push(fast_subscriber);
         let second_step = current_step(2);
         let deliver = async {
             delivery.serve_subscribers(&second_step, WITHOUT_NEXT_STEP).await;
             delivery.flush().await;
         };
+        let mut early_frame_width = None;
         let draw = async {
-            let early_request = next_draw_request(&mut device, 500).await;
-            let early_frame_width = early_request.as_ref().map(|request| request.width);
+            let early_request = next_draw_request(&mut device, SHORT_WAIT).await;
+            early_frame_width = early_request.as_ref().map(|request| request.width);
             answer(first_request);
             early_request.into_iter().for_each(answer);
-            while let Some(request) = next_draw_request(&mut device, 500).await {
+            while let Some(request) = next_draw_request(&mut device, HANG_GUARD).await {
                 answer(request);
             }
-            early_frame_width
         };
-        let ((), early_frame_width) = tokio::join!(deliver, draw);
+        tokio::select! {
+            () = deliver => {}
+            () = draw => panic!("expected the delivery of all frames"),
+        }
         let mut received = Vec::new();
         for subscription in [&mut slow_subscription, &mut fast_subscription] {
             while let Ok(Ok(StepOutput { step, body: OutputBody::Frames(frames), .. })) =
@@ -366,18 +377,20 @@ mod tests {
             delivery.serve_subscribers(&step, mode).await;
             delivery.flush().await;
         };
+        let mut drawn_count = 0;
         let draw = async {
-            let mut drawn_count = 0;
-            while let Some(request) = next_draw_request(&mut device, 500).await {
+            while let Some(request) = next_draw_request(&mut device, HANG_GUARD).await {
                 answer(request);
                 drawn_count += 1;
             }
-            drawn_count
         };
-        let ((), drawn_count) = tokio::join!(deliver, draw);
+        tokio::select! {
+            () = deliver => {}
+            () = draw => panic!("expected the delivery of all frames"),
+        }
         let mut received_widths = Vec::new();
         for mut subscription in subscriptions {
-            let output = timeout(Duration::from_secs(10), subscription.next()).await.expect("expected a frame in time");
+            let output = timeout(HANG_GUARD, subscription.next()).await.expect("expected a frame");
             let Ok(StepOutput { body: OutputBody::Frames(frames), .. }) = output else { panic!("expected frames") };
             received_widths.push(frames.pictures[0].width);
         }
@@ -395,7 +408,7 @@ mod tests {
             for (camera_version, is_drawn) in [(0, true), (3, is_redrawn)] {
                 while camera_version > 0 && cameras.move_cameras(&[]) < camera_version {}
                 delivery.serve_subscribers(&step, mode).await;
-                let request = next_draw_request(&mut device, if is_drawn { 10_000 } else { 100 }).await;
+                let request = next_draw_request(&mut device, if is_drawn { HANG_GUARD } else { SHORT_WAIT }).await;
                 assert_eq!(request.is_some(), is_drawn, "{mode:?}, version {camera_version}");
                 let Some(request) = request else { continue };
                 answer(request);
@@ -416,13 +429,13 @@ mod tests {
         delivery.add_request(StepRequest { selector: StepSelector::Current, spec: subscriber.spec, reply });
         let step = current_step(1);
         let cancel = async {
-            let mut request = next_draw_request(&mut device, 10_000).await.expect("expected a frame");
+            let mut request = next_draw_request(&mut device, HANG_GUARD).await.expect("expected a frame");
             assert!(!request.reply.is_closed(), "expected a caller that waits");
             drop(answer);
             request.reply.closed().await;
         };
         let both = async { tokio::join!(delivery.answer_requests(&step, 1), cancel) };
-        timeout(Duration::from_secs(10), both).await.expect("expected the cancellation in time");
+        timeout(HANG_GUARD, both).await.expect("expected the cancellation");
     }
 
     /// The frame of the second subscriber is cancelled while the first one is being drawn.
@@ -433,15 +446,16 @@ mod tests {
         let (mut delivery, mut device) = delivery_to(vec![first_subscriber, second_subscriber]);
         delivery.serve_subscribers(&current_step(1), WITHOUT_NEXT_STEP).await;
         let cancel = async {
-            let first_request = next_draw_request(&mut device, 10_000).await.expect("expected the first frame");
-            let mut second_request = next_draw_request(&mut device, 10_000).await.expect("expected the second frame");
+            let first_request = next_draw_request(&mut device, HANG_GUARD).await.expect("expected the first frame");
+            let mut second_request =
+                next_draw_request(&mut device, HANG_GUARD).await.expect("expected the second frame");
             assert!(!second_request.reply.is_closed(), "expected a subscriber that waits");
             drop(second_subscription);
             second_request.reply.closed().await;
             answer(first_request);
         };
         let both = async { tokio::join!(delivery.flush(), cancel) };
-        timeout(Duration::from_secs(10), both).await.expect("expected the cancellation in time");
+        timeout(HANG_GUARD, both).await.expect("expected the cancellation");
         first_subscription.next().await.expect("expected the frame of the first subscriber");
         assert_eq!(delivery.subscribers.len(), 1);
     }

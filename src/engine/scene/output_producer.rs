@@ -166,7 +166,7 @@ impl OutputProducer {
                 round.drawn_pictures.extend(oldest.deliver().await);
             }
             let content = round.content;
-            let reply = self.device.begin_draw(self.scene_on_device.id, spec.camera, spec.size, spec.edges, content);
+            let reply = self.device.begin_draw(self.scene_on_device.id, spec.camera, spec.size, spec.style, content);
             let pending = PendingReadback::of_picture(round.current, *spec, content, reply, recipient);
             round.started_pictures.push_back(pending);
             return;
@@ -255,10 +255,10 @@ impl OutputProducer {
 
     /// Draws a picture of the current step.
     async fn draw(&self, picture: &PictureSpec) -> Result<RenderedPicture> {
-        let (id, PictureSpec { camera, size, output, edges }) = (self.scene_on_device.id, *picture);
+        let (id, PictureSpec { camera, size, output, style }) = (self.scene_on_device.id, *picture);
         if output == FrameOutput::Color {
             let content = PictureContent::PIXELS;
-            return self.device.begin_draw(id, camera, size, edges, content).wait().await.map(RenderedPicture::from);
+            return self.device.begin_draw(id, camera, size, style, content).wait().await.map(RenderedPicture::from);
         }
         let (image, legend) = self.device.render_aov(id, camera, size, output).await?;
         Ok(RenderedPicture::from_aov(image, legend))

@@ -81,6 +81,7 @@ pub struct ArrayUpload {
     ranks: Vec<u32>,
     /// Per domain so far, the crease angle of its mesh.
     crease_angles: Vec<CreaseAngle>,
+    /// Names of the domains so far.
     names: HashSet<String>,
     /// Sum of the sizes of the arrays of all domains so far, in bytes.
     declared_bytes: u64,

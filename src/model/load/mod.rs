@@ -158,7 +158,7 @@ mod tests {
         let (software, hardware) = (RendererKind::Software, RendererKind::Hardware);
         for (manifest, samples) in [("", 4), ("look.samples = 1\n", 1)] {
             let still = look_of(manifest, None);
-            assert_eq!(still.frame_antialiasing(software, 1 << 20, 1 << 20).samples, samples, "{manifest}");
+            assert_eq!(still.frame_antialiasing(software, 1 << 20, 1 << 20, None).samples, samples, "{manifest}");
             let shadow = still.with_shadow_map_for(software).shadow;
             assert_eq!(shadow, by_rule.with_shadow_map_for(hardware).shadow, "{manifest}");
             assert_ne!(shadow, by_rule.with_shadow_map_for(software).shadow, "control: the rule differs on a CPU");

@@ -14,6 +14,9 @@
 //! | hardware | of `standard` | variance, 1024², blur 1.5 |
 //! | software (OpenGL on the CPU) | of `standard` if the frame has at most 320 x 240 pixels and the scene at most 16,384 triangles, else of `preview` | of `preview` |
 //!
+//! A still picture is drawn with the antialiasing of `standard` on every renderer ([`RenderSettings::still_samples`]):
+//! it is looked at for longer than a frame of a stream, and no rate depends on its time.
+//!
 //! The shadow map of the rule is the fastest one with a light error that cannot be seen (hardware) or is hard to see
 //! (software), as measured by `modalcast report render`. It does not depend on the number of pixels, because all frames
 //! of a step share it. A part of the look that the scene sets itself ([`LookOverrides`]) is never changed.
@@ -143,7 +146,7 @@ impl RenderSettings {
     #[must_use]
     pub fn with_preset(self, request: PresetRequest) -> Self {
         let open = Self { preset: Some(request), ..self };
-        let FrameAntialiasing { method, samples } = open.frame_antialiasing(RendererKind::Hardware, 0, 0);
+        let FrameAntialiasing { method, samples } = open.look_antialiasing(RendererKind::Hardware, 0, 0);
         // The given number of samples is kept, so that validation rejects it if it is invalid.
         let samples = request.overrides.samples.unwrap_or(samples);
         Self { antialias: method, samples, ..open.with_shadow_map_for(RendererKind::Hardware) }
@@ -163,8 +166,35 @@ impl RenderSettings {
         Self { shadow, ..self }
     }
 
-    /// The antialiasing of a frame of `pixels` pixels that shows a scene of `triangles` triangles.
-    pub fn frame_antialiasing(&self, renderer: RendererKind, triangles: usize, pixels: u64) -> FrameAntialiasing {
+    /// The samples per pixel that a still picture sets for itself: those of `standard` where the rule would choose, and
+    /// none where a preset or the scene has chosen.
+    pub fn still_samples(&self) -> Option<u32> {
+        let is_open = |request: PresetRequest| {
+            request.preset.is_none() && request.overrides.antialias.is_none() && request.overrides.samples.is_none()
+        };
+        self.preset.is_some_and(is_open).then_some(MULTISAMPLES)
+    }
+
+    /// The antialiasing of a frame of `pixels` pixels that shows a scene of `triangles` triangles. `samples`: samples
+    /// per pixel that the frame sets for itself.
+    pub fn frame_antialiasing(
+        &self,
+        renderer: RendererKind,
+        triangles: usize,
+        pixels: u64,
+        samples: Option<u32>,
+    ) -> FrameAntialiasing {
+        let of_look = self.look_antialiasing(renderer, triangles, pixels);
+        match samples {
+            None => of_look,
+            Some(1) if of_look.samples == 1 => of_look,
+            Some(1) => FrameAntialiasing { method: Antialiasing::None, samples: 1 },
+            Some(samples) => FrameAntialiasing { method: Antialiasing::Msaa, samples },
+        }
+    }
+
+    /// The antialiasing of a frame that sets no samples for itself.
+    fn look_antialiasing(&self, renderer: RendererKind, triangles: usize, pixels: u64) -> FrameAntialiasing {
         let Some(PresetRequest { preset, overrides }) = self.preset else {
             return FrameAntialiasing { method: self.antialias, samples: self.samples_per_pixel() };
         };
@@ -200,7 +230,7 @@ mod tests {
     #[test]
     fn rule_depends_on_renderer_pixels_and_triangles() {
         let look = request(None, LookOverrides::default());
-        let samples = |renderer, triangles, pixels| look.frame_antialiasing(renderer, triangles, pixels).samples;
+        let samples = |renderer, triangles, pixels| look.frame_antialiasing(renderer, triangles, pixels, None).samples;
         for (triangles, pixels) in [(1, 1), (1 << 24, 8192 * 8192)] {
             assert_eq!(samples(RendererKind::Hardware, triangles, pixels), 4);
         }
@@ -208,10 +238,36 @@ mod tests {
         let (small, few) = (SOFTWARE_STANDARD_PIXELS, SOFTWARE_STANDARD_TRIANGLES);
         assert_eq!([software(few, small), software(few, small + 1), software(few + 1, small)], [4, 1, 1]);
         assert_eq!(software(usize::MAX, u64::MAX), 1);
-        assert_eq!(look.frame_antialiasing(RendererKind::Software, 1, HD).method, Antialiasing::None);
+        assert_eq!(look.frame_antialiasing(RendererKind::Software, 1, HD, None).method, Antialiasing::None);
         let [hardware, software] = [RendererKind::Hardware, RendererKind::Software].map(|kind| map(look, kind));
         assert_ne!(hardware, software);
         assert!(hardware.1 > software.1, "expected a smaller map in software");
+    }
+
+    #[test]
+    fn still_pictures_have_four_samples_where_the_rule_would_choose() {
+        let samples_of = |look: RenderSettings, samples| {
+            look.frame_antialiasing(RendererKind::Software, usize::MAX, u64::MAX, samples)
+        };
+        let by_rule = request(None, LookOverrides::default());
+        assert_eq!((by_rule.still_samples(), samples_of(by_rule, None).samples), (Some(4), 1));
+        let standard = request(Some(LookPreset::Standard), LookOverrides::default());
+        assert_eq!(samples_of(by_rule, by_rule.still_samples()), samples_of(standard, None));
+        let fxaa = LookOverrides { antialias: Some(Antialiasing::Fxaa), ..LookOverrides::default() };
+        let one_sample = LookOverrides { samples: Some(1), ..LookOverrides::default() };
+        for look in [
+            standard,
+            request(Some(LookPreset::Preview), LookOverrides::default()),
+            request(None, fxaa),
+            request(None, one_sample),
+            RenderSettings::default(),
+        ] {
+            assert_eq!(look.still_samples(), None, "{look:?}");
+        }
+        // One sample keeps a method that needs no more.
+        assert_eq!(samples_of(request(None, fxaa), Some(1)).method, Antialiasing::Fxaa);
+        assert_eq!(samples_of(standard, Some(1)), FrameAntialiasing { method: Antialiasing::None, samples: 1 });
+        assert_eq!(samples_of(request(None, fxaa), Some(4)).method, Antialiasing::Msaa);
     }
 
     #[test]
@@ -219,7 +275,7 @@ mod tests {
         for preset in LookPreset::ALL {
             let look = request(Some(preset), LookOverrides::default());
             let [hardware, software] = [RendererKind::Hardware, RendererKind::Software].map(|renderer| {
-                (look.with_shadow_map_for(renderer), look.frame_antialiasing(renderer, 1 << 24, 8192 * 8192))
+                (look.with_shadow_map_for(renderer), look.frame_antialiasing(renderer, 1 << 24, 8192 * 8192, None))
             });
             assert_eq!(hardware, software, "{preset:?}");
             assert_eq!(preset.name().parse(), Ok(preset));
@@ -235,7 +291,7 @@ mod tests {
             for renderer in [RendererKind::Hardware, RendererKind::Software] {
                 let antialiasing = |antialias, samples| {
                     let overrides = LookOverrides { antialias, samples, ..LookOverrides::default() };
-                    request(preset, overrides).frame_antialiasing(renderer, 1 << 24, HD)
+                    request(preset, overrides).frame_antialiasing(renderer, 1 << 24, HD, None)
                 };
                 let expected = |method, samples| FrameAntialiasing { method, samples };
                 assert_eq!(antialiasing(None, Some(4)), expected(Antialiasing::Msaa, 4), "{preset:?}");
@@ -261,7 +317,7 @@ mod tests {
         let shadow = Some(ShadowSettings { size: 77, ..ShadowSettings::default() });
         let look = RenderSettings { samples: 1, shadow, ..RenderSettings::default() };
         assert_eq!(look.with_shadow_map_for(RendererKind::Software), look);
-        assert_eq!(look.frame_antialiasing(RendererKind::Hardware, 1, 1).samples, 1);
+        assert_eq!(look.frame_antialiasing(RendererKind::Hardware, 1, 1, None).samples, 1);
         // A preset does not add the shadow that a scene has removed.
         let without_shadow = RenderSettings { shadow: None, ..look }.with_preset(PresetRequest::default());
         assert_eq!(without_shadow.with_shadow_map_for(RendererKind::Hardware).shadow, None);

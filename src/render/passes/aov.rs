@@ -206,7 +206,7 @@ impl AovReader {
         reserve: impl FnOnce(TargetDesc, u64) -> Result<Arc<MemoryReservation>>,
     ) -> Result<PartialAov> {
         let size = [params.width, params.height];
-        let samples = if matches!(field, Aov::Values { .. }) { buffers.antialiasing(size).samples } else { 1 };
+        let samples = if matches!(field, Aov::Values { .. }) { buffers.antialiasing(size, None).samples } else { 1 };
         let desc = TargetDesc::ids_and_depth(&self.gl, size, samples);
         let words_per_pixel = if field == Aov::Normals { 3 } else { u64::from(desc.samples) };
         let uniforms = FrameUniforms::new(&buffers.scene, &buffers.look, params, buffers.origin)?;

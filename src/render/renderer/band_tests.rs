@@ -5,6 +5,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use super::Renderer;
+use crate::hang_guard::HANG_GUARD;
 use crate::pass::Pass;
 use crate::scene_data::geometry::tests::squares;
 use crate::{Aov, DevicePreference, FrameImage, FrameParams, FrameStats, SceneBuffers};
@@ -63,7 +64,7 @@ impl RandomScene {
         let view = View::LookAt { eye: [1.5, 2.0, 8.0], target: [0.0; 3], up: [0.0, 1.0, 0.0] };
         // Near and far 0: the planes are fitted to the bounds.
         let camera = Camera { view, lens: Lens::FieldOfView(45.0), near: 0.0, far: 0.0 };
-        FrameParams { camera, width, height, bounds: self.bounds, light_bounds: None, edges: None }
+        FrameParams { camera, width, height, bounds: self.bounds, light_bounds: None, edges: None, samples: None }
     }
 }
 
@@ -107,7 +108,7 @@ fn draw_in_steps(
     assert!(partial_frame.is_divided());
     let mut step_count = 0;
     while !partial_frame.is_submitted() {
-        assert!(partial_frame.is_ready_within(Duration::from_secs(60)));
+        assert!(partial_frame.is_ready_within(HANG_GUARD));
         renderer.submit_step(&random_scene.buffers, &mut partial_frame).expect("submits");
         step_count += 1;
         // The same size as the frame, and another one.

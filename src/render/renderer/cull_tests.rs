@@ -72,8 +72,15 @@ fn draw_second_frame(scene: &Arc<Scene>, (original, replacement): (&str, &str)) 
     let lens = Lens::Intrinsics { fx: 90.0, fy: 90.0, cx: 32.0, cy: 32.0 };
     // Near and far 0: the planes are fitted to the bounds.
     let camera = Camera { view, lens, near: 0.0, far: 0.0 };
-    let params =
-        FrameParams { camera, width: 64, height: 64, bounds: scene.rest_bounds, light_bounds: None, edges: None };
+    let params = FrameParams {
+        camera,
+        width: 64,
+        height: 64,
+        bounds: scene.rest_bounds,
+        light_bounds: None,
+        edges: None,
+        samples: None,
+    };
     renderer.draw(&buffers, &params).expect("draws");
     let image = renderer.draw(&buffers, &params).expect("draws").rgba;
     assert!(renderer.stats().culled.is_some_and(|culled| culled.camera.culled() > 0));

@@ -216,7 +216,7 @@ impl Renderer {
 
     /// Whether an output of this size is divided into bands.
     pub fn is_divided(&self, scene: &Scene, size: [u32; 2]) -> bool {
-        let samples = antialiasing(scene, self.gl.limits.renderer_kind(), size).samples;
+        let samples = antialiasing(scene, self.gl.limits.renderer_kind(), size, None).samples;
         self.exceeds_band_limit(size, TargetDesc::ids_and_depth(&self.gl, size, samples).samples)
     }
 

@@ -44,7 +44,10 @@ fn draw_glass(transparency: Transparency, alpha_mode: AlphaMode, post_depth_cove
     renderer.upload(&buffers, &surface).expect("uploads");
     let camera = Camera::fit_to_scene(&scene, 64, 64);
     let image = renderer
-        .draw(&buffers, &FrameParams { camera, width: 64, height: 64, bounds, light_bounds: None, edges: None })
+        .draw(
+            &buffers,
+            &FrameParams { camera, width: 64, height: 64, bounds, light_bounds: None, edges: None, samples: None },
+        )
         .expect("draws");
     (image.rgba, renderer)
 }

@@ -143,7 +143,7 @@ impl Renderer {
         self.check_size(params)?;
         let uniforms = FrameUniforms::new(&buffers.scene, &buffers.look, params, buffers.origin)?;
         let size = [params.width, params.height];
-        let antialiasing = buffers.antialiasing(size);
+        let antialiasing = buffers.antialiasing(size, params.samples);
         let blend_storage = blend_storage(&self.gl, &buffers.scene, size)?;
         let desc = TargetDesc::new(&self.gl, size, &buffers.look, antialiasing.samples, blend_storage);
         let desc = TargetDesc { culling: buffers.culling(), ..desc };

@@ -12,7 +12,7 @@ use crate::resources::target_desc::TargetDesc;
 use crate::resources::texture_arrays::TextureUpload;
 use crate::shaders::ProgramSource;
 use modalcast_model::error::Result;
-use modalcast_model::scene::{FrameAntialiasing, Scene};
+use modalcast_model::scene::{FrameAntialiasing, FrameStyle, Scene};
 
 /// Textures and programs of a scene that are not on the device yet. A step uploads a layer of a texture array, or
 /// compiles a program. If threads of the driver compile programs, a step only begins or ends a compilation.
@@ -72,8 +72,8 @@ impl Renderer {
         Ok(self.preparation_of(scene, Some(textures), sources))
     }
 
-    /// Begins to compile the programs of a frame of this size that are not compiled yet. Those are programs for mesh
-    /// edges, or for another number of samples per pixel than most frames have.
+    /// Begins to compile the programs of a frame of this size and style that are not compiled yet. Those are programs
+    /// for mesh edges, or for another number of samples per pixel than most frames have.
     ///
     /// # Errors
     /// `Fault` of OpenGL.
@@ -81,11 +81,12 @@ impl Renderer {
         &mut self,
         buffers: &SceneBuffers,
         size: [u32; 2],
-        has_edges: bool,
+        style: FrameStyle,
     ) -> Result<ScenePreparation> {
         let _current = self.gl.make_current()?;
         let mut sources = Vec::new();
-        let FrameAntialiasing { method, samples } = buffers.antialiasing(size);
+        let has_edges = style.edges.is_some();
+        let FrameAntialiasing { method, samples } = buffers.antialiasing(size, style.samples);
         // Large frames may have fewer samples.
         let antialiasing =
             FrameAntialiasing { method, samples: TargetDesc::ids_and_depth(&self.gl, size, samples).samples };
@@ -258,7 +259,8 @@ mod tests {
             renderer.upload(&buffers, &surface).expect("uploads");
             let camera = Camera::fit_to_scene(&scene, 128, 128);
             let bounds = scene.rest_bounds;
-            let params = FrameParams { camera, width: 128, height: 128, bounds, light_bounds: None, edges: None };
+            let params =
+                FrameParams { camera, width: 128, height: 128, bounds, light_bounds: None, edges: None, samples: None };
             images.push(renderer.draw(&buffers, &params).expect("draws").rgba);
         }
         let colors: HashSet<&[u8]> = images[0].chunks(4).collect();
@@ -272,9 +274,14 @@ mod tests {
         let scene = Scene::new(squares(vec![Material::default()])).expect("a valid scene");
         let buffers = renderer.load(&scene).expect("loads");
         let size = [48, 32];
-        assert!(renderer.begin_frame_preparation(&buffers, size, false).expect("begins").is_finished(), "control");
+        let edges = Some(MeshEdges::default());
+        assert!(
+            renderer.begin_frame_preparation(&buffers, size, FrameStyle::default()).expect("begins").is_finished(),
+            "control"
+        );
         let loaded_count = renderer.programs.labels().count();
-        let mut preparation = renderer.begin_frame_preparation(&buffers, size, true).expect("begins");
+        let mut preparation =
+            renderer.begin_frame_preparation(&buffers, size, FrameStyle { edges, samples: None }).expect("begins");
         assert!(!preparation.is_finished(), "expected programs for edges");
         while !preparation.is_finished() {
             while !preparation.is_ready() {
@@ -285,9 +292,9 @@ mod tests {
         renderer.finish_preparation(preparation);
         let prepared_count = renderer.programs.labels().count();
         assert!(prepared_count > loaded_count && renderer.prepared_scenes.is_empty());
-        let edges = Some(MeshEdges::default());
         let (camera, bounds) = (Camera::fit_to_scene(&scene, size[0], size[1]), scene.rest_bounds);
-        let params = FrameParams { camera, width: size[0], height: size[1], bounds, light_bounds: None, edges };
+        let params =
+            FrameParams { camera, width: size[0], height: size[1], bounds, light_bounds: None, edges, samples: None };
         renderer.draw(&buffers, &params).expect("draws");
         assert_eq!(renderer.programs.labels().count(), prepared_count);
         renderer.unload(buffers);

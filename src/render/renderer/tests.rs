@@ -11,6 +11,7 @@ use super::{FramePixels, MappedPixels, Renderer};
 use crate::device;
 use crate::device::gl::UnsharedMemory;
 use crate::device::readback_ring::{MAX_FRAMES_IN_FLIGHT, ReadbackRing};
+use crate::hang_guard::HANG_GUARD;
 use crate::pass::Pass;
 use crate::scene_data::geometry::tests::squares;
 use crate::{Aov, DevicePreference, FrameImage, FrameParams, PixelReadback, SceneBuffers};
@@ -48,7 +49,15 @@ fn surface(extra_width: f32) -> DeformedSurface {
 
 fn params(scene: &Scene, side: u32) -> FrameParams {
     let camera = Camera::fit_to_scene(scene, side, side);
-    FrameParams { camera, width: side, height: side, bounds: scene.rest_bounds, light_bounds: None, edges: None }
+    FrameParams {
+        camera,
+        width: side,
+        height: side,
+        bounds: scene.rest_bounds,
+        light_bounds: None,
+        edges: None,
+        samples: None,
+    }
 }
 
 /// Pixels of a surface drawn by a new renderer, and its number of blended fragments.
@@ -192,7 +201,7 @@ fn abandoned_frames_return_their_pictures() {
         let pending_frame = renderer.submit(&buffers, &params).expect("submits");
         if round % 2 == 0 {
             // Starts the copy.
-            pending_frame.is_ready_within(Duration::from_secs(60));
+            pending_frame.is_ready_within(HANG_GUARD);
         }
     }
     assert!(renderer.draw(&buffers, &params).expect("draws").rgba == draw_frame(0.0).0);
@@ -220,7 +229,7 @@ fn timeout_names_the_pass_and_the_next_frame_is_drawn() {
         [Pass::Shadow, Pass::Blur, Pass::Visibility, Pass::Blended, Pass::Shade, Pass::Bloom, Pass::Encode, Pass::Read];
     for failing_index in 0..passes.len() {
         let mut pending_frame = renderer.submit(&buffers, &params).expect("submits");
-        renderer.gl.wait("test", Duration::from_secs(60)).expect("a finished frame");
+        renderer.gl.wait("test", HANG_GUARD).expect("a finished frame");
         let timed: Vec<Pass> = pending_frame.passes.iter().map(|(pass, _)| *pass).collect();
         assert_eq!(timed, passes);
         // As if the device had stopped in the pass `failing_index`.
@@ -262,7 +271,7 @@ fn reading_a_frame_beyond_its_time_limit_does_not_wait() {
     // The clock starts at the first poll.
     pending_frame.is_ready();
     thread::sleep(Duration::from_millis(6));
-    assert!(pending_frame.time_left().is_zero() && pending_frame.is_ready_within(Duration::from_secs(60)));
+    assert!(pending_frame.time_left().is_zero() && pending_frame.is_ready_within(HANG_GUARD));
 }
 
 #[test]
@@ -319,7 +328,7 @@ fn threads_copy_pixels_while_the_renderer_is_dropped() {
 #[test]
 fn submit_times_out_while_all_staging_buffers_are_mapped() {
     let (mut renderer, scene, buffers) = load_renderer();
-    renderer.frame_timeout = Duration::from_secs(20);
+    renderer.frame_timeout = HANG_GUARD;
     let params = params(&scene, 64);
     let mut mapped_frames = Vec::new();
     for _ in 0..3 {
@@ -328,7 +337,7 @@ fn submit_times_out_while_all_staging_buffers_are_mapped() {
     }
     renderer.frame_timeout = Duration::from_millis(20);
     assert!(matches!(renderer.submit(&buffers, &params), Err(Error::Busy { .. })));
-    renderer.frame_timeout = Duration::from_secs(20);
+    renderer.frame_timeout = HANG_GUARD;
     let images: Vec<FrameImage> = mapped_frames.into_iter().map(MappedPixels::into_image).collect();
     let last_image = renderer.draw(&buffers, &params).expect("draws");
     assert!(images.iter().all(|image| image.rgba == last_image.rgba));

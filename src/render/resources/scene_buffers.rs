@@ -151,7 +151,7 @@ pub(crate) fn collect_program_sources(
         Ok(Rc::clone(placeholder))
     };
     ScenePrograms::compile(&options, &groups, collect)?;
-    let antialiasing = antialiasing(scene, gl.limits.renderer_kind(), TYPICAL_FRAME_SIZE);
+    let antialiasing = antialiasing(scene, gl.limits.renderer_kind(), TYPICAL_FRAME_SIZE, None);
     PostPrograms::compile(&scene.look, antialiasing.method, collect)?;
     let (samples, has_edges) = (supported_samples(antialiasing, sample_positions), scene.look.edges.is_some());
     SampleCountPrograms::compile(&options, &groups, samples, has_edges, collect)?;
@@ -176,10 +176,15 @@ fn shader_options(
     }
 }
 
-/// The antialiasing that the look of a scene has for a frame.
-pub(crate) fn antialiasing(scene: &Scene, renderer_kind: RendererKind, [width, height]: [u32; 2]) -> FrameAntialiasing {
+/// The antialiasing of a frame. `samples`: samples per pixel that the frame sets for itself.
+pub(crate) fn antialiasing(
+    scene: &Scene,
+    renderer_kind: RendererKind,
+    [width, height]: [u32; 2],
+    samples: Option<u32>,
+) -> FrameAntialiasing {
     let pixels = u64::from(width) * u64::from(height);
-    scene.look.frame_antialiasing(renderer_kind, scene.layout.triangles, pixels)
+    scene.look.frame_antialiasing(renderer_kind, scene.layout.triangles, pixels, samples)
 }
 
 /// Samples per pixel. A device without 4x multisampling has no sample positions, and one sample per pixel.
@@ -211,7 +216,7 @@ impl SceneBuffers {
         let options = shader_options(gl, scene, features, &texture_arrays, sample_positions);
         let renderer_kind = gl.limits.renderer_kind();
         let look = scene.look.with_shadow_map_for(renderer_kind);
-        let antialiasing = antialiasing(scene, renderer_kind, TYPICAL_FRAME_SIZE);
+        let antialiasing = antialiasing(scene, renderer_kind, TYPICAL_FRAME_SIZE, None);
         let samples = supported_samples(antialiasing, sample_positions);
         let cull_resources = match culling {
             Some(culling) => {
@@ -261,9 +266,10 @@ impl SceneBuffers {
         })
     }
 
-    /// The antialiasing that the look has for a frame of this size in pixels. The device may support fewer samples.
-    pub(crate) fn antialiasing(&self, size: [u32; 2]) -> FrameAntialiasing {
-        antialiasing(&self.scene, self.renderer_kind, size)
+    /// The antialiasing of a frame of this size in pixels. The device may support fewer samples. `samples`: samples per
+    /// pixel that the frame sets for itself.
+    pub(crate) fn antialiasing(&self, size: [u32; 2], samples: Option<u32>) -> FrameAntialiasing {
+        antialiasing(&self.scene, self.renderer_kind, size, samples)
     }
 
     /// Whether the programs of a frame with this antialiasing are those of most frames.

@@ -148,7 +148,15 @@ mod tests {
         let eye = [0.0, 2.0, 20.0];
         let view = View::LookAt { eye, target: [angle.sin(), 2.0, 20.0 - angle.cos()], up: [0.0, 1.0, 0.0] };
         let camera = Camera { view, lens: Lens::FieldOfView(40.0), near: 0.1, far: 80.0 };
-        FrameParams { camera, width: 160, height: 90, bounds: box_params().bounds, light_bounds: None, edges: None }
+        FrameParams {
+            camera,
+            width: 160,
+            height: 90,
+            bounds: box_params().bounds,
+            light_bounds: None,
+            edges: None,
+            samples: None,
+        }
     }
 
     #[test]

@@ -312,6 +312,7 @@ mod tests {
             bounds,
             light_bounds: None,
             edges: None,
+            samples: None,
         };
         // y is the up axis.
         let lowered = |depth: f64| BoundingBox { min: [bounds.min[0], bounds.min[1] - depth, bounds.min[2]], ..bounds };
@@ -338,6 +339,7 @@ mod tests {
             bounds: scene.rest_bounds,
             light_bounds: None,
             edges: None,
+            samples: None,
         };
         let uniforms = FrameUniforms::new(&scene, &scene.look, &params, [0.0; 3]).expect("finite uniforms");
         assert!(uniforms.eye[3] > 0.0, "expected a camera above the ground");

@@ -4,7 +4,7 @@ use modalcast_proto::v1;
 
 use crate::engine::{FrameFormat, FrameOutput, JpegQuality, validate_mode};
 use modalcast_model::error::{Result, invalid};
-use modalcast_model::scene::{MeshEdges, Scene};
+use modalcast_model::scene::{FrameStyle, MeshEdges, Scene};
 
 /// Upper limit of the value at the end of a color map's scale. The lower limit is 1 / `MAX_SCALE`.
 const MAX_SCALE: f64 = 1e30;
@@ -32,9 +32,35 @@ pub(super) fn parse_output(scene: &Scene, picture: &v1::Picture) -> Result<(Fram
     Ok((frame_output, parse_format(frame_output, picture)?))
 }
 
+/// How the frames of a request are looked at, which chooses their samples per pixel if nothing else does.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(in crate::service) enum FrameUse {
+    /// A single request.
+    Still,
+    Stream,
+}
+
+/// Parses what a picture sets for itself. The field of an error is relative to the picture.
+pub(super) fn parse_style(
+    scene: &Scene,
+    output: FrameOutput,
+    picture: &v1::Picture,
+    frame_use: FrameUse,
+) -> Result<FrameStyle> {
+    let edges = parse_edges(scene, output, picture.edge_width)?;
+    let is_color = output == FrameOutput::Color;
+    let samples = match picture.samples {
+        0 => scene.look.still_samples().filter(|_| is_color && frame_use == FrameUse::Still),
+        samples if !is_color => return Err(invalid("samples", "0 unless the output is OUTPUT_COLOR", samples)),
+        samples @ (1 | 4) => Some(samples),
+        samples => return Err(invalid("samples", "0, 1 or 4", samples)),
+    };
+    Ok(FrameStyle { edges, samples })
+}
+
 /// Parses the width in pixels of lines along mesh edges. 0 means no lines. The color, and an unset width, are those of
 /// `look.edges` in the scene's scene.toml.
-pub(super) fn parse_edges(scene: &Scene, output: FrameOutput, width: Option<f32>) -> Result<Option<MeshEdges>> {
+fn parse_edges(scene: &Scene, output: FrameOutput, width: Option<f32>) -> Result<Option<MeshEdges>> {
     let look_edges = scene.look.edges.filter(|_| output == FrameOutput::Color);
     let Some(width) = width else { return Ok(look_edges) };
     if output != FrameOutput::Color && width != 0.0 {

@@ -23,8 +23,15 @@ fn read_aov(builder: SceneBuilder, camera: Camera, size: u32, aov: Aov) -> AovIm
         surface.normals.extend(mesh.corners().normals.as_flattened());
     }
     renderer.upload(&buffers, &surface).expect("expected the upload to succeed");
-    let params =
-        FrameParams { camera, width: size, height: size, bounds: scene.rest_bounds, light_bounds: None, edges: None };
+    let params = FrameParams {
+        camera,
+        width: size,
+        height: size,
+        bounds: scene.rest_bounds,
+        light_bounds: None,
+        edges: None,
+        samples: None,
+    };
     if let Aov::Values { .. } = aov {
         renderer.render_aov(&buffers, &params, aov).expect_err("expected an error without vertex values");
         let values: Vec<f32> = surface.positions.chunks_exact(3).map(|point| point[0]).collect();
@@ -185,6 +192,7 @@ fn aovs_allocate_on_demand_and_do_not_change_frames() {
         bounds: scene.rest_bounds,
         light_bounds: None,
         edges: None,
+        samples: None,
     };
     let expected_rgba = renderer.draw(&buffers, &params).expect("expected a frame").rgba;
     let (expected_stats, initial_allocations) = (renderer.stats().clone(), buffers.allocations());

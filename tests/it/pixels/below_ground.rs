@@ -53,6 +53,7 @@ fn read_aov_and_picks(scene: &Arc<Scene>, aov: Aov) -> Readbacks {
         bounds,
         light_bounds: None,
         edges: None,
+        samples: None,
     };
     let aov_words =
         bytemuck::pod_collect_to_vec(&renderer.render_aov(&buffers, &params, aov).expect("expected AOVs").bytes);

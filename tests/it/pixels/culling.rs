@@ -71,7 +71,8 @@ impl CullHarness {
     }
 
     fn draw(&mut self, camera: Camera, [width, height]: [u32; 2]) -> Frame {
-        let params = FrameParams { camera, width, height, bounds: self.bounds, light_bounds: None, edges: None };
+        let params =
+            FrameParams { camera, width, height, bounds: self.bounds, light_bounds: None, edges: None, samples: None };
         let rgba = self.renderer.draw(&self.buffers, &params).expect("expected a frame").rgba;
         let stats = self.renderer.stats().clone();
         Frame { rgba, ids: self.renderer.read_visibility().expect("expected visibility ids"), stats }
@@ -437,6 +438,7 @@ fn picks_aovs_and_rebased_frames_do_not_depend_on_culling() {
             bounds: harness.scene.rest_bounds,
             light_bounds: None,
             edges: None,
+            samples: None,
         };
         harness.draw(camera, [SIZE, SIZE]);
         let rectangle = PixelRect::within([SIZE; 2], [40; 2], [8; 2]).expect("expected a valid rectangle");

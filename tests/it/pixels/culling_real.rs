@@ -37,7 +37,8 @@ fn draw_frames(renderer: &mut Renderer, scene: &Arc<Scene>) -> DrawnFrames {
     let buffers = renderer.load(scene).expect("expected the scene to load");
     renderer.upload(&buffers, deformer.surface().expect("expected a surface")).expect("expected the upload to succeed");
     let camera = Camera::fit_to_scene(scene, SIZE[0], SIZE[1]);
-    let params = FrameParams { camera, width: SIZE[0], height: SIZE[1], bounds, light_bounds: None, edges: None };
+    let params =
+        FrameParams { camera, width: SIZE[0], height: SIZE[1], bounds, light_bounds: None, edges: None, samples: None };
     let images: Vec<_> =
         (0..FRAME_COUNT).map(|_| renderer.draw(&buffers, &params).expect("expected a frame")).collect();
     assert!(images.iter().all(|image| image.rgba == images[0].rgba), "expected identical frames");

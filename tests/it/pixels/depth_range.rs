@@ -56,7 +56,8 @@ fn observe(renderer: &mut Renderer, scene: &Arc<Scene>, state: &SceneState, came
     let bounds = deformer.deform(state).expect("expected the step to succeed").bounds;
     let buffers = renderer.load(scene).expect("expected the scene to load");
     renderer.upload(&buffers, deformer.surface().expect("expected a surface")).expect("expected the upload to succeed");
-    let params = FrameParams { camera, width: SIZE, height: SIZE, bounds, light_bounds: None, edges: None };
+    let params =
+        FrameParams { camera, width: SIZE, height: SIZE, bounds, light_bounds: None, edges: None, samples: None };
     renderer.draw(&buffers, &params).expect("expected a frame");
     let samples = renderer.stats().samples as usize;
     let domain_of = |id: &VisibilityId| match id {

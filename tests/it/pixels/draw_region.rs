@@ -55,7 +55,8 @@ struct Frame {
 }
 
 fn draw_frame(renderer: &mut Renderer, buffers: &SceneBuffers, camera: Camera, bounds: BoundingBox) -> Frame {
-    let params = FrameParams { camera, width: SIZE, height: SIZE, bounds, light_bounds: None, edges: None };
+    let params =
+        FrameParams { camera, width: SIZE, height: SIZE, bounds, light_bounds: None, edges: None, samples: None };
     let rgba = renderer.draw(buffers, &params).expect("expected a frame").rgba;
     Frame { rgba, ids: renderer.read_visibility().expect("expected visibility ids") }
 }

@@ -64,7 +64,8 @@ impl Frame {
             .expect("expected the upload to succeed");
         let mut bounds = scene.rest_bounds;
         bounds.min[1] -= f64::from(lowering);
-        let params = FrameParams { camera, width: SIZE, height: SIZE, bounds, light_bounds: None, edges: None };
+        let params =
+            FrameParams { camera, width: SIZE, height: SIZE, bounds, light_bounds: None, edges: None, samples: None };
         let rgba = renderer.draw(&buffers, &params).expect("expected a frame").rgba;
         let ids = renderer.read_visibility().expect("expected visibility ids");
         renderer.unload(buffers);

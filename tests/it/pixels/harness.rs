@@ -132,7 +132,7 @@ pub(super) fn render_sized(
         deformer.deform(&SceneState::rest(scene)).expect("expected the step to succeed");
     let buffers = renderer.load(scene).expect("expected the scene to load");
     renderer.upload(&buffers, deformer.surface().expect("expected a surface")).expect("expected the upload to succeed");
-    let params = FrameParams { camera, width, height, bounds, light_bounds, edges: None };
+    let params = FrameParams { camera, width, height, bounds, light_bounds, edges: None, samples: None };
     let image = renderer.draw(&buffers, &params).expect("expected a frame");
     let (stats, allocations) = (renderer.stats().clone(), buffers.allocations());
     renderer.unload(buffers);

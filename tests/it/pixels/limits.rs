@@ -97,6 +97,7 @@ fn empty_and_oversized_frames_are_rejected() {
             bounds: scene.rest_bounds,
             light_bounds: None,
             edges: None,
+            samples: None,
         };
         let error = renderer.draw(&buffers, &params).expect_err("expected an invalid-size error").to_string();
         let expected = format!("frame.size: expected 1 to {limit} pixels a side, got {width} x {height}");
@@ -109,6 +110,7 @@ fn empty_and_oversized_frames_are_rejected() {
         bounds: scene.rest_bounds,
         light_bounds: None,
         edges: None,
+        samples: None,
     };
     assert_eq!(renderer.draw(&buffers, &params).expect("expected a frame of one pixel").rgba.len(), 4);
 }
@@ -194,8 +196,15 @@ fn overflowed_vertices_leave_no_black_pixels() {
         let surface = DeformedSurface { positions, normals: [0.0, 0.0, 1.0].repeat(4), ..DeformedSurface::default() };
         renderer.upload(&buffers, &surface).expect("expected the upload to succeed");
         let bounds = BoundingBox { min: [f64::NAN; 3], max: [f64::NAN; 3] };
-        let params =
-            FrameParams { camera: front_camera(64), width: 64, height: 64, bounds, light_bounds: None, edges: None };
+        let params = FrameParams {
+            camera: front_camera(64),
+            width: 64,
+            height: 64,
+            bounds,
+            light_bounds: None,
+            edges: None,
+            samples: None,
+        };
         let image = renderer.draw(&buffers, &params).expect("expected a frame");
         assert!(image.rgba.chunks_exact(4).all(|pixel| pixel[..3] != [0; 3] && pixel[3] == 255), "{value}");
     }
@@ -253,6 +262,7 @@ fn renderers_work_on_separate_and_on_shared_threads() {
         bounds,
         light_bounds: None,
         edges: None,
+        samples: None,
     };
     assert!(
         first_renderer.draw(&buffers, &params).expect("expected a frame").rgba == expected_rgba,

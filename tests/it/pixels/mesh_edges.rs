@@ -43,7 +43,8 @@ impl Harness {
         let lens = Lens::Intrinsics { fx: focal_length, fy: focal_length, cx: center, cy: center };
         let camera = Camera { lens, ..front_camera(SIZE) };
         let bounds = self.scene.rest_bounds;
-        let params = FrameParams { camera, width: SIZE, height: SIZE, bounds, light_bounds: None, edges };
+        let params =
+            FrameParams { camera, width: SIZE, height: SIZE, bounds, light_bounds: None, edges, samples: None };
         self.renderer.draw(&self.buffers, &params).expect("expected a frame")
     }
 }

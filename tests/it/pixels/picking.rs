@@ -38,7 +38,15 @@ impl PickHarness {
     }
 
     fn frame_params(&self, camera: Camera, size: u32) -> FrameParams {
-        FrameParams { camera, width: size, height: size, bounds: self.bounds, light_bounds: None, edges: None }
+        FrameParams {
+            camera,
+            width: size,
+            height: size,
+            bounds: self.bounds,
+            light_bounds: None,
+            edges: None,
+            samples: None,
+        }
     }
 
     /// Hits in a rectangle of `size` pixels, with `corner` as its top left pixel, of a square image with side

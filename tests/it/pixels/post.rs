@@ -370,6 +370,7 @@ fn nan_and_infinite_light_affect_no_other_pixel() {
                     bounds,
                     light_bounds: None,
                     edges: None,
+                    samples: None,
                 };
                 let image = renderer.draw(&buffers, &params).expect("expected a frame");
                 RenderedFrame { image, stats: renderer.stats().clone(), allocations: vec![] }

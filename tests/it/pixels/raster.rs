@@ -67,7 +67,10 @@ fn ids_equal_opengl_except_on_edges_and_depth_ties() {
         renderer.upload(&buffers, &surface).expect("expected the upload to succeed");
         let [width, height] = SIZE;
         renderer
-            .draw(&buffers, &FrameParams { camera, width, height, bounds, light_bounds: None, edges: None })
+            .draw(
+                &buffers,
+                &FrameParams { camera, width, height, bounds, light_bounds: None, edges: None, samples: None },
+            )
             .expect("expected a frame");
         assert_eq!(renderer.stats().samples, 1);
         // The index that a visible triangle has in the mesh.

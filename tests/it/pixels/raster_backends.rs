@@ -139,7 +139,7 @@ fn draw_frame_with(renderer: &mut Renderer, scene: &Arc<Scene>, camera: Camera, 
     attach_backend(renderer, &mut buffers, backend);
     let [width, height] = SIZE;
     let image = renderer
-        .draw(&buffers, &FrameParams { camera, width, height, bounds, light_bounds: None, edges: None })
+        .draw(&buffers, &FrameParams { camera, width, height, bounds, light_bounds: None, edges: None, samples: None })
         .expect("expected a frame");
     let (ids, stats) = (renderer.read_visibility().expect("expected visibility ids"), renderer.stats().clone());
     let allocations = buffers.allocations().into_iter().map(|allocation| allocation.name).collect();
@@ -266,7 +266,8 @@ fn opengl_and_compute_frames_share_a_target() {
     });
     let [width, height] = SIZE;
     for (frame_index, x) in [-2.5, 2.5, 0.0, 1.0, -1.0].into_iter().enumerate() {
-        let params = FrameParams { camera: camera_at(x), width, height, bounds, light_bounds: None, edges: None };
+        let params =
+            FrameParams { camera: camera_at(x), width, height, bounds, light_bounds: None, edges: None, samples: None };
         let image = renderer.draw(&scene_buffers[frame_index % 2], &params).expect("expected a frame");
         let expected = draw_frame(
             &scene,
@@ -303,7 +304,15 @@ fn ground_hides_no_geometry_with_any_rasterizer() {
         renderer
             .draw(
                 &buffers,
-                &FrameParams { camera: default_camera(), width, height, bounds, light_bounds: None, edges: None },
+                &FrameParams {
+                    camera: default_camera(),
+                    width,
+                    height,
+                    bounds,
+                    light_bounds: None,
+                    edges: None,
+                    samples: None,
+                },
             )
             .expect("expected a frame");
         let domain = |id: &VisibilityId| match id {
@@ -390,6 +399,7 @@ fn cameras_share_the_shadow_and_rebased_scenes_use_opengl() {
             bounds: summary.bounds,
             light_bounds: summary.oriented_bounds,
             edges: None,
+            samples: None,
         }
     };
     let (first_params, second_params) = (create_params([1.4, 1.9, 4.0]), create_params([-2.0, 1.2, 3.0]));
@@ -470,6 +480,7 @@ fn draw_with_failing_rasterizer(
         bounds: summary.bounds,
         light_bounds: None,
         edges: None,
+        samples: None,
     };
     let frames = (0..frame_count).map(|_| renderer.draw(&buffers, &params)).collect();
     (frames, draw_calls.get())
@@ -555,6 +566,7 @@ fn rasterizer_is_compiled_when_the_scene_is_loaded() {
             bounds: summary.bounds,
             light_bounds: None,
             edges: None,
+            samples: None,
         };
         let raster_backends = renderer.draw(&buffers, &params).expect("expected a frame").info.raster_backends;
         assert_eq!(raster_backends.visibility, Some(RasterBackend::OpenGl));

@@ -38,7 +38,7 @@ fn cameras(scene: &Scene) -> [Camera; 2] {
 }
 
 fn frame_params(camera: Camera, bounds: BoundingBox) -> FrameParams {
-    FrameParams { camera, width: 64, height: 64, bounds, light_bounds: None, edges: None }
+    FrameParams { camera, width: 64, height: 64, bounds, light_bounds: None, edges: None, samples: None }
 }
 
 fn count_shadow_passes(passes: &[Pass]) -> usize {

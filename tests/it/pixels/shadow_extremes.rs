@@ -46,7 +46,10 @@ fn render_scene(meshes: &[Mesh], sun: [f32; 3], shadow: ShadowSettings, clip_pla
     let buffers = renderer.load(&scene).expect("expected the scene to load");
     renderer.upload(&buffers, deformer.surface().expect("expected a surface")).expect("expected the upload to succeed");
     renderer
-        .draw(&buffers, &FrameParams { camera, width: 32, height: 32, bounds, light_bounds: None, edges: None })
+        .draw(
+            &buffers,
+            &FrameParams { camera, width: 32, height: 32, bounds, light_bounds: None, edges: None, samples: None },
+        )
         .expect("expected a frame")
 }
 
@@ -152,6 +155,7 @@ fn render_growing_bounds(scene: &std::sync::Arc<Scene>, has_light_bounds: bool) 
             bounds,
             light_bounds: has_light_bounds.then_some(light_bounds),
             edges: None,
+            samples: None,
         };
         renderer.draw(&buffers, &params).expect("expected a frame")
     };

@@ -300,6 +300,7 @@ fn render_with_normals(scene: &Arc<Scene>, normal: [f32; 3], tangent: [f32; 4], 
         bounds: scene.rest_bounds,
         light_bounds: None,
         edges: None,
+        samples: None,
     };
     renderer.draw(&buffers, &params).expect("expected a frame").rgba
 }

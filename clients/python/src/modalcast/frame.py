@@ -65,12 +65,15 @@ class Output:
         mode: Column of U for "mode_shape", from 0.
         largest: Value at the bright end of a color map, in meters or in meters per unit of q; 0 fits it to each frame.
         edge_width: For "color": width of lines along face edges in pixels, at most 32; None: as in the scene.
+        samples: For "color": samples per pixel, 1 or 4; 0: as in the scene. If the scene sets none, a single frame has
+            4, and the server chooses for a stream.
     """
 
     name: OutputName
     mode: int = 0
     largest: float = 0.0
     edge_width: float | None = None
+    samples: int = 0
 
 
 Outputs: TypeAlias = OutputName | Output | Sequence[OutputName | Output]
@@ -142,6 +145,7 @@ class PictureOptions:
             largest=output.largest,
             jpeg_quality=self.jpeg_quality if format_ == frames_pb2.FORMAT_JPEG else 0,
             edge_width=output.edge_width,
+            samples=output.samples,
         )
         if camera is not None:
             picture.camera.CopyFrom(camera.to_message(scene_up))

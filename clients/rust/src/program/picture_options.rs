@@ -31,6 +31,10 @@ pub struct PictureOptions {
     /// Quality of JPEG, 1 (smallest file) to 100 (smallest error). Default: 90. Ignored by other formats.
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..=100))]
     quality: Option<u32>,
+    /// Samples per pixel of color pictures: 1 or 4. Default: as the scene sets them, else 4 for a single frame, and the
+    /// choice of the server for a stream.
+    #[arg(long, value_parser = parse_samples)]
+    samples: Option<u32>,
     /// Position of the camera in scene units. Default: a camera that shows the whole scene.
     #[arg(long, value_name = "X,Y,Z", value_parser = parse_vector, requires = "target", allow_hyphen_values = true)]
     eye: Option<[f64; 3]>,
@@ -112,7 +116,9 @@ impl PictureOptions {
             OutputOption::ModeShape => Output::ModeShape { mode, scale_max },
         };
         let jpeg_quality = self.quality.unwrap_or(0);
-        Picture { width: self.size.0, height: self.size.1, format, camera, output, jpeg_quality, edge_width: None }
+        let samples = if output == Output::Color { self.samples.unwrap_or(0) } else { 0 };
+        let (width, height) = self.size;
+        Picture { width, height, format, camera, output, jpeg_quality, edge_width: None, samples }
     }
 }
 
@@ -120,6 +126,14 @@ fn parse_size(text: &str) -> Result<(u32, u32), String> {
     let size = text.split_once('x').and_then(|(width, height)| Some((width.parse().ok()?, height.parse().ok()?)));
     size.filter(|(width, height)| *width > 0 && *height > 0)
         .ok_or_else(|| "expected WIDTHxHEIGHT with positive integers, such as 1280x720".into())
+}
+
+fn parse_samples(text: &str) -> Result<u32, String> {
+    match text {
+        "1" => Ok(1),
+        "4" => Ok(4),
+        _ => Err("expected 1 or 4".into()),
+    }
 }
 
 fn parse_vector(text: &str) -> Result<[f64; 3], String> {
@@ -157,6 +171,9 @@ mod tests {
         let expected = [Output::Color, Output::ModeShape { mode: 2, scale_max: 0.0 }];
         assert!(outputs.eq(expected.map(|output| (FrameFormat::Jpeg, output))));
         assert_eq!(picture_options(&["--format", "jpeg", "--quality", "35"]).pictures()[0].jpeg_quality, 35);
+        let pictures = picture_options(&["--output", "color,depth", "--samples", "4"]).pictures();
+        assert_eq!([pictures[0].samples, pictures[1].samples], [4, 0]);
+        assert!(Program::try_parse_from(["program", "--samples", "2"]).is_err());
         for (arguments, file, format) in [
             (&[][..], "x.jpg", FrameFormat::Jpeg),
             (&[], "x.y.JPEG", FrameFormat::Jpeg),

@@ -48,8 +48,8 @@ impl DeviceLoop {
             {
                 let loaded_scene = scenes.get(id)?;
                 match (loaded_scene.buffers(), command) {
-                    (Ok(buffers), Command::Draw { size, edges, .. }) => {
-                        context.begin_frame_preparation(buffers, *size, edges.is_some())
+                    (Ok(buffers), Command::Draw { size, style, .. }) => {
+                        context.begin_frame_preparation(buffers, *size, *style)
                     }
                     (Ok(_), _) => None,
                     (Err(_), _) => context.begin_preparation(loaded_scene.scene()),
@@ -67,9 +67,9 @@ impl DeviceLoop {
         }
         let Self { context, scenes, loss, .. } = self;
         let (id, kind) = match command {
-            Command::Draw { id, camera, size, edges, content, reply } => {
+            Command::Draw { id, camera, size, style, content, reply } => {
                 let draw =
-                    find_scene(scenes, id).and_then(|scene| context.begin_partial_draw(scene, &camera, size, edges));
+                    find_scene(scenes, id).and_then(|scene| context.begin_partial_draw(scene, &camera, size, style));
                 match loss.record_loss(draw) {
                     Ok(draw) => (id, PartialKind::Frame(draw.with_content(content), reply)),
                     Err(error) => return answer(reply, Err(error)),

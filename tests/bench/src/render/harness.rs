@@ -169,6 +169,7 @@ impl LoadedScene {
             bounds: self.bounds,
             light_bounds: self.light_box,
             edges: None,
+            samples: None,
         }
     }
 

@@ -207,8 +207,15 @@ fn time_frame(
             .upload(&setup.buffers, setup.deformer.surface_with(VertexAttributes::POSITIONS_AND_NORMALS)?)?;
         upload = elapsed_us(begin);
     }
-    let frame_params =
-        FrameParams { camera, width: size.width, height: size.height, bounds, light_bounds, edges: None };
+    let frame_params = FrameParams {
+        camera,
+        width: size.width,
+        height: size.height,
+        bounds,
+        light_bounds,
+        edges: None,
+        samples: None,
+    };
     let image = harness.renderer.draw(&setup.buffers, &frame_params)?;
     let frame = elapsed_us(frame_begin);
     let render = 1e3 * image.times.drawing_ms();

@@ -143,6 +143,7 @@ impl FrameSource {
             bounds: first_bounds.union(second_bounds),
             light_bounds,
             edges: None,
+            samples: None,
             ..loaded_scene.frame_params(camera, size)
         };
         Ok(Self {

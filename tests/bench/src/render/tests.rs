@@ -63,7 +63,7 @@ fn frame_params(bounds: BoundingBox, side: u32, viewpoint: Viewpoint) -> FramePa
         near: 0.0,
         far: 0.0,
     };
-    FrameParams { camera, width: side, height: side, bounds, light_bounds: None, edges: None }
+    FrameParams { camera, width: side, height: side, bounds, light_bounds: None, edges: None, samples: None }
 }
 
 /// Traces one image of `side` x `side` pixels per shadow model.
@@ -395,7 +395,15 @@ fn refitted_bvh_gives_the_same_images_as_a_rebuilt_one() {
     let size = Size { width: 48, height: 32 };
     let view = ReferenceView::new(
         &animation.scene,
-        &FrameParams { camera: animation.camera(size), width: 48, height: 32, bounds, light_bounds: None, edges: None },
+        &FrameParams {
+            camera: animation.camera(size),
+            width: 48,
+            height: 32,
+            bounds,
+            light_bounds: None,
+            edges: None,
+            samples: None,
+        },
     );
     let trace_hard_shadows =
         |ray_scene: &RayScene| trace_reference_images(ray_scene, &view, &[ShadowModel::Hard], SampleCounts::QUICK);

@@ -65,7 +65,7 @@ impl SceneLook {
     /// The look with which a server draws frames of `pixels` pixels.
     fn of(source: &str, renderer: RendererKind, pixels: u64) -> Result<Self> {
         let OpenedScene { scene, backends } = load::open(source)?;
-        let antialiasing = scene.look.frame_antialiasing(renderer, scene.layout.triangles, pixels);
+        let antialiasing = scene.look.frame_antialiasing(renderer, scene.layout.triangles, pixels, None);
         let FrameAntialiasing { method: antialias, samples } = antialiasing;
         let settings = RenderSettings { antialias, samples, ..scene.look.with_shadow_map_for(renderer) };
         Ok(Self {

@@ -87,7 +87,7 @@ DRAWN_BY_OPENGL: DrawnBy
 DRAWN_BY_CUDA: DrawnBy
 
 class Picture(_message.Message):
-    __slots__ = ("width", "height", "format", "camera", "output", "mode", "largest", "jpeg_quality", "edge_width")
+    __slots__ = ("width", "height", "format", "camera", "output", "mode", "largest", "jpeg_quality", "edge_width", "samples")
     WIDTH_FIELD_NUMBER: _ClassVar[int]
     HEIGHT_FIELD_NUMBER: _ClassVar[int]
     FORMAT_FIELD_NUMBER: _ClassVar[int]
@@ -97,6 +97,7 @@ class Picture(_message.Message):
     LARGEST_FIELD_NUMBER: _ClassVar[int]
     JPEG_QUALITY_FIELD_NUMBER: _ClassVar[int]
     EDGE_WIDTH_FIELD_NUMBER: _ClassVar[int]
+    SAMPLES_FIELD_NUMBER: _ClassVar[int]
     width: int
     height: int
     format: Format
@@ -106,7 +107,8 @@ class Picture(_message.Message):
     largest: float
     jpeg_quality: int
     edge_width: float
-    def __init__(self, width: _Optional[int] = ..., height: _Optional[int] = ..., format: _Optional[_Union[Format, str]] = ..., camera: _Optional[_Union[Camera, _Mapping]] = ..., output: _Optional[_Union[Output, str]] = ..., mode: _Optional[int] = ..., largest: _Optional[float] = ..., jpeg_quality: _Optional[int] = ..., edge_width: _Optional[float] = ...) -> None: ...
+    samples: int
+    def __init__(self, width: _Optional[int] = ..., height: _Optional[int] = ..., format: _Optional[_Union[Format, str]] = ..., camera: _Optional[_Union[Camera, _Mapping]] = ..., output: _Optional[_Union[Output, str]] = ..., mode: _Optional[int] = ..., largest: _Optional[float] = ..., jpeg_quality: _Optional[int] = ..., edge_width: _Optional[float] = ..., samples: _Optional[int] = ...) -> None: ...
 
 class Camera(_message.Message):
     __slots__ = ("look_at", "pose", "field_of_view", "intrinsics", "near", "far")
