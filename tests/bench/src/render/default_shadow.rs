@@ -2,10 +2,10 @@
 //!
 //! The rule: of all variants of the shadow map whose mean light error is at most the limit on every workload, the
 //! default is the one with the least time. The light error is that of the sun visibility against the reference with
-//! hard shadows, which is the same for all variants, so that blur counts as an error. The light error grows with the
-//! size of the image, because texels become larger than pixels. The shipped defaults are for 1920 x 1080 on hardware
-//! and 1280 x 720 in software. The time is the geometric mean of the frame times over the workloads, so that all have
-//! the same weight.
+//! hard shadows, which is the same for all variants, so that blur counts as an error. The limit is the error that
+//! changes a white surface in full sunlight by one level of 255 on hardware, and by two levels in software. The light
+//! error depends on the size of the image. The shipped defaults are for 1920 x 1080 on hardware and 1280 x 720 in
+//! software. The time is the geometric mean of the frame times over the workloads, so that all have the same weight.
 //!
 //! Standard maps are not candidates: they are not filtered, and the mean error does not show their jagged edges. The
 //! workload `shelf` is not used: its image shows only a few texels of the map, so its error depends on the width of the
@@ -23,8 +23,7 @@ use modalcast_render::{BlurMethod, RendererInfo};
 /// Mean error of the sun visibility that changes a white surface in full sunlight by one level of 255. The slope of the
 /// sRGB curve at white is 255 * 1.055 / 2.4 levels, and the default sun contributes 0.76 of the light.
 const LIGHT_ERROR_OF_LEVEL: f64 = 2.4 / (255.0 * 1.055 * 0.76);
-/// Largest mean errors in levels of 255: on hardware an error that cannot be seen, in software one that is hard to see,
-/// because time is scarce.
+/// Largest mean errors in levels of 255. Software has the larger limit, because its frames take longer.
 const HARDWARE_LEVELS: f64 = 1.0;
 const SOFTWARE_LEVELS: f64 = 2.0;
 
