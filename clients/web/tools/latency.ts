@@ -3,7 +3,8 @@
  * Server, physics process at 60 steps/s and headless Chromium share this machine. A sample begins with a scene at rest,
  * because only then the first changed pixel is known to follow from the movement: a physics process starts, the mouse
  * grabs the surface (no force yet) and moves once. The sample ends when the pixels of a drawn frame have changed and
- * were read back, which waits for the renderer. The time until a screen shows the frame is not part of it.
+ * were read back, which waits for the renderer. The time until a screen shows the frame is not part of it. A sample that
+ * fails, for example because the pixels changed before a state could follow from the movement, is repeated and counted.
  */
 
 import { type ChildProcess, execFileSync } from "node:child_process";
@@ -20,6 +21,8 @@ const SAMPLES = Number(process.env["MODALCAST_SAMPLES"] ?? 60);
 const GOAL_MS = 50;
 /** Pixels by which the mouse moves. */
 const MOVEMENT = 60;
+/** Milliseconds after which a sample has failed. */
+const LIMIT_MS = 30_000;
 
 interface Case {
     scene: string;
@@ -42,10 +45,12 @@ const cases: Case[] = [
 
 /** Times of one sample in milliseconds since the movement. */
 interface Sample {
-    /** The first state that differs has arrived. */
+    /** The state that the first changed picture shows has arrived. */
     state: number;
-    /** The first picture that differs was drawn and read back. */
+    /** The first changed picture was drawn and read back. */
     picture: number;
+    /** Part of `picture`: deforming, drawing and reading back. */
+    draw: number;
 }
 
 declare global {
@@ -85,52 +90,69 @@ async function measure(browser: Browser, { scene, source, repository, simulation
     await page.evaluate(() => modalcastViewer.frameScene());
     const samples: Sample[] = [];
     const rates: number[] = [];
+    const failures: string[] = [];
     while (samples.length < SAMPLES) {
+        const run = String(await page.evaluate(() => modalcastViewer.model?.state.step?.run ?? 0n));
         const physics = startSimulation(server, ["--scene", scene, "--forces", ...simulation]);
-        samples.push(await takeSample(page, physics));
-        rates.push(await page.evaluate(() => modalcastViewer.status.stateRate.perSecond()));
-        await end(physics, "SIGKILL");
+        try {
+            samples.push(await takeSample(page, physics, run));
+            rates.push(await page.evaluate(() => modalcastViewer.status.stateRate.perSecond()));
+        } catch (error) {
+            failures.push(String(error));
+            if (failures.length > SAMPLES) throw new Error(`more failures than samples: ${failures.join("; ")}`);
+        } finally {
+            await page.mouse.up();
+            await page.keyboard.up("Shift");
+            await end(physics, "SIGKILL");
+        }
     }
     const renderer = await page.evaluate(() => modalcastViewer.viewport.rendererName);
     await page.close();
     await server.stop();
     const of = (name: keyof Sample) => summary(samples.map((sample) => sample[name]));
-    return { renderer, steps_per_second: summary(rates).p50, state_ms: of("state"), picture_ms: of("picture") };
+    return {
+        renderer,
+        steps_per_second: summary(rates).p50,
+        state_ms: of("state"),
+        picture_ms: of("picture"),
+        draw_ms: of("draw"),
+        failures,
+    };
 }
 
-async function takeSample(page: Page, physics: ChildProcess): Promise<Sample> {
-    const ended = new Promise((_, fail) =>
+/** @param run The run before the physics process has started. */
+async function takeSample(page: Page, physics: ChildProcess, run: string): Promise<Sample> {
+    const ended = new Promise<never>((_, fail) =>
         physics.once("exit", (code) => fail(new Error(`the physics process has ended with code ${code}`))),
     );
     ended.catch(() => {});
-    await Promise.race([waitForRest(page), ended]);
+    await Promise.race([waitForRest(page, run), ended]);
     const [x, y] = await surfacePixel(page);
     await page.keyboard.down("Shift");
-    await page.mouse.move(x, y);
+    // The center of the pixel, which the server picks: elsewhere, the pull would begin with a force.
+    await page.mouse.move(x + 0.5, y + 0.5);
     await page.mouse.down();
-    await page.waitForFunction(() => modalcastViewer.pull?.view != null);
+    await page.waitForFunction(() => modalcastViewer.pull?.view != null, undefined, { timeout: LIMIT_MS });
     // Not in phase with the steps.
     await page.waitForTimeout(100 + 50 * Math.random());
-    await page.evaluate(watch);
+    await page.evaluate(watch, LIMIT_MS);
     await page.mouse.move(x + MOVEMENT, y + MOVEMENT / 4);
-    const sample = await page.evaluate(() => globalThis.sample as Promise<Sample>);
-    await page.mouse.up();
-    await page.keyboard.up("Shift");
-    return sample;
+    return page.evaluate(() => globalThis.sample as Promise<Sample>);
 }
 
-/** Waits for half a second of a new run that has not moved the scene. */
-async function waitForRest(page: Page): Promise<void> {
-    const run = String(await page.evaluate(() => modalcastViewer.model?.state.step?.run ?? 0n));
-    await page.waitForFunction((previous) => {
+/** Waits for half a second of another run than `run`, which has not moved the scene. */
+async function waitForRest(page: Page, run: string): Promise<void> {
+    const isAtRest = (previous: string) => {
         const { step, q } = modalcastViewer.model?.state ?? {};
         return step && String(step.run) !== previous && step.number > 30n && q?.every((value) => value === 0);
-    }, run);
+    };
+    await page.waitForFunction(isAtRest, run, { timeout: LIMIT_MS });
 }
 
 /** Runs in the page: starts to wait for the next movement, and for the state and the picture that follow from it. */
-async function watch(): Promise<void> {
-    const { viewport, model, status } = modalcastViewer;
+async function watch(limit: number): Promise<void> {
+    const { viewport, model } = modalcastViewer;
+    if (!model) throw new Error("expected a scene");
     const gl = viewport.gl?.getContext() as WebGL2RenderingContext;
     const [width, height] = viewport.pixelSize;
     const readPixels = () => {
@@ -138,36 +160,43 @@ async function watch(): Promise<void> {
         gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
         return new Uint32Array(pixels.buffer);
     };
-    const nextFrame = () =>
-        new Promise<Uint32Array>((done) => {
-            viewport.onDrawn = () => {
-                viewport.onDrawn = () => {};
-                done(readPixels());
-            };
-            viewport.invalidate();
-        });
-    const before = await nextFrame();
-    const q = model?.state.q.slice();
-    globalThis.sample = new Promise((done) => {
+    const before = await new Promise<Uint32Array>((done) => {
+        viewport.onDrawn = () => done(readPixels());
+        viewport.invalidate();
+    });
+    const { onFrame } = viewport;
+    const { onState } = model;
+    const result = new Promise<Sample>((done, fail) => {
         let moved = 0;
         let state = 0;
+        let frame = 0;
         const onMove = (event: PointerEvent) => {
             moved = event.timeStamp;
         };
         window.addEventListener("pointermove", onMove, { capture: true, once: true });
+        model.onState = () => {
+            state = performance.now();
+            onState();
+        };
+        viewport.onFrame = () => {
+            frame = performance.now();
+            onFrame();
+        };
         viewport.onDrawn = () => {
-            if (moved === 0) return;
-            const isMoved = model?.state.q.some((value, index) => value !== q?.[index]);
-            if (!isMoved || readPixels().every((pixel, index) => pixel === before[index])) return;
-            viewport.onDrawn = () => {};
-            done({ state: state - moved, picture: performance.now() - moved });
+            if (readPixels().every((pixel, index) => pixel === before[index])) return;
+            const now = performance.now();
+            if (moved > 0 && state > moved) done({ state: state - moved, picture: now - moved, draw: now - frame });
+            else fail(new Error("the picture has changed before a state could follow from the movement"));
         };
-        const add = status.stateRate.add.bind(status.stateRate);
-        status.stateRate.add = (value) => {
-            add(value);
-            if (moved > 0 && state === 0 && model && model.lastStateBytes > 0) state = performance.now();
-        };
+        setTimeout(() => fail(new Error(`expected another picture within ${limit} ms`)), limit);
     });
+    globalThis.sample = result.finally(() => {
+        model.onState = onState;
+        viewport.onFrame = onFrame;
+        viewport.onDrawn = () => {};
+    });
+    // An error that nobody awaits yet would be reported as one of the page.
+    globalThis.sample.catch(() => {});
 }
 
 /** A pixel in the middle of the surface of domains with modes. */

@@ -2,39 +2,19 @@
 
 import assert from "node:assert/strict";
 import { readFileSync } from "node:fs";
-import { after, before, test } from "node:test";
-import type { Browser, CDPSession, Page } from "playwright-core";
+import { test } from "node:test";
+import type { CDPSession, Page } from "playwright-core";
 import { SceneModel } from "../../src/scene/scene_model";
-import {
-    changedValues,
-    end,
-    launchBrowser,
-    openPage,
-    rememberPixels,
-    rememberSettledPixels,
-    ServerProcess,
-    startSimulation,
-    waitForScene,
-} from "./harness";
+import { changedValues, end, rememberPixels, rememberSettledPixels, startSimulation } from "./harness";
+import { TreeSetup } from "./tree_setup";
 
 const LIMIT_MS = 300_000;
 /** Wide enough for the panels beside the view. */
 const WIDTH = 760;
 const HEIGHT = 420;
 
-let browser: Browser;
-const server = new ServerProcess();
-
-before(async () => {
-    await server.start();
-    await (await server.client()).openScene("tree");
-    browser = await launchBrowser();
-});
-
-after(async () => {
-    await browser?.close();
-    await server.stop();
-});
+const setup = new TreeSetup();
+const { server } = setup;
 
 /** The first coordinate of the tree that the server has. */
 async function serverQ(): Promise<number> {
@@ -53,8 +33,7 @@ function shownQ(page: Page): Promise<number> {
 }
 
 test("sliders and animated modes drive a scene that nobody else drives", { timeout: LIMIT_MS }, async () => {
-    const { page, errors } = await openPage(browser, server.pageUrl("tree"), WIDTH, HEIGHT);
-    await waitForScene(page);
+    const { page, errors } = await setup.openTree(WIDTH, HEIGHT);
     const slider = page.getByRole("slider", { name: "Coordinate 1", exact: true });
     await slider.waitFor();
     await slider.focus();
@@ -99,8 +78,7 @@ test("sliders and animated modes drive a scene that nobody else drives", { timeo
 });
 
 test("keys switch edges, shadows, colors, panels, the pull tool and help", { timeout: LIMIT_MS }, async () => {
-    const { page, errors } = await openPage(browser, server.pageUrl("tree"), WIDTH, HEIGHT);
-    await waitForScene(page);
+    const { page, errors } = await setup.openTree(WIDTH, HEIGHT);
     await rememberSettledPixels(page);
     for (const [key, name] of [
         ["e", "edges"],
@@ -136,8 +114,7 @@ test("keys switch edges, shadows, colors, panels, the pull tool and help", { tim
 });
 
 test("a paused view shows one step at a time", { timeout: LIMIT_MS }, async () => {
-    const { page, errors } = await openPage(browser, server.pageUrl("tree"), WIDTH, HEIGHT);
-    await waitForScene(page);
+    const { page, errors } = await setup.openTree(WIDTH, HEIGHT);
     const simulation = startSimulation(server, ["--scene", "tree"]);
     await page.waitForFunction(() => modalcastViewer.status.stateRate.perSecond() > 2);
     await page.keyboard.press(" ");
@@ -159,9 +136,8 @@ test("a paused view shows one step at a time", { timeout: LIMIT_MS }, async () =
 });
 
 test("the camera is copied as an expression of the Python package", { timeout: LIMIT_MS }, async () => {
-    const { page, errors } = await openPage(browser, server.pageUrl("tree"), WIDTH, HEIGHT);
+    const { page, errors } = await setup.openTree(WIDTH, HEIGHT);
     await page.context().grantPermissions(["clipboard-read", "clipboard-write"]);
-    await waitForScene(page);
     const copied = async () => {
         await page.keyboard.press("c");
         await page.locator(".notice", { hasText: "Copied: mc.look_at" }).waitFor();
@@ -233,8 +209,7 @@ function distance(a: readonly number[], b: readonly number[]): number {
 }
 
 test("fingers orbit, pinch and pan", { timeout: LIMIT_MS }, async () => {
-    const { page, errors } = await openPage(browser, server.pageUrl("tree"), 390, 844);
-    await waitForScene(page);
+    const { page, errors } = await setup.openTree(390, 844);
     const session = await page.context().newCDPSession(page);
     await session.send("Emulation.setTouchEmulationEnabled", { enabled: true, maxTouchPoints: 2 });
     const start = await viewOf(page);

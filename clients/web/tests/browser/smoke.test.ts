@@ -1,8 +1,8 @@
 /** The viewer in headless Chromium against a server. */
 
 import assert from "node:assert/strict";
-import { after, before, test } from "node:test";
-import type { Browser, Page } from "playwright-core";
+import { test } from "node:test";
+import type { Page } from "playwright-core";
 import type { SurfacePoint } from "../../src/control/surface_point";
 import { Delivery } from "../../src/proto/modalcast/v1/common_pb";
 import { Format, FrameService, type Hit, Output } from "../../src/proto/modalcast/v1/frames_pb";
@@ -10,7 +10,8 @@ import type { CameraMessage } from "../../src/render/camera";
 import { parseArrays } from "../../src/scene/arrays";
 import { Kinematics } from "../../src/scene/kinematics";
 import { SceneModel } from "../../src/scene/scene_model";
-import { end, launchBrowser, openPage, ServerProcess, startSimulation, waitForScene } from "./harness";
+import { end, startSimulation } from "./harness";
+import { TreeSetup } from "./tree_setup";
 
 const WIDTH = 480;
 const HEIGHT = 300;
@@ -25,19 +26,8 @@ declare global {
     var shownModel: SceneModel | null;
 }
 
-let browser: Browser;
-const server = new ServerProcess();
-
-before(async () => {
-    await server.start();
-    await (await server.client()).openScene("tree");
-    browser = await launchBrowser();
-});
-
-after(async () => {
-    await browser?.close();
-    await server.stop();
-});
+const setup = new TreeSetup();
+const { server } = setup;
 
 /** Sends one step with coordinates of the trunk, and transforms that keep all joints closed. Returns the step's number. */
 async function bend(q0: number): Promise<bigint> {
@@ -172,8 +162,7 @@ async function projectHits(page: Page, hits: Hit[]): Promise<number[][]> {
 
 test("the browser draws the same domains and points as the server", { timeout: LIMIT_MS }, async () => {
     const number = await bend(1);
-    const { page, errors } = await openPage(browser, server.pageUrl("tree"), WIDTH, HEIGHT);
-    await waitForScene(page);
+    const { page, errors } = await setup.openTree(WIDTH, HEIGHT);
     await waitForStep(page, number);
     await moveCloser(page, 0.08);
     const camera = await cameraOf(page);
@@ -206,8 +195,7 @@ test("the browser draws the same domains and points as the server", { timeout: L
 });
 
 test("the server's pictures follow the camera and the size of the window", { timeout: LIMIT_MS }, async () => {
-    const { page, errors } = await openPage(browser, server.pageUrl("tree"), WIDTH, HEIGHT);
-    await waitForScene(page);
+    const { page, errors } = await setup.openTree(WIDTH, HEIGHT);
     await page.keyboard.press("v");
     await page.waitForFunction(() => modalcastViewer.pictures !== null && modalcastViewer.pictures.frames > 0);
     // PNG, so that the shown pixels are those of RenderFrame.
@@ -272,8 +260,7 @@ function meanDifference(a: ArrayLike<number>, b: ArrayLike<number>): number {
 }
 
 test("a pull bends a branch, which returns afterwards", { timeout: LIMIT_MS }, async () => {
-    const { page, errors } = await openPage(browser, server.pageUrl("tree"), 640, 480);
-    await waitForScene(page);
+    const { page, errors } = await setup.openTree(640, 480);
     // Nobody receives forces yet.
     await page.keyboard.down("Shift");
     await page.mouse.move(...(await leafPixel(page)));
@@ -343,8 +330,7 @@ function watchedPosition(page: Page): Promise<number[]> {
 }
 
 test("the viewer connects again after a restart of the server", { timeout: LIMIT_MS }, async () => {
-    const { page, errors } = await openPage(browser, server.pageUrl("tree"), 390, 844);
-    await waitForScene(page);
+    const { page, errors } = await setup.openTree(390, 844);
     // Phone width: nothing is wider than the screen, and the panels open above the tools.
     const overflow = await page.evaluate(() => document.documentElement.scrollWidth - window.innerWidth);
     assert.ok(overflow <= 0, `expected no horizontal scrolling, got ${overflow} pixels`);
