@@ -194,6 +194,8 @@ def test_stopped_server_exceeds_the_deadline(server: RestartableServer):
         scene = client.upload(builder.add(positions, faces, np.ones((3 * len(positions), 1)), name="copy"))
         drive = scene.drive()
         server.process.send_signal(signal.SIGSTOP)
+        # Until one of its threads has taken the signal, the others still answer.
+        os.waitpid(server.process.pid, os.WUNTRACED)
         try:
             with pytest.raises(mc.DeadlineExceeded):
                 scene.vertices(timeout=0.3)
