@@ -54,7 +54,7 @@
 //! | `modalcast-render::pass` | names of the passes and stages, and their times | |
 //! | `modalcast-model::load` | scene loaders: OBJ, glTF, PLY, STL, Vega, NumPy, safetensors, SOFA, plant scans with one object per organ, `scene.toml`; the scene repository (a folder of scene sources) | `tree`, `backend_settings`, `scene`, `domain`, `memory`, `error` |
 //! | `modalcast-model::tree` | the built-in scene: a tree of beams, the modes of the beams, and the surface mesh that they deform | `scene`, `domain`, `error` |
-//! | `modalcast-model::deform` | the trait of deformers | `scene`, `error` |
+//! | `modalcast-model::deform` | the trait of deformers | `scene`, `shared_memory`, `error` |
 //! | `modalcast-model::raster` | the trait of compute rasterizers, which replace OpenGL in selected passes | `scene`, `shared_memory`, `error` |
 //! | `modalcast-model::shared_memory` | the traits of device memory that OpenGL and CUDA share, and of its copies to the host | `error` |
 //! | `modalcast-model::backend_settings` | settings of deformers and rasterizers, which are not part of a scene | `scene` |

@@ -22,6 +22,9 @@ pub enum Stage {
     Deform,
     /// Upload of vertices to OpenGL.
     Upload,
+    /// Waits of the CUDA rasterizer for the GPU to change from OpenGL to CUDA, with the frames of OpenGL that the GPU draws
+    /// before. Short if the rasterizer follows a deformation, which has waited.
+    Switch,
     /// Shadow map.
     Shadow,
     /// All other passes of a frame.
@@ -42,6 +45,7 @@ impl Stage {
             Self::Queue => "queue",
             Self::Deform => "deform",
             Self::Upload => "upload",
+            Self::Switch => "switch",
             Self::Shadow => "shadow",
             Self::Draw => "draw",
             Self::Read => "read",

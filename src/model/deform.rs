@@ -11,6 +11,7 @@ use std::sync::Arc;
 
 use crate::error::{Result, fault};
 use crate::scene::{BoundingBox, OrientedBounds, SceneState};
+use crate::shared_memory::SharedPositions;
 
 /// Deformed vertices of a whole scene, packed as in [`Layout`](crate::scene::Layout). A corner is a vertex with a
 /// normal and texture coordinates.
@@ -166,6 +167,15 @@ pub struct DeformSummary {
     pub ms: f64,
 }
 
+/// A step that is computed ahead of the call that shows it ([`Deformer::deform_with_next`]).
+#[derive(Debug, Clone)]
+pub struct StepAhead {
+    pub positions: SharedPositions,
+    pub bounds: BoundingBox,
+    pub oriented_bounds: Option<OrientedBounds>,
+    pub state: Arc<SceneState>,
+}
+
 /// A deformer for one scene. It owns all data that it needs from the scene.
 pub trait Deformer {
     /// The implementation behind this trait object.
@@ -184,6 +194,21 @@ pub trait Deformer {
     /// As for [`Self::deform`].
     fn deform_with_next(&mut self, state: &Arc<SceneState>, _next: Option<&Arc<SceneState>>) -> Result<DeformSummary> {
         self.deform(state)
+    }
+
+    /// The positions of the last [`Self::deform`], if they are in memory that a compute rasterizer can read. They are valid
+    /// until the next step begins.
+    fn shared_positions(&self) -> Option<SharedPositions> {
+        None
+    }
+
+    /// Waits for the step that [`Self::deform_with_next`] computes ahead. `None` if there is no such step, or its positions
+    /// are not in memory that a compute rasterizer can read.
+    ///
+    /// # Errors
+    /// `Fault` if the device fails.
+    fn step_ahead(&mut self) -> Result<Option<StepAhead>> {
+        Ok(None)
     }
 
     /// Whether [`Self::fill_gl_buffers`] can fill the renderer's buffers, so that no upload is needed.

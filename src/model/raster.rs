@@ -6,11 +6,12 @@
 //! it in the last bits of filtered images.
 
 use std::any::Any;
+use std::os::fd::OwnedFd;
 use std::rc::Rc;
 
-use crate::error::Result;
+use crate::error::{Result, fault};
 use crate::scene::{DrawRange, Viewport};
-use crate::shared_memory::VertexImporter;
+use crate::shared_memory::{SharedRange, VertexImporter};
 
 /// The owner of an OpenGL buffer. The buffer is deleted once its owner is dropped.
 pub trait GlBufferOwner: std::fmt::Debug {
@@ -106,8 +107,30 @@ pub struct AlphaImage {
 /// A viewport and the buffer that receives its samples.
 pub type DrawTarget<'a> = (&'a Viewport, &'a GlBuffer);
 
-/// Draws one mesh. Buffer accesses are ordered with OpenGL commands before and after each call without blocking the
-/// host. Between calls, the implementation may keep the handles of the position buffer and the target buffers, and
+/// A viewport and the shared memory that receives its samples.
+pub type SharedDrawTarget<'a> = (&'a Viewport, &'a dyn SharedRange);
+
+/// Samples in memory that OpenGL has not imported yet.
+#[derive(Debug)]
+pub struct NewTarget {
+    /// Names the memory. An import takes ownership of it.
+    pub descriptor: OwnedFd,
+    /// Size of the allocation, which an import must state: the bytes of the samples, rounded up by the device.
+    pub allocated_bytes: u64,
+    pub range: Rc<dyn SharedRange>,
+}
+
+/// The passes of one step that [`Rasterizer::draw_shared`] draws.
+#[derive(Debug, Clone, Copy)]
+pub struct SharedDraw<'a> {
+    /// Three f32 per vertex.
+    pub positions: &'a dyn SharedRange,
+    pub depth: Option<SharedDrawTarget<'a>>,
+    pub ids: Option<SharedDrawTarget<'a>>,
+}
+
+/// Draws one mesh. [`Self::draw`] orders its buffer accesses with OpenGL commands before and after each call without
+/// blocking the host. Between calls, the implementation may keep the handles of the position buffer and the target buffers, and
 /// leave these buffers registered with CUDA.
 pub trait Rasterizer: std::fmt::Debug {
     /// Draws depths, ids, or both. One call for both is cheaper, because the switch from OpenGL to CUDA and back takes
@@ -129,4 +152,22 @@ pub trait Rasterizer: std::fmt::Debug {
     /// # Errors
     /// `Unavailable` if there is no compiler; `Fault` if compilation fails.
     fn precompile(&mut self, depth: bool, ids: bool) -> Result<()>;
+
+    /// Allocates memory for samples of [`Self::draw_shared`], which OpenGL can import.
+    ///
+    /// # Errors
+    /// `Fault` if the implementation has no such memory, or the device has not enough of it.
+    fn create_target(&mut self, _bytes: u64) -> Result<NewTarget> {
+        Err(fault("raster", "expected a rasterizer that shares memory with OpenGL"))
+    }
+
+    /// Draws as [`Self::draw`], but from and into shared memory, and waits for the end of all draws. Returns the
+    /// milliseconds that the device took. Nothing orders the draws with OpenGL commands: the caller has waited for the
+    /// commands that read the targets. Several draws need one change of the device between OpenGL and the rasterizer.
+    ///
+    /// # Errors
+    /// `Fault` if the device fails, or if a range is not of this rasterizer's device or too small.
+    fn draw_shared(&mut self, _draws: &[SharedDraw<'_>]) -> Result<f64> {
+        Err(fault("raster", "expected a rasterizer that shares memory with OpenGL"))
+    }
 }

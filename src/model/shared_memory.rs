@@ -1,14 +1,17 @@
 //! Traits of device memory that OpenGL and another API share for as long as it exists. The module `gpu` of
 //! `modalcast-compute` allocates it in CUDA. The renderer draws pictures into such memory, and CUDA copies them to the
-//! host. A deformer writes vertices into such memory, and OpenGL copies them to the vertex buffers of the scene.
+//! host. A deformer writes vertices into such memory, and OpenGL copies them to the vertex buffers of the scene. A compute
+//! rasterizer reads these vertices and writes its samples into such memory, which OpenGL reads.
 //!
 //! Each API holds its own reference to the memory, so neither can free it while the other uses it. Nothing orders the
 //! accesses of the two APIs on the device. The host does: it waits for the end of the accesses of one API before it
 //! submits those of the other one.
 
+use std::any::Any;
 use std::fmt::Debug;
 use std::ops::Range;
 use std::os::fd::OwnedFd;
+use std::rc::Rc;
 use std::sync::Arc;
 
 use crate::error::Result;
@@ -142,4 +145,18 @@ pub trait ImportedVertices: Debug {
     /// # Errors
     /// `Fault` if the device does not finish.
     fn wait_for_copy(&self) -> Result<()>;
+}
+
+/// A range of shared memory, as a handle of the API that allocated it. The memory exists at least as long as the handle.
+pub trait SharedRange: Debug {
+    /// The handle itself, so that its API can get back its own type.
+    fn as_any(&self) -> &dyn Any;
+}
+
+/// The positions of one step in shared memory: three f32 per vertex.
+#[derive(Debug, Clone)]
+pub struct SharedPositions {
+    pub range: Rc<dyn SharedRange>,
+    /// Number of the step, which no other step of the deformer has.
+    pub step: u64,
 }

@@ -64,6 +64,9 @@ pub enum Pass {
 pub enum RenderStage {
     /// Upload of deformed vertices from host memory; measured by the caller.
     Upload,
+    /// Waits for the compute rasterizer, without the time in which it drew: for frames of OpenGL in flight, and for the
+    /// change of the device from OpenGL to CUDA. Not measured if the rasterizer maps OpenGL's buffers.
+    Switch,
     Shadow,
     Draw,
     Read,
@@ -155,6 +158,7 @@ impl RenderStage {
     pub const fn name(self) -> &'static str {
         match self {
             Self::Upload => "upload",
+            Self::Switch => "switch",
             Self::Shadow => "shadow",
             Self::Draw => "draw",
             Self::Read => "read",

@@ -1,12 +1,13 @@
 //! Frames that the server rasterizes with CUDA. They equal OpenGL frames except on edges and at depth ties. Steps that
 //! are computed while a frame is in flight do not change it. Frames are deterministic.
 
+use std::rc::Rc;
 use std::sync::Arc;
 
 use modalcast::config::{BackendChoice, Config};
 use modalcast::engine::DeviceContext;
 use modalcast_compute::cpu::CpuDeformer;
-use modalcast_compute::gpu::{CudaRasterizer, Device};
+use modalcast_compute::gpu::{CudaDeformer, CudaDeformerOptions, CudaPictureMemory, CudaRasterizer, Device};
 use modalcast_model::backend_settings::{BackendSettings, RasterPolicy};
 use modalcast_model::deform::Deformer as _;
 use modalcast_model::raster::{RasterGeometry, Rasterizer};
@@ -15,7 +16,8 @@ use modalcast_model::scene::{
     ShadowSettings,
 };
 use modalcast_render::{
-    FrameImage, FrameParams, MAX_FRAMES_IN_FLIGHT, MappedPixels, RasterBackend, RasterBackends, VisibilityId,
+    FrameImage, FrameParams, MAX_FRAMES_IN_FLIGHT, MappedPixels, RasterBackend, RasterBackends, RenderStage,
+    VisibilityId,
 };
 
 use crate::common::exact_triangle::{ExactTriangle, compare_ids};
@@ -329,6 +331,105 @@ fn gpu_cuda_frames_in_flight_keep_their_step() {
         assert!(got.expect("expected a frame").rgba == want.rgba, "frame {frame}");
     }
     context.unload_scene(loaded_scene);
+}
+
+/// Each step is computed together with the next one, and so are its samples. Sometimes another step follows, and some
+/// steps are drawn from two cameras.
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_cuda_frames_of_steps_ahead_keep_their_step() {
+    let scene = scenes::random_scene(
+        &[(3000, 12), (700, 3)],
+        scenes::RandomSceneOptions { instances: 5, normal_maps: false, rigid_transforms: false },
+    );
+    let states: Vec<SceneState> = (0..6).map(|seed| scenes::random_state(&scene, seed)).collect();
+    let want = draw_states(&scene, RasterPolicy::Cuda, &states);
+    assert!(want.windows(2).all(|pair| pair[0].rgba != pair[1].rgba), "expected different images of different states");
+    let (mut context, cuda_scene) = (open_device(), with_one_sample(&scene));
+    let camera = Camera::fit_to_scene(&cuda_scene, SIZE[0], SIZE[1]);
+    let other_camera = Camera::fit_to_scene(&cuda_scene, SIZE[1], SIZE[1]);
+    let mut loaded_scene = context
+        .load_scene(&cuda_scene, BackendSettings { raster: RasterPolicy::Cuda, ..BackendSettings::default() })
+        .expect("expected the scene to load");
+    let shared_states: Vec<Arc<SceneState>> = states.iter().cloned().map(Arc::new).collect();
+    let mut in_flight = std::collections::VecDeque::new();
+    let mut shared_frames = 0;
+    for step in 0..120 {
+        let announced = if step % 7 == 3 { step + 2 } else { step + 1 };
+        let next = &shared_states[announced % states.len()];
+        loaded_scene
+            .deform_with_next(&shared_states[step % states.len()], Some(next))
+            .expect("expected the step to succeed");
+        if step % 11 == 5 {
+            let size = FrameSize::new(SIZE[1], SIZE[1]);
+            context.draw(&mut loaded_scene, &other_camera, size).expect("expected a frame");
+        }
+        let frame =
+            context.begin_draw(&mut loaded_scene, &camera, FrameSize::new(SIZE[0], SIZE[1]), FrameStyle::default());
+        in_flight.push_back((step, frame.expect("expected the frame to start")));
+        if in_flight.len() == MAX_FRAMES_IN_FLIGHT || step == 119 {
+            for (step, frame) in in_flight.drain(..) {
+                let image = context.finish_draw(frame).map(MappedPixels::into_image).expect("expected a frame");
+                assert!(image.rgba == want[step % states.len()].rgba, "step {step}");
+                shared_frames += usize::from(image.times.stage(RenderStage::Switch).is_some());
+            }
+        }
+    }
+    eprintln!("{shared_frames} of 120 frames in shared memory");
+    assert_eq!(shared_frames, 120, "expected samples in shared memory");
+    context.unload_scene(loaded_scene);
+}
+
+/// Samples in shared memory give the frame of mapped samples. Samples of another camera are not used.
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_frames_of_shared_samples_equal_frames_of_mapped_samples() {
+    let device = Device::open(0).expect("expected a CUDA device");
+    let mut renderer = Exclusive::renderer();
+    let memory = CudaPictureMemory::new(&device).expect("expected a copy stream");
+    renderer.share_pictures(Rc::new(memory)).expect("expected no lost device");
+    for (name, scene, state) in scenes_and_states() {
+        let scene = with_one_sample(&scene);
+        let mut buffers = renderer.load(&scene).expect("expected the scene to load");
+        let options = CudaDeformerOptions::with_bounding_axes(scene.light_axes());
+        let mut deformer = CudaDeformer::new(&device, &scene, Some(buffers.vertex_buffers()), options)
+            .expect("expected a CUDA deformer");
+        let create_rasterizer =
+            |mesh: RasterGeometry| Ok(Box::new(CudaRasterizer::new(&device, mesh)?) as Box<dyn Rasterizer>);
+        renderer.attach_rasterizer(&mut buffers, create_rasterizer).expect("expected a rasterizer");
+        let summary = deformer.deform(&state).expect("expected the step to succeed");
+        let positions = deformer.shared_positions().expect("expected positions in shared memory");
+        let params = |camera| FrameParams {
+            camera,
+            width: SIZE[0],
+            height: SIZE[1],
+            bounds: summary.bounds,
+            light_bounds: summary.oriented_bounds,
+            edges: None,
+            samples: None,
+        };
+        let camera = Camera::fit_to_scene(&scene, SIZE[0], SIZE[1]);
+        let other_camera = camera.relative_to([0.3, 0.0, 0.0]);
+        deformer.fill_gl_buffers().expect("expected filled buffers");
+        let mut draw = |rasterized: Option<Camera>| {
+            if let Some(camera) = rasterized {
+                let rasterized = renderer.rasterize(&buffers, &params(camera), positions.clone(), || Ok(None));
+                rasterized.expect("expected samples");
+            }
+            let image = renderer.draw(&buffers, &params(camera)).expect("expected a frame");
+            assert_eq!(image.info.raster_backends, CUDA_BACKENDS, "{name}");
+            (image.rgba, image.times.stage(RenderStage::Switch).is_some())
+        };
+        let (mapped, is_shared) = draw(None);
+        assert!(!is_shared, "{name}");
+        assert!(draw(Some(camera)) == (mapped.clone(), true), "{name}: expected the same frame in shared memory");
+        assert!(
+            draw(Some(other_camera)) == (mapped, false),
+            "{name}: expected a frame without the other camera's samples"
+        );
+        drop(deformer);
+        renderer.unload(buffers);
+    }
 }
 
 /// A part of the soup lies below the ground.

@@ -346,7 +346,7 @@ impl DeviceLoop {
             Command::Deform { id, state, next, reply } => {
                 // The GPU changes to the context of CUDA once for both.
                 self.context.start_encodings();
-                let deformed = self.scene(id).and_then(|scene| scene.deform_shared(&state, next.as_ref()));
+                let deformed = self.scene(id).and_then(|scene| scene.deform_with_next(&state, next.as_ref()));
                 answer(reply, self.loss.record_loss(deformed));
             }
             Command::UnloadScene { id, reply } => {

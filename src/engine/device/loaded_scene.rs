@@ -11,7 +11,7 @@ use super::scalar_field;
 use crate::engine::output::step_output::FrameOutput;
 use crate::frame::{Legend, encode_png};
 use crate::telemetry::ms_since;
-use modalcast_model::deform::{DeformSummary, DeformedSurface, Deformer, VertexAttributes, VertexReadback};
+use modalcast_model::deform::{DeformSummary, DeformedSurface, Deformer, StepAhead, VertexAttributes, VertexReadback};
 use modalcast_model::error::{Error, Result, fault, invalid};
 use modalcast_model::fault_injection::{self, InjectionPoint};
 use modalcast_model::raster::{RasterGeometry, Rasterizer};
@@ -133,12 +133,15 @@ impl LoadedScene {
     /// # Errors
     /// `Invalid` naming the domain whose vertices overflow; `Fault` of the device.
     pub fn deform(&mut self, state: &SceneState) -> Result<DeformSummary> {
-        self.deform_shared(&Arc::new(state.clone()), None)
+        self.deform_with_next(&Arc::new(state.clone()), None)
     }
 
     /// [`Self::deform`] of a shared state, without a copy. `next` is the state that will probably follow
     /// ([`Deformer::deform_with_next`]).
-    pub(in crate::engine) fn deform_shared(
+    ///
+    /// # Errors
+    /// As [`Self::deform`].
+    pub fn deform_with_next(
         &mut self,
         state: &Arc<SceneState>,
         next: Option<&Arc<SceneState>>,
@@ -188,21 +191,48 @@ impl LoadedScene {
     ) -> Result<BufferContents> {
         let is_uploaded = self.fill_without_rebase(renderer)?;
         let Some(buffers) = &mut self.buffers else { return Err(no_buffers_error()) };
-        let origins = match &self.current_state.origins {
-            Some(origins) if !origins.has_no_outliers() => Arc::clone(origins),
-            // All domains have the same origin (the scene's origin if `None`), so the deformer's output is drawn
-            // unchanged.
-            uniform_origins => {
-                buffers.set_shared_origin(uniform_origins.as_ref().map_or([0.0; 3], |origins| origins.shared_origin()));
-                buffers.set_step(self.generation);
-                return Ok(BufferContents { bounds: self.bounds, light_bounds: self.light_bounds, is_uploaded });
-            }
-        };
+        if let Some(origin) = uniform_origin(&self.current_state) {
+            buffers.set_shared_origin(origin);
+            buffers.set_step(self.generation);
+            return Ok(BufferContents { bounds: self.bounds, light_bounds: self.light_bounds, is_uploaded });
+        }
+        let Some(origins) = self.current_state.origins.clone() else { return Err(no_buffers_error()) };
         let camera_origin = self.scene.origin_grids.snap(camera.eye().into());
         let positions = &self.deformer.surface_with(VertexAttributes::POSITIONS_AND_NORMALS)?.positions;
         let (positions, bounds) = origins.rebase_positions(camera_origin, &self.scene, positions);
         renderer.upload_rebased(buffers, &positions, camera_origin)?;
         Ok(BufferContents { bounds, light_bounds: None, is_uploaded: true })
+    }
+
+    /// Draws the passes of the compute rasterizer for the next frame before OpenGL gets commands, if the positions are in
+    /// shared memory. Also draws those of the step that the deformer has computed ahead, for the same camera. The frame must
+    /// follow with the same parameters.
+    pub(in crate::engine) fn rasterize(
+        &mut self,
+        renderer: &mut Renderer,
+        camera: &Camera,
+        size: FrameSize,
+    ) -> Result<()> {
+        let (Some(buffers), Some(origin)) = (&mut self.buffers, uniform_origin(&self.current_state)) else {
+            return Ok(());
+        };
+        if !buffers.has_compute_rasterizer() {
+            return Ok(());
+        }
+        let Some(positions) = self.deformer.shared_positions() else { return Ok(()) };
+        buffers.set_shared_origin(origin);
+        buffers.set_step(self.generation);
+        let contents = BufferContents { bounds: self.bounds, light_bounds: self.light_bounds, is_uploaded: false };
+        let deformer = &mut self.deformer;
+        let ahead = || {
+            let ahead = deformer.step_ahead()?;
+            let ahead = ahead.filter(|step| uniform_origin(&step.state) == Some(origin) && is_in_range(&step.bounds));
+            Ok(ahead.map(|StepAhead { positions, bounds, oriented_bounds: light_bounds, .. }| {
+                let contents = BufferContents { bounds, light_bounds, is_uploaded: false };
+                (contents.frame_params(*camera, size), positions)
+            }))
+        };
+        renderer.rasterize(buffers, &contents.frame_params(*camera, size), positions, ahead)
     }
 
     /// Starts copying attributes of the last deformation to host memory. The copy overlaps with the next deformation.
@@ -367,6 +397,15 @@ impl LoadedScene {
         let name = &scene.domains[domain].name;
         let given = format!("vertex {vertex} of domain '{name}' out of range, largest |q| {max_q:e}");
         Ok(invalid("step.q", format!("q and transform that keep every vertex within {MAX_COORDINATE:e}"), given))
+    }
+}
+
+/// The origin of all domains: the scene's origin, or one floating origin. The deformer's output is then drawn unchanged.
+/// `None` if the domains have different origins.
+fn uniform_origin(state: &SceneState) -> Option<[f64; 3]> {
+    match &state.origins {
+        Some(origins) => origins.has_no_outliers().then(|| origins.shared_origin()),
+        None => Some([0.0; 3]),
     }
 }
 

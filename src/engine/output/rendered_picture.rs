@@ -105,6 +105,7 @@ fn shared_bytes(rgba: FramePixels) -> Bytes {
 fn stage_times(times: &FrameTimes) -> StageTimes {
     let stage_of_key = |key: TimeKey| match key {
         TimeKey::Stage(RenderStage::Upload) => Some(Stage::Upload),
+        TimeKey::Stage(RenderStage::Switch) => Some(Stage::Switch),
         TimeKey::Stage(RenderStage::Shadow) => Some(Stage::Shadow),
         TimeKey::Stage(RenderStage::Draw) => Some(Stage::Draw),
         TimeKey::Stage(RenderStage::Read) => Some(Stage::Read),

@@ -2,10 +2,13 @@
 //! the depth of a pixel.
 
 use super::recorder::{FrameContext, PassRecorder};
+use crate::device::gl::MemoryBarriers;
 use crate::layout::{TILE, WORDS_BINDING};
 use crate::pass::Pass;
 use crate::resources::compute_rasterizer::{ComputeRasterizer, RasterPasses};
-use crate::types::RasterBackend;
+use crate::resources::scene_buffers::SceneBuffers;
+use crate::resources::shared_targets::RasterViews;
+use crate::types::{FrameParams, RasterBackend};
 use crate::uniforms::frame::{clip_from_positions, shadow_clip_from_positions};
 use modalcast_model::error::{Result, fault_in};
 use modalcast_model::scene::Viewport;
@@ -20,28 +23,50 @@ impl RasterPasses {
     }
 }
 
-/// Draws the selected passes of a frame with the compute rasterizer.
-pub(crate) fn draw(
-    recorder: &mut PassRecorder<'_>,
-    frame: &FrameContext<'_>,
-    compute_rasterizer: &ComputeRasterizer,
-    passes: RasterPasses,
-) -> Result<()> {
-    let FrameContext { buffers, params, .. } = *frame;
+/// What the compute rasterizer draws for the selected passes of a frame.
+///
+/// # Errors
+/// `Invalid` if a side of the frame is out of range.
+pub(crate) fn views(buffers: &SceneBuffers, params: &FrameParams, passes: RasterPasses) -> Result<RasterViews> {
     let (scene, look, origin) = (&buffers.scene, &buffers.look, buffers.origin);
     // Without a shadow map, the size is not used.
     let map_size = look.shadow.map_or(1, |shadow| shadow.size);
-    let shadow_viewport = match passes.shadow {
+    let shadow = match passes.shadow {
         true => Some(Viewport::new(&shadow_clip_from_positions(scene, look, params, origin), map_size, map_size)?),
         false => None,
     };
-    let frame_viewport = Viewport::new(&clip_from_positions(scene, params, origin), params.width, params.height)?;
+    let frame = match passes.visibility {
+        true => Some(Viewport::new(&clip_from_positions(scene, params, origin), params.width, params.height)?),
+        false => None,
+    };
+    Ok(RasterViews { shadow, frame })
+}
+
+/// Draws the selected passes of a frame with the compute rasterizer into mapped buffers.
+pub(crate) fn draw(
+    recorder: &mut PassRecorder<'_>,
+    compute_rasterizer: &ComputeRasterizer,
+    passes: RasterPasses,
+    views: &RasterViews,
+) -> Result<()> {
     recorder.begin(passes.stats_pass());
-    compute_rasterizer.draw(recorder.gl, shadow_viewport.as_ref(), passes.visibility.then_some(&frame_viewport))?;
+    compute_rasterizer.draw(recorder.gl, views)?;
+    record(recorder, passes);
+    Ok(())
+}
+
+/// Uses the selected passes of a frame that the compute rasterizer has drawn into shared memory.
+pub(crate) fn use_shared(recorder: &mut PassRecorder<'_>, passes: RasterPasses) {
+    recorder.begin(passes.stats_pass());
+    // OpenGL may hold older contents of the memory in its caches.
+    recorder.gl.barrier(MemoryBarriers::SHADER_STORAGE);
+    record(recorder, passes);
+}
+
+fn record(recorder: &mut PassRecorder<'_>, passes: RasterPasses) {
     recorder.add_to_stats(passes.stats_pass());
     recorder.stats.raster_backends.shadow = passes.shadow.then_some(RasterBackend::Cuda);
     recorder.stats.raster_backends.visibility = passes.visibility.then_some(RasterBackend::Cuda);
-    Ok(())
 }
 
 /// Converts the visibility keys to ids.

@@ -10,7 +10,7 @@ use super::Renderer;
 use super::pending_frame::{MappedPixels, PendingFrame};
 use crate::device::gl::ReadbackView;
 use crate::layout;
-use crate::pass::{FrameTimes, Pass};
+use crate::pass::{FrameTimes, Pass, RenderStage};
 use crate::resources::scene_buffers::SceneBuffers;
 use crate::types::{FrameImage, FrameInfo, FrameParams, FrameStats, RasterBackend};
 use modalcast_model::error::Result;
@@ -62,7 +62,7 @@ impl Renderer {
         fault_injection::check(InjectionPoint::Pixels)?;
         pending_frame.wait()?;
         let limit = pending_frame.time_left();
-        let PendingFrame { desc, readback, fence, passes, mut stats, info, .. } = pending_frame;
+        let PendingFrame { desc, readback, fence, passes, switch_ms, mut stats, info, .. } = pending_frame;
         let mut view = readback.map_or(Ok(None), |readback| readback.into_view(&fence, limit))?;
         let png = view.as_mut().and_then(ReadbackView::take_png);
         if let Some(view) = &mut view {
@@ -92,7 +92,10 @@ impl Renderer {
                 None => times.push((*pass, timer.ms())),
             }
         }
-        let times = FrameTimes::of_passes(&times);
+        let mut times = FrameTimes::of_passes(&times);
+        if let Some(ms) = switch_ms {
+            times.insert_first(RenderStage::Switch, ms);
+        }
         Ok(MappedPixels { width: desc.width, height: desc.height, view, png, times, info })
     }
 

@@ -6,6 +6,7 @@ mod frame_readback;
 mod partial_frame;
 mod pending_frame;
 mod preparation;
+mod shared_raster;
 
 #[cfg(test)]
 mod band_tests;
@@ -254,6 +255,9 @@ impl Renderer {
     pub fn upload(&mut self, buffers: &SceneBuffers, surface: &DeformedSurface) -> Result<()> {
         let _current = self.gl.make_current()?;
         buffers.shadow_cache.invalidate();
+        if let Some(rasterizer) = &buffers.compute_rasterizer {
+            rasterizer.release_shared(&self.gl)?;
+        }
         let geometry = &buffers.geometry;
         let attributes = [
             ("positions", Some(&geometry.positions), &surface.positions),

@@ -49,6 +49,8 @@ pub struct PartialFrame {
     info: FrameInfo,
     /// Submitted passes in execution order. A pass in bands has one entry for each band.
     timers: Vec<(Pass, PassTimer)>,
+    /// Milliseconds that the host waited for [`Renderer::rasterize`] beside its device time.
+    switch_ms: Option<f64>,
     /// Steps that are not submitted yet.
     steps: VecDeque<Step>,
     is_divided: bool,
@@ -180,6 +182,7 @@ impl Renderer {
             stats: FrameStats { samples: desc.samples, ..FrameStats::default() },
             info: frame_info(buffers, params, FrameAntialiasing { samples: desc.samples, ..antialiasing }),
             timers: Vec::new(),
+            switch_ms: None,
             is_divided,
             has_breaks: is_divided || !buffers.is_drawn_with(desc.samples),
             steps,
@@ -195,8 +198,9 @@ impl Renderer {
     /// `Fault` with the pass if OpenGL reports an error. The frame must then be dropped.
     pub fn submit_step(&mut self, buffers: &SceneBuffers, partial_frame: &mut PartialFrame) -> Result<()> {
         let _current = self.gl.make_current()?;
-        let PartialFrame { params, uniforms, target, programs, encode, readback, stats, timers, steps, .. } =
-            partial_frame;
+        let PartialFrame {
+            params, uniforms, target, programs, encode, readback, stats, timers, steps, switch_ms, ..
+        } = partial_frame;
         if let Some(readback) = readback {
             readback.collect(partial_frame.fence.as_ref(), self.frame_timeout)?;
         }
@@ -213,7 +217,9 @@ impl Renderer {
         let has_breaks = partial_frame.has_breaks;
         while let Some(step) = steps.pop_front() {
             match step {
-                Step::ComputeRaster => timers.extend(self.record_compute_raster(&mut recorder, &frame)?),
+                Step::ComputeRaster => {
+                    timers.extend(self.record_compute_raster(&mut recorder, &frame, switch_ms)?);
+                }
                 Step::Shadow => self.record_shadow(&mut recorder, &frame, timers)?,
                 Step::Cull if buffers.cull_resources.is_some() && buffers.visibility_rasterizer().is_none() => {
                     timers.push(self.time_pass(Pass::Cull, || passes::cull::cull_for_camera(&mut recorder, &frame))?);
@@ -233,6 +239,7 @@ impl Renderer {
         }
         if partial_frame.is_submitted() {
             buffers.mark_drawn_with(partial_frame.target.desc.samples);
+            buffers.compute_rasterizer.as_ref().map_or(Ok(()), |rasterizer| rasterizer.release_shared(&self.gl))?;
         }
         Ok(())
     }
@@ -246,7 +253,7 @@ impl Renderer {
             return Err(fault("draw", "expected a frame whose steps are all submitted"));
         }
         let _current = self.gl.make_current()?;
-        let PartialFrame { uniforms, mut target, readback, timers, stats, info, .. } = partial_frame;
+        let PartialFrame { uniforms, mut target, readback, timers, switch_ms, stats, info, .. } = partial_frame;
         let desc = target.desc;
         target.last_use = Instant::now();
         // A frame with an equal description may have been drawn between the steps of this one.
@@ -261,6 +268,7 @@ impl Renderer {
             readback,
             fence: self.gl.fence(Pass::Read.name())?,
             passes: timers,
+            switch_ms,
             stats,
             info,
             timeout: self.frame_timeout,
@@ -268,12 +276,13 @@ impl Renderer {
         })
     }
 
-    /// Draws the passes of the compute rasterizer. Returns no timer if there is none or it fails; OpenGL then draws
-    /// these passes in later steps.
+    /// Draws the passes of the compute rasterizer, unless [`Renderer::rasterize`] has drawn them. Returns no timer if there
+    /// is none or it fails; OpenGL then draws these passes in later steps.
     fn record_compute_raster(
         &self,
         recorder: &mut PassRecorder<'_>,
         frame: &FrameContext<'_>,
+        switch_ms: &mut Option<f64>,
     ) -> Result<Option<(Pass, PassTimer)>> {
         let buffers = frame.buffers;
         let Some((rasterizer, enabled)) = buffers.active_rasterizer() else { return Ok(None) };
@@ -282,7 +291,13 @@ impl Renderer {
         if !raster_passes.has_any() {
             return Ok(None);
         }
-        let draw = || passes::raster::draw(recorder, frame, rasterizer, raster_passes);
+        let views = passes::raster::views(buffers, frame.params, raster_passes)?;
+        if let Some(time) = rasterizer.shared_time(&self.gl, &views)? {
+            passes::raster::use_shared(recorder, raster_passes);
+            *switch_ms = Some(time.switch_ms);
+            return Ok(Some((raster_passes.stats_pass(), PassTimer::Wall(time.device_ms))));
+        }
+        let draw = || passes::raster::draw(recorder, rasterizer, raster_passes, &views);
         match self.time_pass(raster_passes.stats_pass(), draw) {
             Ok(timer) => Ok(Some(timer)),
             // OpenGL cannot draw on a lost device either.

@@ -25,6 +25,8 @@ pub struct PendingFrame {
     pub(super) fence: Fence,
     /// Passes in execution order, each with its timer.
     pub(super) passes: Vec<(Pass, PassTimer)>,
+    /// Milliseconds of [`RenderStage::Switch`]; `None` if nothing was rasterized in shared memory.
+    pub(super) switch_ms: Option<f64>,
     pub(super) stats: FrameStats,
     /// Without the rasterizers, which `stats` contains.
     pub(super) info: FrameInfo,

@@ -1,19 +1,22 @@
 //! A compute rasterizer that draws selected passes instead of OpenGL, and its output buffers.
 //!
-//! The compute rasterizer writes into OpenGL buffers: depth for the blur, and visibility keys, which a compute pass
-//! converts to ids. A key is the triangle and the depth of a pixel. All later passes are the same as with OpenGL. A
-//! scene has these resources only if its backend settings select a compute rasterizer.
+//! The compute rasterizer writes depth for the blur, and visibility keys, which a compute pass converts to ids. A key is
+//! the triangle and the depth of a pixel. It writes into shared memory ([`SharedTargets`]), or into OpenGL buffers that it
+//! maps. All later passes are the same as with OpenGL. A scene has these resources only if its backend settings select a
+//! compute rasterizer.
 
-use std::cell::{Cell, Ref, RefCell};
+use std::cell::{Cell, RefCell};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::rc::Rc;
+use std::time::Duration;
 
 use super::programs::ProgramCompiler;
+use super::shared_targets::{KEY_BYTES, RasterViews, SharedDrawTime, SharedTargets, StepViews};
 use crate::device::gl::{self, Buffer, Gl, Program};
 use crate::shaders::ShaderOptions;
 use modalcast_model::error::{Error, Result, fault};
 use modalcast_model::raster::{GlBuffer, Rasterizer};
-use modalcast_model::scene::{Scene, Viewport};
+use modalcast_model::scene::Scene;
 
 /// The passes that a compute rasterizer draws.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -29,10 +32,12 @@ pub(crate) struct ComputeRasterizer {
     rasterizer: RefCell<Box<dyn Rasterizer>>,
     outputs: RasterOutputs,
     enabled: Cell<RasterPasses>,
+    /// `None` after an error; the rasterizer then maps OpenGL's buffers.
+    shared: RefCell<Option<SharedTargets>>,
 }
 
-/// Output buffers of a compute rasterizer, and the programs that read them. An output is absent if the compute
-/// rasterizer does not support its pass.
+/// Output buffers of a compute rasterizer that maps them, and the programs that read the output. An output is absent if
+/// the compute rasterizer does not support its pass.
 #[derive(Debug)]
 pub(crate) struct RasterOutputs {
     shadow: Option<ShadowDepths>,
@@ -42,22 +47,22 @@ pub(crate) struct RasterOutputs {
 /// Depth of the shadow map.
 #[derive(Debug)]
 struct ShadowDepths {
-    buffer: Buffer,
-    /// The program of the first blur pass, which reads `buffer`.
+    buffer: OutputBuffer,
+    /// The program of the first blur pass, which reads the depth from a buffer.
     blur: Rc<Program>,
 }
 
 /// Visibility keys of a frame.
 #[derive(Debug)]
 struct VisibilityKeys {
-    /// Sized for the largest frame so far; none before the first frame.
-    buffer: RefCell<Option<Buffer>>,
+    buffer: OutputBuffer,
     /// The program that converts keys to ids.
     unpack: Rc<Program>,
 }
 
-/// Bytes of a key: a word of the triangle's index, and a word of the inverted bits of the depth.
-const KEY_BYTES: u64 = 8;
+/// A buffer that the rasterizer maps. Sized for the largest frame so far; none before the first one.
+#[derive(Debug, Default)]
+struct OutputBuffer(RefCell<Option<Buffer>>);
 
 impl RasterPasses {
     pub(crate) const NONE: Self = Self { shadow: false, visibility: false };
@@ -86,23 +91,18 @@ impl RasterPasses {
 }
 
 impl RasterOutputs {
-    /// Creates the outputs of the passes. `options` are the shader options of the scene.
+    /// The outputs of the passes. Their buffers are allocated when they are drawn. `options` are the shader options of the scene.
     pub(crate) fn new(
-        gl: &Rc<Gl>,
         passes: RasterPasses,
         options: &ShaderOptions,
         compile: &mut ProgramCompiler<'_>,
     ) -> Result<Self> {
-        let map_size = options.features.shadow.map_or(0, |shadow| u64::from(shadow.size));
         let shadow = match options.blur_from_buffer().filter(|_| passes.shadow) {
-            Some(source) => {
-                let buffer = gl.buffer(4 * map_size * map_size, gl::STREAM_COPY, None)?;
-                Some(ShadowDepths { buffer, blur: compile(source)? })
-            }
+            Some(source) => Some(ShadowDepths { buffer: OutputBuffer::default(), blur: compile(source)? }),
             None => None,
         };
         let visibility = match passes.visibility {
-            true => Some(VisibilityKeys { buffer: RefCell::default(), unpack: compile(options.unpack())? }),
+            true => Some(VisibilityKeys { buffer: OutputBuffer::default(), unpack: compile(options.unpack())? }),
             false => None,
         };
         Ok(Self { shadow, visibility })
@@ -118,7 +118,8 @@ impl ComputeRasterizer {
     /// Enables all passes that have an output.
     pub(crate) fn new(rasterizer: Box<dyn Rasterizer>, outputs: RasterOutputs) -> Self {
         let enabled = Cell::new(outputs.passes());
-        Self { rasterizer: RefCell::new(rasterizer), outputs, enabled }
+        let shared = RefCell::new(Some(SharedTargets::default()));
+        Self { rasterizer: RefCell::new(rasterizer), outputs, enabled, shared }
     }
 
     /// Passes that the compute rasterizer draws at present.
@@ -137,67 +138,110 @@ impl ComputeRasterizer {
         self.enabled.set(RasterPasses::NONE);
     }
 
-    /// Draws the depth of the shadow map, the visibility of the frame, or both.
+    /// Draws the depth of the shadow map, the visibility of the frame, or both, into mapped buffers.
     ///
     /// # Errors
-    /// Errors of the rasterizer; `Fault` if the rasterizer panics or OpenGL has no memory for the keys.
-    pub(crate) fn draw(
-        &self,
-        gl: &Rc<Gl>,
-        shadow_viewport: Option<&Viewport>,
-        frame_viewport: Option<&Viewport>,
-    ) -> Result<()> {
-        let depths = self
-            .outputs
-            .shadow
-            .as_ref()
-            .zip(shadow_viewport)
-            .map(|(depths, shadow_viewport)| (shadow_viewport, depths.buffer.shared()));
-        let keys = match self.outputs.visibility.as_ref().zip(frame_viewport) {
-            Some((keys, frame_viewport)) => {
-                Some((frame_viewport, keys.reserve(gl, KEY_BYTES * frame_viewport.pixel_count() as u64)?))
+    /// Errors of the rasterizer; `Fault` if the rasterizer panics or OpenGL has no memory for the output.
+    pub(crate) fn draw(&self, gl: &Rc<Gl>, views: &RasterViews) -> Result<()> {
+        let depths = match self.outputs.shadow.as_ref().zip(views.shadow.as_ref()) {
+            Some((depths, viewport)) => Some((viewport, depths.buffer.reserve(gl, 4 * viewport.pixel_count() as u64)?)),
+            None => None,
+        };
+        let keys = match self.outputs.visibility.as_ref().zip(views.frame.as_ref()) {
+            Some((keys, viewport)) => {
+                Some((viewport, keys.buffer.reserve(gl, KEY_BYTES * viewport.pixel_count() as u64)?))
             }
             None => None,
         };
         // `Rasterizer::draw` borrows the handles.
-        let depths = depths.as_ref().map(|(shadow_viewport, buffer)| (*shadow_viewport, buffer));
-        let keys = keys.as_ref().map(|(frame_viewport, buffer)| (*frame_viewport, buffer));
-        // A panic is converted to an error, so that the caller disables the rasterizer and draws this frame with
-        // OpenGL.
-        catch_unwind(AssertUnwindSafe(|| self.rasterizer.borrow_mut().draw(depths, keys)))
+        let depths = depths.as_ref().map(|(viewport, buffer)| (*viewport, buffer));
+        let keys = keys.as_ref().map(|(viewport, buffer)| (*viewport, buffer));
+        self.run(|rasterizer| rasterizer.draw(depths, keys))
+    }
+
+    /// Draws into shared memory, and makes the result the input of the next frame ([`SharedTargets::draw`]). After an
+    /// error, the rasterizer maps OpenGL's buffers instead, in this and all later frames.
+    ///
+    /// # Errors
+    /// `DeviceLost`.
+    pub(crate) fn draw_shared(
+        &self,
+        gl: &Rc<Gl>,
+        step: StepViews,
+        ahead: impl FnOnce() -> Result<Option<StepViews>>,
+        limit: Duration,
+    ) -> Result<()> {
+        let mut shared = self.shared.borrow_mut();
+        let Some(targets) = shared.as_mut() else { return Ok(()) };
+        match self.run(|rasterizer| targets.draw(gl, rasterizer, step, ahead, limit)) {
+            Ok(()) => Ok(()),
+            Err(lost) if lost.is_loss() => Err(lost),
+            Err(error) => {
+                tracing::warn!(%error, "the compute rasterizer maps OpenGL's buffers: it cannot share memory");
+                *shared = None;
+                Ok(())
+            }
+        }
+    }
+
+    /// The time of the views in shared memory if they are the input of the present frame. Otherwise they must be drawn
+    /// into mapped buffers.
+    pub(crate) fn shared_time(&self, gl: &Rc<Gl>, views: &RasterViews) -> Result<Option<SharedDrawTime>> {
+        self.shared.borrow_mut().as_mut().map_or(Ok(None), |targets| targets.time_of(gl, views))
+    }
+
+    /// Ends the use of shared memory by the present frame, after all its commands.
+    pub(crate) fn release_shared(&self, gl: &Rc<Gl>) -> Result<()> {
+        self.shared.borrow_mut().as_mut().map_or(Ok(()), |targets| targets.release(gl))
+    }
+
+    /// Runs the rasterizer. A panic becomes an error, so that the caller disables the rasterizer and draws this frame in
+    /// another way.
+    fn run<T>(&self, work: impl FnOnce(&mut dyn Rasterizer) -> Result<T>) -> Result<T> {
+        catch_unwind(AssertUnwindSafe(|| work(self.rasterizer.borrow_mut().as_mut())))
             .unwrap_or_else(|_| Err(fault("rasterize", "the compute rasterizer panicked")))
     }
 
-    /// Input buffer and program of the first blur pass; none without shadow output.
-    pub(crate) fn blur_input(&self) -> Option<(&Buffer, &Program)> {
-        self.outputs.shadow.as_ref().map(|depths| (&depths.buffer, depths.blur.as_ref()))
+    /// Depths of the present frame and the program of the first blur pass; none without shadow output.
+    pub(crate) fn blur_input(&self) -> Option<(Buffer, &Program)> {
+        let depths = self.outputs.shadow.as_ref()?;
+        let shared = self.shared.borrow().as_ref().and_then(|targets| targets.depths().map(Buffer::alias));
+        Some((shared.or_else(|| depths.buffer.alias())?, depths.blur.as_ref()))
     }
 
-    /// Keys of the last frame and the program that converts them; none before the first visibility pass.
-    pub(crate) fn unpack_input(&self) -> Option<(Ref<'_, Buffer>, &Program)> {
+    /// Keys of the present frame and the program that converts them; none before the first visibility pass.
+    pub(crate) fn unpack_input(&self) -> Option<(Buffer, &Program)> {
         let keys = self.outputs.visibility.as_ref()?;
-        let buffer = Ref::filter_map(keys.buffer.borrow(), Option::as_ref).ok()?;
-        Some((buffer, keys.unpack.as_ref()))
+        let shared = self.shared.borrow().as_ref().and_then(|targets| targets.keys().map(Buffer::alias));
+        Some((shared.or_else(|| keys.buffer.alias())?, keys.unpack.as_ref()))
     }
 
-    /// Name and bytes of each buffer.
+    /// Name and bytes of each kind of buffers.
     pub(crate) fn allocations(&self) -> impl Iterator<Item = (&'static str, u64)> {
-        let keys =
-            self.outputs.visibility.as_ref().and_then(|keys| keys.buffer.borrow().as_ref().map(|buffer| buffer.bytes));
-        let depths = self.outputs.shadow.as_ref().map(|depths| depths.buffer.bytes);
-        [("raster shadow depths", depths), ("raster visibility keys", keys)]
-            .into_iter()
-            .filter_map(|(name, bytes)| Some((name, bytes?)))
+        let RasterOutputs { shadow, visibility } = &self.outputs;
+        let mapped = [shadow.as_ref().map(|depths| &depths.buffer), visibility.as_ref().map(|keys| &keys.buffer)].map(
+            |buffer| {
+                buffer.and_then(|buffer| buffer.0.borrow().as_ref().map(|buffer| buffer.bytes)).unwrap_or_default()
+            },
+        );
+        let shared = self.shared.borrow().as_ref().map_or([0, 0], SharedTargets::bytes);
+        let bytes = [0, 1].map(|index| mapped[index] + shared[index]);
+        ["raster shadow depths", "raster visibility keys"].into_iter().zip(bytes).filter(|(_, bytes)| *bytes > 0)
     }
 }
 
-impl VisibilityKeys {
+impl OutputBuffer {
     /// Returns a handle to the buffer. Reallocates the buffer if it is smaller than `bytes`.
     fn reserve(&self, gl: &Rc<Gl>, bytes: u64) -> Result<GlBuffer> {
-        let mut buffer = self.buffer.borrow_mut();
+        let mut buffer = self.0.borrow_mut();
         match buffer.take().filter(|buffer| buffer.bytes >= bytes) {
             Some(reusable_buffer) => Ok(buffer.insert(reusable_buffer).shared()),
             None => Ok(buffer.insert(gl.buffer(bytes, gl::STREAM_COPY, None)?).shared()),
         }
+    }
+
+    /// Another owner of the buffer; none before the first frame.
+    fn alias(&self) -> Option<Buffer> {
+        self.0.borrow().as_ref().map(Buffer::alias)
     }
 }

@@ -9,6 +9,7 @@ mod raster_mesh;
 pub(crate) mod scene_buffers;
 pub(crate) mod shadow_cache;
 pub(crate) mod shadow_map;
+pub(crate) mod shared_targets;
 pub(crate) mod shared_vertices;
 pub(crate) mod target;
 pub(crate) mod target_desc;

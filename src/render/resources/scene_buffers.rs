@@ -416,7 +416,7 @@ impl SceneBuffers {
         if !supported.has_any() {
             return Ok(());
         }
-        let outputs = RasterOutputs::new(gl, supported, &self.options, compile)?;
+        let outputs = RasterOutputs::new(supported, &self.options, compile)?;
         let passes = outputs.passes();
         let positions = self.geometry.positions.shared();
         let mut rasterizer =
@@ -432,6 +432,11 @@ impl SceneBuffers {
         let compute_rasterizer = self.compute_rasterizer.as_ref().filter(|_| self.rebased.is_none())?;
         let enabled = compute_rasterizer.enabled();
         enabled.has_any().then_some((compute_rasterizer, enabled))
+    }
+
+    /// Whether a compute rasterizer is attached. It may draw no passes.
+    pub const fn has_compute_rasterizer(&self) -> bool {
+        self.compute_rasterizer.is_some()
     }
 
     /// The compute rasterizer if it draws the depth of the shadow map.

@@ -9,6 +9,7 @@
 //! between the contexts of OpenGL and CUDA takes 0.2 ms. The second one, the step ahead, is shown when its state is deformed.
 
 use std::collections::VecDeque;
+use std::rc::Rc;
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -29,10 +30,13 @@ use crate::gpu::tables::change_list::{ChangeListLengths, ChangedDomains, max_cha
 use crate::gpu::tables::device_tables::{CudaDeformerOptions, DeviceTables};
 use crate::gpu::tables::layout::StepHeader;
 use crate::gpu::tables::plan::{BufferRole, DeformPlan, plan_from_tables};
-use modalcast_model::deform::{Backend, DeformSummary, DeformedSurface, Deformer, VertexAttributes, VertexReadback};
+use modalcast_model::deform::{
+    Backend, DeformSummary, DeformedSurface, Deformer, StepAhead, VertexAttributes, VertexReadback,
+};
 use modalcast_model::error::{Error, Result, fault};
 use modalcast_model::raster::GlVertexBuffers;
 use modalcast_model::scene::{DirtyDomains, Scene, SceneState};
+use modalcast_model::shared_memory::SharedPositions;
 
 /// Maximum number of steps in flight.
 pub const MAX_STEPS_IN_FLIGHT: usize = 2;
@@ -70,6 +74,8 @@ pub struct CudaDeformer {
     shown_slot: usize,
     /// The state of the newest step in flight, if that is a step ahead.
     ahead: Option<Arc<SceneState>>,
+    /// Number of steps that were started, including steps ahead.
+    started_steps: u64,
     readbacks: ReadbackPool,
     /// The readback of the last step and the attributes it copies; `None` after the next step is submitted.
     readback: Option<(VertexAttributes, VertexReadback)>,
@@ -165,6 +171,7 @@ impl CudaDeformer {
             in_flight: VecDeque::new(),
             shown_slot: 0,
             ahead: None,
+            started_steps: 0,
             readbacks: ReadbackPool::default(),
             readback: None,
             surface: PinnedSurface::empty(),
@@ -355,6 +362,7 @@ impl CudaDeformer {
         }
         self.gl_buffers_are_current = fills_gl_buffers;
         self.output_ring.end_step(state);
+        self.started_steps += 1;
         Ok(Some(StepInFlight { slot: slot_index, submitted, ms_before_begin }))
     }
 
@@ -496,6 +504,23 @@ impl Deformer for CudaDeformer {
             self.submit_ahead(next)?;
         }
         self.finish_shown()
+    }
+
+    fn shared_positions(&self) -> Option<SharedPositions> {
+        let range = self.output.shared_positions(&self.device, self.output_ring.shown_output()?)?;
+        // A step ahead was started after the one that is shown.
+        Some(SharedPositions { range: Rc::new(range), step: self.started_steps - u64::from(self.ahead.is_some()) })
+    }
+
+    fn step_ahead(&mut self) -> Result<Option<StepAhead>> {
+        let (Some(state), Some(step)) = (self.ahead.clone(), self.in_flight.back().copied()) else { return Ok(None) };
+        let newest_output = self.output_ring.newest_output();
+        let Some(range) = newest_output.and_then(|set| self.output.shared_positions(&self.device, set)) else {
+            return Ok(None);
+        };
+        let (bounds, oriented_bounds) = self.step_slots[step.slot].wait().inspect_err(|_| self.invalidate())?;
+        let positions = SharedPositions { range: Rc::new(range), step: self.started_steps };
+        Ok(Some(StepAhead { positions, bounds, oriented_bounds, state }))
     }
 
     fn fills_gl_buffers(&self) -> bool {

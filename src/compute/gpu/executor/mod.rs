@@ -9,7 +9,8 @@
 //! | `output_ring` | double buffering of the outputs: the output that a step writes, and its outdated domains |
 //! | `readback`, `pinned_surface` | asynchronous readback of vertices, concurrent with the next step |
 //! | `picture` | pictures that OpenGL draws and CUDA copies to the host |
-//! | `raster` | compute rasterizer, which draws into OpenGL's buffers |
+//! | `raster` | compute rasterizer, which draws into OpenGL's buffers or shared memory |
+//! | `shared_range` | ranges of memory that CUDA shares with OpenGL |
 //! | `png` | PNG encoder, from pixels in device memory to a file in pinned memory |
 //! | `layout_check` | check that host and device agree on struct layouts |
 
@@ -26,6 +27,7 @@ mod pinned_surface;
 pub(crate) mod png;
 pub(crate) mod raster;
 mod readback;
+mod shared_range;
 mod step_slot;
 
 pub use deformer::{CudaDeformer, MAX_STEPS_IN_FLIGHT, PreparedDeformer};

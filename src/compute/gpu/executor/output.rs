@@ -17,6 +17,7 @@ use cudarc::driver::{result, sys};
 
 use super::interop::{GlInterop, MapAccess, Mapping, RegisteredBuffer, with_mapped};
 use super::pinned_surface::SurfaceLists;
+use super::shared_range::CudaRange;
 use crate::gpu::launch::error::cuda_error;
 use crate::gpu::launch::{Device, DeviceBuffer, ExportedMemory, download};
 use crate::gpu::tables::plan::{BufferRole, DeformPlan};
@@ -70,7 +71,7 @@ enum SetMemory {
         _buffers: Vec<DeviceBuffer>,
     },
     /// Shared with OpenGL, which releases its reference first.
-    Shared { vertices: Box<dyn ImportedVertices>, _memory: ExportedMemory },
+    Shared { vertices: Box<dyn ImportedVertices>, memory: Rc<ExportedMemory> },
 }
 
 /// Bytes of positions, normals and tangents.
@@ -108,13 +109,22 @@ impl OutputSet {
         let addresses = OutputAddresses { positions, normals, tangents };
         let (descriptor, allocated_bytes) = (memory.export()?, memory.bytes() as u64);
         let vertices = importer.import(ExportedVertices { descriptor, allocated_bytes, ranges })?;
-        Ok(Self { addresses, sizes, memory: SetMemory::Shared { vertices, _memory: memory } })
+        Ok(Self { addresses, sizes, memory: SetMemory::Shared { vertices, memory: Rc::new(memory) } })
     }
 
     /// Address and bytes of each attribute that the scene has.
     fn attributes(&self) -> impl Iterator<Item = (u64, u64)> {
         let OutputAddresses { positions, normals, tangents } = self.addresses;
         [positions, normals, tangents].into_iter().zip(self.sizes).filter(|(_, bytes)| *bytes > 0)
+    }
+
+    /// The positions in shared memory.
+    fn shared_positions(&self, device: &Device) -> Option<CudaRange> {
+        match &self.memory {
+            SetMemory::Own { .. } => None,
+            // The positions are at the beginning.
+            SetMemory::Shared { memory, .. } => Some(CudaRange::new(device, memory, 0..self.sizes[0])),
+        }
     }
 
     /// OpenGL's side of shared memory.
@@ -285,6 +295,11 @@ impl OutputBuffers {
     pub(super) fn copy_by_gl(&self, set: usize) -> Result<()> {
         let missing_import = || fault("interop", "expected an output that OpenGL has imported, got none");
         self.sets[set].imported().ok_or_else(missing_import)?.copy_to_scene()
+    }
+
+    /// The positions of a set, if OpenGL has imported it.
+    pub(super) fn shared_positions(&self, device: &Device, set: usize) -> Option<CudaRange> {
+        self.sets[set].shared_positions(device)
     }
 
     /// Whether OpenGL still copies from a set.

@@ -193,6 +193,11 @@ impl OutputRing {
         (self.outputs[self.shown_index].shown_step > 0).then_some(self.shown_index)
     }
 
+    /// The output of the last step that began; `None` if that step failed.
+    pub(super) fn newest_output(&self) -> Option<usize> {
+        (self.outputs[self.current_output].shown_step > 0).then_some(self.current_output)
+    }
+
     /// Begins a readback of the output that is shown. Returns its number.
     pub(super) fn begin_read(&mut self) -> u64 {
         self.read_count += 1;

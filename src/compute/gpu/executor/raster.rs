@@ -12,7 +12,7 @@
 //! | `variant` | the variants of the kernels |
 //! | `check` | validation of meshes |
 //! | `cut_out` | texture coordinates, materials and images of cut-outs |
-//! | `cuda_rasterizer` | positions and samples in OpenGL's buffers |
+//! | `cuda_rasterizer` | positions and samples in OpenGL's buffers or in shared memory |
 
 mod check;
 mod cuda_rasterizer;

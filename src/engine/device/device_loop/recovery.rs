@@ -48,7 +48,7 @@ impl DeviceLoop {
         let count = scenes.len();
         for SceneToRestore { id, scene, state, backends } in scenes {
             let mut loaded_scene = self.context.load_scene(&scene, backends)?;
-            loaded_scene.deform_shared(&state, None)?;
+            loaded_scene.deform_with_next(&state, None)?;
             self.insert_scene(id, loaded_scene, backends);
         }
         Ok(count)

@@ -1,12 +1,21 @@
-//! The compute rasterizer on OpenGL's buffers. It can replace OpenGL's depth pass and id pass.
+//! The compute rasterizer on OpenGL's buffers, or on memory that OpenGL imports. It can replace OpenGL's depth pass and id
+//! pass.
 
+use std::rc::Rc;
 use std::sync::Arc;
 
+use cudarc::driver::CudaEvent;
+use cudarc::driver::sys::CUevent_flags;
+
 use super::super::interop::{GlInterop, MapAccess, Mapping, RegisteredBuffer, with_mapped};
+use super::super::shared_range::CudaRange;
 use super::{RasterFunctions, RasterPass, RasterPipeline, RasterVariant, check_cut_outs, check_mesh};
-use crate::gpu::launch::Device;
+use crate::gpu::launch::cleanup::WaitForStream;
+use crate::gpu::launch::error::cuda_error;
+use crate::gpu::launch::{Device, ExportedMemory};
 use modalcast_model::error::{Error, Result, fault};
-use modalcast_model::raster::{DrawTarget, GlBuffer, RasterGeometry, Rasterizer};
+use modalcast_model::fault_injection::{self, InjectionPoint};
+use modalcast_model::raster::{DrawTarget, GlBuffer, NewTarget, RasterGeometry, Rasterizer, SharedDraw};
 use modalcast_model::scene::{CullMode, DrawRange};
 
 /// Bytes of a vertex position.
@@ -21,6 +30,8 @@ pub struct CudaRasterizer {
     ids: PassState,
     interop: GlInterop,
     pipeline: RasterPipeline,
+    /// Begin and end of [`Rasterizer::draw_shared`]; `None` before the first call.
+    shared_draw_events: Option<[CudaEvent; 2]>,
     device: Arc<Device>,
 }
 
@@ -110,13 +121,14 @@ impl CudaRasterizer {
             ids: PassState::new(RasterVariant::default(), mesh.groups),
             interop,
             pipeline: RasterPipeline::new(device, &mesh.triangles, cut_outs.as_ref())?,
+            shared_draw_events: None,
             device: Arc::clone(device),
         })
     }
 
     /// Draws the depth pass, the id pass or both, with all buffers mapped together.
     fn draw_passes(&mut self, depth: Option<DrawTarget<'_>>, ids: Option<DrawTarget<'_>>) -> Result<()> {
-        let Self { positions, depth: depth_pass, ids: id_pass, interop, pipeline, device } = self;
+        let Self { positions, depth: depth_pass, ids: id_pass, interop, pipeline, device, .. } = self;
         let _current = device.enter()?;
         let mut prepared = Vec::new();
         for (pass_state, draw_target) in [(depth_pass, depth), (id_pass, ids)] {
@@ -149,6 +161,32 @@ impl CudaRasterizer {
     }
 }
 
+impl CudaRasterizer {
+    /// Submits the passes of one step, from and into shared memory.
+    fn submit_shared(&mut self, draw: &SharedDraw<'_>) -> Result<()> {
+        let Self { positions, depth, ids, pipeline, device, .. } = self;
+        let positions = CudaRange::address_of(draw.positions, device, positions.buffer().bytes)?;
+        for (pass_state, draw_target) in [(depth, draw.depth), (ids, draw.ids)] {
+            let Some((window, range)) = draw_target else { continue };
+            let target = CudaRange::address_of(range, device, pass_state.variant.bytes(window))?;
+            pass_state.ensure_compiled(device, pipeline)?;
+            let Some(functions) = &pass_state.functions else { continue };
+            let pass = RasterPass { functions, groups: &pass_state.groups, window, positions, target };
+            // SAFETY: `new` checked mesh and groups against the size of OpenGL's buffer of positions, and the shared
+            // positions have at least this size. The target has the bytes of the pass. `draw_shared` borrows the handles
+            // of both until the passes have ended.
+            unsafe { pipeline.draw(device, &pass) }?;
+        }
+        Ok(())
+    }
+}
+
+/// The two events of [`Rasterizer::draw_shared`], which record when they are reached.
+fn new_timed_events(device: &Device) -> Result<[CudaEvent; 2]> {
+    let new_event = || device.context().new_event(Some(CUevent_flags::CU_EVENT_DEFAULT)).map_err(cuda_error("raster"));
+    Ok([new_event()?, new_event()?])
+}
+
 impl Rasterizer for CudaRasterizer {
     /// Draws the requested passes. After a failure the targets are unregistered.
     fn draw(&mut self, depth: Option<DrawTarget<'_>>, ids: Option<DrawTarget<'_>>) -> Result<()> {
@@ -168,6 +206,36 @@ impl Rasterizer for CudaRasterizer {
             }
         }
         Ok(())
+    }
+
+    fn create_target(&mut self, bytes: u64) -> Result<NewTarget> {
+        let _current = self.device.enter()?;
+        let memory = Rc::new(ExportedMemory::new(&self.device, bytes as usize)?);
+        Ok(NewTarget {
+            descriptor: memory.export()?,
+            allocated_bytes: memory.bytes() as u64,
+            range: Rc::new(CudaRange::new(&self.device, &memory, 0..bytes)),
+        })
+    }
+
+    fn draw_shared(&mut self, draws: &[SharedDraw<'_>]) -> Result<f64> {
+        let device = Arc::clone(&self.device);
+        let _current = device.enter()?;
+        fault_injection::check(InjectionPoint::Interop)?;
+        let [begin, end] = match self.shared_draw_events.take() {
+            Some(events) => events,
+            None => new_timed_events(&device)?,
+        };
+        // Also waits if a draw fails or panics, because the caller may then free the memory.
+        let guard = WaitForStream::new(device.stream());
+        begin.record(device.stream()).map_err(cuda_error("raster"))?;
+        draws.iter().try_for_each(|draw| self.submit_shared(draw))?;
+        end.record(device.stream()).map_err(cuda_error("raster"))?;
+        end.synchronize().map_err(cuda_error("raster"))?;
+        guard.disarm();
+        let ms = begin.elapsed_ms(&end).map(f64::from).map_err(cuda_error("raster"))?;
+        self.shared_draw_events = Some([begin, end]);
+        Ok(ms)
     }
 }
 
