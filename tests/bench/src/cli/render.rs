@@ -64,9 +64,13 @@ pub(super) struct Args {
     /// triangles that fill the frame. Writes raster.json and raster.md. Needs an NVIDIA GPU.
     #[arg(long, conflicts_with_all = ["variants", "figures", "scenes"])]
     raster: bool,
+    /// Only measure steps per second with frames in flight by OpenGL's and the CUDA rasterizer, and steps that are not drawn,
+    /// on the loads and scenes. Writes pipeline.json. Needs an NVIDIA GPU.
+    #[arg(long, conflicts_with_all = ["variants", "figures", "raster"])]
+    pipeline: bool,
     /// A scene of your own, a path to a model or a scene folder; repeatable. With --figures, also draws a picture of
-    /// it. Without --figures, only its frame times are measured: times.json and a picture.
-    #[arg(long = "scene", value_name = "PATH", conflicts_with_all = ["loads", "variants", "quick"])]
+    /// it. Without --figures and --pipeline, only its frame times are measured: times.json and a picture.
+    #[arg(long = "scene", value_name = "PATH", conflicts_with_all = ["variants", "quick"])]
     scenes: Vec<String>,
 }
 
@@ -81,7 +85,13 @@ pub(super) fn run(args: &Args) -> Outcome {
     if args.figures {
         return run_figures(args);
     }
+    if args.pipeline {
+        return run_pipelines(args);
+    }
     if !args.scenes.is_empty() {
+        if !args.loads.is_empty() {
+            return Err(invalid("scene", "either --load or --scene, unless with --pipeline", "both"));
+        }
         return run_frame_times(args);
     }
     let options = report_options(args)?;
@@ -103,6 +113,22 @@ fn run_raster_comparison(args: &Args, options: &RenderReportOptions) -> Outcome 
     comparisons.frames.iter().for_each(|row| print_line(row.line()));
     print_line(format!("written to {}", args.out.display()));
     Ok(Completion::of_check(comparisons.passed()))
+}
+
+fn run_pipelines(args: &Args) -> Outcome {
+    let mut options = report_options(args)?;
+    if args.loads.is_empty() && !args.scenes.is_empty() {
+        options.loads.clear();
+    }
+    let report = with_spinner("measuring", || {
+        render::measure_pipelines(&options, &args.scenes, |what| tracing::info!(what, "measuring"))
+    })?;
+    report.write(&args.out)?;
+    report.rows.iter().for_each(|row| print_line(row.line()));
+    report.undrawn_steps.iter().for_each(|step| print_line(step.line()));
+    report.readback.iter().for_each(|rates| print_line(rates.line()));
+    print_line(format!("written to {}", args.out.display()));
+    Ok(Completion::Success)
 }
 
 fn run_figures(args: &Args) -> Outcome {
@@ -263,6 +289,7 @@ mod tests {
             replays: None,
             quick: true,
             figures: false,
+            pipeline: false,
             raster: false,
             scenes: vec![],
         }

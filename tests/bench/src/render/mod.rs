@@ -12,6 +12,7 @@
 //!   are cast by one ray per sample to the sun, or by rays that are distributed over the footprint of the blur.
 //! - `harness`, `light_meter`: draw and time frames of the renderer, and measure their sun visibility.
 //! - `readback`: frames per second when each frame is copied to the host.
+//! - `pipeline`: steps per second with frames in flight, as in the server, and steps that are not drawn.
 //! - [`metrics`]: errors, light bleeding, flicker.
 //! - `minimal_passes`: times of two passes of the scene stripped to its mesh: the depth of the shadow map, and the
 //!   visibility pass, which writes the depth and the id of the visible triangle of every sample.
@@ -40,6 +41,7 @@ pub mod metrics;
 mod minimal_passes;
 mod output;
 pub mod packing;
+mod pipeline;
 pub mod plants;
 mod plot;
 mod raster_comparison;
@@ -69,6 +71,7 @@ pub use self::harness::{PassTime, Size};
 pub use self::image_files::ImageFile;
 pub use self::measure::RenderRow;
 pub use self::minimal_passes::{FrameBaseline, MinimalPasses};
+pub use self::pipeline::{PipelineReport, measure_pipelines};
 use self::plants::PlantResult;
 pub use self::raster_comparison::RasterComparison;
 pub use self::raster_report::{RasterReport, compare_rasterizers};

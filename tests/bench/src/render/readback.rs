@@ -55,6 +55,17 @@ pub struct ReadbackRates {
     pub moving_ring_loss: f64,
 }
 
+impl ReadbackRates {
+    /// The results as one line of text.
+    pub fn line(&self) -> String {
+        let Self { load, unread_fps, ring_fps, ring_loss, moving_ring_loss, .. } = self;
+        format!(
+            "{load:<18}readback: {ring_fps:.1} frames/s of {unread_fps:.1} without it, loss {ring_loss:.1} %, \
+             {moving_ring_loss:.1} % with uploads"
+        )
+    }
+}
+
 /// Parameters and vertices of even and of odd frames.
 struct FrameSource {
     frame_params: [FrameParams; 2],

@@ -184,6 +184,19 @@ pub(super) fn swaying_state(scene: &Arc<Scene>) -> SceneState {
     state
 }
 
+/// States of a scene in a light wind.
+pub(super) fn moving_states(scene: &Arc<Scene>, count: usize) -> Vec<SceneState> {
+    let workload = Workload::new(scene.name.clone(), Arc::clone(scene));
+    let motion = WorkloadMotion::new(&workload, None);
+    let state_at = |step: usize| {
+        let mut state = SceneState::rest(scene);
+        add_sway(&mut state, &motion, step);
+        state.mark_all_dirty();
+        state
+    };
+    (0..count).map(state_at).collect()
+}
+
 /// Four corners, counter-clockwise, as two triangles.
 pub(super) fn quad(corners: [[f32; 3]; 4], normal: [f32; 3]) -> Result<Mesh> {
     Mesh::from_indexed(corners.to_vec(), vec![normal; 4], Vec::new(), vec![[0, 1, 2], [0, 2, 3]])
