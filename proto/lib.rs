@@ -12,5 +12,5 @@ pub mod v1 {
 
     /// `GetServerInfoResponse.protocol_version` of this contract. Increase it with every change after which a client of
     /// the previous contract no longer works.
-    pub const PROTOCOL_VERSION: u32 = 1;
+    pub const PROTOCOL_VERSION: u32 = 2;
 }

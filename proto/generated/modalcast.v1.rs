@@ -4506,6 +4506,10 @@ pub struct StreamStatesRequest {
     /// Number of states after which the stream ends; 0: no limit.
     #[prost(uint64, tag = "4")]
     pub steps: u64,
+    /// Send StateHead.stages with the first state and with every n-th one after it, for n = stages_every; 0: with none.
+    /// Stage times take about 50 bytes, more than the coordinates of a small scene.
+    #[prost(uint32, tag = "5")]
+    pub stages_every: u32,
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct StreamStatesResponse {
@@ -4532,6 +4536,8 @@ pub struct StateStreamSettings {
     pub max_hz: f64,
     #[prost(uint64, tag = "3")]
     pub steps: u64,
+    #[prost(uint32, tag = "4")]
+    pub stages_every: u32,
 }
 /// A part of a state, in the order of the offsets.
 #[derive(Clone, PartialEq, ::prost::Message)]
@@ -4564,6 +4570,7 @@ pub struct StateHead {
     /// Size of all sections in bytes.
     #[prost(uint64, tag = "5")]
     pub total: u64,
+    /// In a stream, only as StreamStatesRequest.stages_every demands.
     #[prost(message, repeated, tag = "6")]
     pub stages: ::prost::alloc::vec::Vec<StageTime>,
 }
@@ -4583,11 +4590,13 @@ pub struct StateSection {
 #[repr(i32)]
 pub enum StateContent {
     Unspecified = 0,
-    /// u32: indices of the domains with coordinates in STATE_CONTENT_Q, ascending.
+    /// u32: indices of the domains with coordinates in STATE_CONTENT_Q, ascending. Left out, as in a step, if the state has
+    /// the coordinates of all domains of the scene, and none shares those of another one.
     QDomains = 1,
     /// f32: q of each of these domains, r numbers each (ShapeDescription.rank), concatenated.
     Q = 2,
-    /// u32: indices of the domains with transforms in STATE_CONTENT_TRANSFORMS, ascending.
+    /// u32: indices of the domains with transforms in STATE_CONTENT_TRANSFORMS, ascending. Left out, as in a step, if the
+    /// state has the transforms of all domains that follow no other one.
     TransformDomains = 3,
     /// 12 f32 for each of these domains: world_from_domain, row-major 3x4, in scene units relative to the origin of the
     /// domain (STATE_CONTENT_ORIGINS).

@@ -53,8 +53,12 @@ impl v1::state_service_server::StateService for StateServiceImpl {
         let delivery = parse_stream_delivery(request.delivery, request.max_hz).map_err(to_status)?;
         // Subscribe before the response headers are sent, so that a client can rely on receiving the next step.
         let subscription = scene_handle.subscribe(OutputSpec::State, delivery).await.map_err(to_status)?;
-        let settings =
-            v1::StateStreamSettings { delivery: request.delivery, max_hz: request.max_hz, steps: request.steps };
+        let settings = v1::StateStreamSettings {
+            delivery: request.delivery,
+            max_hz: request.max_hz,
+            steps: request.steps,
+            stages_every: request.stages_every,
+        };
         let scene = Arc::clone(&scene_handle.scene);
         let state_stream = StateStream { scene, max_chunk_bytes: self.0.config().chunk_bytes, settings };
         Ok(without_copies(respond(move |reply_sender| {
@@ -85,7 +89,11 @@ impl StateStream {
                 output = subscription.next() => output.map_err(to_status)?,
                 () = reply_sender.closed() => return Ok(()),
             };
-            let packed = pack_state(output, &self.scene, previous_state).await.map_err(to_status)?;
+            let mut packed = pack_state(output, &self.scene, previous_state).await.map_err(to_status)?;
+            // A division by 0 has no remainder: no state has stages then.
+            if sent_count.checked_rem(u64::from(self.settings.stages_every)) != Some(0) {
+                packed.stages.clear();
+            }
             for chunk in state_chunks(&packed, self.max_chunk_bytes) {
                 tokio::select! {
                     sent = reply_sender.send(to_response(Part::Chunk(chunk))) => sent?,

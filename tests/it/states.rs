@@ -192,9 +192,9 @@ async fn later_states_contain_only_changed_domains() {
     ] {
         writer.send_step_and_wait(step).await;
     }
-    // Per domain an index, two coordinates, another index and a matrix; then the origin.
+    // Per domain two coordinates and a matrix; then the origin.
     let mut state = next_state(&mut states).await;
-    assert_eq!(state.encoded_bytes, 70_000 * (4 + 8 + 4 + 48) + 24);
+    assert_eq!(state.encoded_bytes, 70_000 * (8 + 48) + 24);
     // Step 2 sets domain 7 to the values that it has. Step 4 changes nothing.
     for (number, encoded_bytes) in [(2, 4 + 8), (3, 4 + 48), (4, 0)] {
         state = next_state(&mut states).await;
@@ -238,9 +238,10 @@ async fn recorded_state_can_be_sent_as_a_step() {
     let format = v1::TransformFormat::QuaternionXyzwF32;
     writer.send_step_and_wait(rigid_step(2, format, &[(1, QUARTER_TURN, [1.0, 2.0, 3.0])])).await;
     let (head, bytes) = get_state(&server, "twig").await;
+    // Lists that are left out mean all domains, in a state as in a step.
     let section = |content: v1::StateContent| {
-        let section = head.sections.iter().find(|section| section.content() == content).expect("expected a section");
-        bytes[section.offset as usize..][..section.bytes as usize].to_vec()
+        let section = head.sections.iter().find(|section| section.content() == content);
+        section.map(|section| bytes[section.offset as usize..][..section.bytes as usize].to_vec()).unwrap_or_default()
     };
     let (rest_head, rest_bytes) = get_state(&server, "replay").await;
     assert_eq!((rest_head.step.map(|step| step.run), rest_head.sections), (Some(0), head.sections.clone()));
@@ -267,7 +268,7 @@ async fn single_state_is_that_of_the_selected_step() {
     let layout = StateLayout::new(&description).expect("expected a valid description");
     // 70,000 domains take several chunks.
     let (head, _) = get_state(&server, "crowd").await;
-    assert!(head.total > 4 << 20);
+    assert!(head.total > 3 << 20);
     let request = StateRequest::new("crowd", ()).minimum_step(1);
     let (state, ()) = tokio::join!(with_timeout(client.get_state(&request, &layout)), async {
         server.drive_lossless("crowd").await.send_step_and_wait(step(1, &[69_999], &[0.5, 0.25])).await;

@@ -319,6 +319,7 @@ impl Subscriptions {
             delivery: v1::Delivery::from(request.delivery).into(),
             steps: request.max_states,
             max_hz: 0.0,
+            stages_every: 0,
         };
         let force_request = v1::StreamForcesRequest { scene: scene.to_owned(), max_hz: 0.0, passive: true };
         let forces = client.force_messages(force_request).await?;

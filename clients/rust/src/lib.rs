@@ -47,7 +47,10 @@ pub use scene::{
     AlphaMode, Attachment, Domain, Follow, Material, MaterialRange, SceneDescription, Shape, ShapeArray, Texture,
 };
 pub use stages::{StageSamples, StageTimes};
-pub use states::{SceneState, SentValues, StateDecoder, StateLayout, StateRequest, StateStream, StateStreamRequest};
+pub use states::{
+    SceneState, SentValues, StateDecoder, StateLayout, StateRequest, StateStream, StateStreamOptions,
+    StateStreamRequest,
+};
 pub use step::{DomainTransform, Step};
 pub use step_stream::{Ack, DriveRequest, StepStream, StreamSummary};
 pub use tonic::Code;

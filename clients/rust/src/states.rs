@@ -119,6 +119,7 @@ pub struct SceneState {
     pub skipped: u64,
     /// Size of the sent values in bytes, without the heads and the encoding of messages.
     pub encoded_bytes: u64,
+    /// In a stream, only as [`StateStreamOptions::stages_every`] demands.
     pub stages: StageTimes,
     pub(crate) layout: Arc<StateLayout>,
     /// Of the domains that own their coordinates, in order.
@@ -162,7 +163,20 @@ impl SceneState {
 pub type StateRequest = StepRequest<()>;
 
 /// A subscription to the states of every step.
-pub type StateStreamRequest = Subscription<()>;
+pub type StateStreamRequest = Subscription<StateStreamOptions>;
+
+/// The contents of the states of a stream.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct StateStreamOptions {
+    /// The first state and every n-th one after it has stage times; 0: no state.
+    pub stages_every: u32,
+}
+
+impl From<()> for StateStreamOptions {
+    fn from((): ()) -> Self {
+        Self::default()
+    }
+}
 
 impl Client {
     /// Gets the state of one step.
@@ -195,6 +209,7 @@ impl Client {
             delivery: v1::Delivery::from(request.delivery).into(),
             max_hz: request.max_hz,
             steps: request.max_steps,
+            stages_every: request.query.stages_every,
         };
         let channel = self.channel_for(request.delivery);
         let mut messages = self.replies(StateServiceClient::new(channel).stream_states(wire).await)?;
@@ -361,6 +376,14 @@ impl StateChanges {
         if offset != bytes.len() as u64 {
             return Err(malformed_reply("states.total", offset, bytes.len()));
         }
+        // A list that is left out has all domains.
+        if changes.q_domains.is_empty() && !changes.q.is_empty() {
+            changes.q_domains =
+                (0..layout.domain_count() as u32).filter(|domain| layout.owns_coordinates(*domain)).collect();
+        }
+        if changes.transform_domains.is_empty() && !changes.transforms.is_empty() {
+            changes.transform_domains.clone_from(&layout.roots);
+        }
         changes.check(layout)?;
         Ok(changes)
     }
@@ -510,6 +533,19 @@ mod tests {
         assert_eq!((second.q(1), second.q(2), second.encoded_bytes), (Some(&[7.0][..]), Some(&[1.0, 2.0][..]), 13));
         assert_eq!(second.origin(2), Some([1e7, 0.0, -1.0]));
         assert_eq!(first.q(1), Some(&[3.0][..]), "control: the held state is unchanged");
+    }
+
+    #[test]
+    fn lists_that_are_left_out_have_all_domains() {
+        let [_, q, _, transforms, origins] = complete_sections().try_into().expect("five sections");
+        let mut decoder = decoder();
+        let state = decoder.add_message(message(true, &[q, transforms, origins])).expect("a valid message");
+        let state = state.expect("a complete state");
+        assert_eq!([state.q(0), state.q(1), state.q(2)], [Some(&[1.0, 2.0][..]), Some(&[3.0]), Some(&[1.0, 2.0])]);
+        assert_eq!(state.transform(0), Some(IDENTITY));
+        let expected =
+            SentValues { is_complete: true, q_domains: vec![0, 1], transform_domains: vec![0], origins: true };
+        assert_eq!(decoder.states.sent_values(), &expected);
     }
 
     #[test]

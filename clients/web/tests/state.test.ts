@@ -83,6 +83,20 @@ test("followers and domains that share q have the values of others", () => {
     assert.equal(state.step?.number, 5n);
 });
 
+test("lists that are left out have all domains", () => {
+    const state = new SceneState(new StateLayout(fourDomains()));
+    const { head, data } = encode([
+        [StateContent.Q, floats(4, 5, 6)],
+        [StateContent.TRANSFORMS, floats(...translation(20, 0, 0), ...translation(0, 0, 8))],
+    ]);
+    state.apply(head, data);
+    assert.deepEqual(
+        [0, 1, 2, 3].map((domain) => [...state.qOf(domain)]),
+        [[4, 5], [6], [4, 5], []],
+    );
+    assert.deepEqual([...state.rootTransforms.subarray(3, 4), ...state.rootTransforms.subarray(47, 48)], [20, 8]);
+});
+
 test("a partial state keeps the values of other domains", () => {
     const state = new SceneState(new StateLayout(fourDomains()));
     const first = complete();

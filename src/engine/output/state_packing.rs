@@ -15,11 +15,11 @@ use modalcast_model::scene::{Scene, SceneState};
 /// The content of a [`StateSection`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum StateContent {
-    /// u32 indices of domains that own coordinates.
+    /// u32 indices of domains that own coordinates. Omitted if all domains have theirs.
     QDomains,
     /// f32 coordinates of these domains.
     Q,
-    /// u32 indices of transform roots: domains that follow no other domain.
+    /// u32 indices of transform roots: domains that follow no other domain. Omitted if all have their transforms.
     TransformDomains,
     /// 12 f32 per transform root.
     Transforms,
@@ -96,14 +96,21 @@ impl StateBytes {
 fn pack(scene: &Scene, state: &SceneState, previous: Option<&SceneState>) -> StateBytes {
     let mut packed = StateBytes::default();
     let (mut domains, mut q) = (Vec::<u32>::new(), Vec::<f32>::new());
-    for domain in (0..scene.domains.len()).filter(|domain| scene.domains[*domain].shares_q_with.is_none()) {
+    // The coordinates of all domains, one after the other, need no list.
+    let mut is_all_q = true;
+    for domain in 0..scene.domains.len() {
         let domain_q = state.q_of(scene, domain);
-        if previous.map_or(!domain_q.is_empty(), |previous| !are_bits_equal(domain_q, previous.q_of(scene, domain))) {
+        let is_sent = scene.domains[domain].shares_q_with.is_none()
+            && previous.is_none_or(|previous| !are_bits_equal(domain_q, previous.q_of(scene, domain)));
+        if is_sent && !domain_q.is_empty() {
             domains.push(domain as u32);
             q.extend_from_slice(domain_q);
         }
+        is_all_q &= is_sent || domain_q.is_empty();
     }
-    packed.append(StateContent::QDomains, bytemuck::cast_slice(&domains));
+    if !is_all_q {
+        packed.append(StateContent::QDomains, bytemuck::cast_slice(&domains));
+    }
     packed.append(StateContent::Q, bytemuck::cast_slice(&q));
     domains.clear();
     let mut transforms = Vec::new();
@@ -113,7 +120,9 @@ fn pack(scene: &Scene, state: &SceneState, previous: Option<&SceneState>) -> Sta
             transforms.push(*transform);
         }
     }
-    packed.append(StateContent::TransformDomains, bytemuck::cast_slice(&domains));
+    if transforms.len() < state.transforms.len() {
+        packed.append(StateContent::TransformDomains, bytemuck::cast_slice(&domains));
+    }
     packed.append(StateContent::Transforms, bytemuck::cast_slice(&transforms));
     let origins = origins_in_meters(scene, state);
     if previous.is_none_or(|previous| origins_in_meters(scene, previous) != origins) {
@@ -150,7 +159,7 @@ mod tests {
     }
 
     #[test]
-    fn complete_state_has_all_domains_and_no_gaps() {
+    fn complete_state_has_all_values_and_no_lists() {
         let scene = testing::two_strips();
         let mut state = SceneState::rest(&scene);
         state.q = vec![1.0, 2.0, 3.0, 4.0];
@@ -160,14 +169,22 @@ mod tests {
             assert_eq!(section.offset, end);
             end += section.bytes;
         }
-        assert_eq!((end, packed.sections.len()), (packed.bytes.len() as u64, 5));
-        let u32_section =
-            |content| section_bytes(&packed, content).map(bytemuck::pod_collect_to_vec::<u8, u32>).unwrap_or_default();
-        assert_eq!(u32_section(StateContent::QDomains), [0, 1]);
-        assert_eq!(u32_section(StateContent::TransformDomains), [0, 1]);
+        assert_eq!((end, packed.sections.len()), (packed.bytes.len() as u64, 3));
         assert_eq!(section_bytes(&packed, StateContent::Q), Some(bytemuck::cast_slice(&state.q)));
         assert_eq!(section_bytes(&packed, StateContent::Transforms), Some(bytemuck::cast_slice(&state.transforms)));
         assert_eq!(section_bytes(&packed, StateContent::Origins), Some(&[0; 24][..]));
+    }
+
+    #[test]
+    fn shared_coordinates_need_a_list() {
+        let mut scene = testing::two_strips();
+        let mut state = SceneState::rest(&scene);
+        state.q = vec![1.0, 2.0, 3.0, 4.0];
+        assert_eq!(section_bytes(&pack(&scene, &state, None), StateContent::QDomains), None, "control");
+        Arc::get_mut(&mut scene).expect("expected the only owner").domains[1].shares_q_with = Some(0);
+        let packed = pack(&scene, &state, None);
+        assert_eq!(section_bytes(&packed, StateContent::QDomains), Some(&0_u32.to_le_bytes()[..]));
+        assert_eq!(section_bytes(&packed, StateContent::Q), Some(bytemuck::cast_slice(&[1.0_f32, 2.0])));
     }
 
     #[test]

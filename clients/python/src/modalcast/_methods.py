@@ -17,7 +17,7 @@ from modalcast.v1 import (
     vertices_pb2,
 )
 
-PROTOCOL_VERSION = 1
+PROTOCOL_VERSION = 2
 """Version of the contract that this client implements."""
 
 RequestT = TypeVar("RequestT", bound=Message)

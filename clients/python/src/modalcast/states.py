@@ -73,7 +73,7 @@ class SceneState:
         transforms: world_from_domain of every domain: domains x 3 x 4, in scene units relative to the origins.
         origins: World position in meters of the origin of each domain's transform: domains x 3.
         skipped: Number of steps skipped since the previous state of the stream.
-        stages: Milliseconds by stage.
+        stages: Milliseconds by stage; those of `Scene.steps` only as `stages_every` demands.
     """
 
     step: StepId
@@ -103,6 +103,7 @@ class StateDecoder:
         self._root_transforms: F32 = np.zeros((len(layout.domains), 3, 4), np.float32)
         self._root = np.array(layout.root, np.intp)
         self._is_root = self._root == np.arange(len(self._root))
+        self._roots = np.flatnonzero(self._is_root)
         self._origins: F64 = np.zeros((len(layout.domains), 3))
 
     def decode(self, head: states_pb2.StateHead, data: Bytes) -> SceneState:
@@ -135,15 +136,26 @@ class StateDecoder:
         def numbers(content: int, dtype: str) -> NDArray[Any]:
             return sections.get(content, np.empty(0, np.uint8)).view(dtype)
 
-        q, position = numbers(states_pb2.STATE_CONTENT_Q, "<f4"), 0
-        for index in numbers(states_pb2.STATE_CONTENT_Q_DOMAINS, "<u4"):
-            place = self._layout.q_slice(self._layout.domains[int(index)])
+        q = numbers(states_pb2.STATE_CONTENT_Q, "<f4")
+        listed = numbers(states_pb2.STATE_CONTENT_Q_DOMAINS, "<u4")
+        # A list that is left out has all domains, each with coordinates of its own.
+        places = [self._layout.q_slice(self._layout.domains[int(index)]) for index in listed]
+        if len(listed) == 0 < len(q):
+            places = [slice(0, self._layout.coordinate_count)]
+        position = 0
+        for place in places:
             rank = place.stop - place.start
             self._q[place] = q[position : position + rank]
             position += rank
-        moved = numbers(states_pb2.STATE_CONTENT_TRANSFORM_DOMAINS, "<u4")
-        transforms = numbers(states_pb2.STATE_CONTENT_TRANSFORMS, "<f4")
-        self._root_transforms[moved.astype(np.intp)] = transforms.reshape(-1, 3, 4)
+        if position != len(q):
+            raise ValueError(f"{len(q)} coordinates in place of {position}")
+        transforms = numbers(states_pb2.STATE_CONTENT_TRANSFORMS, "<f4").reshape(-1, 3, 4)
+        moved = numbers(states_pb2.STATE_CONTENT_TRANSFORM_DOMAINS, "<u4").astype(np.intp)
+        if len(moved) == 0 < len(transforms):
+            moved = self._roots
+        if len(moved) != len(transforms):
+            raise ValueError(f"{len(transforms)} transforms in place of {len(moved)}")
+        self._root_transforms[moved] = transforms
         origins = numbers(states_pb2.STATE_CONTENT_ORIGINS, "<f8").reshape(-1, 3)
         if len(origins) == 1:
             self._origins[:] = origins

@@ -51,7 +51,7 @@ export class SceneModel {
         this.counts.skipped += head.skipped;
         this.counts.bytes += data.length;
         this.lastStateBytes = data.length;
-        this.stages = head.stages;
+        if (head.stages.length > 0) this.stages = head.stages;
         this.onState();
     }
 }

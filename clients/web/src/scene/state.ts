@@ -19,6 +19,10 @@ export class StateLayout {
     readonly rootFromDomain: Float64Array;
     readonly coordinates: number;
     readonly domains: number;
+    /** The domains with coordinates of their own. */
+    readonly owners: Uint32Array;
+    /** The domains with transforms of their own. */
+    readonly roots: Uint32Array;
 
     constructor(readonly scene: SceneDescription) {
         this.domains = scene.domains.length;
@@ -49,6 +53,9 @@ export class StateLayout {
             }
         }
         this.coordinates = coordinates;
+        const indices = Uint32Array.from({ length: this.domains }, (_, index) => index);
+        this.owners = indices.filter((domain) => this.owner[domain] === domain);
+        this.roots = indices.filter((domain) => this.isRoot(domain));
     }
 
     isRoot(domain: number): boolean {
@@ -118,9 +125,13 @@ export class SceneState {
             if (end > data.length) throw new Error(`state: expected ${end} bytes, got ${data.length}`);
             return data.subarray(Number(found.offset), end);
         };
-        this.applyCoordinates(toU32(section(StateContent.Q_DOMAINS)), toF32(section(StateContent.Q)));
-        const moved = toU32(section(StateContent.TRANSFORM_DOMAINS));
+        // A list that is left out has all domains.
+        const q = toF32(section(StateContent.Q));
+        const listed = toU32(section(StateContent.Q_DOMAINS));
+        this.applyCoordinates(listed.length > 0 || q.length === 0 ? listed : this.layout.owners, q);
         const transforms = toF32(section(StateContent.TRANSFORMS));
+        const roots = toU32(section(StateContent.TRANSFORM_DOMAINS));
+        const moved = roots.length > 0 || transforms.length === 0 ? roots : this.layout.roots;
         if (transforms.length !== TRANSFORM_SIZE * moved.length) {
             throw new Error(
                 `state: expected ${TRANSFORM_SIZE * moved.length} numbers of transforms, got ${transforms.length}`,
@@ -137,7 +148,7 @@ export class SceneState {
         this.updateTransforms();
     }
 
-    private applyCoordinates(domains: Uint32Array, q: Float32Array): void {
+    private applyCoordinates(domains: Iterable<number>, q: Float32Array): void {
         let place = 0;
         for (const domain of domains) {
             const rank = this.layout.ranks[domain];
@@ -152,10 +163,8 @@ export class SceneState {
 
     private applyOrigins(origins: Float64Array): void {
         if (origins.length === 0) return;
-        const { info } = this.layout.scene;
-        const roots = Array.from({ length: this.layout.domains }, (_, domain) => domain).filter((domain) =>
-            this.layout.isRoot(domain),
-        );
+        const { scene, roots } = this.layout;
+        const { info } = scene;
         if (origins.length !== 3 && origins.length !== 3 * roots.length) {
             throw new Error(`state: expected 3 or ${3 * roots.length} numbers of origins, got ${origins.length}`);
         }

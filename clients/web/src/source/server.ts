@@ -23,10 +23,13 @@ import type { Channel, DuplexStream, ReplyStream } from "../wire/channel";
 import { type ContentCache, hasHash } from "./content_cache";
 
 /** Version of the contract, see GetServerInfoResponse. */
-export const PROTOCOL_VERSION = 1;
+export const PROTOCOL_VERSION = 2;
 
 /** Largest number of hashes in a request. */
 const HASHES_PER_REQUEST = 4096;
+
+/** Stage times arrive with every so many states: about twice per second at 60 steps per second. */
+const STAGES_EVERY = 30;
 
 /** Flow-control window of a picture stream in bytes. It admits one frame, so that a slow browser gets the newest. */
 const PICTURE_WINDOW = 1;
@@ -103,7 +106,8 @@ export class Server {
     }
 
     streamStates(scene: string): ReplyStream<StreamStatesResponse> {
-        return this.channel.serverStream(StateService.method.streamStates, { scene, delivery: Delivery.LATEST });
+        const request = { scene, delivery: Delivery.LATEST, stagesEvery: STAGES_EVERY };
+        return this.channel.serverStream(StateService.method.streamStates, request);
     }
 
     streamForces(scene: string): ReplyStream<StreamForcesResponse> {

@@ -482,18 +482,24 @@ class Scene:
             lambda: SceneStateDecoder(self._layout, chunk_field=1),
         )
 
-    def steps(self, *, delivery: Delivery = "latest", max_hz: float = 0.0, count: int = 0) -> Stream[SceneState]:
+    def steps(
+        self, *, delivery: Delivery = "latest", max_hz: float = 0.0, count: int = 0, stages_every: int = 0
+    ) -> Stream[SceneState]:
         """Iterates over the coordinates and transforms of steps. Only changes are sent, and complete states returned.
 
+        Args:
+            delivery, max_hz, count: As for `frames`.
+            stages_every: The first state and every n-th one after it has `SceneState.stages`; 0: no state.
+
         Raises:
-            ValueError: An argument is invalid; `frames` documents them.
+            ValueError: An argument is invalid.
             Error: The call failed.
         """
         wire_delivery = delivery_message(delivery)
 
         def open_call(steps: int, wait: bool) -> ReplyStream:
             request = states_pb2.StreamStatesRequest(
-                scene=self.name, delivery=wire_delivery, max_hz=max_hz, steps=steps
+                scene=self.name, delivery=wire_delivery, max_hz=max_hz, steps=steps, stages_every=stages_every
             )
             return self._transport.subscribe(STREAM_STATES, request, wait_for_ready=wait)
 

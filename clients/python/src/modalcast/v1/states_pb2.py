@@ -25,31 +25,31 @@ _sym_db = _symbol_database.Default()
 from modalcast.v1 import common_pb2 as modalcast_dot_v1_dot_common__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x19modalcast/v1/states.proto\x12\x0cmodalcast.v1\x1a\x19modalcast/v1/common.proto\"_\n\x0fGetStateRequest\x12\r\n\x05scene\x18\x01 \x01(\t\x12(\n\x04step\x18\x02 \x01(\x0b\x32\x1a.modalcast.v1.StepSelector\x12\x13\n\x0b\x64\x65\x61\x64line_ms\x18\x03 \x01(\r\";\n\x10GetStateResponse\x12\'\n\x05\x63hunk\x18\x01 \x01(\x0b\x32\x18.modalcast.v1.StateChunk\"m\n\x13StreamStatesRequest\x12\r\n\x05scene\x18\x01 \x01(\t\x12(\n\x08\x64\x65livery\x18\x02 \x01(\x0e\x32\x16.modalcast.v1.Delivery\x12\x0e\n\x06max_hz\x18\x03 \x01(\x01\x12\r\n\x05steps\x18\x04 \x01(\x04\"\x80\x01\n\x14StreamStatesResponse\x12\x35\n\x08settings\x18\x01 \x01(\x0b\x32!.modalcast.v1.StateStreamSettingsH\x00\x12)\n\x05\x63hunk\x18\x02 \x01(\x0b\x32\x18.modalcast.v1.StateChunkH\x00\x42\x06\n\x04part\"^\n\x13StateStreamSettings\x12(\n\x08\x64\x65livery\x18\x01 \x01(\x0e\x32\x16.modalcast.v1.Delivery\x12\x0e\n\x06max_hz\x18\x02 \x01(\x01\x12\r\n\x05steps\x18\x03 \x01(\x04\"_\n\nStateChunk\x12*\n\x04head\x18\x01 \x01(\x0b\x32\x17.modalcast.v1.StateHeadH\x00\x88\x01\x01\x12\x0e\n\x06offset\x18\x02 \x01(\x04\x12\x0c\n\x04\x64\x61ta\x18\x03 \x01(\x0c\x42\x07\n\x05_head\"\xb8\x01\n\tStateHead\x12\"\n\x04step\x18\x01 \x01(\x0b\x32\x14.modalcast.v1.StepId\x12\x0f\n\x07skipped\x18\x02 \x01(\x04\x12\x10\n\x08\x63omplete\x18\x03 \x01(\x08\x12,\n\x08sections\x18\x04 \x03(\x0b\x32\x1a.modalcast.v1.StateSection\x12\r\n\x05total\x18\x05 \x01(\x04\x12\'\n\x06stages\x18\x06 \x03(\x0b\x32\x17.modalcast.v1.StageTime\"Z\n\x0cStateSection\x12+\n\x07\x63ontent\x18\x01 \x01(\x0e\x32\x1a.modalcast.v1.StateContent\x12\x0e\n\x06offset\x18\x02 \x01(\x04\x12\r\n\x05\x62ytes\x18\x03 \x01(\x04*\xbd\x01\n\x0cStateContent\x12\x1d\n\x19STATE_CONTENT_UNSPECIFIED\x10\x00\x12\x1b\n\x17STATE_CONTENT_Q_DOMAINS\x10\x01\x12\x13\n\x0fSTATE_CONTENT_Q\x10\x02\x12#\n\x1fSTATE_CONTENT_TRANSFORM_DOMAINS\x10\x03\x12\x1c\n\x18STATE_CONTENT_TRANSFORMS\x10\x04\x12\x19\n\x15STATE_CONTENT_ORIGINS\x10\x05\x32\xb4\x01\n\x0cStateService\x12K\n\x08GetState\x12\x1d.modalcast.v1.GetStateRequest\x1a\x1e.modalcast.v1.GetStateResponse0\x01\x12W\n\x0cStreamStates\x12!.modalcast.v1.StreamStatesRequest\x1a\".modalcast.v1.StreamStatesResponse0\x01\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x19modalcast/v1/states.proto\x12\x0cmodalcast.v1\x1a\x19modalcast/v1/common.proto\"_\n\x0fGetStateRequest\x12\r\n\x05scene\x18\x01 \x01(\t\x12(\n\x04step\x18\x02 \x01(\x0b\x32\x1a.modalcast.v1.StepSelector\x12\x13\n\x0b\x64\x65\x61\x64line_ms\x18\x03 \x01(\r\";\n\x10GetStateResponse\x12\'\n\x05\x63hunk\x18\x01 \x01(\x0b\x32\x18.modalcast.v1.StateChunk\"\x83\x01\n\x13StreamStatesRequest\x12\r\n\x05scene\x18\x01 \x01(\t\x12(\n\x08\x64\x65livery\x18\x02 \x01(\x0e\x32\x16.modalcast.v1.Delivery\x12\x0e\n\x06max_hz\x18\x03 \x01(\x01\x12\r\n\x05steps\x18\x04 \x01(\x04\x12\x14\n\x0cstages_every\x18\x05 \x01(\r\"\x80\x01\n\x14StreamStatesResponse\x12\x35\n\x08settings\x18\x01 \x01(\x0b\x32!.modalcast.v1.StateStreamSettingsH\x00\x12)\n\x05\x63hunk\x18\x02 \x01(\x0b\x32\x18.modalcast.v1.StateChunkH\x00\x42\x06\n\x04part\"t\n\x13StateStreamSettings\x12(\n\x08\x64\x65livery\x18\x01 \x01(\x0e\x32\x16.modalcast.v1.Delivery\x12\x0e\n\x06max_hz\x18\x02 \x01(\x01\x12\r\n\x05steps\x18\x03 \x01(\x04\x12\x14\n\x0cstages_every\x18\x04 \x01(\r\"_\n\nStateChunk\x12*\n\x04head\x18\x01 \x01(\x0b\x32\x17.modalcast.v1.StateHeadH\x00\x88\x01\x01\x12\x0e\n\x06offset\x18\x02 \x01(\x04\x12\x0c\n\x04\x64\x61ta\x18\x03 \x01(\x0c\x42\x07\n\x05_head\"\xb8\x01\n\tStateHead\x12\"\n\x04step\x18\x01 \x01(\x0b\x32\x14.modalcast.v1.StepId\x12\x0f\n\x07skipped\x18\x02 \x01(\x04\x12\x10\n\x08\x63omplete\x18\x03 \x01(\x08\x12,\n\x08sections\x18\x04 \x03(\x0b\x32\x1a.modalcast.v1.StateSection\x12\r\n\x05total\x18\x05 \x01(\x04\x12\'\n\x06stages\x18\x06 \x03(\x0b\x32\x17.modalcast.v1.StageTime\"Z\n\x0cStateSection\x12+\n\x07\x63ontent\x18\x01 \x01(\x0e\x32\x1a.modalcast.v1.StateContent\x12\x0e\n\x06offset\x18\x02 \x01(\x04\x12\r\n\x05\x62ytes\x18\x03 \x01(\x04*\xbd\x01\n\x0cStateContent\x12\x1d\n\x19STATE_CONTENT_UNSPECIFIED\x10\x00\x12\x1b\n\x17STATE_CONTENT_Q_DOMAINS\x10\x01\x12\x13\n\x0fSTATE_CONTENT_Q\x10\x02\x12#\n\x1fSTATE_CONTENT_TRANSFORM_DOMAINS\x10\x03\x12\x1c\n\x18STATE_CONTENT_TRANSFORMS\x10\x04\x12\x19\n\x15STATE_CONTENT_ORIGINS\x10\x05\x32\xb4\x01\n\x0cStateService\x12K\n\x08GetState\x12\x1d.modalcast.v1.GetStateRequest\x1a\x1e.modalcast.v1.GetStateResponse0\x01\x12W\n\x0cStreamStates\x12!.modalcast.v1.StreamStatesRequest\x1a\".modalcast.v1.StreamStatesResponse0\x01\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'modalcast.v1.states_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_STATECONTENT']._serialized_start=943
-  _globals['_STATECONTENT']._serialized_end=1132
+  _globals['_STATECONTENT']._serialized_start=988
+  _globals['_STATECONTENT']._serialized_end=1177
   _globals['_GETSTATEREQUEST']._serialized_start=70
   _globals['_GETSTATEREQUEST']._serialized_end=165
   _globals['_GETSTATERESPONSE']._serialized_start=167
   _globals['_GETSTATERESPONSE']._serialized_end=226
-  _globals['_STREAMSTATESREQUEST']._serialized_start=228
-  _globals['_STREAMSTATESREQUEST']._serialized_end=337
-  _globals['_STREAMSTATESRESPONSE']._serialized_start=340
-  _globals['_STREAMSTATESRESPONSE']._serialized_end=468
-  _globals['_STATESTREAMSETTINGS']._serialized_start=470
-  _globals['_STATESTREAMSETTINGS']._serialized_end=564
-  _globals['_STATECHUNK']._serialized_start=566
-  _globals['_STATECHUNK']._serialized_end=661
-  _globals['_STATEHEAD']._serialized_start=664
-  _globals['_STATEHEAD']._serialized_end=848
-  _globals['_STATESECTION']._serialized_start=850
-  _globals['_STATESECTION']._serialized_end=940
-  _globals['_STATESERVICE']._serialized_start=1135
-  _globals['_STATESERVICE']._serialized_end=1315
+  _globals['_STREAMSTATESREQUEST']._serialized_start=229
+  _globals['_STREAMSTATESREQUEST']._serialized_end=360
+  _globals['_STREAMSTATESRESPONSE']._serialized_start=363
+  _globals['_STREAMSTATESRESPONSE']._serialized_end=491
+  _globals['_STATESTREAMSETTINGS']._serialized_start=493
+  _globals['_STATESTREAMSETTINGS']._serialized_end=609
+  _globals['_STATECHUNK']._serialized_start=611
+  _globals['_STATECHUNK']._serialized_end=706
+  _globals['_STATEHEAD']._serialized_start=709
+  _globals['_STATEHEAD']._serialized_end=893
+  _globals['_STATESECTION']._serialized_start=895
+  _globals['_STATESECTION']._serialized_end=985
+  _globals['_STATESERVICE']._serialized_start=1180
+  _globals['_STATESERVICE']._serialized_end=1360
 # @@protoc_insertion_point(module_scope)

@@ -40,16 +40,18 @@ class GetStateResponse(_message.Message):
     def __init__(self, chunk: _Optional[_Union[StateChunk, _Mapping]] = ...) -> None: ...
 
 class StreamStatesRequest(_message.Message):
-    __slots__ = ("scene", "delivery", "max_hz", "steps")
+    __slots__ = ("scene", "delivery", "max_hz", "steps", "stages_every")
     SCENE_FIELD_NUMBER: _ClassVar[int]
     DELIVERY_FIELD_NUMBER: _ClassVar[int]
     MAX_HZ_FIELD_NUMBER: _ClassVar[int]
     STEPS_FIELD_NUMBER: _ClassVar[int]
+    STAGES_EVERY_FIELD_NUMBER: _ClassVar[int]
     scene: str
     delivery: _common_pb2.Delivery
     max_hz: float
     steps: int
-    def __init__(self, scene: _Optional[str] = ..., delivery: _Optional[_Union[_common_pb2.Delivery, str]] = ..., max_hz: _Optional[float] = ..., steps: _Optional[int] = ...) -> None: ...
+    stages_every: int
+    def __init__(self, scene: _Optional[str] = ..., delivery: _Optional[_Union[_common_pb2.Delivery, str]] = ..., max_hz: _Optional[float] = ..., steps: _Optional[int] = ..., stages_every: _Optional[int] = ...) -> None: ...
 
 class StreamStatesResponse(_message.Message):
     __slots__ = ("settings", "chunk")
@@ -60,14 +62,16 @@ class StreamStatesResponse(_message.Message):
     def __init__(self, settings: _Optional[_Union[StateStreamSettings, _Mapping]] = ..., chunk: _Optional[_Union[StateChunk, _Mapping]] = ...) -> None: ...
 
 class StateStreamSettings(_message.Message):
-    __slots__ = ("delivery", "max_hz", "steps")
+    __slots__ = ("delivery", "max_hz", "steps", "stages_every")
     DELIVERY_FIELD_NUMBER: _ClassVar[int]
     MAX_HZ_FIELD_NUMBER: _ClassVar[int]
     STEPS_FIELD_NUMBER: _ClassVar[int]
+    STAGES_EVERY_FIELD_NUMBER: _ClassVar[int]
     delivery: _common_pb2.Delivery
     max_hz: float
     steps: int
-    def __init__(self, delivery: _Optional[_Union[_common_pb2.Delivery, str]] = ..., max_hz: _Optional[float] = ..., steps: _Optional[int] = ...) -> None: ...
+    stages_every: int
+    def __init__(self, delivery: _Optional[_Union[_common_pb2.Delivery, str]] = ..., max_hz: _Optional[float] = ..., steps: _Optional[int] = ..., stages_every: _Optional[int] = ...) -> None: ...
 
 class StateChunk(_message.Message):
     __slots__ = ("head", "offset", "data")
