@@ -48,16 +48,18 @@ pub(super) enum InjectedFault {
     PanicInDeform,
     PanicInReadback,
     PanicInWait,
+    Fault,
     RendererLost,
     DeviceLost,
     Endless,
 }
 
 impl InjectedFault {
-    const ALL: [Self; 6] = [
+    const ALL: [Self; 7] = [
         Self::PanicInDeform,
         Self::PanicInReadback,
         Self::PanicInWait,
+        Self::Fault,
         Self::RendererLost,
         Self::DeviceLost,
         Self::Endless,
@@ -93,6 +95,7 @@ impl Deformer for FaultyDeformer {
         self.fault = InjectedFault::ALL.into_iter().find(|fault| state.q[0] == fault.q());
         match self.fault {
             Some(InjectedFault::PanicInDeform) => panic!("injected into deform"),
+            Some(InjectedFault::Fault) => Err(fault_error()),
             Some(InjectedFault::RendererLost) => Err(renderer_lost_error()),
             Some(InjectedFault::DeviceLost) => Err(device_lost_error()),
             Some(InjectedFault::Endless) => loop {
@@ -122,6 +125,11 @@ impl Deformer for FaultyDeformer {
             .expect("expected a readback of this deformer");
         Ok(self.readbacks.swap_remove(index))
     }
+}
+
+/// The error of an injected fault, after which the device works.
+pub(super) fn fault_error() -> Error {
+    Error::Fault { stage: "deform", reason: "injected".into() }
 }
 
 /// The error of an injected loss of the renderer.

@@ -18,7 +18,7 @@ pub enum InjectionPoint {
     Target,
     /// The computation of a step.
     Deform,
-    /// The launch of a CUDA kernel.
+    /// The launch of a CUDA kernel or graph.
     Launch,
     /// The access of CUDA to buffers of OpenGL.
     Interop,

@@ -9,6 +9,8 @@ mod common;
 mod cuda_checks;
 mod device;
 mod extremes;
+#[cfg(feature = "fault-injection")]
+mod faults;
 mod frame_info;
 mod gl;
 #[expect(dead_code, reason = "shared with the benchmarks")]

@@ -35,7 +35,7 @@ NOT_CLAIMED = {
     6: "loads have a deadline and equal shares",
     9: "while no other frame is drawn, Mesa keeps the memory of the last one",
     12: "names in the errors of all loaders",
-    13: "faults of CUDA in `deploy/prove`, which runs without a GPU",
+    13: "faults of CUDA here, without a GPU; tests/gpu/faults.rs plans them on one",
     14: "hostile recordings that a page opens in the browser",
     15: "uploads and messages of WebSockets; 10^8 executions, and coverage of 90 % of the lines of the loaders",
 }

@@ -38,7 +38,8 @@
 //!
 //! # Failures
 //! A panic in a command, in a poll or in a copy drops the reply channel of that command, so its caller gets an error.
-//! The loop continues. A lost renderer is opened again ([`recovery`]). After the first `Error::DeviceLost` the loop
+//! The loop continues. After the loss of the renderer, and after a step that has failed on the device, the renderer is
+//! opened and all scenes are loaded again ([`recovery`]). After the first `Error::DeviceLost` the loop
 //! answers every command with that error, except `UnloadScene`. A call that does not return is noticed by the watchdog
 //! ([`super::watchdog`]).
 
@@ -205,7 +206,7 @@ impl DeviceLoop {
         true
     }
 
-    /// Executes the work, answers readbacks, and opens a lost renderer again.
+    /// Executes the work, answers readbacks, and recovers from errors.
     fn run_taken(&mut self, taken: Taken<Work>) {
         self.free_in_flight_slot(&taken.work);
         let older_readback_count = self.vertices.len();
@@ -225,7 +226,7 @@ impl DeviceLoop {
             run_caught(|| self.finish_oldest_frame());
         }
         self.free_unused_targets();
-        self.recover_renderer();
+        self.recover();
     }
 
     /// Frees the memory of render targets that no frame has used for [`TARGET_LIFETIME`].
@@ -259,7 +260,7 @@ impl DeviceLoop {
                 clock.measure(|| {
                     self.start_encodings_if_idle();
                     run_caught(|| self.finish_one());
-                    self.recover_renderer();
+                    self.recover();
                 });
             } else if let Some(output) = self.partial_outputs.values().next() {
                 output.is_ready_within(self.poll_interval);
@@ -346,8 +347,10 @@ impl DeviceLoop {
             Command::Deform { id, state, next, reply } => {
                 // The GPU changes to the context of CUDA once for both.
                 self.context.start_encodings();
-                let deformed = self.scene(id).and_then(|scene| scene.deform_with_next(&state, next.as_ref()));
-                answer(reply, self.loss.record_loss(deformed));
+                let Self { scenes, loss, .. } = self;
+                let deformed = find_scene(scenes, id)
+                    .and_then(|scene| loss.record_step(scene.deform_with_next(&state, next.as_ref())));
+                answer(reply, deformed);
             }
             Command::UnloadScene { id, reply } => {
                 self.unload(id);
@@ -594,16 +597,26 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn lost_renderer_is_opened_again_and_scenes_keep_their_states() {
+    async fn scenes_keep_their_states_after_loss_of_renderer() {
+        check_recovery(InjectedFault::RendererLost, testing::renderer_lost_error()).await;
+    }
+
+    #[tokio::test]
+    async fn scenes_keep_their_states_after_failed_step() {
+        check_recovery(InjectedFault::Fault, testing::fault_error()).await;
+    }
+
+    /// Checks that a step with the fault fails, and that the state of no scene changes.
+    async fn check_recovery(fault: InjectedFault, expected_error: Error) {
         let (handle, scene) = start_with_two_scenes().await;
         let [state, other_state] = [0.5, 0.25].map(|q| state_with_q(&scene, q));
         let expected = deform_and_read(&handle, FAULTY_SCENE, &state).await.expect("expected positions");
         let other_expected = deform_and_read(&handle, CONTROL_SCENE, &other_state).await.expect("expected positions");
         assert_ne!(expected, other_expected, "control: expected states with different positions");
         let mut loss = handle.loss().clone();
-        let faulty_state = state_with_q(&scene, InjectedFault::RendererLost.q());
+        let faulty_state = state_with_q(&scene, fault.q());
         let error = deform_and_read(&handle, FAULTY_SCENE, &faulty_state).await;
-        assert_eq!(error, Err(testing::renderer_lost_error()));
+        assert_eq!(error, Err(expected_error));
         loss.changed().await;
         for (id, expected) in [(FAULTY_SCENE, &expected), (CONTROL_SCENE, &other_expected)] {
             let vertices = handle.read_vertices(id, POSITIONS).wait().await.expect("expected vertices");
@@ -615,16 +628,18 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn renderer_that_is_lost_again_and_again_is_a_lost_device() {
-        let (handle, scene) = start_with_two_scenes().await;
-        let faulty_state = state_with_q(&scene, InjectedFault::RendererLost.q());
-        let mut losses = 0;
-        while handle.loss().error().is_none() {
-            deform_and_read(&handle, FAULTY_SCENE, &faulty_state).await.expect_err("expected the loss");
-            losses += 1;
-            assert!(losses < 10, "expected a limit on the number of recoveries");
+    async fn too_many_recoveries_are_a_lost_device() {
+        for fault in [InjectedFault::RendererLost, InjectedFault::Fault] {
+            let (handle, scene) = start_with_two_scenes().await;
+            let faulty_state = state_with_q(&scene, fault.q());
+            let mut failures = 0;
+            while handle.loss().error().is_none() {
+                deform_and_read(&handle, FAULTY_SCENE, &faulty_state).await.expect_err("expected the fault");
+                failures += 1;
+                assert!(failures < 10, "{fault:?}: expected a limit on the number of recoveries");
+            }
+            assert!(failures > 1, "{fault:?}: expected a recovery from the first one");
         }
-        assert!(losses > 1, "expected the first loss to be recovered from");
     }
 
     #[tokio::test]

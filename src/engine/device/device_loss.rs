@@ -1,5 +1,6 @@
 //! The loss of the renderer or of the device. The device thread and the watchdog record it. Every other task observes it.
-//! A lost renderer is opened again; after the first [`Error::DeviceLost`], the device is lost for ever.
+//! After the loss of the renderer, and after a step that has failed on the device, the renderer is opened and all scenes
+//! are loaded again. After the first [`Error::DeviceLost`], the device is lost for ever.
 
 use std::sync::Arc;
 
@@ -11,7 +12,7 @@ use modalcast_model::error::{Error, Result};
 #[derive(Debug, Clone, PartialEq)]
 enum DeviceStatus {
     Working,
-    /// The renderer is lost with this error, and is being opened again.
+    /// The renderer is lost, or a step has failed, with this error. All scenes are being loaded again.
     Recovering(Error),
     /// The error that reported the loss of the device.
     Lost(Error),
@@ -40,29 +41,51 @@ impl DeviceLossSender {
         result
     }
 
+    /// [`Self::record_loss`] of a step. A fault of the device starts a recovery, too: its memory may contain a part of the
+    /// step, and OpenGL may still lack buffers that CUDA has mapped.
+    pub(super) fn record_step<T>(&self, result: Result<T>) -> Result<T> {
+        if let Err(error @ Error::Fault { .. }) = &result {
+            self.begin_recovery(error);
+        }
+        self.record_loss(result)
+    }
+
     /// Records an error that reports a loss. Other errors change nothing.
     pub(super) fn record(&self, error: &Error) {
-        let is_first = self.0.send_if_modified(|status| match (error, &*status) {
-            (Error::DeviceLost { .. }, DeviceStatus::Working | DeviceStatus::Recovering(_)) => {
-                *status = DeviceStatus::Lost(error.clone());
-                true
-            }
-            (Error::RendererLost { .. }, DeviceStatus::Working) => {
-                *status = DeviceStatus::Recovering(error.clone());
-                true
-            }
-            _ => false,
-        });
         match error {
-            Error::DeviceLost { .. } if is_first => {
-                tracing::error!(%error, "the device is lost; every scene is closed")
-            }
-            Error::RendererLost { .. } if is_first => tracing::error!(%error, "the renderer is lost"),
+            Error::DeviceLost { .. } => self.record_lost_device(error),
+            Error::RendererLost { .. } => self.begin_recovery(error),
             _ => {}
         }
     }
 
-    /// Records that the renderer is open again.
+    fn record_lost_device(&self, error: &Error) {
+        let is_first = self.0.send_if_modified(|status| {
+            let is_first = lost_device(status).is_none();
+            if is_first {
+                *status = DeviceStatus::Lost(error.clone());
+            }
+            is_first
+        });
+        if is_first {
+            tracing::error!(%error, "the device is lost; every scene is closed");
+        }
+    }
+
+    fn begin_recovery(&self, error: &Error) {
+        let is_first = self.0.send_if_modified(|status| {
+            let is_first = *status == DeviceStatus::Working;
+            if is_first {
+                *status = DeviceStatus::Recovering(error.clone());
+            }
+            is_first
+        });
+        if is_first {
+            tracing::error!(%error, "every scene is being loaded again");
+        }
+    }
+
+    /// Records that the renderer is open and all scenes are loaded again.
     pub(super) fn record_recovery(&self) {
         self.0.send_if_modified(|status| {
             let is_recovered = matches!(status, DeviceStatus::Recovering(_));
@@ -78,8 +101,8 @@ impl DeviceLossSender {
         lost_device(&self.0.borrow())
     }
 
-    /// The error that reported the loss of the renderer, until it is open again.
-    pub(super) fn renderer_error(&self) -> Option<Error> {
+    /// The error because of which all scenes must be loaded again.
+    pub(super) fn recovery_cause(&self) -> Option<Error> {
         match &*self.0.borrow() {
             DeviceStatus::Recovering(error) => Some(error.clone()),
             DeviceStatus::Working | DeviceStatus::Lost(_) => None,
@@ -103,7 +126,7 @@ impl DeviceLoss {
         }
     }
 
-    /// Whether the renderer and the device work.
+    /// Whether the renderer and the device work, and no scene is being loaded again.
     pub fn is_working(&self) -> bool {
         *self.0.borrow() == DeviceStatus::Working
     }

@@ -1,22 +1,22 @@
-//! Limit on how often the renderer is opened again.
+//! Limit on how often the renderer is opened and all scenes are loaded again.
 
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
-/// Maximum number of recoveries within [`RECOVERY_PERIOD`]. A renderer that is lost more often is a lost device, so that a
-/// frame that always loses it does not occupy the server for ever.
+/// Maximum number of recoveries within [`RECOVERY_PERIOD`]. After more of them the device is lost, so that a frame or a step
+/// that always causes one does not occupy the server for ever.
 pub(super) const MAX_RECOVERIES: usize = 3;
 pub(super) const RECOVERY_PERIOD: Duration = Duration::from_secs(60);
 
-/// Limits how often the renderer is opened again.
+/// Limits the number of recoveries.
 #[derive(Debug, Default)]
 pub(super) struct RecoveryLimit {
-    /// When the renderer was lost, oldest first.
+    /// When a recovery was needed, oldest first.
     losses: VecDeque<Instant>,
 }
 
 impl RecoveryLimit {
-    /// Counts a loss. Returns whether the renderer may be opened again.
+    /// Counts a loss or a failed step. Returns whether a recovery is permitted.
     pub(super) fn admits(&mut self, now: Instant) -> bool {
         self.losses.retain(|loss| now.duration_since(*loss) < RECOVERY_PERIOD);
         self.losses.push_back(now);

@@ -15,6 +15,7 @@ use crate::gpu::launch::{Device, PinnedBuffer, PinnedUse, capture};
 use crate::gpu::tables::box_keys::{bounds_from_keys, oriented_bounds_from_keys};
 use crate::gpu::tables::layout::StepHeader;
 use modalcast_model::error::{Error, Result};
+use modalcast_model::fault_injection::{self, InjectionPoint};
 use modalcast_model::scene::{BoundingBox, OrientedBounds};
 
 /// The kernels of a scene.
@@ -93,6 +94,7 @@ impl StepSlot {
             StepKind::Partial => self.partial_graph.as_ref(),
         };
         let missing_graph = || Error::Fault { stage: "deform", reason: "expected a captured graph, got none".into() };
+        fault_injection::check(InjectionPoint::Launch)?;
         graph.ok_or_else(missing_graph)?.launch().map_err(cuda_error("deform"))
     }
 

@@ -1,5 +1,6 @@
-//! Recovery from the loss of the renderer: the device thread opens the renderer again, loads all scenes again and deforms
-//! them to their last states. Commands that are queued meanwhile are executed afterwards.
+//! Recovery from the loss of the renderer, or from a step that has failed on the device: the device thread opens the
+//! renderer again, loads all scenes again and deforms them to their last states. Commands that are queued meanwhile are
+//! executed afterwards.
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -19,30 +20,34 @@ struct SceneToRestore {
 }
 
 impl DeviceLoop {
-    /// Opens the renderer again if it is lost. If that fails, the device is lost.
-    pub(super) fn recover_renderer(&mut self) {
-        let Some(error) = self.loss.renderer_error() else { return };
+    /// Opens the renderer and loads all scenes again if an error demands it. If that fails, the device is lost.
+    pub(super) fn recover(&mut self) {
+        let Some(error) = self.loss.recovery_cause() else { return };
         let begin = Instant::now();
         let result = match self.recoveries.admits(begin) {
             true => self.reload_all(&error),
             false => Err(Error::DeviceLost {
-                stage: "renderer",
-                reason: format!("lost more than {MAX_RECOVERIES} times in {} s: {error}", RECOVERY_PERIOD.as_secs()),
+                stage: "recovery",
+                reason: format!("more than {MAX_RECOVERIES} in {} s: {error}", RECOVERY_PERIOD.as_secs()),
             }),
         };
         match result {
             Ok(scenes) => {
-                tracing::warn!(scenes, ms = begin.elapsed().as_millis() as u64, "the renderer is open again");
+                tracing::warn!(scenes, ms = begin.elapsed().as_millis() as u64, "all scenes are loaded again");
                 self.loss.record_recovery();
             }
             Err(lost @ Error::DeviceLost { .. }) => self.loss.record(&lost),
-            Err(error) => self.loss.record(&Error::DeviceLost { stage: "renderer", reason: error.to_string() }),
+            Err(error) => self.loss.record(&Error::DeviceLost { stage: "recovery", reason: error.to_string() }),
         }
     }
 
-    /// Answers all outputs in flight with `error`, opens the renderer, and restores all scenes. Returns their number.
-    fn reload_all(&mut self, error: &Error) -> Result<usize> {
-        self.fail_outputs(error);
+    /// Answers all outputs in flight with an error, opens the renderer, and restores all scenes. Returns their number.
+    fn reload_all(&mut self, cause: &Error) -> Result<usize> {
+        let output_error = match cause {
+            Error::RendererLost { .. } => cause.clone(),
+            cause => Error::RendererLost { stage: "output", reason: cause.to_string() },
+        };
+        self.fail_outputs(&output_error);
         let scenes = self.unload_all();
         self.context.reopen_renderer()?;
         let count = scenes.len();
