@@ -6,12 +6,13 @@ use std::sync::Arc;
 use serde::Serialize;
 
 use super::UploadTiming;
-use super::cuda_variants::{self, StepVariant};
+use super::cpu_bandwidth::best_read_gbs;
+use super::cuda_variants::{self, STEP_SUFFIX, StepVariant};
 use super::error_model::ErrorModelCache;
 use super::variant::{DeformerVariant, VariantCandidate, VariantFilter, VariantLabel, make_candidate};
 use super::workloads::Workload;
 use crate::kernels::{self, StepOutputs};
-use modalcast_compute::cpu::{CpuDeformer, read_bandwidth};
+use modalcast_compute::cpu::CpuDeformer;
 use modalcast_compute::gpu::{CudaDeformer, CudaDeformerOptions, Device};
 use modalcast_compute::reference::ReferenceDeformer;
 use modalcast_model::deform::{Backend, Deformer};
@@ -24,7 +25,7 @@ use modalcast_model::scene::{DeformationSettings, NormalMethod, Scene, SceneStat
 pub struct MemoryBandwidth {
     /// Fastest copy: bytes read plus bytes written.
     pub copy_gbs: Option<f64>,
-    /// Fastest pure read.
+    /// Fastest pure read of several kernels, from memory, not from a cache.
     pub read_gbs: Option<f64>,
     /// Launch overhead: replay of a graph with one empty kernel, microseconds.
     pub empty_us: Option<f64>,
@@ -89,11 +90,6 @@ pub struct LocalMachine {
     cpu_bandwidth: MemoryBandwidth,
 }
 
-/// Size of the buffer from which the read bandwidth of all cores is measured. 512 MiB exceed the caches of a socket.
-const READ_BYTES: usize = 1 << 29;
-/// Number of reads of the buffer. The fastest one counts.
-const READ_REPETITIONS: usize = 5;
-
 impl LocalMachine {
     /// Opens the first CUDA device, if it exists and NVRTC works, and measures the memory bandwidths of device and CPU.
     pub fn open() -> Self {
@@ -105,10 +101,7 @@ impl LocalMachine {
             let [pinned_h2d_gbs, pinned_d2h_gbs] = [pinned_h2d_gbs, pinned_d2h_gbs].map(Some);
             Ok((device, MemoryBandwidth { copy_gbs, read_gbs, empty_us, pinned_h2d_gbs, pinned_d2h_gbs }))
         };
-        let cpu_bandwidth = MemoryBandwidth {
-            read_gbs: Some(read_bandwidth(READ_BYTES, READ_REPETITIONS)),
-            ..MemoryBandwidth::default()
-        };
+        let cpu_bandwidth = MemoryBandwidth { read_gbs: Some(best_read_gbs()), ..MemoryBandwidth::default() };
         match Device::open(0).and_then(measure_device) {
             Ok((device, cuda_bandwidth)) => Self { device: Ok(device), cuda_bandwidth, cpu_bandwidth },
             Err(error) => Self { device: Err(error), cuda_bandwidth: MemoryBandwidth::default(), cpu_bandwidth },
@@ -150,12 +143,16 @@ impl BenchTarget for LocalMachine {
             if let Some(exact) = exact_normals(scene) {
                 candidates.push(candidate("cuda f32 step, exact normals", Backend::Cuda, exact, &cuda));
             }
-            // The alternatives with exact normals are added above, those with other storage types in `kernel_variants`.
+            // The alternative with exact normals is added above.
             for (name, deformation) in alternative_deformations(scene)
                 .into_iter()
-                .filter(|(_, deformation)| cuda_variants::truncates_or_compensates(deformation))
+                .filter(|(_, deformation)| deformation.normals == scene.deformation.normals)
             {
-                candidates.push(candidate(&format!("cuda {name} step"), Backend::Cuda, deformation, &cuda));
+                candidates.push(candidate(&format!("cuda {name}{STEP_SUFFIX}"), Backend::Cuda, deformation, &cuda));
+                // `kernel_variants` adds the kernels of other storage types.
+                if !cuda_variants::truncates_or_compensates(&deformation) {
+                    continue;
+                }
                 let variant = StepVariant {
                     name: format!("cuda {name} positions"),
                     deformation,

@@ -8,6 +8,8 @@ use std::path::PathBuf;
 use clap::{CommandFactory as _, Parser, Subcommand};
 
 use crate::bench::LocalMachine;
+use crate::recommendation::Recommendation;
+use crate::validate::ValidationLimits;
 use crate::workloads::{Size, WorkloadKind};
 use crate::{DeformReport, DeformReportOptions, Progress, WorkloadSource, deform};
 use modalcast::cli::options::with_spinner;
@@ -53,7 +55,7 @@ const LOADS: &str = "Loads:
   a, a-positions      one domain of 1.5 M vertices and 32 modes, with normals and tangents, or without
   b                   1,000 domains of 1,500 vertices and 0 to 64 modes
   c                   200,000 domains of 7 vertices, 95 % of them rigid
-  cancel              one domain whose modes nearly cancel in pairs
+  cancel              one domain at the origin whose modes nearly cancel in pairs
   batch               16 instances of one domain of 2^18 vertices and 32 modes
   plant-1 .. plant-12 the plants of table 4.5 of the thesis
   plant-N-follows     the same plant with leaves that follow branches, so that only branches have a T
@@ -91,10 +93,14 @@ struct DeformArgs {
     /// Validate at most this number of trajectory steps [default: all].
     #[arg(long)]
     steps: Option<usize>,
+    /// Seconds per load after which no further states are validated. At least 10 random states and 2 steps are.
+    #[arg(long, value_name = "SECONDS", default_value_t = 8.0, value_parser = parse_seconds)]
+    validation_seconds: f64,
     /// Measure only this variant, or all variants with this prefix: "cuda*"; repeatable.
     #[arg(long = "variant", value_name = "NAME")]
     variants: Vec<String>,
-    /// Build every load at a fraction of its size, for machines without a GPU; the report marks these loads.
+    /// Build each load that would take more than seconds at a fraction of its size, for machines without a GPU; the
+    /// report marks these loads.
     #[arg(long)]
     quick: bool,
 }
@@ -134,6 +140,12 @@ fn run_deform(args: &DeformArgs) -> Outcome {
     Ok(Completion::of_check(report.passed()))
 }
 
+/// Parses a number of seconds that is not negative.
+fn parse_seconds(text: &str) -> Result<f64, String> {
+    let seconds = text.parse::<f64>().ok().filter(|seconds| *seconds >= 0.0);
+    seconds.ok_or_else(|| format!("expected a number of seconds of at least 0, got {text}"))
+}
+
 fn report_options(args: &DeformArgs) -> Result<DeformReportOptions> {
     let mut sources = Vec::new();
     if let Some(source) = &args.scene {
@@ -150,9 +162,12 @@ fn report_options(args: &DeformArgs) -> Result<DeformReportOptions> {
     let count_or = |argument: Option<u32>, default: usize| argument.map_or(default, |count| count as usize);
     Ok(DeformReportOptions {
         sources,
-        seeds: count_or(args.seeds, default_seeds),
+        validation: ValidationLimits {
+            seeds: count_or(args.seeds, default_seeds),
+            steps: args.steps.unwrap_or(usize::MAX),
+            seconds: args.validation_seconds,
+        },
         replays: count_or(args.replays, default_replays),
-        steps: args.steps.unwrap_or(usize::MAX),
         variants: args.variants.clone(),
         size,
     })
@@ -185,6 +200,17 @@ fn format_lines(report: &DeformReport) -> Vec<String> {
             }
         ));
     }
+    for workload in &report.loads {
+        lines.extend(workload.recommendations.iter().map(|recommendation| {
+            let Recommendation { limit_meters, variant, median_us, equally_fast, .. } = recommendation;
+            let note = if equally_fast.is_empty() {
+                String::new()
+            } else {
+                format!(" (within noise: {})", equally_fast.join(", "))
+            };
+            format!("{}: for an error <= {limit_meters:.0e} m: {variant}, {median_us:.1} us{note}", workload.name)
+        }));
+    }
     lines.extend(report.failed.iter().map(|failed| format!("failed: {failed}")));
     lines
 }
@@ -203,6 +229,7 @@ mod tests {
             seeds: None,
             replays: None,
             steps: None,
+            validation_seconds: 8.0,
             variants: vec![],
             quick: false,
         }
@@ -212,11 +239,11 @@ mod tests {
     fn measures_all_loads_by_default_and_fewer_states_if_quick() {
         let all = report_options(&args()).expect("valid arguments");
         assert_eq!(
-            (all.sources.len(), all.seeds, all.replays, all.size),
+            (all.sources.len(), all.validation.seeds, all.replays, all.size),
             (WorkloadKind::all().len(), 100, 100, Size::Full)
         );
         let quick = report_options(&DeformArgs { quick: true, seeds: Some(3), ..args() }).expect("valid arguments");
-        assert_eq!((quick.seeds, quick.replays, quick.size), (3, 20, Size::Quick));
+        assert_eq!((quick.validation.seeds, quick.replays, quick.size), (3, 20, Size::Quick));
     }
 
     #[test]

@@ -23,6 +23,8 @@ type BenchmarkFactory = Box<dyn Fn(&Device, &Arc<Scene>, &[SceneState]) -> Resul
 
 /// Name suffix of variants that compute only u = U q.
 const UQ_SUFFIX: &str = " Uq";
+/// Name suffix of variants that are complete steps on a device.
+pub(super) const STEP_SUFFIX: &str = " step";
 /// Name suffix of the variant that changes one domain in a hundred.
 const ONE_PERCENT_CHANGED: &str = ", 1 % changed";
 
@@ -33,6 +35,16 @@ const PARTS: [(kernels::StepPart, &str); 2] = [(kernels::StepPart::Uq, UQ_SUFFIX
 /// Whether the variant of this name computes only a part of a step. Its time is not comparable with whole steps.
 pub(super) fn is_partial_step(name: &str) -> bool {
     [UQ_SUFFIX, ONE_PERCENT_CHANGED].iter().any(|ending| name.ends_with(ending))
+}
+
+/// Whether the variant of this name does all that the server does for a step: on the CPU a call of the deformer, on a
+/// device also the copies of q and T to the device and of bounding boxes to the host.
+pub(super) fn is_complete_step(backend: Backend, name: &str) -> bool {
+    match backend {
+        Backend::Cpu => true,
+        Backend::Cuda => name.ends_with(STEP_SUFFIX) || name.contains(&format!("{STEP_SUFFIX},")),
+        Backend::Reference => false,
+    }
 }
 
 /// A kernel benchmark as a variant. [`Variant::prepare`] creates the benchmark, because it needs the states.

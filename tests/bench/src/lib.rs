@@ -11,10 +11,11 @@
 //!   approximations of a variant, and a-priori bounds. [`errors`] and [`error_sources`] measure variants against them.
 //! - [`variant`] and [`mod@bench`]: the variants to measure. A new variant implements [`variant::Variant`], and
 //!   [`bench::LocalMachine`] lists it.
-//! - [`table`], [`thesis_comparison`], [`plot`]: the output.
+//! - [`table`], [`thesis_comparison`], [`recommendation`], [`plot`]: the output.
 
 pub mod bench;
 pub mod cli;
+mod cpu_bandwidth;
 mod cuda_variants;
 mod double_double;
 pub mod error_model;
@@ -33,6 +34,7 @@ pub mod motion;
 mod output_files;
 pub mod plot;
 pub mod provenance;
+pub mod recommendation;
 pub mod recorded_trajectory;
 pub mod render;
 pub mod stream;
@@ -58,11 +60,12 @@ use modalcast_model::load::{self, OpenedScene};
 use motion::WorkloadMotion;
 use output_files::write_files;
 use provenance::Provenance;
+use recommendation::{Recommendation, recommend};
 use recorded_trajectory::RecordedTrajectory;
 use table::DeformRow;
 use thesis_comparison::ThesisComparison;
 use timing::CacheState;
-use validate::ConditionNumbers;
+use validate::{ConditionNumbers, ValidationLimits};
 use variant::Variant;
 use workloads::{Size, Workload, WorkloadKind};
 
@@ -77,12 +80,10 @@ const ROTATING_STATES: usize = 8;
 #[derive(Debug, Clone)]
 pub struct DeformReportOptions {
     pub sources: Vec<WorkloadSource>,
-    /// Random states per workload.
-    pub seeds: usize,
+    /// How many states of each workload are validated.
+    pub validation: ValidationLimits,
     /// Repetitions per median.
     pub replays: usize,
-    /// Maximum number of trajectory steps to validate.
-    pub steps: usize,
     /// Variants to measure: full names, or prefixes that end in `*`. An empty list selects all.
     pub variants: Vec<String>,
     pub size: Size,
@@ -155,6 +156,8 @@ pub struct WorkloadSummary {
     pub upload: Option<UploadTiming>,
     /// Times of steps with readback of the vertices, serial and overlapped; `None` without a CUDA device.
     pub overlap: Option<Overlap>,
+    /// The fastest complete step for limits of the error.
+    pub recommendations: Vec<Recommendation>,
 }
 
 /// Host-to-device upload of one step, timed alone.
@@ -173,7 +176,7 @@ pub struct DeformReport {
     pub provenance: Provenance,
     /// Capabilities that this machine lacks, each with the reason.
     pub remarks: Vec<String>,
-    /// Random states per workload.
+    /// Maximum number of random states per workload; `states` of a row is the number of validated states.
     pub seeds: usize,
     /// Peak memory bandwidth of each backend.
     #[serde(rename = "roofs")]
@@ -217,13 +220,18 @@ pub fn deform(
         let (vertices, domains) = (workload.scene.layout.vertices, workload.scene.domains.len());
         progress(Progress::Started(&format!("{}: {vertices} vertices, {domains} domains", workload.name)))?;
         let (condition, rows) = measure_variants(options, target, &workload, &motion);
+        let recommendations = recommend(rows.iter());
         measurements.rows.extend(rows);
-        let is_full_size = options.size == Size::Full && matches!(source, WorkloadSource::Synthetic(_));
+        let is_full_size = match source {
+            WorkloadSource::Synthetic(kind) => options.size == Size::Full || kind.quick_size() == Size::Full,
+            WorkloadSource::Scene { .. } => false,
+        };
         let summary = summarize(&workload, &motion, condition, is_full_size);
         let overlap = measure_overlap(options, target, &workload, &motion, &mut measurements.failed);
         measurements.loads.push(WorkloadSummary {
             upload: target.time_upload(&workload, options.replays),
             overlap,
+            recommendations,
             ..summary
         });
         report = assemble_report(options, target, &measurements);
@@ -261,7 +269,7 @@ fn assemble_report(
     DeformReport {
         provenance: Provenance::collect(),
         remarks: target.remarks(),
-        seeds: options.seeds,
+        seeds: options.validation.seeds,
         memory_bandwidths: memory_bandwidths.into(),
         host_writes: measurements.host_writes.clone(),
         loads: loads.clone(),
@@ -303,6 +311,7 @@ fn measure_overlap(
 fn open_workload(source: &WorkloadSource, size: Size) -> Result<(Workload, WorkloadMotion)> {
     match source {
         WorkloadSource::Synthetic(kind) => {
+            let size = if size == Size::Quick { kind.quick_size() } else { size };
             let workload = kind.build(size)?;
             let motion = WorkloadMotion::new(&workload, None);
             Ok((workload, motion))
@@ -344,6 +353,7 @@ fn summarize(
         condition,
         upload: None,
         overlap: None,
+        recommendations: Vec::new(),
     }
 }
 
@@ -365,7 +375,7 @@ fn measure_variants(
             Err(error) => rows.push(DeformRow::not_created(&workload.name, &label, &error)),
         }
     }
-    let (results, condition) = validate::validate(workload, motion, &mut variants, (options.seeds, options.steps));
+    let (results, condition) = validate::validate(workload, motion, &mut variants, options.validation);
     let states: Vec<_> = (0..ROTATING_STATES).map(|seed| motion.random_state(seed).state()).collect();
     for (variant, result) in variants.iter_mut().zip(results) {
         for cache in [CacheState::Warm, CacheState::Cold] {

@@ -21,6 +21,9 @@ const RELATIVE_AMPLITUDE: f64 = 0.05;
 const MAX_ROTATION: f64 = 0.2;
 /// Limit of a domain's random translation from its placement, as a fraction of the domain's diagonal.
 const MAX_RELATIVE_SHIFT: f64 = 0.05;
+/// Limit of the standard deviation of a coordinate. A mode whose largest entry is denormal would otherwise need
+/// coordinates that overflow in f32, whose largest number is 3.4e38.
+const MAX_DEVIATION: f64 = 1e30;
 /// Steps of a synthetic trajectory.
 const TRAJECTORY_STEPS: usize = 24;
 /// Seconds between steps.
@@ -166,7 +169,7 @@ fn mode_spreads(scene: &Scene, domain: usize) -> Vec<ModeSpread> {
             .map_or((mode + 1) as f64, |first_eigenvalue| (eigenvalues[mode] / first_eigenvalue).max(1.0).sqrt());
         let max_entry = modes.column(mode).iter().fold(0.0_f32, |max, entry| max.max(entry.abs()));
         // The coordinate of a mode without displacement is arbitrary.
-        let deviation = if max_entry > 0.0 { amplitude / f64::from(max_entry) } else { 1.0 };
+        let deviation = if max_entry > 0.0 { (amplitude / f64::from(max_entry)).min(MAX_DEVIATION) } else { 1.0 };
         ModeSpread { deviation: deviation / relative_frequency, relative_frequency }
     };
     (0..modes.rank()).map(mode_spread).collect()
@@ -197,6 +200,7 @@ fn random_normal(rng: &mut Rng) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::testing;
     use crate::workloads::{Size, WorkloadKind};
 
     fn motion(kind: WorkloadKind) -> WorkloadMotion {
@@ -239,6 +243,18 @@ mod tests {
         // A sum of f64 that cancels leaves only rounding errors of about 1e-16.
         assert!(max_condition(1) > 1e12, "expected a row that cancels, got condition {}", max_condition(1));
         assert!(max_condition(0) < 1e6, "expected no row that cancels, got condition {}", max_condition(0));
+    }
+
+    #[test]
+    fn coordinates_of_denormal_modes_are_finite_in_f32() {
+        let workload = testing::with_denormal_modes(&WorkloadKind::Single { power: 6, rank: 4 });
+        let motion = WorkloadMotion::new(&workload, None);
+        for exact_state in
+            (0..6).map(|seed| motion.random_state(seed)).chain((0..4).map(|step| motion.trajectory_state(step)))
+        {
+            let q = exact_state.state().q;
+            assert!(q.iter().all(|coordinate| coordinate.is_finite() && *coordinate != 0.0), "{q:?}");
+        }
     }
 
     #[test]

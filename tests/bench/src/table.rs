@@ -117,11 +117,12 @@ impl DeformRow {
         self
     }
 
-    /// Median time in microseconds and largest error as a fraction of the diagonal; `None` when the variant failed or
-    /// was not timed.
-    pub fn time_and_error(&self) -> Option<(f64, f64)> {
+    /// Time, and largest error as a fraction of the diagonal; `None` when the variant failed or was not timed.
+    pub fn time_and_error(&self) -> Option<TimeAndError> {
         let validation = self.validation.as_ref().filter(|_| self.passed)?;
-        Some((self.timing?.median_us, validation.errors.of_diagonal.largest))
+        let Timing { median_us, q1_us, q3_us, .. } = self.timing?;
+        let error = validation.errors.of_diagonal.largest;
+        Some(TimeAndError { time_us: median_us, quartiles_us: [q1_us, q3_us], error })
     }
 }
 
@@ -209,19 +210,61 @@ pub fn csv(rows: &[DeformRow]) -> Result<Vec<u8>> {
     writer.into_inner().map_err(fault_in("report"))
 }
 
-/// Pareto front of points whose numbers should both be small. Returns the indices of the points that no other point
-/// dominates, by ascending first number. Of equal points, only one is on the front.
-pub fn pareto_front(points: &[(f64, f64)]) -> Vec<usize> {
+/// Relative difference of times or errors below which one variant does not count as better than another.
+const MIN_RELATIVE_GAIN: f64 = 1e-3;
+
+/// Time and error of a variant, and the quartiles of the time.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct TimeAndError {
+    pub time_us: f64,
+    /// First and third quartile; both are `time_us` if they were not measured.
+    pub quartiles_us: [f64; 2],
+    pub error: f64,
+}
+
+impl TimeAndError {
+    /// Whether the time is smaller than that of `other` by more than noise: the quartiles do not overlap, and the
+    /// difference is more than [`MIN_RELATIVE_GAIN`].
+    pub fn is_faster_than(&self, other: &Self) -> bool {
+        self.quartiles_us[1] < other.quartiles_us[0] && self.time_us < other.time_us * (1.0 - MIN_RELATIVE_GAIN)
+    }
+
+    /// Whether neither time is smaller than the other by more than noise.
+    pub fn has_time_of(&self, other: &Self) -> bool {
+        !self.is_faster_than(other) && !other.is_faster_than(self)
+    }
+}
+
+/// Pareto front of times and errors: the indices of the points that no other point dominates, by ascending time. Of
+/// points that differ only by noise in time, or by less than [`MIN_RELATIVE_GAIN`] in error, one is on the front.
+pub fn pareto_front(points: &[TimeAndError]) -> Vec<usize> {
     let mut order: Vec<usize> = (0..points.len()).collect();
-    order.sort_by(|a, b| points[*a].0.total_cmp(&points[*b].0).then(points[*a].1.total_cmp(&points[*b].1)));
-    let mut min_second = f64::INFINITY;
-    let mut is_on_front = |index: &usize| {
-        let is_smaller = points[*index].1 < min_second;
-        min_second = min_second.min(points[*index].1);
+    order.sort_by(|a, b| {
+        let (a, b) = (&points[*a], &points[*b]);
+        a.time_us.total_cmp(&b.time_us).then(a.error.total_cmp(&b.error))
+    });
+    let mut min_error = f64::INFINITY;
+    order.retain(|index| {
+        let is_smaller = points[*index].error < min_error;
+        min_error = min_error.min(points[*index].error);
         is_smaller
-    };
-    order.retain(|index| is_on_front(index));
-    order
+    });
+    // From the smallest error to the shortest time. Each point is compared with the last one that remains, so that a
+    // chain of small differences does not remove a point that differs from all others by more than noise.
+    let mut front: Vec<usize> = Vec::new();
+    for index in order.into_iter().rev() {
+        let point = &points[index];
+        match front.last().map(|last| &points[*last]) {
+            Some(last) if !point.is_faster_than(last) => continue,
+            Some(last) if last.error >= point.error * (1.0 - MIN_RELATIVE_GAIN) => {
+                front.pop();
+            }
+            _ => {}
+        }
+        front.push(index);
+    }
+    front.reverse();
+    front
 }
 
 #[cfg(test)]
@@ -259,12 +302,31 @@ pub(super) mod tests {
         DeformRow::new(load, &label, validation, traffic, (cache, Some(timing)))
     }
 
+    /// A point whose quartiles are the time minus and plus `noise_us`.
+    fn point((time_us, noise_us): (f64, f64), error: f64) -> TimeAndError {
+        TimeAndError { time_us, quartiles_us: [time_us - noise_us, time_us + noise_us], error }
+    }
+
     #[test]
     fn front_contains_exactly_the_pareto_optimal_points() {
         let points = [(1.0, 5.0), (2.0, 6.0), (3.0, 1.0), (3.0, 0.5), (4.0, 0.5), (0.5, 9.0)];
+        let points = points.map(|(time_us, error)| point((time_us, 0.0), error));
         assert_eq!(pareto_front(&points), [5, 0, 3]);
         assert_eq!(pareto_front(&[]), [0; 0]);
-        assert_eq!(pareto_front(&[(1.0, 1.0), (1.0, 1.0)]).len(), 1, "expected one of two equal points");
+        assert_eq!(pareto_front(&[points[0], points[0]]).len(), 1, "expected one of two equal points");
+    }
+
+    #[test]
+    fn front_ignores_gains_within_noise_and_of_a_thousandth() {
+        let exact = |time_us: f64, error: f64| point((time_us, 0.0), error);
+        assert_eq!(pareto_front(&[exact(1.0, 2.0), exact(1.0005, 1.0)]), [1], "a time of 0.05 % less");
+        assert_eq!(pareto_front(&[exact(1.0, 2.0), exact(1.01, 1.0)]), [0, 1]);
+        assert_eq!(pareto_front(&[exact(1.0, 1.0), exact(2.0, 0.9995)]), [0], "an error of 0.05 % less");
+        assert_eq!(pareto_front(&[exact(1.0, 1.0), exact(2.0, 0.99)]), [0, 1]);
+        let noisy = [point((10.0, 1.0), 3.0), point((11.0, 1.0), 2.0), point((12.0, 0.5), 1.0)];
+        assert_eq!(pareto_front(&noisy), [0, 2], "the second time is that of the third");
+        let distinct = [point((10.0, 0.1), 3.0), point((11.0, 0.1), 2.0), point((12.0, 0.1), 1.0)];
+        assert_eq!(pareto_front(&distinct), [0, 1, 2]);
     }
 
     #[test]

@@ -8,9 +8,26 @@ use super::exact_state::ExactState;
 use super::memory_traffic::Operand;
 use super::timing::{CacheState, Timing};
 use super::variant::{Variant, VariantLabel};
+use super::workloads::{Size, Workload, WorkloadKind};
 use modalcast_model::deform::DeformedSurface;
+use modalcast_model::domain::{Modes, Shape};
 use modalcast_model::error::Result;
 use modalcast_model::scene::{Scene, SceneState};
+
+/// A workload of one shape, with modes whose entries are denormal numbers.
+pub(super) fn with_denormal_modes(kind: &WorkloadKind) -> Workload {
+    let workload = kind.build(Size::Quick).expect("expected a workload");
+    let mut parts = workload.scene.parts();
+    let shape = &parts.shapes[0];
+    let rows = 3 * shape.modes.vertices();
+    let rank = shape.modes.rank();
+    // Entries of a workload are at most 1. The smallest normal number is 1.2e-38.
+    let entries = (0..rank).flat_map(|mode| shape.modes.column(mode).iter().map(|entry| entry * 1e-39)).collect();
+    let modes = Modes::from_columns(rows, rank, entries).expect("expected modes");
+    parts.shapes[0] = Shape::new(shape.mesh.clone(), modes).expect("expected a shape");
+    let scene = Scene::new(parts).expect("expected a scene");
+    Workload { scene, ..workload }
+}
 
 /// Wraps another variant and adds an error to the last coordinate of its positions.
 pub(super) struct InaccurateVariant<V> {

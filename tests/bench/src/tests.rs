@@ -30,7 +30,8 @@ impl BenchTarget for CpuTarget {
 }
 
 fn report_options(sources: Vec<WorkloadSource>) -> DeformReportOptions {
-    DeformReportOptions { sources, seeds: 3, replays: 20, steps: usize::MAX, variants: vec![], size: Size::Quick }
+    let validation = ValidationLimits { seeds: 3, steps: usize::MAX, seconds: f64::INFINITY };
+    DeformReportOptions { sources, validation, replays: 20, variants: vec![], size: Size::Quick }
 }
 
 /// Measures two workloads with the CPU target and checks the progress events.

@@ -71,15 +71,27 @@ impl ThesisComparison {
         }
     }
 
-    /// Both tables as Markdown.
+    /// The tables with results of ours, as Markdown; empty without any.
     pub fn markdown(&self) -> String {
+        let mut tables = String::new();
+        if self.table_4_4.iter().any(|comparison| comparison.ours.is_some()) {
+            let table = single_domain_table(&self.table_4_4);
+            tables.push_str(&format!("\nTable 4.4, CPU time over GPU time, thesis / ours:\n\n{table}"));
+        }
+        let measured: Vec<PlantComparison> =
+            self.tables_4_5_to_4_7.iter().filter(|comparison| !comparison.ours.is_empty()).cloned().collect();
+        if !measured.is_empty() {
+            let table = plant_table(&measured);
+            tables.push_str(&format!(
+                "\nTables 4.5 to 4.7, milliseconds of the thesis, then ours (complete vertex update):\n\n{table}"
+            ));
+        }
+        if tables.is_empty() {
+            return tables;
+        }
         format!(
-            "## Comparison with the thesis\n\nSource: {}. Our results for loads of reduced size are omitted.\n\n\
-             Table 4.4, CPU time over GPU time, thesis / ours:\n\n{}\n\
-             Tables 4.5 to 4.7, milliseconds of the thesis, then ours (complete vertex update):\n\n{}",
-            self.source,
-            single_domain_table(&self.table_4_4),
-            plant_table(&self.tables_4_5_to_4_7)
+            "\n## Comparison with the thesis\n\nSource: {}. Our results for loads of reduced size are omitted.\n{tables}",
+            self.source
         )
     }
 }
@@ -157,5 +169,6 @@ mod tests {
         let reduced = ThesisComparison::new(&rows, |_| false);
         assert!(reduced.table_4_4.iter().all(|single| single.ours.is_none()));
         assert!(reduced.tables_4_5_to_4_7.iter().all(|plant| plant.ours.is_empty()));
+        assert_eq!(reduced.markdown(), "", "expected no table without results");
     }
 }

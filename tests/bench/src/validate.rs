@@ -2,6 +2,7 @@
 
 use std::ops::Range;
 use std::sync::{Arc, OnceLock};
+use std::time::Instant;
 
 use rayon::prelude::*;
 use serde::Serialize;
@@ -168,15 +169,45 @@ impl<'a> StateSample<'a> {
 /// takes at most 2^24 x 112 bytes = 1.9 GB.
 const MAX_GROUP_ITEMS: usize = 1 << 24;
 
-/// Validates the variants at every vertex and corner of `seeds` random states (at least one) and of at most `steps`
-/// states of the trajectory. The reference values are computed once for all variants, in parallel over several states.
+/// How many states of a workload are validated.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ValidationLimits {
+    /// Maximum number of random states; at least one is validated.
+    pub seeds: usize,
+    /// Maximum number of states of the trajectory.
+    pub steps: usize,
+    /// Seconds after which no state beyond [`MIN_RANDOM_STATES`] and [`MIN_STEPS`] is validated. Random states take at most
+    /// [`RANDOM_FRACTION`] of this time. The groups of states that are evaluated together are finished.
+    pub seconds: f64,
+}
+
+/// Minimum number of random states, if as many are requested.
+pub const MIN_RANDOM_STATES: usize = 10;
+/// Minimum number of states of the trajectory, if as many are requested: one step from a state to the next.
+pub const MIN_STEPS: usize = 2;
+/// Fraction of the time for random states. The rest is for the trajectory.
+const RANDOM_FRACTION: f64 = 0.8;
+
+impl ValidationLimits {
+    /// Whether the time is over for a state with this index: random states come first, then those of the trajectory.
+    fn exclude(&self, index: usize, elapsed_seconds: f64) -> bool {
+        match index.checked_sub(self.seeds) {
+            None => index >= MIN_RANDOM_STATES && elapsed_seconds >= RANDOM_FRACTION * self.seconds,
+            Some(step) => step >= MIN_STEPS && elapsed_seconds >= self.seconds,
+        }
+    }
+}
+
+/// Validates the variants at every vertex and corner of random states and of states of the trajectory, as many as
+/// `limits` allows. The reference values are computed once for all variants, in parallel over several states.
 pub fn validate(
     workload: &Workload,
     motion: &WorkloadMotion,
     variants: &mut [Box<dyn Variant>],
-    (seeds, steps): (usize, usize),
+    limits: ValidationLimits,
 ) -> (Vec<ValidationResult>, ConditionNumbers) {
-    let seeds = seeds.max(1);
+    let limits = ValidationLimits { seeds: limits.seeds.max(1), ..limits };
+    let ValidationLimits { seeds, steps, .. } = limits;
     let camera = Camera::fit_to_scene(&workload.scene, IMAGE_SIZE.0, IMAGE_SIZE.1);
     let error_scale = ErrorScale::new(&workload.scene, &camera);
     let exact_state =
@@ -188,7 +219,11 @@ pub fn validate(
     let (scenes, mut conditions) = (NormalScenes::new(workload), ConditionAccumulator::default());
     // Reference directions that variants needed at the first state. For later states, they are computed in parallel.
     let (mut needs_rigid_directions, mut needs_exact_directions) = (false, false);
-    for group in group_states(state_count, workload.scene.layout.vertices + workload.scene.layout.corners) {
+    let begin = Instant::now();
+    for group in group_states(seeds, state_count, workload.scene.layout.vertices + workload.scene.layout.corners) {
+        if limits.exclude(group.start, begin.elapsed().as_secs_f64()) {
+            continue;
+        }
         let evaluate = |index: usize| {
             let sample = StateSample::new(&scenes, index, &states[index], index >= seeds);
             if needs_rigid_directions {
@@ -217,11 +252,15 @@ pub fn validate(
 }
 
 /// Splits states 0 to `count` into groups that are evaluated together. The first state is a group of its own, because
-/// it shows which directions the other states need.
-fn group_states(count: usize, items_per_state: usize) -> impl Iterator<Item = Range<usize>> {
+/// it shows which directions the other states need. No group has both random states, which come before `seeds`, and
+/// states of the trajectory.
+fn group_states(seeds: usize, count: usize, items_per_state: usize) -> impl Iterator<Item = Range<usize>> {
     let group_size = (MAX_GROUP_ITEMS / items_per_state.max(1)).clamp(1, rayon::current_num_threads());
-    let rest = (1..count).step_by(group_size).map(move |first| first..count.min(first + group_size));
-    std::iter::once(0..count.min(1)).chain(rest)
+    let groups_of = move |states: Range<usize>| {
+        let end = states.end;
+        states.step_by(group_size).map(move |first| first..end.min(first + group_size))
+    };
+    std::iter::once(0..count.min(1)).chain(groups_of(1..seeds)).chain(groups_of(seeds..count))
 }
 
 impl<'a> VariantCheck<'a> {
@@ -419,6 +458,11 @@ mod tests {
     use modalcast_model::deform::Backend;
     use modalcast_model::scene::StorageType;
 
+    /// This number of random states and all steps, without a time limit.
+    fn limits(seeds: usize) -> ValidationLimits {
+        ValidationLimits { seeds, steps: usize::MAX, seconds: f64::INFINITY }
+    }
+
     /// Validates the CPU deformer with `error` added to its last coordinate, at four random states and the trajectory.
     fn validate_cpu(kind: WorkloadKind, error: f32) -> (ValidationResult, ConditionNumbers) {
         let workload = kind.build(Size::Quick).expect("expected a load");
@@ -426,7 +470,7 @@ mod tests {
         let cpu = DeformerVariant::new(label, &workload.scene, Box::new(CpuDeformer::new(&workload.scene)));
         let mut variants: Vec<Box<dyn Variant>> = vec![Box::new(InaccurateVariant::new(cpu, error))];
         let motion = WorkloadMotion::new(&workload, None);
-        let (mut results, condition) = validate(&workload, &motion, &mut variants, (4, usize::MAX));
+        let (mut results, condition) = validate(&workload, &motion, &mut variants, limits(4));
         (results.remove(0), condition)
     }
 
@@ -473,7 +517,7 @@ mod tests {
         let emulated =
             EmulatedVariant { label, scene: declared_scene, applied, declared, surface: DeformedSurface::default() };
         let mut variants: Vec<Box<dyn Variant>> = vec![Box::new(emulated)];
-        validate(&workload, &WorkloadMotion::new(&workload, None), &mut variants, (3, usize::MAX)).0.remove(0)
+        validate(&workload, &WorkloadMotion::new(&workload, None), &mut variants, limits(3)).0.remove(0)
     }
 
     #[test]
@@ -482,8 +526,42 @@ mod tests {
         let label = VariantLabel::new("cpu", Backend::Cpu, &workload.scene);
         let cpu = DeformerVariant::new(label, &workload.scene, Box::new(CpuDeformer::new(&workload.scene)));
         let mut variants: Vec<Box<dyn Variant>> = vec![Box::new(cpu)];
-        let (results, _) = validate(&workload, &WorkloadMotion::new(&workload, None), &mut variants, (0, 0));
+        let limits = ValidationLimits { seeds: 0, steps: 0, seconds: 0.0 };
+        let (results, _) = validate(&workload, &WorkloadMotion::new(&workload, None), &mut variants, limits);
         assert!(results[0].errors.states == 1 && results[0].passed(), "{results:?}");
+    }
+
+    #[test]
+    fn time_limit_keeps_the_minimum_of_states() {
+        let workload = WorkloadKind::Single { power: 8, rank: 2 }.build(Size::Full).expect("expected a load");
+        let count_states = |seeds: usize, seconds: f64| {
+            let label = VariantLabel::new("cpu", Backend::Cpu, &workload.scene);
+            let cpu = DeformerVariant::new(label, &workload.scene, Box::new(CpuDeformer::new(&workload.scene)));
+            let mut variants: Vec<Box<dyn Variant>> = vec![Box::new(cpu)];
+            let limits = ValidationLimits { seconds, ..limits(seeds) };
+            let (results, _) = validate(&workload, &WorkloadMotion::new(&workload, None), &mut variants, limits);
+            assert!(results[0].passed() && results[0].step_meters.largest > 0.0, "{results:?}");
+            results[0].errors.states
+        };
+        assert_eq!(count_states(4000, f64::INFINITY), 4000 + 24, "the control: no limit");
+        // The groups that contain the last states of the minimum are finished.
+        let most = MIN_RANDOM_STATES + MIN_STEPS + 2 * rayon::current_num_threads();
+        assert!(
+            (MIN_RANDOM_STATES + MIN_STEPS..=most).contains(&count_states(4000, 0.0)),
+            "{}",
+            count_states(4000, 0.0)
+        );
+        assert!(count_states(4, 0.0) <= 4 + MIN_STEPS + rayon::current_num_threads());
+    }
+
+    #[test]
+    fn denormal_modes_pass_and_are_no_false_failure() {
+        let workload = crate::testing::with_denormal_modes(&WorkloadKind::Single { power: 6, rank: 4 });
+        let label = VariantLabel::new("cpu", Backend::Cpu, &workload.scene);
+        let cpu = DeformerVariant::new(label, &workload.scene, Box::new(CpuDeformer::new(&workload.scene)));
+        let mut variants: Vec<Box<dyn Variant>> = vec![Box::new(cpu)];
+        let (results, _) = validate(&workload, &WorkloadMotion::new(&workload, None), &mut variants, limits(6));
+        assert!(results[0].passed(), "{:?}", results[0].faults);
     }
 
     #[test]

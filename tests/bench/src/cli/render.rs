@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use crate::render::workloads::RenderWorkload;
-use crate::render::{self, RenderReport, RenderReportOptions, variants};
+use crate::render::{self, RenderProgress, RenderReport, RenderReportOptions, variants};
 use crate::thesis::PLANTS;
 use modalcast::cli::options::with_spinner;
 use modalcast::cli::{Completion, Outcome, print_line};
@@ -32,7 +32,8 @@ Examples:
 /// Error against run time of the renderer: validates every variant against brute-force references, then times it.
 ///
 /// Writes report.json, report.csv, report.md, report.svg, report.png and a folder pictures/ with the references and,
-/// for every variant, a strip of rendered, reference and difference image. Exit code 1 when a variant exceeds its error
+/// for every variant, a strip of rendered, reference and difference image. The files are written after each load: an
+/// interrupted run keeps the finished loads and names the missing ones. Exit code 1 when a variant exceeds its error
 /// bounds.
 #[derive(Debug, clap::Args)]
 #[command(after_help = WORKLOAD_HELP)]
@@ -98,8 +99,14 @@ pub(super) fn run(args: &Args) -> Outcome {
     if args.raster {
         return run_raster_comparison(args, &options);
     }
-    let report = with_spinner("measuring", || render::render(&options, |what| tracing::info!(what, "measuring")))?;
-    report.write(&args.out)?;
+    let on_progress = |progress: RenderProgress<'_>| match progress {
+        RenderProgress::Started(what) => {
+            tracing::info!(what, "measuring");
+            Ok(())
+        }
+        RenderProgress::Measured(report) => report.write(&args.out),
+    };
+    let report = with_spinner("measuring", || render::render(&options, on_progress))?;
     report_lines(&report).into_iter().for_each(print_line);
     print_line(format!("written to {}", args.out.display()));
     Ok(Completion::of_check(report.passed()))

@@ -58,7 +58,7 @@ pub fn draw_svg(report: &DeformReport) -> String {
     let text_style = "font-size=\"12\" fill=\"#555555\"";
     write_text(&mut svg, (MARGIN + 8.0, MARGIN + 40.0), text_style, &report.provenance.line());
     let explanations = [
-        "filled: warm, hollow: cold; ringed: Pareto front (without variants that compute only a part)",
+        "filled: warm, hollow: cold; ringed: Pareto front (gains beyond noise, without variants that compute only a part)",
         "circle: CPU, square and triangle: CUDA, diamond: reference",
     ];
     for (line, explanation) in explanations.into_iter().enumerate() {
@@ -113,8 +113,8 @@ pub fn render_png(svg: &str) -> Result<Vec<u8>> {
 /// only a part of a step.
 fn row_point(row: &DeformRow) -> Option<Point<'_>> {
     let is_filled = row.cache == CacheState::Warm;
-    let (time_us, error) = row.time_and_error()?;
-    Some(Point { name: &row.name, time_us, error, is_filled, is_candidate: is_filled && !is_partial_step(&row.name) })
+    let is_candidate = is_filled && !is_partial_step(&row.name);
+    Some(Point { name: &row.name, value: row.time_and_error()?, is_filled, is_candidate })
 }
 
 /// Each variant once with its backend, in the order of the rows.

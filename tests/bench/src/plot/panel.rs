@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 
 use super::axis::{self, Axis};
 use super::{PANEL_SIZE, write_text};
-use crate::table::pareto_front;
+use crate::table::{TimeAndError, pareto_front};
 use modalcast_model::deform::Backend;
 
 /// Margins of the plotted area for axis labels and the title, SVG units.
@@ -44,10 +44,8 @@ impl Rectangle {
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Point<'a> {
     pub(crate) name: &'a str,
-    /// Median time, microseconds.
-    pub(crate) time_us: f64,
-    /// Error in the unit of the y axis.
-    pub(crate) error: f64,
+    /// Time, and error in the unit of the y axis.
+    pub(crate) value: TimeAndError,
     /// Whether the marker is filled; filled markers are drawn on top.
     pub(crate) is_filled: bool,
     /// Whether the point may be on the Pareto front.
@@ -72,8 +70,8 @@ impl<'a> Panel<'a> {
         // The smallest error is at the bottom.
         let y_range = (corner.1 + PANEL_SIZE.1 - BOTTOM_MARGIN, corner.1 + TOP_MARGIN);
         // The ranges (1 us to 1 ms, 1e-8 to 1e-6) are those of a panel without points.
-        let time_axis = Axis::new(points.iter().map(|point| point.time_us), (1.0, 1e3), x_range);
-        let error_axis = Axis::new(points.iter().map(|point| point.error), (1e-8, 1e-6), y_range);
+        let time_axis = Axis::new(points.iter().map(|point| point.value.time_us), (1.0, 1e3), x_range);
+        let error_axis = Axis::new(points.iter().map(|point| point.value.error), (1e-8, 1e-6), y_range);
         Self { corner, title, axis_labels, points, time_axis, error_axis }
     }
 
@@ -83,7 +81,7 @@ impl<'a> Panel<'a> {
         let positions: Vec<(f64, f64)> = self
             .points
             .iter()
-            .map(|point| (self.time_axis.pixel(point.time_us), self.error_axis.pixel(point.error)))
+            .map(|point| (self.time_axis.pixel(point.value.time_us), self.error_axis.pixel(point.value.error)))
             .collect();
         let front = self.pareto_front();
         let vertices: Vec<String> =
@@ -124,8 +122,7 @@ impl<'a> Panel<'a> {
     /// Indices of the points on the Pareto front of the candidates.
     fn pareto_front(&self) -> Vec<usize> {
         let candidates: Vec<usize> = (0..self.points.len()).filter(|index| self.points[*index].is_candidate).collect();
-        let points: Vec<(f64, f64)> =
-            candidates.iter().map(|index| (self.points[*index].time_us, self.points[*index].error)).collect();
+        let points: Vec<TimeAndError> = candidates.iter().map(|index| self.points[*index].value).collect();
         pareto_front(&points).into_iter().map(|index| candidates[index]).collect()
     }
 
@@ -275,8 +272,10 @@ mod tests {
     #[test]
     fn front_has_only_candidates_and_labels_do_not_overlap() {
         // Arguments: name, is_filled, is_candidate, time_us, error.
-        let point =
-            |name, is_filled, is_candidate, time_us, error| Point { name, time_us, error, is_filled, is_candidate };
+        let point = |name, is_filled, is_candidate, time_us, error| {
+            let value = TimeAndError { time_us, quartiles_us: [time_us; 2], error };
+            Point { name, value, is_filled, is_candidate }
+        };
         let points = vec![
             point("cold and best", false, false, 0.1, 1e-9),
             point("first", true, true, 1.0, 1e-6),

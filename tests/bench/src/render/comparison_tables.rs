@@ -1,21 +1,46 @@
 //! Sections of `report.md` that cover all workloads: minimal passes, rasterizers, blurs, and the plants of the thesis.
 
-use super::RenderReport;
 use super::blur_comparison::{BlurComparison, MAX_COMPUTE_US, MIN_SPEEDUP};
 use super::minimal_passes::{MAX_EXCESS_US, MinimalPasses};
 use super::plants::PlantResult;
 use super::raster_comparison::{MAX_DIFFERING_FRACTION, RasterComparison, TimingPair, TriangleCounts};
+use super::{RenderReport, RenderRow};
 use crate::markdown_table::{dash, table};
 
 /// All sections for which the report has data.
 pub(super) fn markdown(report: &RenderReport) -> String {
     [
+        antialias_section(&report.rows),
         minimal_passes_section(&report.minimal_passes),
         raster_section(&report.raster),
         blur_section(&report.blurs),
         plant_section(&report.plants),
     ]
     .concat()
+}
+
+/// The antialiasing methods of each load. Nothing has a shadow, and the reference has no shadow either.
+fn antialias_section(rows: &[RenderRow]) -> String {
+    let mut rows = rows.iter().filter(|row| row.name.starts_with("antialias ")).peekable();
+    if rows.peek().is_none() {
+        return String::new();
+    }
+    let header = ["load", "method", "frame us", "color mean", "p99", "largest", "flicker mean", "MB"];
+    let cells = |row: &RenderRow| {
+        let errors = row.intended_color_errors;
+        [
+            row.load.clone(),
+            row.name.trim_start_matches("antialias ").into(),
+            row.median_us().map_or_else(dash, |us| format!("{us:.1}")),
+            format!("{:.3}", errors.mean),
+            format!("{:.1}", errors.p99),
+            format!("{:.1}", errors.max),
+            row.flicker.map_or_else(dash, |flicker| format!("{:.3}", flicker.mean)),
+            format!("{:.1}", row.bytes as f64 / 1e6),
+        ]
+    };
+    let table = table(&header, rows.map(cells));
+    format!("\n## Antialiasing\n\nWithout shadows; color errors against the ray-cast reference, of 255.\n\n{table}")
 }
 
 fn minimal_passes_section(rows: &[MinimalPasses]) -> String {

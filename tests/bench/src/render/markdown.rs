@@ -14,6 +14,9 @@ pub(super) fn markdown(report: &RenderReport) -> String {
         report.renderer.renderer, size.width, size.height
     ));
     text.push_str(EXPLANATION);
+    if !report.missing.is_empty() {
+        text.push_str(&format!("\nNot measured yet: {}.\n", report.missing.join(", ")));
+    }
     let bounds = report.bounds;
     text.push_str(&match report.failed.is_empty() {
         true => format!(

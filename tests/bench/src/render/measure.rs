@@ -19,6 +19,7 @@ use super::time_budget::{STEP_TIME_BUDGET, TimeBudget};
 use super::variants::{ErrorLimits, ReferenceKind, RenderVariant, ShadowVariant};
 use super::workloads::{AnimatedScene, RenderWorkload};
 use super::{RenderReportOptions, RenderWorkloadSummary, ShadowTexelSize, light_meter};
+use crate::timing::Timing;
 use modalcast_model::error::Result;
 use modalcast_model::scene::{Camera, Culling, RenderSettings, Scene, ShadowSettings};
 use modalcast_render::{BlurMethod, FrameCullStats, FrameImage, shadow_texel_axes};
@@ -97,7 +98,12 @@ impl RenderRow {
 
     /// Median time of a frame in microseconds.
     pub fn median_us(&self) -> Option<f64> {
-        self.passes.iter().find(|pass| pass.name == "frame").map(|pass| pass.timing.median_us)
+        self.frame_timing().map(|timing| timing.median_us)
+    }
+
+    /// Time of a frame.
+    pub fn frame_timing(&self) -> Option<Timing> {
+        self.passes.iter().find(|pass| pass.name == "frame").map(|pass| pass.timing)
     }
 }
 

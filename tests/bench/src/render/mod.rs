@@ -178,6 +178,8 @@ pub struct RenderReport {
     /// Default error bounds against the intended result. [`RenderRow::bounds`] has the bounds of each row.
     pub bounds: variants::ErrorLimits,
     pub loads: Vec<RenderWorkloadSummary>,
+    /// Names of the requested workloads and plants that are not measured yet. Empty when the report is complete.
+    pub missing: Vec<String>,
     pub rows: Vec<RenderRow>,
     /// One entry per workload.
     pub readback: Vec<ReadbackRates>,
@@ -196,62 +198,116 @@ pub struct RenderReport {
     /// Unexpected results, as `workload: variant: reason`: variants that failed unexpectedly or passed although they
     /// are expected to fail, and rasterizer comparisons with too many differing ids.
     pub failed: Vec<String>,
-    /// Reference images and comparison strips.
+    /// Reference images and comparison strips; in a progress event only the new ones.
     #[serde(skip)]
     pub pictures: Vec<ImageFile>,
 }
 
-/// Measures the selected variants on all workloads, and the plants; `progress` receives a description of each stage.
+/// Progress events of a running report.
+#[derive(Debug)]
+pub enum RenderProgress<'a> {
+    /// Description of the stage that starts now.
+    Started(&'a str),
+    /// All results so far, with the pictures that are new since the previous event of this kind.
+    Measured(&'a RenderReport),
+}
+
+/// Measures the selected variants on all workloads, then the rasterizers and the plants. `progress` is called before each
+/// stage, and with the results after each workload, the rasterizers and each plant; the last results are complete.
 ///
 /// # Errors
-/// `Unavailable` without OpenGL; errors of loading and drawing a scene.
-pub fn render(options: &RenderReportOptions, mut progress: impl FnMut(&str)) -> Result<RenderReport> {
+/// `Unavailable` without OpenGL; errors of loading and drawing a scene, and of `progress`.
+pub fn render(
+    options: &RenderReportOptions,
+    mut progress: impl FnMut(RenderProgress<'_>) -> Result<()>,
+) -> Result<RenderReport> {
     let mut harness = RenderHarness::open()?;
-    let (mut loads, mut rows, mut minimal_passes, mut pictures) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
-    let mut readback = Vec::new();
+    let (mut measurements, mut pictures) = (Measurements::default(), Vec::new());
     for workload in &options.loads {
-        progress(&format!("{}: building", workload.name()));
-        let result = measure::measure_workload(&mut harness, options, *workload, &mut progress)?;
-        loads.push(result.summary);
-        rows.extend(result.rows);
-        minimal_passes.extend(result.minimal_passes);
-        pictures.extend(result.files);
-        progress(&format!("{}: measuring readback", workload.name()));
-        readback.push(readback::measure(&mut harness, options, *workload)?);
+        progress(RenderProgress::Started(&format!("{}: building", workload.name())))?;
+        // An error of `progress` ends the report after this stage.
+        let mut stage_result = Ok(());
+        let mut start_stage = |stage: &str| start(&mut stage_result, &mut progress, stage);
+        let result = measure::measure_workload(&mut harness, options, *workload, &mut start_stage)?;
+        start_stage(&format!("{}: measuring readback", workload.name()));
+        stage_result?;
+        measurements.loads.push(result.summary);
+        measurements.rows.extend(result.rows);
+        measurements.minimal_passes.extend(result.minimal_passes);
+        measurements.readback.push(readback::measure(&mut harness, options, *workload)?);
+        let report = measurements.assemble(options, harness.renderer.info(), result.files);
+        progress(RenderProgress::Measured(&report))?;
+        pictures.extend(report.pictures);
     }
     let device = harness::cuda_device();
-    let raster = match &device {
-        Some(device) => raster_comparison::measure(&mut harness, device, options, &mut progress)?,
-        None => Vec::new(),
-    };
-    let mut plants = Vec::new();
-    for index in &options.plants {
-        progress(&format!("plant-{}", index + 1));
-        plants.push(plants::measure(&mut harness, device.as_ref(), options, *index)?);
+    if let Some(device) = &device {
+        let mut stage_result = Ok(());
+        let mut start_stage = |stage: &str| start(&mut stage_result, &mut progress, stage);
+        measurements.raster = raster_comparison::measure(&mut harness, device, options, &mut start_stage)?;
+        stage_result?;
+        let report = measurements.assemble(options, harness.renderer.info(), Vec::new());
+        progress(RenderProgress::Measured(&report))?;
     }
-    let failed = rows.iter().filter(|row: &&RenderRow| !row.is_as_expected()).map(describe_failure);
-    let failed = failed.chain(raster.iter().filter_map(RasterComparison::describe_missing_times)).collect();
-    let (provenance, renderer, bounds) =
-        (Provenance::collect(), harness.renderer.info().clone(), variants::ERROR_LIMITS);
-    let blurs = BlurComparison::pair_rows(&rows);
-    let size = options.size;
-    let default_shadow = DefaultShadow::choose(&rows, &renderer);
-    Ok(RenderReport {
-        provenance,
-        renderer,
-        size,
-        bounds,
-        loads,
-        rows,
-        readback,
-        minimal_passes,
-        raster,
-        blurs,
-        plants,
-        default_shadow,
-        failed,
-        pictures,
-    })
+    for index in &options.plants {
+        progress(RenderProgress::Started(&plant_name(*index)))?;
+        measurements.plants.push(plants::measure(&mut harness, device.as_ref(), options, *index)?);
+        let report = measurements.assemble(options, harness.renderer.info(), Vec::new());
+        progress(RenderProgress::Measured(&report))?;
+    }
+    Ok(measurements.assemble(options, harness.renderer.info(), pictures))
+}
+
+/// Reports the start of a stage, unless an earlier report failed.
+fn start(result: &mut Result<()>, progress: &mut impl FnMut(RenderProgress<'_>) -> Result<()>, stage: &str) {
+    if result.is_ok() {
+        *result = progress(RenderProgress::Started(stage));
+    }
+}
+
+fn plant_name(index: usize) -> String {
+    format!("plant-{}", index + 1)
+}
+
+/// Results so far. The workloads are the first ones of the options, and so are the plants.
+#[derive(Default)]
+struct Measurements {
+    loads: Vec<RenderWorkloadSummary>,
+    rows: Vec<RenderRow>,
+    readback: Vec<ReadbackRates>,
+    minimal_passes: Vec<MinimalPasses>,
+    raster: Vec<RasterComparison>,
+    plants: Vec<PlantResult>,
+}
+
+impl Measurements {
+    fn assemble(
+        &self,
+        options: &RenderReportOptions,
+        renderer: &RendererInfo,
+        pictures: Vec<ImageFile>,
+    ) -> RenderReport {
+        let Self { loads, rows, readback, minimal_passes, raster, plants } = self;
+        let failed = rows.iter().filter(|row: &&RenderRow| !row.is_as_expected()).map(describe_failure);
+        let missing_loads = options.loads[loads.len()..].iter().map(|workload| workload.name());
+        let missing_plants = options.plants[plants.len()..].iter().map(|index| plant_name(*index));
+        RenderReport {
+            provenance: Provenance::collect(),
+            renderer: renderer.clone(),
+            size: options.size,
+            bounds: variants::ERROR_LIMITS,
+            missing: missing_loads.chain(missing_plants).collect(),
+            loads: loads.clone(),
+            rows: rows.clone(),
+            readback: readback.clone(),
+            minimal_passes: minimal_passes.clone(),
+            raster: raster.clone(),
+            blurs: BlurComparison::pair_rows(rows),
+            plants: plants.clone(),
+            default_shadow: DefaultShadow::choose(rows, renderer),
+            failed: failed.chain(raster.iter().filter_map(RasterComparison::describe_missing_times)).collect(),
+            pictures,
+        }
+    }
 }
 
 fn describe_failure(row: &RenderRow) -> String {

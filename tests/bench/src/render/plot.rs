@@ -3,6 +3,8 @@
 use super::{RenderReport, RenderRow};
 use crate::plot::panel::{MarkerStyle, Panel, Point};
 use crate::plot::{COLORS, HEADER_HEIGHT, LEGEND_LINE_HEIGHT, MARGIN, PANEL_SIZE, begin_svg, draw_legend, write_text};
+use crate::table::TimeAndError;
+use crate::timing::Timing;
 use modalcast_model::deform::Backend;
 
 /// Panels per row.
@@ -61,8 +63,9 @@ fn min_samples(report: &RenderReport) -> usize {
 
 /// The point of a row; `None` for a row that was not timed. Every point may be on the Pareto front.
 fn row_point(row: &RenderRow) -> Option<Point<'_>> {
-    let (time_us, error) = (row.median_us()?, row.color_errors.mean);
-    Some(Point { name: &row.name, time_us, error, is_filled: true, is_candidate: true })
+    let Timing { median_us, q1_us, q3_us, .. } = row.frame_timing()?;
+    let value = TimeAndError { time_us: median_us, quartiles_us: [q1_us, q3_us], error: row.color_errors.mean };
+    Some(Point { name: &row.name, value, is_filled: true, is_candidate: true })
 }
 
 /// Color and shape of a variant's marker: circles until all colors are used, then squares and triangles. `backend` and

@@ -14,7 +14,7 @@ use super::reference_view::ReferenceView;
 use super::rigid_domain::add_rigid_domain;
 use super::variants;
 use super::workloads::{RenderWorkload, horizontal_square, quad};
-use super::{RenderReportOptions, render};
+use super::{RenderProgress, RenderReportOptions, render};
 use modalcast_compute::reference::ReferenceDeformer;
 use modalcast_model::deform::{DeformedSurface, Deformer as _};
 use modalcast_model::domain::{AlphaMode, Material, Mesh, Texture};
@@ -298,7 +298,7 @@ fn report_measures_selected_variants_and_writes_files() {
         quick: true,
         replays: 1,
     };
-    let report = render(&options, |_| {}).expect("a report");
+    let report = render(&options, |_| Ok(())).expect("a report");
     assert!(report.passed(), "{:?}", report.failed);
     let [unshadowed, variance] = &report.rows[..] else { panic!("expected two rows, got {:?}", report.rows) };
     assert!(
@@ -336,6 +336,32 @@ fn report_measures_selected_variants_and_writes_files() {
 }
 
 #[test]
+fn interrupted_report_keeps_finished_loads_and_names_missing_ones() {
+    let options = RenderReportOptions {
+        plants: vec![],
+        loads: vec![RenderWorkload::Square, RenderWorkload::Shelf],
+        variants: vec!["none".into()],
+        size: Size { width: 48, height: 27 },
+        quick: true,
+        replays: 1,
+    };
+    let folder = tempfile::tempdir().expect("a folder");
+    let interruption = modalcast_model::error::invalid("run", "an interruption", "one");
+    let interrupted = render(&options, |progress| match progress {
+        RenderProgress::Started(stage) if stage.starts_with("shelf") => Err(interruption.clone()),
+        RenderProgress::Started(_) => Ok(()),
+        RenderProgress::Measured(report) => report.write(folder.path()),
+    });
+    assert_eq!(interrupted.err(), Some(interruption));
+    let json = std::fs::read(folder.path().join("report.json")).expect("a report");
+    let json: serde_json::Value = serde_json::from_slice(&json).expect("JSON");
+    assert_eq!((&json["rows"][0]["load"], &json["missing"][0]), (&"square".into(), &"shelf".into()));
+    assert!(folder.path().join("pictures/square-none.png").exists());
+    let markdown = std::fs::read_to_string(folder.path().join("report.md")).expect("a report");
+    assert!(markdown.contains("Not measured yet: shelf."), "{markdown}");
+}
+
+#[test]
 fn minimal_passes_have_a_baseline_without_culling() {
     let options = RenderReportOptions {
         plants: vec![],
@@ -345,7 +371,7 @@ fn minimal_passes_have_a_baseline_without_culling() {
         quick: true,
         replays: 1,
     };
-    let report = render(&options, |_| {}).expect("a report");
+    let report = render(&options, |_| Ok(())).expect("a report");
     let ([row], [minimal_passes]) = (&report.rows[..], &report.minimal_passes[..]) else {
         panic!("expected one row and one entry, got {report:?}")
     };
@@ -357,7 +383,7 @@ fn minimal_passes_have_a_baseline_without_culling() {
         assert!((frame.frame_us - sum_us - frame.excess_us).abs() < 1e-6 && Some(frame.frame_us) != row.median_us());
     }
     let options = RenderReportOptions { variants: vec!["culling none".into(), "culling triangles".into()], ..options };
-    let report = render(&options, |_| {}).expect("a report");
+    let report = render(&options, |_| Ok(())).expect("a report");
     assert_eq!(
         report.minimal_passes[0].without_culling.name, "culling none: without culling",
         "the timed row is reused"
@@ -375,7 +401,7 @@ fn exact_transparency_is_closer_to_reference_than_two_pass() {
         quick: true,
         replays: 1,
     };
-    let report = render(&options, |_| {}).expect("a report");
+    let report = render(&options, |_| Ok(())).expect("a report");
     // The square has nothing transparent, so these variants do not apply to it.
     let [exact, two_pass] = &report.rows[..] else { panic!("expected two rows of the panes, got {:?}", report.rows) };
     let [exact_error, two_pass_error] = [exact, two_pass].map(|row| row.intended_color_errors.mean);

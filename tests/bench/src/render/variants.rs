@@ -7,7 +7,7 @@ use serde::Serialize;
 use super::packing::Packing;
 use super::workloads::RenderWorkload;
 use modalcast_model::scene::{
-    Culling, MomentFormat, RenderSettings, ShadowFit, ShadowMethod, ShadowSettings, Transparency,
+    Antialiasing, Culling, MomentFormat, RenderSettings, ShadowFit, ShadowMethod, ShadowSettings, Transparency,
 };
 use modalcast_render::BlurMethod;
 
@@ -63,6 +63,8 @@ pub struct RenderVariant {
     pub packing: Option<Packing>,
     /// Culling, for variants that compare it. It does not change the image.
     pub culling: Option<Culling>,
+    /// Antialiasing, for variants that compare it.
+    pub antialias: Option<Antialiasing>,
     /// Implementation of the shadow blur. It changes the image only by rounding.
     pub blur_method: BlurMethod,
     pub intended_reference: ReferenceKind,
@@ -81,6 +83,11 @@ const EXACT_BLEEDING_LIMIT: f64 = 0.01;
 /// most of the sunlight leaks into the shadow.
 const SHELF_MEAN_LIGHT_LIMIT: f64 = 0.4;
 
+/// Bound on the mean color error of images without antialiasing, in which each pixel of an edge shows one surface only.
+const ALIASED_MEAN_COLOR_LIMIT: f64 = 2.0 * ERROR_LIMITS.mean_color;
+/// Samples per pixel of multisampling, the only number that the renderer has.
+const MULTISAMPLES: u32 = 4;
+
 /// Sides of shadow maps, texels.
 const MAP_SIZES: [u32; 5] = [256, 512, 1024, 2048, 4096];
 /// Standard deviations of the blur, texels.
@@ -91,7 +98,11 @@ impl RenderVariant {
     pub fn settings(&self, look: RenderSettings) -> RenderSettings {
         let (transparency, culling) =
             (self.transparency.unwrap_or(look.transparency), self.culling.unwrap_or(look.culling));
-        RenderSettings { shadow: self.shadow, transparency, culling, ..look }
+        let settings = RenderSettings { shadow: self.shadow, transparency, culling, ..look };
+        match self.antialias {
+            Some(antialias) => RenderSettings { antialias, samples: MULTISAMPLES, ..settings },
+            None => settings,
+        }
     }
 
     /// Whether a workload has the features that the variant compares.
@@ -101,6 +112,7 @@ impl RenderVariant {
         matches_packing
             && (self.transparency.is_none() || workload == RenderWorkload::Panes)
             && (self.culling.is_none() || is_large)
+            && (self.antialias.is_none() || is_large || workload == RenderWorkload::Square)
     }
 
     /// Error bounds on a workload.
@@ -111,7 +123,8 @@ impl RenderVariant {
         };
         let mean_light =
             if workload == RenderWorkload::Shelf { SHELF_MEAN_LIGHT_LIMIT } else { ERROR_LIMITS.mean_light };
-        ErrorLimits { bleeding, mean_light, ..ERROR_LIMITS }
+        let mean_color = if self.antialias.is_some() { ALIASED_MEAN_COLOR_LIMIT } else { ERROR_LIMITS.mean_color };
+        ErrorLimits { mean_color, bleeding, mean_light, ..ERROR_LIMITS }
     }
 
     /// Whether the variant is expected to exceed its bounds on a workload: with f16 second moments, light bleeds into a
@@ -128,6 +141,7 @@ impl RenderVariant {
             transparency: None,
             packing: None,
             culling: None,
+            antialias: None,
             blur_method: BlurMethod::Auto,
             intended_reference: ReferenceKind::Unshadowed,
         }
@@ -143,6 +157,7 @@ impl RenderVariant {
             transparency: None,
             packing: None,
             culling: None,
+            antialias: None,
             blur_method: BlurMethod::Auto,
             intended_reference: ReferenceKind::Hard,
         }
@@ -197,6 +212,7 @@ impl RenderVariant {
             transparency: None,
             packing: None,
             culling: None,
+            antialias: None,
             blur_method: BlurMethod::Auto,
             intended_reference: ReferenceKind::Hard,
         }
@@ -210,6 +226,11 @@ impl RenderVariant {
     /// Images with this packing, without shadows.
     fn with_packing(name: &str, packing: Packing) -> Self {
         Self { name: name.into(), packing: Some(packing), ..Self::without_shadow() }
+    }
+
+    /// One antialiasing method, without shadows. The reference has 64 samples per pixel, 16 in a quick run.
+    fn with_antialias((name, antialias): (&str, Antialiasing)) -> Self {
+        Self { name: format!("antialias {name}"), antialias: Some(antialias), ..Self::without_shadow() }
     }
 
     /// The default variance map with this culling, which does not change the image.
@@ -231,6 +252,7 @@ impl RenderVariant {
             transparency: None,
             packing: None,
             culling: None,
+            antialias: None,
             blur_method: BlurMethod::Auto,
             intended_reference,
         }
@@ -261,6 +283,10 @@ pub fn all(quick: bool) -> Vec<RenderVariant> {
     variants.push(RenderVariant::with_transparency("two-pass transparency", Transparency::TwoPass));
     variants.extend(packing_variants());
     variants.extend(culling_variants());
+    variants.extend(
+        [("none", Antialiasing::None), ("4 samples", Antialiasing::Msaa), ("fxaa", Antialiasing::Fxaa)]
+            .map(RenderVariant::with_antialias),
+    );
     variants
 }
 
@@ -311,22 +337,24 @@ mod tests {
             let names: std::collections::BTreeSet<&str> =
                 variants.iter().map(|variant| variant.name.as_str()).collect();
             // Quick: 15 variants, 3 of packing and 3 of culling. All: 1 without shadow, 5 map sizes x 6, 2 f16, 2
-            // bleeding, 3 cascades, 1 corner fit, 3 maps x 3 blur methods, 2 transparency, 3 of packing and 3 of
-            // culling.
-            assert_eq!((names.len(), variants.len()), if quick { (21, 21) } else { (56, 56) });
+            // bleeding, 3 cascades, 1 corner fit, 3 maps x 3 blur methods, 2 transparency, 3 of packing, 3 of culling
+            // and 3 of antialiasing.
+            assert_eq!((names.len(), variants.len()), if quick { (21, 21) } else { (59, 59) });
             for variant in &variants {
                 let settings = variant.settings(RenderSettings::default());
                 let transparency = variant.transparency.unwrap_or_default();
                 let culling = variant.culling.unwrap_or_default();
-                let expected = RenderSettings { shadow: None, transparency, culling, ..RenderSettings::default() };
+                let antialias = variant.antialias.unwrap_or_default();
+                let expected =
+                    RenderSettings { shadow: None, transparency, culling, antialias, ..RenderSettings::default() };
                 assert_eq!(RenderSettings { shadow: None, ..settings }, expected);
                 let (has_transparency, has_packing) = (variant.transparency.is_some(), variant.packing.is_some());
                 let applies_to = [RenderWorkload::Panes, RenderWorkload::Tree, RenderWorkload::Images]
                     .map(|workload| variant.is_applicable(workload));
-                let has_culling = variant.culling.is_some();
+                let needs_large_scene = variant.culling.is_some() || variant.antialias.is_some();
                 assert_eq!(
                     applies_to,
-                    [!has_packing && !has_culling, !has_packing && !has_transparency, has_packing],
+                    [!has_packing && !needs_large_scene, !has_packing && !has_transparency, has_packing],
                     "panes, tree and images with {}",
                     variant.name
                 );

@@ -8,6 +8,7 @@ use super::vertex_encodings::VertexEncodingRow;
 use super::{CaseResult, StreamReport};
 use crate::plot::panel::{MarkerStyle, Panel, Point};
 use crate::plot::{COLORS, MARGIN, PANEL_SIZE, begin_svg, write_text};
+use crate::table::TimeAndError;
 use modalcast_model::deform::Backend;
 
 /// Height of the title and the subtitle.
@@ -100,12 +101,10 @@ fn encoding_panels(report: &StreamReport) -> Vec<(String, Vec<&VertexEncodingRow
 fn draw_encodings(svg: &mut String, corner: (f64, f64), title: &str, rows: &[&VertexEncodingRow]) {
     let names: Vec<String> =
         rows.iter().map(|row| format!("{}, {} kB", row.encoding, row.bytes.div_ceil(1000))).collect();
-    let points = rows.iter().zip(&names).map(|(row, name)| Point {
-        name,
-        time_us: 1e3 * (row.pack_ms + row.decode_ms),
-        error: row.errors.largest,
-        is_filled: true,
-        is_candidate: true,
+    let points = rows.iter().zip(&names).map(|(row, name)| {
+        let time_us = 1e3 * (row.pack_ms + row.decode_ms);
+        let value = TimeAndError { time_us, quartiles_us: [time_us; 2], error: row.errors.largest };
+        Point { name, value, is_filled: true, is_candidate: true }
     });
     let unit = rows.first().map_or("", |row| row.error_unit());
     let error_label = format!("largest error, {unit}");

@@ -7,7 +7,7 @@
 //! | `a`, `a-positions` | one domain of 1.5 M vertices, r = 32, with normals and tangents, or without |
 //! | `b` | 1,000 domains of 1,500 vertices, r random from 0 to 64, about 17 on average |
 //! | `c` | 200,000 domains of 7 vertices, 95 % of them rigid |
-//! | `cancel` | one domain of 2^16 vertices whose modes nearly cancel in pairs |
+//! | `cancel` | one domain of 2^16 vertices at the origin, whose modes nearly cancel in pairs |
 //! | `batch` | 16 instances of one domain of 2^18 vertices, r = 32: one U for 16 vectors q (`single-18-32` has one) |
 //! | `plant-1` to `plant-12` | the plants of table 4.5 |
 //! | `plant-1-follows` to `plant-12-follows` | the same plants; leaves follow branches, so only branches have a T |
@@ -25,6 +25,10 @@ use super::thesis::{PLANTS, POWERS, RANKS};
 use modalcast_model::backend_settings::BatchPolicy;
 use modalcast_model::error::{Result, invalid};
 use modalcast_model::scene::{DeformationSettings, Scene, SceneParts};
+
+/// Maximum count of numbers in x0 and U of a load that a quick report measures at full size. Two cores measure such a
+/// load in seconds.
+const MAX_QUICK_NUMBERS: usize = 1 << 21;
 
 /// Size of a workload.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -156,6 +160,20 @@ impl WorkloadKind {
         }
     }
 
+    /// The size in a quick report: full for loads of at most [`MAX_QUICK_NUMBERS`] numbers in x0 and U.
+    pub fn quick_size(self) -> Size {
+        let numbers = match self {
+            Self::Single { power, rank } => 3 * (1_usize << power) * (1 + rank),
+            Self::Plant(index) | Self::FollowingPlant(index) => {
+                let plant = &PLANTS[index];
+                // The modes are distributed evenly over the domains that have some.
+                3 * plant.vertices + plant.rows * plant.modes.div_ceil(plant.deformable.max(1))
+            }
+            _ => usize::MAX,
+        };
+        if numbers <= MAX_QUICK_NUMBERS { Size::Full } else { Size::Quick }
+    }
+
     /// Builds the scene.
     ///
     /// # Errors
@@ -203,6 +221,20 @@ mod tests {
         ] {
             assert!(WorkloadKind::parse(name).is_err(), "{name}");
         }
+    }
+
+    #[test]
+    fn quick_reports_measure_small_loads_at_full_size() {
+        // 3 x 2^14 x 31 = 1.5 M numbers; 3 x 2^16 x 11 = 2.2 M.
+        assert_eq!(WorkloadKind::Single { power: 14, rank: 30 }.quick_size(), Size::Full);
+        assert_eq!(WorkloadKind::Single { power: 16, rank: 10 }.quick_size(), Size::Quick);
+        let kinds = WorkloadKind::all();
+        let full = kinds.iter().filter(|kind| kind.quick_size() == Size::Full);
+        let counts = full.map(|kind| {
+            let scene = kind.build(Size::Full).expect("a workload").scene;
+            scene.layout.domains.iter().map(|domain| 3 * domain.vertices * (1 + domain.rank)).sum::<usize>()
+        });
+        assert!(counts.max().is_some_and(|count| count <= 2 * MAX_QUICK_NUMBERS), "expected a small load");
     }
 
     #[test]

@@ -45,17 +45,23 @@ pub(super) fn part_seed(name: &str, index: usize) -> u64 {
     Rng::with_seed(hash).u64(..)
 }
 
-/// Builds the mesh and the modes of a patch. `has_cancelling_mode_pairs`: see [`random_modes`].
+/// Builds the mesh and the modes of a patch. `has_cancelling_mode_pairs`: see [`random_modes`]; almost all vertices then
+/// rest at the origin, because the rounding error of x0 + u would otherwise hide that of u.
 pub(super) fn build_shape(patch: &PatchSpec, has_cancelling_mode_pairs: bool) -> Result<Shape> {
     let mut rng = Rng::with_seed(patch.seed);
     let grid_columns = (patch.vertices as f64).sqrt().ceil().max(1.0) as usize;
     let spacing = patch.size / grid_columns as f32;
-    let positions: Vec<[f32; 3]> = (0..patch.vertices)
+    let mut positions: Vec<[f32; 3]> = (0..patch.vertices)
         .map(|vertex| {
             let height = 0.1 * patch.size * (rng.f32() - 0.5);
             [(vertex % grid_columns) as f32 * spacing, (vertex / grid_columns) as f32 * spacing, height]
         })
         .collect();
+    if has_cancelling_mode_pairs {
+        // The three corners of the triangle and the last vertex keep their places, and with them the size of the scene.
+        let first = 3.min(patch.vertices - 1);
+        positions[first..patch.vertices - 1].fill([0.0; 3]);
+    }
     // Corners are distributed evenly over the vertices.
     let vertex_of_corner =
         |corner: usize| (corner * patch.vertices / patch.corners.max(1)).min(patch.vertices - 1) as u32;

@@ -2,6 +2,7 @@
 //! timed CUDA variants.
 
 use modalcast_bench::bench::LocalMachine;
+use modalcast_bench::validate::ValidationLimits;
 use modalcast_bench::workloads::{Size, WorkloadKind};
 use modalcast_bench::{DeformReportOptions, WorkloadSource, deform};
 use modalcast_model::deform::Backend;
@@ -13,8 +14,8 @@ fn gpu_all_variants_of_quick_workloads_pass_and_are_timed() {
     let kinds = names.iter().flat_map(|name| WorkloadKind::parse(name).expect("workloads"));
     let sources = kinds.map(WorkloadSource::Synthetic).collect();
     // All steps and all variants.
-    let (steps, variants) = (usize::MAX, Vec::new());
-    let options = DeformReportOptions { sources, seeds: 4, replays: 20, steps, variants, size: Size::Quick };
+    let validation = ValidationLimits { seeds: 4, steps: usize::MAX, seconds: f64::INFINITY };
+    let options = DeformReportOptions { sources, validation, replays: 20, variants: Vec::new(), size: Size::Quick };
     let report = deform(&options, &LocalMachine::open(), |_| Ok(())).expect("expected a report");
     assert!(report.passed(), "{:#?}", report.failed);
     assert!(report.remarks.is_empty(), "{:?}", report.remarks);
