@@ -419,7 +419,7 @@ impl DeviceContext {
     ) -> Result<PartialDraw> {
         let camera = camera.validated()?;
         let renderer = self.renderer.as_mut().map_err(|error| error.clone())?;
-        loaded_scene.rasterize(renderer, &camera, size)?;
+        loaded_scene.rasterize(renderer, &camera, size, style.samples)?;
         let upload_begin = Instant::now();
         let contents = loaded_scene.fill_buffers(renderer, &camera)?;
         let upload_ms = contents.is_uploaded.then(|| ms_since(upload_begin));

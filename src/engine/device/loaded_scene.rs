@@ -206,12 +206,13 @@ impl LoadedScene {
 
     /// Draws the passes of the compute rasterizer for the next frame before OpenGL gets commands, if the positions are in
     /// shared memory. Also draws those of the step that the deformer has computed ahead, for the same camera. The frame must
-    /// follow with the same parameters.
+    /// follow with the same parameters. `samples`: samples per pixel that the frame sets for itself.
     pub(in crate::engine) fn rasterize(
         &mut self,
         renderer: &mut Renderer,
         camera: &Camera,
         size: FrameSize,
+        samples: Option<u32>,
     ) -> Result<()> {
         let (Some(buffers), Some(origin)) = (&mut self.buffers, uniform_origin(&self.current_state)) else {
             return Ok(());
@@ -229,10 +230,11 @@ impl LoadedScene {
             let ahead = ahead.filter(|step| uniform_origin(&step.state) == Some(origin) && is_in_range(&step.bounds));
             Ok(ahead.map(|StepAhead { positions, bounds, oriented_bounds: light_bounds, .. }| {
                 let contents = BufferContents { bounds, light_bounds, is_uploaded: false };
-                (contents.frame_params(*camera, size), positions)
+                (FrameParams { samples, ..contents.frame_params(*camera, size) }, positions)
             }))
         };
-        renderer.rasterize(buffers, &contents.frame_params(*camera, size), positions, ahead)
+        let params = FrameParams { samples, ..contents.frame_params(*camera, size) };
+        renderer.rasterize(buffers, &params, positions, ahead)
     }
 
     /// Starts copying attributes of the last deformation to host memory. The copy overlaps with the next deformation.

@@ -23,7 +23,7 @@ use crate::pass::Pass;
 use crate::passes::post::BloomStep;
 use crate::passes::{self, FrameContext, OitFrame, PassRecorder};
 use crate::region::{Band, Region};
-use crate::resources::compute_rasterizer::RasterPasses;
+use crate::resources::compute_rasterizer::{ComputeRasterizer, RasterPasses};
 use crate::resources::oit::blend_storage;
 use crate::resources::programs::SampleCountPrograms;
 use crate::resources::scene_buffers::SceneBuffers;
@@ -221,7 +221,7 @@ impl Renderer {
                     timers.extend(self.record_compute_raster(&mut recorder, &frame, switch_ms)?);
                 }
                 Step::Shadow => self.record_shadow(&mut recorder, &frame, timers)?,
-                Step::Cull if buffers.cull_resources.is_some() && buffers.visibility_rasterizer().is_none() => {
+                Step::Cull if buffers.cull_resources.is_some() && visibility_rasterizer(&frame).is_none() => {
                     timers.push(self.time_pass(Pass::Cull, || passes::cull::cull_for_camera(&mut recorder, &frame))?);
                 }
                 Step::Cull => {}
@@ -287,7 +287,10 @@ impl Renderer {
         let buffers = frame.buffers;
         let Some((rasterizer, enabled)) = buffers.active_rasterizer() else { return Ok(None) };
         let is_shadow_stale = buffers.shadow_cache.is_stale(buffers.shadow_key(frame.params));
-        let raster_passes = RasterPasses { shadow: enabled.shadow && is_shadow_stale, ..enabled };
+        let raster_passes = RasterPasses {
+            shadow: enabled.shadow && is_shadow_stale,
+            visibility: visibility_rasterizer(frame).is_some(),
+        };
         if !raster_passes.has_any() {
             return Ok(None);
         }
@@ -336,6 +339,12 @@ impl Renderer {
     }
 }
 
+/// The compute rasterizer if it draws the visibility of a frame. It draws one sample per pixel, but a frame can set another
+/// number than its scene.
+fn visibility_rasterizer<'a>(frame: &FrameContext<'a>) -> Option<&'a ComputeRasterizer> {
+    frame.buffers.visibility_rasterizer().filter(|_| frame.target.desc.samples == 1)
+}
+
 /// Records a pass, or a band of it.
 fn record(
     recorder: &mut PassRecorder<'_>,
@@ -343,7 +352,7 @@ fn record(
     readback: Option<&FrameReadback>,
     band_pass: BandPass,
 ) -> Result<()> {
-    let rasterizer = frame.buffers.visibility_rasterizer();
+    let rasterizer = visibility_rasterizer(frame);
     match (band_pass, OitFrame::of(frame)) {
         (BandPass::Visibility(band), _) => match rasterizer {
             // This pass only converts the output of the compute rasterizer, so the first band converts all rows.

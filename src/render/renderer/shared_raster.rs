@@ -30,6 +30,8 @@ impl Renderer {
         let Some((rasterizer, enabled)) = buffers.active_rasterizer() else { return Ok(()) };
         let _current = self.gl.make_current()?;
         self.check_size(params)?;
+        let samples = buffers.antialiasing([params.width, params.height], params.samples).samples;
+        let enabled = RasterPasses { visibility: enabled.visibility && samples == 1, ..enabled };
         let is_shadow_stale = buffers.shadow_cache.is_stale(buffers.shadow_key(params));
         let passes = RasterPasses { shadow: enabled.shadow && is_shadow_stale, ..enabled };
         if !passes.has_any() {

@@ -438,6 +438,31 @@ fn cameras_share_the_shadow_and_rebased_scenes_use_opengl() {
     assert!(restored_image.rgba == unshared_image.rgba, "expected the same image as before `upload_rebased`");
 }
 
+/// The compute rasterizer draws one sample per pixel, so OpenGL draws the visibility of a frame that asks for four.
+#[test]
+fn opengl_draws_frames_that_ask_for_more_samples_than_their_scene() {
+    let scene = yard_builder(Some(ShadowSettings { size: 128, ..ShadowSettings::default() }), 1).build();
+    let draw = |backend: Backend, samples: Option<u32>| {
+        let (mut renderer, mut deformer) = (open_renderer(), ReferenceDeformer::new(&scene));
+        let bounds = deformer.deform(&SceneState::rest(&scene)).expect("expected the step to succeed").bounds;
+        let mut buffers = renderer.load(&scene).expect("expected the scene to load");
+        let surface = deformer.surface().expect("expected a surface");
+        renderer.upload(&buffers, surface).expect("expected the upload to succeed");
+        attach_backend(&mut renderer, &mut buffers, backend);
+        let [width, height] = SIZE;
+        let camera = default_camera();
+        let params = FrameParams { camera, width, height, bounds, light_bounds: None, edges: None, samples };
+        renderer.draw(&buffers, &params).expect("expected a frame")
+    };
+    let [one, four] = [None, Some(4)].map(|samples| draw(Backend::Compute(0.0), samples));
+    assert_eq!(one.info.raster_backends.visibility, Some(RasterBackend::Cuda));
+    let (cuda, opengl) = (Some(RasterBackend::Cuda), Some(RasterBackend::OpenGl));
+    assert_eq!(four.info.raster_backends, RasterBackends { shadow: cuda, visibility: opengl });
+    let want = draw(Backend::OpenGl, Some(4));
+    assert!(count_different_bytes(&four, &want) <= 60, "{}", count_different_bytes(&four, &want));
+    assert!(count_different_bytes(&one, &want) > 60, "control: expected another image with one sample");
+}
+
 /// A rasterizer whose draw calls return the result of `failure`.
 #[derive(Debug)]
 struct FailingRasterizer {
