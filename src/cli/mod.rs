@@ -86,6 +86,9 @@ Exit codes:
   6  error of the server or the device
   7  the device is lost, or does not answer; the state is on disk, and a new process can go on";
 
+/// The exit code of [`Error::DeviceLost`].
+pub const EXIT_CODE_OF_LOST_DEVICE: u8 = 7;
+
 /// How a command without an error ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Completion {
@@ -152,7 +155,7 @@ fn exit_code(error: &Error) -> u8 {
         | Error::Unavailable { .. }
         | Error::ShuttingDown => 5,
         Error::Deadline { .. } | Error::Fault { .. } | Error::RendererLost { .. } => 6,
-        Error::DeviceLost { .. } => 7,
+        Error::DeviceLost { .. } => EXIT_CODE_OF_LOST_DEVICE,
     }
 }
 
