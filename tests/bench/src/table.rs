@@ -224,7 +224,7 @@ pub struct TimeAndError {
 
 impl TimeAndError {
     /// Whether the time is smaller than that of `other` by more than noise: the quartiles do not overlap, and the
-    /// difference is more than [`MIN_RELATIVE_GAIN`].
+    /// difference is more than `MIN_RELATIVE_GAIN`.
     pub fn is_faster_than(&self, other: &Self) -> bool {
         self.quartiles_us[1] < other.quartiles_us[0] && self.time_us < other.time_us * (1.0 - MIN_RELATIVE_GAIN)
     }
@@ -236,7 +236,7 @@ impl TimeAndError {
 }
 
 /// Pareto front of times and errors: the indices of the points that no other point dominates, by ascending time. Of
-/// points that differ only by noise in time, or by less than [`MIN_RELATIVE_GAIN`] in error, one is on the front.
+/// points that differ only by noise in time, or by less than `MIN_RELATIVE_GAIN` in error, one is on the front.
 pub fn pareto_front(points: &[TimeAndError]) -> Vec<usize> {
     let mut order: Vec<usize> = (0..points.len()).collect();
     order.sort_by(|a, b| {

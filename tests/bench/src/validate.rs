@@ -177,7 +177,7 @@ pub struct ValidationLimits {
     /// Maximum number of states of the trajectory.
     pub steps: usize,
     /// Seconds after which no state beyond [`MIN_RANDOM_STATES`] and [`MIN_STEPS`] is validated. Random states take at most
-    /// [`RANDOM_FRACTION`] of this time. The groups of states that are evaluated together are finished.
+    /// `RANDOM_FRACTION` of this time. The groups of states that are evaluated together are finished.
     pub seconds: f64,
 }
 

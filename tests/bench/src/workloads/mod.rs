@@ -160,7 +160,7 @@ impl WorkloadKind {
         }
     }
 
-    /// The size in a quick report: full for loads of at most [`MAX_QUICK_NUMBERS`] numbers in x0 and U.
+    /// The size in a quick report: full for loads of at most `MAX_QUICK_NUMBERS` numbers in x0 and U.
     pub fn quick_size(self) -> Size {
         let numbers = match self {
             Self::Single { power, rank } => 3 * (1_usize << power) * (1 + rank),
