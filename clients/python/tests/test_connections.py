@@ -18,6 +18,7 @@ from conftest import SERVER_ARGUMENTS
 from scenes import SIZE, beam, beam_builder
 
 import modalcast as mc
+from modalcast._methods import PROTOCOL_VERSION
 from modalcast._server_process import _find_program
 
 
@@ -277,7 +278,8 @@ def test_close_ends_a_blocked_reader(beams: mc.Scene):
 
 def test_another_protocol_version_is_rejected(client: mc.Client, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("modalcast._sync.client.PROTOCOL_VERSION", 99)
-    with pytest.raises(mc.ProtocolVersionError, match="expected a server of protocol version 99, got version 1"):
+    expected = f"expected a server of protocol version 99, got version {PROTOCOL_VERSION}"
+    with pytest.raises(mc.ProtocolVersionError, match=expected):
         mc.connect(client.address)
 
 
