@@ -251,7 +251,8 @@ function shownPicture(page: Page): Promise<ShownPicture> {
 }
 
 async function serverPicture(camera: CameraMessage, width: number, height: number): Promise<Uint8Array> {
-    const request = { scene: "tree", pictures: [{ width, height, camera, format: Format.RGBA }] };
+    // Streams of this size have one sample per pixel on a CPU, single frames have four by default.
+    const request = { scene: "tree", pictures: [{ width, height, camera, format: Format.RGBA, samples: 1 }] };
     const bytes = new Uint8Array(4 * width * height);
     const { channel } = await server.client();
     for await (const { part } of channel.serverStream(FrameService.method.renderFrame, request)) {
