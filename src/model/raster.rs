@@ -130,8 +130,8 @@ pub struct SharedDraw<'a> {
 }
 
 /// Draws one mesh. [`Self::draw`] orders its buffer accesses with OpenGL commands before and after each call without
-/// blocking the host. Between calls, the implementation may keep the handles of the position buffer and the target buffers, and
-/// leave these buffers registered with CUDA.
+/// blocking the host. Between calls, the implementation may keep the handles of the position buffer and the target
+/// buffers, and leave these buffers registered with CUDA.
 pub trait Rasterizer: std::fmt::Debug {
     /// Draws depths, ids, or both. One call for both is cheaper, because the switch from OpenGL to CUDA and back takes
     /// longer than either pass.

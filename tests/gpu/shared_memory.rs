@@ -69,8 +69,9 @@ impl Fixture {
     }
 
     /// Deforms and draws steps with [`MAX_FRAMES_IN_FLIGHT`] frames in flight for at least `seconds` and two rounds of
-    /// the states. `next` returns the index of the state that the deformer may compute with that of a step. `change_buffers` changes the buffers that the deformer gets. Returns the numbers of frames and of
-    /// frames that show another image than that of their step.
+    /// the states. `next` returns the index of the state that the deformer may compute with that of a step.
+    /// `change_buffers` changes the buffers that the deformer gets. Returns the numbers of frames and of frames that show
+    /// another image than that of their step.
     fn draw_steps_with_next(
         &mut self,
         seconds: f64,

@@ -195,7 +195,7 @@ async function watch(limit: number): Promise<void> {
         viewport.onFrame = onFrame;
         viewport.onDrawn = () => {};
     });
-    // An error that nobody awaits yet would be reported as one of the page.
+    // A rejected promise without a handler would count as an error of the page.
     globalThis.sample.catch(() => {});
 }
 

@@ -191,12 +191,14 @@ impl LoadedScene {
     ) -> Result<BufferContents> {
         let is_uploaded = self.fill_without_rebase(renderer)?;
         let Some(buffers) = &mut self.buffers else { return Err(no_buffers_error()) };
-        if let Some(origin) = uniform_origin(&self.current_state) {
-            buffers.set_shared_origin(origin);
-            buffers.set_step(self.generation);
-            return Ok(BufferContents { bounds: self.bounds, light_bounds: self.light_bounds, is_uploaded });
-        }
-        let Some(origins) = self.current_state.origins.clone() else { return Err(no_buffers_error()) };
+        let origins = match (uniform_origin(&self.current_state), &self.current_state.origins) {
+            (None, Some(origins)) => Arc::clone(origins),
+            (origin, _) => {
+                buffers.set_shared_origin(origin.unwrap_or_default());
+                buffers.set_step(self.generation);
+                return Ok(BufferContents { bounds: self.bounds, light_bounds: self.light_bounds, is_uploaded });
+            }
+        };
         let camera_origin = self.scene.origin_grids.snap(camera.eye().into());
         let positions = &self.deformer.surface_with(VertexAttributes::POSITIONS_AND_NORMALS)?.positions;
         let (positions, bounds) = origins.rebase_positions(camera_origin, &self.scene, positions);
@@ -205,8 +207,8 @@ impl LoadedScene {
     }
 
     /// Draws the passes of the compute rasterizer for the next frame before OpenGL gets commands, if the positions are in
-    /// shared memory. Also draws those of the step that the deformer has computed ahead, for the same camera. The frame must
-    /// follow with the same parameters. `samples`: samples per pixel that the frame sets for itself.
+    /// shared memory. Also draws those of the step that the deformer has computed ahead, for the same camera. The frame
+    /// must follow with the same parameters. `samples`: samples per pixel that the frame sets for itself.
     pub(in crate::engine) fn rasterize(
         &mut self,
         renderer: &mut Renderer,

@@ -91,7 +91,8 @@ impl RasterPasses {
 }
 
 impl RasterOutputs {
-    /// The outputs of the passes. Their buffers are allocated when they are drawn. `options` are the shader options of the scene.
+    /// The outputs of the passes. Their buffers are allocated when they are drawn. `options` are the shader options of the
+    /// scene.
     pub(crate) fn new(
         passes: RasterPasses,
         options: &ShaderOptions,

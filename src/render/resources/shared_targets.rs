@@ -191,9 +191,9 @@ impl SharedTargets {
     /// Ends the use of the current set by OpenGL, after all commands that read it.
     pub(super) fn release(&mut self, gl: &Rc<Gl>) -> Result<()> {
         if let Some(DrawnSet { set, .. }) = self.current.take() {
-            self.count -= 1;
-            self.free.push_back(TargetSet { read: Some(gl.fence("raster")?), ..set });
-            self.count += 1;
+            // Without a fence, the set cannot be reused, and is freed.
+            let read = gl.fence("raster").inspect_err(|_| self.count -= 1)?;
+            self.free.push_back(TargetSet { read: Some(read), ..set });
         }
         Ok(())
     }

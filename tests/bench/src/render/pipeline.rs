@@ -155,11 +155,12 @@ pub fn measure_pipelines(
             let settings = BackendSettings { raster, ..BackendSettings::default() };
             let mut loaded_scene = context.load_scene(&setup.scene, settings)?;
             let row = setup.measure_frames(&mut context, &mut loaded_scene, knows_next_step, options.replays);
-            let wall_us = setup.measure_undrawn(&mut loaded_scene, options.replays);
+            let wall_us =
+                (raster == RasterPolicy::OpenGl).then(|| setup.measure_undrawn(&mut loaded_scene, options.replays));
             context.unload_scene(loaded_scene);
             report.rows.push(row?);
-            if raster == RasterPolicy::OpenGl {
-                let (wall_us, graph_us) = (wall_us?, setup.measure_graph(&device, options.replays)?);
+            if let Some(wall_us) = wall_us.transpose()? {
+                let graph_us = setup.measure_graph(&device, options.replays)?;
                 report.undrawn_steps.push(UndrawnStep { load: setup.name.clone(), wall_us, graph_us });
             }
         }
