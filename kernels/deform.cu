@@ -336,11 +336,14 @@ struct WarpShared {
     unsigned repaired_keys[32][6];
 };
 
-// x0 and T of a lane's vertices.
+// x0 and T of a lane's vertices, and the address of the output, which is loaded with them so that the stores do not
+// wait for it.
 struct VertexInputs {
     LaneItems x, y, z;
     Affine t;
+    float* output;
     __device__ __forceinline__ void load(const DeformArgs& args, const LaneSlice& slice) {
+        output = args.header->positions;
         x = load_items(args.rest_positions, slice, 3, 0);
         y = load_items(args.rest_positions, slice, 3, 1);
         z = load_items(args.rest_positions, slice, 3, 2);
@@ -377,7 +380,7 @@ __device__ __forceinline__ void write_positions(const DeformArgs& args, WarpShar
             }
         }
     }
-    store_staged_triples(args.header->positions, shared.staging, slice);
+    store_staged_triples(inputs.output, shared.staging, slice);
     // A tile has four boxes of six keys. Each of four warps writes one box; a single warp writes its box four times.
     const unsigned key = reduce_box_keys(keys);
     if (lane_id() < 6 * ITEMS_PER_LANE) {

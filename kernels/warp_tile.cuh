@@ -112,6 +112,14 @@ __device__ __forceinline__ void stage_triples(OutputStaging& staging, const Lane
     staging.item_ranges[lane_id()] = make_uint2(first_item, slice.item_count);
 }
 
+// Stores a float with the cache hint of `__stcs` if `is_stored`. The store is a predicated instruction, because with a
+// branch around each store the compiler would load the next float from shared memory only after the store.
+__device__ __forceinline__ void store_if(bool is_stored, float* output, float number) {
+    asm volatile("{ .reg .pred stored; setp.ne.u32 stored, %2, 0; @stored st.global.cs.f32 [%0], %1; }" ::"l"(output),
+                 "f"(number), "r"((unsigned)is_stored)
+                 : "memory");
+}
+
 // Stores the staged triples so that whole sectors of 32 bytes are written. The items of a tile of one domain are
 // contiguous in the output: a lane writes 16 bytes at a time if the output is aligned, else 4 bytes. In a mixed tile, a
 // lane writes 4 bytes at a time.
@@ -141,11 +149,21 @@ __device__ __forceinline__ void store_staged_triples(float* packed, OutputStagin
             owner_lane[k] = (32 * k + lane_id()) / FLOATS_PER_LANE;
             number_in_lane[k] = (32 * k + lane_id()) % FLOATS_PER_LANE;
         }
+        // Three floats at a time, whose loads from shared memory are in flight together.
 #pragma unroll
-        for (unsigned k = 0; k < FLOATS_PER_LANE; ++k) {
-            const uint2 item_range = staging.item_ranges[owner_lane[k % 3] + 96 / FLOATS_PER_LANE * (k / 3)];
-            if (number_in_lane[k % 3] < 3 * item_range.y) {
-                __stcs(packed + (3 * (size_t)item_range.x + number_in_lane[k % 3]), staged_floats(staging)[32 * k + lane_id()]);
+        for (unsigned first = 0; first < FLOATS_PER_LANE; first += 3) {
+            bool is_stored[3];
+            float *outputs[3], numbers[3];
+#pragma unroll
+            for (unsigned i = 0; i < 3; ++i) {
+                const uint2 item_range = staging.item_ranges[owner_lane[i] + 96 / FLOATS_PER_LANE * (first / 3)];
+                is_stored[i] = number_in_lane[i] < 3 * item_range.y;
+                outputs[i] = packed + (3 * (size_t)item_range.x + number_in_lane[i]);
+                numbers[i] = staged_floats(staging)[32 * (first + i) + lane_id()];
+            }
+#pragma unroll
+            for (unsigned i = 0; i < 3; ++i) {
+                store_if(is_stored[i], outputs[i], numbers[i]);
             }
         }
     }
