@@ -175,53 +175,88 @@ __device__ __forceinline__ void stage_member(const RestPositionPair& rest, const
     }
 }
 
-// Computes the boxes of the two staged members, `first_member` and the next. Each half warp (16 lanes) reduces one
-// member, with four vertices (three float4) per lane. The lower sides of a box are maxima of -x, -y, -z, the upper
-// sides maxima of x, y, z. After the first exchange, lanes 0 to 7 of a half warp reduce only the lower sides, and lanes
-// 8 to 15 only the upper sides, so later exchanges move three numbers instead of six. The maxima ignore NaN: if a
-// position is not finite, this function sets `has_non_finite`, and `repair_non_finite` computes the boxes again.
-__device__ __forceinline__ void write_two_boxes(const BatchArgs& args, WarpSlice& slice, const BlockStorage& block,
-                                                unsigned first_member, const float4* staged) {
+// Three sides of a box: the lower ones, maxima of -x, -y, -z, or the upper ones, maxima of x, y, z. A side is NaN if a
+// position has a NaN.
+struct BoxSides {
+    float values[3];
+};
+
+// Sides of an empty box.
+__device__ __forceinline__ BoxSides empty_sides() {
     const float NEGATIVE_INFINITY = __uint_as_float(0xff800000u);
-    const unsigned member = first_member + lane_id() / 16, half_lane = lane_id() % 16;
+    return {NEGATIVE_INFINITY, NEGATIVE_INFINITY, NEGATIVE_INFINITY};
+}
+
+// Exchanges sides with the lane that differs in `lane_bit`. The lane without this bit returns the merged sides `a` of
+// both lanes, the lane with this bit the merged sides `b`. All lanes must call this.
+__device__ __forceinline__ BoxSides exchange_sides(const BoxSides& a, const BoxSides& b, unsigned lane_bit) {
+    const bool keeps_b = lane_id() & lane_bit;
+    BoxSides merged;
+#pragma unroll
+    for (unsigned axis = 0; axis < 3; ++axis) {
+        const float received = __shfl_xor_sync(0xffffffffu, keeps_b ? a.values[axis] : b.values[axis], lane_bit);
+        merged.values[axis] = max_or_nan(keeps_b ? b.values[axis] : a.values[axis], received);
+    }
+    return merged;
+}
+
+// Computes sides of the boxes of two staged members. Each half warp (16 lanes) reads one member, with four vertices
+// (three float4) per lane. Lanes 0 to 7 of a half warp return lower sides, lanes 8 to 15 upper sides, each of eight
+// vertices.
+__device__ __forceinline__ BoxSides compute_pair_sides(const WarpSlice& slice, const float4* staged) {
+    const unsigned half_lane = lane_id() % 16;
     const float4* lane_vectors = staged + 48 * (lane_id() / 16) + 3 * half_lane;
     const float4 vector0 = lane_vectors[0], vector1 = lane_vectors[1], vector2 = lane_vectors[2];
     const float coordinates[12] = {vector0.x, vector0.y, vector0.z, vector0.w, vector1.x, vector1.y,
                                    vector1.z, vector1.w, vector2.x, vector2.y, vector2.z, vector2.w};
-    float negated_min[3] = {NEGATIVE_INFINITY, NEGATIVE_INFINITY, NEGATIVE_INFINITY};
-    float box_max[3] = {NEGATIVE_INFINITY, NEGATIVE_INFINITY, NEGATIVE_INFINITY}, non_finite_flag = 0.0f;
-#pragma unroll
-    for (unsigned i = 0; i < 12; ++i) {
-        if (slice.vertex_count == WARP_VERTICES || 4 * half_lane + i / 3 < slice.vertex_count) {
-            negated_min[i % 3] = fmaxf(negated_min[i % 3], -coordinates[i]);
-            box_max[i % 3] = fmaxf(box_max[i % 3], coordinates[i]);
-        }
-        // Remains zero unless a number is not finite.
-        non_finite_flag = fmaf(0.0f, coordinates[i], non_finite_flag);
-    }
-    if (__any_sync(0xffffffffu, non_finite_flag != 0.0f) && lane_id() == 0) {
-        slice.has_non_finite = 1;
-    }
-    const bool is_upper = half_lane >= 8;
-    float sides[3];
+    const float NEGATIVE_INFINITY = __uint_as_float(0xff800000u);
+    BoxSides lower, upper;
 #pragma unroll
     for (unsigned axis = 0; axis < 3; ++axis) {
-        const float other_half_side = __shfl_xor_sync(0xffffffffu, is_upper ? negated_min[axis] : box_max[axis], 8);
-        sides[axis] = fmaxf(is_upper ? box_max[axis] : negated_min[axis], other_half_side);
+        lower.values[axis] = 4 * half_lane < slice.vertex_count ? -coordinates[axis] : NEGATIVE_INFINITY;
+        upper.values[axis] = 4 * half_lane < slice.vertex_count ? coordinates[axis] : NEGATIVE_INFINITY;
     }
 #pragma unroll
-    for (unsigned lane_offset = 4; lane_offset > 0; lane_offset /= 2) {
-#pragma unroll
-        for (unsigned axis = 0; axis < 3; ++axis) {
-            sides[axis] = fmaxf(sides[axis], __shfl_xor_sync(0xffffffffu, sides[axis], lane_offset));
+    for (unsigned i = 3; i < 12; ++i) {
+        if (slice.vertex_count == WARP_VERTICES || 4 * half_lane + i / 3 < slice.vertex_count) {
+            lower.values[i % 3] = max_or_nan(lower.values[i % 3], -coordinates[i]);
+            upper.values[i % 3] = max_or_nan(upper.values[i % 3], coordinates[i]);
         }
     }
-    // All eight lanes of a quarter warp have the same three sides. Six of them write these sides to two boxes, because
-    // half a tile has two of the tile's four boxes.
-    const unsigned axis = half_lane % 8 % 3, box_copy = half_lane % 8 / 3;
-    if (box_copy < 2 && member < slice.member_count) {
-        const float side = axis == 0 ? sides[0] : axis == 1 ? sides[1] : sides[2];
-        warp_box_keys(args, slice, block.members[member])[6 * box_copy + (is_upper ? 3 : 0) + axis] = non_nan_to_ordered(side);
+    return exchange_sides(lower, upper, 8);
+}
+
+// Number of exchanges that distribute the sides of all pairs of members over the lanes of half a warp: of the lane bits
+// 4, 2, 1 with 8 pairs.
+constexpr unsigned PAIR_LEVELS = BATCH_SIZE == 16 ? 3 : BATCH_SIZE == 8 ? 2 : 1;
+
+// Writes the boxes of all members, from the sides that `store_members` has merged. Sets `has_non_finite` if a box is
+// not finite; then `repair_non_finite` computes the boxes again.
+__device__ __forceinline__ void write_boxes(const BatchArgs& args, WarpSlice& slice, const BlockStorage& block, BoxSides sides) {
+    // With fewer pairs than lanes, several lanes have sides of the same box.
+#pragma unroll
+    for (unsigned lane_bit = 4 >> PAIR_LEVELS; lane_bit > 0; lane_bit /= 2) {
+        sides = exchange_sides(sides, sides, lane_bit);
+    }
+    // Bit i of the pair is the lane bit of the exchange at level i.
+    unsigned pair = 0;
+#pragma unroll
+    for (unsigned level = 0; level < PAIR_LEVELS; ++level) {
+        pair |= (lane_id() >> (2 - level) & 1) << level;
+    }
+    const unsigned member = 2 * pair + lane_id() / 16;
+    if (member < slice.member_count) {
+        // Half a tile has two of the tile's four boxes.
+        unsigned* keys = warp_box_keys(args, slice, block.members[member]) + 3 * (lane_id() / 8 % 2);
+        bool is_finite = true;
+#pragma unroll
+        for (unsigned axis = 0; axis < 3; ++axis) {
+            keys[axis] = keys[6 + axis] = non_nan_to_ordered(sides.values[axis]);
+            is_finite = is_finite && isfinite(sides.values[axis]);
+        }
+        if (!is_finite) {
+            slice.has_non_finite = 1;
+        }
     }
 }
 
@@ -265,8 +300,10 @@ __device__ __forceinline__ void store_floats(const WarpSlice& slice, const Block
 // it.
 __device__ __forceinline__ void store_members(const BatchArgs& args, WarpSlice& slice, WarpStorage& storage,
                                               const BlockStorage& block, const Sums& sums) {
+    BoxSides carries[PAIR_LEVELS + 1];
 #pragma unroll
     for (unsigned member = 0; member < BATCH_SIZE; member += 2) {
+        BoxSides sides = empty_sides();
         if (member < slice.member_count) {
             const bool has_two_members = member + 1 < slice.member_count;
             float* staged = (float*)storage.ring + member / 2 % 2 * (2 * 3 * WARP_VERTICES);
@@ -277,14 +314,24 @@ __device__ __forceinline__ void store_members(const BatchArgs& args, WarpSlice& 
             stage_member(rest, block, sums, member + 1, staged + 3 * WARP_VERTICES);
             const BatchMember &first = block.members[member], &second = block.members[member + 1];
             __syncwarp();
-            write_two_boxes(args, slice, block, member, (const float4*)staged);
+            sides = compute_pair_sides(slice, (const float4*)staged);
             if (has_two_members && slice.vertex_count == WARP_VERTICES && (first.first_vertex | second.first_vertex) % 4 == 0) {
                 store_two_members(output_pointer(slice, first), output_pointer(slice, second), (const float4*)staged);
             } else {
                 store_floats(slice, block, member, staged);
             }
         }
+        // Merge two pairs with one exchange, after which half of the lanes have the sides of each pair, then two of
+        // these results, and so on, like the carries of a binary counter. This takes half as many exchanges as a
+        // reduction of each pair. Inline, because otherwise the compiler spills registers.
+        unsigned level = 0;
+#pragma unroll
+        for (; member / 2 >> level & 1; ++level) {
+            sides = exchange_sides(carries[level], sides, 4 >> level);
+        }
+        carries[level] = sides;
     }
+    write_boxes(args, slice, block, carries[PAIR_LEVELS]);
 }
 
 // Computes x of one vertex of this lane in f64 and rounds it once. The member's coordinate of mode m is at

@@ -19,6 +19,17 @@ __device__ inline float ordered_to_float(unsigned key) {
     return __uint_as_float(key >> 31 ? key & 0x7fffffffu : ~key);
 }
 
+// The maximum of two numbers, where 0 exceeds -0; NaN if one of them is NaN.
+__device__ inline float max_or_nan(float a, float b) {
+#if __CUDA_ARCH__ >= 800
+    float maximum;
+    asm("max.NaN.f32 %0, %1, %2;" : "=f"(maximum) : "f"(a), "f"(b));
+    return maximum;
+#else
+    return a != a ? a : b != b ? b : fmaxf(a, b);
+#endif
+}
+
 // The maximum of `key` over the lanes of the warp. All lanes must call this function.
 __device__ inline unsigned warp_max(unsigned key) {
 #if __CUDA_ARCH__ >= 800
