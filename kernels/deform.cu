@@ -3,8 +3,8 @@
 // computes four bounding boxes of x per tile. One launch covers all domains.
 //
 // A quad is four consecutive vertices or corners of a domain. A tile, the work of one warp (of four warps with
-// ONE_ITEM_PER_LANE), is up to 32 quads: of one domain, or of several small domains (a mixed tile). A chunk is a few
-// modes.
+// ONE_ITEM_PER_LANE, of twelve with AXIS_PER_WARP), is up to 32 quads: of one domain, or of several small domains (a
+// mixed tile). A chunk is a few modes.
 //   tiles, mixed_quads  the tiles of all domains, and the quads of mixed tiles (layout.cuh)                      (in)
 //   words            U, per tile [chunk][3][quad] words of 16 bytes (chunk.cuh)                                  (in)
 //   rest_positions   x0, per tile of one domain [axis][quad][vertex in the quad] f32, per quad of a mixed tile
@@ -32,11 +32,12 @@
 //                    DISPLACEMENTS_ONLY (benchmarks) the only output, and u is not recomputed in f64             (out)
 //   boxes            [tiles][4 boxes][6 keys] u32: `float_to_ordered` maxima of -x, -y, -z, x, y, z. Four warps of a
 //                    tile write one box each; a single warp writes its box four times                            (out)
-// Launch: WARPS warps per block, WARPS_PER_TILE warps for each of `tile_count` tiles; with TILE_LIST any number of
-// blocks.
+// Launch: WARPS warps per block, WARPS_PER_TILE * WARPS_PER_SLICE warps for each of `tile_count` tiles; with TILE_LIST
+// any number of blocks.
 // CPU twin: src/compute/reference/deform.rs.
 // Further macros: MODES (a domain has modes), SHEAR (a transform may have shear or a non-uniform scale),
-// ONE_ITEM_PER_LANE (a tile has four warps instead of one) and COMPENSATED_SUM (described at `Sums`).
+// ONE_ITEM_PER_LANE (a tile has four warps instead of one), AXIS_PER_WARP (with MODES, ONE_ITEM_PER_LANE and f32: each
+// of these four warps is replaced by three, which sum one axis each) and COMPENSATED_SUM (described at `Sums`).
 //
 // Determinism: each vertex sums its modes in order, from +0, by fused multiply-adds, independent of the tile and the
 // lane, so runs agree bit by bit. A result that is not finite in f32 is computed again in f64. An output that is still
@@ -53,10 +54,16 @@
 #else
 #define PREFETCH_CHUNKS 4
 #endif
+// Number of warps that share a slice (`LaneSlice`): with AXIS_PER_WARP, one for each axis.
+#ifdef AXIS_PER_WARP
+constexpr unsigned WARPS_PER_SLICE = 3;
+#else
+constexpr unsigned WARPS_PER_SLICE = 1;
+#endif
 // Warps per block. Twin: `block_threads` in src/compute/gpu/tables/kernels.rs. Tiles with modes read long contiguous
 // ranges and are fastest in blocks of one warp.
 #if defined(MODES) || defined(SHEAR) || defined(TILE_LIST)
-constexpr unsigned WARPS = 1;
+constexpr unsigned WARPS = WARPS_PER_SLICE;
 #else
 constexpr unsigned WARPS = 2;
 #endif
@@ -88,16 +95,19 @@ __device__ __forceinline__ ChunkWeights load_chunk_weights(const DeformArgs& arg
     return weights;
 }
 
-// u of a lane's vertices, [axis][vertex]. COMPENSATED_SUM also accumulates the rounding errors (Ogita, Rump and Oishi,
-// "Accurate sum and dot product", algorithm Dot2), which doubles the registers of the sums.
+constexpr unsigned SUMS_PER_LANE = FLOATS_PER_LANE / WARPS_PER_SLICE;
+
+// u of a lane's vertices, [axis][vertex]; with AXIS_PER_WARP only along the axis of the warp. COMPENSATED_SUM also
+// accumulates the rounding errors (Ogita, Rump and Oishi, "Accurate sum and dot product", algorithm Dot2), which
+// doubles the registers of the sums.
 struct Sums {
-    float values[FLOATS_PER_LANE];
+    float values[SUMS_PER_LANE];
 #ifdef COMPENSATED_SUM
-    float compensation[FLOATS_PER_LANE];
+    float compensation[SUMS_PER_LANE];
 #endif
     __device__ __forceinline__ void clear() {
 #pragma unroll
-        for (unsigned i = 0; i < FLOATS_PER_LANE; ++i) {
+        for (unsigned i = 0; i < SUMS_PER_LANE; ++i) {
             values[i] = 0.0f;
 #ifdef COMPENSATED_SUM
             compensation[i] = 0.0f;
@@ -125,6 +135,88 @@ struct Sums {
     }
 };
 
+// Indices of the chunks that a domain sums: all of them, or with MODE_TRUNCATION the retained ones.
+struct ChunkIndices {
+    unsigned count;
+#ifdef MODE_TRUNCATION
+    const unsigned short* retained;
+#endif
+    __device__ __forceinline__ ChunkIndices(const DeformArgs& args, const LaneSlice& slice) : count(slice.chunk_count) {
+#ifdef MODE_TRUNCATION
+        // `retained` has an entry for every CHUNK_MODES coordinates of q, so that no chunk list overflows when every
+        // chunk is retained. The list of a domain begins at the entry of its first coordinate.
+        retained = args.retained + slice.first_q / CHUNK_MODES;
+        count = slice.chunk_count == 0 || slice.item_count == 0 ? 0 : __ldg(args.retained_counts + slice.domain);
+#endif
+    }
+    __device__ __forceinline__ unsigned operator[](unsigned i) const {
+#ifdef MODE_TRUNCATION
+        return __ldg(retained + i);
+#else
+        return i;
+#endif
+    }
+};
+
+#ifdef AXIS_PER_WARP
+// Number of modes that a lane loads before it sums the first one. The latency of memory dominates the time of small
+// scenes, so most of them should need one round. A group of modes beyond the last mode costs one branch.
+constexpr unsigned ROUND_MODES = 32, GROUP_MODES = 8;
+
+// Sums the modes of the warp's axis. QUADS is the number of quads of the tile, or 0 if it is not known at compile time.
+template <unsigned QUADS>
+__device__ __forceinline__ void sum_axis(const DeformArgs& args, const LaneSlice& slice, Sums& sums) {
+    const ChunkIndices mode_indices(args, slice);
+    const unsigned quad_count = QUADS > 0 ? QUADS : slice.quad_count, axis = threadIdx.x / 32;
+    const float* lane_entries =
+        (const float*)(args.words + slice.first_word + axis * quad_count + slice.quad) + slice.item_in_quad;
+    const float* domain_q = args.q + slice.first_q;
+    for (unsigned first = 0; first < mode_indices.count; first += ROUND_MODES) {
+        const unsigned count = mode_indices.count - first;
+        // Without MODE_TRUNCATION, the indices of the modes relative to `base` are compile-time constants.
+#ifdef MODE_TRUNCATION
+        const unsigned base = 0;
+#else
+        const unsigned base = first;
+#endif
+        const float *base_entries = lane_entries + (size_t)base * (12 * quad_count), *base_q = domain_q + base;
+        float entries[ROUND_MODES], q[ROUND_MODES];
+#pragma unroll
+        for (unsigned group = 0; group < ROUND_MODES; group += GROUP_MODES) {
+            if (group < count) {
+#pragma unroll
+                for (unsigned i = group; i < group + GROUP_MODES; ++i) {
+                    if (i < count) {
+                        const unsigned mode = mode_indices[first + i] - base;
+                        entries[i] = __ldcs(base_entries + (size_t)mode * (12 * quad_count));
+                        q[i] = __ldg(base_q + mode);
+                    }
+                }
+            }
+        }
+#pragma unroll
+        for (unsigned group = 0; group < ROUND_MODES; group += GROUP_MODES) {
+            if (group < count) {
+#pragma unroll
+                for (unsigned i = group; i < group + GROUP_MODES; ++i) {
+                    if (i < count) {
+                        sums.add(0, entries[i], q[i]);
+                    }
+                }
+            }
+        }
+    }
+}
+
+__device__ __forceinline__ void sum_modes(const DeformArgs& args, const LaneSlice& slice, Sums& sums) {
+    // In a full tile, the addresses of the entries differ by constants.
+    if (slice.quad_count == TILE_QUADS) {
+        sum_axis<TILE_QUADS>(args, slice, sums);
+    } else {
+        sum_axis<0>(args, slice, sums);
+    }
+}
+#else
 // The entries of a chunk for a lane's items. `load` gets a pointer to the first of the three words of the lane's quad.
 #ifdef ONE_ITEM_PER_LANE
 struct Chunk {
@@ -169,29 +261,6 @@ __device__ __forceinline__ void add_chunk(Sums& sums, const Chunk& chunk, const 
     }
 }
 
-// Indices of the chunks that a domain sums: all of them, or with MODE_TRUNCATION the retained ones.
-struct ChunkIndices {
-    unsigned count;
-#ifdef MODE_TRUNCATION
-    const unsigned short* retained;
-#endif
-    __device__ __forceinline__ ChunkIndices(const DeformArgs& args, const LaneSlice& slice) : count(slice.chunk_count) {
-#ifdef MODE_TRUNCATION
-        // `retained` has an entry for every CHUNK_MODES coordinates of q, so that no chunk list overflows when every
-        // chunk is retained. The list of a domain begins at the entry of its first coordinate.
-        retained = args.retained + slice.first_q / CHUNK_MODES;
-        count = slice.chunk_count == 0 || slice.item_count == 0 ? 0 : __ldg(args.retained_counts + slice.domain);
-#endif
-    }
-    __device__ __forceinline__ unsigned operator[](unsigned i) const {
-#ifdef MODE_TRUNCATION
-        return __ldg(retained + i);
-#else
-        return i;
-#endif
-    }
-};
-
 // Adds the next COUNT chunks, from `chunk_indices[i]` on, and advances `i`. Loads all of them before it sums the first
 // one.
 template <unsigned COUNT>
@@ -232,6 +301,7 @@ __device__ __forceinline__ void sum_modes(const DeformArgs& args, const LaneSlic
         sum_chunks<1>(args, slice, chunk_indices, i, sums);
     }
 }
+#endif
 #endif
 
 // Computes u of one vertex of this lane in f64. `vertex` is below ITEMS_PER_LANE.
@@ -394,10 +464,45 @@ __device__ __forceinline__ void compute_displacements(const DeformArgs& args, co
     Sums sums;
     sums.clear();
     sum_modes(args, slice, sums);
+#ifdef AXIS_PER_WARP
+    __shared__ float axis_displacements[3][32];
+    axis_displacements[threadIdx.x / 32][lane_id()] = sums.total(0);
+    __syncthreads();
+#pragma unroll
+    for (unsigned axis = 0; axis < 3; ++axis) {
+        displacements[axis] = axis_displacements[axis][lane_id()];
+    }
+#else
 #pragma unroll
     for (unsigned i = 0; i < FLOATS_PER_LANE; ++i) {
         displacements[i] = sums.total(i);
     }
+#endif
+}
+#endif
+
+// With AXIS_PER_WARP, the first warp of a block writes positions and displacements, and the second one normals and
+// tangents.
+__device__ __forceinline__ bool writes_vertices() {
+    return WARPS_PER_SLICE == 1 || threadIdx.x / 32 == 0;
+}
+
+__device__ __forceinline__ bool writes_corners() {
+    return WARPS_PER_SLICE == 1 || threadIdx.x / 32 == 1;
+}
+
+#ifdef DISPLACEMENTS
+// `displacements` is u, [axis][vertex].
+__device__ __forceinline__ void write_displacements(const DeformArgs& args, WarpShared& shared, const LaneSlice& slice,
+                                                    const float (&displacements)[FLOATS_PER_LANE]) {
+    // Transpose u to [vertex][axis].
+    float u[FLOATS_PER_LANE];
+#pragma unroll
+    for (unsigned i = 0; i < FLOATS_PER_LANE; ++i) {
+        u[i] = displacements[i % 3 * ITEMS_PER_LANE + i / 3];
+    }
+    stage_triples(shared.staging, slice, slice.first_item, u);
+    store_staged_triples(args.header->displacements, shared.staging, slice);
 }
 #endif
 
@@ -409,22 +514,19 @@ __device__ __forceinline__ void compute_tile(const DeformArgs& args, WarpShared&
     if (slice.kind & TILE_VERTICES) {
         float displacements[FLOATS_PER_LANE] = {};
         VertexInputs inputs;
-        // With one item per lane, a lane has registers to load x0 and T before the sum.
 #if defined(MODES) && defined(ONE_ITEM_PER_LANE)
-        inputs.load(args, slice);
-        compute_displacements(args, slice, displacements);
-#elif defined(MODES)
+        // With one item per lane, a lane has registers to load x0 and T before the sum.
+        if (writes_vertices()) {
+            inputs.load(args, slice);
+        }
+#endif
+#ifdef MODES
         compute_displacements(args, slice, displacements);
 #endif
 #ifdef DISPLACEMENTS
-        // Transpose u from [axis][vertex] to [vertex][axis].
-        float u[FLOATS_PER_LANE];
-#pragma unroll
-        for (unsigned i = 0; i < FLOATS_PER_LANE; ++i) {
-            u[i] = displacements[i % 3 * ITEMS_PER_LANE + i / 3];
+        if (writes_vertices()) {
+            write_displacements(args, shared, slice, displacements);
         }
-        stage_triples(shared.staging, slice, slice.first_item, u);
-        store_staged_triples(args.header->displacements, shared.staging, slice);
 #endif
 #ifndef DISPLACEMENTS_ONLY
 #if !(defined(MODES) && defined(ONE_ITEM_PER_LANE))
@@ -432,15 +534,17 @@ __device__ __forceinline__ void compute_tile(const DeformArgs& args, WarpShared&
 #endif
 #ifdef RIGID_NORMALS
         // Load the rest normals before the positions are stored, so that both transfers are in flight together.
-        if (slice.kind & TILE_CORNERS) {
+        if (writes_corners() && slice.kind & TILE_CORNERS) {
             normals.load(args, slice);
         }
 #endif
-        write_positions(args, shared, slice, tile, tile_warp, inputs, displacements);
+        if (writes_vertices()) {
+            write_positions(args, shared, slice, tile, tile_warp, inputs, displacements);
+        }
 #endif
     }
 #ifdef RIGID_NORMALS
-    if (slice.kind & TILE_CORNERS) {
+    if (writes_corners() && slice.kind & TILE_CORNERS) {
         if (!(slice.kind & TILE_VERTICES)) {
             normals.load(args, slice);
         }
@@ -452,7 +556,8 @@ __device__ __forceinline__ void compute_tile(const DeformArgs& args, WarpShared&
 extern "C" __global__ void __launch_bounds__(32 * WARPS, MIN_BLOCKS_PER_SM) deform(const __grid_constant__ DeformArgs args) {
     launch_dependent_grids();
     __shared__ WarpShared shared[WARPS];
-    const unsigned warp = blockIdx.x * WARPS + threadIdx.x / 32;
+    // Warps with the same vertices have the same index.
+    const unsigned warp = (blockIdx.x * WARPS + threadIdx.x / 32) / WARPS_PER_SLICE;
 #ifdef TILE_LIST
     const unsigned warp_count = WARPS_PER_TILE * __ldg(&args.header->dirty_tile_count);
     for (unsigned i = warp; i < warp_count; i += gridDim.x * WARPS) {

@@ -85,17 +85,27 @@ fn bits_of(result: &StepResult, scene: &Scene, domain: usize) -> [Vec<u32>; 3] {
     .map(|numbers| numbers.iter().map(|number| number.to_bits()).collect())
 }
 
-/// Whether the scene has so few tiles that each lane (a GPU thread) computes one vertex instead of four.
-pub(crate) fn has_one_item_per_lane(scene: &Scene) -> bool {
+/// Whether the CUDA kernel `deform` of a scene is compiled with this macro.
+fn has_define(scene: &Scene, define: &str) -> bool {
     plan(scene, CudaDeformerOptions::default())
         .kernel(KernelKind::Deform)
         .expect("expected a deform kernel")
         .defines
-        .contains(&"ONE_ITEM_PER_LANE")
+        .contains(&define)
 }
 
-/// The domains under test have the same bits alone, among a thousand other domains, and with 270 further instances of a
-/// large shape. The instances change the kernel variant ([`has_one_item_per_lane`]).
+/// Whether the scene has so few tiles that each lane (a GPU thread) computes one vertex instead of four.
+pub(crate) fn has_one_item_per_lane(scene: &Scene) -> bool {
+    has_define(scene, "ONE_ITEM_PER_LANE")
+}
+
+/// Whether the scene has so few tiles that the axes of a vertex are summed by different warps.
+fn has_axis_per_warp(scene: &Scene) -> bool {
+    has_define(scene, "AXIS_PER_WARP")
+}
+
+/// The domains under test have the same bits alone, among a thousand other domains, and with 60 or 270 further instances
+/// of a large shape. The instances change the kernel variant ([`has_axis_per_warp`], [`has_one_item_per_lane`]).
 pub(crate) fn check_independence_of_neighbors<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) {
     for (storage, compensated) in StorageType::ALL.map(|storage| (storage, storage == StorageType::Bf16)) {
         let deformation = DeformationSettings { storage, compensated, ..DeformationSettings::default() };
@@ -104,12 +114,15 @@ pub(crate) fn check_independence_of_neighbors<D: Deformer>(create_deformer: impl
         let expected = run_step(&mut create_deformer(&small_scene), &tested_state);
         let name = storage.name();
         assert!(has_one_item_per_lane(&small_scene));
+        assert_eq!(has_axis_per_warp(&small_scene), storage == StorageType::F32, "{name}");
         for neighbors in [
             Neighbors { preceding: 500, following: 500, instances: 0 },
+            Neighbors { preceding: 499, following: 501, instances: 60 },
             Neighbors { preceding: 501, following: 499, instances: 270 },
         ] {
             let (scene, first_domain) = (embedded_scene(deformation, neighbors), neighbors.preceding);
-            assert_eq!(has_one_item_per_lane(&scene), neighbors.instances == 0);
+            assert_eq!(has_one_item_per_lane(&scene), neighbors.instances < 270, "{name}");
+            assert!(neighbors.instances == 0 || !has_axis_per_warp(&scene), "{name}");
             let (mut deformer, state) = (create_deformer(&scene), state_of(&scene, first_domain, &tested_state));
             let actual = run_step(&mut deformer, &state);
             for index in 0..tested_state.transforms.len() {

@@ -71,6 +71,24 @@ fn deform_variants(features: &[&'static str]) -> Vec<Variant> {
         add_variants(&sum(&all_options), &normal_defines[1..3], &["DISPLACEMENTS"]);
         add_variants(&sum(&all_options), &normal_defines[1..3], &["FOLLOWERS"]);
     }
+    // The variant with one warp per axis reads U as f32, and has neither other storage types nor tile lists.
+    let axis_sum =
+        |options: &[&'static str]| [&["MODES", "ONE_ITEM_PER_LANE", kernels::AXIS_PER_WARP], options].concat();
+    for (options, normals) in subsets(&["MODE_TRUNCATION", "COMPENSATED_SUM"])
+        .iter()
+        .flat_map(|options| normal_defines.iter().map(move |normals| (options, normals)))
+    {
+        variants.push(([axis_sum(options).as_slice(), normals].concat(), SM_90));
+    }
+    let largest_axis_sum = axis_sum(
+        &[
+            &["MODE_TRUNCATION", "COMPENSATED_SUM", "DISPLACEMENTS", "FOLLOWERS"],
+            normal_defines[normal_defines.len() - 1],
+        ]
+        .concat(),
+    );
+    variants.extend(CAPABILITIES.map(|capability| (largest_axis_sum.clone(), capability)));
+    variants.extend(CAPABILITIES.map(|capability| (axis_sum(&[]), capability)));
     for storage in storage_variants() {
         let smallest = [&["MODES"], storage.as_slice()].concat();
         let largest = [features, &LAUNCHER_DEFINES, &storage].concat();

@@ -54,6 +54,14 @@ pub(crate) const STORAGE_DEFINES: [&str; 3] = ["STORE_F16", "STORE_BF16", "STORE
 /// warp per tile would not fill the device. 1024 is about eight warps for each of 132 multiprocessors.
 const MIN_FOUR_ITEM_TILES: usize = 1024;
 
+/// Up to this number of tiles, `deform` has one warp per axis for each 32 vertices (AXIS_PER_WARP): the latency of memory
+/// dominates, and three times as many lanes load all of U at once. A tile has four blocks, and 132 multiprocessors have
+/// 660 resident blocks: with more tiles, some blocks would start late.
+const MAX_AXIS_PER_WARP_TILES: usize = 160;
+
+/// The macro that gives each axis of the sum U q a warp of its own; needs MODES and ONE_ITEM_PER_LANE.
+pub(crate) const AXIS_PER_WARP: &str = "AXIS_PER_WARP";
+
 /// Group sizes below [`MAX_BATCH_SIZE`]: the maximum number of domains of a group, and the macro that compiles `batch`
 /// for it. In ascending order.
 const SMALLER_BATCHES: [(usize, &str); 2] = [(4, "BATCH_4"), (8, "BATCH_8")];
@@ -80,16 +88,29 @@ pub(crate) const fn has_one_item_per_lane(work: &WorkList) -> bool {
     work.full_step_tiles < MIN_FOUR_ITEM_TILES
 }
 
+/// Whether each axis of the sum U q has a warp of its own. The variant reads U as f32.
+fn has_axis_per_warp(scene: &Scene, work: &WorkList) -> bool {
+    scene.features.modes
+        && scene.deformation.storage == StorageType::F32
+        && work.full_step_tiles <= MAX_AXIS_PER_WARP_TILES
+}
+
 /// Threads per block of `deform`. Twin of the constant WARPS in `kernels/deform.cu`. The launcher compares the number
 /// of threads with the compiled kernel. TILE_LIST selects the variant for the tile lists of partial steps.
 fn block_threads(defines: &[&str]) -> u32 {
     let has_one_warp = ["MODES", "SHEAR", "TILE_LIST"].iter().any(|name| defines.contains(name));
-    WARP_THREADS * if has_one_warp { 1 } else { 2 }
+    let warps = match (defines.contains(&AXIS_PER_WARP), has_one_warp) {
+        (true, _) => 3,
+        (false, true) => 1,
+        (false, false) => 2,
+    };
+    WARP_THREADS * warps
 }
 
 /// Number of blocks of `deform` for a number of tiles.
 pub(crate) fn deform_blocks(kernel: &KernelDescriptor, tile_count: usize) -> u32 {
-    let warps = tile_count * if kernel.defines.contains(&"ONE_ITEM_PER_LANE") { 4 } else { 1 };
+    let slices = tile_count * if kernel.defines.contains(&"ONE_ITEM_PER_LANE") { 4 } else { 1 };
+    let warps = slices * if kernel.defines.contains(&AXIS_PER_WARP) { 3 } else { 1 };
     warps.div_ceil((kernel.threads / WARP_THREADS) as usize) as u32
 }
 
@@ -150,6 +171,7 @@ fn deform_defines(scene: &Scene, work: &WorkList) -> Vec<&'static str> {
     let flags = [
         ("MODES", features.modes),
         ("ONE_ITEM_PER_LANE", has_one_item_per_lane(work)),
+        (AXIS_PER_WARP, has_axis_per_warp(scene, work)),
         ("MODE_TRUNCATION", features.truncation),
         ("COMPENSATED_SUM", features.compensated),
         ("DISPLACEMENTS", features.displacements),

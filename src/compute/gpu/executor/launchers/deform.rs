@@ -15,7 +15,7 @@ use crate::gpu::launch::error::cuda_error;
 use crate::gpu::launch::{Device, DeviceBuffer, KernelDescriptor, LaunchOrder, launch_kernel};
 use crate::gpu::tables::device_tables::DeviceTables;
 use crate::gpu::tables::input_packing::{DirtyTileLayout, InputPacker};
-use crate::gpu::tables::kernels::deform_blocks;
+use crate::gpu::tables::kernels::{AXIS_PER_WARP, deform_blocks};
 use crate::gpu::tables::layout::{BoxSegment, DeformArgs, WARP_THREADS};
 use crate::gpu::tables::occupancy::deform_tuning;
 use crate::gpu::tables::work::{WordSource, WorkList, mix_tiles};
@@ -286,7 +286,9 @@ fn compile_function(device: &Device, kernel: &KernelDescriptor) -> Result<CudaFu
 /// Compiles the function of partial steps.
 fn compile_tile_list_function(device: &Device, kernel: &KernelDescriptor) -> Result<CudaFunction> {
     // Tile lists are short: with more than one item (vertex or corner) per lane, most of the device would be idle.
-    let defines = kernel.defines.iter().copied().filter(|define| *define != "ONE_ITEM_PER_LANE");
+    // The list has tiles of any number, so the warps of a tile are not split further.
+    let defines =
+        kernel.defines.iter().copied().filter(|define| !["ONE_ITEM_PER_LANE", AXIS_PER_WARP].contains(define));
     let tile_list_defines: Vec<&str> = defines.chain(["ONE_ITEM_PER_LANE", "TILE_LIST"]).collect();
     compile(device, kernel, &tile_list_defines)
 }

@@ -47,7 +47,7 @@ fn used_features_are_compiled_and_stored() {
     let full = plan(&scene_with_normal_map(&[(7, 2), (300, 0)]));
     assert_eq!(
         full.kernels[0].defines,
-        ["MODES", "ONE_ITEM_PER_LANE", "RIGID_NORMALS", "CORNER_OFFSETS", "NORMAL_MAPS", "SHEAR"]
+        ["MODES", "ONE_ITEM_PER_LANE", "AXIS_PER_WARP", "RIGID_NORMALS", "CORNER_OFFSETS", "NORMAL_MAPS", "SHEAR"]
     );
     assert_eq!(full.bytes(BufferRole::Tangents), 16 * 2 * (9 + 302));
     assert_eq!(full.bytes(BufferRole::RestTangents), 64 * (3 + 76), "64 bytes per quad of four corners");
@@ -88,7 +88,7 @@ fn exact_normals_add_a_kernel_and_its_tables() {
     let (plan, rings) = (plan(&scene), RingTables::new(&scene));
     let normals = plan.kernel(KernelKind::Normals).expect("the kernel `normals`");
     assert_eq!((normals.name, normals.defines.as_slice()), ("normals", ["SHEAR"].as_slice()));
-    assert_eq!(plan.kernels[0].defines, ["MODES", "ONE_ITEM_PER_LANE"]);
+    assert_eq!(plan.kernels[0].defines, ["MODES", "ONE_ITEM_PER_LANE", "AXIS_PER_WARP"]);
     assert_eq!(plan.launches(), 4, "a partial step launches `apply`, `deform`, `bounds` and `normals`");
     for (role, bytes) in [
         (BufferRole::CornerSlots, size_of_val(super::super::rings::normal_slots(&scene).as_slice())),
