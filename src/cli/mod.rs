@@ -1,5 +1,6 @@
 //! The command line: the commands, one per file, and their exit codes.
 
+mod allocator;
 mod demo;
 mod doctor;
 mod inspect;
@@ -110,6 +111,7 @@ pub type Outcome = modalcast_model::error::Result<Completion>;
 
 /// Runs the command line and returns the process's exit code.
 pub fn run() -> u8 {
+    allocator::limit_arenas();
     let cli = Cli::parse();
     crate::telemetry::init_logging();
     let outcome = match cli.command {

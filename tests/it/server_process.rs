@@ -40,6 +40,11 @@ impl ServerProcess {
 
     /// As [`Self::start`], with further options.
     pub(crate) fn start_with(folder: &Path, options: &[&str]) -> Self {
+        Self::start_in(folder, options, &[])
+    }
+
+    /// As [`Self::start_with`], with further variables of the environment.
+    fn start_in(folder: &Path, options: &[&str], variables: &[(&str, &str)]) -> Self {
         let scenes = folder.join("scenes");
         std::fs::create_dir_all(&scenes).expect("expected a folder");
         let mut process = Command::new(env!("CARGO_BIN_EXE_modalcast"))
@@ -49,6 +54,7 @@ impl ServerProcess {
             .arg(scenes)
             .args(LONG_LIMITS)
             .args(options)
+            .envs(variables.iter().copied())
             .stdout(Stdio::piped())
             .stderr(Stdio::null())
             .spawn()
@@ -74,6 +80,19 @@ impl ServerProcess {
         maps.lines().filter(|line| line.contains(name)).count()
     }
 
+    /// The number of mappings that arenas of glibc begin with: without a file, at a multiple of 64 MiB.
+    #[cfg(target_env = "gnu")]
+    fn arenas(&self) -> usize {
+        let maps = std::fs::read_to_string(format!("/proc/{}/maps", self.process.id())).expect("expected a process");
+        let is_arena = |line: &&str| {
+            let fields: Vec<&str> = line.split_whitespace().collect();
+            let start = fields[0].split('-').next().expect("expected a range");
+            let start = u64::from_str_radix(start, 16).expect("expected an address");
+            fields.len() == 5 && start.is_multiple_of(64 << 20)
+        };
+        maps.lines().filter(is_arena).count()
+    }
+
     /// The number of open files and sockets.
     pub(crate) fn open_files(&self) -> usize {
         std::fs::read_dir(format!("/proc/{}/fd", self.process.id())).expect("expected a process").count()
@@ -94,6 +113,16 @@ impl Drop for ServerProcess {
         self.process.kill().expect("expected a process");
         self.process.wait().expect("expected the end of the process");
     }
+}
+
+/// Arenas of the allocator keep the most memory that they have had in use at once.
+#[test]
+#[cfg(target_env = "gnu")]
+fn threads_share_few_arenas_of_the_allocator() {
+    let folder = tempfile::tempdir().expect("expected a folder");
+    assert!(ServerProcess::start(folder.path()).arenas() <= 4);
+    let many = ServerProcess::start_in(folder.path(), &[], &[("MALLOC_ARENA_MAX", "16")]);
+    assert!(many.arenas() > 4, "negative control: {} arenas", many.arenas());
 }
 
 /// Number of clients that never read, for each kind of stream.
