@@ -146,8 +146,8 @@ fn nvrtc_compiles_every_kernel_without_spilling() {
         };
         let describe_spill = |(variant, compiled): (&Variant, CompiledVariant)| {
             let spill_bytes = compiled.spill_bytes();
-            // `sum_modes` of batch.cu may spill the counter of its pipeline stages, up to 16 bytes.
-            let max_spill_bytes = if kernel.name == "batch" { 16 } else { 0 };
+            // Batches may spill up to 24 bytes: with more registers, fewer blocks would fit on a multiprocessor.
+            let max_spill_bytes = if kernel.name == "batch" { 24 } else { 0 };
             (spill_bytes > max_spill_bytes).then(|| format!("{variant:?}: {spill_bytes} bytes"))
         };
         let spilling: Vec<String> =
@@ -164,14 +164,13 @@ fn nvrtc_compiles_every_kernel_without_spilling() {
 }
 
 /// Kernel, a macro that adds code, and the macros that this macro requires. [`ALTERNATIVES`] has all other macros.
-const ADDED_CODE: [(&str, &str, &[&str]); 14] = [
+const ADDED_CODE: [(&str, &str, &[&str]); 13] = [
     ("deform", "MODES", &[]),
     ("deform", "COMPENSATED_SUM", &["MODES"]),
     ("deform", "DISPLACEMENTS", &["MODES"]),
     ("bounds", "ORIENTED_BOUNDS", &[]),
     ("bounds", "DOMAIN_BOXES", &[]),
     ("deform", "RIGID_NORMALS", &[]),
-    ("deform", "CORNER_OFFSETS", &["RIGID_NORMALS"]),
     ("deform", "NORMAL_MAPS", &["RIGID_NORMALS"]),
     ("deform", "SHEAR", &["RIGID_NORMALS"]),
     ("deform", "FOLLOWERS", &[]),
@@ -180,13 +179,15 @@ const ADDED_CODE: [(&str, &str, &[&str]); 14] = [
     ("normals", "SHEAR", &[]),
     ("normals", "FOLLOWERS", &[]),
 ];
-/// Macros that select among code of similar length. FOLLOWERS of `apply` adds less code than the padding of its cubin.
-const ALTERNATIVES: [(&str, &str); 5] = [
+/// Macros that select among code of similar length. FOLLOWERS of `apply` and CORNER_OFFSETS of `deform` add less code
+/// than the padding of their cubins.
+const ALTERNATIVES: [(&str, &str); 6] = [
     ("batch", "BATCH_8"),
     ("batch", "BATCH_4"),
     ("deform", "ONE_ITEM_PER_LANE"),
     ("deform", "MODE_TRUNCATION"),
     ("apply", "FOLLOWERS"),
+    ("deform", "CORNER_OFFSETS"),
 ];
 
 #[test]
