@@ -29,7 +29,7 @@ use modalcast_model::error::Error;
 const MAX_STALL: u32 = 3;
 
 /// How often a sender that waits for the total searches for connections to close.
-const EVICTION_INTERVAL: Duration = Duration::from_millis(200);
+const EVICTION_INTERVAL: Duration = Duration::from_millis(100);
 
 /// Time without progress after which a connection above its share is closed when the total is exhausted.
 const EVICTION_STALL: Duration = Duration::from_millis(400);

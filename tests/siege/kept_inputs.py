@@ -1,11 +1,10 @@
 """Item 15: the files that `deploy/fuzz/run` keeps crash no program."""
 
 import json
-import os
-import subprocess
 import tempfile
 from pathlib import Path
 
+import measured
 from report import Result, mb
 
 ITEM = 15
@@ -41,11 +40,8 @@ def inspect(program, name, content):
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / name
         path.write_bytes(content)
-        command = ["timeout", "--signal=ABRT", str(MAX_SECONDS), str(program), "inspect", str(path)]
-        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        _, status, usage = os.wait4(process.pid, 0)
-        process.returncode = os.waitstatus_to_exitcode(status)
-    return process.returncode, 1024 * usage.ru_maxrss
+        run = measured.execute([program, "inspect", path], MAX_SECONDS)
+    return run.code, run.memory
 
 
 def run(program):

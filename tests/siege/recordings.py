@@ -2,13 +2,12 @@
 `modalcast-record`."""
 
 import dataclasses
-import os
 import struct
 import subprocess
 import tempfile
-import time
 from pathlib import Path
 
+import measured
 from client import Client, scenes_pb2
 from report import Result, mb
 from server import Server
@@ -131,35 +130,18 @@ def hostile_files(valid):
     }
 
 
-@dataclasses.dataclass
-class Run:
-    code: int
-    seconds: float
-    memory: int
-    error: str
+def is_refused(run):
+    """Whether a command has refused its input with a short reason, within the limits."""
+    return run.code in REFUSED and is_bounded(run) and len(run.error) < 2000
 
-    def is_refused(self):
-        is_bounded = self.seconds <= MAX_SECONDS and self.memory <= MAX_MEMORY
-        return self.code in REFUSED and is_bounded and len(self.error) < 2000
+
+def is_bounded(run):
+    return run.seconds <= MAX_SECONDS and run.memory <= MAX_MEMORY
 
 
 def execute(command):
     """Runs a command for at most five times the allowed time."""
-    start = time.monotonic()
-    with tempfile.TemporaryFile() as errors:
-        process = subprocess.Popen([str(part) for part in command], stdout=subprocess.DEVNULL, stderr=errors)
-        usage = None
-        while usage is None and time.monotonic() < start + 5 * MAX_SECONDS:
-            pid, status, ended_usage = os.wait4(process.pid, os.WNOHANG)
-            usage = ended_usage if pid else None
-            time.sleep(0.01)
-        if usage is None:
-            process.kill()
-            _, status, usage = os.wait4(process.pid, 0)
-        process.returncode = os.waitstatus_to_exitcode(status)
-        errors.seek(0)
-        error = errors.read().decode(errors="replace")
-    return Run(process.returncode, time.monotonic() - start, 1024 * usage.ru_maxrss, error)
+    return measured.execute(command, 5 * MAX_SECONDS)
 
 
 def record_tree(program, server, folder):
@@ -200,7 +182,7 @@ def run(program):
                 result = execute(arguments)
                 count += 1
                 slowest, largest = max(slowest, result.seconds), max(largest, result.memory)
-                if not result.is_refused():
+                if not is_refused(result):
                     accepted.append(
                         f"{kind} ({command}: code {result.code}, {result.seconds:.1f} s, {mb(result.memory)})"
                     )
@@ -208,7 +190,7 @@ def run(program):
             result = execute([recorder, "recover", path, "--out", out])
             count += 1
             slowest, largest = max(slowest, result.seconds), max(largest, result.memory)
-            if result.code not in (0, *REFUSED) or result.seconds > MAX_SECONDS or result.memory > MAX_MEMORY:
+            if result.code not in (0, *REFUSED) or not is_bounded(result):
                 accepted.append(f"{kind} (recover: code {result.code}, {result.seconds:.1f} s, {mb(result.memory)})")
         with Client(server) as client:
             scenes = client.scenes.ListScenes(scenes_pb2.ListScenesRequest(), timeout=10).scenes
@@ -224,6 +206,6 @@ def run(program):
             + "".join(f"; {entry}" for entry in accepted),
             passed,
             f"the recording before it was changed, exit code {control.code}",
-            not control.is_refused(),
+            not is_refused(control),
         )
     ]
