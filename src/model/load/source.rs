@@ -69,7 +69,7 @@ const MAX_LISTED_NAMES: usize = 16;
 /// `NotFound` if nothing has this name; otherwise `Invalid` with the file, the field, and the expected and given value.
 pub(super) fn read(files: &AssetDir, source: &str) -> Result<SceneDescription> {
     if is_built_in(source) {
-        return crate::tree::generate(&crate::tree::TreeParameters::default()).map(SceneDescription::from);
+        return built_in().map(SceneDescription::from);
     }
     match files.kind(source)? {
         None => Err(Error::NotFound { what: "scene", given: source.into() }),
@@ -88,11 +88,19 @@ pub(super) fn read(files: &AssetDir, source: &str) -> Result<SceneDescription> {
     }
 }
 
-/// Reads one model: a file, or a folder with exactly one recognized model.
+/// Generates the only scene in [`BUILT_IN`].
+fn built_in() -> Result<SceneParts> {
+    crate::tree::generate(&crate::tree::TreeParameters::default())
+}
+
+/// Reads one model: a file, a folder with exactly one recognized model, or a built-in name, which ignores the options.
 ///
 /// # Errors
 /// `Invalid` with the file, the field, and the expected and given value.
 pub(super) fn read_model(files: &AssetDir, path: &str, options: ModelOptions) -> Result<SceneParts> {
+    if is_built_in(path) {
+        return built_in();
+    }
     match files.kind(path)? {
         Some(EntryKind::Directory) => {
             let folder = files.within(path)?;

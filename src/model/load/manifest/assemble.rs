@@ -81,7 +81,7 @@ struct LoadedModel {
     domains: Vec<Domain>,
 }
 
-/// What entries that share a model have in common: the path of the model file, the name of the modes file, and the bits
+/// What entries that share a model have in common: the path of the model file or a built-in name, the name of the modes file, and the bits
 /// of the crease angle in degrees.
 type ModelKey = (PathBuf, Option<String>, u64);
 
@@ -116,7 +116,10 @@ impl TextureLookup for ManifestAssembler<'_> {
 impl ManifestAssembler<'_> {
     /// Adds the domains of an entry. The first entry with a model loads it.
     fn add_entry(&mut self, entry_index: usize, entry: &DomainEntry) -> Result<()> {
-        let path = self.files.resolve(&entry.model)?;
+        let path = match source::is_built_in(&entry.model) {
+            true => PathBuf::from(&entry.model),
+            false => self.files.resolve(&entry.model)?,
+        };
         let crease_angle = self.crease_angle(entry)?;
         let model_key = (path, entry.modes.clone(), crease_angle.degrees().to_bits());
         if !self.models.contains_key(&model_key) {

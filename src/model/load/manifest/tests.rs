@@ -311,3 +311,24 @@ fn look_is_a_preset_or_a_table_with_overrides() {
         assert!(message.contains(expected), "{look}: {message}");
     }
 }
+
+#[test]
+fn built_in_tree_is_a_model_with_other_settings_and_places() {
+    let tree = crate::load::open("tree").expect("the tree").scene;
+    let count = tree.parts().domains.len();
+    let one = read_parts("model = 'tree'\ntransforms = 'rigid'\nlook = { raster = 'cuda' }\n").expect("a tree");
+    assert_eq!((one.domains.len(), one.shapes.len()), (count, tree.parts().shapes.len()));
+    assert_eq!(one.domains[count - 1].attachment, tree.parts().domains[count - 1].attachment);
+    assert!(one.rigid_transforms && one.remarks.is_empty());
+
+    let grove = "[material.bark]\nshininess = 3\n[[domain]]\nmodel = 'tree'\n[[domain]]\nmodel = 'tree'\n\
+                 name = 'second'\nplacement = { translation = [5, 0, 0] }\n";
+    let grove = read_parts(grove).expect("two trees");
+    assert_eq!((grove.domains.len(), grove.shapes.len()), (2 * count, one.shapes.len()));
+    let parent_of = |index: usize| grove.domains[index].attachment.as_ref().map(|attachment| attachment.parent);
+    assert_eq!(parent_of(2 * count - 1), parent_of(count - 1).map(|parent| parent + count));
+    assert!(grove.materials.iter().any(|material| material.name == "bark" && material.shininess == 3.0));
+
+    let error = read_manifest("model = './tree'\n").map(drop).expect_err("there is no folder 'tree'");
+    assert!(error.to_string().contains("tree"), "{error}");
+}
