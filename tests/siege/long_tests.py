@@ -95,11 +95,33 @@ def execute(test, programs, log):
         return code == 0, last
 
 
+@dataclasses.dataclass
+class LongResult:
+    """How a long test ended. `reached` is the last line of its output."""
+
+    name: str
+    subject: str
+    passed: bool
+    reached: str
+    seconds: int
+    control_failed: bool
+
+    def is_good(self):
+        return self.passed and self.control_failed
+
+    def line(self):
+        control = "fails, as it must" if self.control_failed else "PASSES, so the test proves nothing"
+        return (
+            f"    {'pass' if self.passed else 'FAIL'}  {self.subject}\n"
+            f"      reached: {self.reached}, in {self.seconds} s ({LOGS.relative_to(ROOT)}/{self.name}.log)\n"
+            f"      control: programs that do nothing: {control}"
+        )
+
+
 def run(program, names):
     """Runs long tests with the programs beside `program`. Each runs a second time with programs that do nothing, as a
-    negative control. Returns whether all tests passed and all controls failed."""
+    negative control. Yields the results."""
     LOGS.mkdir(parents=True, exist_ok=True)
-    is_good = True
     with tempfile.TemporaryDirectory(prefix="modalcast-prove-") as folder:
         useless = Path(folder)
         for name in PROGRAMS:
@@ -107,14 +129,6 @@ def run(program, names):
         for test in (test for test in LONG_TESTS if test.name in names):
             start = time.monotonic()
             passed, last = execute(test, program.parent, LOGS / f"{test.name}.log")
-            seconds = time.monotonic() - start
+            seconds = round(time.monotonic() - start)
             control_passed, _ = execute(test, useless, LOGS / f"{test.name}-control.log")
-            is_good &= passed and not control_passed
-            control = "PASSES, so the test proves nothing" if control_passed else "fails, as it must"
-            print(
-                f"    {'pass' if passed else 'FAIL'}  {test.subject}\n"
-                f"      reached: {last}, in {seconds:.0f} s ({LOGS.relative_to(ROOT)}/{test.name}.log)\n"
-                f"      control: programs that do nothing: {control}",
-                flush=True,
-            )
-    return is_good
+            yield LongResult(test.name, test.subject, passed, last, seconds, not control_passed)

@@ -1,7 +1,13 @@
 """Runs the attacks, and prints for each check the requirement and the measured result."""
 
 import argparse
+import dataclasses
+import datetime
 import importlib
+import json
+import os
+import shlex
+import shutil
 import sys
 import time
 from pathlib import Path
@@ -85,8 +91,9 @@ def main():
     parser.add_argument(
         "--full", nargs="*", choices=long_tests.NAMES, help="then run the long tests of the clients, all or by name"
     )
+    parser.add_argument("--record", type=Path, help="also writes all results to this JSON file")
     arguments = parser.parse_args()
-    is_good = True
+    results = []
     for item in sorted(set(arguments.items) & set(ITEMS)):
         modules, subject = ITEMS[item]
         if modules is None:
@@ -100,17 +107,39 @@ def main():
             programs.append(arguments.fault_program.resolve())
         start = time.monotonic()
         for module in modules.split():
-            results: list[Result] = importlib.import_module(module).run(*programs)
-            for result in results:
-                is_good &= result.is_good()
+            checks: list[Result] = importlib.import_module(module).run(*programs)
+            for result in checks:
                 print(result.line(), flush=True)
+            results += checks
         if item in NOT_CLAIMED:
             print(f"    not claimed: {NOT_CLAIMED[item]}", flush=True)
         print(f"      took {time.monotonic() - start:.0f} s", flush=True)
     print_rows()
     if arguments.full is not None:
-        is_good &= long_tests.run(arguments.program.resolve(), arguments.full or long_tests.NAMES)
-    sys.exit(0 if is_good else 1)
+        for result in long_tests.run(arguments.program.resolve(), arguments.full or long_tests.NAMES):
+            print(result.line(), flush=True)
+            results.append(result)
+    if arguments.record:
+        write_record(arguments, results)
+    sys.exit(0 if all(result.is_good() for result in results) else 1)
+
+
+def write_record(arguments, results):
+    command = ["deploy/prove"]
+    if arguments.items != sorted(ITEMS):
+        command += ["--items", *map(str, arguments.items)]
+    if arguments.full is not None:
+        command += ["--full", *arguments.full]
+    gpu = "" if shutil.which("nvidia-smi") else ", no GPU"
+    record = {
+        "what": "the promises of the server and what attacks measured",
+        "command": shlex.join(command),
+        "machine": f"{os.cpu_count()} cores{gpu}",
+        "commit": os.environ.get("MODALCAST_COMMIT", ""),
+        "date": datetime.date.today().isoformat(),
+        "results": [dataclasses.asdict(result) for result in results],
+    }
+    arguments.record.write_text(json.dumps(record, indent=1) + "\n")
 
 
 def print_rows():
