@@ -22,8 +22,6 @@
 //   q                the coordinates of all domains; with STORE_F16 and STORE_BF16 multiplied by the factor of
 //                    their mode                                                                                  (in)
 //   scales           with STORE_INT8: one scale per tile of U and mode                                           (in)
-//   retained_counts  with MODE_TRUNCATION, [domains]: number of chunks that the domain sums                      (in)
-//   retained         with MODE_TRUNCATION, [chunks of all domains] u16: the ascending indices of these chunks    (in)
 //   tile_list        with TILE_LIST: indices of the tiles to compute; their number is in the header              (in)
 //   positions        [vertices][3] f32, address in the header                                                    (out)
 //   normals          [corners][3] f32, address in the header                                                     (out)
@@ -135,29 +133,6 @@ struct Sums {
     }
 };
 
-// Indices of the chunks that a domain sums: all of them, or with MODE_TRUNCATION the retained ones.
-struct ChunkIndices {
-    unsigned count;
-#ifdef MODE_TRUNCATION
-    const unsigned short* retained;
-#endif
-    __device__ __forceinline__ ChunkIndices(const DeformArgs& args, const LaneSlice& slice) : count(slice.chunk_count) {
-#ifdef MODE_TRUNCATION
-        // `retained` has an entry for every CHUNK_MODES coordinates of q, so that no chunk list overflows when every
-        // chunk is retained. The list of a domain begins at the entry of its first coordinate.
-        retained = args.retained + slice.first_q / CHUNK_MODES;
-        count = slice.chunk_count == 0 || slice.item_count == 0 ? 0 : __ldg(args.retained_counts + slice.domain);
-#endif
-    }
-    __device__ __forceinline__ unsigned operator[](unsigned i) const {
-#ifdef MODE_TRUNCATION
-        return __ldg(retained + i);
-#else
-        return i;
-#endif
-    }
-};
-
 #ifdef AXIS_PER_WARP
 // Number of modes that a lane loads before it sums the first one. The latency of memory dominates the time of small
 // scenes, so most of them should need one round. A group of modes beyond the last mode costs one branch.
@@ -166,20 +141,14 @@ constexpr unsigned ROUND_MODES = 32, GROUP_MODES = 8;
 // Sums the modes of the warp's axis. QUADS is the number of quads of the tile, or 0 if it is not known at compile time.
 template <unsigned QUADS>
 __device__ __forceinline__ void sum_axis(const DeformArgs& args, const LaneSlice& slice, Sums& sums) {
-    const ChunkIndices mode_indices(args, slice);
     const unsigned quad_count = QUADS > 0 ? QUADS : slice.quad_count, axis = threadIdx.x / 32;
     const float* lane_entries =
         (const float*)(args.words + slice.first_word + axis * quad_count + slice.quad) + slice.item_in_quad;
     const float* domain_q = args.q + slice.first_q;
-    for (unsigned first = 0; first < mode_indices.count; first += ROUND_MODES) {
-        const unsigned count = mode_indices.count - first;
-        // Without MODE_TRUNCATION, the indices of the modes relative to `base` are compile-time constants.
-#ifdef MODE_TRUNCATION
-        const unsigned base = 0;
-#else
-        const unsigned base = first;
-#endif
-        const float *base_entries = lane_entries + (size_t)base * (12 * quad_count), *base_q = domain_q + base;
+    // In f32, a chunk is one mode.
+    for (unsigned first = 0; first < slice.chunk_count; first += ROUND_MODES) {
+        const unsigned count = slice.chunk_count - first;
+        const float *round_entries = lane_entries + (size_t)first * (12 * quad_count), *round_q = domain_q + first;
         float entries[ROUND_MODES], q[ROUND_MODES];
 #pragma unroll
         for (unsigned group = 0; group < ROUND_MODES; group += GROUP_MODES) {
@@ -187,9 +156,8 @@ __device__ __forceinline__ void sum_axis(const DeformArgs& args, const LaneSlice
 #pragma unroll
                 for (unsigned i = group; i < group + GROUP_MODES; ++i) {
                     if (i < count) {
-                        const unsigned mode = mode_indices[first + i] - base;
-                        entries[i] = __ldcs(base_entries + (size_t)mode * (12 * quad_count));
-                        q[i] = __ldg(base_q + mode);
+                        entries[i] = __ldcs(round_entries + (size_t)i * (12 * quad_count));
+                        q[i] = __ldg(round_q + i);
                     }
                 }
             }
@@ -261,44 +229,41 @@ __device__ __forceinline__ void add_chunk(Sums& sums, const Chunk& chunk, const 
     }
 }
 
-// Adds the next COUNT chunks, from `chunk_indices[i]` on, and advances `i`. Loads all of them before it sums the first
-// one.
+// Adds the next COUNT chunks, from chunk `i` on, and advances `i`. Loads all of them before it sums the first one.
 template <unsigned COUNT>
-__device__ __forceinline__ void sum_chunks(const DeformArgs& args, const LaneSlice& slice,
-                                           const ChunkIndices& chunk_indices, unsigned& i, Sums& sums) {
+__device__ __forceinline__ void sum_chunks(const DeformArgs& args, const LaneSlice& slice, unsigned& i, Sums& sums) {
     const uint4* words = args.words + slice.first_word + slice.quad;
     const size_t chunk_words = 3 * (size_t)slice.quad_count;
     Chunk chunks[COUNT];
 #pragma unroll
     for (unsigned k = 0; k < COUNT; ++k) {
-        chunks[k].load(slice, words + chunk_indices[i + k] * chunk_words);
+        chunks[k].load(slice, words + (i + k) * chunk_words);
     }
 #pragma unroll
     for (unsigned k = 0; k < COUNT; ++k) {
-        add_chunk(sums, chunks[k], load_chunk_weights(args, slice, chunk_indices[i + k]));
+        add_chunk(sums, chunks[k], load_chunk_weights(args, slice, i + k));
     }
     i += COUNT;
 }
 
 __device__ __forceinline__ void sum_modes(const DeformArgs& args, const LaneSlice& slice, Sums& sums) {
-    const ChunkIndices chunk_indices(args, slice);
     unsigned i = 0;
-    while (i + PREFETCH_CHUNKS <= chunk_indices.count) {
-        sum_chunks<PREFETCH_CHUNKS>(args, slice, chunk_indices, i, sums);
+    while (i + PREFETCH_CHUNKS <= slice.chunk_count) {
+        sum_chunks<PREFETCH_CHUNKS>(args, slice, i, sums);
     }
     // Fewer than PREFETCH_CHUNKS chunks remain: one call for each bit of their number.
-    const unsigned remaining_chunks = chunk_indices.count - i;
+    const unsigned remaining_chunks = slice.chunk_count - i;
     if (PREFETCH_CHUNKS > 8 && remaining_chunks & 8) {
-        sum_chunks<8>(args, slice, chunk_indices, i, sums);
+        sum_chunks<8>(args, slice, i, sums);
     }
     if (PREFETCH_CHUNKS > 4 && remaining_chunks & 4) {
-        sum_chunks<4>(args, slice, chunk_indices, i, sums);
+        sum_chunks<4>(args, slice, i, sums);
     }
     if (remaining_chunks & 2) {
-        sum_chunks<2>(args, slice, chunk_indices, i, sums);
+        sum_chunks<2>(args, slice, i, sums);
     }
     if (remaining_chunks & 1) {
-        sum_chunks<1>(args, slice, chunk_indices, i, sums);
+        sum_chunks<1>(args, slice, i, sums);
     }
 }
 #endif
@@ -309,10 +274,9 @@ __device__ __forceinline__ void sum_modes_f64(const DeformArgs& args, const Lane
     for (unsigned axis = 0; axis < 3; ++axis) {
         u[axis] = 0.0;
 #ifdef MODES
-        const ChunkIndices chunk_indices(args, slice);
-        for (unsigned i = 0; i < chunk_indices.count; ++i) {
-            const ChunkWeights weights = load_chunk_weights(args, slice, chunk_indices[i]);
-            const uint4* words = args.words + slice.first_word + slice.quad + chunk_indices[i] * 3 * (size_t)slice.quad_count;
+        for (unsigned chunk = 0; chunk < slice.chunk_count; ++chunk) {
+            const ChunkWeights weights = load_chunk_weights(args, slice, chunk);
+            const uint4* words = args.words + slice.first_word + slice.quad + chunk * 3 * (size_t)slice.quad_count;
             for (unsigned mode = 0; mode < CHUNK_MODES; ++mode) {
                 const double entry = load_entry(words, slice.quad_count, mode, axis, slice.item_in_quad + vertex);
                 u[axis] += entry * (double)weights.values[mode];

@@ -121,13 +121,11 @@ struct DeformArgs {
     const float4* follower_frames;
     const float* q;
     const unsigned* tile_list;
-    const unsigned* retained_counts; // per domain, number of its retained chunks, which are not truncated
-    const unsigned short* retained;  // indices of the retained chunks
     unsigned* boxes;
     unsigned tile_count;
     unsigned reserved;
 };
-static_assert(sizeof(DeformArgs) == 152, "DeformArgs differs from src/compute/gpu/tables/layout.rs");
+static_assert(sizeof(DeformArgs) == 136, "DeformArgs differs from src/compute/gpu/tables/layout.rs");
 
 // A group of domains of one shape, for which `batch` reads U once. The domains are the members of the group.
 struct BatchGroup {

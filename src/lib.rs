@@ -39,7 +39,7 @@
 //! | `modalcast-compute::gpu::launch` | access to a CUDA device: context, memory, compilation, launches, graphs | |
 //! | `modalcast-compute::cpu` | the f32 deformer for machines without a GPU | `storage` |
 //! | `modalcast-compute::reference` | the f64 reference deformer, which the others are tested against | |
-//! | `modalcast-compute::storage` | tiled storage of U for CPU and GPU: storage types, a-priori bounds, mode truncation; pure functions | |
+//! | `modalcast-compute::storage` | tiled storage of U for CPU and GPU: storage types, a-priori bounds; pure functions | |
 //! | `modalcast-render::renderer` | the calls that load scenes and draw them; frames in flight, choice of rasterizers | `passes`, `resources`, `shaders`, `layout`, `uniforms`, `device`, `region`, `types`, `pass` |
 //! | `modalcast-render::passes` | the commands of each pass (culling, shadow, visibility, transparency, shading, post-processing, picking, AOV), its inputs, outputs and barriers | `resources`, `shaders`, `layout`, `scene_data`, `uniforms`, `device`, `region`, `types`, `pass` |
 //! | `modalcast-render::resources` | buffers, textures and programs of a scene, images of a frame | `shaders`, `plan`, `layout`, `scene_data`, `device`, `region`, `types` |

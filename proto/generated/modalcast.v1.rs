@@ -864,8 +864,8 @@ pub enum Array {
     Uvs = 4,
     /// f32 rest normals, three per corner: unit vectors in the domain's own frame.
     RestNormals = 5,
-    /// f32 entries of U, row-major 3n x r, in scene units per unit of q: all modes, before any truncation or conversion
-    /// that the server applies; empty if r is 0. ReadModes returns selected rows.
+    /// f32 entries of U, row-major 3n x r, in scene units per unit of q: all modes, before any conversion to the
+    /// scene's storage type; empty if r is 0. ReadModes returns selected rows.
     Modes = 6,
 }
 impl Array {
@@ -2987,8 +2987,8 @@ pub struct Hit {
     /// r, the number of columns of U.
     #[prost(uint32, tag = "11")]
     pub rank: u32,
-    /// U at the point: 3 x rank little-endian f32 in scene units per unit of q, row-major, interpolated from the scene's
-    /// untruncated modes. A force f at the point, in world axes, acts on the domain's coordinates as f_q = U^T A^T f.
+    /// U at the point: 3 x rank little-endian f32 in scene units per unit of q, row-major, interpolated from the modes in
+    /// f32. A force f at the point, in world axes, acts on the domain's coordinates as f_q = U^T A^T f.
     #[prost(bytes = "bytes", tag = "12")]
     pub modes: ::prost::bytes::Bytes,
 }
@@ -5159,9 +5159,9 @@ pub struct AppliedForce {
     #[prost(message, optional, tag = "2")]
     pub force: ::core::option::Option<Force>,
     /// The force on the domain's coordinates: r little-endian f32. For a surface force U^T A^T f, where U is interpolated
-    /// at the point from the scene's untruncated modes, as in Hit.modes, and A is the linear part of the domain's
-    /// transform at `step`. In newtons times scene units per unit of q, because U is in scene units per unit of q. A
-    /// number beyond the range of f32 becomes infinite.
+    /// at the point from the modes in f32, as in Hit.modes, and A is the linear part of the domain's transform at `step`.
+    /// In newtons times scene units per unit of q, because U is in scene units per unit of q. A number beyond the range of
+    /// f32 becomes infinite.
     #[prost(bytes = "bytes", tag = "3")]
     pub f_q: ::prost::bytes::Bytes,
 }

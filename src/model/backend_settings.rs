@@ -40,8 +40,7 @@ pub enum BatchPolicy {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct BackendSettings {
     pub raster: RasterPolicy,
-    /// Batching in the CUDA deformer. Ignored with truncation, compensated sums or stored displacements
-    /// ([`DeformationSettings`]).
+    /// Batching in the CUDA deformer. Ignored with compensated sums or stored displacements ([`DeformationSettings`]).
     pub batches: BatchPolicy,
 }
 

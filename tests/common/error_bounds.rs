@@ -9,12 +9,9 @@ use modalcast_model::scene::{Scene, SceneState};
 /// Vertices per tile; all vertices of a tile have the same bound.
 const TILE_VERTICES: usize = QUAD * TILE_QUADS;
 
-/// Largest position error of each domain relative to the bound of its tile; infinite if a position is not finite. The
-/// bound is increased by `truncation_bound`, in scene units.
-fn position_error_ratios(scene: &Scene, state: &SceneState, positions: &[f32], truncation_bound: f64) -> Vec<f64> {
-    let bound = |model: &ShapeErrorModel, tile: usize, step: &ErrorBoundInput| {
-        model.tile_bound(tile, step).total() + truncation_bound
-    };
+/// Largest position error of each domain relative to the bound of its tile; infinite if a position is not finite.
+fn position_error_ratios(scene: &Scene, state: &SceneState, positions: &[f32]) -> Vec<f64> {
+    let bound = |model: &ShapeErrorModel, tile: usize, step: &ErrorBoundInput| model.tile_bound(tile, step).total();
     error_ratios(scene, state, Comparison { actual: positions, expected: &reference::deform(scene, state) }, bound)
 }
 
@@ -81,14 +78,8 @@ fn error_ratio(error: f64, bound: f64) -> f64 {
 }
 
 /// Prints the largest ratio of a position error to its bound, and panics if the ratio exceeds 1.
-pub(crate) fn assert_within_bound(
-    name: &str,
-    scene: &Scene,
-    state: &SceneState,
-    positions: &[f32],
-    truncation_bound: f64,
-) {
-    assert_ratios(&format!("{name}, x"), scene, &position_error_ratios(scene, state, positions, truncation_bound));
+pub(crate) fn assert_within_bound(name: &str, scene: &Scene, state: &SceneState, positions: &[f32]) {
+    assert_ratios(&format!("{name}, x"), scene, &position_error_ratios(scene, state, positions));
 }
 
 /// Prints the largest ratio of a displacement error to its bound, and panics if the ratio exceeds 1.
@@ -114,13 +105,8 @@ pub(crate) fn domains_beyond_displacement_bound(
 }
 
 /// Indices of the domains with a position error that exceeds its bound.
-pub(crate) fn domains_beyond_bound(
-    scene: &Scene,
-    state: &SceneState,
-    positions: &[f32],
-    truncation_bound: f64,
-) -> Vec<usize> {
-    domains_beyond(&position_error_ratios(scene, state, positions, truncation_bound))
+pub(crate) fn domains_beyond_bound(scene: &Scene, state: &SceneState, positions: &[f32]) -> Vec<usize> {
+    domains_beyond(&position_error_ratios(scene, state, positions))
 }
 
 fn domains_beyond(ratios: &[f64]) -> Vec<usize> {
@@ -136,17 +122,17 @@ fn error_bounds_reject_wrong_and_non_finite_vertices() {
     let state = crate::scenes::random_state(&scene, 2);
     let positions: Vec<f32> = reference::deform(&scene, &state).as_flattened().iter().map(|x| *x as f32).collect();
     // `[0; 0]` is the empty list.
-    assert_eq!(domains_beyond_bound(&scene, &state, &positions, 0.0), [0; 0]);
+    assert_eq!(domains_beyond_bound(&scene, &state, &positions), [0; 0]);
     // Vertices 0 to 129 belong to domain 0. Its second tile begins at vertex 128. Vertices from 130 on belong to domain
     // 1.
     for (index, wrong_number) in [(3 * 129, f32::NAN), (3 * 129, f32::INFINITY), (3 * 129 + 2, 0.125), (0, 7.0)] {
         let mut modified = positions.clone();
         modified[index] = wrong_number;
-        assert_eq!(domains_beyond_bound(&scene, &state, &modified, 0.0), [0], "{wrong_number}");
+        assert_eq!(domains_beyond_bound(&scene, &state, &modified), [0], "{wrong_number}");
     }
     let mut wrong_positions = positions;
     wrong_positions[3 * 136] += 1e-3;
-    assert_eq!(domains_beyond_bound(&scene, &state, &wrong_positions, 0.0), [1]);
+    assert_eq!(domains_beyond_bound(&scene, &state, &wrong_positions), [1]);
     let displacements: Vec<f32> =
         reference::displacements(&scene, &state).as_flattened().iter().map(|u| *u as f32).collect();
     assert_eq!(domains_beyond_displacement_bound(&scene, &state, &displacements), [0; 0]);
@@ -156,6 +142,4 @@ fn error_bounds_reject_wrong_and_non_finite_vertices() {
         modified[index] = wrong_number;
         assert_eq!(domains_beyond_displacement_bound(&scene, &state, &modified), [domain], "{wrong_number}");
     }
-    // A truncation bound of 2e-3 permits the error of 1e-3.
-    assert_eq!(domains_beyond_bound(&scene, &state, &wrong_positions, 2e-3), [0; 0]);
 }

@@ -56,13 +56,13 @@ pub(crate) fn check_huge_and_tiny_q<D: Deformer>(create_deformer: impl Fn(&Arc<S
             state.q = random_numbers(&mut Random(7), rank).iter().map(|number| number * scale).collect();
             let result = run_step(&mut deformer, &state);
             assert!(result.bounds.is_finite(), "{name}: {:?}", result.bounds);
-            assert_within_bound(&name, &scene, &state, &result.surface.positions, 0.0);
+            assert_within_bound(&name, &scene, &state, &result.surface.positions);
             // Whether a wrong sign exceeds the bound. At 1e-42, f16 and int8 lose the sign, because they first multiply
             // q by a scale. At 1e-45, all storage types lose it.
             let is_sign_visible =
                 scale >= 1e-38 || scale == 1e-42 && matches!(deformation.storage, StorageType::F32 | StorageType::Bf16);
             if is_sign_visible {
-                let wrong_domains = domains_beyond_bound(&scene, &negate_q(&state), &result.surface.positions, 0.0);
+                let wrong_domains = domains_beyond_bound(&scene, &negate_q(&state), &result.surface.positions);
                 assert_eq!(wrong_domains, [0], "{name}: negative control with the opposite q");
             }
         }
@@ -82,21 +82,15 @@ pub(crate) fn check_column_scales<D: Deformer>(create_deformer: impl Fn(&Arc<Sce
         let name = format_deformation(deformation);
         state.q = (0..rank).map(|mode| if mode % 2 == 0 { 0.75 } else { -1.25 }).collect();
         let equal_q_positions = run_step(&mut deformer, &state).surface.positions;
-        assert_within_bound(&format!("{name}, columns that differ by 1e12"), &scene, &state, &equal_q_positions, 0.0);
+        assert_within_bound(&format!("{name}, columns that differ by 1e12"), &scene, &state, &equal_q_positions);
         state.q.iter_mut().enumerate().for_each(|(mode, coordinate)| *coordinate /= scale(mode));
         let balanced_positions = run_step(&mut deformer, &state).surface.positions;
-        assert_within_bound(
-            &format!("{name}, columns and q that differ by 1e12"),
-            &scene,
-            &state,
-            &balanced_positions,
-            0.0,
-        );
+        assert_within_bound(&format!("{name}, columns and q that differ by 1e12"), &scene, &state, &balanced_positions);
         for mode in [0, rank - 1] {
             let mut negated_state = state.clone();
             negated_state.q[mode] = -negated_state.q[mode];
             assert_eq!(
-                domains_beyond_bound(&scene, &negated_state, &balanced_positions, 0.0),
+                domains_beyond_bound(&scene, &negated_state, &balanced_positions),
                 [0],
                 "{name}: negative control with mode {mode} negated"
             );
@@ -123,7 +117,7 @@ pub(crate) fn check_canceling_modes<D: Deformer>(create_deformer: impl Fn(&Arc<S
         let mut state = SceneState::rest(&scene);
         state.q = (0..rank).map(|mode| if mode < rank / 2 { 1000.0 } else { -1000.0 }).collect();
         let positions = run_step(&mut create_deformer(&scene), &state).surface.positions;
-        assert_within_bound(&format!("nearly canceling, compensated {compensated}"), &scene, &state, &positions, 0.0);
+        assert_within_bound(&format!("nearly canceling, compensated {compensated}"), &scene, &state, &positions);
         let modes = &scene.shape_of(0).modes;
         let expected = reference::deform(&scene, &state).into_flattened();
         let ratio = |(row, (actual, expected)): (usize, (&f32, &f64))| {
@@ -217,7 +211,6 @@ pub(crate) fn check_zero_tiles<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>
             &scene,
             &state,
             &deformed_positions,
-            0.0,
         );
         let mut positions_at = |q: f32| {
             state.q.fill(q);
@@ -253,8 +246,8 @@ pub(crate) fn check_ranks<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> 
             let scene = scene_of_shapes(shapes, 2, deformation, normal_maps);
             let state = scenes::random_state(&scene, 5);
             let positions = run_step(&mut create_deformer(&scene), &state).surface.positions;
-            assert_within_bound(&format!("{}, rank {rank}", storage.name()), &scene, &state, &positions, 0.0);
-            let wrong_domains = domains_beyond_bound(&scene, &negate_q(&state), &positions, 0.0);
+            assert_within_bound(&format!("{}, rank {rank}", storage.name()), &scene, &state, &positions);
+            let wrong_domains = domains_beyond_bound(&scene, &negate_q(&state), &positions);
             assert_eq!(
                 wrong_domains.len(),
                 scene.domains.len(),

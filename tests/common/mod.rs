@@ -19,7 +19,6 @@ pub(crate) mod overflow;
 pub(crate) mod partial_steps;
 pub(crate) mod soups;
 pub(crate) mod surfaces;
-pub(crate) mod truncation;
 
 use std::sync::Arc;
 

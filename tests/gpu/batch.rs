@@ -38,7 +38,7 @@ fn count_differing_states(name: &str, scene: &Arc<Scene>) -> usize {
     for state in &states {
         let (result, want) = (run_step(&mut batched_deformer, state), run_step(&mut separate_deformer, state));
         if result.bounds.is_finite() {
-            assert_within_bound(name, scene, state, &result.surface.positions, 0.0);
+            assert_within_bound(name, scene, state, &result.surface.positions);
             assert!(result.surface.boxes.is_empty() || find_wrong_box(scene, &result).is_none(), "{name}");
         }
         let difference = result.difference(&want);

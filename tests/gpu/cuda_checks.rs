@@ -1,21 +1,15 @@
 //! Runs the checks of `tests/common` on the CUDA deformer, and tests scenes that are too large for the CPU tests.
 
 use modalcast::config::BackendChoice;
-use modalcast_compute::gpu::{BufferRole, CudaDeformer, KernelKind};
+use modalcast_compute::gpu::{BufferRole, KernelKind};
 use modalcast_model::domain::{Domain, FollowConstraint};
 use modalcast_model::scene::{DeformationSettings, Scene};
 
 use crate::common::{
     self, attributes, distant_steps, extreme_values, followers, neighbors, overflow, partial_steps, surfaces,
-    truncation,
 };
 use crate::reference_comparison::{cuda_deformer, cuda_deformer_with_batches};
 use crate::scenes::{self, Random};
-
-/// The error bound of the truncated modes, as `check_error_budget` requests it.
-fn truncation_bound(deformer: &CudaDeformer, _: &Scene) -> f64 {
-    deformer.truncation_bound()
-}
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
@@ -79,18 +73,6 @@ fn gpu_overflow_error_names_the_domain() {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
-fn gpu_truncation_errors_stay_within_the_budget() {
-    truncation::check_error_budget(cuda_deformer, truncation_bound);
-}
-
-#[test]
-#[ignore = "needs an NVIDIA GPU"]
-fn gpu_mode_near_the_truncation_limit_keeps_its_status() {
-    truncation::check_hysteresis(cuda_deformer);
-}
-
-#[test]
-#[ignore = "needs an NVIDIA GPU"]
 fn gpu_partial_steps_have_the_bits_of_full_steps() {
     partial_steps::check_partial_steps(cuda_deformer_with_batches);
 }
@@ -149,9 +131,9 @@ fn gpu_domain_of_four_million_vertices_is_within_its_bound() {
     let mut state = scenes::random_state(&scene, 91);
     let mut deformer = cuda_deformer(&scene);
     let positions = common::run_step(&mut deformer, &state).surface.positions;
-    common::assert_within_bound("n 4,000,000 r 2", &scene, &state, &positions, 0.0);
+    common::assert_within_bound("n 4,000,000 r 2", &scene, &state, &positions);
     state.q[1] = -state.q[1];
-    assert_eq!(common::domains_beyond_bound(&scene, &state, &positions, 0.0), [0], "negative control");
+    assert_eq!(common::domains_beyond_bound(&scene, &state, &positions), [0], "negative control");
 }
 
 /// Each domain has its own shape, so that a tile (up to 128 vertices, in quads of four) contains many domains.
@@ -171,7 +153,7 @@ fn gpu_two_hundred_thousand_domains_take_three_launches() {
     assert_eq!(plan.launches(), 3);
     let mut state = scenes::random_state(&scene, 93);
     let result = common::run_step(&mut deformer, &state);
-    common::assert_within_bound("200,000 domains of 7", &scene, &state, &result.surface.positions, 0.0);
+    common::assert_within_bound("200,000 domains of 7", &scene, &state, &result.surface.positions);
     // A partial step of a thousand domains has the bits of a full step, and no other domain moves.
     let dirty_domains: Vec<u32> = (0..1000).map(|index| index * 199 + 7).collect();
     partial_steps::randomize_q_and_transforms(&scene, &mut state, &mut random, &dirty_domains, &dirty_domains[..500]);
@@ -260,7 +242,7 @@ fn gpu_two_hundred_thousand_leaves_follow_their_branches() {
     assert_eq!((plan.launches(), plan.bytes_in), (3, 112 + 48 * 1000 + 4 * 6000));
     let mut state = scenes::random_state(&scene, 95);
     let result = common::run_step(&mut deformer, &state);
-    common::assert_within_bound("200,000 leaves", &scene, &state, &result.surface.positions, 0.0);
+    common::assert_within_bound("200,000 leaves", &scene, &state, &result.surface.positions);
     partial_steps::randomize_q_and_transforms(&scene, &mut state, &mut random, &[7], &[3, 999]);
     let partial_result = common::run_step(&mut deformer, &state);
     common::assert_within_bound(
@@ -268,7 +250,6 @@ fn gpu_two_hundred_thousand_leaves_follow_their_branches() {
         &scene,
         &state,
         &partial_result.surface.positions,
-        0.0,
     );
     let mut dirty_state = state.clone();
     dirty_state.mark_all_dirty();

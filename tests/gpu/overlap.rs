@@ -132,12 +132,10 @@ impl Reader<'_> {
 fn deformations() -> Vec<DeformationSettings> {
     let with_storage = |storage| DeformationSettings { storage, ..DeformationSettings::default() };
     let exact = DeformationSettings { normals: NormalMethod::Exact, ..with_storage(StorageType::F32) };
-    let truncated = DeformationSettings { truncation: Some(1e-9), ..with_storage(StorageType::F32) };
     vec![
         with_storage(StorageType::F32),
         exact,
         with_storage(StorageType::Int8),
-        truncated,
         with_displacements_and_boxes(with_storage(StorageType::F32)),
     ]
 }

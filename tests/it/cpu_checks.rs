@@ -6,23 +6,15 @@ use std::sync::Arc;
 use modalcast::config::BackendChoice;
 use modalcast_compute::cpu::CpuDeformer;
 use modalcast_compute::reference::ReferenceDeformer;
-use modalcast_compute::storage::Truncation;
 use modalcast_model::scene::Scene;
 
 use crate::common::{
     attributes, distant_steps, extreme_values, followers, light_bounds, neighbors, overflow, partial_steps, surfaces,
-    truncation,
 };
 
 /// A deformer that also computes light-space bounds if the scene has a shadow.
 fn cpu_deformer(scene: &Arc<Scene>) -> CpuDeformer {
     CpuDeformer::new(scene).with_bounding_axes(scene.light_axes())
-}
-
-/// Maximum error that truncated modes cause in any domain, in scene units.
-fn truncation_bound(deformer: &CpuDeformer, scene: &Scene) -> f64 {
-    let bound = |domain| deformer.truncation(domain).map_or(0.0, Truncation::bound);
-    (0..scene.domains.len()).map(bound).fold(0.0, f64::max)
 }
 
 #[test]
@@ -73,16 +65,6 @@ fn overflow_is_reported_for_its_step_only() {
 #[test]
 fn overflow_error_names_the_domain() {
     overflow::check_overflow_rejection(BackendChoice::Cpu);
-}
-
-#[test]
-fn truncation_errors_stay_within_the_error_budget() {
-    truncation::check_error_budget(cpu_deformer, truncation_bound);
-}
-
-#[test]
-fn mode_near_the_limit_is_truncated_at_most_once() {
-    truncation::check_hysteresis(cpu_deformer);
 }
 
 #[test]

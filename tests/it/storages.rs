@@ -9,7 +9,7 @@ use modalcast_compute::reference;
 use modalcast_compute::storage::bound::{ErrorBoundInput, ShapeErrorModel};
 use modalcast_compute::storage::{QUAD, TILE_QUADS, TiledModes};
 use modalcast_model::deform::{DeformSummary, Deformer};
-use modalcast_model::domain::{Domain, Material, Mesh, Modes, Shape, Transform};
+use modalcast_model::domain::{Domain, Material, Mesh, Modes, Shape};
 use modalcast_model::scene::{DeformationSettings, Scene, SceneParts, SceneState, StorageType};
 
 use crate::deformers::{TestRng, random_state, random_strip};
@@ -55,31 +55,25 @@ fn deform(deformer: &mut CpuDeformer, state: &SceneState) -> (DeformSummary, Vec
     (summary, deformer.surface().expect("expected a surface").positions.clone())
 }
 
-/// Error bound of each tile of a domain, including the bound of the truncated modes.
-fn tile_bounds(scene: &Scene, state: &SceneState, deformer: &CpuDeformer, domain: usize) -> Vec<f64> {
+/// Error bound of each tile of a domain.
+fn tile_bounds(scene: &Scene, state: &SceneState, domain: usize) -> Vec<f64> {
     let shape = scene.shape_of(domain);
     let tiles = TiledModes::new(shape, scene.deformation.storage);
-    let mut q = state.q_of(scene, domain).to_vec();
-    let mut truncation_bound = 0.0;
-    if let Some(truncation) = deformer.truncation(domain) {
-        truncation_bound = truncation.bound();
-        (0..q.len()).filter(|mode| !truncation.retained().contains(&(*mode as u16))).for_each(|mode| q[mode] = 0.0);
-    }
     let input = ErrorBoundInput {
-        q: &q,
+        q: state.q_of(scene, domain),
         transform: state.composed_transform(scene, domain),
         compensated: scene.deformation.compensated,
     };
     let model = ShapeErrorModel::new(shape, &tiles);
-    (0..tiles.count()).map(|tile| model.tile_bound(tile, &input).total() + truncation_bound).collect()
+    (0..tiles.count()).map(|tile| model.tile_bound(tile, &input).total()).collect()
 }
 
 /// For each domain, the largest ratio of a vertex error to the bound of the tile of the vertex; infinite for NaN.
-fn error_ratios(scene: &Scene, state: &SceneState, positions: &[f32], deformer: &CpuDeformer) -> Vec<f64> {
+fn error_ratios(scene: &Scene, state: &SceneState, positions: &[f32]) -> Vec<f64> {
     let expected = reference::deform(scene, state);
     let domain_ratio = |domain: usize| {
         let layout = scene.layout.domains[domain];
-        let bounds = tile_bounds(scene, state, deformer, domain);
+        let bounds = tile_bounds(scene, state, domain);
         let vertex_ratio = |vertex: usize| {
             let scene_vertex = layout.first_vertex + vertex;
             let squared_error =
@@ -96,33 +90,25 @@ fn error_ratios(scene: &Scene, state: &SceneState, positions: &[f32], deformer: 
 #[test]
 fn errors_stay_within_bounds_in_every_storage() {
     for storage in StorageType::ALL {
-        // The truncation budget is in meters.
-        for (compensated, truncation) in [(false, None), (true, None), (false, Some(0.02)), (true, Some(0.02))] {
-            let scene = random_scene(DeformationSettings {
-                storage,
-                compensated,
-                truncation,
-                ..DeformationSettings::default()
-            });
+        for compensated in [false, true] {
+            let scene = random_scene(DeformationSettings { storage, compensated, ..DeformationSettings::default() });
             let mut state = random_state(&scene);
-            // Amplitudes decrease from 1 to 2^-12 over all coordinates, so that some modes may be truncated.
+            // Amplitudes decrease from 1 to 2^-12 over all coordinates, as for a vibrating body.
             let coordinate_count = state.q.len() as f32;
             state
                 .q
                 .iter_mut()
                 .enumerate()
                 .for_each(|(mode, number)| *number *= f32::exp2(-12.0 * mode as f32 / coordinate_count));
-            let mut deformer = CpuDeformer::new(&scene);
-            let (_, positions) = deform(&mut deformer, &state);
-            for (domain, ratio) in error_ratios(&scene, &state, &positions, &deformer).into_iter().enumerate() {
+            let (_, positions) = deform(&mut CpuDeformer::new(&scene), &state);
+            for (domain, ratio) in error_ratios(&scene, &state, &positions).into_iter().enumerate() {
                 assert!(ratio <= 1.0, "{storage:?}, domain {domain}: {ratio} of the bound");
             }
             let mut negated_state = state.clone();
             negated_state.q.iter_mut().for_each(|number| *number = -*number);
-            let ratios = error_ratios(&scene, &negated_state, &positions, &deformer);
-            // The sign of q has no effect on a domain without modes, and may have none if modes are truncated.
-            let is_sensitive = |domain: usize| scene.rank_of(domain) > 0 && truncation.is_none();
-            for domain in (0..ratios.len()).filter(|domain| is_sensitive(*domain)) {
+            let ratios = error_ratios(&scene, &negated_state, &positions);
+            // The sign of q has no effect on a domain without modes.
+            for domain in (0..ratios.len()).filter(|domain| scene.rank_of(*domain) > 0) {
                 assert!(
                     ratios[domain] > 1.0,
                     "{storage:?}, domain {domain}: expected a wrong sign to exceed the bound, got {} of it",
@@ -212,7 +198,7 @@ fn huge_tiny_and_denormal_q_stay_within_the_bound() {
                 state.q.iter_mut().for_each(|number| *number *= scale);
                 let (summary, positions) = deform(&mut deformer, &state);
                 assert!(summary.bounds.is_finite());
-                for (domain, ratio) in error_ratios(&scene, &state, &positions, &deformer).into_iter().enumerate() {
+                for (domain, ratio) in error_ratios(&scene, &state, &positions).into_iter().enumerate() {
                     assert!(ratio <= 1.0, "{storage:?}, {scale}, domain {domain}: {ratio} of the bound");
                 }
             }
@@ -250,43 +236,4 @@ fn finite_sums_survive_overflowing_terms() {
             );
         }
     }
-}
-
-#[test]
-fn truncation_budget_in_meters_holds_in_scene_units() {
-    for unit in [1.0, 0.01] {
-        let mut parts = SceneParts::named("truncated");
-        parts.unit = unit;
-        parts.deformation.truncation = Some(1e-3);
-        parts.materials = vec![Material::default()];
-        parts.shapes = vec![random_strip(300, 24, &mut TestRng(2))];
-        parts.domains = vec![Domain::new("strip", 0)];
-        let scene = Scene::new(parts).expect("expected a valid scene");
-        let mut state = SceneState::rest(&scene);
-        state.q.iter_mut().enumerate().for_each(|(mode, number)| *number = f32::exp2(-(mode as f32)));
-        // The transform doubles x, and the budget applies to the transformed vertices.
-        state.transforms[0] = Transform([2.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0]);
-        let mut deformer = CpuDeformer::new(&scene);
-        let (_, positions) = deform(&mut deformer, &state);
-        let truncation = deformer.truncation(0).expect("expected the truncation of domain 0");
-        let retained = truncation.retained().to_vec();
-        assert!(truncation.bound() > 0.0 && truncation.bound() <= 1e-3 / unit);
-        assert!(retained.len() > 2 && retained.len() < 20, "{retained:?}");
-        assert!(error_ratios(&scene, &state, &positions, &deformer)[0] <= 1.0);
-        // The result has the same bits as without truncation, with q = 0 for the truncated modes.
-        let mut zeroed_state = state.clone();
-        (0..24).filter(|mode| !retained.contains(&(*mode as u16))).for_each(|mode| zeroed_state.q[mode] = 0.0);
-        let untruncated_scene = copy_without_truncation(&scene);
-        assert_eq!(f32_bits(&deform(&mut CpuDeformer::new(&untruncated_scene), &zeroed_state).1), f32_bits(&positions));
-        assert_ne!(f32_bits(&deform(&mut CpuDeformer::new(&untruncated_scene), &state).1), f32_bits(&positions));
-    }
-}
-
-/// The same scene without a truncation budget.
-fn copy_without_truncation(scene: &Scene) -> Arc<Scene> {
-    let mut parts = SceneParts::named("plain");
-    parts.materials = scene.materials.clone();
-    parts.shapes = scene.shapes.clone();
-    parts.domains = scene.domains.clone();
-    Scene::new(parts).expect("expected a valid scene")
 }

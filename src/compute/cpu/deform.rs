@@ -2,9 +2,8 @@
 
 use pulp::NullaryFnOnce;
 
-use super::retained_modes::RetainedModes;
 use super::simd::run_vectorized;
-use super::sum::{ModeSelection, Scratch, TileVertices, sum_modes};
+use super::sum::{Scratch, TileVertices, sum_modes};
 use super::tile::{self, DomainTile, PackedOutput, PerTileOutput, SplitOutput};
 use super::tile_bounds::TileBounds;
 use crate::storage::{QUAD, TILE_QUADS, TiledModes};
@@ -21,9 +20,6 @@ pub(super) struct DeformInputs<'a> {
     pub(super) state: &'a SceneState,
     /// Per shape.
     pub(super) shapes: &'a [TiledModes],
-    pub(super) retained_modes: Option<&'a RetainedModes>,
-    /// 0, 1, 2 and so on: the indices of the chunks that a domain without truncated modes sums.
-    pub(super) all_chunks: &'a [u16],
 }
 
 /// The outputs of a step.
@@ -101,7 +97,7 @@ fn deform_tile<const COMPENSATED: bool>(
     let tiled_modes = inputs.tiled_modes_of(tile);
     let layout = tiled_modes.tile(tile.first_item() / MAX_TILE_VERTICES);
     if tiled_modes.rank() > 0 {
-        sum_modes::<COMPENSATED>(tiled_modes, &layout, inputs.mode_selection(tile), scratch);
+        sum_modes::<COMPENSATED>(tiled_modes, &layout, inputs.q_of(tile), scratch);
     } else {
         scratch.sums[..3 * QUAD * layout.quads].fill(0.0);
     }
@@ -153,18 +149,10 @@ impl<'a> DeformInputs<'a> {
         &self.shapes[self.scene.domains[tile.domain()].shape]
     }
 
-    #[inline(always)]
-    fn mode_selection(&self, tile: &DomainTile) -> ModeSelection<'a> {
-        let chunks = self.tiled_modes_of(tile).chunks();
-        match self.retained_modes {
-            Some(retained_modes) => retained_modes.selection_of(tile.domain()),
-            None => ModeSelection { q: self.state.q_of(self.scene, tile.domain()), chunks: &self.all_chunks[..chunks] },
-        }
-    }
-
     /// The coordinates of a tile's domain; empty without modes.
+    #[inline(always)]
     fn q_of(&self, tile: &DomainTile) -> &'a [f32] {
-        if self.tiled_modes_of(tile).rank() > 0 { self.mode_selection(tile).q } else { &[] }
+        self.state.q_of(self.scene, tile.domain())
     }
 }
 

@@ -3,8 +3,7 @@
 //!
 //! Equal inputs give bit-identical outputs on any number of cores: the modes of a vertex are summed in order by fused
 //! multiply-adds, independent of its tile and of the domains that changed. Domains whose q and T equal those of the
-//! previous step keep their vertices and normals. With a truncation budget, the result also depends on earlier steps,
-//! because the choice of truncated modes has hysteresis.
+//! previous step keep their vertices and normals.
 
 mod bandwidth;
 #[cfg(test)]
@@ -15,7 +14,6 @@ mod deform;
 #[cfg(target_arch = "x86_64")]
 mod fused;
 mod normals;
-mod retained_modes;
 mod rigid_normals;
 mod simd;
 mod sum;
@@ -29,13 +27,12 @@ use rayon::prelude::*;
 
 pub use bandwidth::read_bandwidth;
 
-use crate::storage::{TiledModes, Truncation};
+use crate::storage::TiledModes;
 use changes::ChangeTracker;
 use deform::{DeformInputs, DeformOutputs, MAX_TILE_VERTICES};
 use modalcast_model::deform::{Backend, BoundingAxes, DeformSummary, DeformedSurface, Deformer};
 use modalcast_model::error::Result;
 use modalcast_model::scene::{BoundingBox, Scene, SceneState};
-use retained_modes::RetainedModes;
 use tile::{PackedOutput, PerTileOutput, WorkList};
 use tile_bounds::TileBounds;
 
@@ -50,10 +47,6 @@ pub struct CpuDeformer {
     bounding_axes: Option<BoundingAxes>,
     /// Per shape, its stored U and x0.
     shapes: Vec<TiledModes>,
-    /// 0, 1, 2 and so on: the chunk indices of the shape with the most chunks. A chunk is the one to four modes that
-    /// are stored together (`storage`).
-    all_chunks: Vec<u16>,
-    retained_modes: Option<RetainedModes>,
     changes: ChangeTracker,
     /// The tiles of vertices.
     vertex_work: WorkList,
@@ -71,13 +64,10 @@ impl CpuDeformer {
         let tangent_length = if scene.features.normal_maps { 4 * layout.corners } else { 0 };
         let storage = scene.deformation.storage;
         let shapes: Vec<TiledModes> = scene.shapes.par_iter().map(|shape| TiledModes::new(shape, storage)).collect();
-        let max_chunks = shapes.iter().map(TiledModes::chunks).max().unwrap_or(0);
         let vertex_work = WorkList::new(layout.domains.iter().map(|domain| domain.vertices), MAX_TILE_VERTICES);
         Self {
             scene: Arc::clone(scene),
             bounding_axes: None,
-            all_chunks: (0..max_chunks as u16).collect(),
-            retained_modes: RetainedModes::new(scene),
             changes: ChangeTracker::default(),
             tile_bounds: vec![TileBounds::EMPTY; vertex_work.len()],
             shapes,
@@ -105,19 +95,8 @@ impl CpuDeformer {
         self.shapes.iter().map(|tiles| tiles.bytes().len() + size_of_val(tiles.rest())).sum()
     }
 
-    /// The truncated modes of a domain in the last step; `None` for a scene without a truncation budget.
-    pub fn truncation(&self, domain: usize) -> Option<&Truncation> {
-        self.retained_modes.as_ref().map(|retained_modes| retained_modes.truncation(domain))
-    }
-
     fn deform_positions(&mut self, state: &SceneState) {
-        let inputs = DeformInputs {
-            scene: &self.scene,
-            state,
-            shapes: &self.shapes,
-            retained_modes: self.retained_modes.as_ref(),
-            all_chunks: &self.all_chunks,
-        };
+        let inputs = DeformInputs { scene: &self.scene, state, shapes: &self.shapes };
         let DeformedSurface { positions, displacements, .. } = &mut self.surface;
         let displacements = self.scene.features.displacements.then(|| PackedOutput::new(3, displacements));
         let outputs = DeformOutputs {
@@ -147,9 +126,6 @@ impl Deformer for CpuDeformer {
     fn deform(&mut self, state: &SceneState) -> Result<DeformSummary> {
         let start = Instant::now();
         self.changes.update(&self.scene, state);
-        if let Some(retained_modes) = &mut self.retained_modes {
-            retained_modes.update(&self.scene, state, &self.changes);
-        }
         self.deform_positions(state);
         self.update_boxes();
         // Exact and rigid normals depend only on the positions and T of their domain.

@@ -30,15 +30,6 @@ impl Scratch {
     }
 }
 
-/// The modes that a domain sums.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct ModeSelection<'a> {
-    /// Coordinates, zero for truncated modes.
-    pub(super) q: &'a [f32],
-    /// Chunks with at least one retained mode, ascending.
-    pub(super) chunks: &'a [u16],
-}
-
 /// Writes u to the sums. With `COMPENSATED`, it also accumulates the rounding errors: algorithm Dot2 of Ogita, Rump and
 /// Oishi, "Accurate sum and dot product", 2005, with a fused multiply-add. The result is then as accurate as a sum in
 /// twice the precision.
@@ -46,33 +37,28 @@ pub(super) struct ModeSelection<'a> {
 pub(super) fn sum_modes<const COMPENSATED: bool>(
     tiled_modes: &TiledModes,
     tile: &TileLayout,
-    mode_selection: ModeSelection,
+    q: &[f32],
     scratch: &mut Scratch,
 ) {
     #[cfg(target_arch = "x86_64")]
     if let (false, Some(simd)) = (COMPENSATED, pulp::x86::V3::try_new()) {
-        return sum_fused(simd, tiled_modes, tile, mode_selection, scratch);
+        return sum_fused(simd, tiled_modes, tile, q, scratch);
     }
-    sum_columns::<COMPENSATED>(tiled_modes, tile, mode_selection, scratch);
+    sum_columns::<COMPENSATED>(tiled_modes, tile, q, scratch);
 }
 
 /// Decodes entries to columns in scratch memory, then adds the columns.
 #[inline(always)]
-fn sum_columns<const COMPENSATED: bool>(
-    tiled_modes: &TiledModes,
-    tile: &TileLayout,
-    mode_selection: ModeSelection,
-    scratch: &mut Scratch,
-) {
+fn sum_columns<const COMPENSATED: bool>(tiled_modes: &TiledModes, tile: &TileLayout, q: &[f32], scratch: &mut Scratch) {
     let Scratch { sums, compensation, columns, scaled_q } = scratch;
     let length = 12 * tile.quads;
-    scale_coordinates(tiled_modes, tile, mode_selection.q, scaled_q);
+    scale_coordinates(tiled_modes, tile, q, scaled_q);
     let sums = &mut sums[..length];
     let compensation = &mut compensation[..if COMPENSATED { length } else { 0 }];
     sums.fill(0.0);
     compensation.fill(0.0);
     let mut accumulator = Sums::<COMPENSATED> { sums, compensation };
-    let chunks = TileChunks::of(tiled_modes, tile, mode_selection, scaled_q);
+    let chunks = TileChunks::of(tiled_modes, tile, scaled_q);
     match tiled_modes.storage() {
         StorageType::F32 => accumulator.add_f32(chunks),
         StorageType::F16 => accumulator.add_packed16(chunks, columns, decode::unpack_f16),
@@ -89,18 +75,12 @@ fn sum_columns<const COMPENSATED: bool>(
 /// Decodes entries in vector registers, without columns in memory ([`fused`]).
 #[cfg(target_arch = "x86_64")]
 #[inline(always)]
-fn sum_fused(
-    simd: pulp::x86::V3,
-    tiled_modes: &TiledModes,
-    tile: &TileLayout,
-    mode_selection: ModeSelection,
-    scratch: &mut Scratch,
-) {
+fn sum_fused(simd: pulp::x86::V3, tiled_modes: &TiledModes, tile: &TileLayout, q: &[f32], scratch: &mut Scratch) {
     let Scratch { sums, scaled_q, .. } = scratch;
-    scale_coordinates(tiled_modes, tile, mode_selection.q, scaled_q);
+    scale_coordinates(tiled_modes, tile, q, scaled_q);
     let sums = &mut sums[..12 * tile.quads];
     sums.fill(0.0);
-    let chunks = TileChunks::of(tiled_modes, tile, mode_selection, scaled_q);
+    let chunks = TileChunks::of(tiled_modes, tile, scaled_q);
     match tiled_modes.storage() {
         StorageType::F32 => Sums::<false> { sums, compensation: &mut [] }.add_f32(chunks),
         StorageType::F16 => chunks.fuse_packed16::<fused::DecodeF16>(simd, sums),
@@ -124,40 +104,34 @@ fn scale_coordinates(tiled_modes: &TiledModes, tile: &TileLayout, q: &[f32], sca
     scaled_q[rank..MAX_RANK.min(rank + 3)].fill(0.0);
 }
 
-/// The chunks of a tile that are summed.
+/// The chunks of a tile.
 #[derive(Clone, Copy)]
 struct TileChunks<'a> {
-    /// All chunks of the tile.
     packed_words: &'a [PackedWord],
     quads: usize,
-    /// Indices of the chunks to sum, ascending.
-    chunks: &'a [u16],
+    /// Number of chunks.
+    count: usize,
     scaled_q: &'a [f32; MAX_RANK],
 }
 
 impl<'a> TileChunks<'a> {
     #[inline(always)]
-    fn of(
-        tiled_modes: &'a TiledModes,
-        tile: &TileLayout,
-        mode_selection: ModeSelection<'a>,
-        scaled_q: &'a [f32; MAX_RANK],
-    ) -> Self {
-        let packed_words =
-            &tiled_modes.packed_words()[tile.first_packed_word..][..3 * tiled_modes.chunks() * tile.quads];
-        Self { packed_words, quads: tile.quads, chunks: mode_selection.chunks, scaled_q }
+    fn of(tiled_modes: &'a TiledModes, tile: &TileLayout, scaled_q: &'a [f32; MAX_RANK]) -> Self {
+        let (quads, count) = (tile.quads, tiled_modes.chunks());
+        let packed_words = &tiled_modes.packed_words()[tile.first_packed_word..][..3 * count * quads];
+        Self { packed_words, quads, count, scaled_q }
     }
 
     /// The three planes of a chunk.
     #[inline(always)]
-    fn chunk(&self, chunk: u16) -> &'a [PackedWord] {
-        &self.packed_words[3 * self.quads * usize::from(chunk)..][..3 * self.quads]
+    fn chunk(&self, chunk: usize) -> &'a [PackedWord] {
+        &self.packed_words[3 * self.quads * chunk..][..3 * self.quads]
     }
 
     /// The scaled coordinates of a chunk of K modes.
     #[inline(always)]
-    fn scaled_q<const K: usize>(&self, chunk: u16) -> [f32; K] {
-        std::array::from_fn(|mode| self.scaled_q[K * usize::from(chunk) + mode])
+    fn scaled_q<const K: usize>(&self, chunk: usize) -> [f32; K] {
+        std::array::from_fn(|mode| self.scaled_q[K * chunk + mode])
     }
 }
 
@@ -167,21 +141,22 @@ impl TileChunks<'_> {
     /// packed word, 2 modes per chunk, and the number of chunks.
     #[inline(always)]
     fn fuse_packed16<D: fused::Decode<2>>(&self, simd: pulp::x86::V3, sums: &mut [f32]) {
-        let with_scaled_q = |chunk: u16| (self.chunk(chunk), self.scaled_q(chunk));
-        let mut pairs = self.chunks.chunks_exact(2);
-        for pair in pairs.by_ref() {
-            fused::add_chunks::<D, 2, 2, 2>(simd, [with_scaled_q(pair[0]), with_scaled_q(pair[1])], sums);
+        let with_scaled_q = |chunk: usize| (self.chunk(chunk), self.scaled_q(chunk));
+        let mut first = 0;
+        while first + 2 <= self.count {
+            fused::add_chunks::<D, 2, 2, 2>(simd, [with_scaled_q(first), with_scaled_q(first + 1)], sums);
+            first += 2;
         }
-        for chunk in pairs.remainder() {
-            fused::add_chunks::<D, 2, 2, 1>(simd, [with_scaled_q(*chunk)], sums);
+        if first < self.count {
+            fused::add_chunks::<D, 2, 2, 1>(simd, [with_scaled_q(first)], sums);
         }
     }
 
     /// Adds the chunks of `Int8`, one at a time. A packed word has 4 groups, and a chunk has 4 modes.
     #[inline(always)]
     fn fuse_int8(&self, simd: pulp::x86::V3, sums: &mut [f32]) {
-        for chunk in self.chunks {
-            fused::add_chunks::<fused::DecodeInt8, 4, 4, 1>(simd, [(self.chunk(*chunk), self.scaled_q(*chunk))], sums);
+        for chunk in 0..self.count {
+            fused::add_chunks::<fused::DecodeInt8, 4, 4, 1>(simd, [(self.chunk(chunk), self.scaled_q(chunk))], sums);
         }
     }
 }
@@ -197,14 +172,15 @@ impl<const COMPENSATED: bool> Sums<'_, COMPENSATED> {
     /// does not change.
     #[inline(always)]
     fn add_f32(&mut self, tile_chunks: TileChunks) {
-        let column = |chunk: u16| bytemuck::cast_slice(tile_chunks.chunk(chunk));
-        let mut blocks = tile_chunks.chunks.chunks_exact(4);
-        for block in blocks.by_ref() {
-            let chunks = [block[0], block[1], block[2], block[3]];
-            self.add(chunks.map(column), chunks.map(|chunk| tile_chunks.scaled_q[usize::from(chunk)]));
+        let column = |mode: usize| bytemuck::cast_slice(tile_chunks.chunk(mode));
+        let mut first = 0;
+        while first + 4 <= tile_chunks.count {
+            let modes = [first, first + 1, first + 2, first + 3];
+            self.add(modes.map(column), modes.map(|mode| tile_chunks.scaled_q[mode]));
+            first += 4;
         }
-        for chunk in blocks.remainder() {
-            self.add([column(*chunk)], tile_chunks.scaled_q(*chunk));
+        for mode in first..tile_chunks.count {
+            self.add([column(mode)], tile_chunks.scaled_q(mode));
         }
     }
 
@@ -216,25 +192,26 @@ impl<const COMPENSATED: bool> Sums<'_, COMPENSATED> {
         decode: impl Fn(&[PackedWord], &mut [f32]),
     ) {
         let length = self.sums.len();
-        let mut pairs = tile_chunks.chunks.chunks_exact(2);
-        for pair in pairs.by_ref() {
-            let ([a, b], [c, d]) = (tile_chunks.scaled_q(pair[0]), tile_chunks.scaled_q(pair[1]));
-            decode(tile_chunks.chunk(pair[0]), &mut columns[..2 * length]);
-            decode(tile_chunks.chunk(pair[1]), &mut columns[2 * length..4 * length]);
+        let mut first = 0;
+        while first + 2 <= tile_chunks.count {
+            let ([a, b], [c, d]) = (tile_chunks.scaled_q(first), tile_chunks.scaled_q(first + 1));
+            decode(tile_chunks.chunk(first), &mut columns[..2 * length]);
+            decode(tile_chunks.chunk(first + 1), &mut columns[2 * length..4 * length]);
             self.add(split_columns(columns, length), [a, b, c, d]);
+            first += 2;
         }
-        for chunk in pairs.remainder() {
-            decode(tile_chunks.chunk(*chunk), &mut columns[..2 * length]);
-            self.add::<2>(split_columns(columns, length), tile_chunks.scaled_q(*chunk));
+        if first < tile_chunks.count {
+            decode(tile_chunks.chunk(first), &mut columns[..2 * length]);
+            self.add::<2>(split_columns(columns, length), tile_chunks.scaled_q(first));
         }
     }
 
     #[inline(always)]
     fn add_int8(&mut self, tile_chunks: TileChunks, columns: &mut Columns) {
         let length = self.sums.len();
-        for chunk in tile_chunks.chunks {
-            decode::unpack_int8(tile_chunks.chunk(*chunk), &mut columns[..4 * length]);
-            self.add::<4>(split_columns(columns, length), tile_chunks.scaled_q(*chunk));
+        for chunk in 0..tile_chunks.count {
+            decode::unpack_int8(tile_chunks.chunk(chunk), &mut columns[..4 * length]);
+            self.add::<4>(split_columns(columns, length), tile_chunks.scaled_q(chunk));
         }
     }
 
@@ -309,29 +286,20 @@ mod tests {
             let shape = shape_with_columns(vertices, rank, columns, &mut rng);
             for storage in StorageType::ALL {
                 let tiled_modes = TiledModes::new(&shape, storage);
-                let mut q: Vec<f32> = (0..rank).map(|_| rng.next()).collect();
-                let chunk_modes = crate::storage::modes_per_chunk(storage);
-                let all_chunks: Vec<u16> = (0..tiled_modes.chunks() as u16).collect();
-                let even_chunks: Vec<u16> = all_chunks.iter().copied().filter(|chunk| chunk % 2 == 0).collect();
-                for chunks in [all_chunks, even_chunks] {
-                    (0..rank)
-                        .filter(|mode| !chunks.contains(&((mode / chunk_modes) as u16)))
-                        .for_each(|mode| q[mode] = 0.0);
-                    let mode_selection = ModeSelection { q: &q, chunks: &chunks };
-                    for tile_index in 0..tiled_modes.count() {
-                        let tile = tiled_modes.tile(tile_index);
-                        let (mut fused, mut columns) = (Scratch::new(), Scratch::new());
-                        crate::cpu::simd::run_vectorized(|| {
-                            sum_modes::<false>(&tiled_modes, &tile, mode_selection, &mut fused);
-                        });
-                        sum_columns::<false>(&tiled_modes, &tile, mode_selection, &mut columns);
-                        let bits = |sums: &[f32]| sums.iter().map(|sum| sum.to_bits()).collect::<Vec<_>>();
-                        assert_eq!(bits(&fused.sums), bits(&columns.sums), "{storage:?} {vertices} x {rank}");
-                        // Only f32 stores exact entries. In a tile without padding, sums have the order of `sum_tile`.
-                        if storage == StorageType::F32 && tile.vertices == 4 * tile.quads {
-                            let expected = sum_tile(&shape, &tile, &q);
-                            assert_eq!(bits(&fused.sums[..expected.len()]), bits(&expected), "{vertices} x {rank}");
-                        }
+                let q: Vec<f32> = (0..rank).map(|_| rng.next()).collect();
+                for tile_index in 0..tiled_modes.count() {
+                    let tile = tiled_modes.tile(tile_index);
+                    let (mut fused, mut columns) = (Scratch::new(), Scratch::new());
+                    crate::cpu::simd::run_vectorized(|| {
+                        sum_modes::<false>(&tiled_modes, &tile, &q, &mut fused);
+                    });
+                    sum_columns::<false>(&tiled_modes, &tile, &q, &mut columns);
+                    let bits = |sums: &[f32]| sums.iter().map(|sum| sum.to_bits()).collect::<Vec<_>>();
+                    assert_eq!(bits(&fused.sums), bits(&columns.sums), "{storage:?} {vertices} x {rank}");
+                    // Only f32 stores exact entries. In a tile without padding, sums have the order of `sum_tile`.
+                    if storage == StorageType::F32 && tile.vertices == 4 * tile.quads {
+                        let expected = sum_tile(&shape, &tile, &q);
+                        assert_eq!(bits(&fused.sums[..expected.len()]), bits(&expected), "{vertices} x {rank}");
                     }
                 }
             }

@@ -59,33 +59,22 @@ fn deform_variants(features: &[&'static str]) -> Vec<Variant> {
     }
     for storage in storage_variants() {
         let sum = |options: &[&'static str]| [&["MODES"], storage.as_slice(), options].concat();
-        let all_options = ["MODE_TRUNCATION", "COMPENSATED_SUM"];
-        // bf16 needs the same registers as f16, so bf16 is compiled only with none and with all of the options.
-        let mut option_sets = subsets(&all_options);
-        option_sets.retain(|options| storage != ["STORE_BF16"] || options.len() != 1);
-        for options in &option_sets {
+        for options in [&[][..], &["COMPENSATED_SUM"]] {
             add_variants(&sum(options), &normal_defines, &[]);
         }
         // Displacements and followers need further registers, so they are combined with the sum that needs the most.
         // Entries 1 and 2 of `normal_defines` are rigid normals without and with normal maps.
-        add_variants(&sum(&all_options), &normal_defines[1..3], &["DISPLACEMENTS"]);
-        add_variants(&sum(&all_options), &normal_defines[1..3], &["FOLLOWERS"]);
+        add_variants(&sum(&["COMPENSATED_SUM"]), &normal_defines[1..3], &["DISPLACEMENTS"]);
+        add_variants(&sum(&["COMPENSATED_SUM"]), &normal_defines[1..3], &["FOLLOWERS"]);
     }
     // The variant with one warp per axis reads U as f32, and has neither other storage types nor tile lists.
     let axis_sum =
         |options: &[&'static str]| [&["MODES", "ONE_ITEM_PER_LANE", kernels::AXIS_PER_WARP], options].concat();
-    for (options, normals) in subsets(&["MODE_TRUNCATION", "COMPENSATED_SUM"])
-        .iter()
-        .flat_map(|options| normal_defines.iter().map(move |normals| (options, normals)))
-    {
-        variants.push(([axis_sum(options).as_slice(), normals].concat(), SM_90));
+    for options in [&[][..], &["COMPENSATED_SUM"]] {
+        variants.extend(normal_defines.map(|normals| ([axis_sum(options).as_slice(), normals].concat(), SM_90)));
     }
     let largest_axis_sum = axis_sum(
-        &[
-            &["MODE_TRUNCATION", "COMPENSATED_SUM", "DISPLACEMENTS", "FOLLOWERS"],
-            normal_defines[normal_defines.len() - 1],
-        ]
-        .concat(),
+        &[&["COMPENSATED_SUM", "DISPLACEMENTS", "FOLLOWERS"], normal_defines[normal_defines.len() - 1]].concat(),
     );
     variants.extend(CAPABILITIES.map(|capability| (largest_axis_sum.clone(), capability)));
     variants.extend(CAPABILITIES.map(|capability| (axis_sum(&[]), capability)));
@@ -181,11 +170,10 @@ const ADDED_CODE: [(&str, &str, &[&str]); 13] = [
 ];
 /// Macros that select among code of similar length. FOLLOWERS of `apply` and CORNER_OFFSETS of `deform` add less code
 /// than the padding of their cubins.
-const ALTERNATIVES: [(&str, &str); 6] = [
+const ALTERNATIVES: [(&str, &str); 5] = [
     ("batch", "BATCH_8"),
     ("batch", "BATCH_4"),
     ("deform", "ONE_ITEM_PER_LANE"),
-    ("deform", "MODE_TRUNCATION"),
     ("apply", "FOLLOWERS"),
     ("deform", "CORNER_OFFSETS"),
 ];

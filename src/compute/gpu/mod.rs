@@ -53,7 +53,7 @@ pub mod launchers {
 /// The input values of a step, for programs that measure their upload.
 pub mod step_input {
     pub use super::executor::inputs::{InputPart, StagingBuffer, StepInputs};
-    pub use super::tables::input_packing::{InputPacker, InputWriter};
+    pub use super::tables::input_packing::InputPacker;
     pub use super::tables::layout::StepHeader;
     pub use super::tables::staging::{PARALLEL_THRESHOLD, parallel_copy};
 }

@@ -70,7 +70,7 @@ impl ErrorBound {
 /// Inputs of a bound besides the shape.
 #[derive(Debug, Clone, Copy)]
 pub struct ErrorBoundInput<'a> {
-    /// Coordinates of the domain; zero for truncated modes.
+    /// Coordinates of the domain.
     pub q: &'a [f32],
     /// As returned by `modalcast_model::scene::SceneState::composed_transform`.
     pub transform: ComposedTransform,
@@ -236,7 +236,7 @@ fn frame_rounding_error(transform: &ComposedTransform) -> FrameError {
 
 /// Upper bound of `||A||_2`, both for the exact A and for A as deformers round it. The bound is too large by a relative
 /// 1e-7 at most, and for a follower also by the rounding error of the product with its frame.
-pub fn linear_norm_bound(transform: &ComposedTransform) -> f64 {
+fn linear_norm_bound(transform: &ComposedTransform) -> f64 {
     (spectral_norm(&transform.to_f32()) + frame_rounding_error(transform).linear) * ROUND_UP
 }
 

@@ -1,5 +1,4 @@
-//! The stored form of U: its tiles, as the deformers for CPU and GPU read them, error bounds of each storage type, and
-//! modal truncation.
+//! The stored form of U: its tiles, as the deformers for CPU and GPU read them, and error bounds of each storage type.
 //!
 //! # Layout
 //! Four consecutive vertices form a quad. Up to [`TILE_QUADS`] consecutive quads of a shape form a tile. A few
@@ -15,11 +14,9 @@ pub mod bound;
 mod quantize;
 mod split_coordinates;
 mod tiles;
-mod truncation;
 
 pub use split_coordinates::{SplitCoordinates, TensorCoreError};
 pub use tiles::{PackedWord, TileLayout, TiledModes};
-pub use truncation::{Truncation, TruncationInput, max_row_norms};
 
 use modalcast_model::scene::StorageType;
 

@@ -1,8 +1,6 @@
 //! Settings of the deformation: how modes are stored, and which approximations and additional outputs are computed. The
 //! default has no approximations.
 
-use crate::error::{Result, invalid};
-
 /// The storage type of the entries of U. Sums over modes are always f32.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -46,27 +44,14 @@ pub enum NormalMethod {
 }
 
 /// Options that trade accuracy for time, and additional outputs.
-#[derive(Debug, Clone, Copy, PartialEq, Default, serde::Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize)]
 pub struct DeformationSettings {
     pub storage: StorageType,
     pub normals: NormalMethod,
-    /// Error bound in meters: the modes skipped in a step would together move no vertex by more than this distance.
-    pub truncation: Option<f64>,
     /// Sum modes with error compensation. Useful for modes that nearly cancel.
     pub compensated: bool,
     /// Store the displacement u = U q of every vertex in the domain's own frame, for example for collision tests.
     pub displacements: bool,
     /// Store an axis-aligned bounding box of each domain's deformed positions.
     pub boxes: bool,
-}
-
-impl DeformationSettings {
-    pub(super) fn check(&self) -> Result<()> {
-        match self.truncation {
-            Some(meters) if !(meters.is_finite() && meters > 0.0) => {
-                Err(invalid("deform.truncation", "a positive number of meters", meters))
-            }
-            _ => Ok(()),
-        }
-    }
 }

@@ -23,8 +23,6 @@ pub struct SceneFeatures {
     pub shear: bool,
     /// Normals are computed from the deformed triangles; requires the triangles around each vertex.
     pub exact_normals: bool,
-    /// Modes that are negligible at a step's q are skipped; requires a list of the remaining modes in every step.
-    pub truncation: bool,
     /// Sums over modes are compensated: their rounding errors are accumulated and added.
     pub compensated: bool,
     /// Some domain follows another one by a constant frame; requires products of transforms.
@@ -37,7 +35,7 @@ pub struct SceneFeatures {
 
 impl SceneFeatures {
     pub(super) fn from_parts(parts: &SceneParts) -> Self {
-        // Without modes, exact normals, truncation and compensated sums have no effect, so they are off.
+        // Without modes, exact normals and compensated sums have no effect, so they are off.
         let modes = parts.domains.iter().any(|domain| parts.shapes[domain.shape].modes.rank() > 0);
         Self {
             modes,
@@ -51,7 +49,6 @@ impl SceneFeatures {
             shadows: parts.look.shadow.is_some(),
             shear: !parts.rigid_transforms || !parts.domains.iter().all(has_similarity_transforms),
             exact_normals: modes && parts.deformation.normals == NormalMethod::Exact,
-            truncation: modes && parts.deformation.truncation.is_some(),
             compensated: modes && parts.deformation.compensated,
             followers: parts.domains.iter().any(|domain| domain.follows.is_some()),
             displacements: parts.deformation.displacements,
@@ -60,7 +57,7 @@ impl SceneFeatures {
     }
 
     /// Each flag with its name, in a fixed order.
-    pub fn flags(&self) -> [(&'static str, bool); 13] {
+    pub fn flags(&self) -> [(&'static str, bool); 12] {
         [
             ("modes", self.modes),
             ("textures", self.textures),
@@ -70,7 +67,6 @@ impl SceneFeatures {
             ("shadows", self.shadows),
             ("shear", self.shear),
             ("exact_normals", self.exact_normals),
-            ("truncation", self.truncation),
             ("compensated", self.compensated),
             ("followers", self.followers),
             ("displacements", self.displacements),

@@ -159,7 +159,6 @@ impl Scene {
         }
         let transform_roots = TransformRoots::new(&mut parts.domains)?;
         parts.look.check()?;
-        parts.deformation.check()?;
         drop_textures_without_uvs(&mut parts);
         parts.remarks.extend(negative_eigenvalues(&parts.domains));
         add_tangents(&mut parts);

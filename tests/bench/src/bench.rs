@@ -150,7 +150,7 @@ impl BenchTarget for LocalMachine {
             {
                 candidates.push(candidate(&format!("cuda {name}{STEP_SUFFIX}"), Backend::Cuda, deformation, &cuda));
                 // `kernel_variants` adds the kernels of other storage types.
-                if !cuda_variants::truncates_or_compensates(&deformation) {
+                if !deformation.compensated {
                     continue;
                 }
                 let variant = StepVariant {
@@ -199,27 +199,20 @@ impl BenchTarget for LocalMachine {
     }
 }
 
-/// Error budgets of mode truncation as fractions of the scene's diagonal, each with its text in variant names.
-const TRUNCATION_BUDGETS: [(&str, f64); 3] = [("1e-6", 1e-6), ("1e-5", 1e-5), ("1e-4", 1e-4)];
-
-/// Deformations to measure in addition to the scene's own, by name: other storage types, truncation, compensated
-/// summation and exact normals. Empty when the scene has no modes, or sets a deformation other than the default.
+/// Deformations to measure in addition to the scene's own, by name: other storage types, compensated summation and
+/// exact normals. Empty when the scene has no modes, or sets a deformation other than the default.
 fn alternative_deformations(scene: &Scene) -> Vec<(String, DeformationSettings)> {
     let default = scene.deformation;
     if !scene.features.modes || default != DeformationSettings::default() {
         return Vec::new();
     }
-    let diagonal = scene.unit * scene.rest_bounds.diagonal();
     let with_storage =
         |storage: &StorageType| (storage.name().to_owned(), DeformationSettings { storage: *storage, ..default });
-    let with_truncation = |(name, fraction): &(&str, f64)| {
-        (format!("f32 truncated {name}"), DeformationSettings { truncation: Some(fraction * diagonal), ..default })
-    };
     let compensated = ("f32 compensated".to_owned(), DeformationSettings { compensated: true, ..default });
     let exact = exact_normals(scene).map(|exact| ("f32 exact normals".to_owned(), exact));
     // The first storage type is f32, the default.
     let stored = StorageType::ALL[1..].iter().map(with_storage);
-    stored.chain(TRUNCATION_BUDGETS.iter().map(with_truncation)).chain([compensated]).chain(exact).collect()
+    stored.chain([compensated]).chain(exact).collect()
 }
 
 /// The scene's deformation with exact instead of rigid normals. `None` when the scene has no modes, no normals, or
@@ -246,8 +239,7 @@ mod tests {
         let workload = WorkloadKind::TinyDomains.build(Size::Quick).expect("expected a workload");
         let names: Vec<String> =
             machine.variants(&workload, &|_| true).into_iter().map(|(label, _)| label.name).collect();
-        for name in
-            ["cpu f32", "cpu f16", "cpu int8", "cpu f32 truncated 1e-5", "cpu f32 exact normals", "reference f64"]
+        for name in ["cpu f32", "cpu f16", "cpu int8", "cpu f32 compensated", "cpu f32 exact normals", "reference f64"]
         {
             assert!(names.iter().any(|variant_name| variant_name == name), "{name} is not among {names:?}");
         }

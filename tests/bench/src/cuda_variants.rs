@@ -117,13 +117,7 @@ fn with_extra_outputs(scene: &Scene) -> Vec<(String, DeformationSettings)> {
     vec![with_displacements, with_boxes]
 }
 
-/// Whether a deformation truncates modes or compensates sums, for which the deformer has separate kernels.
-pub(super) fn truncates_or_compensates(deformation: &DeformationSettings) -> bool {
-    deformation.truncation.is_some() || deformation.compensated
-}
-
-/// Settings of a variant that times the deformer's kernels on steps that change all domains. With truncation, the
-/// variant selects the modes of every state independently of earlier states.
+/// Settings of a variant that times the deformer's kernels on steps that change all domains.
 pub(super) struct StepVariant {
     pub name: String,
     pub deformation: DeformationSettings,
@@ -285,7 +279,6 @@ pub(super) fn has_normals(scene: &Scene) -> bool {
 fn traffic_formula(array: &str) -> &'static str {
     match array {
         "U" => "as packed: entries of all modes and vertices, filled up to tiles",
-        "U kept" => "as packed: the share of modes that are kept, mean over the domains and states that are timed",
         "q" => "4 x sum r",
         "T" => "48 x d",
         "x0" | "u or x" | "x" => "12 x sum n",
@@ -349,9 +342,7 @@ impl Variant for BenchmarkVariant {
         Ok(())
     }
 
-    fn surface(&mut self, state_index: usize, state: &SceneState) -> Result<&DeformedSurface> {
-        self.error_model.reset_truncation();
-        self.error_model.update_truncation(state);
+    fn surface(&mut self, state_index: usize, _state: &SceneState) -> Result<&DeformedSurface> {
         let benchmark = self.benchmark()?;
         // A step that changes few domains computes only these. The other domains must also be at this state.
         benchmark.compute_skipped_domains(&self.device, state_index)?;

@@ -1,15 +1,13 @@
 //! Error model of a deformer: the operands of x = T (x0 + U q) that the deformer approximates before it computes (U by
-//! its storage type, modes by truncation, q by 16-bit numbers), and a-priori bounds on the resulting error.
+//! its storage type, q by 16-bit numbers), and a-priori bounds on the resulting error.
 
 use std::sync::{Arc, Mutex, PoisonError};
 
 use rayon::prelude::*;
 
 use super::workloads::with_deformation;
-use modalcast_compute::storage::bound::{ErrorBound, ErrorBoundInput, ShapeErrorModel, linear_norm_bound};
-use modalcast_compute::storage::{
-    QUAD, SplitCoordinates, TILE_QUADS, TensorCoreError, TiledModes, Truncation, TruncationInput, max_row_norms,
-};
+use modalcast_compute::storage::bound::{ErrorBound, ErrorBoundInput, ShapeErrorModel};
+use modalcast_compute::storage::{QUAD, SplitCoordinates, TILE_QUADS, TensorCoreError, TiledModes};
 use modalcast_model::error::Result;
 use modalcast_model::scene::{DeformationSettings, DomainLayout, Scene, SceneState, StorageType};
 
@@ -22,7 +20,6 @@ pub struct ErrorModel {
     scene: Arc<Scene>,
     /// Stored U of each shape; empty when U is stored in f32.
     stored: Arc<Vec<StoredShape>>,
-    truncation: Option<TruncationState>,
     /// Whether tensor cores compute U q. Each coordinate is then split into two 16-bit numbers.
     uses_tensor_cores: bool,
 }
@@ -34,17 +31,6 @@ struct StoredShape {
     error_model: ShapeErrorModel,
 }
 
-/// The modes that truncation omits now, and the data that selects them.
-#[derive(Debug)]
-struct TruncationState {
-    /// Error budget, scene units.
-    budget: f64,
-    /// Per shape and mode: the largest displacement of a vertex by a coordinate of 1.
-    max_row_norms: Vec<Vec<f64>>,
-    /// Truncation state per domain.
-    domains: Vec<Truncation>,
-}
-
 impl ErrorModel {
     /// The error model of a deformer that follows this scene's deformation.
     pub fn of(scene: &Arc<Scene>) -> Self {
@@ -52,13 +38,7 @@ impl ErrorModel {
     }
 
     fn with_stored_shapes(scene: &Arc<Scene>, stored: Arc<Vec<StoredShape>>) -> Self {
-        let truncation =
-            scene.deformation.truncation.filter(|_| scene.features.truncation).map(|meters| TruncationState {
-                budget: meters / scene.unit,
-                max_row_norms: scene.shapes.par_iter().map(|shape| max_row_norms(&shape.modes)).collect(),
-                domains: (0..scene.domains.len()).map(|domain| Truncation::new(scene.rank_of(domain))).collect(),
-            });
-        Self { scene: Arc::clone(scene), stored, truncation, uses_tensor_cores: false }
+        Self { scene: Arc::clone(scene), stored, uses_tensor_cores: false }
     }
 
     /// This error model with sums computed by tensor cores. U must be stored in 16 bits.
@@ -68,7 +48,7 @@ impl ErrorModel {
 
     /// Whether no operand of x = T (x0 + U q) is approximated. All such deformers have the same bounds.
     pub fn is_exact(&self) -> bool {
-        !self.has_stored_modes() && !self.truncates()
+        !self.has_stored_modes()
     }
 
     /// Whether U is stored in another type than f32.
@@ -76,58 +56,19 @@ impl ErrorModel {
         !self.stored.is_empty()
     }
 
-    /// Whether modes may be truncated.
-    pub fn truncates(&self) -> bool {
-        self.truncation.is_some()
-    }
-
-    /// Forgets which modes were truncated at earlier states. Otherwise they influence the choice at the next state.
-    pub fn reset_truncation(&mut self) {
-        if let Some(TruncationState { domains, .. }) = &mut self.truncation {
-            domains.iter_mut().for_each(Truncation::reset);
-        }
-    }
-
-    /// Selects the modes to omit at a state, as a deformer does after the same earlier states.
-    pub fn update_truncation(&mut self, state: &SceneState) {
-        let Self { scene, truncation, .. } = self;
-        if let Some(TruncationState { budget, max_row_norms, domains }) = truncation {
-            // Tasks of 64 domains, because scheduling a task costs more than one domain.
-            domains.par_iter_mut().enumerate().with_min_len(64).for_each(|(domain, truncation)| {
-                let max_row_norms = &max_row_norms[scene.domains[domain].shape];
-                // Maximum factor by which T enlarges a displacement.
-                let norm = linear_norm_bound(&state.composed_transform(scene, domain));
-                truncation.update(TruncationInput { q: state.q_of(scene, domain), max_row_norms, norm }, *budget);
-            });
-        }
-    }
-
     /// Stored U of a shape; `None` when it is stored in f32.
     pub(super) fn tiles(&self, shape: usize) -> Option<&TiledModes> {
         self.stored.get(shape).map(|stored| &stored.tiles)
     }
 
-    /// Zeroes the coordinates of a domain's truncated modes.
-    pub(super) fn truncate<T: Default + Copy>(&self, domain: usize, q: &mut [T]) {
-        if let Some(truncation) = &self.truncation {
-            let mut retained = vec![false; q.len()];
-            truncation.domains[domain].retained().iter().for_each(|mode| retained[usize::from(*mode)] = true);
-            q.iter_mut().zip(retained).filter(|(_, retained)| !retained).for_each(|(q, _)| *q = T::default());
-        }
-    }
-
     /// Error bounds of a domain at a state.
     pub(super) fn bounds(&self, domain: usize, state: &SceneState) -> DomainErrorBounds<'_> {
-        let mut q = state.q_of(&self.scene, domain).to_vec();
-        self.truncate(domain, &mut q);
-        let truncation = self.truncation.as_ref().map_or(0.0, |truncation| truncation.domains[domain].bound());
         let error_model = self.stored.get(self.scene.domains[domain].shape).map(|stored| &stored.error_model);
         DomainErrorBounds {
             error_model,
-            q,
+            q: state.q_of(&self.scene, domain).to_vec(),
             transform: state.composed_transform(&self.scene, domain),
             compensated: self.scene.deformation.compensated,
-            truncation,
             tensor_core_error: self
                 .uses_tensor_cores
                 .then(|| TensorCoreError::of(self.scene.deformation.storage, self.scene.rank_of(domain))),
@@ -198,7 +139,7 @@ impl ErrorModelCache {
     /// The scene with another deformation.
     ///
     /// # Errors
-    /// `Invalid` when the deformation's options contradict each other.
+    /// As for [`Scene::new`].
     pub fn scene(&self, deformation: DeformationSettings) -> Result<Arc<Scene>> {
         let mut scenes = self.scenes.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some((_, scene)) = scenes.iter().find(|(cached, _)| *cached == deformation) {
@@ -229,8 +170,6 @@ pub(super) struct DomainErrorBounds<'a> {
     q: Vec<f32>,
     transform: modalcast_model::domain::ComposedTransform,
     compensated: bool,
-    /// Bound on the error of the truncated modes.
-    truncation: f64,
     /// Relative errors of tensor cores; `None` if the deformer does not use them.
     tensor_core_error: Option<TensorCoreError>,
 }
@@ -239,27 +178,25 @@ impl DomainErrorBounds<'_> {
     /// Widens the bounds of consecutive vertices, from vertex `first` of the shape. On entry, `bounds` holds the bounds
     /// of a sum of all modes in f32.
     pub(super) fn widen_bounds<'b>(&self, first: usize, bounds: impl Iterator<Item = &'b mut f64>) {
+        let Some(error_model) = self.error_model else { return };
         let input = ErrorBoundInput { q: &self.q, transform: self.transform, compensated: self.compensated };
         // The tile evaluated last, its bounds, and the bound of its tensor core errors.
         let mut cached: Option<(usize, ErrorBound, f64)> = None;
         for (vertex, bound) in bounds.enumerate() {
-            if let Some(error_model) = self.error_model {
-                let tile = (first + vertex) / TILE;
-                let evaluate_tile = || {
-                    let tensor_core_bound =
-                        self.tensor_core_error.map_or(0.0, |error| error_model.tensor_core_bound(tile, &input, error));
-                    (tile, error_model.tile_bound(tile, &input), tensor_core_bound)
-                };
-                let (_, tile_bound, tensor_core_bound) =
-                    cached.filter(|(cached_tile, ..)| *cached_tile == tile).unwrap_or_else(evaluate_tile);
-                cached = Some((tile, tile_bound, tensor_core_bound));
-                // Rounding errors of the sum grow with the stored entries. 1e-4 exceeds their relative growth: 512
-                // modes, the maximum, have about 520 roundings of 6e-8 each, 3e-5 in total.
-                let stored = (tile_bound.storage + tile_bound.coordinates) * (1.0 + 1e-4);
-                // The total of the tile also bounds the error of each vertex. The smaller of the two bounds is used.
-                *bound = (*bound + stored).min(tile_bound.total()) + tensor_core_bound;
-            }
-            *bound += self.truncation;
+            let tile = (first + vertex) / TILE;
+            let evaluate_tile = || {
+                let tensor_core_bound =
+                    self.tensor_core_error.map_or(0.0, |error| error_model.tensor_core_bound(tile, &input, error));
+                (tile, error_model.tile_bound(tile, &input), tensor_core_bound)
+            };
+            let (_, tile_bound, tensor_core_bound) =
+                cached.filter(|(cached_tile, ..)| *cached_tile == tile).unwrap_or_else(evaluate_tile);
+            cached = Some((tile, tile_bound, tensor_core_bound));
+            // Rounding errors of the sum grow with the stored entries. 1e-4 exceeds their relative growth: 512 modes,
+            // the maximum, have about 520 roundings of 6e-8 each, 3e-5 in total.
+            let stored = (tile_bound.storage + tile_bound.coordinates) * (1.0 + 1e-4);
+            // The total of the tile also bounds the error of each vertex. The smaller of the two bounds is used.
+            *bound = (*bound + stored).min(tile_bound.total()) + tensor_core_bound;
         }
     }
 }
@@ -296,10 +233,10 @@ mod tests {
             &cache.scene(workload.scene.deformation).expect("expected the cached scene"),
             &workload.scene
         ));
-        let truncated = cache.scene(DeformationSettings { truncation: Some(0.01), ..f16 }).expect("expected a scene");
-        let models = [&first, &truncated].map(|scene| cache.error_model(scene));
+        let compensated = cache.scene(DeformationSettings { compensated: true, ..f16 }).expect("expected a scene");
+        let models = [&first, &compensated].map(|scene| cache.error_model(scene));
         assert!(Arc::ptr_eq(&models[0].stored, &models[1].stored) && models[0].has_stored_modes());
-        assert!(models[1].truncates() && !models[0].truncates());
+        assert!(!Arc::ptr_eq(&models[0].scene, &models[1].scene));
         assert!(cache.error_model(&workload.scene).is_exact());
     }
 
@@ -349,23 +286,5 @@ mod tests {
         };
         // Two bf16 of 8 bits each represent 16 bits, fewer than the 24 bits of f32.
         assert!(is_within(2f64.powi(-16)) && !is_within(2f64.powi(-24)), "{rounded_q:?} {q:?}");
-    }
-
-    #[test]
-    fn truncates_small_modes_within_budget_after_first_state() {
-        let (mut truncated, state) =
-            model_and_state(DeformationSettings { truncation: Some(0.01), ..DeformationSettings::default() });
-        let count_nonzero_coordinates = |error_model: &ErrorModel| {
-            let mut q = state.q.clone();
-            error_model.truncate(0, &mut q);
-            q.iter().filter(|q| **q != 0.0).count()
-        };
-        // The workload has 20 modes. None is truncated before the first state.
-        assert_eq!(count_nonzero_coordinates(&truncated), 20);
-        truncated.update_truncation(&state);
-        assert!((1..20).contains(&count_nonzero_coordinates(&truncated)), "{}", count_nonzero_coordinates(&truncated));
-        let mut bounds = [0.0];
-        truncated.bounds(0, &state).widen_bounds(0, bounds.iter_mut());
-        assert!(bounds[0] > 0.0 && bounds[0] <= 0.01, "{bounds:?}");
     }
 }

@@ -8,7 +8,7 @@ use serde::Serialize;
 
 use super::error_model::ErrorModel;
 use super::errors::{ErrorNorms, NormAccumulator, reduce_parallel};
-use super::exact_positions::{ErrorModelTerms, positions};
+use super::exact_positions::positions;
 use super::exact_state::ExactState;
 use modalcast_model::scene::{Scene, SceneState, StorageType};
 
@@ -25,13 +25,11 @@ pub struct ErrorSources {
     pub transform: ErrorNorms,
     /// The final rounding of the position itself, which grows with the distance from the scene's origin.
     pub origin: ErrorNorms,
-    /// Truncated modes.
-    pub truncation: ErrorNorms,
 }
 
-/// Accumulators of the six sources, in the order of [`ErrorSources`].
+/// Accumulators of the five sources, in the order of [`ErrorSources`].
 #[derive(Debug, Clone, Copy, Default)]
-pub(super) struct ErrorSourcesAccumulator([NormAccumulator; 6]);
+pub(super) struct ErrorSourcesAccumulator([NormAccumulator; 5]);
 
 /// Reference positions of one exact state, which all variants share.
 #[derive(Debug)]
@@ -46,14 +44,13 @@ pub(super) struct SharedErrorSources {
     q_norms: NormAccumulator,
     /// Error from rounding T alone.
     transform_norms: NormAccumulator,
-    /// Positions with q and T rounded to f32, U exact and all modes.
+    /// Positions with q and T rounded to f32, and U exact.
     rounded_positions: Vec<[f64; 3]>,
     /// Errors of the storage types that variants have requested so far.
     storage_errors: Mutex<Vec<(StorageType, Arc<StorageError>)>>,
 }
 
-/// Error and positions of one storage type. All variants with this storage type share the error, and those without
-/// truncation also the positions.
+/// Error and positions of one storage type. All variants with this storage type share them.
 #[derive(Debug)]
 struct StorageError {
     /// Error of the storage alone.
@@ -66,8 +63,7 @@ impl SharedErrorSources {
     /// Evaluates an exact state and `state`, its rounding to f32, in f64.
     pub(super) fn new(scene: &Scene, truth: ExactState, state: &SceneState) -> Self {
         let rounded = ExactState::of(state);
-        let positions_of =
-            |q: &[f64], transforms: &[[f64; 12]]| positions_at(scene, q, transforms, ErrorModelTerms::default());
+        let positions_of = |q: &[f64], transforms: &[[f64; 12]]| positions_at(scene, q, transforms, None);
         let exact_positions = positions_of(&truth.q, &truth.transforms);
         let q_norms = distances(&exact_positions, &positions_of(&rounded.q, &truth.transforms));
         let transform_norms = distances(&exact_positions, &positions_of(&truth.q, &rounded.transforms));
@@ -83,9 +79,9 @@ impl SharedErrorSources {
         if let Some((_, stored)) = cached.iter().find(|(cached_storage, _)| *cached_storage == storage) {
             return Arc::clone(stored);
         }
-        let terms = ErrorModelTerms { storage: Some(error_model), truncation: None };
-        let norms = distances(&self.exact_positions, &positions(scene, &self.truth, terms));
-        let stored = Arc::new(StorageError { norms, positions: positions(scene, &self.rounded, terms) });
+        let positions_of = |truth: &ExactState| positions(scene, truth, Some(error_model));
+        let norms = distances(&self.exact_positions, &positions_of(&self.truth));
+        let stored = Arc::new(StorageError { norms, positions: positions_of(&self.rounded) });
         cached.push((storage, Arc::clone(&stored)));
         stored
     }
@@ -99,27 +95,17 @@ impl SharedErrorSources {
         accumulator: &mut ErrorSourcesAccumulator,
     ) {
         let storage = Some(error_model).filter(|error_model| error_model.has_stored_modes());
-        let truncation = Some(error_model).filter(|error_model| error_model.truncates());
         let stored = storage.map(|error_model| self.storage_error(scene, error_model));
         // A source that moves no vertex contributes a zero for each vertex.
         let zero_norms = distances(&self.exact_positions, &self.exact_positions);
         let storage_norms = stored.as_ref().map_or(zero_norms, |stored| stored.norms);
-        // The omitted modes were selected from the rounded q. Their displacement by the exact q is almost the same.
-        let truncation_only = ErrorModelTerms { storage: None, truncation };
-        let truncation_norms = truncation
-            .map_or(zero_norms, |_| distances(&self.exact_positions, &positions(scene, &self.truth, truncation_only)));
         let split_q = error_model.split_q(&self.rounded.q);
-        let error_from_q = |q: &Vec<f64>| {
-            let moved_positions = positions_at(scene, q, &self.truth.transforms, ErrorModelTerms::default());
-            distances(&self.exact_positions, &moved_positions)
-        };
+        let error_from_q =
+            |q: &Vec<f64>| distances(&self.exact_positions, &positions_at(scene, q, &self.truth.transforms, None));
         let q_norms = split_q.as_ref().map_or(self.q_norms, error_from_q);
-        let q = split_q.as_ref().unwrap_or(&self.rounded.q);
-        // Positions with all approximations except f32 arithmetic. Only variants that truncate modes or split q need
-        // positions of their own.
-        let needs_own_positions = truncation.is_some() || split_q.is_some();
-        let own_positions = needs_own_positions
-            .then(|| positions_at(scene, q, &self.rounded.transforms, ErrorModelTerms { storage, truncation }));
+        // Positions with all approximations except f32 arithmetic. Only variants that split q need positions of their
+        // own.
+        let own_positions = split_q.as_ref().map(|q| positions_at(scene, q, &self.rounded.transforms, storage));
         let approximate_positions = own_positions
             .as_ref()
             .or(stored.as_ref().map(|stored| &stored.positions))
@@ -133,7 +119,6 @@ impl SharedErrorSources {
             distances(&rounded, &got),
             self.transform_norms,
             distances(approximate_positions, &rounded),
-            truncation_norms,
         ];
         accumulator.0.iter_mut().zip(norms).for_each(|(sum, norms)| *sum = sum.join(norms));
     }
@@ -142,15 +127,14 @@ impl SharedErrorSources {
 impl ErrorSourcesAccumulator {
     /// The accumulated sources in meters; `unit` is meters per scene unit.
     pub(super) fn sources(&self, unit: f64) -> ErrorSources {
-        let [storage, q, accumulation, transform, origin, truncation] =
-            self.0.map(|norms| norms.norms(unit).unwrap_or_default());
-        ErrorSources { storage, q, accumulation, transform, origin, truncation }
+        let [storage, q, accumulation, transform, origin] = self.0.map(|norms| norms.norms(unit).unwrap_or_default());
+        ErrorSources { storage, q, accumulation, transform, origin }
     }
 }
 
-/// Positions of these coordinates and transforms.
-fn positions_at(scene: &Scene, q: &[f64], transforms: &[[f64; 12]], terms: ErrorModelTerms<'_>) -> Vec<[f64; 3]> {
-    positions(scene, &ExactState { q: q.to_vec(), transforms: transforms.to_vec() }, terms)
+/// Positions of these coordinates and transforms; with `storage`, U is as this model stores it.
+fn positions_at(scene: &Scene, q: &[f64], transforms: &[[f64; 12]], storage: Option<&ErrorModel>) -> Vec<[f64; 3]> {
+    positions(scene, &ExactState { q: q.to_vec(), transforms: transforms.to_vec() }, storage)
 }
 
 /// Norms of the distances between corresponding positions.
@@ -182,10 +166,8 @@ mod tests {
     /// rounds only its positions.
     fn measure(deformation: DeformationSettings, truth: &ExactState, got: Option<&[f32]>) -> ErrorSources {
         let (scene, state) = (with_deformation(&load().scene, deformation).expect("expected a scene"), truth.state());
-        let mut error_model = ErrorModel::of(&scene);
-        error_model.update_truncation(&state);
-        let terms = ErrorModelTerms { storage: Some(&error_model), truncation: Some(&error_model) };
-        let emulated = positions(&scene, &ExactState::of(&state), terms);
+        let error_model = ErrorModel::of(&scene);
+        let emulated = positions(&scene, &ExactState::of(&state), Some(&error_model));
         let emulated: Vec<f32> = emulated.as_flattened().iter().map(|number| *number as f32).collect();
         let mut accumulator = ErrorSourcesAccumulator::default();
         SharedErrorSources::new(&scene, truth.clone(), &state).add_sources(
@@ -207,10 +189,7 @@ mod tests {
     fn measures_each_source_alone() {
         let default = DeformationSettings::default;
         let sources = measure(default(), &representable_truth(), None);
-        assert!(
-            [sources.storage, sources.q, sources.accumulation, sources.transform, sources.truncation]
-                == [ErrorNorms::default(); 5]
-        );
+        assert_eq!([sources.storage, sources.q, sources.accumulation, sources.transform], [ErrorNorms::default(); 4]);
         assert!(sources.origin.largest > 0.0 && sources.origin.largest < 1e-6);
         // 1 + 2^-30 is 1 in f32. Entries of U are at most 1, so a vertex moves by at most 2^-30 sqrt(3) = 1.6e-9.
         let sources =
@@ -230,13 +209,7 @@ mod tests {
         // int8 stores entries of at most 1 with errors of at most 0.5 / 127. The coordinates add up to 1.5, and errors
         // on three axes have a length of at most sqrt(3) < 1.74 times each of them.
         assert!(sources.storage.largest > 1e-3 && sources.storage.largest < 0.5 / 127.0 * 1.5 * 1.74, "{sources:?}");
-        assert_eq!([sources.accumulation, sources.truncation], [ErrorNorms::default(); 2]);
-        // The truncated modes together may displace a vertex by half of the budget, 1.75 / 2 = 0.875. Mode 0 moves
-        // vertices by up to sqrt(3) = 1.73, mode 1 by up to 0.5 sqrt(3) = 0.866. Only mode 1 is truncated.
-        let sources =
-            measure(DeformationSettings { truncation: Some(1.75), ..default() }, &representable_truth(), None);
-        assert!(sources.truncation.largest > 0.5 && sources.truncation.largest <= 0.87, "{sources:?}");
-        assert_eq!([sources.accumulation, sources.storage], [ErrorNorms::default(); 2]);
+        assert_eq!(sources.accumulation, ErrorNorms::default());
     }
 
     #[test]

@@ -1,5 +1,5 @@
-//! Reference evaluation of x = T (x0 + U q) in f64, on request with the approximations of an error model, and the
-//! a-priori bound on the f32 error.
+//! Reference evaluation of x = T (x0 + U q) in f64, on request with U as an error model stores it, and the a-priori
+//! bound on the f32 error.
 //!
 //! Where the modes cancel, u = U q is summed in double-double. Tiles of vertices are distributed over all cores, so
 //! that scenes of millions of vertices can be evaluated hundreds of times. A test compares the results with
@@ -43,26 +43,14 @@ const UNIT_ROUNDOFF: f64 = 1.0 / (1 << 24) as f64;
 /// up.
 const MAX_UNDERFLOW_ERROR: f64 = 7.1e-46;
 
-/// The approximations of a deformer to apply; `None` computes a term exactly.
-#[derive(Debug, Clone, Copy, Default)]
-pub struct ErrorModelTerms<'a> {
-    /// Use U as this model stores it.
-    pub storage: Option<&'a ErrorModel>,
-    /// Use only the modes that this model retains.
-    pub truncation: Option<&'a ErrorModel>,
-}
-
-/// World positions of an exact state in f64, scene units. Only the approximations in `terms` are applied.
-pub fn positions(scene: &Scene, truth: &ExactState, terms: ErrorModelTerms<'_>) -> Vec<[f64; 3]> {
+/// World positions of an exact state in f64, scene units. With `storage`, U is as this model stores it; everything else
+/// is exact.
+pub fn positions(scene: &Scene, truth: &ExactState, storage: Option<&ErrorModel>) -> Vec<[f64; 3]> {
     map_tiles(scene, [0.0; 3], |domain, vertices, out| {
         let shape = scene.domains[domain].shape;
-        let mut q = coordinates_of(scene, domain, truth).to_vec();
-        if let Some(error_model) = terms.truncation {
-            error_model.truncate(domain, &mut q);
-        }
-        let stored = terms.storage.and_then(|error_model| error_model.tiles(shape));
+        let stored = storage.and_then(|error_model| error_model.tiles(shape));
         let entries = stored.map_or(ModeEntries::Exact(&scene.shapes[shape].modes), ModeEntries::Stored);
-        let sums = sum_modes(vertices.clone(), entries, &q);
+        let sums = sum_modes(vertices.clone(), entries, coordinates_of(scene, domain, truth));
         let (rest, transform) =
             (&scene.shapes[shape].mesh.rest_positions()[vertices], truth.transform_of(scene, domain));
         for ((rest, sum), out) in rest.iter().zip(&sums).zip(out) {
@@ -283,7 +271,7 @@ mod tests {
         for workload in workloads() {
             let state = WorkloadMotion::new(&workload, None).random_state(0).state();
             let want = modalcast_compute::reference::deform(&workload.scene, &state);
-            let got = positions(&workload.scene, &ExactState::of(&state), ErrorModelTerms::default());
+            let got = positions(&workload.scene, &ExactState::of(&state), None);
             let differences = want.as_flattened().iter().zip(got.as_flattened()).map(|(want, got)| (want - got).abs());
             assert_eq!(want.len(), got.len());
             // f64 sums in another order differ by a few roundings of 1e-16.

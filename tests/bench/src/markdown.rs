@@ -167,7 +167,7 @@ mod tests {
 
     #[test]
     fn marks_times_within_noise_and_omits_columns_without_values() {
-        let mut noisy = row("a", "cpu f32 truncated 1e-6", CacheState::Warm, (101.0, 1e-7));
+        let mut noisy = row("a", "cpu f32 compensated", CacheState::Warm, (101.0, 1e-7));
         if let Some(timing) = &mut noisy.timing {
             (timing.q1_us, timing.q3_us) = (99.0, 103.0);
         }

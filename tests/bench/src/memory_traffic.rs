@@ -17,7 +17,7 @@ pub struct Operand {
 }
 
 /// Minimum number of bytes that a step reads and writes, for the scene's storage type and normals. Every operand counts
-/// once, and every shape once for all domains that use it. All modes count, even with truncation.
+/// once, and every shape once for all domains that use it.
 pub fn minimum_traffic(scene: &Scene) -> Vec<Operand> {
     let layout = &scene.layout;
     let [

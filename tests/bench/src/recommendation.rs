@@ -138,14 +138,14 @@ mod tests {
         if let Some(timing) = &mut noisy.timing {
             (timing.q1_us, timing.q3_us) = (95.0, 105.0);
         }
-        let rows = [cpu("cpu f32 truncated 1e-6", 99.0, 9e-7), noisy];
+        let rows = [cpu("cpu f32 compensated", 99.0, 9e-7), noisy];
         let recommendations = recommend(rows.iter());
         assert_eq!(recommendations.len(), 1);
         assert_eq!(recommendations[0].variant, "cpu f32");
-        assert_eq!(recommendations[0].equally_fast, ["cpu f32 truncated 1e-6"]);
+        assert_eq!(recommendations[0].equally_fast, ["cpu f32 compensated"]);
         // The control: without noise, the faster variant is recommended.
-        let exact = [cpu("cpu f32 truncated 1e-6", 99.0, 9e-7), cpu("cpu f32", 100.0, 2e-7)];
-        assert_eq!(recommend(exact.iter())[0].variant, "cpu f32 truncated 1e-6");
+        let exact = [cpu("cpu f32 compensated", 99.0, 9e-7), cpu("cpu f32", 100.0, 2e-7)];
+        assert_eq!(recommend(exact.iter())[0].variant, "cpu f32 compensated");
     }
 
     #[test]

@@ -20,9 +20,6 @@ pub struct DeformRow {
     pub name: String,
     pub backend: Backend,
     pub storage: StorageType,
-    /// Error budget of mode truncation, meters.
-    #[serde(rename = "truncation_metres")]
-    pub truncation_meters: Option<f64>,
     pub normals: NormalMethod,
     pub compensated: bool,
     pub cache: CacheState,
@@ -91,7 +88,6 @@ impl DeformRow {
             name: label.name.clone(),
             backend: label.backend,
             storage: label.deformation.storage,
-            truncation_meters: label.deformation.truncation,
             normals: label.deformation.normals,
             compensated: label.deformation.compensated,
             cache: CacheState::Warm,
@@ -130,12 +126,11 @@ impl DeformRow {
 /// columns that `csv` computes. `of_copy` and `of_read` are fractions of peak bandwidths, `of_diagonal` and `of_bound`
 /// are fractions of the scene's diagonal and of the a-priori bound. `step_` columns are errors of the displacement
 /// between consecutive steps. `left_out` is true for a skipped variant.
-const COLUMNS: [(&str, &str); 56] = [
+const COLUMNS: [(&str, &str); 53] = [
     ("load", "/load"),
     ("variant", "/name"),
     ("backend", "/backend"),
     ("storage", "/storage"),
-    ("truncation_m", "/truncation_metres"),
     ("normals", "/normals"),
     ("compensated", "/compensated"),
     ("cache", "/cache"),
@@ -175,8 +170,6 @@ const COLUMNS: [(&str, &str); 56] = [
     ("transform_rms_m", "/found/sources/transform/rms"),
     ("origin_largest_m", "/found/sources/origin/largest"),
     ("origin_rms_m", "/found/sources/origin/rms"),
-    ("truncation_largest_m", "/found/sources/truncation/largest"),
-    ("truncation_rms_m", "/found/sources/truncation/rms"),
     ("normals_largest_deg", "/found/orientation/normals_degrees/largest"),
     ("normals_rms_deg", "/found/orientation/normals_degrees/rms"),
     ("normals_to_surface_largest_deg", "/found/orientation/normals_to_surface_degrees/largest"),
@@ -368,7 +361,6 @@ pub(super) mod tests {
             read_gbs: Some(1.0),
             ..MemoryBandwidth::default()
         });
-        full.truncation_meters = Some(1e-3);
         let validation = full.validation.as_mut().expect("expected a validation result");
         let norms = Some(ErrorNorms::default());
         validation.errors.pixels = norms;

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use super::error_model::ErrorModel;
-use super::exact_positions::{ErrorModelTerms, positions};
+use super::exact_positions::positions;
 use super::exact_state::ExactState;
 use super::memory_traffic::Operand;
 use super::timing::{CacheState, Timing};
@@ -71,7 +71,7 @@ impl<V: Variant> Variant for InaccurateVariant<V> {
     }
 }
 
-/// Emulates storage and truncation in f64. Only the positions are rounded to f32.
+/// Emulates storage in f64. Only the positions are rounded to f32.
 pub(super) struct EmulatedVariant {
     pub(super) label: VariantLabel,
     pub(super) scene: Arc<Scene>,
@@ -100,10 +100,7 @@ impl Variant for EmulatedVariant {
     }
 
     fn surface(&mut self, _state_index: usize, state: &SceneState) -> Result<&DeformedSurface> {
-        self.applied.update_truncation(state);
-        self.declared.update_truncation(state);
-        let terms = ErrorModelTerms { storage: Some(&self.applied), truncation: Some(&self.applied) };
-        let positions = positions(&self.scene, &ExactState::of(state), terms);
+        let positions = positions(&self.scene, &ExactState::of(state), Some(&self.applied));
         self.surface.positions = positions.as_flattened().iter().map(|number| *number as f32).collect();
         Ok(&self.surface)
     }

@@ -50,9 +50,7 @@ impl ThesisComparison {
             let (power, rank) = (POWERS[column], RANKS[row]);
             let timed_rows = warm_rows(&format!("single-{power}-{rank}"));
             let fastest_us = |backend: Backend| {
-                let is_exact = |row: &&&DeformRow| {
-                    row.backend == backend && row.storage == StorageType::F32 && row.truncation_meters.is_none()
-                };
+                let is_exact = |row: &&&DeformRow| row.backend == backend && row.storage == StorageType::F32;
                 timed_rows.iter().filter(is_exact).filter_map(|row| Some(row.timing?.median_us)).min_by(f64::total_cmp)
             };
             let ours = fastest_us(Backend::Cpu).zip(fastest_us(Backend::Cuda)).map(|(cpu, cuda)| cpu / cuda);

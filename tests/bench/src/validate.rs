@@ -87,7 +87,7 @@ struct StateSample<'a> {
     index: usize,
     scenes: &'a NormalScenes<'a>,
     state: &'a SceneState,
-    /// Exact positions, with the bounds of a deformer that stores U exactly and sums all modes.
+    /// Exact positions, with the bounds of a deformer that stores U exactly.
     references: Arc<Vec<ReferenceVertex>>,
     condition: StateCondition,
     /// Present for the states whose error is split into its sources.
@@ -331,10 +331,9 @@ impl<'a> VariantCheck<'a> {
         !self.surface.normals.is_empty() && self.variant.scene().features.exact_normals
     }
 
-    /// Evaluates the first state again, after all others. Variants with truncation are exempt: their choice of modes
-    /// may depend on earlier states.
+    /// Evaluates the first state again, after all others.
     fn repeat_first_state(&mut self, states: &[SceneState]) {
-        if self.fault.is_none() && !self.variant.error_model().truncates() {
+        if self.fault.is_none() {
             let surface = self.variant.surface(0, &states[0]);
             self.is_repeatable =
                 surface.is_ok_and(|surface| surface_bits(surface).eq(surface_bits(&self.first_surface)));
@@ -487,8 +486,8 @@ mod tests {
         assert!(to_surface.largest > 0.1, "expected rigid normals to differ from surface normals, got {found:?}");
         assert!(normals.largest < 1e-4 && tangents.largest < 1e-4, "{found:?}");
         assert!(found.orientation.normal_dot_tangent.expect("expected dot products").largest < 1e-6, "{found:?}");
-        let ErrorSources { storage, q, accumulation, transform, origin, truncation } = found.sources;
-        assert_eq!([storage, truncation], [ErrorNorms::default(); 2]);
+        let ErrorSources { storage, q, accumulation, transform, origin } = found.sources;
+        assert_eq!(storage, ErrorNorms::default());
         assert!([q, accumulation, transform, origin].iter().all(|part| part.largest > 0.0), "{:?}", found.sources);
         assert!(condition.median > 1.0 && condition.largest > condition.median, "{condition:?}");
         for kind in
@@ -568,14 +567,12 @@ mod tests {
     fn approximate_deformers_meet_only_their_own_bounds() {
         let storage = |storage| DeformationSettings { storage, ..DeformationSettings::default() };
         let [f16, bf16, int8] = [StorageType::F16, StorageType::Bf16, StorageType::Int8].map(storage);
-        let truncated = DeformationSettings { truncation: Some(1e-4), ..DeformationSettings::default() };
-        for deformation in [f16, bf16, int8, truncated, DeformationSettings { truncation: Some(1e-4), ..int8 }] {
+        for deformation in [f16, bf16, int8] {
             let found = emulate(deformation, deformation);
             assert!(found.passed(), "{deformation:?}: {:?}", found.faults);
             assert!(found.errors.of_bound > 0.05, "{deformation:?}: expected a tight bound, got {found:?}");
             assert_eq!(found.sources.accumulation, ErrorNorms::default(), "{deformation:?}");
-            assert_eq!(found.sources.storage.largest > 0.0, deformation.storage != StorageType::F32);
-            assert_eq!(found.sources.truncation.largest > 0.0, deformation.truncation.is_some());
+            assert!(found.sources.storage.largest > 0.0, "{deformation:?}");
             let declared_exact = emulate(deformation, DeformationSettings::default());
             assert!(!declared_exact.passed(), "{deformation:?}: expected an error above the bound of exact sums");
         }

@@ -115,7 +115,6 @@ impl Variant for DeformerVariant {
     }
 
     fn surface(&mut self, _state_index: usize, state: &SceneState) -> Result<&DeformedSurface> {
-        self.error_model.update_truncation(state);
         self.deformer.deform(state)?;
         self.deformer.surface()
     }

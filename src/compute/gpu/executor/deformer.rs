@@ -196,11 +196,6 @@ impl CudaDeformer {
         self.output.count()
     }
 
-    /// Upper bound of any vertex's displacement by the truncated modes in the last step, in scene units.
-    pub fn truncation_bound(&self) -> f64 {
-        self.inputs.truncation_bound()
-    }
-
     /// Starts a step without waiting for the steps in flight. [`Self::finish`] waits for the oldest step.
     ///
     /// # Errors
@@ -241,12 +236,9 @@ impl CudaDeformer {
     }
 
     /// Whether a step ahead leaves everything that readers of the shown step read: the device has one buffer each for
-    /// displacements and boxes, and the host one truncation bound.
+    /// displacements and boxes.
     fn supports_steps_ahead(&self) -> bool {
-        !self.output.maps_gl_buffers()
-            && self.displacements.is_none()
-            && self.kernels.bounds.boxes.is_none()
-            && self.inputs.retained_chunk_counts().is_none()
+        !self.output.maps_gl_buffers() && self.displacements.is_none() && self.kernels.bounds.boxes.is_none()
     }
 
     /// Waits for the oldest step in flight.

@@ -6,7 +6,7 @@ use cudarc::driver::result;
 
 use crate::gpu::launch::error::cuda_error;
 use crate::gpu::launch::{Device, DeviceBuffer, PinnedBuffer, PinnedUse};
-use crate::gpu::tables::input_packing::{InputPacker, InputSizes, InputWriter, transform_links};
+use crate::gpu::tables::input_packing::{InputPacker, InputSizes, transform_links};
 use crate::gpu::tables::layout::StepHeader;
 use crate::gpu::tables::staging::SliceWriter;
 use modalcast_model::error::{Error, Result};
@@ -25,17 +25,13 @@ pub(crate) struct InputAddresses {
     pub q: u64,
     /// Per domain, the step that last changed it.
     pub change_steps: u64,
-    /// Per domain, the number of chunks (modes that are stored together) that it sums. Empty without truncation.
-    pub retained_counts: u64,
-    /// Per domain, the indices of these chunks. Empty without truncation.
-    pub retained: u64,
 }
 
-/// The device buffers of a step's values, and their writer.
+/// The device buffers of a step's values.
 #[derive(Debug)]
 pub struct StepInputs {
-    writer: InputWriter,
-    /// Header, transforms, q, and with truncation the counts and indices of the retained chunks.
+    packer: Arc<InputPacker>,
+    /// Header, transforms and q.
     values: DeviceBuffer,
     change_steps: DeviceBuffer,
     transform_links: DeviceBuffer,
@@ -63,7 +59,7 @@ impl StepInputs {
     pub fn new(device: &Device, packer: &Arc<InputPacker>) -> Result<Self> {
         let (scene, sizes) = (&packer.scene, InputSizes::of(&packer.scene, &packer.coordinates));
         Ok(Self {
-            writer: InputWriter::new(packer),
+            packer: Arc::clone(packer),
             values: DeviceBuffer::zeroed(device, sizes.total())?,
             change_steps: DeviceBuffer::zeroed(device, 4 * scene.domains.len() as u64)?,
             transform_links: DeviceBuffer::upload(device, &transform_links(scene))?,
@@ -84,7 +80,6 @@ impl StepInputs {
         let header = self.values.address();
         let transforms = header + size_of::<StepHeader>() as u64;
         let q = transforms + self.sizes.transforms;
-        let retained_counts = q + self.sizes.q;
         InputAddresses {
             header,
             transforms,
@@ -92,8 +87,6 @@ impl StepInputs {
             follower_frames: self.follower_frames.address(),
             q,
             change_steps: self.change_steps.address(),
-            retained_counts,
-            retained: retained_counts + self.sizes.retained_counts,
         }
     }
 
@@ -101,8 +94,8 @@ impl StepInputs {
     ///
     /// # Errors
     /// `Fault` when the device fails.
-    pub fn write(&mut self, staging: &mut StagingBuffer, header: &StepHeader, state: &SceneState) -> Result<()> {
-        self.writer.write(staging.as_mut_slice()?, header, state);
+    pub fn write(&self, staging: &mut StagingBuffer, header: &StepHeader, state: &SceneState) -> Result<()> {
+        self.packer.write(staging.as_mut_slice()?, header, state);
         Ok(())
     }
 
@@ -139,15 +132,5 @@ impl StepInputs {
     /// Bytes that a full step copies.
     pub const fn bytes(&self) -> u64 {
         self.sizes.total()
-    }
-
-    /// Number of chunks of modes that each domain sums in the last step; `None` in a scene without truncation.
-    pub fn retained_chunk_counts(&self) -> Option<&[u32]> {
-        self.writer.retained_chunk_counts()
-    }
-
-    /// Upper bound of any vertex's displacement by the truncated modes in the last step, in scene units.
-    pub(crate) fn truncation_bound(&self) -> f64 {
-        self.writer.truncation_bound()
     }
 }

@@ -24,10 +24,9 @@ pub struct ChangeListLengths {
 const CHANGE_WORDS: usize = size_of::<Change>() / 4;
 const TRANSFORM_WORDS: usize = 12;
 
-/// Maximum number of changed domains in a partial step. 0 if all steps are full: in a scene with too few domains, and
-/// in a scene that truncates modes, because only a full step uploads the set of truncated modes, which depends on q.
+/// Maximum number of changed domains in a partial step; 0 in a scene with too few domains, whose steps are all full.
 pub(crate) const fn max_changed_domains(scene: &Scene) -> usize {
-    if scene.features.truncation { 0 } else { scene.domains.len() / MAX_CHANGED_DIVISOR }
+    scene.domains.len() / MAX_CHANGED_DIVISOR
 }
 
 /// Maximum number of [`Change`]s of a partial step.
@@ -203,7 +202,5 @@ mod tests {
         assert_eq!([defaults, exact, boxes, displacements].map(max_entries), [3, 4, 4, 3]);
         assert_eq!(max_change_entries(&scene_with_deformation(&sizes, defaults)), 4, "a scene without followers");
         assert_eq!(max_changed_domains(&scene_with_followers(&sizes, defaults)), 4, "followers also change");
-        let truncated = DeformationSettings { truncation: Some(0.1), ..defaults };
-        assert_eq!(max_entries(truncated), 0);
     }
 }

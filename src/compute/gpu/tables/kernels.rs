@@ -19,7 +19,6 @@ pub(crate) const KERNELS: [KernelSource; 5] = [
         features: &[
             "MODES",
             "ONE_ITEM_PER_LANE",
-            "MODE_TRUNCATION",
             "COMPENSATED_SUM",
             "DISPLACEMENTS",
             "RIGID_NORMALS",
@@ -172,7 +171,6 @@ fn deform_defines(scene: &Scene, work: &WorkList) -> Vec<&'static str> {
         ("MODES", features.modes),
         ("ONE_ITEM_PER_LANE", has_one_item_per_lane(work)),
         (AXIS_PER_WARP, has_axis_per_warp(scene, work)),
-        ("MODE_TRUNCATION", features.truncation),
         ("COMPENSATED_SUM", features.compensated),
         ("DISPLACEMENTS", features.displacements),
         ("RIGID_NORMALS", has_rigid_normals),

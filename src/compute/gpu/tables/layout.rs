@@ -119,8 +119,6 @@ pub(crate) struct DeformArgs {
     pub follower_frames: u64,
     pub q: u64,
     pub tile_list: u64,
-    pub retained_counts: u64,
-    pub retained: u64,
     pub boxes: u64,
     pub tile_count: u32,
     pub reserved: u32,
@@ -257,7 +255,7 @@ const _: () = assert!(size_of::<WarpTile>() == 32, "WarpTile differs from kernel
 const _: () = assert!(size_of::<MixedQuad>() == 16, "MixedQuad differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<Change>() == 16, "Change differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<TransformLink>() == 8, "TransformLink differs from kernels/layout.cuh");
-const _: () = assert!(size_of::<DeformArgs>() == 152, "DeformArgs differs from kernels/layout.cuh");
+const _: () = assert!(size_of::<DeformArgs>() == 136, "DeformArgs differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<BatchGroup>() == 32, "BatchGroup differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<BatchMember>() == 16, "BatchMember differs from kernels/layout.cuh");
 const _: () = assert!(size_of::<BatchBlock>() == 16, "BatchBlock differs from kernels/layout.cuh");
@@ -302,8 +300,7 @@ pub fn layout_constants() -> Vec<LayoutConstant> {
         TransformLink { root, frame }
         DeformArgs {
             header, tiles, mixed_quads, words, rest_positions, rest_normals, rest_tangents, corner_offsets, scales,
-            mixed_quad_scales, transforms, transform_links, follower_frames, q, tile_list, retained_counts, retained, boxes, tile_count,
-            reserved
+            mixed_quad_scales, transforms, transform_links, follower_frames, q, tile_list, boxes, tile_count, reserved
         }
         BatchGroup { first_word, rest_quad, first_scale, vertex_count, first_member, chunk_count, member_count }
         BatchMember { first_vertex, first_q, domain, first_tile }

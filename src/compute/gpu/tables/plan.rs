@@ -188,7 +188,6 @@ fn list_omitted_features(scene: &Scene, tables: &DeviceTables) -> Vec<OmittedFea
         (features.modes, feature("modes", "the sum U q in `deform`", 0)),
         (features.normal_maps, feature("normal_maps", "tangents and their two buffers", tangent_bytes)),
         (features.shear, feature("shear", "the inverse transpose", 0)),
-        (features.truncation, feature("truncation", "lists of modes in `deform`", 0)),
         (
             features.exact_normals,
             feature(

@@ -149,7 +149,6 @@ impl LookKeys {
 pub(super) struct DeformKeys {
     storage: StorageType,
     normals: NormalMethod,
-    truncation: Option<f64>,
     compensated: bool,
     displacements: bool,
     boxes: bool,
@@ -163,7 +162,6 @@ impl DeformKeys {
         DeformationSettings {
             storage: self.storage,
             normals: self.normals,
-            truncation: self.truncation,
             compensated: self.compensated,
             displacements: self.displacements,
             boxes: self.boxes,

@@ -47,7 +47,7 @@ fn scene_keys_override_the_defaults() {
          model = 'a.obj'\nmodes = 'u.txt'\nplacement = { translation = [1, 2, 3] }\nlook.sunlight = [2, 2, 2]\n\
          look.antialias = 'fxaa'\nlook.bloom.strength = 0.25\nlook.tone = 'aces'\nlook.exposure = 1.5\n\
          look.dither = true\nlook.culling = 'depth'\nlook.raster = 'fastest'\n\
-         deform = { storage = 'int8', normals = 'exact', truncation = 1e-4, displacements = true, batches = 'never' }\n",
+         deform = { storage = 'int8', normals = 'exact', displacements = true, batches = 'never' }\n",
     )
     .expect("a valid manifest");
     assert_eq!((parts.name.as_str(), parts.up, parts.unit), ("n", UpAxis::Z, 0.01));
@@ -61,7 +61,6 @@ fn scene_keys_override_the_defaults() {
     let deformation = DeformationSettings {
         storage: StorageType::Int8,
         normals: NormalMethod::Exact,
-        truncation: Some(1e-4),
         displacements: true,
         ..DeformationSettings::default()
     };
@@ -221,6 +220,10 @@ fn invalid_manifest_is_rejected_with_line_or_entry() {
         ("model = 'a.obj'\nup = 'w'\n", "line 2: expected the keys and values of a scene, got unknown variant `w`"),
         ("model = \n", "line 1: expected the keys and values of a scene"),
         ("model = 'a.obj'\n[look]\nsky = 1\n", "line 3: expected the keys and values of a scene, got unknown field"),
+        (
+            "deform.truncation = 1e-4\n",
+            "line 1: expected the keys and values of a scene, got unknown field `truncation`",
+        ),
         ("model = 'a.obj'\n[[domain]]\nmodel = 'b.obj'\n", "model: expected either one model"),
         ("modes = 'u.txt'\n[[domain]]\nmodel = 'b.obj'\n", "modes: expected this key in the [[domain]] entries"),
         ("[[domain]]\nname = 'x'\n", "line 1: expected the keys and values of a scene, got missing field `model`"),

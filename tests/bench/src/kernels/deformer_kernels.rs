@@ -7,7 +7,6 @@ use serde::Serialize;
 
 use super::input_sets::InputSets;
 use super::kernel_benchmark::{ArrayTraffic, KernelAttributes, KernelBenchmark};
-use super::timer::MAX_GRAPHS;
 use modalcast_compute::gpu::launch::DeviceBuffer;
 use modalcast_compute::gpu::launchers::{
     ApplyKernel, BoundsKernel, ChangeListLengths, ChangedDomains, DeformKernel, DeviceTables, NormalsKernel,
@@ -15,7 +14,6 @@ use modalcast_compute::gpu::launchers::{
 };
 use modalcast_compute::gpu::step_input::{InputPart, StagingBuffer, StepHeader, StepInputs};
 use modalcast_compute::gpu::{BufferRole, CudaDeformerOptions, DeformPlan, Device, KernelDescriptor, KernelKind};
-use modalcast_compute::storage::modes_per_chunk;
 use modalcast_model::backend_settings::BatchPolicy;
 use modalcast_model::error::{Result, fault_in, invalid};
 use modalcast_model::scene::{Scene, SceneState};
@@ -135,12 +133,12 @@ impl DeformerBenchmark {
         for state in states {
             // Step 1 is a full step: it computes all domains.
             let header = StepHeader { last_full_step: 1, step: 1, ..benchmark.header() };
-            let mut inputs = StepInputs::new(device, benchmark.deform.packer())?;
+            let inputs = StepInputs::new(device, benchmark.deform.packer())?;
             let staging = match &mut staging {
                 Some(staging) => staging,
                 empty => empty.insert(inputs.allocate_staging(device)?),
             };
-            upload_step(device, (&mut inputs, staging), &header, state)?;
+            upload_step(device, (&inputs, staging), &header, state)?;
             benchmark.step_inputs.push(inputs);
         }
         changed.map_or(Ok(()), |changed| benchmark.apply_changes(device, states, changed))?;
@@ -148,8 +146,8 @@ impl DeformerBenchmark {
     }
 
     /// Replaces each input set by that of a step that changes only these domains.
-    fn apply_changes(&mut self, device: &Device, states: &[SceneState], changed: &[u32]) -> Result<()> {
-        let requirement = "a quarter of the domains at most, no truncation, and less work than a whole step";
+    fn apply_changes(&self, device: &Device, states: &[SceneState], changed: &[u32]) -> Result<()> {
+        let requirement = "a quarter of the domains at most, and less work than a whole step";
         let not_partial = || invalid("changed", requirement, changed.len());
         let mut apply = ApplyKernel::new(
             device,
@@ -158,7 +156,7 @@ impl DeformerBenchmark {
         )?;
         let mut change_list = apply.allocate_list(device)?;
         let full_step = StepHeader { last_full_step: 1, ..self.header() };
-        for (inputs, state) in self.step_inputs.iter_mut().zip(states) {
+        for (inputs, state) in self.step_inputs.iter().zip(states) {
             let mut staging = inputs.allocate_staging(device)?;
             // No domain is outdated: step 1 computed all domains.
             let lengths = apply.write(
@@ -197,26 +195,6 @@ impl DeformerBenchmark {
         }
     }
 
-    /// Fraction of the modes that truncation retains, weighted by vertices: the mean over the first [`MAX_GRAPHS`]
-    /// input sets, which are timed. `None` without truncation. Truncation omits whole chunks: the one, two or four
-    /// modes that are stored together.
-    fn retained_mode_share(&self) -> Option<f64> {
-        let per_chunk = modes_per_chunk(self.scene.deformation.storage);
-        let weighted_sum = |chunk_count_of: &dyn Fn(usize) -> usize| -> f64 {
-            let domain_layouts = self.scene.layout.domains.iter().enumerate();
-            domain_layouts
-                .map(|(domain, domain_layout)| domain_layout.vertices as f64 * chunk_count_of(domain) as f64)
-                .sum()
-        };
-        let all_chunks = weighted_sum(&|domain| self.scene.rank_of(domain).div_ceil(per_chunk));
-        let shares = self.step_inputs.iter().take(MAX_GRAPHS).map(|inputs| {
-            let retained = inputs.retained_chunk_counts()?;
-            Some(weighted_sum(&|domain| retained[domain] as usize) / all_chunks.max(1.0))
-        });
-        let shares: Vec<f64> = shares.collect::<Option<_>>()?;
-        Some(shares.iter().sum::<f64>() / shares.len().max(1) as f64)
-    }
-
     fn step_inputs(&self, input_set: usize) -> &StepInputs {
         &self.step_inputs[input_set % self.step_inputs.len()]
     }
@@ -243,7 +221,7 @@ fn select_output_defines(kernel: &mut KernelDescriptor, step_outputs: StepOutput
 /// Writes a step to its staging buffer, uploads it and waits for the copy.
 fn upload_step(
     device: &Device,
-    (inputs, staging): (&mut StepInputs, &mut StagingBuffer),
+    (inputs, staging): (&StepInputs, &mut StagingBuffer),
     header: &StepHeader,
     state: &SceneState,
 ) -> Result<()> {
@@ -337,11 +315,8 @@ impl KernelBenchmark for DeformerBenchmark {
 
     fn traffic(&self) -> Vec<ArrayTraffic> {
         let StepCounts { vertices, coordinates, transform_bytes, mode_bytes, rest_bytes } = self.counts;
-        // The part of U that truncation retains.
-        let retained_traffic = |share: f64| ArrayTraffic::new("U kept", (share * mode_bytes as f64) as u64);
-        let mode_traffic = self.retained_mode_share().map_or(ArrayTraffic::new("U", mode_bytes), retained_traffic);
         let mut traffic = vec![
-            mode_traffic,
+            ArrayTraffic::new("U", mode_bytes),
             ArrayTraffic::new("scales", self.plan.bytes(BufferRole::Scales)),
             ArrayTraffic::new("q", 4 * coordinates),
         ];

@@ -19,9 +19,7 @@ use crate::timing::{Timing, quantile};
 use crate::workloads::Workload;
 use modalcast_compute::gpu::Device;
 use modalcast_compute::gpu::launch::{PinnedBuffer, PinnedUse};
-use modalcast_compute::gpu::step_input::{
-    InputPacker, InputWriter, PARALLEL_THRESHOLD, StepHeader, StepInputs, parallel_copy,
-};
+use modalcast_compute::gpu::step_input::{InputPacker, PARALLEL_THRESHOLD, StepHeader, StepInputs, parallel_copy};
 use modalcast_compute::gpu::{CudaDeformer, CudaDeformerOptions, MAX_STEPS_IN_FLIGHT};
 use modalcast_model::deform::{DeformedSurface, Deformer as _, VertexAttributes};
 use modalcast_model::error::{Result, fault_in, invalid};
@@ -240,12 +238,11 @@ fn time_input_writes(
     let packer = Arc::new(InputPacker::sizes_only(scene));
     let mut staging = StepInputs::new(device, &packer)?.allocate_staging(device)?;
     let words = staging.as_mut_slice()?;
-    let mut writer = InputWriter::new(&packer);
     let bytes = size_of_val(words) as u64;
     let mut measure = move || {
         let mut time_write = |step: usize| {
             let begin = Instant::now();
-            writer.write(words, &StepHeader::default(), &states[step % states.len()]);
+            packer.write(words, &StepHeader::default(), &states[step % states.len()]);
             elapsed_us(begin)
         };
         // An untimed warm-up.

@@ -21,7 +21,7 @@ const BATCH_REPLAYS: usize = 25;
 const DELAY_US: u64 = 40;
 
 /// Maximum number of graphs that the replays rotate through. Each graph has its own input set.
-pub(super) const MAX_GRAPHS: usize = 8;
+const MAX_GRAPHS: usize = 8;
 
 /// Warm-up time before timing, so that the device reaches its clock rates.
 const WARM_UP: Duration = Duration::from_millis(30);

@@ -42,7 +42,7 @@ impl KernelBenchmark for UploadBenchmark {
 /// `Fault` when the device fails; `Invalid` when `replays` is 0.
 pub fn time_upload(device: &Device, scene: &Arc<Scene>, state: &SceneState, replays: usize) -> Result<(u64, Timing)> {
     // `sizes_only` packs wrong values of the right sizes. The values do not affect the time of a copy.
-    let mut inputs = StepInputs::new(device, &Arc::new(InputPacker::sizes_only(scene)))?;
+    let inputs = StepInputs::new(device, &Arc::new(InputPacker::sizes_only(scene)))?;
     let mut staging = inputs.allocate_staging(device)?;
     inputs.write(&mut staging, &StepHeader::default(), state)?;
     let bytes = inputs.bytes();

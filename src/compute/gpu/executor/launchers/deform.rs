@@ -248,8 +248,6 @@ impl DeformKernel {
             follower_frames: values.follower_frames,
             q: values.q,
             tile_list: self.tile_list.address(),
-            retained_counts: values.retained_counts,
-            retained: values.retained,
             boxes: self.boxes.address(),
             tile_count: self.full_step_tiles,
             reserved: 0,

@@ -4,8 +4,8 @@
 use super::super::kernels::storage_define;
 use super::super::rings::RingTables;
 use super::super::test_scenes::{
-    rigid_scene, scene, scene_with_deformation, scene_with_exact_normals, scene_with_followers, scene_with_normal_map,
-    scene_with_readbacks, scene_with_storage, scene_without_shadow,
+    rigid_scene, scene, scene_with_exact_normals, scene_with_followers, scene_with_normal_map, scene_with_readbacks,
+    scene_with_storage, scene_without_shadow,
 };
 use super::super::work::{CoordinateLayout, WorkList};
 use super::*;
@@ -36,7 +36,7 @@ fn unused_features_are_not_compiled_or_stored() {
     assert_eq!((minimal.bytes(BufferRole::ModeWords), minimal.bytes(BufferRole::Scales)), (0, 0));
     assert_eq!(minimal.bytes_in, 112 + 48 * 4, "a header and four transforms, but no q");
     let omitted: Vec<_> = minimal.omitted.iter().map(|omitted| omitted.feature).collect();
-    let never_used = ["truncation", "exact_normals", "compensated", "followers", "displacements", "boxes", "batches"];
+    let never_used = ["exact_normals", "compensated", "followers", "displacements", "boxes", "batches"];
     assert_eq!(omitted, [&["modes", "normal_maps", "shear"][..], &never_used].concat());
     // Shapes have 9 + 302 = 311 corners, domains twice as many.
     assert_eq!(minimal.omitted[1].bytes, 16 * (311 + 622), "`normal_maps`: rest and world tangents of every corner");
@@ -52,8 +52,8 @@ fn used_features_are_compiled_and_stored() {
     assert_eq!(full.bytes(BufferRole::Tangents), 16 * 2 * (9 + 302));
     assert_eq!(full.bytes(BufferRole::RestTangents), 64 * (3 + 76), "64 bytes per quad of four corners");
     assert_eq!(full.bytes_in, 112 + 48 * 4 + 4 * 4, "a header, four transforms and four coordinates");
-    // Of the eleven optional features, this scene uses modes, normal maps, shear and shadows.
-    assert_eq!(full.omitted.len(), 7);
+    // Of the ten optional features, this scene uses modes, normal maps, shear and shadows.
+    assert_eq!(full.omitted.len(), 6);
 }
 
 #[test]
@@ -179,8 +179,6 @@ fn scenes_without_partial_steps_have_no_change_lists() {
     // Two instances of each shape.
     assert!(!has_lists(&scene(&[(7, 1)])), "a quarter of two domains is less than one domain");
     assert!(has_lists(&scene(&[(7, 1), (7, 1)])));
-    let truncated = DeformationSettings { truncation: Some(0.1), ..DeformationSettings::default() };
-    assert!(!has_lists(&scene_with_deformation(&[(7, 1), (7, 1)], truncated)), "truncation requires full steps");
 }
 
 #[test]

@@ -40,8 +40,8 @@ pub(crate) struct BatchTables {
 /// Per shape, whether its domains are deformed in batches.
 pub(crate) fn batched_shapes(scene: &Scene, policy: BatchPolicy) -> Vec<bool> {
     let features = scene.features;
-    // `batch` neither truncates nor compensates its sums, and writes no displacements.
-    let is_supported = !(features.truncation || features.compensated || features.displacements);
+    // `batch` does not compensate its sums, and writes no displacements.
+    let is_supported = !(features.compensated || features.displacements);
     let is_batched = |(shape, user_count): (&Shape, usize)| {
         let bytes = (48 * quad_count(shape) * chunk_count(scene, shape)) as u64;
         let is_faster = bytes >= MIN_SHAPE_BYTES || user_count as u64 * bytes >= MIN_READ_BYTES;

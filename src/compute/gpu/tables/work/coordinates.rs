@@ -18,9 +18,9 @@ pub(crate) struct CoordinateLayout {
 impl CoordinateLayout {
     pub(crate) fn new(scene: &Scene) -> Self {
         let storage = scene.deformation.storage;
-        // Domains may share coordinates. Factors belong to a shape and retained chunks to a domain, so with either of
-        // them each domain has its own coordinates on the device.
-        if storage == StorageType::F32 && !scene.features.truncation {
+        // Domains may share coordinates. Factors belong to a shape, so with factors each domain has its own coordinates
+        // on the device.
+        if storage == StorageType::F32 {
             let first_q = scene.layout.domains.iter().map(|layout| layout.first_q as u32).collect();
             return Self { first_q, total: scene.layout.coordinates.next_multiple_of(4), is_scene_order: true };
         }
