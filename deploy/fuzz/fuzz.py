@@ -1,6 +1,7 @@
 """Runs the fuzzers for a time per target, keeps their crashes and corpora, and adds the executions to the record."""
 
 import argparse
+import concurrent.futures
 import datetime
 import json
 import os
@@ -82,7 +83,7 @@ class Target:
             )
             counted = re.search(r"stat::number_of_executed_units:\s+(\d+)", output)
             if not counted:
-                sys.exit(f"{self.target}: expected the statistics of libFuzzer, got:\n{output[-3000:]}")
+                raise RuntimeError(f"{self.target}: expected the statistics of libFuzzer, got:\n{output[-3000:]}")
             executions += int(counted[1])
             if new := set(self.crashes.iterdir()) - before:
                 print(output[-3000:], f"{self.target}: crash: {sorted(file.name for file in new)}", sep="\n")
@@ -109,37 +110,58 @@ class Target:
         return len(files)
 
 
-def add_to_record(target, executions, seconds, crashes):
-    """Adds a run to the record."""
+def add_to_record(runs):
+    """Adds runs, by target, to the record. A run has the fields of a target in the record."""
     record = json.loads(RECORD.read_text()) if RECORD.exists() else {"targets": {}}
-    entry = record["targets"].setdefault(target, {"executions": 0, "seconds": 0, "crashes_found": 0})
-    entry["executions"] += executions
-    entry["seconds"] = round(entry["seconds"] + seconds)
-    entry["crashes_found"] += crashes
-    entry["date"] = datetime.date.today().isoformat()
+    for target, run in runs.items():
+        entry = record["targets"].setdefault(target, {"executions": 0, "seconds": 0, "crashes_found": 0, "date": ""})
+        for count in ["executions", "seconds", "crashes_found"]:
+            entry[count] += run[count]
+        entry["date"] = max(entry["date"], run["date"])
     record["targets"] = dict(sorted(record["targets"].items()))
     record["executions"] = sum(entry["executions"] for entry in record["targets"].values())
+    RECORD.parent.mkdir(parents=True, exist_ok=True)
     RECORD.write_text(json.dumps(record, indent=2) + "\n")
+
+
+def run_target(programs, name, seconds, keep):
+    """Fuzzes a target. Returns the run for the record, and a sentence about it."""
+    target = Target(programs, name)
+    executions, elapsed, crashes = target.fuzz(seconds)
+    run = {"executions": executions, "seconds": round(elapsed), "crashes_found": crashes}
+    run["date"] = datetime.date.today().isoformat()
+    kept = f", {target.keep()} inputs kept" if keep else ""
+    return run, f"{name}: {executions} executions in {elapsed:.0f} s, {crashes} crashes{kept}"
 
 
 def main():
     parser = argparse.ArgumentParser(prog="deploy/fuzz/run", description="Fuzzes what the server and its clients read.")
     parser.add_argument("--seconds", type=float, default=60, help="time per target, default 60")
+    parser.add_argument("--jobs", type=int, default=1, help="targets at a time, default 1")
     parser.add_argument("--keep", action="store_true", help="replace the corpora of the repository afterwards")
+    parser.add_argument("--add", metavar="RECORD", help="only add the record of another copy of the project")
     parser.add_argument("targets", nargs="*", metavar="TARGET", help=f"default all: {' '.join(TARGETS)}")
     arguments = parser.parse_args()
+    if arguments.add:
+        add_to_record(json.loads(Path(arguments.add).read_text())["targets"])
+        return
     programs = [Path(program) for program in os.environ["MODALCAST_FUZZERS"].split()]
     if unknown := set(arguments.targets) - set(TARGETS):
         parser.error(f"expected targets of {' '.join(TARGETS)}, got {' '.join(sorted(unknown))}")
-    crashes = 0
-    for name in arguments.targets or TARGETS:
-        target = Target(programs, name)
-        executions, seconds, new_crashes = target.fuzz(arguments.seconds)
-        add_to_record(name, executions, seconds, new_crashes)
-        kept = f", {target.keep()} inputs kept" if arguments.keep else ""
-        print(f"{name}: {executions} executions in {seconds:.0f} s, {new_crashes} crashes{kept}", flush=True)
-        crashes += new_crashes
-    sys.exit(1 if crashes else 0)
+    failures = 0
+    with concurrent.futures.ThreadPoolExecutor(arguments.jobs) as pool:
+        names = arguments.targets or list(TARGETS)
+        runs = {pool.submit(run_target, programs, name, arguments.seconds, arguments.keep): name for name in names}
+        for finished in concurrent.futures.as_completed(runs):
+            if error := finished.exception():
+                print(error, flush=True)
+                failures += 1
+                continue
+            run, sentence = finished.result()
+            add_to_record({runs[finished]: run})
+            print(sentence, flush=True)
+            failures += run["crashes_found"]
+    sys.exit(1 if failures else 0)
 
 
 if __name__ == "__main__":

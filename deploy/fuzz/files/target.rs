@@ -1,11 +1,15 @@
 //! The targets of model files. Each opens a small scene with one file that has the content of the input. The fuzzer and
 //! `replay.rs` run them.
 
+#[path = "../temporary_folder.rs"]
+mod temporary_folder;
+
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use modalcast_model::load::SceneRepository;
 use modalcast_model::memory::{MemoryBudget, MemoryKind, MemoryReservation};
+use temporary_folder::temporary_folder;
 
 /// The memory in bytes that a scene may take.
 const MAX_MEMORY: u64 = 256 << 20;
@@ -115,11 +119,4 @@ impl FileTarget {
     fn path(&self, name: &str) -> PathBuf {
         self.folder.path().join(name)
     }
-}
-
-/// A temporary folder in memory, where the system has one.
-fn temporary_folder() -> tempfile::TempDir {
-    let memory = Path::new("/dev/shm");
-    let folder = if memory.is_dir() { tempfile::tempdir_in(memory) } else { tempfile::tempdir() };
-    folder.expect("expected a writable folder")
 }

@@ -1,9 +1,13 @@
 //! The target of recordings: reads, repairs and exports a file with the content of the input. The fuzzer and
 //! `clients/recording/tests/files.rs` run it.
 
+#[path = "../temporary_folder.rs"]
+mod temporary_folder;
+
 use std::fs;
 
 use modalcast_recording::{Error, Recording, Result, Topic, export_gltf, export_html, export_npz, recover};
+use temporary_folder::temporary_folder;
 
 /// A temporary folder for the recording and its exports.
 pub(crate) struct RecordingTarget {
@@ -14,9 +18,7 @@ impl RecordingTarget {
     /// # Panics
     /// If there is no writable folder.
     pub(crate) fn new() -> Self {
-        let memory = std::path::Path::new("/dev/shm");
-        let folder = if memory.is_dir() { tempfile::tempdir_in(memory) } else { tempfile::tempdir() };
-        Self { folder: folder.expect("expected a writable folder") }
+        Self { folder: temporary_folder() }
     }
 
     /// Uses the input in every way. An invalid file is an error, which has no effect here.
