@@ -22,6 +22,7 @@ FUZZERS = {
     "recordings": "recording",
     "cubic_forces": "cub",
     "steps": "step",
+    "calls": "drive_scene upload_arrays upload_scene",
 }
 TARGETS = {target: fuzzer for fuzzer, targets in FUZZERS.items() for target in targets.split()}
 

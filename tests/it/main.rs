@@ -19,6 +19,7 @@ mod forces;
 mod frames;
 mod import_cycles;
 mod invalid_input;
+mod kept_calls;
 mod layering;
 mod light;
 mod loads;
