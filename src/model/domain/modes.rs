@@ -28,15 +28,7 @@ impl Modes {
     /// `Invalid` if the number of rows is not a positive multiple of three, there are more than 512 columns, the number
     /// of entries differs from rows x columns, or an entry is not finite.
     pub fn from_columns(rows: usize, rank: usize, columns: Vec<f32>) -> Result<Self> {
-        if !rows.is_multiple_of(3) || rows == 0 {
-            return Err(invalid("modes.rows", "a positive multiple of 3", rows));
-        }
-        if rank > MAX_RANK {
-            return Err(invalid("modes.columns", format!("0 to {MAX_RANK}"), rank));
-        }
-        if rows.checked_mul(rank) != Some(columns.len()) {
-            return Err(invalid("modes.entries", format!("{rows} x {rank}"), columns.len()));
-        }
+        check_sizes(rows, rank, columns.len())?;
         if let Some(index) = columns.iter().position(|entry| !entry.is_finite()) {
             let field = format!("modes[{}, {}]", index % rows, index / rows);
             return Err(invalid(field, "a finite number", columns[index]));
@@ -52,9 +44,7 @@ impl Modes {
     /// # Errors
     /// As for [`Self::from_columns`].
     pub fn from_rows(rows: usize, rank: usize, entries: &[f32]) -> Result<Self> {
-        if rows.checked_mul(rank) != Some(entries.len()) {
-            return Err(invalid("modes.entries", format!("{rows} x {rank}"), entries.len()));
-        }
+        check_sizes(rows, rank, entries.len())?;
         let columns = (0..rank).flat_map(|mode| (0..rows).map(move |row| entries[row * rank + mode])).collect();
         Self::from_columns(rows, rank, columns)
     }
@@ -101,6 +91,19 @@ impl Modes {
     /// Replaces U by [`Self::rigid`] if all entries are zero.
     pub fn without_zero_matrix(self) -> Self {
         if self.columns.iter().all(|entry| *entry == 0.0) { Self::rigid() } else { self }
+    }
+}
+
+fn check_sizes(rows: usize, rank: usize, entries: usize) -> Result<()> {
+    if !rows.is_multiple_of(3) || rows == 0 {
+        return Err(invalid("modes.rows", "a positive multiple of 3", rows));
+    }
+    if rank > MAX_RANK {
+        return Err(invalid("modes.columns", format!("0 to {MAX_RANK}"), rank));
+    }
+    match rows.checked_mul(rank) {
+        Some(expected) if expected == entries => Ok(()),
+        _ => Err(invalid("modes.entries", format!("{rows} x {rank}"), entries)),
     }
 }
 

@@ -84,6 +84,7 @@ mod tests {
             ),
             ("3 1\n1\nx\n3\n", "line 3: expected a number, got x"),
             ("3 1\n1\nnan\n3\n", "modes[1, 0]: expected a finite number, got NaN"),
+            ("0 82022820221111090\n", "modes.rows: expected a positive multiple of 3, got 0"),
             ("4 1\n1 2 3 4\n", "modes.rows: expected a positive multiple of 3, got 4"),
         ] {
             assert_eq!(parse(text.as_bytes()).expect_err(text).to_string(), message);
