@@ -43,7 +43,7 @@ NOT_CLAIMED = {
     12: "names in the errors of all loaders",
     13: "faults of CUDA here, without a GPU; tests/gpu/faults.rs plans them on one",
     14: "hostile recordings that a page opens in the browser",
-    15: "uploads and messages of WebSockets; 10^8 executions, and coverage of 90 % of the lines of the loaders",
+    15: "messages of WebSockets; 10^8 executions, and coverage of 90 % of the lines of the loaders",
 }
 
 # The rows R of the promises of a robust server: what each promises, and the item that checks it or a part of it, or the
