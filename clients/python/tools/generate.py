@@ -54,7 +54,7 @@ def sync_modules() -> dict[Path, str]:
 
 
 def proto_modules(tools: Path) -> dict[Path, str]:
-    """The modules of the messages by path. Installs grpcio-tools into the folder `tools`, for this version of Python."""
+    """The modules of the messages by path. Installs grpcio-tools for this Python into a folder in `tools`."""
     tools /= f"{sys.version_info.major}.{sys.version_info.minor}"
     if not (tools / "grpc_tools").exists():
         install = [sys.executable, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-deps"]
