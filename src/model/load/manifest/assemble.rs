@@ -81,8 +81,8 @@ struct LoadedModel {
     domains: Vec<Domain>,
 }
 
-/// What entries that share a model have in common: the path of the model file or a built-in name, the name of the modes file, and the bits
-/// of the crease angle in degrees.
+/// What entries that share a model have in common: the path of the model file or the built-in name, the name of the
+/// modes file, and the bits of the crease angle in degrees.
 type ModelKey = (PathBuf, Option<String>, u64);
 
 /// Adds the entries of a manifest to a scene, one after another.
