@@ -1,14 +1,14 @@
 //! Budgets for the bytes of replies that are produced and not yet sent, per connection and in total.
 //!
 //! A message counts from the moment when it is queued until HTTP/2 has written its last byte to the socket. A sender
-//! without budget waits. The wait is bounded: a call whose client takes no bytes for the reply timeout ends as soon as
+//! without budget waits; the connection that holds the fewest bytes is the first to continue. The wait is bounded: a call whose client takes no bytes for the reply timeout ends as soon as
 //! another sender waits for the same budget. If that does not free the bytes, the connection is closed. If the total is
 //! exhausted, a connection that holds more than its share and takes nothing for a shorter time is closed, so that a few
 //! connections do not delay all others.
 
 use std::collections::{HashMap, VecDeque};
 use std::pin::Pin;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, Weak};
 use std::task::{Context, Poll};
 use std::time::{Duration, Instant};
@@ -20,6 +20,7 @@ use tonic::Status;
 use tonic::body::Body;
 
 use super::connection_table::CountedCall;
+use super::fair_bytes::{FairBytes, Granted, Holder};
 use crate::config::Config;
 use crate::engine::lock;
 use modalcast_model::error::Error;
@@ -41,18 +42,11 @@ const MIN_SHARE: usize = 4 << 20;
 /// The budget of all connections.
 #[derive(Debug)]
 pub(super) struct ReplyBudget {
-    share: Share,
+    bytes: Arc<FairBytes>,
     max_connection_bytes: usize,
     /// Time without progress after which a call may be ended.
     reply_timeout: Duration,
     connections: Registry<ConnectionReplyBudget>,
-}
-
-/// A limited number of bytes.
-#[derive(Debug)]
-struct Share {
-    permits: Arc<Semaphore>,
-    max_bytes: usize,
 }
 
 /// The budget of one connection.
@@ -61,12 +55,17 @@ pub(super) struct ConnectionReplyBudget {
     total: Arc<ReplyBudget>,
     /// Key in `ReplyBudget::connections`.
     id: u64,
-    share: Share,
+    /// What the connection holds of the total.
+    of_total: Arc<Holder>,
+    /// The budget of the connection.
+    permits: Arc<Semaphore>,
+    max_bytes: usize,
     /// Held by the sender that waits for the total. One sender per connection waits there, so that connections with
     /// many calls do not delay the others.
     turn: tokio::sync::Mutex<()>,
     close: Arc<Notify>,
     calls: Registry<CallReplies>,
+    progress: Mutex<Progress>,
 }
 
 /// The unsent replies of one call.
@@ -77,15 +76,39 @@ pub(super) struct CallReplies {
     id: u64,
     progress: Mutex<Progress>,
     ended: Notify,
+    /// Whether the call was ended because its client does not read.
+    is_ended: AtomicBool,
 }
 
-#[derive(Debug)]
+/// How a connection or a call sends what was produced for it.
+#[derive(Debug, Clone, Copy)]
 struct Progress {
     unsent_bytes: usize,
     /// When bytes were last sent, or when the first unsent bytes were produced.
     last_change: Instant,
-    /// Whether the call was ended because its client does not read.
-    is_ended: bool,
+}
+
+impl Progress {
+    fn new() -> Self {
+        Self { unsent_bytes: 0, last_change: Instant::now() }
+    }
+
+    fn produce(&mut self, bytes: usize) {
+        if self.unsent_bytes == 0 {
+            self.last_change = Instant::now();
+        }
+        self.unsent_bytes += bytes;
+    }
+
+    fn send(&mut self, bytes: usize) {
+        self.unsent_bytes -= bytes;
+        self.last_change = Instant::now();
+    }
+
+    /// Time for which unsent bytes have waited without any being sent.
+    fn stall(&self) -> Duration {
+        if self.unsent_bytes > 0 { self.last_change.elapsed() } else { Duration::ZERO }
+    }
 }
 
 /// Bytes of a reply that count against the budgets until this is dropped.
@@ -96,7 +119,7 @@ pub(super) struct UnsentBytes {
     /// What these bytes take from the budget of the connection.
     of_connection: OwnedSemaphorePermit,
     /// What these bytes take from the budget of all connections.
-    of_total: OwnedSemaphorePermit,
+    of_total: Granted,
 }
 
 /// All existing objects of a kind.
@@ -136,27 +159,14 @@ impl<T> Registry<T> {
     }
 }
 
-impl Share {
-    fn new(bytes: usize) -> Self {
-        let max_bytes = bytes.min(u32::MAX as usize).min(Semaphore::MAX_PERMITS);
-        Self { permits: Arc::new(Semaphore::new(max_bytes)), max_bytes }
-    }
-
-    /// Acquires bytes, at most all of the share. Calls `search` repeatedly during a wait.
-    async fn acquire(
-        &self,
-        bytes: usize,
-        search_interval: Duration,
-        search: impl Fn(),
-    ) -> Result<OwnedSemaphorePermit, Status> {
-        let mut acquire =
-            std::pin::pin!(Arc::clone(&self.permits).acquire_many_owned(bytes.min(self.max_bytes) as u32));
-        loop {
-            tokio::select! {
-                biased;
-                permit = &mut acquire => return permit.map_err(|_| Status::internal("the reply budget is closed")),
-                () = tokio::time::sleep(search_interval) => search(),
-            }
+/// Waits for bytes, and calls `search` after each `interval` of the wait.
+async fn search_while_waiting<T>(acquire: impl Future<Output = T>, interval: Duration, search: impl Fn()) -> T {
+    let mut acquire = std::pin::pin!(acquire);
+    loop {
+        tokio::select! {
+            biased;
+            granted = &mut acquire => return granted,
+            () = tokio::time::sleep(interval) => search(),
         }
     }
 }
@@ -164,7 +174,7 @@ impl Share {
 impl ReplyBudget {
     pub(super) fn new(config: &Config) -> Arc<Self> {
         Arc::new(Self {
-            share: Share::new(config.reply_bytes),
+            bytes: FairBytes::new(config.reply_bytes),
             max_connection_bytes: config.connection_reply_bytes,
             reply_timeout: config.reply_timeout,
             connections: Registry::new(),
@@ -173,9 +183,18 @@ impl ReplyBudget {
 
     /// The budget of a new connection, which `close` closes.
     pub(super) fn new_connection(self: &Arc<Self>, close: Arc<Notify>) -> Arc<ConnectionReplyBudget> {
-        let (total, share) = (Arc::clone(self), Share::new(self.max_connection_bytes));
-        let (turn, calls) = (tokio::sync::Mutex::default(), Registry::new());
-        self.connections.insert(|id| ConnectionReplyBudget { total, id, share, turn, close, calls })
+        let max_bytes = self.max_connection_bytes.min(u32::MAX as usize).min(Semaphore::MAX_PERMITS);
+        self.connections.insert(|id| ConnectionReplyBudget {
+            total: Arc::clone(self),
+            id,
+            of_total: self.bytes.new_holder(),
+            permits: Arc::new(Semaphore::new(max_bytes)),
+            max_bytes,
+            turn: tokio::sync::Mutex::default(),
+            close,
+            calls: Registry::new(),
+            progress: Mutex::new(Progress::new()),
+        })
     }
 
     /// How often a sender that waits for its connection searches for stalled calls.
@@ -191,10 +210,8 @@ impl ReplyBudget {
     /// Ends the stalled calls of all connections, and closes stalled connections above their share.
     fn relieve(&self) {
         let connections = self.connections.search(self.total_search_interval() / 2);
-        let calls_of = |connection: &Arc<ConnectionReplyBudget>| connection.calls.search(Duration::ZERO);
-        let calls: Vec<_> = connections.iter().map(calls_of).collect();
-        let loads: Vec<_> = calls.iter().map(|calls| Load::of(calls)).collect();
-        for index in find_connections_above_share(&loads, self.share.max_bytes, EVICTION_STALL) {
+        let loads: Vec<_> = connections.iter().map(|connection| *lock(&connection.progress)).collect();
+        for index in find_connections_above_share(&loads, self.bytes.max_bytes(), EVICTION_STALL) {
             let unsent_bytes = loads[index].unsent_bytes;
             tracing::warn!(
                 unsent_bytes,
@@ -202,38 +219,17 @@ impl ReplyBudget {
             );
             connections[index].close.notify_one();
         }
-        end_stalled(&calls.concat(), self.reply_timeout, Some(MAX_STALL * self.reply_timeout));
-    }
-}
-
-/// The unsent bytes of a connection.
-#[derive(Debug, Clone, Copy)]
-struct Load {
-    unsent_bytes: usize,
-    /// Time since bytes of any call were last sent.
-    stall: Duration,
-}
-
-impl Load {
-    fn of(calls: &[Arc<CallReplies>]) -> Self {
-        let mut load = Self { unsent_bytes: 0, stall: Duration::MAX };
-        for call in calls {
-            let progress = lock(&call.progress);
-            if progress.unsent_bytes > 0 {
-                load.unsent_bytes += progress.unsent_bytes;
-                load.stall = load.stall.min(progress.last_change.elapsed());
-            }
-        }
-        load
+        let calls: Vec<_> = connections.iter().flat_map(|connection| connection.calls.search(Duration::ZERO)).collect();
+        end_stalled(&calls, self.reply_timeout, Some(MAX_STALL * self.reply_timeout));
     }
 }
 
 /// The stalled connections that hold more than an equal share of the total, beginning with the largest, until they hold
 /// a quarter of the total together. The connection that waits counts for the shares, too.
-fn find_connections_above_share(loads: &[Load], max_bytes: usize, stall: Duration) -> Vec<usize> {
+fn find_connections_above_share(loads: &[Progress], max_bytes: usize, stall: Duration) -> Vec<usize> {
     let holders = loads.iter().filter(|load| load.unsent_bytes > 0).count();
     let share = MIN_SHARE.max(max_bytes / (holders + 1));
-    let is_above_share = |index: &usize| loads[*index].unsent_bytes > share && loads[*index].stall >= stall;
+    let is_above_share = |index: &usize| loads[*index].unsent_bytes > share && loads[*index].stall() >= stall;
     let mut found: Vec<usize> = (0..loads.len()).filter(is_above_share).collect();
     found.sort_by_key(|index| std::cmp::Reverse(loads[*index].unsent_bytes));
     let mut freed_bytes = 0;
@@ -249,9 +245,8 @@ impl ConnectionReplyBudget {
     /// The replies of a new call.
     pub(super) fn new_call(self: &Arc<Self>) -> Arc<CallReplies> {
         let connection = Arc::clone(self);
-        let progress = Progress { unsent_bytes: 0, last_change: Instant::now(), is_ended: false };
-        let (progress, ended) = (Mutex::new(progress), Notify::new());
-        self.calls.insert(|id| CallReplies { connection, id, progress, ended })
+        let (progress, ended) = (Mutex::new(Progress::new()), Notify::new());
+        self.calls.insert(|id| CallReplies { connection, id, progress, ended, is_ended: AtomicBool::new(false) })
     }
 
     /// Ends the stalled calls of this connection, unless they were searched less than `interval` ago.
@@ -275,19 +270,30 @@ impl CallReplies {
         let connection = &self.connection;
         let total = &connection.total;
         // A larger message passes with all permits of its connection.
-        let permits = bytes.min(connection.share.max_bytes);
+        let permits = bytes.min(connection.max_bytes);
         let interval = total.search_interval();
         let end_own = || connection.end_stalled_calls(interval / 2);
-        let of_connection = connection.share.acquire(permits, interval, end_own).await?;
+        let of_connection = Arc::clone(&connection.permits).acquire_many_owned(permits as u32);
+        let of_connection = search_while_waiting(of_connection, interval, end_own)
+            .await
+            .map_err(|_| Status::internal("the reply budget is closed"))?;
         let turn = connection.turn.lock().await;
-        let of_total = total.share.acquire(permits, total.total_search_interval(), || total.relieve()).await?;
+        let of_total = connection.of_total.acquire(permits);
+        let of_total = search_while_waiting(of_total, total.total_search_interval(), || total.relieve()).await;
         drop(turn);
-        let mut progress = lock(&self.progress);
-        if progress.unsent_bytes == 0 {
-            progress.last_change = Instant::now();
-        }
-        progress.unsent_bytes += bytes;
+        self.each_progress(|progress| progress.produce(bytes));
         Ok(UnsentBytes { call: Arc::clone(self), bytes, of_connection, of_total })
+    }
+
+    /// Changes the progress of the call and of its connection.
+    fn each_progress(&self, change: impl Fn(&mut Progress)) {
+        for progress in [&self.progress, &self.connection.progress] {
+            change(&mut lock(progress));
+        }
+    }
+
+    fn is_ended(&self) -> bool {
+        self.is_ended.load(Ordering::Relaxed)
     }
 
     /// Waits until the call is ended because its client does not read. Cancel-safe.
@@ -308,24 +314,24 @@ impl CallReplies {
 fn end_stalled(calls: &[Arc<CallReplies>], timeout: Duration, max_stall: Option<Duration>) {
     let is_stalled = |call: &&Arc<CallReplies>| {
         let progress = lock(&call.progress);
-        progress.unsent_bytes > 0 && progress.last_change.elapsed() >= timeout
+        progress.unsent_bytes > 0 && progress.stall() >= timeout
     };
     let stalled = calls.iter().filter(is_stalled);
-    let (ended, running): (Vec<_>, Vec<_>) = stalled.partition(|call| lock(&call.progress).is_ended);
+    let (ended, running): (Vec<_>, Vec<_>) = stalled.partition(|call| call.is_ended());
     for call in &running {
-        let mut progress = lock(&call.progress);
-        (progress.is_ended, progress.last_change) = (true, Instant::now());
+        call.is_ended.store(true, Ordering::Relaxed);
+        lock(&call.progress).last_change = Instant::now();
         call.ended.notify_one();
     }
     if running.is_empty() {
         for call in ended {
-            let (unsent_bytes, stall) = {
-                let progress = lock(&call.progress);
-                (progress.unsent_bytes, progress.last_change.elapsed())
-            };
-            if max_stall.is_none_or(|max_stall| stall < max_stall) && holds_sendable_bytes(calls, &call.connection) {
+            let progress = *lock(&call.progress);
+            if max_stall.is_none_or(|max_stall| progress.stall() < max_stall)
+                && holds_sendable_bytes(calls, &call.connection)
+            {
                 continue;
             }
+            let unsent_bytes = progress.unsent_bytes;
             tracing::warn!(unsent_bytes, "a connection that does not read its replies is closed");
             call.connection.close.notify_one();
         }
@@ -334,10 +340,8 @@ fn end_stalled(calls: &[Arc<CallReplies>], timeout: Duration, max_stall: Option<
 
 /// Whether a call of the connection that was not ended has unsent bytes.
 fn holds_sendable_bytes(calls: &[Arc<CallReplies>], connection: &Arc<ConnectionReplyBudget>) -> bool {
-    calls.iter().filter(|call| Arc::ptr_eq(&call.connection, connection)).any(|call| {
-        let progress = lock(&call.progress);
-        progress.unsent_bytes > 0 && !progress.is_ended
-    })
+    let mut of_connection = calls.iter().filter(|call| Arc::ptr_eq(&call.connection, connection));
+    of_connection.any(|call| lock(&call.progress).unsent_bytes > 0 && !call.is_ended())
 }
 
 impl Drop for CallReplies {
@@ -347,29 +351,34 @@ impl Drop for CallReplies {
 }
 
 impl UnsentBytes {
-    /// Releases all but `bytes`. Without this, a call that was sent completely would still hold bytes, as if its client
-    /// did not read.
+    /// Releases all but `bytes`, which is no progress. Without this, a call that was sent completely would still hold
+    /// bytes, as if its client did not read.
     pub(super) fn shrink_to(&mut self, bytes: usize) {
         if let Some(excess) = self.bytes.checked_sub(bytes) {
-            drop(self.split(excess));
+            self.split_permits(excess);
+            self.bytes = bytes;
+            self.call.each_progress(|progress| progress.unsent_bytes -= excess);
         }
     }
 
     /// Removes `bytes` from the front.
     fn split(&mut self, bytes: usize) -> Option<Self> {
-        // A message above the share has fewer permits than bytes. The remainder keeps what is left of them.
-        let take = |permit: &mut OwnedSemaphorePermit| permit.split(bytes.min(permit.num_permits()));
-        let (of_connection, of_total) = (take(&mut self.of_connection)?, take(&mut self.of_total)?);
+        let (of_connection, of_total) = self.split_permits(bytes)?;
         self.bytes -= bytes;
         Some(Self { call: Arc::clone(&self.call), bytes, of_connection, of_total })
+    }
+
+    /// Removes what `bytes` take from the budgets. A message above the budget of its connection has fewer permits than
+    /// bytes; the remainder keeps what is left of them.
+    fn split_permits(&mut self, bytes: usize) -> Option<(OwnedSemaphorePermit, Granted)> {
+        let of_connection = self.of_connection.split(bytes.min(self.of_connection.num_permits()))?;
+        Some((of_connection, self.of_total.split(bytes)))
     }
 }
 
 impl Drop for UnsentBytes {
     fn drop(&mut self) {
-        let mut progress = lock(&self.call.progress);
-        progress.unsent_bytes -= self.bytes;
-        progress.last_change = Instant::now();
+        self.call.each_progress(|progress| progress.send(self.bytes));
     }
 }
 
@@ -488,7 +497,7 @@ mod tests {
             unsent.shrink_to(bytes);
             context.encode(unsent);
         }
-        let free_bytes = || budget.share.permits.available_permits();
+        let free_bytes = || budget.bytes.free_bytes();
         assert_eq!(free_bytes(), 50);
         let frames = [40, 10, 5].map(|bytes| context.attach(vec![0; bytes].into()));
         let [first, second, uncounted] = frames;
@@ -511,14 +520,17 @@ mod tests {
         let large = with_timeout(call.acquire(1000)).await.expect("expected capacity");
         let other = with_timeout(other_call.acquire(40)).await.expect("expected capacity");
         drop((large, other));
-        assert_eq!(budget.share.permits.available_permits(), 100);
+        assert_eq!(budget.bytes.free_bytes(), 100);
     }
 
     #[test]
     fn largest_stalled_connections_above_their_share_are_found() {
         const MIB: usize = 1 << 20;
-        let load = |mib: usize, stall: u64| Load { unsent_bytes: mib * MIB, stall: Duration::from_secs(stall) };
-        let find = |loads: &[Load]| find_connections_above_share(loads, 256 * MIB, Duration::from_secs(1));
+        let load = |mib: usize, stall: u64| Progress {
+            unsent_bytes: mib * MIB,
+            last_change: Instant::now() - Duration::from_secs(stall),
+        };
+        let find = |loads: &[Progress]| find_connections_above_share(loads, 256 * MIB, Duration::from_secs(1));
         // The share is 64 MiB for three holders and the connection that waits. Idle connections do not count.
         assert_eq!(find(&[load(70, 2), load(90, 0), load(80, 2), load(0, 9)]), [2]);
         assert_eq!(find(&[load(64, 9), load(63, 9), load(90, 0), load(0, 9)]), [0; 0]);
@@ -558,7 +570,7 @@ mod tests {
         let calls = [connection.new_call(), connection.new_call()];
         let _stalled_bytes = calls[0].acquire(20).await.expect("expected capacity");
         end_stalled(&calls, Duration::ZERO, None);
-        assert!(lock(&calls[0].progress).is_ended);
+        assert!(calls[0].is_ended());
         let running_bytes = calls[1].acquire(10).await.expect("expected capacity");
         lock(&calls[0].progress).last_change -= Duration::from_secs(60);
         let is_closed = async || tokio::time::timeout(Duration::ZERO, close.notified()).await.is_ok();
@@ -571,11 +583,25 @@ mod tests {
         assert!(is_closed().await, "expected nothing that could free bytes");
     }
 
+    /// Otherwise each message that a stalled connection produces would postpone its end.
+    #[tokio::test]
+    async fn only_sent_bytes_are_progress_of_a_connection() {
+        let connection = small_budget().new_connection(Arc::default());
+        let first = connection.new_call().acquire(20).await.expect("expected capacity");
+        let first_change = lock(&connection.progress).last_change;
+        let mut second = connection.new_call().acquire(30).await.expect("expected capacity");
+        second.shrink_to(10);
+        let progress = *lock(&connection.progress);
+        assert_eq!((progress.unsent_bytes, progress.last_change), (30, first_change));
+        drop(first);
+        assert!(lock(&connection.progress).last_change > first_change);
+    }
+
     #[tokio::test]
     async fn only_a_call_without_progress_is_stalled() {
         let call = small_budget().new_connection(Arc::default()).new_call();
         let calls = [Arc::clone(&call)];
-        let is_ended = || lock(&call.progress).is_ended;
+        let is_ended = || call.is_ended();
         end_stalled(&calls, Duration::ZERO, None);
         assert!(!is_ended(), "expected a call without unsent bytes to continue");
         let held = [10, 20].map(|bytes| call.acquire(bytes));
