@@ -5,6 +5,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
 
 use tokio::sync::oneshot;
+use tonic::Status;
 
 use crate::engine::lock;
 
@@ -89,12 +90,15 @@ impl State {
 
 impl Holder {
     /// Waits for bytes, at most all that exist. Cancel-safe.
-    pub(super) async fn acquire(self: &Arc<Self>, bytes: usize) -> Granted {
+    ///
+    /// # Errors
+    /// `INTERNAL` if the place of the waiter is lost, which would be a fault of this module.
+    pub(super) async fn acquire(self: &Arc<Self>, bytes: usize) -> Result<Granted, Status> {
         let bytes = bytes.min(self.total.max_bytes);
         let _update = UpdateOnDrop(&self.total);
         let (grant, granted) = oneshot::channel();
         self.total.update(|state| state.waiting.push(Waiter { holder: Arc::clone(self), bytes, grant }));
-        granted.await.expect("a waiter that is not cancelled stays until its bytes are granted")
+        granted.await.map_err(|_| Status::internal("a wait for the reply budget was lost"))
     }
 }
 
@@ -137,7 +141,7 @@ mod tests {
 
     fn acquire(holder: &Arc<Holder>, bytes: usize) -> Acquire {
         let holder = Arc::clone(holder);
-        Box::pin(async move { holder.acquire(bytes).await })
+        Box::pin(async move { holder.acquire(bytes).await.expect("expected a place") })
     }
 
     /// What is granted at once.

@@ -279,7 +279,7 @@ impl CallReplies {
             .map_err(|_| Status::internal("the reply budget is closed"))?;
         let turn = connection.turn.lock().await;
         let of_total = connection.of_total.acquire(permits);
-        let of_total = search_while_waiting(of_total, total.total_search_interval(), || total.relieve()).await;
+        let of_total = search_while_waiting(of_total, total.total_search_interval(), || total.relieve()).await?;
         drop(turn);
         self.each_progress(|progress| progress.produce(bytes));
         Ok(UnsentBytes { call: Arc::clone(self), bytes, of_connection, of_total })
