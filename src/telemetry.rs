@@ -22,8 +22,9 @@ pub enum Stage {
     Deform,
     /// Upload of vertices to OpenGL.
     Upload,
-    /// Waits of the CUDA rasterizer for the GPU to change from OpenGL to CUDA, with the frames of OpenGL that the GPU draws
-    /// before. Short if the rasterizer follows a deformation, which has waited.
+    /// Time until OpenGL begins a submitted frame while no other frame is drawn: the GPU changes from CUDA to OpenGL. With
+    /// the CUDA rasterizer in shared memory, also its wait for the change from OpenGL to CUDA, with the frames of OpenGL
+    /// that the GPU draws before; short if the rasterizer follows a deformation, which has waited.
     Switch,
     /// Shadow map.
     Shadow,

@@ -66,6 +66,7 @@ pub use self::passes::picking::{PendingPick, PickHit};
 pub use self::plan::{Allocation, OmittedFeature, RenderPlan, plan};
 pub use self::renderer::{
     EncodedFrame, FramePixels, HeldPixels, MappedPixels, PartialFrame, PendingFrame, Renderer, ScenePreparation,
+    TrialScene,
 };
 pub use self::resources::scene_buffers::SceneBuffers;
 pub use self::types::{

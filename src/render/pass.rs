@@ -64,8 +64,10 @@ pub enum Pass {
 pub enum RenderStage {
     /// Upload of deformed vertices from host memory; measured by the caller.
     Upload,
-    /// Waits for the compute rasterizer, without the time in which it drew: for frames of OpenGL in flight, and for the
-    /// change of the device from OpenGL to CUDA. Not measured if the rasterizer maps OpenGL's buffers.
+    /// What the device waits for instead of drawing the frame: from its submission, or from the end of the previous frame
+    /// if that is later, until OpenGL begins it. Includes the change of the device from CUDA to OpenGL. In frames whose
+    /// compute rasterizer draws into shared memory, also the waits for it without the time in which it drew: for frames
+    /// of OpenGL in flight, and for the change from OpenGL to CUDA. Not measured by software rasterizers.
     Switch,
     Shadow,
     Draw,

@@ -87,6 +87,8 @@ pub struct FrameImage<P = Vec<u8>> {
 pub struct FrameInfo {
     /// The rasterizer that drew the shadow map and the visibility.
     pub raster_backends: RasterBackends,
+    /// Whether the compute rasterizer drew into shared memory, not into mapped buffers.
+    pub shares_samples: bool,
     /// The parts of the look that a preset can choose. `None` for outputs other than color.
     pub look: Option<FrameLook>,
     /// How far the lowest vertex lies below the ground, in meters. 0 if the scene has no ground, or if the distance is
@@ -126,6 +128,8 @@ pub struct FrameStats {
     pub passes: Vec<Pass>,
     /// The rasterizer that drew the shadow map and the visibility.
     pub raster_backends: RasterBackends,
+    /// Whether the compute rasterizer drew into shared memory, not into mapped buffers.
+    pub shares_samples: bool,
     /// Number of draw calls of the occluder, visibility and blended passes.
     pub draw_calls: usize,
     /// Samples per pixel.

@@ -3,6 +3,7 @@
 
 use std::rc::Rc;
 use std::sync::Arc;
+use std::time::Instant;
 
 use modalcast::config::{BackendChoice, Config};
 use modalcast::engine::DeviceContext;
@@ -371,7 +372,7 @@ fn gpu_cuda_frames_of_steps_ahead_keep_their_step() {
             for (step, frame) in in_flight.drain(..) {
                 let image = context.finish_draw(frame).map(MappedPixels::into_image).expect("expected a frame");
                 assert!(image.rgba == want[step % states.len()].rgba, "step {step}");
-                shared_frames += usize::from(image.times.stage(RenderStage::Switch).is_some());
+                shared_frames += usize::from(image.info.shares_samples);
             }
         }
     }
@@ -418,7 +419,7 @@ fn gpu_frames_of_shared_samples_equal_frames_of_mapped_samples() {
             }
             let image = renderer.draw(&buffers, &params(camera)).expect("expected a frame");
             assert_eq!(image.info.raster_backends, CUDA_BACKENDS, "{name}");
-            (image.rgba, image.times.stage(RenderStage::Switch).is_some())
+            (image.rgba, image.info.shares_samples)
         };
         let (mapped, is_shared) = draw(None);
         assert!(!is_shared, "{name}");
@@ -499,9 +500,44 @@ fn gpu_fastest_rasterizer_draws_frames_of_every_size() {
         let camera = Camera::fit_to_scene(&scene, width, height);
         let image = context.draw(&mut loaded_scene, &camera, FrameSize::new(width, height)).expect("expected a frame");
         eprintln!("{width} x {height}: {:?}", image.info.raster_backends);
-        assert!(image.info.raster_backends.visibility.is_some());
+        let visibility = image.info.raster_backends.visibility;
+        assert!(visibility.is_some());
+        assert!(visibility == Some(RasterBackend::OpenGl) || image.info.shares_samples);
         assert_eq!(image.rgba.len(), 4 * (width * height) as usize);
         loaded_scene.deform(&scenes::random_state(&scene, u64::from(width))).expect("expected the step to succeed");
+    }
+    context.unload_scene(loaded_scene);
+}
+
+/// The times of frames in flight do not overlap: they add up to at most the wall time.
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_time_of_a_frame_excludes_the_frames_before() {
+    let [(_, scene, state), _] = scenes_and_states();
+    let mut context = open_device();
+    let mut loaded_scene = context.load_scene(&scene, BackendSettings::default()).expect("expected the scene to load");
+    let (camera, size) = (Camera::fit_to_scene(&scene, 1920, 1080), FrameSize::new(1920, 1080));
+    context.draw(&mut loaded_scene, &camera, size).expect("expected a frame");
+    for count in [1, MAX_FRAMES_IN_FLIGHT] {
+        loaded_scene.deform(&state).expect("expected the step to succeed");
+        let begin = Instant::now();
+        let frames: Vec<_> = (0..count)
+            .map(|_| {
+                let frame = context.begin_draw(&mut loaded_scene, &camera, size, FrameStyle::default());
+                frame.expect("expected the frame to start")
+            })
+            .collect();
+        let mut sum_ms = 0.0;
+        for frame in frames {
+            let pixels = context.finish_draw(frame).expect("expected a frame");
+            let times = pixels.times();
+            let switch_ms = times.stage(RenderStage::Switch).expect("expected a measured change to OpenGL");
+            sum_ms += switch_ms + times.drawing_ms() + times.stage(RenderStage::Read).unwrap_or(0.0);
+            eprintln!("switch {switch_ms:.3} ms, draw {:.3} ms", times.drawing_ms());
+        }
+        let wall_ms = begin.elapsed().as_secs_f64() * 1e3;
+        // The clocks of host and device may differ a little.
+        assert!(sum_ms <= 1.05 * wall_ms, "{count} frames: {sum_ms:.3} ms in {wall_ms:.3} ms");
     }
     context.unload_scene(loaded_scene);
 }

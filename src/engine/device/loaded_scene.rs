@@ -16,7 +16,7 @@ use modalcast_model::error::{Error, Result, fault, invalid};
 use modalcast_model::fault_injection::{self, InjectionPoint};
 use modalcast_model::raster::{RasterGeometry, Rasterizer};
 use modalcast_model::scene::{BoundingBox, Camera, FrameSize, OrientedBounds, Scene, SceneState};
-use modalcast_render::{FrameInfo, FrameParams, FramePixels, Renderer, SceneBuffers};
+use modalcast_render::{FrameInfo, FrameParams, FramePixels, PendingFrame, Renderer, SceneBuffers, TrialScene};
 
 /// Positions beyond this bound (scene units) are rejected like infinite ones, because their squares overflow f32 in the
 /// shaders.
@@ -317,13 +317,10 @@ impl LoadedScene {
         renderer.attach_rasterizer(buffers, create_rasterizer)
     }
 
-    /// Measures both rasterizers with frames of [`BENCHMARK_SIZE`] of the current state and selects the faster one for
-    /// each pass.
+    /// Measures both rasterizers with steps of the current state and frames of [`BENCHMARK_SIZE`], and selects the faster
+    /// one for each pass.
     pub(in crate::engine) fn select_raster_backends(&mut self, renderer: &mut Renderer) -> Result<()> {
-        let camera = Camera::fit_to_scene(&self.scene, BENCHMARK_SIZE.width, BENCHMARK_SIZE.height);
-        let contents = self.fill_buffers(renderer, &camera)?;
-        let Some(buffers) = &mut self.buffers else { return Err(no_buffers_error()) };
-        renderer.select_raster_backends(buffers, &contents.frame_params(camera, BENCHMARK_SIZE)).map(drop)
+        renderer.select_raster_backends(self).map(drop)
     }
 
     pub(in crate::engine) const fn encodes_on_cuda(&self) -> bool {
@@ -410,6 +407,22 @@ fn uniform_origin(state: &SceneState) -> Option<[f64; 3]> {
     match &state.origins {
         Some(origins) => origins.has_no_outliers().then(|| origins.shared_origin()),
         None => Some([0.0; 3]),
+    }
+}
+
+/// Draws the steps of the trial as those of a client that sends them ahead.
+impl TrialScene for LoadedScene {
+    fn buffers_mut(&mut self) -> Result<&mut SceneBuffers> {
+        self.buffers.as_mut().ok_or_else(no_buffers_error)
+    }
+
+    fn submit(&mut self, renderer: &mut Renderer) -> Result<PendingFrame> {
+        let state = Arc::clone(&self.current_state);
+        self.deform_with_next(&state, Some(&state))?;
+        let camera = Camera::fit_to_scene(&self.scene, BENCHMARK_SIZE.width, BENCHMARK_SIZE.height);
+        self.rasterize(renderer, &camera, BENCHMARK_SIZE, None)?;
+        let params = self.fill_buffers(renderer, &camera)?.frame_params(camera, BENCHMARK_SIZE);
+        renderer.submit_without_readback(self.buffers()?, &params)
     }
 }
 

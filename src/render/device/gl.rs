@@ -43,7 +43,7 @@ pub(crate) use self::picture_buffer::testing::UnsharedMemory;
 pub(crate) use self::picture_buffer::{PictureBuffer, check_sharing};
 pub(crate) use self::program::PendingProgram;
 pub(crate) use self::staging::{ReadbackView, StagingBuffer};
-pub(crate) use self::timer::PassTimer;
+pub(crate) use self::timer::{PassTimer, SpanTimer};
 use super::egl::{Context, CurrentContext};
 use modalcast_model::error::{Error, Result, fault, fault_in};
 
@@ -71,6 +71,8 @@ pub(crate) struct Gl {
     is_leak_logged: Cell<bool>,
     /// Pool of timer queries that are not in use.
     free_queries: RefCell<Vec<glow::Query>>,
+    /// Pool of timestamp queries that are not in use. OpenGL fixes the kind of a query when it is first used.
+    free_timestamps: RefCell<Vec<glow::Query>>,
     /// Buffers of dropped staging buffers from which a thread still copies. They are freed afterwards.
     retired_buffers: RefCell<Vec<staging::RetiredBuffer>>,
 }
@@ -199,6 +201,7 @@ impl Gl {
             skipped_error: RefCell::default(),
             is_leak_logged: Cell::default(),
             free_queries: RefCell::default(),
+            free_timestamps: RefCell::default(),
             retired_buffers: RefCell::default(),
         }))
     }

@@ -60,6 +60,7 @@ pub(crate) fn use_shared(recorder: &mut PassRecorder<'_>, passes: RasterPasses) 
     recorder.begin(passes.stats_pass());
     // OpenGL may hold older contents of the memory in its caches.
     recorder.gl.barrier(MemoryBarriers::SHADER_STORAGE);
+    recorder.stats.shares_samples = true;
     record(recorder, passes);
 }
 

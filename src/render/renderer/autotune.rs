@@ -1,29 +1,51 @@
 //! Chooses the faster rasterizer for each pass by timing them on the scene itself.
 
-use super::Renderer;
-use crate::resources::compute_rasterizer::RasterPasses;
+use std::collections::VecDeque;
+use std::time::Instant;
+
+use super::{PendingFrame, Renderer};
+use crate::resources::compute_rasterizer::{ComputeRasterizer, RasterPasses};
 use crate::resources::scene_buffers::SceneBuffers;
-use crate::types::{FrameParams, RasterBackend, RasterBackends};
+use crate::types::{RasterBackend, RasterBackends};
 use modalcast_model::error::Result;
 
-/// Frames per combination of rasterizers. The first frame warms up; the result is the median time of the others.
-const TRIAL_FRAMES: usize = 6;
+/// Frames of a trial whose time does not count: they compile programs, allocate memory and fill the queue of the device.
+const WARM_UP_FRAMES: usize = 3;
+/// Frames of a trial whose time counts.
+const TIMED_FRAMES: usize = 8;
+/// Frames that the device draws while the host submits the next one.
+const FRAMES_IN_FLIGHT: usize = 2;
+/// Trials of a combination of rasterizers. The fastest one counts, because other work can only delay a trial.
+const TRIALS: usize = 2;
+
+/// A scene whose frames are drawn to compare rasterizers.
+pub trait TrialScene {
+    /// The buffers of the scene.
+    ///
+    /// # Errors
+    /// `Fault` without buffers.
+    fn buffers_mut(&mut self) -> Result<&mut SceneBuffers>;
+
+    /// Submits a frame without readback, of a new step and in the way in which frames of the scene are drawn later.
+    ///
+    /// # Errors
+    /// Errors of deforming and drawing.
+    fn submit(&mut self, renderer: &mut Renderer) -> Result<PendingFrame>;
+}
 
 impl Renderer {
     /// Selects the fastest combination of OpenGL and the compute rasterizer for shadow map and visibility, and returns
-    /// it. All combinations are timed, because the time of one pass depends on the rasterizer of the other. A compute
-    /// rasterizer that draws no pass is dropped. Without a compute rasterizer, both fields of the result are none.
+    /// it. All combinations are timed with steps and frames in flight, because the time of one pass depends on the
+    /// rasterizer of the other, and a change between CUDA and OpenGL can cost more than a pass. A compute rasterizer that
+    /// draws no pass is dropped. Without a compute rasterizer, both fields of the result are none.
     ///
     /// # Errors
-    /// Errors of drawing. The compute rasterizer then draws the same passes as before.
-    pub fn select_raster_backends(
-        &mut self,
-        buffers: &mut SceneBuffers,
-        params: &FrameParams,
-    ) -> Result<RasterBackends> {
-        let Some(rasterizer) = &buffers.compute_rasterizer else { return Ok(RasterBackends::default()) };
+    /// Errors of the scene. The compute rasterizer then draws the same passes as before.
+    pub fn select_raster_backends(&mut self, scene: &mut dyn TrialScene) -> Result<RasterBackends> {
+        let Some(rasterizer) = &scene.buffers_mut()?.compute_rasterizer else { return Ok(RasterBackends::default()) };
         let supported_passes = rasterizer.enabled();
-        let result = self.find_fastest_passes(buffers, params, supported_passes);
+        let result = self.find_fastest_passes(scene, supported_passes);
+        let buffers = scene.buffers_mut()?;
         let Some(rasterizer) = &buffers.compute_rasterizer else { return Ok(RasterBackends::default()) };
         let fastest_passes = result.inspect_err(|_| rasterizer.enable(supported_passes))?;
         rasterizer.enable(fastest_passes);
@@ -37,22 +59,24 @@ impl Renderer {
     /// Times all subsets of the supported passes, and returns the fastest. Leaves the last subset enabled.
     fn find_fastest_passes(
         &mut self,
-        buffers: &SceneBuffers,
-        params: &FrameParams,
+        scene: &mut dyn TrialScene,
         supported_passes: RasterPasses,
     ) -> Result<RasterPasses> {
-        let Some(rasterizer) = &buffers.compute_rasterizer else { return Ok(RasterPasses::NONE) };
-        let mut timings = Vec::new();
-        for (shadow, visibility) in [(false, false), (true, false), (false, true), (true, true)] {
-            let combination = RasterPasses { shadow, visibility };
-            if !combination.is_subset_of(supported_passes) {
-                continue;
-            }
-            rasterizer.enable(combination);
-            let ms = self.measure_median_ms(buffers, params)?;
-            // An error disables the compute rasterizer. The time is then that of OpenGL, and does not count.
-            if rasterizer.enabled() == combination {
-                timings.push((combination, ms));
+        let all = [(false, false), (true, false), (false, true), (true, true)];
+        let combinations = all.map(|(shadow, visibility)| RasterPasses { shadow, visibility });
+        let mut timings: Vec<(RasterPasses, f64)> = Vec::new();
+        for _ in 0..TRIALS {
+            for combination in combinations.into_iter().filter(|passes| passes.is_subset_of(supported_passes)) {
+                enable(scene, combination)?;
+                let ms = self.measure_frame_ms(scene)?;
+                // An error disables the compute rasterizer. The time is then that of OpenGL, and does not count.
+                if enabled(scene)? != combination {
+                    continue;
+                }
+                match timings.iter_mut().find(|(timed, _)| *timed == combination) {
+                    Some((_, fastest_ms)) => *fastest_ms = fastest_ms.min(ms),
+                    None => timings.push((combination, ms)),
+                }
             }
         }
         tracing::info!(measured = ?timings, "milliseconds per frame by the passes of the compute rasterizer");
@@ -60,17 +84,36 @@ impl Renderer {
         Ok(fastest.map_or(RasterPasses::NONE, |(combination, _)| combination))
     }
 
-    /// Median time of a frame in milliseconds, including its shadow map, without readback.
-    fn measure_median_ms(&mut self, buffers: &SceneBuffers, params: &FrameParams) -> Result<f64> {
-        let mut times = Vec::new();
-        for _ in 0..TRIAL_FRAMES {
-            buffers.shadow_cache.invalidate();
-            // Without readback, the trial needs no staging buffer, which frames in flight may occupy.
-            let pending_frame = self.submit_without_readback(buffers, params)?;
-            times.push(self.read_image(pending_frame)?.times.drawing_ms());
+    /// Mean wall time of a frame in milliseconds, with its step and its shadow map, without readback.
+    fn measure_frame_ms(&mut self, scene: &mut dyn TrialScene) -> Result<f64> {
+        let (mut in_flight, mut ends) = (VecDeque::new(), Vec::new());
+        for _ in 0..WARM_UP_FRAMES + TIMED_FRAMES {
+            scene.buffers_mut()?.shadow_cache.invalidate();
+            in_flight.push_back(scene.submit(self)?);
+            if in_flight.len() > FRAMES_IN_FLIGHT
+                && let Some(frame) = in_flight.pop_front()
+            {
+                self.read_image(frame)?;
+                ends.push(Instant::now());
+            }
         }
-        times.remove(0);
-        times.sort_by(f64::total_cmp);
-        Ok(times[times.len() / 2])
+        for frame in in_flight {
+            self.read_image(frame)?;
+            ends.push(Instant::now());
+        }
+        let timed = &ends[WARM_UP_FRAMES - 1..];
+        Ok((timed[TIMED_FRAMES] - timed[0]).as_secs_f64() * 1e3 / TIMED_FRAMES as f64)
     }
+}
+
+/// The passes that the compute rasterizer of a scene draws.
+fn enabled(scene: &mut dyn TrialScene) -> Result<RasterPasses> {
+    Ok(scene.buffers_mut()?.compute_rasterizer.as_ref().map_or(RasterPasses::NONE, ComputeRasterizer::enabled))
+}
+
+/// Selects the passes that the compute rasterizer of a scene draws.
+fn enable(scene: &mut dyn TrialScene, passes: RasterPasses) -> Result<()> {
+    let buffers = scene.buffers_mut()?;
+    buffers.compute_rasterizer.iter().for_each(|rasterizer| rasterizer.enable(passes));
+    Ok(())
 }

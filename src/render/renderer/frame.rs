@@ -62,7 +62,7 @@ impl Renderer {
         fault_injection::check(InjectionPoint::Pixels)?;
         pending_frame.wait()?;
         let limit = pending_frame.time_left();
-        let PendingFrame { desc, readback, fence, passes, switch_ms, mut stats, info, .. } = pending_frame;
+        let PendingFrame { desc, readback, fence, passes, raster_switch_ms, span, mut stats, info, .. } = pending_frame;
         let mut view = readback.map_or(Ok(None), |readback| readback.into_view(&fence, limit))?;
         let png = view.as_mut().and_then(ReadbackView::take_png);
         if let Some(view) = &mut view {
@@ -82,7 +82,7 @@ impl Renderer {
         if let Some(culled) = &stats.culled {
             tracing::trace!(?culled, "culled triangles");
         }
-        let info = FrameInfo { raster_backends: stats.raster_backends, ..info };
+        let info = FrameInfo { raster_backends: stats.raster_backends, shares_samples: stats.shares_samples, ..info };
         self.stats = stats;
         let mut times: Vec<(Pass, f64)> = Vec::new();
         for (pass, timer) in &passes {
@@ -93,7 +93,8 @@ impl Renderer {
             }
         }
         let mut times = FrameTimes::of_passes(&times);
-        if let Some(ms) = switch_ms {
+        if let Some(span) = &span {
+            let ms = raster_switch_ms + span.delay_ms(&mut self.last_end_ns);
             times.insert_first(RenderStage::Switch, ms);
         }
         Ok(MappedPixels { width: desc.width, height: desc.height, view, png, times, info })

@@ -24,6 +24,7 @@ use std::time::{Duration, Instant};
 
 use rayon::{ThreadPool, ThreadPoolBuilder};
 
+pub use self::autotune::TrialScene;
 pub use self::partial_frame::PartialFrame;
 pub use self::pending_frame::{EncodedFrame, FramePixels, HeldPixels, MappedPixels, PendingFrame};
 pub use self::preparation::ScenePreparation;
@@ -82,6 +83,8 @@ pub struct Renderer {
     stats: FrameStats,
     /// The last frame that was submitted without an error.
     last_frame: Option<LastFrame>,
+    /// When the device finished the last frame whose times were read, by the device's clock.
+    last_end_ns: u64,
     frame_timeout: Duration,
     band_limit: BandLimit,
     /// Staging buffers of frames that are copied to the host band by band.
@@ -146,6 +149,7 @@ impl Renderer {
             target_budget: MemoryBudget::new(MemoryKind::RenderTargets, u64::MAX, u64::MAX),
             stats: FrameStats::default(),
             last_frame: None,
+            last_end_ns: 0,
             frame_timeout: FRAME_TIMEOUT,
             band_limit: if gl.limits.software { SOFTWARE_BAND_LIMIT } else { HARDWARE_BAND_LIMIT },
             band_ring: ReadbackRing::new(&gl, frame_readback::BAND_STAGING_BYTES, None),
@@ -325,7 +329,8 @@ impl Renderer {
         create_rasterizer: impl FnOnce(RasterGeometry) -> Result<Box<dyn Rasterizer>>,
     ) -> Result<()> {
         let _current = self.gl.make_current()?;
-        buffers.attach_rasterizer(&self.gl, &mut |source| self.programs.program(source), create_rasterizer)
+        let compile = &mut |source| self.programs.program(source);
+        buffers.attach_rasterizer(&self.gl, &self.target_budget, compile, create_rasterizer)
     }
 
     /// Begins a pick in a rectangle of the frame that `params` describes, without waiting for the device.

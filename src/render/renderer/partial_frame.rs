@@ -18,7 +18,7 @@ use std::time::{Duration, Instant};
 use super::frame_readback::{BandReadback, FrameReadback, MAX_BAND_PIXELS};
 use super::pending_frame::PendingFrame;
 use super::{LastFrame, MAX_TARGETS, Renderer};
-use crate::device::gl::{Fence, PassTimer, Program};
+use crate::device::gl::{Fence, PassTimer, Program, SpanTimer};
 use crate::pass::Pass;
 use crate::passes::post::BloomStep;
 use crate::passes::{self, FrameContext, OitFrame, PassRecorder};
@@ -50,7 +50,9 @@ pub struct PartialFrame {
     /// Submitted passes in execution order. A pass in bands has one entry for each band.
     timers: Vec<(Pass, PassTimer)>,
     /// Milliseconds that the host waited for [`Renderer::rasterize`] beside its device time.
-    switch_ms: Option<f64>,
+    raster_switch_ms: f64,
+    /// When the device draws the frame; `None` for a software rasterizer, and before the first step.
+    span: Option<SpanTimer>,
     /// Steps that are not submitted yet.
     steps: VecDeque<Step>,
     is_divided: bool,
@@ -182,7 +184,8 @@ impl Renderer {
             stats: FrameStats { samples: desc.samples, ..FrameStats::default() },
             info: frame_info(buffers, params, FrameAntialiasing { samples: desc.samples, ..antialiasing }),
             timers: Vec::new(),
-            switch_ms: None,
+            raster_switch_ms: 0.0,
+            span: None,
             is_divided,
             has_breaks: is_divided || !buffers.is_drawn_with(desc.samples),
             steps,
@@ -199,7 +202,17 @@ impl Renderer {
     pub fn submit_step(&mut self, buffers: &SceneBuffers, partial_frame: &mut PartialFrame) -> Result<()> {
         let _current = self.gl.make_current()?;
         let PartialFrame {
-            params, uniforms, target, programs, encode, readback, stats, timers, steps, switch_ms, ..
+            params,
+            uniforms,
+            target,
+            programs,
+            encode,
+            readback,
+            stats,
+            timers,
+            steps,
+            raster_switch_ms,
+            ..
         } = partial_frame;
         if let Some(readback) = readback {
             readback.collect(partial_frame.fence.as_ref(), self.frame_timeout)?;
@@ -209,6 +222,7 @@ impl Renderer {
             // Commands of other scenes may have changed the bindings.
             passes::uniforms::bind(buffers);
         } else {
+            partial_frame.span = self.gl.begin_span()?;
             passes::uniforms::upload(&recorder, buffers, params, uniforms);
         }
         let readback = readback.as_ref();
@@ -218,7 +232,7 @@ impl Renderer {
         while let Some(step) = steps.pop_front() {
             match step {
                 Step::ComputeRaster => {
-                    timers.extend(self.record_compute_raster(&mut recorder, &frame, switch_ms)?);
+                    timers.extend(self.record_compute_raster(&mut recorder, &frame, raster_switch_ms)?);
                 }
                 Step::Shadow => self.record_shadow(&mut recorder, &frame, timers)?,
                 Step::Cull if buffers.cull_resources.is_some() && visibility_rasterizer(&frame).is_none() => {
@@ -253,7 +267,9 @@ impl Renderer {
             return Err(fault("draw", "expected a frame whose steps are all submitted"));
         }
         let _current = self.gl.make_current()?;
-        let PartialFrame { uniforms, mut target, readback, timers, switch_ms, stats, info, .. } = partial_frame;
+        let PartialFrame { uniforms, mut target, readback, timers, raster_switch_ms, mut span, stats, info, .. } =
+            partial_frame;
+        span.as_mut().map_or(Ok(()), |span| span.end(&self.gl))?;
         let desc = target.desc;
         target.last_use = Instant::now();
         // A frame with an equal description may have been drawn between the steps of this one.
@@ -268,7 +284,8 @@ impl Renderer {
             readback,
             fence: self.gl.fence(Pass::Read.name())?,
             passes: timers,
-            switch_ms,
+            raster_switch_ms,
+            span,
             stats,
             info,
             timeout: self.frame_timeout,
@@ -282,7 +299,7 @@ impl Renderer {
         &self,
         recorder: &mut PassRecorder<'_>,
         frame: &FrameContext<'_>,
-        switch_ms: &mut Option<f64>,
+        raster_switch_ms: &mut f64,
     ) -> Result<Option<(Pass, PassTimer)>> {
         let buffers = frame.buffers;
         let Some((rasterizer, enabled)) = buffers.active_rasterizer() else { return Ok(None) };
@@ -297,7 +314,7 @@ impl Renderer {
         let views = passes::raster::views(buffers, frame.params, raster_passes)?;
         if let Some(time) = rasterizer.shared_time(&self.gl, &views)? {
             passes::raster::use_shared(recorder, raster_passes);
-            *switch_ms = Some(time.switch_ms);
+            *raster_switch_ms = time.switch_ms;
             return Ok(Some((raster_passes.stats_pass(), PassTimer::Wall(time.device_ms))));
         }
         let draw = || passes::raster::draw(recorder, rasterizer, raster_passes, &views);
@@ -421,12 +438,13 @@ fn plan_steps(target: &RenderTarget, has_readback: bool, max_pixels: u64) -> Vec
     steps
 }
 
-/// How a frame is drawn, without the rasterizers.
+/// How a frame is drawn, without the rasterizers, which are known when it is finished.
 fn frame_info(buffers: &SceneBuffers, params: &FrameParams, antialiasing: FrameAntialiasing) -> FrameInfo {
     let FrameAntialiasing { method: antialias, samples } = antialiasing;
     let preset = buffers.look.preset.and_then(|request| request.preset);
     FrameInfo {
         raster_backends: RasterBackends::default(),
+        shares_samples: false,
         look: Some(FrameLook { preset, antialias, samples, shadow: buffers.look.shadow }),
         below_ground: depth_below_ground(&buffers.scene, params, buffers.origin),
     }

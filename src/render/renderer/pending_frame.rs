@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use rayon::prelude::*;
 
 use super::frame_readback::FrameReadback;
-use crate::device::gl::{Fence, PassTimer, ReadbackView};
+use crate::device::gl::{Fence, PassTimer, ReadbackView, SpanTimer};
 use crate::pass::{FrameTimes, Pass, RenderStage};
 use crate::resources::target_desc::TargetDesc;
 use crate::types::{FrameImage, FrameInfo, FrameStats};
@@ -25,8 +25,10 @@ pub struct PendingFrame {
     pub(super) fence: Fence,
     /// Passes in execution order, each with its timer.
     pub(super) passes: Vec<(Pass, PassTimer)>,
-    /// Milliseconds of [`RenderStage::Switch`]; `None` if nothing was rasterized in shared memory.
-    pub(super) switch_ms: Option<f64>,
+    /// Milliseconds that the host waited for the compute rasterizer beside its device time.
+    pub(super) raster_switch_ms: f64,
+    /// When the device draws the frame; `None` for a software rasterizer.
+    pub(super) span: Option<SpanTimer>,
     pub(super) stats: FrameStats,
     /// Without the rasterizers, which `stats` contains.
     pub(super) info: FrameInfo,

@@ -2,19 +2,21 @@
 //!
 //! The compute rasterizer writes depth for the blur, and visibility keys, which a compute pass converts to ids. A key is
 //! the triangle and the depth of a pixel. It writes into shared memory ([`SharedTargets`]), or into OpenGL buffers that it
-//! maps. All later passes are the same as with OpenGL. A scene has these resources only if its backend settings select a
+//! maps. Both count against the budget of render targets. All later passes are the same as with OpenGL. A scene has these resources only if its backend settings select a
 //! compute rasterizer.
 
 use std::cell::{Cell, RefCell};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::rc::Rc;
+use std::sync::Arc;
 use std::time::Duration;
 
 use super::programs::ProgramCompiler;
-use super::shared_targets::{KEY_BYTES, RasterViews, SharedDrawTime, SharedTargets, StepViews};
+use super::shared_targets::{DEPTH_BYTES, KEY_BYTES, RasterViews, SharedDrawTime, SharedTargets, StepViews};
 use crate::device::gl::{self, Buffer, Gl, Program};
 use crate::shaders::ShaderOptions;
 use modalcast_model::error::{Error, Result, fault};
+use modalcast_model::memory::{MemoryBudget, MemoryReservation};
 use modalcast_model::raster::{GlBuffer, Rasterizer};
 use modalcast_model::scene::Scene;
 
@@ -34,6 +36,8 @@ pub(crate) struct ComputeRasterizer {
     enabled: Cell<RasterPasses>,
     /// `None` after an error; the rasterizer then maps OpenGL's buffers.
     shared: RefCell<Option<SharedTargets>>,
+    /// Limit on the memory of the output.
+    budget: Arc<MemoryBudget>,
 }
 
 /// Output buffers of a compute rasterizer that maps them, and the programs that read the output. An output is absent if
@@ -62,7 +66,13 @@ struct VisibilityKeys {
 
 /// A buffer that the rasterizer maps. Sized for the largest frame so far; none before the first one.
 #[derive(Debug, Default)]
-struct OutputBuffer(RefCell<Option<Buffer>>);
+struct OutputBuffer(RefCell<Option<CountedBuffer>>);
+
+#[derive(Debug)]
+struct CountedBuffer {
+    buffer: Buffer,
+    _memory: Arc<MemoryReservation>,
+}
 
 impl RasterPasses {
     pub(crate) const NONE: Self = Self { shadow: false, visibility: false };
@@ -117,10 +127,10 @@ impl RasterOutputs {
 
 impl ComputeRasterizer {
     /// Enables all passes that have an output.
-    pub(crate) fn new(rasterizer: Box<dyn Rasterizer>, outputs: RasterOutputs) -> Self {
+    pub(crate) fn new(rasterizer: Box<dyn Rasterizer>, outputs: RasterOutputs, budget: &Arc<MemoryBudget>) -> Self {
         let enabled = Cell::new(outputs.passes());
-        let shared = RefCell::new(Some(SharedTargets::default()));
-        Self { rasterizer: RefCell::new(rasterizer), outputs, enabled, shared }
+        let shared = RefCell::new(Some(SharedTargets::new(budget)));
+        Self { rasterizer: RefCell::new(rasterizer), outputs, enabled, shared, budget: Arc::clone(budget) }
     }
 
     /// Passes that the compute rasterizer draws at present.
@@ -142,15 +152,17 @@ impl ComputeRasterizer {
     /// Draws the depth of the shadow map, the visibility of the frame, or both, into mapped buffers.
     ///
     /// # Errors
-    /// Errors of the rasterizer; `Fault` if the rasterizer panics or OpenGL has no memory for the output.
+    /// Errors of the rasterizer; `OutOfMemory`; `Fault` if the rasterizer panics or OpenGL has no memory for the output.
     pub(crate) fn draw(&self, gl: &Rc<Gl>, views: &RasterViews) -> Result<()> {
         let depths = match self.outputs.shadow.as_ref().zip(views.shadow.as_ref()) {
-            Some((depths, viewport)) => Some((viewport, depths.buffer.reserve(gl, 4 * viewport.pixel_count() as u64)?)),
+            Some((depths, viewport)) => {
+                Some((viewport, depths.buffer.reserve(gl, &self.budget, DEPTH_BYTES * viewport.pixel_count() as u64)?))
+            }
             None => None,
         };
         let keys = match self.outputs.visibility.as_ref().zip(views.frame.as_ref()) {
             Some((keys, viewport)) => {
-                Some((viewport, keys.buffer.reserve(gl, KEY_BYTES * viewport.pixel_count() as u64)?))
+                Some((viewport, keys.buffer.reserve(gl, &self.budget, KEY_BYTES * viewport.pixel_count() as u64)?))
             }
             None => None,
         };
@@ -178,7 +190,7 @@ impl ComputeRasterizer {
             Ok(()) => Ok(()),
             Err(lost) if lost.is_loss() => Err(lost),
             Err(error) => {
-                tracing::warn!(%error, "the compute rasterizer maps OpenGL's buffers: it cannot share memory");
+                tracing::warn!(%error, "the compute rasterizer maps OpenGL's buffers from now on");
                 *shared = None;
                 Ok(())
             }
@@ -222,7 +234,8 @@ impl ComputeRasterizer {
         let RasterOutputs { shadow, visibility } = &self.outputs;
         let mapped = [shadow.as_ref().map(|depths| &depths.buffer), visibility.as_ref().map(|keys| &keys.buffer)].map(
             |buffer| {
-                buffer.and_then(|buffer| buffer.0.borrow().as_ref().map(|buffer| buffer.bytes)).unwrap_or_default()
+                let buffer = buffer.and_then(|buffer| buffer.0.borrow().as_ref().map(|counted| counted.buffer.bytes));
+                buffer.unwrap_or_default()
             },
         );
         let shared = self.shared.borrow().as_ref().map_or([0, 0], SharedTargets::bytes);
@@ -233,16 +246,30 @@ impl ComputeRasterizer {
 
 impl OutputBuffer {
     /// Returns a handle to the buffer. Reallocates the buffer if it is smaller than `bytes`.
-    fn reserve(&self, gl: &Rc<Gl>, bytes: u64) -> Result<GlBuffer> {
-        let mut buffer = self.0.borrow_mut();
-        match buffer.take().filter(|buffer| buffer.bytes >= bytes) {
-            Some(reusable_buffer) => Ok(buffer.insert(reusable_buffer).shared()),
-            None => Ok(buffer.insert(gl.buffer(bytes, gl::STREAM_COPY, None)?).shared()),
-        }
+    fn reserve(&self, gl: &Rc<Gl>, budget: &Arc<MemoryBudget>, bytes: u64) -> Result<GlBuffer> {
+        let mut slot = self.0.borrow_mut();
+        let counted = match slot.take().filter(|counted| counted.buffer.bytes >= bytes) {
+            Some(reusable_buffer) => reusable_buffer,
+            None => {
+                let memory = reserve_output(budget, bytes)?;
+                CountedBuffer { buffer: gl.buffer(bytes, gl::STREAM_COPY, None)?, _memory: memory }
+            }
+        };
+        Ok(slot.insert(counted).buffer.shared())
     }
 
     /// Another owner of the buffer; none before the first frame.
     fn alias(&self) -> Option<Buffer> {
-        self.0.borrow().as_ref().map(Buffer::alias)
+        self.0.borrow().as_ref().map(|counted| counted.buffer.alias())
     }
+}
+
+/// Reserves the memory of an output buffer.
+///
+/// # Errors
+/// `OutOfMemory`.
+pub(super) fn reserve_output(budget: &Arc<MemoryBudget>, bytes: u64) -> Result<Arc<MemoryReservation>> {
+    let memory = MemoryReservation::new(budget);
+    memory.reserve("the output of the compute rasterizer", bytes)?;
+    Ok(memory)
 }

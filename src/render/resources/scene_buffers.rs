@@ -28,6 +28,7 @@ use crate::scene_data::textures::{ArrayUse, TextureArray, TextureRole, arrays, c
 use crate::shaders::{ImageFilter, MaterialUse, ProgramSource, ShaderOptions, post};
 use crate::types::{BlurMethod, FrameParams};
 use modalcast_model::error::Result;
+use modalcast_model::memory::MemoryBudget;
 use modalcast_model::raster::{GlVertexBuffers, RasterGeometry, Rasterizer};
 use modalcast_model::scene::{Antialiasing, Culling, FrameAntialiasing, RenderSettings, RendererKind, Scene};
 use modalcast_model::shared_memory::VertexImporter;
@@ -400,8 +401,8 @@ impl SceneBuffers {
             .map(|array| (array, &cull_resources.buffers.draws))
     }
 
-    /// Attaches a compute rasterizer, which draws all passes that it supports. Does nothing for a scene without such
-    /// passes.
+    /// Attaches a compute rasterizer, which draws all passes that it supports. `budget` limits the memory of its output.
+    /// Does nothing for a scene without such passes.
     ///
     /// # Errors
     /// Errors of `create_rasterizer` and [`Rasterizer::precompile`], and `Fault` of OpenGL. OpenGL then draws all
@@ -409,6 +410,7 @@ impl SceneBuffers {
     pub(crate) fn attach_rasterizer(
         &mut self,
         gl: &Rc<Gl>,
+        budget: &Arc<MemoryBudget>,
         compile: &mut ProgramCompiler<'_>,
         create_rasterizer: impl FnOnce(RasterGeometry) -> Result<Box<dyn Rasterizer>>,
     ) -> Result<()> {
@@ -422,7 +424,7 @@ impl SceneBuffers {
         let mut rasterizer =
             create_rasterizer(raster_mesh::raster_geometry(&self.scene, positions, gl.limits.anisotropy))?;
         rasterizer.precompile(passes.shadow, passes.visibility)?;
-        self.compute_rasterizer = Some(ComputeRasterizer::new(rasterizer, outputs));
+        self.compute_rasterizer = Some(ComputeRasterizer::new(rasterizer, outputs, budget));
         Ok(())
     }
 

@@ -6,10 +6,13 @@
 
 use std::collections::VecDeque;
 use std::rc::Rc;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use super::compute_rasterizer::reserve_output;
 use crate::device::gl::{Buffer, Fence, Gl};
-use modalcast_model::error::Result;
+use modalcast_model::error::{Error, Result};
+use modalcast_model::memory::{MemoryBudget, MemoryReservation};
 use modalcast_model::raster::{NewTarget, Rasterizer, SharedDraw};
 use modalcast_model::scene::Viewport;
 use modalcast_model::shared_memory::{SharedPositions, SharedRange};
@@ -17,7 +20,7 @@ use modalcast_model::shared_memory::{SharedPositions, SharedRange};
 /// Maximum number of sets: two that OpenGL reads, and two that the rasterizer writes.
 const MAX_SETS: usize = 4;
 /// Bytes of a depth.
-const DEPTH_BYTES: u64 = 4;
+pub(super) const DEPTH_BYTES: u64 = 4;
 /// Bytes of a visibility key: a word of the triangle's index, and a word of the inverted bits of the depth.
 pub(super) const KEY_BYTES: u64 = 8;
 
@@ -51,6 +54,7 @@ pub(crate) struct SharedDrawTime {
 struct SharedBuffer {
     buffer: Buffer,
     range: Rc<dyn SharedRange>,
+    _memory: Arc<MemoryReservation>,
 }
 
 /// The samples of one frame.
@@ -72,8 +76,10 @@ struct DrawnSet {
 }
 
 /// The sets of a scene.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub(super) struct SharedTargets {
+    /// Limit on their memory.
+    budget: Arc<MemoryBudget>,
     /// Sets whose readers have been submitted, oldest first, and unused ones.
     free: VecDeque<TargetSet>,
     /// Sets of frames that are not recorded yet.
@@ -85,18 +91,10 @@ pub(super) struct SharedTargets {
 }
 
 impl SharedBuffer {
-    fn new(gl: &Rc<Gl>, rasterizer: &mut dyn Rasterizer, bytes: u64) -> Result<Self> {
+    fn new(gl: &Rc<Gl>, budget: &Arc<MemoryBudget>, rasterizer: &mut dyn Rasterizer, bytes: u64) -> Result<Self> {
+        let memory = reserve_output(budget, bytes)?;
         let NewTarget { descriptor, allocated_bytes, range } = rasterizer.create_target(bytes)?;
-        Ok(Self { buffer: Buffer::import(gl, descriptor, allocated_bytes, bytes)?, range })
-    }
-
-    /// Replaces the buffer unless it has at least `bytes` bytes. Nothing accesses it.
-    fn reserve(slot: &mut Option<Self>, gl: &Rc<Gl>, rasterizer: &mut dyn Rasterizer, bytes: u64) -> Result<()> {
-        if slot.as_ref().is_none_or(|shared| shared.buffer.bytes < bytes) {
-            *slot = None;
-            *slot = Some(Self::new(gl, rasterizer, bytes)?);
-        }
-        Ok(())
+        Ok(Self { buffer: Buffer::import(gl, descriptor, allocated_bytes, bytes)?, range, _memory: memory })
     }
 }
 
@@ -105,13 +103,21 @@ impl TargetSet {
         self.read.as_ref().is_none_or(Fence::is_done)
     }
 
-    /// Allocates the memory that the views need.
-    fn reserve(&mut self, gl: &Rc<Gl>, rasterizer: &mut dyn Rasterizer, views: &RasterViews) -> Result<()> {
+    /// Allocates the memory that the views need. Replaces buffers that are too small; nothing accesses them.
+    fn reserve(
+        &mut self,
+        gl: &Rc<Gl>,
+        budget: &Arc<MemoryBudget>,
+        rasterizer: &mut dyn Rasterizer,
+        views: &RasterViews,
+    ) -> Result<()> {
         for (slot, viewport, sample_bytes) in
             [(&mut self.depths, views.shadow, DEPTH_BYTES), (&mut self.keys, views.frame, KEY_BYTES)]
         {
-            if let Some(viewport) = viewport {
-                SharedBuffer::reserve(slot, gl, rasterizer, sample_bytes * viewport.pixel_count() as u64)?;
+            let bytes = viewport.map_or(0, |viewport| sample_bytes * viewport.pixel_count() as u64);
+            if slot.as_ref().map_or(0, |shared| shared.buffer.bytes) < bytes {
+                *slot = None;
+                *slot = Some(SharedBuffer::new(gl, budget, rasterizer, bytes)?);
             }
         }
         Ok(())
@@ -134,11 +140,17 @@ impl TargetSet {
 }
 
 impl SharedTargets {
+    pub(super) fn new(budget: &Arc<MemoryBudget>) -> Self {
+        let (free, drawn) = (VecDeque::new(), Vec::new());
+        Self { budget: Arc::clone(budget), free, drawn, current: None, count: 0 }
+    }
+
     /// Makes the set of these views the current one. Draws it unless it was drawn ahead; then also draws the step that
-    /// `ahead` returns, if a set is free, in the same turn of the device. After an error, this value must be dropped.
+    /// `ahead` returns, if a set is free and its memory is within the budget, in the same turn of the device. After an
+    /// error, this value must be dropped.
     ///
     /// # Errors
-    /// Errors of the rasterizer and of `ahead`; `Fault` if OpenGL refuses the memory or does not finish within `limit`.
+    /// Errors of the rasterizer and of `ahead`; `OutOfMemory`; `Fault` if OpenGL refuses the memory or does not finish within `limit`.
     pub(super) fn draw(
         &mut self,
         gl: &Rc<Gl>,
@@ -154,15 +166,20 @@ impl SharedTargets {
             self.current = Some(self.drawn.swap_remove(index));
             return Ok(());
         }
-        let mut sets = vec![(self.take_free(limit)?, step)];
+        let begin = Instant::now();
+        let mut first = self.take_free(limit)?;
+        first.reserve(gl, &self.budget, rasterizer, &step.views)?;
+        let mut sets = vec![(first, step)];
         if let Some(step) = ahead()?
-            && let Some(set) = self.take_read()
+            && let Some(mut set) = self.take_read()
         {
-            sets.push((set, step));
+            match set.reserve(gl, &self.budget, rasterizer, &step.views) {
+                Ok(()) => sets.push((set, step)),
+                Err(Error::OutOfMemory { .. }) => self.free.push_front(set),
+                Err(error) => return Err(error),
+            }
         }
         let count = sets.len() as f64;
-        let begin = Instant::now();
-        sets.iter_mut().try_for_each(|(set, step)| set.reserve(gl, rasterizer, &step.views))?;
         let device_ms = rasterizer.draw_shared(&sets.iter().map(|(set, step)| set.draw(step)).collect::<Vec<_>>())?;
         let switch_ms = (begin.elapsed().as_secs_f64() * 1e3 - device_ms).max(0.0);
         let device_ms = device_ms / count;

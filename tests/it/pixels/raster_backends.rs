@@ -12,6 +12,7 @@ use modalcast_compute::reference::raster::VisibilityBuffer;
 use modalcast_model::deform::Deformer as _;
 use modalcast_model::domain::{AlphaMode, Material};
 use modalcast_model::error::{Error, Result, invalid};
+use modalcast_model::memory::{MemoryBudget, MemoryKind};
 use modalcast_model::raster::{DrawTarget, GlBuffer, RasterGeometry, Rasterizer};
 use modalcast_model::scene::{Camera, CullMode, DrawRange, Lens, Scene, SceneState, ShadowSettings, View, Viewport};
 use modalcast_render::{
@@ -241,6 +242,29 @@ fn compute_rasterized_frame_equals_opengl() {
             "negative control: shifted by two pixels, {different_ids} ids and {different_bytes} bytes differ"
         );
     }
+}
+
+/// The depths of the shadow map and the keys of the frame count against the budget of render targets.
+#[test]
+fn compute_rasterizer_without_memory_leaves_its_passes_to_opengl() {
+    let shadow = ShadowSettings { size: 256, ..ShadowSettings::default() };
+    let scene = yard_builder(Some(shadow), 1).build();
+    let output_bytes = 4 * 256 * 256 + 8 * u64::from(SIZE[0] * SIZE[1]);
+    // The frame, and what is reserved when the scene is unloaded: the memory of the target.
+    let draw = |backend, bytes: u64| {
+        let budget = MemoryBudget::new(MemoryKind::RenderTargets, bytes, bytes);
+        let mut renderer = open_renderer();
+        renderer.set_target_budget(Arc::clone(&budget));
+        let frame = draw_frame_with(&mut renderer, &scene, default_camera(), backend);
+        (frame, budget.reserved())
+    };
+    let (opengl_frame, target_bytes) = draw(Backend::OpenGl, u64::MAX);
+    let (exact_frame, reserved_bytes) = draw(Backend::Compute(0.0), target_bytes + output_bytes);
+    assert_eq!(exact_frame.stats.raster_backends.visibility, Some(RasterBackend::Cuda));
+    assert_eq!(reserved_bytes, target_bytes);
+    let (frame, _) = draw(Backend::Compute(0.0), target_bytes + output_bytes - 1);
+    assert_eq!(frame.stats.raster_backends, opengl_frame.stats.raster_backends);
+    assert!(frame.image.rgba == opengl_frame.image.rgba);
 }
 
 /// Frames of both rasterizers alternate on one render target. Each equals the frame of a new renderer.

@@ -1,6 +1,7 @@
 //! Tests of the OpenGL layer: current contexts, ranges of buffers, ownership of names, timer queries and errors.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::time::Instant;
 
 use super::*;
 use crate::device;
@@ -138,6 +139,28 @@ fn timer_queries_end_when_their_commands_fail_or_panic() {
     gl.check("test").expect("at most one active query at a time");
     drop(timer);
     assert_eq!(gl.free_queries.borrow().len(), 1, "expected one query for all timers");
+}
+
+#[test]
+fn span_begins_after_its_submission_and_after_the_previous_one() {
+    let mut gl = open();
+    assert!(gl.begin_span().expect("no error").is_none(), "expected no spans of a software rasterizer");
+    Rc::get_mut(&mut gl).expect("not shared").limits.software = false;
+    let buffer = gl.buffer(4, STATIC_DRAW, None).expect("a buffer");
+    let mut previous_end_ns = 0;
+    let measure = |previous_end_ns: &mut u64| {
+        let mut span = gl.begin_span().expect("no error").expect("a span");
+        buffer.write(&[0; 4]);
+        span.end(&gl).expect("no error");
+        gl.wait("test", HANG_GUARD).expect("completed commands");
+        span.delay_ms(previous_end_ns)
+    };
+    let begin = Instant::now();
+    let delay_ms = measure(&mut previous_end_ns);
+    assert!(previous_end_ns > 0 && (0.0..=begin.elapsed().as_secs_f64() * 1e3).contains(&delay_ms), "{delay_ms}");
+    let mut far_end_ns = u64::MAX;
+    assert_eq!((measure(&mut far_end_ns), far_end_ns), (0.0, u64::MAX), "expected no delay before the previous end");
+    assert_eq!(gl.free_timestamps.borrow().len(), 2, "expected two queries for all spans");
 }
 
 #[test]

@@ -1,5 +1,6 @@
 //! Measures the device time of passes, and waits for the device.
 
+use std::cell::RefCell;
 use std::rc::Rc;
 use std::time::{Duration, Instant};
 
@@ -44,19 +45,88 @@ impl Gl {
             self.wait(pass, limit)?;
             return Ok(PassTimer::Wall(start.elapsed().as_secs_f64() * 1e3));
         }
-        let timer = PassTimer::Query(Rc::clone(self), self.acquire_query()?);
+        let timer = PassTimer::Query(Rc::clone(self), self.acquire_query(&self.free_queries)?);
         let active_query = ActiveQuery::begin(&timer)?;
         commands()?;
         drop(active_query);
         Ok(timer)
     }
 
-    /// Takes a query from the pool; creates one if the pool is empty.
-    fn acquire_query(&self) -> Result<glow::Query> {
-        let free_query = self.free_queries.borrow_mut().pop();
+    /// Begins to measure when the device executes the following commands. `None` for a software rasterizer, which
+    /// executes them without a queue.
+    pub(crate) fn begin_span(self: &Rc<Self>) -> Result<Option<SpanTimer>> {
+        if self.limits.software {
+            return Ok(None);
+        }
+        // SAFETY: only reads the clock of the device.
+        let now_ns = unsafe { self.functions()?.get_parameter_i64(glow::TIMESTAMP) };
+        Ok(Some(SpanTimer { submission_ns: now_ns.max(0) as u64, begin: self.timestamp()?, end: None }))
+    }
+
+    /// The time at which the device has executed all commands so far.
+    fn timestamp(self: &Rc<Self>) -> Result<Timestamp> {
+        let query = self.acquire_query(&self.free_timestamps)?;
+        // SAFETY: the query belongs to the timestamp alone, and is used for timestamps only.
+        unsafe { self.functions()?.query_counter(query, glow::TIMESTAMP) }
+        Ok(Timestamp { gl: Rc::clone(self), query })
+    }
+
+    /// Takes a query from a pool; creates one if the pool is empty.
+    fn acquire_query(&self, pool: &RefCell<Vec<glow::Query>>) -> Result<glow::Query> {
+        let free_query = pool.borrow_mut().pop();
         let gl = self.functions()?;
         // SAFETY: a new name, which stays in the pool until the context is destroyed.
         free_query.map_or_else(|| unsafe { gl.create_query() }.map_err(fault_in("timer")), Ok)
+    }
+}
+
+/// Measures when the device executes a sequence of commands.
+#[derive(Debug)]
+pub(crate) struct SpanTimer {
+    /// Time of the device's clock at the submission of the first command.
+    submission_ns: u64,
+    begin: Timestamp,
+    /// `None` until [`SpanTimer::end`].
+    end: Option<Timestamp>,
+}
+
+/// A timestamp query, which returns to its pool when this is dropped.
+#[derive(Debug)]
+struct Timestamp {
+    gl: Rc<Gl>,
+    query: glow::Query,
+}
+
+impl SpanTimer {
+    /// Ends the sequence of commands.
+    pub(crate) fn end(&mut self, gl: &Rc<Gl>) -> Result<()> {
+        self.end = Some(gl.timestamp()?);
+        Ok(())
+    }
+
+    /// Milliseconds from the time at which the device could have begun the commands, which is their submission or
+    /// `previous_end_ns`, until it began them. Replaces `previous_end_ns` by the end of these commands if that is later.
+    /// Waits for the device.
+    pub(crate) fn delay_ms(&self, previous_end_ns: &mut u64) -> f64 {
+        let (begin_ns, end_ns) = (self.begin.ns(), self.end.as_ref().map_or(0, Timestamp::ns));
+        let ready_ns = self.submission_ns.max(*previous_end_ns);
+        *previous_end_ns = end_ns.max(*previous_end_ns);
+        begin_ns.saturating_sub(ready_ns) as f64 * 1e-6
+    }
+}
+
+impl Timestamp {
+    /// The time of the device's clock. Waits for the device. 0 if the context cannot be made current.
+    fn ns(&self) -> u64 {
+        let Some(gl) = self.gl.functions_or_skip() else { return 0 };
+        // SAFETY: the query was issued; reading its result waits until it is available.
+        unsafe { gl.get_query_parameter_u64(self.query, glow::QUERY_RESULT) }
+    }
+}
+
+impl Drop for Timestamp {
+    fn drop(&mut self) {
+        self.gl.free_timestamps.borrow_mut().push(self.query);
     }
 }
 

@@ -14,7 +14,7 @@ use modalcast_model::deform::{DeformedSurface, Deformer};
 use modalcast_model::error::{Result, fault};
 use modalcast_model::raster::{RasterGeometry, Rasterizer};
 use modalcast_model::scene::{BoundingBox, Camera, OrientedBounds, Scene, SceneState};
-use modalcast_render::{DevicePreference, FrameImage, FrameParams, Renderer, SceneBuffers};
+use modalcast_render::{DevicePreference, FrameImage, FrameParams, PendingFrame, Renderer, SceneBuffers, TrialScene};
 
 /// CUDA device 0, if there is one and the kernel compiler works on it.
 pub(super) fn cuda_device() -> Option<Arc<Device>> {
@@ -97,7 +97,7 @@ impl RenderHarness {
         self.attach_rasterizer(loaded_scene, &device)?;
         if policy == RasterPolicy::Fastest {
             let frame_params = loaded_scene.frame_params(camera, size);
-            self.renderer.select_raster_backends(&mut loaded_scene.buffers, &frame_params)?;
+            self.renderer.select_raster_backends(&mut StillScene { scene: loaded_scene, frame_params })?;
         }
         Ok(())
     }
@@ -157,6 +157,22 @@ impl RenderHarness {
 
     pub(super) fn unload(&mut self, loaded_scene: LoadedScene) {
         self.renderer.unload(loaded_scene.buffers);
+    }
+}
+
+/// Draws the same step again, because the report measures the passes of a frame without a deformation.
+struct StillScene<'a> {
+    scene: &'a mut LoadedScene,
+    frame_params: FrameParams,
+}
+
+impl TrialScene for StillScene<'_> {
+    fn buffers_mut(&mut self) -> Result<&mut SceneBuffers> {
+        Ok(&mut self.scene.buffers)
+    }
+
+    fn submit(&mut self, renderer: &mut Renderer) -> Result<PendingFrame> {
+        renderer.submit_without_readback(&self.scene.buffers, &self.frame_params)
     }
 }
 
