@@ -117,3 +117,66 @@ fn enable(scene: &mut dyn TrialScene, passes: RasterPasses) -> Result<()> {
     buffers.compute_rasterizer.iter().for_each(|rasterizer| rasterizer.enable(passes));
     Ok(())
 }
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use super::*;
+    use crate::renderer::tests::{load_renderer, params};
+    use crate::types::FrameParams;
+    use modalcast_model::raster::{DrawTarget, Rasterizer};
+
+    /// Time by which a trial is slowed down. Frames of the test take much less.
+    const DELAY: Duration = Duration::from_millis(60);
+
+    #[derive(Debug)]
+    struct EmptyRasterizer;
+
+    impl Rasterizer for EmptyRasterizer {
+        fn precompile(&mut self, _depth: bool, _ids: bool) -> Result<()> {
+            Ok(())
+        }
+
+        fn draw(&mut self, _depth: Option<DrawTarget<'_>>, _ids: Option<DrawTarget<'_>>) -> Result<()> {
+            Ok(())
+        }
+    }
+
+    /// A scene that takes longer unless the compute rasterizer draws `fastest`.
+    struct DelayedScene {
+        buffers: SceneBuffers,
+        params: FrameParams,
+        fastest: RasterPasses,
+    }
+
+    impl TrialScene for DelayedScene {
+        fn buffers_mut(&mut self) -> Result<&mut SceneBuffers> {
+            Ok(&mut self.buffers)
+        }
+
+        fn submit(&mut self, renderer: &mut Renderer) -> Result<PendingFrame> {
+            if enabled(self)? != self.fastest {
+                std::thread::sleep(DELAY);
+            }
+            renderer.submit_without_readback(&self.buffers, &self.params)
+        }
+    }
+
+    #[test]
+    fn combination_with_the_fastest_frames_is_selected() {
+        let (mut renderer, scene, mut buffers) = load_renderer();
+        renderer.attach_rasterizer(&mut buffers, |_| Ok(Box::new(EmptyRasterizer))).expect("a rasterizer");
+        let supported = buffers.compute_rasterizer.as_ref().map(ComputeRasterizer::enabled).expect("a rasterizer");
+        let fastest = RasterPasses { shadow: true, visibility: false };
+        assert!(fastest.is_subset_of(supported), "expected a scene whose shadow map the rasterizer can draw");
+        let params = params(&scene, 16);
+        let mut scene = DelayedScene { buffers, params, fastest };
+        let backends = renderer.select_raster_backends(&mut scene).expect("timed trials");
+        assert_eq!(backends.shadow, Some(RasterBackend::Cuda));
+        assert_eq!(enabled(&mut scene).expect("buffers"), fastest);
+        scene.fastest = RasterPasses::NONE;
+        renderer.select_raster_backends(&mut scene).expect("timed trials");
+        assert!(scene.buffers.compute_rasterizer.is_none(), "expected no rasterizer that draws no pass");
+    }
+}

@@ -47,7 +47,7 @@ fn surface(extra_width: f32) -> DeformedSurface {
     DeformedSurface { positions: positions.as_flattened().to_vec(), normals, ..DeformedSurface::default() }
 }
 
-fn params(scene: &Scene, side: u32) -> FrameParams {
+pub(super) fn params(scene: &Scene, side: u32) -> FrameParams {
     let camera = Camera::fit_to_scene(scene, side, side);
     FrameParams {
         camera,
@@ -70,7 +70,7 @@ fn draw_frame(extra_width: f32) -> (Vec<u8>, u64) {
 }
 
 /// A renderer with a loaded scene and its uploaded surface.
-fn load_renderer() -> (Renderer, Arc<Scene>, SceneBuffers) {
+pub(super) fn load_renderer() -> (Renderer, Arc<Scene>, SceneBuffers) {
     let (mut renderer, scene) = (open(), scene());
     let buffers = renderer.load(&scene).expect("loads");
     renderer.upload(&buffers, &surface(0.0)).expect("uploads");
