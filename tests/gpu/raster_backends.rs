@@ -157,8 +157,8 @@ fn gpu_ids_equal_opengl_except_on_edges_and_depth_ties() {
         );
         eprintln!("{name}: {differences:?} of {} pixels", got.visible_triangles.len());
         // At the border of a cut-out, the filtered alpha crosses its threshold. Hardware uses 8-bit filter weights, so
-        // up to 0.2 % of the pixels of the tree may differ.
-        let max_wrong = if name == "tree" { SIZE[0] * SIZE[1] / 500 } else { 0 };
+        // up to 0.15 % of the pixels of the tree may differ. Measured on an H100: 0.125 %.
+        let max_wrong = if name == "tree" { SIZE[0] * SIZE[1] * 3 / 2000 } else { 0 };
         assert!(
             differences.wrong <= max_wrong as usize,
             "{name}: expected at most {max_wrong} wrong pixels, got {differences:?}"
@@ -201,8 +201,8 @@ fn gpu_shading_of_equal_ids_equals_opengl() {
                 "{name}, {:?}, {edges:?}: {different_count} pixels with equal ids have different colors",
                 shadow.map(|shadow| shadow.size)
             );
-            // 0.2 % of the pixels.
-            let limit = got.visible_triangles.len() / 500;
+            // Shadows of cut-outs differ with the border of the cut-outs in the shadow map: on an H100 at 37 pixels.
+            let limit = if name == "tree" && shadow.is_some() { 100 } else { 0 };
             assert!(
                 different_count <= limit,
                 "{name}: expected at most {limit} different pixels, got {different_count}"
@@ -266,7 +266,8 @@ fn gpu_scene_moved_by_4096_units_is_drawn_by_both_rasterizers() {
     assert_eq!((opengl.info.raster_backends, cuda.info.raster_backends), (OPENGL_BACKENDS, CUDA_BACKENDS));
     // Edges of triangles, and intersections of triangles.
     let (different, pixel_count) = (count_different(&opengl, &cuda), opengl.rgba.len() / 4);
-    assert!(different < pixel_count / 50, "{different} of {pixel_count} pixels differ");
+    // Measured on an H100: 874 pixels, at edges.
+    assert!(different < pixel_count / 400, "{different} of {pixel_count} pixels differ");
     let count_surface = |image: &FrameImage| image.rgba.chunks_exact(4).filter(|pixel| pixel[..3] != [0; 3]).count();
     let (rest, moved) = (count_surface(&draw_moved(RasterPolicy::Cuda, 0.0)), count_surface(&cuda));
     eprintln!("{different} pixels differ; surfaces cover {rest} pixels at rest and {moved} after the move");
