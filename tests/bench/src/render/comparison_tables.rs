@@ -157,6 +157,7 @@ fn plant_section(plants: &[PlantResult]) -> String {
     let Some(first_plant) = plants.first() else { return String::new() };
     let header = [
         "species",
+        "shadow map",
         "triangles",
         "domains",
         "deform ms",
@@ -174,12 +175,12 @@ fn plant_section(plants: &[PlantResult]) -> String {
     let vertex_transfer =
         if first_plant.fills_gl_buffers { "vertices stay on the device" } else { "vertices are uploaded" };
     let mut text = format!(
-        "\n## The plants of table 4.5, deformed and drawn\n\nDeformed by {}, {vertex_transfer}; a variance shadow map of {}. \
-         t_vbr: deforming, uploading and rendering; FPS: whole frames with readback of the pixels; s: device memory of \
+        "\n## The plants of table 4.5, deformed and drawn\n\nDeformed by {}, {vertex_transfer}; a variance shadow map, fitted \
+         to the corners of a box as in the thesis, or to the vertices; 4 samples a pixel, or FXAA with the CUDA rasterizer. \
+         The thesis states neither the size of its images nor that of its maps. t_vbr: deforming, uploading and rendering; FPS: whole frames with readback of the pixels; s: device memory of \
          the scene; O_vbr: fraction of the frame that is t_vbr. Thesis: GeForce GTX 680, the GPU columns of tables 4.6 and \
          4.7. The thesis's frame includes the simulation, ours does not.{}\n\n",
         first_plant.backend.name(),
-        first_plant.map_size,
         if first_plant.is_full_size {
             ""
         } else {
@@ -190,12 +191,13 @@ fn plant_section(plants: &[PlantResult]) -> String {
     text
 }
 
-fn plant_cells(plant: &PlantResult) -> [String; 14] {
+fn plant_cells(plant: &PlantResult) -> [String; 15] {
     let format_ms = |us: f64| format!("{:.3}", us / 1e3);
     let format_percent = |fraction: f64| format!("{:.2} %", 100.0 * fraction);
     let thesis = plant.thesis.drawn;
     [
         plant.thesis.name.into(),
+        plant.setting.to_string(),
         plant.triangles.to_string(),
         plant.domains.to_string(),
         format_ms(plant.deform.median_us),

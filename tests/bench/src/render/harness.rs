@@ -77,8 +77,13 @@ impl RenderHarness {
     /// # Errors
     /// Errors of the device.
     pub(super) fn attach_rasterizer(&mut self, loaded_scene: &mut LoadedScene, device: &Arc<Device>) -> Result<()> {
+        self.attach_rasterizer_to(&mut loaded_scene.buffers, device)
+    }
+
+    /// [`Self::attach_rasterizer`] for the buffers of a scene.
+    pub(super) fn attach_rasterizer_to(&mut self, buffers: &mut SceneBuffers, device: &Arc<Device>) -> Result<()> {
         let create = |mesh: RasterGeometry| Ok(Box::new(CudaRasterizer::new(device, mesh)?) as Box<dyn Rasterizer>);
-        self.renderer.attach_rasterizer(&mut loaded_scene.buffers, create)
+        self.renderer.attach_rasterizer(buffers, create)
     }
 
     /// Selects the rasterizers of a deformed scene by `policy`. `Fastest` draws `camera`'s frame to measure both

@@ -100,7 +100,7 @@ pub struct RenderReportOptions {
 }
 
 impl RenderReportOptions {
-    /// Texels per side of the shadow maps of plants and of rasterizer comparisons.
+    /// Texels per side of the shadow maps of rasterizer comparisons.
     fn shadow_map_size(&self) -> u32 {
         if self.quick { 1024 } else { 4096 }
     }
@@ -250,7 +250,7 @@ pub fn render(
     }
     for index in &options.plants {
         progress(RenderProgress::Started(&plant_name(*index)))?;
-        measurements.plants.push(plants::measure(&mut harness, device.as_ref(), options, *index)?);
+        measurements.plants.extend(plants::measure(&mut harness, device.as_ref(), options, *index)?);
         let report = measurements.assemble(options, harness.renderer.info(), Vec::new());
         progress(RenderProgress::Measured(&report))?;
     }
@@ -289,7 +289,8 @@ impl Measurements {
         let Self { loads, rows, readback, minimal_passes, raster, plants } = self;
         let failed = rows.iter().filter(|row: &&RenderRow| !row.is_as_expected()).map(describe_failure);
         let missing_loads = options.loads[loads.len()..].iter().map(|workload| workload.name());
-        let missing_plants = options.plants[plants.len()..].iter().map(|index| plant_name(*index));
+        let is_missing = |name: &String| plants.iter().all(|plant| plant.load != *name);
+        let missing_plants = options.plants.iter().map(|index| plant_name(*index)).filter(is_missing);
         RenderReport {
             provenance: Provenance::collect(),
             renderer: renderer.clone(),

@@ -174,12 +174,20 @@ fn passes_csv(report: &RenderReport) -> Result<Vec<u8>> {
     encode_csv(header.map(String::from), lines)
 }
 
-/// The CSV of plants, one plant per line: our measurements, then the measurements of the thesis. `t_vbr` and `o_vbr`
+/// The CSV of plants, one plant and setting per line: our measurements, then the measurements of the thesis. `t_vbr` and `o_vbr`
 /// are defined in [`super::plants`].
 fn plants_csv(plants: &[PlantResult]) -> Result<Vec<u8>> {
-    let header =
-        ["load", "species", "full", "backend", "shared", "triangles", "domains", "map_size", "deform_ms", "upload_ms"];
-    let header = header.into_iter().chain(["render_ms", "t_vbr_ms", "frame_ms", "fps", "memory_mb", "o_vbr"]);
+    let header = ["load", "species", "full", "backend", "shared", "triangles", "domains", "map_size", "fit", "raster"];
+    let header = header.into_iter().chain([
+        "deform_ms",
+        "upload_ms",
+        "render_ms",
+        "t_vbr_ms",
+        "frame_ms",
+        "fps",
+        "memory_mb",
+        "o_vbr",
+    ]);
     let header = header.chain(["thesis_t_vbr_ms", "thesis_fps", "thesis_memory_mb", "thesis_o_vbr"]);
     let line = |plant: &PlantResult| {
         let median_ms = |timing: Timing| (timing.median_us / 1e3).to_string();
@@ -191,12 +199,14 @@ fn plants_csv(plants: &[PlantResult]) -> Result<Vec<u8>> {
             plant.backend.name().into(),
             plant.fills_gl_buffers.to_string(),
         ];
-        let sizes = [plant.triangles, plant.domains, plant.map_size as usize].map(|number| number.to_string());
+        let sizes = [plant.triangles, plant.domains, plant.setting.map_size as usize].map(|number| number.to_string());
+        let raster = if plant.setting.is_cuda_rasterized { "cuda" } else { "opengl" };
+        let setting = [format!("{:?}", plant.setting.fit).to_lowercase(), raster.into()];
         let times = [plant.deform, plant.upload, plant.render, plant.vbr, plant.frame].map(median_ms);
         let rates = [plant.fps, plant.bytes as f64 / 1e6, plant.occupation];
         let thesis = [thesis.gpu_vbr_ms, thesis.gpu_fps, thesis.gpu_mb, thesis.gpu_vbr_occupation];
         let numbers = rates.iter().chain(&thesis).map(|number| number.to_string());
-        texts.into_iter().chain(sizes).chain(times).chain(numbers).collect::<Vec<String>>()
+        texts.into_iter().chain(sizes).chain(setting).chain(times).chain(numbers).collect::<Vec<String>>()
     };
     encode_csv(header.map(String::from), plants.iter().map(line))
 }

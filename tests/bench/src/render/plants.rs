@@ -6,9 +6,12 @@
 //!
 //! Our `t_vbr` is the sum of three times: a step of the deformer (upload of the modal coordinates q and of the
 //! transforms T, and the product U q with the modes U), the upload of vertices if the deformer does not write the
-//! renderer's buffers, and all passes except the readback. Our frame also contains the readback of the pixels and the
-//! waits between all of these. The thesis's frame includes the simulation, ours does not.
+//! renderer's buffers, and all passes except the readback, with the change from CUDA to OpenGL before them. Our frame
+//! also contains the readback of the pixels and the waits between all of these. The thesis's frame includes the
+//! simulation, ours does not. The thesis states neither the size of its images nor that of its shadow maps, so several
+//! settings are measured ([`PlantSetting`]).
 
+use std::fmt;
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -24,8 +27,8 @@ use modalcast_compute::cpu::CpuDeformer;
 use modalcast_compute::gpu::{CudaDeformer, CudaDeformerOptions, Device};
 use modalcast_model::deform::{Backend, DeformSummary, Deformer, VertexAttributes};
 use modalcast_model::error::{Result, fault};
-use modalcast_model::scene::{Camera, RenderSettings, Scene, SceneState, ShadowSettings};
-use modalcast_render::{FrameParams, SceneBuffers};
+use modalcast_model::scene::{Antialiasing, Camera, RenderSettings, Scene, SceneState, ShadowFit, ShadowSettings};
+use modalcast_render::{FrameParams, RenderStage, SceneBuffers};
 
 /// Results of one plant, with the numbers of the thesis.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -43,14 +46,12 @@ pub struct PlantResult {
     pub fills_gl_buffers: bool,
     pub triangles: usize,
     pub domains: usize,
-    /// Side of the variance shadow map, texels.
-    #[serde(rename = "map")]
-    pub map_size: u32,
+    pub setting: PlantSetting,
     /// A step of the deformer.
     pub deform: Timing,
     /// Upload of the vertices; 0 if the deformer fills the renderer's buffers.
     pub upload: Timing,
-    /// Shadow and draw passes.
+    /// Shadow and draw passes, with the change from CUDA to OpenGL.
     pub render: Timing,
     /// `t_vbr`: the sum of deform, upload and render.
     pub vbr: Timing,
@@ -62,8 +63,63 @@ pub struct PlantResult {
     pub bytes: u64,
 }
 
+/// How a plant is drawn: with a variance shadow map.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+pub struct PlantSetting {
+    /// Side of the shadow map, texels.
+    #[serde(rename = "map")]
+    pub map_size: u32,
+    pub fit: ShadowFit,
+    /// Whether the CUDA rasterizer draws the passes that it supports, with one sample per pixel and FXAA. Otherwise
+    /// OpenGL draws four samples per pixel.
+    #[serde(rename = "cuda_raster")]
+    pub is_cuda_rasterized: bool,
+}
+
+impl PlantSetting {
+    /// Three sizes with the thesis's fit to the corners of a bounding box; the default fit; and the CUDA rasterizer, if
+    /// there is a device. Quick runs have smaller maps.
+    fn all(quick: bool, has_device: bool) -> Vec<Self> {
+        let scale: u32 = if quick { 4 } else { 1 };
+        let with_opengl = |map_size, fit| Self { map_size: map_size / scale, fit, is_cuda_rasterized: false };
+        let mut settings = [1024, 2048, 4096].map(|size| with_opengl(size, ShadowFit::Corners)).to_vec();
+        let fitted = with_opengl(2048, ShadowFit::Vertices);
+        settings.push(fitted);
+        if has_device {
+            settings.push(Self { is_cuda_rasterized: true, ..fitted });
+        }
+        settings
+    }
+
+    fn look(self, scene: &Scene) -> RenderSettings {
+        let shadow = Some(ShadowSettings { size: self.map_size, fit: self.fit, ..ShadowSettings::default() });
+        let (antialias, samples) =
+            if self.is_cuda_rasterized { (Antialiasing::Fxaa, 1) } else { (Antialiasing::Msaa, 4) };
+        RenderSettings { shadow, antialias, samples, ..scene.look }
+    }
+}
+
+impl fmt::Display for PlantSetting {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let rasterizer = if self.is_cuda_rasterized { "CUDA, FXAA" } else { "OpenGL" };
+        let fit = match self.fit {
+            ShadowFit::Corners => "corners",
+            ShadowFit::Vertices => "fitted",
+        };
+        write!(out, "{}, {fit}, {rasterizer}", self.map_size)
+    }
+}
+
 /// Number of different states that the frames cycle through.
 const STATES: usize = 8;
+
+/// A plant to measure.
+struct Plant {
+    thesis: ThesisPlant,
+    workload: Workload,
+    is_full_size: bool,
+    states: Vec<SceneState>,
+}
 
 /// A plant's deformer and renderer buffers. The deformer is dropped first, because it may have registered the buffers.
 struct PlantSetup {
@@ -73,36 +129,48 @@ struct PlantSetup {
     buffers: SceneBuffers,
 }
 
-/// Measures the plant `index` of table 4.5, counted from 0.
+/// Measures the plant `index` of table 4.5, counted from 0, with all settings.
 pub(super) fn measure(
     harness: &mut RenderHarness,
     device: Option<&Arc<Device>>,
     options: &RenderReportOptions,
     index: usize,
-) -> Result<PlantResult> {
+) -> Result<Vec<PlantResult>> {
     let workload_size = if options.quick { WorkloadSize::Quick } else { WorkloadSize::Full };
     let workload = WorkloadKind::Plant(index).build(workload_size)?;
-    let map_size = options.shadow_map_size();
-    let shadow = Some(ShadowSettings { size: map_size, ..ShadowSettings::default() });
-    let scene = light_meter::with_settings(&workload.scene, RenderSettings { shadow, ..workload.scene.look })?;
-    let states = motion_states(&Workload { scene: Arc::clone(&scene), ..workload.clone() });
-    let mut setup = create_setup(harness, device, &scene)?;
-    let timings = time_frames(harness, &mut setup, &scene, options, &states)?;
+    let states = motion_states(&workload);
+    let is_full_size = workload_size == WorkloadSize::Full;
+    let plant = Plant { thesis: PLANTS[index], workload, is_full_size, states };
+    let settings = PlantSetting::all(options.quick, device.is_some());
+    settings.into_iter().map(|setting| measure_setting(harness, device, options, &plant, setting)).collect()
+}
+
+fn measure_setting(
+    harness: &mut RenderHarness,
+    device: Option<&Arc<Device>>,
+    options: &RenderReportOptions,
+    plant: &Plant,
+    setting: PlantSetting,
+) -> Result<PlantResult> {
+    let Plant { thesis, workload, is_full_size, states } = plant;
+    let scene = light_meter::with_settings(&workload.scene, setting.look(&workload.scene))?;
+    let mut setup = create_setup(harness, device, &scene, setting)?;
+    let timings = time_frames(harness, &mut setup, &scene, options, states)?;
     let PlantSetup { deformer, deformer_bytes, buffers } = setup;
     let (backend, fills_gl_buffers) = (deformer.backend(), deformer.fills_gl_buffers());
     let bytes = deformer_bytes + buffers.plan().bytes();
     drop(deformer);
     harness.renderer.unload(buffers);
     Ok(PlantResult {
-        load: workload.name,
-        thesis: PLANTS[index],
-        is_full_size: workload_size == WorkloadSize::Full,
-        remarks: workload.remarks,
+        load: workload.name.clone(),
+        thesis: *thesis,
+        is_full_size: *is_full_size,
+        remarks: workload.remarks.clone(),
         backend,
         fills_gl_buffers,
         triangles: scene.layout.triangles,
         domains: scene.domains.len(),
-        map_size,
+        setting,
         deform: timings.deform,
         upload: timings.upload,
         render: timings.render,
@@ -124,8 +192,13 @@ fn motion_states(workload: &Workload) -> Vec<SceneState> {
     (0..STATES).map(state).collect()
 }
 
-fn create_setup(harness: &mut RenderHarness, device: Option<&Arc<Device>>, scene: &Arc<Scene>) -> Result<PlantSetup> {
-    let buffers = harness.renderer.load(scene)?;
+fn create_setup(
+    harness: &mut RenderHarness,
+    device: Option<&Arc<Device>>,
+    scene: &Arc<Scene>,
+    setting: PlantSetting,
+) -> Result<PlantSetup> {
+    let mut buffers = harness.renderer.load(scene)?;
     let Some(device) = device else {
         return Ok(PlantSetup {
             deformer: Box::new(CpuDeformer::new(scene).with_bounding_axes(scene.light_axes())),
@@ -138,6 +211,9 @@ fn create_setup(harness: &mut RenderHarness, device: Option<&Arc<Device>>, scene
     let vertex_buffers = if is_same_device { Some(buffers.vertex_buffers()) } else { None };
     let deformer =
         CudaDeformer::new(device, scene, vertex_buffers, CudaDeformerOptions::with_bounding_axes(scene.light_axes()))?;
+    if setting.is_cuda_rasterized {
+        harness.attach_rasterizer_to(&mut buffers, device)?;
+    }
     Ok(PlantSetup { deformer_bytes: deformer.plan().total_bytes(), deformer: Box::new(deformer), buffers })
 }
 
@@ -197,6 +273,18 @@ fn time_frame(
     let frame_begin = Instant::now();
     let DeformSummary { bounds, oriented_bounds: light_bounds, .. } = setup.deformer.deform(state)?;
     let deform = elapsed_us(frame_begin);
+    let frame_params = FrameParams {
+        camera,
+        width: size.width,
+        height: size.height,
+        bounds,
+        light_bounds,
+        edges: None,
+        samples: None,
+    };
+    if let Some(positions) = setup.deformer.shared_positions() {
+        harness.renderer.rasterize(&setup.buffers, &frame_params, positions, || Ok(None))?;
+    }
     let begin = Instant::now();
     let mut upload = 0.0;
     if setup.deformer.fills_gl_buffers() {
@@ -207,18 +295,10 @@ fn time_frame(
             .upload(&setup.buffers, setup.deformer.surface_with(VertexAttributes::POSITIONS_AND_NORMALS)?)?;
         upload = elapsed_us(begin);
     }
-    let frame_params = FrameParams {
-        camera,
-        width: size.width,
-        height: size.height,
-        bounds,
-        light_bounds,
-        edges: None,
-        samples: None,
-    };
     let image = harness.renderer.draw(&setup.buffers, &frame_params)?;
     let frame = elapsed_us(frame_begin);
-    let render = 1e3 * image.times.drawing_ms();
+    let switch_ms = image.times.stage(RenderStage::Switch).unwrap_or(0.0);
+    let render = 1e3 * (switch_ms + image.times.drawing_ms());
     Ok(FrameTimes { deform, upload, render, vbr: deform + upload + render, frame })
 }
 
@@ -238,7 +318,12 @@ mod tests {
             replays: 1,
         };
         // Plant 1 is the conifer of table 4.5.
-        let plant = measure(&mut harness, None, &options, 1).expect("a result");
+        let plants = measure(&mut harness, None, &options, 1).expect("results");
+        assert_eq!(
+            plants.iter().map(|plant| plant.setting.to_string()).collect::<Vec<_>>(),
+            ["256, corners, OpenGL", "512, corners, OpenGL", "1024, corners, OpenGL", "512, fitted, OpenGL"]
+        );
+        let plant = &plants[0];
         assert_eq!(
             (plant.thesis.name, plant.is_full_size, plant.backend, plant.fills_gl_buffers),
             ("Conifer", false, Backend::Cpu, false)

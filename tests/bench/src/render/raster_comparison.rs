@@ -21,8 +21,8 @@ use modalcast_model::scene::{Camera, CullMode, DrawRange, RenderSettings, Scene,
 use modalcast_render::{FrameParams, VisibilityId, shadow_clip_from_world};
 
 /// Largest fraction of samples whose ids may differ from OpenGL's. If more ids differ, no speedup is measured. Correct
-/// rasterizers differ only at edges and depth ties, which are a small part of a frame.
-pub(super) const MAX_DIFFERING_FRACTION: f64 = 0.01;
+/// rasterizers differ only at edges and depth ties: on an H200 at 59 of 2,073,600 samples, a fraction of 2.8e-5.
+pub(super) const MAX_DIFFERING_FRACTION: f64 = 1e-4;
 
 /// Both passes by both rasterizers on one workload.
 #[derive(Debug, Clone, PartialEq, Serialize)]
