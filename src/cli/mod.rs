@@ -72,14 +72,15 @@ const REPORT_EXAMPLES: &str = "Examples:
   modalcast report --help
   modalcast report deform --out report --quick
   modalcast report render --out report --quick
-  modalcast report stream --out report --quick";
+  modalcast report stream --out report --quick
+  modalcast report drift --out report";
 
 /// Help text on the exit codes of all commands.
 pub const EXIT_CODES: &str = "\
 Exit codes:
   0  done
   1  a check failed (doctor: no frame can be drawn; demo: a criterion is not met; report: a variant exceeds its error
-     bound)
+     bound, or errors grow)
   2  invalid command line
   3  invalid input; the message names the field, the expected and the given value
   4  not found

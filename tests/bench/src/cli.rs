@@ -1,5 +1,6 @@
 //! Command line of `modalcast-report`, the program that `modalcast report` starts.
 
+mod drift;
 mod render;
 mod stream;
 
@@ -16,7 +17,8 @@ use modalcast::cli::options::with_spinner;
 use modalcast::cli::{Completion, EXIT_CODES, Outcome, finish, print_line};
 use modalcast_model::error::Result;
 
-/// Measures error against run time, and rates and latencies at the client, on this machine. Writes tables and plots.
+/// Measures error against run time, rates and latencies at the client, and errors over long runs, on this machine.
+/// Writes tables and plots.
 #[derive(Debug, Parser)]
 #[command(name = "modalcast report", version, after_help = format!("{EXAMPLES}\n\n{EXIT_CODES}"))]
 struct Cli {
@@ -32,6 +34,7 @@ enum ReportCommand {
     Deform(DeformArgs),
     Render(render::Args),
     Stream(stream::Args),
+    Drift(drift::Args),
     /// Runs as a child process of a report. The job is JSON.
     #[command(hide = true)]
     Peer {
@@ -48,7 +51,8 @@ const EXAMPLES: &str = "Examples:
   modalcast report deform --out report --scene path/to/finger
   modalcast report deform --out report --scene tree --trajectory path/to/record
   modalcast report render --out report --quick
-  modalcast report stream --out report --quick";
+  modalcast report stream --out report --quick
+  modalcast report drift --out report";
 
 const LOADS: &str = "Loads:
   single-P-R          one domain of 2^P vertices and R modes (table 4.4 of the thesis: P is 14 to 22, R is 10 to 30)
@@ -117,6 +121,7 @@ pub fn run() -> u8 {
         Some(ReportCommand::Deform(args)) => run_deform(args),
         Some(ReportCommand::Render(args)) => render::run(args),
         Some(ReportCommand::Stream(args)) => stream::run(args),
+        Some(ReportCommand::Drift(args)) => drift::run(args),
         Some(ReportCommand::Peer { job }) => stream::run_peer(job),
         None => {
             Cli::command().print_help().ok(); // A closed stdout is no error.

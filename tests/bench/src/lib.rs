@@ -1,5 +1,6 @@
 //! Benchmarks of error against run time for every variant of the deformation, on synthetic scenes or on a scene of the
-//! user. [`render`] does the same for the renderer, and [`stream`] measures at the client.
+//! user. [`render`] does the same for the renderer, [`stream`] measures at the client, and [`drift`] measures errors
+//! over long runs.
 //!
 //! A workload (`load` in options and reports) is a scene to measure. A variant is one way to deform it: a backend, a
 //! storage type of U and further options. Validation comes before timing: a variant whose error exceeds its a-priori
@@ -18,6 +19,7 @@ pub mod cli;
 mod cpu_bandwidth;
 mod cuda_variants;
 mod double_double;
+pub mod drift;
 pub mod error_model;
 pub mod error_sources;
 pub mod errors;
