@@ -19,6 +19,8 @@ pub enum Stage {
     Parse,
     /// Wait in the step queue.
     Queue,
+    /// Computation of the vertices. In CUDA, from the begin of the step on the device to its end, without the wait for
+    /// that begin; with the time in which the GPU draws frames of OpenGL in flight before the step is complete.
     Deform,
     /// Upload of vertices to OpenGL.
     Upload,

@@ -290,8 +290,8 @@ fn gpu_frames_have_the_png_of_the_cpu() {
 fn gpu_frames_of_steps_ahead_are_not_stale() {
     let mut fixture = Fixture::open([640, 360], 7);
     let always = fixture.draw_steps_with_next(3.0, |buffers| buffers, |step| Some(step + 1));
-    assert!(always.stale == 0 && always.all > 100, "{always:?}");
+    assert!(always.stale == 0 && always.all >= 10, "{always:?}");
     let wrong_sometimes = |step: usize| Some(if step % 5 == 3 { step + 2 } else { step + 1 });
     let mixed = fixture.draw_steps_with_next(3.0, |buffers| buffers, wrong_sometimes);
-    assert!(mixed.stale == 0 && mixed.all > 100, "{mixed:?}");
+    assert!(mixed.stale == 0 && mixed.all >= 10, "{mixed:?}");
 }

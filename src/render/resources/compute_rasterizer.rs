@@ -12,7 +12,9 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use super::programs::ProgramCompiler;
-use super::shared_targets::{DEPTH_BYTES, KEY_BYTES, RasterViews, SharedDrawTime, SharedTargets, StepViews};
+use super::shared_targets::{
+    DEPTH_BYTES, KEY_BYTES, RasterViews, SharedDrawTime, SharedTargets, StepViews, reserve_output,
+};
 use crate::device::gl::{self, Buffer, Gl, Program};
 use crate::shaders::ShaderOptions;
 use modalcast_model::error::{Error, Result, fault};
@@ -262,14 +264,4 @@ impl OutputBuffer {
     fn alias(&self) -> Option<Buffer> {
         self.0.borrow().as_ref().map(|counted| counted.buffer.alias())
     }
-}
-
-/// Reserves the memory of an output buffer.
-///
-/// # Errors
-/// `OutOfMemory`.
-pub(super) fn reserve_output(budget: &Arc<MemoryBudget>, bytes: u64) -> Result<Arc<MemoryReservation>> {
-    let memory = MemoryReservation::new(budget);
-    memory.reserve("the output of the compute rasterizer", bytes)?;
-    Ok(memory)
 }

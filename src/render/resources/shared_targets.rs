@@ -9,7 +9,6 @@ use std::rc::Rc;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use super::compute_rasterizer::reserve_output;
 use crate::device::gl::{Buffer, Fence, Gl};
 use modalcast_model::error::{Error, Result};
 use modalcast_model::memory::{MemoryBudget, MemoryReservation};
@@ -88,6 +87,16 @@ pub(super) struct SharedTargets {
     current: Option<DrawnSet>,
     /// Number of allocated sets.
     count: usize,
+}
+
+/// Reserves the memory of an output buffer of the compute rasterizer.
+///
+/// # Errors
+/// `OutOfMemory`.
+pub(super) fn reserve_output(budget: &Arc<MemoryBudget>, bytes: u64) -> Result<Arc<MemoryReservation>> {
+    let memory = MemoryReservation::new(budget);
+    memory.reserve("the output of the compute rasterizer", bytes)?;
+    Ok(memory)
 }
 
 impl SharedBuffer {
