@@ -41,7 +41,7 @@ pub use output::step_output::{
 pub use output::step_vertices::StepVertices;
 pub use output::vertex_encoding::Encoding;
 pub use output::vertex_selection::{Attribute, VertexSelection, validate_domains};
-pub use registry::FailedScene;
+pub use registry::{FailedScene, SceneList};
 pub use scene::delivery::{Delivery, StreamDelivery};
 pub use scene::encoded_subscription::EncodedSubscription;
 pub use scene::force_subscription::{ForceReport, ForceSubscription};
@@ -224,11 +224,6 @@ impl Engine {
         self.shared.services.checkpoints.watch_degraded()
     }
 
-    /// The names of the scenes that are being opened, sorted.
-    pub fn opening(&self) -> Vec<String> {
-        self.shared.registry.opening()
-    }
-
     /// The scenes that have failed, or that could not be opened again, since this server was started, sorted by name. A
     /// scene that is open again or deleted is not among them.
     pub fn failed_scenes(&self) -> Vec<FailedScene> {
@@ -286,8 +281,8 @@ impl Engine {
         self.shared.frame_streams.find(id)
     }
 
-    /// All open scenes, sorted by name.
-    pub fn list(&self) -> Vec<Arc<SceneHandle>> {
+    /// All scenes that are open or being opened, sorted by name.
+    pub fn list(&self) -> SceneList {
         self.shared.registry.list()
     }
 
@@ -404,7 +399,7 @@ impl Engine {
         if self.shared.is_stopping.swap(true, Ordering::AcqRel) {
             return;
         }
-        for scene_handle in self.list() {
+        for scene_handle in self.list().open {
             scene_handle.stop(Error::ShuttingDown).await;
         }
         let engine = self.clone();
@@ -747,7 +742,7 @@ mod tests {
 
         let error = engine.find("faulty").expect_err("expected an error for a failed scene");
         assert!(matches!(error, Error::NotFound { .. }), "expected NotFound, got {error}");
-        let names = engine.list().iter().map(|scene| scene.name.clone()).collect::<Vec<_>>();
+        let names = engine.list().open.iter().map(|scene| scene.name.clone()).collect::<Vec<_>>();
         assert_eq!(names, ["control"]);
         let rest_state = Arc::new(modalcast_model::scene::SceneState::rest(&faulty_scene.scene));
         let deformation = engine.shared.services.device.deform(faulty_scene.id(), &rest_state);
@@ -758,6 +753,33 @@ mod tests {
             await_within_limit(engine.open("strips", "faulty", None)).await.expect("expected to reopen the scene");
         let restored_step = reopened_scene.last_step().map(|step| step.number);
         assert_eq!(restored_step, Some(1), "expected the step of the checkpoint");
+        engine.shutdown().await;
+    }
+
+    /// Otherwise a client that waits for the scenes of a restarted server would miss one.
+    #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+    async fn scene_that_is_opened_is_never_missing_from_the_list() {
+        let folder = tempfile::tempdir().expect("expected a temporary folder");
+        let (engine, _, _) = start_faulty_engine(folder.path()).await;
+        let opening_engine = engine.clone();
+        let opening = tokio::spawn(async move { opening_engine.open("strips", "late", None).await.map(drop) });
+        let is_listed = |names: &[&str]| names.contains(&"late");
+        await_within_limit(async {
+            let mut was_listed = false;
+            loop {
+                let list = engine.list();
+                let open = is_listed(&list.open.iter().map(|scene| scene.name.as_str()).collect::<Vec<_>>());
+                let opening = is_listed(&list.opening.iter().map(String::as_str).collect::<Vec<_>>());
+                assert!(!(open && opening) && (open || opening || !was_listed), "expected the scene in one list");
+                was_listed |= opening;
+                if open {
+                    break;
+                }
+                tokio::task::yield_now().await;
+            }
+        })
+        .await;
+        await_within_limit(opening).await.expect("expected no panic").expect("expected an open scene");
         engine.shutdown().await;
     }
 

@@ -25,6 +25,14 @@ pub(super) struct OpenRequest {
     pub(super) is_built_in: bool,
 }
 
+/// The scenes of a server at one moment.
+#[derive(Debug, Clone)]
+pub struct SceneList {
+    pub open: Vec<Arc<SceneHandle>>,
+    /// Names of the scenes that are being opened.
+    pub opening: Vec<String>,
+}
+
 /// A scene that has failed, or that could not be opened again.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FailedScene {
@@ -176,12 +184,6 @@ impl Registry {
         }
     }
 
-    /// The names whose scene is not loaded yet, sorted.
-    pub(super) fn opening(&self) -> Vec<String> {
-        let entries = self.lock();
-        entries.iter().filter(|(_, entry)| entry.scene_handle().is_none()).map(|(name, _)| name.clone()).collect()
-    }
-
     /// The failed scenes, sorted by name.
     pub(super) fn failed(&self) -> Vec<FailedScene> {
         let entries = self.lock();
@@ -199,13 +201,18 @@ impl Registry {
         lock(&self.failed).remove(name);
     }
 
-    /// The open scenes, sorted by name.
-    pub(super) fn list(&self) -> Vec<Arc<SceneHandle>> {
-        self.lock()
-            .values()
-            .filter_map(|entry| entry.scene_handle().cloned())
-            .filter(|scene_handle| !scene_handle.is_closing())
-            .collect()
+    /// The scenes, sorted by name. The state of each scene is read once, so that a scene that is loaded meanwhile is not
+    /// missing.
+    pub(super) fn list(&self) -> SceneList {
+        let mut list = SceneList { open: Vec::new(), opening: Vec::new() };
+        for (name, entry) in self.lock().iter() {
+            match entry.scene_handle() {
+                Some(scene_handle) if scene_handle.is_closing() => {}
+                Some(scene_handle) => list.open.push(Arc::clone(scene_handle)),
+                None => list.opening.push(name.clone()),
+            }
+        }
+        list
     }
 
     /// Ends one call that opens the name. The last such call releases the name if no scene was loaded.
@@ -275,7 +282,8 @@ mod tests {
         let second_tree = registry.reserve(&request("tree 2", 3, true), false);
         assert_eq!(limit(second_tree), ("open scenes", 3), "expected one extra place for each built-in scene");
         assert!(
-            matches!(registry.find("tree"), Err(Error::Busy { .. })) && registry.opening().contains(&"tree".into())
+            matches!(registry.find("tree"), Err(Error::Busy { .. }))
+                && registry.list().opening.contains(&"tree".into())
         );
         registry.release("a", &first);
         reserve("d", 2).expect("expected the place of the released name");

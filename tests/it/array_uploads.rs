@@ -262,5 +262,5 @@ async fn invalid_arrays_are_rejected_and_leave_no_files() {
     let rejection = error.rejection().expect("expected details");
     assert_eq!(rejection.to_string(), "domains[0]: expected 120 bytes, got 84 bytes");
     let left = std::fs::read_dir(folder.path().join("state/uploads")).expect("expected an uploads folder").count();
-    assert_eq!((left, server.engine.list().len()), (0, 0));
+    assert_eq!((left, server.engine.list().open.len()), (0, 0));
 }

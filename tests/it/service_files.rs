@@ -166,7 +166,7 @@ async fn invalid_files_are_rejected_and_leave_no_files() {
             "{name}"
         );
     }
-    assert!(server.engine.list().is_empty());
+    assert!(server.engine.list().open.is_empty());
     upload(&server, "", &[("a.obj", square)]).await.expect("expected the upload to succeed after rejected ones");
 }
 

@@ -134,7 +134,7 @@ impl CallTarget {
             let rejection = self.send(self.call, messages).await;
             let reason = rejection.as_ref().map(v1::Rejection::reason);
             assert_ne!(reason, Some(v1::Reason::Internal), "{rejection:?}");
-            for scene in self.engine.list().iter().filter(|scene| scene.name != STORED_SCENE) {
+            for scene in self.engine.list().open.iter().filter(|scene| scene.name != STORED_SCENE) {
                 self.engine.close(&scene.name).await.expect("expected a scene that closes");
             }
             self.wait_for_removal().await;
