@@ -24,9 +24,8 @@ pub enum Stage {
     Deform,
     /// Upload of vertices to OpenGL.
     Upload,
-    /// Time until OpenGL begins a submitted frame while no other frame is drawn: the GPU changes from CUDA to OpenGL. With
-    /// the CUDA rasterizer in shared memory, also its wait for the change from OpenGL to CUDA, with the frames of OpenGL
-    /// that the GPU draws before; short if the rasterizer follows a deformation, which has waited.
+    /// Time before the GPU begins a frame: mostly the change from CUDA to OpenGL. `RenderStage::Switch` of the renderer
+    /// defines it.
     Switch,
     /// Shadow map.
     Shadow,

@@ -38,7 +38,7 @@ pub mod step_selector {
 /// Duration of one stage of the work. The stages:
 ///
 /// * parse: validation of the step; queue: its wait in the step queue; deform: computation of the vertices
-/// * upload: vertices to OpenGL; switch: changes of the GPU between CUDA and OpenGL
+/// * upload: vertices to OpenGL; switch: until the GPU begins to draw, mostly its change from CUDA
 /// * shadow: shadow map; draw: all other passes; read: readback of pixels
 /// * encode: PNG or JPEG encoding, or packing of vertices; copy: readback of vertices
 #[derive(Clone, PartialEq, ::prost::Message)]

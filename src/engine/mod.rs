@@ -122,8 +122,8 @@ struct Shared {
 }
 
 impl Engine {
-    /// Opens the state folder and the devices, and begins to reopen every scene in the folder's list of open scenes. Until
-    /// such a scene is open, [`Self::find_opened`] waits for it.
+    /// Opens the state folder and the devices, and begins to reopen every scene in the folder's list of open scenes.
+    /// Until such a scene is open, [`Self::find_opened`] waits for it.
     ///
     /// # Errors
     /// `Unavailable` when a backend requested by name cannot be opened, or another server uses the state folder.
@@ -231,7 +231,8 @@ impl Engine {
     }
 
     /// Opens a source of the repository under a name; an empty name means the last path component of the source. If the
-    /// name is already open from the same source, returns the open scene. A new scene counts to `client`, if there is one.
+    /// name is already open from the same source, returns the open scene. A new scene counts to `client`, if there is
+    /// one.
     ///
     /// # Errors
     /// `NameTaken` when the name belongs to another source, `LimitReached` when too many scenes are open, and the
@@ -446,8 +447,9 @@ impl Engine {
         self.shared.services.device.loss().error().map_or(Ok(()), Err)
     }
 
-    /// Reserves the names of the scenes of the catalog, and reopens the scenes in the background. A scene that cannot be
-    /// opened is logged, and its entry remains in the catalog, because its files may be available again at the next start.
+    /// Reserves the names of the scenes of the catalog, and reopens the scenes in the background. A scene that cannot
+    /// be opened is logged, and its entry remains in the catalog, because its files may be available again at the next
+    /// start.
     fn reopen_scenes(&self) {
         let mut openings = tokio::task::JoinSet::new();
         for (name, provenance) in self.shared.scene_catalog.entries() {

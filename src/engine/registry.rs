@@ -31,6 +31,7 @@ pub struct SceneList {
     pub open: Vec<Arc<SceneHandle>>,
     /// Names of the scenes that are being opened.
     pub opening: Vec<String>,
+    pub failed: Vec<FailedScene>,
 }
 
 /// A scene that has failed, or that could not be opened again.
@@ -186,7 +187,10 @@ impl Registry {
 
     /// The failed scenes, sorted by name.
     pub(super) fn failed(&self) -> Vec<FailedScene> {
-        let entries = self.lock();
+        self.failed_among(&self.lock())
+    }
+
+    fn failed_among(&self, entries: &BTreeMap<String, Arc<RegistryEntry>>) -> Vec<FailedScene> {
         lock(&self.failed).values().filter(|failed| !entries.contains_key(&failed.name)).cloned().collect()
     }
 
@@ -201,11 +205,12 @@ impl Registry {
         lock(&self.failed).remove(name);
     }
 
-    /// The scenes, sorted by name. The state of each scene is read once, so that a scene that is loaded meanwhile is not
-    /// missing.
+    /// The scenes, sorted by name. The state of each scene is read once, so that a scene that is loaded meanwhile is
+    /// not missing.
     pub(super) fn list(&self) -> SceneList {
-        let mut list = SceneList { open: Vec::new(), opening: Vec::new() };
-        for (name, entry) in self.lock().iter() {
+        let entries = self.lock();
+        let mut list = SceneList { open: Vec::new(), opening: Vec::new(), failed: self.failed_among(&entries) };
+        for (name, entry) in entries.iter() {
             match entry.scene_handle() {
                 Some(scene_handle) if scene_handle.is_closing() => {}
                 Some(scene_handle) => list.open.push(Arc::clone(scene_handle)),

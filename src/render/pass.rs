@@ -64,10 +64,10 @@ pub enum Pass {
 pub enum RenderStage {
     /// Upload of deformed vertices from host memory; measured by the caller.
     Upload,
-    /// What the device waits for instead of drawing the frame: from its submission, or from the end of the previous frame
-    /// if that is later, until OpenGL begins it. Includes the change of the device from CUDA to OpenGL. In frames whose
-    /// compute rasterizer draws into shared memory, also the waits for it without the time in which it drew: for frames
-    /// of OpenGL in flight, and for the change from OpenGL to CUDA. Not measured by software rasterizers.
+    /// Time before the device begins the frame, counted from the begin of its recording or from the end of the frame
+    /// that was read last, whichever is later. Includes the change from CUDA to OpenGL, and other work of the device.
+    /// If a compute rasterizer draws into shared memory, the wait of the host for it is added, without its device time:
+    /// for frames of OpenGL in flight, and for the change from OpenGL to CUDA. Not measured with software rasterizers.
     Switch,
     Shadow,
     Draw,

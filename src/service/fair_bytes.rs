@@ -1,5 +1,5 @@
-//! A limited number of bytes, which go first to the holder that has the fewest (max-min fairness). A holder that keeps
-//! what it has cannot delay one that returns its bytes.
+//! A limited number of bytes. Those that are free go to the waiting holder that has the fewest (max-min fairness), so
+//! that a holder of many bytes does not delay one that returns its bytes.
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
@@ -25,14 +25,14 @@ struct State {
 
 #[derive(Debug)]
 struct Waiter {
-    holder: Arc<Holder>,
+    holder: Arc<ByteHolder>,
     bytes: usize,
-    grant: oneshot::Sender<Granted>,
+    grant: oneshot::Sender<ByteGrant>,
 }
 
-/// One that holds bytes.
+/// A connection, or another user of bytes.
 #[derive(Debug)]
-pub(super) struct Holder {
+pub(super) struct ByteHolder {
     total: Arc<FairBytes>,
     /// Changes only while `FairBytes::state` is locked.
     held_bytes: AtomicUsize,
@@ -40,8 +40,8 @@ pub(super) struct Holder {
 
 /// Bytes that return to the total when this is dropped.
 #[derive(Debug)]
-pub(super) struct Granted {
-    holder: Arc<Holder>,
+pub(super) struct ByteGrant {
+    holder: Arc<ByteHolder>,
     bytes: usize,
 }
 
@@ -54,8 +54,8 @@ impl FairBytes {
         self.max_bytes
     }
 
-    pub(super) fn new_holder(self: &Arc<Self>) -> Arc<Holder> {
-        Arc::new(Holder { total: Arc::clone(self), held_bytes: AtomicUsize::new(0) })
+    pub(super) fn new_holder(self: &Arc<Self>) -> Arc<ByteHolder> {
+        Arc::new(ByteHolder { total: Arc::clone(self), held_bytes: AtomicUsize::new(0) })
     }
 
     #[cfg(test)]
@@ -63,7 +63,7 @@ impl FairBytes {
         lock(&self.state).free_bytes
     }
 
-    /// Changes the state and grants what is free then.
+    /// Changes the state, and grants free bytes to waiters.
     fn update(&self, change: impl FnOnce(&mut State)) {
         let mut state = lock(&self.state);
         change(&mut state);
@@ -71,9 +71,9 @@ impl FairBytes {
         while let Some(Waiter { holder, bytes, grant }) = state.take_next() {
             state.free_bytes -= bytes;
             holder.held_bytes.fetch_add(bytes, Ordering::Relaxed);
-            unclaimed.extend(grant.send(Granted { holder, bytes }).err());
+            unclaimed.extend(grant.send(ByteGrant { holder, bytes }).err());
         }
-        // What is granted to a waiter that was cancelled returns through `update`, which needs the lock.
+        // A grant to a cancelled waiter is returned by `update`, which needs the lock.
         drop(state);
     }
 }
@@ -88,12 +88,12 @@ impl State {
     }
 }
 
-impl Holder {
+impl ByteHolder {
     /// Waits for bytes, at most all that exist. Cancel-safe.
     ///
     /// # Errors
     /// `INTERNAL` if the place of the waiter is lost, which would be a fault of this module.
-    pub(super) async fn acquire(self: &Arc<Self>, bytes: usize) -> Result<Granted, Status> {
+    pub(super) async fn acquire(self: &Arc<Self>, bytes: usize) -> Result<ByteGrant, Status> {
         let bytes = bytes.min(self.total.max_bytes);
         let _update = UpdateOnDrop(&self.total);
         let (grant, granted) = oneshot::channel();
@@ -111,7 +111,7 @@ impl Drop for UpdateOnDrop<'_> {
     }
 }
 
-impl Granted {
+impl ByteGrant {
     /// Removes `bytes`, at most all of these.
     pub(super) fn split(&mut self, bytes: usize) -> Self {
         let bytes = bytes.min(self.bytes);
@@ -120,7 +120,7 @@ impl Granted {
     }
 }
 
-impl Drop for Granted {
+impl Drop for ByteGrant {
     fn drop(&mut self) {
         self.holder.total.update(|state| {
             state.free_bytes += self.bytes;
@@ -137,15 +137,15 @@ mod tests {
 
     use super::*;
 
-    type Acquire = Pin<Box<dyn Future<Output = Granted>>>;
+    type Acquire = Pin<Box<dyn Future<Output = ByteGrant>>>;
 
-    fn acquire(holder: &Arc<Holder>, bytes: usize) -> Acquire {
+    fn acquire(holder: &Arc<ByteHolder>, bytes: usize) -> Acquire {
         let holder = Arc::clone(holder);
         Box::pin(async move { holder.acquire(bytes).await.expect("expected a place") })
     }
 
     /// What is granted at once.
-    fn granted(acquire: &mut Acquire) -> Option<Granted> {
+    fn granted(acquire: &mut Acquire) -> Option<ByteGrant> {
         acquire.now_or_never()
     }
 

@@ -64,8 +64,8 @@ pub async fn bind(config: &Config) -> Result<Listener> {
 }
 
 /// Serves until `shutdown` completes. Then answers health checks with `NOT_SERVING`, ends every stream and returns
-/// within the configured drain time, whether or not clients close their connections. A lost device ends the server, too.
-/// Health checks are also answered with `NOT_SERVING` while a lost renderer is opened again.
+/// within the configured drain time, whether or not clients close their connections. A lost device ends the server,
+/// too. Health checks are also answered with `NOT_SERVING` while a lost renderer is opened again.
 ///
 /// # Errors
 /// `Fault` when the description of the services for reflection is invalid; `DeviceLost`.

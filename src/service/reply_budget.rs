@@ -1,10 +1,10 @@
 //! Budgets for the bytes of replies that are produced and not yet sent, per connection and in total.
 //!
 //! A message counts from the moment when it is queued until HTTP/2 has written its last byte to the socket. A sender
-//! without budget waits; the connection that holds the fewest bytes is the first to continue. The wait is bounded: a call whose client takes no bytes for the reply timeout ends as soon as
-//! another sender waits for the same budget. If that does not free the bytes, the connection is closed. If the total is
-//! exhausted, a connection that holds more than its share and takes nothing for a shorter time is closed, so that a few
-//! connections do not delay all others.
+//! without budget waits; the connection that holds the fewest bytes is the first to continue. The wait is bounded: a
+//! call whose client takes no bytes for the reply timeout ends as soon as another sender waits for the same budget. If
+//! that does not free the bytes, the connection is closed. If the total is exhausted, a connection that holds more than
+//! its share and takes nothing for a shorter time is closed, so that a few connections do not delay all others.
 
 use std::collections::{HashMap, VecDeque};
 use std::pin::Pin;
@@ -20,7 +20,7 @@ use tonic::Status;
 use tonic::body::Body;
 
 use super::connection_table::CountedCall;
-use super::fair_bytes::{FairBytes, Granted, Holder};
+use super::fair_bytes::{ByteGrant, ByteHolder, FairBytes};
 use crate::config::Config;
 use crate::engine::lock;
 use modalcast_model::error::Error;
@@ -56,7 +56,7 @@ pub(super) struct ConnectionReplyBudget {
     /// Key in `ReplyBudget::connections`.
     id: u64,
     /// What the connection holds of the total.
-    of_total: Arc<Holder>,
+    of_total: Arc<ByteHolder>,
     /// The budget of the connection.
     permits: Arc<Semaphore>,
     max_bytes: usize,
@@ -118,8 +118,10 @@ pub(super) struct UnsentBytes {
     bytes: usize,
     /// What these bytes take from the budget of the connection.
     of_connection: OwnedSemaphorePermit,
+    /// Whether the bytes are part of a frame of the response. Others are dropped without being sent.
+    is_attached: bool,
     /// What these bytes take from the budget of all connections.
-    of_total: Granted,
+    of_total: ByteGrant,
 }
 
 /// All existing objects of a kind.
@@ -282,7 +284,7 @@ impl CallReplies {
         let of_total = search_while_waiting(of_total, total.total_search_interval(), || total.relieve()).await?;
         drop(turn);
         self.each_progress(|progress| progress.produce(bytes));
-        Ok(UnsentBytes { call: Arc::clone(self), bytes, of_connection, of_total })
+        Ok(UnsentBytes { call: Arc::clone(self), bytes, of_connection, is_attached: false, of_total })
     }
 
     /// Changes the progress of the call and of its connection.
@@ -312,18 +314,24 @@ impl CallReplies {
 /// While another call of the connection holds bytes, which it may still send or release, the connection is closed only
 /// after `max_stall`; `None` means never.
 fn end_stalled(calls: &[Arc<CallReplies>], timeout: Duration, max_stall: Option<Duration>) {
-    let is_stalled = |call: &&Arc<CallReplies>| {
-        let progress = lock(&call.progress);
-        progress.unsent_bytes > 0 && progress.stall() >= timeout
-    };
-    let stalled = calls.iter().filter(is_stalled);
-    let (ended, running): (Vec<_>, Vec<_>) = stalled.partition(|call| call.is_ended());
-    for call in &running {
-        call.is_ended.store(true, Ordering::Relaxed);
-        lock(&call.progress).last_change = Instant::now();
-        call.ended.notify_one();
+    let mut ended = Vec::new();
+    let mut ends_running = false;
+    for call in calls {
+        // Two searches may find the same call.
+        let mut progress = lock(&call.progress);
+        if progress.unsent_bytes == 0 || progress.stall() < timeout {
+            continue;
+        }
+        if call.is_ended() {
+            ended.push(call);
+        } else {
+            call.is_ended.store(true, Ordering::Relaxed);
+            progress.last_change = Instant::now();
+            call.ended.notify_one();
+            ends_running = true;
+        }
     }
-    if running.is_empty() {
+    if !ends_running {
         for call in ended {
             let progress = *lock(&call.progress);
             if max_stall.is_none_or(|max_stall| progress.stall() < max_stall)
@@ -365,12 +373,12 @@ impl UnsentBytes {
     fn split(&mut self, bytes: usize) -> Option<Self> {
         let (of_connection, of_total) = self.split_permits(bytes)?;
         self.bytes -= bytes;
-        Some(Self { call: Arc::clone(&self.call), bytes, of_connection, of_total })
+        Some(Self { call: Arc::clone(&self.call), bytes, of_connection, is_attached: self.is_attached, of_total })
     }
 
     /// Removes what `bytes` take from the budgets. A message above the budget of its connection has fewer permits than
     /// bytes; the remainder keeps what is left of them.
-    fn split_permits(&mut self, bytes: usize) -> Option<(OwnedSemaphorePermit, Granted)> {
+    fn split_permits(&mut self, bytes: usize) -> Option<(OwnedSemaphorePermit, ByteGrant)> {
         let of_connection = self.of_connection.split(bytes.min(self.of_connection.num_permits()))?;
         Some((of_connection, self.of_total.split(bytes)))
     }
@@ -378,7 +386,10 @@ impl UnsentBytes {
 
 impl Drop for UnsentBytes {
     fn drop(&mut self) {
-        self.call.each_progress(|progress| progress.send(self.bytes));
+        let (bytes, is_attached) = (self.bytes, self.is_attached);
+        let end =
+            |progress: &mut Progress| if is_attached { progress.send(bytes) } else { progress.unsent_bytes -= bytes };
+        self.call.each_progress(end);
     }
 }
 
@@ -424,7 +435,8 @@ impl ReplyContext {
         let (mut unsent, mut missing_bytes) = (Vec::new(), frame.len());
         while let Some(first) = encoding.front_mut().filter(|_| missing_bytes > 0) {
             let part = if first.bytes <= missing_bytes { encoding.pop_front() } else { first.split(missing_bytes) };
-            let Some(part) = part else { break };
+            let Some(mut part) = part else { break };
+            part.is_attached = true;
             missing_bytes -= part.bytes;
             unsent.push(part);
         }
@@ -593,7 +605,11 @@ mod tests {
         second.shrink_to(10);
         let progress = *lock(&connection.progress);
         assert_eq!((progress.unsent_bytes, progress.last_change), (30, first_change));
-        drop(first);
+        drop(second);
+        assert_eq!(lock(&connection.progress).last_change, first_change, "expected no progress by a canceled message");
+        let context = ReplyContext::new(Arc::clone(&first.call));
+        context.encode(first);
+        drop(context.attach(vec![0; 20].into()));
         assert!(lock(&connection.progress).last_change > first_change);
     }
 
@@ -608,7 +624,9 @@ mod tests {
         let [first, second] = held;
         let (first, second) = (first.await.expect("expected capacity"), second.await.expect("expected capacity"));
         let change_before = lock(&call.progress).last_change;
-        drop(first);
+        let context = ReplyContext::new(Arc::clone(&call));
+        context.encode(first);
+        drop(context.attach(vec![0; 10].into()));
         assert!(lock(&call.progress).last_change > change_before, "expected sent bytes to count as progress");
         end_stalled(&calls, Duration::from_secs(1000), None);
         assert!(!is_ended(), "expected a call with recent progress to continue");

@@ -76,11 +76,11 @@ impl v1::scene_service_server::SceneService for SceneServiceImpl {
     async fn list_scenes(&self, _: Request<v1::ListScenesRequest>) -> Result<Response<v1::ListScenesResponse>, Status> {
         let engine = self.0.clone();
         catch_panic(async move {
-            let SceneList { open, opening } = engine.list();
+            let SceneList { open, opening, failed } = engine.list();
             let scenes = open.iter().map(|scene_handle| wire_scene_summary(scene_handle)).collect();
             let mut budget = ByteBudget::new(MAX_SOURCE_BYTES);
             let sources = engine.sources().await?.into_iter().take_while(|source| budget.take_string(source)).collect();
-            let failed = engine.failed_scenes().into_iter().map(wire_failed_scene).collect();
+            let failed = failed.into_iter().map(wire_failed_scene).collect();
             Ok(v1::ListScenesResponse { scenes, sources, opening, failed })
         })
         .await

@@ -70,8 +70,8 @@ impl Fixture {
 
     /// Deforms and draws steps with [`MAX_FRAMES_IN_FLIGHT`] frames in flight for at least `seconds` and two rounds of
     /// the states. `next` returns the index of the state that the deformer may compute with that of a step.
-    /// `change_buffers` changes the buffers that the deformer gets. Returns the numbers of frames and of frames that show
-    /// another image than that of their step.
+    /// `change_buffers` changes the buffers that the deformer gets. Returns the numbers of frames and of frames that
+    /// show another image than that of their step.
     fn draw_steps_with_next(
         &mut self,
         seconds: f64,
@@ -113,7 +113,8 @@ impl Fixture {
         counts
     }
 
-    /// Draws each state once with the PNG file. Returns the numbers of files and of files that differ from those of the CPU.
+    /// Draws each state once with the PNG file. Returns the numbers of files and of files that differ from those of the
+    /// CPU.
     fn encode_steps(&mut self, copies_pixels: bool) -> FrameCounts {
         let buffers = self.renderer.load(&self.scene).expect("expected the scene to load");
         let mut deformer = open_deformer(&self.device, &self.scene, Some(buffers.vertex_buffers()));

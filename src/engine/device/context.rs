@@ -221,11 +221,14 @@ impl DeviceContext {
         self.renderer.as_ref().is_ok_and(Renderer::has_targets)
     }
 
-    /// Frees the render targets that no frame has used for this time.
-    pub(super) fn free_unused_targets(&mut self, unused: Duration) {
-        if let Ok(renderer) = &mut self.renderer
-            && let Err(error) = renderer.free_unused_targets(unused)
-        {
+    /// Frees the render targets and the output of compute rasterizers that no frame has used for this time.
+    pub(super) fn free_unused_targets<'a>(&mut self, scenes: impl Iterator<Item = &'a LoadedScene>, unused: Duration) {
+        let Ok(renderer) = &mut self.renderer else { return };
+        let mut buffers = scenes.filter_map(|scene| scene.buffers().ok());
+        let result = renderer
+            .free_unused_targets(unused)
+            .and_then(|()| buffers.try_for_each(|buffers| renderer.free_unused_samples(buffers, unused)));
+        if let Err(error) = result {
             tracing::warn!(%error, "the memory of unused render targets is not freed");
         }
     }
@@ -337,8 +340,8 @@ impl DeviceContext {
         }
     }
 
-    /// Starts to encode the frames that wait for it. The caller calls this before a deformation, and when OpenGL has nothing
-    /// to draw ([`CudaPictureMemory::start_encodings`]).
+    /// Starts to encode the frames that wait for it. The caller calls this before a deformation, and when OpenGL has
+    /// nothing to draw ([`CudaPictureMemory::start_encodings`]).
     pub(super) fn start_encodings(&self) {
         if let Some(picture_encoder) = &self.picture_encoder {
             picture_encoder.start_encodings();

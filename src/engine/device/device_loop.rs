@@ -33,8 +33,8 @@
 //! rayon's global thread pool because a long job in that pool, such as building a scene, would delay the copies. A
 //! delayed copy occupies its ring slot and so delays the frames of all scenes.
 //!
-//! If CUDA encodes frames as PNG, a frame that is drawn waits for the next deformation, or until no frame is being drawn:
-//! each change of the GPU between the contexts of OpenGL and CUDA takes 0.2 ms.
+//! If CUDA encodes frames as PNG, a frame that is drawn waits for the next deformation, or until no frame is being
+//! drawn: each change of the GPU between the contexts of OpenGL and CUDA takes 0.2 ms.
 //!
 //! # Failures
 //! A panic in a command, in a poll or in a copy drops the reply channel of that command, so its caller gets an error.
@@ -233,7 +233,7 @@ impl DeviceLoop {
     fn free_unused_targets(&mut self) {
         if self.context.has_targets() && self.last_target_check.elapsed() >= TARGET_CHECK_INTERVAL {
             self.last_target_check = Instant::now();
-            run_caught(|| self.context.free_unused_targets(TARGET_LIFETIME));
+            run_caught(|| self.context.free_unused_targets(self.scenes.values(), TARGET_LIFETIME));
         }
     }
 

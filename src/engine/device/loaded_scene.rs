@@ -206,9 +206,9 @@ impl LoadedScene {
         Ok(BufferContents { bounds, light_bounds: None, is_uploaded: true })
     }
 
-    /// Draws the passes of the compute rasterizer for the next frame before OpenGL gets commands, if the positions are in
-    /// shared memory. Also draws those of the step that the deformer has computed ahead, for the same camera. The frame
-    /// must follow with the same parameters. `samples`: samples per pixel that the frame sets for itself.
+    /// Draws the passes of the compute rasterizer for the next frame before OpenGL gets commands, if the positions are
+    /// in shared memory. Also draws those of the step that the deformer has computed ahead, for the same camera. The
+    /// frame must follow with the same parameters. `samples`: samples per pixel that the frame sets for itself.
     pub(in crate::engine) fn rasterize(
         &mut self,
         renderer: &mut Renderer,
@@ -317,8 +317,8 @@ impl LoadedScene {
         renderer.attach_rasterizer(buffers, create_rasterizer)
     }
 
-    /// Measures both rasterizers with steps of the current state and frames of [`BENCHMARK_SIZE`], and selects the faster
-    /// one for each pass.
+    /// Measures both rasterizers with steps of the current state and frames of [`BENCHMARK_SIZE`], and selects the
+    /// faster one for each pass.
     pub(in crate::engine) fn select_raster_backends(&mut self, renderer: &mut Renderer) -> Result<()> {
         renderer.select_raster_backends(self).map(drop)
     }
@@ -331,8 +331,8 @@ impl LoadedScene {
         self.encodes_on_cuda = encodes_on_cuda;
     }
 
-    /// Measures both PNG encoders with a frame of [`BENCHMARK_SIZE`] of the current state and selects the faster one: the time
-    /// of CUDA's kernels is compared with that of one thread of the CPU, divided by the number of threads.
+    /// Measures both PNG encoders with a frame of [`BENCHMARK_SIZE`] of the current state and selects the faster one:
+    /// the time of CUDA's kernels is compared with that of one thread of the CPU, divided by the number of threads.
     pub(in crate::engine) fn select_png_encoder(&mut self, renderer: &mut Renderer) -> Result<()> {
         let FrameSize { width, height } = BENCHMARK_SIZE;
         let camera = Camera::fit_to_scene(&self.scene, width, height);
@@ -401,8 +401,8 @@ impl LoadedScene {
     }
 }
 
-/// The origin of all domains: the scene's origin, or one floating origin. The deformer's output is then drawn unchanged.
-/// `None` if the domains have different origins.
+/// The origin of all domains: the scene's origin, or one floating origin. The deformer's output is then drawn
+/// unchanged. `None` if the domains have different origins.
 fn uniform_origin(state: &SceneState) -> Option<[f64; 3]> {
     match &state.origins {
         Some(origins) => origins.has_no_outliers().then(|| origins.shared_origin()),

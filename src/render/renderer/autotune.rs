@@ -9,7 +9,8 @@ use crate::resources::scene_buffers::SceneBuffers;
 use crate::types::{RasterBackend, RasterBackends};
 use modalcast_model::error::Result;
 
-/// Frames of a trial whose time does not count: they compile programs, allocate memory and fill the queue of the device.
+/// Frames of a trial whose time does not count: they compile programs, allocate memory and fill the queue of the
+/// device.
 const WARM_UP_FRAMES: usize = 3;
 /// Frames of a trial whose time counts.
 const TIMED_FRAMES: usize = 8;
@@ -36,8 +37,8 @@ pub trait TrialScene {
 impl Renderer {
     /// Selects the fastest combination of OpenGL and the compute rasterizer for shadow map and visibility, and returns
     /// it. All combinations are timed with steps and frames in flight, because the time of one pass depends on the
-    /// rasterizer of the other, and a change between CUDA and OpenGL can cost more than a pass. A compute rasterizer that
-    /// draws no pass is dropped. Without a compute rasterizer, both fields of the result are none.
+    /// rasterizer of the other, and a change between CUDA and OpenGL can cost more than a pass. A compute rasterizer
+    /// that draws no pass is dropped. Without a compute rasterizer, both fields of the result are none.
     ///
     /// # Errors
     /// Errors of the scene. The compute rasterizer then draws the same passes as before.
@@ -128,7 +129,7 @@ mod tests {
     use modalcast_model::raster::{DrawTarget, Rasterizer};
 
     /// Time by which a trial is slowed down. Frames of the test take much less.
-    const DELAY: Duration = Duration::from_millis(60);
+    const DELAY: Duration = Duration::from_millis(20);
 
     #[derive(Debug)]
     struct EmptyRasterizer;

@@ -373,8 +373,8 @@ impl Renderer {
     /// Begins to read an AOV field in bands. The scene's buffers must not change until it is finished.
     ///
     /// # Errors
-    /// `Invalid` for a size above the limit or a camera whose matrices overflow; `OutOfMemory`; `Fault` if no values were
-    /// uploaded or OpenGL reports an error.
+    /// `Invalid` for a size above the limit or a camera whose matrices overflow; `OutOfMemory`; `Fault` if no values
+    /// were uploaded or OpenGL reports an error.
     pub fn begin_aov(&mut self, buffers: &SceneBuffers, params: &FrameParams, field: Aov) -> Result<PartialAov> {
         let _current = self.gl.make_current()?;
         self.check_size(params)?;
@@ -455,6 +455,17 @@ impl Renderer {
         {
             self.last_frame = None;
         }
+        Ok(())
+    }
+
+    /// Frees the memory into which the compute rasterizer of a scene draws, if no frame has used it for the time
+    /// `unused`.
+    ///
+    /// # Errors
+    /// `Fault` if the context cannot be made current.
+    pub fn free_unused_samples(&mut self, buffers: &SceneBuffers, unused: Duration) -> Result<()> {
+        let _current = self.gl.make_current()?;
+        buffers.compute_rasterizer.iter().for_each(|rasterizer| rasterizer.free_unused(unused));
         Ok(())
     }
 

@@ -293,8 +293,8 @@ impl Renderer {
         })
     }
 
-    /// Draws the passes of the compute rasterizer, unless [`Renderer::rasterize`] has drawn them. Returns no timer if there
-    /// is none or it fails; OpenGL then draws these passes in later steps.
+    /// Draws the passes of the compute rasterizer, unless [`Renderer::rasterize`] has drawn them. Returns no timer if
+    /// there is none or it fails; OpenGL then draws these passes in later steps.
     fn record_compute_raster(
         &self,
         recorder: &mut PassRecorder<'_>,
@@ -356,8 +356,8 @@ impl Renderer {
     }
 }
 
-/// The compute rasterizer if it draws the visibility of a frame. It draws one sample per pixel, but a frame can set another
-/// number than its scene.
+/// The compute rasterizer if it draws the visibility of a frame. It draws one sample per pixel, but a frame can set
+/// another number than its scene.
 fn visibility_rasterizer<'a>(frame: &FrameContext<'a>) -> Option<&'a ComputeRasterizer> {
     frame.buffers.visibility_rasterizer().filter(|_| frame.target.desc.samples == 1)
 }

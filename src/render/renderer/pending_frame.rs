@@ -104,8 +104,8 @@ impl PartialEq for FramePixels {
 }
 
 impl PendingFrame {
-    /// Requests that the device encodes the frame as PNG. The pixels are copied, too, if `copies_pixels`, or if the device
-    /// cannot encode the frame ([`crate::PixelReadback`]).
+    /// Requests that the device encodes the frame as PNG. The pixels are copied, too, if `copies_pixels`, or if the
+    /// device cannot encode the frame ([`crate::PixelReadback`]).
     pub fn request_png(&self, copies_pixels: bool) {
         if let Some(FrameReadback::Whole(slot)) = &self.readback {
             slot.request_png(PngRequest { size: [self.desc.width, self.desc.height], copies_pixels });
@@ -170,8 +170,8 @@ impl MappedPixels {
         self
     }
 
-    /// The pixels, held in the memory of the readback if enough of it is left for the next frames, else copied. With the
-    /// PNG file, if it was requested and the device has encoded it.
+    /// The pixels, held in the memory of the readback if enough of it is left for the next frames, else copied. With
+    /// the PNG file, if it was requested and the device has encoded it.
     pub fn into_shared_image(mut self) -> FrameImage<FramePixels> {
         let Some(CopiedPng { file, has_pixels, ms }) = self.png.take() else { return self.into_shared_pixels() };
         let (width, height, info) = (self.width, self.height, self.info);

@@ -1,9 +1,9 @@
 //! A compute rasterizer that draws selected passes instead of OpenGL, and its output buffers.
 //!
-//! The compute rasterizer writes depth for the blur, and visibility keys, which a compute pass converts to ids. A key is
-//! the triangle and the depth of a pixel. It writes into shared memory ([`SharedTargets`]), or into OpenGL buffers that it
-//! maps. Both count against the budget of render targets. All later passes are the same as with OpenGL. A scene has these resources only if its backend settings select a
-//! compute rasterizer.
+//! The compute rasterizer writes depth for the blur, and visibility keys, which a compute pass converts to ids. A key
+//! is the triangle and the depth of a pixel. It writes into shared memory ([`SharedTargets`]), or into OpenGL buffers
+//! that it maps. Both count against the budget of render targets. All later passes are the same as with OpenGL. A scene
+//! has these resources only if its backend settings select a compute rasterizer.
 
 use std::cell::{Cell, RefCell};
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -103,8 +103,8 @@ impl RasterPasses {
 }
 
 impl RasterOutputs {
-    /// The outputs of the passes. Their buffers are allocated when they are drawn. `options` are the shader options of the
-    /// scene.
+    /// The outputs of the passes. Their buffers are allocated when they are drawn. `options` are the shader options of
+    /// the scene.
     pub(crate) fn new(
         passes: RasterPasses,
         options: &ShaderOptions,
@@ -154,7 +154,8 @@ impl ComputeRasterizer {
     /// Draws the depth of the shadow map, the visibility of the frame, or both, into mapped buffers.
     ///
     /// # Errors
-    /// Errors of the rasterizer; `OutOfMemory`; `Fault` if the rasterizer panics or OpenGL has no memory for the output.
+    /// Errors of the rasterizer; `OutOfMemory`; `Fault` if the rasterizer panics or OpenGL has no memory for the
+    /// output.
     pub(crate) fn draw(&self, gl: &Rc<Gl>, views: &RasterViews) -> Result<()> {
         let depths = match self.outputs.shadow.as_ref().zip(views.shadow.as_ref()) {
             Some((depths, viewport)) => {
@@ -205,13 +206,20 @@ impl ComputeRasterizer {
         self.shared.borrow_mut().as_mut().map_or(Ok(None), |targets| targets.time_of(gl, views))
     }
 
+    /// Frees shared memory that no frame has used for the time `unused`.
+    pub(crate) fn free_unused(&self, unused: Duration) {
+        if let Some(targets) = self.shared.borrow_mut().as_mut() {
+            targets.free_unused(unused);
+        }
+    }
+
     /// Ends the use of shared memory by the present frame, after all its commands.
     pub(crate) fn release_shared(&self, gl: &Rc<Gl>) -> Result<()> {
         self.shared.borrow_mut().as_mut().map_or(Ok(()), |targets| targets.release(gl))
     }
 
-    /// Runs the rasterizer. A panic becomes an error, so that the caller disables the rasterizer and draws this frame in
-    /// another way.
+    /// Runs the rasterizer. A panic becomes an error, so that the caller disables the rasterizer and draws this frame
+    /// in another way.
     fn run<T>(&self, work: impl FnOnce(&mut dyn Rasterizer) -> Result<T>) -> Result<T> {
         catch_unwind(AssertUnwindSafe(|| work(self.rasterizer.borrow_mut().as_mut())))
             .unwrap_or_else(|_| Err(fault("rasterize", "the compute rasterizer panicked")))

@@ -401,8 +401,8 @@ impl SceneBuffers {
             .map(|array| (array, &cull_resources.buffers.draws))
     }
 
-    /// Attaches a compute rasterizer, which draws all passes that it supports. `budget` limits the memory of its output.
-    /// Does nothing for a scene without such passes.
+    /// Attaches a compute rasterizer, which draws all passes that it supports. `budget` limits the memory of its
+    /// output. Does nothing for a scene without such passes.
     ///
     /// # Errors
     /// Errors of `create_rasterizer` and [`Rasterizer::precompile`], and `Fault` of OpenGL. OpenGL then draws all

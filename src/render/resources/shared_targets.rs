@@ -85,8 +85,11 @@ pub(super) struct SharedTargets {
     drawn: Vec<DrawnSet>,
     /// The set of the frame that is recorded next, or at present.
     current: Option<DrawnSet>,
-    /// Number of allocated sets.
+    /// Number of existing sets.
     count: usize,
+    /// Limit on `count`: [`MAX_SETS`], or fewer if the budget has no memory for more.
+    max_count: usize,
+    last_draw: Instant,
 }
 
 /// Reserves the memory of an output buffer of the compute rasterizer.
@@ -151,7 +154,8 @@ impl TargetSet {
 impl SharedTargets {
     pub(super) fn new(budget: &Arc<MemoryBudget>) -> Self {
         let (free, drawn) = (VecDeque::new(), Vec::new());
-        Self { budget: Arc::clone(budget), free, drawn, current: None, count: 0 }
+        let (current, count, max_count, last_draw) = (None, 0, MAX_SETS, Instant::now());
+        Self { budget: Arc::clone(budget), free, drawn, current, count, max_count, last_draw }
     }
 
     /// Makes the set of these views the current one. Draws it unless it was drawn ahead; then also draws the step that
@@ -159,7 +163,8 @@ impl SharedTargets {
     /// error, this value must be dropped.
     ///
     /// # Errors
-    /// Errors of the rasterizer and of `ahead`; `OutOfMemory`; `Fault` if OpenGL refuses the memory or does not finish within `limit`.
+    /// Errors of the rasterizer and of `ahead`; `OutOfMemory`; `Fault` if OpenGL refuses the memory or does not finish
+    /// within `limit`.
     pub(super) fn draw(
         &mut self,
         gl: &Rc<Gl>,
@@ -176,17 +181,19 @@ impl SharedTargets {
             return Ok(());
         }
         let begin = Instant::now();
-        let mut first = self.take_free(limit)?;
-        first.reserve(gl, &self.budget, rasterizer, &step.views)?;
+        self.last_draw = begin;
+        let first = loop {
+            let set = self.take_free(limit)?;
+            if let Some(set) = self.reserve(gl, rasterizer, set, &step.views)? {
+                break set;
+            }
+        };
         let mut sets = vec![(first, step)];
         if let Some(step) = ahead()?
-            && let Some(mut set) = self.take_read()
+            && let Some(set) = self.take_read()
+            && let Some(set) = self.reserve(gl, rasterizer, set, &step.views)?
         {
-            match set.reserve(gl, &self.budget, rasterizer, &step.views) {
-                Ok(()) => sets.push((set, step)),
-                Err(Error::OutOfMemory { .. }) => self.free.push_front(set),
-                Err(error) => return Err(error),
-            }
+            sets.push((set, step));
         }
         let count = sets.len() as f64;
         let device_ms = rasterizer.draw_shared(&sets.iter().map(|(set, step)| set.draw(step)).collect::<Vec<_>>())?;
@@ -204,6 +211,39 @@ impl SharedTargets {
             current.time.switch_ms = switch_ms;
         }
         Ok(())
+    }
+
+    /// The set with the memory that the views need. `None` if the budget has no memory for so many sets; the set is
+    /// then freed, and fewer exist from now on.
+    ///
+    /// # Errors
+    /// `OutOfMemory` for the last set; `Fault` if OpenGL refuses the memory.
+    fn reserve(
+        &mut self,
+        gl: &Rc<Gl>,
+        rasterizer: &mut dyn Rasterizer,
+        mut set: TargetSet,
+        views: &RasterViews,
+    ) -> Result<Option<TargetSet>> {
+        match set.reserve(gl, &self.budget, rasterizer, views) {
+            Ok(()) => Ok(Some(set)),
+            Err(Error::OutOfMemory { .. }) if self.count > 1 => {
+                self.count -= 1;
+                self.max_count = self.count;
+                Ok(None)
+            }
+            Err(error) => Err(error),
+        }
+    }
+
+    /// Frees the sets that OpenGL does not read, if no set was drawn for the time `unused`.
+    pub(super) fn free_unused(&mut self, unused: Duration) {
+        if self.last_draw.elapsed() >= unused {
+            self.forget_steps_before(u64::MAX);
+            self.free.retain(|set| !set.is_read());
+            self.count = self.free.len() + usize::from(self.current.is_some());
+            self.max_count = MAX_SETS;
+        }
     }
 
     /// The time of the current set if it has these views; otherwise there is no current set afterwards.
@@ -258,7 +298,7 @@ impl SharedTargets {
         if self.free.front().is_some_and(TargetSet::is_read) {
             return self.free.pop_front();
         }
-        (self.count < MAX_SETS).then(|| {
+        (self.count < self.max_count).then(|| {
             self.count += 1;
             TargetSet::default()
         })

@@ -83,7 +83,7 @@ impl Gl {
 /// Measures when the device executes a sequence of commands.
 #[derive(Debug)]
 pub(crate) struct SpanTimer {
-    /// Time of the device's clock at the submission of the first command.
+    /// Time of the device's clock before the first command was recorded.
     submission_ns: u64,
     begin: Timestamp,
     /// `None` until [`SpanTimer::end`].
@@ -104,15 +104,21 @@ impl SpanTimer {
         Ok(())
     }
 
-    /// Milliseconds from the time at which the device could have begun the commands, which is their submission or
-    /// `previous_end_ns`, until it began them. Replaces `previous_end_ns` by the end of these commands if that is later.
-    /// Waits for the device.
+    /// Milliseconds from the begin of the recording of the commands, or from `previous_end_ns` if that is later, until
+    /// the device began them. Replaces `previous_end_ns` by the end of these commands if that is later. Waits for the
+    /// device.
     pub(crate) fn delay_ms(&self, previous_end_ns: &mut u64) -> f64 {
         let (begin_ns, end_ns) = (self.begin.ns(), self.end.as_ref().map_or(0, Timestamp::ns));
-        let ready_ns = self.submission_ns.max(*previous_end_ns);
+        let delay_ns = delay_ns(self.submission_ns, *previous_end_ns, begin_ns);
         *previous_end_ns = end_ns.max(*previous_end_ns);
-        begin_ns.saturating_sub(ready_ns) as f64 * 1e-6
+        delay_ns as f64 * 1e-6
     }
+}
+
+/// Nanoseconds from the later one of two times until the begin.
+const fn delay_ns(submission_ns: u64, previous_end_ns: u64, begin_ns: u64) -> u64 {
+    let ready_ns = if submission_ns > previous_end_ns { submission_ns } else { previous_end_ns };
+    begin_ns.saturating_sub(ready_ns)
 }
 
 impl Timestamp {
@@ -197,5 +203,17 @@ impl Gl {
         // SAFETY: a new name; reading a query that was never begun is an OpenGL error without a result.
         let query = unsafe { self.functions().expect("a current context").create_query() }.expect("a query");
         PassTimer::Query(Rc::clone(self), query)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::delay_ns;
+
+    #[test]
+    fn delay_begins_at_the_submission_or_the_end_of_the_previous_commands() {
+        assert_eq!(delay_ns(100, 40, 130), 30);
+        assert_eq!(delay_ns(100, 120, 130), 10);
+        assert_eq!(delay_ns(100, 140, 130), 0);
     }
 }

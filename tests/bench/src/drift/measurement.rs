@@ -53,7 +53,7 @@ pub struct DriftResult {
     #[serde(rename = "control")]
     pub is_control: bool,
     pub domains: usize,
-    /// The largest error of a later window divided by that of the first [`WINDOW`] steps.
+    /// The largest error of a later window divided by that of the first window.
     pub growth: f64,
     /// Steps in which the floating origin of domain 0 differs from that of the previous step.
     pub origin_changes: u64,

@@ -20,8 +20,8 @@ use modalcast_model::scene::{
 };
 use modalcast_render::{FrameCullStats, FrameImage, RasterBackends, VisibilityId};
 
-/// Largest fraction of pixels whose ids may differ from OpenGL's. More than in [`super::raster_comparison`], because at the
-/// border of a cut-out the filtered alpha crosses its threshold, and hardware filters with 8-bit weights.
+/// Largest fraction of pixels whose ids may differ from OpenGL's. More than in [`super::raster_comparison`], because at
+/// the border of a cut-out the filtered alpha crosses its threshold, and hardware filters with 8-bit weights.
 const MAX_DIFFERING_FRACTION: f64 = 2e-3;
 
 /// Results of one workload with both rasterizers.

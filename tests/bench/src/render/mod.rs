@@ -212,8 +212,8 @@ pub enum RenderProgress<'a> {
     Measured(&'a RenderReport),
 }
 
-/// Measures the selected variants on all workloads, then the rasterizers and the plants. `progress` is called before each
-/// stage, and with the results after each workload, the rasterizers and each plant; the last results are complete.
+/// Measures the selected variants on all workloads, then the rasterizers and the plants. `progress` is called before
+/// each stage, and with the results after each workload, the rasterizers and each plant; the last results are complete.
 ///
 /// # Errors
 /// `Unavailable` without OpenGL; errors of loading and drawing a scene, and of `progress`.

@@ -174,8 +174,8 @@ fn passes_csv(report: &RenderReport) -> Result<Vec<u8>> {
     encode_csv(header.map(String::from), lines)
 }
 
-/// The CSV of plants, one plant and setting per line: our measurements, then the measurements of the thesis. `t_vbr` and `o_vbr`
-/// are defined in [`super::plants`].
+/// The CSV of plants, one plant and setting per line: our measurements, then the measurements of the thesis. `t_vbr`
+/// and `o_vbr` are defined in [`super::plants`].
 fn plants_csv(plants: &[PlantResult]) -> Result<Vec<u8>> {
     let header = ["load", "species", "full", "backend", "shared", "triangles", "domains", "map_size", "fit", "raster"];
     let header = header.into_iter().chain([

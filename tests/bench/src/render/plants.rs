@@ -28,7 +28,7 @@ use modalcast_compute::gpu::{CudaDeformer, CudaDeformerOptions, Device};
 use modalcast_model::deform::{Backend, DeformSummary, Deformer, VertexAttributes};
 use modalcast_model::error::{Result, fault};
 use modalcast_model::scene::{Antialiasing, Camera, RenderSettings, Scene, SceneState, ShadowFit, ShadowSettings};
-use modalcast_render::{FrameParams, RenderStage, SceneBuffers};
+use modalcast_render::{FrameParams, RasterBackend, RenderStage, SceneBuffers};
 
 /// Results of one plant, with the numbers of the thesis.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -127,6 +127,7 @@ struct PlantSetup {
     /// Device bytes of the deformer.
     deformer_bytes: u64,
     buffers: SceneBuffers,
+    is_cuda_rasterized: bool,
 }
 
 /// Measures the plant `index` of table 4.5, counted from 0, with all settings.
@@ -156,7 +157,7 @@ fn measure_setting(
     let scene = light_meter::with_settings(&workload.scene, setting.look(&workload.scene))?;
     let mut setup = create_setup(harness, device, &scene, setting)?;
     let timings = time_frames(harness, &mut setup, &scene, options, states)?;
-    let PlantSetup { deformer, deformer_bytes, buffers } = setup;
+    let PlantSetup { deformer, deformer_bytes, buffers, .. } = setup;
     let (backend, fills_gl_buffers) = (deformer.backend(), deformer.fills_gl_buffers());
     let bytes = deformer_bytes + buffers.plan().bytes();
     drop(deformer);
@@ -204,6 +205,7 @@ fn create_setup(
             deformer: Box::new(CpuDeformer::new(scene).with_bounding_axes(scene.light_axes())),
             deformer_bytes: 0,
             buffers,
+            is_cuda_rasterized: false,
         });
     };
     let renderer_device = harness.renderer.info().cuda_device.and_then(|ordinal| usize::try_from(ordinal).ok());
@@ -214,7 +216,9 @@ fn create_setup(
     if setting.is_cuda_rasterized {
         harness.attach_rasterizer_to(&mut buffers, device)?;
     }
-    Ok(PlantSetup { deformer_bytes: deformer.plan().total_bytes(), deformer: Box::new(deformer), buffers })
+    let is_cuda_rasterized = setting.is_cuda_rasterized;
+    let deformer_bytes = deformer.plan().total_bytes();
+    Ok(PlantSetup { deformer_bytes, deformer: Box::new(deformer), buffers, is_cuda_rasterized })
 }
 
 /// Times of one frame in microseconds, or their distributions over many frames.
@@ -296,6 +300,9 @@ fn time_frame(
         upload = elapsed_us(begin);
     }
     let image = harness.renderer.draw(&setup.buffers, &frame_params)?;
+    if setup.is_cuda_rasterized && image.info.raster_backends.visibility != Some(RasterBackend::Cuda) {
+        return Err(fault("plants", "expected a frame by the CUDA rasterizer, got one by OpenGL"));
+    }
     let frame = elapsed_us(frame_begin);
     let switch_ms = image.times.stage(RenderStage::Switch).unwrap_or(0.0);
     let render = 1e3 * (switch_ms + image.times.drawing_ms());
