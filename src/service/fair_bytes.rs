@@ -73,7 +73,7 @@ impl FairBytes {
             holder.held_bytes.fetch_add(bytes, Ordering::Relaxed);
             unclaimed.extend(grant.send(ByteGrant { holder, bytes }).err());
         }
-        // A grant to a cancelled waiter is returned by `update`, which needs the lock.
+        // A grant to a canceled waiter is returned by `update`, which needs the lock.
         drop(state);
     }
 }
@@ -102,7 +102,7 @@ impl ByteHolder {
     }
 }
 
-/// Grants bytes to others when a waiter is cancelled that was before them.
+/// Grants bytes to others when a waiter is canceled that was before them.
 struct UpdateOnDrop<'a>(&'a FairBytes);
 
 impl Drop for UpdateOnDrop<'_> {
@@ -144,7 +144,7 @@ mod tests {
         Box::pin(async move { holder.acquire(bytes).await.expect("expected a place") })
     }
 
-    /// What is granted at once.
+    /// The bytes that are granted at once.
     fn granted(acquire: &mut Acquire) -> Option<ByteGrant> {
         acquire.now_or_never()
     }
@@ -166,7 +166,7 @@ mod tests {
         assert!(waiting.iter_mut().take(2).all(|waiter| granted(waiter).is_none()));
         let [first, second, _, last] = &mut waiting;
         assert!(granted(last).is_none());
-        // A waiter that is cancelled leaves its place and what it was granted.
+        // A canceled waiter gives up its place and the bytes that it was granted.
         *last = acquire(&empty, 0);
         assert!(granted(second).is_some() && granted(first).is_some());
         drop((of_large, of_small, of_empty));

@@ -80,7 +80,7 @@ pub(super) struct CallReplies {
     is_ended: AtomicBool,
 }
 
-/// How a connection or a call sends what was produced for it.
+/// The unsent bytes of a connection or of a call.
 #[derive(Debug, Clone, Copy)]
 struct Progress {
     unsent_bytes: usize,
@@ -377,7 +377,7 @@ impl UnsentBytes {
     }
 
     /// Removes what `bytes` take from the budgets. A message above the budget of its connection has fewer permits than
-    /// bytes; the remainder keeps what is left of them.
+    /// bytes; the remainder keeps the rest.
     fn split_permits(&mut self, bytes: usize) -> Option<(OwnedSemaphorePermit, ByteGrant)> {
         let of_connection = self.of_connection.split(bytes.min(self.of_connection.num_permits()))?;
         Some((of_connection, self.of_total.split(bytes)))

@@ -180,8 +180,7 @@ impl SharedTargets {
             self.current = Some(self.drawn.swap_remove(index));
             return Ok(());
         }
-        let begin = Instant::now();
-        self.last_draw = begin;
+        self.last_draw = Instant::now();
         let first = loop {
             let set = self.take_free(limit)?;
             if let Some(set) = self.reserve(gl, rasterizer, set, &step.views)? {
@@ -196,6 +195,7 @@ impl SharedTargets {
             sets.push((set, step));
         }
         let count = sets.len() as f64;
+        let begin = Instant::now();
         let device_ms = rasterizer.draw_shared(&sets.iter().map(|(set, step)| set.draw(step)).collect::<Vec<_>>())?;
         let switch_ms = (begin.elapsed().as_secs_f64() * 1e3 - device_ms).max(0.0);
         let device_ms = device_ms / count;

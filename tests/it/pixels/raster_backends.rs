@@ -250,7 +250,7 @@ fn compute_rasterizer_without_memory_leaves_its_passes_to_opengl() {
     let shadow = ShadowSettings { size: 256, ..ShadowSettings::default() };
     let scene = yard_builder(Some(shadow), 1).build();
     let output_bytes = 4 * 256 * 256 + 8 * u64::from(SIZE[0] * SIZE[1]);
-    // The frame, and what is reserved when the scene is unloaded: the memory of the target.
+    // The frame, and the bytes that are reserved after its scene is unloaded, which are those of the target.
     let draw = |backend, bytes: u64| {
         let budget = MemoryBudget::new(MemoryKind::RenderTargets, bytes, bytes);
         let mut renderer = open_renderer();

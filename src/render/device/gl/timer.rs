@@ -60,7 +60,7 @@ impl Gl {
         }
         // SAFETY: only reads the clock of the device.
         let now_ns = unsafe { self.functions()?.get_parameter_i64(glow::TIMESTAMP) };
-        Ok(Some(SpanTimer { submission_ns: now_ns.max(0) as u64, begin: self.timestamp()?, end: None }))
+        Ok(Some(SpanTimer { recording_ns: now_ns.max(0) as u64, begin: self.timestamp()?, end: None }))
     }
 
     /// The time at which the device has executed all commands so far.
@@ -84,7 +84,7 @@ impl Gl {
 #[derive(Debug)]
 pub(crate) struct SpanTimer {
     /// Time of the device's clock before the first command was recorded.
-    submission_ns: u64,
+    recording_ns: u64,
     begin: Timestamp,
     /// `None` until [`SpanTimer::end`].
     end: Option<Timestamp>,
@@ -109,15 +109,15 @@ impl SpanTimer {
     /// device.
     pub(crate) fn delay_ms(&self, previous_end_ns: &mut u64) -> f64 {
         let (begin_ns, end_ns) = (self.begin.ns(), self.end.as_ref().map_or(0, Timestamp::ns));
-        let delay_ns = delay_ns(self.submission_ns, *previous_end_ns, begin_ns);
+        let delay_ns = delay_ns(self.recording_ns, *previous_end_ns, begin_ns);
         *previous_end_ns = end_ns.max(*previous_end_ns);
         delay_ns as f64 * 1e-6
     }
 }
 
 /// Nanoseconds from the later one of two times until the begin.
-const fn delay_ns(submission_ns: u64, previous_end_ns: u64, begin_ns: u64) -> u64 {
-    let ready_ns = if submission_ns > previous_end_ns { submission_ns } else { previous_end_ns };
+const fn delay_ns(recording_ns: u64, previous_end_ns: u64, begin_ns: u64) -> u64 {
+    let ready_ns = if recording_ns > previous_end_ns { recording_ns } else { previous_end_ns };
     begin_ns.saturating_sub(ready_ns)
 }
 
@@ -211,7 +211,7 @@ mod tests {
     use super::delay_ns;
 
     #[test]
-    fn delay_begins_at_the_submission_or_the_end_of_the_previous_commands() {
+    fn delay_begins_at_the_recording_or_the_end_of_the_previous_commands() {
         assert_eq!(delay_ns(100, 40, 130), 30);
         assert_eq!(delay_ns(100, 120, 130), 10);
         assert_eq!(delay_ns(100, 140, 130), 0);
