@@ -225,6 +225,11 @@ void main() {
         atomicAdd(draws.totals[block.index / SUPERBLOCK], class_counts[VISIBLE]);
     }
 #ifndef CULL_PREVIOUS
-    if (lane < CLASS_COUNT && class_counts[lane] > 0u) atomicAdd(cull_counters[FIRST_COUNTER + lane], class_counts[lane]);
+    // Not a condition `lane < CLASS_COUNT && class_counts[lane] > 0u`: Mesa evaluates both operands, and its software
+    // renderer does not check the bounds of shared arrays.
+    if (lane < CLASS_COUNT) {
+        uint class_count = class_counts[lane];
+        if (class_count > 0u) atomicAdd(cull_counters[FIRST_COUNTER + lane], class_count);
+    }
 #endif
 }

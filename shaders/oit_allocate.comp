@@ -50,14 +50,19 @@ void main() {
     for (uint stride = 1u; stride < TILE * TILE; stride *= 2u) {
         memoryBarrierShared();
         barrier();
-        uint preceding_sum = lane >= stride ? scan[lane - stride] : 0u;
+        uint preceding_sum = 0u;
+        // Not a conditional expression, because Mesa evaluates both of its operands.
+        if (lane >= stride) preceding_sum = scan[lane - stride];
         memoryBarrierShared();
         barrier();
         scan[lane] += preceding_sum;
     }
     memoryBarrierShared();
     barrier();
-    if (lane == TILE * TILE - 1u) tile_first_record = scan[lane] > 0u ? atomicAdd(counters.allocated, scan[lane]) : 0u;
+    if (lane == TILE * TILE - 1u) {
+        uint tile_record_count = scan[lane];
+        tile_first_record = tile_record_count > 0u ? atomicAdd(counters.allocated, tile_record_count) : 0u;
+    }
     memoryBarrierShared();
     barrier();
     uint first_record = tile_first_record + scan[lane] - record_count;

@@ -314,6 +314,9 @@ pub(crate) enum UvDerivatives {
 }
 
 #[cfg(test)]
+mod shared_array_tests;
+
+#[cfg(test)]
 mod tests {
     use super::*;
     use crate::device::gl::Limits;
