@@ -242,11 +242,10 @@ impl Registry {
         let mut entries = self.lock();
         let is_registered = |entry: &&Arc<RegistryEntry>| entry.scene_handle().is_some_and(|scene| scene.id() == id);
         let Some(entry) = entries.get(name).filter(is_registered).cloned() else { return };
-        entries.remove(name);
-        drop(entries);
         if let Some(error) = entry.scene_handle().and_then(|scene_handle| scene_handle.failure()) {
             self.record_failure(name, &entry.provenance, error.clone());
         }
+        entries.remove(name);
     }
 
     fn lock(&self) -> MutexGuard<'_, BTreeMap<String, Arc<RegistryEntry>>> {

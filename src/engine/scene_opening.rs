@@ -1,0 +1,256 @@
+//! Opens and closes scenes: reserves a name, reads the files and the checkpoint, starts the scene's task, and keeps the
+//! catalog and the registry in step.
+
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+
+use super::blocking::run_blocking;
+use super::device::command::SceneId;
+use super::registry::{OpenRequest, RegistryEntry};
+use super::scene::handle::{OpenParams, SceneHandle};
+use super::scene_memory::SceneMemory;
+use super::storage::provenance::SceneProvenance;
+use super::storage::scene_catalog::folder_bytes;
+use super::storage::upload::CompleteUpload;
+use super::upload_quota::ClientId;
+use super::{Engine, scene_not_open};
+use modalcast_model::error::{Error, Result};
+use modalcast_model::load::{OpenedScene, modes_files};
+
+/// The largest number of modes files, and of remarks, that are logged when a scene is opened.
+const MAX_LOGGED_LINES: usize = 16;
+
+impl Engine {
+    /// Reserves the names of the scenes of the catalog, and reopens the scenes in the background. A scene that cannot
+    /// be opened is logged, and its entry remains in the catalog, because its files may be available again at the next
+    /// start.
+    pub(super) fn reopen_scenes(&self) {
+        let mut openings = tokio::task::JoinSet::new();
+        for (name, provenance) in self.shared.scene_catalog.entries() {
+            let request = self.open_request(&name, &provenance, None);
+            let reserved = self.shared.registry.reserve(&request, false);
+            let engine = self.clone();
+            openings.spawn(async move { engine.reopen_scene(reserved, &name, &provenance).await });
+        }
+        let engine = self.clone();
+        tokio::spawn(async move {
+            while openings.join_next().await.is_some() {}
+            engine.shared.are_scenes_reopened.send_replace(true);
+        });
+    }
+
+    async fn reopen_scene(&self, reserved: Result<Arc<RegistryEntry>>, name: &str, provenance: &SceneProvenance) {
+        let record_failure = |error: &Error| {
+            tracing::warn!(scene = name, %error, "a scene of the last run could not be reopened");
+            self.shared.registry.record_failure(name, provenance, error.clone());
+        };
+        match reserved {
+            Err(error) => record_failure(&error),
+            Ok(entry) => {
+                let open = async || {
+                    self.check_running()?;
+                    self.open_or_discard(name.to_owned(), provenance.clone(), None).await
+                };
+                let opened = entry.get_or_open(open).await;
+                // Before the name is released, so that the scene is always in a list.
+                if let Err(error) = &opened {
+                    record_failure(error);
+                }
+                self.end_opening(name, &entry, &opened);
+            }
+        }
+    }
+
+    fn open_request(&self, name: &str, provenance: &SceneProvenance, client: Option<ClientId>) -> OpenRequest {
+        let is_built_in =
+            matches!(provenance, SceneProvenance::Repository { source } if self.shared.source.is_built_in(source));
+        OpenRequest { name: name.to_owned(), provenance: provenance.clone(), client, is_built_in }
+    }
+
+    /// Opens a scene. Concurrent calls with the same name share one opening. The opening runs in a separate task, so
+    /// that a cancelled caller does not cancel the opening.
+    pub(super) async fn open_once(
+        &self,
+        name: String,
+        provenance: SceneProvenance,
+        upload: Option<CompleteUpload>,
+        client: Option<ClientId>,
+    ) -> Result<Arc<SceneHandle>> {
+        self.check_running()?;
+        let engine = self.clone();
+        let work = async move {
+            // A new upload must not join the opening of an earlier scene with the same name.
+            let must_be_new = upload.is_some();
+            let request = engine.open_request(&name, &provenance, client);
+            let entry = engine.shared.registry.reserve(&request, must_be_new)?;
+            engine.open_reserved(&entry, name, provenance, upload).await
+        };
+        tokio::spawn(work).await.map_err(modalcast_model::error::fault_in("open"))?
+    }
+
+    /// Opens a scene whose name is reserved for this call.
+    async fn open_reserved(
+        &self,
+        entry: &Arc<RegistryEntry>,
+        name: String,
+        provenance: SceneProvenance,
+        upload: Option<CompleteUpload>,
+    ) -> Result<Arc<SceneHandle>> {
+        let opened = entry.get_or_open(|| self.open_or_discard(name.clone(), provenance, upload)).await;
+        self.end_opening(&name, entry, &opened);
+        opened
+    }
+
+    fn end_opening(&self, name: &str, entry: &Arc<RegistryEntry>, opened: &Result<Arc<SceneHandle>>) {
+        self.shared.registry.release(name, entry);
+        // The scene may have failed before the registry had its handle.
+        if opened.as_ref().is_ok_and(|scene_handle| scene_handle.failure().is_some()) {
+            self.shared.registry.remove(name, entry);
+        }
+    }
+
+    /// Loads a scene. If that fails, removes the files of a new upload.
+    async fn open_or_discard(
+        &self,
+        name: String,
+        provenance: SceneProvenance,
+        upload: Option<CompleteUpload>,
+    ) -> Result<Arc<SceneHandle>> {
+        let is_new_upload = upload.is_some();
+        let result = self.load_scene(&name, &provenance, upload).await;
+        if result.is_err() && is_new_upload {
+            let engine = self.clone();
+            let remove = move || {
+                engine.shared.scene_catalog.remove_upload(&name);
+                engine.shared.upload_quota.remove(&name);
+                Ok(())
+            };
+            run_blocking("upload", remove).await?;
+        }
+        result.map(Arc::new)
+    }
+
+    /// Reads a scene's files and its checkpoint, starts its task and adds it to the catalog.
+    async fn load_scene(
+        &self,
+        name: &str,
+        provenance: &SceneProvenance,
+        upload: Option<CompleteUpload>,
+    ) -> Result<SceneHandle> {
+        let memory = self.shared.memory.new_scene();
+        let OpenedScene { scene, backends } = self.read_scene_files(name, provenance, upload, &memory).await?;
+        memory.reserve_loaded(name, &scene)?;
+        let (engine, scene_name, shared_scene) = (self.clone(), name.to_owned(), Arc::clone(&scene));
+        let restored_state =
+            run_blocking("checkpoint", move || Ok(engine.shared.services.checkpoints.load(&scene_name, &shared_scene)))
+                .await?;
+        let restored_state = restored_state.unwrap_or_else(|error| {
+            tracing::warn!(scene = name, %error, "the checkpoint could not be loaded; the scene starts at rest");
+            None
+        });
+        if let Some(state) = &restored_state {
+            self.shared.services.run_counter.continue_after(state.run);
+        }
+        let id = self.shared.next_scene_id.fetch_add(1, Ordering::Relaxed);
+        let params = OpenParams {
+            name: name.into(),
+            provenance: provenance.clone(),
+            scene,
+            backends,
+            id,
+            state: restored_state,
+            on_failure: self.failure_callback(name, id),
+            frames_unavailable: self.shared.info.renderer.as_ref().err().cloned(),
+            memory,
+        };
+        let scene_handle = SceneHandle::open(params, self.shared.services.clone()).await?;
+        let (engine, scene_name, provenance) = (self.clone(), name.to_owned(), provenance.clone());
+        if let Err(error) =
+            run_blocking("scenes.json", move || engine.shared.scene_catalog.add(&scene_name, &provenance)).await
+        {
+            scene_handle.stop(error.clone()).await;
+            return Err(error);
+        }
+        let layout = &scene_handle.scene.layout;
+        let modes = modes_files(&scene_handle.scene);
+        let modes = modes.iter().take(MAX_LOGGED_LINES).map(String::as_str).collect::<Vec<_>>().join(", ");
+        tracing::info!(scene = name, domains = layout.domains.len(), vertices = layout.vertices, modes, "opened");
+        for remark in scene_handle.scene.remarks.iter().take(MAX_LOGGED_LINES) {
+            tracing::warn!(scene = name, remark, "remark of the loader");
+        }
+        Ok(scene_handle)
+    }
+
+    /// Creates the callback for the failure of a scene. It removes the scene from the registry. The catalog keeps the
+    /// scene, so that the next start opens it again. The callback holds a weak reference to the engine.
+    fn failure_callback(&self, name: &str, id: SceneId) -> Box<dyn FnOnce() + Send> {
+        let (shared, name) = (Arc::downgrade(&self.shared), name.to_owned());
+        Box::new(move || {
+            if let Some(shared) = shared.upgrade() {
+                shared.registry.remove_failed_scene(&name, id);
+            }
+        })
+    }
+
+    /// Reads a scene's files. First moves the files of a new `upload` to the upload folder. A panic in a loader becomes
+    /// a `Fault` of this call.
+    async fn read_scene_files(
+        &self,
+        name: &str,
+        provenance: &SceneProvenance,
+        upload: Option<CompleteUpload>,
+        memory: &SceneMemory,
+    ) -> Result<OpenedScene> {
+        let memory = Arc::clone(&memory.host);
+        let source = Arc::clone(&self.shared.source);
+        let is_built_in =
+            matches!(provenance, SceneProvenance::Repository { source: path } if source.is_built_in(path));
+        let _permit = self.shared.load_permits.acquire(is_built_in).await?;
+        let upload_folder = self.shared.scene_catalog.upload_folder(name);
+        let (engine, scene_name, provenance) = (self.clone(), name.to_owned(), provenance.clone());
+        let read = move || match provenance {
+            SceneProvenance::Repository { source: path } => source.open(&path, &memory),
+            SceneProvenance::Upload { entry } => {
+                if let Some(upload) = upload {
+                    // A checkpoint of an older scene with this name does not apply to the new one.
+                    engine.shared.services.checkpoints.remove(&scene_name);
+                    let client = upload.client().cloned();
+                    upload.commit(&upload_folder)?;
+                    if let Some(client) = client {
+                        engine.shared.upload_quota.store(&scene_name, client, folder_bytes(&upload_folder));
+                    }
+                }
+                source.open_within(&upload_folder, &entry, &memory)
+            }
+        };
+        run_blocking("load", || read().map_err(Error::into_file_error)).await
+    }
+
+    /// Stops a scene and removes its checkpoint, its uploaded files, its catalog entry and its name.
+    pub(super) async fn close_scene(&self, name: &str) -> Result<()> {
+        // The outer `Option` tells whether the name is reserved, the inner one whether the scene is loaded.
+        let entry = self.shared.registry.find_entry(name);
+        match entry.as_ref().map(|entry| entry.scene_handle()) {
+            Some(Some(scene_handle)) if scene_handle.is_closing() => return Err(scene_not_open(name)),
+            Some(Some(scene_handle)) => scene_handle.stop(scene_not_open(name)).await,
+            Some(None) => return Err(Error::Busy { queue: "queue for a scene that is being opened", limit: 1 }),
+            None => {}
+        }
+        let (engine, scene_name) = (self.clone(), name.to_owned());
+        let catalog_change = run_blocking("close", move || {
+            engine.shared.services.checkpoints.remove(&scene_name);
+            let is_removed = engine.shared.scene_catalog.remove(&scene_name);
+            engine.shared.upload_quota.remove(&scene_name);
+            is_removed
+        })
+        .await;
+        // Release the name only after the files are removed, so that a new upload with this name does not lose its
+        // files. Release it even if the catalog could not be written.
+        if let Some(entry) = &entry {
+            self.shared.registry.remove(name, entry);
+        }
+        self.shared.registry.forget_failure(name);
+        let was_listed = catalog_change?;
+        if entry.is_some() || was_listed { Ok(()) } else { Err(scene_not_open(name)) }
+    }
+}
