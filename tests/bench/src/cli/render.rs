@@ -34,7 +34,7 @@ Examples:
 /// Writes report.json, report.csv, report.md, report.svg, report.png and a folder pictures/ with the references and,
 /// for every variant, a strip of rendered, reference and difference image. The files are written after each load: an
 /// interrupted run keeps the finished loads and names the missing ones. Exit code 1 when a variant exceeds its error
-/// bounds.
+/// limits.
 #[derive(Debug, clap::Args)]
 #[command(after_help = WORKLOAD_HELP)]
 pub(super) struct Args {
@@ -48,7 +48,8 @@ pub(super) struct Args {
     #[arg(long = "variant", value_name = "GLOB")]
     variants: Vec<String>,
     /// Width and height of still pictures in pixels [default: 640x360]. Moving pictures have a quarter of the width and
-    /// of the height. With --figures, the size of each picture [default: 640x480].
+    /// of the height. The error limits are for 640x360 and larger pictures. With --figures, the size of each picture
+    /// [default: 640x480].
     #[arg(long)]
     size: Option<FrameSize>,
     /// Frames per median, at least 20 [default: 100, 20 with --quick].

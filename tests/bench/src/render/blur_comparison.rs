@@ -56,8 +56,10 @@ fn blur_us(row: &RenderRow) -> Option<f64> {
 mod tests {
     use super::*;
     use crate::render::PassTime;
+    use crate::render::error_limits::ErrorLimits;
     use crate::render::metrics::{ErrorDistribution, LightErrors};
-    use crate::render::variants::{ERROR_LIMITS, ShadowVariant};
+    use crate::render::variants::ShadowVariant;
+    use crate::render::workloads::RenderWorkload;
     use crate::timing::Timing;
     use modalcast_model::scene::Culling;
 
@@ -71,7 +73,7 @@ mod tests {
             blur_method,
             packing: None,
             culling: Culling::default(),
-            bounds: ERROR_LIMITS,
+            error_limits: ErrorLimits::of_workload(RenderWorkload::Tree),
             passed: true,
             is_expected_to_fail: false,
             faults: Vec::new(),

@@ -146,9 +146,11 @@ fn is_candidate(row: &RenderRow) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::render::error_limits::ErrorLimits;
     use crate::render::harness::PassTime;
     use crate::render::metrics::{ErrorDistribution, LightErrors};
     use crate::render::variants;
+    use crate::render::workloads::RenderWorkload;
     use crate::timing::Timing;
 
     fn renderer(software: bool) -> RendererInfo {
@@ -176,7 +178,7 @@ mod tests {
             blur_method: BlurMethod::Auto,
             packing: None,
             culling: Culling::default(),
-            bounds: variants::ERROR_LIMITS,
+            error_limits: ErrorLimits::of_workload(RenderWorkload::Tree),
             passed: true,
             is_expected_to_fail: false,
             faults: vec![],

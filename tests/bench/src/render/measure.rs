@@ -7,6 +7,7 @@ use std::time::Instant;
 use nalgebra::Vector3;
 use serde::Serialize;
 
+use super::error_limits::ErrorLimits;
 use super::harness::{LoadedScene, PassTime, RenderHarness, Size};
 use super::image_files::{self, ImageFile};
 use super::metrics::{self, ErrorDistribution, FlickerMeter, LightErrors};
@@ -16,7 +17,7 @@ use super::ray_scene::RayScene;
 use super::reference_image::{ReferenceImage, SampleCounts, ShadowModel, trace_reference_images};
 use super::reference_view::ReferenceView;
 use super::time_budget::{STEP_TIME_BUDGET, TimeBudget};
-use super::variants::{ErrorLimits, ReferenceKind, RenderVariant, ShadowVariant};
+use super::variants::{ReferenceKind, RenderVariant, ShadowVariant};
 use super::workloads::{AnimatedScene, RenderWorkload};
 use super::{RenderReportOptions, RenderWorkloadSummary, ShadowTexelSize, light_meter};
 use crate::timing::Timing;
@@ -47,9 +48,10 @@ pub struct RenderRow {
     pub packing: Option<Packing>,
     /// Culling of the variant's settings.
     pub culling: Culling,
-    /// Bounds on the error against the intended result.
-    pub bounds: ErrorLimits,
-    /// Whether the variant is within its bounds.
+    /// Limits of the error against the intended result.
+    #[serde(rename = "bounds")]
+    pub error_limits: ErrorLimits,
+    /// Whether the variant is within its limits.
     pub passed: bool,
     /// Whether the variant is expected to fail. The report fails if it passes.
     #[serde(rename = "to_fail")]
@@ -420,8 +422,8 @@ impl WorkloadContext<'_> {
         let hard_image = &self.references.hard_image;
         let intended_color_errors = metrics::compare_colors(&image.rgba, &reference.colors);
         let intended_light_errors = metrics::compare_light(sun_visibility, &reference.sun_visibility);
-        let bounds = variant.error_limits(self.animation.workload);
-        let faults = exceeded_bounds(&intended_color_errors, &intended_light_errors, &bounds);
+        let error_limits = ErrorLimits::of(variant, self.animation.workload);
+        let faults = exceeded_limits(&intended_color_errors, &intended_light_errors, &error_limits);
         RenderRow {
             load: self.animation.name.clone(),
             name: variant.name.clone(),
@@ -430,7 +432,7 @@ impl WorkloadContext<'_> {
             blur_method: variant.blur_method,
             packing: variant.packing,
             culling: variant.settings(self.animation.scene.look).culling,
-            bounds,
+            error_limits,
             passed: faults.is_empty(),
             is_expected_to_fail: variant.is_expected_to_fail(self.animation.workload),
             faults,
@@ -495,64 +497,64 @@ impl WorkloadContext<'_> {
     }
 }
 
-/// Messages about exceeded bounds.
-fn exceeded_bounds(color: &ErrorDistribution, light: &LightErrors, bounds: &ErrorLimits) -> Vec<String> {
+/// Messages about exceeded limits.
+fn exceeded_limits(color: &ErrorDistribution, light: &LightErrors, limits: &ErrorLimits) -> Vec<String> {
     let errors = [
-        ("mean color error", Some(color.mean), bounds.mean_color),
-        ("mean sun visibility error", Some(light.all_pixels.mean), bounds.mean_light),
-        ("mean sun visibility in the umbra", light.umbra_visibility, bounds.bleeding),
-        ("mean sun visibility lost outside of shadows", light.lost_visibility, bounds.lost_visibility),
+        ("mean color error", Some(color.mean), limits.mean_color),
+        ("mean sun visibility error", Some(light.all_pixels.mean), limits.mean_light),
+        ("mean sun visibility in the umbra", light.umbra_visibility, limits.bleeding),
+        ("mean sun visibility lost outside of shadows", light.lost_visibility, limits.lost_visibility),
     ];
-    let message = |(quantity, error, bound): (&str, Option<f64>, f64)| {
-        let error = error.filter(|error| error.is_nan() || *error > bound)?;
-        Some(format!("{quantity}: expected at most {bound}, got {error:.3}"))
+    let message = |(quantity, error, limit): (&str, Option<f64>, f64)| {
+        let error = error.filter(|error| error.is_nan() || *error > limit)?;
+        Some(format!("{quantity}: expected at most {limit}, got {error:.4}"))
     };
     errors.into_iter().filter_map(message).collect()
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::variants::ERROR_LIMITS;
+    use super::super::variants;
     use super::*;
+
+    /// The sun visibility of 1000 pixels: 0 in a shadow of ten pixels and 1 elsewhere.
+    fn visibility_with_shadow(first_pixel: usize) -> Vec<Option<f32>> {
+        let shadow = first_pixel..first_pixel + 10;
+        (0..1000).map(|pixel| Some(if shadow.contains(&pixel) { 0.0 } else { 1.0 })).collect()
+    }
+
+    /// The messages about an image with exact colors and this sun visibility.
+    fn find_faults(visibility: &[Option<f32>], limits: &ErrorLimits) -> Vec<String> {
+        let light_errors = metrics::compare_light(visibility, &visibility_with_shadow(100));
+        exceeded_limits(&ErrorDistribution::default(), &light_errors, limits)
+    }
 
     #[test]
     fn detects_missing_dark_or_displaced_small_shadows() {
-        // The sun visibility of 1000 pixels: 0 in a shadow of ten pixels and 1 elsewhere.
-        let visibility_with_shadow = |first_pixel: usize| -> Vec<Option<f32>> {
-            (0..1000)
-                .map(|pixel| Some(if (first_pixel..first_pixel + 10).contains(&pixel) { 0.0 } else { 1.0 }))
-                .collect()
-        };
-        let find_faults = |visibility: &[Option<f32>]| {
-            exceeded_bounds(
-                &ErrorDistribution::default(),
-                &metrics::compare_light(visibility, &visibility_with_shadow(100)),
-                &ERROR_LIMITS,
-            )
-        };
-        assert_eq!(find_faults(&visibility_with_shadow(100)), Vec::<String>::new(), "control: equal to the reference");
-        assert_eq!(
-            find_faults(&visibility_with_shadow(102)),
-            Vec::<String>::new(),
-            "a displacement by a fifth of the shadow's width is within the bound"
-        );
-        let (displaced_shadow, no_shadow) = (visibility_with_shadow(200), vec![Some(1.0); 1000]);
-        let half_displaced_shadow = visibility_with_shadow(105);
-        for visibility in [displaced_shadow, no_shadow, half_displaced_shadow] {
+        let limits = ErrorLimits::of_workload(RenderWorkload::Tree);
+        let faults = |visibility: &[Option<f32>]| find_faults(visibility, &limits);
+        assert_eq!(faults(&visibility_with_shadow(100)), Vec::<String>::new(), "control: equal to the reference");
+        // Shadows that are displaced by a tenth of their width or more, and no shadow.
+        for visibility in [101, 105, 200].map(visibility_with_shadow).into_iter().chain([vec![Some(1.0); 1000]]) {
             assert!(
-                find_faults(&visibility)[0].starts_with("mean sun visibility in the umbra"),
+                faults(&visibility)[0].starts_with("mean sun visibility in the umbra"),
                 "{:?}",
-                find_faults(&visibility)
+                faults(&visibility)
             );
         }
-        assert!(
-            find_faults(&vec![Some(0.5); 1000]).iter().any(|message| message.starts_with("mean sun visibility lost"))
-        );
+        let dark = faults(&vec![Some(0.5); 1000]);
+        assert!(dark.iter().any(|message| message.starts_with("mean sun visibility lost")));
         let undefined = ErrorDistribution { mean: f64::NAN, ..ErrorDistribution::default() };
-        assert_eq!(
-            exceeded_bounds(&undefined, &LightErrors::default(), &ERROR_LIMITS).len(),
-            1,
-            "NaN exceeds every bound"
-        );
+        assert_eq!(exceeded_limits(&undefined, &LightErrors::default(), &limits).len(), 1, "NaN exceeds every limit");
+    }
+
+    #[test]
+    fn every_variant_without_its_shadow_exceeds_its_limits() {
+        for workload in RenderWorkload::all(false) {
+            for variant in variants::all(false) {
+                let faults = find_faults(&vec![Some(1.0); 1000], &ErrorLimits::of(&variant, workload));
+                assert!(!faults.is_empty(), "{} on {workload:?}", variant.name);
+            }
+        }
     }
 }

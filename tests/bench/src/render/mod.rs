@@ -29,6 +29,7 @@
 mod blur_comparison;
 mod comparison_tables;
 mod default_shadow;
+pub mod error_limits;
 pub mod figures;
 mod frame_comparison;
 pub mod frame_times;
@@ -175,8 +176,6 @@ pub struct RenderReport {
     pub provenance: Provenance,
     pub renderer: RendererInfo,
     pub size: Size,
-    /// Default error bounds against the intended result. [`RenderRow::bounds`] has the bounds of each row.
-    pub bounds: variants::ErrorLimits,
     pub loads: Vec<RenderWorkloadSummary>,
     /// Names of the requested workloads and plants that are not measured yet. Empty when the report is complete.
     pub missing: Vec<String>,
@@ -295,7 +294,6 @@ impl Measurements {
             provenance: Provenance::collect(),
             renderer: renderer.clone(),
             size: options.size,
-            bounds: variants::ERROR_LIMITS,
             missing: missing_loads.chain(missing_plants).collect(),
             loads: loads.clone(),
             rows: rows.clone(),
@@ -313,7 +311,7 @@ impl Measurements {
 
 fn describe_failure(row: &RenderRow) -> String {
     let reason =
-        if row.passed { "expected to exceed its bounds, but is within them".into() } else { row.faults.join("; ") };
+        if row.passed { "expected to exceed its limits, but is within them".into() } else { row.faults.join("; ") };
     format!("{}: {}: {reason}", row.load, row.name)
 }
 

@@ -18,7 +18,7 @@ use modalcast_model::error::{Result, fault_in};
 /// - `of_aim`: errors against the intended result: no shadow, a hard shadow, or a hard shadow with the variant's blur
 /// - `bleeding`, `penumbra`, `lost`: mean sun visibility in the umbra, errors in the penumbra, and mean missing sun
 ///   visibility where there is no shadow; all against the intended result
-/// - `to_fail`: whether the variant is expected to exceed its bounds
+/// - `to_fail`: whether the variant is expected to exceed its limits
 /// - `no_flicker`: why flicker was not measured
 /// - `listed`, `hidden`: triangles that are passed to the rasterizer, and triangles that are occluded
 const COLUMNS: [(&str, &str); 55] = [

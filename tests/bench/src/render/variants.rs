@@ -36,20 +36,6 @@ pub enum ReferenceKind {
     Filtered { texels: f64 },
 }
 
-/// Error bounds of a variant against its intended result.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub struct ErrorLimits {
-    /// Mean color error of a pixel, of 255.
-    pub mean_color: f64,
-    /// Mean error of the sun visibility, of 1.
-    pub mean_light: f64,
-    /// Mean sun visibility inside the umbra (light bleeding), of 1.
-    pub bleeding: f64,
-    /// Mean sun visibility that is missing outside of shadows, of 1.
-    #[serde(rename = "lost")]
-    pub lost_visibility: f64,
-}
-
 /// One way to draw a scene.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RenderVariant {
@@ -70,21 +56,6 @@ pub struct RenderVariant {
     pub intended_reference: ReferenceKind,
 }
 
-/// Twice the measured errors of small images with many leaves, where each leaf covers a pixel or two. The errors of all
-/// other images are far smaller. A missing or displaced shadow exceeds `bleeding` or `lost_visibility` even if it
-/// covers a small part of the image.
-pub(super) const ERROR_LIMITS: ErrorLimits =
-    ErrorLimits { mean_color: 16.0, mean_light: 0.2, bleeding: 0.25, lost_visibility: 0.25 };
-/// Bound on light bleeding of a filtered map where no two casters overlap: Chebyshev's bound is exact there, and only
-/// rounding remains.
-const EXACT_BLEEDING_LIMIT: f64 = 0.01;
-/// Bound on the mean light error of the shelf. Its shadow fills half of the image and is narrower than the widest blur.
-/// Within the footprint of this blur, the depth of the ground varies by as much as the height of the shelf. Therefore
-/// most of the sunlight leaks into the shadow.
-const SHELF_MEAN_LIGHT_LIMIT: f64 = 0.4;
-
-/// Bound on the mean color error of images without antialiasing, in which each pixel of an edge shows one surface only.
-const ALIASED_MEAN_COLOR_LIMIT: f64 = 2.0 * ERROR_LIMITS.mean_color;
 /// Samples per pixel of multisampling, the only number that the renderer has.
 const MULTISAMPLES: u32 = 4;
 
@@ -115,19 +86,7 @@ impl RenderVariant {
             && (self.antialias.is_none() || is_large || workload == RenderWorkload::Square)
     }
 
-    /// Error bounds on a workload.
-    pub fn error_limits(&self, workload: RenderWorkload) -> ErrorLimits {
-        let bleeding = match (self.intended_reference, workload) {
-            (ReferenceKind::Filtered { .. }, RenderWorkload::Square | RenderWorkload::Shelf) => EXACT_BLEEDING_LIMIT,
-            _ => ERROR_LIMITS.bleeding,
-        };
-        let mean_light =
-            if workload == RenderWorkload::Shelf { SHELF_MEAN_LIGHT_LIMIT } else { ERROR_LIMITS.mean_light };
-        let mean_color = if self.antialias.is_some() { ALIASED_MEAN_COLOR_LIMIT } else { ERROR_LIMITS.mean_color };
-        ErrorLimits { mean_color, bleeding, mean_light, ..ERROR_LIMITS }
-    }
-
-    /// Whether the variant is expected to exceed its bounds on a workload: with f16 second moments, light bleeds into a
+    /// Whether the variant is expected to exceed its limits on a workload: with f16 second moments, light bleeds into a
     /// shadow near its caster.
     pub fn is_expected_to_fail(&self, workload: RenderWorkload) -> bool {
         workload == RenderWorkload::Shelf && self.shadow.is_some_and(|shadow| shadow.moments == MomentFormat::F16)
@@ -373,15 +332,5 @@ mod tests {
             let expected: &[RenderWorkload] = if variant.name.contains("f16") { &[RenderWorkload::Shelf] } else { &[] };
             assert_eq!(workloads, expected, "{}", variant.name);
         }
-    }
-
-    #[test]
-    fn only_filtered_maps_get_the_exact_bleeding_bound() {
-        let filtered_variant = RenderVariant::with_variance_map(512, 1.5);
-        assert!(
-            filtered_variant.error_limits(RenderWorkload::Square).bleeding < 0.02
-                && filtered_variant.error_limits(RenderWorkload::Tree) == ERROR_LIMITS
-        );
-        assert_eq!(RenderVariant::with_standard_map(512).error_limits(RenderWorkload::Square), ERROR_LIMITS);
     }
 }

@@ -1,0 +1,105 @@
+//! The largest errors that a variant may have against its intended result.
+
+use serde::Serialize;
+
+use super::packing::Packing;
+use super::variants::{ReferenceKind, RenderVariant};
+use super::workloads::RenderWorkload;
+use modalcast_model::scene::Transparency;
+
+/// Error limits of a variant against its intended result.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct ErrorLimits {
+    /// Mean color error of a pixel, of 255.
+    pub mean_color: f64,
+    /// Mean error of the sun visibility, of 1.
+    pub mean_light: f64,
+    /// Mean sun visibility inside the umbra (light bleeding), of 1.
+    pub bleeding: f64,
+    /// Mean sun visibility that is missing outside of shadows, of 1.
+    #[serde(rename = "lost")]
+    pub lost_visibility: f64,
+}
+
+impl ErrorLimits {
+    /// The limits of a variant on a workload: 1.5 times the largest error of all variants in images of 640x360. Errors
+    /// of larger images are smaller, because fewer of their pixels lie on edges.
+    pub(super) fn of(variant: &RenderVariant, workload: RenderWorkload) -> Self {
+        let limits = Self::of_workload(workload);
+        let has_bleeding_reduction = variant.shadow.is_none_or(|shadow| shadow.bleeding > 0.0);
+        match (workload, variant.intended_reference) {
+            // A shadow above its only caster: Chebyshev's bound is exact, except where the depth of the ground varies
+            // within the blur, which the reduction of bleeding hides.
+            (RenderWorkload::Shelf, ReferenceKind::Filtered { .. }) if has_bleeding_reduction => {
+                Self { bleeding: 0.02, ..limits }
+            }
+            (RenderWorkload::Shelf, ReferenceKind::Filtered { .. }) => Self { bleeding: 0.27, ..limits },
+            // The passes of the thesis blend panes in the order of the list, not of their depth.
+            (RenderWorkload::Panes, _) if variant.transparency == Some(Transparency::TwoPass) => {
+                Self { mean_color: 4.0, ..limits }
+            }
+            // The rule of the thesis repeats images at a wrong scale.
+            (RenderWorkload::Images, _) if variant.packing == Some(Packing::PrintedRepetition) => {
+                Self { mean_color: 14.4, ..limits }
+            }
+            _ => limits,
+        }
+    }
+
+    /// The limits of the variants without an exception.
+    pub(super) const fn of_workload(workload: RenderWorkload) -> Self {
+        match workload {
+            // Edges without antialiasing; a map of 256 texels with a blur of 4.
+            RenderWorkload::Square => {
+                Self { mean_color: 0.9, mean_light: 0.0036, bleeding: 0.0013, lost_visibility: 0.0003 }
+            }
+            // Its shadow fills half of the image and is narrower than the widest blur, so most of the sunlight leaks
+            // into the shadow. Texels of standard maps of 256 shade the ground.
+            RenderWorkload::Shelf => {
+                Self { mean_color: 13.0, mean_light: 0.385, bleeding: 0.123, lost_visibility: 0.185 }
+            }
+            RenderWorkload::Panes => {
+                Self { mean_color: 1.2, mean_light: 0.0094, bleeding: 0.0013, lost_visibility: 0.0003 }
+            }
+            // Differences of filtering between the texture units and the reference.
+            RenderWorkload::Images => {
+                Self { mean_color: 5.9, mean_light: 0.0001, bleeding: 0.0001, lost_visibility: 0.0001 }
+            }
+            // Leaves of a pixel or two: without antialiasing, a pixel shows one of several leaves.
+            RenderWorkload::Tree => {
+                Self { mean_color: 5.4, mean_light: 0.08, bleeding: 0.075, lost_visibility: 0.0017 }
+            }
+            // Its leaves are half as large.
+            RenderWorkload::Grove => {
+                Self { mean_color: 11.6, mean_light: 0.195, bleeding: 0.163, lost_visibility: 0.0086 }
+            }
+            // Poles cast thin shadows, which a map of 256 texels with a blur of 4 widens.
+            RenderWorkload::Triangles(_) => {
+                Self { mean_color: 1.5, mean_light: 0.022, bleeding: 0.03, lost_visibility: 0.0096 }
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::variants;
+    use super::*;
+
+    #[test]
+    fn only_the_methods_of_the_thesis_have_other_limits_of_color() {
+        for workload in RenderWorkload::all(false) {
+            let limit = ErrorLimits::of_workload(workload).mean_color;
+            let exceptions = variants::all(false).into_iter().filter(|variant| {
+                variant.is_applicable(workload) && ErrorLimits::of(variant, workload).mean_color > limit
+            });
+            let names: Vec<String> = exceptions.map(|variant| variant.name).collect();
+            let expected: &[&str] = match workload {
+                RenderWorkload::Panes => &["two-pass transparency"],
+                RenderWorkload::Images => &["images repeat-filled"],
+                _ => &[],
+            };
+            assert_eq!(names, expected);
+        }
+    }
+}
