@@ -564,6 +564,27 @@ mod tests {
         engine.shutdown().await;
     }
 
+    /// A scene can fail before the registry has its handle.
+    #[tokio::test]
+    async fn scene_that_fails_while_it_is_opened_is_listed_as_failed() {
+        let folder = tempfile::tempdir().expect("expected a temporary folder");
+        let (engine, faulty_scene, _) = start_faulty_engine(folder.path()).await;
+        let writer = acquire_writer(&faulty_scene).await;
+        faulty_scene.inject_panic().await;
+        let panic = await_within_limit(writer.next_report()).await.expect_err("expected the panic");
+        let provenance = SceneProvenance::Repository { source: "strips".into() };
+        let request = engine.open_request("late", &provenance, None);
+        let entry = engine.shared.registry.reserve(&request, true).expect("expected a place");
+        let opened = entry.get_or_open(async || Ok(Arc::clone(&faulty_scene))).await;
+        assert_eq!(opened.expect_err("expected the error of the scene"), panic);
+        engine.end_opening("late", &entry);
+        let list = engine.list();
+        let is_late = |failed: &FailedScene| failed.name == "late" && failed.error == panic;
+        assert!(list.failed.iter().any(is_late) && list.opening.is_empty(), "{:?}", list.failed);
+        await_within_limit(engine.open("strips", "late", None)).await.expect("expected that the name is free");
+        engine.shutdown().await;
+    }
+
     #[tokio::test]
     async fn panicking_device_command_rejects_only_its_step() {
         let folder = tempfile::tempdir().expect("expected a temporary folder");

@@ -60,15 +60,18 @@ impl RegistryEntry {
     /// it.
     ///
     /// # Errors
-    /// The error of `load`; `Busy` when the scene is being closed.
+    /// The error of `load`; the error of a scene that has failed; `Busy` when the scene is being closed.
     pub(super) async fn get_or_open<F>(&self, load: impl FnOnce() -> F) -> Result<Arc<SceneHandle>>
     where
         F: Future<Output = Result<Arc<SceneHandle>>>,
     {
         let scene_handle = self.cell.get_or_try_init(load).await?;
-        match scene_handle.is_closing() {
-            false => Ok(Arc::clone(scene_handle)),
-            true => Err(Error::Busy { queue: "queue for a scene that is being closed", limit: 1 }),
+        match scene_handle.failure() {
+            Some(error) => Err(error.clone()),
+            None if scene_handle.is_closing() => {
+                Err(Error::Busy { queue: "queue for a scene that is being closed", limit: 1 })
+            }
+            None => Ok(Arc::clone(scene_handle)),
         }
     }
 

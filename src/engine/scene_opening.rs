@@ -1,5 +1,5 @@
-//! Opens and closes scenes: reserves a name, reads the files and the checkpoint, starts the scene's task, and keeps the
-//! catalog and the registry in step.
+//! Opens and closes scenes: reserves a name, reads the files and the checkpoint, starts the scene's task, and updates the
+//! catalog and the registry.
 
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
@@ -52,16 +52,24 @@ impl Engine {
                     self.open_or_discard(name.to_owned(), provenance.clone(), None).await
                 };
                 let opened = entry.get_or_open(open).await;
-                // Before the name is released, so that the scene is always in a list.
-                if let Err(error) = &opened {
-                    record_failure(error);
+                // `end_opening` records the failure of a loaded scene. The failure of an opening is recorded before the
+                // name is released, so that a list always contains the scene.
+                if let Err(error) = opened
+                    && entry.scene_handle().is_none()
+                {
+                    record_failure(&error);
                 }
-                self.end_opening(name, &entry, &opened);
+                self.end_opening(name, &entry);
             }
         }
     }
 
-    fn open_request(&self, name: &str, provenance: &SceneProvenance, client: Option<ClientId>) -> OpenRequest {
+    pub(super) fn open_request(
+        &self,
+        name: &str,
+        provenance: &SceneProvenance,
+        client: Option<ClientId>,
+    ) -> OpenRequest {
         let is_built_in =
             matches!(provenance, SceneProvenance::Repository { source } if self.shared.source.is_built_in(source));
         OpenRequest { name: name.to_owned(), provenance: provenance.clone(), client, is_built_in }
@@ -97,15 +105,18 @@ impl Engine {
         upload: Option<CompleteUpload>,
     ) -> Result<Arc<SceneHandle>> {
         let opened = entry.get_or_open(|| self.open_or_discard(name.clone(), provenance, upload)).await;
-        self.end_opening(&name, entry, &opened);
+        self.end_opening(&name, entry);
         opened
     }
 
-    fn end_opening(&self, name: &str, entry: &Arc<RegistryEntry>, opened: &Result<Arc<SceneHandle>>) {
+    /// Ends a call that opens a scene.
+    pub(super) fn end_opening(&self, name: &str, entry: &Arc<RegistryEntry>) {
         self.shared.registry.release(name, entry);
-        // The scene may have failed before the registry had its handle.
-        if opened.as_ref().is_ok_and(|scene_handle| scene_handle.failure().is_some()) {
-            self.shared.registry.remove(name, entry);
+        // The scene may have failed before the registry had its handle. Then the callback for failures did nothing.
+        if let Some(scene_handle) = entry.scene_handle()
+            && scene_handle.failure().is_some()
+        {
+            self.shared.registry.remove_failed_scene(name, scene_handle.id());
         }
     }
 

@@ -22,8 +22,9 @@ pub struct ErrorLimits {
 }
 
 impl ErrorLimits {
-    /// The limits of a variant on a workload: 1.5 times the largest error of all variants in images of 640x360. Errors
-    /// of larger images are smaller, because fewer of their pixels lie on edges.
+    /// The limits of a variant on a workload: 1.5 times the largest error of all variants, which llvmpipe drew with
+    /// 640x360 pixels, against references of 64 samples per pixel. Larger images have smaller errors, because fewer of
+    /// their pixels lie on edges.
     pub(super) fn of(variant: &RenderVariant, workload: RenderWorkload) -> Self {
         let limits = Self::of_workload(workload);
         let has_bleeding_reduction = variant.shadow.is_none_or(|shadow| shadow.bleeding > 0.0);
@@ -85,6 +86,17 @@ impl ErrorLimits {
 mod tests {
     use super::super::variants;
     use super::*;
+
+    /// A shadow that is missing has a mean sun visibility of 1 in the umbra, a shadow displaced by half its width 0.5.
+    #[test]
+    fn shadows_displaced_by_less_than_half_their_width_exceed_the_limits() {
+        for workload in RenderWorkload::all(false) {
+            let shadows = variants::all(false).into_iter().filter(|variant| variant.shadow.is_some());
+            for variant in shadows.filter(|variant| variant.is_applicable(workload)) {
+                assert!(ErrorLimits::of(&variant, workload).bleeding < 0.3, "{} on {workload:?}", variant.name);
+            }
+        }
+    }
 
     #[test]
     fn only_the_methods_of_the_thesis_have_other_limits_of_color() {

@@ -20,7 +20,7 @@ pub(super) fn markdown(report: &RenderReport) -> String {
     text.push_str(&match report.failed.is_empty() {
         true => {
             "\nEvery variant is within its error limits against its intended result, except for the variants that are \
-                 expected to exceed them. The limits depend on the scene; `report.json` has those of each row.\n"
+                 expected to exceed them. The limits depend on the scene; `error_limits` in `report.json` are those of each row.\n"
                 .to_owned()
         }
         false => format!("\nFailed:\n\n- {}\n", report.failed.join("\n- ")),

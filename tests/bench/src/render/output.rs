@@ -32,7 +32,7 @@ const COLUMNS: [(&str, &str); 55] = [
     ("bleeding_cut", "/shadow/bleeding"),
     ("passed", "/passed"),
     ("to_fail", "/to_fail"),
-    ("bleeding_bound", "/bounds/bleeding"),
+    ("bleeding_limit", "/error_limits/bleeding"),
     ("frame_us", "frame"),
     ("frame_q1_us", "frame"),
     ("frame_q3_us", "frame"),
