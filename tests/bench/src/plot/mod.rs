@@ -24,6 +24,8 @@ pub(super) const PANEL_SIZE: (f64, f64) = (440.0, 320.0);
 pub(super) const MARGIN: f64 = 24.0;
 /// Height of the title, the subtitle and the explanation of the markers.
 pub(super) const HEADER_HEIGHT: f64 = 94.0;
+/// Mean width of a character of the text below the title.
+const CHARACTER_WIDTH: f64 = 6.8;
 /// Height of a line of the legend.
 pub(super) const LEGEND_LINE_HEIGHT: f64 = 22.0;
 
@@ -44,26 +46,17 @@ pub fn draw_svg(report: &DeformReport) -> String {
         5..=12 => 3,
         _ => 4,
     };
-    let width = 2.0 * MARGIN + columns as f64 * PANEL_SIZE.0;
+    let header = [
+        report.provenance.line(),
+        "filled: warm, hollow: cold; circle: CPU, square and triangle: CUDA, diamond: reference".into(),
+        "ringed: Pareto front (gains beyond noise, without variants that compute only a part)".into(),
+    ];
+    let width = plot_width(columns, &header);
     let (legend, lines) = draw_legend(variants.iter().map(|(name, _)| (*name, marker_style(&variants, name))), width);
     let panels_top = MARGIN + HEADER_HEIGHT + lines as f64 * LEGEND_LINE_HEIGHT;
     let height = panels_top + workloads.len().div_ceil(columns) as f64 * PANEL_SIZE.1 + MARGIN;
     let mut svg = begin_svg(width, height);
-    write_text(
-        &mut svg,
-        (MARGIN + 8.0, MARGIN + 18.0),
-        "font-size=\"20\" font-weight=\"bold\" fill=\"#222222\"",
-        "Error against run time",
-    );
-    let text_style = "font-size=\"12\" fill=\"#555555\"";
-    write_text(&mut svg, (MARGIN + 8.0, MARGIN + 40.0), text_style, &report.provenance.line());
-    let explanations = [
-        "filled: warm, hollow: cold; ringed: Pareto front (gains beyond noise, without variants that compute only a part)",
-        "circle: CPU, square and triangle: CUDA, diamond: reference",
-    ];
-    for (line, explanation) in explanations.into_iter().enumerate() {
-        write_text(&mut svg, (MARGIN + 8.0, MARGIN + 57.0 + 15.0 * line as f64), text_style, explanation);
-    }
+    draw_header(&mut svg, "Error against run time", &header);
     svg.push_str(&legend);
     let axis_labels = ["median time of a step", "largest error / diagonal"];
     for (index, workload) in workloads.iter().enumerate() {
@@ -74,6 +67,22 @@ pub fn draw_svg(report: &DeformReport) -> String {
     }
     svg.push_str("</svg>\n");
     svg
+}
+
+/// Width of a plot with `columns` panels per row, or that of its header if that is wider.
+pub(super) fn plot_width(columns: usize, header: &[String; 3]) -> f64 {
+    let characters = header.iter().map(|line| line.chars().count()).max().unwrap_or(0);
+    2.0 * MARGIN + (columns as f64 * PANEL_SIZE.0).max((characters as f64 * CHARACTER_WIDTH).ceil())
+}
+
+/// Draws the title and three lines below it, in the height [`HEADER_HEIGHT`].
+pub(super) fn draw_header(svg: &mut String, title: &str, lines: &[String; 3]) {
+    let title_style = "font-size=\"20\" font-weight=\"bold\" fill=\"#222222\"";
+    write_text(svg, (MARGIN + 8.0, MARGIN + 18.0), title_style, title);
+    for (index, line) in lines.iter().enumerate() {
+        let baseline = MARGIN + 40.0 + 16.0 * index as f64;
+        write_text(svg, (MARGIN + 8.0, baseline), "font-size=\"12\" fill=\"#555555\"", line);
+    }
 }
 
 /// The opening tag and the white background of an SVG.

@@ -2,7 +2,9 @@
 
 use super::{RenderReport, RenderRow};
 use crate::plot::panel::{MarkerStyle, Panel, Point};
-use crate::plot::{COLORS, HEADER_HEIGHT, LEGEND_LINE_HEIGHT, MARGIN, PANEL_SIZE, begin_svg, draw_legend, write_text};
+use crate::plot::{
+    COLORS, HEADER_HEIGHT, LEGEND_LINE_HEIGHT, MARGIN, PANEL_SIZE, begin_svg, draw_header, draw_legend, plot_width,
+};
 use crate::table::TimeAndError;
 use crate::timing::Timing;
 use modalcast_model::deform::Backend;
@@ -19,12 +21,13 @@ pub(super) fn draw_svg(report: &RenderReport) -> String {
         }
     }
     let columns = report.loads.len().clamp(1, COLUMNS);
-    let width = 2.0 * MARGIN + columns as f64 * PANEL_SIZE.0;
+    let header = header_lines(report);
+    let width = plot_width(columns, &header);
     let (legend, lines) = draw_legend(variants.iter().map(|name| (*name, marker_style(&variants, name))), width);
     let panels_top = MARGIN + HEADER_HEIGHT + lines as f64 * LEGEND_LINE_HEIGHT;
     let height = panels_top + report.loads.len().div_ceil(columns) as f64 * PANEL_SIZE.1 + MARGIN;
     let mut svg = begin_svg(width, height);
-    draw_header(&mut svg, report);
+    draw_header(&mut svg, "Rendering: error against run time", &header);
     svg.push_str(&legend);
     let axis_labels = ["median frame time without readback", "mean error of a pixel, of 255"];
     for (index, workload) in report.loads.iter().enumerate() {
@@ -37,12 +40,10 @@ pub(super) fn draw_svg(report: &RenderReport) -> String {
     svg
 }
 
-fn draw_header(svg: &mut String, report: &RenderReport) {
-    let title_style = "font-size=\"20\" font-weight=\"bold\" fill=\"#222222\"";
-    let text_style = "font-size=\"12\" fill=\"#555555\"";
-    write_text(svg, (MARGIN + 8.0, MARGIN + 18.0), title_style, "Rendering: error against run time");
+/// The lines below the title.
+fn header_lines(report: &RenderReport) -> [String; 3] {
     let size = format!("{} x {}", report.size.width, report.size.height);
-    let lines = [
+    [
         report.provenance.line(),
         format!(
             "{}, {size} pixels; error against hard shadow rays, {} samples per pixel",
@@ -50,10 +51,7 @@ fn draw_header(svg: &mut String, report: &RenderReport) {
             min_samples(report)
         ),
         "ringed: Pareto front".into(),
-    ];
-    for (index, line) in lines.iter().enumerate() {
-        write_text(svg, (MARGIN + 8.0, MARGIN + 40.0 + 16.0 * index as f64), text_style, line);
-    }
+    ]
 }
 
 /// Minimum number of samples per pixel of the references.
