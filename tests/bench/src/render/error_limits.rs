@@ -24,7 +24,8 @@ pub struct ErrorLimits {
 impl ErrorLimits {
     /// The limits of a variant on a workload: 1.5 times the largest error of all variants, which llvmpipe drew with
     /// 640x360 pixels, against references of 64 samples per pixel. Larger images have smaller errors, because fewer of
-    /// their pixels lie on edges.
+    /// their pixels lie on edges. On the grove and the field (300,000 triangles), 23 variants were measured, among them
+    /// the coarsest maps and the widest blurs, most of them against 16 samples.
     pub(super) fn of(variant: &RenderVariant, workload: RenderWorkload) -> Self {
         let limits = Self::of_workload(workload);
         let has_bleeding_reduction = variant.shadow.is_none_or(|shadow| shadow.bleeding > 0.0);
