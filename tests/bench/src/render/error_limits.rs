@@ -23,15 +23,15 @@ pub struct ErrorLimits {
 
 impl ErrorLimits {
     /// The limits of a variant on a workload: 1.5 times the largest error of all variants, which llvmpipe drew with
-    /// 640x360 pixels, against references of 64 samples per pixel. Larger images have smaller errors, because fewer of
-    /// their pixels lie on edges. On the grove and the field (300,000 triangles), 23 variants were measured, among them
+    /// 640x360 pixels, against references of 64 samples per pixel. Larger images should have smaller errors, because fewer
+    /// of their pixels lie on edges. On the grove and the field (300,000 triangles), 23 variants were measured, among them
     /// the coarsest maps and the widest blurs, most of them against 16 samples.
     pub(super) fn of(variant: &RenderVariant, workload: RenderWorkload) -> Self {
         let limits = Self::of_workload(workload);
         let has_bleeding_reduction = variant.shadow.is_none_or(|shadow| shadow.bleeding > 0.0);
         match (workload, variant.intended_reference) {
-            // A shadow above its only caster: Chebyshev's bound is exact, except where the depth of the ground varies
-            // within the blur, which the reduction of bleeding hides.
+            // The shelf is the only caster, so Chebyshev's bound is exact, except where the depth of the ground varies
+            // within the blur. The reduction of light bleeding removes most of that light.
             (RenderWorkload::Shelf, ReferenceKind::Filtered { .. }) if has_bleeding_reduction => {
                 Self { bleeding: 0.02, ..limits }
             }
@@ -71,7 +71,7 @@ impl ErrorLimits {
             RenderWorkload::Tree => {
                 Self { mean_color: 5.4, mean_light: 0.08, bleeding: 0.075, lost_visibility: 0.0017 }
             }
-            // Its leaves are half as large.
+            // Four trees in an image of the same size have smaller leaves.
             RenderWorkload::Grove => {
                 Self { mean_color: 11.6, mean_light: 0.195, bleeding: 0.163, lost_visibility: 0.0086 }
             }
@@ -88,9 +88,10 @@ mod tests {
     use super::super::variants;
     use super::*;
 
-    /// A shadow that is missing has a mean sun visibility of 1 in the umbra, a shadow displaced by half its width 0.5.
+    /// In the umbra, the mean sun visibility of a missing shadow is 1, that of a shadow displaced by a third of its width
+    /// is 1/3.
     #[test]
-    fn shadows_displaced_by_less_than_half_their_width_exceed_the_limits() {
+    fn shadows_displaced_by_a_third_of_their_width_exceed_the_limits() {
         for workload in RenderWorkload::all(false) {
             let shadows = variants::all(false).into_iter().filter(|variant| variant.shadow.is_some());
             for variant in shadows.filter(|variant| variant.is_applicable(workload)) {
