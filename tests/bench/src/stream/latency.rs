@@ -5,7 +5,7 @@
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
-use modalcast_client::FrameStreamRequest;
+use modalcast_client::{Client, Frame, FrameStream, FrameStreamRequest, StageTimes};
 use serde::Serialize;
 
 use super::SCENE;
@@ -13,7 +13,6 @@ use super::motion::{self, Motion};
 use super::peers::viewer::{self, Content};
 use super::session::Session;
 use crate::timing::quantile;
-use modalcast_client::{Client, StageTimes};
 use modalcast_model::error::{Result, fault, fault_in};
 
 /// Time between two steps: 60 steps per second.
@@ -114,6 +113,62 @@ pub(super) fn measure_frames(session: &Session, content: Content, steps: u64) ->
     runtime()?.block_on(time_frames(&session.url(), motion, content, steps))
 }
 
+/// Median times of the stages of pictures in milliseconds, for each view. A step is sent after the frames of the previous
+/// one have been received: a stage of overlapping steps would also include waits for the other steps.
+///
+/// # Errors
+/// `Fault` when the server rejects a request or a frame shows another step.
+pub(super) fn measure_stages(
+    session: &Session,
+    content: Content,
+    views: usize,
+    steps: u64,
+) -> Result<Vec<BTreeMap<String, f32>>> {
+    let motion = session.motion(steps.min(super::RECORDED_STEPS))?;
+    runtime()?.block_on(time_stages(&session.url(), motion, content, views, steps))
+}
+
+async fn time_stages(
+    url: &str,
+    motion: &Motion,
+    content: Content,
+    views: usize,
+    steps: u64,
+) -> Result<Vec<BTreeMap<String, f32>>> {
+    let (sender, viewer) = (connect(url).await?, connect(url).await?);
+    let mut streams = Vec::new();
+    for view in 0..views {
+        let picture = viewer::picture(&viewer, SCENE, content, view as u32).await?;
+        let picture = picture.ok_or_else(|| fault("report", "expected a picture"))?;
+        let request = FrameStreamRequest::new(SCENE, picture).max_steps(WARM_UP_STEPS + steps);
+        let frames = viewer.stream_frames(&request).await.map_err(fault_in("report"))?;
+        streams.push((frames, modalcast_client::StageSamples::default()));
+    }
+    let mut writer = motion::open_writer(&sender, None).await?;
+    for number in 0..WARM_UP_STEPS + steps {
+        writer.step(&motion.step(number)).await.map_err(fault_in("report"))?;
+        for (frames, samples) in &mut streams {
+            let frame = next_frame(frames, number).await?;
+            if number >= WARM_UP_STEPS {
+                samples.add(&frame.stages);
+            }
+        }
+        writer.take_acks();
+    }
+    writer.finish().await.map_err(fault_in("report"))?;
+    Ok(streams.into_iter().map(|(_, samples)| samples.medians()).collect())
+}
+
+/// The next frame of a stream, which must show this step.
+async fn next_frame(frames: &mut FrameStream, number: u64) -> Result<Frame> {
+    let frame = frames.next().await.ok_or_else(|| fault("report", "expected another frame"))?;
+    let frame = frame.map_err(fault_in("report"))?;
+    match frame.step.number == number {
+        true => Ok(frame),
+        false => Err(fault("report", format!("expected a frame of step {number}, got {}", frame.step.number))),
+    }
+}
+
 /// A runtime with one thread.
 pub(super) fn runtime() -> Result<tokio::runtime::Runtime> {
     tokio::runtime::Builder::new_current_thread().enable_all().build().map_err(fault_in("report"))
@@ -141,11 +196,7 @@ async fn time_frames(url: &str, motion: &Motion, content: Content, steps: u64) -
         }
         let sent = Instant::now();
         writer.step(&step).await.map_err(fault_in("report"))?;
-        let frame = frames.next().await.ok_or_else(|| fault("report", "expected another frame"))?;
-        let frame = frame.map_err(fault_in("report"))?;
-        if frame.step.number != number {
-            return Err(fault("report", format!("expected a frame of step {number}, got {}", frame.step.number)));
-        }
+        let frame = next_frame(&mut frames, number).await?;
         if timed_number.is_some() {
             let total_ms = sent.elapsed().as_secs_f64() * 1e3;
             times_ms.push(total_ms);

@@ -17,10 +17,11 @@ that receives n replies in a time t, from the first to the last reply, has the r
 rate of its slowest viewer. In a run without viewers, it is the rate of the physics process from the first step sent to \
 the last acknowledgment. The rate of a case is the median of its runs. All streams are lossless.
 
-The rate of a stage alone is the number of threads that run it in parallel, divided by its median time per step in the \
-same run. Drawing and encoding times are summed over the distinct views. `deform`, `upload`, `shadow` and `draw` run one \
-after the other on one device and count as one stage. The rate of the physics process alone is measured with a server \
-that merges steps. The transfer alone is a plain TCP connection over loopback with replies of the same size.";
+The rate of a stage alone is the number of threads that run it in parallel, divided by its median time per step: \
+for pictures in a run with one step in flight, otherwise in the same run. Drawing and encoding times are summed over the \
+distinct views. `deform`, `upload`, `shadow` and `draw` run one after the other on one device and count as one stage. The \
+rate of the physics process alone is measured with a server that merges steps. The transfer alone is a plain TCP \
+connection over loopback with replies of the same size.";
 
 /// The complete report.
 pub(super) fn markdown(report: &StreamReport) -> String {

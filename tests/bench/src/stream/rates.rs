@@ -6,6 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use super::SCENE;
 use super::StreamReportOptions;
+use super::latency;
 use super::peers::PeerJob;
 use super::peers::socket::{self, SocketJob};
 use super::peers::viewer::{Content, ViewerJob, ViewerSummary};
@@ -22,6 +23,9 @@ const WARM_UP_STEPS: u64 = 3;
 /// Minimum number of steps from which the rate of the physics process alone is measured, because its first step sends
 /// all values.
 const MIN_PHYSICS_STEPS: u64 = 60;
+
+/// Maximum number of steps from which the times of the stages of pictures alone are measured.
+const MAX_STAGE_STEPS: u64 = 60;
 
 /// The viewers of a case.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -63,9 +67,10 @@ pub struct RateResult {
     /// Bytes of a reply on average; `None` without viewers.
     pub reply_bytes: Option<f64>,
     pub skipped: u64,
-    /// Median of each stage in milliseconds, for each distinct view.
+    /// Median of each stage in milliseconds, for each distinct view. A stage of overlapping steps includes waits for
+    /// the other steps.
     pub stages_ms: Vec<BTreeMap<String, f32>>,
-    /// The rates of the stages alone, the slowest first.
+    /// The rates of the stages alone, the slowest first. Those of pictures are measured with one step in flight.
     pub stage_rates: Vec<StageRate>,
     /// `per_second` divided by the rate of the slowest stage.
     pub of_slowest_stage: f64,
@@ -116,12 +121,18 @@ pub(super) fn measure(
         Some(viewers) => median_run.viewers.iter().take(viewers.views).map(|viewer| viewer.stages_ms.clone()).collect(),
     };
     let sum = |count: fn(&ViewerSummary) -> u64| median_run.viewers.iter().map(count).sum::<u64>();
+    let views_alone = match viewers {
+        Some(Viewers { content, views, .. }) if content.is_picture() => {
+            latency::measure_stages(session, content, views, steps.min(MAX_STAGE_STEPS))?
+        }
+        _ => views.clone(),
+    };
     let reply_bytes = viewers.map(|_| sum(|viewer| viewer.bytes) as f64 / sum(|viewer| viewer.replies).max(1) as f64);
     let stage_rates = StageInputs {
         server: &session.server_info,
         threads: std::thread::available_parallelism().map_or(1, std::num::NonZero::get),
         viewers: viewers.map(|viewers| (viewers.content, viewers.count)),
-        views: &views,
+        views: &views_alone,
         physics_per_second: measure_physics(session, steps)?,
         socket_per_second: reply_bytes.map(|bytes| measure_socket(bytes, options.size)).transpose()?,
     }

@@ -54,7 +54,8 @@ pub(super) struct StageInputs<'a> {
     pub(super) threads: usize,
     /// Content of the replies and number of viewers; `None` for steps without viewers.
     pub(super) viewers: Option<(Content, usize)>,
-    /// Median time of each stage in milliseconds, for each distinct view. Without viewers: from the acknowledgments.
+    /// Median time of each stage in milliseconds, for each distinct view; of pictures, with one step in flight. Without
+    /// viewers: from the acknowledgments.
     pub(super) views: &'a [BTreeMap<String, f32>],
     pub(super) physics_per_second: f64,
     /// Replies per second over a plain TCP connection, if there are viewers.
