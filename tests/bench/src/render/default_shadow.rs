@@ -4,8 +4,8 @@
 //! default is the one with the least time. The light error is that of the sun visibility against the reference with
 //! hard shadows, which is the same for all variants, so that blur counts as an error. The limit is the error that
 //! changes a white surface in full sunlight by one level of 255 on hardware, and by two levels in software. The light
-//! error depends on the size of the image. The shipped defaults are for 1920 x 1080 on hardware and 1280 x 720 in
-//! software. The time is the geometric mean of the frame times over the workloads, so that all have the same weight.
+//! error depends on the size of the image, so the rule applies only to images of 1920 x 1080 on hardware and of
+//! 1280 x 720 in software, for which the shipped defaults are. The time is the geometric mean of the frame times over the workloads, so that all have the same weight.
 //!
 //! Standard maps are not candidates: they are not filtered, and the mean error does not show their jagged edges. The
 //! workload `shelf` is not used: its image shows only a few texels of the map, so its error depends on the width of the
@@ -13,6 +13,7 @@
 
 use serde::Serialize;
 
+use super::harness::Size;
 use super::measure::RenderRow;
 use super::workloads::RenderWorkload;
 use modalcast_model::scene::{
@@ -26,6 +27,9 @@ const LIGHT_ERROR_OF_LEVEL: f64 = 2.4 / (255.0 * 1.055 * 0.76);
 /// Largest mean errors in levels of 255. Software has the larger limit, because its frames take longer.
 const HARDWARE_LEVELS: f64 = 1.0;
 const SOFTWARE_LEVELS: f64 = 2.0;
+/// The size of the images from which the default is chosen.
+const HARDWARE_SIZE: Size = Size { width: 1920, height: 1080 };
+const SOFTWARE_SIZE: Size = Size { width: 1280, height: 720 };
 
 /// The default shadow map by the measurements of a report.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -36,7 +40,11 @@ pub struct DefaultShadow {
     pub loads: Vec<String>,
     /// Fastest first.
     pub candidates: Vec<DefaultCandidate>,
-    /// The variant that the rule chooses; `None` if no candidate is within the limit.
+    /// The size of the images to which the rule applies.
+    pub rule_size: Size,
+    /// Whether the images of the report have this size.
+    pub has_rule_size: bool,
+    /// The variant that the rule chooses; `None` if no candidate is within the limit, or if the images have another size.
     pub chosen: Option<String>,
     /// The variant that is the shipped default on this kind of renderer; `None` if it was not measured.
     pub shipped: Option<String>,
@@ -56,9 +64,12 @@ pub struct DefaultCandidate {
 
 impl DefaultShadow {
     /// Applies the rule to the rows of a report. `None` if no variant of the shadow map was timed.
-    pub(super) fn choose(rows: &[RenderRow], renderer: &RendererInfo) -> Option<Self> {
-        let kind = if renderer.software { RendererKind::Software } else { RendererKind::Hardware };
-        let levels = if renderer.software { SOFTWARE_LEVELS } else { HARDWARE_LEVELS };
+    pub(super) fn choose(rows: &[RenderRow], renderer: &RendererInfo, size: Size) -> Option<Self> {
+        let (kind, levels, rule_size) = match renderer.software {
+            true => (RendererKind::Software, SOFTWARE_LEVELS, SOFTWARE_SIZE),
+            false => (RendererKind::Hardware, HARDWARE_LEVELS, HARDWARE_SIZE),
+        };
+        let has_rule_size = size == rule_size;
         let max_light_error = levels * LIGHT_ERROR_OF_LEVEL;
         let rows: Vec<&RenderRow> = rows.iter().filter(|row| is_candidate(row)).collect();
         let distinct = |name: fn(&RenderRow) -> &str| {
@@ -77,11 +88,12 @@ impl DefaultShadow {
         };
         let mut candidates: Vec<DefaultCandidate> = variants.iter().filter_map(candidate).collect();
         candidates.sort_by(|a, b| a.frame_us.total_cmp(&b.frame_us));
-        let chosen = candidates.iter().find(|candidate| candidate.light_error <= max_light_error);
-        let chosen = chosen.map(|candidate| candidate.name.clone());
+        let mut accurate = candidates.iter().filter(|candidate| candidate.light_error <= max_light_error);
+        let chosen = accurate.next().filter(|_| has_rule_size).map(|candidate| candidate.name.clone());
         let shipped_map = shipped_shadow(kind);
         let shipped = rows.iter().find(|row| row.shadow == Some(shipped_map)).map(|row| row.name.clone());
-        (!candidates.is_empty()).then_some(Self { max_light_error, loads, candidates, chosen, shipped })
+        let has_candidates = !candidates.is_empty();
+        has_candidates.then_some(Self { max_light_error, loads, candidates, rule_size, has_rule_size, chosen, shipped })
     }
 
     /// Whether the shipped default is the variant that the rule chooses.
@@ -100,6 +112,11 @@ impl DefaultShadow {
             let DefaultCandidate { name, light_error, worst_load, frame_us } = candidate;
             format!("  {name:<40}{frame_us:>12.1} us{light_error:>10.5} on {worst_load}")
         }));
+        if !self.has_rule_size {
+            let Size { width, height } = self.rule_size;
+            lines.push(format!("  none is chosen: the default is chosen from images of {width} x {height} pixels"));
+            return lines;
+        }
         let name = |variant: &Option<String>| variant.clone().unwrap_or_else(|| "none of the measured".into());
         let verdict = if self.is_shipped() { "equal to" } else { "different from" };
         lines.push(format!("  chosen: {}; {verdict} the shipped default: {}", name(&self.chosen), name(&self.shipped)));
@@ -225,20 +242,24 @@ mod tests {
                 row("shelf", "shipped", shipped, 1.0, 0.9),
             ]
         };
-        let default = DefaultShadow::choose(&rows(100.0), &renderer(false)).expect("candidates");
+        let default = DefaultShadow::choose(&rows(100.0), &renderer(false), HARDWARE_SIZE).expect("candidates");
         assert_eq!((default.chosen.as_deref(), default.is_shipped()), (Some("shipped"), true));
         let names: Vec<&str> = default.candidates.iter().map(|candidate| candidate.name.as_str()).collect();
         assert_eq!(names, ["small", "shipped", "large"]);
         assert!((default.candidates[2].frame_us - 200.0).abs() < 1e-9, "{}", default.candidates[2].frame_us);
         assert_eq!(default.candidates[0].worst_load, "square");
-        let slower = DefaultShadow::choose(&rows(300.0), &renderer(false)).expect("candidates");
+        let slower = DefaultShadow::choose(&rows(300.0), &renderer(false), HARDWARE_SIZE).expect("candidates");
         assert_eq!((slower.chosen.as_deref(), slower.is_shipped()), (Some("large"), false));
         // The limit of software renderers is larger, and their default is another map.
-        let software = DefaultShadow::choose(&rows(100.0), &renderer(true)).expect("candidates");
+        let software = DefaultShadow::choose(&rows(100.0), &renderer(true), SOFTWARE_SIZE).expect("candidates");
         assert_eq!(
             (software.chosen.as_deref(), software.shipped, software.max_light_error > 0.02),
             (Some("small"), None, true)
         );
-        assert_eq!(DefaultShadow::choose(&[], &renderer(false)), None);
+        // The images of the report have another size.
+        let smaller = DefaultShadow::choose(&rows(100.0), &renderer(false), SOFTWARE_SIZE).expect("candidates");
+        assert_eq!((smaller.chosen.as_deref(), smaller.candidates.len()), (None, 3));
+        assert!(smaller.lines().last().is_some_and(|line| line.contains("1920 x 1080")), "{:?}", smaller.lines());
+        assert_eq!(DefaultShadow::choose(&[], &renderer(false), HARDWARE_SIZE), None);
     }
 }

@@ -23,13 +23,13 @@ pub struct ErrorDistribution {
 
 impl ErrorDistribution {
     fn from_values(mut values: Vec<f32>) -> Self {
-        values.sort_by(f32::total_cmp);
         let count = values.len();
-        let Some(max_value) = values.last() else { return Self::default() };
+        let Some(max_value) = values.iter().copied().max_by(f32::total_cmp) else { return Self::default() };
         let mean = values.iter().map(|value| f64::from(*value)).sum::<f64>() / count as f64;
         // Nearest-rank percentile: the smallest number that at least 99 % of the numbers do not exceed.
         let rank = (99 * count).div_ceil(100).clamp(1, count);
-        Self { mean, p99: f64::from(values[rank - 1]), max: f64::from(*max_value), count }
+        let (_, p99, _) = values.select_nth_unstable_by(rank - 1, f32::total_cmp);
+        Self { mean, p99: f64::from(*p99), max: f64::from(max_value), count }
     }
 }
 

@@ -302,7 +302,7 @@ impl Measurements {
             raster: raster.clone(),
             blurs: BlurComparison::pair_rows(rows),
             plants: plants.clone(),
-            default_shadow: DefaultShadow::choose(rows, renderer),
+            default_shadow: DefaultShadow::choose(rows, renderer, options.size),
             failed: failed.chain(raster.iter().filter_map(RasterComparison::describe_missing_times)).collect(),
             pictures,
         }
