@@ -1,11 +1,11 @@
-//! A Markdown table whose numbers are values of a record.
+//! A Markdown table whose numbers are values of records.
 
 use std::ops::Range;
 
 use serde::Deserialize;
 use serde_json::Value;
 
-/// A table of a document, and the values of a record that its cells quote.
+/// A table of a document, and the values of records that its cells quote.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct FigureTable {
@@ -13,10 +13,9 @@ pub(crate) struct FigureTable {
     pub(crate) document: String,
     /// The header line, which occurs once in the document.
     header: String,
-    /// Name of the record's file.
-    pub(crate) record: String,
-    /// Path of a value in the record. `{}` stands for the text of a cell below. A path consists of segments after `/`:
-    /// a key, an index, or `key=value` for the element of a list with this value, several separated by commas.
+    /// Path of a value: the file of its record, and segments after `/`: a key, an index, or `key=value` for the element
+    /// of a list with this value, several separated by commas. ` * FACTOR` at the end converts the unit. `{}` stands for
+    /// the text of a cell below. A text that contains `.json/` is a whole path.
     #[serde(default = "whole_selector")]
     selector: String,
     /// The rows below the header, without their first cells.
@@ -55,21 +54,26 @@ struct Figure<'a> {
 }
 
 impl FigureTable {
-    /// The figures of the table in `document` that differ from the values in `record`, as messages.
-    pub(crate) fn mismatches(&self, document: &str, record: &Value) -> Vec<String> {
+    /// The figures of the table in `document` that differ from the values of the records, as messages. `read_record`
+    /// returns the record of a file name.
+    pub(crate) fn mismatches(&self, document: &str, read_record: &dyn Fn(&str) -> Value) -> Vec<String> {
         let figures = match self.figures(document) {
             Ok(figures) => figures,
             Err(message) => return vec![message],
         };
         let mismatch = |figure: &Figure<'_>| {
-            let (printed, path) = (&document[figure.range.clone()], self.selector.replace("{}", figure.name));
+            let (printed, path) = (&document[figure.range.clone()], self.path_of(figure.name));
             let message = |expected: String| format!("{}: {path}: expected {expected}, got {printed}", self.document);
-            match select(record, &path).and_then(Value::as_f64) {
-                None => Some(message(format!("a number in {}", self.record))),
+            match value_at(&path, read_record) {
+                None => Some(message("a path to a number".into())),
                 Some(value) => (!is_rounded(printed, value)).then(|| message(value.to_string())),
             }
         };
         figures.iter().filter(|figure| !figure.name.is_empty()).filter_map(mismatch).collect()
+    }
+
+    fn path_of(&self, name: &str) -> String {
+        if name.contains(".json/") { name.to_owned() } else { self.selector.replace("{}", name) }
     }
 
     /// The byte of the last digit of each figure.
@@ -167,9 +171,19 @@ fn is_rounded(printed: &str, value: f64) -> bool {
     (number - value).abs() <= half_unit * (1.0 + 1e-6)
 }
 
-/// The value at a path, as [`FigureTable::selector`] describes it.
+/// The number at a path, as [`FigureTable::selector`] describes it.
+fn value_at(path: &str, read_record: &dyn Fn(&str) -> Value) -> Option<f64> {
+    let (path, factor) = match path.split_once(" * ") {
+        Some((path, factor)) => (path, factor.parse().ok()?),
+        None => (path, 1.0),
+    };
+    let (file, path) = path.split_once('/')?;
+    Some(factor * select(&read_record(file), path)?.as_f64()?)
+}
+
+/// The value at a path within a record.
 fn select<'a>(record: &'a Value, path: &str) -> Option<&'a Value> {
-    path.trim_start_matches('/').split('/').try_fold(record, |value, segment| match value {
+    path.split('/').try_fold(record, |value, segment| match value {
         Value::Array(elements) => match segment.parse::<usize>() {
             Ok(index) => elements.get(index),
             Err(_) => elements.iter().find(|element| {
@@ -208,8 +222,10 @@ fn printed_number_must_be_the_rounded_value() {
 #[test]
 fn selects_by_key_index_and_condition() {
     let record = serde_json::json!({"rows": [{"a": "x", "b": "y", "n": 1}, {"a": "x", "b": "z", "n": [2, 3]}]});
-    let number = |path: &str| select(&record, path).and_then(Value::as_f64);
-    assert_eq!(number("/rows/a=x,b=z/n/1"), Some(3.0));
-    assert_eq!(number("/rows/a=x/n"), Some(1.0));
-    assert_eq!((number("/rows/a=q/n"), number("/rows/2/n"), number("/absent")), (None, None, None));
+    let read_record = |file: &str| if file == "a.json" { record.clone() } else { Value::Null };
+    let number = |path: &str| value_at(path, &read_record);
+    assert_eq!(number("a.json/rows/a=x,b=z/n/1"), Some(3.0));
+    assert_eq!(number("a.json/rows/a=x/n * 1e-3"), Some(1e-3));
+    assert_eq!((number("a.json/rows/a=q/n"), number("a.json/rows/2/n"), number("a.json/absent")), (None, None, None));
+    assert_eq!((number("b.json/rows/a=x/n"), number("a.json/rows/a=x/n * x")), (None, None));
 }
