@@ -56,7 +56,14 @@ fn quick_report_is_complete_and_consistent() {
     );
     for stage in ["draw", "shadow", "encode"] {
         number(&png["stages_ms"][0][stage]);
+        number(&png["alone_ms"][0][stage]);
     }
+    // The rates are those of the stages alone.
+    let stage_rates = png["stage_rates"].as_array().expect("expected rates");
+    let drawing = stage_rates.iter().find(|rate| rate["stages"].as_str().is_some_and(|stages| stages.contains("draw")));
+    let alone_ms = ["deform", "upload", "switch", "shadow", "draw"].map(|stage| png["alone_ms"][0][stage].as_f64());
+    let sum_ms: f64 = alone_ms.into_iter().flatten().sum();
+    assert!((number(&drawing.expect("expected the device")["ms"]) - sum_ms).abs() < 1e-6 * sum_ms, "{png}");
     // Both are positions of the same vertices: 12 bytes as f32, and about 6 bytes as 16-bit numbers.
     let compact_bytes = number(&case("tree-vertices-compact")["result"]["rate"]["reply_bytes"]);
     let socket = &case("tree-socket")["result"]["socket"];

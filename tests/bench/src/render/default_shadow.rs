@@ -5,7 +5,8 @@
 //! hard shadows, which is the same for all variants, so that blur counts as an error. The limit is the error that
 //! changes a white surface in full sunlight by one level of 255 on hardware, and by two levels in software. The light
 //! error depends on the size of the image, so the rule applies only to images of 1920 x 1080 on hardware and of
-//! 1280 x 720 in software, for which the shipped defaults are. The time is the geometric mean of the frame times over the workloads, so that all have the same weight.
+//! 1280 x 720 in software, for which the shipped defaults are chosen. The time is the geometric mean of the frame times
+//! over the workloads, so that all have the same weight.
 //!
 //! Standard maps are not candidates: they are not filtered, and the mean error does not show their jagged edges. The
 //! workload `shelf` is not used: its image shows only a few texels of the map, so its error depends on the width of the
@@ -44,7 +45,7 @@ pub struct DefaultShadow {
     pub rule_size: Size,
     /// Whether the images of the report have this size.
     pub has_rule_size: bool,
-    /// The variant that the rule chooses; `None` if no candidate is within the limit, or if the images have another size.
+    /// The variant that the rule chooses; `None` if no candidate is within the limit or the images have another size.
     pub chosen: Option<String>,
     /// The variant that is the shipped default on this kind of renderer; `None` if it was not measured.
     pub shipped: Option<String>,

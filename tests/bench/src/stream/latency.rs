@@ -114,17 +114,17 @@ pub(super) fn measure_frames(session: &Session, content: Content, steps: u64) ->
 }
 
 /// Median times of the stages of pictures in milliseconds, for each view. A step is sent after the frames of the previous
-/// one have been received: a stage of overlapping steps would also include waits for the other steps.
+/// one have been received. A stage of overlapping steps would also include waits for the other steps.
 ///
 /// # Errors
 /// `Fault` when the server rejects a request or a frame shows another step.
 pub(super) fn measure_stages(
     session: &Session,
+    motion: &Motion,
     content: Content,
     views: usize,
     steps: u64,
 ) -> Result<Vec<BTreeMap<String, f32>>> {
-    let motion = session.motion(steps.min(super::RECORDED_STEPS))?;
     runtime()?.block_on(time_stages(&session.url(), motion, content, views, steps))
 }
 

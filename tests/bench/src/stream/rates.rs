@@ -4,7 +4,6 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
-use super::SCENE;
 use super::StreamReportOptions;
 use super::latency;
 use super::peers::PeerJob;
@@ -13,6 +12,7 @@ use super::peers::viewer::{Content, ViewerJob, ViewerSummary};
 use super::processes::{Process, arguments};
 use super::session::Session;
 use super::stages::{StageInputs, StageRate};
+use super::{RECORDED_STEPS, SCENE};
 use crate::timing::quantile;
 use crate::workloads::Size;
 use modalcast_model::error::{Result, fault};
@@ -61,8 +61,8 @@ pub struct RateResult {
     /// has the rate (n - 1) / t. The rate of a run is that of its slowest client, or that of the physics process if
     /// there are no clients.
     pub per_second: f64,
-    /// Steps per second of the physics process, from its first step to its last acknowledgment. This and the following
-    /// results are those of the run with the median rate.
+    /// Steps per second of the physics process, from its first step to its last acknowledgment. This result and those up
+    /// to `stages_ms` are of the run with the median rate.
     pub steps_per_second: f64,
     /// Bytes of a reply on average; `None` without viewers.
     pub reply_bytes: Option<f64>,
@@ -70,7 +70,10 @@ pub struct RateResult {
     /// Median of each stage in milliseconds, for each distinct view. A stage of overlapping steps includes waits for
     /// the other steps.
     pub stages_ms: Vec<BTreeMap<String, f32>>,
-    /// The rates of the stages alone, the slowest first. Those of pictures are measured with one step in flight.
+    /// The medians from which `stage_rates` are computed: those of a further run with one step in flight for pictures,
+    /// otherwise `stages_ms`.
+    pub alone_ms: Vec<BTreeMap<String, f32>>,
+    /// The rates of the stages alone, the slowest first.
     pub stage_rates: Vec<StageRate>,
     /// `per_second` divided by the rate of the slowest stage.
     pub of_slowest_stage: f64,
@@ -121,9 +124,10 @@ pub(super) fn measure(
         Some(viewers) => median_run.viewers.iter().take(viewers.views).map(|viewer| viewer.stages_ms.clone()).collect(),
     };
     let sum = |count: fn(&ViewerSummary) -> u64| median_run.viewers.iter().map(count).sum::<u64>();
-    let views_alone = match viewers {
+    let alone_ms = match viewers {
         Some(Viewers { content, views, .. }) if content.is_picture() => {
-            latency::measure_stages(session, content, views, steps.min(MAX_STAGE_STEPS))?
+            let motion = session.motion(options.steps.min(RECORDED_STEPS))?;
+            latency::measure_stages(session, motion, content, views, steps.min(MAX_STAGE_STEPS))?
         }
         _ => views.clone(),
     };
@@ -132,7 +136,7 @@ pub(super) fn measure(
         server: &session.server_info,
         threads: std::thread::available_parallelism().map_or(1, std::num::NonZero::get),
         viewers: viewers.map(|viewers| (viewers.content, viewers.count)),
-        views: &views_alone,
+        views: &alone_ms,
         physics_per_second: measure_physics(session, steps)?,
         socket_per_second: reply_bytes.map(|bytes| measure_socket(bytes, options.size)).transpose()?,
     }
@@ -149,6 +153,7 @@ pub(super) fn measure(
         reply_bytes,
         skipped: sum(|viewer| viewer.skipped),
         stages_ms: views,
+        alone_ms,
         stage_rates,
         of_slowest_stage: per_second / slowest_rate,
     })

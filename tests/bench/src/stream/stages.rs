@@ -13,8 +13,9 @@ use serde::Serialize;
 use super::peers::viewer::Content;
 use modalcast::frame::PngLayout;
 
-/// The stages that run one after the other on the GPU, or on the CPU if the machine has no GPU.
-const DEVICE_STAGES: [&str; 4] = ["deform", "upload", "shadow", "draw"];
+/// The stages that run one after the other on the GPU, or on the CPU if the machine has no GPU. `switch` is the change of
+/// the GPU from CUDA to OpenGL.
+const DEVICE_STAGES: [&str; 5] = ["deform", "upload", "switch", "shadow", "draw"];
 
 /// Stages that share a resource are reported as one group. A stage that takes less than this fraction of the group's
 /// time is not named.

@@ -36,6 +36,7 @@ fn rate_result() -> RateResult {
         reply_bytes: Some(1234.0),
         skipped: 0,
         stages_ms: vec![BTreeMap::from([("draw".to_owned(), 1.5)])],
+        alone_ms: vec![BTreeMap::from([("draw".to_owned(), 1.25)])],
         stage_rates,
         of_slowest_stage: 0.25,
     }

@@ -65,7 +65,7 @@ impl FigureTable {
             let (printed, path) = (&document[figure.range.clone()], self.path_of(figure.name));
             let message = |expected: String| format!("{}: {path}: expected {expected}, got {printed}", self.document);
             match value_at(&path, read_record) {
-                None => Some(message("a path to a number".into())),
+                None => Some(format!("{}: {path}: expected a number at this path, got none", self.document)),
                 Some(value) => (!is_rounded(printed, value)).then(|| message(value.to_string())),
             }
         };
