@@ -89,8 +89,8 @@ impl DefaultShadow {
         };
         let mut candidates: Vec<DefaultCandidate> = variants.iter().filter_map(candidate).collect();
         candidates.sort_by(|a, b| a.frame_us.total_cmp(&b.frame_us));
-        let mut accurate = candidates.iter().filter(|candidate| candidate.light_error <= max_light_error);
-        let chosen = accurate.next().filter(|_| has_rule_size).map(|candidate| candidate.name.clone());
+        let is_allowed = |candidate: &&DefaultCandidate| has_rule_size && candidate.light_error <= max_light_error;
+        let chosen = candidates.iter().find(is_allowed).map(|candidate| candidate.name.clone());
         let shipped_map = shipped_shadow(kind);
         let shipped = rows.iter().find(|row| row.shadow == Some(shipped_map)).map(|row| row.name.clone());
         let has_candidates = !candidates.is_empty();

@@ -20,9 +20,8 @@ the last acknowledgment. The rate of a case is the median of its runs. All strea
 The rate of a stage alone is the number of threads that run it in parallel, divided by its median time per step: \
 for pictures in a run with one step in flight, otherwise in the same run. Drawing and encoding times are summed over the \
 distinct views. `deform`, `upload`, `switch`, `shadow` and `draw` run one after the other on one device and count as one \
-stage. The \
-rate of the physics process alone is measured with a server that merges steps. The transfer alone is a plain TCP \
-connection over loopback with replies of the same size.";
+stage. The rate of the physics process alone is measured with a server that merges steps. The transfer alone is a plain \
+TCP connection over loopback with replies of the same size.";
 
 /// The complete report.
 pub(super) fn markdown(report: &StreamReport) -> String {

@@ -1,9 +1,13 @@
 //! A Markdown table whose numbers are values of records.
 
+use std::collections::BTreeMap;
 use std::ops::Range;
 
 use serde::Deserialize;
 use serde_json::Value;
+
+/// The records by the names of their files.
+pub(crate) type Records = BTreeMap<String, Value>;
 
 /// A table of a document, and the values of records that its cells quote.
 #[derive(Debug, Deserialize)]
@@ -54,9 +58,8 @@ struct Figure<'a> {
 }
 
 impl FigureTable {
-    /// The figures of the table in `document` that differ from the values of the records, as messages. `read_record`
-    /// returns the record of a file name.
-    pub(crate) fn mismatches(&self, document: &str, read_record: &dyn Fn(&str) -> Value) -> Vec<String> {
+    /// The figures of the table in `document` that differ from the values of the records, as messages.
+    pub(crate) fn mismatches(&self, document: &str, records: &Records) -> Vec<String> {
         let figures = match self.figures(document) {
             Ok(figures) => figures,
             Err(message) => return vec![message],
@@ -64,7 +67,7 @@ impl FigureTable {
         let mismatch = |figure: &Figure<'_>| {
             let (printed, path) = (&document[figure.range.clone()], self.path_of(figure.name));
             let message = |expected: String| format!("{}: {path}: expected {expected}, got {printed}", self.document);
-            match value_at(&path, read_record) {
+            match value_at(&path, records) {
                 None => Some(format!("{}: {path}: expected a number at this path, got none", self.document)),
                 Some(value) => (!is_rounded(printed, value)).then(|| message(value.to_string())),
             }
@@ -172,13 +175,13 @@ fn is_rounded(printed: &str, value: f64) -> bool {
 }
 
 /// The number at a path, as [`FigureTable::selector`] describes it.
-fn value_at(path: &str, read_record: &dyn Fn(&str) -> Value) -> Option<f64> {
+fn value_at(path: &str, records: &Records) -> Option<f64> {
     let (path, factor) = match path.split_once(" * ") {
         Some((path, factor)) => (path, factor.parse().ok()?),
         None => (path, 1.0),
     };
     let (file, path) = path.split_once('/')?;
-    Some(factor * select(&read_record(file), path)?.as_f64()?)
+    Some(factor * select(records.get(file)?, path)?.as_f64()?)
 }
 
 /// The value at a path within a record.
@@ -222,8 +225,8 @@ fn printed_number_must_be_the_rounded_value() {
 #[test]
 fn selects_by_key_index_and_condition() {
     let record = serde_json::json!({"rows": [{"a": "x", "b": "y", "n": 1}, {"a": "x", "b": "z", "n": [2, 3]}]});
-    let read_record = |file: &str| if file == "a.json" { record.clone() } else { Value::Null };
-    let number = |path: &str| value_at(path, &read_record);
+    let records = Records::from([("a.json".to_owned(), record)]);
+    let number = |path: &str| value_at(path, &records);
     assert_eq!(number("a.json/rows/a=x,b=z/n/1"), Some(3.0));
     assert_eq!(number("a.json/rows/a=x/n * 1e-3"), Some(1e-3));
     assert_eq!((number("a.json/rows/a=q/n"), number("a.json/rows/2/n"), number("a.json/absent")), (None, None, None));

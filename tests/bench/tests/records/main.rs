@@ -8,6 +8,7 @@ mod record_program;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
+use figure_table::Records;
 use record_index::RecordIndex;
 
 /// The root of the working tree.
@@ -19,8 +20,11 @@ fn read(path: &str) -> String {
     std::fs::read_to_string(root().join(path)).unwrap_or_else(|error| panic!("{path}: {error}"))
 }
 
-fn read_record(file: &str) -> serde_json::Value {
-    serde_json::from_str(&read(&format!("tests/bench/records/{file}"))).expect("expected JSON")
+fn read_records(index: &RecordIndex) -> Records {
+    let read_record = |file: &String| {
+        (file.clone(), serde_json::from_str(&read(&format!("tests/bench/records/{file}"))).expect("expected JSON"))
+    };
+    index.records.iter().map(|record| read_record(&record.file)).collect()
 }
 
 #[test]
@@ -42,18 +46,19 @@ fn every_record_has_an_entry_and_every_entry_a_file() {
 
 #[test]
 fn figures_of_tables_are_those_of_the_records() {
-    let mismatches: Vec<String> = RecordIndex::read()
-        .tables
-        .iter()
-        .flat_map(|table| table.mismatches(&read(&table.document), &read_record))
-        .collect();
+    let index = RecordIndex::read();
+    let records = read_records(&index);
+    let mismatches: Vec<String> =
+        index.tables.iter().flat_map(|table| table.mismatches(&read(&table.document), &records)).collect();
     assert!(mismatches.is_empty(), "{}", mismatches.join("\n"));
 }
 
 /// The control of the test above: each figure of each table is changed, one at a time.
 #[test]
 fn a_changed_figure_is_a_mismatch() {
-    for table in RecordIndex::read().tables {
+    let index = RecordIndex::read();
+    let records = read_records(&index);
+    for table in index.tables {
         let document = read(&table.document);
         let positions = table.digit_positions(&document);
         assert!(!positions.is_empty(), "{}: expected figures", table.document);
@@ -62,7 +67,7 @@ fn a_changed_figure_is_a_mismatch() {
             // A change by 5 units, because a value in the middle of two figures may be rounded to either.
             changed[position] = b'0' + (changed[position] - b'0' + 5) % 10;
             let changed = String::from_utf8(changed).expect("a digit is replaced by a digit");
-            let mismatches = table.mismatches(&changed, &read_record);
+            let mismatches = table.mismatches(&changed, &records);
             assert_eq!(mismatches.len(), 1, "{}: byte {position}: {mismatches:?}", table.document);
         }
     }
