@@ -130,13 +130,11 @@ impl ChangeListWriter {
                 // Domains can share coordinates, so the changes may need more coordinates than the scene has.
                 return None;
             }
-            packer.put_q(domain, domain_q, |coordinate| {
-                q[q_count] = coordinate.to_bits();
-                q_count += 1;
-            });
+            let first_q = packer.coordinates.first_q[domain];
+            q_count += packer.put_q(first_q as usize, domain_q, bytemuck::cast_slice_mut(&mut q[q_count..]));
             let change = Change {
                 domain: *domain_id,
-                first_q: packer.coordinates.first_q[domain],
+                first_q,
                 q_count: (q_count - first_new_q) as u32,
                 first_new_q: first_new_q as u32,
             };

@@ -13,7 +13,6 @@ use std::sync::Arc;
 use super::layout::{StepHeader, TransformLink};
 use super::staging::{SliceWriter, fill_parts};
 use super::work::{CoordinateLayout, DomainTiles};
-use crate::storage::modes_per_chunk;
 use modalcast_model::scene::{Scene, SceneState};
 
 /// Writes the input values of a scene's steps in the layout of the device.
@@ -21,8 +20,9 @@ use modalcast_model::scene::{Scene, SceneState};
 pub struct InputPacker {
     pub(crate) scene: Arc<Scene>,
     pub(crate) coordinates: CoordinateLayout,
-    /// Per shape, the factors of its modes, by which q is multiplied; empty unless the storage type has factors.
-    pub(crate) factors: Vec<Vec<f32>>,
+    /// Per coordinate of the device, the factor by which q is multiplied (`CoordinateLayout::spread_factors`); empty
+    /// unless the storage type has factors.
+    pub(crate) factors: Vec<f32>,
     pub(crate) dirty_tile_layout: DirtyTileLayout,
 }
 
@@ -74,7 +74,7 @@ impl InputPacker {
         Self {
             scene: Arc::clone(scene),
             coordinates: CoordinateLayout::new(scene),
-            factors: vec![Vec::new(); scene.shapes.len()],
+            factors: Vec::new(),
             dirty_tile_layout: DirtyTileLayout::default(),
         }
     }
@@ -97,30 +97,35 @@ impl InputPacker {
             writer.take(self.coordinates.total - state.q.len()).fill(0.0);
             return;
         }
-        fill_parts(device_q, &self.coordinates.first_q, |domains, part| {
-            let mut length = 0;
-            for domain in domains {
-                self.put_q(domain, state.q_of(&self.scene, domain), |coordinate| {
-                    part[length] = coordinate;
-                    length += 1;
-                });
-            }
-            part[length..].fill(0.0);
-        });
+        fill_parts(
+            device_q,
+            &self.coordinates.ranges,
+            |range| range.first_q,
+            |ranges, part| {
+                let mut length = 0;
+                for range in ranges {
+                    let q = &state.q[range.scene_first_q..][..range.rank];
+                    length += self.put_q(range.first_q, q, &mut part[length..]);
+                }
+                part[length..].fill(0.0);
+            },
+        );
     }
 
-    /// Passes the coordinates of one domain to `put`, multiplied by the factors of their modes. Then passes zeros up to
-    /// whole chunks, unless the device has the coordinates in the order of the scene's state.
-    pub(crate) fn put_q(&self, domain: usize, q: &[f32], mut put: impl FnMut(f32)) {
-        let factors = &self.factors[self.scene.domains[domain].shape];
-        // The factor is a power of two, so the product is exact unless it overflows or underflows f32.
-        for (mode, coordinate) in q.iter().enumerate() {
-            put(factors.get(mode).map_or(*coordinate, |factor| coordinate * factor));
+    /// Writes the coordinates of one domain, multiplied by the factors of their modes, to the begin of `target`, and
+    /// then zeros up to whole chunks, unless the device has the coordinates in the order of the scene's state. Returns
+    /// the number of written words. `first_q` is the offset of the domain's first coordinate on the device.
+    pub(crate) fn put_q(&self, first_q: usize, q: &[f32], target: &mut [f32]) -> usize {
+        let (coordinates, padding) = target[..self.coordinates.padded_rank(&self.scene, q.len())].split_at_mut(q.len());
+        if self.factors.is_empty() {
+            coordinates.copy_from_slice(q);
+        } else {
+            // A factor is a power of two, so a product is exact unless it overflows or underflows f32.
+            let factored = q.iter().zip(&self.factors[first_q..]);
+            coordinates.iter_mut().zip(factored).for_each(|(word, (coordinate, factor))| *word = coordinate * factor);
         }
-        if !self.coordinates.is_scene_order {
-            let padded_length = q.len().next_multiple_of(modes_per_chunk(self.scene.deformation.storage));
-            (q.len()..padded_length).for_each(|_| put(0.0));
-        }
+        padding.fill(0.0);
+        q.len() + padding.len()
     }
 }
 
@@ -131,8 +136,9 @@ mod tests {
     use modalcast_model::scene::{DeformationSettings, StorageType};
 
     fn packer_with_factors(scene: &Arc<Scene>) -> InputPacker {
-        let factors = vec![vec![0.5; 64]; scene.shapes.len()];
-        InputPacker { factors, ..InputPacker::sizes_only(scene) }
+        let packer = InputPacker::sizes_only(scene);
+        let factors = if packer.coordinates.is_scene_order { Vec::new() } else { vec![0.5; packer.coordinates.total] };
+        InputPacker { factors, ..packer }
     }
 
     fn state_with_distinct_values(scene: &Scene) -> SceneState {

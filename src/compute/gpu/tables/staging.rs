@@ -1,8 +1,6 @@
 //! Writes staging buffers: pinned, write-combined host memory, which the host writes from front to back and never
 //! reads.
 
-use std::ops::Range;
-
 use bytemuck::Pod;
 use rayon::prelude::*;
 
@@ -11,6 +9,10 @@ use rayon::prelude::*;
 pub const PARALLEL_THRESHOLD: usize = 1 << 20;
 /// Minimum number of 32-bit words per parallel part (128 KiB): long contiguous writes, but enough parts for many cores.
 const PART_WORDS: usize = 1 << 15;
+/// Minimum number of items of a list that several cores write: short items cost more than their words.
+const PARALLEL_ITEMS: usize = 1 << 13;
+/// Maximum number of items per parallel part.
+const PART_ITEMS: usize = 1 << 11;
 
 /// Writes a list of 32-bit words from front to back. The field is the part that is not yet written.
 pub(crate) struct SliceWriter<'a>(&'a mut [f32]);
@@ -49,23 +51,28 @@ pub fn parallel_copy(target: &mut [f32], source: &[f32]) {
     parts.for_each(|(target, source)| target.copy_from_slice(source));
 }
 
-/// Fills a list with `fill(items, part)`: `part` is a part of the list, and `items` are the indices of the items in it.
-/// Item i begins at word `item_offsets[i]`; the offsets ascend. A large list is split between items into parts, which
+/// Fills a list with `fill(items, part)`: `part` is a part of the list, and `items` are the items in it. An item begins
+/// at word `first_word(item)`; these offsets ascend from 0. A large list is split between items into parts, which
 /// several cores fill.
-pub(crate) fn fill_parts(list: &mut [f32], item_offsets: &[u32], fill: impl Fn(Range<usize>, &mut [f32]) + Sync) {
-    if size_of_val(list) < PARALLEL_THRESHOLD {
-        fill(0..item_offsets.len(), list);
+pub(crate) fn fill_parts<T: Sync>(
+    list: &mut [f32],
+    items: &[T],
+    first_word: impl Fn(&T) -> usize,
+    fill: impl Fn(&[T], &mut [f32]) + Sync,
+) {
+    if size_of_val(list) < PARALLEL_THRESHOLD && items.len() < PARALLEL_ITEMS {
+        fill(items, list);
         return;
     }
-    let (mut parts, mut remaining_words, mut first_item) = (Vec::new(), list, 0);
-    let mut part_begin = item_offsets.first().map_or(0, |offset| *offset as usize);
-    while first_item < item_offsets.len() {
+    let (mut parts, mut remaining_words, mut remaining_items, mut part_begin) = (Vec::new(), list, items, 0);
+    while !remaining_items.is_empty() {
         let min_part_end = part_begin + PART_WORDS;
-        let end_item = item_offsets.partition_point(|offset| (*offset as usize) < min_part_end).max(first_item + 1);
-        let part_end = item_offsets.get(end_item).map_or(part_begin + remaining_words.len(), |offset| *offset as usize);
+        let item_count = remaining_items.partition_point(|item| first_word(item) < min_part_end).clamp(1, PART_ITEMS);
+        let (part_items, following_items) = remaining_items.split_at(item_count);
+        let part_end = following_items.first().map_or(part_begin + remaining_words.len(), &first_word);
         let (part, following_words) = remaining_words.split_at_mut(part_end - part_begin);
-        parts.push((first_item..end_item, part));
-        (remaining_words, first_item, part_begin) = (following_words, end_item, part_end);
+        parts.push((part_items, part));
+        (remaining_words, remaining_items, part_begin) = (following_words, following_items, part_end);
     }
     parts.into_par_iter().for_each(|(items, part)| fill(items, part));
 }
@@ -99,19 +106,25 @@ mod tests {
 
     #[test]
     fn every_item_and_word_belongs_to_one_part() {
-        // Lists of more than 262,144 words (`PARALLEL_THRESHOLD`) have several parts.
-        for lengths in [vec![1; 400_000], vec![0; 5], vec![300_000, 0, 0, 7, 200_000, 0], vec![4; 3]] {
-            let item_offsets: Vec<u32> =
+        // Lists of more than 262,144 words (`PARALLEL_THRESHOLD`) or 8,192 items (`PARALLEL_ITEMS`) have several parts.
+        let lists = [vec![1; 400_000], vec![2; 10_000], vec![0; 5], vec![300_000, 0, 0, 7, 200_000, 0], vec![4; 3]];
+        for lengths in lists {
+            let item_offsets: Vec<usize> =
                 lengths.iter().scan(0, |sum, length| Some(std::mem::replace(sum, *sum + length))).collect();
             // Three words after the last item belong to the last part.
-            let word_count = lengths.iter().sum::<u32>() as usize + 3;
+            let word_count = lengths.iter().sum::<usize>() + 3;
             let mut list = vec![-1.0; word_count];
             let item_count = std::sync::atomic::AtomicUsize::new(0);
-            fill_parts(&mut list, &item_offsets, |items, part| {
-                item_count.fetch_add(items.len(), std::sync::atomic::Ordering::Relaxed);
-                let part_begin = item_offsets[items.start] as usize;
-                part.iter_mut().enumerate().for_each(|(index, word)| *word = (part_begin + index) as f32);
-            });
+            fill_parts(
+                &mut list,
+                &item_offsets,
+                |offset| *offset,
+                |items, part| {
+                    item_count.fetch_add(items.len(), std::sync::atomic::Ordering::Relaxed);
+                    let part_begin = items[0];
+                    part.iter_mut().enumerate().for_each(|(index, word)| *word = (part_begin + index) as f32);
+                },
+            );
             assert_eq!(item_count.into_inner(), lengths.len());
             assert!(list.iter().enumerate().all(|(index, word)| *word == index as f32));
         }

@@ -111,6 +111,7 @@ impl DeformKernel {
         let mut uploader = ModeUploader::new(device, scene, &work)?;
         work.sources.iter().try_for_each(|source| uploader.add(source))?;
         let UploadedModes { words, scales, factors } = uploader.finish()?;
+        let factors = coordinates.spread_factors(scene, &factors);
         let has_partial_steps = tile_list_capacity > 0;
         // Tiles that have only corners are needed only for rigid normals.
         let full_step_tiles =

@@ -43,13 +43,11 @@ impl Tables {
         let work = WorkList::new(scene, &coordinates, BatchPolicy::Always);
         let loaded = load_tables(scene, &work);
         let mut q = vec![f32::NAN; coordinates.total];
-        let packer = InputPacker { factors: loaded.factors.clone(), ..InputPacker::sizes_only(scene) };
+        let factors = coordinates.spread_factors(scene, &loaded.factors);
+        let packer = InputPacker { factors, ..InputPacker::sizes_only(scene) };
         for domain in 0..scene.domains.len() {
-            let mut index = packer.coordinates.first_q[domain] as usize;
-            packer.put_q(domain, state.q_of(scene, domain), |number| {
-                q[index] = number;
-                index += 1;
-            });
+            let first_q = packer.coordinates.first_q[domain] as usize;
+            packer.put_q(first_q, state.q_of(scene, domain), &mut q[first_q..]);
         }
         Self { scene: Arc::clone(scene), work, loaded, state: state.clone(), q }
     }
