@@ -108,6 +108,7 @@ impl TiledModes {
     }
 
     /// Offsets and sizes of tile `tile`.
+    #[inline]
     pub fn tile(&self, tile: usize) -> TileLayout {
         let first_quad = TILE_QUADS * tile;
         let quads = TILE_QUADS.min(self.quads() - first_quad);
@@ -157,6 +158,7 @@ impl TiledModes {
     }
 
     /// The stored entry of vertex `vertex`, axis `axis` and mode `mode`, times its factor or scale. Exact in f64.
+    #[inline]
     pub fn decode_entry(&self, vertex: usize, axis: usize, mode: usize) -> f64 {
         let chunk_modes = modes_per_chunk(self.storage);
         let (quad, tile) = (vertex / QUAD, vertex / QUAD / TILE_QUADS);
