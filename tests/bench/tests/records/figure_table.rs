@@ -75,6 +75,21 @@ impl FigureTable {
         figures.iter().filter(|figure| !figure.name.is_empty()).filter_map(mismatch).collect()
     }
 
+    /// The document with the values of the records in place of the figures of the table.
+    pub(crate) fn update(&self, document: &str, records: &Records) -> Result<String, String> {
+        let (mut updated, mut copied) = (String::new(), 0);
+        for Figure { range, name } in self.figures(document)?.into_iter().filter(|figure| !figure.name.is_empty()) {
+            let path = self.path_of(name);
+            let Some(value) = value_at(&path, records) else {
+                return Err(format!("{}: {path}: expected a number at this path, got none", self.document));
+            };
+            updated.push_str(&document[copied..range.start]);
+            updated.push_str(&format_like(&document[range.clone()], value));
+            copied = range.end;
+        }
+        Ok(updated + &document[copied..])
+    }
+
     fn path_of(&self, name: &str) -> String {
         if name.contains(".json/") { name.to_owned() } else { self.selector.replace("{}", name) }
     }
@@ -164,10 +179,34 @@ fn parse_number(printed: &str) -> Option<f64> {
     printed.replace(',', "").parse().ok()
 }
 
+/// Number of digits after the decimal point of a printed number.
+fn decimals(printed: &str) -> usize {
+    let digits = printed.split_once('e').map_or(printed, |(digits, _)| digits);
+    digits.split_once('.').map_or(0, |(_, decimals)| decimals.len())
+}
+
+/// `value` in the format of `printed`: with as many decimals, and with an exponent if it has one.
+fn format_like(printed: &str, value: f64) -> String {
+    let decimals = decimals(printed);
+    if printed.contains('e') {
+        return format!("{value:.decimals$e}");
+    }
+    let digits = format!("{value:.decimals$}");
+    let integer_length = digits.find('.').unwrap_or(digits.len());
+    let mut formatted = String::new();
+    for (index, digit) in digits.char_indices() {
+        if index > 0 && index < integer_length && (integer_length - index).is_multiple_of(3) {
+            formatted.push(',');
+        }
+        formatted.push(digit);
+    }
+    formatted
+}
+
 /// Whether `printed` is `value`, rounded to the printed digits.
 fn is_rounded(printed: &str, value: f64) -> bool {
-    let (digits, exponent) = printed.split_once('e').unwrap_or((printed, "0"));
-    let decimals = digits.split_once('.').map_or(0, |(_, decimals)| decimals.len() as i32);
+    let exponent = printed.split_once('e').map_or("0", |(_, exponent)| exponent);
+    let decimals = decimals(printed) as i32;
     let (Some(number), Ok(exponent)) = (parse_number(printed), exponent.parse::<i32>()) else { return false };
     let half_unit = 0.5 * 10_f64.powi(exponent - decimals);
     // A value in the middle may be rounded either way. The factor covers the rounding errors of this comparison.

@@ -44,10 +44,18 @@ fn every_record_has_an_entry_and_every_entry_a_file() {
     }
 }
 
+/// With the environment variable `UPDATE_FIGURES`, the figures of the records are written into the tables.
 #[test]
 fn figures_of_tables_are_those_of_the_records() {
     let index = RecordIndex::read();
     let records = read_records(&index);
+    if std::env::var_os("UPDATE_FIGURES").is_some() {
+        for table in &index.tables {
+            let updated = table.update(&read(&table.document), &records).expect("expected a table and its values");
+            std::fs::write(root().join(&table.document), updated).expect("expected a writable document");
+        }
+        return;
+    }
     let mismatches: Vec<String> =
         index.tables.iter().flat_map(|table| table.mismatches(&read(&table.document), &records)).collect();
     assert!(mismatches.is_empty(), "{}", mismatches.join("\n"));
@@ -69,6 +77,8 @@ fn a_changed_figure_is_a_mismatch() {
             let changed = String::from_utf8(changed).expect("a digit is replaced by a digit");
             let mismatches = table.mismatches(&changed, &records);
             assert_eq!(mismatches.len(), 1, "{}: byte {position}: {mismatches:?}", table.document);
+            let updated = table.update(&changed, &records).expect("expected a table and its values");
+            assert!(table.mismatches(&updated, &records).is_empty(), "{}: byte {position}", table.document);
         }
     }
 }
