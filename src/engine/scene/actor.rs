@@ -218,7 +218,7 @@ impl SceneActor {
         let mode = DeliveryMode { applies_back_pressure, overlaps_next_step: self.has_queued_step() };
         self.delivery.serve_subscribers(&self.current, mode).await;
         if self.applies_back_pressure() && self.delivery.has_unserved_lossless(&self.current) {
-            return self.delivery.flush().await;
+            return self.delivery.flush_until_woken(&self.wake).await;
         }
         self.acknowledge().await;
         if self.writer.as_ref().is_some_and(|writer| writer.step_queue.is_closed()) {
@@ -229,7 +229,7 @@ impl SceneActor {
             // More steps may be queued. Handle waiting messages first.
             self.wake.notify_one();
         } else {
-            self.delivery.flush().await;
+            self.delivery.flush_until_woken(&self.wake).await;
         }
     }
 

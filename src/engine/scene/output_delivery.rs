@@ -5,6 +5,8 @@ use std::collections::VecDeque;
 use std::mem;
 use std::time::Instant;
 
+use tokio::sync::Notify;
+
 use super::current_step::CurrentStep;
 use super::delivery::Delivery;
 use super::message::StepRequest;
@@ -144,6 +146,17 @@ impl OutputDelivery {
         self.drop_closed_subscribers();
     }
 
+    /// Delivers all readbacks in flight, but returns when `wake` is notified, and notifies it again for the caller. A
+    /// subscriber that has received a credit meanwhile then shares a picture in flight, which would be drawn again
+    /// after its delivery.
+    pub(super) async fn flush_until_woken(&mut self, wake: &Notify) {
+        tokio::select! {
+            biased;
+            () = wake.notified() => wake.notify_one(),
+            () = self.flush() => {}
+        }
+    }
+
     /// Delivers readbacks until the device answers `pending_reply`, which is the next step. Afterwards only frames of
     /// the step in `current` may be in flight.
     pub(super) async fn deliver_during<T>(
@@ -256,6 +269,11 @@ mod tests {
 
     /// Subscribes to frames of this width in pixels.
     fn subscribe(delivery: Delivery, width: u32) -> (Subscriber, Subscription) {
+        subscribe_with(delivery, width, &Arc::default())
+    }
+
+    /// Subscribes to frames of this width in pixels. Credits notify `wake`.
+    fn subscribe_with(delivery: Delivery, width: u32, wake: &Arc<Notify>) -> (Subscriber, Subscription) {
         let camera = Camera::fit_to_scene(&testing::two_strips(), width, 8);
         Subscription::new(
             OutputSpec::Frames(
@@ -268,7 +286,7 @@ mod tests {
                 .into(),
             ),
             delivery.into(),
-            Arc::default(),
+            Arc::clone(wake),
         )
     }
 
@@ -458,6 +476,62 @@ mod tests {
         timeout(HANG_GUARD, both).await.expect("expected the cancellation");
         first_subscription.next().await.expect("expected the frame of the first subscriber");
         assert_eq!(delivery.subscribers.len(), 1);
+    }
+
+    /// Serves the third step to two subscribers with the same view, the second of which has read none of its results
+    /// yet. It reads one while the frame of the first is in flight or, without `returns_when_woken`, afterwards. Returns
+    /// how often the third step was drawn.
+    async fn draws_for_late_credit(returns_when_woken: bool) -> usize {
+        let wake = Arc::new(Notify::new());
+        let (first_subscriber, mut first_subscription) = subscribe_with(Delivery::Lossless, 16, &wake);
+        let (second_subscriber, mut second_subscription) = subscribe_with(Delivery::Lossless, 16, &wake);
+        let (mut delivery, mut device) = delivery_to(vec![first_subscriber, second_subscriber]);
+        for number in [1, 2] {
+            delivery.serve_subscribers(&current_step(number), WITH_NEXT_STEP).await;
+            answer(next_draw_request(&mut device, HANG_GUARD).await.expect("expected a frame"));
+            delivery.flush().await;
+            first_subscription.next().await.expect("expected a frame");
+        }
+        let step = current_step(3);
+        let grant_late_credit = async {
+            let request = next_draw_request(&mut device, HANG_GUARD).await.expect("expected a frame");
+            if !returns_when_woken {
+                answer(request);
+                first_subscription.next().await.expect("expected a frame");
+                second_subscription.next().await.expect("expected a frame");
+                return None;
+            }
+            second_subscription.next().await.expect("expected a frame");
+            Some(request)
+        };
+        wake.notified().await; // The credits of the first subscriber.
+        delivery.serve_subscribers(&step, WITH_NEXT_STEP).await;
+        let ((), request_in_flight) = tokio::join!(delivery.flush_until_woken(&wake), grant_late_credit);
+        timeout(HANG_GUARD, wake.notified()).await.expect("expected the wake-up to be left for the caller");
+        delivery.serve_subscribers(&step, WITH_NEXT_STEP).await;
+        let mut drawn_count = 1;
+        let draw = async {
+            request_in_flight.into_iter().for_each(answer);
+            while let Some(request) = next_draw_request(&mut device, HANG_GUARD).await {
+                answer(request);
+                drawn_count += 1;
+            }
+        };
+        tokio::select! {
+            () = delivery.flush() => {}
+            () = draw => panic!("expected the delivery of all frames"),
+        }
+        for expected in [2, 3] {
+            let output = second_subscription.next().await.expect("expected a frame");
+            assert_eq!(output.step.number, expected);
+        }
+        drawn_count
+    }
+
+    #[tokio::test]
+    async fn late_credit_shares_the_frame_in_flight() {
+        assert_eq!(draws_for_late_credit(true).await, 1);
+        assert_eq!(draws_for_late_credit(false).await, 2, "control: after its delivery, the frame is drawn again");
     }
 
     #[tokio::test]
