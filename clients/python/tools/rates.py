@@ -5,7 +5,7 @@ Usage: rates.py --programs target/release [--scene tree] [--rounds 40] [--record
 Build the programs with `cargo build --release --workspace --bins` and
 `cargo build --release -p modalcast-client --example rates`. This program starts a server of its own. The clients take
 turns after every time, so that other load on the machine affects both. A number is the median of all rounds in
-milliseconds:
+milliseconds. `more` is the median difference of the two times of a round, with its 95 % confidence interval:
 
 - sky: a step, its acknowledgment and a raw frame of 1280x720 as an array. The camera sees no domain, so that the time
   to draw, which is the same for both clients, does not hide their own
@@ -21,6 +21,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
+import math
 import os
 import platform
 import statistics
@@ -222,6 +223,17 @@ class Comparison:
             process.terminate()
 
 
+def median_interval(values: list[float]) -> dict[str, float]:
+    """The median of independent values and its 95 % confidence interval, by the sign test.
+
+    Of n values, n/2 +- 0.98 sqrt(n) are below the median, whatever their distribution.
+    """
+    ordered, count = sorted(values), len(values)
+    rank = max(0, int(count / 2 - 0.98 * math.sqrt(count)))
+    bounds = {"median": statistics.median(ordered), "lower": ordered[rank], "upper": ordered[count - 1 - rank]}
+    return {name: round(value, 4) for name, value in bounds.items()}
+
+
 def machine() -> dict[str, Any]:
     """The machine and the versions of the packages."""
     lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
@@ -253,7 +265,7 @@ def main() -> None:
         "machine": machine(),
         "rows": [],
     }
-    print_row("milliseconds", "Python", "Rust", "more", "rate", "load")
+    print_row("milliseconds", "Python", "Rust", "more", "rate", "load", "more, 95 %")
     with mc.spawn(program=arguments.programs / "modalcast") as client:
         comparison = Comparison(client, arguments.scene, arguments.programs, arguments.rounds)
         record["server"] = {"version": client.info.version, "renderer": client.info.renderer}
@@ -266,10 +278,12 @@ def main() -> None:
             medians = {name: round(statistics.median(times), 4) for name, times in rounds.items()}
             python, rust = medians["Python"], medians["Rust"]
             row: dict[str, Any] = {"measurement": what, "medians_ms": medians}
-            row |= {"python_minus_rust_ms": round(python - rust, 4), "rate_of_rust": round(rust / python, 3)}
+            more = median_interval([p - r for p, r in zip(rounds["Python"], rounds["Rust"], strict=True)])
+            row |= {"python_minus_rust_ms": more, "rate_of_rust": round(rust / python, 3)}
             row |= {"load_before_and_after": loads, "rounds_ms": rounds}
             record["rows"].append(row)
-            print_row(what, python, rust, python - rust, row["rate_of_rust"], loads[-1])
+            interval = "{lower:.2f} to {upper:.2f}".format(**more)
+            print_row(what, python, rust, more["median"], row["rate_of_rust"], loads[-1], interval)
             if "grpcio alone" in medians:
                 print_row(f"{what}, grpcio alone", medians["grpcio alone"])
     chunks = chunk_times(200)
