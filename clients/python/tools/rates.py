@@ -226,7 +226,8 @@ class Comparison:
 def median_interval(values: list[float]) -> dict[str, float]:
     """The median of independent values and its 95 % confidence interval, by the sign test.
 
-    Of n values, n/2 +- 0.98 sqrt(n) are below the median, whatever their distribution.
+    With a probability of about 95 %, between n/2 - 0.98 sqrt(n) and n/2 + 0.98 sqrt(n) of n values are below the
+    median. With fewer than 6 values, the interval is that of all values, whose probability is lower.
     """
     ordered, count = sorted(values), len(values)
     rank = max(0, int(count / 2 - 0.98 * math.sqrt(count)))

@@ -436,26 +436,4 @@ async fn sleep_until(deadline: Option<Instant>) {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::engine::testing;
-    use modalcast_model::scene::{DirtyDomains, RawStepUpdate};
-
-    /// A restored state has the serial number of the rest state. Only the list of changed domains tells the two apart.
-    #[test]
-    fn step_from_rest_changes_every_domain() {
-        let scene = testing::two_strips();
-        let mut restored_state = SceneState::rest(&scene);
-        restored_state.q[0] = 0.5;
-        let q = vec![0; 4 * scene.layout.domains[1].rank].into();
-        let raw = RawStepUpdate { number: 1, q_domains: vec![1], q, ..RawStepUpdate::default() };
-        let update = StepUpdate::parse(&scene, &raw).expect("expected a valid step");
-        for (starts_from_rest, first_q, dirty_domains) in
-            [(true, 0.0, DirtyDomains::All), (false, 0.5, DirtyDomains::Some(vec![1]))]
-        {
-            let state = next_state(&scene, &restored_state, starts_from_rest, &update);
-            assert_eq!((state.q[0], &state.dirty_domains), (first_q, &dirty_domains));
-            assert!(state.serial > restored_state.serial);
-        }
-    }
-}
+mod tests;

@@ -104,18 +104,21 @@ impl OutputProducer {
     /// dropped.
     pub(super) async fn serve(&mut self, subscriber: &mut Subscriber, round: &mut DeliveryRound<'_>) -> bool {
         let is_new_step = subscriber.delivered_step_count < round.current.step_count;
-        // The frame of a queued step will show a moved camera, too.
-        let redraws = !round.mode.overlaps_next_step && subscriber.has_moved_camera();
+        // The frame of a queued step will show a moved camera, too. While an earlier frame of the subscriber is in
+        // flight, a frame with the moved camera could arrive before it; the credit of the earlier one wakes the scene.
+        let redraws =
+            !round.mode.overlaps_next_step && subscriber.has_moved_camera() && !self.readbacks.has_any_for(subscriber);
         if !is_new_step && !redraws {
             return true;
         }
         if !subscriber.has_credit() {
             return !is_new_step || self.check_stall(subscriber, round.mode);
         }
-        // `round.attributes` lacks the attributes of a subscriber that received its credit after the round had begun.
-        let is_covered = |attributes: VertexAttributes| round.attributes.contains(attributes);
-        if round.starts_shared_copy && attributes_for(subscriber, round.current).is_some_and(is_covered) {
-            round.vertex_recipients.push(Recipient::take_credit_of(subscriber, round.current));
+        let current = round.current;
+        if let Some(attributes) = attributes_for(subscriber, current)
+            && let Some(recipients) = self.recipients_of_shared_copy(attributes, round)
+        {
+            recipients.push(Recipient::take_credit_of(subscriber, current));
             return true;
         }
         if let Some(cameras) = subscriber.take_pictures() {
@@ -123,6 +126,21 @@ impl OutputProducer {
             return true;
         }
         self.serve_now(subscriber, round).await
+    }
+
+    /// The recipients of a copy with these attributes: of a copy in flight, or of the one that the round will start.
+    fn recipients_of_shared_copy<'a>(
+        &'a mut self,
+        attributes: VertexAttributes,
+        round: &'a mut DeliveryRound<'_>,
+    ) -> Option<&'a mut Vec<Recipient>> {
+        let step_count = round.current.step_count;
+        // `round.attributes` lacks the attributes of a subscriber that received its credit after the round had begun.
+        let is_covered = round.starts_shared_copy && round.attributes.contains(attributes);
+        self.readbacks
+            .iter_mut()
+            .find_map(|pending| pending.recipients_of_vertices(step_count, attributes))
+            .or_else(|| is_covered.then_some(&mut round.vertex_recipients))
     }
 
     /// Starts the pictures of the current step for one subscriber, which receives them when the last one is there.
@@ -144,7 +162,8 @@ impl OutputProducer {
     }
 
     /// Draws a picture of the current step for a recipient. An equal picture of another recipient is shared. At most
-    /// [`MAX_FRAMES_IN_FLIGHT`] color pictures are in flight; a further one waits for the oldest.
+    /// [`MAX_FRAMES_IN_FLIGHT`] color pictures of a step are in flight, also of several rounds; a further one waits for
+    /// the oldest.
     async fn start_picture(&mut self, spec: &PictureSpec, recipient: PictureRecipient, round: &mut DeliveryRound<'_>) {
         let step_count = round.current.step_count;
         if let Some((_, picture)) = round.drawn_pictures.iter().find(|(drawn_spec, _)| drawn_spec == spec) {
@@ -159,11 +178,13 @@ impl OutputProducer {
             return recipients.push(recipient);
         }
         if spec.output == FrameOutput::Color {
-            if round.started_pictures.len() >= MAX_FRAMES_IN_FLIGHT
-                && let Some(oldest) = round.started_pictures.pop_front()
-            {
+            while self.readbacks.count_of(step_count) + round.started_pictures.len() >= MAX_FRAMES_IN_FLIGHT {
                 self.readbacks.flush_before(step_count).await;
-                round.drawn_pictures.extend(oldest.deliver().await);
+                if !self.readbacks.is_empty() {
+                    self.readbacks.deliver_oldest().await;
+                } else if let Some(oldest) = round.started_pictures.pop_front() {
+                    round.drawn_pictures.extend(oldest.deliver().await);
+                }
             }
             let content = round.content;
             let reply = self.device.begin_draw(self.scene_on_device.id, spec.camera, spec.size, spec.style, content);

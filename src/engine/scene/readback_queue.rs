@@ -48,6 +48,7 @@ use crate::engine::output::rendered_picture::RenderedPicture;
 use crate::engine::output::step_output::{OutputBody, PictureContent, PictureSpec, StepFrames, StepId, StepOutput};
 use crate::engine::output::step_vertices::StepVertices;
 use crate::telemetry::{Stage, StageTimes};
+use modalcast_model::deform::VertexAttributes;
 use modalcast_model::error::Result;
 use modalcast_model::scene::FloatingOrigins;
 use modalcast_render::{FrameImage, FramePixels};
@@ -183,7 +184,7 @@ impl<T, R> InFlight<T, R> {
 }
 
 enum Readback {
-    Vertices(InFlight<CopiedVertices, Recipient>),
+    Vertices(VertexAttributes, InFlight<CopiedVertices, Recipient>),
     Picture(Box<PictureSpec>, InFlight<FrameImage<FramePixels>, PictureRecipient>),
     /// No recipient waits any longer, so the command to the device is cancelled.
     Cancelled,
@@ -201,13 +202,14 @@ pub(super) struct PendingReadback {
 }
 
 impl PendingReadback {
-    /// A copy of the current step's vertices that was just started.
+    /// A copy of the current step's vertices with these attributes that was just started.
     pub(super) fn of_vertices(
         current: &CurrentStep,
+        attributes: VertexAttributes,
         reply: PendingReply<CopiedVertices>,
         recipients: Vec<Recipient>,
     ) -> Self {
-        Self::new(current, Readback::Vertices(InFlight::new(reply, recipients)))
+        Self::new(current, Readback::Vertices(attributes, InFlight::new(reply, recipients)))
     }
 
     /// A color picture of the current step whose drawing was just started.
@@ -246,6 +248,21 @@ impl PendingReadback {
         }
     }
 
+    /// The recipients of this copy of the vertices of the scene's `step_count`-th step; `None` if this is another
+    /// readback, or if it lacks attributes.
+    pub(super) fn recipients_of_vertices(
+        &mut self,
+        step_count: u64,
+        attributes: VertexAttributes,
+    ) -> Option<&mut Vec<Recipient>> {
+        match &mut self.readback {
+            Readback::Vertices(copied, in_flight) if self.step_count == step_count && copied.contains(attributes) => {
+                Some(&mut in_flight.recipients)
+            }
+            _ => None,
+        }
+    }
+
     /// Waits for the answer of the device, or until no recipient waits any longer. Cancel-safe.
     async fn wait(&mut self) {
         let cancelled = self.cancelled();
@@ -259,7 +276,7 @@ impl PendingReadback {
     /// Waits for the answer of the device. Cancel-safe.
     async fn wait_for_answer(&mut self) {
         match &mut self.readback {
-            Readback::Vertices(in_flight) => in_flight.wait().await,
+            Readback::Vertices(_, in_flight) => in_flight.wait().await,
             Readback::Picture(_, in_flight) => in_flight.wait().await,
             Readback::Cancelled => {}
         }
@@ -269,7 +286,7 @@ impl PendingReadback {
     fn cancelled(&self) -> impl Future<Output = ()> + Send + use<> {
         let mut cancellations: Vec<Cancellation> = Vec::new();
         match &self.readback {
-            Readback::Vertices(in_flight) => {
+            Readback::Vertices(_, in_flight) => {
                 cancellations.extend(in_flight.recipients.iter().map(|recipient| boxed(recipient.permit.closed())));
             }
             Readback::Picture(_, in_flight) => {
@@ -287,7 +304,7 @@ impl PendingReadback {
     /// Sends the answer, which must be there, to all recipients. Returns the picture, if it is one.
     fn send(self) -> Option<(PictureSpec, Arc<RenderedPicture>)> {
         let picture = match self.readback {
-            Readback::Vertices(InFlight { answer, recipients, .. }) => {
+            Readback::Vertices(_, InFlight { answer, recipients, .. }) => {
                 let vertices = answer?.map(|CopiedVertices { surface, copy_ms }| {
                     (OutputBody::Vertices(Arc::new(StepVertices::new(surface))), vec![(Stage::Copy, copy_ms)])
                 });
@@ -315,7 +332,7 @@ impl PendingReadback {
 
     fn is_for(&self, subscriber: &Subscriber) -> bool {
         match &self.readback {
-            Readback::Vertices(in_flight) => {
+            Readback::Vertices(_, in_flight) => {
                 in_flight.recipients.iter().any(|recipient| recipient.permit.belongs_to(subscriber))
             }
             Readback::Picture(_, in_flight) => {
@@ -342,6 +359,16 @@ pub(super) struct ReadbackQueue {
 impl ReadbackQueue {
     pub(super) fn is_empty(&self) -> bool {
         self.pending.is_empty()
+    }
+
+    /// Whether a readback is in flight for this subscriber.
+    pub(super) fn has_any_for(&self, subscriber: &Subscriber) -> bool {
+        self.pending.iter().any(|pending| pending.is_for(subscriber))
+    }
+
+    /// Number of readbacks in flight of the scene's `step_count`-th step.
+    pub(super) fn count_of(&self, step_count: u64) -> usize {
+        self.pending.iter().filter(|pending| pending.step_count == step_count).count()
     }
 
     pub(super) fn push(&mut self, readback: PendingReadback) {
@@ -421,14 +448,14 @@ impl ReadbackQueue {
     /// Delivers readbacks until no vertices are in flight, so that the results of the next step, which is already
     /// submitted, cannot overtake these vertices.
     pub(super) async fn flush_vertices(&mut self) {
-        while self.pending.iter().any(|pending| matches!(pending.readback, Readback::Vertices(_))) {
+        while self.pending.iter().any(|pending| matches!(pending.readback, Readback::Vertices(..))) {
             self.deliver_oldest().await;
         }
     }
 
     /// Delivers readbacks until none is in flight for `subscriber`, so that it can then be served synchronously.
     pub(super) async fn flush_for(&mut self, subscriber: &Subscriber) {
-        while self.pending.iter().any(|pending| pending.is_for(subscriber)) {
+        while self.has_any_for(subscriber) {
             self.deliver_oldest().await;
         }
     }

@@ -106,7 +106,7 @@ impl CheckpointStore {
 
     /// A store whose test calls [`Self::write_round`].
     #[cfg(test)]
-    pub(super) fn without_thread(folder: PathBuf, file_system: &Arc<dyn FileSystem>) -> Self {
+    pub(in crate::engine) fn without_thread(folder: PathBuf, file_system: &Arc<dyn FileSystem>) -> Self {
         Self { writer: Arc::new(CheckpointWriter::new(folder, file_system)), thread: Mutex::new(None) }
     }
 

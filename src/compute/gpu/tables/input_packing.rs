@@ -112,7 +112,7 @@ impl InputPacker {
         );
     }
 
-    /// Writes the coordinates of one domain, multiplied by the factors of their modes, to the begin of `target`, and
+    /// Writes the coordinates of one domain, multiplied by the factors of their modes, to the beginning of `target`, and
     /// then zeros up to whole chunks, unless the device has the coordinates in the order of the scene's state. Returns
     /// the number of written words. `first_q` is the offset of the domain's first coordinate on the device.
     pub(crate) fn put_q(&self, first_q: usize, q: &[f32], target: &mut [f32]) -> usize {
@@ -131,13 +131,27 @@ impl InputPacker {
 
 #[cfg(test)]
 mod tests {
-    use super::super::test_scenes::{scene, scene_with_deformation};
+    use super::super::test_scenes::scene_with_storage;
     use super::*;
-    use modalcast_model::scene::{DeformationSettings, StorageType};
+    use modalcast_model::domain::Shape;
+    use modalcast_model::scene::StorageType;
+
+    /// A factor that differs from those of the shape's other modes and of the next shapes.
+    fn factor(shape: usize, mode: usize) -> f32 {
+        (-((7 * shape + mode) as f32 % 50.0)).exp2()
+    }
+
+    fn has_factors(scene: &Scene) -> bool {
+        matches!(scene.deformation.storage, StorageType::F16 | StorageType::Bf16)
+    }
 
     fn packer_with_factors(scene: &Arc<Scene>) -> InputPacker {
         let packer = InputPacker::sizes_only(scene);
-        let factors = if packer.coordinates.is_scene_order { Vec::new() } else { vec![0.5; packer.coordinates.total] };
+        let factors_of = |(shape, data): (usize, &Shape)| -> Vec<f32> {
+            (0..data.modes.rank()).filter(|_| has_factors(scene)).map(|mode| factor(shape, mode)).collect()
+        };
+        let shape_factors: Vec<Vec<f32>> = scene.shapes.iter().enumerate().map(factors_of).collect();
+        let factors = packer.coordinates.spread_factors(scene, &shape_factors);
         InputPacker { factors, ..packer }
     }
 
@@ -159,7 +173,8 @@ mod tests {
         for domain in 0..scene.domains.len() {
             let first = q_offset + packer.coordinates.first_q[domain] as usize;
             for (mode, coordinate) in state.q_of(scene, domain).iter().enumerate() {
-                words[first + mode] = if packer.coordinates.is_scene_order { *coordinate } else { 0.5 * coordinate };
+                let factor = if has_factors(scene) { factor(scene.domains[domain].shape, mode) } else { 1.0 };
+                words[first + mode] = factor * coordinate;
             }
         }
         words
@@ -167,16 +182,16 @@ mod tests {
 
     #[test]
     fn parallel_steps_equal_sequential_steps() {
-        let f16 = DeformationSettings { storage: StorageType::F16, ..DeformationSettings::default() };
         for (shapes, cores) in [(3, 1), (3, 4), (20_000, 1), (20_000, 4)] {
             let sizes: Vec<(usize, usize)> = (0..shapes).map(|shape| (7, shape % 20)).collect();
-            for scene in [scene(&sizes), scene_with_deformation(&sizes, f16)] {
+            for storage in [StorageType::F32, StorageType::F16, StorageType::Int8] {
+                let scene = scene_with_storage(&sizes, storage);
                 let (packer, state) = (packer_with_factors(&scene), state_with_distinct_values(&scene));
                 let mut words = vec![f32::NAN; InputSizes::of(&scene, &packer.coordinates).total() as usize / 4];
                 let pool = rayon::ThreadPoolBuilder::new().num_threads(cores).build().expect("a thread pool");
                 pool.install(|| packer.write(&mut words, &StepHeader::default(), &state));
                 let mut expected = expected_words(&packer, &state);
-                assert!(words == expected, "{shapes} shapes, {cores} cores");
+                assert!(words == expected, "{storage:?}, {shapes} shapes, {cores} cores");
                 let changed_word = 24; // any word
                 expected[changed_word] += 1.0;
                 assert!(words != expected, "control: expected the comparison to detect a changed word");

@@ -7,9 +7,11 @@ use rayon::prelude::*;
 /// Minimum number of bytes of a list that several cores write. The benchmark `modalcast report deform` measures one and
 /// several cores below and above this limit (table `host_writes`).
 pub const PARALLEL_THRESHOLD: usize = 1 << 20;
-/// Minimum number of 32-bit words per parallel part (128 KiB): long contiguous writes, but enough parts for many cores.
+/// Number of 32-bit words after which a parallel part ends (128 KiB): long contiguous writes, but enough parts for many
+/// cores.
 const PART_WORDS: usize = 1 << 15;
-/// Minimum number of items of a list that several cores write: short items cost more than their words.
+/// Minimum number of items of a list that several cores write although it has fewer bytes than `PARALLEL_THRESHOLD`. For
+/// short items, the cost per item exceeds that of writing the words.
 const PARALLEL_ITEMS: usize = 1 << 13;
 /// Maximum number of items per parallel part.
 const PART_ITEMS: usize = 1 << 11;
@@ -120,6 +122,7 @@ mod tests {
                 &item_offsets,
                 |offset| *offset,
                 |items, part| {
+                    assert!(items.len() <= PART_ITEMS || items.len() < PARALLEL_ITEMS && items.len() == lengths.len());
                     item_count.fetch_add(items.len(), std::sync::atomic::Ordering::Relaxed);
                     let part_begin = items[0];
                     part.iter_mut().enumerate().for_each(|(index, word)| *word = (part_begin + index) as f32);

@@ -195,7 +195,8 @@ fn format_like(printed: &str, value: f64) -> String {
     let integer_length = digits.find('.').unwrap_or(digits.len());
     let mut formatted = String::new();
     for (index, digit) in digits.char_indices() {
-        if index > 0 && index < integer_length && (integer_length - index).is_multiple_of(3) {
+        let follows_digit = formatted.ends_with(|last: char| last.is_ascii_digit());
+        if follows_digit && index < integer_length && (integer_length - index).is_multiple_of(3) {
             formatted.push(',');
         }
         formatted.push(digit);

@@ -44,7 +44,8 @@ fn every_record_has_an_entry_and_every_entry_a_file() {
     }
 }
 
-/// With the environment variable `UPDATE_FIGURES`, the figures of the records are written into the tables.
+/// With the environment variable `UPDATE_FIGURES`, the figures of the records are written into the tables. The control
+/// below may then read a document while it is written; run this test alone.
 #[test]
 fn figures_of_tables_are_those_of_the_records() {
     let index = RecordIndex::read();

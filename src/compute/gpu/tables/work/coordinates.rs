@@ -20,7 +20,7 @@ pub(crate) struct CoordinateLayout {
     /// Per domain, the offset of its first coordinate.
     pub first_q: Vec<u32>,
     /// The ranges of all domains with modes, in the order of the device; empty if the layout is that of the scene's
-    /// state. A scene may have many more domains, which are rigid.
+    /// state. The other domains, often most of them, are rigid.
     pub ranges: Vec<CoordinateRange>,
     /// Number of all coordinates with padding, a multiple of four.
     pub total: usize,

@@ -1,0 +1,172 @@
+//! Tests of the actor with a device whose commands the test answers.
+
+use std::time::Duration;
+
+use tokio::time::timeout;
+
+use super::super::delivery::Delivery;
+use super::super::handle::{OpenParams, SceneHandle, WriterSession};
+use super::super::subscriber::Subscription;
+use super::*;
+use crate::config::Config;
+use crate::engine::device::command::Command;
+use crate::engine::memory_limits::MemoryLimits;
+use crate::engine::output::step_output::{FrameOutput, OutputSpec, PictureSpec};
+use crate::engine::scene_memory::MemoryBudgets;
+use crate::engine::storage::file_system::{DiskFileSystem, FileSystem};
+use crate::engine::storage::provenance::SceneProvenance;
+use crate::engine::testing;
+use crate::hang_guard::HANG_GUARD;
+use modalcast_model::scene::{BoundingBox, Camera, DirtyDomains, FrameSize, FrameStyle, RawStepUpdate};
+use modalcast_render::{FrameImage, FrameInfo, FrameTimes};
+
+/// Wait for a command that must not arrive.
+const SHORT_WAIT: Duration = Duration::from_millis(500);
+
+/// An open scene, its device and its folder.
+struct TestScene {
+    handle: SceneHandle,
+    commands: mpsc::Receiver<Command>,
+    _folder: tempfile::TempDir,
+}
+
+impl TestScene {
+    async fn open() -> Self {
+        let folder = tempfile::tempdir().expect("expected a temporary folder");
+        let disk: Arc<dyn FileSystem> = Arc::new(DiskFileSystem);
+        let config = Config::default();
+        let memory = MemoryBudgets::new(MemoryLimits::new(&config, None), true).new_scene();
+        let (device, mut commands) = DeviceHandle::mock();
+        let services = SceneServices {
+            device,
+            checkpoints: Arc::new(CheckpointStore::without_thread(folder.path().into(), &disk)),
+            run_counter: Arc::new(RunCounter::open(folder.path(), &disk).expect("expected a new counter")),
+            config: Arc::new(config.validated().expect("expected valid defaults")),
+        };
+        let params = OpenParams {
+            name: "strips".into(),
+            provenance: SceneProvenance::Repository { source: "strips".into() },
+            scene: testing::two_strips(),
+            backends: Default::default(),
+            id: 1,
+            on_failure: Box::new(|| {}),
+            state: None,
+            frames_unavailable: None,
+            memory,
+        };
+        let load = async {
+            match commands.recv().await {
+                Some(Command::LoadScene { reply, .. }) => reply.send(Ok(())).expect("expected a caller that waits"),
+                _ => panic!("expected the command that loads the scene"),
+            }
+        };
+        let (handle, ()) = tokio::join!(SceneHandle::open(params, services), load);
+        Self { handle: handle.expect("expected an open scene"), commands, _folder: folder }
+    }
+
+    /// Subscribes to frames of one view.
+    async fn subscribe(&self, delivery: Delivery) -> Subscription {
+        let picture = PictureSpec {
+            camera: Camera::fit_to_scene(&testing::two_strips(), 16, 8),
+            size: FrameSize::new(16, 8),
+            output: FrameOutput::Color,
+            style: FrameStyle::default(),
+        };
+        self.handle.subscribe(OutputSpec::Frames([picture].into()), delivery).await.expect("expected a subscription")
+    }
+
+    async fn next_command(&mut self) -> Command {
+        timeout(HANG_GUARD, self.commands.recv()).await.expect("expected a command").expect("expected a scene")
+    }
+
+    async fn deform(&mut self) {
+        let Command::Deform { reply, .. } = self.next_command().await else { panic!("expected a step") };
+        let summary = DeformSummary { bounds: BoundingBox::EMPTY, oriented_bounds: None, ms: 0.0 };
+        reply.send(Ok(summary)).expect("expected a caller that waits");
+    }
+
+    /// Takes the next command, which must draw a frame. Sending to the result answers it.
+    async fn draw(&mut self) -> impl FnOnce() {
+        let Command::Draw { size, reply, .. } = self.next_command().await else { panic!("expected a frame") };
+        let (rgba, times, info) = (vec![].into(), FrameTimes::default(), FrameInfo::default());
+        let image = FrameImage { width: size.width, height: size.height, rgba, times, info };
+        move || reply.send(Ok(image)).expect("expected a caller that waits")
+    }
+
+    /// Whether a frame is drawn although none is expected.
+    async fn draws_again(&mut self) -> bool {
+        matches!(timeout(SHORT_WAIT, self.commands.recv()).await, Ok(Some(Command::Draw { .. })))
+    }
+}
+
+fn push_step(writer: &mut WriterSession, number: u64) {
+    writer.push_step(&RawStepUpdate { number, ..RawStepUpdate::default() }).expect("expected capacity");
+}
+
+async fn receive(subscription: &mut Subscription) -> u64 {
+    let output = timeout(HANG_GUARD, subscription.next()).await.expect("expected a frame");
+    output.expect("expected no error").step.number
+}
+
+/// A lossless subscriber blocks the step until it reads an earlier frame, while the other subscriber's frame of this
+/// step is in flight.
+#[tokio::test]
+async fn credit_during_back_pressure_shares_the_frame_in_flight() {
+    let mut scene = TestScene::open().await;
+    let mut first = scene.subscribe(Delivery::Lossless).await;
+    let mut second = scene.subscribe(Delivery::Lossless).await;
+    let mut writer = scene.handle.drive("test", testing::lossless_lease(8)).await.expect("expected the lease");
+    for number in 1..=2 {
+        push_step(&mut writer, number);
+        scene.deform().await;
+        let finish = scene.draw().await;
+        finish();
+        assert_eq!(receive(&mut first).await, number);
+    }
+    push_step(&mut writer, 3);
+    scene.deform().await;
+    let finish = scene.draw().await;
+    assert_eq!(receive(&mut second).await, 1);
+    // The actor runs until it waits for the frame.
+    tokio::time::sleep(SHORT_WAIT).await;
+    finish();
+    assert!(!scene.draws_again().await, "expected one frame for both");
+    assert_eq!(receive(&mut first).await, 3);
+    assert_eq!([receive(&mut second).await, receive(&mut second).await], [2, 3]);
+}
+
+/// A subscriber to the latest step receives its credit while no step is queued and the frame of another subscriber is in
+/// flight.
+#[tokio::test]
+async fn credit_without_a_queued_step_shares_the_frame_in_flight() {
+    let mut scene = TestScene::open().await;
+    let mut first = scene.subscribe(Delivery::Lossless).await;
+    let mut second = scene.subscribe(Delivery::Latest).await;
+    let mut writer = scene.handle.drive("test", testing::lossless_lease(8)).await.expect("expected the lease");
+    push_step(&mut writer, 1);
+    scene.deform().await;
+    let finish = scene.draw().await;
+    // Polling grants the credit.
+    timeout(SHORT_WAIT, second.next()).await.expect_err("expected no frame yet");
+    finish();
+    assert!(!scene.draws_again().await, "expected one frame for both");
+    assert_eq!([receive(&mut first).await, receive(&mut second).await], [1, 1]);
+}
+
+/// A restored state has the serial number of the rest state. Only the list of changed domains tells the two apart.
+#[test]
+fn step_from_rest_changes_every_domain() {
+    let scene = testing::two_strips();
+    let mut restored_state = SceneState::rest(&scene);
+    restored_state.q[0] = 0.5;
+    let q = vec![0; 4 * scene.layout.domains[1].rank].into();
+    let raw = RawStepUpdate { number: 1, q_domains: vec![1], q, ..RawStepUpdate::default() };
+    let update = StepUpdate::parse(&scene, &raw).expect("expected a valid step");
+    for (starts_from_rest, first_q, dirty_domains) in
+        [(true, 0.0, DirtyDomains::All), (false, 0.5, DirtyDomains::Some(vec![1]))]
+    {
+        let state = next_state(&scene, &restored_state, starts_from_rest, &update);
+        assert_eq!((state.q[0], &state.dirty_domains), (first_q, &dirty_domains));
+        assert!(state.serial > restored_state.serial);
+    }
+}
