@@ -61,8 +61,10 @@ fn warns_of_a_record_whose_sources_have_changed() {
     let added: serde_json::Value = serde_json::from_str(&added).expect("JSON");
     assert_eq!(added, serde_json::json!({"rows": [{"us": 1.23457}], "count": 12}));
 
-    // Documents are no sources. The record itself is not one either.
+    // Documents and unit tests are no sources. The record itself is not one either.
     write("src/README.md", "text");
+    write("src/scene/tests.rs", "test");
+    write("src/scene/tests/control.rs", "test");
     commit(folder);
     assert_eq!(record(folder, &["check"]), "");
     write("src/lib.rs", "two");
