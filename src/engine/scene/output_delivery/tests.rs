@@ -401,3 +401,17 @@ async fn moved_camera_is_drawn_after_the_frame_in_flight() {
         assert_eq!(frames.camera_version, expected);
     }
 }
+
+/// Wake-ups that arrive without a pause must not delay frames that are ready.
+#[tokio::test]
+async fn ready_frame_is_delivered_before_a_wake_up_is_handled() {
+    let wake = Arc::new(Notify::new());
+    let (subscriber, mut subscription) = subscribe_with(Delivery::Lossless, 16, &wake);
+    let (mut delivery, mut device) = delivery_to(vec![subscriber]);
+    delivery.serve_subscribers(&current_step(1), WITH_NEXT_STEP).await;
+    answer(next_draw_request(&mut device, HANG_GUARD).await.expect("expected a frame"));
+    wake.notify_one();
+    delivery.flush_until_woken(&wake).await;
+    timeout(Duration::ZERO, subscription.next()).await.expect("expected the frame").expect("expected no error");
+    timeout(HANG_GUARD, wake.notified()).await.expect("expected the wake-up to be left for the caller");
+}
