@@ -85,7 +85,7 @@ impl TestScene {
         reply.send(Ok(summary)).expect("expected a caller that waits");
     }
 
-    /// Takes the next command, which must draw a frame. Sending to the result answers it.
+    /// Takes the next command, which must draw a frame. Calling the result answers it.
     async fn draw(&mut self) -> impl FnOnce() {
         let Command::Draw { size, reply, .. } = self.next_command().await else { panic!("expected a frame") };
         let (rgba, times, info) = (vec![].into(), FrameTimes::default(), FrameInfo::default());
