@@ -2,6 +2,8 @@
 
 use std::sync::Arc;
 
+use rayon::slice::ParallelSliceMut as _;
+
 use super::error_model::{ErrorModel, ErrorModelCache};
 use super::memory_traffic::Operand;
 use super::timing::{CacheState, Timing};
@@ -27,14 +29,16 @@ const UQ_SUFFIX: &str = " Uq";
 pub(super) const STEP_SUFFIX: &str = " step";
 /// Name suffix of the variant that changes one domain in a hundred.
 const ONE_PERCENT_CHANGED: &str = ", 1 % changed";
+/// Name suffix of the thesis's steps in a scene with vertices that no triangle refers to. The thesis's vertex update writes
+/// triangle corners, so it omits these vertices.
+const TRIANGLE_VERTICES: &str = ", triangle vertices";
 
-/// The parts of a step for which cuBLAS and the kernels of the thesis are measured, each with the name suffix of its
-/// variant.
+/// The parts of a step for which cuBLAS is measured, each with the name suffix of its variant.
 const PARTS: [(kernels::StepPart, &str); 2] = [(kernels::StepPart::Uq, UQ_SUFFIX), (kernels::StepPart::Whole, "")];
 
 /// Whether the variant of this name computes only a part of a step. Its time is not comparable with whole steps.
 pub(super) fn is_partial_step(name: &str) -> bool {
-    [UQ_SUFFIX, ONE_PERCENT_CHANGED].iter().any(|ending| name.ends_with(ending))
+    [UQ_SUFFIX, ONE_PERCENT_CHANGED, TRIANGLE_VERTICES].iter().any(|ending| name.ends_with(ending))
 }
 
 /// Whether the variant of this name does all that the server does for a step: on the CPU a call of the deformer, on a
@@ -54,6 +58,8 @@ struct BenchmarkVariant {
     error_model: ErrorModel,
     device: Arc<Device>,
     create_benchmark: BenchmarkFactory,
+    /// The vertices that the benchmark computes; `None` for all.
+    computed_vertices: Option<Vec<u32>>,
     /// Present after [`Variant::prepare`].
     benchmark: Option<Box<dyn KernelBenchmark>>,
     surface: DeformedSurface,
@@ -227,27 +233,29 @@ fn cublas_variants(device: &Arc<Device>, scene: &Arc<Scene>, is_selected: Varian
 /// The kernels of the thesis. A scene of one domain uses the single-domain kernel. A scene of several domains uses the
 /// grouped kernels, which support up to 32 modes, in every split of the domains among 1, 2 or 4 kernels.
 fn thesis_variants(device: &Arc<Device>, scene: &Arc<Scene>, is_selected: VariantFilter<'_>) -> Vec<VariantCandidate> {
-    let candidate = |name: String, create: BenchmarkFactory| {
+    // The Uq kernels compute all vertices; the vertex update computes those of triangles.
+    let candidate = |name: String, part: kernels::StepPart, create: BenchmarkFactory| {
+        let computed_vertices = (part == kernels::StepPart::Whole).then(|| vertices_of_triangles(scene)).flatten();
         let label = VariantLabel::new(name, Backend::Cuda, scene);
-        make_candidate(is_selected, label, |label| Ok(BenchmarkVariant::new(label, scene, device, create)))
+        let make =
+            |label| Ok(BenchmarkVariant { computed_vertices, ..BenchmarkVariant::new(label, scene, device, create) });
+        make_candidate(is_selected, label, make)
     };
     let single = |(part, suffix): (kernels::StepPart, &str)| {
         let create: BenchmarkFactory =
             Box::new(move |device, scene, states| Ok(Box::new(ThesisBenchmark::single(device, scene, states, part)?)));
-        candidate(format!("thesis single{suffix}"), create)
+        candidate(format!("thesis single{suffix}"), part, create)
     };
     let multi = |split: KernelSplit, (part, suffix): (kernels::StepPart, &str)| {
         let create: BenchmarkFactory = Box::new(move |device, scene, states| {
             Ok(Box::new(ThesisBenchmark::multi(device, scene, states, (split, part))?))
         });
-        candidate(format!("thesis {} kernels{suffix}", split.widths().len()), create)
+        candidate(format!("thesis {} kernels{suffix}", split.widths().len()), part, create)
     };
     let max_rank = (0..scene.domains.len()).map(|domain| scene.rank_of(domain)).max().unwrap_or(0);
-    // The thesis's vertex update writes triangle corners, so it omits vertices that no triangle refers to. A scene with
-    // such vertices is measured for u = U q only.
-    let parts = if refers_to_all_vertices(scene) { &PARTS[..] } else { &PARTS[..1] };
+    let parts = thesis_parts(scene);
     match (scene.domains.len(), max_rank) {
-        (1, _) => parts.iter().copied().map(single).collect(),
+        (1, _) => parts.into_iter().map(single).collect(),
         (_, 0..=32) => KernelSplit::ALL
             .into_iter()
             .flat_map(|split| parts.iter().map(move |part| (split, *part)))
@@ -257,15 +265,23 @@ fn thesis_variants(device: &Arc<Device>, scene: &Arc<Scene>, is_selected: Varian
     }
 }
 
-/// Whether every vertex of every shape is a corner of some triangle.
-fn refers_to_all_vertices(scene: &Scene) -> bool {
-    scene.shapes.iter().all(|shape| {
-        let mut is_corner = vec![false; shape.mesh.rest_positions().len()];
-        for corner in shape.mesh.triangles().as_flattened() {
-            is_corner[shape.mesh.corners().vertices[*corner as usize] as usize] = true;
-        }
-        is_corner.into_iter().all(|is_corner| is_corner)
-    })
+/// The parts of a step for which the kernels of the thesis are measured, each with the name suffix of its variant. A
+/// scene whose triangles are placeholders has no vertex update.
+fn thesis_parts(scene: &Scene) -> Vec<(kernels::StepPart, &'static str)> {
+    let update_suffix = match vertices_of_triangles(scene) {
+        None => Some(""),
+        Some(_) => has_normals(scene).then_some(TRIANGLE_VERTICES),
+    };
+    let uq = (kernels::StepPart::Uq, UQ_SUFFIX);
+    std::iter::once(uq).chain(update_suffix.map(|suffix| (kernels::StepPart::Whole, suffix))).collect()
+}
+
+/// Ascending indices of the vertices that triangles refer to; `None` if these are all vertices.
+fn vertices_of_triangles(scene: &Scene) -> Option<Vec<u32>> {
+    let mut vertices = scene.triangle_vertices().into_flattened();
+    vertices.par_sort_unstable();
+    vertices.dedup();
+    (vertices.len() < scene.layout.vertices).then_some(vertices)
 }
 
 /// Whether the scene has normals to compute. A mesh needs at least one triangle, so a workload that measures only
@@ -305,6 +321,7 @@ impl BenchmarkVariant {
             error_model,
             device,
             create_benchmark: create,
+            computed_vertices: None,
             benchmark: None,
             surface: DeformedSurface::default(),
         }
@@ -329,6 +346,10 @@ impl Variant for BenchmarkVariant {
 
     fn error_model(&self) -> &ErrorModel {
         &self.error_model
+    }
+
+    fn computed_vertices(&self) -> Option<&[u32]> {
+        self.computed_vertices.as_deref()
     }
 
     fn traffic(&self) -> Vec<Operand> {
@@ -361,5 +382,21 @@ impl Variant for BenchmarkVariant {
 
     fn kernel_attributes(&self) -> Vec<KernelAttributes> {
         self.benchmark.as_ref().map_or_else(Vec::new, |benchmark| benchmark.kernel_attributes())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::kernels::StepPart;
+    use crate::workloads::{Size, WorkloadKind};
+
+    #[test]
+    fn the_vertex_update_of_the_thesis_is_measured_where_triangles_are_no_placeholders() {
+        let parts_of = |kind: WorkloadKind| thesis_parts(&kind.build(Size::Quick).expect("expected a load").scene);
+        let uq = (StepPart::Uq, UQ_SUFFIX);
+        assert_eq!(parts_of(WorkloadKind::TinyDomains), [uq, (StepPart::Whole, "")]);
+        assert_eq!(parts_of(WorkloadKind::Plant(0)), [uq, (StepPart::Whole, TRIANGLE_VERTICES)]);
+        assert_eq!(parts_of(WorkloadKind::Batch), [uq]);
     }
 }

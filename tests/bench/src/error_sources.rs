@@ -7,7 +7,7 @@ use rayon::prelude::*;
 use serde::Serialize;
 
 use super::error_model::ErrorModel;
-use super::errors::{ErrorNorms, NormAccumulator, reduce_parallel};
+use super::errors::{ErrorNorms, NormAccumulator, reduce_parallel, select};
 use super::exact_positions::positions;
 use super::exact_state::ExactState;
 use modalcast_model::scene::{Scene, SceneState, StorageType};
@@ -25,6 +25,15 @@ pub struct ErrorSources {
     pub transform: ErrorNorms,
     /// The final rounding of the position itself, which grows with the distance from the scene's origin.
     pub origin: ErrorNorms,
+}
+
+/// Positions that a variant computed.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct ComputedPositions<'a> {
+    /// Three f32 per computed vertex.
+    pub positions: &'a [f32],
+    /// Indices of the computed vertices; `None` if these are all vertices.
+    pub vertices: Option<&'a [u32]>,
 }
 
 /// Accumulators of the five sources, in the order of [`ErrorSources`].
@@ -86,12 +95,13 @@ impl SharedErrorSources {
         stored
     }
 
-    /// Adds the sources of a variant's error at this state. `got` holds the variant's positions, three f32 per vertex.
+    /// Adds the sources of a variant's error at this state. Those of the arithmetic are of the vertices in `got`, the
+    /// others of all vertices.
     pub(super) fn add_sources(
         &self,
         scene: &Scene,
         error_model: &ErrorModel,
-        got: &[f32],
+        got: ComputedPositions<'_>,
         accumulator: &mut ErrorSourcesAccumulator,
     ) {
         let storage = Some(error_model).filter(|error_model| error_model.has_stored_modes());
@@ -112,11 +122,16 @@ impl SharedErrorSources {
             .unwrap_or(&self.rounded_positions);
         let rounded: Vec<[f64; 3]> =
             approximate_positions.par_iter().map(|position| position.map(|number| f64::from(number as f32))).collect();
-        let got: Vec<[f64; 3]> = got.as_chunks::<3>().0.par_iter().map(|position| position.map(f64::from)).collect();
+        let got_positions = got.positions.as_chunks::<3>().0;
+        let got_positions: Vec<[f64; 3]> = got_positions.par_iter().map(|position| position.map(f64::from)).collect();
+        let arithmetic_norms = match got.vertices {
+            None => distances(&rounded, &got_positions),
+            Some(vertices) => distances(&select(&rounded, vertices), &got_positions),
+        };
         let norms = [
             storage_norms,
             q_norms,
-            distances(&rounded, &got),
+            arithmetic_norms,
             self.transform_norms,
             distances(approximate_positions, &rounded),
         ];
@@ -173,7 +188,7 @@ mod tests {
         SharedErrorSources::new(&scene, truth.clone(), &state).add_sources(
             &scene,
             &error_model,
-            got.unwrap_or(&emulated),
+            ComputedPositions { positions: got.unwrap_or(&emulated), vertices: None },
             &mut accumulator,
         );
         accumulator.sources(1.0)

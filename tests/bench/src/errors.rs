@@ -203,6 +203,11 @@ pub(super) fn step_errors(got: [&[f32]; 2], want: [&[ReferenceVertex]; 2]) -> No
     reduce_parallel(count, |index, norms: &mut NormAccumulator| norms.add(error(index)), NormAccumulator::join)
 }
 
+/// The elements with these indices.
+pub(super) fn select<T: Copy + Send + Sync>(elements: &[T], indices: &[u32]) -> Vec<T> {
+    indices.par_iter().map(|index| elements[*index as usize]).collect()
+}
+
 /// Parallel reduction of items 0 to `count`. Blocks have a fixed size and are joined in order, so that the result does
 /// not depend on the thread count.
 pub(super) fn reduce_parallel<T: Default + Send>(

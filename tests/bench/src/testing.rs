@@ -33,12 +33,18 @@ pub(super) fn with_denormal_modes(kind: &WorkloadKind) -> Workload {
 pub(super) struct InaccurateVariant<V> {
     inner: V,
     error: f32,
+    computed_vertices: Option<Vec<u32>>,
     surface: DeformedSurface,
 }
 
 impl<V: Variant> InaccurateVariant<V> {
     pub(super) fn new(inner: V, error: f32) -> Self {
-        Self { inner, error, surface: DeformedSurface::default() }
+        Self { inner, error, computed_vertices: None, surface: DeformedSurface::default() }
+    }
+
+    /// A variant that claims to compute only these vertices.
+    pub(super) fn computing(self, vertices: Vec<u32>) -> Self {
+        Self { computed_vertices: Some(vertices), ..self }
     }
 }
 
@@ -53,6 +59,10 @@ impl<V: Variant> Variant for InaccurateVariant<V> {
 
     fn error_model(&self) -> &ErrorModel {
         self.inner.error_model()
+    }
+
+    fn computed_vertices(&self) -> Option<&[u32]> {
+        self.computed_vertices.as_deref()
     }
 
     fn traffic(&self) -> Vec<Operand> {

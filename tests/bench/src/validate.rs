@@ -8,10 +8,10 @@ use rayon::prelude::*;
 use serde::Serialize;
 
 use super::cuda_variants::has_normals;
-use super::error_sources::{ErrorSources, ErrorSourcesAccumulator, SharedErrorSources};
+use super::error_sources::{ComputedPositions, ErrorSources, ErrorSourcesAccumulator, SharedErrorSources};
 use super::errors::{
     ErrorNorms, ErrorScale, IMAGE_SIZE, NormAccumulator, OrientationErrorAccumulator, OrientationErrors,
-    PositionErrorAccumulator, PositionErrors, step_errors,
+    PositionErrorAccumulator, PositionErrors, select, step_errors,
 };
 use super::exact_positions::{ReferenceVertex, reference_vertices, widen_bounds};
 use super::motion::WorkloadMotion;
@@ -300,30 +300,44 @@ impl<'a> VariantCheck<'a> {
             self.fault = Some(format!("positions: expected {expected} coordinates, got {given}"));
             return;
         }
-        self.positions.add(error_scale, &self.surface.positions, &self.bounded_references(sample));
-        self.add_orientation(sample);
-        if let Some(error_sources) = &sample.error_sources {
-            let (scene, error_model) = (self.variant.scene(), self.variant.error_model());
-            error_sources.add_sources(scene, error_model, &self.surface.positions, &mut self.sources);
-        }
         if sample.index == 0 {
             copy_surface(&mut self.first_surface, &self.surface);
         }
+        let bounded_references = self.compared_references(&self.bounded_references(sample));
+        if let Some(vertices) = self.variant.computed_vertices() {
+            self.surface.positions = select(self.surface.positions.as_chunks::<3>().0, vertices).into_flattened();
+        }
+        self.positions.add(error_scale, &self.surface.positions, &bounded_references);
+        self.add_orientation(sample);
+        if let Some(error_sources) = &sample.error_sources {
+            let (scene, error_model) = (self.variant.scene(), self.variant.error_model());
+            let vertices = self.variant.computed_vertices();
+            let positions = ComputedPositions { positions: &self.surface.positions, vertices };
+            error_sources.add_sources(scene, error_model, positions, &mut self.sources);
+        }
         if sample.is_trajectory_step {
-            self.add_step(sample);
+            self.add_step(self.compared_references(&sample.references));
         }
     }
 
-    /// Adds the error of the step from the previous state.
-    fn add_step(&mut self, sample: &StateSample<'_>) {
-        if let Some((positions, references)) = &self.previous {
+    /// Adds the error of the step from the previous state. `references`: those of the vertices that the variant computes.
+    fn add_step(&mut self, references: Arc<Vec<ReferenceVertex>>) {
+        if let Some((positions, previous_references)) = &self.previous {
             self.steps =
-                self.steps.join(step_errors([positions, &self.surface.positions], [references, &sample.references]));
+                self.steps.join(step_errors([positions, &self.surface.positions], [previous_references, &references]));
         }
         // The buffer of the previous positions is reused for the next surface.
         let (mut positions, _) = self.previous.take().unwrap_or_default();
         std::mem::swap(&mut positions, &mut self.surface.positions);
-        self.previous = Some((positions, Arc::clone(&sample.references)));
+        self.previous = Some((positions, references));
+    }
+
+    /// The references of the vertices that the variant computes.
+    fn compared_references(&self, references: &Arc<Vec<ReferenceVertex>>) -> Arc<Vec<ReferenceVertex>> {
+        match self.variant.computed_vertices() {
+            None => Arc::clone(references),
+            Some(vertices) => Arc::new(select(references, vertices)),
+        }
     }
 
     /// Whether the variant outputs normals that must follow the deformed surface.
@@ -504,6 +518,26 @@ mod tests {
         assert!(!found.passed() && found.faults[0].contains("times its a-priori bound"), "{:?}", found.faults);
         let (found, _) = validate_cpu(WorkloadKind::ManyDomains, f32::NAN);
         assert!(found.faults[0].contains("not finite"), "{:?}", found.faults);
+    }
+
+    #[test]
+    fn only_computed_vertices_are_compared() {
+        let workload = WorkloadKind::ManyDomains.build(Size::Quick).expect("expected a load");
+        let validate_without_last_vertex = |error: f32, first: u32| {
+            let label = VariantLabel::new("cpu", Backend::Cpu, &workload.scene);
+            let cpu = DeformerVariant::new(label, &workload.scene, Box::new(CpuDeformer::new(&workload.scene)));
+            let last = workload.scene.layout.vertices as u32 - 1;
+            let mut variants: Vec<Box<dyn Variant>> =
+                vec![Box::new(InaccurateVariant::new(cpu, error).computing((first..last).collect()))];
+            let motion = WorkloadMotion::new(&workload, None);
+            validate(&workload, &motion, &mut variants, limits(4)).0.remove(0)
+        };
+        let omitted = validate_without_last_vertex(f32::NAN, 0);
+        assert!(omitted.passed() && omitted.repeatable, "{:?}", omitted.faults);
+        assert_eq!(omitted, validate_without_last_vertex(0.0, 0), "expected no influence of the omitted vertex");
+        // The control: the compared positions belong to the listed vertices, not to as many first ones.
+        assert_ne!(omitted.errors.meters, validate_without_last_vertex(0.0, 1000).errors.meters);
+        assert!(validate_without_last_vertex(0.0, 1000).passed());
     }
 
     /// Validates an emulated deformer that applies one deformation and declares another, which gives its bounds.

@@ -37,6 +37,11 @@ pub trait Variant {
     /// The variant's approximations in x = T (x0 + U q), which determine the a-priori bound.
     fn error_model(&self) -> &ErrorModel;
 
+    /// Indices of the vertices that the variant computes, whose errors are measured. `None` if it computes all vertices.
+    fn computed_vertices(&self) -> Option<&[u32]> {
+        None
+    }
+
     /// Minimum memory traffic of a step per operand.
     fn traffic(&self) -> Vec<Operand>;
 

@@ -172,6 +172,8 @@ pub(super) fn write_text(svg: &mut String, (x, y): (f64, f64), style: &str, text
 
 #[cfg(test)]
 mod tests {
+    use std::collections::HashSet;
+
     use super::*;
     use crate::table::tests::row;
 
@@ -204,11 +206,18 @@ mod tests {
     }
 
     #[test]
-    fn thirty_six_cuda_variants_have_distinct_markers() {
-        // Twelve colors, each with three shapes.
-        let names: Vec<String> = (0..36).map(|index| index.to_string()).collect();
-        let variants: Vec<(&str, Backend)> = names.iter().map(|name| (name.as_str(), Backend::Cuda)).collect();
-        let styles: Vec<MarkerStyle> = names.iter().map(|name| marker_style(&variants, name)).collect();
-        assert!((0..36).all(|first| (0..first).all(|second| styles[first] != styles[second])));
+    fn sixty_cuda_variants_have_distinct_markers() {
+        // Twelve colors, each with five shapes.
+        let draw_markers = |count: usize| {
+            let names: Vec<String> = (0..count).map(|index| index.to_string()).collect();
+            let variants: Vec<(&str, Backend)> = names.iter().map(|name| (name.as_str(), Backend::Cuda)).collect();
+            let draw = |name: &String| {
+                let (style, mut svg) = (marker_style(&variants, name), String::new());
+                panel::draw_marker(&mut svg, (0.0, 0.0), style, &panel::filled_attributes(style.color));
+                svg
+            };
+            names.iter().map(draw).collect::<HashSet<String>>().len()
+        };
+        assert_eq!((draw_markers(60), draw_markers(61)), (60, 60));
     }
 }

@@ -246,20 +246,23 @@ fn hollow_attributes(color: &str) -> String {
 pub(crate) struct MarkerStyle {
     pub(crate) color: &'static str,
     pub(crate) backend: Backend,
-    /// Number of earlier variants with the same color. It selects one of three shapes of CUDA markers.
+    /// Number of earlier variants with the same color. It selects one of five shapes of CUDA markers: a
+    /// square, and triangles in four directions.
     pub(crate) color_reuse: usize,
 }
 
 /// Draws the marker of a variant at a point.
 pub(crate) fn draw_marker(svg: &mut String, (x, y): (f64, f64), style: MarkerStyle, attributes: &str) {
-    let shape = match (style.backend, style.color_reuse % 3) {
+    let shape = match (style.backend, style.color_reuse % 5) {
         (Backend::Cpu, _) => format!("<circle cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"5\" {attributes}/>"),
         (Backend::Reference, _) => format!("<path d=\"M{x:.1} {:.1}l6 6l-6 6l-6 -6z\" {attributes}/>", y - 6.0),
         (Backend::Cuda, 0) => {
             format!("<rect x=\"{:.1}\" y=\"{:.1}\" width=\"9\" height=\"9\" {attributes}/>", x - 4.5, y - 4.5)
         }
         (Backend::Cuda, 1) => format!("<path d=\"M{x:.1} {:.1}l6 10h-12z\" {attributes}/>", y - 6.0),
-        (Backend::Cuda, _) => format!("<path d=\"M{x:.1} {:.1}l6 -10h-12z\" {attributes}/>", y + 6.0),
+        (Backend::Cuda, 2) => format!("<path d=\"M{x:.1} {:.1}l6 -10h-12z\" {attributes}/>", y + 6.0),
+        (Backend::Cuda, 3) => format!("<path d=\"M{:.1} {y:.1}l10 6v-12z\" {attributes}/>", x - 6.0),
+        (Backend::Cuda, _) => format!("<path d=\"M{:.1} {y:.1}l-10 6v-12z\" {attributes}/>", x + 6.0),
     };
     svg.push_str(&shape);
     svg.push('\n');
