@@ -56,15 +56,20 @@ fn gpu_dropped_deformers_release_their_memory() {
         deformer.plan().total_bytes()
     };
     let bytes = deform_once();
-    let (free_before, _) = device.memory().expect("expected the free memory");
-    for _ in 0..200 {
-        deform_once();
-    }
-    let (free_after, _) = device.memory().expect("expected the free memory");
-    // If deformers leaked, the memory of 200 deformers would be missing. The tolerance, the memory of eight deformers,
-    // is for memory that the driver keeps.
-    assert!(
-        (free_before as u64) < free_after as u64 + 8 * bytes,
-        "expected about {free_before} free bytes after 200 scenes, got {free_after}"
-    );
+    // If deformers leaked, a round would lose the memory of 200 deformers. The tolerance, the memory of eight
+    // deformers, is for memory that the driver keeps. Other programs of the device may lower its free memory in some
+    // rounds.
+    let tolerance = 8 * bytes;
+    let mut lost_bytes = Vec::new();
+    let releases_memory = (0..5).any(|_| {
+        let (free_before, _) = device.memory().expect("expected the free memory");
+        for _ in 0..200 {
+            deform_once();
+        }
+        let (free_after, _) = device.memory().expect("expected the free memory");
+        let lost = free_before.saturating_sub(free_after) as u64;
+        lost_bytes.push(lost);
+        lost < tolerance
+    });
+    assert!(releases_memory, "expected a round that loses less than {tolerance} bytes, got losses of {lost_bytes:?}");
 }

@@ -29,8 +29,8 @@ const UQ_SUFFIX: &str = " Uq";
 pub(super) const STEP_SUFFIX: &str = " step";
 /// Name suffix of the variant that changes one domain in a hundred.
 const ONE_PERCENT_CHANGED: &str = ", 1 % changed";
-/// Name suffix of the thesis's steps in a scene with vertices that no triangle refers to. The thesis's vertex update writes
-/// triangle corners, so it omits these vertices.
+/// Name suffix of the thesis's steps in a scene with vertices that no triangle refers to. The thesis's vertex update
+/// writes triangle corners, so it omits these vertices.
 const TRIANGLE_VERTICES: &str = ", triangle vertices";
 
 /// The parts of a step for which cuBLAS is measured, each with the name suffix of its variant.

@@ -19,8 +19,8 @@ pub struct SingleDomainComparison {
     pub rank: usize,
     /// Table 4.4: CPU time over GPU time.
     pub thesis: f64,
-    /// Time of `cpu f32` divided by that of `cuda f32 positions`; `None` without both. The thesis compares U q alone. No
-    /// CPU variant computes that alone, so both sides compute positions.
+    /// Time of `cpu f32` divided by that of `cuda f32 positions`; `None` without both. The thesis compares U q alone.
+    /// No CPU variant computes that alone, so both sides compute positions.
     pub ours: Option<f64>,
 }
 

@@ -320,7 +320,8 @@ impl<'a> VariantCheck<'a> {
         }
     }
 
-    /// Adds the error of the step from the previous state. `references`: those of the vertices that the variant computes.
+    /// Adds the error of the step from the previous state. `references` are those of the vertices that the variant
+    /// computes.
     fn add_step(&mut self, references: Arc<Vec<ReferenceVertex>>) {
         if let Some((positions, previous_references)) = &self.previous {
             self.steps =

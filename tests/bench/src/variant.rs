@@ -37,7 +37,7 @@ pub trait Variant {
     /// The variant's approximations in x = T (x0 + U q), which determine the a-priori bound.
     fn error_model(&self) -> &ErrorModel;
 
-    /// Indices of the vertices that the variant computes, whose errors are measured. `None` if it computes all vertices.
+    /// Indices of the vertices that the variant computes, whose errors are measured. `None` if it computes all.
     fn computed_vertices(&self) -> Option<&[u32]> {
         None
     }
