@@ -31,7 +31,7 @@ pub(super) const STEP_SUFFIX: &str = " step";
 const ONE_PERCENT_CHANGED: &str = ", 1 % changed";
 /// Name suffix of the thesis's steps in a scene with vertices that no triangle refers to. The thesis's vertex update
 /// writes triangle corners, so it omits these vertices.
-const TRIANGLE_VERTICES: &str = ", triangle vertices";
+pub(super) const TRIANGLE_VERTICES: &str = ", triangle vertices";
 
 /// The parts of a step for which cuBLAS is measured, each with the name suffix of its variant.
 const PARTS: [(kernels::StepPart, &str); 2] = [(kernels::StepPart::Uq, UQ_SUFFIX), (kernels::StepPart::Whole, "")];

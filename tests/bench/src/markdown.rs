@@ -1,6 +1,6 @@
 //! Formats a report as Markdown tables (`report.md`).
 
-use super::cuda_variants::is_partial_step;
+use super::cuda_variants::{TRIANGLE_VERTICES, is_partial_step};
 use super::markdown_table::{dash, table};
 use super::recommendation;
 use super::table::DeformRow;
@@ -78,14 +78,21 @@ fn workload_section(workload: &WorkloadSummary, rows: &[&DeformRow]) -> String {
     text
 }
 
-/// The table of variants, without the columns that have no value.
+/// The table of variants, without the columns that have no value, and an explanation of a name.
 fn variants_table(rows: &[&DeformRow]) -> String {
     let cells: Vec<[String; 15]> = rows.iter().map(|row| row_cells(row, rows)).collect();
     let columns: Vec<usize> =
         (0..COLUMNS.len()).filter(|column| cells.iter().any(|row| row[*column] != dash())).collect();
     let head: Vec<&str> = columns.iter().map(|column| COLUMNS[*column]).collect();
     let select = |row: &[String; 15]| columns.iter().map(|column| row[*column].clone()).collect::<Vec<String>>();
-    table(&head, cells.iter().map(select))
+    let mut text = table(&head, cells.iter().map(select));
+    if rows.iter().any(|row| row.name.ends_with(TRIANGLE_VERTICES)) {
+        text.push_str(
+            "\nA variant of `triangle vertices` computes only the vertices that triangles refer to. Its errors are those \
+             of these vertices.\n",
+        );
+    }
+    text
 }
 
 /// The time divided by that of the variant that does the same work with all modes in f32, and whether the quartiles of
@@ -181,6 +188,8 @@ mod tests {
         // These rows have neither pixel errors nor bandwidths of a machine.
         assert!(!text.contains("px") && !text.contains("of copy"), "{text}");
         assert!(variants_table(&rows.iter().take(1).collect::<Vec<_>>()).lines().all(|line| !line.contains("| - |")));
+        let partial = row("a", "thesis 2 kernels, triangle vertices", CacheState::Warm, (10.0, 1e-7));
+        assert!(!text.contains("triangles") && variants_table(&[&partial]).contains("triangles refer to"));
     }
 
     #[test]

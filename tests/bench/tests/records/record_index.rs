@@ -31,6 +31,7 @@ pub(crate) struct RecordEntry {
 
 impl RecordIndex {
     pub(crate) fn read() -> Self {
-        toml::from_str(&crate::read("tests/bench/records/records.toml")).expect("expected a valid index")
+        let text = crate::read("tests/bench/records/records.toml");
+        toml::from_str(&text).unwrap_or_else(|error| panic!("expected a valid index: {error}"))
     }
 }
