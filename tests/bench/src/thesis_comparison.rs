@@ -75,7 +75,10 @@ impl ThesisComparison {
         let mut tables = String::new();
         if self.table_4_4.iter().any(|comparison| comparison.ours.is_some()) {
             let table = single_domain_table(&self.table_4_4);
-            tables.push_str(&format!("\nTable 4.4, CPU time over GPU time: the thesis for U q / `{CPU_POSITIONS}` over `{CUDA_POSITIONS}`:\n\n{table}"));
+            tables.push_str(&format!(
+                "\nTable 4.4, CPU time over GPU time: the thesis for U q / `{CPU_POSITIONS}` over \
+                 `{CUDA_POSITIONS}`:\n\n{table}"
+            ));
         }
         let measured: Vec<PlantComparison> =
             self.tables_4_5_to_4_7.iter().filter(|comparison| !comparison.ours.is_empty()).cloned().collect();
