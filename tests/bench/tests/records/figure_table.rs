@@ -18,8 +18,8 @@ pub(crate) struct FigureTable {
     /// The header line, which occurs once in the document.
     header: String,
     /// Path of a value: the file of its record, and segments after `/`: a key, an index, or `key=value` for the element
-    /// of a list with this value, several separated by commas. ` * FACTOR` at the end converts the unit. `{}` stands for
-    /// the text of a cell below. A text that contains `.json/` is a whole path.
+    /// of a list with this value, several separated by `&`. ` * FACTOR` at the end converts the unit. `{}` stands for the
+    /// text of a cell below. A text that contains `.json/` is a whole path.
     #[serde(default = "whole_selector")]
     selector: String,
     /// The rows below the header, without their first cells.
@@ -230,7 +230,7 @@ fn select<'a>(record: &'a Value, path: &str) -> Option<&'a Value> {
         Value::Array(elements) => match segment.parse::<usize>() {
             Ok(index) => elements.get(index),
             Err(_) => elements.iter().find(|element| {
-                segment.split(',').all(|condition| {
+                segment.split('&').all(|condition| {
                     condition.split_once('=').is_some_and(|(key, text)| element[key].as_str() == Some(text))
                 })
             }),
@@ -264,10 +264,10 @@ fn printed_number_must_be_the_rounded_value() {
 
 #[test]
 fn selects_by_key_index_and_condition() {
-    let record = serde_json::json!({"rows": [{"a": "x", "b": "y", "n": 1}, {"a": "x", "b": "z", "n": [2, 3]}]});
+    let record = serde_json::json!({"rows": [{"a": "x", "b": "y", "n": 1}, {"a": "x", "b": "z, 1 %", "n": [2, 3]}]});
     let records = Records::from([("a.json".to_owned(), record)]);
     let number = |path: &str| value_at(path, &records);
-    assert_eq!(number("a.json/rows/a=x,b=z/n/1"), Some(3.0));
+    assert_eq!(number("a.json/rows/a=x&b=z, 1 %/n/1"), Some(3.0));
     assert_eq!(number("a.json/rows/a=x/n * 1e-3"), Some(1e-3));
     assert_eq!((number("a.json/rows/a=q/n"), number("a.json/rows/2/n"), number("a.json/absent")), (None, None, None));
     assert_eq!((number("b.json/rows/a=x/n"), number("a.json/rows/a=x/n * x")), (None, None));
