@@ -192,12 +192,21 @@ impl AssetDir {
     /// # Errors
     /// As for [`Self::read`], except for the size.
     pub(super) fn read_start(&self, relative: &str, count: u64) -> Result<Vec<u8>> {
-        let (path, _) = self.regular_file(relative)?;
+        let (file, _) = self.open(relative)?;
         // A list that grows would have up to twice the size of the file.
         let mut bytes = Vec::with_capacity(count as usize);
-        let file = File::open(&path).map_err(|error| unreadable(relative, &error.kind()))?;
         file.take(count).read_to_end(&mut bytes).map_err(|error| unreadable(relative, &error.kind()))?;
         Ok(bytes)
+    }
+
+    /// Opens a regular file. Returns it with its size in bytes.
+    ///
+    /// # Errors
+    /// As for [`Self::read`], except for the size.
+    pub(super) fn open(&self, relative: &str) -> Result<(File, u64)> {
+        let (path, file_bytes) = self.regular_file(relative)?;
+        let file = File::open(&path).map_err(|error| unreadable(relative, &error.kind()))?;
+        Ok((file, file_bytes))
     }
 
     /// The resolved path of a regular file, and its size in bytes.

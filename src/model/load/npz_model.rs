@@ -3,7 +3,7 @@
 //! sRGB, 0 to 1, or 0 to 255 if any value is above 1).
 
 use super::asset_dir::{AssetDir, MAX_MODEL_BYTES, stem_of};
-use super::modes::{LoadedModes, NpzArchive, parse_f64, read_npz_modes};
+use super::modes::{LoadedModes, NpzArchive, has_arrays, parse_f64, read_npz_modes};
 use super::polygons::{Corner, NO_INDEX, PolygonMesh};
 use super::surface::{self, ModelOptions};
 use crate::domain::Material;
@@ -12,6 +12,11 @@ use crate::scene::{SceneParts, UpAxis};
 
 /// The arrays that are read. Other arrays are named in a remark.
 const ARRAY_NAMES: [&str; 8] = ["vertices", "faces", "U", "modes", "eigenvalues", "normals", "uvs", "colors"];
+
+/// Whether the file `name` is an archive with a mesh.
+pub(super) fn is_model(files: &AssetDir, name: &str) -> bool {
+    has_arrays(files, name, &["vertices", "faces"])
+}
 
 /// Reads the archive `name` in the folder `files` as one domain. Z is up.
 ///

@@ -81,7 +81,7 @@ impl SceneRepository {
 fn collect_names(folder: &AssetDir, prefix: &str, depth: usize, names: &mut Vec<String>) {
     let entries = folder.entries();
     let has_manifest = entries.contains(&(manifest::MANIFEST_FILE.to_owned(), EntryKind::File));
-    if has_manifest || matches!(&source::find_models(folder)[..], [model] if model.is_mesh()) {
+    if has_manifest || source::find_models(folder).len() == 1 {
         names.push(if prefix.is_empty() { ".".into() } else { prefix.trim_end_matches('/').into() });
     }
     for (name, kind) in entries {
@@ -91,8 +91,7 @@ fn collect_names(folder: &AssetDir, prefix: &str, depth: usize, names: &mut Vec<
         }
         let path = format!("{prefix}{name}");
         match kind {
-            // Most NumPy archives are not models.
-            EntryKind::File if source::recognize_model(&name).is_some_and(|model| model.is_mesh()) => names.push(path),
+            EntryKind::File if source::find_model(folder, &name).is_some() => names.push(path),
             EntryKind::Directory if depth > 0 => {
                 if let Ok(subfolder) = folder.within(&name) {
                     collect_names(&subfolder, &format!("{path}/"), depth - 1, names);
@@ -155,6 +154,31 @@ mod tests {
             repository.open("a/b/c/d/e/f/far.obj", &MemoryReservation::unlimited()).is_ok(),
             "expected an unlisted path to open"
         );
+    }
+
+    #[test]
+    fn archives_are_listed_if_they_contain_a_mesh() {
+        use crate::load::modes::test_archives::{archive, npy};
+        let (outer, repository) = repository(&[("parts/notes.txt", ""), ("results/notes.txt", "")]);
+        let mesh = [
+            ("vertices", npy(&ndarray::arr2(&[[0.0_f32; 3], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]))),
+            ("faces", npy(&ndarray::arr2(&[[0_i64, 1, 2]]))),
+        ];
+        let write = |path: &str, arrays: &[(&str, Vec<u8>)]| {
+            let bytes = archive(arrays, zip::CompressionMethod::Deflated);
+            std::fs::write(outer.path().join("root").join(path), bytes).expect("a writable file");
+        };
+        write("parts/part.npz", &mesh);
+        write("parts/stress.npz", &mesh[..1]);
+        write("results/stress.npz", &mesh[..1]);
+        let names = repository.list();
+        assert_eq!(names, ["tree", "parts", "parts/part.npz"]);
+        for name in &names[1..] {
+            let opened = repository.open(name, &MemoryReservation::unlimited()).expect("a scene");
+            assert_eq!(opened.scene.domains.len(), 1, "{name}");
+        }
+        let error = repository.open("results", &MemoryReservation::unlimited()).expect_err("no mesh").to_string();
+        assert!(error.contains("no model among: notes.txt, stress.npz"), "{error}");
     }
 
     #[test]

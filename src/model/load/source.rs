@@ -40,11 +40,6 @@ impl ModelFile {
         }
     }
 
-    /// Whether the format always contains a mesh.
-    pub(super) const fn is_mesh(&self) -> bool {
-        !matches!(self, Self::Npz(_))
-    }
-
     /// Only the models of the smallest rank in a folder are used, because exporters write meshes of the other formats
     /// beside a model with materials.
     const fn format_rank(&self) -> usize {
@@ -144,13 +139,18 @@ pub(super) fn recognize_model(name: &str) -> Option<ModelFile> {
     }
 }
 
+/// As [`recognize_model`], but only for a NumPy archive that contains a mesh: most archives contain other arrays.
+pub(super) fn find_model(folder: &AssetDir, name: &str) -> Option<ModelFile> {
+    recognize_model(name).filter(|model| !matches!(model, ModelFile::Npz(_)) || npz_model::is_model(folder, name))
+}
+
 /// The models of a folder: its glTF and OBJ files; if there is none, its PLY files, else its STL files, else its NumPy
-/// archives.
+/// archives with a mesh.
 pub(super) fn find_models(folder: &AssetDir) -> Vec<ModelFile> {
     let names = folder.file_names();
     let mut models: Vec<ModelFile> = names.iter().filter_map(|name| recognize_model(name)).collect();
     let rank = models.iter().map(ModelFile::format_rank).min();
-    models.retain(|model| Some(model.format_rank()) == rank);
+    models.retain(|model| Some(model.format_rank()) == rank && find_model(folder, model.name()).is_some());
     models.into_iter().map(|model| detect_plant(model, &names)).collect()
 }
 

@@ -9,7 +9,7 @@ mod vega;
 
 pub(super) use npy::parse_f64;
 pub use npy::{NpyArray, parse as parse_numpy};
-pub(super) use npz::{NpzArchive, read_modes as read_npz_modes};
+pub(super) use npz::{NpzArchive, has_arrays, read_modes as read_npz_modes};
 pub(super) use sidecar::find_sidecar;
 
 #[cfg(test)]

@@ -1,6 +1,6 @@
 //! Reader of NumPy archives (`numpy.savez`, `numpy.savez_compressed`): arrays by name.
 
-use std::io::{Cursor, Read as _};
+use std::io::{BufReader, Cursor, Read, Seek};
 use std::sync::Arc;
 
 use zip::ZipArchive;
@@ -9,7 +9,7 @@ use super::npy::{self, NpyArray};
 use super::{LoadedModes, matrix};
 use crate::domain::MAX_RANK;
 use crate::error::{Error, Result, invalid};
-use crate::load::asset_dir::MAX_MODEL_BYTES;
+use crate::load::asset_dir::{AssetDir, MAX_MODEL_BYTES};
 use crate::memory::{MemoryReservation, TemporaryReservation};
 
 /// The largest number of arrays in an archive.
@@ -43,9 +43,7 @@ impl<'a> NpzArchive<'a> {
         if archive.len() > MAX_ARRAYS {
             return Err(invalid("archive", format!("at most {MAX_ARRAYS} arrays"), archive.len()));
         }
-        let members = archive.file_names().filter_map(Result::ok);
-        let mut names: Vec<String> = members.filter_map(|name| Some(name.strip_suffix(".npy")?.to_owned())).collect();
-        names.sort();
+        let names = array_names(&archive);
         Ok(Self { archive, memory: Arc::clone(memory), reserved: Vec::new(), names })
     }
 
@@ -106,6 +104,22 @@ impl<'a> NpzArchive<'a> {
         }
         Ok(bytes)
     }
+}
+
+/// Whether the file `name` is an archive with arrays of all these names. Reads only the directory of the archive.
+pub(in crate::load) fn has_arrays(files: &AssetDir, name: &str, arrays: &[&str]) -> bool {
+    let file = files.open(name).ok().filter(|(_, file_bytes)| *file_bytes <= MAX_MODEL_BYTES);
+    let archive = file.and_then(|(file, _)| ZipArchive::new(BufReader::new(file)).ok());
+    let names = archive.map_or_else(Vec::new, |archive| array_names(&archive));
+    arrays.iter().all(|array| names.iter().any(|name| name == array))
+}
+
+/// Names of the arrays in an archive, sorted.
+fn array_names<R: Read + Seek>(archive: &ZipArchive<R>) -> Vec<String> {
+    let members = archive.file_names().filter_map(Result::ok);
+    let mut names: Vec<String> = members.filter_map(|name| Some(name.strip_suffix(".npy")?.to_owned())).collect();
+    names.sort();
+    names
 }
 
 fn in_array(error: Error, name: &str) -> Error {

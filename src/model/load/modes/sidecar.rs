@@ -3,7 +3,7 @@
 
 use crate::error::Result;
 use crate::load::asset_dir::{AssetDir, EntryKind, stem_of};
-use crate::load::source::{find_models, recognize_model};
+use crate::load::source::{find_model, find_models, recognize_model};
 
 /// The rule in words, for remarks.
 const NAMES: &str = "the modes of MODEL are in MODEL.U.npy, MODEL.npy, MODEL.U.float or another name of the reference \
@@ -45,7 +45,8 @@ pub(in crate::load) struct Sidecar {
 
 /// Finds the modes of the model `name` in its folder. A name consists of the name of the model, without extension and
 /// without `.derived`, and one of [`ENDINGS`]. If no file has such a name and the folder has no other model, the
-/// [`GENERIC_NAMES`] are tried. Letter case is ignored, unless a file has the exact name.
+/// [`GENERIC_NAMES`] are tried. Letter case is ignored, unless a file has the exact name. A NumPy archive with a mesh is
+/// not used, because it is a model, whose U has the rows of its own vertices.
 ///
 /// # Errors
 /// `Invalid` for a name that leaves the root of the repository.
@@ -61,12 +62,14 @@ pub(in crate::load) fn find_sidecar(files: &AssetDir, name: &str) -> Result<Side
     if find_models(files).iter().all(|model| model.name() == name) {
         candidates.extend(GENERIC_NAMES.map(str::to_owned));
     }
+    let is_model = |name: &str| find_model(files, name).is_some();
     let mut file = None;
     for candidate in candidates.iter().filter(|candidate| *candidate != name) {
-        file = match files.kind(candidate)? {
+        let found = match files.kind(candidate)? {
             Some(EntryKind::File) => Some(candidate.clone()),
             _ => names.iter().find(|other| other.eq_ignore_ascii_case(candidate) && *other != name).cloned(),
         };
+        file = found.filter(|found| !is_model(found));
         if file.is_some() {
             break;
         }
@@ -78,7 +81,7 @@ pub(in crate::load) fn find_sidecar(files: &AssetDir, name: &str) -> Result<Side
         .iter()
         .map(String::as_str)
         .filter(|other| *other != name && Some(*other) != file.as_deref())
-        .filter(|other| looks_like_modes(other) && !belongs_to_other(other))
+        .filter(|other| looks_like_modes(other) && !belongs_to_other(other) && !is_model(other))
         .collect();
     Ok(Sidecar { remark: unused_remark(&unused, file.is_some()), file })
 }
@@ -140,6 +143,29 @@ mod tests {
         ] {
             assert_eq!(find_among(names, model).file.as_deref(), expected, "{names:?}");
         }
+    }
+
+    #[test]
+    fn archive_with_a_mesh_is_a_model_and_has_no_modes_for_others() {
+        use crate::load::modes::test_archives::{archive, npy};
+        let column = npy(&ndarray::arr2(&[[1.0_f32], [2.0], [3.0]]));
+        let find = |arrays: &[&str], names: &[&str]| {
+            let folder = tempfile::tempdir().expect("a temporary folder");
+            let arrays: Vec<_> = arrays.iter().map(|name| (*name, column.clone())).collect();
+            let bytes = archive(&arrays, zip::CompressionMethod::Deflated);
+            for name in names {
+                let content = if name.ends_with(".npz") { &bytes[..] } else { &[] };
+                std::fs::write(folder.path().join(name), content).expect("a writable file");
+            }
+            find_sidecar(&AssetDir::unrestricted(folder.path()), "a.stl").expect("names in the folder")
+        };
+        let mesh_and_modes = ["vertices", "faces", "U"];
+        assert_eq!(find(&mesh_and_modes, &["a.stl", "a.npz", "modes.npz"]), Sidecar::default());
+        let other = find(&mesh_and_modes, &["a.stl", "a.npz", "a.modes.txt"]);
+        assert_eq!(other, Sidecar { file: Some("a.modes.txt".into()), remark: None });
+        // Control: an archive without a mesh.
+        assert_eq!(find(&["U", "vertices"], &["a.stl", "a.npz"]).file.as_deref(), Some("a.npz"));
+        assert_eq!(find(&["U"], &["a.stl", "modes.npz"]).file.as_deref(), Some("modes.npz"));
     }
 
     #[test]
