@@ -20,6 +20,7 @@
 //!   replaced by a default with a remark. In strict mode, they are errors.
 
 mod asset_dir;
+mod conversion;
 #[cfg(test)]
 mod dataset_tests;
 mod gltf;

@@ -1,6 +1,7 @@
 //! Resolves a SCENE argument: a built-in name, a folder with `scene.toml`, a model file, or a folder with one model.
 
 use super::asset_dir::{AssetDir, EntryKind, extension_of, file_name_of, parent_of, stem_of};
+use super::conversion::model_hint;
 use super::surface::ModelOptions;
 use super::{SceneDescription, gltf, manifest, npz_model, obj, plant, ply, stl};
 use crate::error::{Error, Result, invalid};
@@ -107,8 +108,9 @@ pub(super) fn read_model(files: &AssetDir, path: &str, options: ModelOptions) ->
         Some(EntryKind::File) => {
             let folder = files.within(parent_of(path))?;
             let file_name = file_name_of(path);
+            let given = || format!("{file_name}{}", model_hint(file_name));
             let model = recognize_model(file_name)
-                .ok_or_else(|| invalid(format!("file '{path}'"), expected_format(), describe_format(file_name)))?;
+                .ok_or_else(|| invalid(format!("file '{path}'"), format!("a file ending in {FORMATS}"), given()))?;
             let model = detect_plant(model, &folder.file_names());
             read_model_file(&folder, &model, options)
         }
@@ -176,8 +178,7 @@ fn choose_single_model(folder: &AssetDir, path: &str) -> Result<ModelFile> {
             // The record of an upload is a hidden file.
             let entries = folder.entries().into_iter().filter(|(name, _)| !name.starts_with('.'));
             let names: Vec<String> = entries.map(|(name, _)| name).collect();
-            let hint =
-                names.iter().find_map(|name| conversion(name)).map_or_else(String::new, |hint| format!(" ({hint})"));
+            let hint = names.iter().map(|name| model_hint(name)).find(|hint| !hint.is_empty()).unwrap_or_default();
             Err(invalid(field, expected, format!("no model among: {}{hint}", join_names(names))))
         }
         model_count => {
@@ -188,40 +189,5 @@ fn choose_single_model(folder: &AssetDir, path: &str) -> Result<ModelFile> {
             let given = join_names(models.into_iter().map(name).collect());
             Err(invalid(field, expected, format!("{model_count}: {given}")))
         }
-    }
-}
-
-fn expected_format() -> String {
-    format!("a file ending in {FORMATS}")
-}
-
-/// The name of a file of another format, with the command that converts it.
-fn describe_format(name: &str) -> String {
-    conversion(name).map_or_else(|| name.to_owned(), |conversion| format!("{name} ({conversion})"))
-}
-
-/// The command that converts a mesh of surfaces.
-fn meshio_conversion(name: &str, converted: &str) -> String {
-    format!(
-        "convert it: meshio convert {name} {converted}; of a volume mesh, write the surface as the section Models in the \
-         reference of scene.toml shows"
-    )
-}
-
-/// How a file of another format is converted; `None` for an unknown format.
-fn conversion(name: &str) -> Option<String> {
-    let stem = stem_of(name);
-    match extension_of(name).as_str() {
-        // Formats that meshio reads (5.3). It writes only triangles and quadrilaterals to these formats. Binary VTK
-        // files are big-endian, which it cannot write as PLY.
-        "vtk" => Some(meshio_conversion(name, &format!("{stem}.obj"))),
-        "vtu" | "msh" | "inp" | "bdf" | "nas" | "fem" | "e" | "ex2" | "exo" | "xdmf" | "xmf" | "med" | "mesh"
-        | "meshb" | "off" | "ugrid" | "su2" | "cgns" | "h5m" | "avs" | "mdpa" | "f3grid" | "wkt" | "tec" => {
-            Some(meshio_conversion(name, &format!("{stem}.ply")))
-        }
-        "vtp" => Some(format!("convert it with PyVista: pyvista.read('{name}').save('{stem}.ply')")),
-        "fbx" | "dae" | "3ds" | "blend" | "usd" | "usda" | "usdc" | "usdz" | "abc" | "x3d" | "3mf" | "step" | "stp"
-        | "iges" | "igs" => Some(format!("export it as {stem}.glb, for example with Blender")),
-        _ => None,
     }
 }

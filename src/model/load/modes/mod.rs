@@ -15,7 +15,8 @@ pub(super) use sidecar::find_sidecar;
 #[cfg(test)]
 pub(super) use npz::tests as test_archives;
 
-use super::asset_dir::{AssetDir, MAX_MODEL_BYTES, extension_of, stem_of};
+use super::asset_dir::{AssetDir, MAX_MODEL_BYTES, extension_of};
+use super::conversion::modes_hint;
 use crate::domain::Modes;
 use crate::error::{Result, invalid};
 
@@ -87,16 +88,7 @@ pub(super) fn read(files: &AssetDir, name: &str) -> Result<LoadedModes> {
 }
 
 fn unknown_format(name: &str) -> crate::error::Error {
-    let load = match extension_of(name).as_str() {
-        "mat" => "scipy.io.loadmat(F)['U']",
-        "csv" => "numpy.loadtxt(F, delimiter=',')",
-        "h5" | "hdf5" => "h5py.File(F)['U'][()]",
-        _ => "",
-    };
-    let given = match load {
-        "" => name.to_owned(),
-        load => format!("{name} (convert it in Python: F = '{name}'; numpy.save('{}.npy', {load}))", stem_of(name)),
-    };
+    let given = format!("{name}{}", modes_hint(name));
     invalid("modes", "a file ending in .float, .double, .U, .npy, .npz, .safetensors or .txt", given)
 }
 
@@ -128,6 +120,9 @@ mod tests {
         let message = read(&AssetDir::unrestricted(std::path::Path::new(".")), "u.mat")
             .expect_err("an unknown ending")
             .to_string();
-        assert!(message.contains(".npy, .npz, .safetensors or .txt, got u.mat (convert it in Python"), "{message}");
+        assert!(
+            message.contains(".npy, .npz, .safetensors or .txt, got u.mat (convert it in its folder with `python3 -c"),
+            "{message}"
+        );
     }
 }
