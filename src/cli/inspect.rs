@@ -4,7 +4,7 @@
 use serde::Serialize;
 use serde_json::{Value, json};
 
-use super::options::with_spinner;
+use super::options::{remark_lines, with_spinner};
 use super::{Completion, Outcome, print_line};
 use modalcast_compute::gpu::{self, CudaDeformerOptions, DeformPlan};
 use modalcast_model::backend_settings::{BackendSettings, DeformTable, LookTable};
@@ -186,7 +186,7 @@ fn text_lines(opened_scene: &OpenedScene) -> Vec<String> {
     let diagonal = scene.rest_bounds.diagonal();
     lines.push(format!("up {:?}, unit {} m, diagonal {diagonal:.4}, origin {:?}", scene.up, scene.unit, scene.origin));
     lines.extend(load::modes_files(scene).iter().map(|file| format!("modes: {file}")));
-    lines.extend(scene.remarks.iter().map(|remark| format!("remark: {remark}")));
+    lines.extend(remark_lines(scene));
     let flags = scene.features.flags().into_iter();
     let needed_features: Vec<&str> = flags.filter_map(|(name, is_needed)| is_needed.then_some(name)).collect();
     lines.push(format!("needs: {}", needed_features.join(", ")));

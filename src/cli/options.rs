@@ -1,6 +1,7 @@
 //! Option types and helpers that several commands share.
 
 use modalcast_model::error::{Result, invalid};
+use modalcast_model::scene::Scene;
 
 /// Runs `work`. Shows a spinner meanwhile if standard error is a terminal.
 pub fn with_spinner<T>(message: &'static str, work: impl FnOnce() -> T) -> T {
@@ -9,6 +10,11 @@ pub fn with_spinner<T>(message: &'static str, work: impl FnOnce() -> T) -> T {
     let result = work();
     spinner.finish_and_clear();
     result
+}
+
+/// Lines with the remarks of a scene's loader, such as parts of the files that are not used.
+pub fn remark_lines(scene: &Scene) -> impl Iterator<Item = String> {
+    scene.remarks.iter().map(|remark| format!("remark: {remark}"))
 }
 
 /// Parses a point in the format X,Y,Z.

@@ -4,7 +4,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use super::options::{parse_point, with_spinner};
+use super::options::{parse_point, remark_lines, with_spinner};
 use super::{Completion, Outcome, print_line};
 use crate::config::{BackendChoice, Config, RendererChoice};
 use crate::engine::{DeviceContext, FrameInfo, FrameOutput, LoadedScene, validate_mode};
@@ -161,7 +161,7 @@ pub(super) fn run(args: &Args) -> Outcome {
     fs::write(&args.out, bytes).map_err(|error| invalid(field, "a file that can be written", error))?;
     device.unload_scene(loaded_scene);
     print_line(format!("{} ({}, {})", args.out.display(), args.size, device.backend().name()));
-    info_lines(&info).into_iter().for_each(print_line);
+    info_lines(&info).into_iter().chain(remark_lines(&scene)).for_each(print_line);
     Ok(Completion::Success)
 }
 

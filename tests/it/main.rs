@@ -5,6 +5,7 @@ mod attribute_streams;
 mod broken_streams;
 mod budgets;
 mod bulk_steps;
+mod commands;
 #[path = "../common/mod.rs"]
 mod common;
 mod connections;
