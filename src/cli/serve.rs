@@ -203,15 +203,21 @@ async fn serve(config: ValidatedConfig) -> Result<()> {
         started = start(config) => started?,
         () = signals.received() => return Ok(()),
     };
+    announce(&engine, &listener);
     service::serve(engine, listener, async move { signals.received().await }).await
 }
 
-/// Opens the devices and the scenes, and prints the addresses.
+/// Binds the addresses and opens the devices.
 pub(super) async fn start(config: ValidatedConfig) -> Result<(Engine, Listener)> {
     let repository = Arc::new(SceneRepository::new(config.scenes.as_deref())?);
     // Bind before scenes are loaded, so that a second server on the same address fails immediately.
     let listener = service::bind(&config).await?;
     let engine = Engine::start(config, repository).await?;
+    Ok((engine, listener))
+}
+
+/// Logs the devices and prints the addresses.
+pub(super) fn announce(engine: &Engine, listener: &Listener) {
     for address in listener.remote_addresses() {
         tracing::warn!("{address} accepts clients on other machines, without authentication");
     }
@@ -222,10 +228,9 @@ pub(super) async fn start(config: ValidatedConfig) -> Result<(Engine, Listener)>
     for url in listener.viewer_urls() {
         print_line(format!("viewer at {url}"));
     }
-    for command in tunnel_commands(&listener) {
+    for command in tunnel_commands(listener) {
         print_line(format!("viewer from another machine: run '{command}' there, then open this URL"));
     }
-    Ok((engine, listener))
 }
 
 /// The commands that make the viewer available on another machine through SSH. There are none unless the user has

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
 use super::demo::{ForceFiles, Process, SceneLocation, program_path};
-use super::serve::{TerminationSignals, start};
+use super::serve::{TerminationSignals, announce, start};
 use super::{Completion, Outcome, print_line};
 use crate::config::{BackendChoice, Config, ListenAddress, RendererChoice, ValidatedConfig};
 use crate::service::{self, Listener};
@@ -104,6 +104,7 @@ async fn view(
         opened = open => opened?,
         () = signals.received() => return Ok(()),
     };
+    announce(&engine, &listener);
     // The sockets are already open, so the browser and the physics process wait until the server answers.
     let url = viewer_url(&listener, &scene)?;
     print_line(format!("open {url}"));

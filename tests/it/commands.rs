@@ -27,3 +27,16 @@ fn render_prints_the_remarks_that_inspect_prints() {
     assert_eq!(remarks(&rendered), remarks(&inspected));
     assert!(remarks(&rendered)[0].starts_with("remark: not used as modes: pressure.npy"), "{rendered:?}");
 }
+
+#[test]
+fn view_rejects_what_it_cannot_open_before_it_prints_an_address() {
+    let folder = tempfile::tempdir().expect("expected a temporary folder");
+    let write = |name: &str, text: &str| std::fs::write(folder.path().join(name), text).expect("a written file");
+    write("damaged.obj", "v 0 0\n");
+    for (model, code) in [("damaged.obj", 3), ("absent.obj", 4)] {
+        let output = run(folder.path(), &["view", model, "--no-open", "--backend", "cpu", "--renderer", "off"]);
+        assert_eq!(output.status.code(), Some(code), "{model}: {output:?}");
+        assert_eq!(String::from_utf8_lossy(&output.stdout), "", "{model}");
+        assert!(String::from_utf8_lossy(&output.stderr).contains(model), "{output:?}");
+    }
+}
