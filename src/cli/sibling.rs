@@ -70,6 +70,18 @@ mod tests {
 
     use super::*;
 
+    /// `modalcast record` works after the first command of the README.
+    #[test]
+    fn demo_builds_the_recorder() {
+        let demo = include_str!("../../deploy/demo");
+        let words: Vec<&str> = demo.split_whitespace().collect();
+        assert!(
+            words.windows(2).any(|pair| pair == ["-p", RECORD.package]),
+            "expected -p {} in deploy/demo",
+            RECORD.package
+        );
+    }
+
     #[test]
     fn missing_program_or_program_of_another_build_is_an_error() {
         let folder = tempfile::tempdir().expect("expected a temporary folder");
