@@ -5,6 +5,7 @@ use std::net::{Ipv4Addr, SocketAddr};
 use std::path::PathBuf;
 use std::time::Duration;
 
+use bytes::Bytes;
 use modalcast_model::error::{Result, fault_in, invalid};
 
 /// The deformation backend.
@@ -125,6 +126,8 @@ pub struct Config {
     pub viewer: bool,
     /// The secret in the URL of the viewer. `None` selects a random one.
     pub viewer_token: Option<ViewerToken>,
+    /// The recording (an MCAP file) that the viewer's page plays in place of the server's scenes.
+    pub viewer_recording: Option<Bytes>,
     /// The folder of scenes that clients may open. `None` allows only the built-in scenes.
     pub scenes: Option<PathBuf>,
     /// The folder for uploads, the list of open scenes and their last steps. Only one server at a time can use it.
@@ -228,6 +231,7 @@ impl Default for Config {
             shared_memory: None,
             viewer: true,
             viewer_token: None,
+            viewer_recording: None,
             scenes: None,
             state: default_state(),
             backend: BackendChoice::Auto,

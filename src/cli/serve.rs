@@ -218,10 +218,15 @@ pub(super) async fn start(config: ValidatedConfig) -> Result<(Engine, Listener)>
 
 /// Logs the devices and prints the addresses.
 pub(super) fn announce(engine: &Engine, listener: &Listener) {
+    log_devices(engine.info());
+    print_addresses(listener);
+}
+
+/// Prints the addresses. Warns about those that other machines can connect to.
+pub(super) fn print_addresses(listener: &Listener) {
     for address in listener.remote_addresses() {
         tracing::warn!("{address} accepts clients on other machines, without authentication");
     }
-    log_devices(engine.info());
     for url in listener.urls() {
         print_line(format!("listening on {url}"));
     }

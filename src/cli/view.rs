@@ -1,12 +1,12 @@
-//! `modalcast view`: runs a server with one scene and opens its viewer in the browser.
+//! `modalcast view`: runs a server with one scene, or with a recording, and opens its viewer in the browser.
 
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
 use super::demo::{ForceFiles, Process, SceneLocation, program_path};
-use super::serve::{TerminationSignals, announce, start};
-use super::{Completion, Outcome, print_line};
+use super::serve::{TerminationSignals, announce, print_addresses, start};
+use super::{Completion, Outcome, print_line, recording};
 use crate::config::{BackendChoice, Config, ListenAddress, RendererChoice, ValidatedConfig};
 use crate::service::{self, Listener};
 use modalcast_model::error::{Result, fault, fault_in};
@@ -17,15 +17,16 @@ const URL_OPENER: &str = "xdg-open";
 /// The physics process, in the folder of this program.
 const PHYSICS_PROGRAM: &str = "modalcast-sim";
 
-/// Shows a model in the browser. Runs a server with this scene until Ctrl-C.
+/// Shows a model or a recording in the browser. Runs a server for it until Ctrl-C.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   modalcast view tree
   modalcast view path/to/simpleBridge --no-sim
+  modalcast view tree.mcap                          plays a recording
   modalcast view model.glb --listen 0.0.0.0:50051   also for browsers on other machines")]
 pub(super) struct Args {
-    /// A built-in name, a folder with scene.toml, a .glb, .gltf, .obj, .ply, .stl or .npz file, or a folder with
-    /// one model.
+    /// A built-in name, a folder with scene.toml, a .glb, .gltf, .obj, .ply, .stl or .npz file, a folder with one
+    /// model, or a recording: an .mcap file, which the browser plays.
     model: String,
     /// Address to listen on: IP:PORT, where port 0 selects a free port.
     #[arg(long, default_value_t = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 0))]
@@ -61,6 +62,27 @@ impl Args {
         .validated()
     }
 
+    /// The configuration of a server whose page plays the recording. It opens no scene and needs no GPU.
+    fn playback_config(&self, state: &Path) -> Result<ValidatedConfig> {
+        Config {
+            listen: vec![ListenAddress::Tcp(self.listen)],
+            viewer_recording: Some(recording::read(&self.model)?),
+            state: state.to_owned(),
+            backend: BackendChoice::Cpu,
+            renderer: RendererChoice::Off,
+            ..Config::default()
+        }
+        .validated()
+    }
+
+    /// Prints the URL, and opens it in the browser unless the user works on another machine.
+    fn show(&self, url: &str) {
+        print_line(format!("open {url}"));
+        if !self.no_open && std::env::var_os("SSH_CONNECTION").is_none() {
+            open_browser(url);
+        }
+    }
+
     /// The physics program, if the scene is to be moved.
     ///
     /// # Errors
@@ -76,13 +98,17 @@ impl Args {
 }
 
 pub(super) fn run(args: &Args) -> Outcome {
-    let location = SceneLocation::find(&args.model)?;
     // The server's state. The folder is removed when this value is dropped.
     let state = tempfile::tempdir().map_err(fault_in("view"))?;
-    let config = args.config(&location, state.path())?;
-    let physics_program = args.physics_program()?;
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().map_err(fault_in("view"))?;
-    let result = runtime.block_on(view(args, &location, config, physics_program));
+    let result = match recording::is_recording(&args.model) {
+        true => runtime.block_on(play(args, args.playback_config(state.path())?)),
+        false => {
+            let location = SceneLocation::find(&args.model)?;
+            let config = args.config(&location, state.path())?;
+            runtime.block_on(view(args, &location, config, args.physics_program()?))
+        }
+    };
     // A frame that is being drawn must not delay the exit.
     runtime.shutdown_background();
     result.map(|()| Completion::Success)
@@ -106,11 +132,8 @@ async fn view(
     };
     announce(&engine, &listener);
     // The sockets are already open, so the browser and the physics process wait until the server answers.
-    let url = viewer_url(&listener, &scene)?;
-    print_line(format!("open {url}"));
-    if !args.no_open && std::env::var_os("SSH_CONNECTION").is_none() {
-        open_browser(&url);
-    }
+    // Names of scenes have only letters that are valid in a URL.
+    args.show(&format!("{}#scene={scene}", viewer_url(&listener)?));
     let mut physics = physics_program.map(|path| start_physics(&path, &force_files, &listener, &scene)).transpose()?;
     let result = service::serve(engine, listener, async move { signals.received().await }).await;
     if let Some(physics) = &mut physics {
@@ -119,10 +142,18 @@ async fn view(
     result
 }
 
-/// The URL of the viewer that shows a scene. Names of scenes have only letters that are valid in a URL.
-fn viewer_url(listener: &Listener, scene: &str) -> Result<String> {
-    let url = listener.viewer_urls().into_iter().next();
-    url.map(|url| format!("{url}#scene={scene}")).ok_or_else(|| fault("view", "expected the URL of the viewer"))
+/// Serves the page that plays the recording of the configuration.
+async fn play(args: &Args, config: ValidatedConfig) -> Result<()> {
+    let mut signals = TerminationSignals::install()?;
+    let (engine, listener) = start(config).await?;
+    print_addresses(&listener);
+    args.show(&viewer_url(&listener)?);
+    service::serve(engine, listener, async move { signals.received().await }).await
+}
+
+/// The URL of the viewer.
+fn viewer_url(listener: &Listener) -> Result<String> {
+    listener.viewer_urls().into_iter().next().ok_or_else(|| fault("view", "expected the URL of the viewer"))
 }
 
 fn start_physics(program: &PathBuf, force_files: &ForceFiles, listener: &Listener, scene: &str) -> Result<Process> {

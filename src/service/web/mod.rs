@@ -70,7 +70,7 @@ type Answer = Response<Full<Bytes>>;
 type Upgrade = Mutex<Option<OnUpgrade>>;
 
 impl WebServer {
-    /// Unpacks the page of the viewer.
+    /// Unpacks the page of the viewer, and adds the recording of the configuration.
     ///
     /// # Errors
     /// `Fault` when the page that the program contains is damaged.
@@ -83,7 +83,8 @@ impl WebServer {
             .max_header_size(MAX_HEAD_BYTES)
             .max_buf_size(MAX_HEAD_BYTES);
         let websocket_limits = WebSocketLimits::new(config);
-        Ok(Self { routes, access, page: Page::viewer()?, is_serving, http1, websocket_limits })
+        let page = config.viewer_recording.as_deref().map_or_else(Page::viewer, Page::playing)?;
+        Ok(Self { routes, access, page, is_serving, http1, websocket_limits })
     }
 
     /// Serves a connection, of which `first_bytes` were read before, until it ends or must be closed.
@@ -160,7 +161,9 @@ impl WebServer {
     fn page_answer(&self, host: &str) -> Answer {
         let mut answer = answer_with(StatusCode::OK, "text/html; charset=utf-8", self.page.body.clone());
         let headers = answer.headers_mut();
-        headers.insert(header::CONTENT_ENCODING, HeaderValue::from_static("gzip"));
+        if self.page.is_compressed {
+            headers.insert(header::CONTENT_ENCODING, HeaderValue::from_static("gzip"));
+        }
         // The host was parsed before, so it is a valid header value.
         if let Ok(policy) = HeaderValue::try_from(self.page.policy(host)) {
             headers.insert(header::CONTENT_SECURITY_POLICY, policy);

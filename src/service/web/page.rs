@@ -16,11 +16,15 @@ const VIEWER: &[u8] = include_bytes!("../../../clients/web/dist/index.html.gz");
 /// Limit on the uncompressed page, in bytes.
 const MAX_PAGE_BYTES: u64 = 64 << 20;
 
+/// The place of a recording in the page.
+const RECORDING_PLACE: &str = "<!--RECORDING-->";
+
 /// The page and its content security policy.
 #[derive(Debug)]
 pub(super) struct Page {
-    /// Compressed with gzip.
     pub(super) body: Bytes,
+    /// Whether `body` is compressed with gzip.
+    pub(super) is_compressed: bool,
     /// The hashes of the inline scripts, as sources of the policy.
     script_sources: String,
 }
@@ -31,10 +35,27 @@ impl Page {
     /// # Errors
     /// `Fault` when it is damaged.
     pub(super) fn viewer() -> Result<Self> {
-        let mut html = String::new();
-        let limited = flate2::read::GzDecoder::new(VIEWER).take(MAX_PAGE_BYTES);
-        std::io::BufReader::new(limited).read_to_string(&mut html).map_err(fault_in("viewer page"))?;
-        Ok(Self { body: Bytes::from_static(VIEWER), script_sources: script_sources(&html)? })
+        let script_sources = script_sources(&viewer_html()?)?;
+        Ok(Self { body: Bytes::from_static(VIEWER), is_compressed: true, script_sources })
+    }
+
+    /// The viewer with a recording inside, which it plays without a connection to the server.
+    ///
+    /// # Errors
+    /// As for [`Self::viewer`].
+    pub(super) fn playing(recording: &[u8]) -> Result<Self> {
+        let html = viewer_html()?;
+        let (start, end) =
+            html.split_once(RECORDING_PLACE).ok_or_else(|| fault("viewer page", "expected a place for a recording"))?;
+        let text_bytes = base64::encoded_len(recording.len(), true).unwrap_or_default();
+        let mut body = String::with_capacity(html.len() + text_bytes + 128);
+        body.push_str(start);
+        body.push_str("<script id=\"recording\" type=\"application/octet-stream\">");
+        STANDARD.encode_string(recording, &mut body);
+        body.push_str("</script>");
+        body.push_str(end);
+        // A script of this type is data, which the policy does not concern.
+        Ok(Self { body: body.into(), is_compressed: false, script_sources: script_sources(&html)? })
     }
 
     /// The content security policy for a page that was loaded from `host`, which may have a port. Only the scripts of
@@ -47,6 +68,14 @@ impl Page {
             self.script_sources
         )
     }
+}
+
+/// The text of the viewer's page.
+fn viewer_html() -> Result<String> {
+    let mut html = String::new();
+    let limited = flate2::read::GzDecoder::new(VIEWER).take(MAX_PAGE_BYTES);
+    std::io::BufReader::new(limited).read_to_string(&mut html).map_err(fault_in("viewer page"))?;
+    Ok(html)
 }
 
 /// The sources of a policy that permit the inline scripts of a page: their SHA-256.
@@ -93,5 +122,16 @@ mod tests {
         let policy = page.policy("localhost:8000");
         assert!(policy.contains("connect-src 'self' ws://localhost:8000;"), "{policy}");
         assert!(!policy.contains("script-src 'unsafe"), "{policy}");
+    }
+
+    #[test]
+    fn recording_is_inside_of_the_page_under_the_same_policy() {
+        let viewer = Page::viewer().expect("expected the viewer");
+        let page = Page::playing(b"\x89MCAP").expect("expected a page");
+        let html = std::str::from_utf8(&page.body).expect("expected text");
+        let element = "<script id=\"recording\" type=\"application/octet-stream\">iU1DQVA=</script>";
+        assert_eq!(html.replace(element, RECORDING_PLACE), viewer_html().expect("expected the viewer"));
+        assert!(!page.is_compressed && viewer.is_compressed);
+        assert_eq!(page.policy("localhost"), viewer.policy("localhost"));
     }
 }

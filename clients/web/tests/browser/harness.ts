@@ -23,7 +23,7 @@ declare global {
 
 const TIMEOUT_MS = 120_000;
 /** Whether servers show the page of dist instead of the one that they were built with. */
-const usesCommittedPage = Boolean(process.env["MODALCAST_COMMITTED_PAGE"]);
+export const usesCommittedPage = Boolean(process.env["MODALCAST_COMMITTED_PAGE"]);
 const TOKEN = "smoke-test-token-0001";
 const programs = resolve(process.env["MODALCAST_PROGRAMS"] ?? join(process.cwd(), "../../target/debug"));
 
@@ -65,22 +65,8 @@ export class ServerProcess {
             "cpu",
             ...scenes,
         ];
-        const server = startProgram("modalcast", options, ["ignore", "pipe", "pipe"]);
-        this.process = server;
-        let log = "";
-        server.stderr?.on("data", (text) => (log += text));
-        const line = await new Promise<string>((done, fail) => {
-            let output = "";
-            server.stdout?.on("data", (text) => {
-                output += text;
-                const found = /viewer at (http:\S+)/.exec(output);
-                if (found?.[1]) done(found[1]);
-            });
-            server.once("exit", (code) =>
-                fail(new Error(`the server has ended with code ${code}: ${log.slice(-2000)}`)),
-            );
-        });
-        this.port = Number(new URL(line).port);
+        this.process = startProgram("modalcast", options, ["ignore", "pipe", "pipe"]);
+        this.port = Number(new URL(await printedUrl(this.process, "viewer at")).port);
     }
 
     /** The page with a scene. */
@@ -127,6 +113,21 @@ export function startProgram(name: string, options: string[], stdio: StdioOption
     process.once("exit", kill);
     program.once("exit", () => process.removeListener("exit", kill));
     return program;
+}
+
+/** The URL after `prefix` in the output of a server. */
+export function printedUrl(server: ChildProcess, prefix: string): Promise<string> {
+    let log = "";
+    server.stderr?.on("data", (text) => (log += text));
+    return new Promise<string>((done, fail) => {
+        let output = "";
+        server.stdout?.on("data", (text) => {
+            output += text;
+            const found = new RegExp(`${prefix} (http:\\S+)`).exec(output);
+            if (found?.[1]) done(found[1]);
+        });
+        server.once("exit", (code) => fail(new Error(`the server has ended with code ${code}: ${log.slice(-2000)}`)));
+    });
 }
 
 /** Runs a program of the project to its end. Throws if it fails. */

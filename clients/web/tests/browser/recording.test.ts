@@ -15,11 +15,14 @@ import {
     end,
     launchBrowser,
     openPage,
+    printedUrl,
     rememberPixels,
     runProgram,
     ServerProcess,
+    startProgram,
     startSimulation,
     temporaryFolder,
+    usesCommittedPage,
     waitForScene,
 } from "./harness";
 
@@ -139,6 +142,18 @@ test("an exported page plays its recording without a server", { timeout: LIMIT_M
     assert.deepEqual(others, [], "expected no requests to a server");
     assert.deepEqual(errors, []);
     await page.close();
+});
+
+// The recording is in the page of the server.
+test("`modalcast view` plays a recording", { timeout: LIMIT_MS, skip: usesCommittedPage }, async () => {
+    const server = startProgram("modalcast", ["view", file, "--no-open"], ["ignore", "pipe", "inherit"]);
+    const url = await printedUrl(server, "open");
+    const { page, errors } = await openPage(browser, url, WIDTH, HEIGHT);
+    await checkPlayback(page);
+    assert.deepEqual(errors, []);
+    await page.close();
+    await end(server);
+    assert.equal(server.exitCode, 0);
 });
 
 test("a recording that is dropped onto the page plays", { timeout: LIMIT_MS }, async () => {
