@@ -37,6 +37,13 @@ pub struct Layout {
 }
 
 impl Layout {
+    /// The domain that owns the coordinates of a domain: the domain itself, unless it shares those of another one.
+    pub fn q_owner(&self, domain: u32) -> u32 {
+        let DomainLayout { first_q, rank, .. } = self.domains[domain as usize];
+        let sharing_domains = self.domains_sharing_q.get(&first_q).filter(|_| rank > 0);
+        sharing_domains.and_then(|domains| domains.first()).map_or(domain, |owner| *owner)
+    }
+
     pub(super) fn new(shapes: &[Shape], domains: &[Domain]) -> Result<Self> {
         let mut layout = Self {
             domains: Vec::with_capacity(domains.len()),

@@ -36,6 +36,7 @@ pub struct RawStepUpdate {
 /// The coordinates of one domain within `StepUpdate::values`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct CoordinateSpan {
+    /// The domain that owns the coordinates, so that steps can be merged by domain.
     domain: u32,
     /// Index in `StepUpdate::values` of the first coordinate.
     first: usize,
@@ -97,7 +98,7 @@ impl StepUpdate {
         })
     }
 
-    /// Each domain with new coordinates, and its r numbers.
+    /// Each domain with new coordinates of its own, and its r numbers. Of several values for a domain, the last one counts.
     pub fn coordinates(&self) -> impl Iterator<Item = (usize, &[f32])> {
         self.spans.iter().map(|span| (span.domain as usize, &self.values[span.first..][..span.rank]))
     }
@@ -163,6 +164,9 @@ fn parse_coordinates(scene: &Scene, raw: &RawStepUpdate) -> Result<(Vec<Coordina
             let given = format!("{} for mode {mode} of domain '{name}'", values[first + mode]);
             return Err(invalid(format!("step.q[{}]", first + mode), "a finite number", given));
         }
+    }
+    for span in &mut spans {
+        span.domain = scene.layout.q_owner(span.domain);
     }
     Ok((spans, values))
 }

@@ -274,6 +274,20 @@ fn scattered_scene_is_not_searched_in_every_step() {
     }
 }
 
+/// Domains 2 and 4 share the coordinates of domain 1. The newer step names another one of them.
+#[test]
+fn merged_step_keeps_newest_shared_coordinates() {
+    let scene = scene(7);
+    for newer in [coordinates_step(&[1], &[3.0, 4.0]), coordinates_step(&[2, 0], &[3.0, 4.0, 0.0, 0.0])] {
+        let steps = [coordinates_step(&[4], &[1.0, 2.0]), newer];
+        let [older, newer] = steps.each_ref().map(|raw| parse_step(&scene, raw));
+        let mut merged_state = SceneState::rest(&scene);
+        merged_state.apply(&scene, &newer.merged_with_older(&older));
+        assert_eq!(merged_state, state_after(&scene, &steps));
+        assert_eq!(merged_state.q_of(&scene, 4), [3.0, 4.0]);
+    }
+}
+
 #[test]
 fn merged_step_gives_the_state_of_all_its_steps() {
     let scene = scene(4);
