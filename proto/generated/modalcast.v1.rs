@@ -1996,7 +1996,11 @@ pub struct Step {
     /// Simulation time in seconds; finite.
     #[prost(double, tag = "2")]
     pub time: f64,
-    /// Domains whose coordinates are in `q`, each once. If empty and `q` is not empty: all domains in order.
+    /// Domains whose coordinates are in `q`, each once. If empty and `q` is not empty, `q` has all coordinates of the scene
+    /// (SceneInfo.coordinates): r numbers for each domain, in order, without the domains that share the coordinates of
+    /// another one (DomainDescription.shares_q_with). A server without FEATURE_PACKED_Q accepts that only for scenes in
+    /// which no domain shares coordinates. Every server also accepts r numbers for every domain; of several values for the
+    /// same coordinates, those of the last domain count.
     #[prost(uint32, repeated, tag = "3")]
     pub q_domains: ::prost::alloc::vec::Vec<u32>,
     /// r finite little-endian f32 per domain, concatenated; r is ShapeDescription.rank. U q is in scene units.
@@ -5686,6 +5690,8 @@ pub enum Feature {
     SharedMemory = 5,
     /// The port also serves browsers: the viewer and a WebSocket that carries these calls (proto/websocket.md).
     Viewer = 6,
+    /// A step without `q_domains` may have each coordinate of the scene once, see Step.q_domains.
+    PackedQ = 7,
 }
 impl Feature {
     /// String value of the enum field names used in the ProtoBuf definition.
@@ -5701,6 +5707,7 @@ impl Feature {
             Self::UploadArrays => "FEATURE_UPLOAD_ARRAYS",
             Self::SharedMemory => "FEATURE_SHARED_MEMORY",
             Self::Viewer => "FEATURE_VIEWER",
+            Self::PackedQ => "FEATURE_PACKED_Q",
         }
     }
     /// Creates an enum from field names used in the ProtoBuf definition.
@@ -5713,6 +5720,7 @@ impl Feature {
             "FEATURE_UPLOAD_ARRAYS" => Some(Self::UploadArrays),
             "FEATURE_SHARED_MEMORY" => Some(Self::SharedMemory),
             "FEATURE_VIEWER" => Some(Self::Viewer),
+            "FEATURE_PACKED_Q" => Some(Self::PackedQ),
             _ => None,
         }
     }

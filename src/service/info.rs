@@ -66,7 +66,8 @@ fn to_ms(duration: Duration) -> u32 {
 
 /// The features of a server with these devices and settings.
 fn list_features(info: &EngineInfo, config: &Config) -> Vec<v1::Feature> {
-    let mut features = vec![v1::Feature::ContentHashes, v1::Feature::UploadReuse, v1::Feature::UploadArrays];
+    let mut features =
+        vec![v1::Feature::ContentHashes, v1::Feature::UploadReuse, v1::Feature::UploadArrays, v1::Feature::PackedQ];
     features.extend(info.renderer.is_ok().then_some(v1::Feature::Frames));
     features.extend(config.shared_memory.is_some().then_some(v1::Feature::SharedMemory));
     features.extend(config.viewer.then_some(v1::Feature::Viewer));
@@ -94,7 +95,8 @@ mod tests {
         let memory =
             MemoryLimits { host: 4, scene_host: 2, device: 0, scene_device: 0, render_targets: 1, has_device: false };
         let info = |renderer| EngineInfo { backend: Backend::Cpu, device: "none".into(), renderer, memory };
-        let always = [v1::Feature::ContentHashes, v1::Feature::UploadReuse, v1::Feature::UploadArrays];
+        let always =
+            [v1::Feature::ContentHashes, v1::Feature::UploadReuse, v1::Feature::UploadArrays, v1::Feature::PackedQ];
         let config = |shared_memory, viewer| Config { shared_memory, viewer, ..Config::default() };
         let no_renderer = info(Err(fault("renderer", "none")));
         assert_eq!(list_features(&no_renderer, &config(None, false)), always);

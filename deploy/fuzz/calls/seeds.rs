@@ -44,7 +44,8 @@ fn floats(numbers: &[f32]) -> Vec<u8> {
     numbers.iter().flat_map(|number| number.to_le_bytes()).collect()
 }
 
-/// A run of a writer in the stored scene: a step of one message, a step of two messages, and one with quaternions.
+/// A run of a writer in the stored scene: a step of one message, a step of two messages, one with quaternions, and one
+/// of the whole scene.
 fn steps() -> Vec<u8> {
     let delivery = v1::Delivery::Lossless.into();
     let open = v1::OpenDrive { scene: STORED_SCENE.into(), delivery, take_over: true, ..Default::default() };
@@ -64,7 +65,14 @@ fn steps() -> Vec<u8> {
         transforms: floats(&[0.0, 0.0, 0.0, 1.0, 1.0, 2.0, 3.0]).into(),
         ..step(3, false)
     };
-    let steps = [step(1, false), step(2, true), last_part, rotation].map(DriveKind::Step);
+    let whole = v1::Step {
+        q_domains: vec![],
+        q: floats(&[0.5, 0.25]).into(),
+        transform_domains: vec![],
+        transforms: floats(&IDENTITY.repeat(2)).into(),
+        ..step(4, false)
+    };
+    let steps = [step(1, false), step(2, true), last_part, rotation, whole].map(DriveKind::Step);
     let kinds = [DriveKind::Open(open)].into_iter().chain(steps);
     let messages = kinds.map(|kind| message(&v1::DriveSceneRequest { kind: Some(kind) }));
     messages.collect::<Vec<_>>().join(SEPARATOR)

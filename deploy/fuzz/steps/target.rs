@@ -1,4 +1,4 @@
-//! The target of steps: parses the steps of a writer for a scene with two domains, merges them, and applies them. The
+//! The target of steps: parses the steps of a writer for a scene with three domains, merges them, and applies them. The
 //! fuzzer and `files/replay.rs` run it.
 //!
 //! An input is a sequence of steps. Each begins with a head of [`HEAD_BYTES`]: the time (f64, little-endian), the format
@@ -7,7 +7,7 @@
 use std::fs;
 use std::sync::Arc;
 
-use modalcast_model::domain::Transform;
+use modalcast_model::domain::{Domain, Transform};
 use modalcast_model::load::SceneRepository;
 use modalcast_model::memory::{MemoryBudget, MemoryKind, MemoryReservation};
 use modalcast_model::scene::{RawStepUpdate, Scene, SceneState, StepUpdate, TransformFormat};
@@ -26,13 +26,14 @@ const MODES: &str = "12 2\n1 0\n0 1\n0 0\n1 0\n0 2\n0 0\n0 0\n0 1\n1 0\n0 0\n0 1
 const SCENE: &str = "unit = 0.5\n[[domain]]\nname = \"a\"\nmodel = \"m.obj\"\nmodes = \"modes.txt\"\n[[domain]]\nname = \"b\"\n\
                      model = \"m.obj\"\nmodes = \"\"\n";
 
-/// A scene and its rest state.
+/// A scene and its rest state. Domain "c" shares the coordinates of domain "a".
 pub(crate) struct StepTarget {
     scene: Arc<Scene>,
     rest: SceneState,
 }
 
-/// Three steps: coordinates and transforms, a quaternion, and a quaternion with a translation in f64.
+/// Steps and sequences of them: coordinates and transforms; a quaternion; a quaternion with a translation in f64; values
+/// of the whole scene, with coordinates of every domain and with each coordinate once.
 pub(crate) fn seeds(_target: &str) -> Vec<Vec<u8>> {
     let floats = |numbers: &[f32]| numbers.iter().flat_map(|number| number.to_le_bytes()).collect::<Vec<u8>>();
     let step = |format: u8, q_domains: &[u8], transform_domains: &[u8], q: &[u8], transforms: &[u8]| {
@@ -46,8 +47,11 @@ pub(crate) fn seeds(_target: &str) -> Vec<Vec<u8>> {
         step(0, &[0], &[1], &floats(&[0.5, -0.5]), &identity),
         step(1, &[], &[1], &[], &[quaternion.clone(), floats(&[1.0, 2.0, 3.0])].concat()),
         step(2, &[], &[0], &[], &[quaternion, translation].concat()),
+        step(0, &[], &[], &floats(&[0.25, 0.75, -0.5, 1.0]), &identity.repeat(3)),
+        step(0, &[], &[], &floats(&[0.5, 0.25]), &[]),
     ];
-    steps.iter().cloned().chain([steps.concat()]).collect()
+    let sequences = [steps[..3].concat(), steps[3..].concat()];
+    steps.into_iter().chain(sequences).collect()
 }
 
 impl StepTarget {
@@ -61,8 +65,11 @@ impl StepTarget {
         let repository = SceneRepository::new(Some(folder.path())).expect("expected a readable folder");
         let budget = MemoryBudget::new(MemoryKind::Host, u64::MAX, u64::MAX);
         let opened = repository.open(".", &MemoryReservation::new(&budget)).expect("expected a valid scene");
-        let rest = SceneState::rest(&opened.scene);
-        Self { scene: Arc::clone(&opened.scene), rest }
+        let mut parts = opened.scene.parts();
+        let sharing = Domain { name: "c".into(), shares_q_with: Some(0), ..parts.domains[0].clone() };
+        parts.domains.push(sharing);
+        let scene = Scene::new(parts).expect("expected a valid scene");
+        Self { rest: SceneState::rest(&scene), scene }
     }
 
     /// Parses and applies the steps. Returns whether all are valid.

@@ -21,7 +21,8 @@ const PARALLEL_TRANSFORMS: usize = 4096;
 pub struct RawStepUpdate {
     pub number: u64,
     pub time: f64,
-    /// Domains whose coordinates are in `q`. If this is empty and `q` is not, `q` contains all domains in order.
+    /// Domains whose coordinates are in `q`. If this is empty and `q` is not, `q` contains all domains in order, with
+    /// or without those that share the coordinates of another one.
     pub q_domains: Vec<u32>,
     /// r little-endian f32 per domain of `q_domains`, concatenated. The bytes need no alignment.
     pub q: bytes::Bytes,
@@ -139,7 +140,7 @@ impl StepUpdate {
 fn parse_coordinates(scene: &Scene, raw: &RawStepUpdate) -> Result<(Vec<CoordinateSpan>, Vec<f32>)> {
     let is_for_all_domains = raw.q_domains.is_empty() && !raw.q.is_empty();
     let domains = match is_for_all_domains {
-        true => (0..scene.domains.len() as u32).collect(),
+        true => domains_of_whole_q(scene, raw.q.len()),
         false => parse_domain_list(scene, "step.q_domains", &raw.q_domains)?,
     };
     let mut coordinate_count = 0;
@@ -169,6 +170,15 @@ fn parse_coordinates(scene: &Scene, raw: &RawStepUpdate) -> Result<(Vec<Coordina
         span.domain = scene.layout.q_owner(span.domain);
     }
     Ok((spans, values))
+}
+
+/// The domains of a `q` without a list of domains: all domains if it has the length of their coordinates, else those
+/// with coordinates of their own.
+fn domains_of_whole_q(scene: &Scene, q_bytes: usize) -> Vec<u32> {
+    let all_ranks: usize = scene.layout.domains.iter().map(|domain| domain.rank).sum();
+    let has_all_domains = q_bytes == 4 * all_ranks;
+    let indices = 0..scene.domains.len() as u32;
+    indices.filter(|index| has_all_domains || scene.domains[*index as usize].shares_q_with.is_none()).collect()
 }
 
 /// The transforms of a step, and the translations that were given in f64, each with the index of its domain.

@@ -95,6 +95,37 @@ fn changed_domains_include_those_that_share_coordinates() {
     assert_eq!((state.serial, &state.dirty_domains), (9, &DirtyDomains::All));
 }
 
+/// Domains 2 and 4 share the coordinates of domain 1, and domain 5 has no modes.
+#[test]
+fn q_without_list_has_each_coordinate_once_or_every_domain() {
+    let scene = scene(7);
+    let packed: Vec<f32> = (0..8).map(|number| number as f32).collect();
+    let of_domain = |domain: usize| scene.layout.domains[domain].first_q;
+    let every_domain: Vec<f32> =
+        [0, 1, 2, 3, 4, 6].iter().flat_map(|domain| packed[of_domain(*domain)..][..2].to_vec()).collect();
+    for values in [&packed, &every_domain] {
+        let state = state_after(&scene, &[coordinates_step(&[], values)]);
+        assert_eq!(state.q, packed, "{} numbers", values.len());
+        assert_eq!(state.dirty_domains, DirtyDomains::Some((0..7).collect()));
+    }
+    // Of several values of a coordinate, the last one counts.
+    let mut different = every_domain;
+    different[8] = 9.0;
+    assert_eq!(state_after(&scene, &[coordinates_step(&[], &different)]).q[2], 9.0);
+    for (numbers, given) in [(7, "28 bytes"), (9, "36 bytes")] {
+        let error = StepUpdate::parse(&scene, &coordinates_step(&[], &vec![0.0; numbers])).expect_err("a wrong length");
+        let expected = format!("step.q: expected 32 bytes (8 coordinates), got {given}");
+        assert!(error.to_string().contains(&expected), "{error}");
+    }
+    let mut invalid = packed;
+    invalid[5] = f32::NAN;
+    let error = StepUpdate::parse(&scene, &coordinates_step(&[], &invalid)).expect_err("a number that is not finite");
+    assert!(
+        error.to_string().contains("step.q[5]: expected a finite number, got NaN for mode 1 of domain 'point 3'"),
+        "{error}"
+    );
+}
+
 /// Recomputing only the domains in `dirty_domains` must suffice, and no entry of the list may be superfluous.
 #[test]
 fn changed_domains_are_complete_and_minimal() {

@@ -16,6 +16,7 @@ class Feature(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     FEATURE_UPLOAD_ARRAYS: _ClassVar[Feature]
     FEATURE_SHARED_MEMORY: _ClassVar[Feature]
     FEATURE_VIEWER: _ClassVar[Feature]
+    FEATURE_PACKED_Q: _ClassVar[Feature]
 FEATURE_UNSPECIFIED: Feature
 FEATURE_FRAMES: Feature
 FEATURE_CONTENT_HASHES: Feature
@@ -23,6 +24,7 @@ FEATURE_UPLOAD_REUSE: Feature
 FEATURE_UPLOAD_ARRAYS: Feature
 FEATURE_SHARED_MEMORY: Feature
 FEATURE_VIEWER: Feature
+FEATURE_PACKED_Q: Feature
 
 class GetServerInfoRequest(_message.Message):
     __slots__ = ()
