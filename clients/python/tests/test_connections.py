@@ -18,6 +18,7 @@ from conftest import SERVER_ARGUMENTS
 from scenes import SIZE, beam, beam_builder
 
 import modalcast as mc
+from modalcast._channel import default_address
 from modalcast._methods import PROTOCOL_VERSION
 from modalcast._server_process import _find_program
 
@@ -64,6 +65,20 @@ def test_invalid_addresses_are_rejected():
     for address in ("https://127.0.0.1:1", ""):
         with pytest.raises(ValueError, match="expected HOST:PORT, http://HOST:PORT or unix:PATH"):
             mc.connect(address)
+
+
+def test_environment_names_the_server(client: mc.Client, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("MODALCAST_SERVER", f"http://{client.address}")
+    with mc.connect() as connected:
+        assert connected.info == client.info
+    # An address of the caller comes first.
+    with pytest.raises(mc.ConnectionLost, match=r"127\.0\.0\.1:1: no connection"):
+        mc.connect("127.0.0.1:1", connect_timeout=0.1)
+    monkeypatch.setenv("MODALCAST_SERVER", "")
+    with pytest.raises(ValueError, match=r"expected HOST:PORT.*got an empty text"):
+        mc.connect()
+    monkeypatch.delenv("MODALCAST_SERVER")
+    assert default_address() == "127.0.0.1:50051"
 
 
 def test_connect_over_unix_socket(tmp_path: Path):

@@ -13,7 +13,6 @@ from pathlib import Path
 import pytest
 
 import modalcast as mc
-from modalcast import aio
 from modalcast._server_process import _find_program
 
 ROOT = Path(__file__).parents[3]
@@ -62,10 +61,8 @@ def test_python_runs(
     if "import subprocess" in block:
         monkeypatch.setenv("PATH", request.getfixturevalue("programs"), prepend=os.pathsep)
     monkeypatch.chdir(tmp_path)
-    connect, connect_async = mc.connect, aio.connect
     # The server of the tests in place of the one that the reader has started.
-    monkeypatch.setattr(mc, "connect", lambda _="", **options: connect(client.address, **options))
-    monkeypatch.setattr(aio, "connect", lambda _="", **options: connect_async(client.address, **options))
+    monkeypatch.setenv("MODALCAST_SERVER", client.address)
     exec(compile(block, "document.md", "exec"), {"__name__": "document"})
     if "save(" in block:
         pictures = [path for path in Path().iterdir() if path.suffix in {".png", ".jpg"}]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 # Bytes. The server sends messages of at most 3 MiB.
 _MAX_MESSAGE_BYTES = 4 << 20
 
@@ -28,6 +30,11 @@ UNIX_OPTIONS: list[tuple[str, int | str]] = [("grpc.default_authority", "localho
 def options_of(target: str) -> list[tuple[str, int | str]]:
     """The settings of connections to a target."""
     return CHANNEL_OPTIONS + (UNIX_OPTIONS if target.startswith("unix:") else [])
+
+
+def default_address() -> str:
+    """The address of the server if the caller names none."""
+    return os.environ.get("MODALCAST_SERVER", "127.0.0.1:50051")
 
 
 def target_of(address: str) -> str:

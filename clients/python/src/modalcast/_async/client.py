@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from modalcast._async.scene import Scene, open_scene
 from modalcast._async.streams import with_reconnect
 from modalcast._async.transport import RETRY_SECONDS, Transport, sleep
+from modalcast._channel import default_address
 from modalcast._methods import (
     DELETE_SCENE,
     FIND_UPLOADED_FILES,
@@ -303,12 +304,13 @@ class RecordedErrors(Iterator[RequestT]):
 
 
 async def connect(
-    address: str = "127.0.0.1:50051", *, timeout: float = 60.0, reconnect: float = 10.0, connect_timeout: float = 5.0
+    address: str | None = None, *, timeout: float = 60.0, reconnect: float = 10.0, connect_timeout: float = 5.0
 ) -> Client:
     """Connects to a server.
 
     Args:
-        address: HOST:PORT, http://HOST:PORT or unix:PATH.
+        address: HOST:PORT, http://HOST:PORT or unix:PATH; None: the environment variable MODALCAST_SERVER, or
+            127.0.0.1:50051.
         timeout: Default time limit of a call, in seconds.
         reconnect: Seconds for which calls without side effects, streams of the latest steps and drives wait for the
             server after a lost connection; 0: they raise `ConnectionLost` at once.
@@ -319,7 +321,7 @@ async def connect(
         ProtocolVersionError: The server has another version of the contract.
         ValueError: The address is invalid.
     """
-    transport = Transport(address)
+    transport = Transport(default_address() if address is None else address)
     client = Client(transport, timeout=timeout, reconnect=reconnect, server=None)
     try:
         await client.check_version(connect_timeout)
