@@ -67,9 +67,9 @@ class Recorder(
             for item in [value] if isinstance(value, Message) else value:
                 self.record(item)
 
-    def _sent(self, requests: Iterator[Message]) -> Iterator[Message]:
+    def _sent(self, path: str, requests: Iterator[Message | bytes]) -> Iterator[Message | bytes]:
         for request in requests:
-            self.record(request)
+            self.record(METHODS[path].request.FromString(request) if isinstance(request, bytes) else request)
             yield request
 
     def _received(self, path: str, replies: Any) -> Any:
@@ -99,7 +99,7 @@ class Recorder(
 
     def intercept_stream_unary(self, continuation: Any, client_call_details: Any, request_iterator: Any) -> Any:
         self.paths.add(client_call_details.method)
-        call = continuation(client_call_details, self._sent(request_iterator))
+        call = continuation(client_call_details, self._sent(client_call_details.method, request_iterator))
         if call.code() == grpc.StatusCode.OK:
             self.record(call.result())
         return call
@@ -111,7 +111,7 @@ class Recorder(
 
     def intercept_stream_stream(self, continuation: Any, client_call_details: Any, request_iterator: Any) -> Any:
         self.paths.add(client_call_details.method)
-        replies = continuation(client_call_details, self._sent(request_iterator))
+        replies = continuation(client_call_details, self._sent(client_call_details.method, request_iterator))
         return self._received(client_call_details.method, replies)
 
 

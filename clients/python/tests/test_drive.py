@@ -1,7 +1,11 @@
 from __future__ import annotations
 
+import base64
+import json
 import re
 import time
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,6 +13,7 @@ import pytest
 from scenes import RANK, beam
 
 import modalcast as mc
+from modalcast.states import StateLayout
 
 
 def expected_beam(q: np.ndarray) -> np.ndarray:
@@ -37,6 +42,30 @@ def test_all_coordinates_of_scene_are_one_array(beams: mc.Scene):
     assert state.q_of("copy").tolist() == [7, 8, 9]
 
 
+def test_transforms_of_scene_are_one_array(beams: mc.Scene):
+    matrices = np.tile(np.eye(4), (2, 1, 1))
+    matrices[:, :3, 3] = [[1, 2, 3], [4, 5, 6]]
+    with beams.drive() as drive:
+        drive.step(transforms=matrices)
+        np.testing.assert_array_equal(beams.state().transforms, matrices[:, :3])
+        moved = beams.state().transforms + np.float32(1)
+        drive.step(np.ones(2 * RANK), transforms=moved)
+    state = beams.state()
+    np.testing.assert_array_equal(state.transforms, moved)
+    assert state.q.tolist() == 2 * RANK * [1]
+
+
+def test_transforms_of_attached_domains_in_an_array_are_ignored(tree: mc.Scene):
+    trunk = tree.domains["trunk"]
+    with tree.drive(reset=True) as drive:
+        expected = drive.step(transforms={trunk: np.eye(4)}) and tree.state().transforms
+        transforms = np.zeros((len(tree.domains), 3, 4))
+        transforms[trunk.index] = np.eye(4)[:3]
+        drive.step(transforms=transforms)
+        np.testing.assert_array_equal(tree.state().transforms, expected)
+        drive.reset()
+
+
 def test_transforms_are_matrices(beams: mc.Scene):
     moved = np.eye(4)
     moved[:3, 3] = 1, 2, 3
@@ -55,6 +84,15 @@ def test_world_pose_far_from_origin_keeps_precision(beams: mc.Scene):
     assert vertex_set.positions is not None
     world = vertex_set.origins + vertex_set.positions.astype(np.float64)
     np.testing.assert_allclose(world[0], beam()[0][0] + [far, 0, 0], atol=1e-4)
+
+
+def test_world_poses_of_scene_are_one_array(beams: mc.Scene):
+    translations = np.array([[1e7, 0, 0], [1e7, 1, 0]])
+    with beams.drive() as drive:
+        drive.step(transforms=mc.WorldPose(np.tile([0.0, 0, 0, 1], (2, 1)), translations))
+    state = beams.state()
+    world = state.origins + state.transforms[:, :, 3].astype(np.float64)
+    np.testing.assert_allclose(world, translations, atol=1e-6)
 
 
 def test_wrong_arguments_name_expected_and_given(beams: mc.Scene):
@@ -248,6 +286,48 @@ def test_rejected_step_of_a_scene_with_joints_changes_nothing(tree: mc.Scene):
             drive.step(transforms={"trunk": np.full((3, 4), np.inf)})
         drive.step(q={"trunk": np.zeros(tree.domains["trunk"].rank)})
         np.testing.assert_allclose(tree.vertices(), before, atol=1e-5)
+
+
+@pytest.fixture(params=[True, False], ids=["packed", "listed"])
+def shared(client: mc.Client, tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[mc.Scene]:
+    """A glTF model of two primitives, of which the second one shares the weight of the first one."""
+    (tmp_path / "shared.gltf").write_text(json.dumps(model_of_two_primitives()))
+    scene = client.upload_files(tmp_path / "shared.gltf", "shared", replace=True)
+    if not request.param:
+        # As for a server of an earlier version.
+        scene._layout = StateLayout(scene.domains, has_packed_q=False)
+    yield scene
+    scene.delete()
+
+
+def model_of_two_primitives() -> dict[str, Any]:
+    positions = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4").tobytes()
+    displacements = np.array([[0, 0, 1]] * 3, "<f4").tobytes()
+    data = base64.b64encode(positions + displacements).decode()
+    accessor = {"componentType": 5126, "count": 3, "type": "VEC3", "min": [0, 0, 0], "max": [1, 1, 1]}
+    primitive = {"attributes": {"POSITION": 0}, "targets": [{"POSITION": 1}]}
+    return {
+        "asset": {"version": "2.0"},
+        "buffers": [{"byteLength": 72, "uri": f"data:application/octet-stream;base64,{data}"}],
+        "bufferViews": [{"buffer": 0, "byteOffset": 36 * index, "byteLength": 36} for index in range(2)],
+        "accessors": [{**accessor, "bufferView": index} for index in range(2)],
+        "meshes": [{"primitives": [primitive, {**primitive, "material": 0}]}],
+        "materials": [{}],
+        "nodes": [{"mesh": 0}, {"mesh": 0, "translation": [3, 0, 0]}],
+        "scenes": [{"nodes": [0, 1]}],
+        "scene": 0,
+    }
+
+
+def test_shared_coordinates_are_in_the_array_once(shared: mc.Scene):
+    assert [domain.shares_q_with for domain in shared.domains] == [None, 0, None, 2]
+    assert shared.coordinate_count == 2
+    with shared.drive() as drive:
+        drive.step([0.25, 0.5])
+        assert shared.state().q.tolist() == [0.25, 0.5]
+        np.testing.assert_allclose(shared.vertices()[:, 2], [0.25] * 6 + [0.5] * 6)
+        drive.reset()
+        assert not shared.state().q.any()
 
 
 def test_transform_of_attached_domain_needs_joints_false(tree: mc.Scene):

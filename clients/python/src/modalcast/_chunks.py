@@ -1,12 +1,8 @@
-"""Assembles chunks of the server into complete replies, without the copies that parsing with protobuf makes.
-
-protobuf copies the bytes of a field into its arena and again into a `bytes` object. Here, the data of a chunk is a view
-of the message as gRPC has received it, and is copied once, to its place in the reply.
-"""
+"""Assembles chunks of the server into complete replies. The data of a chunk are copied once, to their place there."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
@@ -14,68 +10,14 @@ import numpy as np
 from google.protobuf.message import DecodeError, Message
 
 from modalcast._types import Bytes
+from modalcast._wire import split_data, submessage
 from modalcast.errors import MalformedReply
 
 REPLY_LIMIT = 1 << 30
 """Largest reply that is assembled, in bytes."""
 
-_LENGTH_DELIMITED = 2
-_FIXED_BYTES = {1: 8, 5: 4}
-
 HeadT = TypeVar("HeadT", bound=Message)
 ChunkT = TypeVar("ChunkT", bound=Message)
-
-
-def _varint(buffer: memoryview, position: int) -> tuple[int, int]:
-    value = shift = 0
-    while True:
-        byte = buffer[position]
-        position += 1
-        value |= (byte & 0x7F) << shift
-        if byte < 0x80:
-            return value, position
-        shift += 7
-        if shift > 63:
-            raise DecodeError("a number has more than 64 bits")
-
-
-def _fields(buffer: memoryview) -> Iterator[tuple[int, int, int, int]]:
-    """The fields of a message: number, start of the tag, start of the content, end."""
-    position = 0
-    while position < len(buffer):
-        start = position
-        tag, position = _varint(buffer, position)
-        wire_type = tag & 7
-        content = position
-        if wire_type == _LENGTH_DELIMITED:
-            length, content = _varint(buffer, position)
-            position = content + length
-        elif wire_type == 0:
-            _, position = _varint(buffer, position)
-        elif wire_type in _FIXED_BYTES:
-            position += _FIXED_BYTES[wire_type]
-        else:
-            raise DecodeError(f"wire type {wire_type}")
-        if position > len(buffer):
-            raise DecodeError("a field exceeds its message")
-        yield tag >> 3, start, content, position
-
-
-def split_data(chunk: memoryview, data_field: int) -> tuple[bytes, memoryview]:
-    """Separates the data of a chunk from its other fields."""
-    for number, start, content, end in _fields(chunk):
-        if number == data_field:
-            return bytes(chunk[:start]) + bytes(chunk[end:]), chunk[content:end]
-    return bytes(chunk), memoryview(b"")
-
-
-def submessage(message: bytes, field: int) -> memoryview | None:
-    """The content of a message field; None if it is not set."""
-    view = memoryview(message)
-    for number, _, content, end in _fields(view):
-        if number == field:
-            return view[content:end]
-    return None
 
 
 @dataclass(frozen=True)

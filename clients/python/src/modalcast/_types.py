@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,6 +12,10 @@ Bytes: TypeAlias = NDArray[np.uint8]
 F32: TypeAlias = NDArray[np.float32]
 F64: TypeAlias = NDArray[np.float64]
 U32: TypeAlias = NDArray[np.uint32]
+Indices: TypeAlias = NDArray[np.intp]
+
+Rows: TypeAlias = NDArray[Any]
+"""Arrays of f32, or of structures with the layout of the wire."""
 
 Vector: TypeAlias = Sequence[float] | F64 | F32
 """Three numbers."""
@@ -27,7 +31,8 @@ def to_f32(name: str, values: ArrayLike, shape: tuple[int | None, ...]) -> F32:
     check_shape(name, given, shape)
     with np.errstate(over="ignore"):
         converted = np.ascontiguousarray(given, dtype="<f4")
-    if np.isinf(converted).sum() != np.isinf(given).sum():
+    is_rounded = converted.dtype != given.dtype and not np.isfinite(converted).all()
+    if is_rounded and np.isinf(converted).sum() != np.isinf(given).sum():
         largest = float(np.abs(given).max())
         raise ValueError(f"{name}: expected numbers of at most 3.4e38, which f32 can represent, got {largest:g}")
     return converted
@@ -68,20 +73,24 @@ def format_shape(shape: tuple[int | None, ...]) -> str:
     return f"({lengths},)" if len(shape) == 1 else f"({lengths})"
 
 
-def affine(name: str, transform: ArrayLike) -> F32:
-    """Converts a 3x4 or a 4x4 matrix to 3x4 f32.
+def affine(name: str, transforms: ArrayLike, leading: tuple[int, ...] = ()) -> F32:
+    """Converts 3x4 or 4x4 matrices, in an array with the `leading` dimensions before these, to 3x4 f32.
 
     Raises:
-        ValueError: The matrix has another shape, or the last row of a 4x4 matrix is not 0 0 0 1.
+        ValueError: The array has another shape, or the last row of a 4x4 matrix is not 0 0 0 1.
     """
-    matrix = to_f64(name, transform, np.shape(transform))
-    if matrix.shape == (4, 4):
-        if not np.array_equal(matrix[3], (0, 0, 0, 1)):
-            raise ValueError(f"{name}: expected the last row 0 0 0 1, got {matrix[3].tolist()}")
-        matrix = matrix[:3]
-    if matrix.shape != (3, 4):
-        raise ValueError(f"{name}: expected a matrix of shape (3, 4) or (4, 4), got {matrix.shape}")
-    return to_f32(name, matrix, (3, 4))
+    matrices = _real_array(name, transforms)
+    square_shape, shape = (*leading, 4, 4), (*leading, 3, 4)
+    if matrices.shape == square_shape:
+        last_rows = matrices[..., 3, :]
+        if not (last_rows == (0, 0, 0, 1)).all():
+            wrong = last_rows[(last_rows != (0, 0, 0, 1)).any(axis=-1)].reshape(-1, 4)[0]
+            raise ValueError(f"{name}: expected the last row 0 0 0 1, got {wrong.tolist()}")
+        matrices = matrices[..., :3, :]
+    if matrices.shape != shape:
+        kind = "an array" if leading else "a matrix"
+        raise ValueError(f"{name}: expected {kind} of shape {shape} or {square_shape}, got {matrices.shape}")
+    return to_f32(name, matrices, shape)
 
 
 def _real_array(name: str, values: ArrayLike) -> NDArray[np.generic]:

@@ -8,12 +8,12 @@ each coordinate is computed once.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from modalcast._types import F32, F64
+from modalcast._types import F32, F64, Indices
 from modalcast.scene_description import Domain
 from modalcast.states import StateLayout, square
 
@@ -38,7 +38,7 @@ def has_fit(domain: Domain, layout: StateLayout) -> bool:
 
 
 class Kinematics:
-    """Computes the transforms of all domains of a scene from its coordinates."""
+    """Computes the transforms of the domains of a scene that are attached to others or follow them."""
 
     def __init__(self, layout: StateLayout, points: Mapping[int, AttachmentPoints]) -> None:
         """Precomputes the fits.
@@ -48,46 +48,56 @@ class Kinematics:
             points: The attachment vertices of the domains for which `has_fit` is true, by domain.
         """
         self._layout = layout
-        self._fitted = np.array(sorted(points), np.intp)
+        self._tree = _DomainTree(layout)
+        fitted = sorted(points)
+        # The joint (the attachment of a domain to its parent) of each domain with a fit, -1 for the others.
+        self._joint_of: Indices = np.full(len(layout.domains), -1)
+        self._joint_of[fitted] = np.arange(len(fitted))
         self._rest_means = np.zeros((len(points), 3))
-        parents = [self._parent(index) for index in self._fitted.tolist()]
+        parents = [self._parent(index) for index in fitted]
         largest_rank = max((parent.rank for parent in parents), default=0)
         # Per joint: mean and correlation at rest (12 numbers), and their change per coordinate of the parent.
         self._rest_moments = np.zeros((len(points), 12))
         self._mode_moments = np.zeros((len(points), largest_rank, 12))
-        # For a parent with fewer modes, the remaining entries are the index of a zero after the last coordinate.
-        self._coordinates = np.full((len(points), largest_rank), layout.coordinate_count, np.intp)
-        for joint, (index, parent) in enumerate(zip(self._fitted.tolist(), parents, strict=True)):
+        # For a parent with fewer modes, the remaining entries are coordinate 0, whose moments are 0.
+        self._coordinates: Indices = np.zeros((len(points), largest_rank), np.intp)
+        for joint, (index, parent) in enumerate(zip(fitted, parents, strict=True)):
             place = layout.q_slice(parent)
             self._coordinates[joint, : parent.rank] = np.arange(place.start, place.stop)
             self._add_moments(joint, points[index], parent.rank)
         self._frames = self._rest_frames()
-        self._levels = self._order_by_depth()
 
-    def transforms(self, q: F64, root_transforms: F64) -> F64:
-        """world_from_domain of every domain, 4x4, at the coordinates `q` of the scene.
+    def dependents(self, domains: Iterable[int] | None) -> Indices:
+        """The domains whose transforms depend on the coordinates or the transforms of `domains`, sources first.
+
+        None selects those that depend on any domain.
+        """
+        return self._tree.below(domains)
+
+    def update(self, world: F64, q: F32, dependents: Indices) -> None:
+        """Computes the transforms of domains that `dependents` has returned, from those of all others.
 
         Args:
-            q: All coordinates.
-            root_transforms: 4x4 per domain; those of attached domains and of followers are ignored.
+            world: world_from_domain of every domain, 4x4, which receives the result.
+            q: All coordinates of the scene.
+            dependents: The domains to compute.
         """
-        local = self._frames.copy()
-        if len(self._fitted) > 0:
-            local[self._fitted] = self._fit(q) @ self._frames[self._fitted]
-        result = root_transforms.copy()
-        for domains, sources in self._levels:
-            result[domains] = result[sources] @ local[domains]
-        return result
+        local = self._frames[dependents]
+        joints = self._joint_of[dependents]
+        has_fit = joints >= 0
+        if has_fit.any():
+            local[has_fit] = self._fit(q, joints[has_fit]) @ local[has_fit]
+        for level in self._tree.levels(dependents):
+            domains = dependents[level]
+            world[domains] = world[self._tree.sources[domains]] @ local[level]
 
-    def _fit(self, q: F64) -> F64:
-        """The fitted rigid transform of each joint (the attachment of a domain to its parent), 4x4."""
-        values = np.append(q, 0.0)[self._coordinates]
-        moments = self._rest_moments + (values[:, None] @ self._mode_moments)[:, 0]
+    def _fit(self, q: F32, joints: Indices) -> F64:
+        """The fitted rigid transforms of joints, 4x4."""
+        values = q[self._coordinates[joints]].astype(np.float64)
+        moments = self._rest_moments[joints] + (values[:, None] @ self._mode_moments[joints])[:, 0]
         rotations = nearest_rotations(moments[:, 3:].reshape(-1, 3, 3))
-        rigid = np.tile(np.eye(4), (len(moments), 1, 1))
-        rigid[:, :3, :3] = rotations
-        rigid[:, :3, 3] = moments[:, :3] - (rotations @ self._rest_means[:, :, None])[..., 0]
-        return rigid
+        translations = moments[:, :3] - (rotations @ self._rest_means[joints][:, :, None])[..., 0]
+        return square(np.concatenate((rotations, translations[:, :, None]), axis=2))
 
     def _parent(self, index: int) -> Domain:
         parent = self._layout.domains[index].parent
@@ -113,20 +123,65 @@ class Kinematics:
                 frames[domain.index] = square(domain.attachment_frame)
         return frames
 
-    def _order_by_depth(self) -> list[tuple[np.ndarray[tuple[int], np.dtype[np.intp]], list[int]]]:
-        """Domains with the domains that they depend on: those of a level depend on earlier levels only."""
-        depths: list[int] = []
-        levels: list[list[tuple[int, int]]] = []
-        for domain in self._layout.domains:
-            source = domain.parent if domain.follows is None else domain.follows
+
+class _DomainTree:
+    """The domains that each domain depends on: the one that it follows, or the one that it is attached to.
+
+    Domains that depend on a domain are consecutive in the preorder of the tree, so that the domains below several
+    others are found without a loop over all domains.
+
+    Attributes:
+        sources: The domain that each domain depends on, -1 for none.
+    """
+
+    def __init__(self, layout: StateLayout) -> None:
+        sources = [domain.parent if domain.follows is None else domain.follows for domain in layout.domains]
+        self.sources: Indices = np.array([-1 if source is None else source for source in sources], np.intp)
+        self._depths: Indices = np.zeros(len(sources), np.intp)
+        # Number of domains below each domain. Sources have smaller indices than the domains that depend on them.
+        sizes = [0] * len(sources)
+        for index, source in reversed(list(enumerate(sources))):
+            if source is not None:
+                sizes[source] += 1 + sizes[index]
+        # The preorder: a domain, then all domains below it.
+        first_below = [0] * len(sources)
+        next_root = 0
+        next_below = [0] * len(sources)
+        self._preorder: Indices = np.zeros(len(sources), np.intp)
+        for index, source in enumerate(sources):
             if source is None:
-                depths.append(0)
-                continue
-            depths.append(depths[source] + 1)
-            if depths[-1] > len(levels):
-                levels.append([])
-            levels[depths[-1] - 1].append((domain.index, source))
-        return [(np.array([pair[0] for pair in level], np.intp), [pair[1] for pair in level]) for level in levels]
+                position, next_root = next_root, next_root + 1 + sizes[index]
+            else:
+                position, next_below[source] = next_below[source], next_below[source] + 1 + sizes[index]
+                self._depths[index] = self._depths[source] + 1
+            self._preorder[position] = index
+            first_below[index] = next_below[index] = position + 1
+        self._below = [slice(first, first + size) for first, size in zip(first_below, sizes, strict=True)]
+        # Domains with the same coordinates, by their owner, if there are several.
+        self._owner = layout.owner
+        self._sharing: dict[int, list[int]] = {}
+        for index, owner in enumerate(layout.owner):
+            self._sharing.setdefault(owner, []).append(index)
+        self._all = self._by_depth(np.flatnonzero(self.sources >= 0))
+
+    def below(self, domains: Iterable[int] | None) -> Indices:
+        """All domains below `domains` and below those that have the same coordinates, sources first; None: all."""
+        if domains is None:
+            return self._all
+        sharing = {other for domain in domains for other in self._sharing[self._owner[domain]]}
+        ranges = [self._preorder[self._below[domain]] for domain in sharing]
+        return self._by_depth(np.unique(np.concatenate(ranges))) if ranges else self._all[:0]
+
+    def levels(self, domains: Indices) -> Iterator[slice]:
+        """Slices of domains that `below` has returned: those of a slice depend on earlier slices only."""
+        ends = np.flatnonzero(np.diff(self._depths[domains], append=-1)) + 1
+        start = 0
+        for end in ends.tolist():
+            yield slice(start, end)
+            start = end
+
+    def _by_depth(self, domains: Indices) -> Indices:
+        return domains[np.argsort(self._depths[domains], kind="stable")]
 
 
 def nearest_rotations(correlations: F64) -> F64:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from modalcast._chunks import malformed
 from modalcast._common import StepId, stage_times, step_id
-from modalcast._types import F32, F64, Bytes
+from modalcast._types import F32, F64, Bytes, Indices
 from modalcast.scene_description import Domain, Domains
 from modalcast.v1 import states_pb2
 
@@ -22,33 +22,50 @@ class StateLayout:
         domains: The domains of the scene.
         first_coordinate: Index of the first coordinate of each domain; equal for domains that share coordinates.
         coordinate_count: Number of coordinates of all domains.
-        owns_q: Whether each domain has coordinates of its own.
+        owner: Index of the domain whose coordinates each domain has: the end of the chain of domains with which it
+            shares them, or the domain itself.
+        owners: Indices of the domains of rank above 0 that are their own owners.
+        all_q_domains: Indices of the domains with which a step lists all coordinates of the scene.
         root: Index of the root of each domain: the end of the chain of domains that it follows, or the domain itself.
+        roots: Indices of the domains that are their own roots.
         root_from_domain: 4x4 for each domain; the identity for a root.
+        is_attached: Whether each domain is a root that is attached to a parent.
     """
 
-    def __init__(self, domains: Domains) -> None:
+    def __init__(self, domains: Domains, *, has_packed_q: bool) -> None:
+        """Computes the layout.
+
+        Args:
+            domains: The domains of the scene.
+            has_packed_q: Whether the server has FEATURE_PACKED_Q.
+        """
         self.domains = domains
         self.first_coordinate: list[int] = []
-        self.owns_q: list[bool] = []
-        self.root: list[int] = []
-        self.root_from_domain: F64 = np.tile(np.eye(4), (len(domains), 1, 1))
+        self.owner: list[int] = []
         self.coordinate_count = 0
+        root: list[int] = []
+        self.root_from_domain: F64 = np.tile(np.eye(4), (len(domains), 1, 1))
         for domain in domains:
             others = {"parent": domain.parent, "shares_q_with": domain.shares_q_with, "follows": domain.follows}
             for name, other in others.items():
                 if other is not None and other >= domain.index:
                     raise malformed(f"domains[{domain.index}].{name}", f"below {domain.index}", str(other))
-            owner = domain.shares_q_with
-            self.owns_q.append(owner is None)
-            self.first_coordinate.append(self.coordinate_count if owner is None else self.first_coordinate[owner])
-            self.coordinate_count += domain.rank if owner is None else 0
+            shared = domain.shares_q_with
+            self.owner.append(domain.index if shared is None else self.owner[shared])
+            self.first_coordinate.append(self.coordinate_count if shared is None else self.first_coordinate[shared])
+            self.coordinate_count += domain.rank if shared is None else 0
             if domain.follows is None or domain.follow_frame is None:
-                self.root.append(domain.index)
+                root.append(domain.index)
                 continue
-            self.root.append(self.root[domain.follows])
+            root.append(root[domain.follows])
             frame = self.root_from_domain[domain.follows] @ square(domain.follow_frame)
             self.root_from_domain[domain.index] = frame
+        self.owners = [index for index, owner in enumerate(self.owner) if owner == index and domains[index].rank > 0]
+        shares_q = any(domain.rank > 0 and self.owner[domain.index] != domain.index for domain in domains)
+        self.all_q_domains = self.owners if shares_q and not has_packed_q else []
+        self.root: Indices = np.array(root, np.intp)
+        self.roots: Indices = np.flatnonzero(self.root == np.arange(len(root)))
+        self.is_attached = np.array([domain.parent is not None and domain.follows is None for domain in domains], bool)
 
     def q_slice(self, domain: Domain) -> slice:
         """The slice of a domain's coordinates in those of the scene."""
@@ -56,10 +73,11 @@ class StateLayout:
         return slice(first, first + domain.rank)
 
 
-def square(matrix: F32 | F64) -> F64:
-    """A 3x4 matrix as 4x4 f64."""
-    result = np.eye(4)
-    result[:3] = matrix
+def square(matrices: F32 | F64) -> F64:
+    """3x4 matrices, in an array of any number of dimensions, as 4x4 f64."""
+    result = np.zeros((*matrices.shape[:-2], 4, 4))
+    result[..., :3, :] = matrices
+    result[..., 3, 3] = 1
     return result
 
 
@@ -101,9 +119,8 @@ class StateDecoder:
         self._q: F32 = np.zeros(layout.coordinate_count, np.float32)
         # Transforms of roots; those of followers are computed from them.
         self._root_transforms: F32 = np.zeros((len(layout.domains), 3, 4), np.float32)
-        self._root = np.array(layout.root, np.intp)
+        self._root = layout.root
         self._is_root = self._root == np.arange(len(self._root))
-        self._roots = np.flatnonzero(self._is_root)
         self._origins: F64 = np.zeros((len(layout.domains), 3))
 
     def decode(self, head: states_pb2.StateHead, data: Bytes) -> SceneState:
@@ -152,7 +169,7 @@ class StateDecoder:
         transforms = numbers(states_pb2.STATE_CONTENT_TRANSFORMS, "<f4").reshape(-1, 3, 4)
         moved = numbers(states_pb2.STATE_CONTENT_TRANSFORM_DOMAINS, "<u4").astype(np.intp)
         if len(moved) == 0 < len(transforms):
-            moved = self._roots
+            moved = self._layout.roots
         if len(moved) != len(transforms):
             raise ValueError(f"{len(transforms)} transforms in place of {len(moved)}")
         self._root_transforms[moved] = transforms

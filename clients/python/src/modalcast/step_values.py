@@ -3,42 +3,48 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, TypeAlias, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from modalcast._types import F32, F64, Vector, affine, to_f32, vector3
+from modalcast._step_message import StepMessage
+from modalcast._types import F32, F64, Indices, Rows, affine, to_f32, to_f64
 from modalcast.kinematics import Kinematics
 from modalcast.scene_description import Domain
 from modalcast.states import StateLayout, square
 from modalcast.v1 import steps_pb2
 
-# In bytes: a step of at most _MAX_SINGLE_BYTES is one message, a larger one is sent in parts of _PART_BYTES.
-_MAX_SINGLE_BYTES = 1 << 20
-_PART_BYTES = 512 << 10
-# The index of a domain is a varint of at most 5 bytes.
-_PART_DOMAINS = _PART_BYTES // 5
+# A world pose on the wire.
+_POSE = np.dtype([("rotation", "<f4", 4), ("translation", "<f8", 3)])
 
 
 @dataclass(frozen=True)
 class WorldPose:
     """A rigid transform relative to the origin of the world, with an f64 translation, for scenes far from the origin.
 
+    Arrays with one more dimension have the poses of all domains of a scene.
+
     Attributes:
         rotation: Quaternion x, y, z, w; w is the real part. Its norm may differ from 1 by at most 0.001.
         translation: In scene units.
     """
 
-    rotation: Vector
-    translation: Vector
+    rotation: ArrayLike
+    translation: ArrayLike
 
-    def to_bytes(self) -> bytes:
-        """The quaternion in f32, then the translation in f64."""
-        rotation = to_f32("rotation", self.rotation, (4,))
-        return rotation.tobytes() + np.array(vector3("translation", self.translation), "<f8").tobytes()
+    def to_rows(self, name: str, shape: tuple[int, ...]) -> Rows:
+        """The poses as on the wire, in an array of this shape.
+
+        Raises:
+            ValueError: The rotation or the translation has another shape.
+        """
+        rows = np.empty(shape, _POSE)
+        rows["rotation"] = to_f32(f"rotation in {name}", self.rotation, (*shape, 4))
+        rows["translation"] = to_f64(f"translation in {name}", self.translation, (*shape, 3))
+        return rows
 
 
 DomainKey: TypeAlias = int | str | Domain
@@ -48,14 +54,32 @@ DomainKey: TypeAlias = int | str | Domain
 Coordinates: TypeAlias = Mapping[Any, ArrayLike] | ArrayLike
 """q by domain (name, index or domain), r numbers each; or all coordinates of the scene."""
 
-Transforms: TypeAlias = Mapping[Any, "ArrayLike | WorldPose"]
-"""world_from_domain by domain (name, index or domain): 3x4 or 4x4 matrices, or world poses."""
+Transforms: TypeAlias = Mapping[Any, "ArrayLike | WorldPose"] | ArrayLike | WorldPose
+"""world_from_domain by domain (name, index or domain), 3x4 or 4x4 matrices or world poses; or those of all domains."""
+
+
+@dataclass(frozen=True)
+class _GivenTransforms:
+    """Transforms of k domains, each given once. `is_whole`: of all domains whose transforms the caller sets."""
+
+    domains: Indices
+    rows: Rows
+    is_whole: bool = False
+
+    @property
+    def are_poses(self) -> bool:
+        """Whether the rows are poses, not matrices."""
+        return self.rows.dtype == _POSE
+
+
+_NO_TRANSFORMS = _GivenTransforms(np.empty(0, np.intp), np.empty((0, 3, 4), np.float32))
 
 
 class StepValues:
     """The current coordinates and transforms of a scene, and what has changed since the last step.
 
-    The arguments of a step are converted and checked completely before any value changes.
+    The arguments of a step are converted and checked completely before any value changes. The cost of a step depends on
+    the domains that it changes, not on those of the scene. Arrays of all domains are converted without a loop.
     """
 
     def __init__(self, layout: StateLayout, kinematics: Kinematics | None, q: F32, transforms: F32) -> None:
@@ -70,13 +94,18 @@ class StepValues:
         self._layout = layout
         self._kinematics = kinematics
         self._q = q.copy()
-        # world_from_domain as 4 x 4 per domain. `kinematics` ignores those of attached domains and followers.
-        self._roots: F64 = np.stack([square(transform) for transform in transforms])
+        # The transforms that the server has.
         self._sent: F32 = transforms.copy()
         # The last pose of each domain, if the caller sends poses instead of matrices.
-        self._poses: dict[int, WorldPose] = {}
-        domains = layout.domains
-        self._is_attached = np.array([domain.parent is not None and domain.follows is None for domain in domains])
+        self._poses: Rows = np.zeros(len(transforms), _POSE)
+        self._has_pose = np.zeros(len(transforms), bool)
+        # Domains whose transforms follow from those of other domains, and domains whose transforms the caller sets.
+        self._is_attached = layout.is_attached & (kinematics is not None)
+        self._own = layout.roots[~self._is_attached[layout.roots]]
+        # world_from_domain in f64, 4 x 4, from which the transforms of attached domains are computed.
+        self._world: F64 = square(transforms) if kinematics is not None else np.empty((0, 4, 4))
+        # Whether the transforms of attached domains may not follow from the coordinates, as those of the first state.
+        self._is_world_stale = True
 
     def step(
         self,
@@ -84,70 +113,102 @@ class StepValues:
         time: float,
         q: Coordinates | None,
         transforms: Transforms | None,
-    ) -> steps_pb2.Step:
+    ) -> StepMessage:
         """The message with the given values and the transforms of attached domains that change.
+
+        Its arrays may be those of the caller: encode it before they change.
 
         Raises:
             KeyError: A domain name is unknown.
             ValueError: An array has another shape, or a domain has no coordinates or no transform of its own.
         """
-        step = steps_pb2.Step(number=number, time=time)
-        changed_q = self._convert_q(q)
-        matrices, poses = self._convert_transforms(transforms or {})
-        for domain, values in changed_q.items():
-            step.q_domains.append(domain)
-            self._q[self._layout.q_slice(self._layout.domains[domain])] = values
-        step.q = b"".join(values.tobytes() for values in changed_q.values())
-        self._poses.update(poses)
-        if poses:
-            _add_poses(step, poses)
+        new_q = self._convert_q({} if q is None else q)
+        given = _NO_TRANSFORMS if transforms is None else self._convert_transforms(transforms)
+        message = StepMessage(steps_pb2.Step(number=number, time=time))
+        self._add_q(message, new_q)
+        if given.are_poses:
+            self._add_poses(message, given)
         else:
-            self._add_matrices(step, matrices)
-        return step
+            self._add_matrices(message, given, new_q)
+        return message
 
-    def complete_step(self, number: int, time: float) -> steps_pb2.Step:
+    def complete_step(self, number: int, time: float) -> StepMessage:
         """A step with all values, for a server that may have lost some of them.
 
         Transforms of a step have one format. If earlier steps have sent world poses, this step has the last pose of
         each domain, and domains without a pose keep the transforms that the server has.
         """
-        domains = self._layout.domains
-        step = steps_pb2.Step(number=number, time=time)
-        owners = [domain for domain in domains if self._layout.owns_q[domain.index] and domain.rank > 0]
-        step.q_domains.extend(domain.index for domain in owners)
-        step.q = b"".join(self._q[self._layout.q_slice(domain)].tobytes() for domain in owners)
-        if self._poses:
-            _add_poses(step, self._poses)
-            return step
-        moved = [domain.index for domain in domains if domain.follows is None]
-        step.transform_domains.extend(moved)
-        step.transforms = self._sent[moved].tobytes()
-        return step
+        message = StepMessage(steps_pb2.Step(number=number, time=time))
+        self._add_q(message, self._q)
+        if self._has_pose.any():
+            domains = np.flatnonzero(self._has_pose)
+            self._add_poses(message, _GivenTransforms(domains, self._poses[domains]))
+        else:
+            message.transforms = self._sent.take(self._layout.roots, axis=0)
+        return message
 
-    def _add_matrices(self, step: steps_pb2.Step, matrices: Mapping[int, F32]) -> None:
-        for index, matrix in matrices.items():
-            self._roots[index] = square(matrix)
-        current = self._sent.copy()
+    def _add_q(self, message: StepMessage, new_q: dict[int, F32] | F32) -> None:
+        if not isinstance(new_q, dict):
+            self._q[:] = new_q
+            message.head.q_domains.extend(self._layout.all_q_domains)
+            message.q = new_q
+        elif new_q:
+            for index, values in new_q.items():
+                self._q[self._layout.q_slice(self._layout.domains[index])] = values
+            message.head.q_domains.extend(new_q)
+            message.q = np.concatenate(list(new_q.values()))
+
+    def _add_poses(self, message: StepMessage, given: _GivenTransforms) -> None:
+        self._poses[given.domains] = given.rows
+        self._has_pose[given.domains] = True
+        message.head.transform_format = steps_pb2.TRANSFORM_FORMAT_QUATERNION_XYZW_F64
+        message.transforms = given.rows
+        if not given.is_whole:
+            message.head.transform_domains.extend(given.domains.tolist())
+
+    def _add_matrices(self, message: StepMessage, given: _GivenTransforms, new_q: dict[int, F32] | F32) -> None:
+        moved = np.concatenate((self._store(given.domains, given.rows), self._move_attached(given, new_q)))
+        roots = self._layout.roots
+        if given.is_whole and 2 * len(moved) > len(roots):
+            # A list of domains takes longer than the transforms that have not changed.
+            message.transforms = self._sent.take(roots, axis=0)
+        elif len(moved) > 0:
+            message.head.transform_domains.extend(moved.tolist())
+            message.transforms = self._sent.take(moved, axis=0)
+
+    def _store(self, domains: Indices, matrices: F32) -> Indices:
+        """Stores transforms. Returns the domains whose transform has changed in any bit."""
+        if len(domains) == 0:
+            return domains
+        stored = self._sent.take(domains, axis=0)
+        self._sent[domains] = matrices
+        return domains[(matrices.view(np.uint32) != stored.view(np.uint32)).any(axis=(1, 2))]
+
+    def _move_attached(self, given: _GivenTransforms, new_q: dict[int, F32] | F32) -> Indices:
+        """Computes the transforms that depend on new values. Returns the domains whose transform has changed."""
+        none = _NO_TRANSFORMS.domains
+        if self._kinematics is None or (isinstance(new_q, dict) and len(new_q) + len(given.domains) == 0):
+            return none
+        self._world[given.domains, :3] = given.rows
+        changed: list[int] | None = None
+        new_values: list[F32 | F64] = [self._q, self._world]
+        if not self._is_world_stale:
+            new_values = [*(new_q.values() if isinstance(new_q, dict) else [new_q]), given.rows]
+            if isinstance(new_q, dict) and not given.is_whole:
+                changed = [*new_q, *given.domains.tolist()]
         # The server rejects a step with infinite numbers or NaN.
-        is_finite = bool(np.isfinite(self._q).all() and np.isfinite(self._roots).all())
-        if self._kinematics is not None and (step.q_domains or matrices) and is_finite:
-            computed = self._kinematics.transforms(self._q.astype(np.float64), self._roots)[:, :3]
-            current[self._is_attached] = computed[self._is_attached]
-        for index, matrix in matrices.items():
-            current[index] = matrix
-        moved = np.flatnonzero((current.view(np.uint32) != self._sent.view(np.uint32)).any(axis=(1, 2)))
-        step.transform_domains.extend(moved.tolist())
-        step.transforms = current[moved].tobytes()
-        self._sent = current
+        self._is_world_stale = not all(np.isfinite(values).all() for values in new_values)
+        if self._is_world_stale:
+            return none
+        dependents = self._kinematics.dependents(changed)
+        self._kinematics.update(self._world, self._q, dependents)
+        attached = dependents[self._is_attached[dependents]]
+        return self._store(attached, self._world[attached, :3].astype(np.float32))
 
-    def _convert_q(self, q: Coordinates | None) -> dict[int, F32]:
+    def _convert_q(self, q: Coordinates) -> dict[int, F32] | F32:
         layout = self._layout
-        if q is None:
-            return {}
         if not isinstance(q, Mapping):
-            values = to_f32("q of the scene", q, (layout.coordinate_count,))
-            owners = [domain for domain in layout.domains if layout.owns_q[domain.index] and domain.rank > 0]
-            return {domain.index: values[layout.q_slice(domain)] for domain in owners}
+            return to_f32("q of the scene", q, (layout.coordinate_count,))
         converted: dict[int, F32] = {}
         coordinates_of = cast(Mapping[DomainKey, ArrayLike], q)
         for key, coordinates in coordinates_of.items():
@@ -158,66 +219,50 @@ class StepValues:
             converted[domain.index] = to_f32(f"q of domain '{domain.name}'", coordinates, (domain.rank,))
         return converted
 
-    def _convert_transforms(self, transforms: Transforms) -> tuple[dict[int, F32], dict[int, WorldPose]]:
+    def _convert_transforms(self, transforms: Transforms) -> _GivenTransforms:
+        name = "transforms of the scene"
+        if isinstance(transforms, Mapping):
+            given = self._convert_transforms_by_domain(cast(Mapping[DomainKey, "ArrayLike | WorldPose"], transforms))
+        elif isinstance(transforms, WorldPose):
+            poses = transforms.to_rows(name, (len(self._sent),))
+            given = _GivenTransforms(self._own, poses.take(self._own), is_whole=True)
+        else:
+            matrices = affine(name, transforms, (len(self._sent),))
+            given = _GivenTransforms(self._own, matrices.take(self._own, axis=0), is_whole=True)
+        if given.are_poses and self._kinematics is not None:
+            raise ValueError("transforms: expected world poses only, in a drive with joints=False")
+        if not given.are_poses and len(given.domains) > 0 and self._has_pose.any():
+            raise ValueError("transforms: expected world poses, as in earlier steps of the drive, got matrices")
+        return given
+
+    def _convert_transforms_by_domain(self, transforms: Mapping[DomainKey, ArrayLike | WorldPose]) -> _GivenTransforms:
         matrices: dict[int, F32] = {}
-        poses: dict[int, WorldPose] = {}
-        for key, transform in cast(Mapping[DomainKey, "ArrayLike | WorldPose"], transforms).items():
+        poses: dict[int, Rows] = {}
+        for key, transform in transforms.items():
             domain = self._layout.domains[key]
             name = f"transform of domain '{domain.name}'"
             if domain.follows is not None:
                 leader = self._layout.domains[domain.follows].name
                 raise ValueError(f"{name}: the domain follows domain '{leader}': set the transform of that domain")
             if isinstance(transform, WorldPose):
-                poses[domain.index] = transform
-            elif self._kinematics is not None and self._is_attached[domain.index]:
+                poses[domain.index] = transform.to_rows(name, ())
+            elif self._is_attached[domain.index]:
                 raise ValueError(f"{name}: it follows from the joint; open the drive with joints=False to set it")
             else:
                 matrices[domain.index] = affine(name, transform)
-        if poses and (matrices or self._kinematics is not None):
+        if poses and matrices:
             raise ValueError("transforms: expected world poses only, in a drive with joints=False")
-        if matrices and self._poses:
-            raise ValueError("transforms: expected world poses, as in earlier steps of the drive, got matrices")
-        return matrices, poses
-
-
-def _add_poses(step: steps_pb2.Step, poses: Mapping[int, WorldPose]) -> None:
-    step.transform_domains.extend(poses)
-    step.transforms = b"".join(pose.to_bytes() for pose in poses.values())
-    step.transform_format = steps_pb2.TRANSFORM_FORMAT_QUATERNION_XYZW_F64
-
-
-def step_parts(step: steps_pb2.Step) -> Iterator[steps_pb2.Step]:
-    """The step as one message or, above 1 MiB, in parts."""
-    if step.ByteSize() <= _MAX_SINGLE_BYTES:
-        yield step
-        return
-    parts = [
-        steps_pb2.Step(number=step.number, time=step.time, transform_format=step.transform_format),
-        *(steps_pb2.Step(number=step.number, q_domains=piece) for piece in _pieces(step.q_domains, _PART_DOMAINS)),
-        *(steps_pb2.Step(number=step.number, q=piece) for piece in _pieces(step.q, _PART_BYTES)),
-        *(
-            steps_pb2.Step(number=step.number, transform_domains=piece)
-            for piece in _pieces(step.transform_domains, _PART_DOMAINS)
-        ),
-        *(steps_pb2.Step(number=step.number, transforms=piece) for piece in _pieces(step.transforms, _PART_BYTES)),
-    ]
-    for part in parts[:-1]:
-        part.has_more = True
-    yield from parts
-
-
-def _pieces(values: Any, size: int) -> Iterator[Any]:
-    """Splits a list or bytes."""
-    for start in range(0, len(values), size):
-        yield values[start : start + size]
+        rows: Mapping[int, Rows] = poses or matrices
+        if not rows:
+            return _NO_TRANSFORMS
+        return _GivenTransforms(np.array(list(rows), np.intp), np.stack(list(rows.values())))
 
 
 def rest_values(layout: StateLayout) -> tuple[F32, F32]:
     """The coordinates and the transforms of the scene at rest."""
     q = np.zeros(layout.coordinate_count, np.float32)
-    for domain in layout.domains:
-        if layout.owns_q[domain.index]:
-            q[layout.q_slice(domain)] = domain.rest_q
+    for index in layout.owners:
+        q[layout.q_slice(layout.domains[index])] = layout.domains[index].rest_q
     return q, np.stack([domain.placement for domain in layout.domains]).astype(np.float32)
 
 

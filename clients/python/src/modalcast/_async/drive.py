@@ -9,10 +9,11 @@ from dataclasses import dataclass, replace
 from modalcast._async.streams import with_reconnect
 from modalcast._async.transport import StepStream, Transport
 from modalcast._common import Delivery, StepId, delivery_message
+from modalcast._step_message import StepMessage
 from modalcast.errors import ConnectionLost
 from modalcast.kinematics import Kinematics
 from modalcast.states import SceneState, StateLayout
-from modalcast.step_values import Coordinates, StepValues, Transforms, rest_values, step_parts, to_time
+from modalcast.step_values import Coordinates, StepValues, Transforms, rest_values, to_time
 from modalcast.v1 import steps_pb2
 
 
@@ -92,12 +93,15 @@ class Drive:
     ) -> StepId:
         """Sends a step. Values that are not given remain unchanged.
 
-        Domains that are attached to a domain that deforms move with it: their transforms are computed and sent.
+        Domains that are attached to a domain that deforms move with it: their transforms are computed and sent. A step
+        takes the time of the values that it changes. For a whole scene, arrays are much faster than mappings.
 
         Args:
-            q: Coordinates by domain (name, index or domain), r numbers each; or all coordinates of the scene.
+            q: Coordinates by domain (name, index or domain), r numbers each; or all coordinates of the scene, in the
+                order of `SceneState.q`.
             transforms: world_from_domain by domain: 3x4 or 4x4, translation in scene units relative to the scene's
-                origin; or `WorldPose`.
+                origin; or `WorldPose`. Or those of all domains: D x 3 x 4 or D x 4 x 4, or one `WorldPose` of arrays.
+                In such arrays, domains that follow another one are ignored, and attached ones unless joints=False.
             time: Simulation time in seconds; None: dt after the previous step.
             wait: Whether to wait until the server has completed the step. If not, this waits only while the server has
                 no capacity, and a rejection is raised by a later call.
@@ -234,18 +238,19 @@ class Drive:
     def _is_idle(self) -> bool:
         return not self._stream.progress.in_flight
 
-    async def _send(self, message: steps_pb2.Step, timeout: float) -> None:
+    async def _send(self, message: StepMessage, timeout: float) -> None:
         stream = self._stream
         self._is_stale = True
+        requests = message.encode()
         await stream.wait_until(lambda: stream.progress.fits(self._options.window), timeout)
-        stream.progress.in_flight.append(message.number)
-        self._next_number = message.number + 1
+        stream.progress.in_flight.append(message.head.number)
+        self._next_number = message.head.number + 1
         try:
-            for part in step_parts(message):
-                await stream.send(part, timeout)
+            for request in requests:
+                await stream.send(request, timeout)
         except BaseException:
             # No acknowledgment will arrive for this step.
-            stream.progress.discard(message.number)
+            stream.progress.discard(message.head.number)
             raise
         self._is_stale = False
 

@@ -39,7 +39,16 @@ from modalcast.frame import ColorFormat, Frame, Outputs, PictureOptions, picture
 from modalcast.kinematics import Kinematics
 from modalcast.scene_description import ArrayName, Domain, Domains, SceneDescription
 from modalcast.states import SceneState, StateLayout
-from modalcast.v1 import common_pb2, forces_pb2, frames_pb2, scenes_pb2, states_pb2, steps_pb2, vertices_pb2
+from modalcast.v1 import (
+    common_pb2,
+    forces_pb2,
+    frames_pb2,
+    scenes_pb2,
+    server_pb2,
+    states_pb2,
+    steps_pb2,
+    vertices_pb2,
+)
 from modalcast.vertices import Attributes, VertexSet, output_bytes, vertex_selection
 from modalcast.viewer import ViewerLink, viewer_link
 
@@ -79,7 +88,8 @@ class Scene:
         self._force_owner = force_owner
         self._timeout = timeout
         self._reconnect = reconnect
-        self._layout = StateLayout(self.domains)
+        has_packed_q = server_pb2.FEATURE_PACKED_Q in client.info.features
+        self._layout = StateLayout(self.domains, has_packed_q=has_packed_q)
         self._kinematics: Kinematics | None = None
 
     @property

@@ -71,7 +71,7 @@ class StepStream:
         """
         try:
             async with asyncio.timeout(timeout):
-                await self._call.write(steps_pb2.DriveSceneRequest(open=request))
+                await self._call.write(steps_pb2.DriveSceneRequest(open=request).SerializeToString())
                 reply = await self._call.read()
         except grpc.RpcError as error:
             raise from_rpc_error(error, self._address) from None
@@ -84,8 +84,8 @@ class StepStream:
         self._reader = asyncio.create_task(self._read_replies())
         return reply.opened
 
-    async def send(self, step: steps_pb2.Step, timeout: float) -> None:
-        """Sends a part of a step. gRPC ends the stream if this is cancelled.
+    async def send(self, request: bytes, timeout: float) -> None:
+        """Sends an encoded step or a part of one. gRPC ends the stream if this is cancelled.
 
         Raises:
             DeadlineExceeded: The server had no capacity in time, and the stream has ended.
@@ -95,7 +95,7 @@ class StepStream:
             raise self.progress.end.with_traceback(None)
         try:
             async with asyncio.timeout(timeout):
-                await self._call.write(steps_pb2.DriveSceneRequest(step=step))
+                await self._call.write(request)
         except TimeoutError:
             complaint = f"the server had no capacity for a step within {timeout:g} s, and the drive has ended"
             raise DeadlineExceeded(f"{self._address}: {complaint}") from None
@@ -229,7 +229,8 @@ class Transport:
     def step_stream(self) -> StepStream:
         """Makes a call that sends steps."""
         method = DRIVE_SCENE
-        call = self._channel.stream_stream(method.path, method.request.SerializeToString, method.reply.FromString)
+        # The requests are encoded already.
+        call = cast(Any, self._channel.stream_stream(method.path, None, method.reply.FromString))
         return StepStream(call(), self.address)
 
     async def close(self) -> None:

@@ -67,14 +67,14 @@ class ReplyStream:
 
 
 class _RequestQueue:
-    """The requests of a step stream. gRPC takes them in a thread of its own; a full queue blocks `put`."""
+    """The encoded requests of a step stream. gRPC takes them in a thread of its own; a full queue blocks `put`."""
 
     def __init__(self) -> None:
-        self._requests: deque[steps_pb2.DriveSceneRequest] = deque()
+        self._requests: deque[bytes] = deque()
         self._condition = threading.Condition()
         self._is_closed = False
 
-    def put(self, request: steps_pb2.DriveSceneRequest, timeout: float) -> bool:
+    def put(self, request: bytes, timeout: float) -> bool:
         """Adds a request. Returns False if the queue had no capacity in time. A closed queue drops the request."""
 
         def has_capacity() -> bool:
@@ -94,10 +94,10 @@ class _RequestQueue:
             self._is_closed = True
             self._condition.notify_all()
 
-    def __iter__(self) -> Iterator[steps_pb2.DriveSceneRequest]:
+    def __iter__(self) -> Iterator[bytes]:
         return self
 
-    def __next__(self) -> steps_pb2.DriveSceneRequest:
+    def __next__(self) -> bytes:
         with self._condition:
             self._condition.wait_for(lambda: self._is_closed or self._requests)
             if not self._requests:
@@ -130,7 +130,7 @@ class StepStream:
         Raises:
             Error: The server rejects the request, or does not answer in time.
         """
-        self._requests.put(steps_pb2.DriveSceneRequest(open=request), timeout)
+        self._requests.put(steps_pb2.DriveSceneRequest(open=request).SerializeToString(), timeout)
         self._wait(lambda: self._opened is not None, timeout, "the drive did not open")
         reply = self._opened or steps_pb2.DriveSceneResponse()
         if reply.HasField("rejection"):
@@ -139,8 +139,8 @@ class StepStream:
             raise malformed("drive.opened", "`opened` first", "another message")
         return reply.opened
 
-    def send(self, step: steps_pb2.Step, timeout: float) -> None:
-        """Sends a part of a step.
+    def send(self, request: bytes, timeout: float) -> None:
+        """Sends an encoded step or a part of one.
 
         Raises:
             DeadlineExceeded: The server had no capacity in time; the stream remains open.
@@ -148,7 +148,7 @@ class StepStream:
         """
         if self.progress.end is not None:
             raise self.progress.end.with_traceback(None)
-        if not self._requests.put(steps_pb2.DriveSceneRequest(step=step), timeout):
+        if not self._requests.put(request, timeout):
             raise DeadlineExceeded(f"{self._address}: the server had no capacity for a step within {timeout:g} s")
 
     def wait_until(self, condition: Callable[[], bool], timeout: float) -> None:
@@ -281,8 +281,9 @@ class Transport:
     def step_stream(self) -> StepStream:
         """Makes a call that sends steps."""
         method = DRIVE_SCENE
-        call = self._channel.stream_stream(method.path, method.request.SerializeToString, method.reply.FromString)
-        return StepStream(cast(Callable[[_RequestQueue], _Call], call), self.address)
+        # The requests are encoded already.
+        call = cast(Any, self._channel.stream_stream(method.path, None, method.reply.FromString))
+        return StepStream(call, self.address)
 
     def close(self) -> None:
         """Closes the connections, and ends all calls."""
