@@ -1,6 +1,9 @@
 from __future__ import annotations
 
+import platform
 import re
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -35,6 +38,36 @@ def test_large_reply_fills_out_across_chunks(tree: mc.Scene):
     out = np.zeros_like(expected)
     tree.vertices(out=out)
     np.testing.assert_array_equal(out, expected)
+
+
+# Reads the scene "large", and prints the page faults per reply.
+COUNT_PAGE_FAULTS = """
+import resource, sys
+import numpy as np
+import modalcast as mc
+with mc.connect(sys.argv[1]) as client:
+    scene = client.scene("large")
+    out = np.zeros((scene.vertex_count, 3), np.float32)
+    for _ in range(5):
+        scene.vertices(out=out)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    for _ in range(20):
+        scene.vertices(out=out)
+    print((resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before) / 20)
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="needs the allocator of glibc")
+def test_large_replies_reuse_their_memory(client: mc.Client):
+    count = 400_000
+    faces = np.arange(3 * (count // 3)).reshape(-1, 3)
+    scene = client.add_scene("large", np.random.default_rng(0).random((count, 3)), faces, replace=True)
+    command = [sys.executable, "-c", COUNT_PAGE_FAULTS, client.address]
+    faults = float(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+    scene.delete()
+    pages = 12 * count / 4096
+    # Without it, there is about one fault per page.
+    assert faults < 0.3 * pages
 
 
 def test_encodings_differ_by_their_error_bounds(tree: mc.Scene):

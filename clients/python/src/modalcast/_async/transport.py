@@ -11,7 +11,7 @@ import grpc
 import grpc.aio
 from google.protobuf.message import Message
 
-from modalcast._channel import options_of, target_of
+from modalcast._channel import keep_memory_of_messages, options_of, target_of
 from modalcast._chunks import malformed
 from modalcast._methods import DRIVE_SCENE, GET_SERVER_INFO, Method
 from modalcast._step_progress import Progress
@@ -162,6 +162,7 @@ class Transport:
         """
         self.address = address
         self._target = target_of(address)
+        keep_memory_of_messages()
         self._channel = self._new_channel()
         self._subscriptions: grpc.aio.Channel | None = None
 

@@ -12,7 +12,7 @@ import grpc
 from google.protobuf.message import Message
 from grpc.experimental import ChannelOptions  # pyright: ignore[reportMissingTypeStubs]
 
-from modalcast._channel import options_of, target_of
+from modalcast._channel import keep_memory_of_messages, options_of, target_of
 from modalcast._chunks import malformed
 from modalcast._methods import DRIVE_SCENE, GET_SERVER_INFO, Method
 from modalcast._step_progress import Progress
@@ -216,6 +216,7 @@ class Transport:
         """
         self.address = address
         self._target = target_of(address)
+        keep_memory_of_messages()
         self._channel = self._new_channel()
         self._subscriptions: grpc.Channel | None = None
 
