@@ -3055,7 +3055,7 @@ impl Output {
         }
     }
 }
-/// Encoding of a frame. Color and color maps are PNG, JPEG or RGBA. Every other output has exactly one format. Values of
+/// Encoding of a frame. Color and color maps are PNG, JPEG, RGB or RGBA. Every other output has exactly one format. Values of
 /// several bytes are little-endian; rows are stored without padding, top row first.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
 #[repr(i32)]
@@ -3075,6 +3075,9 @@ pub enum Format {
     /// 8-bit sRGB baseline JPEG (JFIF), without alpha. Below a quality of 90 the chroma has half the resolution in both
     /// directions (4:2:0), else the full one.
     Jpeg = 6,
+    /// RGB8 sRGB, 3 bytes per pixel: FORMAT_RGBA without alpha, which is 255 in every frame. Only a server with
+    /// FEATURE_RGB_FRAMES accepts it.
+    Rgb = 7,
 }
 impl Format {
     /// String value of the enum field names used in the ProtoBuf definition.
@@ -3090,6 +3093,7 @@ impl Format {
             Self::U32 => "FORMAT_U32",
             Self::F32x3 => "FORMAT_F32X3",
             Self::Jpeg => "FORMAT_JPEG",
+            Self::Rgb => "FORMAT_RGB",
         }
     }
     /// Creates an enum from field names used in the ProtoBuf definition.
@@ -3102,6 +3106,7 @@ impl Format {
             "FORMAT_U32" => Some(Self::U32),
             "FORMAT_F32X3" => Some(Self::F32x3),
             "FORMAT_JPEG" => Some(Self::Jpeg),
+            "FORMAT_RGB" => Some(Self::Rgb),
             _ => None,
         }
     }
@@ -5692,6 +5697,8 @@ pub enum Feature {
     Viewer = 6,
     /// A step without `q_domains` may have each coordinate of the scene once, see Step.q_domains.
     PackedQ = 7,
+    /// Pictures may have FORMAT_RGB.
+    RgbFrames = 8,
 }
 impl Feature {
     /// String value of the enum field names used in the ProtoBuf definition.
@@ -5708,6 +5715,7 @@ impl Feature {
             Self::SharedMemory => "FEATURE_SHARED_MEMORY",
             Self::Viewer => "FEATURE_VIEWER",
             Self::PackedQ => "FEATURE_PACKED_Q",
+            Self::RgbFrames => "FEATURE_RGB_FRAMES",
         }
     }
     /// Creates an enum from field names used in the ProtoBuf definition.
@@ -5721,6 +5729,7 @@ impl Feature {
             "FEATURE_SHARED_MEMORY" => Some(Self::SharedMemory),
             "FEATURE_VIEWER" => Some(Self::Viewer),
             "FEATURE_PACKED_Q" => Some(Self::PackedQ),
+            "FEATURE_RGB_FRAMES" => Some(Self::RgbFrames),
             _ => None,
         }
     }

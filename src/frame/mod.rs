@@ -4,10 +4,12 @@
 mod colormap;
 mod legend;
 mod png;
+mod rgb;
 
 pub use colormap::{apply_colormap, viridis};
 pub use legend::{Legend, draw as draw_legend, round_up_scale};
 pub use png::{EncodedStrip, PngLayout, StripBuffers};
+pub use rgb::drop_alpha;
 
 use modalcast_model::error::{Result, fault_in};
 

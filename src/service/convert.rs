@@ -327,7 +327,12 @@ pub(super) fn parse_pick(engine: &Engine, scene: &Scene, request: &v1::PickReque
 pub(super) fn wire_picture(RequestedPicture { spec, format }: &RequestedPicture) -> v1::Picture {
     let jpeg_quality = match format {
         FrameFormat::Jpeg(quality) => quality.get().into(),
-        FrameFormat::Png | FrameFormat::Rgba | FrameFormat::F32 | FrameFormat::U32 | FrameFormat::F32x3 => 0,
+        FrameFormat::Png
+        | FrameFormat::Rgb
+        | FrameFormat::Rgba
+        | FrameFormat::F32
+        | FrameFormat::U32
+        | FrameFormat::F32x3 => 0,
     };
     v1::Picture {
         width: spec.size.width,

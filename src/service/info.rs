@@ -68,7 +68,9 @@ fn to_ms(duration: Duration) -> u32 {
 fn list_features(info: &EngineInfo, config: &Config) -> Vec<v1::Feature> {
     let mut features =
         vec![v1::Feature::ContentHashes, v1::Feature::UploadReuse, v1::Feature::UploadArrays, v1::Feature::PackedQ];
-    features.extend(info.renderer.is_ok().then_some(v1::Feature::Frames));
+    if info.renderer.is_ok() {
+        features.extend([v1::Feature::Frames, v1::Feature::RgbFrames]);
+    }
     features.extend(config.shared_memory.is_some().then_some(v1::Feature::SharedMemory));
     features.extend(config.viewer.then_some(v1::Feature::Viewer));
     features
@@ -101,6 +103,7 @@ mod tests {
         let no_renderer = info(Err(fault("renderer", "none")));
         assert_eq!(list_features(&no_renderer, &config(None, false)), always);
         let features = list_features(&info(Ok(renderer)), &config(Some("socket".into()), true));
-        assert_eq!(features[always.len()..], [v1::Feature::Frames, v1::Feature::SharedMemory, v1::Feature::Viewer]);
+        let expected = [v1::Feature::Frames, v1::Feature::RgbFrames, v1::Feature::SharedMemory, v1::Feature::Viewer];
+        assert_eq!(features[always.len()..], expected);
     }
 }

@@ -21,7 +21,7 @@ fn camera(height: f64) -> Option<Camera> {
     Some(Camera { view, lens: Lens::FieldOfView(40.0), clip: None })
 }
 
-/// Pictures of two cameras and of all kinds of outputs. The first two differ only in their format.
+/// Pictures of several cameras and of all kinds of outputs. The first two and the last two differ only in their format.
 fn pictures() -> Vec<Picture> {
     let color = Picture { camera: camera(0.5), ..Picture::default() }.size(48, 32);
     let raw_color = color.format(FrameFormat::Rgba);
@@ -36,6 +36,7 @@ fn pictures() -> Vec<Picture> {
         output(Output::Normals).size(40, 40),
         output(Output::Displacement { scale_max: 0.0 }),
         Picture { camera: camera(-0.5), ..raw_color },
+        Picture { camera: camera(-0.5), ..color.format(FrameFormat::Rgb) },
     ]
 }
 
@@ -53,6 +54,9 @@ async fn pictures_of_one_request_equal_single_requests() {
         let is_unique = frames[..index].iter().all(|earlier| earlier.bytes != frame.bytes);
         assert!(is_unique, "negative control: expected different bytes of picture {index}");
     }
+    let [.., rgba, rgb] = frames.as_slice() else { panic!("expected several frames") };
+    let colors: Vec<u8> = rgba.bytes.as_chunks::<4>().0.iter().flat_map(|pixel| pixel[..3].to_vec()).collect();
+    assert!(rgb.bytes == colors, "expected the colors of the same picture");
     let default_frames = client.render_frames(&FramesRequest::new("strips", vec![])).await.expect("expected a frame");
     assert_eq!((default_frames.len(), default_frames[0].width), (1, 1280));
 }

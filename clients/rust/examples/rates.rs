@@ -52,7 +52,7 @@ impl Stepper {
         let drive = client.drive(&DriveRequest::new(scene, Delivery::Lossless)).await?;
         let view = View::LookAt { eye: [0.0, 1e3, 0.0], target: [0.0, 2e3, 0.0], up: Some([0.0, 0.0, 1.0]) };
         let camera = looks_up.then_some(Camera { view, lens: Lens::FieldOfView(45.0), clip: None });
-        let picture = Picture { camera, ..Picture::default() }.size(1280, 720).format(FrameFormat::Rgba);
+        let picture = Picture { camera, ..Picture::default() }.size(1280, 720).format(FrameFormat::Rgb);
         Ok(Self { drive, picture, q: vec![0.0; rank], number: 0 })
     }
 
@@ -64,7 +64,7 @@ impl Stepper {
         self.drive.flush().await?;
         let frame = client.render_frame(&FrameRequest::new(scene, self.picture)).await?;
         let seconds = start.elapsed().as_secs_f64();
-        assert_eq!(frame.bytes.len(), 4 * 1280 * 720);
+        assert_eq!(frame.bytes.len(), 3 * 1280 * 720);
         Ok(seconds)
     }
 }

@@ -32,6 +32,8 @@ pub enum FrameFormat {
     Png,
     /// Without alpha; see [`Picture::jpeg_quality`].
     Jpeg,
+    /// Three bytes per pixel, if the server has [`Feature::RgbFrames`](crate::Feature::RgbFrames).
+    Rgb,
     Rgba,
     /// Little-endian f32, one per pixel: the only format of [`Output::Depth`] and
     /// [`Output::DepthWithGround`].
@@ -48,6 +50,7 @@ impl FrameFormat {
         match self {
             Self::Png => "png",
             Self::Jpeg => "jpg",
+            Self::Rgb => "rgb",
             Self::Rgba => "rgba",
             Self::F32 => "f32",
             Self::U32 => "u32",
@@ -377,6 +380,7 @@ impl WireChunk for v1::FrameChunk {
         let (format, pixel_bytes) = match head.format() {
             v1::Format::Png => (FrameFormat::Png, None),
             v1::Format::Jpeg => (FrameFormat::Jpeg, None),
+            v1::Format::Rgb => (FrameFormat::Rgb, Some(3)),
             v1::Format::Rgba => (FrameFormat::Rgba, Some(4)),
             v1::Format::F32 => (FrameFormat::F32, Some(4)),
             v1::Format::U32 => (FrameFormat::U32, Some(4)),
@@ -465,6 +469,7 @@ impl From<Picture> for v1::Picture {
             (Output::Depth | Output::DepthWithGround | Output::Domains | Output::Normals, _)
             | (_, FrameFormat::Png) => v1::Format::Unspecified,
             (_, FrameFormat::Jpeg) => v1::Format::Jpeg,
+            (_, FrameFormat::Rgb) => v1::Format::Rgb,
             (_, FrameFormat::Rgba) => v1::Format::Rgba,
             (_, FrameFormat::F32) => v1::Format::F32,
             (_, FrameFormat::U32) => v1::Format::U32,

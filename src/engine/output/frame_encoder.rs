@@ -143,6 +143,7 @@ impl FrameEncoder {
                 let encode = move || frame::encode_jpeg(width, height, &rgba, quality.get()).map(Bytes::from);
                 self.run(&permit, encode).await?
             }
+            FrameFormat::Rgb => self.run(&permit, move || Ok(frame::drop_alpha(&rgba).into())).await?,
             FrameFormat::Rgba => (rgba, 0.0),
             FrameFormat::F32 | FrameFormat::U32 | FrameFormat::F32x3 => {
                 return Err(fault("encode", "expected a format of colors, got a format of numbers"));
@@ -282,7 +283,7 @@ pub(in crate::engine) mod tests {
             (first.expect("expected an encoded frame").output, second.expect("expected an encoded frame").output)
         };
         let jpeg = |quality| FrameFormat::Jpeg(JpegQuality::parse("quality", quality).expect("expected a quality"));
-        for format in [FrameFormat::Png, FrameFormat::Rgba, jpeg(50), jpeg(90)] {
+        for format in [FrameFormat::Png, FrameFormat::Rgb, FrameFormat::Rgba, jpeg(50), jpeg(90)] {
             let (first, second) = encode_twice(format).await;
             assert_eq!(first.bytes.as_ptr(), second.bytes.as_ptr(), "{format:?}: expected shared bytes");
             assert_eq!(first.bytes.len(), second.bytes.len(), "{format:?}");

@@ -8,6 +8,8 @@ pub enum FrameFormat {
     Png,
     /// Without alpha.
     Jpeg(JpegQuality),
+    /// RGB8 sRGB: [`Self::Rgba`] without alpha.
+    Rgb,
     /// RGBA8 sRGB.
     Rgba,
     /// One f32 per pixel: depth.

@@ -1,5 +1,9 @@
 //! The filter of rows: Sub, the difference to the pixel on the left. In one pass it also drops alpha.
 
+use crate::frame::rgb::block_colors;
+#[cfg(target_arch = "x86_64")]
+use crate::frame::rgb::shuffled_block_colors;
+
 /// PNG's number of the filter Sub.
 const SUB: u8 = 1;
 
@@ -50,10 +54,7 @@ fn sub_rgb(rgba: &[u8], target: &mut [u8]) -> bool {
     if let Some(simd) = pulp::x86::V3::try_new() {
         return simd.vectorize(SubRgb { simd, rgba, target });
     }
-    sub_rgb_blocks(rgba, target, |current, previous| {
-        let difference = sub(current, previous);
-        std::array::from_fn(|index| difference[index / 3 * 4 + index % 3])
-    })
+    sub_rgb_blocks(rgba, target, |current, previous| block_colors(&sub(current, previous)))
 }
 
 /// [`sub_rgb`] with byte shuffles, which take a third of the time.
@@ -70,15 +71,10 @@ impl pulp::NullaryFnOnce for SubRgb<'_> {
 
     #[inline(always)]
     fn call(self) -> bool {
-        // 0x80 selects no byte.
-        const COLORS: [u8; 16] = [0, 1, 2, 4, 5, 6, 8, 9, 10, 12, 13, 14, 0x80, 0x80, 0x80, 0x80];
         let Self { simd, rgba, target } = self;
         sub_rgb_blocks(rgba, target, |current, previous| {
             let difference = simd.sse2._mm_sub_epi8(pulp::cast(*current), pulp::cast(*previous));
-            let colors: [u8; 16] = pulp::cast(simd.ssse3._mm_shuffle_epi8(difference, pulp::cast(COLORS)));
-            let mut target = [0; 12];
-            target.copy_from_slice(&colors[..12]);
-            target
+            shuffled_block_colors(simd, pulp::cast(difference))
         })
     }
 }

@@ -93,9 +93,11 @@ fn parse_format(frame_output: FrameOutput, picture: &v1::Picture) -> Result<Fram
     match (required_format, requested_format) {
         (None, v1::Format::Unspecified | v1::Format::Png) => Ok(FrameFormat::Png),
         (None, v1::Format::Jpeg) => JpegQuality::parse("jpeg_quality", picture.jpeg_quality).map(FrameFormat::Jpeg),
+        (None, v1::Format::Rgb) => Ok(FrameFormat::Rgb),
         (None, v1::Format::Rgba) => Ok(FrameFormat::Rgba),
         (None, other) => {
-            Err(invalid("format", "FORMAT_PNG, FORMAT_JPEG or FORMAT_RGBA for this output", other.as_str_name()))
+            let expected = "FORMAT_PNG, FORMAT_JPEG, FORMAT_RGB or FORMAT_RGBA for this output";
+            Err(invalid("format", expected, other.as_str_name()))
         }
         (Some((_, format)), v1::Format::Unspecified) => Ok(format),
         (Some((wire_format, format)), _) if wire_format == requested_format => Ok(format),
@@ -124,6 +126,7 @@ pub(crate) const fn wire_format(format: FrameFormat) -> v1::Format {
     match format {
         FrameFormat::Png => v1::Format::Png,
         FrameFormat::Jpeg(_) => v1::Format::Jpeg,
+        FrameFormat::Rgb => v1::Format::Rgb,
         FrameFormat::Rgba => v1::Format::Rgba,
         FrameFormat::F32 => v1::Format::F32,
         FrameFormat::U32 => v1::Format::U32,

@@ -28,6 +28,7 @@ class Format(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     FORMAT_U32: _ClassVar[Format]
     FORMAT_F32X3: _ClassVar[Format]
     FORMAT_JPEG: _ClassVar[Format]
+    FORMAT_RGB: _ClassVar[Format]
 
 class LookPreset(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -70,6 +71,7 @@ FORMAT_F32: Format
 FORMAT_U32: Format
 FORMAT_F32X3: Format
 FORMAT_JPEG: Format
+FORMAT_RGB: Format
 LOOK_PRESET_UNSPECIFIED: LookPreset
 LOOK_PRESET_PREVIEW: LookPreset
 LOOK_PRESET_STANDARD: LookPreset

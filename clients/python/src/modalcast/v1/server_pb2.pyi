@@ -17,6 +17,7 @@ class Feature(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     FEATURE_SHARED_MEMORY: _ClassVar[Feature]
     FEATURE_VIEWER: _ClassVar[Feature]
     FEATURE_PACKED_Q: _ClassVar[Feature]
+    FEATURE_RGB_FRAMES: _ClassVar[Feature]
 FEATURE_UNSPECIFIED: Feature
 FEATURE_FRAMES: Feature
 FEATURE_CONTENT_HASHES: Feature
@@ -25,6 +26,7 @@ FEATURE_UPLOAD_ARRAYS: Feature
 FEATURE_SHARED_MEMORY: Feature
 FEATURE_VIEWER: Feature
 FEATURE_PACKED_Q: Feature
+FEATURE_RGB_FRAMES: Feature
 
 class GetServerInfoRequest(_message.Message):
     __slots__ = ()
