@@ -34,8 +34,8 @@ def test_color_maps_have_parameters(beams: mc.Scene):
         drive.step(q={"beam": [0.5, 0, 0]})
     outputs = [mc.Output("displacement", largest=1.0), mc.Output("mode_shape", mode=1)]
     frame = beams.frame(outputs=outputs, **SIZE)
-    assert frame["displacement"].shape == frame["mode_shape"].shape == (90, 160, 4)
-    assert np.array_equal(frame.rgba, frame["displacement"])
+    assert frame["displacement"].shape == frame["mode_shape"].shape == (90, 160, 3)
+    assert np.array_equal(frame.array, frame["displacement"])
     assert beams.frame(outputs="depth", **SIZE).depth.shape == (90, 160)
     edges = beams.frame(outputs=mc.Output("color", edge_width=2.0), **SIZE)
     assert not np.array_equal(edges.array, beams.frame(**SIZE).array)
@@ -51,7 +51,7 @@ def test_png_files_have_the_pixels_of_the_array(beams: mc.Scene, tmp_path: Path)
     encoded.save(tmp_path / "server.png")
     for name in ("raw.png", "server.png"):
         np.testing.assert_array_equal(np.asarray(PillowImage.open(tmp_path / name)), raw.array)
-    np.testing.assert_array_equal(np.load(tmp_path / "raw.npy"), raw.rgba)
+    np.testing.assert_array_equal(np.load(tmp_path / "raw.npy"), raw.array)
     shown = raw._repr_png_()
     assert shown is not None
     np.testing.assert_array_equal(np.asarray(PillowImage.open(io.BytesIO(shown))), raw.array)
@@ -61,11 +61,21 @@ def test_png_files_have_the_pixels_of_the_array(beams: mc.Scene, tmp_path: Path)
         raw.save(tmp_path / "frame.jpg")
 
 
-def test_transparent_pixels_keep_their_alpha_in_png():
-    from modalcast.frame import encode_png
-
-    rgba = np.random.default_rng(1).integers(0, 256, (5, 7, 4), np.uint8)
-    np.testing.assert_array_equal(np.asarray(PillowImage.open(io.BytesIO(encode_png(rgba)))), rgba)
+def test_raw_colors_have_alpha_only_from_earlier_servers(beams: mc.Scene, tmp_path: Path):
+    frame = beams.frame(**SIZE)
+    beams._has_rgb = False
+    earlier = beams.frame(**SIZE)
+    assert (frame["color"].shape, earlier["color"].shape) == ((90, 160, 3), (90, 160, 4))
+    assert (frame.array.flags.c_contiguous, len(frame.images["color"].data)) == (True, 3 * 90 * 160)
+    np.testing.assert_array_equal(frame.array, earlier.array)
+    np.testing.assert_array_equal(frame.rgba, earlier.rgba)
+    assert (frame.rgba[..., 3] == 255).all()
+    for number, saved in enumerate((frame, earlier)):
+        saved.save(tmp_path / f"{number}.png")
+        np.testing.assert_array_equal(np.asarray(PillowImage.open(tmp_path / f"{number}.png")), frame.array)
+    with beams.drive() as drive, beams.frames(**SIZE, count=1) as frames:
+        drive.step()
+        assert next(frames)["color"].shape == (90, 160, 4)
 
 
 def test_jpeg_is_close_to_raw(beams: mc.Scene, tmp_path: Path):

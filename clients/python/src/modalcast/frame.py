@@ -39,17 +39,21 @@ _OUTPUTS: dict[str, frames_pb2.Output] = {
 }
 _COLORED = ("color", "displacement", "mode_shape")
 _COLOR_FORMATS: dict[str, frames_pb2.Format] = {
-    "raw": frames_pb2.FORMAT_RGBA,
+    "raw": frames_pb2.FORMAT_RGB,
     "png": frames_pb2.FORMAT_PNG,
     "jpeg": frames_pb2.FORMAT_JPEG,
 }
 # Type and number of channels of the formats that are arrays.
 _ARRAYS = {
+    frames_pb2.FORMAT_RGB: ("u1", 3),
     frames_pb2.FORMAT_RGBA: ("u1", 4),
     frames_pb2.FORMAT_F32: ("<f4", 1),
     frames_pb2.FORMAT_U32: ("<u4", 1),
     frames_pb2.FORMAT_F32X3: ("<f4", 3),
 }
+# The color type of a PNG file.
+_PNG_RGB = 2
+_RAW_COLORS = (frames_pb2.FORMAT_RGB, frames_pb2.FORMAT_RGBA)
 _SUFFIXES = {frames_pb2.FORMAT_PNG: (".png",), frames_pb2.FORMAT_JPEG: (".jpg", ".jpeg")}
 
 
@@ -91,6 +95,7 @@ class PictureOptions:
         height: Height in pixels; None: that of the camera, or 720.
         format: Encoding of color and color maps.
         jpeg_quality: 1 to 100.
+        has_rgb: Whether the server has FEATURE_RGB_FRAMES. Raw colors of another server have alpha.
     """
 
     cameras: Sequence[Camera | None]
@@ -99,6 +104,7 @@ class PictureOptions:
     height: int | None
     format: ColorFormat
     jpeg_quality: int
+    has_rgb: bool
 
     def output_list(self) -> list[Output]:
         """The outputs with their parameters."""
@@ -135,6 +141,8 @@ class PictureOptions:
             raise ValueError(f"outputs: expected names from {list(_OUTPUTS)}, got '{output.name}'")
         is_colored = output.name in _COLORED
         format_ = _COLOR_FORMATS[self.format] if is_colored else frames_pb2.FORMAT_UNSPECIFIED
+        if format_ == frames_pb2.FORMAT_RGB and not self.has_rgb:
+            format_ = frames_pb2.FORMAT_RGBA
         size = picture_size(camera, self.width, self.height)
         picture = frames_pb2.Picture(
             width=size[0],
@@ -215,13 +223,17 @@ class Frame:
 
     @property
     def array(self) -> NDArray[np.uint8]:
-        """Color, or the first color map: H x W x 3, sRGB. A view of `rgba`."""
-        return self.rgba[..., :3]
+        """Color, or the first color map: H x W x 3, sRGB."""
+        # Frames of servers without FEATURE_RGB_FRAMES have alpha, which is 255.
+        return self._colored().array[..., :3]  # pyright: ignore[reportReturnType] # color is u8
 
     @property
     def rgba(self) -> NDArray[np.uint8]:
-        """Color with alpha: H x W x 4."""
-        return self._colored().array  # pyright: ignore[reportReturnType] # color is u8
+        """Color with alpha, which is 255: H x W x 4. A copy, unless the server has sent alpha."""
+        array: NDArray[np.uint8] = self._colored().array  # pyright: ignore[reportAssignmentType] # color is u8
+        if array.shape[2] == 4:
+            return array
+        return np.concatenate((array, np.full_like(array[..., :1], 255)), axis=2)
 
     @property
     def depth(self) -> F32:
@@ -286,7 +298,7 @@ class Frame:
         image = self._colored()
         if image.head.format == frames_pb2.FORMAT_PNG:
             return image.data.tobytes()
-        return encode_png(self.rgba)
+        return encode_png(self.array)
 
     def save(self, path: str | Path, output: str | None = None) -> None:
         """Writes color as `.png`, the file of a frame in the format "jpeg" as `.jpg`, or any output as `.npy`.
@@ -307,12 +319,11 @@ class Frame:
             np.save(path, image.array)
         elif suffix in _SUFFIXES.get(image.head.format, ()):
             path.write_bytes(image.data.tobytes())
-        elif suffix == ".png" and image.head.format == frames_pb2.FORMAT_RGBA:
-            path.write_bytes(encode_png(image.data.reshape(image.head.height, image.head.width, 4)))
+        elif suffix == ".png" and image.head.format in _RAW_COLORS:
+            path.write_bytes(encode_png(image.array[..., :3]))  # pyright: ignore[reportArgumentType] # color is u8
         else:
             name = frames_pb2.Format.Name(image.head.format).removeprefix("FORMAT_")
-            is_rgba = image.head.format == frames_pb2.FORMAT_RGBA
-            arrays = ".png or .npy" if is_rgba else ".npy"
+            arrays = ".png or .npy" if image.head.format in _RAW_COLORS else ".npy"
             expected = arrays if image.head.format in _ARRAYS else _SUFFIXES[image.head.format][0]
             raise ValueError(f"expected a path that ends with {expected} for an image of format {name}, got '{path}'")
 
@@ -344,14 +355,10 @@ def frames_of_step(names: Sequence[str], images: Sequence[Image]) -> list[Frame]
     return frames
 
 
-def encode_png(rgba: NDArray[np.uint8]) -> bytes:
-    """Encodes H x W x 4 sRGB as PNG, without alpha if every pixel is opaque.
-
-    Every row has the filter "up", and the compression level is 1.
-    """
-    height, width = rgba.shape[:2]
-    is_opaque = bool((rgba[..., 3] == 255).all())
-    rows = np.ascontiguousarray(rgba[..., :3] if is_opaque else rgba).reshape(height, -1)
+def encode_png(rgb: NDArray[np.uint8]) -> bytes:
+    """Encodes H x W x 3 sRGB as PNG. Every row has the filter "up", and the compression level is 1."""
+    height, width = rgb.shape[:2]
+    rows = np.ascontiguousarray(rgb).reshape(height, -1)
     filtered = np.empty((height, rows.shape[1] + 1), np.uint8)
     filtered[:, 0] = 2
     filtered[0, 1:] = rows[0]
@@ -360,8 +367,7 @@ def encode_png(rgba: NDArray[np.uint8]) -> bytes:
     def chunk(kind: bytes, content: bytes) -> bytes:
         return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
 
-    color_type = 2 if is_opaque else 6
-    header = struct.pack(">IIBBBBB", width, height, 8, color_type, 0, 0, 0)
+    header = struct.pack(">IIBBBBB", width, height, 8, _PNG_RGB, 0, 0, 0)
     return (
         b"\x89PNG\r\n\x1a\n"
         + chunk(b"IHDR", header)

@@ -90,6 +90,7 @@ class Scene:
         self._reconnect = reconnect
         has_packed_q = server_pb2.FEATURE_PACKED_Q in client.info.features
         self._layout = StateLayout(self.domains, has_packed_q=has_packed_q)
+        self._has_rgb = server_pb2.FEATURE_RGB_FRAMES in client.info.features
         self._kinematics: Kinematics | None = None
 
     @property
@@ -299,7 +300,7 @@ class Scene:
         Raises:
             Error: As for `frame`, which documents the other arguments.
         """
-        options = PictureOptions(cameras, outputs, width, height, format, jpeg_quality)
+        options = PictureOptions(cameras, outputs, width, height, format, jpeg_quality, self._has_rgb)
         time_limit = self._time_limit(timeout)
         request = frames_pb2.RenderFrameRequest(
             scene=self.name,
@@ -371,7 +372,7 @@ class Scene:
         Raises:
             Error: As for `frames`, which documents the arguments.
         """
-        options = PictureOptions(cameras, outputs, width, height, format, jpeg_quality)
+        options = PictureOptions(cameras, outputs, width, height, format, jpeg_quality, self._has_rgb)
         pictures = options.to_messages(self.info.up)
         wire_delivery = delivery_message(delivery)
 
