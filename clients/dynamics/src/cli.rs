@@ -28,6 +28,7 @@ pub(crate) struct Cli {
 #[derive(Debug, Subcommand)]
 pub(crate) enum Command {
     /// Wind on a tree by modal superposition, with exact integration of every mode. The scene must have eigenvalues.
+    /// The notes damping_ratio and rigid_modes of a domain set its damping and the number of modes that are held still.
     #[command(after_help = EXAMPLES)]
     Tree {
         #[command(flatten)]

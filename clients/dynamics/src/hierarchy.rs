@@ -111,12 +111,12 @@ pub(crate) mod tests {
                 // Three rows (x, y, z) of two modes. Per unit of q, a section moves sideways by y^2, which is 1 at the
                 // tip. The section rotates by the slope 2 y, which moves its vertices along y.
                 let mode_rows = vec![y * y, 0.0, -2.0 * y * x, -2.0 * y * z, 0.0, y * y];
-                samples.push(Sample { rest_position: Vector3::new(x, y, z), mode_rows });
+                samples.push(Sample { rest_position: Vector3::new(x, y, z), mode_rows, part: 0 });
             }
         }
         let surface_sample_count = samples.len();
         // The base sample, at the origin.
-        samples.push(Sample { rest_position: Vector3::zeros(), mode_rows: vec![0.0; 6] });
+        samples.push(Sample { rest_position: Vector3::zeros(), mode_rows: vec![0.0; 6], part: 0 });
         DomainModel {
             name: "beam".into(),
             rank: 2,
@@ -128,6 +128,7 @@ pub(crate) mod tests {
             eigenvalues: vec![30.0, 35.0],
             notes: BTreeMap::new(),
             area: radius,
+            part_count: 1,
             diagonal: 1.0,
             samples,
             surface_sample_count,

@@ -5,9 +5,11 @@
 //! |---|---|
 //! | `model` | converts a scene description into domain models: rank, joints, selected rows of U |
 //! | `affine` | affine transforms, and the rotation nearest to a matrix |
+//! | `connected_parts` | finds the connected parts of a mesh |
 //! | `attachments` | the rigid transforms of joints as functions of q, fitted to displaced vertices |
 //! | `hierarchy` | computes transforms that keep every joint closed, and measures the remaining gap |
 //! | `parameters` | reads and validates eigenvalues and damping ratios |
+//! | `rigid_modes` | finds the modes without stiffness, which are held still |
 //! | `oscillator` | integrates one linear mode over a step, exactly |
 //! | `wind` | wind pressure by time and position, from a spectrum of turbulence |
 //! | `tree` | a tree in the wind, by modal superposition |
@@ -58,6 +60,7 @@
 pub mod affine;
 pub mod attachments;
 pub mod bridge;
+mod connected_parts;
 pub mod cubic;
 pub mod divergence;
 mod error;
@@ -66,6 +69,7 @@ pub mod model;
 pub mod newmark;
 pub mod oscillator;
 pub mod parameters;
+mod rigid_modes;
 pub mod run;
 #[cfg(test)]
 mod stability;

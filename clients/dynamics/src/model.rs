@@ -10,6 +10,7 @@ use nalgebra::Vector3;
 use rayon::prelude::*;
 
 use crate::affine::AffineTransform;
+use crate::connected_parts::ConnectedParts;
 use crate::error::{Result, invalid_input};
 
 /// Maximum number of entries of U in the surface samples of all domains together: 64 MiB of f64.
@@ -28,6 +29,8 @@ pub struct Sample {
     pub rest_position: Vector3<f64>,
     /// Rows of U at this vertex: 3 x r, row-major.
     pub mode_rows: Vec<f64>,
+    /// The connected part of the mesh that has this vertex; 0 if the mesh was not requested.
+    pub part: usize,
 }
 
 /// The attachment of a domain to its parent.
@@ -72,6 +75,8 @@ pub struct DomainModel {
     pub notes: BTreeMap<String, String>,
     /// Surface area; 0 if the mesh was not requested.
     pub area: f64,
+    /// Number of connected parts of the mesh; 0 if it was not requested.
+    pub part_count: usize,
     /// Diagonal of the bounds at rest; 0 if the positions were not requested.
     pub diagonal: f64,
     /// The first `surface_sample_count` samples are spread evenly over the vertices. The remaining samples are further
@@ -206,6 +211,7 @@ impl Model {
         selections: Vec<SelectedVertices>,
         mode_rows: impl Fn(&Domain, &[u32]) -> Option<&'a ModeRows>,
     ) -> Result<Self> {
+        let parts_of_shapes: Vec<_> = description.shapes.par_iter().map(ConnectedParts::of_shape).collect();
         let mut domains: Vec<DomainModel> = vec![];
         let mut coordinate_count = 0;
         for (domain, selection) in description.domains.iter().zip(&selections) {
@@ -222,8 +228,13 @@ impl Model {
             let owns_q = domain.shares_q_with.is_none();
             coordinate_count += if owns_q { domain.rank } else { 0 };
             let shape = description.shape_of(domain);
-            let samples = create_samples(domain, shape, selection, mode_rows(domain, &selection.vertices))?;
+            let parts = &parts_of_shapes[domain.shape];
+            let mut samples = create_samples(domain, shape, selection, mode_rows(domain, &selection.vertices))?;
+            for (sample, vertex) in samples.iter_mut().zip(&selection.vertices) {
+                sample.part = parts.part_of(*vertex);
+            }
             let mut domain_model = create_domain_model(domain, shape, selection, samples);
+            domain_model.part_count = parts.count;
             (domain_model.first_coordinate, domain_model.owns_q) = (first_coordinate, owns_q);
             domain_model.joint = create_joint(domain, &selections);
             domain_model.follow = create_follow(domain, domains.len())?;
@@ -343,7 +354,8 @@ fn rest_position(shape: &Shape, vertex: u32) -> Vector3<f64> {
     Vector3::from_fn(|component, _| f64::from(shape.rest_positions[3 * vertex as usize + component]))
 }
 
-/// The samples of a domain's selected vertices. They have no rows of U if `mode_rows` is `None`.
+/// The samples of a domain's selected vertices. They have no rows of U if `mode_rows` is `None`. The caller sets their
+/// parts.
 fn create_samples(
     domain: &Domain,
     shape: &Shape,
@@ -360,12 +372,12 @@ fn create_samples(
             None => &[],
         };
         let mode_rows = rows.iter().map(|entry| f64::from(*entry)).collect();
-        Ok(Sample { rest_position: rest_position(shape, *vertex), mode_rows })
+        Ok(Sample { rest_position: rest_position(shape, *vertex), mode_rows, part: 0 })
     };
     selection.vertices.iter().enumerate().map(sample).collect()
 }
 
-/// Creates the model of a domain. The caller sets `joint`, `follow`, `first_coordinate` and `owns_q`.
+/// Creates the model of a domain. The caller sets `joint`, `follow`, `first_coordinate`, `owns_q` and `part_count`.
 fn create_domain_model(
     domain: &Domain,
     shape: &Shape,
@@ -384,6 +396,7 @@ fn create_domain_model(
         eigenvalues: domain.eigenvalues.clone(),
         notes: domain.notes.clone(),
         area: surface_area(shape),
+        part_count: 0,
         diagonal: bounds_diagonal(shape),
         base_sample: base_vertex
             .and_then(|base_vertex| selection.vertices.iter().position(|vertex| *vertex == base_vertex)),

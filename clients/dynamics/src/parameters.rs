@@ -2,16 +2,13 @@
 
 use crate::error::{Result, invalid_input};
 use crate::model::{DomainModel, Model};
+use crate::rigid_modes::find_held_modes;
 
 /// Damping ratio of domains without a note `damping_ratio`.
 const DEFAULT_DAMPING_RATIO: f64 = 0.03;
 
 /// Largest accepted damping ratio. A ratio of 1 is critical damping.
 const MAX_DAMPING_RATIO: f64 = 1000.0;
-
-/// Largest magnitude of an eigenvalue that counts as 0, as a fraction of the largest eigenvalue of its domain. Solvers
-/// return the eigenvalues of rigid motions as rounding errors of either sign.
-const ZERO_TOLERANCE: f64 = 1e-9;
 
 /// Maximum number of domains that a remark names.
 const MAX_NAMED_DOMAINS: usize = 3;
@@ -31,7 +28,7 @@ pub struct ModalParameters {
     /// Per coordinate. `None` for a mode without stiffness: it would drift without bound in any wind, so it is held
     /// still.
     pub modes: Vec<Option<ModeParameters>>,
-    /// Names the modes that are held still, and those without damping.
+    /// Names the modes that are held still, with their frequencies, and those without damping.
     pub remarks: Vec<String>,
 }
 
@@ -40,57 +37,62 @@ impl ModalParameters {
     ///
     /// # Errors
     /// `Invalid` if a domain has another number of eigenvalues than modes, if an eigenvalue is negative or not finite,
-    /// or if the note `damping_ratio` is not a number from 0 to 1000.
+    /// if the note `damping_ratio` is not a number from 0 to 1000, or if the note `rigid_modes` is not a number of
+    /// modes or does not count a mode without stiffness.
     pub fn read(model: &Model) -> Result<Self> {
         let mut modes = vec![None; model.coordinate_count];
-        let (mut held_modes, mut undamped_modes) = (vec![], vec![]);
+        let (mut held_count, mut held_modes) = (0, vec![]);
+        let (mut unknown_modes, mut undamped_modes) = (vec![], vec![]);
         for domain in model.domains.iter().filter(|domain| domain.owns_q) {
             let damping_ratio = read_damping_ratio(domain)?;
-            let eigenvalues = read_eigenvalues(domain)?;
-            for (mode, eigenvalue) in eigenvalues.iter().enumerate().filter(|(_, eigenvalue)| **eigenvalue > 0.0) {
-                modes[domain.first_coordinate + mode] = Some(ModeParameters { eigenvalue: *eigenvalue, damping_ratio });
+            let is_held = find_held_modes(domain)?;
+            if domain.eigenvalues.is_empty() {
+                unknown_modes.push((domain.name.as_str(), domain.rank));
+                continue;
             }
-            let held = eigenvalues.iter().filter(|eigenvalue| **eigenvalue == 0.0).count();
-            if held > 0 {
-                held_modes.push((domain.name.as_str(), held));
+            let mut held = vec![];
+            for (mode, eigenvalue) in domain.eigenvalues.iter().enumerate() {
+                if is_held[mode] {
+                    held.push(format!("q[{mode}] ({} Hz)", rounded_frequency(*eigenvalue)));
+                } else {
+                    let parameters = ModeParameters { eigenvalue: *eigenvalue, damping_ratio };
+                    modes[domain.first_coordinate + mode] = Some(parameters);
+                }
             }
-            if damping_ratio == 0.0 && held < domain.rank {
-                undamped_modes.push((domain.name.as_str(), domain.rank - held));
+            if damping_ratio == 0.0 {
+                undamped_modes.push((domain.name.as_str(), domain.rank - held.len()));
+            }
+            held_count += held.len();
+            if !held.is_empty() {
+                held_modes.push(format!("'{}': {}", domain.name, held.join(", ")));
             }
         }
-        let held = describe_modes("modes without stiffness (eigenvalue 0) are held still", &held_modes);
+        let held = (held_count > 0).then(|| {
+            let list = held_modes.join("; ");
+            format!("modes without stiffness are held still ({held_count}; the note rigid_modes sets how many): {list}")
+        });
+        let unknown = describe_modes("modes without eigenvalues are held still", &unknown_modes);
         let undamped =
             describe_modes("modes without damping (damping_ratio 0) keep the energy of all gusts", &undamped_modes);
-        Ok(Self { modes, remarks: held.into_iter().chain(undamped).collect() })
+        Ok(Self { modes, remarks: [held, unknown, undamped].into_iter().flatten().collect() })
     }
 
     /// The lowest frequency in hertz; `None` if no mode can move.
     pub fn lowest_frequency(&self) -> Option<f64> {
         let eigenvalues = self.modes.iter().flatten().map(|mode| mode.eigenvalue);
-        eigenvalues.min_by(f64::total_cmp).map(|eigenvalue| eigenvalue.sqrt() / std::f64::consts::TAU)
+        eigenvalues.min_by(f64::total_cmp).map(frequency)
     }
 }
 
-/// One eigenvalue per mode. It is 0 for a mode without stiffness, or of a domain without eigenvalues.
-fn read_eigenvalues(domain: &DomainModel) -> Result<Vec<f64>> {
-    if domain.eigenvalues.is_empty() {
-        return Ok(vec![0.0; domain.rank]);
-    }
-    if domain.eigenvalues.len() != domain.rank {
-        let field = format!("eigenvalues of '{}'", domain.name);
-        let expected = format!("{} numbers, one per mode", domain.rank);
-        return Err(invalid_input(field, expected, format!("{} numbers", domain.eigenvalues.len())));
-    }
-    let tolerance =
-        ZERO_TOLERANCE * domain.eigenvalues.iter().fold(0.0, |largest: f64, value| largest.max(value.abs()));
-    let eigenvalue = |(mode, eigenvalue): (usize, &f64)| {
-        if !eigenvalue.is_finite() || *eigenvalue < -tolerance {
-            let field = format!("eigenvalues[{mode}] of '{}'", domain.name);
-            return Err(invalid_input(field, "a finite number >= 0 in (rad/s)^2: a stiffness", eigenvalue));
-        }
-        Ok(if *eigenvalue > tolerance { *eigenvalue } else { 0.0 })
-    };
-    domain.eigenvalues.iter().enumerate().map(eigenvalue).collect()
+/// The frequency in hertz of a mode by its eigenvalue; 0 for a negative one.
+fn frequency(eigenvalue: f64) -> f64 {
+    eigenvalue.max(0.0).sqrt() / std::f64::consts::TAU
+}
+
+/// The frequency with four significant digits.
+fn rounded_frequency(eigenvalue: f64) -> f64 {
+    let hertz = frequency(eigenvalue);
+    format!("{hertz:.3e}").parse().unwrap_or(hertz)
 }
 
 fn read_damping_ratio(domain: &DomainModel) -> Result<f64> {
@@ -104,6 +106,7 @@ fn read_damping_ratio(domain: &DomainModel) -> Result<f64> {
 
 /// A remark on some modes, with the name of each domain and the number of its modes. `None` without modes.
 fn describe_modes(subject: &str, modes: &[(&str, usize)]) -> Option<String> {
+    let modes: Vec<_> = modes.iter().filter(|(_, count)| *count > 0).collect();
     let count: usize = modes.iter().map(|(_, count)| count).sum();
     let mut names: Vec<String> =
         modes.iter().take(MAX_NAMED_DOMAINS).map(|(name, count)| format!("{count} of '{name}'")).collect();
@@ -159,7 +162,7 @@ mod tests {
         // A rounding error of a rigid motion, and a domain without eigenvalues.
         let parameters = read(&[-1e-12, 30.0], None).expect("valid parameters");
         assert!(parameters.modes[2].is_none() && parameters.modes[3].is_some());
-        assert!(parameters.remarks[0].contains("1 of 'branch'"), "{:?}", parameters.remarks);
+        assert!(parameters.remarks[0].ends_with("'branch': q[0] (0 Hz)"), "{:?}", parameters.remarks);
         let remarks = read(&[], None).expect("valid parameters").remarks;
         assert!(remarks[0].contains("2 of 'branch'"), "{remarks:?}");
         assert_eq!(read(&[30.0, 35.0], None).expect("valid parameters").remarks, [""; 0]);

@@ -249,11 +249,13 @@ async fn invalid_parameters_stop_before_the_first_step() {
 async fn fixed_modes_and_unresolved_gusts_are_reported() {
     let mut server = tree_server();
     server.domains[1].shape.eigenvalues[0] = 0.0;
+    server.domains[2].wire.notes.insert("rigid_modes".into(), "1".into());
     let url = serve(Arc::new(server)).await;
     let sim_output = run_sim(&url, &["tree", "--scene", "toy", "--steps", "3", "--dt", "0.5", "--json"]).await;
     assert_eq!(sim_output.exit_code, 0, "{}", sim_output.stderr);
     let report = sim_output.report();
-    for (index, remark) in ["modes without stiffness", "gusts above 1 Hz"].into_iter().enumerate() {
+    let held = "(2; the note rigid_modes sets how many): 'domain 1': q[0] (0 Hz); 'domain 2': q[0] (0.9 Hz)";
+    for (index, remark) in [held, "gusts above 1 Hz"].into_iter().enumerate() {
         assert!(sim_output.stderr.contains(remark), "{}", sim_output.stderr);
         assert!(report["remarks"][index].as_str().expect("a remark").contains(remark), "{report}");
     }
