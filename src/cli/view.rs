@@ -160,11 +160,7 @@ fn start_physics(program: &PathBuf, force_files: &ForceFiles, listener: &Listene
     let server = listener.local_urls().into_iter().next().ok_or_else(|| fault("view", "expected an address"))?;
     let mut flags = vec!["auto".to_owned(), "--server".into(), server, "--scene".into(), scene.into()];
     flags.extend(["--wait", "30", "--seconds", "0", "--realtime", "--forces", "--delivery", "latest"].map(Into::into));
-    for (flag, path) in [("--cubic", &force_files.cubic), ("--config", &force_files.config)] {
-        if let Some(path) = path {
-            flags.extend([flag.into(), path.to_string_lossy().into_owned()]);
-        }
-    }
+    flags.extend(force_files.flags());
     Process::start("physics", program, &flags)
 }
 

@@ -26,6 +26,8 @@ const DEFLECTION_TOLERANCE: f64 = 1e-3;
 /// Settings of the bridge scenario.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct BridgeOptions {
+    /// Index of the domain that the reduced forces belong to.
+    pub domain: usize,
     /// Seconds per step.
     pub dt: f64,
     /// Deflection at equilibrium as a fraction of the diagonal of the scene's rest bounds.
@@ -50,8 +52,6 @@ pub struct BridgeScenario {
     model: Model,
     system: ReducedSystem,
     options: BridgeOptions,
-    /// Index of the deforming domain.
-    domain: usize,
     is_damped: bool,
     /// Reduced load U^T f of the force f at the peak of the pulse.
     peak_load: DVector<f64>,
@@ -79,29 +79,22 @@ impl BridgeScenario {
     /// Calibrates the load of the bridge.
     ///
     /// # Errors
-    /// `Invalid` if an option is out of range, no domain has the rank of the forces, the stiffness is not positive
-    /// definite, the load cannot deform the domain, or the bridge has no stable equilibrium at the requested
-    /// deflection.
+    /// `Invalid` if an option is out of range, the domain has another rank than the forces or no coordinates of its
+    /// own, the stiffness is not positive definite, the load cannot deform the domain, or the bridge has no stable
+    /// equilibrium at the requested deflection.
     pub fn new(model: Model, force: ReducedForce, settings: &VegaSettings, options: BridgeOptions) -> Result<Self> {
         check_option("dt", options.dt, f64::MIN_POSITIVE..=1e6)?;
         check_option("deflection", options.deflection_fraction, 0.0..=0.5)?;
         check_option("period", options.period, f64::MIN_POSITIVE..=1e6)?;
         let rank = force.rank();
-        // The first domain with coordinates of its own and as many modes as the force.
-        let domain = model.domains.iter().position(|domain| domain.owns_q && domain.rank == rank);
-        let ranks =
-            || format!("domains of ranks {:?}", model.domains.iter().map(|domain| domain.rank).collect::<Vec<_>>());
-        let domain = domain.ok_or_else(|| {
-            invalid_input("scene", format!("a domain of rank {rank} (the rank of the cubic forces)"), ranks())
-        })?;
+        let domain = find_domain(&model, options.domain, rank)?;
         let system = ReducedSystem::new(force, settings)?;
-        let unit_load = compute_unit_load(&model, &model.domains[domain], options.load_direction)?;
+        let unit_load = compute_unit_load(&model, domain, options.load_direction)?;
         let target_deflection = options.deflection_fraction * model.diagonal();
-        let equilibrium = calibrate_load(&system, &model.domains[domain], &unit_load, target_deflection)?;
-        let static_deflection = max_sample_displacement(&model.domains[domain], &equilibrium.q);
+        let equilibrium = calibrate_load(&system, domain, &unit_load, target_deflection)?;
+        let static_deflection = max_sample_displacement(domain, &equilibrium.q);
         Ok(Self {
             options,
-            domain,
             is_damped: settings.damping_mass > 0.0 || settings.damping_stiffness > 0.0,
             peak_load: unit_load * equilibrium.strength,
             viewer_load: DVector::zeros(rank),
@@ -136,7 +129,7 @@ impl Scenario for BridgeScenario {
     }
 
     fn compute_next_step(&mut self, values: &mut StepValues) -> Result<()> {
-        let first_coordinate = self.model.domains[self.domain].first_coordinate;
+        let first_coordinate = self.model.domains[self.options.domain].first_coordinate;
         values.q = vec![0.0; self.model.coordinate_count];
         for (destination, coordinate) in values.q[first_coordinate..].iter_mut().zip(self.state.q.iter()) {
             *destination = *coordinate as f32;
@@ -151,7 +144,7 @@ impl Scenario for BridgeScenario {
     }
 
     fn set_viewer_forces(&mut self, forces: &[f64]) -> Result<()> {
-        let first_coordinate = self.model.domains[self.domain].first_coordinate;
+        let first_coordinate = self.model.domains[self.options.domain].first_coordinate;
         self.viewer_load.copy_from_slice(&forces[first_coordinate..][..self.system.rank()]);
         let q = self.system.linear_equilibrium(&self.viewer_load);
         let displacements_per_unit = &self.model.displacements_per_unit()[first_coordinate..];
@@ -183,6 +176,22 @@ impl Scenario for BridgeScenario {
             ("frequencies_hz".to_owned(), json!(self.system.frequencies())),
         ])
     }
+}
+
+/// The domain with an index. `rank` is the rank of the forces that act on it.
+fn find_domain(model: &Model, index: usize, rank: usize) -> Result<&DomainModel> {
+    let domain_count = model.domains.len();
+    let domain = model.domains.get(index);
+    let domain = domain.ok_or_else(|| invalid_input("domain", format!("an index below {domain_count}"), index))?;
+    if !domain.owns_q {
+        let given = format!("'{}', which shares them", domain.name);
+        return Err(invalid_input("domain", "a domain with coordinates of its own", given));
+    }
+    if domain.rank != rank {
+        let expected = format!("a domain of rank {rank} (the rank of the cubic forces)");
+        return Err(invalid_input("domain", expected, format!("'{}' of rank {}", domain.name, domain.rank)));
+    }
+    Ok(domain)
 }
 
 impl LoadDirection {
@@ -301,10 +310,15 @@ mod tests {
     use crate::divergence::DivergenceCheck;
     use crate::hierarchy::tests::four_domain_model;
 
-    const OPTIONS: BridgeOptions =
-        BridgeOptions { dt: 1.0 / 60.0, deflection_fraction: 0.03, period: 2.0, load_direction: LoadDirection::Across };
+    const OPTIONS: BridgeOptions = BridgeOptions {
+        domain: 0,
+        dt: 1.0 / 60.0,
+        deflection_fraction: 0.03,
+        period: 2.0,
+        load_direction: LoadDirection::Across,
+    };
 
-    /// A bridge whose force has rank 2, as the first domain of the model. The force consists of two springs with the
+    /// A bridge whose force has rank 2, as the domains of the model. The force consists of two springs with the
     /// eigenvalues 40 and 90 (rad/s)^2, coupled by a quartic (30) and a cubic (4) potential.
     fn two_mode_bridge() -> BridgeScenario {
         let force = spring_chain(&[40.0, 90.0], 30.0, 4.0);
@@ -405,10 +419,27 @@ mod tests {
     }
 
     #[test]
-    fn force_of_another_rank_is_rejected_with_available_ranks() {
-        let force = spring_chain(&[1.0, 2.0, 3.0], 0.0, 0.0);
-        let result = BridgeScenario::new(four_domain_model(), force, &VegaSettings::default(), OPTIONS);
-        let error = result.err().expect("an error").to_string();
-        assert!(error.contains("rank 3") && error.contains("[2, 2, 2, 0]"), "{error}");
+    fn only_the_given_domain_moves() {
+        let options = BridgeOptions { domain: 1, ..OPTIONS };
+        let force = spring_chain(&[40.0, 90.0], 30.0, 4.0);
+        let bridge = BridgeScenario::new(four_domain_model(), force, &VegaSettings::default(), options);
+        let mut values = StepValues::default();
+        bridge.expect("a valid scenario").compute_next_step(&mut values).expect("the first step");
+        assert!(values.q[..2] == [0.0; 2] && values.q[2..4] != [0.0; 2] && values.q[4..] == [0.0; 2], "{:?}", values.q);
+    }
+
+    #[test]
+    fn domain_that_does_not_fit_the_force_is_rejected() {
+        let mut model = four_domain_model();
+        model.domains[1].owns_q = false;
+        let error = |rank: usize, domain: usize| {
+            let force = spring_chain(&vec![2.0; rank], 0.0, 0.0);
+            let options = BridgeOptions { domain, ..OPTIONS };
+            let result = BridgeScenario::new(model.clone(), force, &VegaSettings::default(), options);
+            result.err().expect("an error").to_string()
+        };
+        assert!(error(3, 0).contains("rank 3") && error(3, 0).contains("'beam' of rank 2"), "{}", error(3, 0));
+        assert!(error(2, 1).contains("coordinates of its own"), "{}", error(2, 1));
+        assert!(error(2, 4).contains("an index below 4"), "{}", error(2, 4));
     }
 }

@@ -162,6 +162,10 @@ pub(crate) struct ForceFileOptions {
     /// The file of reduced cubic forces that the FEM library Vega exported.
     #[arg(long, value_name = "FILE.cub")]
     pub(crate) cubic: Option<PathBuf>,
+    /// Name or index of the domain that the cubic forces act on. Default: the one whose modes are those of the
+    /// .URendering.float file next to the file of cubic forces.
+    #[arg(long, value_name = "DOMAIN")]
+    pub(crate) domain: Option<String>,
     /// Vega's file of frequency scale and damping. Default: the .config file next to the file of cubic forces, if it
     /// exists.
     #[arg(long, value_name = "FILE.config")]

@@ -14,7 +14,8 @@
 //! | `wind` | wind pressure by time and position, from a spectrum of turbulence |
 //! | `tree` | a tree in the wind, by modal superposition |
 //! | `cubic` | reduced forces of a St. Venant-Kirchhoff material from a `.cub` file, with Jacobian and potential |
-//! | `vega` | base frequency and damping from a `.config` file |
+//! | `vega` | base frequency and damping from a `.config` file, and the hash of U in a `.URendering.float` file |
+//! | `force_domain` | finds the domain that a file of reduced forces belongs to |
 //! | `newmark` | implicit time integration of the reduced equations of motion |
 //! | `bridge` | a bridge under a pulsating load |
 //! | `sweep` | motion for any scene: moves one coordinate after another, or rocks a rigid scene |
@@ -64,6 +65,7 @@ mod connected_parts;
 pub mod cubic;
 pub mod divergence;
 mod error;
+pub mod force_domain;
 pub mod hierarchy;
 pub mod model;
 pub mod newmark;

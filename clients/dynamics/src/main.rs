@@ -11,6 +11,7 @@ use clap::Parser as _;
 use modalcast_client::{Client, program};
 use modalcast_dynamics::bridge::{BridgeOptions, BridgeScenario};
 use modalcast_dynamics::cubic::ReducedForce;
+use modalcast_dynamics::force_domain::find_force_domain;
 use modalcast_dynamics::model::Model;
 use modalcast_dynamics::run::{Report, RunOptions, RunSummary, Scenario, drive_scene};
 use modalcast_dynamics::sweep::{SweepOptions, SweepScenario};
@@ -19,7 +20,7 @@ use modalcast_dynamics::vega::VegaSettings;
 use modalcast_dynamics::{Error, Result, invalid_input};
 use tokio::sync::watch;
 
-use cli::{Cli, Command, CommonOptions, ForceFileOptions};
+use cli::{Cli, Command, CommonOptions, ForceFileOptions, LoadOptions};
 
 /// Maximum number of surface samples per domain of a tree. A tree may have thousands of domains, and the rows of U of
 /// every sample are fetched from the server.
@@ -114,16 +115,7 @@ async fn create_scenario(client: &Client, scene: &str, command: &Command) -> Res
             };
             Ok(Box::new(TreeScenario::new(model, options)?))
         }
-        Command::Bridge { files, load, .. } => {
-            let model = Model::fetch(client, scene, MAX_SAMPLES).await?;
-            let options = BridgeOptions {
-                dt,
-                deflection_fraction: load.deflection_fraction,
-                period: load.period,
-                load_direction: load.direction.into(),
-            };
-            create_bridge_scenario(model, files, options)
-        }
+        Command::Bridge { files, load, .. } => create_bridge_scenario(client, scene, files, load, dt).await,
         Command::Sweep { displacement_fraction, .. } => {
             let model = Model::fetch(client, scene, MAX_SAMPLES).await?;
             let options = SweepOptions { dt, steps, displacement_fraction: *displacement_fraction };
@@ -132,10 +124,11 @@ async fn create_scenario(client: &Client, scene: &str, command: &Command) -> Res
         Command::Auto { files, load, wind, displacement_fraction, .. } => {
             // A model with few samples is enough to choose the scenario.
             let model = Model::fetch(client, scene, MAX_TREE_SAMPLES).await?;
-            if let Some(remark) = unused_force_files(&model, files) {
+            let force_file = find_force_file(&model, files)?;
+            if let Some(remark) = unused_force_files(files).filter(|_| force_file.is_none()) {
                 eprintln!("modalcast-sim: {scene}: {remark}");
             }
-            let command = if find_force_file(&model, files).is_some() {
+            let command = if force_file.is_some() {
                 Command::Bridge { common: common.clone(), files: files.clone(), load: *load }
             } else if is_tree(&model) {
                 Command::Tree { common: common.clone(), wind: *wind }
@@ -155,38 +148,64 @@ fn is_tree(model: &Model) -> bool {
     has_eigenvalues && model.domains.iter().any(|domain| domain.joint.is_some())
 }
 
-fn create_bridge_scenario(model: Model, files: &ForceFileOptions, options: BridgeOptions) -> Result<Box<dyn Scenario>> {
-    let force_path = find_force_file(&model, files).ok_or_else(|| {
-        let expected = "--cubic FILE.cub, or --files DIR with the one file that a note vega.cubic of the scene names";
-        invalid_input("cubic", expected, "no such file, or several")
-    })?;
+async fn create_bridge_scenario(
+    client: &Client,
+    scene: &str,
+    files: &ForceFileOptions,
+    load: &LoadOptions,
+    dt: f64,
+) -> Result<Box<dyn Scenario>> {
+    let model = Model::fetch(client, scene, MAX_SAMPLES).await?;
+    let force_path = require_force_file(&model, files)?;
     let default_config = force_path.with_extension("config");
     let config_path = files.config.clone().or_else(|| default_config.is_file().then_some(default_config));
     let settings = config_path.map_or_else(|| Ok(VegaSettings::default()), |path| VegaSettings::read(&path))?;
-    Ok(Box::new(BridgeScenario::new(model, ReducedForce::read(&force_path)?, &settings, options)?))
+    let force = ReducedForce::read(&force_path)?;
+    let options = BridgeOptions {
+        domain: find_force_domain(client, scene, files.domain.as_deref(), &force_path).await?,
+        dt,
+        deflection_fraction: load.deflection_fraction,
+        period: load.period,
+        load_direction: load.direction.into(),
+    };
+    Ok(Box::new(BridgeScenario::new(model, force, &settings, options)?))
+}
+
+/// As [`find_force_file`], but a missing file is an error.
+fn require_force_file(model: &Model, files: &ForceFileOptions) -> Result<PathBuf> {
+    find_force_file(model, files)?.ok_or_else(|| {
+        let expected = "--cubic FILE.cub, or --files DIR with the one file that a note vega.cubic of the scene names";
+        invalid_input("cubic", expected, "no such file")
+    })
 }
 
 /// Finds the file of reduced forces: the file of `--cubic`, else the file in `--files` that the note `vega.cubic` of a
-/// domain names (notes are metadata in the scene's description). `None` if there is no such file or several ones. No
-/// other file is used, because the forces of another model would move this one in a wrong way.
-fn find_force_file(model: &Model, files: &ForceFileOptions) -> Option<PathBuf> {
+/// domain names (notes are metadata in the scene's description). `None` if there is no such file. No other file is
+/// used, because the forces of another model would move this one in a wrong way.
+///
+/// # Errors
+/// `Invalid` if the folder has several such files.
+fn find_force_file(model: &Model, files: &ForceFileOptions) -> Result<Option<PathBuf>> {
     if let Some(path) = &files.cubic {
-        return Some(path.clone());
+        return Ok(Some(path.clone()));
     }
-    let folder = files.folder.as_deref()?;
+    let Some(folder) = files.folder.as_deref() else { return Ok(None) };
     let notes = model.domains.iter().filter_map(|domain| domain.notes.get("vega.cubic"));
     let paths_in_notes = notes.filter_map(|note| Path::new(note).file_name()).map(|name| folder.join(name));
     let mut candidates: Vec<PathBuf> = paths_in_notes.filter(|path| path.is_file()).collect();
     // Several domains may name the same file.
     candidates.sort();
     candidates.dedup();
-    if candidates.len() == 1 { candidates.pop() } else { None }
+    if candidates.len() > 1 {
+        let given = candidates.iter().map(|path| path.display().to_string()).collect::<Vec<_>>().join(", ");
+        return Err(invalid_input("--files", "one file that a note vega.cubic names, or --cubic FILE.cub", given));
+    }
+    Ok(candidates.pop())
 }
 
-/// Names the .cub files in `--files` if none of them is used.
-fn unused_force_files(model: &Model, files: &ForceFileOptions) -> Option<String> {
-    let folder = files.folder.as_deref().filter(|_| find_force_file(model, files).is_none())?;
-    let paths = folder.read_dir().ok()?.filter_map(|entry| Some(entry.ok()?.path()));
+/// Names the .cub files in `--files`, of which none is used.
+fn unused_force_files(files: &ForceFileOptions) -> Option<String> {
+    let paths = files.folder.as_deref()?.read_dir().ok()?.filter_map(|entry| Some(entry.ok()?.path()));
     let is_cubic = |path: &PathBuf| path.extension().is_some_and(|extension| extension == "cub");
     let mut names: Vec<String> = paths.filter(is_cubic).map(|path| path.display().to_string()).collect();
     names.sort();

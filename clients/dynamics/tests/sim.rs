@@ -311,6 +311,63 @@ async fn cubic_forces_of_another_model_are_not_used() {
     assert!(sim_output.exit_code == 5 && sim_output.stderr.contains("vega.cubic"), "{}", sim_output.stderr);
 }
 
+/// Writes the files of a Vega model of rank 2: linear forces, and the modes of a domain.
+fn write_vega_files(folder: &Path, name: &str, domain: &FakeDomain) {
+    let counts = [2_i32, 2, 3, 4];
+    let mut coefficients = vec![40.0_f64, 0.0, 0.0, 90.0];
+    coefficients.resize(2 * (2 + 3 + 4), 0.0);
+    let bytes = [pack(&counts), pack(&coefficients)].concat();
+    std::fs::write(folder.join(format!("{name}.cub")), bytes).expect("a writable file");
+    let rows = domain.modes.len() / 2;
+    let columns: Vec<f32> = (0..2).flat_map(|column| domain.modes.iter().skip(column).step_by(2).copied()).collect();
+    let bytes = [pack(&[rows as i32, 2]), pack(&columns)].concat();
+    std::fs::write(folder.join(format!("{name}.URendering.float")), bytes).expect("a writable file");
+}
+
+/// Both domains have rank 2. The modes next to the forces identify the domain, and so does its name.
+#[tokio::test(flavor = "multi_thread")]
+async fn cubic_forces_move_the_domain_with_their_modes() {
+    let domains: Vec<FakeDomain> = [("a", 0.05), ("b", 0.04)]
+        .into_iter()
+        .enumerate()
+        .map(|(index, (name, radius))| {
+            let mut domain = beam(index as u32, radius);
+            domain.wire.name = name.into();
+            domain.wire.notes.insert("vega.cubic".into(), format!("{name}.cub"));
+            domain
+        })
+        .collect();
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    write_vega_files(folder.path(), "b", &domains[1]);
+    let url = serve(Arc::new(FakeServer::new(domains.clone()))).await;
+    let files = folder.path().display().to_string();
+    let record = folder.path().join("record").display().to_string();
+    for (options, moved_domain) in
+        [(&[][..], 1), (&["--domain", "b"], 1), (&["--domain", "a"], 0), (&["--domain", "0"], 0)]
+    {
+        let arguments = ["auto", "--scene", "toy", "--files", &files, "--steps", "3", "--record", &record];
+        let sim_output = run_sim(&url, &[&arguments[..], options].concat()).await;
+        assert_eq!(sim_output.exit_code, 0, "{}", sim_output.stderr);
+        // Two domains with two coordinates each.
+        let q = read_npy(&folder.path().join("record/q.npy"));
+        let moves = |domain: usize| q.chunks(4).any(|row| row[2 * domain..][..2] != [0.0; 2]);
+        assert!(moves(moved_domain) && !moves(1 - moved_domain), "{options:?}: {q:?}");
+    }
+    // Both domains have the modes of the file; then there is no such file; then there are two files.
+    let twins = FakeServer::new((0..2).map(|index| beam(index, 0.04)).collect());
+    let ambiguous_url = serve(Arc::new(twins)).await;
+    let cubic = folder.path().join("b.cub").display().to_string();
+    let sim_output = run_sim(&ambiguous_url, &["bridge", "--scene", "toy", "--cubic", &cubic]).await;
+    let names = "several: 'domain 0' (index 0), 'domain 1' (index 1)";
+    assert!(sim_output.exit_code == 5 && sim_output.stderr.contains(names), "{}", sim_output.stderr);
+    std::fs::remove_file(folder.path().join("b.URendering.float")).expect("an existing file");
+    let sim_output = run_sim(&url, &["bridge", "--scene", "toy", "--cubic", &cubic]).await;
+    assert!(sim_output.exit_code == 5 && sim_output.stderr.contains("--domain NAME"), "{}", sim_output.stderr);
+    write_vega_files(folder.path(), "a", &domains[0]);
+    let sim_output = run_sim(&url, &["auto", "--scene", "toy", "--files", &files]).await;
+    assert!(sim_output.exit_code == 5 && sim_output.stderr.contains("a.cub, "), "{}", sim_output.stderr);
+}
+
 /// The folder of a Vega model.
 fn vega_folder(name: &str) -> PathBuf {
     let default_folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared/data");

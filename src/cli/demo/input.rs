@@ -25,6 +25,18 @@ pub(in crate::cli) struct ForceFiles {
     pub(in crate::cli) cubic: Option<PathBuf>,
     /// Simulation settings (`.config`) beside `cubic`.
     pub(in crate::cli) config: Option<PathBuf>,
+    /// Name of the domain that the forces of `cubic` act on.
+    domain: Option<String>,
+}
+
+impl ForceFiles {
+    /// Options with which `modalcast-sim` finds the files and their domain.
+    pub(in crate::cli) fn flags(&self) -> Vec<String> {
+        let text = |path: &Option<PathBuf>| path.as_ref().map(|path| path.to_string_lossy().into_owned());
+        let options =
+            [("--cubic", text(&self.cubic)), ("--config", text(&self.config)), ("--domain", self.domain.clone())];
+        options.into_iter().filter_map(|(flag, value)| Some([flag.to_owned(), value?])).flatten().collect()
+    }
 }
 
 impl SceneLocation {
@@ -54,9 +66,10 @@ impl SceneLocation {
 
     /// The force files in the folder of the scene that is here.
     pub(in crate::cli) fn force_files(&self, scene: &Scene) -> ForceFiles {
-        let cubic = self.folder.as_ref().and_then(|folder| cubic_file(scene, folder));
+        let found = self.folder.as_ref().and_then(|folder| cubic_file(scene, folder));
+        let (cubic, domain) = found.unzip();
         let config = cubic.as_ref().map(|path| path.with_extension("config")).filter(|path| path.is_file());
-        ForceFiles { cubic, config }
+        ForceFiles { cubic, config, domain }
     }
 }
 
@@ -80,13 +93,14 @@ impl DemoScene {
     }
 }
 
-/// The file of cubic polynomials that belongs to the model. The loader stores the file's name as a note of the domain.
-/// `None` if not exactly one domain has this note, or the file is not in the folder.
-fn cubic_file(scene: &Scene, folder: &Path) -> Option<PathBuf> {
-    let mut names = scene.domains.iter().filter_map(|domain| domain.metadata.notes.get("vega.cubic"));
-    let name = names.next()?;
-    let path = folder.join(name);
-    (names.next().is_none() && path.is_file()).then_some(path)
+/// The file of cubic polynomials that belongs to the model, and the name of its domain. The loader stores the file's
+/// name as a note of the domain. `None` if not exactly one domain has this note, or the file is not in the folder.
+fn cubic_file(scene: &Scene, folder: &Path) -> Option<(PathBuf, String)> {
+    let mut domains =
+        scene.domains.iter().filter_map(|domain| Some((domain, domain.metadata.notes.get("vega.cubic")?)));
+    let (domain, file_name) = domains.next()?;
+    let path = folder.join(file_name);
+    (domains.next().is_none() && path.is_file()).then(|| (path, domain.name.clone()))
 }
 
 #[cfg(test)]
@@ -116,8 +130,10 @@ mod tests {
         assert_eq!(location.source, "./beam");
         let file_name = |path: &Option<PathBuf>| path.as_ref().and_then(|path| path.file_name()).map(ToOwned::to_owned);
         assert_eq!((file_name(&beam.cubic), file_name(&beam.config)), (Some("a.cub".into()), Some("a.config".into())));
+        let flags = beam.flags();
+        assert_eq!((flags.len(), &flags[4..]), (6, &["--domain".to_owned(), "a".to_owned()][..]));
         let (_, other) = locate("other");
-        assert_eq!((other.cubic, other.config), (None, None), "expected no guess");
+        assert_eq!(other.flags(), [""; 0], "expected no guess");
         // `tree` is the built-in scene, although a folder has this name. `./tree` is the folder.
         let (built_in, files) = locate("tree");
         assert_eq!((built_in.source.as_str(), built_in.repository, files.cubic), ("tree", None, None));

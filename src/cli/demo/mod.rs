@@ -147,14 +147,8 @@ fn run_processes(args: &Args, input: &DemoScene, temporary_folder: &std::path::P
         &record_folder,
         "--json",
     ];
-    let cubic = input.force_files.cubic.as_ref().map(|path| path.to_string_lossy().into_owned());
-    let config = input.force_files.config.as_ref().map(|path| path.to_string_lossy().into_owned());
-    if let Some(path) = &cubic {
-        flags.extend(["--cubic", path.as_str()]);
-    }
-    if let Some(path) = &config {
-        flags.extend(["--config", path.as_str()]);
-    }
+    let force_flags = input.force_files.flags();
+    flags.extend(force_flags.iter().map(String::as_str));
     let physics_process =
         Process::start("physics", &program_path("modalcast-sim")?, &[&flags[..], &common_flags].concat())?;
 

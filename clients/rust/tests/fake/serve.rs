@@ -7,6 +7,7 @@ use std::task::{Context, Poll};
 
 use bytes::Bytes;
 use modalcast_proto::v1;
+use sha2::{Digest as _, Sha256};
 use tokio_stream::StreamExt as _;
 use tokio_stream::wrappers::{BroadcastStream, ReceiverStream, TcpListenerStream};
 use tonic::codegen::{BoxFuture, Service, http};
@@ -201,7 +202,14 @@ impl SceneService for FakeService {
         };
         parts.push(Part::Materials(v1::MaterialDescriptions { materials: vec![material] }));
         for domain in &self.0.domains {
-            parts.push(Part::Shapes(v1::ShapeDescriptions { shapes: vec![domain.shape.clone()] }));
+            let mut shape = domain.shape.clone();
+            if request.hashes {
+                // The fake server has no hashes of other arrays.
+                let modes = pack(&domain.modes);
+                let (bytes, sha256) = (modes.len() as u64, Sha256::digest(&modes).to_vec().into());
+                shape.arrays = vec![v1::ArrayDescription { array: v1::Array::Modes.into(), bytes, sha256 }];
+            }
+            parts.push(Part::Shapes(v1::ShapeDescriptions { shapes: vec![shape] }));
             parts.push(Part::Domains(v1::DomainDescriptions { domains: vec![domain.wire.clone()] }));
         }
         for domain in &self.0.domains {
@@ -224,7 +232,7 @@ impl SceneService for FakeService {
 
     type ReadContentStream = ResponseStream<v1::ReadContentResponse>;
 
-    /// The fake server computes no hashes.
+    /// The fake server reads no contents.
     async fn read_content(
         &self,
         _: Request<v1::ReadContentRequest>,
