@@ -5158,6 +5158,10 @@ pub struct StreamForcesResponse {
     /// Ordered by owner; the forces of an owner have the order of ApplyForcesRequest.
     #[prost(message, repeated, tag = "2")]
     pub forces: ::prost::alloc::vec::Vec<AppliedForce>,
+    /// Why nothing answers the forces: the last message of the physics process that `modalcast view` started, if it has
+    /// ended. Empty otherwise, and from the moment at which another reader that is not passive subscribes.
+    #[prost(string, tag = "3")]
+    pub receiver_error: ::prost::alloc::string::String,
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct AppliedForce {
@@ -5297,8 +5301,9 @@ pub mod force_service_client {
             self.inner.unary(req, path, codec).await
         }
         /// Returns the present forces of all owners, and then all forces again after every change: forces were set, removed or
-        /// have expired, or a step has changed AppliedForce.f_q. A slow reader skips replies and receives the newest one. A
-        /// renewal without a change is not reported. A scene may have 32 of these streams (REASON_LIMIT_REACHED).
+        /// have expired, a step has changed AppliedForce.f_q, or `receiver_error` has changed. A slow reader skips replies and
+        /// receives the newest one. A renewal without a change is not reported. A scene may have 32 of these streams
+        /// (REASON_LIMIT_REACHED).
         pub async fn stream_forces(
             &mut self,
             request: impl tonic::IntoRequest<super::StreamForcesRequest>,
@@ -5357,8 +5362,9 @@ pub mod force_service_server {
             + std::marker::Send
             + 'static;
         /// Returns the present forces of all owners, and then all forces again after every change: forces were set, removed or
-        /// have expired, or a step has changed AppliedForce.f_q. A slow reader skips replies and receives the newest one. A
-        /// renewal without a change is not reported. A scene may have 32 of these streams (REASON_LIMIT_REACHED).
+        /// have expired, a step has changed AppliedForce.f_q, or `receiver_error` has changed. A slow reader skips replies and
+        /// receives the newest one. A renewal without a change is not reported. A scene may have 32 of these streams
+        /// (REASON_LIMIT_REACHED).
         async fn stream_forces(
             &self,
             request: tonic::Request<super::StreamForcesRequest>,

@@ -5,6 +5,7 @@ mod demo;
 mod doctor;
 mod inspect;
 pub mod options;
+mod physics;
 mod recording;
 mod render;
 mod serve;

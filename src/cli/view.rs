@@ -4,7 +4,10 @@ use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
-use super::demo::{ForceFiles, Process, SceneLocation, program_path};
+use tokio::sync::oneshot;
+
+use super::demo::{ForceFiles, SceneLocation, program_path};
+use super::physics::PhysicsProcess;
 use super::serve::{TerminationSignals, announce, print_addresses, start};
 use super::{Completion, Outcome, print_line, recording};
 use crate::config::{BackendChoice, Config, ListenAddress, RendererChoice, ValidatedConfig};
@@ -34,8 +37,9 @@ pub(super) struct Args {
     /// Print the URL and do not open a browser.
     #[arg(long)]
     no_open: bool,
-    /// Move the scene with the physics process `modalcast-sim auto`, so that viewers can pull on the scene. Default: on
-    /// if the program is in the folder of this one.
+    /// Move the scene with the physics process `modalcast-sim auto --forces`, so that viewers can pull on the scene. A
+    /// scene with neither eigenvalues nor cubic forces stays at rest. Default: on if the program is in the folder of
+    /// this one.
     #[arg(long, overrides_with = "no_sim")]
     sim: bool,
     /// Show the scene at rest, until another process drives it.
@@ -134,10 +138,16 @@ async fn view(
     // The sockets are already open, so the browser and the physics process wait until the server answers.
     // Names of scenes have only letters that are valid in a URL.
     args.show(&format!("{}#scene={scene}", viewer_url(&listener)?));
-    let mut physics = physics_program.map(|path| start_physics(&path, &force_files, &listener, &scene)).transpose()?;
-    let result = service::serve(engine, listener, async move { signals.received().await }).await;
-    if let Some(physics) = &mut physics {
-        physics.stop();
+    let physics = physics_program.map(|path| start_physics(&path, &force_files, &listener, &scene)).transpose()?;
+    let (stop_sender, stopped) = oneshot::channel();
+    let physics = physics.map(|physics| tokio::spawn(physics.supervise(engine.clone(), scene, stopped)));
+    let shutdown = async move {
+        signals.received().await;
+        stop_sender.send(()).ok(); // Fails without a physics process.
+    };
+    let result = service::serve(engine, listener, shutdown).await;
+    if let Some(physics) = physics {
+        physics.await.map_err(fault_in("view"))?;
     }
     result
 }
@@ -156,12 +166,12 @@ fn viewer_url(listener: &Listener) -> Result<String> {
     listener.viewer_urls().into_iter().next().ok_or_else(|| fault("view", "expected the URL of the viewer"))
 }
 
-fn start_physics(program: &PathBuf, force_files: &ForceFiles, listener: &Listener, scene: &str) -> Result<Process> {
+fn start_physics(program: &Path, force_files: &ForceFiles, listener: &Listener, scene: &str) -> Result<PhysicsProcess> {
     let server = listener.local_urls().into_iter().next().ok_or_else(|| fault("view", "expected an address"))?;
     let mut flags = vec!["auto".to_owned(), "--server".into(), server, "--scene".into(), scene.into()];
     flags.extend(["--wait", "30", "--seconds", "0", "--realtime", "--forces", "--delivery", "latest"].map(Into::into));
     flags.extend(force_files.flags());
-    Process::start("physics", program, &flags)
+    PhysicsProcess::start(program, &flags)
 }
 
 /// Opens a URL in the browser. A machine without a browser is not an error, because the URL is printed.

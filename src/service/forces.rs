@@ -88,6 +88,7 @@ fn parse_force(scene: &Scene, force: &v1::Force) -> ModelResult<Force> {
 fn wire_report(report: &ForceReport) -> v1::StreamForcesResponse {
     v1::StreamForcesResponse {
         step: report.step.map(wire_step_id),
+        receiver_error: report.receiver_error.to_string(),
         forces: report.forces.iter().map(wire_applied_force).collect(),
     }
 }

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 use modalcast::config::{Config, RendererChoice};
 use modalcast_client::{
     Camera, Client, Force, ForceKind, ForceRequest, ForceSet, ForceStream, Lens, PickRectangle, PickRequest, Picture,
-    Reason, Rejection, SurfaceForce, View,
+    Reason, Rejection, Replies, SurfaceForce, View,
 };
 use modalcast_proto::v1;
 
@@ -94,6 +94,27 @@ async fn stream_reports_new_changed_and_cleared_forces() {
     assert_eq!(summarize(&next_set(&mut late_stream).await), [(1, 7, vec![5.0, 6.0])]);
     apply(&client, &FIRST_OWNER, &[]).await;
     assert_eq!(next_set(&mut stream).await, ForceSet::default());
+}
+
+/// The next reason why nothing receives the forces.
+async fn next_receiver_error(reader: &mut Replies<v1::StreamForcesResponse>) -> String {
+    with_timeout(reader.next()).await.expect("expected a valid report").expect("expected a report").receiver_error
+}
+
+/// Readers learn the reason, also those that come later, until another receiver subscribes.
+#[tokio::test(flavor = "multi_thread")]
+async fn readers_learn_why_nothing_receives_forces() {
+    let (server, client) = start_server().await;
+    let request = || v1::StreamForcesRequest { scene: "strips".into(), max_hz: 0.0, passive: true };
+    let mut reader = with_timeout(client.force_messages(request())).await.expect("expected a subscription");
+    assert_eq!(next_receiver_error(&mut reader).await, "");
+    let scene_handle = server.engine.find_opened("strips").await.expect("expected the scene");
+    scene_handle.set_receiver_error("diverged");
+    assert_eq!(next_receiver_error(&mut reader).await, "diverged");
+    let mut late_reader = with_timeout(client.force_messages(request())).await.expect("expected a subscription");
+    assert_eq!(next_receiver_error(&mut late_reader).await, "diverged");
+    subscribe(&client).await;
+    assert_eq!(next_receiver_error(&mut reader).await, "");
 }
 
 /// The forces of a viewer whose connection is lost expire; those of another viewer that renews them remain.

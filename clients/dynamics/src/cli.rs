@@ -56,7 +56,8 @@ pub(crate) enum Command {
         displacement_fraction: f64,
     },
     /// Selects the scenario: the bridge if cubic forces are available, else the tree if the scene has eigenvalues and
-    /// attached domains, else the sweep.
+    /// attached domains, else the sweep. With --forces, the tree without wind takes the place of the sweep; it needs
+    /// eigenvalues.
     #[command(after_help = EXAMPLES)]
     Auto {
         #[command(flatten)]

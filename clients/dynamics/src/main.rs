@@ -13,6 +13,7 @@ use modalcast_dynamics::bridge::{BridgeOptions, BridgeScenario};
 use modalcast_dynamics::cubic::ReducedForce;
 use modalcast_dynamics::force_domain::find_force_domain;
 use modalcast_dynamics::model::Model;
+use modalcast_dynamics::parameters::ModalParameters;
 use modalcast_dynamics::run::{Report, RunOptions, RunSummary, Scenario, drive_scene};
 use modalcast_dynamics::sweep::{SweepOptions, SweepScenario};
 use modalcast_dynamics::tree::{TreeOptions, TreeScenario};
@@ -20,7 +21,7 @@ use modalcast_dynamics::vega::VegaSettings;
 use modalcast_dynamics::{Error, Result, invalid_input};
 use tokio::sync::watch;
 
-use cli::{Cli, Command, CommonOptions, ForceFileOptions, LoadOptions};
+use cli::{Cli, Command, CommonOptions, ForceFileOptions, LoadOptions, WindOptions};
 
 /// Maximum number of surface samples per domain of a tree. A tree may have thousands of domains, and the rows of U of
 /// every sample are fetched from the server.
@@ -132,6 +133,9 @@ async fn create_scenario(client: &Client, scene: &str, command: &Command) -> Res
                 Command::Bridge { common: common.clone(), files: files.clone(), load: *load }
             } else if is_tree(&model) {
                 Command::Tree { common: common.clone(), wind: *wind }
+            } else if common.forces {
+                check_forces_move(&model)?;
+                Command::Tree { common: common.clone(), wind: WindOptions { strength: 0.0, ..*wind } }
             } else {
                 Command::Sweep { common: common.clone(), displacement_fraction: *displacement_fraction }
             };
@@ -146,6 +150,25 @@ async fn create_scenario(client: &Client, scene: &str, command: &Command) -> Res
 fn is_tree(model: &Model) -> bool {
     let has_eigenvalues = model.domains.iter().any(|domain| !domain.eigenvalues.is_empty());
     has_eigenvalues && model.domains.iter().any(|domain| domain.joint.is_some())
+}
+
+/// Checks that forces can move the scene.
+///
+/// # Errors
+/// `Invalid` if no mode has a stiffness. Says what the scene lacks.
+fn check_forces_move(model: &Model) -> Result<()> {
+    let parameters = ModalParameters::read(model)?;
+    if parameters.modes.iter().any(Option::is_some) {
+        return Ok(());
+    }
+    let given = match model.coordinate_count {
+        0 => "no modes: add the arrays U and eigenvalues in MODEL.npz".to_owned(),
+        count if model.domains.iter().all(|domain| domain.eigenvalues.is_empty()) => {
+            format!("{count} modes without: add the array eigenvalues, in (rad/s)^2, next to U")
+        }
+        _ => parameters.remarks.join("; "),
+    };
+    Err(invalid_input("scene", "modes with eigenvalues", given))
 }
 
 async fn create_bridge_scenario(

@@ -221,6 +221,39 @@ async fn forces_of_viewers_act_on_request() {
     assert!(sim_output.exit_code == 5 && sim_output.stderr.contains("--forces"), "{}", sim_output.stderr);
 }
 
+/// A force moves a body that is no tree. Without a stiffness, the process ends with the reason, and sends no step.
+#[tokio::test(flavor = "multi_thread")]
+async fn auto_moves_any_body_with_eigenvalues_by_forces() {
+    type Change<'a> = &'a dyn Fn(&mut FakeDomain);
+    let cases: [(Change<'_>, &str); 4] = [
+        (&|_| (), ""),
+        (&|domain| domain.shape.eigenvalues.clear(), "2 modes without: add the array eigenvalues"),
+        (&|domain| domain.shape.eigenvalues.fill(0.0), "'domain 0': q[0] (0 Hz), q[1] (0 Hz)"),
+        (&|domain| *domain = FakeDomain::new(0, domain.rest_positions.clone(), 0, vec![]), "no modes"),
+    ];
+    for (change, reason) in cases {
+        let mut domain = tree_server().domains.swap_remove(0);
+        change(&mut domain);
+        let f_q = vec![2.0_f32; domain.shape.rank as usize];
+        let mut server = FakeServer::new(vec![domain]);
+        let force = v1::Force { id: 1, domain: 0, kind: None };
+        server.forces = vec![v1::AppliedForce { owner: 1, force: Some(force), f_q: pack(&f_q).into() }];
+        let server = Arc::new(server);
+        let rest_positions = server.output().positions;
+        let url = serve(Arc::clone(&server)).await;
+        let sim_output = run_sim(&url, &["auto", "--scene", "toy", "--steps", "20", "--forces", "--json"]).await;
+        if reason.is_empty() {
+            assert_eq!(sim_output.exit_code, 0, "{}", sim_output.stderr);
+            assert_ne!(server.output().positions, rest_positions, "expected motion");
+            assert!(sim_output.report()["load"].as_str().expect("a load").starts_with("wind 0 "));
+            continue;
+        }
+        let last_line = sim_output.stderr.lines().last().unwrap_or_default();
+        assert!(sim_output.exit_code == 5 && last_line.contains(reason), "{}", sim_output.stderr);
+        assert!(last_line.contains("eigenvalues") && server.steps.lock().expect("lock").is_empty(), "{last_line}");
+    }
+}
+
 /// Invalid parameters of modes stop the process before the first step.
 #[tokio::test(flavor = "multi_thread")]
 async fn invalid_parameters_stop_before_the_first_step() {

@@ -150,6 +150,7 @@ export class App implements CommandHandlers {
         this.session = null;
         this.viewport.setScene(null);
         this.driveHint = "";
+        this.notices.hide("receiver");
         this.forceLines.setSession(null);
     }
 
@@ -227,7 +228,11 @@ export class App implements CommandHandlers {
     private connectSession(session: SceneSession): void {
         const { model, pictures, pull, driver } = session;
         model.onState = () => this.onState(session);
-        model.onForces = () => this.viewport.invalidate();
+        model.onForces = () => {
+            this.viewport.invalidate();
+            const text = model.receiverError && `Nothing answers a pull. ${model.receiverError}`;
+            this.notices.show("receiver", text, { severity: "warn", duration: 0 });
+        };
         if (pictures) {
             pictures.onFrame = () => {
                 this.status.pictureRate.add(1);

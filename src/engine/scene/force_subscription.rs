@@ -17,6 +17,8 @@ use modalcast_model::scene::SceneState;
 /// All forces in a scene.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ForceReport {
+    /// Why nothing receives the forces; empty if unknown.
+    pub receiver_error: Arc<str>,
     /// The step with whose transforms f_q was computed. `None` if f_q depends on no transform.
     pub step: Option<StepId>,
     /// Ordered by owner.
@@ -34,8 +36,8 @@ pub struct ForceSubscription {
     min_interval: Option<Duration>,
     /// Earliest time of the next report; `None` if it may be returned at once.
     next_report_at: Option<Instant>,
-    /// The forces of the last report; `None` before the first one.
-    reported_forces: Option<Arc<[AppliedForce]>>,
+    /// The last report; `None` before the first one.
+    last_report: Option<ForceReport>,
 }
 
 impl ForceSubscription {
@@ -48,11 +50,11 @@ impl ForceSubscription {
         let channel = Arc::clone(scene_handle.force_channel());
         let (reader, states) = (channel.subscribe(passive)?, scene_handle.watch_state());
         let min_interval = delivery.min_interval();
-        Ok(Self { scene_handle, channel, reader, states, min_interval, next_report_at: None, reported_forces: None })
+        Ok(Self { scene_handle, channel, reader, states, min_interval, next_report_at: None, last_report: None })
     }
 
-    /// Returns the present forces, and then waits until the forces or their f_q differ from those of the last report.
-    /// Cancel-safe.
+    /// Returns the present forces, and then waits until the forces, their f_q or the receiver's error differ from those
+    /// of the last report. Cancel-safe.
     ///
     /// # Errors
     /// The error with which the scene has ended.
@@ -69,8 +71,10 @@ impl ForceSubscription {
             let next_expiry = set.next_expiry();
             let depends_on_state = set.depends_on_state();
             let report = self.reduce(set, depends_on_state).await?;
-            if self.reported_forces.as_ref() != Some(&report.forces) {
-                self.reported_forces = Some(Arc::clone(&report.forces));
+            let is_equal =
+                |last: &ForceReport| (&last.forces, &last.receiver_error) == (&report.forces, &report.receiver_error);
+            if !self.last_report.as_ref().is_some_and(is_equal) {
+                self.last_report = Some(report.clone());
                 self.next_report_at = self.min_interval.and_then(|interval| Instant::now().checked_add(interval));
                 return Ok(report);
             }
@@ -83,11 +87,12 @@ impl ForceSubscription {
         let state = Arc::clone(&self.states.borrow_and_update());
         let step = depends_on_state.then(|| StepId::of(&state));
         let scene = Arc::clone(&self.scene_handle.scene);
-        if !depends_on_state {
-            return Ok(ForceReport { step, forces: set.reduce(&scene, &state).into() });
-        }
-        let forces = run_blocking("forces", move || Ok(set.reduce(&scene, &state))).await?;
-        Ok(ForceReport { step, forces: forces.into() })
+        let receiver_error = Arc::clone(&set.receiver_error);
+        let forces = match depends_on_state {
+            true => run_blocking("forces", move || Ok(set.reduce(&scene, &state))).await?,
+            false => set.reduce(&scene, &state),
+        };
+        Ok(ForceReport { receiver_error, step, forces: forces.into() })
     }
 
     /// Waits until the forces may have changed: they were set or may have expired or, if f_q depends on the state, a

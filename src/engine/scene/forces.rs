@@ -219,9 +219,11 @@ struct OwnedForces {
     expires_at: Instant,
 }
 
-/// The forces of all owners. A clone shares the forces.
+/// The forces of all owners, and why nothing receives them. A clone shares the forces.
 #[derive(Debug, Clone, Default)]
 pub(super) struct ForceSet {
+    /// The last message of the physics process that has ended; empty if none has, or if another one reads the forces.
+    pub(super) receiver_error: Arc<str>,
     /// In ascending order of `number`.
     owners: Vec<OwnedForces>,
     /// `number` of the newest owner.
@@ -349,7 +351,13 @@ impl ForceChannel {
         self.sets.send_if_modified(|set| set.drop_expired(Instant::now()));
     }
 
-    /// Adds a reader. A passive one, which does not simulate, does not count as a receiver of the forces.
+    /// Reports to all readers why nothing receives the forces.
+    pub(super) fn set_receiver_error(&self, message: &str) {
+        self.sets.send_modify(|set| set.receiver_error = message.into());
+    }
+
+    /// Adds a reader. A passive one, which does not simulate, does not count as a receiver of the forces. Another one
+    /// clears the error of the last receiver.
     ///
     /// # Errors
     /// `LimitReached` when there are too many readers.
@@ -357,6 +365,9 @@ impl ForceChannel {
         let sets = self.sets.subscribe();
         if self.sets.receiver_count() > MAX_READERS {
             return Err(Error::LimitReached { objects: "readers of the forces of one scene", limit: MAX_READERS });
+        }
+        if !passive {
+            self.sets.send_if_modified(|set| !std::mem::take(&mut set.receiver_error).is_empty());
         }
         Ok(ForceReader { sets, _receiver: (!passive).then(|| Arc::clone(&self.receivers)) })
     }

@@ -222,6 +222,11 @@ impl SceneHandle {
         self.force_channel().apply(update)
     }
 
+    /// Reports to viewers why nothing receives the forces any more, until another physics process does.
+    pub fn set_receiver_error(&self, message: &str) {
+        self.force_channel().set_receiver_error(message);
+    }
+
     pub(super) fn force_channel(&self) -> &Arc<ForceChannel> {
         self.forces.get_or_init(Arc::default)
     }

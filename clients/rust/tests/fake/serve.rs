@@ -111,7 +111,7 @@ impl ForceService for FakeService {
         request: Request<v1::StreamForcesRequest>,
     ) -> Result<Response<Self::StreamForcesStream>, Status> {
         self.check_scene(&request.into_inner().scene)?;
-        let forces = v1::StreamForcesResponse { step: None, forces: self.0.forces.clone() };
+        let forces = v1::StreamForcesResponse { forces: self.0.forces.clone(), ..Default::default() };
         let stream = tokio_stream::once(Ok(forces)).chain(tokio_stream::pending());
         Ok(Response::new(Box::pin(stream)))
     }

@@ -27,6 +27,11 @@ const LONGEST_PULL = 0.6;
 const LONGEST_PULL_OF_SCENE = 0.1;
 /** Force in newtons at a distance of the scene's diagonal if the description has no eigenvalues. */
 const DEFAULT_FORCE = 1000;
+/**
+ * Largest eigenvalue of a mode that may be a rigid motion, as a fraction of the largest of its domain. Solvers return
+ * rounding errors for these; the physics process holds such modes still, so they do not count for the compliance.
+ */
+const RIGID_TOLERANCE = 1e-9;
 
 export interface PullView {
     from: Vec3;
@@ -156,10 +161,11 @@ export class PullTool {
         const eigenvalues =
             description?.eigenvalues?.values ?? scene.shapes[description?.shape ?? 0]?.eigenvalues ?? [];
         const rank = at(layout.ranks, domain);
+        const smallest = RIGID_TOLERANCE * eigenvalues.reduce((largest, value) => Math.max(largest, value), 0);
         let compliance = 0;
         for (let mode = 0; mode < Math.min(rank, eigenvalues.length); mode++) {
             const eigenvalue = at(eigenvalues, mode);
-            if (!(eigenvalue > 0)) continue;
+            if (!(eigenvalue > smallest)) continue;
             for (let axis = 0; axis < 3; axis++) compliance += at(modes, axis * rank + mode) ** 2 / eigenvalue;
         }
         return compliance > 0 ? 1 / compliance : DEFAULT_FORCE / this.diagonal;
@@ -201,10 +207,11 @@ export class PullTool {
         try {
             const response = await this.server.applyForces(scene, this.owner, forces, LIFETIME_MS);
             this.ownerNumber = response.owner;
-            const isLost = forces.length > 0 && response.receivers === 0;
+            // If the reason is known, the page shows it already.
+            const isLost = forces.length > 0 && response.receivers === 0 && !this.model.receiverError;
             this.onMessage(
                 isLost
-                    ? "Nobody receives forces: no physics process reads them. For example, start `modalcast-sim auto --forces`."
+                    ? "Nobody receives forces: no physics process reads them. `modalcast-sim auto --forces` moves a scene with eigenvalues or cubic forces."
                     : "",
             );
         } catch (error) {

@@ -11,6 +11,8 @@ export class SceneModel {
     readonly layout: StateLayout;
     readonly state: SceneState;
     forces: readonly AppliedForce[] = [];
+    /** Why nothing answers the forces; empty if unknown, see StreamForcesResponse. */
+    receiverError = "";
     private readonly assembler = new StateAssembler();
     /** Number of states applied, steps skipped between them, and bytes of all states. */
     readonly counts = { states: 0, skipped: 0n, bytes: 0 };
@@ -37,6 +39,7 @@ export class SceneModel {
 
     receiveForces(response: StreamForcesResponse): void {
         this.forces = response.forces;
+        this.receiverError = response.receiverError;
         this.onForces();
     }
 

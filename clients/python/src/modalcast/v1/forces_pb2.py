@@ -25,7 +25,7 @@ _sym_db = _symbol_database.Default()
 from modalcast.v1 import common_pb2 as modalcast_dot_v1_dot_common__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x19modalcast/v1/forces.proto\x12\x0cmodalcast.v1\x1a\x19modalcast/v1/common.proto\"l\n\x12\x41pplyForcesRequest\x12\r\n\x05scene\x18\x01 \x01(\t\x12\r\n\x05owner\x18\x02 \x01(\x0c\x12#\n\x06\x66orces\x18\x03 \x03(\x0b\x32\x13.modalcast.v1.Force\x12\x13\n\x0blifetime_ms\x18\x04 \x01(\r\"L\n\x13\x41pplyForcesResponse\x12\r\n\x05owner\x18\x01 \x01(\x04\x12\x13\n\x0blifetime_ms\x18\x02 \x01(\r\x12\x11\n\treceivers\x18\x03 \x01(\r\"\x85\x01\n\x05\x46orce\x12\n\n\x02id\x18\x01 \x01(\x04\x12\x0e\n\x06\x64omain\x18\x02 \x01(\r\x12-\n\x07surface\x18\x03 \x01(\x0b\x32\x1a.modalcast.v1.SurfaceForceH\x00\x12)\n\x05modal\x18\x04 \x01(\x0b\x32\x18.modalcast.v1.ModalForceH\x00\x42\x06\n\x04kind\"E\n\x0cSurfaceForce\x12\x10\n\x08triangle\x18\x01 \x01(\r\x12\x13\n\x0b\x62\x61rycentric\x18\x02 \x03(\x01\x12\x0e\n\x06vector\x18\x03 \x03(\x01\"\x19\n\nModalForce\x12\x0b\n\x03\x66_q\x18\x01 \x01(\x0c\"E\n\x13StreamForcesRequest\x12\r\n\x05scene\x18\x01 \x01(\t\x12\x0e\n\x06max_hz\x18\x02 \x01(\x01\x12\x0f\n\x07passive\x18\x03 \x01(\x08\"t\n\x14StreamForcesResponse\x12\'\n\x04step\x18\x01 \x01(\x0b\x32\x14.modalcast.v1.StepIdH\x00\x88\x01\x01\x12*\n\x06\x66orces\x18\x02 \x03(\x0b\x32\x1a.modalcast.v1.AppliedForceB\x07\n\x05_step\"N\n\x0c\x41ppliedForce\x12\r\n\x05owner\x18\x01 \x01(\x04\x12\"\n\x05\x66orce\x18\x02 \x01(\x0b\x32\x13.modalcast.v1.Force\x12\x0b\n\x03\x66_q\x18\x03 \x01(\x0c\x32\xbb\x01\n\x0c\x46orceService\x12R\n\x0b\x41pplyForces\x12 .modalcast.v1.ApplyForcesRequest\x1a!.modalcast.v1.ApplyForcesResponse\x12W\n\x0cStreamForces\x12!.modalcast.v1.StreamForcesRequest\x1a\".modalcast.v1.StreamForcesResponse0\x01\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x19modalcast/v1/forces.proto\x12\x0cmodalcast.v1\x1a\x19modalcast/v1/common.proto\"l\n\x12\x41pplyForcesRequest\x12\r\n\x05scene\x18\x01 \x01(\t\x12\r\n\x05owner\x18\x02 \x01(\x0c\x12#\n\x06\x66orces\x18\x03 \x03(\x0b\x32\x13.modalcast.v1.Force\x12\x13\n\x0blifetime_ms\x18\x04 \x01(\r\"L\n\x13\x41pplyForcesResponse\x12\r\n\x05owner\x18\x01 \x01(\x04\x12\x13\n\x0blifetime_ms\x18\x02 \x01(\r\x12\x11\n\treceivers\x18\x03 \x01(\r\"\x85\x01\n\x05\x46orce\x12\n\n\x02id\x18\x01 \x01(\x04\x12\x0e\n\x06\x64omain\x18\x02 \x01(\r\x12-\n\x07surface\x18\x03 \x01(\x0b\x32\x1a.modalcast.v1.SurfaceForceH\x00\x12)\n\x05modal\x18\x04 \x01(\x0b\x32\x18.modalcast.v1.ModalForceH\x00\x42\x06\n\x04kind\"E\n\x0cSurfaceForce\x12\x10\n\x08triangle\x18\x01 \x01(\r\x12\x13\n\x0b\x62\x61rycentric\x18\x02 \x03(\x01\x12\x0e\n\x06vector\x18\x03 \x03(\x01\"\x19\n\nModalForce\x12\x0b\n\x03\x66_q\x18\x01 \x01(\x0c\"E\n\x13StreamForcesRequest\x12\r\n\x05scene\x18\x01 \x01(\t\x12\x0e\n\x06max_hz\x18\x02 \x01(\x01\x12\x0f\n\x07passive\x18\x03 \x01(\x08\"\x8c\x01\n\x14StreamForcesResponse\x12\'\n\x04step\x18\x01 \x01(\x0b\x32\x14.modalcast.v1.StepIdH\x00\x88\x01\x01\x12*\n\x06\x66orces\x18\x02 \x03(\x0b\x32\x1a.modalcast.v1.AppliedForce\x12\x16\n\x0ereceiver_error\x18\x03 \x01(\tB\x07\n\x05_step\"N\n\x0c\x41ppliedForce\x12\r\n\x05owner\x18\x01 \x01(\x04\x12\"\n\x05\x66orce\x18\x02 \x01(\x0b\x32\x13.modalcast.v1.Force\x12\x0b\n\x03\x66_q\x18\x03 \x01(\x0c\x32\xbb\x01\n\x0c\x46orceService\x12R\n\x0b\x41pplyForces\x12 .modalcast.v1.ApplyForcesRequest\x1a!.modalcast.v1.ApplyForcesResponse\x12W\n\x0cStreamForces\x12!.modalcast.v1.StreamForcesRequest\x1a\".modalcast.v1.StreamForcesResponse0\x01\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -44,10 +44,10 @@ if not _descriptor._USE_C_DESCRIPTORS:
   _globals['_MODALFORCE']._serialized_end=490
   _globals['_STREAMFORCESREQUEST']._serialized_start=492
   _globals['_STREAMFORCESREQUEST']._serialized_end=561
-  _globals['_STREAMFORCESRESPONSE']._serialized_start=563
-  _globals['_STREAMFORCESRESPONSE']._serialized_end=679
-  _globals['_APPLIEDFORCE']._serialized_start=681
-  _globals['_APPLIEDFORCE']._serialized_end=759
-  _globals['_FORCESERVICE']._serialized_start=762
-  _globals['_FORCESERVICE']._serialized_end=949
+  _globals['_STREAMFORCESRESPONSE']._serialized_start=564
+  _globals['_STREAMFORCESRESPONSE']._serialized_end=704
+  _globals['_APPLIEDFORCE']._serialized_start=706
+  _globals['_APPLIEDFORCE']._serialized_end=784
+  _globals['_FORCESERVICE']._serialized_start=787
+  _globals['_FORCESERVICE']._serialized_end=974
 # @@protoc_insertion_point(module_scope)

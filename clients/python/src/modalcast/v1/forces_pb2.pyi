@@ -68,12 +68,14 @@ class StreamForcesRequest(_message.Message):
     def __init__(self, scene: _Optional[str] = ..., max_hz: _Optional[float] = ..., passive: bool = ...) -> None: ...
 
 class StreamForcesResponse(_message.Message):
-    __slots__ = ("step", "forces")
+    __slots__ = ("step", "forces", "receiver_error")
     STEP_FIELD_NUMBER: _ClassVar[int]
     FORCES_FIELD_NUMBER: _ClassVar[int]
+    RECEIVER_ERROR_FIELD_NUMBER: _ClassVar[int]
     step: _common_pb2.StepId
     forces: _containers.RepeatedCompositeFieldContainer[AppliedForce]
-    def __init__(self, step: _Optional[_Union[_common_pb2.StepId, _Mapping]] = ..., forces: _Optional[_Iterable[_Union[AppliedForce, _Mapping]]] = ...) -> None: ...
+    receiver_error: str
+    def __init__(self, step: _Optional[_Union[_common_pb2.StepId, _Mapping]] = ..., forces: _Optional[_Iterable[_Union[AppliedForce, _Mapping]]] = ..., receiver_error: _Optional[str] = ...) -> None: ...
 
 class AppliedForce(_message.Message):
     __slots__ = ("owner", "force", "f_q")

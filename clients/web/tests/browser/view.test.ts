@@ -1,0 +1,174 @@
+/** `modalcast view` in headless Chromium: a body with eigenvalues answers a pull, and others say why they do not. */
+
+import assert from "node:assert/strict";
+import type { ChildProcess } from "node:child_process";
+import { mkdirSync, readdirSync, readFileSync, writeFileSync } from "node:fs";
+import { join } from "node:path";
+import { after, before, test } from "node:test";
+import type { Browser, Page } from "playwright-core";
+import {
+    end,
+    launchBrowser,
+    openPage,
+    printedUrl,
+    startProgram,
+    temporaryFolder,
+    type ViewerPage,
+    waitForScene,
+} from "./harness";
+import { Beam } from "./model_files";
+
+const LIMIT_MS = 300_000;
+const WIDTH = 1000;
+const HEIGHT = 640;
+/** Folder for a screenshot of each test; empty: none. */
+const SCREENSHOTS = process.env["MODALCAST_SCREENSHOTS"] ?? "";
+
+let browser: Browser;
+const programs: ChildProcess[] = [];
+before(async () => {
+    browser = await launchBrowser();
+});
+after(async () => {
+    await browser.close();
+    await Promise.all(programs.map((program) => end(program)));
+});
+
+/** `modalcast view` of a model file, and its page. */
+interface View extends ViewerPage {
+    program: ChildProcess;
+}
+
+async function view(name: string, content: Buffer | string): Promise<View> {
+    const model = join(temporaryFolder(), name);
+    writeFileSync(model, content);
+    const options = ["view", model, "--no-open", "--backend", "cpu"];
+    const program = startProgram("modalcast", options, ["ignore", "pipe", "pipe"]);
+    programs.push(program);
+    const url = await printedUrl(program, "open");
+    const viewerPage = await openPage(browser, url, WIDTH, HEIGHT);
+    await waitForScene(viewerPage.page);
+    return { ...viewerPage, program };
+}
+
+async function close({ page, errors, program }: View): Promise<void> {
+    assert.deepEqual(errors, []);
+    await page.close();
+    await end(program);
+    assert.equal(program.exitCode, 0);
+}
+
+async function takeScreenshot(page: Page, name: string): Promise<void> {
+    if (!SCREENSHOTS) return;
+    mkdirSync(SCREENSHOTS, { recursive: true });
+    await page.screenshot({ path: join(SCREENSHOTS, `${name}.png`) });
+}
+
+/** The child processes of a program, zombies included: their numbers by their names. */
+function children(program: ChildProcess): Record<string, number> {
+    const found: Record<string, number> = {};
+    for (const pid of readdirSync("/proc").filter((name) => /^\d+$/.test(name))) {
+        let stat = "";
+        try {
+            stat = readFileSync(`/proc/${pid}/stat`, "utf8");
+        } catch {
+            // The process has ended.
+        }
+        const [, name = "", parent] = /^\d+ \((.*)\) \w (\d+)/.exec(stat) ?? [];
+        if (Number(parent) === program.pid) found[name] = Number(pid);
+    }
+    return found;
+}
+
+/** A pixel in the middle of the beam, in its upper half and below the bar at the top of the page. */
+function upperPixel(page: Page): Promise<[number, number]> {
+    return page.evaluate(() => {
+        const { renderer, viewport } = modalcastViewer;
+        const stage = document.getElementById("stage") as HTMLElement;
+        const [width, height] = [stage.clientWidth, stage.clientHeight];
+        const ids = renderer?.domainIds(viewport.camera.camera, width, height) ?? [];
+        const y = Math.round(0.3 * height);
+        const pixels = Array.from({ length: width }, (_, x) => x).filter((x) => ids[y * width + x] === 0);
+        const x = pixels[Math.floor(pixels.length / 2)];
+        if (x === undefined) throw new Error("expected the beam in the picture");
+        return [x, y] as [number, number];
+    });
+}
+
+function coordinates(page: Page): Promise<number[]> {
+    return page.evaluate(() => [...(modalcastViewer.model?.state.q ?? [])]);
+}
+
+/** Largest norm of q within some time. */
+async function largestNorm(page: Page, milliseconds: number): Promise<number> {
+    let largest = 0;
+    for (const limit = performance.now() + milliseconds; performance.now() < limit; ) {
+        largest = Math.max(largest, Math.hypot(...(await coordinates(page))));
+        await page.waitForTimeout(20);
+    }
+    return largest;
+}
+
+test("a one-part archive with eigenvalues is pulled, moves and rings down", { timeout: LIMIT_MS }, async () => {
+    const eigenvalue = (hertz: number) => (2 * Math.PI * hertz) ** 2;
+    const shown = await view("beam.npz", new Beam().npz([eigenvalue(1), eigenvalue(1.5)]));
+    const { page, program } = shown;
+    await page.waitForFunction(() => modalcastViewer.status.stateRate.perSecond() > 5);
+    assert.equal(Math.hypot(...(await coordinates(page))), 0, "expected no motion without a pull");
+    assert.deepEqual(Object.keys(children(program)), ["modalcast-sim"]);
+    const [x, y] = await upperPixel(page);
+    await page.keyboard.down("Shift");
+    await page.mouse.move(x, y);
+    await page.mouse.down();
+    await page.waitForFunction(() => modalcastViewer.pull?.view != null);
+    await page.mouse.move(x + 80, y, { steps: 5 });
+    // The displacement at the free end is |q|; the beam has length 1.
+    await page.waitForFunction(() => Math.hypot(...(modalcastViewer.model?.state.q ?? [])) > 0.1);
+    await page.waitForTimeout(500);
+    await takeScreenshot(page, "view-npz-pulled");
+    const pulled = await coordinates(page);
+    await page.mouse.up();
+    await page.keyboard.up("Shift");
+    // It swings to the other side, and comes to rest.
+    await page.waitForFunction((start) => {
+        const q = modalcastViewer.model?.state.q ?? [];
+        return start.reduce((sum, value, mode) => sum + value * (q[mode] ?? 0), 0) < 0;
+    }, pulled);
+    let norm = Math.hypot(...pulled);
+    while (norm > 0.2 * Math.hypot(...pulled)) norm = await largestNorm(page, 1200);
+    assert.equal(await page.locator(".notice").count(), 0);
+    // The page learns that the physics process has ended.
+    const physics = children(program)["modalcast-sim"];
+    assert.ok(physics);
+    process.kill(physics, "SIGKILL");
+    await page.locator(".notice", { hasText: "modalcast-sim has ended (signal: 9" }).waitFor();
+    assert.deepEqual(children(program), {}, "expected no child process, and no zombie");
+    await close(shown);
+});
+
+for (const [name, content, reason] of [
+    ["beam.npz", new Beam().npz(null), "got 2 modes without: add the array eigenvalues"],
+    ["beam.stl", new Beam().stl(), "got no modes: add the arrays U and eigenvalues"],
+] as const) {
+    test(`${name} without eigenvalues says why it does not answer a pull`, { timeout: LIMIT_MS }, async () => {
+        const shown = await view(name, content);
+        const { page, program } = shown;
+        const notice = page.locator(".notice", { hasText: "Nothing answers a pull." });
+        await notice.waitFor();
+        const text = (await notice.textContent()) ?? "";
+        assert.ok(text.includes(reason), text);
+        await takeScreenshot(page, `view-${name.replace("beam.", "")}-without-eigenvalues`);
+        assert.deepEqual(children(program), {}, "expected no child process, and no zombie");
+        // A pull shows the reason again after the user has closed it.
+        await notice.getByRole("button", { name: "Close this message" }).click();
+        await notice.waitFor({ state: "hidden" });
+        await page.keyboard.down("Shift");
+        await page.mouse.move(...(await upperPixel(page)));
+        await page.mouse.down();
+        await notice.waitFor();
+        await page.mouse.up();
+        await page.keyboard.up("Shift");
+        assert.equal(await page.locator(".notice").count(), 1, "expected one message");
+        await close(shown);
+    });
+}
