@@ -27,6 +27,10 @@ pub(crate) fn seeds(target: &str) -> Vec<Vec<u8>> {
             ("faces", npy("<i4", "(1, 3)", &[0, 0, 0, 0, 1, 0, 0, 0, 2, 0, 0, 0])),
             ("U", npy("<f4", "(9, 1)", &f32s(9))),
             ("eigenvalues", npy("<f8", "(1,)", &2.0_f64.to_le_bytes())),
+            ("corner_normals", npy("<f4", "(1, 3, 3)", &f32s(9))),
+            ("face_materials", npy("|u1", "(1,)", &[1])),
+            ("material_colors", npy("|u1", "(2, 3)", &[0, 0, 1, 1, 1, 0])),
+            ("notes", npy("|u1", "(10,)", b"{\"a\": \"b\"}")),
         ])],
         "obj" => texts(&[
             "mtllib m.mtl\no a\nv 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvn 0 0 1\ng p\ns 1\nusemtl a\n\

@@ -2,7 +2,8 @@
 
 use super::asset_dir::{AssetDir, EntryKind, extension_of, file_name_of, parent_of, stem_of};
 use super::conversion::model_hint;
-use super::surface::ModelOptions;
+use super::modes::computed_modes_remark;
+use super::surface::{ModelOptions, ModesSource};
 use super::{SceneDescription, gltf, manifest, npz_model, obj, plant, ply, stl};
 use crate::error::{Error, Result, invalid};
 use crate::scene::SceneParts;
@@ -119,14 +120,19 @@ pub(super) fn read_model(files: &AssetDir, path: &str, options: ModelOptions) ->
 }
 
 fn read_model_file(folder: &AssetDir, model: &ModelFile, options: ModelOptions) -> Result<SceneParts> {
-    match model {
+    let mut parts = match model {
         ModelFile::Gltf(name) => gltf::read(folder, name, options.crease_angle),
         ModelFile::Obj(name) => obj::read(folder, name, options),
         ModelFile::Plant(name) => plant::read(folder, name, options.crease_angle),
         ModelFile::Ply(name) => ply::read(folder, name, options),
         ModelFile::Stl(name) => stl::read(folder, name, options),
         ModelFile::Npz(name) => npz_model::read(folder, name, options),
+    }?;
+    let is_rigid = parts.shapes.iter().all(|shape| shape.modes.rank() == 0);
+    if is_rigid && options.modes == ModesSource::Sidecar {
+        parts.remarks.extend(computed_modes_remark(folder, model.name()));
     }
+    Ok(parts)
 }
 
 /// Recognizes a model by the extension of its main file `name`.

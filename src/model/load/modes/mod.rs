@@ -1,5 +1,6 @@
 //! Loaders of the modal matrix U: 3n rows for n vertices, r columns for r modes, f32.
 
+mod computed;
 mod npy;
 mod npz;
 mod safetensors;
@@ -7,9 +8,10 @@ mod sidecar;
 mod sofa;
 mod vega;
 
+pub(super) use computed::computed_modes_remark;
 pub(super) use npy::parse_f64;
 pub use npy::{NpyArray, parse as parse_numpy};
-pub(super) use npz::{NpzArchive, has_arrays, read_modes as read_npz_modes};
+pub(super) use npz::{NpzArchive, has_arrays, read_modes as read_npz_modes, read_notes as read_npz_notes};
 pub(super) use sidecar::find_sidecar;
 
 #[cfg(test)]

@@ -85,6 +85,19 @@ pub(in crate::load) fn parse_f64(bytes: &[u8]) -> Result<(Vec<usize>, Vec<f64>)>
     Ok((header.shape, entries))
 }
 
+/// The entries of an array of bytes.
+///
+/// # Errors
+/// `Invalid` as for [`parse`], or if the entries are not bytes.
+pub(in crate::load) fn parse_bytes(bytes: &[u8]) -> Result<&[u8]> {
+    let (header, body) = parse_header(bytes)?;
+    header.check_size(body)?;
+    match header.dtype.get(1..) {
+        Some("u1") => Ok(body),
+        _ => Err(invalid("descr", "u1", header.dtype)),
+    }
+}
+
 /// The type of the entries without its byte order, and the entries in little-endian order.
 fn in_little_endian<'a, 'b>(dtype: &'a str, body: &'b [u8]) -> (&'a str, Cow<'b, [u8]>) {
     let kind = dtype.get(1..).unwrap_or_default();

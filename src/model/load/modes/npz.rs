@@ -1,5 +1,7 @@
 //! Reader of NumPy archives (`numpy.savez`, `numpy.savez_compressed`): arrays by name.
 
+use std::collections::BTreeMap;
+use std::fs::File;
 use std::io::{BufReader, Cursor, Read, Seek};
 use std::sync::Arc;
 
@@ -12,8 +14,14 @@ use crate::error::{Error, Result, invalid};
 use crate::load::asset_dir::{AssetDir, MAX_MODEL_BYTES};
 use crate::memory::{MemoryReservation, TemporaryReservation};
 
+/// The name of the array of notes.
+const NOTES: &str = "notes";
 /// The largest number of arrays in an archive.
 const MAX_ARRAYS: usize = 1024;
+/// The largest array of notes in bytes.
+const MAX_NOTES_BYTES: usize = 256 << 10;
+/// The largest length of an error of the JSON parser in an error message.
+const MAX_QUOTED_CHARS: usize = 160;
 /// The largest number of names in an error message.
 const MAX_LISTED_NAMES: usize = 16;
 /// Bytes of an entry while it is parsed: as f64, and as f32 in two orders.
@@ -108,10 +116,14 @@ impl<'a> NpzArchive<'a> {
 
 /// Whether the file `name` is an archive with arrays of all these names. Reads only the directory of the archive.
 pub(in crate::load) fn has_arrays(files: &AssetDir, name: &str, arrays: &[&str]) -> bool {
-    let file = files.open(name).ok().filter(|(_, file_bytes)| *file_bytes <= MAX_MODEL_BYTES);
-    let archive = file.and_then(|(file, _)| ZipArchive::new(BufReader::new(file)).ok());
-    let names = archive.map_or_else(Vec::new, |archive| array_names(&archive));
+    let names = open_file(files, name).map_or_else(Vec::new, |archive| array_names(&archive));
     arrays.iter().all(|array| names.iter().any(|name| name == array))
+}
+
+/// Reads the directory of the archive in the file `name`. `None` if the file is not an archive.
+fn open_file(files: &AssetDir, name: &str) -> Option<ZipArchive<BufReader<File>>> {
+    let (file, _) = files.open(name).ok().filter(|(_, file_bytes)| *file_bytes <= MAX_MODEL_BYTES)?;
+    ZipArchive::new(BufReader::new(file)).ok()
 }
 
 /// Names of the arrays in an archive, sorted.
@@ -146,6 +158,47 @@ pub(in crate::load) fn read_modes(archive: &mut NpzArchive<'_>) -> Result<Loaded
     let array: Result<NpyArray> = npy::parse(&bytes);
     let modes = array.and_then(matrix).map_err(|error| in_array(error, &name))?;
     LoadedModes::new(modes, read_vector(archive, "eigenvalues", MAX_RANK)?)
+}
+
+/// Reads the array `notes`: a JSON object of texts, in UTF-8, as an array of bytes. Without this array, there are no
+/// notes.
+///
+/// # Errors
+/// `Invalid` if the array is too large or contains other values.
+pub(in crate::load) fn read_notes(archive: &mut NpzArchive<'_>) -> Result<BTreeMap<String, String>> {
+    let Some(bytes) = archive.read(NOTES, check_notes_shape)? else { return Ok(BTreeMap::new()) };
+    parse_notes(&bytes).map_err(|error| in_array(error, NOTES))
+}
+
+/// As [`read_notes`], without reading the other arrays of the file `name`. There are no notes if the file is not an
+/// archive or has no valid notes.
+pub(in crate::load) fn find_notes(files: &AssetDir, name: &str) -> BTreeMap<String, String> {
+    let read = || {
+        let mut archive = open_file(files, name)?;
+        let member = archive.by_name(&format!("{NOTES}.npy")).ok()?;
+        let limit = MAX_NOTES_BYTES + npy::MAX_PREFIX_BYTES;
+        let mut bytes = Vec::new();
+        member.take(limit as u64).read_to_end(&mut bytes).ok()?;
+        parse_notes(&bytes).ok()
+    };
+    read().unwrap_or_default()
+}
+
+fn check_notes_shape(shape: &[usize]) -> Result<()> {
+    match shape {
+        [bytes] if *bytes <= MAX_NOTES_BYTES => Ok(()),
+        _ => Err(invalid("shape", format!("at most {MAX_NOTES_BYTES} bytes"), format!("{shape:?}"))),
+    }
+}
+
+fn parse_notes(bytes: &[u8]) -> Result<BTreeMap<String, String>> {
+    let text = npy::parse_bytes(bytes)?;
+    let invalid_text = |error: serde_json::Error| {
+        // The error may quote the text.
+        let given: String = error.to_string().chars().take(MAX_QUOTED_CHARS).collect();
+        invalid("text", "a JSON object of texts in UTF-8", given)
+    };
+    serde_json::from_slice(text).map_err(invalid_text)
 }
 
 /// Reads a vector of at most `limit` entries. Returns an empty vector if the archive has no array of this name.
