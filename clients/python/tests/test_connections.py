@@ -20,7 +20,7 @@ from scenes import SIZE, beam, beam_builder
 import modalcast as mc
 from modalcast._channel import default_address
 from modalcast._methods import PROTOCOL_VERSION
-from modalcast._server_process import _find_program
+from modalcast._server_process import find_program
 
 
 class RestartableServer:
@@ -30,7 +30,7 @@ class RestartableServer:
         with socket.create_server(("127.0.0.1", 0)) as probe:
             port = probe.getsockname()[1]
         self.address = f"127.0.0.1:{port}"
-        self.command = [_find_program(None), "serve", "--listen", self.address, "--state", str(folder)]
+        self.command = [find_program(None), "serve", "--listen", self.address, "--state", str(folder)]
         self.command += SERVER_ARGUMENTS
         self.start()
 

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from test_surface import POINTS, TETRAHEDRA
 
-from modalcast._server_process import _find_program
+from modalcast._server_process import find_program
 
 PAGE = Path(__file__).parents[3] / "src/model/load/manifest/README.md"
 NAME = "a part's"
@@ -54,7 +54,7 @@ def run_tool(*command: str, folder: Path) -> None:
 
 def inspect(path: str, folder: Path) -> subprocess.CompletedProcess[str]:
     # The path of the program may be relative to the folder in which the tests run.
-    return run(str(Path(_find_program(None)).resolve()), "inspect", path, folder=folder)
+    return run(str(Path(find_program(None)).resolve()), "inspect", path, folder=folder)
 
 
 def total(output: str, name: str) -> int:

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 import modalcast as mc
-from modalcast._server_process import _find_program
+from modalcast._server_process import find_program
 
 ROOT = Path(__file__).parents[3]
 DOCUMENTS = [ROOT / name for name in ("README.md", "clients/python/README.md", "clients/recipes.md")]
@@ -33,10 +33,9 @@ PYTHON, SHELL = list(blocks("python")), list(blocks("bash"))
 @pytest.fixture
 def programs() -> str:
     """The folder of the programs, of which a build of the server alone has only one."""
-    folder = Path(_find_program(None)).parent
-    missing = [
-        name for name in ("modalcast-sim", "modalcast-fetch", "modalcast-record") if not (folder / name).exists()
-    ]
+    folder = Path(find_program(None)).parent
+    names = ("modalcast-sim", "modalcast-fetch", "modalcast-record", "modalcast-modes")
+    missing = [name for name in names if not (folder / name).exists()]
     if missing:
         pytest.skip(f"{folder} has no {', '.join(missing)}")
     return str(folder)
@@ -58,7 +57,7 @@ def test_python_runs(
     for package in OPTIONAL_PACKAGES:
         if f"import {package}\n" in block:
             pytest.importorskip(package)
-    if "import subprocess" in block:
+    if "import subprocess" in block or "make_model" in block:
         monkeypatch.setenv("PATH", request.getfixturevalue("programs"), prepend=os.pathsep)
     monkeypatch.chdir(tmp_path)
     # The server of the tests in place of the one that the reader has started.

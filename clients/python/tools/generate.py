@@ -43,7 +43,7 @@ def sync_modules() -> dict[Path, str]:
     """The synchronous modules by path."""
     modules: dict[Path, str] = {}
     for path in sorted((SOURCE / "_async").glob("*.py")):
-        if path.name not in ("__init__.py", "transport.py"):
+        if path.name not in ("__init__.py", "threads.py", "transport.py"):
             modules[SOURCE / "_sync" / path.name] = to_sync(path.read_text(), path.name)
     # Remove the imports that only the asyncio client uses, sort the others, and format.
     for arguments in (["check", "--quiet", "--fix", "--exit-zero", "--select=F401,I"], ["format", "--quiet"]):

@@ -8,6 +8,7 @@ from modalcast._common import Delivery, StepId
 from modalcast._methods import PROTOCOL_VERSION
 from modalcast._sync.client import Client, SceneList, connect, spawn
 from modalcast._sync.drive import Drive
+from modalcast._sync.modeling import make_model
 from modalcast._sync.scene import Scene
 from modalcast._sync.streams import FrameBatchStream, FrameStream, Stream
 from modalcast.camera import Camera, at_pose, look_at, pinhole
@@ -21,6 +22,7 @@ from modalcast.errors import (
     LeaseLost,
     LimitReached,
     MalformedReply,
+    ModelingError,
     NotFound,
     ProtocolVersionError,
     ServerError,
@@ -31,6 +33,7 @@ from modalcast.errors import (
 )
 from modalcast.forces import AppliedForce, Force, ForceSet, Hit, PickResult, modal_force, surface_force
 from modalcast.frame import NO_DOMAIN, Frame, Image, Output
+from modalcast.modeling import ModalModel
 from modalcast.scene_description import Domain, Domains, Material, SceneDescription, Shape, Texture
 from modalcast.states import SceneState
 from modalcast.step_values import WorldPose
@@ -67,6 +70,8 @@ __all__ = [
     "LimitReached",
     "MalformedReply",
     "Material",
+    "ModalModel",
+    "ModelingError",
     "NotFound",
     "Output",
     "PickResult",
@@ -91,6 +96,7 @@ __all__ = [
     "at_pose",
     "connect",
     "look_at",
+    "make_model",
     "modal_force",
     "pinhole",
     "spawn",

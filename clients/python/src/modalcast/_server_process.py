@@ -32,7 +32,7 @@ class ServerProcess:
         Raises:
             ServerStartError: The program does not exist or cannot be started.
         """
-        path = _find_program(program)
+        path = find_program(program)
         self._folder = tempfile.TemporaryDirectory(prefix="modalcast-", ignore_cleanup_errors=True)
         folder = Path(self._folder.name)
         self._output, self._log = folder / "output", folder / "log"
@@ -70,7 +70,12 @@ class ServerProcess:
         self._finalizer()
 
 
-def _find_program(program: str | Path | None) -> str:
+def find_program(program: str | Path | None) -> str:
+    """The path of the program `modalcast`: the given one, that of MODALCAST_PROGRAM, or the one in PATH.
+
+    Raises:
+        ServerStartError: It does not exist.
+    """
     name = str(program or os.environ.get("MODALCAST_PROGRAM") or "modalcast")
     # A wheel with the programs installs them in the folder of scripts, which need not be in PATH.
     path = shutil.which(name) or shutil.which(name, path=sysconfig.get_path("scripts"))

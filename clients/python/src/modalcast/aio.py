@@ -2,7 +2,19 @@
 
 from modalcast._async.client import Client, SceneList, connect, spawn
 from modalcast._async.drive import Drive
+from modalcast._async.modeling import make_model
 from modalcast._async.scene import Scene
 from modalcast._async.streams import FrameBatchStream, FrameStream, Stream
 
-__all__ = ["Client", "Drive", "FrameBatchStream", "FrameStream", "Scene", "SceneList", "Stream", "connect", "spawn"]
+__all__ = [
+    "Client",
+    "Drive",
+    "FrameBatchStream",
+    "FrameStream",
+    "Scene",
+    "SceneList",
+    "Stream",
+    "connect",
+    "make_model",
+    "spawn",
+]

@@ -37,6 +37,10 @@ class ServerStartError(Error):
     """`spawn` could not start a server."""
 
 
+class ModelingError(Error):
+    """`make_model` could not compute modes; the message is that of the program."""
+
+
 class ServerError(Error):
     """The server rejected a call, a step or a stream.
 
