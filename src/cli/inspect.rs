@@ -1,6 +1,8 @@
 //! `modalcast inspect`: prints the content of a scene, the features that it uses, and the memory and passes that are
 //! saved because unused features are omitted.
 
+use std::collections::BTreeMap;
+
 use serde::Serialize;
 use serde_json::{Value, json};
 
@@ -15,6 +17,9 @@ use modalcast_render::{Pass, RenderPlan};
 
 /// Number of domains that the text table lists; `--json` lists all.
 const MAX_LISTED_DOMAINS: usize = 24;
+
+/// Number of characters of a note that the text output shows.
+const MAX_NOTE_CHARS: usize = 100;
 
 /// Shows the size of each domain, the totals, the features that the scene needs, and the savings from unused features.
 #[derive(Debug, clap::Args)]
@@ -104,6 +109,7 @@ struct DomainReport<'a> {
     /// Index of the domain whose transform determines the transform of this domain.
     follows: Option<usize>,
     material: &'a str,
+    notes: &'a BTreeMap<String, String>,
 }
 
 impl<'a> SceneReport<'a> {
@@ -140,6 +146,7 @@ impl<'a> DomainReport<'a> {
             parent: domain.attachment.as_ref().map(|attachment| attachment.parent),
             follows: domain.follows.map(|follow| follow.parent),
             material: &scene.materials[domain.material].name,
+            notes: &domain.metadata.notes,
         }
     }
 }
@@ -186,12 +193,23 @@ fn text_lines(opened_scene: &OpenedScene) -> Vec<String> {
     let diagonal = scene.rest_bounds.diagonal();
     lines.push(format!("up {:?}, unit {} m, diagonal {diagonal:.4}, origin {:?}", scene.up, scene.unit, scene.origin));
     lines.extend(load::modes_files(scene).iter().map(|file| format!("modes: {file}")));
+    if let [domain] = &scene.domains[..] {
+        lines.extend(domain.metadata.notes.iter().map(|(name, text)| format!("note {name}: {}", shortened(text))));
+    }
     lines.extend(remark_lines(scene));
     let flags = scene.features.flags().into_iter();
     let needed_features: Vec<&str> = flags.filter_map(|(name, is_needed)| is_needed.then_some(name)).collect();
     lines.push(format!("needs: {}", needed_features.join(", ")));
     lines.extend(plan_lines(opened_scene));
     lines
+}
+
+/// The text of a note, or its beginning if it is long (`--json` has all of it).
+fn shortened(text: &str) -> String {
+    match text.char_indices().nth(MAX_NOTE_CHARS) {
+        Some((end, _)) => format!("{} ...", &text[..end]),
+        None => text.to_owned(),
+    }
 }
 
 /// The plan of the CUDA deformer that the server creates for the scene.
@@ -306,6 +324,9 @@ mod tests {
         let lines = text_lines(&opened_scene);
         assert!(lines.contains(&"modes: a.modes.txt (r = 1)".to_owned()), "{lines:?}");
         assert!(lines.contains(&"remark: not used as modes: pressure.npy".to_owned()), "{lines:?}");
+        assert!(lines.contains(&"note modes.file: a.modes.txt".to_owned()), "{lines:?}");
+        assert_eq!(shortened(&"ä".repeat(101)), format!("{} ...", "ä".repeat(100)));
+        assert_eq!(shortened(&"ä".repeat(100)), "ä".repeat(100));
     }
 
     #[test]
