@@ -1,9 +1,11 @@
 //! The command line: the commands, one per file, and their exit codes.
 
 mod allocator;
+mod computed_modes;
 mod demo;
 mod doctor;
 mod inspect;
+mod modeling_options;
 pub mod options;
 mod physics;
 mod recording;
@@ -44,6 +46,9 @@ enum Command {
     /// Converts a recording to a web page, glTF, NumPy arrays, pictures or a video.
     #[command(after_help = EXPORT_EXAMPLES, disable_help_flag = true)]
     Export(sibling::Args),
+    /// Computes the modes of a surface, so that the part can be pulled, and writes them in a model file.
+    #[command(after_help = MODEL_EXAMPLES, disable_help_flag = true)]
+    Model(sibling::Args),
     /// Measures error against run time on this machine and writes tables and plots.
     #[command(after_help = REPORT_EXAMPLES, disable_help_flag = true)]
     Report(sibling::Args),
@@ -69,6 +74,11 @@ const EXPORT_EXAMPLES: &str = "Examples:
 const RECOVER_EXAMPLES: &str = "Examples:
   modalcast recover --help
   modalcast recover cut.mcap --out tree.mcap";
+
+const MODEL_EXAMPLES: &str = "Examples:
+  modalcast model --help
+  modalcast model part.stl --modes 20 --material steel --clamp 'z < 0.01' --out part.npz
+  modalcast view part.npz";
 
 const REPORT_EXAMPLES: &str = "Examples:
   modalcast report --help
@@ -100,6 +110,8 @@ pub enum Completion {
     Success,
     /// The command is done, and its check failed.
     CheckFailed,
+    /// A program that the command started has failed with this exit code and printed the reason.
+    ProgramFailed(u8),
 }
 
 impl Completion {
@@ -126,6 +138,7 @@ pub fn run() -> u8 {
         Command::Replay(args) => sibling::RECORD.execute(Some("replay"), &args),
         Command::Export(args) => sibling::RECORD.execute(Some("export"), &args),
         Command::Recover(args) => sibling::RECORD.execute(Some("recover"), &args),
+        Command::Model(args) => sibling::MODES.execute(None, &args),
         Command::Report(args) => sibling::REPORT.execute(None, &args),
         Command::Inspect(args) => inspect::run(&args),
         Command::Doctor(args) => doctor::run(&args),
@@ -138,6 +151,7 @@ pub fn finish(outcome: Outcome) -> u8 {
     match outcome {
         Ok(Completion::Success) => 0,
         Ok(Completion::CheckFailed) => 1,
+        Ok(Completion::ProgramFailed(code)) => code,
         Err(error) => {
             eprintln!("modalcast: {error}");
             exit_code(&error)

@@ -1,9 +1,9 @@
 //! Commands that other programs of this project execute: executables in the same folder. They are separate, so that the
-//! server is built without benchmarks and recordings.
+//! server is built without benchmarks, recordings and finite elements.
 
 use std::ffi::OsString;
 use std::os::unix::process::CommandExt as _;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use modalcast_model::error::{Error, Result, fault_in};
@@ -32,14 +32,31 @@ pub(super) const REPORT: Sibling = Sibling { program: "modalcast-report", packag
 /// Recordings: a client of the server.
 pub(super) const RECORD: Sibling = Sibling { program: "modalcast-record", package: "modalcast-recording" };
 
+/// Modes of surfaces.
+pub(super) const MODES: Sibling = Sibling { program: "modalcast-modes", package: "modalcast-modes" };
+
 impl Sibling {
+    /// File name of the executable.
+    pub(super) const fn program(&self) -> &'static str {
+        self.program
+    }
+
     /// Replaces this process by the program, so that the program receives all signals and sets the exit code. Returns
     /// only if that fails. `command` precedes the arguments.
     pub(super) fn execute(&self, command: Option<&str>, args: &Args) -> Outcome {
+        let program_path = self.checked_path()?;
+        Err(fault_in("program")(Command::new(&program_path).args(command).args(&args.arguments).exec()))
+    }
+
+    /// The path of the program.
+    ///
+    /// # Errors
+    /// `Unavailable` if it is missing or was built from other sources.
+    pub(super) fn checked_path(&self) -> Result<PathBuf> {
         let own_path = std::env::current_exe().map_err(fault_in("program"))?;
         let program_path = own_path.with_file_name(self.program);
         self.check_build(&program_path)?;
-        Err(fault_in("program")(Command::new(&program_path).args(command).args(&args.arguments).exec()))
+        Ok(program_path)
     }
 
     /// Fails if the program is missing or was built from other sources.
@@ -70,16 +87,14 @@ mod tests {
 
     use super::*;
 
-    /// `modalcast record` works after the first command of the README.
+    /// `modalcast record` and `modalcast model` work after `deploy/demo`.
     #[test]
-    fn demo_builds_the_recorder() {
+    fn demo_builds_recorder_and_modes() {
         let demo = include_str!("../../deploy/demo");
         let words: Vec<&str> = demo.split_whitespace().collect();
-        assert!(
-            words.windows(2).any(|pair| pair == ["-p", RECORD.package]),
-            "expected -p {} in deploy/demo",
-            RECORD.package
-        );
+        for package in [RECORD.package, MODES.package] {
+            assert!(words.windows(2).any(|pair| pair == ["-p", package]), "expected -p {package} in deploy/demo");
+        }
     }
 
     #[test]

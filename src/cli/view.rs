@@ -6,13 +6,15 @@ use std::process::{Command, Stdio};
 
 use tokio::sync::oneshot;
 
+use super::computed_modes::{self, Computed};
 use super::demo::{ForceFiles, SceneLocation, program_path};
+use super::modeling_options::ModelingOptions;
 use super::physics::PhysicsProcess;
 use super::serve::{TerminationSignals, announce, print_addresses, start};
 use super::{Completion, Outcome, print_line, recording};
 use crate::config::{BackendChoice, Config, ListenAddress, RendererChoice, ValidatedConfig};
 use crate::service::{self, Listener};
-use modalcast_model::error::{Result, fault, fault_in};
+use modalcast_model::error::{Result, fault, fault_in, invalid};
 
 /// The program that opens a URL in the user's browser (xdg-utils).
 const URL_OPENER: &str = "xdg-open";
@@ -25,6 +27,7 @@ const PHYSICS_PROGRAM: &str = "modalcast-sim";
 #[command(after_help = "Examples:
   modalcast view tree
   modalcast view path/to/simpleBridge --no-sim
+  modalcast view part.stl --modes 20 --material steel --clamp 'z < 0.01'
   modalcast view tree.mcap                          plays a recording
   modalcast view model.glb --listen 0.0.0.0:50051   also for browsers on other machines")]
 pub(super) struct Args {
@@ -51,9 +54,21 @@ pub(super) struct Args {
     /// OpenGL renderer.
     #[arg(long, value_enum, default_value_t)]
     renderer: RendererChoice,
+    /// Any of these options computes the modes of the model, whose own modes are not used. The result is kept in the
+    /// user's cache folder.
+    #[command(flatten)]
+    modeling: ModelingOptions,
 }
 
 impl Args {
+    /// The model to show: the given one or, with options of modes, a file with its modes.
+    async fn model(&self) -> Result<Computed> {
+        match self.modeling.is_requested() {
+            true => computed_modes::compute(&self.model, &self.modeling).await,
+            false => Ok(Computed::File(self.model.clone().into())),
+        }
+    }
+
     fn config(&self, location: &SceneLocation, state: &Path) -> Result<ValidatedConfig> {
         Config {
             listen: vec![ListenAddress::Tcp(self.listen)],
@@ -106,16 +121,24 @@ pub(super) fn run(args: &Args) -> Outcome {
     let state = tempfile::tempdir().map_err(fault_in("view"))?;
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().map_err(fault_in("view"))?;
     let result = match recording::is_recording(&args.model) {
+        true if args.modeling.is_requested() => Err(invalid("options of modes", "a surface", "a recording")),
         true => runtime.block_on(play(args, args.playback_config(state.path())?)),
-        false => {
-            let location = SceneLocation::find(&args.model)?;
-            let config = args.config(&location, state.path())?;
-            runtime.block_on(view(args, &location, config, args.physics_program()?))
-        }
+        false => runtime.block_on(view_model(args, state.path())),
     };
     // A frame that is being drawn must not delay the exit.
     runtime.shutdown_background();
-    result.map(|()| Completion::Success)
+    result
+}
+
+async fn view_model(args: &Args, state: &Path) -> Outcome {
+    let physics_program = args.physics_program()?;
+    let model = match args.model().await? {
+        Computed::File(path) => path,
+        Computed::Ended(completion) => return Ok(completion),
+    };
+    let location = SceneLocation::find(&model.to_string_lossy())?;
+    let config = args.config(&location, state)?;
+    view(args, &location, config, physics_program).await
 }
 
 async fn view(
@@ -123,7 +146,7 @@ async fn view(
     location: &SceneLocation,
     config: ValidatedConfig,
     physics_program: Option<PathBuf>,
-) -> Result<()> {
+) -> Outcome {
     let mut signals = TerminationSignals::install()?;
     let open = async {
         let (engine, listener) = start(config).await?;
@@ -132,7 +155,7 @@ async fn view(
     };
     let (engine, listener, scene, force_files) = tokio::select! {
         opened = open => opened?,
-        () = signals.received() => return Ok(()),
+        () = signals.received() => return Ok(Completion::Success),
     };
     announce(&engine, &listener);
     // The sockets are already open, so the browser and the physics process wait until the server answers.
@@ -149,16 +172,17 @@ async fn view(
     if let Some(physics) = physics {
         physics.await.map_err(fault_in("view"))?;
     }
-    result
+    result.map(|()| Completion::Success)
 }
 
 /// Serves the page that plays the recording of the configuration.
-async fn play(args: &Args, config: ValidatedConfig) -> Result<()> {
+async fn play(args: &Args, config: ValidatedConfig) -> Outcome {
     let mut signals = TerminationSignals::install()?;
     let (engine, listener) = start(config).await?;
     print_addresses(&listener);
     args.show(&viewer_url(&listener)?);
-    service::serve(engine, listener, async move { signals.received().await }).await
+    service::serve(engine, listener, async move { signals.received().await }).await?;
+    Ok(Completion::Success)
 }
 
 /// The URL of the viewer.

@@ -2,6 +2,7 @@
 
 use std::io::{BufRead as _, BufReader, Read as _, Write as _};
 use std::net::TcpStream;
+use std::os::unix::fs::PermissionsExt as _;
 use std::path::Path;
 use std::process::{Command, Output, Stdio};
 
@@ -48,6 +49,80 @@ fn view_rejects_what_it_cannot_open_before_it_prints_an_address() {
         assert_eq!(output.status.code(), Some(code), "{model}: {output:?}");
         assert_eq!(String::from_utf8_lossy(&output.stdout), "", "{model}");
         assert!(String::from_utf8_lossy(&output.stderr).contains(model), "{output:?}");
+    }
+}
+
+/// A folder with the program `modalcast` and a stand-in for `modalcast-modes`, which counts its runs in the file `runs`.
+fn folder_with_stand_in() -> tempfile::TempDir {
+    let program = Path::new(env!("CARGO_BIN_EXE_modalcast"));
+    // In the folder of the program, because a hard link cannot cross file systems.
+    let folder = tempfile::tempdir_in(program.parent().expect("expected a folder")).expect("expected a folder");
+    std::fs::hard_link(program, folder.path().join("modalcast")).expect("expected a link");
+    let script = format!(
+        "#!/bin/sh\n[ \"$1\" = --build ] && {{ echo {}; exit; }}\necho >>runs\necho \"modes of $*\" >&2\n\
+         case \"$*\" in *=slow*) exec sleep 600;; *=bad*) echo 'error: no material' >&2; exit 2;; esac\n\
+         while [ \"$1\" != --out ]; do shift; done\necho model >\"$2\"\necho mass 1 kg\necho \"written $2\"\n",
+        modalcast::BUILD
+    );
+    let path = folder.path().join("modalcast-modes");
+    std::fs::write(&path, script).expect("expected a written file");
+    std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o755)).expect("expected changed permissions");
+    std::fs::write(folder.path().join("part.obj"), TRIANGLE).expect("expected a written file");
+    folder
+}
+
+/// `modalcast view part.obj` with a material, and with its cache in the folder.
+fn view_command(folder: &Path, material: &str) -> Command {
+    let mut command = Command::new(folder.join("modalcast"));
+    command.current_dir(folder).env("XDG_CACHE_HOME", folder.join("cache")).args(["view", "part.obj", "--material"]);
+    command.args([material, "--no-open", "--backend", "cpu", "--renderer", "off"]);
+    command
+}
+
+/// Names of the entries in the cache of [`view_command`].
+fn cached_names(folder: &Path) -> Vec<String> {
+    let entries = std::fs::read_dir(folder.join("cache/modalcast/models")).into_iter().flatten().flatten();
+    entries.map(|entry| entry.file_name().to_string_lossy().into_owned()).collect()
+}
+
+#[test]
+fn view_computes_modes_once_for_a_surface_and_its_options() {
+    let folder = folder_with_stand_in();
+    let folder = folder.path();
+    for (runs, material) in [(1, "steel"), (1, "steel"), (2, "brass"), (2, "steel")] {
+        let output = view_command(folder, material).output().expect("expected the program to start");
+        let text = String::from_utf8_lossy(&output.stdout);
+        assert!(text.starts_with("mass 1 kg\ncached    /"), "{output:?}");
+        assert!(text.trim_end().ends_with("/part.npz"), "the scene has the name of the part: {text}");
+        // The stand-in writes no archive, which ends the server.
+        assert!(String::from_utf8_lossy(&output.stderr).contains("part.npz': archive: expected"), "{output:?}");
+        assert_eq!(std::fs::read_to_string(folder.join("runs")).expect("expected runs").len(), runs);
+        assert_eq!(cached_names(folder).len(), runs, "{:?}", cached_names(folder));
+    }
+    std::fs::write(folder.join("part.obj"), TRIANGLE.replace('1', "2")).expect("expected a written file");
+    view_command(folder, "steel").output().expect("expected the program to start");
+    assert_eq!(cached_names(folder).len(), 3, "another surface");
+}
+
+#[test]
+fn view_ends_as_the_computation_and_keeps_nothing() {
+    let folder = folder_with_stand_in();
+    let folder = folder.path();
+    let output = view_command(folder, "bad").output().expect("expected the program to start");
+    assert_eq!((output.status.code(), cached_names(folder).len()), (Some(2), 0));
+    assert_eq!(String::from_utf8_lossy(&output.stdout), "");
+    assert!(String::from_utf8_lossy(&output.stderr).ends_with("part.obj\nerror: no material\n"), "{output:?}");
+    for signal in [Signal::INT, Signal::TERM] {
+        let mut view = view_command(folder, "slow").stderr(Stdio::piped()).spawn().expect("expected a process");
+        let mut messages = BufReader::new(view.stderr.take().expect("expected messages"));
+        messages.read_line(&mut String::new()).expect("expected the start of the computation");
+        assert_eq!(cached_names(folder).len(), 1, "control: the folder of the computation");
+        let pid = i32::try_from(view.id()).ok().and_then(Pid::from_raw).expect("expected a process");
+        kill_process(pid, signal).expect("expected a running process");
+        assert_eq!(view.wait().expect("expected the end of the program").code(), Some(130));
+        // The pipe ends with the last process that writes to it.
+        messages.read_to_string(&mut String::new()).expect("expected the end of the stand-in");
+        assert_eq!(cached_names(folder), [""; 0]);
     }
 }
 

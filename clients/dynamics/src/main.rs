@@ -162,7 +162,10 @@ fn check_forces_move(model: &Model) -> Result<()> {
         return Ok(());
     }
     let given = match model.coordinate_count {
-        0 => "no modes: add the arrays U and eigenvalues in MODEL.npz".to_owned(),
+        0 => {
+            "no modes: add the arrays U and eigenvalues in MODEL.npz, or compute them: modalcast view MODEL --modes 20"
+                .to_owned()
+        }
         count if model.domains.iter().all(|domain| domain.eigenvalues.is_empty()) => {
             format!("{count} modes without: add the array eigenvalues, in (rad/s)^2, next to U")
         }
