@@ -18,8 +18,9 @@
 //! | `modalcast-model` (`src/model`) | scenes, their file formats, the traits of deformers and rasterizers | |
 //!
 //! Further crates: `proto` (the gRPC contract), `clients/rust`, `clients/dynamics` and `clients/recording` (they use none
-//! of the crates in the table; the last one is started by `modalcast record` and `replay`), and `tests/bench` (all
-//! benchmarks, started by `modalcast report`). `clients/python` is a client in Python.
+//! of the crates in the table; the last one is started by `modalcast record` and `replay`), `clients/modes` (modes of
+//! surfaces by finite elements, started by `modalcast model` and `view`; it uses `modalcast-model` for its loaders), and
+//! `tests/bench` (all benchmarks, started by `modalcast report`). `clients/python` is a client in Python.
 //!
 //! # Modules
 //! A test (`tests/it/layering.rs`) reads this table. It checks that a module uses only the modules in its row and that

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use syn::visit::Visit;
 
 /// Root files of the checked crates.
-const CRATE_ROOTS: [&str; 11] = [
+const CRATE_ROOTS: [&str; 13] = [
     "src/lib.rs",
     "src/model/lib.rs",
     "src/compute/lib.rs",
@@ -19,6 +19,8 @@ const CRATE_ROOTS: [&str; 11] = [
     "clients/dynamics/src/main.rs",
     "clients/recording/src/lib.rs",
     "clients/recording/src/bin/modalcast-record/main.rs",
+    "clients/modes/src/lib.rs",
+    "clients/modes/src/bin/modalcast-modes/main.rs",
     "tests/bench/src/lib.rs",
 ];
 

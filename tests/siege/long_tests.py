@@ -68,7 +68,7 @@ LONG_TESTS = (
 NAMES = [test.name for test in LONG_TESTS]
 
 # The programs that a control replaces.
-PROGRAMS = ("modalcast", "modalcast-sim", "modalcast-fetch", "modalcast-record")
+PROGRAMS = ("modalcast", "modalcast-sim", "modalcast-fetch", "modalcast-record", "modalcast-modes")
 
 
 def execute(test, programs, log):

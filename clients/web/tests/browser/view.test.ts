@@ -39,10 +39,10 @@ interface View extends ViewerPage {
     program: ChildProcess;
 }
 
-async function view(name: string, content: Buffer | string): Promise<View> {
+async function view(name: string, content: Buffer | string, modeling: string[] = []): Promise<View> {
     const model = join(temporaryFolder(), name);
     writeFileSync(model, content);
-    const options = ["view", model, "--no-open", "--backend", "cpu"];
+    const options = ["view", model, "--no-open", "--backend", "cpu", ...modeling];
     const program = startProgram("modalcast", options, ["ignore", "pipe", "pipe"]);
     programs.push(program);
     const url = await printedUrl(program, "open");
@@ -143,6 +143,34 @@ test("a one-part archive with eigenvalues is pulled, moves and rings down", { ti
     process.kill(physics, "SIGKILL");
     await page.locator(".notice", { hasText: "modalcast-sim has ended (signal: 9" }).waitFor();
     assert.deepEqual(children(program), {}, "expected no child process, and no zombie");
+    await close(shown);
+});
+
+test("the modes of a surface are computed, and the part is pulled", { timeout: LIMIT_MS }, async () => {
+    process.env["XDG_CACHE_HOME"] = temporaryFolder();
+    // The first frequency of the beam is about 2.7 Hz.
+    const material = ["--material", "E=2e7,nu=0.3,rho=1000", "--damping", "0.05"];
+    const modeling = ["--modes", "4", ...material, "--clamp", "z < 0.05", "--freedoms", "5000"];
+    const shown = await view("beam.stl", new Beam().stl(), modeling);
+    const { page } = shown;
+    await page.waitForFunction(() => modalcastViewer.status.stateRate.perSecond() > 5);
+    assert.equal((await coordinates(page)).length, 4);
+    assert.equal(Math.hypot(...(await coordinates(page))), 0, "expected no motion without a pull");
+    await takeScreenshot(page, "view-stl-at-rest");
+    const [x, y] = await upperPixel(page);
+    await page.keyboard.down("Shift");
+    await page.mouse.move(x, y);
+    await page.mouse.down();
+    await page.waitForFunction(() => modalcastViewer.pull?.view != null);
+    await page.mouse.move(x + 80, y, { steps: 5 });
+    // The mass of the beam is 14 kg, so the displacement at the free end is about 0.5 |q|.
+    await page.waitForFunction(() => Math.hypot(...(modalcastViewer.model?.state.q ?? [])) > 0.1);
+    await page.waitForTimeout(500);
+    await takeScreenshot(page, "view-stl-pulled");
+    await page.mouse.up();
+    await page.keyboard.up("Shift");
+    await page.waitForFunction(() => Math.hypot(...(modalcastViewer.model?.state.q ?? [])) < 0.02);
+    assert.equal(await page.locator(".notice").count(), 0);
     await close(shown);
 });
 
