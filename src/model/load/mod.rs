@@ -121,6 +121,15 @@ pub fn open_strict(source: &str) -> Result<OpenedScene> {
     OpenedScene::new(source::read(&asset_dir::AssetDir::unrestricted(Path::new(".")).strict(), source)?)
 }
 
+/// As [`open`] for a model file, but without modes: neither those of the file nor those of a file beside it are read.
+///
+/// # Errors
+/// As for [`open`].
+pub fn open_without_modes(source: &str) -> Result<Arc<Scene>> {
+    let options = surface::ModelOptions { modes: surface::ModesSource::None, ..Default::default() };
+    Scene::new(source::read_model(&asset_dir::AssetDir::unrestricted(Path::new(".")), source, options)?)
+}
+
 /// The files with the modes of a scene, each with its number of columns: `FILE (r = 20)`, without repetitions, in the
 /// order of the domains. Modes that are not in a file of their own, such as morph targets, are not listed.
 pub fn modes_files(scene: &Scene) -> Vec<String> {

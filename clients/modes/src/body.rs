@@ -1,0 +1,261 @@
+//! The body: its surface, materials and clamps, and its division into cells.
+
+use std::sync::Arc;
+
+use modalcast_model::error::{Result, invalid};
+use nalgebra::Vector3;
+
+use crate::cell_moments::{GroupMoments, integrate};
+use crate::cell_pieces::CellPieces;
+use crate::constraints::{HeldPoint, points_on_groups, remove_regions};
+use crate::grid::{Grid, RAY_WEIGHT};
+use crate::material_rays::{RaySegment, trace_rays};
+use crate::materials::Material;
+use crate::parameters::ModelingParameters;
+use crate::region::Region;
+use crate::surface::Surface;
+use crate::surface_file::SurfaceFile;
+use crate::thickness::thicken;
+use crate::winding_number::WindingNumber;
+
+/// Parts with less than this share of the volume are removed.
+const MIN_PART_FRACTION: f64 = 1e-3;
+/// Pieces with less than this share of a cell are removed.
+const MIN_PIECE_FRACTION: f64 = 1e-9;
+/// Limit on the cells of a grid, with and without material.
+const MAX_GRID_CELLS: f64 = 1.6e7;
+
+/// The input of all grids.
+#[derive(Debug)]
+pub struct Body {
+    pub surface: Arc<Surface>,
+    /// The material of each group.
+    pub materials: Vec<Material>,
+    /// Held regions.
+    pub regions: Vec<Region>,
+    /// Meters per unit of the file.
+    pub unit: f64,
+    /// For a surface with holes.
+    winding: Option<WindingNumber>,
+}
+
+/// The cells of one grid.
+#[derive(Debug)]
+pub struct Layout {
+    pub grid: Grid,
+    pub pieces: CellPieces,
+    /// The moments of each piece.
+    pub moments: Vec<Vec<GroupMoments>>,
+    /// Points on the border of removed regions and on held groups.
+    pub held_points: Vec<HeldPoint>,
+    /// Parts that were too small.
+    pub removed_parts: usize,
+}
+
+impl Layout {
+    /// The number of freedoms.
+    pub const fn freedoms(&self) -> usize {
+        3 * self.pieces.node_count
+    }
+
+    /// The share of its cell that each piece fills.
+    pub fn volume_fractions(&self) -> Vec<f64> {
+        volume_fractions(&self.moments)
+    }
+}
+
+impl Body {
+    /// Prepares the surface of a file.
+    ///
+    /// # Errors
+    /// `Invalid` if the surface has no area or no volume, or a clamp or material is wrong.
+    pub fn new(file: &SurfaceFile, parameters: &ModelingParameters) -> Result<Self> {
+        let mesh = &file.mesh;
+        let unit = parameters.unit.meters;
+        let mut surface = Surface::new(&mesh.positions, &mesh.triangles, &mesh.triangle_groups);
+        if surface.area() <= 0.0 {
+            return Err(invalid("surface", "at least one triangle with an area", "none"));
+        }
+        if let Some(thickness) = parameters.thickness {
+            surface = thicken(&surface, thickness * unit);
+        }
+        let surface = Arc::new(surface);
+        let winding = (!surface.is_closed).then(|| WindingNumber::new(surface.clone()));
+        let regions = parameters.clamps.iter().map(|text| Region::parse(text, &file.groups)).collect::<Result<_>>()?;
+        let body = Self { materials: parameters.materials_of(&file.groups)?, surface, regions, unit, winding };
+        body.check_volume()?;
+        Ok(body)
+    }
+
+    /// The diagonal of the bounding box, meters.
+    pub fn diagonal(&self) -> f64 {
+        let (low, high) = self.surface.bounds();
+        (high - low).norm()
+    }
+
+    /// A point in units of cells in the coordinates of the file.
+    pub fn to_file(&self, grid: &Grid, point: Vector3<f64>) -> Vector3<f64> {
+        (grid.origin + point * grid.cell_size) / self.unit
+    }
+
+    /// Fails unless the surface encloses a volume. An open surface such as a bowl has points with a winding number above
+    /// 1/2 near it, but most of them have much less than 1.
+    fn check_volume(&self) -> Result<()> {
+        /// Cells along the longest side.
+        const CELLS: f64 = 6.0;
+        /// The smallest mean winding number inside of a body with holes.
+        const MIN_WINDING: f64 = 0.8;
+        let (low, high) = self.surface.bounds();
+        let grid = Grid::covering(low, high, (high - low).max() / CELLS);
+        let segments = self.trace(&grid);
+        let volume = segments.iter().map(|segments| ray_volume(segments)).fold(0.0, f64::max) * grid.cell_size.powi(3);
+        let hint = "a surface that encloses a volume. For a sheet, give its --thickness";
+        // Rounding of the positions gives a plane surface a volume of this size.
+        if volume < 1e-9 * self.surface.area() * self.diagonal() {
+            return Err(invalid("surface", hint, "none"));
+        }
+        let Some(winding) = &self.winding else { return Ok(()) };
+        let mut sum = (0.0, 0.0);
+        for (axis, segments) in segments.iter().enumerate() {
+            for segment in segments {
+                let middle = f64::midpoint(segment.start, segment.end);
+                let point = crate::material_rays::point_on_ray(axis, segment.ray, middle);
+                let length = segment.end - segment.start;
+                let value = winding.at(grid.origin + point * grid.cell_size).abs().min(1.0);
+                sum = (sum.0 + length * value, sum.1 + length);
+            }
+        }
+        match sum.0 >= MIN_WINDING * sum.1 {
+            true => Ok(()),
+            false => Err(invalid("surface", hint, "a surface with large openings")),
+        }
+    }
+
+    /// The finest grid with at most `limit` freedoms. The search ends when it has at least 93 % of them.
+    ///
+    /// # Errors
+    /// `Invalid` if the coarsest grid has more freedoms, or clamps hold nothing or everything.
+    pub fn finest_layout(&self, limit: usize) -> Result<Layout> {
+        const ENOUGH: f64 = 0.93;
+        const MAX_TRIALS: usize = 12;
+        let (low, high) = self.surface.bounds();
+        let extent = high - low;
+        let mut cell_size = extent.max() / 8.0;
+        // Cell sizes with too many freedoms, and with few enough.
+        let (mut too_fine, mut coarse_enough): (f64, f64) = (0.0, f64::INFINITY);
+        let mut best: Option<Layout> = None;
+        for _ in 0..MAX_TRIALS {
+            let cells: f64 = (0..3).map(|axis| (extent[axis] / cell_size).max(1.0)).product();
+            if cells > MAX_GRID_CELLS {
+                break;
+            }
+            let layout = self.layout(cell_size)?;
+            let ratio = layout.freedoms() as f64 / limit as f64;
+            if ratio <= 1.0 {
+                coarse_enough = coarse_enough.min(cell_size);
+                if best.as_ref().is_none_or(|best| layout.freedoms() > best.freedoms()) {
+                    best = Some(layout);
+                }
+            } else {
+                too_fine = too_fine.max(cell_size);
+            }
+            if (ENOUGH..=1.0).contains(&ratio) || (ratio <= 1.0 && coarse_enough < 1.005 * too_fine) {
+                break;
+            }
+            // Freedoms grow with the power -2 (plates) to -3 (solids) of the cell size.
+            let guess = cell_size * (ratio / 0.97).powf(0.4).clamp(0.25, 4.0);
+            let is_bracketed = guess > too_fine && guess < coarse_enough;
+            cell_size = if is_bracketed { guess } else { f64::midpoint(too_fine, coarse_enough.min(4.0 * too_fine)) };
+        }
+        best.ok_or_else(|| invalid("--freedoms", "more, because the coarsest grid of this surface has more", limit))
+    }
+
+    /// Divides the body into cells of the given size.
+    ///
+    /// # Errors
+    /// `Invalid` if clamps hold nothing or everything.
+    pub fn layout(&self, cell_size: f64) -> Result<Layout> {
+        let (low, high) = self.surface.bounds();
+        let grid = Grid::covering(low, high, cell_size);
+        let mut held_points = points_on_groups(&self.surface, &grid, &self.regions);
+        let mut segments = self.trace(&grid);
+        for (axis, segments) in segments.iter_mut().enumerate() {
+            let (remaining, held) = remove_regions(segments, axis, &self.regions, |point| self.to_file(&grid, point));
+            *segments = remaining;
+            held_points.extend(held);
+        }
+        if segments.iter().all(Vec::is_empty) {
+            return Err(invalid("--clamp", "a region that leaves a part of the body free", "one with the whole body"));
+        }
+        let pieces = CellPieces::new(&grid, &segments);
+        let moments = integrate(&grid, &pieces, &segments);
+        Ok(remove_small_parts(Layout { grid, pieces, moments, held_points, removed_parts: 0 }))
+    }
+
+    /// Fails for a clamp that touches nothing.
+    ///
+    /// # Errors
+    /// `Invalid` with the clamp, and the bounds of the surface in the units of the file.
+    pub fn check_clamps(&self, grid: &Grid, clamps: &[String]) -> Result<()> {
+        let segments = self.trace(grid);
+        for (region, text) in self.regions.iter().zip(clamps) {
+            let one_region = std::slice::from_ref(region);
+            let is_group = !points_on_groups(&self.surface, grid, one_region).is_empty();
+            let touches = |axis: usize| {
+                let (remaining, _) =
+                    remove_regions(&segments[axis], axis, one_region, |point| self.to_file(grid, point));
+                remaining != segments[axis]
+            };
+            if !is_group && !(0..3).any(touches) {
+                let (low, high) = self.surface.bounds();
+                let range = |axis: usize| {
+                    let [low, high] = [low[axis], high[axis]].map(|coordinate| coordinate / self.unit);
+                    format!("{} from {low:.4} to {high:.4}", ["x", "y", "z"][axis])
+                };
+                let expected = format!("a region that touches the body: {}", [0, 1, 2].map(range).join(", "));
+                return Err(invalid(format!("--clamp '{text}'"), expected, "one that does not"));
+            }
+        }
+        Ok(())
+    }
+
+    /// The material along the rays of the three axes.
+    fn trace(&self, grid: &Grid) -> [Vec<RaySegment>; 3] {
+        [0, 1, 2].map(|axis| trace_rays(&self.surface, grid, axis, self.winding.as_ref()))
+    }
+}
+
+/// The volume that the rays of one axis find, in cells.
+fn ray_volume(segments: &[RaySegment]) -> f64 {
+    segments.iter().map(|segment| segment.end - segment.start).sum::<f64>() * RAY_WEIGHT
+}
+
+/// The share of its cell that each piece fills.
+fn volume_fractions(moments: &[Vec<GroupMoments>]) -> Vec<f64> {
+    moments.iter().map(|groups| groups.iter().map(GroupMoments::volume_fraction).sum()).collect()
+}
+
+/// Removes parts with less than [`MIN_PART_FRACTION`] of the volume, and pieces without volume.
+fn remove_small_parts(layout: Layout) -> Layout {
+    let fractions = layout.volume_fractions();
+    let layout =
+        retain_pieces(layout, &fractions.iter().map(|fraction| *fraction > MIN_PIECE_FRACTION).collect::<Vec<_>>());
+    let fractions = layout.volume_fractions();
+    let mut part_volumes = vec![0.0; layout.pieces.part_count];
+    for (part, fraction) in layout.pieces.parts.iter().zip(&fractions) {
+        part_volumes[*part as usize] += fraction;
+    }
+    let limit = MIN_PART_FRACTION * part_volumes.iter().sum::<f64>();
+    let removed_parts = part_volumes.iter().filter(|volume| **volume < limit).count();
+    let keep: Vec<bool> = layout.pieces.parts.iter().map(|part| part_volumes[*part as usize] >= limit).collect();
+    Layout { removed_parts, ..retain_pieces(layout, &keep) }
+}
+
+fn retain_pieces(layout: Layout, keep: &[bool]) -> Layout {
+    if keep.iter().all(|keep| *keep) {
+        return layout;
+    }
+    let pieces = layout.pieces.retain(&layout.grid, keep);
+    let moments = layout.moments.into_iter().zip(keep).filter(|(_, keep)| **keep).map(|(moments, _)| moments);
+    Layout { pieces, moments: moments.collect(), ..layout }
+}

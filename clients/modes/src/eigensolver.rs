@@ -1,0 +1,385 @@
+//! The lowest elastic modes of K x = lambda M x, by shift-invert with a sparse Cholesky factorization and the
+//! Krylov-Schur method, both of the library faer.
+//!
+//! With K + s M = L L^T for a small shift s > 0, the operator L^-1 M L^-T has the eigenvalues 1 / (lambda + s). The shift
+//! makes the matrix of a free body definite. Rigid motions are known and projected out. A Krylov method can miss copies of
+//! repeated eigenvalues, so it runs again with the modes that were found projected out, until it finds only higher ones.
+
+use faer::dyn_stack::{MemBuffer, MemStack, StackReq};
+use faer::linalg::cholesky::llt::factor::LltRegularization;
+use faer::matrix_free::LinOp;
+use faer::matrix_free::eigen::{PartialEigenParams, partial_self_adjoint_eigen, partial_self_adjoint_eigen_scratch};
+use faer::sparse::linalg::SupernodalThreshold;
+use faer::sparse::linalg::cholesky::supernodal::SupernodalLltRef;
+use faer::sparse::linalg::cholesky::{
+    CholeskySymbolicParams, SymbolicCholesky, SymbolicCholeskyRaw, SymmetricOrdering, factorize_symbolic_cholesky,
+};
+use faer::{Col, Conj, Mat, MatMut, MatRef, Par, Side};
+use modalcast_model::error::{Result, fault, fault_in};
+
+use crate::assembly::{SystemMatrices, dot};
+
+/// Elastic modes, ascending. Vectors are mass-normalized: x^T M x = 1.
+#[derive(Debug, Default)]
+pub struct ElasticModes {
+    /// (rad/s)^2.
+    pub eigenvalues: Vec<f64>,
+    /// One vector of all freedoms per mode.
+    pub vectors: Vec<Vec<f64>>,
+    /// |K x - lambda M x| / |lambda M x| of each mode.
+    pub residuals: Vec<f64>,
+}
+
+impl ElasticModes {
+    /// Keeps the first modes.
+    pub fn truncate(&mut self, count: usize) {
+        self.eigenvalues.truncate(count);
+        self.vectors.truncate(count);
+        self.residuals.truncate(count);
+    }
+}
+
+/// The tolerance of one Krylov-Schur run, relative to the largest eigenvalue of the operator.
+const TOLERANCE: f64 = 1e-10;
+/// Modes that are computed beyond the requested ones, so that the last cluster is complete.
+const EXTRA_MODES: usize = 2;
+/// Modes of a run that looks for missed copies.
+const CHECKED_MODES: usize = 4;
+/// Limit on the runs that look for missed copies.
+const MAX_CHECKS: usize = 8;
+/// Eigenvalues that differ by less, relative to their size, form a cluster.
+const CLUSTER_GAP: f64 = 1e-4;
+
+/// Finds the `count` lowest elastic modes. `rigid` contains the rigid motions, and `shift` is a small eigenvalue,
+/// (rad/s)^2. `progress` receives the share of the work that is done, 0 to 1.
+///
+/// # Errors
+/// `Fault` if the factorization fails or the method does not converge.
+pub fn find_elastic_modes(
+    system: &SystemMatrices,
+    rigid: &[Vec<f64>],
+    shift: f64,
+    count: usize,
+    progress: &dyn Fn(f64, &str),
+) -> Result<ElasticModes> {
+    progress(0.0, "factorization");
+    let factor = Factor::new(system, shift)?;
+    progress(0.5, "eigenvalues");
+    let mut operator = ShiftInvert { system, factor: &factor, deflated: Vec::new() };
+    for motion in rigid {
+        // K r = 0, so that L^T r = L^-1 (K + s M) r = s L^-1 M r.
+        let mut vector = factor.permuted(&system.apply_mass(motion));
+        factor.solve_lower(as_column(&mut vector));
+        operator.deflate(vector);
+    }
+    let wanted = count + EXTRA_MODES;
+    let mut vectors = operator.largest(wanted, 0)?;
+    for check in 1..=MAX_CHECKS {
+        progress(0.5 + 0.4 * check as f64 / (check + 1) as f64, "check for repeated eigenvalues");
+        let rigid_count = operator.deflated.len();
+        vectors.iter().for_each(|(_, vector)| operator.deflate(vector.clone()));
+        let found = operator.largest(CHECKED_MODES, check as u64)?;
+        operator.deflated.truncate(rigid_count);
+        let limit = vectors[vectors.len().min(wanted) - 1].0;
+        let missed: Vec<(f64, Vec<f64>)> =
+            found.into_iter().filter(|(value, _)| *value > limit * (1.0 + 1e-6)).collect();
+        if missed.is_empty() {
+            break;
+        }
+        if check == MAX_CHECKS {
+            return Err(fault("eigensolver", format!("{} modes were missed by {MAX_CHECKS} runs", missed.len())));
+        }
+        vectors.extend(missed);
+        vectors.sort_by(|(a, _), (b, _)| b.total_cmp(a));
+        vectors.truncate(wanted);
+    }
+    progress(0.95, "mode shapes");
+    let shapes = vectors.into_iter().map(|(_, mut vector)| {
+        factor.solve_upper(as_column(&mut vector));
+        factor.unpermuted(&vector)
+    });
+    Ok(normalize(system, shapes.collect(), count))
+}
+
+/// Mass-normalizes the vectors, computes eigenvalues by Rayleigh quotients, and makes signs and bases unique.
+fn normalize(system: &SystemMatrices, shapes: Vec<Vec<f64>>, count: usize) -> ElasticModes {
+    let mut modes: Vec<(f64, Vec<f64>)> = shapes
+        .into_iter()
+        .map(|mut shape| {
+            let scale = dot(&shape, &system.apply_mass(&shape)).sqrt().recip();
+            shape.iter_mut().for_each(|entry| *entry *= scale);
+            (dot(&shape, &system.apply_stiffness(&shape)), shape)
+        })
+        .collect();
+    modes.sort_by(|(a, _), (b, _)| a.total_cmp(b));
+    let mut start = 0;
+    while start < modes.len() {
+        let mut stop = start + 1;
+        while stop < modes.len() && modes[stop].0 - modes[stop - 1].0 < CLUSTER_GAP * modes[stop].0 {
+            stop += 1;
+        }
+        choose_basis(&mut modes[start..stop]);
+        start = stop;
+    }
+    modes.truncate(count);
+    let mut result = ElasticModes::default();
+    for (_, shape) in modes {
+        let [stiffness, mass] = [system.apply_stiffness(&shape), system.apply_mass(&shape)];
+        let eigenvalue = dot(&shape, &stiffness);
+        let difference = stiffness.iter().zip(&mass).map(|(k, m)| (k - eigenvalue * m).powi(2)).sum::<f64>().sqrt();
+        result.residuals.push(difference / (eigenvalue * dot(&mass, &mass).sqrt()));
+        result.eigenvalues.push(eigenvalue);
+        result.vectors.push(shape);
+    }
+    result
+}
+
+/// Replaces the vectors of a cluster by a unique basis of the same space: by pivoted Gram-Schmidt, vector k is the only
+/// one from k on that moves at freedom k of a sequence of freedoms with the largest motion. The largest entry of each
+/// vector is positive.
+fn choose_basis(cluster: &mut [(f64, Vec<f64>)]) {
+    let freedoms = cluster[0].1.len();
+    let size = cluster.len();
+    let mut directions: Vec<Vec<f64>> = Vec::new();
+    while size > 1 && directions.len() < size {
+        let remainder = |freedom: usize| {
+            let mut row: Vec<f64> = cluster.iter().map(|(_, vector)| vector[freedom]).collect();
+            for direction in &directions {
+                let share = dot(&row, direction);
+                row.iter_mut().zip(direction).for_each(|(entry, component)| *entry -= share * component);
+            }
+            row
+        };
+        let squared = |row: &[f64]| dot(row, row);
+        let mut best = (0.0, 0);
+        for freedom in 0..freedoms {
+            let norm = squared(&remainder(freedom));
+            if norm > best.0 {
+                best = (norm, freedom);
+            }
+        }
+        let mut direction = remainder(best.1);
+        let scale = squared(&direction).sqrt().recip();
+        direction.iter_mut().for_each(|entry| *entry *= scale);
+        directions.push(direction);
+    }
+    if size > 1 {
+        let combine = |direction: &Vec<f64>| -> Vec<f64> {
+            let mut sum = vec![0.0; freedoms];
+            for ((_, vector), weight) in cluster.iter().zip(direction) {
+                sum.iter_mut().zip(vector).for_each(|(sum, entry)| *sum += weight * entry);
+            }
+            sum
+        };
+        let combined: Vec<Vec<f64>> = directions.iter().map(combine).collect();
+        cluster.iter_mut().zip(combined).for_each(|((_, vector), combined)| *vector = combined);
+    }
+    for (_, vector) in cluster {
+        let largest = vector
+            .iter()
+            .copied()
+            .fold(0.0, |largest: f64, entry| if entry.abs() > largest.abs() { entry } else { largest });
+        if largest < 0.0 {
+            vector.iter_mut().for_each(|entry| *entry = -*entry);
+        }
+    }
+}
+
+/// The Cholesky factor of K + s M.
+struct Factor {
+    symbolic: SymbolicCholesky<usize>,
+    values: Vec<f64>,
+}
+
+impl Factor {
+    fn new(system: &SystemMatrices, shift: f64) -> Result<Self> {
+        let matrix = system.shifted_stiffness(shift);
+        let params = CholeskySymbolicParams {
+            supernodal_flop_ratio_threshold: SupernodalThreshold::FORCE_SUPERNODAL,
+            ..Default::default()
+        };
+        let symbolic = factorize_symbolic_cholesky(matrix.symbolic(), Side::Lower, SymmetricOrdering::Amd, params);
+        let symbolic = symbolic.map_err(|error| fault("factorization", format!("{error:?}")))?;
+        let mut values = Vec::new();
+        values.try_reserve_exact(symbolic.len_val()).map_err(fault_in("factorization"))?;
+        values.resize(symbolic.len_val(), 0.0);
+        // One thread, so that the result does not depend on the number of threads.
+        let scratch = symbolic.factorize_numeric_llt_scratch::<f64>(Par::Seq, Default::default());
+        let mut memory = MemBuffer::try_new(scratch).map_err(|error| fault("factorization", format!("{error:?}")))?;
+        let stack = MemStack::new(&mut memory);
+        symbolic
+            .factorize_numeric_llt(
+                &mut values,
+                matrix.as_ref(),
+                Side::Lower,
+                LltRegularization::default(),
+                Par::Seq,
+                stack,
+                Default::default(),
+            )
+            .map_err(|error| fault("factorization", format!("the stiffness is not positive definite ({error:?})")))?;
+        Ok(Self { symbolic, values })
+    }
+
+    fn lower(&self) -> Option<SupernodalLltRef<'_, usize, f64>> {
+        match self.symbolic.raw() {
+            SymbolicCholeskyRaw::Supernodal(symbolic) => Some(SupernodalLltRef::new(symbolic, &self.values)),
+            SymbolicCholeskyRaw::Simplicial(_) => None,
+        }
+    }
+
+    fn solve_scratch(&self) -> StackReq {
+        self.symbolic.solve_in_place_scratch::<f64>(1, Par::Seq)
+    }
+
+    /// Replaces b by L^-1 b, in the order of the factor.
+    fn solve_lower(&self, vector: MatMut<'_, f64>) {
+        let mut memory = MemBuffer::new(self.solve_scratch());
+        if let Some(lower) = self.lower() {
+            lower.l_solve_with_conj(Conj::No, vector, Par::Seq, MemStack::new(&mut memory));
+        }
+    }
+
+    /// Replaces b by L^-T b, in the order of the factor.
+    fn solve_upper(&self, vector: MatMut<'_, f64>) {
+        let mut memory = MemBuffer::new(self.solve_scratch());
+        if let Some(lower) = self.lower() {
+            lower.l_transpose_solve_with_conj(Conj::No, vector, Par::Seq, MemStack::new(&mut memory));
+        }
+    }
+
+    /// A vector in the order of the factor.
+    fn permuted(&self, vector: &[f64]) -> Vec<f64> {
+        match self.symbolic.perm() {
+            Some(order) => order.arrays().0.iter().map(|index| vector[*index]).collect(),
+            None => vector.to_vec(),
+        }
+    }
+
+    /// A vector in the original order.
+    fn unpermuted(&self, vector: &[f64]) -> Vec<f64> {
+        match self.symbolic.perm() {
+            Some(order) => order.arrays().1.iter().map(|index| vector[*index]).collect(),
+            None => vector.to_vec(),
+        }
+    }
+}
+
+/// The operator L^-1 M L^-T without the deflated vectors.
+struct ShiftInvert<'a> {
+    system: &'a SystemMatrices,
+    factor: &'a Factor,
+    /// Orthonormal vectors in the order of the factor.
+    deflated: Vec<Vec<f64>>,
+}
+
+impl std::fmt::Debug for ShiftInvert<'_> {
+    fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(formatter, "ShiftInvert({} freedoms)", self.system.freedoms())
+    }
+}
+
+impl ShiftInvert<'_> {
+    /// Orthonormalizes a vector against the deflated ones and adds it.
+    fn deflate(&mut self, mut vector: Vec<f64>) {
+        self.project(&mut vector);
+        self.project(&mut vector);
+        let scale = dot(&vector, &vector).sqrt().recip();
+        vector.iter_mut().for_each(|entry| *entry *= scale);
+        self.deflated.push(vector);
+    }
+
+    /// Removes the components along the deflated vectors.
+    fn project(&self, vector: &mut [f64]) {
+        for deflated in &self.deflated {
+            let share = dot(vector, deflated);
+            vector.iter_mut().zip(deflated).for_each(|(entry, component)| *entry -= share * component);
+        }
+    }
+
+    fn apply_to(&self, input: &[f64]) -> Vec<f64> {
+        let mut vector = input.to_vec();
+        self.project(&mut vector);
+        self.factor.solve_upper(as_column(&mut vector));
+        let product = self.system.apply_mass(&self.factor.unpermuted(&vector));
+        vector = self.factor.permuted(&product);
+        self.factor.solve_lower(as_column(&mut vector));
+        self.project(&mut vector);
+        vector
+    }
+
+    /// The largest eigenvalues, descending, with their vectors.
+    fn largest(&self, count: usize, seed: u64) -> Result<Vec<(f64, Vec<f64>)>> {
+        let freedoms = self.system.freedoms();
+        let count = count.min(freedoms - self.deflated.len());
+        let mut random = fastrand::Rng::with_seed(seed);
+        let mut start: Vec<f64> = (0..freedoms).map(|_| random.f64() - 0.5).collect();
+        // Power iterations estimate the largest eigenvalue and remove high frequencies from the start vector.
+        let mut estimate = 0.0;
+        for _ in 0..3 {
+            let scale = dot(&start, &start).sqrt().recip();
+            start.iter_mut().for_each(|entry| *entry *= scale);
+            start = self.apply_to(&start);
+            estimate = dot(&start, &start).sqrt();
+        }
+        let start = Col::from_fn(freedoms, |row| start[row]);
+        let mut vectors = Mat::<f64>::zeros(freedoms, count);
+        let mut values = vec![0.0; count];
+        let params = PartialEigenParams::default();
+        let scratch = partial_self_adjoint_eigen_scratch::<f64>(self, count, Par::Seq, params);
+        let mut memory = MemBuffer::try_new(scratch).map_err(|error| fault("eigensolver", format!("{error:?}")))?;
+        let tolerance = TOLERANCE * estimate;
+        let stack = MemStack::new(&mut memory);
+        let info = partial_self_adjoint_eigen(
+            vectors.as_mut(),
+            &mut values,
+            self,
+            start.as_ref(),
+            tolerance,
+            Par::Seq,
+            stack,
+            params,
+        );
+        if info.n_converged_eigen < count {
+            let reason = format!("expected {count} converged modes, got {}", info.n_converged_eigen);
+            return Err(fault("eigensolver", reason));
+        }
+        let column = |index: usize| vectors.col(index).iter().copied().collect();
+        let mut pairs: Vec<(f64, Vec<f64>)> = (0..count).map(|index| (values[index], column(index))).collect();
+        pairs.sort_by(|(a, _), (b, _)| b.total_cmp(a));
+        Ok(pairs)
+    }
+}
+
+impl LinOp<f64> for ShiftInvert<'_> {
+    fn apply_scratch(&self, _: usize, _: Par) -> StackReq {
+        StackReq::EMPTY
+    }
+
+    fn nrows(&self) -> usize {
+        self.system.freedoms()
+    }
+
+    fn ncols(&self) -> usize {
+        self.system.freedoms()
+    }
+
+    fn apply(&self, mut out: MatMut<'_, f64>, rhs: MatRef<'_, f64>, _: Par, _: &mut MemStack) {
+        for index in 0..rhs.ncols() {
+            let input: Vec<f64> = rhs.col(index).iter().copied().collect();
+            for (row, entry) in self.apply_to(&input).into_iter().enumerate() {
+                out[(row, index)] = entry;
+            }
+        }
+    }
+
+    fn conj_apply(&self, out: MatMut<'_, f64>, rhs: MatRef<'_, f64>, par: Par, stack: &mut MemStack) {
+        self.apply(out, rhs, par, stack);
+    }
+}
+
+/// A vector as a matrix with one column.
+fn as_column(vector: &mut [f64]) -> MatMut<'_, f64> {
+    let rows = vector.len();
+    MatMut::from_column_major_slice_mut(vector, rows, 1)
+}

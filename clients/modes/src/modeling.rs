@@ -1,0 +1,329 @@
+//! The computation as a whole: from a surface file to modes at its vertices.
+
+use std::sync::Arc;
+
+use modalcast_model::error::{Result, invalid};
+use nalgebra::Vector3;
+use rayon::prelude::*;
+
+use crate::assembly::SystemMatrices;
+use crate::body::{Body, Layout};
+use crate::cell_matrices::{CELL_FREEDOMS, CellMatrices, full_moments, node_coordinates};
+use crate::constraints::{SPRING_FACTOR, embed_held_points};
+use crate::eigensolver::{ElasticModes, find_elastic_modes};
+use crate::embedding::{EmbeddedPoint, embed};
+use crate::grid::{CELL_NODES, Grid};
+use crate::parameters::ModelingParameters;
+use crate::refinement::divide_long_edges;
+use crate::surface_file::{DrawnMesh, SurfaceFile};
+
+/// Receives the share of the work that is done, 0 to 1, and the name of the current stage.
+pub type Progress<'a> = dyn Fn(f64, &str) + 'a;
+
+/// The modes of a body.
+#[derive(Debug, Default)]
+pub struct Modeling {
+    /// The drawn mesh. Long edges are divided, so that large triangles can bend.
+    pub mesh: DrawnMesh,
+    /// U: entry `(3 vertex + axis) * modes + mode`. Mass-normalized, 1 / sqrt(kg).
+    pub modes: Vec<f32>,
+    /// (rad/s)^2, ascending.
+    pub eigenvalues: Vec<f64>,
+    /// Estimates of the relative error of each frequency, from a second, coarser grid. Empty if that grid has too few
+    /// cells.
+    pub frequency_errors: Vec<f64>,
+    /// |K x - lambda M x| / |lambda M x| of each mode.
+    pub residuals: Vec<f64>,
+    pub freedoms: usize,
+    /// Side of a cell, meters.
+    pub cell_size: f64,
+    /// Connected parts.
+    pub parts: usize,
+    /// Rigid motions: six per part that is not held. They are no columns of U.
+    pub rigid_modes: usize,
+    /// Kilograms, with point masses, without the material in held regions.
+    pub mass: f64,
+    /// Extents of the surface, meters.
+    pub size: [f64; 3],
+    pub damping_ratio: f64,
+    /// What the user should know about the input.
+    pub remarks: Vec<String>,
+}
+
+/// The stiffness in the rest of a cut cell, relative to that of the material.
+const FILL_FRACTION: f64 = 1e-8;
+/// The coarse grid of the error estimate has this share of the freedoms.
+const COARSE_FRACTION: f64 = 0.4;
+/// The order of the frequencies' error in the cell size that the error estimate assumes. Quadratic cells reach 4 for
+/// smooth modes; re-entrant corners and cut cells lower it.
+const ASSUMED_ORDER: i32 = 3;
+
+/// Computes the modes of a surface.
+///
+/// # Errors
+/// `Invalid` for a surface without volume, wrong groups, and clamps that hold nothing or everything; `Fault` if the
+/// eigenproblem cannot be solved.
+pub fn compute_modes(file: &SurfaceFile, parameters: &ModelingParameters, progress: &Progress<'_>) -> Result<Modeling> {
+    progress(0.0, "surface");
+    let body = Body::new(file, parameters)?;
+    let layout = body.finest_layout(parameters.freedoms)?;
+    body.check_clamps(&layout.grid, &parameters.clamps)?;
+    if layout.freedoms() < 2 * parameters.modes {
+        let expected = format!("at most half of the {} freedoms", layout.freedoms());
+        return Err(invalid("--modes", expected, parameters.modes));
+    }
+    let count = parameters.modes;
+    let mut solution = solve(&body, &layout, parameters, count, &|share, stage| progress(0.05 + 0.65 * share, stage))?;
+    let coarse_progress = |share: f64, stage: &str| progress(0.7 + 0.25 * share, stage);
+    let mut frequency_errors = estimate_errors(&body, &layout, parameters, &solution.modes, &coarse_progress);
+    if let Some(frequency) = parameters.max_frequency {
+        let limit = (std::f64::consts::TAU * frequency).powi(2);
+        let count = solution.modes.eigenvalues.partition_point(|eigenvalue| *eigenvalue <= limit);
+        if count == 0 {
+            let expected = format!("at least {:.4} Hz, the first frequency", to_hertz(solution.modes.eigenvalues[0]));
+            return Err(invalid("--max-frequency", expected, frequency));
+        }
+        solution.modes.truncate(count);
+        frequency_errors.truncate(count);
+    }
+    progress(0.95, "interpolation");
+    let (mesh, modes) = interpolate(&body, &layout, file, &solution.modes);
+    let (low, high) = body.surface.bounds();
+    let damping_ratio = parameters.damping_ratio.unwrap_or(parameters.material.damping_ratio);
+    let mut modeling = Modeling {
+        mesh,
+        modes,
+        frequency_errors,
+        freedoms: layout.freedoms(),
+        cell_size: layout.grid.cell_size,
+        parts: layout.pieces.part_count,
+        rigid_modes: solution.rigid_modes,
+        mass: solution.mass,
+        size: (high - low).into(),
+        damping_ratio,
+        remarks: file.remarks.clone(),
+        eigenvalues: solution.modes.eigenvalues,
+        residuals: solution.modes.residuals,
+    };
+    add_remarks(&body, &layout, parameters, &mut modeling);
+    Ok(modeling)
+}
+
+/// The frequency of an eigenvalue, Hz.
+pub fn to_hertz(eigenvalue: f64) -> f64 {
+    eigenvalue.sqrt() / std::f64::consts::TAU
+}
+
+/// The modes on one grid.
+struct Solution {
+    modes: ElasticModes,
+    rigid_modes: usize,
+    mass: f64,
+}
+
+/// Assembles and solves the eigenproblem of one grid.
+fn solve(
+    body: &Body,
+    layout: &Layout,
+    parameters: &ModelingParameters,
+    count: usize,
+    progress: &Progress<'_>,
+) -> Result<Solution> {
+    progress(0.0, "cells");
+    let mut matrices = cell_matrices(body, layout);
+    let held = embed_held_points(&layout.grid, &layout.pieces, &layout.held_points);
+    add_springs(body, &layout.grid, &held, &mut matrices);
+    for mass in &parameters.point_masses {
+        let point = layout.grid.to_cell_units(mass.position * body.unit);
+        if let Some(embedded) = embed(&layout.grid, &layout.pieces, point) {
+            add_outer_product(&mut Arc::make_mut(&mut matrices[embedded.piece]).mass, &embedded.weights, mass.mass);
+        }
+    }
+    let mass = matrices.iter().map(|matrices| matrices.mass.iter().sum::<f64>()).sum();
+    progress(0.05, "assembly");
+    let system = SystemMatrices::assemble(&layout.pieces.nodes, layout.pieces.node_count, &matrices);
+    drop(matrices);
+    let rigid = rigid_motions(layout, &held);
+    let modes = find_elastic_modes(&system, &rigid, shift(body, layout), count, &|share, stage| {
+        progress(0.1 + 0.9 * share, stage);
+    })?;
+    Ok(Solution { modes, rigid_modes: rigid.len(), mass })
+}
+
+/// The matrices of each piece. Full cells of one material share theirs.
+fn cell_matrices(body: &Body, layout: &Layout) -> Vec<Arc<CellMatrices>> {
+    let cell_size = layout.grid.cell_size;
+    let full: Vec<Arc<CellMatrices>> = body
+        .materials
+        .iter()
+        .map(|material| {
+            let mut matrices = CellMatrices::zeros();
+            matrices.add_material(&full_moments(), material, cell_size);
+            Arc::new(matrices)
+        })
+        .collect();
+    let matrices_of = |groups: &Vec<crate::cell_moments::GroupMoments>| {
+        if let [group] = &groups[..]
+            && group.volume_fraction() > 1.0 - 1e-12
+        {
+            return full[group.group as usize].clone();
+        }
+        let mut matrices = CellMatrices::zeros();
+        for group in groups {
+            matrices.add_material(&group.moments, &body.materials[group.group as usize], cell_size);
+            matrices.add_fill(&full[group.group as usize], FILL_FRACTION);
+        }
+        Arc::new(matrices)
+    };
+    layout.moments.par_iter().map(matrices_of).collect()
+}
+
+/// Adds the springs that hold points.
+fn add_springs(body: &Body, grid: &Grid, held: &[(EmbeddedPoint, f64)], matrices: &mut [Arc<CellMatrices>]) {
+    let modulus = body.materials.iter().map(|material| material.youngs_modulus).fold(0.0, f64::max);
+    // Newtons per meter and cell face: the modulus divided by the cell size, times the area of a face.
+    let face_stiffness = SPRING_FACTOR * modulus * grid.cell_size;
+    for (point, area) in held {
+        let stiffness = &mut Arc::make_mut(&mut matrices[point.piece]).stiffness;
+        for (i, weight) in point.weights.iter().enumerate() {
+            for (j, other) in point.weights.iter().enumerate() {
+                let entry = face_stiffness * area * weight * other;
+                for axis in 0..3 {
+                    stiffness[(3 * i + axis) * CELL_FREEDOMS + 3 * j + axis] += entry;
+                }
+            }
+        }
+    }
+}
+
+/// Adds `scale w w^T`.
+fn add_outer_product(matrix: &mut [f64], weights: &[f64; CELL_NODES], scale: f64) {
+    for (i, weight) in weights.iter().enumerate() {
+        for (j, other) in weights.iter().enumerate() {
+            matrix[i * CELL_NODES + j] += scale * weight * other;
+        }
+    }
+}
+
+/// Six rigid motions of each part without held points: translations, and rotations about the center of the part.
+fn rigid_motions(layout: &Layout, held: &[(EmbeddedPoint, f64)]) -> Vec<Vec<f64>> {
+    let pieces = &layout.pieces;
+    let mut is_held = vec![false; pieces.part_count];
+    for (point, _) in held {
+        is_held[pieces.parts[point.piece] as usize] = true;
+    }
+    let mut nodes_of_part = vec![std::collections::BTreeMap::new(); pieces.part_count];
+    for (index, nodes) in pieces.nodes.iter().enumerate() {
+        let cell = layout.grid.cell_at(pieces.pieces[index].cell);
+        for (local, node) in nodes.iter().enumerate() {
+            let offset = node_coordinates(local);
+            let position = Vector3::from_fn(|axis, _| cell[axis] as f64 + offset[axis] as f64 / 2.0);
+            nodes_of_part[pieces.parts[index] as usize].insert(*node as usize, position);
+        }
+    }
+    let mut motions = Vec::new();
+    for nodes in nodes_of_part.iter().zip(is_held).filter(|(_, is_held)| !is_held).map(|(nodes, _)| nodes) {
+        let center = nodes.values().sum::<Vector3<f64>>() / nodes.len() as f64;
+        for axis in 0..3 {
+            let unit = Vector3::ith(axis, 1.0);
+            let motion = |displacement: &dyn Fn(&Vector3<f64>) -> Vector3<f64>| {
+                let mut motion = vec![0.0; layout.freedoms()];
+                for (node, position) in nodes {
+                    motion[3 * node..3 * node + 3].copy_from_slice(displacement(position).as_slice());
+                }
+                motion
+            };
+            motions.push(motion(&|_| unit));
+            motions.push(motion(&|position| unit.cross(&(position - center))));
+        }
+    }
+    motions
+}
+
+/// A small eigenvalue, (rad/s)^2: 1/100 of that of a plate with the mean thickness of the body.
+fn shift(body: &Body, layout: &Layout) -> f64 {
+    let volume = layout.volume_fractions().iter().sum::<f64>() * layout.grid.cell_size.powi(3);
+    let thickness = 2.0 * volume / body.surface.area();
+    let speed = body.materials.iter().map(|material| material.bar_wave_speed()).fold(f64::INFINITY, f64::min);
+    0.01 * (speed * thickness / body.diagonal().powi(2)).powi(2)
+}
+
+/// Estimates the relative errors of the frequencies from the difference to those of a coarser grid (Richardson). Empty if
+/// there is no coarser grid.
+fn estimate_errors(
+    body: &Body,
+    layout: &Layout,
+    parameters: &ModelingParameters,
+    modes: &ElasticModes,
+    progress: &Progress<'_>,
+) -> Vec<f64> {
+    let limit = (layout.freedoms() as f64 * COARSE_FRACTION) as usize;
+    let count = modes.eigenvalues.len();
+    let coarse = body.finest_layout(limit).and_then(|coarse| {
+        let solution = solve(body, &coarse, parameters, count, progress)?;
+        Ok((coarse.grid.cell_size / layout.grid.cell_size, solution.modes.eigenvalues))
+    });
+    let Ok((ratio, coarse_eigenvalues)) = coarse else { return Vec::new() };
+    let scale = (ratio.powi(ASSUMED_ORDER) - 1.0).max(0.5);
+    let pairs = modes.eigenvalues.iter().zip(coarse_eigenvalues);
+    pairs.map(|(fine, coarse)| ((coarse / fine).sqrt() - 1.0).abs() / scale).collect()
+}
+
+/// Interpolates the modes at the vertices of the drawn mesh, whose long edges are divided. Vertices in held regions do
+/// not move.
+fn interpolate(body: &Body, layout: &Layout, file: &SurfaceFile, modes: &ElasticModes) -> (DrawnMesh, Vec<f32>) {
+    let grid = &layout.grid;
+    let mut mesh = file.mesh.clone();
+    divide_long_edges(&mut mesh, grid.cell_size);
+    let rank = modes.vectors.len();
+    let row = |position: &Vector3<f64>| {
+        let mut row = vec![0.0_f32; 3 * rank];
+        let is_held = body.regions.iter().any(|region| region.contains(position / body.unit));
+        if let Some(point) = embed(grid, &layout.pieces, grid.to_cell_units(*position)).filter(|_| !is_held) {
+            let nodes = &layout.pieces.nodes[point.piece];
+            for (mode, vector) in modes.vectors.iter().enumerate() {
+                for axis in 0..3 {
+                    let weighted = nodes.iter().zip(point.weights);
+                    let displacement: f64 =
+                        weighted.map(|(node, weight)| weight * vector[3 * *node as usize + axis]).sum();
+                    row[axis * rank + mode] = displacement as f32;
+                }
+            }
+        }
+        row
+    };
+    let rows: Vec<Vec<f32>> = mesh.positions.par_iter().map(row).collect();
+    (mesh, rows.concat())
+}
+
+/// Adds what the user should know.
+fn add_remarks(body: &Body, layout: &Layout, parameters: &ModelingParameters, modeling: &mut Modeling) {
+    let remarks = &mut modeling.remarks;
+    if !body.surface.is_closed {
+        remarks.push("the surface has holes; its inside is found by winding numbers".into());
+    }
+    if body.surface.flipped_triangles > 0 {
+        remarks.push(format!("{} triangles faced the other way and were turned over", body.surface.flipped_triangles));
+    }
+    if layout.removed_parts > 0 {
+        remarks.push(format!("{} parts with less than 0.1 % of the volume were removed", layout.removed_parts));
+    }
+    let diagonal = body.diagonal();
+    if !(1e-3..=100.0).contains(&diagonal) {
+        let unit = parameters.unit.name;
+        remarks.push(format!("the part measures {diagonal:.3e} m from corner to corner; is '{unit}' its --unit?"));
+    }
+    if modeling.rigid_modes > 0 {
+        let parts = modeling.rigid_modes / 6;
+        let text = if parts == 1 { "1 part is".to_owned() } else { format!("{parts} parts are") };
+        remarks
+            .push(format!("{text} free: it deforms in place, and its rigid motions are left out (--clamp holds it)"));
+    }
+    if modeling.frequency_errors.is_empty() {
+        remarks.push("the errors of the frequencies are unknown, because no coarser grid covers the part".into());
+    } else if let Some(worst) = modeling.frequency_errors.iter().copied().reduce(f64::max).filter(|worst| *worst > 0.05)
+    {
+        let percent = 100.0 * worst;
+        remarks.push(format!("the error of a frequency is about {percent:.0} %; more --freedoms reduce it"));
+    }
+}

@@ -1,0 +1,146 @@
+//! Reads the surface of a part from a model file, with the loaders of the server.
+
+use std::path::Path;
+
+use modalcast_model::domain::Material;
+use modalcast_model::error::{Result, invalid};
+use modalcast_model::load;
+use modalcast_model::scene::{Scene, UpAxis};
+use nalgebra::Vector3;
+use sha2::{Digest as _, Sha256};
+
+/// The mesh that is drawn, with the vertices and normals of the file. Positions are in meters, in the axes of the file.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct DrawnMesh {
+    pub positions: Vec<Vector3<f64>>,
+    pub triangles: Vec<[u32; 3]>,
+    pub corner_normals: Vec<[[f32; 3]; 3]>,
+    /// The index of the group of each triangle.
+    pub triangle_groups: Vec<u32>,
+    /// The index of the color of each triangle.
+    pub triangle_materials: Vec<u32>,
+    /// sRGB with alpha, 0 to 1. Empty if the file has no colors.
+    pub material_colors: Vec<[f32; 4]>,
+}
+
+/// A surface file.
+#[derive(Debug, Clone, Default)]
+pub struct SurfaceFile {
+    /// The file name without its folder.
+    pub name: String,
+    /// SHA-256 of the file, hexadecimal.
+    pub sha256: String,
+    /// The axis of the file that points up: 1 for y, 2 for z.
+    pub up_axis: usize,
+    pub mesh: DrawnMesh,
+    /// Names of the groups: materials and objects of the file, then `shell N`.
+    pub groups: Vec<String>,
+    /// The remarks of the loader.
+    pub remarks: Vec<String>,
+}
+
+/// Reads a model file. `unit` is the number of meters per unit of the file.
+///
+/// # Errors
+/// Those of the loaders; `Invalid` for scenes that are not a file.
+pub fn read(path: &str, unit: f64) -> Result<SurfaceFile> {
+    let file_path = Path::new(path);
+    let bytes = match std::fs::read(file_path) {
+        Ok(bytes) => bytes,
+        Err(error) => return Err(invalid(format!("file '{path}'"), "a readable model file", error)),
+    };
+    let opened = load::open_without_modes(path)?;
+    let mut file = SurfaceFile {
+        name: file_path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default(),
+        sha256: Sha256::digest(&bytes).iter().map(|byte| format!("{byte:02x}")).collect(),
+        up_axis: if opened.up == UpAxis::Y { 1 } else { 2 },
+        remarks: opened.remarks.clone(),
+        ..SurfaceFile::default()
+    };
+    for domain in 0..opened.domains.len() {
+        add_domain(&opened, domain, unit * opened.unit, &mut file);
+    }
+    if opened.materials.iter().any(|material| material.diffuse != Material::UNSPECIFIED_COLOR) {
+        let to_srgb = |linear: f32| match linear {
+            ..=0.003_130_8 => 12.92 * linear,
+            _ => 1.055 * linear.powf(1.0 / 2.4) - 0.055,
+        };
+        let color = |material: &Material| {
+            let [red, green, blue] = material.diffuse.map(to_srgb);
+            [red, green, blue, material.alpha]
+        };
+        file.mesh.material_colors = opened.materials.iter().map(color).collect();
+    }
+    let is_finite = file.mesh.positions.iter().all(|position| position.iter().all(|coordinate| coordinate.is_finite()));
+    match is_finite {
+        true => Ok(file),
+        false => Err(invalid(format!("file '{path}'"), "finite positions", "an infinite one")),
+    }
+}
+
+/// Adds a domain with its placement at rest. Each of its materials is a group.
+fn add_domain(scene: &Scene, domain: usize, unit: f64, file: &mut SurfaceFile) {
+    let shape = scene.shape_of(domain);
+    let domain = &scene.domains[domain];
+    let placement = domain.placement.to_matrix();
+    let mesh = &mut file.mesh;
+    let first_vertex = mesh.positions.len() as u32;
+    let place =
+        |position: &[f32; 3]| placement.transform_point(&Vector3::from(*position).cast::<f64>().into()).coords * unit;
+    mesh.positions.extend(shape.mesh.rest_positions().iter().map(place));
+    let normal_matrix = placement.fixed_view::<3, 3>(0, 0).try_inverse().unwrap_or_default().transpose();
+    let corners = shape.mesh.corners();
+    let rotate = |normal: [f32; 3]| {
+        let rotated = normal_matrix * Vector3::from(normal).cast::<f64>();
+        rotated.try_normalize(0.0).map_or(normal, |normal| normal.cast::<f32>().into())
+    };
+    let mut group_of_material = std::collections::HashMap::new();
+    for (index, triangle) in shape.mesh.triangles().iter().enumerate() {
+        mesh.triangles.push(triangle.map(|corner| first_vertex + corners.vertices[corner as usize]));
+        mesh.corner_normals.push(triangle.map(|corner| rotate(corners.normals[corner as usize])));
+        let range = domain.material_ranges.iter().rfind(|range| range.first_triangle <= index);
+        let material = range.map_or(domain.material, |range| range.material);
+        mesh.triangle_materials.push(material as u32);
+        let group = *group_of_material.entry(material).or_insert_with(|| {
+            let name = match domain.material_ranges.len() {
+                0 | 1 if scene.domains.len() > 1 => &domain.name,
+                _ => &scene.materials[material].name,
+            };
+            let known = file.groups.iter().position(|group| group == name);
+            known.unwrap_or_else(|| {
+                file.groups.push(name.clone());
+                file.groups.len() - 1
+            }) as u32
+        });
+        mesh.triangle_groups.push(group);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn materials_of_an_obj_file_are_groups() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("part.obj");
+        std::fs::write(folder.path().join("part.mtl"), "newmtl red\nKd 1 0 0\nnewmtl blue\nKd 0 0 1\n")
+            .expect("a file");
+        let text = "mtllib part.mtl\nv 0 0 0\nv 10 0 0\nv 0 10 0\nv 0 0 10\n\
+                    usemtl red\nf 1 3 2\nf 1 2 4\nusemtl blue\nf 1 4 3\nf 2 3 4\n";
+        std::fs::write(&path, text).expect("a file");
+        let file = read(&path.to_string_lossy(), 0.001).expect("a surface");
+        assert_eq!(file.groups, ["red", "blue"]);
+        assert_eq!(file.mesh.triangle_groups, [0, 0, 1, 1]);
+        assert!((file.mesh.positions[1] - Vector3::new(0.01, 0.0, 0.0)).norm() < 1e-9);
+        assert_eq!((file.up_axis, file.name.as_str()), (1, "part.obj"));
+        let [red, green, ..] = file.mesh.material_colors[0];
+        assert!((red - 1.0).abs() < 1e-6 && green == 0.0);
+    }
+
+    #[test]
+    fn missing_file_is_an_error() {
+        let error = read("missing.stl", 1.0).expect_err("expected an error").to_string();
+        assert!(error.contains("missing.stl"), "{error}");
+    }
+}
