@@ -1,5 +1,6 @@
 //! The body: its surface, materials and clamps, and its division into cells.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use modalcast_model::error::{Result, invalid};
@@ -8,11 +9,11 @@ use nalgebra::Vector3;
 use crate::cell_moments::{GroupMoments, integrate};
 use crate::cell_pieces::CellPieces;
 use crate::constraints::{HeldPoint, points_on_groups, remove_regions};
-use crate::grid::{Grid, RAY_WEIGHT};
+use crate::grid::Grid;
 use crate::material_rays::{RaySegment, trace_rays};
 use crate::materials::Material;
 use crate::parameters::ModelingParameters;
-use crate::region::Region;
+use crate::region::{self, Region};
 use crate::surface::Surface;
 use crate::surface_file::SurfaceFile;
 use crate::thickness::thicken;
@@ -23,7 +24,7 @@ const MIN_PART_FRACTION: f64 = 1e-3;
 /// Pieces with less than this share of a cell are removed.
 const MIN_PIECE_FRACTION: f64 = 1e-9;
 /// Limit on the cells of a grid, with and without material.
-const MAX_GRID_CELLS: f64 = 1.6e7;
+const MAX_GRID_CELLS: f64 = 4e6;
 
 /// The input of all grids.
 #[derive(Debug)]
@@ -37,6 +38,8 @@ pub struct Body {
     pub unit: f64,
     /// For a surface with holes.
     winding: Option<WindingNumber>,
+    /// For each axis, the coordinates of faces and clamps across it, meters.
+    breaks: [Vec<f64>; 3],
 }
 
 /// The cells of one grid.
@@ -81,8 +84,14 @@ impl Body {
         }
         let surface = Arc::new(surface);
         let winding = (!surface.is_closed).then(|| WindingNumber::new(surface.clone()));
-        let regions = parameters.clamps.iter().map(|text| Region::parse(text, &file.groups)).collect::<Result<_>>()?;
-        let body = Self { materials: parameters.materials_of(&file.groups)?, surface, regions, unit, winding };
+        let regions: Vec<Region> =
+            parameters.clamps.iter().map(|text| Region::parse(text, &file.groups)).collect::<Result<_>>()?;
+        let mut breaks = aligned_faces(&surface);
+        for (axis, position) in parameters.clamps.iter().flat_map(|text| region::limits(text)) {
+            breaks[axis].push(position * unit);
+        }
+        let materials = parameters.materials_of(&file.groups)?;
+        let body = Self { materials, surface, regions, unit, winding, breaks };
         body.check_volume()?;
         Ok(body)
     }
@@ -108,7 +117,10 @@ impl Body {
         let (low, high) = self.surface.bounds();
         let grid = Grid::covering(low, high, (high - low).max() / CELLS);
         let segments = self.trace(&grid);
-        let volume = segments.iter().map(|segments| ray_volume(segments)).fold(0.0, f64::max) * grid.cell_size.powi(3);
+        let ray_volume =
+            |axis: usize, segment: &RaySegment| (segment.end - segment.start) * grid.ray_area(axis, segment.ray);
+        let volume_of = |axis: usize| segments[axis].iter().map(|segment| ray_volume(axis, segment)).sum::<f64>();
+        let volume = [0, 1, 2].map(volume_of).into_iter().fold(0.0, f64::max) * grid.cell_size.powi(3);
         let hint = "a surface that encloses a volume. For a sheet, give its --thickness";
         // Rounding of the positions gives a plane surface a volume of this size.
         if volume < 1e-9 * self.surface.area() * self.diagonal() {
@@ -119,7 +131,7 @@ impl Body {
         for (axis, segments) in segments.iter().enumerate() {
             for segment in segments {
                 let middle = f64::midpoint(segment.start, segment.end);
-                let point = crate::material_rays::point_on_ray(axis, segment.ray, middle);
+                let point = grid.point_on_ray(axis, segment.ray, middle);
                 let length = segment.end - segment.start;
                 let value = winding.at(grid.origin + point * grid.cell_size).abs().min(1.0);
                 sum = (sum.0 + length * value, sum.1 + length);
@@ -176,11 +188,12 @@ impl Body {
     /// `Invalid` if clamps hold nothing or everything.
     pub fn layout(&self, cell_size: f64) -> Result<Layout> {
         let (low, high) = self.surface.bounds();
-        let grid = Grid::covering(low, high, cell_size);
+        let grid = Grid::covering(low, high, cell_size).with_breaks(&self.breaks);
         let mut held_points = points_on_groups(&self.surface, &grid, &self.regions);
         let mut segments = self.trace(&grid);
         for (axis, segments) in segments.iter_mut().enumerate() {
-            let (remaining, held) = remove_regions(segments, axis, &self.regions, |point| self.to_file(&grid, point));
+            let (remaining, held) =
+                remove_regions(&grid, segments, axis, &self.regions, |point| self.to_file(&grid, point));
             *segments = remaining;
             held_points.extend(held);
         }
@@ -203,7 +216,7 @@ impl Body {
             let is_group = !points_on_groups(&self.surface, grid, one_region).is_empty();
             let touches = |axis: usize| {
                 let (remaining, _) =
-                    remove_regions(&segments[axis], axis, one_region, |point| self.to_file(grid, point));
+                    remove_regions(grid, &segments[axis], axis, one_region, |point| self.to_file(grid, point));
                 remaining != segments[axis]
             };
             if !is_group && !(0..3).any(touches) {
@@ -225,9 +238,31 @@ impl Body {
     }
 }
 
-/// The volume that the rays of one axis find, in cells.
-fn ray_volume(segments: &[RaySegment]) -> f64 {
-    segments.iter().map(|segment| segment.end - segment.start).sum::<f64>() * RAY_WEIGHT
+/// For each axis, the coordinates of the largest faces across it.
+fn aligned_faces(surface: &Surface) -> [Vec<f64>; 3] {
+    /// Limit on the coordinates per axis.
+    const MAX_FACES: usize = 64;
+    /// Faces with a smaller share of the area are left out.
+    const MIN_AREA: f64 = 1e-3;
+    let (low, high) = surface.bounds();
+    let total_area = surface.area();
+    [0, 1, 2].map(|axis| {
+        // Rounded coordinates, as coordinates of one face differ by rounding.
+        let step = (high - low).norm() * 1e-7;
+        let mut areas: BTreeMap<i64, f64> = BTreeMap::new();
+        for triangle in 0..surface.triangles.len() {
+            let corners = surface.corners(triangle).map(|corner| corner[axis]);
+            if corners.iter().all(|corner| (corner - corners[0]).abs() < step) {
+                let area = surface.area_vector(triangle).norm();
+                *areas.entry(((corners[0] - low[axis]) / step).round() as i64).or_default() += area;
+            }
+        }
+        let mut faces: Vec<(f64, i64)> = areas.into_iter().map(|(key, area)| (area, key)).collect();
+        faces.retain(|(area, _)| *area > MIN_AREA * total_area);
+        faces.sort_by(|(a, _), (b, _)| b.total_cmp(a));
+        faces.truncate(MAX_FACES);
+        faces.into_iter().map(|(_, key)| low[axis] + key as f64 * step).collect()
+    })
 }
 
 /// The share of its cell that each piece fills.
@@ -255,7 +290,7 @@ fn retain_pieces(layout: Layout, keep: &[bool]) -> Layout {
     if keep.iter().all(|keep| *keep) {
         return layout;
     }
-    let pieces = layout.pieces.retain(&layout.grid, keep);
+    let pieces = layout.pieces.retain(keep);
     let moments = layout.moments.into_iter().zip(keep).filter(|(_, keep)| **keep).map(|(moments, _)| moments);
     Layout { pieces, moments: moments.collect(), ..layout }
 }

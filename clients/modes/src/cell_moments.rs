@@ -2,8 +2,8 @@
 //! determine the matrices of a 27-node cell exactly, because products of its shape functions have this degree.
 
 use crate::cell_pieces::{CellPieces, sub_cell_bit};
-use crate::grid::{Grid, RAY_WEIGHT, RAYS_PER_CELL, SUBDIVISIONS, ray_position};
-use crate::material_rays::{RaySegment, cross_axes};
+use crate::grid::{Grid, SUBDIVISIONS, cross_axes};
+use crate::material_rays::RaySegment;
 
 /// Polynomials per axis: degrees 0 to 4.
 pub const DEGREES: usize = 5;
@@ -35,12 +35,12 @@ pub fn integrate(grid: &Grid, pieces: &CellPieces, segments: &[Vec<RaySegment>; 
             let first = segment.start.floor().max(0.0) as usize;
             let stop = (segment.end.ceil().max(0.0) as usize).min(grid.cells[axis]);
             let mut cell = [0; 3];
-            [cell[u], cell[v]] = segment.ray.map(|ray| ray as usize / RAYS_PER_CELL);
+            [cell[u], cell[v]] = grid.lines_of(axis, segment.ray).map(|line| line.sub_cell / SUBDIVISIONS);
             for position in first..stop {
                 cell[axis] = position;
                 let index = grid.cell_index(cell);
                 if usize::from(axis_of_cell[index]) == axis {
-                    add_ray(pieces, index, position, axis, segment, &mut moments);
+                    add_ray(grid, pieces, index, position, axis, segment, &mut moments);
                 }
             }
         }
@@ -50,6 +50,7 @@ pub fn integrate(grid: &Grid, pieces: &CellPieces, segments: &[Vec<RaySegment>; 
 
 /// Adds the part of a segment in one cell. `position` is the cell's coordinate along the axis.
 fn add_ray(
+    grid: &Grid,
     pieces: &CellPieces,
     cell: usize,
     position: usize,
@@ -59,9 +60,11 @@ fn add_ray(
 ) {
     let [u, v] = cross_axes(axis);
     let mut sub_cell = [0; 3];
-    [sub_cell[u], sub_cell[v]] = segment.ray.map(|ray| ray as usize / 2);
-    let local = |ray: u32| 2.0 * ray_position(ray as usize % RAYS_PER_CELL) - 1.0;
-    let across = segment.ray.map(|ray| legendre(local(ray)));
+    let lines = grid.lines_of(axis, segment.ray);
+    [sub_cell[u], sub_cell[v]] = lines.map(|line| line.sub_cell);
+    let across = lines.map(|line| legendre(2.0 * (line.position - (line.sub_cell / SUBDIVISIONS) as f64) - 1.0));
+    // Areas from -1 to 1 are four times as large as those in units of cells.
+    let area = 4.0 * lines[0].weight * lines[1].weight;
     for (piece, cell_piece) in pieces.in_cell(cell) {
         let mut along = [0.0; DEGREES];
         let mut is_hit = false;
@@ -94,7 +97,7 @@ fn add_ray(
         let strides = [DEGREES * DEGREES, DEGREES, 1];
         for (i, across_u) in across[0].iter().enumerate() {
             for (j, across_v) in across[1].iter().enumerate() {
-                let weight = 4.0 * RAY_WEIGHT * across_u * across_v;
+                let weight = area * across_u * across_v;
                 for (k, integral) in along.iter().enumerate() {
                     sums[i * strides[u] + j * strides[v] + k * strides[axis]] += weight * integral;
                 }
@@ -103,23 +106,22 @@ fn add_ray(
     }
 }
 
-/// The axis whose rays are integrated in each cell: the one whose rays cross the surface most often, as the surface is
-/// then seen under the steepest angle. Thin walls parallel to the rays would otherwise be missed.
+/// The axis whose rays are integrated in each cell: the one that sees the largest projected area of the surface. Thin walls parallel to the rays would otherwise be missed.
 fn choose_axes(grid: &Grid, segments: &[Vec<RaySegment>; 3]) -> Vec<u8> {
-    let mut crossings = vec![[0_u16; 3]; grid.cell_count()];
+    let mut crossings = vec![[0.0_f32; 3]; grid.cell_count()];
     for (axis, segments) in segments.iter().enumerate() {
         let [u, v] = cross_axes(axis);
         for segment in segments {
             let mut cell = [0; 3];
-            [cell[u], cell[v]] = segment.ray.map(|ray| ray as usize / RAYS_PER_CELL);
+            [cell[u], cell[v]] = grid.lines_of(axis, segment.ray).map(|line| line.sub_cell / SUBDIVISIONS);
             // An end on the face between two cells belongs to the cell with the material.
             for position in [segment.start.floor(), segment.end.ceil() - 1.0] {
                 cell[axis] = (position.max(0.0) as usize).min(grid.cells[axis] - 1);
-                crossings[grid.cell_index(cell)][axis] += 1;
+                crossings[grid.cell_index(cell)][axis] += grid.ray_area(axis, segment.ray) as f32;
             }
         }
     }
-    let best_axis = |counts: [u16; 3]| (0..3).rev().max_by_key(|axis| counts[*axis]).unwrap_or(0) as u8;
+    let best_axis = |areas: [f32; 3]| (0..3).rev().max_by(|a, b| areas[*a].total_cmp(&areas[*b])).unwrap_or(0) as u8;
     crossings.into_iter().map(best_axis).collect()
 }
 

@@ -5,8 +5,8 @@ use nalgebra::Vector3;
 
 use crate::cell_pieces::CellPieces;
 use crate::embedding::{EmbeddedPoint, embed};
-use crate::grid::{Grid, RAY_WEIGHT};
-use crate::material_rays::{RaySegment, point_on_ray};
+use crate::grid::Grid;
+use crate::material_rays::RaySegment;
 use crate::region::Region;
 use crate::surface::Surface;
 
@@ -27,6 +27,7 @@ pub const SPRING_FACTOR: f64 = 1e3;
 /// rays enter or leave a region inside of the material. `to_file` converts a point in units of cells to the coordinates
 /// of regions.
 pub fn remove_regions(
+    grid: &Grid,
     segments: &[RaySegment],
     axis: usize,
     regions: &[Region],
@@ -39,7 +40,7 @@ pub fn remove_regions(
     let (mut remaining, mut held) = (Vec::new(), Vec::new());
     for segment in segments {
         let is_held = |position: f64| {
-            let point = to_file(point_on_ray(axis, segment.ray, position));
+            let point = to_file(grid.point_on_ray(axis, segment.ray, position));
             regions.iter().any(|region| region.contains(point))
         };
         let length = segment.end - segment.start;
@@ -65,7 +66,10 @@ pub fn remove_regions(
                 remaining.push(RaySegment { start, end: low, ..*segment });
             }
             let border = if was_held { high } else { low };
-            held.push(HeldPoint { position: point_on_ray(axis, segment.ray, border), area: RAY_WEIGHT });
+            held.push(HeldPoint {
+                position: grid.point_on_ray(axis, segment.ray, border),
+                area: grid.ray_area(axis, segment.ray),
+            });
             (start, was_held) = (border, !was_held);
         }
         if !was_held && segment.end > start {
@@ -111,6 +115,10 @@ pub fn embed_held_points(grid: &Grid, pieces: &CellPieces, points: &[HeldPoint])
 mod tests {
     use super::*;
 
+    fn grid() -> Grid {
+        Grid::covering(Vector3::zeros(), Vector3::repeat(2.0), 1.0)
+    }
+
     fn slab_region() -> Vec<Region> {
         vec![Region::parse("z < 0.3", &[]).expect("a region")]
     }
@@ -118,14 +126,14 @@ mod tests {
     #[test]
     fn material_in_a_region_is_removed_and_its_border_held() {
         let segment = RaySegment { ray: [3, 4], start: 0.1, end: 2.0, group: 0 };
-        let (remaining, held) = remove_regions(&[segment], 2, &slab_region(), |point| point);
+        let (remaining, held) = remove_regions(&grid(), &[segment], 2, &slab_region(), |point| point);
         assert_eq!((remaining.len(), held.len()), (1, 1));
         assert!((remaining[0].start - 0.3).abs() < 1e-6 && remaining[0].end == 2.0);
         assert!((held[0].position.z - 0.3).abs() < 1e-6);
         let above = RaySegment { start: 0.4, ..segment };
-        assert_eq!(remove_regions(&[above], 2, &slab_region(), |point| point), (vec![above], vec![]));
+        assert_eq!(remove_regions(&grid(), &[above], 2, &slab_region(), |point| point), (vec![above], vec![]));
         let below = RaySegment { end: 0.2, ..segment };
-        assert_eq!(remove_regions(&[below], 2, &slab_region(), |point| point), (vec![], vec![]));
+        assert_eq!(remove_regions(&grid(), &[below], 2, &slab_region(), |point| point), (vec![], vec![]));
     }
 
     /// A region much thinner than the distance of the tested positions, at either end of the material.
@@ -134,7 +142,7 @@ mod tests {
         let segment = RaySegment { ray: [0, 0], start: 0.0, end: 2.0, group: 0 };
         for text in ["z < 0.00001", "z > 1.99999"] {
             let regions = [Region::parse(text, &[]).expect("a region")];
-            let (remaining, held) = remove_regions(&[segment], 2, &regions, |point| point);
+            let (remaining, held) = remove_regions(&grid(), &[segment], 2, &regions, |point| point);
             assert_eq!((remaining.len(), held.len()), (1, 1), "{text}");
         }
     }

@@ -3,7 +3,7 @@
 use nalgebra::Vector3;
 
 use crate::cell_matrices::shape_functions;
-use crate::cell_pieces::{CellPiece, CellPieces, offset_cell};
+use crate::cell_pieces::{CellPiece, CellPieces, all_offsets, offset_cell};
 use crate::grid::{CELL_NODES, Grid, SUBDIVISIONS};
 
 /// Coordinates in a cell are limited to this magnitude. Beyond 1, a point lies outside of the cell, and its displacement
@@ -43,8 +43,7 @@ fn closest_piece(
 
 /// A cell and its 26 neighbors.
 fn neighborhood(grid: &Grid, cell: [usize; 3]) -> impl Iterator<Item = usize> {
-    let offsets = (0..27_i8).map(|index| [index / 9 - 1, index / 3 % 3 - 1, index % 3 - 1]);
-    offsets.filter_map(move |offset| offset_cell(grid, cell, offset))
+    all_offsets().filter_map(move |offset| offset_cell(grid, cell, offset))
 }
 
 /// The squared distance of a point from the sub-cells of a piece, in cells.

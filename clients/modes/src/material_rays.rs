@@ -3,34 +3,19 @@
 use nalgebra::Vector3;
 use rayon::prelude::*;
 
-use crate::grid::{Grid, RAYS_PER_CELL, ray_position};
+use crate::grid::{Grid, RayLine, cross_axes};
 use crate::surface::Surface;
 use crate::winding_number::WindingNumber;
 
 /// A part of a ray inside material. Positions are in units of cells, relative to the origin of the grid.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RaySegment {
-    /// The indices of the ray across the two other axes (see [`cross_axes`]), in rays.
+    /// The indices of the ray's lines across the two other axes (see [`cross_axes`]).
     pub ray: [u32; 2],
     pub start: f64,
     pub end: f64,
     /// The group of the surface that encloses the material.
     pub group: u32,
-}
-
-/// The two axes across the rays of an axis.
-pub const fn cross_axes(axis: usize) -> [usize; 2] {
-    [(axis + 1) % 3, (axis + 2) % 3]
-}
-
-/// A point in units of cells on a ray.
-pub fn point_on_ray(axis: usize, ray: [u32; 2], position: f64) -> Vector3<f64> {
-    let [u, v] = cross_axes(axis);
-    let mut point = Vector3::zeros();
-    point[axis] = position;
-    point[u] = ray_position(ray[0] as usize);
-    point[v] = ray_position(ray[1] as usize);
-    point
 }
 
 /// An intersection of a ray with a triangle.
@@ -59,32 +44,34 @@ pub fn trace_rays(surface: &Surface, grid: &Grid, axis: usize, winding: Option<&
         }
     }
     let trace_layer = |(layer, triangles): (usize, &Vec<usize>)| {
-        let rays_across = grid.cells[v] * RAYS_PER_CELL;
-        let mut crossings = vec![Vec::new(); RAYS_PER_CELL * rays_across];
-        let first_ray = layer * RAYS_PER_CELL;
+        let first_line = grid.first_lines[u][layer];
+        let lines = &grid.lines[u][first_line..grid.first_lines[u][layer + 1]];
+        let lines_across = &grid.lines[v];
+        let mut crossings = vec![Vec::new(); lines.len() * lines_across.len()];
         for triangle in triangles {
             let corners = surface.triangles[*triangle];
             let group = surface.triangle_groups[*triangle];
             let projected = ProjectedTriangle::new(corners, &positions, axis);
             let [u_range, v_range] = projected.ranges;
-            for u_ray in rays(u_range, first_ray, first_ray + RAYS_PER_CELL) {
-                for v_ray in rays(v_range, 0, rays_across) {
-                    if let Some((position, sign)) = projected.intersect([ray_position(u_ray), ray_position(v_ray)]) {
+            for u_line in lines_in(lines, u_range) {
+                for v_line in lines_in(lines_across, v_range) {
+                    let point = [lines[u_line].position, lines_across[v_line].position];
+                    if let Some((position, sign)) = projected.intersect(point) {
                         let crossing = Crossing { position, sign, group };
-                        crossings[(u_ray - first_ray) * rays_across + v_ray].push(crossing);
+                        crossings[u_line * lines_across.len() + v_line].push(crossing);
                     }
                 }
             }
         }
         let mut segments = Vec::new();
         for (index, crossings) in crossings.iter_mut().enumerate() {
-            let ray = [(first_ray + index / rays_across) as u32, (index % rays_across) as u32];
+            let ray = [(first_line + index / lines_across.len()) as u32, (index % lines_across.len()) as u32];
             crossings.sort_by(|a, b| a.position.total_cmp(&b.position).then(b.sign.cmp(&a.sign)));
             match winding {
                 None => add_closed_segments(ray, crossings, &mut segments),
                 Some(winding) => {
                     let inside = |position: f64| {
-                        let point = grid.origin + point_on_ray(axis, ray, position) * grid.cell_size;
+                        let point = grid.origin + grid.point_on_ray(axis, ray, position) * grid.cell_size;
                         winding.at(point).abs() > 0.5
                     };
                     add_open_segments(ray, crossings, grid.cells[axis], inside, &mut segments);
@@ -235,23 +222,19 @@ fn layers([low, high]: [f64; 2], count: usize) -> std::ops::Range<usize> {
     first..((high.max(0.0) as usize).min(count - 1) + 1)
 }
 
-/// The rays between two coordinates, limited to `first..end`. May contain one more ray on each side.
-fn rays([low, high]: [f64; 2], first: usize, end: usize) -> std::ops::Range<usize> {
-    let scale = RAYS_PER_CELL as f64;
-    let start = ((low * scale).floor() - 1.0).max(first as f64) as usize;
-    let stop = ((high * scale).ceil() + 1.0).clamp(0.0, end as f64) as usize;
-    start..stop.max(start)
+/// The indices of the lines between two coordinates.
+fn lines_in(lines: &[RayLine], [low, high]: [f64; 2]) -> std::ops::Range<usize> {
+    lines.partition_point(|line| line.position < low)..lines.partition_point(|line| line.position <= high)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::grid::RAY_WEIGHT;
     use crate::surface::tests::box_surface;
     use crate::winding_number::tests::ellipsoid;
 
-    fn volume(segments: &[RaySegment]) -> f64 {
-        segments.iter().map(|segment| segment.end - segment.start).sum::<f64>() * RAY_WEIGHT
+    fn volume(grid: &Grid, axis: usize, segments: &[RaySegment]) -> f64 {
+        segments.iter().map(|segment| (segment.end - segment.start) * grid.ray_area(axis, segment.ray)).sum()
     }
 
     #[test]
@@ -269,7 +252,11 @@ mod tests {
             assert!(surface.is_closed);
             for axis in 0..3 {
                 let segments = trace_rays(&surface, &grid, axis, None);
-                assert!((volume(&segments) - expected).abs() < 1e-9, "axis {axis}: {}", volume(&segments));
+                assert!(
+                    (volume(&grid, axis, &segments) - expected).abs() < 1e-9,
+                    "axis {axis}: {}",
+                    volume(&grid, axis, &segments)
+                );
                 let inner = segments.iter().filter(|segment| segment.group == 1).count();
                 assert_eq!(inner > 0, !is_cavity, "the inner shell's material");
             }
@@ -286,9 +273,9 @@ mod tests {
         let (low, high) = closed.bounds();
         let grid = Grid::covering(low, high, 0.1);
         for axis in 0..3 {
-            let expected = volume(&trace_rays(&closed, &grid, axis, None));
+            let expected = volume(&grid, axis, &trace_rays(&closed, &grid, axis, None));
             let winding = WindingNumber::new(std::sync::Arc::new(open.clone()));
-            let with_holes = volume(&trace_rays(&open, &grid, axis, Some(&winding)));
+            let with_holes = volume(&grid, axis, &trace_rays(&open, &grid, axis, Some(&winding)));
             assert!((with_holes / expected - 1.0).abs() < 0.01, "axis {axis}: {with_holes} instead of {expected}");
             let exact = 4.0 / 3.0 * std::f64::consts::PI * 0.5 * 0.35 * 0.2 / 1e-3;
             assert!((expected / exact - 1.0).abs() < 0.01, "axis {axis}: {expected} instead of {exact}");

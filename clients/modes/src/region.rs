@@ -76,11 +76,54 @@ impl Region {
     }
 }
 
+/// The axes and constants of the comparisons `x < 1` in a region's text.
+pub fn limits(text: &str) -> Vec<(usize, f64)> {
+    let comparisons = text.split(['&', '|', '(', ')']);
+    let limit = |comparison: &str| {
+        let (name, constant) = comparison.split_once(['<', '>'])?;
+        let axis = ["x", "y", "z"].iter().position(|axis| *axis == name.trim())?;
+        Some((axis, constant.trim_start_matches('=').trim().parse().ok()?))
+    };
+    comparisons.filter_map(limit).collect()
+}
+
 /// Adds parentheses, so that comparisons bind more tightly than `&&`, and `&&` more tightly than `||`. The parser has
 /// other priorities.
 fn bind_operators(text: &str) -> String {
-    let inner = text.replace('(', "(((").replace(')', ")))").replace("&&", ") && (").replace("||", ")) || ((");
+    let inner = expand_exponents(text)
+        .replace('(', "(((")
+        .replace(')', ")))")
+        .replace("&&", ") && (")
+        .replace("||", ")) || ((");
     format!("(({inner}))")
+}
+
+/// Replaces numbers such as `1e-6` by decimals, which the parser reads.
+fn expand_exponents(text: &str) -> String {
+    let mut expanded = String::new();
+    let mut rest = text;
+    while let Some(character) = rest.chars().next() {
+        // The longest number that begins here, unless it continues a name.
+        let is_number = character.is_ascii_digit() || character == '.';
+        let continues_name = expanded.ends_with(|last: char| last.is_alphanumeric() || last == '_');
+        let number = (1..=rest.len()).rev().filter(|_| is_number && !continues_name).find_map(|length| {
+            let candidate =
+                rest.get(..length).filter(|candidate| candidate.ends_with(|last: char| last.is_ascii_digit()))?;
+            Some((length, candidate.parse::<f64>().ok()?))
+        });
+        let length = match number {
+            Some((length, value)) => {
+                expanded.push_str(&value.to_string());
+                length
+            }
+            None => {
+                expanded.push(character);
+                character.len_utf8()
+            }
+        };
+        rest = &rest[length..];
+    }
+    expanded
 }
 
 /// Names in quotation marks, for error messages.
@@ -106,8 +149,15 @@ mod tests {
         assert!(contains("z<-1 || x >= 2 && y > 1", [2.0, 1.5, 0.0]));
         assert!(!contains("(z<-1 || x >= 2) && y > 1", [0.0, 0.5, -2.0]));
         assert!(contains("x^2 + y^2 < 4", [1.0, -1.0, 9.0]));
+        assert!(contains("x < 1e-6 && y > -2.5E3", [0.0; 3]) && !contains("x<1e-6", [1e-5, 0.0, 0.0]));
         assert!(contains("near 1 2 -3 0.5", [1.0, 2.4, -3.0]) && !contains("near 1 2 -3 0.5", [1.0, 2.6, -3.0]));
         assert!(matches!(Region::parse("group upper arm", &groups), Ok(Region::Group(1))));
+    }
+
+    #[test]
+    fn limits_are_the_constants_of_comparisons() {
+        assert_eq!(limits("(z<-1e-3 || x >= 2) && y + x > 1"), [(2, -1e-3), (0, 2.0)]);
+        assert!(limits("near 1 2 3 4").is_empty());
     }
 
     #[test]

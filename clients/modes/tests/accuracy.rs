@@ -69,7 +69,7 @@ fn thin_plate_has_the_exact_frequencies() {
         let modeling = compute(&rotated(solid_box([1.0, 0.6, 0.01]), rotation), &parameters(6000, 8));
         let difference = worst_difference(&modeling.eigenvalues, &solids::PLATE);
         let frequencies: Vec<f64> = modeling.eigenvalues.iter().map(|v| to_hertz(*v)).collect();
-        assert!(difference < 0.02, "rotation {rotation}: {difference}: {frequencies:?}");
+        assert!(difference < 0.025, "rotation {rotation}: {difference}: {frequencies:?}");
     }
 }
 
