@@ -1,20 +1,24 @@
-//! The lowest elastic modes of K x = lambda M x, by shift-invert with a sparse Cholesky factorization and the
-//! Krylov-Schur method, both of the library faer.
+//! The lowest elastic modes of K x = lambda M x, by shift-invert with a sparse Cholesky factorization and a block Krylov
+//! method (Golub, Underwood 1977) with full orthogonalization.
+//!
+//! The factorization, products, QR and dense eigenproblems are those of the library faer. Its own Krylov-Schur solver is
+//! not used: its loop of reorthogonalization does not end where the rounding of a dot product exceeds its limit, which
+//! happens for a sphere of 25,000 freedoms.
 //!
 //! With K + s M = L L^T for a small shift s > 0, the operator L^-1 M L^-T has the eigenvalues 1 / (lambda + s). The shift
-//! makes the matrix of a free body definite. Rigid motions are known and projected out. A Krylov method can miss copies of
-//! repeated eigenvalues, so it runs again with the modes that were found projected out, until it finds only higher ones.
+//! makes the matrix of a free body definite. Rigid motions are known and projected out. A block Krylov method can miss
+//! copies of eigenvalues with more copies than the block has vectors, so it runs again with the modes that were found
+//! projected out, until it finds only higher ones.
 
 use faer::dyn_stack::{MemBuffer, MemStack, StackReq};
 use faer::linalg::cholesky::llt::factor::LltRegularization;
-use faer::matrix_free::LinOp;
-use faer::matrix_free::eigen::{PartialEigenParams, partial_self_adjoint_eigen, partial_self_adjoint_eigen_scratch};
+use faer::linalg::matmul::matmul;
 use faer::sparse::linalg::SupernodalThreshold;
 use faer::sparse::linalg::cholesky::supernodal::SupernodalLltRef;
 use faer::sparse::linalg::cholesky::{
     CholeskySymbolicParams, SymbolicCholesky, SymbolicCholeskyRaw, SymmetricOrdering, factorize_symbolic_cholesky,
 };
-use faer::{Col, Conj, Mat, MatMut, MatRef, Par, Side};
+use faer::{Accum, Conj, Mat, MatMut, MatRef, Par, Side};
 use modalcast_model::error::{Result, fault, fault_in};
 
 use crate::assembly::{SystemMatrices, dot};
@@ -39,8 +43,12 @@ impl ElasticModes {
     }
 }
 
-/// The tolerance of one Krylov-Schur run, relative to the largest eigenvalue of the operator.
+/// Limit on the residual of a converged mode, relative to the largest eigenvalue of the operator.
 const TOLERANCE: f64 = 1e-10;
+/// Vectors of a block.
+const BLOCK: usize = 8;
+/// Limit on the blocks of a run, beyond twice the number of modes.
+const EXTRA_BLOCKS: usize = 40;
 /// Modes that are computed beyond the requested ones, so that the last cluster is complete.
 const EXTRA_MODES: usize = 2;
 /// Modes of a run that looks for missed copies.
@@ -48,7 +56,7 @@ const CHECKED_MODES: usize = 4;
 /// Limit on the runs that look for missed copies.
 const MAX_CHECKS: usize = 8;
 /// Eigenvalues that differ by less, relative to their size, form a cluster.
-const CLUSTER_GAP: f64 = 1e-4;
+const CLUSTER_GAP: f64 = 1e-6;
 
 /// Finds the `count` lowest elastic modes. `rigid` contains the rigid motions, and `shift` is a small eigenvalue,
 /// (rad/s)^2. `progress` receives the share of the work that is done, 0 to 1.
@@ -69,7 +77,7 @@ pub fn find_elastic_modes(
     for motion in rigid {
         // K r = 0, so that L^T r = L^-1 (K + s M) r = s L^-1 M r.
         let mut vector = factor.permuted(&system.apply_mass(motion));
-        factor.solve_lower(as_column(&mut vector));
+        factor.solve_lower(as_columns(&mut vector, 1));
         operator.deflate(vector);
     }
     let wanted = count + EXTRA_MODES;
@@ -95,7 +103,7 @@ pub fn find_elastic_modes(
     }
     progress(0.95, "mode shapes");
     let shapes = vectors.into_iter().map(|(_, mut vector)| {
-        factor.solve_upper(as_column(&mut vector));
+        factor.solve_upper(as_columns(&mut vector, 1));
         factor.unpermuted(&vector)
     });
     Ok(normalize(system, shapes.collect(), count))
@@ -228,21 +236,21 @@ impl Factor {
         }
     }
 
-    fn solve_scratch(&self) -> StackReq {
-        self.symbolic.solve_in_place_scratch::<f64>(1, Par::Seq)
+    fn solve_scratch(&self, columns: usize) -> StackReq {
+        self.symbolic.solve_in_place_scratch::<f64>(columns, Par::Seq)
     }
 
-    /// Replaces b by L^-1 b, in the order of the factor.
+    /// Replaces each column b by L^-1 b, in the order of the factor.
     fn solve_lower(&self, vector: MatMut<'_, f64>) {
-        let mut memory = MemBuffer::new(self.solve_scratch());
+        let mut memory = MemBuffer::new(self.solve_scratch(vector.ncols()));
         if let Some(lower) = self.lower() {
             lower.l_solve_with_conj(Conj::No, vector, Par::Seq, MemStack::new(&mut memory));
         }
     }
 
-    /// Replaces b by L^-T b, in the order of the factor.
+    /// Replaces each column b by L^-T b, in the order of the factor.
     fn solve_upper(&self, vector: MatMut<'_, f64>) {
-        let mut memory = MemBuffer::new(self.solve_scratch());
+        let mut memory = MemBuffer::new(self.solve_scratch(vector.ncols()));
         if let Some(lower) = self.lower() {
             lower.l_transpose_solve_with_conj(Conj::No, vector, Par::Seq, MemStack::new(&mut memory));
         }
@@ -273,12 +281,6 @@ struct ShiftInvert<'a> {
     deflated: Vec<Vec<f64>>,
 }
 
-impl std::fmt::Debug for ShiftInvert<'_> {
-    fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(formatter, "ShiftInvert({} freedoms)", self.system.freedoms())
-    }
-}
-
 impl ShiftInvert<'_> {
     /// Orthonormalizes a vector against the deflated ones and adds it.
     fn deflate(&mut self, mut vector: Vec<f64>) {
@@ -297,89 +299,125 @@ impl ShiftInvert<'_> {
         }
     }
 
-    fn apply_to(&self, input: &[f64]) -> Vec<f64> {
-        let mut vector = input.to_vec();
-        self.project(&mut vector);
-        self.factor.solve_upper(as_column(&mut vector));
-        let product = self.system.apply_mass(&self.factor.unpermuted(&vector));
-        vector = self.factor.permuted(&product);
-        self.factor.solve_lower(as_column(&mut vector));
-        self.project(&mut vector);
-        vector
+    /// Replaces each of the columns by its product with the operator.
+    fn apply(&self, columns: &mut [f64]) {
+        let freedoms = self.system.freedoms();
+        let count = columns.len() / freedoms;
+        columns.chunks_exact_mut(freedoms).for_each(|column| self.project(column));
+        self.factor.solve_upper(as_columns(columns, count));
+        for column in columns.chunks_exact_mut(freedoms) {
+            let product = self.system.apply_mass(&self.factor.unpermuted(column));
+            column.copy_from_slice(&self.factor.permuted(&product));
+        }
+        self.factor.solve_lower(as_columns(columns, count));
+        columns.chunks_exact_mut(freedoms).for_each(|column| self.project(column));
     }
 
     /// The largest eigenvalues, descending, with their vectors.
+    ///
+    /// # Errors
+    /// `Fault` if the residuals do not fall below the limit.
     fn largest(&self, count: usize, seed: u64) -> Result<Vec<(f64, Vec<f64>)>> {
         let freedoms = self.system.freedoms();
-        let count = count.min(freedoms - self.deflated.len());
+        let dimension = freedoms - self.deflated.len();
+        let count = count.min(dimension);
+        let limit = dimension.min(2 * count + EXTRA_BLOCKS * BLOCK);
         let mut random = fastrand::Rng::with_seed(seed);
-        let mut start: Vec<f64> = (0..freedoms).map(|_| random.f64() - 0.5).collect();
-        // Power iterations estimate the largest eigenvalue and remove high frequencies from the start vector.
-        let mut estimate = 0.0;
-        for _ in 0..3 {
-            let scale = dot(&start, &start).sqrt().recip();
-            start.iter_mut().for_each(|entry| *entry *= scale);
-            start = self.apply_to(&start);
-            estimate = dot(&start, &start).sqrt();
-        }
-        let start = Col::from_fn(freedoms, |row| start[row]);
-        let mut vectors = Mat::<f64>::zeros(freedoms, count);
-        let mut values = vec![0.0; count];
-        let params = PartialEigenParams::default();
-        let scratch = partial_self_adjoint_eigen_scratch::<f64>(self, count, Par::Seq, params);
-        let mut memory = MemBuffer::try_new(scratch).map_err(|error| fault("eigensolver", format!("{error:?}")))?;
-        let tolerance = TOLERANCE * estimate;
-        let stack = MemStack::new(&mut memory);
-        let info = partial_self_adjoint_eigen(
-            vectors.as_mut(),
-            &mut values,
-            self,
-            start.as_ref(),
-            tolerance,
-            Par::Seq,
-            stack,
-            params,
-        );
-        if info.n_converged_eigen < count {
-            let reason = format!("expected {count} converged modes, got {}", info.n_converged_eigen);
-            return Err(fault("eigensolver", reason));
-        }
-        let column = |index: usize| vectors.col(index).iter().copied().collect();
-        let mut pairs: Vec<(f64, Vec<f64>)> = (0..count).map(|index| (values[index], column(index))).collect();
-        pairs.sort_by(|(a, _), (b, _)| b.total_cmp(a));
-        Ok(pairs)
-    }
-}
-
-impl LinOp<f64> for ShiftInvert<'_> {
-    fn apply_scratch(&self, _: usize, _: Par) -> StackReq {
-        StackReq::EMPTY
-    }
-
-    fn nrows(&self) -> usize {
-        self.system.freedoms()
-    }
-
-    fn ncols(&self) -> usize {
-        self.system.freedoms()
-    }
-
-    fn apply(&self, mut out: MatMut<'_, f64>, rhs: MatRef<'_, f64>, _: Par, _: &mut MemStack) {
-        for index in 0..rhs.ncols() {
-            let input: Vec<f64> = rhs.col(index).iter().copied().collect();
-            for (row, entry) in self.apply_to(&input).into_iter().enumerate() {
-                out[(row, index)] = entry;
+        let mut block: Vec<f64> = (0..freedoms * BLOCK.min(dimension)).map(|_| random.f64() - 0.5).collect();
+        // Orthonormal columns, and their products with the operator.
+        let (mut basis, mut images) = (Vec::new(), Vec::new());
+        loop {
+            let columns = basis.len() / freedoms;
+            block.truncate(freedoms * (limit - columns).min(BLOCK));
+            self.orthonormalize(&mut block, &basis)?;
+            basis.extend_from_slice(&block);
+            self.apply(&mut block);
+            images.extend_from_slice(&block);
+            let columns = basis.len() / freedoms;
+            if columns < count {
+                continue;
+            }
+            let ritz = RitzPairs::new(&basis, &images, freedoms, count)?;
+            if columns == dimension || ritz.has_converged() {
+                return Ok(ritz.into_pairs());
+            }
+            if columns == limit {
+                let reason = format!("expected {count} converged modes, got residuals {:?}", ritz.residuals);
+                return Err(fault("eigensolver", reason));
             }
         }
     }
 
-    fn conj_apply(&self, out: MatMut<'_, f64>, rhs: MatRef<'_, f64>, par: Par, stack: &mut MemStack) {
-        self.apply(out, rhs, par, stack);
+    /// Orthonormalizes the columns of a block against the deflated vectors, the basis and each other. A column that
+    /// depends on the others becomes an arbitrary direction.
+    fn orthonormalize(&self, block: &mut [f64], basis: &[f64]) -> Result<()> {
+        let freedoms = self.system.freedoms();
+        let count = block.len() / freedoms;
+        let basis = MatRef::from_column_major_slice(basis, freedoms, basis.len() / freedoms);
+        // The second pass removes what rounding leaves of dependent columns.
+        for _ in 0..3 {
+            block.chunks_exact_mut(freedoms).for_each(|column| self.project(column));
+            let mut columns = as_columns(block, count);
+            let mut shares = Mat::zeros(basis.ncols(), count);
+            matmul(shares.as_mut(), Accum::Replace, basis.transpose(), columns.as_ref(), 1.0, Par::Seq);
+            matmul(columns.as_mut(), Accum::Add, basis, shares.as_ref(), -1.0, Par::Seq);
+            let orthonormal = columns.as_ref().qr().compute_thin_Q();
+            columns.copy_from(&orthonormal);
+        }
+        match block.iter().all(|entry| entry.is_finite()) {
+            true => Ok(()),
+            false => Err(fault("eigensolver", "a vector is not finite")),
+        }
     }
 }
 
-/// A vector as a matrix with one column.
-fn as_column(vector: &mut [f64]) -> MatMut<'_, f64> {
-    let rows = vector.len();
-    MatMut::from_column_major_slice_mut(vector, rows, 1)
+/// Approximate eigenpairs from a basis (Rayleigh-Ritz).
+struct RitzPairs {
+    /// Descending.
+    values: Vec<f64>,
+    vectors: Mat<f64>,
+    /// Norms of the residuals S y - theta y.
+    residuals: Vec<f64>,
+}
+
+impl RitzPairs {
+    fn new(basis: &[f64], images: &[f64], freedoms: usize, count: usize) -> Result<Self> {
+        let columns = basis.len() / freedoms;
+        let basis = MatRef::from_column_major_slice(basis, freedoms, columns);
+        let images = MatRef::from_column_major_slice(images, freedoms, columns);
+        let mut projected = Mat::zeros(columns, columns);
+        matmul(projected.as_mut(), Accum::Replace, basis.transpose(), images, 1.0, Par::Seq);
+        let symmetric = Mat::from_fn(columns, columns, |i, j| f64::midpoint(projected[(i, j)], projected[(j, i)]));
+        let decomposition = symmetric.self_adjoint_eigen(Side::Lower);
+        let decomposition = decomposition.map_err(|error| fault("eigensolver", format!("{error:?}")))?;
+        let (values, coefficients) = (decomposition.S(), decomposition.U());
+        // Eigenvalues ascend.
+        let chosen = Mat::from_fn(columns, count, |row, index| coefficients[(row, columns - 1 - index)]);
+        let values: Vec<f64> = (0..count).map(|index| values[columns - 1 - index]).collect();
+        let mut vectors = Mat::zeros(freedoms, count);
+        matmul(vectors.as_mut(), Accum::Replace, basis, chosen.as_ref(), 1.0, Par::Seq);
+        let mut differences = Mat::zeros(freedoms, count);
+        matmul(differences.as_mut(), Accum::Replace, images, chosen.as_ref(), 1.0, Par::Seq);
+        let residual = |index: usize| {
+            let pairs = differences.col(index).iter().zip(vectors.col(index).iter());
+            pairs.map(|(image, vector)| (image - values[index] * vector).powi(2)).sum::<f64>().sqrt()
+        };
+        let residuals = (0..count).map(residual).collect();
+        Ok(Self { values, vectors, residuals })
+    }
+
+    fn has_converged(&self) -> bool {
+        self.residuals.iter().all(|residual| *residual <= TOLERANCE * self.values[0])
+    }
+
+    fn into_pairs(self) -> Vec<(f64, Vec<f64>)> {
+        let column = |index: usize| self.vectors.col(index).iter().copied().collect();
+        self.values.iter().enumerate().map(|(index, value)| (*value, column(index))).collect()
+    }
+}
+
+/// Vectors, one after the other, as the columns of a matrix.
+fn as_columns(vectors: &mut [f64], count: usize) -> MatMut<'_, f64> {
+    let rows = vectors.len() / count;
+    MatMut::from_column_major_slice_mut(vectors, rows, count)
 }

@@ -1,0 +1,188 @@
+//! The program `modalcast-modes`: from files to models.
+
+mod solids;
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output, Stdio};
+use std::time::{Duration, Instant};
+
+use modalcast_model::load;
+use modalcast_modes::surface_file::SurfaceFile;
+use solids::{ellipsoid, solid_box};
+
+fn program(folder: &Path, arguments: &[&str]) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_modalcast-modes"));
+    command.current_dir(folder).args(arguments);
+    command
+}
+
+fn run(folder: &Path, arguments: &[&str]) -> Output {
+    program(folder, arguments).output().expect("expected the program to start")
+}
+
+fn error_of(output: &Output) -> String {
+    assert_eq!(output.status.code(), Some(2), "{output:?}");
+    String::from_utf8_lossy(&output.stderr).into_owned()
+}
+
+/// Writes a surface as an STL file, scaled.
+fn write_stl(folder: &Path, name: &str, surface: &SurfaceFile, scale: f64) -> PathBuf {
+    let mut text = String::from("solid part\n");
+    for triangle in &surface.mesh.triangles {
+        text.push_str("facet normal 0 0 0\nouter loop\n");
+        for vertex in triangle {
+            let [x, y, z]: [f64; 3] = (surface.mesh.positions[*vertex as usize] * scale).into();
+            text.push_str(&format!("vertex {x} {y} {z}\n"));
+        }
+        text.push_str("endloop\nendfacet\n");
+    }
+    text.push_str("endsolid part\n");
+    let path = folder.join(name);
+    std::fs::write(&path, text).expect("expected a writable file");
+    path
+}
+
+#[test]
+fn stl_becomes_a_model_with_modes_eigenvalues_and_notes() {
+    let folder = tempfile::tempdir().expect("expected a folder");
+    write_stl(folder.path(), "bar.stl", &solid_box([0.1, 0.01, 0.01]), 1000.0);
+    let arguments = "bar.stl --unit mm --material aluminium --modes 6 --freedoms 2000 --damping 0.02 --json --clamp";
+    let arguments: Vec<&str> = arguments.split(' ').chain(["x < -49"]).collect();
+    let output = run(folder.path(), &arguments);
+    assert!(output.status.success(), "{output:?}");
+    let result: serde_json::Value = serde_json::from_slice(&output.stdout).expect("expected JSON");
+    // Euler and Bernoulli: the first frequency of an aluminum bar of 99 mm with a square section of 10 mm.
+    let expected = 1.875_104_f64.powi(2) / std::f64::consts::TAU * 0.01 / 12.0_f64.sqrt() / 0.099_f64.powi(2)
+        * (69e9_f64 / 2700.0).sqrt();
+    let first = result["frequencies"][0].as_f64().expect("expected a frequency");
+    assert!((first / expected - 1.0).abs() < 0.02, "{first} instead of {expected}");
+    assert_eq!(result["rigid_modes"], 0);
+    let opened = load::open(&folder.path().join("bar.npz").to_string_lossy()).expect("expected a scene");
+    let (shape, domain) = (opened.scene.shape_of(0), &opened.scene.domains[0]);
+    assert_eq!((shape.modes.rank(), domain.metadata.eigenvalues.len()), (6, 6));
+    let frequency = domain.metadata.eigenvalues[0].sqrt() / std::f64::consts::TAU;
+    assert!((frequency / first - 1.0).abs() < 1e-12);
+    for (note, value) in
+        [("damping_ratio", "0.02"), ("rigid_modes", "0"), ("modes.source", "bar.stl"), ("modes.clamps", "x < -49")]
+    {
+        assert_eq!(domain.metadata.notes[note], value, "{note}");
+    }
+    // The bar has more vertices than the file, so that it bends, and its length is in meters.
+    let positions = shape.mesh.rest_positions();
+    assert!(positions.len() > 60, "{}", positions.len());
+    assert!(positions.iter().all(|position| position[0].abs() <= 0.0501));
+}
+
+/// The modes do not depend on threads, so that caches and tests can compare bytes.
+#[test]
+fn bytes_are_equal_for_any_number_of_threads() {
+    let folder = tempfile::tempdir().expect("expected a folder");
+    write_stl(folder.path(), "body.stl", &ellipsoid([0.5, 0.5, 0.3], 24), 1.0);
+    let model = |threads: &str| {
+        let output = format!("{threads}.npz");
+        let flags = ["body.stl", "--freedoms", "2500", "--threads", threads, "--out", &output];
+        assert!(run(folder.path(), &flags).status.success());
+        std::fs::read(folder.path().join(output)).expect("expected a model")
+    };
+    let one = model("1");
+    assert_eq!(one, model("2"));
+    assert_eq!(one, model("5"));
+    let flags = ["body.stl", "--freedoms", "2400", "--out", "other.npz"];
+    assert!(run(folder.path(), &flags).status.success());
+    assert_ne!(one, std::fs::read(folder.path().join("other.npz")).expect("a model"), "control: another grid");
+}
+
+#[test]
+fn y_up_surface_becomes_a_z_up_model() {
+    let folder = tempfile::tempdir().expect("expected a folder");
+    let text = "v 0 0 0\nv 1 0 0\nv 0 3 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n";
+    std::fs::write(folder.path().join("tetrahedron.obj"), text).expect("expected a writable file");
+    let arguments = ["tetrahedron.obj", "--freedoms", "1500", "--modes", "4", "--material", "E=1e6,nu=0.3,rho=1000"];
+    let heights = |extra: &[&str], out: &str| {
+        let output = run(folder.path(), &[&arguments[..], extra, &["--out", out]].concat());
+        assert!(output.status.success(), "{output:?}");
+        let scene = load::open(&folder.path().join(out).to_string_lossy()).expect("expected a scene").scene;
+        let positions = scene.shape_of(0).mesh.rest_positions();
+        positions.iter().map(|position| position[2]).fold(0.0, f32::max)
+    };
+    assert_eq!(heights(&[], "a.npz"), 3.0);
+    assert_eq!(heights(&["--up", "z"], "b.npz"), 1.0);
+}
+
+#[test]
+fn errors_name_what_is_wrong_and_leave_no_file() {
+    let folder = tempfile::tempdir().expect("expected a folder");
+    write_stl(folder.path(), "box.stl", &solid_box([1.0, 0.7, 0.4]), 1.0);
+    std::fs::write(folder.path().join("nan.obj"), "v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n").expect("a file");
+    std::fs::write(folder.path().join("flat.obj"), "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n").expect("a file");
+    let entries = || std::fs::read_dir(folder.path()).expect("a folder").count();
+    let before = entries();
+    for (arguments, message) in [
+        ("missing.stl", "missing.stl"),
+        ("nan.obj", "finite"),
+        ("flat.obj", "--thickness"),
+        ("box.stl --material E=1e9,nu=0.5,rho=1000", "below 0.5, got 0.5"),
+        ("box.stl --unit yard", "m, mm, cm"),
+        ("box.stl --clamp z<-9", "touches the body"),
+        ("box.stl --clamp h<1", "x, y and z"),
+        ("box.stl --modes 0", "1 to 512"),
+        ("box.stl --modes 300 --freedoms 500", "at most half"),
+        ("box.stl --threads 0", "at least 1"),
+        ("box.stl --point-mass 1,2", "X Y Z KG"),
+    ] {
+        let output = run(folder.path(), &arguments.split(' ').collect::<Vec<_>>());
+        let error = error_of(&output);
+        assert!(error.starts_with("error: ") && error.contains(message), "{arguments}: {error}");
+        assert_eq!(error.lines().count(), 1, "{error}");
+    }
+    assert_eq!(entries(), before);
+    let flags = ["box.stl", "--freedoms", "1500", "--progress", "lines"];
+    let output = run(folder.path(), &flags);
+    assert!(output.status.success(), "{output:?}");
+    let progress = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(
+        progress.lines().all(|line| line.starts_with("progress 0.") || line.starts_with("progress 1.")),
+        "{progress}"
+    );
+    assert!(String::from_utf8_lossy(&output.stdout).contains("1 part is free"), "{output:?}");
+    assert!(error_of(&run(folder.path(), &flags)).contains("--force"), "the model exists now");
+    assert!(run(folder.path(), &[&flags[..], &["--force"]].concat()).status.success());
+}
+
+/// Millimeters that are read as meters.
+#[test]
+fn implausible_sizes_are_remarks() {
+    let folder = tempfile::tempdir().expect("expected a folder");
+    write_stl(folder.path(), "part.stl", &solid_box([0.2, 0.1, 0.1]), 1000.0);
+    let arguments = ["part.stl", "--freedoms", "1500", "--modes", "3", "--force"];
+    let text = |extra: &[&str]| {
+        let output = run(folder.path(), &[&arguments[..], extra].concat());
+        String::from_utf8_lossy(&output.stdout).into_owned()
+    };
+    assert!(text(&[]).contains("is 'm' its --unit?"));
+    assert!(!text(&["--unit", "mm"]).contains("--unit?"), "control");
+}
+
+#[test]
+fn interrupted_program_leaves_no_file() {
+    let folder = tempfile::tempdir().expect("expected a folder");
+    write_stl(folder.path(), "body.stl", &ellipsoid([0.5, 0.4, 0.3], 40), 1.0);
+    let mut child = program(folder.path(), &["body.stl", "--freedoms", "60000", "--progress", "lines"])
+        .stderr(Stdio::piped())
+        .stdout(Stdio::null())
+        .spawn()
+        .expect("expected the program to start");
+    // The first line of progress: the computation has begun.
+    let mut line = String::new();
+    let stderr = child.stderr.take().expect("expected a pipe");
+    std::io::BufRead::read_line(&mut std::io::BufReader::new(stderr), &mut line).expect("expected a line");
+    assert!(line.starts_with("progress"), "{line}");
+    let pid = rustix::process::Pid::from_child(&child);
+    rustix::process::kill_process(pid, rustix::process::Signal::INT).expect("expected a signal");
+    let deadline = Instant::now() + Duration::from_secs(60);
+    while child.try_wait().expect("expected a status").is_none() {
+        assert!(Instant::now() < deadline, "the program ignores SIGINT");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    assert_eq!(std::fs::read_dir(folder.path()).expect("a folder").count(), 1, "only the surface");
+}
