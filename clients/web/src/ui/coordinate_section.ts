@@ -4,7 +4,7 @@ import { rankOf } from "../scene/description";
 import { at } from "../scene/numbers";
 import type { SceneModel } from "../scene/scene_model";
 import { h, setText } from "./dom";
-import { short } from "./format";
+import * as format from "./format";
 import { icon } from "./icons";
 
 /** Modes shown at a time. */
@@ -147,7 +147,7 @@ export class CoordinateSection {
             const current = at(q, mode);
             const range = Math.max(at(this.ranges, mode), Math.abs(current));
             this.ranges[mode] = range;
-            setText(value, short(current));
+            setText(value, format.short(current));
             bar.style.transform = `scaleX(${current / range})`;
             const isEdited = slider.matches(":active") || performance.now() - this.lastInput < INPUT_MS;
             if (document.activeElement !== slider || !isEdited) {
@@ -199,7 +199,7 @@ export class CoordinateSection {
         const value = h("span", { className: "value" });
         this.rows.push({ value, bar, track, slider, play });
         const name = h("span", { className: "name", textContent: `q${mode + 1}` });
-        const frequency = h("span", { className: "name", textContent: hertz > 0 ? `${short(hertz)} Hz` : "" });
+        const frequency = h("span", { className: "name", textContent: hertz > 0 ? format.frequency(hertz) : "" });
         return h("div", { className: "mode" }, name, frequency, h("div", {}, track, slider), value, play);
     }
 }

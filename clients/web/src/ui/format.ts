@@ -24,6 +24,11 @@ export function newtons(value: number): string {
     return size >= 1e3 ? `${short(value / 1e3)} kN` : `${short(value)} N`;
 }
 
+export function frequency(hertz: number): string {
+    if (hertz >= 1e6) return `${short(hertz / 1e6)} MHz`;
+    return hertz >= 1e4 ? `${short(hertz / 1e3)} kHz` : `${short(hertz)} Hz`;
+}
+
 export function bytes(value: number): string {
     if (value < 1000) return `${Math.round(value)} B`;
     if (value < 1e6) return `${short(value / 1e3)} kB`;
