@@ -2,16 +2,18 @@
 //! device thread.
 
 mod colormap;
+mod jpeg;
 mod legend;
 mod png;
 mod rgb;
 
 pub use colormap::{apply_colormap, viridis};
+pub use jpeg::{JpegBuffers, JpegLayout};
 pub use legend::{Legend, draw as draw_legend, round_up_scale};
 pub use png::{EncodedStrip, PngLayout, StripBuffers};
 pub use rgb::drop_alpha;
 
-use modalcast_model::error::{Result, fault_in};
+use modalcast_model::error::Result;
 
 /// Converts an AOV of values to RGBA8 sRGB pixels with a legend. `word_bytes` contains native-endian u32 words with the
 /// layout of [`apply_colormap`], `samples` words per pixel. `size` is the width and height in pixels.
@@ -34,19 +36,14 @@ pub fn encode_png(width: u32, height: u32, rgba: &[u8]) -> Result<Vec<u8>> {
     png::encode(width, height, rgba)
 }
 
-/// Encodes RGBA8 sRGB pixels, top row first, as baseline JPEG without alpha. `quality` is 1 to 100. Below 90 the chroma
-/// has half the resolution in both directions.
+/// Encodes RGBA8 sRGB pixels, top row first, as baseline JPEG without alpha, on the calling thread. `quality` is 1 to 100.
+/// Below 90 the chroma has half the resolution in both directions. [`JpegLayout`] divides the work for several threads,
+/// with the same result.
 ///
 /// # Errors
-/// `Fault` when a side has more than 65,535 pixels or the encoder fails.
+/// `Fault` when a side is 0 or has more than 65,535 pixels, or `rgba` has too few pixels.
 pub fn encode_jpeg(width: u32, height: u32, rgba: &[u8], quality: u8) -> Result<Vec<u8>> {
-    let to_u16 = |side: u32| u16::try_from(side).map_err(fault_in("encode"));
-    let mut bytes = Vec::with_capacity(rgba.len() / 16);
-    let mut encoder = jpeg_encoder::Encoder::new(&mut bytes, quality);
-    encoder.set_chroma_subsampling_method(jpeg_encoder::ChromaSubsamplingMethod::Average);
-    let (width, height) = (to_u16(width)?, to_u16(height)?);
-    encoder.encode(rgba, width, height, jpeg_encoder::ColorType::Rgba).map_err(fault_in("encode"))?;
-    Ok(bytes)
+    jpeg::encode(width, height, rgba, quality)
 }
 
 #[cfg(test)]

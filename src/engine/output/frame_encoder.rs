@@ -1,5 +1,5 @@
 //! Encodes frames for the wire as PNG, JPEG or raw pixels. All streams share one encoder, which uses at most one thread
-//! per core. The strips of a PNG are encoded in parallel.
+//! per core. The strips of a PNG or JPEG are encoded in parallel.
 
 use std::num::NonZero;
 use std::sync::Arc;
@@ -9,10 +9,10 @@ use bytes::Bytes;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
 use super::encoder_pool::EncoderPool;
-use super::frame_format::FrameFormat;
+use super::frame_format::{FrameFormat, JpegQuality};
 use super::rendered_picture::{Pixels, RenderedPicture};
 use super::step_output::{OutputBody, StepFrames, StepId, StepOutput};
-use crate::frame::{self, EncodedStrip, PngLayout, StripBuffers};
+use crate::frame::{self, EncodedStrip, JpegBuffers, JpegLayout, PngLayout, StripBuffers};
 use crate::telemetry::{Stage, StageTimes};
 use modalcast_model::error::{Result, fault, fault_in};
 use modalcast_render::FrameInfo;
@@ -139,10 +139,7 @@ impl FrameEncoder {
         let (width, height) = (picture.width, picture.height);
         let (bytes, encode_ms) = match format {
             FrameFormat::Png => self.encode_png([width, height], rgba, &permit).await?,
-            FrameFormat::Jpeg(quality) => {
-                let encode = move || frame::encode_jpeg(width, height, &rgba, quality.get()).map(Bytes::from);
-                self.run(&permit, encode).await?
-            }
+            FrameFormat::Jpeg(quality) => self.encode_jpeg([width, height], quality, rgba, &permit).await?,
             FrameFormat::Rgb => self.run(&permit, move || Ok(frame::drop_alpha(&rgba).into())).await?,
             FrameFormat::Rgba => (rgba, 0.0),
             FrameFormat::F32 | FrameFormat::U32 | FrameFormat::F32x3 => {
@@ -174,16 +171,16 @@ impl FrameEncoder {
         permit: &Arc<OwnedSemaphorePermit>,
     ) -> Result<(Bytes, f64)> {
         let opaque = PngLayout::opaque(width, height)?;
-        let (file, ms) = self.encode_strips(opaque, rgba.clone(), permit).await?;
+        let (file, ms) = self.encode_png_strips(opaque, rgba.clone(), permit).await?;
         if let Some(file) = file {
             return Ok((file, ms));
         }
-        let (file, translucent_ms) = self.encode_strips(opaque.translucent()?, rgba, permit).await?;
+        let (file, translucent_ms) = self.encode_png_strips(opaque.translucent()?, rgba, permit).await?;
         Ok((file.ok_or_else(|| fault("encode", "expected a PNG with alpha"))?, ms + translucent_ms))
     }
 
     /// Encodes the strips of a picture. Returns `None` if a pixel is not opaque and the layout has no alpha channel.
-    async fn encode_strips(
+    async fn encode_png_strips(
         &self,
         layout: PngLayout,
         rgba: Bytes,
@@ -206,6 +203,29 @@ impl FrameEncoder {
             Ok(strips.map(|strips| Bytes::from(layout.assemble(&strips))))
         };
         let (file, ms) = self.pool.run(layout.strip_count(), encode_strip, assemble).await?;
+        Ok((file?, ms))
+    }
+
+    /// Encodes the strips of a picture in parallel.
+    async fn encode_jpeg(
+        &self,
+        [width, height]: [u32; 2],
+        quality: JpegQuality,
+        rgba: Bytes,
+        permit: &Arc<OwnedSemaphorePermit>,
+    ) -> Result<(Bytes, f64)> {
+        let layout = Arc::new(JpegLayout::new(width, height, quality.get())?);
+        let strip_layout = Arc::clone(&layout);
+        let encode_strip =
+            move |index: usize, buffers: &mut JpegBuffers| strip_layout.encode_strip(&rgba, index, buffers);
+        let permit = Arc::clone(permit);
+        let strip_count = layout.strip_count();
+        let assemble = move |strips: Vec<Result<Vec<u8>>>| {
+            let _permit = permit;
+            let strips: Vec<Vec<u8>> = strips.into_iter().collect::<Result<_>>()?;
+            Ok(Bytes::from(layout.assemble(&strips)))
+        };
+        let (file, ms) = self.pool.run(strip_count, encode_strip, assemble).await?;
         Ok((file?, ms))
     }
 
@@ -301,6 +321,20 @@ pub(in crate::engine) mod tests {
             shared.bytes.as_ptr(),
             "control: expected separate bytes for another frame"
         );
+    }
+
+    #[tokio::test]
+    async fn all_threads_write_the_files_of_one_thread() {
+        let encoder = encoder(3);
+        let output = noise_frame(5, 300);
+        let encode = async |format| {
+            encoder.encode(first_picture(&output), format).await.expect("expected an encoded frame").output.bytes
+        };
+        let rgba = encode(FrameFormat::Rgba).await;
+        let quality = JpegQuality::parse("quality", 70).expect("expected a quality");
+        let jpeg = frame::encode_jpeg(300, 300, &rgba, 70).expect("expected a JPEG");
+        let png = frame::encode_png(300, 300, &rgba).expect("expected a PNG");
+        assert!(encode(FrameFormat::Jpeg(quality)).await == jpeg && encode(FrameFormat::Png).await == png);
     }
 
     #[tokio::test]

@@ -4,7 +4,7 @@ use std::cell::RefCell;
 use std::num::NonZero;
 use std::time::Instant;
 
-use modalcast::frame::{self, EncodedStrip, PngLayout, StripBuffers};
+use modalcast::frame::{self, EncodedStrip, JpegBuffers, JpegLayout, PngLayout, StripBuffers};
 use modalcast_client::FrameRequest;
 use modalcast_compute::gpu::launch::DeviceBuffer;
 use modalcast_compute::gpu::{Device, DevicePicture, EncodedPng, PngChannels, PngEncoder};
@@ -53,6 +53,8 @@ enum Encoder {
     ServerJpeg(u8),
     /// The crate `png`.
     Png(png::Filter, png::Compression),
+    /// The crate `jpeg-encoder`, with a quality.
+    Jpeg(u8),
 }
 
 impl Encoder {
@@ -61,6 +63,7 @@ impl Encoder {
             Self::ServerPng => "PNG of the server".into(),
             Self::ServerJpeg(quality) => format!("JPEG of quality {quality}"),
             Self::Png(filter, level) => format!("PNG {filter:?} {level:?}"),
+            Self::Jpeg(quality) => format!("JPEG of quality {quality} by the crate `jpeg-encoder`"),
         }
     }
 
@@ -69,6 +72,7 @@ impl Encoder {
             Self::ServerPng => frame::encode_png(pixels.width, pixels.height, &pixels.rgba),
             Self::ServerJpeg(quality) => frame::encode_jpeg(pixels.width, pixels.height, &pixels.rgba, quality),
             Self::Png(filter, level) => encode_png(pixels, filter, level),
+            Self::Jpeg(quality) => encode_jpeg(pixels, quality),
         }
     }
 
@@ -105,7 +109,7 @@ async fn draw(session: &Session, content: Content) -> Result<Pixels> {
     Ok(Pixels { width: frame.width, height: frame.height, rgba: frame.bytes.to_vec(), rgb })
 }
 
-/// The server's encoders; then the crate `png` with all filters at one compression level, and all levels with one
+/// The server's encoders; then the crate `jpeg-encoder`, and the crate `png` with all filters at one compression level, and all levels with one
 /// filter.
 fn encoders() -> Vec<Encoder> {
     use png::{Compression, Filter};
@@ -114,17 +118,34 @@ fn encoders() -> Vec<Encoder> {
     let with_filters = filters.into_iter().map(|filter| (filter, Compression::Fast));
     let with_levels = levels.into_iter().map(|level| (Filter::Sub, level));
     let png = |(filter, level)| Encoder::Png(filter, level);
-    let jpegs = [50, 75, 90, 100].map(Encoder::ServerJpeg);
+    let jpegs = [50, 75, 90, 100].map(Encoder::ServerJpeg).into_iter().chain([75, 90].map(Encoder::Jpeg));
     std::iter::once(Encoder::ServerPng).chain(jpegs).chain(with_filters.chain(with_levels).map(png)).collect()
 }
 
 /// The PNG of the server, whose strips are encoded on all threads.
-fn encode_on_all_threads(pixels: &Pixels) -> Result<Vec<u8>> {
+fn encode_png_on_all_threads(pixels: &Pixels) -> Result<Vec<u8>> {
     let layout = PngLayout::opaque(pixels.width, pixels.height)?;
     let encode_strip = |buffers: &mut StripBuffers, index| layout.encode_strip(&pixels.rgba, index, buffers);
     let strips = (0..layout.strip_count()).into_par_iter().map_init(StripBuffers::default, encode_strip);
     let strips: Option<Vec<EncodedStrip>> = strips.collect::<Result<Vec<_>>>()?.into_iter().collect();
     Ok(layout.assemble(&strips.ok_or_else(|| fault("report", "expected an opaque picture"))?))
+}
+
+/// The JPEG of the server, whose strips are encoded on all threads.
+fn encode_jpeg_on_all_threads(pixels: &Pixels, quality: u8) -> Result<Vec<u8>> {
+    let layout = JpegLayout::new(pixels.width, pixels.height, quality)?;
+    let encode_strip = |buffers: &mut JpegBuffers, index| layout.encode_strip(&pixels.rgba, index, buffers);
+    let strips = (0..layout.strip_count()).into_par_iter().map_init(JpegBuffers::default, encode_strip);
+    Ok(layout.assemble(&strips.collect::<Result<Vec<_>>>()?))
+}
+
+fn encode_jpeg(pixels: &Pixels, quality: u8) -> Result<Vec<u8>> {
+    let mut bytes = Vec::new();
+    let mut encoder = jpeg_encoder::Encoder::new(&mut bytes, quality);
+    encoder.set_chroma_subsampling_method(jpeg_encoder::ChromaSubsamplingMethod::Average);
+    let [width, height] = [pixels.width as u16, pixels.height as u16];
+    encoder.encode(&pixels.rgba, width, height, jpeg_encoder::ColorType::Rgba).map_err(fault_in("report"))?;
+    Ok(bytes)
 }
 
 fn encode_png(pixels: &Pixels, filter: png::Filter, level: png::Compression) -> Result<Vec<u8>> {
@@ -145,8 +166,11 @@ fn encode_png(pixels: &Pixels, filter: png::Filter, level: png::Compression) -> 
 fn measure_encoder(encoder: Encoder, pixels: &Pixels, repetitions: usize) -> Result<PictureEncodingRow> {
     let (bytes, ms) = time_median(repetitions, || encoder.encode(pixels))?;
     let all_threads_ms = match encoder {
-        Encoder::ServerPng => Some(time_median(repetitions, || encode_on_all_threads(pixels))?.1),
-        Encoder::ServerJpeg(_) | Encoder::Png(..) => None,
+        Encoder::ServerPng => Some(time_median(repetitions, || encode_png_on_all_threads(pixels))?.1),
+        Encoder::ServerJpeg(quality) => {
+            Some(time_median(repetitions, || encode_jpeg_on_all_threads(pixels, quality))?.1)
+        }
+        Encoder::Png(..) | Encoder::Jpeg(_) => None,
     };
     let [largest_error, rms_error] = decoding_errors(&bytes, &pixels.rgb)?;
     Ok(PictureEncodingRow {
@@ -231,10 +255,11 @@ mod tests {
             .collect();
         let (pngs, jpegs): (Vec<_>, Vec<_>) = rows.iter().partition(|row| row.encoder.starts_with("PNG"));
         assert!(pngs.iter().all(|row| (row.largest_error, row.rms_error) == (0.0, 0.0) && row.bytes > 100), "{rows:?}");
-        assert!(jpegs.len() > 2 && jpegs.iter().all(|row| row.is_used_by_server && row.rms_error > 0.0), "{rows:?}");
+        assert!(jpegs.len() > 2 && jpegs.iter().all(|row| row.rms_error > 0.0), "{rows:?}");
         let used: Vec<&str> = pngs.iter().filter(|row| row.is_used_by_server).map(|row| row.encoder.as_str()).collect();
         assert_eq!(used, ["PNG of the server"]);
-        assert_eq!(rows.iter().filter(|row| row.all_threads_ms.is_some()).count(), 1);
+        assert_eq!(jpegs.iter().filter(|row| row.is_used_by_server).count(), 4, "{rows:?}");
+        assert!(rows.iter().all(|row| row.all_threads_ms.is_some() == row.is_used_by_server), "{rows:?}");
     }
 
     #[test]
@@ -248,7 +273,9 @@ mod tests {
     #[test]
     fn all_threads_write_the_same_file() {
         let file = Encoder::ServerPng.encode(&pixels()).expect("expected a PNG");
-        assert_eq!(encode_on_all_threads(&pixels()).expect("expected a PNG"), file);
+        assert_eq!(encode_png_on_all_threads(&pixels()).expect("expected a PNG"), file);
+        let file = Encoder::ServerJpeg(90).encode(&pixels()).expect("expected a JPEG");
+        assert_eq!(encode_jpeg_on_all_threads(&pixels(), 90).expect("expected a JPEG"), file);
     }
 
     #[test]
