@@ -9,7 +9,7 @@ use modalcast::config::{BackendChoice, Config};
 use modalcast::engine::DeviceContext;
 use modalcast_compute::cpu::CpuDeformer;
 use modalcast_compute::gpu::{CudaDeformer, CudaDeformerOptions, CudaPictureMemory, CudaRasterizer, Device};
-use modalcast_model::backend_settings::{BackendSettings, RasterPolicy};
+use modalcast_model::backend_settings::{BackendSettings, RasterFacts, RasterPolicy};
 use modalcast_model::deform::Deformer as _;
 use modalcast_model::raster::{RasterGeometry, Rasterizer};
 use modalcast_model::scene::{
@@ -483,6 +483,49 @@ fn gpu_resized_cuda_frames_equal_a_fresh_renderer() {
         assert!(resized_frame == draw(&mut context, &mut loaded_scene, size), "{size:?}");
         context.unload_scene(loaded_scene);
     }
+}
+
+/// By default CUDA draws the shadow map of the built-in tree on the GPUs where it is faster, and OpenGL that of a small
+/// scene. The pictures are nearly equal: 0.003 levels in the mean on an H200.
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_default_rasterizer_follows_the_rule_and_keeps_the_picture() {
+    let capability = Device::open(0).expect("expected a CUDA device").capability();
+    let mut context = open_device();
+    let mut draw = |scene: &Arc<Scene>, raster: RasterPolicy, lowering: f32| {
+        let settings = BackendSettings { raster, ..BackendSettings::default() };
+        let mut loaded_scene = context.load_scene(scene, settings).expect("expected the scene to load");
+        let mut state = SceneState::rest(scene);
+        state.transforms.iter_mut().for_each(|transform| transform.0[7] -= lowering);
+        loaded_scene.deform(&state).expect("expected the step to succeed");
+        let camera = Camera::fit_to_scene(scene, 1920, 1080);
+        let image = context.draw(&mut loaded_scene, &camera, FrameSize::new(1920, 1080)).expect("expected a frame");
+        context.unload_scene(loaded_scene);
+        image
+    };
+    // Mean of the channels, and fraction of the pixels with a difference of more than 8 levels.
+    let differences = |left: &FrameImage, right: &FrameImage| {
+        let sum: u64 = left.rgba.iter().zip(right.rgba.iter()).map(|(a, b)| u64::from(a.abs_diff(*b))).sum();
+        let pixels = left.rgba.chunks_exact(4).zip(right.rgba.chunks_exact(4));
+        let large = pixels.filter(|(left, right)| left.iter().zip(*right).any(|(a, b)| a.abs_diff(*b) > 8)).count();
+        let pixel_count = left.rgba.len() as f64 / 4.0;
+        (sum as f64 / (3.0 * pixel_count), large as f64 / pixel_count)
+    };
+    let tree = modalcast_model::load::open("tree").expect("expected the built-in scene").scene;
+    let default = draw(&tree, BackendSettings::default().raster, 0.0);
+    let opengl = draw(&tree, RasterPolicy::OpenGl, 0.0);
+    let is_cuda_faster = RasterFacts::new(capability, &tree).is_cuda_faster();
+    let shadow = if is_cuda_faster { RasterBackend::Cuda } else { RasterBackend::OpenGl };
+    let expected = RasterBackends { shadow: Some(shadow), ..OPENGL_BACKENDS };
+    assert_eq!((default.info.raster_backends, opengl.info.raster_backends), (expected, OPENGL_BACKENDS));
+    let (mean, large) = differences(&default, &opengl);
+    eprintln!("{capability:?}: {mean} levels in the mean, {large} of the pixels by more than 8 levels");
+    assert!(mean < 0.01 && large < 1e-4, "{mean} {large}");
+    let (moved_mean, _) = differences(&default, &draw(&tree, RasterPolicy::OpenGl, 0.02));
+    assert!(moved_mean > 0.05, "negative control: a moved tree differs by {moved_mean}");
+    let options = scenes::RandomSceneOptions { instances: 3, normal_maps: false, rigid_transforms: false };
+    let small = scenes::random_scene(&[(300, 4)], options);
+    assert_eq!(draw(&small, RasterPolicy::Auto, 0.0).info.raster_backends, OPENGL_BACKENDS);
 }
 
 /// `RasterPolicy::Fastest` measures both rasterizers and uses the faster one.

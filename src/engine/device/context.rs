@@ -14,7 +14,7 @@ use crate::telemetry::ms_since;
 use modalcast_compute::cpu::CpuDeformer;
 use modalcast_compute::gpu::{self, CudaDeformer, CudaDeformerOptions, CudaPictureMemory, CudaRasterizer};
 use modalcast_compute::reference::ReferenceDeformer;
-use modalcast_model::backend_settings::{BackendSettings, BatchPolicy, RasterPolicy};
+use modalcast_model::backend_settings::{BackendSettings, BatchPolicy, RasterFacts, RasterPolicy};
 use modalcast_model::deform::{Backend, Deformer};
 use modalcast_model::error::{Error, Result, fault};
 use modalcast_model::fault_injection;
@@ -300,7 +300,7 @@ impl DeviceContext {
         }
     }
 
-    /// Creates the compute (CUDA) rasterizer of a scene unless `policy` is OpenGL. For [`RasterPolicy::Fastest`] also
+    /// Creates the compute (CUDA) rasterizer of a scene if `policy` selects it. For [`RasterPolicy::Fastest`] also
     /// measures both rasterizers and selects the faster one for each pass. If the compute rasterizer cannot be created,
     /// logs the reason and leaves all passes to OpenGL.
     ///
@@ -308,12 +308,23 @@ impl DeviceContext {
     /// `DeviceLost`; the errors of drawing the measured frames.
     fn attach_rasterizer(&mut self, loaded_scene: &mut LoadedScene, policy: RasterPolicy) -> Result<()> {
         let (Some(device), Ok(renderer)) = (&self.cuda_device, &mut self.renderer) else { return Ok(()) };
-        if policy == RasterPolicy::OpenGl || renderer.info().cuda_device.is_none() {
+        let is_selected = match policy {
+            RasterPolicy::OpenGl => false,
+            RasterPolicy::Auto => RasterFacts::new(device.capability(), loaded_scene.scene()).is_cuda_faster(),
+            RasterPolicy::Cuda | RasterPolicy::Fastest => true,
+        };
+        if !is_selected || renderer.info().cuda_device.is_none() {
             return Ok(());
         }
         let create_rasterizer =
             |geometry: RasterGeometry| Ok(Box::new(CudaRasterizer::new(device, geometry)?) as Box<dyn Rasterizer>);
-        match loaded_scene.attach_rasterizer(renderer, create_rasterizer) {
+        let attached = match policy {
+            RasterPolicy::Auto => loaded_scene.attach_shadow_rasterizer(renderer, create_rasterizer),
+            RasterPolicy::OpenGl | RasterPolicy::Cuda | RasterPolicy::Fastest => {
+                loaded_scene.attach_rasterizer(renderer, create_rasterizer)
+            }
+        };
+        match attached {
             Ok(()) => {}
             Err(error) if error.is_loss() => return Err(error),
             Err(error) => {

@@ -317,6 +317,17 @@ impl LoadedScene {
         renderer.attach_rasterizer(buffers, create_rasterizer)
     }
 
+    /// [`Self::attach_rasterizer`], but the compute rasterizer draws the shadow map only.
+    pub(in crate::engine) fn attach_shadow_rasterizer(
+        &mut self,
+        renderer: &mut Renderer,
+        create_rasterizer: impl FnOnce(RasterGeometry) -> Result<Box<dyn Rasterizer>>,
+    ) -> Result<()> {
+        self.fill_without_rebase(renderer)?;
+        let Some(buffers) = &mut self.buffers else { return Err(no_buffers_error()) };
+        renderer.attach_shadow_rasterizer(buffers, create_rasterizer)
+    }
+
     /// Measures both rasterizers with steps of the current state and frames of [`BENCHMARK_SIZE`], and selects the
     /// faster one for each pass.
     pub(in crate::engine) fn select_raster_backends(&mut self, renderer: &mut Renderer) -> Result<()> {

@@ -34,6 +34,7 @@ use crate::passes::aov::{Aov, AovImage, AovReader, PartialAov};
 use crate::passes::picking::{PendingPick, PickHit, Picker};
 use crate::passes::{PassRecorder, readback};
 use crate::region::BandLimit;
+use crate::resources::compute_rasterizer::RasterPasses;
 use crate::resources::programs::ProgramCache;
 use crate::resources::scene_buffers::{RebasedPositions, SceneBuffers, VertexValues, antialiasing};
 use crate::resources::target::RenderTarget;
@@ -328,9 +329,30 @@ impl Renderer {
         buffers: &mut SceneBuffers,
         create_rasterizer: impl FnOnce(RasterGeometry) -> Result<Box<dyn Rasterizer>>,
     ) -> Result<()> {
+        self.attach_rasterizer_for(RasterPasses::ALL, buffers, create_rasterizer)
+    }
+
+    /// [`Self::attach_rasterizer`], but the compute rasterizer draws the shadow map only.
+    ///
+    /// # Errors
+    /// As [`Self::attach_rasterizer`].
+    pub fn attach_shadow_rasterizer(
+        &mut self,
+        buffers: &mut SceneBuffers,
+        create_rasterizer: impl FnOnce(RasterGeometry) -> Result<Box<dyn Rasterizer>>,
+    ) -> Result<()> {
+        self.attach_rasterizer_for(RasterPasses::SHADOW, buffers, create_rasterizer)
+    }
+
+    fn attach_rasterizer_for(
+        &mut self,
+        passes: RasterPasses,
+        buffers: &mut SceneBuffers,
+        create_rasterizer: impl FnOnce(RasterGeometry) -> Result<Box<dyn Rasterizer>>,
+    ) -> Result<()> {
         let _current = self.gl.make_current()?;
         let compile = &mut |source| self.programs.program(source);
-        buffers.attach_rasterizer(&self.gl, &self.target_budget, compile, create_rasterizer)
+        buffers.attach_rasterizer(&self.gl, &self.target_budget, compile, passes, create_rasterizer)
     }
 
     /// Begins a pick in a rectangle of the frame that `params` describes, without waiting for the device.

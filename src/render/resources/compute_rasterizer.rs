@@ -78,6 +78,8 @@ struct CountedBuffer {
 
 impl RasterPasses {
     pub(crate) const NONE: Self = Self { shadow: false, visibility: false };
+    pub(crate) const SHADOW: Self = Self { shadow: true, visibility: false };
+    pub(crate) const ALL: Self = Self { shadow: true, visibility: true };
 
     /// The passes of a scene that a compute rasterizer may draw. The shadow pass needs moments and only one cascade.
     /// The visibility pass needs one sample per pixel and no blended triangles, because no depth image is written.
@@ -89,6 +91,11 @@ impl RasterPasses {
             shadow: has_triangles && is_shadow_supported,
             visibility: has_triangles && look.samples_per_pixel() == 1 && !scene.features.blend,
         }
+    }
+
+    /// The passes of both.
+    pub(crate) const fn intersection(self, other: Self) -> Self {
+        Self { shadow: self.shadow && other.shadow, visibility: self.visibility && other.visibility }
     }
 
     /// Whether any pass is selected.

@@ -401,7 +401,7 @@ impl SceneBuffers {
             .map(|array| (array, &cull_resources.buffers.draws))
     }
 
-    /// Attaches a compute rasterizer, which draws all passes that it supports. `budget` limits the memory of its
+    /// Attaches a compute rasterizer, which draws those of `passes` that it supports. `budget` limits the memory of its
     /// output. Does nothing for a scene without such passes.
     ///
     /// # Errors
@@ -412,9 +412,10 @@ impl SceneBuffers {
         gl: &Rc<Gl>,
         budget: &Arc<MemoryBudget>,
         compile: &mut ProgramCompiler<'_>,
+        passes: RasterPasses,
         create_rasterizer: impl FnOnce(RasterGeometry) -> Result<Box<dyn Rasterizer>>,
     ) -> Result<()> {
-        let supported = RasterPasses::supported(&self.scene);
+        let supported = RasterPasses::supported(&self.scene).intersection(passes);
         if !supported.has_any() {
             return Ok(());
         }

@@ -132,11 +132,12 @@ impl LookKeys {
     /// The keys that no preset changes.
     fn overrides(&self) -> LookOverrides {
         let method = self.shadow.and_then(|keys| keys.method);
+        let requires_cuda = matches!(self.raster, RasterPolicy::Cuda | RasterPolicy::Fastest);
         LookOverrides {
             antialias: self.antialias,
             samples: self.samples,
             // The compute rasterizer draws the depth of variance maps only, so it implies the method.
-            shadow_method: method.or((self.raster != RasterPolicy::OpenGl).then_some(ShadowMethod::Variance)),
+            shadow_method: method.or(requires_cuda.then_some(ShadowMethod::Variance)),
             shadow_size: self.shadow.and_then(|keys| keys.size),
             shadow_blur: self.shadow.and_then(|keys| keys.blur),
         }

@@ -299,6 +299,7 @@ fn look_is_a_preset_or_a_table_with_overrides() {
     let named = "look = { raster = 'cuda', shadow.method = 'filtered' }";
     let methods = [method("look.raster = 'cuda'"), method(named), method("look.raster = 'opengl'")];
     assert_eq!(methods, [Some(ShadowMethod::Variance), Some(ShadowMethod::PercentageCloser), None]);
+    assert_eq!([method(""), method("look.raster = 'auto'")], [None, None]);
     for (look, expected) in [
         ("look = 'fast'", "unknown variant `fast`, expected one of `preview`, `standard`, `best`"),
         ("look = 3", "the name of a preset, or a table"),

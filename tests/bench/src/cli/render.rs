@@ -7,6 +7,7 @@ use crate::render::{self, RenderProgress, RenderReport, RenderReportOptions, var
 use crate::thesis::PLANTS;
 use modalcast::cli::options::with_spinner;
 use modalcast::cli::{Completion, Outcome, print_line};
+use modalcast_model::backend_settings::RasterFacts;
 use modalcast_model::error::{Result, invalid};
 use modalcast_model::scene::FrameSize;
 
@@ -278,6 +279,7 @@ fn report_lines(report: &RenderReport) -> Vec<String> {
         }));
     }
     lines.extend(report.raster.iter().map(render::RasterComparison::line));
+    lines.push(format!("rasterizer by default: {}", RasterFacts::rule()));
     lines.extend(report.failed.iter().map(|failed| format!("failed: {failed}")));
     lines.extend(report.default_shadow.iter().flat_map(render::DefaultShadow::lines));
     lines

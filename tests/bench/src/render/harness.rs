@@ -9,7 +9,7 @@ use crate::timing::{MIN_REPETITIONS, Timing};
 use modalcast::engine::share_pictures;
 use modalcast_compute::cpu::CpuDeformer;
 use modalcast_compute::gpu::{CudaRasterizer, Device};
-use modalcast_model::backend_settings::RasterPolicy;
+use modalcast_model::backend_settings::{RasterFacts, RasterPolicy};
 use modalcast_model::deform::{DeformedSurface, Deformer};
 use modalcast_model::error::{Result, fault};
 use modalcast_model::raster::{RasterGeometry, Rasterizer};
@@ -99,6 +99,13 @@ impl RenderHarness {
         size: Size,
     ) -> Result<()> {
         let Some(device) = cuda_device().filter(|_| policy != RasterPolicy::OpenGl) else { return Ok(()) };
+        if policy == RasterPolicy::Auto {
+            if !RasterFacts::new(device.capability(), &loaded_scene.scene).is_cuda_faster() {
+                return Ok(());
+            }
+            let create = |mesh| Ok(Box::new(CudaRasterizer::new(&device, mesh)?) as Box<dyn Rasterizer>);
+            return self.renderer.attach_shadow_rasterizer(&mut loaded_scene.buffers, create);
+        }
         self.attach_rasterizer(loaded_scene, &device)?;
         if policy == RasterPolicy::Fastest {
             let frame_params = loaded_scene.frame_params(camera, size);
