@@ -56,10 +56,9 @@ impl Grid {
         const GAUSS: f64 = 0.577_350_269_189_625_8;
         /// Parts that are shorter, in sub-cells, are merged with their neighbor.
         const MIN_PART: f64 = 1e-6;
-        for axis in 0..3 {
+        for (axis, breaks) in breaks.iter().enumerate() {
             let scale = SUBDIVISIONS as f64 / self.cell_size;
-            let mut inner: Vec<f64> =
-                breaks[axis].iter().map(|position| (position - self.origin[axis]) * scale).collect();
+            let mut inner: Vec<f64> = breaks.iter().map(|position| (position - self.origin[axis]) * scale).collect();
             inner.sort_by(f64::total_cmp);
             let (mut lines, mut first_lines) = (Vec::new(), Vec::new());
             for sub_cell in 0..self.cells[axis] * SUBDIVISIONS {
