@@ -1,7 +1,6 @@
 //! The body: its surface, materials and clamps, and its division into cells.
 
 use std::collections::BTreeMap;
-use std::sync::Arc;
 
 use modalcast_model::error::{Result, invalid};
 use nalgebra::Vector3;
@@ -10,6 +9,7 @@ use crate::cell_moments::{GroupMoments, integrate};
 use crate::cell_pieces::CellPieces;
 use crate::constraints::{HeldPoint, points_on_groups, remove_regions};
 use crate::grid::Grid;
+use crate::inside_test::InsideTest;
 use crate::material_rays::{RaySegment, trace_rays};
 use crate::materials::Material;
 use crate::parameters::ModelingParameters;
@@ -29,7 +29,7 @@ const MAX_GRID_CELLS: f64 = 4e6;
 /// The input of all grids.
 #[derive(Debug)]
 pub struct Body {
-    pub surface: Arc<Surface>,
+    pub surface: Surface,
     /// The material of each group.
     pub materials: Vec<Material>,
     /// Held regions.
@@ -82,8 +82,7 @@ impl Body {
         if let Some(thickness) = parameters.thickness {
             surface = thicken(&surface, thickness * unit);
         }
-        let surface = Arc::new(surface);
-        let winding = (!surface.is_closed).then(|| WindingNumber::new(surface.clone()));
+        let winding = (!surface.is_closed).then(|| WindingNumber::new(&surface));
         let regions: Vec<Region> =
             parameters.clamps.iter().map(|text| Region::parse(text, &file.groups)).collect::<Result<_>>()?;
         let mut breaks = aligned_faces(&surface);
@@ -234,7 +233,8 @@ impl Body {
 
     /// The material along the rays of the three axes.
     fn trace(&self, grid: &Grid) -> [Vec<RaySegment>; 3] {
-        [0, 1, 2].map(|axis| trace_rays(&self.surface, grid, axis, self.winding.as_ref()))
+        let inside = self.winding.as_ref().map(|winding| InsideTest::new(grid, winding));
+        [0, 1, 2].map(|axis| trace_rays(&self.surface, grid, axis, inside.as_ref()))
     }
 }
 

@@ -4,8 +4,8 @@ use nalgebra::Vector3;
 use rayon::prelude::*;
 
 use crate::grid::{Grid, RayLine, cross_axes};
+use crate::inside_test::InsideTest;
 use crate::surface::Surface;
-use crate::winding_number::WindingNumber;
 
 /// A part of a ray inside material. Positions are in units of cells, relative to the origin of the grid.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -30,9 +30,8 @@ struct Crossing {
 /// Finds the material along all rays of an axis. Segments are sorted by ray and position.
 ///
 /// A point inside a closed surface is one with a winding number other than 0, so that shells may overlap and may contain
-/// cavities. `winding` is given for surfaces with holes; a point is then inside if its generalized winding number is
-/// above 1/2 in magnitude.
-pub fn trace_rays(surface: &Surface, grid: &Grid, axis: usize, winding: Option<&WindingNumber>) -> Vec<RaySegment> {
+/// cavities. `inside` is given for surfaces with holes.
+pub fn trace_rays(surface: &Surface, grid: &Grid, axis: usize, inside: Option<&InsideTest<'_>>) -> Vec<RaySegment> {
     let [u, v] = cross_axes(axis);
     let positions: Vec<Vector3<f64>> = surface.positions.iter().map(|point| grid.to_cell_units(*point)).collect();
     // The triangles that touch each layer of cells across the first axis.
@@ -67,13 +66,10 @@ pub fn trace_rays(surface: &Surface, grid: &Grid, axis: usize, winding: Option<&
         for (index, crossings) in crossings.iter_mut().enumerate() {
             let ray = [(first_line + index / lines_across.len()) as u32, (index % lines_across.len()) as u32];
             crossings.sort_by(|a, b| a.position.total_cmp(&b.position).then(b.sign.cmp(&a.sign)));
-            match winding {
+            match inside {
                 None => add_closed_segments(ray, crossings, &mut segments),
-                Some(winding) => {
-                    let inside = |position: f64| {
-                        let point = grid.origin + grid.point_on_ray(axis, ray, position) * grid.cell_size;
-                        winding.at(point).abs() > 0.5
-                    };
+                Some(test) => {
+                    let inside = |position: f64| test.contains(grid.point_on_ray(axis, ray, position));
                     add_open_segments(ray, crossings, grid.cells[axis], inside, &mut segments);
                 }
             }
@@ -231,6 +227,7 @@ fn lines_in(lines: &[RayLine], [low, high]: [f64; 2]) -> std::ops::Range<usize> 
 mod tests {
     use super::*;
     use crate::surface::tests::box_surface;
+    use crate::winding_number::WindingNumber;
     use crate::winding_number::tests::ellipsoid;
 
     fn volume(grid: &Grid, axis: usize, segments: &[RaySegment]) -> f64 {
@@ -274,8 +271,9 @@ mod tests {
         let grid = Grid::covering(low, high, 0.1);
         for axis in 0..3 {
             let expected = volume(&grid, axis, &trace_rays(&closed, &grid, axis, None));
-            let winding = WindingNumber::new(std::sync::Arc::new(open.clone()));
-            let with_holes = volume(&grid, axis, &trace_rays(&open, &grid, axis, Some(&winding)));
+            let winding = WindingNumber::new(&open);
+            let with_holes =
+                volume(&grid, axis, &trace_rays(&open, &grid, axis, Some(&InsideTest::new(&grid, &winding))));
             assert!((with_holes / expected - 1.0).abs() < 0.01, "axis {axis}: {with_holes} instead of {expected}");
             let exact = 4.0 / 3.0 * std::f64::consts::PI * 0.5 * 0.35 * 0.2 / 1e-3;
             assert!((expected / exact - 1.0).abs() < 0.01, "axis {axis}: {expected} instead of {exact}");

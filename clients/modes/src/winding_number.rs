@@ -3,7 +3,6 @@
 //! "Fast winding numbers for soups and clouds").
 
 use std::f64::consts::PI;
-use std::sync::Arc;
 
 use nalgebra::Vector3;
 
@@ -17,7 +16,8 @@ const DISTANCE_FACTOR: f64 = 2.5;
 /// The tree of a surface.
 #[derive(Debug)]
 pub struct WindingNumber {
-    surface: Arc<Surface>,
+    /// Corners of triangles. Long triangles are divided, because compact ones are soon far away.
+    corners: Vec<[Vector3<f64>; 3]>,
     nodes: Vec<Node>,
     /// Triangles in the order of the leaves.
     triangles: Vec<u32>,
@@ -40,13 +40,38 @@ struct Node {
 
 impl WindingNumber {
     /// Builds the tree.
-    pub fn new(surface: Arc<Surface>) -> Self {
-        let count = surface.triangles.len();
-        let mut tree = Self { surface, nodes: Vec::new(), triangles: (0..count as u32).collect() };
+    pub fn new(surface: &Surface) -> Self {
+        /// The longest edge, as a share of the diagonal of the bounding box.
+        const MAX_EDGE: f64 = 1.0 / 64.0;
+        let (low, high) = surface.bounds();
+        let max_length = MAX_EDGE * (high - low).norm();
+        let mut corners = Vec::new();
+        for triangle in 0..surface.triangles.len() {
+            let mut remaining = vec![surface.corners(triangle)];
+            while let Some([a, b, c]) = remaining.pop() {
+                let [ab, bc, ca] = [(b - a).norm(), (c - b).norm(), (a - c).norm()];
+                if ab.max(bc).max(ca) <= max_length {
+                    corners.push([a, b, c]);
+                } else if bc >= ab && bc >= ca {
+                    let middle = (b + c) / 2.0;
+                    remaining.extend([[a, b, middle], [a, middle, c]]);
+                } else {
+                    // The longest edge becomes the second one.
+                    remaining.push(if ab >= ca { [c, a, b] } else { [b, c, a] });
+                }
+            }
+        }
+        let count = corners.len();
+        let mut tree = Self { corners, nodes: Vec::new(), triangles: (0..count as u32).collect() };
         if count > 0 {
             tree.add_node(0..count);
         }
         tree
+    }
+
+    /// The corners of the triangles that the tree contains: those of the surface, or parts of them.
+    pub fn triangle_corners(&self) -> &[[Vector3<f64>; 3]] {
+        &self.corners
     }
 
     /// The winding number at a point: 1 inside a closed surface, 0 outside.
@@ -71,7 +96,7 @@ impl WindingNumber {
 
     /// The signed solid angle of a triangle divided by 4 pi (Van Oosterom, Strackee 1983).
     fn solid_angle(&self, triangle: usize, point: Vector3<f64>) -> f64 {
-        let [a, b, c] = self.surface.corners(triangle).map(|corner| corner - point);
+        let [a, b, c] = self.corners[triangle].map(|corner| corner - point);
         let [length_a, length_b, length_c] = [a.norm(), b.norm(), c.norm()];
         let numerator = a.dot(&b.cross(&c));
         let denominator =
@@ -81,20 +106,23 @@ impl WindingNumber {
 
     /// Adds the node of a range of triangles and its descendants. Returns its index.
     fn add_node(&mut self, range: std::ops::Range<usize>) -> usize {
-        let surface = self.surface.clone();
-        let centroid = |triangle: u32| surface.corners(triangle as usize).iter().sum::<Vector3<f64>>() / 3.0;
-        let members = &mut self.triangles[range.clone()];
-        let areas = members.iter().map(|triangle| surface.area_vector(*triangle as usize));
+        let corners = &self.corners;
+        let centroid = |triangle: u32| corners[triangle as usize].iter().sum::<Vector3<f64>>() / 3.0;
+        let area_vector = |triangle: u32| {
+            let [a, b, c] = corners[triangle as usize];
+            (b - a).cross(&(c - a)) / 2.0
+        };
+        let members = &self.triangles[range.clone()];
+        let areas = members.iter().map(|triangle| area_vector(*triangle));
         let (dipole, area) =
             areas.fold((Vector3::zeros(), 0.0), |(sum, area), vector| (sum + vector, area + vector.norm()));
-        let weighted =
-            members.iter().map(|triangle| centroid(*triangle) * surface.area_vector(*triangle as usize).norm());
+        let weighted = members.iter().map(|triangle| centroid(*triangle) * area_vector(*triangle).norm());
         let center = match area > 0.0 {
             true => weighted.sum::<Vector3<f64>>() / area,
             false => centroid(members[0]),
         };
-        let corners = members.iter().flat_map(|triangle| surface.corners(*triangle as usize));
-        let radius = corners.map(|corner| (corner - center).norm()).fold(0.0, f64::max);
+        let all_corners = members.iter().flat_map(|triangle| corners[*triangle as usize]);
+        let radius = all_corners.map(|corner| (corner - center).norm()).fold(0.0, f64::max);
         let index = self.nodes.len();
         self.nodes.push(Node { center, radius, dipole, triangles: range.clone(), children: None });
         if range.len() > LEAF_TRIANGLES {
@@ -152,12 +180,11 @@ pub(crate) mod tests {
         let mut random = fastrand::Rng::with_seed(1);
         triangles.retain(|_| random.f64() > 0.05);
         let surface = Surface::new(&positions, &triangles, &vec![0; triangles.len()]);
-        let tree = WindingNumber::new(Arc::new(surface.clone()));
+        let tree = WindingNumber::new(&surface);
         for index in 0..200 {
             let point = Vector3::from_fn(|_, _| random.f64() - 0.5);
             let level = (point.x / 0.5).powi(2) + (point.y / 0.35).powi(2) + (point.z / 0.2).powi(2);
-            let direct: f64 =
-                (0..triangles.len().min(surface.triangles.len())).map(|i| tree.solid_angle(i, point)).sum();
+            let direct: f64 = (0..tree.corners.len()).map(|triangle| tree.solid_angle(triangle, point)).sum();
             let fast = tree.at(point);
             assert!((fast - direct).abs() < 0.05, "point {index}: tree {fast}, sum {direct}");
             if !(0.9..1.1).contains(&level) {

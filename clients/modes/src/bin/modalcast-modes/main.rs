@@ -31,6 +31,7 @@ const INTERRUPTED: u8 = 130;
 #[derive(Debug, Parser)]
 #[command(
     name = "modalcast model",
+    bin_name = "modalcast model",
     after_help = "Examples:
   modalcast model bracket.stl --unit mm --material steel --clamp 'z < 1' --out bracket.npz
   modalcast model fork.stl --material E=70e9,nu=0.33,rho=2700 --modes 30 --out fork.npz
