@@ -101,6 +101,12 @@ impl Body {
         (high - low).norm()
     }
 
+    /// The size of cells at which the search of a grid begins: eight cells along the longest side.
+    pub fn first_cell_size(&self) -> f64 {
+        let (low, high) = self.surface.bounds();
+        (high - low).max() / 8.0
+    }
+
     /// A point in units of cells in the coordinates of the file.
     pub fn to_file(&self, grid: &Grid, point: Vector3<f64>) -> Vector3<f64> {
         (grid.origin + point * grid.cell_size) / self.unit
@@ -142,16 +148,16 @@ impl Body {
         }
     }
 
-    /// The finest grid with at most `limit` freedoms. The search ends when it has at least 93 % of them.
+    /// The finest grid with at most `limit` freedoms. The search begins at the cell size `first`, in meters, and ends when
+    /// the grid has at least the share `enough` of the freedoms.
     ///
     /// # Errors
     /// `Invalid` if the coarsest grid has more freedoms, or clamps hold nothing or everything.
-    pub fn finest_layout(&self, limit: usize) -> Result<Layout> {
-        const ENOUGH: f64 = 0.93;
+    pub fn finest_layout(&self, limit: usize, first: f64, enough: f64) -> Result<Layout> {
         const MAX_TRIALS: usize = 12;
         let (low, high) = self.surface.bounds();
         let extent = high - low;
-        let mut cell_size = extent.max() / 8.0;
+        let mut cell_size = first;
         // Cell sizes with too many freedoms, and with few enough.
         let (mut too_fine, mut coarse_enough): (f64, f64) = (0.0, f64::INFINITY);
         let mut best: Option<Layout> = None;
@@ -170,7 +176,7 @@ impl Body {
             } else {
                 too_fine = too_fine.max(cell_size);
             }
-            if (ENOUGH..=1.0).contains(&ratio) || (ratio <= 1.0 && coarse_enough < 1.005 * too_fine) {
+            if (enough..=1.0).contains(&ratio) || (ratio <= 1.0 && coarse_enough < 1.005 * too_fine) {
                 break;
             }
             // Freedoms grow with the power -2 (plates) to -3 (solids) of the cell size.

@@ -10,6 +10,7 @@
 
 use std::collections::HashMap;
 
+use crate::disjoint_sets::DisjointSets;
 use crate::grid::{CELL_NODES, FORWARD_NEIGHBORS, Grid, NODES_PER_SIDE, SUBDIVISIONS, cross_axes};
 use crate::material_rays::RaySegment;
 
@@ -297,44 +298,6 @@ pub fn offset_cell(grid: &Grid, cell: [usize; 3], offset: [i8; 3]) -> Option<usi
     Some(grid.cell_index(neighbor))
 }
 
-/// Disjoint sets of indices (union-find), represented by their smallest members.
-struct DisjointSets(Vec<u32>);
-
-impl DisjointSets {
-    fn new(count: usize) -> Self {
-        Self((0..count as u32).collect())
-    }
-
-    fn find(&mut self, mut index: usize) -> usize {
-        while self.0[index] as usize != index {
-            self.0[index] = self.0[self.0[index] as usize];
-            index = self.0[index] as usize;
-        }
-        index
-    }
-
-    fn merge(&mut self, a: usize, b: usize) {
-        let [a, b] = [self.find(a), self.find(b)];
-        self.0[a.max(b)] = a.min(b) as u32;
-    }
-
-    /// The number of the set of each index, in the order of their first members, and the number of sets.
-    fn into_numbers(mut self) -> (Vec<u32>, usize) {
-        let mut count = 0;
-        for index in 0..self.0.len() {
-            // The smallest member of the set already has its number if it is not this index.
-            let root = self.0[index] as usize;
-            self.0[index] = if root == index {
-                count += 1;
-                count - 1
-            } else {
-                self.0[root]
-            };
-        }
-        (self.0, count as usize)
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use nalgebra::Vector3;
@@ -399,15 +362,6 @@ mod tests {
             let segments = [0, 1, 2].map(|axis| trace_rays(&surface, &grid, axis, None));
             assert_eq!(CellPieces::new(&grid, &segments).part_count, 1, "{angle}");
         }
-    }
-
-    #[test]
-    fn numbers_of_sets_ascend_with_their_first_members() {
-        let mut sets = DisjointSets::new(6);
-        sets.merge(4, 1);
-        sets.merge(5, 4);
-        sets.merge(2, 3);
-        assert_eq!(sets.into_numbers(), (vec![0, 1, 2, 2, 1, 1], 4 - 1));
     }
 
     #[test]

@@ -24,6 +24,7 @@ pub mod cell_matrices;
 pub mod cell_moments;
 pub mod cell_pieces;
 pub mod constraints;
+pub mod disjoint_sets;
 pub mod eigensolver;
 pub mod embedding;
 pub mod grid;

@@ -13,6 +13,7 @@ use crate::constraints::{SPRING_FACTOR, embed_held_points};
 use crate::eigensolver::{ElasticModes, find_elastic_modes};
 use crate::embedding::{EmbeddedPoint, embed};
 use crate::grid::{CELL_NODES, Grid};
+use crate::materials::Material;
 use crate::parameters::ModelingParameters;
 use crate::refinement::divide_long_edges;
 use crate::surface_file::{DrawnMesh, SurfaceFile};
@@ -66,7 +67,7 @@ const ASSUMED_ORDER: i32 = 3;
 pub fn compute_modes(file: &SurfaceFile, parameters: &ModelingParameters, progress: &Progress<'_>) -> Result<Modeling> {
     progress(0.0, "surface");
     let body = Body::new(file, parameters)?;
-    let layout = body.finest_layout(parameters.freedoms)?;
+    let layout = body.finest_layout(parameters.freedoms, body.first_cell_size(), 0.93)?;
     body.check_clamps(&layout.grid, &parameters.clamps)?;
     if layout.freedoms() < 2 * parameters.modes {
         let expected = format!("at most half of the {} freedoms", layout.freedoms());
@@ -259,7 +260,8 @@ fn estimate_errors(
 ) -> Vec<f64> {
     let limit = (layout.freedoms() as f64 * COARSE_FRACTION) as usize;
     let count = modes.eigenvalues.len();
-    let coarse = body.finest_layout(limit).and_then(|coarse| {
+    let first = layout.grid.cell_size * COARSE_FRACTION.powf(-0.38);
+    let coarse = body.finest_layout(limit, first, 0.75).and_then(|coarse| {
         let solution = solve(body, &coarse, parameters, count, progress)?;
         Ok((coarse.grid.cell_size / layout.grid.cell_size, solution.modes.eigenvalues))
     });
@@ -296,6 +298,17 @@ fn interpolate(body: &Body, layout: &Layout, file: &SurfaceFile, modes: &Elastic
     (mesh, rows.concat())
 }
 
+/// Adds remarks about constants in units of millimeters, which differ from those in meters by factors of 1e6 and 1e12.
+fn add_unit_remarks(material: &Material, remarks: &mut Vec<String>) {
+    let Material { youngs_modulus, density, .. } = material;
+    if *youngs_modulus < 0.9e6 && material.name == "custom" {
+        remarks.push(format!("E = {youngs_modulus:e} Pa is softer than rubber; a modulus in MPa (N/mm2) is E=...e6"));
+    }
+    if *density < 1.0 {
+        remarks.push(format!("rho = {density:e} kg/m3 is lighter than air; a density in t/mm3 is rho=...e12"));
+    }
+}
+
 /// Adds what the user should know.
 fn add_remarks(body: &Body, layout: &Layout, parameters: &ModelingParameters, modeling: &mut Modeling) {
     let remarks = &mut modeling.remarks;
@@ -312,6 +325,9 @@ fn add_remarks(body: &Body, layout: &Layout, parameters: &ModelingParameters, mo
     if !(1e-3..=100.0).contains(&diagonal) {
         let unit = parameters.unit.name;
         remarks.push(format!("the part measures {diagonal:.3e} m from corner to corner; is '{unit}' its --unit?"));
+    }
+    for material in &body.materials {
+        add_unit_remarks(material, remarks);
     }
     if modeling.rigid_modes > 0 {
         let parts = modeling.rigid_modes / 6;

@@ -1,5 +1,6 @@
 //! Reads the surface of a part from a model file, with the loaders of the server.
 
+use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
 
 use modalcast_model::domain::Material;
@@ -8,6 +9,8 @@ use modalcast_model::load;
 use modalcast_model::scene::{Scene, UpAxis};
 use nalgebra::Vector3;
 use sha2::{Digest as _, Sha256};
+
+use crate::disjoint_sets::DisjointSets;
 
 /// The mesh that is drawn, with the vertices and normals of the file. Positions are in meters, in the axes of the file.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -33,7 +36,8 @@ pub struct SurfaceFile {
     /// The axis of the file that points up: 1 for y, 2 for z.
     pub up_axis: usize,
     pub mesh: DrawnMesh,
-    /// Names of the groups: materials and objects of the file, then `shell N`.
+    /// Names of the groups: materials or objects of the file. A file with one group and several shells has the groups
+    /// `shell 1`, `shell 2` and so on, the largest one first.
     pub groups: Vec<String>,
     /// The remarks of the loader.
     pub remarks: Vec<String>,
@@ -59,6 +63,9 @@ pub fn read(path: &str, unit: f64) -> Result<SurfaceFile> {
     };
     for domain in 0..opened.domains.len() {
         add_domain(&opened, domain, unit * opened.unit, &mut file);
+    }
+    if file.groups.len() == 1 {
+        name_shells(&mut file);
     }
     if opened.materials.iter().any(|material| material.diffuse != Material::UNSPECIFIED_COLOR) {
         let to_srgb = |linear: f32| match linear {
@@ -94,7 +101,7 @@ fn add_domain(scene: &Scene, domain: usize, unit: f64, file: &mut SurfaceFile) {
         let rotated = normal_matrix * Vector3::from(normal).cast::<f64>();
         rotated.try_normalize(0.0).map_or(normal, |normal| normal.cast::<f32>().into())
     };
-    let mut group_of_material = std::collections::HashMap::new();
+    let mut group_of_material = HashMap::new();
     for (index, triangle) in shape.mesh.triangles().iter().enumerate() {
         mesh.triangles.push(triangle.map(|corner| first_vertex + corners.vertices[corner as usize]));
         mesh.corner_normals.push(triangle.map(|corner| rotate(corners.normals[corner as usize])));
@@ -114,6 +121,36 @@ fn add_domain(scene: &Scene, domain: usize, unit: f64, file: &mut SurfaceFile) {
         });
         mesh.triangle_groups.push(group);
     }
+}
+
+/// Makes each shell, a set of triangles that are connected by vertices, a group. A surface with more than
+/// [`MAX_SHELLS`] shells keeps its group: most of them are then loose triangles.
+fn name_shells(file: &mut SurfaceFile) {
+    const MAX_SHELLS: usize = 32;
+    let mesh = &mut file.mesh;
+    let mut first_at = HashMap::new();
+    let mut sets = DisjointSets::new(mesh.positions.len());
+    for (vertex, position) in mesh.positions.iter().enumerate() {
+        let key: [u64; 3] = [0, 1, 2].map(|axis| (position[axis] + 0.0).to_bits());
+        sets.merge(vertex, *first_at.entry(key).or_insert(vertex));
+    }
+    for [a, b, c] in &mesh.triangles {
+        sets.merge(*a as usize, *b as usize);
+        sets.merge(*b as usize, *c as usize);
+    }
+    let shells: Vec<usize> = mesh.triangles.iter().map(|[vertex, ..]| sets.find(*vertex as usize)).collect();
+    let mut sizes: BTreeMap<usize, usize> = BTreeMap::new();
+    for shell in &shells {
+        *sizes.entry(*shell).or_default() += 1;
+    }
+    if !(2..=MAX_SHELLS).contains(&sizes.len()) {
+        return;
+    }
+    let mut order: Vec<usize> = sizes.keys().copied().collect();
+    order.sort_by_key(|shell| std::cmp::Reverse(sizes[shell]));
+    let number_of: HashMap<usize, u32> = order.into_iter().zip(0..).collect();
+    file.groups = (1..=sizes.len()).map(|number| format!("shell {number}")).collect();
+    mesh.triangle_groups = shells.iter().map(|shell| number_of[shell]).collect();
 }
 
 #[cfg(test)]
@@ -136,6 +173,25 @@ mod tests {
         assert_eq!((file.up_axis, file.name.as_str()), (1, "part.obj"));
         let [red, green, ..] = file.mesh.material_colors[0];
         assert!((red - 1.0).abs() < 1e-6 && green == 0.0);
+    }
+
+    /// Two tetrahedra without names, the second one with more triangles.
+    #[test]
+    fn shells_without_names_are_groups() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("two.obj");
+        let mut text = String::new();
+        for x in [0, 5] {
+            for [dx, y, z] in [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, -1]] {
+                text.push_str(&format!("v {} {y} {z}\n", x + dx));
+            }
+        }
+        text.push_str("f 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n");
+        text.push_str("f 6 7 9\nf 6 9 8\nf 7 8 9\nf 6 10 7\nf 6 8 10\nf 7 10 8\n");
+        std::fs::write(&path, text).expect("a file");
+        let file = read(&path.to_string_lossy(), 1.0).expect("a surface");
+        assert_eq!(file.groups, ["shell 1", "shell 2"]);
+        assert_eq!(file.mesh.triangle_groups, [1, 1, 1, 1, 0, 0, 0, 0, 0, 0]);
     }
 
     #[test]

@@ -11,7 +11,7 @@ use crate::surface::Surface;
 /// The largest number of triangles in a leaf of the tree.
 const LEAF_TRIANGLES: usize = 8;
 /// A node is replaced by its dipole at distances beyond this multiple of its radius.
-const DISTANCE_FACTOR: f64 = 2.5;
+const DISTANCE_FACTOR: f64 = 2.0;
 
 /// The tree of a surface.
 #[derive(Debug)]
@@ -186,7 +186,7 @@ pub(crate) mod tests {
             let level = (point.x / 0.5).powi(2) + (point.y / 0.35).powi(2) + (point.z / 0.2).powi(2);
             let direct: f64 = (0..tree.corners.len()).map(|triangle| tree.solid_angle(triangle, point)).sum();
             let fast = tree.at(point);
-            assert!((fast - direct).abs() < 0.05, "point {index}: tree {fast}, sum {direct}");
+            assert!((fast - direct).abs() < 0.08, "point {index}: tree {fast}, sum {direct}");
             if !(0.9..1.1).contains(&level) {
                 assert_eq!(fast > 0.5, level < 1.0, "point {index}: {fast} at level {level}");
             }

@@ -161,6 +161,10 @@ fn implausible_sizes_are_remarks() {
     };
     assert!(text(&[]).contains("is 'm' its --unit?"));
     assert!(!text(&["--unit", "mm"]).contains("--unit?"), "control");
+    // Steel in newtons and millimeters.
+    let steel = text(&["--unit", "mm", "--material", "E=210000,nu=0.3,rho=7.85e-9"]);
+    assert!(steel.contains("E=...e6") && steel.contains("rho=...e12"), "{steel}");
+    assert!(!text(&["--unit", "mm", "--material", "E=210e9,nu=0.3,rho=7850"]).contains("e12"), "control");
 }
 
 #[test]
