@@ -32,36 +32,31 @@ pub enum RasterPolicy {
 ///
 /// | scene | triangles | cut-outs | OpenGL | CUDA |
 /// |---|---|---|---|---|
-/// | built-in tree | 114,853 | yes | 319 to 321 | 415 to 418 |
-/// | bridge | 32,014 | no | 847 to 855 | 898 to 902 |
-/// | almond tree | 37,560 | yes | 771 to 782 | 764 to 767 |
-/// | fern | 6,232 | yes | equal | equal |
+/// | built-in tree | 114,853 | yes | 322 to 324 | 417 to 421 |
+/// | almond tree | 37,560 | yes | 767 to 774 | 860 to 872 |
+/// | bridge | 32,014 | no | 868 to 878 | 934 to 943 |
+/// | fern | 6,232 | yes | 678 | not supported |
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct RasterFacts {
     /// Compute capability of the CUDA device.
     pub capability: (i32, i32),
     pub triangles: usize,
-    /// Whether a material is alpha-tested. CUDA then reads the alpha of each pixel from memory.
-    pub has_cut_outs: bool,
 }
 
 /// The only measured architecture: H100 and H200.
 const MEASURED_CAPABILITY: (i32, i32) = (9, 0);
-/// Fewest triangles of scenes in which CUDA is faster.
+/// Fewest triangles of scenes in which CUDA was measured to be faster.
 const MIN_TRIANGLES: usize = 30_000;
-/// The same with cut-outs: between the almond tree and the built-in tree.
-const MIN_TRIANGLES_WITH_CUT_OUTS: usize = 75_000;
 
 impl RasterFacts {
     /// The facts about a scene on a device of this compute capability.
     pub const fn new(capability: (i32, i32), scene: &Scene) -> Self {
-        Self { capability, triangles: scene.layout.triangles, has_cut_outs: scene.features.mask }
+        Self { capability, triangles: scene.layout.triangles }
     }
 
     /// Whether CUDA draws the shadow map, if it supports the kind of the map.
     pub fn is_cuda_faster(&self) -> bool {
-        let min_triangles = if self.has_cut_outs { MIN_TRIANGLES_WITH_CUT_OUTS } else { MIN_TRIANGLES };
-        self.capability == MEASURED_CAPABILITY && self.triangles >= min_triangles
+        self.capability == MEASURED_CAPABILITY && self.triangles >= MIN_TRIANGLES
     }
 
     /// The rule in words.
@@ -69,8 +64,7 @@ impl RasterFacts {
         let (major, minor) = MEASURED_CAPABILITY;
         format!(
             "CUDA draws the variance shadow map (one cascade) on GPUs of compute capability {major}.{minor}, in scenes \
-             of at least {MIN_TRIANGLES} triangles, or {MIN_TRIANGLES_WITH_CUT_OUTS} if there are cut-outs; OpenGL draws \
-             everything else"
+             of at least {MIN_TRIANGLES} triangles; OpenGL draws everything else"
         )
     }
 }
@@ -119,19 +113,20 @@ mod tests {
 
     #[test]
     fn rule_selects_the_faster_rasterizer_of_measured_scenes() {
-        let facts = |triangles, has_cut_outs| RasterFacts { capability: (9, 0), triangles, has_cut_outs };
-        assert!(facts(114_853, true).is_cuda_faster(), "tree");
-        assert!(facts(32_014, false).is_cuda_faster(), "bridge");
-        assert!(!facts(37_560, true).is_cuda_faster(), "almond tree");
-        assert!(!facts(6232, true).is_cuda_faster() && !facts(6232, false).is_cuda_faster(), "fern");
+        let facts = |triangles| RasterFacts { capability: (9, 0), triangles };
+        for (scene, triangles, expected) in
+            [("tree", 114_853, true), ("almond tree", 37_560, true), ("bridge", 32_014, true), ("fern", 6232, false)]
+        {
+            assert_eq!(facts(triangles).is_cuda_faster(), expected, "{scene}");
+        }
         for capability in [(7, 5), (8, 0), (8, 6), (8, 9), (10, 0), (12, 0)] {
-            assert!(!RasterFacts { capability, ..facts(1 << 24, false) }.is_cuda_faster(), "{capability:?}");
+            assert!(!RasterFacts { capability, ..facts(1 << 24) }.is_cuda_faster(), "{capability:?}");
         }
     }
 
     #[test]
     fn rule_in_words_has_its_numbers() {
         let rule = RasterFacts::rule();
-        assert!(["9.0", "30000", "75000"].iter().all(|number| rule.contains(number)), "{rule}");
+        assert!(["9.0", "30000"].iter().all(|number| rule.contains(number)), "{rule}");
     }
 }
