@@ -9,7 +9,7 @@ use crate::cell_moments::{GroupMoments, integrate};
 use crate::cell_pieces::CellPieces;
 use crate::constraints::{HeldPoint, points_on_groups, remove_regions};
 use crate::grid::Grid;
-use crate::inside_test::InsideTest;
+use crate::inside_outside::InsideOutsideTest;
 use crate::material_rays::{RaySegment, trace_rays};
 use crate::materials::Material;
 use crate::parameters::ModelingParameters;
@@ -239,7 +239,7 @@ impl Body {
 
     /// The material along the rays of the three axes.
     fn trace(&self, grid: &Grid) -> [Vec<RaySegment>; 3] {
-        let inside = self.winding.as_ref().map(|winding| InsideTest::new(grid, winding));
+        let inside = self.winding.as_ref().map(|winding| InsideOutsideTest::new(grid, winding));
         [0, 1, 2].map(|axis| trace_rays(&self.surface, grid, axis, inside.as_ref()))
     }
 }

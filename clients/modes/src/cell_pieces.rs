@@ -11,7 +11,7 @@
 use std::collections::HashMap;
 
 use crate::disjoint_sets::DisjointSets;
-use crate::grid::{CELL_NODES, FORWARD_NEIGHBORS, Grid, NODES_PER_SIDE, SUBDIVISIONS, cross_axes};
+use crate::grid::{CELL_NODES, FORWARD_NEIGHBORS, Grid, NODES_PER_SIDE, SUBDIVISIONS, all_offsets, cross_axes};
 use crate::material_rays::RaySegment;
 
 /// Sub-cells of a cell, one bit each. Bit `(x * 4 + y) * 4 + z` is the sub-cell (x, y, z).
@@ -281,23 +281,6 @@ fn shared_nodes(offset: [i8; 3]) -> Vec<[usize; 2]> {
     coordinates.filter_map(pair).collect()
 }
 
-/// The offsets of a cell and its 26 neighbors.
-pub fn all_offsets() -> impl Iterator<Item = [i8; 3]> {
-    (0..27_i8).map(|index| [index / 9 - 1, index / 3 % 3 - 1, index % 3 - 1])
-}
-
-/// The index of the neighbor of a cell; `None` outside of the grid.
-pub fn offset_cell(grid: &Grid, cell: [usize; 3], offset: [i8; 3]) -> Option<usize> {
-    let mut neighbor = [0; 3];
-    for axis in 0..3 {
-        neighbor[axis] = cell[axis].checked_add_signed(isize::from(offset[axis]))?;
-        if neighbor[axis] >= grid.cells[axis] {
-            return None;
-        }
-    }
-    Some(grid.cell_index(neighbor))
-}
-
 #[cfg(test)]
 mod tests {
     use nalgebra::Vector3;
@@ -362,12 +345,5 @@ mod tests {
             let segments = [0, 1, 2].map(|axis| trace_rays(&surface, &grid, axis, None));
             assert_eq!(CellPieces::new(&grid, &segments).part_count, 1, "{angle}");
         }
-    }
-
-    #[test]
-    fn neighbors_outside_of_the_grid_do_not_exist() {
-        let grid = Grid::covering(Vector3::zeros(), Vector3::repeat(2.0), 1.0);
-        assert_eq!(offset_cell(&grid, [0, 0, 1], [0, 0, 1]), None);
-        assert_eq!(offset_cell(&grid, [1, 0, 1], [0, 1, -1]), Some(grid.cell_index([1, 1, 0])));
     }
 }

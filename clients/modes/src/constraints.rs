@@ -6,7 +6,7 @@ use nalgebra::Vector3;
 use crate::cell_pieces::CellPieces;
 use crate::embedding::{EmbeddedPoint, embed};
 use crate::grid::Grid;
-use crate::material_rays::RaySegment;
+use crate::material_rays::{RaySegment, bisect};
 use crate::region::Region;
 use crate::surface::Surface;
 
@@ -57,11 +57,7 @@ pub fn remove_regions(
             if is_held(position(sample)) == was_held {
                 continue;
             }
-            let (mut low, mut high) = (position(sample - 1), position(sample));
-            while high - low > ACCURACY {
-                let middle = f64::midpoint(low, high);
-                if is_held(middle) == was_held { low = middle } else { high = middle }
-            }
+            let [low, high] = bisect([position(sample - 1), position(sample)], ACCURACY, is_held);
             if !was_held && low > start {
                 remaining.push(RaySegment { start, end: low, ..*segment });
             }

@@ -3,8 +3,8 @@
 use nalgebra::Vector3;
 
 use crate::cell_matrices::shape_functions;
-use crate::cell_pieces::{CellPiece, CellPieces, all_offsets, offset_cell};
-use crate::grid::{CELL_NODES, Grid, SUBDIVISIONS};
+use crate::cell_pieces::{CellPiece, CellPieces};
+use crate::grid::{CELL_NODES, Grid, SUBDIVISIONS, all_offsets, offset_cell};
 
 /// Coordinates in a cell are limited to this magnitude. Beyond 1, a point lies outside of the cell, and its displacement
 /// is extrapolated.

@@ -157,6 +157,23 @@ pub const FORWARD_NEIGHBORS: [[i8; 3]; 13] = [
     [1, 1, 1],
 ];
 
+/// The offsets of a cell and its 26 neighbors.
+pub fn all_offsets() -> impl Iterator<Item = [i8; 3]> {
+    (0..27_i8).map(|index| [index / 9 - 1, index / 3 % 3 - 1, index % 3 - 1])
+}
+
+/// The index of the neighbor of a cell; `None` outside of the grid.
+pub fn offset_cell(grid: &Grid, cell: [usize; 3], offset: [i8; 3]) -> Option<usize> {
+    let mut neighbor = [0; 3];
+    for axis in 0..3 {
+        neighbor[axis] = cell[axis].checked_add_signed(isize::from(offset[axis]))?;
+        if neighbor[axis] >= grid.cells[axis] {
+            return None;
+        }
+    }
+    Some(grid.cell_index(neighbor))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -188,5 +205,12 @@ mod tests {
         assert!((integral(&grid, 1.3) - exact(1.3)).abs() < 1e-12);
         assert_eq!((grid.first_lines[0][1], grid.lines[0].len()), (8, 18));
         assert!(grid.lines[0].iter().all(|line| line.sub_cell == (line.position * 4.0) as usize));
+    }
+
+    #[test]
+    fn neighbors_outside_of_the_grid_do_not_exist() {
+        let grid = Grid::covering(Vector3::zeros(), Vector3::repeat(2.0), 1.0);
+        assert_eq!(offset_cell(&grid, [0, 0, 1], [0, 0, 1]), None);
+        assert_eq!(offset_cell(&grid, [1, 0, 1], [0, 1, -1]), Some(grid.cell_index([1, 1, 0])));
     }
 }

@@ -8,7 +8,7 @@
 //! | step | module |
 //! |---|---|
 //! | read a surface, weld its vertices, orient its triangles | [`surface`] |
-//! | find the material along rays, with winding numbers where the surface has holes | [`material_rays`], [`inside_test`], [`winding_number`] |
+//! | find the material along rays, with winding numbers where the surface has holes | [`material_rays`], [`inside_outside`], [`winding_number`] |
 //! | divide the material of each cell into connected pieces, and the pieces into parts | [`cell_pieces`] |
 //! | integrate each piece, and assemble stiffness and mass | [`cell_moments`], [`cell_matrices`], [`assembly`] |
 //! | hold clamped regions, add point masses | [`region`], [`constraints`] |
@@ -28,7 +28,7 @@ pub mod disjoint_sets;
 pub mod eigensolver;
 pub mod embedding;
 pub mod grid;
-pub mod inside_test;
+pub mod inside_outside;
 pub mod material_rays;
 pub mod materials;
 pub mod model_file;

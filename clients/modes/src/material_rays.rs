@@ -4,7 +4,7 @@ use nalgebra::Vector3;
 use rayon::prelude::*;
 
 use crate::grid::{Grid, RayLine, cross_axes};
-use crate::inside_test::InsideTest;
+use crate::inside_outside::InsideOutsideTest;
 use crate::surface::Surface;
 
 /// A part of a ray inside material. Positions are in units of cells, relative to the origin of the grid.
@@ -31,7 +31,12 @@ struct Crossing {
 ///
 /// A point inside a closed surface is one with a winding number other than 0, so that shells may overlap and may contain
 /// cavities. `inside` is given for surfaces with holes.
-pub fn trace_rays(surface: &Surface, grid: &Grid, axis: usize, inside: Option<&InsideTest<'_>>) -> Vec<RaySegment> {
+pub fn trace_rays(
+    surface: &Surface,
+    grid: &Grid,
+    axis: usize,
+    inside: Option<&InsideOutsideTest<'_>>,
+) -> Vec<RaySegment> {
     let [u, v] = cross_axes(axis);
     let positions: Vec<Vector3<f64>> = surface.positions.iter().map(|point| grid.to_cell_units(*point)).collect();
     // The triangles that touch each layer of cells across the first axis.
@@ -132,11 +137,7 @@ fn add_open_segments(
                 if inside(position(sample)) == is_inside {
                     continue;
                 }
-                let (mut low, mut high) = (position(sample - 1), position(sample));
-                while high - low > HOLE_ACCURACY {
-                    let middle = f64::midpoint(low, high);
-                    if inside(middle) == is_inside { low = middle } else { high = middle }
-                }
+                let [low, _] = bisect([position(sample - 1), position(sample)], HOLE_ACCURACY, &inside);
                 if is_inside {
                     add_segment(RaySegment { ray, start: segment_start, end: low, group }, segments);
                 }
@@ -148,6 +149,16 @@ fn add_open_segments(
         }
         (start, group) = (crossing.position, crossing.group);
     }
+}
+
+/// Narrows an interval at whose ends a condition differs, until it is not longer than `accuracy`.
+pub fn bisect([mut low, mut high]: [f64; 2], accuracy: f64, condition: impl Fn(f64) -> bool) -> [f64; 2] {
+    let at_low = condition(low);
+    while high - low > accuracy {
+        let middle = f64::midpoint(low, high);
+        if condition(middle) == at_low { low = middle } else { high = middle }
+    }
+    [low, high]
 }
 
 /// Adds a segment, or extends the previous one if both touch.
@@ -273,7 +284,7 @@ mod tests {
             let expected = volume(&grid, axis, &trace_rays(&closed, &grid, axis, None));
             let winding = WindingNumber::new(&open);
             let with_holes =
-                volume(&grid, axis, &trace_rays(&open, &grid, axis, Some(&InsideTest::new(&grid, &winding))));
+                volume(&grid, axis, &trace_rays(&open, &grid, axis, Some(&InsideOutsideTest::new(&grid, &winding))));
             assert!((with_holes / expected - 1.0).abs() < 0.01, "axis {axis}: {with_holes} instead of {expected}");
             let exact = 4.0 / 3.0 * std::f64::consts::PI * 0.5 * 0.35 * 0.2 / 1e-3;
             assert!((expected / exact - 1.0).abs() < 0.01, "axis {axis}: {expected} instead of {exact}");

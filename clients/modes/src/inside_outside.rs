@@ -4,20 +4,19 @@
 use nalgebra::Vector3;
 use rayon::prelude::*;
 
-use crate::cell_pieces::{all_offsets, offset_cell};
-use crate::grid::Grid;
+use crate::grid::{Grid, all_offsets, offset_cell};
 use crate::winding_number::WindingNumber;
 
 /// Inside tests for one grid.
 #[derive(Debug)]
-pub struct InsideTest<'a> {
+pub struct InsideOutsideTest<'a> {
     grid: &'a Grid,
     winding: &'a WindingNumber,
     /// For each cell, whether all of it is inside or outside; `None` if that depends on the point.
     cells: Vec<Option<bool>>,
 }
 
-impl<'a> InsideTest<'a> {
+impl<'a> InsideOutsideTest<'a> {
     /// Classifies the cells. A cell is inside or outside as a whole if no triangle touches it, and the winding numbers at
     /// its center and at those of its neighbors are clearly on the same side of 1/2.
     pub fn new(grid: &'a Grid, winding: &'a WindingNumber) -> Self {
@@ -73,7 +72,7 @@ mod tests {
         let surface = Surface::new(&positions, &triangles, &vec![0; triangles.len()]);
         let winding = WindingNumber::new(&surface);
         let grid = Grid::covering(Vector3::repeat(-0.6), Vector3::repeat(0.6), 0.05);
-        let test = InsideTest::new(&grid, &winding);
+        let test = InsideOutsideTest::new(&grid, &winding);
         let decided = test.cells.iter().filter(|cell| cell.is_some()).count();
         assert!(decided * 3 > test.cells.len(), "control: {decided} of {} cells are decided", test.cells.len());
         let mut random = fastrand::Rng::with_seed(5);
