@@ -1,9 +1,12 @@
-//! A bridge under a pulsating load: reduced forces of a Saint Venant-Kirchhoff (StVK) material, integrated by the
-//! implicit Newmark method.
+//! A bridge under a pulsating load: reduced forces of a Saint Venant-Kirchhoff (StVK) material, integrated implicitly.
 //!
 //! The load acts on the middle of the bridge, spread evenly over the sampled vertices there. Its strength is calibrated
 //! so that the deflection at equilibrium is a given fraction of the diagonal of the scene's rest bounds. The run starts
 //! at this equilibrium. The load then pulsates between its full strength and 0, as (1 + cos(2 pi t / period)) / 2.
+//!
+//! The load does not act on eigenvectors without stiffness at rest, which it would move away. A bridge whose stiffness
+//! at rest has a negative eigenvalue (a buckled one) is not in equilibrium there: its run starts at rest, and the linear
+//! stiffness calibrates the load.
 
 use std::f64::consts::TAU;
 
@@ -13,8 +16,10 @@ use serde_json::json;
 use crate::affine::AffineTransform;
 use crate::cubic::ReducedForce;
 use crate::error::{Result, check_option, invalid_input};
+use crate::implicit::{ImplicitIntegrator, ImplicitMethod, MAX_SUB_STEPS, StepControl};
+use crate::integrator::{Integrator as _, IntegratorTotals, LoadChange, MotionState, nyquist_remark};
 use crate::model::{DomainModel, Model};
-use crate::newmark::{LoadChange, NewmarkState, ReducedSystem};
+use crate::reduced_system::ReducedSystem;
 use crate::run::{Report, Scenario, aliasing_remark};
 use crate::step_values::StepValues;
 use crate::vega::VegaSettings;
@@ -22,6 +27,9 @@ use crate::viewer_forces::force_scale;
 
 /// Largest error of the deflection at equilibrium, as a fraction of the requested deflection.
 const DEFLECTION_TOLERANCE: f64 = 1e-3;
+
+/// Largest estimated error of the displacement in a step, in diagonals of the scene's rest bounds.
+const STEP_TOLERANCE: f64 = 1e-5;
 
 /// Settings of the bridge scenario.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -35,6 +43,9 @@ pub struct BridgeOptions {
     /// Period of the load in seconds.
     pub period: f64,
     pub load_direction: LoadDirection,
+    pub method: ImplicitMethod,
+    /// Whether every step is one step of the integrator, instead of sub-steps by an estimate of the error.
+    pub has_fixed_step: bool,
 }
 
 /// Direction of the load.
@@ -50,7 +61,8 @@ pub enum LoadDirection {
 /// The bridge scenario.
 pub struct BridgeScenario {
     model: Model,
-    system: ReducedSystem,
+    integrator: ImplicitIntegrator,
+    totals: IntegratorTotals,
     options: BridgeOptions,
     is_damped: bool,
     /// Reduced load U^T f of the force f at the peak of the pulse.
@@ -58,7 +70,7 @@ pub struct BridgeScenario {
     /// Reduced load of the viewers' forces.
     viewer_load: DVector<f64>,
     /// The state at step `next_step`.
-    state: NewmarkState,
+    state: MotionState,
     /// The step that the next call of `compute_next_step` computes.
     next_step: u64,
     /// Magnitude of the force at the peak of the pulse, in the units in which the reduced mass matrix is the identity.
@@ -67,6 +79,8 @@ pub struct BridgeScenario {
     static_deflection_fraction: f64,
     /// Largest displacement so far, in scene units.
     peak_displacement: f64,
+    /// On the first step whose estimated error exceeds the tolerance.
+    late_remark: Option<String>,
 }
 
 /// An equilibrium and the strength of the load that causes it.
@@ -80,40 +94,68 @@ impl BridgeScenario {
     ///
     /// # Errors
     /// `Invalid` if an option is out of range, the domain has another rank than the forces or no coordinates of its
-    /// own, the stiffness is not positive definite, the load cannot deform the domain, or the bridge has no stable
-    /// equilibrium at the requested deflection.
+    /// own, the load cannot deform the domain, or the bridge has no stable equilibrium at the requested deflection.
     pub fn new(model: Model, force: ReducedForce, settings: &VegaSettings, options: BridgeOptions) -> Result<Self> {
         check_option("dt", options.dt, f64::MIN_POSITIVE..=1e6)?;
         check_option("deflection", options.deflection_fraction, 0.0..=0.5)?;
         check_option("period", options.period, f64::MIN_POSITIVE..=1e6)?;
         let rank = force.rank();
         let domain = find_domain(&model, options.domain, rank)?;
-        let system = ReducedSystem::new(force, settings)?;
-        let unit_load = compute_unit_load(&model, domain, options.load_direction)?;
+        let system = ReducedSystem::new(force, settings);
+        let unit_load = system.stiff_part(&compute_unit_load(&model, domain, options.load_direction)?);
+        if unit_load.norm() == 0.0 {
+            let given = format!("{rank} modes, and no stiffness at rest against the load");
+            return Err(invalid_input("cubic forces", "a stiffness at rest", given));
+        }
         let target_deflection = options.deflection_fraction * model.diagonal();
-        let equilibrium = calibrate_load(&system, domain, &unit_load, target_deflection)?;
+        let (_, negative_count) = system.unstable_counts();
+        let equilibrium = match negative_count {
+            0 => calibrate_load(&system, domain, &unit_load, target_deflection)?,
+            _ => calibrate_load_at_rest(&system, domain, &unit_load, target_deflection),
+        };
         let static_deflection = max_sample_displacement(domain, &equilibrium.q);
+        let coordinates = domain.first_coordinate..domain.first_coordinate + rank;
+        let control = match options.has_fixed_step {
+            true => StepControl::Fixed,
+            false => StepControl::Adaptive {
+                tolerance: STEP_TOLERANCE,
+                displacements_per_unit: model.displacements_per_unit()[coordinates].to_vec(),
+            },
+        };
+        let integrator = ImplicitIntegrator::new(system, options.method, control, options.dt)?;
         Ok(Self {
             options,
             is_damped: settings.damping_mass > 0.0 || settings.damping_stiffness > 0.0,
             peak_load: unit_load * equilibrium.strength,
             viewer_load: DVector::zeros(rank),
-            state: system.static_state(equilibrium.q),
+            state: MotionState::resting(equilibrium.q),
             next_step: 0,
             strength: equilibrium.strength,
             static_deflection_fraction: static_deflection / model.diagonal(),
             peak_displacement: 0.0,
-            system,
+            late_remark: None,
+            totals: IntegratorTotals::default(),
+            integrator,
             model,
         })
     }
 
     /// Integrates the state over one step.
-    fn advance(&mut self) {
+    fn advance(&mut self) -> Result<()> {
         let (start_load, end_load) = (self.compute_load(self.next_step), self.compute_load(self.next_step + 1));
         let load = LoadChange { start: &start_load, end: &end_load };
-        self.state = self.system.advance(&self.state, self.options.dt, load);
+        let report = self.integrator.advance(&mut self.state, load)?;
+        self.totals.add(&report);
+        if report.is_limited && self.late_remark.is_none() {
+            self.late_remark = Some(format!(
+                "step {}: {MAX_SUB_STEPS} sub-steps leave an estimated error of {:.1e} diagonals, more than \
+                 {STEP_TOLERANCE:e}: choose smaller steps (--dt); integrator.steps_above_tolerance counts such steps",
+                self.next_step + 1,
+                report.error
+            ));
+        }
         self.next_step += 1;
+        Ok(())
     }
 
     /// The reduced load at a step.
@@ -139,14 +181,13 @@ impl Scenario for BridgeScenario {
         let world_from_domain: Vec<AffineTransform> =
             values.transforms.iter().map(AffineTransform::from_row_major).collect();
         self.peak_displacement = self.peak_displacement.max(self.model.max_displacement(&q, &world_from_domain));
-        self.advance();
-        Ok(())
+        self.advance()
     }
 
     fn set_viewer_forces(&mut self, forces: &[f64]) -> Result<()> {
         let first_coordinate = self.model.domains[self.options.domain].first_coordinate;
-        self.viewer_load.copy_from_slice(&forces[first_coordinate..][..self.system.rank()]);
-        let q = self.system.linear_equilibrium(&self.viewer_load);
+        self.viewer_load.copy_from_slice(&forces[first_coordinate..][..self.integrator.system().rank()]);
+        let q = self.integrator.system().linear_equilibrium(&self.viewer_load);
         let displacements_per_unit = &self.model.displacements_per_unit()[first_coordinate..];
         self.viewer_load *= force_scale(q.as_slice(), displacements_per_unit);
         Ok(())
@@ -156,7 +197,23 @@ impl Scenario for BridgeScenario {
         let undamped = (!self.is_damped).then(|| {
             "the bridge has no damping, so that vibrations do not decay: set it in the .config file".to_owned()
         });
-        aliasing_remark("the load", self.options.period, self.options.dt).into_iter().chain(undamped).collect()
+        let system = self.integrator.system();
+        let unstable = match system.unstable_counts() {
+            (0, 0) => None,
+            (zero, negative) => Some(format!(
+                "the stiffness at rest has {zero} eigenvalues of 0 and {negative} negative ones, the lowest of \
+                 {:.3e} (rad/s)^2: the load does not act on them",
+                system.eigenvalues()[0]
+            )),
+        };
+        let modes = system.frequencies().into_iter().enumerate();
+        let unresolved = nyquist_remark(modes.map(|(mode, hertz)| (format!("mode {mode}"), hertz)), self.options.dt);
+        let unresolved_load = aliasing_remark("the load", self.options.period, self.options.dt);
+        [unresolved_load, undamped, unstable, unresolved, self.late_remark.clone()].into_iter().flatten().collect()
+    }
+
+    fn late_remark(&self) -> Option<&str> {
+        self.late_remark.as_deref()
     }
 
     fn report(&self) -> Report {
@@ -173,7 +230,8 @@ impl Scenario for BridgeScenario {
             ("load".to_owned(), json!(load_description)),
             ("deflection_of_diagonal".to_owned(), json!(self.static_deflection_fraction)),
             ("peak_of_diagonal".to_owned(), json!(peak_displacement_fraction)),
-            ("frequencies_hz".to_owned(), json!(self.system.frequencies())),
+            ("frequencies_hz".to_owned(), json!(self.integrator.system().frequencies())),
+            ("integrator".to_owned(), self.totals.to_json()),
         ])
     }
 }
@@ -247,6 +305,18 @@ fn max_sample_displacement(domain: &DomainModel, q: &DVector<f64>) -> f64 {
     domain.samples.iter().map(|sample| sample.displacement(q.as_slice()).norm()).fold(0.0, f64::max)
 }
 
+/// The strength of the load whose linear deflection at rest is the target (scene units). The run starts at rest.
+fn calibrate_load_at_rest(
+    system: &ReducedSystem,
+    domain: &DomainModel,
+    unit_load: &DVector<f64>,
+    target_deflection: f64,
+) -> LoadedEquilibrium {
+    let deflection = max_sample_displacement(domain, &system.linear_equilibrium(unit_load));
+    let strength = if deflection > 0.0 { target_deflection / deflection } else { 0.0 };
+    LoadedEquilibrium { strength, q: DVector::zeros(system.rank()) }
+}
+
 /// Finds the strength of the load whose equilibrium has the target deflection (scene units). Increases the strength
 /// until the deflection reaches the target, then bisects. Each solve starts from the equilibrium of a smaller load.
 ///
@@ -316,6 +386,8 @@ mod tests {
         deflection_fraction: 0.03,
         period: 2.0,
         load_direction: LoadDirection::Across,
+        method: ImplicitMethod::AverageVectorField,
+        has_fixed_step: false,
     };
 
     /// A bridge whose force has rank 2, as the domains of the model. The force consists of two springs with the
@@ -355,7 +427,8 @@ mod tests {
         assert!((bridge.static_deflection_fraction - 0.03).abs() <= 1e-4);
     }
 
-    /// A push beyond the potential barrier accelerates the softening bridge without bound.
+    /// A push beyond the potential barrier accelerates the softening bridge to infinity in a finite time, in which the
+    /// last step has no solution.
     #[test]
     fn diverging_softening_bridge_is_reported_as_error() {
         let mut bridge = softening_bridge(0.03).expect("a valid scenario");
@@ -364,11 +437,11 @@ mod tests {
         bridge.viewer_load[0] = 500.0;
         let mut values = StepValues::default();
         let mut steps = (0..600).map(|step| {
-            bridge.compute_next_step(&mut values).expect("a step");
+            bridge.compute_next_step(&mut values)?;
             check.check(&bridge.model, step, 0.0, &values)
         });
         let error = steps.find_map(Result::err).expect("expected the bridge to diverge").to_string();
-        assert!(error.contains("of 'beam' diverged"), "{error}");
+        assert!(error.contains("with 64 sub-steps"), "{error}");
     }
 
     #[test]
@@ -382,7 +455,9 @@ mod tests {
         };
         // With one step per period, the load is the same in all steps.
         let unresolved = remarks(2.0, 2.0, 0.01);
-        assert!(unresolved.len() == 1 && unresolved[0].contains("the load has a period of 2 s"), "{unresolved:?}");
+        assert!(unresolved.len() == 2 && unresolved[0].contains("the load has a period of 2 s"), "{unresolved:?}");
+        // The modes at rest have 1.0 and 1.5 Hz.
+        assert!(unresolved[1].starts_with("2 modes are above the Nyquist frequency"), "{unresolved:?}");
         let undamped = remarks(1.0 / 60.0, 2.0, 0.0);
         assert!(undamped.len() == 1 && undamped[0].starts_with("the bridge has no damping"), "{undamped:?}");
         assert_eq!(remarks(1.0 / 60.0, 2.0, 0.01), [""; 0]);

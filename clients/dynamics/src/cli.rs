@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use modalcast_client::Delivery;
 use modalcast_dynamics::bridge::LoadDirection;
+use modalcast_dynamics::implicit::ImplicitMethod;
 
 const EXAMPLES: &str = "\
 Examples:
@@ -36,7 +37,7 @@ pub(crate) enum Command {
         #[command(flatten)]
         wind: WindOptions,
     },
-    /// A pulsating load on the middle of a bridge, by Vega's reduced cubic forces and implicit Newmark integration.
+    /// A pulsating load on the middle of a bridge, by Vega's reduced cubic forces.
     #[command(after_help = EXAMPLES)]
     Bridge {
         #[command(flatten)]
@@ -45,6 +46,8 @@ pub(crate) enum Command {
         files: ForceFileOptions,
         #[command(flatten)]
         load: LoadOptions,
+        #[command(flatten)]
+        integration: IntegrationOptions,
     },
     /// Moves one coordinate after another; rocks a scene without coordinates.
     #[command(after_help = EXAMPLES)]
@@ -66,6 +69,8 @@ pub(crate) enum Command {
         files: ForceFileOptions,
         #[command(flatten)]
         load: LoadOptions,
+        #[command(flatten)]
+        integration: IntegrationOptions,
         #[command(flatten)]
         wind: WindOptions,
         /// Largest displacement of the sweep as a fraction of the diagonal of the scene's bounds.
@@ -188,6 +193,31 @@ pub(crate) struct LoadOptions {
     /// Direction of the load: across the bridge and slightly upwards (a wind), down (a weight), or up.
     #[arg(long = "toward", value_name = "TOWARD", value_enum, default_value = "across")]
     pub(crate) direction: LoadDirectionOption,
+}
+
+#[derive(Debug, Clone, Copy, Args)]
+pub(crate) struct IntegrationOptions {
+    /// Integrator of cubic forces. average-vector-field conserves the energy; backward-euler damps fast vibrations.
+    #[arg(long = "integrator", value_name = "INTEGRATOR", value_enum, default_value = "average-vector-field")]
+    pub(crate) method: MethodOption,
+    /// Integrate cubic forces with one step per step sent, instead of up to 64 sub-steps by an estimate of the error.
+    #[arg(long = "fixed-step")]
+    pub(crate) has_fixed_step: bool,
+}
+
+#[derive(Debug, Clone, Copy, ValueEnum)]
+pub(crate) enum MethodOption {
+    AverageVectorField,
+    BackwardEuler,
+}
+
+impl From<MethodOption> for ImplicitMethod {
+    fn from(option: MethodOption) -> Self {
+        match option {
+            MethodOption::AverageVectorField => Self::AverageVectorField,
+            MethodOption::BackwardEuler => Self::BackwardEuler,
+        }
+    }
 }
 
 #[derive(Debug, Clone, Copy, ValueEnum)]

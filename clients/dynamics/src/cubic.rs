@@ -20,16 +20,30 @@ const HEADER_BYTES: usize = 16;
 /// degree. Vega's files have differences below 1e-10.
 const GRADIENT_TOLERANCE: f64 = 1e-6;
 
-/// Coefficients of a polynomial force, which is the gradient of a quartic potential.
+/// A polynomial force, which is the gradient of a quartic potential. It is stored as its Jacobian, which is symmetric:
+/// entry (i, j) with i <= j is a row ("pair") of the matrices below. By Euler's theorem on homogeneous functions, the
+/// Jacobian J_d of the term of degree d gives the force J_d q / d and the potential q . J_d q / (d (d + 1)).
+///
+/// A file has every coefficient of the potential several times, with rounding errors. Their mean is stored, because the
+/// conservation of energy needs an exact gradient.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ReducedForce {
     rank: usize,
     /// r x r: the stiffness at rest.
     linear_block: DMatrix<f64>,
-    /// Row-major: one row per force component, one column per monomial of degree two.
-    quadratic_block: Vec<f64>,
-    /// Row-major: one row per force component, one column per monomial of degree three.
-    cubic_block: Vec<f64>,
+    /// The Jacobian of the term of degree two: one row per pair, one column per coordinate.
+    quadratic_jacobian: DMatrix<f64>,
+    /// The Jacobian of the term of degree three: one row per pair, one column per monomial of degree two.
+    cubic_jacobian: DMatrix<f64>,
+}
+
+/// Force, Jacobian and potential at one q.
+#[derive(Debug, Clone)]
+pub struct ForceEvaluation {
+    pub force: DVector<f64>,
+    /// df/dq, r x r, symmetric.
+    pub jacobian: DMatrix<f64>,
+    pub potential: f64,
 }
 
 impl ReducedForce {
@@ -38,7 +52,7 @@ impl ReducedForce {
     /// # Errors
     /// `Invalid` if r is not 1 to 512, a block has the wrong length, an entry is not finite, or the force is not the
     /// gradient of a potential.
-    pub fn new(rank: usize, linear: &[f64], quadratic: Vec<f64>, cubic: Vec<f64>) -> Result<Self> {
+    pub fn new(rank: usize, linear: &[f64], quadratic: &[f64], cubic: &[f64]) -> Result<Self> {
         let counts = monomial_counts(rank).ok_or_else(|| invalid_input("cub.r", "1 to 512", rank))?;
         for (field, length, count) in [
             ("cub.linear", linear.len(), counts[0]),
@@ -49,16 +63,21 @@ impl ReducedForce {
                 return Err(invalid_input(field, format!("{rank} x {count} numbers"), length));
             }
         }
-        for (field, block) in [("cub.linear", linear), ("cub.quadratic", &quadratic), ("cub.cubic", &cubic)] {
+        for (field, block) in [("cub.linear", linear), ("cub.quadratic", quadratic), ("cub.cubic", cubic)] {
             if let Some(index) = block.iter().position(|entry| !entry.is_finite()) {
                 return Err(invalid_input(format!("{field}[{index}]"), "a finite number", block[index]));
             }
         }
-        let linear_block = DMatrix::from_row_slice(rank, rank, linear);
         check_gradient("cub.linear", rank, 1, linear)?;
-        check_gradient("cub.quadratic", rank, 2, &quadratic)?;
-        check_gradient("cub.cubic", rank, 3, &cubic)?;
-        Ok(Self { rank, linear_block, quadratic_block: quadratic, cubic_block: cubic })
+        check_gradient("cub.quadratic", rank, 2, quadratic)?;
+        check_gradient("cub.cubic", rank, 3, cubic)?;
+        let linear_block = DMatrix::from_row_slice(rank, rank, linear);
+        Ok(Self {
+            rank,
+            linear_block: (&linear_block + linear_block.transpose()) * 0.5,
+            quadratic_jacobian: assemble_jacobian(rank, 2, quadratic),
+            cubic_jacobian: assemble_jacobian(rank, 3, cubic),
+        })
     }
 
     /// Reads a file.
@@ -97,7 +116,7 @@ impl ReducedForce {
         let mut coefficients = body.as_chunks().0.iter().map(|bytes| f64::from_le_bytes(*bytes));
         let mut read_block = |count: usize| coefficients.by_ref().take(rank * count).collect::<Vec<_>>();
         let (linear, quadratic, cubic) = (read_block(counts[0]), read_block(counts[1]), read_block(counts[2]));
-        Self::new(rank, &linear, quadratic, cubic)
+        Self::new(rank, &linear, &quadratic, &cubic)
     }
 
     /// The number of coordinates r.
@@ -112,64 +131,85 @@ impl ReducedForce {
 
     /// The force f(q), r entries.
     pub fn force(&self, q: &DVector<f64>) -> DVector<f64> {
-        let [linear_term, quadratic_term, cubic_term] = self.force_terms(q);
-        linear_term + quadratic_term + cubic_term
+        self.evaluate(q).force
     }
 
-    /// The potential V(q), whose gradient is f. By Euler's theorem on homogeneous functions, the term f_d of degree d
-    /// has the potential q . f_d / (d + 1).
+    /// The potential V(q), whose gradient is f.
     pub fn potential(&self, q: &DVector<f64>) -> f64 {
-        let [linear_term, quadratic_term, cubic_term] = self.force_terms(q);
-        q.dot(&linear_term) / 2.0 + q.dot(&quadratic_term) / 3.0 + q.dot(&cubic_term) / 4.0
+        self.evaluate(q).potential
     }
 
-    /// The Jacobian df/dq, r x r.
-    pub fn jacobian(&self, q: &DVector<f64>) -> DMatrix<f64> {
-        let mut matrix = self.linear_block.clone();
-        let [_, quadratic_count, cubic_count] = monomial_counts(self.rank).unwrap_or_default();
-        for row in 0..self.rank {
-            let mut quadratic_entries = self.quadratic_block[row * quadratic_count..][..quadratic_count].iter();
-            let mut cubic_entries = self.cubic_block[row * cubic_count..][..cubic_count].iter();
-            for i in 0..self.rank {
-                for (j, entry) in (i..self.rank).zip(&mut quadratic_entries) {
-                    matrix[(row, i)] += entry * q[j];
-                    matrix[(row, j)] += entry * q[i];
+    /// Force, Jacobian and potential.
+    pub fn evaluate(&self, q: &DVector<f64>) -> ForceEvaluation {
+        let rank = self.rank;
+        let mut monomials = DVector::zeros(rank * (rank + 1) / 2);
+        let products = (0..rank).flat_map(|i| (i..rank).map(move |j| q[i] * q[j]));
+        monomials.iter_mut().zip(products).for_each(|(monomial, product)| *monomial = product);
+        let quadratic_pairs = &self.quadratic_jacobian * q;
+        let cubic_pairs = &self.cubic_jacobian * monomials;
+        let mut force = &self.linear_block * q;
+        let mut jacobian = self.linear_block.clone();
+        // The products of q with the forces of degree two and three.
+        let (mut quadratic_work, mut cubic_work) = (0.0, 0.0);
+        let linear_work = q.dot(&force);
+        let mut pairs = quadratic_pairs.iter().zip(&cubic_pairs);
+        for i in 0..rank {
+            for (j, (quadratic, cubic)) in (i..rank).zip(&mut pairs) {
+                jacobian[(i, j)] += quadratic + cubic;
+                let force_entry = quadratic / 2.0 + cubic / 3.0;
+                force[i] += force_entry * q[j];
+                let mut product = q[i] * q[j];
+                if j > i {
+                    jacobian[(j, i)] = jacobian[(i, j)];
+                    force[j] += force_entry * q[i];
+                    product *= 2.0;
                 }
-            }
-            for i in 0..self.rank {
-                for j in i..self.rank {
-                    let product = q[i] * q[j];
-                    for (k, entry) in (j..self.rank).zip(&mut cubic_entries) {
-                        matrix[(row, i)] += entry * q[j] * q[k];
-                        matrix[(row, j)] += entry * q[i] * q[k];
-                        matrix[(row, k)] += entry * product;
-                    }
-                }
+                quadratic_work += quadratic / 2.0 * product;
+                cubic_work += cubic / 3.0 * product;
             }
         }
-        matrix
+        ForceEvaluation { force, jacobian, potential: linear_work / 2.0 + quadratic_work / 3.0 + cubic_work / 4.0 }
     }
+}
 
-    /// The terms of the force of degree one, two and three.
-    fn force_terms(&self, q: &DVector<f64>) -> [DVector<f64>; 3] {
-        let mut quadratic_monomials = Vec::with_capacity(self.rank * (self.rank + 1) / 2);
-        let mut cubic_monomials = vec![];
-        for i in 0..self.rank {
-            for j in i..self.rank {
-                let product = q[i] * q[j];
-                quadratic_monomials.push(product);
-                cubic_monomials.extend((j..self.rank).map(|k| product * q[k]));
-            }
-        }
-        let multiply_block = |block: &[f64], monomials: &[f64]| {
-            let rows = block.chunks_exact(monomials.len().max(1));
-            let dot = |row: &[f64]| row.iter().zip(monomials).map(|(a, b)| a * b).sum::<f64>();
-            DVector::from_iterator(self.rank, rows.map(dot))
+/// The Jacobian of the force of one degree: one row per pair (i, j) with i <= j, one column per monomial of the degree
+/// below. The monomial v M of the potential adds v d^2 M / (dq_i dq_j) to the pair (i, j).
+fn assemble_jacobian(rank: usize, degree: usize, block: &[f64]) -> DMatrix<f64> {
+    let monomials = list_monomials(rank, degree);
+    let (pairs, columns) = (list_monomials(rank, 2), list_monomials(rank, degree - 1));
+    let mut jacobian = DMatrix::zeros(pairs.len(), columns.len());
+    for potential_monomial in list_monomials(rank, degree + 1) {
+        let mut components = potential_monomial.clone();
+        components.dedup();
+        let exponent = |component: usize| potential_monomial.iter().filter(|index| **index == component).count() as f64;
+        let coefficient = |component: &usize| {
+            let column = find_monomial(&monomials, &potential_monomial, &[*component]);
+            block[component * monomials.len() + column] / exponent(*component)
         };
-        let quadratic_term = multiply_block(&self.quadratic_block, &quadratic_monomials);
-        let cubic_term = multiply_block(&self.cubic_block, &cubic_monomials);
-        [&self.linear_block * q, quadratic_term, cubic_term]
+        let mean_coefficient = components.iter().map(coefficient).sum::<f64>() / components.len() as f64;
+        for (position, i) in components.iter().enumerate() {
+            for j in &components[position..] {
+                let factor = if i == j { exponent(*i) * (exponent(*i) - 1.0) } else { exponent(*i) * exponent(*j) };
+                if factor > 0.0 {
+                    let pair = pairs.binary_search(&vec![*i, *j]).unwrap_or_default();
+                    let column = find_monomial(&columns, &potential_monomial, &[*i, *j]);
+                    jacobian[(pair, column)] += factor * mean_coefficient;
+                }
+            }
+        }
     }
+    jacobian
+}
+
+/// The index in `monomials` of a monomial divided by some of its coordinates.
+fn find_monomial(monomials: &[Vec<usize>], monomial: &[usize], divisors: &[usize]) -> usize {
+    let mut quotient = monomial.to_vec();
+    for divisor in divisors {
+        if let Ok(position) = quotient.binary_search(divisor) {
+            quotient.remove(position);
+        }
+    }
+    monomials.binary_search(&quotient).unwrap_or_default()
 }
 
 /// Checks that a block of monomials of one degree is the gradient of a potential. Without a potential, the stiffness is
@@ -245,6 +285,83 @@ pub(crate) mod tests {
     /// Springs with the given eigenvalues. Neighbors add the potentials a (q_i - q_{i+1})^4 and b q_i^2 q_{i+1} with
     /// a = `quartic_coefficient` and b = `cubic_coefficient`.
     pub(crate) fn spring_chain(eigenvalues: &[f64], quartic_coefficient: f64, cubic_coefficient: f64) -> ReducedForce {
+        spring_chain_blocks(eigenvalues, quartic_coefficient, cubic_coefficient).force()
+    }
+
+    /// The blocks of a file: row-major, one row per force component, one column per monomial.
+    #[derive(Clone)]
+    pub(crate) struct Blocks {
+        rank: usize,
+        linear: Vec<f64>,
+        quadratic: Vec<f64>,
+        cubic: Vec<f64>,
+    }
+
+    impl Blocks {
+        pub(crate) fn force(&self) -> ReducedForce {
+            ReducedForce::new(self.rank, &self.linear, &self.quadratic, &self.cubic).expect("a valid force")
+        }
+
+        /// The bytes of a `.cub` file.
+        fn encode(&self) -> Vec<u8> {
+            let counts = monomial_counts(self.rank).expect("a supported rank");
+            let counts = [self.rank].into_iter().chain(counts);
+            let numbers = self.linear.iter().chain(&self.quadratic).chain(&self.cubic);
+            let header = counts.flat_map(|count| (count as i32).to_le_bytes());
+            header.chain(numbers.flat_map(|number| number.to_le_bytes())).collect()
+        }
+    }
+
+    /// The Duffing oscillator with the force w^2 (q + 10 q^3) and a frequency of 1 Hz at rest.
+    pub(crate) fn duffing() -> ReducedForce {
+        let w2 = std::f64::consts::TAU.powi(2);
+        Blocks { rank: 1, linear: vec![w2], quadratic: vec![0.0], cubic: vec![10.0 * w2] }.force()
+    }
+
+    /// The gradient of a random potential with a positive quartic term: V = q.A q / 2 + cubic terms
+    /// + sum (w_n . q)^4 / 4.
+    pub(crate) fn random_force(seed: u64, rank: usize) -> ReducedForce {
+        let [_, quadratic_count, cubic_count] = monomial_counts(rank).expect("a supported rank");
+        let mut blocks = Blocks {
+            rank,
+            linear: DMatrix::from_diagonal(&DVector::from_fn(rank, |mode, _| 10.0 * (1.0 + mode as f64).powi(2)))
+                .as_slice()
+                .to_vec(),
+            quadratic: vec![0.0; rank * quadratic_count],
+            cubic: vec![0.0; rank * cubic_count],
+        };
+        let (pairs, triples) = (list_monomials(rank, 2), list_monomials(rank, 3));
+        // The force of the potential (w . q)^n / n in component c is w_c (w . q)^(n - 1).
+        for vector in 0..3 * rank as u64 {
+            let w = random_vector(100 * seed + vector, rank) * 2.0;
+            for component in 0..rank {
+                let row = &mut blocks.quadratic[component * quadratic_count..][..quadratic_count];
+                for (entry, pair) in row.iter_mut().zip(&pairs) {
+                    *entry += w[component] * multiplicity(pair) * w[pair[0]] * w[pair[1]];
+                }
+                let row = &mut blocks.cubic[component * cubic_count..][..cubic_count];
+                for (entry, triple) in row.iter_mut().zip(&triples) {
+                    *entry +=
+                        w[component] * multiplicity(triple) * triple.iter().map(|index| w[*index]).product::<f64>();
+                }
+            }
+        }
+        blocks.force()
+    }
+
+    /// The number of orders of the coordinates of a monomial of degree two or three.
+    fn multiplicity(monomial: &[usize]) -> f64 {
+        let mut distinct = monomial.to_vec();
+        distinct.dedup();
+        match (monomial.len(), distinct.len()) {
+            (_, 1) => 1.0,
+            (2, _) => 2.0,
+            (_, 2) => 3.0,
+            _ => 6.0,
+        }
+    }
+
+    fn spring_chain_blocks(eigenvalues: &[f64], quartic_coefficient: f64, cubic_coefficient: f64) -> Blocks {
         let rank = eigenvalues.len();
         let [_, quadratic_count, cubic_count] = monomial_counts(rank).expect("a supported rank");
         let linear = DMatrix::from_diagonal(&DVector::from_column_slice(eigenvalues));
@@ -273,21 +390,7 @@ pub(crate) mod tests {
                 cubic_block[row * cubic_count + cubic_column(j, j, j)] -= coefficient;
             }
         }
-        ReducedForce::new(rank, linear.as_slice(), quadratic_block, cubic_block).expect("a valid force")
-    }
-
-    /// The bytes of a `.cub` file.
-    fn encode_file(force: &ReducedForce) -> Vec<u8> {
-        let mut bytes = vec![];
-        let [linear_count, quadratic_count, cubic_count] = monomial_counts(force.rank).expect("a supported rank");
-        for count in [force.rank, linear_count, quadratic_count, cubic_count] {
-            bytes.extend((count as i32).to_le_bytes());
-        }
-        // nalgebra stores columns, so the slice of the transpose has the rows of the block.
-        let linear = force.linear_block.transpose();
-        let blocks = linear.as_slice().iter().chain(&force.quadratic_block).chain(&force.cubic_block);
-        blocks.for_each(|number| bytes.extend(number.to_le_bytes()));
-        bytes
+        Blocks { rank, linear: linear.as_slice().to_vec(), quadratic: quadratic_block, cubic: cubic_block }
     }
 
     /// Errors of a Jacobian, relative to its largest entry.
@@ -299,7 +402,7 @@ pub(crate) mod tests {
     }
 
     fn jacobian_errors(force: &ReducedForce, q: &DVector<f64>) -> JacobianErrors {
-        let jacobian = force.jacobian(q);
+        let jacobian = force.evaluate(q).jacobian;
         let step = 1e-5 * q.abs().max();
         let mut central_differences = DMatrix::zeros(force.rank(), force.rank());
         for column in 0..force.rank() {
@@ -315,8 +418,9 @@ pub(crate) mod tests {
 
     #[test]
     fn file_round_trips_and_derivatives_agree() {
-        let force = spring_chain(&[3.0, 5.0, 11.0, 400.0], 0.7, 0.4);
-        assert_eq!(ReducedForce::parse(&encode_file(&force)).expect("a valid file"), force);
+        let blocks = spring_chain_blocks(&[3.0, 5.0, 11.0, 400.0], 0.7, 0.4);
+        let force = blocks.force();
+        assert_eq!(ReducedForce::parse(&blocks.encode()).expect("a valid file"), force);
         for seed in 0..8 {
             let q = random_vector(seed, 4);
             let JacobianErrors { difference, asymmetry } = jacobian_errors(&force, &q);
@@ -332,27 +436,35 @@ pub(crate) mod tests {
     /// in component 1), and of the cubic block (q_0 q_0 q_1 in component 0 and q_0 q_0 q_0 in component 1).
     #[test]
     fn forces_without_a_potential_are_rejected() {
-        let force = spring_chain(&[3.0, 5.0, 11.0, 400.0], 0.7, 0.4);
-        let parse = |force: &ReducedForce| ReducedForce::parse(&encode_file(force));
-        let (mut linear, mut quadratic, mut cubic) = (force.clone(), force.clone(), force.clone());
-        linear.linear_block[(0, 2)] += 1.0;
-        quadratic.quadratic_block[1] += 1.0;
-        cubic.cubic_block[1] += 1.0;
-        for (invalid_force, field) in [(linear, "cub.linear"), (quadratic, "cub.quadratic"), (cubic, "cub.cubic")] {
-            let asymmetry = jacobian_errors(&invalid_force, &random_vector(1, 4)).asymmetry;
-            assert!(asymmetry > 1e-5, "expected an asymmetric Jacobian, got the asymmetry {asymmetry}");
-            let error = parse(&invalid_force).expect_err("a force without potential").to_string();
+        let blocks = spring_chain_blocks(&[3.0, 5.0, 11.0, 400.0], 0.7, 0.4);
+        let (mut linear, mut quadratic, mut cubic) = (blocks.clone(), blocks.clone(), blocks.clone());
+        linear.linear[2] += 1.0;
+        quadratic.quadratic[1] += 1.0;
+        cubic.cubic[1] += 1.0;
+        for (invalid, field) in [(linear, "cub.linear"), (quadratic, "cub.quadratic"), (cubic, "cub.cubic")] {
+            let error = ReducedForce::parse(&invalid.encode()).expect_err("a force without potential").to_string();
             assert!(error.starts_with(field) && error.contains("forces of a potential"), "{error}");
         }
         // Rounding errors of an exporter.
-        let mut rounded = force;
-        rounded.cubic_block[1] += 1e-9;
-        parse(&rounded).expect("a valid file");
+        let mut rounded = blocks;
+        rounded.cubic[1] += 1e-9;
+        ReducedForce::parse(&rounded.encode()).expect("a valid file");
+    }
+
+    /// Component 0 of the force of [`spring_chain`] with two springs, written out.
+    #[test]
+    fn force_equals_the_polynomial_of_the_file() {
+        let force = spring_chain(&[40.0, 90.0], 30.0, 4.0);
+        for seed in 0..4 {
+            let q = random_vector(seed, 2);
+            let expected = 40.0 * q[0] + 8.0 * q[0] * q[1] + 120.0 * (q[0] - q[1]).powi(3);
+            assert!((force.force(&q)[0] - expected).abs() <= 1e-12 * expected.abs().max(1.0), "{expected}");
+        }
     }
 
     #[test]
     fn truncated_oversized_and_invalid_files_are_rejected() {
-        let valid_file = encode_file(&spring_chain(&[1.0, 2.0], 0.1, 0.1));
+        let valid_file = spring_chain_blocks(&[1.0, 2.0], 0.1, 0.1).encode();
         // The header has r = 2 in bytes 0 to 3, then the three counts in bytes 4 to 7, 8 to 11 and 12 to 15.
         let replace_byte = |index: usize, byte: u8| {
             let mut bytes = valid_file.clone();

@@ -1,5 +1,5 @@
-//! Errors of the physics process: errors of the gRPC client and of local files, invalid input, and motion
-//! that diverges.
+//! Errors of the physics process: errors of the gRPC client and of local files, invalid input, motion
+//! that diverges, and steps without a solution.
 
 /// The result type of this crate.
 pub type Result<T, E = Error> = std::result::Result<T, E>;
@@ -16,6 +16,12 @@ pub enum Error {
     /// The motion is not finite or far out of range. `subject` is a coordinate or a transform.
     #[error("step {step} ({time} s): {subject} diverged: expected {expected}, got {given}")]
     Diverged { step: u64, time: f64, subject: String, expected: String, given: String },
+    /// The equations of a step have no solution that the integrator finds. `residual` is relative to the largest force.
+    #[error(
+        "a step of {dt} s: expected a solution of the equations of motion, got a residual of {residual:.1e} with \
+         {sub_steps} sub-steps: choose smaller steps (--dt)"
+    )]
+    NotConverged { dt: f64, sub_steps: u32, residual: f64 },
 }
 
 /// Creates an `Invalid` error: `field` holds `given` instead of `expected`.

@@ -16,7 +16,10 @@
 //! | `cubic` | reduced forces of a St. Venant-Kirchhoff material from a `.cub` file, with Jacobian and potential |
 //! | `vega` | base frequency and damping from a `.config` file, and the hash of U in a `.URendering.float` file |
 //! | `force_domain` | finds the domain that a file of reduced forces belongs to |
-//! | `newmark` | implicit time integration of the reduced equations of motion |
+//! | `reduced_system` | the reduced equations of motion of a nonlinear body, and its equilibria |
+//! | `newton` | Newton's method with a line search |
+//! | `integrator` | the trait of integrators, their reports, and the exact integrator of linear modes |
+//! | `implicit` | implicit integrators of cubic forces, with sub-steps by an estimate of the error |
 //! | `bridge` | a bridge under a pulsating load |
 //! | `sweep` | motion for any scene: moves one coordinate after another, or rocks a rigid scene |
 //! | `viewer_forces` | reads the forces that viewers apply |
@@ -67,10 +70,13 @@ pub mod divergence;
 mod error;
 pub mod force_domain;
 pub mod hierarchy;
+pub mod implicit;
+pub mod integrator;
 pub mod model;
-pub mod newmark;
+mod newton;
 pub mod oscillator;
 pub mod parameters;
+pub mod reduced_system;
 mod rigid_modes;
 pub mod run;
 #[cfg(test)]

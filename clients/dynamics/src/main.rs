@@ -21,7 +21,7 @@ use modalcast_dynamics::vega::VegaSettings;
 use modalcast_dynamics::{Error, Result, invalid_input};
 use tokio::sync::watch;
 
-use cli::{Cli, Command, CommonOptions, ForceFileOptions, LoadOptions, WindOptions};
+use cli::{Cli, Command, CommonOptions, ForceFileOptions, IntegrationOptions, LoadOptions, WindOptions};
 
 /// Maximum number of surface samples per domain of a tree. A tree may have thousands of domains, and the rows of U of
 /// every sample are fetched from the server.
@@ -51,7 +51,7 @@ const fn exit_code(error: &Error) -> u8 {
     match error {
         Error::Client(error) => program::exit_code(error),
         Error::Invalid { .. } => 5,
-        Error::Diverged { .. } => 7,
+        Error::Diverged { .. } | Error::NotConverged { .. } => 7,
     }
 }
 
@@ -116,13 +116,15 @@ async fn create_scenario(client: &Client, scene: &str, command: &Command) -> Res
             };
             Ok(Box::new(TreeScenario::new(model, options)?))
         }
-        Command::Bridge { files, load, .. } => create_bridge_scenario(client, scene, files, load, dt).await,
+        Command::Bridge { files, load, integration, .. } => {
+            create_bridge_scenario(client, scene, files, load, *integration, dt).await
+        }
         Command::Sweep { displacement_fraction, .. } => {
             let model = Model::fetch(client, scene, MAX_SAMPLES).await?;
             let options = SweepOptions { dt, steps, displacement_fraction: *displacement_fraction };
             Ok(Box::new(SweepScenario::new(model, options)))
         }
-        Command::Auto { files, load, wind, displacement_fraction, .. } => {
+        Command::Auto { files, load, integration, wind, displacement_fraction, .. } => {
             // A model with few samples is enough to choose the scenario.
             let model = Model::fetch(client, scene, MAX_TREE_SAMPLES).await?;
             let force_file = find_force_file(&model, files)?;
@@ -130,7 +132,7 @@ async fn create_scenario(client: &Client, scene: &str, command: &Command) -> Res
                 eprintln!("modalcast-sim: {scene}: {remark}");
             }
             let command = if force_file.is_some() {
-                Command::Bridge { common: common.clone(), files: files.clone(), load: *load }
+                Command::Bridge { common: common.clone(), files: files.clone(), load: *load, integration: *integration }
             } else if is_tree(&model) {
                 Command::Tree { common: common.clone(), wind: *wind }
             } else if common.forces {
@@ -179,6 +181,7 @@ async fn create_bridge_scenario(
     scene: &str,
     files: &ForceFileOptions,
     load: &LoadOptions,
+    integration: IntegrationOptions,
     dt: f64,
 ) -> Result<Box<dyn Scenario>> {
     let model = Model::fetch(client, scene, MAX_SAMPLES).await?;
@@ -193,6 +196,8 @@ async fn create_bridge_scenario(
         deflection_fraction: load.deflection_fraction,
         period: load.period,
         load_direction: load.direction.into(),
+        method: integration.method.into(),
+        has_fixed_step: integration.has_fixed_step,
     };
     Ok(Box::new(BridgeScenario::new(model, force, &settings, options)?))
 }

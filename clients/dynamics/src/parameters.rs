@@ -77,6 +77,18 @@ impl ModalParameters {
         Ok(Self { modes, remarks: [held, unknown, undamped].into_iter().flatten().collect() })
     }
 
+    /// Names and frequencies in hertz of the modes that can move.
+    pub fn frequencies(&self, model: &Model) -> Vec<(String, f64)> {
+        let modes_of = |domain: &DomainModel| {
+            let modes = self.modes[domain.first_coordinate..][..domain.rank].iter().enumerate();
+            let frequency = |(mode, parameters): (usize, &Option<ModeParameters>)| {
+                Some((format!("q[{mode}] of '{}'", domain.name), frequency(parameters.as_ref()?.eigenvalue)))
+            };
+            modes.filter_map(frequency).collect::<Vec<_>>()
+        };
+        model.domains.iter().filter(|domain| domain.owns_q).flat_map(modes_of).collect()
+    }
+
     /// The lowest frequency in hertz; `None` if no mode can move.
     pub fn lowest_frequency(&self) -> Option<f64> {
         let eigenvalues = self.modes.iter().flatten().map(|mode| mode.eigenvalue);

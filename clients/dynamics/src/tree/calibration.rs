@@ -14,10 +14,11 @@ use rayon::prelude::*;
 
 use super::crown::Crown;
 use super::excitation::WindExcitation;
-use super::response::{Integrator, Response};
+use super::response::Response;
 use crate::attachments::Attachments;
 use crate::error::Result;
 use crate::hierarchy::compose_transforms;
+use crate::integrator::ModalOscillators;
 use crate::model::{DomainModel, MIN_DOMAINS_PER_THREAD, Model};
 use crate::parameters::ModalParameters;
 
@@ -114,7 +115,7 @@ impl SwayTarget {
 /// not deform the scene.
 ///
 /// # Errors
-/// `Invalid` as for [`Integrator::new`].
+/// `Invalid` as for [`ModalOscillators::new`].
 pub(super) fn calibrate(
     model: &Model,
     excitation: &WindExcitation,
@@ -160,24 +161,25 @@ fn record_unit_response(
     parameters: &ModalParameters,
 ) -> Result<UnitResponse> {
     let longest_period = parameters.lowest_frequency().map_or(0.0, f64::recip);
-    let integrator = Integrator::new(parameters, MIN_DURATION.max(MIN_PERIODS * longest_period) / STEP_COUNT as f64)?;
+    let dt = MIN_DURATION.max(MIN_PERIODS * longest_period) / STEP_COUNT as f64;
+    let integrator = ModalOscillators::new(parameters, dt)?;
     // Record every `stride`-th state, so that all of them fit in `MAX_STATE_BYTES`. A state has 8 bytes per coordinate.
     let stride = (STEP_COUNT * model.coordinate_count as u64 * 8).div_ceil(MAX_STATE_BYTES).max(1);
     let mut bending = vec![0.0_f64; model.domains.len()];
     let mut recorded_states = vec![];
     let mut response = Response::at_rest(model);
     for step in 1..=STEP_COUNT {
-        response = integrator.advance(model, excitation, &response, step);
+        response = response.next(&integrator, model, excitation, step)?;
         let q = response.q();
         let domains = model.domains.par_iter().with_min_len(MIN_DOMAINS_PER_THREAD);
-        let displacements: Vec<f64> = domains.map(|domain| elastic_displacement(domain, domain.q(&q))).collect();
+        let displacements: Vec<f64> = domains.map(|domain| elastic_displacement(domain, domain.q(q))).collect();
         let root_displacements = model.domains.iter().zip(&displacements).filter(|(domain, _)| domain.joint.is_none());
         let trunk_displacement: f64 = root_displacements.map(|(_, displacement)| displacement).sum();
         for (bending, displacement) in bending.iter_mut().zip(displacements) {
             *bending = bending.max(displacement);
         }
         if step % stride == 0 {
-            recorded_states.push((trunk_displacement, q));
+            recorded_states.push((trunk_displacement, q.to_vec()));
         }
     }
     // Largest trunk displacement first.

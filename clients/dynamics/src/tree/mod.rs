@@ -17,6 +17,7 @@ use crate::affine::AffineTransform;
 use crate::attachments::Attachments;
 use crate::error::{Result, check_option, invalid_input};
 use crate::hierarchy::{JointGapMeter, compose_transforms};
+use crate::integrator::{ModalOscillators, nyquist_remark};
 use crate::model::{DomainModel, Model};
 use crate::parameters::ModalParameters;
 use crate::run::{Report, Scenario};
@@ -25,7 +26,7 @@ use crate::wind::{Wind, WindPressure};
 use calibration::{Calibration, MAX_BRANCH_BENDING, SwayTarget, calibrate, scale_response};
 use crown::Crown;
 use excitation::WindExcitation;
-use response::{Integrator, Response, ViewerResponse};
+use response::{Response, ViewerResponse};
 
 /// Rotation of a rigid leaf about its base in the pressure of the mean wind at strength 1, in radians.
 const LEAF_ANGLE: f64 = 0.1;
@@ -57,7 +58,7 @@ pub struct TreeScenario {
     model: Model,
     excitation: WindExcitation,
     options: TreeOptions,
-    integrator: Integrator,
+    integrator: ModalOscillators,
     /// The response at step `next_step`.
     response: Response,
     /// The response to the forces of viewers; `None` until there are any.
@@ -136,7 +137,7 @@ impl TreeScenario {
             return Err(invalid_input("scene.eigenvalues", "a domain whose modes have eigenvalues", given));
         }
         let parameters = ModalParameters::read(&model)?;
-        let integrator = Integrator::new(&parameters, options.dt)?;
+        let integrator = ModalOscillators::new(&parameters, options.dt)?;
         let excitation =
             WindExcitation::new(&model, options.direction_radians, options.seed, options.nyquist_frequency());
         let crown = Crown::select(&model);
@@ -161,7 +162,7 @@ impl TreeScenario {
             crown,
             attachments: Attachments::new(&model),
             gap_meter: JointGapMeter::new(&model),
-            remarks: create_remarks(&parameters, &options, &calibration),
+            remarks: create_remarks(&model, &parameters, &options, &calibration),
             calibration,
             rigid_leaves: find_rigid_leaves(&model),
             earlier_peaks: Peaks::default(),
@@ -171,8 +172,8 @@ impl TreeScenario {
     }
 
     /// The response one step after `next_step`.
-    fn next_response(&self) -> Response {
-        self.integrator.advance(&self.model, &self.excitation, &self.response, self.next_step + 1)
+    fn next_response(&self) -> Result<Response> {
+        self.response.next(&self.integrator, &self.model, &self.excitation, self.next_step + 1)
     }
 
     /// The largest values of a step.
@@ -215,7 +216,7 @@ impl Scenario for TreeScenario {
     }
 
     fn compute_next_step(&mut self, values: &mut StepValues) -> Result<()> {
-        let mut q = scale_response(&self.model, &self.response.q(), &self.calibration.gains);
+        let mut q = scale_response(&self.model, self.response.q(), &self.calibration.gains);
         if let Some(viewer_response) = &self.viewer_response {
             viewer_response.add_to(&mut q);
         }
@@ -231,9 +232,9 @@ impl Scenario for TreeScenario {
         values.transforms = world_from_domain.iter().map(|transform| transform.to_row_major()).collect();
         let world_from_domain = values.transforms.iter().map(AffineTransform::from_row_major).collect();
         (self.earlier_peaks, self.last_step) = (earlier_peaks, Some(SentStep { q, world_from_domain }));
-        (self.response, self.next_step) = (next_response, self.next_step + 1);
+        (self.response, self.next_step) = (next_response?, self.next_step + 1);
         if let Some(viewer_response) = &mut self.viewer_response {
-            viewer_response.advance(&self.integrator);
+            viewer_response.advance(&self.integrator)?;
         }
         Ok(())
     }
@@ -283,7 +284,12 @@ fn find_rigid_leaves(model: &Model) -> Vec<bool> {
 }
 
 /// Remarks on held modes, omitted gusts and limited sway.
-fn create_remarks(parameters: &ModalParameters, options: &TreeOptions, calibration: &Calibration) -> Vec<String> {
+fn create_remarks(
+    model: &Model,
+    parameters: &ModalParameters,
+    options: &TreeOptions,
+    calibration: &Calibration,
+) -> Vec<String> {
     let left_out_gusts = (options.nyquist_frequency() < Wind::highest_frequency()).then(|| {
         format!(
             "gusts above {} Hz are left out, because steps of {} s do not resolve them: choose steps below {} s",
@@ -300,5 +306,7 @@ fn create_remarks(parameters: &ModalParameters, options: &TreeOptions, calibrati
             calibration.sway_fraction
         )
     });
-    parameters.remarks.iter().cloned().chain(left_out_gusts).chain(limited_sway).collect()
+    let unresolved_modes = nyquist_remark(parameters.frequencies(model), options.dt);
+    let remarks = parameters.remarks.iter().cloned();
+    remarks.chain(left_out_gusts).chain(limited_sway).chain(unresolved_modes).collect()
 }
