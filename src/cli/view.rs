@@ -28,6 +28,7 @@ const PHYSICS_PROGRAM: &str = "modalcast-sim";
   modalcast view tree
   modalcast view path/to/simpleBridge --no-sim
   modalcast view part.stl --modes 20 --material steel --clamp 'z < 0.01'
+  modalcast view fork.npz --slow 100                pulled and seen in slow motion
   modalcast view tree.mcap                          plays a recording
   modalcast view model.glb --listen 0.0.0.0:50051   also for browsers on other machines")]
 pub(super) struct Args {
@@ -40,11 +41,15 @@ pub(super) struct Args {
     /// Print the URL and do not open a browser.
     #[arg(long)]
     no_open: bool,
-    /// Move the scene with the physics process `modalcast-sim auto --forces`, so that viewers can pull on the scene. A
+    /// Move the scene with the physics process `modalcast-sim --forces`, so that viewers can pull on the scene. A
     /// scene with neither eigenvalues nor cubic forces stays at rest. Default: on if the program is in the folder of
     /// this one.
     #[arg(long, overrides_with = "no_sim")]
     sim: bool,
+    /// Slow motion: the physics process simulates 1/FACTOR of the real time. A body of metal vibrates too fast to be seen
+    /// without it; try 100.
+    #[arg(long, value_name = "FACTOR", default_value_t = 1.0, value_parser = parse_factor)]
+    slow: f64,
     /// Show the scene at rest, until another process drives it.
     #[arg(long)]
     no_sim: bool,
@@ -161,7 +166,8 @@ async fn view(
     // The sockets are already open, so the browser and the physics process wait until the server answers.
     // Names of scenes have only letters that are valid in a URL.
     args.show(&format!("{}#scene={scene}", viewer_url(&listener)?));
-    let physics = physics_program.map(|path| start_physics(&path, &force_files, &listener, &scene)).transpose()?;
+    let start = |path: PathBuf| start_physics(&path, args.slow, &force_files, &listener, &scene);
+    let physics = physics_program.map(start).transpose()?;
     let (stop_sender, stopped) = oneshot::channel();
     let physics = physics.map(|physics| tokio::spawn(physics.supervise(engine.clone(), scene, stopped)));
     let shutdown = async move {
@@ -190,12 +196,24 @@ fn viewer_url(listener: &Listener) -> Result<String> {
     listener.viewer_urls().into_iter().next().ok_or_else(|| fault("view", "expected the URL of the viewer"))
 }
 
-fn start_physics(program: &Path, force_files: &ForceFiles, listener: &Listener, scene: &str) -> Result<PhysicsProcess> {
+fn start_physics(
+    program: &Path,
+    slow: f64,
+    force_files: &ForceFiles,
+    listener: &Listener,
+    scene: &str,
+) -> Result<PhysicsProcess> {
     let server = listener.local_urls().into_iter().next().ok_or_else(|| fault("view", "expected an address"))?;
-    let mut flags = vec!["auto".to_owned(), "--server".into(), server, "--scene".into(), scene.into()];
+    let mut flags =
+        vec!["--server".to_owned(), server, "--scene".into(), scene.into(), "--slow".into(), slow.to_string()];
     flags.extend(["--wait", "30", "--seconds", "0", "--realtime", "--forces", "--delivery", "latest"].map(Into::into));
     flags.extend(force_files.flags());
     PhysicsProcess::start(program, &flags)
+}
+
+fn parse_factor(text: &str) -> std::result::Result<f64, String> {
+    let factor = text.parse().ok().filter(|factor: &f64| *factor > 0.0 && *factor <= 1e6);
+    factor.ok_or_else(|| "expected a positive number up to 1000000".into())
 }
 
 /// Opens a URL in the browser. A machine without a browser is not an error, because the URL is printed.

@@ -101,7 +101,7 @@ def refused(viewer, server):
 @contextlib.contextmanager
 def physics(program, server):
     """A physics process that applies the forces of viewers to the tree in calm air."""
-    command = [program.parent / "modalcast-sim", "tree", "--server", f"http://{server.address}", "--scene", "tree"]
+    command = [program.parent / "modalcast-sim", "--server", f"http://{server.address}", "--scene", "tree"]
     command += ["--seconds", "0", "--realtime", "--forces", "--wind", "0"]
     process = subprocess.Popen([str(part) for part in command], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
     try:

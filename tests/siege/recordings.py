@@ -154,7 +154,7 @@ def record_tree(program, server, folder):
     with subprocess.Popen([str(part) for part in command], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as recorder:
         # The line `ready`: later steps are recorded.
         recorder.stdout.readline()
-        physics = [program.with_name("modalcast-sim"), "tree", "--server", url, "--scene", "tree", "--steps", "10"]
+        physics = [program.with_name("modalcast-sim"), "--server", url, "--scene", "tree", "--steps", "10"]
         subprocess.run(physics, check=True, capture_output=True)
         if recorder.wait(60) != 0:
             raise RuntimeError(recorder.stderr.read().decode())

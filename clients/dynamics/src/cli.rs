@@ -9,74 +9,60 @@ use modalcast_dynamics::implicit::ImplicitMethod;
 
 const EXAMPLES: &str = "\
 Examples:
-  modalcast-sim tree --open tree --scene tree --steps 60 --json
-  modalcast-sim bridge --open simpleBridge --scene bridge --cubic simpleBridge.cub --seconds 4
+  modalcast-sim tree --forces --seconds 0 --realtime
+  modalcast-sim --open tree --scene tree --steps 60 --json
+  modalcast-sim --open simpleBridge --scene bridge --cubic simpleBridge.cub --seconds 4
+  modalcast-sim fork --slow 100 --forces --seconds 0 --realtime
   modalcast-sim sweep --open MorphStressTest --scene morph --record out/record
-  modalcast-sim auto --scene demo --files ../data/vega/simpleBridge --seconds 0 --realtime
 
 Exit codes: 0 done; 1 rejected by the server (unknown scene, or a scene with another writer); 2 invalid command line;
 3 connection failed or lost; 4 local file error; 5 invalid content of a file, a scene or a reply; 6 done, but the server
-rejected steps; 7 stopped before a step that is not finite or far out of range.";
+rejected steps; 7 stopped before a step that has no solution, is not finite or is far out of range.";
 
-/// Drives a scene of a modalcast server: wind on trees, a load on a bridge, or a sweep through all coordinates.
+/// Drives a scene of a modalcast server by the physics that the scene has. Eigenvalues: every mode is integrated
+/// exactly, in a wind if domains are attached to each other (a tree). Cubic forces of the FEM library Vega: implicit
+/// integration, under a pulsating load on the middle (a bridge). Neither: one mode after another is shown; with --forces,
+/// which such a scene cannot follow, this is an error.
+///
+/// The notes damping_ratio and rigid_modes of a domain set its damping and the number of modes that are held still.
 #[derive(Debug, Parser)]
-#[command(name = "modalcast-sim", version, after_help = EXAMPLES)]
+#[command(name = "modalcast-sim", version, after_help = EXAMPLES, args_conflicts_with_subcommands = true)]
 pub(crate) struct Cli {
     #[command(subcommand)]
-    pub(crate) command: Command,
+    pub(crate) command: Option<Command>,
+    #[command(flatten)]
+    pub(crate) common: CommonOptions,
+    #[command(flatten)]
+    pub(crate) physics: PhysicsOptions,
 }
 
 #[derive(Debug, Subcommand)]
 pub(crate) enum Command {
-    /// Wind on a tree by modal superposition, with exact integration of every mode. The scene must have eigenvalues.
-    /// The notes damping_ratio and rigid_modes of a domain set its damping and the number of modes that are held still.
-    #[command(after_help = EXAMPLES)]
-    Tree {
-        #[command(flatten)]
-        common: CommonOptions,
-        #[command(flatten)]
-        wind: WindOptions,
-    },
-    /// A pulsating load on the middle of a bridge, by Vega's reduced cubic forces.
-    #[command(after_help = EXAMPLES)]
-    Bridge {
-        #[command(flatten)]
-        common: CommonOptions,
-        #[command(flatten)]
-        files: ForceFileOptions,
-        #[command(flatten)]
-        load: LoadOptions,
-        #[command(flatten)]
-        integration: IntegrationOptions,
-    },
-    /// Moves one coordinate after another; rocks a scene without coordinates.
+    /// Moves one coordinate after another; rocks a scene without coordinates. Needs no physics.
     #[command(after_help = EXAMPLES)]
     Sweep {
         #[command(flatten)]
         common: CommonOptions,
         /// Largest displacement as a fraction of the diagonal of the scene's bounds.
-        #[arg(long = "share", value_name = "SHARE", default_value_t = 0.06, value_parser = parse_fraction)]
+        #[arg(long = "share", value_name = "SHARE", default_value_t = SWEEP_SHARE, value_parser = parse_fraction)]
         displacement_fraction: f64,
     },
-    /// Selects the scenario: the bridge if cubic forces are available, else the tree if the scene has eigenvalues and
-    /// attached domains, else the sweep. With --forces, the tree without wind takes the place of the sweep; it needs
-    /// eigenvalues.
-    #[command(after_help = EXAMPLES)]
-    Auto {
-        #[command(flatten)]
-        common: CommonOptions,
-        #[command(flatten)]
-        files: ForceFileOptions,
-        #[command(flatten)]
-        load: LoadOptions,
-        #[command(flatten)]
-        integration: IntegrationOptions,
-        #[command(flatten)]
-        wind: WindOptions,
-        /// Largest displacement of the sweep as a fraction of the diagonal of the scene's bounds.
-        #[arg(long = "share", value_name = "SHARE", default_value_t = 0.06, value_parser = parse_fraction)]
-        displacement_fraction: f64,
-    },
+}
+
+/// Largest displacement of a sweep as a fraction of the diagonal of the scene's bounds.
+pub(crate) const SWEEP_SHARE: f64 = 0.06;
+
+/// Options of the physics of a scene.
+#[derive(Debug, Clone, Args)]
+pub(crate) struct PhysicsOptions {
+    #[command(flatten)]
+    pub(crate) wind: WindOptions,
+    #[command(flatten)]
+    pub(crate) files: ForceFileOptions,
+    #[command(flatten)]
+    pub(crate) load: LoadOptions,
+    #[command(flatten)]
+    pub(crate) integration: IntegrationOptions,
 }
 
 #[derive(Debug, Clone, Args)]
@@ -88,8 +74,11 @@ pub(crate) struct CommonOptions {
     #[arg(long, default_value_t = 0.0, value_parser = parse_non_negative)]
     pub(crate) wait: f64,
     /// The scene's name on the server.
-    #[arg(long, default_value = "tree")]
-    pub(crate) scene: String,
+    #[arg(value_name = "SCENE", conflicts_with = "scene")]
+    positional_scene: Option<String>,
+    /// The scene's name on the server, as SCENE.
+    #[arg(long, value_name = "NAME", default_value = "tree")]
+    scene: String,
     /// First opens a scene from this source in the server's scene repository, and names it as --scene says.
     #[arg(long, value_name = "SOURCE")]
     pub(crate) open: Option<String>,
@@ -99,9 +88,13 @@ pub(crate) struct CommonOptions {
     /// Number of steps, in place of --seconds; 0 runs until interrupted.
     #[arg(long, conflicts_with = "seconds")]
     pub(crate) steps: Option<u64>,
-    /// Seconds per step.
+    /// Seconds per step, in which --realtime sends a step.
     #[arg(long, default_value_t = 1.0 / 60.0, value_parser = parse_positive)]
     pub(crate) dt: f64,
+    /// Slow motion: the simulated time of a step is --dt divided by this factor. A tuning fork vibrates too fast for 60
+    /// steps per second; at 100 its vibration is visible.
+    #[arg(long, value_name = "FACTOR", default_value_t = 1.0, value_parser = parse_positive)]
+    pub(crate) slow: f64,
     /// lossless: process every step; latest: skip to the newest step.
     #[arg(long, value_enum, default_value = "lossless")]
     pub(crate) delivery: DeliveryOption,
@@ -112,7 +105,8 @@ pub(crate) struct CommonOptions {
     /// Run in real time instead of as fast as possible.
     #[arg(long)]
     pub(crate) realtime: bool,
-    /// Add the forces that viewers apply to the scene (ApplyForces) to those of the tree or the bridge.
+    /// Add the forces that viewers apply to the scene (ApplyForces). A scene that is neither a tree nor a bridge then
+    /// moves by these forces alone.
     #[arg(long)]
     pub(crate) forces: bool,
     /// Write q.npy (steps x coordinates) and transforms.npy (steps x domains x 12), float32, into this folder.
@@ -141,9 +135,9 @@ impl From<DeliveryOption> for Delivery {
 #[derive(Debug, Clone, Copy, Args)]
 pub(crate) struct WindOptions {
     /// Strength of the wind. At 1, the crown sways by `--sway`. The wind has the spectrum of turbulence 10 m above
-    /// suburbs or forest, and begins with its strongest gust.
-    #[arg(long = "wind", value_name = "WIND", default_value_t = 1.0, value_parser = parse_non_negative)]
-    pub(crate) strength: f64,
+    /// suburbs or forest, and begins with its strongest gust. Default: 1 if domains are attached to each other, else 0.
+    #[arg(long = "wind", value_name = "WIND", value_parser = parse_non_negative)]
+    pub(crate) strength: Option<f64>,
     /// Peak displacement of the crown in 30 s at wind 1, as a fraction of the scene's height. Shorter runs may not
     /// reach it.
     #[arg(long = "sway", value_name = "SWAY", default_value_t = 0.05, value_parser = parse_fraction)]
@@ -237,22 +231,34 @@ impl From<LoadDirectionOption> for LoadDirection {
     }
 }
 
-impl Command {
+impl Cli {
+    /// The options of every kind of motion.
     pub(crate) const fn common(&self) -> &CommonOptions {
-        match self {
-            Self::Tree { common, .. }
-            | Self::Bridge { common, .. }
-            | Self::Sweep { common, .. }
-            | Self::Auto { common, .. } => common,
+        match &self.command {
+            Some(Command::Sweep { common, .. }) => common,
+            None => &self.common,
         }
     }
+}
 
-    pub(crate) const fn name(&self) -> &'static str {
-        match self {
-            Self::Tree { .. } => "tree",
-            Self::Bridge { .. } => "bridge",
-            Self::Sweep { .. } => "sweep",
-            Self::Auto { .. } => "auto",
+impl CommonOptions {
+    /// The scene's name on the server.
+    pub(crate) fn scene(&self) -> &str {
+        self.positional_scene.as_deref().unwrap_or(&self.scene)
+    }
+
+    /// Simulated seconds per step.
+    pub(crate) fn simulated_dt(&self) -> f64 {
+        self.dt / self.slow
+    }
+
+    /// The number of steps; `None` for an unlimited run.
+    pub(crate) fn step_count(&self) -> Option<u64> {
+        match (self.steps, self.seconds) {
+            (Some(0), _) => None,
+            (Some(steps), _) => Some(steps),
+            (None, seconds) if seconds > 0.0 => Some((seconds / self.simulated_dt()).ceil().max(1.0) as u64),
+            (None, _) => None,
         }
     }
 }
@@ -286,6 +292,20 @@ mod tests {
     fn command_line_is_valid() {
         use clap::CommandFactory as _;
         Cli::command().debug_assert();
+    }
+
+    #[test]
+    fn slow_motion_divides_the_simulated_time() {
+        let parse = |arguments: &[&str]| Cli::try_parse_from([&["modalcast-sim"][..], arguments].concat());
+        let cli = parse(&["fork", "--slow", "100", "--dt", "0.5", "--seconds", "2"]).expect("valid arguments");
+        let common = cli.common();
+        assert_eq!((common.scene(), common.simulated_dt(), common.step_count()), ("fork", 0.005, Some(400)));
+        let sweep = parse(&["sweep", "fork", "--dt", "0.5", "--seconds", "2"]).expect("valid arguments");
+        assert_eq!((sweep.common().scene(), sweep.common().step_count()), ("fork", Some(4)));
+        assert_eq!(parse(&[]).expect("valid arguments").common().scene(), "tree");
+        for invalid in [&["fork", "--scene", "tree"][..], &["--slow", "0"], &["--slow", "nan"]] {
+            assert!(parse(invalid).is_err(), "{invalid:?}");
+        }
     }
 
     #[test]

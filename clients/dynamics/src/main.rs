@@ -21,7 +21,7 @@ use modalcast_dynamics::vega::VegaSettings;
 use modalcast_dynamics::{Error, Result, invalid_input};
 use tokio::sync::watch;
 
-use cli::{Cli, Command, CommonOptions, ForceFileOptions, IntegrationOptions, LoadOptions, WindOptions};
+use cli::{Cli, Command, ForceFileOptions, PhysicsOptions, SWEEP_SHARE};
 
 /// Maximum number of surface samples per domain of a tree. A tree may have thousands of domains, and the rows of U of
 /// every sample are fetched from the server.
@@ -40,7 +40,7 @@ fn main() -> ExitCode {
     let arguments = Cli::parse();
     let main = async {
         let summary = run_scenario(&arguments).await?;
-        print_report(&summary.report, arguments.command.common().json);
+        print_report(&summary.report, arguments.common().json);
         Ok(if summary.rejected_steps > 0 { EXIT_STEPS_REJECTED } else { 0 })
     };
     program::run("modalcast-sim", main, exit_code)
@@ -56,13 +56,13 @@ const fn exit_code(error: &Error) -> u8 {
 }
 
 async fn run_scenario(arguments: &Cli) -> Result<RunSummary> {
-    let common = arguments.command.common();
+    let common = arguments.common();
     let client = Client::connect_with_retry(&common.server, Duration::from_secs_f64(common.wait)).await?;
     let scene = match &common.open {
-        Some(source) => client.open_scene(source, &common.scene).await?.scene,
-        None => common.scene.clone(),
+        Some(source) => client.open_scene(source, common.scene()).await?.scene,
+        None => common.scene().to_owned(),
     };
-    let mut scenario = create_scenario(&client, &scene, &arguments.command).await?;
+    let mut scenario = create_scenario(&client, &scene, arguments).await?;
     for remark in scenario.remarks() {
         eprintln!("modalcast-sim: {scene}: {remark}");
     }
@@ -78,7 +78,8 @@ async fn run_scenario(arguments: &Cli) -> Result<RunSummary> {
     });
     let options = RunOptions {
         steps: common.step_count(),
-        dt: common.dt,
+        dt: common.simulated_dt(),
+        slow: common.slow,
         delivery: common.delivery.into(),
         window: common.window,
         realtime: common.realtime,
@@ -101,54 +102,62 @@ async fn wait_for_shutdown_signal() {
     }
 }
 
-async fn create_scenario(client: &Client, scene: &str, command: &Command) -> Result<Box<dyn Scenario>> {
-    let common = command.common();
-    let (dt, steps) = (common.dt, common.step_count());
-    match command {
-        Command::Tree { wind, .. } => {
-            let model = Model::fetch(client, scene, MAX_TREE_SAMPLES).await?;
-            let options = TreeOptions {
-                dt,
-                sway_fraction: wind.sway_fraction,
-                wind_strength: wind.strength,
-                direction_radians: wind.direction_degrees.to_radians(),
-                seed: wind.seed,
-            };
-            Ok(Box::new(TreeScenario::new(model, options)?))
+async fn create_scenario(client: &Client, scene: &str, arguments: &Cli) -> Result<Box<dyn Scenario>> {
+    let common = arguments.common();
+    let sweep = |model: Model, displacement_fraction: f64| {
+        let options = SweepOptions { dt: common.simulated_dt(), steps: common.step_count(), displacement_fraction };
+        Box::new(SweepScenario::new(model, options))
+    };
+    if let Some(Command::Sweep { displacement_fraction, .. }) = &arguments.command {
+        return Ok(sweep(Model::fetch(client, scene, MAX_SAMPLES).await?, *displacement_fraction));
+    }
+    let PhysicsOptions { wind, files, .. } = &arguments.physics;
+    // A model with few samples is enough to select the physics.
+    let model = Model::fetch(client, scene, MAX_TREE_SAMPLES).await?;
+    let announce = |motion: &str| eprintln!("modalcast-sim: {scene}: {motion}");
+    if let Some(force_path) = find_force_file(&model, files)? {
+        announce("cubic forces under a pulsating load");
+        return create_bridge_scenario(client, scene, arguments, &force_path).await;
+    }
+    if let Some(remark) = unused_force_files(files) {
+        announce(&remark);
+    }
+    let wind_strength = match wind.strength {
+        Some(strength) => Some(strength),
+        None if is_tree(&model) => Some(1.0),
+        None => None,
+    };
+    match wind_strength {
+        Some(wind_strength) => {
+            announce(&format!("modes in wind {wind_strength}"));
+            create_tree_scenario(model, arguments, wind_strength)
         }
-        Command::Bridge { files, load, integration, .. } => {
-            create_bridge_scenario(client, scene, files, load, *integration, dt).await
+        None if common.forces => {
+            check_forces_move(&model)?;
+            announce("modes under the forces of viewers");
+            create_tree_scenario(model, arguments, 0.0)
         }
-        Command::Sweep { displacement_fraction, .. } => {
-            let model = Model::fetch(client, scene, MAX_SAMPLES).await?;
-            let options = SweepOptions { dt, steps, displacement_fraction: *displacement_fraction };
-            Ok(Box::new(SweepScenario::new(model, options)))
-        }
-        Command::Auto { files, load, integration, wind, displacement_fraction, .. } => {
-            // A model with few samples is enough to choose the scenario.
-            let model = Model::fetch(client, scene, MAX_TREE_SAMPLES).await?;
-            let force_file = find_force_file(&model, files)?;
-            if let Some(remark) = unused_force_files(files).filter(|_| force_file.is_none()) {
-                eprintln!("modalcast-sim: {scene}: {remark}");
-            }
-            let command = if force_file.is_some() {
-                Command::Bridge { common: common.clone(), files: files.clone(), load: *load, integration: *integration }
-            } else if is_tree(&model) {
-                Command::Tree { common: common.clone(), wind: *wind }
-            } else if common.forces {
-                check_forces_move(&model)?;
-                Command::Tree { common: common.clone(), wind: WindOptions { strength: 0.0, ..*wind } }
-            } else {
-                Command::Sweep { common: common.clone(), displacement_fraction: *displacement_fraction }
-            };
-            eprintln!("modalcast-sim: {scene}: scenario `{}`", command.name());
-            Box::pin(create_scenario(client, scene, &command)).await
+        None => {
+            announce("sweep through all modes (no wind, no cubic forces and no --forces)");
+            Ok(sweep(Model::fetch(client, scene, MAX_SAMPLES).await?, SWEEP_SHARE))
         }
     }
 }
 
-/// Whether the wind scenario fits: some domain has eigenvalues, and some domain is attached to another one. A single
-/// beam with eigenvalues is stiffer than a tree, so that wind would hardly move it; the sweep shows its modes.
+fn create_tree_scenario(model: Model, arguments: &Cli, wind_strength: f64) -> Result<Box<dyn Scenario>> {
+    let wind = &arguments.physics.wind;
+    let options = TreeOptions {
+        dt: arguments.common().simulated_dt(),
+        sway_fraction: wind.sway_fraction,
+        wind_strength,
+        direction_radians: wind.direction_degrees.to_radians(),
+        seed: wind.seed,
+    };
+    Ok(Box::new(TreeScenario::new(model, options)?))
+}
+
+/// Whether wind moves the scene by default: some domain has eigenvalues, and some domain is attached to another one. A
+/// single beam with eigenvalues is stiffer than a tree, so that wind would hardly move it.
 fn is_tree(model: &Model) -> bool {
     let has_eigenvalues = model.domains.iter().any(|domain| !domain.eigenvalues.is_empty());
     has_eigenvalues && model.domains.iter().any(|domain| domain.joint.is_some())
@@ -179,20 +188,18 @@ fn check_forces_move(model: &Model) -> Result<()> {
 async fn create_bridge_scenario(
     client: &Client,
     scene: &str,
-    files: &ForceFileOptions,
-    load: &LoadOptions,
-    integration: IntegrationOptions,
-    dt: f64,
+    arguments: &Cli,
+    force_path: &Path,
 ) -> Result<Box<dyn Scenario>> {
+    let PhysicsOptions { files, load, integration, .. } = &arguments.physics;
     let model = Model::fetch(client, scene, MAX_SAMPLES).await?;
-    let force_path = require_force_file(&model, files)?;
     let default_config = force_path.with_extension("config");
     let config_path = files.config.clone().or_else(|| default_config.is_file().then_some(default_config));
     let settings = config_path.map_or_else(|| Ok(VegaSettings::default()), |path| VegaSettings::read(&path))?;
-    let force = ReducedForce::read(&force_path)?;
+    let force = ReducedForce::read(force_path)?;
     let options = BridgeOptions {
-        domain: find_force_domain(client, scene, files.domain.as_deref(), &force_path).await?,
-        dt,
+        domain: find_force_domain(client, scene, files.domain.as_deref(), force_path).await?,
+        dt: arguments.common().simulated_dt(),
         deflection_fraction: load.deflection_fraction,
         period: load.period,
         load_direction: load.direction.into(),
@@ -200,14 +207,6 @@ async fn create_bridge_scenario(
         has_fixed_step: integration.has_fixed_step,
     };
     Ok(Box::new(BridgeScenario::new(model, force, &settings, options)?))
-}
-
-/// As [`find_force_file`], but a missing file is an error.
-fn require_force_file(model: &Model, files: &ForceFileOptions) -> Result<PathBuf> {
-    find_force_file(model, files)?.ok_or_else(|| {
-        let expected = "--cubic FILE.cub, or --files DIR with the one file that a note vega.cubic of the scene names";
-        invalid_input("cubic", expected, "no such file")
-    })
 }
 
 /// Finds the file of reduced forces: the file of `--cubic`, else the file in `--files` that the note `vega.cubic` of a
@@ -253,17 +252,5 @@ fn print_report(report: &Report, as_json: bool) {
     }
     for (name, value) in report {
         println!("{name:24} {value}");
-    }
-}
-
-impl CommonOptions {
-    /// The number of steps; `None` for an unlimited run.
-    fn step_count(&self) -> Option<u64> {
-        match (self.steps, self.seconds) {
-            (Some(0), _) => None,
-            (Some(steps), _) => Some(steps),
-            (None, seconds) if seconds > 0.0 => Some((seconds / self.dt).ceil().max(1.0) as u64),
-            (None, _) => None,
-        }
     }
 }

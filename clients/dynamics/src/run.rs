@@ -43,11 +43,7 @@ pub trait Scenario {
     /// # Errors
     /// `Invalid` if the motion of the scenario does not follow from forces.
     fn set_viewer_forces(&mut self, _forces: &[f64]) -> Result<()> {
-        Err(invalid_input(
-            "--forces",
-            "a scenario whose motion follows from forces (tree or bridge)",
-            "another scenario",
-        ))
+        Err(invalid_input("--forces", "a motion that follows from forces", "a sweep"))
     }
 
     /// Sentences about parts of the input that the motion does not show, such as modes that are held still. They hold
@@ -82,12 +78,14 @@ pub fn aliasing_remark(subject: &str, period: f64, dt: f64) -> Option<String> {
 pub struct RunOptions {
     /// Number of steps. `None` runs until the caller stops the run.
     pub steps: Option<u64>,
-    /// Seconds per step.
+    /// Simulated seconds per step.
     pub dt: f64,
+    /// Real seconds per simulated second, for `realtime`.
+    pub slow: f64,
     pub delivery: Delivery,
     /// Maximum number of steps in flight. `None` and 0 select the server's default.
     pub window: Option<u32>,
-    /// Whether to run in real time.
+    /// Whether to run in real time, or `slow` times slower.
     pub realtime: bool,
     /// Whether the forces of viewers act on the scene.
     pub applies_viewer_forces: bool,
@@ -141,6 +139,7 @@ pub async fn drive_scene(
     report.extend(Report::from_iter([
         ("scene".to_owned(), json!(scenario.model().scene)),
         ("dt_s".to_owned(), json!(options.dt)),
+        ("slow".to_owned(), json!(options.slow)),
         ("remarks".to_owned(), json!(scenario.remarks())),
     ]));
     Ok(RunSummary { sent_steps: stream_summary.sent, rejected_steps: stream_summary.rejected, report })
@@ -191,7 +190,8 @@ impl<'a> Driver<'a> {
             let time = step_number as f64 * options.dt;
             if options.realtime {
                 // Adding `Duration::MAX` itself would overflow.
-                let due_time = self.start + Duration::try_from_secs_f64(time).unwrap_or(Duration::MAX / 4);
+                let due_time =
+                    self.start + Duration::try_from_secs_f64(time * options.slow).unwrap_or(Duration::MAX / 4);
                 tokio::time::sleep_until(due_time.into()).await;
             }
             // After the pause, so that a force that arrives during the pause acts in this step.

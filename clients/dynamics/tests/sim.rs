@@ -109,7 +109,7 @@ async fn tree_sways_and_subscribers_receive_closed_joints() {
     let mut vertex_stream = client.stream_vertices(&request).await.expect("a stream");
     let folder = tempfile::tempdir().expect("a temporary folder");
     let record = folder.path().display().to_string();
-    let sim_output = run_sim(&url, &["tree", "--scene", "toy", "--steps", "90", "--json", "--record", &record]).await;
+    let sim_output = run_sim(&url, &["--scene", "toy", "--steps", "90", "--json", "--record", &record]).await;
     assert_eq!(sim_output.exit_code, 0, "{}", sim_output.stderr);
     let report = sim_output.report();
     assert_eq!((report["steps_sent"].as_u64(), report["rejected"].as_u64()), (Some(90), Some(0)));
@@ -159,8 +159,9 @@ async fn followers_get_no_transforms_and_move_with_their_leaders() {
     let server = Arc::new(server);
     let rest_positions = server.output().positions;
     let url = serve(Arc::clone(&server)).await;
-    for scenario in ["sweep", "tree"] {
-        let sim_output = run_sim(&url, &[scenario, "--scene", "toy", "--steps", "30", "--json"]).await;
+    for motion in [&["sweep"][..], &[]] {
+        let arguments = [motion, &["--scene", "toy", "--steps", "30", "--json"]].concat();
+        let sim_output = run_sim(&url, &arguments).await;
         assert_eq!(sim_output.exit_code, 0, "{}", sim_output.stderr);
         let report = sim_output.report();
         assert_eq!((report["steps_sent"].as_u64(), report["rejected"].as_u64()), (Some(30), Some(0)), "{report}");
@@ -174,7 +175,7 @@ async fn followers_get_no_transforms_and_move_with_their_leaders() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn auto_selects_tree_or_sweep_by_scene() {
+async fn motion_follows_from_the_content_of_the_scene() {
     let mut server_without_eigenvalues = tree_server();
     server_without_eigenvalues.domains.iter_mut().for_each(|domain| domain.shape.eigenvalues.clear());
     let triangle = vec![-1.0, 0.0, -1.0, 1.0, 2.0, 1.0, 0.0, 1.0, 0.0];
@@ -182,8 +183,8 @@ async fn auto_selects_tree_or_sweep_by_scene() {
     // One beam with eigenvalues is no tree.
     let mut beam_server = tree_server();
     beam_server.domains.truncate(1);
-    for (server, scenario) in [
-        (tree_server(), "tree"),
+    for (server, motion) in [
+        (tree_server(), "modes in wind 1"),
         (server_without_eigenvalues, "sweep"),
         (beam_server, "sweep"),
         (rigid_server, "sweep"),
@@ -191,11 +192,11 @@ async fn auto_selects_tree_or_sweep_by_scene() {
         let server = Arc::new(server);
         let rest_positions = server.output().positions;
         let url = serve(Arc::clone(&server)).await;
-        let arguments = ["auto", "--scene", "toy", "--open", "toy", "--steps", "25", "--delivery", "latest", "--json"];
+        let arguments = ["--scene", "toy", "--open", "toy", "--steps", "25", "--delivery", "latest", "--json"];
         let sim_output = run_sim(&url, &arguments).await;
-        assert!(sim_output.exit_code == 0 && sim_output.stderr.contains(scenario), "{}", sim_output.stderr);
+        assert!(sim_output.exit_code == 0 && sim_output.stderr.contains(motion), "{}", sim_output.stderr);
         assert_eq!(sim_output.report()["steps_sent"].as_u64(), Some(25));
-        assert_ne!(server.output().positions, rest_positions, "expected positions of {scenario} to change");
+        assert_ne!(server.output().positions, rest_positions, "expected positions to change: {motion}");
     }
 }
 
@@ -210,7 +211,7 @@ async fn forces_of_viewers_act_on_request() {
     // Vertex 48 is at the end of the trunk. Its modes move it along x and z, and the force acts on the first one.
     let displacement = || server.output().positions[3 * 48] - rest_positions[3 * 48];
     let url = serve(Arc::clone(&server)).await;
-    let arguments = ["tree", "--scene", "toy", "--steps", "20", "--wind", "0", "--json"];
+    let arguments = ["--scene", "toy", "--steps", "20", "--wind", "0", "--json"];
     let sim_output = run_sim(&url, &arguments).await;
     assert_eq!(sim_output.exit_code, 0, "{}", sim_output.stderr);
     assert_eq!(displacement(), 0.0, "control: expected no motion without --forces");
@@ -223,7 +224,7 @@ async fn forces_of_viewers_act_on_request() {
 
 /// A force moves a body that is no tree. Without a stiffness, the process ends with the reason, and sends no step.
 #[tokio::test(flavor = "multi_thread")]
-async fn auto_moves_any_body_with_eigenvalues_by_forces() {
+async fn forces_move_any_body_with_eigenvalues() {
     type Change<'a> = &'a dyn Fn(&mut FakeDomain);
     let cases: [(Change<'_>, &str); 4] = [
         (&|_| (), ""),
@@ -241,7 +242,7 @@ async fn auto_moves_any_body_with_eigenvalues_by_forces() {
         let server = Arc::new(server);
         let rest_positions = server.output().positions;
         let url = serve(Arc::clone(&server)).await;
-        let sim_output = run_sim(&url, &["auto", "--scene", "toy", "--steps", "20", "--forces", "--json"]).await;
+        let sim_output = run_sim(&url, &["--scene", "toy", "--steps", "20", "--forces", "--json"]).await;
         if reason.is_empty() {
             assert_eq!(sim_output.exit_code, 0, "{}", sim_output.stderr);
             assert_ne!(server.output().positions, rest_positions, "expected motion");
@@ -272,7 +273,7 @@ async fn invalid_parameters_stop_before_the_first_step() {
         change(&mut server);
         let server = Arc::new(server);
         let url = serve(Arc::clone(&server)).await;
-        let sim_output = run_sim(&url, &["tree", "--scene", "toy", "--steps", "3"]).await;
+        let sim_output = run_sim(&url, &["--scene", "toy", "--steps", "3"]).await;
         assert!(sim_output.exit_code == 5 && sim_output.stderr.contains(field), "{}", sim_output.stderr);
         assert!(server.steps.lock().expect("lock").is_empty(), "expected no step");
     }
@@ -284,7 +285,7 @@ async fn fixed_modes_and_unresolved_gusts_are_reported() {
     server.domains[1].shape.eigenvalues[0] = 0.0;
     server.domains[2].wire.notes.insert("rigid_modes".into(), "1".into());
     let url = serve(Arc::new(server)).await;
-    let sim_output = run_sim(&url, &["tree", "--scene", "toy", "--steps", "3", "--dt", "0.5", "--json"]).await;
+    let sim_output = run_sim(&url, &["--scene", "toy", "--steps", "3", "--dt", "0.5", "--json"]).await;
     assert_eq!(sim_output.exit_code, 0, "{}", sim_output.stderr);
     let report = sim_output.report();
     let held = "(2; the note rigid_modes sets how many): 'domain 1': q[0] (0 Hz); 'domain 2': q[0] (0.9 Hz)";
@@ -305,7 +306,7 @@ async fn enormous_forces_bend_the_scene_by_a_limited_amount() {
     let url = serve(Arc::clone(&server)).await;
     let folder = tempfile::tempdir().expect("a temporary folder");
     let record = folder.path().display().to_string();
-    let arguments = ["tree", "--scene", "toy", "--steps", "20", "--forces", "--record", &record];
+    let arguments = ["--scene", "toy", "--steps", "20", "--forces", "--record", &record];
     let sim_output = run_sim(&url, &arguments).await;
     assert_eq!(sim_output.exit_code, 0, "{}", sim_output.stderr);
     let steps = server.steps.lock().expect("lock");
@@ -316,17 +317,35 @@ async fn enormous_forces_bend_the_scene_by_a_limited_amount() {
     assert_eq!(read_npy(&folder.path().join("q.npy")).len(), 6 * steps.len());
 }
 
+/// The simulated time of a step is shorter, and the motion that of such steps.
+#[tokio::test(flavor = "multi_thread")]
+async fn slow_motion_simulates_shorter_steps() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let record = folder.path().display().to_string();
+    let server = Arc::new(tree_server());
+    let url = serve(Arc::clone(&server)).await;
+    let mut records = vec![];
+    for options in [["--dt", "0.5", "--slow", "100"], ["--dt", "0.005", "--slow", "1"], ["--dt", "0.5", "--slow", "1"]]
+    {
+        let arguments = ["toy", "--steps", "5", "--record", &record, "--json"];
+        let sim_output = run_sim(&url, &[&arguments[..], &options].concat()).await;
+        assert_eq!(sim_output.exit_code, 0, "{}", sim_output.stderr);
+        let last_time = server.steps.lock().expect("lock").last().expect("a step").time;
+        records.push((sim_output.report()["dt_s"].clone(), last_time, read_npy(&folder.path().join("q.npy"))));
+    }
+    assert_eq!(records[0], records[1]);
+    assert!(records[0].2 != records[2].2 && records[0].1 == 0.02, "{records:?}");
+}
+
 /// The expected codes are those of `modalcast-sim --help`: 1 rejected by the server, 2 command line, 3 connection, 4
 /// local file, 5 invalid content.
 #[tokio::test(flavor = "multi_thread")]
 async fn errors_exit_with_documented_codes() {
     let url = serve(Arc::new(tree_server())).await;
-    assert_eq!(run_sim(&url, &["tree", "--scene", "none"]).await.exit_code, 1);
-    assert_eq!(run_sim(&url, &["tree", "--dt", "0"]).await.exit_code, 2);
-    assert_eq!(run_sim("http://127.0.0.1:1", &["tree"]).await.exit_code, 3);
-    assert_eq!(run_sim(&url, &["bridge", "--scene", "toy", "--cubic", "/nowhere.cub"]).await.exit_code, 4);
-    let sim_output = run_sim(&url, &["bridge", "--scene", "toy"]).await;
-    assert!(sim_output.exit_code == 5 && sim_output.stderr.contains("--cubic"), "{}", sim_output.stderr);
+    assert_eq!(run_sim(&url, &["--scene", "none"]).await.exit_code, 1);
+    assert_eq!(run_sim(&url, &["--dt", "0"]).await.exit_code, 2);
+    assert_eq!(run_sim("http://127.0.0.1:1", &["--json"]).await.exit_code, 3);
+    assert_eq!(run_sim(&url, &["--scene", "toy", "--cubic", "/nowhere.cub"]).await.exit_code, 4);
 }
 
 /// The only file of cubic forces in the folder is reported but not used, because the scene does not name it.
@@ -336,12 +355,10 @@ async fn cubic_forces_of_another_model_are_not_used() {
     std::fs::write(folder.path().join("other.cub"), "2\n").expect("a writable file");
     let files = folder.path().display().to_string();
     let url = serve(Arc::new(tree_server())).await;
-    let sim_output = run_sim(&url, &["auto", "--scene", "toy", "--files", &files, "--steps", "2"]).await;
+    let sim_output = run_sim(&url, &["--scene", "toy", "--files", &files, "--steps", "2"]).await;
     assert_eq!(sim_output.exit_code, 0, "{}", sim_output.stderr);
-    assert!(sim_output.stderr.contains("scenario `tree`"), "{}", sim_output.stderr);
+    assert!(sim_output.stderr.contains("modes in wind"), "{}", sim_output.stderr);
     assert!(sim_output.stderr.contains("not used as cubic forces: ") && sim_output.stderr.contains("other.cub"));
-    let sim_output = run_sim(&url, &["bridge", "--scene", "toy", "--files", &files, "--steps", "2"]).await;
-    assert!(sim_output.exit_code == 5 && sim_output.stderr.contains("vega.cubic"), "{}", sim_output.stderr);
 }
 
 /// Writes the files of a Vega model of rank 2: linear forces, and the modes of a domain.
@@ -378,7 +395,7 @@ async fn cubic_forces_move_the_domain_with_their_modes() {
     for (options, moved_domain) in
         [(&[][..], 1), (&["--domain", "b"], 1), (&["--domain", "a"], 0), (&["--domain", "0"], 0)]
     {
-        let arguments = ["auto", "--scene", "toy", "--files", &files, "--steps", "3", "--record", &record];
+        let arguments = ["--scene", "toy", "--files", &files, "--steps", "3", "--record", &record];
         let sim_output = run_sim(&url, &[&arguments[..], options].concat()).await;
         assert_eq!(sim_output.exit_code, 0, "{}", sim_output.stderr);
         // Two domains with two coordinates each.
@@ -390,14 +407,14 @@ async fn cubic_forces_move_the_domain_with_their_modes() {
     let twins = FakeServer::new((0..2).map(|index| beam(index, 0.04)).collect());
     let ambiguous_url = serve(Arc::new(twins)).await;
     let cubic = folder.path().join("b.cub").display().to_string();
-    let sim_output = run_sim(&ambiguous_url, &["bridge", "--scene", "toy", "--cubic", &cubic]).await;
+    let sim_output = run_sim(&ambiguous_url, &["--scene", "toy", "--cubic", &cubic]).await;
     let names = "several: 'domain 0' (index 0), 'domain 1' (index 1)";
     assert!(sim_output.exit_code == 5 && sim_output.stderr.contains(names), "{}", sim_output.stderr);
     std::fs::remove_file(folder.path().join("b.URendering.float")).expect("an existing file");
-    let sim_output = run_sim(&url, &["bridge", "--scene", "toy", "--cubic", &cubic]).await;
+    let sim_output = run_sim(&url, &["--scene", "toy", "--cubic", &cubic]).await;
     assert!(sim_output.exit_code == 5 && sim_output.stderr.contains("--domain NAME"), "{}", sim_output.stderr);
     write_vega_files(folder.path(), "a", &domains[0]);
-    let sim_output = run_sim(&url, &["auto", "--scene", "toy", "--files", &files]).await;
+    let sim_output = run_sim(&url, &["--scene", "toy", "--files", &files]).await;
     assert!(sim_output.exit_code == 5 && sim_output.stderr.contains("a.cub, "), "{}", sim_output.stderr);
 }
 
@@ -441,9 +458,9 @@ async fn real_models_deflect_as_requested_and_stay_bounded() {
         let url = serve(Arc::new(FakeServer::new(vec![domain]))).await;
         let files = vega_folder(name).display().to_string();
         for dt in ["0.0166667", "1"] {
-            let arguments = ["auto", "--scene", "toy", "--files", &files, "--steps", "60", "--dt", dt, "--json"];
+            let arguments = ["--scene", "toy", "--files", &files, "--steps", "60", "--dt", dt, "--json"];
             let sim_output = run_sim(&url, &arguments).await;
-            assert!(sim_output.exit_code == 0 && sim_output.stderr.contains("bridge"), "{}", sim_output.stderr);
+            assert!(sim_output.exit_code == 0 && sim_output.stderr.contains("cubic forces"), "{}", sim_output.stderr);
             let report = sim_output.report();
             let number = |field: &str| report[field].as_f64().expect("a number");
             // The default of --deflection is 0.03.

@@ -211,7 +211,7 @@ class Comparison:
     @contextlib.contextmanager
     def _steps(self) -> Iterator[None]:
         """Sends steps as fast as the server accepts them."""
-        command = [self._programs / "modalcast-sim", "auto", "--server", self._url]
+        command = [self._programs / "modalcast-sim", "--server", self._url]
         command += ["--scene", self.scene.name, "--steps", "0"]
         with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
             before = self.scene.state().step

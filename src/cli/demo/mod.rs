@@ -135,18 +135,8 @@ fn run_processes(args: &Args, input: &DemoScene, temporary_folder: &std::path::P
     vertex_client.wait_for("ready", deadline)?;
 
     let record_folder = temporary_folder.join("record").to_string_lossy().into_owned();
-    let mut flags = vec![
-        "auto",
-        "--steps",
-        &frame_count,
-        "--dt",
-        &dt,
-        "--delivery",
-        "lossless",
-        "--record",
-        &record_folder,
-        "--json",
-    ];
+    let mut flags =
+        vec!["--steps", &frame_count, "--dt", &dt, "--delivery", "lossless", "--record", &record_folder, "--json"];
     let force_flags = input.force_files.flags();
     flags.extend(force_flags.iter().map(String::as_str));
     let physics_process =

@@ -133,7 +133,7 @@ impl TreeScenario {
         options.check()?;
         if model.domains.iter().all(|domain| domain.eigenvalues.is_empty()) {
             let given =
-                format!("{} domains without eigenvalues (the scenario `sweep` needs none)", model.domains.len());
+                format!("{} domains without eigenvalues (`modalcast-sim sweep` needs none)", model.domains.len());
             return Err(invalid_input("scene.eigenvalues", "a domain whose modes have eigenvalues", given));
         }
         let parameters = ModalParameters::read(&model)?;

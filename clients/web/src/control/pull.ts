@@ -211,7 +211,7 @@ export class PullTool {
             const isLost = forces.length > 0 && response.receivers === 0 && !this.model.receiverError;
             this.onMessage(
                 isLost
-                    ? "Nobody receives forces: no physics process reads them. `modalcast-sim auto --forces` moves a scene with eigenvalues or cubic forces."
+                    ? "Nobody receives forces: no physics process reads them. `modalcast-sim --forces` moves a scene with eigenvalues or cubic forces."
                     : "",
             );
         } catch (error) {

@@ -139,7 +139,7 @@ export async function runProgram(name: string, options: string[]): Promise<void>
 
 /** A physics process that receives the forces of viewers. */
 export function startSimulation(server: ServerProcess, options: string[]): ChildProcess {
-    const all = ["auto", "--server", server.grpcUrl, "--seconds", "0", "--realtime", ...options];
+    const all = ["--server", server.grpcUrl, "--seconds", "0", "--realtime", ...options];
     return startProgram("modalcast-sim", all);
 }
 

@@ -202,7 +202,7 @@ impl Session {
     /// Those of [`Process::start`].
     pub(super) fn start_physics(&self, steps: u64, further_options: &[OsString]) -> Result<Process> {
         let (url, steps) = (self.url(), steps.to_string());
-        let mut list = arguments([&"auto", &"--server", &url, &"--scene", &SCENE, &"--steps", &steps, &"--json"]);
+        let mut list = arguments([&"--server", &url, &"--scene", &SCENE, &"--steps", &steps, &"--json"]);
         list.extend(arguments([&"--files", &self.files]));
         list.extend_from_slice(further_options);
         Process::start(Program::Physics, &list)
