@@ -376,9 +376,10 @@ fn calibrate_load(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::cubic::tests::spring_chain;
+    use crate::cubic::tests::{data_folder, spring_chain};
     use crate::divergence::DivergenceCheck;
     use crate::hierarchy::tests::four_domain_model;
+    use crate::model::Sample;
 
     const OPTIONS: BridgeOptions = BridgeOptions {
         domain: 0,
@@ -516,5 +517,118 @@ mod tests {
         assert!(error(3, 0).contains("rank 3") && error(3, 0).contains("'beam' of rank 2"), "{}", error(3, 0));
         assert!(error(2, 1).contains("coordinates of its own"), "{}", error(2, 1));
         assert!(error(2, 4).contains("an index below 4"), "{}", error(2, 4));
+    }
+
+    /// The model of Vega's bridge, with every vertex as a sample.
+    fn real_bridge_model() -> Model {
+        let folder = data_folder().join("vega/simpleBridge");
+        let text = std::fs::read_to_string(folder.join("simpleBridge.obj")).expect("an OBJ file");
+        let rest_positions: Vec<Vector3<f64>> = text
+            .lines()
+            .filter_map(|line| line.strip_prefix("v "))
+            .map(|line| {
+                Vector3::from_iterator(line.split_whitespace().map(|number| number.parse().expect("a number")).take(3))
+            })
+            .collect();
+        // U is in column-major order after its numbers of rows and columns.
+        let file = std::fs::read(folder.join("simpleBridge.URendering.float")).expect("a file of U");
+        let (words, _) = file.as_chunks::<4>();
+        let size = |index: usize| i32::from_le_bytes(words[index]) as usize;
+        let (rows, rank) = (size(0), size(1));
+        assert_eq!(rows, 3 * rest_positions.len());
+        let entry = |row: usize, mode: usize| f64::from(f32::from_le_bytes(words[2 + mode * rows + row]));
+        let sample = |(vertex, rest_position): (usize, &Vector3<f64>)| Sample {
+            rest_position: *rest_position,
+            mode_rows: (0..3 * rank).map(|index| entry(3 * vertex + index / rank, index % rank)).collect(),
+            part: 0,
+        };
+        let mut model = four_domain_model();
+        model.domains.truncate(1);
+        let domain = &mut model.domains[0];
+        domain.samples = rest_positions.iter().enumerate().map(sample).collect();
+        (domain.rank, domain.surface_sample_count, domain.base_sample) = (rank, rest_positions.len(), None);
+        model.coordinate_count = rank;
+        model.bounds_min = rest_positions.iter().fold(rest_positions[0], |min, position| min.inf(position));
+        model.bounds_max = rest_positions.iter().fold(rest_positions[0], |max, position| max.sup(position));
+        model
+    }
+
+    /// The scenario of Vega's bridge at a deflection of half its span, with the damping of its file.
+    fn real_bridge(dt: f64, has_fixed_step: bool) -> BridgeScenario {
+        let path = data_folder().join("vega/simpleBridge/simpleBridge.config");
+        real_bridge_with(&VegaSettings::read(&path).expect("a readable file"), dt, has_fixed_step)
+    }
+
+    fn real_bridge_with(settings: &VegaSettings, dt: f64, has_fixed_step: bool) -> BridgeScenario {
+        let path = data_folder().join("vega/simpleBridge/simpleBridge.cub");
+        let force = ReducedForce::read(&path).expect("a readable file");
+        let model = real_bridge_model();
+        let span = (model.bounds_max - model.bounds_min).dot(&model.ground_axes().long_axis);
+        let deflection_fraction = 0.5 * span / model.diagonal();
+        let options = BridgeOptions { dt, deflection_fraction, has_fixed_step, ..OPTIONS };
+        BridgeScenario::new(model, force, settings, options).expect("a valid scenario")
+    }
+
+    /// The coordinates at each of `count` steps of 1/60 s, each divided into `division` steps of the scenario.
+    fn coordinates(bridge: &mut BridgeScenario, count: u32, division: u32) -> Vec<DVector<f64>> {
+        let step = |_| {
+            (0..division).for_each(|_| bridge.advance().expect("a step"));
+            bridge.state.q.clone()
+        };
+        (0..count).map(step).collect()
+    }
+
+    /// The largest error of a mode at any step, relative to the largest value of this mode.
+    fn worst_mode_error(coordinates: &[DVector<f64>], reference: &[DVector<f64>]) -> f64 {
+        let error = |mode: usize| {
+            let largest = reference.iter().map(|q| q[mode].abs()).fold(0.0, f64::max);
+            let difference = coordinates.iter().zip(reference).map(|(a, b)| (a[mode] - b[mode]).abs());
+            difference.fold(0.0, f64::max) / largest
+        };
+        (0..reference[0].len()).map(error).fold(0.0, f64::max)
+    }
+
+    #[test]
+    #[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
+    fn real_bridge_at_half_its_span_is_accurate_by_default() {
+        const STEPS: u32 = 120;
+        // 128 steps of second order per step of the test: an error of 5e-5.
+        let reference = coordinates(&mut real_bridge(1.0 / 60.0 / 128.0, true), STEPS, 128);
+        let error = |has_fixed_step: bool| {
+            let mut bridge = real_bridge(1.0 / 60.0, has_fixed_step);
+            let start = std::time::Instant::now();
+            let q = coordinates(&mut bridge, STEPS, 1);
+            let milliseconds = 1e3 * start.elapsed().as_secs_f64() / f64::from(STEPS);
+            let error = worst_mode_error(&q, &reference);
+            println!("fixed step {has_fixed_step}: {error:.2e}, {milliseconds:.2} ms per step, {:?}", bridge.totals);
+            assert!(bridge.totals.max_residual <= 1e-11, "{:?}", bridge.totals);
+            error
+        };
+        assert!(error(false) <= 0.02);
+        assert!(error(true) > 0.2, "control: expected a large error with one step per step sent");
+    }
+
+    /// Released from half its span, without load and damping.
+    #[test]
+    #[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
+    fn real_bridge_keeps_its_energy_in_large_motion() {
+        let settings = VegaSettings { base_frequency: 0.25, ..VegaSettings::default() };
+        for (method, dt, is_kept) in [
+            (ImplicitMethod::AverageVectorField, 1.0 / 60.0, true),
+            (ImplicitMethod::AverageVectorField, 0.5, true),
+            (ImplicitMethod::BackwardEuler, 1.0 / 60.0, false),
+        ] {
+            let bridge = real_bridge_with(&settings, dt, true);
+            let system = bridge.integrator.system().clone();
+            let integrator = ImplicitIntegrator::new(system, method, StepControl::Fixed, dt).expect("a valid step");
+            let (mut state, no_load) = (bridge.state, DVector::zeros(20));
+            let start = integrator.system().energy(&state);
+            for _ in 0..600 {
+                integrator.advance(&mut state, LoadChange { start: &no_load, end: &no_load }).expect("a step");
+            }
+            let change = (integrator.system().energy(&state) / start - 1.0).abs();
+            println!("{method:?}, dt {dt}: the energy changes by {change:.1e}");
+            assert_eq!(change <= 1e-10, is_kept, "{method:?}, dt {dt}: {change}");
+        }
     }
 }

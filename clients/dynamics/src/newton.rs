@@ -19,6 +19,9 @@ const ROUNDING_TOLERANCE: f64 = 1e-13;
 /// the error after an increment of 1e-9 is at the precision of f64.
 const CONVERGENCE_TOLERANCE: f64 = 1e-9;
 
+/// An increment below this value, relative to the unknown, is close to the solution.
+const LOCAL_INCREMENT: f64 = 1e-3;
+
 /// A residual below this value cannot be reduced further.
 const RESIDUAL_PRECISION: f64 = 1e-15;
 
@@ -78,7 +81,8 @@ pub(crate) fn solve(problem: &dyn NewtonProblem, initial_guess: &DVector<f64>) -
         // The increment of a shifted Hessian says nothing about the distance to the solution.
         let relative_norm = direction.norm() / unknown.norm().max(f64::MIN_POSITIVE);
         let increment = if is_shifted { f64::INFINITY } else { relative_norm };
-        let Some((next_unknown, next)) = search_line(problem, &unknown, &current, &direction) else {
+        let is_local = increment <= LOCAL_INCREMENT;
+        let Some((next_unknown, next)) = search_line(problem, &unknown, &current, &direction, is_local) else {
             // Only rounding errors are left after a small increment.
             return solution(unknown, hessian, increment <= CONVERGENCE_TOLERANCE);
         };
@@ -88,12 +92,14 @@ pub(crate) fn solve(problem: &dyn NewtonProblem, initial_guess: &DVector<f64>) -
     }
 }
 
-/// The first acceptable point along a direction.
+/// The first acceptable point along a direction. Close to the solution, where the terms of the objective may cancel, it
+/// is enough that the gradient halves.
 fn search_line(
     problem: &dyn NewtonProblem,
     unknown: &DVector<f64>,
     current: &ProblemEvaluation,
     direction: &DVector<f64>,
+    is_local: bool,
 ) -> Option<(DVector<f64>, ProblemEvaluation)> {
     let slope = current.gradient.dot(direction);
     let rounding_error = ROUNDING_TOLERANCE * current.objective_scale;
@@ -105,8 +111,9 @@ fn search_line(
         let satisfies_armijo = next.objective <= current.objective + ARMIJO_CONSTANT * step_length * slope;
         let reduces_gradient =
             next.objective <= current.objective + rounding_error && next.gradient.norm() < gradient_norm;
+        let halves_gradient = is_local && next.gradient.norm() <= 0.5 * gradient_norm;
         step_length *= 0.5;
-        (satisfies_armijo || reduces_gradient).then_some((next_unknown, next))
+        (satisfies_armijo || reduces_gradient || halves_gradient).then_some((next_unknown, next))
     })
 }
 
