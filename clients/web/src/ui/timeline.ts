@@ -5,7 +5,7 @@ import { byId, h, setText } from "./dom";
 import * as format from "./format";
 import { icon } from "./icons";
 
-const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 4];
+const SPEEDS = [0.001, 0.01, 0.1, 0.25, 0.5, 1, 2, 4];
 
 export class Timeline {
     private readonly element: HTMLElement;
