@@ -1,4 +1,5 @@
 //! A bridge under a pulsating load: reduced forces of a Saint Venant-Kirchhoff (StVK) material, integrated implicitly.
+//! The other domains of the scene follow at their joints, and their modes with eigenvalues respond to viewers.
 //!
 //! The load acts on the middle of the bridge, spread evenly over the sampled vertices there. Its strength is calibrated
 //! so that the deflection at equilibrium is a given fraction of the diagonal of the scene's rest bounds. The run starts
@@ -13,17 +14,20 @@ use std::f64::consts::TAU;
 use nalgebra::{DVector, Vector3};
 use serde_json::json;
 
-use crate::affine::AffineTransform;
+use crate::attachments::Attachments;
 use crate::cubic::ReducedForce;
 use crate::error::{Result, check_option, invalid_input};
+use crate::hierarchy::compose_transforms;
 use crate::implicit::{ImplicitIntegrator, ImplicitMethod, MAX_SUB_STEPS, StepControl};
-use crate::integrator::{Integrator as _, IntegratorTotals, LoadChange, MotionState, nyquist_remark};
+use crate::integrator::{Integrator as _, IntegratorTotals, LoadChange, ModalOscillators, MotionState, nyquist_remark};
 use crate::model::{DomainModel, Model};
+use crate::parameters::ModalParameters;
 use crate::reduced_system::ReducedSystem;
 use crate::run::{Report, Scenario, aliasing_remark};
 use crate::step_values::StepValues;
 use crate::vega::VegaSettings;
-use crate::viewer_forces::force_scale;
+use crate::viewer_forces::{force_scale, scale_remark};
+use crate::viewer_response::ViewerResponse;
 
 /// Largest error of the deflection at equilibrium, as a fraction of the requested deflection.
 const DEFLECTION_TOLERANCE: f64 = 1e-3;
@@ -69,6 +73,11 @@ pub struct BridgeScenario {
     peak_load: DVector<f64>,
     /// Reduced load of the viewers' forces.
     viewer_load: DVector<f64>,
+    /// The linear modes of the other domains.
+    linear_modes: ModalParameters,
+    oscillators: ModalOscillators,
+    viewer_response: ViewerResponse,
+    attachments: Attachments,
     /// The state at step `next_step`.
     state: MotionState,
     /// The step that the next call of `compute_next_step` computes.
@@ -79,8 +88,9 @@ pub struct BridgeScenario {
     static_deflection_fraction: f64,
     /// Largest displacement so far, in scene units.
     peak_displacement: f64,
-    /// On the first step whose estimated error exceeds the tolerance.
-    late_remark: Option<String>,
+    late_remarks: Vec<String>,
+    /// Whether forces of viewers were scaled down.
+    has_scaled_forces: bool,
 }
 
 /// An equilibrium and the strength of the load that causes it.
@@ -123,7 +133,13 @@ impl BridgeScenario {
             },
         };
         let integrator = ImplicitIntegrator::new(system, options.method, control, options.dt)?;
+        let linear_modes = ModalParameters::read_except(&model, Some(options.domain))?;
+        let oscillators = ModalOscillators::new(&linear_modes, options.dt)?;
         Ok(Self {
+            viewer_response: ViewerResponse::at_rest(&model, &oscillators),
+            linear_modes,
+            oscillators,
+            attachments: Attachments::new(&model),
             options,
             is_damped: settings.damping_mass > 0.0 || settings.damping_stiffness > 0.0,
             peak_load: unit_load * equilibrium.strength,
@@ -133,7 +149,8 @@ impl BridgeScenario {
             strength: equilibrium.strength,
             static_deflection_fraction: static_deflection / model.diagonal(),
             peak_displacement: 0.0,
-            late_remark: None,
+            late_remarks: vec![],
+            has_scaled_forces: false,
             totals: IntegratorTotals::default(),
             integrator,
             model,
@@ -145,9 +162,10 @@ impl BridgeScenario {
         let (start_load, end_load) = (self.compute_load(self.next_step), self.compute_load(self.next_step + 1));
         let load = LoadChange { start: &start_load, end: &end_load };
         let report = self.integrator.advance(&mut self.state, load)?;
+        self.viewer_response.advance(&self.oscillators)?;
         self.totals.add(&report);
-        if report.is_limited && self.late_remark.is_none() {
-            self.late_remark = Some(format!(
+        if report.is_limited && self.totals.limited_steps == 1 {
+            self.late_remarks.push(format!(
                 "step {}: {MAX_SUB_STEPS} sub-steps leave an estimated error of {:.1e} diagonals, more than \
                  {STEP_TOLERANCE:e}: choose smaller steps (--dt); integrator.steps_above_tolerance counts such steps",
                 self.next_step + 1,
@@ -172,14 +190,15 @@ impl Scenario for BridgeScenario {
 
     fn compute_next_step(&mut self, values: &mut StepValues) -> Result<()> {
         let first_coordinate = self.model.domains[self.options.domain].first_coordinate;
-        values.q = vec![0.0; self.model.coordinate_count];
-        for (destination, coordinate) in values.q[first_coordinate..].iter_mut().zip(self.state.q.iter()) {
-            *destination = *coordinate as f32;
+        let mut q = vec![0.0; self.model.coordinate_count];
+        for (destination, coordinate) in q[first_coordinate..].iter_mut().zip(self.state.q.iter()) {
+            *destination = *coordinate;
         }
-        values.transforms = self.model.domains.iter().map(|domain| domain.placement.to_row_major()).collect();
-        let q: Vec<f64> = values.q.iter().map(|coordinate| f64::from(*coordinate)).collect();
-        let world_from_domain: Vec<AffineTransform> =
-            values.transforms.iter().map(AffineTransform::from_row_major).collect();
+        self.viewer_response.add_to(&mut q);
+        let attachments = self.attachments.deform(&self.model, &q);
+        let world_from_domain = compose_transforms(&self.model, &attachments, &[]);
+        values.q = q.iter().map(|coordinate| *coordinate as f32).collect();
+        values.transforms = world_from_domain.iter().map(|transform| transform.to_row_major()).collect();
         self.peak_displacement = self.peak_displacement.max(self.model.max_displacement(&q, &world_from_domain));
         self.advance()
     }
@@ -189,7 +208,13 @@ impl Scenario for BridgeScenario {
         self.viewer_load.copy_from_slice(&forces[first_coordinate..][..self.integrator.system().rank()]);
         let q = self.integrator.system().linear_equilibrium(&self.viewer_load);
         let displacements_per_unit = &self.model.displacements_per_unit()[first_coordinate..];
-        self.viewer_load *= force_scale(q.as_slice(), displacements_per_unit);
+        let scale = force_scale(q.as_slice(), displacements_per_unit);
+        self.viewer_load *= scale;
+        let scale = scale.min(self.viewer_response.set_forces(forces));
+        if !self.has_scaled_forces {
+            self.late_remarks.extend(scale_remark(scale));
+            self.has_scaled_forces = scale < 1.0;
+        }
         Ok(())
     }
 
@@ -207,13 +232,16 @@ impl Scenario for BridgeScenario {
             )),
         };
         let modes = system.frequencies().into_iter().enumerate();
-        let unresolved = nyquist_remark(modes.map(|(mode, hertz)| (format!("mode {mode}"), hertz)), self.options.dt);
+        let modes = modes.map(|(mode, hertz)| (format!("mode {mode}"), hertz));
+        let unresolved = nyquist_remark(modes.chain(self.linear_modes.frequencies(&self.model)), self.options.dt);
         let unresolved_load = aliasing_remark("the load", self.options.period, self.options.dt);
-        [unresolved_load, undamped, unstable, unresolved, self.late_remark.clone()].into_iter().flatten().collect()
+        let remarks = [unresolved_load, undamped, unstable, unresolved];
+        let linear_remarks = self.linear_modes.remarks.iter().cloned();
+        linear_remarks.chain(remarks.into_iter().flatten()).chain(self.late_remarks.iter().cloned()).collect()
     }
 
-    fn late_remark(&self) -> Option<&str> {
-        self.late_remark.as_deref()
+    fn late_remarks(&self) -> &[String] {
+        &self.late_remarks
     }
 
     fn report(&self) -> Report {
@@ -408,7 +436,10 @@ mod tests {
         // The first step is the equilibrium. Its coordinates are rounded to f32.
         assert!(bridge.peak_displacement / bridge.model.diagonal() >= 0.0299);
         (0..40).for_each(|_| bridge.compute_next_step(&mut last_values).expect("the next step"));
-        assert!(first_values.q != last_values.q && first_values.transforms == last_values.transforms);
+        assert_ne!(first_values.q, last_values.q);
+        // The domains that are attached to the bridge follow it.
+        assert_eq!(first_values.transforms[0], last_values.transforms[0]);
+        assert!((1..4).all(|domain| first_values.transforms[domain] != last_values.transforms[domain]));
         assert!(bridge.peak_displacement / bridge.model.diagonal() < 0.2);
     }
 
@@ -457,8 +488,8 @@ mod tests {
         // With one step per period, the load is the same in all steps.
         let unresolved = remarks(2.0, 2.0, 0.01);
         assert!(unresolved.len() == 2 && unresolved[0].contains("the load has a period of 2 s"), "{unresolved:?}");
-        // The modes at rest have 1.0 and 1.5 Hz.
-        assert!(unresolved[1].starts_with("2 modes are above the Nyquist frequency"), "{unresolved:?}");
+        // The modes at rest have 1.0 and 1.5 Hz, and those of the other domains 0.9 Hz.
+        assert!(unresolved[1].starts_with("6 modes are above the Nyquist frequency"), "{unresolved:?}");
         let undamped = remarks(1.0 / 60.0, 2.0, 0.0);
         assert!(undamped.len() == 1 && undamped[0].starts_with("the bridge has no damping"), "{undamped:?}");
         assert_eq!(remarks(1.0 / 60.0, 2.0, 0.01), [""; 0]);
@@ -476,7 +507,10 @@ mod tests {
         };
         let free_q = run(None);
         assert_eq!(run(Some([0.0; 6])), free_q);
-        assert_eq!(run(Some([0.0, 0.0, 1.0, 1.0, 1.0, 1.0])), free_q, "expected no effect on the bridge");
+        // The bridge has the first two coordinates, and the other domains have linear modes.
+        let pulled_q = run(Some([0.0, 0.0, 1.0, 1.0, 1.0, 1.0]));
+        assert_eq!(pulled_q[..2], free_q[..2], "expected no effect on the bridge");
+        assert!(free_q[2..] == [0.0; 4] && pulled_q[2..].iter().all(|q| *q > 1e-4), "{pulled_q:?}");
         let pushed_q = run(Some([5.0, 0.0, 0.0, 0.0, 0.0, 0.0]));
         assert!(pushed_q[0] > free_q[0] + 1e-3, "pushed {pushed_q:?}, free {free_q:?}");
     }
@@ -488,9 +522,59 @@ mod tests {
         let check = DivergenceCheck::new(&bridge.model);
         bridge.set_viewer_forces(&[32.0 * f64::from(f32::MAX); 6]).expect("a scenario with forces");
         assert!(bridge.viewer_load.norm() > 0.0, "expected an effect");
+        bridge.set_viewer_forces(&[1e30; 6]).expect("a scenario with forces");
+        let remarks = bridge.late_remarks();
+        assert!(remarks.len() == 1 && remarks[0].contains("scaled to 0.25"), "{remarks:?}");
         for step in 0..600 {
             bridge.compute_next_step(&mut values).expect("the next step");
             check.check(&bridge.model, step, 0.0, &values).expect("a bounded motion");
+        }
+    }
+
+    /// Very short steps, and steps that are longer than all periods.
+    #[test]
+    fn extreme_steps_run_and_invalid_ones_are_rejected() {
+        let create = |options: BridgeOptions| {
+            let force = spring_chain(&[40.0, 90.0], 30.0, 4.0);
+            BridgeScenario::new(four_domain_model(), force, &VegaSettings::default(), options)
+        };
+        for dt in [1e-9, 10.0] {
+            let mut bridge = create(BridgeOptions { dt, ..OPTIONS }).expect("a valid scenario");
+            let (mut values, check) = (StepValues::default(), DivergenceCheck::new(&bridge.model));
+            for step in 0..50 {
+                bridge.compute_next_step(&mut values).expect("a step");
+                check.check(&bridge.model, step, 0.0, &values).expect("a bounded motion");
+            }
+            assert!(bridge.remarks().iter().any(|remark| remark.contains("Nyquist")) == (dt == 10.0));
+        }
+        for (options, field) in [
+            (BridgeOptions { dt: f64::NAN, ..OPTIONS }, "dt"),
+            (BridgeOptions { dt: 0.0, ..OPTIONS }, "dt"),
+            (BridgeOptions { deflection_fraction: f64::NAN, ..OPTIONS }, "deflection"),
+            (BridgeOptions { period: f64::INFINITY, ..OPTIONS }, "period"),
+        ] {
+            let error = create(options).err().expect("an error").to_string();
+            assert!(error.starts_with(field), "{error}");
+        }
+    }
+
+    /// A buckled bridge starts at rest. A load that is limited by the linear stiffness keeps it in range.
+    #[test]
+    fn forces_with_eigenvalues_that_are_not_positive_run() {
+        for eigenvalues in [[-4.0, 90.0], [0.0, 90.0]] {
+            let force = spring_chain(&eigenvalues, 30.0, 0.0);
+            let bridge = BridgeScenario::new(four_domain_model(), force, &VegaSettings::default(), OPTIONS);
+            let (mut bridge, mut values) = (bridge.expect("a valid scenario"), StepValues::default());
+            let check = DivergenceCheck::new(&bridge.model);
+            let remarks = bridge.remarks();
+            assert!(remarks.iter().any(|remark| remark.contains("the stiffness at rest has")), "{remarks:?}");
+            let mut largest = 0.0_f32;
+            for step in 0..600 {
+                bridge.compute_next_step(&mut values).expect("the next step");
+                check.check(&bridge.model, step, 0.0, &values).expect("a bounded motion");
+                largest = largest.max(values.q[1].abs());
+            }
+            assert!(largest > 1e-3, "{eigenvalues:?}: expected motion, got {largest}");
         }
     }
 

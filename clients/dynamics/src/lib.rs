@@ -20,9 +20,10 @@
 //! | `newton` | Newton's method with a line search |
 //! | `integrator` | the trait of integrators, their reports, and the exact integrator of linear modes |
 //! | `implicit` | implicit integrators of cubic forces, with sub-steps by an estimate of the error |
-//! | `bridge` | a bridge under a pulsating load |
+//! | `bridge` | a bridge with cubic forces under a pulsating load, and linear modes of the other domains |
 //! | `sweep` | motion for any scene: moves one coordinate after another, or rocks a rigid scene |
 //! | `viewer_forces` | reads the forces that viewers apply |
+//! | `viewer_response` | the response of linear modes to the forces of viewers |
 //! | `divergence` | stops a run before it sends a step that is not finite or far out of range |
 //! | `step_values` | coordinates and transforms of a step, and the message with those that have changed |
 //! | `run` | sends a scenario as a step stream, optionally records it, and reports the results |
@@ -86,6 +87,7 @@ pub mod sweep;
 pub mod tree;
 pub mod vega;
 pub mod viewer_forces;
+mod viewer_response;
 pub mod wind;
 
 pub use error::{Error, Result, invalid_input};

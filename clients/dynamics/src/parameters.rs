@@ -40,10 +40,20 @@ impl ModalParameters {
     /// if the note `damping_ratio` is not a number from 0 to 1000, or if the note `rigid_modes` is not a number of
     /// modes or does not count a mode without stiffness.
     pub fn read(model: &Model) -> Result<Self> {
+        Self::read_except(model, None)
+    }
+
+    /// As [`Self::read`], but the modes of the domain with index `skipped` have no parameters and no remarks.
+    ///
+    /// # Errors
+    /// Those of [`Self::read`].
+    pub fn read_except(model: &Model, skipped: Option<usize>) -> Result<Self> {
         let mut modes = vec![None; model.coordinate_count];
         let (mut held_count, mut held_modes) = (0, vec![]);
         let (mut unknown_modes, mut undamped_modes) = (vec![], vec![]);
-        for domain in model.domains.iter().filter(|domain| domain.owns_q) {
+        let domains =
+            model.domains.iter().enumerate().filter(|(index, domain)| domain.owns_q && Some(*index) != skipped);
+        for (_, domain) in domains {
             let damping_ratio = read_damping_ratio(domain)?;
             let is_held = find_held_modes(domain)?;
             if domain.eigenvalues.is_empty() {

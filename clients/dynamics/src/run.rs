@@ -52,9 +52,10 @@ pub trait Scenario {
         vec![]
     }
 
-    /// A sentence about the motion that is not known before a step shows it. It is one of [`Self::remarks`] then.
-    fn late_remark(&self) -> Option<&str> {
-        None
+    /// The last [`Self::remarks`]: those about the motion and the forces of viewers, which are not known before the
+    /// first step.
+    fn late_remarks(&self) -> &[String] {
+        &[]
     }
 
     /// Results so far. The keys depend on the scenario; each scenario has the key `load`, which
@@ -185,7 +186,7 @@ impl<'a> Driver<'a> {
         let mut last_sent_values: Option<StepValues> = None;
         let mut current_values = StepValues::default();
         let mut step_number = 0;
-        let mut printed_late_remark = false;
+        let mut printed_remarks = 0;
         while options.steps.is_none_or(|steps| step_number < steps) && !*stop_receiver.borrow() {
             let time = step_number as f64 * options.dt;
             if options.realtime {
@@ -201,10 +202,11 @@ impl<'a> Driver<'a> {
                 self.scenario.set_viewer_forces(&forces)?;
             }
             self.scenario.compute_next_step(&mut current_values)?;
-            if let Some(remark) = self.scenario.late_remark().filter(|_| !printed_late_remark) {
+            let late_remarks = self.scenario.late_remarks();
+            for remark in &late_remarks[printed_remarks..] {
                 self.progress_bar.suspend(|| eprintln!("modalcast-sim: {}: {remark}", self.scenario.model().scene));
-                printed_late_remark = true;
             }
+            printed_remarks = late_remarks.len();
             let model = self.scenario.model();
             self.check.check(model, step_number, time, &current_values)?;
             let step = add_changes(model, Step::new(step_number, time), last_sent_values.as_ref(), &current_values);

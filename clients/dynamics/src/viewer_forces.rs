@@ -22,6 +22,16 @@ pub fn force_scale(q: &[f64], displacements_per_unit: &[f64]) -> f64 {
     if displacement <= MAX_STATIC_DISPLACEMENT { 1.0 } else { MAX_STATIC_DISPLACEMENT / displacement }
 }
 
+/// A remark on a factor of [`force_scale`]; `None` if the forces are not scaled.
+pub fn scale_remark(scale: f64) -> Option<String> {
+    (scale < 1.0).then(|| {
+        format!(
+            "the forces of viewers would displace the scene by {:.3e} diagonals at rest: scaled to {MAX_STATIC_DISPLACEMENT}",
+            MAX_STATIC_DISPLACEMENT / scale
+        )
+    })
+}
+
 /// The forces of all viewers, read by a task that ends with this object.
 pub struct ViewerForces {
     newest: watch::Receiver<ForceSet>,

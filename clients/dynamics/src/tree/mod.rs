@@ -22,11 +22,13 @@ use crate::model::{DomainModel, Model};
 use crate::parameters::ModalParameters;
 use crate::run::{Report, Scenario};
 use crate::step_values::StepValues;
+use crate::viewer_forces::scale_remark;
+use crate::viewer_response::ViewerResponse;
 use crate::wind::{Wind, WindPressure};
 use calibration::{Calibration, MAX_BRANCH_BENDING, SwayTarget, calibrate, scale_response};
 use crown::Crown;
 use excitation::WindExcitation;
-use response::{Response, ViewerResponse};
+use response::Response;
 
 /// Rotation of a rigid leaf about its base in the pressure of the mean wind at strength 1, in radians.
 const LEAF_ANGLE: f64 = 0.1;
@@ -70,6 +72,7 @@ pub struct TreeScenario {
     gap_meter: JointGapMeter,
     calibration: Calibration,
     remarks: Vec<String>,
+    late_remarks: Vec<String>,
     /// Per domain: whether it is a rigid leaf.
     rigid_leaves: Vec<bool>,
     /// Peaks of all steps but the last one.
@@ -163,6 +166,7 @@ impl TreeScenario {
             attachments: Attachments::new(&model),
             gap_meter: JointGapMeter::new(&model),
             remarks: create_remarks(&model, &parameters, &options, &calibration),
+            late_remarks: vec![],
             calibration,
             rigid_leaves: find_rigid_leaves(&model),
             earlier_peaks: Peaks::default(),
@@ -245,12 +249,19 @@ impl Scenario for TreeScenario {
         }
         let viewer_response =
             self.viewer_response.get_or_insert_with(|| ViewerResponse::at_rest(&self.model, &self.integrator));
-        viewer_response.set_forces(forces);
+        let scale = viewer_response.set_forces(forces);
+        if self.late_remarks.is_empty() {
+            self.late_remarks.extend(scale_remark(scale));
+        }
         Ok(())
     }
 
     fn remarks(&self) -> Vec<String> {
-        self.remarks.clone()
+        [&self.remarks[..], &self.late_remarks].concat()
+    }
+
+    fn late_remarks(&self) -> &[String] {
+        &self.late_remarks
     }
 
     fn report(&self) -> Report {

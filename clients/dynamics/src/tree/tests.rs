@@ -116,6 +116,8 @@ fn enormous_viewer_forces_do_not_end_the_run() {
         last_q.clone_from(&values.q);
     }
     assert!(values.q.iter().any(|q| q.abs() > 1e-3), "expected an effect: {:?}", values.q);
+    let remarks = tree.remarks();
+    assert!(remarks.len() == 1 && remarks[0].contains("scaled to 0.25"), "{remarks:?}");
 }
 
 #[test]
