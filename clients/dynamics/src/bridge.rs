@@ -489,7 +489,7 @@ mod tests {
         let unresolved = remarks(2.0, 2.0, 0.01);
         assert!(unresolved.len() == 2 && unresolved[0].contains("the load has a period of 2 s"), "{unresolved:?}");
         // The modes at rest have 1.0 and 1.5 Hz, and those of the other domains 0.9 Hz.
-        assert!(unresolved[1].starts_with("6 modes are above the Nyquist frequency"), "{unresolved:?}");
+        assert!(unresolved[1].contains("not seen as vibrations (6; "), "{unresolved:?}");
         let undamped = remarks(1.0 / 60.0, 2.0, 0.0);
         assert!(undamped.len() == 1 && undamped[0].starts_with("the bridge has no damping"), "{undamped:?}");
         assert_eq!(remarks(1.0 / 60.0, 2.0, 0.01), [""; 0]);
