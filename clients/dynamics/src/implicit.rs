@@ -45,6 +45,16 @@ pub enum ImplicitMethod {
     BackwardEuler,
 }
 
+impl ImplicitMethod {
+    /// The power of the sub-step to which the error of a step is proportional.
+    const fn order(self) -> f64 {
+        match self {
+            Self::AverageVectorField => 2.0,
+            Self::BackwardEuler => 1.0,
+        }
+    }
+}
+
 /// How a step is divided.
 #[derive(Debug, Clone, PartialEq)]
 pub enum StepControl {
@@ -133,8 +143,8 @@ impl ImplicitIntegrator {
         }
         if let StepControl::Adaptive { tolerance, displacements_per_unit } = &self.control {
             report.error = error.iter().zip(displacements_per_unit).map(|(error, per_unit)| error * per_unit).sum();
-            // The error of a step is proportional to the square of its sub-steps.
-            let wanted = f64::from(count) * (report.error / tolerance).sqrt() * SUB_STEP_MARGIN;
+            let wanted =
+                f64::from(count) * (report.error / tolerance).powf(1.0 / self.method.order()) * SUB_STEP_MARGIN;
             state.sub_steps = (wanted.ceil() as u32).clamp(1, MAX_SUB_STEPS);
             // A NaN is not accurate.
             let is_accurate = report.error <= *tolerance;

@@ -149,9 +149,13 @@ fn energy_is_conserved_in_stiff_systems() {
 }
 
 fn adaptive(force: ReducedForce, tolerance: f64, dt: f64) -> ImplicitIntegrator {
+    adaptive_with(AverageVectorField, force, tolerance, dt)
+}
+
+fn adaptive_with(method: ImplicitMethod, force: ReducedForce, tolerance: f64, dt: f64) -> ImplicitIntegrator {
     let control = StepControl::Adaptive { tolerance, displacements_per_unit: vec![1.0; force.rank()] };
     let system = ReducedSystem::new(force, &VegaSettings::default());
-    ImplicitIntegrator::new(system, AverageVectorField, control, dt).expect("a valid step")
+    ImplicitIntegrator::new(system, method, control, dt).expect("a valid step")
 }
 
 /// The estimate of the error, from which the number of sub-steps follows, agrees with the error of one step.
@@ -184,6 +188,37 @@ fn sub_steps_follow_the_tolerance_up_to_their_limit() {
     // A body at rest needs no sub-steps.
     let rest = run(&adaptive(duffing(), 1e-9, 1.0 / 60.0), &mut MotionState::resting(DVector::zeros(1)), 3);
     assert_eq!((rest.sub_steps, rest.iterations), (3, 0));
+}
+
+/// The error of a run follows the tolerance for both methods, with few rejected steps.
+#[test]
+fn tighter_tolerance_reduces_the_error_of_both_methods() {
+    const STEPS: u32 = 30;
+    let start = moving_state(DVector::from_element(1, 3.0));
+    let coordinates = |integrator: &ImplicitIntegrator, division: u32, totals: &mut IntegratorTotals| -> Vec<f64> {
+        let mut state = start.clone();
+        let step = |_| {
+            let step_totals = run(integrator, &mut state, division);
+            totals.rejections += step_totals.rejections;
+            totals.limited_steps += step_totals.limited_steps;
+            totals.max_error = totals.max_error.max(step_totals.max_error);
+            state.q[0]
+        };
+        (0..STEPS).map(step).collect()
+    };
+    let precise = integrator(duffing(), AverageVectorField, 1.0 / 60.0 / 500.0);
+    let reference = coordinates(&precise, 500, &mut IntegratorTotals::default());
+    for (method, tolerances) in [(AverageVectorField, [1e-3, 1e-5]), (BackwardEuler, [1e-2, 1e-3])] {
+        let error = |tolerance: f64| {
+            let mut totals = IntegratorTotals::default();
+            let q = coordinates(&adaptive_with(method, duffing(), tolerance, 1.0 / 60.0), 1, &mut totals);
+            assert!(totals.limited_steps == 0 && totals.max_error <= tolerance, "{method:?}: {totals:?}");
+            assert!(totals.rejections <= u64::from(STEPS), "{method:?}: {totals:?}");
+            q.iter().zip(&reference).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
+        };
+        let errors = tolerances.map(error);
+        assert!(errors[1] < 0.5 * errors[0], "{method:?}: {errors:?}");
+    }
 }
 
 /// Potentials without a lower bound: beyond the barrier, the motion reaches infinity in a finite time.
