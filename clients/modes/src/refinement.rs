@@ -10,7 +10,7 @@ use crate::surface_file::DrawnMesh;
 const MAX_TRIANGLES: usize = 400_000;
 
 /// Halves all edges longer than `max_length` meters until there are none. Neighbors at an edge share its new vertex. Ends
-/// early at [`MAX_TRIANGLES`].
+/// early when the mesh has hundreds of thousands of triangles.
 pub fn divide_long_edges(mesh: &mut DrawnMesh, max_length: f64) {
     loop {
         let mut middles: HashMap<[u32; 2], u32> = HashMap::new();
