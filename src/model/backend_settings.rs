@@ -1,5 +1,5 @@
 //! Settings of the backends: which implementation computes a scene, and how. They are not part of a
-//! [`Scene`](crate::scene::Scene), because they do not define its result: they change run time and memory; they change
+//! [`Scene`], because they do not define its result: they change run time and memory; they change
 //! vertices and images only by rounding. Rounding can decide whether a triangle covers a sample next to its edge.
 
 use crate::scene::{DeformationSettings, RenderSettings, Scene};
