@@ -205,7 +205,7 @@ impl Body {
         if segments.iter().all(Vec::is_empty) {
             return Err(invalid("--clamp", "a region that leaves a part of the body free", "one with the whole body"));
         }
-        let pieces = CellPieces::new(&grid, &segments);
+        let pieces = CellPieces::new(&grid, &self.surface, &segments);
         let moments = integrate(&grid, &pieces, &segments);
         Ok(remove_small_parts(Layout { grid, pieces, moments, held_points, removed_parts: 0 }))
     }

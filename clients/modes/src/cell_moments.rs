@@ -155,7 +155,7 @@ mod tests {
             let (low, high) = surface.bounds();
             let grid = Grid::covering(low, high, 1.0);
             let segments = [0, 1, 2].map(|axis| trace_rays(&surface, &grid, axis, None));
-            let pieces = CellPieces::new(&grid, &segments);
+            let pieces = CellPieces::new(&grid, &surface, &segments);
             let moments = integrate(&grid, &pieces, &segments);
             assert_eq!(moments.len(), 4);
             for groups in &moments {

@@ -3,16 +3,18 @@
 //! Two walls that pass through the same cell without touching must not share the nodes of that cell. Each of them is a
 //! piece with nodes of its own, and the nodes of neighboring pieces are merged only where the pieces are connected.
 //!
-//! Connections are found on sub-cells. Two sub-cells with material that share a face are connected unless rays leave the
-//! material in one and enter it in the other, and no ray passes through the face inside of material. Sub-cells that share
-//! only an edge or a corner are connected if all sub-cells between them are empty. Walls are therefore told apart if no
+//! Connections are found on sub-cells: two neighboring sub-cells with material are connected if a ray passes through their
+//! common face inside of material, or if a triangle of the surface passes through both. Walls are therefore separate if no
 //! sub-cell contains both.
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
+
+use nalgebra::Vector3;
 
 use crate::disjoint_sets::DisjointSets;
 use crate::grid::{CELL_NODES, FORWARD_NEIGHBORS, Grid, NODES_PER_SIDE, SUBDIVISIONS, all_offsets, cross_axes};
 use crate::material_rays::RaySegment;
+use crate::surface::Surface;
 
 /// Sub-cells of a cell, one bit each. Bit `(x * 4 + y) * 4 + z` is the sub-cell (x, y, z).
 pub type SubCells = u64;
@@ -46,18 +48,22 @@ pub struct CellPieces {
 }
 
 impl CellPieces {
-    /// Divides the material that rays of the three axes found.
-    pub fn new(grid: &Grid, segments: &[Vec<RaySegment>; 3]) -> Self {
+    /// Divides the material of a surface that rays of the three axes found.
+    pub fn new(grid: &Grid, surface: &Surface, segments: &[Vec<RaySegment>; 3]) -> Self {
         let contacts = SubCellContacts::new(grid, segments);
         let mut sets = DisjointSets::new(SUB_CELLS * contacts.cells.len());
         let mut links = Vec::new();
-        contacts.for_each_connection(grid, |own, other, offset| {
+        let mut connect = |own: usize, other: usize, offset: [i8; 3]| {
             let [own_cell, other_cell] = [own / SUB_CELLS, other / SUB_CELLS];
             match own_cell == other_cell {
                 true => sets.merge(own, other),
                 false => links.push((own, other, offset)),
             }
-        });
+        };
+        contacts.for_each_passed_face(grid, &mut connect);
+        for triangle in 0..surface.triangles.len() {
+            contacts.connect_along(grid, surface.corners(triangle), &mut connect);
+        }
         let mut pieces = Self::default();
         let mut piece_of_set = HashMap::new();
         for (slot, cell) in contacts.cells.iter().enumerate() {
@@ -99,9 +105,36 @@ impl CellPieces {
         let renumbered = |(own, other, offset): &(u32, u32, [i8; 3])| {
             Some((new_indices[*own as usize]?, new_indices[*other as usize]?, *offset))
         };
-        pieces.links = self.links.iter().filter_map(renumbered).collect();
+        pieces.links = self.links_across_removed(keep).iter().filter_map(renumbered).collect();
         pieces.connect();
         pieces
+    }
+
+    /// The links, and links between neighbors of a piece that is not kept: it had no volume, but connected them.
+    fn links_across_removed(&self, keep: &[bool]) -> Vec<(u32, u32, [i8; 3])> {
+        let mut links = self.links.clone();
+        let mut neighbors: HashMap<u32, Vec<(u32, [i8; 3])>> = HashMap::new();
+        for (own, other, offset) in &self.links {
+            if !keep[*own as usize] {
+                neighbors.entry(*own).or_default().push((*other, *offset));
+            }
+            if !keep[*other as usize] {
+                neighbors.entry(*other).or_default().push((*own, offset.map(|component| -component)));
+            }
+        }
+        for around in neighbors.into_values() {
+            for (index, (own, own_offset)) in around.iter().enumerate() {
+                for (other, other_offset) in &around[index + 1..] {
+                    let offset = [0, 1, 2].map(|axis| other_offset[axis] - own_offset[axis]);
+                    if offset.iter().all(|component| component.abs() <= 1) {
+                        links.push((*own, *other, offset));
+                    }
+                }
+            }
+        }
+        links.sort_unstable();
+        links.dedup();
+        links
     }
 
     /// Merges the nodes of connected pieces, and numbers nodes and parts.
@@ -132,8 +165,6 @@ struct CellContacts {
     occupied: SubCells,
     /// For each axis, the sub-cells that a ray leaves through their upper face inside of material.
     passed: [SubCells; 3],
-    /// For each axis, the sub-cells in which a ray leaves the material, and enters it again in the next sub-cell.
-    separated: [SubCells; 3],
 }
 
 /// The contacts of all cells with material.
@@ -171,12 +202,10 @@ impl SubCellContacts {
                 if let Some((before, last)) = previous
                     && before.ray == segment.ray
                     && last + 1 == first
+                    && start - before.end * SUBDIVISIONS as f64 <= TOLERANCE
                 {
                     sub_cell[axis] = last;
-                    let cell = contacts.cell_mut(grid, sub_cell);
-                    let touches = start - before.end * SUBDIVISIONS as f64 <= TOLERANCE;
-                    let faces = if touches { &mut cell.passed } else { &mut cell.separated };
-                    faces[axis] |= sub_cell_bit(sub_cell);
+                    contacts.cell_mut(grid, sub_cell).passed[axis] |= sub_cell_bit(sub_cell);
                 }
                 if stop > first {
                     previous = Some((*segment, stop - 1));
@@ -203,57 +232,62 @@ impl SubCellContacts {
         is_occupied.then(|| slot as usize * SUB_CELLS + bit.trailing_zeros() as usize)
     }
 
-    /// Calls `connect` with the numbers of all pairs of connected sub-cells, and the offset between their cells.
-    fn for_each_connection(&self, grid: &Grid, mut connect: impl FnMut(usize, usize, [i8; 3])) {
-        let limits = grid.cells.map(|cells| cells * SUBDIVISIONS);
-        let neighbor_of = |sub_cell: [usize; 3], offset: [i8; 3]| {
-            let mut neighbor = [0; 3];
-            for axis in 0..3 {
-                neighbor[axis] = sub_cell[axis].checked_add_signed(isize::from(offset[axis]))?;
-            }
-            (0..3).all(|axis| neighbor[axis] < limits[axis]).then_some(neighbor)
-        };
+    /// Calls `connect` with the numbers of all pairs of sub-cells whose common face a ray passes inside of material, and
+    /// with the offset between their cells.
+    fn for_each_passed_face(&self, grid: &Grid, connect: &mut impl FnMut(usize, usize, [i8; 3])) {
         for (slot, cell) in self.cells.iter().enumerate() {
             let base = grid.cell_at(cell.index).map(|coordinate| coordinate * SUBDIVISIONS);
-            for bit in (0..SUB_CELLS).filter(|bit| cell.occupied >> bit & 1 == 1) {
+            for bit in 0..SUB_CELLS {
                 let local = [bit / 16, bit / SUBDIVISIONS % SUBDIVISIONS, bit % SUBDIVISIONS];
-                let sub_cell = [0, 1, 2].map(|axis| base[axis] + local[axis]);
-                for offset in FORWARD_NEIGHBORS {
-                    let Some(neighbor) = neighbor_of(sub_cell, offset) else { continue };
-                    let Some(number) = self.number_of(grid, neighbor) else { continue };
-                    let is_connected = match offset {
-                        [1, 0, 0] => cell.is_connected(0, bit),
-                        [0, 1, 0] => cell.is_connected(1, bit),
-                        [0, 0, 1] => cell.is_connected(2, bit),
-                        _ => parts_of(offset).into_iter().all(|part| {
-                            neighbor_of(sub_cell, part).is_none_or(|between| self.number_of(grid, between).is_none())
-                        }),
-                    };
-                    if is_connected {
-                        let cells =
-                            [sub_cell, neighbor].map(|coordinates| coordinates.map(|index| index / SUBDIVISIONS));
-                        let cell_offset =
-                            [0, 1, 2].map(|axis| (cells[1][axis] as isize - cells[0][axis] as isize) as i8);
-                        connect(slot * SUB_CELLS + bit, number, cell_offset);
+                for axis in (0..3).filter(|axis| cell.passed[*axis] >> bit & 1 == 1) {
+                    let mut neighbor = [0, 1, 2].map(|axis| base[axis] + local[axis]);
+                    neighbor[axis] += 1;
+                    let mut offset = [0; 3];
+                    offset[axis] = i8::from(local[axis] + 1 == SUBDIVISIONS);
+                    if neighbor[axis] < grid.cells[axis] * SUBDIVISIONS
+                        && let Some(number) = self.number_of(grid, neighbor)
+                    {
+                        connect(slot * SUB_CELLS + bit, number, offset);
                     }
                 }
             }
         }
     }
-}
 
-impl CellContacts {
-    /// Whether a sub-cell is connected to the next one along an axis, if both have material.
-    fn is_connected(&self, axis: usize, bit: usize) -> bool {
-        let has = |set: SubCells| set >> bit & 1 == 1;
-        has(self.passed[axis]) || !has(self.separated[axis])
+    /// Connects the neighboring sub-cells with material that a triangle passes through.
+    fn connect_along(&self, grid: &Grid, corners: [Vector3<f64>; 3], connect: &mut impl FnMut(usize, usize, [i8; 3])) {
+        /// Distance of the points on the triangle, in sub-cells.
+        const DISTANCE: f64 = 0.5;
+        let [a, b, c] = corners.map(|corner| grid.to_cell_units(corner) * SUBDIVISIONS as f64);
+        let divisions = |edge: Vector3<f64>| (edge.norm() / DISTANCE).ceil().max(1.0) as usize;
+        let along = divisions(b - a).max(divisions(c - b));
+        let mut sub_cells = BTreeMap::new();
+        for i in 0..=along {
+            // Lines from a point on ab to the point on ac with the same share, parallel to bc.
+            let share = i as f64 / along as f64;
+            let (start, edge) = (a + (b - a) * share, (c - b) * share);
+            let across = divisions(edge);
+            for j in 0..=across {
+                let point = start + edge * (j as f64 / across as f64);
+                let sub_cell =
+                    [0, 1, 2].map(|axis| (point[axis].max(0.0) as usize).min(grid.cells[axis] * SUBDIVISIONS - 1));
+                if let Some(number) = self.number_of(grid, sub_cell) {
+                    sub_cells.insert(sub_cell, number);
+                }
+            }
+        }
+        for (sub_cell, number) in &sub_cells {
+            for offset in FORWARD_NEIGHBORS {
+                let neighbor = [0, 1, 2].map(|axis| sub_cell[axis].wrapping_add_signed(isize::from(offset[axis])));
+                if let Some(other) = sub_cells.get(&neighbor) {
+                    let cell_offset = [0, 1, 2].map(|axis| {
+                        (neighbor[axis] / SUBDIVISIONS) as isize - (sub_cell[axis] / SUBDIVISIONS) as isize
+                    });
+                    connect(*number, *other, cell_offset.map(|offset| offset as i8));
+                }
+            }
+        }
     }
-}
-
-/// The offsets between a sub-cell and a neighbor at an edge or corner: those with some of the offset's components.
-fn parts_of(offset: [i8; 3]) -> Vec<[i8; 3]> {
-    let masked = |mask: usize| [0, 1, 2].map(|axis| if mask >> axis & 1 == 1 { offset[axis] } else { 0 });
-    (1..7).map(masked).filter(|part| *part != offset && *part != [0; 3]).collect()
 }
 
 /// The bit of a sub-cell in its cell. Coordinates are those in the whole grid.
@@ -283,8 +317,6 @@ fn shared_nodes(offset: [i8; 3]) -> Vec<[usize; 2]> {
 
 #[cfg(test)]
 mod tests {
-    use nalgebra::Vector3;
-
     use super::*;
     use crate::material_rays::trace_rays;
     use crate::surface::Surface;
@@ -302,7 +334,7 @@ mod tests {
         let (low, high) = surface.bounds();
         let grid = Grid::covering(low, high, cell_size);
         let segments = [0, 1, 2].map(|axis| trace_rays(&surface, &grid, axis, None));
-        CellPieces::new(&grid, &segments)
+        CellPieces::new(&grid, &surface, &segments)
     }
 
     #[test]
@@ -332,6 +364,52 @@ mod tests {
         assert_eq!(pieces_of(&plates(0.0), 1.0).part_count, 1, "control: plates that touch");
     }
 
+    /// Two slanted plates with a gap of 0.5 cells.
+    #[test]
+    fn slanted_plates_with_a_gap_are_separate() {
+        let rotation = nalgebra::Rotation3::from_axis_angle(&Vector3::y_axis(), std::f64::consts::FRAC_PI_4);
+        let parts_with_gap = |gap: f64| {
+            let (mut positions, mut triangles) = box_surface([-2.0, -1.0, gap / 2.0], [2.0, 1.0, gap / 2.0 + 0.1]);
+            let (below, faces) = box_surface([-2.0, -1.0, -gap / 2.0 - 0.1], [2.0, 1.0, -gap / 2.0]);
+            positions.extend(below);
+            triangles.extend(faces.iter().map(|face| face.map(|vertex| vertex + 8)));
+            positions.iter_mut().for_each(|position| *position = rotation * *position);
+            let surface = Surface::new(&positions, &triangles, &[0; 24]);
+            let (low, high) = surface.bounds();
+            let grid = Grid::covering(low, high, 0.4);
+            let segments = [0, 1, 2].map(|axis| trace_rays(&surface, &grid, axis, None));
+            CellPieces::new(&grid, &surface, &segments).part_count
+        };
+        assert_eq!(parts_with_gap(0.2), 2);
+        assert_eq!(parts_with_gap(0.01), 1, "control: both walls in the same sub-cells");
+    }
+
+    /// Two flanges of a thin sheet. Both pass through the same sub-cells near the fold.
+    #[test]
+    fn folded_sheet_is_one_part() {
+        for (thickness, degrees) in [(0.002, 25.0_f64), (0.002, 35.0), (0.001, 45.0), (0.001, 40.0), (0.001, 30.0)] {
+            let angle = degrees.to_radians();
+            let profile =
+                [[0.0, 0.0], [1.0, 0.0], [1.0, thickness], [thickness, thickness], [thickness, 1.0], [0.0, 1.0]];
+            let rotation = nalgebra::Rotation3::from_axis_angle(&Vector3::y_axis(), angle);
+            let side = |y: f64| profile.map(|[x, z]| rotation * Vector3::new(x, y, z));
+            let positions: Vec<_> = side(0.0).into_iter().chain(side(0.5)).collect();
+            let mut triangles = vec![[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 5]];
+            triangles.extend(triangles.clone().iter().map(|[a, b, c]| [a + 6, c + 6, b + 6]));
+            for edge in 0..6 {
+                let next = (edge + 1) % 6;
+                triangles.extend([[next, edge, edge + 6], [next, edge + 6, next + 6]]);
+            }
+            let surface = Surface::new(&positions, &triangles, &[0; 20]);
+            assert!(surface.is_closed);
+            let (low, high) = surface.bounds();
+            let grid = Grid::covering(low, high, 0.05);
+            let segments = [0, 1, 2].map(|axis| trace_rays(&surface, &grid, axis, None));
+            let pieces = CellPieces::new(&grid, &surface, &segments);
+            assert_eq!(pieces.part_count, 1, "thickness {thickness}, {degrees} degrees");
+        }
+    }
+
     /// A thin wall whose sub-cells touch at edges.
     #[test]
     fn slanted_wall_is_one_part() {
@@ -343,7 +421,7 @@ mod tests {
             let (low, high) = surface.bounds();
             let grid = Grid::covering(low, high, 0.4);
             let segments = [0, 1, 2].map(|axis| trace_rays(&surface, &grid, axis, None));
-            assert_eq!(CellPieces::new(&grid, &segments).part_count, 1, "{angle}");
+            assert_eq!(CellPieces::new(&grid, &surface, &segments).part_count, 1, "{angle}");
         }
     }
 }

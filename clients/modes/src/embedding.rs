@@ -77,7 +77,7 @@ mod tests {
         let (low, high) = surface.bounds();
         let grid = Grid::covering(low, high, 0.5);
         let segments = [0, 1, 2].map(|axis| trace_rays(&surface, &grid, axis, None));
-        let pieces = CellPieces::new(&grid, &segments);
+        let pieces = CellPieces::new(&grid, &surface, &segments);
         for position in [[0.0, 0.0, 0.0], [2.3, 1.1, 0.4], [1.0, -0.05, 0.2], [2.31, 0.55, 0.39]] {
             let point = grid.to_cell_units(position.into());
             let embedded = embed(&grid, &pieces, point).expect("a piece");
