@@ -284,6 +284,12 @@ impl Cache {
             Ok(()) => drop(folder.keep()),
             // Another process has computed the same.
             Err(_) if entry.join(file_name).is_file() => {}
+            // An entry without its file: its removal ended halfway.
+            Err(_) if entry.is_dir() => {
+                fs::remove_dir_all(&entry).map_err(|error| self.unavailable(&error))?;
+                fs::rename(folder.path(), &entry).map_err(|error| self.unavailable(&error))?;
+                drop(folder.keep());
+            }
             Err(error) => return Err(self.unavailable(&error)),
         }
         self.remove_oldest(MAX_CACHE_BYTES, name);
@@ -415,6 +421,10 @@ mod tests {
         assert_eq!(names().len(), 3);
         drop(running);
         assert_eq!(names(), ["a", "d"]);
+        // The removal of an entry ended halfway.
+        std::fs::remove_file(cache.folder.join("a").join("a.npz")).expect("expected a removed file");
+        add("a", 0);
+        assert!(cache.find("a", "a.npz").is_some());
     }
 
     #[test]

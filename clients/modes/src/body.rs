@@ -40,6 +40,8 @@ pub struct Body {
     winding: Option<WindingNumber>,
     /// For each axis, the coordinates of faces and clamps across it, meters.
     breaks: [Vec<f64>; 3],
+    /// For each axis, the coordinates where a clamp can begin or end, meters.
+    clamp_borders: [Vec<f64>; 3],
 }
 
 /// The cells of one grid.
@@ -86,11 +88,18 @@ impl Body {
         let regions: Vec<Region> =
             parameters.clamps.iter().map(|text| Region::parse(text, &file.groups)).collect::<Result<_>>()?;
         let mut breaks = aligned_faces(&surface);
+        let mut clamp_borders: [Vec<f64>; 3] = Default::default();
         for (axis, position) in parameters.clamps.iter().flat_map(|text| region::limits(text)) {
             breaks[axis].push(position * unit);
+            clamp_borders[axis].push(position * unit);
+        }
+        for region in &regions {
+            if let Region::Sphere { center, .. } = region {
+                (0..3).for_each(|axis| clamp_borders[axis].push(center[axis] * unit));
+            }
         }
         let materials = parameters.materials_of(&file.groups)?;
-        let body = Self { materials, surface, regions, unit, winding, breaks };
+        let body = Self { materials, surface, regions, unit, winding, breaks, clamp_borders };
         body.check_volume()?;
         Ok(body)
     }
@@ -101,10 +110,15 @@ impl Body {
         (high - low).norm()
     }
 
-    /// The size of cells at which the search of a grid begins: eight cells along the longest side.
-    pub fn first_cell_size(&self) -> f64 {
+    /// The size of cells at which the search of a grid begins: eight cells along the longest side, and for a slender body
+    /// four times the side of a square section, so that rays hit it.
+    pub fn initial_cell_size(&self) -> f64 {
         let (low, high) = self.surface.bounds();
-        (high - low).max() / 8.0
+        let section_side = (self.surface.volume().abs() / self.diagonal()).sqrt();
+        match self.surface.is_closed {
+            true => ((high - low).max() / 8.0).min(4.0 * section_side),
+            false => (high - low).max() / 8.0,
+        }
     }
 
     /// A point in units of cells in the coordinates of the file.
@@ -125,7 +139,10 @@ impl Body {
         let ray_volume =
             |axis: usize, segment: &RaySegment| (segment.end - segment.start) * grid.ray_area(axis, segment.ray);
         let volume_of = |axis: usize| segments[axis].iter().map(|segment| ray_volume(axis, segment)).sum::<f64>();
-        let volume = [0, 1, 2].map(volume_of).into_iter().fold(0.0, f64::max) * grid.cell_size.powi(3);
+        let volume = match self.surface.is_closed {
+            true => self.surface.volume().abs(),
+            false => [0, 1, 2].map(volume_of).into_iter().fold(0.0, f64::max) * grid.cell_size.powi(3),
+        };
         let hint = "a surface that encloses a volume. For a sheet, give its --thickness";
         // Rounding of the positions gives a plane surface a volume of this size.
         if volume < 1e-9 * self.surface.area() * self.diagonal() {
@@ -196,13 +213,17 @@ impl Body {
         let grid = Grid::covering(low, high, cell_size).with_breaks(&self.breaks);
         let mut held_points = points_on_groups(&self.surface, &grid, &self.regions);
         let mut segments = self.trace(&grid);
+        // The rays of a coarse grid can miss a slender body.
+        let has_material = segments.iter().any(|segments| !segments.is_empty());
         for (axis, segments) in segments.iter_mut().enumerate() {
             let (remaining, held) =
-                remove_regions(&grid, segments, axis, &self.regions, |point| self.to_file(&grid, point));
+                remove_regions(&grid, segments, axis, &self.regions, &self.borders(&grid, axis), |point| {
+                    self.to_file(&grid, point)
+                });
             *segments = remaining;
             held_points.extend(held);
         }
-        if segments.iter().all(Vec::is_empty) {
+        if has_material && segments.iter().all(Vec::is_empty) {
             return Err(invalid("--clamp", "a region that leaves a part of the body free", "one with the whole body"));
         }
         let pieces = CellPieces::new(&grid, &self.surface, &segments);
@@ -220,9 +241,11 @@ impl Body {
             let one_region = std::slice::from_ref(region);
             let is_group = !points_on_groups(&self.surface, grid, one_region).is_empty();
             let touches = |axis: usize| {
-                let (remaining, _) =
-                    remove_regions(grid, &segments[axis], axis, one_region, |point| self.to_file(grid, point));
-                remaining != segments[axis]
+                let borders = self.borders(grid, axis);
+                let (_, held) = remove_regions(grid, &segments[axis], axis, one_region, &borders, |point| {
+                    self.to_file(grid, point)
+                });
+                !held.is_empty()
             };
             if !is_group && !(0..3).any(touches) {
                 let (low, high) = self.surface.bounds();
@@ -235,6 +258,11 @@ impl Body {
             }
         }
         Ok(())
+    }
+
+    /// The coordinates along an axis where a clamp can begin or end, in units of cells.
+    fn borders(&self, grid: &Grid, axis: usize) -> Vec<f64> {
+        self.clamp_borders[axis].iter().map(|position| (position - grid.origin[axis]) / grid.cell_size).collect()
     }
 
     /// The material along the rays of the three axes.

@@ -8,7 +8,7 @@ use crate::embedding::{EmbeddedPoint, embed};
 use crate::grid::Grid;
 use crate::material_rays::{RaySegment, bisect};
 use crate::region::Region;
-use crate::surface::Surface;
+use crate::surface::{Surface, divide_triangle};
 
 /// A point of a held face, and the area that it represents.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -24,13 +24,15 @@ pub struct HeldPoint {
 pub const SPRING_FACTOR: f64 = 1e3;
 
 /// Removes the material in regions along the rays of an axis. Returns the remaining segments and the points where the
-/// rays enter or leave a region inside of the material. `to_file` converts a point in units of cells to the coordinates
-/// of regions.
+/// rays enter or leave a region inside of the material. `borders` are known coordinates of the borders of regions along the
+/// axis, in units of cells: regions between two tested positions are found only there. `to_file` converts a point in
+/// units of cells to the coordinates of regions.
 pub fn remove_regions(
     grid: &Grid,
     segments: &[RaySegment],
     axis: usize,
     regions: &[Region],
+    borders: &[f64],
     to_file: impl Fn(Vector3<f64>) -> Vector3<f64>,
 ) -> (Vec<RaySegment>, Vec<HeldPoint>) {
     /// Distance of the positions that are tested, in cells.
@@ -45,23 +47,25 @@ pub fn remove_regions(
         };
         let length = segment.end - segment.start;
         let intervals = (length / SAMPLE_DISTANCE).ceil().max(1.0) as usize;
-        // Positions at the very ends detect regions that only touch the surface.
-        let position = |sample: usize| match sample {
-            0 => segment.start,
-            _ if sample == intervals => segment.end,
-            _ => segment.start + sample as f64 / intervals as f64 * length,
-        };
+        let mut positions: Vec<f64> =
+            (1..intervals).map(|sample| segment.start + sample as f64 / intervals as f64 * length).collect();
+        let around_borders = borders.iter().flat_map(|border| [border - ACCURACY, border + ACCURACY]);
+        positions.extend(around_borders.filter(|position| (segment.start..segment.end).contains(position)));
+        // Positions at the very ends, and beyond by the rounding, detect regions that only touch the surface.
+        positions.extend([segment.start - ACCURACY, segment.end + ACCURACY]);
+        positions.sort_by(f64::total_cmp);
         let mut start = segment.start;
-        let mut was_held = is_held(start);
-        for sample in 1..=intervals {
-            if is_held(position(sample)) == was_held {
+        let mut was_held = is_held(positions[0]);
+        for pair in positions.windows(2) {
+            let [previous, position] = [pair[0], pair[1]];
+            if is_held(position) == was_held {
                 continue;
             }
-            let [low, high] = bisect([position(sample - 1), position(sample)], ACCURACY, is_held);
+            let [low, high] = bisect([previous, position], ACCURACY / 4.0, is_held);
             if !was_held && low > start {
                 remaining.push(RaySegment { start, end: low, ..*segment });
             }
-            let border = if was_held { high } else { low };
+            let border = if was_held { high } else { low }.clamp(segment.start, segment.end);
             held.push(HeldPoint {
                 position: grid.point_on_ray(axis, segment.ray, border),
                 area: grid.ray_area(axis, segment.ray),
@@ -75,28 +79,16 @@ pub fn remove_regions(
     (remaining, held)
 }
 
-/// Points on the triangles of held groups. Each triangle is divided until its parts are smaller than a quarter of a cell.
+/// Points on the triangles of held groups. Each triangle is divided until its edges are shorter than a quarter of a cell.
 pub fn points_on_groups(surface: &Surface, grid: &Grid, regions: &[Region]) -> Vec<HeldPoint> {
-    const MAX_PART: f64 = 0.25;
-    /// Limit on the divisions of one edge.
-    const MAX_DIVISIONS: f64 = 512.0;
+    const MAX_EDGE: f64 = 0.25;
     let is_group = |group: u32| regions.iter().any(|region| matches!(region, Region::Group(index) if *index == group));
     let mut points = Vec::new();
     for triangle in (0..surface.triangles.len()).filter(|index| is_group(surface.triangle_groups[*index])) {
-        let [a, b, c] = surface.corners(triangle).map(|corner| grid.to_cell_units(corner));
-        let longest = (b - a).norm().max((c - b).norm()).max((a - c).norm());
-        let divisions = (longest / MAX_PART).ceil().clamp(1.0, MAX_DIVISIONS);
-        let count = divisions as usize;
-        let area = (b - a).cross(&(c - a)).norm() / 2.0 / divisions.powi(2);
-        let at = |i: f64, j: f64| a + (b - a) * (i / divisions) + (c - a) * (j / divisions);
-        for i in 0..count {
-            for j in 0..count - i {
-                points.push(HeldPoint { position: at(i as f64 + 1.0 / 3.0, j as f64 + 1.0 / 3.0), area });
-                if i + j + 1 < count {
-                    points.push(HeldPoint { position: at(i as f64 + 2.0 / 3.0, j as f64 + 2.0 / 3.0), area });
-                }
-            }
-        }
+        let corners = surface.corners(triangle).map(|corner| grid.to_cell_units(corner));
+        divide_triangle(corners, MAX_EDGE, |[a, b, c]| {
+            points.push(HeldPoint { position: (a + b + c) / 3.0, area: (b - a).cross(&(c - a)).norm() / 2.0 });
+        });
     }
     points
 }
@@ -122,14 +114,14 @@ mod tests {
     #[test]
     fn material_in_a_region_is_removed_and_its_border_held() {
         let segment = RaySegment { ray: [3, 4], start: 0.1, end: 2.0, group: 0 };
-        let (remaining, held) = remove_regions(&grid(), &[segment], 2, &slab_region(), |point| point);
+        let (remaining, held) = remove_regions(&grid(), &[segment], 2, &slab_region(), &[], |point| point);
         assert_eq!((remaining.len(), held.len()), (1, 1));
         assert!((remaining[0].start - 0.3).abs() < 1e-6 && remaining[0].end == 2.0);
         assert!((held[0].position.z - 0.3).abs() < 1e-6);
         let above = RaySegment { start: 0.4, ..segment };
-        assert_eq!(remove_regions(&grid(), &[above], 2, &slab_region(), |point| point), (vec![above], vec![]));
+        assert_eq!(remove_regions(&grid(), &[above], 2, &slab_region(), &[], |point| point), (vec![above], vec![]));
         let below = RaySegment { end: 0.2, ..segment };
-        assert_eq!(remove_regions(&grid(), &[below], 2, &slab_region(), |point| point), (vec![], vec![]));
+        assert_eq!(remove_regions(&grid(), &[below], 2, &slab_region(), &[], |point| point), (vec![], vec![]));
     }
 
     /// A region much thinner than the distance of the tested positions, at either end of the material.
@@ -138,8 +130,30 @@ mod tests {
         let segment = RaySegment { ray: [0, 0], start: 0.0, end: 2.0, group: 0 };
         for text in ["z < 0.00001", "z > 1.99999"] {
             let regions = [Region::parse(text, &[]).expect("a region")];
-            let (remaining, held) = remove_regions(&grid(), &[segment], 2, &regions, |point| point);
+            let (remaining, held) = remove_regions(&grid(), &[segment], 2, &regions, &[], |point| point);
             assert_eq!((remaining.len(), held.len()), (1, 1), "{text}");
+        }
+    }
+
+    /// A slab inside of the material, much thinner than the distance of the tested positions.
+    #[test]
+    fn thin_slab_inside_is_found_at_its_border() {
+        let segment = RaySegment { ray: [0, 0], start: 0.0, end: 2.0, group: 0 };
+        let regions = [Region::parse("z > 0.7 && z < 0.701", &[]).expect("a region")];
+        let (remaining, held) = remove_regions(&grid(), &[segment], 2, &regions, &[0.7, 0.701], |point| point);
+        assert_eq!((remaining.len(), held.len()), (2, 2));
+        let (_, unheld) = remove_regions(&grid(), &[segment], 2, &regions, &[], |point| point);
+        assert!(unheld.is_empty(), "control: the tested positions alone miss the slab");
+    }
+
+    /// A region that contains only the first point of the material.
+    #[test]
+    fn region_of_the_surface_alone_is_found() {
+        for offset in [0.0, 1e-9, -1e-9] {
+            let segment = RaySegment { ray: [0, 0], start: offset, end: 2.0, group: 0 };
+            let regions = [Region::parse("z <= 0", &[]).expect("a region")];
+            let (_, held) = remove_regions(&grid(), &[segment], 2, &regions, &[], |point| point);
+            assert_eq!(held.len(), 1, "{offset}");
         }
     }
 
@@ -152,6 +166,6 @@ mod tests {
         let points = points_on_groups(&surface, &grid, &[Region::Group(1)]);
         let area: f64 = points.iter().map(|point| point.area).sum();
         assert!((area * 0.25 - 2.0).abs() < 1e-9, "{area}");
-        assert!(points.iter().all(|point| point.position.z == 0.0));
+        assert!(points.iter().all(|point| point.position.z.abs() < 1e-12));
     }
 }

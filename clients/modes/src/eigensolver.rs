@@ -44,7 +44,7 @@ impl ElasticModes {
 }
 
 /// Limit on the residual of a converged mode, relative to the largest eigenvalue of the operator.
-const TOLERANCE: f64 = 1e-10;
+const TOLERANCE: f64 = 1e-8;
 /// Vectors of a block.
 const BLOCK: usize = 8;
 /// Limit on the blocks of a run, beyond twice the number of modes.
@@ -55,6 +55,8 @@ const EXTRA_MODES: usize = 2;
 const CHECKED_MODES: usize = 4;
 /// Limit on the runs that look for missed copies.
 const MAX_CHECKS: usize = 8;
+/// The smallest eigenvalue of an elastic mode, relative to the shift.
+const MIN_EIGENVALUE: f64 = 1e-6;
 /// Eigenvalues that differ by less, relative to their size, form a cluster.
 const CLUSTER_GAP: f64 = 1e-6;
 
@@ -106,7 +108,18 @@ pub fn find_elastic_modes(
         factor.solve_upper(as_columns(&mut vector, 1));
         factor.unpermuted(&vector)
     });
-    Ok(normalize(system, shapes.collect(), count))
+    let modes = normalize(system, shapes.collect(), count);
+    // A part that only fill connects to another moves almost without stiffness, and rounding can make it negative.
+    match modes.eigenvalues.iter().find(|eigenvalue| !(**eigenvalue > MIN_EIGENVALUE * shift)) {
+        None => Ok(modes),
+        Some(eigenvalue) => {
+            let reason = format!(
+                "a mode has the eigenvalue {eigenvalue:.3e}, which is too small for an elastic body. Parts may be \
+                 connected by less than a cell, or a clamp may hold a part at a single point; more --freedoms help"
+            );
+            Err(fault("eigensolver", reason))
+        }
+    }
 }
 
 /// Mass-normalizes the vectors, computes eigenvalues by Rayleigh quotients, and makes signs and bases unique.
@@ -129,6 +142,11 @@ fn normalize(system: &SystemMatrices, shapes: Vec<Vec<f64>>, count: usize) -> El
         choose_basis(&mut modes[start..stop]);
         start = stop;
     }
+    // The basis of a cluster has other Rayleigh quotients.
+    for (eigenvalue, shape) in &mut modes {
+        *eigenvalue = dot(shape, &system.apply_stiffness(shape));
+    }
+    modes.sort_by(|(a, _), (b, _)| a.total_cmp(b));
     modes.truncate(count);
     let mut result = ElasticModes::default();
     for (_, shape) in modes {
@@ -342,7 +360,11 @@ impl ShiftInvert<'_> {
                 return Ok(ritz.into_pairs());
             }
             if columns == limit {
-                let reason = format!("expected {count} converged modes, got residuals {:?}", ritz.residuals);
+                let worst = ritz.residuals.iter().copied().fold(0.0, f64::max) / ritz.values[0];
+                let reason = format!(
+                    "{count} modes did not converge: expected residuals below {TOLERANCE:e}, got {worst:.1e}. Fewer --modes \
+                     or more --freedoms help"
+                );
                 return Err(fault("eigensolver", reason));
             }
         }

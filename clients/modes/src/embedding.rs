@@ -17,14 +17,15 @@ pub struct EmbeddedPoint {
     pub weights: [f64; CELL_NODES],
 }
 
-/// Finds the piece at `point`, in units of cells: the one whose sub-cells are closest. `None` without pieces.
+/// Finds the piece at `point`, in units of cells: the one whose sub-cells are closest. `None` if the closest one is farther
+/// than a cell.
 pub fn embed(grid: &Grid, pieces: &CellPieces, point: Vector3<f64>) -> Option<EmbeddedPoint> {
     let cell = grid.cell_containing(point);
     let own = pieces.in_cell(grid.cell_index(cell));
     let (piece, _) = closest_piece(grid, own, point)
         .filter(|(_, distance)| *distance == 0.0)
         .or_else(|| closest_piece(grid, neighborhood(grid, cell).flat_map(|cell| pieces.in_cell(cell)), point))
-        .or_else(|| closest_piece(grid, pieces.pieces.iter().copied().enumerate(), point))?;
+        .filter(|(_, squared_distance)| *squared_distance <= 1.0)?;
     let base = grid.cell_at(pieces.pieces[piece].cell);
     let local = [0, 1, 2]
         .map(|axis| (2.0 * (point[axis] - base[axis] as f64) - 1.0).clamp(-MAX_LOCAL_COORDINATE, MAX_LOCAL_COORDINATE));
@@ -89,5 +90,7 @@ mod tests {
             let sum: Vector3<f64> = (0..CELL_NODES).map(|index| node(index) * embedded.weights[index]).sum();
             assert!((sum - point).norm() < 1e-12, "{position:?}: {sum:?} instead of {point:?}");
         }
+        let far = grid.to_cell_units(Vector3::new(4.0, 0.5, 0.2));
+        assert_eq!(embed(&grid, &pieces, far), None, "a point of no piece");
     }
 }

@@ -56,9 +56,17 @@ impl Grid {
         const GAUSS: f64 = 0.577_350_269_189_625_8;
         /// Parts that are shorter, in sub-cells, are merged with their neighbor.
         const MIN_PART: f64 = 1e-6;
+        /// Grids with fewer cells along an axis have more lines per sub-cell.
+        const FEW_CELLS: usize = 8;
+        /// Limit on the parts of a sub-cell, apart from breaks.
+        const MAX_PARTS: usize = 4;
         for (axis, breaks) in breaks.iter().enumerate() {
             let scale = SUBDIVISIONS as f64 / self.cell_size;
             let mut inner: Vec<f64> = breaks.iter().map(|position| (position - self.origin[axis]) * scale).collect();
+            // Bodies with few cells across have finer lines: their curved faces lie along the axes of the grid.
+            let parts = (FEW_CELLS / self.cells[axis]).clamp(1, MAX_PARTS);
+            let sub_cells = self.cells[axis] * SUBDIVISIONS;
+            inner.extend((1..sub_cells * parts).map(|part| part as f64 / parts as f64));
             inner.sort_by(f64::total_cmp);
             let (mut lines, mut first_lines) = (Vec::new(), Vec::new());
             for sub_cell in 0..self.cells[axis] * SUBDIVISIONS {
@@ -203,7 +211,7 @@ mod tests {
         assert!((integral(&grid, 1.3) - exact(1.3)).abs() > 1e-2, "control: without the break");
         let grid = grid.with_breaks(&breaks);
         assert!((integral(&grid, 1.3) - exact(1.3)).abs() < 1e-12);
-        assert_eq!((grid.first_lines[0][1], grid.lines[0].len()), (8, 18));
+        assert_eq!((grid.first_lines[0][1], grid.lines[0].len()), (32, 66));
         assert!(grid.lines[0].iter().all(|line| line.sub_cell == (line.position * 4.0) as usize));
     }
 

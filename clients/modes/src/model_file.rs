@@ -3,6 +3,7 @@
 
 use std::collections::BTreeMap;
 use std::io::{Cursor, Write as _};
+use std::os::unix::fs::PermissionsExt as _;
 use std::path::Path;
 
 use modalcast_model::error::{Result, fault_in, invalid};
@@ -59,22 +60,25 @@ pub fn write(path: &Path, bytes: &[u8], replace: bool) -> Result<()> {
     let field = format!("file '{}'", path.display());
     let unwritable = |error: std::io::Error| invalid(&field, "a file that can be written", error);
     let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    let mut temporary = tempfile::Builder::new().prefix(".modalcast-").tempfile_in(folder).map_err(unwritable)?;
+    if replace && path.exists() && !path.is_file() {
+        return Err(invalid(field, "a file", "a folder or a device"));
+    }
+    let mut temporary = tempfile::Builder::new()
+        .prefix(".modalcast-")
+        // The umask applies, as to every new file.
+        .permissions(std::fs::Permissions::from_mode(0o666))
+        .tempfile_in(folder)
+        .map_err(unwritable)?;
     temporary.write_all(bytes).map_err(unwritable)?;
+    temporary.as_file().sync_all().map_err(unwritable)?;
     let persisted = if replace { temporary.persist(path) } else { temporary.persist_noclobber(path) };
     match persisted {
-        Ok(file) => make_readable(&file).map_err(unwritable),
+        Ok(_) => Ok(()),
         Err(error) if error.error.kind() == std::io::ErrorKind::AlreadyExists => {
             Err(invalid(field, "a new file (--force replaces an existing one)", "an existing file"))
         }
         Err(error) => Err(unwritable(error.error)),
     }
-}
-
-/// Temporary files are private. A model has the permissions of other new files with the usual mask.
-fn make_readable(file: &std::fs::File) -> std::io::Result<()> {
-    use std::os::unix::fs::PermissionsExt as _;
-    file.set_permissions(std::fs::Permissions::from_mode(0o644))
 }
 
 /// The notes of a model: how it was made, and how accurate it is.
@@ -165,6 +169,7 @@ mod tests {
         assert_eq!(std::fs::read(&path).expect("a file"), b"two");
         assert_eq!(std::fs::read_dir(folder.path()).expect("a folder").count(), 1, "no temporary file remains");
         assert!(write(&folder.path().join("missing/a.npz"), b"one", false).is_err());
+        assert!(write(folder.path(), b"one", true).is_err(), "a folder is not replaced");
     }
 
     #[test]

@@ -51,8 +51,12 @@ pub struct Modeling {
     pub remarks: Vec<String>,
 }
 
-/// The stiffness in the rest of a cut cell, relative to that of the material.
+/// The stiffness in the rest of a cut cell, relative to that of the material. A softer fill lets nodes at slivers of
+/// material move in spurious modes.
 const FILL_FRACTION: f64 = 1e-8;
+/// The thickness in cells below which the fill stiffens a sheet by more than 0.5 % (1e-8 of a solid cell against the cube
+/// of the thickness).
+const MIN_THICKNESS: f64 = 0.01;
 /// The coarse grid of the error estimate has this share of the freedoms.
 const COARSE_FRACTION: f64 = 0.4;
 /// The order of the frequencies' error in the cell size that the error estimate assumes. Quadratic cells reach 4 for
@@ -67,7 +71,7 @@ const ASSUMED_ORDER: i32 = 3;
 pub fn compute_modes(file: &SurfaceFile, parameters: &ModelingParameters, progress: &Progress<'_>) -> Result<Modeling> {
     progress(0.0, "surface");
     let body = Body::new(file, parameters)?;
-    let layout = body.finest_layout(parameters.freedoms, body.first_cell_size(), 0.93)?;
+    let layout = body.finest_layout(parameters.freedoms, body.initial_cell_size(), 0.93)?;
     body.check_clamps(&layout.grid, &parameters.clamps)?;
     if layout.freedoms() < 2 * parameters.modes {
         let expected = format!("at most half of the {} freedoms", layout.freedoms());
@@ -90,7 +94,7 @@ pub fn compute_modes(file: &SurfaceFile, parameters: &ModelingParameters, progre
     progress(0.95, "interpolation");
     let (mesh, modes) = interpolate(&body, &layout, file, &solution.modes);
     let (low, high) = body.surface.bounds();
-    let damping_ratio = parameters.damping_ratio.unwrap_or(parameters.material.damping_ratio);
+    let damping_ratio = parameters.damping_ratio.unwrap_or_else(|| mean_damping_ratio(&body, &layout));
     let mut modeling = Modeling {
         mesh,
         modes,
@@ -108,6 +112,18 @@ pub fn compute_modes(file: &SurfaceFile, parameters: &ModelingParameters, progre
     };
     add_remarks(&body, &layout, parameters, &mut modeling);
     Ok(modeling)
+}
+
+/// The damping ratio of the materials, weighted by mass.
+fn mean_damping_ratio(body: &Body, layout: &Layout) -> f64 {
+    let (mut sum, mut mass) = (0.0, 0.0);
+    for group in layout.moments.iter().flatten() {
+        let material = &body.materials[group.group as usize];
+        let group_mass = group.volume_fraction() * material.density;
+        sum += group_mass * material.damping_ratio;
+        mass += group_mass;
+    }
+    sum / mass
 }
 
 /// The frequency of an eigenvalue, Hz.
@@ -136,9 +152,13 @@ fn solve(
     add_springs(body, &layout.grid, &held, &mut matrices);
     for mass in &parameters.point_masses {
         let point = layout.grid.to_cell_units(mass.position * body.unit);
-        if let Some(embedded) = embed(&layout.grid, &layout.pieces, point) {
-            add_outer_product(&mut Arc::make_mut(&mut matrices[embedded.piece]).mass, &embedded.weights, mass.mass);
-        }
+        let is_held = body.regions.iter().any(|region| region.contains(mass.position));
+        let Some(embedded) = embed(&layout.grid, &layout.pieces, point).filter(|_| !is_held) else {
+            let [x, y, z]: [f64; 3] = mass.position.into();
+            let expected = "a position at the body, outside of clamps";
+            return Err(invalid("--point-mass", expected, format!("{x} {y} {z}")));
+        };
+        add_outer_product(&mut Arc::make_mut(&mut matrices[embedded.piece]).mass, &embedded.weights, mass.mass);
     }
     let mass = matrices.iter().map(|matrices| matrices.mass.iter().sum::<f64>()).sum();
     progress(0.05, "assembly");
@@ -241,10 +261,14 @@ fn rigid_motions(layout: &Layout, held: &[(EmbeddedPoint, f64)]) -> Vec<Vec<f64>
     motions
 }
 
+/// The mean thickness of the body, meters: that of a plate with its volume and area.
+fn mean_thickness(body: &Body, layout: &Layout) -> f64 {
+    2.0 * layout.volume_fractions().iter().sum::<f64>() * layout.grid.cell_size.powi(3) / body.surface.area()
+}
+
 /// A small eigenvalue, (rad/s)^2: 1/100 of that of a plate with the mean thickness of the body.
 fn shift(body: &Body, layout: &Layout) -> f64 {
-    let volume = layout.volume_fractions().iter().sum::<f64>() * layout.grid.cell_size.powi(3);
-    let thickness = 2.0 * volume / body.surface.area();
+    let thickness = mean_thickness(body, layout);
     let speed = body.materials.iter().map(|material| material.bar_wave_speed()).fold(f64::INFINITY, f64::min);
     0.01 * (speed * thickness / body.diagonal().powi(2)).powi(2)
 }
@@ -281,7 +305,8 @@ fn interpolate(body: &Body, layout: &Layout, file: &SurfaceFile, modes: &Elastic
     let row = |position: &Vector3<f64>| {
         let mut row = vec![0.0_f32; 3 * rank];
         let is_held = body.regions.iter().any(|region| region.contains(position / body.unit));
-        if let Some(point) = embed(grid, &layout.pieces, grid.to_cell_units(*position)).filter(|_| !is_held) {
+        let point = if is_held { None } else { embed(grid, &layout.pieces, grid.to_cell_units(*position)) };
+        if let Some(point) = point {
             let nodes = &layout.pieces.nodes[point.piece];
             for (mode, vector) in modes.vectors.iter().enumerate() {
                 for axis in 0..3 {
@@ -313,13 +338,17 @@ fn add_unit_remarks(material: &Material, remarks: &mut Vec<String>) {
 fn add_remarks(body: &Body, layout: &Layout, parameters: &ModelingParameters, modeling: &mut Modeling) {
     let remarks = &mut modeling.remarks;
     if !body.surface.is_closed {
-        remarks.push("the surface has holes; its inside is found by winding numbers".into());
+        let text = "the surface is not closed (holes, or triangles that belong to no wall); its inside is found by winding \
+                    numbers";
+        remarks.push(text.into());
     }
     if body.surface.flipped_triangles > 0 {
         remarks.push(format!("{} triangles faced the other way and were turned over", body.surface.flipped_triangles));
     }
     if layout.removed_parts > 0 {
-        remarks.push(format!("{} parts with less than 0.1 % of the volume were removed", layout.removed_parts));
+        let count = layout.removed_parts;
+        let text = if count == 1 { "1 part".to_owned() } else { format!("{count} parts") };
+        remarks.push(format!("{text} with less than 0.1 % of the volume left out; such a part stays at rest"));
     }
     let diagonal = body.diagonal();
     if !(1e-3..=100.0).contains(&diagonal) {
@@ -332,11 +361,18 @@ fn add_remarks(body: &Body, layout: &Layout, parameters: &ModelingParameters, mo
     if modeling.rigid_modes > 0 {
         let parts = modeling.rigid_modes / 6;
         let text = if parts == 1 { "1 part is".to_owned() } else { format!("{parts} parts are") };
-        remarks
-            .push(format!("{text} free: it deforms in place, and its rigid motions are left out (--clamp holds it)"));
+        remarks.push(format!("{text} free: deformation in place, without rigid motions (--clamp holds a part)"));
+    }
+    let thickness = mean_thickness(body, layout);
+    if thickness < MIN_THICKNESS * modeling.cell_size {
+        remarks.push(format!(
+            "the walls are about {thickness:.1e} m thick, {:.0} times less than a cell: their frequencies are too high; \
+             more --freedoms help",
+            modeling.cell_size / thickness
+        ));
     }
     if modeling.frequency_errors.is_empty() {
-        remarks.push("the errors of the frequencies are unknown, because no coarser grid covers the part".into());
+        remarks.push("the errors of the frequencies are unknown: a coarser grid does not resolve the part".into());
     } else if let Some(worst) = modeling.frequency_errors.iter().copied().reduce(f64::max).filter(|worst| *worst > 0.05)
     {
         let percent = 100.0 * worst;

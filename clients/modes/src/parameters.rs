@@ -160,7 +160,8 @@ impl PointMass {
     /// # Errors
     /// `Invalid` unless these are four finite numbers and the mass is positive.
     pub fn parse(text: &str) -> Result<Self> {
-        let numbers: Vec<f64> = text.split([' ', ',']).filter_map(|word| word.parse().ok()).collect();
+        let numbers: Result<Vec<f64>, _> = text.split_whitespace().map(str::parse).collect();
+        let numbers = numbers.unwrap_or_default();
         match numbers[..] {
             [x, y, z, mass] if numbers.iter().all(|number| number.is_finite()) && mass > 0.0 => {
                 Ok(Self { position: Vector3::new(x, y, z), mass })
@@ -203,6 +204,7 @@ mod tests {
         }
         assert!(Unit::parse("yard").expect_err("an error").to_string().contains("m, mm, cm, um, in, ft"));
         assert!(PointMass::parse("1 2 3").is_err() && PointMass::parse("1 2 3 -1").is_err());
+        assert!(PointMass::parse("1 foo 2 3 4").is_err() && PointMass::parse("0,5 0 1").is_err());
         assert_eq!(PointMass::parse("-1 0 2 0.5").expect("a mass").mass, 0.5);
         assert!(parse_axis("w").is_err() && parse_axis("Y").is_ok_and(|axis| axis == 1));
     }

@@ -12,7 +12,8 @@ const MAX_TRIANGLES: usize = 400_000;
 /// Halves all edges longer than `max_length` meters until there are none. Neighbors at an edge share its new vertex. Ends
 /// early when the mesh has hundreds of thousands of triangles.
 pub fn divide_long_edges(mesh: &mut DrawnMesh, max_length: f64) {
-    loop {
+    // A round makes at most four triangles of one.
+    while mesh.triangles.len() <= MAX_TRIANGLES / 4 {
         let mut middles: HashMap<[u32; 2], u32> = HashMap::new();
         let mut refined = DrawnMesh {
             positions: std::mem::take(&mut mesh.positions),
@@ -22,9 +23,8 @@ pub fn divide_long_edges(mesh: &mut DrawnMesh, max_length: f64) {
         for triangle in 0..mesh.triangles.len() {
             divide_triangle(mesh, triangle, max_length, &mut middles, &mut refined);
         }
-        let is_finished = middles.is_empty() || refined.triangles.len() > MAX_TRIANGLES / 2;
         *mesh = refined;
-        if is_finished {
+        if middles.is_empty() {
             return;
         }
     }

@@ -8,6 +8,9 @@ use nalgebra::Vector3;
 const FORMS: &str =
     "an expression of x, y and z such as 'z < 0.01' or 'x < 0 && y > 1', 'group NAME', or 'near X Y Z RADIUS'";
 
+/// Limit on an expression. The time of the parser grows with the square of its length.
+const MAX_EXPRESSION_BYTES: usize = 1000;
+
 /// A region in the units and axes of the surface file.
 #[derive(Debug, Clone)]
 pub enum Region {
@@ -33,13 +36,17 @@ impl Region {
             return Ok(Self::Group(index as u32));
         }
         if let Some(numbers) = text.trim().strip_prefix("near ") {
-            let values: Vec<f64> = numbers.split_whitespace().filter_map(|word| word.parse().ok()).collect();
+            let values: Result<Vec<f64>, _> = numbers.split_whitespace().map(str::parse).collect();
+            let values = values.unwrap_or_default();
             return match values[..] {
                 [x, y, z, radius] if values.iter().all(|value| value.is_finite()) && radius > 0.0 => {
                     Ok(Self::Sphere { center: Vector3::new(x, y, z), radius })
                 }
                 _ => Err(invalid(field, "'near X Y Z RADIUS' with a radius above 0", format!("'{numbers}'"))),
             };
+        }
+        if text.len() > MAX_EXPRESSION_BYTES {
+            return Err(invalid(field, format!("at most {MAX_EXPRESSION_BYTES} characters"), text.len()));
         }
         let expression =
             exmex::parse_val::<i32, f64>(&bind_operators(text)).map_err(|error| invalid(&field, FORMS, error))?;
@@ -98,7 +105,7 @@ fn bind_operators(text: &str) -> String {
     format!("(({inner}))")
 }
 
-/// Replaces numbers such as `1e-6` by decimals, which the parser reads.
+/// Replaces numbers such as `1e-6` and `2` by decimals with a point, which the parser reads as floats.
 fn expand_exponents(text: &str) -> String {
     let mut expanded = String::new();
     let mut rest = text;
@@ -113,7 +120,10 @@ fn expand_exponents(text: &str) -> String {
         });
         let length = match number {
             Some((length, value)) => {
-                expanded.push_str(&value.to_string());
+                let decimal = value.to_string();
+                // Integers would be divided as integers.
+                let suffix = if decimal.contains('.') { "" } else { ".0" };
+                expanded.push_str(&format!("{decimal}{suffix}"));
                 length
             }
             None => {
@@ -150,6 +160,7 @@ mod tests {
         assert!(!contains("(z<-1 || x >= 2) && y > 1", [0.0, 0.5, -2.0]));
         assert!(contains("x^2 + y^2 < 4", [1.0, -1.0, 9.0]));
         assert!(contains("x < 1e-6 && y > -2.5E3", [0.0; 3]) && !contains("x<1e-6", [1e-5, 0.0, 0.0]));
+        assert!(contains("x < 1/2*200", [99.0, 0.0, 0.0]) && contains("x < 1e10", [3e9, 0.0, 0.0]));
         assert!(contains("near 1 2 -3 0.5", [1.0, 2.4, -3.0]) && !contains("near 1 2 -3 0.5", [1.0, 2.6, -3.0]));
         assert!(matches!(Region::parse("group upper arm", &groups), Ok(Region::Group(1))));
     }
@@ -167,6 +178,7 @@ mod tests {
             ("group hand", "one of the groups 'foot', got hand"),
             ("near 1 2 3", "radius above 0"),
             ("near 1 2 3 -1", "radius above 0"),
+            ("near 1 foo 2 3 4", "radius above 0"),
             ("height < 1", "got the variables height"),
             ("z + 1", "a condition"),
             ("z <", "an expression of x, y and z"),

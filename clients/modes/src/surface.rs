@@ -1,6 +1,6 @@
 //! The surface of a body: welded, consistently oriented triangles.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 
 use nalgebra::Vector3;
 
@@ -9,7 +9,7 @@ use nalgebra::Vector3;
 pub struct Surface {
     /// Positions of the vertices. No two vertices have the same position.
     pub positions: Vec<Vector3<f64>>,
-    /// Vertices of each triangle. Degenerate triangles are removed.
+    /// Vertices of each triangle. Degenerate and repeated triangles are removed.
     pub triangles: Vec<[u32; 3]>,
     /// The index of the group of each triangle.
     pub triangle_groups: Vec<u32>,
@@ -20,7 +20,7 @@ pub struct Surface {
 }
 
 impl Surface {
-    /// Welds vertices with equal positions, removes degenerate triangles, and orients neighbors consistently.
+    /// Welds vertices with equal positions, removes degenerate and repeated triangles, and orients neighbors consistently.
     pub fn new(positions: &[Vector3<f64>], triangles: &[[u32; 3]], triangle_groups: &[u32]) -> Self {
         let mut vertex_of_position = HashMap::new();
         let mut welded_positions = Vec::new();
@@ -36,9 +36,13 @@ impl Surface {
             })
             .collect();
         let mut surface = Self { positions: welded_positions, ..Self::default() };
+        let mut known = HashSet::new();
         for (triangle, group) in triangles.iter().zip(triangle_groups) {
             let [a, b, c] = triangle.map(|vertex| welded_vertices[vertex as usize]);
-            if a != b && b != c && c != a {
+            // The rotation that begins with the smallest vertex. A repeated triangle would count twice.
+            let rotations = [[a, b, c], [b, c, a], [c, a, b]];
+            let is_new = known.insert(rotations.into_iter().min());
+            if a != b && b != c && c != a && is_new {
                 surface.triangles.push([a, b, c]);
                 surface.triangle_groups.push(*group);
             }
@@ -54,6 +58,15 @@ impl Surface {
     /// The positions of the corners of a triangle.
     pub fn corners(&self, triangle: usize) -> [Vector3<f64>; 3] {
         self.triangles[triangle].map(|vertex| self.positions[vertex as usize])
+    }
+
+    /// The signed volume, cubic meters: that of the body if the surface is closed, faces outward and does not overlap.
+    pub fn volume(&self) -> f64 {
+        // Relative to a corner, so that rounding is small for a body far from the origin.
+        let center = self.positions.first().copied().unwrap_or_default();
+        (0..self.triangles.len())
+            .map(|index| self.area_vector(index).dot(&(self.corners(index)[0] - center)) / 3.0)
+            .sum()
     }
 
     /// Half the cross product of two edges: the normal of a triangle, with its area as the length.
@@ -145,6 +158,23 @@ impl Surface {
     }
 }
 
+/// Halves a triangle at its longest edge until no edge is longer than `max_edge`. Calls `add` with the corners of each part.
+pub fn divide_triangle(corners: [Vector3<f64>; 3], max_edge: f64, mut add: impl FnMut([Vector3<f64>; 3])) {
+    let mut remaining = vec![corners];
+    while let Some([a, b, c]) = remaining.pop() {
+        let [ab, bc, ca] = [(b - a).norm(), (c - b).norm(), (a - c).norm()];
+        if ab.max(bc).max(ca) <= max_edge {
+            add([a, b, c]);
+        } else if bc >= ab && bc >= ca {
+            let middle = (b + c) / 2.0;
+            remaining.extend([[a, b, middle], [a, middle, c]]);
+        } else {
+            // The longest edge becomes the second one.
+            remaining.push(if ab >= ca { [c, a, b] } else { [b, c, a] });
+        }
+    }
+}
+
 /// The three directed edges of a triangle.
 pub fn directed_edges([a, b, c]: &[u32; 3]) -> [[u32; 2]; 3] {
     [[*a, *b], [*b, *c], [*c, *a]]
@@ -175,6 +205,14 @@ pub(crate) mod tests {
         assert!(surface.is_closed);
         let volume: f64 = (0..12).map(|index| surface.area_vector(index).dot(&surface.corners(index)[0]) / 3.0).sum();
         assert!((volume - 1.0).abs() < 1e-12, "{volume}");
+    }
+
+    #[test]
+    fn repeated_triangles_count_once() {
+        let (positions, mut triangles) = box_surface([0.0; 3], [1.0; 3]);
+        triangles.extend([triangles[0], [triangles[5][1], triangles[5][2], triangles[5][0]]]);
+        let surface = Surface::new(&positions, &triangles, &[0; 14]);
+        assert!(surface.is_closed && (surface.volume() - 1.0).abs() < 1e-12);
     }
 
     #[test]

@@ -1,6 +1,8 @@
 //! Reads the surface of a part from a model file, with the loaders of the server.
 
 use std::collections::{BTreeMap, HashMap};
+use std::fs::File;
+use std::io::Read as _;
 use std::path::Path;
 
 use modalcast_model::domain::Material;
@@ -37,7 +39,7 @@ pub struct SurfaceFile {
     pub up_axis: usize,
     pub mesh: DrawnMesh,
     /// Names of the groups: materials or objects of the file. A file with one group and several shells has the groups
-    /// `shell 1`, `shell 2` and so on, the largest one first.
+    /// `shell 1`, `shell 2` and so on, those with more triangles first.
     pub groups: Vec<String>,
     /// The remarks of the loader.
     pub remarks: Vec<String>,
@@ -49,14 +51,13 @@ pub struct SurfaceFile {
 /// Those of the loaders; `Invalid` for scenes that are not a file.
 pub fn read(path: &str, unit: f64) -> Result<SurfaceFile> {
     let file_path = Path::new(path);
-    let bytes = match std::fs::read(file_path) {
-        Ok(bytes) => bytes,
-        Err(error) => return Err(invalid(format!("file '{path}'"), "a readable model file", error)),
-    };
+    if !file_path.is_file() {
+        return Err(invalid(format!("file '{path}'"), "an existing model file", "none of this name"));
+    }
     let opened = load::open_without_modes(path)?;
     let mut file = SurfaceFile {
         name: file_path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default(),
-        sha256: Sha256::digest(&bytes).iter().map(|byte| format!("{byte:02x}")).collect(),
+        sha256: hash_file(file_path).map_err(|error| invalid(format!("file '{path}'"), "a readable file", error))?,
         up_axis: if opened.up == UpAxis::Y { 1 } else { 2 },
         remarks: opened.remarks.clone(),
         ..SurfaceFile::default()
@@ -85,6 +86,17 @@ pub fn read(path: &str, unit: f64) -> Result<SurfaceFile> {
     }
 }
 
+/// The SHA-256 of a file, hexadecimal.
+fn hash_file(path: &Path) -> std::io::Result<String> {
+    let (mut file, mut hash, mut buffer) = (File::open(path)?, Sha256::new(), vec![0; 1 << 16]);
+    loop {
+        match file.read(&mut buffer)? {
+            0 => return Ok(hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect()),
+            count => hash.update(&buffer[..count]),
+        }
+    }
+}
+
 /// Adds a domain with its placement at rest. Each of its materials is a group.
 fn add_domain(scene: &Scene, domain: usize, unit: f64, file: &mut SurfaceFile) {
     let shape = scene.shape_of(domain);
@@ -105,7 +117,8 @@ fn add_domain(scene: &Scene, domain: usize, unit: f64, file: &mut SurfaceFile) {
     for (index, triangle) in shape.mesh.triangles().iter().enumerate() {
         mesh.triangles.push(triangle.map(|corner| first_vertex + corners.vertices[corner as usize]));
         mesh.corner_normals.push(triangle.map(|corner| rotate(corners.normals[corner as usize])));
-        let range = domain.material_ranges.iter().rfind(|range| range.first_triangle <= index);
+        let ranges_before = domain.material_ranges.partition_point(|range| range.first_triangle <= index);
+        let range = ranges_before.checked_sub(1).map(|range| &domain.material_ranges[range]);
         let material = range.map_or(domain.material, |range| range.material);
         mesh.triangle_materials.push(material as u32);
         let group = *group_of_material.entry(material).or_insert_with(|| {

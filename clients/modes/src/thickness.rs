@@ -1,22 +1,33 @@
 //! Sheets: a closed surface around a surface without volume.
 
-use nalgebra::Vector3;
+use nalgebra::{Matrix3, Vector3};
 
 use crate::surface::{Surface, directed_edges};
 
-/// Moves every vertex by half the thickness along its normal in both directions, and closes the borders of the sheet.
+/// Limit on the movement of a vertex at a fold, as a multiple of half the thickness.
+const MAX_MITER: f64 = 4.0;
+
+/// Moves every vertex in both directions, so that all of its triangles move by half the thickness along their normals, and
+/// closes the borders of the sheet.
 pub fn thicken(surface: &Surface, thickness: f64) -> Surface {
     let count = surface.positions.len();
+    // Least squares for each vertex: the sums of a n n^T and a n over its triangles with area a and normal n.
+    let mut matrices = vec![Matrix3::zeros(); count];
     let mut normals = vec![Vector3::zeros(); count];
     for (index, triangle) in surface.triangles.iter().enumerate() {
+        let area_vector = surface.area_vector(index);
+        let Some(normal) = area_vector.try_normalize(0.0) else { continue };
         for vertex in triangle {
-            normals[*vertex as usize] += surface.area_vector(index);
+            matrices[*vertex as usize] += area_vector * normal.transpose();
+            normals[*vertex as usize] += area_vector;
         }
     }
+    let movements: Vec<Vector3<f64>> =
+        matrices.iter().zip(&normals).map(|(matrix, normal)| miter(matrix, normal)).collect();
     let offset = |sign: f64| {
-        let moved = surface.positions.iter().zip(&normals);
-        moved.map(move |(position, normal): (&Vector3<f64>, &Vector3<f64>)| {
-            position + normal.try_normalize(0.0).unwrap_or_default() * (sign * thickness / 2.0)
+        let moved = surface.positions.iter().zip(&movements);
+        moved.map(move |(position, movement): (&Vector3<f64>, &Vector3<f64>)| {
+            position + movement * (sign * thickness / 2.0)
         })
     };
     let positions: Vec<Vector3<f64>> = offset(1.0).chain(offset(-1.0)).collect();
@@ -37,9 +48,29 @@ pub fn thicken(surface: &Surface, thickness: f64) -> Surface {
     Surface::new(&positions, &triangles, &groups)
 }
 
+/// The movement of a vertex whose triangles move by 1: the smallest least-squares solution. Directions in which its
+/// normals hardly differ are left out.
+fn miter(matrix: &Matrix3<f64>, normal: &Vector3<f64>) -> Vector3<f64> {
+    /// Singular values below this share of the largest one are left out.
+    const TOLERANCE: f64 = 0.02;
+    let svd = matrix.svd(true, true);
+    let movement = svd.solve(normal, TOLERANCE * svd.singular_values.max()).unwrap_or_default();
+    let length = movement.norm();
+    if length > MAX_MITER { movement * (MAX_MITER / length) } else { movement }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// A cube of twelve triangles becomes a wall of the same thickness everywhere.
+    #[test]
+    fn folds_keep_the_thickness() {
+        let (positions, triangles) = crate::surface::tests::box_surface([0.0; 3], [1.0; 3]);
+        let wall = thicken(&Surface::new(&positions, &triangles, &[0; 12]), 0.01);
+        let expected = 1.01_f64.powi(3) - 0.99_f64.powi(3);
+        assert!((wall.volume() / expected - 1.0).abs() < 1e-9, "{} instead of {expected}", wall.volume());
+    }
 
     #[test]
     fn square_becomes_a_closed_plate() {

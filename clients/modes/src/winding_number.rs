@@ -6,7 +6,7 @@ use std::f64::consts::PI;
 
 use nalgebra::Vector3;
 
-use crate::surface::Surface;
+use crate::surface::{Surface, divide_triangle};
 
 /// The largest number of triangles in a leaf of the tree.
 const LEAF_TRIANGLES: usize = 8;
@@ -47,19 +47,7 @@ impl WindingNumber {
         let max_length = MAX_EDGE * (high - low).norm();
         let mut corners = Vec::new();
         for triangle in 0..surface.triangles.len() {
-            let mut remaining = vec![surface.corners(triangle)];
-            while let Some([a, b, c]) = remaining.pop() {
-                let [ab, bc, ca] = [(b - a).norm(), (c - b).norm(), (a - c).norm()];
-                if ab.max(bc).max(ca) <= max_length {
-                    corners.push([a, b, c]);
-                } else if bc >= ab && bc >= ca {
-                    let middle = (b + c) / 2.0;
-                    remaining.extend([[a, b, middle], [a, middle, c]]);
-                } else {
-                    // The longest edge becomes the second one.
-                    remaining.push(if ab >= ca { [c, a, b] } else { [b, c, a] });
-                }
-            }
+            divide_triangle(surface.corners(triangle), max_length, |part| corners.push(part));
         }
         let count = corners.len();
         let mut tree = Self { corners, nodes: Vec::new(), triangles: (0..count as u32).collect() };

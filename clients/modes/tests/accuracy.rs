@@ -8,8 +8,11 @@ use solids::{compute, cylinder, ellipsoid, parameters, rotated, solid_box};
 
 /// The largest relative difference to the reference frequencies.
 fn worst_difference(eigenvalues: &[f64], reference: &[f64]) -> f64 {
+    assert!(eigenvalues.len() >= reference.len(), "{} modes", eigenvalues.len());
     let frequencies = eigenvalues.iter().map(|eigenvalue| to_hertz(*eigenvalue));
-    frequencies.zip(reference).map(|(frequency, reference)| (frequency / reference - 1.0).abs()).fold(0.0, f64::max)
+    let differences = frequencies.zip(reference).map(|(frequency, reference)| (frequency / reference - 1.0).abs());
+    // The maximum of f64 ignores values that are no numbers.
+    differences.fold(0.0, |largest, difference| if difference <= largest { largest } else { difference })
 }
 
 const BOX: [f64; 10] = [7.577, 9.163, 11.757, 14.721, 14.797, 15.252, 16.019, 16.852, 18.957, 19.664];
@@ -27,7 +30,7 @@ fn rotated_box_has_the_exact_frequencies() {
     assert_eq!(modeling.rigid_modes, 6);
     assert!((modeling.mass - 280.0).abs() < 0.5, "{}", modeling.mass);
     let worst_estimate = modeling.frequency_errors.iter().copied().fold(0.0, f64::max);
-    assert!(worst_estimate < 0.03, "{worst_estimate}");
+    assert!(modeling.frequency_errors.len() == 10 && worst_estimate < 0.03, "{worst_estimate}");
     let control = worst_difference(&modeling.eigenvalues, &ELLIPSOID);
     assert!(control > 0.1, "control: {control}");
 }
@@ -83,6 +86,6 @@ fn damaged_surfaces_have_the_frequencies_of_closed_ones() {
         let modeling = compute(&solids::damaged(clean.clone(), seed), &parameters(4000, 10));
         let difference = worst_difference(&modeling.eigenvalues, &expected);
         assert!(difference < 0.01, "seed {seed}: {difference}");
-        assert!(modeling.remarks.iter().any(|remark| remark.contains("holes")), "{:?}", modeling.remarks);
+        assert!(modeling.remarks.iter().any(|remark| remark.contains("not closed")), "{:?}", modeling.remarks);
     }
 }

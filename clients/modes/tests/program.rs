@@ -21,7 +21,7 @@ fn run(folder: &Path, arguments: &[&str]) -> Output {
 }
 
 fn error_of(output: &Output) -> String {
-    assert_eq!(output.status.code(), Some(2), "{output:?}");
+    assert_eq!(output.status.code(), Some(3), "{output:?}");
     String::from_utf8_lossy(&output.stderr).into_owned()
 }
 
@@ -127,8 +127,10 @@ fn errors_name_what_is_wrong_and_leave_no_file() {
         ("box.stl --clamp h<1", "x, y and z"),
         ("box.stl --modes 0", "1 to 512"),
         ("box.stl --modes 300 --freedoms 500", "at most half"),
-        ("box.stl --threads 0", "at least 1"),
+        ("box.stl --threads 0", "1 to 256"),
         ("box.stl --point-mass 1,2", "X Y Z KG"),
+        ("box.stl --out box.stl --force", "another file than the surface"),
+        ("/dev/zero", "an existing model file"),
     ] {
         let output = run(folder.path(), &arguments.split(' ').collect::<Vec<_>>());
         let error = error_of(&output);
@@ -157,6 +159,7 @@ fn implausible_sizes_are_remarks() {
     let arguments = ["part.stl", "--freedoms", "1500", "--modes", "3", "--force"];
     let text = |extra: &[&str]| {
         let output = run(folder.path(), &[&arguments[..], extra].concat());
+        assert!(output.status.success(), "{output:?}");
         String::from_utf8_lossy(&output.stdout).into_owned()
     };
     assert!(text(&[]).contains("is 'm' its --unit?"));
@@ -178,8 +181,8 @@ fn interrupted_program_leaves_no_file() {
         .expect("expected the program to start");
     // The first line of progress: the computation has begun.
     let mut line = String::new();
-    let stderr = child.stderr.take().expect("expected a pipe");
-    std::io::BufRead::read_line(&mut std::io::BufReader::new(stderr), &mut line).expect("expected a line");
+    let mut stderr = std::io::BufReader::new(child.stderr.take().expect("expected a pipe"));
+    std::io::BufRead::read_line(&mut stderr, &mut line).expect("expected a line");
     assert!(line.starts_with("progress"), "{line}");
     let pid = rustix::process::Pid::from_child(&child);
     rustix::process::kill_process(pid, rustix::process::Signal::INT).expect("expected a signal");
@@ -188,5 +191,7 @@ fn interrupted_program_leaves_no_file() {
         assert!(Instant::now() < deadline, "the program ignores SIGINT");
         std::thread::sleep(Duration::from_millis(20));
     }
+    let status = child.wait().expect("expected a status");
+    assert_eq!(std::os::unix::process::ExitStatusExt::signal(&status), Some(2), "{status:?}");
     assert_eq!(std::fs::read_dir(folder.path()).expect("a folder").count(), 1, "only the surface");
 }

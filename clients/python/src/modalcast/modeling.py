@@ -1,4 +1,4 @@
-"""Modes of a surface, which the program `modalcast model` computes by the finite element method."""
+"""Modes of a surface, which the program `modalcast model` computes by the finite cell method."""
 
 from __future__ import annotations
 
@@ -10,8 +10,10 @@ import tempfile
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from numbers import Real
 from pathlib import Path
 from typing import Any, TypeAlias, TypedDict, cast
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -42,7 +44,7 @@ class ModalModel:
     Attributes:
         positions: Rest positions of the n vertices, n x 3.
         faces: Vertices of the triangles, m x 3.
-        modes: U, n x 3 x r, mass-normalized: q = 1 has the displacement U in m/(kg^0.5 m).
+        modes: U, n x 3 x r, mass-normalized: in 1/sqrt(kg), so that q is in m sqrt(kg).
         eigenvalues: Squared angular frequencies in (rad/s)^2, in ascending order.
         frequency_errors: Estimated relative error of each frequency; NaN if there is no estimate.
         mass: In kg, with point masses.
@@ -226,7 +228,7 @@ def _flags(options: Mapping[str, OptionValue]) -> list[str]:
     """The flags of the options that are not None. A value can start with '-', so its flag is in the same argument."""
     flags: list[str] = []
     for name, value in options.items():
-        values = [value] if isinstance(value, (str, int, float)) else value or ()
+        values = [value] if isinstance(value, (str, Real)) else value or ()
         flags += [f"--{name}={item}" for item in values]
     return flags
 
@@ -277,5 +279,5 @@ def _read_model(path: Path, output: str) -> ModalModel:
                 remarks=tuple(report["remarks"]),
                 notes=cast("dict[str, str]", json.loads(notes)),
             )
-    except (KeyError, ValueError, TypeError, OSError) as error:
+    except (KeyError, ValueError, TypeError, OSError, BadZipFile) as error:
         raise ModelingError(f"expected a report and a model of this version of modalcast: {error!r}") from error

@@ -6,6 +6,7 @@ mod modeling_options;
 mod progress;
 mod summary;
 
+use std::io::Write as _;
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::Arc;
@@ -24,6 +25,9 @@ const BUILD: &str = env!("MODALCAST_BUILD");
 
 /// The exit code after Ctrl-C, as shells report it.
 const INTERRUPTED: u8 = 130;
+
+/// Limit on threads.
+const MAX_THREADS: usize = 256;
 
 /// Computes the modes of a solid part from its surface, and writes a model that deforms.
 ///
@@ -70,8 +74,17 @@ fn main() -> ExitCode {
         Ok(code) => code,
         Err(error) => {
             eprintln!("error: {error}");
-            ExitCode::from(if matches!(error, Error::Fault { .. }) { 1 } else { 2 })
+            ExitCode::from(exit_code(&error))
         }
+    }
+}
+
+/// The exit code of an error, as `modalcast` has it.
+const fn exit_code(error: &Error) -> u8 {
+    match error {
+        Error::Invalid { .. } | Error::InvalidFile { .. } => 3,
+        Error::NotFound { .. } => 4,
+        _ => 1,
     }
 }
 
@@ -79,13 +92,17 @@ fn run(cli: &Cli) -> Result<ExitCode> {
     let Some(model) = &cli.model else { return Ok(ExitCode::SUCCESS) };
     let parameters = parameters(&cli.options)?;
     if let Some(threads) = cli.options.threads {
-        if threads == 0 {
-            return Err(invalid("--threads", "at least 1", threads));
+        if !(1..=MAX_THREADS).contains(&threads) {
+            return Err(invalid("--threads", format!("1 to {MAX_THREADS}"), threads));
         }
         rayon::ThreadPoolBuilder::new().num_threads(threads).build_global().map_err(fault_in("threads"))?;
     }
     let file = surface_file::read(model, parameters.unit.meters)?;
     let out = cli.out.clone().unwrap_or_else(|| PathBuf::from(&file.name).with_extension("npz"));
+    let is_source = std::fs::canonicalize(&out).ok().is_some_and(|out| std::fs::canonicalize(model).ok() == Some(out));
+    if is_source {
+        return Err(invalid("--out", "another file than the surface", format!("'{}'", out.display())));
+    }
     if out.exists() && !cli.force {
         let field = format!("file '{}'", out.display());
         return Err(invalid(field, "a new file (--force replaces an existing one)", "an existing file"));
@@ -103,10 +120,12 @@ fn run(cli: &Cli) -> Result<ExitCode> {
     if interrupted.load(Ordering::Relaxed) {
         return Ok(ExitCode::from(INTERRUPTED));
     }
-    match cli.json {
-        true => println!("{}", summary::json(&out, &modeling)),
-        false => print!("{}", summary::text(&out, &parameters, &modeling)),
-    }
+    let summary = match cli.json {
+        true => format!("{}\n", summary::json(&out, &modeling)),
+        false => summary::text(&out, &parameters, &modeling),
+    };
+    // The model is complete, even if nobody reads the summary.
+    std::io::stdout().write_all(summary.as_bytes()).ok();
     Ok(ExitCode::SUCCESS)
 }
 

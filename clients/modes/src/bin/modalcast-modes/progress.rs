@@ -1,6 +1,6 @@
 //! Progress on stderr.
 
-use std::io::IsTerminal as _;
+use std::io::{IsTerminal as _, Write as _};
 
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle as BarStyle};
 
@@ -44,7 +44,8 @@ impl Reporter {
             bar.set_position((share * STEPS as f64) as u64);
         }
         if self.prints_lines {
-            eprintln!("progress {share:.3} {stage}");
+            // Without a reader, the computation goes on.
+            writeln!(std::io::stderr(), "progress {share:.3} {stage}").ok();
         }
     }
 

@@ -43,18 +43,24 @@ pub(crate) fn text(out: &Path, parameters: &ModelingParameters, modeling: &Model
     let more = if count > listed.len() { ", ..." } else { "" };
     let mut text = format!(
         "size      {x} x {y} x {z} m\nmaterial  {}, mass {} kg\nmodes     {count}, at {}{more} Hz\n",
-        parameters.material.name,
+        names_of_materials(parameters),
         format_number(modeling.mass),
         listed.join(", ")
     );
     if let Some(worst) = modeling.frequency_errors.iter().copied().reduce(f64::max) {
-        text.push_str(&format!("error     about {} % at most\n", format_number(100.0 * worst)));
+        text.push_str(&format!("error     about {} % (estimate for the worst mode)\n", format_number(100.0 * worst)));
     }
     for remark in &modeling.remarks {
         text.push_str(&format!("remark    {remark}\n"));
     }
     text.push_str(&format!("written   {} (modalcast view {} shows it)\n", out.display(), out.display()));
     text
+}
+
+/// The names of all materials, without repetitions.
+fn names_of_materials(parameters: &ModelingParameters) -> String {
+    let others = parameters.group_materials.iter().map(|(group, material)| format!("{} ({group})", material.name));
+    std::iter::once(parameters.material.name.clone()).chain(others).collect::<Vec<_>>().join(", ")
 }
 
 /// A number with four significant digits.
