@@ -110,7 +110,8 @@ pub fn find_elastic_modes(
     });
     let modes = normalize(system, shapes.collect(), count);
     // A part that only fill connects to another moves almost without stiffness, and rounding can make it negative.
-    match modes.eigenvalues.iter().find(|eigenvalue| !(**eigenvalue > MIN_EIGENVALUE * shift)) {
+    let is_elastic = |eigenvalue: &&f64| **eigenvalue > MIN_EIGENVALUE * shift;
+    match modes.eigenvalues.iter().find(|eigenvalue| !is_elastic(eigenvalue)) {
         None => Ok(modes),
         Some(eigenvalue) => {
             let reason = format!(
