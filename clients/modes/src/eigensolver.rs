@@ -83,12 +83,13 @@ pub fn find_elastic_modes(
         operator.deflate(vector);
     }
     let wanted = count + EXTRA_MODES;
-    let mut vectors = operator.largest(wanted, 0)?;
+    let mut vectors = operator.largest(wanted, 0, None)?;
+    let scale = vectors.first().map(|(value, _)| *value);
     for check in 1..=MAX_CHECKS {
         progress(0.5 + 0.4 * check as f64 / (check + 1) as f64, "check for repeated eigenvalues");
         let rigid_count = operator.deflated.len();
         vectors.iter().for_each(|(_, vector)| operator.deflate(vector.clone()));
-        let found = operator.largest(CHECKED_MODES, check as u64)?;
+        let found = operator.largest(CHECKED_MODES, check as u64, scale)?;
         operator.deflated.truncate(rigid_count);
         let limit = vectors[vectors.len().min(wanted) - 1].0;
         let missed: Vec<(f64, Vec<f64>)> =
@@ -332,11 +333,12 @@ impl ShiftInvert<'_> {
         columns.chunks_exact_mut(freedoms).for_each(|column| self.project(column));
     }
 
-    /// The largest eigenvalues, descending, with their vectors.
+    /// The largest eigenvalues, descending, with their vectors. The limit on the residuals is relative to `scale`, or to the
+    /// largest eigenvalue.
     ///
     /// # Errors
     /// `Fault` if the residuals do not fall below the limit.
-    fn largest(&self, count: usize, seed: u64) -> Result<Vec<(f64, Vec<f64>)>> {
+    fn largest(&self, count: usize, seed: u64, scale: Option<f64>) -> Result<Vec<(f64, Vec<f64>)>> {
         let freedoms = self.system.freedoms();
         let dimension = freedoms - self.deflated.len();
         let count = count.min(dimension);
@@ -357,11 +359,12 @@ impl ShiftInvert<'_> {
                 continue;
             }
             let ritz = RitzPairs::new(&basis, &images, freedoms, count)?;
-            if columns == dimension || ritz.has_converged() {
+            let scale = scale.unwrap_or(ritz.values[0]);
+            if columns == dimension || ritz.has_converged(scale) {
                 return Ok(ritz.into_pairs());
             }
             if columns == limit {
-                let worst = ritz.residuals.iter().copied().fold(0.0, f64::max) / ritz.values[0];
+                let worst = ritz.residuals.iter().copied().fold(0.0, f64::max) / scale;
                 let reason = format!(
                     "{count} modes did not converge: expected residuals below {TOLERANCE:e}, got {worst:.1e}. Fewer --modes \
                      or more --freedoms help"
@@ -410,13 +413,16 @@ impl RitzPairs {
         let images = MatRef::from_column_major_slice(images, freedoms, columns);
         let mut projected = Mat::zeros(columns, columns);
         matmul(projected.as_mut(), Accum::Replace, basis.transpose(), images, 1.0, Par::Seq);
-        let symmetric = Mat::from_fn(columns, columns, |i, j| f64::midpoint(projected[(i, j)], projected[(j, i)]));
+        // Entries of about 1: the dense eigensolver loses accuracy for entries below 1e-12.
+        let scale = (0..columns).map(|index| projected[(index, index)].abs()).fold(f64::MIN_POSITIVE, f64::max);
+        let symmetric =
+            Mat::from_fn(columns, columns, |i, j| f64::midpoint(projected[(i, j)], projected[(j, i)]) / scale);
         let decomposition = symmetric.self_adjoint_eigen(Side::Lower);
         let decomposition = decomposition.map_err(|error| fault("eigensolver", format!("{error:?}")))?;
         let (values, coefficients) = (decomposition.S(), decomposition.U());
         // Eigenvalues ascend.
         let chosen = Mat::from_fn(columns, count, |row, index| coefficients[(row, columns - 1 - index)]);
-        let values: Vec<f64> = (0..count).map(|index| values[columns - 1 - index]).collect();
+        let values: Vec<f64> = (0..count).map(|index| scale * values[columns - 1 - index]).collect();
         let mut vectors = Mat::zeros(freedoms, count);
         matmul(vectors.as_mut(), Accum::Replace, basis, chosen.as_ref(), 1.0, Par::Seq);
         let mut differences = Mat::zeros(freedoms, count);
@@ -429,8 +435,8 @@ impl RitzPairs {
         Ok(Self { values, vectors, residuals })
     }
 
-    fn has_converged(&self) -> bool {
-        self.residuals.iter().all(|residual| *residual <= TOLERANCE * self.values[0])
+    fn has_converged(&self, scale: f64) -> bool {
+        self.residuals.iter().all(|residual| *residual <= TOLERANCE * scale)
     }
 
     fn into_pairs(self) -> Vec<(f64, Vec<f64>)> {

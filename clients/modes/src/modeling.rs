@@ -266,11 +266,29 @@ fn mean_thickness(body: &Body, layout: &Layout) -> f64 {
     2.0 * layout.volume_fractions().iter().sum::<f64>() * layout.grid.cell_size.powi(3) / body.surface.area()
 }
 
-/// A small eigenvalue, (rad/s)^2: 1/100 of that of a plate with the mean thickness of the body.
+/// A small eigenvalue, (rad/s)^2: 1/100 of that of a plate with the mean thickness of the body and the size of its largest
+/// part.
 fn shift(body: &Body, layout: &Layout) -> f64 {
     let thickness = mean_thickness(body, layout);
     let speed = body.materials.iter().map(|material| material.bar_wave_speed()).fold(f64::INFINITY, f64::min);
-    0.01 * (speed * thickness / body.diagonal().powi(2)).powi(2)
+    0.01 * (speed * thickness / largest_part(layout).min(body.diagonal()).powi(2)).powi(2)
+}
+
+/// The diagonal of the bounding box of the largest part, meters.
+fn largest_part(layout: &Layout) -> f64 {
+    let pieces = &layout.pieces;
+    let mut bounds = vec![([usize::MAX; 3], [0; 3]); pieces.part_count];
+    for (piece, part) in pieces.pieces.iter().zip(&pieces.parts) {
+        let (low, high) = &mut bounds[*part as usize];
+        for (axis, coordinate) in layout.grid.cell_at(piece.cell).into_iter().enumerate() {
+            low[axis] = low[axis].min(coordinate);
+            high[axis] = high[axis].max(coordinate + 1);
+        }
+    }
+    let diagonal = |(low, high): ([usize; 3], [usize; 3])| {
+        (0..3).map(|axis| ((high[axis] - low[axis]) as f64).powi(2)).sum::<f64>().sqrt() * layout.grid.cell_size
+    };
+    bounds.into_iter().map(diagonal).fold(0.0, f64::max)
 }
 
 /// Estimates the relative errors of the frequencies from the difference to those of a coarser grid (Richardson). Empty if

@@ -225,6 +225,16 @@ fn wrong_requests_are_errors_with_figures() {
     assert_eq!(compute(&solid, &limited).eigenvalues.len(), 3, "7.6, 9.2 and 11.8 Hz");
 }
 
+/// Parts that are far apart: the shift of the eigensolver follows the size of a part, not that of the whole.
+#[test]
+fn small_parts_far_apart_converge() {
+    let cubes = joined(&[solid_box([0.01; 3]), moved(solid_box([0.01; 3]), [1.0, 0.0, 0.0])]);
+    let mut steel = parameters(3000, 4);
+    steel.add_material("steel").expect("a material");
+    let modeling = compute(&cubes, &steel);
+    assert_eq!((modeling.parts, modeling.rigid_modes), (2, 12));
+}
+
 /// More modes than a block of the eigensolver has vectors many times over, of a stiff body.
 #[test]
 fn many_modes_of_a_bar_converge() {
