@@ -2,7 +2,8 @@
 
 use super::codes::{CHROMA_AC, CHROMA_DC, CodeTable, LUMA_AC, LUMA_DC};
 use super::mcu::Subsampling;
-use super::quantization::{QuantizationTables, ZIGZAG};
+use super::quantization::QuantizationTables;
+use super::zigzag::ZIGZAG;
 
 const START_OF_IMAGE: u8 = 0xd8;
 const APP0: u8 = 0xe0;

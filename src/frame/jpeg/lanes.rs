@@ -1,7 +1,7 @@
 //! Vector operations on eight numbers, for AVX2 and portable. Both have the same results, bit by bit: they use no fused
 //! multiplication, and round ties to even.
 
-use super::quantization::ZIGZAG;
+use super::zigzag::ZIGZAG;
 use pulp::{Scalar256b, Simd, f32x8};
 
 /// Quantized coefficients of a block.

@@ -19,6 +19,7 @@ mod header;
 mod lanes;
 mod mcu;
 mod quantization;
+mod zigzag;
 
 use bit_writer::BitWriter;
 use entropy::{DcPredictions, MAX_BLOCK_BYTES};
