@@ -130,6 +130,17 @@ mod tests {
     }
 
     #[test]
+    fn manual_lists_the_table() {
+        let manual = include_str!("../README.md");
+        for (name, youngs_modulus, poissons_ratio, density, damping_ratio) in TABLE {
+            // Decimal fractions, as 1e5 / 1e9 is not exactly 0.0001.
+            let modulus = (youngs_modulus / 1e5).round() / 1e4;
+            let row = format!("| {name} | {modulus} | {poissons_ratio} | {density} | {damping_ratio} |");
+            assert!(manual.contains(&row), "{row}");
+        }
+    }
+
+    #[test]
     fn wrong_materials_name_what_is_expected() {
         for (text, message) in [
             ("steal", "one of steel, stainless-steel"),

@@ -10,7 +10,6 @@ import tempfile
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from numbers import Real
 from pathlib import Path
 from typing import Any, TypeAlias, TypedDict, cast
 from zipfile import BadZipFile
@@ -228,7 +227,7 @@ def _flags(options: Mapping[str, OptionValue]) -> list[str]:
     """The flags of the options that are not None. A value can start with '-', so its flag is in the same argument."""
     flags: list[str] = []
     for name, value in options.items():
-        values = [value] if isinstance(value, (str, Real)) else value or ()
+        values = [value] if isinstance(value, (str, int, float, np.generic)) else value or ()
         flags += [f"--{name}={item}" for item in values]
     return flags
 
