@@ -1,4 +1,4 @@
-//! Time integrators of reduced equations of motion, and what they report about a step.
+//! Time integrators of reduced equations of motion, and their reports of steps.
 //!
 //! [`ModalOscillators`] integrates linear modes exactly. [`ImplicitIntegrator`](crate::implicit::ImplicitIntegrator)
 //! integrates forces that are cubic in q.

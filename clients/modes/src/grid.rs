@@ -2,7 +2,7 @@
 
 use nalgebra::Vector3;
 
-/// Sub-cells per side of a cell. Pieces of material in a cell are told apart by its sub-cells.
+/// Sub-cells per side of a cell. Sub-cells separate disconnected material in a cell.
 pub const SUBDIVISIONS: usize = 4;
 /// Nodes per side of a cell.
 pub const NODES_PER_SIDE: usize = 3;

@@ -47,7 +47,7 @@ pub struct Modeling {
     /// Extents of the surface, meters.
     pub size: [f64; 3],
     pub damping_ratio: f64,
-    /// What the user should know about the input.
+    /// Warnings about the input and the result.
     pub remarks: Vec<String>,
 }
 
@@ -352,7 +352,7 @@ fn add_unit_remarks(material: &Material, remarks: &mut Vec<String>) {
     }
 }
 
-/// Adds what the user should know.
+/// Adds warnings about the input and the result.
 fn add_remarks(body: &Body, layout: &Layout, parameters: &ModelingParameters, modeling: &mut Modeling) {
     let remarks = &mut modeling.remarks;
     if !body.surface.is_closed {

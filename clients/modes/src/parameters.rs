@@ -1,4 +1,4 @@
-//! What is computed: modes, materials, units and constraints.
+//! Parameters of a computation: modes, materials, units and constraints.
 
 use modalcast_model::error::{Result, invalid};
 use nalgebra::Vector3;

@@ -1,4 +1,4 @@
-//! Regions of a body: what a clamp holds.
+//! Regions of a body that clamps hold.
 
 use exmex::{Express as _, FlatExVal, Val};
 use modalcast_model::error::{Result, invalid};

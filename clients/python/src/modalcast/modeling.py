@@ -51,7 +51,7 @@ class ModalModel:
         rigid_modes: Number of rigid modes, which are not among the r modes: six per free part.
         parts: Number of parts that are not connected.
         freedoms: Number of unknowns of the computation.
-        remarks: What the user should know about the surface and the result.
+        remarks: Warnings about the surface and the result.
         notes: What the file says about its origin: material, damping, unit and others.
     """
 

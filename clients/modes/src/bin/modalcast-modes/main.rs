@@ -124,7 +124,7 @@ fn run(cli: &Cli) -> Result<ExitCode> {
         true => format!("{}\n", summary::json(&out, &modeling)),
         false => summary::text(&out, &parameters, &modeling),
     };
-    // The model is complete, even if nobody reads the summary.
+    // The model is already written, so a closed stdout is not an error.
     std::io::stdout().write_all(summary.as_bytes()).ok();
     Ok(ExitCode::SUCCESS)
 }
