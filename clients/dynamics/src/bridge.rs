@@ -12,9 +12,11 @@
 use std::f64::consts::TAU;
 
 use nalgebra::{DVector, Vector3};
-use serde_json::json;
+use serde::{Deserialize, Serialize};
+use serde_json::{Value, json};
 
 use crate::attachments::Attachments;
+use crate::checkpoint::RunIdentity;
 use crate::cubic::ReducedForce;
 use crate::error::{Result, check_option, invalid_input};
 use crate::hierarchy::compose_transforms;
@@ -24,10 +26,11 @@ use crate::model::{DomainModel, Model};
 use crate::parameters::ModalParameters;
 use crate::reduced_system::ReducedSystem;
 use crate::run::{Report, Scenario, aliasing_remark};
+use crate::saved_state::{check_vector, from_json, number_bits, to_json, vector_bits};
 use crate::step_values::StepValues;
 use crate::vega::VegaSettings;
 use crate::viewer_forces::{force_scale, scale_remark};
-use crate::viewer_response::ViewerResponse;
+use crate::viewer_response::{ForcedMotion, ViewerResponse};
 
 /// Largest error of the deflection at equilibrium, as a fraction of the requested deflection.
 const DEFLECTION_TOLERANCE: f64 = 1e-3;
@@ -68,7 +71,7 @@ pub struct BridgeScenario {
     integrator: ImplicitIntegrator,
     totals: IntegratorTotals,
     options: BridgeOptions,
-    is_damped: bool,
+    settings: VegaSettings,
     /// Reduced load U^T f of the force f at the peak of the pulse.
     peak_load: DVector<f64>,
     /// Reduced load of the viewers' forces.
@@ -90,6 +93,20 @@ pub struct BridgeScenario {
     peak_displacement: f64,
     late_remarks: Vec<String>,
     /// Whether forces of viewers were scaled down.
+    has_scaled_forces: bool,
+}
+
+/// The state of a bridge in a checkpoint.
+#[derive(Serialize, Deserialize)]
+struct SavedBridge {
+    state: MotionState,
+    #[serde(with = "vector_bits")]
+    viewer_load: DVector<f64>,
+    viewer_response: ForcedMotion,
+    totals: IntegratorTotals,
+    #[serde(with = "number_bits")]
+    peak_displacement: f64,
+    late_remarks: Vec<String>,
     has_scaled_forces: bool,
 }
 
@@ -141,7 +158,7 @@ impl BridgeScenario {
             oscillators,
             attachments: Attachments::new(&model),
             options,
-            is_damped: settings.damping_mass > 0.0 || settings.damping_stiffness > 0.0,
+            settings: *settings,
             peak_load: unit_load * equilibrium.strength,
             viewer_load: DVector::zeros(rank),
             state: MotionState::resting(equilibrium.q),
@@ -188,6 +205,48 @@ impl Scenario for BridgeScenario {
         &self.model
     }
 
+    fn identity(&self) -> RunIdentity {
+        let BridgeOptions { domain, dt: _, deflection_fraction, period, load_direction, method, has_fixed_step } =
+            self.options;
+        let VegaSettings { base_frequency, damping_mass, damping_stiffness } = self.settings;
+        RunIdentity::default()
+            .with("motion", "cubic forces")
+            .with("cubic forces (SHA-256)", self.integrator.system().force().content_hash())
+            .with("--domain", domain)
+            .with_number("--deflection", deflection_fraction)
+            .with_number("--period", period)
+            .with("--toward", format_args!("{load_direction:?}"))
+            .with("--integrator", format_args!("{method:?}"))
+            .with("--fixed-step", has_fixed_step)
+            .with_number("baseFrequency in --config", base_frequency)
+            .with_number("dampingMassCoef in --config", damping_mass)
+            .with_number("dampingStiffnessCoef in --config", damping_stiffness)
+    }
+
+    fn save(&self) -> Result<Value> {
+        to_json(&SavedBridge {
+            state: self.state.clone(),
+            viewer_load: self.viewer_load.clone(),
+            viewer_response: self.viewer_response.save(),
+            totals: self.totals,
+            peak_displacement: self.peak_displacement,
+            late_remarks: self.late_remarks.clone(),
+            has_scaled_forces: self.has_scaled_forces,
+        })
+    }
+
+    fn restore(&mut self, next_step: u64, state: Value) -> Result<()> {
+        let saved: SavedBridge = from_json(state)?;
+        let rank = self.integrator.system().rank();
+        saved.state.check(rank)?;
+        check_vector("viewer_load", &saved.viewer_load, rank)?;
+        self.viewer_response.restore(saved.viewer_response)?;
+        (self.next_step, self.state, self.viewer_load) = (next_step, saved.state, saved.viewer_load);
+        (self.totals, self.peak_displacement) = (saved.totals, saved.peak_displacement);
+        (self.late_remarks, self.has_scaled_forces) = (saved.late_remarks, saved.has_scaled_forces);
+        Ok(())
+    }
+
     fn compute_next_step(&mut self, values: &mut StepValues) -> Result<()> {
         let first_coordinate = self.model.domains[self.options.domain].first_coordinate;
         let mut q = vec![0.0; self.model.coordinate_count];
@@ -219,7 +278,8 @@ impl Scenario for BridgeScenario {
     }
 
     fn remarks(&self) -> Vec<String> {
-        let undamped = (!self.is_damped).then(|| {
+        let is_damped = self.settings.damping_mass > 0.0 || self.settings.damping_stiffness > 0.0;
+        let undamped = (!is_damped).then(|| {
             "the bridge has no damping, so that vibrations do not decay: set it in the .config file".to_owned()
         });
         let system = self.integrator.system();

@@ -14,6 +14,8 @@ Examples:
   modalcast-sim --open simpleBridge --scene bridge --cubic simpleBridge.cub --seconds 4
   modalcast-sim fork --slow 100 --forces --seconds 0 --realtime
   modalcast-sim sweep --open MorphStressTest --scene morph --record out/record
+  modalcast-sim tree --seconds 3600 --checkpoint tree.checkpoint
+  modalcast-sim tree --seconds 3600 --checkpoint tree.checkpoint --resume tree.checkpoint
 
 Exit codes: 0 done; 1 rejected by the server (unknown scene, or a scene with another writer); 2 invalid command line;
 3 connection failed or lost; 4 local file error; 5 invalid content of a file, a scene or a reply; 6 done, but the server
@@ -82,7 +84,7 @@ pub(crate) struct CommonOptions {
     /// First opens a scene from this source in the server's scene repository, and names it as --scene says.
     #[arg(long, value_name = "SOURCE")]
     pub(crate) open: Option<String>,
-    /// Simulated time in seconds; 0 runs until interrupted.
+    /// Simulated time in seconds, with the time before a checkpoint that --resume continues; 0 runs until interrupted.
     #[arg(long, default_value_t = 10.0, value_parser = parse_non_negative)]
     pub(crate) seconds: f64,
     /// Number of steps, in place of --seconds; 0 runs until interrupted.
@@ -109,9 +111,28 @@ pub(crate) struct CommonOptions {
     /// moves by these forces alone.
     #[arg(long)]
     pub(crate) forces: bool,
-    /// Write q.npy (steps x coordinates) and transforms.npy (steps x domains x 12), float32, into this folder.
+    /// Write q.npy (steps x coordinates) and transforms.npy (steps x domains x 12), float32, into this folder. With
+    /// --resume, a record in the folder continues after the steps of the checkpoint.
     #[arg(long, value_name = "DIR")]
     pub(crate) record: Option<PathBuf>,
+    /// Write the state of the run into this file: regularly, and at the end or when interrupted (Ctrl-C, SIGTERM). The
+    /// file is replaced at once, so that it is complete at any time.
+    #[arg(long, value_name = "FILE")]
+    pub(crate) checkpoint: Option<PathBuf>,
+    /// Number of steps after which --checkpoint writes the file again.
+    #[arg(
+        long = "checkpoint-every",
+        value_name = "STEPS",
+        default_value_t = 600,
+        value_parser = clap::value_parser!(u64).range(1..),
+        requires = "checkpoint"
+    )]
+    pub(crate) checkpoint_interval: u64,
+    /// Continue the run whose state is in this file, with the next step. Needs the same scene and the same options of
+    /// the motion. On the same machine, all steps are those of a run without interruption, bit by bit. To write
+    /// checkpoints again, add --checkpoint, also with the same file.
+    #[arg(long, value_name = "FILE")]
+    pub(crate) resume: Option<PathBuf>,
     /// Print a machine-readable summary on standard output.
     #[arg(long)]
     pub(crate) json: bool,

@@ -10,7 +10,9 @@ use std::path::Path;
 
 use modalcast_client::Error as ClientError;
 use nalgebra::{DMatrix, DVector};
+use sha2::{Digest as _, Sha256};
 
+use crate::checkpoint::hexadecimal;
 use crate::error::{Result, invalid_input};
 
 /// Size of the header of a file: four i32.
@@ -122,6 +124,15 @@ impl ReducedForce {
     /// The number of coordinates r.
     pub const fn rank(&self) -> usize {
         self.rank
+    }
+
+    /// The SHA-256 of all coefficients, 64 hexadecimal digits.
+    pub(crate) fn content_hash(&self) -> String {
+        let mut hasher = Sha256::new();
+        for block in [&self.linear_block, &self.quadratic_jacobian, &self.cubic_jacobian] {
+            block.iter().for_each(|coefficient| hasher.update(coefficient.to_le_bytes()));
+        }
+        hexadecimal(&hasher.finalize())
     }
 
     /// The stiffness at rest, r x r.

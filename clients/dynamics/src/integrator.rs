@@ -4,11 +4,13 @@
 //! integrates forces that are cubic in q.
 
 use nalgebra::DVector;
+use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
 use crate::error::Result;
 use crate::oscillator::{ModeState, Oscillator};
 use crate::parameters::{ModalParameters, ModeParameters};
+use crate::saved_state::{check_vector, number_bits, vector_bits};
 
 /// Maximum number of modes that a remark names.
 const MAX_NAMED_MODES: usize = 8;
@@ -27,9 +29,11 @@ pub trait Integrator {
 }
 
 /// Coordinates and velocities at one time.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct MotionState {
+    #[serde(with = "vector_bits")]
     pub q: DVector<f64>,
+    #[serde(with = "vector_bits")]
     pub v: DVector<f64>,
     /// The number of sub-steps that the next step tries first, at least 1.
     pub sub_steps: u32,
@@ -39,6 +43,15 @@ impl MotionState {
     /// The state at `q` without velocity.
     pub fn resting(q: DVector<f64>) -> Self {
         Self { v: DVector::zeros(q.len()), q, sub_steps: 1 }
+    }
+
+    /// Checks a state of `count` coordinates that was read from a checkpoint.
+    ///
+    /// # Errors
+    /// `Invalid` if a vector has another length, or a number is not finite.
+    pub(crate) fn check(&self, count: usize) -> Result<()> {
+        check_vector("q", &self.q, count)?;
+        check_vector("v", &self.v, count)
     }
 }
 
@@ -74,14 +87,16 @@ pub struct StepReport {
 }
 
 /// Totals of all steps of a run.
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct IntegratorTotals {
     pub steps: u64,
     pub sub_steps: u64,
     pub max_sub_steps: u32,
     pub iterations: u64,
     pub rejections: u64,
+    #[serde(with = "number_bits")]
     pub max_residual: f64,
+    #[serde(with = "number_bits")]
     pub max_error: f64,
     /// Number of steps whose estimated error exceeds the tolerance.
     pub limited_steps: u64,

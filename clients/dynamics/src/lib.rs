@@ -25,7 +25,10 @@
 //! | `viewer_forces` | reads the forces that viewers apply |
 //! | `viewer_response` | the response of linear modes to the forces of viewers |
 //! | `divergence` | stops a run before it sends a step that is not finite or far out of range |
+//! | `checkpoint` | files from which a later process continues a run, bit by bit |
+//! | `saved_state` | converts the state of a scenario to and from JSON, exactly |
 //! | `step_values` | coordinates and transforms of a step, and the message with those that have changed |
+//! | `recorder` | writes the values of all steps to NumPy files |
 //! | `run` | sends a scenario as a step stream, optionally records it, and reports the results |
 //!
 //! # Example
@@ -65,6 +68,7 @@
 pub mod affine;
 pub mod attachments;
 pub mod bridge;
+pub mod checkpoint;
 mod connected_parts;
 pub mod cubic;
 pub mod divergence;
@@ -77,9 +81,13 @@ pub mod model;
 mod newton;
 pub mod oscillator;
 pub mod parameters;
+mod recorder;
 pub mod reduced_system;
+#[cfg(test)]
+mod resume_tests;
 mod rigid_modes;
 pub mod run;
+mod saved_state;
 #[cfg(test)]
 mod stability;
 pub mod step_values;

@@ -10,6 +10,7 @@ use std::time::Duration;
 use clap::Parser as _;
 use modalcast_client::{Client, program};
 use modalcast_dynamics::bridge::{BridgeOptions, BridgeScenario};
+use modalcast_dynamics::checkpoint::CheckpointOptions;
 use modalcast_dynamics::cubic::ReducedForce;
 use modalcast_dynamics::force_domain::find_force_domain;
 use modalcast_dynamics::model::Model;
@@ -85,6 +86,11 @@ async fn run_scenario(arguments: &Cli) -> Result<RunSummary> {
         realtime: common.realtime,
         applies_viewer_forces: common.forces,
         record_folder: common.record.clone(),
+        checkpoint: common
+            .checkpoint
+            .clone()
+            .map(|path| CheckpointOptions { path, interval: common.checkpoint_interval }),
+        resume_path: common.resume.clone(),
     };
     drive_scene(&client, scenario.as_mut(), &options, &stop_receiver).await
 }

@@ -54,6 +54,11 @@ impl ReducedSystem {
         self.force.rank()
     }
 
+    /// f.
+    pub(crate) const fn force(&self) -> &ReducedForce {
+        &self.force
+    }
+
     /// D, r x r.
     pub const fn damping(&self) -> &DMatrix<f64> {
         &self.damping

@@ -1,20 +1,21 @@
 //! Drives a scene with a scenario: sends the changed values of each step, and reports the results. Optionally paces the
-//! steps in real time, and records q and the transforms.
+//! steps in real time, records q and the transforms, and writes checkpoints or continues from one.
 
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
-use modalcast_client::npy::Writer as NpyWriter;
 use modalcast_client::{
     Client, Delivery, DriveRequest, Error as ClientError, StageSamples, Step, StepStream, StreamSummary,
 };
 use serde_json::{Value, json};
 use tokio::sync::watch;
 
+use crate::checkpoint::{Checkpoint, CheckpointOptions, RunIdentity};
 use crate::divergence::DivergenceCheck;
 use crate::error::{Error, Result, invalid_input};
 use crate::model::Model;
+use crate::recorder::Recorder;
 use crate::step_values::{StepValues, add_changes};
 use crate::viewer_forces::ViewerForces;
 
@@ -36,6 +37,22 @@ pub trait Scenario {
     /// # Errors
     /// Those of the scenario.
     fn compute_next_step(&mut self, values: &mut StepValues) -> Result<()>;
+
+    /// What the motion follows from, in addition to the scene, the time of a step and the forces of viewers. A
+    /// checkpoint continues only a run with the same inputs.
+    fn identity(&self) -> RunIdentity;
+
+    /// The state before the next step, for a checkpoint: bit by bit.
+    ///
+    /// # Errors
+    /// `Invalid` if JSON cannot hold the state.
+    fn save(&self) -> Result<Value>;
+
+    /// Continues with step `next_step` from a state of [`Self::save`].
+    ///
+    /// # Errors
+    /// `Invalid` if the state is not that of this scenario.
+    fn restore(&mut self, next_step: u64, state: Value) -> Result<()>;
 
     /// Sets the forces of viewers, which act in all later steps in addition to the load of the scenario: one number per
     /// coordinate of the scene.
@@ -77,7 +94,8 @@ pub fn aliasing_remark(subject: &str, period: f64, dt: f64) -> Option<String> {
 /// Settings of a run.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RunOptions {
-    /// Number of steps. `None` runs until the caller stops the run.
+    /// Number of steps, with those before the checkpoint that the run continues. `None` runs until the caller stops the
+    /// run.
     pub steps: Option<u64>,
     /// Simulated seconds per step.
     pub dt: f64,
@@ -92,6 +110,10 @@ pub struct RunOptions {
     pub applies_viewer_forces: bool,
     /// Folder for q.npy (steps x coordinates) and transforms.npy (steps x domains x 12), f32.
     pub record_folder: Option<PathBuf>,
+    /// `None` writes no checkpoints.
+    pub checkpoint: Option<CheckpointOptions>,
+    /// The checkpoint that the run continues.
+    pub resume_path: Option<PathBuf>,
 }
 
 /// Results of a run.
@@ -119,16 +141,22 @@ struct RunStats {
 /// Drives a scene until all steps are done or `stop_receiver` receives true.
 ///
 /// # Errors
-/// `Client` if the scene has another writer, the stream ends, or a record cannot be written. `Diverged` before a step
-/// that is not finite or far out of range would be sent. Errors of the scenario are returned unchanged. After an error
-/// of the scenario, the stream and the record end with the step before it.
+/// `Client` if the scene has another writer, the stream ends, or a record or a checkpoint cannot be read or written.
+/// `Invalid` if the checkpoint to continue is invalid or belongs to another run. `Diverged` before a step that is not
+/// finite or far out of range would be sent. Errors of the scenario are returned unchanged. After an error of the
+/// scenario, the stream and the record end with the step before it.
 pub async fn drive_scene(
     client: &Client,
     scenario: &mut dyn Scenario,
     options: &RunOptions,
     stop_receiver: &watch::Receiver<bool>,
 ) -> Result<RunSummary> {
-    let mut driver = Driver::start(client, scenario, options).await?;
+    let identity = identity(scenario, options);
+    let start = match &options.resume_path {
+        Some(path) => resume(scenario, &identity, path, options.steps)?,
+        None => RunStart { step: 0, recorded_rows: None },
+    };
+    let mut driver = Driver::start(client, scenario, options, identity, &start).await?;
     let outcome = driver.send_steps(options, stop_receiver).await;
     if let Err(error @ Error::Client(_)) = outcome {
         return Err(error);
@@ -139,6 +167,7 @@ pub async fn drive_scene(
     report.extend(scenario.report());
     report.extend(Report::from_iter([
         ("scene".to_owned(), json!(scenario.model().scene)),
+        ("first_step".to_owned(), json!(start.step)),
         ("dt_s".to_owned(), json!(options.dt)),
         ("slow".to_owned(), json!(options.slow)),
         ("remarks".to_owned(), json!(scenario.remarks())),
@@ -146,20 +175,64 @@ pub async fn drive_scene(
     Ok(RunSummary { sent_steps: stream_summary.sent, rejected_steps: stream_summary.rejected, report })
 }
 
+/// Where a run begins.
+struct RunStart {
+    step: u64,
+    /// Number of steps in the record before; `None` without a record.
+    recorded_rows: Option<u64>,
+}
+
+/// What the motion of a run follows from.
+fn identity(scenario: &dyn Scenario, options: &RunOptions) -> RunIdentity {
+    let identity = scenario.identity().with_scene(scenario.model()).with("--forces", options.applies_viewer_forces);
+    identity.with_number("seconds per step (--dt / --slow)", options.dt)
+}
+
+/// Restores a scenario from the checkpoint at `path`, for a run that ends before step `steps`.
+fn resume(scenario: &mut dyn Scenario, identity: &RunIdentity, path: &Path, steps: Option<u64>) -> Result<RunStart> {
+    let Checkpoint { identity: saved_identity, next_step, recorded_rows, state } =
+        Checkpoint::read(path, scenario.model())?;
+    saved_identity.check(identity, path)?;
+    scenario.restore(next_step, state)?;
+    if let Some(steps) = steps.filter(|steps| next_step >= *steps) {
+        eprintln!(
+            "modalcast-sim: {}: the checkpoint has all {steps} steps of the run (--seconds and --steps count from step 0)",
+            scenario.model().scene
+        );
+    }
+    Ok(RunStart { step: next_step, recorded_rows })
+}
+
 /// A run in progress.
 struct Driver<'a> {
     scenario: &'a mut dyn Scenario,
+    identity: RunIdentity,
     check: DivergenceCheck,
     viewer_forces: Option<ViewerForces>,
     step_stream: StepStream,
     recorder: Option<Recorder>,
     progress_bar: ProgressBar,
     start: Instant,
+    /// The first step of this process.
+    first_step: u64,
+    next_step: u64,
+    /// The next step in the newest checkpoint that this process has written.
+    saved_step: Option<u64>,
+    /// The values of the last step sent. `None` before the first step and after a reported rejection.
+    last_sent_values: Option<StepValues>,
+    current_values: StepValues,
+    printed_remarks: usize,
     stats: RunStats,
 }
 
 impl<'a> Driver<'a> {
-    async fn start(client: &Client, scenario: &'a mut dyn Scenario, options: &RunOptions) -> Result<Self> {
+    async fn start(
+        client: &Client,
+        scenario: &'a mut dyn Scenario,
+        options: &RunOptions,
+        identity: RunIdentity,
+        start: &RunStart,
+    ) -> Result<Self> {
         let scene = &scenario.model().scene;
         let viewer_forces = match options.applies_viewer_forces {
             true => Some(ViewerForces::subscribe(client, scene).await?),
@@ -168,61 +241,92 @@ impl<'a> Driver<'a> {
         let request = DriveRequest::new(scene, options.delivery);
         let request = options.window.into_iter().fold(request, DriveRequest::window);
         let step_stream = client.drive(&request).await?;
-        let create_recorder = |folder| Recorder::create(folder, scenario.model());
+        let open_recorder = |folder: &PathBuf| match options.resume_path {
+            Some(_) => Recorder::resume(folder, scenario.model(), start.recorded_rows),
+            None => Recorder::create(folder, scenario.model()),
+        };
         Ok(Self {
             check: DivergenceCheck::new(scenario.model()),
+            identity,
             viewer_forces,
             step_stream,
-            recorder: options.record_folder.as_deref().map(create_recorder).transpose()?,
-            progress_bar: create_progress_bar(options.steps),
+            recorder: options.record_folder.as_ref().map(open_recorder).transpose()?,
+            progress_bar: create_progress_bar(options.steps).with_position(start.step),
             start: Instant::now(),
+            first_step: start.step,
+            next_step: start.step,
+            saved_step: None,
+            last_sent_values: None,
+            current_values: StepValues::default(),
+            printed_remarks: 0,
             stats: RunStats::default(),
             scenario,
         })
     }
 
     async fn send_steps(&mut self, options: &RunOptions, stop_receiver: &watch::Receiver<bool>) -> Result<()> {
-        // The values of the last step sent. `None` before the first step and after a reported rejection.
-        let mut last_sent_values: Option<StepValues> = None;
-        let mut current_values = StepValues::default();
-        let mut step_number = 0;
-        let mut printed_remarks = 0;
-        while options.steps.is_none_or(|steps| step_number < steps) && !*stop_receiver.borrow() {
-            let time = step_number as f64 * options.dt;
-            if options.realtime {
-                // Adding `Duration::MAX` itself would overflow.
-                let due_time =
-                    self.start + Duration::try_from_secs_f64(time * options.slow).unwrap_or(Duration::MAX / 4);
-                tokio::time::sleep_until(due_time.into()).await;
-            }
-            // After the pause, so that a force that arrives during the pause acts in this step.
-            if let Some(viewer_forces) = &mut self.viewer_forces
-                && let Some(forces) = viewer_forces.take_changed(self.scenario.model()).await?
+        while options.steps.is_none_or(|steps| self.next_step < steps) && !*stop_receiver.borrow() {
+            self.send_next_step(options).await?;
+            if let Some(checkpoint) = &options.checkpoint
+                && self.next_step.is_multiple_of(checkpoint.interval)
             {
-                self.scenario.set_viewer_forces(&forces)?;
+                self.write_checkpoint(checkpoint)?;
             }
-            self.scenario.compute_next_step(&mut current_values)?;
-            let late_remarks = self.scenario.late_remarks();
-            for remark in &late_remarks[printed_remarks..] {
-                self.progress_bar.suspend(|| eprintln!("modalcast-sim: {}: {remark}", self.scenario.model().scene));
-            }
-            printed_remarks = late_remarks.len();
-            let model = self.scenario.model();
-            self.check.check(model, step_number, time, &current_values)?;
-            let step = add_changes(model, Step::new(step_number, time), last_sent_values.as_ref(), &current_values);
-            // A rejection arrives late: it may concern this step or an earlier one.
-            let is_rejected = self.stats.record_rejection(self.step_stream.step(&step).await)?;
-            self.stats.payload_bytes += step.payload_bytes() as u64;
-            self.stats.record_acknowledgments(&self.step_stream);
-            if let Some(recorder) = &mut self.recorder {
-                recorder.write_row(&current_values)?;
-            }
-            // After a rejection the server lacks the values of some step, so the next step sends all values.
-            last_sent_values = if is_rejected { None } else { Some(std::mem::take(&mut current_values)) };
-            step_number += 1;
-            self.progress_bar.inc(1);
         }
+        match &options.checkpoint {
+            Some(checkpoint) if self.saved_step != Some(self.next_step) => self.write_checkpoint(checkpoint),
+            _ => Ok(()),
+        }
+    }
+
+    async fn send_next_step(&mut self, options: &RunOptions) -> Result<()> {
+        let time = self.next_step as f64 * options.dt;
+        if options.realtime {
+            let elapsed_time = (self.next_step - self.first_step) as f64 * options.dt * options.slow;
+            // Adding `Duration::MAX` itself would overflow.
+            let due_time = self.start + Duration::try_from_secs_f64(elapsed_time).unwrap_or(Duration::MAX / 4);
+            tokio::time::sleep_until(due_time.into()).await;
+        }
+        // After the pause, so that a force that arrives during the pause acts in this step.
+        if let Some(viewer_forces) = &mut self.viewer_forces
+            && let Some(forces) = viewer_forces.take_changed(self.scenario.model()).await?
+        {
+            self.scenario.set_viewer_forces(&forces)?;
+        }
+        self.scenario.compute_next_step(&mut self.current_values)?;
+        let late_remarks = self.scenario.late_remarks();
+        for remark in &late_remarks[self.printed_remarks..] {
+            self.progress_bar.suspend(|| eprintln!("modalcast-sim: {}: {remark}", self.scenario.model().scene));
+        }
+        self.printed_remarks = late_remarks.len();
+        let model = self.scenario.model();
+        self.check.check(model, self.next_step, time, &self.current_values)?;
+        let step = Step::new(self.next_step, time);
+        let step = add_changes(model, step, self.last_sent_values.as_ref(), &self.current_values);
+        // A rejection arrives late: it may concern this step or an earlier one.
+        let is_rejected = self.stats.record_rejection(self.step_stream.step(&step).await)?;
+        self.stats.payload_bytes += step.payload_bytes() as u64;
+        self.stats.record_acknowledgments(&self.step_stream);
+        if let Some(recorder) = &mut self.recorder {
+            recorder.write_row(&self.current_values)?;
+        }
+        // After a rejection the server lacks the values of some step, so the next step sends all values.
+        self.last_sent_values = (!is_rejected).then(|| std::mem::take(&mut self.current_values));
+        self.next_step += 1;
+        self.progress_bar.inc(1);
         Ok(())
+    }
+
+    /// Writes the state before the next step. The record is durable before, so that it has all steps of the checkpoint.
+    fn write_checkpoint(&mut self, options: &CheckpointOptions) -> Result<()> {
+        let checkpoint = Checkpoint {
+            identity: self.identity.clone(),
+            next_step: self.next_step,
+            recorded_rows: self.recorder.as_mut().map(Recorder::sync).transpose()?,
+            state: self.scenario.save()?,
+        };
+        self.saved_step = Some(self.next_step);
+        checkpoint.write(&options.path)
     }
 
     /// Waits for the acknowledgments of all steps and closes the stream and the record.
@@ -296,30 +400,4 @@ fn create_progress_bar(steps: Option<u64>) -> ProgressBar {
     };
     let bar = steps.map_or_else(ProgressBar::new_spinner, ProgressBar::new);
     bar.with_style(ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar()))
-}
-
-/// Writes the coordinates and transforms of every step to files.
-struct Recorder {
-    q: NpyWriter,
-    transforms: NpyWriter,
-}
-
-impl Recorder {
-    fn create(folder: &Path, model: &Model) -> Result<Self> {
-        std::fs::create_dir_all(folder).map_err(|error| ClientError::file(folder, error))?;
-        let q = NpyWriter::create(&folder.join("q.npy"), &[model.coordinate_count])?;
-        let transforms = NpyWriter::create(&folder.join("transforms.npy"), &[model.domains.len(), 12])?;
-        Ok(Self { q, transforms })
-    }
-
-    fn write_row(&mut self, values: &StepValues) -> Result<()> {
-        self.q.write_row(&values.q)?;
-        Ok(self.transforms.write_row(values.transforms.as_flattened())?)
-    }
-
-    fn finish(self) -> Result<()> {
-        self.q.finish()?;
-        self.transforms.finish()?;
-        Ok(())
-    }
 }

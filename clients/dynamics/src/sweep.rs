@@ -5,12 +5,15 @@
 use std::f64::consts::TAU;
 
 use nalgebra::Vector3;
-use serde_json::json;
+use serde::{Deserialize, Serialize};
+use serde_json::{Value, json};
 
 use crate::affine::AffineTransform;
+use crate::checkpoint::RunIdentity;
 use crate::error::Result;
 use crate::model::Model;
 use crate::run::{Report, Scenario, aliasing_remark};
+use crate::saved_state::{from_json, number_bits, to_json};
 use crate::step_values::StepValues;
 
 /// Amplitude of a rocking scene, in radians.
@@ -103,9 +106,33 @@ impl SweepScenario {
     }
 }
 
+/// The state of a sweep in a checkpoint. The motion is a function of the step.
+#[derive(Serialize, Deserialize)]
+struct SavedSweep {
+    #[serde(with = "number_bits")]
+    peak_displacement: f64,
+}
+
 impl Scenario for SweepScenario {
     fn model(&self) -> &Model {
         &self.model
+    }
+
+    fn identity(&self) -> RunIdentity {
+        RunIdentity::default()
+            .with("motion", "sweep")
+            .with_number("--share", self.options.displacement_fraction)
+            .with("steps per mode (by --seconds or --steps)", self.steps_per_coordinate)
+    }
+
+    fn save(&self) -> Result<Value> {
+        to_json(&SavedSweep { peak_displacement: self.peak_displacement })
+    }
+
+    fn restore(&mut self, next_step: u64, state: Value) -> Result<()> {
+        let SavedSweep { peak_displacement } = from_json(state)?;
+        (self.next_step, self.peak_displacement) = (next_step, peak_displacement);
+        Ok(())
     }
 
     fn compute_next_step(&mut self, values: &mut StepValues) -> Result<()> {

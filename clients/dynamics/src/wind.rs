@@ -20,8 +20,10 @@
 use std::f64::consts::{PI, TAU};
 
 use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
 
 use crate::model::MIN_DOMAINS_PER_THREAD;
+use crate::saved_state::number_bits;
 
 /// V, in m/s.
 const MEAN_SPEED: f64 = 12.0;
@@ -76,9 +78,11 @@ enum Component {
 }
 
 /// Pressure relative to the pressure of the mean wind, along the two horizontal directions of a wind.
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct WindPressure {
+    #[serde(with = "number_bits")]
     pub downwind: f64,
+    #[serde(with = "number_bits")]
     pub crosswind: f64,
 }
 

@@ -2,7 +2,7 @@
 //! [`Writer::finish`] rewrites the header with the final number.
 
 use std::fs::File;
-use std::io::{BufWriter, Seek as _, SeekFrom, Write as _};
+use std::io::{BufWriter, Read as _, Seek as _, SeekFrom, Write as _};
 use std::path::{Path, PathBuf};
 
 use crate::error::{Error, Result};
@@ -15,6 +15,9 @@ const PREFIX_BYTES: usize = MAGIC.len() + size_of::<u16>();
 
 /// The format pads the header with spaces and a newline, so that the data starts at a multiple of 64 bytes.
 const ALIGNMENT: usize = 64;
+
+/// The dictionary up to the number of rows.
+const DICTIONARY_START: &str = "{'descr': '<f4', 'fortran_order': False, 'shape': (";
 
 /// Writer of a `.npy` file of shape rows x `shape`, little-endian f32, C order.
 pub struct Writer {
@@ -45,6 +48,40 @@ impl Writer {
         Ok(writer)
     }
 
+    /// Continues an existing file of this shape after its first `row_count` rows, and removes later rows. The number of
+    /// rows in the header is not read: a process that ended without [`Self::finish`] has not updated it.
+    ///
+    /// # Errors
+    /// `File` if it cannot be changed, has another shape or type, or fewer rows.
+    pub fn resume(path: &Path, shape: &[usize], row_count: u64) -> Result<Self> {
+        let file_error = |error: std::io::Error| Error::file(path, error);
+        let header_bytes = compute_header_bytes(shape);
+        let mut file = File::options().read(true).write(true).open(path).map_err(file_error)?;
+        let mut header = vec![0; header_bytes];
+        let file_bytes = file.metadata().map_err(file_error)?.len();
+        let is_complete = file.read_exact(&mut header).is_ok();
+        if !is_complete || !has_shape(&header, shape) {
+            return Err(Error::file(
+                path,
+                format!("expected NumPy rows of f32 and of the shape {shape:?}, got another file"),
+            ));
+        }
+        let row_bytes = (size_of::<f32>() * shape.iter().product::<usize>()) as u64;
+        let end = row_bytes.saturating_mul(row_count).saturating_add(header_bytes as u64);
+        if file_bytes < end {
+            let given = (file_bytes - header_bytes as u64) / row_bytes.max(1);
+            return Err(Error::file(path, format!("expected at least {row_count} rows, got {given}")));
+        }
+        file.set_len(end).map_err(file_error)?;
+        file.seek(SeekFrom::End(0)).map_err(file_error)?;
+        Ok(Self { path: path.to_owned(), file: BufWriter::new(file), shape: shape.to_vec(), header_bytes, row_count })
+    }
+
+    /// The number of rows.
+    pub const fn row_count(&self) -> u64 {
+        self.row_count
+    }
+
     /// Writes one row.
     ///
     /// # Errors
@@ -59,15 +96,29 @@ impl Writer {
         self.write_bytes(bytemuck::cast_slice(numbers))
     }
 
+    /// Writes the number of rows into the header, and makes all rows so far durable.
+    ///
+    /// # Errors
+    /// `File` if it cannot be written.
+    pub fn sync(&mut self) -> Result<()> {
+        self.update_header()?;
+        self.file.seek(SeekFrom::End(0)).map_err(|error| Error::file(&self.path, error))?;
+        self.file.get_ref().sync_data().map_err(|error| Error::file(&self.path, error))
+    }
+
     /// Writes the number of rows into the header, closes the file and returns the number.
     ///
     /// # Errors
     /// `File` if it cannot be written.
     pub fn finish(mut self) -> Result<u64> {
-        self.file.seek(SeekFrom::Start(0)).map_err(|error| Error::file(&self.path, error))?;
-        self.write_header()?;
+        self.update_header()?;
         self.file.flush().map_err(|error| Error::file(&self.path, error))?;
         Ok(self.row_count)
+    }
+
+    fn update_header(&mut self) -> Result<()> {
+        self.file.seek(SeekFrom::Start(0)).map_err(|error| Error::file(&self.path, error))?;
+        self.write_header()
     }
 
     /// Writes the magic string, length, dictionary, padding and newline: `header_bytes` bytes for every number of rows.
@@ -94,8 +145,23 @@ fn compute_header_bytes(shape: &[usize]) -> usize {
 
 /// The Python dictionary in the header.
 fn format_dictionary(row_count: u64, shape: &[usize]) -> String {
+    format!("{DICTIONARY_START}{row_count}{}", format_dictionary_end(shape))
+}
+
+/// The dictionary after the number of rows.
+fn format_dictionary_end(shape: &[usize]) -> String {
     let shape: String = shape.iter().map(|size| format!(" {size},")).collect();
-    format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({row_count},{shape}), }}")
+    format!(",{shape}), }}")
+}
+
+/// Whether a header of this module has rows of this shape. The number of rows may be any.
+fn has_shape(header: &[u8], shape: &[usize]) -> bool {
+    let Some((prefix, dictionary)) = header.split_at_checked(PREFIX_BYTES) else { return false };
+    let length = (header.len() - PREFIX_BYTES) as u16;
+    let text = std::str::from_utf8(dictionary).unwrap_or_default().trim_end();
+    let row_count =
+        text.strip_prefix(DICTIONARY_START).and_then(|rest| rest.strip_suffix(&format_dictionary_end(shape)));
+    prefix == [MAGIC, &length.to_le_bytes()].concat() && row_count.is_some_and(|text| text.parse::<u64>().is_ok())
 }
 
 #[cfg(test)]
@@ -151,5 +217,54 @@ mod tests {
         assert!(Writer::create(&path, &[2, 3]).expect("a new file").write_row(&[0.0; 5]).is_err());
         let error = Writer::create(&path, &[1; 30_000]).err().expect("an error").to_string();
         assert!(error.contains("30000 axes"), "{error}");
+    }
+
+    /// A process was killed: the header has no rows yet, and the last row is incomplete.
+    #[test]
+    fn file_continues_after_a_number_of_rows() {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let path = folder.path().join("rows.npy");
+        let row = |number: usize| [number as f32, -1.0];
+        let mut writer = Writer::create(&path, &[2]).expect("a new file");
+        (0..3).for_each(|number| writer.write_row(&row(number)).expect("a row"));
+        writer.sync().expect("a durable file");
+        let text_of = |file: &[u8]| split_file(file).0.to_owned();
+        assert!(text_of(&std::fs::read(&path).expect("a file")).contains("'shape': (3, 2,)"));
+        writer.write_row(&row(3)).expect("a row");
+        drop(writer);
+        let complete = std::fs::read(&path).expect("a file");
+        std::fs::write(&path, &complete[..complete.len() - 3]).expect("a writable file");
+        let mut writer = Writer::resume(&path, &[2], 2).expect("a file of these rows");
+        (2..5).for_each(|number| writer.write_row(&row(number)).expect("a row"));
+        assert_eq!((writer.row_count(), writer.finish().expect("a complete file")), (5, 5));
+        let rows: Vec<[f32; 2]> = (0..5).map(row).collect();
+        assert_eq!(
+            std::fs::read(&path).expect("a file"),
+            write_file(&[2], &rows.iter().map(|row| &row[..]).collect::<Vec<_>>())
+        );
+    }
+
+    #[test]
+    fn file_of_another_shape_type_or_length_is_not_continued() {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let path = folder.path().join("rows.npy");
+        let file = write_file(&[2], &[&[1.0, 2.0]]);
+        let resume = |bytes: &[u8], shape: &[usize], row_count: u64| {
+            std::fs::write(&path, bytes).expect("a writable file");
+            let error = Writer::resume(&path, shape, row_count).err().map(|error| error.to_string());
+            assert_eq!(std::fs::read(&path).expect("a file").len(), bytes.len(), "expected an unchanged file");
+            error.unwrap_or_default()
+        };
+        assert_eq!(resume(&file, &[2], 1), "", "control");
+        assert!(resume(&file, &[2], 2).contains("at least 2 rows, got 1"));
+        assert!(resume(&file, &[2], u64::MAX).contains("got 1"));
+        let mut other_type = file.clone();
+        let digit = file.windows(3).position(|bytes| bytes == b"<f4").expect("a type") + 2;
+        other_type[digit] = b'8';
+        let cases: [(&[u8], &[usize]); 5] =
+            [(&file, &[3]), (&file, &[2, 1]), (&file, &[]), (&file[..100], &[2]), (&[], &[2])];
+        for (bytes, shape) in cases.into_iter().chain([(&other_type[..], &[2_usize][..])]) {
+            assert!(resume(bytes, shape, 0).contains("got another file"), "{shape:?}");
+        }
     }
 }

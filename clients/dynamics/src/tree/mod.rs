@@ -11,19 +11,22 @@ mod response;
 mod tests;
 
 use nalgebra::Vector3;
-use serde_json::json;
+use serde::{Deserialize, Serialize};
+use serde_json::{Value, json};
 
 use crate::affine::AffineTransform;
 use crate::attachments::Attachments;
+use crate::checkpoint::RunIdentity;
 use crate::error::{Result, check_option, invalid_input};
 use crate::hierarchy::{JointGapMeter, compose_transforms};
 use crate::integrator::{ModalOscillators, nyquist_remark};
 use crate::model::{DomainModel, Model};
 use crate::parameters::ModalParameters;
 use crate::run::{Report, Scenario};
+use crate::saved_state::{from_json, number_bits, to_json};
 use crate::step_values::StepValues;
 use crate::viewer_forces::scale_remark;
-use crate::viewer_response::ViewerResponse;
+use crate::viewer_response::{ForcedMotion, ViewerResponse};
 use crate::wind::{Wind, WindPressure};
 use calibration::{Calibration, MAX_BRANCH_BENDING, SwayTarget, calibrate, scale_response};
 use crown::Crown;
@@ -88,14 +91,26 @@ struct SentStep {
 }
 
 /// Largest values of a run or of one step.
-#[derive(Debug, Clone, Copy, Default)]
+#[derive(Debug, Clone, Copy, Default, Serialize, Deserialize)]
 struct Peaks {
     /// Sway of the crown, as a fraction of the height.
+    #[serde(with = "number_bits")]
     sway: f64,
     /// Displacement of a domain's origin or of a surface sample, in scene units.
+    #[serde(with = "number_bits")]
     displacement: f64,
     /// Opening of a joint, in scene units.
+    #[serde(with = "number_bits")]
     gap: f64,
+}
+
+/// The state of a tree in a checkpoint.
+#[derive(Serialize, Deserialize)]
+struct SavedTree {
+    response: Response,
+    viewer_response: Option<ForcedMotion>,
+    peaks: Peaks,
+    late_remarks: Vec<String>,
 }
 
 impl Peaks {
@@ -217,6 +232,38 @@ impl TreeScenario {
 impl Scenario for TreeScenario {
     fn model(&self) -> &Model {
         &self.model
+    }
+
+    fn identity(&self) -> RunIdentity {
+        let TreeOptions { dt: _, sway_fraction, wind_strength, direction_radians, seed } = self.options;
+        RunIdentity::default()
+            .with("motion", "modes in wind")
+            .with_number("--wind", wind_strength)
+            .with_number("--sway", sway_fraction)
+            .with_number("--direction (radians)", direction_radians)
+            .with("--seed", seed)
+    }
+
+    fn save(&self) -> Result<Value> {
+        to_json(&SavedTree {
+            response: self.response.clone(),
+            viewer_response: self.viewer_response.as_ref().map(ViewerResponse::save),
+            peaks: self.peaks(),
+            late_remarks: self.late_remarks.clone(),
+        })
+    }
+
+    fn restore(&mut self, next_step: u64, state: Value) -> Result<()> {
+        let saved: SavedTree = from_json(state)?;
+        saved.response.check(&self.model)?;
+        let restore_viewer_response = |saved| {
+            let mut viewer_response = ViewerResponse::at_rest(&self.model, &self.integrator);
+            viewer_response.restore(saved).map(|()| viewer_response)
+        };
+        self.viewer_response = saved.viewer_response.map(restore_viewer_response).transpose()?;
+        (self.response, self.next_step) = (saved.response, next_step);
+        (self.earlier_peaks, self.last_step, self.late_remarks) = (saved.peaks, None, saved.late_remarks);
+        Ok(())
     }
 
     fn compute_next_step(&mut self, values: &mut StepValues) -> Result<()> {

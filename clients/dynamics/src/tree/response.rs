@@ -1,17 +1,21 @@
 //! The response of all modes to the wind, by exact integration of every mode.
 
 use nalgebra::DVector;
+use serde::{Deserialize, Serialize};
 
 use super::excitation::WindExcitation;
-use crate::error::Result;
+use crate::error::{Result, invalid_input};
 use crate::integrator::{Integrator, LoadChange, MotionState};
 use crate::model::Model;
+use crate::saved_state::{check_vector, vector_bits};
 use crate::wind::WindPressure;
 
 /// The wind and the response to it at one time, with gain 1 (see `calibration`).
+#[derive(Clone, Serialize, Deserialize)]
 pub(super) struct Response {
     state: MotionState,
     /// Per coordinate.
+    #[serde(with = "vector_bits")]
     forces: DVector<f64>,
     /// Per domain.
     pub(super) pressures: Vec<WindPressure>,
@@ -43,6 +47,20 @@ impl Response {
         let mut state = self.state.clone();
         integrator.advance(&mut state, LoadChange { start: &self.forces, end: &forces })?;
         Ok(Self { state, forces, pressures })
+    }
+
+    /// Checks a response that was read from a checkpoint.
+    ///
+    /// # Errors
+    /// `Invalid` if a list has another length than the model demands, or a number is not finite.
+    pub(super) fn check(&self, model: &Model) -> Result<()> {
+        self.state.check(model.coordinate_count)?;
+        check_vector("forces", &self.forces, model.coordinate_count)?;
+        if self.pressures.len() != model.domains.len() {
+            let expected = format!("{} domains", model.domains.len());
+            return Err(invalid_input("state.pressures", expected, self.pressures.len()));
+        }
+        Ok(())
     }
 
     /// Per coordinate.

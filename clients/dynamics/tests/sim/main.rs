@@ -1,9 +1,10 @@
 //! Tests of the physics process against a fake server. Subscribers of the server receive the motion that the process
 //! computes.
 
-#[path = "../../rust/tests/fake/mod.rs"]
+#[path = "../../../rust/tests/fake/mod.rs"]
 #[allow(dead_code, reason = "shared with the tests of the client")]
 mod fake;
+mod resume;
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
