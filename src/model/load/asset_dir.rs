@@ -6,6 +6,9 @@ use std::ops::Deref;
 use std::path::{Component, Path, PathBuf};
 use std::sync::Arc;
 
+use super::file_hashes::FileHashes;
+pub(super) use super::folder_listing::EntryKind;
+use super::folder_listing::{FolderListing, ListingCache};
 use crate::domain::Texture;
 use crate::error::{Result, invalid};
 use crate::memory::{MemoryReservation, TemporaryReservation};
@@ -31,6 +34,11 @@ pub(super) struct AssetDir {
     is_strict: bool,
     /// The memory of the scene that is loaded. Clones of the folder share it.
     memory: Arc<MemoryReservation>,
+    /// Clones of the folder share it.
+    listings: Arc<ListingCache>,
+    /// The hashes of all files in the root, if the files were uploaded. Files that are read whole are verified. The start
+    /// of a file, which only decides whether the file is used, is not.
+    hashes: Option<Arc<FileHashes>>,
 }
 
 /// The bytes of a file. Their memory is reserved until this is dropped.
@@ -55,24 +63,25 @@ impl Deref for FileContent {
     }
 }
 
-/// The kind of an existing path.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum EntryKind {
-    File,
-    Directory,
-}
-
 impl AssetDir {
     /// Allows any path, absolute or relative to `base`, and any amount of memory.
     pub(super) fn unrestricted(base: &Path) -> Self {
-        Self { base: base.to_path_buf(), root: None, is_strict: false, memory: MemoryReservation::unlimited() }
+        Self::new(base, None, MemoryReservation::unlimited())
     }
 
     /// Allows only paths relative to `root` that stay inside it. `root` must be canonical. The loaders reserve their memory
     /// in `memory`.
     pub(super) fn confined_to(root: &Path, memory: &Arc<MemoryReservation>) -> Self {
-        let memory = Arc::clone(memory);
-        Self { base: root.to_path_buf(), root: Some(root.to_path_buf()), is_strict: false, memory }
+        Self::new(root, Some(root.to_path_buf()), Arc::clone(memory))
+    }
+
+    fn new(base: &Path, root: Option<PathBuf>, memory: Arc<MemoryReservation>) -> Self {
+        Self { base: base.to_path_buf(), root, is_strict: false, memory, listings: Arc::default(), hashes: None }
+    }
+
+    /// The same folder, whose files must have these hashes.
+    pub(super) fn with_hashes(self, hashes: Arc<FileHashes>) -> Self {
+        Self { hashes: Some(hashes), ..self }
     }
 
     /// The memory of the scene that is loaded.
@@ -169,22 +178,31 @@ impl AssetDir {
     /// Reads a regular file of at most `limit` bytes.
     ///
     /// # Errors
-    /// `Invalid` if the path is outside the root, does not exist, is not a regular file, is too large or unreadable.
+    /// `Invalid` if the path is outside the root, does not exist, is not a regular file, is too large or unreadable, or
+    /// if an uploaded file has changed.
     /// `OutOfMemory` if the memory of the scene is too small for it. The error contains the unresolved path, so that it
     /// does not reveal the location of the root.
     pub(super) fn read(&self, relative: &str, limit: u64) -> Result<FileContent> {
         let too_large = |size: u64| invalid(field_of(relative), format!("at most {limit} bytes"), size);
-        let file_bytes = self.regular_file(relative)?.1;
+        let (path, file_bytes) = self.regular_file(relative)?;
         if file_bytes > limit {
             return Err(too_large(file_bytes));
         }
         let memory = self.reserve_temporary(&field_of(relative), file_bytes)?;
         // One byte more than the size, to notice a file that has grown.
         let bytes = self.read_start(relative, file_bytes + 1)?;
-        match bytes.len() as u64 <= file_bytes {
-            true => Ok(FileContent { bytes, _memory: memory }),
-            false => Err(unreadable(relative, &"a file that grows while it is read")),
+        if bytes.len() as u64 > file_bytes {
+            return Err(unreadable(relative, &"a file that grows while it is read"));
         }
+        self.check_hash(relative, &path, &bytes)?;
+        Ok(FileContent { bytes, _memory: memory })
+    }
+
+    /// Verifies the content of the file with the canonical path `path`.
+    fn check_hash(&self, relative: &str, path: &Path, content: &[u8]) -> Result<()> {
+        let (Some(hashes), Some(root)) = (&self.hashes, &self.root) else { return Ok(()) };
+        let path_in_root = path.strip_prefix(root).unwrap_or(path).to_string_lossy();
+        hashes.check(&path_in_root, &field_of(relative), content)
     }
 
     /// Reads at most the first `count` bytes of a regular file, for which it allocates memory.
@@ -232,19 +250,27 @@ impl AssetDir {
         Ok(if path.is_dir() { Some(EntryKind::Directory) } else { path.is_file().then_some(EntryKind::File) })
     }
 
-    /// Names and kinds of the folder's direct entries, sorted. Reads at most [`MAX_ENTRIES`] entries.
-    pub(super) fn entries(&self) -> Vec<(String, EntryKind)> {
-        let Ok(listing) = std::fs::read_dir(&self.base) else { return Vec::new() };
-        let names = listing.take(MAX_ENTRIES).filter_map(|entry| entry.ok()?.file_name().into_string().ok());
-        let mut entries: Vec<_> =
-            names.filter_map(|name| self.kind(&name).ok().flatten().map(|kind| (name, kind))).collect();
-        entries.sort_by(|a, b| a.0.cmp(&b.0));
-        entries
+    /// Names and kinds of the folder's direct entries. Reads at most [`MAX_ENTRIES`] entries, when the load first lists
+    /// the folder.
+    pub(super) fn listing(&self) -> Arc<FolderListing> {
+        self.listings.get_or_list(&self.base, || FolderListing::new(self.read_entries()))
     }
 
-    /// Names of the folder's files, sorted.
-    pub(super) fn file_names(&self) -> Vec<String> {
-        self.entries().into_iter().filter(|(_, kind)| *kind == EntryKind::File).map(|(name, _)| name).collect()
+    /// How often a folder was listed since the load began.
+    #[cfg(test)]
+    pub(super) fn listing_count(&self) -> usize {
+        self.listings.count()
+    }
+
+    fn read_entries(&self) -> Vec<(String, EntryKind)> {
+        let Ok(listing) = std::fs::read_dir(&self.base) else { return Vec::new() };
+        let names = listing.take(MAX_ENTRIES).filter_map(|entry| entry.ok()?.file_name().into_string().ok());
+        names.filter_map(|name| self.kind(&name).ok().flatten().map(|kind| (name, kind))).collect()
+    }
+
+    /// Whether `relative` is a file.
+    pub(super) fn has_file(&self, relative: &str) -> bool {
+        self.kind(relative) == Ok(Some(EntryKind::File))
     }
 
     /// The canonical path of `relative`. A symbolic link that leaves the root has the same error as a missing file, so

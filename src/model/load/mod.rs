@@ -23,6 +23,8 @@ mod asset_dir;
 mod conversion;
 #[cfg(test)]
 mod dataset_tests;
+mod file_hashes;
+mod folder_listing;
 mod gltf;
 mod manifest;
 mod modes;
@@ -38,6 +40,7 @@ mod surface;
 mod texture_cache;
 mod vega_config;
 
+pub use file_hashes::FileHashes;
 pub use modes::{NpyArray, parse_numpy};
 pub use repository::SceneRepository;
 pub use source::is_built_in;

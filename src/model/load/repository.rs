@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use super::asset_dir::{AssetDir, EntryKind};
+use super::file_hashes::FileHashes;
 use super::{OpenedScene, manifest, source};
 use crate::error::{Error, Result};
 use crate::memory::MemoryReservation;
@@ -26,17 +27,7 @@ impl SceneRepository {
     /// # Errors
     /// `Unavailable` if the folder does not exist.
     pub fn new(root: Option<&Path>) -> Result<Self> {
-        let Some(root) = root else { return Ok(Self { root: None }) };
-        let unavailable = |reason: String| Error::Unavailable {
-            what: "scene repository",
-            reason: format!("{}: {reason}", root.display()),
-            remedy: "Pass an existing folder".into(),
-        };
-        let canonical = root.canonicalize().map_err(|error| unavailable(error.to_string()))?;
-        if !canonical.is_dir() {
-            return Err(unavailable("not a folder".into()));
-        }
-        Ok(Self { root: Some(canonical) })
+        Ok(Self { root: root.map(canonical_folder).transpose()? })
     }
 
     /// Opens a built-in scene or a path inside the repository; `.` is the repository's root folder. The loaders reserve
@@ -50,6 +41,22 @@ impl SceneRepository {
             None if source::is_built_in(source) => super::open(source),
             None => Err(Error::NotFound { what: "scene", given: source.into() }),
         }
+    }
+
+    /// Opens `entry` of a folder of uploaded files, or the folder itself if `entry` is empty. Nothing outside the folder is
+    /// read. Each file that is read must have its hash in `hashes`.
+    ///
+    /// # Errors
+    /// As for [`Self::open`], and `Invalid` with the name of a file that has changed.
+    pub fn open_upload(
+        folder: &Path,
+        entry: &str,
+        hashes: &Arc<FileHashes>,
+        memory: &Arc<MemoryReservation>,
+    ) -> Result<OpenedScene> {
+        let files = AssetDir::confined_to(&canonical_folder(folder)?, memory).with_hashes(Arc::clone(hashes));
+        // With the leading "./" a file name is never resolved as a built-in name.
+        OpenedScene::new(source::read(&files, &format!("./{entry}"))?)
     }
 
     /// Whether a source names a built-in scene.
@@ -76,24 +83,39 @@ impl SceneRepository {
     }
 }
 
+/// The canonical path of a folder.
+///
+/// # Errors
+/// `Unavailable` if the folder does not exist.
+fn canonical_folder(folder: &Path) -> Result<PathBuf> {
+    let unavailable = |reason: String| Error::Unavailable {
+        what: "scene repository",
+        reason: format!("{}: {reason}", folder.display()),
+        remedy: "Pass an existing folder".into(),
+    };
+    let canonical = folder.canonicalize().map_err(|error| unavailable(error.to_string()))?;
+    match canonical.is_dir() {
+        true => Ok(canonical),
+        false => Err(unavailable("not a folder".into())),
+    }
+}
+
 /// Appends the scenes in `folder` to `names`. `prefix` is the path of the folder below the root with a final `/`, or
 /// empty. Subfolders are searched down to `depth` levels.
 fn collect_names(folder: &AssetDir, prefix: &str, depth: usize, names: &mut Vec<String>) {
-    let entries = folder.entries();
-    let has_manifest = entries.contains(&(manifest::MANIFEST_FILE.to_owned(), EntryKind::File));
-    if has_manifest || source::find_models(folder).len() == 1 {
+    if folder.has_file(manifest::MANIFEST_FILE) || source::find_models(folder).len() == 1 {
         names.push(if prefix.is_empty() { ".".into() } else { prefix.trim_end_matches('/').into() });
     }
-    for (name, kind) in entries {
+    for (name, kind) in folder.listing().entries() {
         // Skip hidden entries: uploads in progress, version control.
         if names.len() >= MAX_LISTED_NAMES || name.starts_with('.') {
             continue;
         }
         let path = format!("{prefix}{name}");
         match kind {
-            EntryKind::File if source::find_model(folder, &name).is_some() => names.push(path),
+            EntryKind::File if source::find_model(folder, name).is_some() => names.push(path),
             EntryKind::Directory if depth > 0 => {
-                if let Ok(subfolder) = folder.within(&name) {
+                if let Ok(subfolder) = folder.within(name) {
                     collect_names(&subfolder, &format!("{path}/"), depth - 1, names);
                 }
             }

@@ -112,8 +112,7 @@ pub(super) fn read_model(files: &AssetDir, path: &str, options: ModelOptions) ->
             let given = || format!("{file_name}{}", model_hint(file_name));
             let model = recognize_model(file_name)
                 .ok_or_else(|| invalid(format!("file '{path}'"), format!("a file ending in {FORMATS}"), given()))?;
-            let model = detect_plant(model, &folder.file_names());
-            read_model_file(&folder, &model, options)
+            read_model_file(&folder, &detect_plant(&folder, model), options)
         }
         None => Err(invalid(format!("file '{path}'"), "an existing model", "no file of this name")),
     }
@@ -155,19 +154,18 @@ pub(super) fn find_model(folder: &AssetDir, name: &str) -> Option<ModelFile> {
 /// The models of a folder: its glTF and OBJ files; if there is none, its PLY files, else its STL files, else its NumPy
 /// archives with a mesh.
 pub(super) fn find_models(folder: &AssetDir) -> Vec<ModelFile> {
-    let names = folder.file_names();
-    let mut models: Vec<ModelFile> = names.iter().filter_map(|name| recognize_model(name)).collect();
+    let mut models: Vec<ModelFile> = folder.listing().file_names().filter_map(recognize_model).collect();
     let rank = models.iter().map(ModelFile::format_rank).min();
     models.retain(|model| Some(model.format_rank()) == rank && find_model(folder, model.name()).is_some());
-    models.into_iter().map(|model| detect_plant(model, &names)).collect()
+    models.into_iter().map(|model| detect_plant(folder, model)).collect()
 }
 
-/// Changes an OBJ file to a plant if both files of the plant's structure are among the `names` of its folder.
-fn detect_plant(model: ModelFile, names: &[String]) -> ModelFile {
+/// Changes an OBJ file to a plant if both files of the plant's structure are in its folder.
+fn detect_plant(folder: &AssetDir, model: ModelFile) -> ModelFile {
     let ModelFile::Obj(name) = &model else { return model };
     let stem = stem_of(name);
     let structure_files = [format!("{stem}.structure.json"), format!("{stem}_object_id.dat")];
-    match structure_files.iter().all(|name| names.contains(name)) {
+    match structure_files.iter().all(|name| folder.has_file(name)) {
         true => ModelFile::Plant(name.clone()),
         false => model,
     }
@@ -182,8 +180,9 @@ fn choose_single_model(folder: &AssetDir, path: &str) -> Result<ModelFile> {
         1 => Ok(models.remove(0)),
         0 => {
             // The record of an upload is a hidden file.
-            let entries = folder.entries().into_iter().filter(|(name, _)| !name.starts_with('.'));
-            let names: Vec<String> = entries.map(|(name, _)| name).collect();
+            let listing = folder.listing();
+            let entries = listing.entries().iter().filter(|(name, _)| !name.starts_with('.'));
+            let names: Vec<String> = entries.map(|(name, _)| name.clone()).collect();
             let hint = names.iter().map(|name| model_hint(name)).find(|hint| !hint.is_empty()).unwrap_or_default();
             Err(invalid(field, expected, format!("no model among: {}{hint}", join_names(names))))
         }

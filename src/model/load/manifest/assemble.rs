@@ -39,6 +39,7 @@ pub(super) fn assemble(
         texture_by_path: HashMap::new(),
         models: HashMap::new(),
         domain_by_name: HashMap::new(),
+        last_suffixes: HashMap::new(),
         material_names: HashSet::new(),
     };
     for (index, entry) in entries.iter().enumerate() {
@@ -94,6 +95,8 @@ struct ManifestAssembler<'a> {
     texture_by_path: HashMap<String, usize>,
     models: HashMap<ModelKey, LoadedModel>,
     domain_by_name: HashMap<String, usize>,
+    /// By name, the last number that was appended to it. All numbers before it are in use.
+    last_suffixes: HashMap<String, usize>,
     /// Names of the materials of all models.
     material_names: HashSet<String>,
 }
@@ -320,14 +323,11 @@ impl ManifestAssembler<'_> {
                 Some(name) => domain.name = format!("{name}/{}", domain.name),
                 None => {}
             }
-            let base_name = domain.name.clone();
-            let mut suffix = 1;
-            while self.domain_by_name.contains_key(&domain.name) {
+            if self.domain_by_name.contains_key(&domain.name) {
                 if entry.name.is_some() && has_one_domain {
-                    return Err(invalid("name", "a name that no earlier domain has", base_name));
+                    return Err(invalid("name", "a name that no earlier domain has", &domain.name));
                 }
-                suffix += 1;
-                domain.name = format!("{base_name} {suffix}");
+                self.add_suffix(&mut domain.name);
             }
             self.domain_by_name.insert(domain.name.clone(), index);
         }
@@ -336,6 +336,19 @@ impl ManifestAssembler<'_> {
             self.domain_by_name.entry(name.clone()).or_insert(self.parts.domains.len());
         }
         Ok(())
+    }
+
+    /// Appends the first number from 2 on with which no domain has the name.
+    fn add_suffix(&mut self, name: &mut String) {
+        let suffix = self.last_suffixes.entry(name.clone()).or_insert(1);
+        let base_name = std::mem::take(name);
+        loop {
+            *suffix += 1;
+            *name = format!("{base_name} {suffix}");
+            if !self.domain_by_name.contains_key(name) {
+                return;
+            }
+        }
     }
 }
 

@@ -109,6 +109,32 @@ fn instances_share_mesh_and_modes_but_not_coordinates_or_names() {
 }
 
 #[test]
+fn numbers_of_unnamed_instances_skip_names_in_use() {
+    let names = |toml: &str| {
+        let parts = read_parts(toml).expect("a valid manifest");
+        parts.domains.into_iter().map(|domain| domain.name).collect::<Vec<_>>()
+    };
+    let entry = "[[domain]]\nmodel = 'a.obj'\n";
+    let toml = format!("{}{entry}name = 'a 3'\n{}", entry.repeat(2), entry.repeat(2));
+    assert_eq!(names(&toml), ["a", "a 2", "a 3", "a 4", "a 5"]);
+}
+
+/// The time of a load must not grow with the square of the number of models.
+#[test]
+fn folder_is_listed_once_for_all_of_its_models() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let mut toml = String::new();
+    for index in 0..20 {
+        std::fs::write(folder.path().join(format!("{index}.obj")), TRIANGLE).expect("a writable file");
+        toml += &format!("[[domain]]\nmodel = '{index}.obj'\n");
+    }
+    std::fs::write(folder.path().join(MANIFEST_FILE), toml).expect("a writable file");
+    let files = AssetDir::unrestricted(folder.path());
+    read(&files, MANIFEST_FILE, "folder").expect("a valid scene");
+    assert_eq!(files.listing_count(), 1);
+}
+
+#[test]
 fn crease_angle_of_an_entry_overrides_that_of_the_scene() {
     // Two triangles at a right angle: `roof.obj` has no normals, `smooth.obj` has the same normal at all vertices.
     let corners = |toml: &str| {

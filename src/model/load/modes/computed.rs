@@ -6,6 +6,7 @@ use sha2::{Digest, Sha256};
 
 use super::npz::{find_notes, has_arrays};
 use crate::load::asset_dir::{AssetDir, stem_of};
+use crate::load::file_hashes::hex;
 
 /// The note with the SHA-256 hash of the file from which modes were computed, in hexadecimal digits.
 const SOURCE_HASH_NOTE: &str = "modes.source_sha256";
@@ -27,7 +28,7 @@ fn file_hash(files: &AssetDir, name: &str) -> Option<String> {
     let (mut hash, mut buffer) = (Sha256::new(), vec![0; 1 << 16]);
     loop {
         match file.read(&mut buffer).ok()? {
-            0 => return Some(hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect()),
+            0 => return Some(hex(&hash.finalize())),
             count => hash.update(&buffer[..count]),
         }
     }

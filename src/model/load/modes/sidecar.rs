@@ -1,8 +1,11 @@
 //! Finds the modes of a mesh by file name. [`NAMES`] states the rule. Other files of the folder are never read as
 //! modes.
 
+use std::collections::HashMap;
+
 use crate::error::Result;
 use crate::load::asset_dir::{AssetDir, EntryKind, stem_of};
+use crate::load::folder_listing::{FolderListing, ModesNames};
 use crate::load::source::{find_model, find_models, recognize_model};
 
 /// The rule in words, for remarks.
@@ -51,39 +54,51 @@ pub(in crate::load) struct Sidecar {
 /// # Errors
 /// `Invalid` for a name that leaves the root of the repository.
 pub(in crate::load) fn find_sidecar(files: &AssetDir, name: &str) -> Result<Sidecar> {
-    let names = files.file_names();
+    let listing = files.listing();
+    let names = listing.modes_names(|| collect_names(files, &listing));
     let stem = model_stem(name);
     let mut candidates: Vec<String> = ENDINGS.iter().map(|ending| format!("{stem}{ending}")).collect();
-    let other_stems: Vec<&str> = names
-        .iter()
-        .filter(|other| *other != name && recognize_model(other).is_some())
-        .map(|other| model_stem(other))
-        .collect();
-    if find_models(files).iter().all(|model| model.name() == name) {
+    if names.models.iter().all(|model| model == name) {
         candidates.extend(GENERIC_NAMES.map(str::to_owned));
     }
-    let is_model = |name: &str| find_model(files, name).is_some();
     let mut file = None;
     for candidate in candidates.iter().filter(|candidate| *candidate != name) {
         let found = match files.kind(candidate)? {
-            Some(EntryKind::File) => Some(candidate.clone()),
-            _ => names.iter().find(|other| other.eq_ignore_ascii_case(candidate) && *other != name).cloned(),
+            Some(EntryKind::File) => Some(candidate),
+            _ => {
+                let same_names = names.by_lower_case.get(&candidate.to_ascii_lowercase());
+                same_names.into_iter().flatten().find(|other| *other != name)
+            }
         };
-        file = found.filter(|found| !is_model(found));
+        file = found.filter(|found| find_model(files, found).is_none()).cloned();
         if file.is_some() {
             break;
         }
     }
-    let belongs_to_other = |candidate: &str| {
-        other_stems.iter().any(|other| candidate.strip_prefix(other).is_some_and(|ending| ending.starts_with('.')))
-    };
-    let unused: Vec<&str> = names
-        .iter()
-        .map(String::as_str)
-        .filter(|other| *other != name && Some(*other) != file.as_deref())
-        .filter(|other| looks_like_modes(other) && !belongs_to_other(other) && !is_model(other))
-        .collect();
-    Ok(Sidecar { remark: unused_remark(&unused, file.is_some()), file })
+    Ok(Sidecar { remark: unused_remark(names, name, file.as_deref()), file })
+}
+
+/// Collects the names of a folder for the search for modes.
+fn collect_names(files: &AssetDir, listing: &FolderListing) -> ModesNames {
+    let models = find_models(files).into_iter().map(|model| model.name().to_owned()).collect();
+    let mut names = ModesNames { models, ..ModesNames::default() };
+    let mut models_by_stem: HashMap<&str, Vec<&str>> = HashMap::new();
+    for name in listing.file_names() {
+        names.by_lower_case.entry(name.to_ascii_lowercase()).or_default().push(name.to_owned());
+        if recognize_model(name).is_some() {
+            models_by_stem.entry(model_stem(name)).or_default().push(name);
+        }
+    }
+    for name in listing.file_names().filter(|name| looks_like_modes(name) && find_model(files, name).is_none()) {
+        let stems = name.match_indices('.').map(|(dot, _)| &name[..dot]);
+        let claims: Vec<&str> = stems.filter_map(|stem| models_by_stem.get(stem)).flatten().copied().collect();
+        match claims[..] {
+            [] => names.unclaimed.push(name.to_owned()),
+            [model] => names.claimed.entry(model.to_owned()).or_default().push(name.to_owned()),
+            _ => {}
+        }
+    }
+    names
 }
 
 /// The name of a model in the names of its mode files.
@@ -99,17 +114,28 @@ fn looks_like_modes(name: &str) -> bool {
     (has_ending || name.ends_with("modes.txt")) && name != "q.npy" && !name.ends_with(".q.npy")
 }
 
-fn unused_remark(unused: &[&str], has_modes: bool) -> Option<String> {
-    if unused.is_empty() {
+/// A remark on the files that look like modes of the model `name` but are not used. `file` has its modes.
+fn unused_remark(names: &ModesNames, name: &str, file: Option<&str>) -> Option<String> {
+    let lists = [&names.unclaimed[..], names.claimed.get(name).map_or(&[], Vec::as_slice)];
+    let is_unused = |other: &&String| *other != name && Some(other.as_str()) != file;
+    let mut listed: Vec<&str> = lists
+        .iter()
+        .flat_map(|list| list.iter().filter(is_unused).take(MAX_LISTED_NAMES).map(String::as_str))
+        .collect();
+    listed.sort_unstable();
+    listed.truncate(MAX_LISTED_NAMES);
+    let used = [Some(name), file].into_iter().flatten();
+    let is_in_lists = |name: &&str| lists.iter().any(|list| list.binary_search_by(|other| (**other).cmp(name)).is_ok());
+    let count = lists.iter().map(|list| list.len()).sum::<usize>() - used.filter(is_in_lists).count();
+    if count == 0 {
         return None;
     }
-    let more = match unused.len().saturating_sub(MAX_LISTED_NAMES) {
+    let more = match count - listed.len() {
         0 => String::new(),
         count => format!(" and {count} more"),
     };
-    let listed = unused.iter().take(MAX_LISTED_NAMES).copied().collect::<Vec<_>>().join(", ");
-    let hint = if has_modes { String::new() } else { format!(": {NAMES}") };
-    Some(format!("not used as modes: {listed}{more}{hint}"))
+    let hint = if file.is_some() { String::new() } else { format!(": {NAMES}") };
+    Some(format!("not used as modes: {}{more}{hint}", listed.join(", ")))
 }
 
 #[cfg(test)]
