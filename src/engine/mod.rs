@@ -53,7 +53,7 @@ pub use scene::lease::{InitialState, LeaseRequest, LeaseToken};
 pub use scene::message::StepSelector;
 pub use scene::step_queue::{Overflow, StepReport};
 pub use scene::subscriber::Subscription;
-pub use source::SceneSource;
+pub use source::{SceneSource, StoredUpload};
 pub use storage::array_upload::{ArrayUpload, ArrayUploadHeader, UploadedDomain, UploadedShape};
 pub use storage::provenance::{SceneProvenance, validate_scene_name};
 pub use storage::upload::{Upload, UploadHeader};
@@ -82,7 +82,6 @@ use self::storage::checkpoint_store::CheckpointStore;
 use self::storage::file_system::{DiskFileSystem, FileSystem};
 use self::storage::run_counter::RunCounter;
 use self::storage::scene_catalog::SceneCatalog;
-use self::storage::upload::CompleteUpload;
 use self::storage::upload_record::find_uploaded_files;
 use self::upload_quota::{UploadPermit, UploadQuota};
 use crate::config::{Config, ValidatedConfig};
@@ -238,7 +237,7 @@ impl Engine {
         } else {
             validate_scene_name(name)?.to_owned()
         };
-        self.open_once(name, SceneProvenance::Repository { source: source.into() }, None, client).await
+        self.open_once(name, SceneProvenance::Repository { source: source.into() }, client).await
     }
 
     /// The open scene with this name.
@@ -355,7 +354,7 @@ impl Engine {
         run_blocking("upload", find).await
     }
 
-    /// Opens a complete upload as a scene. On failure the uploaded files are removed.
+    /// Opens a complete upload as a scene. On failure, and when the caller is cancelled, the uploaded files are removed.
     ///
     /// # Errors
     /// `Invalid` naming the missing or malformed file; `NameTaken` when another scene was opened under the name since
@@ -364,17 +363,13 @@ impl Engine {
         self.open_upload(run_blocking("upload", move || upload.finish()).await?).await
     }
 
-    /// Opens a complete upload of arrays as a scene. On failure the uploaded files are removed.
+    /// Opens a complete upload of arrays as a scene. On failure, and when the caller is cancelled, the uploaded files are
+    /// removed.
     ///
     /// # Errors
     /// As for [`Self::finish_upload`].
     pub async fn finish_array_upload(&self, upload: ArrayUpload) -> Result<Arc<SceneHandle>> {
         self.open_upload(run_blocking("upload", move || upload.finish()).await?).await
-    }
-
-    async fn open_upload(&self, upload: CompleteUpload) -> Result<Arc<SceneHandle>> {
-        let (name, entry, client) = (upload.scene.clone(), upload.entry.clone(), upload.client().cloned());
-        self.open_once(name, SceneProvenance::Upload { entry }, Some(upload), client).await
     }
 
     /// Closes a scene and ends its streams; removes its persisted step and, for an upload, its files.
@@ -450,7 +445,10 @@ fn scene_not_open(name: &str) -> Error {
 #[cfg(test)]
 mod tests {
     use modalcast_model::deform::VertexAttributes;
+    use modalcast_model::load::OpenedScene;
+    use modalcast_model::memory::MemoryReservation;
     use modalcast_model::scene::RawStepUpdate;
+    use sha2::Digest as _;
 
     use super::testing::{FaultyDeformer, InjectedFault, StripsSource};
     use super::*;
@@ -561,6 +559,67 @@ mod tests {
         })
         .await;
         await_within_limit(opening).await.expect("expected no panic").expect("expected an open scene");
+        engine.shutdown().await;
+    }
+
+    /// A source whose uploads are opened when the test allows it.
+    struct WaitingSource(Mutex<std::sync::mpsc::Receiver<()>>);
+
+    impl SceneSource for WaitingSource {
+        fn open(&self, source: &str, memory: &Arc<MemoryReservation>) -> Result<OpenedScene> {
+            StripsSource.open(source, memory)
+        }
+
+        fn open_upload(&self, upload: &StoredUpload, memory: &Arc<MemoryReservation>) -> Result<OpenedScene> {
+            lock(&self.0).recv_timeout(HANG_GUARD).expect("expected the permission to open");
+            self.open(&upload.entry, memory)
+        }
+
+        fn list(&self) -> Vec<String> {
+            Vec::new()
+        }
+    }
+
+    /// A caller that has gone does not know the scene, which would hold its name.
+    #[tokio::test]
+    async fn upload_whose_caller_has_gone_leaves_no_scene_and_no_folder() {
+        let folder = tempfile::tempdir().expect("expected a temporary folder");
+        let config = Config { state: folder.path().to_owned(), ..Config::default() };
+        let (allow, allowed) = std::sync::mpsc::channel();
+        let source = Arc::new(WaitingSource(Mutex::new(allowed)));
+        let open_device = || DeviceContext::with_deformer(FaultyDeformer::boxed);
+        let config = Arc::new(config.validated().expect("expected a valid configuration"));
+        let engine = Engine::start_with_device(config, source, open_device).await.expect("expected a running engine");
+        let uploads = folder.path().join("uploads");
+        let wait_until = async |condition: &dyn Fn() -> bool| {
+            await_within_limit(async {
+                while !condition() {
+                    tokio::time::sleep(std::time::Duration::from_millis(1)).await;
+                }
+            })
+            .await;
+        };
+        for is_canceled in [true, false] {
+            let header = UploadHeader { scene: "upload".into(), entry: String::new(), files: 1, total_bytes: 0 };
+            let upload = engine.begin_upload(header, ClientId::Connection(1)).await;
+            let mut upload = upload.expect("expected an accepted upload");
+            upload.begin_file("a.obj", 0, &sha2::Sha256::digest(b"")).expect("expected an accepted file");
+            let opening_engine = engine.clone();
+            let caller = tokio::spawn(async move { opening_engine.finish_upload(upload).await.map(drop) });
+            // The files are at their place when the source is asked to open them.
+            wait_until(&|| uploads.join("upload").exists()).await;
+            if is_canceled {
+                caller.abort();
+            }
+            allow.send(()).expect("expected a source");
+            match caller.await {
+                Ok(opened) => opened.expect("expected an open scene"),
+                Err(_) => wait_until(&|| engine.shared.registry.find_entry("upload").is_none()).await,
+            }
+            let expected = usize::from(!is_canceled);
+            assert_eq!(std::fs::read_dir(&uploads).expect("expected a folder").count(), expected);
+            assert_eq!((engine.shared.scene_catalog.entries().len(), engine.list().open.len()), (expected, expected));
+        }
         engine.shutdown().await;
     }
 

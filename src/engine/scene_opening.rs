@@ -4,17 +4,21 @@
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
+use tokio::sync::oneshot;
+
 use super::blocking::run_blocking;
 use super::device::command::SceneId;
 use super::registry::{OpenRequest, RegistryEntry};
 use super::scene::handle::{OpenParams, SceneHandle};
 use super::scene_memory::SceneMemory;
+use super::source::StoredUpload;
 use super::storage::provenance::SceneProvenance;
 use super::storage::scene_catalog::folder_bytes;
 use super::storage::upload::CompleteUpload;
+use super::storage::upload_record::read_hashes;
 use super::upload_quota::ClientId;
 use super::{Engine, scene_not_open};
-use modalcast_model::error::{Error, Result};
+use modalcast_model::error::{Error, Result, fault_in};
 use modalcast_model::load::{OpenedScene, modes_files};
 
 /// The largest number of modes files, and of remarks, that are logged when a scene is opened.
@@ -75,25 +79,44 @@ impl Engine {
         OpenRequest { name: name.to_owned(), provenance: provenance.clone(), client, is_built_in }
     }
 
-    /// Opens a scene. Concurrent calls with the same name share one opening. The opening runs in a separate task, so
-    /// that a cancelled caller does not cancel the opening.
+    /// Opens a scene of the repository. Concurrent calls with the same name share one opening. The opening runs in a
+    /// separate task, so that a cancelled caller does not cancel the opening.
     pub(super) async fn open_once(
         &self,
         name: String,
         provenance: SceneProvenance,
-        upload: Option<CompleteUpload>,
         client: Option<ClientId>,
     ) -> Result<Arc<SceneHandle>> {
         self.check_running()?;
         let engine = self.clone();
         let work = async move {
-            // A new upload must not join the opening of an earlier scene with the same name.
-            let must_be_new = upload.is_some();
             let request = engine.open_request(&name, &provenance, client);
-            let entry = engine.shared.registry.reserve(&request, must_be_new)?;
-            engine.open_reserved(&entry, name, provenance, upload).await
+            let entry = engine.shared.registry.reserve(&request, false)?;
+            engine.open_reserved(&entry, name, provenance, None).await
         };
-        tokio::spawn(work).await.map_err(modalcast_model::error::fault_in("open"))?
+        tokio::spawn(work).await.map_err(fault_in("open"))?
+    }
+
+    /// Opens a complete upload as a new scene. If the caller is cancelled, the scene is closed and its files are removed:
+    /// the caller does not know the scene, and could not upload it again under the same name.
+    pub(super) async fn open_upload(&self, upload: CompleteUpload) -> Result<Arc<SceneHandle>> {
+        self.check_running()?;
+        let engine = self.clone();
+        // Dropped together with this future.
+        let (caller, _waits) = oneshot::channel::<()>();
+        let work = async move {
+            let (name, client) = (upload.scene.clone(), upload.client().cloned());
+            let provenance = SceneProvenance::Upload { entry: upload.entry.clone() };
+            let request = engine.open_request(&name, &provenance, client);
+            let entry = engine.shared.registry.reserve(&request, true)?;
+            let opened = engine.open_reserved(&entry, name.clone(), provenance, Some(upload)).await;
+            if opened.is_ok() && caller.is_closed() {
+                tracing::info!(scene = name, "the caller of an upload has gone; the scene is closed");
+                engine.close_scene(&name).await?;
+            }
+            opened
+        };
+        tokio::spawn(work).await.map_err(fault_in("open"))?
     }
 
     /// Opens a scene whose name is reserved for this call.
@@ -231,7 +254,8 @@ impl Engine {
                         engine.shared.upload_quota.store(&scene_name, client, folder_bytes(&upload_folder));
                     }
                 }
-                source.open_within(&upload_folder, &entry, &memory)
+                let hashes = Arc::new(read_hashes(&upload_folder)?);
+                source.open_upload(&StoredUpload { folder: upload_folder, entry, hashes }, &memory)
             }
         };
         run_blocking("load", || read().map_err(Error::into_file_error)).await

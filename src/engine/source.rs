@@ -1,11 +1,21 @@
 //! The trait of scene sources, which resolve a name or path to a validated scene.
 
-use std::path::Path;
+use std::path::PathBuf;
 use std::sync::Arc;
 
 use modalcast_model::error::Result;
-use modalcast_model::load::{OpenedScene, SceneRepository};
+use modalcast_model::load::{FileHashes, OpenedScene, SceneRepository};
 use modalcast_model::memory::MemoryReservation;
+
+/// The files of an uploaded scene.
+#[derive(Debug, Clone)]
+pub struct StoredUpload {
+    pub folder: PathBuf,
+    /// The path in the folder to open. An empty path means the folder.
+    pub entry: String,
+    /// The hashes that the files must have.
+    pub hashes: Arc<FileHashes>,
+}
 
 /// Opens scenes for the engine. The engine calls the methods on threads that may block on the disk.
 pub trait SceneSource: Send + Sync + 'static {
@@ -15,11 +25,11 @@ pub trait SceneSource: Send + Sync + 'static {
     /// `NotFound` when there is no such scene, `Invalid` naming the problem in the path or the files, `OutOfMemory`.
     fn open(&self, source: &str, memory: &Arc<MemoryReservation>) -> Result<OpenedScene>;
 
-    /// Opens `entry` of an uploaded folder, or the folder itself if `entry` is empty. Reads nothing outside the folder.
+    /// Opens an uploaded scene. Reads nothing outside its folder.
     ///
     /// # Errors
-    /// As [`Self::open`].
-    fn open_within(&self, folder: &Path, entry: &str, memory: &Arc<MemoryReservation>) -> Result<OpenedScene>;
+    /// As [`Self::open`], and `Invalid` with the name of a file that has changed since it was uploaded.
+    fn open_upload(&self, upload: &StoredUpload, memory: &Arc<MemoryReservation>) -> Result<OpenedScene>;
 
     /// Whether [`Self::open`] reads no files for the source. Such a source does not wait for others that do.
     fn is_built_in(&self, _source: &str) -> bool {
@@ -35,9 +45,8 @@ impl SceneSource for SceneRepository {
         Self::open(self, source, memory)
     }
 
-    fn open_within(&self, folder: &Path, entry: &str, memory: &Arc<MemoryReservation>) -> Result<OpenedScene> {
-        // With the leading "./" a file name is never resolved as a built-in name.
-        Self::new(Some(folder))?.open(&format!("./{entry}"), memory)
+    fn open_upload(&self, upload: &StoredUpload, memory: &Arc<MemoryReservation>) -> Result<OpenedScene> {
+        Self::open_upload(&upload.folder, &upload.entry, &upload.hashes, memory)
     }
 
     fn is_built_in(&self, source: &str) -> bool {

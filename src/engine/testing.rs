@@ -1,12 +1,11 @@
 //! Test scenes and a faulty deformer for the unit tests of the engine.
 
-use std::path::Path;
 use std::sync::Arc;
 
 use super::scene::delivery::Delivery;
 use super::scene::lease::LeaseRequest;
 use super::scene::step_queue::Overflow;
-use super::source::SceneSource;
+use super::source::{SceneSource, StoredUpload};
 use modalcast_compute::reference::ReferenceDeformer;
 use modalcast_model::backend_settings::BackendSettings;
 use modalcast_model::deform::{Backend, DeformSummary, DeformedSurface, Deformer, VertexAttributes, VertexReadback};
@@ -150,8 +149,8 @@ impl SceneSource for StripsSource {
         Ok(OpenedScene { scene: two_strips(), backends: BackendSettings::default() })
     }
 
-    fn open_within(&self, _folder: &Path, entry: &str, memory: &Arc<MemoryReservation>) -> Result<OpenedScene> {
-        self.open(entry, memory)
+    fn open_upload(&self, upload: &StoredUpload, memory: &Arc<MemoryReservation>) -> Result<OpenedScene> {
+        self.open(&upload.entry, memory)
     }
 
     fn list(&self) -> Vec<String> {

@@ -189,10 +189,14 @@ impl ErrorReport {
 /// Converts an error to a rejection on a stream. `step` is the number of the rejected step, if any.
 pub(super) fn to_rejection(step: Option<u64>, error: &Error) -> Rejection {
     let ErrorReport { reason, field, expected, given, .. } = ErrorReport::of(error);
+    let place = match error {
+        Error::InvalidFile { location, .. } => location.clone(),
+        _ => field,
+    };
     Rejection {
         step,
         reason: reason.into(),
-        field: truncate_text(field),
+        field: truncate_text(place),
         expected: truncate_text(expected),
         given: truncate_text(given),
     }

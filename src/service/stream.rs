@@ -192,11 +192,22 @@ async fn supervise<T>(
     }
 }
 
-/// Runs the work of a unary call in a separate task, so that a panic becomes an `INTERNAL` status of that call.
+/// The task of a unary call. Dropping it cancels the task.
+struct CallTask<T>(JoinHandle<Result<T>>);
+
+impl<T> Drop for CallTask<T> {
+    fn drop(&mut self) {
+        self.0.abort();
+    }
+}
+
+/// Runs the work of a unary call in a separate task, so that a panic becomes an `INTERNAL` status of that call. When the
+/// client cancels the call, `work` is dropped at its next await.
 pub(super) async fn catch_panic<T: prost::Message + 'static>(
     work: impl Future<Output = Result<T>> + Send + 'static,
 ) -> Result<Response<T>, Status> {
-    let message = match tokio::spawn(work).await {
+    let mut task = CallTask(tokio::spawn(work));
+    let message = match (&mut task.0).await {
         Ok(result) => result.map_err(to_status)?,
         Err(_) => return Err(Status::internal("the call panicked in the server")),
     };
@@ -355,6 +366,23 @@ mod tests {
             Ok(())
         });
         drop(replies);
+        let result =
+            tokio::time::timeout(crate::hang_guard::HANG_GUARD, work_dropped).await.expect("expected dropped work");
+        assert!(result.is_err());
+    }
+
+    /// Work that the client no longer waits for must not go on, for example an upload whose scene nobody would know.
+    #[tokio::test]
+    async fn work_of_a_canceled_unary_call_is_dropped() {
+        let (work_guard, work_dropped) = tokio::sync::oneshot::channel::<()>();
+        let mut call = Box::pin(catch_panic(async move {
+            std::future::pending::<()>().await;
+            drop(work_guard);
+            Ok(0_u32)
+        }));
+        let pending = tokio::time::timeout(Duration::ZERO, call.as_mut()).await;
+        assert!(pending.is_err(), "control: expected a call without an end");
+        drop(call);
         let result =
             tokio::time::timeout(crate::hang_guard::HANG_GUARD, work_dropped).await.expect("expected dropped work");
         assert!(result.is_err());

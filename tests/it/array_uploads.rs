@@ -119,6 +119,31 @@ async fn beam_from_arrays_has_the_vertices_of_the_beam_from_files() {
     assert_eq!(vertex_bits(&server, "arrays").await, driven_bits, "expected the scene after a restart");
 }
 
+/// A disk that changes a digit of a coordinate must not change the simulation silently.
+#[tokio::test(flavor = "multi_thread")]
+async fn changed_digit_in_a_stored_file_is_an_error_with_its_name() {
+    let folder = tempfile::tempdir().expect("expected a temporary folder");
+    let state_folder = folder.path().join("state");
+    let (server, client) = start_server(&state_folder, folder.path()).await;
+    client.upload_arrays(two_beams()).await.expect("expected the upload to succeed");
+    server.stop().await.expect("expected the server to stop");
+    let path = state_folder.join("uploads/arrays/0.obj");
+    let text = std::fs::read_to_string(&path).expect("expected a stored mesh");
+    let changed = text.replacen("v 0.0", "v 0.1", 1);
+    assert_ne!(changed, text, "control");
+    std::fs::write(&path, &changed).expect("expected a written file");
+    let (server, client) = start_server(&state_folder, folder.path()).await;
+    client.describe("arrays", &[]).await.expect_err("expected no scene");
+    let list = server.scenes().await.list_scenes(v1::ListScenesRequest {}).await.expect("expected a list").into_inner();
+    let error = list.failed[0].error.clone().expect("expected an error");
+    assert_eq!((error.reason(), &error.field[..]), (Reason::InvalidFile, "file '0.obj'"));
+    assert!(error.expected.starts_with("the uploaded content, SHA-256 "), "{error:?}");
+    server.stop().await.expect("expected the server to stop");
+    std::fs::write(&path, &text).expect("expected a written file");
+    let (_server, client) = start_server(&state_folder, folder.path()).await;
+    client.describe("arrays", &[]).await.expect("expected the scene with the uploaded file");
+}
+
 /// Every vertex of the beam is on an edge of 90 degrees. The second domain has the shape of the first one. The angle is
 /// stored also if it is the default, so that a later default does not change the scene after a restart.
 #[tokio::test(flavor = "multi_thread")]

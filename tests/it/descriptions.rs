@@ -1,9 +1,8 @@
 //! Scene descriptions: each shape, material and texture once, content by hash, and the client's cache.
 
-use std::path::Path;
 use std::sync::Arc;
 
-use modalcast::engine::SceneSource;
+use modalcast::engine::{SceneSource, StoredUpload};
 use modalcast_client::{Client, DescriptionRequest, Error, Reason, SceneDescription, ShapeArray};
 use modalcast_model::domain::{
     AlphaMode, Attachment, Domain, FollowConstraint, Material, MaterialRange, Mesh, Metadata, Modes, Shape, Texture,
@@ -37,8 +36,8 @@ impl SceneSource for OneScene {
         Ok(Arc::clone(&self.0).into())
     }
 
-    fn open_within(&self, _: &Path, entry: &str, memory: &Arc<MemoryReservation>) -> Result<OpenedScene> {
-        self.open(entry, memory)
+    fn open_upload(&self, upload: &StoredUpload, memory: &Arc<MemoryReservation>) -> Result<OpenedScene> {
+        self.open(&upload.entry, memory)
     }
 
     fn list(&self) -> Vec<String> {

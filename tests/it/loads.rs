@@ -1,10 +1,9 @@
 //! Scenes that load slowly do not delay built-in ones.
 
-use std::path::Path;
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::sync::{Arc, Mutex};
 
-use modalcast::engine::SceneSource;
+use modalcast::engine::{SceneSource, StoredUpload};
 use modalcast_model::error::Result;
 use modalcast_model::load::OpenedScene;
 use modalcast_model::memory::MemoryReservation;
@@ -27,8 +26,8 @@ impl SceneSource for BlockedSource {
         Ok(strips().into())
     }
 
-    fn open_within(&self, _: &Path, entry: &str, memory: &Arc<MemoryReservation>) -> Result<OpenedScene> {
-        self.open(entry, memory)
+    fn open_upload(&self, upload: &StoredUpload, memory: &Arc<MemoryReservation>) -> Result<OpenedScene> {
+        self.open(&upload.entry, memory)
     }
 
     fn is_built_in(&self, source: &str) -> bool {

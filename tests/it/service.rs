@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use modalcast::engine::SceneSource;
+use modalcast::engine::{SceneSource, StoredUpload};
 use modalcast_model::error::Result;
 use modalcast_model::load::OpenedScene;
 use modalcast_model::memory::MemoryReservation;
@@ -33,8 +33,8 @@ impl SceneSource for FailingOnceSource {
         Ok(strips().into())
     }
 
-    fn open_within(&self, _: &std::path::Path, entry: &str, memory: &Arc<MemoryReservation>) -> Result<OpenedScene> {
-        self.open(entry, memory)
+    fn open_upload(&self, upload: &StoredUpload, memory: &Arc<MemoryReservation>) -> Result<OpenedScene> {
+        self.open(&upload.entry, memory)
     }
 
     fn list(&self) -> Vec<String> {

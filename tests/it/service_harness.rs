@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use modalcast::config::{BackendChoice, Config, ListenAddress, RendererChoice};
-use modalcast::engine::{Engine, SceneSource};
+use modalcast::engine::{Engine, SceneSource, StoredUpload};
 use modalcast::service;
 use modalcast_compute::reference;
 use modalcast_model::domain::{
@@ -70,8 +70,9 @@ impl SceneSource for SyntheticScenes {
     }
 
     /// Opens the source whose name is the text of a file; an empty `entry` means `scene.txt`.
-    fn open_within(&self, folder: &Path, entry: &str, memory: &Arc<MemoryReservation>) -> Result<OpenedScene> {
-        let path = folder.join(if entry.is_empty() { "scene.txt" } else { entry });
+    fn open_upload(&self, upload: &StoredUpload, memory: &Arc<MemoryReservation>) -> Result<OpenedScene> {
+        let entry = if upload.entry.is_empty() { "scene.txt" } else { &upload.entry };
+        let path = upload.folder.join(entry);
         let text = std::fs::read_to_string(path).map_err(|error| invalid("entry", "a file", error))?;
         self.open(text.trim(), memory)
     }

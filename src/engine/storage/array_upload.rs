@@ -315,10 +315,9 @@ impl ArrayUpload {
         Ok(BufWriter::new(HashedFile { name: name.to_owned(), file, hasher: Sha256::new() }))
     }
 
-    /// Syncs a file and records its hash.
+    /// Records the hash of a complete file. All files are synced together when the upload is complete.
     fn finish_file(&mut self, file: BufWriter<HashedFile>) -> io::Result<()> {
-        let HashedFile { name, mut file, hasher } = file.into_inner().map_err(io::IntoInnerError::into_error)?;
-        file.sync()?;
+        let HashedFile { name, hasher, .. } = file.into_inner().map_err(io::IntoInnerError::into_error)?;
         self.hashes.insert(name, hasher.finalize().into());
         Ok(())
     }

@@ -390,6 +390,10 @@ mod tests {
             DiskFileSystem.sync_folder(path)
         }
 
+        fn sync_tree(&self, path: &Path) -> io::Result<()> {
+            DiskFileSystem.sync_tree(path)
+        }
+
         fn rename(&self, from: &Path, to: &Path) -> io::Result<()> {
             DiskFileSystem.rename(from, to)
         }

@@ -5,13 +5,14 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
 
 use sha2::{Digest as _, Sha256};
 
 use super::array_upload::{ArrayUpload, ArrayUploadHeader, UploadedDomain, UploadedShape};
 use super::checkpoint_store::CheckpointStore;
-use super::file_system::{DiskFileSystem, FileSystem, StateFile};
+use super::file_system::{DiskFileSystem, FileSystem, StateFile, paths_below};
 use super::provenance::SceneProvenance;
 use super::run_counter::RunCounter;
 use super::scene_catalog::SceneCatalog;
@@ -42,6 +43,8 @@ enum Operation {
 struct RecordingFileSystem {
     root: PathBuf,
     operations: Arc<Mutex<Vec<Operation>>>,
+    /// Number of calls that wait for the disk.
+    syncs: Arc<AtomicUsize>,
 }
 
 impl RecordingFileSystem {
@@ -69,7 +72,18 @@ impl FileSystem for RecordingFileSystem {
     }
 
     fn sync_folder(&self, path: &Path) -> io::Result<()> {
+        self.syncs.fetch_add(1, Ordering::Relaxed);
         self.record(path, DiskFileSystem.sync_folder(path), Operation::SyncFolder)
+    }
+
+    fn sync_tree(&self, path: &Path) -> io::Result<()> {
+        self.syncs.fetch_add(1, Ordering::Relaxed);
+        DiskFileSystem.sync_tree(path)?;
+        for path in paths_below(path)? {
+            let operation = if path.is_dir() { Operation::SyncFolder } else { Operation::SyncFile };
+            self.record(&path, Ok(()), operation)?;
+        }
+        Ok(())
     }
 
     fn rename(&self, from: &Path, to: &Path) -> io::Result<()> {
@@ -107,6 +121,7 @@ impl Write for RecordingFile {
 
 impl StateFile for RecordingFile {
     fn sync(&mut self) -> io::Result<()> {
+        self.file_system.syncs.fetch_add(1, Ordering::Relaxed);
         self.file_system.record(&self.path, self.file.sync(), Operation::SyncFile)
     }
 }
@@ -248,6 +263,7 @@ struct Recorder {
     root: PathBuf,
     file_system: Arc<dyn FileSystem>,
     operations: Arc<Mutex<Vec<Operation>>>,
+    syncs: Arc<AtomicUsize>,
     catalog: SceneCatalog,
     checkpoints: CheckpointStore,
     run_counter: RunCounter,
@@ -259,8 +275,12 @@ struct Recorder {
 
 impl Recorder {
     fn new(root: &Path) -> Self {
-        let operations = Arc::new(Mutex::new(Vec::new()));
-        let recording = RecordingFileSystem { root: root.to_owned(), operations: Arc::clone(&operations) };
+        let (operations, syncs) = (Arc::default(), Arc::default());
+        let recording = RecordingFileSystem {
+            root: root.to_owned(),
+            operations: Arc::clone(&operations),
+            syncs: Arc::clone(&syncs),
+        };
         let file_system: Arc<dyn FileSystem> = Arc::new(recording);
         let catalog = SceneCatalog::open(root, &file_system).expect("expected a new state folder");
         Self {
@@ -270,6 +290,7 @@ impl Recorder {
             catalog,
             file_system,
             operations,
+            syncs,
             scene: testing::two_strips(),
             acknowledged: Acknowledged::default(),
             history: vec![(0, Acknowledged::default())],
@@ -316,23 +337,27 @@ impl Recorder {
         self.commit(name, upload.finish().expect("expected a complete upload"));
     }
 
-    fn upload_triangle(&mut self, name: &str) {
-        let header = ArrayUploadHeader { scene: name.into(), domains: 1, total_bytes: 48, unit: 1.0, up: UpAxis::Y };
+    /// Uploads domains with a triangle each.
+    fn upload_triangles(&mut self, name: &str, domains: u32) {
+        let total_bytes = 48 * u64::from(domains);
+        let header = ArrayUploadHeader { scene: name.into(), domains, total_bytes, unit: 1.0, up: UpAxis::Y };
         let memory = MemoryReservation::unlimited();
         let mut upload = ArrayUpload::begin(&self.catalog.uploads(), &self.file_system, header, Self::permit(), memory)
             .expect("expected a temporary folder");
-        let domain = UploadedDomain {
-            name: "triangle".into(),
-            shape: UploadedShape::Arrays { vertices: 3, triangles: 1, rank: 0 },
-            placement: Transform::IDENTITY,
-            color: [1.0; 3],
-            eigenvalues: Vec::new(),
-            crease_angle: None,
-        };
-        upload.begin_domain(&domain).expect("expected a new domain");
         let positions = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0_f32].into_iter().flat_map(f32::to_le_bytes);
         let arrays: Vec<u8> = positions.chain([0, 1, 2_u32].into_iter().flat_map(u32::to_le_bytes)).collect();
-        upload.write_chunk(&arrays).expect("expected accepted arrays");
+        for index in 0..domains {
+            let domain = UploadedDomain {
+                name: format!("triangle {index}"),
+                shape: UploadedShape::Arrays { vertices: 3, triangles: 1, rank: 0 },
+                placement: Transform::IDENTITY,
+                color: [1.0; 3],
+                eigenvalues: Vec::new(),
+                crease_angle: None,
+            };
+            upload.begin_domain(&domain).expect("expected a new domain");
+            upload.write_chunk(&arrays).expect("expected accepted arrays");
+        }
         self.commit(name, upload.finish().expect("expected a complete upload"));
     }
 
@@ -371,7 +396,7 @@ impl Recorder {
         recorder.upload("model", &[("deep/model.obj", "v 0 0 0"), ("model.mtl", "newmtl a")]);
         recorder.save_step("model", 2);
         recorder.save_step("strips", 3);
-        recorder.upload_triangle("triangle");
+        recorder.upload_triangles("triangle", 1);
         recorder.delete("strips");
         recorder.begin_run();
         recorder.delete("model");
@@ -447,6 +472,23 @@ fn every_prefix_of_the_writes_starts_with_all_acknowledged_state() {
             assert_restarts(restarted.path(), before, after, &recorder.scene, &label);
         }
     }
+}
+
+/// Each sync waits for the disk, so their number must not grow with the number of files.
+#[test]
+fn upload_of_many_files_has_as_many_syncs_as_one_of_few() {
+    let folder = tempfile::tempdir().expect("expected a temporary folder");
+    let mut recorder = Recorder::new(folder.path());
+    let syncs_of = |recorder: &mut Recorder, upload: &dyn Fn(&mut Recorder)| {
+        let before = recorder.syncs.load(Ordering::Relaxed);
+        upload(recorder);
+        recorder.syncs.load(Ordering::Relaxed) - before
+    };
+    let syncs_of_few = syncs_of(&mut recorder, &|recorder| recorder.upload("few", &[("a/a.obj", "v 0 0 0")]));
+    let names: Vec<String> = (0..100).map(|index| format!("{index}/{index}.obj")).collect();
+    let files: Vec<(&str, &str)> = names.iter().map(|name| (name.as_str(), "v 0 0 0")).collect();
+    assert_eq!(syncs_of(&mut recorder, &|recorder| recorder.upload("files", &files)), syncs_of_few);
+    assert_eq!(syncs_of(&mut recorder, &|recorder| recorder.upload_triangles("arrays", 100)), syncs_of_few);
 }
 
 /// Control: without syncs, an acknowledged scene is lost.

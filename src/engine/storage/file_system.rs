@@ -4,7 +4,11 @@
 use std::fmt::Debug;
 use std::fs::{self, File};
 use std::io::{self, Write};
-use std::path::Path;
+use std::path::{Path, PathBuf};
+
+/// The largest number of files and folders that are synced one after another. Each waits for the disk. More are synced
+/// by one call for their whole file system, which also writes the files of other programs.
+const MAX_SINGLE_SYNCS: usize = 64;
 
 /// Changes files and folders.
 pub(in crate::engine) trait FileSystem: Debug + Send + Sync {
@@ -16,6 +20,9 @@ pub(in crate::engine) trait FileSystem: Debug + Send + Sync {
 
     /// Makes the names in a folder durable: all files and folders that were created, renamed or removed in it.
     fn sync_folder(&self, path: &Path) -> io::Result<()>;
+
+    /// Makes everything below a folder durable: the content of all files, and the names in all folders.
+    fn sync_tree(&self, path: &Path) -> io::Result<()>;
 
     /// Renames a file, replacing the file `to`, or a folder.
     fn rename(&self, from: &Path, to: &Path) -> io::Result<()>;
@@ -50,6 +57,15 @@ impl FileSystem for DiskFileSystem {
         File::open(path)?.sync_all()
     }
 
+    fn sync_tree(&self, path: &Path) -> io::Result<()> {
+        let paths = paths_below(path)?;
+        if paths.len() > MAX_SINGLE_SYNCS {
+            return Ok(rustix::fs::syncfs(File::open(path)?)?);
+        }
+        // On Linux, any descriptor of a file syncs all that was written to the file.
+        paths.iter().try_for_each(|path| File::open(path)?.sync_all())
+    }
+
     fn rename(&self, from: &Path, to: &Path) -> io::Result<()> {
         fs::rename(from, to)
     }
@@ -82,13 +98,16 @@ pub(super) fn write_atomic(file_system: &dyn FileSystem, path: &Path, bytes: &[u
     path.parent().map_or(Ok(()), |folder| file_system.sync_folder(folder))
 }
 
-/// Makes the names in a folder and in all folders below it durable.
-pub(super) fn sync_folders(file_system: &dyn FileSystem, folder: &Path) -> io::Result<()> {
+/// All files and folders below a folder, and last the folder itself.
+pub(super) fn paths_below(folder: &Path) -> io::Result<Vec<PathBuf>> {
+    let mut paths = Vec::new();
     for entry in fs::read_dir(folder)? {
         let entry = entry?;
-        if entry.file_type()?.is_dir() {
-            sync_folders(file_system, &entry.path())?;
+        match entry.file_type()?.is_dir() {
+            true => paths.append(&mut paths_below(&entry.path())?),
+            false => paths.push(entry.path()),
         }
     }
-    file_system.sync_folder(folder)
+    paths.push(folder.to_owned());
+    Ok(paths)
 }

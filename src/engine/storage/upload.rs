@@ -261,20 +261,21 @@ impl Upload {
         self.folder.discard();
     }
 
-    /// Checks the hash of the open file, syncs and closes it once all of its bytes have arrived.
+    /// Checks the hash of the open file and closes it once all of its bytes have arrived. All files are synced together
+    /// when the upload is complete.
     fn finish_file_if_complete(&mut self) -> Result<()> {
-        let Some(mut open_file) = self.open_file.take_if(|open_file| open_file.remaining_bytes == 0) else {
+        let Some(open_file) = self.open_file.take_if(|open_file| open_file.remaining_bytes == 0) else {
             return Ok(());
         };
         let given: [u8; 32] = open_file.hasher.finalize().into();
-        if given != open_file.declared_sha256 {
-            return Err(invalid(
+        match given == open_file.declared_sha256 {
+            true => Ok(()),
+            false => Err(invalid(
                 "file.sha256",
                 hex(&open_file.declared_sha256),
                 format!("{} for '{}'", hex(&given), open_file.path),
-            ));
+            )),
         }
-        open_file.file.sync().map_err(fault_in("upload"))
     }
 
     /// Fails if the last file is incomplete.

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use super::file_system::{FileSystem, sync_folders};
+use super::file_system::FileSystem;
 use crate::engine::upload_quota::{ClientId, UploadPermit};
 use modalcast_model::error::{Result, fault, fault_in};
 
@@ -53,12 +53,12 @@ impl UploadFolder {
         &self.path
     }
 
-    /// Makes the names of all files durable. Their content must be synced before.
+    /// Makes all files durable.
     ///
     /// # Errors
     /// `Fault` of the disk.
     pub(super) fn sync(&self) -> Result<()> {
-        sync_folders(&*self.file_system, &self.path).map_err(fault_in("upload"))
+        self.file_system.sync_tree(&self.path).map_err(fault_in("upload"))
     }
 
     /// Moves the folder to `target_folder`, also beyond a power loss. Replaces the earlier upload in that folder.

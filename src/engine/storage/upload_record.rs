@@ -11,6 +11,8 @@ use sha2::{Digest as _, Sha256};
 
 use super::file_system::FileSystem;
 use crate::engine::content::{ContentHash, hex};
+use modalcast_model::error::{Error, Result, invalid};
+use modalcast_model::load::FileHashes;
 
 /// Name of the record in the folder of an upload. No uploaded file can have it.
 pub(super) const RECORD_NAME: &str = ".upload.json";
@@ -50,11 +52,10 @@ impl UploadRecord {
         hex(&hasher.finalize())
     }
 
-    /// Writes the record to the folder of its upload.
+    /// Writes the record to the folder of its upload, whose files are synced after that.
     pub(super) fn write(&self, file_system: &dyn FileSystem, folder: &Path) -> io::Result<()> {
         let mut file = file_system.create_file(&folder.join(RECORD_NAME), true)?;
-        file.write_all(&serde_json::to_vec_pretty(self)?)?;
-        file.sync()
+        file.write_all(&serde_json::to_vec_pretty(self)?)
     }
 
     /// Reads the record of a folder. `None` if there is none or it is damaged.
@@ -63,10 +64,37 @@ impl UploadRecord {
         (record.sha256 == record.hash()).then_some(record)
     }
 
+    /// The hashes of all files, which exist.
+    ///
+    /// # Errors
+    /// `Invalid` with the name of a file that does not exist, or with [`RECORD_NAME`] if a hash is malformed.
+    pub(super) fn hashes_of_existing_files(&self, folder: &Path) -> Result<FileHashes> {
+        let hash_of = |(path, digits): (&String, &String)| {
+            if !folder.join(path).is_file() {
+                return Err(invalid(format!("file '{path}'"), "the file that was uploaded", "none"));
+            }
+            let hash = parse_hex(digits).ok_or_else(damaged_record)?;
+            Ok((path.clone(), hash))
+        };
+        self.files.iter().map(hash_of).collect()
+    }
+
     /// Whether the folder has all files with their content. Reads every file.
     pub(super) fn matches(&self, folder: &Path) -> bool {
         self.files.iter().all(|(path, hash)| hash_file(&folder.join(path)).is_ok_and(|given| hex(&given) == *hash))
     }
+}
+
+fn damaged_record() -> Error {
+    invalid(format!("file '{RECORD_NAME}'"), "the record of the upload", "none, or a damaged one")
+}
+
+/// The hashes that the files in the folder of an upload must have. Reads only the record.
+///
+/// # Errors
+/// `Invalid` with the name of the record or of a file, if it does not exist or the record is damaged.
+pub(in crate::engine) fn read_hashes(folder: &Path) -> Result<FileHashes> {
+    UploadRecord::read(folder).ok_or_else(damaged_record)?.hashes_of_existing_files(folder)
 }
 
 fn hash_file(path: &Path) -> io::Result<ContentHash> {
@@ -140,6 +168,17 @@ mod tests {
             fs::write(&path, damaged).expect("expected a written file");
             assert_eq!(UploadRecord::read(folder.path()), None);
         }
+    }
+
+    #[test]
+    fn missing_files_and_damaged_records_are_named() {
+        let folder = tempfile::tempdir().expect("expected a temporary folder");
+        let error = |folder: &Path| read_hashes(folder).expect_err("expected an error").to_string();
+        assert!(error(folder.path()).starts_with("file '.upload.json': expected the record of the upload"));
+        let hash = write_upload(folder.path());
+        assert_eq!(read_hashes(folder.path()), Ok([("x".to_owned(), hash)].into_iter().collect()));
+        fs::remove_file(folder.path().join("x")).expect("expected a removed file");
+        assert_eq!(error(folder.path()), "file 'x': expected the file that was uploaded, got none");
     }
 
     #[test]
