@@ -6,8 +6,11 @@
 use std::collections::{BTreeMap, HashMap};
 
 use super::asset_dir::{AssetDir, MAX_MODEL_BYTES, stem_of};
-use super::modes::{LoadedModes, NpzArchive, has_arrays, parse_f64, read_npz_modes, read_npz_notes};
-use super::polygons::{Corner, NO_INDEX, PolygonMesh, linear_from_srgb};
+use super::modes::{
+    LoadedModes, NpzArchive, declare_npz_modes, declare_npz_notes, has_arrays, parse_f64, read_npz_modes,
+    read_npz_notes,
+};
+use super::polygons::{self, Corner, NO_INDEX, PolygonMesh, build_bytes, linear_from_srgb};
 use super::surface::{self, ModelOptions};
 use crate::domain::{AlphaMode, Material};
 use crate::error::{Result, invalid};
@@ -67,20 +70,19 @@ pub(super) fn read(files: &AssetDir, name: &str, options: ModelOptions) -> Resul
 
 fn parse(files: &AssetDir, bytes: &[u8], remarks: &mut Vec<String>) -> Result<ParsedModel> {
     let mut archive = NpzArchive::open(bytes, files.memory())?;
-    let missing = |archive: &NpzArchive<'_>| {
-        invalid("archive", "the arrays vertices and faces, and optionally U", archive.list_names())
-    };
-    let Some(positions) = read_vectors::<3>(&mut archive, "vertices", None)? else { return Err(missing(&archive)) };
-    let count = positions.len();
-    let Some((sides, faces)) = read_rows(&mut archive, "faces", &[3, 4], None)? else { return Err(missing(&archive)) };
-    let face_count = faces.len() / sides;
-    let mut polygons = PolygonMesh::with_one_material(positions);
-    polygons.memory = files.reserve_polygons("faces", 0)?;
-    polygons.normals = read_vectors::<3>(&mut archive, "normals", Some(count))?.unwrap_or_default();
-    polygons.uvs = read_vectors::<2>(&mut archive, "uvs", Some(count))?.unwrap_or_default();
-    polygons.colors = read_colors(&mut archive, count)?;
+    let sizes = ArraySizes::declare(&mut archive)?;
+    let _parsing_memory = files.reserve_temporary("parsed arrays", sizes.parsing_bytes())?;
+    // The arrays are freed before the mesh is built.
+    let building_bytes = build_bytes(sizes.vertices, sizes.corners()).saturating_sub(archive.reserved_bytes());
+    let _building_memory = files.reserve_temporary("mesh of the arrays", building_bytes)?;
+    let mut polygons = PolygonMesh::with_one_material(Vec::new());
+    polygons.memory = Some(files.reserve_temporary("lists of the mesh", sizes.list_bytes())?);
+    polygons.positions = read_vectors::<3>(&mut archive, "vertices")?;
+    polygons.normals = read_vectors::<3>(&mut archive, "normals")?;
+    polygons.uvs = read_vectors::<2>(&mut archive, "uvs")?;
+    polygons.colors = read_colors(&mut archive)?;
     let has_normals = !polygons.normals.is_empty();
-    let normals = match read_corner_normals(&mut archive, [face_count, sides])? {
+    let normals = match read_corner_normals(&mut archive)? {
         Some(_) if has_normals => {
             return Err(invalid("archive", "the array normals or corner_normals", "both"));
         }
@@ -91,12 +93,13 @@ fn parse(files: &AssetDir, bytes: &[u8], remarks: &mut Vec<String>) -> Result<Pa
         None if has_normals => FaceNormals::OfVertices,
         None => FaceNormals::Missing,
     };
-    let (materials, face_materials) = read_materials(&mut archive, face_count)?;
+    let (materials, face_materials) = read_materials(&mut archive)?;
     polygons.materials = materials.iter().map(|material| material.name.clone()).collect();
-    add_faces(&mut polygons, sides, &faces, &normals, &face_materials)?;
+    let faces = read_entries(&mut archive, "faces")?.unwrap_or_default().1;
+    add_faces(&mut polygons, sizes.sides, &faces, &normals, &face_materials)?;
+    drop((faces, normals, face_materials));
     polygons.check(|face| format!("array 'faces': row {face}"), 0)?;
-    let has_modes = archive.names().iter().any(|name| name == "U" || name == "modes");
-    let modes = if has_modes { Some(read_npz_modes(&mut archive)?) } else { None };
+    let modes = sizes.modes.as_ref().map(|name| read_npz_modes(&mut archive, name)).transpose()?;
     let notes = read_npz_notes(&mut archive)?;
     let unused: Vec<&str> =
         archive.names().iter().map(String::as_str).filter(|name| !ARRAY_NAMES.contains(name)).take(16).collect();
@@ -104,6 +107,90 @@ fn parse(files: &AssetDir, bytes: &[u8], remarks: &mut Vec<String>) -> Result<Pa
         remarks.push(format!("arrays that are not used: {}", unused.join(", ")));
     }
     Ok(ParsedModel { polygons, materials, modes, notes })
+}
+
+/// Sizes from the headers of all arrays that are read.
+struct ArraySizes {
+    vertices: usize,
+    faces: usize,
+    /// Corners of each face, 3 or 4.
+    sides: usize,
+    has_corner_normals: bool,
+    materials: usize,
+    /// Name of the array of U, if there is one.
+    modes: Option<String>,
+}
+
+/// Bytes per corner while equal normals of corners are searched: the normals as vectors, a map from normal to index that
+/// grows, the different normals, and their indices.
+const SEARCH_BYTES_PER_CORNER: u64 = 100;
+
+/// Bytes of a material with its name, also in the list of names.
+const BYTES_PER_MATERIAL: u64 = 512;
+
+impl ArraySizes {
+    /// Declares all arrays, and checks that their shapes agree.
+    ///
+    /// # Errors
+    /// `Invalid` with the array, or if `vertices` or `faces` is missing; `OutOfMemory`.
+    fn declare(archive: &mut NpzArchive<'_>) -> Result<Self> {
+        let missing = |archive: &NpzArchive<'_>| {
+            invalid("archive", "the arrays vertices and faces, and optionally U", archive.list_names())
+        };
+        let vertices = archive.declare("vertices", check_rows(&[3], None))?.ok_or_else(|| missing(archive))?[0];
+        let faces = archive.declare("faces", check_rows(&[3, 4], None))?.ok_or_else(|| missing(archive))?;
+        let (faces, sides) = (faces[0], faces[1]);
+        archive.declare("normals", check_rows(&[3], Some(vertices)))?;
+        archive.declare("uvs", check_rows(&[2], Some(vertices)))?;
+        archive.declare("colors", check_rows(&[3, 4], Some(vertices)))?;
+        let check_corner_normals = |shape: &[usize]| match shape == [faces, sides, 3] {
+            true => Ok(()),
+            false => Err(invalid("shape", format!("{faces} x {sides} x 3"), format!("{shape:?}"))),
+        };
+        let has_corner_normals = archive.declare("corner_normals", check_corner_normals)?.is_some();
+        let check_face_materials = |shape: &[usize]| match shape == [faces] {
+            true => Ok(()),
+            false => Err(invalid("shape", format!("[{faces}]"), format!("{shape:?}"))),
+        };
+        archive.declare("face_materials", check_face_materials)?;
+        let check_materials = |shape: &[usize]| match shape {
+            [rows, _] if *rows > MAX_MATERIALS => Err(invalid("shape", format!("at most {MAX_MATERIALS} rows"), rows)),
+            _ => check_rows(&[3, 4], None)(shape),
+        };
+        let materials = archive.declare("material_colors", check_materials)?.map_or(0, |shape| shape[0]);
+        let has_modes = archive.names().iter().any(|name| name == "U" || name == "modes");
+        let modes = if has_modes { Some(declare_npz_modes(archive)?) } else { None };
+        declare_npz_notes(archive)?;
+        Ok(Self { vertices, faces, sides, has_corner_normals, materials, modes })
+    }
+
+    const fn corners(&self) -> usize {
+        self.faces.saturating_mul(self.sides)
+    }
+
+    /// Largest memory in bytes while arrays are parsed, beyond that of each array.
+    const fn parsing_bytes(&self) -> u64 {
+        let searched_corners = if self.has_corner_normals { self.corners() } else { 0 };
+        SEARCH_BYTES_PER_CORNER * searched_corners as u64 + BYTES_PER_MATERIAL * self.materials as u64
+    }
+
+    /// Largest memory in bytes of the lists of a [`PolygonMesh`].
+    fn list_bytes(&self) -> u64 {
+        let normals = if self.has_corner_normals { self.corners() } else { self.vertices };
+        polygons::list_bytes(2 * self.vertices + normals, self.vertices, self.faces, self.corners())
+    }
+}
+
+/// A check of the shape of an array of rows with one of the given lengths. `count` is the required number of rows.
+fn check_rows<'a>(widths: &'a [usize], count: Option<usize>) -> impl Fn(&[usize]) -> Result<()> + 'a {
+    move |shape| match shape {
+        [rows, width] if widths.contains(width) && *rows > 0 && count.is_none_or(|count| count == *rows) => Ok(()),
+        _ => {
+            let rows = count.map_or_else(|| "n".to_owned(), |count| count.to_string());
+            let widths = widths.iter().map(usize::to_string).collect::<Vec<_>>().join(" or ");
+            Err(invalid("shape", format!("{rows} x {widths}"), format!("{shape:?}")))
+        }
+    }
 }
 
 /// Where the normals of the corners of faces come from.
@@ -155,15 +242,13 @@ struct CornerNormals {
     indices: Vec<u32>,
 }
 
-/// Reads the normals of the corners of `faces` faces with `sides` corners each. Equal normals become one, because corners
-/// of a vertex with one normal are one corner of the mesh.
-fn read_corner_normals(archive: &mut NpzArchive<'_>, [faces, sides]: [usize; 2]) -> Result<Option<CornerNormals>> {
-    let check_shape = |shape: &[usize]| match shape == [faces, sides, 3] {
-        true => Ok(()),
-        false => Err(invalid("shape", format!("{faces} x {sides} x 3"), format!("{shape:?}"))),
-    };
-    let Some((_, entries)) = read_entries(archive, "corner_normals", check_shape)? else { return Ok(None) };
-    let vectors = finite_vectors::<3>("corner_normals", &entries)?;
+/// Reads the normals of the corners of faces. Equal normals become one, because corners of a vertex with one normal are
+/// one corner of the mesh.
+fn read_corner_normals(archive: &mut NpzArchive<'_>) -> Result<Option<CornerNormals>> {
+    let vectors = read_vectors::<3>(archive, "corner_normals")?;
+    if vectors.is_empty() {
+        return Ok(None);
+    }
     let (mut values, mut index_by_bits) = (Vec::new(), HashMap::new());
     let indices = vectors.into_iter().map(|normal| {
         *index_by_bits.entry(normal.map(f32::to_bits)).or_insert_with(|| {
@@ -176,26 +261,17 @@ fn read_corner_normals(archive: &mut NpzArchive<'_>, [faces, sides]: [usize; 2])
 }
 
 /// Reads the materials, and the index of the material of each face. Without materials, there is one, and no indices.
-fn read_materials(archive: &mut NpzArchive<'_>, face_count: usize) -> Result<(Vec<Material>, Vec<usize>)> {
-    let colors = read_rows(archive, "material_colors", &[3, 4], None)?;
-    let check_shape = |shape: &[usize]| match shape == [face_count] {
-        true => Ok(()),
-        false => Err(invalid("shape", format!("[{face_count}]"), format!("{shape:?}"))),
-    };
-    let indices = read_entries(archive, "face_materials", check_shape)?;
+fn read_materials(archive: &mut NpzArchive<'_>) -> Result<(Vec<Material>, Vec<usize>)> {
+    let (colors, indices) = (read_entries(archive, "material_colors")?, read_entries(archive, "face_materials")?);
     let (width, colors, indices) = match (colors, indices) {
         (None, None) => return Ok((vec![Material::unspecified("")], Vec::new())),
-        (Some((width, colors)), Some((_, indices))) => (width, colors, indices),
+        (Some((shape, colors)), Some((_, indices))) => (shape[1], colors, indices),
         (colors, _) => {
             let given = if colors.is_some() { "material_colors" } else { "face_materials" };
             return Err(invalid("archive", "both arrays face_materials and material_colors, or none", given));
         }
     };
     let material_count = colors.len() / width;
-    if material_count > MAX_MATERIALS {
-        let expected = format!("at most {MAX_MATERIALS} rows");
-        return Err(invalid("array 'material_colors': shape", expected, material_count));
-    }
     if let Some(entry) = colors.iter().find(|entry| !(0.0..=1.0).contains(*entry)) {
         return Err(invalid("array 'material_colors'", "0 to 1", entry));
     }
@@ -222,44 +298,16 @@ fn material_of_color(index: usize, color: &[f64]) -> Material {
     }
 }
 
-/// Reads an array of rows. Returns the length of a row and the entries, or `None` if the archive has no such array.
-/// `count` is the required number of rows.
-fn read_rows(
-    archive: &mut NpzArchive<'_>,
-    name: &str,
-    widths: &[usize],
-    count: Option<usize>,
-) -> Result<Option<(usize, Vec<f64>)>> {
-    let check_shape = |shape: &[usize]| match shape {
-        [rows, width] if widths.contains(width) && *rows > 0 && count.is_none_or(|count| count == *rows) => Ok(()),
-        _ => {
-            let rows = count.map_or_else(|| "n".to_owned(), |count| count.to_string());
-            let widths = widths.iter().map(usize::to_string).collect::<Vec<_>>().join(" or ");
-            Err(invalid("shape", format!("{rows} x {widths}"), format!("{shape:?}")))
-        }
-    };
-    let array = read_entries(archive, name, check_shape)?;
-    Ok(array.map(|(shape, entries)| (shape[1], entries)))
-}
-
-/// Reads an array of numbers. Returns its shape and the entries, or `None` if the archive has no such array.
-fn read_entries(
-    archive: &mut NpzArchive<'_>,
-    name: &str,
-    check_shape: impl Fn(&[usize]) -> Result<()>,
-) -> Result<Option<(Vec<usize>, Vec<f64>)>> {
-    let Some(bytes) = archive.read(name, check_shape)? else { return Ok(None) };
+/// Reads a declared array of numbers. Returns its shape and the entries, or `None` if the archive has no such array.
+fn read_entries(archive: &mut NpzArchive<'_>, name: &str) -> Result<Option<(Vec<usize>, Vec<f64>)>> {
+    let Some(bytes) = archive.read(name)? else { return Ok(None) };
     parse_f64(&bytes).map(Some).map_err(|error| error.prefix_field(&format!("array '{name}'")))
 }
 
-/// Reads an array of finite vectors.
-fn read_vectors<const N: usize>(
-    archive: &mut NpzArchive<'_>,
-    name: &str,
-    count: Option<usize>,
-) -> Result<Option<Vec<[f32; N]>>> {
-    let Some((_, entries)) = read_rows(archive, name, &[N], count)? else { return Ok(None) };
-    finite_vectors(name, &entries).map(Some)
+/// Reads a declared array of finite vectors. Empty if the archive has no such array.
+fn read_vectors<const N: usize>(archive: &mut NpzArchive<'_>, name: &str) -> Result<Vec<[f32; N]>> {
+    let Some((_, entries)) = read_entries(archive, name)? else { return Ok(Vec::new()) };
+    finite_vectors(name, &entries)
 }
 
 /// Converts the entries of the array `name` to vectors.
@@ -274,14 +322,14 @@ fn finite_vectors<const N: usize>(name: &str, entries: &[f64]) -> Result<Vec<[f3
 }
 
 /// Reads the colors. Divides them by 255 if any value is above 1. The fourth channel is not used.
-fn read_colors(archive: &mut NpzArchive<'_>, count: usize) -> Result<Vec<[f32; 3]>> {
-    let Some((width, entries)) = read_rows(archive, "colors", &[3, 4], Some(count))? else { return Ok(Vec::new()) };
+fn read_colors(archive: &mut NpzArchive<'_>) -> Result<Vec<[f32; 3]>> {
+    let Some((shape, entries)) = read_entries(archive, "colors")? else { return Ok(Vec::new()) };
     let largest = entries.iter().copied().fold(0.0, f64::max);
     if let Some(entry) = entries.iter().find(|entry| !(0.0..=255.0).contains(*entry)) {
         return Err(invalid("array 'colors'", "0 to 1, or 0 to 255", entry));
     }
     let scale = if largest > 1.0 { 255.0 } else { 1.0 };
-    Ok(entries.chunks_exact(width).map(|row| [0, 1, 2].map(|channel| (row[channel] / scale) as f32)).collect())
+    Ok(entries.chunks_exact(shape[1]).map(|row| [0, 1, 2].map(|channel| (row[channel] / scale) as f32)).collect())
 }
 
 #[cfg(test)]
@@ -302,6 +350,34 @@ mod tests {
         let bytes = archive(arrays, CompressionMethod::Deflated);
         std::fs::write(folder.path().join("a.npz"), bytes).expect("a writable file");
         read(&AssetDir::unrestricted(folder.path()), "a.npz", ModelOptions::default())
+    }
+
+    /// Each array alone is below the limit, but not the mesh that they describe. The checksum of the vertices is wrong,
+    /// which is noticed when their data are read.
+    #[test]
+    fn archive_beyond_the_limit_is_rejected_before_data_are_read() {
+        use crate::memory::{MemoryBudget, MemoryKind, MemoryReservation};
+        let arrays = [
+            ("vertices", npy(&ndarray::Array2::<f64>::zeros((5000, 3)))),
+            ("faces", npy(&ndarray::Array2::<i64>::zeros((5000, 3)))),
+        ];
+        let mut bytes = archive(&arrays, CompressionMethod::Deflated);
+        let record = bytes.windows(4).position(|bytes| bytes == b"PK\x01\x02").expect("a central directory");
+        bytes[record + 16] ^= 1;
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        std::fs::write(folder.path().join("a.npz"), bytes).expect("a writable file");
+        let root = folder.path().canonicalize().expect("an existing folder");
+        let read_within = |bytes: u64| {
+            let budget = MemoryBudget::new(MemoryKind::Host, bytes, bytes);
+            let files = AssetDir::confined_to(&root, &MemoryReservation::new(&budget));
+            read(&files, "a.npz", ModelOptions::default()).expect_err("an invalid archive")
+        };
+        // 24 bytes of a row, and 16 bytes for each of its entries while it is parsed.
+        let array_bytes = (24 + 3 * 16) * 5000;
+        let error = read_within(2 * array_bytes + (1 << 12));
+        assert!(matches!(error, crate::error::Error::OutOfMemory { .. }), "{error}");
+        let message = read_within(u64::MAX).to_string();
+        assert!(message.contains("array 'vertices': data: expected a readable member"), "control: {message}");
     }
 
     /// NumPy stores a transposed array in Fortran's order, for example the points of scikit-fem (`mesh.p.T`).

@@ -11,7 +11,10 @@ mod vega;
 pub(super) use computed::computed_modes_remark;
 pub(super) use npy::parse_f64;
 pub use npy::{NpyArray, parse as parse_numpy};
-pub(super) use npz::{NpzArchive, has_arrays, read_modes as read_npz_modes, read_notes as read_npz_notes};
+pub(super) use npz::{
+    NpzArchive, declare_modes as declare_npz_modes, declare_notes as declare_npz_notes, has_arrays,
+    read_modes as read_npz_modes, read_notes as read_npz_notes,
+};
 pub(super) use sidecar::find_sidecar;
 
 #[cfg(test)]
@@ -77,7 +80,11 @@ pub(super) fn read(files: &AssetDir, name: &str) -> Result<LoadedModes> {
     let parse: fn(&[u8], &AssetDir) -> Result<LoadedModes> = match extension_of(name).as_str() {
         "float" | "double" | "u" => |bytes, _| vega::parse(bytes).map(LoadedModes::from),
         "npy" => |bytes, _| matrix(npy::parse(bytes)?).map(LoadedModes::from),
-        "npz" => |bytes, files| npz::read_modes(&mut npz::NpzArchive::open(bytes, files.memory())?),
+        "npz" => |bytes, files| {
+            let mut archive = npz::NpzArchive::open(bytes, files.memory())?;
+            let name = npz::declare_modes(&mut archive)?;
+            npz::read_modes(&mut archive, &name)
+        },
         "safetensors" => |bytes, _| safetensors::parse(bytes),
         "txt" => |bytes, _| sofa::parse(bytes).map(LoadedModes::from),
         _ => return Err(unknown_format(name)),

@@ -6,6 +6,7 @@ use std::io::{BufReader, Cursor, Read, Seek};
 use std::sync::Arc;
 
 use zip::ZipArchive;
+use zip::read::ZipFile;
 
 use super::npy::{self, NpyArray};
 use super::{LoadedModes, matrix};
@@ -29,19 +30,28 @@ const PARSED_BYTES_PER_ENTRY: u64 = 16;
 /// DEFLATE reduces data by a factor of at most 1032.
 const MAX_COMPRESSION: u64 = 1032;
 
-/// An archive of arrays.
+/// An archive of arrays. [`Self::declare`] reserves the memory of an array from its header. Declare all arrays before the
+/// first one is read, so that an archive that needs too much memory is rejected before any data are decompressed.
 #[derive(Debug)]
 pub(in crate::load) struct NpzArchive<'a> {
     archive: ZipArchive<Cursor<&'a [u8]>>,
     memory: Arc<MemoryReservation>,
-    /// The memory of the arrays that were read.
-    reserved: Vec<TemporaryReservation>,
+    /// By name, the arrays to read.
+    declared: BTreeMap<String, DeclaredArray>,
     /// Names of the arrays, without `.npy`.
     names: Vec<String>,
 }
 
+/// An array whose header is valid.
+#[derive(Debug)]
+struct DeclaredArray {
+    /// Size of the `.npy` file in bytes.
+    size: u64,
+    memory: TemporaryReservation,
+}
+
 impl<'a> NpzArchive<'a> {
-    /// Reads the directory of the archive. Its arrays reserve their memory in `memory` until the archive is dropped.
+    /// Reads the directory of the archive. Declared arrays reserve their memory in `memory` until the archive is dropped.
     ///
     /// # Errors
     /// `Invalid` if the bytes are not a ZIP archive, or the archive has too many members.
@@ -52,7 +62,7 @@ impl<'a> NpzArchive<'a> {
             return Err(invalid("archive", format!("at most {MAX_ARRAYS} arrays"), archive.len()));
         }
         let names = array_names(&archive);
-        Ok(Self { archive, memory: Arc::clone(memory), reserved: Vec::new(), names })
+        Ok(Self { archive, memory: Arc::clone(memory), declared: BTreeMap::new(), names })
     }
 
     /// Names of the arrays, sorted.
@@ -65,53 +75,80 @@ impl<'a> NpzArchive<'a> {
         self.names.iter().take(MAX_LISTED_NAMES).map(String::as_str).collect::<Vec<_>>().join(", ")
     }
 
-    /// The bytes of an array's `.npy` file; `None` if the archive has no array of this name. `check_shape` is called
-    /// with the shape in the header before the data are read.
+    /// Reads the header of an array, and reserves memory for its bytes and its parsed entries. Returns the shape, or `None`
+    /// if the archive has no array of this name.
     ///
     /// # Errors
-    /// `Invalid` with the name of the array, if the member cannot be read, the sizes in the headers contradict each
-    /// other, or the array is too large; `OutOfMemory`.
-    pub(in crate::load) fn read(
+    /// `Invalid` with the name of the array, if the header cannot be read, `check_shape` fails, the sizes in the headers
+    /// contradict each other, or the array is too large; `OutOfMemory`.
+    pub(in crate::load) fn declare(
         &mut self,
         name: &str,
         check_shape: impl Fn(&[usize]) -> Result<()>,
-    ) -> Result<Option<Vec<u8>>> {
+    ) -> Result<Option<Vec<usize>>> {
         if !self.names.iter().any(|other| other == name) {
             return Ok(None);
         }
-        self.read_member(name, check_shape).map(Some).map_err(|error| in_array(error, name))
+        self.declare_member(name, check_shape).map(Some).map_err(|error| in_array(error, name))
     }
 
-    fn read_member(&mut self, name: &str, check_shape: impl Fn(&[usize]) -> Result<()>) -> Result<Vec<u8>> {
-        let unreadable = |error: &dyn std::fmt::Display| invalid("data", "a readable member of the archive", error);
-        let mut member = self.archive.by_name(&format!("{name}.npy")).map_err(|error| unreadable(&error))?;
+    fn declare_member(&mut self, name: &str, check_shape: impl Fn(&[usize]) -> Result<()>) -> Result<Vec<usize>> {
+        let member = member_of(&mut self.archive, name)?;
         let (size, compressed) = (member.size(), member.compressed_size());
-        // Compare the sizes before the data are read, so that a small file cannot claim much memory.
-        if size > MAX_MODEL_BYTES || size > compressed.saturating_mul(MAX_COMPRESSION) {
-            let limit = MAX_MODEL_BYTES.min(compressed.saturating_mul(MAX_COMPRESSION));
+        // A small file cannot claim much memory.
+        let limit = MAX_MODEL_BYTES.min(compressed.saturating_mul(MAX_COMPRESSION));
+        if size > limit {
             return Err(invalid("size", format!("at most {limit} bytes"), size));
         }
         let mut bytes = Vec::new();
-        let prefix = member.by_ref().take(npy::MAX_PREFIX_BYTES as u64).read_to_end(&mut bytes);
-        prefix.map_err(|error| unreadable(&error))?;
+        member.take(npy::MAX_PREFIX_BYTES as u64).read_to_end(&mut bytes).map_err(unreadable_member)?;
         let (header, body) = npy::parse_header(&bytes)?;
-        let header_bytes = bytes.len() - body.len();
-        if Some(size) != (header_bytes as u64).checked_add(header.data_bytes as u64) {
+        let header_bytes = (bytes.len() - body.len()) as u64;
+        if Some(size) != header_bytes.checked_add(header.data_bytes as u64) {
             let expected = format!("{} bytes for the shape {:?}", header.data_bytes, header.shape);
-            return Err(invalid("data", expected, size.saturating_sub(header_bytes as u64)));
+            return Err(invalid("data", expected, size.saturating_sub(header_bytes)));
         }
         check_shape(&header.shape)?;
         let entries = header.shape.iter().product::<usize>() as u64;
         let object = format!("array '{name}' of {:?}", header.shape);
-        self.reserved.push(self.memory.reserve_temporary(&object, size + PARSED_BYTES_PER_ENTRY * entries)?);
-        // One byte more than declared, so that a longer member is noticed.
-        let remaining = (size - bytes.len() as u64).saturating_add(1);
-        member.take(remaining).read_to_end(&mut bytes).map_err(|error| unreadable(&error))?;
-        if bytes.len() as u64 != size {
-            return Err(invalid("data", format!("{size} bytes"), bytes.len()));
-        }
-        Ok(bytes)
+        let memory = self.memory.reserve_temporary(&object, size + PARSED_BYTES_PER_ENTRY * entries)?;
+        self.declared.insert(name.to_owned(), DeclaredArray { size, memory });
+        Ok(header.shape)
     }
+
+    /// Memory in bytes that all declared arrays have reserved.
+    pub(in crate::load) fn reserved_bytes(&self) -> u64 {
+        self.declared.values().map(|array| array.memory.bytes()).sum()
+    }
+
+    /// The bytes of a declared array's `.npy` file; `None` if the array was not declared.
+    ///
+    /// # Errors
+    /// `Invalid` with the name of the array, if the member cannot be read or has another size than its header.
+    pub(in crate::load) fn read(&mut self, name: &str) -> Result<Option<Vec<u8>>> {
+        let Some(size) = self.declared.get(name).map(|array| array.size) else { return Ok(None) };
+        self.read_member(name, size).map(Some).map_err(|error| in_array(error, name))
+    }
+
+    fn read_member(&mut self, name: &str, size: u64) -> Result<Vec<u8>> {
+        // One byte more than declared, so that a longer member is noticed.
+        let limit = size.saturating_add(1);
+        let mut bytes = Vec::with_capacity(limit as usize);
+        member_of(&mut self.archive, name)?.take(limit).read_to_end(&mut bytes).map_err(unreadable_member)?;
+        match bytes.len() as u64 == size {
+            true => Ok(bytes),
+            false => Err(invalid("data", format!("{size} bytes"), bytes.len())),
+        }
+    }
+}
+
+/// Opens the member of an array.
+fn member_of<'a, R: Read + Seek>(archive: &'a mut ZipArchive<R>, name: &str) -> Result<ZipFile<'a, R>> {
+    archive.by_name(&format!("{name}.npy")).map_err(unreadable_member)
+}
+
+fn unreadable_member(error: impl std::fmt::Display) -> Error {
+    invalid("data", "a readable member of the archive", error)
 }
 
 /// Whether the file `name` is an archive with arrays of all these names. Reads only the directory of the archive.
@@ -138,11 +175,12 @@ fn in_array(error: Error, name: &str) -> Error {
     error.prefix_field(&format!("array '{name}'"))
 }
 
-/// Reads U from the array `U`, the array `modes` or the only array, and the array `eigenvalues` if there is one.
+/// Declares the array of U and the array `eigenvalues`, if there is one. Returns the name of the array of U: `U`, `modes`
+/// or the only array.
 ///
 /// # Errors
-/// `Invalid` if U is missing, or an array is invalid.
-pub(in crate::load) fn read_modes(archive: &mut NpzArchive<'_>) -> Result<LoadedModes> {
+/// `Invalid` if U is missing, or a header is invalid; `OutOfMemory`.
+pub(in crate::load) fn declare_modes(archive: &mut NpzArchive<'_>) -> Result<String> {
     let is_array = |name: &&str| archive.names().iter().any(|other| other == name);
     let only_array = match archive.names() {
         [name] => Some(name.as_str()),
@@ -154,19 +192,46 @@ pub(in crate::load) fn read_modes(archive: &mut NpzArchive<'_>) -> Result<Loaded
         [.., rank] if *rank > MAX_RANK => Err(invalid("shape", format!("at most {MAX_RANK} columns"), rank)),
         _ => Ok(()),
     };
-    let bytes = archive.read(&name, check_rank)?.unwrap_or_default();
-    let array: Result<NpyArray> = npy::parse(&bytes);
-    let modes = array.and_then(matrix).map_err(|error| in_array(error, &name))?;
-    LoadedModes::new(modes, read_vector(archive, "eigenvalues", MAX_RANK)?)
+    archive.declare(&name, check_rank)?;
+    let check_length = |shape: &[usize]| match shape.iter().try_fold(1_usize, |size, side| size.checked_mul(*side)) {
+        Some(length) if length <= MAX_RANK => Ok(()),
+        _ => Err(invalid("shape", format!("at most {MAX_RANK} entries"), format!("{shape:?}"))),
+    };
+    archive.declare("eigenvalues", check_length)?;
+    Ok(name)
 }
 
-/// Reads the array `notes`: a JSON object of texts, in UTF-8, as an array of bytes. Without this array, there are no
-/// notes.
+/// Reads U and the eigenvalues, which [`declare_modes`] has declared. `name` is the array of U.
 ///
 /// # Errors
-/// `Invalid` if the array is too large or contains other values.
+/// `Invalid` if an array is invalid.
+pub(in crate::load) fn read_modes(archive: &mut NpzArchive<'_>, name: &str) -> Result<LoadedModes> {
+    let bytes = archive.read(name)?.unwrap_or_default();
+    let array: Result<NpyArray> = npy::parse(&bytes);
+    drop(bytes);
+    let modes = array.and_then(matrix).map_err(|error| in_array(error, name))?;
+    let eigenvalues = match archive.read("eigenvalues")? {
+        Some(bytes) => npy::parse_f64(&bytes).map_err(|error| in_array(error, "eigenvalues"))?.1,
+        None => Vec::new(),
+    };
+    LoadedModes::new(modes, eigenvalues)
+}
+
+/// Declares the array `notes`, if there is one.
+///
+/// # Errors
+/// `Invalid` if the array is too large; `OutOfMemory`.
+pub(in crate::load) fn declare_notes(archive: &mut NpzArchive<'_>) -> Result<()> {
+    archive.declare(NOTES, check_notes_shape).map(drop)
+}
+
+/// Reads the declared array `notes`: a JSON object of texts, in UTF-8, as an array of bytes. Without this array, there
+/// are no notes.
+///
+/// # Errors
+/// `Invalid` if the array contains other values.
 pub(in crate::load) fn read_notes(archive: &mut NpzArchive<'_>) -> Result<BTreeMap<String, String>> {
-    let Some(bytes) = archive.read(NOTES, check_notes_shape)? else { return Ok(BTreeMap::new()) };
+    let Some(bytes) = archive.read(NOTES)? else { return Ok(BTreeMap::new()) };
     parse_notes(&bytes).map_err(|error| in_array(error, NOTES))
 }
 
@@ -201,16 +266,6 @@ fn parse_notes(bytes: &[u8]) -> Result<BTreeMap<String, String>> {
     serde_json::from_slice(text).map_err(invalid_text)
 }
 
-/// Reads a vector of at most `limit` entries. Returns an empty vector if the archive has no array of this name.
-fn read_vector(archive: &mut NpzArchive<'_>, name: &str, limit: usize) -> Result<Vec<f64>> {
-    let check_length = |shape: &[usize]| match shape.iter().try_fold(1_usize, |size, side| size.checked_mul(*side)) {
-        Some(length) if length <= limit => Ok(()),
-        _ => Err(invalid("shape", format!("at most {limit} entries"), format!("{shape:?}"))),
-    };
-    let Some(bytes) = archive.read(name, check_length)? else { return Ok(Vec::new()) };
-    npy::parse_f64(&bytes).map(|(_, entries)| entries).map_err(|error| in_array(error, name))
-}
-
 #[cfg(test)]
 pub(in crate::load) mod tests {
     use std::io::Write as _;
@@ -243,7 +298,9 @@ pub(in crate::load) mod tests {
     }
 
     fn read(bytes: &[u8]) -> Result<LoadedModes> {
-        read_modes(&mut NpzArchive::open(bytes, &MemoryReservation::unlimited())?)
+        let mut archive = NpzArchive::open(bytes, &MemoryReservation::unlimited())?;
+        let name = declare_modes(&mut archive)?;
+        read_modes(&mut archive, &name)
     }
 
     #[test]

@@ -69,6 +69,14 @@ pub(in crate::load) const fn build_bytes(vertices: usize, corners: usize) -> u64
     BUILD_BYTES_PER_CORNER * corners as u64 + BUILD_BYTES_PER_VERTEX * vertices as u64
 }
 
+/// Largest memory in bytes of the lists of a mesh, whose capacity is at most twice their length: numbers of positions,
+/// normals and colors together, of texture coordinates, of faces and of corners.
+pub(in crate::load) const fn list_bytes(vectors: usize, uvs: usize, faces: usize, corners: usize) -> u64 {
+    let vector_bytes = (12 * vectors as u64).saturating_add(8 * uvs as u64);
+    let face_bytes = (size_of::<Face>() * faces) as u64 + (size_of::<Corner>() * corners) as u64;
+    vector_bytes.saturating_add(face_bytes).saturating_mul(2)
+}
+
 impl PolygonMesh {
     /// A mesh without faces, whose faces will have one material without a name.
     pub(super) fn with_one_material(positions: Vec<[f32; 3]>) -> Self {
@@ -80,13 +88,13 @@ impl PolygonMesh {
         build_bytes(self.positions.len(), self.corners.len())
     }
 
-    /// Reserves the memory of the lists, whose capacity is at most twice their length.
+    /// Reserves the memory of the lists.
     fn reserve_lists(&mut self) -> Result<()> {
         let Some(memory) = &mut self.memory else { return Ok(()) };
         let vectors = self.positions.len() + self.normals.len() + self.colors.len();
-        let faces = size_of_val(&self.faces[..]) + size_of_val(&self.corners[..]);
-        let bytes = (12 * vectors + size_of_val(&self.uvs[..]) + faces) as u64;
-        if 2 * bytes > memory.bytes() { memory.grow_to(3 * bytes) } else { Ok(()) }
+        let bytes = list_bytes(vectors, self.uvs.len(), self.faces.len(), self.corners.len());
+        // Half as much again, so that the reservation grows rarely.
+        if bytes > memory.bytes() { memory.grow_to(bytes + bytes / 2) } else { Ok(()) }
     }
 
     /// Adds a polygon.
