@@ -5,6 +5,7 @@
 
 mod composed_transform;
 mod creases;
+mod jpeg_memory;
 mod material;
 mod mesh;
 mod modes;

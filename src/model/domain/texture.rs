@@ -3,8 +3,9 @@
 use std::io::Cursor;
 use std::sync::Arc;
 
-use image::{ImageDecoder as _, ImageReader};
+use image::{ImageDecoder as _, ImageFormat, ImageReader};
 
+use super::jpeg_memory::coefficient_bytes;
 use crate::error::{Result, invalid};
 use crate::memory::MemoryReservation;
 
@@ -46,7 +47,7 @@ impl Texture {
 
     /// Whether a file that starts with these bytes is a PNG or JPEG image.
     pub fn is_supported(start: &[u8]) -> bool {
-        matches!(image::guess_format(start), Ok(image::ImageFormat::Png | image::ImageFormat::Jpeg))
+        matches!(image::guess_format(start), Ok(ImageFormat::Png | ImageFormat::Jpeg))
     }
 
     /// Decodes PNG or JPEG bytes. Reserves the memory of the pixels in `memory` as soon as the header is read.
@@ -63,11 +64,17 @@ impl Texture {
         limits.max_image_height = Some(MAX_TEXTURE_SIDE);
         reader.limits(limits);
         let reader = reader.with_guessed_format().map_err(|error| decode_error(&error))?;
+        let is_jpeg = reader.format() == Some(ImageFormat::Jpeg);
         let decoder = reader.into_decoder().map_err(|error| decode_error(&error))?;
         let (width, height) = decoder.dimensions();
         let object = format!("texture '{name}' of {width} x {height} pixels");
-        // The decoded image in the format of the file is freed after its conversion to RGBA8.
-        let _decoded = memory.reserve_temporary(&object, decoder.total_bytes())?;
+        // The decoded image in the format of the file is freed after its conversion to RGBA8. A JPEG decoder copies the
+        // file, and keeps the coefficients of some images.
+        let of_jpeg = match is_jpeg {
+            true => bytes.len() as u64 + coefficient_bytes(bytes, width, height),
+            false => 0,
+        };
+        let _decoded = memory.reserve_temporary(&object, decoder.total_bytes().saturating_add(of_jpeg))?;
         memory.reserve(&object, 4 * u64::from(width) * u64::from(height))?;
         let image = image::DynamicImage::from_decoder(decoder).map_err(|error| decode_error(&error))?.into_rgba8();
         Self::new(name, width, height, image.into_raw())
