@@ -1,9 +1,11 @@
 //! Limits on the memory of scenes and render targets, derived from the memory of the machine, of its control group and of
-//! the GPU, unless the configuration sets them.
+//! the GPU, and from the resource limits of the process, unless the configuration sets them.
 
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+
+use rustix::process::Resource;
 
 use crate::config::Config;
 use modalcast_model::memory::{MemoryBudget, MemoryKind};
@@ -67,20 +69,33 @@ impl MemoryLimits {
     }
 }
 
-/// The memory in bytes that this process may use: the least of the machine's memory and the limits of its control group
-/// and of the groups that contain it.
+/// The memory in bytes that this process may use: the least of the machine's memory, the limits of its control group and
+/// of the groups that contain it, and what the resource limits of the process leave.
 fn host_memory_bytes() -> u64 {
     let read = |path: &Path| fs::read_to_string(path).ok();
-    let machine = read(Path::new("/proc/meminfo")).and_then(|text| parse_mem_total(&text));
+    let machine = read(Path::new("/proc/meminfo")).and_then(|text| parse_size(&text, "MemTotal"));
     let groups = read(Path::new("/proc/self/cgroup")).unwrap_or_default();
-    let limits = limit_files(&groups).into_iter().filter_map(|path| parse_limit(&read(&path)?));
-    limits.chain(machine).min().unwrap_or(UNKNOWN_MEMORY_BYTES)
+    let group_limits = limit_files(&groups).into_iter().filter_map(|path| parse_limit(&read(&path)?));
+    let status = read(Path::new("/proc/self/status")).unwrap_or_default();
+    let resource_limits = [Resource::As, Resource::Data].map(|resource| rustix::process::getrlimit(resource).current);
+    group_limits
+        .chain(machine)
+        .chain(unused_address_space(resource_limits, &status))
+        .min()
+        .unwrap_or(UNKNOWN_MEMORY_BYTES)
 }
 
-/// `MemTotal` of /proc/meminfo in bytes.
-fn parse_mem_total(meminfo: &str) -> Option<u64> {
-    let line = meminfo.lines().find_map(|line| line.strip_prefix("MemTotal:"))?;
-    line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok()?.checked_mul(1024)
+/// What the limits on the address space (`ulimit -v`) and on private memory (`ulimit -d`) leave, in bytes. Libraries,
+/// stacks of threads and drivers have taken a part before the first scene is opened. `status` is /proc/self/status.
+fn unused_address_space(limits: [Option<u64>; 2], status: &str) -> impl Iterator<Item = u64> {
+    let unused = |(limit, key): (Option<u64>, &str)| Some(limit?.saturating_sub(parse_size(status, key)?));
+    limits.into_iter().zip(["VmSize", "VmData"]).filter_map(unused)
+}
+
+/// The value of a line `KEY: N kB` in a file of /proc, in bytes.
+fn parse_size(text: &str, key: &str) -> Option<u64> {
+    let value = text.lines().find_map(|line| line.strip_prefix(key)?.strip_prefix(':'))?;
+    value.trim().strip_suffix("kB")?.trim().parse::<u64>().ok()?.checked_mul(1024)
 }
 
 /// A limit in bytes. `max` of version 2 means no limit; version 1 has a very large number instead.
@@ -147,8 +162,18 @@ mod tests {
     }
 
     #[test]
+    fn resource_limits_leave_what_the_process_has_not_taken() {
+        let status = "Name:\tx\nVmPeak:\t9 kB\nVmSize:\t    3 kB\nVmData:\t    1 kB\n";
+        let unused = |limits| unused_address_space(limits, status).collect::<Vec<_>>();
+        assert_eq!(unused([Some(8192), None]), [5120]);
+        assert_eq!(unused([Some(1024), Some(8192)]), [0, 7168]);
+        assert!(unused([None, None]).is_empty());
+    }
+
+    #[test]
     fn sizes_are_parsed_in_their_units() {
-        assert_eq!(parse_mem_total("MemFree: 1 kB\nMemTotal:       24683520 kB\n"), Some(24_683_520 * 1024));
+        let text = "MemTotalHuge: 3 kB\nMemFree: 1 kB\nMemTotal:       24683520 kB\n";
+        assert_eq!(parse_size(text, "MemTotal"), Some(24_683_520 * 1024));
         assert_eq!([parse_limit("1073741824\n"), parse_limit("max\n"), parse_limit("")], [Some(1 << 30), None, None]);
         assert!(host_memory_bytes() > 0);
     }
