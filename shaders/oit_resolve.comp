@@ -2,6 +2,7 @@
 // and blends them front to back. A fragment is shaded once, at the center of the samples that it covers.
 //   blend_layers  (out)  [SAMPLES][height][width]  RGBA16F: light of the blended surfaces, transmittance
 layout(local_size_x = TILE, local_size_y = TILE) in;
+layout(location = 2) uniform int first_tile; // that this dispatch resolves
 layout(rgba16f, binding = 3) uniform writeonly image2DArray blend_layers;
 // x: depth; y: triangle index plus 1 in the upper 28 bits, sample coverage in the lower 4.
 layout(std430, binding = 2) buffer Records { uvec2 records[]; };
@@ -60,8 +61,9 @@ vec4 shade_fragment(uvec2 record, ivec2 pixel, vec2 pixel_size) {
 
 void main() {
     ivec2 size = imageSize(blend_layers).xy;
-    ivec2 pixel = listed_pixel();
-    if (!has_listed_tile() || any(greaterThanEqual(pixel, size))) return;
+    uint tile_index = uint(first_tile) + listed_tile_index();
+    ivec2 pixel = listed_pixel(tile_index);
+    if (!has_listed_tile(tile_index) || any(greaterThanEqual(pixel, size))) return;
     uint fragment_count = imageLoad(fragment_counts, pixel).x;
     if (fragment_count == 0u) return;
     uint record_count = min(fragment_count, counters.per_pixel_limit);

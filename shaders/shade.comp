@@ -122,8 +122,8 @@ void main() {
         imageStore(scene_color, pixel, vec4(shade_pixel(pixel, size, sample_ids), 1.0));
     }
 #else
-    ivec2 pixel = listed_pixel();
-    if (!has_listed_tile() || any(greaterThanEqual(pixel, size))) return;
+    ivec2 pixel = listed_pixel(listed_tile_index());
+    if (!has_listed_tile(listed_tile_index()) || any(greaterThanEqual(pixel, size))) return;
     for (int sample_index = 0; sample_index < SAMPLES; sample_index++) sample_ids[sample_index] = sample_id(pixel, sample_index, size);
     imageStore(scene_color, pixel, vec4(shade_pixel(pixel, size, sample_ids), 1.0));
 #endif

@@ -7,12 +7,13 @@
 // unrolled code at the three markers.
 layout(local_size_x = WORKGROUP_SIZE) in;
 layout(FORMAT, binding = 0) uniform writeonly image2D destination;
+layout(location = 2) uniform int band_row; // first row of the map that this dispatch writes
 shared float depths[2 * ITERATION_ROWS * (WORKGROUP_SIZE + 2 * RADIUS)];
 
 void main() {
     int side = int(frame.shadow.w), lane = int(gl_LocalInvocationIndex);
     int buffer_offset = 0; // of the half of `depths` that this iteration uses
-    ivec2 corner = ivec2(gl_WorkGroupID.xy) * ivec2(WORKGROUP_SIZE, OUTPUT_ROWS);
+    ivec2 corner = ivec2(gl_WorkGroupID.xy) * ivec2(WORKGROUP_SIZE, OUTPUT_ROWS) + ivec2(0, band_row);
     // @SUMS
     // The first 2 RADIUS rows complete only sums of rows above the strip. These sums are not stored.
     for (int first_row = 0; first_row < OUTPUT_ROWS + 2 * RADIUS; first_row += ITERATION_ROWS) {

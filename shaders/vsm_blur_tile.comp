@@ -7,10 +7,11 @@
 // `blur_column`.
 layout(local_size_x = WORKGROUP_SIZE) in;
 layout(FORMAT, binding = 0) uniform writeonly image2D destination;
+layout(location = 2) uniform int band_row; // first row of the map that this dispatch writes
 
 void main() {
     int side = int(frame.shadow.w), lane = int(gl_LocalInvocationIndex);
-    ivec2 corner = ivec2(gl_WorkGroupID.xy) * ivec2(OUTPUT_COLUMNS, OUTPUT_ROWS);
+    ivec2 corner = ivec2(gl_WorkGroupID.xy) * ivec2(OUTPUT_COLUMNS, OUTPUT_ROWS) + ivec2(0, band_row);
     for (int first_row = 0; first_row < OUTPUT_ROWS + 2 * RADIUS; first_row += BAND_ROWS) {
         int depth_count = min(BAND_ROWS, OUTPUT_ROWS + 2 * RADIUS - first_row) * (OUTPUT_COLUMNS + 2 * RADIUS);
         for (int index = lane; index < depth_count; index += WORKGROUP_SIZE) {

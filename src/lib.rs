@@ -41,15 +41,16 @@
 //! | `modalcast-compute::cpu` | the f32 deformer for machines without a GPU | `storage` |
 //! | `modalcast-compute::reference` | the f64 reference deformer, which the others are tested against | |
 //! | `modalcast-compute::storage` | tiled storage of U for CPU and GPU: storage types, a-priori bounds; pure functions | |
-//! | `modalcast-render::renderer` | the calls that load scenes and draw them; frames in flight, choice of rasterizers | `passes`, `resources`, `shaders`, `layout`, `uniforms`, `device`, `region`, `types`, `pass` |
-//! | `modalcast-render::passes` | the commands of each pass (culling, shadow, visibility, transparency, shading, post-processing, picking, AOV), its inputs, outputs and barriers | `resources`, `shaders`, `layout`, `scene_data`, `uniforms`, `device`, `region`, `types`, `pass` |
-//! | `modalcast-render::resources` | buffers, textures and programs of a scene, images of a frame | `shaders`, `plan`, `layout`, `scene_data`, `device`, `region`, `types` |
+//! | `modalcast-render::renderer` | the calls that load scenes and draw them; frames in flight, choice of rasterizers | `passes`, `resources`, `shaders`, `layout`, `uniforms`, `scene_data`, `device`, `pieces`, `region`, `types`, `pass` |
+//! | `modalcast-render::passes` | the commands of each pass (culling, shadow, visibility, transparency, shading, post-processing, picking, AOV), its inputs, outputs and barriers | `resources`, `shaders`, `layout`, `scene_data`, `uniforms`, `device`, `pieces`, `region`, `types`, `pass` |
+//! | `modalcast-render::resources` | buffers, textures and programs of a scene, images of a frame | `shaders`, `plan`, `layout`, `scene_data`, `device`, `pieces`, `region`, `types` |
 //! | `modalcast-render::shaders` | shader sources, specialized to the features of a scene | `plan`, `layout`, `scene_data`, `device`, `types` |
 //! | `modalcast-render::plan` | buffers, passes and shader features of a scene; pure functions | `layout`, `scene_data`, `uniforms`, `device`, `types`, `pass` |
 //! | `modalcast-render::layout` | host structs that mirror GLSL blocks; texture units and bindings | `scene_data`, `types` |
 //! | `modalcast-render::scene_data` | draw groups, index lists and texture levels, computed on the host | |
 //! | `modalcast-render::uniforms` | uniforms of a frame: camera, shadow map, cascades | `types` |
-//! | `modalcast-render::device` | EGL and OpenGL: contexts, typed objects, readback ring; the only module that calls OpenGL | `region`, `types` |
+//! | `modalcast-render::device` | EGL and OpenGL: contexts, typed objects, readback ring; the only module that calls OpenGL | `pieces`, `region`, `types` |
+//! | `modalcast-render::pieces` | parts of an output that are drawn without a break, sized by measured times; pure functions | |
 //! | `modalcast-render::region` | rectangles of a frame that are drawn or cleared | |
 //! | `modalcast-render::types` | parameters and results of the renderer | `pass` |
 //! | `modalcast-render::pass` | names of the passes and stages, and their times | |

@@ -8,11 +8,11 @@ layout(std430, binding = 1) buffer TileList {
 
 uint listed_tile_index() { return gl_WorkGroupID.y * TILES_PER_ROW + gl_WorkGroupID.x; }
 
-// Whether the indirect dispatch has a tile for this workgroup. The last row of workgroups may be incomplete.
-bool has_listed_tile() { return listed_tile_index() < tile_list.count; }
+// Whether the list has a tile of this index. The last row of workgroups may be incomplete.
+bool has_listed_tile(uint index) { return index < tile_list.count; }
 
-// Pixel of this lane in the tile of this workgroup. If the workgroup has no tile, a pixel of the last listed tile.
-ivec2 listed_pixel() {
-    uint tile = tile_list.tiles[min(listed_tile_index(), tile_list.count - 1u)];
+// Pixel of this lane in the tile of this index. If the list has no such tile, a pixel of the last listed tile.
+ivec2 listed_pixel(uint index) {
+    uint tile = tile_list.tiles[min(index, tile_list.count - 1u)];
     return TILE * ivec2(tile & 0xFFFFu, tile >> 16) + ivec2(gl_LocalInvocationID.xy);
 }

@@ -6,6 +6,7 @@
 //! it in the last bits of filtered images.
 
 use std::any::Any;
+use std::ops::Range;
 use std::os::fd::OwnedFd;
 use std::rc::Rc;
 
@@ -129,12 +130,18 @@ pub struct SharedDraw<'a> {
     pub ids: Option<SharedDrawTarget<'a>>,
 }
 
+/// The range of [`Rasterizer::draw`] that contains all triangles.
+pub const ALL_TRIANGLES: Range<u32> = 0..u32::MAX;
+
 /// Draws one mesh. [`Self::draw`] orders its buffer accesses with OpenGL commands before and after each call without
 /// blocking the host. Between calls, the implementation may keep the handles of the position buffer and the target
 /// buffers, and leave these buffers registered with CUDA.
 pub trait Rasterizer: std::fmt::Debug {
     /// Draws depths, ids, or both. One call for both is cheaper, because the switch from OpenGL to CUDA and back takes
     /// longer than either pass.
+    ///
+    /// Draws the triangles of `range` only, which are indices in [`RasterGeometry::triangles`]. A range that begins at 0
+    /// clears all samples first. A later range adds its triangles to the samples.
     ///
     /// Depths are one f32 per sample: 1 at the near plane, 0 at the far plane and without a triangle. The depth pass
     /// draws both faces of every triangle.
@@ -145,7 +152,7 @@ pub trait Rasterizer: std::fmt::Debug {
     ///
     /// # Errors
     /// `Fault` if the device fails, or if a buffer is unknown or smaller than its viewport.
-    fn draw(&mut self, depth: Option<DrawTarget<'_>>, ids: Option<DrawTarget<'_>>) -> Result<()>;
+    fn draw(&mut self, depth: Option<DrawTarget<'_>>, ids: Option<DrawTarget<'_>>, range: Range<u32>) -> Result<()>;
 
     /// Compiles the kernels for depth, id, or both passes ahead of the first frame.
     ///

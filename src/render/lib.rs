@@ -26,8 +26,8 @@
 //! Submitting a frame and reading its pixels are separate calls, so that several frames can be in flight
 //! ([`PendingFrame`]).
 //!
-//! A large frame, and the first frame of a scene, is submitted in steps, so that other scenes can be drawn in between
-//! ([`PartialFrame`]). For the same reason, the textures and programs of a scene can be prepared one by one
+//! A frame that may take long, as the first one of a scene, is submitted in steps, so that other scenes can be drawn in
+//! between ([`PartialFrame`]). For the same reason, the textures and programs of a scene can be prepared one by one
 //! ([`ScenePreparation`]).
 //!
 //! Two outputs are drawn only on request, with programs and buffers that are created on first use. Picking finds the
@@ -49,6 +49,7 @@ mod device;
 mod layout;
 mod pass;
 mod passes;
+mod pieces;
 mod plan;
 mod region;
 mod renderer;

@@ -75,12 +75,17 @@ impl Band {
 
     /// Divides an image into bands of at most `max_pixels` pixels, but at least [`BAND_ALIGNMENT`] rows, from the
     /// bottom to the top.
-    pub(crate) fn divide([width, height]: [u32; 2], max_pixels: u64) -> Vec<Self> {
+    pub(crate) fn divide(size: [u32; 2], max_pixels: u64) -> Vec<Self> {
+        Self::divide_aligned(size, max_pixels, BAND_ALIGNMENT)
+    }
+
+    /// [`Self::divide`], but the first row of each band is a multiple of `alignment`.
+    pub(crate) fn divide_aligned([width, height]: [u32; 2], max_pixels: u64, alignment: u32) -> Vec<Self> {
         let max_rows = u32::try_from(max_pixels / u64::from(width.max(1))).unwrap_or(u32::MAX);
         if height <= max_rows {
             return vec![Self::whole(height)];
         }
-        let band_rows = (max_rows / BAND_ALIGNMENT).max(1) * BAND_ALIGNMENT;
+        let band_rows = (max_rows / alignment).max(1) * alignment;
         let first_rows = (0..height).step_by(band_rows as usize);
         first_rows
             .map(|first_row| Self { first_row, rows: band_rows.min(height - first_row), image_rows: height })

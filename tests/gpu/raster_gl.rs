@@ -7,7 +7,7 @@ use std::sync::Arc;
 use modalcast_compute::gpu::{CudaDeformer, CudaDeformerOptions, CudaRasterizer, Device};
 use modalcast_compute::reference::raster::VisibilityBuffer;
 use modalcast_model::deform::Deformer as _;
-use modalcast_model::raster::{CutOuts, GlBuffer, RasterGeometry, Rasterizer};
+use modalcast_model::raster::{ALL_TRIANGLES, CutOuts, GlBuffer, RasterGeometry, Rasterizer};
 use modalcast_model::scene::{CullMode, DrawRange, Viewport};
 
 use crate::common::cut_outs::constant_alpha_soups;
@@ -36,13 +36,13 @@ impl GpuContext {
     /// The key of each sample: the inverted bits of its depth in the upper half, the index of its triangle in the lower
     /// half.
     fn draw_ids(&self, rasterizer: &mut CudaRasterizer, viewport: &Viewport, target: &GlBuffer) -> Vec<u64> {
-        rasterizer.draw(None, Some((viewport, target))).expect("expected a frame");
+        rasterizer.draw(None, Some((viewport, target)), ALL_TRIANGLES).expect("expected a frame");
         self.gl.read(target, viewport.pixel_count())
     }
 
     /// The bits of the depth of each sample, without culling.
     fn draw_depths(&self, rasterizer: &mut CudaRasterizer, viewport: &Viewport, target: &GlBuffer) -> Vec<u32> {
-        rasterizer.draw(Some((viewport, target)), None).expect("expected a frame");
+        rasterizer.draw(Some((viewport, target)), None, ALL_TRIANGLES).expect("expected a frame");
         self.gl.read(target, viewport.pixel_count())
     }
 }

@@ -520,6 +520,15 @@ impl DeviceContext {
         }
     }
 
+    /// Sets the time of a piece of a long output, and the maximum samples of a piece
+    /// ([`Renderer::set_piece_limits`]).
+    #[cfg(test)]
+    pub(in crate::engine) fn set_piece_limits(&mut self, target_ms: f64, max_samples: u64) {
+        if let Ok(renderer) = &mut self.renderer {
+            renderer.set_piece_limits(target_ms, max_samples);
+        }
+    }
+
     /// Waits for a frame. Any thread may then copy its pixels.
     ///
     /// # Errors
@@ -547,7 +556,7 @@ impl DeviceContext {
     ) -> Result<(AovImage, Option<Legend>)> {
         let mut draw = self.begin_aov(loaded_scene, camera, size, frame_output)?;
         while !draw.aov.is_submitted() {
-            self.submit_aov_band(loaded_scene, &mut draw)?;
+            self.submit_aov_piece(loaded_scene, &mut draw)?;
         }
         self.finish_aov(loaded_scene, draw)
     }
@@ -581,8 +590,8 @@ impl DeviceContext {
     ///
     /// # Errors
     /// `Fault` of OpenGL. The AOV must then be dropped.
-    pub(in crate::engine) fn submit_aov_band(&mut self, scene: &LoadedScene, draw: &mut PartialAovDraw) -> Result<()> {
-        self.renderer.as_mut().map_err(|error| error.clone())?.submit_aov_band(scene.buffers()?, &mut draw.aov)
+    pub(in crate::engine) fn submit_aov_piece(&mut self, scene: &LoadedScene, draw: &mut PartialAovDraw) -> Result<()> {
+        self.renderer.as_mut().map_err(|error| error.clone())?.submit_aov_piece(scene.buffers()?, &mut draw.aov)
     }
 
     /// Waits for an AOV whose bands are all submitted.

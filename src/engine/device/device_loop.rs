@@ -3,16 +3,15 @@
 //! Scenes are served by deficit round-robin ([`super::fair_queue`]). The commands of a scene are executed in their
 //! order, so a frame shows the step before it, and a step waits for the frames before it.
 //!
-//! A large frame or AOV (arbitrary output variable: depth, normals and others) is drawn in several draw steps, each of
-//! which submits a part of its drawing commands. (Draw steps are unrelated to the steps of the simulation.) Other
-//! scenes are served between the draw steps ([`PartialOutput`]). The commands of its own scene wait until the last draw
-//! step is submitted. Each draw step is submitted when the device has finished the one before it, so the commands of
-//! other scenes never wait for more than one draw step. Only one large output is drawn at a time, because each needs
-//! its own images; another one waits. A draw step draws at most a fixed number of samples
-//! ([`modalcast_render::Renderer::set_max_band_samples`]). On a software renderer this limit is a whole frame of
-//! 1920x1080 pixels with four samples per pixel, so other scenes wait at most about as long as such a frame takes. The
-//! first frame of a scene has several draw steps, too, because drivers finish the compilation of a program when it is
-//! used for the first time.
+//! A frame or AOV (arbitrary output variable: depth, normals and others) that may take long is drawn in several draw
+//! steps, each of which submits a part of its drawing commands: a range of triangles, or a band of rows. (Draw steps are
+//! unrelated to the steps of the simulation.) Other scenes are served between the draw steps ([`PartialOutput`]). The
+//! commands of its own scene wait until the last draw step is submitted. A draw step is submitted when the device has
+//! finished the one before it, of any scene, so the commands of other scenes never wait for more than one draw step. The
+//! size of a draw step follows from the time of the one before it: about 50 ms on hardware, and 500 ms on a software
+//! renderer. An output may take long if it is the first of its kind and size in its scene, or if such outputs took longer
+//! than a draw step. Outputs above a number of samples ([`modalcast_render::Renderer::set_max_band_samples`]) are large:
+//! only one of them is drawn at a time, because each needs its own images.
 //!
 //! Another thread prepares the deformer of a scene before the scene is loaded: it compiles the kernels and uploads the
 //! tables. The OpenGL buffers of a scene are created by its first output, or, with CUDA, when the scene is loaded.
@@ -240,14 +239,15 @@ impl DeviceLoop {
     /// Takes the next work. While no work can run, answers readbacks in flight.
     fn next_work(&mut self) -> Option<Taken<Work>> {
         loop {
-            // Polled before the queue is locked.
-            let can_continue = |output: &PartialOutput| output.is_cancelled() || output.is_ready_within(Duration::ZERO);
-            let outputs = self.partial_outputs.iter().filter(|(_, output)| can_continue(output));
-            let ready: Vec<SceneId> = outputs.map(|(id, _)| *id).collect();
+            // Polled before the queue is locked. A draw step waits for those of all scenes, so that a command never
+            // waits for more than one.
+            let busy: Vec<SceneId> = self.busy_outputs().map(|(id, _)| *id).collect();
+            let is_drawing = |id: &SceneId| self.partial_outputs.get(id).is_some_and(PartialOutput::draws);
+            let is_device_busy = busy.iter().any(is_drawing);
             let has_large_output = self.partial_outputs.values().any(PartialOutput::is_large);
             let can_run = |id: SceneId, work: &Work| match work {
                 // An output that has failed between its steps has nothing to continue.
-                Work::Continue => ready.contains(&id) || !self.partial_outputs.contains_key(&id),
+                Work::Continue => !(busy.contains(&id) || is_device_busy && is_drawing(&id)),
                 Work::Command(command) | Work::Prepared(command) => {
                     !(has_large_output && self.is_large_output(id, command))
                 }
@@ -262,7 +262,7 @@ impl DeviceLoop {
                     run_caught(|| self.finish_one());
                     self.recover();
                 });
-            } else if let Some(output) = self.partial_outputs.values().next() {
+            } else if let Some((_, output)) = self.busy_outputs().next() {
                 output.is_ready_within(self.poll_interval);
             } else {
                 self.free_unused_targets();
@@ -271,6 +271,11 @@ impl DeviceLoop {
                 }
             }
         }
+    }
+
+    /// The outputs whose last draw step is not finished.
+    fn busy_outputs(&self) -> impl Iterator<Item = (&SceneId, &PartialOutput)> {
+        self.partial_outputs.iter().filter(|(_, output)| !output.is_ready_within(Duration::ZERO))
     }
 
     /// Whether a command draws an output in several draw steps.
@@ -318,11 +323,12 @@ impl DeviceLoop {
             // The costs of outputs are recorded when they are finished.
             Work::Command(command @ (Command::Draw { .. } | Command::RenderAov { .. }))
             | Work::Prepared(command @ (Command::Draw { .. } | Command::RenderAov { .. })) => {
-                return self.begin_output(command, Charge { class, charged_ms, spent_ms: 0.0, is_recorded: false });
+                return self.begin_output(command, Charge::new(class, charged_ms));
             }
             Work::Command(command) | Work::Prepared(command) => self.execute(command),
             Work::Continue => {
-                if let Some(output) = self.partial_outputs.remove(&id) {
+                if let Some(mut output) = self.partial_outputs.remove(&id) {
+                    self.queue.charge(id, output.take_device_ms());
                     self.continue_output(id, output);
                 }
             }
@@ -471,6 +477,11 @@ impl DeviceLoop {
 
 #[cfg(test)]
 impl DeviceLoop {
+    /// Sets the time and the samples of a piece of a long output.
+    pub(super) fn set_piece_limits(&mut self, target_ms: f64, max_samples: u64) {
+        self.context.set_piece_limits(target_ms, max_samples);
+    }
+
     /// The scene of the large output that is being drawn.
     pub(super) fn partial_scene(&self) -> Option<SceneId> {
         self.partial_outputs.iter().find(|(_, output)| output.is_large()).map(|(id, _)| *id)

@@ -25,6 +25,11 @@ const SMALL: FrameSize = FrameSize::new(32, 32);
 /// Samples of a band of 64 rows of [`LARGE`], with four samples per pixel. A draw step draws one band at most.
 const BAND_SAMPLES: u64 = 4 * 192 * 64;
 
+/// Time of a piece that no output of these tests reaches, so that only the first output of a size has pieces.
+const PIECE_MS: f64 = 1e9;
+/// Samples of a piece that contains all triangles.
+const ALL_SAMPLES: u64 = 1 << 40;
+
 /// A device loop with loaded scenes.
 struct Fixture {
     device_loop: DeviceLoop,
@@ -39,11 +44,7 @@ impl Fixture {
     async fn start(max_band_samples: u64) -> Self {
         let mut fixture = Self::load(max_band_samples).await;
         for id in [1, 2] {
-            let first_frame = fixture.draw(id, SMALL);
-            while fixture.queue.len(id) > 0 {
-                fixture.run(1);
-            }
-            first_frame.wait().await.expect("expected a frame");
+            fixture.draw_first(id, SMALL).await;
         }
         // The scenes begin with equal shares.
         fixture.queue.reset_costs();
@@ -60,6 +61,7 @@ impl Fixture {
         };
         let mut context = DeviceContext::open(&config).expect("expected a renderer");
         context.set_max_band_samples(max_band_samples);
+        context.set_piece_limits(PIECE_MS, ALL_SAMPLES);
         let queue = CommandQueue::new();
         let (loss_sender, loss) = device_loss_channel();
         let handle = DeviceHandle::of_queue(&queue, loss);
@@ -83,6 +85,15 @@ impl Fixture {
     fn draw(&self, id: SceneId, size: FrameSize) -> PendingReply<FrameImage<FramePixels>> {
         let camera = Camera::fit_to_scene(&self.scene, size.width, size.height);
         self.handle.begin_draw(id, camera, size, FrameStyle::default(), PictureContent::PIXELS)
+    }
+
+    /// Draws the first frame of a size, which is drawn in pieces, because its time is not known.
+    async fn draw_first(&mut self, id: SceneId, size: FrameSize) {
+        let first_frame = self.draw(id, size);
+        while self.queue.len(id) > 0 {
+            self.run(1);
+        }
+        first_frame.wait().await.expect("expected a frame");
     }
 
     /// Runs `count` commands or draw steps.
@@ -123,6 +134,7 @@ async fn large_frame_does_not_delay_another_scene() {
     // Negative control: without a limit on a band, the frame is one draw step, for which the other scene waits.
     for (max_band_samples, is_divided) in [(BAND_SAMPLES, true), (u64::MAX, false)] {
         let mut fixture = Fixture::start(max_band_samples).await;
+        fixture.draw_first(1, LARGE).await;
         let large = fixture.draw(1, LARGE);
         fixture.run(1);
         let state = state_with_q(&fixture.scene, 0.5);
@@ -138,6 +150,31 @@ async fn large_frame_does_not_delay_another_scene() {
         assert_eq!(remaining_count > 15, is_divided, "{remaining_count} draw steps after the answer");
         assert_eq!(large.wait().await.expect("expected a frame").height, LARGE.height);
     }
+}
+
+#[tokio::test]
+async fn long_frame_does_not_delay_another_scene() {
+    let (mut remaining_counts, mut triangles) = (Vec::new(), 0);
+    // Negative control: without a limit on its samples, a piece contains all triangles.
+    for piece_samples in [1, ALL_SAMPLES] {
+        let mut fixture = Fixture::start(u64::MAX).await;
+        // Each frame takes longer than a piece.
+        fixture.device_loop.set_piece_limits(0.0, piece_samples);
+        let long = fixture.draw(1, SMALL);
+        fixture.run(1);
+        let mut deformed = fixture.handle.deform(2, &state_with_q(&fixture.scene, 0.5));
+        let mut waited = 0;
+        while !is_answered(&mut deformed).await {
+            fixture.run(1);
+            waited += 1;
+        }
+        assert!((1..=2).contains(&waited), "the other scene waited for {waited} commands and draw steps");
+        remaining_counts.push(fixture.run_all());
+        triangles = fixture.scene.layout.triangles;
+        long.wait().await.expect("expected a frame");
+    }
+    // The triangles are drawn twice: into the shadow map and into the frame.
+    assert_eq!(remaining_counts[0], remaining_counts[1] + 2 * (triangles - 1), "{triangles} triangles");
 }
 
 #[tokio::test]

@@ -19,11 +19,21 @@ pub(super) struct Charge {
     pub class: CostClass,
     /// Milliseconds that the scene was charged for the command.
     pub charged_ms: f64,
-    /// Milliseconds that the device thread has spent on all draw steps so far.
+    /// Milliseconds of all draw steps so far: the time of the device thread, or of the device if that is longer. Only
+    /// the time of the device thread is known of the last draw step, and of those without breaks.
     pub spent_ms: f64,
+    /// Milliseconds that the device thread has spent on the last draw step.
+    pub last_submit_ms: f64,
     /// Whether the cost of the command itself, which is the cost of the first draw step, was recorded in the queue.
     /// Later draw steps are charged to a class of their own.
     pub is_recorded: bool,
+}
+
+impl Charge {
+    /// The costs of a command before its first draw step.
+    pub(super) const fn new(class: CostClass, charged_ms: f64) -> Self {
+        Self { class, charged_ms, spent_ms: 0.0, last_submit_ms: 0.0, is_recorded: false }
+    }
 }
 
 /// An output, the channel for its answer, and its costs.
@@ -67,11 +77,16 @@ impl PartialOutput {
         }
     }
 
+    /// Whether the output draws on the device. A preparation does not: the driver compiles programs in other threads.
+    pub(super) const fn draws(&self) -> bool {
+        !matches!(self.kind, PartialKind::Preparation(_))
+    }
+
     /// Whether other scenes are served between the draw steps.
     pub(super) const fn has_breaks(&self) -> bool {
         match &self.kind {
             PartialKind::Frame(draw, _) => draw.frame.has_breaks(),
-            PartialKind::Aov(draw, _) => draw.aov.is_divided(),
+            PartialKind::Aov(draw, _) => draw.aov.has_breaks(),
             PartialKind::Preparation(_) => true,
         }
     }
@@ -90,6 +105,23 @@ impl PartialOutput {
                 is_ready
             }
         }
+    }
+
+    /// Milliseconds that the device took for the last draw step. Waits for the draw step.
+    fn last_step_ms(&self) -> f64 {
+        match &self.kind {
+            PartialKind::Frame(draw, _) => draw.frame.last_step_ms(),
+            PartialKind::Aov(draw, _) => draw.aov.last_step_ms(),
+            PartialKind::Preparation(_) => 0.0,
+        }
+    }
+
+    /// Adds the device time of the last draw step to the costs. Returns the milliseconds beyond those of the device
+    /// thread, which its scene was charged already.
+    pub(super) fn take_device_ms(&mut self) -> f64 {
+        let device_ms = (self.last_step_ms() - self.charge.last_submit_ms).max(0.0);
+        self.charge.spent_ms += device_ms;
+        device_ms
     }
 
     /// Class of the draw steps after the first.
@@ -120,7 +152,7 @@ impl PartialOutput {
     pub(super) fn submit_step(&mut self, context: &mut DeviceContext, scene: Result<&LoadedScene>) -> Result<()> {
         match &mut self.kind {
             PartialKind::Frame(draw, _) => context.submit_draw_step(scene?, draw),
-            PartialKind::Aov(draw, _) => context.submit_aov_band(scene?, draw),
+            PartialKind::Aov(draw, _) => context.submit_aov_piece(scene?, draw),
             PartialKind::Preparation(preparation) => context.prepare_step(preparation),
         }
     }

@@ -45,6 +45,7 @@ pub(crate) use self::program::PendingProgram;
 pub(crate) use self::staging::{ReadbackView, StagingBuffer};
 pub(crate) use self::timer::{PassTimer, SpanTimer};
 use super::egl::{Context, CurrentContext};
+use crate::pieces::PieceRange;
 use modalcast_model::error::{Error, Result, fault, fault_in};
 
 /// OpenGL constants that other modules use.
@@ -495,14 +496,15 @@ impl Gl {
         }
     }
 
-    /// Draws `triangles` triangles of the index buffer of `array`, from triangle `first` on. A triangle has three u32
-    /// indices.
-    pub(crate) fn draw_indexed(&self, array: &VertexArray, first: usize, triangles: usize) {
+    /// Draws triangles of the index buffer of `array`. A triangle has three u32 indices.
+    pub(crate) fn draw_indexed(&self, array: &VertexArray, triangles: PieceRange) {
         let Some(gl) = self.functions_or_skip() else { return };
-        // SAFETY: the indices come from validated meshes and stay below the number of elements of each attribute.
+        // SAFETY: the indices come from validated meshes, or are 0, and stay below the number of elements of each
+        // attribute.
         unsafe {
             gl.bind_vertex_array(Some(array.name));
-            gl.draw_elements(glow::TRIANGLES, 3 * triangles as i32, glow::UNSIGNED_INT, 12 * first as i32);
+            let (count, first_byte) = (3 * triangles.count() as i32, 12 * triangles.first as i32);
+            gl.draw_elements(glow::TRIANGLES, count, glow::UNSIGNED_INT, first_byte);
             gl.bind_vertex_array(None);
         }
     }

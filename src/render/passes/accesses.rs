@@ -236,6 +236,8 @@ const PASS_ACCESSES: [(Pass, &[Accesses]); Pass::ALL.len()] = [
                 (Resource::Depth, Access::Attachment),
                 (Resource::OitCounts, Access::ImageRead),
                 (Resource::OitCounters, Access::StorageRead),
+                // A part of a group sets the range of its indirect draw.
+                (Resource::OitCounters, Access::Transfer),
                 (Resource::OitCounters, Access::Indirect),
                 (Resource::OitRecords, Access::StorageWrite),
                 (Resource::OitCursors, Access::ImageWrite),

@@ -16,6 +16,7 @@ use super::visibility::{IdDraw, draw_ids};
 use crate::device::gl::{self, Buffer, ClearOp, Fence, Gl, PassTimer, Program};
 use crate::layout::VALUE_UNIT;
 use crate::pass::{FrameTimes, Pass, RenderStage};
+use crate::pieces::{OutputClass, OutputKind, PieceCursor, PieceLimits, PieceLoad, PieceRange};
 use crate::region::{Band, BandLimit, Region};
 use crate::resources::programs::ProgramCache;
 use crate::resources::scene_buffers::SceneBuffers;
@@ -92,6 +93,13 @@ impl Aov {
     }
 }
 
+/// The most that is drawn without a break.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct OutputLimits {
+    pub(crate) bands: BandLimit,
+    pub(crate) pieces: PieceLimits,
+}
+
 /// A readback of which some bands are not submitted yet. Owns its render target.
 #[derive(Debug)]
 pub struct PartialAov {
@@ -104,9 +112,14 @@ pub struct PartialAov {
     target: AovTarget,
     /// Bands that are not submitted yet.
     bands: VecDeque<Band>,
+    /// Triangles of the first of `bands` that are not submitted yet; none before its first piece.
+    cursor: Option<PieceCursor>,
+    class: OutputClass,
     is_divided: bool,
+    /// Whether the readback is drawn in pieces.
+    has_pieces: bool,
     timers: Vec<PassTimer>,
-    /// Fence after the last submitted band of a divided readback.
+    /// Fence after the last piece.
     fence: Option<Fence>,
 }
 
@@ -116,12 +129,22 @@ impl PartialAov {
         self.bands.is_empty()
     }
 
-    /// Whether commands of other scenes should be executed between the bands, because the readback is large.
+    /// Whether the readback is large and therefore divided into bands.
     pub const fn is_divided(&self) -> bool {
         self.is_divided
     }
 
-    /// Waits at most `limit` for the last submitted band. Returns whether it is complete. Submitting the next band only
+    /// Whether commands of other scenes should be executed between the pieces, because the readback may take long.
+    pub const fn has_breaks(&self) -> bool {
+        self.has_pieces
+    }
+
+    /// Milliseconds that the device took for the last submitted piece. Waits for the piece.
+    pub fn last_step_ms(&self) -> f64 {
+        self.timers.last().map_or(0.0, PassTimer::ms)
+    }
+
+    /// Waits at most `limit` for the last submitted piece. Returns whether it is complete. Submitting the next piece only
     /// then keeps the queue of the device short.
     pub fn is_ready_within(&self, limit: Duration) -> bool {
         self.fence.as_ref().is_none_or(|fence| fence.is_done_within(limit))
@@ -132,8 +155,14 @@ impl PartialAov {
         4 * self.target.words_per_pixel * self.target.desc.width as u64 * self.target.desc.height as u64
     }
 
-    /// Draws the ids of a band, and converts them to the field.
-    fn record(&self, recorder: &mut PassRecorder<'_>, buffers: &SceneBuffers, band: Band) -> Result<()> {
+    /// Draws the ids of the triangles of a range in a band. After the last range, converts the ids to the field.
+    fn record(
+        &self,
+        recorder: &mut PassRecorder<'_>,
+        buffers: &SceneBuffers,
+        band: Band,
+        range: PieceRange,
+    ) -> Result<()> {
         let AovTarget { desc, ids: id_target, .. } = &self.target;
         let ids = IdDraw {
             framebuffer: &id_target.framebuffer,
@@ -141,14 +170,36 @@ impl PartialAov {
             region: Region::whole([desc.width, desc.height]),
             band,
             triangles: TriangleSet::All,
+            range,
             mask: self.mask.as_deref(),
             opaque_parts: None,
         };
         recorder.begin(Pass::Aov);
         draw_ids(recorder, buffers, &ids)?;
+        if self.cursor.as_ref().is_some_and(|cursor| !cursor.is_finished()) {
+            return Ok(());
+        }
         let word_pass = self.word_pass(buffers, band);
         id_target.convert(recorder, &word_pass);
-        if self.is_submitted() { id_target.copy(recorder, &word_pass) } else { recorder.check(Pass::Aov) }
+        if band.is_last() { id_target.copy(recorder, &word_pass) } else { recorder.check(Pass::Aov) }
+    }
+
+    /// The triangles of the next piece of a band.
+    fn next_piece(&mut self, buffers: &SceneBuffers, band: Band, limits: PieceLimits) -> PieceRange {
+        let last_ms = self.last_step_ms();
+        match &mut self.cursor {
+            Some(cursor) => {
+                // The device has finished the previous piece, so the time above did not wait.
+                cursor.record_ms(last_ms);
+                cursor.next_piece()
+            }
+            cursor => {
+                let TargetDesc { width, samples, .. } = self.target.desc;
+                let samples = u64::from(width) * u64::from(band.rows) * u64::from(samples);
+                let load = PieceLoad { items: buffers.all_triangles(), samples, sample_cost: 1 };
+                cursor.insert(PieceCursor::new(limits, load)).next_piece()
+            }
+        }
     }
 
     fn word_pass(&self, buffers: &SceneBuffers, band: Band) -> WordPass<'_> {
@@ -202,7 +253,7 @@ impl AovReader {
         buffers: &SceneBuffers,
         params: &FrameParams,
         field: Aov,
-        band_limit: BandLimit,
+        limits: OutputLimits,
         reserve: impl FnOnce(TargetDesc, u64) -> Result<Arc<MemoryReservation>>,
     ) -> Result<PartialAov> {
         let size = [params.width, params.height];
@@ -219,26 +270,51 @@ impl AovReader {
             return Err(fault("aov", "expected uploaded vertex values, got none"));
         }
         let target = self.take_target(desc, words_per_pixel, reserve)?;
-        let bands = VecDeque::from(Band::divide(size, band_limit.max_pixels(desc.samples)));
+        let bands = VecDeque::from(Band::divide(size, limits.bands.max_pixels(desc.samples)));
         let is_divided = bands.len() > 1;
-        let (timers, fence) = (Vec::new(), None);
-        Ok(PartialAov { field, uniforms, mask, program, target, bands, is_divided, timers, fence })
+        let class = OutputClass::new(OutputKind::Aov, size, desc.samples);
+        let has_pieces = is_divided || buffers.costs.has_pieces(class, limits.pieces);
+        Ok(PartialAov {
+            field,
+            uniforms,
+            mask,
+            program,
+            target,
+            bands,
+            cursor: None,
+            class,
+            is_divided,
+            has_pieces,
+            timers: Vec::new(),
+            fence: None,
+        })
     }
 
-    /// Submits the next band. The scene's buffers must not change until all bands are submitted.
+    /// Submits the next piece. The scene's buffers must not change until all pieces are submitted.
     ///
     /// # Errors
     /// `Fault` if OpenGL reports an error or a software renderer does not finish in time.
-    pub(crate) fn submit_band(&self, aov: &mut PartialAov, buffers: &SceneBuffers, timeout: Duration) -> Result<()> {
-        let Some(band) = aov.bands.pop_front() else { return Ok(()) };
+    pub(crate) fn submit_piece(
+        &self,
+        aov: &mut PartialAov,
+        buffers: &SceneBuffers,
+        limits: OutputLimits,
+        timeout: Duration,
+    ) -> Result<()> {
+        let Some(band) = aov.bands.front().copied() else { return Ok(()) };
+        let range = if aov.has_pieces { aov.next_piece(buffers, band, limits.pieces) } else { PieceRange::ALL };
         upload_frame(buffers, &aov.uniforms);
         if let (Aov::Values { .. }, Some(values)) = (aov.field, &buffers.values) {
             values.view.bind(VALUE_UNIT);
         }
         let mut recorder = PassRecorder { gl: &self.gl, stats: &mut FrameStats::default() };
-        let timer = self.gl.time_pass(Pass::Aov.name(), timeout, || aov.record(&mut recorder, buffers, band))?;
+        let timer = self.gl.time_pass(Pass::Aov.name(), timeout, || aov.record(&mut recorder, buffers, band, range))?;
         aov.timers.push(timer);
-        if aov.is_divided {
+        if aov.cursor.as_ref().is_none_or(PieceCursor::is_finished) {
+            aov.cursor = None;
+            aov.bands.pop_front();
+        }
+        if aov.has_pieces {
             aov.fence = Some(self.gl.fence(Pass::Aov.name())?);
         }
         Ok(())
@@ -250,7 +326,7 @@ impl AovReader {
     /// `Fault` if OpenGL reports an error or the device does not finish in time.
     pub(crate) fn finish(&mut self, aov: PartialAov, buffers: &SceneBuffers, timeout: Duration) -> Result<AovImage> {
         let byte_count = aov.byte_count();
-        let PartialAov { field, target, timers, .. } = aov;
+        let PartialAov { field, target, timers, class, .. } = aov;
         self.gl.wait(Pass::Aov.name(), timeout)?;
         let start = Instant::now();
         let words = target.staging.read(byte_count as usize)?;
@@ -258,6 +334,7 @@ impl AovReader {
         let bytes = if field == Aov::Domains { domain_indices(buffers, words) } else { words };
         let read_ms = start.elapsed().as_secs_f64() * 1e3;
         let draw_ms = timers.iter().map(PassTimer::ms).sum();
+        buffers.costs.record(class, draw_ms);
         let times = FrameTimes::of_stages(&[(RenderStage::Draw, draw_ms), (RenderStage::Read, read_ms)]);
         let TargetDesc { width, height, samples, .. } = target.desc;
         self.target = Some(AovTarget { last_use: Instant::now(), ..target });

@@ -35,6 +35,8 @@ use crate::device::gl::{ClearOp, PipelineState, Program};
 use crate::layout::cull::MAX_LEVEL;
 use crate::layout::{DEPTH_UNIT, TRIANGLE_ID_UNIT, pack_size};
 use crate::pass::Pass;
+use crate::pieces::PieceRange;
+use crate::plan::buffers::CullBuffers;
 use crate::region::Band;
 use crate::resources::cull::CullResources;
 use crate::resources::depth_pyramid::DepthPyramid;
@@ -63,57 +65,60 @@ fn cull_and_compact(recorder: &PassRecorder<'_>, pass: Pass, cull_resources: &Cu
     cull_resources.triangle_ids.bind(TRIANGLE_ID_UNIT);
 }
 
-/// Begins a pass that lists triangles: empties the lists and binds the buffers.
-fn begin_lists(recorder: &PassRecorder<'_>, pass: Pass, cull_resources: &CullResources) {
+/// Begins a pass that lists triangles: empties the lists and binds the buffers. `has_pieces`: whether parts of the lists
+/// are drawn. The indices beyond the end of each list are then 0, so that they draw nothing.
+fn begin_lists(recorder: &PassRecorder<'_>, pass: Pass, cull_resources: &CullResources, has_pieces: bool) {
     recorder.begin(pass);
-    cull_resources.buffers.draws.write(&cull_resources.uniforms.empty_draws());
+    let CullBuffers { draws, indices, .. } = &cull_resources.buffers;
+    draws.write(&cull_resources.uniforms.empty_draws());
+    if has_pieces {
+        indices.write(&vec![0; indices.bytes as usize]);
+    }
     cull_resources.bind();
 }
 
 /// Lists the triangles that may cast a shadow into one layer of the map. `size`: side of the map in texels. `set_layer`
-/// sets the layer of the bound program. Does nothing without culling.
+/// sets the layer of the bound program. `has_pieces`: whether parts of the lists are drawn. Does nothing without culling.
 pub(super) fn cull_shadow_casters(
     recorder: &PassRecorder<'_>,
     buffers: &SceneBuffers,
     size: u32,
+    has_pieces: bool,
     set_layer: impl Fn(&Program),
 ) -> Result<()> {
     let (Some(cull_resources), Some(programs)) = (&buffers.cull_resources, &buffers.programs.shadow_cull) else {
         return Ok(());
     };
-    begin_lists(recorder, Pass::ShadowCull, cull_resources);
+    begin_lists(recorder, Pass::ShadowCull, cull_resources, has_pieces);
     programs.cull_triangles.bind(Some(pack_size([size; 2])));
     set_layer(&programs.cull_triangles);
     cull_and_compact(recorder, Pass::ShadowCull, cull_resources, &programs.compact);
     recorder.check(Pass::ShadowCull)
 }
 
-/// Lists the triangles that the camera may see. Does nothing without culling.
-pub(crate) fn cull_for_camera(recorder: &mut PassRecorder<'_>, frame: &FrameContext<'_>) -> Result<()> {
-    let FrameContext { buffers, target, programs, .. } = *frame;
+/// Lists the triangles that were visible in the last frame, which are the occluders of this one. Does nothing without
+/// occlusion culling.
+pub(crate) fn list_occluders(recorder: &PassRecorder<'_>, frame: &FrameContext<'_>) -> Result<()> {
+    let FrameContext { buffers, target, programs, has_pieces, .. } = *frame;
     let (Some(cull_resources), Some(programs)) = (&buffers.cull_resources, &programs.cull) else { return Ok(()) };
-    if let (Some(pyramid), Some(occlusion)) = (&target.depth_pyramid, &programs.occlusion) {
-        begin_lists(recorder, Pass::Occluders, cull_resources);
-        occlusion.cull_previous.bind(None);
-        cull_and_compact(recorder, Pass::Occluders, cull_resources, &programs.compact);
-        recorder.barrier_within_pass(Pass::Occluders);
-        draw_occluders(recorder, frame, pyramid);
-        build_pyramid(recorder, target, pyramid, occlusion);
-        recorder.finish(Pass::Occluders)?;
-    }
-    begin_lists(recorder, Pass::Cull, cull_resources);
-    if let Some(pyramid) = &target.depth_pyramid {
-        pyramid.bind();
-    }
-    programs.cull_triangles.bind(Some(pack_size([target.desc.width, target.desc.height])));
-    cull_and_compact(recorder, Pass::Cull, cull_resources, &programs.compact);
-    recorder.finish(Pass::Cull)
+    let (Some(_), Some(occlusion)) = (&target.depth_pyramid, &programs.occlusion) else { return Ok(()) };
+    begin_lists(recorder, Pass::Occluders, cull_resources, has_pieces);
+    occlusion.cull_previous.bind(None);
+    cull_and_compact(recorder, Pass::Occluders, cull_resources, &programs.compact);
+    recorder.check(Pass::Occluders)
 }
 
-/// Draws the depth of the occluders, which are in the lists of visible triangles at this point.
-fn draw_occluders(recorder: &mut PassRecorder<'_>, frame: &FrameContext<'_>, pyramid: &DepthPyramid) {
+/// Draws the depth of the occluders in a range of the lists. Several calls draw consecutive ranges of all triangles. Does
+/// nothing without occlusion culling.
+pub(crate) fn draw_occluders(
+    recorder: &mut PassRecorder<'_>,
+    frame: &FrameContext<'_>,
+    range: PieceRange,
+) -> Result<()> {
     let FrameContext { buffers, target, programs, .. } = *frame;
-    let clear = ClearOp::Depth(Some(&target.dirty_regions.depth));
+    let Some(pyramid) = &target.depth_pyramid else { return Ok(()) };
+    recorder.barrier_within_pass(Pass::Occluders);
+    let clear = if range.first == 0 { ClearOp::Depth(Some(&target.dirty_regions.depth)) } else { ClearOp::Load };
     let band = Band::whole(target.desc.height);
     recorder.gl.begin_pass(&pyramid.occluder_fbo, target.draw_region.get(), band, clear);
     let programs_by_mode =
@@ -121,14 +126,29 @@ fn draw_occluders(recorder: &mut PassRecorder<'_>, frame: &FrameContext<'_>, pyr
     let state = PipelineState { depth_write: true, ..PipelineState::default() };
     for (blend_mode, program) in programs_by_mode {
         if let Some(program) = program {
-            draw_groups(
-                recorder,
-                buffers,
-                TriangleDraw { blend_mode, program, triangles: TriangleSet::Visible },
-                state,
-            );
+            let draw = TriangleDraw { blend_mode, program, triangles: TriangleSet::Visible, range };
+            draw_groups(recorder, buffers, draw, state);
         }
     }
+    recorder.check(Pass::Occluders)
+}
+
+/// Lists the triangles that the camera may see. With occlusion culling, all occluders must be drawn before. Does nothing
+/// without culling.
+pub(crate) fn cull_for_camera(recorder: &mut PassRecorder<'_>, frame: &FrameContext<'_>) -> Result<()> {
+    let FrameContext { buffers, target, programs, has_pieces, .. } = *frame;
+    let (Some(cull_resources), Some(programs)) = (&buffers.cull_resources, &programs.cull) else { return Ok(()) };
+    if let (Some(pyramid), Some(occlusion)) = (&target.depth_pyramid, &programs.occlusion) {
+        build_pyramid(recorder, target, pyramid, occlusion);
+        recorder.finish(Pass::Occluders)?;
+    }
+    begin_lists(recorder, Pass::Cull, cull_resources, has_pieces);
+    if let Some(pyramid) = &target.depth_pyramid {
+        pyramid.bind();
+    }
+    programs.cull_triangles.bind(Some(pack_size([target.desc.width, target.desc.height])));
+    cull_and_compact(recorder, Pass::Cull, cull_resources, &programs.compact);
+    recorder.finish(Pass::Cull)
 }
 
 /// Builds all levels of the pyramid from the depth of the occluders.

@@ -6,6 +6,7 @@ use crate::layout::cull::command_offset;
 use crate::layout::{
     CASCADE_BLOCK, COLOR_UNIT, DEPTH_UNIT, FRAME_BLOCK, ID_UNIT, NORMAL_UNIT, POSITION_UNIT, SHADOW_UNIT,
 };
+use crate::pieces::PieceRange;
 use crate::resources::scene_buffers::SceneBuffers;
 use crate::resources::target::RenderTarget;
 use crate::scene_data::geometry::{BlendMode, DrawGroup};
@@ -26,6 +27,8 @@ pub(super) struct TriangleDraw<'a> {
     pub(super) blend_mode: BlendMode,
     pub(super) program: &'a Program,
     pub(super) triangles: TriangleSet,
+    /// Only these triangles are drawn.
+    pub(super) range: PieceRange,
 }
 
 /// Binds the buffers and textures that all passes read.
@@ -72,9 +75,10 @@ pub(super) fn draw_groups(
     state: PipelineState,
 ) {
     for (index, group) in groups_of(buffers, draw.blend_mode) {
+        let Some(part) = GroupPart::new(index, group, draw.triangles, draw.range) else { continue };
         recorder.gl.set_pipeline_state(PipelineState { cull_back_faces: !group.double_sided, ..state });
-        draw.program.bind(Some(first_triangle_of(group, draw.triangles)));
-        draw_group(recorder.gl, buffers, index, draw.triangles);
+        draw.program.bind(Some(part.first_triangle()));
+        part.draw(recorder.gl, buffers);
         recorder.stats.draw_calls += 1;
     }
 }
@@ -85,20 +89,21 @@ pub(super) fn draw_double_sided(gl: &Gl, buffers: &SceneBuffers, draw: TriangleD
     // Only the fragment shader of cut-outs and blended triangles reads the uniform `first_triangle`.
     let has_fragment_shader = draw.blend_mode != BlendMode::Opaque;
     if draw.triangles == TriangleSet::All {
-        let (first, count) = buffers.triangle_range(draw.blend_mode);
+        let triangles = buffers.triangle_range(draw.blend_mode).intersection(draw.range);
         if has_fragment_shader {
-            draw.program.set_first_triangle(first as u32);
+            draw.program.set_first_triangle(triangles.first as u32);
         }
         if let Some(array) = buffers.vertex_array(draw.blend_mode) {
-            gl.draw_indexed(array, first, count);
+            gl.draw_indexed(array, triangles);
         }
         return;
     }
     for (index, group) in groups_of(buffers, draw.blend_mode) {
+        let Some(part) = GroupPart::new(index, group, draw.triangles, draw.range) else { continue };
         if has_fragment_shader {
-            draw.program.set_first_triangle(first_triangle_of(group, draw.triangles));
+            draw.program.set_first_triangle(part.first_triangle());
         }
-        draw_group(gl, buffers, index, draw.triangles);
+        part.draw(gl, buffers);
     }
 }
 
@@ -107,28 +112,66 @@ pub(super) fn triangle_set(buffers: &SceneBuffers) -> TriangleSet {
     if buffers.cull_resources.is_some() { TriangleSet::Visible } else { TriangleSet::All }
 }
 
-/// Uniform `first_triangle` of `shaders/shared/triangle_id.glsl`: the first triangle of a group, or its bitwise
-/// complement for a list of visible triangles.
-pub(super) const fn first_triangle_of(group: &DrawGroup, triangles: TriangleSet) -> u32 {
-    match triangles {
-        TriangleSet::All => group.first_triangle as u32,
-        TriangleSet::Visible => !(group.first_triangle as u32),
-    }
+/// The part of a draw group in a range of triangles.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct GroupPart {
+    group_index: usize,
+    blend_mode: BlendMode,
+    triangles: TriangleSet,
+    range: PieceRange,
+    /// Whether the part is the whole group.
+    is_whole: bool,
 }
 
-/// Draws a group, or the visible triangles of the group.
-pub(super) fn draw_group(gl: &Gl, buffers: &SceneBuffers, group_index: usize, triangles: TriangleSet) {
-    let group = buffers.groups[group_index];
-    match triangles {
-        TriangleSet::All => {
-            if let Some(array) = buffers.vertex_array(group.blend_mode) {
-                gl.draw_indexed(array, group.first_triangle, group.triangle_count);
-            }
+impl GroupPart {
+    /// None if the range contains no triangle of the group.
+    pub(super) fn new(
+        group_index: usize,
+        group: &DrawGroup,
+        triangles: TriangleSet,
+        range: PieceRange,
+    ) -> Option<Self> {
+        let whole = PieceRange::new(group.first_triangle, group.triangle_count);
+        let part = whole.intersection(range);
+        let is_whole = part == whole;
+        let blend_mode = group.blend_mode;
+        (part.count() > 0).then_some(Self { group_index, blend_mode, triangles, range: part, is_whole })
+    }
+
+    /// Whether the part is the whole group.
+    pub(super) const fn is_whole(&self) -> bool {
+        self.is_whole
+    }
+
+    pub(super) const fn range(&self) -> PieceRange {
+        self.range
+    }
+
+    /// Uniform `first_triangle` of `shaders/shared/triangle_id.glsl`: the first triangle, or its bitwise complement for
+    /// a list of visible triangles.
+    pub(super) const fn first_triangle(&self) -> u32 {
+        match self.triangles {
+            TriangleSet::All => self.range.first as u32,
+            TriangleSet::Visible => !(self.range.first as u32),
         }
-        TriangleSet::Visible => {
-            if let Some((array, draws)) = buffers.visible_draws(group.blend_mode) {
-                gl.draw_indexed_indirect(array, draws, command_offset(group_index));
+    }
+
+    /// Draws the part. The length of a list of visible triangles is known to the device only, so a part of the list may
+    /// extend beyond its end, where the indices are 0 ([`super::cull::cull_shadow_casters`]).
+    pub(super) fn draw(&self, gl: &Gl, buffers: &SceneBuffers) {
+        match self.triangles {
+            TriangleSet::All => {
+                if let Some(array) = buffers.vertex_array(self.blend_mode) {
+                    gl.draw_indexed(array, self.range);
+                }
             }
+            TriangleSet::Visible => match buffers.visible_draws(self.blend_mode) {
+                Some((array, draws)) if self.is_whole => {
+                    gl.draw_indexed_indirect(array, draws, command_offset(self.group_index));
+                }
+                Some((array, _)) => gl.draw_indexed(array, self.range),
+                None => {}
+            },
         }
     }
 }

@@ -6,9 +6,9 @@
 //! second phase adds the ids. The lists are sorted by depth and id before blending, so the image does not depend on the
 //! order of the fragments.
 
-use super::draw::{bind_shadow, draw_group, first_triangle_of, groups_of, triangle_set};
+use super::draw::{GroupPart, bind_shadow, groups_of, triangle_set};
 use super::recorder::{FrameContext, PassRecorder};
-use crate::device::gl::{BufferCopy, ClearOp, Gl, PipelineState};
+use crate::device::gl::{Buffer, BufferCopy, ClearOp, Gl, PipelineState};
 use crate::layout::cull::command_offset;
 use crate::layout::oit::{
     BLEND_LAYERS_IMAGE, COMMANDS_OFFSET, COUNTERS_BYTES, HISTOGRAM_TILE, OIT_HEADER_BYTES, OitCounters, PHASE_COUNT,
@@ -16,6 +16,7 @@ use crate::layout::oit::{
 };
 use crate::layout::{EMPTY_TILE_LIST, TILE};
 use crate::pass::Pass;
+use crate::pieces::PieceRange;
 use crate::region::{Band, Region};
 use crate::resources::oit::OitTarget;
 use crate::resources::programs::OitPrograms;
@@ -58,8 +59,18 @@ fn reset_counters(gl: &Gl, buffers: &SceneBuffers, target: &OitTarget) {
     }
 }
 
-/// Exact transparency of a frame. The calls of a frame are: [`Self::count`] for each band, [`Self::sum_counts`], then
-/// [`Self::blend`] for each band. Fragments behind opaque triangles are discarded.
+/// Sets the triangles of an indirect draw command at this byte of a buffer. Keeps the number of instances, which is its
+/// second word.
+fn set_indirect_range(commands: &Buffer, command: usize, triangles: PieceRange) {
+    let [index_count, first_index] = [triangles.count(), triangles.first].map(|number| 3 * number as u32);
+    commands.write_at(command as u64, bytemuck::bytes_of(&index_count));
+    commands.write_at(command as u64 + 8, bytemuck::bytes_of(&first_index));
+}
+
+/// Exact transparency of a frame. The calls of a frame are: [`Self::count`] for each band, [`Self::sum_counts`], then for
+/// each band [`Self::allocate`], [`Self::fill`], [`Self::fill_ids`] and [`Self::resolve`]. Several calls of `count`,
+/// `fill` or `fill_ids` draw consecutive ranges of all blended triangles. Fragments behind opaque triangles are
+/// discarded.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct OitFrame<'a> {
     buffers: &'a SceneBuffers,
@@ -75,15 +86,18 @@ impl<'a> OitFrame<'a> {
         Some(Self { buffers: frame.buffers, target, programs, region: frame.target.draw_region.get() })
     }
 
-    /// Counts the fragments of the blended triangles in a band. The first band resets the counters.
-    pub(crate) fn count(&self, recorder: &mut PassRecorder<'_>, band: Band) -> Result<()> {
+    /// Counts the fragments of blended triangles in a band. The first call resets the counters.
+    pub(crate) fn count(&self, recorder: &mut PassRecorder<'_>, band: Band, range: PieceRange) -> Result<()> {
         recorder.begin(Pass::OitCount);
-        if band.first_row == 0 {
-            reset_counters(recorder.gl, self.buffers, self.target);
+        if range.first <= self.buffers.triangle_range(BlendMode::Blend).first {
+            if band.first_row == 0 {
+                reset_counters(recorder.gl, self.buffers, self.target);
+            }
+            let clear = ClearOp::Uint(&self.target.dirty_region);
+            recorder.gl.begin_pass(&self.target.counts_fbo, self.region, band, clear);
         }
-        recorder.gl.begin_pass(&self.target.counts_fbo, self.region, band, ClearOp::Uint(&self.target.dirty_region));
         self.target.bind();
-        self.gather(recorder, band, PHASE_COUNT);
+        self.gather(recorder, band, range, PHASE_COUNT);
         recorder.finish(Pass::OitCount)
     }
 
@@ -97,51 +111,74 @@ impl<'a> OitFrame<'a> {
         recorder.finish(Pass::OitAllocate)
     }
 
-    /// Allocates, stores and blends the fragments of a band.
-    pub(crate) fn blend(&self, recorder: &mut PassRecorder<'_>, band: Band) -> Result<()> {
-        let Self { buffers, target, programs, region } = *self;
-        let gl = recorder.gl;
+    /// Allocates the lists of a band.
+    pub(crate) fn allocate(&self, recorder: &mut PassRecorder<'_>, band: Band) -> Result<()> {
+        let Self { target, programs, region, .. } = *self;
         recorder.begin(Pass::OitAllocate);
         target.tile_list.write(bytemuck::cast_slice(&EMPTY_TILE_LIST));
         target.bind();
         programs.allocate.bind(None);
         programs.allocate.set_first_row(band.first_row);
-        gl.dispatch(region.frame_size()[0].div_ceil(TILE), band.rows.div_ceil(TILE));
-        recorder.finish(Pass::OitAllocate)?;
+        recorder.gl.dispatch(region.frame_size()[0].div_ceil(TILE), band.rows.div_ceil(TILE));
+        recorder.finish(Pass::OitAllocate)
+    }
+
+    /// Stores fragments in the lists of a band. Of a pixel with more fragments than the limit, only depths.
+    pub(crate) fn fill(&self, recorder: &mut PassRecorder<'_>, band: Band, range: PieceRange) -> Result<()> {
         recorder.begin(Pass::OitFill);
-        self.gather(recorder, band, PHASE_FILL);
+        self.target.bind();
+        self.gather(recorder, band, range, PHASE_FILL);
+        recorder.finish(Pass::OitFill)
+    }
+
+    /// Stores the ids of the fragments of which [`Self::fill`] has stored only depths.
+    pub(crate) fn fill_ids(&self, recorder: &mut PassRecorder<'_>, band: Band, range: PieceRange) -> Result<()> {
         recorder.barrier_within_pass(Pass::OitFill);
-        self.gather(recorder, band, PHASE_FILL_IDS);
-        recorder.finish(Pass::OitFill)?;
+        self.target.bind();
+        self.gather(recorder, band, range, PHASE_FILL_IDS);
+        recorder.finish(Pass::OitFill)
+    }
+
+    /// Sorts, shades and blends the lists of a range of the tiles of a band.
+    pub(crate) fn resolve(&self, recorder: &mut PassRecorder<'_>, tiles: PieceRange) -> Result<()> {
+        let Self { buffers, target, programs, .. } = *self;
         recorder.begin(Pass::OitResolve);
+        target.bind();
         bind_shadow(buffers);
         target.blend_layers.bind_image(BLEND_LAYERS_IMAGE);
         programs.resolve.bind(None);
-        gl.dispatch_indirect(&target.tile_list);
+        programs.resolve.set_first_tile(tiles.first as u32);
+        if tiles == PieceRange::ALL {
+            recorder.gl.dispatch_indirect(&target.tile_list);
+        } else {
+            // The list may have fewer tiles.
+            recorder.gl.dispatch(tiles.count() as u32, 1);
+        }
         recorder.finish(Pass::OitResolve)
     }
 
-    /// Draws all blended triangles in one phase. `PHASE_FILL_IDS` is needed only if the fragments exceed the budget.
+    /// Draws blended triangles in one phase. `PHASE_FILL_IDS` is needed only if the fragments exceed the budget.
     /// Therefore it is drawn indirectly: the allocate program sets its number of instances to 1 if it is needed, else
     /// to 0.
-    fn gather(&self, recorder: &mut PassRecorder<'_>, band: Band, phase: i32) {
+    fn gather(&self, recorder: &mut PassRecorder<'_>, band: Band, range: PieceRange, phase: i32) {
         let Self { buffers, target, programs, region } = *self;
         let (gl, triangles) = (recorder.gl, triangle_set(buffers));
         let culled_vertex_array = buffers.visible_draws(BlendMode::Blend).map(|(vertex_array, _)| vertex_array);
         let Some(vertex_array) = culled_vertex_array.or_else(|| buffers.vertex_array(BlendMode::Blend)) else { return };
         gl.begin_pass(&target.depth_fbo, region, band, ClearOp::Load);
         for (command_index, (group_index, group)) in groups_of(buffers, BlendMode::Blend).enumerate() {
+            let Some(part) = GroupPart::new(group_index, group, triangles, range) else { continue };
             gl.set_pipeline_state(PipelineState { cull_back_faces: !group.double_sided, ..PipelineState::default() });
-            programs.gather.bind(Some(first_triangle_of(group, triangles)));
+            programs.gather.bind(Some(part.first_triangle()));
             programs.gather.set_phase(phase);
             if phase == PHASE_FILL_IDS {
-                gl.draw_indexed_indirect(
-                    vertex_array,
-                    &target.counters,
-                    COMMANDS_OFFSET + size_of::<[u32; 5]>() * command_index,
-                );
+                let command = COMMANDS_OFFSET + size_of::<[u32; 5]>() * command_index;
+                if !part.is_whole() {
+                    set_indirect_range(&target.counters, command, part.range());
+                }
+                gl.draw_indexed_indirect(vertex_array, &target.counters, command);
             } else {
-                draw_group(gl, buffers, group_index, triangles);
+                part.draw(gl, buffers);
             }
             recorder.stats.draw_calls += 1;
         }

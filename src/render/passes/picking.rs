@@ -19,6 +19,7 @@ use super::visibility::{IdDraw, draw_ids};
 use crate::device::gl::{self, Buffer, ClearOp, Fence, Gl};
 use crate::layout::pack_size;
 use crate::pass::Pass;
+use crate::pieces::PieceRange;
 use crate::region::{Band, Region};
 use crate::resources::programs::ProgramCache;
 use crate::resources::scene_buffers::SceneBuffers;
@@ -127,6 +128,7 @@ impl Picker {
             region: Region::whole(size),
             band: Band::whole(height),
             triangles: TriangleSet::All,
+            range: PieceRange::ALL,
             mask: mask.as_deref(),
             opaque_parts: None,
         };

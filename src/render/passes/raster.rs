@@ -5,6 +5,7 @@ use super::recorder::{FrameContext, PassRecorder};
 use crate::device::gl::MemoryBarriers;
 use crate::layout::{TILE, WORDS_BINDING};
 use crate::pass::Pass;
+use crate::pieces::PieceRange;
 use crate::resources::compute_rasterizer::{ComputeRasterizer, RasterPasses};
 use crate::resources::scene_buffers::SceneBuffers;
 use crate::resources::shared_targets::RasterViews;
@@ -42,15 +43,17 @@ pub(crate) fn views(buffers: &SceneBuffers, params: &FrameParams, passes: Raster
     Ok(RasterViews { shadow, frame })
 }
 
-/// Draws the selected passes of a frame with the compute rasterizer into mapped buffers.
+/// Draws the selected passes of a frame with the compute rasterizer into mapped buffers. Several calls draw consecutive
+/// ranges of all triangles.
 pub(crate) fn draw(
     recorder: &mut PassRecorder<'_>,
     compute_rasterizer: &ComputeRasterizer,
     passes: RasterPasses,
     views: &RasterViews,
+    range: PieceRange,
 ) -> Result<()> {
     recorder.begin(passes.stats_pass());
-    compute_rasterizer.draw(recorder.gl, views)?;
+    compute_rasterizer.draw(recorder.gl, views, range)?;
     record(recorder, passes);
     Ok(())
 }

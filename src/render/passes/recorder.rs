@@ -20,6 +20,8 @@ pub(crate) struct FrameContext<'a> {
     /// Encodes the frame, with its antialiasing.
     pub(crate) encode: &'a Program,
     pub(crate) params: &'a FrameParams,
+    /// Whether the frame is drawn in pieces.
+    pub(crate) has_pieces: bool,
     /// The shared picture of the frame; `None` if the encode pass writes the readback source of the target.
     pub(crate) picture: Option<&'a Buffer>,
 }

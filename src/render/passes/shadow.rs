@@ -2,10 +2,11 @@
 
 use super::cull::cull_shadow_casters;
 use super::draw::{TriangleDraw, draw_double_sided, triangle_set};
-use super::recorder::PassRecorder;
+use super::recorder::{FrameContext, PassRecorder};
 use crate::device::gl::{ClearOp, PipelineState, Program, Texture};
 use crate::layout::{SOURCE_UNIT, WORDS_BINDING, WORKGROUP_SIZE};
 use crate::pass::Pass;
+use crate::pieces::PieceRange;
 use crate::region::{Band, Region};
 use crate::resources::compute_rasterizer::ComputeRasterizer;
 use crate::resources::scene_buffers::SceneBuffers;
@@ -18,24 +19,34 @@ use modalcast_model::error::{Result, fault_in};
 /// Image unit that the blur writes.
 const DESTINATION_IMAGE: u32 = 0;
 
-/// Draws the depth from the sun, unless the compute rasterizer has drawn it. Each cascade of the map is a layer.
-pub(crate) fn draw_depth(recorder: &mut PassRecorder<'_>, buffers: &SceneBuffers) -> Result<()> {
+/// Draws the depth from the sun into a layer of the map, unless the compute rasterizer has drawn it. Each cascade of the
+/// map is a layer. Several calls draw consecutive ranges of all triangles.
+pub(crate) fn draw_depth(
+    recorder: &mut PassRecorder<'_>,
+    frame: &FrameContext<'_>,
+    layer: u32,
+    range: PieceRange,
+) -> Result<()> {
+    let FrameContext { buffers, has_pieces, .. } = *frame;
     let Some(map) = buffers.shadow.as_ref().filter(|_| buffers.shadow_rasterizer().is_none()) else { return Ok(()) };
+    let Some(framebuffer) = map.framebuffers.get(layer as usize) else { return Ok(()) };
     recorder.stats.raster_backends.shadow = Some(RasterBackend::OpenGl);
     let (size, triangles) = (map.shadow.size, triangle_set(buffers));
-    for (layer, framebuffer) in (0..).zip(&map.framebuffers) {
-        cull_shadow_casters(recorder, buffers, size, |program| set_layer(program, map, layer))?;
-        recorder.begin(Pass::Shadow);
-        recorder.gl.begin_pass(framebuffer, Region::whole([size; 2]), Band::whole(size), ClearOp::Depth(None));
-        recorder.gl.set_pipeline_state(PipelineState { depth_write: true, ..PipelineState::default() });
-        for (blend_mode, program) in
-            [BlendMode::Opaque, BlendMode::Mask, BlendMode::Blend].into_iter().zip(&buffers.programs.shadow)
-        {
-            let Some(program) = program else { continue };
-            program.bind(None);
-            set_layer(program, map, layer);
-            draw_double_sided(recorder.gl, buffers, TriangleDraw { blend_mode, program, triangles });
-        }
+    let is_first = range.first == 0;
+    if is_first {
+        cull_shadow_casters(recorder, buffers, size, has_pieces, |program| set_layer(program, map, layer))?;
+    }
+    recorder.begin(Pass::Shadow);
+    let clear = if is_first { ClearOp::Depth(None) } else { ClearOp::Load };
+    recorder.gl.begin_pass(framebuffer, Region::whole([size; 2]), Band::whole(size), clear);
+    recorder.gl.set_pipeline_state(PipelineState { depth_write: true, ..PipelineState::default() });
+    for (blend_mode, program) in
+        [BlendMode::Opaque, BlendMode::Mask, BlendMode::Blend].into_iter().zip(&buffers.programs.shadow)
+    {
+        let Some(program) = program else { continue };
+        program.bind(None);
+        set_layer(program, map, layer);
+        draw_double_sided(recorder.gl, buffers, TriangleDraw { blend_mode, program, triangles, range });
     }
     if buffers.cull_resources.is_some() {
         recorder.add_to_stats(Pass::ShadowCull);
@@ -43,8 +54,19 @@ pub(crate) fn draw_depth(recorder: &mut PassRecorder<'_>, buffers: &SceneBuffers
     recorder.finish(Pass::Shadow)
 }
 
-/// Blurs the moments of the depth, layer by layer. Does nothing for maps without moments.
-pub(crate) fn blur(recorder: &mut PassRecorder<'_>, buffers: &SceneBuffers) -> Result<()> {
+/// Bands of a layer of the map that [`blur`] blurs without a break, of at most `max_texels` texels.
+pub(crate) fn blur_bands(map: &ShadowMap, max_texels: u64) -> Vec<Band> {
+    let is_divisible = map.blurred.as_ref().is_some_and(|blurred| blurred.horizontal.is_none());
+    let size = map.shadow.size;
+    match is_divisible {
+        true => Band::divide_aligned([size; 2], max_texels, texels_per_workgroup(&map.shadow)[1]),
+        // The other methods are for measurements.
+        false => vec![Band::whole(size)],
+    }
+}
+
+/// Blurs the moments of the depth in a band of a layer. Does nothing for maps without moments.
+pub(crate) fn blur(recorder: &mut PassRecorder<'_>, buffers: &SceneBuffers, layer: u32, band: Band) -> Result<()> {
     let Some(map) = &buffers.shadow else { return Ok(()) };
     let Some(blurred) = &map.blurred else { return Ok(()) };
     let gl = recorder.gl;
@@ -57,42 +79,41 @@ pub(crate) fn blur(recorder: &mut PassRecorder<'_>, buffers: &SceneBuffers) -> R
         *first_program = buffer_program;
         depths.bind_storage(WORDS_BINDING);
     }
-    for layer in 0..map.shadow.cascades {
-        match (programs.as_slice(), &blurred.horizontal) {
-            // One compute pass blurs in both directions.
-            ([program], None) => {
-                let workgroups = texels_per_workgroup(&map.shadow).map(|side| map.shadow.size.div_ceil(side));
-                bind_blur(program, &map.depth, map, layer);
-                blurred.moments.bind_image_layer(DESTINATION_IMAGE, layer);
-                gl.dispatch(workgroups[0], workgroups[1]);
-            }
-            // Two compute passes.
-            ([x_program, y_program], Some(horizontal)) if blurred.framebuffers.is_empty() => {
-                let (size, invocations_per_line) = (map.shadow.size, map.shadow.size.div_ceil(TEXELS_PER_INVOCATION));
-                // Wait until the previous layer has read `horizontal`.
-                recorder.barrier_within_pass(Pass::Blur);
-                bind_blur(x_program, &map.depth, map, layer);
-                horizontal.bind_image(DESTINATION_IMAGE);
-                gl.dispatch(invocations_per_line.div_ceil(WORKGROUP_SIZE), size);
-                recorder.barrier_within_pass(Pass::Blur);
-                bind_blur(y_program, horizontal, map, layer);
-                blurred.moments.bind_image_layer(DESTINATION_IMAGE, layer);
-                gl.dispatch(size.div_ceil(WORKGROUP_SIZE), invocations_per_line);
-            }
-            // Two fragment passes. Framebuffer 0 is that of `horizontal`; framebuffer 1 + i is that of layer i of
-            // `moments`.
-            ([x_program, y_program], Some(horizontal)) => {
-                gl.set_pipeline_state(PipelineState::default());
-                let framebuffers = [&blurred.framebuffers[0], &blurred.framebuffers[1 + layer as usize]];
-                for ((program, source), framebuffer) in
-                    [(x_program, &map.depth), (y_program, horizontal)].into_iter().zip(framebuffers)
-                {
-                    bind_blur(program, source, map, layer);
-                    gl.draw_fullscreen_triangle(framebuffer, map.shadow.size, &buffers.empty_vertex_array);
-                }
-            }
-            _ => return Err(fault_in(Pass::Blur.name())("the blur programs do not match the shadow map")),
+    match (programs.as_slice(), &blurred.horizontal) {
+        // One compute pass blurs in both directions.
+        ([program], None) => {
+            let [columns, rows] = texels_per_workgroup(&map.shadow);
+            bind_blur(program, &map.depth, map, layer);
+            program.set_first_row(band.first_row);
+            blurred.moments.bind_image_layer(DESTINATION_IMAGE, layer);
+            gl.dispatch(map.shadow.size.div_ceil(columns), band.rows.div_ceil(rows));
         }
+        // Two compute passes.
+        ([x_program, y_program], Some(horizontal)) if blurred.framebuffers.is_empty() => {
+            let (size, invocations_per_line) = (map.shadow.size, map.shadow.size.div_ceil(TEXELS_PER_INVOCATION));
+            // Wait until the previous layer has read `horizontal`.
+            recorder.barrier_within_pass(Pass::Blur);
+            bind_blur(x_program, &map.depth, map, layer);
+            horizontal.bind_image(DESTINATION_IMAGE);
+            gl.dispatch(invocations_per_line.div_ceil(WORKGROUP_SIZE), size);
+            recorder.barrier_within_pass(Pass::Blur);
+            bind_blur(y_program, horizontal, map, layer);
+            blurred.moments.bind_image_layer(DESTINATION_IMAGE, layer);
+            gl.dispatch(size.div_ceil(WORKGROUP_SIZE), invocations_per_line);
+        }
+        // Two fragment passes. Framebuffer 0 is that of `horizontal`; framebuffer 1 + i is that of layer i of
+        // `moments`.
+        ([x_program, y_program], Some(horizontal)) => {
+            gl.set_pipeline_state(PipelineState::default());
+            let framebuffers = [&blurred.framebuffers[0], &blurred.framebuffers[1 + layer as usize]];
+            for ((program, source), framebuffer) in
+                [(x_program, &map.depth), (y_program, horizontal)].into_iter().zip(framebuffers)
+            {
+                bind_blur(program, source, map, layer);
+                gl.draw_fullscreen_triangle(framebuffer, map.shadow.size, &buffers.empty_vertex_array);
+            }
+        }
+        _ => return Err(fault_in(Pass::Blur.name())("the blur programs do not match the shadow map")),
     }
     recorder.finish(Pass::Blur)
 }

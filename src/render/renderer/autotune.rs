@@ -139,7 +139,12 @@ mod tests {
             Ok(())
         }
 
-        fn draw(&mut self, _depth: Option<DrawTarget<'_>>, _ids: Option<DrawTarget<'_>>) -> Result<()> {
+        fn draw(
+            &mut self,
+            _depth: Option<DrawTarget<'_>>,
+            _ids: Option<DrawTarget<'_>>,
+            _range: std::ops::Range<u32>,
+        ) -> Result<()> {
             Ok(())
         }
     }

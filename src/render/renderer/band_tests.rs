@@ -1,16 +1,22 @@
-//! Tests of frames and AOVs that are drawn in bands: the pixels are those of a frame without bands, also if other
-//! scenes are drawn between the bands.
+//! Tests of frames and AOVs that are drawn in bands and pieces: the pixels are those of a frame without them, also if
+//! other scenes are drawn in between.
 
+use std::cell::RefCell;
+use std::ops::Range;
+use std::rc::Rc;
 use std::sync::Arc;
 use std::time::Duration;
 
 use super::Renderer;
 use crate::hang_guard::HANG_GUARD;
 use crate::pass::Pass;
+use crate::pieces::PieceLimits;
 use crate::scene_data::geometry::tests::squares;
 use crate::{Aov, DevicePreference, FrameImage, FrameParams, FrameStats, SceneBuffers};
 use modalcast_model::deform::DeformedSurface;
 use modalcast_model::domain::{AlphaMode, Material};
+use modalcast_model::error::Result;
+use modalcast_model::raster::{DrawTarget, Rasterizer};
 use modalcast_model::scene::{
     Antialiasing, Bloom, BoundingBox, Camera, Culling, Ground, Lens, PixelRect, RenderSettings, Scene, ShadowSettings,
     Transparency, View,
@@ -125,6 +131,12 @@ fn draw_in_steps(
     (image, renderer.stats().clone(), step_count)
 }
 
+/// Limits of pieces with about 30 triangles of a band of 64 rows.
+fn small_pieces(samples_per_pixel: u32) -> PieceLimits {
+    let samples = 30 * u64::from(samples_per_pixel * SIZE[0] * 64);
+    PieceLimits { first_samples: samples, max_samples: samples, ..PieceLimits::SOFTWARE }
+}
+
 #[test]
 fn frame_in_bands_has_the_pixels_of_the_whole_frame() {
     for (name, look) in looks() {
@@ -137,17 +149,81 @@ fn frame_in_bands_has_the_pixels_of_the_whole_frame() {
         let whole = renderer.draw(&random_scene.buffers, &params).expect("draws");
         let whole_stats = renderer.stats().clone();
         let whole_ids = renderer.read_visibility().expect("ids");
-        random_scene.buffers.shadow_cache.invalidate();
-        renderer.set_max_band_samples(u64::from(look.samples * SIZE[0] * 64));
-        let (image, stats, step_count) = draw_in_steps(&mut renderer, &random_scene, &other_scene);
-        let count = image.rgba.chunks(4).zip(whole.rgba.chunks(4)).filter(|(band, whole)| band != whole).count();
-        assert_eq!(count, 0, "{name}: pixels differ");
-        assert!(renderer.read_visibility().expect("ids") == whole_ids, "{name}: ids differ");
-        assert_eq!((stats.passes, stats.oit, stats.culled), (whole_stats.passes, whole_stats.oit, whole_stats.culled));
-        assert!(step_count > 15, "{name}: {step_count} steps");
         let colors: std::collections::HashSet<&[u8]> = whole.rgba.chunks(4).collect();
         assert!(colors.len() > 500, "{name}: expected a detailed image, got {} colors", colors.len());
+        renderer.set_max_band_samples(u64::from(look.samples * SIZE[0] * 64));
+        // Bands, and pieces of the triangles of each band.
+        let mut step_counts = Vec::new();
+        for pieces in [PieceLimits::SOFTWARE, small_pieces(look.samples)] {
+            random_scene.buffers.shadow_cache.invalidate();
+            renderer.output_limits.pieces = pieces;
+            let (image, stats, step_count) = draw_in_steps(&mut renderer, &random_scene, &other_scene);
+            let count = image.rgba.chunks(4).zip(whole.rgba.chunks(4)).filter(|(band, whole)| band != whole).count();
+            assert_eq!(count, 0, "{name}: pixels differ, {step_count} steps");
+            assert!(renderer.read_visibility().expect("ids") == whole_ids, "{name}: ids differ");
+            let results = |stats: &FrameStats| (stats.passes.clone(), stats.oit, stats.culled);
+            assert_eq!(results(&stats), results(&whole_stats), "{name}");
+            step_counts.push(step_count);
+        }
+        assert!(step_counts[0] > 15 && step_counts[1] > step_counts[0] + 20, "{name}: {step_counts:?} steps");
     }
+}
+
+/// Records the ranges that it draws.
+#[derive(Debug)]
+struct RangeRecorder(Rc<RefCell<Vec<Range<u32>>>>);
+
+impl Rasterizer for RangeRecorder {
+    fn draw(&mut self, _: Option<DrawTarget<'_>>, _: Option<DrawTarget<'_>>, range: Range<u32>) -> Result<()> {
+        self.0.borrow_mut().push(range);
+        Ok(())
+    }
+
+    fn precompile(&mut self, _: bool, _: bool) -> Result<()> {
+        Ok(())
+    }
+}
+
+#[test]
+fn compute_rasterizer_draws_consecutive_ranges() {
+    let mut renderer = open_renderer();
+    let mut random_scene = RandomScene::load(&mut renderer, 1, look(1));
+    let ranges = Rc::new(RefCell::new(Vec::new()));
+    let recorder = RangeRecorder(Rc::clone(&ranges));
+    renderer.attach_shadow_rasterizer(&mut random_scene.buffers, |_| Ok(Box::new(recorder))).expect("attaches");
+    renderer.output_limits.pieces = small_pieces(1);
+    let params = random_scene.params(SIZE);
+    let mut partial_frame = renderer.begin_frame(&random_scene.buffers, &params, true).expect("begins");
+    while !partial_frame.is_submitted() {
+        renderer.submit_step(&random_scene.buffers, &mut partial_frame).expect("submits");
+    }
+    let ranges = ranges.take();
+    let triangles = random_scene.scene.layout.triangles as u32;
+    assert!(ranges.len() > 20, "{ranges:?}");
+    let ends = std::iter::once(0).chain(ranges.iter().map(|range| range.end));
+    assert!(ranges.iter().map(|range| range.start).zip(ends).all(|(start, end)| start == end), "{ranges:?}");
+    assert_eq!(ranges.last().map(|range| range.end), Some(triangles));
+}
+
+/// The first frame of a size has breaks; later ones are drawn whole, because they take less time than a piece.
+#[test]
+fn frame_that_is_known_to_be_short_has_no_breaks() {
+    let mut renderer = open_renderer();
+    let random_scene = RandomScene::load(&mut renderer, 1, look(4));
+    let has_breaks = |renderer: &mut Renderer, size: [u32; 2]| {
+        let params = random_scene.params(size);
+        let has_breaks = renderer.begin_frame(&random_scene.buffers, &params, true).expect("begins").has_breaks();
+        renderer.draw(&random_scene.buffers, &params).expect("draws");
+        has_breaks
+    };
+    // Far longer than a frame takes on a busy machine.
+    renderer.output_limits.pieces.target_ms = 1e9;
+    assert_eq!(
+        [SIZE, SIZE, [32, 32], [32, 32], SIZE].map(|size| has_breaks(&mut renderer, size)),
+        [true, false, true, false, false]
+    );
+    renderer.output_limits.pieces.target_ms = 1e-9;
+    assert!(has_breaks(&mut renderer, SIZE), "expected breaks in a frame that took longer than a piece");
 }
 
 /// Negative control: a step that is missing changes the pixels, so the comparison sees every band.
@@ -234,17 +310,23 @@ fn aov_in_bands_has_the_words_of_the_whole_aov() {
         renderer.set_max_band_samples(u64::MAX);
         let whole = renderer.render_aov(&random_scene.buffers, &params, field).expect("reads");
         renderer.set_max_band_samples(u64::from(whole.samples * SIZE[0] * 64));
-        let mut partial_aov = renderer.begin_aov(&random_scene.buffers, &params, field).expect("begins");
-        let mut band_count = 0;
-        while !partial_aov.is_submitted() {
-            renderer.submit_aov_band(&random_scene.buffers, &mut partial_aov).expect("submits");
-            band_count += 1;
-            renderer.draw(&other_scene.buffers, &other_scene.params([70, 90])).expect("draws");
-            renderer.render_aov(&other_scene.buffers, &params, Aov::Normals).expect("reads");
+        let triangle_pieces = random_scene.scene.layout.triangles.div_ceil(30);
+        for (pieces, piece_count) in [(PieceLimits::SOFTWARE, 4), (small_pieces(whole.samples), 4 * triangle_pieces)] {
+            renderer.output_limits.pieces = pieces;
+            let mut partial_aov = renderer.begin_aov(&random_scene.buffers, &params, field).expect("begins");
+            let mut submitted_count = 0;
+            while !partial_aov.is_submitted() {
+                renderer.submit_aov_piece(&random_scene.buffers, &mut partial_aov).expect("submits");
+                submitted_count += 1;
+                renderer.draw(&other_scene.buffers, &other_scene.params([70, 90])).expect("draws");
+                renderer.render_aov(&other_scene.buffers, &params, Aov::Normals).expect("reads");
+            }
+            let aov = renderer.finish_aov(&random_scene.buffers, partial_aov).expect("reads");
+            assert_eq!(aov.samples, whole.samples, "{field:?}");
+            // The last band has fewer rows, so its pieces have more triangles.
+            assert!((piece_count * 3 / 4..=piece_count).contains(&submitted_count), "{field:?}: {submitted_count}");
+            assert!(aov.bytes == whole.bytes, "{field:?}: words differ");
         }
-        let aov = renderer.finish_aov(&random_scene.buffers, partial_aov).expect("reads");
-        assert_eq!((band_count, aov.samples), (4, whole.samples), "{field:?}");
-        assert!(aov.bytes == whole.bytes, "{field:?}: words differ");
     }
 }
 

@@ -7,6 +7,7 @@
 use std::ops::Range;
 
 use super::Renderer;
+use super::partial_frame::Breaks;
 use super::pending_frame::{MappedPixels, PendingFrame};
 use crate::device::gl::ReadbackView;
 use crate::layout;
@@ -62,7 +63,9 @@ impl Renderer {
         fault_injection::check(InjectionPoint::Pixels)?;
         pending_frame.wait()?;
         let limit = pending_frame.time_left();
-        let PendingFrame { desc, readback, fence, passes, raster_switch_ms, span, mut stats, info, .. } = pending_frame;
+        let PendingFrame {
+            desc, readback, fence, passes, raster_switch_ms, span, mut stats, info, class, costs, ..
+        } = pending_frame;
         let mut view = readback.map_or(Ok(None), |readback| readback.into_view(&fence, limit))?;
         let png = view.as_mut().and_then(ReadbackView::take_png);
         if let Some(view) = &mut view {
@@ -92,6 +95,7 @@ impl Renderer {
                 None => times.push((*pass, timer.ms())),
             }
         }
+        costs.record(class, times.iter().map(|(_, ms)| ms).sum());
         let mut times = FrameTimes::of_passes(&times);
         if let Some(span) = &span {
             let ms = raster_switch_ms + span.delay_ms(&mut self.last_end_ns);
@@ -106,7 +110,7 @@ impl Renderer {
         params: &FrameParams,
         has_readback: bool,
     ) -> Result<PendingFrame> {
-        let mut partial_frame = self.begin_frame(buffers, params, has_readback)?;
+        let mut partial_frame = self.begin_frame_with(buffers, params, has_readback, Breaks::AfterBands)?;
         while !partial_frame.is_submitted() {
             self.submit_step(buffers, &mut partial_frame)?;
         }

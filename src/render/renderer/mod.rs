@@ -3,6 +3,7 @@
 mod autotune;
 mod frame;
 mod frame_readback;
+mod frame_steps;
 mod partial_frame;
 mod pending_frame;
 mod preparation;
@@ -30,9 +31,10 @@ pub use self::pending_frame::{EncodedFrame, FramePixels, HeldPixels, MappedPixel
 pub use self::preparation::ScenePreparation;
 use crate::device::readback_ring::ReadbackRing;
 use crate::device::{self, gl, gl::Gl};
-use crate::passes::aov::{Aov, AovImage, AovReader, PartialAov};
+use crate::passes::aov::{Aov, AovImage, AovReader, OutputLimits, PartialAov};
 use crate::passes::picking::{PendingPick, PickHit, Picker};
 use crate::passes::{PassRecorder, readback};
+use crate::pieces::PieceLimits;
 use crate::region::BandLimit;
 use crate::resources::compute_rasterizer::RasterPasses;
 use crate::resources::programs::ProgramCache;
@@ -87,7 +89,7 @@ pub struct Renderer {
     /// When the device finished the last frame whose times were read, by the device's clock.
     last_end_ns: u64,
     frame_timeout: Duration,
-    band_limit: BandLimit,
+    output_limits: OutputLimits,
     /// Staging buffers of frames that are copied to the host band by band.
     band_ring: Rc<ReadbackRing>,
     /// Threads that compute mipmap levels: few, because they compete with the threads of a software renderer and with
@@ -152,7 +154,10 @@ impl Renderer {
             last_frame: None,
             last_end_ns: 0,
             frame_timeout: FRAME_TIMEOUT,
-            band_limit: if gl.limits.software { SOFTWARE_BAND_LIMIT } else { HARDWARE_BAND_LIMIT },
+            output_limits: match gl.limits.software {
+                true => OutputLimits { bands: SOFTWARE_BAND_LIMIT, pieces: PieceLimits::SOFTWARE },
+                false => OutputLimits { bands: HARDWARE_BAND_LIMIT, pieces: PieceLimits::HARDWARE },
+            },
             band_ring: ReadbackRing::new(&gl, frame_readback::BAND_STAGING_BYTES, None),
             picker: Picker::new(&gl),
             aov_reader: AovReader::new(&gl),
@@ -217,7 +222,14 @@ impl Renderer {
     /// frames and AOVs are divided into bands of rows. The pixels do not depend on the bands. By default, hardware
     /// draws 2^25 samples and 2^23 pixels without a break, and a software renderer 2^21 pixels.
     pub fn set_max_band_samples(&mut self, max_band_samples: u64) {
-        self.band_limit = BandLimit { max_pixels: u64::MAX, max_samples: max_band_samples };
+        self.output_limits.bands = BandLimit { max_pixels: u64::MAX, max_samples: max_band_samples };
+    }
+
+    /// Sets the time in milliseconds of a piece of a long output, and the maximum samples of a piece if each of its
+    /// triangles covers its whole image. The pixels do not depend on the pieces. By default, a piece takes about 50 ms on
+    /// hardware and 500 ms on a software renderer.
+    pub fn set_piece_limits(&mut self, target_ms: f64, max_samples: u64) {
+        self.output_limits.pieces = PieceLimits { target_ms, first_samples: max_samples, max_samples };
     }
 
     /// Whether an output of this size is divided into bands.
@@ -227,7 +239,7 @@ impl Renderer {
     }
 
     fn exceeds_band_limit(&self, [width, height]: [u32; 2], samples: u32) -> bool {
-        u64::from(width) * u64::from(height) > self.band_limit.max_pixels(samples)
+        u64::from(width) * u64::from(height) > self.output_limits.bands.max_pixels(samples)
     }
 
     /// Uploads the static data of a scene and allocates the buffers of the deformed data.
@@ -387,12 +399,12 @@ impl Renderer {
     pub fn render_aov(&mut self, buffers: &SceneBuffers, params: &FrameParams, field: Aov) -> Result<AovImage> {
         let mut partial_aov = self.begin_aov(buffers, params, field)?;
         while !partial_aov.is_submitted() {
-            self.submit_aov_band(buffers, &mut partial_aov)?;
+            self.submit_aov_piece(buffers, &mut partial_aov)?;
         }
         self.finish_aov(buffers, partial_aov)
     }
 
-    /// Begins to read an AOV field in bands. The scene's buffers must not change until it is finished.
+    /// Begins to read an AOV field in pieces. The scene's buffers must not change until it is finished.
     ///
     /// # Errors
     /// `Invalid` for a size above the limit or a camera whose matrices overflow; `OutOfMemory`; `Fault` if no values
@@ -401,16 +413,16 @@ impl Renderer {
         let _current = self.gl.make_current()?;
         self.check_size(params)?;
         let reserve = |desc, bytes| reserve_target(&self.target_budget, &mut self.targets, desc, bytes);
-        self.aov_reader.begin(&mut self.programs, buffers, params, field, self.band_limit, reserve)
+        self.aov_reader.begin(&mut self.programs, buffers, params, field, self.output_limits, reserve)
     }
 
-    /// Submits the next band of an AOV field.
+    /// Submits the next piece of an AOV field.
     ///
     /// # Errors
     /// `Fault` if OpenGL reports an error or a software renderer does not finish in time.
-    pub fn submit_aov_band(&mut self, buffers: &SceneBuffers, partial_aov: &mut PartialAov) -> Result<()> {
+    pub fn submit_aov_piece(&mut self, buffers: &SceneBuffers, partial_aov: &mut PartialAov) -> Result<()> {
         let _current = self.gl.make_current()?;
-        self.aov_reader.submit_band(partial_aov, buffers, self.frame_timeout)
+        self.aov_reader.submit_piece(partial_aov, buffers, self.output_limits, self.frame_timeout)
     }
 
     /// Waits for an AOV field whose bands are all submitted.

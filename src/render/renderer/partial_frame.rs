@@ -1,11 +1,11 @@
 //! Frames that are submitted in steps (draw steps, not steps of a simulation). Between two steps, the device can
 //! execute commands of other scenes.
 //!
-//! A frame within the limit of [`Renderer::set_max_band_samples`] has one step for each pass, and is meant to be
-//! submitted without a break. The first frame of a scene is an exception: drivers finish the compilation of a program
-//! when it is used for the first time. A larger frame is divided into bands of rows. Its steps are the passes that work
-//! on the complete frame, and each band of the other passes. A pass ends with its last band before the next pass
-//! begins, so the inputs of a pass are complete, and the pixels do not depend on the bands.
+//! A frame whose size exceeds the limit of [`Renderer::set_max_band_samples`] is divided into bands of rows: each band of
+//! a pass is a step. A frame that may take long, as the first frames of a scene, is drawn in pieces
+//! ([`crate::pieces`]): each band, and each range of triangles of a band or of a layer of the shadow map, is a step. A
+//! pass ends with its last step before the next pass begins, so the inputs of a pass are complete, and the pixels do not
+//! depend on the steps. All other frames are submitted without a break.
 //!
 //! The target of the frame is not in the cache until the frame is submitted, so other frames cannot use it. The buffers
 //! of the scene must not change until then.
@@ -15,15 +15,16 @@ use std::collections::VecDeque;
 use std::rc::Rc;
 use std::time::{Duration, Instant};
 
-use super::frame_readback::{BandReadback, FrameReadback, MAX_BAND_PIXELS};
+use super::frame_readback::{BandReadback, FrameReadback};
+use super::frame_steps::{FramePlan, Step, record, visibility_rasterizer};
 use super::pending_frame::PendingFrame;
 use super::{LastFrame, MAX_TARGETS, Renderer};
 use crate::device::gl::{Fence, PassTimer, Program, SpanTimer};
 use crate::pass::Pass;
-use crate::passes::post::BloomStep;
-use crate::passes::{self, FrameContext, OitFrame, PassRecorder};
-use crate::region::{Band, Region};
-use crate::resources::compute_rasterizer::{ComputeRasterizer, RasterPasses};
+use crate::passes::{self, FrameContext, PassRecorder};
+use crate::pieces::{OutputClass, OutputCosts, OutputKind, PieceCursor, PieceLoad, PieceRange};
+use crate::region::Region;
+use crate::resources::compute_rasterizer::RasterPasses;
 use crate::resources::oit::blend_storage;
 use crate::resources::programs::SampleCountPrograms;
 use crate::resources::scene_buffers::SceneBuffers;
@@ -55,39 +56,53 @@ pub struct PartialFrame {
     span: Option<SpanTimer>,
     /// Steps that are not submitted yet.
     steps: VecDeque<Step>,
+    /// Items of the first of `steps` that are not submitted yet; none before its first piece.
+    cursor: Option<PieceCursor>,
+    class: OutputClass,
+    /// Receives the time of the frame.
+    costs: Rc<OutputCosts>,
     is_divided: bool,
-    has_breaks: bool,
+    has_pieces: bool,
     is_begun: bool,
-    /// Fence after the last submitted step of a frame with breaks.
+    /// Fence after the last submitted step of a frame in pieces.
     fence: Option<Fence>,
 }
 
-/// Commands that are submitted without a break.
-#[derive(Debug)]
-enum Step {
-    /// The passes of the compute rasterizer, if there is one.
-    ComputeRaster,
-    /// Shadow map and its blur, unless the map of an earlier frame is valid.
-    Shadow,
-    /// Culling for the camera, if OpenGL draws the visibility.
-    Cull,
-    /// Passes that are timed together under one name.
-    Passes(Pass, Vec<BandPass>),
+/// Where a frame has breaks.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Breaks {
+    /// After each band of a large frame.
+    AfterBands,
+    /// Also after each piece of a frame that may take long.
+    AfterPieces,
 }
 
-/// A pass, or a part of it.
-#[derive(Debug, Clone, Copy)]
-enum BandPass {
-    Visibility(Band),
-    RecordVisible,
-    Blended(Band),
-    OitCount(Band),
-    OitSumCounts,
-    OitBlend(Band),
-    Shade(Band),
-    Bloom(BloomStep, Band),
-    Encode(Band),
-    Read(Band),
+/// How the compute rasterizer drew its passes.
+#[derive(Debug)]
+enum ComputeRaster {
+    /// OpenGL draws all passes.
+    Unused,
+    /// Before the frame, into shared memory.
+    Shared { timer: (Pass, PassTimer), switch_ms: f64 },
+    /// A range of triangles, into mapped buffers.
+    Drawn((Pass, PassTimer)),
+}
+
+impl ComputeRaster {
+    /// [`PartialFrame::raster_switch_ms`].
+    const fn switch_ms(&self) -> f64 {
+        match self {
+            Self::Shared { switch_ms, .. } => *switch_ms,
+            Self::Unused | Self::Drawn(_) => 0.0,
+        }
+    }
+
+    fn into_timer(self) -> Option<(Pass, PassTimer)> {
+        match self {
+            Self::Unused => None,
+            Self::Shared { timer, .. } | Self::Drawn(timer) => Some(timer),
+        }
+    }
 }
 
 impl PartialFrame {
@@ -101,10 +116,14 @@ impl PartialFrame {
         self.is_divided
     }
 
-    /// Whether commands of other scenes should be executed between the steps, because the frame is large or the first
-    /// one of its scene.
+    /// Whether commands of other scenes should be executed between the steps, because the frame may take long.
     pub const fn has_breaks(&self) -> bool {
-        self.has_breaks
+        self.has_pieces
+    }
+
+    /// Milliseconds that the device took for the last submitted step. Waits for the step.
+    pub fn last_step_ms(&self) -> f64 {
+        self.timers.last().map_or(0.0, |(_, timer)| timer.ms())
     }
 
     /// How the frame is drawn, without the rasterizers, which are known when it is finished.
@@ -112,7 +131,7 @@ impl PartialFrame {
         &self.info
     }
 
-    /// Waits at most `limit` for the last submitted step of a frame with breaks. Returns whether it is complete.
+    /// Waits at most `limit` for the last submitted step of a frame in pieces. Returns whether it is complete.
     /// Submitting the next step only then keeps the queue of the device short.
     pub fn is_ready_within(&self, limit: Duration) -> bool {
         self.fence.as_ref().is_none_or(|fence| fence.is_done_within(limit))
@@ -141,6 +160,17 @@ impl Renderer {
         buffers: &SceneBuffers,
         params: &FrameParams,
         has_readback: bool,
+    ) -> Result<PartialFrame> {
+        self.begin_frame_with(buffers, params, has_readback, Breaks::AfterPieces)
+    }
+
+    /// [`Self::begin_frame`] with a choice of breaks.
+    pub(super) fn begin_frame_with(
+        &mut self,
+        buffers: &SceneBuffers,
+        params: &FrameParams,
+        has_readback: bool,
+        breaks: Breaks,
     ) -> Result<PartialFrame> {
         let _current = self.gl.make_current()?;
         fault_injection::check(InjectionPoint::Frame)?;
@@ -174,7 +204,14 @@ impl Renderer {
         self.last_frame = None;
         let Some(target) = self.targets.pop() else { return Err(fault("draw", "expected a render target, got none")) };
         target.draw_region.set(draw_region(buffers, params));
-        let steps = plan_steps(&target, readback.is_some(), self.band_limit.max_pixels(desc.samples));
+        let draws_shadow = buffers.shadow.is_some() && buffers.shadow_cache.is_stale(buffers.shadow_key(params));
+        let class = OutputClass::new(OutputKind::Frame { draws_shadow }, size, desc.samples);
+        let may_take_long = buffers.costs.has_pieces(class, self.output_limits.pieces);
+        let has_pieces = is_divided || breaks == Breaks::AfterPieces && may_take_long;
+        let max_pixels = self.output_limits.bands.max_pixels(desc.samples);
+        let planned = FramePlan { target: &target, has_readback: readback.is_some(), max_pixels, has_pieces };
+        let shadow = buffers.shadow.as_ref().filter(|_| draws_shadow);
+        let steps = planned.steps(shadow);
         Ok(PartialFrame {
             params: *params,
             uniforms,
@@ -187,7 +224,10 @@ impl Renderer {
             raster_switch_ms: 0.0,
             span: None,
             is_divided,
-            has_breaks: is_divided || !buffers.is_drawn_with(desc.samples),
+            has_pieces,
+            class,
+            costs: Rc::clone(&buffers.costs),
+            cursor: None,
             steps,
             is_begun: false,
             fence: None,
@@ -195,7 +235,7 @@ impl Renderer {
         })
     }
 
-    /// Submits the next step of a frame. On hardware, submits all steps of a frame without breaks.
+    /// Submits the next step of a frame. On hardware, submits all steps of a frame that is not drawn in pieces.
     ///
     /// # Errors
     /// `Fault` with the pass if OpenGL reports an error. The frame must then be dropped.
@@ -211,6 +251,7 @@ impl Renderer {
             stats,
             timers,
             steps,
+            cursor,
             raster_switch_ms,
             ..
         } = partial_frame;
@@ -227,32 +268,38 @@ impl Renderer {
         }
         let readback = readback.as_ref();
         let picture = readback.and_then(FrameReadback::picture);
-        let frame = FrameContext { buffers, target, programs, encode, params, picture };
-        let has_breaks = partial_frame.has_breaks;
-        while let Some(step) = steps.pop_front() {
+        let has_pieces = partial_frame.has_pieces;
+        let frame = FrameContext { buffers, target, programs, encode, params, has_pieces, picture };
+        while let Some(step) = steps.front() {
+            let range = match step.load(&frame).filter(|_| has_pieces) {
+                Some(load) => self.next_piece(cursor, load, timers),
+                None => PieceRange::ALL,
+            };
+            let mut is_finished = cursor.as_ref().is_none_or(PieceCursor::is_finished);
             match step {
                 Step::ComputeRaster => {
-                    timers.extend(self.record_compute_raster(&mut recorder, &frame, raster_switch_ms)?);
+                    let raster = self.record_compute_raster(&mut recorder, &frame, range)?;
+                    is_finished |= !matches!(raster, ComputeRaster::Drawn(_));
+                    *raster_switch_ms = raster.switch_ms();
+                    timers.extend(raster.into_timer());
                 }
-                Step::Shadow => self.record_shadow(&mut recorder, &frame, timers)?,
-                Step::Cull if buffers.cull_resources.is_some() && visibility_rasterizer(&frame).is_none() => {
-                    timers.push(self.time_pass(Pass::Cull, || passes::cull::cull_for_camera(&mut recorder, &frame))?);
-                }
-                Step::Cull => {}
-                Step::Passes(pass, band_passes) => timers.push(self.time_pass(pass, || {
-                    let mut band_passes = band_passes.into_iter();
-                    band_passes.try_for_each(|band_pass| record(&mut recorder, &frame, readback, band_pass))
+                Step::Passes(pass, band_passes) => timers.push(self.time_pass(*pass, || {
+                    let mut band_passes = band_passes.iter();
+                    band_passes.try_for_each(|band_pass| record(&mut recorder, &frame, readback, *band_pass, range))
                 })?),
             }
-            if has_breaks || self.gl.limits.software {
+            if is_finished {
+                *cursor = None;
+                steps.pop_front();
+            }
+            if has_pieces || self.gl.limits.software {
                 break;
             }
         }
-        if has_breaks {
+        if has_pieces {
             partial_frame.fence = Some(self.gl.fence("draw")?);
         }
         if partial_frame.is_submitted() {
-            buffers.mark_drawn_with(partial_frame.target.desc.samples);
             buffers.compute_rasterizer.as_ref().map_or(Ok(()), |rasterizer| rasterizer.release_shared(&self.gl))?;
         }
         Ok(())
@@ -267,8 +314,19 @@ impl Renderer {
             return Err(fault("draw", "expected a frame whose steps are all submitted"));
         }
         let _current = self.gl.make_current()?;
-        let PartialFrame { uniforms, mut target, readback, timers, raster_switch_ms, mut span, stats, info, .. } =
-            partial_frame;
+        let PartialFrame {
+            uniforms,
+            mut target,
+            readback,
+            timers,
+            raster_switch_ms,
+            mut span,
+            stats,
+            info,
+            class,
+            costs,
+            ..
+        } = partial_frame;
         span.as_mut().map_or(Ok(()), |span| span.end(&self.gl))?;
         let desc = target.desc;
         target.last_use = Instant::now();
@@ -288,61 +346,64 @@ impl Renderer {
             span,
             stats,
             info,
+            class,
+            costs,
             timeout: self.frame_timeout,
             first_wait: Cell::new(None),
         })
     }
 
-    /// Draws the passes of the compute rasterizer, unless [`Renderer::rasterize`] has drawn them. Returns no timer if
-    /// there is none or it fails; OpenGL then draws these passes in later steps.
+    /// The items of the next piece of a step.
+    fn next_piece(
+        &self,
+        cursor: &mut Option<PieceCursor>,
+        load: PieceLoad,
+        timers: &[(Pass, PassTimer)],
+    ) -> PieceRange {
+        match cursor {
+            Some(cursor) => {
+                // The device has finished the previous piece, so this does not wait.
+                cursor.record_ms(timers.last().map_or(0.0, |(_, timer)| timer.ms()));
+                cursor.next_piece()
+            }
+            None => cursor.insert(PieceCursor::new(self.output_limits.pieces, load)).next_piece(),
+        }
+    }
+
+    /// Draws triangles of a range in the passes of the compute rasterizer, unless [`Renderer::rasterize`] has drawn them.
+    /// If it fails, OpenGL draws these passes in later steps.
     fn record_compute_raster(
         &self,
         recorder: &mut PassRecorder<'_>,
         frame: &FrameContext<'_>,
-        raster_switch_ms: &mut f64,
-    ) -> Result<Option<(Pass, PassTimer)>> {
+        range: PieceRange,
+    ) -> Result<ComputeRaster> {
         let buffers = frame.buffers;
-        let Some((rasterizer, enabled)) = buffers.active_rasterizer() else { return Ok(None) };
+        let Some((rasterizer, enabled)) = buffers.active_rasterizer() else { return Ok(ComputeRaster::Unused) };
         let is_shadow_stale = buffers.shadow_cache.is_stale(buffers.shadow_key(frame.params));
         let raster_passes = RasterPasses {
             shadow: enabled.shadow && is_shadow_stale,
             visibility: visibility_rasterizer(frame).is_some(),
         };
         if !raster_passes.has_any() {
-            return Ok(None);
+            return Ok(ComputeRaster::Unused);
         }
         let views = passes::raster::views(buffers, frame.params, raster_passes)?;
         if let Some(time) = rasterizer.shared_time(&self.gl, &views)? {
             passes::raster::use_shared(recorder, raster_passes);
-            *raster_switch_ms = time.switch_ms;
-            return Ok(Some((raster_passes.stats_pass(), PassTimer::Wall(time.device_ms))));
+            let timer = (raster_passes.stats_pass(), PassTimer::Wall(time.device_ms));
+            return Ok(ComputeRaster::Shared { timer, switch_ms: time.switch_ms });
         }
-        let draw = || passes::raster::draw(recorder, rasterizer, raster_passes, &views);
+        let draw = || passes::raster::draw(recorder, rasterizer, raster_passes, &views, range);
         match self.time_pass(raster_passes.stats_pass(), draw) {
-            Ok(timer) => Ok(Some(timer)),
+            Ok(timer) => Ok(ComputeRaster::Drawn(timer)),
             // OpenGL cannot draw on a lost device either.
             Err(error) if error.is_loss() => Err(error),
             Err(error) => {
                 rasterizer.disable(&error);
-                Ok(None)
+                Ok(ComputeRaster::Unused)
             }
         }
-    }
-
-    /// Draws and blurs the shadow map unless the map of an earlier frame is valid.
-    fn record_shadow(
-        &self,
-        recorder: &mut PassRecorder<'_>,
-        frame: &FrameContext<'_>,
-        timers: &mut Vec<(Pass, PassTimer)>,
-    ) -> Result<()> {
-        let buffers = frame.buffers;
-        let draw = || {
-            timers.push(self.time_pass(Pass::Shadow, || passes::shadow::draw_depth(recorder, buffers))?);
-            timers.push(self.time_pass(Pass::Blur, || passes::shadow::blur(recorder, buffers))?);
-            Ok(())
-        };
-        buffers.shadow_cache.draw_if_stale(buffers.shadow_key(frame.params), draw).map(drop)
     }
 
     /// Times the passes that `commands` records, and reports the time under `pass`, which is one of these passes.
@@ -354,88 +415,6 @@ impl Renderer {
         };
         self.gl.time_pass(pass.name(), self.frame_timeout, commands).map(|timer| (pass, timer))
     }
-}
-
-/// The compute rasterizer if it draws the visibility of a frame. It draws one sample per pixel, but a frame can set
-/// another number than its scene.
-fn visibility_rasterizer<'a>(frame: &FrameContext<'a>) -> Option<&'a ComputeRasterizer> {
-    frame.buffers.visibility_rasterizer().filter(|_| frame.target.desc.samples == 1)
-}
-
-/// Records a pass, or a band of it.
-fn record(
-    recorder: &mut PassRecorder<'_>,
-    frame: &FrameContext<'_>,
-    readback: Option<&FrameReadback>,
-    band_pass: BandPass,
-) -> Result<()> {
-    let rasterizer = visibility_rasterizer(frame);
-    match (band_pass, OitFrame::of(frame)) {
-        (BandPass::Visibility(band), _) => match rasterizer {
-            // This pass only converts the output of the compute rasterizer, so the first band converts all rows.
-            Some(rasterizer) if band.first_row == 0 => passes::raster::unpack(recorder, frame, rasterizer),
-            Some(_) => Ok(()),
-            None => passes::visibility::draw(recorder, frame, band),
-        },
-        (BandPass::RecordVisible, _) if rasterizer.is_none() => passes::cull::record_visible(recorder, frame),
-        (BandPass::Blended(band), _) => passes::blended::draw(recorder, frame, band),
-        (BandPass::OitCount(band), Some(oit)) => oit.count(recorder, band),
-        (BandPass::OitSumCounts, Some(oit)) => oit.sum_counts(recorder),
-        (BandPass::OitBlend(band), Some(oit)) => oit.blend(recorder, band),
-        (BandPass::Shade(band), _) => passes::shade::draw(recorder, frame, band),
-        (BandPass::Bloom(step, band), _) => passes::post::bloom(recorder, frame, step, band),
-        (BandPass::Encode(band), _) => passes::post::encode(recorder, frame, band),
-        (BandPass::Read(band), _) => {
-            let staging = readback.and_then(|readback| readback.buffer(frame.target.desc, band));
-            passes::readback::copy_frame(recorder, frame, staging, band)
-        }
-        // Passes that OpenGL or a frame without fragment lists does not have.
-        (BandPass::RecordVisible | BandPass::OitCount(_), _) | (BandPass::OitSumCounts | BandPass::OitBlend(_), _) => {
-            Ok(())
-        }
-    }
-}
-
-/// The steps of a frame. Bands have at most `max_pixels` pixels.
-fn plan_steps(target: &RenderTarget, has_readback: bool, max_pixels: u64) -> VecDeque<Step> {
-    let TargetDesc { width, height, .. } = target.desc;
-    let bands = Band::divide([width, height], max_pixels);
-    let of_bands = |pass: fn(Band) -> BandPass| bands.iter().copied().map(pass);
-    let mut visibility: Vec<BandPass> = of_bands(BandPass::Visibility).collect();
-    visibility.push(BandPass::RecordVisible);
-    let blended = match (&target.blend_layer, &target.oit) {
-        (_, Some(_)) => {
-            of_bands(BandPass::OitCount).chain([BandPass::OitSumCounts]).chain(of_bands(BandPass::OitBlend)).collect()
-        }
-        (Some(_), None) => of_bands(BandPass::Blended).collect(),
-        (None, None) => Vec::new(),
-    };
-    let bloom = passes::post::bloom_steps(target).flat_map(|(step, image)| {
-        let bands = Band::divide([image.desc.width, image.desc.height], max_pixels);
-        bands.into_iter().map(move |band| BandPass::Bloom(step, band))
-    });
-    let mut groups = vec![
-        (Pass::Visibility, visibility),
-        (Pass::Blended, blended),
-        (Pass::Shade, of_bands(BandPass::Shade).collect()),
-        (Pass::Bloom, bloom.collect()),
-        (Pass::Encode, of_bands(BandPass::Encode).collect()),
-    ];
-    if has_readback && bands.len() > 1 {
-        let bands = Band::divide([width, height], max_pixels.min(MAX_BAND_PIXELS));
-        groups.push((Pass::Read, bands.into_iter().map(BandPass::Read).collect()));
-    } else if has_readback {
-        groups.push((Pass::Read, of_bands(BandPass::Read).collect()));
-    }
-    let mut steps = VecDeque::from([Step::ComputeRaster, Step::Shadow, Step::Cull]);
-    for (pass, band_passes) in groups {
-        if bands.len() > 1 {
-            steps.extend(band_passes.into_iter().map(|band_pass| Step::Passes(pass, vec![band_pass])));
-        } else {
-            steps.push_back(Step::Passes(pass, band_passes));
-        }
-    }
-    steps
 }
 
 /// How a frame is drawn, without the rasterizers, which are known when it is finished.

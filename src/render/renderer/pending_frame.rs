@@ -1,6 +1,7 @@
 //! Frames in flight, and their mapped pixels.
 
 use std::cell::Cell;
+use std::rc::Rc;
 use std::time::{Duration, Instant};
 
 use rayon::prelude::*;
@@ -8,6 +9,7 @@ use rayon::prelude::*;
 use super::frame_readback::FrameReadback;
 use crate::device::gl::{Fence, PassTimer, ReadbackView, SpanTimer};
 use crate::pass::{FrameTimes, Pass, RenderStage};
+use crate::pieces::{OutputClass, OutputCosts};
 use crate::resources::target_desc::TargetDesc;
 use crate::types::{FrameImage, FrameInfo, FrameStats};
 use modalcast_model::error::{Error, Result};
@@ -32,6 +34,9 @@ pub struct PendingFrame {
     pub(super) stats: FrameStats,
     /// Without the rasterizers, which `stats` contains.
     pub(super) info: FrameInfo,
+    pub(super) class: OutputClass,
+    /// Receives the time of the frame.
+    pub(super) costs: Rc<OutputCosts>,
     /// Maximum time from `first_wait` until the frame is finished.
     pub(super) timeout: Duration,
     /// When the host first polled or waited for the frame.

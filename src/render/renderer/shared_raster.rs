@@ -2,6 +2,7 @@
 
 use super::Renderer;
 use crate::passes::raster;
+use crate::pieces::{OutputClass, OutputKind};
 use crate::resources::compute_rasterizer::RasterPasses;
 use crate::resources::scene_buffers::SceneBuffers;
 use crate::resources::shared_targets::StepViews;
@@ -16,7 +17,7 @@ impl Renderer {
     /// so that several frames need one change. Without this call, or after an error of shared memory, the frame itself draws
     /// these passes into mapped buffers.
     ///
-    /// Does nothing if OpenGL draws all passes.
+    /// Does nothing if OpenGL draws all passes, or if the frame may take long and is therefore drawn in pieces.
     ///
     /// # Errors
     /// `Invalid` for a size above the limit or a camera whose matrices overflow; `DeviceLost`; errors of `ahead`.
@@ -34,7 +35,9 @@ impl Renderer {
         let enabled = RasterPasses { visibility: enabled.visibility && samples == 1, ..enabled };
         let is_shadow_stale = buffers.shadow_cache.is_stale(buffers.shadow_key(params));
         let passes = RasterPasses { shadow: enabled.shadow && is_shadow_stale, ..enabled };
-        if !passes.has_any() {
+        let draws_shadow = buffers.shadow.is_some() && is_shadow_stale;
+        let class = OutputClass::new(OutputKind::Frame { draws_shadow }, [params.width, params.height], samples);
+        if !passes.has_any() || buffers.costs.has_pieces(class, self.output_limits.pieces) {
             return Ok(());
         }
         let views = raster::views(buffers, params, passes)?;

@@ -16,6 +16,7 @@ use super::shared_targets::{
     DEPTH_BYTES, KEY_BYTES, RasterViews, SharedDrawTime, SharedTargets, StepViews, reserve_output,
 };
 use crate::device::gl::{self, Buffer, Gl, Program};
+use crate::pieces::PieceRange;
 use crate::shaders::ShaderOptions;
 use modalcast_model::error::{Error, Result, fault};
 use modalcast_model::memory::{MemoryBudget, MemoryReservation};
@@ -158,12 +159,13 @@ impl ComputeRasterizer {
         self.enabled.set(RasterPasses::NONE);
     }
 
-    /// Draws the depth of the shadow map, the visibility of the frame, or both, into mapped buffers.
+    /// Draws triangles of a range into the depth of the shadow map, the visibility of the frame, or both, in mapped
+    /// buffers. The range that begins with the first triangle clears them before.
     ///
     /// # Errors
     /// Errors of the rasterizer; `OutOfMemory`; `Fault` if the rasterizer panics or OpenGL has no memory for the
     /// output.
-    pub(crate) fn draw(&self, gl: &Rc<Gl>, views: &RasterViews) -> Result<()> {
+    pub(crate) fn draw(&self, gl: &Rc<Gl>, views: &RasterViews, range: PieceRange) -> Result<()> {
         let depths = match self.outputs.shadow.as_ref().zip(views.shadow.as_ref()) {
             Some((depths, viewport)) => {
                 Some((viewport, depths.buffer.reserve(gl, &self.budget, DEPTH_BYTES * viewport.pixel_count() as u64)?))
@@ -179,7 +181,8 @@ impl ComputeRasterizer {
         // `Rasterizer::draw` borrows the handles.
         let depths = depths.as_ref().map(|(viewport, buffer)| (*viewport, buffer));
         let keys = keys.as_ref().map(|(viewport, buffer)| (*viewport, buffer));
-        self.run(|rasterizer| rasterizer.draw(depths, keys))
+        let [first, end] = [range.first, range.end].map(|triangle| u32::try_from(triangle).unwrap_or(u32::MAX));
+        self.run(|rasterizer| rasterizer.draw(depths, keys, first..end))
     }
 
     /// Draws into shared memory, and makes the result the input of the next frame ([`SharedTargets::draw`]). After an

@@ -1,6 +1,6 @@
 //! Device resources of one scene: buffers, texture arrays, shadow map and programs, as listed in its plan.
 
-use std::cell::{Cell, OnceCell};
+use std::cell::OnceCell;
 use std::rc::Rc;
 use std::sync::Arc;
 
@@ -17,6 +17,7 @@ use crate::layout::{
     CORNER_NORMAL_UNIT, FIXED_TEXTURE_READS, MATERIAL_UNIT, TANGENT_UNIT, TRIANGLE_CORNER_UNIT, TRIANGLE_MATERIAL_UNIT,
     TRIANGLE_VERTEX_UNIT, UV_UNIT,
 };
+use crate::pieces::{OutputCosts, PieceRange};
 use crate::plan::buffers::{BufferName, GeometryBuffers, MaterialBuffers, SceneBufferSet, UniformBuffers};
 use crate::plan::features::ShaderFeatures;
 use crate::plan::{Allocation, RenderPlan, ScenePlan};
@@ -85,8 +86,8 @@ pub struct SceneBuffers {
     pub(crate) values: Option<VertexValues>,
     /// Marks of the edges inside of polygons; allocated by the first frame with lines along mesh edges.
     pub(crate) inner_edges: OnceCell<Buffer>,
-    /// Bit mask of the numbers of samples per pixel (1, 4) of the frames that were drawn.
-    drawn_samples: Cell<u32>,
+    /// Device times of recent outputs. Frames in flight record theirs.
+    pub(crate) costs: Rc<OutputCosts>,
     plan: RenderPlan,
     /// Names and sizes of the plan's buffers as they were allocated, sorted by name.
     plan_allocations: Vec<Allocation>,
@@ -261,7 +262,7 @@ impl SceneBuffers {
             rebased: None,
             values: None,
             inner_edges: OnceCell::new(),
-            drawn_samples: Cell::new(0),
+            costs: Rc::default(),
             plan,
             plan_allocations,
         })
@@ -343,20 +344,16 @@ impl SceneBuffers {
         compile(self.options.aov(field, samples))
     }
 
-    /// Whether a frame with this number of samples per pixel was drawn, so that the driver has compiled its programs.
-    pub(crate) fn is_drawn_with(&self, samples: u32) -> bool {
-        self.drawn_samples.get() & samples != 0
-    }
-
-    pub(crate) fn mark_drawn_with(&self, samples: u32) {
-        self.drawn_samples.set(self.drawn_samples.get() | samples);
-    }
-
-    /// First triangle and number of triangles with this blend mode; they are contiguous.
-    pub(crate) fn triangle_range(&self, blend_mode: BlendMode) -> (usize, usize) {
+    /// The triangles with this blend mode, which are contiguous.
+    pub(crate) fn triangle_range(&self, blend_mode: BlendMode) -> PieceRange {
         let mut groups = self.groups.iter().filter(|group| group.blend_mode == blend_mode);
-        let first_range = groups.next().map_or((0, 0), |group| (group.first_triangle, group.triangle_count));
-        groups.fold(first_range, |(first_triangle, count), group| (first_triangle, count + group.triangle_count))
+        let first_triangle = groups.clone().next().map_or(0, |group| group.first_triangle);
+        PieceRange::new(first_triangle, groups.by_ref().map(|group| group.triangle_count).sum())
+    }
+
+    /// All triangles of the scene.
+    pub(crate) fn all_triangles(&self) -> PieceRange {
+        PieceRange::new(0, self.scene.layout.triangles)
     }
 
     /// Domain of a triangle, and its index in the mesh of the domain. `triangle` is an index in the draw order: an id

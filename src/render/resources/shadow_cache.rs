@@ -5,7 +5,6 @@
 use std::cell::Cell;
 
 use crate::types::FrameParams;
-use modalcast_model::error::Result;
 use modalcast_model::scene::{BoundingBox, OrientedBounds};
 
 /// Step of the current vertices, and content of the map.
@@ -48,15 +47,8 @@ impl ShadowCache {
         key.is_none() || key != self.content.get()
     }
 
-    /// Calls `draw` unless the map already has this content, and returns whether the map was drawn. If `draw` fails,
-    /// the content is invalid.
-    pub(crate) fn draw_if_stale(&self, key: Option<ShadowKey>, draw: impl FnOnce() -> Result<()>) -> Result<bool> {
-        let is_stale = self.is_stale(key);
-        self.content.take();
-        if is_stale {
-            draw()?;
-        }
+    /// Sets the content of the map; none before the map is drawn.
+    pub(crate) fn set_content(&self, key: Option<ShadowKey>) {
         self.content.set(key);
-        Ok(is_stale)
     }
 }

@@ -3,6 +3,7 @@
 //! up to a few samples on edges, and each frame reports the rasterizer that drew it.
 
 use std::cell::Cell;
+use std::ops::Range;
 use std::rc::Rc;
 use std::sync::Arc;
 
@@ -89,18 +90,21 @@ impl Rasterizer for ReferenceRasterizer {
         Ok(())
     }
 
-    fn draw(&mut self, depth: Option<DrawTarget<'_>>, ids: Option<DrawTarget<'_>>) -> Result<()> {
+    /// Draws all triangles up to the end of the range, so that it need not read the samples of earlier ranges.
+    fn draw(&mut self, depth: Option<DrawTarget<'_>>, ids: Option<DrawTarget<'_>>, range: Range<u32>) -> Result<()> {
         if let Some((viewport, target)) = depth {
-            let all_triangles = DrawRange {
-                first_triangle: 0,
-                triangle_count: self.mesh.triangles.len() as u32,
-                cull_mode: CullMode::None,
-            };
-            self.write(target, bytemuck::cast_slice(&self.rasterize(viewport, &[all_triangles]).depths()))?;
+            let triangle_count = (self.mesh.triangles.len() as u32).min(range.end);
+            let triangles = DrawRange { first_triangle: 0, triangle_count, cull_mode: CullMode::None };
+            self.write(target, bytemuck::cast_slice(&self.rasterize(viewport, &[triangles]).depths()))?;
         }
         let Some((viewport, target)) = ids else { return Ok(()) };
+        let cut_group = |group: &DrawRange| DrawRange {
+            triangle_count: group.triangle_count.min(range.end.saturating_sub(group.first_triangle)),
+            ..*group
+        };
+        let groups: Vec<DrawRange> = self.mesh.groups.iter().map(cut_group).collect();
         // A sample has a 64-bit key: the inverted bits of its depth above its triangle id.
-        self.write(target, bytemuck::cast_slice(&self.rasterize(viewport, &self.mesh.groups).keys))
+        self.write(target, bytemuck::cast_slice(&self.rasterize(viewport, &groups).keys))
     }
 }
 
@@ -499,7 +503,7 @@ impl Rasterizer for FailingRasterizer {
         Ok(())
     }
 
-    fn draw(&mut self, _depth: Option<DrawTarget<'_>>, _ids: Option<DrawTarget<'_>>) -> Result<()> {
+    fn draw(&mut self, _depth: Option<DrawTarget<'_>>, _ids: Option<DrawTarget<'_>>, _range: Range<u32>) -> Result<()> {
         self.draw_calls.set(self.draw_calls.get() + 1);
         (self.failure)()
     }
@@ -579,7 +583,7 @@ impl Rasterizer for UncompiledRasterizer {
         Err(invalid("raster", "a compiler", "none"))
     }
 
-    fn draw(&mut self, _depth: Option<DrawTarget<'_>>, _ids: Option<DrawTarget<'_>>) -> Result<()> {
+    fn draw(&mut self, _depth: Option<DrawTarget<'_>>, _ids: Option<DrawTarget<'_>>, _range: Range<u32>) -> Result<()> {
         panic!("expected no draw call after a failed compilation");
     }
 }

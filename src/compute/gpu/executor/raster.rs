@@ -19,6 +19,8 @@ mod cuda_rasterizer;
 mod cut_out;
 mod variant;
 
+use std::ops::Range;
+
 use bytemuck::{Pod, Zeroable};
 use cudarc::driver::sys::{self, CUdevice_attribute};
 use cudarc::driver::{CudaFunction, LaunchConfig};
@@ -125,7 +127,7 @@ impl RasterFunctions {
 }
 
 /// The inputs and the target of one pass.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone)]
 pub struct RasterPass<'a> {
     pub functions: &'a RasterFunctions,
     pub groups: &'a [DrawRange],
@@ -134,6 +136,8 @@ pub struct RasterPass<'a> {
     pub positions: u64,
     /// Device address of the samples, one per pixel: [`RasterVariant::bytes`] bytes.
     pub target: u64,
+    /// Only these triangles are drawn. A range that begins at 0 clears the samples first.
+    pub range: Range<u32>,
 }
 
 /// A mesh's triangles on the device, and the queues between the kernels.
@@ -177,7 +181,7 @@ impl RasterPipeline {
         self.cut_outs.is_some()
     }
 
-    /// Clears the target and draws into it, on the device's stream.
+    /// Clears the target if the range of the pass begins at 0, and draws into it, on the device's stream.
     ///
     /// # Safety
     /// [`check_mesh`] accepted this mesh and the groups of the pass for the number of vertices at `positions`.
@@ -195,7 +199,7 @@ impl RasterPipeline {
         // triangles. The queues have capacity for each triangle. The caller guarantees positions and target.
         let start = |function, blocks, args| unsafe { start(device, function, blocks, args) };
         for group in pass.groups {
-            let (opaque_range, cut_out_range) = self.split(*group);
+            let (opaque_range, cut_out_range) = self.split(intersect(*group, &pass.range));
             for (function, range) in
                 [(Some(&functions.raster), opaque_range), (functions.raster_cut_outs.as_ref(), cut_out_range)]
             {
@@ -269,18 +273,21 @@ impl RasterPipeline {
         }
     }
 
-    /// Empties the queues and clears the samples.
+    /// Empties the queues, and clears the samples if the range of the pass begins at 0.
     ///
     /// # Safety
     /// The target of the pass has at least as many bytes as all samples of its window ([`RasterVariant::bytes`]).
     unsafe fn clear(&self, device: &Device, pass: &RasterPass<'_>) -> Result<()> {
         let variant = pass.functions.variant;
         let clear_word = if variant.depth_only { FAR_DEPTH } else { EMPTY_SAMPLE };
-        let words = variant.bytes(pass.window) / 4;
+        let words = if pass.range.start == 0 { variant.bytes(pass.window) / 4 } else { 0 };
         let counter_words = size_of::<RasterCounters>() as u64 / 4;
         for (address, word, word_count) in
             [(pass.target, clear_word, words), (self.counters.address(), 0, counter_words)]
         {
+            if word_count == 0 {
+                continue;
+            }
             let stream = device.stream().cu_stream();
             // SAFETY: the counters are one `RasterCounters`, and the caller guarantees the target. The stream orders
             // the writes before their readers.
@@ -289,6 +296,13 @@ impl RasterPipeline {
         }
         Ok(())
     }
+}
+
+/// The part of a group in a range of triangles; without triangles if there is none.
+fn intersect(group: DrawRange, range: &Range<u32>) -> DrawRange {
+    let first_triangle = group.first_triangle.max(range.start);
+    let end = (group.first_triangle + group.triangle_count).min(range.end);
+    DrawRange { first_triangle, triangle_count: end.saturating_sub(first_triangle), ..group }
 }
 
 /// Starts a kernel of `blocks` blocks on the device's stream.

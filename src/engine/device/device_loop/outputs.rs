@@ -29,7 +29,7 @@ impl DeviceLoop {
             },
             ..taken
         });
-        let charge = Charge { class, charged_ms: 0.0, spent_ms: 0.0, is_recorded: true };
+        let charge = Charge { is_recorded: true, ..Charge::new(class, 0.0) };
         let output = PartialOutput { kind: PartialKind::Preparation(preparation), charge };
         self.queue.push_continuation(id, output.step_class());
         self.partial_outputs.insert(id, output);
@@ -106,7 +106,8 @@ impl DeviceLoop {
                 return output.reply_error(error);
             }
             if output.has_breaks() && !output.is_submitted() {
-                output.charge.spent_ms += ms_since(begin);
+                output.charge.last_submit_ms = ms_since(begin);
+                output.charge.spent_ms += output.charge.last_submit_ms;
                 if !output.charge.is_recorded {
                     let Charge { class, charged_ms, spent_ms, .. } = output.charge;
                     self.queue.record_cost(id, class, charged_ms, spent_ms);
@@ -123,7 +124,7 @@ impl DeviceLoop {
 
     /// Charges a scene for a finished output, which took `total_ms` in all steps.
     pub(super) fn record_output_cost(&self, id: SceneId, charge: Charge, total_ms: f64) {
-        let Charge { class, charged_ms, spent_ms, is_recorded } = charge;
+        let Charge { class, charged_ms, spent_ms, is_recorded, .. } = charge;
         match is_recorded {
             true => self.queue.charge(id, total_ms - spent_ms),
             false => self.queue.record_cost(id, class, charged_ms, total_ms),

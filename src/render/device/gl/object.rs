@@ -164,15 +164,21 @@ impl Buffer {
 
     /// Overwrites the first `data.len()` bytes.
     pub(crate) fn write(&self, data: &[u8]) {
+        self.write_at(0, data);
+    }
+
+    /// Overwrites `data.len()` bytes from `offset` on.
+    pub(crate) fn write_at(&self, offset: u64, data: &[u8]) {
         let gl = &self.object.gl;
-        if data.len() as u64 > self.bytes {
-            return gl.record_skipped(format!("expected a write of at most {} bytes, got {}", self.bytes, data.len()));
+        if offset.checked_add(data.len() as u64).is_none_or(|end| end > self.bytes) {
+            let reason = format!("expected a write within {} bytes, got {} at byte {offset}", self.bytes, data.len());
+            return gl.record_skipped(reason);
         }
         let Some(gl) = gl.functions_or_skip() else { return };
         // SAFETY: the data fits into the buffer.
         unsafe {
             gl.bind_buffer(glow::COPY_WRITE_BUFFER, Some(self.object.name));
-            gl.buffer_sub_data_u8_slice(glow::COPY_WRITE_BUFFER, 0, data);
+            gl.buffer_sub_data_u8_slice(glow::COPY_WRITE_BUFFER, offset as i32, data);
         }
     }
 
@@ -372,6 +378,11 @@ impl Program {
     /// program.
     pub(crate) fn set_first_row(&self, first_row: u32) {
         self.set_uniform(2, first_row as i32);
+    }
+
+    /// Sets the first tile of the tile list that the next dispatch processes (location 2). This must be the bound program.
+    pub(crate) fn set_first_tile(&self, first_tile: u32) {
+        self.set_uniform(2, first_tile as i32);
     }
 
     fn set_uniform(&self, location: u32, value: i32) {

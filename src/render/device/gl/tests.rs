@@ -90,7 +90,9 @@ fn ranges_beyond_a_buffer_are_errors_without_an_opengl_call() {
         gl.check("test").expect("no error of OpenGL");
     };
     target.write(&[9; 9]);
-    assert_rejected("expected a write of at most 8 bytes, got 9");
+    assert_rejected("expected a write within 8 bytes, got 9 at byte 0");
+    target.write_at(6, &[9; 3]);
+    assert_rejected("expected a write within 8 bytes, got 3 at byte 6");
     target.bind_uniform(0, 9);
     assert_rejected("expected at most 8 bytes of uniforms, got 9");
     let full_copy = BufferCopy::first(8, &source, &target);

@@ -7,7 +7,7 @@ use modalcast_compute::gpu::RasterVariant;
 use modalcast_compute::gpu::launch::DeviceBuffer;
 use modalcast_compute::gpu::launchers::{RasterFunctions, RasterPass, RasterPipeline, check_cut_outs, check_mesh};
 use modalcast_model::error::Result;
-use modalcast_model::raster::CutOuts;
+use modalcast_model::raster::{ALL_TRIANGLES, CutOuts};
 use modalcast_model::scene::{DrawRange, Viewport};
 
 /// The mesh to draw.
@@ -143,6 +143,7 @@ impl KernelBenchmark for RasterBenchmark {
             window: &self.viewport,
             positions: self.positions.address(),
             target: self.target.address(),
+            range: ALL_TRIANGLES,
         };
         // SAFETY: `new` checked mesh and groups. Both buffers have the sizes of the pass, and releasing device memory
         // is stream-ordered.

@@ -1,6 +1,7 @@
 //! The compute rasterizer on OpenGL's buffers, or on memory that OpenGL imports. It can replace OpenGL's depth pass and id
 //! pass.
 
+use std::ops::Range;
 use std::rc::Rc;
 use std::sync::Arc;
 
@@ -15,7 +16,7 @@ use crate::gpu::launch::error::cuda_error;
 use crate::gpu::launch::{Device, ExportedMemory};
 use modalcast_model::error::{Error, Result, fault};
 use modalcast_model::fault_injection::{self, InjectionPoint};
-use modalcast_model::raster::{DrawTarget, GlBuffer, NewTarget, RasterGeometry, Rasterizer, SharedDraw};
+use modalcast_model::raster::{ALL_TRIANGLES, DrawTarget, GlBuffer, NewTarget, RasterGeometry, Rasterizer, SharedDraw};
 use modalcast_model::scene::{CullMode, DrawRange};
 
 /// Bytes of a vertex position.
@@ -127,7 +128,12 @@ impl CudaRasterizer {
     }
 
     /// Draws the depth pass, the id pass or both, with all buffers mapped together.
-    fn draw_passes(&mut self, depth: Option<DrawTarget<'_>>, ids: Option<DrawTarget<'_>>) -> Result<()> {
+    fn draw_passes(
+        &mut self,
+        depth: Option<DrawTarget<'_>>,
+        ids: Option<DrawTarget<'_>>,
+        range: &Range<u32>,
+    ) -> Result<()> {
         let Self { positions, depth: depth_pass, ids: id_pass, interop, pipeline, device, .. } = self;
         let _current = device.enter()?;
         let mut prepared = Vec::new();
@@ -151,7 +157,7 @@ impl CudaRasterizer {
         with_mapped(device, &mut mappings, |addresses| {
             let Some((&positions, targets)) = addresses.split_first() else { return Ok(()) };
             passes.iter().zip(targets).try_for_each(|((window, functions, groups), &target)| {
-                let pass = RasterPass { functions, groups, window, positions, target };
+                let pass = RasterPass { functions, groups, window, positions, target, range: range.clone() };
                 // SAFETY: `new` checked mesh and groups against the size of the positions, and this function checked
                 // the size of the target. The mapping checks that the buffers have these sizes, and they stay
                 // registered until `release` or `drop` has waited for the pass.
@@ -171,7 +177,8 @@ impl CudaRasterizer {
             let target = CudaRange::address_of(range, device, pass_state.variant.bytes(window))?;
             pass_state.ensure_compiled(device, pipeline)?;
             let Some(functions) = &pass_state.functions else { continue };
-            let pass = RasterPass { functions, groups: &pass_state.groups, window, positions, target };
+            let groups = &pass_state.groups;
+            let pass = RasterPass { functions, groups, window, positions, target, range: ALL_TRIANGLES };
             // SAFETY: `new` checked mesh and groups against the size of OpenGL's buffer of positions, and the shared
             // positions have at least this size. The target has the bytes of the pass. `draw_shared` borrows the handles
             // of both until the passes have ended.
@@ -189,8 +196,8 @@ fn new_timed_events(device: &Device) -> Result<[CudaEvent; 2]> {
 
 impl Rasterizer for CudaRasterizer {
     /// Draws the requested passes. After a failure the targets are unregistered.
-    fn draw(&mut self, depth: Option<DrawTarget<'_>>, ids: Option<DrawTarget<'_>>) -> Result<()> {
-        let result = if depth.is_some() || ids.is_some() { self.draw_passes(depth, ids) } else { Ok(()) };
+    fn draw(&mut self, depth: Option<DrawTarget<'_>>, ids: Option<DrawTarget<'_>>, range: Range<u32>) -> Result<()> {
+        let result = if depth.is_some() || ids.is_some() { self.draw_passes(depth, ids, &range) } else { Ok(()) };
         if result.is_err() {
             self.depth.release(&self.device);
             self.ids.release(&self.device);
