@@ -36,7 +36,6 @@ use crate::layout::cull::MAX_LEVEL;
 use crate::layout::{DEPTH_UNIT, TRIANGLE_ID_UNIT, pack_size};
 use crate::pass::Pass;
 use crate::pieces::PieceRange;
-use crate::plan::buffers::CullBuffers;
 use crate::region::Band;
 use crate::resources::cull::CullResources;
 use crate::resources::depth_pyramid::DepthPyramid;
@@ -69,10 +68,10 @@ fn cull_and_compact(recorder: &PassRecorder<'_>, pass: Pass, cull_resources: &Cu
 /// are drawn. The indices beyond the end of each list are then 0, so that they draw nothing.
 fn begin_lists(recorder: &PassRecorder<'_>, pass: Pass, cull_resources: &CullResources, has_pieces: bool) {
     recorder.begin(pass);
-    let CullBuffers { draws, indices, .. } = &cull_resources.buffers;
-    draws.write(&cull_resources.uniforms.empty_draws());
+    let buffers = &cull_resources.buffers;
+    buffers.draws.write(&cull_resources.uniforms.empty_draws());
     if has_pieces {
-        indices.write(&vec![0; indices.bytes as usize]);
+        buffers.indices.write(&vec![0; buffers.indices.bytes as usize]);
     }
     cull_resources.bind();
 }
