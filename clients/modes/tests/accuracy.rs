@@ -4,7 +4,7 @@
 mod solids;
 
 use modalcast_modes::modeling::to_hertz;
-use solids::{compute, cylinder, ellipsoid, parameters, rotated, solid_box};
+use solids::{BOX, CYLINDER, ELLIPSOID, SPHERE, compute, cylinder, ellipsoid, parameters, rotated, solid_box};
 
 /// The largest relative difference to the reference frequencies.
 fn worst_difference(eigenvalues: &[f64], reference: &[f64]) -> f64 {
@@ -15,13 +15,10 @@ fn worst_difference(eigenvalues: &[f64], reference: &[f64]) -> f64 {
     differences.fold(0.0, |largest, difference| if difference <= largest { largest } else { difference })
 }
 
-const BOX: [f64; 10] = [7.577, 9.163, 11.757, 14.721, 14.797, 15.252, 16.019, 16.852, 18.957, 19.664];
-const ELLIPSOID: [f64; 10] = [11.852, 13.311, 16.263, 19.571, 20.948, 20.954, 22.029, 23.347, 26.868, 27.918];
-
 #[test]
 fn rotated_box_has_the_exact_frequencies() {
     let modeling = compute(&rotated(solid_box([1.0, 0.7, 0.4]), 1), &parameters(6000, 10));
-    let difference = worst_difference(&modeling.eigenvalues, &BOX);
+    let difference = worst_difference(&modeling.eigenvalues, &BOX[..10]);
     assert!(
         difference < 0.005,
         "{difference}: {:?}",
@@ -31,14 +28,14 @@ fn rotated_box_has_the_exact_frequencies() {
     assert!((modeling.mass - 280.0).abs() < 0.5, "{}", modeling.mass);
     let worst_estimate = modeling.frequency_errors.iter().copied().fold(0.0, f64::max);
     assert!(modeling.frequency_errors.len() == 10 && worst_estimate < 0.03, "{worst_estimate}");
-    let control = worst_difference(&modeling.eigenvalues, &ELLIPSOID);
+    let control = worst_difference(&modeling.eigenvalues, &ELLIPSOID[..10]);
     assert!(control > 0.1, "control: {control}");
 }
 
 #[test]
 fn rotated_ellipsoid_has_the_exact_frequencies() {
     let modeling = compute(&rotated(ellipsoid([0.5, 0.35, 0.2], 60), 2), &parameters(6000, 10));
-    let difference = worst_difference(&modeling.eigenvalues, &ELLIPSOID);
+    let difference = worst_difference(&modeling.eigenvalues, &ELLIPSOID[..10]);
     assert!(difference < 0.005, "{difference}");
 }
 
@@ -46,22 +43,20 @@ fn rotated_ellipsoid_has_the_exact_frequencies() {
 #[test]
 fn sphere_has_complete_clusters() {
     let modeling = compute(&rotated(ellipsoid([0.5; 3], 40), 3), &parameters(6000, 20));
-    let clusters = [(15.614, 5), (16.519, 5), (22.036, 3), (24.126, 7)];
+    assert!(worst_difference(&modeling.eigenvalues, &SPHERE) < 0.01, "{:?}", modeling.eigenvalues);
     let mut first = 0;
-    for (reference, count) in clusters {
+    for count in [5, 5, 3, 7] {
         let cluster = &modeling.eigenvalues[first..first + count];
-        first += count;
-        assert!(worst_difference(cluster, &vec![reference; count]) < 0.01, "{reference}: {cluster:?}");
         let spread = (cluster[count - 1] / cluster[0]).sqrt() - 1.0;
-        assert!(spread < 0.003, "{reference}: spread {spread}");
+        assert!(spread < 0.003, "{}: spread {spread}", SPHERE[first]);
+        first += count;
     }
 }
 
 #[test]
 fn cylinder_has_the_exact_frequencies() {
-    let reference = [9.658, 9.658, 9.806, 15.569, 17.868, 17.868, 19.612, 26.108, 26.108];
     let modeling = compute(&rotated(cylinder(0.25, 1.0, 96), 4), &parameters(6000, 9));
-    let difference = worst_difference(&modeling.eigenvalues, &reference);
+    let difference = worst_difference(&modeling.eigenvalues, &CYLINDER[..9]);
     assert!(difference < 0.005, "{difference}");
 }
 

@@ -1,11 +1,30 @@
-//! Solids for tests: surfaces whose modes are known.
+//! Solids for tests and for `modalcast report dynamics`: surfaces whose modes are known.
 
-#![allow(dead_code, reason = "each test uses some of the solids")]
+#![allow(dead_code, reason = "each test and the report use some of the solids")]
 
 use modalcast_modes::materials::Material;
 use modalcast_modes::surface_file::{DrawnMesh, SurfaceFile};
 use modalcast_modes::{Modeling, ModelingParameters, compute_modes};
 use nalgebra::{Rotation3, Unit, Vector3};
+
+/// The first 20 frequencies of free solids in Hz, by the Rayleigh-Ritz method with polynomials of degree 18, 14, 14 and 18.
+/// Two degrees less change them by at most 4e-6.
+pub(crate) const BOX: [f64; 20] = [
+    7.576_96, 9.163_03, 11.756_61, 14.720_34, 14.797_15, 15.252_21, 16.018_73, 16.851_24, 18.955_81, 19.663_56,
+    19.682_62, 20.090_77, 22.632_49, 23.066_85, 23.212_93, 23.223_95, 23.701_63, 24.040_95, 24.420_39, 24.768_56,
+];
+pub(crate) const ELLIPSOID: [f64; 20] = [
+    11.851_92, 13.310_75, 16.263_10, 19.570_45, 20.947_58, 20.953_63, 22.028_99, 23.346_53, 26.867_76, 27.917_67,
+    28.282_01, 28.510_24, 29.770_91, 30.392_80, 30.512_95, 30.593_73, 30.956_93, 34.300_31, 35.415_11, 35.542_02,
+];
+pub(crate) const SPHERE: [f64; 20] = [
+    15.613_50, 15.613_50, 15.613_50, 15.613_50, 15.613_50, 16.519_20, 16.519_20, 16.519_20, 16.519_20, 16.519_20,
+    22.036_19, 22.036_19, 22.036_19, 24.125_66, 24.125_66, 24.125_66, 24.125_66, 24.125_66, 24.125_66, 24.125_66,
+];
+pub(crate) const CYLINDER: [f64; 20] = [
+    9.657_77, 9.657_77, 9.805_81, 15.568_89, 17.867_59, 17.867_59, 19.611_61, 26.107_78, 26.107_78, 26.439_85,
+    26.439_85, 26.559_62, 26.559_62, 26.789_81, 26.789_81, 29.045_34, 29.321_36, 29.321_36, 29.417_42, 30.408_53,
+];
 
 /// The first eight frequencies of the free plate 1 x 0.6 x 0.01 m, Hz, by the Rayleigh-Ritz method.
 pub(crate) const PLATE: [f64; 8] = [0.326_49, 0.337_70, 0.764_10, 0.899_45, 0.935_00, 1.175_20, 1.378_78, 1.684_39];
