@@ -17,6 +17,7 @@
 pub mod bench;
 pub mod cli;
 mod cpu_bandwidth;
+mod csv_table;
 mod cuda_variants;
 mod double_double;
 pub mod drift;

@@ -21,56 +21,66 @@ pub struct Recommendation {
     pub equally_fast: Vec<String>,
 }
 
-/// A complete step within a limit.
-struct Candidate<'a> {
-    name: &'a str,
-    value: TimeAndError,
-    error_meters: f64,
-}
-
-/// The recommendations for the rows of one load, by ascending limit: one for the smallest power of ten that some variant
-/// keeps, and one for each larger power that allows another variant. Only complete steps with warm caches are compared.
+/// The recommendations for the rows of one load, by ascending limit. Only complete steps with warm caches are compared.
 pub fn recommend<'a>(rows: impl Iterator<Item = &'a DeformRow>) -> Vec<Recommendation> {
     let is_comparable = |row: &&DeformRow| row.cache == CacheState::Warm && is_complete_step(row.backend, &row.name);
-    let candidates: Vec<Candidate<'_>> = rows
-        .filter(is_comparable)
-        .filter_map(|row| {
-            let error_meters = row.validation.as_ref()?.errors.meters.largest;
-            Some(Candidate { name: &row.name, value: row.time_and_error()?, error_meters })
-        })
-        .collect();
-    // An error of 0, as of a rigid scene with exact transforms, is within every limit.
-    let decade = |candidate: &Candidate<'_>| candidate.error_meters.max(MIN_LIMIT).log10().ceil() as i32;
-    let (Some(first), Some(last)) = (candidates.iter().map(decade).min(), candidates.iter().map(decade).max()) else {
-        return Vec::new();
-    };
-    let mut recommendations: Vec<Recommendation> = Vec::new();
-    for limit_meters in (first..=last).map(|exponent| 10_f64.powi(exponent)) {
-        let recommendation = recommend_within(&candidates, limit_meters);
-        let is_new = |new: &Recommendation| recommendations.last().is_none_or(|last| last.variant != new.variant);
-        recommendations.extend(recommendation.filter(is_new));
+    let (mut names, mut points) = (Vec::new(), Vec::new());
+    for row in rows.filter(is_comparable) {
+        let (Some(validation), Some(value)) = (&row.validation, row.time_and_error()) else { continue };
+        names.push(&row.name);
+        points.push(TimeAndError { error: validation.errors.meters.largest, ..value });
     }
-    recommendations
+    let recommendation = |choice: LimitChoice| Recommendation {
+        limit_meters: choice.limit,
+        variant: names[choice.best].clone(),
+        median_us: points[choice.best].time_us,
+        largest_error_meters: points[choice.best].error,
+        equally_fast: choice.equally_fast.iter().map(|index| names[*index].clone()).collect(),
+    };
+    choose_by_limit(&points).into_iter().map(recommendation).collect()
 }
 
-/// Smallest limit, meters. An error below it is of no interest.
+/// The point that is recommended for one limit of the error.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct LimitChoice {
+    /// A power of ten.
+    pub(crate) limit: f64,
+    /// Of the points within the limit whose times differ from the shortest one only by noise, the one with the smallest
+    /// error.
+    pub(crate) best: usize,
+    /// Further points within the limit whose times differ from the shortest one only by noise.
+    pub(crate) equally_fast: Vec<usize>,
+}
+
+/// Smallest limit, meters or relative. An error below it is of no interest.
 const MIN_LIMIT: f64 = 1e-9;
 
-fn recommend_within(candidates: &[Candidate<'_>], limit_meters: f64) -> Option<Recommendation> {
+/// Chooses points by ascending limit: one for the smallest power of ten that some point keeps, and one for each larger
+/// power that allows another point.
+pub(crate) fn choose_by_limit(points: &[TimeAndError]) -> Vec<LimitChoice> {
+    // An error of 0, as of a rigid scene with exact transforms, is within every limit.
+    let decades = || points.iter().map(|point| point.error.max(MIN_LIMIT).log10().ceil() as i32);
+    let (Some(first), Some(last)) = (decades().min(), decades().max()) else { return Vec::new() };
+    let mut choices: Vec<LimitChoice> = Vec::new();
+    for limit in (first..=last).map(|exponent| 10_f64.powi(exponent)) {
+        let choice = choose_within(points, limit);
+        let is_new = |new: &LimitChoice| choices.last().is_none_or(|last| last.best != new.best);
+        choices.extend(choice.filter(is_new));
+    }
+    choices
+}
+
+fn choose_within(points: &[TimeAndError], limit: f64) -> Option<LimitChoice> {
     // The tolerance covers the rounding of powers of ten.
-    let within = || candidates.iter().filter(|candidate| candidate.error_meters <= limit_meters * (1.0 + 1e-12));
-    let fastest = within().min_by(|a, b| a.value.time_us.total_cmp(&b.value.time_us))?;
-    let mut group: Vec<&Candidate<'_>> =
-        within().filter(|candidate| candidate.value.has_time_of(&fastest.value)).collect();
-    group.sort_by(|a, b| a.error_meters.total_cmp(&b.error_meters).then(a.value.time_us.total_cmp(&b.value.time_us)));
+    let within = || (0..points.len()).filter(|index| points[*index].error <= limit * (1.0 + 1e-12));
+    let fastest = within().min_by(|a, b| points[*a].time_us.total_cmp(&points[*b].time_us))?;
+    let mut group: Vec<usize> = within().filter(|index| points[*index].has_time_of(&points[fastest])).collect();
+    group.sort_by(|a, b| {
+        let (a, b) = (&points[*a], &points[*b]);
+        a.error.total_cmp(&b.error).then(a.time_us.total_cmp(&b.time_us))
+    });
     let (best, others) = group.split_first()?;
-    Some(Recommendation {
-        limit_meters,
-        variant: best.name.to_owned(),
-        median_us: best.value.time_us,
-        largest_error_meters: best.error_meters,
-        equally_fast: others.iter().map(|candidate| candidate.name.to_owned()).collect(),
-    })
+    Some(LimitChoice { limit, best: *best, equally_fast: others.to_vec() })
 }
 
 /// The recommendations of all loads as a Markdown section; empty without recommendations. Each item is the name of a

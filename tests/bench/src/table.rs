@@ -1,9 +1,9 @@
 //! The result table of a report: one row per variant, load and cache state.
 
 use serde::Serialize;
-use serde_json::Value;
 
 use super::bench::MemoryBandwidth;
+use super::csv_table;
 use super::memory_traffic::{self, Operand};
 use super::timing::{CacheState, Timing};
 use super::validate::ValidationResult;
@@ -187,20 +187,16 @@ const COLUMNS: [(&str, &str); 53] = [
 /// # Errors
 /// `Fault` when writing into memory fails.
 pub fn csv(rows: &[DeformRow]) -> Result<Vec<u8>> {
-    let mut writer = csv::Writer::from_writer(Vec::new());
-    writer.write_record(COLUMNS.map(|(name, _)| name)).map_err(fault_in("report"))?;
+    let mut lines = Vec::new();
     for row in rows {
         let value = serde_json::to_value(row).map_err(fault_in("report"))?;
-        let cell = |(name, pointer): (&str, &str)| match (name, value.pointer(pointer)) {
-            ("bytes_by_formula", _) => memory_traffic::format_operands(&row.traffic),
-            ("faults", _) => row.faults.join("; "),
-            (_, None | Some(Value::Null)) => String::new(),
-            (_, Some(Value::String(text))) => text.clone(),
-            (_, Some(other)) => other.to_string(),
-        };
-        writer.write_record(COLUMNS.map(cell)).map_err(fault_in("report"))?;
+        lines.push(COLUMNS.map(|(name, pointer)| match name {
+            "bytes_by_formula" => memory_traffic::format_operands(&row.traffic),
+            "faults" => row.faults.join("; "),
+            _ => csv_table::cell_text(&value, pointer),
+        }));
     }
-    writer.into_inner().map_err(fault_in("report"))
+    csv_table::encode(COLUMNS.map(|(name, _)| name.to_owned()), lines)
 }
 
 /// Relative difference of times or errors below which one variant does not count as better than another.

@@ -71,6 +71,11 @@ pub(super) fn format_time(us: f64) -> String {
     format!("{} {unit}", (value * 100.0).round() / 100.0)
 }
 
+/// Formats a count.
+pub(super) fn format_count(count: f64) -> String {
+    format!("{count:.0}")
+}
+
 /// Formats a number as one digit and a power of ten.
 pub(super) fn format_power(value: f64) -> String {
     format!("{value:.0e}")

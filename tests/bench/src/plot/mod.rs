@@ -144,6 +144,17 @@ fn marker_style(variants: &[(&str, Backend)], name: &str) -> MarkerStyle {
     MarkerStyle { color: COLORS[index % COLORS.len()], backend, color_reuse: index / COLORS.len() }
 }
 
+/// Color and shape of a name in a list: circles until all colors are used, then squares and triangles. `backend` and
+/// `color_reuse` select the shape.
+pub(super) fn style_of_name(names: &[&str], name: &str) -> MarkerStyle {
+    let index = names.iter().position(|known| *known == name).unwrap_or(0);
+    let (backend, color_reuse) = match index / COLORS.len() {
+        0 => (Backend::Cpu, 0),
+        reuse => (Backend::Cuda, reuse - 1),
+    };
+    MarkerStyle { color: COLORS[index % COLORS.len()], backend, color_reuse }
+}
+
 /// Draws the legend of a plot of this width. Returns its SVG and its number of lines.
 pub(super) fn draw_legend<'a>(
     entries: impl Iterator<Item = (&'a str, MarkerStyle)>,

@@ -1,4 +1,4 @@
-//! One panel of a plot: frame, grid, points, Pareto front, and labels that do not overlap.
+//! One panel of a plot: frame, grid, curves, points, Pareto front, and labels that do not overlap.
 
 use std::fmt::Write as _;
 
@@ -52,6 +52,16 @@ pub(crate) struct Point<'a> {
     pub(crate) is_candidate: bool,
 }
 
+/// A line through points, given as (x, error).
+#[derive(Debug, Clone)]
+pub(crate) struct Curve {
+    pub(crate) points: Vec<(f64, f64)>,
+    pub(crate) color: &'static str,
+    pub(crate) is_dashed: bool,
+    /// Text beside the last point.
+    pub(crate) label: Option<String>,
+}
+
 /// The panel of one workload.
 pub(crate) struct Panel<'a> {
     /// Top left corner.
@@ -60,7 +70,10 @@ pub(crate) struct Panel<'a> {
     /// Labels of the x and y axes.
     axis_labels: [&'a str; 2],
     points: Vec<Point<'a>>,
+    curves: Vec<Curve>,
     time_axis: Axis,
+    /// Formats a tick of the x axis.
+    format_time: fn(f64) -> String,
     error_axis: Axis,
 }
 
@@ -72,7 +85,18 @@ impl<'a> Panel<'a> {
         // The ranges (1 us to 1 ms, 1e-8 to 1e-6) are those of a panel without points.
         let time_axis = Axis::new(points.iter().map(|point| point.value.time_us), (1.0, 1e3), x_range);
         let error_axis = Axis::new(points.iter().map(|point| point.value.error), (1e-8, 1e-6), y_range);
-        Self { corner, title, axis_labels, points, time_axis, error_axis }
+        let (curves, format_time) = (Vec::new(), axis::format_time as fn(f64) -> String);
+        Self { corner, title, axis_labels, points, curves, time_axis, format_time, error_axis }
+    }
+
+    /// The panel with lines below its points. They do not widen the axes.
+    pub(crate) fn with_curves(self, curves: Vec<Curve>) -> Self {
+        Self { curves, ..self }
+    }
+
+    /// The panel with counts in place of times.
+    pub(crate) fn with_counts(self) -> Self {
+        Self { format_time: axis::format_count, ..self }
     }
 
     /// Appends the panel to an SVG. `marker_style` gives the style of a variant by its name.
@@ -83,17 +107,15 @@ impl<'a> Panel<'a> {
             .iter()
             .map(|point| (self.time_axis.pixel(point.value.time_us), self.error_axis.pixel(point.value.error)))
             .collect();
-        let front = self.pareto_front();
-        let vertices: Vec<String> =
-            front.iter().map(|index| format!("{:.1},{:.1}", positions[*index].0, positions[*index].1)).collect();
-        if vertices.len() > 1 {
-            // Writing into a string cannot fail.
-            let _ = writeln!(
-                svg,
-                "<polyline points=\"{}\" fill=\"none\" stroke=\"#999999\" stroke-width=\"1.5\" stroke-dasharray=\"5 3\"/>",
-                vertices.join(" ")
-            );
+        // Areas of markers and of the labels drawn so far.
+        let mut occupied: Vec<Rectangle> =
+            positions.iter().map(|(x, y)| Rectangle { x: x - 7.0, y: y - 7.0, width: 14.0, height: 14.0 }).collect();
+        for curve in &self.curves {
+            self.draw_curve(svg, curve, &mut occupied);
         }
+        let front = self.pareto_front();
+        let vertices: Vec<(f64, f64)> = front.iter().map(|index| positions[*index]).collect();
+        draw_line(svg, &vertices, "#999999", true);
         for index in &front {
             let (x, y) = positions[*index];
             let _ = writeln!(
@@ -112,7 +134,7 @@ impl<'a> Panel<'a> {
                 draw_marker(svg, *position, style, &attributes);
             }
         }
-        self.draw_point_labels(svg, &positions, &front, &marker_style);
+        self.draw_point_labels(svg, &positions, &front, &marker_style, &mut occupied);
         if self.points.is_empty() {
             let center = (self.corner.0 + PANEL_SIZE.0 / 2.0, self.corner.1 + PANEL_SIZE.1 / 2.0);
             write_text(svg, center, "font-size=\"13\" fill=\"#b2182b\" text-anchor=\"middle\"", "no points to show");
@@ -152,7 +174,7 @@ impl<'a> Panel<'a> {
                 svg,
                 (x, bottom + 15.0),
                 "font-size=\"11\" fill=\"#444444\" text-anchor=\"middle\"",
-                &axis::format_time(tick),
+                &(self.format_time)(tick),
             );
         }
         for tick in self.error_axis.ticks() {
@@ -175,31 +197,54 @@ impl<'a> Panel<'a> {
         write_text(svg, (x, y), &rotated_style, self.axis_labels[1]);
     }
 
-    /// Labels the points of the front, and all filled points if the panel has few points.
+    /// Draws a curve and its label.
+    fn draw_curve(&self, svg: &mut String, curve: &Curve, occupied: &mut Vec<Rectangle>) {
+        let position = |(x, error): &(f64, f64)| (self.time_axis.pixel(*x), self.error_axis.pixel(*error));
+        let vertices: Vec<(f64, f64)> = curve.points.iter().map(position).collect();
+        draw_line(svg, &vertices, curve.color, curve.is_dashed);
+        if let (Some(label), Some(end)) = (&curve.label, vertices.last()) {
+            self.draw_label(svg, *end, label, curve.color, occupied);
+        }
+    }
+
+    /// Labels the points of the front, and all filled points if the panel has few points. A name is drawn once.
     fn draw_point_labels(
         &self,
         svg: &mut String,
         positions: &[(f64, f64)],
         front: &[usize],
         marker_style: &impl Fn(&str) -> MarkerStyle,
+        occupied: &mut Vec<Rectangle>,
     ) {
-        // Areas of markers and of the labels drawn so far.
-        let mut occupied: Vec<Rectangle> =
-            positions.iter().map(|(x, y)| Rectangle { x: x - 7.0, y: y - 7.0, width: 14.0, height: 14.0 }).collect();
         let has_few_points = self.points.len() <= 8;
         let has_label = |index: &usize| front.contains(index) || (has_few_points && self.points[*index].is_filled);
+        let mut labeled: Vec<&str> = Vec::new();
         for index in (0..self.points.len()).filter(has_label) {
             let name = self.points[index].name;
-            // A label without free space is omitted; the legend also names its point.
-            if let Some(area) = self.find_label_area(positions[index], text_width(name, LABEL_SIZE), &occupied) {
-                let color = marker_style(name).color;
-                let style = format!(
-                    "font-size=\"{LABEL_SIZE}\" fill=\"{color}\" stroke=\"#fafafa\" stroke-width=\"3\" paint-order=\"stroke\""
-                );
-                write_text(svg, (area.x, area.y + LABEL_SIZE), &style, name);
-                occupied.push(area);
+            if !labeled.contains(&name)
+                && self.draw_label(svg, positions[index], name, marker_style(name).color, occupied)
+            {
+                labeled.push(name);
             }
         }
+    }
+
+    /// Draws a label near a point. Returns false without free space; the legend also names the point.
+    fn draw_label(
+        &self,
+        svg: &mut String,
+        position: (f64, f64),
+        text: &str,
+        color: &str,
+        occupied: &mut Vec<Rectangle>,
+    ) -> bool {
+        let Some(area) = self.find_label_area(position, text_width(text, LABEL_SIZE), occupied) else { return false };
+        let style = format!(
+            "font-size=\"{LABEL_SIZE}\" fill=\"{color}\" stroke=\"#fafafa\" stroke-width=\"3\" paint-order=\"stroke\""
+        );
+        write_text(svg, (area.x, area.y + LABEL_SIZE), &style, text);
+        occupied.push(area);
+        true
     }
 
     /// Finds free space for a label of this width near a point: to its right or left, else above or below it.
@@ -224,6 +269,21 @@ impl<'a> Panel<'a> {
             .map(|(x, y)| Rectangle { x, y, width, height })
             .find(|label| label_bounds.contains(label) && !occupied.iter().any(|area| area.overlaps(label)))
     }
+}
+
+/// Draws a line through points in SVG units; nothing for fewer than two points.
+fn draw_line(svg: &mut String, vertices: &[(f64, f64)], color: &str, is_dashed: bool) {
+    if vertices.len() < 2 {
+        return;
+    }
+    let points: Vec<String> = vertices.iter().map(|(x, y)| format!("{x:.1},{y:.1}")).collect();
+    let dashes = if is_dashed { " stroke-dasharray=\"5 3\"" } else { "" };
+    // Writing into a string cannot fail.
+    let _ = writeln!(
+        svg,
+        "<polyline points=\"{}\" fill=\"none\" stroke=\"{color}\" stroke-width=\"1.5\"{dashes}/>",
+        points.join(" ")
+    );
 }
 
 /// Approximate width of a text in `DejaVu Sans`, whose letters are 0.61 of the font size wide on average.
@@ -294,6 +354,27 @@ mod tests {
             assert!(svg.contains(&format!(">{name}</text>")), "expected a label for '{name}'");
         }
         assert!(!svg.contains("cold and best"), "expected no label for a hollow point off the front");
+    }
+
+    #[test]
+    fn curves_have_labels_and_repeated_names_have_one() {
+        let point = |time_us: f64| {
+            let value = TimeAndError { time_us, quartiles_us: [time_us; 2], error: 1.0 / time_us };
+            Point { name: "repeated", value, is_filled: true, is_candidate: false }
+        };
+        let curve = |label: Option<&str>, is_dashed| {
+            let (points, label) = (vec![(1.0, 1.0), (20.0, 0.05)], label.map(String::from));
+            Curve { points, color: "#999999", is_dashed, label }
+        };
+        let panel = Panel::new((0.0, 0.0), "a", ["modes", "error"], vec![point(1.0), point(20.0)]);
+        let mut svg = String::new();
+        panel
+            .with_curves(vec![curve(Some("order 1"), true), curve(None, false)])
+            .with_counts()
+            .draw(&mut svg, |_| MarkerStyle { color: "#0072b2", backend: Backend::Cpu, color_reuse: 0 });
+        let count = |text: &str| svg.matches(text).count();
+        assert_eq!((count(">repeated</text>"), count(">order 1</text>"), count("<polyline")), (1, 1, 2), "{svg}");
+        assert!(count("stroke-dasharray") == 1 && count(">10</text>") == 1 && count("µs") == 0, "{svg}");
     }
 
     #[test]

@@ -6,6 +6,7 @@ use serde_json::Value;
 
 use super::plants::PlantResult;
 use super::{RenderReport, RenderRow, markdown, plot};
+use crate::csv_table;
 use crate::plot::render_png;
 use crate::timing::Timing;
 use modalcast_model::error::{Result, fault_in};
@@ -114,7 +115,7 @@ fn rows_csv(rows: &[RenderRow]) -> Result<Vec<u8>> {
         let value = serde_json::to_value(row).map_err(fault_in("report"))?;
         lines.push(COLUMNS.map(|column| cell_text(row, &value, column)));
     }
-    encode_csv(COLUMNS.map(|(name, _)| name.to_owned()), lines)
+    csv_table::encode(COLUMNS.map(|(name, _)| name.to_owned()), lines)
 }
 
 /// The CSV of minimal passes, rasterizers and blurs. Each line has the time of a pass, `median_us`. The columns
@@ -171,7 +172,7 @@ fn passes_csv(report: &RenderReport) -> Result<Vec<u8>> {
                 .map(String::from),
         );
     }
-    encode_csv(header.map(String::from), lines)
+    csv_table::encode(header.map(String::from), lines)
 }
 
 /// The CSV of plants, one plant and setting per line: our measurements, then the measurements of the thesis. `t_vbr`
@@ -208,19 +209,7 @@ fn plants_csv(plants: &[PlantResult]) -> Result<Vec<u8>> {
         let numbers = rates.iter().chain(&thesis).map(|number| number.to_string());
         texts.into_iter().chain(sizes).chain(setting).chain(times).chain(numbers).collect::<Vec<String>>()
     };
-    encode_csv(header.map(String::from), plants.iter().map(line))
-}
-
-fn encode_csv<L: IntoIterator<Item = String>>(
-    header: impl IntoIterator<Item = String>,
-    lines: impl IntoIterator<Item = L>,
-) -> Result<Vec<u8>> {
-    let mut writer = csv::Writer::from_writer(Vec::new());
-    writer.write_record(header).map_err(fault_in("report"))?;
-    for line in lines {
-        writer.write_record(line).map_err(fault_in("report"))?;
-    }
-    writer.into_inner().map_err(fault_in("report"))
+    csv_table::encode(header.map(String::from), plants.iter().map(line))
 }
 
 /// The text of a column in a row; `value` is the row as JSON.
@@ -237,11 +226,7 @@ fn cell_text(row: &RenderRow, value: &Value, (name, source): (&str, &str)) -> St
         });
         return us.map_or_else(String::new, |us| us.to_string());
     }
-    match value.pointer(source) {
-        None | Some(Value::Null) => String::new(),
-        Some(Value::String(text)) => text.clone(),
-        Some(scalar) => scalar.to_string(),
-    }
+    csv_table::cell_text(value, source)
 }
 
 #[cfg(test)]

@@ -1,13 +1,13 @@
 //! Plots error against frame time in one panel per workload, and marks the Pareto front.
 
 use super::{RenderReport, RenderRow};
-use crate::plot::panel::{MarkerStyle, Panel, Point};
+use crate::plot::panel::{Panel, Point};
 use crate::plot::{
-    COLORS, HEADER_HEIGHT, LEGEND_LINE_HEIGHT, MARGIN, PANEL_SIZE, begin_svg, draw_header, draw_legend, plot_width,
+    HEADER_HEIGHT, LEGEND_LINE_HEIGHT, MARGIN, PANEL_SIZE, begin_svg, draw_header, draw_legend, plot_width,
+    style_of_name,
 };
 use crate::table::TimeAndError;
 use crate::timing::Timing;
-use modalcast_model::deform::Backend;
 
 /// Panels per row.
 const COLUMNS: usize = 3;
@@ -23,7 +23,7 @@ pub(super) fn draw_svg(report: &RenderReport) -> String {
     let columns = report.loads.len().clamp(1, COLUMNS);
     let header = header_lines(report);
     let width = plot_width(columns, &header);
-    let (legend, lines) = draw_legend(variants.iter().map(|name| (*name, marker_style(&variants, name))), width);
+    let (legend, lines) = draw_legend(variants.iter().map(|name| (*name, style_of_name(&variants, name))), width);
     let panels_top = MARGIN + HEADER_HEIGHT + lines as f64 * LEGEND_LINE_HEIGHT;
     let height = panels_top + report.loads.len().div_ceil(columns) as f64 * PANEL_SIZE.1 + MARGIN;
     let mut svg = begin_svg(width, height);
@@ -34,7 +34,7 @@ pub(super) fn draw_svg(report: &RenderReport) -> String {
         let corner =
             (MARGIN + (index % columns) as f64 * PANEL_SIZE.0, panels_top + (index / columns) as f64 * PANEL_SIZE.1);
         let points = report.rows.iter().filter(|row| row.load == workload.name).filter_map(row_point).collect();
-        Panel::new(corner, &workload.name, axis_labels, points).draw(&mut svg, |name| marker_style(&variants, name));
+        Panel::new(corner, &workload.name, axis_labels, points).draw(&mut svg, |name| style_of_name(&variants, name));
     }
     svg.push_str("</svg>\n");
     svg
@@ -64,15 +64,4 @@ fn row_point(row: &RenderRow) -> Option<Point<'_>> {
     let Timing { median_us, q1_us, q3_us, .. } = row.frame_timing()?;
     let value = TimeAndError { time_us: median_us, quartiles_us: [q1_us, q3_us], error: row.color_errors.mean };
     Some(Point { name: &row.name, value, is_filled: true, is_candidate: true })
-}
-
-/// Color and shape of a variant's marker: circles until all colors are used, then squares and triangles. `backend` and
-/// `color_reuse` select the shape.
-fn marker_style(variants: &[&str], name: &str) -> MarkerStyle {
-    let index = variants.iter().position(|variant| *variant == name).unwrap_or(0);
-    let (backend, color_reuse) = match index / COLORS.len() {
-        0 => (Backend::Cpu, 0),
-        reuse => (Backend::Cuda, reuse - 1),
-    };
-    MarkerStyle { color: COLORS[index % COLORS.len()], backend, color_reuse }
 }

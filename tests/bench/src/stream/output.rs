@@ -11,6 +11,7 @@ use super::picture_encodings::PictureEncodingRow;
 use super::rates::RateResult;
 use super::vertex_encodings::VertexEncodingRow;
 use super::{CaseReport, CaseResult, StreamReport, markdown, plot};
+use crate::csv_table;
 use crate::output_files::write_files;
 use crate::plot::render_png;
 use modalcast_model::error::{Result, fault_in};
@@ -71,14 +72,9 @@ impl StreamReport {
 }
 
 fn csv(cases: &[CaseReport]) -> Result<Vec<u8>> {
-    let mut writer = csv::Writer::from_writer(Vec::new());
-    writer.write_record(COLUMNS).map_err(fault_in("report"))?;
-    for case in cases {
-        for quantity in case.result.quantities() {
-            writer.write_record(csv_record(case, &quantity)).map_err(fault_in("report"))?;
-        }
-    }
-    writer.into_inner().map_err(fault_in("report"))
+    let quantities = |case: &CaseReport| case.result.quantities();
+    let lines = cases.iter().flat_map(|case| quantities(case).into_iter().map(move |entry| csv_record(case, &entry)));
+    csv_table::encode(COLUMNS.map(String::from), lines)
 }
 
 fn csv_record(case: &CaseReport, quantity: &Quantity) -> [String; COLUMNS.len()] {
