@@ -85,7 +85,8 @@ const REPORT_EXAMPLES: &str = "Examples:
   modalcast report deform --out report --quick
   modalcast report render --out report --quick
   modalcast report stream --out report --quick
-  modalcast report drift --out report";
+  modalcast report drift --out report
+  modalcast report dynamics --out report";
 
 /// Help text on the exit codes of all commands.
 pub const EXIT_CODES: &str = "\

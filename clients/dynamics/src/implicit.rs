@@ -47,7 +47,7 @@ pub enum ImplicitMethod {
 
 impl ImplicitMethod {
     /// The power of the sub-step to which the error of a step is proportional.
-    const fn order(self) -> f64 {
+    pub const fn order(self) -> f64 {
         match self {
             Self::AverageVectorField => 2.0,
             Self::BackwardEuler => 1.0,

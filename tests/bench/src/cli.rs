@@ -1,6 +1,7 @@
 //! Command line of `modalcast-report`, the program that `modalcast report` starts.
 
 mod drift;
+mod dynamics;
 mod render;
 mod stream;
 
@@ -17,8 +18,8 @@ use modalcast::cli::options::with_spinner;
 use modalcast::cli::{Completion, EXIT_CODES, Outcome, finish, print_line};
 use modalcast_model::error::Result;
 
-/// Measures error against run time, rates and latencies at the client, and errors over long runs, on this machine.
-/// Writes tables and plots.
+/// Measures error against run time, rates and latencies at the client, errors over long runs, and time integrators, on
+/// this machine. Writes tables and plots.
 #[derive(Debug, Parser)]
 #[command(name = "modalcast report", version, after_help = format!("{EXAMPLES}\n\n{EXIT_CODES}"))]
 struct Cli {
@@ -35,6 +36,7 @@ enum ReportCommand {
     Render(render::Args),
     Stream(stream::Args),
     Drift(drift::Args),
+    Dynamics(dynamics::Args),
     /// Runs as a child process of a report. The job is JSON.
     #[command(hide = true)]
     Peer {
@@ -52,7 +54,8 @@ const EXAMPLES: &str = "Examples:
   modalcast report deform --out report --scene tree --trajectory path/to/record
   modalcast report render --out report --quick
   modalcast report stream --out report --quick
-  modalcast report drift --out report";
+  modalcast report drift --out report
+  modalcast report dynamics --out report --quick";
 
 const LOADS: &str = "Loads:
   single-P-R          one domain of 2^P vertices and R modes (table 4.4 of the thesis: P is 14 to 22, R is 10 to 30)
@@ -122,6 +125,7 @@ pub fn run() -> u8 {
         Some(ReportCommand::Render(args)) => render::run(args),
         Some(ReportCommand::Stream(args)) => stream::run(args),
         Some(ReportCommand::Drift(args)) => drift::run(args),
+        Some(ReportCommand::Dynamics(args)) => dynamics::run(args),
         Some(ReportCommand::Peer { job }) => stream::run_peer(job),
         None => {
             Cli::command().print_help().ok(); // A closed stdout is no error.

@@ -1,6 +1,6 @@
 //! Benchmarks of error against run time for every variant of the deformation, on synthetic scenes or on a scene of the
-//! user. [`render`] does the same for the renderer, [`stream`] measures at the client, and [`drift`] measures errors
-//! over long runs.
+//! user. [`render`] does the same for the renderer, [`stream`] measures at the client, [`drift`] measures errors over
+//! long runs, and [`dynamics`] measures time integrators and computed modes.
 //!
 //! A workload (`load` in options and reports) is a scene to measure. A variant is one way to deform it: a backend, a
 //! storage type of U and further options. Validation comes before timing: a variant whose error exceeds its a-priori
@@ -21,6 +21,7 @@ mod csv_table;
 mod cuda_variants;
 mod double_double;
 pub mod drift;
+pub mod dynamics;
 pub mod error_model;
 pub mod error_sources;
 pub mod errors;
