@@ -33,7 +33,8 @@ pub struct ReplayRequest {
     pub repeats: bool,
     /// Pictures of each step that are passed to the caller; at most 16, the server's limit.
     pub pictures: Vec<Picture>,
-    /// Plays only the states that are current at the times of this number of frames per second; `None`: every state.
+    /// Plays only the states that are current at the times of this number of frames per second of the recording, 0.001 to
+    /// 1e9; `None`: every state.
     pub frame_rate: Option<f64>,
 }
 
@@ -177,8 +178,8 @@ pub async fn replay(
     if let Some(speed) = speed.filter(|speed| !(speed.is_finite() && *speed > 0.0)) {
         return Err(Error::invalid("speed", "a finite number above 0", speed));
     }
-    if let Some(rate) = request.frame_rate.filter(|rate| !(1e-3..=1e3).contains(rate)) {
-        return Err(Error::invalid("frame_rate", "0.001 to 1000 frames per second", rate));
+    if let Some(rate) = request.frame_rate.filter(|rate| !(1e-3..=1e9).contains(rate)) {
+        return Err(Error::invalid("frame_rate", "0.001 to 1e9 frames per second of the recording", rate));
     }
     let name = &scene.info.scene;
     let frames = match request.pictures.as_slice() {

@@ -31,8 +31,8 @@ impl RecordingTarget {
         if let Ok(recording) = Recording::open(&path) {
             read_all(&recording).ok();
             export_npz(&recording, &out).ok();
-            export_gltf(&recording, &out).ok();
-            export_html(&recording, "<head></head>", &out).ok();
+            export_gltf(&recording, 1.0, &out).ok();
+            export_html(&recording, "<head></head>", 1.0, &out).ok();
         }
         if recover(&path, &repaired).is_ok() {
             let recording = Recording::open(&repaired);

@@ -8,6 +8,7 @@ use glam::{DMat3, DQuat, DVec3};
 use modalcast_client::{AlphaMode, Domain, Material, MaterialRange, SceneDescription, Shape, ShapeArray, Texture};
 use serde_json::{Map, Value, json};
 
+use super::check_slow;
 use super::glb::{Element, GlbBuilder};
 use super::tracks::{Matrix3x4, StateTimes, Track, for_each_track};
 use crate::error::{Error, Result};
@@ -19,13 +20,14 @@ const SHEAR_TOLERANCE: f64 = 1e-5;
 /// Writes a `.glb` file. Each domain is a node with a mesh, whose morph targets are the columns of U; domains of the
 /// same shape and materials share their mesh. The animation has one key frame per state, with linear interpolation. Of
 /// several states at the same time, the last one is used. Normals are those of the rest shape. The Phong materials are
-/// approximated.
+/// approximated. A second of the motion lasts `slow` seconds.
 ///
 /// # Errors
-/// `Invalid` if a transform has shear or a scale of 0, which a node cannot express, or the file exceeds 4 GiB;
-/// `Unavailable` if the recording has only the hashes of its contents; `InvalidFile` if it is damaged; `File` if the
-/// file cannot be written.
-pub fn export_gltf(recording: &Recording, out: &Path) -> Result<()> {
+/// `Invalid` if `slow` is no positive number, a transform has shear or a scale of 0, which a node cannot express, or the
+/// file exceeds 4 GiB; `Unavailable` if the recording has only the hashes of its contents; `InvalidFile` if it is
+/// damaged; `File` if the file cannot be written.
+pub fn export_gltf(recording: &Recording, slow: f64, out: &Path) -> Result<()> {
+    check_slow(slow)?;
     let arrays = [
         ShapeArray::Indices,
         ShapeArray::CornerVertices,
@@ -44,7 +46,7 @@ pub fn export_gltf(recording: &Recording, out: &Path) -> Result<()> {
         .collect::<Result<Vec<_>>>()?;
     let images = description.textures.iter().map(|texture| image(&mut glb, texture)).collect::<Result<Vec<_>>>()?;
 
-    let selected = StateTimes::read(recording, true)?;
+    let selected = StateTimes::read_increasing(recording, slow)?;
     let times: Vec<f32> = selected.times.iter().map(|time| *time as f32).collect();
     let input = glb.add_floats(Element::Scalar, &times)?;
     let mut animation = Animation { input, samplers: Vec::new(), channels: Vec::new() };

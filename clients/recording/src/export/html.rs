@@ -7,6 +7,7 @@ use std::path::Path;
 use base64::engine::general_purpose::STANDARD;
 use base64::write::EncoderWriter;
 
+use super::check_slow;
 use crate::error::{Error, Result};
 use crate::reader::Recording;
 
@@ -14,12 +15,13 @@ use crate::reader::Recording;
 const HEAD_END: &str = "</head>";
 
 /// Writes the viewer's page with the recording inside, as base64 in `<script id="recording">`. The file is copied in
-/// pieces.
+/// pieces. The page first shows a second of the motion in `slow` seconds.
 ///
 /// # Errors
-/// `Unavailable` if the recording has only the hashes of its contents; `Invalid` if the page has no end of its head;
-/// `File` if a file cannot be read or written.
-pub fn export_html(recording: &Recording, page: &str, out: &Path) -> Result<()> {
+/// `Unavailable` if the recording has only the hashes of its contents; `Invalid` if `slow` is no positive number or the
+/// page has no end of its head; `File` if a file cannot be read or written.
+pub fn export_html(recording: &Recording, page: &str, slow: f64, out: &Path) -> Result<()> {
+    check_slow(slow)?;
     recording.require_contents()?;
     let Some(position) = page.find(HEAD_END) else {
         return Err(Error::invalid("--page", format!("a page with {HEAD_END}"), "another page"));
@@ -32,7 +34,7 @@ pub fn export_html(recording: &Recording, page: &str, out: &Path) -> Result<()> 
     let mut file = BufWriter::new(file);
     let mut write = || {
         file.write_all(start.as_bytes())?;
-        file.write_all(b"<script id=\"recording\" type=\"application/octet-stream\">")?;
+        write!(file, "<script id=\"recording\" type=\"application/octet-stream\" data-slow=\"{slow}\">")?;
         let mut encoder = EncoderWriter::new(&mut file, &STANDARD);
         std::io::copy(&mut source, &mut encoder)?;
         encoder.finish()?;

@@ -32,7 +32,7 @@ use crate::reader::Recording;
 pub fn export_npz(recording: &Recording, out: &Path) -> Result<()> {
     let arrays = [ShapeArray::Indices, ShapeArray::CornerVertices, ShapeArray::RestPositions, ShapeArray::Modes];
     let description = recording.read_description(&arrays, false)?;
-    let selected = StateTimes::read(recording, false)?;
+    let selected = StateTimes::read(recording)?;
     let file = File::create(out).map_err(|error| Error::open(out, &error))?;
     let mut archive = Archive { zip: ZipWriter::new(BufWriter::new(file)), path: out };
     let steps = selected.count();

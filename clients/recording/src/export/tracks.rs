@@ -24,7 +24,7 @@ pub(super) struct Track {
 /// Which states are exported: their times and steps.
 #[derive(Debug, Default)]
 pub(super) struct StateTimes {
-    /// Seconds since the first state.
+    /// Seconds since the first state, times the factor of the slow motion.
     pub(super) times: Vec<f64>,
     pub(super) steps: Vec<u64>,
     pub(super) runs: Vec<u64>,
@@ -33,15 +33,23 @@ pub(super) struct StateTimes {
 }
 
 impl StateTimes {
-    /// Selects all states. With `with_increasing_times`, selects only the last one of consecutive states whose times
-    /// are equal as f32.
-    pub(super) fn read(recording: &Recording, with_increasing_times: bool) -> Result<Self> {
+    /// Selects all states.
+    pub(super) fn read(recording: &Recording) -> Result<Self> {
+        Self::select(recording, 1.0, |_, _| true)
+    }
+
+    /// Selects the last one of consecutive states whose times are equal as f32. All times are multiplied by `slow`.
+    pub(super) fn read_increasing(recording: &Recording, slow: f64) -> Result<Self> {
+        Self::select(recording, slow, |last, next| last as f32 != next as f32)
+    }
+
+    /// Selects the states whose time `is_distinct` from that of the next one.
+    fn select(recording: &Recording, slow: f64, is_distinct: impl Fn(f64, f64) -> bool) -> Result<Self> {
         let mut selected = Self::default();
         let mut states = recording.states(0, u64::MAX)?;
         while let Some(recorded) = states.next()? {
-            let time = recorded.time as f64 * 1e-9;
-            if with_increasing_times && selected.times.last().is_some_and(|last| *last as f32 == time as f32) {
-                // The later one of two states at the same time.
+            let time = recorded.time as f64 * 1e-9 * slow;
+            if selected.times.last().is_some_and(|last| !is_distinct(*last, time)) {
                 selected.pop();
             }
             selected.times.push(time);

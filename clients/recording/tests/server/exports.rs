@@ -148,6 +148,11 @@ impl Glb {
         bytemuck::pod_collect_to_vec(&self.data[number("byteOffset")..][..number("byteLength")])
     }
 
+    /// The times of the keys of all channels.
+    fn times(&self) -> Vec<f32> {
+        self.floats(&self.document["animations"][0]["samplers"][0]["input"])
+    }
+
     /// The values of a channel of a node at a key, or those of the node itself if it has no channel.
     fn value(&self, node: usize, path: &str, key: usize) -> Vec<f32> {
         let animation = &self.document["animations"][0];
@@ -185,7 +190,7 @@ fn matrix(translation: &[f32], rotation: &[f32], scale: &[f32], unit: f64) -> Ve
 async fn animation_of_gltf_gives_the_vertices_of_the_server() {
     let Recorded { recording, positions, folder } = record_pair().await;
     let out = folder.path().join("pair.glb");
-    export_gltf(&recording, &out).expect("an exported file");
+    export_gltf(&recording, 1.0, &out).expect("an exported file");
     let glb = Glb::read(&out);
     let unit = recording.description().info.unit;
     // The server loads the file as a scene.
@@ -224,6 +229,16 @@ async fn animation_of_gltf_gives_the_vertices_of_the_server() {
         assert!(difference.fold(0.0, f64::max) < 1e-6, "{:?} {placement:?}", domain.placement);
     }
     assert!(largest < 1e-5, "{largest}");
+    // In slow motion, the same keys have later times.
+    export_gltf(&recording, 100.0, &out).expect("an exported file");
+    let slow = Glb::read(&out);
+    for (step, (time, slow_time)) in glb.times().into_iter().zip(slow.times()).enumerate() {
+        let expected = step as f32 / 24.0;
+        assert!((time - expected).abs() < 1e-6 && (slow_time - 100.0 * expected).abs() < 1e-4, "{time} {slow_time}");
+        assert_eq!(glb.value(1, "rotation", step), slow.value(1, "rotation", step));
+    }
+    assert_eq!((glb.times().len(), slow.times().len()), (positions.len(), positions.len()));
+    assert_eq!(export_gltf(&recording, 0.0, &out).expect_err("a factor of 0").exit_code(), 3);
     assert_ne!(glb.value(0, "weights", 3), glb.value(0, "weights", 4), "control: expected animated weights");
     assert_ne!(glb.value(1, "translation", 3), glb.value(1, "translation", 4), "control: expected motion");
     assert_ne!(glb.value(1, "rotation", 3), glb.value(1, "rotation", 4), "control: expected motion");
@@ -235,13 +250,13 @@ async fn page_contains_the_recording() {
     let Recorded { recording, folder, .. } = record_pair().await;
     let out = folder.path().join("pair.html");
     let page = "<!doctype html><html><head><title>t</title></head><body><script>main()</script></body></html>";
-    export_html(&recording, page, &out).expect("a page");
+    export_html(&recording, page, 100.0, &out).expect("a page");
     let text = std::fs::read_to_string(&out).expect("a page");
-    let tag = "<script id=\"recording\" type=\"application/octet-stream\">";
+    let tag = "<script id=\"recording\" type=\"application/octet-stream\" data-slow=\"100\">";
     let (before, rest) = text.split_once(tag).expect("the recording");
     let (encoded, after) = rest.split_once("</script>").expect("the end of the recording");
     assert_eq!(format!("{before}{}", after.trim_start()), page);
     let bytes = base64::engine::general_purpose::STANDARD.decode(encoded).expect("base64");
     assert_eq!(bytes, std::fs::read(recording.path()).expect("the recording"));
-    assert_eq!(export_html(&recording, "no page", &out).expect_err("another page").exit_code(), 3);
+    assert_eq!(export_html(&recording, "no page", 1.0, &out).expect_err("another page").exit_code(), 3);
 }

@@ -121,6 +121,12 @@ async fn errors_exit_with_the_documented_codes() {
     assert_eq!(run(&["replay", &missing]).status.code(), Some(4));
     let no_file = text(&folder.path().join("no/such/folder.mcap"));
     assert_eq!(run(&["recover", &missing, "--out", &no_file]).status.code(), Some(4));
+    // Formats without times that could be changed.
+    for format in ["npz", "png"] {
+        let output = run(&["export", &out, "--to", format, "--slow", "2", "--out", &missing]);
+        let message = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert!(output.status.code() == Some(3) && message.contains("--slow: expected 1"), "{message}");
+    }
     let video = text(&folder.path().join("x.mp4"));
     let arguments =
         ["export", &out, "--to", "video", "--out", &video, "--server", &server.url, "--ffmpeg", "./no-ffmpeg"];
@@ -164,8 +170,17 @@ async fn pictures_and_videos_have_a_frame_per_interval() {
     let video = folder.path().join("video.mp4");
     let encoder = copying_encoder(folder.path());
     export(&["--to", "video", "--fps", "48", "--ffmpeg", &text(&encoder), "--out", &text(&video)]);
+    // A tenth of the frames per second, ten times slower: the same frames.
+    let slow_video = folder.path().join("slow.mp4");
+    let slow = ["--to", "video", "--fps", "4.8", "--slow", "10", "--ffmpeg", &text(&encoder), "--out"];
+    export(&[&slow[..], &[&text(&slow_video)]].concat());
     let video = std::fs::read(video).expect("a file");
     assert_eq!(video.len(), 13 * 4 * 32 * 16);
+    assert_eq!(std::fs::read(slow_video).expect("a file"), video);
+    // Six intervals of 1/24 s, which last 25 s at 1/100 of real time, have 10 frames per second and a last one.
+    let frames = folder.path().join("slow");
+    export(&["--to", "png", "--fps", "10", "--slow", "100", "--out", &text(&frames)]);
+    assert_eq!(std::fs::read_dir(&frames).expect("a folder").count(), 251);
     let frame = |index: usize| std::fs::read(raw.join(format!("frame_{index:05}.rgba"))).expect("a frame");
     // A frame has 32x16 pixels of four bytes.
     for index in 0..13 {

@@ -13,7 +13,7 @@ use modalcast_recording::{
 };
 
 use crate::frame_folder::FrameFolder;
-use crate::options::{ServerOptions, termination_signal};
+use crate::options::{ServerOptions, parse_slow, termination_signal};
 use crate::replay::print_difference;
 
 /// The page of the viewer, compressed with gzip.
@@ -37,7 +37,8 @@ const MAX_PAGE_BYTES: u64 = 64 << 20;
   modalcast export tree.mcap --to gltf --out tree.glb
   modalcast export tree.mcap --to npz --out tree.npz
   modalcast export tree.mcap --to png --out frames --size 640x360 --fps 24
-  modalcast export tree.mcap --to video --out tree.mp4")]
+  modalcast export tree.mcap --to video --out tree.mp4
+  modalcast export fork.mcap --to video --slow 100 --out fork.mp4")]
 pub(crate) struct ExportOptions {
     /// Recording to convert.
     file: PathBuf,
@@ -55,9 +56,13 @@ pub(crate) struct ExportOptions {
     /// Name of the scene on the server, for `--to png` and `--to video`. Default: the recorded name.
     #[arg(long, default_value = "")]
     scene: String,
-    /// Frames per second of the recording, 0.001 to 1000. Default: 30 for `--to video`, and every state for `--to png`.
+    /// Frames per second, 0.001 to 1000. Default: 30 for `--to video`, and every state for `--to png`.
     #[arg(long, value_parser = parse_rate)]
     fps: Option<f64>,
+    /// Slow motion: a second of the recording lasts FACTOR seconds in the video, in the frames of --fps, in the animation
+    /// of glTF, and in the page until another speed is selected.
+    #[arg(long, value_name = "FACTOR", default_value_t = 1.0, value_parser = parse_slow)]
+    slow: f64,
     /// Path of ffmpeg, for `--to video`.
     #[arg(long, value_name = "PATH", default_value = "ffmpeg")]
     ffmpeg: PathBuf,
@@ -76,16 +81,30 @@ enum ExportFormat {
 
 impl ExportOptions {
     pub(crate) async fn run(self) -> Result<()> {
+        self.check_slow()?;
         let recording = Recording::open(&self.file)?;
         match self.to {
-            ExportFormat::Html => export_html(&recording, &self.read_page()?, &self.out)?,
-            ExportFormat::Gltf => export_gltf(&recording, &self.out)?,
+            ExportFormat::Html => export_html(&recording, &self.read_page()?, self.slow, &self.out)?,
+            ExportFormat::Gltf => export_gltf(&recording, self.slow, &self.out)?,
             ExportFormat::Npz => export_npz(&recording, &self.out)?,
             ExportFormat::Png => self.export_frames(&recording).await?,
             ExportFormat::Video => self.export_video(&recording).await?,
         }
         println!("{}", self.out.display());
         Ok(())
+    }
+
+    /// Checks that the format has times that `--slow` can change.
+    fn check_slow(&self) -> Result<()> {
+        let expected = match self.to {
+            ExportFormat::Npz => "1 with --to npz, whose times are those of the simulation",
+            ExportFormat::Png if self.fps.is_none() => "1, or --fps, with --to png",
+            _ => return Ok(()),
+        };
+        match self.slow {
+            1.0 => Ok(()),
+            slow => Err(Error::Invalid { field: "--slow".into(), expected: expected.into(), given: slow.to_string() }),
+        }
     }
 
     /// The page of `--page`, which may be compressed with gzip, or the viewer of this build.
@@ -134,7 +153,8 @@ impl ExportOptions {
         encoder.finish()
     }
 
-    /// Replays the recording as fast as possible and passes all frames to `on_frame`.
+    /// Replays the recording as fast as possible and passes all frames to `on_frame`. `frame_rate` is in frames per second
+    /// of the result.
     async fn render(
         &self,
         recording: &Recording,
@@ -145,6 +165,7 @@ impl ExportOptions {
         let client = self.server.connect().await?;
         let scene = open_recorded_scene(&client, recording, &self.scene).await?;
         print_difference(&scene);
+        let frame_rate = frame_rate.map(|rate| rate * self.slow);
         let request = ReplayRequest { speed: None, pictures, frame_rate, ..ReplayRequest::default() };
         let replayed = replay(&client, recording, &scene, &request, on_frame, termination_signal()?).await;
         if scene.target == StepTarget::UploadedArrays {

@@ -41,6 +41,12 @@ pub(crate) fn output_error(error: &std::io::Error) -> Error {
     Error::File { path: "modalcast-record".to_owned(), reason: error.to_string() }
 }
 
+/// Parses a factor of slow motion.
+pub(crate) fn parse_slow(text: &str) -> Result<f64, String> {
+    let factor = text.parse().ok().filter(|factor| (1e-3..=1e6).contains(factor));
+    factor.ok_or_else(|| "expected a factor, 0.001 to 1000000".into())
+}
+
 pub(crate) fn parse_seconds(text: &str) -> Result<f64, String> {
     let seconds = text.parse().ok().filter(|seconds| (0.0..=1e6).contains(seconds));
     seconds.ok_or_else(|| "expected seconds, 0 to 1000000".into())
