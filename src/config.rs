@@ -114,6 +114,15 @@ impl std::fmt::Debug for ViewerToken {
     }
 }
 
+/// A recording that the viewer's page plays.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ViewerRecording {
+    /// An MCAP file.
+    pub file: Bytes,
+    /// Real seconds per second of the recording, until the user selects another speed. Positive.
+    pub slow: f64,
+}
+
 /// The server's configuration. The name or the documentation of a field gives its unit.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Config {
@@ -126,8 +135,8 @@ pub struct Config {
     pub viewer: bool,
     /// The secret in the URL of the viewer. `None` selects a random one.
     pub viewer_token: Option<ViewerToken>,
-    /// The recording (an MCAP file) that the viewer's page plays in place of the server's scenes.
-    pub viewer_recording: Option<Bytes>,
+    /// The recording that the viewer's page plays in place of the server's scenes.
+    pub viewer_recording: Option<ViewerRecording>,
     /// The folder of scenes that clients may open. `None` allows only the built-in scenes.
     pub scenes: Option<PathBuf>,
     /// The folder for uploads, the list of open scenes and their last steps. Only one server at a time can use it.

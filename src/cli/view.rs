@@ -12,7 +12,7 @@ use super::modeling_options::ModelingOptions;
 use super::physics::PhysicsProcess;
 use super::serve::{TerminationSignals, announce, print_addresses, start};
 use super::{Completion, Outcome, print_line, recording};
-use crate::config::{BackendChoice, Config, ListenAddress, RendererChoice, ValidatedConfig};
+use crate::config::{BackendChoice, Config, ListenAddress, RendererChoice, ValidatedConfig, ViewerRecording};
 use crate::service::{self, Listener};
 use modalcast_model::error::{Result, fault, fault_in, invalid};
 
@@ -28,7 +28,7 @@ const PHYSICS_PROGRAM: &str = "modalcast-sim";
   modalcast view tree
   modalcast view path/to/simpleBridge --no-sim
   modalcast view part.stl --modes 20 --material steel --clamp 'z < 0.01'
-  modalcast view fork.npz --slow 100                pulled and seen in slow motion
+  modalcast view fork.npz --slow 500                pulled, and seen in slower motion than by default
   modalcast view tree.mcap                          plays a recording
   modalcast view model.glb --listen 0.0.0.0:50051   also for browsers on other machines")]
 pub(super) struct Args {
@@ -46,10 +46,11 @@ pub(super) struct Args {
     /// this one.
     #[arg(long, overrides_with = "no_sim")]
     sim: bool,
-    /// Slow motion: the physics process simulates 1/FACTOR of the real time. A body of metal vibrates too fast to be seen
-    /// without it; try 100.
-    #[arg(long, value_name = "FACTOR", default_value_t = 1.0, value_parser = parse_factor)]
-    slow: f64,
+    /// Slow motion: the physics process simulates 1/FACTOR of the real time, because a body of metal vibrates too fast to
+    /// be seen. Default: the lowest frequency of the scene decides, and 1 up to 5 Hz. For a recording: the speed at which
+    /// it is played first is 1/FACTOR; default 1.
+    #[arg(long, value_name = "FACTOR", value_parser = parse_factor)]
+    slow: Option<f64>,
     /// Show the scene at rest, until another process drives it.
     #[arg(long)]
     no_sim: bool,
@@ -90,7 +91,10 @@ impl Args {
     fn playback_config(&self, state: &Path) -> Result<ValidatedConfig> {
         Config {
             listen: vec![ListenAddress::Tcp(self.listen)],
-            viewer_recording: Some(recording::read(&self.model)?),
+            viewer_recording: Some(ViewerRecording {
+                file: recording::read(&self.model)?,
+                slow: self.slow.unwrap_or(1.0),
+            }),
             state: state.to_owned(),
             backend: BackendChoice::Cpu,
             renderer: RendererChoice::Off,
@@ -198,14 +202,14 @@ fn viewer_url(listener: &Listener) -> Result<String> {
 
 fn start_physics(
     program: &Path,
-    slow: f64,
+    slow: Option<f64>,
     force_files: &ForceFiles,
     listener: &Listener,
     scene: &str,
 ) -> Result<PhysicsProcess> {
     let server = listener.local_urls().into_iter().next().ok_or_else(|| fault("view", "expected an address"))?;
-    let mut flags =
-        vec!["--server".to_owned(), server, "--scene".into(), scene.into(), "--slow".into(), slow.to_string()];
+    let slow = slow.map_or_else(|| "auto".to_owned(), |factor| factor.to_string());
+    let mut flags = vec!["--server".to_owned(), server, "--scene".into(), scene.into(), "--slow".into(), slow];
     flags.extend(["--wait", "30", "--seconds", "0", "--realtime", "--forces", "--delivery", "latest"].map(Into::into));
     flags.extend(force_files.flags());
     PhysicsProcess::start(program, &flags)

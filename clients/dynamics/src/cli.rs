@@ -6,6 +6,7 @@ use clap::{Args, Parser, Subcommand, ValueEnum};
 use modalcast_client::Delivery;
 use modalcast_dynamics::bridge::LoadDirection;
 use modalcast_dynamics::implicit::ImplicitMethod;
+use modalcast_dynamics::slow_motion::slow_factor;
 
 const EXAMPLES: &str = "\
 Examples:
@@ -94,9 +95,10 @@ pub(crate) struct CommonOptions {
     #[arg(long, default_value_t = 1.0 / 60.0, value_parser = parse_positive)]
     pub(crate) dt: f64,
     /// Slow motion: the simulated time of a step is --dt divided by this factor. A tuning fork vibrates too fast for 60
-    /// steps per second; at 100 its vibration is visible.
-    #[arg(long, value_name = "FACTOR", default_value_t = 1.0, value_parser = parse_positive)]
-    pub(crate) slow: f64,
+    /// steps per second; at 100 its vibration is visible. auto: a factor with which the lowest frequency is visible, and
+    /// 1 if it is at most 5 Hz.
+    #[arg(long, value_name = "FACTOR|auto", default_value = "1", value_parser = parse_slow)]
+    pub(crate) slow: SlowMotion,
     /// lossless: process every step; latest: skip to the newest step.
     #[arg(long, value_enum, default_value = "lossless")]
     pub(crate) delivery: DeliveryOption,
@@ -136,6 +138,26 @@ pub(crate) struct CommonOptions {
     /// Print a machine-readable summary on standard output.
     #[arg(long)]
     pub(crate) json: bool,
+}
+
+/// Slow motion of a run.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) enum SlowMotion {
+    /// Real seconds per simulated second.
+    Factor(f64),
+    /// By the lowest frequency of the scene.
+    Auto,
+}
+
+/// The times of a run.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Timing {
+    /// Simulated seconds per step.
+    pub(crate) dt: f64,
+    /// Real seconds per simulated second, with --realtime.
+    pub(crate) slow: f64,
+    /// The number of steps; `None` for an unlimited run.
+    pub(crate) steps: Option<u64>,
 }
 
 #[derive(Debug, Clone, Copy, ValueEnum)]
@@ -268,19 +290,20 @@ impl CommonOptions {
         self.positional_scene.as_deref().unwrap_or(&self.scene)
     }
 
-    /// Simulated seconds per step.
-    pub(crate) fn simulated_dt(&self) -> f64 {
-        self.dt / self.slow
-    }
-
-    /// The number of steps; `None` for an unlimited run.
-    pub(crate) fn step_count(&self) -> Option<u64> {
-        match (self.steps, self.seconds) {
+    /// The times of a run of a scene whose lowest frequency in hertz is known, or unknown.
+    pub(crate) fn timing(&self, lowest_frequency: Option<f64>) -> Timing {
+        let slow = match self.slow {
+            SlowMotion::Factor(factor) => factor,
+            SlowMotion::Auto => lowest_frequency.map_or(1.0, slow_factor),
+        };
+        let dt = self.dt / slow;
+        let steps = match (self.steps, self.seconds) {
             (Some(0), _) => None,
             (Some(steps), _) => Some(steps),
-            (None, seconds) if seconds > 0.0 => Some((seconds / self.simulated_dt()).ceil().max(1.0) as u64),
+            (None, seconds) if seconds > 0.0 => Some((seconds / dt).ceil().max(1.0) as u64),
             (None, _) => None,
-        }
+        };
+        Timing { dt, slow, steps }
     }
 }
 
@@ -292,6 +315,13 @@ fn parse_non_negative(text: &str) -> Result<f64, String> {
 fn parse_degrees(text: &str) -> Result<f64, String> {
     let degrees = text.parse().ok().filter(|degrees: &f64| degrees.abs() <= 360.0);
     degrees.ok_or_else(|| "expected degrees, -360 to 360".into())
+}
+
+fn parse_slow(text: &str) -> Result<SlowMotion, String> {
+    match text {
+        "auto" => Ok(SlowMotion::Auto),
+        _ => parse_positive(text).map(SlowMotion::Factor).map_err(|error| format!("{error}, or auto")),
+    }
 }
 
 fn parse_positive(text: &str) -> Result<f64, String> {
@@ -320,10 +350,14 @@ mod tests {
         let parse = |arguments: &[&str]| Cli::try_parse_from([&["modalcast-sim"][..], arguments].concat());
         let cli = parse(&["fork", "--slow", "100", "--dt", "0.5", "--seconds", "2"]).expect("valid arguments");
         let common = cli.common();
-        assert_eq!((common.scene(), common.simulated_dt(), common.step_count()), ("fork", 0.005, Some(400)));
+        let timing = Timing { dt: 0.005, slow: 100.0, steps: Some(400) };
+        assert_eq!((common.scene(), common.timing(Some(5000.0))), ("fork", timing));
         let sweep = parse(&["sweep", "fork", "--dt", "0.5", "--seconds", "2"]).expect("valid arguments");
-        assert_eq!((sweep.common().scene(), sweep.common().step_count()), ("fork", Some(4)));
+        assert_eq!((sweep.common().scene(), sweep.common().timing(None).steps), ("fork", Some(4)));
         assert_eq!(parse(&[]).expect("valid arguments").common().scene(), "tree");
+        let auto = parse(&["--slow", "auto", "--dt", "0.5", "--steps", "9"]).expect("valid arguments");
+        assert_eq!(auto.common().timing(Some(206.0)), Timing { dt: 0.005, slow: 100.0, steps: Some(9) });
+        assert_eq!(auto.common().timing(None), Timing { dt: 0.5, slow: 1.0, steps: Some(9) });
         for invalid in [&["fork", "--scene", "tree"][..], &["--slow", "0"], &["--slow", "nan"]] {
             assert!(parse(invalid).is_err(), "{invalid:?}");
         }

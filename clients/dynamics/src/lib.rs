@@ -27,6 +27,7 @@
 //! | `divergence` | stops a run before it sends a step that is not finite or far out of range |
 //! | `checkpoint` | files from which a later process continues a run, bit by bit |
 //! | `saved_state` | converts the state of a scenario to and from JSON, exactly |
+//! | `slow_motion` | the slow motion in which the vibrations of a stiff body are visible |
 //! | `step_values` | coordinates and transforms of a step, and the message with those that have changed |
 //! | `recorder` | writes the values of all steps to NumPy files |
 //! | `run` | sends a scenario as a step stream, optionally records it, and reports the results |
@@ -88,6 +89,7 @@ mod resume_tests;
 mod rigid_modes;
 pub mod run;
 mod saved_state;
+pub mod slow_motion;
 #[cfg(test)]
 mod stability;
 pub mod step_values;

@@ -15,6 +15,7 @@ use modalcast_dynamics::cubic::ReducedForce;
 use modalcast_dynamics::force_domain::find_force_domain;
 use modalcast_dynamics::model::Model;
 use modalcast_dynamics::parameters::ModalParameters;
+use modalcast_dynamics::reduced_system::ReducedSystem;
 use modalcast_dynamics::run::{Report, RunOptions, RunSummary, Scenario, drive_scene};
 use modalcast_dynamics::sweep::{SweepOptions, SweepScenario};
 use modalcast_dynamics::tree::{TreeOptions, TreeScenario};
@@ -22,7 +23,7 @@ use modalcast_dynamics::vega::VegaSettings;
 use modalcast_dynamics::{Error, Result, invalid_input};
 use tokio::sync::watch;
 
-use cli::{Cli, Command, ForceFileOptions, PhysicsOptions, SWEEP_SHARE};
+use cli::{Cli, Command, ForceFileOptions, PhysicsOptions, SWEEP_SHARE, SlowMotion, Timing};
 
 /// Maximum number of surface samples per domain of a tree. A tree may have thousands of domains, and the rows of U of
 /// every sample are fetched from the server.
@@ -63,7 +64,7 @@ async fn run_scenario(arguments: &Cli) -> Result<RunSummary> {
         Some(source) => client.open_scene(source, common.scene()).await?.scene,
         None => common.scene().to_owned(),
     };
-    let mut scenario = create_scenario(&client, &scene, arguments).await?;
+    let TimedScenario { mut scenario, timing } = create_scenario(&client, &scene, arguments).await?;
     for remark in scenario.remarks() {
         eprintln!("modalcast-sim: {scene}: {remark}");
     }
@@ -78,9 +79,9 @@ async fn run_scenario(arguments: &Cli) -> Result<RunSummary> {
         }
     });
     let options = RunOptions {
-        steps: common.step_count(),
-        dt: common.simulated_dt(),
-        slow: common.slow,
+        steps: timing.steps,
+        dt: timing.dt,
+        slow: timing.slow,
         delivery: common.delivery.into(),
         window: common.window,
         realtime: common.realtime,
@@ -108,11 +109,18 @@ async fn wait_for_shutdown_signal() {
     }
 }
 
-async fn create_scenario(client: &Client, scene: &str, arguments: &Cli) -> Result<Box<dyn Scenario>> {
+/// A motion and the times of its steps.
+struct TimedScenario {
+    scenario: Box<dyn Scenario>,
+    timing: Timing,
+}
+
+async fn create_scenario(client: &Client, scene: &str, arguments: &Cli) -> Result<TimedScenario> {
     let common = arguments.common();
     let sweep = |model: Model, displacement_fraction: f64| {
-        let options = SweepOptions { dt: common.simulated_dt(), steps: common.step_count(), displacement_fraction };
-        Box::new(SweepScenario::new(model, options))
+        let timing = common.timing(None);
+        let options = SweepOptions { dt: timing.dt, steps: timing.steps, displacement_fraction };
+        TimedScenario { scenario: Box::new(SweepScenario::new(model, options)), timing }
     };
     if let Some(Command::Sweep { displacement_fraction, .. }) = &arguments.command {
         return Ok(sweep(Model::fetch(client, scene, MAX_SAMPLES).await?, *displacement_fraction));
@@ -150,16 +158,32 @@ async fn create_scenario(client: &Client, scene: &str, arguments: &Cli) -> Resul
     }
 }
 
-fn create_tree_scenario(model: Model, arguments: &Cli, wind_strength: f64) -> Result<Box<dyn Scenario>> {
+fn create_tree_scenario(model: Model, arguments: &Cli, wind_strength: f64) -> Result<TimedScenario> {
+    let timing = choose_timing(&model.scene, arguments, ModalParameters::read(&model)?.lowest_frequency());
     let wind = &arguments.physics.wind;
     let options = TreeOptions {
-        dt: arguments.common().simulated_dt(),
+        dt: timing.dt,
         sway_fraction: wind.sway_fraction,
         wind_strength,
         direction_radians: wind.direction_degrees.to_radians(),
         seed: wind.seed,
     };
-    Ok(Box::new(TreeScenario::new(model, options)?))
+    Ok(TimedScenario { scenario: Box::new(TreeScenario::new(model, options)?), timing })
+}
+
+/// The times of a run. Says by which factor `--slow auto` slows the motion down.
+fn choose_timing(scene: &str, arguments: &Cli, lowest_frequency: Option<f64>) -> Timing {
+    let common = arguments.common();
+    let timing = common.timing(lowest_frequency);
+    if let (SlowMotion::Auto, Some(hertz)) = (common.slow, lowest_frequency.filter(|_| timing.slow > 1.0)) {
+        eprintln!(
+            "modalcast-sim: {scene}: slow motion at 1/{} of real time, which shows the lowest frequency of {hertz:.4} Hz \
+             as {:.2} Hz (--slow FACTOR sets it; --slow 1 is real time)",
+            timing.slow,
+            hertz / timing.slow
+        );
+    }
+    timing
 }
 
 /// Whether wind moves the scene by default: some domain has eigenvalues, and some domain is attached to another one. A
@@ -196,23 +220,27 @@ async fn create_bridge_scenario(
     scene: &str,
     arguments: &Cli,
     force_path: &Path,
-) -> Result<Box<dyn Scenario>> {
+) -> Result<TimedScenario> {
     let PhysicsOptions { files, load, integration, .. } = &arguments.physics;
     let model = Model::fetch(client, scene, MAX_SAMPLES).await?;
     let default_config = force_path.with_extension("config");
     let config_path = files.config.clone().or_else(|| default_config.is_file().then_some(default_config));
     let settings = config_path.map_or_else(|| Ok(VegaSettings::default()), |path| VegaSettings::read(&path))?;
     let force = ReducedForce::read(force_path)?;
+    let domain = find_force_domain(client, scene, files.domain.as_deref(), force_path).await?;
+    let linear_frequency = ModalParameters::read_except(&model, Some(domain))?.lowest_frequency();
+    let frequencies = [linear_frequency, ReducedSystem::new(force.clone(), &settings).lowest_frequency()];
+    let timing = choose_timing(scene, arguments, frequencies.into_iter().flatten().min_by(f64::total_cmp));
     let options = BridgeOptions {
-        domain: find_force_domain(client, scene, files.domain.as_deref(), force_path).await?,
-        dt: arguments.common().simulated_dt(),
+        domain,
+        dt: timing.dt,
         deflection_fraction: load.deflection_fraction,
         period: load.period,
         load_direction: load.direction.into(),
         method: integration.method.into(),
         has_fixed_step: integration.has_fixed_step,
     };
-    Ok(Box::new(BridgeScenario::new(model, force, &settings, options)?))
+    Ok(TimedScenario { scenario: Box::new(BridgeScenario::new(model, force, &settings, options)?), timing })
 }
 
 /// Finds the file of reduced forces: the file of `--cubic`, else the file in `--files` that the note `vega.cubic` of a

@@ -74,6 +74,14 @@ impl ReducedSystem {
         self.eigenvalues.iter().map(|eigenvalue| eigenvalue.max(0.0).sqrt() / std::f64::consts::TAU).collect()
     }
 
+    /// The lowest natural frequency at rest in hertz, without eigenvectors that have no positive stiffness; `None` if none
+    /// has one.
+    pub fn lowest_frequency(&self) -> Option<f64> {
+        let tolerance = self.eigenvalue_tolerance();
+        let lowest = self.eigenvalues.iter().find(|eigenvalue| **eigenvalue > tolerance)?;
+        Some(lowest.sqrt() / std::f64::consts::TAU)
+    }
+
     /// The number of eigenvectors without stiffness at rest and of those with a negative one.
     pub fn unstable_counts(&self) -> (usize, usize) {
         let tolerance = self.eigenvalue_tolerance();
@@ -185,6 +193,7 @@ mod tests {
         let settings = VegaSettings { damping_stiffness: 0.1, ..VegaSettings::default() };
         let system = ReducedSystem::new(spring_chain(&[5.0, -2.0, 0.0], 0.0, 0.0), &settings);
         assert_eq!((system.unstable_counts(), system.eigenvalues()), ((1, 1), &[-2.0, 0.0, 5.0][..]));
+        assert_eq!(system.lowest_frequency(), Some(5.0_f64.sqrt() / std::f64::consts::TAU));
         assert!(system.damping().clone().symmetric_eigenvalues().min() >= -1e-15);
         let load = DVector::from_column_slice(&[5.0, 10.0, 15.0]);
         assert!((system.linear_equilibrium(&load) - DVector::from_column_slice(&[1.0, 2.0, 3.0])).norm() <= 1e-12);

@@ -12,6 +12,7 @@ import type { Vec3 } from "./scene/affine";
 import type { SceneArrays } from "./scene/arrays";
 import type { SceneDescription } from "./scene/description";
 import { SceneModel } from "./scene/scene_model";
+import { TimeScale } from "./scene/time_scale";
 import { SceneSession, type SceneSource } from "./session";
 import type { Playback } from "./source/playback";
 import type { PictureOptions } from "./source/server";
@@ -55,6 +56,7 @@ export class App implements CommandHandlers {
     private showsOneStep = false;
     private driveHint = "";
     private framedScene = "";
+    private timeScale = new TimeScale();
 
     constructor() {
         this.coordinates = new CoordinateSection({
@@ -115,6 +117,7 @@ export class App implements CommandHandlers {
         const model = new SceneModel(scene, arrays);
         const session = new SceneSession(model, source, viewport, this.picture);
         this.session = session;
+        this.timeScale = new TimeScale();
         const { renderer } = session;
         if (renderer) {
             renderer.setOptions(settings);
@@ -151,6 +154,7 @@ export class App implements CommandHandlers {
         this.viewport.setScene(null);
         this.driveHint = "";
         this.notices.hide("receiver");
+        this.bar.setTimeScale("");
         this.forceLines.setSession(null);
     }
 
@@ -259,6 +263,7 @@ export class App implements CommandHandlers {
         this.status.stateRate.add(1);
         this.status.byteRate.add(model.lastStateBytes);
         session.receiveState();
+        if (model.state.step) this.timeScale.add(model.state.step, performance.now());
         if (this.isPaused && !this.showsOneStep) return;
         this.showsOneStep = false;
         // A step that changes nothing has no bytes.
@@ -344,6 +349,15 @@ export class App implements CommandHandlers {
         this.coordinates.setCanDrive(source.features.drive && !isDriven, source.features.drive ? driven : "");
         this.coordinates.update();
         if (driver && !driver.isAnimating) this.coordinates.setAnimated(false);
+        this.updateTimeScale(isDriven);
         this.status.update(session);
+    }
+
+    /** The panel shows every time scale, and the bar those that are at least two times slower or faster than real time. */
+    private updateTimeScale(isDriven: boolean): void {
+        const ratio = this.playback?.speed ?? (isDriven ? this.timeScale.ratio(performance.now()) : null);
+        this.status.timeScale = ratio;
+        const isVisible = ratio !== null && (ratio <= 0.5 || ratio >= 2);
+        this.bar.setTimeScale(isVisible ? format.timeScale(ratio) : "");
     }
 }

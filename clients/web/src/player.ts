@@ -31,15 +31,17 @@ export class RecordingPlayer {
         if (!element?.textContent) return false;
         const text = element.textContent;
         element.remove();
-        this.open(document.title, () => decodeBase64(text));
+        const slow = Number(element.dataset["slow"] ?? 1);
+        this.open(document.title, () => decodeBase64(text), slow > 0 && Number.isFinite(slow) ? slow : 1);
         return true;
     }
 
-    private open(name: string, file: Uint8Array | (() => Uint8Array)): void {
+    /** @param slow Factor of the slow motion that is played first. */
+    private open(name: string, file: Uint8Array | (() => Uint8Array), slow = 1): void {
         const { app } = this;
         this.close();
         try {
-            this.play(name, readRecording(typeof file === "function" ? file() : file));
+            this.play(name, readRecording(typeof file === "function" ? file() : file), slow);
         } catch (error) {
             app.closeScene();
             const text = error instanceof Error ? error.message : String(error);
@@ -47,7 +49,7 @@ export class RecordingPlayer {
         }
     }
 
-    private play(name: string, recording: Recording): void {
+    private play(name: string, recording: Recording, slow: number): void {
         const { app } = this;
         const { scene, arrays, view, isCutOff } = recording;
         const reason = app.drawingProblem(scene);
@@ -64,6 +66,7 @@ export class RecordingPlayer {
             app.notices.show("recording", text, { severity: "warn" });
         }
         const playback = new Playback(recording, model);
+        playback.speed = 1 / slow;
         this.playback = playback;
         this.timeline = new Timeline(playback);
         app.setPlayback(playback);

@@ -83,7 +83,7 @@ impl WebServer {
             .max_header_size(MAX_HEAD_BYTES)
             .max_buf_size(MAX_HEAD_BYTES);
         let websocket_limits = WebSocketLimits::new(config);
-        let page = config.viewer_recording.as_deref().map_or_else(Page::viewer, Page::playing)?;
+        let page = config.viewer_recording.as_ref().map_or_else(Page::viewer, Page::playing)?;
         Ok(Self { routes, access, page, is_serving, http1, websocket_limits })
     }
 

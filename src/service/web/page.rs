@@ -8,6 +8,7 @@ use base64::engine::general_purpose::STANDARD;
 use bytes::Bytes;
 use sha2::{Digest as _, Sha256};
 
+use crate::config::ViewerRecording;
 use modalcast_model::error::{Result, fault, fault_in};
 
 /// The viewer: one HTML file with all scripts and styles, compressed with gzip. `clients/web` builds it.
@@ -43,15 +44,17 @@ impl Page {
     ///
     /// # Errors
     /// As for [`Self::viewer`].
-    pub(super) fn playing(recording: &[u8]) -> Result<Self> {
+    pub(super) fn playing(recording: &ViewerRecording) -> Result<Self> {
+        let ViewerRecording { file, slow } = recording;
         let html = viewer_html()?;
         let (start, end) =
             html.split_once(RECORDING_PLACE).ok_or_else(|| fault("viewer page", "expected a place for a recording"))?;
-        let text_bytes = base64::encoded_len(recording.len(), true).unwrap_or_default();
+        let text_bytes = base64::encoded_len(file.len(), true).unwrap_or_default();
         let mut body = String::with_capacity(html.len() + text_bytes + 128);
         body.push_str(start);
-        body.push_str("<script id=\"recording\" type=\"application/octet-stream\">");
-        STANDARD.encode_string(recording, &mut body);
+        write!(body, "<script id=\"recording\" type=\"application/octet-stream\" data-slow=\"{slow}\">")
+            .map_err(fault_in("viewer page"))?;
+        STANDARD.encode_string(file, &mut body);
         body.push_str("</script>");
         body.push_str(end);
         // A script of this type is data, which the policy does not concern.
@@ -127,9 +130,10 @@ mod tests {
     #[test]
     fn recording_is_inside_of_the_page_under_the_same_policy() {
         let viewer = Page::viewer().expect("expected the viewer");
-        let page = Page::playing(b"\x89MCAP").expect("expected a page");
+        let recording = ViewerRecording { file: Bytes::from_static(b"\x89MCAP"), slow: 100.0 };
+        let page = Page::playing(&recording).expect("expected a page");
         let html = std::str::from_utf8(&page.body).expect("expected text");
-        let element = "<script id=\"recording\" type=\"application/octet-stream\">iU1DQVA=</script>";
+        let element = "<script id=\"recording\" type=\"application/octet-stream\" data-slow=\"100\">iU1DQVA=</script>";
         assert_eq!(html.replace(element, RECORDING_PLACE), viewer_html().expect("expected the viewer"));
         assert!(!page.is_compressed && viewer.is_compressed);
         assert_eq!(page.policy("localhost"), viewer.policy("localhost"));

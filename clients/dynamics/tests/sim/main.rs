@@ -338,6 +338,26 @@ async fn slow_motion_simulates_shorter_steps() {
     assert!(records[0].2 != records[2].2 && records[0].1 == 0.02, "{records:?}");
 }
 
+/// The slow motion follows from the lowest frequency, unless a factor is given.
+#[tokio::test(flavor = "multi_thread")]
+async fn slow_motion_by_the_lowest_frequency_is_announced() {
+    // The lowest frequency of the tree is 0.9 Hz, and that of the fork 206 Hz.
+    let mut fork_server = tree_server();
+    fork_server.domains.truncate(1);
+    fork_server.domains[0].shape.eigenvalues =
+        [206.0, 400.0].map(|hertz: f64| (std::f64::consts::TAU * hertz).powi(2)).to_vec();
+    let (fork, tree) = (serve(Arc::new(fork_server)).await, serve(Arc::new(tree_server())).await);
+    let message = "toy: slow motion at 1/100 of real time, which shows the lowest frequency of 206.0000 Hz as 2.06 Hz";
+    for (url, slow, factor, is_announced) in
+        [(&fork, "auto", 100.0, true), (&fork, "7", 7.0, false), (&tree, "auto", 1.0, false)]
+    {
+        let sim_output = run_sim(url, &["toy", "--forces", "--slow", slow, "--steps", "2", "--json"]).await;
+        assert_eq!(sim_output.exit_code, 0, "{}", sim_output.stderr);
+        assert_eq!(sim_output.report()["slow"].as_f64(), Some(factor));
+        assert_eq!(sim_output.stderr.contains(message), is_announced, "{}", sim_output.stderr);
+    }
+}
+
 /// The expected codes are those of `modalcast-sim --help`: 1 rejected by the server, 2 command line, 3 connection, 4
 /// local file, 5 invalid content.
 #[tokio::test(flavor = "multi_thread")]

@@ -1,4 +1,4 @@
-/** The bar at the top: scene and connection. */
+/** The bar at the top: scene, connection, and the time scale of slow or fast motion. */
 
 import { byId, h, setText } from "./dom";
 import { icon } from "./icons";
@@ -9,6 +9,7 @@ export class Bar {
     private readonly menu: HTMLSelectElement;
     private readonly dot = h("i", { className: "dot" });
     private readonly text = h("span");
+    private readonly timeScale = h("div", { id: "time-scale", hidden: true });
     private readonly panelButton: HTMLButtonElement;
     onScene: (value: string) => void = () => {};
     onPanel: () => void = () => {};
@@ -24,7 +25,7 @@ export class Bar {
         this.panelButton.onclick = () => this.onPanel();
         const brand = h("div", { className: "brand" }, icon("logo"), h("span", { textContent: "modalcast" }));
         const connection = h("div", { id: "connection", aria: { role: "status" } }, this.dot, this.text);
-        byId("bar").append(brand, this.menu, connection, this.panelButton);
+        byId("bar").append(brand, this.menu, connection, this.timeScale, this.panelButton);
     }
 
     /** Values are "open:NAME" and "source:SOURCE". */
@@ -57,6 +58,12 @@ export class Bar {
         this.dot.className = `dot ${state}`;
         setText(this.text, text);
         this.text.parentElement?.setAttribute("title", text);
+    }
+
+    /** Shows a text on the time scale; an empty one hides it. */
+    setTimeScale(text: string): void {
+        this.timeScale.hidden = text === "";
+        setText(this.timeScale, text);
     }
 
     setPanelOpen(isOpen: boolean): void {

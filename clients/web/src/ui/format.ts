@@ -35,8 +35,22 @@ export function bytes(value: number): string {
     return value < 1e9 ? `${short(value / 1e6)} MB` : `${short(value / 1e9)} GB`;
 }
 
-export function seconds(value: number): string {
-    return `${value.toFixed(2)} s`;
+/** A time in seconds. Times up to `largest` have the same unit. */
+export function seconds(value: number, largest = value): string {
+    if (largest >= 1 || largest <= 0) return `${value.toFixed(2)} s`;
+    return largest >= 1e-3 ? `${(value * 1e3).toFixed(1)} ms` : `${(value * 1e6).toFixed(1)} µs`;
+}
+
+/** A time scale: seconds of a motion per second of real time. */
+export function timeScale(ratio: number): string {
+    if (Math.abs(ratio - 1) < 0.05) return "real time";
+    return ratio <= 0.5 ? `1/${rounded(1 / ratio)} of real time` : `${rounded(ratio)}x real time`;
+}
+
+/** A measured number with one significant digit if the difference is at most 3 %, or else with two. */
+function rounded(value: number): string {
+    const digit = Number(value.toPrecision(1));
+    return String(Math.abs(digit / value - 1) <= 0.03 ? digit : Number(value.toPrecision(2)));
 }
 
 export function count(value: number | bigint): string {

@@ -20,6 +20,8 @@ export class StatusPanels {
     readonly pictureRate = new RateMeter();
     /** Round trip of the last call in milliseconds. */
     latency = 0;
+    /** Seconds of the motion per second of real time; null if unknown. */
+    timeScale: number | null = null;
     private readonly legend = new Legend();
     private readonly scene = new FactsTable();
     private readonly performance = new FactsTable();
@@ -79,6 +81,7 @@ export class StatusPanels {
             "Storage of U": renderer && model.layout.coordinates > 0 ? storage : null,
             "Graphics memory": renderer ? format.bytes(renderer.deformer.bytes + meshBytes(model.scene)) : null,
             Step: step ? `${step.number} at ${format.seconds(step.time)}` : "rest state",
+            "Time scale": this.timeScale === null ? null : format.timeScale(this.timeScale),
             Stages:
                 stages.length > 0
                     ? `${stages.map(({ stage, milliseconds }) => `${stage} ${milliseconds.toFixed(2)}`).join(", ")} ms`

@@ -32,9 +32,14 @@ export class Timeline {
         this.slider.oninput = () => playback.seek(Number(this.slider.value));
         const total = h("output", { className: "total", textContent: format.seconds(playback.duration) });
         const speed = h("select", { title: "Speed", aria: { label: "Speed" } });
+        const speeds = [...new Set([...SPEEDS, playback.speed])].sort((a, b) => a - b);
         speed.append(
-            ...SPEEDS.map((value) =>
-                h("option", { value: String(value), textContent: `${value}x`, selected: value === 1 }),
+            ...speeds.map((value) =>
+                h("option", {
+                    value: String(value),
+                    textContent: `${format.short(value)}x`,
+                    selected: value === playback.speed,
+                }),
             ),
         );
         speed.onchange = () => {
@@ -78,7 +83,7 @@ export class Timeline {
             this.play.setAttribute("aria-label", label);
         }
         if (!this.slider.matches(":active")) this.slider.value = String(playback.time);
-        this.slider.setAttribute("aria-valuetext", format.seconds(playback.time));
-        setText(this.now, format.seconds(playback.time));
+        this.slider.setAttribute("aria-valuetext", format.seconds(playback.time, playback.duration));
+        setText(this.now, format.seconds(playback.time, playback.duration));
     }
 }

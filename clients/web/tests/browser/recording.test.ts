@@ -156,6 +156,25 @@ test("`modalcast view` plays a recording", { timeout: LIMIT_MS, skip: usesCommit
     assert.equal(server.exitCode, 0);
 });
 
+test("a page that is exported for slow motion plays slowly first", { timeout: LIMIT_MS }, async () => {
+    const slowPage = join(folder, "slow.html");
+    const options = ["export", file, "--to", "html", "--slow", "400", "--page", viewerPage, "--out", slowPage];
+    await runProgram("modalcast-record", options);
+    const { page, errors } = await openPage(browser, pathToFileURL(slowPage).href, 900, HEIGHT);
+    await waitForScene(page);
+    await page.locator("#time-scale", { hasText: "1/400 of real time" }).waitFor();
+    // It has played for at most as long as the page exists.
+    await page.waitForFunction(() => (modalcastViewer.playback?.time ?? 0) > 0.002);
+    const [time, age] = await page.evaluate(() => [modalcastViewer.playback?.time ?? 0, performance.now() / 1000]);
+    assert.ok((time ?? 0) < (age ?? 0) / 300, `expected at most 1/400 of ${age} s, got ${time} s`);
+    // Control: at the recorded speed, the bar shows no time scale.
+    await page.getByRole("combobox", { name: "Speed" }).selectOption("1");
+    await page.locator("#time-scale").waitFor({ state: "hidden" });
+    await page.waitForFunction(() => (modalcastViewer.playback?.time ?? 0) > 0.5);
+    assert.deepEqual(errors, []);
+    await page.close();
+});
+
 test("a recording that is dropped onto the page plays", { timeout: LIMIT_MS }, async () => {
     const { page, errors } = await openPage(browser, pathToFileURL(viewerPage).href, WIDTH, HEIGHT);
     // Control: without a recording there is nothing to play.

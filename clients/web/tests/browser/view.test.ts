@@ -174,6 +174,27 @@ test("the modes of a surface are computed, and the part is pulled", { timeout: L
     await close(shown);
 });
 
+/** Its vibrations of 206 Hz are slowed down by default, so that they are seen. */
+test("a stiff body is shown in slow motion, which the page names", { timeout: LIMIT_MS }, async () => {
+    const eigenvalue = (hertz: number) => (2 * Math.PI * hertz) ** 2;
+    const fork = new Beam().npz([eigenvalue(206), eigenvalue(300)]);
+    for (const [options, text] of [
+        [[], "1/100 of real time"],
+        [["--slow", "500"], "1/500 of real time"],
+        [["--slow", "1"], null],
+    ] as const) {
+        const shown = await view("fork.npz", fork, [...options]);
+        const { page } = shown;
+        const facts = page.locator(".facts tr", { hasText: "Time scale" });
+        await facts.getByText(text ?? "real time", { exact: true }).waitFor();
+        const bar = page.locator("#time-scale");
+        if (text) assert.equal(await bar.textContent(), text);
+        else assert.equal(await bar.isVisible(), false, "expected no remark on real time");
+        await takeScreenshot(page, `view-slow-${options[1] ?? "default"}`);
+        await close(shown);
+    }
+});
+
 for (const [name, content, reason] of [
     ["beam.npz", new Beam().npz(null), "got 2 modes without: add the array eigenvalues"],
     ["beam.stl", new Beam().stl(), "got no modes: add the arrays U and eigenvalues"],

@@ -1,0 +1,57 @@
+/** Measures how fast the time of a simulation passes, from the times of its steps and their arrival. */
+
+import type { StepId } from "../proto/modalcast/v1/common_pb";
+
+/** Steps of the last milliseconds are measured. */
+const WINDOW_MS = 10_000;
+/** At most one step in this many milliseconds is remembered. */
+const INTERVAL_MS = 50;
+/** Shortest time that gives a result. */
+const SHORTEST_MS = 1000;
+/** After a pause of this many milliseconds the measurement begins again. */
+const LONGEST_PAUSE_MS = 1000;
+
+interface Arrival {
+    /** Milliseconds of real time. */
+    now: number;
+    /** Seconds of the simulation. */
+    time: number;
+}
+
+export class TimeScale {
+    private arrivals: Arrival[] = [];
+    private last: Arrival | null = null;
+    private run = 0n;
+
+    /** Adds a step that has arrived at `now`, in milliseconds. */
+    add(step: StepId, now: number): void {
+        const { last } = this;
+        const continues = last && step.run === this.run && step.time >= last.time && !this.hasPaused(now);
+        if (!continues) this.arrivals = [];
+        this.run = step.run;
+        this.last = { now, time: step.time };
+        const newest = this.arrivals.at(-1);
+        if (!newest || now - newest.now >= INTERVAL_MS) this.arrivals.push(this.last);
+        const oldest = this.arrivals.findIndex((arrival) => now - arrival.now <= WINDOW_MS);
+        if (oldest > 0) this.arrivals.splice(0, oldest);
+    }
+
+    /** Seconds of the simulation per second of real time; null if it is unknown at `now`, or the simulation pauses. */
+    ratio(now: number): number | null {
+        const { arrivals } = this;
+        const elapsed = (arrivals.at(-1)?.now ?? 0) - (arrivals[0]?.now ?? 0);
+        if (elapsed < SHORTEST_MS || this.hasPaused(now)) return null;
+        // The median of ratios over half of the window, because a busy page receives some steps late.
+        const half = arrivals.length >> 1;
+        const ratios = arrivals.slice(half).map((arrival, place) => {
+            const earlier = arrivals[place] ?? arrival;
+            return (1000 * (arrival.time - earlier.time)) / (arrival.now - earlier.now);
+        });
+        const median = ratios.sort((a, b) => a - b)[ratios.length >> 1] ?? 0;
+        return median > 0 && Number.isFinite(median) ? median : null;
+    }
+
+    private hasPaused(now: number): boolean {
+        return this.last !== null && now - this.last.now > LONGEST_PAUSE_MS;
+    }
+}
