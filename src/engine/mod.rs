@@ -8,12 +8,16 @@
 mod blocking;
 mod catch_unwind;
 mod content;
+mod crash_signals;
+#[cfg(test)]
+mod crash_tests;
 mod device;
 mod load_permits;
 mod lock;
 mod memory_limits;
 mod output;
 mod registry;
+mod running_scene;
 mod scene;
 mod scene_memory;
 mod scene_opening;
@@ -72,6 +76,7 @@ use tokio::sync::watch;
 
 use self::blocking::run_blocking;
 use self::device::handle::DeviceThread;
+use self::device::work_owners::WorkOwners;
 use self::load_permits::LoadPermits;
 pub(crate) use self::lock::lock;
 use self::registry::Registry;
@@ -79,6 +84,7 @@ use self::scene::actor::SceneServices;
 use self::scene::frame_stream::FrameStreamRegistry;
 use self::scene_memory::MemoryBudgets;
 use self::storage::checkpoint_store::CheckpointStore;
+use self::storage::crash_log::CrashLog;
 use self::storage::file_system::{DiskFileSystem, FileSystem};
 use self::storage::run_counter::RunCounter;
 use self::storage::scene_catalog::SceneCatalog;
@@ -110,6 +116,7 @@ struct Shared {
     next_scene_id: AtomicU64,
     is_stopping: AtomicBool,
     device_thread: Mutex<Option<JoinHandle<()>>>,
+    crash_log: Arc<CrashLog>,
     // Last field, so that its lock on the state folder is released only after the fields that write into the folder
     // are dropped.
     scene_catalog: SceneCatalog,
@@ -148,17 +155,24 @@ impl Engine {
     ) -> Result<Self> {
         let state = config.state.clone();
         let quota_config = Arc::clone(&config);
-        let (scene_catalog, checkpoints, run_counter, upload_quota) = run_blocking("state folder", move || {
-            let file_system: Arc<dyn FileSystem> = Arc::new(DiskFileSystem);
-            let scene_catalog = SceneCatalog::open(&state, &file_system)?;
-            let run_counter = Arc::new(RunCounter::open(&state, &file_system)?);
-            let checkpoints = CheckpointStore::start(scene_catalog.checkpoint_folder(), &file_system)?;
-            let upload_quota = UploadQuota::new(&quota_config, scene_catalog.stored_uploads());
-            Ok((scene_catalog, Arc::new(checkpoints), run_counter, upload_quota))
-        })
-        .await?;
+        let (scene_catalog, crash_log, checkpoints, run_counter, upload_quota) =
+            run_blocking("state folder", move || {
+                let file_system: Arc<dyn FileSystem> = Arc::new(DiskFileSystem);
+                let scene_catalog = SceneCatalog::open(&state, &file_system)?;
+                let scenes = scene_catalog.entries();
+                let crash_log = CrashLog::open(&state, &file_system, |scene| scenes.contains_key(scene));
+                let run_counter = Arc::new(RunCounter::open(&state, &file_system)?);
+                let checkpoints = CheckpointStore::start(scene_catalog.checkpoint_folder(), &file_system)?;
+                let upload_quota = UploadQuota::new(&quota_config, scene_catalog.stored_uploads());
+                Ok((scene_catalog, Arc::new(crash_log), Arc::new(checkpoints), run_counter, upload_quota))
+            })
+            .await?;
+        if let Some(Err(error)) = crash_log.file().map(crash_signals::install) {
+            tracing::warn!(%error, "crashes by signals are not recorded");
+        }
+        let owners = WorkOwners::new(Some(Arc::clone(&crash_log)));
         let DeviceThread { handle, info, thread: device_thread } =
-            DeviceThread::start(open_device, config.device_work_limit).await?;
+            DeviceThread::start(open_device, config.device_work_limit, owners).await?;
         let shared = Shared {
             services: SceneServices { device: handle, checkpoints, run_counter, config: Arc::clone(&config) },
             memory: MemoryBudgets::new(info.memory, info.renderer.is_ok()),
@@ -175,6 +189,7 @@ impl Engine {
             next_scene_id: AtomicU64::new(1),
             is_stopping: AtomicBool::new(false),
             device_thread: Mutex::new(Some(device_thread)),
+            crash_log,
             scene_catalog,
         };
         let engine = Self { shared: Arc::new(shared) };
@@ -225,8 +240,9 @@ impl Engine {
     }
 
     /// Opens a source of the repository under a name; an empty name means the last path component of the source. If the
-    /// name is already open from the same source, returns the open scene. A new scene counts to `client`, if there is
-    /// one.
+    /// name is already open from the same source, returns the open scene. With an empty source, opens a scene of the
+    /// catalog again, for example one that has failed or that the crash log sets aside. A new scene counts to `client`,
+    /// if there is one.
     ///
     /// # Errors
     /// `NameTaken` when the name belongs to another source, `LimitReached` when too many scenes are open, and the
@@ -237,7 +253,9 @@ impl Engine {
         } else {
             validate_scene_name(name)?.to_owned()
         };
-        self.open_once(name, SceneProvenance::Repository { source: source.into() }, client).await
+        let listed = source.is_empty().then(|| self.shared.scene_catalog.entries().remove(&name)).flatten();
+        let provenance = listed.unwrap_or_else(|| SceneProvenance::Repository { source: source.into() });
+        self.open_once(name, provenance, client).await
     }
 
     /// The open scene with this name.

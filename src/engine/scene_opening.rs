@@ -9,6 +9,7 @@ use tokio::sync::oneshot;
 use super::blocking::run_blocking;
 use super::device::command::SceneId;
 use super::registry::{OpenRequest, RegistryEntry};
+use super::running_scene::{SceneName, run_as};
 use super::scene::handle::{OpenParams, SceneHandle};
 use super::scene_memory::SceneMemory;
 use super::source::StoredUpload;
@@ -27,10 +28,15 @@ const MAX_LOGGED_LINES: usize = 16;
 impl Engine {
     /// Reserves the names of the scenes of the catalog, and reopens the scenes in the background. A scene that cannot
     /// be opened is logged, and its entry remains in the catalog, because its files may be available again at the next
-    /// start.
+    /// start. A scene that the crash log sets aside is not opened.
     pub(super) fn reopen_scenes(&self) {
         let mut openings = tokio::task::JoinSet::new();
         for (name, provenance) in self.shared.scene_catalog.entries() {
+            if let Some(error) = self.shared.crash_log.reason(&name) {
+                tracing::warn!(scene = name, %error, "a scene of the last run is set aside");
+                self.shared.registry.record_failure(&name, &provenance, error);
+                continue;
+            }
             let request = self.open_request(&name, &provenance, None);
             let reserved = self.shared.registry.reserve(&request, false);
             let engine = self.clone();
@@ -246,8 +252,9 @@ impl Engine {
             SceneProvenance::Repository { source: path } => source.open(&path, &memory),
             SceneProvenance::Upload { entry } => {
                 if let Some(upload) = upload {
-                    // A checkpoint of an older scene with this name does not apply to the new one.
+                    // A checkpoint and crashes of an older scene with this name do not apply to the new one.
                     engine.shared.services.checkpoints.remove(&scene_name);
+                    engine.shared.crash_log.forget(&scene_name);
                     let client = upload.client().cloned();
                     upload.commit(&upload_folder)?;
                     if let Some(client) = client {
@@ -258,7 +265,13 @@ impl Engine {
                 source.open_upload(&StoredUpload { folder: upload_folder, entry, hashes }, &memory)
             }
         };
-        run_blocking("load", || read().map_err(Error::into_file_error)).await
+        let (crash_log, scene_name) = (Arc::clone(&self.shared.crash_log), name.to_owned());
+        let load = move || {
+            // Before the files are read, so that a crash meanwhile counts.
+            crash_log.readmit(&scene_name);
+            run_as(SceneName::new(&scene_name), read).map_err(Error::into_file_error)
+        };
+        run_blocking("load", load).await
     }
 
     /// Stops a scene and removes its checkpoint, its uploaded files, its catalog entry and its name.
@@ -274,6 +287,7 @@ impl Engine {
         let (engine, scene_name) = (self.clone(), name.to_owned());
         let catalog_change = run_blocking("close", move || {
             engine.shared.services.checkpoints.remove(&scene_name);
+            engine.shared.crash_log.forget(&scene_name);
             let is_removed = engine.shared.scene_catalog.remove(&scene_name);
             engine.shared.upload_quota.remove(&scene_name);
             is_removed

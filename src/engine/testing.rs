@@ -51,10 +51,18 @@ pub(super) enum InjectedFault {
     RendererLost,
     DeviceLost,
     Endless,
+    Abort,
+    StackOverflow,
+    /// SIGKILL, as the kernel sends it when memory is exhausted.
+    Kill,
+    /// SIGABRT from another process, as a supervisor sends it.
+    SentAbort,
+    /// An abort because the operating system has no memory.
+    FailedAllocation,
 }
 
 impl InjectedFault {
-    const ALL: [Self; 7] = [
+    const ALL: [Self; 12] = [
         Self::PanicInDeform,
         Self::PanicInReadback,
         Self::PanicInWait,
@@ -62,6 +70,11 @@ impl InjectedFault {
         Self::RendererLost,
         Self::DeviceLost,
         Self::Endless,
+        Self::Abort,
+        Self::StackOverflow,
+        Self::Kill,
+        Self::SentAbort,
+        Self::FailedAllocation,
     ];
 
     /// The first coordinate of a state that triggers the fault, far above that of any valid test state.
@@ -100,6 +113,11 @@ impl Deformer for FaultyDeformer {
             Some(InjectedFault::Endless) => loop {
                 std::thread::park();
             },
+            Some(InjectedFault::Abort) => std::process::abort(),
+            Some(InjectedFault::StackOverflow) => panic!("{}", overflow_stack(0)),
+            Some(InjectedFault::Kill) => send_signal("KILL"),
+            Some(InjectedFault::SentAbort) => send_signal("ABRT"),
+            Some(InjectedFault::FailedAllocation) => exhaust_memory(),
             _ => self.inner.deform(state),
         }
     }
@@ -123,6 +141,32 @@ impl Deformer for FaultyDeformer {
             .position(|surface| readback.writes_to(surface))
             .expect("expected a readback of this deformer");
         Ok(self.readbacks.swap_remove(index))
+    }
+}
+
+/// Recurses until the stack ends.
+#[expect(unconditional_recursion, reason = "the stack must overflow")]
+fn overflow_stack(depth: u64) -> u64 {
+    let frame = std::hint::black_box([depth; 64]);
+    overflow_stack(frame[0] + 1) + frame[1]
+}
+
+/// Another process sends a signal to this one.
+fn send_signal(signal: &str) -> ! {
+    let process = std::process::id().to_string();
+    std::process::Command::new("kill").args(["-s", signal, &process]).status().expect("expected the program `kill`");
+    loop {
+        std::thread::park();
+    }
+}
+
+/// Allocates until the operating system refuses, which aborts the process.
+fn exhaust_memory() -> ! {
+    let no_memory = rustix::process::Rlimit { current: Some(1), maximum: Some(1) };
+    rustix::process::setrlimit(rustix::process::Resource::As, no_memory).expect("expected a lower limit");
+    let mut blocks = Vec::new();
+    loop {
+        blocks.push(vec![1_u8; 1 << 20]);
     }
 }
 

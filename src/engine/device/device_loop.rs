@@ -62,6 +62,7 @@ use super::loaded_scene::LoadedScene;
 use super::partial_output::{Charge, PartialOutput};
 use super::recovery_limit::RecoveryLimit;
 use super::watchdog::WorkClock;
+use super::work_owners::WorkOwners;
 use crate::telemetry::ms_since;
 use modalcast_model::backend_settings::BackendSettings;
 use modalcast_model::deform::{VertexAttributes, VertexReadback};
@@ -94,6 +95,7 @@ pub(super) struct DeviceLoop {
     /// Threads that copy pixels of frames.
     copy_pool: ThreadPool,
     clock: Arc<WorkClock>,
+    owners: Arc<WorkOwners>,
     recoveries: RecoveryLimit,
     scenes: HashMap<SceneId, LoadedScene>,
     /// The settings of the loaded scenes, to load them again.
@@ -101,7 +103,7 @@ pub(super) struct DeviceLoop {
     /// Outputs with further draw steps. The queue of their scene begins with [`Work::Continue`].
     partial_outputs: HashMap<SceneId, PartialOutput>,
     vertices: InFlightQueue<PendingVertices, CopiedVertices>,
-    picks: InFlightQueue<PendingPick, Vec<PickHit>>,
+    picks: InFlightQueue<PickInFlight, Vec<PickHit>>,
     frames: InFlightQueue<FrameInFlight, FrameImage<FramePixels>>,
     poll_interval: Duration,
     /// When the targets were last checked.
@@ -115,6 +117,12 @@ struct FrameInFlight {
     draw: PendingDraw,
 }
 
+/// A pick in flight.
+struct PickInFlight {
+    id: SceneId,
+    pick: PendingPick,
+}
+
 /// A vertex readback in flight.
 struct PendingVertices {
     id: SceneId,
@@ -123,10 +131,10 @@ struct PendingVertices {
     start: Instant,
 }
 
-impl Pollable for PendingPick {
+impl Pollable for PickInFlight {
     /// Ignores `limit`, because a pick can only be polled.
     fn is_ready_within(&self, _limit: Duration) -> bool {
-        self.is_ready()
+        self.pick.is_ready()
     }
 }
 
@@ -159,6 +167,7 @@ impl DeviceLoop {
         loss: DeviceLossSender,
         queue: Arc<CommandQueue>,
         clock: Arc<WorkClock>,
+        owners: Arc<WorkOwners>,
     ) -> Result<Self> {
         let copy_pool =
             ThreadPoolBuilder::new().num_threads(COPY_THREADS).thread_name(|index| format!("pixels {index}"));
@@ -169,6 +178,7 @@ impl DeviceLoop {
             queue,
             copy_pool: copy_pool.build().map_err(fault_in("threads that copy pixels"))?,
             clock,
+            owners,
             recoveries: RecoveryLimit::default(),
             scenes: HashMap::new(),
             backends: HashMap::new(),
@@ -210,22 +220,28 @@ impl DeviceLoop {
         self.free_in_flight_slot(&taken.work);
         let older_readback_count = self.vertices.len();
         let (begin, scene, class) = (Instant::now(), taken.scene, taken.class);
-        run_caught(|| self.run_work(taken));
+        self.run_caught_for(scene, |this| this.run_work(taken));
         let ms = ms_since(begin);
         if ms >= LONG_WORK_MS {
             tracing::debug!(scene, work = class.kind, ms, "other scenes waited for the device thread");
         }
         for _ in 0..older_readback_count {
-            run_caught(|| self.finish_oldest_vertices());
+            self.finish_oldest_vertices();
         }
         while self.picks.is_oldest_ready(Duration::ZERO) {
-            run_caught(|| self.finish_oldest_pick());
+            self.finish_oldest_pick();
         }
         while self.frames.is_oldest_ready(Duration::ZERO) {
-            run_caught(|| self.finish_oldest_frame());
+            self.finish_oldest_frame();
         }
         self.free_unused_targets();
         self.recover();
+    }
+
+    /// Runs work of a scene, catches its panic, and lets the crash log name the scene if the work ends the process.
+    fn run_caught_for(&mut self, id: SceneId, work: impl FnOnce(&mut Self)) {
+        let owners = Arc::clone(&self.owners);
+        owners.run_on_device(id, || run_caught(|| work(self)));
     }
 
     /// Frees the memory of render targets that no frame has used for [`TARGET_LIFETIME`].
@@ -293,17 +309,17 @@ impl DeviceLoop {
         match work {
             Work::Command(Command::Draw { .. }) | Work::Prepared(Command::Draw { .. }) | Work::Continue => {
                 while self.frames.is_full() {
-                    run_caught(|| self.finish_oldest_frame());
+                    self.finish_oldest_frame();
                 }
             }
             Work::Command(Command::Pick { .. }) | Work::Prepared(Command::Pick { .. }) => {
                 while self.picks.is_full() {
-                    run_caught(|| self.finish_oldest_pick());
+                    self.finish_oldest_pick();
                 }
             }
             Work::Command(Command::ReadVertices { .. }) => {
                 while self.vertices.is_full() {
-                    run_caught(|| self.finish_oldest_vertices());
+                    self.finish_oldest_vertices();
                 }
             }
             Work::Command(_) | Work::Prepared(_) => {}
@@ -388,7 +404,7 @@ impl DeviceLoop {
         let pending_pick =
             find_scene(scenes, id).and_then(|scene| context.begin_pick(scene, &camera, picture, rectangle));
         match self.loss.record_loss(pending_pick) {
-            Ok(pending_pick) => self.picks.push(pending_pick, reply),
+            Ok(pick) => self.picks.push(PickInFlight { id, pick }, reply),
             Err(error) => answer(reply, Err(error)),
         }
     }
@@ -433,18 +449,23 @@ impl DeviceLoop {
 
     /// Waits for the oldest pick in flight and answers it.
     fn finish_oldest_pick(&mut self) {
-        let Some(InFlight { pending, reply }) = self.picks.pop_oldest() else { return };
-        let hits = self.context.finish_pick(pending);
-        answer(reply, self.loss.record_loss(hits));
+        let Some(InFlight { pending: PickInFlight { id, pick }, reply }) = self.picks.pop_oldest() else { return };
+        self.run_caught_for(id, |this| {
+            let hits = this.context.finish_pick(pick);
+            answer(reply, this.loss.record_loss(hits));
+        });
     }
 
     /// Waits for the oldest frame in flight; a copy thread then copies its pixels if necessary, and sends them.
     fn finish_oldest_frame(&mut self) {
         let Some(InFlight { pending, reply }) = self.frames.pop_oldest() else { return };
-        if reply.is_closed() {
-            return; // The caller no longer waits.
+        if !reply.is_closed() {
+            self.run_caught_for(pending.id, |this| this.finish_frame(pending, reply));
         }
-        let FrameInFlight { id, charge, draw } = pending;
+    }
+
+    fn finish_frame(&mut self, frame: FrameInFlight, reply: Reply<FrameImage<FramePixels>>) {
+        let FrameInFlight { id, charge, draw } = frame;
         let pixels = self.context.finish_draw(draw);
         if let Ok(pixels) = &pixels {
             // A GPU takes longer to draw a frame than the device thread takes to submit it.
@@ -459,7 +480,7 @@ impl DeviceLoop {
     /// Waits for the oldest vertex readback in flight and answers it.
     fn finish_oldest_vertices(&mut self) {
         if let Some(oldest) = self.vertices.pop_oldest() {
-            self.finish_vertices(oldest);
+            self.run_caught_for(oldest.pending.id, |this| this.finish_vertices(oldest));
         }
     }
 
@@ -530,7 +551,10 @@ mod tests {
     /// Starts a device thread whose deformer injects faults, and loads two scenes.
     async fn start_with_two_scenes() -> (DeviceHandle, Arc<Scene>) {
         let open_device = || DeviceContext::with_deformer(FaultyDeformer::boxed);
-        let handle = DeviceThread::start(open_device, WORK_LIMIT).await.expect("expected a device thread").handle;
+        let handle = DeviceThread::start(open_device, WORK_LIMIT, WorkOwners::new(None))
+            .await
+            .expect("expected a device thread")
+            .handle;
         let scene = testing::two_strips();
         for id in [FAULTY_SCENE, CONTROL_SCENE] {
             handle.load_scene(id, &scene, BackendSettings::default()).await.expect("expected a loaded scene");
@@ -588,7 +612,10 @@ mod tests {
     #[tokio::test]
     async fn scenes_are_served_while_another_deformer_is_prepared() {
         let open_device = || DeviceContext::with_deformer(create_when_open);
-        let handle = DeviceThread::start(open_device, WORK_LIMIT).await.expect("expected a device thread").handle;
+        let handle = DeviceThread::start(open_device, WORK_LIMIT, WorkOwners::new(None))
+            .await
+            .expect("expected a device thread")
+            .handle;
         let scene = testing::two_strips();
         handle.load_scene(CONTROL_SCENE, &scene, BackendSettings::default()).await.expect("expected a loaded scene");
         IS_GATE_CLOSED.store(true, Ordering::Relaxed);
@@ -657,7 +684,10 @@ mod tests {
     async fn device_that_does_not_answer_is_lost() {
         let open_device = || DeviceContext::with_deformer(FaultyDeformer::boxed);
         let limit = Duration::from_secs(5);
-        let handle = DeviceThread::start(open_device, limit).await.expect("expected a device thread").handle;
+        let handle = DeviceThread::start(open_device, limit, WorkOwners::new(None))
+            .await
+            .expect("expected a device thread")
+            .handle;
         let scene = testing::two_strips();
         handle.load_scene(FAULTY_SCENE, &scene, BackendSettings::default()).await.expect("expected a loaded scene");
         let faulty_state = state_with_q(&scene, InjectedFault::Endless.q());

@@ -12,6 +12,7 @@ use super::device_loop::DeviceLoop;
 use super::device_loss::device_loss_channel;
 use super::handle::{DeviceHandle, PendingReply};
 use super::watchdog::WorkClock;
+use super::work_owners::WorkOwners;
 use crate::config::{BackendChoice, Config, RendererChoice};
 use crate::engine::output::step_output::{FrameOutput, PictureContent};
 use crate::engine::testing;
@@ -66,7 +67,8 @@ impl Fixture {
         let (loss_sender, loss) = device_loss_channel();
         let handle = DeviceHandle::of_queue(&queue, loss);
         let device_loop =
-            DeviceLoop::new(context, loss_sender, Arc::clone(&queue), WorkClock::new()).expect("expected a loop");
+            DeviceLoop::new(context, loss_sender, Arc::clone(&queue), WorkClock::new(), WorkOwners::new(None));
+        let device_loop = device_loop.expect("expected a loop");
         let mut fixture = Self { device_loop, queue, handle, scene: testing::two_strips() };
         for id in [1, 2] {
             let (handle, scene) = (fixture.handle.clone(), Arc::clone(&fixture.scene));

@@ -13,6 +13,7 @@ use super::context::{DeformerPreparer, DeviceContext, EngineInfo};
 use super::device_loop::DeviceLoop;
 use super::device_loss::{DeviceLoss, device_loss_channel};
 use super::watchdog::{self, WorkClock};
+use super::work_owners::WorkOwners;
 use crate::engine::blocking::run_blocking;
 use crate::engine::output::step_output::{FrameOutput, PictureContent};
 use crate::frame::Legend;
@@ -28,6 +29,7 @@ pub(in crate::engine) struct DeviceHandle {
     commands: Arc<CommandSender>,
     loss: DeviceLoss,
     preparer: DeformerPreparer,
+    owners: Arc<WorkOwners>,
 }
 
 /// Closes the queue when the last handle is dropped.
@@ -49,24 +51,27 @@ pub(in crate::engine) struct DeviceThread {
 
 impl DeviceThread {
     /// Starts the thread. Returns when `open_device` has opened the devices. The device is lost when one piece of work
-    /// takes longer than `work_limit`.
+    /// takes longer than `work_limit`. `owners` records the scene of this work.
     ///
     /// # Errors
     /// The errors of `open_device`; `Fault` when a thread cannot be started.
     pub(in crate::engine) async fn start(
         open_device: impl FnOnce() -> Result<DeviceContext> + Send + 'static,
         work_limit: Duration,
+        owners: Arc<WorkOwners>,
     ) -> Result<Self> {
         let queue = CommandQueue::new();
         let commands = Arc::new(CommandSender(Arc::clone(&queue)));
         let (info_sender, info_receiver) = oneshot::channel();
         let (loss_sender, loss) = device_loss_channel();
         let clock = WorkClock::new();
-        watchdog::start(&clock, work_limit, loss_sender.clone())?;
+        watchdog::start(&clock, work_limit, loss_sender.clone(), Arc::clone(&owners))?;
+        let loop_owners = Arc::clone(&owners);
         let thread = std::thread::Builder::new()
             .name("device".into())
             .spawn(move || {
-                match open_device().and_then(|context| DeviceLoop::new(context, loss_sender, queue, clock)) {
+                match open_device().and_then(|context| DeviceLoop::new(context, loss_sender, queue, clock, loop_owners))
+                {
                     Ok(device_loop) => {
                         // Fails only if the caller no longer waits. The queue is then closed and `run` returns.
                         info_sender.send(Ok((device_loop.info().clone(), device_loop.deformer_preparer()))).ok();
@@ -79,7 +84,7 @@ impl DeviceThread {
             })
             .map_err(fault_in("device thread"))?;
         let (info, preparer) = info_receiver.await.map_err(|_| no_answer_error())??;
-        Ok(Self { handle: DeviceHandle { commands, loss, preparer }, info, thread })
+        Ok(Self { handle: DeviceHandle { commands, loss, preparer, owners }, info, thread })
     }
 }
 
@@ -94,6 +99,7 @@ impl DeviceHandle {
             commands: Arc::new(CommandSender(Arc::clone(&queue))),
             loss: device_loss_channel().1,
             preparer: DeformerPreparer::reference(),
+            owners: WorkOwners::new(None),
         };
         // Ends when the handle or the receiver is dropped.
         std::thread::spawn(move || {
@@ -111,12 +117,18 @@ impl DeviceHandle {
     /// A handle for tests that run the device loop themselves.
     #[cfg(test)]
     pub(super) fn of_queue(queue: &Arc<CommandQueue>, loss: DeviceLoss) -> Self {
-        Self { commands: Arc::new(CommandSender(Arc::clone(queue))), loss, preparer: DeformerPreparer::reference() }
+        let (commands, preparer) = (Arc::new(CommandSender(Arc::clone(queue))), DeformerPreparer::reference());
+        Self { commands, loss, preparer, owners: WorkOwners::new(None) }
     }
 
     /// The observer of a device loss.
     pub(in crate::engine) const fn loss(&self) -> &DeviceLoss {
         &self.loss
+    }
+
+    /// Names a scene that will be loaded, so that the crash log can name it.
+    pub(in crate::engine) fn name_scene(&self, id: SceneId, name: &str) {
+        self.owners.insert(id, name);
     }
 
     /// Prepares the deformer of a scene on another thread, and then loads the scene on the device thread.
@@ -127,10 +139,15 @@ impl DeviceHandle {
         backends: BackendSettings,
     ) -> Result<()> {
         let (preparer, prepared_scene) = (self.preparer.clone(), Arc::clone(scene));
-        let prepare = move || preparer.prepare(&prepared_scene, backends.batches);
+        let owners = Arc::clone(&self.owners);
+        let prepare = move || owners.run(id, || preparer.prepare(&prepared_scene, backends.batches));
         let deformer = run_blocking("load", prepare).await;
         let scene = Arc::clone(scene);
-        self.call(|reply| Command::LoadScene { id, scene, deformer, backends, reply }).await
+        let loaded = self.call(|reply| Command::LoadScene { id, scene, deformer, backends, reply }).await;
+        if loaded.is_err() {
+            self.owners.remove(id);
+        }
+        loaded
     }
 
     /// Starts deforming a scene to a state.
@@ -192,7 +209,9 @@ impl DeviceHandle {
 
     /// Unloads a scene. A full queue accepts this command, too.
     pub(in crate::engine) async fn unload_scene(&self, id: SceneId) -> Result<()> {
-        match self.call(|reply| Command::UnloadScene { id, reply }).await {
+        let unloaded = self.call(|reply| Command::UnloadScene { id, reply }).await;
+        self.owners.remove(id);
+        match unloaded {
             // The end of the process frees the memory of a lost device.
             Err(Error::DeviceLost { .. }) => Ok(()),
             result => result,

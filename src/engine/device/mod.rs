@@ -18,3 +18,4 @@ mod partial_output;
 mod recovery_limit;
 pub(super) mod scalar_field;
 mod watchdog;
+pub(super) mod work_owners;

@@ -80,6 +80,7 @@ impl SceneHandle {
     pub(in crate::engine) async fn open(params: OpenParams, services: SceneServices) -> Result<Self> {
         let OpenParams { name, provenance, scene, backends, id, on_failure, state, frames_unavailable, memory } =
             params;
+        services.device.name_scene(id, &name);
         services.device.load_scene(id, &scene, backends).await?;
         let state = match state.map(Arc::new) {
             Some(state) => match services.device.deform(id, &state).wait().await {

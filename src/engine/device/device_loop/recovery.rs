@@ -52,8 +52,11 @@ impl DeviceLoop {
         self.context.reopen_renderer()?;
         let count = scenes.len();
         for SceneToRestore { id, scene, state, backends } in scenes {
-            let mut loaded_scene = self.context.load_scene(&scene, backends)?;
-            loaded_scene.deform_with_next(&state, None)?;
+            let owners = Arc::clone(&self.owners);
+            let loaded_scene = owners.run_on_device(id, || {
+                let mut loaded_scene = self.context.load_scene(&scene, backends)?;
+                loaded_scene.deform_with_next(&state, None).map(|_| loaded_scene)
+            })?;
             self.insert_scene(id, loaded_scene, backends);
         }
         Ok(count)
@@ -62,7 +65,7 @@ impl DeviceLoop {
     /// Answers all outputs in flight with an error. Vertices do not depend on the renderer, so these are answered.
     fn fail_outputs(&mut self, error: &Error) {
         while !self.vertices.is_empty() {
-            run_caught(|| self.finish_oldest_vertices());
+            self.finish_oldest_vertices();
         }
         while let Some(InFlight { reply, .. }) = self.picks.pop_oldest() {
             answer(reply, Err(error.clone()));
