@@ -130,8 +130,8 @@ pub struct Rejection {
     pub step: ::core::option::Option<u64>,
     #[prost(enumeration = "Reason", tag = "2")]
     pub reason: i32,
-    /// Path of the invalid field in the message, such as "step.q_domains\[1\]" or "open.delivery"; empty if no field is
-    /// invalid.
+    /// Path of the invalid field in the message, such as "step.q_domains\[1\]" or "open.delivery"; for REASON_INVALID_FILE
+    /// the file and the place in it; empty if no field is invalid.
     #[prost(string, tag = "3")]
     pub field: ::prost::alloc::string::String,
     /// The expected value, range or condition.
@@ -252,7 +252,8 @@ impl Reason {
 }
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct OpenSceneRequest {
-    /// A built-in name, or a path inside the server's repository.
+    /// A built-in name, or a path inside the server's repository. Empty: the source of the scene in the server's list that
+    /// has the name `scene`, which may be an uploaded scene. Scenes in ListScenesResponse.failed are in this list.
     #[prost(string, tag = "1")]
     pub source: ::prost::alloc::string::String,
     /// The name that the scene gets: 1 to 64 of A-Z, a-z, 0-9, '.', '\_' and '-', not starting with a dot. Empty: the
@@ -503,8 +504,9 @@ pub struct ListScenesResponse {
     /// Names of the scenes that are being opened, for example after a restart. Calls for them wait.
     #[prost(string, repeated, tag = "3")]
     pub opening: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
-    /// Scenes that have failed, or that could not be opened again after a restart. OpenScene tries again, and DeleteScene
-    /// removes them from this list.
+    /// Scenes that have failed, that could not be opened again after a restart, or that were not opened again because their
+    /// work ended the server in two of the last three starts. OpenScene tries again, and DeleteScene removes them from this
+    /// list.
     #[prost(message, repeated, tag = "4")]
     pub failed: ::prost::alloc::vec::Vec<FailedScene>,
 }
