@@ -88,6 +88,12 @@ fn gpu_samples_have_the_bits_of_the_reference() {
             let got = context.draw_depths(&mut rasterizer, &soup.viewport, &depth_target);
             assert_eq!(count_differences(&got, &want_depths), 0, "{}, depth, run {run}", soup.name);
         }
+        let half = soup.triangles.len() as u32 / 2;
+        for range in [0..half, half..ALL_TRIANGLES.end] {
+            rasterizer.draw(None, Some((&soup.viewport, &id_target)), range).expect("expected a frame");
+        }
+        let got: Vec<u64> = context.gl.read(&id_target, soup.viewport.pixel_count());
+        assert_eq!(count_differences(&got, &want.keys), 0, "{}, in two ranges", soup.name);
         // CUDA releases the buffers before OpenGL deletes them.
         drop(rasterizer);
         drop((positions, id_target, depth_target));
@@ -188,14 +194,14 @@ fn gpu_unknown_or_small_buffers_return_errors() {
     assert!(result.expect_err("expected an unknown-buffer error").to_string().contains("999999"));
     let (mut rasterizer, positions) = context.create_rasterizer(&soup, None);
     rasterizer
-        .draw(None, Some((&soup.viewport, &unknown_buffer(8 * pixel_count))))
+        .draw(None, Some((&soup.viewport, &unknown_buffer(8 * pixel_count))), ALL_TRIANGLES)
         .expect_err("expected an unknown-buffer error");
     let small_target = context.gl.create_buffer(4 * pixel_count);
     rasterizer
-        .draw(None, Some((&soup.viewport, &small_target)))
+        .draw(None, Some((&soup.viewport, &small_target)), ALL_TRIANGLES)
         .expect_err("expected an error for a target that is too small");
     rasterizer
-        .draw(None, Some((&soup.viewport, &GlBuffer { bytes: 8 * pixel_count, ..small_target.clone() })))
+        .draw(None, Some((&soup.viewport, &GlBuffer { bytes: 8 * pixel_count, ..small_target.clone() })), ALL_TRIANGLES)
         .expect_err("expected an error for a target smaller than its stated size");
     // The positions of two vertices.
     let too_few_positions = GlBuffer { bytes: 2 * size_of::<[f32; 3]>() as u64, ..positions };
