@@ -132,7 +132,7 @@ async fn scene_that_hangs_twice_is_set_aside() {
 async fn causes_outside_the_process_set_no_scene_aside() {
     for fault in [InjectedFault::Kill, InjectedFault::SentAbort, InjectedFault::FailedAllocation] {
         let folder = tempfile::tempdir().expect("expected a temporary folder");
-        for _ in 0..3 {
+        for _ in 0..2 {
             run_server(folder.path(), fault);
         }
         let engine = start_engine(folder.path()).await;
