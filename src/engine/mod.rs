@@ -603,7 +603,7 @@ mod tests {
     async fn upload_whose_caller_has_gone_leaves_no_scene_and_no_folder() {
         let folder = tempfile::tempdir().expect("expected a temporary folder");
         let config = Config { state: folder.path().to_owned(), ..Config::default() };
-        let (allow, allowed) = std::sync::mpsc::channel();
+        let (allow, allowed) = std::sync::mpsc::sync_channel(1);
         let source = Arc::new(WaitingSource(Mutex::new(allowed)));
         let open_device = || DeviceContext::with_deformer(FaultyDeformer::boxed);
         let config = Arc::new(config.validated().expect("expected a valid configuration"));
