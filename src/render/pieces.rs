@@ -140,6 +140,14 @@ impl OutputClass {
         let samples = u64::from(width) * u64::from(height) * u64::from(samples_per_pixel);
         Self { kind, samples_per_pixel, size_class: samples.checked_ilog2().unwrap_or(0) }
     }
+
+    /// The class of the same output with a shadow map, which takes longer.
+    const fn with_shadow(self) -> Self {
+        match self.kind {
+            OutputKind::Frame { .. } => Self { kind: OutputKind::Frame { draws_shadow: true }, ..self },
+            OutputKind::Aov => self,
+        }
+    }
 }
 
 /// Device times of the recent outputs of a scene in milliseconds. The number of classes is bounded by the sizes of
@@ -148,9 +156,12 @@ impl OutputClass {
 pub(crate) struct OutputCosts(RefCell<HashMap<OutputClass, f64>>);
 
 impl OutputCosts {
-    /// Whether an output is drawn in pieces: it is the first of its class, or recent ones took longer than a piece.
+    /// Whether an output is drawn in pieces: it is the first of its class, or recent ones took longer than a piece. The
+    /// first frame without a shadow map takes at most the time of those with one.
     pub(crate) fn has_pieces(&self, class: OutputClass, limits: PieceLimits) -> bool {
-        self.0.borrow().get(&class).is_none_or(|ms| *ms > limits.target_ms)
+        let costs = self.0.borrow();
+        let cost_ms = costs.get(&class).or_else(|| costs.get(&class.with_shadow()));
+        cost_ms.is_none_or(|ms| *ms > limits.target_ms)
     }
 
     /// Records the device time of an output.
@@ -227,6 +238,10 @@ mod tests {
         ] {
             assert!(costs.has_pieces(other, LIMITS), "{other:?}");
         }
+        let [with_shadow, without_shadow] =
+            [true, false].map(|draws_shadow| OutputClass::new(OutputKind::Frame { draws_shadow }, [640, 400], 1));
+        costs.record(with_shadow, 3.0);
+        assert!(!costs.has_pieces(without_shadow, LIMITS));
         costs.record(class, 400.0);
         let short_outputs = (0..1000).take_while(|_| {
             costs.record(class, 3.0);

@@ -136,7 +136,8 @@ async fn changed_digit_in_a_stored_file_is_an_error_with_its_name() {
     client.describe("arrays", &[]).await.expect_err("expected no scene");
     let list = server.scenes().await.list_scenes(v1::ListScenesRequest {}).await.expect("expected a list").into_inner();
     let error = list.failed[0].error.clone().expect("expected an error");
-    assert_eq!((error.reason(), &error.field[..]), (Reason::InvalidFile, "file '0.obj'"));
+    assert_eq!(error.reason(), Reason::InvalidFile);
+    assert_eq!(error.field, "file 'scene.toml': domain 0 ('0.obj'): file '0.obj'");
     assert!(error.expected.starts_with("the uploaded content, SHA-256 "), "{error:?}");
     server.stop().await.expect("expected the server to stop");
     std::fs::write(&path, &text).expect("expected a written file");

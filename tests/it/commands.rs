@@ -142,7 +142,8 @@ fn view_serves_a_page_that_contains_the_recording() {
     socket.read_to_string(&mut answer).expect("expected a page that is not compressed");
     assert!(answer.starts_with("HTTP/1.1 200"), "{answer}");
     // echo -ne '\x89MCAP0\r\n' | base64
-    assert!(answer.contains("<script id=\"recording\" type=\"application/octet-stream\">iU1DQVAwDQo=</script>"));
+    let element = "<script id=\"recording\" type=\"application/octet-stream\" data-slow=\"1\">iU1DQVAwDQo=</script>";
+    assert!(answer.contains(element), "{answer}");
     let pid = i32::try_from(server.id()).ok().and_then(Pid::from_raw).expect("expected a process");
     kill_process(pid, Signal::TERM).expect("expected a running server");
     assert!(server.wait().expect("expected the end of the server").success());

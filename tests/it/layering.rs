@@ -338,7 +338,13 @@ fn every_kernel_has_a_launcher_and_a_twin() {
 /// Devices, memory that processes share, and a setting of the C library.
 #[test]
 fn only_modules_near_devices_shared_memory_and_the_c_library_have_unsafe_code() {
-    let allowed = ["src/compute/gpu/", "src/render/", "src/service/shared_memory/", "src/cli/allocator.rs", "src/engine/crash_signals.rs"];
+    let allowed = [
+        "src/compute/gpu/",
+        "src/render/",
+        "src/service/shared_memory/",
+        "src/cli/allocator.rs",
+        "src/engine/crash_signals.rs",
+    ];
     for path in list_files(&repository_root().join("src"), &["rs"]) {
         let relative_path = path
             .strip_prefix(repository_root())

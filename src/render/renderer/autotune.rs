@@ -32,6 +32,11 @@ pub trait TrialScene {
     /// # Errors
     /// Errors of deforming and drawing.
     fn submit(&mut self, renderer: &mut Renderer) -> Result<PendingFrame>;
+
+    /// The time, by which frames are compared.
+    fn now(&self) -> Instant {
+        Instant::now()
+    }
 }
 
 impl Renderer {
@@ -95,12 +100,12 @@ impl Renderer {
                 && let Some(frame) = in_flight.pop_front()
             {
                 self.read_image(frame)?;
-                ends.push(Instant::now());
+                ends.push(scene.now());
             }
         }
         for frame in in_flight {
             self.read_image(frame)?;
-            ends.push(Instant::now());
+            ends.push(scene.now());
         }
         let timed = &ends[WARM_UP_FRAMES - 1..];
         Ok((timed[TIMED_FRAMES] - timed[0]).as_secs_f64() * 1e3 / TIMED_FRAMES as f64)
@@ -128,8 +133,10 @@ mod tests {
     use crate::types::FrameParams;
     use modalcast_model::raster::{DrawTarget, Rasterizer};
 
-    /// Time by which a trial is slowed down. Frames of the test take much less.
-    const DELAY: Duration = Duration::from_millis(20);
+    /// Time of a frame of the fastest combination.
+    const SHORT_FRAME: Duration = Duration::from_millis(10);
+    /// Time of a frame of the other combinations.
+    const LONG_FRAME: Duration = Duration::from_millis(11);
 
     #[derive(Debug)]
     struct EmptyRasterizer;
@@ -149,23 +156,27 @@ mod tests {
         }
     }
 
-    /// A scene that takes longer unless the compute rasterizer draws `fastest`.
-    struct DelayedScene {
+    /// A scene with a clock of its own, by which frames take longer unless the compute rasterizer draws `fastest`.
+    struct ClockedScene {
         buffers: SceneBuffers,
         params: FrameParams,
         fastest: RasterPasses,
+        clock: Instant,
     }
 
-    impl TrialScene for DelayedScene {
+    impl TrialScene for ClockedScene {
         fn buffers_mut(&mut self) -> Result<&mut SceneBuffers> {
             Ok(&mut self.buffers)
         }
 
         fn submit(&mut self, renderer: &mut Renderer) -> Result<PendingFrame> {
-            if enabled(self)? != self.fastest {
-                std::thread::sleep(DELAY);
-            }
+            let duration = if enabled(self)? == self.fastest { SHORT_FRAME } else { LONG_FRAME };
+            self.clock += duration;
             renderer.submit_without_readback(&self.buffers, &self.params)
+        }
+
+        fn now(&self) -> Instant {
+            self.clock
         }
     }
 
@@ -177,7 +188,7 @@ mod tests {
         let fastest = RasterPasses { shadow: true, visibility: false };
         assert!(fastest.is_subset_of(supported), "expected a scene whose shadow map the rasterizer can draw");
         let params = params(&scene, 16);
-        let mut scene = DelayedScene { buffers, params, fastest };
+        let mut scene = ClockedScene { buffers, params, fastest, clock: Instant::now() };
         let backends = renderer.select_raster_backends(&mut scene).expect("timed trials");
         assert_eq!(backends.shadow, Some(RasterBackend::Cuda));
         assert_eq!(enabled(&mut scene).expect("buffers"), fastest);

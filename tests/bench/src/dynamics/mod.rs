@@ -24,6 +24,7 @@ mod reference;
 mod row;
 mod run;
 mod solid_modes;
+mod work;
 
 use std::path::PathBuf;
 
@@ -32,8 +33,9 @@ use serde::Serialize;
 use self::cubic::CubicResult;
 pub use self::recommendation::DynamicsRecommendation;
 pub use self::reference::ReferenceSummary;
-pub use self::row::{Expectation, IntegrationRow, MotionErrors, Work};
+pub use self::row::{Expectation, IntegrationRow, MotionErrors};
 pub use self::solid_modes::SolidRow;
+pub use self::work::Work;
 use crate::provenance::Provenance;
 use crate::workloads::Size;
 use modalcast_dynamics::Result as DynamicsResult;

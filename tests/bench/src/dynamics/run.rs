@@ -4,7 +4,7 @@ use std::time::Instant;
 
 use nalgebra::DVector;
 
-use super::row::Work;
+use super::work::Work;
 use crate::timing::Timing;
 use modalcast_dynamics::integrator::{Integrator, IntegratorTotals, LoadChange, MotionState};
 
