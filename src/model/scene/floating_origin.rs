@@ -218,6 +218,14 @@ impl FloatingOrigins {
         transform
     }
 
+    /// Makes these origins equal to `newer`, from which they differ at most in the translations of `roots`.
+    pub(super) fn copy_roots(&mut self, newer: &Self, roots: impl Iterator<Item = usize>) {
+        let Self { grids: _, translations, shared_origin, counts, translations_since_search } = self;
+        (*shared_origin, *counts) = (newer.shared_origin, newer.counts);
+        *translations_since_search = newer.translations_since_search;
+        roots.for_each(|root| translations[root] = newer.translations[root]);
+    }
+
     /// Sets the translation of a root, in scene units from the scene's origin.
     pub(super) fn set_translation(&mut self, root: usize, translation: [f64; 3]) {
         let previous_translation = std::mem::replace(&mut self.translations[root], translation);

@@ -129,6 +129,24 @@ impl SceneState {
         is_rebased
     }
 
+    /// Makes this state equal to `newer`, from which it differs at most in `domains`.
+    pub(super) fn copy_domains(&mut self, scene: &Scene, newer: &Self, domains: &[u32]) {
+        let Self { run, step, time, q, transforms, origins, serial, dirty_domains } = self;
+        (*run, *step, *time, *serial) = (newer.run, newer.step, newer.time, newer.serial);
+        dirty_domains.clone_from(&newer.dirty_domains);
+        let roots = domains.iter().map(|domain| scene.transform_roots.root_of(*domain as usize));
+        roots.clone().for_each(|root| transforms[root] = newer.transforms[root]);
+        for domain in domains {
+            let layout = scene.layout.domains[*domain as usize];
+            let range = layout.first_q..layout.first_q + layout.rank;
+            q[range.clone()].copy_from_slice(&newer.q[range]);
+        }
+        match (origins.as_mut().and_then(Arc::get_mut), &newer.origins) {
+            (Some(origins), Some(newer)) => origins.copy_roots(newer, roots),
+            (_, newer) => origins.clone_from(newer),
+        }
+    }
+
     /// The floating origin of a transform root, in scene units from the scene's origin. The root's transform, its
     /// vertices and those of its followers are relative to this point. `root` is an index into `transforms`.
     pub fn origin_of(&self, root: usize) -> [f64; 3] {
