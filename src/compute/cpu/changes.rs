@@ -1,19 +1,18 @@
 //! Finds the domains that changed since the previous step, that is, those with any changed bit in q or T.
 //!
-//! The tracker compares the values of q and T. The state's own list of changes is not sufficient, because it misses
-//! values that were written to the fields directly. The serial numbers of states are not sufficient either: an
-//! unrelated state may have the same number.
+//! If the state follows the previous one, only the domains in its list of changes are compared
+//! ([`SceneState::dirty_domains`]).
 
 use rayon::prelude::*;
 
 use modalcast_model::domain::Transform;
-use modalcast_model::scene::{Scene, SceneState};
+use modalcast_model::scene::{DirtyDomains, Scene, SceneState};
 
 /// The values of the previous step, and the domains that have changed since.
 #[derive(Debug, Default)]
 pub(super) struct ChangeTracker {
-    /// q and T of the previous step; `None` before the first.
-    previous: Option<(Vec<f32>, Vec<Transform>)>,
+    /// The previous step; `None` before the first.
+    previous: Option<PreviousStep>,
     /// Per domain, whether it changed.
     flags: Vec<bool>,
     /// The changed domains, ascending.
@@ -21,30 +20,69 @@ pub(super) struct ChangeTracker {
     all_changed: bool,
 }
 
+/// The values of a step.
+#[derive(Debug)]
+struct PreviousStep {
+    serial: u64,
+    q: Vec<f32>,
+    transforms: Vec<Transform>,
+}
+
+impl PreviousStep {
+    /// Whether the values of a domain differ in any bit. A domain that follows another one has no T of its own. It
+    /// changes with the T of its root.
+    fn differs(&self, scene: &Scene, state: &SceneState, domain: usize) -> bool {
+        let layout = &scene.layout.domains[domain];
+        let q_range = layout.first_q..layout.first_q + layout.rank;
+        let root = scene.transform_roots.root_of(domain);
+        as_bytes(&self.transforms[root].0) != as_bytes(&state.transforms[root].0)
+            || as_bytes(&self.q[q_range.clone()]) != as_bytes(&state.q[q_range])
+    }
+
+    /// Copies the values of domains.
+    fn copy(&mut self, scene: &Scene, state: &SceneState, domains: &[u32]) {
+        for domain in domains {
+            let layout = &scene.layout.domains[*domain as usize];
+            let q_range = layout.first_q..layout.first_q + layout.rank;
+            let root = scene.transform_roots.root_of(*domain as usize);
+            self.q[q_range.clone()].copy_from_slice(&state.q[q_range]);
+            self.transforms[root] = state.transforms[root];
+        }
+    }
+}
+
 impl ChangeTracker {
     /// Compares a step with the previous one and stores its values.
     pub(super) fn update(&mut self, scene: &Scene, state: &SceneState) {
         let domain_count = scene.domains.len();
-        let Some((q, transforms)) = &mut self.previous else {
-            self.previous = Some((state.q.clone(), state.transforms.clone()));
+        let Some(previous) = &mut self.previous else {
+            let (serial, q, transforms) = (state.serial, state.q.clone(), state.transforms.clone());
+            self.previous = Some(PreviousStep { serial, q, transforms });
             (self.flags, self.all_changed) = (vec![true; domain_count], true);
             self.domains = (0..domain_count as u32).collect();
             return;
         };
-        let (previous_q, previous_transforms) = (&*q, &*transforms);
-        self.flags.par_iter_mut().with_min_len(4096).enumerate().for_each(|(domain, flag)| {
-            let layout = &scene.layout.domains[domain];
-            let q_range = layout.first_q..layout.first_q + layout.rank;
-            // A domain that follows another one has no T of its own. It changes with the T of its root.
-            let root = scene.transform_roots.root_of(domain);
-            *flag = as_bytes(&previous_transforms[root].0) != as_bytes(&state.transforms[root].0)
-                || as_bytes(&previous_q[q_range.clone()]) != as_bytes(&state.q[q_range]);
-        });
-        self.domains.clear();
-        self.domains.extend((0..domain_count as u32).filter(|domain| self.flags[*domain as usize]));
+        let is_next = previous.serial.checked_add(1) == Some(state.serial);
+        previous.serial = state.serial;
+        for domain in self.domains.drain(..) {
+            self.flags[domain as usize] = false;
+        }
+        match &state.dirty_domains {
+            DirtyDomains::Some(listed) if is_next => {
+                self.domains.extend(listed.iter().filter(|domain| previous.differs(scene, state, **domain as usize)));
+                self.domains.iter().for_each(|domain| self.flags[*domain as usize] = true);
+                previous.copy(scene, state, &self.domains);
+            }
+            _ => {
+                self.flags.par_iter_mut().with_min_len(4096).enumerate().for_each(|(domain, flag)| {
+                    *flag = previous.differs(scene, state, domain);
+                });
+                self.domains.extend((0..domain_count as u32).filter(|domain| self.flags[*domain as usize]));
+                previous.q.copy_from_slice(&state.q);
+                previous.transforms.copy_from_slice(&state.transforms);
+            }
+        }
         self.all_changed = self.domains.len() == domain_count;
-        q.copy_from_slice(&state.q);
-        transforms.copy_from_slice(&state.transforms);
     }
 
     /// The domains that changed, ascending; `None` when all domains changed.
