@@ -13,8 +13,6 @@ use modalcast_model::scene::{DirtyDomains, Scene, SceneState};
 pub(super) struct ChangeTracker {
     /// The previous step; `None` before the first.
     previous: Option<PreviousStep>,
-    /// Per domain, whether it changed.
-    flags: Vec<bool>,
     /// The changed domains, ascending.
     domains: Vec<u32>,
     all_changed: bool,
@@ -58,26 +56,22 @@ impl ChangeTracker {
         let Some(previous) = &mut self.previous else {
             let (serial, q, transforms) = (state.serial, state.q.clone(), state.transforms.clone());
             self.previous = Some(PreviousStep { serial, q, transforms });
-            (self.flags, self.all_changed) = (vec![true; domain_count], true);
+            self.all_changed = true;
             self.domains = (0..domain_count as u32).collect();
             return;
         };
         let is_next = previous.serial.checked_add(1) == Some(state.serial);
         previous.serial = state.serial;
-        for domain in self.domains.drain(..) {
-            self.flags[domain as usize] = false;
-        }
+        self.domains.clear();
+        let differs = |domain: &u32| previous.differs(scene, state, *domain as usize);
         match &state.dirty_domains {
             DirtyDomains::Some(listed) if is_next => {
-                self.domains.extend(listed.iter().filter(|domain| previous.differs(scene, state, **domain as usize)));
-                self.domains.iter().for_each(|domain| self.flags[*domain as usize] = true);
+                self.domains.extend(listed.iter().copied().filter(differs));
                 previous.copy(scene, state, &self.domains);
             }
             _ => {
-                self.flags.par_iter_mut().with_min_len(4096).enumerate().for_each(|(domain, flag)| {
-                    *flag = previous.differs(scene, state, domain);
-                });
-                self.domains.extend((0..domain_count as u32).filter(|domain| self.flags[*domain as usize]));
+                let domains = (0..domain_count as u32).into_par_iter().with_min_len(4096);
+                self.domains.par_extend(domains.filter(differs));
                 previous.q.copy_from_slice(&state.q);
                 previous.transforms.copy_from_slice(&state.transforms);
             }
@@ -88,11 +82,6 @@ impl ChangeTracker {
     /// The domains that changed, ascending; `None` when all domains changed.
     pub(super) fn changed_domains(&self) -> Option<&[u32]> {
         (!self.all_changed).then_some(&self.domains)
-    }
-
-    /// Whether a domain changed.
-    pub(super) fn is_changed(&self, domain: usize) -> bool {
-        self.flags[domain]
     }
 }
 
@@ -118,6 +107,7 @@ impl ChangeTracker {
 mod tests {
     use super::*;
     use crate::testing::{TestRng, scene};
+    use modalcast_model::scene::{RawStepUpdate, StepUpdate};
 
     #[test]
     fn only_domains_with_changed_values_are_listed() {
@@ -127,10 +117,6 @@ mod tests {
         let mut changes = ChangeTracker::default();
         let mut update = |state: &SceneState| {
             changes.update(&scene, state);
-            (0..3).for_each(|domain| {
-                let is_listed = changes.changed_domains().is_none_or(|domains| domains.contains(&(domain as u32)));
-                assert_eq!(changes.is_changed(domain), is_listed);
-            });
             changes.changed_domains().map(<[u32]>::to_vec)
         };
         assert_eq!(update(&state), None, "expected the first step to change all domains");
@@ -149,5 +135,15 @@ mod tests {
         state.transforms[1].0[11] = 3.0;
         assert_eq!(update(&state), None);
         assert_eq!(update(&state), Some(vec![]));
+        // The list of the next state names the domains that are compared.
+        let raw = RawStepUpdate { q_domains: vec![0, 2], q: vec![0; 4 * 5].into(), ..RawStepUpdate::default() };
+        let step = StepUpdate::parse(&scene, &raw).expect("a valid step");
+        state.apply(&scene, &step);
+        state.transforms[1].0[11] = 4.0;
+        assert_eq!(update(&state), Some(vec![0, 2]), "control: the list lacks the change of domain 1");
+        state.apply(&scene, &step);
+        assert_eq!(update(&state), Some(vec![]), "expected listed domains without a change to be omitted");
+        state.mark_all_dirty();
+        assert_eq!(update(&state), Some(vec![1]));
     }
 }

@@ -34,7 +34,7 @@ use modalcast_model::deform::{Backend, BoundingAxes, DeformSummary, DeformedSurf
 use modalcast_model::error::Result;
 use modalcast_model::scene::{BoundingBox, Scene, SceneState};
 use tile::{PackedOutput, PerTileOutput, WorkList};
-use tile_bounds::TileBounds;
+use tile_bounds::{SceneBounds, TileBounds};
 
 /// Maximum number of corners that one work item processes. A corner is a vertex with one of its normals and texture
 /// coordinates.
@@ -44,7 +44,6 @@ const MAX_TILE_CORNERS: usize = 256;
 #[derive(Debug)]
 pub struct CpuDeformer {
     scene: Arc<Scene>,
-    bounding_axes: Option<BoundingAxes>,
     /// Per shape, its stored U and x0.
     shapes: Vec<TiledModes>,
     changes: ChangeTracker,
@@ -54,6 +53,7 @@ pub struct CpuDeformer {
     corner_work: WorkList,
     /// Per tile of vertices.
     tile_bounds: Vec<TileBounds>,
+    scene_bounds: SceneBounds,
     surface: DeformedSurface,
 }
 
@@ -67,9 +67,9 @@ impl CpuDeformer {
         let vertex_work = WorkList::new(layout.domains.iter().map(|domain| domain.vertices), MAX_TILE_VERTICES);
         Self {
             scene: Arc::clone(scene),
-            bounding_axes: None,
             changes: ChangeTracker::default(),
             tile_bounds: vec![TileBounds::EMPTY; vertex_work.len()],
+            scene_bounds: SceneBounds::new(),
             shapes,
             vertex_work,
             corner_work: WorkList::new(layout.domains.iter().map(|domain| domain.corners), MAX_TILE_CORNERS),
@@ -85,8 +85,9 @@ impl CpuDeformer {
 
     /// Also bounds the positions of every step along these axes.
     #[must_use]
-    pub fn with_bounding_axes(self, axes: Option<BoundingAxes>) -> Self {
-        Self { bounding_axes: axes, ..self }
+    pub fn with_bounding_axes(mut self, axes: Option<BoundingAxes>) -> Self {
+        self.scene_bounds.set_axes(axes);
+        self
     }
 
     /// Bytes of stored U and x0. A step in which all domains change reads this many bytes if no two domains share a
@@ -109,12 +110,16 @@ impl CpuDeformer {
 
     /// Updates the boxes of the changed domains from the bounds of their tiles, if boxes are an output of the scene.
     fn update_boxes(&mut self) {
-        let (changes, vertex_work, tile_bounds) = (&self.changes, &self.vertex_work, &self.tile_bounds);
-        self.surface.boxes.par_iter_mut().with_min_len(1024).enumerate().for_each(|(domain, bounding_box)| {
-            if changes.is_changed(domain) {
-                *bounding_box = TileBounds::of_domain(&tile_bounds[vertex_work.tiles_of(domain)]);
+        let Self { changes, vertex_work, tile_bounds, surface: DeformedSurface { boxes, .. }, .. } = self;
+        let box_of = |domain: usize| TileBounds::of_domain(&tile_bounds[vertex_work.tiles_of(domain)]);
+        match changes.changed_domains() {
+            _ if boxes.is_empty() => {}
+            Some(domains) => domains.iter().for_each(|domain| boxes[*domain as usize] = box_of(*domain as usize)),
+            None => {
+                let boxes = boxes.par_iter_mut().with_min_len(1024).enumerate();
+                boxes.for_each(|(domain, bounding_box)| *bounding_box = box_of(domain));
             }
-        });
+        }
     }
 }
 
@@ -135,8 +140,12 @@ impl Deformer for CpuDeformer {
         } else {
             rigid_normals::compute_rigid_normals(&self.scene, state, corner_tiles, &mut self.surface);
         }
-        let oriented_bounds = self.bounding_axes.map(|axes| TileBounds::of_scene_along(&self.tile_bounds, &axes));
-        let bounds = TileBounds::of_scene(&self.tile_bounds);
+        let vertex_work = &self.vertex_work;
+        let changed_domains = self.changes.changed_domains();
+        let changed_tiles =
+            changed_domains.map(|domains| domains.iter().map(|domain| vertex_work.tiles_of(*domain as usize)));
+        self.scene_bounds.update(&self.tile_bounds, changed_tiles);
+        let (bounds, oriented_bounds) = self.scene_bounds.get();
         Ok(DeformSummary { bounds, oriented_bounds, ms: start.elapsed().as_secs_f64() * 1e3 })
     }
 

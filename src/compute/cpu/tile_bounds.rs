@@ -1,8 +1,11 @@
-//! Bounds of one tile. The deformer stores them between steps, because the bounds of a scene include unchanged tiles.
+//! Bounds of one tile, and of a scene. The deformer stores them between steps, because the bounds of a scene include
+//! unchanged tiles.
 
-use nalgebra::Vector3;
+use std::ops::Range;
+
 use rayon::prelude::*;
 
+use modalcast_model::deform::BoundingAxes;
 use modalcast_model::scene::{BoundingBox, OrientedBounds};
 
 /// Bounds of f32 positions: all NaN if a position is not finite, `min > max` if there are none.
@@ -64,25 +67,13 @@ impl TileBounds {
         self.min[0].is_finite()
     }
 
-    /// Bounds of all tiles of a scene.
-    pub(super) fn of_scene(tile_bounds: &[Self]) -> BoundingBox {
-        tile_bounds.par_iter().with_min_len(4096).copied().reduce(|| Self::EMPTY, Self::union).to_bounds()
-    }
-
-    /// Bounds of a scene along `axes`. They enclose the boxes of the tiles, so they may be larger than the bounds of
-    /// the positions.
-    pub(super) fn of_scene_along(tile_bounds: &[Self], axes: &[Vector3<f64>; 3]) -> OrientedBounds {
-        let bounds_of_tile = |tile_bounds: &Self| OrientedBounds::enclosing(axes, &tile_bounds.to_bounds());
-        tile_bounds
-            .par_iter()
-            .with_min_len(4096)
-            .map(bounds_of_tile)
-            .reduce(|| OrientedBounds::EMPTY, OrientedBounds::union)
-    }
-
     /// Bounds of the tiles of one domain.
     pub(super) fn of_domain(tile_bounds: &[Self]) -> BoundingBox {
-        tile_bounds.iter().copied().fold(Self::EMPTY, Self::union).to_bounds()
+        Self::of_tiles(tile_bounds).to_bounds()
+    }
+
+    fn of_tiles(tile_bounds: &[Self]) -> Self {
+        tile_bounds.iter().copied().fold(Self::EMPTY, Self::union)
     }
 
     fn to_bounds(self) -> BoundingBox {
@@ -99,6 +90,85 @@ impl TileBounds {
     #[inline(always)]
     fn add_zero_or_nan(self, zero_or_nan: f32) -> Self {
         Self { min: self.min.map(|number| number + zero_or_nan), max: self.max.map(|number| number + zero_or_nan) }
+    }
+}
+
+/// Number of tiles in a block.
+const BLOCK_TILES: usize = 64;
+
+/// Bounds of all tiles of a scene, which a step updates at the cost of the tiles that it changes.
+#[derive(Debug)]
+pub(super) struct SceneBounds {
+    axes: Option<BoundingAxes>,
+    /// Bounds of each [`BLOCK_TILES`] consecutive tiles.
+    blocks: Vec<BlockBounds>,
+}
+
+#[derive(Debug, Clone, Copy)]
+struct BlockBounds {
+    bounds: TileBounds,
+    /// Bounds along the axes, if there are any. They enclose the boxes of the tiles, so they may be larger than the
+    /// bounds of the positions.
+    oriented: OrientedBounds,
+}
+
+impl BlockBounds {
+    const EMPTY: Self = Self { bounds: TileBounds::EMPTY, oriented: OrientedBounds::EMPTY };
+
+    fn of_tiles(tile_bounds: &[TileBounds], axes: Option<&BoundingAxes>) -> Self {
+        let oriented = axes.map_or(OrientedBounds::EMPTY, |axes| {
+            let bounds_of_tile = |tile: &TileBounds| OrientedBounds::enclosing(axes, &tile.to_bounds());
+            tile_bounds.iter().map(bounds_of_tile).fold(OrientedBounds::EMPTY, OrientedBounds::union)
+        });
+        Self { bounds: TileBounds::of_tiles(tile_bounds), oriented }
+    }
+
+    fn union(self, other: Self) -> Self {
+        Self { bounds: self.bounds.union(other.bounds), oriented: self.oriented.union(other.oriented) }
+    }
+}
+
+impl SceneBounds {
+    pub(super) const fn new() -> Self {
+        Self { axes: None, blocks: Vec::new() }
+    }
+
+    /// Also bounds the positions of every step along these axes.
+    pub(super) fn set_axes(&mut self, axes: Option<BoundingAxes>) {
+        (self.axes, self.blocks) = (axes, Vec::new());
+    }
+
+    /// Updates the bounds of the changed tiles: ascending ranges, or all tiles.
+    pub(super) fn update(
+        &mut self,
+        tile_bounds: &[TileBounds],
+        changed_tiles: Option<impl Iterator<Item = Range<usize>>>,
+    ) {
+        let Self { axes, blocks } = self;
+        let of_block = |block: usize| {
+            let first = block * BLOCK_TILES;
+            let tiles = &tile_bounds[first..tile_bounds.len().min(first + BLOCK_TILES)];
+            BlockBounds::of_tiles(tiles, axes.as_ref())
+        };
+        let block_count = tile_bounds.len().div_ceil(BLOCK_TILES);
+        match changed_tiles.filter(|_| blocks.len() == block_count) {
+            Some(ranges) => {
+                let mut next_block = 0;
+                for range in ranges.filter(|range| !range.is_empty()) {
+                    for block in next_block.max(range.start / BLOCK_TILES)..range.end.div_ceil(BLOCK_TILES) {
+                        blocks[block] = of_block(block);
+                    }
+                    next_block = range.end.div_ceil(BLOCK_TILES);
+                }
+            }
+            None => (0..block_count).into_par_iter().with_min_len(64).map(of_block).collect_into_vec(blocks),
+        }
+    }
+
+    /// Bounds of the scene, and bounds along the axes, if there are any.
+    pub(super) fn get(&self) -> (BoundingBox, Option<OrientedBounds>) {
+        let scene = self.blocks.iter().copied().fold(BlockBounds::EMPTY, BlockBounds::union);
+        (scene.bounds.to_bounds(), self.axes.map(|_| scene.oriented))
     }
 }
 
@@ -119,11 +189,38 @@ mod tests {
                 poisoned_axes[index % 3][index / 3] = non_finite;
                 let poisoned = bounds_of(&poisoned_axes);
                 assert!(!poisoned.is_finite());
-                assert!(!TileBounds::of_scene(&[tile_bounds, poisoned, tile_bounds]).is_finite());
+                assert!(!TileBounds::of_tiles(&[tile_bounds, poisoned, tile_bounds]).is_finite());
             }
         }
         let point_bounds = TileBounds::of_axes([&[30.0], &[-5.0], &[3.0]]);
-        let union = TileBounds::of_scene(&[tile_bounds, point_bounds, TileBounds::EMPTY]);
+        let union = TileBounds::of_tiles(&[tile_bounds, point_bounds, TileBounds::EMPTY]);
         assert_eq!((union.min, union.max), ([0.0, -5.0, 2.0], [30.0, 21.0, 22.0]));
+    }
+
+    /// Changed tiles at the ends of blocks, over several blocks and in the last block, which is shorter.
+    #[test]
+    fn updated_bounds_equal_the_bounds_of_all_tiles() {
+        let axes = modalcast_model::scene::light_axes(
+            nalgebra::Vector3::new(0.3, -0.8, 0.5),
+            modalcast_model::scene::UpAxis::Y,
+        );
+        let point = |number: f32| TileBounds::of_axes([&[number], &[-2.0 * number], &[0.5 * number]]);
+        let mut tiles: Vec<TileBounds> = (0..1000).map(|index| point(index as f32)).collect();
+        let bounds_of_all = |tiles: &[TileBounds]| {
+            let mut bounds = SceneBounds::new();
+            bounds.set_axes(Some(axes));
+            bounds.update(tiles, None::<std::vec::IntoIter<Range<usize>>>);
+            bounds
+        };
+        let mut bounds = bounds_of_all(&tiles);
+        for ranges in [vec![0..1], vec![63..64, 64..65], vec![10..300, 300..300, 310..311], vec![5..6, 998..1000]] {
+            let before = bounds.get();
+            for (factor, is_larger) in [(1.0, true), (-1.0, true), (0.0, false)] {
+                ranges.iter().cloned().flatten().for_each(|tile| tiles[tile] = point(factor * 5000.0));
+                bounds.update(&tiles, Some(ranges.clone().into_iter()));
+                assert_eq!(bounds.get(), bounds_of_all(&tiles).get(), "{ranges:?}");
+                assert!(!is_larger || bounds.get() != before, "control: {ranges:?}");
+            }
+        }
     }
 }
