@@ -4,6 +4,18 @@
 //! The task of a scene serializes all operations on the scene (`scene::actor`). A writer sends steps through a bounded
 //! queue (`scene::step_queue`). A subscriber receives results through a bounded channel (`scene::subscriber`).
 //! Exceeding a bound, or blocking the writer for too long, yields an error that names the limit.
+//!
+//! # From q to a picture
+//! | where | what happens | in |
+//! |---|---|---|
+//! | call of the writer | q and T are parsed and queued | `scene::step_queue` |
+//! | task of the scene | the state after the step is computed; commands to deform it and to draw each picture go to the device; the readers get the pictures at once, before they are drawn | `scene::actor`, `scene::output_producer` |
+//! | device thread | the state is deformed and the pictures are drawn, in turn with those of other scenes | `device::device_loop` |
+//! | copy threads | the pixels leave the memory of the device | `output::rendered_picture` |
+//! | encoder threads | the pixels become a file, once for all readers of a format | `output::frame_encoder` |
+//! | call of the reader | waits for the pictures, lets them be encoded, and sends them | `output::frame_queue` |
+//!
+//! Vertices and picks take the same path without the encoder threads.
 
 mod blocking;
 mod catch_unwind;
@@ -30,19 +42,19 @@ mod upload_quota;
 pub use content::{ContentHash, ContentHashes, SceneContent, ShapeArray, hex, parse_hash};
 pub use device::context::{DeviceContext, EngineInfo, share_pictures};
 pub use device::device_loss::DeviceLoss;
+pub use device::handle::PendingReply;
 pub use device::loaded_scene::LoadedScene;
 pub use device::scalar_field::validate_mode;
 pub use memory_limits::MemoryLimits;
-pub use output::encoding_task::EncodingTask;
-pub use output::frame_encoder::{EncodedFrame, EncodedOutput, FrameEncoder, StepPicture};
+pub use output::frame_encoder::FrameEncoder;
 pub use output::frame_format::{FrameFormat, JpegQuality};
+pub use output::frame_queue::{EncodedFrame, FrameQueue};
+pub use output::output_spec::{FrameOutput, OutputSpec, PictureSpec};
 pub use output::pack::{Origins, PackedVertices, Section, VertexPacker};
 pub use output::pick_result::{PickResult, resolve_picks};
 pub use output::rendered_picture::{Pixels, RenderedPicture};
 pub use output::state_packing::{PackedState, StateContent, StateSection, pack_state};
-pub use output::step_output::{
-    FrameOutput, ModalHit, OutputBody, OutputSpec, PictureSpec, StepFrames, StepId, StepOutput,
-};
+pub use output::step_output::{ModalHit, OutputBody, SharedPicture, StepFrames, StepId, StepOutput};
 pub use output::step_vertices::StepVertices;
 pub use output::vertex_encoding::Encoding;
 pub use output::vertex_selection::{Attribute, VertexSelection, validate_domains};

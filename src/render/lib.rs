@@ -66,7 +66,7 @@ pub use self::passes::aov::{Aov, AovImage, PartialAov};
 pub use self::passes::picking::{PendingPick, PickHit};
 pub use self::plan::{Allocation, OmittedFeature, RenderPlan, plan};
 pub use self::renderer::{
-    EncodedFrame, FramePixels, HeldPixels, MappedPixels, PartialFrame, PendingFrame, Renderer, ScenePreparation,
+    EncodedPng, FramePixels, HeldPixels, MappedPixels, PartialFrame, PendingFrame, Renderer, ScenePreparation,
     TrialScene,
 };
 pub use self::resources::scene_buffers::SceneBuffers;

@@ -22,8 +22,8 @@ use super::shared_memory::{CallMemory, SharedMemory};
 use super::status::to_status;
 use super::stream::{Deadline, ReplySender, ReplyStream, chunks_with_head, respond};
 use crate::engine::{
-    EncodedFrame, EncodedSubscription, EncodingTask, Engine, FrameStreamEntry, FrameStreamRegistration, OutputSpec,
-    StepPicture, StreamDelivery, StreamId,
+    EncodedFrame, EncodedSubscription, Engine, FrameFormat, FrameQueue, FrameStreamEntry, FrameStreamRegistration,
+    OutputSpec, StreamDelivery, StreamId,
 };
 use modalcast_model::error::fault;
 
@@ -55,13 +55,11 @@ impl v1::frame_service_server::FrameService for FrameServiceImpl {
             let work = async {
                 let _pixels = connection.acquire_frame_pixels(count_pixels(&pictures)).await.map_err(to_status)?;
                 let output = scene_handle.request_output(selector, output_spec(&pictures)).await.map_err(to_status)?;
-                let step_pictures = StepPicture::of_output(output).map_err(to_status)?.zip(&pictures);
-                // All pictures are encoded concurrently, and sent in order.
-                let mut tasks: Vec<EncodingTask> =
-                    step_pictures.map(|(step, picture)| EncodingTask::start(&encoder, step, picture.format)).collect();
-                for (task, picture) in tasks.iter_mut().zip(&pictures) {
-                    let frame = task.finish().await.map_err(to_status)?;
-                    for mut chunk in frame_chunks(&frame, picture, max_chunk_bytes) {
+                let mut frames = FrameQueue::new(encoder, formats(&pictures));
+                frames.push(output).map_err(to_status)?;
+                for picture in &pictures {
+                    let Some(frame) = frames.next().await else { break };
+                    for mut chunk in frame_chunks(&frame.map_err(to_status)?, picture, max_chunk_bytes) {
                         chunk.shared = memory.share(&mut chunk.data).await;
                         reply_sender.send(v1::RenderFrameResponse { part: Some(SinglePart::Chunk(chunk)) }).await?;
                     }
@@ -113,8 +111,8 @@ impl v1::frame_service_server::FrameService for FrameServiceImpl {
         let cameras = subscription.cameras().cloned().ok_or_else(|| to_status(fault("frames", "expected cameras")))?;
         let entry = FrameStreamEntry { scene: Arc::clone(&scene_handle.scene), cameras };
         let registration = self.engine.register_frame_stream(entry).map_err(to_status)?;
-        let formats = pictures.iter().map(|picture| picture.format).collect();
-        let frames = EncodedSubscription::new(subscription, self.engine.encoder().clone(), formats, request.steps);
+        let encoder = self.engine.encoder().clone();
+        let frames = EncodedSubscription::new(subscription, encoder, formats(&pictures), request.steps);
         let frame_stream = FrameStream {
             registration,
             pictures,
@@ -168,7 +166,7 @@ impl FrameStream {
                 };
                 tokio::select! {
                     sent = send => sent?,
-                    error = frames.disconnected() => return Err(to_status(error)),
+                    error = frames.encode_until_disconnected() => return Err(to_status(error)),
                 }
             }
         }
@@ -189,9 +187,13 @@ fn output_spec(pictures: &[RequestedPicture]) -> OutputSpec {
     OutputSpec::Frames(pictures.iter().map(|picture| picture.spec).collect())
 }
 
+fn formats(pictures: &[RequestedPicture]) -> Vec<FrameFormat> {
+    pictures.iter().map(|picture| picture.format).collect()
+}
+
 /// Splits a frame into chunks, of which the first has the head.
 fn frame_chunks(
-    EncodedFrame { picture: picture_index, camera_version, output: frame }: &EncodedFrame,
+    frame: &EncodedFrame,
     picture: &RequestedPicture,
     max_chunk_bytes: usize,
 ) -> impl Iterator<Item = v1::FrameChunk> + use<> {
@@ -203,8 +205,8 @@ fn frame_chunks(
         total: frame.bytes.len() as u64,
         skipped: frame.skipped,
         stages: wire_stages(&frame.stages),
-        picture: *picture_index,
-        camera_version: *camera_version,
+        picture: frame.picture,
+        camera_version: frame.camera_version,
         ..wire_frame_info(&frame.info)
     };
     chunks_with_head(head, frame.bytes.clone(), max_chunk_bytes, |head, offset, data| v1::FrameChunk {

@@ -141,11 +141,13 @@ async fn output(scene: &SceneHandle) -> (Vec<f32>, Vec<u8>) {
     let spec = OutputSpec::Vertices(VertexAttributes::POSITIONS_AND_NORMALS);
     let vertices = scene.request_output(StepSelector::Current, spec).await.expect("expected vertices");
     let OutputBody::Vertices(vertices) = vertices.body else { panic!("expected vertices") };
+    let vertices = vertices.wait().await.expect("expected vertices");
     let size = FrameSize::new(320, 240);
     let camera = Camera::fit_to_scene(&scene.scene, size.width, size.height);
     let picture = PictureSpec { camera, size, output: FrameOutput::Color, style: FrameStyle::default() };
     let frames = scene.request_output(StepSelector::Current, OutputSpec::Frames(Arc::new([picture]))).await;
     let OutputBody::Frames(frames) = frames.expect("expected a frame").body else { panic!("expected frames") };
-    let Pixels::Color(pixels) = &frames.pictures[0].pixels else { panic!("expected pixels") };
+    let picture = frames.pictures[0].wait().await.expect("expected a picture");
+    let Pixels::Color(pixels) = &picture.pixels else { panic!("expected pixels") };
     (vertices.surface.positions.clone(), pixels.to_vec())
 }

@@ -1,6 +1,8 @@
 //! Displacements u = U q and bounding boxes over the wire. If the scene enables them, the server sends them with or
 //! without the vertices. It rejects requests for disabled attributes.
 
+use std::sync::Arc;
+
 use modalcast::config::{BackendChoice, Config};
 use modalcast::engine::{Delivery, OutputSpec};
 use modalcast_compute::reference::{self, ReferenceDeformer};
@@ -217,9 +219,10 @@ async fn box_stream_delivers_every_step() {
 }
 
 /// Step number and vertex data of an output.
-fn vertices_of_output(output: &modalcast::engine::StepOutput) -> (usize, &DeformedSurface) {
+async fn vertices_of_output(output: &modalcast::engine::StepOutput) -> (usize, Arc<DeformedSurface>) {
     let modalcast::engine::OutputBody::Vertices(vertices) = &output.body else { panic!("expected vertices") };
-    (output.step.number as usize, &vertices.surface)
+    let vertices = with_timeout(vertices.wait()).await.expect("expected vertices");
+    (output.step.number as usize, Arc::clone(&vertices.surface))
 }
 
 /// The corners of all boxes, rounded to f32 as on the wire.
@@ -266,12 +269,12 @@ async fn subscribers_of_different_attributes_get_every_step() {
     };
     // The first output may show any step, because the server may skip steps for this subscription.
     let output = with_timeout(latest_subscription.next()).await.expect("expected a step");
-    let (index, surface) = vertices_of_output(&output);
+    let (index, surface) = vertices_of_output(&output).await;
     let (positions, normals, displacements) = expected_output(index);
     assert!(
         surface.positions == positions
             && surface.normals == normals
-            && box_numbers(surface) == compute_boxes(&positions)
+            && box_numbers(&surface) == compute_boxes(&positions)
     );
     assert!(max_abs_error(&surface.displacements, &displacements) < TOLERANCE);
     drop(latest_subscription);
@@ -279,10 +282,10 @@ async fn subscribers_of_different_attributes_get_every_step() {
         let (positions, normals, displacements) = expected_output(index);
         for (subscription, selection) in subscriptions.iter_mut().zip(selections) {
             let output = with_timeout(subscription.next()).await.expect("expected another message");
-            let (number, surface) = vertices_of_output(&output);
+            let (number, surface) = vertices_of_output(&output).await;
             assert_eq!((number, output.skipped), (index, 0));
             assert!(!selection.positions || surface.positions == positions, "step {index}");
-            assert!(!selection.boxes || box_numbers(surface) == compute_boxes(&positions), "step {index}");
+            assert!(!selection.boxes || box_numbers(&surface) == compute_boxes(&positions), "step {index}");
             assert!(
                 !selection.displacements || max_abs_error(&surface.displacements, &displacements) < TOLERANCE,
                 "step {index}"

@@ -63,10 +63,12 @@ fn reference_images(cameras: &[Camera]) -> Vec<StepImages> {
     steps_with_images
 }
 
-fn frame_bytes(output: &StepOutput) -> &[u8] {
+/// Waits for the first picture of an output.
+async fn frame_bytes(output: &StepOutput) -> Vec<u8> {
     let OutputBody::Frames(frames) = &output.body else { panic!("expected frames") };
-    let Pixels::Color(rgba) = &frames.pictures[0].pixels else { panic!("expected a color picture") };
-    rgba
+    let picture = with_timeout(frames.pictures[0].wait()).await.expect("expected a picture");
+    let Pixels::Color(rgba) = &picture.pixels else { panic!("expected a color picture") };
+    rgba.to_vec()
 }
 
 async fn start_server() -> Server {
@@ -115,7 +117,7 @@ async fn frames_of_many_cameras_show_their_own_step() {
         for (subscription, image) in subscriptions.iter_mut().zip(images) {
             let output = with_timeout(subscription.next()).await.expect("expected another message");
             assert_eq!((output.step.number, output.skipped), (*number, 0));
-            assert!(frame_bytes(&output) == image, "step {number}");
+            assert!(frame_bytes(&output).await == *image, "step {number}");
         }
         assert_eq!(
             with_timeout(vertex_subscription.next()).await.expect("expected another message").step.number,
@@ -167,10 +169,12 @@ async fn pictures_of_one_subscription_show_the_same_step() {
         let OutputBody::Frames(StepFrames { pictures, .. }) = output.body else { panic!("expected frames") };
         assert_eq!(pictures.len(), 6);
         for (picture, image) in pictures.iter().zip(&images) {
+            let picture = with_timeout(picture.wait()).await.expect("expected a picture");
             let Pixels::Color(rgba) = &picture.pixels else { panic!("expected a color picture") };
             assert!(rgba == image, "step {number}");
         }
-        assert!(matches!(pictures[5].pixels, Pixels::Values(_)));
+        let depth = with_timeout(pictures[5].wait()).await.expect("expected a picture");
+        assert!(matches!(depth.pixels, Pixels::Values(_)));
         let output = with_timeout(last_camera.next()).await.expect("expected another output");
         let OutputBody::Frames(single) = output.body else { panic!("expected frames") };
         assert!(Arc::ptr_eq(&single.pictures[0], &pictures[4]), "expected one drawing of step {number}");
@@ -194,13 +198,13 @@ async fn closing_a_scene_delivers_frames_in_flight() {
     }
     let expected_images = reference_images(&cameras);
     let output = with_timeout(subscription.next()).await.expect("expected a frame");
-    assert!(frame_bytes(&output) == expected_images[0].images[0]);
+    assert!(frame_bytes(&output).await == expected_images[0].images[0]);
     with_timeout(server.engine.close("attributes")).await.expect("expected the scene to close");
     // The subscription ends after the frames of some of the 12 steps. No frame is missing in between.
     let mut number = 1;
     while let Ok(output) = with_timeout(subscription.next()).await {
         assert_eq!(output.step.number, number);
-        assert!(frame_bytes(&output) == expected_images[number as usize].images[0]);
+        assert!(frame_bytes(&output).await == expected_images[number as usize].images[0]);
         number += 1;
     }
     assert!(number <= 12);

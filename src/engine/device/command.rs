@@ -2,16 +2,17 @@
 
 use std::sync::Arc;
 
-use tokio::sync::oneshot;
+use tokio::sync::{oneshot, watch};
 
 use super::context::PreparedDeformer;
-use crate::engine::output::step_output::{FrameOutput, PictureContent};
-use crate::frame::Legend;
+use crate::engine::output::output_spec::{FrameOutput, PictureContent, PictureSpec};
+use crate::engine::output::rendered_picture::RenderedPicture;
+use crate::engine::output::step_vertices::StepVertices;
 use modalcast_model::backend_settings::BackendSettings;
-use modalcast_model::deform::{DeformSummary, DeformedSurface, VertexAttributes};
+use modalcast_model::deform::{DeformSummary, VertexAttributes};
 use modalcast_model::error::{Error, Result};
-use modalcast_model::scene::{Camera, FrameSize, FrameStyle, PixelRect, Scene, SceneState};
-use modalcast_render::{AovImage, FrameImage, FramePixels, PickHit};
+use modalcast_model::scene::{Camera, FrameSize, PixelRect, Scene, SceneState};
+use modalcast_render::PickHit;
 
 /// Identifies a loaded scene on the device thread.
 pub(in crate::engine) type SceneId = u64;
@@ -24,15 +25,41 @@ pub(super) struct CostClass {
     pub size_class: u32,
 }
 
-/// The channel that carries a command's answer.
-pub(in crate::engine) type Reply<T> = oneshot::Sender<Result<T>>;
+/// The channel that carries a command's answer. Several readers can wait for it.
+#[derive(Debug)]
+pub(in crate::engine) struct Reply<T> {
+    /// `None` until the answer is sent.
+    answer: watch::Sender<Option<Result<T>>>,
+    /// Dropped after the answer. The task of the scene then knows that the command has ended.
+    _end: oneshot::Sender<()>,
+}
 
-/// Vertices in host memory.
-#[derive(Debug, Clone)]
-pub(in crate::engine) struct CopiedVertices {
-    pub surface: Arc<DeformedSurface>,
-    /// Milliseconds from the start of the copy to its completion.
-    pub copy_ms: f64,
+/// The end of a command: an error once the command is answered or dropped.
+pub(in crate::engine) type CommandEnd = oneshot::Receiver<()>;
+
+impl<T> Reply<T> {
+    /// A channel, with the receivers of the answer and of the end.
+    pub(super) fn channel() -> (Self, watch::Receiver<Option<Result<T>>>, CommandEnd) {
+        let (answer, answer_receiver) = watch::channel(None);
+        let (end, end_receiver) = oneshot::channel();
+        (Self { answer, _end: end }, answer_receiver, end_receiver)
+    }
+
+    /// Sends the answer. Returns false if no reader waits any longer.
+    pub(in crate::engine) fn send(self, answer: Result<T>) -> bool {
+        self.answer.send(Some(answer)).is_ok()
+    }
+
+    /// Whether no reader waits any longer.
+    pub(in crate::engine) fn is_closed(&self) -> bool {
+        self.answer.is_closed()
+    }
+
+    /// Waits until no reader waits any longer.
+    #[cfg(test)]
+    pub(in crate::engine) async fn closed(&self) {
+        self.answer.closed().await;
+    }
 }
 
 /// A command to the device thread with the channel for its answer.
@@ -52,21 +79,12 @@ pub(in crate::engine) enum Command {
         next: Option<Arc<SceneState>>,
         reply: Reply<DeformSummary>,
     },
+    /// Draws a picture of the last deformation: colors, or an AOV (arbitrary output variable, such as depth).
     Draw {
         id: SceneId,
-        camera: Camera,
-        size: FrameSize,
-        style: FrameStyle,
+        picture: PictureSpec,
         content: PictureContent,
-        reply: Reply<FrameImage<FramePixels>>,
-    },
-    /// Renders an AOV (arbitrary output variable): values instead of colors, with a legend if they form a color map.
-    RenderAov {
-        id: SceneId,
-        camera: Camera,
-        size: FrameSize,
-        frame_output: FrameOutput,
-        reply: Reply<(AovImage, Option<Legend>)>,
+        reply: Reply<Arc<RenderedPicture>>,
     },
     /// Finds the surface points at the pixels of a rectangle.
     Pick {
@@ -81,7 +99,7 @@ pub(in crate::engine) enum Command {
     ReadVertices {
         id: SceneId,
         attributes: VertexAttributes,
-        reply: Reply<CopiedVertices>,
+        reply: Reply<Arc<StepVertices>>,
     },
     UnloadScene {
         id: SceneId,
@@ -96,7 +114,6 @@ impl Command {
             Self::LoadScene { id, .. }
             | Self::Deform { id, .. }
             | Self::Draw { id, .. }
-            | Self::RenderAov { id, .. }
             | Self::Pick { id, .. }
             | Self::ReadVertices { id, .. }
             | Self::UnloadScene { id, .. } => *id,
@@ -109,8 +126,10 @@ impl Command {
         match self {
             Self::LoadScene { .. } => of_kind("load"),
             Self::Deform { .. } => of_kind("deform"),
-            Self::Draw { size, .. } => CostClass { kind: "draw", size_class: size_class(*size) },
-            Self::RenderAov { size, .. } => CostClass { kind: "aov", size_class: size_class(*size) },
+            Self::Draw { picture: PictureSpec { output, size, .. }, .. } => {
+                let kind = if *output == FrameOutput::Color { "draw" } else { "aov" };
+                CostClass { kind, size_class: size_class(*size) }
+            }
             Self::Pick { .. } => of_kind("pick"),
             Self::ReadVertices { .. } => of_kind("vertices"),
             Self::UnloadScene { .. } => of_kind("unload"),
@@ -125,14 +144,13 @@ impl Command {
 
     /// Whether the command leaves the queue when its caller no longer waits. The other commands change the scene.
     pub(super) const fn is_cancellable(&self) -> bool {
-        matches!(self, Self::Draw { .. } | Self::RenderAov { .. } | Self::Pick { .. } | Self::ReadVertices { .. })
+        matches!(self, Self::Draw { .. } | Self::Pick { .. } | Self::ReadVertices { .. })
     }
 
     /// Whether the caller of a command that does not change the scene no longer waits.
     pub(super) fn is_cancelled(&self) -> bool {
         match self {
             Self::Draw { reply, .. } => reply.is_closed(),
-            Self::RenderAov { reply, .. } => reply.is_closed(),
             Self::Pick { reply, .. } => reply.is_closed(),
             Self::ReadVertices { reply, .. } => reply.is_closed(),
             Self::LoadScene { .. } | Self::Deform { .. } | Self::UnloadScene { .. } => false,
@@ -141,14 +159,12 @@ impl Command {
 
     /// Answers the command with an error instead of executing it.
     pub(super) fn reply_error(self, error: Error) {
-        // A failed send means that the caller no longer waits. `map_err(drop)` gives all arms the same type.
         match self {
-            Self::LoadScene { reply, .. } | Self::UnloadScene { reply, .. } => reply.send(Err(error)).ok(),
-            Self::Deform { reply, .. } => reply.send(Err(error)).map_err(drop).ok(),
-            Self::Draw { reply, .. } => reply.send(Err(error)).map_err(drop).ok(),
-            Self::RenderAov { reply, .. } => reply.send(Err(error)).map_err(drop).ok(),
-            Self::Pick { reply, .. } => reply.send(Err(error)).map_err(drop).ok(),
-            Self::ReadVertices { reply, .. } => reply.send(Err(error)).map_err(drop).ok(),
+            Self::LoadScene { reply, .. } | Self::UnloadScene { reply, .. } => reply.send(Err(error)),
+            Self::Deform { reply, .. } => reply.send(Err(error)),
+            Self::Draw { reply, .. } => reply.send(Err(error)),
+            Self::Pick { reply, .. } => reply.send(Err(error)),
+            Self::ReadVertices { reply, .. } => reply.send(Err(error)),
         };
     }
 }

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use super::loaded_scene::LoadedScene;
 use crate::config::{BackendChoice, Config, EncodeChoice, RendererChoice};
 use crate::engine::memory_limits::MemoryLimits;
-use crate::engine::output::step_output::{FrameOutput, PictureContent};
+use crate::engine::output::output_spec::{FrameOutput, PictureContent};
 use crate::frame::Legend;
 use crate::telemetry::ms_since;
 use modalcast_compute::cpu::CpuDeformer;
@@ -37,50 +37,11 @@ pub struct EngineInfo {
     pub memory: MemoryLimits,
 }
 
-/// A frame in flight.
-#[derive(Debug)]
-pub struct PendingDraw {
-    frame: PendingFrame,
-    /// Milliseconds spent on uploading vertices to the renderer; `None` if no upload was needed.
-    upload_ms: Option<f64>,
-}
-
-/// A frame of which some draw steps are not submitted yet (see `partial_output`). A draw step is a part of the drawing
-/// commands of one frame; it is no step of the simulation.
-#[derive(Debug)]
-pub(in crate::engine) struct PartialDraw {
-    pub frame: PartialFrame,
-    upload_ms: Option<f64>,
-    /// What the readers of the frame need.
-    content: PictureContent,
-    /// Whether CUDA encodes frames of the scene.
-    encodes_on_cuda: bool,
-}
-
-impl PartialDraw {
-    /// The same frame for readers of this content.
-    pub(super) fn with_content(self, content: PictureContent) -> Self {
-        Self { content, ..self }
-    }
-}
-
 /// An AOV (arbitrary output variable: values instead of colors) of which some bands of rows are not submitted yet.
 #[derive(Debug)]
 pub(in crate::engine) struct PartialAovDraw {
     pub aov: PartialAov,
     legend: Option<Legend>,
-}
-
-impl PendingDraw {
-    /// Whether OpenGL has drawn the frame. It may still have to be copied or encoded.
-    pub(super) fn is_drawn(&self) -> bool {
-        self.frame.is_drawn()
-    }
-
-    /// Waits for at most `limit`. Returns whether [`DeviceContext::finish_draw`] would now return immediately.
-    pub fn is_ready_within(&self, limit: Duration) -> bool {
-        self.frame.is_ready_within(limit)
-    }
 }
 
 /// Creates the deformer of a scene in tests.
@@ -411,12 +372,12 @@ impl DeviceContext {
         camera: &Camera,
         size: FrameSize,
         style: FrameStyle,
-    ) -> Result<PendingDraw> {
-        let mut partial_draw = self.begin_partial_draw(loaded_scene, camera, size, style)?;
-        while !partial_draw.frame.is_submitted() {
-            self.submit_draw_step(loaded_scene, &mut partial_draw)?;
+    ) -> Result<PendingFrame> {
+        let mut frame = self.begin_frame(loaded_scene, camera, size, style)?;
+        while !frame.is_submitted() {
+            self.submit_draw_step(loaded_scene, &mut frame)?;
         }
-        self.finish_partial_draw(partial_draw)
+        self.finish_frame(loaded_scene, frame, PictureContent::PIXELS)
     }
 
     /// Begins a frame of the last deformation. The scene must not be used for anything else until all draw steps of the
@@ -424,13 +385,13 @@ impl DeviceContext {
     ///
     /// # Errors
     /// As [`Self::begin_draw`].
-    pub(in crate::engine) fn begin_partial_draw(
+    pub(in crate::engine) fn begin_frame(
         &mut self,
         loaded_scene: &mut LoadedScene,
         camera: &Camera,
         size: FrameSize,
         style: FrameStyle,
-    ) -> Result<PartialDraw> {
+    ) -> Result<PartialFrame> {
         let camera = camera.validated()?;
         let renderer = self.renderer.as_mut().map_err(|error| error.clone())?;
         loaded_scene.rasterize(renderer, &camera, size, style.samples)?;
@@ -439,31 +400,38 @@ impl DeviceContext {
         let upload_ms = contents.is_uploaded.then(|| ms_since(upload_begin));
         let params = FrameParams { edges: style.edges, samples: style.samples, ..contents.frame_params(camera, size) };
         let has_readback = true;
-        let frame = renderer.begin_frame(loaded_scene.buffers()?, &params, has_readback)?;
+        let mut frame = renderer.begin_frame(loaded_scene.buffers()?, &params, has_readback)?;
+        if let Some(ms) = upload_ms {
+            frame.set_upload_ms(ms);
+        }
         loaded_scene.log_frame(frame.info());
-        let encodes_on_cuda = loaded_scene.encodes_on_cuda();
-        Ok(PartialDraw { frame, upload_ms, content: PictureContent::PIXELS, encodes_on_cuda })
+        Ok(frame)
     }
 
     /// Submits the next draw step of a frame.
     ///
     /// # Errors
     /// `Fault` of OpenGL. The frame must then be dropped.
-    pub(in crate::engine) fn submit_draw_step(&mut self, scene: &LoadedScene, draw: &mut PartialDraw) -> Result<()> {
-        self.renderer.as_mut().map_err(|error| error.clone())?.submit_step(scene.buffers()?, &mut draw.frame)
+    pub(in crate::engine) fn submit_draw_step(&mut self, scene: &LoadedScene, frame: &mut PartialFrame) -> Result<()> {
+        self.renderer.as_mut().map_err(|error| error.clone())?.submit_step(scene.buffers()?, frame)
     }
 
-    /// Returns a frame whose draw steps are all submitted.
+    /// Returns a frame whose draw steps are all submitted. CUDA encodes it as PNG if it can and `content` has the PNG
+    /// file.
     ///
     /// # Errors
     /// `Fault` of OpenGL.
-    pub(in crate::engine) fn finish_partial_draw(&mut self, draw: PartialDraw) -> Result<PendingDraw> {
-        let PartialDraw { frame, upload_ms, content, encodes_on_cuda } = draw;
+    pub(in crate::engine) fn finish_frame(
+        &mut self,
+        scene: &LoadedScene,
+        frame: PartialFrame,
+        content: PictureContent,
+    ) -> Result<PendingFrame> {
         let frame = self.renderer.as_mut().map_err(|error| error.clone())?.finish_frame(frame)?;
-        if encodes_on_cuda && content.png {
+        if scene.encodes_on_cuda() && content.png {
             frame.request_png(content.pixels);
         }
-        Ok(PendingDraw { frame, upload_ms })
+        Ok(frame)
     }
 
     /// Begins to prepare the textures and programs of a scene, so that its buffers can then be created quickly. Returns
@@ -533,13 +501,8 @@ impl DeviceContext {
     ///
     /// # Errors
     /// `Fault` when the device does not finish.
-    pub fn finish_draw(&mut self, pending_draw: PendingDraw) -> Result<MappedPixels> {
-        let renderer = self.renderer.as_mut().map_err(|error| error.clone())?;
-        let pixels = renderer.map_pixels(pending_draw.frame)?;
-        Ok(match pending_draw.upload_ms {
-            Some(ms) => pixels.with_upload_time(ms),
-            None => pixels,
-        })
+    pub fn finish_draw(&mut self, frame: PendingFrame) -> Result<MappedPixels> {
+        self.renderer.as_mut().map_err(|error| error.clone())?.map_pixels(frame)
     }
 
     /// Renders an AOV: depth, domains, normals or the values of a color map. Returns it with the legend if it is a

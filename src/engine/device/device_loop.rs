@@ -52,9 +52,9 @@ use std::time::{Duration, Instant};
 
 use rayon::{ThreadPool, ThreadPoolBuilder};
 
-use super::command::{Command, CopiedVertices, Reply, SceneId};
+use super::command::{Command, Reply, SceneId};
 use super::command_queue::{CommandQueue, Work};
-use super::context::{DeformerPreparer, DeviceContext, EngineInfo, PendingDraw};
+use super::context::{DeformerPreparer, DeviceContext, EngineInfo};
 use super::device_loss::DeviceLossSender;
 use super::fair_queue::Taken;
 use super::in_flight::{InFlight, InFlightQueue, Pollable};
@@ -63,11 +63,14 @@ use super::partial_output::{Charge, PartialOutput};
 use super::recovery_limit::RecoveryLimit;
 use super::watchdog::WorkClock;
 use super::work_owners::WorkOwners;
+use crate::engine::output::output_spec::PictureSpec;
+use crate::engine::output::rendered_picture::RenderedPicture;
+use crate::engine::output::step_vertices::StepVertices;
 use crate::telemetry::ms_since;
 use modalcast_model::backend_settings::BackendSettings;
 use modalcast_model::deform::{VertexAttributes, VertexReadback};
 use modalcast_model::error::{Result, fault, fault_in};
-use modalcast_render::{FrameImage, FramePixels, MAX_FRAMES_IN_FLIGHT, PendingPick, PickHit};
+use modalcast_render::{MAX_FRAMES_IN_FLIGHT, PendingFrame, PendingPick, PickHit};
 
 /// How long the thread waits for a frame of a software renderer before it checks the command queue again.
 const SOFTWARE_POLL_INTERVAL: Duration = Duration::from_micros(100);
@@ -102,45 +105,31 @@ pub(super) struct DeviceLoop {
     backends: HashMap<SceneId, BackendSettings>,
     /// Outputs with further draw steps. The queue of their scene begins with [`Work::Continue`].
     partial_outputs: HashMap<SceneId, PartialOutput>,
-    vertices: InFlightQueue<PendingVertices, CopiedVertices>,
-    picks: InFlightQueue<PickInFlight, Vec<PickHit>>,
-    frames: InFlightQueue<FrameInFlight, FrameImage<FramePixels>>,
+    vertices: InFlightQueue<PendingVertices, Arc<StepVertices>>,
+    picks: InFlightQueue<PendingPick, Vec<PickHit>>,
+    frames: InFlightQueue<PendingFrame, Arc<RenderedPicture>>,
     poll_interval: Duration,
     /// When the targets were last checked.
     last_target_check: Instant,
 }
 
-/// A frame in flight, and the device time that its scene was charged.
-struct FrameInFlight {
-    id: SceneId,
-    charge: Charge,
-    draw: PendingDraw,
-}
-
-/// A pick in flight.
-struct PickInFlight {
-    id: SceneId,
-    pick: PendingPick,
-}
-
 /// A vertex readback in flight.
 struct PendingVertices {
-    id: SceneId,
     readback: VertexReadback,
     /// When the readback was started.
     start: Instant,
 }
 
-impl Pollable for PickInFlight {
+impl Pollable for PendingPick {
     /// Ignores `limit`, because a pick can only be polled.
     fn is_ready_within(&self, _limit: Duration) -> bool {
-        self.pick.is_ready()
+        self.is_ready()
     }
 }
 
-impl Pollable for FrameInFlight {
+impl Pollable for PendingFrame {
     fn is_ready_within(&self, limit: Duration) -> bool {
-        self.draw.is_ready_within(limit)
+        self.is_ready_within(limit)
     }
 }
 
@@ -154,7 +143,7 @@ fn run_caught(work: impl FnOnce()) {
 
 /// Sends an answer. Drops it if the caller no longer waits.
 fn answer<T>(reply: Reply<T>, result: Result<T>) {
-    reply.send(result).ok();
+    reply.send(result);
 }
 
 impl DeviceLoop {
@@ -297,7 +286,7 @@ impl DeviceLoop {
     /// Whether a command draws an output in several draw steps.
     fn is_large_output(&self, id: SceneId, command: &Command) -> bool {
         match command {
-            Command::Draw { size, .. } | Command::RenderAov { size, .. } => {
+            Command::Draw { picture: PictureSpec { size, .. }, .. } => {
                 self.scenes.get(&id).is_some_and(|scene| self.context.is_divided(scene, *size))
             }
             _ => false,
@@ -337,8 +326,7 @@ impl DeviceLoop {
         match work {
             Work::Command(command) | Work::Prepared(command) if command.is_cancelled() => drop(command),
             // The costs of outputs are recorded when they are finished.
-            Work::Command(command @ (Command::Draw { .. } | Command::RenderAov { .. }))
-            | Work::Prepared(command @ (Command::Draw { .. } | Command::RenderAov { .. })) => {
+            Work::Command(command @ Command::Draw { .. }) | Work::Prepared(command @ Command::Draw { .. }) => {
                 return self.begin_output(command, Charge::new(class, charged_ms));
             }
             Work::Command(command) | Work::Prepared(command) => self.execute(command),
@@ -362,7 +350,7 @@ impl DeviceLoop {
                     deformer.and_then(|deformer| self.context.load_prepared(&scene, deformer, backends.raster));
                 let result = self.loss.record_loss(loaded_scene).map(|scene| self.insert_scene(id, scene, backends));
                 // If the caller no longer waits, no `UnloadScene` will follow.
-                if reply.send(result).is_err() {
+                if !reply.send(result) {
                     self.unload(id);
                 }
             }
@@ -380,7 +368,7 @@ impl DeviceLoop {
             }
             Command::Pick { .. } => self.pick(command),
             Command::ReadVertices { id, attributes, reply } => self.read_vertices(id, attributes, reply),
-            Command::Draw { .. } | Command::RenderAov { .. } => {}
+            Command::Draw { .. } => {}
         }
     }
 
@@ -404,20 +392,21 @@ impl DeviceLoop {
         let pending_pick =
             find_scene(scenes, id).and_then(|scene| context.begin_pick(scene, &camera, picture, rectangle));
         match self.loss.record_loss(pending_pick) {
-            Ok(pick) => self.picks.push(PickInFlight { id, pick }, reply),
+            Ok(pending) => self.picks.push(InFlight { id, pending, charge: None, reply }),
             Err(error) => answer(reply, Err(error)),
         }
     }
 
     /// Starts a vertex readback; answers immediately if the vertices are already in host memory.
-    fn read_vertices(&mut self, id: SceneId, attributes: VertexAttributes, reply: Reply<CopiedVertices>) {
+    fn read_vertices(&mut self, id: SceneId, attributes: VertexAttributes, reply: Reply<Arc<StepVertices>>) {
         let start = Instant::now();
         let readback = self.scene(id).and_then(|scene| scene.readback(attributes));
         match self.loss.record_loss(readback) {
-            Ok(readback) if readback.is_ready() => {
-                self.finish_vertices(InFlight { pending: PendingVertices { id, readback, start }, reply });
+            Ok(readback) => {
+                let is_ready = readback.is_ready();
+                let readback = InFlight { id, pending: PendingVertices { readback, start }, charge: None, reply };
+                if is_ready { self.finish_vertices(readback) } else { self.vertices.push(readback) }
             }
-            Ok(readback) => self.vertices.push(PendingVertices { id, readback, start }, reply),
             Err(error) => answer(reply, Err(error)),
         }
     }
@@ -438,10 +427,9 @@ impl DeviceLoop {
 
     /// Starts to encode frames if OpenGL draws no other frame, because the next deformation may be far away.
     fn start_encodings_if_idle(&self) {
-        let is_drawn = |frame: &FrameInFlight| frame.draw.is_drawn();
         if self.context.encodes_on_cuda()
             && self.partial_outputs.is_empty()
-            && self.frames.newest().is_none_or(is_drawn)
+            && self.frames.newest().is_none_or(PendingFrame::is_drawn)
         {
             self.context.start_encodings();
         }
@@ -449,7 +437,7 @@ impl DeviceLoop {
 
     /// Waits for the oldest pick in flight and answers it.
     fn finish_oldest_pick(&mut self) {
-        let Some(InFlight { pending: PickInFlight { id, pick }, reply }) = self.picks.pop_oldest() else { return };
+        let Some(InFlight { id, pending: pick, reply, .. }) = self.picks.pop_oldest() else { return };
         self.run_caught_for(id, |this| {
             let hits = this.context.finish_pick(pick);
             answer(reply, this.loss.record_loss(hits));
@@ -458,21 +446,23 @@ impl DeviceLoop {
 
     /// Waits for the oldest frame in flight; a copy thread then copies its pixels if necessary, and sends them.
     fn finish_oldest_frame(&mut self) {
-        let Some(InFlight { pending, reply }) = self.frames.pop_oldest() else { return };
-        if !reply.is_closed() {
-            self.run_caught_for(pending.id, |this| this.finish_frame(pending, reply));
+        let Some(frame) = self.frames.pop_oldest() else { return };
+        if !frame.reply.is_closed() {
+            self.run_caught_for(frame.id, |this| this.finish_frame(frame));
         }
     }
 
-    fn finish_frame(&mut self, frame: FrameInFlight, reply: Reply<FrameImage<FramePixels>>) {
-        let FrameInFlight { id, charge, draw } = frame;
-        let pixels = self.context.finish_draw(draw);
-        if let Ok(pixels) = &pixels {
+    fn finish_frame(&mut self, frame: InFlight<PendingFrame, Arc<RenderedPicture>>) {
+        let InFlight { id, pending, charge, reply } = frame;
+        let pixels = self.context.finish_draw(pending);
+        if let (Ok(pixels), Some(charge)) = (&pixels, charge) {
             // A GPU takes longer to draw a frame than the device thread takes to submit it.
             self.record_output_cost(id, charge, charge.spent_ms.max(pixels.times().drawing_ms()));
         }
         match self.loss.record_loss(pixels) {
-            Ok(pixels) => self.copy_pool.spawn(move || run_caught(|| answer(reply, Ok(pixels.into_shared_image())))),
+            Ok(pixels) => self.copy_pool.spawn(move || {
+                run_caught(|| answer(reply, Ok(Arc::new(RenderedPicture::from(pixels.into_shared_image())))));
+            }),
             Err(error) => answer(reply, Err(error)),
         }
     }
@@ -480,15 +470,15 @@ impl DeviceLoop {
     /// Waits for the oldest vertex readback in flight and answers it.
     fn finish_oldest_vertices(&mut self) {
         if let Some(oldest) = self.vertices.pop_oldest() {
-            self.run_caught_for(oldest.pending.id, |this| this.finish_vertices(oldest));
+            self.run_caught_for(oldest.id, |this| this.finish_vertices(oldest));
         }
     }
 
-    fn finish_vertices(&mut self, readback: InFlight<PendingVertices, CopiedVertices>) {
-        let InFlight { pending: PendingVertices { id, readback, start }, reply } = readback;
+    fn finish_vertices(&mut self, readback: InFlight<PendingVertices, Arc<StepVertices>>) {
+        let InFlight { id, pending: PendingVertices { readback, start }, reply, .. } = readback;
         let surface = self.scene(id).and_then(|scene| scene.wait_readback(&readback));
         let vertices = self.loss.record_loss(surface);
-        answer(reply, vertices.map(|surface| CopiedVertices { surface, copy_ms: ms_since(start) }));
+        answer(reply, vertices.map(|surface| Arc::new(StepVertices::new(surface, ms_since(start)))));
     }
 
     fn scene(&mut self, id: SceneId) -> Result<&mut LoadedScene> {

@@ -14,12 +14,12 @@ use super::handle::{DeviceHandle, PendingReply};
 use super::watchdog::WorkClock;
 use super::work_owners::WorkOwners;
 use crate::config::{BackendChoice, Config, RendererChoice};
-use crate::engine::output::step_output::{FrameOutput, PictureContent};
+use crate::engine::output::output_spec::{FrameOutput, PictureContent, PictureSpec};
+use crate::engine::output::rendered_picture::{Pixels, RenderedPicture};
 use crate::engine::testing;
 use modalcast_model::backend_settings::BackendSettings;
-use modalcast_model::error::{Error, Result};
+use modalcast_model::error::Error;
 use modalcast_model::scene::{Camera, FrameSize, FrameStyle, Scene, SceneState};
-use modalcast_render::{FrameImage, FramePixels};
 
 const LARGE: FrameSize = FrameSize::new(192, 512);
 const SMALL: FrameSize = FrameSize::new(32, 32);
@@ -84,9 +84,14 @@ impl Fixture {
         fixture
     }
 
-    fn draw(&self, id: SceneId, size: FrameSize) -> PendingReply<FrameImage<FramePixels>> {
+    fn draw(&self, id: SceneId, size: FrameSize) -> PendingReply<Arc<RenderedPicture>> {
+        self.draw_output(id, size, FrameOutput::Color)
+    }
+
+    fn draw_output(&self, id: SceneId, size: FrameSize, output: FrameOutput) -> PendingReply<Arc<RenderedPicture>> {
         let camera = Camera::fit_to_scene(&self.scene, size.width, size.height);
-        self.handle.begin_draw(id, camera, size, FrameStyle::default(), PictureContent::PIXELS)
+        let picture = PictureSpec { camera, size, output, style: FrameStyle::default() };
+        self.handle.draw(id, picture, PictureContent::PIXELS)
     }
 
     /// Draws the first frame of a size, which is drawn in pieces, because its time is not known.
@@ -119,9 +124,19 @@ impl Fixture {
     }
 }
 
+/// The pixels or values of a picture.
+async fn bytes_of(picture: PendingReply<Arc<RenderedPicture>>) -> Vec<u8> {
+    let picture = picture.wait().await.expect("expected a picture");
+    match &picture.pixels {
+        Pixels::Color(bytes) | Pixels::Values(bytes) => bytes.to_vec(),
+        Pixels::ColorMap(image, _) => image.bytes.clone(),
+        Pixels::PngOnly => panic!("expected pixels"),
+    }
+}
+
 /// Whether a command is answered.
-async fn is_answered<T>(reply: &mut PendingReply<T>) -> bool {
-    tokio::time::timeout(Duration::ZERO, reply.recv()).await.is_ok()
+async fn is_answered<T: Clone>(reply: &PendingReply<T>) -> bool {
+    tokio::time::timeout(Duration::ZERO, reply.wait()).await.is_ok()
 }
 
 /// A state whose first coordinate is `q`.
@@ -140,9 +155,9 @@ async fn large_frame_does_not_delay_another_scene() {
         let large = fixture.draw(1, LARGE);
         fixture.run(1);
         let state = state_with_q(&fixture.scene, 0.5);
-        let mut deformed = fixture.handle.deform(2, &state);
+        let deformed = fixture.handle.deform(2, &state);
         let mut waited = 0;
-        while !is_answered(&mut deformed).await {
+        while !is_answered(&deformed).await {
             fixture.run(1);
             waited += 1;
         }
@@ -164,9 +179,9 @@ async fn long_frame_does_not_delay_another_scene() {
         fixture.device_loop.set_piece_limits(0.0, piece_samples);
         let long = fixture.draw(1, SMALL);
         fixture.run(1);
-        let mut deformed = fixture.handle.deform(2, &state_with_q(&fixture.scene, 0.5));
+        let deformed = fixture.handle.deform(2, &state_with_q(&fixture.scene, 0.5));
         let mut waited = 0;
-        while !is_answered(&mut deformed).await {
+        while !is_answered(&deformed).await {
             fixture.run(1);
             waited += 1;
         }
@@ -187,21 +202,19 @@ async fn commands_of_a_scene_wait_for_its_large_outputs() {
         fixture.draw(1, LARGE)
     }];
     fixture.run_all();
-    let whole = whole.wait().await.expect("expected a frame");
-    let deformed_whole = deformed_whole.wait().await.expect("expected a frame");
-    assert!(whole.rgba != deformed_whole.rgba, "expected different frames of different states");
+    let (whole, deformed_whole) = (bytes_of(whole).await, bytes_of(deformed_whole).await);
+    assert!(whole != deformed_whole, "expected different frames of different states");
 
     let mut fixture = Fixture::start(BAND_SAMPLES).await;
     let large = fixture.draw(1, LARGE);
-    let mut deformed = fixture.handle.deform(1, &state_with_q(&fixture.scene, 0.5));
+    let deformed = fixture.handle.deform(1, &state_with_q(&fixture.scene, 0.5));
     let deformed_large = fixture.draw(1, LARGE);
     while fixture.queue.len(1) > 2 {
-        assert!(!is_answered(&mut deformed).await, "expected the deformation to wait for the frame before it");
+        assert!(!is_answered(&deformed).await, "expected the deformation to wait for the frame before it");
         fixture.run(1);
     }
     fixture.run_all();
-    assert!(large.wait().await.expect("expected a frame").rgba == whole.rgba);
-    assert!(deformed_large.wait().await.expect("expected a frame").rgba == deformed_whole.rgba);
+    assert!(bytes_of(large).await == whole && bytes_of(deformed_large).await == deformed_whole);
 }
 
 #[tokio::test]
@@ -216,8 +229,7 @@ async fn one_large_output_is_drawn_at_a_time() {
         fixture.run(1);
     }
     fixture.run_all();
-    let [first, second] = [first.wait().await, second.wait().await].map(|image| image.expect("expected a frame").rgba);
-    assert!(first == second);
+    assert!(bytes_of(first).await == bytes_of(second).await);
 }
 
 #[tokio::test]
@@ -249,20 +261,15 @@ async fn cancelled_large_output_ends_after_its_draw_step() {
     let large = fixture.draw(1, LARGE);
     fixture.run(3);
     drop(large);
-    let (handle, camera) = (fixture.handle.clone(), Camera::fit_to_scene(&fixture.scene, LARGE.width, LARGE.height));
-    let aov = tokio::spawn(async move { handle.render_aov(1, camera, LARGE, FrameOutput::Depth).await });
-    while fixture.queue.len(1) < 2 {
-        tokio::task::yield_now().await;
-    }
+    let aov = fixture.draw_output(1, LARGE, FrameOutput::Depth);
     // Ends the frame, and begins the AOV.
     fixture.run(2);
     assert_eq!((fixture.queue.len(1), fixture.device_loop.partial_scene()), (1, Some(1)));
-    aov.abort();
-    aov.await.expect_err("expected an aborted task");
+    drop(aov);
     let state = state_with_q(&fixture.scene, 0.5);
-    let mut deformed = fixture.handle.deform(1, &state);
+    let deformed = fixture.handle.deform(1, &state);
     fixture.run(2);
-    assert!(is_answered(&mut deformed).await && fixture.device_loop.partial_scene().is_none());
+    assert!(is_answered(&deformed).await && fixture.device_loop.partial_scene().is_none());
 }
 
 #[tokio::test]
@@ -271,25 +278,16 @@ async fn divided_aov_equals_the_undivided_aov() {
     // An AOV has one sample per pixel. With bands of 64 rows, each of the two AOVs has eight bands.
     for max_band_samples in [u64::MAX, 192 * 64] {
         let mut fixture = Fixture::start(max_band_samples).await;
-        let camera = Camera::fit_to_scene(&fixture.scene, LARGE.width, LARGE.height);
-        let outputs = [FrameOutput::Depth, FrameOutput::Displacement { scale_max: 1.0 }];
-        let handle = fixture.handle.clone();
-        let aovs = tokio::spawn(async move {
-            let mut aovs = Vec::new();
-            for output in outputs {
-                aovs.push(handle.render_aov(1, camera, LARGE, output).await.map(|(image, _)| image.bytes));
-            }
-            aovs.into_iter().collect::<Result<Vec<_>>>()
-        });
-        let mut step_count = 0;
-        while !aovs.is_finished() {
-            if fixture.queue.len(1) > 0 {
+        let (mut step_count, mut aovs) = (0, Vec::new());
+        for output in [FrameOutput::Depth, FrameOutput::Displacement { scale_max: 1.0 }] {
+            let aov = fixture.draw_output(1, LARGE, output);
+            while fixture.queue.len(1) > 0 {
                 fixture.run(1);
                 step_count += 1;
             }
-            tokio::task::yield_now().await;
+            aovs.push(bytes_of(aov).await);
         }
-        results.push((step_count, aovs.await.expect("expected no panic").expect("expected AOVs")));
+        results.push((step_count, aovs));
     }
     assert!(results[0].0 == 2 && results[1].0 >= 16, "{} and {} commands and draw steps", results[0].0, results[1].0);
     assert!(results[0].1 == results[1].1);
@@ -304,8 +302,8 @@ async fn first_frame_of_a_scene_has_several_draw_steps() {
         fixture.run(1);
         assert_eq!(fixture.queue.len(1) > 0, is_divided, "{frame} frame: expected draw steps to remain: {is_divided}");
         let state = state_with_q(&fixture.scene, 0.5);
-        let mut deformed = fixture.handle.deform(2, &state);
-        while !is_answered(&mut deformed).await {
+        let deformed = fixture.handle.deform(2, &state);
+        while !is_answered(&deformed).await {
             fixture.run(1);
         }
         while fixture.queue.len(1) > 0 {
@@ -321,8 +319,8 @@ async fn scene_is_prepared_in_steps() {
     let (draw, cancelled_draw) = (fixture.draw(1, SMALL), fixture.draw(1, SMALL));
     fixture.run(1);
     assert_eq!(fixture.queue.len(1), 3, "expected the preparation of programs, and the two frames that need it");
-    let mut deformed = fixture.handle.deform(2, &state_with_q(&fixture.scene, 0.5));
-    while !is_answered(&mut deformed).await {
+    let deformed = fixture.handle.deform(2, &state_with_q(&fixture.scene, 0.5));
+    while !is_answered(&deformed).await {
         fixture.run(1);
     }
     assert_eq!(fixture.queue.len(1), 3, "expected an unfinished preparation");

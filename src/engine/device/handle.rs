@@ -5,9 +5,9 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use tokio::sync::oneshot;
+use tokio::sync::{oneshot, watch};
 
-use super::command::{Command, CopiedVertices, Reply, SceneId};
+use super::command::{Command, CommandEnd, Reply, SceneId};
 use super::command_queue::{CancelGuard, CommandQueue};
 use super::context::{DeformerPreparer, DeviceContext, EngineInfo};
 use super::device_loop::DeviceLoop;
@@ -15,13 +15,14 @@ use super::device_loss::{DeviceLoss, device_loss_channel};
 use super::watchdog::{self, WorkClock};
 use super::work_owners::WorkOwners;
 use crate::engine::blocking::run_blocking;
-use crate::engine::output::step_output::{FrameOutput, PictureContent};
-use crate::frame::Legend;
+use crate::engine::output::output_spec::{PictureContent, PictureSpec};
+use crate::engine::output::rendered_picture::RenderedPicture;
+use crate::engine::output::step_vertices::StepVertices;
 use modalcast_model::backend_settings::BackendSettings;
 use modalcast_model::deform::{DeformSummary, VertexAttributes};
 use modalcast_model::error::{Error, Result, fault, fault_in};
-use modalcast_model::scene::{Camera, FrameSize, FrameStyle, PixelRect, Scene, SceneState};
-use modalcast_render::{AovImage, FrameImage, FramePixels, PickHit};
+use modalcast_model::scene::{Camera, FrameSize, PixelRect, Scene, SceneState};
+use modalcast_render::PickHit;
 
 /// Sends commands to the device thread. The thread ends when the last clone is dropped.
 #[derive(Debug, Clone)]
@@ -166,36 +167,25 @@ impl DeviceHandle {
         self.submit(|reply| Command::Deform { id, state, next, reply })
     }
 
-    /// Starts drawing the last deformation. Later commands do not affect the frame.
-    pub(in crate::engine) fn begin_draw(
+    /// Starts drawing a picture of the last deformation. Later commands do not affect it.
+    pub(in crate::engine) fn draw(
         &self,
         id: SceneId,
-        camera: Camera,
-        size: FrameSize,
-        style: FrameStyle,
+        picture: PictureSpec,
         content: PictureContent,
-    ) -> PendingReply<FrameImage<FramePixels>> {
-        self.submit(|reply| Command::Draw { id, camera, size, style, content, reply })
+    ) -> PendingReply<Arc<RenderedPicture>> {
+        self.submit(|reply| Command::Draw { id, picture, content, reply })
     }
 
-    pub(in crate::engine) async fn render_aov(
-        &self,
-        id: SceneId,
-        camera: Camera,
-        size: FrameSize,
-        frame_output: FrameOutput,
-    ) -> Result<(AovImage, Option<Legend>)> {
-        self.call(|reply| Command::RenderAov { id, camera, size, frame_output, reply }).await
-    }
-
-    pub(in crate::engine) async fn pick(
+    /// Starts finding the surface points of the last deformation at the pixels of a rectangle.
+    pub(in crate::engine) fn pick(
         &self,
         id: SceneId,
         camera: Camera,
         picture: FrameSize,
         rectangle: PixelRect,
-    ) -> Result<Vec<PickHit>> {
-        self.call(|reply| Command::Pick { id, camera, picture, rectangle, reply }).await
+    ) -> PendingReply<Vec<PickHit>> {
+        self.submit(|reply| Command::Pick { id, camera, picture, rectangle, reply })
     }
 
     /// Starts copying attributes of the last deformation. Later commands do not affect the copy.
@@ -203,7 +193,7 @@ impl DeviceHandle {
         &self,
         id: SceneId,
         attributes: VertexAttributes,
-    ) -> PendingReply<CopiedVertices> {
+    ) -> PendingReply<Arc<StepVertices>> {
         self.submit(|reply| Command::ReadVertices { id, attributes, reply })
     }
 
@@ -223,49 +213,62 @@ impl DeviceHandle {
         self.commands.0.close();
     }
 
-    async fn call<T>(&self, create_command: impl FnOnce(Reply<T>) -> Command) -> Result<T> {
+    async fn call<T: Clone>(&self, create_command: impl FnOnce(Reply<T>) -> Command) -> Result<T> {
         self.submit(create_command).wait().await
     }
 
     /// Sends a command; the caller awaits the answer later.
     fn submit<T>(&self, create_command: impl FnOnce(Reply<T>) -> Command) -> PendingReply<T> {
-        let (reply, answer) = oneshot::channel();
+        let (reply, answer, end) = Reply::channel();
         let loss = self.loss.clone();
         match self.commands.0.push(create_command(reply)) {
-            Ok(cancel_guard) => PendingReply { answer: Ok(answer), loss, _cancel_guard: cancel_guard },
+            Ok(cancel_guard) => PendingReply { answer: Ok(answer), end: Some(end), loss, _cancel_guard: cancel_guard },
             Err(error) => {
-                PendingReply { answer: Err(error.unwrap_or_else(no_answer_error)), loss, _cancel_guard: None }
+                let answer = Err(error.unwrap_or_else(no_answer_error));
+                PendingReply { answer, end: None, loss, _cancel_guard: None }
             }
         }
     }
 }
 
-/// The pending answer to a command that was sent to the device thread. Dropping it cancels the command, unless the
-/// command changes the scene. A queued command then leaves the queue at once, and a frame that is being drawn ends
-/// after its present pass.
+/// The pending answer to a command that was sent to the device thread. Readers can share it. Dropping it cancels the
+/// command, unless the command changes the scene. A queued command then leaves the queue at once, and a frame that is
+/// being drawn ends after its present pass.
 #[derive(Debug)]
-pub(in crate::engine) struct PendingReply<T> {
+pub struct PendingReply<T> {
     // Dropped before the guard, so that the device thread sees the cancellation if it has just taken the command.
-    answer: Result<oneshot::Receiver<Result<T>>>,
+    answer: Result<watch::Receiver<Option<Result<T>>>>,
+    /// `None` if the command was rejected, or if the end was taken.
+    end: Option<CommandEnd>,
     loss: DeviceLoss,
     _cancel_guard: Option<CancelGuard>,
 }
 
-impl<T> PendingReply<T> {
-    pub(in crate::engine) async fn wait(mut self) -> Result<T> {
-        self.recv().await
+impl<T: Clone> PendingReply<T> {
+    /// An answer that is already there.
+    #[cfg(test)]
+    pub(in crate::engine) fn answered(answer: T) -> Self {
+        let (_, receiver) = watch::channel(Some(Ok(answer)));
+        Self { answer: Ok(receiver), end: None, loss: device_loss_channel().1, _cancel_guard: None }
     }
 
-    /// [`Self::wait`], but cancel-safe. Must not be called again after it has returned.
-    pub(in crate::engine) async fn recv(&mut self) -> Result<T> {
-        match &mut self.answer {
-            Ok(answer) => tokio::select! {
-                biased;
-                answer = answer => answer.map_err(|_| no_answer_error())?,
-                // A device thread in a call that does not return answers no command.
-                error = self.loss.wait() => Err(error),
-            },
-            Err(error) => Err(error.clone()),
+    /// Takes the end of the command, with which one can wait for the command without its answer.
+    pub(in crate::engine) const fn take_end(&mut self) -> Option<CommandEnd> {
+        self.end.take()
+    }
+
+    /// Waits for the answer. Cancel-safe.
+    ///
+    /// # Errors
+    /// The error of the command; `Busy` if the queue has rejected it; `DeviceLost`.
+    pub async fn wait(&self) -> Result<T> {
+        let mut receiver = self.answer.clone()?;
+        let answer = async { receiver.wait_for(Option::is_some).await.ok().and_then(|answer| answer.clone()) };
+        tokio::select! {
+            biased;
+            answer = answer => answer.unwrap_or_else(|| Err(no_answer_error())),
+            // A device thread in a call that does not return answers no command.
+            error = self.loss.wait() => Err(error),
         }
     }
 }

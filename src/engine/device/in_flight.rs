@@ -4,7 +4,8 @@ use std::collections::VecDeque;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::time::Duration;
 
-use super::command::Reply;
+use super::command::{Reply, SceneId};
+use super::partial_output::Charge;
 
 /// Device work whose completion can be polled.
 pub(super) trait Pollable {
@@ -14,7 +15,10 @@ pub(super) trait Pollable {
 
 /// A readback in flight.
 pub(super) struct InFlight<P, T> {
+    pub id: SceneId,
     pub pending: P,
+    /// The device time that the scene was charged; `None` if its cost is already recorded.
+    pub charge: Option<Charge>,
     pub reply: Reply<T>,
 }
 
@@ -47,9 +51,9 @@ impl<P, T> InFlightQueue<P, T> {
     }
 
     /// Adds the newest readback. The queue must not be full.
-    pub(super) fn push(&mut self, pending: P, reply: Reply<T>) {
+    pub(super) fn push(&mut self, readback: InFlight<P, T>) {
         debug_assert!(!self.is_full(), "expected capacity for a readback");
-        self.entries.push_back(InFlight { pending, reply });
+        self.entries.push_back(readback);
     }
 
     pub(super) fn pop_oldest(&mut self) -> Option<InFlight<P, T>> {
@@ -80,8 +84,6 @@ impl<P: Pollable, T> InFlightQueue<P, T> {
 
 #[cfg(test)]
 mod tests {
-    use tokio::sync::oneshot;
-
     use super::*;
 
     enum FakeReadback {
@@ -106,20 +108,20 @@ mod tests {
         let mut answers = Vec::new();
         // The first readback is the oldest.
         for pending in [FakeReadback::Panics, FakeReadback::Ready, FakeReadback::Busy] {
-            let (reply, answer) = oneshot::channel();
-            queue.push(pending, reply);
+            let (reply, answer, _end) = Reply::channel();
+            queue.push(InFlight { id: 1, pending, charge: None, reply });
             answers.push(answer);
         }
         assert!(queue.is_full());
         assert!(!queue.is_oldest_ready(Duration::ZERO));
         assert_eq!(queue.len(), 2);
-        answers[0].try_recv().expect_err("expected a dropped reply channel");
+        assert!(answers[0].has_changed().is_err(), "expected a dropped reply channel");
         assert!(queue.is_oldest_ready(Duration::ZERO), "expected the second readback to be ready");
         let ready_readback = queue.pop_oldest().expect("expected the second readback");
-        ready_readback.reply.send(Ok(7)).expect("expected a caller that waits");
-        assert_eq!(answers[1].try_recv(), Ok(Ok(7)));
+        assert!(ready_readback.reply.send(Ok(7)), "expected a caller that waits");
+        assert_eq!(*answers[1].borrow(), Some(Ok(7)));
         assert!(!queue.is_oldest_ready(Duration::ZERO));
         assert_eq!(queue.len(), 1, "expected the busy readback to remain");
-        assert!(matches!(answers[2].try_recv(), Err(oneshot::error::TryRecvError::Empty)));
+        assert!(answers[2].has_changed().is_ok() && answers[2].borrow().is_none());
     }
 }

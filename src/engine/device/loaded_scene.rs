@@ -8,7 +8,7 @@ use std::time::Instant;
 
 use super::frame_log::FrameLog;
 use super::scalar_field;
-use crate::engine::output::step_output::FrameOutput;
+use crate::engine::output::output_spec::FrameOutput;
 use crate::frame::{Legend, encode_png};
 use crate::telemetry::ms_since;
 use modalcast_model::deform::{DeformSummary, DeformedSurface, Deformer, StepAhead, VertexAttributes, VertexReadback};

@@ -3,14 +3,16 @@
 //! unrelated to the steps of the simulation.) The commands of its own scene wait until all draw steps are submitted, so
 //! the vertices and the buffers of the scene do not change between them.
 
+use std::sync::Arc;
 use std::time::Duration;
 
 use super::command::{CostClass, Reply};
-use super::context::{DeviceContext, PartialAovDraw, PartialDraw};
+use super::context::{DeviceContext, PartialAovDraw};
 use super::loaded_scene::LoadedScene;
-use crate::frame::Legend;
+use crate::engine::output::output_spec::PictureContent;
+use crate::engine::output::rendered_picture::RenderedPicture;
 use modalcast_model::error::{Error, Result};
-use modalcast_render::{AovImage, FrameImage, FramePixels, ScenePreparation};
+use modalcast_render::{PartialFrame, ScenePreparation};
 
 /// Device time of an output.
 #[derive(Debug, Clone, Copy)]
@@ -39,13 +41,17 @@ impl Charge {
 /// An output, the channel for its answer, and its costs.
 pub(super) struct PartialOutput {
     pub kind: PartialKind,
+    /// What the readers of a frame need.
+    pub content: PictureContent,
+    /// `None` for a preparation, which has no readers.
+    pub reply: Option<Reply<Arc<RenderedPicture>>>,
     pub charge: Charge,
 }
 
 #[expect(clippy::large_enum_variant, reason = "there is at most one per scene, and most are frames")]
 pub(super) enum PartialKind {
-    Frame(PartialDraw, Reply<FrameImage<FramePixels>>),
-    Aov(PartialAovDraw, Reply<(AovImage, Option<Legend>)>),
+    Frame(PartialFrame),
+    Aov(PartialAovDraw),
     /// The textures and programs of the scene, which the next command of the scene needs.
     Preparation(ScenePreparation),
 }
@@ -53,17 +59,13 @@ pub(super) enum PartialKind {
 impl PartialOutput {
     /// Whether the caller no longer waits. The output is then dropped instead of continued.
     pub(super) fn is_cancelled(&self) -> bool {
-        match &self.kind {
-            PartialKind::Frame(_, reply) => reply.is_closed(),
-            PartialKind::Aov(_, reply) => reply.is_closed(),
-            PartialKind::Preparation(_) => false,
-        }
+        self.reply.as_ref().is_some_and(Reply::is_closed)
     }
 
     pub(super) fn is_submitted(&self) -> bool {
         match &self.kind {
-            PartialKind::Frame(draw, _) => draw.frame.is_submitted(),
-            PartialKind::Aov(draw, _) => draw.aov.is_submitted(),
+            PartialKind::Frame(frame) => frame.is_submitted(),
+            PartialKind::Aov(draw) => draw.aov.is_submitted(),
             PartialKind::Preparation(preparation) => preparation.is_finished(),
         }
     }
@@ -71,8 +73,8 @@ impl PartialOutput {
     /// Whether the output is large, so that no other large output is drawn at the same time.
     pub(super) const fn is_large(&self) -> bool {
         match &self.kind {
-            PartialKind::Frame(draw, _) => draw.frame.is_divided(),
-            PartialKind::Aov(draw, _) => draw.aov.is_divided(),
+            PartialKind::Frame(frame) => frame.is_divided(),
+            PartialKind::Aov(draw) => draw.aov.is_divided(),
             PartialKind::Preparation(_) => false,
         }
     }
@@ -85,8 +87,8 @@ impl PartialOutput {
     /// Whether other scenes are served between the draw steps.
     pub(super) const fn has_breaks(&self) -> bool {
         match &self.kind {
-            PartialKind::Frame(draw, _) => draw.frame.has_breaks(),
-            PartialKind::Aov(draw, _) => draw.aov.has_breaks(),
+            PartialKind::Frame(frame) => frame.has_breaks(),
+            PartialKind::Aov(draw) => draw.aov.has_breaks(),
             PartialKind::Preparation(_) => true,
         }
     }
@@ -94,8 +96,8 @@ impl PartialOutput {
     /// Waits at most `limit` for the draw step that was submitted last. Returns whether the device has finished it.
     pub(super) fn is_ready_within(&self, limit: Duration) -> bool {
         match &self.kind {
-            PartialKind::Frame(draw, _) => draw.frame.is_ready_within(limit),
-            PartialKind::Aov(draw, _) => draw.aov.is_ready_within(limit),
+            PartialKind::Frame(frame) => frame.is_ready_within(limit),
+            PartialKind::Aov(draw) => draw.aov.is_ready_within(limit),
             // A preparation can only be polled.
             PartialKind::Preparation(preparation) => {
                 let is_ready = preparation.is_ready();
@@ -110,8 +112,8 @@ impl PartialOutput {
     /// Milliseconds that the device took for the last draw step. Waits for the draw step.
     fn last_step_ms(&self) -> f64 {
         match &self.kind {
-            PartialKind::Frame(draw, _) => draw.frame.last_step_ms(),
-            PartialKind::Aov(draw, _) => draw.aov.last_step_ms(),
+            PartialKind::Frame(frame) => frame.last_step_ms(),
+            PartialKind::Aov(draw) => draw.aov.last_step_ms(),
             PartialKind::Preparation(_) => 0.0,
         }
     }
@@ -127,22 +129,19 @@ impl PartialOutput {
     /// Class of the draw steps after the first.
     pub(super) fn step_class(&self) -> CostClass {
         let kind = match self.kind {
-            PartialKind::Frame(..) => "draw step",
-            PartialKind::Aov(..) => "aov step",
+            PartialKind::Frame(_) => "draw step",
+            PartialKind::Aov(_) => "aov step",
             PartialKind::Preparation(_) => "load step",
         };
         CostClass { kind, ..self.charge.class }
     }
 
-    /// Answers the output with an error instead of finishing it.
+    /// Answers the output with an error instead of finishing it. After a preparation, the next command of the scene
+    /// prepares the scene again, and returns the error.
     pub(super) fn reply_error(self, error: Error) {
-        // A failed send means that the caller no longer waits.
-        match self.kind {
-            PartialKind::Frame(_, reply) => reply.send(Err(error)).map_err(drop).ok(),
-            PartialKind::Aov(_, reply) => reply.send(Err(error)).map_err(drop).ok(),
-            // The next command of the scene prepares it again, and returns the error.
-            PartialKind::Preparation(_) => None,
-        };
+        if let Some(reply) = self.reply {
+            reply.send(Err(error));
+        }
     }
 
     /// Submits the next draw step. `scene` is the loaded scene, or the error if it is not loaded.
@@ -151,8 +150,8 @@ impl PartialOutput {
     /// `Fault` of OpenGL. The output must then be dropped.
     pub(super) fn submit_step(&mut self, context: &mut DeviceContext, scene: Result<&LoadedScene>) -> Result<()> {
         match &mut self.kind {
-            PartialKind::Frame(draw, _) => context.submit_draw_step(scene?, draw),
-            PartialKind::Aov(draw, _) => context.submit_aov_piece(scene?, draw),
+            PartialKind::Frame(frame) => context.submit_draw_step(scene?, frame),
+            PartialKind::Aov(draw) => context.submit_aov_piece(scene?, draw),
             PartialKind::Preparation(preparation) => context.prepare_step(preparation),
         }
     }

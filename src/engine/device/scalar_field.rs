@@ -3,7 +3,7 @@
 use nalgebra::Vector3;
 use rayon::prelude::*;
 
-use crate::engine::output::step_output::FrameOutput;
+use crate::engine::output::output_spec::FrameOutput;
 use crate::frame::{Legend, round_up_scale};
 use modalcast_model::deform::DeformedSurface;
 use modalcast_model::error::{Result, invalid};

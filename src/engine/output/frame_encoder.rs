@@ -11,22 +11,16 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use super::encoder_pool::EncoderPool;
 use super::frame_format::{FrameFormat, JpegQuality};
 use super::rendered_picture::{Pixels, RenderedPicture};
-use super::step_output::{OutputBody, StepFrames, StepId, StepOutput};
 use crate::frame::{self, EncodedStrip, JpegBuffers, JpegLayout, PngLayout, StripBuffers};
 use crate::telemetry::{Stage, StageTimes};
 use modalcast_model::error::{Result, fault, fault_in};
-use modalcast_render::FrameInfo;
 
-/// An encoded result of one step.
-#[derive(Debug, Clone)]
-pub struct EncodedOutput {
-    pub step: StepId,
-    /// Steps that the subscriber skipped since its last output.
-    pub skipped: u64,
-    pub stages: StageTimes,
-    /// How a color frame was drawn; default for other results.
-    pub info: FrameInfo,
+/// The bytes of a picture for the wire.
+#[derive(Debug)]
+pub(super) struct EncodedPicture {
     pub bytes: Bytes,
+    /// Stage times of the picture.
+    pub stages: StageTimes,
 }
 
 /// Encodes frames off the device thread. Clones share its threads.
@@ -37,53 +31,6 @@ pub struct FrameEncoder {
     /// permit, in the order of the requests.
     picture_permits: Arc<Semaphore>,
     cores: usize,
-}
-
-/// A picture of a step that is not encoded yet.
-#[derive(Debug)]
-pub struct StepPicture {
-    pub step: StepId,
-    /// Steps that the subscriber skipped since its last output; 0 for all pictures of a step but the first.
-    pub skipped: u64,
-    /// Stage times of the step, without those of the picture.
-    pub stages: StageTimes,
-    /// Index of the picture in the request.
-    pub index: u32,
-    /// Number of camera updates that the picture includes.
-    pub camera_version: u64,
-    pub picture: Arc<RenderedPicture>,
-}
-
-impl StepPicture {
-    /// Separates the pictures of an output.
-    ///
-    /// # Errors
-    /// `Fault` when `output` has no frames.
-    pub fn of_output(output: StepOutput) -> Result<impl Iterator<Item = Self>> {
-        let StepOutput { step, skipped, stages, body: OutputBody::Frames(frames), .. } = output else {
-            return Err(fault("encode", "expected frames, got another output"));
-        };
-        let StepFrames { pictures, camera_version } = frames;
-        let separate = move |(picture, index)| Self {
-            step,
-            skipped: if index == 0 { skipped } else { 0 },
-            stages: stages.clone(),
-            index,
-            camera_version,
-            picture,
-        };
-        Ok(pictures.into_iter().zip(0..).map(separate))
-    }
-}
-
-/// An encoded picture of a step.
-#[derive(Debug, Clone)]
-pub struct EncodedFrame {
-    /// Index of the picture in the request.
-    pub picture: u32,
-    /// Number of camera updates that the frame includes.
-    pub camera_version: u64,
-    pub output: EncodedOutput,
 }
 
 impl FrameEncoder {
@@ -108,20 +55,18 @@ impl FrameEncoder {
     ///
     /// # Errors
     /// `Fault` when the encoder fails.
-    pub async fn encode(&self, step_picture: StepPicture, format: FrameFormat) -> Result<EncodedFrame> {
-        let StepPicture { step, skipped, mut stages, index, camera_version, picture } = step_picture;
-        stages.extend(picture.stages.iter().copied());
+    pub(super) async fn encode(&self, picture: &Arc<RenderedPicture>, format: FrameFormat) -> Result<EncodedPicture> {
+        let mut stages = picture.stages.clone();
         let bytes = match (&picture.pixels, format) {
             (Pixels::Color(rgba), FrameFormat::Rgba) => rgba.clone(),
             (Pixels::Values(bytes), _) => bytes.clone(),
-            (Pixels::Color(_) | Pixels::PngOnly(_) | Pixels::ColorMap(..), _) => {
-                let (bytes, ms) = self.encode_once(&picture, format).await?;
+            (Pixels::Color(_) | Pixels::PngOnly | Pixels::ColorMap(..), _) => {
+                let (bytes, ms) = self.encode_once(picture, format).await?;
                 stages.push((Stage::Encode, ms));
                 bytes
             }
         };
-        let output = EncodedOutput { step, skipped, stages, info: picture.info, bytes };
-        Ok(EncodedFrame { picture: index, camera_version, output })
+        Ok(EncodedPicture { bytes, stages })
     }
 
     /// Returns the encoding of a picture and the milliseconds that encoding took. The first caller encodes the picture.
@@ -157,7 +102,7 @@ impl FrameEncoder {
                 let picture = Arc::clone(picture);
                 self.run(permit, move || draw_color_map(&picture)).await
             }
-            Pixels::PngOnly(_) => Err(fault("encode", "expected colors, got a PNG file")),
+            Pixels::PngOnly => Err(fault("encode", "expected colors, got a PNG file")),
             Pixels::Values(_) => Err(fault("encode", "expected colors, got values")),
         }
     }
@@ -258,12 +203,14 @@ fn draw_color_map(picture: &RenderedPicture) -> Result<Bytes> {
 #[cfg(test)]
 pub(in crate::engine) mod tests {
     use super::*;
+    use crate::engine::device::handle::PendingReply;
     use crate::engine::output::frame_format::JpegQuality;
-    use modalcast_render::FrameImage;
+    use crate::engine::output::step_output::{OutputBody, StepFrames, StepId, StepOutput};
+    use modalcast_render::{FrameImage, FrameInfo};
 
-    /// A frame of noise, so that encoding its PNG takes time. `number` is the step number and the seed.
-    pub(in crate::engine) fn noise_frame(number: u64, side: u32) -> StepOutput {
-        let mut random = fastrand::Rng::with_seed(number);
+    /// A picture of noise, so that encoding its PNG takes time.
+    fn noise_picture(seed: u64, side: u32) -> Arc<RenderedPicture> {
+        let mut random = fastrand::Rng::with_seed(seed);
         let rgba: Vec<u8> = (0..side * side).flat_map(|_| [random.u8(..), random.u8(..), random.u8(..), 255]).collect();
         let image = FrameImage {
             width: side,
@@ -272,14 +219,15 @@ pub(in crate::engine) mod tests {
             times: modalcast_render::FrameTimes::default(),
             info: FrameInfo::default(),
         };
-        let step = StepId { run: 1, number, time: 0.0 };
-        let body = OutputBody::Frames(StepFrames { pictures: vec![Arc::new(image.into())], camera_version: 0 });
-        StepOutput { step, skipped: 0, stages: vec![], origins: None, body }
+        Arc::new(image.into())
     }
 
-    /// The first picture of an output.
-    fn first_picture(output: &StepOutput) -> StepPicture {
-        StepPicture::of_output(output.clone()).expect("expected frames").next().expect("expected a picture")
+    /// A frame of noise. `number` is the step number and the seed.
+    pub(in crate::engine) fn noise_frame(number: u64, side: u32) -> StepOutput {
+        let step = StepId { run: 1, number, time: 0.0 };
+        let pictures = vec![Arc::new(PendingReply::answered(noise_picture(number, side)))];
+        let body = OutputBody::Frames(StepFrames { pictures, camera_version: 0 });
+        StepOutput { step, skipped: 0, stages: vec![], origins: None, body }
     }
 
     fn encoder(cores: usize) -> FrameEncoder {
@@ -295,12 +243,12 @@ pub(in crate::engine) mod tests {
     #[tokio::test]
     async fn subscribers_share_one_png_and_raw_pixels() {
         let encoder = encoder(2);
-        let output = noise_frame(1, 16);
+        let picture = noise_picture(1, 16);
         let encode_twice = async |format| {
-            let first = encoder.encode(first_picture(&output), format);
-            let second = encoder.encode(first_picture(&output), format);
+            let first = encoder.encode(&picture, format);
+            let second = encoder.encode(&picture, format);
             let (first, second) = tokio::join!(first, second);
-            (first.expect("expected an encoded frame").output, second.expect("expected an encoded frame").output)
+            (first.expect("expected an encoded frame"), second.expect("expected an encoded frame"))
         };
         let jpeg = |quality| FrameFormat::Jpeg(JpegQuality::parse("quality", quality).expect("expected a quality"));
         for format in [FrameFormat::Png, FrameFormat::Rgb, FrameFormat::Rgba, jpeg(50), jpeg(90)] {
@@ -309,8 +257,7 @@ pub(in crate::engine) mod tests {
             assert_eq!(first.bytes.len(), second.bytes.len(), "{format:?}");
             assert_eq!(first.stages, second.stages, "{format:?}");
         }
-        let other_frame = encoder.encode(first_picture(&noise_frame(1, 16)), FrameFormat::Png).await;
-        let other_frame = other_frame.expect("expected a PNG").output;
+        let other_frame = encoder.encode(&noise_picture(1, 16), FrameFormat::Png).await.expect("expected a PNG");
         let ((small, _), (large, _)) = (encode_twice(jpeg(50)).await, encode_twice(jpeg(90)).await);
         assert!(small.bytes.len() < large.bytes.len(), "expected one encoding per quality");
         assert_eq!(large.bytes, encode_twice(jpeg(0)).await.0.bytes, "expected the default quality of 90");
@@ -326,10 +273,8 @@ pub(in crate::engine) mod tests {
     #[tokio::test]
     async fn all_threads_write_the_files_of_one_thread() {
         let encoder = encoder(3);
-        let output = noise_frame(5, 300);
-        let encode = async |format| {
-            encoder.encode(first_picture(&output), format).await.expect("expected an encoded frame").output.bytes
-        };
+        let picture = noise_picture(5, 300);
+        let encode = async |format| encoder.encode(&picture, format).await.expect("expected an encoded frame").bytes;
         let rgba = encode(FrameFormat::Rgba).await;
         let quality = JpegQuality::parse("quality", 70).expect("expected a quality");
         let jpeg = frame::encode_jpeg(300, 300, &rgba, 70).expect("expected a JPEG");
@@ -340,13 +285,13 @@ pub(in crate::engine) mod tests {
     #[tokio::test]
     async fn next_subscriber_encodes_after_a_cancelled_one() {
         let (encoder, picture_permits) = paused_encoder(1);
-        let output = noise_frame(2, 8);
-        let first = encoder.encode(first_picture(&output), FrameFormat::Png);
+        let picture = noise_picture(2, 8);
+        let first = encoder.encode(&picture, FrameFormat::Png);
         let timeout = std::time::Duration::from_millis(20);
         tokio::time::timeout(timeout, first).await.expect_err("expected no PNG without a thread");
         picture_permits.add_permits(1);
-        let second = encoder.encode(first_picture(&output), FrameFormat::Png).await.expect("expected a PNG");
-        assert!(image::load_from_memory(&second.output.bytes).is_ok());
+        let second = encoder.encode(&picture, FrameFormat::Png).await.expect("expected a PNG");
+        assert!(image::load_from_memory(&second.bytes).is_ok());
     }
 
     /// Readers of PNG share the file that the device has encoded. Readers of pixels get them if they are there.
@@ -354,8 +299,8 @@ pub(in crate::engine) mod tests {
     async fn file_of_the_device_is_not_encoded_again() {
         let (encoder, _picture_permits) = paused_encoder(1);
         let rgba = vec![9_u8; 4 * 2 * 2];
-        let output = |has_pixels: bool| {
-            let encoded = modalcast_render::EncodedFrame {
+        let picture = |has_pixels: bool| {
+            let encoded = modalcast_render::EncodedPng {
                 png: vec![1, 2, 3],
                 ms: 0.5,
                 rgba: has_pixels.then(|| Box::new(rgba.clone().into())),
@@ -367,17 +312,16 @@ pub(in crate::engine) mod tests {
                 times: modalcast_render::FrameTimes::default(),
                 info: FrameInfo::default(),
             };
-            let body = OutputBody::Frames(StepFrames { pictures: vec![Arc::new(image.into())], camera_version: 0 });
-            StepOutput { body, ..noise_frame(1, 2) }
+            Arc::new(RenderedPicture::from(image))
         };
         for has_pixels in [false, true] {
-            let picture = first_picture(&output(has_pixels));
-            let png = encoder.encode(picture, FrameFormat::Png).await.expect("expected the file").output;
+            let picture = picture(has_pixels);
+            let png = encoder.encode(&picture, FrameFormat::Png).await.expect("expected the file");
             assert_eq!((&png.bytes[..], png.stages), (&[1, 2, 3][..], vec![(Stage::Encode, 0.5)]));
             // Without pixels this fails only after a permit for the CPU, which the paused encoder does not give.
-            let pixels = encoder.encode(first_picture(&output(has_pixels)), FrameFormat::Rgba);
+            let pixels = encoder.encode(&picture, FrameFormat::Rgba);
             let pixels = tokio::time::timeout(std::time::Duration::from_millis(20), pixels).await;
-            assert_eq!(pixels.is_ok_and(|frame| frame.is_ok_and(|frame| frame.output.bytes == rgba)), has_pixels);
+            assert_eq!(pixels.is_ok_and(|frame| frame.is_ok_and(|frame| frame.bytes == rgba)), has_pixels);
         }
     }
 }

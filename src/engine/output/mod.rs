@@ -2,9 +2,10 @@
 //! encoding for the wire off the device thread.
 
 mod encoder_pool;
-pub(super) mod encoding_task;
 pub(super) mod frame_encoder;
 pub(super) mod frame_format;
+pub(super) mod frame_queue;
+pub(super) mod output_spec;
 pub(super) mod pack;
 pub(super) mod pick_result;
 pub(super) mod rendered_picture;

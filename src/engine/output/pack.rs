@@ -94,20 +94,22 @@ impl VertexPacker {
         Ok(Self { pool: Arc::new(pool.build().map_err(fault_in("threads that pack vertices"))?) })
     }
 
-    /// Packs the selected attributes of the selected domains, then the origins, unless they equal `known_origins`,
+    /// Waits for the vertices. Packs the selected attributes of the selected domains, then the origins, unless they equal `known_origins`,
     /// which the client has received before.
     ///
     /// # Errors
-    /// `Fault` when `output` does not contain the selected attributes.
+    /// The error of the device; `Fault` when `output` does not contain the selected attributes.
     pub async fn pack(
         &self,
         output: StepOutput,
         selection: &Arc<VertexSelection>,
         known_origins: Option<Origins>,
     ) -> Result<PackedVertices> {
-        let StepOutput { step, skipped, stages, body: OutputBody::Vertices(vertices), origins } = output else {
+        let StepOutput { step, skipped, mut stages, body: OutputBody::Vertices(vertices), origins } = output else {
             return Err(fault("copy", "expected vertices, got another output"));
         };
+        let vertices = vertices.wait().await?;
+        stages.push((Stage::Copy, vertices.copy_ms));
         let origins = self.origins_in_meters(selection, origins).await?;
         let (sections, parts) = (Vec::new(), Vec::new());
         let mut packed = PackedVertices { step, skipped, stages, sections, parts, origins };

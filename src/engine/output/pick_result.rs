@@ -18,9 +18,8 @@ pub struct PickResult {
     pub hits: Vec<ModalHit>,
 }
 
-/// Adds the linear parts of the domains' transforms to hits. [`resolve_picks`] adds the modes, which would take too
-/// long on the task of the scene.
-pub(in crate::engine) fn with_transforms(state: &SceneState, scene: &Scene, hits: Vec<PickHit>) -> Vec<ModalHit> {
+/// Adds the linear parts of the domains' transforms to hits.
+fn with_transforms(state: &SceneState, scene: &Scene, hits: Vec<PickHit>) -> Vec<ModalHit> {
     let add_transform = |hit: PickHit| {
         let transform_entries = state.transform_of(scene, hit.domain).0;
         // The transform is 3 x 4, row-major. Its fourth column is the translation.
@@ -30,16 +29,17 @@ pub(in crate::engine) fn with_transforms(state: &SceneState, scene: &Scene, hits
     hits.into_iter().map(add_transform).collect()
 }
 
-/// Adds to every hit the block of U at its point if `with_modes` is true.
+/// Waits for the hits. Adds to every hit the block of U at its point if `with_modes` is true.
 ///
 /// # Errors
-/// `Fault` when `output` is not a pick.
+/// The error of the device; `Fault` when `output` is not a pick.
 pub async fn resolve_picks(output: StepOutput, scene: &Arc<Scene>, with_modes: bool) -> Result<PickResult> {
-    let OutputBody::Pick(mut hits) = output.body else {
+    let OutputBody::Pick(hits, state) = output.body else {
         return Err(fault("pick", "expected a pick, got another output"));
     };
-    let scene = Arc::clone(scene);
+    let (hits, scene) = (hits.wait().await?, Arc::clone(scene));
     let add_modes = move || {
+        let mut hits = with_transforms(&state, &scene, hits);
         if with_modes {
             for modal_hit in &mut hits {
                 let shape = &scene.shapes[scene.domains[modal_hit.hit.domain].shape];

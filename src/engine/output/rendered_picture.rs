@@ -9,7 +9,7 @@ use super::frame_format::FrameFormat;
 use crate::engine::lock::lock;
 use crate::frame::Legend;
 use crate::telemetry::{Stage, StageTimes};
-use modalcast_render::{AovImage, EncodedFrame, FrameImage, FrameInfo, FramePixels, FrameTimes, RenderStage, TimeKey};
+use modalcast_render::{AovImage, EncodedPng, FrameImage, FrameInfo, FramePixels, FrameTimes, RenderStage, TimeKey};
 
 /// The pixels of one picture of a step. All readers of equal pictures share them, and share each encoding, which is
 /// computed once, on first use.
@@ -34,8 +34,8 @@ pub(super) type SharedEncoding = Arc<OnceCell<(Bytes, f64)>>;
 pub enum Pixels {
     /// RGBA8 sRGB, top row first.
     Color(Bytes),
-    /// Only the PNG file of a color picture, of this size in bytes, because no reader wanted the pixels.
-    PngOnly(usize),
+    /// Only the PNG file of a color picture, because no reader wanted the pixels.
+    PngOnly,
     /// Little-endian numbers, top row first.
     Values(Bytes),
     /// Values that are drawn as a color map.
@@ -52,15 +52,6 @@ impl RenderedPicture {
             None => Pixels::Values(image.bytes.into()),
         };
         Self { width, height, pixels, stages, info: FrameInfo::default(), encodings: Mutex::default() }
-    }
-
-    /// Size of the pixels in bytes.
-    pub(in crate::engine) fn pixel_bytes(&self) -> usize {
-        match &self.pixels {
-            Pixels::Color(bytes) | Pixels::Values(bytes) => bytes.len(),
-            Pixels::ColorMap(image, _) => image.bytes.len(),
-            Pixels::PngOnly(bytes) => *bytes,
-        }
     }
 
     /// The cell for the encoding in a format. The caller encodes the picture if the cell is empty.
@@ -80,9 +71,9 @@ impl From<FrameImage<FramePixels>> for RenderedPicture {
         let FrameImage { width, height, rgba, times, info } = image;
         let mut encodings = Vec::new();
         let pixels = match rgba {
-            FramePixels::Encoded(EncodedFrame { png, ms, rgba }) => {
+            FramePixels::Encoded(EncodedPng { png, ms, rgba }) => {
                 let file = Bytes::from(png);
-                let pixels = rgba.map_or(Pixels::PngOnly(file.len()), |rgba| Pixels::Color(shared_bytes(*rgba)));
+                let pixels = rgba.map_or(Pixels::PngOnly, |rgba| Pixels::Color(shared_bytes(*rgba)));
                 encodings.push((FrameFormat::Png, Arc::new(OnceCell::new_with(Some((file, ms))))));
                 pixels
             }

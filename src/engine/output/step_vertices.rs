@@ -14,6 +14,8 @@ use modalcast_model::deform::DeformedSurface;
 #[derive(Debug, Default)]
 pub struct StepVertices {
     pub surface: Arc<DeformedSurface>,
+    /// Milliseconds from the start of the copy to its completion.
+    pub copy_ms: f64,
     /// At most one entry per key.
     packed_sections: Mutex<Vec<(SectionKey, SharedSection)>>,
 }
@@ -40,8 +42,8 @@ pub(super) type SharedSection = Arc<OnceCell<PackedSection>>;
 
 impl StepVertices {
     /// Vertices without packed sections.
-    pub(in crate::engine) fn new(surface: Arc<DeformedSurface>) -> Self {
-        Self { surface, packed_sections: Mutex::default() }
+    pub(in crate::engine) fn new(surface: Arc<DeformedSurface>, copy_ms: f64) -> Self {
+        Self { surface, copy_ms, packed_sections: Mutex::default() }
     }
 
     /// The cell for a packed section. The caller packs the section if the cell is empty.

@@ -1,6 +1,7 @@
 //! The scene actor: one task per scene that serializes all operations on the scene. It owns three objects: the queue of
 //! steps from the writer ([`StepQueue`]), the delivery of outputs ([`OutputDelivery`]) and the checkpoints of the scene
-//! ([`SceneCheckpoints`]). The task awaits the device but never a client.
+//! ([`SceneCheckpoints`]). The task awaits the device for steps, but never a client. It starts outputs, and their readers
+//! wait for the device ([`OutputBody`](crate::engine::OutputBody)).
 //!
 //! # State machine
 //! [`StepPhase`] is the state of the actor while it runs:
@@ -16,14 +17,14 @@
 //! | state | meaning | ends when |
 //! |---|---|---|
 //! | `Idle` | no step is in progress | the writer has queued a step |
-//! | `Deforming` | the device computes the step, readbacks of the previous step are delivered, messages wait | the device answers |
-//! | `Delivering` | the step is the current one, its writer waits for the acknowledgment | every lossless subscriber has received the step, or the writer is not lossless or has disconnected |
+//! | `Deforming` | the device computes the step and finishes outputs of the previous one, messages wait | the device answers |
+//! | `Delivering` | the step is the current one, its writer waits for the acknowledgment | the outputs of every lossless subscriber are started, or the writer is not lossless or has disconnected |
 //!
 //! Single requests and subscribers are served in `Idle` and in `Delivering`. In every state the actor ends, and
 //! [`SceneActor::close`] consumes it, when
-//! - it receives `Stop` or every sender of the mailbox is dropped: readbacks in flight are delivered first;
+//! - it receives `Stop` or every sender of the mailbox is dropped: outputs in flight are finished first;
 //! - the device is lost: the scene fails with `DeviceLost`;
-//! - the actor's code panics: the scene fails with a `Fault`, and readbacks in flight are dropped.
+//! - the actor's code panics: the scene fails with a `Fault`.
 //!
 //! A failed scene is first removed from the registry. Then its writer, subscribers and requests get the error, and the
 //! device unloads the scene. Other scenes continue.
@@ -51,7 +52,7 @@ use crate::engine::storage::run_counter::RunCounter;
 use crate::telemetry::{Stage, StageTimes};
 use modalcast_model::deform::DeformSummary;
 use modalcast_model::error::{Error, Result, fault};
-use modalcast_model::scene::{Scene, SceneState, StepUpdate};
+use modalcast_model::scene::{Scene, SceneState, StatePool, StepUpdate};
 
 /// Services that all scenes share.
 #[derive(Debug, Clone)]
@@ -144,6 +145,7 @@ pub(super) struct SceneActor {
     /// A step that was taken from the queue of the writer early.
     next_step: Option<NextStep>,
     current: CurrentStep,
+    states: StatePool,
     delivery: OutputDelivery,
     checkpoints: SceneCheckpoints,
     current_state: watch::Sender<Arc<SceneState>>,
@@ -158,7 +160,7 @@ impl SceneActor {
     pub(super) fn new(params: ActorParams, services: SceneServices) -> Self {
         let ActorParams { name, id, scene, state, wake, current_state, failure, on_failure, memory } = params;
         let SceneServices { device, checkpoints, run_counter, config } = services;
-        let scene_on_device = SceneOnDevice { name: name.clone(), id, scene: Arc::clone(&scene) };
+        let scene_on_device = SceneOnDevice { name: name.clone(), id };
         Self {
             delivery: OutputDelivery::new(scene_on_device, device.clone(), &config),
             checkpoints: SceneCheckpoints::new(checkpoints, name.clone()),
@@ -174,6 +176,7 @@ impl SceneActor {
             phase: StepPhase::Idle,
             next_step: None,
             current: CurrentStep::of_opened_scene(state),
+            states: StatePool::default(),
             current_state,
             wake,
             failure,
@@ -206,21 +209,22 @@ impl SceneActor {
                     None => return ActorEnd::Stopped { error: Error::ShuttingDown, done: None },
                 },
                 () = self.wake.notified() => {}
+                () = self.delivery.finish_oldest_output(), if self.delivery.has_outputs_in_flight() => {}
                 () = sleep_until(stall_deadline) => {}
             }
         }
     }
 
-    /// Delivers everything that can be delivered now and computes at most one step.
+    /// Starts all outputs that can be started now and computes at most one step.
     async fn advance(&mut self) {
         self.delivery.answer_requests(&self.current, self.run).await;
         let applies_back_pressure = self.applies_back_pressure();
         let mode = DeliveryMode { applies_back_pressure, overlaps_next_step: self.has_queued_step() };
         self.delivery.serve_subscribers(&self.current, mode).await;
         if self.applies_back_pressure() && self.delivery.has_unserved_lossless(&self.current) {
-            return self.delivery.flush_until_woken(&self.wake).await;
+            return;
         }
-        self.acknowledge().await;
+        self.acknowledge();
         if self.writer.as_ref().is_some_and(|writer| writer.step_queue.is_closed()) {
             self.writer = None;
         }
@@ -228,15 +232,13 @@ impl SceneActor {
             self.finish_step().await;
             // More steps may be queued. Handle waiting messages first.
             self.wake.notify_one();
-        } else {
-            self.delivery.flush_until_woken(&self.wake).await;
         }
     }
 
-    /// `Delivering` to `Idle`: acknowledges the step after its last readback in flight.
-    async fn acknowledge(&mut self) {
+    /// `Delivering` to `Idle`: the step is acknowledged after its last output in flight.
+    fn acknowledge(&mut self) {
         if let StepPhase::Delivering(step) = mem::take(&mut self.phase) {
-            self.delivery.acknowledge(&self.current, step).await;
+            self.delivery.acknowledge(step);
         }
     }
 
@@ -260,11 +262,18 @@ impl SceneActor {
         let Some(queued_step) = queued_step else { return false };
         // Ends the time in the queue, so before the states are computed.
         let stages = queued_step.stages();
-        let state = state.unwrap_or_else(|| self.state_after(&self.current.state, self.starts_from_rest, &queued_step));
+        let current = Arc::clone(&self.current.state);
+        let state = match state {
+            Some(state) => state,
+            None if self.starts_from_rest => {
+                Arc::new(state_from_rest(&self.scene, &current, self.run, &queued_step.update))
+            }
+            None => self.state_after(&current, &queued_step),
+        };
         self.next_step = step_queue.take_early().map(|next| NextStep {
             step_queue: Arc::clone(&step_queue),
             base: Arc::clone(&state),
-            state: self.state_after(&state, false, &next),
+            state: self.state_after(&state, &next),
             queued_step: next,
         });
         let next_state = self.next_step.as_ref().map(|next_step| Arc::clone(&next_step.state));
@@ -274,17 +283,15 @@ impl SceneActor {
         true
     }
 
-    /// The state after a step of the present run.
-    fn state_after(&self, base: &SceneState, starts_from_rest: bool, step: &QueuedStep) -> Arc<SceneState> {
-        let state = next_state(&self.scene, base, starts_from_rest, &step.update);
-        Arc::new(SceneState { run: self.run, ..state })
+    /// The state after a step of the present run that changes `base`.
+    fn state_after(&mut self, base: &Arc<SceneState>, step: &QueuedStep) -> Arc<SceneState> {
+        self.states.apply(&self.scene, base, self.run, &step.update)
     }
 
-    /// `Deforming` to `Delivering`, or to `Idle` if the device rejects the step. Delivers readbacks in flight while the
-    /// device computes.
+    /// `Deforming` to `Delivering`, or to `Idle` if the device rejects the step.
     async fn finish_step(&mut self) {
-        let StepPhase::Deforming(step) = &mut self.phase else { return };
-        let deformed = self.delivery.deliver_during(&mut step.pending_summary, &self.current).await;
+        let StepPhase::Deforming(step) = &self.phase else { return };
+        let deformed = self.delivery.wait_for_step(&step.pending_summary, &self.current).await;
         let StepPhase::Deforming(step) = mem::take(&mut self.phase) else { return };
         let DeformingStep { step_queue, merged, mut stages, state, .. } = step;
         match deformed {
@@ -294,12 +301,12 @@ impl SceneActor {
                 self.checkpoints.save(&state);
                 self.current_state.send_replace(Arc::clone(&state));
                 self.current = CurrentStep { state, step_count: self.current.step_count + 1 + merged, stages };
-                self.delivery.drop_cached_vertices();
+                self.delivery.begin_step();
                 self.phase = StepPhase::Delivering(CompletedStep::new(step_queue, self.current.stages.clone()));
             }
             Err(error) => {
                 // Reports have the order of the steps, so deliver the acknowledgments of earlier steps first.
-                self.delivery.flush().await;
+                self.delivery.finish_outputs().await;
                 step_queue.report(Err(error));
             }
         }
@@ -357,8 +364,7 @@ impl SceneActor {
         Ok(AcquiredLease { lease, token, run, initial_state })
     }
 
-    /// Whether another step is queued. If so, readbacks of the current step are only started and overlap with the
-    /// computation of the next step.
+    /// Whether another step is queued.
     fn has_queued_step(&self) -> bool {
         let has_next = |step_queue: &Arc<StepQueue>| {
             step_queue.has_queued()
@@ -377,12 +383,12 @@ impl SceneActor {
     async fn close(mut self, end: ActorEnd, mailbox: mpsc::Receiver<Message>) {
         let (error, done) = match end {
             ActorEnd::Stopped { error, done } => {
-                self.delivery.flush().await;
+                self.delivery.finish_outputs().await;
                 (error, done)
             }
             ActorEnd::DeviceLost(error) => {
                 self.fail(&error);
-                self.delivery.flush().await;
+                self.delivery.finish_outputs().await;
                 (error, None)
             }
             ActorEnd::Panicked(error) => {
@@ -414,16 +420,11 @@ impl SceneActor {
     }
 }
 
-/// The state after a step that changes the current state or, with `starts_from_rest`, the rest state.
-fn next_state(scene: &Scene, current: &SceneState, starts_from_rest: bool, update: &StepUpdate) -> SceneState {
-    if !starts_from_rest {
-        let mut state = current.clone();
-        state.apply(scene, update);
-        return state;
-    }
-    let mut state = SceneState { serial: current.serial, ..SceneState::rest(scene) };
+/// The state after a step that changes the rest state instead of `current`. The device shows `current`, which may differ
+/// from rest in every domain.
+fn state_from_rest(scene: &Scene, current: &SceneState, run: u64, update: &StepUpdate) -> SceneState {
+    let mut state = SceneState { run, serial: current.serial, ..SceneState::rest(scene) };
     state.apply(scene, update);
-    // The device shows the current state, which may differ from rest in every domain.
     state.mark_all_dirty();
     state
 }

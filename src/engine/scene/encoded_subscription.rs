@@ -1,18 +1,20 @@
-//! A frame subscription with parallel encoding. Frames, also those of one step, are encoded concurrently and delivered
-//! in order.
+//! A frame subscription whose frames are encoded. Frames, also those of one step, are drawn and encoded concurrently and
+//! delivered in order.
 
 use std::collections::VecDeque;
 
 use super::delivery::Delivery;
 use super::subscriber::Subscription;
-use crate::engine::output::encoding_task::EncodingTask;
-use crate::engine::output::frame_encoder::{EncodedFrame, FrameEncoder, StepPicture};
+use crate::engine::output::frame_encoder::FrameEncoder;
 use crate::engine::output::frame_format::FrameFormat;
-use crate::engine::output::step_output::{PictureContent, StepOutput};
+use crate::engine::output::frame_queue::{EncodedFrame, FrameQueue};
+use crate::engine::output::output_spec::PictureContent;
 use modalcast_model::error::{Error, Result};
 
 /// A stream that holds at least this many bytes of pixels accepts no further step.
-const MAX_PIXEL_BYTES: usize = 128 << 20;
+const MAX_PIXEL_BYTES: u64 = 128 << 20;
+/// Size of a pixel. Normals have 12 bytes, but most pictures are colors.
+const PIXEL_BYTES: u64 = 4;
 /// Maximum number of steps whose frames a [`Delivery::Latest`] stream holds. The next step is encoded while the
 /// previous one is sent. Further steps would only add latency.
 const MAX_LATEST_STEPS: usize = 2;
@@ -20,17 +22,18 @@ const MAX_LATEST_STEPS: usize = 2;
 /// The encoded frames of a [`Subscription`], in the same order. A lossless stream holds the frames of at most as many
 /// steps as there are cores. While the client does not read frames, the subscription is not read either and applies
 /// back-pressure to the writer.
-#[derive(Debug)]
 pub struct EncodedSubscription {
     subscription: Subscription,
-    encoder: FrameEncoder,
-    /// The format of each picture.
-    formats: Vec<FrameFormat>,
     /// Number of steps that will still be taken from the subscription.
     remaining_steps: u64,
-    /// Oldest first.
-    encodings: VecDeque<EncodingTask>,
-    /// The error that ended the subscription. It is reported after the frames in `encodings`.
+    /// Size of the pixels of a step.
+    step_bytes: u64,
+    queue: FrameQueue,
+    /// Frames that were encoded while an earlier one was sent.
+    encoded: VecDeque<Result<EncodedFrame>>,
+    /// Number of frames that were returned and are being sent: 0 or 1.
+    sending: usize,
+    /// The error that ended the subscription. It is reported after the frames that are held.
     end_error: Option<Error>,
 }
 
@@ -39,62 +42,93 @@ impl EncodedSubscription {
     /// each picture of the subscription.
     pub fn new(subscription: Subscription, encoder: FrameEncoder, formats: Vec<FrameFormat>, max_steps: u64) -> Self {
         subscription.set_content(PictureContent::of_formats(&formats));
-        let remaining_steps = if max_steps == 0 { u64::MAX } else { max_steps };
-        Self { subscription, encoder, formats, remaining_steps, encodings: VecDeque::new(), end_error: None }
+        let pixels = subscription.cameras().map_or(0, |cameras| {
+            cameras
+                .pictures()
+                .iter()
+                .map(|picture| u64::from(picture.size.width) * u64::from(picture.size.height))
+                .sum()
+        });
+        Self {
+            subscription,
+            remaining_steps: if max_steps == 0 { u64::MAX } else { max_steps },
+            step_bytes: PIXEL_BYTES * pixels,
+            queue: FrameQueue::new(encoder, formats),
+            encoded: VecDeque::new(),
+            sending: 0,
+            end_error: None,
+        }
     }
 
     /// Waits for the next frame: the pictures of a step in order, then those of the next step. Returns `None` after the
     /// requested number of steps. Cancel-safe.
     ///
     /// # Errors
-    /// `Fault` when a frame cannot be encoded; the error that ended the subscription, after the frames that are held.
+    /// The errors of drawing; `Fault` when a frame cannot be encoded; the error that ended the subscription, after the
+    /// frames that are held.
     pub async fn next(&mut self) -> Result<Option<EncodedFrame>> {
+        self.sending = 0;
         loop {
-            let has_capacity = self.has_capacity();
-            let Self { subscription, encodings, .. } = self;
-            tokio::select! {
-                biased;
-                encoded = finish_oldest(encodings), if !encodings.is_empty() => return encoded.map(Some),
-                output = subscription.next(), if has_capacity => match output {
-                    Ok(output) => self.start_encoding(output)?,
-                    Err(error) => self.end_error = Some(error),
-                },
-                else => return self.end_error.clone().map_or(Ok(None), Err),
+            if let Some(frame) = self.encoded.pop_front() {
+                self.sending = 1;
+                return frame.map(Some);
+            }
+            if !self.advance().await? {
+                return self.end_error.clone().map_or(Ok(None), Err);
             }
         }
     }
 
-    /// Waits until the scene disconnects the subscriber; see [`Subscription::disconnected`].
-    pub async fn disconnected(&self) -> Error {
-        self.subscription.disconnected().await
+    /// Takes and encodes further steps while a frame is sent. Returns the error with which the scene disconnects the
+    /// subscriber; see [`Subscription::disconnected`]. Cancel-safe.
+    pub async fn encode_until_disconnected(&mut self) -> Error {
+        let disconnected = self.subscription.disconnected();
+        let encode = async {
+            loop {
+                match self.advance().await {
+                    Ok(true) => {}
+                    // The frames that are held end with the stream.
+                    Ok(false) => return std::future::pending().await,
+                    Err(error) => return error,
+                }
+            }
+        };
+        tokio::select! {
+            error = disconnected => error,
+            error = encode => error,
+        }
+    }
+
+    /// Waits until a frame is encoded, or until a step was taken from the subscription. Returns false if neither will
+    /// happen before frames are sent. Cancel-safe.
+    async fn advance(&mut self) -> Result<bool> {
+        let has_capacity = self.has_capacity();
+        let Self { subscription, queue, .. } = self;
+        tokio::select! {
+            biased;
+            Some(frame) = queue.next(), if !queue.is_empty() => self.encoded.push_back(frame),
+            output = subscription.next(), if has_capacity => match output {
+                Ok(output) => {
+                    self.queue.push(output)?;
+                    self.remaining_steps -= 1;
+                }
+                Err(error) => self.end_error = Some(error),
+            },
+            else => return Ok(false),
+        }
+        Ok(true)
     }
 
     fn has_capacity(&self) -> bool {
-        let max_steps = match self.subscription.delivery().delivery() {
-            Delivery::Lossless => self.encoder.cores(),
-            Delivery::Latest => MAX_LATEST_STEPS,
+        let held_frames = self.queue.len() + self.encoded.len();
+        let (held_frames, max_steps) = match self.subscription.delivery().delivery() {
+            Delivery::Lossless => (held_frames, self.queue.encoder().cores()),
+            Delivery::Latest => (held_frames + self.sending, MAX_LATEST_STEPS),
         };
-        let pixel_bytes: usize = self.encodings.iter().map(EncodingTask::pixel_bytes).sum();
-        let held_steps = self.encodings.len().div_ceil(self.formats.len().max(1));
-        let is_within_limits = held_steps < max_steps && pixel_bytes < MAX_PIXEL_BYTES;
+        let held_steps = held_frames.div_ceil(self.queue.pictures_per_step());
+        let is_within_limits = held_steps < max_steps && held_steps as u64 * self.step_bytes < MAX_PIXEL_BYTES;
         is_within_limits && self.remaining_steps > 0 && self.end_error.is_none()
     }
-
-    fn start_encoding(&mut self, output: StepOutput) -> Result<()> {
-        for (picture, format) in StepPicture::of_output(output)?.zip(&self.formats) {
-            self.encodings.push_back(EncodingTask::start(&self.encoder, picture, *format));
-        }
-        self.remaining_steps -= 1;
-        Ok(())
-    }
-}
-
-/// Waits for the oldest encoding and removes it. Cancel-safe.
-async fn finish_oldest(encodings: &mut VecDeque<EncodingTask>) -> Result<EncodedFrame> {
-    let Some(oldest) = encodings.front_mut() else { return std::future::pending().await };
-    let encoded = oldest.finish().await;
-    encodings.pop_front();
-    encoded
 }
 
 #[cfg(test)]
@@ -107,19 +141,32 @@ mod tests {
     use super::super::subscriber::Subscriber;
     use super::*;
     use crate::engine::output::frame_encoder::tests::{noise_frame, paused_encoder};
-    use crate::engine::output::step_output::{OutputBody, OutputSpec, StepFrames};
-    use modalcast_model::deform::VertexAttributes;
+    use crate::engine::output::output_spec::{FrameOutput, OutputSpec, PictureSpec};
+    use crate::engine::output::step_output::{OutputBody, StepOutput};
+    use crate::engine::testing;
+    use modalcast_model::scene::{Camera, FrameSize, FrameStyle};
 
     /// Limit of an [`EncodedSubscription`] that takes all steps.
     const ALL_STEPS: u64 = 0;
 
     fn subscribe(delivery: Delivery) -> (Subscriber, Subscription) {
-        let spec = OutputSpec::Vertices(VertexAttributes::POSITIONS_AND_NORMALS);
-        Subscription::new(spec, delivery.into(), Arc::default())
+        subscribe_to(FrameSize::new(64, 64), delivery)
+    }
+
+    /// Subscribes to one picture of this size.
+    fn subscribe_to(size: FrameSize, delivery: Delivery) -> (Subscriber, Subscription) {
+        let camera = Camera::fit_to_scene(&testing::two_strips(), size.width, size.height);
+        let picture = PictureSpec { camera, size, output: FrameOutput::Color, style: FrameStyle::default() };
+        Subscription::new(OutputSpec::Frames([picture].into()), delivery.into(), Arc::default())
     }
 
     fn send_frame(subscriber: &Subscriber, frame: StepOutput) {
-        assert!(subscriber.take_permit().send(Ok(frame)), "expected an open subscription");
+        assert!(subscriber.send(frame), "expected an open subscription");
+    }
+
+    /// Number of frames that are being encoded.
+    fn encoding_count(frames: &EncodedSubscription) -> usize {
+        frames.queue.len()
     }
 
     /// Polls for a frame while the encoder is paused.
@@ -133,7 +180,7 @@ mod tests {
 
     /// The step number of the next frame.
     async fn next_step(frames: &mut EncodedSubscription) -> u64 {
-        next_frame(frames).await.output.step.number
+        next_frame(frames).await.step.number
     }
 
     fn png_frames(subscription: Subscription, encoder: FrameEncoder) -> EncodedSubscription {
@@ -164,7 +211,7 @@ mod tests {
             let (subscriber, subscription) = subscribe(delivery);
             let mut frames = png_frames(subscription, encoder);
             let sent = send_until_full(&subscriber, &mut frames).await;
-            assert_eq!(frames.encodings.len(), max_encodings, "{delivery:?}");
+            assert_eq!(encoding_count(&frames), max_encodings, "{delivery:?}");
             assert_eq!(sent, max_encodings + buffered, "{delivery:?}");
             thread_permits.add_permits(cores);
             for number in 0..sent as u64 {
@@ -188,38 +235,26 @@ mod tests {
             send_frame(&subscriber, StepOutput { skipped: 5, body: OutputBody::Frames(frames), ..output });
         }
         poll_without_frame(&mut frames).await;
-        assert!(frames.encodings.len() == 2 * MAX_LATEST_STEPS && !subscriber.has_credit());
+        assert!(encoding_count(&frames) == 2 * MAX_LATEST_STEPS && !subscriber.has_credit());
         thread_permits.add_permits(3);
         for (number, picture, skipped) in [(0, 0, 5), (0, 1, 0), (1, 0, 5), (1, 1, 0)] {
             let frame = next_frame(&mut frames).await;
-            assert_eq!((frame.output.step.number, frame.picture, frame.output.skipped), (number, picture, skipped));
+            assert_eq!((frame.step.number, frame.picture, frame.skipped), (number, picture, skipped));
             let raw_bytes = 16 * 16 * 4;
-            assert_eq!(
-                frame.output.bytes.len() == raw_bytes,
-                picture == 1,
-                "expected raw pixels as the second picture"
-            );
+            assert_eq!(frame.bytes.len() == raw_bytes, picture == 1, "expected raw pixels as the second picture");
         }
     }
 
     #[tokio::test]
     async fn frame_that_reaches_the_byte_limit_is_encoded_alone() {
         let (encoder, _thread_permits) = paused_encoder(4);
-        let (subscriber, subscription) = subscribe(Delivery::Lossless);
+        // 128 MiB of pixels.
+        let (subscriber, subscription) = subscribe_to(FrameSize::new(8192, 4096), Delivery::Lossless);
         let mut frames = png_frames(subscription, encoder);
-        let large_image = modalcast_render::FrameImage {
-            width: 1,
-            height: 1,
-            rgba: vec![0; MAX_PIXEL_BYTES].into(),
-            times: modalcast_render::FrameTimes::default(),
-            info: modalcast_render::FrameInfo::default(),
-        };
-        let body = OutputBody::Frames(StepFrames { pictures: vec![Arc::new(large_image.into())], camera_version: 0 });
-        let large_frame = StepOutput { body, ..noise_frame(0, 1) };
-        send_frame(&subscriber, large_frame);
+        send_frame(&subscriber, noise_frame(0, 8));
         send_frame(&subscriber, noise_frame(1, 4));
         poll_without_frame(&mut frames).await;
-        assert_eq!(frames.encodings.len(), 1);
+        assert_eq!(encoding_count(&frames), 1);
         drop(frames);
         assert!(subscriber.is_closed());
     }

@@ -7,7 +7,7 @@ use std::sync::{Arc, Mutex, Weak};
 use tokio::sync::{Notify, watch};
 
 use crate::engine::lock::lock;
-use crate::engine::output::step_output::PictureSpec;
+use crate::engine::output::output_spec::PictureSpec;
 use modalcast_model::error::{Error, Result, fault_in, invalid};
 use modalcast_model::scene::{Camera, Scene};
 
@@ -145,7 +145,7 @@ impl Drop for FrameStreamRegistration {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::engine::output::step_output::FrameOutput;
+    use crate::engine::output::output_spec::FrameOutput;
     use crate::engine::testing;
     use modalcast_model::scene::{FrameSize, FrameStyle};
 

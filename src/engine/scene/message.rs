@@ -4,7 +4,8 @@ use tokio::sync::oneshot;
 
 use super::lease::{AcquiredLease, LeaseRequest};
 use super::subscriber::Subscriber;
-use crate::engine::output::step_output::{OutputSpec, StepOutput};
+use crate::engine::output::output_spec::OutputSpec;
+use crate::engine::output::step_output::StepOutput;
 use modalcast_model::error::{Error, Result};
 
 /// The step that a single request asks for. A run is the sequence of steps from one writer; run 0 selects that of the

@@ -13,6 +13,6 @@ pub(super) mod lease;
 pub(super) mod message;
 mod output_delivery;
 mod output_producer;
-mod readback_queue;
+mod outputs_in_flight;
 pub(super) mod step_queue;
 pub(super) mod subscriber;

@@ -1,26 +1,22 @@
 //! Delivery of a scene's outputs: to single requests whose step has been reached, and to subscribers that have not
 //! received the current step yet. A subscriber receives one result per credit ([`super::subscriber`]).
 
-use std::collections::VecDeque;
 use std::mem;
 use std::time::Instant;
-
-use tokio::sync::Notify;
 
 use super::current_step::CurrentStep;
 use super::delivery::Delivery;
 use super::message::StepRequest;
-use super::output_producer::{DeliveryMode, DeliveryRound, OutputProducer, SceneOnDevice, attributes_for};
-use super::readback_queue::PendingReadback;
+use super::output_producer::{DeliveryMode, OutputProducer, SceneOnDevice, SharedNeeds, attributes_for};
 use super::step_queue::CompletedStep;
 use super::subscriber::Subscriber;
 use crate::config::Config;
 use crate::engine::device::handle::{DeviceHandle, PendingReply};
-use crate::engine::output::step_output::PictureContent;
+use crate::engine::output::output_spec::PictureContent;
 use modalcast_model::deform::VertexAttributes;
 use modalcast_model::error::{Error, Result};
 
-/// Owns the subscribers and the single requests of one scene, and the readbacks in flight for them.
+/// Owns the subscribers and the single requests of one scene, and starts their outputs.
 pub(super) struct OutputDelivery {
     subscribers: Vec<Subscriber>,
     requests: Vec<StepRequest>,
@@ -94,8 +90,8 @@ impl OutputDelivery {
             let answer = match self.producer.is_reached(request.selector, current, run) {
                 Ok(true) => tokio::select! {
                     biased;
-                    answer = self.producer.produce(&request.spec, current, VertexAttributes::default()) => answer,
-                    // The caller no longer waits. Dropping the production cancels its commands to the device.
+                    answer = self.producer.answer(&request.spec, current) => Ok(answer),
+                    // The caller no longer waits. Dropping the outputs cancels their commands to the device.
                     () = request.reply.closed() => continue,
                 },
                 Ok(false) => {
@@ -111,84 +107,59 @@ impl OutputDelivery {
     /// Delivers the current step to every subscriber with a credit. Subscribers with equal pictures share one drawing,
     /// and subscribers to vertices share one copy.
     pub(super) async fn serve_subscribers(&mut self, current: &CurrentStep, mode: DeliveryMode) {
-        let attributes = self.combined_attributes(current);
-        let starts_shared_copy = mode.overlaps_next_step && !self.producer.cached_attributes().contains(attributes);
-        let mut round = DeliveryRound {
-            current,
-            mode,
-            attributes,
-            starts_shared_copy,
-            content: self.combined_content(),
-            vertex_recipients: Vec::new(),
-            started_pictures: VecDeque::new(),
-            drawn_pictures: Vec::new(),
-        };
+        let needs = SharedNeeds { attributes: self.combined_attributes(current), content: self.combined_content() };
         let mut index = 0;
         while let Some(subscriber) = self.subscribers.get_mut(index) {
-            if !subscriber.is_closed() && self.producer.serve(subscriber, &mut round).await {
+            if !subscriber.is_closed() && self.producer.serve(subscriber, current, mode, needs).await {
                 index += 1;
             } else {
                 self.subscribers.remove(index);
             }
         }
-        let DeliveryRound { vertex_recipients, started_pictures, .. } = round;
-        if !vertex_recipients.is_empty() {
-            let reply = self.producer.device.read_vertices(self.producer.scene_on_device.id, attributes);
-            self.producer.readbacks.push(PendingReadback::of_vertices(current, attributes, reply, vertex_recipients));
-        }
-        started_pictures.into_iter().for_each(|picture| self.producer.readbacks.push(picture));
-        self.drop_closed_subscribers();
     }
 
-    /// Delivers all readbacks in flight.
-    pub(super) async fn flush(&mut self) {
-        self.producer.readbacks.flush().await;
-        self.drop_closed_subscribers();
+    /// Whether the device has not finished all outputs.
+    pub(super) fn has_outputs_in_flight(&self) -> bool {
+        !self.producer.in_flight.is_empty()
     }
 
-    /// Delivers the readbacks in flight that are ready, then waits for the others until `wake` is notified, and notifies
-    /// it again for the caller. A subscriber that has received a credit meanwhile then shares a frame in flight. After
-    /// the delivery of that frame, it would be drawn again.
-    pub(super) async fn flush_until_woken(&mut self, wake: &Notify) {
-        tokio::select! {
-            biased;
-            () = self.flush() => {}
-            () = wake.notified() => wake.notify_one(),
-        }
+    /// Waits for the oldest output in flight. Cancel-safe.
+    pub(super) async fn finish_oldest_output(&mut self) {
+        self.producer.in_flight.finish_oldest().await;
     }
 
-    /// Delivers readbacks until the device answers `pending_reply`, which is the next step. Afterwards only frames of
-    /// the step in `current` may be in flight.
-    pub(super) async fn deliver_during<T>(
+    /// Waits for all outputs in flight.
+    pub(super) async fn finish_outputs(&mut self) {
+        self.producer.in_flight.finish_all().await;
+    }
+
+    /// Waits for the answer to the next step. Afterwards only outputs of the step in `current` may be in flight.
+    pub(super) async fn wait_for_step<T: Clone>(
         &mut self,
-        pending_reply: &mut PendingReply<T>,
+        pending_reply: &PendingReply<T>,
         current: &CurrentStep,
     ) -> Result<T> {
-        let readbacks = &mut self.producer.readbacks;
-        readbacks.flush_vertices().await;
+        let in_flight = &mut self.producer.in_flight;
+        let mut reply = std::pin::pin!(pending_reply.wait());
         let result = loop {
             tokio::select! {
                 biased;
-                result = pending_reply.recv() => break result,
-                () = readbacks.deliver_oldest(), if !readbacks.is_empty() => {}
+                result = &mut reply => break result,
+                () = in_flight.finish_oldest(), if !in_flight.is_empty() => {}
             }
         };
-        readbacks.flush_before(current.step_count).await;
-        self.drop_closed_subscribers();
+        in_flight.finish_before(current.step_count).await;
         result
     }
 
-    /// Acknowledges the current step after its last readback in flight, or now if it has none.
-    pub(super) async fn acknowledge(&mut self, current: &CurrentStep, step: CompletedStep) {
-        if let Some(step) = self.producer.readbacks.attach_acknowledgment(current.step_count, step) {
-            self.flush().await;
-            step.acknowledge();
-        }
+    /// Acknowledges the current step after all outputs that are in flight.
+    pub(super) fn acknowledge(&mut self, step: CompletedStep) {
+        self.producer.in_flight.acknowledge(step);
     }
 
-    /// Drops the cached vertices of the previous step.
-    pub(super) fn drop_cached_vertices(&mut self) {
-        self.producer.cached_vertices = None;
+    /// Forgets the outputs of the previous step.
+    pub(super) fn begin_step(&mut self) {
+        self.producer.begin_step();
     }
 
     /// Ends every subscription and every request with `error`.

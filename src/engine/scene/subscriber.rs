@@ -7,7 +7,7 @@
 //! If the future of `next` is dropped, the next call returns the result that the dropped future has requested, even if
 //! the scene has completed a later step since.
 
-use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
@@ -16,7 +16,8 @@ use tokio::sync::{Notify, mpsc, watch};
 use super::delivery::{Delivery, StreamDelivery};
 use super::frame_stream::{CameraControl, CameraState};
 use crate::engine::lock::lock;
-use crate::engine::output::step_output::{OutputSpec, PictureContent, StepOutput};
+use crate::engine::output::output_spec::{OutputSpec, PictureContent};
+use crate::engine::output::step_output::StepOutput;
 use modalcast_model::error::{Error, Result, fault};
 
 /// Number of results that a lossless subscriber may leave unread before it blocks the writer. Also the capacity of the
@@ -48,40 +49,8 @@ pub(in crate::engine) struct Subscriber {
     content: Arc<Mutex<PictureContent>>,
     /// Number of results that may be sent now. The subscription grants credits.
     credits: Arc<AtomicUsize>,
-    results: mpsc::Sender<Result<StepOutput>>,
-    /// Whether an error was sent, which ends the subscription.
-    is_error_sent: Arc<AtomicBool>,
+    results: mpsc::Sender<StepOutput>,
     end: watch::Sender<Option<EndReason>>,
-}
-
-/// A permit to send one result to a subscriber. It has consumed one credit.
-#[derive(Debug)]
-pub(in crate::engine) struct SendPermit {
-    results: mpsc::Sender<Result<StepOutput>>,
-    is_error_sent: Arc<AtomicBool>,
-}
-
-impl SendPermit {
-    /// Sends a result. An error ends the subscription. Returns false if the subscriber must be dropped.
-    pub(in crate::engine) fn send(self, output: Result<StepOutput>) -> bool {
-        let is_output = output.is_ok();
-        if !is_output {
-            self.is_error_sent.store(true, Ordering::Release);
-        }
-        // The channel has capacity for every credit, so this fails only if the subscription was dropped or has ended.
-        self.results.try_send(output).is_ok() && is_output
-    }
-
-    /// Waits until the subscription is dropped.
-    pub(in crate::engine) fn closed(&self) -> impl Future<Output = ()> + Send + use<> {
-        let results = self.results.clone();
-        async move { results.closed().await }
-    }
-
-    /// Whether the permit belongs to this subscriber.
-    pub(in crate::engine) fn belongs_to(&self, subscriber: &Subscriber) -> bool {
-        self.results.same_channel(&subscriber.results)
-    }
 }
 
 impl Subscriber {
@@ -95,9 +64,9 @@ impl Subscriber {
         self.cameras.as_ref().map(|_| *lock(&self.content))
     }
 
-    /// Whether the subscription was dropped or an error was sent.
+    /// Whether the subscription was dropped.
     pub(in crate::engine) fn is_closed(&self) -> bool {
-        self.results.is_closed() || self.is_error_sent.load(Ordering::Acquire)
+        self.results.is_closed()
     }
 
     /// Waits until the subscription is dropped. Cancel-safe.
@@ -129,10 +98,11 @@ impl Subscriber {
         skipped
     }
 
-    /// Consumes one credit for a result that is sent now or later.
-    pub(in crate::engine) fn take_permit(&self) -> SendPermit {
+    /// Sends a result, which consumes one credit. Returns false if the subscriber must be dropped.
+    pub(in crate::engine) fn send(&self, output: StepOutput) -> bool {
         self.credits.fetch_sub(1, Ordering::AcqRel);
-        SendPermit { results: self.results.clone(), is_error_sent: Arc::clone(&self.is_error_sent) }
+        // The channel has capacity for every credit, so this fails only if the subscription was dropped.
+        self.results.try_send(output).is_ok()
     }
 
     /// Ends the subscription after its buffered results.
@@ -156,7 +126,7 @@ pub struct Subscription {
     rate_limiter: Option<RateLimiter>,
     content: Arc<Mutex<PictureContent>>,
     credits: Arc<AtomicUsize>,
-    results: mpsc::Receiver<Result<StepOutput>>,
+    results: mpsc::Receiver<StepOutput>,
     end: watch::Receiver<Option<EndReason>>,
     /// Wakes the scene: a credit was granted or the subscription was dropped.
     scene_wake: Arc<Notify>,
@@ -188,7 +158,6 @@ impl Subscription {
             content: Arc::clone(&content),
             credits: Arc::clone(&credits),
             results: result_sender,
-            is_error_sent: Arc::default(),
             end: end_sender,
         };
         let rate_limiter =
@@ -228,12 +197,12 @@ impl Subscription {
             }
             Delivery::Latest => self.receive_latest().await,
         };
-        result.unwrap_or_else(|| Err(self.end_error()))
+        result.ok_or_else(|| self.end_error())
     }
 
     /// Grants a credit, if necessary after a wait for the rate limit, and waits for its result. `None` if the
     /// subscription has ended. Cancel-safe.
-    async fn receive_latest(&mut self) -> Option<Result<StepOutput>> {
+    async fn receive_latest(&mut self) -> Option<StepOutput> {
         if !self.has_granted_credit {
             tokio::select! {
                 biased;
@@ -254,13 +223,15 @@ impl Subscription {
 
     /// Waits until the scene disconnects the subscriber, and returns the reason. Pends forever if the subscription ends
     /// in another way.
-    pub async fn disconnected(&self) -> Error {
+    pub fn disconnected(&self) -> impl Future<Output = Error> + Send + use<> {
         let mut end_receiver = self.end.clone();
         let is_immediate = |end: &Option<EndReason>| end.as_ref().is_some_and(|end| end.is_immediate);
-        match end_receiver.wait_for(is_immediate).await.map(|end| end.clone()) {
-            Ok(Some(end)) => end.error,
-            // The scene has ended without disconnecting the subscriber, so buffered results may still be read.
-            _ => std::future::pending().await,
+        async move {
+            match end_receiver.wait_for(is_immediate).await.map(|end| end.clone()) {
+                Ok(Some(end)) => end.error,
+                // The scene has ended without disconnecting the subscriber, so buffered results may still be read.
+                _ => std::future::pending().await,
+            }
         }
     }
 
@@ -311,12 +282,14 @@ impl Drop for Subscription {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::engine::device::handle::PendingReply;
     use crate::engine::output::step_output::{OutputBody, StepId};
     use modalcast_model::deform::VertexAttributes;
 
-    fn output(number: u64) -> Result<StepOutput> {
+    fn output(number: u64) -> StepOutput {
         let step = StepId { run: 1, number, time: 0.0 };
-        Ok(StepOutput { step, skipped: 0, stages: vec![], origins: None, body: OutputBody::Vertices(Arc::default()) })
+        let body = OutputBody::Vertices(Arc::new(PendingReply::answered(Arc::default())));
+        StepOutput { step, skipped: 0, stages: vec![], origins: None, body }
     }
 
     fn subscribe(delivery: impl Into<StreamDelivery>) -> (Subscriber, Subscription) {
@@ -333,7 +306,7 @@ mod tests {
     async fn lossless_subscription_grants_one_credit_per_result() {
         let (subscriber, mut subscription) = subscribe(Delivery::Lossless);
         for number in 1..=2 {
-            assert!(subscriber.has_credit() && subscriber.take_permit().send(output(number)));
+            assert!(subscriber.has_credit() && subscriber.send(output(number)));
         }
         assert!(!subscriber.has_credit());
         assert_eq!(subscription.next().await.expect("expected the first result").step.number, 1);
@@ -348,7 +321,7 @@ mod tests {
             let result = tokio::time::timeout(std::time::Duration::ZERO, subscription.next()).await;
             assert!(result.is_err(), "expected no result yet");
         }
-        assert!(subscriber.has_credit() && subscriber.take_permit().send(output(4)) && !subscriber.has_credit());
+        assert!(subscriber.has_credit() && subscriber.send(output(4)) && !subscriber.has_credit());
         assert_eq!(subscription.next().await.expect("expected the sent result").step.number, 4);
     }
 
@@ -360,7 +333,7 @@ mod tests {
                 tokio::time::timeout(Duration::ZERO, subscription.next()).await.expect_err("expected no result yet");
                 assert_eq!(subscriber.has_credit(), grants_credit, "{delivery:?}, result {number}");
                 if grants_credit {
-                    subscriber.take_permit().send(output(number));
+                    subscriber.send(output(number));
                     subscription.next().await.expect("expected the sent result");
                 }
             }
@@ -371,7 +344,7 @@ mod tests {
     async fn end_is_reported_while_the_rate_limit_delays_a_credit() {
         let (subscriber, mut subscription) = subscribe(slow_delivery());
         tokio::time::timeout(Duration::ZERO, subscription.next()).await.expect_err("expected no result yet");
-        subscriber.take_permit().send(output(1));
+        subscriber.send(output(1));
         subscription.next().await.expect("expected the sent result");
         let error = Error::NotFound { what: "scene", given: "'closed'".into() };
         subscriber.end(error.clone());
@@ -394,7 +367,7 @@ mod tests {
     #[tokio::test]
     async fn end_comes_after_buffered_results() {
         let (subscriber, mut subscription) = subscribe(Delivery::Lossless);
-        subscriber.take_permit().send(output(1));
+        subscriber.send(output(1));
         let error = Error::NotFound { what: "scene", given: "'closed'".into() };
         subscriber.end(error.clone());
         drop(subscriber);

@@ -64,7 +64,18 @@ impl Renderer {
         pending_frame.wait()?;
         let limit = pending_frame.time_left();
         let PendingFrame {
-            desc, readback, fence, passes, raster_switch_ms, span, mut stats, info, class, costs, ..
+            desc,
+            readback,
+            fence,
+            passes,
+            upload_ms,
+            raster_switch_ms,
+            span,
+            mut stats,
+            info,
+            class,
+            costs,
+            ..
         } = pending_frame;
         let mut view = readback.map_or(Ok(None), |readback| readback.into_view(&fence, limit))?;
         let png = view.as_mut().and_then(ReadbackView::take_png);
@@ -100,6 +111,9 @@ impl Renderer {
         if let Some(span) = &span {
             let ms = raster_switch_ms + span.delay_ms(&mut self.last_end_ns);
             times.insert_first(RenderStage::Switch, ms);
+        }
+        if let Some(ms) = upload_ms {
+            times.insert_first(RenderStage::Upload, ms);
         }
         Ok(MappedPixels { width: desc.width, height: desc.height, view, png, times, info })
     }

@@ -27,7 +27,7 @@ use rayon::{ThreadPool, ThreadPoolBuilder};
 
 pub use self::autotune::TrialScene;
 pub use self::partial_frame::PartialFrame;
-pub use self::pending_frame::{EncodedFrame, FramePixels, HeldPixels, MappedPixels, PendingFrame};
+pub use self::pending_frame::{EncodedPng, FramePixels, HeldPixels, MappedPixels, PendingFrame};
 pub use self::preparation::ScenePreparation;
 use crate::device::readback_ring::ReadbackRing;
 use crate::device::{self, gl, gl::Gl};

@@ -50,6 +50,8 @@ pub struct PartialFrame {
     info: FrameInfo,
     /// Submitted passes in execution order. A pass in bands has one entry for each band.
     timers: Vec<(Pass, PassTimer)>,
+    /// Milliseconds of the upload of vertices before the frame; `None` if none were uploaded.
+    upload_ms: Option<f64>,
     /// Milliseconds that the host waited for [`Renderer::rasterize`] beside its device time.
     raster_switch_ms: f64,
     /// When the device draws the frame; `None` for a software rasterizer, and before the first step.
@@ -124,6 +126,11 @@ impl PartialFrame {
     /// Milliseconds that the device took for the last submitted step. Waits for the step.
     pub fn last_step_ms(&self) -> f64 {
         self.timers.last().map_or(0.0, |(_, timer)| timer.ms())
+    }
+
+    /// Sets the milliseconds of the upload of vertices before the frame.
+    pub const fn set_upload_ms(&mut self, ms: f64) {
+        self.upload_ms = Some(ms);
     }
 
     /// How the frame is drawn, without the rasterizers, which are known when it is finished.
@@ -221,6 +228,7 @@ impl Renderer {
             stats: FrameStats { samples: desc.samples, ..FrameStats::default() },
             info: frame_info(buffers, params, FrameAntialiasing { samples: desc.samples, ..antialiasing }),
             timers: Vec::new(),
+            upload_ms: None,
             raster_switch_ms: 0.0,
             span: None,
             is_divided,
@@ -319,6 +327,7 @@ impl Renderer {
             mut target,
             readback,
             timers,
+            upload_ms,
             raster_switch_ms,
             mut span,
             stats,
@@ -342,6 +351,7 @@ impl Renderer {
             readback,
             fence: self.gl.fence(Pass::Read.name())?,
             passes: timers,
+            upload_ms,
             raster_switch_ms,
             span,
             stats,

@@ -27,6 +27,8 @@ pub struct PendingFrame {
     pub(super) fence: Fence,
     /// Passes in execution order, each with its timer.
     pub(super) passes: Vec<(Pass, PassTimer)>,
+    /// Milliseconds of the upload of vertices before the frame; `None` if none were uploaded.
+    pub(super) upload_ms: Option<f64>,
     /// Milliseconds that the host waited for the compute rasterizer beside its device time.
     pub(super) raster_switch_ms: f64,
     /// When the device draws the frame; `None` for a software rasterizer.
@@ -62,12 +64,12 @@ pub enum FramePixels {
     Copied(Vec<u8>),
     Held(HeldPixels),
     /// The PNG file, which the device has encoded.
-    Encoded(EncodedFrame),
+    Encoded(EncodedPng),
 }
 
 /// The PNG file of a frame.
 #[derive(Debug)]
-pub struct EncodedFrame {
+pub struct EncodedPng {
     /// A copy, so that the device's memory for files is free for the next frames.
     pub png: Vec<u8>,
     /// Milliseconds that the device encoded.
@@ -168,13 +170,6 @@ impl MappedPixels {
         &self.times
     }
 
-    /// Adds the time of the vertex upload that preceded the frame, in milliseconds.
-    #[must_use]
-    pub fn with_upload_time(mut self, ms: f64) -> Self {
-        self.times.insert_first(RenderStage::Upload, ms);
-        self
-    }
-
     /// The pixels, held in the memory of the readback if enough of it is left for the next frames, else copied. With
     /// the PNG file, if it was requested and the device has encoded it.
     pub fn into_shared_image(mut self) -> FrameImage<FramePixels> {
@@ -188,7 +183,7 @@ impl MappedPixels {
         } else {
             (self.times, None)
         };
-        FrameImage { width, height, rgba: FramePixels::Encoded(EncodedFrame { png, ms, rgba }), times, info }
+        FrameImage { width, height, rgba: FramePixels::Encoded(EncodedPng { png, ms, rgba }), times, info }
     }
 
     fn into_shared_pixels(self) -> FrameImage<FramePixels> {

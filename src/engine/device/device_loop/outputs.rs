@@ -1,13 +1,17 @@
 //! Draws frames and AOVs (arbitrary output variables, such as depth), and prepares their scenes before. Long work is
 //! split into draw steps, and other scenes are served between them.
 
+use std::sync::Arc;
 use std::time::Instant;
 
-use super::{DeviceLoop, FrameInFlight, answer, find_scene};
+use super::{DeviceLoop, answer, find_scene};
 use crate::engine::device::command::{Command, SceneId};
 use crate::engine::device::command_queue::Work;
 use crate::engine::device::fair_queue::Taken;
+use crate::engine::device::in_flight::InFlight;
 use crate::engine::device::partial_output::{Charge, PartialKind, PartialOutput};
+use crate::engine::output::output_spec::{FrameOutput, PictureContent, PictureSpec};
+use crate::engine::output::rendered_picture::RenderedPicture;
 use crate::telemetry::ms_since;
 use modalcast_render::ScenePreparation;
 
@@ -30,7 +34,8 @@ impl DeviceLoop {
             ..taken
         });
         let charge = Charge { is_recorded: true, ..Charge::new(class, 0.0) };
-        let output = PartialOutput { kind: PartialKind::Preparation(preparation), charge };
+        let (kind, content) = (PartialKind::Preparation(preparation), PictureContent::PIXELS);
+        let output = PartialOutput { kind, content, reply: None, charge };
         self.queue.push_continuation(id, output.step_class());
         self.partial_outputs.insert(id, output);
         None
@@ -43,13 +48,11 @@ impl DeviceLoop {
         let Self { context, scenes, .. } = self;
         match command {
             Command::LoadScene { scene, .. } if context.creates_buffers_at_load() => context.begin_preparation(scene),
-            Command::Draw { id, .. } | Command::RenderAov { id, .. } | Command::Pick { id, .. }
-                if !command.is_cancelled() =>
-            {
+            Command::Draw { id, .. } | Command::Pick { id, .. } if !command.is_cancelled() => {
                 let loaded_scene = scenes.get(id)?;
                 match (loaded_scene.buffers(), command) {
-                    (Ok(buffers), Command::Draw { size, style, .. }) => {
-                        context.begin_frame_preparation(buffers, *size, *style)
+                    (Ok(buffers), Command::Draw { picture, .. }) if picture.output == FrameOutput::Color => {
+                        context.begin_frame_preparation(buffers, picture.size, picture.style)
                     }
                     (Ok(_), _) => None,
                     (Err(_), _) => context.begin_preparation(loaded_scene.scene()),
@@ -65,28 +68,19 @@ impl DeviceLoop {
         if let Some(error) = self.loss.error() {
             return command.reply_error(error);
         }
+        let Command::Draw { id, picture, content, reply } = command else { return };
+        let PictureSpec { camera, size, output, style } = picture;
         let Self { context, scenes, loss, .. } = self;
-        let (id, kind) = match command {
-            Command::Draw { id, camera, size, style, content, reply } => {
-                let draw =
-                    find_scene(scenes, id).and_then(|scene| context.begin_partial_draw(scene, &camera, size, style));
-                match loss.record_loss(draw) {
-                    Ok(draw) => (id, PartialKind::Frame(draw.with_content(content), reply)),
-                    Err(error) => return answer(reply, Err(error)),
-                }
-            }
-            Command::RenderAov { id, camera, size, frame_output, reply } => {
-                let draw =
-                    find_scene(scenes, id).and_then(|scene| context.begin_aov(scene, &camera, size, frame_output));
-                match loss.record_loss(draw) {
-                    Ok(draw) => (id, PartialKind::Aov(draw, reply)),
-                    Err(error) => return answer(reply, Err(error)),
-                }
-            }
-            _ => return,
+        let kind = find_scene(scenes, id).and_then(|scene| match output {
+            FrameOutput::Color => context.begin_frame(scene, &camera, size, style).map(PartialKind::Frame),
+            output => context.begin_aov(scene, &camera, size, output).map(PartialKind::Aov),
+        });
+        let kind = match loss.record_loss(kind) {
+            Ok(kind) => kind,
+            Err(error) => return answer(reply, Err(error)),
         };
         let charge = Charge { spent_ms: ms_since(begin), ..charge };
-        self.continue_output(id, PartialOutput { kind, charge });
+        self.continue_output(id, PartialOutput { kind, content, reply: Some(reply), charge });
     }
 
     /// Submits the next draw step of an output, after which other scenes are served. An output without breaks is
@@ -133,23 +127,25 @@ impl DeviceLoop {
 
     /// Waits for an AOV and answers it. A frame is answered later.
     fn finish_output(&mut self, id: SceneId, output: PartialOutput) {
-        let PartialOutput { kind, charge } = output;
-        match kind {
-            PartialKind::Preparation(preparation) => self.context.finish_preparation(preparation),
-            PartialKind::Frame(draw, reply) => {
-                let pending_draw = self.context.finish_partial_draw(draw);
-                match self.loss.record_loss(pending_draw) {
-                    Ok(draw) => self.frames.push(FrameInFlight { id, charge, draw }, reply),
+        let begin = Instant::now();
+        let PartialOutput { kind, content, reply, charge } = output;
+        let Self { context, scenes, .. } = self;
+        match (kind, reply) {
+            (PartialKind::Frame(frame), Some(reply)) => {
+                let frame = find_scene(scenes, id).and_then(|scene| context.finish_frame(scene, frame, content));
+                match self.loss.record_loss(frame) {
+                    Ok(pending) => self.frames.push(InFlight { id, pending, charge: Some(charge), reply }),
                     Err(error) => answer(reply, Err(error)),
                 }
             }
-            PartialKind::Aov(draw, reply) => {
-                let begin = Instant::now();
-                let Self { context, scenes, .. } = self;
+            (PartialKind::Aov(draw), Some(reply)) => {
                 let aov = find_scene(scenes, id).and_then(|scene| context.finish_aov(scene, draw));
-                answer(reply, self.loss.record_loss(aov));
+                let picture = aov.map(|(image, legend)| Arc::new(RenderedPicture::from_aov(image, legend)));
+                answer(reply, self.loss.record_loss(picture));
                 self.record_output_cost(id, charge, charge.spent_ms + ms_since(begin));
             }
+            (PartialKind::Preparation(preparation), _) => context.finish_preparation(preparation),
+            (PartialKind::Frame(_) | PartialKind::Aov(_), None) => {}
         }
     }
 }

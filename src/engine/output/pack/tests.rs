@@ -1,6 +1,7 @@
 //! Tests of packing.
 
 use super::*;
+use crate::engine::device::handle::PendingReply;
 use crate::engine::testing;
 
 const STEP: StepId = StepId { run: 1, number: 4, time: 0.0 };
@@ -11,7 +12,7 @@ fn numbers_from(first: f32, count: usize) -> Vec<f32> {
 }
 
 fn output(vertices: &Arc<StepVertices>) -> StepOutput {
-    let body = OutputBody::Vertices(Arc::clone(vertices));
+    let body = OutputBody::Vertices(Arc::new(PendingReply::answered(Arc::clone(vertices))));
     StepOutput { step: STEP, skipped: 0, stages: vec![], origins: None, body }
 }
 
@@ -31,7 +32,7 @@ async fn packed_floats(vertices: &Arc<StepVertices>, selection: &Arc<VertexSelec
 }
 
 fn step_vertices(surface: DeformedSurface) -> Arc<StepVertices> {
-    Arc::new(StepVertices::new(Arc::new(surface)))
+    Arc::new(StepVertices::new(Arc::new(surface), 0.0))
 }
 
 const F32_POSITIONS: (Attribute, Encoding) = (Attribute::Positions, Encoding::F32);

@@ -1,5 +1,6 @@
 //! Tests with a device whose commands the test answers.
 
+use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -7,35 +8,31 @@ use tokio::sync::{mpsc, oneshot};
 use tokio::time::timeout;
 
 use super::super::message::StepSelector;
+use super::super::step_queue::{Overflow, QueuedStep, StepQueue, StepReport};
 use super::super::subscriber::Subscription;
 use super::*;
-use crate::engine::device::command::{Command, CopiedVertices, Reply};
-use crate::engine::output::step_output::{FrameOutput, OutputBody, OutputSpec, PictureSpec, StepOutput};
+use crate::engine::device::command::{Command, Reply};
+use crate::engine::output::output_spec::{FrameOutput, OutputSpec, PictureSpec};
+use crate::engine::output::rendered_picture::RenderedPicture;
+use crate::engine::output::step_output::{OutputBody, SharedPicture, StepOutput};
 use crate::engine::testing;
 use crate::hang_guard::HANG_GUARD;
-use modalcast_model::scene::{Camera, FrameSize, FrameStyle, SceneState};
-use modalcast_render::{FrameImage, FrameInfo, FramePixels, MAX_FRAMES_IN_FLIGHT};
+use modalcast_model::scene::{Camera, FrameSize, FrameStyle, RawStepUpdate, SceneState, StepUpdate};
+use modalcast_render::{FrameImage, FrameInfo, FramePixels, FrameTimes, MAX_FRAMES_IN_FLIGHT};
 
 const WITHOUT_NEXT_STEP: DeliveryMode = DeliveryMode { applies_back_pressure: false, overlaps_next_step: false };
 const WITH_NEXT_STEP: DeliveryMode = DeliveryMode { overlaps_next_step: true, ..WITHOUT_NEXT_STEP };
 
-/// A frame that a subscriber of a test has received.
-#[derive(Debug, PartialEq)]
-struct ReceivedFrame {
-    width: u32,
-    step: u64,
-}
-
 /// A frame that was requested from the device.
 struct DrawRequest {
     width: u32,
-    reply: Reply<FrameImage<FramePixels>>,
+    reply: Reply<Arc<RenderedPicture>>,
 }
 
 /// Creates the delivery of a scene to some subscribers, and the receiver of its device commands.
 fn delivery_to(subscribers: Vec<Subscriber>) -> (OutputDelivery, mpsc::Receiver<Command>) {
     let (device, commands) = DeviceHandle::mock();
-    let scene = SceneOnDevice { name: "strips".into(), id: 1, scene: testing::two_strips() };
+    let scene = SceneOnDevice { name: "strips".into(), id: 1 };
     let delivery = OutputDelivery::new(scene, device, &Config::default());
     (OutputDelivery { subscribers, ..delivery }, commands)
 }
@@ -48,150 +45,105 @@ fn current_step(number: u64) -> CurrentStep {
 
 /// Subscribes to frames of this width in pixels.
 fn subscribe(delivery: Delivery, width: u32) -> (Subscriber, Subscription) {
-    subscribe_with(delivery, width, &Arc::default())
+    let camera = Camera::fit_to_scene(&testing::two_strips(), width, 8);
+    let size = FrameSize::new(width, 8);
+    let picture = PictureSpec { camera, size, output: FrameOutput::Color, style: FrameStyle::default() };
+    Subscription::new(OutputSpec::Frames([picture].into()), delivery.into(), Arc::default())
 }
 
-/// Subscribes to frames of this width in pixels. Credits notify `wake`.
-fn subscribe_with(delivery: Delivery, width: u32, wake: &Arc<Notify>) -> (Subscriber, Subscription) {
-    let camera = Camera::fit_to_scene(&testing::two_strips(), width, 8);
-    Subscription::new(
-        OutputSpec::Frames(
-            [PictureSpec {
-                camera,
-                size: FrameSize::new(width, 8),
-                output: FrameOutput::Color,
-                style: FrameStyle::default(),
-            }]
-            .into(),
-        ),
-        delivery.into(),
-        Arc::clone(wake),
-    )
+/// Grants the credit of a [`Delivery::Latest`] subscription, which has no result yet.
+async fn grant_credit(subscription: &mut Subscription) {
+    timeout(Duration::ZERO, subscription.next()).await.expect_err("expected no result yet");
 }
 
 /// Wait for a request that must not arrive.
 const SHORT_WAIT: Duration = Duration::from_millis(500);
 
-/// Returns the next frame that is requested from the device within `limit`.
-async fn next_draw_request(device: &mut mpsc::Receiver<Command>, limit: Duration) -> Option<DrawRequest> {
-    match timeout(limit, device.recv()).await.ok()?? {
-        Command::Draw { size, reply, .. } => Some(DrawRequest { width: size.width, reply }),
-        _ => None,
+/// Returns the next frame that is requested from the device.
+async fn next_draw_request(device: &mut mpsc::Receiver<Command>) -> DrawRequest {
+    match timeout(HANG_GUARD, device.recv()).await.expect("expected a frame") {
+        Some(Command::Draw { picture, reply, .. }) => DrawRequest { width: picture.size.width, reply },
+        _ => panic!("expected a frame, got another command"),
     }
+}
+
+/// Checks that the device gets no command.
+async fn expect_no_command(device: &mut mpsc::Receiver<Command>) {
+    assert!(timeout(SHORT_WAIT, device.recv()).await.is_err(), "expected no command");
 }
 
 fn answer(DrawRequest { width, reply }: DrawRequest) {
-    reply
-        .send(Ok(FrameImage {
-            width,
-            height: 8,
-            rgba: vec![].into(),
-            times: modalcast_render::FrameTimes::default(),
-            info: FrameInfo::default(),
-        }))
-        .expect("expected a caller that waits");
+    let (rgba, times, info) = (FramePixels::from(vec![]), FrameTimes::default(), FrameInfo::default());
+    let image = FrameImage { width, height: 8, rgba, times, info };
+    assert!(reply.send(Ok(Arc::new(image.into()))), "expected a reader that waits");
 }
 
-/// Outcome of [`serve_slow_and_fast`].
-struct ServedFrames {
-    /// Width of the frame that is requested while the first frame is still in flight.
-    early_frame_width: Option<u32>,
-    /// First the frames of the slow subscriber, then the frames of the fast subscriber.
-    received: Vec<ReceivedFrame>,
+/// The step number and the picture of the next result, which must be there.
+async fn receive(subscription: &mut Subscription) -> (u64, SharedPicture) {
+    let output = timeout(Duration::ZERO, subscription.next()).await.expect("expected a result").expect("no error");
+    let OutputBody::Frames(frames) = &output.body else { panic!("expected frames") };
+    (output.step.number, Arc::clone(&frames.pictures[0]))
 }
 
-/// Delivers the second step to a slow subscriber (width 16) and to a fast one (width 24). The slow one waits for
-/// its frame of the first step, and the fast one has credits.
-async fn serve_slow_and_fast(slow_delivery: Delivery) -> ServedFrames {
-    let (slow_subscriber, mut slow_subscription) = subscribe(slow_delivery, 16);
-    let (fast_subscriber, mut fast_subscription) = subscribe(Delivery::Lossless, 24);
-    // Polling grants a `Latest` subscription one credit. A lossless subscription has credits from the start.
-    timeout(Duration::ZERO, slow_subscription.next()).await.expect_err("expected no frame yet");
-    let (mut delivery, mut device) = delivery_to(vec![slow_subscriber]);
+async fn width_of(picture: &SharedPicture) -> u32 {
+    timeout(HANG_GUARD, picture.wait()).await.expect("expected a picture").expect("expected no error").width
+}
+
+/// The scene does not wait for the device, so a reader of two steps gets both before the first is drawn.
+#[tokio::test]
+async fn results_are_sent_in_order_before_they_are_drawn() {
+    let (subscriber, mut subscription) = subscribe(Delivery::Lossless, 16);
+    let (mut delivery, mut device) = delivery_to(vec![subscriber]);
     delivery.serve_subscribers(&current_step(1), WITH_NEXT_STEP).await;
-    let first_request = next_draw_request(&mut device, HANG_GUARD).await.expect("expected the first frame");
-    delivery.subscribers.push(fast_subscriber);
-    let second_step = current_step(2);
-    let deliver = async {
-        delivery.serve_subscribers(&second_step, WITHOUT_NEXT_STEP).await;
-        delivery.flush().await;
-    };
-    let mut early_frame_width = None;
-    let draw = async {
-        let early_request = next_draw_request(&mut device, SHORT_WAIT).await;
-        early_frame_width = early_request.as_ref().map(|request| request.width);
-        answer(first_request);
-        early_request.into_iter().for_each(answer);
-        while let Some(request) = next_draw_request(&mut device, HANG_GUARD).await {
-            answer(request);
-        }
-    };
-    tokio::select! {
-        () = deliver => {}
-        () = draw => panic!("expected the delivery of all frames"),
-    }
-    let mut received = Vec::new();
-    for subscription in [&mut slow_subscription, &mut fast_subscription] {
-        while let Ok(Ok(StepOutput { step, body: OutputBody::Frames(frames), .. })) =
-            timeout(Duration::ZERO, subscription.next()).await
-        {
-            received.push(ReceivedFrame { width: frames.pictures[0].width, step: step.number });
-        }
-    }
-    ServedFrames { early_frame_width, received }
+    delivery.begin_step();
+    delivery.serve_subscribers(&current_step(2), WITH_NEXT_STEP).await;
+    let ((first_step, first), (second_step, second)) =
+        (receive(&mut subscription).await, receive(&mut subscription).await);
+    assert_eq!((first_step, second_step), (1, 2));
+    let (first_request, second_request) = (next_draw_request(&mut device).await, next_draw_request(&mut device).await);
+    answer(second_request);
+    assert_eq!(width_of(&second).await, 16);
+    timeout(Duration::ZERO, first.wait()).await.expect_err("expected a picture that is not drawn");
+    answer(first_request);
+    assert_eq!(width_of(&first).await, 16);
 }
 
+/// A slow subscriber has no credit for the second step, because it has not read the first.
 #[tokio::test]
 async fn subscriber_without_credit_delays_no_other_subscriber() {
-    let served = serve_slow_and_fast(Delivery::Latest).await;
-    assert_eq!(served.early_frame_width, Some(24));
-    assert_eq!(served.received, [ReceivedFrame { width: 16, step: 1 }, ReceivedFrame { width: 24, step: 2 }]);
+    let (slow_subscriber, mut slow_subscription) = subscribe(Delivery::Latest, 16);
+    let (fast_subscriber, mut fast_subscription) = subscribe(Delivery::Lossless, 24);
+    grant_credit(&mut slow_subscription).await;
+    let (mut delivery, mut device) = delivery_to(vec![slow_subscriber, fast_subscriber]);
+    for number in [1, 2] {
+        delivery.serve_subscribers(&current_step(number), WITH_NEXT_STEP).await;
+        delivery.begin_step();
+    }
+    for width in [16, 24, 24] {
+        assert_eq!(next_draw_request(&mut device).await.width, width);
+    }
+    assert_eq!([receive(&mut fast_subscription).await.0, receive(&mut fast_subscription).await.0], [1, 2]);
+    assert_eq!(receive(&mut slow_subscription).await.0, 1);
+    grant_credit(&mut slow_subscription).await;
 }
 
+/// Of three subscribers, the first and the third have the same view.
 #[tokio::test]
-async fn lossless_subscriber_receives_its_frames_in_order() {
-    let served = serve_slow_and_fast(Delivery::Lossless).await;
-    // The slow subscriber is served first. Its second frame is requested while its first one is in flight.
-    assert_eq!(served.early_frame_width, Some(16));
-    let expected = [(16, 1), (16, 2), (24, 2)].map(|(width, step)| ReceivedFrame { width, step });
-    assert_eq!(served.received, expected);
-}
-
-/// Outcome of [`serve_three_subscribers`].
-#[derive(Debug, PartialEq)]
-struct SharedFrames {
-    drawn_count: usize,
-    received_widths: Vec<u32>,
-}
-
-/// Delivers a step to three subscribers, of which the first and the third have the same view.
-async fn serve_three_subscribers(mode: DeliveryMode) -> SharedFrames {
-    let (subscribers, subscriptions): (Vec<_>, Vec<_>) =
-        [16, 24, 16].map(|width| subscribe(Delivery::Lossless, width)).into_iter().unzip();
-    let (mut delivery, mut device) = delivery_to(subscribers);
-    let step = current_step(1);
-    let deliver = async {
-        delivery.serve_subscribers(&step, mode).await;
-        delivery.flush().await;
-    };
-    let mut drawn_count = 0;
-    let draw = async {
-        while let Some(request) = next_draw_request(&mut device, HANG_GUARD).await {
-            answer(request);
-            drawn_count += 1;
+async fn subscribers_with_the_same_view_share_one_frame() {
+    for mode in [WITHOUT_NEXT_STEP, WITH_NEXT_STEP] {
+        let (subscribers, mut subscriptions): (Vec<_>, Vec<_>) =
+            [16, 24, 16].map(|width| subscribe(Delivery::Lossless, width)).into_iter().unzip();
+        let (mut delivery, mut device) = delivery_to(subscribers);
+        delivery.serve_subscribers(&current_step(1), mode).await;
+        let (first, second) = (next_draw_request(&mut device).await, next_draw_request(&mut device).await);
+        assert_eq!([first.width, second.width], [16, 24], "{mode:?}");
+        answer(first);
+        answer(second);
+        for (subscription, width) in subscriptions.iter_mut().zip([16, 24, 16]) {
+            assert_eq!(width_of(&receive(subscription).await.1).await, width, "{mode:?}");
         }
-    };
-    tokio::select! {
-        () = deliver => {}
-        () = draw => panic!("expected the delivery of all frames"),
+        expect_no_command(&mut device).await;
     }
-    let mut received_widths = Vec::new();
-    for mut subscription in subscriptions {
-        let output = timeout(HANG_GUARD, subscription.next()).await.expect("expected a frame");
-        let Ok(StepOutput { body: OutputBody::Frames(frames), .. }) = output else { panic!("expected frames") };
-        received_widths.push(frames.pictures[0].width);
-    }
-    SharedFrames { drawn_count, received_widths }
 }
 
 /// A camera that moves after the frame of the current step is drawn again, unless another step is queued.
@@ -205,11 +157,12 @@ async fn moved_camera_redraws_the_step_if_no_step_is_queued() {
         for (camera_version, is_drawn) in [(0, true), (3, is_redrawn)] {
             while camera_version > 0 && cameras.move_cameras(&[]) < camera_version {}
             delivery.serve_subscribers(&step, mode).await;
-            let request = next_draw_request(&mut device, if is_drawn { HANG_GUARD } else { SHORT_WAIT }).await;
-            assert_eq!(request.is_some(), is_drawn, "{mode:?}, version {camera_version}");
-            let Some(request) = request else { continue };
-            answer(request);
-            delivery.flush().await;
+            if !is_drawn {
+                expect_no_command(&mut device).await;
+                continue;
+            }
+            // Without the answer, the equal picture would be shared.
+            answer(next_draw_request(&mut device).await);
             let output = subscription.next().await.expect("expected frames");
             let OutputBody::Frames(frames) = output.body else { panic!("expected frames") };
             let received = (output.step.number, output.skipped, frames.camera_version);
@@ -219,15 +172,36 @@ async fn moved_camera_redraws_the_step_if_no_step_is_queued() {
 }
 
 #[tokio::test]
-async fn cancelled_request_cancels_its_frame() {
+async fn dropped_answer_cancels_its_frame() {
     let (mut delivery, mut device) = delivery_to(Vec::new());
     let (subscriber, _subscription) = subscribe(Delivery::Lossless, 16);
     let (reply, answer) = oneshot::channel();
     delivery.add_request(StepRequest { selector: StepSelector::Current, spec: subscriber.spec, reply });
+    delivery.answer_requests(&current_step(1), 1).await;
+    let request = next_draw_request(&mut device).await;
+    let output = answer.await.expect("expected an answer").expect("expected no error");
+    assert!(!request.reply.is_closed(), "expected a reader that waits");
+    drop(output);
+    timeout(HANG_GUARD, request.reply.closed()).await.expect("expected the cancellation");
+}
+
+/// The request has one more picture than may be in flight.
+#[tokio::test]
+async fn cancelled_request_ends_the_wait_for_capacity() {
+    let (mut delivery, mut device) = delivery_to(Vec::new());
+    let widths = (0..=MAX_FRAMES_IN_FLIGHT as u32).map(|index| 16 + 8 * index);
+    let pictures: Vec<PictureSpec> = widths
+        .map(|width| match subscribe(Delivery::Lossless, width).0.spec {
+            OutputSpec::Frames(pictures) => pictures[0],
+            _ => panic!("expected frames"),
+        })
+        .collect();
+    let (reply, answer) = oneshot::channel();
+    let spec = OutputSpec::Frames(pictures.into());
+    delivery.add_request(StepRequest { selector: StepSelector::Current, spec, reply });
     let step = current_step(1);
     let cancel = async {
-        let mut request = next_draw_request(&mut device, HANG_GUARD).await.expect("expected a frame");
-        assert!(!request.reply.is_closed(), "expected a caller that waits");
+        let request = next_draw_request(&mut device).await;
         drop(answer);
         request.reply.closed().await;
     };
@@ -235,82 +209,44 @@ async fn cancelled_request_cancels_its_frame() {
     timeout(HANG_GUARD, both).await.expect("expected the cancellation");
 }
 
-/// The frame of the second subscriber is cancelled while the first one is being drawn.
 #[tokio::test]
-async fn dropped_subscription_cancels_its_frame_at_once() {
+async fn dropped_subscription_cancels_its_frame_only() {
     let (first_subscriber, mut first_subscription) = subscribe(Delivery::Lossless, 16);
     let (second_subscriber, second_subscription) = subscribe(Delivery::Lossless, 24);
     let (mut delivery, mut device) = delivery_to(vec![first_subscriber, second_subscriber]);
     delivery.serve_subscribers(&current_step(1), WITHOUT_NEXT_STEP).await;
-    let cancel = async {
-        let first_request = next_draw_request(&mut device, HANG_GUARD).await.expect("expected the first frame");
-        let mut second_request = next_draw_request(&mut device, HANG_GUARD).await.expect("expected the second frame");
-        assert!(!second_request.reply.is_closed(), "expected a subscriber that waits");
-        drop(second_subscription);
-        second_request.reply.closed().await;
-        answer(first_request);
-    };
-    let both = async { tokio::join!(delivery.flush(), cancel) };
-    timeout(HANG_GUARD, both).await.expect("expected the cancellation");
-    first_subscription.next().await.expect("expected the frame of the first subscriber");
+    let (first, second) = (next_draw_request(&mut device).await, next_draw_request(&mut device).await);
+    drop(second_subscription);
+    timeout(HANG_GUARD, second.reply.closed()).await.expect("expected the cancellation");
+    answer(first);
+    assert_eq!(width_of(&receive(&mut first_subscription).await.1).await, 16);
+    delivery.serve_subscribers(&current_step(1), WITHOUT_NEXT_STEP).await;
     assert_eq!(delivery.subscribers.len(), 1);
 }
 
-/// Serves the third step to two subscribers with the same view, the second of which has read none of its results
-/// yet. It reads one while the frame of the first is in flight or, without `returns_when_woken`, afterwards. Returns
-/// how often the third step was drawn.
-async fn draws_for_late_credit(returns_when_woken: bool) -> usize {
-    let wake = Arc::new(Notify::new());
-    let (first_subscriber, mut first_subscription) = subscribe_with(Delivery::Lossless, 16, &wake);
-    let (second_subscriber, mut second_subscription) = subscribe_with(Delivery::Lossless, 16, &wake);
-    let (mut delivery, mut device) = delivery_to(vec![first_subscriber, second_subscriber]);
-    for number in [1, 2] {
-        delivery.serve_subscribers(&current_step(number), WITH_NEXT_STEP).await;
-        answer(next_draw_request(&mut device, HANG_GUARD).await.expect("expected a frame"));
-        delivery.flush().await;
-        first_subscription.next().await.expect("expected a frame");
-    }
-    let step = current_step(3);
-    let grant_late_credit = async {
-        let request = next_draw_request(&mut device, HANG_GUARD).await.expect("expected a frame");
-        if !returns_when_woken {
-            answer(request);
-            first_subscription.next().await.expect("expected a frame");
-            second_subscription.next().await.expect("expected a frame");
-            return None;
-        }
-        second_subscription.next().await.expect("expected a frame");
-        Some(request)
-    };
-    wake.notified().await; // The credits of the first subscriber.
-    delivery.serve_subscribers(&step, WITH_NEXT_STEP).await;
-    let both = async { tokio::join!(delivery.flush_until_woken(&wake), grant_late_credit) };
-    let ((), request_in_flight) = timeout(HANG_GUARD, both).await.expect("expected a return at the wake-up");
-    timeout(HANG_GUARD, wake.notified()).await.expect("expected the wake-up to be left for the caller");
-    delivery.serve_subscribers(&step, WITH_NEXT_STEP).await;
-    let mut drawn_count = 1;
-    let draw = async {
-        request_in_flight.into_iter().for_each(answer);
-        while let Some(request) = next_draw_request(&mut device, HANG_GUARD).await {
-            answer(request);
-            drawn_count += 1;
-        }
-    };
-    tokio::select! {
-        () = delivery.flush() => {}
-        () = draw => panic!("expected the delivery of all frames"),
-    }
-    for expected in [2, 3] {
-        let output = second_subscription.next().await.expect("expected a frame");
-        assert_eq!(output.step.number, expected);
-    }
-    drawn_count
-}
-
+/// The second subscriber has the view of the first one, and gets its credit while the first one has the picture, or
+/// after it has dropped the picture.
 #[tokio::test]
-async fn late_credit_shares_the_frame_in_flight() {
-    assert_eq!(draws_for_late_credit(true).await, 1);
-    assert_eq!(draws_for_late_credit(false).await, 2, "control: after its delivery, the frame is drawn again");
+async fn late_credit_shares_the_frame_that_a_reader_has() {
+    for (first_keeps_picture, is_shared) in [(true, true), (false, false)] {
+        let (first_subscriber, mut first_subscription) = subscribe(Delivery::Lossless, 16);
+        let (second_subscriber, mut second_subscription) = subscribe(Delivery::Latest, 16);
+        let (mut delivery, mut device) = delivery_to(vec![first_subscriber, second_subscriber]);
+        let step = current_step(1);
+        delivery.serve_subscribers(&step, WITH_NEXT_STEP).await;
+        let request = next_draw_request(&mut device).await;
+        let (_, picture) = receive(&mut first_subscription).await;
+        let kept = first_keeps_picture.then_some(picture);
+        grant_credit(&mut second_subscription).await;
+        delivery.serve_subscribers(&step, WITH_NEXT_STEP).await;
+        let (_, second) = receive(&mut second_subscription).await;
+        match is_shared {
+            true => expect_no_command(&mut device).await,
+            false => assert_eq!(next_draw_request(&mut device).await.width, 16),
+        }
+        assert_eq!(kept.is_some_and(|kept| Arc::ptr_eq(&kept, &second)), is_shared);
+        drop(request);
+    }
 }
 
 /// Four views, the last of which receives its credit while the frames of the others are in flight.
@@ -324,24 +260,16 @@ async fn frames_in_flight_of_a_step_are_bounded_across_rounds() {
     delivery.serve_subscribers(&step, WITH_NEXT_STEP).await;
     let mut requests = VecDeque::new();
     for _ in 0..MAX_FRAMES_IN_FLIGHT {
-        requests.push_back(next_draw_request(&mut device, HANG_GUARD).await.expect("expected a frame"));
+        requests.push_back(next_draw_request(&mut device).await);
     }
-    // Polling grants the credit.
-    timeout(Duration::ZERO, subscriptions[3].next()).await.expect_err("expected no frame yet");
-    let serve = async {
-        delivery.serve_subscribers(&step, WITH_NEXT_STEP).await;
-        delivery.flush().await;
-    };
+    grant_credit(&mut subscriptions[3]).await;
     let draw = async {
-        assert!(next_draw_request(&mut device, SHORT_WAIT).await.is_none(), "expected no fourth frame in flight");
+        expect_no_command(&mut device).await;
         answer(requests.pop_front().expect("expected the oldest request"));
-        requests.push_back(next_draw_request(&mut device, HANG_GUARD).await.expect("expected the fourth frame"));
-        requests.into_iter().for_each(answer);
+        assert_eq!(next_draw_request(&mut device).await.width, 40);
     };
-    timeout(HANG_GUARD, async { tokio::join!(serve, draw) }).await.expect("expected the delivery of all frames");
-    for subscription in &mut subscriptions {
-        timeout(HANG_GUARD, subscription.next()).await.expect("expected a frame").expect("expected no error");
-    }
+    let both = async { tokio::join!(delivery.serve_subscribers(&step, WITH_NEXT_STEP), draw) };
+    timeout(HANG_GUARD, both).await.expect("expected the fourth frame");
 }
 
 /// The second subscriber to vertices receives its credit while the copy for the first one is in flight.
@@ -357,61 +285,46 @@ async fn late_credit_shares_the_copy_in_flight() {
     delivery.serve_subscribers(&step, WITH_NEXT_STEP).await;
     let command = timeout(HANG_GUARD, device.recv()).await.expect("expected a command");
     let Some(Command::ReadVertices { reply, .. }) = command else { panic!("expected a copy") };
-    // Polling grants the credit.
-    timeout(Duration::ZERO, second_subscription.next()).await.expect_err("expected no vertices yet");
+    grant_credit(&mut second_subscription).await;
     delivery.serve_subscribers(&step, WITH_NEXT_STEP).await;
-    reply.send(Ok(CopiedVertices { surface: Arc::default(), copy_ms: 0.0 })).expect("expected a caller that waits");
-    timeout(HANG_GUARD, delivery.flush()).await.expect("expected no second copy");
+    assert!(reply.send(Ok(Arc::default())), "expected readers that wait");
     for subscription in [&mut first_subscription, &mut second_subscription] {
-        let output = timeout(HANG_GUARD, subscription.next()).await.expect("expected vertices");
-        assert_eq!(output.expect("expected no error").step.number, 1);
+        let StepOutput { step, body: OutputBody::Vertices(vertices), .. } =
+            subscription.next().await.expect("expected vertices")
+        else {
+            panic!("expected vertices");
+        };
+        timeout(HANG_GUARD, vertices.wait()).await.expect("expected vertices").expect("expected no error");
+        assert_eq!(step.number, 1);
     }
-    let second_copy = timeout(SHORT_WAIT, device.recv()).await;
-    assert!(second_copy.is_err(), "expected one copy for both");
+    expect_no_command(&mut device).await;
 }
 
+/// The second step has no output of its own, and its acknowledgment comes after that of the first.
 #[tokio::test]
-async fn subscribers_with_the_same_view_share_one_frame() {
-    for mode in [WITHOUT_NEXT_STEP, WITH_NEXT_STEP] {
-        let expected = SharedFrames { drawn_count: 2, received_widths: vec![16, 24, 16] };
-        assert_eq!(serve_three_subscribers(mode).await, expected, "{mode:?}");
+async fn steps_are_acknowledged_in_order_after_their_outputs() {
+    let step_queue = Arc::new(StepQueue::new(Delivery::Lossless, Overflow::Reject, 2, Arc::default()));
+    for number in [1, 2] {
+        let raw = RawStepUpdate { number, ..RawStepUpdate::default() };
+        let update = StepUpdate::parse(&testing::two_strips(), &raw).expect("expected a valid step");
+        step_queue.push(QueuedStep::new(update, 0.0)).expect("expected capacity");
+        step_queue.take().expect("expected a queued step");
     }
-}
-
-/// A camera that moves while the frame of the current step is in flight is drawn after the delivery of that frame.
-#[tokio::test]
-async fn moved_camera_is_drawn_after_the_frame_in_flight() {
+    let complete = || CompletedStep::new(Arc::clone(&step_queue), Vec::new());
     let (subscriber, mut subscription) = subscribe(Delivery::Lossless, 16);
-    let cameras = subscription.cameras().expect("expected the cameras of frames").clone();
-    let (mut delivery, mut device) = delivery_to(vec![subscriber]);
-    let step = current_step(1);
-    delivery.serve_subscribers(&step, WITHOUT_NEXT_STEP).await;
-    let first_request = next_draw_request(&mut device, HANG_GUARD).await.expect("expected a frame");
-    let moved = cameras.move_cameras(&[]);
-    delivery.serve_subscribers(&step, WITHOUT_NEXT_STEP).await;
-    assert!(next_draw_request(&mut device, SHORT_WAIT).await.is_none(), "expected one frame in flight");
-    answer(first_request);
-    timeout(HANG_GUARD, delivery.flush()).await.expect("expected no second frame");
-    delivery.serve_subscribers(&step, WITHOUT_NEXT_STEP).await;
-    answer(next_draw_request(&mut device, HANG_GUARD).await.expect("expected the frame of the moved camera"));
-    delivery.flush().await;
-    for expected in [0, moved] {
-        let output = timeout(HANG_GUARD, subscription.next()).await.expect("expected a frame").expect("no error");
-        let OutputBody::Frames(frames) = output.body else { panic!("expected frames") };
-        assert_eq!(frames.camera_version, expected);
-    }
-}
-
-/// Wake-ups that arrive without a pause must not delay frames that are ready.
-#[tokio::test]
-async fn ready_frame_is_delivered_before_a_wake_up_is_handled() {
-    let wake = Arc::new(Notify::new());
-    let (subscriber, mut subscription) = subscribe_with(Delivery::Lossless, 16, &wake);
     let (mut delivery, mut device) = delivery_to(vec![subscriber]);
     delivery.serve_subscribers(&current_step(1), WITH_NEXT_STEP).await;
-    answer(next_draw_request(&mut device, HANG_GUARD).await.expect("expected a frame"));
-    wake.notify_one();
-    delivery.flush_until_woken(&wake).await;
-    timeout(Duration::ZERO, subscription.next()).await.expect("expected the frame").expect("expected no error");
-    timeout(HANG_GUARD, wake.notified()).await.expect("expected the wake-up to be left for the caller");
+    let (_, picture) = receive(&mut subscription).await;
+    delivery.acknowledge(complete());
+    delivery.acknowledge(complete());
+    let request = next_draw_request(&mut device).await;
+    timeout(SHORT_WAIT, delivery.finish_outputs()).await.expect_err("expected an output in flight");
+    timeout(Duration::ZERO, step_queue.next_report()).await.expect_err("expected no acknowledgment");
+    answer(request);
+    timeout(HANG_GUARD, delivery.finish_outputs()).await.expect("expected the end of the output");
+    assert_eq!(width_of(&picture).await, 16);
+    for number in [1, 2] {
+        let report = step_queue.next_report().await.expect("expected a report");
+        assert!(matches!(report, StepReport::Done { step, .. } if step == number), "{report:?}");
+    }
 }
