@@ -57,7 +57,7 @@ pub use output::state_packing::{PackedState, StateContent, StateSection, pack_st
 pub use output::step_output::{ModalHit, OutputBody, SharedPicture, StepFrames, StepId, StepOutput};
 pub use output::step_vertices::StepVertices;
 pub use output::vertex_encoding::Encoding;
-pub use output::vertex_selection::{Attribute, VertexSelection, validate_domains};
+pub use output::vertex_selection::{Attribute, VertexSelection};
 pub use registry::{FailedScene, SceneList};
 pub use scene::delivery::{Delivery, StreamDelivery};
 pub use scene::encoded_subscription::EncodedSubscription;

@@ -1,6 +1,8 @@
 //! Describes a scene for clients that do not have its files: shapes, materials, textures and domains, each once, and
-//! the arrays of the shapes. Replies are sent in messages of about 1 MiB.
+//! the arrays of the shapes. Replies are sent in messages of about 1 MiB. A message is built after it has capacity in the
+//! reply budget, so a call that waits holds little more than its request.
 
+use std::ops::Range;
 use std::sync::Arc;
 
 use bytes::Bytes;
@@ -8,10 +10,11 @@ use modalcast_proto::v1;
 use modalcast_proto::v1::describe_scene_response::Part;
 use tonic::{Response, Status};
 
+use super::MAX_REPLY_BYTES;
 use super::convert::{parse_hashes, wire_scene_info};
 use super::status::to_status;
 use super::stream::{ReplySender, ReplyStream, respond};
-use crate::engine::{ContentHash, ContentHashes, SceneContent, SceneHandle, ShapeArray, hex, validate_domains};
+use crate::engine::{ContentHash, ContentHashes, SceneContent, SceneHandle, ShapeArray, hex};
 use modalcast_model::domain::{AlphaMode, Domain, Material, MaterialRange, Transform};
 use modalcast_model::error::{Error, Result, invalid};
 use modalcast_model::scene::Scene;
@@ -26,7 +29,7 @@ pub(super) fn respond_with_description(
     request: v1::DescribeSceneRequest,
     max_chunk_bytes: usize,
 ) -> Result<Response<ReplyStream<v1::DescribeSceneResponse>>> {
-    let domains = validate_domains("domains", &scene_handle.scene, request.domains)?;
+    let selection = Selection::new("domains", request.domains, scene_handle.scene.domains.len())?;
     let arrays = parse_arrays(&request.arrays)?;
     Ok(respond(move |reply_sender| async move {
         reply_sender.send(response_with(Part::Scene(wire_scene_info(&scene_handle)))).await?;
@@ -34,15 +37,62 @@ pub(super) fn respond_with_description(
             true => Some(scene_handle.content_hashes().await.map_err(to_status)?),
             false => None,
         };
-        let description = Description::new(&scene_handle.scene, domains, hashes.as_deref());
-        description.send(max_chunk_bytes, &reply_sender).await?;
-        for shape in description.shapes {
+        let scene = &scene_handle.scene;
+        let mut position = Some(Position::START);
+        while let Some(start) = position {
+            // A single item may be as large as a message may be.
+            let permit = reply_sender.reserve(MAX_REPLY_BYTES).await?;
+            // The lists of what the selected domains use are not kept while the call waits.
+            let used = UsedContent::new(scene, &selection);
+            let description = Description { scene, selection: &selection, used: &used, hashes: hashes.as_deref() };
+            let (part, end) = description.part(start, max_chunk_bytes);
+            permit.send(response_with(part))?;
+            position = description.next_position(end);
+        }
+        let shapes = if arrays.is_empty() { vec![] } else { UsedContent::new(scene, &selection).shape_ranges() };
+        for shape in shapes.into_iter().flatten() {
             for array in &arrays {
-                send_array(&scene_handle.scene, shape, *array, max_chunk_bytes, &reply_sender).await?;
+                send_array(scene, shape, *array, max_chunk_bytes, &reply_sender).await?;
             }
         }
         Ok(())
     }))
+}
+
+/// Indices that a request selects: those that it lists, or all.
+struct Selection {
+    /// Empty for all.
+    listed: Vec<u32>,
+    /// Number of all indices.
+    count: usize,
+}
+
+impl Selection {
+    /// Checks a list of indices of `count` objects; an empty list means all in order. `field` names the list in errors.
+    ///
+    /// # Errors
+    /// `Invalid` when an index is out of range or there are more indices than objects.
+    fn new(field: &str, listed: Vec<u32>, count: usize) -> Result<Self> {
+        if listed.len() > count {
+            return Err(invalid(field, format!("at most {count} indices"), listed.len()));
+        }
+        match listed.iter().position(|index| *index as usize >= count) {
+            None => Ok(Self { listed, count }),
+            Some(position) => {
+                let expected = format!("an index below {count}");
+                Err(invalid(format!("{field}[{position}]"), expected, listed[position]))
+            }
+        }
+    }
+
+    fn len(&self) -> usize {
+        if self.listed.is_empty() { self.count } else { self.listed.len() }
+    }
+
+    /// The selected indices from a position on, in the order of the reply.
+    fn from(&self, position: usize) -> impl Iterator<Item = u32> {
+        (position..self.len()).map(|position| self.listed.get(position).copied().unwrap_or(position as u32))
+    }
 }
 
 /// Sends an array in chunks. An empty array is one empty chunk.
@@ -63,7 +113,7 @@ async fn send_array(
             total: size as u64,
             data: array.read(scene, shape, start..size.min(start + max_chunk_bytes)),
         };
-        permit.send(response_with(Part::Chunk(chunk)));
+        permit.send(response_with(Part::Chunk(chunk)))?;
     }
     Ok(())
 }
@@ -91,7 +141,7 @@ pub(super) async fn respond_with_content(
                 let permit = reply_sender.reserve(max_chunk_bytes.min(size) + CHUNK_HEAD_BYTES).await?;
                 let data = content.read(&scene_handle.scene, start..size.min(start + max_chunk_bytes));
                 let (item, offset, total) = (item as u32, start as u64, size as u64);
-                permit.send(v1::ReadContentResponse { item, offset, total, data });
+                permit.send(v1::ReadContentResponse { item, offset, total, data })?;
             }
         }
         Ok(())
@@ -110,34 +160,26 @@ pub(super) fn respond_with_modes(
     }
     let shape = scene_handle.scene.shape_of(request.domain as usize);
     let (vertex_count, rank) = (shape.mesh.rest_positions().len(), shape.modes.rank());
-    // An empty list means all vertices.
-    let vertices_to_read =
-        if request.vertices.is_empty() { (0..vertex_count as u32).collect() } else { request.vertices };
-    if vertices_to_read.len() > vertex_count {
-        return Err(invalid("vertices", format!("at most {vertex_count} indices"), vertices_to_read.len()));
-    }
-    if let Some(index) = vertices_to_read.iter().position(|vertex| *vertex as usize >= vertex_count) {
-        let expected = format!("an index below {vertex_count}");
-        return Err(invalid(format!("vertices[{index}]"), expected, vertices_to_read[index]));
-    }
+    let selection = Selection::new("vertices", request.vertices, vertex_count)?;
     // Three rows of `rank` f32.
     let bytes_per_vertex = 12 * rank;
     // A chunk has whole vertices, and only one chunk is in memory at a time. Without modes, one message without data is
     // the reply.
-    let vertices_per_chunk =
-        if rank == 0 { vertices_to_read.len() } else { (max_chunk_bytes / bytes_per_vertex).max(1) };
-    let total = (bytes_per_vertex * vertices_to_read.len()) as u64;
+    let vertices_per_chunk = if rank == 0 { selection.len() } else { (max_chunk_bytes / bytes_per_vertex).max(1) };
+    let total = (bytes_per_vertex * selection.len()) as u64;
     Ok(respond(move |reply_sender: ReplySender<v1::ReadModesResponse>| async move {
         let modes = &scene_handle.scene.shape_of(request.domain as usize).modes;
-        for (chunk_index, vertices_of_chunk) in vertices_to_read.chunks(vertices_per_chunk).enumerate() {
-            let permit = reply_sender.reserve(vertices_of_chunk.len() * bytes_per_vertex + CHUNK_HEAD_BYTES).await?;
+        for first in (0..selection.len()).step_by(vertices_per_chunk) {
+            let chunk_vertices = vertices_per_chunk.min(selection.len() - first);
+            let permit = reply_sender.reserve(chunk_vertices * bytes_per_vertex + CHUNK_HEAD_BYTES).await?;
             let entries_of_row = |row: usize| (0..rank).map(move |mode| modes.column(mode)[row]);
-            let rows = vertices_of_chunk
-                .iter()
-                .flat_map(|vertex| (0..3).map(move |component| 3 * *vertex as usize + component));
+            let rows = selection
+                .from(first)
+                .take(chunk_vertices)
+                .flat_map(|vertex| (0..3).map(move |component| 3 * vertex as usize + component));
             let data: Vec<u8> = rows.flat_map(entries_of_row).flat_map(f32::to_le_bytes).collect();
-            let offset = (chunk_index * vertices_per_chunk * bytes_per_vertex) as u64;
-            permit.send(v1::ReadModesResponse { rank: rank as u32, offset, total, data: data.into() });
+            let offset = (first * bytes_per_vertex) as u64;
+            permit.send(v1::ReadModesResponse { rank: rank as u32, offset, total, data: data.into() })?;
         }
         Ok(())
     }))
@@ -181,53 +223,132 @@ const fn wire_array(array: ShapeArray) -> v1::Array {
     }
 }
 
+/// A kind of items in a description.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum DescriptionKind {
+    Shapes,
+    Materials,
+    Textures,
+    Domains,
+}
+
+/// An item of a description.
+#[derive(Debug, Clone, Copy)]
+struct Position {
+    kind: DescriptionKind,
+    /// Number of items of this kind before it.
+    index: usize,
+}
+
+impl Position {
+    /// A scene has at least one domain, and every domain has a shape.
+    const START: Self = Self { kind: DescriptionKind::Shapes, index: 0 };
+}
+
+/// What the selected domains of a scene use.
+struct UsedContent {
+    /// Indices of the shapes, materials and textures, ascending.
+    shapes: Vec<u32>,
+    materials: Vec<u32>,
+    textures: Vec<u32>,
+    /// Per shape of the scene, the first domain that has it. The eigenvalues of a shape are those of this domain.
+    first_domains: Vec<Option<u32>>,
+}
+
+impl UsedContent {
+    fn new(scene: &Scene, selection: &Selection) -> Self {
+        let mut first_domains = vec![None; scene.shapes.len()];
+        for (index, domain) in scene.domains.iter().enumerate() {
+            first_domains[domain.shape].get_or_insert(index as u32);
+        }
+        let selected_domains = || selection.from(0).map(|index| &scene.domains[index as usize]);
+        let shapes = used_indices(scene.shapes.len(), selected_domains().map(|domain| domain.shape));
+        let materials = used_indices(scene.materials.len(), selected_domains().flat_map(Domain::materials));
+        let textures_of = |material: &u32| {
+            let material = &scene.materials[*material as usize];
+            [material.color_texture, material.normal_texture].into_iter().flatten()
+        };
+        let textures = used_indices(scene.textures.len(), materials.iter().flat_map(textures_of));
+        Self { shapes, materials, textures, first_domains }
+    }
+
+    /// The indices of the shapes as ranges of consecutive indices.
+    fn shape_ranges(&self) -> Vec<Range<usize>> {
+        self.shapes
+            .chunk_by(|shape, next_shape| shape + 1 == *next_shape)
+            .map(|consecutive| {
+                let first = consecutive[0] as usize;
+                first..first + consecutive.len()
+            })
+            .collect()
+    }
+}
+
 /// The parts of a scene that a reply describes.
 struct Description<'a> {
     scene: &'a Scene,
-    /// Indices of domains in the order of the reply.
-    domains: Vec<u32>,
-    /// Indices of the shapes, materials and textures that the domains use, ascending.
-    shapes: Vec<usize>,
-    materials: Vec<usize>,
-    textures: Vec<usize>,
-    /// Per shape of the scene, the first domain that has it. The eigenvalues of a shape are those of this domain.
-    first_domains: Vec<Option<usize>>,
+    selection: &'a Selection,
+    used: &'a UsedContent,
     /// Present if hashes were requested.
     hashes: Option<&'a ContentHashes>,
 }
 
-impl<'a> Description<'a> {
-    fn new(scene: &'a Scene, domains: Vec<u32>, hashes: Option<&'a ContentHashes>) -> Self {
-        let mut first_domains = vec![None; scene.shapes.len()];
-        for (index, domain) in scene.domains.iter().enumerate() {
-            first_domains[domain.shape].get_or_insert(index);
+impl Description<'_> {
+    /// Number of items of a kind.
+    fn count(&self, kind: DescriptionKind) -> usize {
+        match kind {
+            DescriptionKind::Shapes => self.used.shapes.len(),
+            DescriptionKind::Materials => self.used.materials.len(),
+            DescriptionKind::Textures => self.used.textures.len(),
+            DescriptionKind::Domains => self.selection.len(),
         }
-        let selected_domains = || domains.iter().map(|index| &scene.domains[*index as usize]);
-        let shapes = used_indices(scene.shapes.len(), selected_domains().map(|domain| domain.shape));
-        let materials = used_indices(scene.materials.len(), selected_domains().flat_map(Domain::materials));
-        let textures_of = |material: &usize| {
-            let material = &scene.materials[*material];
-            [material.color_texture, material.normal_texture].into_iter().flatten()
-        };
-        let textures = used_indices(scene.textures.len(), materials.iter().flat_map(textures_of));
-        Self { scene, domains, shapes, materials, textures, first_domains, hashes }
     }
 
-    /// Sends all descriptions in messages of about `max_message_bytes`.
-    async fn send(
-        &self,
-        max_message_bytes: usize,
-        reply_sender: &ReplySender<v1::DescribeSceneResponse>,
-    ) -> Result<(), Status> {
-        let packer = ItemPacker { max_message_bytes, reply_sender };
-        let shapes = self.shapes.iter().map(|shape| self.describe_shape(*shape));
-        packer.send(shapes, |shapes| Part::Shapes(v1::ShapeDescriptions { shapes })).await?;
-        let materials = self.materials.iter().map(|index| wire_material(*index, &self.scene.materials[*index]));
-        packer.send(materials, |materials| Part::Materials(v1::MaterialDescriptions { materials })).await?;
-        let textures = self.textures.iter().map(|texture| self.describe_texture(*texture));
-        packer.send(textures, |textures| Part::Textures(v1::TextureDescriptions { textures })).await?;
-        let domains = self.domains.iter().map(|domain| self.describe_domain(*domain));
-        packer.send(domains, |domains| Part::Domains(v1::DomainDescriptions { domains })).await
+    /// The first item at a position or after it, or `None` at the end.
+    fn next_position(&self, mut position: Position) -> Option<Position> {
+        while position.index == self.count(position.kind) {
+            let kind = match position.kind {
+                DescriptionKind::Shapes => DescriptionKind::Materials,
+                DescriptionKind::Materials => DescriptionKind::Textures,
+                DescriptionKind::Textures => DescriptionKind::Domains,
+                DescriptionKind::Domains => return None,
+            };
+            position = Position { kind, index: 0 };
+        }
+        Some(position)
+    }
+
+    /// Describes items of one kind from a position on, in about `max_bytes` bytes: as many as fit, and at least one.
+    /// Returns also the position after them.
+    fn part(&self, Position { kind, index }: Position, max_bytes: usize) -> (Part, Position) {
+        let position_after = |count: usize| Position { kind, index: index + count };
+        let describe_material = |index: u32| wire_material(index as usize, &self.scene.materials[index as usize]);
+        match kind {
+            DescriptionKind::Shapes => {
+                let indices = self.used.shapes[index..].iter().copied();
+                let shapes = take_fitting(indices.map(|shape| self.describe_shape(shape as usize)), max_bytes);
+                let count = shapes.len();
+                (Part::Shapes(v1::ShapeDescriptions { shapes }), position_after(count))
+            }
+            DescriptionKind::Materials => {
+                let indices = self.used.materials[index..].iter().copied();
+                let materials = take_fitting(indices.map(describe_material), max_bytes);
+                let count = materials.len();
+                (Part::Materials(v1::MaterialDescriptions { materials }), position_after(count))
+            }
+            DescriptionKind::Textures => {
+                let indices = self.used.textures[index..].iter().copied();
+                let textures = take_fitting(indices.map(|texture| self.describe_texture(texture as usize)), max_bytes);
+                let count = textures.len();
+                (Part::Textures(v1::TextureDescriptions { textures }), position_after(count))
+            }
+            DescriptionKind::Domains => {
+                let indices = self.selection.from(index);
+                let domains = take_fitting(indices.map(|domain| self.describe_domain(domain)), max_bytes);
+                let count = domains.len();
+                (Part::Domains(v1::DomainDescriptions { domains }), position_after(count))
+            }
+        }
     }
 
     fn describe_shape(&self, index: usize) -> v1::ShapeDescription {
@@ -250,7 +371,7 @@ impl<'a> Description<'a> {
     }
 
     fn eigenvalues_of_shape(&self, shape: usize) -> &[f64] {
-        self.first_domains[shape].map_or(&[], |domain| &self.scene.domains[domain].metadata.eigenvalues)
+        self.used.first_domains[shape].map_or(&[], |domain| &self.scene.domains[domain as usize].metadata.eigenvalues)
     }
 
     fn describe_texture(&self, index: usize) -> v1::TextureDescription {
@@ -296,42 +417,25 @@ impl<'a> Description<'a> {
 }
 
 /// The indices below `count` that occur in `indices`, ascending.
-fn used_indices(count: usize, indices: impl Iterator<Item = usize>) -> Vec<usize> {
+fn used_indices(count: usize, indices: impl Iterator<Item = usize>) -> Vec<u32> {
     let mut is_used = vec![false; count];
     indices.for_each(|index| is_used[index] = true);
-    (0..count).filter(|index| is_used[*index]).collect()
+    (0..count as u32).filter(|index| is_used[*index as usize]).collect()
 }
 
-/// Sends lists of descriptions, several in a message.
-struct ItemPacker<'a> {
-    max_message_bytes: usize,
-    reply_sender: &'a ReplySender<v1::DescribeSceneResponse>,
-}
-
-impl ItemPacker<'_> {
-    /// Sends `items` in the order of the list. A message contains as many items as fit, and at least one.
-    async fn send<T: prost::Message>(
-        &self,
-        items: impl Iterator<Item = T>,
-        wrap: impl Fn(Vec<T>) -> Part,
-    ) -> Result<(), Status> {
-        let mut group = Vec::new();
-        let mut group_bytes = 0;
-        for item in items {
-            // Protobuf adds at most 8 bytes to a nested message: tag and length.
-            let item_bytes = item.encoded_len() + 8;
-            if group_bytes + item_bytes > self.max_message_bytes && !group.is_empty() {
-                self.reply_sender.send(response_with(wrap(std::mem::take(&mut group)))).await?;
-                group_bytes = 0;
-            }
-            group_bytes += item_bytes;
-            group.push(item);
+/// Takes as many of the items as fit into `max_bytes` bytes when they are encoded, and at least one.
+fn take_fitting<T: prost::Message>(items: impl Iterator<Item = T>, max_bytes: usize) -> Vec<T> {
+    let mut total_bytes = 0;
+    let mut fitting = Vec::new();
+    for item in items {
+        // Protobuf adds at most 8 bytes to a nested message: tag and length.
+        total_bytes += item.encoded_len() + 8;
+        if total_bytes > max_bytes && !fitting.is_empty() {
+            break;
         }
-        if group.is_empty() {
-            return Ok(());
-        }
-        self.reply_sender.send(response_with(wrap(group))).await
+        fitting.push(item);
     }
+    fitting
 }
 
 fn wire_material(index: usize, material: &Material) -> v1::MaterialDescription {
@@ -363,4 +467,26 @@ const fn wire_material_range(range: &MaterialRange) -> v1::MaterialRange {
 /// 48 bytes: twelve little-endian f32.
 fn transform_bytes(transform: &Transform) -> Bytes {
     transform.0.into_iter().flat_map(f32::to_le_bytes).collect::<Vec<u8>>().into()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn message_has_the_items_that_fit_and_at_least_one() {
+        let text = |bytes: usize| "x".repeat(bytes);
+        let counts = |max_bytes: usize| take_fitting([30, 30, 30].map(text).into_iter(), max_bytes).len();
+        assert_eq!([0, 39, 79, 80, 119, 120, 1000].map(counts), [1, 1, 1, 2, 2, 3, 3]);
+        assert_eq!(take_fitting(std::iter::empty::<String>(), 100).len(), 0);
+    }
+
+    #[test]
+    fn selection_is_the_list_or_everything() {
+        let select = |listed: &[u32]| Selection::new("domains", listed.to_vec(), 4);
+        let selected = |listed: &[u32]| select(listed).map(|selection| selection.from(1).collect::<Vec<_>>());
+        assert_eq!(selected(&[]).expect("expected all"), [1, 2, 3]);
+        assert_eq!(selected(&[3, 0, 3]).expect("expected valid indices"), [0, 3]);
+        assert!(select(&[0, 4]).is_err() && select(&[0; 5]).is_err());
+    }
 }

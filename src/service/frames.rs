@@ -17,7 +17,6 @@ use super::convert::{
     wire_step_id,
 };
 use super::picks;
-use super::reply_body::without_copies;
 use super::shared_memory::{CallMemory, SharedMemory};
 use super::status::to_status;
 use super::stream::{Deadline, ReplySender, ReplyStream, chunks_with_head, respond};
@@ -51,7 +50,7 @@ impl v1::frame_service_server::FrameService for FrameServiceImpl {
             parse_pictures(&self.engine, &scene_handle.scene, request.pictures, FrameUse::Still).map_err(to_status)?;
         let selector = parse_step_selector(request.step);
         let (max_chunk_bytes, encoder) = (config.chunk_bytes, self.engine.encoder().clone());
-        Ok(without_copies(respond(move |reply_sender| async move {
+        Ok(respond(move |reply_sender| async move {
             let work = async {
                 let _pixels = connection.acquire_frame_pixels(count_pixels(&pictures)).await.map_err(to_status)?;
                 let output = scene_handle.request_output(selector, output_spec(&pictures)).await.map_err(to_status)?;
@@ -67,7 +66,7 @@ impl v1::frame_service_server::FrameService for FrameServiceImpl {
                 Ok(())
             };
             deadline.enforce(&describe_step_selector(selector, &scene_handle.name), work).await
-        })))
+        }))
     }
 
     type PickStream = ReplyStream<v1::PickResponse>;
@@ -122,9 +121,7 @@ impl v1::frame_service_server::FrameService for FrameServiceImpl {
             max_chunk_bytes: self.engine.config().chunk_bytes,
             _pixels: pixels,
         };
-        Ok(without_copies(respond(move |reply_sender| {
-            deadline.enforce("the frame stream", frame_stream.run(frames, reply_sender))
-        })))
+        Ok(respond(move |reply_sender| deadline.enforce("the frame stream", frame_stream.run(frames, reply_sender))))
     }
 }
 

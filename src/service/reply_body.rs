@@ -1,9 +1,8 @@
-//! Bodies of reply streams whose chunks are sent without a copy. tonic encodes every message into one buffer. A
-//! [`ReplyBody`] encodes only the head of a chunk. The data of the chunk follow as a separate frame, which refers to
-//! the memory that the engine filled.
+//! Encodes reply messages, and sends them as the body of a response. Large data of a message are not copied: they are
+//! a frame of their own, which refers to the memory that the engine filled or that the scene holds.
 //!
-//! tonic decodes the request and builds the head of the response as for every call. The response has an empty body,
-//! which [`replace_body`] replaces by the body in the extensions of the response.
+//! tonic decodes the request and builds the head of the response as for every call. [`with_body`] adds the body to the
+//! extensions of that response, and [`replace_body`] replaces the empty body of tonic by it.
 
 use std::collections::VecDeque;
 use std::mem;
@@ -15,12 +14,13 @@ use bytes::{Buf as _, BufMut as _, Bytes, BytesMut};
 use http_body::Frame;
 use modalcast_proto::v1;
 use prost::Message;
+use tokio_stream::Stream;
 use tonic::body::Body;
 use tonic::codegen::http;
 use tonic::{Response, Status};
 
 use super::MAX_REPLY_BYTES;
-use super::stream::ReplyStream;
+use super::reply_budget::{UnsentBytes, count_until_sent};
 
 /// Data of at least this size are sent as a frame of their own. Copying fewer bytes costs less than a further frame.
 const MIN_DATA_FRAME: usize = 16 << 10;
@@ -28,28 +28,41 @@ const MIN_DATA_FRAME: usize = 16 << 10;
 /// Messages are collected in one frame until it has this size, or no further message is ready.
 const MAX_COLLECTED_BYTES: usize = 32 << 10;
 
-/// Initial capacity of the buffer that messages are collected in.
-const BUFFER_CAPACITY: usize = 8 << 10;
-
 /// Size of the prefix of a message: a flag (0: not compressed) and the length of the message as u32.
-const PREFIX_BYTES: usize = 5;
+pub(super) const PREFIX_BYTES: usize = 5;
 
-/// Key of the field `data` of a chunk: field 3 with a length. It is the last field of every chunk with large data.
-const DATA_KEY: u8 = 3 << 3 | 2;
+/// Wire type of a field whose length precedes it.
+const LENGTH_DELIMITED: u8 = 2;
 
-/// A reply that may have a chunk. The chunk is then its only field.
-pub(super) trait ChunkReply: Message {
-    /// The field `data` of the chunk. It has the number 3, and is the last field of the chunk if it is not empty.
-    fn chunk_data(&mut self) -> Option<&mut Bytes>;
+/// Initial capacity of the buffer for a message without its large data, in bytes.
+const HEAD_CAPACITY: usize = 64;
+
+/// A message of a reply.
+pub(super) trait ReplyMessage: Message {
+    /// The data of the message, if it may have large data.
+    fn data(&mut self) -> Option<DataField<'_>> {
+        None
+    }
 }
 
-/// Implements [`ChunkReply`] for messages with `oneof part { ... chunk }`.
-macro_rules! chunk_reply_with_parts {
-    ($($reply:ident, $part:ident;)*) => {$(
-        impl ChunkReply for v1::$reply {
-            fn chunk_data(&mut self) -> Option<&mut Bytes> {
+/// The field `data` of a message. If it is not empty, it is the last field.
+pub(super) struct DataField<'a> {
+    data: &'a mut Bytes,
+    /// Number of the field.
+    number: u8,
+    /// Whether the data belong to a chunk, which is then the only field of the message.
+    is_in_chunk: bool,
+}
+
+/// Implements [`ReplyMessage`] for messages with `oneof part { ... chunk }`, whose chunk has `data` with a number.
+macro_rules! replies_with_chunk_part {
+    ($($reply:ident, $part:ident, $number:literal;)*) => {$(
+        impl ReplyMessage for v1::$reply {
+            fn data(&mut self) -> Option<DataField<'_>> {
                 match &mut self.part {
-                    Some(v1::$part::Part::Chunk(chunk)) => Some(&mut chunk.data),
+                    Some(v1::$part::Part::Chunk(chunk)) => {
+                        Some(DataField { data: &mut chunk.data, number: $number, is_in_chunk: true })
+                    }
                     #[allow(unreachable_patterns, reason = "some replies have no other part than a chunk")]
                     _ => None,
                 }
@@ -58,33 +71,147 @@ macro_rules! chunk_reply_with_parts {
     )*};
 }
 
-chunk_reply_with_parts! {
-    GetVerticesResponse, get_vertices_response;
-    StreamVerticesResponse, stream_vertices_response;
-    RenderFrameResponse, render_frame_response;
-    StreamFramesResponse, stream_frames_response;
-    StreamStatesResponse, stream_states_response;
+replies_with_chunk_part! {
+    GetVerticesResponse, get_vertices_response, 3;
+    StreamVerticesResponse, stream_vertices_response, 3;
+    RenderFrameResponse, render_frame_response, 3;
+    StreamFramesResponse, stream_frames_response, 3;
+    StreamStatesResponse, stream_states_response, 3;
+    DescribeSceneResponse, describe_scene_response, 5;
 }
 
-impl ChunkReply for v1::GetStateResponse {
-    fn chunk_data(&mut self) -> Option<&mut Bytes> {
-        self.chunk.as_mut().map(|chunk| &mut chunk.data)
+impl ReplyMessage for v1::GetStateResponse {
+    fn data(&mut self) -> Option<DataField<'_>> {
+        self.chunk.as_mut().map(|chunk| DataField { data: &mut chunk.data, number: 3, is_in_chunk: true })
     }
 }
 
-/// Lets the data of chunks be sent without a copy.
-pub(super) fn without_copies<T: ChunkReply + 'static>(response: Response<ReplyStream<T>>) -> Response<ReplyStream<T>> {
-    let (metadata, messages, mut extensions) = response.into_parts();
-    extensions.insert(DetachedBody::new(Body::new(ReplyBody::new(messages))));
-    Response::from_parts(metadata, Box::pin(tokio_stream::empty()), extensions)
+/// Implements [`ReplyMessage`] for messages whose last field is `data` with a number.
+macro_rules! replies_with_data {
+    ($($reply:ident, $number:literal;)*) => {$(
+        impl ReplyMessage for v1::$reply {
+            fn data(&mut self) -> Option<DataField<'_>> {
+                Some(DataField { data: &mut self.data, number: $number, is_in_chunk: false })
+            }
+        }
+    )*};
 }
 
-/// Replaces the body of a response by the one that [`without_copies`] has set, if any.
+replies_with_data! {
+    ReadContentResponse, 4;
+    ReadModesResponse, 4;
+}
+
+/// Implements [`ReplyMessage`] for messages without large data.
+macro_rules! replies_without_data {
+    ($($reply:ident)*) => {$(impl ReplyMessage for v1::$reply {})*};
+}
+
+replies_without_data! {
+    DeleteSceneResponse
+    DriveSceneResponse
+    FindUploadedFilesResponse
+    ListScenesResponse
+    OpenSceneResponse
+    PickResponse
+    StreamForcesResponse
+    UploadArraysResponse
+    UploadSceneResponse
+}
+
+/// An encoded message with the prefix of gRPC.
+#[derive(Debug)]
+pub(super) struct EncodedMessage {
+    /// The message without its large data.
+    head: BytesMut,
+    /// Large data, which follow the head. They are not copied.
+    large_data: Option<Bytes>,
+}
+
+impl EncodedMessage {
+    /// # Errors
+    /// `INTERNAL` for a message that is larger than a reply may be.
+    pub(super) fn new(mut message: impl ReplyMessage) -> Result<Self, Status> {
+        let length = message.encoded_len();
+        if length > MAX_REPLY_BYTES {
+            let expected = format!("expected a reply of at most {MAX_REPLY_BYTES} bytes");
+            return Err(Status::internal(format!("{expected}, got {length}")));
+        }
+        let large_data = message.data().filter(|field| field.data.len() >= MIN_DATA_FRAME);
+        let large_data = large_data.map(|field| (mem::take(field.data), field.number, field.is_in_chunk));
+        let mut head =
+            BytesMut::with_capacity(if large_data.is_some() { HEAD_CAPACITY } else { PREFIX_BYTES + length });
+        head.put_u8(0);
+        head.put_u32(length as u32);
+        let Some((data, number, is_in_chunk)) = large_data else {
+            message.encode(&mut head).map_err(|error| Status::internal(error.to_string()))?;
+            return Ok(Self { head, large_data: None });
+        };
+        if is_in_chunk {
+            encode_chunk_without_data(&message, data.len(), &mut head)?;
+        } else {
+            message.encode(&mut head).map_err(|error| Status::internal(error.to_string()))?;
+        }
+        head.put_u8(number << 3 | LENGTH_DELIMITED);
+        put_length(data.len(), &mut head)?;
+        Ok(Self { head, large_data: Some(data) })
+    }
+
+    /// Size in bytes, including the prefix.
+    pub(super) fn size(&self) -> usize {
+        self.head.len() + self.large_data.as_ref().map_or(0, Bytes::len)
+    }
+}
+
+fn put_length(length: usize, buffer: &mut BytesMut) -> Result<(), Status> {
+    prost::encode_length_delimiter(length, buffer).map_err(|error| Status::internal(error.to_string()))
+}
+
+/// Encodes a message with a chunk up to the field `data`, of which there are `data_length` bytes. `message` has a chunk
+/// without data.
+fn encode_chunk_without_data(message: &impl Message, data_length: usize, buffer: &mut BytesMut) -> Result<(), Status> {
+    let invalid = |error: prost::DecodeError| Status::internal(error.to_string());
+    // The key of the chunk, the length of the chunk, and the chunk.
+    let mut encoded = Bytes::from(message.encode_to_vec());
+    let chunk_key = encoded.try_get_u8().map_err(|_| Status::internal("expected a reply with a chunk"))?;
+    let chunk_length = prost::decode_length_delimiter(&mut encoded).map_err(invalid)?;
+    if encoded.len() != chunk_length {
+        return Err(Status::internal("expected a reply with nothing but a chunk"));
+    }
+    buffer.put_u8(chunk_key);
+    put_length(chunk_length + 1 + prost::length_delimiter_len(data_length) + data_length, buffer)?;
+    buffer.put(encoded);
+    Ok(())
+}
+
+/// A message that waits to be sent, and its share of the reply budget.
+#[derive(Debug)]
+pub(super) struct QueuedMessage {
+    pub(super) message: EncodedMessage,
+    pub(super) unsent: UnsentBytes,
+}
+
+/// Adds the body that replaces the empty body of a response.
+pub(super) fn with_body<T>(
+    mut response: Response<T>,
+    messages: impl Stream<Item = Result<QueuedMessage, Status>> + Send + Unpin + 'static,
+) -> Response<T> {
+    response.extensions_mut().insert(DetachedBody::new(Body::new(ReplyBody::new(messages))));
+    response
+}
+
+/// Replaces the body of a response by the one that [`with_body`] has set, if any.
 pub(super) fn replace_body(mut response: http::Response<Body>) -> http::Response<Body> {
     match response.extensions_mut().remove::<DetachedBody>().and_then(DetachedBody::into_body) {
         Some(body) => response.map(|_| body),
         None => response,
     }
+}
+
+/// The body that [`with_body`] has set.
+#[cfg(test)]
+pub(super) fn take_body<T>(mut response: Response<T>) -> Option<Body> {
+    response.extensions_mut().remove::<DetachedBody>().and_then(DetachedBody::into_body)
 }
 
 /// A body in the extensions of a response, which must be `Clone` and `Sync`.
@@ -101,13 +228,18 @@ impl DetachedBody {
     }
 }
 
-/// The messages of a reply stream as frames, and the status of the call as trailers.
-struct ReplyBody<T> {
-    messages: ReplyStream<T>,
-    /// Messages that are not in `frames` yet.
-    collected: BytesMut,
+/// A part of the body.
+struct UnsentFrame {
+    bytes: Bytes,
+    /// What the messages that end in the frame take from the reply budget.
+    unsent: Vec<UnsentBytes>,
+}
+
+/// Encoded messages as frames, and the status of the call as trailers.
+struct ReplyBody<S> {
+    messages: S,
     /// Frames to send, the oldest first.
-    frames: VecDeque<Bytes>,
+    frames: VecDeque<UnsentFrame>,
     state: State,
 }
 
@@ -119,88 +251,49 @@ enum State {
     Ended,
 }
 
-impl<T: ChunkReply> ReplyBody<T> {
-    fn new(messages: ReplyStream<T>) -> Self {
-        let collected = BytesMut::with_capacity(BUFFER_CAPACITY);
-        Self { messages, collected, frames: VecDeque::new(), state: State::Streaming }
+impl<S: Stream<Item = Result<QueuedMessage, Status>> + Unpin> ReplyBody<S> {
+    const fn new(messages: S) -> Self {
+        Self { messages, frames: VecDeque::new(), state: State::Streaming }
     }
 
-    /// Fills `frames` with the messages that are ready, or sets the status at the end.
+    /// Fills `frames` with the messages that are ready, or sets the status at the end. Small messages share a frame.
     fn poll_messages(&mut self, context: &mut Context<'_>) -> Poll<()> {
-        while self.frames.is_empty() && self.collected.len() < MAX_COLLECTED_BYTES {
-            match self.messages.as_mut().poll_next(context) {
-                Poll::Ready(Some(message)) => {
-                    if let Err(status) = message.and_then(|message| self.encode(message)) {
-                        self.state = State::Ending(status);
-                        break;
-                    }
+        let (mut collected, mut unsent) = (BytesMut::new(), Vec::new());
+        while collected.len() < MAX_COLLECTED_BYTES {
+            let queued = match Pin::new(&mut self.messages).poll_next(context) {
+                Poll::Ready(Some(Ok(queued))) => queued,
+                Poll::Ready(Some(Err(status))) => {
+                    self.state = State::Ending(status);
+                    break;
                 }
                 Poll::Ready(None) => {
                     self.state = State::Ending(Status::ok(""));
                     break;
                 }
-                Poll::Pending if self.collected.is_empty() => return Poll::Pending,
+                Poll::Pending if collected.is_empty() => return Poll::Pending,
                 Poll::Pending => break,
+            };
+            let EncodedMessage { head, large_data } = queued.message;
+            if collected.is_empty() {
+                collected = head;
+            } else {
+                collected.extend_from_slice(&head);
             }
+            if let Some(data) = large_data {
+                self.frames.push_back(UnsentFrame { bytes: collected.freeze(), unsent });
+                self.frames.push_back(UnsentFrame { bytes: data, unsent: vec![queued.unsent] });
+                return Poll::Ready(());
+            }
+            unsent.push(queued.unsent);
         }
-        self.end_frame();
+        if !collected.is_empty() {
+            self.frames.push_back(UnsentFrame { bytes: collected.freeze(), unsent });
+        }
         Poll::Ready(())
     }
-
-    /// Moves the collected messages to a frame.
-    fn end_frame(&mut self) {
-        if !self.collected.is_empty() {
-            self.frames.push_back(self.collected.split().freeze());
-        }
-    }
-
-    /// Encodes a message. Large data of a chunk become a frame without a copy.
-    fn encode(&mut self, mut message: T) -> Result<(), Status> {
-        let length = message.encoded_len();
-        if length > MAX_REPLY_BYTES {
-            let expected = format!("expected a reply of at most {MAX_REPLY_BYTES} bytes");
-            return Err(Status::internal(format!("{expected}, got {length}")));
-        }
-        self.collected.reserve(PREFIX_BYTES);
-        self.collected.put_u8(0);
-        self.collected.put_u32(length as u32);
-        let data = match message.chunk_data().filter(|data| data.len() >= MIN_DATA_FRAME) {
-            Some(data) => mem::take(data),
-            None => {
-                // The buffer grows, so it has room for every message.
-                return message.encode(&mut self.collected).map_err(|error| Status::internal(error.to_string()));
-            }
-        };
-        encode_without_data(&message, data.len(), &mut self.collected)?;
-        self.end_frame();
-        self.frames.push_back(data);
-        Ok(())
-    }
 }
 
-/// Encodes a message up to the data of its chunk, of which there are `data_length` bytes. `message` has a chunk without
-/// data.
-fn encode_without_data(message: &impl Message, data_length: usize, buffer: &mut BytesMut) -> Result<(), Status> {
-    let invalid = |error: prost::DecodeError| Status::internal(error.to_string());
-    // The key of the chunk, the length of the chunk, and the chunk.
-    let mut encoded = Bytes::from(message.encode_to_vec());
-    let chunk_key = encoded.try_get_u8().map_err(|_| Status::internal("expected a reply with a chunk"))?;
-    let chunk_length = prost::decode_length_delimiter(&mut encoded).map_err(invalid)?;
-    if encoded.len() != chunk_length {
-        return Err(Status::internal("expected a reply with nothing but a chunk"));
-    }
-    let chunk_length = chunk_length + 1 + prost::length_delimiter_len(data_length) + data_length;
-    let put_length = |length: usize, buffer: &mut BytesMut| {
-        prost::encode_length_delimiter(length, buffer).map_err(|error| Status::internal(error.to_string()))
-    };
-    buffer.put_u8(chunk_key);
-    put_length(chunk_length, buffer)?;
-    buffer.put(encoded);
-    buffer.put_u8(DATA_KEY);
-    put_length(data_length, buffer)
-}
-
-impl<T: ChunkReply> http_body::Body for ReplyBody<T> {
+impl<S: Stream<Item = Result<QueuedMessage, Status>> + Unpin> http_body::Body for ReplyBody<S> {
     type Data = Bytes;
     type Error = Status;
 
@@ -208,8 +301,8 @@ impl<T: ChunkReply> http_body::Body for ReplyBody<T> {
         if self.frames.is_empty() && matches!(self.state, State::Streaming) {
             ready!(self.poll_messages(context));
         }
-        if let Some(frame) = self.frames.pop_front() {
-            return Poll::Ready(Some(Ok(Frame::data(frame))));
+        if let Some(UnsentFrame { bytes, unsent }) = self.frames.pop_front() {
+            return Poll::Ready(Some(Ok(Frame::data(count_until_sent(bytes, unsent)))));
         }
         match mem::replace(&mut self.state, State::Ended) {
             State::Ending(status) => {
@@ -233,6 +326,7 @@ mod tests {
     use http_body::Body as _;
     use tokio_stream::wrappers::ReceiverStream;
 
+    use super::super::reply_budget::CallReplies;
     use super::*;
 
     /// A chunk of a vertex stream. All of its fields are set.
@@ -243,11 +337,24 @@ mod tests {
         v1::StreamVerticesResponse { part: Some(v1::stream_vertices_response::Part::Chunk(chunk)) }
     }
 
+    async fn queued(message: impl ReplyMessage) -> Result<QueuedMessage, Status> {
+        let message = EncodedMessage::new(message)?;
+        let unsent = CallReplies::current().acquire(message.size()).await?;
+        Ok(QueuedMessage { message, unsent })
+    }
+
     /// The frames and the trailers of a body with these messages, which are all ready.
-    async fn body_frames<T: ChunkReply + 'static>(
+    async fn body_frames<T: ReplyMessage + 'static>(
         messages: Vec<Result<T, Status>>,
     ) -> (Vec<Bytes>, Option<http::HeaderMap>) {
-        let mut body = pin!(ReplyBody::new(Box::pin(tokio_stream::iter(messages))));
+        let mut queued_messages = Vec::new();
+        for message in messages {
+            queued_messages.push(match message {
+                Ok(message) => queued(message).await,
+                Err(status) => Err(status),
+            });
+        }
+        let mut body = pin!(ReplyBody::new(tokio_stream::iter(queued_messages)));
         let (mut frames, mut trailers) = (Vec::new(), None);
         while let Some(frame) = poll_fn(|context| body.as_mut().poll_frame(context)).await {
             assert_eq!(trailers, None, "expected nothing after the trailers");
@@ -286,7 +393,7 @@ mod tests {
 
     #[tokio::test]
     async fn every_reply_with_large_data_is_encoded_as_by_prost() {
-        async fn assert_encoding<T: ChunkReply + Clone + 'static>(reply: T) {
+        async fn assert_encoding<T: ReplyMessage + Clone + 'static>(reply: T) {
             let (frames, _) = body_frames(vec![Ok(reply.clone())]).await;
             assert_eq!((frames.len(), frames.concat()), (2, encoded(&reply)), "{}", std::any::type_name::<T>());
         }
@@ -304,6 +411,12 @@ mod tests {
         assert_encoding(v1::GetStateResponse { chunk: Some(state.clone()) }).await;
         let part = v1::stream_states_response::Part::Chunk(state);
         assert_encoding(v1::StreamStatesResponse { part: Some(part) }).await;
+        let data = Bytes::from(vec![6; MIN_DATA_FRAME]);
+        let array = v1::ArrayChunk { shape: 3, array: 2, offset: 1 << 40, total: 1 << 41, data: data.clone() };
+        let part = v1::describe_scene_response::Part::Chunk(array);
+        assert_encoding(v1::DescribeSceneResponse { part: Some(part) }).await;
+        assert_encoding(v1::ReadContentResponse { item: 7, offset: 9, total: 1 << 33, data: data.clone() }).await;
+        assert_encoding(v1::ReadModesResponse { rank: 0, offset: 0, total: 0, data }).await;
     }
 
     #[tokio::test]
@@ -343,8 +456,8 @@ mod tests {
     #[tokio::test]
     async fn message_does_not_wait_for_the_next_one() {
         let (sender, receiver) = tokio::sync::mpsc::channel(1);
-        let mut body = pin!(ReplyBody::new(Box::pin(ReceiverStream::new(receiver))));
-        sender.send(Ok(chunk(Bytes::new()))).await.expect("expected an open channel");
+        let mut body = pin!(ReplyBody::new(ReceiverStream::new(receiver)));
+        sender.send(queued(chunk(Bytes::new())).await).await.expect("expected an open channel");
         let frame = poll_fn(|context| body.as_mut().poll_frame(context)).await;
         let frame = frame.expect("expected a frame").expect("expected data").into_data();
         assert_eq!(frame.expect("expected data"), encoded(&chunk(Bytes::new())));

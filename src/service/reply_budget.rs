@@ -6,7 +6,7 @@
 //! that does not free the bytes, the connection is closed. If the total is exhausted, a connection that holds more than
 //! its share and takes nothing for a shorter time is closed, so that a few connections do not delay all others.
 
-use std::collections::{HashMap, VecDeque};
+use std::collections::HashMap;
 use std::pin::Pin;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, Weak};
@@ -264,6 +264,17 @@ impl Drop for ConnectionReplyBudget {
 }
 
 impl CallReplies {
+    /// The replies of the current call. A call without a connection, as in tests, has a budget of its own.
+    pub(super) fn current() -> Arc<Self> {
+        let own_budget = |_| ReplyBudget::new(&Config::default()).new_connection(Arc::default()).new_call();
+        CURRENT_CALL.try_with(Arc::clone).unwrap_or_else(own_budget)
+    }
+
+    /// Runs a handler, for which these are the current replies.
+    pub(super) async fn scope<F: Future>(self: Arc<Self>, handler: F) -> F::Output {
+        CURRENT_CALL.scope(self, handler).await
+    }
+
     /// Waits for budget for a reply. Cancel-safe.
     ///
     /// # Errors
@@ -369,8 +380,9 @@ impl UnsentBytes {
         }
     }
 
-    /// Removes `bytes` from the front.
-    fn split(&mut self, bytes: usize) -> Option<Self> {
+    /// Removes `bytes`, at most all of these.
+    pub(super) fn split(&mut self, bytes: usize) -> Option<Self> {
+        let bytes = bytes.min(self.bytes);
         let (of_connection, of_total) = self.split_permits(bytes)?;
         self.bytes -= bytes;
         Some(Self { call: Arc::clone(&self.call), bytes, of_connection, is_attached: self.is_attached, of_total })
@@ -393,73 +405,35 @@ impl Drop for UnsentBytes {
     }
 }
 
-/// The call that a handler answers. [`super::routes`] sets it, so that handlers need not pass it on.
-#[derive(Debug, Clone)]
-pub(super) struct ReplyContext {
-    pub(super) replies: Arc<CallReplies>,
-    /// Bytes of messages that tonic has taken and not yet returned as a frame.
-    encoding: Arc<Mutex<VecDeque<UnsentBytes>>>,
-}
-
 tokio::task_local! {
-    static CONTEXT: ReplyContext;
-}
-
-impl ReplyContext {
-    pub(super) fn new(replies: Arc<CallReplies>) -> Self {
-        Self { replies, encoding: Arc::default() }
-    }
-
-    /// The context of the current call. A call without a connection, as in tests, has a budget of its own.
-    pub(super) fn current() -> Self {
-        let own_budget = |_| {
-            let connection = ReplyBudget::new(&Config::default()).new_connection(Arc::default());
-            Self::new(connection.new_call())
-        };
-        CONTEXT.try_with(Clone::clone).unwrap_or_else(own_budget)
-    }
-
-    /// Runs a handler in this context.
-    pub(super) async fn scope<F: Future>(self, handler: F) -> F::Output {
-        CONTEXT.scope(self, handler).await
-    }
-
-    /// Passes the bytes of a message on to the body, when tonic encodes the message.
-    pub(super) fn encode(&self, unsent: UnsentBytes) {
-        lock(&self.encoding).push_back(unsent);
-    }
-
-    /// Attaches the unsent bytes to a frame of the body.
-    fn attach(&self, frame: Bytes) -> Bytes {
-        let mut encoding = lock(&self.encoding);
-        let (mut unsent, mut missing_bytes) = (Vec::new(), frame.len());
-        while let Some(first) = encoding.front_mut().filter(|_| missing_bytes > 0) {
-            let part = if first.bytes <= missing_bytes { encoding.pop_front() } else { first.split(missing_bytes) };
-            let Some(mut part) = part else { break };
-            part.is_attached = true;
-            missing_bytes -= part.bytes;
-            unsent.push(part);
-        }
-        if unsent.is_empty() { frame } else { Bytes::from_owner(UnsentFrame { frame, _unsent: unsent }) }
-    }
+    /// The call that a handler answers. [`super::routes`] sets it, so that handlers need not pass it on.
+    static CURRENT_CALL: Arc<CallReplies>;
 }
 
 /// A frame that counts until HTTP/2 drops it.
-struct UnsentFrame {
-    frame: Bytes,
+struct CountedFrame {
+    bytes: Bytes,
     _unsent: Vec<UnsentBytes>,
 }
 
-impl AsRef<[u8]> for UnsentFrame {
+impl AsRef<[u8]> for CountedFrame {
     fn as_ref(&self) -> &[u8] {
-        &self.frame
+        &self.bytes
     }
 }
 
-/// The body of a response. Its frames count until they are sent.
+/// Makes a frame of a body hold `unsent` until HTTP/2 has written its last byte.
+pub(super) fn count_until_sent(bytes: Bytes, mut unsent: Vec<UnsentBytes>) -> Bytes {
+    if unsent.is_empty() {
+        return bytes;
+    }
+    unsent.iter_mut().for_each(|unsent| unsent.is_attached = true);
+    Bytes::from_owner(CountedFrame { bytes, _unsent: unsent })
+}
+
+/// The body of a response. The call counts until the body is dropped.
 pub(super) struct CountedReplyBody {
     pub(super) inner: Body,
-    pub(super) context: ReplyContext,
     pub(super) _call: Arc<CountedCall>,
 }
 
@@ -468,8 +442,7 @@ impl HttpBody for CountedReplyBody {
     type Error = Status;
 
     fn poll_frame(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
-        let frame = Pin::new(&mut self.inner).poll_frame(cx);
-        frame.map_ok(|frame| frame.map_data(|data| self.context.attach(data)))
+        Pin::new(&mut self.inner).poll_frame(cx)
     }
 
     fn is_end_stream(&self) -> bool {
@@ -502,25 +475,24 @@ mod tests {
     #[tokio::test]
     async fn bytes_count_until_their_frame_is_dropped() {
         let budget = small_budget();
-        let context = ReplyContext::new(budget.new_connection(Arc::default()).new_call());
-        // Two messages, of which one needs less than was reserved, in frames of other sizes.
+        let call = budget.new_connection(Arc::default()).new_call();
+        // A frame of two messages, of which one needs less than was reserved.
+        let mut unsent = Vec::new();
         for (reserved_bytes, bytes) in [(20, 20), (40, 30)] {
-            let mut unsent = context.replies.acquire(reserved_bytes).await.expect("expected capacity");
-            unsent.shrink_to(bytes);
-            context.encode(unsent);
+            let mut of_message = call.acquire(reserved_bytes).await.expect("expected capacity");
+            of_message.shrink_to(bytes);
+            unsent.push(of_message);
         }
         let free_bytes = || budget.bytes.free_bytes();
         assert_eq!(free_bytes(), 50);
-        let frames = [40, 10, 5].map(|bytes| context.attach(vec![0; bytes].into()));
-        let [first, second, uncounted] = frames;
-        assert_eq!((first.len(), second.len(), uncounted.len(), free_bytes()), (40, 10, 5, 50));
-        let slice = first.slice(3..4);
-        drop(first);
+        let frame = count_until_sent(vec![0; 50].into(), unsent);
+        let uncounted = count_until_sent(vec![0; 5].into(), vec![]);
+        assert_eq!((frame.len(), uncounted.len(), free_bytes()), (50, 5, 50));
+        let slice = frame.slice(3..4);
+        drop(frame);
         assert_eq!(free_bytes(), 50);
         drop(slice);
-        assert_eq!(free_bytes(), 90);
-        drop(second);
-        assert_eq!((free_bytes(), lock(&context.replies.progress).unsent_bytes), (100, 0));
+        assert_eq!((free_bytes(), lock(&call.progress).unsent_bytes), (100, 0));
     }
 
     /// A message above the budget passes when nothing else is unsent.
@@ -607,9 +579,7 @@ mod tests {
         assert_eq!((progress.unsent_bytes, progress.last_change), (30, first_change));
         drop(second);
         assert_eq!(lock(&connection.progress).last_change, first_change, "expected no progress by a canceled message");
-        let context = ReplyContext::new(Arc::clone(&first.call));
-        context.encode(first);
-        drop(context.attach(vec![0; 20].into()));
+        drop(count_until_sent(vec![0; 20].into(), vec![first]));
         assert!(lock(&connection.progress).last_change > first_change);
     }
 
@@ -624,9 +594,7 @@ mod tests {
         let [first, second] = held;
         let (first, second) = (first.await.expect("expected capacity"), second.await.expect("expected capacity"));
         let change_before = lock(&call.progress).last_change;
-        let context = ReplyContext::new(Arc::clone(&call));
-        context.encode(first);
-        drop(context.attach(vec![0; 10].into()));
+        drop(count_until_sent(vec![0; 10].into(), vec![first]));
         assert!(lock(&call.progress).last_change > change_before, "expected sent bytes to count as progress");
         end_stalled(&calls, Duration::from_secs(1000), None);
         assert!(!is_ended(), "expected a call with recent progress to continue");

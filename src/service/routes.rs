@@ -13,7 +13,7 @@ use tonic::{Code, Status};
 
 use super::connection::ConnectionInfo;
 use super::reply_body::replace_body;
-use super::reply_budget::{CountedReplyBody, ReplyContext};
+use super::reply_budget::CountedReplyBody;
 use super::request_body::{RequestBody, RequestMemory};
 use super::status::{to_status, transport_status};
 use super::stream::parse_timeout;
@@ -110,10 +110,9 @@ async fn call_within_budgets(
     let request_call = Arc::clone(&call);
     let limits = connection.receive.limits();
     let request = request.map(|body| Body::new(RequestBody::new(body, request_memory, limits, request_call)));
-    let context = ReplyContext::new(connection.reply.new_call());
-    let response = context.clone().scope(route(request)).await;
+    let response = connection.reply.new_call().scope(route(request)).await;
     memory.release_complete();
-    response.map(|response| response.map(|inner| Body::new(CountedReplyBody { inner, context, _call: call })))
+    response.map(|response| response.map(|inner| Body::new(CountedReplyBody { inner, _call: call })))
 }
 
 #[cfg(test)]

@@ -7,12 +7,19 @@ use super::connection::ConnectionInfo;
 use super::convert::{ByteBudget, parse_hashes, wire_failed_scene, wire_scene_info, wire_scene_summary};
 use super::describe;
 use super::status::to_status;
-use super::stream::{ReplyStream, catch_panic};
+use super::stream::{ReplyStream, catch_panic, respond_once};
 use super::uploads::receive_upload;
 use crate::engine::{ArrayUpload, Engine, SceneList, Upload};
 
 /// Limit in bytes on the source names in one list.
 const MAX_SOURCE_BYTES: usize = 512 << 10;
+
+/// Upper bound on the size of a scene's description in bytes: remarks of about 64 KiB, names and paths. It is also above
+/// that of the answers to 4096 hashes.
+const MAX_INFO_BYTES: usize = 128 << 10;
+
+/// Upper bound on the size of one list in bytes: sources, and scenes with their names and errors.
+const MAX_LIST_BYTES: usize = 1 << 20;
 
 /// Implementation of `SceneService`.
 pub(super) struct SceneServiceImpl(pub(super) Engine);
@@ -27,8 +34,8 @@ impl v1::scene_service_server::SceneService for SceneServiceImpl {
         let connection = ConnectionInfo::of(&request).map_err(to_status)?;
         let client = connection.client(request.metadata()).map_err(to_status)?;
         let v1::OpenSceneRequest { source, scene } = request.into_inner();
-        catch_panic(async move {
-            let scene_handle = engine.open(&source, &scene, Some(client)).await?;
+        let scene_handle = catch_panic(async move { engine.open(&source, &scene, Some(client)).await }).await?;
+        respond_once(MAX_INFO_BYTES, async move {
             Ok(v1::OpenSceneResponse { scene: Some(wire_scene_info(&scene_handle)) })
         })
         .await
@@ -40,8 +47,8 @@ impl v1::scene_service_server::SceneService for SceneServiceImpl {
     ) -> Result<Response<v1::UploadSceneResponse>, Status> {
         let upload: Upload = receive_upload(&self.0, request).await?;
         let engine = self.0.clone();
-        catch_panic(async move {
-            let scene_handle = engine.finish_upload(upload).await?;
+        let scene_handle = catch_panic(async move { engine.finish_upload(upload).await }).await?;
+        respond_once(MAX_INFO_BYTES, async move {
             Ok(v1::UploadSceneResponse { scene: Some(wire_scene_info(&scene_handle)) })
         })
         .await
@@ -53,8 +60,8 @@ impl v1::scene_service_server::SceneService for SceneServiceImpl {
     ) -> Result<Response<v1::UploadArraysResponse>, Status> {
         let upload: ArrayUpload = receive_upload(&self.0, request).await?;
         let engine = self.0.clone();
-        catch_panic(async move {
-            let scene_handle = engine.finish_array_upload(upload).await?;
+        let scene_handle = catch_panic(async move { engine.finish_array_upload(upload).await }).await?;
+        respond_once(MAX_INFO_BYTES, async move {
             Ok(v1::UploadArraysResponse { scene: Some(wire_scene_info(&scene_handle)) })
         })
         .await
@@ -66,16 +73,13 @@ impl v1::scene_service_server::SceneService for SceneServiceImpl {
     ) -> Result<Response<v1::FindUploadedFilesResponse>, Status> {
         let engine = self.0.clone();
         let sha256 = request.into_inner().sha256;
-        catch_panic(async move {
-            let found = engine.find_uploaded_files(parse_hashes(&sha256)?).await?;
-            Ok(v1::FindUploadedFilesResponse { found })
-        })
-        .await
+        let found = catch_panic(async move { engine.find_uploaded_files(parse_hashes(&sha256)?).await }).await?;
+        respond_once(MAX_INFO_BYTES, async move { Ok(v1::FindUploadedFilesResponse { found }) }).await
     }
 
     async fn list_scenes(&self, _: Request<v1::ListScenesRequest>) -> Result<Response<v1::ListScenesResponse>, Status> {
         let engine = self.0.clone();
-        catch_panic(async move {
+        respond_once(MAX_LIST_BYTES, async move {
             let SceneList { open, opening, failed } = engine.list();
             let scenes = open.iter().map(|scene_handle| wire_scene_summary(scene_handle)).collect();
             let mut budget = ByteBudget::new(MAX_SOURCE_BYTES);
@@ -92,7 +96,8 @@ impl v1::scene_service_server::SceneService for SceneServiceImpl {
     ) -> Result<Response<v1::DeleteSceneResponse>, Status> {
         let engine = self.0.clone();
         let name = request.into_inner().scene;
-        catch_panic(async move { engine.close(&name).await.map(|()| v1::DeleteSceneResponse {}) }).await
+        catch_panic(async move { engine.close(&name).await }).await?;
+        respond_once(0, async { Ok(v1::DeleteSceneResponse {}) }).await
     }
 
     type DescribeSceneStream = ReplyStream<v1::DescribeSceneResponse>;

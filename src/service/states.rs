@@ -8,11 +8,21 @@ use tonic::{Request, Response, Status};
 use v1::stream_states_response::Part;
 
 use super::convert::{describe_step_selector, parse_step_selector, parse_stream_delivery, wire_stages, wire_step_id};
-use super::reply_body::without_copies;
 use super::status::to_status;
 use super::stream::{Deadline, ReplySender, ReplyStream, chunks_with_head, respond};
 use crate::engine::{Engine, OutputSpec, PackedState, StateContent, StateSection, Subscription, pack_state};
+use modalcast_model::domain::Transform;
 use modalcast_model::scene::Scene;
+
+/// Upper bound on the bytes of the heads of all chunks of a state, apart from their data.
+const HEAD_BYTES: usize = 4 << 10;
+
+/// Upper bound on the bytes of a packed state: coordinates, and per domain two indices, a transform and an origin.
+fn max_state_bytes(scene: &Scene) -> usize {
+    size_of::<f32>() * scene.layout.coordinates
+        + (2 * size_of::<u32>() + size_of::<Transform>() + size_of::<[f64; 3]>()) * scene.domains.len()
+        + HEAD_BYTES
+}
 
 /// Implementation of `StateService`.
 pub(super) struct StateServiceImpl(pub(super) Engine);
@@ -28,17 +38,19 @@ impl v1::state_service_server::StateService for StateServiceImpl {
         let scene_handle = self.0.find_opened(&request.scene).await.map_err(to_status)?;
         let selector = parse_step_selector(request.step);
         let max_chunk_bytes = config.chunk_bytes;
-        Ok(without_copies(respond(move |reply_sender| async move {
+        Ok(respond(move |reply_sender| async move {
             let work = async {
                 let output = scene_handle.request_output(selector, OutputSpec::State).await.map_err(to_status)?;
+                let mut reply = reply_sender.reserve_whole(max_state_bytes(&scene_handle.scene)).await?;
                 let packed = pack_state(output, &scene_handle.scene, None).await.map_err(to_status)?;
+                reply.shrink_to(packed.bytes.len() + HEAD_BYTES);
                 for chunk in state_chunks(&packed, max_chunk_bytes) {
-                    reply_sender.send(v1::GetStateResponse { chunk: Some(chunk) }).await?;
+                    reply.send(v1::GetStateResponse { chunk: Some(chunk) }).await?;
                 }
                 Ok(())
             };
             deadline.enforce(&describe_step_selector(selector, &scene_handle.name), work).await
-        })))
+        }))
     }
 
     type StreamStatesStream = ReplyStream<v1::StreamStatesResponse>;
@@ -61,9 +73,9 @@ impl v1::state_service_server::StateService for StateServiceImpl {
         };
         let scene = Arc::clone(&scene_handle.scene);
         let state_stream = StateStream { scene, max_chunk_bytes: self.0.config().chunk_bytes, settings };
-        Ok(without_copies(respond(move |reply_sender| {
+        Ok(respond(move |reply_sender| {
             deadline.enforce("the stream of states", state_stream.run(subscription, reply_sender))
-        })))
+        }))
     }
 }
 
@@ -89,18 +101,24 @@ impl StateStream {
                 output = subscription.next() => output.map_err(to_status)?,
                 () = reply_sender.closed() => return Ok(()),
             };
-            let mut packed = pack_state(output, &self.scene, previous_state).await.map_err(to_status)?;
-            // A division by 0 has no remainder: no state has stages then.
-            if sent_count.checked_rem(u64::from(self.settings.stages_every)) != Some(0) {
-                packed.stages.clear();
-            }
-            for chunk in state_chunks(&packed, self.max_chunk_bytes) {
-                tokio::select! {
-                    sent = reply_sender.send(to_response(Part::Chunk(chunk))) => sent?,
-                    error = subscription.disconnected() => return Err(to_status(error)),
+            let send_state = async {
+                let mut reply = reply_sender.reserve_whole(max_state_bytes(&self.scene)).await?;
+                let mut packed = pack_state(output, &self.scene, previous_state).await.map_err(to_status)?;
+                reply.shrink_to(packed.bytes.len() + HEAD_BYTES);
+                // A division by 0 has no remainder: no state has stages then.
+                if sent_count.checked_rem(u64::from(self.settings.stages_every)) != Some(0) {
+                    packed.stages.clear();
                 }
-            }
-            previous_state = Some(packed.state);
+                for chunk in state_chunks(&packed, self.max_chunk_bytes) {
+                    reply.send(to_response(Part::Chunk(chunk))).await?;
+                }
+                Ok(packed.state)
+            };
+            let sent_state = tokio::select! {
+                sent = send_state => sent,
+                error = subscription.disconnected() => Err(to_status(error)),
+            };
+            previous_state = Some(sent_state?);
             sent_count += 1;
         }
         Ok(())

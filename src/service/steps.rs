@@ -111,7 +111,7 @@ impl DriveSession {
                 permit = reply_sender.reserve(next_reply_bytes), if !self.replies.is_empty() => {
                     let permit = permit?;
                     if let Some(reply) = self.replies.pop_front() {
-                        permit.send(reply);
+                        permit.send(reply)?;
                     }
                 }
                 () = reply_sender.closed() => return Ok(()),

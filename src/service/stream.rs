@@ -1,6 +1,7 @@
 //! Reply streams. A task sends messages through a bounded queue, within the reply budgets. Replies are split into
 //! chunks of at most 1 MiB. A deadline covers the whole reply up to its last chunk. A panic ends only its own call.
 
+use std::marker::PhantomData;
 use std::pin::Pin;
 use std::sync::{Arc, Mutex};
 use std::task::{Context, Poll, ready};
@@ -13,7 +14,8 @@ use tokio_stream::Stream;
 use tonic::metadata::MetadataMap;
 use tonic::{Response, Status};
 
-use super::reply_budget::{CallReplies, ReplyContext, UnsentBytes};
+use super::reply_body::{EncodedMessage, PREFIX_BYTES, QueuedMessage, ReplyMessage, with_body};
+use super::reply_budget::{CallReplies, UnsentBytes};
 use super::status::to_status;
 use crate::config::Config;
 use crate::engine::lock;
@@ -25,42 +27,73 @@ pub(super) type ReplyStream<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + 
 /// Maximum number of messages of a reply that are queued for the connection.
 const REPLY_CAPACITY: usize = 2;
 
-/// Bytes that gRPC adds to a message.
-const MESSAGE_HEADER_BYTES: usize = 5;
-
-/// A message with its share of the reply budget.
-type QueuedMessage<T> = (T, UnsentBytes);
-
 /// Sender of a reply stream. Sending waits while the client reads slowly (back-pressure), and while the replies of its
 /// connection or of all connections exceed their budget.
 #[derive(Debug)]
 pub(super) struct ReplySender<T> {
-    messages: mpsc::Sender<QueuedMessage<T>>,
+    messages: mpsc::Sender<QueuedMessage>,
     replies: Arc<CallReplies>,
+    message_type: PhantomData<fn(T)>,
 }
 
 /// Capacity for one message.
 pub(super) struct ReplyPermit<'a, T> {
-    slot: mpsc::Permit<'a, QueuedMessage<T>>,
+    slot: mpsc::Permit<'a, QueuedMessage>,
     unsent: UnsentBytes,
+    message_type: PhantomData<fn(T)>,
 }
 
-impl<T: prost::Message> ReplyPermit<'_, T> {
-    /// Queues a message, and releases the reserved bytes that it does not need.
-    pub(super) fn send(mut self, message: T) {
-        self.unsent.shrink_to(message.encoded_len() + MESSAGE_HEADER_BYTES);
-        self.slot.send((message, self.unsent));
+impl<T: ReplyMessage> ReplyPermit<'_, T> {
+    /// Encodes and queues a message, and releases the reserved bytes that it does not need.
+    ///
+    /// # Errors
+    /// `INTERNAL` for a message that is larger than a reply may be.
+    pub(super) fn send(self, message: T) -> Result<(), Status> {
+        self.slot.send(encode_within(message, self.unsent)?);
+        Ok(())
     }
 }
 
-impl<T: prost::Message> ReplySender<T> {
-    /// Sends one message. Waits until there is capacity.
+/// Encodes a message, and releases the reserved bytes that it does not need.
+fn encode_within(message: impl ReplyMessage, mut unsent: UnsentBytes) -> Result<QueuedMessage, Status> {
+    let message = EncodedMessage::new(message)?;
+    unsent.shrink_to(message.size());
+    Ok(QueuedMessage { message, unsent })
+}
+
+/// Capacity for the messages of a whole reply that is produced at once.
+pub(super) struct WholeReplyPermit<'a, T> {
+    sender: &'a ReplySender<T>,
+    unsent: UnsentBytes,
+}
+
+impl<T: ReplyMessage> WholeReplyPermit<'_, T> {
+    /// Releases all but `bytes`.
+    pub(super) fn shrink_to(&mut self, bytes: usize) {
+        self.unsent.shrink_to(bytes);
+    }
+
+    /// Encodes and queues a message. Waits until the queue has capacity.
     ///
     /// # Errors
-    /// `CANCELLED` when the client has disconnected.
-    pub(super) async fn send(&self, message: T) -> Result<(), Status> {
-        self.reserve(message.encoded_len()).await?.send(message);
+    /// `CANCELLED` when the client has disconnected; `INTERNAL` for a message that is larger than a reply may be.
+    pub(super) async fn send(&mut self, message: T) -> Result<(), Status> {
+        let slot = self.sender.messages.reserve().await.map_err(|_| disconnected_status())?;
+        let message = EncodedMessage::new(message)?;
+        let unsent = self.unsent.split(message.size()).ok_or_else(|| Status::internal("the reply budget is closed"))?;
+        slot.send(QueuedMessage { message, unsent });
         Ok(())
+    }
+}
+
+impl<T: ReplyMessage> ReplySender<T> {
+    /// Sends one message. Waits until there is capacity. Large messages wait outside the budget here, so reserve before
+    /// they are built.
+    ///
+    /// # Errors
+    /// `CANCELLED` when the client has disconnected; `INTERNAL` for a message that is larger than a reply may be.
+    pub(super) async fn send(&self, message: T) -> Result<(), Status> {
+        self.reserve(message.encoded_len()).await?.send(message)
     }
 
     /// Waits until there is capacity for a message of `bytes` bytes. Reserve before a large message is built, so that
@@ -70,8 +103,18 @@ impl<T: prost::Message> ReplySender<T> {
     /// `CANCELLED` when the client has disconnected.
     pub(super) async fn reserve(&self, bytes: usize) -> Result<ReplyPermit<'_, T>, Status> {
         let slot = self.messages.reserve().await.map_err(|_| disconnected_status())?;
-        let unsent = self.replies.acquire(bytes + MESSAGE_HEADER_BYTES).await?;
-        Ok(ReplyPermit { slot, unsent })
+        let unsent = self.replies.acquire(bytes + PREFIX_BYTES).await?;
+        Ok(ReplyPermit { slot, unsent, message_type: PhantomData })
+    }
+
+    /// Waits until the budget has capacity for a whole reply of `bytes` bytes, whose messages are produced at once.
+    /// Reserve before they are produced. A reply above the budget of its connection waits until nothing else of the
+    /// connection is unsent. Cancel-safe.
+    ///
+    /// # Errors
+    /// `CANCELLED` when the client has disconnected.
+    pub(super) async fn reserve_whole(&self, bytes: usize) -> Result<WholeReplyPermit<'_, T>, Status> {
+        Ok(WholeReplyPermit { sender: self, unsent: self.replies.acquire(bytes).await? })
     }
 
     /// Waits until the queue has capacity for a message of unknown size. Cancel-safe.
@@ -92,15 +135,15 @@ fn disconnected_status() -> Status {
     Status::cancelled("the client has disconnected")
 }
 
-/// The queue of a reply. The stream takes messages from it, and the task that supervises the call can empty it.
+/// The queue of a reply. The body takes messages from it, and the task that supervises the call can empty it.
 #[derive(Debug)]
-struct ReplyQueue<T> {
-    messages: Mutex<mpsc::Receiver<QueuedMessage<T>>>,
+struct ReplyQueue {
+    messages: Mutex<mpsc::Receiver<QueuedMessage>>,
     /// The error after the last message.
     error: Mutex<Option<Status>>,
 }
 
-impl<T> ReplyQueue<T> {
+impl ReplyQueue {
     /// Drops all queued messages.
     fn clear(&self) {
         let mut messages = lock(&self.messages);
@@ -109,29 +152,25 @@ impl<T> ReplyQueue<T> {
 }
 
 /// The stream of queued messages.
-struct QueuedReplies<T> {
-    queue: Arc<ReplyQueue<T>>,
-    context: ReplyContext,
+struct QueuedReplies {
+    queue: Arc<ReplyQueue>,
     /// Tells the supervising task when the stream is dropped.
     _is_open: oneshot::Sender<()>,
 }
 
-impl<T> Stream for QueuedReplies<T> {
-    type Item = Result<T, Status>;
+impl Stream for QueuedReplies {
+    type Item = Result<QueuedMessage, Status>;
 
     fn poll_next(self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Option<Self::Item>> {
         let next = lock(&self.queue.messages).poll_recv(cx);
         match ready!(next) {
-            Some((message, unsent)) => {
-                self.context.encode(unsent);
-                Poll::Ready(Some(Ok(message)))
-            }
+            Some(queued) => Poll::Ready(Some(Ok(queued))),
             None => Poll::Ready(lock(&self.queue.error).take().map(Err)),
         }
     }
 }
 
-impl<T> Drop for QueuedReplies<T> {
+impl Drop for QueuedReplies {
     fn drop(&mut self) {
         lock(&self.queue.messages).close();
         self.queue.clear();
@@ -140,32 +179,34 @@ impl<T> Drop for QueuedReplies<T> {
 
 /// Creates a reply stream to which `work` sends messages. An error of `work` ends the stream. When the client
 /// disconnects, `work` is dropped at its next await, so that its resources are released. If the client does not read
-/// while others wait for the reply budget, the call ends with `SlowReader`.
+/// while others wait for the reply budget, the call ends with `SlowReader`. The stream of the response is empty: its
+/// messages are in the body that [`with_body`] adds.
 pub(super) fn respond<T, W, F>(work: W) -> Response<ReplyStream<T>>
 where
     T: Send + 'static,
     W: FnOnce(ReplySender<T>) -> F,
     F: Future<Output = Result<(), Status>> + Send + 'static,
 {
-    let context = ReplyContext::current();
-    let replies = Arc::clone(&context.replies);
+    let replies = CallReplies::current();
     let (messages, receiver) = mpsc::channel(REPLY_CAPACITY);
     let queue = Arc::new(ReplyQueue { messages: Mutex::new(receiver), error: Mutex::default() });
     let (_is_open, is_closed) = oneshot::channel();
-    let stream = QueuedReplies { queue: Arc::clone(&queue), context, _is_open };
+    let stream = QueuedReplies { queue: Arc::clone(&queue), _is_open };
     // The stream must not end before the error of `work` is stored.
     let keep_open = messages.clone();
-    let task = tokio::spawn(work(ReplySender { messages, replies: Arc::clone(&replies) }));
+    let reply_sender = ReplySender { messages, replies: Arc::clone(&replies), message_type: PhantomData };
+    let task = tokio::spawn(work(reply_sender));
     tokio::spawn(supervise(task, queue, replies, keep_open, is_closed));
-    Response::new(Box::pin(stream))
+    let no_messages: ReplyStream<T> = Box::pin(tokio_stream::empty());
+    with_body(Response::new(no_messages), stream)
 }
 
 /// Stores the error of a call. Ends the call when the stream is dropped or its client does not read.
-async fn supervise<T>(
+async fn supervise(
     mut task: JoinHandle<Result<(), Status>>,
-    queue: Arc<ReplyQueue<T>>,
+    queue: Arc<ReplyQueue>,
     replies: Arc<CallReplies>,
-    keep_open: mpsc::Sender<QueuedMessage<T>>,
+    keep_open: mpsc::Sender<QueuedMessage>,
     mut is_closed: oneshot::Receiver<()>,
 ) {
     let panicked = |_| Err(Status::internal("the call panicked in the server"));
@@ -201,19 +242,27 @@ impl<T> Drop for CallTask<T> {
     }
 }
 
-/// Runs the work of a unary call in a separate task, so that a panic becomes an `INTERNAL` status of that call. When the
+/// Runs work of a unary call in a separate task, so that a panic becomes an `INTERNAL` status of that call. When the
 /// client cancels the call, `work` is dropped at its next await.
-pub(super) async fn catch_panic<T: prost::Message + 'static>(
+pub(super) async fn catch_panic<T: Send + 'static>(
     work: impl Future<Output = Result<T>> + Send + 'static,
-) -> Result<Response<T>, Status> {
+) -> Result<T, Status> {
     let mut task = CallTask(tokio::spawn(work));
-    let message = match (&mut task.0).await {
-        Ok(result) => result.map_err(to_status)?,
-        Err(_) => return Err(Status::internal("the call panicked in the server")),
-    };
-    let context = ReplyContext::current();
-    context.encode(context.replies.acquire(message.encoded_len() + MESSAGE_HEADER_BYTES).await?);
-    Ok(Response::new(message))
+    match (&mut task.0).await {
+        Ok(result) => result.map_err(to_status),
+        Err(_) => Err(Status::internal("the call panicked in the server")),
+    }
+}
+
+/// Answers a unary call with the message that `build` produces, of at most `max_bytes` bytes. Waits for the reply budget
+/// first, so `build` must not wait for other clients.
+pub(super) async fn respond_once<T: ReplyMessage + Default + Send + 'static>(
+    max_bytes: usize,
+    build: impl Future<Output = Result<T>> + Send + 'static,
+) -> Result<Response<T>, Status> {
+    let unsent = CallReplies::current().acquire(max_bytes + PREFIX_BYTES).await?;
+    let queued = encode_within(catch_panic(build).await?, unsent)?;
+    Ok(with_body(Response::new(T::default()), tokio_stream::once(Ok(queued))))
 }
 
 /// Splits a reply into chunks of at most `max_chunk_bytes` bytes, each with its offset in bytes. An empty reply is one
@@ -307,7 +356,14 @@ pub(super) fn parse_timeout(text: &str) -> Option<Duration> {
 
 #[cfg(test)]
 mod tests {
+    use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+
+    use modalcast_proto::v1;
+    use prost::Message as _;
+
     use super::*;
+    use crate::service::reply_body::take_body;
+    use crate::service::reply_budget::{ConnectionReplyBudget, ReplyBudget};
 
     #[test]
     fn chunks_cover_a_reply_once() {
@@ -360,7 +416,7 @@ mod tests {
     #[tokio::test]
     async fn work_is_dropped_when_the_client_disconnects() {
         let (work_guard, work_dropped) = tokio::sync::oneshot::channel::<()>();
-        let replies = respond(move |_: ReplySender<u32>| async move {
+        let replies = respond(move |_: ReplySender<v1::StreamForcesResponse>| async move {
             std::future::pending::<()>().await;
             drop(work_guard);
             Ok(())
@@ -378,7 +434,7 @@ mod tests {
         let mut call = Box::pin(catch_panic(async move {
             std::future::pending::<()>().await;
             drop(work_guard);
-            Ok(0_u32)
+            Ok(())
         }));
         let pending = tokio::time::timeout(Duration::ZERO, call.as_mut()).await;
         assert!(pending.is_err(), "control: expected a call without an end");
@@ -388,22 +444,83 @@ mod tests {
         assert!(result.is_err());
     }
 
+    /// A connection whose unsent replies have at most 100 bytes.
+    fn small_connection() -> Arc<ConnectionReplyBudget> {
+        let config = Config { connection_reply_bytes: 100, ..Config::default() };
+        ReplyBudget::new(&config).new_connection(Arc::default())
+    }
+
+    /// Lets other tasks run until they wait.
+    async fn run_other_tasks() {
+        for _ in 0..100 {
+            tokio::task::yield_now().await;
+        }
+    }
+
+    /// Otherwise each call whose client does not read would hold a whole reply outside the budget.
+    #[tokio::test]
+    async fn whole_reply_is_produced_after_it_has_budget() {
+        let connection = small_connection();
+        let produced = Arc::new(AtomicUsize::new(0));
+        let start_call = async || {
+            let produced = Arc::clone(&produced);
+            let work = |reply_sender: ReplySender<v1::StreamForcesResponse>| async move {
+                let mut reply = reply_sender.reserve_whole(80).await?;
+                produced.fetch_add(1, Ordering::Relaxed);
+                reply.shrink_to(60);
+                reply.send(v1::StreamForcesResponse { receiver_error: "x".repeat(50), ..Default::default() }).await
+            };
+            connection.new_call().scope(async { respond(work) }).await
+        };
+        let unread = start_call().await;
+        run_other_tasks().await;
+        let waiting = start_call().await;
+        run_other_tasks().await;
+        assert_eq!(produced.load(Ordering::Relaxed), 1, "expected one reply within the budget");
+        drop(unread);
+        run_other_tasks().await;
+        assert_eq!(produced.load(Ordering::Relaxed), 2, "expected the second reply after the first one");
+        drop(waiting);
+    }
+
+    #[tokio::test]
+    async fn unary_reply_is_built_after_it_has_budget() {
+        let connection = small_connection();
+        let unread = connection.new_call().acquire(50).await.expect("expected capacity");
+        let is_built = Arc::new(AtomicBool::new(false));
+        let mark_built = Arc::clone(&is_built);
+        let build = async move {
+            mark_built.store(true, Ordering::Relaxed);
+            Ok(v1::DeleteSceneResponse {})
+        };
+        let mut call = Box::pin(connection.new_call().scope(respond_once(60, build)));
+        let pending = tokio::time::timeout(Duration::from_millis(50), call.as_mut()).await;
+        assert!(pending.is_err() && !is_built.load(Ordering::Relaxed), "expected no reply without budget");
+        drop(unread);
+        tokio::time::timeout(crate::hang_guard::HANG_GUARD, call)
+            .await
+            .expect("expected an answer")
+            .expect("expected a reply");
+        assert!(is_built.load(Ordering::Relaxed));
+    }
+
     /// The channel is full when the work panics.
     #[tokio::test]
     async fn panicking_work_ends_its_stream_with_internal() {
-        use tokio_stream::StreamExt as _;
-        let response = respond(|reply_sender: ReplySender<u32>| async move {
-            reply_sender.send(1).await?;
-            reply_sender.send(2).await?;
+        use http_body_util::BodyExt as _;
+        let reply = |text: &str| v1::StreamForcesResponse { receiver_error: text.into(), ..Default::default() };
+        let response = respond(move |reply_sender: ReplySender<v1::StreamForcesResponse>| async move {
+            reply_sender.send(reply("first")).await?;
+            reply_sender.send(reply("second")).await?;
             panic!("injected")
         });
-        let mut replies = response.into_inner();
-        for expected in [1, 2] {
-            let reply = replies.next().await.expect("expected a reply").expect("expected a message");
-            assert_eq!(reply, expected);
-        }
-        let end = replies.next().await.expect("expected an end").expect_err("expected an error");
-        assert_eq!(end.code(), tonic::Code::Internal);
-        assert!(replies.next().await.is_none());
+        let body = take_body(response).expect("expected a body").collect().await.expect("expected frames");
+        let status = Status::from_header_map(body.trailers().expect("expected trailers")).expect("expected a status");
+        assert_eq!(status.code(), tonic::Code::Internal);
+        let expected = ["first", "second"].map(|text| {
+            let message = reply(text).encode_to_vec();
+            [&[0], &(message.len() as u32).to_be_bytes()[..], &message].concat()
+        });
+        assert_eq!(body.to_bytes(), expected.concat());
     }
 }

@@ -13,7 +13,6 @@ use super::convert::{
     describe_step_selector, parse_step_selector, parse_stream_delivery, parse_vertex_selection, wire_delivery,
     wire_sections, wire_stages, wire_step_id,
 };
-use super::reply_body::without_copies;
 use super::shared_memory::{CallMemory, SharedMemory};
 use super::status::to_status;
 use super::stream::{Deadline, ReplySender, ReplyStream, respond, split_into_chunks};
@@ -45,7 +44,7 @@ impl v1::vertex_service_server::VertexService for VertexServiceImpl {
         let selector = parse_step_selector(request.step);
         let (packer, max_chunk_bytes) = (self.engine.vertex_packer().clone(), config.chunk_bytes);
         let to_response = |part| v1::GetVerticesResponse { part: Some(part) };
-        Ok(without_copies(respond(move |reply_sender| async move {
+        Ok(respond(move |reply_sender| async move {
             let work = async {
                 let spec = OutputSpec::Vertices(selection.vertex_attributes());
                 let output = scene_handle.request_output(selector, spec).await.map_err(to_status)?;
@@ -60,7 +59,7 @@ impl v1::vertex_service_server::VertexService for VertexServiceImpl {
                 Ok(())
             };
             deadline.enforce(&describe_step_selector(selector, &scene_handle.name), work).await
-        })))
+        }))
     }
 
     type StreamVerticesStream = ReplyStream<v1::StreamVerticesResponse>;
@@ -85,9 +84,9 @@ impl v1::vertex_service_server::VertexService for VertexServiceImpl {
             max_chunk_bytes: self.engine.config().chunk_bytes,
             max_steps: request.steps,
         };
-        Ok(without_copies(respond(move |reply_sender| {
+        Ok(respond(move |reply_sender| {
             deadline.enforce("the vertex stream", vertex_stream.run(subscription, reply_sender))
-        })))
+        }))
     }
 }
 

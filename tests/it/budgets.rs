@@ -15,6 +15,7 @@ use tonic::codegen::{Service as _, http};
 use tonic::transport::{Channel, Endpoint};
 use tonic::{Code, Status, Streaming};
 use v1::scene_service_client::SceneServiceClient;
+use v1::state_service_client::StateServiceClient;
 use v1::{Delivery, Reason};
 
 use crate::service_harness::{LONG_LIMITS, SILENCE_LIMIT, Server, StepWriter, rejection_details, step, with_timeout};
@@ -249,10 +250,13 @@ struct ServerProcess {
 }
 
 impl ServerProcess {
-    /// Starts a server that can open `grid.obj`.
+    /// Starts a server that can open `scene.toml`, a scene of many domains.
     fn start(flags: &[&str]) -> Self {
         let folder = tempfile::tempdir().expect("expected a temporary folder");
-        std::fs::write(folder.path().join("grid.obj"), grid_obj(400)).expect("expected a writable folder");
+        let write = |name: &str, text: &str| std::fs::write(folder.path().join(name), text);
+        write("triangle.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n").expect("expected a writable folder");
+        write("scene.toml", &"[[domain]]\nmodel = 'triangle.obj'\n".repeat(DOMAINS))
+            .expect("expected a writable folder");
         let mut child = Command::new(env!("CARGO_BIN_EXE_modalcast"))
             .args(["serve", "--listen", "127.0.0.1:0", "--backend", "cpu", "--renderer", "off", "--scenes"])
             .arg(folder.path())
@@ -291,36 +295,51 @@ impl Drop for ServerProcess {
     }
 }
 
-/// A grid of `side` x `side` vertices.
-fn grid_obj(side: usize) -> String {
-    use std::fmt::Write as _;
-    let mut text = String::new();
-    for index in 0..side * side {
-        writeln!(text, "v {} {} 0", index % side, index / side).expect("expected a string");
-    }
-    for first in (0..(side - 1) * (side - 1)).map(|cell| cell / (side - 1) * side + cell % (side - 1) + 1) {
-        let quad = [first, first + 1, first + side + 1, first + side];
-        writeln!(text, "f {} {} {} {}", quad[0], quad[1], quad[2], quad[3]).expect("expected a string");
-    }
-    text
+/// Domains of the scene of a [`ServerProcess`]. Its description and its state have 1 MB or more, and are produced for each
+/// call, unlike arrays, which replies share with the scene.
+const DOMAINS: usize = 20_000;
+
+/// Replies that a client does not read.
+#[derive(Debug, Clone, Copy)]
+enum UnreadReplies {
+    Descriptions,
+    States,
 }
 
-/// Peak of the memory growth of a server with 120 unread descriptions, in bytes, up to `enough` bytes.
-async fn growth_by_unread_replies(flags: &[&str], enough: u64) -> u64 {
+impl UnreadReplies {
+    /// Opens calls, which end when the result is dropped.
+    async fn open(self, channel: &Channel, count: usize) -> Box<dyn std::any::Any> {
+        match self {
+            Self::Descriptions => Box::new(open_unread_calls(channel, "scene", count).await),
+            Self::States => {
+                let mut client = StateServiceClient::new(channel.clone());
+                let mut calls = Vec::new();
+                for _ in 0..count {
+                    let request = v1::GetStateRequest { scene: "scene".into(), ..Default::default() };
+                    calls.push(with_timeout(client.get_state(request)).await.expect("expected a reply").into_inner());
+                }
+                Box::new(calls)
+            }
+        }
+    }
+}
+
+/// Peak of the memory growth of a server with 120 unread replies, in bytes, up to `enough` bytes.
+async fn growth_by_unread_replies(replies: UnreadReplies, flags: &[&str], enough: u64) -> u64 {
     let server = ServerProcess::start(flags);
-    let open = v1::OpenSceneRequest { source: "grid.obj".into(), scene: "grid".into() };
+    let open = v1::OpenSceneRequest { source: "scene.toml".into(), scene: "scene".into() };
     let mut scenes = SceneServiceClient::new(server.channel().await);
     scenes.open_scene(open).await.expect("expected the scene to open");
-    read_description(server.channel().await, "grid", Duration::ZERO).await.expect("expected a description");
+    read_description(server.channel().await, "scene", Duration::ZERO).await.expect("expected a description");
     let idle_bytes = server.memory("VmHWM");
     let attacker = server.channel().await;
-    let unread_calls = open_unread_calls(&attacker, "grid", 120).await;
+    let unread_calls = replies.open(&attacker, 120).await;
     let growth = || server.memory("VmHWM") - idle_bytes;
     // Clients on other connections are served. Meanwhile, the server has time to produce the unread replies.
     let read_descriptions = async {
         let mut count = 0;
-        while count < 10 || growth() < enough {
-            let description = read_description(server.channel().await, "grid", Duration::from_millis(10)).await;
+        while count < 40 || growth() < enough {
+            let description = read_description(server.channel().await, "scene", Duration::from_millis(1)).await;
             description.expect("expected a description");
             count += 1;
         }
@@ -333,13 +352,19 @@ async fn growth_by_unread_replies(flags: &[&str], enough: u64) -> u64 {
 #[tokio::test(flavor = "multi_thread")]
 async fn unread_replies_use_bounded_memory() {
     const UNBOUNDED: u64 = 100 << 20;
-    let (bounded, unbounded) = tokio::join!(
-        growth_by_unread_replies(&["--connection-reply-bytes", "16777216"], 0),
-        growth_by_unread_replies(&["--connection-reply-bytes", "4000000000", "--reply-bytes", "4000000000"], UNBOUNDED),
-    );
-    println!("unread replies: {bounded} bytes with a budget of 16 MiB, {unbounded} bytes without");
-    assert!(bounded < 64 << 20, "{bounded}");
-    assert!(unbounded >= UNBOUNDED, "control: {unbounded}");
+    for replies in [UnreadReplies::Descriptions, UnreadReplies::States] {
+        let (bounded, unbounded) = tokio::join!(
+            growth_by_unread_replies(replies, &["--connection-reply-bytes", "16777216"], 0),
+            growth_by_unread_replies(
+                replies,
+                &["--connection-reply-bytes", "4000000000", "--reply-bytes", "4000000000"],
+                UNBOUNDED
+            ),
+        );
+        println!("{replies:?}: {bounded} bytes with a budget of 16 MiB, {unbounded} bytes without");
+        assert!(bounded < 64 << 20, "{replies:?}: {bounded}");
+        assert!(unbounded >= UNBOUNDED, "control of {replies:?}: {unbounded}");
+    }
 }
 
 /// Memory growth in bytes of a server to which a connection sends half of each of 40 messages of 8 MiB. With

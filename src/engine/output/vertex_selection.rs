@@ -135,7 +135,7 @@ fn check_available(field: &str, scene: &Scene, attribute: Attribute) -> Result<(
 ///
 /// # Errors
 /// `Invalid` when an index is out of range or the list is longer than the scene.
-pub fn validate_domains(field: &str, scene: &Scene, domains: Vec<u32>) -> Result<Vec<u32>> {
+fn validate_domains(field: &str, scene: &Scene, domains: Vec<u32>) -> Result<Vec<u32>> {
     let count = scene.domains.len();
     if domains.is_empty() {
         return Ok((0..count as u32).collect());
