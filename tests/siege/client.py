@@ -18,19 +18,21 @@ from modalcast.v1 import (  # noqa: E402
     frames_pb2_grpc,
     scenes_pb2,
     scenes_pb2_grpc,
+    states_pb2,
     steps_pb2,
     steps_pb2_grpc,
     vertices_pb2,
     vertices_pb2_grpc,
 )
 
-__all__ = ["common_pb2", "forces_pb2", "forces_pb2_grpc", "frames_pb2", "scenes_pb2", "steps_pb2", "vertices_pb2"]
+__all__ = ["common_pb2", "forces_pb2", "forces_pb2_grpc", "frames_pb2", "scenes_pb2", "states_pb2", "steps_pb2", "vertices_pb2"]
 
 LIST_SCENES = "/modalcast.v1.SceneService/ListScenes"
 DESCRIBE_SCENE = "/modalcast.v1.SceneService/DescribeScene"
 OPEN_SCENE = "/modalcast.v1.SceneService/OpenScene"
 DRIVE_SCENE = "/modalcast.v1.StepService/DriveScene"
 RENDER_FRAME = "/modalcast.v1.FrameService/RenderFrame"
+GET_STATE = "/modalcast.v1.StateService/GetState"
 GET_VERTICES = "/modalcast.v1.VertexService/GetVertices"
 HEALTH_WATCH = "/grpc.health.v1.Health/Watch"
 

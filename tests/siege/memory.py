@@ -24,6 +24,14 @@ UPLOADS = 4
 # Rows of the array of vertices in an archive: 1.9 GB of zeros.
 VERTICES = 80_000_000
 
+# Rows of an array of vertices of 144 MB, which is within the limit, and columns of its modes, which have 1 GB.
+ARCHIVE_VERTICES = 6_000_000
+ARCHIVE_MODES = 7
+
+# Limit on the address space of a server in bytes, and the images of an upload that alone is within it: 537 MB.
+ADDRESS_SPACE = 4 << 30
+SMALL_IMAGES = 2
+
 # Limit on the memory of all scenes, and on the growth of the server's memory.
 LIMIT = 256 << 20
 MAX_GROWTH = 96 << 20
@@ -52,17 +60,26 @@ def model(image, images):
     return {"m.obj": (OBJ + faces).encode(), "m.mtl": materials.encode(), **files}
 
 
-def archive(vertices):
-    """A NumPy archive whose array of vertices has so many rows of zeros."""
-    header = f"{{'descr': '<f8', 'fortran_order': False, 'shape': ({vertices}, 3), }}".ljust(117) + "\n"
+def write_zeros(archive, name, rows, columns, kind="<f8"):
+    """Adds an array of zeros of 8 bytes each to a NumPy archive."""
+    header = f"{{'descr': '{kind}', 'fortran_order': False, 'shape': ({rows}, {columns}), }}".ljust(117) + "\n"
+    with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+        member.write(b"\x93NUMPY\x01\x00\x76\x00" + header.encode())
+        block = bytes(1_000_000)
+        whole_blocks, rest = divmod(8 * rows * columns, len(block))
+        for _ in range(whole_blocks):
+            member.write(block)
+        member.write(block[:rest])
+
+
+def archive(vertices, modes=0):
+    """A NumPy archive whose array of vertices has so many rows of zeros, and its modes so many columns."""
     data = io.BytesIO()
     with zipfile.ZipFile(data, "w", zipfile.ZIP_DEFLATED, compresslevel=6) as archive:
-        with archive.open("vertices.npy", "w", force_zip64=True) as member:
-            member.write(b"\x93NUMPY\x01\x00\x76\x00" + header.encode())
-            block = bytes(24_000_000)
-            for _ in range(vertices // 1_000_000):
-                member.write(block)
-        archive.writestr("faces.npy", b"")
+        write_zeros(archive, "vertices", vertices, 3)
+        write_zeros(archive, "faces", 1, 3, "<i8")
+        if modes:
+            write_zeros(archive, "U", 3 * vertices, modes)
     return {"m.npz": data.getvalue()}
 
 
@@ -108,6 +125,34 @@ def attack_with_files(program, limit, uploads):
         return rejected, peak.growth(), is_served
 
 
+def attack_within_address_space(program, images, *flags):
+    """Concurrent uploads of so many images under a limit on the address space. Returns how many uploads are opened, how
+    many are rejected because of the memory, and whether another scene is still served."""
+    files = model(png(SIDE), images)
+    with Server(program, *flags, address_space=ADDRESS_SPACE) as server, Client(server) as client:
+        client.open_scene("tree", "tree")
+        opened, rejected = [], []
+
+        def upload(number):
+            def send():
+                upload_files(client, f"s{number}", files)
+                opened.append(number)
+
+            if is_out_of_memory(send):
+                rejected.append(number)
+
+        uploads = [threading.Thread(target=upload, args=[number]) for number in range(UPLOADS)]
+        for thread in uploads:
+            thread.start()
+        for thread in uploads:
+            thread.join()
+        try:
+            is_served = any(info.scene == "tree" for info in client.list_scenes())
+        except grpc.RpcError:
+            is_served = False
+        return len(opened), len(rejected), is_served and server.process.poll() is None
+
+
 def render(client, side):
     picture = frames_pb2.Picture(width=side, height=side, format=frames_pb2.FORMAT_RGBA)
     request = frames_pb2.RenderFrameRequest(scene="tree", pictures=[picture], deadline_ms=600_000)
@@ -134,6 +179,11 @@ def run(program):
     size = max(sum(map(len, files.values())) for files in uploads)
     rejected, growth, is_served = attack_with_files(program, LIMIT, uploads)
     _, control_growth, _ = attack_with_files(program, 1 << 40, [model(image, 2)])
+    with_modes = [archive(ARCHIVE_VERTICES, ARCHIVE_MODES)]
+    modes_rejected, modes_growth, modes_served = attack_with_files(program, LIMIT, with_modes)
+    _, control_modes_growth, _ = attack_with_files(program, 1 << 40, with_modes)
+    opened, limit_rejected, limit_served = attack_within_address_space(program, SMALL_IMAGES)
+    *_, control_served = attack_within_address_space(program, IMAGES, "--scenes-host-bytes", str(1 << 40))
     is_rejected, frame_growth, seconds = attack_with_frames(program, "--render-target-bytes", str(LIMIT))
     _, control_frame_growth, _ = attack_with_frames(program)
     return [
@@ -145,6 +195,24 @@ def run(program):
             rejected == len(uploads) and is_served and growth <= MAX_GROWTH,
             f"two of the images without a limit, +{mb(control_growth)}",
             control_growth > MAX_GROWTH,
+        ),
+        Result(
+            ITEM,
+            f"an archive of {len(with_modes[0]['m.npz']) / 1e6:.1f} MB with 144 MB of vertices and 1 GB of modes",
+            f"rejected with the numbers before the vertices are read, another scene served, +{mb(MAX_GROWTH)}",
+            f"{modes_rejected} rejected, {'served' if modes_served else 'not served'}, +{mb(modes_growth)}",
+            modes_rejected == 1 and modes_served and modes_growth <= MAX_GROWTH,
+            f"without a limit, +{mb(control_modes_growth)}",
+            control_modes_growth > MAX_GROWTH,
+        ),
+        Result(
+            ITEM,
+            f"{UPLOADS} uploads of images at once within an address space (ulimit -v) of {mb(ADDRESS_SPACE)}",
+            "opened or rejected with the numbers, at least one of each, another scene served",
+            f"{opened} opened, {limit_rejected} rejected, {'served' if limit_served else 'not served'}",
+            min(opened, limit_rejected) > 0 and opened + limit_rejected == UPLOADS and limit_served,
+            f"more images and no limit on scenes, {'served' if control_served else 'the server ended'}",
+            not control_served,
         ),
         Result(
             ITEM,

@@ -12,6 +12,12 @@ def write_grid(path, side):
     path.write_text("\n".join(lines))
 
 
+def write_domains(folder, count):
+    """A scene of so many domains, which have one triangle each: the entry `scene.toml` in a folder."""
+    (folder / "triangle.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    (folder / "scene.toml").write_text("[[domain]]\nmodel = 'triangle.obj'\n" * count)
+
+
 def write_thin_arcs(path, polygons, corners=256):
     """Polygons that are thin arcs of 4 radians. Each triangle of three corners on the outer side contains corners of
     the inner side, so that triangulation is slow. All polygons have the same vertices."""

@@ -13,10 +13,20 @@ resource.setrlimit(resource.RLIMIT_NOFILE, (resource.getrlimit(resource.RLIMIT_N
 
 
 class Server:
-    """`modalcast serve` on a free port, with a state folder in a new folder or in `state`, and with additional variables
-    in its environment. The end of the `with` block kills it."""
+    """`modalcast serve` on a free port, with a state folder in a new folder or in `state`, with additional variables in
+    its environment, and with a limit on its address space in bytes. The end of the `with` block kills it."""
 
-    def __init__(self, program, *flags, scenes=None, backend="cpu", renderer="off", state=None, environment=None):
+    def __init__(
+        self,
+        program,
+        *flags,
+        scenes=None,
+        backend="cpu",
+        renderer="off",
+        state=None,
+        environment=None,
+        address_space=resource.RLIM_INFINITY,
+    ):
         self.folder = tempfile.TemporaryDirectory(prefix="modalcast-siege-")
         self.state = Path(state or self.folder.name) / "state"
         self.log_path = Path(self.folder.name) / "log"
@@ -29,6 +39,7 @@ class Server:
             stderr=self.log_path.open("w"),
             text=True,
             env=os.environ | (environment or {}),
+            preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (address_space, address_space)),
         )
         line = self.process.stdout.readline()
         if not line.startswith("listening on http://"):
