@@ -3,7 +3,7 @@
 use modalcast_model::error::{Result, fault_in};
 
 /// Runs blocking or long work on a thread of tokio's blocking pool. A panic becomes a `Fault` of `stage`.
-pub(super) async fn run_blocking<T: Send + 'static>(
+pub(crate) async fn run_blocking<T: Send + 'static>(
     stage: &'static str,
     work: impl FnOnce() -> Result<T> + Send + 'static,
 ) -> Result<T> {

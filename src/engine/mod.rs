@@ -39,6 +39,7 @@ mod storage;
 mod testing;
 mod upload_quota;
 
+pub(crate) use blocking::run_blocking;
 pub use content::{ContentHash, ContentHashes, SceneContent, ShapeArray, hex, parse_hash};
 pub use device::context::{DeviceContext, EngineInfo, share_pictures};
 pub use device::device_loss::DeviceLoss;
@@ -86,7 +87,6 @@ use std::thread::JoinHandle;
 
 use tokio::sync::watch;
 
-use self::blocking::run_blocking;
 use self::device::handle::DeviceThread;
 use self::device::work_owners::WorkOwners;
 use self::load_permits::LoadPermits;

@@ -14,7 +14,7 @@ use super::MAX_REPLY_BYTES;
 use super::convert::{parse_hashes, wire_scene_info};
 use super::status::to_status;
 use super::stream::{ReplySender, ReplyStream, respond};
-use crate::engine::{ContentHash, ContentHashes, SceneContent, SceneHandle, ShapeArray, hex};
+use crate::engine::{ContentHash, ContentHashes, SceneContent, SceneHandle, ShapeArray, hex, run_blocking};
 use modalcast_model::domain::{AlphaMode, Domain, Material, MaterialRange, Transform};
 use modalcast_model::error::{Error, Result, invalid};
 use modalcast_model::scene::Scene;
@@ -29,7 +29,7 @@ pub(super) fn respond_with_description(
     request: v1::DescribeSceneRequest,
     max_chunk_bytes: usize,
 ) -> Result<Response<ReplyStream<v1::DescribeSceneResponse>>> {
-    let selection = Selection::new("domains", request.domains, scene_handle.scene.domains.len())?;
+    let selection = Arc::new(Selection::new("domains", request.domains, scene_handle.scene.domains.len())?);
     let arrays = parse_arrays(&request.arrays)?;
     Ok(respond(move |reply_sender| async move {
         reply_sender.send(response_with(Part::Scene(wire_scene_info(&scene_handle)))).await?;
@@ -42,12 +42,18 @@ pub(super) fn respond_with_description(
         while let Some(start) = position {
             // A single item may be as large as a message may be.
             let permit = reply_sender.reserve(MAX_REPLY_BYTES).await?;
-            // The lists of what the selected domains use are not kept while the call waits.
-            let used = UsedContent::new(scene, &selection);
-            let description = Description { scene, selection: &selection, used: &used, hashes: hashes.as_deref() };
-            let (part, end) = description.part(start, max_chunk_bytes);
+            let (scene, selection, hashes) = (Arc::clone(scene), Arc::clone(&selection), hashes.clone());
+            let describe = move || {
+                // The lists of what the selected domains use are not kept while the call waits.
+                let used = UsedContent::new(&scene, &selection);
+                let description =
+                    Description { scene: &scene, selection: &selection, used: &used, hashes: hashes.as_deref() };
+                let (part, end) = description.part(start, max_chunk_bytes);
+                Ok((part, description.next_position(end)))
+            };
+            let (part, next_position) = run_blocking("describe", describe).await.map_err(to_status)?;
             permit.send(response_with(part))?;
-            position = description.next_position(end);
+            position = next_position;
         }
         let shapes = if arrays.is_empty() { vec![] } else { UsedContent::new(scene, &selection).shape_ranges() };
         for shape in shapes.into_iter().flatten() {
