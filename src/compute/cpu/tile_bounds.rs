@@ -155,10 +155,12 @@ impl SceneBounds {
             Some(ranges) => {
                 let mut next_block = 0;
                 for range in ranges.filter(|range| !range.is_empty()) {
-                    for block in next_block.max(range.start / BLOCK_TILES)..range.end.div_ceil(BLOCK_TILES) {
-                        blocks[block] = of_block(block);
+                    let end = range.end.div_ceil(BLOCK_TILES);
+                    let first = next_block.max(range.start / BLOCK_TILES).min(end);
+                    for (block, bounds) in (first..).zip(&mut blocks[first..end]) {
+                        *bounds = of_block(block);
                     }
-                    next_block = range.end.div_ceil(BLOCK_TILES);
+                    next_block = end;
                 }
             }
             None => (0..block_count).into_par_iter().with_min_len(64).map(of_block).collect_into_vec(blocks),
