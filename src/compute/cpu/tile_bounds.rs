@@ -215,7 +215,8 @@ mod tests {
             bounds
         };
         let mut bounds = bounds_of_all(&tiles);
-        for ranges in [vec![0..1], vec![63..64, 64..65], vec![10..300, 300..300, 310..311], vec![5..6, 998..1000]] {
+        for ranges in [vec![0..1, 1..1], vec![63..64, 64..65], vec![10..300, 300..300, 310..311], vec![5..6, 998..1000]]
+        {
             let before = bounds.get();
             for (factor, is_larger) in [(1.0, true), (-1.0, true), (0.0, false)] {
                 ranges.iter().cloned().flatten().for_each(|tile| tiles[tile] = point(factor * 5000.0));
