@@ -1,13 +1,13 @@
 //! Time integrators and computed modes: error against step and time.
 //!
-//! - [`oscillators`]: linear modes from 1 mHz to 1 MHz against their closed form;
-//! - [`beam`]: a cantilever beam against its modal series, with the error of the time integration apart from that of the
+//! - `oscillators`: linear modes from 1 mHz to 1 MHz against their closed form;
+//! - `beam`: a cantilever beam against its modal series, with the error of the time integration apart from that of the
 //!   modes that are left out;
-//! - [`cubic`]: systems with cubic forces against a Runge-Kutta reference;
-//! - [`extremes`]: extreme steps, eigenvalues and loads;
-//! - [`solid_modes`]: frequencies by `modalcast model` against exact ones.
+//! - `cubic`: systems with cubic forces against a Runge-Kutta reference;
+//! - `extremes`: extreme steps, eigenvalues and loads;
+//! - `solid_modes`: frequencies by `modalcast model` against exact ones.
 //!
-//! Observed orders are compared with the theory, and a negative control must have a large error. [`recommendation`]
+//! Observed orders are compared with the theory, and a negative control must have a large error. `recommendation`
 //! selects the fastest setting within each limit of the error.
 
 mod beam;
