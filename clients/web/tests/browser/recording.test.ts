@@ -119,9 +119,11 @@ async function checkLoop(page: Page, duration: number): Promise<void> {
     await page.getByRole("button", { name: "Play" }).click();
     await page.waitForFunction((limit) => (modalcastViewer.playback?.time ?? limit) < limit, 0.5 * duration);
     assert.ok(await page.evaluate(() => modalcastViewer.playback?.isPlaying));
-    // Control: without the loop, it stops at the end.
+    // Control: without the loop, it stops at the end. It is paused meanwhile, so that it does not end before the seek.
+    await page.getByRole("button", { name: "Pause" }).click();
     await page.getByRole("button", { name: "Loop" }).click();
     await seek(page, 0.9 * duration);
+    await page.getByRole("button", { name: "Play" }).click();
     await page.waitForFunction(() => modalcastViewer.playback?.isPlaying === false);
     assert.deepEqual(await shownQ(page), expectedQ(duration));
     // Keys step through the recording.
